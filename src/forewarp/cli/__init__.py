@@ -1,0 +1,1 @@
+"""The command line: Hydra entry points and nothing else."""

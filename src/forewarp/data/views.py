@@ -1,0 +1,77 @@
+"""Poses and boxes as files and configs give them, checked."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from reprlib import repr as short
+
+import numpy as np
+import torch
+
+from forewarp.data.files import number
+from forewarp.scene.box import Box
+from forewarp.scene.camera import Camera
+from forewarp.scene.errors import SceneError
+
+# Poses are stored with six digits or more; a scale or a shear in a pose is never this small.
+_ROTATION_TOLERANCE = 1e-3
+
+
+def pose_of(value: object, where: str) -> np.ndarray:
+    """A camera-to-world matrix (4, 4) float64 whose upper left part is a rotation.
+
+    Raises:
+        SceneError: for another shape, entries that are no finite numbers, or no rotation.
+    """
+    try:
+        matrix = np.array(value)
+    except ValueError:  # rows of different lengths
+        matrix = np.array(None)
+    if matrix.shape != (4, 4) or matrix.dtype.kind not in "if" or not np.isfinite(matrix).all():
+        raise SceneError(f"{where}: expected 4 x 4 finite numbers, but got {short(value)}; check the export")
+    matrix = matrix.astype(np.float64)
+    rotation = matrix[:3, :3]
+    error = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    determinant = np.linalg.det(rotation)
+    if error > _ROTATION_TOLERANCE or determinant < 0:
+        raise SceneError(
+            f"{where}: expected a rotation, but got determinant {determinant:.4g} and columns that are off "
+            f"orthonormal by {error:.2g}; remove scale and mirroring from the camera"
+        )
+    if np.abs(matrix[3] - [0, 0, 0, 1]).max() > _ROTATION_TOLERANCE:
+        raise SceneError(f"{where}: expected the last row 0 0 0 1, but got {matrix[3].tolist()}")
+    return matrix
+
+
+def box_of(values: Sequence[float]) -> Box:
+    """The box a config names by x0 y0 z0 x1 y1 z1 in world units.
+
+    >>> box_of([-1, -1, -1, 1, 1, 2]).high
+    (1.0, 1.0, 2.0)
+    """
+    expected = "data.box: expected six numbers x0 y0 z0 x1 y1 z1, each low end below its high end"
+    try:
+        low, high = tuple(float(v) for v in values[:3]), tuple(float(v) for v in values[3:])
+        return Box(low, high)
+    except (TypeError, ValueError) as error:
+        raise SceneError(f"{expected}, but got {short(values)}") from error
+
+
+def frustum_box(cameras: Iterable[Camera]) -> Box:
+    """The bounds of all rays between near and far, along the unit rays of 3 x 3 pixels a camera."""
+    points = []
+    for camera in cameras:
+        # Not corners alone: of rays of one length those through the middle of an edge reach further sideways.
+        columns = torch.tensor([0, camera.width // 2, camera.width - 1])
+        rows = torch.tensor([0, camera.height // 2, camera.height - 1])
+        pixels = rows[:, None] * camera.width + columns
+        rays = camera.rays(pixels.flatten(), dtype=torch.float64)
+        points += [rays.origins + distance * rays.directions for distance in (camera.near, camera.far)]
+    cloud = torch.cat(points)
+    return Box(tuple(cloud.amin(0).tolist()), tuple(cloud.amax(0).tolist()))
+
+
+def check_range(near: float, far: float) -> None:
+    """Refuse a range of distances that is empty, negative or endless."""
+    if not number(near, "data.near", 0) < number(far, "data.far", 0):
+        raise SceneError(f"data.near, data.far: expected near < far, but got {near} and {far}")

@@ -1,0 +1,1 @@
+"""The optional parts of a scene: motion, up-sampling, inpainting, view dependence."""

@@ -1,0 +1,56 @@
+"""Between sparse lattices and the dense boxes that convolutions need."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from forewarp.scene.box import Lattice
+from forewarp.scene.state import RadianceGrid
+
+
+@dataclass(frozen=True)
+class Crop:
+    """The voxels ``low`` to ``high`` (inclusive) of a lattice."""
+
+    low: tuple[int, int, int]
+    high: tuple[int, int, int]
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Voxels per axis."""
+        return tuple(h - l + 1 for l, h in zip(self.low, self.high))
+
+    def scaled(self, scale: int) -> Crop:
+        """The same region of the lattice refined ``scale`` times, its corners on the same points."""
+        return Crop(tuple(v * scale for v in self.low), tuple(v * scale for v in self.high))
+
+
+def occupied_crop(index: Tensor, margin: int) -> Crop:
+    """The box around the present voxels, ``margin`` wider, at least 2 voxels an axis; all where none is."""
+    present = (index >= 0).nonzero()
+    if not len(present):
+        return Crop((0, 0, 0), tuple(n - 1 for n in index.shape))
+    low = [max(0, int(v) - margin) for v in present.amin(0)]
+    high = [min(n - 1, max(int(v) + margin, l + 1)) for v, n, l in zip(present.amax(0), index.shape, low)]
+    return Crop(tuple(min(l, h - 1) for l, h in zip(low, high)), tuple(high))
+
+
+def densify(grid: RadianceGrid, crop: Crop) -> Tensor:
+    """The crop's values (1, 1 + C, x, y, z), absent voxels filled with empty space. Differentiable."""
+    region = tuple(slice(l, h + 1) for l, h in zip(crop.low, crop.high))
+    rows = grid.index[region].reshape(-1).long()
+    padded = torch.cat([grid.values, grid.fill[None]])
+    dense = padded.index_select(0, torch.where(rows < 0, len(padded) - 1, rows))
+    return dense.T.reshape(1, -1, *crop.shape)
+
+
+def sparsify(grid: RadianceGrid, lattice: Lattice, crop: Crop, dense: Tensor) -> RadianceGrid:
+    """A grid on ``lattice`` that holds ``dense`` (1, 1 + C, x, y, z) in ``crop`` and is empty elsewhere."""
+    index = torch.full(lattice.shape, -1, dtype=torch.int32, device=dense.device)
+    count = dense[0, 0].numel()
+    rows = torch.arange(count, dtype=torch.int32, device=dense.device).reshape(crop.shape)
+    index[tuple(slice(l, h + 1) for l, h in zip(crop.low, crop.high))] = rows
+    return replace(grid, lattice=lattice, index=index, values=dense.reshape(dense.shape[1], -1).T.contiguous())

@@ -1,0 +1,94 @@
+"""The up-sampling effect: warp on a coarse lattice, render on a finer one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from forewarp.effects.dense import Crop, densify, occupied_crop, sparsify
+from forewarp.effects.inpaint import ConvBlock
+from forewarp.ops.grid import index_of, occupied_cells, trilinear
+from forewarp.scene.box import Lattice
+from forewarp.scene.state import RadianceGrid
+
+
+def refined(lattice: Lattice, scale: float) -> Lattice:
+    """The lattice of the same box with spacing divided by ``scale``."""
+    return Lattice(lattice.box, tuple(max(2, round((n - 1) * scale) + 1) for n in lattice.shape))
+
+
+class TrilinearUpsampler(nn.Module):
+    """Plain interpolation to a lattice ``scale`` times finer, in occupied cells only.
+
+    Args:
+        scale: > 1, not necessarily whole.
+    """
+
+    def __init__(self, *, scale: float = 2.0) -> None:
+        super().__init__()
+        if not scale > 1:
+            raise ValueError(f"model.upsampler.scale: expected a number > 1, but got {scale}; or model/upsampler=none")
+        self.scale = scale
+
+    def forward(self, grid: RadianceGrid) -> RadianceGrid:
+        """The grid on the finer lattice; differentiable in its values.
+
+        Cost: one trilinear read a fine voxel in occupied cells.
+        """
+        fine = refined(grid.lattice, self.scale)
+        cells = occupied_cells(grid.index)
+        axes = [
+            (torch.arange(n, device=cells.device) * ((m - 1) / (n - 1))).long().clamp(max=m - 2)
+            for n, m in zip(fine.shape, grid.lattice.shape)
+        ]
+        voxels = cells[axes[0]][:, axes[1]][:, :, axes[2]].nonzero()
+        points = grid.lattice.to_lattice(fine.to_world(voxels))
+        values = trilinear(grid.values, grid.index, points, grid.fill)
+        return replace(grid, lattice=fine, index=index_of(voxels, fine.shape), values=values)
+
+
+class LearnedUpsampler(TrilinearUpsampler):
+    """Interpolation, then two convolutions at the fine resolution that add detail: the paper's up-layer.
+
+    Its last layer starts at zero, so the first step equals plain interpolation.
+
+    Args:
+        scale: a whole number > 1.
+        channels: 1 + C of the radiance grid.
+        width: channels of the features that it refines (an inpainter's, or the warped grid's own).
+        margin: voxels around the occupied box.
+    """
+
+    def __init__(self, *, scale: int = 2, channels: int, width: int = 16, margin: int = 2, features: int = 0) -> None:
+        super().__init__(scale=scale)
+        if int(scale) != scale:
+            raise ValueError(f"model.upsampler.scale: the learned layer expects a whole number, but got {scale}")
+        self.scale, self.margin = int(scale), margin
+        self.project = nn.Conv3d(features or channels, width, 1)
+        self.layers = nn.Sequential(ConvBlock(width, width), ConvBlock(width, width))
+        self.head = nn.Conv3d(width, channels, 1)
+        nn.init.zeros_(self.head.weight)
+        nn.init.zeros_(self.head.bias)
+
+    def residual(self, features: Tensor, crop: Crop) -> Tensor:
+        """Coarse features (1, F, x, y, z) of ``crop`` -> detail (1, 1 + C, x', y', z') of the fine crop."""
+        # Project to few channels before the fine resolution, where all the cost is.
+        fine = functional.interpolate(
+            self.project(features), size=crop.scaled(self.scale).shape, mode="trilinear", align_corners=True
+        )
+        return self.head(self.layers(fine))
+
+    def alone(self, grid: RadianceGrid) -> RadianceGrid:
+        """Up-sample without an inpainter: interpolation plus learned detail."""
+        crop = occupied_crop(grid.index, self.margin)
+        dense = densify(grid, crop)
+        fine = interpolate_dense(dense, crop, self.scale) + self.residual(dense, crop)
+        return sparsify(grid, refined(grid.lattice, self.scale), crop.scaled(self.scale), fine)
+
+
+def interpolate_dense(dense: Tensor, crop: Crop, scale: int) -> Tensor:
+    """(1, C, x, y, z) of ``crop`` on the lattice ``scale`` times finer."""
+    return functional.interpolate(dense, size=crop.scaled(scale).shape, mode="trilinear", align_corners=True)

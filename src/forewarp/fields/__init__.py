@@ -1,0 +1,1 @@
+"""What is learned: radiance and trajectories on a canonical lattice."""

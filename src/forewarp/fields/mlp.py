@@ -1,0 +1,30 @@
+"""Small networks."""
+
+from __future__ import annotations
+
+from torch import nn
+
+
+def mlp(inputs: int, outputs: int, *, width: int, layers: int, zero_last: bool = False) -> nn.Sequential:
+    """``layers`` linear layers, ReLU between them.
+
+    Args:
+        inputs, outputs: channels.
+        width: of the hidden layers.
+        layers: linear layers in all, at least 1.
+        zero_last: start from zero outputs, so that training starts from the identity.
+
+    >>> len([m for m in mlp(33, 4, width=128, layers=3) if isinstance(m, nn.Linear)])
+    3
+    """
+    if layers < 1 or width < 1:
+        raise ValueError(f"mlp: expected layers >= 1 and width >= 1, but got {layers=}, {width=}")
+    sizes = [inputs, *[width] * (layers - 1), outputs]
+    parts: list[nn.Module] = []
+    for a, b in zip(sizes[:-1], sizes[1:]):
+        parts += [nn.Linear(a, b), nn.ReLU(inplace=True)]
+    parts.pop()
+    if zero_last:
+        nn.init.zeros_(parts[-1].weight)
+        nn.init.zeros_(parts[-1].bias)
+    return nn.Sequential(*parts)

@@ -1,0 +1,118 @@
+"""The canonical radiance field: density and colour features on a lattice at the canonical time."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from forewarp.fields.mlp import mlp
+from forewarp.fields.voxel_grid import VoxelGrid
+from forewarp.ops.encode import positional_encoding
+from forewarp.scene.box import Lattice
+from forewarp.scene.state import EMPTY, Activation, RadianceGrid
+
+
+def density_shift(alpha_init: float) -> float:
+    """``log(1 / (1 - alpha_init) - 1)``: raw density 0 has opacity ``alpha_init`` over one unit.
+
+    >>> round(density_shift(0.5), 6)
+    0.0
+    """
+    if not 0 < alpha_init < 1:
+        raise ValueError(f"model.radiance.alpha_init: expected a number in (0, 1), but got {alpha_init}")
+    return math.log(1 / (1 - alpha_init) - 1)
+
+
+class DirectRadiance(VoxelGrid):
+    """Density and colour held in the voxels themselves: no network, the cheap choice.
+
+    Args:
+        lattice: where voxels may be.
+        active: (X, Y, Z) bool.
+        features: colour channels; the first 3 are the colour, the rest its shading by direction.
+        alpha_init: opacity over ``unit`` at raw density 0.
+        unit: length that density is measured in, world units.
+        skip_alpha: cells more transparent than this over a voxel are not sampled.
+    """
+
+    def __init__(
+        self, lattice: Lattice, active: Tensor, *, features: int, alpha_init: float, unit: float, skip_alpha: float
+    ) -> None:
+        super().__init__(lattice, active, self._channels(features))
+        self.activation = Activation(density_shift(alpha_init), unit)
+        self.skip_alpha = skip_alpha
+
+    @staticmethod
+    def _channels(features: int) -> dict[str, int]:
+        channels = {"density": 1, "color": 3}
+        return channels | {"shading": features - 3} if features > 3 else channels
+
+    def forward(self) -> RadianceGrid:
+        """The canonical radiance grid, values (N, 1 + C)."""
+        values = torch.cat([self.parameter(name) for name in self.names], -1)
+        return RadianceGrid(self.lattice, self.index, values, self.activation, self.skip_alpha)
+
+    def births(self, alpha: float) -> dict[str, float]:
+        """What a newly activated voxel starts from: density of opacity ``alpha``, its neighbours' colour."""
+        return {"density": self.activation.raw(alpha, self.lattice.pitch)}
+
+    def empties(self) -> dict[str, float]:
+        """What absent voxels count as when the lattice changes."""
+        return {"density": EMPTY}
+
+
+class FeatureRadiance(VoxelGrid):
+    """The paper's F1: a feature grid and the encoded position through a small MLP give density and colour.
+
+    Args:
+        lattice, active, features, alpha_init, unit, skip_alpha: as ``DirectRadiance``.
+        grid_features: channels of the feature grid.
+        width, layers: of F1.
+        frequencies: of the positional encoding.
+        reference: the lattice whose box normalises positions to [-1, 1] (kept when the lattice changes).
+    """
+
+    def __init__(
+        self,
+        lattice: Lattice,
+        active: Tensor,
+        *,
+        features: int,
+        alpha_init: float,
+        unit: float,
+        skip_alpha: float,
+        grid_features: int = 12,
+        width: int = 128,
+        layers: int = 3,
+        frequencies: int = 5,
+    ) -> None:
+        super().__init__(lattice, active, {"features": grid_features})
+        nn.init.normal_(self.features, std=0.1)
+        self.network = mlp(
+            grid_features + 3 * (1 + 2 * frequencies), 1 + features, width=width, layers=layers, zero_last=True
+        )
+        self.frequencies = frequencies
+        self.activation = Activation(density_shift(alpha_init), unit)
+        self.skip_alpha = skip_alpha
+        self._encoded: tuple[int, Tensor] | None = None
+
+    def forward(self) -> RadianceGrid:
+        """The canonical radiance grid, values (N, 1 + C)."""
+        values = self.network(torch.cat([self._positions(), self.features], -1))
+        return RadianceGrid(self.lattice, self.index, values, self.activation, self.skip_alpha)
+
+    def _positions(self) -> Tensor:
+        key = id(self.voxels)
+        if self._encoded is None or self._encoded[0] != key:
+            self._encoded = (key, positional_encoding(self.lattice.normalised(self.voxels), self.frequencies))
+        return self._encoded[1]
+
+    def births(self, alpha: float) -> dict[str, float]:
+        """Features are averaged from the neighbours; F1 decides their density."""
+        return {}
+
+    def empties(self) -> dict[str, float]:
+        """Features are averaged over the voxels present."""
+        return {}

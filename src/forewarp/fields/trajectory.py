@@ -1,0 +1,115 @@
+"""The canonical trajectory field: every voxel's path through time in a few cosines."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from forewarp.fields.mlp import mlp
+from forewarp.fields.voxel_grid import VoxelGrid
+from forewarp.ops.dct import dct_basis
+from forewarp.ops.encode import positional_encoding
+from forewarp.ops.grid import corner_weights, index_of, trilinear
+from forewarp.scene.box import Box, Lattice
+
+
+class TrajectoryField(nn.Module):
+    """F2: encoded position (and optional grid features) -> DCT coefficients (N, 3, K) of world-unit flow.
+
+    Coefficients are evaluated at the nodes of a coarse lattice and interpolated to the voxels, which also
+    keeps neighbours' motion alike; with ``nodes=0`` they are evaluated at every voxel, as printed. Bases
+    beyond ``bases_in_play`` are silent and start at 0 when they are let in.
+
+    Args:
+        box: normalises positions to [-1, 1]; kept through all stages so that the network carries over.
+        bases: K, at most ``frames - 1``.
+        frames: T, the number of distinct training times.
+        canonical_time: where flow is exactly 0.
+        nodes: about how many nodes along the box's mean side; 0 for none.
+        features: channels of the deformation feature grid; 0 for none.
+        width, layers, frequencies: of F2 and its encoding.
+    """
+
+    def __init__(
+        self,
+        box: Box,
+        *,
+        bases: int,
+        frames: int,
+        canonical_time: float,
+        nodes: int = 25,
+        features: int = 0,
+        width: int = 64,
+        layers: int = 4,
+        frequencies: int = 5,
+    ) -> None:
+        super().__init__()
+        if frames < 2:
+            raise ValueError(
+                f"model.motion: expected at least 2 distinct training times, but got {frames}; use model/motion=none"
+            )
+        self.box, self.frames, self.canonical_time = box, frames, canonical_time
+        self.bases = min(bases, frames - 1)
+        self.scale = 0.5 * max(box.size)
+        self.lattice = Lattice.of_count(box, max(nodes, 8) ** 3)
+        self.at_nodes = nodes > 0
+        self.features = None
+        if features:
+            self.features = VoxelGrid(self.lattice, torch.ones(self.lattice.shape, dtype=torch.bool), {"grid": features})
+        self.frequencies = frequencies
+        self.network = mlp(
+            3 * (1 + 2 * frequencies) + features, 3 * self.bases, width=width, layers=layers, zero_last=True
+        )
+        self.register_buffer("bases_in_play", torch.tensor(self.bases))
+        self._nodes: tuple[Tensor, tuple[Tensor, Tensor, Tensor]] | None = None
+
+    def coefficients(self, points: Tensor) -> Tensor:
+        """DCT coefficients (N, 3, K) in world units at points (N, 3) in world units."""
+        coordinates = self.lattice.to_lattice(points)
+        inputs = positional_encoding(self.lattice.normalised(coordinates), self.frequencies)
+        if self.features is not None:
+            grid = self.features.parameter("grid")
+            read = trilinear(grid, self.features.index, coordinates, grid.new_zeros(grid.shape[1]))
+            inputs = torch.cat([inputs, read], -1)
+        return self.scale * self.network(inputs).reshape(-1, 3, self.bases)
+
+    def _basis(self, time: float | Tensor) -> Tensor:
+        basis = dct_basis(time, self.bases, self.frames, self.canonical_time)
+        playing = torch.arange(self.bases) < self.bases_in_play.cpu()
+        return (basis * playing).to(self.network[0].weight.device)
+
+    def flow(self, voxels: VoxelGrid, time: float) -> Tensor:
+        """Flow (N, 3) in world units from the canonical time to ``time`` for a grid's active voxels.
+
+        Cost: F2 on the nodes around the active voxels, then one trilinear read a voxel.
+        """
+        points, (nodes, index, coordinates) = self._around(voxels)
+        at_nodes = self.coefficients(nodes if self.at_nodes else points) @ self._basis(time)
+        if not self.at_nodes:
+            return at_nodes
+        return trilinear(at_nodes, index, coordinates, at_nodes.new_zeros(3))
+
+    def _around(self, voxels: VoxelGrid):
+        if self._nodes is None or self._nodes[0] is not voxels.voxels:
+            points = voxels.lattice.to_world(voxels.voxels)
+            self._nodes = (voxels.voxels, (points, self._nodes_around(points)))
+        return self._nodes[1]
+
+    def _nodes_around(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        coordinates = self.lattice.to_lattice(points)
+        corners = corner_weights(coordinates, self.lattice.shape)[0].reshape(-1, 3)
+        mask = torch.zeros(self.lattice.shape, dtype=torch.bool, device=points.device)
+        mask[corners[:, 0], corners[:, 1], corners[:, 2]] = True
+        nodes = mask.nonzero()
+        return self.lattice.to_world(nodes), index_of(nodes, self.lattice.shape), coordinates
+
+    def trajectories(self, points: Tensor, times: Tensor) -> Tensor:
+        """Paths (N, T, 3) of canonical points (N, 3) at ``times`` (T,), world units."""
+        if not self.at_nodes:
+            flow = self.coefficients(points) @ self._basis(times).T  # (N, 3, T)
+            return points[:, None] + flow.transpose(1, 2)
+        nodes, index, coordinates = self._nodes_around(points)
+        at_nodes = self.coefficients(nodes).flatten(1)
+        read = trilinear(at_nodes, index, coordinates, at_nodes.new_zeros(at_nodes.shape[1]))
+        flow = read.reshape(-1, 3, self.bases) @ self._basis(times).T
+        return points[:, None] + flow.transpose(1, 2)

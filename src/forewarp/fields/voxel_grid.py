@@ -1,0 +1,123 @@
+"""Learned values on the active voxels of a lattice: dense where all are active, sparse elsewhere."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from forewarp.ops.grid import index_of, trilinear
+from forewarp.scene.box import Box, Lattice
+
+
+class VoxelGrid(nn.Module):
+    """Parameters (N, C) by name, one row an active voxel, and the buffers that place them.
+
+    The lattice and its active voxels change while training (``activate``, ``resample``); a checkpoint
+    brings its own, so shapes are adopted on loading.
+
+    Args:
+        lattice: where voxels may be.
+        active: (X, Y, Z) bool.
+        channels: name -> C.
+    """
+
+    def __init__(self, lattice: Lattice, active: Tensor, channels: dict[str, int]) -> None:
+        super().__init__()
+        self.lattice = lattice
+        self.names = tuple(channels)
+        voxels = active.nonzero()
+        self.register_buffer("voxels", voxels)
+        self.register_buffer("index", index_of(voxels, lattice.shape))
+        for name, c in channels.items():
+            self.register_parameter(name, nn.Parameter(torch.zeros(len(voxels), c)))
+
+    def extra_repr(self) -> str:
+        """Shape, share of active voxels, channels."""
+        return f"{self.lattice.shape}, active={len(self.voxels) / self.lattice.count:.1%}, {self.names}"
+
+    def parameter(self, name: str) -> nn.Parameter:
+        """The parameter (N, C) of that name."""
+        return getattr(self, name)
+
+    @torch.no_grad()
+    def activate(self, active: Tensor, births: dict[str, float]) -> Tensor:
+        """Make exactly the voxels in ``active`` (X, Y, Z) the active ones.
+
+        New voxels get ``births[name]``, or the mean of their active neighbours where a name is not in it.
+
+        Returns:
+            (N',) int64: the row each voxel had before, -1 where it is new.
+        """
+        voxels = active.nonzero().to(self.voxels.device)
+        rows = self.index[voxels[:, 0], voxels[:, 1], voxels[:, 2]].long()
+        new = (rows < 0).nonzero()[:, 0]
+        for name in self.names:
+            old = self.parameter(name)
+            values = old.data[rows.clamp(min=0)] if len(old) else old.data.new_zeros(len(rows), old.shape[1])
+            if name in births:
+                values[new] = births[name]
+            else:
+                values[new] = self._neighbour_mean(old.data, voxels[new])
+            self._renew(name, values)
+        self._place(self.lattice, voxels)
+        return rows
+
+    @torch.no_grad()
+    def resample(self, lattice: Lattice, active: Tensor, empty: dict[str, float]) -> None:
+        """Carry the values to another lattice by trilinear interpolation.
+
+        Absent voxels read ``empty[name]``; names not in it are averaged over the voxels present.
+        """
+        voxels = active.nonzero().to(self.voxels.device)
+        points = self.lattice.to_lattice(lattice.to_world(voxels))
+        ones = torch.ones(len(self.voxels), 1, device=points.device)
+        share = trilinear(ones, self.index, points, ones.new_zeros(1)).clamp(min=1e-6)
+        for name in self.names:
+            p = self.parameter(name)
+            fill = p.data.new_full((p.shape[1],), empty.get(name, 0.0))
+            values = trilinear(p.data, self.index, points, fill)
+            self._renew(name, values if name in empty else values / share)
+        self._place(lattice, voxels)
+
+    def _renew(self, name: str, values: Tensor) -> None:
+        # A new Parameter: autograd remembers an old one's shape for as long as any graph lives.
+        setattr(self, name, nn.Parameter(values))
+
+    def _place(self, lattice: Lattice, voxels: Tensor) -> None:
+        self.lattice = lattice
+        self.voxels = voxels
+        self.index = index_of(voxels, lattice.shape)
+
+    def _neighbour_mean(self, values: Tensor, voxels: Tensor) -> Tensor:
+        last = torch.tensor(self.lattice.shape, device=voxels.device) - 1
+        total = values.new_zeros(len(voxels), values.shape[1])
+        count = values.new_zeros(len(voxels), 1)
+        for offset in torch.cartesian_prod(*[torch.arange(-1, 2)] * 3).to(voxels.device):
+            at = voxels + offset
+            inside = ((at >= 0) & (at <= last)).all(-1)
+            x, y, z = torch.minimum(at.clamp(min=0), last).unbind(-1)
+            row = torch.where(inside, self.index[x, y, z].long(), -1)
+            there = (row >= 0)[:, None]
+            if len(values):
+                total += torch.where(there, values[row.clamp(min=0)], 0.0)
+            count += there
+        return total / count.clamp(min=1)
+
+    def get_extra_state(self) -> dict:
+        """The lattice, in plain numbers."""
+        box = self.lattice.box
+        return {"low": list(box.low), "high": list(box.high), "shape": list(self.lattice.shape)}
+
+    def set_extra_state(self, state: dict) -> None:
+        """Adopt a checkpoint's lattice."""
+        self.lattice = Lattice(Box(tuple(state["low"]), tuple(state["high"])), tuple(state["shape"]))
+
+    def _load_from_state_dict(self, state_dict, prefix, *args, **kwargs) -> None:
+        for name in ("voxels", "index"):
+            if prefix + name in state_dict:
+                setattr(self, name, torch.empty_like(state_dict[prefix + name]))
+        for name in self.names:
+            if prefix + name in state_dict:
+                p = self.parameter(name)
+                p.data = p.data.new_empty(state_dict[prefix + name].shape)
+        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)

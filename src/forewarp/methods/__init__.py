@@ -1,0 +1,1 @@
+"""Answers to one question: at this time, what is where?"""

@@ -1,0 +1,149 @@
+"""The opponent: every sample asks a network where it was at the canonical time (as NDVG)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from forewarp.fields.mlp import mlp
+from forewarp.fields.radiance import DirectRadiance
+from forewarp.ops.encode import positional_encoding
+from forewarp.ops.grid import dilate
+from forewarp.scene.box import Box, Lattice
+from forewarp.scene.state import RadianceGrid, State
+
+
+class Deformation(nn.Module):
+    """Encoded position and time -> displacement to the canonical time, world units.
+
+    It is exactly 0 at the canonical time: the printed opponents add a penalty for that.
+
+    Args:
+        box: normalises positions.
+        canonical_time: in [0, 1].
+        width, layers, frequencies, time_frequencies: of the network and its encodings.
+    """
+
+    def __init__(
+        self,
+        box: Box,
+        *,
+        canonical_time: float,
+        width: int = 64,
+        layers: int = 4,
+        frequencies: int = 5,
+        time_frequencies: int = 5,
+    ) -> None:
+        super().__init__()
+        self.lattice = Lattice(box, (2, 2, 2))
+        self.canonical_time = canonical_time
+        self.scale = 0.5 * max(box.size)
+        self.frequencies, self.time_frequencies = frequencies, time_frequencies
+        inputs = 3 * (1 + 2 * frequencies) + 1 + 2 * time_frequencies
+        self.network = mlp(inputs, 3, width=width, layers=layers, zero_last=True)
+
+    def forward(self, points: Tensor, time: float) -> Tensor:
+        """World points (P, 3) at ``time`` -> displacement (P, 3)."""
+        position = positional_encoding(self.lattice.normalised(self.lattice.to_lattice(points)), self.frequencies)
+        clock = positional_encoding(points.new_tensor([[2 * time - 1]]), self.time_frequencies)
+        inputs = torch.cat([position, clock.expand(len(points), -1)], -1)
+        # Fades in over a twentieth of the sequence, so that the field stays continuous in time.
+        gate = min(1.0, abs(time - self.canonical_time) * 20)
+        return gate * self.scale * self.network(inputs)
+
+
+@dataclass(frozen=True)
+class MovedField:
+    """A canonical grid read at displaced points."""
+
+    canonical: RadianceGrid
+    deformation: Deformation
+    time: float
+    cells: Tensor
+
+    @property
+    def lattice(self) -> Lattice:
+        """The canonical lattice; points are given in it."""
+        return self.canonical.lattice
+
+    def _moved(self, points: Tensor) -> Tensor:
+        displacement = self.deformation(self.lattice.to_world(points), self.time)
+        return points + displacement / points.new_tensor(self.lattice.spacing)
+
+    def _inside(self, points: Tensor) -> Tensor:
+        last = torch.tensor(self.lattice.shape, device=points.device) - 1
+        return ((points >= 0) & (points <= last)).all(-1)
+
+    def density(self, points: Tensor) -> Tensor:
+        """Sigma (P,); 0 where the canonical position lies outside the box."""
+        moved = self._moved(points)
+        return self.canonical.density(moved) * self._inside(moved.detach())
+
+    def features(self, points: Tensor) -> Tensor:
+        """Colour features (P, C)."""
+        return self.canonical.features(self._moved(points))
+
+
+class BackwardWarp(nn.Module):
+    """Canonical grid, and a deformation network on the samples.
+
+    Args:
+        radiance: the canonical radiance field.
+        deformation: to the canonical time.
+        view: None: the colour features are the colour.
+        canonical_time: where nothing is displaced.
+        mask_nodes: side of the lattice on which occupancy at a time is looked up.
+    """
+
+    def __init__(
+        self,
+        radiance: DirectRadiance,
+        *,
+        canonical_time: float,
+        deformation: Deformation,
+        view: nn.Module | None = None,
+        mask_nodes: int = 32,
+    ) -> None:
+        super().__init__()
+        self.radiance, self.deformation, self.view = radiance, deformation, view
+        self.canonical_time, self.mask_nodes = canonical_time, mask_nodes
+
+    def at(self, time: float) -> State:
+        """The moved canonical field, under the name ``backward``."""
+        canonical = self.radiance()
+        field = MovedField(canonical, self.deformation, time, self._cells(canonical, time))
+        return State(time, {"backward": field}, canonical)
+
+    @torch.no_grad()
+    def _cells(self, canonical: RadianceGrid, time: float) -> Tensor:
+        """Cells at ``time`` that the displacement carries near an occupied canonical cell."""
+        source = canonical.cells
+        if time == self.canonical_time:
+            return source
+        lattice = canonical.lattice
+        coarse = Lattice(lattice.box, tuple(min(n, self.mask_nodes) for n in lattice.shape))
+        nodes = coarse.to_world(coarse.all_voxels(source.device))
+        moved = lattice.to_lattice(nodes + self.deformation(nodes, time))
+        reach = max(-(-n // m) for n, m in zip(lattice.shape, coarse.shape)) + 1
+        near = dilate(source, reach)
+        last = torch.tensor(source.shape, device=source.device) - 1
+        x, y, z = torch.minimum(moved.round().long().clamp(min=0), last).unbind(-1)
+        hit = near[x, y, z].reshape(coarse.shape)
+        axes = [
+            ((torch.arange(n, device=hit.device) + 0.5) / n * (m - 1)).round().long()
+            for n, m in zip(source.shape, coarse.shape)
+        ]
+        return dilate(hit)[axes[0]][:, axes[1]][:, :, axes[2]]
+
+    @torch.no_grad()
+    def trajectories(self, points: Tensor, times: Tensor) -> Tensor:
+        """Paths (N, T, 3): the inverse of the displacement, by fixed-point iteration."""
+        paths = []
+        for time in times.tolist():
+            at = points.clone()
+            for _ in range(10):
+                at = points - self.deformation(at, time)
+            paths.append(at)
+        return torch.stack(paths, 1)

@@ -1,0 +1,94 @@
+"""The paper's method: a canonical radiance grid warped forward to any time."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from forewarp.effects.dense import densify, occupied_crop, sparsify
+from forewarp.effects.inpaint import UNet3d
+from forewarp.effects.motion import Motion
+from forewarp.effects.upsample import LearnedUpsampler, TrilinearUpsampler, interpolate_dense, refined
+from forewarp.fields.radiance import DirectRadiance, FeatureRadiance
+from forewarp.scene.state import RadianceGrid, State
+
+
+class ForwardWarp(nn.Module):
+    """Canonical radiance -> flow -> warped -> up-sampled (-> inpainted). An absent effect is None.
+
+    Args:
+        radiance: the canonical radiance field.
+        motion: trajectories and splat; None: a static radiance field.
+        upsampler: None: rendered at the resolution of the warp.
+        inpainter: None: one rendering instead of two.
+        view: None: the colour features are the colour.
+        canonical_time: where no warp is needed.
+    """
+
+    def __init__(
+        self,
+        radiance: DirectRadiance | FeatureRadiance,
+        *,
+        canonical_time: float,
+        motion: Motion | None = None,
+        upsampler: TrilinearUpsampler | None = None,
+        inpainter: UNet3d | None = None,
+        view: nn.Module | None = None,
+    ) -> None:
+        super().__init__()
+        effects = {"motion": motion, "upsampler": upsampler, "inpainter": inpainter, "view": view}
+        for name, effect in effects.items():
+            if effect is not None and not isinstance(effect, nn.Module):
+                raise ValueError(
+                    f"model.{name}: expected a module or null, but got {type(effect).__name__}; choose model/{name}=none"
+                )
+            setattr(self, name, effect)
+        self.radiance, self.canonical_time = radiance, canonical_time
+
+    def at(self, time: float) -> State:
+        """The radiance at ``time``, under each of its renderings' names, the best last."""
+        canonical = self.radiance()
+        warped, flow, coverage, dropped = canonical, None, None, 0
+        if self.motion is not None and time != self.canonical_time:
+            flow = self.motion.flow(self.radiance, time)
+            warped, coverage, dropped = self.motion.warp(canonical, self.radiance.voxels, flow)
+        if self.inpainter is None:
+            fields, difference = {"upsampled": self._upsample(warped)}, None
+        else:
+            fields, difference = self._inpaint(warped, coverage)
+        return State(time, fields, canonical, flow, coverage, dropped, difference)
+
+    def _upsample(self, warped: RadianceGrid) -> RadianceGrid:
+        if self.upsampler is None:
+            return warped
+        learned = isinstance(self.upsampler, LearnedUpsampler)
+        return self.upsampler.alone(warped) if learned else self.upsampler(warped)
+
+    def _inpaint(self, warped: RadianceGrid, coverage: Tensor | None) -> tuple[dict[str, RadianceGrid], Tensor]:
+        crop = occupied_crop(warped.index, self.inpainter.margin)
+        dense = densify(warped, crop)
+        inputs = dense
+        if self.inpainter.coverage_channel:
+            cover = warped.values.new_ones(len(warped.values)) if coverage is None else coverage.clamp(max=1)
+            inputs = torch.cat([dense, densify(warped.with_values(cover[:, None] * 1.0), crop).clamp(min=0)], 1)
+        features = self.inpainter.features(inputs)
+        lattice, region = warped.lattice, crop
+        if isinstance(self.upsampler, LearnedUpsampler):
+            residual = self.upsampler.residual(features, crop)
+        else:
+            residual = self.inpainter.residual(features)
+        if self.upsampler is not None:
+            scale = int(self.upsampler.scale)
+            lattice, region = refined(lattice, scale), crop.scaled(scale)
+            dense = interpolate_dense(dense, crop, scale)
+            if residual.shape[2:] != dense.shape[2:]:
+                residual = interpolate_dense(residual, crop, scale)
+        upsampled = sparsify(warped, lattice, region, dense)
+        inpainted = sparsify(warped, lattice, region, dense + residual)
+        return {"upsampled": upsampled, "inpainted": inpainted}, residual
+
+    def trajectories(self, points: Tensor, times: Tensor) -> Tensor:
+        """Paths (N, T, 3) of canonical points (N, 3) at ``times`` (T,), world units."""
+        if self.motion is None:
+            return points[:, None].expand(-1, len(times), -1)
+        return self.motion.trajectory.trajectories(points, times)

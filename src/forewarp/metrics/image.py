@@ -1,0 +1,153 @@
+"""How alike two images are, measured on 8-bit images as they are saved.
+
+Every function takes a prediction and a target (H, W, 3), floats in [0, 1], and rounds both to 8 bits first,
+so a number can be repeated from the saved PNG files. Structural similarity is computed in float64: in
+float32 the variance of a flat region cancels badly, and two equal white images score 0.9985 instead of 1.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+PSNR_CAP = 100.0
+SSIM_LEAST_SIDE = 11
+MS_SSIM_LEAST_SIDE = 161
+_C1, _C2 = 0.01**2, 0.03**2
+_SCALE_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
+
+
+def quantise(image: Tensor) -> Tensor:
+    """An image (...,) of floats as an 8-bit file returns it: clipped to [0, 1], in steps of 1/255, float64.
+
+    >>> (quantise(torch.tensor([-0.1, 0.5, 1.0])) * 255).tolist()
+    [0.0, 128.0, 255.0]
+    """
+    return (image.detach().to("cpu", torch.float64).clamp(0, 1) * 255).round() / 255
+
+
+def image_pair(prediction: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+    """Both images checked and rounded to 8 bits, (H, W, 3) float64 on the CPU.
+
+    A prediction slightly outside [0, 1] is clipped, as saving clips it; one a whole unit outside is taken
+    for an image in other units.
+
+    Raises:
+        ValueError: another shape, dtype or range, or a value that is not finite.
+    """
+    for name, image, slack in (("prediction", prediction, 1.0), ("target", target, 1e-3)):
+        if image.ndim != 3 or image.shape[-1] != 3 or not image.numel():
+            raise ValueError(f"{name}: expected an image (H, W, 3), but got shape {tuple(image.shape)}")
+        if not image.is_floating_point():
+            raise ValueError(f"{name}: expected floats in [0, 1], but got {image.dtype}; divide by 255")
+        bad = int((~torch.isfinite(image)).sum())
+        if bad:
+            raise ValueError(
+                f"{name}: expected finite values, but got {bad} of {image.numel()} NaN or infinite"
+            )
+        low, high = float(image.min()), float(image.max())
+        if low < -slack or high > 1 + slack:
+            raise ValueError(f"{name}: expected values in [0, 1], but got [{low:.4g}, {high:.4g}]")
+    if prediction.shape != target.shape:
+        raise ValueError(
+            f"prediction: expected shape {tuple(target.shape)}, but got {tuple(prediction.shape)}"
+        )
+    return quantise(prediction), quantise(target)
+
+
+def psnr(prediction: Tensor, target: Tensor) -> float:
+    r"""Peak signal-to-noise ratio of one image in dB, :math:`-10 \log_{10} \mathrm{MSE}`, at most 100.
+
+    Report the mean of this over images: pooling the MSE over all images first, as torchmetrics' class does
+    by default, gives a smaller number. The cap keeps equal images from making a mean infinite.
+
+    >>> round(psnr(torch.zeros(2, 2, 3), torch.full((2, 2, 3), 0.2)), 6)
+    13.9794
+    """
+    a, b = image_pair(prediction, target)
+    error = float((a - b).square().mean())
+    return PSNR_CAP if error == 0 else min(PSNR_CAP, -10 * math.log10(error))
+
+
+def ssim(prediction: Tensor, target: Tensor) -> float | None:
+    """Structural similarity: Gaussian window of 11 pixels and sigma 1.5, data range 1, mean over all pixels.
+
+    Borders are reflected, the convention of ``torchmetrics``' function, whose float64 value this equals.
+
+    Returns:
+        None where the window does not fit: a side below 11 pixels.
+
+    **Cost** 22 multiply-adds per pixel and channel for each of five blurred images.
+    """
+    a, b = image_pair(prediction, target)
+    if min(a.shape[:2]) < SSIM_LEAST_SIDE:
+        return None
+    a, b = (F.pad(x.permute(2, 0, 1), (5, 5, 5, 5), mode="reflect") for x in (a, b))
+    return float(_similarity(a, b)[0].mean())
+
+
+def ms_ssim(prediction: Tensor, target: Tensor) -> float | None:
+    """Structural similarity over five scales, the mean over channels, as ``tf.image.ssim_multiscale``.
+
+    Windows stay inside the image; an odd side is halved upwards, its last row or column kept as it is.
+
+    Returns:
+        None where the window does not fit the coarsest scale: a side of 160 pixels or fewer.
+    """
+    a, b = (x.permute(2, 0, 1) for x in image_pair(prediction, target))
+    return _multi_scale(a, b, lambda x: F.avg_pool2d(x, 2, ceil_mode=True))
+
+
+def ms_ssim_legacy(prediction: Tensor, target: Tensor) -> float | None:
+    """The MS-SSIM that TiNeuVox and NDVG print, for comparison with their published columns only.
+
+    They reshape (H, W, 3) to (3, H, W) without a permute, so each "channel" is a third of the image with
+    the colours of neighbouring pixels interleaved along its rows. That flatters a blurred or shifted full
+    picture by up to 0.07; for an object before white it may be the lower of the two.
+
+    Returns:
+        None where the window does not fit the coarsest scale: a side of 160 pixels or fewer.
+    """
+    a, b = (x.reshape(3, *x.shape[:2]) for x in image_pair(prediction, target))
+    # Their library pads odd sides with zeros on both ends before it halves them.
+    return _multi_scale(a, b, lambda x: F.avg_pool2d(x, 2, padding=[s % 2 for s in x.shape[-2:]]))
+
+
+def _multi_scale(a: Tensor, b: Tensor, halve) -> float | None:
+    """The product over scales of contrast (all but the last) and similarity (the last), images (C, H, W)."""
+    if min(a.shape[-2:]) < MS_SSIM_LEAST_SIDE:
+        return None
+    value = torch.ones(len(a), dtype=a.dtype)
+    for scale, weight in enumerate(_SCALE_WEIGHTS):
+        similarity, contrast = _similarity(a, b)
+        last = scale == len(_SCALE_WEIGHTS) - 1
+        # A negative base has no real power; both libraries cut it off at 0.
+        value = value * (similarity if last else contrast).mean((-2, -1)).relu() ** weight
+        if not last:
+            a, b = halve(a), halve(b)
+    return float(value.mean())
+
+
+def _similarity(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+    """Similarity and its contrast part at every full window of two images (C, H, W) -> (C, H-10, W-10)."""
+    mean_a, mean_b, square_a, square_b, product = _blur(torch.stack([a, b, a * a, b * b, a * b]))
+    variances = (square_a - mean_a**2).clamp_min(0) + (square_b - mean_b**2).clamp_min(0)
+    contrast = (2 * (product - mean_a * mean_b) + _C2) / (variances + _C2)
+    return contrast * (2 * mean_a * mean_b + _C1) / (mean_a**2 + mean_b**2 + _C1), contrast
+
+
+def _blur(images: Tensor) -> Tensor:
+    """The Gaussian mean over 11 x 11 pixels, (..., H, W) -> (..., H-10, W-10), one axis after the other."""
+    offsets = torch.arange(-5, 6, dtype=images.dtype)
+    weights = torch.exp(-(offsets**2) / (2 * 1.5**2))
+    for axis in (-2, -1):
+        length = images.shape[axis] - 10
+        # Shifted sums: PyTorch's float64 convolution takes several times as long.
+        shifted = (
+            w * images.narrow(axis, k, length) for k, w in enumerate((weights / weights.sum()).tolist())
+        )
+        images = sum(shifted)
+    return images

@@ -1,0 +1,235 @@
+"""Learned perceptual image patch similarity (LPIPS, version 0.1), on three backbones.
+
+Distances of different backbones are not comparable, so the net is part of every name: ``lpips_vgg`` is what
+papers print. Backbone weights are files in torchvision's format, looked for but never downloaded; the small
+linear heads come with torchmetrics.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+from collections.abc import Iterable
+from importlib import resources
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from forewarp.metrics.image import image_pair
+
+NETS = ("squeeze", "vgg", "alex")
+WEIGHTS_VARIABLE = "FOREWARP_LPIPS_WEIGHTS"
+LPIPS_LEAST_SIDE = 32
+_FILE_PATTERNS = {
+    "squeeze": ("squeezenet1_1*.pth", "squeeze.backbone.pth"),
+    "vgg": ("vgg16-*.pth", "vgg16.pth", "vgg.backbone.pth"),
+    "alex": ("alexnet*.pth", "alex.backbone.pth"),
+}
+# The layers whose output is compared, as indices into torchvision's ``features``.
+_TAPS = {
+    "squeeze": (1, 4, 7, 9, 10, 11, 12),
+    "vgg": (3, 8, 15, 22, 29),
+    "alex": (1, 4, 7, 9, 11),
+}
+_UNIT_EPSILON = 1e-10
+
+
+class Fire(nn.Module):
+    """SqueezeNet's block: a 1x1 squeeze, then 1x1 and 3x3 filters side by side."""
+
+    def __init__(self, inputs: int, squeezed: int, expanded: int) -> None:
+        super().__init__()
+        self.squeeze = nn.Conv2d(inputs, squeezed, 1)
+        self.expand1x1 = nn.Conv2d(squeezed, expanded, 1)
+        self.expand3x3 = nn.Conv2d(squeezed, expanded, 3, padding=1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, inputs, H, W) -> (B, 2 * expanded, H, W)."""
+        x = self.squeeze(x).relu_()
+        return torch.cat([self.expand1x1(x), self.expand3x3(x)], 1).relu_()
+
+
+def squeezenet_features() -> nn.Sequential:
+    """The convolutional part of SqueezeNet 1.1, parameter names as in torchvision."""
+    return nn.Sequential(
+        nn.Conv2d(3, 64, 3, stride=2),
+        nn.ReLU(inplace=True),
+        nn.MaxPool2d(3, 2, ceil_mode=True),
+        Fire(64, 16, 64),
+        Fire(128, 16, 64),
+        nn.MaxPool2d(3, 2, ceil_mode=True),
+        Fire(128, 32, 128),
+        Fire(256, 32, 128),
+        nn.MaxPool2d(3, 2, ceil_mode=True),
+        Fire(256, 48, 192),
+        Fire(384, 48, 192),
+        Fire(384, 64, 256),
+        Fire(512, 64, 256),
+    )
+
+
+def vgg16_features() -> nn.Sequential:
+    """The convolutional part of VGG16 up to its last ReLU, parameter names as in torchvision."""
+    layers, inputs = [], 3
+    for width, repeats in ((64, 2), (128, 2), (256, 3), (512, 3), (512, 3)):
+        for _ in range(repeats):
+            layers += [nn.Conv2d(inputs, width, 3, padding=1), nn.ReLU(inplace=True)]
+            inputs = width
+        layers.append(nn.MaxPool2d(2, 2))
+    return nn.Sequential(*layers[:-1])
+
+
+def alexnet_features() -> nn.Sequential:
+    """The convolutional part of AlexNet up to its last ReLU, parameter names as in torchvision."""
+    return nn.Sequential(
+        nn.Conv2d(3, 64, 11, stride=4, padding=2),
+        nn.ReLU(inplace=True),
+        nn.MaxPool2d(3, 2),
+        nn.Conv2d(64, 192, 5, padding=2),
+        nn.ReLU(inplace=True),
+        nn.MaxPool2d(3, 2),
+        nn.Conv2d(192, 384, 3, padding=1),
+        nn.ReLU(inplace=True),
+        nn.Conv2d(384, 256, 3, padding=1),
+        nn.ReLU(inplace=True),
+        nn.Conv2d(256, 256, 3, padding=1),
+        nn.ReLU(inplace=True),
+    )
+
+
+_BACKBONES = {"squeeze": squeezenet_features, "vgg": vgg16_features, "alex": alexnet_features}
+
+
+class LPIPS(nn.Module):
+    """Perceptual distance of one backbone, frozen.
+
+    Args:
+        net: ``squeeze``, ``vgg`` or ``alex``.
+        backbone: a torchvision-format weight file of that net, of the whole model or of its ``features``.
+        heads: a file of linear heads ``lin<k>.model.1.weight``; None takes torchmetrics' own.
+
+    Raises:
+        ValueError: an unknown net, or a file that does not hold its weights.
+    """
+
+    shift: Tensor
+    scale: Tensor
+
+    def __init__(self, net: str, backbone: str | Path, heads: str | Path | None = None) -> None:
+        super().__init__()
+        _check_net(net)
+        self.net = net
+        self.features = _BACKBONES[net]()
+        _load_backbone(self.features, Path(backbone), net)
+        for k, weight in enumerate(_read_heads(net, heads)):
+            self.register_buffer(f"head{k}", weight)
+        self.register_buffer("shift", torch.tensor([-0.030, -0.088, -0.188])[:, None, None])
+        self.register_buffer("scale", torch.tensor([0.458, 0.448, 0.450])[:, None, None])
+        self.requires_grad_(False)
+
+    @torch.no_grad()
+    def distance(self, first: Tensor, second: Tensor) -> Tensor:
+        """Distances (B,) of image pairs (B, 3, H, W) in [-1, 1]; no gradient.
+
+        **Cost** one pass of the backbone over both; only two neighbouring layers are held at a time.
+        """
+        x = (torch.cat([first, second]) - self.shift) / self.scale
+        total = x.new_zeros(len(first))
+        for index, layer in enumerate(self.features):
+            x = layer(x)
+            if index in _TAPS[self.net]:
+                head = getattr(self, f"head{_TAPS[self.net].index(index)}")
+                unit = x / (torch.linalg.vector_norm(x, dim=1, keepdim=True) + _UNIT_EPSILON)
+                a, b = unit.chunk(2)
+                total = total + F.conv2d((a - b).square(), head).mean((1, 2, 3))
+        return total
+
+    def forward(self, prediction: Tensor, target: Tensor) -> float | None:
+        """Distance of two images (H, W, 3) in [0, 1], as 8-bit files; None below 32 pixels a side."""
+        pair = image_pair(prediction, target)
+        if min(prediction.shape[:2]) < LPIPS_LEAST_SIDE:
+            return None
+        a, b = ((x.permute(2, 0, 1)[None] * 2 - 1).to(self.shift) for x in pair)
+        return float(self.distance(a, b))
+
+
+def find_lpips_weights(net: str, extra: Iterable[str | Path] | str | Path | None = ()) -> Path | None:
+    """The backbone file of a net, or None.
+
+    Looks at the given files and folders, then at the one named by ``FOREWARP_LPIPS_WEIGHTS``, then at torch
+    hub's cache, where torchvision leaves what it downloaded. A file counts for the net it is named after.
+
+    Raises:
+        ValueError: an unknown net; a given place that does not exist, or a given file named after no net.
+    """
+    _check_net(net)
+    extra = [extra] if isinstance(extra, str | Path) else extra or ()
+    named = [("lpips_weights", Path(place).expanduser()) for place in extra if place]
+    if os.environ.get(WEIGHTS_VARIABLE):
+        named.append((WEIGHTS_VARIABLE, Path(os.environ[WEIGHTS_VARIABLE]).expanduser()))
+    for key, place in named:
+        if not place.exists():
+            raise ValueError(f"{key}: expected an existing weight file or folder, but got {place}")
+        if place.is_file() and not any(_is_named_after(place, other) for other in NETS):
+            names = ", ".join(pattern for patterns in _FILE_PATTERNS.values() for pattern in patterns)
+            raise ValueError(f"{key}: expected a file named like {names}, but got {place}; rename it")
+    for place in [*(place for _, place in named), Path(torch.hub.get_dir()) / "checkpoints"]:
+        for file in [place] if place.is_file() else sorted(place.glob("*.pth")):
+            if _is_named_after(file, net):
+                return file
+    return None
+
+
+def _is_named_after(file: Path, net: str) -> bool:
+    return any(file.match(pattern) for pattern in _FILE_PATTERNS[net])
+
+
+def find_lpips(
+    nets: Iterable[str] = NETS, extra: Iterable[str | Path] | str | Path | None = ()
+) -> dict[str, LPIPS | None]:
+    """``{"lpips_<net>": LPIPS or None}`` for the nets asked for; None where no weights are found."""
+    files = {net: find_lpips_weights(net, extra) for net in nets}
+    return {f"lpips_{net}": LPIPS(net, file) if file else None for net, file in files.items()}
+
+
+def _check_net(net: str) -> None:
+    if net not in NETS:
+        raise ValueError(f"lpips: expected a net of {', '.join(NETS)}, but got {net!r}")
+
+
+def _read(file: Path, what: str) -> dict[str, Tensor]:
+    """A state dict; nothing but tensors is unpickled."""
+    try:
+        state = torch.load(file, map_location="cpu", weights_only=True)
+    except (OSError, RuntimeError, EOFError, pickle.UnpicklingError) as error:
+        raise ValueError(f"{file}: expected {what}, but got {type(error).__name__} on reading") from error
+    if not isinstance(state, dict):
+        raise ValueError(f"{file}: expected {what}, but got a {type(state).__name__}")
+    return state
+
+
+def _load_backbone(features: nn.Sequential, file: Path, net: str) -> None:
+    what = f"weights of {net}'s features"
+    state = {key.removeprefix("features."): value for key, value in _read(file, what).items()}
+    for key, parameter in features.state_dict().items():
+        if key not in state or state[key].shape != parameter.shape:
+            got = f"shape {tuple(state[key].shape)}" if key in state else "none"
+            raise ValueError(
+                f"{file}: expected {what} with {key!r} of shape {tuple(parameter.shape)}, but got {got}"
+            )
+    features.load_state_dict({key: state[key] for key in features.state_dict()})
+
+
+def _read_heads(net: str, heads: str | Path | None) -> list[Tensor]:
+    """The heads (1, C, 1, 1), one per tap."""
+    if heads is None:
+        heads = resources.files("torchmetrics") / "functional" / "image" / "lpips_models" / f"{net}.pth"
+    what = f"LPIPS heads of {net}"
+    state = _read(Path(str(heads)), what)
+    keys = [f"lin{k}.model.1.weight" for k in range(len(_TAPS[net]))]
+    missing = [key for key in keys if key not in state]
+    if missing:
+        raise ValueError(f"{heads}: expected {what}, but got no {missing[0]!r}")
+    return [state[key] for key in keys]

@@ -1,0 +1,130 @@
+"""All metrics of an image at once, and their means per ability."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Iterable, Mapping
+
+from torch import Tensor
+
+from forewarp.metrics import depth, image, lpips
+from forewarp.metrics.lpips import LPIPS
+from forewarp.scene.batch import Target
+
+ABILITIES = ("space", "time", "canonical", "all")
+DEPTH_METRICS = tuple(f"depth_delta_{threshold:g}" for threshold in depth.THRESHOLDS)
+LPIPS_METRICS = tuple(f"lpips_{net}" for net in lpips.NETS)
+METRICS = ("psnr", "ssim", "ms_ssim", "ms_ssim_legacy", *LPIPS_METRICS, *DEPTH_METRICS)
+
+log = logging.getLogger(__name__)
+
+
+class ImageSuite:
+    """Scores rendered images.
+
+    Args:
+        lpips: ``{"lpips_<net>": LPIPS or None}`` as ``find_lpips`` gives it; a None is left out.
+
+    ``absent`` says of every metric left out so far why; each is logged once.
+
+    Raises:
+        ValueError: a name that is not ``lpips_<net>``, or that names another net than its module.
+    """
+
+    def __init__(self, lpips: Mapping[str, LPIPS | None] | None = None) -> None:
+        self.absent: dict[str, str] = {}
+        self.lpips: dict[str, LPIPS] = {}
+        for name, net in (lpips or {}).items():
+            if name not in LPIPS_METRICS or (net is not None and name != f"lpips_{net.net}"):
+                got = repr(name) if net is None else f"{name!r} for the net {net.net!r}"
+                raise ValueError(f"lpips: expected names of {', '.join(LPIPS_METRICS)}, but got {got}")
+            if net is None:
+                self._leave_out(name, "no backbone weights were found")
+            else:
+                self.lpips[name] = net
+
+    def score(
+        self, prediction: Tensor, target: Target, predicted_depth: Tensor | None = None
+    ) -> dict[str, float]:
+        """The metrics of one image that it allows, in the order of ``METRICS``.
+
+        Args:
+            prediction: (H, W, 3) in [0, 1].
+            target: what it should be.
+            predicted_depth: ray depth (H, W), world units; scored where the target has a depth.
+
+        Raises:
+            ValueError: naming the frame, where a shape differs or a colour is not finite.
+        """
+        try:
+            values = {
+                "psnr": image.psnr(prediction, target.rgb),
+                "ssim": image.ssim(prediction, target.rgb),
+                "ms_ssim": image.ms_ssim(prediction, target.rgb),
+                "ms_ssim_legacy": image.ms_ssim_legacy(prediction, target.rgb),
+            }
+            values |= {name: net(prediction, target.rgb) for name, net in self.lpips.items()}
+            if predicted_depth is not None and target.depth is not None:
+                values |= _depth_scores(predicted_depth, target)
+        except ValueError as error:
+            raise ValueError(f"frame {target.frame.name}: {error}") from error
+        for name, value in values.items():
+            if value is None:
+                self._leave_out(name, _reason(name, target))
+        return {name: values[name] for name in METRICS if values.get(name) is not None}
+
+    def _leave_out(self, name: str, reason: str) -> None:
+        if name not in self.absent:
+            self.absent[name] = reason
+            log.warning("%s is left out: %s", name, reason)
+
+
+def summarise(rows: Iterable[tuple[str, Mapping[str, float]]]) -> dict[str, dict[str, float]]:
+    """Means over images, per ability.
+
+    Args:
+        rows: per image its ability (``space``, ``time``, ``canonical`` or ``all``) and its scores.
+
+    Returns:
+        ``{ability: {metric: mean}}`` for the abilities that occur, in fixed order. A metric that some images
+        lack is averaged over those that have it. Abilities are never averaged together.
+
+    Raises:
+        ValueError: an unknown ability or metric, or a score that is not finite.
+
+    >>> summarise([("time", {"psnr": 30.0}), ("space", {"psnr": 20.0}), ("time", {"psnr": 20.0})])
+    {'space': {'psnr': 20.0}, 'time': {'psnr': 25.0}}
+    """
+    collected: dict[str, dict[str, list[float]]] = {ability: {} for ability in ABILITIES}
+    for ability, scores in rows:
+        if ability not in ABILITIES:
+            raise ValueError(f"ability: expected one of {', '.join(ABILITIES)}, but got {ability!r}")
+        for name, value in scores.items():
+            if name not in METRICS:
+                raise ValueError(f"metric: expected one of {', '.join(METRICS)}, but got {name!r}")
+            if not math.isfinite(value):
+                raise ValueError(f"{name}: expected a finite score, but got {value}")
+            collected[ability].setdefault(name, []).append(float(value))
+    return {
+        ability: {name: math.fsum(found[name]) / len(found[name]) for name in METRICS if name in found}
+        for ability, found in collected.items()
+        if found
+    }
+
+
+def _depth_scores(predicted: Tensor, target: Target) -> dict[str, float | None]:
+    fractions = depth.depth_delta(predicted, target.depth, target.foreground)
+    return dict(zip(DEPTH_METRICS, fractions or [None] * len(DEPTH_METRICS)))
+
+
+def _reason(name: str, target: Target) -> str:
+    """Why an image has no score of this name."""
+    if name in DEPTH_METRICS:
+        return f"frame {target.frame.name} has no foreground"
+    if name in LPIPS_METRICS:
+        least = lpips.LPIPS_LEAST_SIDE
+    else:
+        least = image.SSIM_LEAST_SIDE if name == "ssim" else image.MS_SSIM_LEAST_SIDE
+    height, width = target.rgb.shape[:2]
+    return f"frame {target.frame.name} is {width}x{height} pixels, a side must have {least}"

@@ -1,0 +1,148 @@
+"""Sparse lattices: trilinear reads, neighbourhoods, occupied cells.
+
+A sparse lattice is ``values`` (M, C) and ``index`` (X, Y, Z) int32 that holds a voxel's row, or -1 where the
+voxel is absent. A dense grid is the case in which no entry is -1. Points are in lattice coordinates.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from forewarp.ops.backend import use_numba
+from forewarp.ops.checks import check_shape
+
+_CORNERS = [(a, b, c) for a in (0, 1) for b in (0, 1) for c in (0, 1)]
+
+
+def corner_weights(points: Tensor, shape: tuple[int, int, int]) -> tuple[Tensor, Tensor]:
+    """The 8 corners around each point and their trilinear weights; points outside are clamped to the border.
+
+    Args:
+        points: (P, 3) lattice coordinates.
+        shape: (X, Y, Z), at least 2 each.
+
+    Returns:
+        corners (P, 8, 3) int64 and weights (P, 8), differentiable in ``points``.
+    """
+    last = torch.tensor(shape, device=points.device) - 2
+    base = torch.minimum(points.detach().floor().long().clamp(min=0), last)
+    fraction = (points - base).clamp(0, 1)
+    offsets = torch.tensor(_CORNERS, device=points.device)
+    weights = torch.where(offsets.bool(), fraction[:, None], 1 - fraction[:, None]).prod(-1)
+    return base[:, None] + offsets, weights
+
+
+def trilinear(values: Tensor, index: Tensor, points: Tensor, fill: Tensor) -> Tensor:
+    """Trilinear read: ``sum_corners w(corner) values[index[corner]]``, ``fill`` where a voxel is absent.
+
+    Args:
+        values: (M, C).
+        index: (X, Y, Z) int32, rows of ``values`` or -1.
+        points: (P, 3) lattice coordinates; outside they are clamped to the border.
+        fill: (C,), what an absent voxel reads.
+
+    Returns:
+        (P, C). Differentiable in ``values`` and ``points``, not in ``fill``.
+
+    Cost: 8 reads of C channels a point; the gradient of ``values`` is an (M, C) scatter.
+
+    >>> v, i = torch.tensor([[1.0], [3.0]]), torch.arange(2, dtype=torch.int32).reshape(2, 1, 1)
+    >>> trilinear(v, i.expand(2, 2, 2).contiguous(), torch.tensor([[0.5, 0.2, 0.9]]), torch.zeros(1))
+    tensor([[2.]])
+    """
+    check_shape("values", values, ("M", "C"))
+    check_shape("index", index, ("X", "Y", "Z"))
+    check_shape("points", points, ("P", 3))
+    check_shape("fill", fill, (values.shape[1],))
+    if min(index.shape) < 2:
+        raise ValueError(f"trilinear: expected at least 2 voxels an axis, but got {tuple(index.shape)}")
+    if use_numba(values):
+        return _NumbaTrilinear.apply(values, index, points, fill)
+    return trilinear_reference(values, index, points, fill)
+
+
+def trilinear_reference(values: Tensor, index: Tensor, points: Tensor, fill: Tensor) -> Tensor:
+    """``trilinear`` in plain PyTorch: runs on any device."""
+    corners, weights = corner_weights(points, tuple(index.shape))
+    rows = index[corners[..., 0], corners[..., 1], corners[..., 2]].long()  # (P, 8)
+    padded = torch.cat([values, fill[None].to(values)])
+    rows = torch.where(rows < 0, len(values), rows)
+    out = values.new_zeros(len(points), values.shape[1])
+    for corner in range(8):
+        out = out + weights[:, corner, None] * padded.index_select(0, rows[:, corner])
+    return out
+
+
+class _NumbaTrilinear(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, values, index, points, fill):
+        from forewarp.ops import kernels
+
+        kernels.match_threads()
+        ctx.save_for_backward(values, index, points, fill)
+        out = values.new_empty(len(points), values.shape[1])
+        kernels.gather(*(_array(v) for v in (values, index, points, fill, out)))
+        return out
+
+    @staticmethod
+    def backward(ctx, grad):
+        from forewarp.ops import kernels
+
+        values, index, points, fill = ctx.saved_tensors
+        chunks = min(4, kernels.match_threads())
+        grad = grad.contiguous()
+        grad_values = grad_points = None
+        if ctx.needs_input_grad[0]:
+            parts = values.new_zeros(chunks, *values.shape)
+            kernels.gather_backward_values(*(_array(v) for v in (index, points, grad, parts)))
+            grad_values = parts.sum(0) if chunks > 1 else parts[0]
+        if ctx.needs_input_grad[2]:
+            grad_points = points.new_empty(points.shape)
+            kernels.gather_backward_points(*(_array(v) for v in (values, index, points, fill, grad, grad_points)))
+        return grad_values, None, grad_points, None
+
+
+def _array(tensor: Tensor):
+    return tensor.detach().contiguous().numpy()
+
+
+def index_of(voxels: Tensor, shape: tuple[int, int, int]) -> Tensor:
+    """The index (X, Y, Z) int32 of a list of distinct voxels (N, 3): their row, -1 elsewhere."""
+    check_shape("voxels", voxels, ("N", 3))
+    index = torch.full(shape, -1, dtype=torch.int32, device=voxels.device)
+    x, y, z = voxels.long().unbind(-1)
+    index[x, y, z] = torch.arange(len(voxels), dtype=torch.int32, device=voxels.device)
+    return index
+
+
+def dilate(mask: Tensor, by: int = 1) -> Tensor:
+    """A mask (X, Y, Z) grown by ``by`` voxels in every direction, diagonals included."""
+    grown = mask.clone()
+    for _ in range(by):
+        for axis in range(3):
+            before = grown.clone()
+            n = mask.shape[axis]
+            grown.narrow(axis, 1, n - 1).logical_or_(before.narrow(axis, 0, n - 1))
+            grown.narrow(axis, 0, n - 1).logical_or_(before.narrow(axis, 1, n - 1))
+    return grown
+
+
+def occupied_cells(index: Tensor) -> Tensor:
+    """Cells (X-1, Y-1, Z-1) bool of which at least one corner is present."""
+    cells = index >= 0
+    for axis in range(3):
+        n = cells.shape[axis] - 1
+        cells = cells.narrow(axis, 0, n) | cells.narrow(axis, 1, n)
+    return cells
+
+
+def neighbour_pairs(index: Tensor) -> list[tuple[Tensor, Tensor]]:
+    """Rows of neighbouring present voxels, a pair of (E,) int64 lists per axis; empty on one-voxel axes."""
+    pairs = []
+    for axis in range(3):
+        n = index.shape[axis] - 1
+        first, second = index.narrow(axis, 0, n).reshape(-1), index.narrow(axis, 1, n).reshape(-1)
+        both = ((first >= 0) & (second >= 0)).nonzero()[:, 0]
+        pairs.append((first[both].long(), second[both].long()))
+    return pairs

@@ -1,0 +1,116 @@
+"""Forward warping: the average splat with a trilinear kernel."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from forewarp.ops.backend import use_numba
+from forewarp.ops.checks import check_shape
+from forewarp.ops.grid import _CORNERS, _array
+
+
+class Splat(NamedTuple):
+    """A sparse target: ``values`` (M, C) averaged, ``coverage`` (M,), ``index`` (X, Y, Z) int32, and
+    ``dropped``, how many of the source voxels left the box or had no finite position.
+    """
+
+    values: Tensor
+    coverage: Tensor
+    index: Tensor
+    dropped: int
+
+
+def average_splat(source: Tensor, positions: Tensor, shape: tuple[int, int, int], tau: float = 1e-2) -> Splat:
+    """Average splatting (the paper's three warping equations), sums divided by ``max(coverage, tau)``.
+
+    ``target[p] = sum_q b(u) source[q] / sum_q b(u)``, ``b(u) = prod max(0, 1 - |u_i|)``,
+    ``u = positions[q] - p``. Cells that nothing reaches are absent from the sparse result.
+
+    Args:
+        source: (N, C) values to carry.
+        positions: (N, 3) where they land, lattice coordinates.
+        shape: (X, Y, Z) of the target.
+        tau: least divisor. It bounds the gradient with respect to positions by about 1/tau.
+
+    Returns:
+        A ``Splat``. Values and coverage are differentiable in ``source`` and ``positions``. A voxel with a
+        non-finite position contributes nothing; one outside the box contributes what its kernel reaches.
+
+    Cost: 8 cells of C + 1 channels a source voxel; memory M (C + 1) for M touched cells.
+    """
+    check_shape("source", source, ("N", "C"))
+    check_shape("positions", positions, (len(source), 3))
+    last = torch.tensor(shape, device=positions.device) - 1
+    detached = positions.detach()
+    reaches = ((detached > -1) & (detached < last + 1)).all(-1)  # False for NaN
+    usable = torch.where(reaches[:, None], positions, torch.full_like(positions, float("nan")))
+    scatter = _numba_scatter if use_numba(source) else scatter_reference
+    sums, index = scatter(source, usable, tuple(shape))
+    coverage = sums[:, -1]
+    values = sums[:, :-1] / coverage.clamp(min=tau)[:, None]
+    inside = ((detached >= 0) & (detached <= last)).all(-1)
+    return Splat(values, coverage, index, int(len(source) - int(inside.sum())))
+
+
+def scatter_reference(source: Tensor, positions: Tensor, shape: tuple[int, int, int]) -> tuple[Tensor, Tensor]:
+    """Sums (M, C + 1), coverage last, and the index of the touched cells, in plain PyTorch on any device.
+
+    ``positions`` are NaN where a voxel contributes nothing.
+    """
+    keep = (~positions.detach().isnan().any(-1)).nonzero()[:, 0]
+    source, positions = source[keep], positions[keep]
+    base = positions.detach().floor().long()
+    fraction = positions - base
+    offsets = torch.tensor(_CORNERS, device=source.device)
+    weights = torch.where(offsets.bool(), fraction[:, None], 1 - fraction[:, None]).prod(-1)  # (N, 8)
+    cells = base[:, None] + offsets
+    x, y, z = shape
+    inside = ((cells >= 0) & (cells < torch.tensor(shape, device=cells.device))).all(-1)
+    flat = (cells[..., 0] * y + cells[..., 1]) * z + cells[..., 2]
+    flat = torch.where(inside, flat, x * y * z)
+    touched = torch.zeros(x * y * z + 1, dtype=torch.bool, device=source.device)
+    touched[flat.reshape(-1)] = True
+    rows = touched[:-1].cumsum(0, dtype=torch.int32) - 1
+    index = torch.where(touched[:-1], rows, -1)
+    row_of = torch.cat([index, index.new_tensor([-1])])[flat].long()  # (N, 8)
+    payload = torch.cat([source, torch.ones_like(source[:, :1])], -1)
+    sums = source.new_zeros(int(touched[:-1].sum()) + 1, payload.shape[1])
+    row_of = torch.where(row_of < 0, len(sums) - 1, row_of)
+    for corner in range(8):
+        sums = sums.index_add(0, row_of[:, corner], weights[:, corner, None] * payload)
+    return sums[:-1], index.reshape(shape).int()
+
+
+def _numba_scatter(source: Tensor, positions: Tensor, shape: tuple[int, int, int]) -> tuple[Tensor, Tensor]:
+    from forewarp.ops import kernels
+
+    index = torch.full(shape, -1, dtype=torch.int32)
+    rows = kernels.number_touched(_array(positions), index.numpy())
+    return _NumbaScatter.apply(source, positions, index, rows), index
+
+
+class _NumbaScatter(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, source, positions, index, rows):
+        from forewarp.ops import kernels
+
+        chunks = min(4, kernels.match_threads())
+        ctx.save_for_backward(source, positions, index)
+        sums = source.new_zeros(chunks, rows, source.shape[1] + 1)
+        kernels.scatter(*(_array(v) for v in (source, positions, index, sums)))
+        return sums.sum(0) if chunks > 1 else sums[0]
+
+    @staticmethod
+    def backward(ctx, grad):
+        from forewarp.ops import kernels
+
+        kernels.match_threads()
+        source, positions, index = ctx.saved_tensors
+        grad_source, grad_positions = source.new_zeros(source.shape), positions.new_zeros(positions.shape)
+        kernels.scatter_backward(
+            *(_array(v) for v in (source, positions, index, grad, grad_source, grad_positions))
+        )
+        return grad_source, grad_positions, None, None

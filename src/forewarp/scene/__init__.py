@@ -1,0 +1,1 @@
+"""The nouns: boxes, cameras, rays, frames, batches and what a method answers."""

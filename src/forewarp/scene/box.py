@@ -1,0 +1,127 @@
+"""An axis-aligned box in world units, and the regular lattice of voxel centres inside one."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Box:
+    """An axis-aligned box: ``low`` and ``high`` are tuples of three floats in world units.
+
+    Raises:
+        ValueError: where a side has no extent or a corner is not finite.
+
+    >>> Box((-1, -1, -1), (1, 2, 1)).size
+    (2.0, 3.0, 2.0)
+    """
+
+    low: tuple[float, float, float]
+    high: tuple[float, float, float]
+
+    def __post_init__(self) -> None:
+        low, high = (tuple(float(v) for v in corner) for corner in (self.low, self.high))
+        object.__setattr__(self, "low", low)
+        object.__setattr__(self, "high", high)
+        good = len(low) == 3 and len(high) == 3 and all(math.isfinite(v) for v in low + high)
+        if not good or any(h <= l for l, h in zip(low, high)):
+            raise ValueError(f"a box: expected finite low < high on three axes, but got low={low}, high={high}")
+
+    @property
+    def size(self) -> tuple[float, float, float]:
+        """Extent per axis, world units."""
+        return tuple(h - l for l, h in zip(self.low, self.high))
+
+    @property
+    def center(self) -> tuple[float, float, float]:
+        """Midpoint, world units."""
+        return tuple(0.5 * (h + l) for l, h in zip(self.low, self.high))
+
+    @property
+    def diagonal(self) -> float:
+        """Length of the diagonal: the scene's unit of length."""
+        return math.sqrt(sum(s * s for s in self.size))
+
+    def scaled(self, factor: float) -> Box:
+        """The box grown about its centre."""
+        half = [0.5 * factor * s for s in self.size]
+        return Box(
+            tuple(c - h for c, h in zip(self.center, half)), tuple(c + h for c, h in zip(self.center, half))
+        )
+
+    def padded(self, by: float) -> Box:
+        """The box with ``by`` world units added on every side."""
+        return Box(tuple(v - by for v in self.low), tuple(v + by for v in self.high))
+
+    def intersection(self, other: Box) -> Box:
+        """The common part of two boxes."""
+        return Box(
+            tuple(max(a, b) for a, b in zip(self.low, other.low)),
+            tuple(min(a, b) for a, b in zip(self.high, other.high)),
+        )
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """``shape`` points spread evenly over ``box``, the outermost on its faces (align-corners).
+
+    A point's *lattice coordinate* runs from 0 to ``n - 1`` per axis; every operator in ``ops`` speaks it.
+    """
+
+    box: Box
+    shape: tuple[int, int, int]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "shape", tuple(int(n) for n in self.shape))
+        if len(self.shape) != 3 or min(self.shape) < 2:
+            raise ValueError(f"a lattice: expected three axes of at least 2 points, but got shape={self.shape}")
+
+    @classmethod
+    def of_count(cls, box: Box, count: float, least: int = 4) -> Lattice:
+        """The lattice of about ``count`` cubic voxels over a box.
+
+        >>> Lattice.of_count(Box((0, 0, 0), (1, 2, 1)), 2000).shape
+        (10, 20, 10)
+        """
+        side = (math.prod(box.size) / float(count)) ** (1 / 3)
+        return cls(box, tuple(max(least, int(round(s / side))) for s in box.size))
+
+    @property
+    def count(self) -> int:
+        """Number of points."""
+        return math.prod(self.shape)
+
+    @property
+    def spacing(self) -> tuple[float, float, float]:
+        """Distance between neighbours per axis, world units."""
+        return tuple(s / (n - 1) for s, n in zip(self.box.size, self.shape))
+
+    @property
+    def pitch(self) -> float:
+        """One number for the spacing: its geometric mean, world units."""
+        return math.prod(self.spacing) ** (1 / 3)
+
+    def to_lattice(self, points: Tensor) -> Tensor:
+        """World (..., 3) -> lattice coordinates (..., 3)."""
+        low = points.new_tensor(self.box.low)
+        return (points - low) / points.new_tensor(self.spacing)
+
+    def to_world(self, coordinates: Tensor) -> Tensor:
+        """Lattice coordinates (..., 3) -> world (..., 3)."""
+        dtype = coordinates.dtype if coordinates.is_floating_point() else torch.get_default_dtype()
+        c = coordinates.to(dtype)
+        return c * c.new_tensor(self.spacing) + c.new_tensor(self.box.low)
+
+    def normalised(self, coordinates: Tensor) -> Tensor:
+        """Lattice coordinates (..., 3) -> [-1, 1] per axis, for positional encoding."""
+        last = torch.tensor([n - 1 for n in self.shape], device=coordinates.device)
+        return coordinates * (2.0 / last) - 1.0
+
+    def all_voxels(self, device: torch.device | str = "cpu") -> Tensor:
+        """Every voxel's integer coordinate (X*Y*Z, 3), last axis fastest."""
+        axes = [torch.arange(n, device=device) for n in self.shape]
+        return torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)

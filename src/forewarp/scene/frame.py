@@ -1,0 +1,64 @@
+"""A frame and the scene it belongs to."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from torch import Tensor
+
+from forewarp.scene.box import Box
+from forewarp.scene.camera import Camera
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One image with its camera and time.
+
+    ``load()`` gives the image as a uint8 tensor (H, W, 4), straight (not premultiplied) alpha, at the
+    camera's size; without an alpha channel on disk it is 255 everywhere. ``load_depth()``, where not None,
+    gives exact ray depth (H, W) float32 in world units, 0 on the background. ``ability`` is what a test
+    frame measures: ``space``, ``time``, ``canonical``, or ``all`` where a dataset does not say.
+    """
+
+    name: str
+    time: float
+    camera: Camera
+    load: Callable[[], Tensor]
+    load_depth: Callable[[], Tensor] | None = None
+    ability: str = "all"
+
+
+@dataclass(frozen=True)
+class Truth:
+    """Exact trajectories of surface points: ``points`` (N, T, 3) float32 at ``times`` (T,), world units.
+
+    The first column is the canonical time.
+    """
+
+    points: Tensor
+    times: Tensor
+
+
+@dataclass(frozen=True)
+class Scene:
+    """All frames of one subject, read once.
+
+    ``box`` bounds everything that may be seen; ``canonical_time`` in [0, 1]; ``has_alpha`` says that the
+    images tell foreground from background; ``protocol`` names how the numbers are to be measured.
+    """
+
+    name: str
+    train: tuple[Frame, ...]
+    val: tuple[Frame, ...]
+    test: tuple[Frame, ...]
+    box: Box
+    canonical_time: float
+    has_alpha: bool
+    truth: Truth | None = None
+    protocol: dict = field(default_factory=dict)
+
+    @property
+    def times(self) -> tuple[float, ...]:
+        """The distinct training times, ascending."""
+        return tuple(sorted({f.time for f in self.train}))

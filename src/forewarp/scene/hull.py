@@ -1,0 +1,32 @@
+"""The visual hull: which points all silhouettes allow."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from forewarp.scene.camera import Camera
+
+
+def visual_hull(points: Tensor, cameras: list[Camera], masks: list[Tensor], misses: int = 0) -> Tensor:
+    """Points that project onto the silhouette in all views but ``misses`` of those that see them.
+
+    Args:
+        points: (N, 3) world units.
+        cameras: V of them.
+        masks: V masks (H, W) bool, True on the foreground (grow them first where the scene moves).
+        misses: views that may disagree.
+
+    Returns:
+        (N,) bool. A point that no view sees is outside.
+    """
+    against = torch.zeros(len(points), dtype=torch.int32)
+    seen = torch.zeros(len(points), dtype=torch.int32)
+    for camera, mask in zip(cameras, masks, strict=True):
+        pixel, z = camera.project(points)
+        column, row = pixel.floor().long().unbind(-1)
+        visible = (z > 0) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
+        on = mask[row.clamp(0, camera.height - 1), column.clamp(0, camera.width - 1)]
+        against += (visible & ~on).int()
+        seen += visible.int()
+    return (seen > 0) & (against <= misses)

@@ -1,0 +1,89 @@
+"""Poses that no image was taken from: random views for regularisation, paths for videos."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from forewarp.scene.camera import Camera, look_at
+from forewarp.scene.rays import Rays
+
+
+def focus_point(cameras: list[Camera]) -> Tensor:
+    """The point nearest to all optical axes, least squares (3,), float64.
+
+    Parallel axes leave it undetermined along them; the smallest solution about the mean centre is taken.
+    """
+    centers = torch.stack([c.center.double() for c in cameras])
+    axes = torch.stack([c.camera_to_world[:3, 2].double() for c in cameras])
+    across = torch.eye(3, dtype=torch.float64) - axes[:, :, None] * axes[:, None, :]
+    middle = centers.mean(0)
+    offset = (across @ (centers - middle)[..., None]).sum(0)
+    return middle + (torch.linalg.pinv(across.sum(0), rtol=1e-8) @ offset)[:, 0]
+
+
+def mean_up(cameras: list[Camera]) -> Tensor:
+    """The mean upward direction of the pictures (3,), float64, unit length; z where they cancel."""
+    up = -torch.stack([c.camera_to_world[:3, 1].double() for c in cameras]).mean(0)
+    return up / up.norm() if up.norm() > 0.1 else torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+
+
+class RandomPatches:
+    """Rays of small patches seen from random poses on the training cameras' sphere (RegNeRF).
+
+    A pose lies between two random training cameras, at their distance from the focus point, and looks at it.
+
+    Args:
+        cameras: the training cameras.
+        patches: patches a draw.
+        size: pixels a side.
+    """
+
+    def __init__(self, cameras: list[Camera], *, patches: int = 16, size: int = 8) -> None:
+        self.cameras, self.patches, self.size = cameras, patches, size
+        self.focus, self.up = focus_point(cameras), mean_up(cameras)
+
+    def draw(self, generator: torch.Generator) -> Rays:
+        """Rays (patches * size * size), patch by patch, all from one pose."""
+        i, j = torch.randint(len(self.cameras), (2,), generator=generator).tolist()
+        share = torch.rand((), generator=generator, dtype=torch.float64)
+        a, b = (self.cameras[k].center.double() - self.focus for k in (i, j))
+        mixed = torch.nn.functional.normalize(a * share + b * (1 - share), dim=0)
+        radius = a.norm() * share + b.norm() * (1 - share)
+        pose = look_at(self.focus + mixed * radius, self.focus, self.up)
+        camera = self.cameras[i]
+        camera = Camera(
+            camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, pose, camera.near, camera.far
+        )
+        span = torch.tensor([max(1, camera.height - self.size), max(1, camera.width - self.size)])
+        corner = (torch.rand(self.patches, 2, generator=generator) * span).long()
+        inner = torch.stack(torch.meshgrid(torch.arange(self.size), torch.arange(self.size), indexing="ij"), -1)
+        at = corner[:, None, None] + inner
+        return camera.rays((at[..., 0] * camera.width + at[..., 1]).reshape(-1))
+
+
+def orbit(camera: Camera, focus: Tensor, up: Tensor, turns: Tensor) -> list[Camera]:
+    """Cameras that circle ``focus`` about ``up`` at ``camera``'s height and distance.
+
+    Args:
+        camera: gives the start and the lens.
+        focus, up: (3,).
+        turns: (N,) fractions of a full turn from the start.
+    """
+    offset = camera.center.double() - focus
+    height = (offset @ up) * up
+    a = offset - height
+    b = torch.linalg.cross(up, a)
+    views = []
+    for turn in turns.tolist():
+        angle = 2 * math.pi * turn
+        center = focus + height + math.cos(angle) * a + math.sin(angle) * b
+        pose = look_at(center, focus, up)
+        views.append(
+            Camera(
+                camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, pose, camera.near, camera.far
+            )
+        )
+    return views

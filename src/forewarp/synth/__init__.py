@@ -1,0 +1,1 @@
+"""Procedural moving scenes with exact images, depth and trajectories."""

@@ -1,0 +1,56 @@
+"""Exact trajectories of points that stay on the surface."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from forewarp.scene.frame import Truth
+from forewarp.synth.raycast import LIFT_OFF, Posed
+from forewarp.synth.vehicle import World
+
+# Candidates per point wanted: about half of the surface lies inside or below, and is never seen.
+_SPARE = 4
+
+
+def surface_points(
+    world: World, count: int, centers: np.ndarray, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points spread evenly by area over what can be seen at the canonical time 0.
+
+    Args:
+        world: whose surface.
+        count: how many; fewer come back only where hardly anything can be seen.
+        centers: camera centres (C, 3); a point counts as seen where at least one of them sees it.
+        rng: the same state gives the same points.
+
+    Returns:
+        faces (N,) and barycentric coordinates (N, 3), which ``World.points`` places at any time.
+    """
+    posed = Posed(world, 0.0)
+    drawn = _SPARE * count
+    cumulative = np.cumsum(posed.area)
+    face = np.searchsorted(cumulative, rng.random(drawn) * cumulative[-1], side="right")
+    # The square root makes the density even over the triangle.
+    a, b = np.sqrt(rng.random(drawn)), rng.random(drawn)
+    barycentric = np.stack([1 - a, a * (1 - b), a * b], -1)
+    seen = np.flatnonzero(_is_seen(posed, face, barycentric, centers))[:count]
+    return face[seen], barycentric[seen]
+
+
+def trajectories(world: World, faces: np.ndarray, barycentric: np.ndarray, times: np.ndarray) -> Truth:
+    """Where surface points (N) are at ``times`` (T,), the canonical time first; float32 world units."""
+    points = np.stack([world.points(faces, barycentric, t) for t in times], 1)
+    return Truth(torch.from_numpy(points.astype(np.float32)), torch.from_numpy(np.asarray(times, np.float64)))
+
+
+def _is_seen(posed: Posed, face: np.ndarray, barycentric: np.ndarray, centers: np.ndarray) -> np.ndarray:
+    point = np.einsum("nc,ncd->nd", barycentric, posed.corners[face])
+    normal = posed.normal[face]
+    seen = np.zeros(len(face), dtype=bool)
+    for center in centers:
+        towards = center - point
+        towards /= np.linalg.norm(towards, axis=-1, keepdims=True)
+        rows = np.flatnonzero(~seen & (np.einsum("nd,nd->n", normal, towards) > 0))
+        seen[rows] = posed.is_free(point[rows] + LIFT_OFF * normal[rows], towards[rows])
+    return seen

@@ -1,0 +1,72 @@
+"""Which frames a step may see: the nearest to the canonical time first, then one more and one more."""
+
+from __future__ import annotations
+
+import torch
+
+
+class Curriculum:
+    """Progressive frames. Call it for the index of the next training frame.
+
+    The number of frames in play grows evenly with the fraction of the stage that is done, so a run bounded by
+    time has seen them all as well. A share of the draws goes to the newest, whose motion is still unknown.
+
+    Args:
+        times: of every training frame.
+        canonical_time: where training starts.
+        start: frames in play at the beginning.
+        all_in: fraction of the stage at which all are in play; 0: from the start.
+        newest_share: share of the draws that goes to the newest part.
+        newest_part: that part, as a share of the frames in play.
+        seed: of the draws.
+    """
+
+    def __init__(
+        self,
+        times: list[float],
+        canonical_time: float,
+        *,
+        start: int = 10,
+        all_in: float = 0.6,
+        newest_share: float = 0.3,
+        newest_part: float = 0.125,
+        seed: int = 0,
+    ) -> None:
+        if not (start >= 1 and 0 <= all_in <= 1 and 0 <= newest_share <= 1 and 0 < newest_part <= 1):
+            raise ValueError(
+                "stage.curriculum: expected start >= 1, all_in and newest_share in [0, 1] and newest_part in (0, 1], "
+                f"but got {start=}, {all_in=}, {newest_share=}, {newest_part=}"
+            )
+        self.order = sorted(range(len(times)), key=lambda i: (abs(times[i] - canonical_time), i))
+        self.start, self.all_in = min(start, len(times)), all_in
+        self.newest_share, self.newest_part = newest_share, newest_part
+        self.fraction = 0.0
+        self.generator = torch.Generator().manual_seed(seed)
+
+    @property
+    def in_play(self) -> int:
+        """How many frames may be drawn now."""
+        done = 1.0 if self.all_in == 0 else min(1.0, self.fraction / self.all_in)
+        return self.start + int((len(self.order) - self.start) * done)
+
+    def frames(self) -> list[int]:
+        """The frames in play, nearest to the canonical time first."""
+        return self.order[: self.in_play]
+
+    def __call__(self) -> int:
+        """The next training frame."""
+        playing = self.in_play
+        newest = max(1, int(playing * self.newest_part))
+        growing = playing < len(self.order)
+        favour = growing and float(torch.rand((), generator=self.generator)) < self.newest_share
+        low = playing - newest if favour else 0
+        return self.order[int(torch.randint(low, playing, (), generator=self.generator))]
+
+    def state_dict(self) -> dict:
+        """The draws' generator and the fraction done."""
+        return {"generator": self.generator.get_state(), "fraction": self.fraction}
+
+    def load_state_dict(self, state: dict) -> None:
+        """Continue where ``state_dict`` was taken."""
+        self.generator.set_state(state["generator"])
+        self.fraction = state["fraction"]

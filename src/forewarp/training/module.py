@@ -1,0 +1,205 @@
+"""The LightningModule: fields, warper, inpainter and renderer, and the step that trains them."""
+
+from __future__ import annotations
+
+import lightning
+import torch
+from torch import Tensor
+
+from forewarp.methods.spec import parameter_kinds
+from forewarp.renderer import Renderer
+from forewarp.scene.batch import Batch, Target
+from forewarp.scene.camera import Camera
+from forewarp.scene.paths import RandomPatches
+from forewarp.scene.rays import Rays
+from forewarp.scene.state import Rendering, State
+from forewarp.training.clock import Clock
+from forewarp.training.curriculum import Curriculum
+from forewarp.training.objective import Objective, Step
+from forewarp.training.settings import StageSettings
+from forewarp.training.structure import refresh, resample
+
+
+class DynamicSceneModule(lightning.LightningModule):
+    """One stage of one scene.
+
+    Args:
+        method: what is learned; answers the radiance at a time.
+        renderer: makes pictures of it.
+        objective: the weighted terms.
+        settings: the stage's numbers.
+        curriculum: which frames are in play.
+        cameras: of the training frames, for random views.
+        seed: of the samples' jitter and the random views.
+    """
+
+    def __init__(
+        self,
+        method: torch.nn.Module,
+        *,
+        renderer: Renderer,
+        objective: Objective,
+        settings: StageSettings,
+        curriculum: Curriculum,
+        cameras: list[Camera],
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        self.method = method
+        self.renderer, self.objective, self.settings = renderer, objective, settings
+        self.curriculum = curriculum
+        self.patches = RandomPatches(cameras, patches=settings.patches) if cameras else None
+        self.generator = torch.Generator().manual_seed(seed)
+        self.clock = Clock()
+        self.lattice_voxels = settings.at("voxels", 0.0)
+        self.last: dict[str, float] = {}
+
+    @property
+    def fraction(self) -> float:
+        """How much of the stage is done."""
+        return self.settings.fraction(self.global_step, self.clock.seconds)
+
+    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
+        """The loss of one batch of rays of one time."""
+        state = self.method.at(batch.time)
+        renderings = {
+            name: self.renderer(
+                field,
+                batch.rays,
+                batch.background,
+                self.method.view,
+                self.generator,
+                keep_all_weights=self.objective.needs_all_weights,
+            )
+            for name, field in state.fields.items()
+        }
+        step = Step(batch, state, renderings, lambda: self._patches(state))
+        loss, raw = self.objective(step, self.global_step)
+        self._remember(loss, raw, step)
+        return loss
+
+    def validation_step(self, target: Target, batch_idx: int) -> Tensor:
+        """PSNR of one whole image; logged as ``val/psnr``, the mean over images."""
+        drawn = self.render_image(target.frame.camera, target.frame.time, target.background)
+        error = (drawn.rgb.clamp(0, 1).reshape(target.rgb.shape) - target.rgb).square().mean()
+        psnr = -10 * torch.log10(error.clamp(min=1e-10))
+        self.log("val/psnr", psnr, batch_size=1, prog_bar=True)
+        return psnr
+
+    def _patches(self, state: State) -> tuple[Tensor, Tensor]:
+        rays = self.patches.draw(self.generator).to(self.device)
+        field = list(state.fields.values())[-1]
+        shape = (self.patches.patches, self.patches.size, self.patches.size)
+        black = torch.zeros(3, device=self.device)
+        drawn = self.renderer(field, rays, black, self.method.view, self.generator)
+        return drawn.depth.reshape(shape) / (rays.far - rays.near), drawn.opacity.reshape(shape)
+
+    def _remember(self, loss: Tensor, raw: dict[str, Tensor], step: Step) -> None:
+        best = list(step.renderings.values())[-1]
+        error = float((best.rgb.detach() - step.batch.rgb).square().mean())
+        self.last = {
+            "loss": float(loss.detach()),
+            "psnr": -10 * torch.log10(torch.tensor(max(error, 1e-10))).item(),
+            "frames_in_play": self.curriculum.in_play,
+            "occupied_voxels": len(step.state.canonical.values),
+            "samples": best.samples,
+            "dropped_voxels": step.state.dropped,
+        } | {f"loss/{name}": float(value) for name, value in raw.items()}
+        if step.state.coverage is not None:
+            self.last["coverage"] = float(step.state.coverage.detach().clamp(max=1).mean())
+
+    def on_fit_start(self) -> None:
+        """Let the data follow the curriculum."""
+        self.trainer.datamodule.picker = self.curriculum
+
+    def on_train_start(self) -> None:
+        """Start the training clock."""
+        self.clock.start()
+
+    def on_train_end(self) -> None:
+        """Stop it."""
+        self.clock.stop()
+
+    def on_train_batch_start(self, batch: Batch, batch_idx: int) -> int | None:
+        """Set what depends on the fraction done: rates, bases, the lattice, the active voxels."""
+        fraction = self.fraction
+        if fraction >= 1:
+            self.trainer.should_stop = True
+            return -1
+        self._follow(fraction)
+        return None
+
+    def _follow(self, fraction: float) -> None:
+        settings, step = self.settings, self.global_step
+        self.curriculum.fraction = fraction
+        optimizer = self.optimizers().optimizer
+        factor = settings.rate_factor(fraction)
+        for group in optimizer.param_groups:
+            group["lr"] = group["base_rate"] * factor
+        motion = getattr(self.method, "motion", None)
+        bases = settings.at("bases", fraction)
+        if motion is not None and bases is not None:
+            motion.trajectory.bases_in_play.fill_(min(int(bases), motion.trajectory.bases))
+        voxels = settings.at("voxels", fraction)
+        if voxels != self.lattice_voxels:
+            radiance = self.method.radiance
+            resample(radiance, radiance.lattice.box, voxels, keep_alpha=settings.keep_alpha, optimizer=optimizer)
+            self.lattice_voxels = voxels
+        elif settings.refresh_every and step and step % settings.refresh_every == 0 and fraction >= settings.refresh_from:
+            refresh(
+                self.method.radiance, optimizer, keep_alpha=settings.keep_alpha, birth_alpha=settings.birth_alpha
+            )
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        """Adam with the ancestors' betas; a rate of its own for every kind of parameter."""
+        groups = []
+        for kind, parameters in parameter_kinds(self.method).items():
+            if kind not in self.settings.rates:
+                raise ValueError(
+                    f"stage.{self.settings.name}.rates: expected a rate for '{kind}', but got {sorted(self.settings.rates)}"
+                )
+            rate = float(self.settings.rates[kind])
+            groups.append({"params": parameters, "lr": rate, "base_rate": rate, "name": kind})
+        return torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-8, fused=True)
+
+    def configure_gradient_clipping(self, optimizer, gradient_clip_val=None, gradient_clip_algorithm=None) -> None:
+        """Clip the gradients' norm where the stage asks for it."""
+        if self.settings.max_gradient > 0:
+            torch.nn.utils.clip_grad_norm_(self.method.parameters(), self.settings.max_gradient)
+
+    def on_save_checkpoint(self, checkpoint: dict) -> None:
+        """All that a continued run needs to equal an uninterrupted one."""
+        checkpoint["forewarp"] = {
+            "generator": self.generator.get_state(),
+            "curriculum": self.curriculum.state_dict(),
+            "clock": self.clock.state_dict(),
+            "lattice_voxels": self.lattice_voxels,
+        }
+
+    def on_load_checkpoint(self, checkpoint: dict) -> None:
+        """Continue from ``on_save_checkpoint``."""
+        state = checkpoint["forewarp"]
+        self.generator.set_state(state["generator"])
+        self.curriculum.load_state_dict(state["curriculum"])
+        self.clock.load_state_dict(state["clock"])
+        self.lattice_voxels = state["lattice_voxels"]
+
+    @torch.no_grad()
+    def render_image(self, camera: Camera, time: float, background: Tensor, state: State | None = None) -> Rendering:
+        """A whole picture, by the best rendering. ``state`` of the same time may be handed in to save the warp."""
+        state = state or self.method.at(time)
+        field = list(state.fields.values())[-1]
+        return render_all(self.renderer, field, camera.rays().to(self.device), background, self.method.view)
+
+
+def render_all(renderer: Renderer, field, rays: Rays, background: Tensor, view, chunk: int = 16384) -> Rendering:
+    """Render many rays in chunks; the samples' arrays are left empty."""
+    parts = []
+    with torch.no_grad():
+        for begin in range(0, len(rays), chunk):
+            parts.append(renderer(field, rays[begin : begin + chunk], background, view))
+    none = parts[0].weights[:0]
+    joined = {k: torch.cat([getattr(p, k) for p in parts]) for k in ("rgb", "depth", "opacity", "transmittance")}
+    return Rendering(
+        **joined, weights=none, colors=parts[0].colors[:0], ray_ids=parts[0].ray_ids[:0], samples=sum(p.samples for p in parts)
+    )

@@ -1,0 +1,112 @@
+"""The weighted sum of the paper's terms. The only place where a weight is compared with 0."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from forewarp import losses
+from forewarp.ops.grid import neighbour_pairs
+from forewarp.scene.batch import Batch
+from forewarp.scene.state import Rendering, State
+
+
+@dataclass
+class Step:
+    """What the terms may look at: the batch, what the method answered, what was rendered of it, and
+    ``render_patches``, which renders depth and opacity (B, S, S) of patches from random views at this time.
+    """
+
+    batch: Batch
+    state: State
+    renderings: dict[str, Rendering]
+    render_patches: Callable[[], tuple[Tensor, Tensor]]
+
+    @cached_property
+    def pairs(self) -> list[tuple[Tensor, Tensor]]:
+        """Neighbouring canonical voxels."""
+        return neighbour_pairs(self.state.canonical.index)
+
+
+def _over_renderings(term: Callable[[Step, Rendering], Tensor]) -> Callable[[Step], Tensor]:
+    return lambda step: sum(term(step, rendering) for rendering in step.renderings.values())
+
+
+def _flow(term: Callable[[Step, Tensor], Tensor]) -> Callable[[Step], Tensor | None]:
+    return lambda step: None if step.state.flow is None else term(step, step.state.flow)
+
+
+def _inpaint(step: Step) -> Tensor | None:
+    residual = step.state.inpaint_difference
+    return None if residual is None else losses.inpaint_diff(residual)
+
+
+def _terms(literal: frozenset[str]) -> dict[str, Callable[[Step], Tensor | None]]:
+    def entropy(step: Step, r: Rendering) -> Tensor:
+        if "background_entropy" in literal:
+            return losses.sample_entropy(r.all_weights)
+        return losses.background_entropy(r.transmittance)
+
+    return {
+        "photo": _over_renderings(lambda s, r: losses.photometric(r.rgb, s.batch.rgb, literal="photo" in literal)),
+        "point_color": _over_renderings(
+            lambda s, r: losses.point_color(
+                r.weights, r.colors, r.ray_ids, s.batch.rgb, literal="point_color" in literal
+            )
+        ),
+        "background_entropy": _over_renderings(entropy),
+        "flow_l1": _flow(lambda s, flow: losses.flow_l1(flow)),
+        "inpaint_diff": _inpaint,
+        "tv_density": lambda s: losses.tv_density(s.state.canonical.raw_density, s.pairs),
+        "tv_flow": _flow(lambda s, flow: losses.tv_flow(flow, s.pairs)),
+        "tv_depth": lambda s: losses.tv_depth(*s.render_patches()),
+    }
+
+
+class Objective:
+    """``loss = sum_i w_i term_i``; a term of weight 0 is never called.
+
+    Args:
+        weights: term -> weight; terms not named have weight 0.
+        every: term -> n: evaluated each n-th step with n times the weight.
+        literal: terms in the printed form where that differs (see ``losses``).
+        photo_on: renderings that the per-ray terms look at; null: all.
+    """
+
+    def __init__(
+        self,
+        weights: Mapping[str, float],
+        *,
+        every: Mapping[str, int] | None = None,
+        literal: list[str] | tuple[str, ...] = (),
+        photo_on: list[str] | None = None,
+    ) -> None:
+        known = _terms(frozenset(literal))
+        self.every = dict(every or {})
+        for name in (*weights, *self.every, *literal):
+            if name not in known:
+                raise ValueError(f"objective: expected a term of {', '.join(known)}, but got '{name}'")
+        self.weights = {name: float(w) for name, w in weights.items()}
+        self.terms = known
+        self.photo_on = tuple(photo_on) if photo_on is not None else None
+        self.needs_all_weights = "background_entropy" in literal
+
+    def __call__(self, step: Step, number: int) -> tuple[Tensor, dict[str, Tensor]]:
+        """The loss of step ``number`` and every term evaluated, raw, by name."""
+        if self.photo_on is not None:
+            step.renderings = {k: v for k, v in step.renderings.items() if k in self.photo_on} or step.renderings
+        loss, raw = torch.zeros(()), {}
+        for name, weight in self.weights.items():
+            every = self.every.get(name, 1)
+            if weight == 0 or number % every:
+                continue
+            value = self.terms[name](step)
+            if value is None:  # the effect that it measures is off
+                continue
+            raw[name] = value.detach()
+            loss = loss.to(value) + weight * every * value
+        return loss, raw

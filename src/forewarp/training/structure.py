@@ -1,0 +1,129 @@
+"""How the canonical grid changes while it is trained: which voxels are active, and how fine the lattice is."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn import Parameter
+
+from forewarp.fields.voxel_grid import VoxelGrid
+from forewarp.ops.grid import dilate, trilinear
+from forewarp.scene.box import Box, Lattice
+
+
+def occupied(radiance: VoxelGrid, keep_alpha: float) -> Tensor:
+    """Voxels (X, Y, Z) bool whose opacity over one voxel exceeds ``keep_alpha``."""
+    with torch.no_grad():
+        grid = radiance()
+    solid = grid.activation.alpha(grid.raw_density, grid.lattice.pitch) > keep_alpha
+    mask = torch.zeros(grid.lattice.shape, dtype=torch.bool, device=solid.device)
+    x, y, z = radiance.voxels[solid].unbind(-1)
+    mask[x, y, z] = True
+    return mask
+
+
+@torch.no_grad()
+def refresh(
+    radiance: VoxelGrid, optimizer: torch.optim.Optimizer, *, keep_alpha: float, birth_alpha: float, allowed=None
+) -> bool:
+    """Keep what is occupied and one voxel around it; forget the rest. The optimiser's moments follow.
+
+    An empty grid is left as it is, so that a scene which has not begun to appear cannot vanish for good.
+
+    Args:
+        radiance: the canonical field; its active set changes in place.
+        optimizer: holds moments by row.
+        keep_alpha: opacity over one voxel above which a voxel is occupied.
+        birth_alpha: what a new voxel starts with; below ``keep_alpha``, or fog spreads.
+        allowed: (X, Y, Z) bool, voxels that may be active at all; None for every one.
+
+    Returns:
+        Whether the active set changed.
+    """
+    mask = occupied(radiance, keep_alpha)
+    if not bool(mask.any()):
+        return False
+    active = dilate(mask, 1)
+    if allowed is not None:
+        active &= allowed | mask
+    if bool((active == (radiance.index >= 0)).all()):
+        return False
+    before = [radiance.parameter(n) for n in radiance.names]
+    rows = radiance.activate(active, radiance.births(birth_alpha))
+    renew_parameters(optimizer, before, [radiance.parameter(n) for n in radiance.names], rows)
+    return True
+
+
+def renew_parameters(
+    optimizer: torch.optim.Optimizer, before: list[Parameter], after: list[Parameter], rows: Tensor | None
+) -> None:
+    """Put ``after`` in the place of ``before``; moments go to the new rows (old row or -1), or start afresh.
+
+    Args:
+        optimizer: whose groups and moments are changed.
+        before, after: parameters (N, C) and (N', C), pairwise.
+        rows: (N',) int64, or None to start the moments afresh.
+    """
+    renewed = dict(zip(map(id, before), after))
+    for group in optimizer.param_groups:
+        group["params"] = [renewed.get(id(p), p) for p in group["params"]]
+    for old, new in zip(before, after):
+        state = optimizer.state.pop(old, None)
+        if state is None:
+            continue
+        for key, value in state.items():
+            if not torch.is_tensor(value) or value.dim() == 0:
+                continue
+            if rows is None or not len(value):
+                state[key] = torch.zeros_like(new)
+            else:
+                state[key] = torch.where((rows >= 0)[:, None], value[rows.clamp(min=0)], 0.0)
+        optimizer.state[new] = state
+
+
+@torch.no_grad()
+def resample(
+    radiance: VoxelGrid, box: Box, voxels: float, *, keep_alpha: float, optimizer: torch.optim.Optimizer | None = None
+) -> None:
+    """Carry the field to a lattice of about ``voxels`` over ``box``; active is what is occupied there, dilated.
+
+    An empty field becomes active everywhere. The optimiser's moments of the grid start afresh.
+    """
+    source = radiance()
+    lattice = Lattice.of_count(box, voxels)
+    points = source.lattice.to_lattice(lattice.to_world(lattice.all_voxels(source.values.device)))
+    raw = trilinear(source.values[:, :1].contiguous(), source.index, points, source.fill[:1])[:, 0]
+    last = torch.tensor(source.lattice.shape, device=points.device) - 1
+    inside = ((points >= 0) & (points <= last)).all(-1)
+    solid = (source.activation.alpha(raw, source.lattice.pitch) > keep_alpha) & inside
+    mask = dilate(solid.reshape(lattice.shape), 1)
+    if not bool(mask.any()):
+        mask = torch.ones_like(mask)
+    before = [radiance.parameter(n) for n in radiance.names]
+    radiance.resample(lattice, mask, radiance.empties())
+    if optimizer is not None:
+        renew_parameters(optimizer, before, [radiance.parameter(n) for n in radiance.names], None)
+
+
+@torch.no_grad()
+def box_of_all_times(method, times: list[float], *, alpha: float, pad: float) -> Box | None:
+    """The box around everything more opaque than ``alpha`` at any of ``times``, ``pad`` voxels wider.
+
+    None where nothing is that opaque. Sources that left the box are counted by the warp, not here.
+    """
+    radiance = method.radiance
+    grid = radiance()
+    solid = grid.activation.alpha(grid.raw_density, grid.lattice.pitch) > alpha
+    if not bool(solid.any()):
+        return None
+    home = grid.lattice.to_world(radiance.voxels)[solid]
+    low, high = home.amin(0), home.amax(0)
+    if getattr(method, "motion", None) is not None:
+        for time in times:
+            at = home + method.motion.flow(radiance, time)[solid]
+            low, high = torch.minimum(low, at.amin(0)), torch.maximum(high, at.amax(0))
+    elif hasattr(method, "deformation"):
+        for time in times:
+            at = method.trajectories(home, torch.tensor([time]))[:, 0]
+            low, high = torch.minimum(low, at.amin(0)), torch.maximum(high, at.amax(0))
+    return Box(tuple(low.tolist()), tuple(high.tolist())).padded(pad * grid.lattice.pitch)

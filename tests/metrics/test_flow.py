@@ -1,0 +1,91 @@
+import math
+
+import pytest
+import torch
+
+import reference
+from forewarp.metrics.flow import end_point_error
+
+
+def walks(count=7, times=4, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    start = torch.rand(count, 1, 3, generator=generator)
+    steps = (
+        torch.rand(count, times - 1, 3, generator=generator) * torch.linspace(0, 0.4, count)[:, None, None]
+    )
+    truth = torch.cat([start, start + steps], 1)
+    return truth + 0.05 * torch.randn(truth.shape, generator=generator), truth
+
+
+def test_by_hand():
+    # The first point goes 3 then 4 along x, the second stays; predictions miss by (5, 1) and (2, 0).
+    truth = torch.tensor([[[0.0, 0, 0], [3, 0, 0], [4, 0, 0]], [[1.0, 1, 1], [1, 1, 1], [1, 1, 1]]])
+    predicted = truth.clone()
+    predicted[0, 1] += torch.tensor([0.0, 3, 4])
+    predicted[0, 2] += torch.tensor([0.0, 0, 1])
+    predicted[1, 1] += torch.tensor([2.0, 0, 0])
+    assert end_point_error(predicted, truth, 0.5) == {
+        "epe_moving": 3.0,
+        "epe_still": 1.0,
+        "motion_mean": 3.5,
+        "count_moving": 1,
+        "count_still": 1,
+        "moving_threshold": 0.5,
+    }
+
+
+def test_the_canonical_time_does_not_count():
+    _, truth = walks()
+    predicted = truth.clone()
+    predicted[:, 0] += 5
+    scores = end_point_error(predicted, truth, 0.1)
+    assert scores["epe_moving"] == scores["epe_still"] == 0
+
+
+def test_no_motion_scores_the_mean_motion():
+    _, truth = walks()
+    scores = end_point_error(truth[:, :1].expand_as(truth), truth, 0.1)
+    assert scores["epe_moving"] == pytest.approx(scores["motion_mean"])
+    assert scores["epe_still"] < 0.1
+
+
+def test_default_threshold_follows_the_scale_of_the_scene():
+    predicted, truth = walks()
+    small, large = end_point_error(predicted, truth), end_point_error(predicted * 50, truth * 50)
+    extent = (truth[:, 0].amax(0) - truth[:, 0].amin(0)).norm().item()
+    assert small["moving_threshold"] == pytest.approx(0.02 * extent)
+    assert small["count_moving"] == large["count_moving"] == 6
+    assert large["epe_moving"] == pytest.approx(50 * small["epe_moving"], rel=1e-5)
+
+
+def test_without_moving_or_still_points():
+    predicted, truth = walks()
+    all_still = end_point_error(predicted, truth, 100.0)
+    assert all_still["epe_moving"] is None
+    assert all_still["motion_mean"] is None
+    assert (all_still["count_moving"], all_still["count_still"]) == (0, 7)
+    all_moving = end_point_error(predicted[1:], truth[1:], 0.0)
+    assert all_moving["epe_still"] is None
+    assert (all_moving["count_moving"], all_moving["count_still"]) == (6, 0)
+
+
+def test_is_its_twin():
+    predicted, truth = walks()
+    scores = end_point_error(predicted, truth, 0.2)
+    found = tuple(scores[key] for key in ("epe_moving", "epe_still", "motion_mean"))
+    assert found == pytest.approx(reference.end_point_error(predicted, truth, 0.2))
+
+
+def test_refusals():
+    predicted, truth = walks()
+    with pytest.raises(ValueError, match=r"true points: expected \(N, T, 3\).* but got shape \(7, 1, 3\)"):
+        end_point_error(predicted[:, :1], truth[:, :1])
+    with pytest.raises(ValueError, match=r"true points: expected .* but got shape \(0, 4, 3\)"):
+        end_point_error(predicted[:0], truth[:0])
+    with pytest.raises(
+        ValueError, match=r"predicted points: expected shape \(7, 4, 3\), but got \(7, 3, 3\)"
+    ):
+        end_point_error(predicted[:, 1:], truth)
+    predicted[2, 1, 0] = math.nan
+    with pytest.raises(ValueError, match=r"predicted points: expected finite places, but got 1 of 84"):
+        end_point_error(predicted, truth)

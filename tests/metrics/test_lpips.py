@@ -1,0 +1,186 @@
+import os
+from pathlib import Path
+
+import imageio.v3 as iio
+import pytest
+import torch
+
+import reference
+from forewarp.metrics import lpips
+from forewarp.metrics.lpips import LPIPS, NETS, find_lpips, find_lpips_weights
+
+
+def weights_folder():
+    root = Path(__file__).parents[2]
+    data = Path(os.environ.get("FOREWARP_DATA") or root.parent / "shared" / "data")
+    return data.parent / "weights" / "lpips"
+
+
+@pytest.fixture(scope="module")
+def squeeze():
+    file = weights_folder() / "squeeze.backbone.pth"
+    if not file.exists():
+        pytest.skip(
+            "the SqueezeNet backbone weights are not here (set FOREWARP_DATA to the folder beside them)"
+        )
+    return LPIPS("squeeze", file)
+
+
+@pytest.fixture(autouse=True)
+def no_weights_of_the_machine(monkeypatch, tmp_path):
+    monkeypatch.delenv(lpips.WEIGHTS_VARIABLE, raising=False)
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path / "hub"))
+
+
+@pytest.fixture(scope="module")
+def alex_file(tmp_path_factory):
+    torch.manual_seed(0)
+    file = tmp_path_factory.mktemp("weights") / "alexnet-owt-0.pth"
+    torch.save(lpips.alexnet_features().state_dict(), file)
+    return file
+
+
+def example(name):
+    pixels = iio.imread(weights_folder() / "example_images" / f"ex_{name}.png")
+    return torch.from_numpy(pixels[..., :3]).float() / 255
+
+
+def images(height=48, width=56):
+    generator = torch.Generator().manual_seed(3)
+    return torch.rand(height, width, 3, generator=generator), torch.rand(
+        height, width, 3, generator=generator
+    )
+
+
+def test_published_values_of_random_images(squeeze):
+    generator = torch.Generator().manual_seed(42)
+    first, second = (torch.rand(2, 3, 100, 100, generator=generator) * 2 - 1 for _ in range(2))
+    assert squeeze.distance(first, second).tolist() == pytest.approx([0.10238, 0.09377], abs=1e-5)
+
+
+@pytest.mark.parametrize(("name", "distance"), [("p0", 0.7110), ("p1", 0.1479), ("ref", 0.0)])
+def test_published_values_of_the_example_images(squeeze, name, distance):
+    assert squeeze(example(name), example("ref")) == pytest.approx(distance, abs=1e-4)
+
+
+def test_heads_of_torchmetrics_are_version_0_1(squeeze):
+    original = LPIPS(
+        "squeeze", weights_folder() / "squeeze.backbone.pth", weights_folder() / "lin_v0.1/squeeze.pth"
+    )
+    assert all(torch.equal(squeeze.state_dict()[k], v) for k, v in original.state_dict().items())
+
+
+@pytest.mark.parametrize(
+    ("net", "parameters", "taps"),
+    [
+        ("squeeze", 722_496, [64, 128, 256, 384, 384, 512, 512]),
+        ("vgg", 14_714_688, [64, 128, 256, 512, 512]),
+        ("alex", 2_469_696, [64, 192, 384, 256, 256]),
+    ],
+)
+def test_architectures(net, parameters, taps):
+    features = lpips._BACKBONES[net]()
+    assert sum(p.numel() for p in features.parameters()) == parameters
+    x, widths = torch.zeros(1, 3, 64, 80), []
+    with torch.no_grad():
+        for index, layer in enumerate(features):
+            x = layer(x)
+            if index in lpips._TAPS[net]:
+                widths.append(x.shape[1])
+    assert widths == taps == [head.shape[1] for head in lpips._read_heads(net, None)]
+
+
+def test_is_its_twin(alex_file):
+    net = LPIPS("alex", alex_file)
+    first, second = images()
+    first, second = ((x * 255).round() / 255 for x in (first, second))
+    heads = [getattr(net, f"head{k}") for k in range(5)]
+    planes = [x.permute(2, 0, 1)[None] * 2 - 1 for x in (first, second)]
+    twin = reference.lpips_distance(net.features, lpips._TAPS["alex"], heads, *planes)
+    assert net(first, second) == pytest.approx(twin, rel=1e-4)
+    assert twin > 1e-3
+
+
+def test_equal_and_white_images_are_at_no_distance(alex_file):
+    net = LPIPS("alex", alex_file)
+    first, second = images()
+    white = torch.ones(40, 40, 3)
+    assert net(first, first) == net(white, white) == 0
+    assert net(first, second) == pytest.approx(net(second, first), rel=1e-5)
+
+
+def test_too_small_an_image_has_no_distance(alex_file):
+    net = LPIPS("alex", alex_file)
+    assert net(*images(31, 64)) is None
+    assert net(*images(32, 32)) > 0
+
+
+def test_whole_model_files_are_read(alex_file, tmp_path):
+    bare = torch.load(alex_file, weights_only=True)
+    whole = {f"features.{key}": value for key, value in bare.items()} | {
+        "classifier.1.weight": torch.zeros(2)
+    }
+    torch.save(whole, tmp_path / "alexnet-whole.pth")
+    pair = images()
+    assert LPIPS("alex", tmp_path / "alexnet-whole.pth")(*pair) == LPIPS("alex", alex_file)(*pair)
+
+
+def test_nothing_is_trained(alex_file):
+    net = LPIPS("alex", alex_file)
+    assert not any(p.requires_grad for p in net.parameters())
+
+
+def test_no_weights_is_none():
+    assert [find_lpips_weights(net) for net in NETS] == [None, None, None]
+    assert find_lpips() == {"lpips_squeeze": None, "lpips_vgg": None, "lpips_alex": None}
+
+
+def test_weights_are_found_in_order(alex_file, tmp_path, monkeypatch):
+    def touch(folder, name):
+        path = tmp_path / folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+        return path
+
+    in_hub = {
+        "squeeze": touch("hub/checkpoints", "squeezenet1_1-b8a52dc0.pth"),
+        "vgg": touch("hub/checkpoints", "vgg16-397923af.pth"),
+        "alex": touch("hub/checkpoints", "alexnet-owt-7be5be79.pth"),
+    }
+    touch("hub/checkpoints", "vgg16_bn-6c64b313.pth")
+    assert {net: find_lpips_weights(net) for net in NETS} == in_hub
+    named = touch("named", "vgg16-1.pth")
+    monkeypatch.setenv(lpips.WEIGHTS_VARIABLE, str(named.parent))
+    assert find_lpips_weights("vgg") == named
+    assert find_lpips_weights("alex") == in_hub["alex"]
+    assert find_lpips_weights("alex", str(alex_file)) == alex_file
+    assert find_lpips_weights("alex", [None, alex_file.parent]) == alex_file
+    assert find_lpips_weights("vgg", [alex_file]) == named
+    assert find_lpips(["alex"], alex_file)["lpips_alex"].net == "alex"
+
+
+def test_heads_are_not_taken_for_a_backbone(tmp_path):
+    (tmp_path / "squeeze.pth").touch()
+    assert find_lpips_weights("squeeze", [tmp_path]) is None
+
+
+def test_refusals(alex_file, tmp_path, monkeypatch):
+    with pytest.raises(ValueError, match="lpips: expected a net of squeeze, vgg, alex, but got 'resnet'"):
+        find_lpips_weights("resnet")
+    with pytest.raises(ValueError, match="lpips_weights: expected an existing .* but got .*absent"):
+        find_lpips_weights("vgg", [tmp_path / "absent"])
+    (tmp_path / "mine.pth").touch()
+    with pytest.raises(ValueError, match="lpips_weights: expected a file named like .*mine.pth; rename it"):
+        find_lpips_weights("vgg", [tmp_path / "mine.pth"])
+    monkeypatch.setenv(lpips.WEIGHTS_VARIABLE, str(tmp_path / "gone"))
+    with pytest.raises(ValueError, match="FOREWARP_LPIPS_WEIGHTS: expected an existing"):
+        find_lpips_weights("vgg")
+    with pytest.raises(ValueError, match="expected weights of squeeze's features with '0.weight' of shape"):
+        LPIPS("squeeze", alex_file)
+    with pytest.raises(ValueError, match="mine.pth: expected weights of alex's features, but got EOFError"):
+        LPIPS("alex", tmp_path / "mine.pth")
+    (tmp_path / "text.pth").write_text("not a model")
+    with pytest.raises(ValueError, match="text.pth: expected weights of alex's features, but got Unpickling"):
+        LPIPS("alex", tmp_path / "text.pth")
+    with pytest.raises(ValueError, match="expected LPIPS heads of alex, but got no 'lin0.model.1.weight'"):
+        LPIPS("alex", alex_file, alex_file)

@@ -1,0 +1,119 @@
+import logging
+import math
+
+import pytest
+import torch
+
+from forewarp.metrics import image, lpips
+from forewarp.metrics.lpips import LPIPS
+from forewarp.metrics.suite import DEPTH_METRICS, METRICS, ImageSuite, summarise
+from forewarp.scene.batch import Target
+from forewarp.scene.camera import Camera
+from forewarp.scene.frame import Frame
+
+
+def target(height=34, width=40, depth=None, foreground=None, seed=0):
+    rgb = torch.rand(height, width, 3, generator=torch.Generator().manual_seed(seed))
+    camera = Camera(
+        width, height, 50.0, 50.0, width / 2, height / 2, torch.eye(4, dtype=torch.float64), 1.0, 5.0
+    )
+    frame = Frame("test/r_007", 0.5, camera, load=lambda: None)
+    return Target(frame, rgb, torch.ones(3), foreground=foreground, depth=depth)
+
+
+@pytest.fixture
+def alex(tmp_path):
+    torch.manual_seed(0)
+    torch.save(lpips.alexnet_features().state_dict(), tmp_path / "alexnet.pth")
+    return LPIPS("alex", tmp_path / "alexnet.pth")
+
+
+def test_scores_are_the_metrics_in_fixed_order(alex):
+    true = target(170, 180, depth=torch.full((170, 180), 2.0))
+    prediction = (true.rgb + 0.1).clamp(0, 1)
+    scores = ImageSuite({"lpips_alex": alex}).score(prediction, true, torch.full((170, 180), 2.2))
+    assert list(scores) == [name for name in METRICS if name not in ("lpips_squeeze", "lpips_vgg")]
+    assert scores["psnr"] == image.psnr(prediction, true.rgb)
+    assert scores["ssim"] == image.ssim(prediction, true.rgb)
+    assert scores["ms_ssim"] == image.ms_ssim(prediction, true.rgb)
+    assert scores["ms_ssim_legacy"] == image.ms_ssim_legacy(prediction, true.rgb)
+    assert scores["lpips_alex"] == alex(prediction, true.rgb)
+    assert [scores[name] for name in DEPTH_METRICS] == [0.0, 1.0, 1.0]
+
+
+def test_depth_metrics_carry_their_threshold():
+    assert DEPTH_METRICS == ("depth_delta_1.02", "depth_delta_1.25", "depth_delta_1.5625")
+
+
+def test_what_an_image_does_not_allow_is_left_out_and_said_once(caplog):
+    suite = ImageSuite({"lpips_vgg": None})
+    with caplog.at_level(logging.WARNING):
+        for _ in range(3):
+            scores = suite.score(target().rgb, target(depth=torch.zeros(34, 40)), torch.ones(34, 40))
+    assert scores == {"psnr": image.PSNR_CAP, "ssim": pytest.approx(1)}
+    assert set(suite.absent) == {"lpips_vgg", "ms_ssim", "ms_ssim_legacy", *DEPTH_METRICS}
+    assert suite.absent["lpips_vgg"] == "no backbone weights were found"
+    assert suite.absent["ms_ssim"] == "frame test/r_007 is 40x34 pixels, a side must have 161"
+    assert suite.absent["depth_delta_1.25"] == "frame test/r_007 has no foreground"
+    assert len(caplog.records) == len(suite.absent) == 6
+
+
+def test_foreground_limits_the_depth_score():
+    depth, foreground = torch.ones(34, 40), torch.zeros(34, 40, dtype=torch.bool)
+    foreground[0, :2] = True
+    predicted = depth.clone()
+    predicted[0, 0] = math.nan
+    scores = ImageSuite().score(target().rgb, target(depth=depth, foreground=foreground), predicted)
+    assert [scores[name] for name in DEPTH_METRICS] == [0.5, 0.5, 0.5]
+
+
+def test_errors_name_the_frame():
+    true = target(depth=torch.ones(34, 40))
+    prediction = true.rgb.clone()
+    prediction[0, 0, 0] = math.inf
+    with pytest.raises(
+        ValueError, match=r"frame test/r_007: prediction: expected finite values, but got 1 of"
+    ):
+        ImageSuite().score(prediction, true)
+    with pytest.raises(ValueError, match=r"frame test/r_007: depth: expected .* but got \(40, 34\)"):
+        ImageSuite().score(true.rgb, true, torch.ones(40, 34))
+
+
+def test_lpips_names_name_their_net(alex):
+    with pytest.raises(ValueError, match="lpips: expected names of lpips_squeeze, .* but got 'lpips'"):
+        ImageSuite({"lpips": None})
+    with pytest.raises(ValueError, match="but got 'lpips_vgg' for the net 'alex'"):
+        ImageSuite({"lpips_vgg": alex})
+
+
+def test_summary_by_hand():
+    rows = [
+        ("canonical", {"ssim": 0.5, "psnr": 30.0}),
+        ("space", {"psnr": 20.0, "depth_delta_1.02": 1.0}),
+        ("space", {"psnr": 24.0}),
+    ]
+    found = summarise(iter(rows))
+    assert found == {
+        "space": {"psnr": 22.0, "depth_delta_1.02": 1.0},
+        "canonical": {"psnr": 30.0, "ssim": 0.5},
+    }
+    assert list(found) == ["space", "canonical"]
+    assert list(found["canonical"]) == ["psnr", "ssim"]
+
+
+def test_summary_of_stock_splits_and_of_nothing():
+    assert summarise([("all", {"psnr": 1.0}), ("all", {"psnr": 2.0})]) == {"all": {"psnr": 1.5}}
+    assert summarise([]) == {}
+
+
+@pytest.mark.parametrize(
+    ("row", "message"),
+    [
+        (("spcae", {"psnr": 1.0}), "ability: expected one of space, time, canonical, all, but got 'spcae'"),
+        (("all", {"pnsr": 1.0}), "metric: expected one of psnr, .* but got 'pnsr'"),
+        (("all", {"psnr": math.nan}), "psnr: expected a finite score, but got nan"),
+    ],
+)
+def test_summary_refuses(row, message):
+    with pytest.raises(ValueError, match=message):
+        summarise([row])
