@@ -83,3 +83,98 @@ def end_point_error(predicted, truth, threshold):
         else:
             still += errors
     return tuple(sum(v) / len(v) for v in (moving, still, motion))
+
+
+# the core --------------------------------------------------------------------------------------------------
+
+
+def dct_difference(time, bases, frames, canonical, padding=0.0):
+    """``b_k(t) - b_k(canonical)`` for k = 1..K, one cosine at a time."""
+
+    def basis(t, k):
+        t = (t + padding) / (1 + 2 * padding)
+        return math.sqrt(2 / frames) * math.cos(math.pi / (2 * frames) * (2 * t * (frames - 1) + 1) * k)
+
+    return [basis(time, k) - basis(canonical, k) for k in range(1, bases + 1)]
+
+
+def tent(u):
+    """The trilinear kernel of an offset (3,)."""
+    return math.prod(max(0.0, 1 - abs(v)) for v in u)
+
+
+def lattice_cells(shape):
+    """Every (x, y, z), last axis fastest."""
+    return [(x, y, z) for x in range(shape[0]) for y in range(shape[1]) for z in range(shape[2])]
+
+
+def trilinear_read(values, index, points, fill):
+    """Every voxel's value times its kernel, all voxels for all points; points clamped to the border."""
+    out = []
+    for point in points.tolist():
+        at = [min(max(v, 0.0), n - 1.0) for v, n in zip(point, index.shape)]
+        total = torch.zeros(values.shape[1], dtype=values.dtype)
+        for cell in lattice_cells(index.shape):
+            row = int(index[cell])
+            total += tent([a - c for a, c in zip(at, cell)]) * (fill if row < 0 else values[row])
+        out.append(total)
+    return torch.stack(out)
+
+
+def splat_sums(source, positions, shape):
+    """Sums of values (X, Y, Z, C) and of weights (X, Y, Z): every source voxel against every cell."""
+    sums, weights = np.zeros((*shape, source.shape[1])), np.zeros(shape)
+    for value, position in zip(source.tolist(), positions.tolist()):
+        if not all(math.isfinite(v) for v in position):
+            continue
+        for cell in lattice_cells(shape):
+            w = tent([p - c for p, c in zip(position, cell)])
+            sums[cell] += w * np.array(value)
+            weights[cell] += w
+    return torch.from_numpy(sums), torch.from_numpy(weights)
+
+
+def march_samples(origins, directions, near, far, step, cells, jitter):
+    """Every step of every ray from near to far, kept where it lies in an occupied cell."""
+    found = []
+    for ray, (o, d, j) in enumerate(zip(origins.tolist(), directions.tolist(), jitter.tolist())):
+        k = 0
+        while (t := near + (k + j) * step) <= far:
+            at = [a + t * b for a, b in zip(o, d)]
+            if all(0 <= v <= n for v, n in zip(at, cells.shape)):
+                cell = tuple(min(int(v), n - 1) for v, n in zip(at, cells.shape))
+                if cells[cell]:
+                    found.append((ray, t))
+            k += 1
+    return [ray for ray, _ in found], [t for _, t in found]
+
+
+def composite(optical, ray_ids, rays):
+    """Weights and final transmittance by the running product of what is let through."""
+    through, weights = [1.0] * rays, []
+    for x, ray in zip(optical.tolist(), ray_ids.tolist()):
+        alpha = 1 - math.exp(-x)
+        weights.append(through[ray] * alpha)
+        through[ray] *= 1 - alpha
+    return weights, through
+
+
+def variation(grid):
+    """Mean absolute difference of neighbours in a grid (X, Y, Z, C), summed over axes; NaN is absent."""
+    total = 0.0
+    for axis in range(3):
+        difference = np.abs(np.diff(grid, axis=axis))
+        present = difference[~np.isnan(difference)]
+        total += present.mean() if present.size else 0.0
+    return total
+
+
+def patch_roughness(depth, opacity):
+    """Pixel by pixel: squared differences to the right and down, by the smaller opacity."""
+    depth, opacity = depth.tolist(), opacity.tolist()
+    size = range(len(depth[0]))
+    right, down = [], []
+    for d, o in zip(depth, opacity):
+        right += [(d[i][j + 1] - d[i][j]) ** 2 * min(o[i][j + 1], o[i][j]) for i in size for j in size[:-1]]
+        down += [(d[i + 1][j] - d[i][j]) ** 2 * min(o[i + 1][j], o[i][j]) for i in size[:-1] for j in size]
+    return sum(right) / len(right) + sum(down) / len(down)

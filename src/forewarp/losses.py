@@ -21,7 +21,9 @@ def photometric(rgb: Tensor, truth: Tensor, *, literal: bool = False) -> Tensor:
     return error.sum(-1).mean() if literal else error.mean()
 
 
-def point_color(weights: Tensor, colors: Tensor, ray_ids: Tensor, truth: Tensor, *, literal: bool = False) -> Tensor:
+def point_color(
+    weights: Tensor, colors: Tensor, ray_ids: Tensor, truth: Tensor, *, literal: bool = False
+) -> Tensor:
     """w1: ``sum_k w_k ||c_k - truth||^2`` over the samples of a ray, mean over rays; w without gradient.
 
     Args:

@@ -28,6 +28,10 @@ class Renderer:
             )
         self.step, self.color_threshold = step, color_threshold
 
+    def with_threshold(self, color_threshold: float | None) -> Renderer:
+        """The same renderer with another ``color_threshold``; None: this one."""
+        return self if color_threshold is None else Renderer(step=self.step, color_threshold=color_threshold)
+
     def __call__(
         self,
         field: FieldAtTime,
@@ -56,10 +60,16 @@ class Renderer:
         ray_ids, distances = march(origins, directions, rays.near, rays.far, step, field.cells, jitter)
         points = origins[ray_ids] + distances[:, None] * directions[ray_ids]
         weights, transmittance = render_weights(field.density(points) * step, ray_ids, count)
-        kept = (weights.detach() > self.color_threshold).nonzero()[:, 0] if self.color_threshold > 0 else slice(None)
+        kept = (
+            (weights.detach() > self.color_threshold).nonzero()[:, 0]
+            if self.color_threshold > 0
+            else slice(None)
+        )
         some_weights, some_rays = weights[kept], ray_ids[kept]
         features = field.features(points[kept])
-        colors = torch.sigmoid(features[:, :3]) if view is None else view(features, rays.directions[some_rays])
+        colors = (
+            torch.sigmoid(features[:, :3]) if view is None else view(features, rays.directions[some_rays])
+        )
         rgb = accumulate(some_weights, colors, some_rays, count) + transmittance[:, None] * background
         opacity = 1 - transmittance
         depth = accumulate(weights, distances[:, None], ray_ids, count)[:, 0] / opacity.clamp(min=1e-6)

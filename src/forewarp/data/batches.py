@@ -53,7 +53,7 @@ class RayBatches(IterableDataset):
                 "without alpha; set data.background=white"
             )
         self.frames, self.rays, self.background, self.picker = scene.train, int(rays), background, picker
-        self._generator = torch.Generator().manual_seed(seed)
+        self.seed, self._generator = seed, torch.Generator().manual_seed(seed)
 
     def __iter__(self) -> Iterator[Batch]:
         while True:
@@ -77,6 +77,10 @@ class RayBatches(IterableDataset):
             background = color_of(self.background)
         rgb = composited(frame.load().reshape(-1, 4)[pixels], background)
         return Batch(camera.rays(pixels), rgb, background, frame.time, index)
+
+    def restart(self, number: int) -> None:
+        """Draw from the beginning of stream ``number``; 0 is the one that is drawn from at first."""
+        self._generator.manual_seed(self.seed + number)
 
     def state_dict(self) -> dict[str, Tensor]:
         """The random generator's state."""

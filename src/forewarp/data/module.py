@@ -91,6 +91,10 @@ class SceneDataModule(LightningDataModule):
         """The test images one by one."""
         return self.targets("test")
 
+    def restart(self, number: int) -> None:
+        """Let the next batches be those of stream ``number``, whatever was drawn before."""
+        self.batches.restart(number)
+
     def state_dict(self) -> dict:
         """What an interrupted run needs to draw on bit for bit."""
         return self.batches.state_dict()

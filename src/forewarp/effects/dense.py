@@ -53,4 +53,6 @@ def sparsify(grid: RadianceGrid, lattice: Lattice, crop: Crop, dense: Tensor) ->
     count = dense[0, 0].numel()
     rows = torch.arange(count, dtype=torch.int32, device=dense.device).reshape(crop.shape)
     index[tuple(slice(l, h + 1) for l, h in zip(crop.low, crop.high))] = rows
-    return replace(grid, lattice=lattice, index=index, values=dense.reshape(dense.shape[1], -1).T.contiguous())
+    return replace(
+        grid, lattice=lattice, index=index, values=dense.reshape(dense.shape[1], -1).T.contiguous()
+    )

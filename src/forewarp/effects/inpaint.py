@@ -39,18 +39,30 @@ class UNet3d(nn.Module):
     """
 
     def __init__(
-        self, *, channels: int, width: int = 16, levels: int = 4, margin: int = 4, coverage_channel: bool = False
+        self,
+        *,
+        channels: int,
+        width: int = 16,
+        levels: int = 4,
+        margin: int = 4,
+        coverage_channel: bool = False,
     ) -> None:
         super().__init__()
         if width % 16 or levels < 2:
             raise ValueError(
                 f"model.inpainter: expected a width that is a multiple of 16 and levels >= 2, but got {width=}, {levels=}"
             )
-        self.channels, self.width, self.margin, self.coverage_channel = channels, width, margin, coverage_channel
+        self.channels, self.width, self.margin, self.coverage_channel = (
+            channels,
+            width,
+            margin,
+            coverage_channel,
+        )
         widths = [width * 2**level for level in range(levels)]
         inputs = [channels + coverage_channel, *widths[:-1]]
         self.encode = nn.ModuleList(
-            nn.Sequential(ConvBlock(i, max(o // 2, i)), ConvBlock(max(o // 2, i), o)) for i, o in zip(inputs, widths)
+            nn.Sequential(ConvBlock(i, max(o // 2, i)), ConvBlock(max(o // 2, i), o))
+            for i, o in zip(inputs, widths)
         )
         self.decode = nn.ModuleList(
             nn.Sequential(ConvBlock(deep + skip, skip), ConvBlock(skip, skip))

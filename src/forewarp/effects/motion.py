@@ -19,14 +19,16 @@ class Motion(nn.Module):
     Args:
         trajectory: the canonical trajectory field.
         tau: least divisor of the splat; bounds its gradient.
-        fade: coverage below which a target voxel fades to empty space; 0 for none (then a voxel touched by
-            1e-7 of a source is as solid as its source).
+        fade: coverage below which a target voxel fades to empty space, at least ``tau``: below that the
+            averages shrink to 0, which as raw density is fog and not empty space.
     """
 
     def __init__(self, trajectory: TrajectoryField, *, tau: float = 1e-2, fade: float = 0.5) -> None:
         super().__init__()
         if not (0 < tau <= 1 and 0 <= fade <= 1):
-            raise ValueError(f"model.motion: expected 0 < tau <= 1 and 0 <= fade <= 1, but got {tau=}, {fade=}")
+            raise ValueError(
+                f"model.motion: expected 0 < tau <= 1 and 0 <= fade <= 1, but got {tau=}, {fade=}"
+            )
         self.trajectory, self.tau, self.fade = trajectory, tau, fade
 
     def flow(self, voxels: VoxelGrid, time: float) -> Tensor:
@@ -41,9 +43,7 @@ class Motion(nn.Module):
         """
         spacing = flow.new_tensor(canonical.lattice.spacing)
         splat = average_splat(canonical.values, voxels + flow / spacing, canonical.lattice.shape, self.tau)
-        values = splat.values
-        if self.fade > 0:
-            share = (splat.coverage / self.fade).clamp(max=1.0)[:, None]
-            density = values[:, :1] * share + EMPTY * (1 - share)
-            values = torch.cat([density, values[:, 1:]], -1)
+        share = (splat.coverage / max(self.fade, self.tau)).clamp(max=1.0)[:, None]
+        density = splat.values[:, :1] * share + EMPTY * (1 - share)
+        values = torch.cat([density, splat.values[:, 1:]], -1)
         return replace(canonical, index=splat.index, values=values), splat.coverage, splat.dropped

@@ -30,7 +30,9 @@ class TrilinearUpsampler(nn.Module):
     def __init__(self, *, scale: float = 2.0) -> None:
         super().__init__()
         if not scale > 1:
-            raise ValueError(f"model.upsampler.scale: expected a number > 1, but got {scale}; or model/upsampler=none")
+            raise ValueError(
+                f"model.upsampler.scale: expected a number > 1, but got {scale}; or model/upsampler=none"
+            )
         self.scale = scale
 
     def forward(self, grid: RadianceGrid) -> RadianceGrid:
@@ -62,10 +64,14 @@ class LearnedUpsampler(TrilinearUpsampler):
         margin: voxels around the occupied box.
     """
 
-    def __init__(self, *, scale: int = 2, channels: int, width: int = 16, margin: int = 2, features: int = 0) -> None:
+    def __init__(
+        self, *, scale: int = 2, channels: int, width: int = 16, margin: int = 2, features: int = 0
+    ) -> None:
         super().__init__(scale=scale)
         if int(scale) != scale:
-            raise ValueError(f"model.upsampler.scale: the learned layer expects a whole number, but got {scale}")
+            raise ValueError(
+                f"model.upsampler.scale: the learned layer expects a whole number, but got {scale}"
+            )
         self.scale, self.margin = int(scale), margin
         self.project = nn.Conv3d(features or channels, width, 1)
         self.layers = nn.Sequential(ConvBlock(width, width), ConvBlock(width, width))

@@ -38,7 +38,14 @@ class DirectRadiance(VoxelGrid):
     """
 
     def __init__(
-        self, lattice: Lattice, active: Tensor, *, features: int, alpha_init: float, unit: float, skip_alpha: float
+        self,
+        lattice: Lattice,
+        active: Tensor,
+        *,
+        features: int,
+        alpha_init: float,
+        unit: float,
+        skip_alpha: float,
     ) -> None:
         super().__init__(lattice, active, self._channels(features))
         self.activation = Activation(density_shift(alpha_init), unit)
@@ -91,12 +98,16 @@ class FeatureRadiance(VoxelGrid):
         super().__init__(lattice, active, {"features": grid_features})
         nn.init.normal_(self.features, std=0.1)
         self.network = mlp(
-            grid_features + 3 * (1 + 2 * frequencies), 1 + features, width=width, layers=layers, zero_last=True
+            grid_features + 3 * (1 + 2 * frequencies),
+            1 + features,
+            width=width,
+            layers=layers,
+            zero_last=True,
         )
         self.frequencies = frequencies
         self.activation = Activation(density_shift(alpha_init), unit)
         self.skip_alpha = skip_alpha
-        self._encoded: tuple[int, Tensor] | None = None
+        self._encoded: tuple[Tensor, Tensor] | None = None
 
     def forward(self) -> RadianceGrid:
         """The canonical radiance grid, values (N, 1 + C)."""
@@ -104,9 +115,12 @@ class FeatureRadiance(VoxelGrid):
         return RadianceGrid(self.lattice, self.index, values, self.activation, self.skip_alpha)
 
     def _positions(self) -> Tensor:
-        key = id(self.voxels)
-        if self._encoded is None or self._encoded[0] != key:
-            self._encoded = (key, positional_encoding(self.lattice.normalised(self.voxels), self.frequencies))
+        # The tensor itself is the key: an id may be given again to the next one.
+        if self._encoded is None or self._encoded[0] is not self.voxels:
+            self._encoded = (
+                self.voxels,
+                positional_encoding(self.lattice.normalised(self.voxels), self.frequencies),
+            )
         return self._encoded[1]
 
     def births(self, alpha: float) -> dict[str, float]:

@@ -28,6 +28,7 @@ class TrajectoryField(nn.Module):
         nodes: about how many nodes along the box's mean side; 0 for none.
         features: channels of the deformation feature grid; 0 for none.
         width, layers, frequencies: of F2 and its encoding.
+        padding: see ``dct_basis``: lets things move at the first and last frame.
     """
 
     def __init__(
@@ -42,6 +43,7 @@ class TrajectoryField(nn.Module):
         width: int = 64,
         layers: int = 4,
         frequencies: int = 5,
+        padding: float = 0.0,
     ) -> None:
         super().__init__()
         if frames < 2:
@@ -55,8 +57,10 @@ class TrajectoryField(nn.Module):
         self.at_nodes = nodes > 0
         self.features = None
         if features:
-            self.features = VoxelGrid(self.lattice, torch.ones(self.lattice.shape, dtype=torch.bool), {"grid": features})
-        self.frequencies = frequencies
+            self.features = VoxelGrid(
+                self.lattice, torch.ones(self.lattice.shape, dtype=torch.bool), {"grid": features}
+            )
+        self.frequencies, self.padding = frequencies, padding
         self.network = mlp(
             3 * (1 + 2 * frequencies) + features, 3 * self.bases, width=width, layers=layers, zero_last=True
         )
@@ -74,7 +78,7 @@ class TrajectoryField(nn.Module):
         return self.scale * self.network(inputs).reshape(-1, 3, self.bases)
 
     def _basis(self, time: float | Tensor) -> Tensor:
-        basis = dct_basis(time, self.bases, self.frames, self.canonical_time)
+        basis = dct_basis(time, self.bases, self.frames, self.canonical_time, self.padding)
         playing = torch.arange(self.bases) < self.bases_in_play.cpu()
         return (basis * playing).to(self.network[0].weight.device)
 

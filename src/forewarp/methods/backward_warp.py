@@ -46,7 +46,9 @@ class Deformation(nn.Module):
 
     def forward(self, points: Tensor, time: float) -> Tensor:
         """World points (P, 3) at ``time`` -> displacement (P, 3)."""
-        position = positional_encoding(self.lattice.normalised(self.lattice.to_lattice(points)), self.frequencies)
+        position = positional_encoding(
+            self.lattice.normalised(self.lattice.to_lattice(points)), self.frequencies
+        )
         clock = positional_encoding(points.new_tensor([[2 * time - 1]]), self.time_frequencies)
         inputs = torch.cat([position, clock.expand(len(points), -1)], -1)
         # Fades in over a twentieth of the sequence, so that the field stays continuous in time.

@@ -43,6 +43,12 @@ class ForwardWarp(nn.Module):
                     f"model.{name}: expected a module or null, but got {type(effect).__name__}; choose model/{name}=none"
                 )
             setattr(self, name, effect)
+        scale = getattr(upsampler, "scale", 1)
+        if inpainter is not None and scale != int(scale):
+            raise ValueError(
+                f"model.upsampler.scale: expected a whole number beside an inpainter, but got {scale}; "
+                "set it to 2, or choose model/inpainter=none"
+            )
         self.radiance, self.canonical_time = radiance, canonical_time
 
     def at(self, time: float) -> State:
@@ -64,13 +70,17 @@ class ForwardWarp(nn.Module):
         learned = isinstance(self.upsampler, LearnedUpsampler)
         return self.upsampler.alone(warped) if learned else self.upsampler(warped)
 
-    def _inpaint(self, warped: RadianceGrid, coverage: Tensor | None) -> tuple[dict[str, RadianceGrid], Tensor]:
+    def _inpaint(
+        self, warped: RadianceGrid, coverage: Tensor | None
+    ) -> tuple[dict[str, RadianceGrid], Tensor]:
         crop = occupied_crop(warped.index, self.inpainter.margin)
         dense = densify(warped, crop)
         inputs = dense
         if self.inpainter.coverage_channel:
             cover = warped.values.new_ones(len(warped.values)) if coverage is None else coverage.clamp(max=1)
-            inputs = torch.cat([dense, densify(warped.with_values(cover[:, None] * 1.0), crop).clamp(min=0)], 1)
+            inputs = torch.cat(
+                [dense, densify(warped.with_values(cover[:, None] * 1.0), crop).clamp(min=0)], 1
+            )
         features = self.inpainter.features(inputs)
         lattice, region = warped.lattice, crop
         if isinstance(self.upsampler, LearnedUpsampler):

@@ -42,6 +42,13 @@ class MethodSpec:
                     f"model.{name}: expected a factory or null, but got {choice!r}; choose model/{name}=none to switch it off"
                 )
 
+        needed = {"deformation": self.warp == "backward", "trajectory": self.motion is not None}
+        for name, need in needed.items():
+            if need and getattr(self, name) is None:
+                raise ValueError(
+                    f"model.{name}: expected a factory, but got null; choose another model/motion or model"
+                )
+
     def build(
         self,
         lattice: Lattice,
@@ -75,7 +82,11 @@ class MethodSpec:
         motion = None
         if self.motion is not None and frames > 1 and "motion" in effects:
             motion = self.motion(self.trajectory(scene_box, frames=frames, canonical_time=canonical_time))
-        inpainter = self.inpainter(channels=1 + features) if self.inpainter is not None and "inpainter" in effects else None
+        inpainter = (
+            self.inpainter(channels=1 + features)
+            if self.inpainter is not None and "inpainter" in effects
+            else None
+        )
         return ForwardWarp(
             radiance,
             canonical_time=canonical_time,
@@ -119,5 +130,3 @@ def parameter_kinds(method: nn.Module) -> dict[str, list[nn.Parameter]]:
 def parameter_count(method: nn.Module) -> int:
     """Learned numbers."""
     return sum(p.numel() for p in method.parameters())
-
-

@@ -11,7 +11,9 @@ def check_shape(name: str, tensor: Tensor, shape: tuple[int | str, ...]) -> None
     >>> import torch
     >>> check_shape("points", torch.zeros(4, 3), ("P", 3))
     """
-    fits = tensor.dim() == len(shape) and all(isinstance(s, str) or s == n for s, n in zip(shape, tensor.shape))
+    fits = tensor.dim() == len(shape) and all(
+        isinstance(s, str) or s == n for s, n in zip(shape, tensor.shape)
+    )
     if not fits:
         wanted = "(" + ", ".join(str(s) for s in shape) + ")"
         raise ValueError(f"{name}: expected shape {wanted}, but got {tuple(tensor.shape)}")

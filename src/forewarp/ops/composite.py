@@ -34,7 +34,9 @@ def render_weights(optical: Tensor, ray_ids: Tensor, rays: int) -> tuple[Tensor,
     # An optical depth of 80 is opaque to the last bit of a float32; the cap keeps the global sum exact.
     x = optical.double().clamp(max=80.0)
     through = x.cumsum(0) - x
-    counts = torch.zeros(rays, dtype=torch.int64, device=x.device).index_add_(0, ray_ids, torch.ones_like(ray_ids))
+    counts = torch.zeros(rays, dtype=torch.int64, device=x.device).index_add_(
+        0, ray_ids, torch.ones_like(ray_ids)
+    )
     starts = counts.cumsum(0) - counts
     offset = torch.cat([through, through.new_zeros(1)])[starts]  # a ray without samples may start at the end
     before = (through - offset[ray_ids]).clamp(min=0)

@@ -8,7 +8,9 @@ import torch
 from torch import Tensor
 
 
-def dct_basis(time: Tensor | float, bases: int, frames: int, canonical_time: float) -> Tensor:
+def dct_basis(
+    time: Tensor | float, bases: int, frames: int, canonical_time: float, padding: float = 0.0
+) -> Tensor:
     """Basis differences ``b_k(t) - b_k(canonical)`` for k = 1..K: exactly zero at the canonical time.
 
     ``b_k(t) = sqrt(2/T) cos(pi/(2T) (2 t (T-1) + 1) k)``; a trajectory is
@@ -19,6 +21,9 @@ def dct_basis(time: Tensor | float, bases: int, frames: int, canonical_time: flo
         bases: K >= 1; at most T - 1 are independent.
         frames: T >= 2, the number of distinct training times.
         canonical_time: in [0, 1].
+        padding: share of the sequence that is imagined before its first and after its last frame. Every cosine
+            stands still at both ends of its period, so without padding nothing can move at the first and last
+            frame; 0 is the printed form.
 
     Returns:
         (..., K), float32 (or ``time``'s floating dtype). Differentiable in ``time``.
@@ -35,10 +40,12 @@ def dct_basis(time: Tensor | float, bases: int, frames: int, canonical_time: flo
         raise ValueError(f"dct: expected 1 <= bases <= frames - 1, but got bases={bases}, frames={frames}")
     t = torch.as_tensor(time)
     t = t if t.is_floating_point() else t.float()
-    both = torch.stack([t.double(), torch.full_like(t, canonical_time, dtype=torch.float64)])
+    # Both rounded alike, or the difference at the canonical time is not 0.
+    both = torch.stack([t, torch.full_like(t, canonical_time)]).double()
     if not bool(((both >= 0) & (both <= 1)).all()):
         low, high = float(both.min()), float(both.max())
         raise ValueError(f"dct: expected times in [0, 1], but got {low:.4g} to {high:.4g}; scale the times")
+    both = (both + padding) / (1 + 2 * padding)
     k = torch.arange(1, bases + 1, dtype=torch.float64, device=t.device)
     phase = math.pi / (2 * frames) * (2 * both[..., None] * (frames - 1) + 1) * k
     basis = math.sqrt(2 / frames) * torch.cos(phase)

@@ -7,7 +7,7 @@ from torch import Tensor
 
 
 def positional_encoding(x: Tensor, frequencies: int) -> Tensor:
-    """``(x, sin(2^0 x), cos(2^0 x), ..., sin(2^(F-1) x), cos(2^(F-1) x))``, as NeRF.
+    """``(x, sin(2^0 x), ..., sin(2^(F-1) x), cos(2^0 x), ..., cos(2^(F-1) x))``: NeRF's, sines first.
 
     Args:
         x: (..., D), normalised to [-1, 1].

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from forewarp.ops.backend import use_numba
 from forewarp.ops.checks import check_shape
@@ -26,7 +27,8 @@ def corner_weights(points: Tensor, shape: tuple[int, int, int]) -> tuple[Tensor,
         corners (P, 8, 3) int64 and weights (P, 8), differentiable in ``points``.
     """
     last = torch.tensor(shape, device=points.device) - 2
-    base = torch.minimum(points.detach().floor().long().clamp(min=0), last)
+    # Clamped before it is a whole number: a far point has none.
+    base = torch.minimum(points.detach().nan_to_num().floor().clamp(min=0), last).long()
     fraction = (points - base).clamp(0, 1)
     offsets = torch.tensor(_CORNERS, device=points.device)
     weights = torch.where(offsets.bool(), fraction[:, None], 1 - fraction[:, None]).prod(-1)
@@ -86,6 +88,7 @@ class _NumbaTrilinear(torch.autograd.Function):
         return out
 
     @staticmethod
+    @once_differentiable
     def backward(ctx, grad):
         from forewarp.ops import kernels
 
@@ -99,7 +102,9 @@ class _NumbaTrilinear(torch.autograd.Function):
             grad_values = parts.sum(0) if chunks > 1 else parts[0]
         if ctx.needs_input_grad[2]:
             grad_points = points.new_empty(points.shape)
-            kernels.gather_backward_points(*(_array(v) for v in (values, index, points, fill, grad, grad_points)))
+            kernels.gather_backward_points(
+                *(_array(v) for v in (values, index, points, fill, grad, grad_points))
+            )
         return grad_values, None, grad_points, None
 
 
@@ -128,9 +133,29 @@ def dilate(mask: Tensor, by: int = 1) -> Tensor:
     return grown
 
 
-def occupied_cells(index: Tensor) -> Tensor:
-    """Cells (X-1, Y-1, Z-1) bool of which at least one corner is present."""
+def occupied_cells(index: Tensor, keep: Tensor | None = None) -> Tensor:
+    """Cells (X-1, Y-1, Z-1) bool of which at least one corner is present, and kept.
+
+    Args:
+        index: (X, Y, Z) int32.
+        keep: (M,) bool over the rows; None keeps all.
+    """
+    if use_numba(index):
+        from forewarp.ops import kernels
+
+        rows = int(index.max()) + 1 if keep is None else len(keep)
+        cells = torch.zeros([n - 1 for n in index.shape], dtype=torch.uint8)
+        kept = torch.ones(rows, dtype=torch.bool) if keep is None else keep
+        kernels.mark_cells(_array(index), _array(kept), cells.numpy())
+        return cells.view(torch.bool)
+    return occupied_cells_reference(index, keep)
+
+
+def occupied_cells_reference(index: Tensor, keep: Tensor | None = None) -> Tensor:
+    """``occupied_cells`` in plain PyTorch."""
     cells = index >= 0
+    if keep is not None:  # -1 reads the last entry: False
+        cells = torch.cat([keep, keep.new_zeros(1)])[index.long()]
     for axis in range(3):
         n = cells.shape[axis] - 1
         cells = cells.narrow(axis, 0, n) | cells.narrow(axis, 1, n)

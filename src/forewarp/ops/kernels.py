@@ -15,16 +15,19 @@ from numba import config as numba_config
 
 def match_threads() -> int:
     """Let Numba use as many threads as PyTorch does; returns that number."""
-    wanted = max(1, min(torch.get_num_threads(), numba_config.NUMBA_NUM_THREADS))
+    asked = torch.get_num_threads()
+    wanted = max(1, min(asked, numba_config.NUMBA_NUM_THREADS))
     if get_num_threads() != wanted:
         set_num_threads(wanted)
+    if torch.get_num_threads() != asked:  # Numba's first call starts all threads of the OpenMP they share
+        torch.set_num_threads(asked)
     return wanted
 
 
 @njit(inline="always")
 def _corner(x, n):
-    base = int(np.floor(x))
-    base = min(max(base, 0), n - 2)
+    base = int(min(max(np.floor(x), 0.0), n - 2.0))
+    base = min(max(base, 0), n - 2)  # NaN has no whole number
     return base, min(max(x - base, 0.0), 1.0)
 
 
@@ -107,7 +110,11 @@ def number_touched(positions, index):
     for q in range(positions.shape[0]):
         if np.isnan(positions[q, 0]):
             continue
-        x0, y0, z0 = int(np.floor(positions[q, 0])), int(np.floor(positions[q, 1])), int(np.floor(positions[q, 2]))
+        x0, y0, z0 = (
+            int(np.floor(positions[q, 0])),
+            int(np.floor(positions[q, 1])),
+            int(np.floor(positions[q, 2])),
+        )
         for a in range(2):
             for b in range(2):
                 for d in range(2):
@@ -134,7 +141,11 @@ def scatter(source, positions, index, out):
         for q in range(total * chunk // chunks, total * (chunk + 1) // chunks):
             if np.isnan(positions[q, 0]):
                 continue
-            x0, y0, z0 = int(np.floor(positions[q, 0])), int(np.floor(positions[q, 1])), int(np.floor(positions[q, 2]))
+            x0, y0, z0 = (
+                int(np.floor(positions[q, 0])),
+                int(np.floor(positions[q, 1])),
+                int(np.floor(positions[q, 2])),
+            )
             fx, fy, fz = positions[q, 0] - x0, positions[q, 1] - y0, positions[q, 2] - z0
             for i in range(8):
                 a, b, d = i >> 2, (i >> 1) & 1, i & 1
@@ -155,7 +166,11 @@ def scatter_backward(source, positions, index, grad, grad_source, grad_positions
     for q in prange(positions.shape[0]):
         if np.isnan(positions[q, 0]):
             continue
-        x0, y0, z0 = int(np.floor(positions[q, 0])), int(np.floor(positions[q, 1])), int(np.floor(positions[q, 2]))
+        x0, y0, z0 = (
+            int(np.floor(positions[q, 0])),
+            int(np.floor(positions[q, 1])),
+            int(np.floor(positions[q, 2])),
+        )
         fx, fy, fz = positions[q, 0] - x0, positions[q, 1] - y0, positions[q, 2] - z0
         gx, gy, gz = 0.0, 0.0, 0.0
         for i in range(8):
@@ -190,7 +205,9 @@ def _slab(o, d, near, far, nx, ny, nz):
 
 
 @njit(parallel=True, cache=True)
-def march(origins, directions, near, far, step, jitter, cells, blocks, block, counts, starts, ray_ids, distances):
+def march(
+    origins, directions, near, far, step, jitter, cells, blocks, block, counts, starts, ray_ids, distances
+):
     """Samples in occupied cells only. With ``starts`` empty it counts, else it writes from ``starts[r]``."""
     nx, ny, nz = cells.shape[0] + 1, cells.shape[1] + 1, cells.shape[2] + 1
     for r in prange(origins.shape[0]):
@@ -222,3 +239,29 @@ def march(origins, directions, near, far, step, jitter, cells, blocks, block, co
                     k += 1
                 t = near + (k + jitter[r]) * step
         counts[r] = found
+
+
+@njit(cache=True)
+def mark_cells(index, keep, cells):
+    """cells[x, y, z] = 1 where a corner of the cell is present and kept."""
+    nx, ny, nz = index.shape
+    for x in range(nx):
+        for y in range(ny):
+            for z in range(nz):
+                row = index[x, y, z]
+                if row >= 0 and keep[row]:
+                    for a in range(max(x - 1, 0), min(x + 1, nx - 1)):
+                        for b in range(max(y - 1, 0), min(y + 1, ny - 1)):
+                            for d in range(max(z - 1, 0), min(z + 1, nz - 1)):
+                                cells[a, b, d] = 1
+
+
+@njit(cache=True)
+def pool_blocks(cells, blocks, block):
+    """blocks = 1 where one of their ``block`` cubed cells is."""
+    nx, ny, nz = cells.shape
+    for x in range(nx):
+        for y in range(ny):
+            for z in range(nz):
+                if cells[x, y, z]:
+                    blocks[x // block, y // block, z // block] = 1

@@ -77,9 +77,10 @@ def _numba_march(origins, directions, near, far, step, cells, jitter) -> tuple[T
     from forewarp.ops import kernels
 
     kernels.match_threads()
-    pooled = torch.nn.functional.max_pool3d(cells[None].float(), _BLOCK, ceil_mode=True)[0]
     rays = [_array(v) for v in (origins, directions)]
-    grid = [_array(v.to(torch.uint8)) for v in (cells, pooled)]
+    blocks = torch.zeros([-(-n // _BLOCK) for n in cells.shape], dtype=torch.uint8)
+    grid = [_array(cells.contiguous().view(torch.uint8)), blocks.numpy()]
+    kernels.pool_blocks(*grid, _BLOCK)
     counts = torch.zeros(len(origins), dtype=torch.int64)
     none = torch.zeros(0, dtype=torch.int64)
     common = (*rays, float(near), float(far), float(step), _array(jitter), *grid, _BLOCK, counts.numpy())

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from forewarp.ops.backend import use_numba
 from forewarp.ops.checks import check_shape
@@ -55,7 +56,9 @@ def average_splat(source: Tensor, positions: Tensor, shape: tuple[int, int, int]
     return Splat(values, coverage, index, int(len(source) - int(inside.sum())))
 
 
-def scatter_reference(source: Tensor, positions: Tensor, shape: tuple[int, int, int]) -> tuple[Tensor, Tensor]:
+def scatter_reference(
+    source: Tensor, positions: Tensor, shape: tuple[int, int, int]
+) -> tuple[Tensor, Tensor]:
     """Sums (M, C + 1), coverage last, and the index of the touched cells, in plain PyTorch on any device.
 
     ``positions`` are NaN where a voxel contributes nothing.
@@ -104,6 +107,7 @@ class _NumbaScatter(torch.autograd.Function):
         return sums.sum(0) if chunks > 1 else sums[0]
 
     @staticmethod
+    @once_differentiable
     def backward(ctx, grad):
         from forewarp.ops import kernels
 

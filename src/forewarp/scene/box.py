@@ -29,7 +29,9 @@ class Box:
         object.__setattr__(self, "high", high)
         good = len(low) == 3 and len(high) == 3 and all(math.isfinite(v) for v in low + high)
         if not good or any(h <= l for l, h in zip(low, high)):
-            raise ValueError(f"a box: expected finite low < high on three axes, but got low={low}, high={high}")
+            raise ValueError(
+                f"a box: expected finite low < high on three axes, but got low={low}, high={high}"
+            )
 
     @property
     def size(self) -> tuple[float, float, float]:
@@ -78,7 +80,9 @@ class Lattice:
     def __post_init__(self) -> None:
         object.__setattr__(self, "shape", tuple(int(n) for n in self.shape))
         if len(self.shape) != 3 or min(self.shape) < 2:
-            raise ValueError(f"a lattice: expected three axes of at least 2 points, but got shape={self.shape}")
+            raise ValueError(
+                f"a lattice: expected three axes of at least 2 points, but got shape={self.shape}"
+            )
 
     @classmethod
     def of_count(cls, box: Box, count: float, least: int = 4) -> Lattice:
@@ -119,7 +123,7 @@ class Lattice:
     def normalised(self, coordinates: Tensor) -> Tensor:
         """Lattice coordinates (..., 3) -> [-1, 1] per axis, for positional encoding."""
         last = torch.tensor([n - 1 for n in self.shape], device=coordinates.device)
-        return coordinates * (2.0 / last) - 1.0
+        return 2.0 * coordinates / last - 1.0  # divided last: keeps float64 exact
 
     def all_voxels(self, device: torch.device | str = "cpu") -> Tensor:
         """Every voxel's integer coordinate (X*Y*Z, 3), last axis fastest."""

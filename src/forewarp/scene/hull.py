@@ -18,7 +18,7 @@ def visual_hull(points: Tensor, cameras: list[Camera], masks: list[Tensor], miss
         misses: views that may disagree.
 
     Returns:
-        (N,) bool. A point that no view sees is outside.
+        (N,) bool. A point that fewer than half of the views see is outside.
     """
     against = torch.zeros(len(points), dtype=torch.int32)
     seen = torch.zeros(len(points), dtype=torch.int32)
@@ -29,4 +29,4 @@ def visual_hull(points: Tensor, cameras: list[Camera], masks: list[Tensor], miss
         on = mask[row.clamp(0, camera.height - 1), column.clamp(0, camera.width - 1)]
         against += (visible & ~on).int()
         seen += visible.int()
-    return (seen > 0) & (against <= misses)
+    return (2 * seen >= len(cameras)) & (seen > misses) & (against <= misses)

@@ -55,11 +55,21 @@ class RandomPatches:
         pose = look_at(self.focus + mixed * radius, self.focus, self.up)
         camera = self.cameras[i]
         camera = Camera(
-            camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, pose, camera.near, camera.far
+            camera.width,
+            camera.height,
+            camera.fx,
+            camera.fy,
+            camera.cx,
+            camera.cy,
+            pose,
+            camera.near,
+            camera.far,
         )
         span = torch.tensor([max(1, camera.height - self.size), max(1, camera.width - self.size)])
         corner = (torch.rand(self.patches, 2, generator=generator) * span).long()
-        inner = torch.stack(torch.meshgrid(torch.arange(self.size), torch.arange(self.size), indexing="ij"), -1)
+        inner = torch.stack(
+            torch.meshgrid(torch.arange(self.size), torch.arange(self.size), indexing="ij"), -1
+        )
         at = corner[:, None, None] + inner
         return camera.rays((at[..., 0] * camera.width + at[..., 1]).reshape(-1))
 
@@ -83,7 +93,15 @@ def orbit(camera: Camera, focus: Tensor, up: Tensor, turns: Tensor) -> list[Came
         pose = look_at(center, focus, up)
         views.append(
             Camera(
-                camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, pose, camera.near, camera.far
+                camera.width,
+                camera.height,
+                camera.fx,
+                camera.fy,
+                camera.cx,
+                camera.cy,
+                pose,
+                camera.near,
+                camera.far,
             )
         )
     return views

@@ -81,9 +81,7 @@ class RadianceGrid:
     @property
     def fill(self) -> Tensor:
         """What an absent voxel reads (1 + C,)."""
-        return torch.nn.functional.pad(
-            self.values.new_full((1,), EMPTY), (0, self.values.shape[1] - 1)
-        )
+        return torch.nn.functional.pad(self.values.new_full((1,), EMPTY), (0, self.values.shape[1] - 1))
 
     @property
     def cells(self) -> Tensor:
@@ -91,9 +89,7 @@ class RadianceGrid:
         if self.skip_alpha <= 0 or not len(self.values):
             return occupied_cells(self.index)
         low = self.activation.raw(self.skip_alpha, self.lattice.pitch)
-        keep = torch.cat([self.raw_density.detach() > low, self.values.new_zeros(1, dtype=torch.bool)])
-        kept = keep[self.index.long()]  # -1 reads the last entry: False
-        return occupied_cells(torch.where(kept, 0, -1))
+        return occupied_cells(self.index, self.raw_density.detach() > low)
 
     def density(self, points: Tensor) -> Tensor:
         """Sigma (P,) at lattice coordinates (P, 3)."""

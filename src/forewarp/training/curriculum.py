@@ -18,6 +18,8 @@ class Curriculum:
         all_in: fraction of the stage at which all are in play; 0: from the start.
         newest_share: share of the draws that goes to the newest part.
         newest_part: that part, as a share of the frames in play.
+        error_share: share of the draws in which a frame's chance is its own last error, told by ``report``: the
+            ends of a sequence are hard, and one in two hundred frames has little say.
         seed: of the draws.
     """
 
@@ -30,6 +32,7 @@ class Curriculum:
         all_in: float = 0.6,
         newest_share: float = 0.3,
         newest_part: float = 0.125,
+        error_share: float = 0.0,
         seed: int = 0,
     ) -> None:
         if not (start >= 1 and 0 <= all_in <= 1 and 0 <= newest_share <= 1 and 0 < newest_part <= 1):
@@ -40,6 +43,8 @@ class Curriculum:
         self.order = sorted(range(len(times)), key=lambda i: (abs(times[i] - canonical_time), i))
         self.start, self.all_in = min(start, len(times)), all_in
         self.newest_share, self.newest_part = newest_share, newest_part
+        self.error_share = error_share
+        self.errors = torch.full((len(times),), float("nan"))
         self.fraction = 0.0
         self.generator = torch.Generator().manual_seed(seed)
 
@@ -56,17 +61,37 @@ class Curriculum:
     def __call__(self) -> int:
         """The next training frame."""
         playing = self.in_play
+        if self.error_share > 0 and float(torch.rand((), generator=self.generator)) < self.error_share:
+            return self._by_error()
         newest = max(1, int(playing * self.newest_part))
         growing = playing < len(self.order)
         favour = growing and float(torch.rand((), generator=self.generator)) < self.newest_share
         low = playing - newest if favour else 0
         return self.order[int(torch.randint(low, playing, (), generator=self.generator))]
 
+    def report(self, frame: int, error: float) -> None:
+        """Tell the squared error of a frame that was just trained on."""
+        before = float(self.errors[frame])
+        self.errors[frame] = error if before != before else 0.5 * (before + error)
+
+    def _by_error(self) -> int:
+        frames = self.order[: self.in_play]
+        errors = self.errors[frames]
+        known = errors[~errors.isnan()]
+        # A frame not yet seen counts as the worst one.
+        chance = torch.nan_to_num(errors, nan=float(known.max()) if len(known) else 1.0) + 1e-8
+        return frames[int(torch.multinomial(chance, 1, generator=self.generator))]
+
     def state_dict(self) -> dict:
         """The draws' generator and the fraction done."""
-        return {"generator": self.generator.get_state(), "fraction": self.fraction}
+        return {
+            "generator": self.generator.get_state(),
+            "fraction": self.fraction,
+            "errors": self.errors.clone(),
+        }
 
     def load_state_dict(self, state: dict) -> None:
         """Continue where ``state_dict`` was taken."""
         self.generator.set_state(state["generator"])
         self.fraction = state["fraction"]
+        self.errors = state["errors"].clone()

@@ -40,12 +40,18 @@ class Handover:
 def write_json(path: Path, content: dict) -> None:
     """Write beside, then rename, so that half a file is never taken for one."""
     beside = path.with_name(path.name + ".part")
-    beside.write_text(json.dumps(content, indent=2) + "\n")
+    beside.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
     os.replace(beside, path)
 
 
 def make_handover(
-    method: nn.Module, scene: Scene, unit: float, frames_in_play: int, *, alpha: float = 1e-2, pad: float = 2.0
+    method: nn.Module,
+    scene: Scene,
+    unit: float,
+    frames_in_play: int,
+    *,
+    alpha: float = 1e-2,
+    pad: float = 2.0,
 ) -> Handover:
     """The tight box of a fitted stage.
 
@@ -104,13 +110,17 @@ def carried_method(
         for k, v in theirs.items()
         if torch.is_tensor(v) and k in own and own[k].shape == v.shape and not k.startswith("radiance.")
     }
-    network = {k: v for k, v in theirs.items() if k.startswith("radiance.network") and own[k].shape == v.shape}
+    network = {
+        k: v for k, v in theirs.items() if k.startswith("radiance.network") and own[k].shape == v.shape
+    }
     own.update(rest | network)
     method.load_state_dict(own)
     return method
 
 
-def _build(spec: MethodSpec, settings: StageSettings, scene: Scene, lattice: Lattice, active: Tensor, unit: float):
+def _build(
+    spec: MethodSpec, settings: StageSettings, scene: Scene, lattice: Lattice, active: Tensor, unit: float
+):
     return spec.build(
         lattice,
         active,
@@ -137,11 +147,12 @@ def _hull(scene: Scene, lattice: Lattice, settings: StageSettings, frames: list[
         raise ValueError(
             f"stage.{settings.name}.start: expected box, since the images of '{scene.name}' have no alpha, but got hull"
         )
-    grow = 2 * settings.hull_grow + 1
+    frames = frames[: settings.hull_frames]
     masks = []
     for i in frames:
+        pixels = max(1, round(settings.hull_grow * scene.train[i].camera.width))
         alpha = (scene.train[i].load()[..., 3] > 127).float()
-        grown = torch.nn.functional.max_pool2d(alpha[None], grow, stride=1, padding=settings.hull_grow)
+        grown = torch.nn.functional.max_pool2d(alpha[None], 2 * pixels + 1, stride=1, padding=pixels)
         masks.append(grown[0].bool())
     points = lattice.to_world(lattice.all_voxels())
     hull = visual_hull(points, [scene.train[i].camera for i in frames], masks, settings.hull_misses)

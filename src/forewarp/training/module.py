@@ -51,7 +51,7 @@ class DynamicSceneModule(lightning.LightningModule):
         self.patches = RandomPatches(cameras, patches=settings.patches) if cameras else None
         self.generator = torch.Generator().manual_seed(seed)
         self.clock = Clock()
-        self.lattice_voxels = settings.at("voxels", 0.0)
+        self.lattice_voxels, self.lattice_step = settings.at("voxels", 0.0), 0
         self.last: dict[str, float] = {}
 
     @property
@@ -97,6 +97,7 @@ class DynamicSceneModule(lightning.LightningModule):
     def _remember(self, loss: Tensor, raw: dict[str, Tensor], step: Step) -> None:
         best = list(step.renderings.values())[-1]
         error = float((best.rgb.detach() - step.batch.rgb).square().mean())
+        self.curriculum.report(step.batch.frame, error)
         self.last = {
             "loss": float(loss.detach()),
             "psnr": -10 * torch.log10(torch.tensor(max(error, 1e-10))).item(),
@@ -140,15 +141,18 @@ class DynamicSceneModule(lightning.LightningModule):
         bases = settings.at("bases", fraction)
         if motion is not None and bases is not None:
             motion.trajectory.bases_in_play.fill_(min(int(bases), motion.trajectory.bases))
-        voxels = settings.at("voxels", fraction)
+        self._follow_lattice(settings.at("voxels", fraction), fraction, optimizer)
+
+    def _follow_lattice(self, voxels: float, fraction: float, optimizer: torch.optim.Optimizer) -> None:
+        settings, step, radiance = self.settings, self.global_step, self.method.radiance
+        only_seen = settings.see_steps > 0 and step - self.lattice_step >= settings.see_steps
+        common = {"keep_alpha": settings.keep_alpha, "optimizer": optimizer, "only_seen": only_seen}
+        due = settings.refresh_every and step and step % settings.refresh_every == 0
         if voxels != self.lattice_voxels:
-            radiance = self.method.radiance
-            resample(radiance, radiance.lattice.box, voxels, keep_alpha=settings.keep_alpha, optimizer=optimizer)
-            self.lattice_voxels = voxels
-        elif settings.refresh_every and step and step % settings.refresh_every == 0 and fraction >= settings.refresh_from:
-            refresh(
-                self.method.radiance, optimizer, keep_alpha=settings.keep_alpha, birth_alpha=settings.birth_alpha
-            )
+            resample(radiance, radiance.lattice.box, voxels, **common)
+            self.lattice_voxels, self.lattice_step = voxels, step
+        elif due and fraction >= settings.refresh_from:
+            refresh(radiance, birth_alpha=settings.birth_alpha, **common)
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """Adam with the ancestors' betas; a rate of its own for every kind of parameter."""
@@ -162,7 +166,9 @@ class DynamicSceneModule(lightning.LightningModule):
             groups.append({"params": parameters, "lr": rate, "base_rate": rate, "name": kind})
         return torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-8, fused=True)
 
-    def configure_gradient_clipping(self, optimizer, gradient_clip_val=None, gradient_clip_algorithm=None) -> None:
+    def configure_gradient_clipping(
+        self, optimizer, gradient_clip_val=None, gradient_clip_algorithm=None
+    ) -> None:
         """Clip the gradients' norm where the stage asks for it."""
         if self.settings.max_gradient > 0:
             torch.nn.utils.clip_grad_norm_(self.method.parameters(), self.settings.max_gradient)
@@ -173,7 +179,7 @@ class DynamicSceneModule(lightning.LightningModule):
             "generator": self.generator.get_state(),
             "curriculum": self.curriculum.state_dict(),
             "clock": self.clock.state_dict(),
-            "lattice_voxels": self.lattice_voxels,
+            "lattice": [self.lattice_voxels, self.lattice_step],
         }
 
     def on_load_checkpoint(self, checkpoint: dict) -> None:
@@ -182,24 +188,34 @@ class DynamicSceneModule(lightning.LightningModule):
         self.generator.set_state(state["generator"])
         self.curriculum.load_state_dict(state["curriculum"])
         self.clock.load_state_dict(state["clock"])
-        self.lattice_voxels = state["lattice_voxels"]
+        self.lattice_voxels, self.lattice_step = state["lattice"]
 
     @torch.no_grad()
-    def render_image(self, camera: Camera, time: float, background: Tensor, state: State | None = None) -> Rendering:
+    def render_image(
+        self, camera: Camera, time: float, background: Tensor, state: State | None = None
+    ) -> Rendering:
         """A whole picture, by the best rendering. ``state`` of the same time may be handed in to save the warp."""
         state = state or self.method.at(time)
         field = list(state.fields.values())[-1]
         return render_all(self.renderer, field, camera.rays().to(self.device), background, self.method.view)
 
 
-def render_all(renderer: Renderer, field, rays: Rays, background: Tensor, view, chunk: int = 16384) -> Rendering:
+def render_all(
+    renderer: Renderer, field, rays: Rays, background: Tensor, view, chunk: int = 16384
+) -> Rendering:
     """Render many rays in chunks; the samples' arrays are left empty."""
     parts = []
     with torch.no_grad():
         for begin in range(0, len(rays), chunk):
             parts.append(renderer(field, rays[begin : begin + chunk], background, view))
     none = parts[0].weights[:0]
-    joined = {k: torch.cat([getattr(p, k) for p in parts]) for k in ("rgb", "depth", "opacity", "transmittance")}
+    joined = {
+        k: torch.cat([getattr(p, k) for p in parts]) for k in ("rgb", "depth", "opacity", "transmittance")
+    }
     return Rendering(
-        **joined, weights=none, colors=parts[0].colors[:0], ray_ids=parts[0].ray_ids[:0], samples=sum(p.samples for p in parts)
+        **joined,
+        weights=none,
+        colors=parts[0].colors[:0],
+        ray_ids=parts[0].ray_ids[:0],
+        samples=sum(p.samples for p in parts),
     )

@@ -26,10 +26,12 @@ class Step:
     renderings: dict[str, Rendering]
     render_patches: Callable[[], tuple[Tensor, Tensor]]
 
+    neighbours: Callable[[Tensor], list[tuple[Tensor, Tensor]]] = neighbour_pairs
+
     @cached_property
     def pairs(self) -> list[tuple[Tensor, Tensor]]:
         """Neighbouring canonical voxels."""
-        return neighbour_pairs(self.state.canonical.index)
+        return self.neighbours(self.state.canonical.index)
 
 
 def _over_renderings(term: Callable[[Step, Rendering], Tensor]) -> Callable[[Step], Tensor]:
@@ -52,7 +54,9 @@ def _terms(literal: frozenset[str]) -> dict[str, Callable[[Step], Tensor | None]
         return losses.background_entropy(r.transmittance)
 
     return {
-        "photo": _over_renderings(lambda s, r: losses.photometric(r.rgb, s.batch.rgb, literal="photo" in literal)),
+        "photo": _over_renderings(
+            lambda s, r: losses.photometric(r.rgb, s.batch.rgb, literal="photo" in literal)
+        ),
         "point_color": _over_renderings(
             lambda s, r: losses.point_color(
                 r.weights, r.colors, r.ray_ids, s.batch.rgb, literal="point_color" in literal
@@ -90,15 +94,21 @@ class Objective:
         for name in (*weights, *self.every, *literal):
             if name not in known:
                 raise ValueError(f"objective: expected a term of {', '.join(known)}, but got '{name}'")
+        if any(not (n >= 1 and n == int(n)) for n in self.every.values()):
+            raise ValueError(f"objective.every: expected whole numbers of steps >= 1, but got {self.every}")
         self.weights = {name: float(w) for name, w in weights.items()}
         self.terms = known
         self.photo_on = tuple(photo_on) if photo_on is not None else None
         self.needs_all_weights = "background_entropy" in literal
+        self._pairs: tuple[Tensor, list[tuple[Tensor, Tensor]]] | None = None
 
     def __call__(self, step: Step, number: int) -> tuple[Tensor, dict[str, Tensor]]:
         """The loss of step ``number`` and every term evaluated, raw, by name."""
         if self.photo_on is not None:
-            step.renderings = {k: v for k, v in step.renderings.items() if k in self.photo_on} or step.renderings
+            step.renderings = {
+                k: v for k, v in step.renderings.items() if k in self.photo_on
+            } or step.renderings
+        step.neighbours = self._neighbours
         loss, raw = torch.zeros(()), {}
         for name, weight in self.weights.items():
             every = self.every.get(name, 1)
@@ -110,3 +120,8 @@ class Objective:
             raw[name] = value.detach()
             loss = loss.to(value) + weight * every * value
         return loss, raw
+
+    def _neighbours(self, index: Tensor) -> list[tuple[Tensor, Tensor]]:
+        if self._pairs is None or self._pairs[0] is not index:  # the active voxels changed
+            self._pairs = (index, neighbour_pairs(index))
+        return self._pairs[1]

@@ -22,12 +22,15 @@ class StageSettings:
         upsample: plain interpolation by this factor in place of the model's up-sampler; null: the model's.
         carry: start from the stage before; otherwise only its box is used.
         start: what is active at the beginning, ``box`` or ``hull`` (needs alpha).
-        hull_grow: pixels by which silhouettes are grown, since the scene moves; hull_misses: views that may
-            disagree.
+        hull_frames: the hull is that of so many frames nearest to the canonical time; few, or what moves fast
+            is carved away. hull_grow: share of the image's width by which silhouettes are grown, since the scene
+            moves. hull_misses: views that may disagree.
         hold: fraction up to which rates are constant; after it they fall exponentially to ``final_rate``.
         refresh_every: steps between updates of the active voxels; 0: never. refresh_from: fraction.
         keep_alpha, birth_alpha: opacity over a voxel that is kept, and that new voxels start with.
+        see_steps: voxels that no view has seen for so many steps are forgotten; 0: kept.
         start_alpha: opacity over a voxel of the first active voxels.
+        color_threshold: the renderer's in this stage; null: as elsewhere.
         bases: ``[[fraction, K], ...]``: how many bases play from that fraction on; empty: all.
         curriculum: arguments of ``Curriculum``.
         patches: patches a draw for the depth term.
@@ -43,15 +46,18 @@ class StageSettings:
     upsample: float | None = None
     carry: bool = True
     start: str = "box"
-    hull_grow: int = 4
-    hull_misses: int = 1
+    hull_grow: float = 0.01
+    hull_misses: int = 0
+    hull_frames: int = 5
     hold: float = 0.0
     final_rate: float = 0.1
     refresh_every: int = 0
     refresh_from: float = 0.0
     keep_alpha: float = 1e-3
     birth_alpha: float = 5e-4
+    see_steps: int = 0
     start_alpha: float = 0.05
+    color_threshold: float | None = None
     bases: Sequence[Sequence[float]] = ()
     curriculum: Mapping[str, float] = field(default_factory=dict)
     patches: int = 16
@@ -60,22 +66,32 @@ class StageSettings:
     def __post_init__(self) -> None:
         where = f"stage.{self.name}"
         if self.iterations is None and self.minutes is None:
-            raise ValueError(f"{where}: expected iterations or minutes, but got neither; set budget.minutes=10")
+            raise ValueError(
+                f"{where}: expected iterations or minutes, but got neither; set budget.minutes=10"
+            )
         for key in ("iterations", "minutes"):
             value = getattr(self, key)
             if value is not None and not value > 0:
                 raise ValueError(f"{where}.{key}: expected a number > 0, but got {value}")
         for key in ("voxels", "bases"):
             steps = [tuple(s) for s in getattr(self, key)]
-            if (key == "voxels" and not steps) or any(len(s) != 2 or not 0 <= s[0] <= 1 or s[1] < 1 for s in steps):
-                raise ValueError(f"{where}.{key}: expected [[fraction, count], ...], but got {getattr(self, key)}")
+            if (key == "voxels" and not steps) or any(
+                len(s) != 2 or not 0 <= s[0] <= 1 or s[1] < 1 for s in steps
+            ):
+                raise ValueError(
+                    f"{where}.{key}: expected [[fraction, count], ...], but got {getattr(self, key)}"
+                )
         if not set(self.effects) <= set(EFFECTS):
-            raise ValueError(f"{where}.effects: expected some of {', '.join(EFFECTS)}, but got {list(self.effects)}")
+            raise ValueError(
+                f"{where}.effects: expected some of {', '.join(EFFECTS)}, but got {list(self.effects)}"
+            )
         if self.start not in ("box", "hull"):
             raise ValueError(f"{where}.start: expected box or hull, but got '{self.start}'")
-        if not self.birth_alpha < self.keep_alpha < 1:
+        if not 0 < self.start_alpha < 1:
+            raise ValueError(f"{where}.start_alpha: expected a number in (0, 1), but got {self.start_alpha}")
+        if not 0 < self.birth_alpha < self.keep_alpha < 1:
             raise ValueError(
-                f"{where}: expected birth_alpha < keep_alpha < 1, or fog spreads, but got {self.birth_alpha}, {self.keep_alpha}"
+                f"{where}: expected 0 < birth_alpha < keep_alpha < 1, or fog spreads, but got {self.birth_alpha}, {self.keep_alpha}"
             )
 
     def at(self, key: str, fraction: float) -> float | None:

@@ -26,6 +26,7 @@ from forewarp.training.handover import (
 )
 from forewarp.training.module import DynamicSceneModule
 from forewarp.training.objective import Objective
+from forewarp.training.protocol import peak_memory_bytes
 from forewarp.training.settings import StageSettings
 
 
@@ -42,7 +43,7 @@ class Run:
     """All stages of one scene.
 
     Args:
-        datamodule: serves the scene (``.scene``, ``.picker``, batches).
+        datamodule: serves the scene (``.scene``, ``.picker``, ``.restart``, batches).
         spec: the method.
         stages: in order.
         renderer: of training and evaluation.
@@ -72,6 +73,7 @@ class Run:
             folder.mkdir(parents=True, exist_ok=True)
             # Every stage draws anew, so that skipping a finished one changes nothing that follows.
             lightning.seed_everything(self.seed + number, verbose=False)
+            self.datamodule.restart(number)
             module, unit = self._module(stage, module, handover, number)
             if self.is_finished(stage):
                 load_weights(module, folder / "last.ckpt")
@@ -106,14 +108,10 @@ class Run:
         """Whether a stage was fitted to its end."""
         return (self.stage_folder(stage) / "done.json").is_file()
 
-    def seconds(self) -> dict[str, float]:
-        """Training seconds by stage."""
-        found = {}
-        for stage in self.stages:
-            path = self.stage_folder(stage) / "done.json"
-            if path.is_file():
-                found[stage.settings.name] = json.loads(path.read_text())["seconds"]
-        return found
+    def finished(self) -> dict[str, dict]:
+        """What finished stages noted at their end, by name: seconds, steps, peak memory and so on."""
+        paths = {stage.settings.name: self.stage_folder(stage) / "done.json" for stage in self.stages}
+        return {name: json.loads(path.read_text()) for name, path in paths.items() if path.is_file()}
 
     def _module(
         self, stage: Stage, before: DynamicSceneModule | None, handover: Handover | None, number: int
@@ -129,7 +127,7 @@ class Run:
             method, unit = fresh_method(self.spec, settings, scene, box, unit, curriculum.frames())
         module = DynamicSceneModule(
             method,
-            renderer=self.renderer,
+            renderer=self.renderer.with_threshold(settings.color_threshold),
             objective=stage.objective,
             settings=settings,
             curriculum=curriculum,
@@ -159,6 +157,7 @@ class Run:
                 "steps": module.global_step,
                 "parameters": parameter_count(module.method),
                 "frames_in_play": module.curriculum.in_play,
+                "peak_memory_bytes": peak_memory_bytes(),
             },
         )
 
@@ -189,8 +188,12 @@ class KeepCheckpoint(lightning.Callback):
     def save(self, trainer: lightning.Trainer) -> None:
         """Save now."""
         beside = self.path.with_name(self.path.name + ".part")
-        trainer.save_checkpoint(beside)
-        os.replace(beside, self.path)
+        try:
+            trainer.save_checkpoint(beside)
+            os.replace(beside, self.path)
+        except OSError as error:  # a full disk does not say which file
+            beside.unlink(missing_ok=True)
+            raise OSError(error.errno, error.strerror or str(error), str(self.path)) from error
 
 
 def check_checkpoint(path: Path, module: DynamicSceneModule) -> dict:
@@ -202,7 +205,9 @@ def check_checkpoint(path: Path, module: DynamicSceneModule) -> dict:
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:
-        raise ValueError(f"{path}: expected a checkpoint, but it cannot be read ({type(error).__name__}); delete it") from None
+        raise ValueError(
+            f"{path}: expected a checkpoint, but it cannot be read ({type(error).__name__}); delete it"
+        ) from None
     own, theirs = set(module.state_dict()), set(content.get("state_dict", {}))
     if own != theirs:
         differ = sorted(own ^ theirs)[:3]

@@ -9,13 +9,24 @@ from torch.nn import Parameter
 from forewarp.fields.voxel_grid import VoxelGrid
 from forewarp.ops.grid import dilate, trilinear
 from forewarp.scene.box import Box, Lattice
+from forewarp.scene.state import EMPTY
 
 
-def occupied(radiance: VoxelGrid, keep_alpha: float) -> Tensor:
-    """Voxels (X, Y, Z) bool whose opacity over one voxel exceeds ``keep_alpha``."""
+def seen_rows(radiance: VoxelGrid, optimizer: torch.optim.Optimizer) -> Tensor:
+    """Voxels (N,) bool whose colour has had a gradient since the moments began: some view has seen them."""
+    name = "color" if "color" in radiance.names else radiance.names[0]
+    moments = optimizer.state.get(radiance.parameter(name), {}).get("exp_avg_sq")
+    if moments is None:
+        return torch.ones(len(radiance.voxels), dtype=torch.bool, device=radiance.voxels.device)
+    return moments.amax(-1) > 0
+
+
+def occupied(radiance: VoxelGrid, keep_alpha: float, seen: Tensor | None = None) -> Tensor:
+    """Voxels (X, Y, Z) bool whose opacity over one voxel exceeds ``keep_alpha``, and that are ``seen`` (N,)."""
     with torch.no_grad():
         grid = radiance()
     solid = grid.activation.alpha(grid.raw_density, grid.lattice.pitch) > keep_alpha
+    solid = solid if seen is None else solid & seen
     mask = torch.zeros(grid.lattice.shape, dtype=torch.bool, device=solid.device)
     x, y, z = radiance.voxels[solid].unbind(-1)
     mask[x, y, z] = True
@@ -24,7 +35,12 @@ def occupied(radiance: VoxelGrid, keep_alpha: float) -> Tensor:
 
 @torch.no_grad()
 def refresh(
-    radiance: VoxelGrid, optimizer: torch.optim.Optimizer, *, keep_alpha: float, birth_alpha: float, allowed=None
+    radiance: VoxelGrid,
+    optimizer: torch.optim.Optimizer,
+    *,
+    keep_alpha: float,
+    birth_alpha: float,
+    only_seen: bool = False,
 ) -> bool:
     """Keep what is occupied and one voxel around it; forget the rest. The optimiser's moments follow.
 
@@ -35,17 +51,15 @@ def refresh(
         optimizer: holds moments by row.
         keep_alpha: opacity over one voxel above which a voxel is occupied.
         birth_alpha: what a new voxel starts with; below ``keep_alpha``, or fog spreads.
-        allowed: (X, Y, Z) bool, voxels that may be active at all; None for every one.
+        only_seen: also forget what no view has seen since the moments began, the inside of things.
 
     Returns:
         Whether the active set changed.
     """
-    mask = occupied(radiance, keep_alpha)
+    mask = occupied(radiance, keep_alpha, seen_rows(radiance, optimizer) if only_seen else None)
     if not bool(mask.any()):
         return False
     active = dilate(mask, 1)
-    if allowed is not None:
-        active &= allowed | mask
     if bool((active == (radiance.index >= 0)).all()):
         return False
     before = [radiance.parameter(n) for n in radiance.names]
@@ -83,7 +97,13 @@ def renew_parameters(
 
 @torch.no_grad()
 def resample(
-    radiance: VoxelGrid, box: Box, voxels: float, *, keep_alpha: float, optimizer: torch.optim.Optimizer | None = None
+    radiance: VoxelGrid,
+    box: Box,
+    voxels: float,
+    *,
+    keep_alpha: float,
+    optimizer: torch.optim.Optimizer | None = None,
+    only_seen: bool = False,
 ) -> None:
     """Carry the field to a lattice of about ``voxels`` over ``box``; active is what is occupied there, dilated.
 
@@ -92,7 +112,10 @@ def resample(
     source = radiance()
     lattice = Lattice.of_count(box, voxels)
     points = source.lattice.to_lattice(lattice.to_world(lattice.all_voxels(source.values.device)))
-    raw = trilinear(source.values[:, :1].contiguous(), source.index, points, source.fill[:1])[:, 0]
+    raw = source.values[:, :1].detach()
+    if only_seen and optimizer is not None:
+        raw = torch.where(seen_rows(radiance, optimizer)[:, None], raw, EMPTY)
+    raw = trilinear(raw.contiguous(), source.index, points, source.fill[:1])[:, 0]
     last = torch.tensor(source.lattice.shape, device=points.device) - 1
     inside = ((points >= 0) & (points <= last)).all(-1)
     solid = (source.activation.alpha(raw, source.lattice.pitch) > keep_alpha) & inside
@@ -126,4 +149,5 @@ def box_of_all_times(method, times: list[float], *, alpha: float, pad: float) ->
         for time in times:
             at = method.trajectories(home, torch.tensor([time]))[:, 0]
             low, high = torch.minimum(low, at.amin(0)), torch.maximum(high, at.amax(0))
-    return Box(tuple(low.tolist()), tuple(high.tolist())).padded(pad * grid.lattice.pitch)
+    margin = pad * grid.lattice.pitch  # added first: a flat thing has no box of its own
+    return Box(tuple((low - margin).tolist()), tuple((high + margin).tolist()))

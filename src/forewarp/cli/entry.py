@@ -1,0 +1,188 @@
+"""What all commands share: where conf/ is, one line for a mistake, and the help."""
+
+from __future__ import annotations
+
+import errno
+import logging
+import os
+import re
+import sys
+import traceback
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+ROOT_VARIABLE, TRACEBACK_VARIABLE = "FOREWARP_ROOT", "FOREWARP_TRACEBACK"
+MISTAKE, INTERRUPTED = 2, 130
+
+
+def project_root() -> Path:
+    """The folder that holds ``conf/``: the checkout, or what ``FOREWARP_ROOT`` names.
+
+    Raises:
+        ValueError: where there is no ``conf/``.
+    """
+    named = os.environ.get(ROOT_VARIABLE)
+    root = Path(named).expanduser().resolve() if named else Path(__file__).resolve().parents[3]
+    if not (root / "conf" / "train.yaml").is_file():
+        raise ValueError(
+            f"{root / 'conf'}: expected the configuration files, but got none; "
+            f"install with pip install -e from a checkout, or set {ROOT_VARIABLE} to one"
+        )
+    return root
+
+
+def command(name: str, task: Callable, text: str) -> None:
+    """Run a console script: compose ``conf/<name>.yaml`` with the command line and hand it to ``task``.
+
+    Never returns: exits with 0; with 2 and one line for a mistake of the user's; with 130 on Ctrl-C.
+    ``FOREWARP_TRACEBACK=1`` shows the whole story.
+
+    Args:
+        name: of the config file and of the command after ``forewarp-``.
+        task: takes the composed config.
+        text: what ``--help`` says first.
+    """
+    quiet()
+    try:
+        root = project_root()
+        os.environ[ROOT_VARIABLE] = str(root)
+        if {"-h", "--help"} & set(sys.argv[1:]):
+            print(text.strip() + "\n\n" + choices(root / "conf", name), flush=True)
+            sys.exit(0)
+        failures = _run(name, task, root / "conf")
+    except KeyboardInterrupt:
+        _interrupted(name)
+    except BrokenPipeError:  # whoever read the output has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(0)
+    except SystemExit as leaving:
+        # Lightning turns Ctrl-C into an exit of its own.
+        if isinstance(leaving.__context__, KeyboardInterrupt):
+            _interrupted(name)
+        raise
+    except Exception as error:
+        failures = [_tell(name, error)]
+    sys.exit(max(failures, default=0))
+
+
+def quiet() -> None:
+    """Settings that must stand before torch is imported, and silence for Lightning's small talk."""
+    # On a busy machine threads that spin while they wait are many times slower.
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+    # Hydra then raises what it would print.
+    os.environ["HYDRA_FULL_ERROR"] = "1"
+    logging.disable(logging.INFO)
+    logging.getLogger("forewarp.metrics").setLevel(logging.ERROR)  # the table says it
+    if TRACEBACK_VARIABLE not in os.environ:
+        warnings.filterwarnings("ignore", module=r"(lightning|torch|tensorboard|numba)(\..*)?$")
+        warnings.filterwarnings("ignore", message=".*LeafSpec.*", category=FutureWarning)
+
+
+def _run(name: str, task: Callable, conf: Path) -> list[int]:
+    """Exit statuses of the jobs that failed; with ``--multirun`` the others still run."""
+    import hydra
+
+    failures = []
+
+    def job(config) -> None:
+        # Caught here, as Hydra would add a line of its own.
+        try:
+            task(config)
+        except Exception as error:
+            failures.append(_tell(name, error))
+
+    hydra.main(version_base="1.3", config_path=str(conf), config_name=name)(job)()
+    return failures
+
+
+def _tell(name: str, error: Exception) -> int:
+    """Say what went wrong and return the exit status."""
+    line = one_line(error)
+    if line is None or os.environ.get(TRACEBACK_VARIABLE) == "1":
+        traceback.print_exception(error)
+    print(f"forewarp-{name}: error: {line or _bug(error)}", file=sys.stderr)
+    return 1 if line is None else MISTAKE
+
+
+def _interrupted(name: str) -> None:
+    say = "run the same command again" + (" to go on from the last checkpoint" if name == "train" else "")
+    print(f"\nforewarp-{name}: interrupted; {say}", file=sys.stderr)
+    sys.exit(INTERRUPTED)
+
+
+def _bug(error: Exception) -> str:
+    return f"{type(error).__name__}: {_flat(str(error))}; this is a bug, please report it"
+
+
+def one_line(error: BaseException) -> str | None:
+    """What a user should read of an error that is his to mend; None where it is ours."""
+    from hydra.errors import HydraException, InstantiationException
+    from omegaconf.errors import OmegaConfBaseException
+
+    if isinstance(error, InstantiationException):
+        where = _after(str(error), "full_key:")
+        if isinstance(error.__cause__, ValueError | OSError | ImportError):
+            return one_line(error.__cause__)
+        return f"{where or 'config'}: {_flat(str(error.__cause__ or error))}"
+    missing = re.search(r"Missing mandatory value: ([\w.]+)", str(error))
+    if missing and isinstance(error, OmegaConfBaseException):
+        return f"{missing[1]}: expected a value, but got none; set {missing[1]}=..."
+    if getattr(error, "override", None):  # what Hydra could not parse
+        return f"{error.override}: {_flat(str(error))}"
+    if isinstance(error, HydraException | OmegaConfBaseException):
+        cause = error.__cause__
+        detail = f" ({_flat(str(cause))})" if isinstance(cause, OmegaConfBaseException) else ""
+        return _flat(str(error).split("Config search path")[0]) + detail
+    if isinstance(error, OSError):
+        return _of_system(error)
+    if isinstance(error, TypeError) and "unexpected keyword argument" in str(error):
+        return f"config: {error}; leave that key out"
+    if isinstance(error, ImportError):
+        return _flat(str(error)) + ("" if "forewarp[" in str(error) else "; install it with make install")
+    return _flat(str(error)) if isinstance(error, ValueError) else None
+
+
+def _of_system(error: OSError) -> str:
+    reason, file = error.strerror or str(error), error.filename
+    full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+    advice = (
+        "free some room and run the same command again" if full else "check that it exists and may be written"
+    )
+    expected = "room to write" if full else "a usable file or folder"
+    return f"{file or 'a file'}: expected {expected}, but got {reason}; {advice}"
+
+
+def _after(text: str, mark: str) -> str:
+    """The rest of the line after ``mark``; empty where it does not occur."""
+    return text.split(mark, 1)[1].strip().splitlines()[0] if mark in text else ""
+
+
+def _flat(text: str) -> str:
+    lines = [line.strip() for line in text.splitlines()]
+    kept = [line for line in lines if line and not line.startswith(("full_key:", "object_type="))]
+    return "; ".join(kept).replace(":; ", ": ").replace(".; ", "; ")
+
+
+def choices(conf: Path, name: str) -> str:
+    """The options of every group that ``<name>.yaml`` uses, for the help."""
+    if name != "train":
+        groups = ["trainer"] if "trainer:" in (conf / f"{name}.yaml").read_text() else []
+    else:
+        silent = {"hydra", "paths", "callbacks"}
+        folders = [path for path in sorted(conf.rglob("*")) if path.is_dir() and path.name != "one"]
+        groups = [
+            p.relative_to(conf).as_posix() for p in folders if p.relative_to(conf).parts[0] not in silent
+        ]
+    found = {group: sorted(path.stem for path in (conf / group).glob("*.yaml")) for group in groups}
+    if name == "train":
+        found["sweeps"] = [
+            f"{path.stem} (with --multirun)" for path in sorted((conf.parent / "sweeps").glob("*.yaml"))
+        ]
+    lines = [f"  {group:<17} {' | '.join(options)}" for group, options in found.items() if options]
+    more = [
+        "Every other key: --cfg job prints them all; key=value sets one.",
+        "Hydra's own options: --hydra-help.",
+    ]
+    return "\n".join((["Choices (group=option):", *lines, ""] if lines else []) + more)

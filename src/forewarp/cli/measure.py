@@ -1,0 +1,116 @@
+"""Evaluation with a progress line, and the table it ends with."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import torch
+from omegaconf import DictConfig
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from forewarp.metrics.lpips import find_lpips
+from forewarp.metrics.suite import METRICS, ImageSuite
+from forewarp.training.evaluation import evaluate
+from forewarp.training.module import DynamicSceneModule
+from forewarp.training.progress import ProgressLine, time_text
+from forewarp.training.stages import Run
+
+
+def measure(run: Run, module: DynamicSceneModule, config: DictConfig) -> dict:
+    """Evaluate a fitted run into its folder and print the table."""
+    extra = config.lpips_weights
+    suite = ImageSuite(find_lpips(extra=[extra] if isinstance(extra, str) else extra))
+    module.to(device_of(config.trainer.accelerator))
+    protocol = {"method": config.model.warp, "budget": config.budget.name, "seed": config.seed}
+    protocol |= {"minutes": config.budget.minutes, "iterations": config.budget.iterations}
+    with Progress("test views") as progress:
+        metrics = evaluate(
+            module,
+            run.datamodule,
+            run.folder,
+            suite,
+            protocol=protocol,
+            finished=run.finished(),
+            sheets=config.sheets,
+            progress=progress,
+        )
+    show(metrics, run.folder, suite.absent)
+    return metrics
+
+
+def device_of(accelerator: str) -> torch.device:
+    """The device that a trainer of this accelerator uses."""
+    wanted = accelerator in ("gpu", "cuda") or (accelerator == "auto" and torch.cuda.is_available())
+    return torch.device("cuda" if wanted else "cpu")
+
+
+class Progress:
+    """``progress(done, total)`` as a line with the time left; a context, after which all is as it was."""
+
+    def __init__(self, title: str, stream=None) -> None:
+        self.line, self.begin, self.done, self.total = (
+            ProgressLine(title, stream=stream),
+            time.perf_counter(),
+            0,
+            1,
+        )
+
+    def __call__(self, done: int, total: int) -> None:
+        """Show that ``done`` of ``total`` are done, where it is time to."""
+        self.done, self.total = done, total
+        if self.line.due():
+            spent = time.perf_counter() - self.begin
+            self.line.show(done / total, spent / done * (total - done) if done else None, f"{done}/{total}")
+
+    def __enter__(self) -> Progress:
+        return self
+
+    def __exit__(self, *error) -> None:
+        spent = time_text(time.perf_counter() - self.begin)
+        self.line.close(self.done / self.total, f"{self.done}/{self.total} in {spent}")
+
+
+def show(metrics: dict, folder: Path, absent: dict[str, str]) -> None:
+    """Print what was measured and where it is."""
+    console = Console()
+    console.print(table_of(metrics))
+    seconds, flow = metrics["seconds"], metrics.get("flow")
+    stages = ", ".join(
+        f"{name} {time_text(s)}" for name, s in seconds.items() if name not in ("train", "render_per_frame")
+    )
+    lines = [f"trained {time_text(seconds['train'])} ({stages}), {seconds['render_per_frame']:.2f} s a frame"]
+    if flow and flow["epe_moving"] is not None:
+        error, motion = flow["epe_moving"], flow["motion_mean"]
+        lines.append(
+            f"flow: moving points off by {error:.4f}, {error / motion:.0%} of their motion {motion:.4f}"
+        )
+    for reason in dict.fromkeys(absent.values()):
+        lines.append(f"without {', '.join(name for name, why in absent.items() if why == reason)}: {reason}")
+    lines += [f"numbers  {Path(folder) / 'metrics.json'}", f"pictures {Path(folder) / 'images'}"]
+    console.print("\n".join(lines), highlight=False, soft_wrap=True)
+
+
+def table_of(metrics: dict) -> Table:
+    """A row for every rendering and kind of test view, a column for every metric."""
+    blocks = {key: value for key, value in metrics.items() if key.split("_")[0] == "test"}
+    names = [m for m in METRICS if any(m in scores for block in blocks.values() for scores in block.values())]
+    table = Table(
+        title=f"{metrics['protocol']['scene']}, {metrics['protocol'].get('method', '')}",
+        title_justify="left",
+        box=box.SIMPLE,
+    )
+    table.add_column("test views")
+    for name in names:
+        table.add_column(name.replace("depth_delta_", "depth<"), justify="right")
+    for key, block in blocks.items():
+        suffix = key.removeprefix("test").replace("_", " ")
+        for ability, scores in block.items():
+            cells = [
+                f"{scores[n]:.2f}" if n == "psnr" else f"{scores[n]:.4f}" if n in scores else ""
+                for n in names
+            ]
+            table.add_row(ability + suffix, *cells)
+    return table

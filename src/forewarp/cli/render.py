@@ -1,0 +1,96 @@
+"""``forewarp-render``: videos of a finished run."""
+
+from __future__ import annotations
+
+from forewarp.cli.entry import command
+
+HELP = """
+forewarp-render makes a video of a finished run, into its videos/.
+
+  forewarp-render run=runs/vehicle/forward-demo-seed0 path=both
+  forewarp-render run=FOLDER path=trajectories format=gif size=300
+
+What one types most:
+  run=FOLDER                    the run (needed)
+  path=fixed                    one camera, through time
+  path=orbit time=0.5           once around, at one time
+  path=both                     once around while time passes
+  path=trajectories             as fixed, with the ways that points of the moving surface took drawn over it
+  frames=N fps=N size=N         how many, how fast, pixels of the longer side
+  view=N                        the test view that it shows or starts from
+  format=mp4|gif|png            a film, a moving picture, stills
+  points=N tail=SHARE           how many trajectories, and how much of the time they stay
+  data.root=FOLDER              where the data are now, if they moved
+  threads=N trainer=cpu         what to compute with
+"""
+
+
+def render(config) -> None:
+    """Load, and write the video."""
+    from pathlib import Path
+
+    from forewarp.cli.measure import Progress, device_of
+    from forewarp.cli.runs import build_run, saved_config
+    from forewarp.drawing.files import write_video
+
+    check(config)
+    saved = saved_config(config.run, config)
+    run = build_run(saved)
+    module = run.load().to(device_of(saved.trainer.accelerator))
+    pictures = pictures_of(config, module, run.datamodule)
+    file = Path(run.folder) / "videos" / f"{config.path}.{config.format}"
+    with Progress(config.path) as progress:
+        written = write_video(file, counted(pictures, config.frames, progress), fps=float(config.fps))
+    print(f"written: {written}")
+
+
+def pictures_of(config, module, datamodule):
+    """The pictures of the video that the config describes."""
+    from forewarp.training.pictures import sized
+    from forewarp.training.trajectories import Trajectories
+    from forewarp.training.videos import make_shots, video
+
+    cameras = [frame.camera for frame in datamodule.scene.train]
+    targets = datamodule.targets("test")
+    if config.view >= len(targets):
+        raise ValueError(f"view: expected a test view, 0 to {len(targets) - 1}, but got {config.view}")
+    target, paint = targets[config.view], None
+    if config.path == "trajectories":
+        paint = Trajectories(module, cameras, count=config.points, tail=float(config.tail))
+    start = target.frame.camera if config.size is None else sized(target.frame.camera, config.size)
+    shots = make_shots(config.path, config.frames, float(config.time), start, cameras)
+    return video(module, shots, target.background.to(module.device), paint)
+
+
+def counted(pictures, total: int, progress):
+    """The same pictures; each is reported once it is there."""
+    for done, picture in enumerate(pictures, 1):
+        progress(done, total)
+        yield picture
+
+
+def check(config) -> None:
+    """Refuse what no video can be made of, before anything is loaded."""
+    from forewarp.drawing.files import FORMATS
+    from forewarp.training.videos import PATHS
+
+    for key, known in (("path", PATHS), ("format", FORMATS)):
+        if config[key] not in known:
+            raise ValueError(f"{key}: expected one of {', '.join(known)}, but got '{config[key]}'")
+    for key, least in (("frames", 2), ("view", 0), ("points", 1), ("size", 16)):
+        if type(config[key]) is not int or config[key] < least:
+            if key == "size" and config.size is None:
+                continue
+            raise ValueError(f"{key}: expected a whole number of at least {least}, but got {config[key]}")
+    for key, low, high in (("fps", 0.1, 1000), ("time", 0, 1), ("tail", 0.01, 1)):
+        if type(config[key]) not in (int, float) or not low <= config[key] <= high:
+            raise ValueError(f"{key}: expected a number in [{low}, {high}], but got {config[key]}")
+
+
+def main() -> None:
+    """The console script."""
+    command("render", render, HELP)
+
+
+if __name__ == "__main__":
+    main()

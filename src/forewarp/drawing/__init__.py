@@ -1,0 +1,1 @@
+"""Pixels: colours for depth, error and flow, lines over pictures, files."""

@@ -1,0 +1,88 @@
+"""Numbers as colours: depth, error and flow pictures (H, W, 3) in [0, 1]."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+# Far to near, of steadily rising lightness, so that it also reads in grey.
+_DEPTH = ((0.16, 0.11, 0.33), (0.17, 0.36, 0.55), (0.16, 0.61, 0.57), (0.55, 0.80, 0.36), (0.99, 0.91, 0.45))
+_ERROR = ((0.0, 0.0, 0.0), (0.45, 0.05, 0.25), (0.90, 0.30, 0.10), (1.0, 0.78, 0.25), (1.0, 1.0, 0.9))
+_STILL = 0.88  # grey of what does not move, to be told from the white where nothing is
+
+
+def ramp(values: Tensor, anchors: tuple[tuple[float, float, float], ...]) -> Tensor:
+    """Values (...) in [0, 1] on the broken line through ``anchors`` (..., 3).
+
+    >>> ramp(torch.tensor(0.5), ((0.0, 0.0, 0.0), (1.0, 0.5, 0.0))).tolist()
+    [0.5, 0.25, 0.0]
+    """
+    table = torch.tensor(anchors, device=values.device)
+    at = values.clamp(0, 1) * (len(anchors) - 1)
+    low = at.floor().long().clamp(max=len(anchors) - 2)
+    return torch.lerp(table[low], table[low + 1], (at - low)[..., None])
+
+
+def hues(turns: Tensor) -> Tensor:
+    """Hues (..., 3) by fractions of a turn (...) around the colour wheel; 0 is red."""
+    thirds = torch.arange(3, device=turns.device) / 3
+    return 0.5 + 0.45 * torch.cos(2 * math.pi * (turns[..., None] - thirds))
+
+
+def depth_colors(depth: Tensor, opacity: Tensor) -> Tensor:
+    """Depth (H, W) over white, near bright; the scale spans what is opaque, but for 1 % at either end."""
+    solid = depth[opacity > 0.5]
+    if not len(solid):
+        return depth.new_ones(*depth.shape, 3)
+    near, far = torch.quantile(solid[:: max(1, len(solid) // 100_000)], depth.new_tensor([0.01, 0.99]))
+    colors = ramp((far - depth) / (far - near).clamp(min=1e-6), _DEPTH)
+    return torch.lerp(torch.ones_like(colors), colors, opacity[..., None].clamp(0, 1))
+
+
+def error_colors(a: Tensor, b: Tensor, full: float = 0.25) -> Tensor:
+    """The mean absolute difference of two pictures (H, W, 3): black is none, white ``full`` and more."""
+    return ramp((a - b).abs().mean(-1) / full, _ERROR)
+
+
+def flow_colors(flow: Tensor, opacity: Tensor, full: float | None = None) -> Tensor:
+    """Flow (H, W, 2) in pixels over white: hue is the direction, saturation the length.
+
+    Args:
+        flow: right and down.
+        opacity: (H, W), where there is anything.
+        full: length of full saturation; None: the 98 % quantile, but at least a pixel.
+    """
+    length = flow.norm(dim=-1)
+    if full is None:
+        solid = length[opacity > 0.5][:: max(1, length.numel() // 100_000)]
+        full = max(1.0, float(torch.quantile(solid, 0.98))) if len(solid) else 1.0
+    turns = torch.atan2(flow[..., 1], flow[..., 0]) / (2 * math.pi)
+    still = torch.full_like(flow[..., :1], _STILL).expand(*length.shape, 3)
+    colors = torch.lerp(still, hues(turns), (length / full).clamp(max=1)[..., None])
+    return torch.lerp(torch.ones_like(colors), colors, opacity[..., None].clamp(0, 1))
+
+
+def with_wheel(picture: Tensor, share: float = 0.16) -> Tensor:
+    """The picture (H, W, 3) with the wheel of flow colours in its lower right corner."""
+    height, width = picture.shape[:2]
+    size = max(8, int(share * min(height, width)))
+    if size + 4 > min(height, width):
+        return picture
+    axis = (torch.arange(size, device=picture.device) + 0.5) / size * 2 - 1
+    y, x = torch.meshgrid(axis, axis, indexing="ij")
+    inside = ((1 - torch.hypot(x, y)) * size / 2).clamp(0, 1)
+    rows, columns = slice(height - size - 2, height - 2), slice(width - size - 2, width - 2)
+    behind = picture[rows, columns]
+    picture = picture.clone()
+    picture[rows, columns] = torch.lerp(
+        behind, flow_colors(torch.stack([x, y], -1), torch.ones_like(x), 1.0), inside[..., None]
+    )
+    return picture
+
+
+def in_a_row(pictures: list[Tensor], gap: int = 4) -> Tensor:
+    """Pictures (H, W_i, 3) of one height side by side, white between."""
+    white = pictures[0].new_ones(pictures[0].shape[0], gap, 3)
+    return torch.cat([part for picture in pictures for part in (white, picture)][1:], 1)

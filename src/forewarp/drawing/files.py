@@ -1,0 +1,81 @@
+"""Pictures and videos on disk; a name appears only when its file is whole."""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Iterable
+from itertools import chain
+from pathlib import Path
+
+import imageio.v3 as iio
+import imageio_ffmpeg
+import numpy as np
+from torch import Tensor
+
+FORMATS = ("mp4", "gif", "png")
+
+
+def to_bytes(picture: Tensor) -> np.ndarray:
+    """(H, W, 3) in [0, 1] -> uint8 (H, W, 3), rounded."""
+    return (picture.detach().clamp(0, 1) * 255).round().byte().cpu().numpy()
+
+
+def write_png(path: Path, picture: Tensor) -> Path:
+    """Write (H, W, 3) in [0, 1]; the folder is made."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    _replace(path, lambda beside: iio.imwrite(beside, to_bytes(picture), extension=".png"))
+    return path
+
+
+def write_video(path: Path, pictures: Iterable[Tensor], *, fps: float) -> Path:
+    """Write pictures (H, W, 3) in [0, 1], drawn one by one, in the format that the suffix names.
+
+    ``.mp4`` and ``.gif`` are files; ``.png`` makes a folder of stills beside, named as the file without it.
+
+    Returns:
+        the file or the folder.
+    """
+    if path.suffix == ".png":
+        folder = path.with_suffix("")
+        for number, picture in enumerate(pictures):
+            write_png(folder / f"{number:04d}.png", picture)
+        return folder
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.suffix == ".gif":
+        frames = [to_bytes(picture) for picture in pictures]
+        _replace(path, lambda b: iio.imwrite(b, frames, extension=".gif", duration=1000 / fps, loop=0))
+    else:
+        _replace(path, lambda b: _write_mp4(b, map(to_bytes, pictures), fps))
+    return path
+
+
+def _write_mp4(path: Path, frames: Iterable[np.ndarray], fps: float) -> None:
+    frames = map(_even, frames)
+    first = next(frames)
+    size = first.shape[1], first.shape[0]
+    # The default block of 16 would stretch the picture; 2 is the least that the codec takes.
+    options = {"fps": fps, "quality": 8, "macro_block_size": 2, "ffmpeg_log_level": "error"}
+    writer = imageio_ffmpeg.write_frames(str(path), size, **options)
+    writer.send(None)
+    try:
+        for frame in chain([first], frames):
+            writer.send(frame)
+    except OSError as error:  # of many lines, and without the file
+        raise OSError(errno.EIO, "ffmpeg could not go on (is the disk full?)", str(path)) from error
+    finally:
+        writer.close()
+
+
+def _even(frame: np.ndarray) -> np.ndarray:
+    height, width = frame.shape[:2]
+    return np.ascontiguousarray(np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge"))
+
+
+def _replace(path: Path, write) -> None:
+    beside = path.with_name(f".{path.name}.part{path.suffix}")
+    try:
+        write(beside)
+        os.replace(beside, path)
+    finally:
+        beside.unlink(missing_ok=True)

@@ -1,0 +1,64 @@
+"""What a run may spend, shared out among its stages."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from forewarp.training.objective import Objective
+from forewarp.training.settings import StageSettings
+from forewarp.training.stages import Stage
+
+
+class StagePlan:
+    """A stage that waits for its part of the budget.
+
+    Args:
+        share: of the run's budget, against the other stages' shares.
+        objective: of the stage.
+        settings: the other arguments of ``StageSettings``.
+    """
+
+    def __init__(self, *, share: float, objective: Objective, **settings: Any) -> None:
+        self.share, self.objective, self.settings = share, objective, settings
+
+    def stage(self, name: str, minutes: float | None, iterations: int | None) -> Stage:
+        """The stage, bounded.
+
+        Raises:
+            TypeError: a key that ``StageSettings`` does not know.
+        """
+        return Stage(
+            StageSettings(name, minutes=minutes, iterations=iterations, **self.settings), self.objective
+        )
+
+
+def share_out(
+    plans: Mapping[str, StagePlan | None], *, minutes: float | None, iterations: int | None
+) -> list[Stage]:
+    """The stages in order, each with its share of the minutes and iterations of the whole run.
+
+    Args:
+        plans: by name; a None is left out.
+        minutes, iterations: of the run; None where the other one bounds it. With both, what comes first.
+    """
+    kept = {name: plan for name, plan in plans.items() if plan is not None}
+    if not kept:
+        raise ValueError("stage: expected at least one stage, but got none; choose stage=fast")
+    for name, plan in kept.items():
+        if not (isinstance(plan.share, int | float) and plan.share > 0):
+            raise ValueError(
+                f"stage.{name}.share: expected a number > 0, but got {plan.share}; drop it with ~stage.{name}"
+            )
+    for key, value in (("minutes", minutes), ("iterations", iterations)):
+        if value is not None and not (isinstance(value, int | float) and value > 0):
+            raise ValueError(f"budget.{key}: expected a number > 0 or null, but got {value}")
+    whole = sum(plan.share for plan in kept.values())
+    return [
+        plan.stage(
+            name,
+            None if minutes is None else minutes * plan.share / whole,
+            None if iterations is None else max(1, round(iterations * plan.share / whole)),
+        )
+        for name, plan in kept.items()
+    ]

@@ -1,0 +1,167 @@
+"""From a fitted scene to its numbers: pictures of the test views, scores by image and ability, flow error."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from forewarp.drawing.colors import error_colors, in_a_row
+from forewarp.drawing.files import write_png
+from forewarp.methods.spec import parameter_count
+from forewarp.metrics.flow import end_point_error
+from forewarp.metrics.suite import ImageSuite, summarise
+from forewarp.scene.batch import Target
+from forewarp.scene.frame import Scene
+from forewarp.scene.state import Rendering
+from forewarp.training.handover import write_json
+from forewarp.training.module import DynamicSceneModule, render_all
+from forewarp.training.protocol import device_name, versions
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A test view as drawn: its number in the split, its renderings by name, the best last, and the seconds
+    that the best one took, the warp included where the view before had another time.
+    """
+
+    number: int
+    target: Target
+    renderings: dict[str, Rendering]
+    seconds: float
+
+
+def draw(module: DynamicSceneModule, targets: list[Target]) -> Iterator[Shown]:
+    """Every target by every rendering, in the order of time: the warp is computed once a time."""
+    state = None
+    for number in sorted(range(len(targets)), key=lambda i: targets[i].frame.time):
+        target = targets[number]
+        begin = time.perf_counter()
+        with torch.no_grad():
+            if state is None or state.time != target.frame.time:
+                state = module.method.at(target.frame.time)
+            rays, behind = target.frame.camera.rays().to(module.device), target.background.to(module.device)
+            drawn, spent = {}, time.perf_counter() - begin
+            for name, field in state.fields.items():
+                begin = time.perf_counter()
+                drawn[name] = render_all(module.renderer, field, rays, behind, module.method.view)
+                last = time.perf_counter() - begin
+        yield Shown(number, target, drawn, spent + last)
+
+
+def evaluate(
+    module: DynamicSceneModule,
+    datamodule,
+    folder: Path,
+    suite: ImageSuite,
+    *,
+    protocol: Mapping | None = None,
+    finished: Mapping[str, Mapping] | None = None,
+    sheets: int = 6,
+    progress: Callable[[int, int], None] | None = None,
+) -> dict:
+    """Measure a fitted scene on its test views; the same scene gives the same numbers, seconds apart.
+
+    Writes ``images/<name>.png`` (the best rendering), ``images/sheets/<name>.png`` (truth | prediction |
+    error) of some, ``per_image.json``, and last ``metrics.json``.
+
+    Args:
+        module: fitted; on the device that is to be used.
+        datamodule: serves ``scene`` and ``targets("test")``.
+        folder: the run's.
+        suite: scores an image.
+        protocol: what else is worth knowing of how the run came about.
+        finished: what the stages noted at their end (``Run.finished``).
+        sheets: how many, spread over the split.
+        progress: called with (images done, all images) after each image.
+
+    Returns:
+        what ``metrics.json`` holds.
+    """
+    scene, targets, finished = datamodule.scene, datamodule.targets("test"), finished or {}
+    on_sheets = {round(i * (len(targets) - 1) / max(sheets - 1, 1)) for i in range(sheets)}
+    rows: dict[int, dict] = {}
+    for shown in draw(module, targets):
+        rows[shown.number] = _score(shown, suite)
+        _save(shown, Path(folder) / "images", shown.number in on_sheets)
+        if progress is not None:
+            progress(len(rows), len(targets))
+    per_image = [rows[number] for number in sorted(rows)]
+    metrics = {
+        "protocol": _protocol(module, scene, per_image, protocol or {}),
+        "seconds": _seconds(per_image, finished),
+        "peak_memory_bytes": max((int(s["peak_memory_bytes"]) for s in finished.values()), default=None),
+        "parameters": parameter_count(module.method),
+        **_means(per_image),
+    }
+    if scene.truth is not None:
+        metrics["flow"] = flow_error(module, scene)
+    write_json(Path(folder) / "per_image.json", {"images": per_image})
+    write_json(Path(folder) / "metrics.json", metrics)
+    return metrics
+
+
+@torch.no_grad()
+def flow_error(module: DynamicSceneModule, scene: Scene) -> dict:
+    """End-point errors of the learned trajectories against the scene's true ones, world units."""
+    truth = scene.truth
+    points, times = truth.points[:, 0].to(module.device), truth.times.float().to(module.device)
+    return end_point_error(module.method.trajectories(points, times), truth.points)
+
+
+def _image(rendering: Rendering, target: Target) -> Tensor:
+    return rendering.rgb.clamp(0, 1).reshape(target.rgb.shape).cpu()
+
+
+def _score(shown: Shown, suite: ImageSuite) -> dict:
+    """One image's entry: the best rendering's scores, the others' under their names."""
+    target, frame = shown.target, shown.target.frame
+    scores = {
+        name: suite.score(_image(r, target), target, r.depth.reshape(target.rgb.shape[:2]).cpu())
+        for name, r in shown.renderings.items()
+    }
+    best = list(scores)[-1]
+    about = {"name": frame.name, "time": frame.time, "ability": frame.ability, "rendering": best}
+    others = {name: values for name, values in scores.items() if name != best}
+    return {**about, "seconds": shown.seconds, "scores": scores[best], "others": others}
+
+
+def _save(shown: Shown, folder: Path, on_sheet: bool) -> None:
+    target, image = shown.target, _image(list(shown.renderings.values())[-1], shown.target)
+    name = shown.target.frame.name + ".png"
+    write_png(folder / name, image)
+    if on_sheet:
+        sheet = in_a_row([target.rgb, image, error_colors(target.rgb, image)])
+        write_png(folder / "sheets" / name, sheet)
+
+
+def _means(per_image: list[dict]) -> dict[str, dict]:
+    """``test`` of the best rendering, and ``test_<rendering>`` of every other one."""
+    means = {"test": summarise((row["ability"], row["scores"]) for row in per_image)}
+    for name in per_image[0]["others"]:
+        means[f"test_{name}"] = summarise((row["ability"], row["others"][name]) for row in per_image)
+    return means
+
+
+def _seconds(per_image: list[dict], finished: Mapping[str, Mapping]) -> dict[str, float]:
+    stages = {name: float(noted["seconds"]) for name, noted in finished.items()}
+    drawing = sum(row["seconds"] for row in per_image) / len(per_image)
+    return {"train": sum(stages.values()), **stages, "render_per_frame": drawing}
+
+
+def _protocol(module: DynamicSceneModule, scene: Scene, per_image: list[dict], protocol: Mapping) -> dict:
+    first = per_image[0]
+    return {
+        "scene": scene.name,
+        **scene.protocol,
+        **protocol,
+        "renderings": [*first["others"], first["rendering"]],
+        "scored": first["rendering"],
+        "device": device_name(module.device),
+        "threads": torch.get_num_threads(),
+        "versions": versions(),
+    }

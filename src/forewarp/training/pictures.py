@@ -1,0 +1,141 @@
+"""Pictures of a stage: truth, prediction and error, depth, and the flow from the canonical time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import lightning
+import torch
+from lightning.pytorch.loggers import TensorBoardLogger
+from torch import Tensor
+
+from forewarp.drawing.colors import depth_colors, error_colors, flow_colors, in_a_row, with_wheel
+from forewarp.drawing.files import write_png
+from forewarp.scene.batch import Target
+from forewarp.scene.camera import Camera
+from forewarp.training.module import DynamicSceneModule, render_all
+
+
+def sized(camera: Camera, size: int) -> Camera:
+    """The same view with ``size`` pixels along its longer side."""
+    scale = size / max(camera.width, camera.height)
+    return camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
+
+
+def within(camera: Camera, size: int | None) -> Camera:
+    """The same view with at most ``size`` pixels along its longer side."""
+    return camera if size is None or max(camera.width, camera.height) <= size else sized(camera, size)
+
+
+def pictures_of(module: DynamicSceneModule, target: Target, size: int | None = None) -> dict[str, Tensor]:
+    """Pictures (h, w, 3) in [0, 1] of one view by name.
+
+    ``compare`` is truth | prediction | error, ``depth`` is near bright, ``flow`` is the way in the picture
+    from the canonical time to the target's: hue is its direction, as the wheel shows, saturation its length.
+    """
+    camera, time = within(target.frame.camera, size), target.frame.time
+    shape = (camera.height, camera.width)
+    drawn = module.render_image(camera, time, target.background)
+    predicted = drawn.rgb.reshape(*shape, 3).clamp(0, 1)
+    truth = target.rgb.to(predicted)
+    if truth.shape != predicted.shape:
+        channels_first = truth.permute(2, 0, 1)[None]
+        truth = torch.nn.functional.interpolate(channels_first, shape, mode="area")[0].permute(1, 2, 0)
+    return {
+        "compare": in_a_row([truth, predicted, error_colors(truth, predicted)]),
+        "depth": depth_colors(drawn.depth.reshape(shape), drawn.opacity.reshape(shape)),
+        "flow": with_wheel(flow_colors(*image_flow(module, camera, time))),
+    }
+
+
+@torch.no_grad()
+def image_flow(module: DynamicSceneModule, camera: Camera, time: float) -> tuple[Tensor, Tensor]:
+    """The scene at its canonical time as ``camera`` sees it, and how that moves until ``time``.
+
+    Displacements are rendered in the place of colours, so the picture is as smooth as any other.
+
+    Returns:
+        flow (H, W, 2) in pixels, opacity (H, W).
+    """
+    method = module.method
+    canonical = method.radiance()
+    points = canonical.lattice.to_world(method.radiance.voxels)
+    displacement = method.trajectories(points, torch.tensor([time], device=points.device))[:, 0] - points
+    moving = canonical.with_values(torch.cat([canonical.raw_density[:, None], displacement], 1))
+    rays = camera.rays().to(module.device)
+    drawn = render_all(
+        module.renderer, moving, rays, points.new_zeros(3), lambda features, directions: features
+    )
+    at = rays.origins + drawn.depth[:, None] * rays.directions
+    moved = drawn.rgb / drawn.opacity.clamp(min=1e-6)[:, None]
+    flow = camera.project(at + moved)[0] - camera.project(at)[0]
+    shape = (camera.height, camera.width)
+    return flow.reshape(*shape, 2), drawn.opacity.reshape(shape)
+
+
+class TensorBoardPictures(lightning.Callback):
+    """Pictures of one held-out view at a few moments, to TensorBoard and into the stage's ``images/``.
+
+    The training clock stands still meanwhile, and nothing random is drawn: training goes on as without.
+
+    Args:
+        moments: fractions of the stage.
+        view: index into the validation images, or into the training images without any; None: the middle.
+        size: pixels of the longer side at most.
+    """
+
+    def __init__(
+        self,
+        *,
+        moments: Sequence[float] = (0.1, 0.25, 0.5, 0.75, 1.0),
+        view: int | None = None,
+        size: int = 400,
+    ) -> None:
+        if not all(0 <= moment <= 1 for moment in moments):
+            raise ValueError(
+                f"callbacks.pictures.moments: expected numbers in [0, 1], but got {list(moments)}"
+            )
+        self.moments, self.view, self.size = sorted(moments), view, size
+        self._due: list[float] = []
+
+    def on_train_start(self, trainer, module) -> None:
+        """Leave out the moments that a continued run is past."""
+        done = module.fraction
+        self._due = [moment for moment in self.moments if moment >= done]
+
+    def on_train_batch_end(self, trainer, module, outputs, batch, batch_idx) -> None:
+        """Make the pictures when it is time."""
+        self._follow(trainer, module)
+
+    def on_train_end(self, trainer, module) -> None:
+        """A stage bounded by minutes ends between two steps."""
+        self._follow(trainer, module)
+
+    def _follow(self, trainer, module) -> None:
+        passed = [moment for moment in self._due if moment <= module.fraction]
+        if passed:
+            self._due = self._due[len(passed) :]
+            with module.clock.paused():
+                self._make(trainer, module, passed[-1])
+
+    def _make(self, trainer, module, moment: float) -> None:
+        pictures = pictures_of(module, self._target(trainer.datamodule), self.size)
+        for name, picture in pictures.items():
+            write_png(
+                Path(trainer.default_root_dir) / "images" / f"{round(100 * moment):03d}_{name}.png", picture
+            )
+            for logger in trainer.loggers:
+                if isinstance(logger, TensorBoardLogger):
+                    logger.experiment.add_image(
+                        f"images/{name}", picture, module.global_step, dataformats="HWC"
+                    )
+
+    def _target(self, datamodule) -> Target:
+        targets = datamodule.targets("val" if datamodule.scene.val else "train")
+        view = len(targets) // 2 if self.view is None else self.view
+        if not 0 <= view < len(targets):
+            raise ValueError(
+                f"callbacks.pictures.view: expected 0 to {len(targets) - 1}, but got {view}; use null"
+            )
+        return targets[view]

@@ -1,0 +1,66 @@
+"""Videos of a fitted scene: through time, around it, or both at once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+
+import torch
+from torch import Tensor
+
+from forewarp.scene.camera import Camera
+from forewarp.scene.paths import focus_point, mean_up, orbit
+from forewarp.scene.state import Rendering
+from forewarp.training.module import DynamicSceneModule
+
+PATHS = ("fixed", "orbit", "both", "trajectories")
+
+Shot = tuple[Camera, float]  # from where, at which time
+Paint = Callable[[Tensor, Rendering, Camera, float], Tensor]
+
+
+def make_shots(path: str, frames: int, time: float, camera: Camera, cameras: Sequence[Camera]) -> list[Shot]:
+    """From where and when each frame of a video is seen.
+
+    Args:
+        path: ``fixed`` and ``trajectories`` go through time, ``orbit`` once around at ``time``; ``both``.
+        frames: of the video.
+        time: in [0, 1].
+        camera: where the video starts.
+        cameras: the training cameras, which tell what to look at and where up is.
+
+    Raises:
+        ValueError: naming the key that is wrong.
+    """
+    if path not in PATHS:
+        raise ValueError(f"path: expected one of {', '.join(PATHS)}, but got '{path}'")
+    if frames < 2:
+        raise ValueError(f"frames: expected at least 2, but got {frames}")
+    if not 0 <= time <= 1:
+        raise ValueError(f"time: expected a number in [0, 1], but got {time}")
+    views, times = [camera] * frames, torch.linspace(0, 1, frames).tolist()
+    if path in ("orbit", "both"):
+        # Without the last turn, which is the first again: played in a loop it runs smoothly.
+        turns = torch.arange(frames, dtype=torch.float64) / frames
+        views = orbit(camera, focus_point(list(cameras)), mean_up(list(cameras)), turns)
+    return list(zip(views, [time] * frames if path == "orbit" else times))
+
+
+def video(
+    module: DynamicSceneModule, shots: Sequence[Shot], background: Tensor, paint: Paint | None = None
+) -> Iterator[Tensor]:
+    """The pictures (H, W, 3) in [0, 1] of a video one by one; the warp is made once for a time.
+
+    Args:
+        module: the fitted scene.
+        shots: from where and when.
+        background: (3,).
+        paint: draws over a picture, see ``Trajectories``.
+    """
+    state = None
+    for camera, time in shots:
+        with torch.no_grad():
+            state = state if state is not None and state.time == time else module.method.at(time)
+            drawn = module.render_image(camera, time, background, state)
+            picture = drawn.rgb.reshape(camera.height, camera.width, 3).clamp(0, 1)
+            picture = picture if paint is None else paint(picture, drawn, camera, time)
+        yield picture

@@ -1,0 +1,144 @@
+import errno
+
+import pytest
+
+from configs import options
+from forewarp.cli.entry import one_line, project_root
+from forewarp.scene.errors import SceneError
+
+COMMANDS = ("train", "evaluate", "render", "synthesize")
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_says_what_it_does_and_what_one_types(forewarp, name):
+    done = forewarp(name, "--help")
+    assert done.status == 0
+    assert done.out.startswith(f"forewarp-{name} ")
+    assert done.out.count(f"forewarp-{name}") >= 2  # and examples
+    assert done.err == ""
+
+
+@pytest.mark.parametrize("group", ["data", "model", "model/view", "budget", "experiment", "trainer"])
+def test_help_lists_every_choice(forewarp, group):
+    text = forewarp("train", "--help").out
+    (line,) = [line for line in text.splitlines() if line.split()[:1] == [group]]
+    assert line.split()[1::2] == options(group)
+
+
+def test_missing_conf_is_named(refused, monkeypatch, in_tmp):
+    monkeypatch.setenv("FOREWARP_ROOT", str(in_tmp))
+    line = refused("train")
+    assert line.startswith(f"{in_tmp / 'conf'}: expected the configuration files, but got none; ")
+
+
+def test_the_root_holds_conf():
+    assert (project_root() / "conf" / "train.yaml").is_file()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        (
+            ["budget=quick"],
+            "Could not find 'budget/quick'; Available options in 'budget': demo; faithful; fast",
+        ),
+        (["data.foo=1"], "Could not override 'data.foo'; To append to your config use +data.foo=1"),
+        (["data=dnerf"], "data.scene: expected a value, but got none; set data.scene=..."),
+        (["data=[1"], "data=[1: no viable alternative at input '[1'"),
+        (["budget.minutes=-1"], "budget.minutes: expected a number > 0 or null, but got -1"),
+        (["budget.minutes=soon"], "budget.minutes: expected a number > 0 or null, but got soon"),
+        (["budget.minutes=null"], "stage.coarse: expected iterations or minutes, but got neither"),
+        (["threads=0"], "threads: expected a whole number > 0 or null, but got 0"),
+        (["~stage.coarse", "~stage.fine"], "stage: expected at least one stage, but got none"),
+        (["stage.coarse.start=middle"], "stage.coarse.start: expected box or hull, but got 'middle'"),
+        (["+stage.coarse.bogus=1"], "got an unexpected keyword argument 'bogus'; leave that key out"),
+        (["+renderer.bogus=1"], "renderer: "),
+        (["objective.coarse.literal=[foto]"], "objective: expected a term of photo"),
+        (["+model.inpainter.width=16"], "model.inpainter: expected a factory or null, but got {'width': 16}"),
+    ],
+)
+def test_a_mistyped_command_ends_in_one_line(refused, in_tmp, arguments, line):
+    assert line in refused("train", *arguments, "paths.data=data")
+    assert list(in_tmp.iterdir()) == []
+
+
+def test_the_whole_story_on_demand(forewarp, monkeypatch, in_tmp):
+    monkeypatch.setenv("FOREWARP_TRACEBACK", "1")
+    done = forewarp("train", "budget.minutes=-1")
+    assert done.status == 2
+    assert "Traceback" in done.err
+
+
+def test_a_bug_keeps_its_traceback(forewarp, monkeypatch, in_tmp):
+    def broken(config):
+        raise RuntimeError("oops")
+
+    monkeypatch.setattr("forewarp.cli.train.train", broken)
+    done = forewarp("train")
+    assert done.status == 1
+    assert "Traceback" in done.err
+    assert done.err.strip().endswith(
+        "forewarp-train: error: RuntimeError: oops; this is a bug, please report it"
+    )
+
+
+def test_interruption_says_how_to_go_on(forewarp, monkeypatch, in_tmp):
+    def interrupted(config):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("forewarp.cli.train.train", interrupted)
+    done = forewarp("train")
+    assert done.status == 130
+    assert "forewarp-train: interrupted; run the same command again" in done.err
+    assert "Traceback" not in done.err
+
+
+def test_lightnings_own_exit_on_interruption_counts_as_one(forewarp, monkeypatch, in_tmp):
+    def interrupted(config):
+        try:
+            raise KeyboardInterrupt
+        except KeyboardInterrupt:
+            raise SystemExit(1)  # noqa: B904
+
+    monkeypatch.setattr("forewarp.cli.train.train", interrupted)
+    assert forewarp("train").status == 130
+
+
+@pytest.mark.parametrize(
+    ("error", "line"),
+    [
+        (
+            SceneError("a.json: frames: expected a list,\n but got 1"),
+            "a.json: frames: expected a list,; but got 1",
+        ),
+        (
+            OSError(errno.ENOSPC, "No space left on device", "x/last.ckpt"),
+            "x/last.ckpt: expected room to write, but",
+        ),
+        (
+            PermissionError(errno.EACCES, "Permission denied", "x"),
+            "x: expected a usable file or folder, but got Perm",
+        ),
+        (ImportError("install forewarp[synth]"), "install forewarp[synth]"),
+        (
+            ModuleNotFoundError("No module named 'trimesh'"),
+            "No module named 'trimesh'; install it with make install",
+        ),
+    ],
+)
+def test_one_line(error, line):
+    assert one_line(error).startswith(line)
+
+
+def test_a_failed_job_of_several_does_not_stop_the_others(forewarp, monkeypatch, in_tmp):
+    seen = []
+
+    def job(config):
+        seen.append(config.seed)
+        if config.seed == 0:
+            raise ValueError("seed: expected another")
+
+    monkeypatch.setattr("forewarp.cli.train.train", job)
+    done = forewarp("train", "--multirun", "seed=0,1")
+    assert seen == [0, 1]
+    assert (done.status, done.err) == (2, "forewarp-train: error: seed: expected another\n")

@@ -1,0 +1,260 @@
+"""From a written scene to its numbers, and everything a user can get wrong on the way."""
+
+import errno
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import lightning
+import pytest
+import yaml
+
+from dnerf_scene import edit, write_tiny
+from forewarp.synth.scenes import synthesize
+
+TINY = ["data=dnerf", "budget=demo", "trainer=cpu", "data.rays=128", "logger=none", "callbacks.pictures=null"]
+STEPS = ["budget.iterations=60", "stage.fine.voxels=[[0,8000]]", "stage.coarse.voxels=[[0,4000]]"]
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory):
+    """A folder with the scene ``vehicle``, 32 x 32 pixels."""
+    root = tmp_path_factory.mktemp("scenes")
+    synthesize(root / "vehicle", size=32, frames=6, test_views=(2, 1, 2), val_views=1, samples_per_pixel=1)
+    return root
+
+
+def arguments(root, run, *more, scene="vehicle"):
+    """A command line for a minute run."""
+    return ["train", *TINY, *STEPS, f"data.root={root}", f"data.scene={scene}", f"run={run}", *more]
+
+
+def numbers(folder):
+    """What metrics.json holds, but for seconds."""
+    content = json.loads((Path(folder) / "metrics.json").read_text())
+    content.pop("seconds")
+    return content
+
+
+@pytest.fixture(scope="module")
+def fitted(scenes, tmp_path_factory):
+    """The folder of a finished run, trained by the command in a process of its own."""
+    folder = tmp_path_factory.mktemp("run") / "forward"
+    call = [sys.executable, "-m", "forewarp.cli.train", *arguments(scenes, folder)[1:]]
+    done = subprocess.run(call, capture_output=True, text=True, cwd=folder.parent)
+    (folder / "said.txt").write_text(done.stdout + "\n---\n" + done.stderr)
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+def test_a_run_leaves_what_it_promises(fitted):
+    for name in ("config.yaml", "metrics.json", "per_image.json", "coarse/handover.json", "coarse/last.ckpt"):
+        assert (fitted / name).is_file()
+    assert (fitted / "fine" / "last.ckpt").is_file()
+    assert len(list((fitted / "images").glob("test_*/*.png"))) == 5
+    assert len(list((fitted / "images" / "sheets").rglob("*.png"))) == 5
+    assert not list(fitted.rglob("*.part"))
+
+
+def test_metrics_have_the_promised_shape(fitted):
+    content = json.loads((fitted / "metrics.json").read_text())
+    assert set(content) == {"protocol", "seconds", "peak_memory_bytes", "parameters", "test", "flow"}
+    assert set(content["seconds"]) == {"train", "coarse", "fine", "render_per_frame"}
+    assert content["seconds"]["train"] == pytest.approx(
+        content["seconds"]["coarse"] + content["seconds"]["fine"]
+    )
+    assert list(content["test"]) == ["space", "time", "canonical"]
+    for scores in content["test"].values():
+        assert 10 < scores["psnr"] < 60
+        assert {"ssim", "depth_delta_1.02"} <= set(scores)
+    assert {"epe_moving", "epe_still", "motion_mean"} <= set(content["flow"])
+    assert content["parameters"] > 1000
+    assert content["peak_memory_bytes"] > 2**26
+    expected = {"scene": "vehicle", "budget": "demo", "seed": 0, "method": "forward", "scored": "upsampled"}
+    assert expected.items() <= content["protocol"].items()
+    assert {"device", "threads", "versions", "background", "resolution"} <= set(content["protocol"])
+
+
+def test_per_image_values_average_to_the_means(fitted):
+    rows = json.loads((fitted / "per_image.json").read_text())["images"]
+    means = numbers(fitted)["test"]
+    for ability, scores in means.items():
+        found = [row["scores"]["psnr"] for row in rows if row["ability"] == ability]
+        assert scores["psnr"] == pytest.approx(sum(found) / len(found))
+
+
+def test_it_says_what_it_does_and_nothing_else(fitted):
+    out, err = (fitted / "said.txt").read_text().split("\n---\n")
+    assert "canonical" in out
+    assert "metrics.json" in out
+    for noise in ("GPU available", "Tip:", "Warning", "weights_only", "Trainer.fit"):
+        assert noise not in out + err
+    assert [line.split()[0] for line in err.strip().splitlines()] == ["coarse", "fine", "test"]
+
+
+def test_evaluating_twice_gives_the_same_numbers(forewarp, fitted, scenes, tmp_path):
+    again = tmp_path / "again"
+    shutil.copytree(fitted, again)
+    moved = tmp_path / "moved"
+    shutil.copytree(scenes, moved)
+    done = forewarp("evaluate", f"run={again}", f"data.root={moved}")
+    assert done.status == 0, done.err
+    assert "canonical" in done.out
+    assert numbers(again) == numbers(fitted)
+
+
+def test_the_same_command_again_trains_nothing(forewarp, fitted, scenes, monkeypatch):
+    def never(*_, **__):
+        raise AssertionError("trained again")
+
+    monkeypatch.setattr(lightning.Trainer, "fit", never)
+    before = numbers(fitted)
+    done = forewarp(*arguments(scenes, fitted))
+    assert done.status == 0, done.err
+    assert numbers(fitted) == before
+
+
+def test_what_does_not_matter_may_change(forewarp, fitted, scenes):
+    assert forewarp(*arguments(scenes, fitted, "evaluate=false", "checkpoint_seconds=5")).status == 0
+    assert yaml.safe_load((fitted / "config.yaml").read_text())["checkpoint_seconds"] == 5
+
+
+@pytest.mark.parametrize(
+    ("change", "line"),
+    [
+        ("seed=1", "config.yaml: data.seed: expected 0, but got 1; use run=... or delete the folder"),
+        ("budget.minutes=9", "config.yaml: budget.minutes: expected 1.2, but got 9; use run="),
+        ("model/view=none", "config.yaml: model.view: expected {"),
+    ],
+)
+def test_another_configuration_is_refused(refused, fitted, scenes, change, line):
+    assert line in refused(*arguments(scenes, fitted, change))
+
+
+def test_a_checkpoint_of_another_configuration_is_refused(refused, fitted, scenes, tmp_path):
+    shutil.copytree(fitted, tmp_path / "run")
+    saved = yaml.safe_load((tmp_path / "run" / "config.yaml").read_text())
+    saved["model"]["view"] = None
+    (tmp_path / "run" / "config.yaml").write_text(yaml.safe_dump(saved))
+    line = refused("evaluate", f"run={tmp_path / 'run'}")
+    assert "last.ckpt: expected a checkpoint of this configuration, but got one that differs in" in line
+
+
+def test_a_corrupt_checkpoint_is_named(refused, fitted, scenes, tmp_path):
+    shutil.copytree(fitted, tmp_path / "run")
+    (tmp_path / "run" / "fine" / "last.ckpt").write_bytes(b"nonsense")
+    assert "last.ckpt: expected a checkpoint, but it cannot be read" in refused(
+        "evaluate", f"run={tmp_path / 'run'}"
+    )
+
+
+@pytest.mark.parametrize(
+    ("content", "line"),
+    [
+        (None, "expected the configuration of a run, but got none"),
+        ("[", "expected YAML"),
+        ("a: 1", "expected the key data"),
+    ],
+)
+def test_a_folder_that_is_no_run(refused, tmp_path, content, line):
+    if content is not None:
+        (tmp_path / "config.yaml").write_text(content)
+    assert line in refused("evaluate", f"run={tmp_path}")
+
+
+def test_an_unfinished_run_is_not_measured(refused, fitted, tmp_path):
+    shutil.copytree(fitted, tmp_path / "run")
+    (tmp_path / "run" / "fine" / "done.json").unlink()
+    assert "fine: expected a finished stage, but got none" in refused("evaluate", f"run={tmp_path / 'run'}")
+
+
+def test_no_run_is_named(refused):
+    assert refused("evaluate").startswith("run: expected the folder of a run, but got nothing")
+
+
+def spoil_image(folder):
+    (folder / "train" / "r_1.png").write_bytes((folder / "train" / "r_1.png").read_bytes()[:60])
+
+
+def drop_matrix(content):
+    content["frames"][2].pop("transform_matrix")
+
+
+SPOILED = [
+    (lambda f: (f / "train" / "r_1.png").unlink(), "train/r_1.png: expected an image, but got No such file"),
+    (spoil_image, "train/r_1.png: expected a whole PNG image, but got a truncated one"),
+    (lambda f: (f / "transforms_train.json").write_text("{"), "transforms_train.json: line 1: expected JSON"),
+    (
+        lambda f: edit(f, "train", drop_matrix),
+        "transforms_train.json: frames[2].transform_matrix: expected 4 x 4",
+    ),
+    (
+        lambda f: shutil.copy(f.parent / "big" / "train" / "r_1.png", f / "train"),
+        "expected 8 x 6 pixels as the first",
+    ),
+    (
+        lambda f: edit(f, "train", lambda c: c["frames"][0].update(time=1.5)),
+        "frames[0].time: expected a number in [0, 1]",
+    ),
+    (
+        lambda f: edit(f, "test", lambda c: c.update(frames=[])),
+        "transforms_test.json: frames: expected a list of at least",
+    ),
+]
+
+
+@pytest.mark.parametrize(("spoil", "line"), SPOILED)
+def test_bad_data_end_in_one_line_and_leave_nothing(refused, in_tmp, spoil, line):
+    write_tiny(in_tmp / "scenes" / "big", size=(8, 8))
+    spoil(write_tiny(in_tmp / "scenes" / "small"))
+    assert line in refused(*arguments("scenes", "run", scene="small"))
+    assert not Path("run").exists()
+
+
+def test_an_unknown_scene_lists_the_known(refused, scenes, in_tmp):
+    line = refused(*arguments(scenes, "run", scene="lorry"))
+    assert line.endswith(
+        f"expected a scene with transforms_train.json, but got none; scenes in {scenes}: vehicle"
+    )
+
+
+def test_a_missing_folder(refused, in_tmp):
+    assert "data.root: expected an existing folder" in refused(*arguments("nowhere", "run"))
+
+
+def test_a_run_folder_that_cannot_be(refused, scenes, in_tmp):
+    Path("file").write_text("")
+    assert "file/run: expected a usable file or folder, but got Not a directory" in refused(
+        *arguments(scenes, "file/run")
+    )
+
+
+def test_a_full_disk_names_the_file_and_leaves_no_half(refused, scenes, in_tmp, monkeypatch):
+    def full(self, path, *_, **__):
+        Path(path).write_bytes(b"half")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(lightning.Trainer, "save_checkpoint", full)
+    line = refused(*arguments(scenes, "run", "budget.iterations=2"))
+    assert line.startswith(
+        "run/coarse/last.ckpt: expected room to write, but got No space left on device; free some"
+    )
+    assert list(Path("run/coarse").iterdir()) == []
+
+
+def test_settings_of_a_failed_start_do_not_bind(refused, forewarp, scenes, in_tmp):
+    assert "model.motion: expected 0 < tau" in refused(*arguments(scenes, "run", "model.motion.tau=7"))
+    assert forewarp(*arguments(scenes, "run", "budget.iterations=2", "evaluate=false")).status == 0
+
+
+def test_renderings_of_an_inpainter_are_both_scored(forewarp, scenes, in_tmp):
+    more = ["model/inpainter=unet3d", "model/upsampler=trilinear", "budget.iterations=2", "sheets=1"]
+    small = ["stage.coarse.voxels=[[0,500]]", "~stage.fine"]
+    done = forewarp("train", *TINY, f"data.root={scenes}", "data.scene=vehicle", "run=run", *more, *small)
+    assert done.status == 0, done.err
+    content = json.loads(Path("run/metrics.json").read_text())
+    assert content["protocol"]["renderings"] == ["upsampled", "inpainted"]
+    assert list(content["test"]) == list(content["test_upsampled"])
+    assert set(content["seconds"]) == {"train", "coarse", "render_per_frame"}

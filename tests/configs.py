@@ -1,0 +1,28 @@
+"""Composes the project's configurations."""
+
+import os
+from pathlib import Path
+
+from hydra import compose, initialize_config_dir
+from omegaconf import DictConfig
+
+ROOT = Path(__file__).parents[1]
+CONF = ROOT / "conf"
+
+
+def composed(*overrides: str, name: str = "train", hydra: bool = False) -> DictConfig:
+    """The configuration that a command line composes; with Hydra's own part where asked for."""
+    os.environ.setdefault("FOREWARP_ROOT", str(ROOT))
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        return compose(name, list(overrides), return_hydra_config=hydra)
+
+
+def options(group: str) -> list[str]:
+    """The names of a group's option files."""
+    return sorted(path.stem for path in (CONF / group).glob("*.yaml"))
+
+
+def groups() -> list[str]:
+    """Every group that one chooses from."""
+    folders = [path.relative_to(CONF).as_posix() for path in CONF.rglob("*") if path.is_dir()]
+    return sorted(group for group in folders if options(group) and not group.endswith("/one"))

@@ -1,0 +1,45 @@
+import imageio.v3 as iio
+import pytest
+import torch
+
+from films import read_film
+from forewarp.drawing.files import write_png, write_video
+
+
+def pictures(count, height=18, width=22):
+    """Grey to white, so that no two are alike."""
+    return [torch.full((height, width, 3), 0.2 + 0.8 * i / count) for i in range(count)]
+
+
+def test_a_png_is_rounded_and_clamped(tmp_path):
+    path = write_png(tmp_path / "new" / "a.png", torch.tensor([[[-1.0, 0.5, 2.0]]]))
+    assert iio.imread(path).tolist() == [[[0, 128, 255]]]
+
+
+@pytest.mark.parametrize("size", [(18, 22), (17, 21)])
+def test_mp4_holds_every_frame_unstretched(tmp_path, size):
+    path = write_video(tmp_path / "videos" / "a.mp4", iter(pictures(7, *size)), fps=5)
+    frames = read_film(path, 18, 22)
+    assert frames.shape == (7, 18, 22, 3)
+    assert abs(float(frames[6].mean()) - 255 * (0.2 + 0.8 * 6 / 7)) < 4
+
+
+def test_gif_holds_every_frame(tmp_path):
+    path = write_video(tmp_path / "a.gif", iter(pictures(4)), fps=10)
+    assert iio.imread(path).shape[:3] == (4, 18, 22)
+
+
+def test_stills_are_a_folder(tmp_path):
+    folder = write_video(tmp_path / "a.png", iter(pictures(3)), fps=1)
+    assert [p.name for p in sorted(folder.iterdir())] == ["0000.png", "0001.png", "0002.png"]
+
+
+@pytest.mark.parametrize("suffix", ["mp4", "gif"])
+def test_nothing_half_written_stays(tmp_path, suffix):
+    def broken():
+        yield from pictures(2)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_video(tmp_path / f"a.{suffix}", broken(), fps=5)
+    assert list(tmp_path.iterdir()) == []

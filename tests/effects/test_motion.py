@@ -1,0 +1,88 @@
+import math
+
+import pytest
+import torch
+
+from forewarp.effects.motion import Motion
+from forewarp.fields.trajectory import TrajectoryField
+from forewarp.scene.box import Box, Lattice
+from forewarp.scene.state import EMPTY, Activation, RadianceGrid
+
+BOX = Box((0, 0, 0), (1, 6, 8))  # spacings 1/2, 2, 2
+LATTICE = Lattice(BOX, (3, 4, 5))
+
+
+def motion(**changes):
+    return Motion(TrajectoryField(BOX, bases=2, frames=5, canonical_time=0.0, nodes=8), **changes)
+
+
+def solid(raw=6.0):
+    index = torch.arange(60, dtype=torch.int32).reshape(LATTICE.shape)
+    values = torch.cat([torch.full((60, 1), raw), torch.randn(60, 3)], -1)
+    return RadianceGrid(LATTICE, index, values, Activation(-4.6, 1.0))
+
+
+def test_flow_is_in_world_units():
+    canonical = solid()
+    shift = torch.tensor([0.5, 0.0, -2.0])  # one voxel up in x, one down in z
+    warped, coverage, dropped = motion().warp(canonical, LATTICE.all_voxels(), shift.expand(60, 3))
+    arrived = warped.values[warped.index[1:, :, :4].long()]
+    torch.testing.assert_close(arrived, canonical.values.reshape(3, 4, 5, 4)[:2, :, 1:])
+    assert dropped == 60 - 2 * 4 * 4
+    assert len(coverage) == len(warped.values)
+
+
+def test_zero_flow_is_the_identity():
+    canonical = solid()
+    warped, coverage, dropped = motion().warp(canonical, LATTICE.all_voxels(), torch.zeros(60, 3))
+    assert torch.equal(warped.values, canonical.values)
+    assert torch.equal(warped.index, canonical.index)
+    assert (coverage == 1).all()
+    assert dropped == 0
+
+
+@pytest.mark.parametrize("fade", [0.5, 0.0])
+def test_holes_are_empty_and_not_fog(fade):
+    canonical = solid()
+    flow = torch.zeros(60, 3)
+    flow[:, 2] = 2.0 + 2e-6  # the first plane of z is left open, its neighbour gets a sliver's rest
+    warped, coverage, _ = motion(fade=fade).warp(canonical, LATTICE.all_voxels(), flow)
+    padded = torch.cat([warped.raw_density, torch.tensor([EMPTY])])
+    opened = padded[warped.index[:, :, 0].long()]
+    fog = 1 - math.exp(-80 * float(warped.activation.sigma(opened).max()) * LATTICE.pitch)
+    assert fog < 1e-3
+    assert warped.raw_density.max() == pytest.approx(6.0, abs=1e-4)
+    assert (coverage >= 0).all()
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+def test_a_flow_that_is_not_finite_spoils_no_gradient(bad):
+    canonical = solid()
+    values = canonical.values.clone().requires_grad_()
+    flow = torch.zeros(60, 3)
+    flow[7, 1] = bad
+    flow.requires_grad_()
+    warped, _, dropped = motion().warp(canonical.with_values(values), LATTICE.all_voxels(), flow)
+    assert dropped == 1
+    assert warped.values.isfinite().all()
+    warped.values.square().sum().backward()
+    assert values.grad.isfinite().all()
+    assert flow.grad.isfinite().all()
+
+
+def test_gradcheck():
+    canonical = solid()
+    values = canonical.values[:8].double().requires_grad_()
+    generator = torch.Generator().manual_seed(2)
+    flow = (torch.rand(8, 3, generator=generator, dtype=torch.float64) * 0.2 + 0.05).requires_grad_()
+
+    def run(values, flow):
+        return motion().warp(canonical.with_values(values), LATTICE.all_voxels()[12:20], flow)[0].values
+
+    assert torch.autograd.gradcheck(run, (values, flow))
+
+
+@pytest.mark.parametrize("wrong", [{"tau": 0.0}, {"tau": 2.0}, {"fade": -0.1}, {"fade": 1.5}])
+def test_refuses(wrong):
+    with pytest.raises(ValueError, match=r"model.motion: expected 0 < tau <= 1 and 0 <= fade <= 1, but got"):
+        motion(**wrong)

@@ -1,0 +1,91 @@
+import pytest
+import torch
+
+from forewarp.effects.dense import densify, occupied_crop, sparsify
+from forewarp.effects.upsample import LearnedUpsampler, TrilinearUpsampler, interpolate_dense, refined
+from forewarp.scene.box import Box, Lattice
+from forewarp.scene.state import Activation, RadianceGrid
+
+LATTICE = Lattice(Box((0, 0, 0), (2, 3, 4)), (3, 4, 5))
+
+
+def grid(present=None):
+    present = torch.ones(LATTICE.shape, dtype=torch.bool) if present is None else present
+    index = torch.where(present.flatten(), present.flatten().cumsum(0) - 1, -1).reshape(LATTICE.shape).int()
+    values = torch.randn(int(present.sum()), 4, generator=torch.Generator().manual_seed(0))
+    return RadianceGrid(LATTICE, index, values, Activation(-4.6, 0.5))
+
+
+def corner():
+    present = torch.zeros(LATTICE.shape, dtype=torch.bool)
+    present[:2, 1:3, 2] = True
+    return present
+
+
+POINTS = torch.rand(50, 3, generator=torch.Generator().manual_seed(1)) * torch.tensor([2.0, 3.0, 4.0])
+
+
+def answers(radiance):
+    at = radiance.lattice.to_lattice(POINTS)
+    return torch.cat([radiance.density(at)[:, None], radiance.features(at)], -1)
+
+
+def test_refined_divides_the_spacing():
+    assert refined(LATTICE, 2).shape == (5, 7, 9)
+    assert refined(LATTICE, 2).spacing == (0.5, 0.5, 0.5)
+    assert refined(LATTICE, 1.5).shape == (4, 5, 7)
+
+
+@pytest.mark.parametrize("make", [grid, lambda: grid(corner())])
+def test_coarse_voxels_keep_their_values(make):
+    coarse = make()
+    fine = TrilinearUpsampler(scale=2)(coarse)
+    for at in (coarse.index >= 0).nonzero():
+        row = fine.index[tuple((2 * at).tolist())]
+        torch.testing.assert_close(fine.values[row], coarse.values[coarse.index[tuple(at.tolist())]])
+
+
+def test_interpolation_in_occupied_cells_equals_that_of_the_whole_box():
+    coarse = grid(corner())
+    crop = occupied_crop(coarse.index, 9)
+    dense = interpolate_dense(densify(coarse, crop), crop, 2)
+    whole = sparsify(coarse, refined(LATTICE, 2), crop.scaled(2), dense)
+    fine = TrilinearUpsampler(scale=2)(coarse)
+    assert len(fine.values) < len(whole.values)
+    torch.testing.assert_close(answers(fine), answers(whole), atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("present", [None, corner()])
+def test_the_learned_layer_starts_as_plain_interpolation_to_the_bit(present):
+    coarse = grid(present)
+    learned = LearnedUpsampler(scale=2, channels=4)
+    crop = occupied_crop(coarse.index, learned.margin)
+    plain = interpolate_dense(densify(coarse, crop), crop, 2)
+    fine = learned.alone(coarse)
+    assert torch.equal(fine.values, sparsify(coarse, fine.lattice, crop.scaled(2), plain).values)
+    fine.values.sum().backward()
+    assert learned.head.weight.grad.abs().sum() > 0
+
+
+def test_gradients_reach_the_coarse_values():
+    values = grid().values.requires_grad_()
+    TrilinearUpsampler(scale=1.5)(grid().with_values(values)).values.sum().backward()
+    assert (values.grad > 0).all()
+
+
+def test_an_empty_grid_stays_empty():
+    empty = grid(torch.zeros(LATTICE.shape, dtype=torch.bool))
+    fine = TrilinearUpsampler(scale=2)(empty)
+    assert fine.values.shape == (0, 4)
+    assert (fine.index == -1).all()
+
+
+@pytest.mark.parametrize("scale", [1, 0.5, float("nan")])
+def test_refuses_what_does_not_refine(scale):
+    with pytest.raises(ValueError, match=r"model.upsampler.scale: expected a number > 1, but got"):
+        TrilinearUpsampler(scale=scale)
+
+
+def test_the_learned_layer_takes_whole_scales_only():
+    with pytest.raises(ValueError, match="expects a whole number, but got 1.5"):
+        LearnedUpsampler(scale=1.5, channels=4)

@@ -1,0 +1,61 @@
+import pytest
+import torch
+
+from forewarp.fields.radiance import DirectRadiance, FeatureRadiance, density_shift
+from forewarp.scene.box import Box, Lattice
+from forewarp.scene.state import EMPTY
+
+LATTICE = Lattice(Box((0, 0, 0), (2, 3, 4)), (3, 4, 5))
+ALL = torch.ones(LATTICE.shape, dtype=torch.bool)
+COMMON = {"alpha_init": 1e-2, "unit": 0.5, "skip_alpha": 0.0}
+
+
+@pytest.mark.parametrize(
+    ("features", "names"), [(3, {"density", "color"}), (12, {"density", "color", "shading"})]
+)
+def test_direct_radiance_owns_what_it_uses(features, names):
+    radiance = DirectRadiance(LATTICE, ALL, features=features, **COMMON)
+    assert {n for n, _ in radiance.named_parameters()} == names
+    grid = radiance()
+    assert grid.values.shape == (60, 1 + features)
+    assert grid.activation.alpha(grid.raw_density, 0.5)[0].item() == pytest.approx(1e-2, rel=1e-3)
+
+
+def test_direct_radiance_births_have_their_opacity_over_a_voxel():
+    radiance = DirectRadiance(LATTICE, ALL, features=3, **COMMON)
+    raw = torch.tensor(radiance.births(5e-3)["density"])
+    assert radiance.activation.alpha(raw, LATTICE.pitch).item() == pytest.approx(5e-3, rel=1e-3)
+    assert radiance.empties() == {"density": EMPTY}
+
+
+def test_feature_radiance_starts_uniform_and_learns():
+    radiance = FeatureRadiance(LATTICE, ALL, features=12, grid_features=4, width=16, **COMMON)
+    grid = radiance()
+    assert grid.values.shape == (60, 13)
+    assert (grid.values == 0).all()
+    grid.values.sum().backward()
+    assert radiance.network[-1].weight.grad.abs().sum() > 0
+    assert radiance.births(1e-2) == radiance.empties() == {}
+
+
+def test_positions_follow_the_active_voxels():
+    radiance = FeatureRadiance(LATTICE, ALL, features=3, grid_features=2, width=8, **COMMON)
+    torch.nn.init.normal_(radiance.network[-1].weight)
+    radiance()
+    for keep in ([0, 1], [0], [1], [0, 1], [1]):
+        active = torch.zeros_like(ALL)
+        active[keep] = True
+        radiance.activate(active, {})
+    radiance.features.data[:] = 0
+    fresh = FeatureRadiance(LATTICE, active, features=3, grid_features=2, width=8, **COMMON)
+    fresh.network = radiance.network
+    fresh.features.data[:] = 0
+    torch.testing.assert_close(radiance().values, fresh().values)
+
+
+@pytest.mark.parametrize("alpha", [0.0, 1.0, -1.0, 2.0])
+def test_refuses_an_opacity_out_of_range(alpha):
+    with pytest.raises(
+        ValueError, match=r"model.radiance.alpha_init: expected a number in \(0, 1\), but got"
+    ):
+        density_shift(alpha)

@@ -1,0 +1,101 @@
+from functools import partial
+
+import pytest
+import torch
+
+from forewarp.methods.backward_warp import BackwardWarp, Deformation
+from forewarp.renderer import Renderer
+from forewarp.scene.box import Lattice
+from forewarp.training.settings import EFFECTS
+from tiny_scene import BOX, camera_at, forward_spec
+
+LATTICE = Lattice(BOX, (24, 20, 18))
+
+
+def build(canonical_time=0.3, seed=0):
+    torch.manual_seed(seed)
+    active = torch.zeros(LATTICE.shape, dtype=torch.bool)
+    active[3:7, 3:7, 3:6] = True
+    spec = forward_spec(warp="backward", deformation=partial(Deformation, width=16, layers=2))
+    method = spec.build(
+        LATTICE, active, unit=0.3, scene_box=BOX, frames=5, canonical_time=canonical_time, effects=EFFECTS
+    )
+    for name in method.radiance.names:
+        torch.nn.init.normal_(method.radiance.parameter(name), mean=2.0)
+    return method
+
+
+def moved_by(method, shift):
+    """From the canonical time on everything is displaced by ``-shift``: matter moves by ``shift``."""
+    method.deformation.network[-1].bias.data = -torch.tensor(shift) / method.deformation.scale
+    return method
+
+
+def picture(method, field):
+    with torch.no_grad():
+        return Renderer()(field, camera_at(0.1).rays(), torch.ones(3), method.view).rgb
+
+
+def test_it_owns_radiance_and_deformation_only():
+    method = build()
+    assert {n.split(".")[0] for n, _ in method.named_parameters()} == {"radiance", "deformation"}
+    assert not hasattr(method, "motion")
+
+
+def test_at_the_canonical_time_the_picture_is_the_unwarped_one():
+    method = moved_by(build(), (0.4, 0.0, 0.0))
+    field = method.at(0.3).fields["backward"]
+    assert torch.equal(picture(method, field), picture(method, method.radiance()))
+    assert not torch.equal(
+        picture(method, method.at(0.9).fields["backward"]), picture(method, method.radiance())
+    )
+
+
+def test_a_known_translation_moves_density_colour_and_cells():
+    shift = (2 * LATTICE.spacing[0], -LATTICE.spacing[1], 0.0)
+    method = moved_by(build(), shift)
+    canonical, field = method.radiance(), method.at(0.9).fields["backward"]
+    points = torch.rand(300, 3) * torch.tensor([6.0, 6.0, 4.0]) + torch.tensor([4.0, 1.0, 2.0])
+    before = points - torch.tensor([2.0, -1.0, 0.0])
+    torch.testing.assert_close(field.density(points), canonical.density(before), atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(field.features(points), canonical.features(before), atol=1e-4, rtol=1e-4)
+    solid = canonical.cells.roll((2, -1), (0, 1))
+    assert field.cells[solid].all()
+    assert field.cells.sum() < field.cells.numel()
+
+
+def test_what_comes_from_outside_the_box_is_empty():
+    method = moved_by(build(), (50.0, 0.0, 0.0))
+    field = method.at(0.9).fields["backward"]
+    assert (field.density(torch.rand(20, 3) * 8) == 0).all()
+
+
+def test_paths_invert_the_displacement():
+    method = moved_by(build(), (0.4, 0.1, -0.2))
+    torch.nn.init.normal_(method.deformation.network[-1].weight, std=1e-3)
+    points = torch.rand(5, 3) * 0.5
+    times = torch.tensor([0.3, 0.9])
+    paths = method.trajectories(points, times)
+    torch.testing.assert_close(paths[:, 0], points)
+    back = paths[:, 1] + method.deformation(paths[:, 1], 0.9)
+    torch.testing.assert_close(back, points, atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("wild", [1e6, float("inf")])
+def test_a_wild_deformation_leaves_finite_values_and_gradients(wild):
+    method = moved_by(build(), (wild, 0.0, 0.0))
+    field = method.at(0.9).fields["backward"]
+    density = field.density(torch.rand(20, 3) * 8)
+    assert (density == 0).all()
+    density.sum().backward()
+    assert method.radiance.density.grad.isfinite().all()
+
+
+def test_everything_learns():
+    method = moved_by(build(), (0.1, 0.0, 0.0))
+    field = method.at(0.9).fields["backward"]
+    Renderer()(field, camera_at(0.1).rays(), torch.ones(3), method.view).rgb.square().sum().backward()
+    for parameter in (method.radiance.density, method.radiance.color, method.deformation.network[-1].weight):
+        assert parameter.grad.isfinite().all()
+        assert parameter.grad.abs().sum() > 0
+    assert isinstance(method, BackwardWarp)

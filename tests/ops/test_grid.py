@@ -1,0 +1,183 @@
+import numpy as np
+import pytest
+import torch
+from torch.autograd import gradcheck
+
+from forewarp.ops import grid
+from reference import lattice_cells, trilinear_read
+
+SHAPE = (3, 4, 5)
+
+
+def random_points(count=20, seed=1, low=-1.0, high=5.0):
+    generator = torch.Generator().manual_seed(seed)
+    return low + (high - low) * torch.rand(count, 3, generator=generator, dtype=torch.float64)
+
+
+def test_hand_worked(backend):
+    index = torch.arange(8, dtype=torch.int32).reshape(2, 2, 2)
+    values = torch.arange(8.0)[:, None]  # 4 x + 2 y + z
+    points = torch.tensor([[0.5, 0.0, 0.0], [0.25, 0.5, 0.75], [1.0, 1.0, 1.0]])
+    read = grid.trilinear(values, index, points, torch.zeros(1))
+    torch.testing.assert_close(read[:, 0], torch.tensor([2.0, 1.0 + 1.0 + 0.75, 7.0]))
+
+
+def test_equals_the_slow_twin(backend, sparse):
+    values, index, fill = sparse
+    points = random_points()
+    read = grid.trilinear(values, index, points, fill)
+    torch.testing.assert_close(read, trilinear_read(values, index, points, fill))
+
+
+def test_a_voxel_reads_itself_and_an_absent_one_the_fill(backend, sparse):
+    values, index, fill = sparse
+    cells = torch.tensor(lattice_cells(SHAPE), dtype=torch.float64)
+    read = grid.trilinear(values, index, cells, fill)
+    rows = index.reshape(-1).long()
+    assert torch.equal(read[rows >= 0], values[rows[rows >= 0]])
+    assert (read[rows < 0] == fill).all()
+
+
+def test_linear_fields_are_read_exactly_and_constant_ones_stay_so(backend):
+    cells = torch.tensor(lattice_cells(SHAPE), dtype=torch.float64)
+    index = torch.arange(60, dtype=torch.int32).reshape(SHAPE)
+    points = random_points(low=0.0, high=2.0)
+    slope = torch.tensor([2.0, -3.0, 0.5], dtype=torch.float64)
+    values = torch.stack([cells @ slope, torch.full((60,), 4.0, dtype=torch.float64)], -1)
+    read = grid.trilinear(values, index, points, values.new_zeros(2))
+    torch.testing.assert_close(read[:, 0], points @ slope)
+    torch.testing.assert_close(read[:, 1], torch.full((20,), 4.0, dtype=torch.float64))
+
+
+def test_gradcheck(backend, sparse):
+    values, index, fill = sparse
+    points = random_points(6, low=0.1, high=1.9)  # away from the kinks at whole coordinates
+    values.requires_grad_()
+    points.requires_grad_()
+    assert gradcheck(lambda v, p: grid.trilinear(v, index, p, fill), (values, points))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_both_implementations_agree(sparse, dtype, two_threads):
+    pytest.importorskip("numba")
+    results = []
+    for read in (grid.trilinear, grid.trilinear_reference):
+        values, fill = sparse[0].to(dtype).requires_grad_(), sparse[2].to(dtype)
+        points = random_points(50).to(dtype).requires_grad_()
+        out = read(values, sparse[1], points, fill)
+        (out * torch.arange(100, dtype=dtype).reshape(50, 2)).sum().backward()
+        results.append((out.detach(), values.grad, points.grad))
+    for ours, reference in zip(*results):
+        torch.testing.assert_close(ours, reference, rtol=1e-4, atol=1e-4)
+
+
+def test_points_outside_read_the_border_and_feel_no_pull(backend, sparse):
+    values, index, fill = sparse
+    far = torch.tensor([[-9.0, 1.2, 2.2], [1e30, 1.2, 2.2], [float("inf"), 1.2, 2.2]], dtype=torch.float64)
+    near = torch.tensor([[0.0, 1.2, 2.2], [2.0, 1.2, 2.2], [2.0, 1.2, 2.2]], dtype=torch.float64)
+    far.requires_grad_()
+    read = grid.trilinear(values, index, far, fill)
+    torch.testing.assert_close(read, grid.trilinear(values, index, near, fill))
+    read.sum().backward()
+    assert (far.grad[:, 0] == 0).all()
+    assert far.grad.isfinite().all()
+
+
+def test_no_points_and_no_voxels(backend):
+    values = torch.zeros(0, 2, requires_grad=True)
+    index = torch.full(SHAPE, -1, dtype=torch.int32)
+    fill = torch.tensor([1.0, 2.0])
+    read = grid.trilinear(values, index, torch.ones(3, 3), fill)
+    assert read.tolist() == [[1.0, 2.0]] * 3
+    read.sum().backward()
+    assert values.grad.shape == (0, 2)
+    assert grid.trilinear(values, index, torch.ones(0, 3), fill).shape == (0, 2)
+
+
+def test_a_second_derivative_is_refused_and_not_silently_zero(sparse):
+    pytest.importorskip("numba")
+    values, index, fill = sparse
+    points = random_points(3, low=0.1, high=1.9).requires_grad_()
+    (slope,) = torch.autograd.grad(
+        grid.trilinear(values, index, points, fill).square().sum(), points, create_graph=True
+    )
+    with pytest.raises(RuntimeError, match="once_differentiable"):
+        slope.sum().backward()
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ({"values": torch.zeros(4)}, r"values: expected shape \(M, C\)"),
+        ({"index": torch.zeros(3, 4, dtype=torch.int32)}, r"index: expected shape \(X, Y, Z\)"),
+        ({"points": torch.zeros(5, 2)}, r"points: expected shape \(P, 3\), but got \(5, 2\)"),
+        ({"fill": torch.zeros(3)}, r"fill: expected shape \(2\)"),
+        ({"index": torch.zeros(1, 4, 5, dtype=torch.int32)}, "expected at least 2 voxels an axis"),
+    ],
+)
+def test_refuses_other_shapes(change, text):
+    fine = {
+        "values": torch.zeros(60, 2),
+        "index": torch.zeros(SHAPE, dtype=torch.int32),
+        "points": torch.zeros(5, 3),
+        "fill": torch.zeros(2),
+    }
+    with pytest.raises(ValueError, match=text):
+        grid.trilinear(**(fine | change))
+
+
+def test_index_of_inverts_the_list_of_voxels():
+    voxels = torch.tensor([[2, 3, 4], [0, 0, 0], [1, 2, 0]])
+    index = grid.index_of(voxels, SHAPE)
+    assert [int(index[tuple(v)]) for v in voxels.tolist()] == [0, 1, 2]
+    assert int((index >= 0).sum()) == 3
+    assert (grid.index_of(voxels[:0], SHAPE) == -1).all()
+    with pytest.raises(ValueError, match=r"voxels: expected shape \(N, 3\)"):
+        grid.index_of(torch.zeros(3), SHAPE)
+
+
+def test_dilate_equals_the_largest_distance():
+    mask = torch.zeros(5, 6, 7, dtype=torch.bool)
+    mask[0, 2, 6] = mask[4, 5, 0] = True
+    cells = np.array(lattice_cells(mask.shape))
+    for by in (0, 1, 2):
+        distance = [np.abs(cells - np.array(at)).max(1) for at in ((0, 2, 6), (4, 5, 0))]
+        expected = (np.minimum(*distance) <= by).reshape(mask.shape)
+        assert (grid.dilate(mask, by).numpy() == expected).all()
+
+
+def test_dilate_keeps_one_voxel_axes():
+    assert grid.dilate(torch.tensor([[[True, False, False]]])).tolist() == [[[True, True, False]]]
+
+
+@pytest.mark.parametrize("keeping", [None, torch.arange(40) % 7 == 3, torch.zeros(40, dtype=torch.bool)])
+def test_occupied_cells_have_a_corner_that_is_present_and_kept(backend, sparse, keeping):
+    index = sparse[1].clone()
+    index[0] = -1
+    cells = grid.occupied_cells(index, keeping)
+    keep = [True] * 40 if keeping is None else keeping.tolist()
+    for x, y, z in lattice_cells((2, 3, 4)):
+        rows = index[x : x + 2, y : y + 2, z : z + 2].flatten().tolist()
+        assert bool(cells[x, y, z]) == any(row >= 0 and keep[row] for row in rows)
+
+
+def test_an_empty_lattice_has_no_occupied_cells(backend):
+    assert not grid.occupied_cells(torch.full(SHAPE, -1, dtype=torch.int32)).any()
+
+
+def test_neighbour_pairs_are_all_pairs_at_distance_one(sparse):
+    index = sparse[1]
+    found = {frozenset(p) for a, b in grid.neighbour_pairs(index) for p in zip(a.tolist(), b.tolist())}
+    rows = {cell: int(index[cell]) for cell in lattice_cells(SHAPE) if index[cell] >= 0}
+    expected = {
+        frozenset((r, s))
+        for a, r in rows.items()
+        for b, s in rows.items()
+        if sum(abs(i - j) for i, j in zip(a, b)) == 1
+    }
+    assert found == expected
+
+
+def test_one_voxel_axes_have_no_pairs():
+    pairs = grid.neighbour_pairs(torch.arange(4, dtype=torch.int32).reshape(1, 4, 1))
+    assert [len(a) for a, _ in pairs] == [0, 3, 0]

@@ -1,0 +1,60 @@
+import numpy as np
+import pytest
+import torch
+from torch.autograd import gradcheck
+
+from forewarp.ops.grid import neighbour_pairs
+from forewarp.ops.variation import patch_variation, total_variation
+from reference import patch_roughness, variation
+
+
+def test_hand_worked():
+    index = torch.arange(4, dtype=torch.int32).reshape(2, 2, 1)
+    values = torch.tensor([[0.0], [1.0], [5.0], [3.0]])
+    # x: |5 - 0|, |3 - 1| -> 3.5; y: |1 - 0|, |3 - 5| -> 1.5; z has one voxel.
+    assert total_variation(values, neighbour_pairs(index)).item() == 5.0
+
+
+def test_equals_the_slow_twin(sparse):
+    values, index, _ = sparse
+    padded = np.concatenate([values.numpy(), np.full((1, 2), np.nan)])
+    expected = variation(padded[index.numpy()])
+    assert total_variation(values, neighbour_pairs(index)).item() == pytest.approx(expected)
+
+
+def test_a_constant_has_none_and_lonely_voxels_too(sparse):
+    _, index, _ = sparse
+    assert total_variation(torch.ones(40, 2), neighbour_pairs(index)).item() == 0
+    alone = torch.full((3, 4, 5), -1, dtype=torch.int32)
+    alone[1, 1, 1] = 0
+    values = torch.ones(1, 2, requires_grad=True)
+    assert total_variation(values, neighbour_pairs(alone)).item() == 0
+
+
+def test_gradcheck(sparse):
+    values, index, _ = sparse
+    pairs = neighbour_pairs(index)
+    assert gradcheck(lambda v: total_variation(v, pairs), values.requires_grad_())
+    depth = torch.rand(2, 4, 4, dtype=torch.float64, requires_grad=True)
+    assert gradcheck(lambda d: patch_variation(d, torch.rand(2, 4, 4).double() * 0 + 0.5), depth)
+
+
+def test_patches_equal_the_slow_twin():
+    depth, opacity = torch.rand(3, 5, 5), torch.rand(3, 5, 5)
+    assert patch_variation(depth, opacity).item() == pytest.approx(patch_roughness(depth, opacity))
+
+
+def test_transparent_patches_do_not_count_and_opacity_is_not_pulled():
+    depth = torch.rand(2, 4, 4, requires_grad=True)
+    opacity = torch.rand(2, 4, 4, requires_grad=True)
+    assert patch_variation(depth, torch.zeros(2, 4, 4)).item() == 0
+    patch_variation(depth, opacity).backward()
+    assert opacity.grad is None
+    assert depth.grad.abs().sum() > 0
+
+
+def test_refuses_other_shapes():
+    with pytest.raises(ValueError, match=r"values: expected shape \(M, C\)"):
+        total_variation(torch.zeros(3), [])
+    with pytest.raises(ValueError, match=r"depth: expected shape \(B, S, S\)"):
+        patch_variation(torch.zeros(4, 4), torch.zeros(4, 4))

@@ -1,0 +1,71 @@
+import pytest
+import torch
+
+from forewarp.scene.camera import Camera, look_at
+from forewarp.scene.paths import RandomPatches, focus_point, mean_up, orbit
+from tiny_scene import camera_at
+
+Z = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+
+
+def at(center, target):
+    pose = look_at(torch.tensor(center), torch.tensor(target), Z)
+    return Camera(20, 10, 20.0, 20.0, 10.0, 5.0, pose, 1.0, 6.0)
+
+
+def test_focus_is_what_all_look_at():
+    cameras = [at(c, [0.3, -0.2, 0.5]) for c in ([3.0, 0.0, 1.0], [0.0, 4.0, 0.0], [-2.0, -1.0, 3.0])]
+    torch.testing.assert_close(
+        focus_point(cameras), torch.tensor([0.3, -0.2, 0.5]).double(), atol=1e-6, rtol=0
+    )
+
+
+def test_parallel_axes_have_a_finite_focus_on_the_middle_axis():
+    focus = focus_point([at([x, -4.0, 0.0], [x, 0.0, 0.0]) for x in (-1.0, 1.0)])
+    torch.testing.assert_close(focus, torch.tensor([0.0, -4.0, 0.0]).double(), atol=1e-6, rtol=0)
+
+
+def test_mean_up():
+    assert float(mean_up([camera_at(t) for t in (0.0, 0.3, 0.6)]) @ Z) > 0.8
+    upright = at([3.0, 0.0, 0.0], [0.0, 0.0, 0.0])
+    pose = look_at(torch.tensor([3.0, 0.0, 0.0]), torch.zeros(3), -Z)
+    hanging = Camera(20, 10, 20.0, 20.0, 10.0, 5.0, pose, 1.0, 6.0)
+    torch.testing.assert_close(mean_up([upright, hanging]), Z)  # they cancel
+
+
+def test_patches_are_neighbouring_rays_on_the_sphere_that_look_inwards():
+    cameras = [at([3.0, 0.0, 0.5], [0.0] * 3), at([0.0, 3.0, 0.5], [0.0] * 3)]
+    patches = RandomPatches(cameras, patches=5, size=4)
+    rays = patches.draw(torch.Generator().manual_seed(0))
+    assert len(rays) == 5 * 4 * 4
+    assert (rays.origins == rays.origins[0]).all()
+    distances = [(c.center - patches.focus).norm().item() for c in cameras]
+    radius = (rays.origins[0].double() - patches.focus).norm().item()
+    assert min(distances) - 1e-5 <= radius <= max(distances) + 1e-5
+    blocks = rays.directions.reshape(5, 4, 4, 3)
+    steps = (blocks[:, :, 1:] - blocks[:, :, :-1]).norm(dim=-1)
+    assert 0 < float(steps.min()) <= float(steps.max()) < 1.5 / 20
+    inwards = (patches.focus - rays.origins[0].double()).float()
+    assert (rays.directions @ inwards > 0).all()
+
+
+def test_draws_follow_the_generator():
+    patches = RandomPatches([camera_at(0.0), camera_at(0.4)], patches=2)
+    first, again = (patches.draw(torch.Generator().manual_seed(7)).directions for _ in range(2))
+    other = patches.draw(torch.Generator().manual_seed(8)).directions
+    assert torch.equal(first, again)
+    assert not torch.equal(first, other)
+
+
+def test_orbit_circles_at_the_same_height_and_distance():
+    start = camera_at(0.2)
+    views = orbit(start, torch.zeros(3).double(), Z, torch.tensor([0.0, 0.25, 0.5, 1.0]))
+    torch.testing.assert_close(views[0].center, start.center)
+    torch.testing.assert_close(views[3].center, start.center)
+    for view in views:
+        assert view.center[2].item() == pytest.approx(start.center[2].item())
+        assert view.center.norm().item() == pytest.approx(start.center.norm().item())
+        pixel, depth = view.project(torch.zeros(1, 3).double())
+        assert pixel[0].tolist() == pytest.approx([12, 12])
+        assert depth > 0
+    torch.testing.assert_close(views[2].center[:2], -start.center[:2])

@@ -1,0 +1,170 @@
+"""Every configuration composes and instantiates; the command line wins; off is off."""
+
+from dataclasses import MISSING, fields
+
+import pytest
+import torch
+from hydra.errors import ConfigCompositionException
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
+
+from configs import CONF, ROOT, composed, groups, options
+from forewarp.cli.runs import build_run
+from forewarp.effects.inpaint import UNet3d
+from forewarp.effects.upsample import LearnedUpsampler
+from forewarp.effects.view import SphericalHarmonics, ViewNetwork
+from forewarp.scene.box import Box, Lattice
+from forewarp.training.settings import StageSettings
+
+BUDGETS, MODELS = options("budget"), options("model")
+CHOICES = [(group, option) for group in groups() for option in options(group)]
+OFF = [("inpainter", "unet3d"), ("upsampler", "learned"), ("view", "mlp"), ("motion", "dct")]
+
+
+def run_of(*overrides):
+    """A run put together, of a scene that need not exist."""
+    return build_run(composed("data.scene=x", *overrides))
+
+
+def method_of(spec, frames=4):
+    """A method on a tiny lattice."""
+    lattice = Lattice(Box((-1, -1, -1), (1, 1, 1)), (3, 4, 5))
+    return spec.build(
+        lattice,
+        torch.ones(lattice.shape, dtype=torch.bool),
+        unit=0.5,
+        scene_box=lattice.box,
+        frames=frames,
+        canonical_time=0.0,
+        effects=("motion", "view", "upsampler", "inpainter"),
+    )
+
+
+@pytest.mark.parametrize(("group", "option"), CHOICES)
+def test_every_option_composes_and_instantiates(group, option):
+    run = run_of(f"{group}={option}")
+    assert [stage.settings.name for stage in run.stages] == ["coarse", "fine"]
+    if group.startswith("model"):
+        assert isinstance(method_of(run.spec), torch.nn.Module)
+
+
+@pytest.mark.parametrize("name", [path.stem for path in CONF.glob("*.yaml")])
+def test_every_command_has_a_config(name):
+    config = composed("data.scene=x", name=name) if name == "train" else composed(name=name)
+    OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+
+
+@pytest.mark.parametrize("sweep", [path.stem for path in (ROOT / "sweeps").glob("*.yaml")])
+def test_every_sweep_is_found_and_names_options(sweep):
+    params = composed(f"sweeps={sweep}", hydra=True).hydra.sweeper.params
+    assert len(params) > 0
+    for key, values in params.items():
+        for value in str(values).split(","):
+            run_of(f"{key}={value}")
+
+
+@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("budget", BUDGETS)
+def test_budgets_go_with_models(budget, model):
+    config = composed("data.scene=x", f"budget={budget}", f"model={model}")
+    assert (config.budget.name, config.model.warp) == (budget, model)
+    spec = instantiate(config.model, _convert_="all")
+    if model == "backward":
+        assert [spec.motion, spec.trajectory, spec.upsampler, spec.inpainter] == [None] * 4
+        assert spec.deformation is not None
+    build_run(config)
+
+
+def test_faithful_is_the_papers_model():
+    method = method_of(run_of("budget=faithful").spec, frames=40)
+    assert isinstance(method.inpainter, UNet3d)
+    assert method.inpainter.width == 64
+    assert isinstance(method.upsampler, LearnedUpsampler)
+    assert isinstance(method.view, ViewNetwork)
+    assert method.motion.trajectory.bases == 15
+    assert not method.motion.trajectory.at_nodes
+
+
+def test_faithful_stages_are_the_papers():
+    coarse, fine = run_of("budget=faithful").stages
+    assert (coarse.settings.iterations, fine.settings.iterations) == (20_000, 100_000)
+    assert (coarse.settings.start_alpha, fine.settings.start_alpha) == (1e-6, 1e-2)
+    assert coarse.settings.effects == ["motion"]
+    assert not fine.settings.carry
+    assert coarse.objective.weights["tv_depth"] == fine.objective.weights["tv_depth"] == 1e-1
+    assert (coarse.objective.weights["point_color"], fine.objective.weights["point_color"]) == (1e-1, 1e-2)
+
+
+@pytest.mark.parametrize(("effect", "on"), OFF)
+@pytest.mark.parametrize("budget", BUDGETS)
+def test_off_is_none_whatever_the_budget(budget, effect, on):
+    spec = run_of(f"budget={budget}", f"model/{effect}=none").spec
+    assert getattr(spec, effect) is None
+    assert getattr(run_of(f"budget={budget}", f"model/{effect}={on}").spec, effect) is not None
+
+
+def test_off_effects_own_nothing():
+    off = [f"model/{effect}=none" for effect, _ in OFF]
+    method = method_of(run_of(*off).spec)
+    assert {name.split(".")[0] for name, _ in method.named_parameters()} == {"radiance"}
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_the_command_line_wins_over_the_budget(order):
+    overrides = ["budget=fast", "model/view=mlp"][::order]
+    assert method_of(run_of("budget=fast").spec).view.__class__ is SphericalHarmonics
+    assert method_of(run_of(*overrides).spec).view.__class__ is ViewNetwork
+
+
+def test_the_command_line_wins_over_the_experiment():
+    config = composed("experiment=dnerf", "data.scene=x", "budget=faithful", "data.box=null", "data.rays=7")
+    assert (config.budget.name, config.data.box, config.data.rays) == ("faithful", None, 7)
+    assert composed("experiment=dnerf", "data.scene=x").data.box == [-1.5] * 3 + [1.5] * 3
+
+
+def test_a_ghost_is_refused():
+    config = composed("model/inpainter=none", "+model.inpainter.width=32")
+    with pytest.raises(Exception, match="model.inpainter: expected a factory or null, but got {'width': 32}"):
+        instantiate(config.model, _convert_="all")
+
+
+def test_an_unknown_key_is_refused():
+    with pytest.raises(ConfigCompositionException, match=r"data\.scence"):
+        composed("data.scence=x")
+
+
+def test_budget_is_shared_out():
+    run = run_of("budget=fast", "budget.minutes=20", "budget.iterations=1000")
+    assert [stage.settings.minutes for stage in run.stages] == pytest.approx([8, 12])
+    assert [stage.settings.iterations for stage in run.stages] == [400, 600]
+
+
+def test_a_dropped_stage_leaves_its_share():
+    (only,) = run_of("budget=fast", "budget.minutes=20", "~stage.fine").stages
+    assert (only.settings.name, only.settings.minutes) == ("coarse", 20)
+    (only,) = run_of("budget=fast", "stage.coarse=null").stages
+    assert only.settings.name == "fine"
+
+
+def test_every_stage_key_may_be_typed_and_starts_from_the_same():
+    base = OmegaConf.to_container(OmegaConf.load(CONF / "stage" / "one" / "base.yaml"))
+    for field in fields(StageSettings):
+        if field.name in ("name", "minutes", "iterations"):  # named by its place; bounded by the budget
+            continue
+        assert field.name in base
+        if field.default is not MISSING:
+            expected = list(field.default) if isinstance(field.default, tuple) else field.default
+            assert base[field.name] == expected, field.name
+
+
+def test_every_weight_may_be_typed():
+    config = composed("objective.coarse.weights.tv_depth=0.5", "objective.fine.weights.flow_l1=0.25")
+    coarse, fine = build_run(config).stages
+    assert (coarse.objective.weights["tv_depth"], fine.objective.weights["tv_depth"]) == (0.5, 0.0)
+    assert set(coarse.objective.weights) == set(coarse.objective.terms)
+    assert fine.objective.weights["flow_l1"] == 0.25
+
+
+def test_run_folder_is_named_after_the_choices():
+    config = composed("data.scene=hook", "data=dnerf", "model=backward", "budget=demo", "seed=3")
+    assert config.run == "runs/hook/backward-demo-seed3"

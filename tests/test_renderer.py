@@ -1,0 +1,152 @@
+import math
+
+import pytest
+import torch
+
+from forewarp.renderer import Renderer
+from forewarp.scene.box import Box, Lattice
+from forewarp.scene.rays import Rays
+from forewarp.scene.state import Activation, RadianceGrid
+from reference import composite, march_samples
+
+LATTICE = Lattice(Box((0, 0, 0), (1, 3, 8)), (3, 4, 5))  # spacings 1/2, 1, 2; pitch 1
+
+
+class Slab:
+    """Constant density and colour in the whole box."""
+
+    lattice = LATTICE
+    cells = torch.ones(2, 3, 4, dtype=torch.bool)
+
+    def __init__(self, sigma, feature=0.0):
+        self.sigma, self.feature = sigma, feature
+
+    def density(self, points):
+        return torch.full((len(points),), self.sigma, dtype=points.dtype)
+
+    def features(self, points):
+        return torch.full((len(points), 3), self.feature, dtype=points.dtype)
+
+
+def rays(origins, directions, near=0.0, far=20.0):
+    directions = torch.nn.functional.normalize(torch.tensor(directions, dtype=torch.float64), dim=-1)
+    return Rays(torch.tensor(origins, dtype=torch.float64), directions, near, far)
+
+
+THROUGH = rays([[0.5, 1.5, -2.0], [0.5, -1.0, 3.0]], [[0, 0, 1], [0, 1, 0]])
+MISS = rays([[5.0, 1.5, -2.0], [0.5, 1.0, 9.0]], [[0, 0, 1], [0, 0, 1]])
+WHITE = torch.ones(3, dtype=torch.float64)
+
+
+def cloud():
+    generator = torch.Generator().manual_seed(0)
+    values = 4 * torch.randn(60, 4, generator=generator, dtype=torch.float64)
+    index = torch.arange(60, dtype=torch.int32).reshape(LATTICE.shape)
+    return RadianceGrid(LATTICE, index, values, Activation(0.0, 1.0))
+
+
+def test_a_slab_absorbs_by_its_length():
+    drawn = Renderer(step=0.01)(Slab(0.3), THROUGH, WHITE)
+    expected = torch.tensor([1 - math.exp(-0.3 * 8), 1 - math.exp(-0.3 * 3)]).double()
+    torch.testing.assert_close(drawn.opacity, expected, atol=2e-3, rtol=0)
+    torch.testing.assert_close(drawn.rgb, (1 - 0.5 * expected)[:, None].expand(2, 3), atol=2e-3, rtol=0)
+    torch.testing.assert_close(drawn.opacity + drawn.transmittance, WHITE[:2])
+    # Mean depth of an exponential cut off at L, from where the box begins.
+    mean = [b + 1 / 0.3 - length / math.expm1(0.3 * length) for b, length in ((2, 8), (1, 3))]
+    torch.testing.assert_close(drawn.depth, torch.tensor(mean).double(), atol=1e-2, rtol=0)
+
+
+def test_equals_the_slow_twin():
+    field = cloud()
+    all_rays = rays(
+        [[0.4, 1.2, -2.0], [0.5, -1.0, 3.1], [9.0, 9.0, 9.0], [0.2, 1.0, 4.0]],
+        [[0.1, 0.2, 1], [0.1, 1, 0.3], [1, 0, 0], [0.3, 1, -1]],
+    )
+    drawn = Renderer(step=0.5, color_threshold=0.0)(field, all_rays, WHITE, keep_all_weights=True)
+    spacing = torch.tensor(LATTICE.spacing).double()
+    start, along = all_rays.origins / spacing, all_rays.directions / spacing
+    ids, distances = march_samples(start, along, 0.0, 20.0, 0.5, field.cells, torch.full((4,), 0.5))
+    ids, distances = torch.tensor(ids), torch.tensor(distances).double()
+    points = start[ids] + distances[:, None] * along[ids]
+    weights, through = composite(field.density(points) * 0.5, ids, 4)
+    rgb = torch.tensor(through).double()[:, None] * WHITE
+    for ray, weight, color in zip(ids.tolist(), weights, torch.sigmoid(field.features(points))):
+        rgb[ray] += weight * color
+    torch.testing.assert_close(drawn.rgb, rgb)
+    torch.testing.assert_close(drawn.all_weights, torch.tensor(weights).double())
+    torch.testing.assert_close(drawn.transmittance, torch.tensor(through).double())
+    assert drawn.samples == len(ids)
+
+
+def test_what_misses_shows_the_background():
+    for background in (torch.tensor([0.2, 0.4, 0.6]).double(), torch.rand(2, 3).double()):
+        drawn = Renderer()(Slab(5.0), MISS, background)
+        assert torch.equal(drawn.rgb, background.expand(2, 3))
+        assert drawn.depth.tolist() == drawn.opacity.tolist() == [0, 0]
+        assert drawn.samples == len(drawn.weights) == 0
+
+
+@pytest.mark.parametrize("sigma", [0.0, 1e-8, 1e4, 1e30, float("inf")])
+def test_any_density_is_finite(sigma):
+    drawn = Renderer()(Slab(sigma), THROUGH, WHITE)
+    for value in (drawn.rgb, drawn.depth, drawn.opacity):
+        assert value.isfinite().all()
+    assert ((drawn.opacity >= 0) & (drawn.opacity <= 1)).all()
+
+
+def test_no_rays_and_one_sample():
+    drawn = Renderer()(Slab(1.0), THROUGH[:0], WHITE)
+    assert drawn.rgb.shape == (0, 3)
+    short = rays([[0.5, 1.5, 4.0]], [[0, 0, 1]], near=0.0, far=0.3)
+    drawn = Renderer(step=0.5)(Slab(1.0), short, WHITE)
+    assert drawn.samples == 1
+    assert drawn.opacity.item() == pytest.approx(1 - math.exp(-0.5))
+
+
+def test_gradcheck():
+    field = cloud()
+    values = field.values.clone().requires_grad_()
+    view = rays([[0.4, 1.2, -2.0], [0.5, -1.0, 3.1]], [[0.1, 0.2, 1], [0.1, 1, 0.3]])
+
+    def run(values):
+        drawn = Renderer(color_threshold=0.0)(field.with_values(values), view, WHITE)
+        return drawn.rgb, drawn.depth, drawn.opacity
+
+    assert torch.autograd.gradcheck(run, values)
+
+
+def test_faint_samples_cost_no_colour_and_hardly_any_light():
+    field, view = cloud(), rays([[0.4, 1.2, -2.0]], [[0.1, 0.2, 1]])
+    whole, thrifty = (Renderer(color_threshold=t)(field, view, WHITE) for t in (0.0, 1e-2))
+    assert len(thrifty.weights) < len(whole.weights) == whole.samples
+    assert torch.equal(whole.opacity, thrifty.opacity)
+    torch.testing.assert_close(whole.rgb, thrifty.rgb, atol=0.1, rtol=0)
+
+
+def test_the_view_sees_features_and_directions():
+    def view(features, directions):
+        return directions.abs() + 0 * features[:, :3]
+
+    drawn = Renderer()(Slab(1e3), THROUGH, WHITE, view)
+    torch.testing.assert_close(drawn.rgb, THROUGH.directions.abs())
+
+
+def test_jitter_follows_the_generator():
+    first, again, other = (
+        Renderer()(cloud(), THROUGH, WHITE, generator=torch.Generator().manual_seed(s)).rgb for s in (1, 1, 2)
+    )
+    assert torch.equal(first, again)
+    assert not torch.equal(first, other)
+
+
+def test_another_threshold_by_stage():
+    renderer = Renderer(step=0.3)
+    assert renderer.with_threshold(None) is renderer
+    other = renderer.with_threshold(0.0)
+    assert (other.step, other.color_threshold) == (0.3, 0.0)
+
+
+@pytest.mark.parametrize("wrong", [{"step": 0.0}, {"color_threshold": 1.0}, {"color_threshold": -0.1}])
+def test_refuses(wrong):
+    with pytest.raises(ValueError, match="renderer: expected step > 0 and 0 <= color_threshold < 1, but got"):
+        Renderer(**wrong)

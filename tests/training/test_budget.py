@@ -1,0 +1,46 @@
+import pytest
+
+from forewarp.training.budget import StagePlan, share_out
+from forewarp.training.objective import Objective
+
+
+def plan(share=1.0, **changes):
+    """A stage that waits for its budget."""
+    numbers = {"voxels": [[0, 64]], "rates": {}}
+    return StagePlan(share=share, objective=Objective({"photo": 1.0}), **(numbers | changes))
+
+
+def test_minutes_and_iterations_go_by_share():
+    first, second = share_out({"a": plan(1), "b": plan(3)}, minutes=2.0, iterations=10)
+    assert (first.settings.name, first.settings.minutes, first.settings.iterations) == ("a", 0.5, 2)
+    assert (second.settings.name, second.settings.minutes, second.settings.iterations) == ("b", 1.5, 8)
+
+
+def test_a_bound_may_be_left_to_the_other():
+    (only,) = share_out({"a": plan(), "b": None}, minutes=None, iterations=7)
+    assert (only.settings.minutes, only.settings.iterations) == (None, 7)
+
+
+def test_a_stage_has_at_least_one_step():
+    first, _ = share_out({"a": plan(1), "b": plan(999)}, minutes=None, iterations=3)
+    assert first.settings.iterations == 1
+
+
+@pytest.mark.parametrize(
+    ("plans", "minutes", "match"),
+    [
+        ({}, 1, "stage: expected at least one stage, but got none"),
+        ({"a": plan(0)}, 1, r"stage\.a\.share: expected a number > 0, but got 0"),
+        ({"a": plan()}, 0, r"budget\.minutes: expected a number > 0 or null, but got 0"),
+        ({"a": plan()}, "soon", r"budget\.minutes: expected a number > 0 or null, but got soon"),
+        ({"a": plan()}, None, r"stage\.a: expected iterations or minutes, but got neither"),
+    ],
+)
+def test_refusals(plans, minutes, match):
+    with pytest.raises(ValueError, match=match):
+        share_out(plans, minutes=minutes, iterations=None)
+
+
+def test_an_unknown_key_is_an_error():
+    with pytest.raises(TypeError, match="unexpected keyword argument 'voxel'"):
+        share_out({"a": plan(voxel=1)}, minutes=1, iterations=None)

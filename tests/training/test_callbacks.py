@@ -1,0 +1,217 @@
+import io
+import re
+
+import lightning
+import pytest
+import torch
+from lightning.pytorch.loggers import TensorBoardLogger
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from forewarp.renderer import Renderer
+from forewarp.training.callbacks import StageProgress, TensorBoardScalars
+from forewarp.training.pictures import TensorBoardPictures
+from forewarp.training.progress import ProgressLine
+from forewarp.training.stages import Run
+from tiny_scene import Interrupt, ball_data, forward_spec, stage
+
+STEPS = 12
+
+
+def watched_run(folder, *callbacks, steps=STEPS):
+    """A run of one short stage over the ball, with a TensorBoard logger as the command has it."""
+
+    def make_trainer(where, own):
+        return lightning.Trainer(
+            max_epochs=1,
+            max_steps=-1,
+            accelerator="cpu",
+            logger=TensorBoardLogger(save_dir=str(where), name="tensorboard", version=""),
+            default_root_dir=str(where),
+            enable_checkpointing=False,
+            enable_progress_bar=False,
+            enable_model_summary=False,
+            callbacks=own,
+            limit_val_batches=0,
+            num_sanity_val_steps=0,
+        )
+
+    stages = [stage(iterations=steps)]
+    return Run(
+        ball_data(),
+        forward_spec(),
+        stages,
+        Renderer(),
+        folder,
+        make_trainer,
+        lambda name, where: list(callbacks),
+    )
+
+
+def all_watchers():
+    return StageProgress(every=0), TensorBoardScalars(every=5), TensorBoardPictures(moments=(0.25, 0.5, 1.0))
+
+
+@pytest.fixture(scope="module")
+def watched(tmp_path_factory):
+    """A finished stage that everything watched: its module and its folder."""
+    folder = tmp_path_factory.mktemp("watched")
+    return watched_run(folder, *all_watchers()).fit(), folder / "coarse"
+
+
+@pytest.fixture(scope="module")
+def events(watched):
+    accumulator = EventAccumulator(str(watched[1] / "tensorboard"))
+    accumulator.Reload()
+    return accumulator
+
+
+class Terminal(io.StringIO):
+    """Pretends to be one."""
+
+    def isatty(self):
+        return True
+
+
+def test_lines_where_there_is_no_terminal(tmp_path, capsys):
+    watched_run(tmp_path, StageProgress(every=0)).fit()
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == STEPS + 1
+    shape = (
+        r"coarse +(\d+)% \| (.*) \| psnr -?[\d.]+ \| loss [\d.]+ \| frames (\d+)/12 \| "
+        r"voxels [\d,]+ \| [\d.]+ steps/s"
+    )
+    found = [re.fullmatch(shape, line) for line in lines]
+    assert all(found), lines
+    assert all(re.fullmatch(r"\d+:\d\d left", match[2]) for match in found[:-1])
+    assert re.fullmatch(r"\d+:\d\d trained", found[-1][2])
+    percents = [int(match[1]) for match in found]
+    assert percents == sorted(percents)
+    assert percents[-2:] == [100, 100]
+    assert [found[0][3], found[-1][3]] == ["10", "12"]
+
+
+def test_a_long_wait_between_lines_leaves_only_the_last(tmp_path, capsys):
+    watched_run(tmp_path, StageProgress(every=1000)).fit()
+    assert len(capsys.readouterr().err.splitlines()) == 1
+
+
+def test_a_terminal_gets_a_bar_that_is_not_drawn_too_often(monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr("forewarp.training.progress.time.perf_counter", lambda: now[0])
+    stream = Terminal()
+    line = ProgressLine("fine", refresh=0.25, stream=stream)
+    assert line.due()
+    line.show(0.5, 65, "psnr 30 dB")
+    assert not line.due()
+    now[0] += 0.26
+    assert line.due()
+    line.close(1.0, "done")
+    text = stream.getvalue()
+    assert all(part in text for part in ("fine", "50% | 1:05 left | psnr 30 dB", "100% | done", "━"))
+    assert text.endswith("\x1b[?25h")  # the cursor is back
+
+
+def test_an_error_leaves_the_line_closed(tmp_path, capsys):
+    progress = StageProgress(every=0)
+    with pytest.raises(SystemExit):
+        watched_run(tmp_path, progress, Interrupt("coarse", 3)).fit()
+    assert "25% | 0:0" in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_every_named_curve_is_there(watched, events):
+    terms = {f"train/loss/{name}" for name in ("photo", "point_color", "tv_flow")}
+    counts = {"frames_in_play", "occupied_voxels", "coverage", "dropped_voxels", "samples", "bases_in_play"}
+    rates = {f"lr/{kind}" for kind in ("density", "color", "shading", "flow")}
+    expected = {"train/loss", "train/psnr"} | terms | {f"train/{name}" for name in counts} | rates
+    assert expected <= set(events.Tags()["scalars"])
+
+
+def test_curves_are_means_over_the_steps_between(tmp_path):
+    class Record(lightning.Callback):
+        losses = []
+
+        def on_train_batch_end(self, trainer, module, *_):
+            self.losses.append(module.last["loss"])
+
+    watched_run(tmp_path, Record(), TensorBoardScalars(every=5)).fit()
+    accumulator = EventAccumulator(str(tmp_path / "coarse" / "tensorboard"))
+    accumulator.Reload()
+    curve = accumulator.Scalars("train/loss")
+    assert [point.step for point in curve] == [5, 10, 12]
+    assert curve[1].value == pytest.approx(sum(Record.losses[5:10]) / 5, rel=1e-5)
+    assert curve[2].value == pytest.approx(sum(Record.losses[10:]) / 2, rel=1e-5)
+
+
+def test_logged_values_are_those_of_the_stage(watched, events):
+    module = watched[0]
+    last = {tag: events.Scalars(tag)[-1].value for tag in events.Tags()["scalars"]}
+    assert last["lr/density"] == pytest.approx(0.3 * module.settings.rate_factor(11 / 12))
+    assert last["train/frames_in_play"] == 12
+    assert last["train/bases_in_play"] == 4
+
+
+def test_pictures_are_in_tensorboard_and_on_disk(watched, events):
+    names = ("compare", "depth", "flow")
+    files = sorted(path.name for path in (watched[1] / "images").iterdir())
+    assert files == sorted(f"{moment}_{name}.png" for moment in ("025", "050", "100") for name in names)
+    for name in names:
+        assert [image.step for image in events.Images(f"images/{name}")] == [3, 6, 12]
+
+
+@pytest.fixture(scope="module")
+def unwatched(tmp_path_factory):
+    return watched_run(tmp_path_factory.mktemp("unwatched")).fit().state_dict()
+
+
+def assert_same(one, other):
+    tensors = [key for key in one if torch.is_tensor(one[key])]
+    assert tensors
+    assert one.keys() == other.keys()
+    assert all(torch.equal(one[key], other[key]) for key in tensors)
+
+
+def test_watching_changes_no_weight(watched, unwatched):
+    assert_same(unwatched, watched[0].state_dict())
+
+
+def test_an_interrupted_watched_run_ends_as_an_unwatched_one(tmp_path, unwatched):
+    with pytest.raises(SystemExit):
+        watched_run(tmp_path, *all_watchers(), Interrupt("coarse", 4)).fit()
+    before = sorted(path.name for path in (tmp_path / "coarse" / "images").iterdir())
+    assert before[0] == "025_compare.png"
+    (tmp_path / "coarse" / "images" / "025_compare.png").unlink()
+    assert_same(unwatched, watched_run(tmp_path, *all_watchers()).fit().state_dict())
+    after = {path.name for path in (tmp_path / "coarse" / "images").iterdir()}
+    assert "100_compare.png" in after
+    assert "025_compare.png" not in after  # that moment was past
+
+
+def test_the_clock_stands_still_for_pictures(tmp_path, monkeypatch):
+    seen = []
+
+    def slow_pictures(module, target, size):
+        before = module.clock.seconds
+        torch.ones(200, 200).matmul(torch.ones(200, 200))
+        seen.append(module.clock.seconds - before)
+        return {}
+
+    monkeypatch.setattr("forewarp.training.pictures.pictures_of", slow_pictures)
+    watched_run(tmp_path, TensorBoardPictures(moments=(0.5, 1.0))).fit()
+    assert seen == [0, 0]
+
+
+@pytest.mark.parametrize(
+    ("make", "text"),
+    [
+        (lambda: TensorBoardPictures(moments=(0.5, 1.5)), r"moments: expected numbers in \[0, 1\], but got"),
+        (lambda: TensorBoardScalars(every=0), "every: expected at least 1 step, but got 0"),
+    ],
+)
+def test_bad_settings_are_named(make, text):
+    with pytest.raises(ValueError, match=text):
+        make()
+
+
+def test_a_view_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(ValueError, match="callbacks.pictures.view: expected 0 to 0, but got 7"):
+        watched_run(tmp_path, TensorBoardPictures(moments=(0.1,), view=7)).fit()

@@ -1,0 +1,65 @@
+import pytest
+
+from forewarp.training import clock as module
+from forewarp.training.clock import Clock
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """A clock whose time is set by hand: ``clock.now = 3.0``."""
+    made = Clock()
+    made.now = 0.0
+    monkeypatch.setattr(module.time, "perf_counter", lambda: made.now)
+    return made
+
+
+def test_counts_between_start_and_stop(clock):
+    clock.now = 5.0
+    assert clock.seconds == 0
+    clock.start()
+    clock.now = 7.0
+    assert clock.seconds == 2
+    clock.stop()
+    clock.now = 100.0
+    assert clock.seconds == 2
+
+
+def test_pauses_leave_out_what_runs_inside(clock):
+    clock.start()
+    clock.now = 1.0
+    with clock.paused():
+        clock.now = 50.0
+        assert clock.seconds == 1
+        with clock.paused():
+            clock.now = 60.0
+        assert clock.seconds == 1
+    clock.now = 62.0
+    assert clock.seconds == 3
+
+
+def test_a_pause_ends_also_by_an_error(clock):
+    clock.start()
+
+    def fail():
+        with clock.paused():
+            clock.now = 10.0
+            raise RuntimeError
+
+    pytest.raises(RuntimeError, fail)
+    clock.now = 12.0
+    assert clock.seconds == 2
+
+
+def test_a_stopped_clock_stays_stopped_after_a_pause(clock):
+    with clock.paused():
+        clock.now = 5.0
+    clock.now = 9.0
+    assert clock.seconds == 0
+
+
+def test_goes_on_from_a_saved_state(clock):
+    clock.load_state_dict({"seconds": 40.0})
+    assert clock.seconds == 40
+    clock.start()
+    clock.now = 2.0
+    assert clock.state_dict() == {"seconds": 42.0}

@@ -1,0 +1,171 @@
+from functools import partial
+
+import pytest
+import torch
+
+from forewarp.effects.inpaint import UNet3d
+from forewarp.renderer import Renderer
+from forewarp.scene.box import Lattice
+from forewarp.training.curriculum import Curriculum
+from forewarp.training.module import DynamicSceneModule, render_all
+from forewarp.training.settings import EFFECTS
+from tiny_scene import BOX, RATES, ball_data, forward_spec, stage, trainer
+
+INPAINTER = partial(UNet3d, width=16, levels=2)
+DATA = ball_data(rays=64, frames=5, size=16)
+
+
+class CountingRenderer(Renderer):
+    calls = 0
+
+    def __call__(self, *arguments, **named):
+        self.calls += 1
+        return super().__call__(*arguments, **named)
+
+
+def module(spec=None, weights=None, renderer=None, **changes):
+    torch.manual_seed(0)
+    lattice = Lattice(BOX, (9, 7, 6))
+    method = (spec or forward_spec()).build(
+        lattice,
+        torch.ones(lattice.shape, dtype=torch.bool),
+        unit=0.2,
+        scene_box=BOX,
+        frames=5,
+        canonical_time=0.0,
+        effects=EFFECTS,
+    )
+    for name in method.radiance.names:
+        torch.nn.init.normal_(method.radiance.parameter(name))
+    made = stage(weights=weights, **changes)
+    train = DATA.scene.train
+    return DynamicSceneModule(
+        method,
+        renderer=renderer or Renderer(),
+        objective=made.objective,
+        settings=made.settings,
+        curriculum=Curriculum([f.time for f in train], 0.0),
+        cameras=[f.camera for f in train],
+    )
+
+
+def batch(frame=3):
+    DATA.picker = lambda: frame
+    return DATA.batches.draw()
+
+
+@pytest.mark.parametrize(("spec", "times"), [(forward_spec(), 1), (forward_spec(inpainter=INPAINTER), 2)])
+def test_without_an_inpainter_the_renderer_runs_once_a_step(spec, times):
+    renderer = CountingRenderer()
+    module(spec, renderer=renderer).training_step(batch(), 0)
+    assert renderer.calls == times
+
+
+def test_random_views_are_rendered_only_for_their_term():
+    renderer = CountingRenderer()
+    module(weights={"photo": 1.0, "tv_depth": 0.0}, renderer=renderer).training_step(batch(), 0)
+    assert renderer.calls == 1
+    module(weights={"photo": 1.0, "tv_depth": 0.1}, renderer=renderer, patches=2).training_step(batch(), 0)
+    assert renderer.calls == 3
+
+
+def test_a_step_has_finite_gradients_for_all_terms():
+    terms = ("photo", "point_color", "background_entropy", "flow_l1", "inpaint_diff")
+    weights = dict.fromkeys((*terms, "tv_density", "tv_flow", "tv_depth"), 0.1)
+    made = module(forward_spec(inpainter=INPAINTER), weights, patches=2)
+    torch.nn.init.normal_(made.method.motion.trajectory.network[-1].weight, std=1e-2)
+    made.training_step(batch(), 0).backward()
+    for name, parameter in made.method.named_parameters():
+        if parameter.grad is not None:
+            assert parameter.grad.isfinite().all(), name
+    assert made.method.motion.trajectory.network[0].weight.grad.abs().sum() > 0
+    assert {f"loss/{t}" for t in weights} <= set(made.last)
+    assert made.last["psnr"] > 0
+    assert 0 < made.last["coverage"] <= 1
+    assert not made.curriculum.errors[3].isnan()
+
+
+def test_an_empty_scene_trains_on():
+    made = module()
+    made.method.radiance.density.data[:] = -30.0
+    loss = made.training_step(batch(), 0)
+    loss.backward()
+    assert loss.isfinite()
+    assert made.last["samples"] == 0
+
+
+def test_every_kind_has_its_rate():
+    optimizer = module().configure_optimizers()
+    assert {g["name"]: g["base_rate"] for g in optimizer.param_groups} == {
+        k: RATES[k] for k in ("density", "color", "shading", "flow")
+    }
+    with pytest.raises(
+        ValueError, match=r"stage.coarse.rates: expected a rate for 'flow', but got \['density'\]"
+    ):
+        module(rates={"density": 0.1}).configure_optimizers()
+
+
+def test_gradients_are_clipped_where_asked():
+    for limit in (0.0, 1e-3):
+        made = module(max_gradient=limit)
+        (1e3 * made.training_step(batch(), 0)).backward()
+        made.configure_gradient_clipping(None)
+        norm = sum(p.grad.square().sum() for p in made.method.parameters() if p.grad is not None) ** 0.5
+        assert (norm <= 1.001e-3) == (limit > 0)
+
+
+def test_an_image_in_chunks_is_the_image():
+    made = module()
+    target = DATA.targets("test")[1]
+    whole = made.render_image(target.frame.camera, target.frame.time, target.background)
+    field = made.method.at(target.frame.time).fields["upsampled"]
+    parts = render_all(
+        made.renderer, field, target.frame.camera.rays(), target.background, made.method.view, chunk=100
+    )
+    for name in ("rgb", "depth", "opacity", "transmittance"):
+        torch.testing.assert_close(getattr(whole, name), getattr(parts, name))
+    assert parts.samples == whole.samples
+    state = made.method.at(0.0)
+    other = made.render_image(target.frame.camera, target.frame.time, target.background, state)
+    still = made.render_image(target.frame.camera, 0.0, target.background)
+    assert torch.equal(other.rgb, still.rgb)
+
+
+def test_validation_logs_the_psnr_of_whole_images():
+    made = module()
+    ours = trainer([])
+    ours.limit_val_batches = 1.0
+    (logged,) = ours.validate(made, datamodule=DATA, verbose=False)
+    target = DATA.targets("val")[0]
+    drawn = made.render_image(target.frame.camera, target.frame.time, target.background).rgb
+    error = (drawn.reshape(target.rgb.shape) - target.rgb).square().mean()
+    assert logged["val/psnr"] == pytest.approx(-10 * torch.log10(error).item(), abs=1e-3)
+
+
+def test_a_checkpoint_holds_what_the_weights_do_not():
+    first, second = module(), module()
+    first.training_step(batch(), 0)
+    first.curriculum()
+    first.clock.load_state_dict({"seconds": 12.5})
+    first.lattice_voxels = 4096
+    checkpoint = {}
+    first.on_save_checkpoint(checkpoint)
+    second.on_load_checkpoint(checkpoint)
+    assert torch.equal(first.generator.get_state(), second.generator.get_state())
+    assert torch.equal(first.curriculum.generator.get_state(), second.curriculum.generator.get_state())
+    assert second.clock.seconds == 12.5
+    assert second.lattice_voxels == 4096
+
+
+def test_without_cameras_there_are_no_random_views():
+    made = module()
+    none = DynamicSceneModule(
+        made.method,
+        renderer=Renderer(),
+        objective=made.objective,
+        settings=made.settings,
+        curriculum=made.curriculum,
+        cameras=[],
+    )
+    assert none.patches is None
+    assert none.training_step(batch(), 0).isfinite()

@@ -1,0 +1,230 @@
+import json
+import shutil
+from functools import partial
+
+import lightning
+import pytest
+import torch
+
+from forewarp.effects.inpaint import UNet3d
+from forewarp.effects.upsample import LearnedUpsampler, TrilinearUpsampler
+from forewarp.effects.view import ViewNetwork
+from forewarp.fields.radiance import FeatureRadiance
+from forewarp.methods.backward_warp import Deformation
+from forewarp.training.stages import KeepCheckpoint, check_checkpoint, load_weights
+from tiny_scene import RATES, Interrupt, ball_data, forward_spec, make_run, stage
+
+
+def stages(**changes):
+    """Two short stages; the lattice of the second grows halfway; voxels are refreshed every fourth step."""
+    common = {"iterations": 10, "refresh_every": 4, "start": "hull", "hull_frames": 3, "hull_grow": 0.1}
+    coarse = stage("coarse", voxels=[[0, 10**3]], bases=[[0, 2], [0.5, 4]], **common)
+    return [coarse, stage("fine", voxels=[[0, 11**3], [0.5, 14**3]], **(common | changes))]
+
+
+def run(folder, callbacks=(), **changes):
+    return make_run(folder, stages(**changes), data=ball_data(rays=64, size=16), callbacks=callbacks)
+
+
+def tensors(module):
+    return {k: v for k, v in module.state_dict().items() if torch.is_tensor(v)}
+
+
+def same(a, b):
+    a, b = tensors(a), tensors(b)
+    return a.keys() == b.keys() and all(a[k].shape == b[k].shape and torch.equal(a[k], b[k]) for k in a)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """An uninterrupted run: its folder and its last module."""
+    folder = tmp_path_factory.mktemp("whole")
+    return folder, run(folder).fit()
+
+
+class Crash(lightning.Callback):
+    """Ends without saving when a stage begins."""
+
+    def on_train_start(self, trainer, module):
+        if module.settings.name == "fine":
+            raise SystemExit
+
+
+@pytest.mark.parametrize(
+    "interruptions",
+    [
+        [Interrupt("coarse", 6)],
+        [Crash()],
+        [Interrupt("fine", 3), Interrupt("fine", 7)],  # before and after the lattice grows
+        [Interrupt("coarse", 9), Interrupt("fine", 5)],  # at the last step, and as the lattice grows
+    ],
+    ids=["coarse", "between", "fine", "edges"],
+)
+def test_a_continued_run_equals_an_uninterrupted_one_to_the_bit(tmp_path, whole, interruptions):
+    for interruption in interruptions:
+        with pytest.raises(SystemExit):
+            run(tmp_path, [interruption]).fit()
+    assert same(run(tmp_path).fit(), whole[1])
+
+
+def test_a_run_is_the_same_each_time_and_another_with_another_seed(tmp_path, whole):
+    other = make_run(tmp_path, stages(), data=ball_data(rays=64, size=16, seed=1), seed=1).fit()
+    assert not same(other, whole[1])
+
+
+def test_a_stage_that_ended_before_it_was_noted_only_notes_it(tmp_path, whole):
+    shutil.copytree(whole[0], tmp_path, dirs_exist_ok=True)
+    (tmp_path / "fine" / "done.json").unlink()
+    again = run(tmp_path).fit()
+    assert same(again, whole[1])
+    assert run(tmp_path).finished()["fine"]["steps"] == 10
+
+
+def test_a_finished_run_is_not_run_again(tmp_path, whole):
+    shutil.copytree(whole[0], tmp_path, dirs_exist_ok=True)
+    before = {p: p.stat().st_mtime_ns for p in tmp_path.rglob("*") if p.is_file()}
+    assert same(run(tmp_path, [Crash()]).fit(), whole[1])
+    assert same(run(tmp_path).load(), whole[1])
+    assert before == {p: p.stat().st_mtime_ns for p in tmp_path.rglob("*") if p.is_file()}
+
+
+def test_what_a_run_leaves(whole):
+    folder, module = whole
+    assert {p.name for p in (folder / "fine").iterdir()} >= {"last.ckpt", "handover.json", "done.json"}
+    assert not list(folder.rglob("*.part"))
+    done = run(folder).finished()
+    assert done["coarse"]["steps"] == done["fine"]["steps"] == 10
+    assert done["fine"]["seconds"] > 0
+    assert done["fine"]["frames_in_play"] == 12
+    handover = json.loads((folder / "coarse" / "handover.json").read_text())
+    box = module.method.radiance.lattice.box
+    assert box.low == pytest.approx(tuple(handover["low"]))
+    assert module.method.radiance.lattice.count == pytest.approx(14**3, rel=0.3)
+    assert module.method.motion.trajectory.bases_in_play == 4
+
+
+class Diary(lightning.Callback):
+    """Notes what every step was trained with."""
+
+    def __init__(self):
+        self.steps = []
+
+    def on_before_optimizer_step(self, trainer, module, optimizer):
+        rates = {g["name"]: g["lr"] / g["base_rate"] for g in optimizer.param_groups}
+        parameters = {id(p) for g in optimizer.param_groups for p in g["params"]}
+        assert parameters == {id(p) for p in module.method.parameters()}
+        bases = int(module.method.motion.trajectory.bases_in_play)
+        lattice = module.method.radiance.lattice.count
+        self.steps.append((module.settings.name, rates["flow"], bases, lattice, module.curriculum.in_play))
+
+
+def test_rates_bases_lattice_and_frames_follow_the_fraction(tmp_path):
+    diary = Diary()
+    run(tmp_path, [diary], hold=0.5, curriculum={"start": 2, "all_in": 0.5}).fit()
+    coarse = [s[1:] for s in diary.steps if s[0] == "coarse"]
+    fine = [s[1:] for s in diary.steps if s[0] == "fine"]
+    assert len(coarse) == len(fine) == 10
+    assert [bases for _, bases, _, _ in coarse] == [2] * 5 + [4] * 5
+    assert len({lattice for _, _, lattice, _ in coarse}) == 1
+    rates, _, lattices, playing = zip(*fine)
+    assert rates[:6] == (1,) * 6
+    assert list(rates[5:]) == pytest.approx([0.1 ** (k / 5) for k in range(5)])
+    assert len(set(lattices[:5])) == len(set(lattices[5:])) == 1
+    assert lattices[5] > lattices[4]
+    assert playing == (2, 4, 6, 8, 10, 12, 12, 12, 12, 12)
+
+
+def test_a_stage_may_start_afresh_in_the_tight_box(tmp_path):
+    module = run(tmp_path, carry=False).fit()
+    handover = json.loads((tmp_path / "coarse" / "handover.json").read_text())
+    assert module.method.radiance.activation.unit == handover["unit"]
+
+
+def test_an_unfinished_run_cannot_be_loaded(tmp_path):
+    with pytest.raises(ValueError, match="coarse: expected a finished stage, but got none; continue with"):
+        run(tmp_path).load()
+
+
+def test_a_checkpoint_of_another_configuration_is_refused(tmp_path, whole):
+    folder, module = whole
+    checkpoint = folder / "coarse" / "last.ckpt"
+    plain = make_run(tmp_path, stages()[:1], data=ball_data(times=[0.0] * 3))
+    plain.datamodule.setup()
+    other, _ = plain._module(plain.stages[0], None, None, 0)  # one time: no motion
+    with pytest.raises(
+        ValueError, match="expected a checkpoint of this configuration, but got one that differs in"
+    ):
+        load_weights(other, checkpoint)
+    broken = tmp_path / "last.ckpt"
+    broken.write_bytes(checkpoint.read_bytes()[:500])
+    with pytest.raises(ValueError, match="expected a checkpoint, but it cannot be read"):
+        check_checkpoint(broken, module)
+
+
+def test_checkpoints_come_by_the_clock(tmp_path, monkeypatch):
+    saved = []
+    monkeypatch.setattr(KeepCheckpoint, "save", lambda self, trainer: saved.append(trainer.global_step))
+    ours = run(tmp_path)
+    ours.checkpoint_seconds = 1e-9
+    ours.stages = ours.stages[:1]
+    ours.fit()
+    assert saved == [*range(1, 11), 10]
+
+
+CHOICES = {
+    "static": {"motion": None, "trajectory": None},
+    "backward": {"warp": "backward", "deformation": partial(Deformation, width=8, layers=2)},
+    "network": {
+        "radiance": partial(FeatureRadiance, alpha_init=1e-2, skip_alpha=0.0, width=8),
+        "view": ViewNetwork,
+    },
+    "everything": {"upsampler": partial(LearnedUpsampler, width=8), "inpainter": partial(UNet3d, levels=2)},
+    "interpolated": {"upsampler": TrilinearUpsampler, "view": None},
+}
+
+
+@pytest.mark.parametrize("choice", CHOICES)
+def test_every_model_trains_carries_and_loads(tmp_path, choice):
+    short = stages(iterations=4)
+    ours = make_run(tmp_path, short, data=ball_data(rays=64, size=16), spec=forward_spec(**CHOICES[choice]))
+    module = ours.fit()
+    assert all(v.isfinite().all() for v in tensors(module).values() if v.is_floating_point())
+    assert same(ours.load(), module)
+
+
+def test_a_scene_of_one_time_needs_no_motion_and_no_rate_for_it(tmp_path):
+    rates = {name: rate for name, rate in RATES.items() if name != "flow"}
+    still = [stage(iterations=4, rates=rates)]
+    module = make_run(tmp_path, still, data=ball_data(rays=64, size=16, times=[0.0] * 4)).fit()
+    assert module.method.motion is None
+
+
+def psnr(module, data):
+    """Of every test image."""
+    found = []
+    for target in data.targets("test"):
+        drawn = module.render_image(target.frame.camera, target.frame.time, target.background).rgb
+        found.append(float(-10 * torch.log10((drawn.reshape(target.rgb.shape) - target.rgb).square().mean())))
+    return found
+
+
+def test_a_sliding_ball_is_learned_at_all_times(tmp_path):
+    data = ball_data(rays=512, frames=16)
+    fitting = stage(
+        voxels=[[0, 16**3]],
+        iterations=300,
+        start="hull",
+        hull_frames=4,
+        hull_grow=0.08,
+        refresh_every=25,
+        hold=0.5,
+        curriculum={"start": 4, "all_in": 0.5},
+    )
+    module = make_run(tmp_path, [fitting], data=data).fit()
+    first, between, last = psnr(module, data)
+    assert min(first, between, last) > 22
+    assert (first + between + last) / 3 > 25  # a still radiance field reaches 22
+    moved = module.method.trajectories(torch.tensor([[-0.3, 0.1, 0.0]]), torch.tensor([0.0, 1.0]))[0]
+    x, y, z = (moved[1] - moved[0]).tolist()  # of the centre, which no view sees
+    assert 0.3 < x < 1.2
+    assert max(abs(y), abs(z)) < 0.25

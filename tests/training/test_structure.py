@@ -1,0 +1,242 @@
+from functools import partial
+
+import pytest
+import torch
+
+from forewarp.fields.radiance import DirectRadiance, FeatureRadiance
+from forewarp.methods.backward_warp import Deformation
+from forewarp.scene.box import Box, Lattice
+from forewarp.training.settings import EFFECTS
+from forewarp.training.structure import (
+    box_of_all_times,
+    occupied,
+    refresh,
+    renew_parameters,
+    resample,
+    seen_rows,
+)
+from tiny_scene import BOX, forward_spec
+
+SHAPE = (6, 5, 7)
+LATTICE = Lattice(Box((0, 0, 0), (5, 4, 6)), SHAPE)
+COMMON = {"features": 3, "alpha_init": 1e-2, "unit": 1.0, "skip_alpha": 0.0}
+SOLID, AIR = 8.0, -9.0
+
+
+def radiance(solid=((2, 2, 3),)):
+    """All voxels active, a few solid, colours numbered."""
+    made = DirectRadiance(LATTICE, torch.ones(SHAPE, dtype=torch.bool), **COMMON)
+    made.density.data[:] = AIR
+    for at in solid:
+        made.density.data[made.index[at].long()] = SOLID
+    made.color.data = torch.arange(210.0)[:, None].expand(210, 3).clone()
+    return made
+
+
+def adam(made, unseen=()):
+    """An optimiser after one step with gradients numbered by row, 0 in the rows that no view has seen."""
+    groups = [{"params": [p], "lr": 0.0} for p in made.parameters()]
+    optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99), fused=True)
+    for p in made.parameters():
+        p.grad = torch.arange(1.0, len(p) + 1)[:, None].expand_as(p).clone()
+        p.grad[list(unseen)] = 0
+    optimizer.step()
+    return optimizer
+
+
+def around(at):
+    """The voxels at most one step from ``at``."""
+    active = torch.zeros(SHAPE, dtype=torch.bool)
+    active[tuple(slice(max(v - 1, 0), v + 2) for v in at)] = True
+    return active
+
+
+def number_of(made):
+    """Every active voxel's number in the whole lattice."""
+    x, y, z = made.voxels.unbind(-1)
+    return (x * SHAPE[1] + y) * SHAPE[2] + z
+
+
+def test_occupied_is_what_is_more_opaque_than_asked():
+    made = radiance([(0, 0, 0), (5, 4, 6)])
+    mask = occupied(made, 1e-2)
+    assert mask.nonzero().tolist() == [[0, 0, 0], [5, 4, 6]]
+    assert occupied(made, 1e-9).all()
+    seen = torch.arange(210) > 0
+    assert occupied(made, 1e-2, seen).nonzero().tolist() == [[5, 4, 6]]
+
+
+def test_refresh_keeps_values_and_moments_in_the_right_rows():
+    made = radiance()
+    optimizer = adam(made)
+    assert refresh(made, optimizer, keep_alpha=1e-2, birth_alpha=5e-3)
+    assert torch.equal(made.index >= 0, around((2, 2, 3)))
+    number = number_of(made)
+    assert torch.equal(made.color[:, 0], number.float())
+    assert int((made.density == SOLID).sum()) == 1
+    for parameter in (made.density, made.color):
+        moments = optimizer.state[parameter]
+        torch.testing.assert_close(moments["exp_avg"][:, 0], 0.1 * (number + 1.0))
+        torch.testing.assert_close(moments["exp_avg_sq"][:, 0], 0.01 * (number + 1.0) ** 2)
+        assert float(moments["step"]) == 1
+
+
+def test_refresh_gives_births_to_new_voxels_and_no_moments():
+    made = radiance()
+    optimizer = adam(made)
+    refresh(made, optimizer, keep_alpha=1e-2, birth_alpha=5e-3)
+    old = made.index >= 0
+    made.density.data[made.index[3, 3, 4].long()] = SOLID  # matter has reached a corner of the active set
+    rows_before = made.index.clone()
+    assert refresh(made, optimizer, keep_alpha=1e-2, birth_alpha=5e-3)
+    assert torch.equal(made.index >= 0, around((2, 2, 3)) | around((3, 3, 4)))
+    new = torch.tensor([not bool(old[tuple(v)]) for v in made.voxels.tolist()])
+    alpha = made.activation.alpha(made.density[new, 0], LATTICE.pitch)
+    torch.testing.assert_close(alpha, torch.full_like(alpha, 5e-3), rtol=1e-3, atol=0)
+    x, y, z = (3, 3, 5)
+    neighbours = rows_before[x - 1 : x + 2, y - 1 : y + 2, z - 1 : z + 2].flatten()
+    colours = [made.color[made.index[tuple(v)], 0].item() for v in made.voxels.tolist() if old[tuple(v)]]
+    near = torch.tensor(colours)[neighbours[neighbours >= 0].long()]
+    assert made.color[made.index[x, y, z], 0].item() == pytest.approx(near.mean().item())
+    for parameter in made.parameters():
+        moments = optimizer.state[parameter]["exp_avg"]
+        assert (moments[new] == 0).all()
+        assert (moments[~new] != 0).all()
+
+
+def test_training_goes_on_after_a_refresh():
+    made = radiance()
+    optimizer = adam(made)
+    refresh(made, optimizer, keep_alpha=1e-2, birth_alpha=5e-3)
+    for group in optimizer.param_groups:
+        group["lr"] = 0.1
+    before = made.density.detach().clone()
+    made().values.sum().backward()
+    optimizer.step()
+    assert (made.density != before).all()
+    assert set(optimizer.state) == set(made.parameters())
+
+
+def test_an_empty_grid_is_left_as_it_is():
+    made = radiance([])
+    optimizer = adam(made)
+    before = made.density
+    assert not refresh(made, optimizer, keep_alpha=1e-2, birth_alpha=5e-3)
+    assert made.density is before
+
+
+def test_an_active_set_that_stays_keeps_its_parameters():
+    made = radiance()
+    optimizer = adam(made)
+    refresh(made, optimizer, keep_alpha=1e-2, birth_alpha=5e-3)
+    before = made.density
+    assert not refresh(made, optimizer, keep_alpha=1e-2, birth_alpha=5e-3)
+    assert made.density is before
+
+
+def test_what_no_view_has_seen_is_forgotten_where_asked():
+    made = radiance([(0, 0, 0), (5, 4, 6)])
+    assert seen_rows(made, torch.optim.Adam(made.parameters())).all()  # nothing is known yet
+    optimizer = adam(made, unseen=[0])
+    assert seen_rows(made, optimizer).logical_not().nonzero().tolist() == [[0]]
+    refresh(made, optimizer, keep_alpha=1e-2, birth_alpha=5e-3, only_seen=True)
+    assert torch.equal(made.index >= 0, around((5, 4, 6)))
+
+
+def test_moments_start_afresh_where_rows_mean_nothing():
+    made = radiance()
+    optimizer = adam(made)
+    before = list(made.parameters())
+    made.activate(around((1, 1, 1)), {})
+    renew_parameters(optimizer, before, list(made.parameters()), None)
+    for parameter in made.parameters():
+        assert optimizer.state[parameter]["exp_avg"].shape == parameter.shape
+        assert (optimizer.state[parameter]["exp_avg"] == 0).all()
+    assert [p for g in optimizer.param_groups for p in g["params"]] == list(made.parameters())
+
+
+def test_resample_follows_what_is_occupied():
+    made = radiance([tuple(v) for v in around((2, 2, 3)).nonzero().tolist()])
+    optimizer = adam(made)
+    before = made().density(torch.tensor([[2.0, 2.0, 3.0]]))
+    place = LATTICE.to_world(torch.tensor([[2, 2, 3]]))
+    resample(made, Box((0, 0, 1), (5, 4, 6)), 1500, keep_alpha=1e-2, optimizer=optimizer)
+    assert made.lattice.count == pytest.approx(1500, rel=0.2)
+    at = made.lattice.to_lattice(place)
+    torch.testing.assert_close(made().density(at), before)
+    reach = (made.lattice.to_world(made.voxels) - place).abs().amax(-1).max()
+    assert 1.2 < reach < 2.5  # the block and a little more, not the whole box
+    assert len(made.voxels) < made.lattice.count
+    assert all(optimizer.state[p]["exp_avg"].shape == p.shape for p in made.parameters())
+    made().values.sum().backward()
+    optimizer.step()
+
+
+def test_resample_of_an_empty_field_keeps_all_voxels():
+    made = radiance([])
+    resample(made, LATTICE.box, 400, keep_alpha=1e-2)
+    assert (made.index >= 0).all()
+
+
+@pytest.mark.parametrize("kind", ["direct", "features"])
+def test_resample_of_a_constant_is_constant(kind):
+    everywhere = torch.ones(SHAPE, dtype=torch.bool)
+    if kind == "direct":
+        made = radiance()
+        made.density.data[:], made.color.data[:] = SOLID, 0.25
+    else:
+        made = FeatureRadiance(LATTICE, everywhere, width=4, grid_features=2, **COMMON)
+        made.features.data[:] = 0.25
+        torch.nn.init.constant_(made.network[-1].bias, SOLID)
+    resample(made, Box((1, 1, 1), (4, 3.5, 5)), 300, keep_alpha=1e-2)
+    values = made().values
+    assert len(values) == made.lattice.count
+    torch.testing.assert_close(values, values[:1].expand_as(values))
+    assert values[0, 0].item() == pytest.approx(SOLID, abs=1e-5)
+
+
+def moving(kind, shift):
+    """A method in which everything moves by ``shift`` until time 1."""
+    choices = (
+        {"warp": "backward", "deformation": partial(Deformation, width=8, layers=2)}
+        if kind == "backward"
+        else {}
+    )
+    lattice = Lattice(BOX, (12, 9, 8))
+    method = forward_spec(**choices).build(
+        lattice,
+        torch.ones(lattice.shape, dtype=torch.bool),
+        unit=0.2,
+        scene_box=BOX,
+        frames=2,
+        canonical_time=0.0,
+        effects=EFFECTS,
+    )
+    method.radiance.density.data[:] = AIR
+    method.radiance.density.data[method.radiance.index[3, 4, 4].long()] = SOLID
+    if kind == "backward":
+        method.deformation.network[-1].bias.data = -torch.tensor(shift) / method.deformation.scale
+    else:  # of two frames: one basis, b(1) - b(0) = -sqrt(2)
+        trajectory = method.motion.trajectory
+        trajectory.network[-1].bias.data = torch.tensor(shift) / (-(2**0.5) * trajectory.scale)
+    return method
+
+
+@pytest.mark.parametrize("kind", ["forward", "backward"])
+def test_the_box_of_all_times_of_a_known_translation(kind):
+    method = moving(kind, (0.7, -0.3, 0.0))
+    home = method.radiance.lattice.to_world(torch.tensor([3.0, 4.0, 4.0]))
+    pitch = method.radiance.lattice.pitch
+    box = box_of_all_times(method, [0.0, 1.0], alpha=1e-2, pad=1.5)
+    low = home + torch.tensor([0.0, -0.3, 0.0]) - 1.5 * pitch
+    high = home + torch.tensor([0.7, 0.0, 0.0]) + 1.5 * pitch
+    assert box.low == pytest.approx(low.tolist(), abs=1e-5)
+    assert box.high == pytest.approx(high.tolist(), abs=1e-5)
+    still = box_of_all_times(method, [0.0], alpha=1e-2, pad=1.5)
+    assert still.size == pytest.approx([3 * pitch] * 3, abs=1e-5)
+
+
+def test_nothing_has_no_box():
+    method = moving("forward", (0.7, 0.0, 0.0))
+    method.radiance.density.data[:] = AIR
+    assert box_of_all_times(method, [0.0, 1.0], alpha=1e-2, pad=1.0) is None
