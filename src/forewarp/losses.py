@@ -1,7 +1,7 @@
 """The paper's seven terms, each a pure function of tensors.
 
-Each normalises as its ancestors do, because the printed weights are calibrated to that; ``literal=True`` gives
-the printed form where the two differ.
+Each normalises as its ancestors do, because the printed weights are calibrated to that; ``literal=True``
+gives the printed form where the two differ.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def point_color(
 
 
 def background_entropy(transmittance: Tensor) -> Tensor:
-    """w2: binary entropy of a ray's final transmittance (R,), clamped to [1e-6, 1 - 1e-6] for a finite slope."""
+    """w2: binary entropy of a ray's final transmittance (R,), kept 1e-6 off 0 and 1 for a finite slope."""
     t = transmittance.clamp(1e-6, 1 - 1e-6)
     return -(t * torch.log(t) + (1 - t) * torch.log1p(-t)).mean()
 
@@ -71,5 +71,5 @@ def tv_flow(flow: Tensor, pairs: list[tuple[Tensor, Tensor]]) -> Tensor:
 
 
 def tv_depth(depth: Tensor, opacity: Tensor) -> Tensor:
-    """w7: RegNeRF's smoothness of depth (B, S, S), in fractions of far - near, on patches from random views."""
+    """w7: RegNeRF's smoothness of depth (B, S, S), in fractions of far - near, on patches of random views."""
     return patch_variation(depth, opacity)

@@ -24,7 +24,8 @@ class Renderer:
     def __init__(self, *, step: float = 0.5, color_threshold: float = 1e-4) -> None:
         if not step > 0 or not 0 <= color_threshold < 1:
             raise ValueError(
-                f"renderer: expected step > 0 and 0 <= color_threshold < 1, but got {step=}, {color_threshold=}"
+                "renderer: expected step > 0 and 0 <= color_threshold < 1, "
+                f"but got {step=}, {color_threshold=}"
             )
         self.step, self.color_threshold = step, color_threshold
 
@@ -51,20 +52,12 @@ class Renderer:
             generator: jitters the samples by up to one step; None: the middle of each step.
             keep_all_weights: also return the weights of every sample (P,).
         """
-        lattice, count = field.lattice, len(rays)
-        spacing = rays.origins.new_tensor(lattice.spacing)
-        origins, directions = lattice.to_lattice(rays.origins), rays.directions / spacing
-        step = self.step * lattice.pitch
-        jitter = torch.full((count,), 0.5) if generator is None else torch.rand(count, generator=generator)
-        jitter = jitter.to(origins)
-        ray_ids, distances = march(origins, directions, rays.near, rays.far, step, field.cells, jitter)
-        points = origins[ray_ids] + distances[:, None] * directions[ray_ids]
+        count, step = len(rays), self.step * field.lattice.pitch
+        ray_ids, distances, points = self._samples(field, rays, step, generator)
         weights, transmittance = render_weights(field.density(points) * step, ray_ids, count)
-        kept = (
-            (weights.detach() > self.color_threshold).nonzero()[:, 0]
-            if self.color_threshold > 0
-            else slice(None)
-        )
+        kept = slice(None)
+        if self.color_threshold > 0:
+            kept = (weights.detach() > self.color_threshold).nonzero()[:, 0]
         some_weights, some_rays = weights[kept], ray_ids[kept]
         features = field.features(points[kept])
         colors = (
@@ -84,3 +77,16 @@ class Renderer:
             samples=len(ray_ids),
             all_weights=weights if keep_all_weights else None,
         )
+
+    @staticmethod
+    def _samples(
+        field: FieldAtTime, rays: Rays, step: float, generator: torch.Generator | None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Ray (P,), distance (P,) and lattice coordinates (P, 3) of every sample."""
+        lattice, count = field.lattice, len(rays)
+        spacing = rays.origins.new_tensor(lattice.spacing)
+        origins, directions = lattice.to_lattice(rays.origins), rays.directions / spacing
+        jitter = torch.full((count,), 0.5) if generator is None else torch.rand(count, generator=generator)
+        jitter = jitter.to(origins)
+        ray_ids, distances = march(origins, directions, rays.near, rays.far, step, field.cells, jitter)
+        return ray_ids, distances, origins[ray_ids] + distances[:, None] * directions[ray_ids]

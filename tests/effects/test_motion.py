@@ -45,14 +45,14 @@ def test_zero_flow_is_the_identity():
 def test_holes_are_empty_and_not_fog(fade):
     canonical = solid()
     flow = torch.zeros(60, 3)
-    flow[:, 2] = 2.0 + 2e-6  # the first plane of z is left open, its neighbour gets a sliver's rest
+    flow[:, 2] = 2.0 * (1 - 1e-4)  # a sliver of one in ten thousand stays in the first plane of z
     warped, coverage, _ = motion(fade=fade).warp(canonical, LATTICE.all_voxels(), flow)
     padded = torch.cat([warped.raw_density, torch.tensor([EMPTY])])
     opened = padded[warped.index[:, :, 0].long()]
     fog = 1 - math.exp(-80 * float(warped.activation.sigma(opened).max()) * LATTICE.pitch)
     assert fog < 1e-3
     assert warped.raw_density.max() == pytest.approx(6.0, abs=1e-4)
-    assert (coverage >= 0).all()
+    assert 0 < coverage.min() < 2e-4
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])

@@ -94,3 +94,7 @@ def test_one_time_has_no_motion():
 def test_features_own_parameters_only_where_asked():
     assert not any("features" in n for n, _ in field().named_parameters())
     assert any("features.grid" in n for n, _ in field(features=2).named_parameters())
+
+
+def test_the_basis_lives_where_the_field_does():
+    assert field().to("meta")._basis(0.5).device.type == "meta"

@@ -12,13 +12,19 @@ from tiny_scene import BOX, camera_at, forward_spec
 LATTICE = Lattice(BOX, (24, 20, 18))
 
 
-def build(canonical_time=0.3, seed=0):
+def build(canonical_time=0.3, seed=0, frames=5):
     torch.manual_seed(seed)
     active = torch.zeros(LATTICE.shape, dtype=torch.bool)
     active[3:7, 3:7, 3:6] = True
     spec = forward_spec(warp="backward", deformation=partial(Deformation, width=16, layers=2))
     method = spec.build(
-        LATTICE, active, unit=0.3, scene_box=BOX, frames=5, canonical_time=canonical_time, effects=EFFECTS
+        LATTICE,
+        active,
+        unit=0.3,
+        scene_box=BOX,
+        frames=frames,
+        canonical_time=canonical_time,
+        effects=EFFECTS,
     )
     for name in method.radiance.names:
         torch.nn.init.normal_(method.radiance.parameter(name), mean=2.0)
@@ -40,6 +46,25 @@ def test_it_owns_radiance_and_deformation_only():
     method = build()
     assert {n.split(".")[0] for n, _ in method.named_parameters()} == {"radiance", "deformation"}
     assert not hasattr(method, "motion")
+
+
+def test_one_time_builds_no_deformation():
+    method = build(frames=1)
+    assert method.deformation is None
+    assert {n.split(".")[0] for n, _ in method.named_parameters()} == {"radiance"}
+    field = method.at(0.9).fields["backward"]
+    assert torch.equal(picture(method, field), picture(method, method.radiance()))
+    points = torch.rand(4, 3)
+    assert torch.equal(method.trajectories(points, torch.rand(2)), points[:, None].expand(4, 2, 3))
+
+
+@pytest.mark.parametrize(("name", "choose"), [("deformation", "model=backward"), ("view", "model/view=none")])
+def test_refuses_a_ghost_of_the_configuration(name, choose):
+    given = {"deformation": None, name: {"width": 16}}
+    with pytest.raises(
+        ValueError, match=f"model.{name}: expected a module or null, but got dict; choose {choose}"
+    ):
+        BackwardWarp(build().radiance, canonical_time=0.0, **given)
 
 
 def test_at_the_canonical_time_the_picture_is_the_unwarped_one():
@@ -76,7 +101,7 @@ def test_paths_invert_the_displacement():
     points = torch.rand(5, 3) * 0.5
     times = torch.tensor([0.3, 0.9])
     paths = method.trajectories(points, times)
-    torch.testing.assert_close(paths[:, 0], points)
+    assert torch.equal(paths[:, 0], points)  # although a float32 0.3 is not 0.3
     back = paths[:, 1] + method.deformation(paths[:, 1], 0.9)
     torch.testing.assert_close(back, points, atol=1e-5, rtol=0)
 

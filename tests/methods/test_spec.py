@@ -72,6 +72,12 @@ def test_the_up_layer_refines_what_it_is_given():
     assert after.upsampler.project.in_channels == after.inpainter.width == 16
 
 
+def test_one_layer_makes_the_residual_the_inpainters_or_the_up_layers():
+    assert build(FULL).inpainter.head is None
+    assert build(FULL, ["inpainter"]).inpainter.head is not None
+    assert build(FULL, upsample=2.0).inpainter.head is not None
+
+
 def test_density_is_measured_in_the_unit():
     assert build(forward_spec()).radiance.activation.unit == 0.3
 

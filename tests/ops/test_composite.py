@@ -55,9 +55,10 @@ def test_gradcheck():
 
 @pytest.mark.parametrize("huge", [80.0, 1e4, 1e30, float("inf")])
 def test_opaque_matter_hides_what_follows_with_finite_gradients(huge):
-    optical = torch.tensor([0.0, huge, huge, 1.0], requires_grad=True)
-    weights, transmittance = render_weights(optical, torch.tensor([0, 0, 0, 1]), 2)
-    torch.testing.assert_close(weights, torch.tensor([0, 1, 0, 1 - math.exp(-1)]))
+    optical = torch.tensor([0.0, huge, huge, 1.0, 1.0], requires_grad=True)
+    weights, transmittance = render_weights(optical, torch.tensor([0, 0, 0, 1, 1]), 2)
+    e = math.exp(-1)
+    torch.testing.assert_close(weights, torch.tensor([0, 1, 0, 1 - e, e * (1 - e)]))
     assert transmittance[0].item() == pytest.approx(0, abs=1e-30)
     (weights.sum() + transmittance.sum()).backward()
     assert optical.grad.isfinite().all()

@@ -58,3 +58,11 @@ def test_refuses_other_shapes():
         total_variation(torch.zeros(3), [])
     with pytest.raises(ValueError, match=r"depth: expected shape \(B, S, S\)"):
         patch_variation(torch.zeros(4, 4), torch.zeros(4, 4))
+
+
+def test_single_pixels_have_no_variation():
+    depth = torch.rand(3, 1, 1, requires_grad=True)
+    total = patch_variation(depth, torch.ones(3, 1, 1))
+    total.backward()
+    assert total.item() == 0
+    assert (depth.grad == 0).all()

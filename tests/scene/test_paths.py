@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -20,9 +22,44 @@ def test_focus_is_what_all_look_at():
     )
 
 
-def test_parallel_axes_have_a_finite_focus_on_the_middle_axis():
-    focus = focus_point([at([x, -4.0, 0.0], [x, 0.0, 0.0]) for x in (-1.0, 1.0)])
-    torch.testing.assert_close(focus, torch.tensor([0.0, -4.0, 0.0]).double(), atol=1e-6, rtol=0)
+@pytest.mark.parametrize("places", [(-1.0, 1.0), (0.0,)])
+def test_where_axes_leave_the_focus_open_it_lies_midway_between_near_and_far(places):
+    focus = focus_point([at([x, -4.0, 0.0], [x, 0.0, 0.0]) for x in places])
+    torch.testing.assert_close(focus, torch.tensor([0.0, -0.5, 0.0]).double(), atol=1e-6, rtol=0)
+
+
+def farthest(a, b):
+    """The largest distance of an ``a`` from its nearest ``b``."""
+    return (a[:, None] - b).norm(dim=-1).amin(1).max().item()
+
+
+def turning():
+    """A tripod: cameras of one place that look different ways."""
+    return [at([1.0, 2.0, 0.5], target) for target in ([0.0, 0.0, 0.0], [1.0, 0.0, 2.0], [-1.0, 1.0, 0.0])]
+
+
+@pytest.mark.parametrize("cameras", [turning()[:1], turning()], ids=["one", "tripod"])
+def test_cameras_of_one_place_look_their_own_ways(cameras):
+    patches = RandomPatches(cameras, patches=3, size=4)
+    generator = torch.Generator().manual_seed(0)
+    own = torch.cat([c.rays().directions for c in cameras])
+    for _ in range(4):
+        rays = patches.draw(generator)
+        torch.testing.assert_close(rays.origins, cameras[0].center.float().expand(48, 3))
+        assert farthest(rays.directions, own) < 1e-5
+    turns = torch.tensor([0.0, 0.3])
+    for view in orbit(cameras[0], focus_point(cameras), mean_up(cameras), turns):
+        torch.testing.assert_close(view.rays().directions.norm(dim=-1), torch.ones(200))
+
+
+@pytest.mark.parametrize("size", [2, 3, 8])
+def test_patches_reach_every_pixel_of_an_image_that_may_be_smaller_than_they(size):
+    camera = replace(turning()[0], width=3, height=5)
+    patches = RandomPatches([camera], patches=200, size=size)
+    assert patches.size == min(size, 3)
+    drawn = patches.draw(torch.Generator().manual_seed(0)).directions
+    assert farthest(camera.rays().directions, drawn) < 1e-5
+    assert farthest(drawn, camera.rays().directions) < 1e-5
 
 
 def test_mean_up():

@@ -59,6 +59,29 @@ def test_frames_without_an_error_count_as_the_worst():
     assert draws(curriculum, 0.0)[9] > 500
 
 
+@pytest.mark.parametrize("error", [float("nan"), float("inf"), -float("inf")])
+def test_an_error_that_is_not_finite_tells_nothing(error):
+    curriculum = Curriculum(TIMES, 0.0, all_in=0.0, error_share=1.0)
+    curriculum.report(3, 0.5)
+    curriculum.report(3, error)
+    curriculum.report(4, error)
+    assert curriculum.errors[3] == 0.5
+    assert len(draws(curriculum, 0.0)) == 10
+
+
+def test_frames_of_one_time_come_in_together():
+    times = [t for _ in range(3) for t in (0.0, 0.25, 0.5, 0.75, 1.0)]  # three cameras
+    curriculum = Curriculum(times, 0.5, start=2, all_in=1.0)
+    played = []
+    for fraction in (0.0, 0.34, 0.67, 1.0):
+        curriculum.fraction = fraction
+        played.append([times[i] for i in curriculum.frames()])
+        assert curriculum.in_play == len(played[-1])
+    assert played[0] == [0.5] * 3 + [0.25] * 3
+    assert [len(p) for p in played] == [6, 9, 12, 15]
+    assert played[1] == played[0] + [0.75] * 3
+
+
 def test_goes_on_where_it_was_saved():
     first, second = (Curriculum(TIMES, 0.5, seed=s, error_share=0.3) for s in (1, 2))
     draws(first, 0.4, 17)
@@ -82,7 +105,15 @@ def test_fewer_frames_than_the_start():
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"start": 0}, {"all_in": 1.5}, {"newest_share": -0.1}, {"newest_part": 0.0}, {"newest_part": 2.0}],
+    [
+        {"start": 0},
+        {"all_in": 1.5},
+        {"newest_share": -0.1},
+        {"newest_part": 0.0},
+        {"newest_part": 2.0},
+        {"error_share": 1.5},
+        {"error_share": float("nan")},
+    ],
 )
 def test_refuses(wrong):
     with pytest.raises(ValueError, match=r"stage.curriculum: expected start >= 1, .*but got"):

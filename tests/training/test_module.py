@@ -1,17 +1,23 @@
+import importlib
 from functools import partial
 
 import pytest
 import torch
 
 from forewarp.effects.inpaint import UNet3d
+from forewarp.methods.backward_warp import Deformation
+from forewarp.ops.backend import numba_installed
+from forewarp.ops.warmup import warm_up
 from forewarp.renderer import Renderer
 from forewarp.scene.box import Lattice
 from forewarp.training.curriculum import Curriculum
 from forewarp.training.module import DynamicSceneModule, render_all
 from forewarp.training.settings import EFFECTS
+from forewarp.training.structure import resample
 from tiny_scene import BOX, RATES, ball_data, forward_spec, stage, trainer
 
 INPAINTER = partial(UNet3d, width=16, levels=2)
+BACKWARD = forward_spec(warp="backward", deformation=partial(Deformation, width=8, layers=2))
 DATA = ball_data(rays=64, frames=5, size=16)
 
 
@@ -59,6 +65,55 @@ def test_without_an_inpainter_the_renderer_runs_once_a_step(spec, times):
     renderer = CountingRenderer()
     module(spec, renderer=renderer).training_step(batch(), 0)
     assert renderer.calls == times
+
+
+def test_what_no_term_looks_at_is_not_rendered():
+    renderer = CountingRenderer()
+    made = module(forward_spec(inpainter=INPAINTER), renderer=renderer)
+    made.objective.photo_on = ("inpainted",)
+    made.training_step(batch(), 0)
+    assert renderer.calls == 1
+
+
+def test_the_clock_starts_when_the_kernels_are_warm(monkeypatch):
+    made, seen = module(), []
+    monkeypatch.setattr(
+        "forewarp.training.module.warm_up", lambda device: seen.append((device, made.clock.seconds))
+    )
+    made.on_train_start()
+    assert seen == [(made.device, 0)]
+    assert made.clock.seconds > 0
+
+
+def test_a_step_meets_warm_kernels_only(monkeypatch):
+    numba = pytest.importorskip("numba")
+    if not numba_installed():
+        pytest.skip("Numba is switched off")
+    met = set()
+
+    def watched(name, kernel):
+        def call(*arguments):
+            met.add((name, *(str(numba.typeof(a)) for a in arguments)))
+            return kernel(*arguments)
+
+        return call
+
+    for part in ("grid", "splat", "march"):
+        home = importlib.import_module(f"forewarp.ops.kernels_{part}")
+        for name, kernel in list(vars(home).items()):
+            if hasattr(kernel, "py_func") and not name.startswith("_"):
+                monkeypatch.setattr(home, name, watched(name, kernel))
+    before = torch.get_rng_state()
+    warm_up()
+    assert torch.equal(torch.get_rng_state(), before)
+    warm = met.copy()
+    met.clear()
+    for spec in (forward_spec(), BACKWARD):
+        made = module(spec)
+        made.training_step(batch(), 0).backward()
+        resample(made.method.radiance, BOX, 500, keep_alpha=1e-2)
+    assert len({name for name, *_ in met}) == 9
+    assert met <= warm
 
 
 def test_random_views_are_rendered_only_for_their_term():

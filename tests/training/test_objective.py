@@ -127,13 +127,12 @@ def test_the_printed_forms():
     torch.testing.assert_close(printed["background_entropy"], expected.detach())
 
 
-def test_the_photo_may_look_at_some_renderings_only():
-    seen = step()
-    _, raw = Objective({"photo": 1.0}, photo_on=["inpainted"])(seen, 0)
-    rgb = seen.renderings["inpainted"].rgb
-    torch.testing.assert_close(raw["photo"], losses.photometric(rgb, seen.batch.rgb).detach())
-    _, raw = Objective({"photo": 1.0}, photo_on=["inpainted"])(step(inpainted=False), 0)
-    assert raw["photo"] > 0  # what is not there cannot be looked at
+def test_the_rays_terms_may_look_at_some_renderings_only():
+    both = {"upsampled": 1, "inpainted": 2}
+    assert Objective({}).wanted(both) == ["upsampled", "inpainted"]
+    chosen = Objective({}, photo_on=["inpainted"])
+    assert chosen.wanted(both) == ["inpainted"]
+    assert chosen.wanted(["upsampled"]) == ["upsampled"]  # what is not there cannot be looked at
 
 
 @pytest.mark.parametrize(

@@ -52,6 +52,7 @@ def test_the_fraction_is_of_what_comes_first(bounds, fraction):
             r"stage.coarse.effects: expected some of motion, view, .* got \['motion', 'shine'\]",
         ),
         ({"start": "points"}, "stage.coarse.start: expected box or hull, but got 'points'"),
+        ({"confine": 1.5}, r"stage.coarse.confine: expected a fraction in \[0, 1\], but got 1.5"),
         ({"start_alpha": 1.0}, r"stage.coarse.start_alpha: expected a number in \(0, 1\), but got 1.0"),
         ({"birth_alpha": 1e-2}, "stage.coarse: expected 0 < birth_alpha < keep_alpha < 1"),
         ({"birth_alpha": 0.0}, "stage.coarse: expected 0 < birth_alpha < keep_alpha < 1"),

@@ -10,6 +10,7 @@ from forewarp.effects.inpaint import UNet3d
 from forewarp.effects.upsample import LearnedUpsampler, TrilinearUpsampler
 from forewarp.effects.view import ViewNetwork
 from forewarp.fields.radiance import FeatureRadiance
+from forewarp.fields.trajectory import TrajectoryField
 from forewarp.methods.backward_warp import Deformation
 from forewarp.training.stages import KeepCheckpoint, check_checkpoint, load_weights
 from tiny_scene import RATES, Interrupt, ball_data, forward_spec, make_run, stage
@@ -159,6 +160,25 @@ def test_a_checkpoint_of_another_configuration_is_refused(tmp_path, whole):
     broken.write_bytes(checkpoint.read_bytes()[:500])
     with pytest.raises(ValueError, match="expected a checkpoint, but it cannot be read"):
         check_checkpoint(broken, module)
+
+
+def test_a_checkpoint_of_another_width_is_refused(tmp_path):
+    def made(width):
+        trajectory = partial(TrajectoryField, bases=4, nodes=8, width=width, layers=2)
+        ours = make_run(
+            tmp_path, stages()[:1], data=ball_data(size=16), spec=forward_spec(trajectory=trajectory)
+        )
+        ours.datamodule.setup()
+        return ours._module(ours.stages[0], None, None, 0)[0]
+
+    torch.save({"state_dict": made(8).state_dict()}, tmp_path / "last.ckpt")
+    grown = made(8)
+    grown.method.radiance.activate(torch.ones(grown.method.radiance.lattice.shape, dtype=torch.bool), {})
+    load_weights(grown, tmp_path / "last.ckpt")  # a voxel grid adopts other shapes
+    with pytest.raises(
+        ValueError, match="but got one that differs in method.motion.trajectory.network.0.bias"
+    ):
+        check_checkpoint(tmp_path / "last.ckpt", made(16))
 
 
 def test_checkpoints_come_by_the_clock(tmp_path, monkeypatch):

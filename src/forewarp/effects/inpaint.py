@@ -24,11 +24,19 @@ class ConvBlock(nn.Module):
         return functional.relu(self.conv(normed))
 
 
+def zero_head(inputs: int, outputs: int) -> nn.Conv3d:
+    """A layer that says 0 until it has learned."""
+    head = nn.Conv3d(inputs, outputs, 1)
+    nn.init.zeros_(head.weight)
+    nn.init.zeros_(head.bias)
+    return head
+
+
 class UNet3d(nn.Module):
     """The inpainter: 4 encode levels and 3 decode levels, on the occupied box only.
 
     It sees the warped grid alone, no time, so that it cannot learn to move things. Its output is features for
-    the up-sampler, or, without one, a residual whose last layer starts at zero: the first step is the identity.
+    a learned up-sampler, or, without one, a residual whose layer starts at zero: at first it is the identity.
 
     Args:
         channels: 1 + C of the radiance grid.
@@ -36,6 +44,7 @@ class UNet3d(nn.Module):
         levels: encode levels.
         margin: voxels around the occupied box.
         coverage_channel: also feed the splat's coverage.
+        head: with the layer that makes the residual; a learned up-sampler has its own.
     """
 
     def __init__(
@@ -46,18 +55,16 @@ class UNet3d(nn.Module):
         levels: int = 4,
         margin: int = 4,
         coverage_channel: bool = False,
+        head: bool = True,
     ) -> None:
         super().__init__()
         if width % 16 or levels < 2:
             raise ValueError(
-                f"model.inpainter: expected a width that is a multiple of 16 and levels >= 2, but got {width=}, {levels=}"
+                "model.inpainter: expected a width that is a multiple of 16 and levels >= 2, "
+                f"but got {width=}, {levels=}"
             )
-        self.channels, self.width, self.margin, self.coverage_channel = (
-            channels,
-            width,
-            margin,
-            coverage_channel,
-        )
+        self.channels, self.width, self.margin = channels, width, margin
+        self.coverage_channel = coverage_channel
         widths = [width * 2**level for level in range(levels)]
         inputs = [channels + coverage_channel, *widths[:-1]]
         self.encode = nn.ModuleList(
@@ -68,9 +75,7 @@ class UNet3d(nn.Module):
             nn.Sequential(ConvBlock(deep + skip, skip), ConvBlock(skip, skip))
             for deep, skip in zip(widths[:0:-1], widths[-2::-1])
         )
-        self.head = nn.Conv3d(width, channels, 1)
-        nn.init.zeros_(self.head.weight)
-        nn.init.zeros_(self.head.bias)
+        self.head = zero_head(width, channels) if head else None
 
     def features(self, dense: Tensor) -> Tensor:
         """(1, I, x, y, z) -> (1, width, x, y, z); any size of at least one voxel."""

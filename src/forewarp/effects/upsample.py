@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from forewarp.effects.dense import Crop, densify, occupied_crop, sparsify
-from forewarp.effects.inpaint import ConvBlock
+from forewarp.effects.inpaint import ConvBlock, zero_head
 from forewarp.ops.grid import index_of, occupied_cells, trilinear
 from forewarp.scene.box import Lattice
 from forewarp.scene.state import RadianceGrid
@@ -75,9 +75,7 @@ class LearnedUpsampler(TrilinearUpsampler):
         self.scale, self.margin = int(scale), margin
         self.project = nn.Conv3d(features or channels, width, 1)
         self.layers = nn.Sequential(ConvBlock(width, width), ConvBlock(width, width))
-        self.head = nn.Conv3d(width, channels, 1)
-        nn.init.zeros_(self.head.weight)
-        nn.init.zeros_(self.head.bias)
+        self.head = zero_head(width, channels)
 
     def residual(self, features: Tensor, crop: Crop) -> Tensor:
         """Coarse features (1, F, x, y, z) of ``crop`` -> detail (1, 1 + C, x', y', z') of the fine crop."""

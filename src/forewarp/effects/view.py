@@ -1,4 +1,4 @@
-"""The view-dependence effect: colour features and a direction to colour. None means features are the colour."""
+"""The view-dependence effect: colour features and a direction to colour. Without it features are colours."""
 
 from __future__ import annotations
 

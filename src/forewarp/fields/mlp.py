@@ -5,7 +5,9 @@ from __future__ import annotations
 from torch import nn
 
 
-def mlp(inputs: int, outputs: int, *, width: int, layers: int, zero_last: bool = False) -> nn.Sequential:
+def mlp(
+    inputs: int, outputs: int, *, width: int, layers: int, zero_last: bool = False, leaky: bool = False
+) -> nn.Sequential:
     """``layers`` linear layers, ReLU between them.
 
     Args:
@@ -13,6 +15,8 @@ def mlp(inputs: int, outputs: int, *, width: int, layers: int, zero_last: bool =
         width: of the hidden layers.
         layers: linear layers in all, at least 1.
         zero_last: start from zero outputs, so that training starts from the identity.
+        leaky: a slope of 0.01 below zero. At the rates that motion needs, every ReLU of the last hidden layer
+            may die in one unlucky step, and what is left can only move everything alike.
 
     >>> len([m for m in mlp(33, 4, width=128, layers=3) if isinstance(m, nn.Linear)])
     3
@@ -22,7 +26,7 @@ def mlp(inputs: int, outputs: int, *, width: int, layers: int, zero_last: bool =
     sizes = [inputs, *[width] * (layers - 1), outputs]
     parts: list[nn.Module] = []
     for a, b in zip(sizes[:-1], sizes[1:]):
-        parts += [nn.Linear(a, b), nn.ReLU(inplace=True)]
+        parts += [nn.Linear(a, b), nn.LeakyReLU(0.01) if leaky else nn.ReLU(inplace=True)]
     parts.pop()
     if zero_last:
         nn.init.zeros_(parts[-1].weight)

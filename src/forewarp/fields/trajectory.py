@@ -48,7 +48,8 @@ class TrajectoryField(nn.Module):
         super().__init__()
         if frames < 2:
             raise ValueError(
-                f"model.motion: expected at least 2 distinct training times, but got {frames}; use model/motion=none"
+                f"model.motion: expected at least 2 distinct training times, but got {frames}; "
+                "use model/motion=none"
             )
         self.box, self.frames, self.canonical_time = box, frames, canonical_time
         self.bases = min(bases, frames - 1)
@@ -62,7 +63,12 @@ class TrajectoryField(nn.Module):
             )
         self.frequencies, self.padding = frequencies, padding
         self.network = mlp(
-            3 * (1 + 2 * frequencies) + features, 3 * self.bases, width=width, layers=layers, zero_last=True
+            3 * (1 + 2 * frequencies) + features,
+            3 * self.bases,
+            width=width,
+            layers=layers,
+            zero_last=True,
+            leaky=True,
         )
         self.register_buffer("bases_in_play", torch.tensor(self.bases))
         self._nodes: tuple[Tensor, tuple[Tensor, Tensor, Tensor]] | None = None
@@ -79,8 +85,8 @@ class TrajectoryField(nn.Module):
 
     def _basis(self, time: float | Tensor) -> Tensor:
         basis = dct_basis(time, self.bases, self.frames, self.canonical_time, self.padding)
-        playing = torch.arange(self.bases) < self.bases_in_play.cpu()
-        return (basis * playing).to(self.network[0].weight.device)
+        basis = basis.to(self.bases_in_play.device)
+        return basis * (torch.arange(self.bases, device=basis.device) < self.bases_in_play)
 
     def flow(self, voxels: VoxelGrid, time: float) -> Tensor:
         """Flow (N, 3) in world units from the canonical time to ``time`` for a grid's active voxels.

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from forewarp.fields.mlp import mlp
 from forewarp.fields.radiance import DirectRadiance
+from forewarp.methods.checks import check_effect
 from forewarp.ops.encode import positional_encoding
 from forewarp.ops.grid import dilate
 from forewarp.scene.box import Box, Lattice
@@ -42,7 +43,7 @@ class Deformation(nn.Module):
         self.scale = 0.5 * max(box.size)
         self.frequencies, self.time_frequencies = frequencies, time_frequencies
         inputs = 3 * (1 + 2 * frequencies) + 1 + 2 * time_frequencies
-        self.network = mlp(inputs, 3, width=width, layers=layers, zero_last=True)
+        self.network = mlp(inputs, 3, width=width, layers=layers, zero_last=True, leaky=True)
 
     def forward(self, points: Tensor, time: float) -> Tensor:
         """World points (P, 3) at ``time`` -> displacement (P, 3)."""
@@ -93,7 +94,7 @@ class BackwardWarp(nn.Module):
 
     Args:
         radiance: the canonical radiance field.
-        deformation: to the canonical time.
+        deformation: to the canonical time; None: a static radiance field.
         view: None: the colour features are the colour.
         canonical_time: where nothing is displaced.
         mask_nodes: side of the lattice on which occupancy at a time is looked up.
@@ -104,18 +105,21 @@ class BackwardWarp(nn.Module):
         radiance: DirectRadiance,
         *,
         canonical_time: float,
-        deformation: Deformation,
+        deformation: Deformation | None,
         view: nn.Module | None = None,
         mask_nodes: int = 32,
     ) -> None:
         super().__init__()
+        check_effect("deformation", deformation, "model=backward or another model")
+        check_effect("view", view, "model/view=none")
         self.radiance, self.deformation, self.view = radiance, deformation, view
         self.canonical_time, self.mask_nodes = canonical_time, mask_nodes
 
     def at(self, time: float) -> State:
         """The moved canonical field, under the name ``backward``."""
-        canonical = self.radiance()
-        field = MovedField(canonical, self.deformation, time, self._cells(canonical, time))
+        canonical = field = self.radiance()
+        if self.deformation is not None:
+            field = MovedField(canonical, self.deformation, time, self._cells(canonical, time))
         return State(time, {"backward": field}, canonical)
 
     @torch.no_grad()
@@ -142,8 +146,12 @@ class BackwardWarp(nn.Module):
     @torch.no_grad()
     def trajectories(self, points: Tensor, times: Tensor) -> Tensor:
         """Paths (N, T, 3): the inverse of the displacement, by fixed-point iteration."""
+        if self.deformation is None:
+            return points[:, None].expand(-1, len(times), -1)
         paths = []
-        for time in times.tolist():
+        # The canonical time, rounded as ``times`` are, is itself: nothing at all is displaced there.
+        canonical = times == times.new_tensor(self.canonical_time)
+        for time in torch.where(canonical, self.canonical_time, times.double()).tolist():
             at = points.clone()
             for _ in range(10):
                 at = points - self.deformation(at, time)

@@ -10,6 +10,7 @@ from forewarp.effects.inpaint import UNet3d
 from forewarp.effects.motion import Motion
 from forewarp.effects.upsample import LearnedUpsampler, TrilinearUpsampler, interpolate_dense, refined
 from forewarp.fields.radiance import DirectRadiance, FeatureRadiance
+from forewarp.methods.checks import check_effect
 from forewarp.scene.state import RadianceGrid, State
 
 
@@ -38,10 +39,7 @@ class ForwardWarp(nn.Module):
         super().__init__()
         effects = {"motion": motion, "upsampler": upsampler, "inpainter": inpainter, "view": view}
         for name, effect in effects.items():
-            if effect is not None and not isinstance(effect, nn.Module):
-                raise ValueError(
-                    f"model.{name}: expected a module or null, but got {type(effect).__name__}; choose model/{name}=none"
-                )
+            check_effect(name, effect, f"model/{name}=none")
             setattr(self, name, effect)
         scale = getattr(upsampler, "scale", 1)
         if inpainter is not None and scale != int(scale):

@@ -19,8 +19,8 @@ from forewarp.scene.box import Box, Lattice
 class MethodSpec:
     """The choices of ``model/``, each a factory that waits for what only the scene knows, or None for off.
 
-    ``warp`` is ``forward`` or ``backward``; the backward method takes ``deformation`` and none of the effects
-    that need a forward warp (motion, upsampler, inpainter).
+    ``warp`` is ``forward`` or ``backward``; the backward method takes ``deformation`` and ignores the effects
+    that need a forward warp (motion with its trajectory, upsampler, inpainter).
     """
 
     radiance: Callable[..., nn.Module]
@@ -39,9 +39,9 @@ class MethodSpec:
             choice = getattr(self, name)
             if choice is not None and not callable(choice):
                 raise ValueError(
-                    f"model.{name}: expected a factory or null, but got {choice!r}; choose model/{name}=none to switch it off"
+                    f"model.{name}: expected a factory or null, but got {choice!r}; "
+                    f"choose model/{name}=none to switch it off"
                 )
-
         needed = {"deformation": self.warp == "backward", "trajectory": self.motion is not None}
         for name, need in needed.items():
             if need and getattr(self, name) is None:
@@ -71,22 +71,23 @@ class MethodSpec:
             frames: distinct training times; with one there is no motion.
             canonical_time: in [0, 1].
             effects: those that this stage uses, where the model has them.
-            upsample: plain interpolation by this factor in place of the model's up-sampler.
+            upsample: plain interpolation by this factor in place of the model's up-sampler; forward only.
         """
         view = self.view() if self.view is not None and "view" in effects else None
         features = view.features if view is not None else 3
         radiance = self.radiance(lattice, active, features=features, unit=unit)
         if self.warp == "backward":
-            deformation = self.deformation(scene_box, canonical_time=canonical_time)
+            deformation = None
+            if frames > 1:
+                deformation = self.deformation(scene_box, canonical_time=canonical_time)
             return BackwardWarp(radiance, canonical_time=canonical_time, deformation=deformation, view=view)
         motion = None
         if self.motion is not None and frames > 1 and "motion" in effects:
             motion = self.motion(self.trajectory(scene_box, frames=frames, canonical_time=canonical_time))
-        inpainter = (
-            self.inpainter(channels=1 + features)
-            if self.inpainter is not None and "inpainter" in effects
-            else None
-        )
+        inpainter = None
+        if self.inpainter is not None and "inpainter" in effects:
+            learned = upsample is None and "upsampler" in effects and self._learns_to_upsample
+            inpainter = self.inpainter(channels=1 + features, head=not learned)
         return ForwardWarp(
             radiance,
             canonical_time=canonical_time,
@@ -96,12 +97,16 @@ class MethodSpec:
             view=view,
         )
 
+    @property
+    def _learns_to_upsample(self) -> bool:
+        return getattr(self.upsampler, "func", self.upsampler) is LearnedUpsampler
+
     def _upsampler(self, features, inpainter, effects, upsample) -> nn.Module | None:
         if upsample is not None:
             return TrilinearUpsampler(scale=upsample)
         if self.upsampler is None or "upsampler" not in effects:
             return None
-        if getattr(self.upsampler, "func", self.upsampler) is LearnedUpsampler:
+        if self._learns_to_upsample:
             return self.upsampler(channels=1 + features, features=0 if inpainter is None else inpainter.width)
         return self.upsampler()
 

@@ -1,4 +1,4 @@
-"""Which implementation of an operator runs: the PyTorch reference everywhere, Numba's on the CPU where installed.
+"""Which implementation of an operator runs: PyTorch's everywhere, Numba's on the CPU where it is installed.
 
 ``FOREWARP_NUMBA=0`` switches Numba off. Both are held to each other in values and gradients by the tests.
 """
@@ -9,6 +9,7 @@ import importlib.util
 import os
 from functools import cache
 
+import torch
 from torch import Tensor
 
 
@@ -21,3 +22,16 @@ def numba_installed() -> bool:
 def use_numba(tensor: Tensor) -> bool:
     """True where the Numba kernel serves ``tensor``."""
     return tensor.device.type == "cpu" and numba_installed()
+
+
+def match_threads() -> int:
+    """Let Numba use as many threads as PyTorch does; returns that number."""
+    from numba import config, get_num_threads, set_num_threads
+
+    asked = torch.get_num_threads()
+    wanted = max(1, min(asked, config.NUMBA_NUM_THREADS))
+    if get_num_threads() != wanted:
+        set_num_threads(wanted)
+    if torch.get_num_threads() != asked:  # Numba's first call starts all threads of the OpenMP they share
+        torch.set_num_threads(asked)
+    return wanted

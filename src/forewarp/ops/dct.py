@@ -21,9 +21,9 @@ def dct_basis(
         bases: K >= 1; at most T - 1 are independent.
         frames: T >= 2, the number of distinct training times.
         canonical_time: in [0, 1].
-        padding: share of the sequence that is imagined before its first and after its last frame. Every cosine
-            stands still at both ends of its period, so without padding nothing can move at the first and last
-            frame; 0 is the printed form.
+        padding: share of the sequence that is imagined before its first and after its last frame. Every
+            cosine stands still at both ends of its period, so without padding nothing can move at the first
+            and last frame; 0 is the printed form.
 
     Returns:
         (..., K), float32 (or ``time``'s floating dtype). Differentiable in ``time``.

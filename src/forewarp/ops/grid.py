@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from forewarp.ops.backend import use_numba
+from forewarp.ops.backend import match_threads, use_numba
 from forewarp.ops.checks import check_shape
 
 _CORNERS = [(a, b, c) for a in (0, 1) for b in (0, 1) for c in (0, 1)]
@@ -50,7 +50,7 @@ def trilinear(values: Tensor, index: Tensor, points: Tensor, fill: Tensor) -> Te
     Cost: 8 reads of C channels a point; the gradient of ``values`` is an (M, C) scatter.
 
     >>> v, i = torch.tensor([[1.0], [3.0]]), torch.arange(2, dtype=torch.int32).reshape(2, 1, 1)
-    >>> trilinear(v, i.expand(2, 2, 2).contiguous(), torch.tensor([[0.5, 0.2, 0.9]]), torch.zeros(1))
+    >>> trilinear(v, i.expand(2, 2, 2).contiguous(), torch.tensor([[0.5, 0.25, 0.75]]), torch.zeros(1))
     tensor([[2.]])
     """
     check_shape("values", values, ("M", "C"))
@@ -79,9 +79,9 @@ def trilinear_reference(values: Tensor, index: Tensor, points: Tensor, fill: Ten
 class _NumbaTrilinear(torch.autograd.Function):
     @staticmethod
     def forward(ctx, values, index, points, fill):
-        from forewarp.ops import kernels
+        from forewarp.ops import kernels_grid as kernels
 
-        kernels.match_threads()
+        match_threads()
         ctx.save_for_backward(values, index, points, fill)
         out = values.new_empty(len(points), values.shape[1])
         kernels.gather(*(_array(v) for v in (values, index, points, fill, out)))
@@ -90,10 +90,10 @@ class _NumbaTrilinear(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx, grad):
-        from forewarp.ops import kernels
+        from forewarp.ops import kernels_grid as kernels
 
         values, index, points, fill = ctx.saved_tensors
-        chunks = min(4, kernels.match_threads())
+        chunks = min(4, match_threads())
         grad = grad.contiguous()
         grad_values = grad_points = None
         if ctx.needs_input_grad[0]:
@@ -141,7 +141,7 @@ def occupied_cells(index: Tensor, keep: Tensor | None = None) -> Tensor:
         keep: (M,) bool over the rows; None keeps all.
     """
     if use_numba(index):
-        from forewarp.ops import kernels
+        from forewarp.ops import kernels_grid as kernels
 
         rows = int(index.max()) + 1 if keep is None else len(keep)
         cells = torch.zeros([n - 1 for n in index.shape], dtype=torch.uint8)

@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from forewarp.ops.backend import use_numba
+from forewarp.ops.backend import match_threads, use_numba
 from forewarp.ops.checks import check_shape
 from forewarp.ops.grid import _array
 
@@ -17,7 +17,7 @@ _BLOCK = 4  # cells per side of the coarse occupancy that lets a ray leap over e
 def march(
     origins: Tensor, directions: Tensor, near: float, far: float, step: float, cells: Tensor, jitter: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Samples ``t_k = near + (k + jitter) step``, k = 0, 1, ..., that lie in an occupied cell and before ``far``.
+    """Samples ``t_k = near + (k + jitter) step``, k = 0, 1, ..., in occupied cells and before ``far``.
 
     Args:
         origins: (R, 3), lattice coordinates.
@@ -74,9 +74,9 @@ def march_reference(origins, directions, near, far, step, cells, jitter) -> tupl
 
 
 def _numba_march(origins, directions, near, far, step, cells, jitter) -> tuple[Tensor, Tensor]:
-    from forewarp.ops import kernels
+    from forewarp.ops import kernels_march as kernels
 
-    kernels.match_threads()
+    match_threads()
     rays = [_array(v) for v in (origins, directions)]
     blocks = torch.zeros([-(-n // _BLOCK) for n in cells.shape], dtype=torch.uint8)
     grid = [_array(cells.contiguous().view(torch.uint8)), blocks.numpy()]

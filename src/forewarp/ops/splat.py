@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from forewarp.ops.backend import use_numba
+from forewarp.ops.backend import match_threads, use_numba
 from forewarp.ops.checks import check_shape
 from forewarp.ops.grid import _CORNERS, _array
 
@@ -88,7 +88,7 @@ def scatter_reference(
 
 
 def _numba_scatter(source: Tensor, positions: Tensor, shape: tuple[int, int, int]) -> tuple[Tensor, Tensor]:
-    from forewarp.ops import kernels
+    from forewarp.ops import kernels_splat as kernels
 
     index = torch.full(shape, -1, dtype=torch.int32)
     rows = kernels.number_touched(_array(positions), index.numpy())
@@ -98,9 +98,9 @@ def _numba_scatter(source: Tensor, positions: Tensor, shape: tuple[int, int, int
 class _NumbaScatter(torch.autograd.Function):
     @staticmethod
     def forward(ctx, source, positions, index, rows):
-        from forewarp.ops import kernels
+        from forewarp.ops import kernels_splat as kernels
 
-        chunks = min(4, kernels.match_threads())
+        chunks = min(4, match_threads())
         ctx.save_for_backward(source, positions, index)
         sums = source.new_zeros(chunks, rows, source.shape[1] + 1)
         kernels.scatter(*(_array(v) for v in (source, positions, index, sums)))
@@ -109,9 +109,9 @@ class _NumbaScatter(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx, grad):
-        from forewarp.ops import kernels
+        from forewarp.ops import kernels_splat as kernels
 
-        kernels.match_threads()
+        match_threads()
         source, positions, index = ctx.saved_tensors
         grad_source, grad_positions = source.new_zeros(source.shape), positions.new_zeros(positions.shape)
         kernels.scatter_backward(

@@ -36,10 +36,10 @@ def patch_variation(depth: Tensor, opacity: Tensor) -> Tensor:
         opacity: (B, S, S) in [0, 1].
 
     Returns:
-        A scalar: the weighted mean over both directions. Differentiable in ``depth``.
+        A scalar: the weighted mean over both directions, 0 for single pixels. Differentiable in ``depth``.
     """
     check_shape("depth", depth, ("B", "S", "S"))
     mask = opacity.detach()
     across = (depth[:, :, 1:] - depth[:, :, :-1]).square() * torch.minimum(mask[:, :, 1:], mask[:, :, :-1])
     down = (depth[:, 1:] - depth[:, :-1]).square() * torch.minimum(mask[:, 1:], mask[:, :-1])
-    return across.mean() + down.mean()
+    return across.sum() / max(across.numel(), 1) + down.sum() / max(down.numel(), 1)

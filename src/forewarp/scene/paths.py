@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -14,20 +15,28 @@ from forewarp.scene.rays import Rays
 def focus_point(cameras: list[Camera]) -> Tensor:
     """The point nearest to all optical axes, least squares (3,), float64.
 
-    Parallel axes leave it undetermined along them; the smallest solution about the mean centre is taken.
+    A single axis, or parallel ones, leave it undetermined along them: it lies midway between near and far.
     """
     centers = torch.stack([c.center.double() for c in cameras])
     axes = torch.stack([c.camera_to_world[:3, 2].double() for c in cameras])
+    midway = torch.tensor([[0.5 * (c.near + c.far)] for c in cameras], dtype=torch.float64)
     across = torch.eye(3, dtype=torch.float64) - axes[:, :, None] * axes[:, None, :]
-    middle = centers.mean(0)
-    offset = (across @ (centers - middle)[..., None]).sum(0)
-    return middle + (torch.linalg.pinv(across.sum(0), rtol=1e-8) @ offset)[:, 0]
+    ahead = (centers + midway * axes).mean(0)
+    offset = (across @ (centers - ahead)[..., None]).sum(0)
+    return ahead + (torch.linalg.pinv(across.sum(0), rtol=1e-8) @ offset)[:, 0]
 
 
 def mean_up(cameras: list[Camera]) -> Tensor:
     """The mean upward direction of the pictures (3,), float64, unit length; z where they cancel."""
     up = -torch.stack([c.camera_to_world[:3, 1].double() for c in cameras]).mean(0)
     return up / up.norm() if up.norm() > 0.1 else torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+
+
+def _moved(camera: Camera, center: Tensor, focus: Tensor, up: Tensor) -> Camera:
+    """The lens at ``center`` looking at ``focus``; as it stands where the two coincide: no way to look."""
+    if float((center - focus).norm()) < 1e-6 * camera.far:
+        return camera
+    return replace(camera, camera_to_world=look_at(center, focus, up))
 
 
 class RandomPatches:
@@ -38,11 +47,12 @@ class RandomPatches:
     Args:
         cameras: the training cameras.
         patches: patches a draw.
-        size: pixels a side.
+        size: pixels a side, at most those of the smallest image.
     """
 
     def __init__(self, cameras: list[Camera], *, patches: int = 16, size: int = 8) -> None:
-        self.cameras, self.patches, self.size = cameras, patches, size
+        self.cameras, self.patches = cameras, patches
+        self.size = min([size, *(min(c.width, c.height) for c in cameras)])
         self.focus, self.up = focus_point(cameras), mean_up(cameras)
 
     def draw(self, generator: torch.Generator) -> Rays:
@@ -52,20 +62,8 @@ class RandomPatches:
         a, b = (self.cameras[k].center.double() - self.focus for k in (i, j))
         mixed = torch.nn.functional.normalize(a * share + b * (1 - share), dim=0)
         radius = a.norm() * share + b.norm() * (1 - share)
-        pose = look_at(self.focus + mixed * radius, self.focus, self.up)
-        camera = self.cameras[i]
-        camera = Camera(
-            camera.width,
-            camera.height,
-            camera.fx,
-            camera.fy,
-            camera.cx,
-            camera.cy,
-            pose,
-            camera.near,
-            camera.far,
-        )
-        span = torch.tensor([max(1, camera.height - self.size), max(1, camera.width - self.size)])
+        camera = _moved(self.cameras[i], self.focus + mixed * radius, self.focus, self.up)
+        span = torch.tensor([camera.height - self.size + 1, camera.width - self.size + 1])
         corner = (torch.rand(self.patches, 2, generator=generator) * span).long()
         inner = torch.stack(
             torch.meshgrid(torch.arange(self.size), torch.arange(self.size), indexing="ij"), -1
@@ -76,6 +74,8 @@ class RandomPatches:
 
 def orbit(camera: Camera, focus: Tensor, up: Tensor, turns: Tensor) -> list[Camera]:
     """Cameras that circle ``focus`` about ``up`` at ``camera``'s height and distance.
+
+    One that stands on the focus has nothing to circle and keeps its pose.
 
     Args:
         camera: gives the start and the lens.
@@ -89,19 +89,5 @@ def orbit(camera: Camera, focus: Tensor, up: Tensor, turns: Tensor) -> list[Came
     views = []
     for turn in turns.tolist():
         angle = 2 * math.pi * turn
-        center = focus + height + math.cos(angle) * a + math.sin(angle) * b
-        pose = look_at(center, focus, up)
-        views.append(
-            Camera(
-                camera.width,
-                camera.height,
-                camera.fx,
-                camera.fy,
-                camera.cx,
-                camera.cy,
-                pose,
-                camera.near,
-                camera.far,
-            )
-        )
+        views.append(_moved(camera, focus + height + math.cos(angle) * a + math.sin(angle) * b, focus, up))
     return views

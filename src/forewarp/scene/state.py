@@ -24,11 +24,14 @@ class FieldAtTime(Protocol):
     lattice: Lattice
 
     @property
-    def cells(self) -> Tensor: ...
+    def cells(self) -> Tensor:
+        """Where matter may be."""
 
-    def density(self, points: Tensor) -> Tensor: ...
+    def density(self, points: Tensor) -> Tensor:
+        """Sigma (P,)."""
 
-    def features(self, points: Tensor) -> Tensor: ...
+    def features(self, points: Tensor) -> Tensor:
+        """Colour features (P, C)."""
 
 
 @dataclass(frozen=True)

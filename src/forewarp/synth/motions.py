@@ -16,7 +16,7 @@ WHEELS = {
 }
 WHEEL_RADIUS, WHEEL_SIDE = 0.16, 0.285
 PIVOT, BOOM, STICK = (0.10, 0.0, 0.44), 0.62, 0.46
-BALL_RADIUS, BALL_AT = 0.17, (0.42, -0.62)
+BALL_RADIUS, BALL_AT = 0.17, (0.34, -0.48)
 BAND_FROM, BAND_ALONG_STICK, BAND_SIDE, BAND_RADIUS = (-0.05, 0.52), 0.36, 0.125, 0.022
 
 
@@ -46,14 +46,14 @@ def _lift(time: float) -> Controls:
 
 def _lift_tilt(time: float) -> Controls:
     up = _ease(time)
-    contact = 0.5 + 0.5 * np.cos(3 * np.pi * time)
+    contact = 0.5 - 0.5 * np.cos(2 * np.pi * time)
     return Controls(
-        boom=40 + 26 * up,
-        stick=-132 + 62 * up,
-        bucket=14 + 36 * up + 14 * np.sin(np.pi * time) ** 2,
-        height=0.42 * (1 - contact),
-        drift=0.16 * up,
-        squash=1.06 - 0.36 * contact,
+        boom=46 + 14 * up,
+        stick=-116 + 26 * up,
+        bucket=10 + 16 * up + 8 * np.sin(np.pi * time) ** 2,
+        height=0.3 * (1 - contact),
+        drift=0.12 * up,
+        squash=1.06 - 0.3 * contact,
     )
 
 
@@ -65,7 +65,7 @@ def _drive(time: float) -> Controls:
 
 
 MOTIONS = {"lift": _lift, "lift_tilt": _lift_tilt, "drive": _drive}
-START = {"lift": (-0.34, -0.02, 18.0), "lift_tilt": (-0.34, -0.02, 18.0), "drive": (-0.42, -0.12, 4.0)}
+START = {"lift": (-0.22, 0.08, 18.0), "lift_tilt": (-0.22, 0.08, 18.0), "drive": (-0.32, -0.02, 4.0)}
 
 
 def joints(motion: str, time: float) -> dict[str, np.ndarray]:

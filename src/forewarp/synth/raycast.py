@@ -11,7 +11,7 @@ from forewarp.synth.textures import Surface, color_of
 from forewarp.synth.vehicle import World
 
 LIGHT_AT, LIGHT_RADIUS = np.array([2.2, -2.6, 4.6]), 0.45
-AMBIENT, SKY, DIFFUSE = 0.50, 0.10, 0.52
+AMBIENT, SKY, DIFFUSE = 0.60, 0.10, 0.40
 # Per sample; with four samples a pixel sees two dozen points of the light, and no edge shows in a shadow.
 SHADOW_RAYS = 6
 # Far above float32 error, in which embree works, and far below anything visible.

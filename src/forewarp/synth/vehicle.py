@@ -34,6 +34,8 @@ GLASS, GLINT, RED, BLUE, GREEN = (
     (0.30, 0.72, 0.38),
 )
 
+ORANGE = (0.93, 0.49, 0.16)
+
 BODY = Material("bricks", (YELLOW, AMBER), 0.09)
 DARK = Material("bricks", (CHARCOAL, (0.17, 0.18, 0.20)), 0.09)
 PIN = Material("plain", (CHARCOAL,))
@@ -70,7 +72,7 @@ class World:
 
 
 def _ground() -> list[Part]:
-    slab = rounded_slab(0.98, 0.36, -0.07, 0.0)
+    slab = rounded_slab(0.78, 0.30, -0.07, 0.0)
     return [Part("ground", "ground", *slab, Material("checker", (CREAM, TEAL, SLATE), 0.245))]
 
 
@@ -144,7 +146,7 @@ def _arm() -> list[Part]:
         Part("boom_pins", "boom", *joined(pins), PIN),
         Part("stick", "stick", *_upright(stick, 0.04), BODY),
         Part("stick_pins", "stick", *joined(hooks), PIN),
-        Part("bucket", "bucket", *_bucket(), Material("bricks", METAL.colors, 0.12)),
+        Part("bucket", "bucket", *_bucket(), Material("bricks", (ORANGE, (0.62, 0.26, 0.10)), 0.12)),
         Part("band", "band", *band, Material("rings", (GREEN, (0.85, 0.95, 0.75)), 0.1)),
     ]
 
@@ -162,12 +164,12 @@ def _bucket() -> Mesh:
     along = np.array([np.cos(np.pi / 6), np.sin(np.pi / 6)])
     rim = np.concatenate([rim, rim[-1:] + 0.13 * along])
     inward = np.concatenate([-np.stack([np.cos(angle), np.sin(angle)], -1), [[-along[1], along[0]]]])
-    inner = rim + 0.018 * inward
+    inner = rim + 0.06 * inward
     shell = [
         _upright([tuple(rim[i]), tuple(rim[i + 1]), tuple(inner[i + 1]), tuple(inner[i])], 0.175)
         for i in range(len(rim) - 1)
     ]
-    cheeks = [_upright([tuple(p) for p in rim], 0.01, at=y) for y in (-0.17, 0.17)]
+    cheeks = [_upright([tuple(p) for p in rim], 0.025, at=y) for y in (-0.155, 0.155)]
     lip, thick = rim[-1], 0.018 * inward[-1]
     tooth = [tuple(lip - 0.02 * along), tuple(lip + 0.07 * along), tuple(lip - 0.02 * along + 1.6 * thick)]
     return joined(shell + cheeks + [_upright(tooth, 0.022, at=y) for y in (-0.14, -0.047, 0.047, 0.14)])

@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 
 
 class Curriculum:
     """Progressive frames. Call it for the index of the next training frame.
 
-    The number of frames in play grows evenly with the fraction of the stage that is done, so a run bounded by
-    time has seen them all as well. A share of the draws goes to the newest, whose motion is still unknown.
+    Times come in evenly with the fraction of the stage that is done, each with all its frames, so a run
+    bounded by time has seen them all as well. A share of the draws goes to the newest, whose motion is still
+    unknown.
 
     Args:
         times: of every training frame.
         canonical_time: where training starts.
-        start: frames in play at the beginning.
+        start: distinct times in play at the beginning.
         all_in: fraction of the stage at which all are in play; 0: from the start.
         newest_share: share of the draws that goes to the newest part.
         newest_part: that part, as a share of the frames in play.
-        error_share: share of the draws in which a frame's chance is its own last error, told by ``report``: the
-            ends of a sequence are hard, and one in two hundred frames has little say.
+        error_share: share of the draws in which a frame's chance is its own last error, told by ``report``:
+            the ends of a sequence are hard, and one in two hundred frames has little say.
         seed: of the draws.
     """
 
@@ -35,13 +38,17 @@ class Curriculum:
         error_share: float = 0.0,
         seed: int = 0,
     ) -> None:
-        if not (start >= 1 and 0 <= all_in <= 1 and 0 <= newest_share <= 1 and 0 < newest_part <= 1):
+        shares = all(0 <= share <= 1 for share in (all_in, newest_share, error_share))
+        if not (start >= 1 and shares and 0 < newest_part <= 1):
             raise ValueError(
-                "stage.curriculum: expected start >= 1, all_in and newest_share in [0, 1] and newest_part in (0, 1], "
-                f"but got {start=}, {all_in=}, {newest_share=}, {newest_part=}"
+                "stage.curriculum: expected start >= 1, all_in, newest_share and error_share in [0, 1] and "
+                f"newest_part in (0, 1], but got {start=}, {all_in=}, {newest_share=}, {error_share=}, "
+                f"{newest_part=}"
             )
-        self.order = sorted(range(len(times)), key=lambda i: (abs(times[i] - canonical_time), i))
-        self.start, self.all_in = min(start, len(times)), all_in
+        self.order = sorted(range(len(times)), key=lambda i: (abs(times[i] - canonical_time), times[i], i))
+        last_of_time = {times[i]: place for place, i in enumerate(self.order)}
+        self._ends = [place + 1 for place in last_of_time.values()]  # frames, once so many times are in
+        self.start, self.all_in = min(start, len(self._ends)), all_in
         self.newest_share, self.newest_part = newest_share, newest_part
         self.error_share = error_share
         self.errors = torch.full((len(times),), float("nan"))
@@ -52,7 +59,7 @@ class Curriculum:
     def in_play(self) -> int:
         """How many frames may be drawn now."""
         done = 1.0 if self.all_in == 0 else min(1.0, self.fraction / self.all_in)
-        return self.start + int((len(self.order) - self.start) * done)
+        return self._ends[self.start + int((len(self._ends) - self.start) * done) - 1]
 
     def frames(self) -> list[int]:
         """The frames in play, nearest to the canonical time first."""
@@ -70,7 +77,9 @@ class Curriculum:
         return self.order[int(torch.randint(low, playing, (), generator=self.generator))]
 
     def report(self, frame: int, error: float) -> None:
-        """Tell the squared error of a frame that was just trained on."""
+        """Tell the squared error of a frame just trained on; one that is not finite tells nothing."""
+        if not math.isfinite(error):
+            return
         before = float(self.errors[frame])
         self.errors[frame] = error if before != before else 0.5 * (before + error)
 

@@ -145,7 +145,8 @@ def _set_start_density(radiance: nn.Module, alpha: float) -> None:
 def _hull(scene: Scene, lattice: Lattice, settings: StageSettings, frames: list[int]) -> Tensor:
     if not scene.has_alpha:
         raise ValueError(
-            f"stage.{settings.name}.start: expected box, since the images of '{scene.name}' have no alpha, but got hull"
+            f"stage.{settings.name}.start: expected box, since the images of '{scene.name}' have no alpha, "
+            "but got hull"
         )
     frames = frames[: settings.hull_frames]
     masks = []

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from forewarp.methods.spec import parameter_kinds
+from forewarp.ops.warmup import warm_up
 from forewarp.renderer import Renderer
 from forewarp.scene.batch import Batch, Target
 from forewarp.scene.camera import Camera
@@ -52,6 +53,8 @@ class DynamicSceneModule(lightning.LightningModule):
         self.generator = torch.Generator().manual_seed(seed)
         self.clock = Clock()
         self.lattice_voxels, self.lattice_step = settings.at("voxels", 0.0), 0
+        # Where voxels were active at the start; only on that lattice does it mean anything.
+        self.home = method.radiance.index >= 0
         self.last: dict[str, float] = {}
 
     @property
@@ -64,14 +67,14 @@ class DynamicSceneModule(lightning.LightningModule):
         state = self.method.at(batch.time)
         renderings = {
             name: self.renderer(
-                field,
+                state.fields[name],
                 batch.rays,
                 batch.background,
                 self.method.view,
                 self.generator,
                 keep_all_weights=self.objective.needs_all_weights,
             )
-            for name, field in state.fields.items()
+            for name in self.objective.wanted(state.fields)
         }
         step = Step(batch, state, renderings, lambda: self._patches(state))
         loss, raw = self.objective(step, self.global_step)
@@ -114,7 +117,8 @@ class DynamicSceneModule(lightning.LightningModule):
         self.trainer.datamodule.picker = self.curriculum
 
     def on_train_start(self) -> None:
-        """Start the training clock."""
+        """Start the training clock, once the kernels are there: compiling them is not training."""
+        warm_up(self.device)
         self.clock.start()
 
     def on_train_end(self) -> None:
@@ -131,7 +135,7 @@ class DynamicSceneModule(lightning.LightningModule):
         return None
 
     def _follow(self, fraction: float) -> None:
-        settings, step = self.settings, self.global_step
+        settings = self.settings
         self.curriculum.fraction = fraction
         optimizer = self.optimizers().optimizer
         factor = settings.rate_factor(fraction)
@@ -152,7 +156,9 @@ class DynamicSceneModule(lightning.LightningModule):
             resample(radiance, radiance.lattice.box, voxels, **common)
             self.lattice_voxels, self.lattice_step = voxels, step
         elif due and fraction >= settings.refresh_from:
-            refresh(radiance, birth_alpha=settings.birth_alpha, **common)
+            confined = fraction < settings.confine and self.home.shape == radiance.lattice.shape
+            allowed = self.home.to(self.device) if confined else None
+            refresh(radiance, birth_alpha=settings.birth_alpha, allowed=allowed, **common)
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """Adam with the ancestors' betas; a rate of its own for every kind of parameter."""
@@ -160,7 +166,8 @@ class DynamicSceneModule(lightning.LightningModule):
         for kind, parameters in parameter_kinds(self.method).items():
             if kind not in self.settings.rates:
                 raise ValueError(
-                    f"stage.{self.settings.name}.rates: expected a rate for '{kind}', but got {sorted(self.settings.rates)}"
+                    f"stage.{self.settings.name}.rates: expected a rate for '{kind}', "
+                    f"but got {sorted(self.settings.rates)}"
                 )
             rate = float(self.settings.rates[kind])
             groups.append({"params": parameters, "lr": rate, "base_rate": rate, "name": kind})
@@ -179,6 +186,7 @@ class DynamicSceneModule(lightning.LightningModule):
             "generator": self.generator.get_state(),
             "curriculum": self.curriculum.state_dict(),
             "clock": self.clock.state_dict(),
+            "home": self.home,
             "lattice": [self.lattice_voxels, self.lattice_step],
         }
 
@@ -189,12 +197,13 @@ class DynamicSceneModule(lightning.LightningModule):
         self.curriculum.load_state_dict(state["curriculum"])
         self.clock.load_state_dict(state["clock"])
         self.lattice_voxels, self.lattice_step = state["lattice"]
+        self.home = state["home"]
 
     @torch.no_grad()
     def render_image(
         self, camera: Camera, time: float, background: Tensor, state: State | None = None
     ) -> Rendering:
-        """A whole picture, by the best rendering. ``state`` of the same time may be handed in to save the warp."""
+        """A whole picture, by the best rendering. ``state`` of the same time, handed in, saves the warp."""
         state = state or self.method.at(time)
         field = list(state.fields.values())[-1]
         return render_all(self.renderer, field, camera.rays().to(self.device), background, self.method.view)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -102,12 +102,13 @@ class Objective:
         self.needs_all_weights = "background_entropy" in literal
         self._pairs: tuple[Tensor, list[tuple[Tensor, Tensor]]] | None = None
 
+    def wanted(self, names: Iterable[str]) -> list[str]:
+        """Of the possible renderings, those that the per-ray terms look at; all where none is listed."""
+        names = list(names)
+        return [n for n in names if self.photo_on is None or n in self.photo_on] or names
+
     def __call__(self, step: Step, number: int) -> tuple[Tensor, dict[str, Tensor]]:
         """The loss of step ``number`` and every term evaluated, raw, by name."""
-        if self.photo_on is not None:
-            step.renderings = {
-                k: v for k, v in step.renderings.items() if k in self.photo_on
-            } or step.renderings
         step.neighbours = self._neighbours
         loss, raw = torch.zeros(()), {}
         for name, weight in self.weights.items():

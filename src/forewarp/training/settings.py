@@ -23,11 +23,13 @@ class StageSettings:
         carry: start from the stage before; otherwise only its box is used.
         start: what is active at the beginning, ``box`` or ``hull`` (needs alpha).
         hull_frames: the hull is that of so many frames nearest to the canonical time; few, or what moves fast
-            is carved away. hull_grow: share of the image's width by which silhouettes are grown, since the scene
-            moves. hull_misses: views that may disagree.
+            is carved away. hull_grow: share of the image's width by which silhouettes are grown, since the
+            scene moves. hull_misses: views that may disagree.
         hold: fraction up to which rates are constant; after it they fall exponentially to ``final_rate``.
         refresh_every: steps between updates of the active voxels; 0: never. refresh_from: fraction.
         keep_alpha, birth_alpha: opacity over a voxel that is kept, and that new voxels start with.
+        confine: fraction up to which voxels are born only where some were active at the start, so that new
+            matter cannot stand in for motion; 0: anywhere.
         see_steps: voxels that no view has seen for so many steps are forgotten; 0: kept.
         start_alpha: opacity over a voxel of the first active voxels.
         color_threshold: the renderer's in this stage; null: as elsewhere.
@@ -55,6 +57,7 @@ class StageSettings:
     refresh_from: float = 0.0
     keep_alpha: float = 1e-3
     birth_alpha: float = 5e-4
+    confine: float = 0.0
     see_steps: int = 0
     start_alpha: float = 0.05
     color_threshold: float | None = None
@@ -87,11 +90,14 @@ class StageSettings:
             )
         if self.start not in ("box", "hull"):
             raise ValueError(f"{where}.start: expected box or hull, but got '{self.start}'")
+        if not 0 <= self.confine <= 1:
+            raise ValueError(f"{where}.confine: expected a fraction in [0, 1], but got {self.confine}")
         if not 0 < self.start_alpha < 1:
             raise ValueError(f"{where}.start_alpha: expected a number in (0, 1), but got {self.start_alpha}")
         if not 0 < self.birth_alpha < self.keep_alpha < 1:
             raise ValueError(
-                f"{where}: expected 0 < birth_alpha < keep_alpha < 1, or fog spreads, but got {self.birth_alpha}, {self.keep_alpha}"
+                f"{where}: expected 0 < birth_alpha < keep_alpha < 1, or fog spreads, "
+                f"but got {self.birth_alpha}, {self.keep_alpha}"
             )
 
     def at(self, key: str, fraction: float) -> float | None:

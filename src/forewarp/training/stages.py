@@ -1,4 +1,4 @@
-"""A run: all stages of one scene in one folder. A finished stage is not run again, an interrupted one goes on."""
+"""A run: all stages of one scene in one folder. What is finished is not run again, the rest goes on."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from pathlib import Path
 import lightning
 import torch
 
+from forewarp.fields.voxel_grid import VoxelGrid
 from forewarp.methods.spec import MethodSpec, parameter_count
 from forewarp.renderer import Renderer
 from forewarp.scene.frame import Scene
@@ -92,7 +93,8 @@ class Run:
         for stage in self.stages:
             if not self.is_finished(stage):
                 raise ValueError(
-                    f"{self.stage_folder(stage)}: expected a finished stage, but got none; continue with forewarp-train"
+                    f"{self.stage_folder(stage)}: expected a finished stage, but got none; "
+                    "continue with forewarp-train"
                 )
         stage = self.stages[-1]
         before = [load_handover(self.stage_folder(s)) for s in self.stages[:-1]]
@@ -208,14 +210,23 @@ def check_checkpoint(path: Path, module: DynamicSceneModule) -> dict:
         raise ValueError(
             f"{path}: expected a checkpoint, but it cannot be read ({type(error).__name__}); delete it"
         ) from None
-    own, theirs = set(module.state_dict()), set(content.get("state_dict", {}))
-    if own != theirs:
-        differ = sorted(own ^ theirs)[:3]
+    own, theirs = _shapes(module.state_dict(), module), _shapes(content.get("state_dict", {}), module)
+    differ = sorted(k for k in {**own, **theirs} if k not in own or k not in theirs or own[k] != theirs[k])
+    if differ:
         raise ValueError(
-            f"{path}: expected a checkpoint of this configuration, but got one that differs in {', '.join(differ)}; "
-            "use another run folder, or the configuration that it was made with"
+            f"{path}: expected a checkpoint of this configuration, but got one that differs in "
+            f"{', '.join(differ[:3])}; use another run folder, or the configuration that it was made with"
         )
     return content
+
+
+def _shapes(weights: dict, module: DynamicSceneModule) -> dict[str, tuple | None]:
+    """Of every entry that must fit; None for those of voxel grids, which adopt a checkpoint's shapes."""
+    grids = [(prefix, m) for prefix, m in module.named_modules() if isinstance(m, VoxelGrid)]
+    adopted = {f"{prefix}.{name}" for prefix, m in grids for name in ("voxels", "index", *m.names)}
+    return {
+        k: tuple(v.shape) if torch.is_tensor(v) and k not in adopted else None for k, v in weights.items()
+    }
 
 
 def load_weights(module: DynamicSceneModule, path: Path) -> None:

@@ -1,4 +1,4 @@
-"""How the canonical grid changes while it is trained: which voxels are active, and how fine the lattice is."""
+"""How the canonical grid changes while it is trained: which voxels are active, how fine the lattice is."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def seen_rows(radiance: VoxelGrid, optimizer: torch.optim.Optimizer) -> Tensor:
 
 
 def occupied(radiance: VoxelGrid, keep_alpha: float, seen: Tensor | None = None) -> Tensor:
-    """Voxels (X, Y, Z) bool whose opacity over one voxel exceeds ``keep_alpha``, and that are ``seen`` (N,)."""
+    """Voxels (X, Y, Z) bool that are more opaque than ``keep_alpha`` over one voxel, and ``seen`` (N,)."""
     with torch.no_grad():
         grid = radiance()
     solid = grid.activation.alpha(grid.raw_density, grid.lattice.pitch) > keep_alpha
@@ -41,6 +41,7 @@ def refresh(
     keep_alpha: float,
     birth_alpha: float,
     only_seen: bool = False,
+    allowed: Tensor | None = None,
 ) -> bool:
     """Keep what is occupied and one voxel around it; forget the rest. The optimiser's moments follow.
 
@@ -52,6 +53,7 @@ def refresh(
         keep_alpha: opacity over one voxel above which a voxel is occupied.
         birth_alpha: what a new voxel starts with; below ``keep_alpha``, or fog spreads.
         only_seen: also forget what no view has seen since the moments began, the inside of things.
+        allowed: (X, Y, Z) bool, where voxels may be born; None: anywhere.
 
     Returns:
         Whether the active set changed.
@@ -59,7 +61,7 @@ def refresh(
     mask = occupied(radiance, keep_alpha, seen_rows(radiance, optimizer) if only_seen else None)
     if not bool(mask.any()):
         return False
-    active = dilate(mask, 1)
+    active = dilate(mask, 1) if allowed is None else (dilate(mask, 1) & allowed) | mask
     if bool((active == (radiance.index >= 0)).all()):
         return False
     before = [radiance.parameter(n) for n in radiance.names]
@@ -105,7 +107,7 @@ def resample(
     optimizer: torch.optim.Optimizer | None = None,
     only_seen: bool = False,
 ) -> None:
-    """Carry the field to a lattice of about ``voxels`` over ``box``; active is what is occupied there, dilated.
+    """Carry the field to a lattice of about ``voxels`` over ``box``; what is occupied is active, dilated.
 
     An empty field becomes active everywhere. The optimiser's moments of the grid start afresh.
     """
@@ -117,7 +119,8 @@ def resample(
         raw = torch.where(seen_rows(radiance, optimizer)[:, None], raw, EMPTY)
     raw = trilinear(raw.contiguous(), source.index, points, source.fill[:1])[:, 0]
     last = torch.tensor(source.lattice.shape, device=points.device) - 1
-    inside = ((points >= 0) & (points <= last)).all(-1)
+    slack = 1e-3  # voxels: rounding must not cut off the border of the same box
+    inside = ((points >= -slack) & (points <= last + slack)).all(-1)
     solid = (source.activation.alpha(raw, source.lattice.pitch) > keep_alpha) & inside
     mask = dilate(solid.reshape(lattice.shape), 1)
     if not bool(mask.any()):

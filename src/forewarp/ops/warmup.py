@@ -1,0 +1,26 @@
+"""Compiling ahead of time: a tiny call of every operator that has a kernel."""
+
+from __future__ import annotations
+
+import torch
+
+from forewarp.ops.grid import index_of, occupied_cells, trilinear
+from forewarp.ops.march import march
+from forewarp.ops.splat import average_splat
+
+
+def warm_up(device: torch.device | str = "cpu") -> None:
+    """Run each operator forwards and backwards once, on two voxels an axis; nothing is drawn at random.
+
+    Numba compiles a kernel, or reads it from its cache, at the first call: seconds that are not training.
+    """
+    voxels = torch.cartesian_prod(*[torch.arange(2, device=device)] * 3)
+    positions = voxels.float().requires_grad_()
+    with torch.enable_grad():
+        splat = average_splat(torch.ones_like(positions).requires_grad_(), positions, (2, 2, 2))
+        read = trilinear(splat.values, splat.index, positions, positions.new_zeros(3))
+        read.sum().backward()
+    index = index_of(voxels, (2, 2, 2))
+    cells = occupied_cells(index)
+    start, along = positions.new_zeros(1, 3), positions.new_ones(1, 3)
+    march(start.detach(), along, 0.0, 1.0, 0.5, cells, positions.new_zeros(1))
