@@ -125,8 +125,8 @@ def test_what_does_not_matter_may_change(forewarp, fitted, scenes):
     ("change", "line"),
     [
         ("seed=1", "config.yaml: data.seed: expected 0, but got 1; use run=... or delete the folder"),
-        ("budget.minutes=9", "config.yaml: budget.minutes: expected 1.2, but got 9; use run="),
-        ("model/view=none", "config.yaml: model.view: expected {"),
+        ("budget.minutes=9", "config.yaml: budget.minutes: expected 0.9, but got 9; use run="),
+        ("model/view=sh", "config.yaml: model.view: expected "),
     ],
 )
 def test_another_configuration_is_refused(refused, fitted, scenes, change, line):
@@ -136,7 +136,7 @@ def test_another_configuration_is_refused(refused, fitted, scenes, change, line)
 def test_a_checkpoint_of_another_configuration_is_refused(refused, fitted, scenes, tmp_path):
     shutil.copytree(fitted, tmp_path / "run")
     saved = yaml.safe_load((tmp_path / "run" / "config.yaml").read_text())
-    saved["model"]["view"] = None
+    saved["model"]["view"] = {"_target_": "forewarp.effects.view.SphericalHarmonics", "_partial_": True}
     (tmp_path / "run" / "config.yaml").write_text(yaml.safe_dump(saved))
     line = refused("evaluate", f"run={tmp_path / 'run'}")
     assert "last.ckpt: expected a checkpoint of this configuration, but got one that differs in" in line

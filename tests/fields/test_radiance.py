@@ -59,3 +59,18 @@ def test_refuses_an_opacity_out_of_range(alpha):
         ValueError, match=r"model.radiance.alpha_init: expected a number in \(0, 1\), but got"
     ):
         density_shift(alpha)
+
+
+def test_feature_radiance_knows_where_it_is_on_any_lattice():
+    """The same world point is encoded alike on a lattice of another box, so F1 carries over."""
+    inner = Lattice(Box((0.5, 1, 1), (1.5, 2, 3)), (3, 4, 5))
+    both = [
+        FeatureRadiance(lattice, ALL, features=3, grid_features=1, width=4, box=LATTICE.box, **COMMON)
+        for lattice in (LATTICE, inner)
+    ]
+    centre = [
+        radiance._positions()[(radiance.voxels == torch.tensor([1, 0, 2])).all(-1)] for radiance in both
+    ]
+    assert centre[0][0, 0] == centre[1][0, 0] == 0  # the middle of the scene along x
+    assert centre[0][0, 1] == -1
+    assert centre[1][0, 1] == pytest.approx(-1 / 3, abs=1e-6)

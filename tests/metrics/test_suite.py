@@ -45,7 +45,9 @@ def test_depth_metrics_carry_their_threshold():
     assert DEPTH_METRICS == ("depth_delta_1.02", "depth_delta_1.25", "depth_delta_1.5625")
 
 
-def test_what_an_image_does_not_allow_is_left_out_and_said_once(caplog):
+def test_what_an_image_does_not_allow_is_left_out_and_said_once(caplog, monkeypatch):
+    # Hydra, where a test before this one started it, switches loggers off.
+    monkeypatch.setattr(logging.getLogger("forewarp.metrics.suite"), "disabled", False)
     suite = ImageSuite({"lpips_vgg": None})
     with caplog.at_level(logging.WARNING):
         for _ in range(3):

@@ -7,7 +7,7 @@ import pytest
 pytest.importorskip("trimesh")
 pytest.importorskip("embreex")
 
-from forewarp.synth.motions import GROUND
+from forewarp.synth.motions import GROUND, joints
 from forewarp.synth.raycast import LIGHT_AT, Posed, camera_rays, render
 from forewarp.synth.scenes import orbit_camera
 from forewarp.synth.vehicle import World
@@ -39,7 +39,7 @@ def test_the_background_is_nothing(shot):
 
 def test_depth_is_where_the_ray_meets_the_ground(world):
     """A ray from straight above the free corner of the slab, against the plane's equation."""
-    start = np.array([[0.5, 0.7, 3.0], [0.52, 0.7, 3.0]])
+    start = np.array([[0.1, 0.7, 3.0], [0.12, 0.7, 3.0]])
     slant = np.array([[0, 0, -1.0], [0.1, 0.0, -1.0]])
     slant /= np.linalg.norm(slant, axis=-1, keepdims=True)
     hits = Posed(world, 0.0).first_hits(start, slant)
@@ -68,7 +68,9 @@ def test_camera_rays_are_the_cameras(shot):
 
 def test_a_shadow_falls_behind_the_ball(world):
     """From the ground beside the ball, on the far side from the light, the ball hides the light."""
-    ground = np.array([[0.31, -0.47, GROUND + 1e-3], [0.7, 0.7, GROUND + 1e-3]])
+    ball = joints("lift_tilt", 0.0)["ball"][:3, 3]
+    behind = ball + (ball - LIGHT_AT) * (ball[2] - GROUND - 1e-3) / (LIGHT_AT - ball)[2]
+    ground = np.array([behind, [0.7, 0.7, GROUND + 1e-3]])
     towards = LIGHT_AT - ground
     towards /= np.linalg.norm(towards, axis=-1, keepdims=True)
     assert Posed(world, 0.0).is_free(ground, towards).tolist() == [False, True]

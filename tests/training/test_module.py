@@ -224,3 +224,20 @@ def test_without_cameras_there_are_no_random_views():
     )
     assert none.patches is None
     assert none.training_step(batch(), 0).isfinite()
+
+
+def test_a_loss_that_is_not_finite_stops_with_its_terms():
+    made = module()
+    with torch.no_grad():
+        made.method.radiance.color.fill_(float("nan"))
+    with pytest.raises(ValueError, match=r"expected a finite loss, but got nan at step 0.*photo=nan"):
+        made.training_step(batch(), 0)
+
+
+def test_without_a_schedule_all_bases_play():
+    made = module(bases=[])
+    made.method.motion.trajectory.bases_in_play.fill_(1)
+    optimizer = made.configure_optimizers()
+    made.optimizers = lambda: type("Wrapped", (), {"optimizer": optimizer})()
+    made._follow(0.5)
+    assert int(made.method.motion.trajectory.bases_in_play) == made.method.motion.trajectory.bases

@@ -43,6 +43,8 @@ def measure(run: Run, module: DynamicSceneModule, config: DictConfig) -> dict:
 
 def device_of(accelerator: str) -> torch.device:
     """The device that a trainer of this accelerator uses."""
+    if accelerator in ("gpu", "cuda") and not torch.cuda.is_available():
+        raise ValueError("trainer.accelerator: expected a GPU, but found none; use trainer=cpu")
     wanted = accelerator in ("gpu", "cuda") or (accelerator == "auto" and torch.cuda.is_available())
     return torch.device("cuda" if wanted else "cpu")
 

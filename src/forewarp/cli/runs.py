@@ -11,6 +11,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from forewarp.cli.measure import device_of
 from forewarp.training.budget import share_out
 from forewarp.training.stages import Run
 
@@ -27,6 +28,8 @@ def build_run(config: DictConfig) -> Run:
     parts = {key: instantiate(config[key], _convert_="all") for key in ("data", "model", "renderer", "stage")}
     watchers = [w for w in instantiate(config.callbacks, _convert_="all").values() if w is not None]
     trainer, logger = (instantiate(config[key], _convert_="all") for key in ("trainer", "logger"))
+
+    device_of(config.trainer.accelerator)  # refuses a GPU that is not there, before anything is written
 
     def make_trainer(folder: Path, callbacks: list):
         return trainer(

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from forewarp.fields.mlp import mlp
 from forewarp.fields.voxel_grid import VoxelGrid
 from forewarp.ops.encode import positional_encoding
-from forewarp.scene.box import Lattice
+from forewarp.scene.box import Box, Lattice
 from forewarp.scene.state import EMPTY, Activation, RadianceGrid
 
 
@@ -35,6 +35,7 @@ class DirectRadiance(VoxelGrid):
         alpha_init: opacity over ``unit`` at raw density 0.
         unit: length that density is measured in, world units.
         skip_alpha: cells more transparent than this over a voxel are not sampled.
+        box: the scene's; not needed without a network.
     """
 
     def __init__(
@@ -46,6 +47,7 @@ class DirectRadiance(VoxelGrid):
         alpha_init: float,
         unit: float,
         skip_alpha: float,
+        box: Box | None = None,
     ) -> None:
         super().__init__(lattice, active, self._channels(features))
         self.activation = Activation(density_shift(alpha_init), unit)
@@ -78,7 +80,7 @@ class FeatureRadiance(VoxelGrid):
         grid_features: channels of the feature grid.
         width, layers: of F1.
         frequencies: of the positional encoding.
-        reference: the lattice whose box normalises positions to [-1, 1] (kept when the lattice changes).
+        box: normalises positions to [-1, 1], kept when the lattice changes; None: the lattice's own.
     """
 
     def __init__(
@@ -94,8 +96,10 @@ class FeatureRadiance(VoxelGrid):
         width: int = 128,
         layers: int = 3,
         frequencies: int = 5,
+        box: Box | None = None,
     ) -> None:
         super().__init__(lattice, active, {"features": grid_features})
+        self.reference = Lattice(box or lattice.box, (2, 2, 2))
         nn.init.normal_(self.features, std=0.1)
         self.network = mlp(
             grid_features + 3 * (1 + 2 * frequencies),
@@ -117,10 +121,9 @@ class FeatureRadiance(VoxelGrid):
     def _positions(self) -> Tensor:
         # The tensor itself is the key: an id may be given again to the next one.
         if self._encoded is None or self._encoded[0] is not self.voxels:
-            self._encoded = (
-                self.voxels,
-                positional_encoding(self.lattice.normalised(self.voxels), self.frequencies),
-            )
+            points = self.reference.to_lattice(self.lattice.to_world(self.voxels))
+            encoded = positional_encoding(self.reference.normalised(points), self.frequencies)
+            self._encoded = (self.voxels, encoded)
         return self._encoded[1]
 
     def births(self, alpha: float) -> dict[str, float]:

@@ -62,14 +62,8 @@ class TrajectoryField(nn.Module):
                 self.lattice, torch.ones(self.lattice.shape, dtype=torch.bool), {"grid": features}
             )
         self.frequencies, self.padding = frequencies, padding
-        self.network = mlp(
-            3 * (1 + 2 * frequencies) + features,
-            3 * self.bases,
-            width=width,
-            layers=layers,
-            zero_last=True,
-            leaky=True,
-        )
+        inputs = 3 * (1 + 2 * frequencies) + features
+        self.network = mlp(inputs, 3 * self.bases, width=width, layers=layers, zero_last=True, leaky=True)
         self.register_buffer("bases_in_play", torch.tensor(self.bases))
         self._nodes: tuple[Tensor, tuple[Tensor, Tensor, Tensor]] | None = None
 

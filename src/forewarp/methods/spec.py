@@ -75,7 +75,7 @@ class MethodSpec:
         """
         view = self.view() if self.view is not None and "view" in effects else None
         features = view.features if view is not None else 3
-        radiance = self.radiance(lattice, active, features=features, unit=unit)
+        radiance = self.radiance(lattice, active, features=features, unit=unit, box=scene_box)
         if self.warp == "backward":
             deformation = None
             if frames > 1:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import lightning
 import torch
 from torch import Tensor
@@ -100,6 +102,13 @@ class DynamicSceneModule(lightning.LightningModule):
     def _remember(self, loss: Tensor, raw: dict[str, Tensor], step: Step) -> None:
         best = list(step.renderings.values())[-1]
         error = float((best.rgb.detach() - step.batch.rgb).square().mean())
+        if not math.isfinite(float(loss.detach())):
+            terms = ", ".join(f"{name}={float(value):.3g}" for name, value in raw.items())
+            raise ValueError(
+                f"stage.{self.settings.name}: expected a finite loss, but got {float(loss.detach())} at step "
+                f"{self.global_step}, time {step.batch.time:.4g} ({terms}); "
+                f"lower stage.{self.settings.name}.rates"
+            )
         self.curriculum.report(step.batch.frame, error)
         self.last = {
             "loss": float(loss.detach()),
@@ -143,8 +152,9 @@ class DynamicSceneModule(lightning.LightningModule):
             group["lr"] = group["base_rate"] * factor
         motion = getattr(self.method, "motion", None)
         bases = settings.at("bases", fraction)
-        if motion is not None and bases is not None:
-            motion.trajectory.bases_in_play.fill_(min(int(bases), motion.trajectory.bases))
+        if motion is not None:
+            every = motion.trajectory.bases
+            motion.trajectory.bases_in_play.fill_(every if bases is None else min(int(bases), every))
         self._follow_lattice(settings.at("voxels", fraction), fraction, optimizer)
 
     def _follow_lattice(self, voxels: float, fraction: float, optimizer: torch.optim.Optimizer) -> None:
@@ -206,7 +216,9 @@ class DynamicSceneModule(lightning.LightningModule):
         """A whole picture, by the best rendering. ``state`` of the same time, handed in, saves the warp."""
         state = state or self.method.at(time)
         field = list(state.fields.values())[-1]
-        return render_all(self.renderer, field, camera.rays().to(self.device), background, self.method.view)
+        return render_all(
+            self.renderer, field, camera.rays().to(self.device), background.to(self.device), self.method.view
+        )
 
 
 def render_all(

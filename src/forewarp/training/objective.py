@@ -47,6 +47,9 @@ def _inpaint(step: Step) -> Tensor | None:
     return None if residual is None else losses.inpaint_diff(residual)
 
 
+LITERAL = ("photo", "point_color", "background_entropy")  # terms with a printed form of their own
+
+
 def _terms(literal: frozenset[str]) -> dict[str, Callable[[Step], Tensor | None]]:
     def entropy(step: Step, r: Rendering) -> Tensor:
         if "background_entropy" in literal:
@@ -89,9 +92,13 @@ class Objective:
         literal: list[str] | tuple[str, ...] = (),
         photo_on: list[str] | None = None,
     ) -> None:
+        if not set(literal) <= set(LITERAL):
+            raise ValueError(
+                f"objective.literal: expected some of {', '.join(LITERAL)}, but got {list(literal)}"
+            )
         known = _terms(frozenset(literal))
         self.every = dict(every or {})
-        for name in (*weights, *self.every, *literal):
+        for name in (*weights, *self.every):
             if name not in known:
                 raise ValueError(f"objective: expected a term of {', '.join(known)}, but got '{name}'")
         if any(not (n >= 1 and n == int(n)) for n in self.every.values()):
