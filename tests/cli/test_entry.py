@@ -53,7 +53,7 @@ def test_the_root_holds_conf():
         (["stage.coarse.start=middle"], "stage.coarse.start: expected box or hull, but got 'middle'"),
         (["+stage.coarse.bogus=1"], "got an unexpected keyword argument 'bogus'; leave that key out"),
         (["+renderer.bogus=1"], "renderer: "),
-        (["objective.coarse.literal=[foto]"], "objective: expected a term of photo"),
+        (["objective.coarse.literal=[foto]"], "objective.literal: expected some of photo"),
         (["+model.inpainter.width=16"], "model.inpainter: expected a factory or null, but got {'width': 16}"),
     ],
 )

@@ -46,8 +46,10 @@ def test_depth_metrics_carry_their_threshold():
 
 
 def test_what_an_image_does_not_allow_is_left_out_and_said_once(caplog, monkeypatch):
-    # Hydra, where a test before this one started it, switches loggers off.
-    monkeypatch.setattr(logging.getLogger("forewarp.metrics.suite"), "disabled", False)
+    # The command line, where a test before this one ran it, quietens loggers.
+    for name in ("forewarp", "forewarp.metrics", "forewarp.metrics.suite"):
+        for key, value in (("disabled", False), ("propagate", True), ("level", logging.NOTSET)):
+            monkeypatch.setattr(logging.getLogger(name), key, value)
     suite = ImageSuite({"lpips_vgg": None})
     with caplog.at_level(logging.WARNING):
         for _ in range(3):
