@@ -29,9 +29,8 @@ def build_run(config: DictConfig) -> Run:
     watchers = [w for w in instantiate(config.callbacks, _convert_="all").values() if w is not None]
     trainer, logger = (instantiate(config[key], _convert_="all") for key in ("trainer", "logger"))
 
-    device_of(config.trainer.accelerator)  # refuses a GPU that is not there, before anything is written
-
     def make_trainer(folder: Path, callbacks: list):
+        device_of(config.trainer.accelerator)  # refuses a GPU that is not there
         return trainer(
             max_epochs=1,
             max_steps=-1,
