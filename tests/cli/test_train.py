@@ -32,7 +32,7 @@ def arguments(root, run, *more, scene="vehicle"):
 
 
 def numbers(folder):
-    """What metrics.json holds, but for seconds and the threads, which another test of this process may set."""
+    """What metrics.json holds, but for seconds and the threads, which another test may have set."""
     content = json.loads((Path(folder) / "metrics.json").read_text())
     content.pop("seconds")
     content["protocol"].pop("threads")
