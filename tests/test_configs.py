@@ -51,7 +51,7 @@ def test_every_option_composes_and_instantiates(group, option):
 @pytest.mark.parametrize("name", [path.stem for path in CONF.glob("*.yaml")])
 def test_every_command_has_a_config(name):
     config = composed("data.scene=x", name=name) if name == "train" else composed(name=name)
-    OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    assert OmegaConf.to_container(config, resolve=True, throw_on_missing=True)["paths"]
 
 
 @pytest.mark.parametrize("sweep", [path.stem for path in (ROOT / "sweeps").glob("*.yaml")])
