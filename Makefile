@@ -1,12 +1,24 @@
 .DEFAULT_GOAL := help
-.PHONY: help install demo test lint format clean
+.PHONY: help install demo demo-lego-complete demo-hypernerf demo-nhr test test-stability accuracy-time price-list reproduce-tables lint format clean
 
 PYTHON ?= python3
 BIN := .venv/bin
 DEMO := runs/demo
+# Of accuracy-time and price-list: a folder of D-NeRF scenes (none: the procedural vehicle), a scene of it, minutes of
+# training a run, and, where not all of them are wanted, the variants (conf/variant) and the seeds.
+DATA ?=
+SCENE ?= jumpingjacks
+SCENES ?= jumpingjacks hook
+MINUTES ?= 3
+MORE = budget.minutes=$(MINUTES) $(if $(VARIANTS),variant=$(VARIANTS)) $(if $(SEEDS),seed=$(SEEDS)) $(if $(THREADS),threads=$(THREADS))
+SWEEP = $(BIN)/forewarp-train --multirun sweeps=accuracy_time
+comma := ,
+space := $(subst ,, )
+# Jobs that failed have been named, and the report names what is missing; only an interruption ends it all.
+GO_ON = || [ $$? -ne 130 ]
 
 help: ## show this list
-	@grep -E '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
+	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 20
 
 install: ## make .venv and put forewarp with all its extras into it
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
@@ -21,8 +33,54 @@ demo: ## fit the procedural vehicle forward and backward, compare, make a video 
 	$(BIN)/forewarp-render run=$(DEMO)/forward path=both
 	$(BIN)/python -m forewarp.cli.compare $(DEMO)/forward $(DEMO)/backward
 
+demo-lego-complete: ## make a small counterpart of Lego Complete, fit one of its scenes, measure, make a video
+demo-hypernerf: ## the same for a two-phone rig in a textured room, with a static background
+demo-nhr: ## the same for a dome of cameras with masks
+demo-lego-complete demo-hypernerf demo-nhr:
+	$(BIN)/forewarp-train experiment=$(subst -,_,$@) run=runs/$@
+	$(BIN)/forewarp-render run=runs/$@ path=both
+
 test: ## run the tests, but for the slow ones
 	$(BIN)/pytest --no-cov -m "not slow"
+
+test-stability: ## run the hard cases, those too that take their time
+	$(BIN)/pytest --no-cov -m stability tests/stability
+
+accuracy-time: ## sweep choices against training time and draw it [DATA= SCENE= MINUTES= VARIANTS=a,b SEEDS=0,1]
+	$(SWEEP) $(if $(DATA),experiment=dnerf data.root=$(DATA) data.scene=$(SCENE)) $(MORE) $(GO_ON)
+	$(BIN)/forewarp-report kind=accuracy_time published=docs/results/published.yaml
+
+price-list: SEEDS ?= 0,1
+price-list: ## what each choice costs and brings, on the vehicle and two real scenes [DATA= SCENES="a b" MINUTES=]
+	@test -n "$(DATA)" || { echo "price-list: expected DATA=<folder of D-NeRF scenes>"; exit 2; }
+	$(SWEEP) $(MORE) $(GO_ON)
+	for scene in $(SCENES); do \
+		{ $(SWEEP) experiment=dnerf data.root=$(DATA) data.scene=$$scene $(MORE) $(GO_ON); } || exit; \
+	done
+	$(BIN)/forewarp-report kind=price_list
+
+# A counterpart of each dataset and 12 s a run: 27 runs.
+reproduce-tables: MINUTES := $(if $(filter command line,$(origin MINUTES)),$(MINUTES),$(if $(DATA),5,0.2))
+reproduce-tables: BUDGET ?= $(if $(DATA),fast,demo)
+reproduce-tables: SWEEPS ?= $(if $(SCENES_TYPED),dnerf,dnerf hypernerf nhr lego_complete)
+reproduce-tables: SCENES_TYPED := $(if $(filter command line,$(origin SCENES)),$(SCENES))
+reproduce-tables: REPRODUCE = $(BIN)/forewarp-train --multirun budget=$(BUDGET) budget.minutes=$(MINUTES) seed=$(or $(SEEDS),0) $(if $(THREADS),threads=$(THREADS)) $(if $(LAUNCHER),launcher=$(LAUNCHER))
+reproduce-tables: ## the paper's tables and figures, measured beside printed [DATA= BUDGET= SCENES="hook lego" MINUTES= SWEEPS=]
+ifeq ($(DATA),)
+	$(REPRODUCE) sweeps=methods scene=counterpart_dnerf $(GO_ON)
+	for dataset in hypernerf nhr lego_complete; do \
+		{ $(REPRODUCE) sweeps=$$dataset scene=counterpart_$$dataset $(GO_ON); } || exit; \
+	done
+	$(REPRODUCE) sweeps=ablation_losses scene=counterpart_dnerf $(GO_ON)
+	$(REPRODUCE) sweeps=ablation_modules scene=counterpart_dnerf,counterpart_hypernerf,counterpart_lego_complete $(GO_ON)
+	$(REPRODUCE) sweeps=resolution scene=counterpart_hypernerf $(GO_ON)
+else
+	for sweep in $(SWEEPS); do \
+		{ $(REPRODUCE) sweeps=$$sweep paths.scenes=$(DATA) \
+			$(if $(SCENES_TYPED),scene=$(subst $(space),$(comma),$(addprefix dnerf_,$(SCENES_TYPED)))) $(GO_ON); } || exit; \
+	done
+endif
+	$(BIN)/forewarp-report kind=paper
 
 lint: ## look for mistakes and untidy code
 	$(BIN)/ruff check .

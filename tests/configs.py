@@ -23,6 +23,7 @@ def options(group: str) -> list[str]:
 
 
 def groups() -> list[str]:
-    """Every group that one chooses from."""
+    """Every group that one chooses from to train; ``dataset`` makes scenes, ``launcher`` needs packages."""
     folders = [path.relative_to(CONF).as_posix() for path in CONF.rglob("*") if path.is_dir()]
-    return sorted(group for group in folders if options(group) and not group.endswith("/one"))
+    others = ("/one", "dataset", "launcher")
+    return sorted(group for group in folders if options(group) and not group.endswith(others))

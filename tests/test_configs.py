@@ -1,6 +1,7 @@
 """Every configuration composes and instantiates; the command line wins; off is off."""
 
 from dataclasses import MISSING, fields
+from functools import cache
 
 import pytest
 import torch
@@ -18,7 +19,13 @@ from forewarp.training.settings import StageSettings
 
 BUDGETS, MODELS = options("budget"), options("model")
 CHOICES = [(group, option) for group in groups() for option in options(group)]
-OFF = [("inpainter", "unet3d"), ("upsampler", "learned"), ("view", "mlp"), ("motion", "dct")]
+OFF = [
+    ("inpainter", "unet3d"),
+    ("upsampler", "learned"),
+    ("view", "mlp"),
+    ("motion", "dct"),
+    ("background", "grid"),
+]
 
 
 def run_of(*overrides):
@@ -43,7 +50,8 @@ def method_of(spec, frames=4):
 @pytest.mark.parametrize(("group", "option"), CHOICES)
 def test_every_option_composes_and_instantiates(group, option):
     run = run_of(f"{group}={option}")
-    assert [stage.settings.name for stage in run.stages] == ["coarse", "fine"]
+    stages = ["fine"] if option == "no_coarse" else ["coarse", "fine"]
+    assert [stage.settings.name for stage in run.stages] == stages
     if group.startswith("model"):
         assert isinstance(method_of(run.spec), torch.nn.Module)
 
@@ -59,8 +67,45 @@ def test_every_sweep_is_found_and_names_options(sweep):
     params = composed(f"sweeps={sweep}", hydra=True).hydra.sweeper.params
     assert len(params) > 0
     for key, values in params.items():
-        for value in str(values).split(","):
-            run_of(f"{key}={value}")
+        names = [value.strip() for value in str(values).split(",")]
+        if key in groups():  # each option composes, as is tested above
+            assert set(names) <= set(options(key))
+        else:
+            for name in names:
+                run_of(f"{key}={name}")
+
+
+@cache
+def swept(variant):
+    """What a job of the sweep over variants composes."""
+    common = ["experiment=dnerf", "data.scene=x", "sweeps=accuracy_time", "budget.minutes=3"]
+    return composed(*common, f"variant={variant}")
+
+
+@pytest.mark.parametrize("name", options("variant"))
+def test_a_variant_names_itself_and_changes_what_it_is_compared_with(name):
+    config = swept(name)
+    assert config.variant.name == name
+    assert config.variant.against in ("base", "grid_64")
+    assert config.run == f"{config.paths.runs}/accuracy_time/x/{name}-3min-seed0"
+    assert (config.budget.minutes, config.data.held_out) == (3, 8)
+    before = swept(config.variant.against)
+    same = all(config[key] == before[key] for key in ("model", "stage", "objective", "budget", "data"))
+    assert same is (name == "base")
+
+
+def test_the_sweep_holds_every_variant_once():
+    config = composed("sweeps=accuracy_time", hydra=True)
+    listed = [name.strip() for name in config.hydra.sweeper.params.variant.split(",")]
+    assert sorted(listed) == options("variant")
+
+
+def test_a_variant_wins_over_budget_and_experiment():
+    common = ["experiment=dnerf", "data.scene=x"]
+    assert method_of(run_of(*common, "variant=view_mlp").spec).view.__class__ is ViewNetwork
+    assert composed(*common, "variant=preset_demo").budget.name == "demo"
+    assert run_of(*common, "variant=backward").spec.warp == "backward"
+    assert run_of(*common, "variant=unet_32").spec.inpainter is not None
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -89,7 +134,8 @@ def test_faithful_stages_are_the_papers():
     coarse, fine = run_of("budget=faithful").stages
     assert (coarse.settings.iterations, fine.settings.iterations) == (20_000, 100_000)
     assert (coarse.settings.start_alpha, fine.settings.start_alpha) == (1e-6, 1e-2)
-    assert coarse.settings.effects == ["motion"]
+    assert coarse.settings.box_alpha == 1e-3
+    assert coarse.settings.effects == ["motion", "background"]
     assert not fine.settings.carry
     assert coarse.objective.weights["tv_depth"] == fine.objective.weights["tv_depth"] == 1e-1
     assert (coarse.objective.weights["point_color"], fine.objective.weights["point_color"]) == (1e-1, 1e-2)
@@ -153,8 +199,9 @@ def test_every_stage_key_may_be_typed_and_starts_from_the_same():
             continue
         assert field.name in base
         if field.default is not MISSING:
-            expected = list(field.default) if isinstance(field.default, tuple) else field.default
-            assert base[field.name] == expected, field.name
+            given = [base[field.name], field.default]
+            ours, expected = OmegaConf.to_container(OmegaConf.create(given))
+            assert ours == expected, field.name
 
 
 def test_every_weight_may_be_typed():

@@ -19,11 +19,11 @@ def test_photometric_hand_worked():
 def test_point_color_hand_worked():
     weights, truth = torch.tensor([0.5, 0.25, 1.0]), torch.zeros(3, 3)
     colors = torch.tensor([[1.0, 0, 0], [0, 2.0, 0], [1.0, 1.0, 0]])
-    # ray 0: 0.5 * 1 + 0.25 * 4, ray 1 nothing, ray 2: 1 * 2; literal halves ray 0, which has two samples.
+    # ray 0: 0.5 * 1 + 0.25 * 4, ray 1 nothing, ray 2: 1 * 2; as printed over their 3, 1 and 2 samples.
     assert losses.point_color(weights, colors, IDS, truth).item() == pytest.approx((1.5 + 2) / 3)
-    assert losses.point_color(weights, colors, IDS, truth, literal=True).item() == pytest.approx(
-        (0.75 + 2) / 3
-    )
+    every = torch.tensor([0, 0, 0, 1, 2, 2])
+    printed = losses.point_color(weights, colors, IDS, truth, all_ray_ids=every)
+    assert printed.item() == pytest.approx((1.5 / 3 + 2 / 2) / 3)
 
 
 def test_point_color_pulls_colours_and_not_weights():
@@ -52,6 +52,11 @@ def test_flow_and_inpainting_hand_worked():
     assert losses.inpaint_diff(-flow).item() == 1.0
 
 
+def test_what_stands_still_hand_worked():
+    assert losses.still_points(torch.tensor([[3.0, 0.0, 4.0], [0.0, 0.0, 0.0]])).item() == 12.5
+    assert losses.moving_opacity(torch.tensor([0.0, 1.0, 0.5])).item() == 0.5
+
+
 def test_total_variation_is_that_of_the_lattice():
     pairs = neighbour_pairs(torch.arange(60, dtype=torch.int32).reshape(3, 4, 5))
     number = torch.arange(60.0)  # steps of 20, 5 and 1
@@ -69,6 +74,7 @@ def test_nothing_to_measure_is_zero_and_attached():
     for value in (
         losses.sample_entropy(torch.zeros(0, requires_grad=True)),
         losses.flow_l1(torch.zeros(0, 3, requires_grad=True)),
+        losses.moving_opacity(torch.zeros(0, requires_grad=True)),
         losses.point_color(torch.zeros(0), torch.zeros(0, 3, requires_grad=True), IDS[:0], torch.zeros(2, 3)),
     ):
         assert value.item() == 0
@@ -86,6 +92,7 @@ def test_gradcheck():
     assert gradcheck(losses.background_entropy, draw(5))
     assert gradcheck(losses.sample_entropy, draw(5))
     assert gradcheck(losses.flow_l1, draw(5, 3))
+    assert gradcheck(losses.still_points, draw(5, 3))
     assert gradcheck(losses.inpaint_diff, draw(1, 2, 3, 4, 5))
     assert gradcheck(lambda d: losses.tv_density(d, pairs), draw(60))
     assert gradcheck(lambda f: losses.tv_flow(f, pairs), draw(60, 3))

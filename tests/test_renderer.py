@@ -1,12 +1,17 @@
+import importlib.util
 import math
 
 import pytest
 import torch
 
+from forewarp.effects.view import SphericalHarmonics
+from forewarp.ops import backend
+from forewarp.ops.grid import index_of
+from forewarp.ops.trace import trace
 from forewarp.renderer import Renderer
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.rays import Rays
-from forewarp.scene.state import Activation, RadianceGrid
+from forewarp.scene.state import Activation, RadianceGrid, shade
 from reference import composite, march_samples
 
 LATTICE = Lattice(Box((0, 0, 0), (1, 3, 8)), (3, 4, 5))  # spacings 1/2, 1, 2; pitch 1
@@ -24,8 +29,8 @@ class Slab:
     def density(self, points):
         return torch.full((len(points),), self.sigma, dtype=points.dtype)
 
-    def features(self, points):
-        return torch.full((len(points), 3), self.feature, dtype=points.dtype)
+    def colors(self, points, directions, view):
+        return shade(torch.full((len(points), 3), self.feature, dtype=points.dtype), directions, view)
 
 
 def rays(origins, directions, near=0.0, far=20.0):
@@ -74,6 +79,7 @@ def test_equals_the_slow_twin():
         rgb[ray] += weight * color
     torch.testing.assert_close(drawn.rgb, rgb)
     torch.testing.assert_close(drawn.all_weights, torch.tensor(weights).double())
+    assert torch.equal(drawn.all_ray_ids, ids)
     torch.testing.assert_close(drawn.transmittance, torch.tensor(through).double())
     assert drawn.samples == len(ids)
 
@@ -119,6 +125,9 @@ def test_faint_samples_cost_no_colour_and_hardly_any_light():
     field, view = cloud(), rays([[0.4, 1.2, -2.0]], [[0.1, 0.2, 1]])
     whole, thrifty = (Renderer(color_threshold=t)(field, view, WHITE) for t in (0.0, 1e-2))
     assert len(thrifty.weights) < len(whole.weights) == whole.samples
+    assert thrifty.all_weights is thrifty.all_ray_ids is None
+    kept = Renderer(color_threshold=1e-2)(field, view, WHITE, keep_all_weights=True)
+    assert len(kept.weights) < len(kept.all_weights) == len(kept.all_ray_ids) == kept.samples
     assert torch.equal(whole.opacity, thrifty.opacity)
     torch.testing.assert_close(whole.rgb, thrifty.rgb, atol=0.1, rtol=0)
 
@@ -142,11 +151,70 @@ def test_jitter_follows_the_generator():
 def test_another_threshold_by_stage():
     renderer = Renderer(step=0.3)
     assert renderer.with_threshold(None) is renderer
-    other = renderer.with_threshold(0.0)
-    assert (other.step, other.color_threshold) == (0.3, 0.0)
+    other = Renderer(step=0.3, opaque=0.1).with_threshold(0.0)
+    assert (other.step, other.color_threshold, other.opaque) == (0.3, 0.0, 0.1)
 
 
-@pytest.mark.parametrize("wrong", [{"step": 0.0}, {"color_threshold": 1.0}, {"color_threshold": -0.1}])
+def blocks(shape, strength, seed=3):
+    """A sparse grid of random matter with 12 colour features, and rays all around it, some along faces."""
+    generator = torch.Generator().manual_seed(seed)
+    lattice = Lattice(Box((-1, -1, -2), (1, 2, 1)), shape)
+    voxels = (torch.rand(shape, generator=generator) < 0.4).nonzero()
+    values = strength * torch.randn(len(voxels), 13, generator=generator)
+    grid = RadianceGrid(lattice, index_of(voxels, shape), values, Activation(0.0, lattice.pitch))
+    origins = torch.nn.functional.normalize(torch.randn(300, 3, generator=generator), dim=-1) * 5
+    directions = torch.nn.functional.normalize(torch.randn(300, 3, generator=generator) - origins, dim=-1)
+    face = torch.tensor([[-4, -1, -0.5], [-4, 2, 1], [-4, 0.1, -2]])
+    origins, along = torch.cat([origins, face]), torch.tensor([[1.0, 0, 0]]).expand(3, 3)
+    return grid, Rays(origins, torch.cat([directions, along]), 0.0, 12.0)
+
+
+@pytest.mark.skipif(importlib.util.find_spec("numba") is None, reason="Numba is not installed")
+@pytest.mark.parametrize("strength", [0.0, 0.3, 3.0, 100.0])
+@pytest.mark.parametrize("threshold", [0.0, 1e-4])
+def test_without_gradient_the_kernel_draws_the_same(monkeypatch, strength, threshold):
+    grid, view = blocks((9, 14, 12), strength)
+    behind, renderer = torch.rand(len(view), 3), Renderer(color_threshold=threshold)
+    shading = SphericalHarmonics()
+    with torch.no_grad():
+        fast = renderer(grid, view, behind, shading)
+        whole = Renderer(color_threshold=threshold, opaque=0.0)(grid, view, behind, shading)
+        jittered = [
+            renderer(grid, view, behind, generator=torch.Generator().manual_seed(s)).rgb for s in (1, 1, 2)
+        ]
+        monkeypatch.setattr(backend, "numba_installed", lambda: False)
+        slow = renderer(grid, view, behind, shading)
+    assert torch.equal(jittered[0], jittered[1])
+    assert not torch.equal(jittered[0], jittered[2]) or strength == 0
+    for drawn in (fast, whole):
+        for name in ("rgb", "opacity", "transmittance"):
+            torch.testing.assert_close(getattr(drawn, name), getattr(slow, name), atol=2e-4, rtol=0)
+        torch.testing.assert_close(drawn.depth, slow.depth, atol=2e-3, rtol=0)
+    assert slow.samples > 0
+    assert fast.samples < 0.7 * slow.samples or strength < 100
+    assert abs(whole.samples - slow.samples) <= 1e-3 * slow.samples  # a cell's face belongs to either side
+
+
+@pytest.mark.skipif(importlib.util.find_spec("numba") is None, reason="Numba is not installed")
+def test_the_kernel_serves_only_where_nothing_else_is_asked_for(monkeypatch):
+    asked = []
+    monkeypatch.setattr("forewarp.renderer.trace", lambda *a, **k: asked.append(1) or trace(*a, **k))
+    grid, view = blocks((9, 14, 12), 3.0)
+    black = torch.zeros(3)
+    Renderer()(grid, view, black)
+    with torch.no_grad():
+        Renderer()(Slab(1.0), THROUGH, WHITE)
+        assert Renderer()(grid, view, black, keep_all_weights=True).all_weights is not None
+        assert asked == []
+        Renderer()(grid, view, black)
+    assert asked == [1]
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"step": 0.0}, {"color_threshold": 1.0}, {"color_threshold": -0.1}, {"opaque": 1.0}]
+)
 def test_refuses(wrong):
-    with pytest.raises(ValueError, match="renderer: expected step > 0 and 0 <= color_threshold < 1, but got"):
+    with pytest.raises(
+        ValueError, match="renderer: expected step > 0 and 0 <= color_threshold < 1 and 0 <= opa"
+    ):
         Renderer(**wrong)

@@ -22,17 +22,18 @@ def photometric(rgb: Tensor, truth: Tensor, *, literal: bool = False) -> Tensor:
 
 
 def point_color(
-    weights: Tensor, colors: Tensor, ray_ids: Tensor, truth: Tensor, *, literal: bool = False
+    weights: Tensor, colors: Tensor, ray_ids: Tensor, truth: Tensor, *, all_ray_ids: Tensor | None = None
 ) -> Tensor:
     """w1: ``sum_k w_k ||c_k - truth||^2`` over the samples of a ray, mean over rays; w without gradient.
 
     Args:
         weights: (S,). colors: (S, 3). ray_ids: (S,) int64. truth: (R, 3).
-        literal: the printed 1/K too, K the ray's samples.
+        all_ray_ids: (P,) int64, the rays of all samples, those included that are too faint for a colour:
+            gives the printed 1/K, K the number of a ray's samples; None: without it.
     """
     per_sample = weights.detach() * (colors - truth[ray_ids]).square().sum(-1)
-    if literal:
-        count = torch.bincount(ray_ids, minlength=len(truth)).clamp(min=1)
+    if all_ray_ids is not None:
+        count = torch.bincount(all_ray_ids, minlength=len(truth))
         per_sample = per_sample / count[ray_ids]
     return per_sample.sum() / max(len(truth), 1)
 
@@ -73,3 +74,13 @@ def tv_flow(flow: Tensor, pairs: list[tuple[Tensor, Tensor]]) -> Tensor:
 def tv_depth(depth: Tensor, opacity: Tensor) -> Tensor:
     """w7: RegNeRF's smoothness of depth (B, S, S), in fractions of far - near, on patches of random views."""
     return patch_variation(depth, opacity)
+
+
+def moving_opacity(alpha: Tensor) -> Tensor:
+    """Mean opacity (N,) over a voxel of the grid that moves: what a static background explains, it should."""
+    return alpha.mean() if alpha.numel() else alpha.sum()
+
+
+def still_points(displacement: Tensor) -> Tensor:
+    """Squared displacement (N, 3) of points that are known to stand still, mean over points (Nerfies)."""
+    return displacement.square().sum(-1).mean()

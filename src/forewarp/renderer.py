@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import torch
 from torch import Tensor
 
+from forewarp.ops.backend import use_numba
 from forewarp.ops.composite import accumulate, render_weights
 from forewarp.ops.march import march
+from forewarp.ops.trace import trace
 from forewarp.scene.rays import Rays
-from forewarp.scene.state import FieldAtTime, Rendering
+from forewarp.scene.state import EMPTY, FieldAtTime, RadianceGrid, Rendering, View
 
 
 class Renderer:
@@ -19,26 +19,30 @@ class Renderer:
     Args:
         step: between samples, in voxels of the rendered lattice.
         color_threshold: samples of less weight have no colour computed; 0 for all.
+        opaque: a ray that lets through less than this has ended, where no gradient is asked for and a kernel
+            looks for the end; 0: it never ends.
     """
 
-    def __init__(self, *, step: float = 0.5, color_threshold: float = 1e-4) -> None:
-        if not step > 0 or not 0 <= color_threshold < 1:
+    def __init__(self, *, step: float = 0.5, color_threshold: float = 1e-4, opaque: float = 1e-4) -> None:
+        if not step > 0 or not 0 <= color_threshold < 1 or not 0 <= opaque < 1:
             raise ValueError(
-                "renderer: expected step > 0 and 0 <= color_threshold < 1, "
-                f"but got {step=}, {color_threshold=}"
+                "renderer: expected step > 0 and 0 <= color_threshold < 1 and 0 <= opaque < 1, "
+                f"but got {step=}, {color_threshold=}, {opaque=}"
             )
-        self.step, self.color_threshold = step, color_threshold
+        self.step, self.color_threshold, self.opaque = step, color_threshold, opaque
 
     def with_threshold(self, color_threshold: float | None) -> Renderer:
         """The same renderer with another ``color_threshold``; None: this one."""
-        return self if color_threshold is None else Renderer(step=self.step, color_threshold=color_threshold)
+        if color_threshold is None:
+            return self
+        return Renderer(step=self.step, color_threshold=color_threshold, opaque=self.opaque)
 
     def __call__(
         self,
         field: FieldAtTime,
         rays: Rays,
         background: Tensor,
-        view: Callable[[Tensor, Tensor], Tensor] | None = None,
+        view: View | None = None,
         generator: torch.Generator | None = None,
         keep_all_weights: bool = False,
     ) -> Rendering:
@@ -48,10 +52,13 @@ class Renderer:
             field: density and features at one time.
             rays: R of them.
             background: (3,) or (R, 3), behind everything.
-            view: features (S, C) and directions (S, 3) to colour (S, 3); None: the first 3 features are it.
+            view: makes colour of features and directions; None: the first 3 features are it.
             generator: jitters the samples by up to one step; None: the middle of each step.
-            keep_all_weights: also return the weights of every sample (P,).
+            keep_all_weights: also return the weights and rays of every sample (P,).
         """
+        plain = type(field) is RadianceGrid and not keep_all_weights and not torch.is_grad_enabled()
+        if plain and use_numba(field.values):
+            return self._traced(field, rays, background, view, generator)
         count, step = len(rays), self.step * field.lattice.pitch
         ray_ids, distances, points = self._samples(field, rays, step, generator)
         weights, transmittance = render_weights(field.density(points) * step, ray_ids, count)
@@ -59,13 +66,13 @@ class Renderer:
         if self.color_threshold > 0:
             kept = (weights.detach() > self.color_threshold).nonzero()[:, 0]
         some_weights, some_rays = weights[kept], ray_ids[kept]
-        features = field.features(points[kept])
-        colors = (
-            torch.sigmoid(features[:, :3]) if view is None else view(features, rays.directions[some_rays])
-        )
+        colors = field.colors(points[kept], rays.directions[some_rays], view)
         rgb = accumulate(some_weights, colors, some_rays, count) + transmittance[:, None] * background
-        opacity = 1 - transmittance
-        depth = accumulate(weights, distances[:, None], ray_ids, count)[:, 0] / opacity.clamp(min=1e-6)
+        # Not 1 - transmittance: of thin matter that keeps no digit, and depth would leave the ray's stretch.
+        moments = torch.stack([torch.ones_like(distances), distances], -1)
+        opacity, depth = accumulate(weights, moments, ray_ids, count).unbind(-1)
+        opacity = opacity.clamp(max=1)
+        depth = depth / opacity.clamp(min=1e-6)
         return Rendering(
             rgb=rgb,
             depth=depth,
@@ -76,17 +83,67 @@ class Renderer:
             ray_ids=some_rays,
             samples=len(ray_ids),
             all_weights=weights if keep_all_weights else None,
+            all_ray_ids=ray_ids if keep_all_weights else None,
+        )
+
+    def _traced(
+        self,
+        grid: RadianceGrid,
+        rays: Rays,
+        background: Tensor,
+        view: View | None,
+        generator: torch.Generator | None,
+    ) -> Rendering:
+        """The same without gradient, samples behind opaque matter left out: equal within ``opaque``."""
+        step, activation = self.step * grid.lattice.pitch, grid.activation
+        origins, directions, jitter = self._starts(grid, rays, generator)
+        found = trace(
+            origins,
+            directions,
+            rays.near,
+            rays.far,
+            step,
+            grid.cells,
+            jitter,
+            raw=grid.raw_density,
+            index=grid.index,
+            fill=EMPTY,
+            shift=activation.shift,
+            scale=step / activation.unit,
+            opaque=self.opaque,
+            threshold=self.color_threshold or -1.0,  # 0 is all, also those without weight
+        )
+        ray_ids, weights = found.ray_ids, found.weights
+        points = origins[ray_ids] + found.distances[:, None] * directions[ray_ids]
+        colors = grid.colors(points, rays.directions[ray_ids], view)
+        opacity = found.opacity.clamp(max=1)
+        return Rendering(
+            rgb=accumulate(weights, colors, ray_ids, len(rays)) + found.transmittance[:, None] * background,
+            depth=found.distance / opacity.clamp(min=1e-6),
+            opacity=opacity,
+            transmittance=found.transmittance,
+            weights=weights,
+            colors=colors,
+            ray_ids=ray_ids,
+            samples=found.samples,
         )
 
     @staticmethod
-    def _samples(
-        field: FieldAtTime, rays: Rays, step: float, generator: torch.Generator | None
+    def _starts(
+        field: FieldAtTime, rays: Rays, generator: torch.Generator | None
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Ray (P,), distance (P,) and lattice coordinates (P, 3) of every sample."""
+        """Origins and directions (R, 3) in lattice coordinates, and the shift (R,) of a ray's samples."""
         lattice, count = field.lattice, len(rays)
         spacing = rays.origins.new_tensor(lattice.spacing)
         origins, directions = lattice.to_lattice(rays.origins), rays.directions / spacing
         jitter = torch.full((count,), 0.5) if generator is None else torch.rand(count, generator=generator)
-        jitter = jitter.to(origins)
+        return origins, directions, jitter.to(origins)
+
+    @classmethod
+    def _samples(
+        cls, field: FieldAtTime, rays: Rays, step: float, generator: torch.Generator | None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Ray (P,), distance (P,) and lattice coordinates (P, 3) of every sample."""
+        origins, directions, jitter = cls._starts(field, rays, generator)
         ray_ids, distances = march(origins, directions, rays.near, rays.far, step, field.cells, jitter)
         return ray_ids, distances, origins[ray_ids] + distances[:, None] * directions[ray_ids]

@@ -6,7 +6,7 @@ from configs import options
 from forewarp.cli.entry import one_line, project_root
 from forewarp.scene.errors import SceneError
 
-COMMANDS = ("train", "evaluate", "render", "synthesize")
+COMMANDS = ("train", "evaluate", "render", "synthesize", "report")
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -50,7 +50,7 @@ def test_the_root_holds_conf():
         (["budget.minutes=null"], "stage.coarse: expected iterations or minutes, but got neither"),
         (["threads=0"], "threads: expected a whole number > 0 or null, but got 0"),
         (["~stage.coarse", "~stage.fine"], "stage: expected at least one stage, but got none"),
-        (["stage.coarse.start=middle"], "stage.coarse.start: expected box or hull, but got 'middle'"),
+        (["stage.coarse.start=middle"], "stage.coarse.start: expected auto, box or hull, but got 'middle'"),
         (["+stage.coarse.bogus=1"], "got an unexpected keyword argument 'bogus'; leave that key out"),
         (["+renderer.bogus=1"], "renderer: "),
         (["objective.coarse.literal=[foto]"], "objective.literal: expected some of photo"),
@@ -141,4 +141,9 @@ def test_a_failed_job_of_several_does_not_stop_the_others(forewarp, monkeypatch,
     monkeypatch.setattr("forewarp.cli.train.train", job)
     done = forewarp("train", "--multirun", "seed=0,1")
     assert seen == [0, 1]
-    assert (done.status, done.err) == (2, "forewarp-train: error: seed: expected another\n")
+    assert done.status == 2
+    assert done.err.splitlines() == [
+        "forewarp-train: error: seed: expected another",
+        "forewarp-train: 1 of 2 jobs failed:",
+        "  seed=0",
+    ]

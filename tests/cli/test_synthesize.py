@@ -1,8 +1,17 @@
+import inspect
 import json
 
 import pytest
+from hydra.utils import instantiate
 
-from forewarp.cli.synthetic import SyntheticDataModule
+from forewarp.cli.synthetic import (
+    WRITERS,
+    SyntheticDataModule,
+    SyntheticHyperNeRFDataModule,
+    SyntheticLegoCompleteDataModule,
+    SyntheticNHRDataModule,
+)
+from configs import composed, options
 from forewarp.data.dnerf import read_scene
 from forewarp.scene.errors import SceneError
 
@@ -50,7 +59,7 @@ def test_a_missing_extra_is_named(refused, in_tmp, monkeypatch):
     def absent(*_, **__):
         raise ImportError("expected trimesh and embreex; pip install 'forewarp[synth]'")
 
-    monkeypatch.setattr("forewarp.cli.synthetic.synthesize", absent)
+    monkeypatch.setitem(WRITERS, "dnerf", absent)
     assert refused("synthesize", "folder=s") == "expected trimesh and embreex; pip install 'forewarp[synth]'"
 
 
@@ -72,3 +81,90 @@ def test_a_scene_made_otherwise_is_refused(tmp_path, capsys):
         SceneError, match=r"synthesis\.json: frames: expected 4, but got 3; use another data\.scene"
     ):
         other.setup("fit")
+
+
+def test_every_dataset_has_a_writer_whose_defaults_are_the_configs():
+    assert sorted(WRITERS) == options("dataset")
+    for name, writer in WRITERS.items():
+        config = composed(f"dataset={name}", name="synthesize")
+        for key, parameter in inspect.signature(writer).parameters.items():
+            if key not in ("folder", "progress"):
+                default = parameter.default
+                assert config[key] == (list(default) if isinstance(default, tuple) else default), (name, key)
+
+
+@pytest.mark.parametrize(
+    ("dataset", "keys", "marker"),
+    [
+        (
+            "lego_complete",
+            ["size=8", "frames=2", "motions=[lift]", "test_views=[1,1,1]"],
+            "lift/transforms_train.json",
+        ),
+        ("hypernerf", ["size=16", "frames=3"], "dataset.json"),
+        ("nhr", ["size=24", "frames=2", "points=20"], "CamPose.inf"),
+    ],
+)
+def test_every_dataset_is_written_whole_and_replaced_when_told(
+    forewarp, refused, in_tmp, dataset, keys, marker
+):
+    command = ["synthesize", f"dataset={dataset}", "folder=s", "samples_per_pixel=1", *keys]
+    done = forewarp(*command)
+    assert (done.status, done.out) == (0, "written: s\n")
+    assert "images 100%" in done.err
+    assert (in_tmp / "s" / marker).is_file()
+    assert json.loads((in_tmp / "s" / "synthesis.json").read_text())["dataset"] == dataset
+    assert "set overwrite=true" in refused(*command)
+    assert forewarp(*command, "overwrite=true").status == 0
+    assert [path.name for path in in_tmp.iterdir()] == ["s"]
+
+
+def test_keys_of_another_dataset_are_refused(refused, in_tmp):
+    assert "motions" in refused("synthesize", "dataset=nhr", "motions=[lift]")
+    assert "hypernerf" in refused("synthesize", "dataset=foo")
+    assert list(in_tmp.iterdir()) == []
+
+
+def test_the_help_says_what_each_dataset_is(forewarp):
+    out = forewarp("synthesize", "--help").out
+    assert all(f"{name} " in out for name in WRITERS)
+    assert "dataset           dnerf | hypernerf | lego_complete | nhr" in out
+
+
+@pytest.mark.parametrize(
+    ("kind", "scene", "synthesis", "counts"),
+    [
+        (
+            SyntheticLegoCompleteDataModule,
+            "drive",
+            {"size": 8, "frames": 2, "motions": ["lift", "drive"], "test_views": [1, 2, 1], "val_views": 0},
+            (2, 2 + 3 + 1),
+        ),
+        (SyntheticHyperNeRFDataModule, "s", {"size": 16, "frames": 3}, (3, 3)),
+        (SyntheticNHRDataModule, "s", {"size": 24, "frames": 2, "points": 20}, (36, 4)),
+    ],
+)
+def test_every_dataset_is_synthesised_at_first_use(tmp_path, capsys, kind, scene, synthesis, counts):
+    synthesis = {**synthesis, "samples_per_pixel": 1}
+    data = kind(tmp_path / "root", scene, synthesis=synthesis, rays=8)
+    data.setup("fit")
+    assert (len(data.scene.train), len(data.scene.test)) == counts
+    assert "100%" in capsys.readouterr().err
+    kind(tmp_path / "root", scene, synthesis=synthesis, rays=8).setup("fit")
+    assert capsys.readouterr().err == ""
+    with pytest.raises(SceneError, match="frames: expected 7"):
+        kind(tmp_path / "root", scene, synthesis={**synthesis, "frames": 7}).setup("fit")
+
+
+def test_a_folder_of_something_else_is_left_alone(tmp_path):
+    (tmp_path / "s").mkdir()
+    (tmp_path / "s" / "thesis.txt").write_text("dear")
+    with pytest.raises(SceneError, match="expected a synthesised scene or nothing"):
+        SyntheticDataModule(tmp_path, "s", synthesis=ARGUMENTS).setup("fit")
+    assert (tmp_path / "s" / "thesis.txt").read_text() == "dear"
+
+
+@pytest.mark.parametrize("name", [name for name in options("data") if name.startswith("synthetic")])
+def test_synthetic_data_names_arguments_of_its_writer(name, tmp_path):
+    data = instantiate(composed(f"data={name}", f"data.root={tmp_path}").data, _convert_="all")
+    assert set(data.synthesis) <= set(inspect.signature(WRITERS[data.dataset]).parameters)

@@ -1,5 +1,7 @@
 """Ray batches: right colours for the right rays, repeatable, over any background."""
 
+from dataclasses import replace
+from functools import partial
 from itertools import islice
 
 import pytest
@@ -20,7 +22,15 @@ def scene(tmp_path) -> Scene:
 
 
 def opaque(scene: Scene) -> Scene:
-    return Scene(scene.name, scene.train, scene.val, scene.test, scene.box, 0.0, has_alpha=False)
+    """The same images without an alpha channel, as a reader gives them: 255 everywhere."""
+
+    def load(frame):
+        pixels = frame.load().clone()
+        pixels[..., 3] = 255
+        return pixels
+
+    train = tuple(replace(f, load=partial(load, f)) for f in scene.train)
+    return replace(scene, train=train, has_alpha=False)
 
 
 def colours(batches, count=3):
@@ -48,6 +58,14 @@ def test_backgrounds(scene):
     assert first.shape == (500, 3)
     assert len(first.unique(dim=0)) == 500
     assert not torch.equal(first, second)
+
+
+def test_behind_an_opaque_pixel_a_random_colour_does_not_show(scene):
+    batch = RayBatches(opaque(scene), rays=60, background="random").draw()
+    assert len(batch.background.unique(dim=0)) == 60
+    frame = opaque(scene).train[batch.frame]
+    pixel = frame.camera.project((batch.rays.origins + batch.rays.directions).double())[0].long()
+    torch.testing.assert_close(batch.rgb, frame.load()[pixel[:, 1], pixel[:, 0], :3] / 255)
 
 
 def test_all_pixels_and_frames_are_drawn(scene):
@@ -92,10 +110,6 @@ def test_the_picker_chooses_the_frame(scene):
 def test_bad_settings(scene):
     with pytest.raises(SceneError, match="data.background: expected white, black or random, but got 'blue'"):
         RayBatches(scene, background="blue")
-    with pytest.raises(
-        SceneError, match="data.background: .* but got random and toy has images without alpha"
-    ):
-        RayBatches(opaque(scene), background="random")
     with pytest.raises(SceneError, match="data.rays: expected at least 1, but got 0"):
         RayBatches(scene, rays=0)
     with pytest.raises(SceneError, match="data.eval_background: expected white or black, but got 'random'"):
@@ -120,3 +134,69 @@ def test_targets_are_loaded_when_asked_for(scene):
         [True, False, True]
     ]
     assert [t.frame.name for t in targets] == ["a"]
+
+
+def of_times(scene: Scene, *times: float) -> Scene:
+    """The scene with these times and its cameras' ranges made different."""
+    frames = [
+        replace(frame, time=t, camera=replace(frame.camera, near=2 + 0.1 * i, far=6 + i))
+        for i, (frame, t) in enumerate(zip(scene.train, times, strict=True))
+    ]
+    return replace(scene, train=tuple(frames))
+
+
+def frames_of(batch, scene):
+    """Which training frame each ray starts in."""
+    centers = torch.stack([f.camera.center.float() for f in scene.train])
+    return (batch.rays.origins[:, None] - centers).norm(dim=-1).argmin(-1)
+
+
+def test_a_batch_may_have_rays_of_several_frames_of_one_time(scene):
+    scene = of_times(scene, 0.5, 0.0, 0.5, 0.5)
+    batches = RayBatches(scene, rays=50, background="random", views_per_step=2, picker=lambda: 2)
+    seen = set()
+    for batch in islice(batches, 20):
+        frames = frames_of(batch, scene)
+        one, other = frames.unique().tolist()
+        assert 2 in (one, other)
+        assert torch.bincount(frames).max() == 25
+        seen |= {one, other}
+        used = [scene.train[i].camera for i in (one, other)]
+        assert (batch.time, batch.frame, len(batch.rays)) == (0.5, 2, 50)
+        assert batch.rays.near == min(c.near for c in used)
+        assert batch.rays.far == max(c.far for c in used)
+        for i, rgb, direction, behind in zip(frames, batch.rgb, batch.rays.directions, batch.background):
+            frame = scene.train[i]
+            pixel = frame.camera.project(frame.camera.center + direction.double())[0].long()
+            torch.testing.assert_close(rgb, composited(frame.load()[pixel[1], pixel[0]], behind))
+    assert seen == {0, 2, 3}
+
+
+def test_more_views_than_there_are_takes_all_of_the_time(scene):
+    scene = of_times(scene, 0.5, 0.0, 0.5, 0.5)
+    batches = RayBatches(scene, rays=50, views_per_step=8)
+    picks = {batch.frame: frames_of(batch, scene).unique().tolist() for batch in islice(batches, 40)}
+    assert picks == {0: [0, 2, 3], 1: [1], 2: [0, 2, 3], 3: [0, 2, 3]}
+    few = RayBatches(scene, rays=2, views_per_step=8, picker=lambda: 0).draw()
+    assert len(frames_of(few, scene).unique()) == 2
+
+
+def test_batches_of_several_views_repeat_and_continue_exactly(scene):
+    scene = of_times(scene, 0.5, 0.5, 0.5, 0.5)
+    options = {"rays": 9, "background": "random", "views_per_step": 3}
+    batches = RayBatches(scene, **options)
+    first = colours(batches)
+    state = batches.state_dict()
+    expected = colours(batches)
+    assert torch.equal(colours(RayBatches(scene, **options)), first)
+    other = RayBatches(scene, seed=5, **options)
+    other.load_state_dict(state)
+    assert torch.equal(colours(other), expected)
+
+
+def test_one_view_a_step_draws_what_it_always_drew(scene):
+    """Times that are shared change nothing where one frame gives all rays."""
+    same = of_times(scene, 0.5, 0.5, 0.5, 0.5)
+    assert torch.equal(colours(RayBatches(scene, rays=9)), colours(RayBatches(same, rays=9)))
+    with pytest.raises(SceneError, match="data.views_per_step: expected at least 1, but got 0"):
+        RayBatches(scene, views_per_step=0)

@@ -31,7 +31,10 @@ BAD_TRANSFORMS = {
     "no frames": (lambda c: c.pop("frames"), r"frames: expected a list of at least one frame, but got None"),
     "empty split": (lambda c: c.update(frames=[]), r"frames: expected a list of at least one"),
     "frame list": (lambda c: c["frames"].append([1]), r"frames\[4\]: expected an object, but got \[1\]"),
-    "no pose": (without("transform_matrix"), r"frames\[1\].transform_matrix: expected 4 x 4 numbers"),
+    "no pose": (
+        without("transform_matrix"),
+        r"frames\[1\].transform_matrix: expected 4 x 4 finite numbers, but got None",
+    ),
     "3 x 4": (frame(transform_matrix=NAN[:3]), r"frames\[1\].transform_matrix: expected 4 x 4 finite"),
     "ragged": (frame(transform_matrix=[[1], [1, 2]]), r"transform_matrix: expected 4 x 4 finite"),
     "words": (frame(transform_matrix=[["a"] * 4] * 4), r"transform_matrix: expected 4 x 4 finite"),

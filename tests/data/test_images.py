@@ -64,7 +64,9 @@ def test_an_image_is_decoded_once(tmp_path):
 
 def test_what_is_no_image_is_named(tmp_path):
     (tmp_path / "a.jpg").write_text("no image")
-    with pytest.raises(SceneError, match=r"a.jpg: expected an image, but got data that cannot be decoded"):
+    with pytest.raises(
+        SceneError, match=r"a.jpg: expected a PNG or JPEG image, but got a file of another kind"
+    ):
         read_image(tmp_path / "a.jpg")
     with pytest.raises(SceneError, match=r"b.png: expected an image, but got No such file"):
         read_image(tmp_path / "b.png")

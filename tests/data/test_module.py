@@ -113,7 +113,7 @@ def test_targets_by_split(tmp_path):
     assert (target.frame.ability, target.rgb.shape, target.depth.shape) == ("time", (6, 8, 3), (6, 8))
     moved = target.to("cpu")
     assert torch.equal(moved.rgb, target.rgb)
-    with pytest.raises(SceneError, match="split: expected train, val or test, but got 'all'"):
+    with pytest.raises(SceneError, match="split: expected train, val, test or held, but got 'all'"):
         data.targets("all")
 
 

@@ -67,6 +67,30 @@ def test_the_learned_layer_starts_as_plain_interpolation_to_the_bit(present):
     assert learned.head.weight.grad.abs().sum() > 0
 
 
+def stepped(recompute):
+    """Detail, every gradient, and the bytes that the backward pass held, of a layer that has learned."""
+    torch.manual_seed(0)
+    learned = LearnedUpsampler(scale=2, channels=4, width=8, features=6, recompute=recompute)
+    torch.nn.init.normal_(learned.head.weight)
+    features = torch.randn(1, 6, *LATTICE.shape, requires_grad=True)
+    held = {}
+    with torch.autograd.graph.saved_tensors_hooks(
+        lambda t: held.update({t.data_ptr(): t.nbytes}) or t, lambda t: t
+    ):
+        detail = learned.residual(features, occupied_crop(grid().index, 0))
+    detail.square().sum().backward()
+    return detail.detach(), [features.grad, *(p.grad for p in learned.parameters())], sum(held.values())
+
+
+def test_recomputing_holds_less_and_changes_nothing():
+    (detail, gradients, held), (plain, plain_gradients, plain_held) = stepped(True), stepped(False)
+    assert torch.equal(detail, plain)
+    assert len(gradients) == len(plain_gradients) == 13
+    assert all(torch.equal(ours, theirs) for ours, theirs in zip(gradients, plain_gradients))
+    assert all(gradient.abs().sum() > 0 for gradient in gradients[:-2])
+    assert held < 0.5 * plain_held
+
+
 def test_gradients_reach_the_coarse_values():
     values = grid().values.requires_grad_()
     TrilinearUpsampler(scale=1.5)(grid().with_values(values)).values.sum().backward()

@@ -3,6 +3,7 @@ from functools import partial
 import pytest
 import torch
 
+from forewarp.effects.background import StaticBackground
 from forewarp.effects.inpaint import UNet3d
 from forewarp.effects.upsample import LearnedUpsampler, TrilinearUpsampler
 from forewarp.effects.view import ViewNetwork
@@ -24,6 +25,7 @@ def build(spec, effects=EFFECTS, **changes):
         "frames": 5,
         "canonical_time": 0.0,
         "effects": effects,
+        "still": (LATTICE, torch.ones(LATTICE.shape, dtype=torch.bool)),
     } | changes
     return spec.build(LATTICE, torch.ones(LATTICE.shape, dtype=torch.bool), **options)
 
@@ -34,12 +36,13 @@ FULL = forward_spec(
     view=ViewNetwork,
     upsampler=LearnedUpsampler,
     inpainter=partial(UNet3d, levels=2),
+    background=partial(StaticBackground, features=3, alpha_init=1e-2, skip_alpha=0.0),
 )
 
 
 def test_every_parameter_has_one_kind():
     kinds = parameter_kinds(build(FULL))
-    assert set(kinds) == {"grid", "flow", "network"}
+    assert set(kinds) == {"density", "color", "grid", "flow", "network"}
     listed = [id(p) for parameters in kinds.values() for p in parameters]
     assert len(listed) == len(set(listed)) == len(list(build(FULL).parameters()))
     direct = parameter_kinds(build(forward_spec()))

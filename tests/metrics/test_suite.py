@@ -32,7 +32,9 @@ def test_scores_are_the_metrics_in_fixed_order(alex):
     true = target(170, 180, depth=torch.full((170, 180), 2.0))
     prediction = (true.rgb + 0.1).clamp(0, 1)
     scores = ImageSuite({"lpips_alex": alex}).score(prediction, true, torch.full((170, 180), 2.2))
-    assert list(scores) == [name for name in METRICS if name not in ("lpips_squeeze", "lpips_vgg")]
+    assert list(scores) == [
+        name for name in METRICS if name not in ("psnr_box", "lpips_squeeze", "lpips_vgg")
+    ]
     assert scores["psnr"] == image.psnr(prediction, true.rgb)
     assert scores["ssim"] == image.ssim(prediction, true.rgb)
     assert scores["ms_ssim"] == image.ms_ssim(prediction, true.rgb)
@@ -69,6 +71,26 @@ def test_foreground_limits_the_depth_score():
     predicted[0, 0] = math.nan
     scores = ImageSuite().score(target().rgb, target(depth=depth, foreground=foreground), predicted)
     assert [scores[name] for name in DEPTH_METRICS] == [0.5, 0.5, 0.5]
+
+
+def test_the_mask_box_is_scored_where_it_is_asked_for():
+    foreground = torch.zeros(34, 40, dtype=torch.bool)
+    foreground[5, 20] = foreground[9, 12] = True
+    true = target(foreground=foreground)
+    prediction = (true.rgb + 0.1).clamp(0, 1)
+    prediction[5:10, 12:21] = true.rgb[5:10, 12:21] * 0.9
+    scores = ImageSuite(mask_box=True).score(prediction, true)
+    assert list(scores) == ["psnr", "psnr_box", "ssim"]
+    assert scores["psnr_box"] == image.psnr(prediction[5:10, 12:21], true.rgb[5:10, 12:21])
+    assert scores["psnr"] == image.psnr(prediction, true.rgb) < scores["psnr_box"]
+    assert "psnr_box" not in ImageSuite().score(prediction, true)
+
+
+@pytest.mark.parametrize("foreground", [None, torch.zeros(34, 40, dtype=torch.bool)])
+def test_without_a_foreground_there_is_no_mask_box(foreground):
+    suite = ImageSuite(mask_box=True)
+    assert "psnr_box" not in suite.score(target().rgb, target(foreground=foreground))
+    assert suite.absent["psnr_box"] == "frame test/r_007 has no foreground"
 
 
 def test_errors_name_the_frame():

@@ -71,6 +71,17 @@ def test_both_implementations_agree(sparse, dtype, two_threads):
         torch.testing.assert_close(ours, reference, rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.parametrize("moving", [False, True])
+def test_large_values_are_held_only_where_points_need_a_gradient(sparse, moving):
+    pytest.importorskip("numba")
+    values, points, held = sparse[0].requires_grad_(), random_points().requires_grad_(moving), []
+    with torch.autograd.graph.saved_tensors_hooks(lambda t: held.append(t.data_ptr()) or t, lambda t: t):
+        read = grid.trilinear(values, sparse[1], points, sparse[2])
+    read.sum().backward()
+    assert values.grad.sum() > 0
+    assert (values.data_ptr() in held) == moving
+
+
 def test_points_outside_read_the_border_and_feel_no_pull(backend, sparse):
     values, index, fill = sparse
     far = torch.tensor([[-9.0, 1.2, 2.2], [1e30, 1.2, 2.2], [float("inf"), 1.2, 2.2]], dtype=torch.float64)

@@ -8,7 +8,8 @@ pytest.importorskip("embreex")
 
 from forewarp.data.dnerf import read_scene
 from forewarp.scene.errors import SceneError
-from forewarp.synth.scenes import random_cameras, synthesize
+from forewarp.synth.cameras import random_cameras
+from forewarp.synth.scenes import synthesize
 
 SMALL = {"size": 16, "frames": 4, "test_views": (3, 2, 2), "val_views": 2}
 

@@ -1,5 +1,6 @@
 import io
 import re
+from dataclasses import replace
 
 import lightning
 import pytest
@@ -7,12 +8,13 @@ import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from forewarp.data.module import SceneDataModule
 from forewarp.renderer import Renderer
 from forewarp.training.callbacks import StageProgress, TensorBoardScalars
 from forewarp.training.pictures import TensorBoardPictures
 from forewarp.training.progress import ProgressLine
 from forewarp.training.stages import Run
-from tiny_scene import Interrupt, ball_data, forward_spec, stage
+from tiny_scene import Interrupt, ball_data, ball_scene, forward_spec, stage
 
 STEPS = 12
 
@@ -126,6 +128,25 @@ def test_every_named_curve_is_there(watched, events):
     assert expected <= set(events.Tags()["scalars"])
 
 
+def test_the_validation_curve_is_the_psnr_of_the_moments(watched, events):
+    curve = events.Scalars("val/psnr")
+    assert [point.step for point in curve] == [3, 6, 12]
+    assert curve[2].value > curve[0].value
+    target = ball_data().targets("val")[0]  # fewer pixels than psnr_rays: all of them
+    assert curve[2].value == pytest.approx(float(watched[0].psnr_of(target)), abs=1e-4)
+
+
+def test_without_validation_views_there_is_no_validation_curve(tmp_path):
+    scene = replace(ball_scene(), val=())
+    ours = watched_run(tmp_path, TensorBoardPictures(moments=(1.0,)), steps=2)
+    ours.datamodule = SceneDataModule(lambda: scene, rays=64)
+    ours.fit()
+    accumulator = EventAccumulator(str(tmp_path / "coarse" / "tensorboard"))
+    accumulator.Reload()
+    assert accumulator.Tags()["images"]
+    assert "val/psnr" not in accumulator.Tags()["scalars"]
+
+
 def test_curves_are_means_over_the_steps_between(tmp_path):
     class Record(lightning.Callback):
         losses = []
@@ -204,6 +225,7 @@ def test_the_clock_stands_still_for_pictures(tmp_path, monkeypatch):
     ("make", "text"),
     [
         (lambda: TensorBoardPictures(moments=(0.5, 1.5)), r"moments: expected numbers in \[0, 1\], but got"),
+        (lambda: TensorBoardPictures(psnr_rays=0), "expected psnr_views >= 0 and psnr_rays >= 1, but got"),
         (lambda: TensorBoardScalars(every=0), "every: expected at least 1 step, but got 0"),
     ],
 )

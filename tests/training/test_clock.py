@@ -63,3 +63,19 @@ def test_goes_on_from_a_saved_state(clock):
     clock.start()
     clock.now = 2.0
     assert clock.state_dict() == {"seconds": 42.0}
+
+
+def test_waits_for_a_gpu_where_it_starts_and_stops_only(clock, monkeypatch):
+    waits = []
+    monkeypatch.setattr(module.torch.cuda, "is_initialized", lambda: True)
+    monkeypatch.setattr(module.torch.cuda, "synchronize", lambda: waits.append(clock.seconds))
+    clock.start()
+    clock.now = 3.0
+    assert clock.seconds == 3
+    assert waits == [0]
+    with clock.paused():
+        assert waits == [0, 3]
+    clock.stop()
+    assert len(waits) == 4
+    clock.stop()
+    assert len(waits) == 4

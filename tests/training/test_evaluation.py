@@ -6,6 +6,7 @@ import torch
 from forewarp.metrics.suite import ImageSuite
 from forewarp.scene.frame import Truth
 from forewarp.training.evaluation import draw, evaluate, flow_error
+from forewarp.training.module import render_all
 from tiny_scene import ball_data, make_run, stage
 
 
@@ -46,7 +47,10 @@ def test_scores_every_image_and_saves_it(run, module, tmp_path):
     assert len(list((tmp_path / "images" / "sheets").glob("*.png"))) == 2
     assert "flow" not in metrics  # the scene has no truth
     assert metrics["protocol"]["seed"] == 5
-    assert metrics["seconds"]["train"] == metrics["seconds"]["coarse"] > 0
+    seconds = metrics["seconds"]
+    assert seconds["train"] == seconds["coarse"] > 0
+    assert 0 < seconds["render_again_per_frame"] < seconds["render_per_frame"]
+    assert seconds["render_again_per_frame"] == pytest.approx(sum(row["seconds_again"] for row in rows) / 3)
 
 
 def test_the_same_scene_gives_the_same_numbers(run, module, tmp_path):
@@ -57,11 +61,24 @@ def test_the_same_scene_gives_the_same_numbers(run, module, tmp_path):
 
 def test_warps_once_a_time(module, monkeypatch):
     targets = ball_data().targets("test")
-    times, at = [], module.method.at
-    monkeypatch.setattr(module.method, "at", lambda time: times.append(time) or at(time))
+    times, at, clock = [], module.method.at, [0.0]
+
+    def warped(time):
+        times.append(time)
+        clock[0] += 10
+        return at(time)
+
+    def drawn(*arguments):
+        clock[0] += 1
+        return render_all(*arguments)
+
+    monkeypatch.setattr(module.method, "at", warped)
+    monkeypatch.setattr("forewarp.training.evaluation.render_all", drawn)
+    monkeypatch.setattr("forewarp.training.evaluation.now", lambda: clock[0])
     shown = list(draw(module, [targets[2], targets[0], targets[2], targets[0]]))
     assert times == [0.0, 1.0]
     assert [one.number for one in shown] == [1, 3, 0, 2]
+    assert [(one.seconds, one.seconds_again) for one in shown] == [(11, 1), (1, 1)] * 2
 
 
 def test_flow_is_measured_against_the_truth(run, module):

@@ -74,7 +74,7 @@ def test_a_stage_leaves_the_tight_box():
 
 def test_a_stage_that_found_nothing_keeps_its_box_and_says_so():
     method, unit = ball(raw=-9.0)
-    handover = make_handover(method, SCENE, unit, 6)
+    handover = make_handover(method, SCENE, unit, 6, alpha=1e-2)
     assert not handover.tight
     assert handover.box == method.radiance.lattice.box
 
@@ -113,10 +113,29 @@ def test_the_hull_needs_alpha():
         fresh_method(forward_spec(), settings(start="hull"), scene, BOX, None, [0])
 
 
+def test_left_to_itself_it_starts_in_the_hull_where_there_is_alpha_and_in_the_box_elsewhere():
+    for scene, start in ((SCENE, "hull"), (replace(SCENE, has_alpha=False), "box")):
+        ours, expected = (
+            fresh_method(forward_spec(), settings(start=s, hull_frames=2), scene, BOX, None, [0, 1])[0]
+            for s in ("auto", start)
+        )
+        assert torch.equal(ours.radiance.voxels, expected.radiance.voxels)
+
+
+def test_the_hull_of_a_moment_is_that_of_all_its_views():
+    frames = [replace(frame, time=0.0) for frame in SCENE.train[:3]]
+    scene = replace(SCENE, train=(*frames, *SCENE.train[3:]))
+    one, three = (
+        fresh_method(forward_spec(), settings(start="hull", hull_frames=n), scene, BOX, None, [0, 1, 2, 3])[0]
+        for n in (1, 3)
+    )
+    assert torch.equal(one.radiance.voxels, three.radiance.voxels)
+
+
 def test_carrying_keeps_matter_motion_and_unit():
     before, unit = ball()
     path = before.motion.trajectory.state_dict()
-    handover = make_handover(before, SCENE, unit, 6)
+    handover = make_handover(before, SCENE, unit, 6, alpha=1e-2)
     sigma, at = before.radiance().density, before.radiance.lattice.to_lattice
     points = ball_center(0.0) + 0.2 * (torch.rand(50, 3) - 0.5)
     expected = sigma(at(points)).detach()

@@ -18,6 +18,8 @@ TERMS = (
     "tv_density",
     "tv_flow",
     "tv_depth",
+    "still_points",
+    "moving_opacity",
 )
 LATTICE = Lattice(Box((0, 0, 0), (2, 3, 4)), (3, 4, 5))
 
@@ -28,11 +30,11 @@ def rendering(seed):
     def draw(*shape):
         return torch.rand(*shape, generator=generator).requires_grad_()
 
-    ids = torch.tensor([0, 0, 3])
-    return Rendering(draw(4, 3), draw(4), draw(4), draw(4), draw(3), draw(3, 3), ids, 3, draw(7))
+    ids, every = torch.tensor([0, 0, 3]), torch.tensor([0, 0, 0, 0, 1, 3, 3])
+    return Rendering(draw(4, 3), draw(4), draw(4), draw(4), draw(3), draw(3, 3), ids, 3, draw(7), every)
 
 
-def step(inpainted=True, moving=True):
+def step(inpainted=True, moving=True, background=True):
     rays = Rays(torch.zeros(4, 3), torch.zeros(4, 3), 1.0, 2.0)
     batch = Batch(rays, torch.rand(4, 3, generator=torch.Generator().manual_seed(9)), torch.ones(3), 0.5, 0)
     generator = torch.Generator().manual_seed(3)
@@ -46,10 +48,12 @@ def step(inpainted=True, moving=True):
         canonical,
         flow=torch.randn(60, 3, generator=generator).requires_grad_() if moving else None,
         inpaint_difference=torch.randn(1, 4, 3, 4, 5, generator=generator) if inpainted else None,
+        background=canonical.with_values(torch.randn(60, 4, generator=generator)) if background else None,
     )
-    depth = torch.rand(2, 4, 4, generator=generator)
+    depth, stray = torch.rand(2, 4, 4, generator=generator), torch.randn(7, 3, generator=generator)
+    drawn = {n: rendering(i) for i, n in enumerate(names)}
     return Step(
-        batch, state, {n: rendering(i) for i, n in enumerate(names)}, lambda: (depth, torch.ones(2, 4, 4))
+        batch, state, drawn, lambda: (depth, torch.ones(2, 4, 4)), lambda: stray if background else None
     )
 
 
@@ -67,15 +71,18 @@ def test_every_term_is_the_pure_function_of_its_parts():
     _, raw = Objective(dict.fromkeys(TERMS, 1.0))(seen, 0)
     pairs = neighbour_pairs(seen.state.canonical.index)
     truth, both = seen.batch.rgb, list(seen.renderings.values())
+    grids = [seen.state.canonical, seen.state.background]
     expected = {
         "photo": sum(losses.photometric(r.rgb, truth) for r in both),
         "point_color": sum(losses.point_color(r.weights, r.colors, r.ray_ids, truth) for r in both),
         "background_entropy": sum(losses.background_entropy(r.transmittance) for r in both),
         "flow_l1": losses.flow_l1(seen.state.flow),
         "inpaint_diff": losses.inpaint_diff(seen.state.inpaint_difference),
-        "tv_density": losses.tv_density(seen.state.canonical.raw_density, pairs),
+        "tv_density": sum(losses.tv_density(grid.raw_density, pairs) for grid in grids),
         "tv_flow": losses.tv_flow(seen.state.flow, pairs),
         "tv_depth": losses.tv_depth(*seen.render_patches()),
+        "still_points": losses.still_points(seen.stray()),
+        "moving_opacity": losses.moving_opacity(grids[0].activation.alpha(grids[0].raw_density, 1.0)),
     }
     for name, value in expected.items():
         torch.testing.assert_close(raw[name], value.detach())
@@ -110,8 +117,9 @@ def test_each_nth_step_with_n_times_the_weight():
 
 
 def test_terms_of_effects_that_are_off_are_left_out():
-    _, raw = Objective(dict.fromkeys(TERMS, 1.0))(step(inpainted=False, moving=False), 0)
-    assert set(raw) == set(TERMS) - {"flow_l1", "tv_flow", "inpaint_diff"}
+    _, raw = Objective(dict.fromkeys(TERMS, 1.0))(step(inpainted=False, moving=False, background=False), 0)
+    off = {"flow_l1", "tv_flow", "inpaint_diff", "still_points", "moving_opacity"}
+    assert set(raw) == set(TERMS) - off
 
 
 def test_the_printed_forms():
@@ -122,7 +130,13 @@ def test_the_printed_forms():
     _, printed = objective(seen, 0)
     assert objective.needs_all_weights
     assert printed["photo"].item() == pytest.approx(3 * built["photo"].item())
+    expected = sum(
+        losses.point_color(r.weights, r.colors, r.ray_ids, seen.batch.rgb, all_ray_ids=r.all_ray_ids)
+        for r in seen.renderings.values()
+    )
+    torch.testing.assert_close(printed["point_color"], expected.detach())
     assert printed["point_color"] < built["point_color"]
+    assert [Objective({}, literal=[n]).needs_all_weights for n in names] == [False, True, True]
     expected = sum(losses.sample_entropy(r.all_weights) for r in seen.renderings.values())
     torch.testing.assert_close(printed["background_entropy"], expected.detach())
 
@@ -138,7 +152,7 @@ def test_the_rays_terms_may_look_at_some_renderings_only():
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
-        ({"weights": {"photos": 1.0}}, "objective: expected a term of photo, .*tv_depth, but got 'photos'"),
+        ({"weights": {"photos": 1.0}}, "objective: expected a term of photo, .*but got .photos."),
         ({"weights": {}, "every": {"tv": 2}}, "but got 'tv'"),
         ({"weights": {}, "literal": ["ssim"]}, r"objective.literal: .* but got \['ssim'\]"),
         (

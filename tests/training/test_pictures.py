@@ -3,9 +3,9 @@ import torch
 
 from forewarp.drawing.colors import error_colors
 from forewarp.scene.batch import Target
-from forewarp.training.pictures import image_flow, pictures_of, sized, within
+from forewarp.training.pictures import image_flow, pictures_of, sized, validation_psnr, within
 from known_ball import known_ball
-from tiny_scene import RADIUS, TRAVEL, ball_center, ball_scene, camera_at
+from tiny_scene import RADIUS, TRAVEL, ball_center, ball_data, ball_scene, camera_at
 
 
 @pytest.fixture(scope="module")
@@ -47,6 +47,17 @@ def test_pictures_are_reduced_and_compare_with_the_truth(module):
     left, middle, right = (pictures["compare"][:, i : i + 16] for i in (0, 20, 40))
     torch.testing.assert_close(left, truth[:16, :16])
     torch.testing.assert_close(right, error_colors(left, middle))
+
+
+def test_the_validation_psnr_is_a_mean_over_images_that_draws_nothing_global(module):
+    targets = ball_data(frames=2, size=32).targets("test")
+    whole = validation_psnr(module, targets, rays=32 * 32)
+    assert whole == pytest.approx(sum(float(module.psnr_of(t)) for t in targets) / 3, abs=1e-4)
+    before = torch.get_rng_state()
+    some = validation_psnr(module, targets, rays=400)
+    assert torch.equal(torch.get_rng_state(), before)
+    assert some == validation_psnr(module, targets, rays=400)
+    assert 0 < abs(some - whole) < 2
 
 
 def test_sizes_follow_the_longer_side():

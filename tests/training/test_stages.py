@@ -6,13 +6,13 @@ import lightning
 import pytest
 import torch
 
+from forewarp.effects.background import StaticBackground
 from forewarp.effects.inpaint import UNet3d
 from forewarp.effects.upsample import LearnedUpsampler, TrilinearUpsampler
 from forewarp.effects.view import ViewNetwork
 from forewarp.fields.radiance import FeatureRadiance
-from forewarp.fields.trajectory import TrajectoryField
 from forewarp.methods.backward_warp import Deformation
-from forewarp.training.stages import KeepCheckpoint, check_checkpoint, load_weights
+from forewarp.training import handover
 from tiny_scene import RATES, Interrupt, ball_data, forward_spec, make_run, stage
 
 
@@ -146,49 +146,25 @@ def test_an_unfinished_run_cannot_be_loaded(tmp_path):
         run(tmp_path).load()
 
 
-def test_a_checkpoint_of_another_configuration_is_refused(tmp_path, whole):
-    folder, module = whole
-    checkpoint = folder / "coarse" / "last.ckpt"
-    plain = make_run(tmp_path, stages()[:1], data=ball_data(times=[0.0] * 3))
-    plain.datamodule.setup()
-    other, _ = plain._module(plain.stages[0], None, None, 0)  # one time: no motion
-    with pytest.raises(
-        ValueError, match="expected a checkpoint of this configuration, but got one that differs in"
-    ):
-        load_weights(other, checkpoint)
-    broken = tmp_path / "last.ckpt"
-    broken.write_bytes(checkpoint.read_bytes()[:500])
-    with pytest.raises(ValueError, match="expected a checkpoint, but it cannot be read"):
-        check_checkpoint(broken, module)
-
-
-def test_a_checkpoint_of_another_width_is_refused(tmp_path):
-    def made(width):
-        trajectory = partial(TrajectoryField, bases=4, nodes=8, width=width, layers=2)
-        ours = make_run(
-            tmp_path, stages()[:1], data=ball_data(size=16), spec=forward_spec(trajectory=trajectory)
-        )
-        ours.datamodule.setup()
-        return ours._module(ours.stages[0], None, None, 0)[0]
-
-    torch.save({"state_dict": made(8).state_dict()}, tmp_path / "last.ckpt")
-    grown = made(8)
-    grown.method.radiance.activate(torch.ones(grown.method.radiance.lattice.shape, dtype=torch.bool), {})
-    load_weights(grown, tmp_path / "last.ckpt")  # a voxel grid adopts other shapes
-    with pytest.raises(
-        ValueError, match="but got one that differs in method.motion.trajectory.network.0.bias"
-    ):
-        check_checkpoint(tmp_path / "last.ckpt", made(16))
-
-
-def test_checkpoints_come_by_the_clock(tmp_path, monkeypatch):
-    saved = []
-    monkeypatch.setattr(KeepCheckpoint, "save", lambda self, trainer: saved.append(trainer.global_step))
-    ours = run(tmp_path)
-    ours.checkpoint_seconds = 1e-9
-    ours.stages = ours.stages[:1]
+def test_every_stage_counts_its_own_memory(tmp_path, monkeypatch):
+    order = []
+    monkeypatch.setattr("forewarp.training.stages.reset_peak_memory", lambda: order.append("reset"))
+    monkeypatch.setattr("forewarp.training.stages.peak_memory_bytes", lambda: order.append("peak") or 7)
+    ours = run(tmp_path, iterations=2)
     ours.fit()
-    assert saved == [*range(1, 11), 10]
+    ours.fit()  # all is finished
+    assert order == ["reset", "peak"] * 2
+    assert ours.finished()["fine"]["peak_memory_bytes"] == 7
+
+
+def test_the_next_box_holds_what_the_stage_calls_matter(tmp_path, monkeypatch):
+    asked, make = [], handover.make_handover
+    monkeypatch.setattr(
+        "forewarp.training.stages.make_handover", lambda *a, **k: asked.append(k["alpha"]) or make(*a, **k)
+    )
+    data = ball_data(rays=64, size=16)
+    make_run(tmp_path, [stage(iterations=1, box_alpha=0.25)], data=data).fit()
+    assert asked == [0.25]
 
 
 CHOICES = {
@@ -199,6 +175,7 @@ CHOICES = {
         "view": ViewNetwork,
     },
     "everything": {"upsampler": partial(LearnedUpsampler, width=8), "inpainter": partial(UNet3d, levels=2)},
+    "background": {"background": partial(StaticBackground, features=3, alpha_init=1e-2, skip_alpha=1e-4)},
     "interpolated": {"upsampler": TrilinearUpsampler, "view": None},
 }
 

@@ -10,12 +10,16 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from forewarp.cli.entry import MISTAKE
+
 _ABILITIES = {
     "space": "at training times",
     "time": "between them",
     "canonical": "canonical time",
     "all": "all",
 }
+
+_KEYS = ("protocol", "seconds", "test")
 
 
 def table_of(runs: dict[str, dict]) -> Table:
@@ -52,12 +56,56 @@ def _flow_share(metrics: dict) -> float | None:
     return flow["epe_moving"] / flow["motion_mean"] if flow.get("epe_moving") is not None else None
 
 
+def read_metrics(folder: str) -> dict:
+    """What a run's ``metrics.json`` holds.
+
+    Raises:
+        ValueError: where there is none, or not what ``forewarp-evaluate`` writes.
+    """
+    path = Path(folder) / "metrics.json"
+    try:
+        metrics = json.loads(path.read_text())
+    except OSError as error:
+        raise ValueError(
+            f"{path}: expected the numbers of a run, but got {error.strerror}; "
+            f"make them with forewarp-evaluate run={folder}"
+        ) from None
+    except ValueError:
+        metrics = None
+    missing = [k for k in _KEYS if not isinstance(metrics, dict) or not isinstance(metrics.get(k), dict)]
+    if missing:
+        raise ValueError(
+            f"{path}: expected the key {missing[0]}, but got none; make it anew with forewarp-evaluate "
+            f"run={folder}"
+        )
+    return metrics
+
+
+def named(folders: list[str], metrics: list[dict]) -> dict[str, dict]:
+    """The runs under their methods' names where those differ, else under their folders', as far as needed.
+
+    >>> list(named(["a/x", "b/x"], [{"protocol": {"method": "forward"}}] * 2))
+    ['a/x', 'b/x']
+    """
+    paths = [Path(folder) for folder in folders]
+    choices = (
+        [content["protocol"].get("method", path.name) for path, content in zip(paths, metrics)],
+        [path.resolve().name for path in paths],
+        [path.as_posix() for path in paths],
+        [f"{number} {path.as_posix()}" for number, path in enumerate(paths, 1)],
+    )
+    return dict(zip(next(names for names in choices if len(set(names)) == len(names)), metrics))
+
+
 def main(folders: list[str]) -> None:
-    """Print the table of run folders."""
-    runs = {}
-    for folder in folders:
-        metrics = json.loads((Path(folder) / "metrics.json").read_text())
-        runs[metrics["protocol"].get("method", Path(folder).name)] = metrics
+    """Print the table of run folders; a mistake ends in one line and status 2."""
+    try:
+        if not folders:
+            raise ValueError("expected folders of runs, but got none; name two")
+        runs = named(folders, [read_metrics(folder) for folder in folders])
+    except ValueError as error:
+        print(f"forewarp.cli.compare: error: {error}", file=sys.stderr)
+        sys.exit(MISTAKE)
     Console().print(table_of(runs))
 
 

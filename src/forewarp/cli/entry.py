@@ -7,9 +7,11 @@ import logging
 import os
 import re
 import sys
+import tempfile
 import traceback
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 ROOT_VARIABLE, TRACEBACK_VARIABLE = "FOREWARP_ROOT", "FOREWARP_TRACEBACK"
@@ -83,18 +85,30 @@ def quiet() -> None:
 def _run(name: str, task: Callable, conf: Path) -> list[int]:
     """Exit statuses of the jobs that failed; with ``--multirun`` the others still run."""
     import hydra
-
-    failures = []
+    from hydra.core.hydra_config import HydraConfig
 
     def job(config) -> None:
         # Caught here, as Hydra would add a line of its own.
+        status = 0
         try:
+            quiet()  # a launcher's process begins here
             task(config)
         except Exception as error:
-            failures.append(_tell(name, error))
+            status = _tell(name, error)
+        with suppress(OSError), open(ended, "a") as file:
+            file.write(f"{status} {' '.join(HydraConfig.get().overrides.task)}\n")
 
-    hydra.main(version_base="1.3", config_path=str(conf), config_name=name)(job)()
-    return failures
+    # A file, as jobs may be other processes; those of another machine do not reach it.
+    with tempfile.TemporaryDirectory(prefix="forewarp-") as folder:
+        ended = os.path.join(folder, "ended")
+        hydra.main(version_base="1.3", config_path=str(conf), config_name=name)(job)()
+        lines = Path(ended).read_text().splitlines() if os.path.exists(ended) else []
+    jobs = [line.split(" ", 1) for line in lines]
+    failed = [words for status, words in jobs if int(status)]
+    if failed and len(jobs) > 1:
+        listed = "".join(f"\n  {words}" for words in failed)
+        print(f"forewarp-{name}: {len(failed)} of {len(jobs)} jobs failed:{listed}", file=sys.stderr)
+    return [int(status) for status, _ in jobs]
 
 
 def _tell(name: str, error: Exception) -> int:
@@ -131,12 +145,27 @@ def one_line(error: BaseException) -> str | None:
         return f"{missing[1]}: expected a value, but got none; set {missing[1]}=..."
     if getattr(error, "override", None):  # what Hydra could not parse
         return f"{error.override}: {_flat(str(error))}"
+    if isinstance(error, HydraException) and (launcher := _absent_launcher(str(error))):
+        return (
+            f"launcher: expected the package of hydra/launcher={launcher}, but got none; "
+            "install forewarp[sweeps], or use launcher=local"
+        )
     if isinstance(error, HydraException | OmegaConfBaseException):
         cause = error.__cause__
         detail = f" ({_flat(str(cause))})" if isinstance(cause, OmegaConfBaseException) else ""
         return _flat(str(error).split("Config search path")[0]) + detail
     if isinstance(error, OSError):
         return _of_system(error)
+    if (
+        isinstance(error, MemoryError)
+        or "can't allocate memory" in str(error)
+        or "out of memory" in str(error)
+    ):
+        wanted = re.search(r"allocate (\d+ bytes|[\d.]+ .iB)", str(error))
+        return (
+            f"memory: expected room for {wanted[1] if wanted else 'more'}, but got none; lower data.rays or "
+            "stage.*.voxels, and run the same command again"
+        )
     if isinstance(error, TypeError) and "unexpected keyword argument" in str(error):
         return f"config: {error}; leave that key out"
     if isinstance(error, ImportError):
@@ -144,9 +173,14 @@ def one_line(error: BaseException) -> str | None:
     return _flat(str(error)) if isinstance(error, ValueError) else None
 
 
+def _absent_launcher(text: str) -> str | None:
+    found = re.search(r"hydra/launcher[/'=:\s]+(joblib|ray|submitit_\w+)", text)
+    return found and found[1]
+
+
 def _of_system(error: OSError) -> str:
     reason, file = error.strerror or str(error), error.filename
-    full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+    full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
     advice = (
         "free some room and run the same command again" if full else "check that it exists and may be written"
     )
@@ -168,9 +202,10 @@ def _flat(text: str) -> str:
 def choices(conf: Path, name: str) -> str:
     """The options of every group that ``<name>.yaml`` uses, for the help."""
     if name != "train":
-        groups = ["trainer"] if "trainer:" in (conf / f"{name}.yaml").read_text() else []
+        text = (conf / f"{name}.yaml").read_text()
+        groups = [group for group in ("dataset", "trainer") if f"- {group}:" in text]
     else:
-        silent = {"hydra", "paths", "callbacks"}
+        silent = {"hydra", "paths", "callbacks", "dataset"}
         folders = [path for path in sorted(conf.rglob("*")) if path.is_dir() and path.name != "one"]
         groups = [
             p.relative_to(conf).as_posix() for p in folders if p.relative_to(conf).parts[0] not in silent

@@ -22,12 +22,14 @@ What one types most:
 
 def evaluate(config) -> None:
     """Load and measure."""
+    from forewarp.cli.claims import alone
     from forewarp.cli.measure import measure
     from forewarp.cli.runs import build_run, saved_config
 
     saved = saved_config(config.run, config)
     run = build_run(saved)
-    measure(run, run.load(), saved)
+    with alone(run.folder):
+        measure(run, run.load(), saved)
 
 
 def main() -> None:

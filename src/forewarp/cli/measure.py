@@ -22,7 +22,8 @@ from forewarp.training.stages import Run
 def measure(run: Run, module: DynamicSceneModule, config: DictConfig) -> dict:
     """Evaluate a fitted run into its folder and print the table."""
     extra = config.lpips_weights
-    suite = ImageSuite(find_lpips(extra=[extra] if isinstance(extra, str) else extra))
+    nets = find_lpips(extra=[extra] if isinstance(extra, str) else extra)
+    suite = ImageSuite(nets, mask_box=run.datamodule.scene.protocol.get("mask_box", False))
     module.to(device_of(config.trainer.accelerator))
     protocol = {"method": config.model.warp, "budget": config.budget.name, "seed": config.seed}
     protocol |= {"minutes": config.budget.minutes, "iterations": config.budget.iterations}
@@ -42,7 +43,14 @@ def measure(run: Run, module: DynamicSceneModule, config: DictConfig) -> dict:
 
 
 def device_of(accelerator: str) -> torch.device:
-    """The device that a trainer of this accelerator uses."""
+    """The device that runs use under this ``trainer.accelerator``: with ``auto`` a CUDA GPU, or else the CPU.
+
+    Others, Apple's among them, have no float64, which cameras and the cosine basis are computed in.
+    """
+    if accelerator not in ("auto", "cpu", "gpu", "cuda"):
+        raise ValueError(
+            f"trainer.accelerator: expected auto, cpu, gpu or cuda, but got {accelerator}; use trainer=auto"
+        )
     if accelerator in ("gpu", "cuda") and not torch.cuda.is_available():
         raise ValueError("trainer.accelerator: expected a GPU, but found none; use trainer=cpu")
     wanted = accelerator in ("gpu", "cuda") or (accelerator == "auto" and torch.cuda.is_available())
@@ -80,10 +88,12 @@ def show(metrics: dict, folder: Path, absent: dict[str, str]) -> None:
     console = Console()
     console.print(table_of(metrics))
     seconds, flow = metrics["seconds"], metrics.get("flow")
-    stages = ", ".join(
-        f"{name} {time_text(s)}" for name, s in seconds.items() if name not in ("train", "render_per_frame")
-    )
-    lines = [f"trained {time_text(seconds['train'])} ({stages}), {seconds['render_per_frame']:.2f} s a frame"]
+    others = ("train", "render_per_frame", "render_again_per_frame")
+    stages = ", ".join(f"{name} {time_text(s)}" for name, s in seconds.items() if name not in others)
+    lines = [
+        f"trained {time_text(seconds['train'])} ({stages}), {seconds['render_per_frame']:.2f} s a frame, "
+        f"{seconds['render_again_per_frame']:.2f} s another at the same time"
+    ]
     if flow and flow["epe_moving"] is not None:
         error, motion = flow["epe_moving"], flow["motion_mean"]
         lines.append(
@@ -111,7 +121,7 @@ def table_of(metrics: dict) -> Table:
         suffix = key.removeprefix("test").replace("_", " ")
         for ability, scores in block.items():
             cells = [
-                f"{scores[n]:.2f}" if n == "psnr" else f"{scores[n]:.4f}" if n in scores else ""
+                f"{scores[n]:.2f}" if n.startswith("psnr") else f"{scores[n]:.4f}" if n in scores else ""
                 for n in names
             ]
             table.add_row(ability + suffix, *cells)

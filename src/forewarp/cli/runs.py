@@ -2,21 +2,31 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
+import shlex
 from pathlib import Path
 
 import torch
-import yaml
+from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
 from forewarp.cli.measure import device_of
+from forewarp.cli.trusted import MOST_BYTES, trusted_config
 from forewarp.training.budget import share_out
+from forewarp.training.handover import read_json
 from forewarp.training.stages import Run
 
 # What makes two runs different; where they run and what is shown of them does not.
 IDENTITY = ("data", "model", "objective", "stage", "renderer", "budget", "seed")
+HASH = "{hash}"
+# What may be set beside resume=<run>.
+MAY_CHANGE = (
+    *("trainer", "threads", "lpips_weights", "sheets", "evaluate", "checkpoint_seconds"),
+    *("sentinel", "data_changed"),
+)
 
 
 def build_run(config: DictConfig) -> Run:
@@ -30,8 +40,9 @@ def build_run(config: DictConfig) -> Run:
     trainer, logger = (instantiate(config[key], _convert_="all") for key in ("trainer", "logger"))
 
     def make_trainer(folder: Path, callbacks: list):
-        device_of(config.trainer.accelerator)  # refuses a GPU that is not there
         return trainer(
+            # Not Lightning's own choice, which on a Mac would be a GPU without float64.
+            accelerator=device_of(config.trainer.accelerator).type,
             max_epochs=1,
             max_steps=-1,
             callbacks=callbacks,
@@ -54,13 +65,33 @@ def build_run(config: DictConfig) -> Run:
         callbacks=lambda name, folder: [watcher() for watcher in watchers],
         seed=config.seed,
         checkpoint_seconds=config.checkpoint_seconds,
+        skip=config.get("sentinel", {"skip": 0})["skip"],
     )
+
+
+def hashed(config: DictConfig) -> DictConfig:
+    """The config with ``{hash}`` in ``run`` replaced by ten digits of a SHA-256 of all that tells runs apart.
+
+    So a finished job is known by what it computed, and another config never meets its folder.
+    """
+    if HASH in str(config.run):
+        _make_absolute(config)
+        text = json.dumps({key: _plain(config[key]) for key in IDENTITY}, sort_keys=True)
+        config.run = str(config.run).replace(HASH, hashlib.sha256(text.encode()).hexdigest()[:10])
+    return config
+
+
+def _plain(value: object) -> object:
+    return OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value
 
 
 def claim(config: DictConfig) -> None:
     """Write the resolved config into the run's folder, or refuse a folder begun with another one."""
     folder, path = Path(config.run), Path(config.run) / "config.yaml"
     _make_absolute(config)
+    if config.get("resume") is None:
+        config.command = typed()
+    config.resume = None
     resolved = OmegaConf.create(OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
     begun = folder.is_dir() and any(folder.glob("*/last.ckpt"))
     if begun and not path.is_file():
@@ -68,11 +99,28 @@ def claim(config: DictConfig) -> None:
             f"{path}: expected the configuration of the run, but got none; use run=... or delete the folder"
         )
     if begun:
-        _refuse_another(path, _read(path), resolved)
+        _refuse_another(path, read_config(path), resolved)
     folder.mkdir(parents=True, exist_ok=True)
     beside = path.with_name(path.name + ".part")
     beside.write_text(OmegaConf.to_yaml(resolved))
     os.replace(beside, path)
+
+
+def is_measured(run: Run) -> bool:
+    """Whether a run is finished and was measured since."""
+    metrics = Path(run.folder) / "metrics.json"
+    if read_json(metrics) is None or not all(run.is_finished(stage) for stage in run.stages):
+        return False
+    done = [run.stage_folder(stage) / "done.json" for stage in run.stages]
+    return metrics.stat().st_mtime_ns >= max(path.stat().st_mtime_ns for path in done)
+
+
+def typed() -> str | None:
+    """The command line of this run alone; None where Hydra was not asked."""
+    if not HydraConfig.initialized():
+        return None
+    words = HydraConfig.get().overrides.task
+    return shlex.join(["forewarp-train", *(word for word in words if not word.startswith("sweeps="))])
 
 
 def saved_config(run: str | None, changes: DictConfig) -> DictConfig:
@@ -89,7 +137,7 @@ def saved_config(run: str | None, changes: DictConfig) -> DictConfig:
         raise ValueError(
             f"{path}: expected the configuration of a run, but got none; set run=<a run's folder>"
         )
-    saved = _read(path)
+    saved = read_config(path)
     for key in ("trainer", "threads", "lpips_weights", "sheets"):
         if changes.get(key) is not None:
             saved[key] = changes[key]
@@ -99,12 +147,45 @@ def saved_config(run: str | None, changes: DictConfig) -> DictConfig:
     return saved
 
 
-def _read(path: Path) -> DictConfig:
-    try:
-        config = OmegaConf.load(path)
-    except (yaml.YAMLError, UnicodeDecodeError, OmegaConfBaseException) as error:
-        reason = str(error).splitlines()[0]
-        raise ValueError(f"{path}: expected YAML, but got {reason}; delete the run's folder") from None
+def resumed(config: DictConfig) -> DictConfig:
+    """With ``resume=<folder>`` the config of the run there, and of what was typed only what may change.
+
+    Raises:
+        ValueError: for another key beside it, or a folder that is no run.
+    """
+    if config.get("resume") is None:
+        return config
+    saved = saved_config(str(config.resume), OmegaConf.create({}))
+    saved.resume, saved.data_changed = str(config.resume), "refuse"
+    words = HydraConfig.get().overrides.task if HydraConfig.initialized() else []
+    for word in words:
+        key = word.split("=")[0].lstrip("+~")
+        if key == "data.root":
+            saved.data.root = config.data.root
+        elif key.split(".")[0] in MAY_CHANGE:
+            saved[key.split(".")[0]] = config[key.split(".")[0]]
+        elif key != "resume":
+            raise ValueError(
+                f"{key}: expected no such key beside resume=, whose config.yaml holds it, but got {word}; "
+                f"beside it go {', '.join(MAY_CHANGE)}, data.root"
+            )
+    return saved
+
+
+def read_config(path: Path) -> DictConfig:
+    """The config in a run's folder, or in a stored step.
+
+    Raises:
+        ValueError: where it is no config of a run, or one that is not to be trusted.
+    """
+    if (size := path.stat().st_size) > MOST_BYTES:
+        raise ValueError(f"{path}: expected at most {MOST_BYTES} bytes, but got {size}")
+    return parsed(path.read_bytes().decode(errors="replace"), path)
+
+
+def parsed(text: str, path: Path) -> DictConfig:
+    """As ``read_config``, of text; ``path`` names it in errors."""
+    config = trusted_config(text, path)
     for key in (*IDENTITY, "trainer", "logger", "callbacks"):
         if key not in config:
             raise ValueError(f"{path}: expected the key {key}, but got none; delete the run's folder")

@@ -6,7 +6,7 @@ from forewarp.cli.entry import command
 
 HELP = """
 forewarp-train fits a moving scene by forward warping, coarse and fine, and measures it on its test views.
-The same command run again skips finished stages and goes on with an interrupted one.
+The same command run again skips what is finished and goes on with what was interrupted.
 
   forewarp-train                                     the procedural vehicle, written at first use
   forewarp-train experiment=demo                     the same in about a minute
@@ -21,29 +21,68 @@ What one types most:
   model/view=none|sh|mlp              (and every other effect) switched by a word
   seed=N                              of everything random
   trainer=cpu|gpu|auto                where
+  resume=FOLDER                       go on with the run there; nothing else need be typed
+  sentinel.skip=N                     leave out up to N steps of a stage that are not finite, and count them
   run=FOLDER                          where the run lives (runs/<scene>/<model>-<budget>-seed<seed>)
   evaluate=false                      no test views at the end
+  data.held_out=N                     set N training views aside: a curve of their PSNR against training time
+  variant=NAME                        one change against budget=fast, as the price list has it
+  scene=DATASET_NAME                  as scene=dnerf_hook: a scene of the paper below paths.scenes=FOLDER
+  ablation=NAME                       what the paper takes away, from ablation=full
+  launcher=local|joblib|ray|slurm     of --multirun: where its jobs run
   ~stage.fine                         drop a stage
   --multirun seed=0,1,2               one run after another; --multirun sweeps=methods: a prepared sweep
+  --multirun sweeps=accuracy_time variant=base,unet_16 seed=0,1     what choices cost: see forewarp-report
 
 A run's folder holds config.yaml, a folder a stage (checkpoint, handover.json, TensorBoard events, images),
-images/ of the test views, per_image.json and metrics.json. Watch: tensorboard --logdir runs
+images/ of the test views, per_image.json and metrics.json; with views set aside also accuracy_time.csv and
+accuracy_time.png. Watch: tensorboard --logdir runs
 """
 
 
 def train(config) -> None:
-    """Fit what is not finished, then measure."""
+    """Fit what is not finished, then measure what was not measured."""
+    from forewarp.cli.claims import alone, same_data
     from forewarp.cli.measure import measure
-    from forewarp.cli.runs import build_run, claim
+    from forewarp.cli.report import draw_run
+    from forewarp.cli.runs import build_run, claim, hashed, is_measured, resumed
 
+    config = hashed(resumed(config))
     run = build_run(config)
+    if skips(run, config.get("absent", "refuse")):
+        print(f"skipped: {run.datamodule.place}: no such scene")
+        return
+    if config.evaluate and is_measured(run):
+        claim(config)
+        print(f"measured before: {run.folder}; again with forewarp-evaluate run={run.folder}")
+        return
     run.datamodule.setup("fit")  # before the folder is made: a mistyped scene leaves nothing behind
-    claim(config)
-    module = run.fit()
-    if config.evaluate:
-        measure(run, module, config)
-    else:
-        print(f"fitted: {run.folder}")
+    with alone(run.folder):
+        claim(config)
+        same_data(run, config.get("data_changed", "refuse"))
+        module = run.fit()
+        if config.evaluate:
+            measure(run, module, config)
+        else:
+            print(f"fitted: {run.folder}")
+        draw_run(run.folder)
+    tell_skipped(run)
+
+
+def skips(run, absent: str) -> bool:
+    """Whether a job of a sweep is left out, as its scene is not there; what makes its own scene never is."""
+    if absent not in ("refuse", "skip"):
+        raise ValueError(f"absent: expected refuse or skip, but got {absent}")
+    if absent == "refuse" or hasattr(run.datamodule, "prepare"):
+        return False
+    return run.datamodule.place is not None and not run.datamodule.place.is_dir()
+
+
+def tell_skipped(run) -> None:
+    """Say of every stage how many steps were left out, where any were."""
+    for name, noted in run.finished().items():
+        if steps := noted.get("skipped_steps"):
+            print(f"{name}: {steps} broken steps skipped; each lies in {run.folder / name / 'broken'}")
 
 
 def main() -> None:

@@ -3,14 +3,15 @@
 A pose on disk is camera-to-world with OpenGL's axes (x right, y up, looking along -z); its y and z columns
 are negated on the way in and out. Beside the stock ``transforms_test.json`` a scene may bring one file per
 ability (``transforms_test_space.json``, ``..._time.json``, ``..._canonical.json``), exact ray depth
-(``depth_file_path``: float32 .npy, 0 = background) and ``trajectories.npz`` (``points`` (N, T, 3) and
-``times`` (T,)).
+(``depth_file_path``: float32 .npy, or 16-bit PNG times the file's ``depth_scale``, 0 = background) and
+``trajectories.npz`` (``points`` (N, T, 3), ``times`` (T,)). ``test_space/transforms.json`` serves as well.
 """
 
 from __future__ import annotations
 
 import json
 import math
+import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from forewarp.data.files import inside, number, read_json, replace_file, scene_folder
+from forewarp.data.files import frames_of, inside, number, read_json, replace_file, scene_folder
 from forewarp.data.images import CachedImage, common_header, write_png
 from forewarp.data.truth import StoredDepth, read_truth, write_depth, write_truth
 from forewarp.data.views import box_of, check_range, frustum_box, pose_of
@@ -56,7 +57,7 @@ class _Record:
     pose: np.ndarray
     angle: float
     image: Path
-    depth: Path | None
+    depth: tuple[Path, float | None] | None  # file and world units a step, where it says so
     ability: str
 
 
@@ -120,8 +121,9 @@ def write_scene(
     folder = Path(folder)
     if unknown := set(splits) - {"train", "val", "test"}:
         raise ValueError(f"splits: expected train, val and test, but got {sorted(unknown)}")
-    for stale in (*folder.glob("transforms_*.json"), folder / "trajectories.npz"):
-        stale.unlink(missing_ok=True)
+    for pattern in ("transforms_*.json", "test_*/transforms.json", "trajectories.npz"):
+        for stale in folder.glob(pattern):
+            stale.unlink()
     files: dict[str, dict[str, dict]] = {}  # transforms file -> image path -> entry
     size = None
     for split, shots in splits.items():
@@ -140,8 +142,7 @@ def _read_split(folder: Path, split: str) -> list[_Record]:
     stock = folder / f"transforms_{split}.json"
     files = {stock: "all"} if stock.is_file() else {}
     if split == "test":
-        parts = {folder / f"transforms_test_{ability}.json": ability for ability in ABILITIES}
-        parts = {path: ability for path, ability in parts.items() if path.is_file()}
+        parts = {path: ability for ability in ABILITIES for path in _ability_files(folder, ability)}
         if files and parts:
             raise SceneError(f"{stock}: expected it or one file per ability, but got both; remove one kind")
         files = files or parts
@@ -152,42 +153,45 @@ def _read_split(folder: Path, split: str) -> list[_Record]:
     return [record for path, ability in files.items() for record in _read_records(folder, path, ability)]
 
 
+def _ability_files(folder: Path, ability: str) -> list[Path]:
+    """The transforms file of an ability, beside the others or in its folder; none where there is none."""
+    places = folder / f"transforms_test_{ability}.json", folder / f"test_{ability}" / "transforms.json"
+    return [path for path in places if path.is_file()][:1]
+
+
 def _read_records(folder: Path, path: Path, ability: str) -> list[_Record]:
     content = read_json(path)
     angle = number(content.get("camera_angle_x"), f"{path}: camera_angle_x", 0, math.pi)
     if angle in (0, math.pi):
         raise SceneError(f"{path}: camera_angle_x: expected radians inside (0, pi), but got {angle}")
-    frames = content.get("frames")
-    if not isinstance(frames, list) or not frames:
-        raise SceneError(f"{path}: frames: expected a list of at least one frame, but got {short(frames)}")
-    records = []
+    frames = frames_of(content, path)
+    records, common = [], {"ability": ability, "depth_scale": content.get("depth_scale")}
     for i, entry in enumerate(frames):
         where = f"{path}: frames[{i}]"
         if not isinstance(entry, dict):
             raise SceneError(f"{where}: expected an object, but got {short(entry)}")
         default = i / max(len(frames) - 1, 1)
-        records.append(_record(folder, {"time": default, "ability": ability, **entry}, angle, where))
+        records.append(_record(folder, path.parent, {"time": default, **common, **entry}, angle, where))
     return records
 
 
-def _record(folder: Path, entry: dict, angle: float, where: str) -> _Record:
-    image = inside(folder, entry.get("file_path"), f"{where}.file_path")
+def _record(folder: Path, base: Path, entry: dict, angle: float, where: str) -> _Record:
+    image = inside(base, entry.get("file_path"), f"{where}.file_path")
     if image.suffix != ".png":
         image = image.with_name(image.name + ".png")
     depth = None
     if "depth_file_path" in entry:
-        depth = inside(folder, entry["depth_file_path"], f"{where}.depth_file_path")
-        if not depth.is_file():
-            raise SceneError(f"{where}.depth_file_path: expected an existing file, but got {depth}")
+        file, scale = inside(base, entry["depth_file_path"], f"{where}.depth_file_path"), entry["depth_scale"]
+        if not os.path.isfile(file):
+            raise SceneError(f"{where}.depth_file_path: expected an existing file, but got {file}")
+        depth = file, None if scale is None else number(scale, f"{where}.depth_scale", 1e-12, 1e6)
     if entry["ability"] not in (*ABILITIES, "all"):
         expected = ", ".join(ABILITIES)
         raise SceneError(f"{where}.ability: expected one of {expected}, but got {short(entry['ability'])}")
-    if "transform_matrix" not in entry:
-        raise SceneError(f"{where}.transform_matrix: expected 4 x 4 numbers, but got no such key")
     return _Record(
         name=image.relative_to(folder).with_suffix("").as_posix(),
         time=number(entry["time"], f"{where}.time", 0, 1),
-        pose=pose_of(entry["transform_matrix"], f"{where}.transform_matrix") @ _FLIP,
+        pose=pose_of(entry.get("transform_matrix"), f"{where}.transform_matrix") @ _FLIP,
         angle=angle,
         image=image,
         depth=depth,
@@ -211,7 +215,7 @@ def _frame(record: _Record, size: tuple[int, int], halve: bool, near: float, far
     w, h = (n // 2 if halve else n for n in size)
     focal = 0.5 * w / math.tan(0.5 * record.angle)
     camera = Camera(w, h, focal, focal, w / 2, h / 2, torch.from_numpy(record.pose), near, far)
-    depth = StoredDepth(record.depth, size, halve) if record.depth else None
+    depth = StoredDepth(record.depth[0], size, halve, record.depth[1]) if record.depth else None
     return Frame(
         record.name, record.time, camera, CachedImage(record.image, size, halve), depth, record.ability
     )

@@ -2,25 +2,60 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import os
+import stat
 from pathlib import Path
 from reprlib import repr as short
+from unicodedata import category
 
 from forewarp.scene.errors import SceneError
+
+MOST_TEXT = 1 << 26  # bytes: what is parsed takes up to thirty times as much memory
+MOST_FRAMES = 1_000_000
+_UNPRINTABLE = {"Cc", "Cs", "Zl", "Zp"}  # controls, halves of characters, separators of lines
+
+
+def read_bytes(path: Path, most: int = MOST_TEXT, what: str = "a readable file") -> bytes:
+    """What a file holds; nothing is read of one that is larger than ``most`` bytes, or no file but a pipe.
+
+    Raises:
+        SceneError: where it cannot be read, naming ``what`` was expected.
+    """
+    try:
+        about = path.stat()
+        if not stat.S_ISREG(about.st_mode):
+            got = os.strerror(errno.EISDIR) if stat.S_ISDIR(about.st_mode) else "a device or a pipe"
+            raise SceneError(f"{path}: expected {what}, but got {got}")
+        if about.st_size > most:
+            raise SceneError(f"{path}: expected at most {most} bytes, but got {about.st_size}")
+        return path.read_bytes()
+    except OSError as error:
+        raise SceneError(f"{path}: expected {what}, but got {error.strerror or error}") from error
+
+
+def frames_of(content: dict, path: Path) -> list:
+    """The list ``frames`` of a file, which has from one to a million entries."""
+    frames = content.get("frames")
+    if not isinstance(frames, list) or not frames:
+        raise SceneError(f"{path}: frames: expected a list of at least one frame, but got {short(frames)}")
+    if len(frames) > MOST_FRAMES:
+        raise SceneError(f"{path}: frames: expected at most {MOST_FRAMES} frames, but got {len(frames)}")
+    return frames
 
 
 def read_json(path: Path) -> dict:
     """The object a JSON file holds.
 
     Raises:
-        SceneError: where the file is missing, does not parse (with the line) or holds no object.
+        SceneError: where the file is missing, too large, does not parse (with the line) or holds no object.
     """
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise SceneError(f"{path}: expected a readable file, but got {error.strerror or error}") from error
+        content = json.loads(read_bytes(path).decode())
+    except SceneError:  # which is a ValueError too
+        raise
     except json.JSONDecodeError as error:
         raise SceneError(f"{path}: line {error.lineno}: expected JSON, but got {error.msg}") from error
     except (ValueError, RecursionError) as error:  # bytes that are no text, absurd numbers or nesting
@@ -59,7 +94,7 @@ def inside(folder: Path, name: object, where: str) -> Path:
 
     Judged by the text alone, so a folder may link to where its images really are.
     """
-    if not isinstance(name, str) or not name or "\0" in name:
+    if not isinstance(name, str) or not name or any(category(c) in _UNPRINTABLE for c in name):
         raise SceneError(f"{where}: expected a path inside the scene folder, but got {short(name)}")
     normal = os.path.normpath(name)
     if os.path.isabs(normal) or normal.split(os.sep)[0] in ("..", "."):

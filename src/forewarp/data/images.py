@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import struct
 import zlib
 from collections.abc import Iterable
@@ -13,10 +14,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from forewarp.data.files import replace_file
+from forewarp.data import jpeg
+from forewarp.data.cache import CACHE
+from forewarp.data.files import read_bytes, replace_file
 from forewarp.scene.errors import SceneError
 
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_MOST_PIXELS = 80_000_000  # of a larger image the decoder warns
+_MOST_BYTES = 1 << 29
 
 
 @dataclass(frozen=True)
@@ -62,6 +67,10 @@ def read_image(path: Path) -> Tensor:
     content = _bytes(path)
     if path.suffix.lower() == ".png":
         _inspect(content, path)  # the decoder does not look at the checksums of pixel data
+    elif content.startswith(jpeg.SIGNATURE):
+        check_size(jpeg.jpeg_size(io.BytesIO(content), path), path)
+    else:  # of another kind the size is known only to its decoder
+        raise SceneError(f"{path}: expected a PNG or JPEG image, but got a file of another kind")
     try:
         pixels = iio.imread(content, plugin="pillow", mode="RGBA")
     except Exception as error:  # decoders raise OSError, SyntaxError, struct.error and more
@@ -71,10 +80,43 @@ def read_image(path: Path) -> Tensor:
     return torch.from_numpy(np.array(pixels))
 
 
-def write_png(path: Path, rgba: Tensor | np.ndarray) -> None:
-    """Write uint8 (H, W, 4) as an RGBA PNG, whole or not at all."""
+def read_sized(path: Path, size: tuple[int, int]) -> Tensor:
+    """``read_image`` of a file that must hold ``size`` (width, height); SceneError where it does not."""
+    pixels = read_image(path)
+    if (pixels.shape[1], pixels.shape[0]) != size:
+        got = f"{pixels.shape[1]} x {pixels.shape[0]}"
+        raise SceneError(f"{path}: expected {size[0]} x {size[1]} pixels, but got {got}")
+    return pixels
+
+
+def check_size(size: tuple[int, int], path: Path) -> None:
+    """Refuse an image without pixels or with absurdly many, before it is decoded."""
+    if not 0 < size[0] * size[1] <= _MOST_PIXELS:
+        got = f"{size[0]} x {size[1]}"
+        raise SceneError(f"{path}: expected an image of 1 to {_MOST_PIXELS} pixels, but got {got}")
+
+
+def read_gray16(path: Path) -> np.ndarray:
+    """A decoded grey PNG of 16 bits a pixel, uint16 (H, W).
+
+    Raises:
+        SceneError: where the file is missing, harmed or of another kind.
+    """
+    content = _bytes(path)
+    _inspect(content, path, gray16=True)
+    try:
+        return np.asarray(iio.imread(content, plugin="pillow"), np.uint16)
+    except Exception as error:  # as in read_image
+        raise SceneError(
+            f"{path}: expected an image, but got data that cannot be decoded ({error})"
+        ) from error
+
+
+def write_png(path: Path, pixels: Tensor | np.ndarray) -> None:
+    """Write uint8 (H, W, 4) or (H, W, 3) as a PNG with or without alpha, whole or not at all."""
+    mode = "RGBA" if pixels.shape[-1] == 4 else "RGB"
     replace_file(
-        path, iio.imwrite("<bytes>", np.asarray(rgba), extension=".png", plugin="pillow", mode="RGBA")
+        path, iio.imwrite("<bytes>", np.asarray(pixels), extension=".png", plugin="pillow", mode=mode)
     )
 
 
@@ -106,39 +148,31 @@ def composited(rgba: Tensor, background: Tensor) -> Tensor:
 
 
 class CachedImage:
-    """An image decoded at its first use and kept, uint8 (H, W, 4); treat it as read-only.
+    """An image decoded at its first use and kept while there is room, uint8 (H, W, 4); it is read-only.
 
     ``size`` (width, height) is what the file must hold; with ``halve`` half of that is given.
     """
 
     def __init__(self, path: Path, size: tuple[int, int], halve: bool = False) -> None:
         self.path, self.size, self.halve = path, size, halve
-        self._pixels: Tensor | None = None
 
     def __call__(self) -> Tensor:
         """The pixels; raises SceneError where the file cannot be decoded or has another size."""
-        if self._pixels is None:
-            pixels = read_image(self.path)
-            if (pixels.shape[1], pixels.shape[0]) != self.size:
-                got = f"{pixels.shape[1]} x {pixels.shape[0]}"
-                raise SceneError(
-                    f"{self.path}: expected {self.size[0]} x {self.size[1]} pixels, but got {got}"
-                )
-            self._pixels = halved(pixels) if self.halve else pixels
-        return self._pixels
+        return CACHE.get(self, self._decode)
+
+    def _decode(self) -> Tensor:
+        pixels = read_sized(self.path, self.size)
+        return halved(pixels) if self.halve else pixels
 
 
 def _bytes(path: Path) -> bytes:
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise SceneError(f"{path}: expected an image, but got {error.strerror or error}") from error
+    content = read_bytes(path, _MOST_BYTES, "an image")
     if not content:
         raise SceneError(f"{path}: expected an image, but got an empty file")
     return content
 
 
-def _inspect(content: bytes, path: Path) -> PngHeader:
+def _inspect(content: bytes, path: Path, gray16: bool = False) -> PngHeader:
     if content[:8] != _SIGNATURE:
         raise SceneError(f"{path}: expected a PNG image, but got a file of another kind")
     at, kind, header, transparent = 8, b"", b"", False
@@ -159,6 +193,9 @@ def _inspect(content: bytes, path: Path) -> PngHeader:
     if len(header) != 13:
         raise SceneError(f"{path}: expected a PNG image, but got one without a header")
     width, height, bits, color = struct.unpack(">IIBB", header[:10])
-    if bits > 8:
+    check_size((width, height), path)
+    if gray16 and (bits, color) != (16, 0):
+        raise SceneError(f"{path}: expected a grey PNG of 16 bits a pixel, but got {bits} bits a channel")
+    if bits > 8 and not gray16:
         raise SceneError(f"{path}: expected 8 bits a channel, but got {bits}; convert the image")
     return PngHeader((width, height), transparent or color in (4, 6))

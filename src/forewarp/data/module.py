@@ -9,8 +9,12 @@ from pathlib import Path
 
 from lightning import LightningDataModule
 
-from forewarp.data import dnerf
+from forewarp.data import dnerf, hypernerf, lego_complete, nhr, posed_video
 from forewarp.data.batches import RayBatches, Targets, color_of
+from forewarp.data.cache import CACHE
+from forewarp.data.canonical import with_canonical
+from forewarp.data.fingerprint import fingerprint
+from forewarp.data.held import hold_out
 from forewarp.scene.batch import Target
 from forewarp.scene.errors import SceneError
 from forewarp.scene.frame import Scene
@@ -25,9 +29,14 @@ class SceneDataModule(LightningDataModule):
     Args:
         read: gives the scene; called once, at the first use.
         rays: per batch.
-        background: behind training rays: white, black or random (a colour per ray, needs alpha).
+        background: behind training rays: white, black or random (a colour per ray).
         eval_background: behind whole images: white or black.
         seed: of the pixels, the background colours and the default choice of frames.
+        views_per_step: training frames of one time that a batch's rays are shared out among.
+        cache_bytes: of decoded images to keep; of the process, so of several modules the last one's.
+        held_out: training frames set aside (``hold_out``).
+        canonical: ``middle``: the canonical time is the training time in the middle; None: the format's own.
+        place: the scene's folder, where it has one.
 
     ``picker`` may be set at any time: a callable that says from which training frame the next batch comes.
     """
@@ -40,16 +49,23 @@ class SceneDataModule(LightningDataModule):
         background: str = "white",
         eval_background: str = "white",
         seed: int = 0,
+        views_per_step: int = 1,
+        cache_bytes: int = 1_500_000_000,
+        held_out: int = 0,
+        canonical: str | None = None,
+        place: str | Path | None = None,
     ) -> None:
         super().__init__()
-        self._read = read
-        self._draw = {"rays": rays, "background": background, "seed": seed}
+        self.place = None if place is None else Path(place)
+        self._read, self.cache_bytes, self.held_out = read, cache_bytes, held_out
+        self._canonical = canonical
+        self._draw = {"rays": rays, "background": background, "seed": seed, "views_per_step": views_per_step}
         self.eval_background = eval_background
 
     @cached_property
     def scene(self) -> Scene:
         """The scene, whose protocol names the background that it is measured on."""
-        scene = self._read()
+        scene = hold_out(with_canonical(self._read(), self._canonical), self.held_out)
         behind = self.eval_background if scene.has_alpha else "none"
         return replace(scene, protocol={**scene.protocol, "background": behind})
 
@@ -70,12 +86,13 @@ class SceneDataModule(LightningDataModule):
     def setup(self, stage: str | None = None) -> None:
         """Read the scene, once, and refuse settings that it does not allow."""
         color_of(self.eval_background)
+        CACHE.resize(self.cache_bytes)
         _ = self.batches
 
     def targets(self, split: str) -> Targets:
-        """The whole images of ``train``, ``val`` or ``test``."""
-        if split not in ("train", "val", "test"):
-            raise SceneError(f"split: expected train, val or test, but got {split!r}")
+        """The whole images of ``train``, ``val``, ``test`` or ``held``."""
+        if split not in ("train", "val", "test", "held"):
+            raise SceneError(f"split: expected train, val, test or held, but got {split!r}")
         return Targets(getattr(self.scene, split), color_of(self.eval_background), self.scene.has_alpha)
 
     def train_dataloader(self) -> RayBatches:
@@ -95,6 +112,10 @@ class SceneDataModule(LightningDataModule):
         """Let the next batches be those of stream ``number``, whatever was drawn before."""
         self.batches.restart(number)
 
+    def fingerprint(self) -> dict | None:
+        """What the scene's files are now (see ``data.fingerprint``); None where there are none."""
+        return None if self.place is None else fingerprint(self.place)
+
     def state_dict(self) -> dict:
         """What an interrupted run needs to draw on bit for bit."""
         return self.batches.state_dict()
@@ -106,6 +127,8 @@ class SceneDataModule(LightningDataModule):
 
 class DNeRFDataModule(SceneDataModule):
     """The D-NeRF scene ``root/scene``; arguments as in ``dnerf.read_scene`` and ``SceneDataModule``."""
+
+    _reader = staticmethod(dnerf.read_scene)
 
     def __init__(
         self,
@@ -119,4 +142,70 @@ class DNeRFDataModule(SceneDataModule):
         **common,
     ) -> None:
         options = {"half_resolution": half_resolution, "box": box, "near": near, "far": far}
-        super().__init__(partial(dnerf.read_scene, root, scene, **options), **common)
+        super().__init__(partial(self._reader, root, scene, **options), place=Path(root) / scene, **common)
+
+
+class LegoCompleteDataModule(DNeRFDataModule):
+    """The Lego Complete scene ``root/scene``; arguments as in ``DNeRFDataModule``."""
+
+    _reader = staticmethod(lego_complete.read_scene)
+
+
+class NHRDataModule(SceneDataModule):
+    """The NHR scene ``root/scene``; arguments as in ``nhr.read_scene`` and ``SceneDataModule``."""
+
+    def __init__(
+        self,
+        root: str | Path,
+        scene: str,
+        *,
+        half_resolution: bool = True,
+        box: Sequence[float] | None = None,
+        frames: int = 100,
+        test_views: Sequence[int] | None = None,
+        test_every: int = 1,
+        **common,
+    ) -> None:
+        options = {"half_resolution": half_resolution, "box": box, "frames": frames}
+        options |= {"test_views": test_views, "test_every": test_every}
+        super().__init__(partial(nhr.read_scene, root, scene, **options), place=Path(root) / scene, **common)
+
+
+class PosedVideoDataModule(SceneDataModule):
+    """The capture ``root/scene``; arguments as in ``posed_video.read_scene`` and ``SceneDataModule``."""
+
+    def __init__(
+        self,
+        root: str | Path,
+        scene: str,
+        *,
+        scale: int = 1,
+        near: float | None = None,
+        far: float | None = None,
+        box: Sequence[float] | None = None,
+        normalise: bool = True,
+        canonical: str = "middle",
+        test_every: int = 8,
+        **common,
+    ) -> None:
+        options = {"scale": scale, "near": near, "far": far, "box": box, "normalise": normalise}
+        options |= {"canonical": canonical, "test_every": test_every}
+        super().__init__(
+            partial(posed_video.read_scene, root, scene, **options), place=Path(root) / scene, **common
+        )
+
+
+class HyperNeRFDataModule(SceneDataModule):
+    """The capture ``root/scene``; arguments as in ``hypernerf.read_scene`` and ``SceneDataModule``."""
+
+    def __init__(
+        self,
+        root: str | Path,
+        scene: str,
+        *,
+        scale: int = 2,
+        box: Sequence[float] | None = None,
+        **common,
+    ) -> None:
+        read = partial(hypernerf.read_scene, root, scene, scale=scale, box=box)
+        super().__init__(read, place=Path(root) / scene, **common)

@@ -3,31 +3,45 @@
 from __future__ import annotations
 
 import io
+import math
 import zipfile
 from pathlib import Path
+from reprlib import repr as short
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from forewarp.data.files import replace_file
-from forewarp.data.images import halved_depth
+from forewarp.data.files import read_bytes, replace_file
+from forewarp.data.images import halved_depth, read_gray16
+from forewarp.data.views import MOST_UNITS
 from forewarp.scene.errors import SceneError
 from forewarp.scene.frame import Truth
 
+_MOST_BYTES = 1 << 30  # of arrays, unpacked
+
 
 class StoredDepth:
-    """Ray depth in a .npy file, (H, W) float32 in world units, 0 on the background; read at each call.
+    """Ray depth (H, W) float32 in world units, 0 on the background; read at each call.
 
-    ``size`` (width, height) is what the file must hold; with ``halve`` half of that is given.
+    A .npy file, or a grey 16-bit PNG whose values times ``scale`` are world units (which ``scale`` that is
+    must be known: None is refused). ``size`` (width, height) is what the file must hold; with ``halve`` half
+    of that is given.
     """
 
-    def __init__(self, path: Path, size: tuple[int, int], halve: bool = False) -> None:
-        self.path, self.size, self.halve = path, size, halve
+    def __init__(
+        self, path: Path, size: tuple[int, int], halve: bool = False, scale: float | None = None
+    ) -> None:
+        if path.suffix == ".png" and scale is None:
+            raise SceneError(
+                f"{path}: expected depth_scale in the transforms file, world units for one step of a 16-bit "
+                "depth, but got none"
+            )
+        self.path, self.size, self.halve, self.scale = path, size, halve, scale
 
     def __call__(self) -> Tensor:
         """The depth; raises SceneError where the file holds anything else."""
-        depth = _load(self.path)
+        depth = read_gray16(self.path) if self.path.suffix == ".png" else load_numpy(self.path)
         expected = f"{self.path}: expected finite depths >= 0 of shape {self.size[::-1]}"
         if (
             not isinstance(depth, np.ndarray)
@@ -35,9 +49,13 @@ class StoredDepth:
             or depth.dtype.kind not in "iuf"
         ):
             raise SceneError(f"{expected}, but got shape {getattr(depth, 'shape', None)}")
+        with np.errstate(
+            over="ignore", invalid="ignore"
+        ):  # what is too large for float32 is refused as infinite
+            depth = (depth * (1.0 if self.scale is None else self.scale)).astype(np.float32)
         if not np.isfinite(depth).all() or (depth < 0).any():
             raise SceneError(f"{expected}, but got values from {depth.min()} to {depth.max()}")
-        tensor = torch.from_numpy(depth.astype(np.float32))
+        tensor = torch.from_numpy(depth)
         return halved_depth(tensor) if self.halve else tensor
 
 
@@ -56,7 +74,7 @@ def read_truth(path: Path, canonical_time: float) -> Truth | None:
     """
     if not path.exists():
         return None
-    arrays = _load(path)
+    arrays = load_numpy(path)
     names = set(getattr(arrays, "files", ()))
     if not {"points", "times"} <= names:
         raise SceneError(f"{path}: expected arrays points and times, but got {sorted(names)}")
@@ -79,22 +97,48 @@ def write_truth(path: Path, truth: Truth) -> None:
     replace_file(path, buffer.getvalue())
 
 
-def _load(path: Path):
+def load_numpy(path: Path):
+    """What a .npy or .npz file holds, no objects; SceneError where it cannot be read."""
     try:
-        return np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        content = read_bytes(path, _MOST_BYTES, "a NumPy file")
+        if zipfile.is_zipfile(io.BytesIO(content)):
+            with zipfile.ZipFile(io.BytesIO(content)) as archive:
+                unpacked = sum(part.file_size for part in archive.infolist())
+            if unpacked > _MOST_BYTES:
+                raise ValueError(f"{unpacked} bytes unpacked")
+        elif content.startswith(b"\x93NUMPY"):
+            _check_length(content)
+        return np.load(io.BytesIO(content), allow_pickle=False)
+    except SceneError:
+        raise
+    except Exception as error:  # OSError, ValueError, MemoryError, BadZipFile, zlib.error and more
         raise SceneError(
-            f"{path}: expected a NumPy file, but got one that cannot be read ({error})"
+            f"{path}: expected a NumPy file, but got one that cannot be read ({short(str(error))})"
         ) from error
+
+
+def _check_length(content: bytes) -> None:
+    """Refuse a .npy file whose header promises more than is there, before room is made for it."""
+    stream = io.BytesIO(content)
+    major, _ = np.lib.format.read_magic(stream)
+    read = np.lib.format.read_array_header_1_0 if major == 1 else np.lib.format.read_array_header_2_0
+    shape, _, kind = read(stream)
+    if math.prod(shape) * kind.itemsize > len(content):
+        raise ValueError(f"an array of {shape} in {len(content)} bytes")
 
 
 def _numbers(arrays, name: str, path: Path) -> np.ndarray:
     try:
         array = arrays[name]
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        if not isinstance(array, np.ndarray):  # of a member of an archive that is none NumPy gives the bytes
+            raise ValueError("no NumPy header")
+    except Exception as error:  # as in load_numpy
         raise SceneError(
-            f"{path}: {name}: expected an array, but got one that cannot be read ({error})"
+            f"{path}: {name}: expected an array, but got one that cannot be read ({short(str(error))})"
         ) from error
-    if array.dtype.kind not in "iuf" or not np.isfinite(array).all():
-        raise SceneError(f"{path}: {name}: expected finite numbers, but got {array.dtype}")
+    with np.errstate(invalid="ignore"):  # of a NaN of the signalling kind even comparing warns
+        good = array.dtype.kind in "iuf" and bool((np.abs(array) <= MOST_UNITS).all())
+    if not good:
+        expected = f"numbers within {MOST_UNITS:g}"
+        raise SceneError(f"{path}: {name}: expected finite {expected}, but got {array.dtype} with others")
     return array

@@ -13,6 +13,8 @@ from forewarp.scene.box import Box
 from forewarp.scene.camera import Camera
 from forewarp.scene.errors import SceneError
 
+MOST_UNITS = 1e9  # from the origin: farther off single precision is long lost
+_SAME_PIXEL = 0.01
 # Poses are stored with six digits or more; a scale or a shear in a pose is never this small.
 _ROTATION_TOLERANCE = 1e-3
 
@@ -31,6 +33,9 @@ def pose_of(value: object, where: str) -> np.ndarray:
         raise SceneError(f"{where}: expected 4 x 4 finite numbers, but got {short(value)}; check the export")
     matrix = matrix.astype(np.float64)
     rotation = matrix[:3, :3]
+    if np.abs(matrix).max() > MOST_UNITS:
+        largest = np.abs(matrix).max()
+        raise SceneError(f"{where}: expected a place within {MOST_UNITS:g} units, but got {largest:g}")
     error = np.abs(rotation @ rotation.T - np.eye(3)).max()
     determinant = np.linalg.det(rotation)
     if error > _ROTATION_TOLERANCE or determinant < 0:
@@ -62,10 +67,8 @@ def frustum_box(cameras: Iterable[Camera]) -> Box:
     points = []
     for camera in cameras:
         # Not corners alone: of rays of one length those through the middle of an edge reach further sideways.
-        columns = torch.tensor([0, camera.width // 2, camera.width - 1])
-        rows = torch.tensor([0, camera.height // 2, camera.height - 1])
-        pixels = rows[:, None] * camera.width + columns
-        rays = camera.rays(pixels.flatten(), dtype=torch.float64)
+        pixels = _nine_pixels(camera)
+        rays = camera.rays(pixels, dtype=torch.float64)
         points += [rays.origins + distance * rays.directions for distance in (camera.near, camera.far)]
     cloud = torch.cat(points)
     return Box(tuple(cloud.amin(0).tolist()), tuple(cloud.amax(0).tolist()))
@@ -73,5 +76,39 @@ def frustum_box(cameras: Iterable[Camera]) -> Box:
 
 def check_range(near: float, far: float) -> None:
     """Refuse a range of distances that is empty, negative or endless."""
-    if not number(near, "data.near", 0) < number(far, "data.far", 0):
+    if not number(near, "data.near", 0, MOST_UNITS) < number(far, "data.far", 0, MOST_UNITS):
         raise SceneError(f"data.near, data.far: expected near < far, but got {near} and {far}")
+
+
+def middle_of(times: Iterable[float]) -> float:
+    """The time nearest to the middle between first and last, the earlier of two as near.
+
+    >>> middle_of([0.0, 0.1, 0.2, 0.8, 1.0])
+    0.2
+    """
+    times = sorted(set(times))
+    return min(times, key=lambda time: round(abs(time - 0.5 * (times[0] + times[-1])), 9))
+
+
+def check_lens(camera: Camera, where: str) -> None:
+    """Refuse a lens that cannot be undone all over the picture, which would give rays that mean nothing.
+
+    Cost: nine points of Newton's method.
+    """
+    if camera.lens is None:
+        return
+    pixels = _nine_pixels(camera)
+    u, v = pixels % camera.width + 0.5, torch.div(pixels, camera.width, rounding_mode="floor") + 0.5
+    again, _ = camera.project(camera.center + camera.directions(u, v))
+    if not bool(((again - torch.stack([u, v], -1)).abs() < _SAME_PIXEL).all()):
+        raise SceneError(
+            f"{where}: expected a lens that can be undone all over the picture, but got k={camera.lens.k} "
+            f"and p={camera.lens.p}; undistort the images"
+        )
+
+
+def _nine_pixels(camera: Camera) -> torch.Tensor:
+    """The flat indices (9,) of corners, middles of edges and centre."""
+    columns = torch.tensor([0, camera.width // 2, camera.width - 1])
+    rows = torch.tensor([0, camera.height // 2, camera.height - 1])
+    return (rows[:, None] * camera.width + columns).flatten()

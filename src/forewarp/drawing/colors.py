@@ -37,7 +37,8 @@ def depth_colors(depth: Tensor, opacity: Tensor) -> Tensor:
     if not len(solid):
         return depth.new_ones(*depth.shape, 3)
     near, far = torch.quantile(solid[:: max(1, len(solid) // 100_000)], depth.new_tensor([0.01, 0.99]))
-    colors = ramp((far - depth) / (far - near).clamp(min=1e-6), _DEPTH)
+    span = torch.maximum(far - near, 1e-6 * far).clamp(min=torch.finfo(depth.dtype).tiny)
+    colors = ramp((far - depth) / span, _DEPTH)
     return torch.lerp(torch.ones_like(colors), colors, opacity[..., None].clamp(0, 1))
 
 

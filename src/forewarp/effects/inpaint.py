@@ -94,4 +94,4 @@ class UNet3d(nn.Module):
 
     def residual(self, features: Tensor) -> Tensor:
         """Features (1, width, x, y, z) -> what to add to the warped grid (1, 1 + C, x, y, z)."""
-        return self.head(features)
+        return self.head(features).to(self.head.weight.dtype)  # half precision ends with the convolutions

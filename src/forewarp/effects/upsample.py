@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
+from torch.utils.checkpoint import checkpoint
 
 from forewarp.effects.dense import Crop, densify, occupied_crop, sparsify
 from forewarp.effects.inpaint import ConvBlock, zero_head
@@ -62,28 +64,48 @@ class LearnedUpsampler(TrilinearUpsampler):
         channels: 1 + C of the radiance grid.
         width: channels of the features that it refines (an inpainter's, or the warped grid's own).
         margin: voxels around the occupied box.
+        recompute: hold one volume of the fine resolution for the backward pass and compute the other four
+            again there, for a third more of the convolutions' time.
     """
 
     def __init__(
-        self, *, scale: int = 2, channels: int, width: int = 16, margin: int = 2, features: int = 0
+        self,
+        *,
+        scale: int = 2,
+        channels: int,
+        width: int = 16,
+        margin: int = 2,
+        features: int = 0,
+        recompute: bool = True,
     ) -> None:
         super().__init__(scale=scale)
         if int(scale) != scale:
             raise ValueError(
                 f"model.upsampler.scale: the learned layer expects a whole number, but got {scale}"
             )
-        self.scale, self.margin = int(scale), margin
+        self.scale, self.margin, self.recompute = int(scale), margin, recompute
         self.project = nn.Conv3d(features or channels, width, 1)
         self.layers = nn.Sequential(ConvBlock(width, width), ConvBlock(width, width))
         self.head = zero_head(width, channels)
 
     def residual(self, features: Tensor, crop: Crop) -> Tensor:
         """Coarse features (1, F, x, y, z) of ``crop`` -> detail (1, 1 + C, x', y', z') of the fine crop."""
+        first, second = self.layers
+
+        def refine(coarse: Tensor) -> Tensor:
+            return first(interpolate_dense(coarse, crop, self.scale))
+
+        def finish(fine: Tensor) -> Tensor:
+            return self.head(second(fine))
+
         # Project to few channels before the fine resolution, where all the cost is.
-        fine = functional.interpolate(
-            self.project(features), size=crop.scaled(self.scale).shape, mode="trilinear", align_corners=True
-        )
-        return self.head(self.layers(fine))
+        detail = self._held(finish, self._held(refine, self.project(features)))
+        return detail.to(self.head.weight.dtype)  # half precision ends with the convolutions
+
+    def _held(self, part: Callable[[Tensor], Tensor], volume: Tensor) -> Tensor:
+        if not self.recompute:
+            return part(volume)
+        return checkpoint(part, volume, use_reentrant=False, preserve_rng_state=False)
 
     def alone(self, grid: RadianceGrid) -> RadianceGrid:
         """Up-sample without an inpainter: interpolation plus learned detail."""

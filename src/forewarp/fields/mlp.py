@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
-from torch import nn
+import torch
+from torch import Tensor, nn
+
+
+class Network(nn.Sequential):
+    """Layers that stay in full precision under autocast: eight bits of a trajectory are a blur of a voxel."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(..., I) -> (..., O), never in half precision."""
+        with torch.autocast(x.device.type, enabled=False):
+            return super().forward(x.float() if x.dtype in (torch.float16, torch.bfloat16) else x)
 
 
 def mlp(
     inputs: int, outputs: int, *, width: int, layers: int, zero_last: bool = False, leaky: bool = False
-) -> nn.Sequential:
+) -> Network:
     """``layers`` linear layers, ReLU between them.
 
     Args:
@@ -31,4 +41,4 @@ def mlp(
     if zero_last:
         nn.init.zeros_(parts[-1].weight)
         nn.init.zeros_(parts[-1].bias)
-    return nn.Sequential(*parts)
+    return Network(*parts)

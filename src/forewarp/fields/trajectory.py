@@ -25,7 +25,7 @@ class TrajectoryField(nn.Module):
         bases: K, at most ``frames - 1``.
         frames: T, the number of distinct training times.
         canonical_time: where flow is exactly 0.
-        nodes: about how many nodes along the box's mean side; 0 for none.
+        nodes: about how many nodes along the box's mean side, at least 8; 0 for none.
         features: channels of the deformation feature grid; 0 for none.
         width, layers, frequencies: of F2 and its encoding.
         padding: see ``dct_basis``: lets things move at the first and last frame.
@@ -88,7 +88,7 @@ class TrajectoryField(nn.Module):
         Cost: F2 on the nodes around the active voxels, then one trilinear read a voxel.
         """
         points, (nodes, index, coordinates) = self._around(voxels)
-        at_nodes = self.coefficients(nodes if self.at_nodes else points) @ self._basis(time)
+        at_nodes = _matmul(self.coefficients(nodes if self.at_nodes else points), self._basis(time))
         if not self.at_nodes:
             return at_nodes
         return trilinear(at_nodes, index, coordinates, at_nodes.new_zeros(3))
@@ -110,10 +110,16 @@ class TrajectoryField(nn.Module):
     def trajectories(self, points: Tensor, times: Tensor) -> Tensor:
         """Paths (N, T, 3) of canonical points (N, 3) at ``times`` (T,), world units."""
         if not self.at_nodes:
-            flow = self.coefficients(points) @ self._basis(times).T  # (N, 3, T)
+            flow = _matmul(self.coefficients(points), self._basis(times).T)  # (N, 3, T)
             return points[:, None] + flow.transpose(1, 2)
         nodes, index, coordinates = self._nodes_around(points)
         at_nodes = self.coefficients(nodes).flatten(1)
         read = trilinear(at_nodes, index, coordinates, at_nodes.new_zeros(at_nodes.shape[1]))
-        flow = read.reshape(-1, 3, self.bases) @ self._basis(times).T
+        flow = _matmul(read.reshape(-1, 3, self.bases), self._basis(times).T)
         return points[:, None] + flow.transpose(1, 2)
+
+
+def _matmul(coefficients: Tensor, basis: Tensor) -> Tensor:
+    """``coefficients @ basis``, where autocast must not take what ``Network`` kept from it."""
+    with torch.autocast(coefficients.device.type, enabled=False):
+        return coefficients @ basis

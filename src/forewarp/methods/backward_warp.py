@@ -7,13 +7,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from forewarp.effects.background import StaticBackground, Together
 from forewarp.fields.mlp import mlp
 from forewarp.fields.radiance import DirectRadiance
 from forewarp.methods.checks import check_effect
 from forewarp.ops.encode import positional_encoding
 from forewarp.ops.grid import dilate
 from forewarp.scene.box import Box, Lattice
-from forewarp.scene.state import RadianceGrid, State
+from forewarp.scene.state import RadianceGrid, State, View
 
 
 class Deformation(nn.Module):
@@ -84,9 +85,9 @@ class MovedField:
         moved = self._moved(points)
         return self.canonical.density(moved) * self._inside(moved.detach())
 
-    def features(self, points: Tensor) -> Tensor:
-        """Colour features (P, C)."""
-        return self.canonical.features(self._moved(points))
+    def colors(self, points: Tensor, directions: Tensor, view: View | None) -> Tensor:
+        """Colour (P, 3), seen along the directions as they are."""
+        return self.canonical.colors(self._moved(points), directions, view)
 
 
 class BackwardWarp(nn.Module):
@@ -96,6 +97,7 @@ class BackwardWarp(nn.Module):
         radiance: the canonical radiance field.
         deformation: to the canonical time; None: a static radiance field.
         view: None: the colour features are the colour.
+        background: as in ``ForwardWarp``.
         canonical_time: where nothing is displaced.
         mask_nodes: side of the lattice on which occupancy at a time is looked up.
     """
@@ -107,27 +109,32 @@ class BackwardWarp(nn.Module):
         canonical_time: float,
         deformation: Deformation | None,
         view: nn.Module | None = None,
+        background: StaticBackground | None = None,
         mask_nodes: int = 32,
     ) -> None:
         super().__init__()
         check_effect("deformation", deformation, "model=backward or another model")
         check_effect("view", view, "model/view=none")
+        check_effect("background", background, "model/background=none")
         self.radiance, self.deformation, self.view = radiance, deformation, view
+        self.background = background
         self.canonical_time, self.mask_nodes = canonical_time, mask_nodes
 
     def at(self, time: float) -> State:
-        """The moved canonical field, under the name ``backward``."""
+        """The moved canonical field, at the canonical time that itself, under the name ``backward``."""
         canonical = field = self.radiance()
-        if self.deformation is not None:
+        if self.deformation is not None and time != self.canonical_time:
             field = MovedField(canonical, self.deformation, time, self._cells(canonical, time))
-        return State(time, {"backward": field}, canonical)
+        still = None
+        if self.background is not None:
+            still = self.background()
+            field = Together(field, still)
+        return State(time, {"backward": field}, canonical, background=still)
 
     @torch.no_grad()
     def _cells(self, canonical: RadianceGrid, time: float) -> Tensor:
         """Cells at ``time`` that the displacement carries near an occupied canonical cell."""
         source = canonical.cells
-        if time == self.canonical_time:
-            return source
         lattice = canonical.lattice
         coarse = Lattice(lattice.box, tuple(min(n, self.mask_nodes) for n in lattice.shape))
         nodes = coarse.to_world(coarse.all_voxels(source.device))
@@ -157,3 +164,17 @@ class BackwardWarp(nn.Module):
                 at = points - self.deformation(at, time)
             paths.append(at)
         return torch.stack(paths, 1)
+
+    @property
+    def moves(self) -> bool:
+        """Whether there is a motion to learn."""
+        return self.deformation is not None
+
+    def displacement(self, points: Tensor, time: float) -> Tensor:
+        """From points (N, 3) at ``time`` to where they were at the canonical time (N, 3); differentiable."""
+        return self.deformation(points, time)
+
+    @property
+    def unit(self) -> float:
+        """Half the scene's longest side, world units."""
+        return self.deformation.scale

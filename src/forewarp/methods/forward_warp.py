@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from forewarp.effects.background import StaticBackground, Together
 from forewarp.effects.dense import densify, occupied_crop, sparsify
 from forewarp.effects.inpaint import UNet3d
 from forewarp.effects.motion import Motion
@@ -23,6 +24,7 @@ class ForwardWarp(nn.Module):
         upsampler: None: rendered at the resolution of the warp.
         inpainter: None: one rendering instead of two.
         view: None: the colour features are the colour.
+        background: all that stands still, on a grid of its own; None: a constant colour is behind everything.
         canonical_time: where no warp is needed.
     """
 
@@ -35,9 +37,11 @@ class ForwardWarp(nn.Module):
         upsampler: TrilinearUpsampler | None = None,
         inpainter: UNet3d | None = None,
         view: nn.Module | None = None,
+        background: StaticBackground | None = None,
     ) -> None:
         super().__init__()
         effects = {"motion": motion, "upsampler": upsampler, "inpainter": inpainter, "view": view}
+        effects["background"] = background
         for name, effect in effects.items():
             check_effect(name, effect, f"model/{name}=none")
             setattr(self, name, effect)
@@ -60,7 +64,12 @@ class ForwardWarp(nn.Module):
             fields, difference = {"upsampled": self._upsample(warped)}, None
         else:
             fields, difference = self._inpaint(warped, coverage)
-        return State(time, fields, canonical, flow, coverage, dropped, difference)
+        still = None
+        if self.background is not None:
+            still = self.background()
+            fields = {name: Together(field, still) for name, field in fields.items()}
+        length = 2 / 3 * self.unit if self.moves else 1.0
+        return State(time, fields, canonical, flow, coverage, dropped, difference, still, length)
 
     def _upsample(self, warped: RadianceGrid) -> RadianceGrid:
         if self.upsampler is None:
@@ -100,3 +109,17 @@ class ForwardWarp(nn.Module):
         if self.motion is None:
             return points[:, None].expand(-1, len(times), -1)
         return self.motion.trajectory.trajectories(points, times)
+
+    @property
+    def moves(self) -> bool:
+        """Whether there is a motion to learn."""
+        return self.motion is not None
+
+    def displacement(self, points: Tensor, time: float) -> Tensor:
+        """From canonical points (N, 3) to where they are at ``time`` (N, 3), world units; differentiable."""
+        return self.trajectories(points, points.new_tensor([time]))[:, 0] - points
+
+    @property
+    def unit(self) -> float:
+        """Half the scene's longest side, world units."""
+        return self.motion.trajectory.scale

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from torch import Tensor, nn
 
+from forewarp.effects.background import StaticBackground
 from forewarp.effects.motion import Motion
 from forewarp.effects.upsample import LearnedUpsampler, TrilinearUpsampler
 from forewarp.fields.trajectory import TrajectoryField
@@ -31,11 +32,12 @@ class MethodSpec:
     inpainter: Callable[..., nn.Module] | None = None
     view: Callable[..., nn.Module] | None = None
     deformation: Callable[..., Deformation] | None = None
+    background: Callable[..., StaticBackground] | None = None
 
     def __post_init__(self) -> None:
         if self.warp not in ("forward", "backward"):
             raise ValueError(f"model.warp: expected forward or backward, but got '{self.warp}'")
-        for name in ("motion", "trajectory", "upsampler", "inpainter", "view", "deformation"):
+        for name in ("motion", "trajectory", "upsampler", "inpainter", "view", "deformation", "background"):
             choice = getattr(self, name)
             if choice is not None and not callable(choice):
                 raise ValueError(
@@ -60,6 +62,7 @@ class MethodSpec:
         canonical_time: float,
         effects: Sequence[str],
         upsample: float | None = None,
+        still: tuple[Lattice, Tensor] | None = None,
     ) -> ForwardWarp | BackwardWarp:
         """The method on a lattice.
 
@@ -72,15 +75,19 @@ class MethodSpec:
             canonical_time: in [0, 1].
             effects: those that this stage uses, where the model has them.
             upsample: plain interpolation by this factor in place of the model's up-sampler; forward only.
+            still: lattice and active voxels of the static background; needed where the model has one.
         """
         view = self.view() if self.view is not None and "view" in effects else None
         features = view.features if view is not None else 3
         radiance = self.radiance(lattice, active, features=features, unit=unit, box=scene_box)
+        background = None
+        if self.background is not None and "background" in effects:
+            background = self.background(*still, unit=unit)
+        common = {"canonical_time": canonical_time, "view": view, "background": background}
         if self.warp == "backward":
-            deformation = None
-            if frames > 1:
-                deformation = self.deformation(scene_box, canonical_time=canonical_time)
-            return BackwardWarp(radiance, canonical_time=canonical_time, deformation=deformation, view=view)
+            moves = frames > 1
+            deformation = self.deformation(scene_box, canonical_time=canonical_time) if moves else None
+            return BackwardWarp(radiance, deformation=deformation, **common)
         motion = None
         if self.motion is not None and frames > 1 and "motion" in effects:
             motion = self.motion(self.trajectory(scene_box, frames=frames, canonical_time=canonical_time))
@@ -88,14 +95,8 @@ class MethodSpec:
         if self.inpainter is not None and "inpainter" in effects:
             learned = upsample is None and "upsampler" in effects and self._learns_to_upsample
             inpainter = self.inpainter(channels=1 + features, head=not learned)
-        return ForwardWarp(
-            radiance,
-            canonical_time=canonical_time,
-            motion=motion,
-            upsampler=self._upsampler(features, inpainter, effects, upsample),
-            inpainter=inpainter,
-            view=view,
-        )
+        upsampler = self._upsampler(features, inpainter, effects, upsample)
+        return ForwardWarp(radiance, motion=motion, upsampler=upsampler, inpainter=inpainter, **common)
 
     @property
     def _learns_to_upsample(self) -> bool:

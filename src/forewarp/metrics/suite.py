@@ -15,7 +15,7 @@ from forewarp.scene.batch import Target
 ABILITIES = ("space", "time", "canonical", "all")
 DEPTH_METRICS = tuple(f"depth_delta_{threshold:g}" for threshold in depth.THRESHOLDS)
 LPIPS_METRICS = tuple(f"lpips_{net}" for net in lpips.NETS)
-METRICS = ("psnr", "ssim", "ms_ssim", "ms_ssim_legacy", *LPIPS_METRICS, *DEPTH_METRICS)
+METRICS = ("psnr", "psnr_box", "ssim", "ms_ssim", "ms_ssim_legacy", *LPIPS_METRICS, *DEPTH_METRICS)
 
 log = logging.getLogger(__name__)
 
@@ -25,6 +25,7 @@ class ImageSuite:
 
     Args:
         lpips: ``{"lpips_<net>": LPIPS or None}`` as ``find_lpips`` gives it; a None is left out.
+        mask_box: also score ``psnr_box``, inside the smallest rectangle that holds the foreground.
 
     ``absent`` says of every metric left out so far why; each is logged once.
 
@@ -32,7 +33,8 @@ class ImageSuite:
         ValueError: a name that is not ``lpips_<net>``, or that names another net than its module.
     """
 
-    def __init__(self, lpips: Mapping[str, LPIPS | None] | None = None) -> None:
+    def __init__(self, lpips: Mapping[str, LPIPS | None] | None = None, *, mask_box: bool = False) -> None:
+        self.mask_box = mask_box
         self.absent: dict[str, str] = {}
         self.lpips: dict[str, LPIPS] = {}
         for name, net in (lpips or {}).items():
@@ -64,6 +66,8 @@ class ImageSuite:
                 "ms_ssim": image.ms_ssim(prediction, target.rgb),
                 "ms_ssim_legacy": image.ms_ssim_legacy(prediction, target.rgb),
             }
+            if self.mask_box:
+                values["psnr_box"] = _box_score(prediction, target)
             values |= {name: net(prediction, target.rgb) for name, net in self.lpips.items()}
             if predicted_depth is not None and target.depth is not None:
                 values |= _depth_scores(predicted_depth, target)
@@ -118,9 +122,18 @@ def _depth_scores(predicted: Tensor, target: Target) -> dict[str, float | None]:
     return dict(zip(DEPTH_METRICS, fractions or [None] * len(DEPTH_METRICS)))
 
 
+def _box_score(prediction: Tensor, target: Target) -> float | None:
+    """PSNR inside the foreground's rectangle; None where there is no foreground."""
+    if target.foreground is None or not bool(target.foreground.any()):
+        return None
+    rows, columns = (target.foreground.any(axis).nonzero()[:, 0] for axis in (1, 0))
+    box = slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
+    return image.psnr(prediction[box], target.rgb[box])
+
+
 def _reason(name: str, target: Target) -> str:
     """Why an image has no score of this name."""
-    if name in DEPTH_METRICS:
+    if name in (*DEPTH_METRICS, "psnr_box"):
         return f"frame {target.frame.name} has no foreground"
     if name in LPIPS_METRICS:
         least = lpips.LPIPS_LEAST_SIDE

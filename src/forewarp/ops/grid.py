@@ -82,7 +82,9 @@ class _NumbaTrilinear(torch.autograd.Function):
         from forewarp.ops import kernels_grid as kernels
 
         match_threads()
-        ctx.save_for_backward(values, index, points, fill)
+        # The values serve only the points' gradient, and are large.
+        ctx.save_for_backward(values if ctx.needs_input_grad[2] else None, index, points, fill)
+        ctx.shape = values.shape
         out = values.new_empty(len(points), values.shape[1])
         kernels.gather(*(_array(v) for v in (values, index, points, fill, out)))
         return out
@@ -97,7 +99,7 @@ class _NumbaTrilinear(torch.autograd.Function):
         grad = grad.contiguous()
         grad_values = grad_points = None
         if ctx.needs_input_grad[0]:
-            parts = values.new_zeros(chunks, *values.shape)
+            parts = grad.new_zeros(chunks, *ctx.shape)
             kernels.gather_backward_values(*(_array(v) for v in (index, points, grad, parts)))
             grad_values = parts.sum(0) if chunks > 1 else parts[0]
         if ctx.needs_input_grad[2]:

@@ -1,4 +1,4 @@
-"""Numba kernels behind ``march``, by the rules of ``kernels_grid``."""
+"""Numba kernels behind ``march`` and ``trace``, by the rules of ``kernels_grid``."""
 
 from __future__ import annotations
 
@@ -6,63 +6,131 @@ import numpy as np
 from numba import njit, prange
 
 
-@njit(inline="always")
-def _slab(o, d, near, far, nx, ny, nz):
+@njit(cache=True)
+def _span(o, d, near, far, bounds):
+    """The stretch of a ray within ``bounds`` (2, 3); empty, its end before its start, where it misses."""
     t0, t1 = near, far
-    for k in range(3):
-        last = (nx, ny, nz)[k] - 1.0
-        if d[k] == 0.0:
-            if o[k] < 0.0 or o[k] > last:
+    for axis in range(3):
+        low, high = bounds[0, axis], bounds[1, axis]
+        if d[axis] == 0.0:
+            if o[axis] < low or o[axis] > high:
                 return 1.0, 0.0
         else:
-            a, b = -o[k] / d[k], (last - o[k]) / d[k]
+            a, b = (low - o[axis]) / d[axis], (high - o[axis]) / d[axis]
             t0, t1 = max(t0, min(a, b)), min(t1, max(a, b))
     return t0, t1
 
 
-@njit(parallel=True, cache=True)
-def march(
-    origins, directions, near, far, step, jitter, cells, blocks, block, counts, starts, ray_ids, distances
-):
-    """Samples in occupied cells only. With ``starts`` empty it counts, else it writes from ``starts[r]``."""
-    nx, ny, nz = cells.shape[0] + 1, cells.shape[1] + 1, cells.shape[2] + 1
-    for r in prange(origins.shape[0]):
-        o, d = origins[r], directions[r]
-        t0, t1 = _slab(o, d, near, far, nx, ny, nz)
-        found = 0
-        if t0 <= t1:
-            k = int(np.ceil((t0 - near) / step - jitter[r]))
-            k = max(k, 0)
-            t = near + (k + jitter[r]) * step
-            while t <= t1:
-                x = min(max(int(o[0] + t * d[0]), 0), nx - 2)
-                y = min(max(int(o[1] + t * d[1]), 0), ny - 2)
-                z = min(max(int(o[2] + t * d[2]), 0), nz - 2)
-                bx, by, bz = x // block, y // block, z // block
-                if blocks[bx, by, bz] == 0:
-                    exit_t = 1e30
-                    for axis in range(3):
-                        if d[axis] != 0.0:
-                            corner = (bx, by, bz)[axis] + (1 if d[axis] > 0 else 0)
-                            exit_t = min(exit_t, (corner * block - o[axis]) / d[axis])
-                    k = max(k + 1, int(np.floor((exit_t - near) / step - jitter[r])))
-                else:
-                    if cells[x, y, z]:
-                        if starts.shape[0]:
-                            ray_ids[starts[r] + found] = r
-                            distances[starts[r] + found] = t
-                        found += 1
-                    k += 1
-                t = near + (k + jitter[r]) * step
-        counts[r] = found
+@njit(cache=True)
+def _first(t, near, step, jitter):
+    """The first step at or after distance ``t``."""
+    return max(int(np.ceil((t - near) / step - jitter)), 0)
 
 
 @njit(cache=True)
-def pool_blocks(cells, blocks, block):
-    """blocks = 1 where one of their ``block`` cubed cells is."""
+def _leap(o, d, x, y, z, reach, block, end):
+    """The distance at which a ray leaves the empty blocks, ``reach`` of them all around the one it is in."""
+    for axis in range(3):
+        if d[axis] != 0.0:
+            at = (x, y, z)[axis] // block
+            corner = at + reach if d[axis] > 0 else at - reach + 1
+            leaves = (corner * block - o[axis]) / d[axis]
+            if leaves < end:
+                end = leaves
+    return end
+
+
+@njit(cache=True)
+def _seek(o, d, k, near, step, jitter, end, cells, reach, block):
+    """The next step from ``k`` on that lies in an occupied cell, and its distance; beyond ``end``: none."""
     nx, ny, nz = cells.shape
+    t = near + (k + jitter) * step
+    while t <= end:
+        x = min(max(int(o[0] + t * d[0]), 0), nx - 1)
+        y = min(max(int(o[1] + t * d[1]), 0), ny - 1)
+        z = min(max(int(o[2] + t * d[2]), 0), nz - 1)
+        blocks = reach[x // block, y // block, z // block]
+        if blocks == 0:
+            if cells[x, y, z]:
+                break
+            k += 1
+        else:
+            to = _leap(o, d, x, y, z, blocks, block, end + 2 * step)
+            k = max(k + 1, _first(to - 1e-6 * step, near, step, jitter))  # rounding must not leap too far
+        t = near + (k + jitter) * step
+    return k, t
+
+
+@njit(parallel=True, cache=True)
+def march(
+    origins, directions, near, far, step, jitter, cells, reach, bounds, block, counts, firsts, starts,
+    ray_ids, distances,
+):  # fmt: skip
+    """Samples in occupied cells only. With ``starts`` empty it counts and notes each ray's first step, else
+    it writes from ``starts[r]``.
+    """
+    counting = starts.shape[0] == 0
+    for r in prange(origins.shape[0]):
+        o, d = origins[r], directions[r]
+        t0, t1 = _span(o, d, near, far, bounds)
+        if t0 > t1 or (not counting and counts[r] == 0):
+            continue
+        k = _first(t0, near, step, jitter[r]) if counting else firsts[r]
+        found, t = 0, near
+        while True:
+            k, t = _seek(o, d, k, near, step, jitter[r], t1, cells, reach, block)
+            if not t <= t1:
+                break
+            if not counting:
+                ray_ids[starts[r] + found] = r
+                distances[starts[r] + found] = t
+            elif found == 0:
+                firsts[r] = k
+            found += 1
+            if not counting and found == counts[r]:
+                break
+            k += 1
+        if counting:
+            counts[r] = found
+
+
+@njit(cache=True)
+def pool_blocks(cells, reach, block, bounds):
+    """``reach``: how many blocks of ``block`` cubed cells from one to the nearest that holds an occupied
+    cell, diagonals counted as one; ``bounds`` (2, 3): what the occupied cells lie within, low > high if none.
+    """
+    nx, ny, nz = cells.shape
+    far = 255
+    reach[:] = far
+    bounds[0] = np.inf
+    bounds[1] = -np.inf
     for x in range(nx):
         for y in range(ny):
             for z in range(nz):
                 if cells[x, y, z]:
-                    blocks[x // block, y // block, z // block] = 1
+                    reach[x // block, y // block, z // block] = 0
+                    bounds[0, 0], bounds[1, 0] = min(bounds[0, 0], x), max(bounds[1, 0], x + 1)
+                    bounds[0, 1], bounds[1, 1] = min(bounds[0, 1], y), max(bounds[1, 1], y + 1)
+                    bounds[0, 2], bounds[1, 2] = min(bounds[0, 2], z), max(bounds[1, 2], z + 1)
+    _spread(reach, 1)
+    _spread(reach, -1)
+
+
+@njit(cache=True)
+def _spread(reach, sign):
+    """One sweep of the exact chessboard distance, forwards or backwards."""
+    nx, ny, nz = reach.shape
+    for i in range(nx):
+        x = i if sign > 0 else nx - 1 - i
+        for j in range(ny):
+            y = j if sign > 0 else ny - 1 - j
+            for k in range(nz):
+                z = k if sign > 0 else nz - 1 - k
+                least = int(reach[x, y, z])
+                if least == 0:
+                    continue
+                for n in range(13):  # of the 27 around it those that the sweep has passed
+                    a, b, c = x + sign * (n // 9 - 1), y + sign * (n // 3 % 3 - 1), z + sign * (n % 3 - 1)
+                    if 0 <= a < nx and 0 <= b < ny and 0 <= c < nz:
+                        least = min(least, reach[a, b, c] + 1)
+                reach[x, y, z] = least

@@ -6,6 +6,11 @@ import numpy as np
 from numba import njit, prange
 
 
+@njit(inline="always")
+def _floor(position):
+    return int(np.floor(position[0])), int(np.floor(position[1])), int(np.floor(position[2]))
+
+
 @njit(cache=True)
 def number_touched(positions, index):
     """Give every cell that a kernel touches a row, in the lattice's order. ``index`` starts at -1.
@@ -16,11 +21,7 @@ def number_touched(positions, index):
     for q in range(positions.shape[0]):
         if np.isnan(positions[q, 0]):
             continue
-        x0, y0, z0 = (
-            int(np.floor(positions[q, 0])),
-            int(np.floor(positions[q, 1])),
-            int(np.floor(positions[q, 2])),
-        )
+        x0, y0, z0 = _floor(positions[q])
         for a in range(2):
             for b in range(2):
                 for d in range(2):
@@ -47,11 +48,7 @@ def scatter(source, positions, index, out):
         for q in range(total * chunk // chunks, total * (chunk + 1) // chunks):
             if np.isnan(positions[q, 0]):
                 continue
-            x0, y0, z0 = (
-                int(np.floor(positions[q, 0])),
-                int(np.floor(positions[q, 1])),
-                int(np.floor(positions[q, 2])),
-            )
+            x0, y0, z0 = _floor(positions[q])
             fx, fy, fz = positions[q, 0] - x0, positions[q, 1] - y0, positions[q, 2] - z0
             for i in range(8):
                 a, b, d = i >> 2, (i >> 1) & 1, i & 1
@@ -72,11 +69,7 @@ def scatter_backward(source, positions, index, grad, grad_source, grad_positions
     for q in prange(positions.shape[0]):
         if np.isnan(positions[q, 0]):
             continue
-        x0, y0, z0 = (
-            int(np.floor(positions[q, 0])),
-            int(np.floor(positions[q, 1])),
-            int(np.floor(positions[q, 2])),
-        )
+        x0, y0, z0 = _floor(positions[q])
         fx, fy, fz = positions[q, 0] - x0, positions[q, 1] - y0, positions[q, 2] - z0
         gx, gy, gz = 0.0, 0.0, 0.0
         for i in range(8):

@@ -12,6 +12,7 @@ from forewarp.ops.checks import check_shape
 from forewarp.ops.grid import _array
 
 _BLOCK = 4  # cells per side of the coarse occupancy that lets a ray leap over empty space
+_MARGIN = 1e-3  # cells
 
 
 def march(
@@ -33,13 +34,20 @@ def march(
 
     Cost: one test a step inside the box, one a block where the block is empty; memory P.
     """
+    check_march(origins, directions, near, far, step, jitter)
+    run = _numba_march if use_numba(origins) else march_reference
+    return run(origins.detach(), directions.detach(), near, far, step, cells, jitter)
+
+
+def check_march(
+    origins: Tensor, directions: Tensor, near: float, far: float, step: float, jitter: Tensor
+) -> None:
+    """Raise ValueError where rays cannot be marched along."""
     check_shape("origins", origins, ("R", 3))
     check_shape("directions", directions, (len(origins), 3))
     check_shape("jitter", jitter, (len(origins),))
-    if not (step > 0 and math.isfinite(step)) or not 0 <= near < far:
+    if not (step > 0 and math.isfinite(step)) or not 0 <= near < far < math.inf:
         raise ValueError(f"march: expected step > 0 and 0 <= near < far, but got {step=}, {near=}, {far=}")
-    run = _numba_march if use_numba(origins) else march_reference
-    return run(origins.detach(), directions.detach(), near, far, step, cells, jitter)
 
 
 def _span(origins: Tensor, directions: Tensor, near: float, far: float, shape) -> tuple[Tensor, Tensor]:
@@ -77,16 +85,29 @@ def _numba_march(origins, directions, near, far, step, cells, jitter) -> tuple[T
     from forewarp.ops import kernels_march as kernels
 
     match_threads()
-    rays = [_array(v) for v in (origins, directions)]
-    blocks = torch.zeros([-(-n // _BLOCK) for n in cells.shape], dtype=torch.uint8)
-    grid = [_array(cells.contiguous().view(torch.uint8)), blocks.numpy()]
-    kernels.pool_blocks(*grid, _BLOCK)
-    counts = torch.zeros(len(origins), dtype=torch.int64)
+    counts, firsts = torch.zeros(2, len(origins), dtype=torch.int64).unbind()
     none = torch.zeros(0, dtype=torch.int64)
-    common = (*rays, float(near), float(far), float(step), _array(jitter), *grid, _BLOCK, counts.numpy())
+    common = (*(_array(v) for v in (origins, directions)), float(near), float(far), float(step))
+    common = (*common, _array(jitter), *map_cells(cells), counts.numpy(), firsts.numpy())
     kernels.march(*common, none.numpy(), none.numpy(), origins.new_zeros(0).numpy())
     starts = counts.cumsum(0) - counts
     total = int(counts.sum())
     ray_ids, distances = torch.empty(total, dtype=torch.int64), origins.new_empty(total)
     kernels.march(*common, starts.numpy(), ray_ids.numpy(), distances.numpy())
     return ray_ids, distances
+
+
+def map_cells(cells: Tensor) -> tuple:
+    """What the kernels march through: the cells, how far from each block to the next occupied one, the bounds
+    of all occupied cells, and the block's side.
+    """
+    from forewarp.ops import kernels_march as kernels
+
+    array = _array(cells.contiguous().view(torch.uint8))
+    reach = torch.empty([-(-n // _BLOCK) for n in cells.shape], dtype=torch.uint8).numpy()
+    bounds = torch.empty(2, 3, dtype=torch.float64).numpy()
+    kernels.pool_blocks(array, reach, _BLOCK, bounds)
+    # A sample that rounding puts just outside its cell is not lost; the box itself stays the limit.
+    bounds[0] = (bounds[0] - _MARGIN).clip(min=0)
+    bounds[1] = (bounds[1] + _MARGIN).clip(max=cells.shape)
+    return array, reach, bounds, _BLOCK

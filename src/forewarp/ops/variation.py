@@ -36,7 +36,9 @@ def patch_variation(depth: Tensor, opacity: Tensor) -> Tensor:
         opacity: (B, S, S) in [0, 1].
 
     Returns:
-        A scalar: the weighted mean over both directions, 0 for single pixels. Differentiable in ``depth``.
+        A scalar: for each direction the mean over all pairs of weight times difference, not divided by the
+        weights; the two added. A pair weighs what its less opaque pixel does. 0 for single pixels.
+        Differentiable in ``depth``.
     """
     check_shape("depth", depth, ("B", "S", "S"))
     mask = opacity.detach()

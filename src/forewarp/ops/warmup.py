@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import torch
 
+from forewarp.ops.backend import use_numba
 from forewarp.ops.grid import index_of, occupied_cells, trilinear
 from forewarp.ops.march import march
 from forewarp.ops.splat import average_splat
+from forewarp.ops.trace import trace
 
 
 def warm_up(device: torch.device | str = "cpu") -> None:
@@ -23,4 +25,8 @@ def warm_up(device: torch.device | str = "cpu") -> None:
     index = index_of(voxels, (2, 2, 2))
     cells = occupied_cells(index)
     start, along = positions.new_zeros(1, 3), positions.new_ones(1, 3)
-    march(start.detach(), along, 0.0, 1.0, 0.5, cells, positions.new_zeros(1))
+    rays = (start.detach(), along, 0.0, 1.0, 0.5, cells, positions.new_zeros(1))
+    march(*rays)
+    if use_numba(positions):
+        raw = positions.new_zeros(len(voxels))
+        trace(*rays, raw=raw, index=index, fill=0.0, shift=0.0, scale=1.0)

@@ -15,7 +15,8 @@ class Batch:
     """Rays of ONE time with their true colours.
 
     ``rgb`` (R, 3) in [0, 1], already over ``background``; ``background`` (3,) or (R, 3) is what a ray
-    that meets nothing shows; ``time`` in [0, 1]; ``frame`` is the index into the training frames.
+    that meets nothing shows; ``time`` in [0, 1]; ``frame`` is the index of the training frame
+    that was picked, whose time others may share that gave rays too.
     """
 
     rays: Rays

@@ -86,13 +86,22 @@ class Lattice:
 
     @classmethod
     def of_count(cls, box: Box, count: float, least: int = 4) -> Lattice:
-        """The lattice of about ``count`` cubic voxels over a box.
+        """The lattice of about ``count`` cubic voxels over a box, ``least`` on an axis too flat for them.
 
         >>> Lattice.of_count(Box((0, 0, 0), (1, 2, 1)), 2000).shape
         (10, 20, 10)
+        >>> Lattice.of_count(Box((0, 0, 0), (1, 1, 1e-9)), 4e4).shape
+        (100, 100, 4)
         """
-        side = (math.prod(box.size) / float(count)) ** (1 / 3)
-        return cls(box, tuple(max(least, int(round(s / side))) for s in box.size))
+        flat: list[float] = []
+        while len(flat) < 3:
+            # The flat axes come off first, or a planar scene has a thousand times the voxels asked for.
+            free = sorted(box.size)[len(flat) :]
+            side = (math.prod(free) / (float(count) / least ** len(flat))) ** (1 / len(free))
+            if round(free[0] / side) >= least:
+                break
+            flat.append(free[0])
+        return cls(box, tuple(least if s in flat else max(least, int(round(s / side))) for s in box.size))
 
     @property
     def count(self) -> int:

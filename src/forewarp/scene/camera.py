@@ -1,4 +1,4 @@
-"""A pinhole camera.
+"""A camera: a pinhole, perhaps behind a lens.
 
 Axes are OpenCV's: x right, y down, z forward. Pixel centres lie at +0.5. Distances are along the unit ray.
 """
@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from forewarp.scene.lens import Lens
 from forewarp.scene.rays import Rays
 
 
@@ -17,6 +18,8 @@ from forewarp.scene.rays import Rays
 class Camera:
     """``width`` x ``height`` pixels, focal lengths ``fx fy`` and principal point ``cx cy`` in pixels,
     ``camera_to_world`` (4, 4) float64 tensor, ``near`` and ``far`` along the unit ray in world units.
+
+    The plane's point (x, y), bent by the ``lens``, lies at pixel ``u = fx x + skew y + cx, v = fy y + cy``.
     """
 
     width: int
@@ -28,6 +31,8 @@ class Camera:
     camera_to_world: Tensor
     near: float
     far: float
+    skew: float = 0.0
+    lens: Lens | None = None
 
     @property
     def center(self) -> Tensor:
@@ -45,9 +50,19 @@ class Camera:
             pixels = torch.arange(self.width * self.height)
         u = (pixels % self.width).double() + 0.5
         v = torch.div(pixels, self.width, rounding_mode="floor").double() + 0.5
-        local = torch.stack([(u - self.cx) / self.fx, (v - self.cy) / self.fy, torch.ones_like(u)], -1)
-        directions = torch.nn.functional.normalize(local @ self.camera_to_world[:3, :3].T, dim=-1)
+        directions = self.directions(u, v)
         return Rays(self.center.expand_as(directions).to(dtype), directions.to(dtype), self.near, self.far)
+
+    def directions(self, u: Tensor, v: Tensor) -> Tensor:
+        """Unit world directions (..., 3) float64 through pixel coordinates ``u v`` (...,), the top-left
+        corner of the picture the origin; lens and skew are undone.
+        """
+        y = (v.double() - self.cy) / self.fy
+        x = (u.double() - self.cx - self.skew * y) / self.fx
+        if self.lens is not None:
+            x, y = self.lens.straighten(torch.stack([x, y], -1)).unbind(-1)
+        local = torch.stack([x, y, torch.ones_like(x)], -1)
+        return torch.nn.functional.normalize(local @ self.camera_to_world[:3, :3].T, dim=-1)
 
     def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """World points (..., 3) -> pixel coordinates (..., 2), top-left corner the origin, and the
@@ -56,10 +71,16 @@ class Camera:
         pose = self.camera_to_world.to(points)
         local = (points - pose[:3, 3]) @ pose[:3, :3]
         z = local[..., 2]
-        scale = torch.tensor([self.fx, self.fy]).to(points)
-        shift = torch.tensor([self.cx, self.cy]).to(points)
-        safe = torch.where(z.abs() > 1e-12, z, torch.full_like(z, 1e-12))
-        return local[..., :2] / safe[..., None] * scale + shift, z
+        scale, shift = points.new_tensor([self.fx, self.fy]), points.new_tensor([self.cx, self.cy])
+        # Beside the camera a point lies very far off in the picture; how far depends on no unit of length.
+        least = torch.finfo(z.dtype).eps * local.detach().abs().amax(-1)
+        safe = torch.where(z.abs() > least, z, torch.where(least > 0, least, 1.0))
+        plane = local[..., :2] / safe[..., None]
+        plane = plane if self.lens is None else self.lens.bend(plane)
+        pixel = plane * scale + shift
+        if self.skew:
+            pixel = pixel + self.skew * torch.stack([plane[..., 1], torch.zeros_like(z)], -1)
+        return pixel, z
 
     def resized(self, width: int, height: int) -> Camera:
         """The same view at another image size."""
@@ -72,6 +93,7 @@ class Camera:
             fy=self.fy * sy,
             cx=self.cx * sx,
             cy=self.cy * sy,
+            skew=self.skew * sx,
         )
 
 

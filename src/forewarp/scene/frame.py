@@ -45,7 +45,9 @@ class Scene:
     """All frames of one subject, read once.
 
     ``box`` bounds everything that may be seen; ``canonical_time`` in [0, 1]; ``has_alpha`` says that the
-    images tell foreground from background; ``protocol`` names how the numbers are to be measured.
+    images tell foreground from background; ``protocol`` names how the numbers are to be measured; ``still``
+    (N, 3) float32 are points that never move, world units, where a dataset knows such;
+    ``held`` are training frames set aside, never trained on.
     """
 
     name: str
@@ -57,6 +59,8 @@ class Scene:
     has_alpha: bool
     truth: Truth | None = None
     protocol: dict = field(default_factory=dict)
+    still: Tensor | None = None
+    held: tuple[Frame, ...] = ()
 
     @property
     def times(self) -> tuple[float, ...]:

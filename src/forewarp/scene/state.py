@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Protocol
 
 import torch
@@ -11,14 +13,17 @@ from torch import Tensor
 from forewarp.ops.grid import occupied_cells, trilinear
 from forewarp.scene.box import Lattice
 
-EMPTY = -10.0  # raw density of an absent voxel: 1e-6 of opacity over a voxel, whatever the shift
+EMPTY = -10.0  # raw density of an absent voxel: about exp(-10) of the opacity that raw 0 has
+
+
+View = Callable[[Tensor, Tensor], Tensor]  # features (P, C) and directions (P, 3) -> colour (P, 3)
 
 
 class FieldAtTime(Protocol):
-    """Density and colour features anywhere in ``lattice`` at one time; all that the renderer needs.
+    """Density and colour anywhere in ``lattice`` at one time; all that the renderer needs.
 
     ``cells`` (X-1, Y-1, Z-1) bool are those that may hold matter. ``density`` gives sigma (P,) per world
-    unit and ``features`` (P, C) at points (P, 3) in lattice coordinates.
+    unit and ``colors`` (P, 3) at points (P, 3) in lattice coordinates, seen along unit directions (P, 3).
     """
 
     lattice: Lattice
@@ -30,8 +35,13 @@ class FieldAtTime(Protocol):
     def density(self, points: Tensor) -> Tensor:
         """Sigma (P,)."""
 
-    def features(self, points: Tensor) -> Tensor:
-        """Colour features (P, C)."""
+    def colors(self, points: Tensor, directions: Tensor, view: View | None) -> Tensor:
+        """Colour (P, 3); ``view`` makes it of the features and the directions."""
+
+
+def shade(features: Tensor, directions: Tensor, view: View | None) -> Tensor:
+    """Features (P, C) seen along directions (P, 3) -> colour (P, 3); without ``view`` the first 3 are it."""
+    return torch.sigmoid(features[:, :3]) if view is None else view(features, directions)
 
 
 @dataclass(frozen=True)
@@ -56,7 +66,7 @@ class Activation:
     def raw(self, alpha: float, length: float) -> float:
         """The raw density whose opacity over ``length`` is ``alpha``."""
         sigma = -torch.log1p(-torch.tensor(alpha, dtype=torch.float64)) / length * self.unit
-        return float(torch.log(torch.expm1(sigma)) - self.shift)
+        return float(sigma + torch.log(-torch.expm1(-sigma)) - self.shift)  # expm1(sigma) may overflow
 
 
 @dataclass(frozen=True)
@@ -86,7 +96,7 @@ class RadianceGrid:
         """What an absent voxel reads (1 + C,)."""
         return torch.nn.functional.pad(self.values.new_full((1,), EMPTY), (0, self.values.shape[1] - 1))
 
-    @property
+    @cached_property
     def cells(self) -> Tensor:
         """Cells whose corners are present and may exceed ``skip_alpha`` over one voxel."""
         if self.skip_alpha <= 0 or not len(self.values):
@@ -101,7 +111,12 @@ class RadianceGrid:
 
     def features(self, points: Tensor) -> Tensor:
         """Colour features (P, C) at lattice coordinates (P, 3)."""
-        return trilinear(self.color.contiguous(), self.index, points, self.fill[1:])
+        # Of all channels at once: the colours alone would be a copy of the grid.
+        return trilinear(self.values, self.index, points, self.fill)[:, 1:]
+
+    def colors(self, points: Tensor, directions: Tensor, view: View | None) -> Tensor:
+        """Colour (P, 3) at lattice coordinates (P, 3) seen along unit directions (P, 3)."""
+        return shade(self.features(points), directions, view)
 
     def with_values(self, values: Tensor) -> RadianceGrid:
         """The same voxels with other values."""
@@ -114,7 +129,9 @@ class State:
 
     ``fields`` are what is rendered, by name (``upsampled``, ``inpainted``, ``backward``), the best last;
     ``flow`` (N, 3) world units from canonical to ``time`` on the canonical ``index``; ``coverage`` (M,) of
-    the warped voxels; ``dropped`` source voxels that left the box. None where a method has no such thing.
+    the warped voxels; ``dropped`` source voxels that left the box; ``background`` all that stands still. None
+    where a method has no such thing. ``length`` is what the loss measures flow in, world units: a third of
+    the scene's longest side, 1 for the usual box of 3, so that no weight depends on the scene's units.
     """
 
     time: float
@@ -124,6 +141,8 @@ class State:
     coverage: Tensor | None = None
     dropped: int = 0
     inpaint_difference: Tensor | None = None
+    background: RadianceGrid | None = None
+    length: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -131,6 +150,7 @@ class Rendering:
     """``rgb`` (R, 3), ``depth`` (R,) mean distance along the ray in world units (0 where nothing is met),
     ``opacity`` and ``transmittance`` (R,). Of the samples whose weight counts: ``weights`` (S,), their
     ``colors`` (S, 3) and ``ray_ids`` (S,). ``samples`` is how many were read.
+    Where asked for, ``all_weights`` and ``all_ray_ids`` (P,) of all samples, which lie in occupied cells.
     """
 
     rgb: Tensor
@@ -142,3 +162,4 @@ class Rendering:
     ray_ids: Tensor
     samples: int = 0
     all_weights: Tensor | None = field(default=None, repr=False)
+    all_ray_ids: Tensor | None = field(default=None, repr=False)

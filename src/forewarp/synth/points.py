@@ -14,22 +14,29 @@ _SPARE = 4
 
 
 def surface_points(
-    world: World, count: int, centers: np.ndarray, rng: np.random.Generator
+    world: World,
+    count: int,
+    centers: np.ndarray,
+    rng: np.random.Generator,
+    time: float = 0.0,
+    among: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Points spread evenly by area over what can be seen at the canonical time 0.
+    """Points spread evenly by area over what can be seen at one time.
 
     Args:
         world: whose surface.
         count: how many; fewer come back only where hardly anything can be seen.
         centers: camera centres (C, 3); a point counts as seen where at least one of them sees it.
         rng: the same state gives the same points.
+        time: when they are to be seen.
+        among: which faces (F,) bool they may lie on; None is all.
 
     Returns:
         faces (N,) and barycentric coordinates (N, 3), which ``World.points`` places at any time.
     """
-    posed = Posed(world, 0.0)
+    posed = Posed(world, time)
     drawn = _SPARE * count
-    cumulative = np.cumsum(posed.area)
+    cumulative = np.cumsum(posed.area if among is None else posed.area * among)
     face = np.searchsorted(cumulative, rng.random(drawn) * cumulative[-1], side="right")
     # The square root makes the density even over the triangle.
     a, b = np.sqrt(rng.random(drawn)), rng.random(drawn)

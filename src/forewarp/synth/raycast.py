@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 
 from forewarp.scene.camera import Camera
 from forewarp.synth.textures import Surface, color_of
@@ -45,6 +46,7 @@ class Posed:
         self.normal = cross / (2 * self.area[:, None])
         self.corner_normal = _corner_normals(world, cross, self.normal)
         self._first = _intersector(self.corners)
+        self._first_blocker = self._first if world.casts.all() else _intersector(self.corners[world.casts])
 
     def first_hits(self, origins: np.ndarray, directions: np.ndarray) -> Hits:
         """What rays from ``origins`` (n, 3) along unit ``directions`` (n, 3) meet first."""
@@ -57,8 +59,8 @@ class Posed:
         return Hits(ray, face, barycentric, distance)
 
     def is_free(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Whether rays (n, 3), (n, 3) leave the world without meeting anything (n,)."""
-        return self._first(origins, directions) < 0
+        """Whether rays (n, 3), (n, 3) leave the world (n,); what casts no shadow stops none."""
+        return self._first_blocker(origins, directions) < 0
 
     def _barycentric(self, face: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """The hit in float64 (embree tells only the face), clamped: a grazing ray stays on its face."""
@@ -105,26 +107,30 @@ class Posed:
 
 
 def render(
-    world: World, time: float, camera: Camera, samples_per_pixel: int = 4
+    world: World,
+    time: float,
+    camera: Camera,
+    samples_per_pixel: int = 4,
+    shadow_rays: int = SHADOW_RAYS,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """One picture of the world at any time from any pinhole camera.
+    """One picture of the world at any time from any camera.
 
     Args:
         world: what is seen.
         time: in [0, 1].
-        camera: its size, intrinsics and pose; near and far are ignored.
-        samples_per_pixel: rays averaged into a pixel, each with its own shadow rays.
+        camera: its size, lens and pose; near and far are ignored.
+        samples_per_pixel: rays averaged into a pixel, each with ``shadow_rays`` of its own.
 
     Returns:
         rgba (H, W, 4) uint8, straight alpha, alpha the share of the samples that hit; and depth (H, W)
         float32, the distance along the unit ray through the pixel centre, 0 where it meets nothing.
 
-    **Cost** H * W * samples_per_pixel * (1 + 6) rays at most.
+    **Cost** H * W * samples_per_pixel * (1 + shadow_rays) rays at most.
     """
     posed = Posed(world, time)
     count = camera.height * camera.width
     total, hit = np.zeros((count, 3)), np.zeros(count)
-    lights = _light_points(samples_per_pixel * SHADOW_RAYS)
+    lights = light_points(samples_per_pixel * shadow_rays)
     for i in range(samples_per_pixel):
         # The R1 sequence: any number of samples is spread evenly over the pixel; a single one is its centre.
         offset = ((i + 0.5) / samples_per_pixel, (0.5 + i * 0.6180339887498949) % 1.0)
@@ -142,17 +148,14 @@ def render(
 
 def camera_rays(camera: Camera, offset: tuple[float, float] = (0.5, 0.5)) -> tuple[np.ndarray, np.ndarray]:
     """Origins and unit directions (H*W, 3) float64 through one spot of every pixel, row by row."""
-    u, v = np.meshgrid(np.arange(camera.width) + offset[0], np.arange(camera.height) + offset[1])
-    local = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], -1).reshape(
-        -1, 3
-    )
-    pose = np.asarray(camera.camera_to_world, dtype=np.float64)
-    directions = local @ pose[:3, :3].T
-    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
-    return np.broadcast_to(pose[:3, 3], directions.shape), directions
+    columns = torch.arange(camera.width, dtype=torch.float64) + offset[0]
+    rows = torch.arange(camera.height, dtype=torch.float64) + offset[1]
+    v, u = torch.meshgrid(rows, columns, indexing="ij")
+    directions = camera.directions(u.flatten(), v.flatten()).numpy()
+    return np.broadcast_to(camera.center.double().numpy(), directions.shape), directions
 
 
-def _light_points(count: int) -> np.ndarray:
+def light_points(count: int) -> np.ndarray:
     """Points (count, 3) spread evenly over the light's disc, which faces the origin.
 
     They are the same for every pixel, so a shadow on a surface looks alike from all sides.

@@ -16,7 +16,7 @@ class Part:
     """One coloured piece that follows one joint of the rig.
 
     ``vertices`` (V, 3) float64 are in the joint's rest frame, ``faces`` (F, 3) index them; a ``smooth``
-    part is shaded with interpolated normals.
+    part is shaded with interpolated normals; one that ``casts`` no shadow lets the light through.
     """
 
     name: str
@@ -25,6 +25,7 @@ class Part:
     faces: np.ndarray
     material: Material
     smooth: bool = False
+    casts: bool = True
 
 
 def prism(outline, low: float, high: float, axis: int = 2) -> Mesh:

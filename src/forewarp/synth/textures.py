@@ -93,6 +93,16 @@ def beach(at: Surface, scale: float) -> np.ndarray:
     return np.where(np.abs(pole) > 0.92, 3, gore)
 
 
+def mosaic(at: Surface, scale: float) -> np.ndarray:
+    """Squares of four colours in an order that never repeats, with a fifth for the joints."""
+    u, v = (c / scale for c in at.flat(at.position))
+    joint = np.minimum(np.abs(u - np.rint(u)), np.abs(v - np.rint(v))) < 0.04
+    # Large odd factors scatter neighbours; a product's low bits least, so high ones are folded in.
+    mixed = (np.floor(u).astype(np.int64) * 374761393 + np.floor(v).astype(np.int64) * 668265263) & 0xFFFFFFFF
+    mixed = ((mixed ^ (mixed >> 13)) * 1274126177) & 0xFFFFFFFF
+    return np.where(joint, 4, (mixed ^ (mixed >> 16)) % 4)
+
+
 PATTERNS = {
     "plain": lambda at, scale: np.zeros(len(at.position), dtype=np.int64),
     "checker": checker,
@@ -102,6 +112,7 @@ PATTERNS = {
     "rings": rings,
     "wheel": wheel,
     "beach": beach,
+    "mosaic": mosaic,
 }
 
 

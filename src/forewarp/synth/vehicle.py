@@ -16,6 +16,7 @@ from forewarp.synth.motions import (
     WHEELS,
     joints,
 )
+from forewarp.synth.room import room
 from forewarp.synth.shapes import Mesh, Part, box, cylinder, joined, prism, rounded_slab, sphere, studs
 from forewarp.synth.textures import Material
 
@@ -51,14 +52,16 @@ class World:
 
     Args:
         motion: a name in ``motions.MOTIONS``.
+        has_room: put a room around it, which never moves.
     """
 
-    def __init__(self, motion: str = "lift_tilt"):
-        self.motion = motion
-        self.parts = _ground() + _chassis() + _arm() + _ball()
+    def __init__(self, motion: str = "lift_tilt", has_room: bool = False):
+        self.motion, self.has_room = motion, has_room
+        self.parts = _ground() + _chassis() + _arm() + _ball() + (room() if has_room else [])
         self.rest, self.faces = joined([(p.vertices, p.faces) for p in self.parts])
         self.part_of_face = np.repeat(np.arange(len(self.parts)), [len(p.faces) for p in self.parts])
         self.smooth = np.array([p.smooth for p in self.parts])[self.part_of_face]
+        self.casts = np.array([p.casts for p in self.parts])[self.part_of_face]
 
     def place(self, time: float) -> np.ndarray:
         """World positions (V, 3) float64 of every vertex at any ``time`` in [0, 1]."""

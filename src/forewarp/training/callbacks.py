@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections import defaultdict
 
@@ -35,8 +36,9 @@ class StageProgress(lightning.Callback):
 
     def on_train_batch_end(self, trainer, module, outputs, batch, batch_idx) -> None:
         """Follow the PSNR; show where it is time."""
-        self._psnr += _SMOOTHING * (module.last["psnr"] - self._psnr)
-        self._seen += _SMOOTHING * (1 - self._seen)
+        if math.isfinite(module.last["psnr"]):  # else the step was skipped
+            self._psnr += _SMOOTHING * (module.last["psnr"] - self._psnr)
+            self._seen += _SMOOTHING * (1 - self._seen)
         if self._line.due():
             fraction, seconds = module.fraction, module.clock.seconds
             left = seconds * (1 - fraction) / fraction if fraction > 0 else None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +17,7 @@ from forewarp.metrics.suite import ImageSuite, summarise
 from forewarp.scene.batch import Target
 from forewarp.scene.frame import Scene
 from forewarp.scene.state import Rendering
+from forewarp.training.clock import now
 from forewarp.training.handover import write_json
 from forewarp.training.module import DynamicSceneModule, render_all
 from forewarp.training.protocol import device_name, versions
@@ -26,13 +26,14 @@ from forewarp.training.protocol import device_name, versions
 @dataclass(frozen=True)
 class Shown:
     """A test view as drawn: its number in the split, its renderings by name, the best last, and the seconds
-    that the best one took, the warp included where the view before had another time.
+    that the best one took, the warp included where the view before had another time, and without it.
     """
 
     number: int
     target: Target
     renderings: dict[str, Rendering]
     seconds: float
+    seconds_again: float
 
 
 def draw(module: DynamicSceneModule, targets: list[Target]) -> Iterator[Shown]:
@@ -40,17 +41,17 @@ def draw(module: DynamicSceneModule, targets: list[Target]) -> Iterator[Shown]:
     state = None
     for number in sorted(range(len(targets)), key=lambda i: targets[i].frame.time):
         target = targets[number]
-        begin = time.perf_counter()
+        begin = now()
         with torch.no_grad():
             if state is None or state.time != target.frame.time:
                 state = module.method.at(target.frame.time)
             rays, behind = target.frame.camera.rays().to(module.device), target.background.to(module.device)
-            drawn, spent = {}, time.perf_counter() - begin
+            drawn, warped = {}, now() - begin
             for name, field in state.fields.items():
-                begin = time.perf_counter()
+                begin = now()
                 drawn[name] = render_all(module.renderer, field, rays, behind, module.method.view)
-                last = time.perf_counter() - begin
-        yield Shown(number, target, drawn, spent + last)
+                again = now() - begin
+        yield Shown(number, target, drawn, warped + again, again)
 
 
 def evaluate(
@@ -127,7 +128,8 @@ def _score(shown: Shown, suite: ImageSuite) -> dict:
     best = list(scores)[-1]
     about = {"name": frame.name, "time": frame.time, "ability": frame.ability, "rendering": best}
     others = {name: values for name, values in scores.items() if name != best}
-    return {**about, "seconds": shown.seconds, "scores": scores[best], "others": others}
+    seconds = {"seconds": shown.seconds, "seconds_again": shown.seconds_again}
+    return {**about, **seconds, "scores": scores[best], "others": others}
 
 
 def _save(shown: Shown, folder: Path, on_sheet: bool) -> None:
@@ -148,9 +150,11 @@ def _means(per_image: list[dict]) -> dict[str, dict]:
 
 
 def _seconds(per_image: list[dict], finished: Mapping[str, Mapping]) -> dict[str, float]:
+    """Training by stage, and the mean of drawing an image: its time's first, and another of the same time."""
     stages = {name: float(noted["seconds"]) for name, noted in finished.items()}
-    drawing = sum(row["seconds"] for row in per_image) / len(per_image)
-    return {"train": sum(stages.values()), **stages, "render_per_frame": drawing}
+    drawing, again = (sum(r[key] for r in per_image) / len(per_image) for key in ("seconds", "seconds_again"))
+    frames = {"render_per_frame": drawing, "render_again_per_frame": again}
+    return {"train": sum(stages.values()), **stages, **frames}
 
 
 def _protocol(module: DynamicSceneModule, scene: Scene, per_image: list[dict], protocol: Mapping) -> dict:

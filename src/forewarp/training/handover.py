@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -10,12 +11,15 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
+from forewarp.fields.voxel_grid import VoxelGrid
 from forewarp.methods.spec import MethodSpec
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.frame import Scene
 from forewarp.scene.hull import visual_hull
 from forewarp.training.settings import StageSettings
 from forewarp.training.structure import box_of_all_times, resample
+
+MOST_BYTES = 1 << 26  # of a file that is read whole
 
 
 @dataclass(frozen=True)
@@ -50,7 +54,7 @@ def make_handover(
     unit: float,
     frames_in_play: int,
     *,
-    alpha: float = 1e-2,
+    alpha: float,
     pad: float = 2.0,
 ) -> Handover:
     """The tight box of a fitted stage.
@@ -73,8 +77,29 @@ def save_handover(handover: Handover, folder: Path) -> None:
 
 
 def load_handover(folder: Path) -> Handover:
-    """Read ``handover.json``."""
-    return Handover(**json.loads((folder / "handover.json").read_text()))
+    """Read ``handover.json``.
+
+    Raises:
+        ValueError: where it is not what ``save_handover`` writes.
+    """
+    path = folder / "handover.json"
+    try:
+        handover = Handover(**(read_json(path) or {}))
+        numbers = [*handover.box.low, *handover.box.high, handover.unit]
+        if len(numbers) == 7 and all(math.isfinite(n) for n in numbers) and handover.unit > 0:
+            return handover
+    except (TypeError, ValueError):
+        pass
+    raise ValueError(f"{path}: expected what a stage leaves to the next, but got something else; delete it")
+
+
+def read_json(path: Path) -> dict | None:
+    """The object that a file of a run holds; None where there is no file, or none that is whole."""
+    try:
+        content = json.loads(path.read_text()) if path.stat().st_size <= MOST_BYTES else None
+    except (FileNotFoundError, NotADirectoryError, ValueError, RecursionError):
+        return None
+    return content if isinstance(content, dict) else None
 
 
 def fresh_method(
@@ -88,10 +113,13 @@ def fresh_method(
     lattice = Lattice.of_count(box, settings.at("voxels", 0.0))
     unit = unit or lattice.pitch
     active = torch.ones(lattice.shape, dtype=torch.bool)
-    if settings.start == "hull":
+    if settings.start == "hull" or (settings.start == "auto" and scene.has_alpha):
         active = _hull(scene, lattice, settings, frames)
-    method = _build(spec, settings, scene, lattice, active, unit)
-    _set_start_density(method.radiance, settings.start_alpha)
+    still = _still(spec, settings, scene, None)
+    method = _build(spec, settings, scene, lattice, active, unit, still)
+    for grid in (method.radiance, method.background):
+        if grid is not None:
+            _set_start_density(grid, settings.start_alpha)
     return method, unit
 
 
@@ -100,8 +128,8 @@ def carried_method(
 ) -> nn.Module:
     """The next stage's method, continued from the stage before on the tight box's lattice."""
     resample(before.radiance, handover.box, settings.at("voxels", 0.0), keep_alpha=settings.keep_alpha)
-    source = before.radiance
-    method = _build(spec, settings, scene, source.lattice, source.index >= 0, handover.unit)
+    source, still = before.radiance, _still(spec, settings, scene, before.background)
+    method = _build(spec, settings, scene, source.lattice, source.index >= 0, handover.unit, still)
     for name in set(source.names) & set(method.radiance.names):
         method.radiance.parameter(name).data.copy_(source.parameter(name).data)
     own, theirs = method.state_dict(), before.state_dict()
@@ -118,9 +146,29 @@ def carried_method(
     return method
 
 
+def _still(
+    spec: MethodSpec, settings: StageSettings, scene: Scene, before: VoxelGrid | None
+) -> tuple[Lattice, Tensor] | None:
+    """Lattice and active voxels of the static background, continued from the stage before or all active."""
+    if spec.background is None or "background" not in settings.effects:
+        return None
+    box, voxels = scene.box.scaled(1.05), settings.at("background_voxels", 0.0)  # holds every stage's box
+    if before is None:
+        lattice = Lattice.of_count(box, voxels)
+        return lattice, torch.ones(lattice.shape, dtype=torch.bool)
+    resample(before, box, voxels, keep_alpha=settings.keep_alpha)
+    return before.lattice, before.index >= 0
+
+
 def _build(
-    spec: MethodSpec, settings: StageSettings, scene: Scene, lattice: Lattice, active: Tensor, unit: float
-):
+    spec: MethodSpec,
+    settings: StageSettings,
+    scene: Scene,
+    lattice: Lattice,
+    active: Tensor,
+    unit: float,
+    still: tuple[Lattice, Tensor] | None,
+) -> nn.Module:
     return spec.build(
         lattice,
         active,
@@ -130,6 +178,7 @@ def _build(
         canonical_time=scene.canonical_time,
         effects=settings.effects,
         upsample=settings.upsample,
+        still=still,
     )
 
 
@@ -148,8 +197,10 @@ def _hull(scene: Scene, lattice: Lattice, settings: StageSettings, frames: list[
             f"stage.{settings.name}.start: expected box, since the images of '{scene.name}' have no alpha, "
             "but got hull"
         )
-    frames = frames[: settings.hull_frames]
-    masks = []
+    count, times = settings.hull_frames, [scene.train[i].time for i in frames]
+    while count < len(frames) and times[count] == times[count - 1]:
+        count += 1  # all views of a time that is in: neighbouring cameras alone bound nothing
+    frames, masks = frames[:count], []
     for i in frames:
         pixels = max(1, round(settings.hull_grow * scene.train[i].camera.width))
         alpha = (scene.train[i].load()[..., 3] > 127).float()

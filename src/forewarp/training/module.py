@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import lightning
 import torch
 from torch import Tensor
@@ -18,9 +16,9 @@ from forewarp.scene.rays import Rays
 from forewarp.scene.state import Rendering, State
 from forewarp.training.clock import Clock
 from forewarp.training.curriculum import Curriculum
+from forewarp.training.lattices import Lattices
 from forewarp.training.objective import Objective, Step
 from forewarp.training.settings import StageSettings
-from forewarp.training.structure import refresh, resample
 
 
 class DynamicSceneModule(lightning.LightningModule):
@@ -34,6 +32,7 @@ class DynamicSceneModule(lightning.LightningModule):
         curriculum: which frames are in play.
         cameras: of the training frames, for random views.
         seed: of the samples' jitter and the random views.
+        still: (N, 3) world units, points that are known never to move; None: none is known.
     """
 
     def __init__(
@@ -46,6 +45,7 @@ class DynamicSceneModule(lightning.LightningModule):
         curriculum: Curriculum,
         cameras: list[Camera],
         seed: int = 0,
+        still: Tensor | None = None,
     ) -> None:
         super().__init__()
         self.method = method
@@ -54,9 +54,8 @@ class DynamicSceneModule(lightning.LightningModule):
         self.patches = RandomPatches(cameras, patches=settings.patches) if cameras else None
         self.generator = torch.Generator().manual_seed(seed)
         self.clock = Clock()
-        self.lattice_voxels, self.lattice_step = settings.at("voxels", 0.0), 0
-        # Where voxels were active at the start; only on that lattice does it mean anything.
-        self.home = method.radiance.index >= 0
+        self.lattices = Lattices(method, settings)
+        self.still = still
         self.last: dict[str, float] = {}
 
     @property
@@ -66,6 +65,13 @@ class DynamicSceneModule(lightning.LightningModule):
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """The loss of one batch of rays of one time."""
+        step = self.look(batch)
+        loss, raw = self.objective(step, self.global_step)
+        self._remember(loss, raw, step)
+        return loss
+
+    def look(self, batch: Batch) -> Step:
+        """What the terms of the loss look at."""
         state = self.method.at(batch.time)
         renderings = {
             name: self.renderer(
@@ -78,16 +84,13 @@ class DynamicSceneModule(lightning.LightningModule):
             )
             for name in self.objective.wanted(state.fields)
         }
-        step = Step(batch, state, renderings, lambda: self._patches(state))
-        loss, raw = self.objective(step, self.global_step)
-        self._remember(loss, raw, step)
-        return loss
+        return Step(batch, state, renderings, lambda: self._patches(state), lambda: self._stray(batch.time))
 
     def validation_step(self, target: Target, batch_idx: int) -> Tensor:
-        """PSNR of one whole image; logged as ``val/psnr``, the mean over images."""
-        drawn = self.render_image(target.frame.camera, target.frame.time, target.background)
-        error = (drawn.rgb.clamp(0, 1).reshape(target.rgb.shape) - target.rgb).square().mean()
-        psnr = -10 * torch.log10(error.clamp(min=1e-10))
+        """PSNR of one whole image; logged as ``val/psnr``, the mean over images. For ``trainer.validate``:
+        a run does not stop for it, ``TensorBoardPictures`` logs the curve.
+        """
+        psnr = self.psnr_of(target)
         self.log("val/psnr", psnr, batch_size=1, prog_bar=True)
         return psnr
 
@@ -99,16 +102,16 @@ class DynamicSceneModule(lightning.LightningModule):
         drawn = self.renderer(field, rays, black, self.method.view, self.generator)
         return drawn.depth.reshape(shape) / (rays.far - rays.near), drawn.opacity.reshape(shape)
 
+    def _stray(self, time: float) -> Tensor | None:
+        """How far some of the points that stand still are displaced (N, 3), in half sides of the scene."""
+        if self.still is None or not self.method.moves:
+            return None
+        rows = torch.randint(len(self.still), (min(1024, len(self.still)),), generator=self.generator)
+        return self.method.displacement(self.still[rows].to(self.device), time) / self.method.unit
+
     def _remember(self, loss: Tensor, raw: dict[str, Tensor], step: Step) -> None:
         best = list(step.renderings.values())[-1]
         error = float((best.rgb.detach() - step.batch.rgb).square().mean())
-        if not math.isfinite(float(loss.detach())):
-            terms = ", ".join(f"{name}={float(value):.3g}" for name, value in raw.items())
-            raise ValueError(
-                f"stage.{self.settings.name}: expected a finite loss, but got {float(loss.detach())} at step "
-                f"{self.global_step}, time {step.batch.time:.4g} ({terms}); "
-                f"lower stage.{self.settings.name}.rates"
-            )
         self.curriculum.report(step.batch.frame, error)
         self.last = {
             "loss": float(loss.detach()),
@@ -155,20 +158,7 @@ class DynamicSceneModule(lightning.LightningModule):
         if motion is not None:
             every = motion.trajectory.bases
             motion.trajectory.bases_in_play.fill_(every if bases is None else min(int(bases), every))
-        self._follow_lattice(settings.at("voxels", fraction), fraction, optimizer)
-
-    def _follow_lattice(self, voxels: float, fraction: float, optimizer: torch.optim.Optimizer) -> None:
-        settings, step, radiance = self.settings, self.global_step, self.method.radiance
-        only_seen = settings.see_steps > 0 and step - self.lattice_step >= settings.see_steps
-        common = {"keep_alpha": settings.keep_alpha, "optimizer": optimizer, "only_seen": only_seen}
-        due = settings.refresh_every and step and step % settings.refresh_every == 0
-        if voxels != self.lattice_voxels:
-            resample(radiance, radiance.lattice.box, voxels, **common)
-            self.lattice_voxels, self.lattice_step = voxels, step
-        elif due and fraction >= settings.refresh_from:
-            confined = fraction < settings.confine and self.home.shape == radiance.lattice.shape
-            allowed = self.home.to(self.device) if confined else None
-            refresh(radiance, birth_alpha=settings.birth_alpha, allowed=allowed, **common)
+        self.lattices.follow(fraction, self.global_step, optimizer)
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """Adam with the ancestors' betas; a rate of its own for every kind of parameter."""
@@ -196,8 +186,7 @@ class DynamicSceneModule(lightning.LightningModule):
             "generator": self.generator.get_state(),
             "curriculum": self.curriculum.state_dict(),
             "clock": self.clock.state_dict(),
-            "home": self.home,
-            "lattice": [self.lattice_voxels, self.lattice_step],
+            "lattices": self.lattices.state_dict(),
         }
 
     def on_load_checkpoint(self, checkpoint: dict) -> None:
@@ -206,23 +195,36 @@ class DynamicSceneModule(lightning.LightningModule):
         self.generator.set_state(state["generator"])
         self.curriculum.load_state_dict(state["curriculum"])
         self.clock.load_state_dict(state["clock"])
-        self.lattice_voxels, self.lattice_step = state["lattice"]
-        self.home = state["home"]
+        self.lattices.load_state_dict(state["lattices"])
+
+    def psnr_of(self, target: Target, pixels: Tensor | None = None) -> Tensor:
+        """PSNR (dB) of an image, or of its flat ``pixels`` (R,) alone, by the best rendering."""
+        frame, truth = target.frame, target.rgb.reshape(-1, 3)
+        truth = truth if pixels is None else truth[pixels]
+        drawn = self.render_image(frame.camera, frame.time, target.background, pixels=pixels)
+        error = (drawn.rgb.clamp(0, 1) - truth.to(drawn.rgb)).square().mean()
+        return -10 * torch.log10(error.clamp(min=1e-10))
 
     @torch.no_grad()
     def render_image(
-        self, camera: Camera, time: float, background: Tensor, state: State | None = None
+        self,
+        camera: Camera,
+        time: float,
+        background: Tensor,
+        state: State | None = None,
+        pixels: Tensor | None = None,
     ) -> Rendering:
-        """A whole picture, by the best rendering. ``state`` of the same time, handed in, saves the warp."""
+        """A whole picture, or flat ``pixels`` (R,) of it, by the best rendering. ``state`` of the same time,
+        handed in, saves the warp.
+        """
         state = state or self.method.at(time)
         field = list(state.fields.values())[-1]
-        return render_all(
-            self.renderer, field, camera.rays().to(self.device), background.to(self.device), self.method.view
-        )
+        rays = camera.rays(pixels).to(self.device)
+        return render_all(self.renderer, field, rays, background.to(self.device), self.method.view)
 
 
 def render_all(
-    renderer: Renderer, field, rays: Rays, background: Tensor, view, chunk: int = 16384
+    renderer: Renderer, field, rays: Rays, background: Tensor, view, chunk: int = 65536
 ) -> Rendering:
     """Render many rays in chunks; the samples' arrays are left empty."""
     parts = []

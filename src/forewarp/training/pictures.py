@@ -74,8 +74,19 @@ def image_flow(module: DynamicSceneModule, camera: Camera, time: float) -> tuple
     return flow.reshape(*shape, 2), drawn.opacity.reshape(shape)
 
 
+def validation_psnr(module: DynamicSceneModule, targets: Sequence[Target], rays: int) -> float:
+    """Mean PSNR (dB) of images, each from the same ``rays`` pixels, drawn at random once for all."""
+    found = []
+    for target in targets:
+        every = target.frame.camera.width * target.frame.camera.height
+        pixels = torch.randperm(every, generator=torch.Generator().manual_seed(0))[:rays]
+        found.append(float(module.psnr_of(target, pixels)))
+    return sum(found) / len(found)
+
+
 class TensorBoardPictures(lightning.Callback):
-    """Pictures of one held-out view at a few moments, to TensorBoard and into the stage's ``images/``.
+    """Pictures of one held-out view at a few moments, to TensorBoard and into the stage's ``images/``, and
+    ``val/psnr`` of a few validation views to TensorBoard where the scene has any.
 
     The training clock stands still meanwhile, and nothing random is drawn: training goes on as without.
 
@@ -83,6 +94,8 @@ class TensorBoardPictures(lightning.Callback):
         moments: fractions of the stage.
         view: index into the validation images, or into the training images without any; None: the middle.
         size: pixels of the longer side at most.
+        psnr_views: validation views, spread over the split, that ``val/psnr`` is the mean of; 0: no curve.
+        psnr_rays: pixels that are looked at in each.
     """
 
     def __init__(
@@ -91,12 +104,20 @@ class TensorBoardPictures(lightning.Callback):
         moments: Sequence[float] = (0.1, 0.25, 0.5, 0.75, 1.0),
         view: int | None = None,
         size: int = 400,
+        psnr_views: int = 4,
+        psnr_rays: int = 4096,
     ) -> None:
         if not all(0 <= moment <= 1 for moment in moments):
             raise ValueError(
                 f"callbacks.pictures.moments: expected numbers in [0, 1], but got {list(moments)}"
             )
+        if psnr_views < 0 or psnr_rays < 1:
+            raise ValueError(
+                "callbacks.pictures: expected psnr_views >= 0 and psnr_rays >= 1, "
+                f"but got {psnr_views=}, {psnr_rays=}"
+            )
         self.moments, self.view, self.size = sorted(moments), view, size
+        self.psnr_views, self.psnr_rays = psnr_views, psnr_rays
         self._due: list[float] = []
 
     def on_train_start(self, trainer, module) -> None:
@@ -130,6 +151,18 @@ class TensorBoardPictures(lightning.Callback):
                     logger.experiment.add_image(
                         f"images/{name}", picture, module.global_step, dataformats="HWC"
                     )
+        self._log_psnr(trainer, module)
+
+    def _log_psnr(self, trainer, module) -> None:
+        loggers = [logger for logger in trainer.loggers if isinstance(logger, TensorBoardLogger)]
+        views = trainer.datamodule.targets("val")
+        count = min(self.psnr_views, len(views))
+        if not loggers or not count:
+            return
+        spread = [views[i * len(views) // count] for i in range(count)]
+        psnr = validation_psnr(module, spread, self.psnr_rays)
+        for logger in loggers:
+            logger.log_metrics({"val/psnr": psnr}, module.global_step)
 
     def _target(self, datamodule) -> Target:
         targets = datamodule.targets("val" if datamodule.scene.val else "train")

@@ -5,17 +5,39 @@ from __future__ import annotations
 import platform
 import resource
 import sys
+from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 
 import torch
 
 PACKAGES = ("forewarp", "torch", "lightning", "torchmetrics", "numba")
 
 
+_PROCESS = Path("/proc/self")  # Linux only
+
+
+def reset_peak_memory() -> None:
+    """Let ``peak_memory_bytes`` count from now on, where the system allows it: Linux, and CUDA."""
+    if torch.cuda.is_available():
+        torch.cuda.reset_peak_memory_stats()
+    with suppress(OSError):
+        (_PROCESS / "clear_refs").write_text("5")
+
+
 def peak_memory_bytes() -> int:
-    """The most memory this process has held: of the GPU where one was used, else of the machine."""
+    """The most memory held since ``reset_peak_memory``, or by this process so far where that does nothing: of
+    the GPU where one was used, else of the machine.
+    """
     if torch.cuda.is_available() and torch.cuda.max_memory_allocated() > 0:
         return torch.cuda.max_memory_allocated()
+    try:
+        lines = (_PROCESS / "status").read_text().splitlines()
+    except OSError:
+        lines = []
+    for line in lines:
+        if line.startswith("VmHWM:"):
+            return int(line.split()[1]) * 1024  # in KiB
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else peak * 1024  # elsewhere in KiB
 

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import json
-import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import lightning
-import torch
 
-from forewarp.fields.voxel_grid import VoxelGrid
 from forewarp.methods.spec import MethodSpec, parameter_count
 from forewarp.renderer import Renderer
 from forewarp.scene.frame import Scene
+from forewarp.training.checkpoints import KeepCheckpoint, check_state, load_weights
 from forewarp.training.curriculum import Curriculum
 from forewarp.training.handover import (
     Handover,
@@ -22,12 +20,14 @@ from forewarp.training.handover import (
     fresh_method,
     load_handover,
     make_handover,
+    read_json,
     save_handover,
     write_json,
 )
 from forewarp.training.module import DynamicSceneModule
 from forewarp.training.objective import Objective
-from forewarp.training.protocol import peak_memory_bytes
+from forewarp.training.protocol import peak_memory_bytes, reset_peak_memory
+from forewarp.training.sentinel import Sentinel
 from forewarp.training.settings import StageSettings
 
 
@@ -53,6 +53,7 @@ class Run:
         callbacks: ``(stage name, stage folder) -> list`` of what watches a stage.
         seed: of everything random.
         checkpoint_seconds: between checkpoints of an unfinished stage.
+        skip: steps of a stage that may be left out for a number that is not finite (see ``Sentinel``).
     """
 
     datamodule: lightning.LightningDataModule
@@ -64,6 +65,7 @@ class Run:
     callbacks: Callable[[str, Path], list] = field(default=lambda name, folder: [])
     seed: int = 0
     checkpoint_seconds: float = 60.0
+    skip: int = 0
 
     def fit(self) -> DynamicSceneModule:
         """Run what is not finished; returns the last stage's module, fitted."""
@@ -107,13 +109,33 @@ class Run:
         return Path(self.folder) / stage.settings.name
 
     def is_finished(self, stage: Stage) -> bool:
-        """Whether a stage was fitted to its end."""
-        return (self.stage_folder(stage) / "done.json").is_file()
+        """Whether a stage was fitted to its end, and left all that it should; else it goes on."""
+        folder = self.stage_folder(stage)
+        try:
+            load_handover(folder)
+        except ValueError:
+            return False
+        return _noted(folder) is not None and (folder / "last.ckpt").is_file()
 
     def finished(self) -> dict[str, dict]:
         """What finished stages noted at their end, by name: seconds, steps, peak memory and so on."""
-        paths = {stage.settings.name: self.stage_folder(stage) / "done.json" for stage in self.stages}
-        return {name: json.loads(path.read_text()) for name, path in paths.items() if path.is_file()}
+        found = {stage.settings.name: _noted(self.stage_folder(stage)) for stage in self.stages}
+        return {name: noted for name, noted in found.items() if noted is not None}
+
+    def rebuilt(self, name: str, scene: Scene, unit: float) -> DynamicSceneModule:
+        """A stage's module for a ``state_dict`` that brings its grids: nothing is asked of images or of the
+        stages before.
+
+        Args:
+            name: of the stage.
+            scene: cameras, times and box.
+            unit: of density, world units.
+        """
+        number, stage = next((i, s) for i, s in enumerate(self.stages) if s.settings.name == name)
+        plain = replace(stage, settings=replace(stage.settings, start="box", carry=False))
+        fresh = replace(self, datamodule=SimpleNamespace(scene=scene))
+        handover = Handover(scene.box.low, scene.box.high, unit, False, 0)
+        return fresh._module(plain, None, handover, number)[0]
 
     def _module(
         self, stage: Stage, before: DynamicSceneModule | None, handover: Handover | None, number: int
@@ -135,23 +157,27 @@ class Run:
             curriculum=curriculum,
             cameras=[frame.camera for frame in scene.train],
             seed=self.seed + number,
+            still=scene.still,
         )
         return module, unit
 
     def _fit_stage(self, stage: Stage, module: DynamicSceneModule, folder: Path, unit: float) -> None:
         last = folder / "last.ckpt"
-        keeper = KeepCheckpoint(last, self.checkpoint_seconds)
-        trainer = self.make_trainer(folder, [*self.callbacks(stage.settings.name, folder), keeper])
+        sentinel = Sentinel(folder, skip=self.skip)
+        keeper = KeepCheckpoint(last, self.checkpoint_seconds, sentinel.check)
+        watchers = [sentinel, *self.callbacks(stage.settings.name, folder), keeper]
+        trainer = self.make_trainer(folder, watchers)
         checkpoint = last if last.is_file() else None
         if checkpoint is not None:
-            check_checkpoint(checkpoint, module)
+            check_state(checkpoint, module)
+        reset_peak_memory()
         trainer.fit(module, datamodule=self.datamodule, ckpt_path=checkpoint, weights_only=True)
         if module.fraction < 1:
             raise KeyboardInterrupt
         keeper.save(trainer)
-        save_handover(
-            make_handover(module.method, self.datamodule.scene, unit, module.curriculum.in_play), folder
-        )
+        scene, in_play = self.datamodule.scene, module.curriculum.in_play
+        alpha = stage.settings.box_alpha
+        save_handover(make_handover(module.method, scene, unit, in_play, alpha=alpha), folder)
         write_json(
             folder / "done.json",
             {
@@ -160,75 +186,12 @@ class Run:
                 "parameters": parameter_count(module.method),
                 "frames_in_play": module.curriculum.in_play,
                 "peak_memory_bytes": peak_memory_bytes(),
+                "skipped_steps": sentinel.skipped,
             },
         )
 
 
-class KeepCheckpoint(lightning.Callback):
-    """Writes ``last.ckpt`` beside, then renames it, every so many seconds of training.
-
-    Args:
-        path: of the checkpoint.
-        seconds: between two.
-    """
-
-    def __init__(self, path: Path, seconds: float) -> None:
-        self.path, self.every = Path(path), seconds
-        self._next = seconds
-
-    def on_train_batch_end(self, trainer, module, outputs, batch, batch_idx) -> None:
-        """Save when it is time."""
-        if module.clock.seconds >= self._next:
-            self._next = module.clock.seconds + self.every
-            with module.clock.paused():
-                self.save(trainer)
-
-    def on_train_start(self, trainer, module) -> None:
-        """Count from where a continued run stands."""
-        self._next = module.clock.seconds + self.every
-
-    def save(self, trainer: lightning.Trainer) -> None:
-        """Save now."""
-        beside = self.path.with_name(self.path.name + ".part")
-        try:
-            trainer.save_checkpoint(beside)
-            os.replace(beside, self.path)
-        except OSError as error:  # a full disk does not say which file
-            beside.unlink(missing_ok=True)
-            raise OSError(error.errno, error.strerror or str(error), str(self.path)) from error
-
-
-def check_checkpoint(path: Path, module: DynamicSceneModule) -> dict:
-    """Read a checkpoint and refuse one of another configuration.
-
-    Raises:
-        ValueError: naming what does not fit.
-    """
-    try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:
-        raise ValueError(
-            f"{path}: expected a checkpoint, but it cannot be read ({type(error).__name__}); delete it"
-        ) from None
-    own, theirs = _shapes(module.state_dict(), module), _shapes(content.get("state_dict", {}), module)
-    differ = sorted(k for k in {**own, **theirs} if k not in own or k not in theirs or own[k] != theirs[k])
-    if differ:
-        raise ValueError(
-            f"{path}: expected a checkpoint of this configuration, but got one that differs in "
-            f"{', '.join(differ[:3])}; use another run folder, or the configuration that it was made with"
-        )
-    return content
-
-
-def _shapes(weights: dict, module: DynamicSceneModule) -> dict[str, tuple | None]:
-    """Of every entry that must fit; None for those of voxel grids, which adopt a checkpoint's shapes."""
-    grids = [(prefix, m) for prefix, m in module.named_modules() if isinstance(m, VoxelGrid)]
-    adopted = {f"{prefix}.{name}" for prefix, m in grids for name in ("voxels", "index", *m.names)}
-    return {
-        k: tuple(v.shape) if torch.is_tensor(v) and k not in adopted else None for k, v in weights.items()
-    }
-
-
-def load_weights(module: DynamicSceneModule, path: Path) -> None:
-    """Load a finished stage's weights into a module of the same configuration."""
-    module.load_state_dict(check_checkpoint(path, module)["state_dict"])
+def _noted(folder: Path) -> dict | None:
+    """What a stage noted at its end; None where it did not come to it."""
+    noted = read_json(folder / "done.json")
+    return noted if noted is not None and {"seconds", "steps"} <= noted.keys() else None

@@ -1,0 +1,74 @@
+"""Whose a run's folder is while it is worked on, and what data it was begun with."""
+
+from __future__ import annotations
+
+import os
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from forewarp.data.fingerprint import difference
+from forewarp.training.handover import read_json, write_json
+from forewarp.training.stages import Run
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None
+
+LOCK, DATA = ".lock", "data.json"
+CHOICES = ("refuse", "accept")
+
+
+@contextmanager
+def alone(folder: Path) -> Iterator[None]:
+    """Work on a run's folder, made if need be, while nobody else does.
+
+    The lock is the kernel's: it ends with the process, however that ends. Where the system has no ``flock``
+    nothing is locked.
+
+    Raises:
+        ValueError: where another process works on it, naming that.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with open(folder / LOCK, "a+") as file:
+        if fcntl is not None:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                file.seek(0)
+                raise ValueError(
+                    f"{folder}: expected a run that nobody works on, but got one of "
+                    f"{file.read(200).strip() or 'another process'}; wait for it, or use run=..."
+                ) from None
+        file.truncate(0)
+        file.write(f"process {os.getpid()} on {socket.gethostname()}\n")
+        file.flush()
+        yield
+
+
+def same_data(run: Run, changed: str) -> None:
+    """Note what the scene's files are when a run begins; refuse to go on where they have changed since.
+
+    Args:
+        run: whose data are read.
+        changed: ``refuse``, or ``accept`` what they are now.
+
+    Raises:
+        ValueError: naming what changed.
+    """
+    if changed not in CHOICES:
+        raise ValueError(f"data_changed: expected one of {', '.join(CHOICES)}, but got {changed}")
+    path, now = Path(run.folder) / DATA, run.datamodule.fingerprint()
+    if now is None:
+        return
+    before, begun = read_json(path), any(Path(run.folder).glob("*/last.ckpt"))
+    found = difference(before, now) if before is not None and begun else None
+    if found and changed == "refuse":
+        raise ValueError(
+            f"{path}: expected the data that the run was begun with, but got others: {found}; "
+            "use run=..., or go on with data_changed=accept"
+        )
+    if now != before:
+        write_json(path, now)

@@ -1,0 +1,64 @@
+"""A broken step taken again: what ``python -m forewarp.replay`` does."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from forewarp.cli.entry import one_line, quiet
+
+
+def replay(path: Path) -> str:
+    """Take the step of a bundle again and say what is the first not finite, or that all is well.
+
+    Raises:
+        ValueError: where the file is no such bundle.
+    """
+    import torch
+
+    from forewarp.cli.runs import build_run, parsed
+    from forewarp.training.bundle import read_bundle
+    from forewarp.training.sentinel import diagnose
+
+    bundle = read_bundle(path)
+    stage, number = bundle.noted["stage"], bundle.noted["step"]
+    config = parsed(bundle.config, path)
+    config.trainer.accelerator = "auto"  # it may be another machine
+    run = build_run(config)
+    module = run.rebuilt(stage, bundle.scene, bundle.unit)
+    module.load_state_dict(bundle.state_dict)
+    trainer = replace(run, callbacks=lambda *_: []).make_trainer(path.parent, [])
+    module.generator.set_state(bundle.noted["random"]["samples"])
+    torch.set_rng_state(bundle.noted["random"]["torch"])
+    device = trainer.strategy.root_device
+    with trainer.precision_plugin.forward_context():
+        found = diagnose(module.to(device), bundle.batch.to(device), number)
+    name = bundle.scene.train[bundle.batch.frame].name
+    where = f"stage {stage}, step {number}, frame {name} (time {bundle.batch.time:.4g})"
+    return f"{where}: {found or 'all is finite, where the run saw ' + bundle.noted['found']}"
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Print what is found; exits with 2 and one line where the file cannot be used."""
+    parser = argparse.ArgumentParser(
+        prog="python -m forewarp.replay",
+        description="Take a step again that met a number that is not finite, and name the first such tensor.",
+    )
+    parser.add_argument("bundle", type=Path, help="<run>/<stage>/broken/step_<n>.pt")
+    given = parser.parse_args(arguments)
+    quiet()
+    try:
+        print(replay(given.bundle))
+    except Exception as error:
+        line = one_line(error)
+        if line is None:
+            raise
+        print(f"forewarp.replay: error: {line}", file=sys.stderr)
+        sys.exit(2)
+
+
+if __name__ == "__main__":
+    main()

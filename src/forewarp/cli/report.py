@@ -1,0 +1,78 @@
+"""``forewarp-report``: tables and curves of finished runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from forewarp.cli.entry import command
+
+HELP = """
+forewarp-report makes pages with tables and curves of runs that are already there. It computes nothing anew.
+
+  forewarp-report kind=accuracy_time        accuracy against training time, and the cheapest way to each dB
+  forewarp-report kind=price_list           what each choice costs and brings, with the spread over seeds
+  forewarp-report kind=paper                the paper's tables and figures: Markdown, LaTeX, CSV, HTML
+  forewarp-report kind=price_list runs=FOLDER out=FOLDER
+
+What one types most:
+  kind=accuracy_time|price_list|paper   which page
+  runs=FOLDER                      searched for runs (runs/accuracy_time; of kind=paper runs/paper)
+  out=FOLDER                       where the page goes (docs/results of the project)
+  target=DB                        accuracy_time: PSNR that every variant's seconds are listed for
+  published=FILE                   accuracy_time: points that others report (docs/results/published.yaml);
+                                   paper: what is printed (docs/results/paper.yaml)
+
+The runs: make accuracy-time [DATA=FOLDER SCENE=NAME MINUTES=N], make price-list DATA=FOLDER,
+make reproduce-tables [DATA=FOLDER]. One that has no
+results is named at the end of the page.
+"""
+
+KINDS = ("accuracy_time", "price_list", "paper")
+
+
+def report(config) -> None:
+    """Write the page."""
+    from forewarp.report.accuracy_time import write_accuracy_time
+    from forewarp.report.curve import read_published
+    from forewarp.report.paper import write_paper
+    from forewarp.report.price_list import write_price_list
+
+    if config.kind not in KINDS:
+        raise ValueError(f"kind: expected one of {', '.join(KINDS)}, but got '{config.kind}'")
+    if not isinstance(config.target, int | float | None):
+        raise ValueError(f"target: expected a number of dB or null, but got '{config.target}'")
+    default = f"{config.paths.runs}/{'paper' if config.kind == 'paper' else 'accuracy_time'}"
+    runs, out = Path(config.runs or default), Path(config.out)
+    if config.kind == "price_list":
+        files = write_price_list(runs, out)
+    elif config.kind == "paper":
+        printed = config.published or f"{config.paths.root}/docs/results/paper.yaml"
+        files = write_paper(runs, out, Path(printed))
+    else:
+        published = [] if config.published is None else read_published(Path(config.published))
+        files = write_accuracy_time(runs, out, target=config.target, published=published)
+    for file in files:
+        print(f"written: {file}")
+
+
+def draw_run(folder: Path) -> None:
+    """Draw a run's own curve into ``accuracy_time.png``, where it has one."""
+    from forewarp.report import curve
+    from forewarp.report.collect import read_curve
+
+    points = read_curve(folder)
+    if not points:
+        return
+    try:
+        print(f"curve    {curve.draw_run(folder / 'accuracy_time.png', points, folder.name)}")
+    except ImportError as error:
+        print(f"without accuracy_time.png: {error}")
+
+
+def main() -> None:
+    """The console script."""
+    command("report", report, HELP)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,65 @@
+"""Decoded images kept in a bounded share of the memory, whatever scene they belong to."""
+
+from __future__ import annotations
+
+import weakref
+from collections import OrderedDict
+from collections.abc import Callable
+
+from torch import Tensor
+
+from forewarp.scene.errors import SceneError
+
+
+class ImageCache:
+    """Keeps what was made for an owner as long as the owner lives and the sum of all stays below ``limit``
+    bytes; what was not asked for the longest goes first. What is larger than ``limit`` is never kept.
+
+    >>> import torch
+    >>> class Owner: pass
+    >>> cache, a, b = ImageCache(4), Owner(), Owner()
+    >>> for owner in (a, b):
+    ...     _ = cache.get(owner, lambda: torch.zeros(3, dtype=torch.uint8))
+    >>> cache.bytes
+    3
+    """
+
+    def __init__(self, limit: int) -> None:
+        self._kept: OrderedDict[int, tuple[weakref.ref, Tensor]] = OrderedDict()
+        self.bytes, self.limit = 0, limit
+
+    def get(self, owner: object, make: Callable[[], Tensor]) -> Tensor:
+        """What ``make`` gives, remembered for ``owner``; treat it as read-only."""
+        key = id(owner)
+        if key in self._kept:
+            self._kept.move_to_end(key)
+            return self._kept[key][1]
+        made = make()
+        if made.nbytes <= self.limit:
+            # The owner's end frees its image at once; until then nothing else can have the same id.
+            self._kept[key] = (weakref.ref(owner, lambda _: self._drop(key)), made)
+            self.bytes += made.nbytes
+            self._shrink()
+        return made
+
+    def resize(self, limit: int) -> None:
+        """Allow ``limit`` bytes from now on.
+
+        Raises:
+            SceneError: for anything but a number >= 0.
+        """
+        if isinstance(limit, bool) or not isinstance(limit, (int, float)) or not 0 <= limit < float("inf"):
+            raise SceneError(f"data.cache_bytes: expected a number of bytes >= 0, but got {limit!r}")
+        self.limit = int(limit)
+        self._shrink()
+
+    def _shrink(self) -> None:
+        while self.bytes > self.limit:
+            self._drop(next(iter(self._kept)))
+
+    def _drop(self, key: int) -> None:
+        _, gone = self._kept.pop(key)
+        self.bytes -= gone.nbytes
+
+
+CACHE = ImageCache(1_500_000_000)

@@ -1,0 +1,205 @@
+"""A user's own capture: ``transforms.json`` as nerfstudio and instant-ngp write it, and images, PNG or JPEG.
+
+A pose on disk is camera-to-world with OpenGL's axes (x right, y up, looking along -z). The camera
+(``w h fl_x fl_y cx cy k1 k2 k3 p1 p2 camera_model``) stands at the top or, where it differs, in a frame. All
+lengths (``near``, ``far``, ``aabb``; ``data.near``, ``data.far``, ``data.box``) are in the file's units, of
+whatever kind; the scene's own are such that nothing depends on them.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from reprlib import repr as short
+
+import numpy as np
+from torch import Tensor
+
+from forewarp.data.capture import FLIP, SPLITS, View, read_views, split_views, spread_in_time
+from forewarp.data.files import number, read_json, replace_file, scene_folder
+from forewarp.data.images import CachedImage, write_png
+from forewarp.data.jpeg import write_jpeg
+from forewarp.data.masked import MaskedImage
+from forewarp.data.region import region_of
+from forewarp.data.views import MOST_UNITS, box_of, middle_of, pose_of
+from forewarp.scene.box import Box
+from forewarp.scene.camera import Camera
+from forewarp.scene.errors import SceneError
+from forewarp.scene.frame import Frame, Scene
+
+FILE = "transforms.json"
+SCALES = (1, 2, 4, 8)
+_OF_CAMERA = {"w", "h", "fl_x", "fl_y", "cx", "cy", "camera_model", "k1", "k2", "k3", "p1", "p2"}
+
+
+@dataclass(frozen=True)
+class PosedShot:
+    """One image to write: ``name`` its file, .png or .jpg; ``pixels`` uint8 (H, W, 3), or (H, W, 4) of
+    straight alpha; ``camera`` of that size, its near and far are not written; ``time`` in [0, 1] or None;
+    ``split`` train, val or test, or "" where the reader is to choose.
+    """
+
+    name: str
+    camera: Camera
+    pixels: Tensor | np.ndarray
+    time: float | None = None
+    split: str = ""
+
+
+def read_scene(
+    root: str | Path,
+    scene: str,
+    *,
+    scale: int = 1,
+    near: float | None = None,
+    far: float | None = None,
+    box: Sequence[float] | None = None,
+    normalise: bool = True,
+    canonical: str = "middle",
+    test_every: int = 8,
+) -> Scene:
+    """Read ``root/scene``; pixels are decoded when a frame is first loaded.
+
+    Without ``time`` in the frames they are spread evenly over [0, 1] in the order of their files' names.
+
+    Args:
+        scale: 1, 2, 4 or 8: take the smaller images in ``images_<scale>`` beside ``images``.
+        near, far: along the unit ray, the file's units; None takes the file's or derives them.
+        box: x0 y0 z0 x1 y1 z1 in the file's units; None takes the file's ``aabb``, or all that is seen.
+        normalise: put what is looked at into the origin and the farthest camera at distance 1.
+        canonical: the training time nearest to the ``middle``, or the ``first``.
+        test_every: every n-th frame is a test frame, where the file does not list ``<split>_filenames``.
+
+    Raises:
+        SceneError: for every file or value that is missing or wrong, with file and key.
+    """
+    _check(scale, canonical, test_every, normalise)
+    file = scene_folder(root, scene, FILE) / FILE
+    content = read_json(file)
+    views = read_views(file, content, scale)
+    spread = views[0].time is None
+    views = spread_in_time(views) if spread else sorted(views, key=lambda v: v.time)
+    parts, how = split_views(file, content, views, test_every)
+    near, far, bounds = _limits(file, content, near, far, box)
+    has_alpha = views[0].mask is not None or bool((_load(views[0])()[..., 3] < 255).any())
+    options = {"near": near, "far": far, "box": bounds, "normalise": normalise, "cut_out": has_alpha}
+    region = region_of([v.camera for v in views], str(file), **options)
+    train, val, test = (
+        tuple(Frame(v.name, v.time, region.placed(v.camera), _load(v)) for v in parts[split])
+        for split in SPLITS
+    )
+    start = (min if canonical == "first" else middle_of)([frame.time for frame in train])
+    protocol = {
+        "dataset": "video_with_poses",
+        "resolution": [train[0].camera.width, train[0].camera.height],
+        "times": "spread in the order of the files' names" if spread else "as given",
+        "split": how,
+        "test_frames": len(test),
+        "normalisation": {"center": list(region.center), "scale": region.scale},
+        "near": region.near,
+        "far": region.far,
+        "derived": [n for n, v in (("near", near), ("far", far), ("box", bounds)) if v is None],
+    }
+    return Scene(scene, train, val, test, region.box, start, has_alpha, protocol=protocol)
+
+
+def write_scene(
+    folder: str | Path,
+    shots: Iterable[PosedShot],
+    *,
+    near: float | None = None,
+    far: float | None = None,
+    aabb: Box | None = None,
+) -> None:
+    """Write a scene that ``read_scene`` reads; ``transforms.json`` goes first and comes last.
+
+    Args:
+        shots: consumed one by one; all or none have a split.
+        near, far, aabb: where known, in the units of the cameras' places.
+
+    Raises:
+        ValueError: for a shot that could not be read again.
+    """
+    folder = Path(folder)
+    (folder / FILE).unlink(missing_ok=True)
+    entries, lists = [], {split: [] for split in SPLITS}
+    for shot in shots:
+        entries.append(_write_shot(folder, shot))
+        if shot.split:
+            lists[shot.split].append(entries[-1]["file_path"])
+    common = {key: value for key, value in (entries[0] if entries else {}).items() if key in _OF_CAMERA}
+    for entry in entries:
+        common = {key: value for key, value in common.items() if entry.get(key) == value}
+    content = {**common, **{f"{split}_filenames": names for split, names in lists.items() if names}}
+    content |= {key: value for key, value in (("near", near), ("far", far)) if value is not None}
+    content |= {} if aabb is None else {"aabb": [aabb.low, aabb.high]}
+    content["frames"] = [{k: v for k, v in entry.items() if k not in common} for entry in entries]
+    replace_file(folder / FILE, json.dumps(content, indent=1).encode())
+
+
+def _write_shot(folder: Path, shot: PosedShot) -> dict:
+    """Write one image and give its entry."""
+    camera, pixels = shot.camera, np.asarray(shot.pixels)
+    if shot.split not in ("", *SPLITS):
+        raise ValueError(f"{shot.name}: expected a split of {', '.join(SPLITS)}, but got {shot.split!r}")
+    shapes = [(camera.height, camera.width, channels) for channels in (3, 4)]
+    if pixels.dtype != np.uint8 or pixels.shape not in shapes or camera.skew:
+        raise ValueError(
+            f"{shot.name}: expected uint8 pixels of shape {shapes[0]} or {shapes[1]} and no skew, but got "
+            f"{pixels.dtype} of {pixels.shape} and a skew of {camera.skew:g}"
+        )
+    entry = {"file_path": f"images/{shot.name}", "w": camera.width, "h": camera.height}
+    entry |= {
+        "fl_x": camera.fx,
+        "fl_y": camera.fy,
+        "cx": camera.cx,
+        "cy": camera.cy,
+        "camera_model": "OPENCV",
+    }
+    if camera.lens is not None:
+        entry |= dict(zip(("k1", "k2", "k3", "p1", "p2"), camera.lens.k + camera.lens.p))
+    if shot.time is not None:
+        entry["time"] = number(shot.time, f"{shot.name}: time", 0, 1)
+    entry["transform_matrix"] = (pose_of(camera.camera_to_world.tolist(), shot.name) @ FLIP).tolist()
+    write = write_png if shot.name.endswith(".png") else write_jpeg
+    write(folder / entry["file_path"], pixels)
+    return entry
+
+
+def _check(scale: int, canonical: str, test_every: int, normalise: bool) -> None:
+    """Refuse options that mean nothing."""
+    if type(scale) is not int or scale not in SCALES:
+        raise SceneError(f"data.scale: expected one of {SCALES}, but got {scale!r}")
+    if canonical not in ("middle", "first"):
+        raise SceneError(f"data.canonical: expected middle or first, but got {canonical!r}")
+    if type(test_every) is not int or test_every < 2:
+        raise SceneError(f"data.test_every: expected a whole number >= 2, but got {test_every!r}")
+    if not isinstance(normalise, bool):
+        raise SceneError(f"data.normalise: expected true or false, but got {normalise!r}")
+
+
+def _load(view: View) -> CachedImage | MaskedImage:
+    size = (view.camera.width, view.camera.height)
+    return CachedImage(view.image, size) if view.mask is None else MaskedImage(view.image, view.mask, size)
+
+
+def _limits(
+    file: Path, content: dict, near: float | None, far: float | None, box: Sequence[float] | None
+) -> tuple[float | None, float | None, Box | None]:
+    """Near, far and box in the file's units: of the config, else of the file, else None."""
+    least = {"near": 0.0, "far": 1 / MOST_UNITS}
+    found = []
+    for key, value in (("near", near), ("far", far)):
+        where = f"data.{key}" if value is not None else f"{file}: {key}"
+        value = content.get(key) if value is None else value
+        found.append(None if value is None else number(value, where, least[key], MOST_UNITS))
+    if box is not None or content.get("aabb") is None:
+        return *found, None if box is None else box_of(box)
+    try:
+        low, high = (tuple(number(v, "aabb", -MOST_UNITS, MOST_UNITS) for v in c) for c in content["aabb"])
+        return *found, Box(low, high)
+    except (TypeError, ValueError) as error:
+        expected = "[[x0, y0, z0], [x1, y1, z1]], each low end below its high end"
+        raise SceneError(f"{file}: aabb: expected {expected}, but got {short(content['aabb'])}") from error

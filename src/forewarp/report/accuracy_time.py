@@ -1,0 +1,108 @@
+"""The page that says what accuracy costs in time: for so many dB so many seconds, by which command."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from forewarp.report.collect import Result, by_scene, collect, grouped, machine
+from forewarp.report.curve import Published, draw_scene, seconds_to
+from forewarp.report.tables import Column, Estimate, Table
+
+Groups = Mapping[tuple[str, float | None], Sequence[Result]]
+
+INTRODUCTION = """# Accuracy against training time
+
+Written by `forewarp-report kind=accuracy_time`. Seconds are of training alone: evaluation, logging and
+checkpoints are left out. PSNR is of training views set aside (`data.held_out`), each estimated from the same
+random pixels of the whole image; a value counts as reached once two evaluations in a row reach it. Over
+several seeds: mean ± standard deviation, and only where every seed gets there. A schedule follows the share
+of its minutes that is spent, so a run of ten minutes is not at its best after one.
+"""
+
+
+def write_accuracy_time(
+    runs: Path, out: Path, *, target: float | None = None, published: Sequence[Published] = ()
+) -> list[Path]:
+    """Write ``accuracy-time.md``, and a picture and a CSV file a scene.
+
+    Args:
+        runs: folder of runs.
+        out: folder that they are written into.
+        target: PSNR (dB) that every variant's time is listed for; None: the last whole one that the base, or
+            without one the best run, reached.
+        published: drawn beside, apart.
+
+    Returns:
+        the files.
+    """
+    results, without = collect(runs, ["accuracy_time.csv"])
+    out.mkdir(parents=True, exist_ok=True)
+    written, parts = [], [INTRODUCTION, f"Machine: {machine(results)}.\n"]
+    for scene, found in by_scene(results).items():
+        groups = grouped(found)
+        picture = draw_scene(out / f"accuracy-time-{scene}.png", groups, scene, published)
+        every = variants(groups, _target(groups) if target is None else target)
+        file = out / f"accuracy-time-{scene}.csv"
+        file.write_text(every.csv())
+        parts += [f"## {scene}\n", f"![PSNR against seconds]({picture.name})\n"]
+        parts += [cheapest(groups).markdown(), every.markdown()]
+        written += [picture, file]
+    if published:
+        lines = [f"* {p.name}: {p.psnr:g} dB, {p.seconds:g} s, {p.hardware}; {p.source}" for p in published]
+        parts += ["## Published by others\n", "\n".join(lines) + "\n"]
+    if without:
+        parts += ["## Without a curve\n", "\n".join(f"* {line}" for line in without) + "\n"]
+    page = out / "accuracy-time.md"
+    page.write_text("\n".join(parts))
+    return [page, *written]
+
+
+def reached(group: Sequence[Result], psnr: float) -> Estimate | None:
+    """Seconds to a PSNR over the seeds; None where one of them does not get there."""
+    times = [seconds_to(result.curve, psnr) for result in group]
+    return None if None in times else Estimate.of(times)
+
+
+def cheapest(groups: Groups) -> Table:
+    """For every whole dB that any variant reaches: the one that is there first, and its command."""
+    rows = []
+    values = [point.psnr for group in groups.values() for result in group for point in result.curve]
+    for psnr in range(math.ceil(min(values)), math.floor(max(values)) + 1):
+        found = [(reached(group, psnr), group[0]) for group in groups.values()]
+        found = [(seconds, result) for seconds, result in found if seconds is not None]
+        if found:
+            seconds, result = min(found, key=lambda pair: pair[0].mean)
+            rows.append([str(psnr), seconds, result.variant, f"`{result.command}`"])
+    columns = [Column("for dB"), Column("seconds", 1), Column("variant"), Column("command")]
+    return Table(columns, rows, "The cheapest way to each PSNR:")
+
+
+def variants(groups: Groups, target: float) -> Table:
+    """Every variant: how long to the target, and what it ends with."""
+    rows = []
+    for (variant, minutes), group in groups.items():
+        last = [result.curve[-1] for result in group if result.curve]
+        errors = [point.epe for point in last if point.epe is not None]
+        rows.append(
+            [
+                variant,
+                group[0].about,
+                minutes,
+                len(group),
+                reached(group, target),
+                Estimate.of([point.psnr for point in last]),
+                Estimate.of(errors),
+                Estimate.of([sum(d["steps"] for d in result.stages.values()) for result in group]),
+            ]
+        )
+    columns = [Column("variant"), Column("what"), Column("minutes", 1), Column("seeds", 0)]
+    columns += [Column(f"seconds to {target:g} dB", 1), Column("PSNR at the end"), Column("EPE", 4)]
+    return Table([*columns, Column("steps", 0)], rows, "At equal minutes; the steps that were done in them:")
+
+
+def _target(groups: Groups) -> float:
+    curves = [result.curve for (variant, _), group in groups.items() if variant == "base" for result in group]
+    curves = curves or [result.curve for group in groups.values() for result in group]
+    return float(math.floor(max(min(a.psnr, b.psnr) for c in curves for a, b in zip(c, c[1:] or c))))

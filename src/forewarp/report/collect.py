@@ -1,0 +1,200 @@
+"""What run folders hold, read as plain files."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import yaml
+
+
+@dataclass(frozen=True)
+class Point:
+    """A row of ``accuracy_time.csv``: PSNR (dB) of the views set aside after ``seconds`` of training;
+    ``epe`` is the moving points' error in world units, None where nobody knows the truth.
+    """
+
+    seconds: float
+    psnr: float
+    step: int
+    epe: float | None = None
+
+
+@dataclass(frozen=True)
+class Result:
+    """One run: its resolved ``config``, what its stages noted at their end, its ``metrics.json`` (empty where
+    it was not measured) and its curve (empty where no views were set aside).
+    """
+
+    folder: Path
+    config: dict
+    stages: dict[str, dict] = field(default_factory=dict)
+    metrics: dict = field(default_factory=dict)
+    curve: tuple[Point, ...] = ()
+
+    @property
+    def scene(self) -> str:
+        """Its name."""
+        return str(self.config["data"]["scene"])
+
+    @property
+    def dataset(self) -> str:
+        """What its scene is one of, as its numbers' protocol says; "" where it was not measured."""
+        return str(self.metrics.get("protocol", {}).get("dataset", ""))
+
+    @property
+    def is_counterpart(self) -> bool:
+        """Whether it is of a procedural scene that stands in for its dataset."""
+        return ".Synthetic" in str(self.config["data"].get("_target_", ""))
+
+    @property
+    def variant(self) -> str:
+        """What was changed; without a variant the method and the budget."""
+        known = self.config.get("variant") or {}
+        return known.get("name") or f"{self.config['model']['warp']}-{self.config['budget']['name']}"
+
+    @property
+    def about(self) -> str:
+        """The change in words."""
+        return (self.config.get("variant") or {}).get("about", "")
+
+    @property
+    def against(self) -> str:
+        """The variant that it is compared with."""
+        return (self.config.get("variant") or {}).get("against", "base")
+
+    @property
+    def seed(self) -> int:
+        """Of everything random."""
+        return int(self.config["seed"])
+
+    @property
+    def minutes(self) -> float | None:
+        """What the run could spend; None where steps bound it."""
+        return self.config["budget"]["minutes"]
+
+    @property
+    def command(self) -> str:
+        """What makes such a run, trained on all views."""
+        return self.config.get("command") or f"forewarp-train # as {self.folder / 'config.yaml'}"
+
+    @property
+    def ability(self) -> str:
+        """The kind of test view that its numbers are of: ``all``, or, where a scene tells them apart,
+        ``time``: a new view between the training times.
+        """
+        return "all" if "all" in self.metrics["test"] else "time"
+
+    @property
+    def numbers(self) -> dict[str, float]:
+        """Of a measured run: ``psnr ssim epe``, ``step`` and ``frame`` in seconds, ``memory`` in GiB,
+        ``parameters`` in millions and ``steps``; what is unknown is left out.
+        """
+        scores = self.metrics["test"].get(self.ability, {})
+        seconds, steps = self.metrics["seconds"], sum(done["steps"] for done in self.stages.values())
+        memory, flow = self.metrics.get("peak_memory_bytes"), self.metrics.get("flow") or {}
+        found = {
+            "psnr": scores.get("psnr"),
+            "ssim": scores.get("ssim"),
+            "epe": flow.get("epe_moving"),
+            "step": seconds["train"] / steps if steps else None,
+            "frame": seconds.get("render_per_frame"),
+            "memory": memory / 2**30 if memory else None,
+            "parameters": self.metrics["parameters"] / 1e6,
+            "steps": steps,
+        }
+        return {name: value for name, value in found.items() if value is not None}
+
+
+def collect(root: Path, needed: Sequence[str] = ()) -> tuple[list[Result], list[str]]:
+    """All runs below a folder.
+
+    Args:
+        root: searched for ``config.yaml``.
+        needed: files that a run must hold, as ``metrics.json``.
+
+    Returns:
+        the runs in the order of their folders, and a line for each that cannot be used.
+
+    Raises:
+        ValueError: where there is no run at all.
+    """
+    results, without = [], []
+    for path in sorted(Path(root).rglob("config.yaml")):
+        folder = path.parent
+        absent = [name for name in needed if not (folder / name).is_file()]
+        try:
+            result = read_run(folder)
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, yaml.YAMLError) as error:
+            reason = f"no key {error}" if isinstance(error, KeyError) else str(error).split("\n")[0]
+            without.append(f"{folder.relative_to(root)}: cannot be read ({reason})")
+            continue
+        if absent:
+            without.append(f"{folder.relative_to(root)}: no {', '.join(absent)}; run its command again")
+        else:
+            results.append(result)
+    if not results and not without:
+        raise ValueError(
+            f"{root}: expected folders of runs, but got none; "
+            "make some with make accuracy-time, or set runs=..."
+        )
+    return results, without
+
+
+def read_run(folder: Path) -> Result:
+    """One run; files that are not there leave their part empty."""
+    config = yaml.safe_load((folder / "config.yaml").read_text())
+    stages = {path.parent.name: _json(path) for path in sorted(folder.glob("*/done.json"))}
+    result = Result(folder, config, stages, _json(folder / "metrics.json"), read_curve(folder))
+    # Looked at here, so that what is spoiled is found while it can be named.
+    _ = result.scene, result.variant, result.seed, result.minutes, result.metrics and result.numbers
+    return result
+
+
+def read_curve(folder: Path) -> tuple[Point, ...]:
+    """The rows of a run's ``accuracy_time.csv``; none where it has none."""
+    path = folder / "accuracy_time.csv"
+    if not path.is_file():
+        return ()
+    with path.open(newline="") as file:
+        return tuple(
+            Point(
+                float(row["seconds"]),
+                float(row["psnr"]),
+                int(row["step"]),
+                float(row["epe_moving"]) if row["epe_moving"] else None,
+            )
+            for row in csv.DictReader(file)
+        )
+
+
+def grouped(results: Sequence[Result]) -> dict[tuple[str, float | None], list[Result]]:
+    """The runs that differ in nothing but the seed: (variant, minutes) -> runs by seed; the base first."""
+    groups: dict[tuple[str, float | None], list[Result]] = {}
+    for result in sorted(results, key=lambda r: (r.variant != "base", r.variant, r.minutes or 0, r.seed)):
+        groups.setdefault((result.variant, result.minutes), []).append(result)
+    return groups
+
+
+def by_scene(results: Sequence[Result]) -> dict[str, list[Result]]:
+    """Scene -> its runs, by name."""
+    scenes = sorted({result.scene for result in results})
+    return {scene: [result for result in results if result.scene == scene] for scene in scenes}
+
+
+def machine(results: Sequence[Result]) -> str:
+    """What the runs were computed on, in one line."""
+    found = []
+    for protocol in (result.metrics.get("protocol", {}) for result in results):
+        torch = protocol.get("versions", {}).get("torch")
+        words = [protocol.get("device"), f"{protocol.get('threads')} threads", f"torch {torch}"]
+        if protocol.get("device") and words not in found:
+            found.append(words)
+    return "; ".join(", ".join(words) for words in found) or "unknown"
+
+
+def _json(path: Path) -> dict:
+    return json.loads(path.read_text()) if path.is_file() else {}

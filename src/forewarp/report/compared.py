@@ -1,0 +1,155 @@
+"""Measured runs beside what the paper prints."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from statistics import fmean
+
+from forewarp.report.collect import Result
+from forewarp.report.published import Group, PaperTable
+from forewarp.report.tables import Cell, Column, Difference, Estimate, Table
+
+# Title, digits, whether more is better, and the factor to the unit that is printed.
+METRICS = {
+    "psnr": ("PSNR", 2, True, 1),
+    "ssim": ("SSIM", 3, True, 1),
+    "ms_ssim_legacy": ("MS-SSIM", 3, True, 1),
+    "lpips_vgg": ("LPIPS", 3, False, 1),
+    "depth_delta_1.25": ("δ<1.25", 3, True, 100),
+    "depth_delta_1.5625": ("δ<1.25²", 3, True, 100),
+}
+
+
+@dataclass(frozen=True)
+class Measured:
+    """The runs of one row: equal in all but scene and seed."""
+
+    name: str
+    variant: str
+    runs: tuple[Result, ...]
+
+    def cell(self, group: Group, metric: str) -> Estimate | None:
+        """Over the seeds that all scenes of the group were measured with: the mean of the scenes' means.
+
+        None where there is no such seed.
+        """
+        found = {}
+        for run in self.runs:
+            scores = run.metrics["test"].get(group.ability or run.ability, {})
+            if run.dataset == group.dataset and metric in scores:
+                found[run.scene, run.seed] = scores[metric] * METRICS[metric][3]
+        seeds = sorted({seed for _, seed in found})
+        whole = [seed for seed in seeds if all((scene, seed) in found for scene in group.scenes)]
+        return Estimate.of([fmean(found[scene, seed] for scene in group.scenes) for seed in whole])
+
+
+def row_of(run: Result) -> tuple:
+    """What runs of one row have in common."""
+    budget = run.config["budget"]
+    known = (run.config.get("variant") or {}).get("name", "plain")
+    return known, run.config["model"]["warp"], budget["name"], budget["minutes"], budget.get("iterations")
+
+
+def measured(table: PaperTable, results: Sequence[Result]) -> list[Measured]:
+    """The table's measured rows, in the order of its variants; those without a run are not there."""
+    rows = {}
+    datasets = {group.dataset for group in table.groups}
+    for run in results:
+        key = row_of(run)
+        if key[0] in table.variants and run.dataset in datasets:
+            rows.setdefault(key, []).append(run)
+    order = sorted(rows, key=lambda k: (table.variants.index(k[0]), *(str(part) for part in k[1:])))
+    return [Measured(_name(key, rows[key]), key[0], tuple(rows[key])) for key in order]
+
+
+def comparison(table: PaperTable, results: Sequence[Result], *, difference: bool = True) -> Table:
+    """Measured rows, what they differ by from the paper's own, then the published ones.
+
+    The best and the second of each column are marked among the measured rows alone.
+
+    Args:
+        table: as printed.
+        results: of its scenes.
+        difference: a row after each measured one with its distance from the paper's.
+    """
+    rows, ranked, kinds = [], [], ["measured", "difference to the paper", "published"]
+    for row in measured(table, results):
+        cells = [row.cell(group, metric) for group, metric in table.columns]
+        ranked.append(len(rows))
+        rows.append([row.name, kinds[0], *cells])
+        printed = _ours(table, row.variant)
+        if difference and printed is not None and any(cells):
+            rows.append(["", kinds[1], *map(_difference, cells, printed)])
+    rules = [len(rows)] if rows else []
+    rows += [[row.name, kinds[2], *row.values] for row in table.rows]
+    columns = [
+        Column("method"),
+        Column("kind"),
+        *(_column(*pair) for pair in table.columns),
+    ]
+    return Table(columns, rows, marks=_marks(table, rows, ranked), rules=rules)
+
+
+def counterpart(table: PaperTable, results: Sequence[Result]) -> PaperTable | None:
+    """The same table over the synthetic scenes that were measured, without printed rows; None without any."""
+    groups = {}
+    for group in table.groups:
+        for scene in sorted({run.scene for run in results if run.dataset == group.dataset}):
+            name = group.name if group.ability else scene
+            more = Group(name, group.dataset, group.metrics, (scene,), group.ability)
+            groups[scene, group.ability, group.metrics] = more
+    return replace(table, groups=tuple(groups.values()), rows=(), means=()) if groups else None
+
+
+def with_means(table: PaperTable, results: Sequence[Result]) -> PaperTable:
+    """The table with the means that it asks for, and that of the scenes measured, where that is another."""
+    if not table.means:
+        return table
+    scenes = max(
+        ({run.scene for run in row.runs} for row in measured(table, results)), key=len, default=set()
+    )
+    asked = dict(table.means)
+    order = tuple(group.scenes[0] for group in table.groups if group.scenes[0] in scenes)
+    if order and order not in asked.values():
+        asked[f"Mean of the {len(order)} measured"] = order
+    for name, those in asked.items():
+        table = table.with_mean(name, those)
+    return table
+
+
+def _name(key: tuple, runs: Sequence[Result]) -> str:
+    variant, warp, budget, minutes, iterations = key
+    bounds = [f"{minutes:g} min" if minutes else "", f"{iterations} steps" if iterations else ""]
+    about = warp if variant == "plain" else (runs[0].about or variant)
+    seeds = len({run.seed for run in runs})
+    parts = [f"forewarp: {about}", budget, *bounds, f"{seeds} seeds" if seeds > 1 else ""]
+    return ", ".join(part for part in parts if part)
+
+
+def _column(group: Group, metric: str) -> Column:
+    title, digits, more, _ = METRICS[metric]
+    return Column(f"{group.name} {title}{'↑' if more else '↓'}", digits)
+
+
+def _ours(table: PaperTable, variant: str) -> tuple[str, ...] | None:
+    wanted = "full" if variant == "plain" else variant
+    return next((row.values for row in table.rows if row.variant == wanted), None)
+
+
+def _difference(cell: Estimate | None, printed: str) -> Difference | None:
+    return None if cell is None or not printed else Difference(cell.mean - float(printed))
+
+
+def _marks(table: PaperTable, rows: Sequence[Sequence[Cell]], ranked: Sequence[int]) -> dict:
+    """Best and second as they are written: what reads alike is alike."""
+    marks = {}
+    for number, (_, metric) in enumerate(table.columns, 2):
+        _, digits, more, _ = METRICS[metric]
+        values = {i: round(rows[i][number].mean, digits) for i in ranked if rows[i][number] is not None}
+        order = sorted(set(values.values()), reverse=more)
+        if len(values) > 1:
+            for i, value in values.items():
+                if value in order[:2]:
+                    marks[i, number] = ("best", "second")[order.index(value)]
+    return marks

@@ -1,0 +1,146 @@
+"""Accuracy against training time: what is reached when, the Pareto front, and pictures of both."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import yaml
+
+from forewarp.report.collect import Point, Result
+
+_KEYS = ("name", "seconds", "psnr", "hardware", "source")
+
+
+def seconds_to(curve: Sequence[Point], psnr: float) -> float | None:
+    """Seconds until a PSNR (dB) is first reached on two evaluations in a row: those of the first of the two.
+
+    None where that never happens.
+
+    >>> curve = [Point(s, p, 0) for s, p in [(1, 20), (2, 25), (4, 24), (8, 26), (16, 27)]]
+    >>> seconds_to(curve, 25), seconds_to(curve, 27)
+    (8, None)
+    """
+    for point, following in zip(curve, curve[1:]):
+        if point.psnr >= psnr and following.psnr >= psnr:
+            return point.seconds
+    return None
+
+
+def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
+    """Which of (seconds, psnr) no other one beats in both, in the order of time.
+
+    >>> pareto_front([(2, 20), (1, 21), (4, 25), (3, 25)])
+    [1, 3]
+    """
+    front: list[int] = []
+    for i in sorted(range(len(points)), key=lambda i: (points[i][0], -points[i][1])):
+        if not front or points[i][1] > points[front[-1]][1]:
+            front.append(i)
+    return front
+
+
+@dataclass(frozen=True)
+class Published:
+    """A number that others report: ``psnr`` (dB) after ``seconds`` on their ``hardware``, from ``source``."""
+
+    name: str
+    seconds: float
+    psnr: float
+    hardware: str
+    source: str
+
+
+def read_published(path: Path) -> list[Published]:
+    """A YAML list of entries with the keys name, seconds, psnr, hardware, source.
+
+    Raises:
+        ValueError: an entry that lacks one.
+    """
+    try:
+        entries = yaml.safe_load(Path(path).read_text())
+    except yaml.YAMLError as error:
+        raise ValueError(f"{path}: expected YAML, but got {str(error).splitlines()[0]}") from None
+    for number, entry in enumerate(entries if isinstance(entries, list) else [None]):
+        if not isinstance(entry, dict) or set(entry) != set(_KEYS):
+            got = sorted(entry) if isinstance(entry, dict) else type(entry).__name__
+            raise ValueError(f"{path}: [{number}]: expected the keys {', '.join(_KEYS)}, but got {got}")
+    return [Published(**entry) for entry in entries]
+
+
+def draw_run(path: Path, curve: Sequence[Point], title: str) -> Path:
+    """One run's PSNR against seconds, and its flow error where that is known."""
+    figure, axes = _axes(any(point.epe is not None for point in curve))
+    _line(axes, curve, color="C0", linewidth=2)
+    axes[0].set_title(title)
+    return _save(figure, path)
+
+
+def draw_scene(
+    path: Path,
+    groups: Mapping[tuple[str, float | None], Sequence[Result]],
+    title: str,
+    published: Sequence[Published] = (),
+) -> Path:
+    """All runs of a scene; those on the Pareto front are coloured and named, the front is marked.
+
+    Args:
+        path: of the picture.
+        groups: as ``collect.grouped``; a line a run, a colour a group.
+        title: over it.
+        published: drawn apart, as stars, each with its hardware; they need not be of this scene.
+    """
+    runs = [(key, run) for key, group in groups.items() for run in group]
+    every = [(key, point) for key, run in runs for point in run.curve]
+    front = [every[i] for i in pareto_front([(point.seconds, point.psnr) for _, point in every])]
+    colors = {key: f"C{number % 10}" for number, key in enumerate(dict.fromkeys(key for key, _ in front))}
+    figure, axes = _axes(any(point.epe is not None for _, point in every))
+    for key, run in runs:
+        style = {"color": colors[key], "linewidth": 1.5} if key in colors else {"color": "0.8", "zorder": 1}
+        _line(axes, run.curve, **style)
+    for key, color in colors.items():
+        axes[0].plot([], [], color=color, label=f"{key[0]}, {key[1]:g} min" if key[1] else key[0])
+    marks = [point.seconds for _, point in front], [point.psnr for _, point in front]
+    axes[0].plot(*marks, "ko", markersize=4, label="Pareto front")
+    for number, other in enumerate(published):
+        label = f"{other.name} (published, {other.hardware})"
+        axes[0].plot(other.seconds, other.psnr, "*", color=f"C{number % 10}", fillstyle="none", label=label)
+    axes[0].legend(fontsize="x-small", loc="lower right")
+    axes[0].set_title(title)
+    return _save(figure, path)
+
+
+def _axes(with_flow: bool):
+    try:
+        from matplotlib.figure import Figure
+        from matplotlib.ticker import LogLocator, NullFormatter
+    except ImportError:
+        raise ImportError("expected matplotlib for plots; install forewarp[plots]") from None
+    # No pyplot: nothing global is left behind, and no display is looked for.
+    figure = Figure(figsize=(7, 7.5 if with_flow else 4.5), layout="constrained")
+    axes = figure.subplots(2 if with_flow else 1, 1, squeeze=False)[:, 0]
+    labels = ("PSNR of views set aside (dB)", "error of moving points (world units)")
+    for axis, label in zip(axes, labels):
+        axis.set(xscale="log", xlabel="seconds of training", ylabel=label)
+        axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axis.xaxis.set_major_formatter("{x:g}")
+        axis.xaxis.set_minor_formatter(NullFormatter())
+        axis.grid(alpha=0.3)
+    return figure, axes
+
+
+def _line(axes, curve: Sequence[Point], **style) -> None:
+    axes[0].plot([p.seconds for p in curve], [p.psnr for p in curve], **style)
+    known = [p for p in curve if p.epe is not None]
+    if known and len(axes) > 1:
+        axes[1].plot([p.seconds for p in known], [p.epe for p in known], **style)
+
+
+def _save(figure, path: Path) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    beside = path.with_name(f".{path.name}.part")
+    figure.savefig(beside, format="png", dpi=120)
+    os.replace(beside, path)
+    return path

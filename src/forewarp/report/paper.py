@@ -1,0 +1,160 @@
+"""The paper's tables and figures, measured and printed side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from datetime import datetime, timezone
+from pathlib import Path
+
+from forewarp.report import page, pictures
+from forewarp.report.collect import Result, collect, machine
+from forewarp.report.compared import comparison, counterpart, measured, row_of, with_means
+from forewarp.report.page import Section
+from forewarp.report.published import PaperTable, read_paper
+
+TITLE = "The paper's tables, measured"
+INTRODUCTION = (
+    "Written by `forewarp-report kind=paper`. Rows marked measured are runs of this project, those marked "
+    "published are what the paper prints; the best and the second are marked among measured rows "
+    "alone. Over several seeds: mean ± standard deviation. A cell without a run is empty. Synthetic "
+    "counterparts are procedural scenes in a dataset's format: their numbers are not "
+    "comparable with printed ones."
+)
+DATASETS = ("dnerf", "hypernerf", "nhr", "lego_complete")
+
+
+def write_paper(runs: Path, out: Path, published: Path) -> list[Path]:
+    """Write ``paper.md``, ``paper.tex``, ``paper.html``, a CSV file a table, and the figures.
+
+    Args:
+        runs: folder of measured runs.
+        out: folder that they are written into.
+        published: the printed numbers (``docs/results/paper.yaml``).
+
+    Returns:
+        the files.
+    """
+    results, without = collect(runs, ["metrics.json"])
+    results, older = newest(results)
+    out.mkdir(parents=True, exist_ok=True)
+    tables = [section for table in read_paper(published).values() for section in sections_of(table, results)]
+    figures, drawn = figures_of(results, out)
+    sections = [*tables, *figures]
+    if lines := [*without, *(f"{run.folder}: another run of the same is newer" for run in older)]:
+        sections.append(Section("Left out", facts=lines))
+    files = {
+        "paper.md": page.markdown(TITLE, INTRODUCTION, sections),
+        "paper.html": page.html(TITLE, INTRODUCTION.replace("`", ""), sections),
+        "paper.tex": page.latex(tables),
+    }
+    for name, text in files.items():
+        (out / name).write_text(text)
+    return [out / name for name in files] + _write_csv(tables, out) + drawn
+
+
+def newest(results: Sequence[Result]) -> tuple[list[Result], list[Result]]:
+    """Of runs that differ in nothing that a table tells, the one measured last; and the others."""
+    kept: dict[tuple, Result] = {}
+    for run in sorted(results, key=lambda run: (run.folder / "metrics.json").stat().st_mtime_ns):
+        kept[(run.dataset, run.is_counterpart, run.scene, run.seed) + row_of(run)] = run
+    chosen = {run.folder for run in kept.values()}
+    return [r for r in results if r.folder in chosen], [r for r in results if r.folder not in chosen]
+
+
+def sections_of(table: PaperTable, results: Sequence[Result]) -> list[Section]:
+    """The table as the paper has it, and that of the synthetic counterpart where one was measured."""
+    real = [run for run in results if not run.is_counterpart]
+    made = [run for run in results if run.is_counterpart]
+    printed = with_means(table, real)
+    source = f"published rows: the paper, {table.source}"
+    shown = [run for row in measured(table, real) for run in row.runs]
+    found = [Section(table.title, [comparison(printed, real)], [source, *facts(shown)], table.notes)]
+    stand_in = counterpart(table, made)
+    shown = [run for row in measured(table, made) for run in row.runs]
+    if stand_in is not None and shown:
+        title = f"{table.title}: synthetic counterpart"
+        found.append(Section(title, [comparison(stand_in, made)], facts(shown)))
+    return found
+
+
+def facts(runs: Sequence[Result]) -> list[str]:
+    """How numbers came about: protocol, machine, budget, date and command."""
+    if not runs:
+        return ["measured: nothing yet"]
+    days = sorted({_day(run) for run in runs})
+    protocols = list(dict.fromkeys(_protocol(run) for run in runs))
+    budgets = sorted({_budget(run) for run in runs})
+    return [
+        *(f"protocol: {text}" for text in protocols),
+        f"machine: {machine(runs)}",
+        f"budget: {'; '.join(budgets)}",
+        f"date: {' to '.join(dict.fromkeys((days[0], days[-1])))}",
+        f"command, one of {len(runs)} runs: {runs[0].command}",
+    ]
+
+
+def figures_of(results: Sequence[Result], out: Path) -> tuple[list[Section], list[Path]]:
+    """What can be drawn from these runs; where matplotlib is absent, a section that says so."""
+    try:
+        found = _draw(results, out)
+    except ImportError as error:
+        return [Section("Figures", facts=[str(error)])], []
+    found = [(title, path, facts(runs)) for title, path, runs in found if path is not None]
+    known = [path for path in sorted(out.glob("accuracy-time-*.png"))]
+    sections = [Section(title, facts=lines, pictures=[path]) for title, path, lines in found]
+    sections += [Section("Accuracy against training time", pictures=known)] if known else []
+    return sections, [path for _, path, _ in found]
+
+
+def _draw(results: Sequence[Result], out: Path) -> list[tuple[str, Path | None, list[Result]]]:
+    sides = [run for run in results if run.variant.startswith("voxels_")]
+    found = [("Resolution", pictures.draw_resolution(out / "paper-resolution.png", sides), sides)]
+    plain = [run for run in results if row_of(run)[0] == "plain"]
+    for scene, both in _pairs(plain).items():
+        path = pictures.draw_canonical(out / f"paper-canonical-{scene}.png", *both)
+        found.append((f"Canonical comparison: {scene}", path, both))
+    for dataset in DATASETS:
+        runs = [r for r in plain if r.dataset == dataset and r.config["model"]["warp"] == "forward"]
+        runs = list({run.scene: run for run in runs}.values())
+        path = pictures.draw_sheet(out / f"paper-views-{dataset}.png", runs)
+        found.append((f"Views: {dataset}", path, runs))
+    return found
+
+
+def _pairs(runs: Sequence[Result]) -> dict[str, list[Result]]:
+    """Scene -> a forward and a backward run of it, equal in budget and seed."""
+    equal: dict[tuple, dict[str, Result]] = {}
+    for run in runs:
+        equal.setdefault((run.scene, run.seed) + row_of(run)[2:], {})[run.config["model"]["warp"]] = run
+    both = {key[0]: pair for key, pair in equal.items() if {"forward", "backward"} <= pair.keys()}
+    return {scene: [pair["forward"], pair["backward"]] for scene, pair in sorted(both.items())}
+
+
+def _write_csv(sections: Sequence[Section], out: Path) -> list[Path]:
+    files = []
+    for section in sections:
+        name = "".join(c if c.isalnum() else "-" for c in section.title.split(",")[0].lower())
+        name += "-counterpart" * ("counterpart" in section.title and "counterpart" not in name)
+        files.append(out / f"paper-{'-'.join(part for part in name.split('-') if part)}.csv")
+        files[-1].write_text(replace(section.tables[0], marks={}).csv())
+    return files
+
+
+def _protocol(run: Result) -> str:
+    known = run.metrics.get("protocol", {})
+    size = "x".join(str(side) for side in known.get("resolution", []))
+    words = [run.dataset, size, f"background {known.get('background', 'unknown')}", known.get("note", "")]
+    return ", ".join(word for word in words if word)
+
+
+def _budget(run: Result) -> str:
+    budget = run.config["budget"]
+    minutes = f"{budget['minutes']:g} min a run" if budget["minutes"] else ""
+    steps = f"{budget['iterations']} steps" if budget.get("iterations") else ""
+    return ", ".join(word for word in (budget["name"], minutes, steps) if word)
+
+
+def _day(run: Result) -> str:
+    seconds = (run.folder / "metrics.json").stat().st_mtime
+    return datetime.fromtimestamp(seconds, timezone.utc).date().isoformat()

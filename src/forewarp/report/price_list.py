@@ -1,0 +1,111 @@
+"""The price list: what each choice changes, against the same run without it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from forewarp.report.collect import Result, by_scene, collect, grouped, machine
+from forewarp.report.tables import Column, Estimate, Table
+
+# Of a run's numbers: the title, the digits, and whether the change is a difference or a quotient.
+MEASURES = {
+    "psnr": (Column("PSNR (dB)"), True),
+    "ssim": (Column("SSIM", 4), True),
+    "epe": (Column("EPE", 4), True),
+    "step": (Column("s/step", 3), False),
+    "frame": (Column("s/frame", 2), False),
+    "memory": (Column("GiB", 2), False),
+    "parameters": (Column("parameters (M)", 3), False),
+    "steps": (Column("steps", 0), False),
+}
+
+INTRODUCTION = """# What each choice costs and brings
+
+Written by `make price-list`. One change at a time, at equal minutes of training, so at unequal steps: both
+are listed. Of PSNR, SSIM and EPE (error of moving points, world units, where the truth is known) the table
+gives the difference, of all else the quotient, against the run named there with the same seed; ± is the
+standard deviation over the seeds. A change smaller than its spread says nothing.
+"""
+
+
+def write_price_list(runs: Path, out: Path) -> list[Path]:
+    """Write ``price-list.md`` and ``price-list.csv`` (every run's own numbers).
+
+    Args:
+        runs: folder of measured runs.
+        out: folder that they are written into.
+
+    Returns:
+        the files.
+    """
+    results, without = collect(runs, ["metrics.json"])
+    out.mkdir(parents=True, exist_ok=True)
+    parts = [INTRODUCTION, f"Machine: {machine(results)}.\n"]
+    for scene, found in by_scene(results).items():
+        for minutes in sorted({result.minutes for result in found}, key=lambda value: value or 0):
+            equal = [result for result in found if result.minutes == minutes]
+            bound = f"{minutes:g} minutes" if minutes else "bounded by steps"
+            parts += [f"## {scene}, {bound}\n", references(equal).markdown(), changes(equal).markdown()]
+    if without:
+        parts += ["## Without numbers\n", "\n".join(f"* {line}" for line in without) + "\n"]
+    page, file = out / "price-list.md", out / "price-list.csv"
+    page.write_text("\n".join(parts))
+    file.write_text(every_run(results).csv())
+    return [page, file]
+
+
+def references(results: Sequence[Result]) -> Table:
+    """What the runs that others are compared with reach themselves."""
+    names = {result.against for result in results}
+    rows = []
+    for (variant, _), group in grouped(results).items():
+        if variant in names:
+            values = [Estimate.of(_known(group, measure)) for measure in MEASURES]
+            rows.append([variant, group[0].about, len(group), *values])
+    columns = [Column("compared with"), Column("what"), Column("seeds", 0)]
+    kind = {"all": "all test views", "time": "test views between the training times"}
+    views = ", ".join(sorted({kind[result.ability] for result in results}))
+    return Table([*columns, *(column for column, _ in MEASURES.values())], rows, f"Of {views}:")
+
+
+def changes(results: Sequence[Result]) -> Table:
+    """What every other variant changes."""
+    own = {(result.variant, result.seed): result for result in results}
+    rows = []
+    for (variant, _), group in grouped(results).items():
+        if variant == group[0].against:
+            continue
+        pairs = [(result, own.get((result.against, result.seed))) for result in group]
+        pairs = [(result, before) for result, before in pairs if before is not None]
+        values = [_change(pairs, measure) for measure in MEASURES]
+        rows.append([variant, group[0].about, group[0].against, len(pairs), *values])
+    columns = [Column("variant"), Column("what"), Column("against"), Column("seeds", 0)]
+    for column, difference in MEASURES.values():
+        signed = Column(column.name, column.digits, signed=True)
+        columns.append(signed if difference else Column(column.name, prefix="×"))
+    return Table(columns, rows, "Changes:")
+
+
+def every_run(results: Sequence[Result]) -> Table:
+    """A row a run, nothing summed up."""
+    rows = []
+    for result in results:
+        numbers = result.numbers
+        about = [result.scene, result.variant, result.minutes, result.seed, result.ability]
+        rows.append([*about, *(numbers.get(measure) for measure in MEASURES), result.command])
+    columns = [Column(name) for name in ("scene", "variant", "minutes", "seed", "views")]
+    return Table([*columns, *(column for column, _ in MEASURES.values()), Column("command")], rows)
+
+
+def _known(group: Sequence[Result], measure: str) -> list[float]:
+    return [result.numbers[measure] for result in group if measure in result.numbers]
+
+
+def _change(pairs: Sequence[tuple[Result, Result]], measure: str) -> Estimate | None:
+    _, difference = MEASURES[measure]
+    both = [(result.numbers.get(measure), before.numbers.get(measure)) for result, before in pairs]
+    both = [(now, before) for now, before in both if None not in (now, before)]
+    if difference:
+        return Estimate.of([now - before for now, before in both])
+    return Estimate.of([now / before for now, before in both if before])

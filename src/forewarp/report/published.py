@@ -1,0 +1,120 @@
+"""What the paper prints, kept as data."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from statistics import fmean
+
+import yaml
+
+
+@dataclass(frozen=True)
+class Group:
+    """What a few columns are the mean of: scenes of a dataset, and one kind of test view (None: all, or,
+    where a scene tells them apart, those between the training times).
+    """
+
+    name: str
+    dataset: str
+    metrics: tuple[str, ...]
+    scenes: tuple[str, ...]
+    ability: str | None = None
+
+
+@dataclass(frozen=True)
+class Row:
+    """A printed row: its numbers as they were written, "" where none was; ``variant``: what measured rows are
+    compared with it, None for others' methods.
+    """
+
+    name: str
+    values: tuple[str, ...]
+    variant: str | None = None
+
+
+@dataclass(frozen=True)
+class PaperTable:
+    """One of the paper's tables; ``variants`` are those whose measured rows belong into it, ``means`` more
+    groups to be calculated: name -> scenes.
+    """
+
+    key: str
+    title: str
+    source: str
+    variants: tuple[str, ...]
+    groups: tuple[Group, ...]
+    rows: tuple[Row, ...]
+    notes: tuple[str, ...] = ()
+    means: tuple[tuple[str, tuple[str, ...]], ...] = ()
+
+    @property
+    def columns(self) -> list[tuple[Group, str]]:
+        """Group and metric of every column."""
+        return [(group, metric) for group in self.groups for metric in group.metrics]
+
+    def with_mean(self, name: str, scenes: tuple[str, ...]) -> PaperTable:
+        """The table with one more group, the mean of some that hold one scene each; printed rows get theirs
+        with the digits that their scenes have.
+        """
+        found = [group for group in self.groups if len(group.scenes) == 1 and group.scenes[0] in scenes]
+        metrics = found[0].metrics
+        more = Group(name, found[0].dataset, metrics, tuple(scenes))
+        rows = []
+        for row in self.rows:
+            values = dict(zip(self.columns, row.values))
+            means = [_mean([values[group, metric] for group in found]) for metric in metrics]
+            rows.append(replace(row, values=(*row.values, *means)))
+        return replace(self, groups=(*self.groups, more), rows=tuple(rows))
+
+
+def read_paper(path: Path) -> dict[str, PaperTable]:
+    """The paper's tables from a YAML file as ``docs/results/paper.yaml``, by key.
+
+    Raises:
+        ValueError: what lacks a key, or a row of another length than its table.
+    """
+    # Without types: 30.50 is to stay what was printed.
+    try:
+        content = yaml.load(Path(path).read_text(), Loader=yaml.BaseLoader)
+        return {key: _table(key, entry, content["datasets"]) for key, entry in content["tables"].items()}
+    except yaml.YAMLError as error:
+        raise ValueError(f"{path}: expected YAML, but got {str(error).splitlines()[0]}") from None
+    except (KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"{path}: expected tables of groups and rows, but got {error!r}") from None
+
+
+def _table(key: str, entry: dict, datasets: dict) -> PaperTable:
+    groups = tuple(
+        Group(
+            g["name"],
+            g["dataset"],
+            tuple(g["metrics"]),
+            tuple(g.get("scenes", datasets[g["dataset"]])),
+            g.get("ability"),
+        )
+        for g in entry["groups"]
+    )
+    rows = tuple(
+        Row(r["name"], tuple("" if v == "null" else v for v in r["values"]), _variant(r))
+        for r in entry["rows"]
+    )
+    about = [entry[name] for name in ("title", "source")]
+    table = PaperTable(key, *about, tuple(entry["variants"]), groups, rows, tuple(entry["notes"]))
+    for row in rows:
+        if len(row.values) != len(table.columns):
+            expected = f"{len(table.columns)} values"
+            raise ValueError(f"{key}: {row.name}: expected {expected}, but got {len(row.values)}")
+    means = entry.get("means", {}).items()
+    return replace(table, means=tuple((name, tuple(scenes)) for name, scenes in means))
+
+
+def _variant(row: dict) -> str | None:
+    return row.get("variant", "full" if row["name"].split(" (")[0] == "Ours" else None)
+
+
+def _mean(values: list[str]) -> str:
+    if "" in values:
+        return ""
+    digits = max(len(value.partition(".")[2]) for value in values)
+    return f"{fmean(map(float, values)):.{digits}f}"

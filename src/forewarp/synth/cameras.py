@@ -1,0 +1,48 @@
+"""Cameras on the sphere that D-NeRF's scenes are seen from, and streams of random numbers."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+
+from forewarp.scene.camera import Camera, look_at
+
+CAMERA_RADIUS, CAMERA_ANGLE_X = 4.0311, 0.6911112
+# Sine of the elevation: neither along the slab nor straight from above.
+_ELEVATION = (0.06, 0.96)
+
+
+def orbit_camera(azimuth: float, sine: float, size: int) -> Camera:
+    """A square camera on the sphere that looks at the origin, z upwards.
+
+    Args:
+        azimuth: radians from x towards y.
+        sine: of the elevation above the ground.
+        size: pixels.
+    """
+    level = math.sqrt(1 - sine * sine)
+    center = CAMERA_RADIUS * torch.tensor(
+        [level * math.cos(azimuth), level * math.sin(azimuth), sine], dtype=torch.float64
+    )
+    pose = look_at(center, torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
+    focal = 0.5 * size / math.tan(0.5 * CAMERA_ANGLE_X)
+    return Camera(size, size, focal, focal, size / 2, size / 2, pose, 2.0, 6.0)
+
+
+def random_cameras(count: int, size: int, rng: np.random.Generator) -> list[Camera]:
+    """Cameras spread evenly by area over the upper half of the sphere."""
+    azimuth = rng.uniform(0, 2 * np.pi, count)
+    sine = rng.uniform(*_ELEVATION, count)
+    return [orbit_camera(float(a), float(s), size) for a, s in zip(azimuth, sine)]
+
+
+def centers_of(cameras: list[Camera]) -> np.ndarray:
+    """Their centres (C, 3) float64, world units."""
+    return np.stack([np.asarray(camera.center) for camera in cameras])
+
+
+def stream(seed: int, *number: int) -> np.random.Generator:
+    """A stream of random numbers for one purpose, so that a count changed in one moves no other."""
+    return np.random.default_rng([seed, *number])

@@ -1,0 +1,124 @@
+"""Many pictures of moving worlds, taken by several processes where that is worth it."""
+
+from __future__ import annotations
+
+import math
+import os
+import pickle
+import signal
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from functools import lru_cache
+from multiprocessing import get_context
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from forewarp.scene.camera import Camera
+from forewarp.synth.raycast import SHADOW_RAYS, render
+from forewarp.synth.vehicle import World
+
+# A process takes seconds to start, and casts about two million samples in each.
+_SAMPLES_A_PROCESS = 4e7
+# Pictures waiting for whoever writes them: enough that no process idles, few enough for any memory.
+_AHEAD = 3
+
+
+class View(NamedTuple):
+    """A picture to take: at ``time`` in [0, 1] by ``camera``; ``ability`` as in ``scene.Frame``."""
+
+    name: str
+    time: float
+    camera: Camera
+    ability: str = "all"
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """How a picture is taken: rays averaged into a pixel, and shadow rays of each."""
+
+    samples_per_pixel: int = 4
+    shadow_rays: int = SHADOW_RAYS
+
+
+class Film:
+    """Takes pictures in order; a context, which ends its processes.
+
+    The pictures are the same whatever the number of processes. With more than one, a script that calls this
+    needs the guard ``if __name__ == "__main__"``, as all of Python's processes do.
+
+    Args:
+        exposure: of every picture.
+        cameras: of all pictures there will be: how much there is to do.
+        workers: processes; None is one a processor, fewer where there is little to do; 1 is this process.
+        progress: called with (pictures done, all pictures) after each.
+    """
+
+    def __init__(
+        self,
+        exposure: Exposure,
+        cameras: Iterable[Camera],
+        workers: int | None = None,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> None:
+        pixels = [camera.width * camera.height for camera in cameras]
+        self.exposure, self.progress, self.done, self.total = exposure, progress, 0, len(pixels)
+        self.workers = workers or _worth(sum(pixels) * exposure.samples_per_pixel)
+        self._pool: ProcessPoolExecutor | None = None
+
+    def __enter__(self) -> Film:
+        if self.workers > 1:
+            self._pool = ProcessPoolExecutor(self.workers, get_context("spawn"), _begin)
+        return self
+
+    def __exit__(self, *error) -> None:
+        if self._pool is not None:
+            self._pool.shutdown(cancel_futures=True)
+
+    def pictures(self, world: World, views: Iterable[View]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """What ``raycast.render`` gives for each view, in order."""
+        for picture in self._taken(world, views):
+            self.done += 1
+            if self.progress is not None:
+                self.progress(self.done, self.total)
+            yield picture
+
+    def _taken(self, world: World, views: Iterable[View]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        exposure = self.exposure.samples_per_pixel, self.exposure.shadow_rays
+        if self._pool is None:
+            yield from (render(world, view.time, view.camera, *exposure) for view in views)
+            return
+        waiting: deque = deque()
+        for view in views:
+            # Pickled here, as an executor would send tensors through shared memory, a file each.
+            job = pickle.dumps((view.time, view.camera, *exposure))
+            waiting.append(self._pool.submit(_take, world.motion, world.has_room, job))
+            if len(waiting) > _AHEAD * self.workers:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+
+
+def _worth(samples: float) -> int:
+    """How many processes so many samples are worth."""
+    affinity = getattr(os, "sched_getaffinity", None)
+    processors = len(affinity(0)) if affinity else os.cpu_count() or 1
+    return max(1, min(processors, math.floor(samples / _SAMPLES_A_PROCESS)))
+
+
+def _begin() -> None:
+    """In a new process: Ctrl-C is the parent's business, and one thread is all it uses."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    torch.set_num_threads(1)
+
+
+@lru_cache(4)
+def _world(motion: str, has_room: bool) -> World:
+    return World(motion, has_room)
+
+
+def _take(motion: str, has_room: bool, job: bytes) -> tuple[np.ndarray, np.ndarray]:
+    return render(_world(motion, has_room), *pickle.loads(job))

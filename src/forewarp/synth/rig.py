@@ -1,0 +1,192 @@
+"""The vehicle in a textured room, filmed by two phones on one slowly moving rig, in the HyperNeRF layout."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from forewarp.data.hypernerf import RigShot, write_scene
+from forewarp.scene.camera import Camera, look_at
+from forewarp.scene.errors import SceneError
+from forewarp.scene.frame import Truth
+from forewarp.scene.lens import Lens
+from forewarp.synth.arguments import check_motion, check_numbers, check_whole, check_workers
+from forewarp.synth.cameras import centers_of, stream
+from forewarp.synth.film import Exposure, Film, View
+from forewarp.synth.points import surface_points, trajectories
+from forewarp.synth.raycast import Posed, camera_rays
+from forewarp.synth.scenes import writing_to
+from forewarp.synth.vehicle import World
+
+# Of the still points drawn about a ninth lies in both pictures.
+POINTS, STILL_POINTS = 4000, 20000
+# The arc, in the vehicle's units and degrees from x towards y.
+RADIUS, ARC, FOCUS, BASELINE = 3.0, (-118.0, -62.0), (0.0, 0.0, -0.08), 0.26
+VIEW_ANGLE = 52.0  # horizontal, degrees
+# Two phones of one make: pixel aspect, focal length and principal point differ a little, as do the lenses.
+PHONES = (
+    {
+        "aspect": 1.013,
+        "focal": 1.0,
+        "off": (0.012, -0.008),
+        "lens": Lens((0.11, -0.08, 0.02), (0.004, -0.006)),
+    },
+    {
+        "aspect": 0.991,
+        "focal": 1.02,
+        "off": (-0.009, 0.011),
+        "lens": Lens((0.08, -0.05, 0.0), (-0.003, 0.004)),
+    },
+)
+# The capture's own world: as a reconstruction leaves it, neither centred nor of any known scale.
+WORLD_SCALE, WORLD_AT = 2.4, (3.1, -1.7, 0.9)
+SCENE_CENTER, SCENE_SCALE = (2.9, -1.4, 1.1), 0.2
+_SHAKE, _POINTS, _STILL = 0, 1, 2
+_RANGE_MARGIN = 0.08
+
+
+def synthesize(
+    folder: str | Path,
+    *,
+    size: int = 256,
+    frames: int = 41,
+    seed: int = 0,
+    motion: str = "lift_tilt",
+    samples_per_pixel: int = 4,
+    workers: int | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Path:
+    """Write a capture by a validation rig into ``folder`` and return that folder.
+
+    Both phones take a picture at each of ``frames`` times spread evenly over [0, 1]; one is trained on and
+    the other held out, in turns. Lenses distort, pixels are not square, the world is scaled and shifted.
+    ``points.npy`` has points of the room and the slab, trajectories follow vehicle, ball and slab from the
+    middle time on. Equal arguments give equal files, byte by byte; ``seed`` draws hand shake and points.
+
+    Args:
+        folder: the capture's own; one already there is replaced.
+        size: pixels across, a multiple of 8; three quarters of that high. Half-size images are written too.
+        frames: odd, so that one of them is at the canonical time 1/2.
+        motion: one of ``motions.MOTIONS``.
+        samples_per_pixel: rays averaged into a pixel.
+        workers, progress: as in ``film.Film``.
+
+    Raises:
+        SceneError: for a bad argument or folder; ImportError: without ``forewarp[synth]``.
+    """
+    check_whole("size", size, 16, multiple=8)
+    check_numbers(frames=(frames, 3), seed=(seed, 0), samples_per_pixel=(samples_per_pixel, 1))
+    if frames % 2 == 0:
+        raise SceneError(f"frames: expected an odd number, one in the middle, but got {frames}; set frames")
+    check_motion(motion)
+    check_workers(workers)
+    world, times = World(motion, has_room=True), np.linspace(0, 1, frames)
+    pairs = rig_cameras(size, times, seed)
+    near, far = _seen_range(world, pairs)
+    views = [
+        View(_name(t, k), float(times[t]), camera)
+        for t, pair in enumerate(pairs)
+        for k, camera in enumerate(pair)
+    ]
+    with (
+        Film(Exposure(samples_per_pixel), [v.camera for v in views], workers, progress) as film,
+        writing_to(folder) as place,
+    ):
+        write_scene(
+            place,
+            _shots(film, world, views),
+            center=SCENE_CENTER,
+            scale=SCENE_SCALE,
+            near=near * WORLD_SCALE * SCENE_SCALE,
+            far=far * WORLD_SCALE * SCENE_SCALE,
+            points=_still_points(world, pairs, stream(seed, _STILL)),
+            trajectories=_truth(world, times, pairs, stream(seed, _POINTS)),
+        )
+    return Path(folder)
+
+
+def rig_cameras(size: int, times: np.ndarray, seed: int) -> list[tuple[Camera, Camera]]:
+    """Left and right camera at each time, in the vehicle's units: along an arc, with a slow shake."""
+    rng = stream(seed, _SHAKE)
+    phase, rate = rng.uniform(0, 2 * np.pi, 4), rng.uniform(1.0, 2.2, 4)
+    pairs = []
+    for time in times:
+        shake = np.sin(2 * np.pi * rate * time + phase)
+        azimuth = math.radians(ARC[0] + (ARC[1] - ARC[0]) * float(time) + 0.8 * shake[0])
+        rise = math.radians(20.0 + 3.0 * shake[1])
+        level = RADIUS * math.cos(rise)
+        middle = np.array([level * math.cos(azimuth), level * math.sin(azimuth), RADIUS * math.sin(rise)])
+        right = np.array([-math.sin(azimuth), math.cos(azimuth), 0.0])
+        target = np.array(FOCUS) + 0.03 * np.array([shake[2], 0, shake[3]])
+        pairs.append(tuple(_phone(size, k, middle + (k - 0.5) * BASELINE * right, target) for k in (0, 1)))
+    return pairs
+
+
+def _phone(size: int, k: int, center: np.ndarray, target: np.ndarray) -> Camera:
+    phone, width, height = PHONES[k], size, size * 3 // 4
+    fx = phone["focal"] * 0.5 * width / math.tan(0.5 * math.radians(VIEW_ANGLE))
+    cx, cy = width * (0.5 + phone["off"][0]), height * (0.5 + phone["off"][1])
+    pose = look_at(torch.from_numpy(center), torch.from_numpy(target), torch.tensor([0.0, 0.0, 1.0]))
+    return Camera(width, height, fx, fx * phone["aspect"], cx, cy, pose, 0.1, 10.0, lens=phone["lens"])
+
+
+def _name(t: int, k: int) -> str:
+    return f"{('left', 'right')[k]}1_{t:06d}"
+
+
+def _shots(film: Film, world: World, views: list[View]) -> Iterator[RigShot]:
+    for i, (view, (rgba, _)) in enumerate(zip(views, film.pictures(world, views))):
+        t, k = divmod(i, 2)
+        camera = replace(view.camera, camera_to_world=_pose_in_capture(view.camera))
+        yield RigShot(view.name, t, k, "train" if k == t % 2 else "val", camera, rgba[..., :3])
+
+
+def _pose_in_capture(camera: Camera) -> torch.Tensor:
+    pose = camera.camera_to_world.clone()
+    pose[:3, 3] = torch.from_numpy(_in_capture(pose[:3, 3].numpy()))
+    return pose
+
+
+def _in_capture(points: np.ndarray) -> np.ndarray:
+    """Points (..., 3) of the vehicle's units in the capture's world."""
+    return WORLD_SCALE * points + np.array(WORLD_AT)
+
+
+def _seen_range(world: World, pairs: list[tuple[Camera, Camera]]) -> tuple[float, float]:
+    """The least and the greatest distance that any picture shows, and a margin; every ray ends somewhere."""
+    seen = []
+    for i, pair in enumerate(pairs):
+        posed = Posed(world, i / (len(pairs) - 1))
+        seen += [posed.first_hits(*camera_rays(camera.resized(16, 12))).distance for camera in pair]
+    distance = np.concatenate(seen)
+    if len(distance) < 2 * 16 * 12 * len(pairs):
+        raise AssertionError("a ray left the room")
+    return float(distance.min()) * (1 - _RANGE_MARGIN), float(distance.max()) * (1 + _RANGE_MARGIN)
+
+
+def _truth(world: World, times: np.ndarray, pairs, rng: np.random.Generator) -> Truth:
+    """Trajectories of what is no wall, the middle time first."""
+    middle = len(times) // 2
+    order = [middle, *(i for i in range(len(times)) if i != middle)]
+    centers = centers_of([camera for pair in pairs for camera in pair])
+    chosen = surface_points(world, POINTS, centers, rng, times[middle], world.casts)
+    found = trajectories(world, *chosen, times[order])
+    return Truth(torch.from_numpy(_in_capture(found.points.double().numpy())).float(), found.times)
+
+
+def _still_points(world: World, pairs, rng: np.random.Generator) -> np.ndarray:
+    """Points (N, 3) float32 of room and slab, in the capture's world, in the pictures of both phones."""
+    still = np.array([part.joint == "ground" for part in world.parts])[world.part_of_face]
+    pair = pairs[len(pairs) // 2]
+    faces, barycentric = surface_points(world, STILL_POINTS, centers_of(list(pair)), rng, 0.5, still)
+    points = world.points(faces, barycentric, 0.5)
+    for camera in pair:
+        pixel, depth = (np.asarray(v) for v in camera.project(torch.from_numpy(points)))
+        inside = (depth > 0) & (pixel > 0).all(-1) & (pixel < (camera.width, camera.height)).all(-1)
+        points = points[inside]
+    return _in_capture(points).astype(np.float32)

@@ -1,0 +1,43 @@
+import pytest
+import torch
+
+from configs import composed
+from forewarp.cli.measure import device_of
+from forewarp.cli.runs import build_run
+
+
+@pytest.fixture
+def machine(monkeypatch):
+    """Pretends to a machine with or without GPUs of NVIDIA's and Apple's."""
+
+    def pretend(cuda=False, apple=False):
+        monkeypatch.setattr(torch.cuda, "is_available", lambda: cuda)
+        monkeypatch.setattr(torch.backends.mps, "is_available", lambda: apple)
+
+    return pretend
+
+
+@pytest.mark.parametrize(
+    ("accelerator", "cuda", "device"),
+    [("auto", False, "cpu"), ("auto", True, "cuda"), ("gpu", True, "cuda"), ("cpu", True, "cpu")],
+)
+def test_device_of_an_accelerator(machine, accelerator, cuda, device):
+    machine(cuda=cuda, apple=True)
+    assert device_of(accelerator) == torch.device(device)
+
+
+@pytest.mark.parametrize(
+    ("accelerator", "text"),
+    [("gpu", "expected a GPU, but found none; use trainer=cpu"), ("mps", "cpu, gpu or cuda, but got mps")],
+)
+def test_refuses_what_is_not_there(machine, accelerator, text):
+    machine(apple=True)
+    with pytest.raises(ValueError, match=text):
+        device_of(accelerator)
+
+
+def test_training_and_evaluation_use_the_same_device(machine, tmp_path):
+    machine(apple=True)  # which Lightning would take
+    run = build_run(composed("data.scene=x", "trainer=auto", "logger=none"))
+    trainer = run.make_trainer(tmp_path, [])
+    assert trainer.strategy.root_device == device_of("auto") == torch.device("cpu")

@@ -1,0 +1,118 @@
+"""``resume=<run>``, data that changed, broken steps, as one types them."""
+
+import json
+import os
+import shutil
+
+import pytest
+import yaml
+
+from forewarp.cli.claims import alone
+from forewarp.cli.replay import main as replay
+from forewarp.synth.scenes import synthesize
+
+SMALL = [
+    *("data=dnerf", "data.scene=vehicle", "budget=demo", "trainer=cpu", "data.rays=64", "logger=none"),
+    *("budget.minutes=null", "budget.iterations=6", "stage.coarse.voxels=[[0,800]]", "~stage.fine"),
+    *("callbacks.pictures=null", "evaluate=false", "checkpoint_seconds=0"),
+]
+
+
+@pytest.fixture
+def begun(forewarp, in_tmp):
+    """A run that was interrupted at its end; scene and run are in the current folder."""
+    synthesize(in_tmp / "vehicle", size=16, frames=4, test_views=(1, 1, 1), val_views=1, samples_per_pixel=1)
+    done = forewarp("train", *SMALL, "data.root=.", "run=run")
+    assert done.status == 0, done.err
+    (in_tmp / "run" / "coarse" / "done.json").unlink()
+    return in_tmp / "run"
+
+
+def config(run):
+    return yaml.safe_load((run / "config.yaml").read_text())
+
+
+def test_a_run_is_resumed_by_its_folder_alone(forewarp, begun):
+    before = config(begun)
+    done = forewarp("train", f"resume={begun}")
+    assert done.status == 0, done.err
+    assert json.loads((begun / "coarse" / "done.json").read_text())["steps"] == 6
+    assert {**config(begun), "run": "run"} == before
+    assert "forewarp-train data=dnerf" in before["command"]
+
+
+def test_beside_it_stands_only_what_may_change(forewarp, refused, begun):
+    done = forewarp("train", f"resume={begun}", "threads=1", "sentinel.skip=3", "trainer=cpu")
+    assert done.status == 0, done.err
+    assert (config(begun)["threads"], config(begun)["sentinel"]) == (1, {"skip": 3})
+    line = refused("train", f"resume={begun}", "seed=3")
+    assert line.startswith(
+        "seed: expected no such key beside resume=, whose config.yaml holds it, but got seed=3"
+    )
+    assert "expected the configuration of a run, but got none" in refused("train", "resume=nowhere")
+
+
+def test_changed_data_are_refused_unless_accepted(forewarp, refused, begun):
+    path = begun.parent / "vehicle" / "transforms_train.json"
+    path.write_text(path.read_text() + " ")
+    for words in ([f"resume={begun}"], [*SMALL, "data.root=.", "run=run"]):
+        line = refused("train", *words)
+        assert "data.json: expected the data that the run was begun with, but got others" in line
+        assert "transforms_train.json; use run=..., or go on with data_changed=accept" in line
+    done = forewarp("train", f"resume={begun}", "data_changed=accept")
+    assert done.status == 0, done.err
+    (begun / "coarse" / "done.json").unlink()
+    assert forewarp("train", f"resume={begun}").status == 0  # it was accepted once for all
+    path.write_text(path.read_text() + " ")
+    (begun / "coarse" / "done.json").unlink()
+    assert "expected the data" in refused("train", f"resume={begun}")  # and not what comes later
+    assert "data_changed: expected one of refuse, accept, but got x" in refused(
+        "train", f"resume={begun}", "data_changed=x"
+    )
+
+
+def test_a_folder_in_work_is_refused(refused, begun):
+    with alone(begun):
+        line = refused("train", f"resume={begun}")
+        assert f"expected a run that nobody works on, but got one of process {os.getpid()} on " in line
+        assert "nobody works on" in refused("evaluate", f"run={begun}")
+
+
+def test_a_broken_step_ends_in_one_line_and_is_seen_again(forewarp, refused, begun, in_tmp, capsys):
+    shutil.rmtree(in_tmp / "run")
+    broken = [*SMALL, "data.root=.", "run=run", "stage.coarse.rates.color=1e39"]
+    line = refused("train", *broken)
+    assert line.startswith(
+        "stage.coarse: expected finite numbers, but got parameter: radiance.color at step 0, "
+    )
+    bundle = in_tmp / "run" / "coarse" / "broken" / "step_0.pt"
+    assert f"python -m forewarp.replay {bundle.relative_to(in_tmp)} shows it again" in line
+    shutil.rmtree(in_tmp / "vehicle")  # it needs no data
+    capsys.readouterr()
+    replay([str(bundle)])
+    assert capsys.readouterr().out.endswith(": parameter: radiance.color\n")
+    bundle.write_bytes(b"x")
+    with pytest.raises(SystemExit) as leaving:
+        replay([str(bundle)])
+    assert leaving.value.code == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f"forewarp.replay: error: {bundle}: expected a step that a run left in broken/")
+
+
+def test_skipped_steps_are_told(forewarp, begun, monkeypatch):
+    from forewarp.data.batches import RayBatches
+
+    draw, drawn = RayBatches.draw, []
+
+    def spoiled(self):
+        batch = draw(self)
+        drawn.append(batch)
+        if len(drawn) == 2:
+            batch.rgb[0] = float("nan")
+        return batch
+
+    shutil.rmtree(begun)
+    monkeypatch.setattr(RayBatches, "draw", spoiled)
+    done = forewarp("train", *SMALL, "data.root=.", "run=run", "sentinel.skip=1")
+    assert done.status == 0, done.err
+    assert "coarse: 1 broken steps skipped; each lies in run/coarse/broken" in done.out

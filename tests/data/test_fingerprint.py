@@ -1,0 +1,63 @@
+import os
+
+import pytest
+
+from dnerf_scene import write_tiny
+from forewarp.data.fingerprint import difference, fingerprint
+from forewarp.data.module import DNeRFDataModule, SceneDataModule
+
+
+@pytest.fixture
+def scene(tmp_path):
+    return write_tiny(tmp_path / "a")
+
+
+def append(path):
+    path.write_bytes(path.read_bytes() + b" ")
+
+
+def rename(folder):
+    (folder / "train" / "r_0.png").rename(folder / "train" / "r_9.png")
+
+
+CHANGES = {
+    "text": (lambda f: append(f / "transforms_val.json"), "transforms_val.json"),
+    "gone": (lambda f: (f / "transforms_val.json").unlink(), "transforms_val.json"),
+    "size": (lambda f: append(f / "train" / "r_0.png"), "images: 9 files of"),
+    "fewer": (lambda f: (f / "train" / "r_0.png").unlink(), "images: 8 files of"),
+    "name": (rename, "images: 9 files of"),
+    "new": (lambda f: (f / "b.json").write_text("{}"), "b.json"),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_a_change_is_seen_and_named(scene, change):
+    before = fingerprint(scene)
+    assert difference(before, fingerprint(scene)) is None
+    CHANGES[change][0](scene)
+    assert difference(before, fingerprint(scene)).startswith(CHANGES[change][1])
+
+
+def test_what_is_no_part_of_the_scene_does_not_count(scene):
+    before = fingerprint(scene)
+    (scene / ".cache.json").write_text("x")
+    (scene / ".hidden").mkdir()
+    (scene / ".hidden" / "a.png").write_text("x")
+    (scene / "notes.md").write_text("x")
+    os.utime(scene / "transforms_train.json")
+    assert fingerprint(scene) == before
+
+
+def test_links_count_as_what_they_lead_to_and_may_go_in_circles(scene, tmp_path):
+    before = fingerprint(scene)
+    (scene / "train").rename(tmp_path / "elsewhere")
+    (scene / "train").symlink_to(tmp_path / "elsewhere")
+    assert fingerprint(scene) == before
+    (scene / "round").symlink_to(scene)
+    assert fingerprint(scene) == before
+
+
+def test_a_data_module_knows_its_files(scene):
+    module = DNeRFDataModule(scene.parent, "a", box=[-1, -1, -1, 1, 1, 1])
+    assert module.fingerprint() == fingerprint(scene)
+    assert SceneDataModule(lambda: None).fingerprint() is None

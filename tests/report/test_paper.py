@@ -1,0 +1,213 @@
+"""The paper's tables from hand-made run folders."""
+
+import base64
+import json
+import os
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+import yaml
+
+from forewarp.report.compared import comparison, counterpart, measured, with_means
+from forewarp.report.collect import collect
+from forewarp.report.page import latex_text
+from forewarp.report.paper import write_paper
+from forewarp.report.pictures import thirds
+from forewarp.report.published import read_paper
+from runs_on_disk import write_run
+
+PRINTED = Path(__file__).parents[2] / "docs" / "results" / "paper.yaml"
+ALL = ["hellwarrior", "mutant", "hook", "bouncingballs", "lego", "trex", "standup", "jumpingjacks"]
+
+
+def paper_run(root, scene, variant=None, seed=0, *, dataset="dnerf", made=False, warp="forward", **scores):
+    """A run as a sweep of the paper leaves it; ``variant`` None is the plain method."""
+    name = f"{variant or 'plain'}-{warp}"
+    folder = write_run(root, name, seed, scene=scene, curve=None)
+    config = yaml.safe_load((folder / "config.yaml").read_text())
+    config["variant"] = {"name": variant, "about": f"the {variant}", "against": "full"} if variant else None
+    config["model"]["warp"] = warp
+    config["data"]["_target_"] = f"forewarp.{'cli.synthetic.Synthetic' if made else 'data.module.'}DataModule"
+    (folder / "config.yaml").write_text(yaml.safe_dump(config))
+    metrics = json.loads((folder / "metrics.json").read_text())
+    metrics["protocol"] |= {"dataset": dataset, "resolution": [4, 3], "background": "white"}
+    abilities = {k: v for k, v in scores.items() if isinstance(v, dict)}
+    metrics["test"] = abilities or {"all": {"psnr": 30.0, "ssim": 0.9, **scores}}
+    (folder / "metrics.json").write_text(json.dumps(metrics))
+    return folder
+
+
+def table_of(root, key="dnerf", **options):
+    results, _ = collect(root, ["metrics.json"])
+    return comparison(with_means(read_paper(PRINTED)[key], results), results, **options)
+
+
+def cells(table, name, kind="measured"):
+    rows = [
+        i for i, row in enumerate(table.rows) if row[1] == kind and (kind != "measured" or row[0] == name)
+    ]
+    return table.texts({"best": "[{}]", "second": "({})"})[rows[0]][2:]
+
+
+def test_a_mean_is_of_all_scenes_or_empty(tmp_path):
+    for number, scene in enumerate(ALL[:7]):
+        paper_run(tmp_path, scene, psnr=20.0 + number)
+    assert cells(table_of(tmp_path), "forewarp: forward, fast, 1 min") == ["", "", ""]
+    scenes = table_of(tmp_path, "dnerf_scenes")
+    names = [column.name for column in scenes.columns]
+    values = dict(zip(names[2:], cells(scenes, "forewarp: forward, fast, 1 min")))
+    assert values["Hook PSNR↑"] == "22.00"
+    assert values["Hook LPIPS↓"] == values["Mean of 8 PSNR↑"] == values["Jumping Jacks PSNR↑"] == ""
+    assert values["Mean of the 7 measured PSNR↑"] == "23.00"
+    paper_run(tmp_path, ALL[7], psnr=27.0)
+    row = cells(table_of(tmp_path), "forewarp: forward, fast, 1 min")
+    assert row == ["23.50", "0.900", ""]
+    values = dict(zip(names[2:], cells(table_of(tmp_path, "dnerf_scenes"), "forewarp: forward, fast, 1 min")))
+    assert values["Mean of 7 without Lego PSNR↑"] == "23.43"
+    assert cells(table_of(tmp_path), "", "difference to the paper") == ["-9.18", "-0.070", ""]
+
+
+def test_seeds_give_a_deviation_where_all_scenes_have_them(tmp_path):
+    for seed, psnr in ((0, 20.0), (1, 22.0)):
+        for scene in ALL:
+            paper_run(tmp_path, scene, seed=seed, psnr=psnr)
+    paper_run(tmp_path, "hook", seed=2, psnr=99.0)
+    assert cells(table_of(tmp_path), "forewarp: forward, fast, 1 min, 3 seeds")[0] == "21.00 ± 1.41"
+
+
+def test_ranks_are_among_measured_rows_alone(tmp_path):
+    four = ["hellwarrior", "mutant", "hook", "bouncingballs"]
+    for variant, psnr, lpips in (("full", 25.0, 0.2), ("no_tv", 24.0, 0.1), ("no_view", 20.0, 0.3)):
+        for scene in four:
+            paper_run(tmp_path, scene, variant, psnr=psnr, lpips_vgg=lpips)
+    table = table_of(tmp_path, "losses", difference=False)
+    assert cells(table, "forewarp: the full, fast, 1 min") == ["[25.00]", "[0.900]", "(0.200)"]
+    assert cells(table, "forewarp: the no_tv, fast, 1 min") == ["(24.00)", "[0.900]", "[0.100]"]
+    assert cells(table, "forewarp: the no_view, fast, 1 min")[::2] == ["20.00", "0.300"]
+    assert cells(table, "", "published") == ["33.75", "0.979", "0.040"]  # as printed, unmarked
+    assert table.rules == [3]
+
+
+def test_abilities_and_depth_have_columns_of_their_own(tmp_path):
+    by_ability = {
+        "space": {"psnr": 20.0, "depth_delta_1.25": 0.5},
+        "time": {"psnr": 21.0},
+        "canonical": {"psnr": 22.0, "depth_delta_1.5625": 0.25},
+    }
+    for scene in ("lift", "lift_tilt", "drive"):
+        paper_run(tmp_path, scene, dataset="lego_complete", **by_ability)
+    row = cells(table_of(tmp_path, "lego_complete"), "forewarp: forward, fast, 1 min")
+    assert row == ["20.00", "", "50.000", "", "21.00", "", "", "", "22.00", "", "", "25.000"]
+
+
+def test_counterparts_never_meet_printed_numbers(tmp_path):
+    paper_run(tmp_path, "vehicle", made=True, psnr=28.0)
+    results, _ = collect(tmp_path, ["metrics.json"])
+    table = counterpart(read_paper(PRINTED)["dnerf"], results)
+    made = comparison(table, results)
+    assert [column.name for column in made.columns[2:]] == [
+        "vehicle PSNR↑",
+        "vehicle SSIM↑",
+        "vehicle LPIPS↓",
+    ]
+    assert [row[1] for row in made.rows] == ["measured"]
+    write_paper(tmp_path, tmp_path / "out", PRINTED)
+    text = (tmp_path / "out" / "paper.md").read_text()
+    first, second = text.split("## Table 1: D-NeRF, mean of eight scenes")[1:3]
+    assert "28.00" not in first
+    assert "published" not in second.split("## ")[0]
+
+
+@pytest.fixture
+def whole(tmp_path):
+    """A folder with every output, of a few runs with pictures."""
+    runs = tmp_path / "runs"
+    for warp in ("forward", "backward"):
+        folder = paper_run(runs, "hook", warp=warp)
+        sheet = np.full((3, 4 * 3 + 8, 3), 255, np.uint8)
+        (folder / "images" / "sheets" / "test").mkdir(parents=True)
+        for name in ("a", "b"):
+            iio.imwrite(folder / "images" / "sheets" / "test" / f"{name}.png", sheet)
+        images = [{"name": f"test/{name}", "time": time} for name, time in (("a", 0.9), ("b", 0.0))]
+        (folder / "per_image.json").write_text(json.dumps({"images": images}))
+    for side, psnr in ((20, 18.0), (40, 20.0)):
+        paper_run(runs, "vrig-chicken", f"voxels_{side}", dataset="hypernerf", psnr=psnr)
+    write_run(runs, "failed", psnr=None)
+    files = write_paper(runs, tmp_path / "out", PRINTED)
+    assert all(file.is_file() for file in files)
+    return tmp_path / "out"
+
+
+def test_the_page_tells_how_numbers_came_about(whole):
+    text = (whole / "paper.md").read_text()
+    for line in (
+        "* protocol: dnerf, 4x3, background white",
+        "* machine: a cpu, 2 threads, torch 2",
+        "* budget: fast, 1 min a run",
+        "* measured: nothing yet",
+        "* published rows: the paper, table:quant",
+        "1. T-NeRF's printed mean PSNR is 29.51; its printed scenes average 28.78",
+        "* ball/failed-1.0-seed0: no metrics.json; run its command again",
+    ):
+        assert line in text
+    assert re.search(r"\* date: \d{4}-\d\d-\d\d\n\* command, one of 2 runs: forewarp-train variant=", text)
+    names = {path.name for path in whole.iterdir()}
+    assert {"paper-resolution.png", "paper-canonical-hook.png", "paper-views-dnerf.png"} <= names
+    assert {"paper-table-1-d-nerf.csv", "paper-table-4-lego-complete.csv"} <= names
+    assert "| forewarp: backward, fast, 1 min | measured |" in text
+    assert "| Ours (80^3) | published | 32.68 | 0.97 | 0.04 |" in text
+
+
+def test_the_html_page_needs_nothing_else(whole):
+    text = (whole / "paper.html").read_text()
+    sources = re.findall(r'src="([^"]*)"', text)
+    assert len(sources) == 3
+    for source in sources:
+        kind, content = source.split(",")
+        assert kind == "data:image/png;base64"
+        assert base64.b64decode(content).startswith(b"\x89PNG")
+    assert not re.search(r"https?://|<script|<link", text)
+
+
+def test_latex_is_escaped_and_balanced(whole):
+    text = (whole / "paper.tex").read_text()
+    assert latex_text("a_b & 5 %^2") == r"a\_b \& 5 \%\textasciicircum{}2"
+    for name in ("table", "tabular", "document"):
+        assert text.count(rf"\begin{{{name}}}") == text.count(rf"\end{{{name}}}") > 0
+    assert r"\underline{" in text or r"\textbf{" in text
+
+
+@pytest.mark.skipif(shutil.which("pdflatex") is None, reason="pdflatex is not installed")
+def test_latex_compiles(whole):
+    call = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "paper.tex"]
+    done = subprocess.run(call, cwd=whole, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout[-2000:]
+
+
+def test_of_runs_alike_the_newest_counts(tmp_path):
+    old, new = paper_run(tmp_path / "a", "hook", psnr=10.0), paper_run(tmp_path / "b", "hook", psnr=20.0)
+    os.utime(old / "metrics.json", (1, 1))
+    write_paper(tmp_path, tmp_path / "out", PRINTED)
+    text = (tmp_path / "out" / "paper.md").read_text()
+    assert f"* {old}: another run of the same is newer" in text
+    assert "20.00" in text
+    assert str(new) not in text
+
+
+def test_measured_rows_keep_the_order_of_the_variants(tmp_path):
+    for variant in ("no_inpainter", "full", "no_tv"):
+        paper_run(tmp_path, "hook", variant)
+    results, _ = collect(tmp_path)
+    found = measured(read_paper(PRINTED)["modules"], results)
+    assert [row.variant for row in found] == ["full", "no_tv", "no_inpainter"]
+
+
+def test_a_sheet_falls_into_its_parts():
+    sheet = np.concatenate([np.full((2, 3, 1), i) for i in (0, 1, 2)], 1)
+    wide = np.insert(sheet, [3] * 4 + [6] * 4, 9, axis=1)
+    assert [part.tolist() for part in thirds(wide)] == [[[[i]] * 3] * 2 for i in (0, 1, 2)]

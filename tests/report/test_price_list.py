@@ -1,0 +1,52 @@
+from forewarp.report.price_list import write_price_list
+from runs_on_disk import write_run
+
+
+def rows(text, first):
+    """The cells of rows that begin with ``first``."""
+    lines = [line for line in text.splitlines() if line.startswith(f"| {first} |")]
+    return [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines]
+
+
+def test_changes_are_against_the_same_seed(tmp_path):
+    runs = tmp_path / "runs"
+    write_run(runs, "base", 0, psnr=30.0, epe=0.2)
+    write_run(runs, "base", 1, psnr=28.0, epe=0.2)
+    write_run(runs, "grid_64", 0, psnr=29.0, steps=200, epe=0.1)
+    write_run(runs, "grid_64", 1, psnr=27.5, steps=200, epe=0.1)
+    write_run(runs, "unet_16", 0, psnr=30.5, steps=50, against="grid_64")
+    write_run(runs, "alone", 5)
+    write_run(runs, "failed", psnr=None)
+    page, file = write_price_list(runs, tmp_path / "out")
+    text = page.read_text()
+    own, change = rows(text, "grid_64")
+    assert own[2:4] == ["2", "28.25 ± 1.06"]
+    assert change[2:] == [
+        "base",
+        "2",
+        "-0.75 ± 0.35",
+        "+0.0000 ± 0.0000",
+        "-0.1000 ± 0.0000",
+        "×0.50 ± 0.00",
+        "×1.00 ± 0.00",
+        "×1.00 ± 0.00",
+        "×1.00 ± 0.00",
+        "×2.00 ± 0.00",
+    ]
+    assert rows(text, "unet_16")[0][2:7] == ["grid_64", "1", "+1.50", "+0.0000", ""]
+    assert len(rows(text, "base")) == 1
+    assert rows(text, "alone")[0][3:5] == ["0", ""]  # nothing to compare it with
+    assert "Of all test views:" in text
+    assert "* ball/failed-1.0-seed0: no metrics.json" in text
+    lines = file.read_text().splitlines()
+    assert lines[0].startswith("scene,variant,minutes,seed,views,PSNR (dB),SSIM,EPE,s/step,")
+    assert len(lines) == 7
+
+
+def test_scenes_and_minutes_stand_apart(tmp_path):
+    for scene, minutes in (("ball", 1.0), ("ball", 3.0), ("cube", 1.0)):
+        write_run(tmp_path, scene=scene, minutes=minutes, ability="time")
+    text = write_price_list(tmp_path, tmp_path / "out")[0].read_text()
+    heads = [line for line in text.splitlines() if line.startswith("## ")]
+    assert heads == ["## ball, 1 minutes", "## ball, 3 minutes", "## cube, 1 minutes"]
+    assert "Of test views between the training times:" in text

@@ -1,0 +1,97 @@
+"""Cameras behind a lens and with skew: what is projected is seen along the same ray."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from forewarp.scene.camera import Camera, look_at
+from forewarp.scene.lens import Lens
+
+PHONE = Lens((0.105, -0.088, 0.01), (-0.0537, 0.0037))
+
+
+def camera(**changes):
+    pose = look_at(torch.tensor([3.0, 1.0, 2.0]), torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
+    plain = Camera(64, 48, 55.0, 57.0, 30.5, 25.0, pose, 1.0, 9.0)
+    return replace(plain, **changes)
+
+
+@pytest.mark.parametrize("skew", [0.0, 3.0])
+@pytest.mark.parametrize("lens", [None, PHONE, Lens((-0.25, 0.05, 0.0))])
+def test_rays_project_back_to_their_pixels(lens, skew):
+    view = camera(lens=lens, skew=skew)
+    rays = view.rays(dtype=torch.float64)
+    pixel, z = view.project(rays.origins + 2.5 * rays.directions)
+    number = torch.arange(64 * 48)
+    expected = torch.stack([number % 64, number // 64], -1) + 0.5
+    assert (pixel - expected).abs().max() < 1e-8
+    assert ((z > 0) & (z <= 2.5)).all()
+    assert (rays.directions.norm(dim=-1) - 1).abs().max() < 1e-12
+
+
+def test_projection_by_hand():
+    view = replace(
+        camera(skew=2.0, lens=Lens((0.1, 0.0, 0.0), (0.02, 0.0))),
+        camera_to_world=torch.eye(4, dtype=torch.float64),
+    )
+    # The plane's point (0.5, 1): r^2 = 1.25, s = 1.125.
+    x, y = 0.5 * 1.125 + 2 * 0.02 * 0.5, 1.125 + 0.02 * (1.25 + 2)
+    pixel, z = view.project(torch.tensor([1.0, 2.0, 2.0], dtype=torch.float64))
+    assert pixel.tolist() == pytest.approx([55 * x + 2 * y + 30.5, 57 * y + 25])
+    assert z.item() == 2
+
+
+def test_directions_take_any_shape_and_place_in_the_pixel():
+    view = camera(lens=PHONE, skew=1.0)
+    u = torch.tensor([[0.0, 10.25, 64.0]], dtype=torch.float64)
+    v = torch.tensor([[48.0, 7.75, 0.0]], dtype=torch.float64)
+    directions = view.directions(u, v)
+    assert (directions.shape, directions.dtype) == ((1, 3, 3), torch.float64)
+    torch.testing.assert_close(view.project(view.center + 3 * directions)[0], torch.stack([u, v], -1))
+
+
+def test_resizing_keeps_the_view():
+    small, large = (camera(lens=PHONE, skew=3.0), camera(lens=PHONE, skew=3.0).resized(128, 144))
+    point = torch.tensor([[0.3, -0.2, 0.1], [0.0, 0.4, 0.5]], dtype=torch.float64)
+    scale = torch.tensor([2.0, 3.0], dtype=torch.float64)
+    torch.testing.assert_close(large.project(point)[0], small.project(point)[0] * scale)
+    assert large.lens == small.lens
+
+
+def test_what_lies_beyond_the_fold_does_not_come_back_into_the_picture():
+    # The polynomial x (1 - 0.25 x^2) is 0 again at x = 2, that is 63 degrees off the axis.
+    view = replace(camera(lens=Lens((-0.25, 0.0, 0.0))), camera_to_world=torch.eye(4, dtype=torch.float64))
+    pixel, z = view.project(torch.tensor([[2.0, 0.0, 1.0], [1.0, 0.0, 1.0]], dtype=torch.float64))
+    assert (z > 0).all()
+    assert pixel[0, 0] > 64
+    assert pixel[1, 0].item() == pytest.approx(30.5 + 55 * 0.75)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_points_beside_and_behind_are_finite(dtype):
+    view = camera(lens=PHONE, skew=1.0)
+    side = view.camera_to_world[:3, 0]
+    points = torch.stack([view.center, view.center + side, view.center + 0.5 * view.center]).to(dtype)
+    pixel, z = view.project(points)
+    assert pixel.isfinite().all()
+    assert pixel.dtype == dtype
+    assert z[2] < 0
+
+
+def test_a_lens_that_does_nothing_changes_little():
+    plain, behind = camera(), camera(lens=Lens())
+    torch.testing.assert_close(plain.rays().directions, behind.rays().directions)
+
+
+@pytest.mark.parametrize(
+    ("k", "p", "match"),
+    [
+        ((0.1, 0.2), (0.0, 0.0), r"lens.k: expected 3 finite numbers, but got \(0.1, 0.2\)"),
+        ((0.1, 0.2, float("nan")), (0.0, 0.0), "lens.k: expected 3 finite"),
+        ((0.0, 0.0, 0.0), (1.0,), r"lens.p: expected 2 finite numbers, but got \(1.0,\)"),
+    ],
+)
+def test_a_lens_of_other_numbers_is_refused(k, p, match):
+    with pytest.raises(ValueError, match=match):
+        Lens(k, p)

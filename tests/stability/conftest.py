@@ -1,0 +1,26 @@
+"""Hard cases run wherever they can: on every device, in both implementations of the operators."""
+
+import importlib.util
+
+import pytest
+import torch
+
+from forewarp.ops import backend
+
+PLACES = ["cpu-reference", "cpu-numba", *(["cuda-reference"] if torch.cuda.is_available() else [])]
+
+
+@pytest.fixture(params=PLACES)
+def place(request, monkeypatch):
+    """The device; the operators' implementation is chosen along with it."""
+    device, kind = request.param.split("-")
+    if kind == "numba" and importlib.util.find_spec("numba") is None:
+        pytest.skip("Numba is not installed")
+    monkeypatch.setattr(backend, "numba_installed", lambda: kind == "numba")
+    return torch.device(device)
+
+
+@pytest.fixture(params=["cpu", *(["cuda"] if torch.cuda.is_available() else [])])
+def device(request):
+    """Every device there is."""
+    return torch.device(request.param)

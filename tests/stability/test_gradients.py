@@ -1,0 +1,162 @@
+"""Gradients against finite differences in float64, for every operator there is, at many random places."""
+
+import ast
+import importlib
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import given, settings, strategies
+from torch.autograd import gradcheck
+
+from forewarp import ops
+from forewarp.ops import backend
+from forewarp.ops.composite import accumulate, render_weights
+from forewarp.ops.dct import dct_basis
+from forewarp.ops.encode import positional_encoding, spherical_harmonics_1
+from forewarp.ops.grid import corner_weights, neighbour_pairs, trilinear, trilinear_reference
+from forewarp.ops.lens import distort
+from forewarp.ops.splat import average_splat, scatter_reference
+from forewarp.ops.variation import patch_variation, total_variation
+from hard_cases import index_with
+
+pytestmark = pytest.mark.stability
+
+MANY = settings(derandomize=True, deadline=None, database=None, max_examples=8)
+SEEDS = strategies.integers(0, 10_000)
+
+# What has no gradient, and why.
+WITHOUT = {
+    "check_shape": "a guard",
+    "numba_installed": "a switch",
+    "use_numba": "a switch",
+    "match_threads": "a switch",
+    "warm_up": "compiles",
+    "march": "places samples; says so",
+    "march_reference": "places samples; says so",
+    "check_march": "a guard",
+    "map_cells": "whole numbers",
+    "trace": "for pictures; says so",
+    "index_of": "whole numbers",
+    "dilate": "yes or no",
+    "occupied_cells": "yes or no",
+    "occupied_cells_reference": "yes or no",
+    "neighbour_pairs": "whole numbers",
+    "undistort": "made once for the rays; says so",
+}
+
+
+def generic(seed, count, shape):
+    """Positions (count, 3) inside a lattice and off the kinks at whole coordinates, float64."""
+    generator = torch.Generator().manual_seed(seed)
+    cell = torch.stack([torch.randint(0, n - 1, (count,), generator=generator) for n in shape], -1)
+    return cell + 0.1 + 0.8 * torch.rand(count, 3, generator=generator, dtype=torch.float64)
+
+
+def draw(seed, *shape):
+    generator = torch.Generator().manual_seed(seed + 1)
+    return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+
+def sparse(seed):
+    """A random shape, an index over it with absent voxels, and values (M, 2)."""
+    generator = torch.Generator().manual_seed(seed)
+    shape = tuple(torch.randint(2, 5, (3,), generator=generator).tolist())
+    present = torch.rand(shape, generator=generator) < 0.7
+    present[0, 0, 0] = True
+    return shape, index_with(present), draw(seed, int(present.sum()), 2)
+
+
+def check_trilinear(seed, read=trilinear):
+    shape, index, values = sparse(seed)
+    fill = draw(seed + 2, 2)
+    inputs = (values.requires_grad_(), generic(seed, 5, shape).requires_grad_())
+    assert gradcheck(lambda v, p: read(v, index, p, fill), inputs)
+
+
+def check_splat(seed):
+    shape = sparse(seed)[0]
+    inputs = (draw(seed, 6, 2).requires_grad_(), generic(seed, 6, shape).requires_grad_())
+    assert gradcheck(lambda s, p: average_splat(s, p, shape)[:2], inputs)
+
+
+def check_scatter(seed):
+    shape = sparse(seed)[0]
+    inputs = (draw(seed, 6, 2).requires_grad_(), generic(seed, 6, shape).requires_grad_())
+    assert gradcheck(lambda s, p: scatter_reference(s, p, shape)[0], inputs)
+
+
+def check_weights(seed):
+    ids = torch.randint(0, 4, (9,), generator=torch.Generator().manual_seed(seed)).sort().values
+    optical = draw(seed, 9).exp().requires_grad_()
+    assert gradcheck(lambda x: render_weights(x, ids, 5), optical)
+
+
+def check_accumulate(seed):
+    ids = torch.randint(0, 4, (9,), generator=torch.Generator().manual_seed(seed)).sort().values
+    inputs = (draw(seed, 9).requires_grad_(), draw(seed + 1, 9, 3).requires_grad_())
+    assert gradcheck(lambda w, v: accumulate(w, v, ids, 5), inputs)
+
+
+def check_total_variation(seed):
+    _, index, values = sparse(seed)
+    pairs = neighbour_pairs(index)
+    assert gradcheck(lambda v: total_variation(v, pairs), values.requires_grad_())
+
+
+def check_dct(seed):
+    times = draw(seed, 3).sigmoid().requires_grad_()
+    assert gradcheck(lambda t: dct_basis(t, 4, 9, 0.3, 0.2), times)
+
+
+CHECKS = {
+    "trilinear": check_trilinear,
+    "trilinear_reference": lambda seed: check_trilinear(seed, trilinear_reference),
+    "corner_weights": lambda seed: gradcheck(
+        lambda p: corner_weights(p, (3, 4, 5))[1], generic(seed, 4, (3, 4, 5)).requires_grad_()
+    ),
+    "average_splat": check_splat,
+    "scatter_reference": check_scatter,
+    "render_weights": check_weights,
+    "accumulate": check_accumulate,
+    "total_variation": check_total_variation,
+    "patch_variation": lambda seed: gradcheck(
+        lambda d: patch_variation(d, draw(seed, 2, 3, 3).sigmoid()), draw(seed + 1, 2, 3, 3).requires_grad_()
+    ),
+    "dct_basis": check_dct,
+    "positional_encoding": lambda seed: gradcheck(
+        lambda x: positional_encoding(x, 4), draw(seed, 3, 2).requires_grad_()
+    ),
+    "distort": lambda seed: gradcheck(
+        lambda p: distort(p, (0.1, -0.05, 0.01), (0.01, -0.02)), draw(seed, 4, 2).requires_grad_()
+    ),
+    "spherical_harmonics_1": lambda seed: gradcheck(spherical_harmonics_1, draw(seed, 3, 3).requires_grad_()),
+}
+
+
+@pytest.mark.parametrize("numba", [False, True])
+@pytest.mark.parametrize("operator", CHECKS)
+def test_gradients_equal_finite_differences(operator, numba, monkeypatch):
+    if numba and operator not in ("trilinear", "average_splat"):
+        pytest.skip("has no kernel")
+    if numba:
+        pytest.importorskip("numba")
+    monkeypatch.setattr(backend, "numba_installed", lambda: numba)
+
+    @MANY
+    @given(SEEDS)
+    def check(seed):
+        CHECKS[operator](seed)
+
+    check()
+
+
+def test_every_operator_is_checked_or_has_no_gradient():
+    found = set()
+    for path in Path(ops.__path__[0]).glob("*.py"):
+        if path.stem.startswith(("kernels_", "__")):
+            continue
+        importlib.import_module(f"forewarp.ops.{path.stem}")
+        tree = ast.parse(path.read_text())
+        found |= {n.name for n in tree.body if isinstance(n, ast.FunctionDef) and n.name[0] != "_"}
+    assert found == set(CHECKS) | set(WITHOUT)

@@ -1,0 +1,101 @@
+"""Half precision: convolutions may run in it under autocast, places and densities may not (cases 21, 22)."""
+
+from functools import partial
+
+import pytest
+import torch
+
+from forewarp.effects.inpaint import UNet3d
+from forewarp.effects.upsample import LearnedUpsampler
+from forewarp.effects.view import ViewNetwork
+from forewarp.fields.mlp import mlp
+from forewarp.fields.radiance import FeatureRadiance
+from forewarp.methods.backward_warp import Deformation
+from forewarp.renderer import Renderer
+from forewarp.scene.box import Lattice
+from forewarp.training.settings import EFFECTS
+from tiny_scene import BOX, camera_at, forward_spec
+
+pytestmark = pytest.mark.stability
+
+HALVES = [torch.bfloat16, torch.float16]
+NETWORKS = {
+    "radiance": partial(FeatureRadiance, alpha_init=1e-2, skip_alpha=0.0, width=16, grid_features=4),
+    "view": ViewNetwork,
+}
+SPECS = {
+    "everything": {
+        **NETWORKS,
+        "upsampler": partial(LearnedUpsampler, width=8),
+        "inpainter": partial(UNet3d, levels=2),
+    },
+    "inpainter": {"inpainter": partial(UNet3d, levels=2)},
+    "backward": {"warp": "backward", "deformation": partial(Deformation, width=16, layers=2)},
+    "forward": {},
+}
+
+
+def method_of(choice, device):
+    torch.manual_seed(0)
+    lattice = Lattice(BOX, (8, 7, 6))
+    made = forward_spec(**SPECS[choice]).build(
+        lattice,
+        torch.ones(lattice.shape, dtype=torch.bool),
+        unit=lattice.pitch,
+        scene_box=BOX,
+        frames=5,
+        canonical_time=0.0,
+        effects=EFFECTS,
+    )
+    for parameter in made.parameters():  # nothing starts from zero, or half of it has no gradient
+        parameter.data += 0.05 * torch.randn(parameter.shape)
+    return made.to(device)
+
+
+def picture(method, device):
+    state = method.at(0.7)
+    field = list(state.fields.values())[-1]
+    drawn = Renderer()(field, camera_at(0.1, 8).rays().to(device), torch.ones(3, device=device), method.view)
+    return state, drawn
+
+
+@pytest.mark.parametrize("half", HALVES, ids=str)
+@pytest.mark.parametrize("choice", SPECS)
+def test_every_method_runs_under_autocast(device, choice, half):
+    method = method_of(choice, device)
+    with torch.autocast(device.type, dtype=half):
+        state, drawn = picture(method, device)
+        loss = (drawn.rgb - 0.3).square().mean()
+    loss.backward()
+    for name in ("rgb", "depth", "opacity", "weights", "colors"):
+        assert getattr(drawn, name).dtype == torch.float32
+        assert getattr(drawn, name).isfinite().all()
+    for name, parameter in method.named_parameters():
+        assert parameter.grad is None or parameter.grad.isfinite().all(), name
+    assert state.flow is None or state.flow.dtype == torch.float32
+
+
+@pytest.mark.parametrize("choice", SPECS)
+def test_autocast_changes_what_convolutions_say_and_no_place_and_no_density(device, choice):
+    method = method_of(choice, device)
+    with torch.no_grad():
+        state, drawn = picture(method, device)
+        with torch.autocast(device.type, dtype=torch.bfloat16):
+            other, half = picture(method, device)
+    assert torch.equal(state.canonical.values, other.canonical.values)
+    if state.flow is not None:
+        assert torch.equal(state.flow, other.flow)
+    exact = "inpainter" not in SPECS[choice]
+    assert torch.equal(drawn.rgb, half.rgb) == exact
+    torch.testing.assert_close(drawn.rgb, half.rgb, atol=0.0 if exact else 0.05, rtol=0)
+
+
+@pytest.mark.parametrize("half", HALVES, ids=str)
+def test_a_network_given_half_precision_answers_in_full(device, half):
+    made = mlp(3, 2, width=8, layers=3).to(device)
+    x = torch.randn(5, 3, device=device)
+    with torch.autocast(device.type, dtype=half):
+        assert torch.equal(made(x), made(x.clone()))
+        assert made(x.to(half)).dtype == torch.float32
+    torch.testing.assert_close(made(x.to(half)), made(x.to(half).float()))
+    assert made.double()(x.double()).dtype == torch.float64

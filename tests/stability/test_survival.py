@@ -1,0 +1,324 @@
+"""A run is killed, starved and interrupted wherever it may be; continued, it ends as if nothing had been."""
+
+import contextlib
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+import torch
+
+from forewarp.synth.scenes import synthesize
+from zygote import Zygote
+
+pytestmark = pytest.mark.stability
+KILLS = 24
+SMALL = [
+    *("data=dnerf", "data.scene=vehicle", "data.rays=64", "data.half_resolution=false", "data.held_out=1"),
+    *(
+        "budget=demo",
+        "budget.minutes=null",
+        "budget.iterations=36",
+        "budget.nodes=6",
+        "trainer=cpu",
+        "threads=1",
+    ),
+    *("stage.coarse.voxels=[[0,800],[0.5,1500]]", "stage.fine.voxels=[[0,1500],[0.5,2500]]"),
+    *(
+        "stage.coarse.share=0.5",
+        "stage.fine.share=0.5",
+        "stage.coarse.refresh_every=4",
+        "stage.fine.refresh_every=4",
+        "stage.fine.see_steps=2",
+    ),
+    *("stage.coarse.bases=[[0,2],[0.5,4],[0.75,6]]", "stage.coarse.curriculum={start: 2, all_in: 0.8}"),
+    *(
+        "callbacks.pictures=null",
+        "callbacks.accuracy.first=0.05",
+        "callbacks.accuracy.rays=50",
+        "logger=none",
+    ),
+    *("checkpoint_seconds=0.02", "sheets=1"),
+]
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory):
+    """A folder with the scene ``vehicle``, 16 x 16 pixels."""
+    root = tmp_path_factory.mktemp("scenes")
+    synthesize(root / "vehicle", size=16, frames=8, test_views=(1, 1, 1), val_views=1, samples_per_pixel=1)
+    return root
+
+
+@pytest.fixture(scope="module")
+def zygote():
+    with Zygote() as server:
+        yield server
+
+
+@pytest.fixture(scope="module")
+def begin(zygote, scenes, tmp_path_factory):
+    """``begin(folder, *more, **limits)`` runs the command to its end: exit status and what it said."""
+    log = tmp_path_factory.mktemp("logs") / "log.txt"
+
+    def call(folder, *more, **limits):
+        log.write_text("")
+        status = zygote.call([*SMALL, f"data.root={scenes}", f"run={folder}", *more], log, **limits)
+        return status, log.read_text()
+
+    call.log = log
+    return call
+
+
+@pytest.fixture(scope="module")
+def whole(begin, tmp_path_factory):
+    """The undisturbed run, and the seconds of a second one, whose kernels are warm."""
+    root = tmp_path_factory.mktemp("whole")
+    assert begin(root / "first")[0] == 0, begin.log.read_text()
+    since = time.perf_counter()
+    assert begin(root / "second")[0] == 0
+    return root / "first", time.perf_counter() - since
+
+
+def end(folder):
+    """All that a run ends with and that no clock has touched."""
+    left = {}
+    for stage in ("coarse", "fine"):
+        content = torch.load(folder / stage / "last.ckpt", weights_only=True)
+        for name, value in content["state_dict"].items():
+            left[stage, "weights", name] = value
+        for row, moments in content["optimizer_states"][0]["state"].items():
+            left |= {(stage, "moments", row, name): value for name, value in moments.items()}
+        ours = content["forewarp"]
+        left[stage, "samples"] = ours["generator"]
+        left |= {(stage, "frames", name): value for name, value in ours["curriculum"].items()}
+        left[stage, "home"], left[stage, "followed"] = ours["lattices"]["home"], ours["lattices"]["followed"]
+        left[stage, "batches"] = content["DNeRFDataModule"]
+        left[stage, "handover"] = (folder / stage / "handover.json").read_text()
+    rows = json.loads((folder / "per_image.json").read_text())["images"]
+    left["scores"] = [row["scores"] for row in rows]
+    return left
+
+
+def equal(a, b):
+    if torch.is_tensor(a):
+        return a.shape == b.shape and torch.equal(a.nan_to_num(-7.0), b.nan_to_num(-7.0))
+    if isinstance(a, dict):
+        return a.keys() == b.keys() and all(equal(a[k], b[k]) for k in a)
+    return a == b
+
+
+def differences(folder, whole):
+    ours, theirs = end(folder), end(whole[0])
+    assert ours.keys() == theirs.keys()
+    return [name for name in theirs if not equal(ours[name], theirs[name])]
+
+
+def goes_on(begin, folder, whole):
+    """Continue a run to its end, which must be that of the undisturbed one."""
+    status, said = begin(folder)
+    assert status == 0, said
+    assert differences(folder, whole) == []
+
+
+def test_two_undisturbed_runs_are_alike(whole):
+    assert differences(whole[0].parent / "second", whole) == []
+
+
+@pytest.mark.parametrize("moment", ["before", "half", "after"])
+def test_killed_while_a_checkpoint_takes_its_place(begin, whole, tmp_path, moment):
+    # The first two files are config.yaml and data.json, the third and the ninth are checkpoints.
+    for number in (3, 9):
+        assert begin(tmp_path / "run", die=[number, moment])[0] == -signal.SIGKILL
+    goes_on(begin, tmp_path / "run", whole)
+    assert not list((tmp_path / "run").rglob("last.ckpt.part"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(4))
+def test_killed_at_random_moments(zygote, begin, scenes, whole, tmp_path, seed):
+    draw, kills, run, deaths = random.Random(seed), 0, 0, []
+    arguments = [*SMALL, f"data.root={scenes}"]
+    while kills < KILLS // 4:
+        folder = tmp_path / str(run)
+        pid = zygote.start([*arguments, f"run={folder}"], begin.log)
+        time.sleep(draw.uniform(0.1, 0.9) * whole[1])
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+        if zygote.status() == 0:
+            assert differences(folder, whole) == []
+            run += 1
+        else:
+            deaths.append(where(folder))
+            kills += deaths[-1] != "before coarse"  # where there is nothing yet to be lost
+    goes_on(begin, tmp_path / str(run), whole)
+    print(f"\nseed {seed}: killed in {', '.join(deaths)}")
+
+
+def where(folder):
+    """The phase that a killed run had come to."""
+    done = [stage for stage in ("coarse", "fine") if (folder / stage / "done.json").is_file()]
+    if "fine" in done:
+        return "evaluation"
+    stage = "fine" if done else "coarse"
+    return stage if (folder / stage / "last.ckpt").is_file() else f"before {stage}"
+
+
+@pytest.mark.slow
+def test_killed_at_every_kind_of_file(begin, whole, tmp_path):
+    """From the last checkpoint of a stage on: handover, notes, pictures, numbers."""
+    shutil.copytree(whole[0], tmp_path / "run")
+    for stage in ("coarse", "fine"):
+        for name in ("handover.json", "done.json"):
+            (tmp_path / "run" / stage / name).unlink()
+    (tmp_path / "run" / "metrics.json").unlink()
+    deaths, number = 0, 1
+    while number < 20:
+        status, said = begin(tmp_path / "run", die=[number, ("before", "half", "after")[number % 3]])
+        if status == 0:
+            break
+        assert status == -signal.SIGKILL, said
+        deaths, number = deaths + 1, number + 2
+    assert deaths >= 3
+    goes_on(begin, tmp_path / "run", whole)
+
+
+HARM = {"empty": lambda c: b"", "half": lambda c: c[: len(c) // 2], "nonsense": lambda c: b"\x00nonsense"}
+
+
+@pytest.mark.parametrize("harm", HARM)
+def test_no_harmed_note_is_taken_for_one(begin, whole, tmp_path, harm):
+    shutil.copytree(whole[0], tmp_path / "run")
+    for name in ("coarse/handover.json", "fine/done.json", "metrics.json", "per_image.json", "data.json"):
+        path = tmp_path / "run" / name
+        path.write_bytes(HARM[harm](path.read_bytes()))
+    goes_on(begin, tmp_path / "run", whole)
+
+
+def refused(status, said, *words):
+    """Whether a command ended with one line of error that holds these words."""
+    lines = [line for line in said.splitlines() if "error:" in line]
+    assert status not in (0, 1), said
+    assert "Traceback" not in said
+    assert len(lines) == 1, said
+    assert all(word in lines[0] for word in words), lines[0]
+
+
+@pytest.mark.parametrize("harm", HARM)
+def test_a_harmed_checkpoint_is_refused_by_name(begin, whole, tmp_path, harm):
+    shutil.copytree(whole[0], tmp_path / "run")
+    (tmp_path / "run" / "fine" / "done.json").unlink()
+    path = tmp_path / "run" / "fine" / "last.ckpt"
+    path.write_bytes(HARM[harm](path.read_bytes()))
+    refused(
+        *begin(tmp_path / "run"), "fine/last.ckpt: expected a checkpoint, but it cannot be read", "delete it"
+    )
+    path.unlink()
+    goes_on(begin, tmp_path / "run", whole)
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A file system of 600 KB."""
+    place = tmp_path / "disk"
+    place.mkdir()
+    made = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=600k", "tmpfs", place], capture_output=True)
+    if made.returncode:
+        pytest.skip(f"no small file system can be mounted: {made.stderr.decode().strip()}")
+    yield place
+    subprocess.run(["umount", place], check=True)
+
+
+def step_of(path):
+    return torch.load(path, weights_only=True)["global_step"]
+
+
+def test_a_full_disk_ends_in_one_line_and_the_run_goes_on_elsewhere(begin, whole, small_disk, tmp_path):
+    size = (whole[0] / "coarse" / "last.ckpt").stat().st_size
+    (small_disk / "ballast").write_bytes(b"x" * (600 * 1024 - 24 * 1024 - int(1.6 * size)))
+    refused(*begin(small_disk / "run"), "last.ckpt: expected room to write, but got No space left on device")
+    assert step_of(small_disk / "run" / "coarse" / "last.ckpt") > 0
+    shutil.copytree(small_disk / "run", tmp_path / "run")
+    goes_on(begin, tmp_path / "run", whole)
+
+
+def test_a_limit_on_files_is_a_full_disk(begin, whole, tmp_path):
+    size = (whole[0] / "coarse" / "last.ckpt").stat().st_size
+    refused(
+        *begin(tmp_path / "run", file=size // 2), "last.ckpt: expected room to write, but got File too large"
+    )
+    assert list((tmp_path / "run" / "coarse").glob("last*")) == []
+
+
+def test_a_place_that_cannot_be_written(begin, whole, tmp_path):
+    shutil.copytree(whole[0], tmp_path / "run")
+    (tmp_path / "run" / "fine" / "done.json").unlink()
+    before = (tmp_path / "run" / "fine" / "last.ckpt").read_bytes()
+    (tmp_path / "run" / "fine" / "last.ckpt.part").mkdir()
+    refused(
+        *begin(tmp_path / "run"), "fine/last.ckpt: expected a usable file or folder, but got Is a directory"
+    )
+    assert (tmp_path / "run" / "fine" / "last.ckpt").read_bytes() == before
+    (tmp_path / "file").write_text("")
+    refused(*begin(tmp_path / "file" / "run"), "file/run", "Not a directory")
+
+
+def test_a_read_only_file_system(begin, whole, tmp_path):
+    place = tmp_path / "disk"
+    shutil.copytree(whole[0], place / "run")
+    (place / "run" / "fine" / "done.json").unlink()
+    for options in (["--bind"], ["-o", "remount,bind,ro"]):
+        made = subprocess.run(["mount", *options, place, place], capture_output=True)
+        if made.returncode:
+            pytest.skip(f"nothing can be mounted: {made.stderr.decode().strip()}")
+    try:
+        refused(*begin(place / "run"), "expected a usable file or folder, but got Read-only file system")
+    finally:
+        subprocess.run(["umount", place], check=True)
+
+
+def test_too_little_memory_ends_in_one_line(begin, whole, tmp_path):
+    status, said = begin(tmp_path / "run", "data.rays=4000000", memory=400 * 2**20)
+    refused(status, said, "memory: expected room for", "lower data.rays")
+
+
+def test_an_interruption_keeps_the_last_checkpoint(zygote, begin, scenes, whole, tmp_path):
+    folder, log = tmp_path / "run", tmp_path / "log.txt"
+    pid = zygote.start([*SMALL, f"data.root={scenes}", f"run={folder}"], log)
+    deadline = time.perf_counter() + 60
+    while not (folder / "coarse" / "last.ckpt").is_file() and time.perf_counter() < deadline:
+        time.sleep(0.01)
+    os.kill(pid, signal.SIGINT)
+    assert zygote.status() == 130, log.read_text()
+    said = log.read_text()
+    assert "forewarp-train: interrupted; run the same command again to go on from the last checkpoint" in said
+    assert "Traceback" not in said
+    goes_on(begin, folder, whole)
+
+
+def test_two_in_one_folder_refuse_each_other(zygote, begin, scenes, whole, tmp_path):
+    folder = tmp_path / "run"
+    call = [sys.executable, "-c", HOLD, folder]
+    with subprocess.Popen(call, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+        assert other.stdout.readline() == b"held\n"
+        refused(
+            *begin(folder),
+            f"{folder}: expected a run that nobody works on, but got one of process {other.pid}",
+        )
+        other.kill()
+    assert begin(folder, "budget.iterations=2", "evaluate=false")[0] == 0
+
+
+HOLD = """
+import sys
+from pathlib import Path
+from forewarp.cli.claims import alone
+with alone(Path(sys.argv[1])):
+    print("held", flush=True)
+    sys.stdin.read()
+"""

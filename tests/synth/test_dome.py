@@ -1,0 +1,99 @@
+import filecmp
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("trimesh")
+pytest.importorskip("embreex")
+
+from forewarp.data.nhr import read_scene
+from forewarp.scene.errors import SceneError
+from forewarp.synth import dome
+from forewarp.synth.cameras import centers_of, stream
+from forewarp.synth.dome import dome_cameras, synthesize
+from forewarp.synth.motions import MOTIONS
+from forewarp.synth.points import surface_points
+from forewarp.synth.vehicle import World
+from lit_points import color_errors, lit_points
+
+SMALL = {"size": 120, "frames": 2, "points": 300, "samples_per_pixel": 2}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return synthesize(tmp_path_factory.mktemp("synth") / "scene", **SMALL)
+
+
+@pytest.fixture(scope="module")
+def scene(folder):
+    return read_scene(folder.parent, folder.name, half_resolution=False)
+
+
+def test_twenty_cameras_of_two_sizes(scene):
+    frames = scene.train + scene.test
+    assert len(frames) == 40
+    assert {f.time for f in frames} == {0.0, 1.0}
+    assert {(f.camera.width, f.camera.height) for f in frames} == {(120, 100), (100, 75)}
+    assert scene.has_alpha
+
+
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_no_picture_cuts_anything_off(motion):
+    world = World(motion)
+    for time in (0, 0.5, 1):
+        placed = torch.from_numpy(world.place(time))
+        for camera in dome_cameras(240, 0):
+            pixel, _ = camera.project(placed)
+            assert (pixel > 2).all()
+            assert (pixel < torch.tensor([camera.width, camera.height]) - 2).all()
+
+
+def test_true_points_have_the_colour_of_their_pixels_and_lie_in_the_masks(scene):
+    world, centers = World("lift_tilt"), centers_of(dome_cameras(120, 0))
+    faces, barycentric = surface_points(world, dome.POINTS, centers, stream(0, dome._POINTS))
+    assert scene.truth.times.tolist() == [0, 1]
+    for frame in (scene.train + scene.test)[::3]:
+        points, rgba = scene.truth.points[:, int(frame.time)], frame.load()
+        colors, visible = lit_points(world, faces, barycentric, frame.time, frame.camera.center.numpy())
+        errors = color_errors(rgba, frame.camera, points[visible], colors[visible])
+        assert len(errors) > 800
+        assert np.median(errors) < 0.06
+        pixel, _ = frame.camera.project(points.double())
+        column, row = pixel.floor().long().unbind(-1)
+        assert (rgba[row, column, 3] > 0).double().mean() > 0.95
+
+
+def test_clouds_lie_on_what_moves_with_the_frame(folder):
+    first, last = (np.load(folder / "pointclouds" / f"frame{f}.npy") for f in (1, 2))
+    assert first.shape == last.shape == (300, 6)
+    assert first[:, 3:].min() >= 0
+    assert 100 < first[:, 3:].max() <= 255
+    for cloud, time in ((first, 0.0), (last, 1.0)):
+        placed = World("lift_tilt").place(time)
+        assert (cloud[:, :3] >= placed.min(0) - 1e-5).all()
+        assert (cloud[:, :3] <= placed.max(0) + 1e-5).all()
+    assert not np.array_equal(first, last)
+
+
+def test_equal_arguments_give_equal_bytes(folder, tmp_path):
+    again = synthesize(tmp_path / "again", **SMALL)
+    names = sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file())
+    assert len(names) == 2 * (2 * 20 + 1) + 3
+    assert filecmp.cmpfiles(folder, again, names, shallow=False) == (names, [], [])
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ({"size": 100}, "size: expected a multiple of 24 of at least 24, but got 100; set size"),
+        ({"frames": 1}, "frames: expected a whole number of at least 2"),
+        ({"points": 0}, "points: expected a whole number of at least 1"),
+        ({"motion": 3}, "motion: expected one of"),
+    ],
+)
+def test_bad_arguments_get_one_line(tmp_path, change, text):
+    with pytest.raises(SceneError, match=text) as caught:
+        synthesize(tmp_path / "scene", **{**SMALL, **change})
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "scene").exists()

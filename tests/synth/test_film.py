@@ -1,0 +1,37 @@
+import numpy as np
+import pytest
+
+pytest.importorskip("trimesh")
+pytest.importorskip("embreex")
+
+from forewarp.synth import film as of_film
+from forewarp.synth.cameras import random_cameras
+from forewarp.synth.film import Exposure, Film, View
+from forewarp.synth.vehicle import World
+
+VIEWS = [
+    View(str(i), i / 8, camera) for i, camera in enumerate(random_cameras(9, 12, np.random.default_rng(0)))
+]
+
+
+def test_the_number_of_processes_does_not_matter():
+    """And an error in a process is the caller's; one pool for both, as a process takes seconds to start."""
+    seen, world = {1: [], 2: []}, World("drive")
+    cameras = [view.camera for view in VIEWS]
+    with Film(Exposure(2, 3), cameras, 1, lambda *n: seen[1].append(n)) as film:
+        alone = list(film.pictures(world, VIEWS))
+    with Film(Exposure(2, 3), cameras, 2, lambda *n: seen[2].append(n)) as film:
+        together = list(film.pictures(world, VIEWS))
+        with pytest.raises(AttributeError):
+            list(film.pictures(world, [View("", 0.5, None)]))
+    assert seen[1] == seen[2] == [(i, 9) for i in range(1, 10)]
+    assert len(alone) == len(together) == len({rgba.tobytes() for rgba, _ in alone}) == 9
+    for one, other in zip(alone, together):
+        np.testing.assert_array_equal(one[0], other[0])
+        np.testing.assert_array_equal(one[1], other[1])
+
+
+def test_processes_are_for_much_work_and_never_more_than_processors(monkeypatch):
+    monkeypatch.setattr(of_film.os, "sched_getaffinity", lambda _: range(3), raising=False)
+    assert [of_film._worth(samples) for samples in (0, 6e7, 9e7, 1e12)] == [1, 1, 2, 3]
+    assert Film(Exposure(), [v.camera for v in VIEWS]).workers == 1

@@ -1,0 +1,96 @@
+import filecmp
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("trimesh")
+pytest.importorskip("embreex")
+
+from forewarp.data.lego_complete import read_scene
+from forewarp.scene.errors import SceneError
+from forewarp.synth.lego_complete import _views, synthesize
+
+SMALL = {"size": 64, "frames": 3, "motions": ["lift", "drive"], "test_views": (2, 4, 3), "val_views": 1}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return synthesize(tmp_path_factory.mktemp("synth") / "scenes", **SMALL)
+
+
+def test_every_motion_is_a_scene_with_three_kinds_of_view(folder):
+    assert sorted(p.name for p in folder.iterdir()) == ["drive", "lift"]
+    for name in SMALL["motions"]:
+        scene = read_scene(folder, name)
+        assert [f.time for f in scene.train] == pytest.approx([0, 0.5, 1])
+        times = {a: [f.time for f in scene.test if f.ability == a] for a in ("space", "time", "canonical")}
+        assert times["space"] == pytest.approx([0, 0, 0.5, 0.5, 1, 1])
+        assert times["time"] == pytest.approx(np.linspace(0, 1, 9))
+        assert times["canonical"] == [0] * 3
+        assert scene.truth.times.tolist() == pytest.approx(np.linspace(0, 1, 9))
+        places = torch.stack([f.camera.center for f in scene.train + scene.test])
+        assert len(torch.unique(places, dim=0)) == len(places)
+
+
+def test_the_default_counts_are_the_published_ones():
+    views = _views((0, 100), 8, np.linspace(0, 1, 197), 4, (4, 4, 50), 0)
+    counts = {a: sum(v.ability == a for v in views["test"]) for a in ("space", "time", "canonical")}
+    assert counts == {"space": 200, "time": 197, "canonical": 50}
+    assert len(views["train"]) == len({v.time for v in views["train"]}) == 50
+    assert {v.time for v in views["train"]} <= {v.time for v in views["test"] if v.ability == "time"}
+
+
+def test_scenes_move_differently_and_are_seen_from_different_places(folder):
+    lift, drive = (read_scene(folder, name) for name in SMALL["motions"])
+    assert not torch.equal(lift.train[0].camera.center, drive.train[0].camera.center)
+    moved = [
+        (s.truth.points[:, -1] - s.truth.points[:, 0]).norm(dim=-1).gt(0.02).float().mean()
+        for s in (lift, drive)
+    ]
+    assert 0 < moved[0] < moved[1]
+
+
+@pytest.mark.parametrize("name", SMALL["motions"])
+def test_true_points_meet_the_depth_maps(folder, name):
+    scene, shares = read_scene(folder, name), []
+    for frame in scene.test:
+        step = int((scene.truth.times - frame.time).abs().argmin())
+        points, depth = scene.truth.points[:, step].double(), frame.load_depth()
+        pixel, _ = frame.camera.project(points)
+        column, row = pixel.floor().long().clamp(1, 62).unbind(-1)
+        around = torch.stack([depth[row + i, column + j] for i in (-1, 0, 1) for j in (-1, 0, 1)]).double()
+        distance = (points - frame.camera.center).norm(dim=-1)
+        seen = (distance - around).abs().amin(0) < 0.02
+        shares.append(float(seen.double().mean()))
+        around[around == 0] = torch.inf
+        assert (distance > around.amin(0) - 0.15).double().mean() > 0.98, frame.name
+    # A pixel is 0.05 units wide here, and on a slab seen from low down a multiple of that deep.
+    assert min(shares) > 0.2
+    assert np.mean(shares) > 0.38
+
+
+def test_equal_arguments_give_equal_bytes(folder, tmp_path):
+    again = synthesize(tmp_path / "again", **SMALL)
+    names = sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file())
+    assert len(names) == 2 * (3 + 1 + 2 * 18 + 5 + 1)
+    assert filecmp.cmpfiles(folder, again, names, shallow=False) == (names, [], [])
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ({"motions": ["fly"]}, "motions: expected one of lift, lift_tilt, drive, but got 'fly'"),
+        ({"motions": []}, "motions: expected a list of"),
+        ({"motions": "lift"}, "motions: expected a list of"),
+        ({"motions": ["lift", "lift"]}, "motions: expected each once"),
+        ({"test_views": (1, 2)}, "test_views: expected three numbers"),
+        ({"frames": 1}, "frames: expected a whole number of at least 2, but got 1"),
+        ({"workers": 0}, "workers: expected a whole number of at least 1, but got 0"),
+    ],
+)
+def test_bad_arguments_get_one_line(tmp_path, change, text):
+    with pytest.raises(SceneError, match=text) as caught:
+        synthesize(tmp_path / "scene", **{**SMALL, **change})
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "scene").exists()

@@ -1,0 +1,98 @@
+"""The sweeps behind the paper's tables: every job composes, and is known by what it computes."""
+
+from itertools import product
+
+import pytest
+import yaml
+
+from configs import ROOT, composed
+from forewarp.cli.runs import build_run, hashed
+
+PAPER = {
+    "dnerf": 8,
+    "hypernerf": 4,
+    "nhr": 4,
+    "lego_complete": 3,
+    "ablation_modules": 60,
+    "ablation_losses": 32,
+    "resolution": 16,
+}
+COUNTERPARTS = ["dnerf", "hypernerf", "nhr", "lego_complete"]
+
+
+def jobs_of(sweep):
+    """The overrides of every job, as Hydra's sweeper multiplies them out."""
+    content = yaml.safe_load((ROOT / "sweeps" / f"{sweep}.yaml").read_text())
+    params = content["hydra"]["sweeper"]["params"]
+    choices = [[f"{key}={v.strip()}" for v in str(values).split(",")] for key, values in params.items()]
+    return [list(job) for job in product(*choices)]
+
+
+def job_of(sweep, *overrides):
+    """A job's config, put together as far as it goes without its data."""
+    config = composed(f"sweeps={sweep}", *overrides)
+    build_run(config)
+    return config
+
+
+@pytest.mark.parametrize(("sweep", "count"), PAPER.items())
+def test_a_sweep_has_its_jobs(sweep, count):
+    jobs = jobs_of(sweep)
+    assert len(jobs) == len({tuple(job) for job in jobs}) == count
+    config = job_of(sweep, *jobs[-1])
+    assert config.absent == "skip"
+    assert config.run.startswith(f"runs/paper/{config.data.scene}/")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sweep", PAPER)
+def test_every_job_composes_and_has_a_folder_of_its_own(sweep):
+    folders = [hashed(job_of(sweep, *job)).run for job in jobs_of(sweep)]
+    assert len(set(folders)) == len(folders)
+
+
+@pytest.mark.parametrize("dataset", COUNTERPARTS)
+def test_a_counterpart_stands_in_for_each_dataset(dataset):
+    config = job_of("ablation_modules", f"scene=counterpart_{dataset}", "ablation=full", "budget=demo")
+    assert "Synthetic" in config.data._target_
+    assert (config.budget.name, config.variant.name) == ("demo", "full")
+    assert config.stage.fine.voxels == [[0, 13824]]
+
+
+def test_an_ablation_takes_one_thing_from_all():
+    common = ["scene=dnerf_hook", "budget=fast"]
+    full = composed(*common, "ablation=full")
+    assert None not in (full.model.upsampler, full.model.inpainter, full.model.view)
+    without = {
+        "no_upsampling": "upsampler",
+        "no_inpainter": "inpainter",
+        "no_view": "view",
+    }
+    for name, part in without.items():
+        model = composed(*common, f"ablation={name}").model
+        assert [key for key in full.model if full.model[key] != model[key]] == [part]
+        assert model[part] is None
+    for name, terms in {"no_tv": ["tv_density", "tv_flow", "tv_depth"], "no_flow": ["flow_l1"]}.items():
+        weights = composed(*common, f"ablation={name}").objective.fine.weights
+        before = full.objective.fine.weights
+        assert [term for term in before if before[term] != weights[term]] == terms
+        assert all(weights[term] == 0 for term in terms)
+
+
+def test_a_job_is_known_by_what_it_computes():
+    full = ["scene=dnerf_hook", "ablation=full"]
+    same = [hashed(composed(f"sweeps={s}", *full)).run for s in ("ablation_modules", "ablation_losses")]
+    assert same[0] == same[1]
+    assert "{hash}" not in same[0]
+    others = (["seed=1"], ["budget.minutes=3"], ["data.rays=7"], ["stage.fine.share=0.1"])
+    changed = {hashed(composed("sweeps=ablation_losses", *full, *more)).run for more in others}
+    assert len(changed - set(same)) == len(others)
+    shown = hashed(composed("sweeps=ablation_losses", *full, "sheets=1", "threads=1", "trainer=cpu")).run
+    assert shown == same[0]
+    plain = composed("data.scene=x", "data=dnerf")
+    assert hashed(plain).run == "runs/x/forward-fast-seed0"
+
+
+def test_the_canonical_middle_reaches_the_data():
+    run = build_run(composed("scene=dnerf_hook", "ablation=canonical_middle"))
+    assert run.datamodule._canonical == "middle"

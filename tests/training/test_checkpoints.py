@@ -1,0 +1,106 @@
+from functools import partial
+
+import pytest
+import torch
+
+from forewarp.fields.trajectory import TrajectoryField
+from forewarp.training.checkpoints import KeepCheckpoint, check_checkpoint, check_state, load_weights
+from tiny_scene import Interrupt, ball_data, forward_spec, make_run, stage
+
+
+def run(folder, callbacks=(), width=8, times=None):
+    """A run of one short stage."""
+    trajectory = partial(TrajectoryField, bases=2, nodes=8, width=width, layers=2)
+    data = ball_data(rays=64, size=16, times=times)
+    spec = forward_spec(trajectory=trajectory)
+    return make_run(folder, [stage(voxels=[[0, 1000]])], data=data, spec=spec, callbacks=callbacks)
+
+
+def module(folder, **changes):
+    """What such a run begins with."""
+    ours = run(folder, **changes)
+    ours.datamodule.setup()
+    return ours._module(ours.stages[0], None, None, 0)[0]
+
+
+@pytest.fixture(scope="module")
+def interrupted(tmp_path_factory):
+    """The checkpoint of a stage that was interrupted."""
+    folder = tmp_path_factory.mktemp("interrupted")
+    with pytest.raises(SystemExit):
+        run(folder, [Interrupt("coarse", 3)]).fit()
+    return folder / "coarse" / "last.ckpt"
+
+
+def test_what_fits_is_taken(tmp_path, interrupted):
+    check_state(interrupted, module(tmp_path))
+    assert set(check_checkpoint(interrupted, module(tmp_path))) >= {"state_dict", "forewarp"}
+
+
+@pytest.mark.parametrize(
+    ("changes", "name"),
+    [({"width": 16}, "method.motion.trajectory.network.0.bias"), ({"times": [0.0] * 3}, "method.motion")],
+    ids=["width", "motion"],  # of one time: none
+)
+def test_another_configuration_is_refused_by_what_differs(tmp_path, interrupted, changes, name):
+    text = f"expected a checkpoint of this configuration, but got one that differs in {name}"
+    with pytest.raises(ValueError, match=text):
+        load_weights(module(tmp_path, **changes), interrupted)
+
+
+def test_half_a_file_is_refused(tmp_path, interrupted):
+    broken = tmp_path / "last.ckpt"
+    broken.write_bytes(interrupted.read_bytes()[:500])
+    with pytest.raises(ValueError, match="last.ckpt: expected a checkpoint, but it cannot be read"):
+        check_checkpoint(broken, module(tmp_path))
+
+
+def test_one_flipped_bit_is_refused(tmp_path, interrupted):
+    content = bytearray(interrupted.read_bytes())
+    stored = torch.load(interrupted, weights_only=True)["state_dict"]["method.radiance.density"]
+    at = content.index(stored.numpy().tobytes()[:64])
+    content[at + 3] ^= 1
+    (tmp_path / "last.ckpt").write_bytes(content)
+    with pytest.raises(
+        ValueError, match="last.ckpt: expected a checkpoint, but it cannot be read .BadZipFile."
+    ):
+        check_checkpoint(tmp_path / "last.ckpt", module(tmp_path))
+
+
+def test_a_checkpoint_cannot_execute_code(tmp_path):
+    class Deed:
+        def __reduce__(self):
+            return (exec, (f"open({str(tmp_path / 'deed')!r}, 'w')",))
+
+    torch.save({"state_dict": {"a": Deed()}}, tmp_path / "last.ckpt")
+    with pytest.raises(ValueError, match="last.ckpt: expected a checkpoint, but it cannot be read"):
+        check_checkpoint(tmp_path / "last.ckpt", module(tmp_path))
+    assert not (tmp_path / "deed").exists()
+
+
+def test_a_voxel_grid_adopts_other_shapes(tmp_path, interrupted):
+    grown = module(tmp_path)
+    everywhere = torch.ones(grown.method.radiance.lattice.shape, dtype=torch.bool)
+    grown.method.radiance.activate(everywhere, {})
+    grown.method.radiance.activate(everywhere & (torch.rand(everywhere.shape) > 0.5), {})
+    load_weights(grown, interrupted)
+    stored = torch.load(interrupted, weights_only=True)["state_dict"]["method.radiance.density"]
+    assert torch.equal(grown.method.radiance.density, stored)
+
+
+def test_an_older_checkpoint_is_refused_by_what_it_lacks(tmp_path, interrupted):
+    content = torch.load(interrupted, weights_only=True)
+    content["forewarp"].pop("curriculum")
+    (tmp_path / "coarse").mkdir()
+    torch.save(content, tmp_path / "coarse" / "last.ckpt")
+    with pytest.raises(ValueError, match=r"last.ckpt: .* but got one without curriculum; delete it to begin"):
+        run(tmp_path).fit()
+
+
+def test_checkpoints_come_by_the_clock(tmp_path, monkeypatch):
+    saved = []
+    monkeypatch.setattr(KeepCheckpoint, "save", lambda self, trainer: saved.append(trainer.global_step))
+    ours = run(tmp_path)
+    ours.checkpoint_seconds = 1e-9
+    ours.fit()
+    assert saved == [*range(1, 13), 12]

@@ -1,0 +1,37 @@
+import os
+import resource
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from forewarp.training import protocol
+from forewarp.training.protocol import peak_memory_bytes, reset_peak_memory
+
+CLEARED = Path("/proc/self/clear_refs")
+
+
+@pytest.fixture
+def on_the_cpu(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+
+
+@pytest.mark.skipif(not os.access(CLEARED, os.W_OK), reason=f"{CLEARED} cannot be written: not Linux")
+def test_the_peak_counts_from_the_reset(on_the_cpu):
+    reset_peak_memory()
+    before = peak_memory_bytes()
+    block = torch.ones(50_000_000)  # 200 MB, touched
+    during = peak_memory_bytes()
+    del block
+    assert peak_memory_bytes() > during - 10e6  # the kernel counts in batches of pages
+    assert during > before + 190e6
+    reset_peak_memory()
+    assert peak_memory_bytes() < during - 150e6
+
+
+def test_elsewhere_it_is_that_of_the_process(on_the_cpu, monkeypatch, tmp_path):
+    monkeypatch.setattr(protocol, "_PROCESS", tmp_path / "nowhere")
+    reset_peak_memory()  # does nothing, and says nothing
+    unit = 1 if sys.platform == "darwin" else 1024
+    assert peak_memory_bytes() == resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit

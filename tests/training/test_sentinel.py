@@ -1,0 +1,195 @@
+import json
+from functools import partial
+
+import lightning
+import pytest
+import torch
+
+from forewarp.effects.inpaint import UNet3d
+from forewarp.scene.lens import Lens
+from forewarp.training.bundle import read_bundle
+from forewarp.training.sentinel import BrokenStep, Sentinel, all_finite, diagnose, first_bad
+from tiny_scene import ball_data, forward_spec, make_run, stage
+
+NAN = float("nan")
+
+
+class Poison(lightning.Callback):
+    """Breaks a number at one step, and notes the bytes of the checkpoint before."""
+
+    def __init__(self, what, *steps):
+        self.what, self.steps = what, steps
+
+    def on_train_batch_start(self, trainer, module, batch, batch_idx):
+        if module.global_step in self.steps:
+            with torch.no_grad():
+                if self.what == "parameter":
+                    module.method.radiance.color[0, 0] = NAN
+                if self.what == "batch":
+                    batch.rgb[3, 1] = NAN
+                if self.what == "slope":  # finite values whose gradient is not
+                    module.objective.terms["tv_flow"] = lambda step: (0 * step.state.flow.sum()).sqrt()
+
+    def on_after_backward(self, trainer, module):
+        if self.what == "gradient" and module.global_step in self.steps:
+            module.method.radiance.density.grad[0, 0] = NAN
+
+    def on_before_zero_grad(self, trainer, module, optimizer):
+        if self.what == "moment" and module.global_step in self.steps:
+            next(iter(optimizer.state.values()))["exp_avg_sq"][0] = float("inf")
+
+
+def run(folder, poison, iterations=12, **changes):
+    """A run of one stage with a checkpoint after every step."""
+    spec = changes.pop("spec", None)
+    ours = make_run(
+        folder,
+        [stage(iterations=iterations)],
+        data=ball_data(rays=64, size=16),
+        spec=spec,
+        callbacks=[poison],
+    )
+    ours.checkpoint_seconds = 0.0
+    for name, value in changes.items():
+        setattr(ours, name, value)
+    return ours
+
+
+def broken(folder, poison, **changes):
+    """The message of a run that stops, and the bundle of its step 5."""
+    with pytest.raises(BrokenStep) as stopped:
+        run(folder, poison, **changes).fit()
+    return str(stopped.value), folder / "coarse" / "broken" / "step_5.pt"
+
+
+def again(folder, path):
+    """What a stored step shows when it is taken again by a run that has no data."""
+    bundle = read_bundle(path)
+    ours = make_run(folder / "elsewhere", [stage()], data=None)
+    module = ours.rebuilt("coarse", bundle.scene, bundle.unit)
+    module.load_state_dict(bundle.state_dict)
+    module.generator.set_state(bundle.noted["random"]["samples"])
+    return str(diagnose(module, bundle.batch, bundle.noted["step"])), bundle
+
+
+def test_a_loss_that_is_not_finite_stops_the_stage(tmp_path):
+    said, path = broken(tmp_path, Poison("batch", 5))
+    told = "stage.coarse: expected finite numbers, but got loss: batch.rgb (terms photo) at step 5,"
+    assert said.startswith(told)
+    assert "\n" not in said
+    assert f"python -m forewarp.replay {path}" in said
+    found, bundle = again(tmp_path, path)
+    assert found == bundle.noted["found"] == "loss: batch.rgb (terms photo)"
+    frame = bundle.scene.train[bundle.batch.frame]
+    assert f"frame {frame.name} (time {frame.time:.4g})" in said
+
+
+def test_the_last_checkpoint_is_the_one_before_and_the_run_goes_on_from_it(tmp_path):
+    broken(tmp_path, Poison("batch", 5))
+    kept = torch.load(tmp_path / "coarse" / "last.ckpt", weights_only=True)
+    assert kept["global_step"] == 5
+    assert all(v.isfinite().all() for v in kept["state_dict"].values() if torch.is_tensor(v))
+    module = run(tmp_path, Poison("nothing")).fit()
+    whole = run(tmp_path / "whole", Poison("nothing")).fit()
+    ours, theirs = ({k: v for k, v in m.state_dict().items() if torch.is_tensor(v)} for m in (module, whole))
+    assert all(torch.equal(ours[k], theirs[k]) for k in theirs)
+
+
+def test_a_parameter_that_is_not_finite_is_named(tmp_path):
+    said, path = broken(tmp_path, Poison("parameter", 5))
+    assert "but got parameter: radiance.color at step 5" in said
+    assert again(tmp_path, path)[0] == "parameter: radiance.color"
+
+
+def test_a_gradient_that_is_not_finite_is_named_with_its_term(tmp_path):
+    said, _ = broken(tmp_path, Poison("slope", 5))
+    assert "gradient: motion.trajectory." in said
+    assert "(terms tv_flow)" in said
+
+
+def test_what_does_not_happen_again_is_said_to(tmp_path):
+    said, path = broken(tmp_path, Poison("gradient", 5))
+    assert "gradient: radiance.density, though not when the step was repeated, at step 5" in said
+    assert again(tmp_path, path)[0] == "None"
+
+
+def test_a_broken_optimizer_is_never_saved(tmp_path):
+    with pytest.raises(BrokenStep, match=r"optimizer: exp_avg_sq of "):
+        run(tmp_path, Poison("moment", 5)).fit()
+    kept = torch.load(tmp_path / "coarse" / "last.ckpt", weights_only=True)
+    states = kept["optimizer_states"][0]["state"].values()
+    assert kept["global_step"] == 5
+    assert all(v.isfinite().all() for s in states for v in s.values())
+
+
+def test_steps_are_skipped_where_asked_and_counted(tmp_path):
+    ours = run(tmp_path, Poison("batch", 3, 5), skip=2)
+    module = ours.fit()
+    assert all(p.isfinite().all() for p in module.parameters())
+    assert ours.finished()["coarse"]["skipped_steps"] == 2
+    assert ours.finished()["coarse"]["steps"] == 12
+    assert sorted(p.name for p in (tmp_path / "coarse" / "broken").iterdir()) == ["step_3.pt", "step_5.pt"]
+
+
+def test_one_too_many_stops_and_the_count_is_continued(tmp_path):
+    with pytest.raises(BrokenStep, match="at step 5"):
+        run(tmp_path, Poison("batch", 3, 5), skip=1).fit()
+    with pytest.raises(BrokenStep, match="at step 7"):
+        run(tmp_path, Poison("batch", 7), skip=1).fit()
+    done = run(tmp_path, Poison("batch", 7), skip=2)
+    done.fit()
+    assert done.finished()["coarse"]["skipped_steps"] == 2
+
+
+def test_a_skipped_step_changes_no_weight(tmp_path):
+    class Diary(Poison):
+        weights = {}
+
+        def on_train_batch_end(self, trainer, module, *_):
+            self.weights[module.global_step] = {n: p.detach().clone() for n, p in module.named_parameters()}
+
+    diary = Diary("batch", 5)
+    run(tmp_path, diary, skip=1).fit()
+    same = {
+        a: all(torch.equal(v, diary.weights[a + 1][k]) for k, v in diary.weights[a].items()) for a in (5, 6)
+    }
+    assert same == {5: True, 6: False}
+
+
+def test_a_bundle_holds_lenses_and_is_refused_where_it_is_none(tmp_path):
+    from forewarp.training.bundle import _plain_scene, _scene
+
+    data = ball_data(size=16)
+    scene = data.scene
+    object.__setattr__(scene.train[0].camera, "lens", Lens((0.1, 0.0, 0.0), (0.01, 0.0)))
+    copy = _scene(_plain_scene(scene))
+    assert copy.train[0].camera.lens == scene.train[0].camera.lens
+    assert torch.equal(copy.train[1].camera.rays().directions, scene.train[1].camera.rays().directions)
+    with pytest.raises(ValueError, match="expected a scene with images"):
+        copy.train[0].load()
+    for content in (b"", b"nonsense", json.dumps({}).encode()):
+        (tmp_path / "step.pt").write_bytes(content)
+        with pytest.raises(ValueError, match="step.pt: expected a step that a run left in broken/"):
+            read_bundle(tmp_path / "step.pt")
+
+
+def test_an_inpainters_step_is_taken_again(tmp_path):
+    spec = forward_spec(inpainter=partial(UNet3d, width=16, levels=2))
+    said, path = broken(tmp_path, Poison("batch", 5), spec=spec)
+    bundle = read_bundle(path)
+    module = make_run(tmp_path / "e", [stage()], spec=spec).rebuilt("coarse", bundle.scene, bundle.unit)
+    module.load_state_dict(bundle.state_dict)
+    assert str(diagnose(module, bundle.batch, 5)) == bundle.noted["found"]
+
+
+def test_the_checks_by_hand():
+    good, bad = torch.ones(3), torch.tensor([1.0, NAN])
+    assert all_finite([])
+    assert all_finite([good, torch.zeros(0)])
+    assert not all_finite([good, bad])
+    assert first_bad([("a", None), ("b", torch.arange(3)), ("c", good)]) is None
+    assert first_bad([("c", good), ("d", bad)]) == "d"
+    assert first_bad([("e", torch.tensor([1e20]))]) is None
+    assert first_bad([("e", torch.tensor([1e20]))], squared=True) == "e"
+    with pytest.raises(ValueError, match="sentinel.skip: expected a whole number of steps >= 0, but got -1"):
+        Sentinel(".", skip=-1)
