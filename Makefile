@@ -1,18 +1,23 @@
 .DEFAULT_GOAL := help
-.PHONY: help install demo demo-lego-complete demo-hypernerf demo-nhr test test-stability accuracy-time price-list reproduce-tables lint format clean
+.PHONY: help install install-launchers demo demo-lego-complete demo-hypernerf demo-nhr test test-stability bench bench-gpu accuracy-time price-list reproduce-tables lint format clean
 
 PYTHON ?= python3
 BIN := .venv/bin
 DEMO := runs/demo
 # Of accuracy-time and price-list: a folder of D-NeRF scenes (none: the procedural vehicle), a scene of it, minutes of
-# training a run, and, where not all of them are wanted, the variants (conf/variant) and the seeds.
+# training a run, and, where not all of them are wanted, the variants (conf/variant) and how many seeds.
 DATA ?=
 SCENE ?= jumpingjacks
 SCENES ?= jumpingjacks hook
 MINUTES ?= 3
-MORE = budget.minutes=$(MINUTES) $(if $(VARIANTS),variant=$(VARIANTS)) $(if $(SEEDS),seed=$(SEEDS)) $(if $(THREADS),threads=$(THREADS))
-SWEEP = $(BIN)/forewarp-train --multirun sweeps=accuracy_time
+DEVICE ?= gpu
+# Large pages, as the commands set them themselves; one thread, as threads that wait for a busy core tell nothing.
+MEASURE := OMP_NUM_THREADS=1 OMP_WAIT_POLICY=passive THP_MEM_ALLOC_ENABLE=1
+MORE = budget.minutes=$(MINUTES) $(if $(VARIANTS),variant=$(VARIANTS)) $(SEED) $(if $(THREADS),threads=$(THREADS))
 comma := ,
+# SEEDS=3: each job three times; SEEDS=4,7: with these.
+SEED = $(if $(SEEDS),$(if $(findstring $(comma),$(SEEDS)),seed,seeds)=$(SEEDS))
+SWEEP = $(BIN)/forewarp-train --multirun sweeps=accuracy_time
 space := $(subst ,, )
 # Jobs that failed have been named, and the report names what is missing; only an interruption ends it all.
 GO_ON = || [ $$? -ne 130 ]
@@ -20,18 +25,23 @@ GO_ON = || [ $$? -ne 130 ]
 help: ## show this list
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 20
 
-install: ## make .venv and put forewarp with all its extras into it
+install: ## make .venv and put forewarp into it, with all its extras but the launchers of sweeps
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
 	$(BIN)/pip install --quiet uv
 	links="$$($(BIN)/pip config get global.find-links 2>/dev/null || echo "$$PIP_FIND_LINKS")"; \
 	if [ -n "$$links" ]; then export UV_FIND_LINKS="$$links"; fi; \
 	VIRTUAL_ENV="$$PWD/.venv" $(BIN)/uv pip install -c constraints.txt -e '.[cpu,synth,plots,dev]'
 
+install-launchers: ## add joblib, Ray and submitit, that sweeps may run on (launcher=...)
+	links="$$($(BIN)/pip config get global.find-links 2>/dev/null || echo "$$PIP_FIND_LINKS")"; \
+	if [ -n "$$links" ]; then export UV_FIND_LINKS="$$links"; fi; \
+	VIRTUAL_ENV="$$PWD/.venv" $(BIN)/uv pip install -c constraints.txt -e '.[sweeps]'
+
 demo: ## fit the procedural vehicle forward and backward, compare, make a video (three minutes)
 	$(BIN)/forewarp-train experiment=demo run=$(DEMO)/forward
 	$(BIN)/forewarp-train experiment=demo model=backward run=$(DEMO)/backward
-	$(BIN)/forewarp-render run=$(DEMO)/forward path=both
 	$(BIN)/python -m forewarp.cli.compare $(DEMO)/forward $(DEMO)/backward
+	$(BIN)/forewarp-render run=$(DEMO)/forward path=both
 
 demo-lego-complete: ## make a small counterpart of Lego Complete, fit one of its scenes, measure, make a video
 demo-hypernerf: ## the same for a two-phone rig in a textured room, with a static background
@@ -41,16 +51,26 @@ demo-lego-complete demo-hypernerf demo-nhr:
 	$(BIN)/forewarp-render run=runs/$@ path=both
 
 test: ## run the tests, but for the slow ones
-	$(BIN)/pytest --no-cov -m "not slow"
+	$(BIN)/pytest --no-cov -m "not slow and not bench"
 
 test-stability: ## run the hard cases, those too that take their time
 	$(BIN)/pytest --no-cov -m stability tests/stability
 
-accuracy-time: ## sweep choices against training time and draw it [DATA= SCENE= MINUTES= VARIANTS=a,b SEEDS=0,1]
+bench: ## time every operator, a step and a frame, into docs/performance.md (a quarter of an hour)
+	mkdir -p runs/bench
+	$(MEASURE) $(BIN)/pytest --no-cov -m bench tests/bench --benchmark-json=runs/bench/growth.json
+	$(MEASURE) $(BIN)/python -m forewarp.cli.performance
+
+bench-gpu: MINUTES := $(if $(filter command line,$(origin MINUTES)),$(MINUTES),10)
+bench-gpu: ## steps, frames and PSNR against seconds on a GPU [DATA= SCENES="a b" MINUTES= DEVICE=cpu SMALL=1]
+	$(BIN)/python -m forewarp.cli.device --device $(DEVICE) --minutes $(MINUTES) $(if $(SMALL),--small) \
+		$(if $(DATA),--data $(DATA) --scenes $(SCENES))
+
+accuracy-time: ## sweep choices against training time and draw it [DATA= SCENE= MINUTES= VARIANTS=a,b SEEDS=3]
 	$(SWEEP) $(if $(DATA),experiment=dnerf data.root=$(DATA) data.scene=$(SCENE)) $(MORE) $(GO_ON)
 	$(BIN)/forewarp-report kind=accuracy_time published=docs/results/published.yaml
 
-price-list: SEEDS ?= 0,1
+price-list: SEEDS ?= 2
 price-list: ## what each choice costs and brings, on the vehicle and two real scenes [DATA= SCENES="a b" MINUTES=]
 	@test -n "$(DATA)" || { echo "price-list: expected DATA=<folder of D-NeRF scenes>"; exit 2; }
 	$(SWEEP) $(MORE) $(GO_ON)
@@ -64,8 +84,10 @@ reproduce-tables: MINUTES := $(if $(filter command line,$(origin MINUTES)),$(MIN
 reproduce-tables: BUDGET ?= $(if $(DATA),fast,demo)
 reproduce-tables: SWEEPS ?= $(if $(SCENES_TYPED),dnerf,dnerf hypernerf nhr lego_complete)
 reproduce-tables: SCENES_TYPED := $(if $(filter command line,$(origin SCENES)),$(SCENES))
-reproduce-tables: REPRODUCE = $(BIN)/forewarp-train --multirun budget=$(BUDGET) budget.minutes=$(MINUTES) seed=$(or $(SEEDS),0) $(if $(THREADS),threads=$(THREADS)) $(if $(LAUNCHER),launcher=$(LAUNCHER))
-reproduce-tables: ## the paper's tables and figures, measured beside printed [DATA= BUDGET= SCENES="hook lego" MINUTES= SWEEPS=]
+reproduce-tables: SEEDS ?= 1
+reproduce-tables: OUT ?= runs/paper/results
+reproduce-tables: REPRODUCE = $(BIN)/forewarp-train --multirun budget=$(BUDGET) budget.minutes=$(MINUTES) $(SEED) $(if $(THREADS),threads=$(THREADS)) $(if $(LAUNCHER),launcher=$(LAUNCHER))
+reproduce-tables: ## the paper's tables and figures, measured beside printed [DATA= BUDGET= SCENES="hook lego" MINUTES= SEEDS=3 OUT=]
 ifeq ($(DATA),)
 	$(REPRODUCE) sweeps=methods scene=counterpart_dnerf $(GO_ON)
 	for dataset in hypernerf nhr lego_complete; do \
@@ -80,7 +102,7 @@ else
 			$(if $(SCENES_TYPED),scene=$(subst $(space),$(comma),$(addprefix dnerf_,$(SCENES_TYPED)))) $(GO_ON); } || exit; \
 	done
 endif
-	$(BIN)/forewarp-report kind=paper
+	$(BIN)/forewarp-report kind=paper out=$(OUT)
 
 lint: ## look for mistakes and untidy code
 	$(BIN)/ruff check .

@@ -1,7 +1,9 @@
 """Every configuration composes and instantiates; the command line wins; off is off."""
 
+import re
 from dataclasses import MISSING, fields
 from functools import cache
+from inspect import signature
 
 import pytest
 import torch
@@ -14,6 +16,7 @@ from forewarp.cli.runs import build_run
 from forewarp.effects.inpaint import UNet3d
 from forewarp.effects.upsample import LearnedUpsampler
 from forewarp.effects.view import SphericalHarmonics, ViewNetwork
+from forewarp.renderer import Renderer
 from forewarp.scene.box import Box, Lattice
 from forewarp.training.settings import StageSettings
 
@@ -68,7 +71,9 @@ def test_every_sweep_is_found_and_names_options(sweep):
     assert len(params) > 0
     for key, values in params.items():
         names = [value.strip() for value in str(values).split(",")]
-        if key in groups():  # each option composes, as is tested above
+        if key == "seed":
+            assert re.fullmatch(r"range\(0, ?\d+\)", str(values))
+        elif key in groups():  # each option composes, as is tested above
             assert set(names) <= set(options(key))
         else:
             for name in names:
@@ -149,6 +154,15 @@ def test_off_is_none_whatever_the_budget(budget, effect, on):
     assert getattr(run_of(f"budget={budget}", f"model/{effect}={on}").spec, effect) is not None
 
 
+def test_every_number_of_the_renderer_is_a_key_and_equals_its_default():
+    defaults = {
+        name: p.default for name, p in signature(Renderer.__init__).parameters.items() if name != "self"
+    }
+    config = OmegaConf.to_container(composed("data.scene=x").renderer)
+    assert config == {"_target_": "forewarp.renderer.Renderer"} | defaults
+    assert run_of("renderer.opaque=0").renderer.opaque == 0
+
+
 def test_off_effects_own_nothing():
     off = [f"model/{effect}=none" for effect, _ in OFF]
     method = method_of(run_of(*off).spec)
@@ -210,6 +224,15 @@ def test_every_weight_may_be_typed():
     assert (coarse.objective.weights["tv_depth"], fine.objective.weights["tv_depth"]) == (0.5, 0.0)
     assert set(coarse.objective.weights) == set(coarse.objective.terms)
     assert fine.objective.weights["flow_l1"] == 0.25
+
+
+@pytest.mark.parametrize("data", options("data"))
+def test_every_dataset_takes_a_canonical_time_and_the_budgets_background(data):
+    common = [f"data={data}", "data.scene=x", "budget.background=black"]
+    config = composed(*common, "data.canonical=middle")
+    assert (config.data.canonical, config.data.background) == ("middle", "black")
+    build_run(config)
+    assert composed(*common, "ablation=canonical_middle").data.canonical == "middle"
 
 
 def test_run_folder_is_named_after_the_choices():

@@ -21,6 +21,7 @@ class Slab:
     """Constant density and colour in the whole box."""
 
     lattice = LATTICE
+    pitch = LATTICE.pitch
     cells = torch.ones(2, 3, 4, dtype=torch.bool)
 
     def __init__(self, sigma, feature=0.0):

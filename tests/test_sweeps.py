@@ -1,9 +1,8 @@
 """The sweeps behind the paper's tables: every job composes, and is known by what it computes."""
 
-from itertools import product
-
 import pytest
-import yaml
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from configs import ROOT, composed
 from forewarp.cli.runs import build_run, hashed
@@ -16,16 +15,16 @@ PAPER = {
     "ablation_modules": 60,
     "ablation_losses": 32,
     "resolution": 16,
+    "methods": 4,
 }
 COUNTERPARTS = ["dnerf", "hypernerf", "nhr", "lego_complete"]
 
 
-def jobs_of(sweep):
+def jobs_of(sweep, *words):
     """The overrides of every job, as Hydra's sweeper multiplies them out."""
-    content = yaml.safe_load((ROOT / "sweeps" / f"{sweep}.yaml").read_text())
-    params = content["hydra"]["sweeper"]["params"]
-    choices = [[f"{key}={v.strip()}" for v in str(values).split(",")] for key, values in params.items()]
-    return [list(job) for job in product(*choices)]
+    config = composed(f"sweeps={sweep}", *words, hydra=True)
+    params = [f"{key}={value}" for key, value in config.hydra.sweeper.params.items()]
+    return BasicSweeper.split_arguments(OverridesParser.create().parse_overrides(params), None)[0]
 
 
 def job_of(sweep, *overrides):
@@ -42,6 +41,18 @@ def test_a_sweep_has_its_jobs(sweep, count):
     config = job_of(sweep, *jobs[-1])
     assert config.absent == "skip"
     assert config.run.startswith(f"runs/paper/{config.data.scene}/")
+
+
+def test_no_sweep_is_forgotten():
+    assert {path.stem for path in (ROOT / "sweeps").glob("*.yaml")} == {*PAPER, "accuracy_time"}
+
+
+@pytest.mark.parametrize("sweep", ["dnerf", "methods"])
+def test_seeds_repeat_every_job(sweep):
+    once, thrice = ({tuple(sorted(job)) for job in jobs_of(sweep, f"seeds={n}")} for n in (1, 3))
+    assert len(thrice) == 3 * len(once)
+    for seed in range(3):
+        assert {tuple(word.replace("seed=0", f"seed={seed}") for word in job) for job in once} <= thrice
 
 
 @pytest.mark.slow

@@ -2,8 +2,9 @@
 
 ``python zygote.py`` reads a job a line (JSON) and answers with two lines: the process's number at once, its
 wait status at its end. A job has ``arguments``, ``log`` (where its output goes), and may have ``memory`` (a
-limit on address space, bytes), ``file`` (a limit on a file's size, bytes) and ``die`` ([n, moment]: SIGKILL
-at the n-th file that takes its place, ``before``, ``after`` or with ``half`` of it written).
+limit on address space, bytes), ``file`` (a limit on a file's size, bytes) and ``die`` ([n, moment, end]:
+SIGKILL at the n-th file that takes its place, ``before``, ``after`` or with ``half`` of it written; with an
+``end`` only files count whose path ends so).
 """
 
 import json
@@ -47,13 +48,13 @@ class Zygote:
         return self.status()
 
 
-def kill_at(number, moment):
-    """Let the process die at the ``number``-th replacement of a file."""
+def kill_at(number, moment, end=""):
+    """Let the process die at the ``number``-th replacement of a file whose path ends so."""
     replace, seen = os.replace, [0]
 
     def deadly(source, target, **options):
-        seen[0] += 1
-        if seen[0] != number:
+        seen[0] += str(target).endswith(end)
+        if seen[0] != number or not str(target).endswith(end):
             return replace(source, target, **options)
         if moment == "half":
             os.truncate(source, os.path.getsize(source) // 2)

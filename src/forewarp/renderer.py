@@ -17,7 +17,7 @@ class Renderer:
     """Marches rays through the occupied cells and composites what they meet.
 
     Args:
-        step: between samples, in voxels of the rendered lattice.
+        step: between samples, in voxels of the rendered field, of its finest where it has several.
         color_threshold: samples of less weight have no colour computed; 0 for all.
         opaque: a ray that lets through less than this has ended, where no gradient is asked for and a kernel
             looks for the end; 0: it never ends.
@@ -59,7 +59,7 @@ class Renderer:
         plain = type(field) is RadianceGrid and not keep_all_weights and not torch.is_grad_enabled()
         if plain and use_numba(field.values):
             return self._traced(field, rays, background, view, generator)
-        count, step = len(rays), self.step * field.lattice.pitch
+        count, step = len(rays), self.step * field.pitch
         ray_ids, distances, points = self._samples(field, rays, step, generator)
         weights, transmittance = render_weights(field.density(points) * step, ray_ids, count)
         kept = slice(None)
@@ -95,7 +95,7 @@ class Renderer:
         generator: torch.Generator | None,
     ) -> Rendering:
         """The same without gradient, samples behind opaque matter left out: equal within ``opaque``."""
-        step, activation = self.step * grid.lattice.pitch, grid.activation
+        step, activation = self.step * grid.pitch, grid.activation
         origins, directions, jitter = self._starts(grid, rays, generator)
         found = trace(
             origins,

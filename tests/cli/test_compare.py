@@ -36,6 +36,15 @@ def test_two_runs_side_by_side_with_their_difference(runs, capsys):
     assert {"31.50", "30.00", "+1.50", "25%", "+0%", "60"} <= set(words)
 
 
+def test_steps_of_all_stages_where_every_run_noted_them(runs, capsys):
+    steps = {"steps": {"coarse": 400, "fine": 900}}
+    folders = runs(one=metrics("forward", **steps), two=metrics("backward", **steps), old=metrics("forward"))
+    main(folders[:2])
+    assert "steps 1,300 1,300" in " ".join(capsys.readouterr().out.split())
+    main(folders)
+    assert "steps" not in capsys.readouterr().out
+
+
 def test_every_run_of_one_method_has_a_column_of_its_own(runs, capsys):
     main(runs(seed0=metrics("forward", 31.0), seed1=metrics("forward", 32.0)))
     out = capsys.readouterr().out

@@ -4,6 +4,7 @@ import pytest
 
 from configs import options
 from forewarp.cli.entry import one_line, project_root
+from forewarp.cli.misspelt import with_keys
 from forewarp.scene.errors import SceneError
 
 COMMANDS = ("train", "evaluate", "render", "synthesize", "report")
@@ -42,7 +43,21 @@ def test_the_root_holds_conf():
             ["budget=quick"],
             "Could not find 'budget/quick'; Available options in 'budget': demo; faithful; fast",
         ),
-        (["data.foo=1"], "Could not override 'data.foo'; To append to your config use +data.foo=1"),
+        (
+            ["data.nothing_like_it=1"],
+            "data.nothing_like_it: expected a key of the configuration, but got none of this name; forewarp-",
+        ),
+        (
+            ["budget.minuts=1"],
+            "budget.minuts: expected a key of the configuration, but got none of this name; did you mean "
+            "budget.minutes?",
+        ),
+        (["data=hypernerf", "data.interp_capture=1"], "of this name"),
+        (
+            ["modle/view=sh"],
+            "modle/view: expected a key of the configuration, but got none of this name; did you ",
+        ),
+        (["--multirun", "seed=0,1", "model=forward,backward", "budgt=fast"], "did you mean budget?"),
         (["data=dnerf"], "data.scene: expected a value, but got none; set data.scene=..."),
         (["data=[1"], "data=[1: no viable alternative at input '[1'"),
         (["budget.minutes=-1"], "budget.minutes: expected a number > 0 or null, but got -1"),
@@ -60,6 +75,26 @@ def test_the_root_holds_conf():
 def test_a_mistyped_command_ends_in_one_line(refused, in_tmp, arguments, line):
     assert line in refused("train", *arguments, "paths.data=data")
     assert list(in_tmp.iterdir()) == []
+
+
+def test_keys_of_what_was_chosen_are_suggested(refused, in_tmp):
+    words = ["model/upsampler=learned", "model.upsampler.recomputes=true"]
+    assert refused("train", *words).endswith("did you mean model.upsampler.recompute?")
+
+
+@pytest.mark.parametrize(("name", "key"), [("evaluate", "run"), ("render", "run"), ("train", "resume")])
+def test_a_bare_folder_is_a_run(refused, in_tmp, name, key):
+    (in_tmp / "demo").mkdir()
+    line = "demo/config.yaml: expected the configuration of a run, but got none; set "
+    assert refused(name, "demo").startswith(f"{line}{key}=")
+    assert "Error parsing override 'nothing'" in refused(name, "nothing")
+
+
+def test_what_follows_an_option_is_no_run(in_tmp):
+    (in_tmp / "demo").mkdir()
+    words = ["--config-dir", "demo", "demo", "run=demo", "-x", "other"]
+    assert with_keys("render", words) == ["--config-dir", "demo", "run=demo", "run=demo", "-x", "other"]
+    assert with_keys("report", ["demo"]) == ["demo"]
 
 
 def test_the_whole_story_on_demand(forewarp, monkeypatch, in_tmp):

@@ -2,8 +2,9 @@ import pytest
 import torch
 
 from configs import composed
-from forewarp.cli.measure import device_of
+from forewarp.cli.measure import check_precision, device_of, without
 from forewarp.cli.runs import build_run
+from forewarp.metrics.suite import LPIPS_METRICS
 
 
 @pytest.fixture
@@ -41,3 +42,23 @@ def test_training_and_evaluation_use_the_same_device(machine, tmp_path):
     run = build_run(composed("data.scene=x", "trainer=auto", "logger=none"))
     trainer = run.make_trainer(tmp_path, [])
     assert trainer.strategy.root_device == device_of("auto") == torch.device("cpu")
+
+
+def test_what_is_left_out_fits_one_line():
+    lpips = dict.fromkeys(LPIPS_METRICS, "no weights")
+    small = dict.fromkeys(("ms_ssim", "ms_ssim_legacy"), "too small")
+    assert without(lpips | small) == "without lpips (no weights), ms_ssim (too small)"
+    lpips.pop("lpips_vgg")
+    assert without(lpips) == f"without {list(lpips)[0]} (no weights), {list(lpips)[1]} (no weights)"
+
+
+@pytest.mark.parametrize("precision", ["16-mixed", "16-true", "16", 16, "transformer-engine-float16"])
+def test_float16_is_refused(precision):
+    text = f"trainer.precision: expected 32-true or bf16-mixed, but got {precision}; "
+    with pytest.raises(ValueError, match=text):
+        build_run(composed(f"+trainer.precision={precision}"))
+
+
+@pytest.mark.parametrize("precision", [None, "32-true", 32, "bf16-mixed", "64-true"])
+def test_other_precisions_are_not(precision):
+    check_precision(precision)

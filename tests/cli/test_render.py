@@ -84,8 +84,14 @@ def test_trajectories_are_drawn_over_fixed(run):
     assert (abs(plain - drawn).max(-1) > 20).sum() > 20
 
 
-def test_a_gif_at_the_size_of_the_images(run):
+def test_a_gif_of_small_images_is_larger(run):
     assert call(render, f"run={run}", "frames=2", "format=gif", "fps=10") == 0
+    assert iio.imread(run / "videos" / "fixed.gif").shape[:3] == (2, 400, 400)
+
+
+def test_large_images_keep_their_size(run, monkeypatch):
+    monkeypatch.setattr(render, "LEAST_SIZE", 16)
+    assert call(render, str(run), "frames=2", "format=gif") == 0  # a bare folder is one, too
     assert iio.imread(run / "videos" / "fixed.gif").shape[:3] == (2, SIZE, SIZE)
 
 

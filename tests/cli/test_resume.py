@@ -1,10 +1,12 @@
 """``resume=<run>``, data that changed, broken steps, as one types them."""
 
+import copy
 import json
 import os
 import shutil
 
 import pytest
+import torch
 import yaml
 
 from forewarp.cli.claims import alone
@@ -49,7 +51,8 @@ def test_beside_it_stands_only_what_may_change(forewarp, refused, begun):
     assert line.startswith(
         "seed: expected no such key beside resume=, whose config.yaml holds it, but got seed=3"
     )
-    assert "expected the configuration of a run, but got none" in refused("train", "resume=nowhere")
+    line = refused("train", "resume=nowhere")
+    assert line.endswith("expected the configuration of a run, but got none; set resume=<a run's folder>")
 
 
 def test_changed_data_are_refused_unless_accepted(forewarp, refused, begun):
@@ -71,11 +74,53 @@ def test_changed_data_are_refused_unless_accepted(forewarp, refused, begun):
     )
 
 
+def test_a_run_begun_inside_its_scene_goes_on(forewarp, begun, monkeypatch):
+    scene = begun.parent / "vehicle"
+    shutil.rmtree(begun)
+    monkeypatch.chdir(scene)
+    assert forewarp("train", *SMALL, "data.root=..", "run=runs/a").status == 0
+    (scene / "runs" / "a" / "coarse" / "done.json").unlink()
+    done = forewarp("train", "resume=runs/a")
+    assert done.status == 0, done.err
+
+
+def test_what_is_measured_on_changed_data_says_so(forewarp, begun):
+    assert forewarp("train", f"resume={begun}").status == 0
+    path = begun.parent / "vehicle" / "transforms_test_time.json"
+    assert "warning:" not in forewarp("evaluate", f"run={begun}").err
+    path.write_text(path.read_text() + " ")
+    done = forewarp("evaluate", f"run={begun}")
+    assert done.status == 0, done.err
+    said = f"warning: {begun}/data.json: expected the data that the run was begun with, but got others: "
+    assert f"{said}transforms_test_time.json" in done.err
+
+
 def test_a_folder_in_work_is_refused(refused, begun):
     with alone(begun):
         line = refused("train", f"resume={begun}")
         assert f"expected a run that nobody works on, but got one of process {os.getpid()} on " in line
         assert "nobody works on" in refused("evaluate", f"run={begun}")
+
+
+def test_a_measured_run_in_work_is_refused(forewarp, refused, begun):
+    assert forewarp("train", f"resume={begun}", "evaluate=true").status == 0
+    with alone(begun):
+        assert "nobody works on" in refused("train", f"resume={begun}", "evaluate=true")
+
+
+ODD = {
+    "stage": (lambda c: c["noted"].update(stage="fine"), "a step of stage coarse, but got one of 'fine'"),
+    "weights": (lambda c: c["state_dict"].popitem(), "weights that its config describes, but got others: "),
+    "index": (
+        lambda c: c["state_dict"]["method.radiance.index"].fill_(10**6),
+        "weights that its config describes, but got others: method.radiance.index",
+    ),
+    "random": (
+        lambda c: c["noted"]["random"].update(torch=torch.zeros(3, dtype=torch.uint8)),
+        "states of random generators, but got other bytes",
+    ),
+    "config": (lambda c: c.update(config="a: {_target_: os.system}"), "a class of forewarp"),
+}
 
 
 def test_a_broken_step_ends_in_one_line_and_is_seen_again(forewarp, refused, begun, in_tmp, capsys):
@@ -91,6 +136,18 @@ def test_a_broken_step_ends_in_one_line_and_is_seen_again(forewarp, refused, beg
     capsys.readouterr()
     replay([str(bundle)])
     assert capsys.readouterr().out.endswith(": parameter: radiance.color\n")
+    content = torch.load(bundle, weights_only=True)
+    for spoil, told in ODD.items():
+        changed = copy.deepcopy(content)
+        told[0](changed)
+        torch.save(changed, in_tmp / "odd.pt")
+        with pytest.raises(SystemExit) as leaving:
+            replay([str(in_tmp / "odd.pt")])
+        assert leaving.value.code == 2
+        line = capsys.readouterr().err
+        assert line.startswith(f"forewarp.replay: error: {in_tmp}/odd.pt: "), spoil
+        assert f"expected {told[1]}" in line, spoil
+        assert len(line.splitlines()) == 1
     bundle.write_bytes(b"x")
     with pytest.raises(SystemExit) as leaving:
         replay([str(bundle)])

@@ -19,6 +19,16 @@ def test_without_a_sweep_an_absent_scene_is_a_mistake(refused, in_tmp):
     assert expected in refused("train", "scene=dnerf_hook", "absent=maybe")
 
 
+def test_seeds_repeat_a_job_and_nothing_else(forewarp, refused, in_tmp):
+    scene = ["data=dnerf", "data.root=nowhere", "data.scene=x", "absent=skip"]
+    done = forewarp("train", "--multirun", *scene, "seeds=3")
+    assert done.status == 0, done.err
+    assert done.out.count("skipped: ") == 3
+    assert refused("train", *scene, "seeds=3") == (
+        "seeds: expected --multirun beside seeds=3; add it, or use seed=N"
+    )
+
+
 @pytest.mark.parametrize(
     ("word", "plugin", "launcher"),
     [

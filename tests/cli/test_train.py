@@ -61,7 +61,9 @@ def test_a_run_leaves_what_it_promises(fitted):
 
 def test_metrics_have_the_promised_shape(fitted):
     content = json.loads((fitted / "metrics.json").read_text())
-    assert set(content) == {"protocol", "seconds", "peak_memory_bytes", "parameters", "test", "flow"}
+    whole = {"protocol", "seconds", "steps", "peak_memory_bytes", "parameters", "test", "flow"}
+    assert set(content) == whole
+    assert set(content["steps"]) == {"coarse", "fine"}
     frames = {"render_per_frame", "render_again_per_frame"}
     assert set(content["seconds"]) == {"train", "coarse", "fine"} | frames
     assert content["seconds"]["train"] == pytest.approx(
@@ -96,6 +98,22 @@ def test_it_says_what_it_does_and_nothing_else(fitted):
     told = [line.split()[0] for line in err.strip().splitlines()]
     # A slow machine says each more than once.
     assert list(dict.fromkeys(told)) == ["coarse", "fine", "test"]
+
+
+def test_it_says_first_what_is_trained_where(fitted):
+    first, second = (fitted / "said.txt").read_text().splitlines()[:2]
+    assert first == "vehicle: 6 training images (32 x 32) and 5 test images (32 x 32), on the CPU"
+    assert second == f"run: {fitted}"
+
+
+def test_without_evaluation_it_says_how_to_get_it_and_where_stages_stand(forewarp, scenes, in_tmp):
+    words = arguments(scenes, "run", "budget.iterations=4", "evaluate=false")
+    done = forewarp(*words)
+    assert done.out.endswith("fitted: run; measure it with forewarp-evaluate run=run\n")
+    Path("run/fine/done.json").unlink()
+    lines = forewarp(*words).out.splitlines()
+    assert lines[2] == "coarse: finished before"
+    assert lines[3].startswith("fine: goes on at 100%, step ")
 
 
 def test_evaluating_twice_gives_the_same_numbers(forewarp, fitted, scenes, tmp_path):
@@ -149,13 +167,28 @@ def test_what_does_not_matter_may_change(forewarp, fitted, scenes):
 @pytest.mark.parametrize(
     ("change", "line"),
     [
-        ("seed=1", "config.yaml: data.seed: expected 0, but got 1; use run=... or delete the folder"),
-        ("budget.minutes=9", "config.yaml: budget.minutes: expected 0.9, but got 9; use run="),
+        (
+            "seed=1",
+            "config.yaml: seed: expected 0, as the run that this folder holds, but got 1 (and 1 more keys); "
+            "use run=<another folder>, or delete this one",
+        ),
+        (
+            "budget.minutes=9",
+            "config.yaml: budget.minutes: expected 0.9, as the run that this folder holds, but got 9; use",
+        ),
         ("model/view=sh", "config.yaml: model.view: expected "),
     ],
 )
 def test_another_configuration_is_refused(refused, fitted, scenes, change, line):
     assert line in refused(*arguments(scenes, fitted, change))
+
+
+def test_another_dataset_is_refused_by_its_scene(refused, fitted, scenes):
+    other = scenes.parent / "other"
+    shutil.copytree(scenes / "vehicle", other / "lorry", dirs_exist_ok=True)
+    words = arguments(other, fitted, scene="lorry")
+    line = refused(*["data=synthetic" if word == "data=dnerf" else word for word in words])
+    assert "data.scene: expected vehicle, as the run that this folder holds, but got lorry" in line
 
 
 def test_a_checkpoint_of_another_configuration_is_refused(refused, fitted, scenes, tmp_path):
@@ -245,15 +278,19 @@ def test_an_unknown_scene_lists_the_known(refused, scenes, in_tmp):
     )
 
 
+def test_a_scene_for_the_folder_of_scenes_is_put_right(refused, scenes, in_tmp):
+    line = refused(*arguments(scenes / "vehicle", "run"))
+    assert line.endswith(f"but got none; did you mean data.root={scenes} data.scene=vehicle?")
+
+
 def test_a_missing_folder(refused, in_tmp):
     assert "data.root: expected an existing folder" in refused(*arguments("nowhere", "run"))
 
 
 def test_a_run_folder_that_cannot_be(refused, scenes, in_tmp):
     Path("file").write_text("")
-    assert "file/run: expected a usable file or folder, but got Not a directory" in refused(
-        *arguments(scenes, "file/run")
-    )
+    line = refused(*arguments(scenes, "file/run"))
+    assert line.startswith("run: file/run: expected a usable file or folder, but got Not a directory")
 
 
 def test_a_full_disk_names_the_file_and_leaves_no_half(refused, scenes, in_tmp, monkeypatch):

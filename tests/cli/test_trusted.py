@@ -28,6 +28,23 @@ TARGETS = [
     "torch.nn.modules.module.warnings.warn",
     "lightning.pytorch.cli.LightningCLI",
     "lightning.pytorch.callbacks.os.system",
+    # classes of torch and lightning that write files, listen or compile, by whatever way they are reached
+    "torch.nn.functional.torch.package.PackageExporter",
+    "torch.nn.Linear",
+    "torch.distributed.TCPStore",
+    "torch.optim.optimizer.torch.distributed.TCPStore",
+    "lightning.pytorch.loggers.CSVLogger",
+    "lightning.pytorch.loggers.tensorboard.SummaryWriter",
+    "lightning.pytorch.profilers.AdvancedProfiler",
+    "lightning.pytorch.profilers.PyTorchProfiler",
+    "lightning.pytorch.callbacks.ModelCheckpoint",
+    "lightning.Trainer.fit",
+    # what modules of ours import, though ours it is or looks
+    "forewarp.training.checkpoints.lightning.Trainer",
+    "forewarp.training.checkpoints.torch.package.PackageExporter",
+    "forewarp.training.callbacks.TensorBoardLogger",
+    "forewarp.training.stages.StageSettings",
+    "forewarp.training.stages.Run.__class__",
     "forewarp.no.such.thing",
     "forewarp.",
     "forewarp",
@@ -45,9 +62,17 @@ def test_what_is_no_class_of_ours_is_refused(target, where):
     node = {"_target_": target, "_partial_": True}
     text = OmegaConf.to_yaml({"a": node} if where == "top" else {"b": [{"c": {"d": [node]}}]})
     with pytest.raises(
-        ValueError, match=r"_target_: expected a class of forewarp, torch or lightning, but got"
+        ValueError, match=r"_target_: expected a class of forewarp, or one of lightning.Trainer, .*, but got"
     ):
         read(text)
+
+
+@pytest.mark.parametrize("key", ["name", "version", "sub_dir"])
+@pytest.mark.parametrize("value", ["/tmp/x", "..", "../x", "a/b", "a\\b", ["x"]])
+def test_a_logger_stays_in_the_folder_of_its_stage(key, value):
+    node = {"_target_": "lightning.pytorch.loggers.TensorBoardLogger", key: value}
+    with pytest.raises(ValueError, match=f"logger.{key}: expected the name of a folder, but got"):
+        read(OmegaConf.to_yaml({"logger": node}))
 
 
 @pytest.mark.parametrize("text", ["${oc.env:HOME}", "x${a}", "${oc.create:{a: 1}}", "${oc.decode:1}"])
@@ -65,6 +90,7 @@ def test_interpolations_are_refused(text):
         ("a: !!python/object/apply:os.system [false]", "expected YAML"),
         ("- 1", "expected a mapping"),
         ("a: {_args: [1]}", "_args: expected no key of this name"),
+        ("a: {_args_: [1]}", "_args_: expected no key of this name"),
         ("a: [", "expected YAML"),
     ],
 )

@@ -11,11 +11,11 @@ import zlib
 import numpy as np
 import pytest
 
-from dnerf_scene import edit, write_tiny
-from forewarp.data import capture, dnerf, hypernerf, nerfies_items, posed_video
+from dnerf_scene import ANGLE, edit, shots, truth, write_tiny
+from forewarp.data import capture, dnerf, hypernerf, lego_complete, nerfies_items, posed_video
 from forewarp.data import files as data_files
 from forewarp.data.files import MOST_FRAMES, frames_of, inside, read_bytes, read_json
-from forewarp.data.images import inspect_png, read_image
+from forewarp.data.images import inspect_png, read_gray16, read_image
 from forewarp.data.truth import load_numpy
 from forewarp.scene.errors import SceneError
 from posed_scene import edit as edit_video
@@ -60,6 +60,62 @@ def test_a_decompression_bomb_is_not_decoded(tmp_path, name, content):
         lambda: read_image(tmp_path / name),
         f"{name}: expected an image of 1 to 80000000 pixels, but got 60000",
     )
+
+
+def png_with(*chunks):
+    return b"\x89PNG\r\n\x1a\n" + b"".join(chunk(kind, body) for kind, body in chunks) + chunk(b"IEND", b"")
+
+
+def size(width, height, bits=8, color=6):
+    return b"IHDR", struct.pack(">IIBBBBB", width, height, bits, color, 0, 0, 0)
+
+
+def film(count, side, bits=8, color=6):
+    """An animated PNG: ``count`` squares of zeros in a few bytes each."""
+    row = side * {6: 4, 0: 1}[color] * bits // 8 + 1
+    pixels = zlib.compress(bytes(row * side), 9)
+    chunks, number = [size(side, side, bits, color), (b"acTL", struct.pack(">II", count, 0))], 0
+    for i in range(count):
+        about = struct.pack(">IIIIIHHBB", number, side, side, 0, 0, 1, 10, 0, 0)
+        number += 1 + (i > 0)
+        body = (b"IDAT", pixels) if i == 0 else (b"fdAT", struct.pack(">I", number - 1) + pixels)
+        chunks += [(b"fcTL", about), body]
+    return png_with(*chunks)
+
+
+def test_of_a_film_one_picture_is_decoded(tmp_path):
+    """All hundred would take 100 MB."""
+    (tmp_path / "a.png").write_bytes(film(100, 512))
+    (tmp_path / "b.png").write_bytes(film(100, 512, bits=16, color=0))
+    tracemalloc.start()
+    try:
+        assert read_image(tmp_path / "a.png").shape == (512, 512, 4)
+        assert read_gray16(tmp_path / "b.png").shape == (512, 512)
+        assert tracemalloc.get_traced_memory()[1] < 16 * 2**20
+    finally:
+        tracemalloc.stop()
+
+
+ROWS = (b"IDAT", zlib.compress(bytes(17 * 4)))
+
+
+@pytest.mark.parametrize(
+    "chunks",
+    [
+        [size(BIG, BIG), size(4, 4), ROWS],
+        [size(4, 4), ROWS, size(BIG, BIG)],
+        [(b"tEXt", b"a"), size(4, 4), ROWS],
+        [ROWS],
+    ],
+    ids=["large first", "large last", "later", "none"],
+)
+def test_a_png_has_one_header_and_has_it_first(tmp_path, chunks):
+    (tmp_path / "a.png").write_bytes(png_with(*chunks))
+    for read in (inspect_png, read_image):
+        cheaply(
+            lambda read=read: read(tmp_path / "a.png"),
+            "a.png: expected a PNG that begins with its only header, but got another",
+        )
 
 
 def test_a_bomb_in_a_scene_is_refused_when_the_scene_is_read(tmp_path):
@@ -129,7 +185,8 @@ def test_pipes_and_devices_are_no_files(tmp_path):
     cheaply(lambda: read_json(tmp_path / "b.json"), "b.json: expected a readable file, but got a device")
 
 
-OUTSIDE = ["../x", "/etc/passwd", "a/../../x", "..", ".", "", "a\n", "a\x00b", "./../x", 7, None, ["a"]]
+OUTSIDE = ["../x", "/etc/passwd", "a/../../x", "..", ".", "", "a\n", "a\x00b", "./../x", "..\\x", "a\\b"]
+OUTSIDE += [7, None, ["a"]]
 
 
 @pytest.mark.parametrize("name", OUTSIDE)
@@ -161,6 +218,20 @@ def read_rig(root, name, key):
     return hypernerf.read_scene(root, "a")
 
 
+def write_lego(folder):
+    test = [s for k, a in enumerate(dnerf.ABILITIES) for s in shots(2, k, (6, 8), a, True, [0.0, 0.0])]
+    lego_complete.write_scene(
+        folder, {"train": shots(3), "test": test}, camera_angle_x=ANGLE, trajectories=truth()
+    )
+    return folder
+
+
+def read_lego(root, name, key):
+    folder = write_lego(root / "a")
+    edit(folder, "test_time", lambda c: c["frames"][1].update({key: name}))
+    return lego_complete.read_scene(root, "a")
+
+
 @pytest.mark.parametrize(
     ("read", "key"),
     [
@@ -169,6 +240,8 @@ def read_rig(root, name, key):
         (read_video, "file_path"),
         (read_video, "mask_path"),
         (read_rig, "ids"),
+        (read_lego, "file_path"),
+        (read_lego, "depth_file_path"),
     ],
 )
 @pytest.mark.parametrize("name", ["../../secret", "/etc/secret"])

@@ -3,6 +3,7 @@ import os
 import pytest
 
 from dnerf_scene import write_tiny
+from forewarp.data.files import MOST_TEXT
 from forewarp.data.fingerprint import difference, fingerprint
 from forewarp.data.module import DNeRFDataModule, SceneDataModule
 
@@ -46,6 +47,32 @@ def test_what_is_no_part_of_the_scene_does_not_count(scene):
     (scene / "notes.md").write_text("x")
     os.utime(scene / "transforms_train.json")
     assert fingerprint(scene) == before
+
+
+def test_a_run_below_the_scene_is_no_part_of_it(scene):
+    before = fingerprint(scene)
+    run = scene / "runs" / "a"
+    run.mkdir(parents=True)
+    for name in (".lock", "data.json", "metrics.json"):
+        (run / name).write_text("{}")
+    (run / "images").mkdir()
+    (run / "images" / "0.png").write_text("x")
+    assert fingerprint(scene) == before
+    (scene / ".lock").write_text("")
+    (scene / "new.json").write_text("{}")
+    assert difference(before, fingerprint(scene)) == "new.json"
+
+
+def test_a_text_too_large_to_read_counts_by_its_size(scene):
+    large, before = scene / "sparse" / "images.txt", fingerprint(scene)
+    large.parent.mkdir()
+    large.touch()
+    os.truncate(large, MOST_TEXT + 1)
+    found = fingerprint(scene)
+    assert found["texts"] == before["texts"]
+    assert found["images"]["bytes"] == before["images"]["bytes"] + MOST_TEXT + 1
+    os.truncate(large, MOST_TEXT + 2)
+    assert difference(found, fingerprint(scene)).startswith("images: 10 files of")
 
 
 def test_links_count_as_what_they_lead_to_and_may_go_in_circles(scene, tmp_path):

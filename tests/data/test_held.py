@@ -44,7 +44,7 @@ def test_the_ends_and_the_canonical_time_keep_their_frames(canonical):
 
 @pytest.mark.parametrize("count", [-1, 1.5, "all"])
 def test_bad_counts_are_named(count):
-    with pytest.raises(SceneError, match="data.held_out: expected a whole number of frames >= 0, but got"):
+    with pytest.raises(SceneError, match="data.held_out: expected a whole number of at least 0, but got"):
         hold_out(ball_scene(frames=4, size=8), count)
 
 

@@ -92,6 +92,14 @@ def test_time_id_counts_before_warp_id(tmp_path, write_time_id):
     assert scene.test[0].time == (0.5 if write_time_id else 0.25)
 
 
+def test_entries_that_no_item_has_decide_nothing(tmp_path):
+    folder = write_rig(tmp_path / "toy", hand(5), write_time_id=False)
+    expected = read_scene(tmp_path, "toy").test[0].time
+    edit(folder, "metadata", lambda c: c.update(ghost={"time_id": 90, "warp_id": 90}, other=3))
+    (folder / "camera" / "ghost.json").write_text("none")
+    assert read_scene(tmp_path, "toy").test[0].time == expected
+
+
 def test_points_and_trajectories_are_normalised(tmp_path):
     points = np.array([[1.0, 2, 3], [2.5, -1, 0.75]], np.float32)
     write_rig(tmp_path / "toy", points=points, trajectories=truth())

@@ -48,6 +48,10 @@ def frame_at(content):
     return content.index(b"\xff\xc0")
 
 
+def frame_of(content):
+    return content[frame_at(content) : frame_at(content) + 19]
+
+
 def widened(content):
     at = frame_at(content)
     return content[: at + 5] + b"\xff\xff\xff\xff" + content[at + 9 :]
@@ -63,6 +67,7 @@ BAD = {
     "harmed": (with_byte(2, 0), "expected an unharmed JPEG image, but got a broken header"),
     "12 bits": (lambda c: with_byte(frame_at(c) + 4, 12)(c), "channels of 8 bits, but got 3 of 12"),
     "lossless": (lambda c: with_byte(frame_at(c) + 1, 0xC3)(c), "expected a baseline or progressive JPEG"),
+    "two frames": (lambda c: c.replace(frame_of(c), 2 * frame_of(c)), "with one header, but got two"),
     "no frame": (lambda c: c[:2] + c[c.index(b"\xff\xda") :], "but got one without a header"),
 }
 

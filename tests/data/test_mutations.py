@@ -71,6 +71,8 @@ ARRAYS = [
     np.full((2, 6), np.inf),
     np.full((2, 3), 0x7F800001, np.uint32).view(np.float32),
     np.full((2, 3), 1e30),
+    np.full((2, 6), 1e30),
+    np.diag([-1e30] * 6),
     np.array("x"),
     np.array([["a"] * 3]),
 ]
@@ -193,6 +195,7 @@ def check_whole(scene: Scene) -> None:
     assert scene.train
     assert scene.test
     assert scene.canonical_time in scene.times
+    assert scene.box.diagonal < 1e16  # places within 1e9, at most 1e6 times as large
     for frame in (*scene.train, *scene.val, *scene.test):
         camera = frame.camera
         pixels, rays = frame.load(), camera.rays()

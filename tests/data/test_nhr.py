@@ -158,6 +158,47 @@ def test_the_first_frames_and_every_other_one_measured(written):
     assert [frame.name for frame in scene.test] == ["0/img_0000", "2/img_0000"]
 
 
+@pytest.mark.parametrize(("frames", "there"), [(3, 5), (2, 3), (5, 5), (9, 5)])
+def test_true_trajectories_keep_step_with_the_frames_that_are_read(tmp_path, frames, there):
+    write_dome(tmp_path / "toy", count=there, trajectories=truth(there))
+    scene = read_scene(tmp_path, "toy", frames=frames)
+    places = {f.time: BALLS + int(f.name.split("/")[0]) * STEP for f in scene.train}
+    times = scene.truth.times.tolist()
+    assert times == pytest.approx(list(scene.times))
+    for i, moment in enumerate(scene.times):
+        assert scene.truth.points[:, i].numpy() == pytest.approx(places[moment], abs=1e-6)
+    assert max(times) <= 1
+
+
+def test_one_frame_has_no_trajectories(written):
+    assert read_scene(written, "toy", frames=1).truth is None
+
+
+INTRINSICS = {
+    "a mark in front": lambda text: "\ufeff" + text,
+    "one line a camera": lambda text: text.replace("\n\n", "|").replace("\n", " ").replace("|", "\n"),
+    "all in one line": lambda text: " ".join(text.split()),
+    "from 1": lambda text: re.sub(r"^(\d+)$", lambda m: str(int(m[1]) + 1), text, flags=re.MULTILINE),
+}
+
+
+@pytest.mark.parametrize("case", INTRINSICS)
+def test_intrinsics_by_others(toy, case):
+    expected = [f.camera for f in read_scene(toy.parent, "toy", half_resolution=False).train]
+    path = toy / "Intrinsic.inf"
+    path.write_text(INTRINSICS[case](path.read_text()), encoding="utf-8")
+    found = [f.camera for f in read_scene(toy.parent, "toy", half_resolution=False).train]
+    for one, other in zip(expected, found, strict=True):
+        for name in ("width", "fx", "fy", "cx", "cy", "skew"):
+            assert getattr(one, name) == getattr(other, name)
+
+
+def test_a_mark_before_the_poses(toy):
+    path = toy / "CamPose.inf"
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    assert read_scene(toy.parent, "toy").protocol["views"] == 4
+
+
 def test_files_by_others(toy):
     """Blanks and blank lines, three-channel masks, soft mask values, clouds as .obj, a leading mark."""
     text = (toy / "Intrinsic.inf").read_text()
@@ -243,11 +284,29 @@ BAD_TEXT = {
         "Intrinsic.inf",
         2,
         words(lambda w: w[:2]),
-        r"line 2: expected 3 finite numbers, but got 2 values",
+        r"line 3: expected a row 0 fy cy, but got 71.5 23.2 0",
+    ),
+    "no number": (
+        "Intrinsic.inf",
+        3,
+        words(lambda w: ["0", "x", w[2]]),
+        r"line 3: expected 3 finite numbers",
+    ),
+    "another index": (
+        "Intrinsic.inf",
+        6,
+        lambda line: "2",
+        r"line 6: expected the number 1 of a camera, but got '2'",
+    ),
+    "from 2": (
+        "Intrinsic.inf",
+        1,
+        lambda line: "2",
+        r"line 1: expected the number 0 of a camera, but got '2'",
     ),
     "no index": ("Intrinsic.inf", 6, None, r"line 6: expected the number 1 of a camera, but got '71.0"),
-    "row gone": ("Intrinsic.inf", 3, None, r"line 5: expected 3 finite numbers, but got 1 values"),
-    "last gone": ("Intrinsic.inf", 19, None, r"line 18: expected three rows of camera 3, but got the end"),
+    "row gone": ("Intrinsic.inf", 3, None, r"line 3: focal length: expected a number .*got 0"),
+    "last gone": ("Intrinsic.inf", 19, None, r"line 18: expected nine numbers of camera 3, .* after 6"),
     "focal 0": ("Intrinsic.inf", 2, words(lambda w: ["0", *w[1:]]), r"line 2: focal length: expected"),
     "focal inf": ("Intrinsic.inf", 2, words(lambda w: ["inf", *w[1:]]), r"line 2: expected 3 finite"),
     "no pinhole": (
@@ -324,6 +383,11 @@ BAD_FILES = {
         "pointclouds/frame3.npy",
         cloud(lambda c: c * np.nan),
         r"expected finite numbers, .*in row 0",
+    ),
+    "cloud far off": (
+        "pointclouds/frame2.npy",
+        cloud(lambda c: np.where(c == c[1, 2], 1e30, c)),
+        r"expected points within 1e\+09 units, but got 1e\+30 in row 1; export it again",
     ),
     "cloud text": ("pointclouds/frame3.npy", lambda p: p.write_text("v 1"), r"expected a NumPy file"),
     "no lenses": ("Intrinsic.inf", Path.unlink, r"expected a readable file, but got No such file"),

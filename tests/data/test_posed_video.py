@@ -136,12 +136,23 @@ def test_given_times_are_kept(tmp_path):
     assert scene.protocol["times"] == "as given"
 
 
-@pytest.mark.parametrize(("every", "held"), [(2, [2, 4, 6, 8, 10]), (3, [2, 5, 8]), (4, [3, 7])])
+@pytest.mark.parametrize(("every", "held"), [(2, [2, 4, 6, 8]), (3, [2, 5, 8]), (4, [3, 7])])
 def test_every_nth_frame_is_held_out(tmp_path, every, held):
     write_tiny(tmp_path / "toy")
     scene = read_scene(tmp_path, "toy", test_every=every)
     assert [f.name for f in scene.test] == [f"images/frame_{i}" for i in held]
     assert len(scene.train) == 10 - len(held)
+
+
+@pytest.mark.parametrize(
+    ("count", "every", "held"), [(6, 8, [5]), (13, 8, [5]), (21, 8, [5, 13]), (4, 2, [2])]
+)
+def test_the_first_and_the_last_frame_are_never_held_out(tmp_path, count, every, held):
+    write_tiny(tmp_path / "toy", count=count)
+    scene = read_scene(tmp_path, "toy", test_every=every)
+    assert [f.name for f in scene.test] == [f"images/frame_{i}" for i in held]
+    assert {0.0, 1.0} <= {f.time for f in scene.train}
+    assert len(scene.train) == count - len(held)
 
 
 def test_lists_choose_the_splits(tmp_path):
@@ -264,6 +275,35 @@ def test_alpha_counts_where_it_says_something(tmp_path):
     ]
     write_scene(tmp_path / "opaque", opaque, near=20, far=120)
     assert not read_scene(tmp_path, "opaque").has_alpha
+
+
+def test_one_image_that_is_cut_out_is_enough(tmp_path):
+    *solid, last = shots(channels=4)
+    first = [replace(s, pixels=np.where([0, 0, 0, 1], 255, s.pixels).astype("u1")) for s in solid]
+    write_scene(tmp_path / "toy", [*first, last], near=20, far=120)
+    assert read_scene(tmp_path, "toy").has_alpha
+
+
+def test_masks_and_alpha_count_together(tmp_path):
+    mask = masked(tmp_path / "toy")
+    shot = next(shots(channels=4))
+    for i in range(10):
+        write_png(tmp_path / "toy" / "images" / f"frame_{i + 1}.png", shot.pixels)
+    rgba = read_scene(tmp_path, "toy").train[0].load().numpy()
+    assert np.array_equal(rgba[..., 3], shot.pixels[..., 3] * mask)
+    on = rgba[..., 3] > 0
+    assert np.array_equal(rgba[on], shot.pixels[on])
+    assert (rgba[~on] == 0).all()
+
+
+@pytest.mark.parametrize("name", ["frame.PNG", "frame.jpeg"])
+def test_a_suffix_says_what_is_written(tmp_path, name):
+    pixels = next(shots()).pixels
+    written = [replace(s, name=f"{i}_{name}", pixels=pixels) for i, s in enumerate(shots())]
+    write_scene(tmp_path / "toy", written, near=20, far=120)
+    content = (tmp_path / "toy" / "images" / f"0_{name}").read_bytes()
+    assert content.startswith(b"\x89PNG" if name.endswith("PNG") else b"\xff\xd8")
+    assert len(read_scene(tmp_path, "toy").train) == 9
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".jpeg", ".JPG"])

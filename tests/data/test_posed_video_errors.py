@@ -109,7 +109,7 @@ OPTIONS = [
     ({"box": [1, 2]}, r"data.box: expected six numbers"),
     ({"normalise": "yes"}, r"data.normalise: expected true or false, but got 'yes'"),
     ({"canonical": "last"}, r"data.canonical: expected middle or first, but got 'last'"),
-    ({"test_every": 1}, r"data.test_every: expected a whole number >= 2, but got 1"),
+    ({"test_every": 1}, r"data.test_every: expected a whole number of at least 2, but got 1"),
     ({"test_every": 21}, r"expected a frame to test on, but got none of 10; name some in test_filenames"),
 ]
 
@@ -190,10 +190,26 @@ WRITES = [
 ]
 
 
+CUT_OUT = np.zeros((20, 30, 4), np.uint8)
+WRITES += [
+    (PosedShot("a", CAMERA, PIXELS), r"a: expected a name in .png, .*, but got ''"),
+    (PosedShot("a.tif", CAMERA, PIXELS), r"a.tif: expected a name in .png, .*, but got '.tif'"),
+    (PosedShot("a.jpg", CAMERA, CUT_OUT), "a.jpg: expected 3 channels, as a JPEG has no alpha, but got 4"),
+    (PosedShot("../../a.png", CAMERA, PIXELS), "expected a path inside the scene folder"),
+]
+
+
 @pytest.mark.parametrize(("shot", "match"), WRITES)
 def test_the_writer_refuses_what_could_not_be_read(tmp_path, shot, match):
     with pytest.raises(ValueError, match=match):
         write_scene(tmp_path, [shot])
+
+
+@pytest.mark.parametrize("second", ["a.png", "a.jpg", "./a.png"])
+def test_the_writer_refuses_two_images_of_one_name(tmp_path, second):
+    both = [PosedShot(name, CAMERA, PIXELS) for name in ("a.png", second)]
+    with pytest.raises(ValueError, match=r"a.*: expected names that differ without their suffix"):
+        write_scene(tmp_path, both)
 
 
 def test_mixed_alpha_is_refused(tmp_path):

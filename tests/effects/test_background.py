@@ -45,6 +45,21 @@ def test_densities_add_and_colours_are_weighted_by_them():
     torch.testing.assert_close(together.colors(points, points, None), mixed)
 
 
+def test_what_is_thin_and_moves_is_not_stepped_over():
+    lattice = Lattice(Box((-0.2, -0.2, -0.2), (0.2, 0.2, 0.2)), (33, 33, 33))
+    sheet = torch.cartesian_prod(torch.tensor([16]), torch.arange(33), torch.arange(33))
+    values = torch.tensor([[20.0, 0, 0, 0]], dtype=torch.float64).repeat(len(sheet), 1)
+    moving = RadianceGrid(lattice, index_of(sheet, lattice.shape), values, Activation(0.0, lattice.pitch / 9))
+    still = grid_on(WIDE, -50.0, (0, 0, 0))
+    assert WIDE.pitch > 30 * lattice.pitch
+    y, z = torch.rand(2, 200, generator=torch.Generator().manual_seed(2), dtype=torch.float64) * 0.3 - 0.15
+    origins = torch.stack([torch.full_like(y, -2.0), y, z], -1)
+    directions = torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64).expand(200, 3)
+    rays = Rays(origins, directions, 0.0, 5.0)
+    seen = Renderer()(Together(moving, still), rays, torch.zeros(3, dtype=torch.float64))
+    assert float(seen.opacity.min()) > 0.99
+
+
 def test_directions_change_only_what_moves():
     moving, still = grid_on(SMALL, 1.0, (0, 0, 0)), grid_on(WIDE, -50.0, (0, 0, 0))
     points = random_points()
@@ -91,7 +106,8 @@ def test_an_empty_moving_grid_leaves_the_still_one():
         9.0,
     )
     both = Renderer()(Together(empty, still), rays, torch.ones(3, dtype=torch.float64))
-    alone = Renderer()(still, rays, torch.ones(3, dtype=torch.float64))
+    same = Renderer(step=0.5 * SMALL.pitch / WIDE.pitch)  # the steps of the finer of the two
+    alone = same(still, rays, torch.ones(3, dtype=torch.float64))
     torch.testing.assert_close(both.rgb, alone.rgb, atol=1e-5, rtol=0)  # an absent voxel has 1e-6 of opacity
     assert not empty.cells.any()
 

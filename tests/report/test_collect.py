@@ -78,3 +78,13 @@ def test_groups_hold_the_seeds_and_the_base_comes_first(tmp_path):
     groups = grouped(scenes["ball"])
     assert list(groups) == [("base", 1.0), ("a", 1.0), ("a", 3.0)]
     assert [result.seed for result in groups["a", 1.0]] == [0, 1]
+
+
+def test_a_config_that_is_no_config_of_ours_is_left_out(tmp_path):
+    for seed, text in enumerate(["#" * (1 << 20) + "x", "a: " + "[" * 5000]):
+        (write_run(tmp_path, seed=seed) / "config.yaml").write_text(text)
+    write_run(tmp_path, seed=2)
+    results, without = collect(tmp_path)
+    assert [result.seed for result in results] == [2]
+    assert "cannot be read (config.yaml: expected at most 1048576 bytes, but got 1048577)" in without[0]
+    assert "cannot be read (" in without[1]

@@ -51,7 +51,7 @@ def cells(table, name, kind="measured"):
     rows = [
         i for i, row in enumerate(table.rows) if row[1] == kind and (kind != "measured" or row[0] == name)
     ]
-    return table.texts({"best": "[{}]", "second": "({})"})[rows[0]][2:]
+    return table.texts({"best": "[{}]", "second": "({})"})[rows[0]][2:-1]
 
 
 def test_a_mean_is_of_all_scenes_or_empty(tmp_path):
@@ -91,6 +91,7 @@ def test_ranks_are_among_measured_rows_alone(tmp_path):
     assert cells(table, "forewarp: the no_view, fast, 1 min")[::2] == ["20.00", "0.300"]
     assert cells(table, "", "published") == ["33.75", "0.979", "0.040"]  # as printed, unmarked
     assert table.rules == [3]
+    assert [row[-1] for row in table.rows[:4]] == [50.0] * 3 + [None]
 
 
 def test_abilities_and_depth_have_columns_of_their_own(tmp_path):
@@ -105,12 +106,25 @@ def test_abilities_and_depth_have_columns_of_their_own(tmp_path):
     assert row == ["20.00", "", "50.000", "", "21.00", "", "", "", "22.00", "", "", "25.000"]
 
 
+def test_a_scene_with_one_kind_of_view_is_measured_by_it(tmp_path):
+    for number, scene in enumerate(("sport_1", "sport_2", "sport_3", "basketball")):
+        folder = paper_run(tmp_path, scene, dataset="nhr", space={"psnr": 20.0 + number})
+    row = cells(table_of(tmp_path, "nhr"), "forewarp: forward, fast, 1 min")
+    assert row == ["20.00", "", "", "21.00", "", "", "22.00", "", "", "23.00", "", "", "21.50", "", ""]
+    metrics = json.loads((folder / "metrics.json").read_text())
+    metrics["protocol"]["resolution"] = [[512, 384], [1024, 768]]
+    (folder / "metrics.json").write_text(json.dumps(metrics))
+    write_paper(tmp_path, tmp_path / "out", PRINTED)
+    text = (tmp_path / "out" / "paper.md").read_text()
+    assert "* protocol: nhr, 512x384 and 1024x768, background white" in text
+
+
 def test_counterparts_never_meet_printed_numbers(tmp_path):
     paper_run(tmp_path, "vehicle", made=True, psnr=28.0)
     results, _ = collect(tmp_path, ["metrics.json"])
     table = counterpart(read_paper(PRINTED)["dnerf"], results)
     made = comparison(table, results)
-    assert [column.name for column in made.columns[2:]] == [
+    assert [column.name for column in made.columns[2:-1]] == [
         "vehicle PSNR↑",
         "vehicle SSIM↑",
         "vehicle LPIPS↓",

@@ -68,6 +68,27 @@ def test_what_lies_beyond_the_fold_does_not_come_back_into_the_picture():
     assert pixel[1, 0].item() == pytest.approx(30.5 + 55 * 0.75)
 
 
+def test_beyond_the_fold_of_a_cushion_nothing_is_seen():
+    # r (1 + 0.3 r^2 - 0.1 r^4) is greatest, 1.780, at r = 1.605.
+    lens = Lens((0.3, -0.1, 0.0))
+    away = torch.linspace(0, 8, 401, dtype=torch.float64)
+    points = torch.stack([0.6 * away, 0.8 * away], -1)
+    bent = lens.bend(points)
+    before = away < 1.605
+    expected = away * (1 + 0.3 * away**2 - 0.1 * away**4)
+    torch.testing.assert_close(bent.norm(dim=-1)[before], expected[before])
+    assert bent.isfinite().all()
+    assert (bent[~before].norm(dim=-1) > 1e6).all()
+    assert (torch.nn.functional.cosine_similarity(bent[1:], points[1:]) > 0.999).all()
+    assert (lens.straighten(bent[before]) - points[before]).abs().max() < 1e-8
+
+
+def test_bending_has_finite_gradients_everywhere():
+    points = torch.tensor([[0.0, 0.0], [0.5, 0.2], [3.0, 0.0], [1e7, -1e7]], requires_grad=True)
+    Lens((0.3, -0.1, 0.0)).bend(points).sum().backward()
+    assert points.grad.isfinite().all()
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_points_beside_and_behind_are_finite(dtype):
     view = camera(lens=PHONE, skew=1.0)

@@ -36,6 +36,7 @@ WITHOUT = {
     "march_reference": "places samples; says so",
     "check_march": "a guard",
     "map_cells": "whole numbers",
+    "unfolded": "a yes or no",
     "trace": "for pictures; says so",
     "index_of": "whole numbers",
     "dilate": "yes or no",

@@ -139,6 +139,39 @@ def test_killed_while_a_checkpoint_takes_its_place(begin, whole, tmp_path, momen
     assert not list((tmp_path / "run").rglob("last.ckpt.part"))
 
 
+# Which file a run dies at, its number among those of that name and the moment; and where that leaves it.
+PHASES = {
+    "checkpoint writing": ((1, "half", "coarse/last.ckpt"), "before coarse"),
+    "coarse": ((2, "after", "coarse/last.ckpt"), "coarse"),
+    "handover": ((1, "half", "coarse/handover.json"), "coarse"),
+    "between": ((1, "after", "coarse/done.json"), "before fine"),
+    "fine": ((2, "after", "fine/last.ckpt"), "fine"),
+    "fine handover": ((1, "before", "fine/handover.json"), "fine"),
+    "evaluation": ((1, "half", "per_image.json"), "evaluation"),
+    "end": ((1, "before", "metrics.json"), "evaluation"),
+}
+
+
+def test_killed_in_every_phase(begin, whole, tmp_path):
+    """One run dies in one phase after the other."""
+    for phase, (die, left) in PHASES.items():
+        assert begin(tmp_path / "run", die=die)[0] == -signal.SIGKILL, phase
+        assert where(tmp_path / "run") == left, phase
+    goes_on(begin, tmp_path / "run", whole)
+
+
+def test_killed_with_an_inpainter_and_a_logger(begin, tmp_path):
+    more = ["model/inpainter=unet3d", "logger=tensorboard"]
+    assert begin(tmp_path / "whole", *more)[0] == 0, begin.log.read_text()
+    for die in ((2, "after", "coarse/last.ckpt"), (2, "half", "fine/last.ckpt")):
+        assert begin(tmp_path / "run", *more, die=die)[0] == -signal.SIGKILL
+    assert begin(tmp_path / "run", *more)[0] == 0, begin.log.read_text()
+    assert differences(tmp_path / "run", [tmp_path / "whole"]) == []
+    names = end(tmp_path / "run")
+    assert any("inpainter" in name[2] for name in names if name[1:2] == ("weights",))
+    assert list((tmp_path / "run" / "fine").rglob("events.out.*"))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_killed_at_random_moments(zygote, begin, scenes, whole, tmp_path, seed):
@@ -280,6 +313,21 @@ def test_a_read_only_file_system(begin, whole, tmp_path):
         refused(*begin(place / "run"), "expected a usable file or folder, but got Read-only file system")
     finally:
         subprocess.run(["umount", place], check=True)
+
+
+def test_starved_halfway_a_run_keeps_its_checkpoint_and_goes_on(begin, tmp_path):
+    run, more, die = (
+        tmp_path / "run",
+        ["data.rays=200000", "evaluate=false"],
+        (1, "after", "coarse/last.ckpt"),
+    )
+    last = run / "coarse" / "last.ckpt"
+    assert begin(run, *more, die=die)[0] == -signal.SIGKILL
+    before, step = last.read_bytes(), step_of(last)
+    refused(*begin(run, *more, memory=250 * 2**20), "memory: expected room for", "lower data.rays")
+    assert last.read_bytes() == before
+    assert begin(run, *more, die=die)[0] == -signal.SIGKILL
+    assert step_of(last) > step
 
 
 def test_too_little_memory_ends_in_one_line(begin, whole, tmp_path):

@@ -1,11 +1,14 @@
 """Training under hostile conditions: rates far too high, odd scenes, other units (cases 27 to 30)."""
 
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
 
 from forewarp.data.module import SceneDataModule
+from forewarp.effects.background import StaticBackground
+from forewarp.effects.inpaint import UNet3d
 from forewarp.fields.trajectory import TrajectoryField
 from forewarp.scene.box import Box
 from forewarp.training.objective import Objective
@@ -26,10 +29,20 @@ def in_other_units(scene, factor):
 
     box = Box(tuple(v * factor for v in scene.box.low), tuple(v * factor for v in scene.box.high))
     splits = {name: tuple(map(grown, getattr(scene, name))) for name in ("train", "val", "test")}
-    return replace(scene, box=box, **splits)
+    still = None if scene.still is None else scene.still * factor
+    return replace(scene, box=box, still=still, **splits)
 
 
-TERMS = ("photo", "point_color", "background_entropy", "flow_l1", "tv_density", "tv_flow", "tv_depth")
+TERMS = (
+    *("photo", "point_color", "background_entropy", "flow_l1", "tv_density", "tv_flow", "tv_depth"),
+    *("inpaint_diff", "still_points", "moving_opacity"),
+)
+
+
+ALL = {
+    "inpainter": partial(UNet3d, levels=2),
+    "background": partial(StaticBackground, features=3, alpha_init=1e-2, skip_alpha=1e-4),
+}
 
 
 class Diary(Objective):
@@ -44,9 +57,10 @@ class Diary(Objective):
 def fit(folder, scene, iterations, weights=None, **changes):
     """A fitted module, the losses of its steps, and the mean PSNR of its test images."""
     data = SceneDataModule(lambda: scene, rays=changes.pop("rays", 128))
+    spec = changes.pop("spec", None) or forward_spec()
     fitting = stage(iterations=iterations, weights=weights, **({"voxels": [[0, 12**3]]} | changes))
     diary = Diary(fitting.objective.weights)
-    module = make_run(folder, [replace(fitting, objective=diary)], data=data, spec=forward_spec()).fit()
+    module = make_run(folder, [replace(fitting, objective=diary)], data=data, spec=spec).fit()
     scores = []
     for target in data.targets("test"):
         drawn = module.render_image(target.frame.camera, target.frame.time, target.background).rgb
@@ -63,8 +77,10 @@ def all_finite(module):
 def test_no_term_of_the_loss_depends_on_the_unit_of_length(tmp_path, factor):
     """The first steps, all terms on, are the same but for rounding."""
     weights = dict.fromkeys(TERMS, 0.1)
+    assert set(TERMS) == set(Objective(weights).terms)
     options = {"iterations": 4, "weights": weights, "start": "hull", "patches": 2}
-    scene = ball_scene(frames=6, size=16)
+    options |= {"spec": forward_spec(**ALL), "background_voxels": [[0, 12**3]]}
+    scene = replace(ball_scene(frames=6, size=16), still=torch.tensor([[0.9, 0.1, 0.2], [-0.8, 0.3, -0.2]]))
     _, plain, _ = fit(tmp_path / "a", scene, **options)
     _, other, _ = fit(tmp_path / "b", in_other_units(scene, factor), **options)
     assert other == pytest.approx(plain, rel=2e-4)

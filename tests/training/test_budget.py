@@ -1,6 +1,6 @@
 import pytest
 
-from forewarp.training.budget import StagePlan, share_out
+from forewarp.training.budget import StagePlan, seconds_after, share_out
 from forewarp.training.objective import Objective
 
 
@@ -14,6 +14,13 @@ def test_minutes_and_iterations_go_by_share():
     first, second = share_out({"a": plan(1), "b": plan(3)}, minutes=2.0, iterations=10)
     assert (first.settings.name, first.settings.minutes, first.settings.iterations) == ("a", 0.5, 2)
     assert (second.settings.name, second.settings.minutes, second.settings.iterations) == ("b", 1.5, 8)
+
+
+def test_what_the_stages_after_one_may_take():
+    stages = share_out({"a": plan(1), "b": plan(2), "c": plan(1)}, minutes=2.0, iterations=10)
+    assert [seconds_after(stages, name) for name in "abc"] == [90, 30, 0]
+    steps = share_out({"a": plan(), "b": plan()}, minutes=None, iterations=10)
+    assert [seconds_after(steps, name) for name in "ab"] == [None, 0]
 
 
 def test_a_bound_may_be_left_to_the_other():

@@ -79,7 +79,7 @@ def test_lines_where_there_is_no_terminal(tmp_path, capsys):
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == STEPS + 1
     shape = (
-        r"coarse +(\d+)% \| (.*) \| psnr -?[\d.]+ \| loss [\d.]+ \| frames (\d+)/12 \| "
+        r"coarse +(\d+)% \| (.*) \| train psnr -?[\d.]+ \| loss [\d.]+ \| frames (\d+)/12 \| "
         r"voxels [\d,]+ \| [\d.]+ steps/s"
     )
     found = [re.fullmatch(shape, line) for line in lines]
@@ -90,6 +90,15 @@ def test_lines_where_there_is_no_terminal(tmp_path, capsys):
     assert percents == sorted(percents)
     assert percents[-2:] == [100, 100]
     assert [found[0][3], found[-1][3]] == ["10", "12"]
+
+
+def test_the_time_left_of_all_stages(tmp_path, capsys):
+    progress = StageProgress(every=0)
+    progress.later = 7200.0
+    watched_run(tmp_path, progress).fit()
+    lines = capsys.readouterr().err.splitlines()
+    assert re.search(r"\| \d+:\d\d left \| 2:\d\d:\d\d with what follows \| train psnr", lines[0])
+    assert "0:00 left | 2:00:00 with what follows" in lines[-2]
 
 
 def test_a_long_wait_between_lines_leaves_only_the_last(tmp_path, capsys):

@@ -104,3 +104,53 @@ def test_checkpoints_come_by_the_clock(tmp_path, monkeypatch):
     ours.checkpoint_seconds = 1e-9
     ours.fit()
     assert saved == [*range(1, 13), 12]
+
+
+GRID = "method.radiance."
+HARM = {
+    "index out of range": ("index", lambda v, c: v.__setitem__((0, 0, 0), 10**6)),
+    "index below": ("index", lambda v, c: v.__setitem__((0, 0, 0), -2)),
+    "index swapped": ("index", lambda v, c: v.copy_(v.flip(0))),
+    "index of another shape": ("index", lambda v, c: c.update({GRID + "index": v[1:].clone()})),
+    "index of another kind": ("index", lambda v, c: c.update({GRID + "index": v.long()})),
+    "index of nothing": ("index", lambda v, c: c.update({GRID + "index": None})),
+    "voxel outside": ("voxels", lambda v, c: v.__setitem__((0, 2), 10**6)),
+    "voxel below": ("voxels", lambda v, c: v.__setitem__((0, 2), -1)),
+    "voxels of a plane": ("voxels", lambda v, c: c.update({GRID + "voxels": v[:, :2].clone()})),
+    "fewer rows": ("color", lambda v, c: c.update({GRID + "color": v[:1].clone()})),
+    "more channels": ("density", lambda v, c: c.update({GRID + "density": v.repeat(1, 2)})),
+    "another shape": ("_extra_state", lambda v, c: v.update(shape=[99, 99, 99])),
+    "an absurd shape": ("_extra_state", lambda v, c: v.update(shape=[10**6] * 3)),
+    "no shape": ("_extra_state", lambda v, c: v.pop("shape")),
+    "no box": ("_extra_state", lambda v, c: v.update(low=[9.0, 9.0, 9.0])),
+}
+
+
+@pytest.mark.parametrize("harm", HARM)
+def test_a_grid_whose_parts_do_not_fit_is_refused(tmp_path, interrupted, harm):
+    """The kernels would read where nothing is, which ends the process."""
+    content = torch.load(interrupted, weights_only=True)
+    name, change = HARM[harm]
+    change(content["state_dict"][GRID + name], content["state_dict"])
+    torch.save(content, tmp_path / "last.ckpt")
+    named = "(index|_extra_state)" if "shape" in harm else name
+    with pytest.raises(ValueError, match=f"last.ckpt: expected .* that differs in {GRID}{named};"):
+        load_weights(module(tmp_path), tmp_path / "last.ckpt")
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda c: c.pop("global_step"), "expected a checkpoint with its step and seconds, but got None"),
+        (lambda c: c["forewarp"].update(clock=7), "expected a checkpoint with its step and seconds"),
+        (lambda c: c.update(forewarp=7), "expected a checkpoint of this version"),
+        (lambda c: c.update(state_dict=7), "expected a checkpoint, but it holds no weights"),
+        (lambda c: c["state_dict"].update({7: 7}), "that differs in 7;"),
+    ],
+)
+def test_odd_parts_are_refused_in_one_line(tmp_path, interrupted, change, said):
+    content = torch.load(interrupted, weights_only=True)
+    change(content)
+    torch.save(content, tmp_path / "last.ckpt")
+    with pytest.raises(ValueError, match=f"last.ckpt: .*{said}"):
+        check_state(tmp_path / "last.ckpt", module(tmp_path))

@@ -1,8 +1,10 @@
 import json
 
+import imageio.v3 as iio
 import pytest
 import torch
 
+from forewarp.data.batches import Targets
 from forewarp.metrics.suite import ImageSuite
 from forewarp.scene.frame import Truth
 from forewarp.training.evaluation import draw, evaluate, flow_error
@@ -45,6 +47,9 @@ def test_scores_every_image_and_saves_it(run, module, tmp_path):
         "t_2.png",
     ]
     assert len(list((tmp_path / "images" / "sheets").glob("*.png"))) == 2
+    sheet = iio.imread(tmp_path / "images" / "sheets" / "t_0.png")
+    assert sheet.shape == (312, 3 * 312 + 2 * 4, 3)  # 24 pixels, each 13 times
+    assert metrics["steps"] == {"coarse": 4}
     assert "flow" not in metrics  # the scene has no truth
     assert metrics["protocol"]["seed"] == 5
     seconds = metrics["seconds"]
@@ -75,7 +80,8 @@ def test_warps_once_a_time(module, monkeypatch):
     monkeypatch.setattr(module.method, "at", warped)
     monkeypatch.setattr("forewarp.training.evaluation.render_all", drawn)
     monkeypatch.setattr("forewarp.training.evaluation.now", lambda: clock[0])
-    shown = list(draw(module, [targets[2], targets[0], targets[2], targets[0]]))
+    frames = [targets.frames[i] for i in (2, 0, 2, 0)]
+    shown = list(draw(module, Targets(frames, targets.background, targets.has_alpha)))
     assert times == [0.0, 1.0]
     assert [one.number for one in shown] == [1, 3, 0, 2]
     assert [(one.seconds, one.seconds_again) for one in shown] == [(11, 1), (1, 1)] * 2

@@ -193,3 +193,45 @@ def test_the_checks_by_hand():
     assert first_bad([("e", torch.tensor([1e20]))], squared=True) == "e"
     with pytest.raises(ValueError, match="sentinel.skip: expected a whole number of steps >= 0, but got -1"):
         Sentinel(".", skip=-1)
+
+
+@pytest.mark.parametrize("skip", [0, 2])
+def test_a_bundle_that_cannot_be_written_hides_nothing(tmp_path, skip):
+    (tmp_path / "coarse").mkdir()
+    (tmp_path / "coarse" / "broken").write_text("")
+    with pytest.raises(BrokenStep) as stopped:
+        run(tmp_path, Poison("batch", 5), skip=skip).fit()
+    said = str(stopped.value)
+    assert "expected finite numbers, but got loss: batch.rgb (terms photo) at step 5," in said
+    assert "coarse/broken/step_5.pt could not be written (File exists); begin anew" in said
+    assert "forewarp.replay" not in said
+
+
+SPOIL = {
+    "noted.random": lambda c: c["noted"].pop("random"),
+    "noted.random.torch": lambda c: c["noted"]["random"].pop("torch"),
+    "noted.stage": lambda c: c["noted"].update(stage=7),
+    "config": lambda c: c.update(config=None),
+    "state_dict": lambda c: c.update(state_dict=[]),
+    "batch.frame": lambda c: c["batch"].update(frame=99),
+    "batch": lambda c: c["batch"].update(rgb=torch.zeros(3)),
+    "scene": lambda c: c.pop("scene"),
+    "frames": lambda c: c["scene"].update(frames=[7]),
+    "TypeError": lambda c: c["batch"].update(rgb=torch.zeros(1).expand(64, 3)),  # more than the file holds
+}
+
+
+@pytest.mark.parametrize("name", SPOIL)
+def test_a_bundle_with_a_wrong_part_is_refused_in_one_line(bundle, tmp_path, name):
+    content = torch.load(bundle, weights_only=True)
+    SPOIL[name](content)
+    torch.save(content, tmp_path / "a.pt")
+    with pytest.raises(ValueError, match="a.pt: expected a step that a run left in broken/, but got") as no:
+        read_bundle(tmp_path / "a.pt")
+    assert len(str(no.value).splitlines()) == 1
+
+
+@pytest.fixture(scope="module")
+def bundle(tmp_path_factory):
+    """A stored step."""
+    return broken(tmp_path_factory.mktemp("broken"), Poison("batch", 5))[1]

@@ -63,3 +63,9 @@ def test_the_fraction_is_of_what_comes_first(bounds, fraction):
 def test_refuses_by_the_name_of_the_key(wrong, text):
     with pytest.raises(ValueError, match=text):
         settings(**wrong)
+
+
+@pytest.mark.parametrize("name", ["/tmp/x", "..", "../x", "a/b", "a\\b", "", "-a", "a b", "a\n", 7])
+def test_a_stage_has_no_name_that_leads_out_of_the_run(name):
+    with pytest.raises(ValueError, match="stage: expected names of letters, digits, _ and -"):
+        settings(name=name)

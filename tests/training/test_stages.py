@@ -1,5 +1,6 @@
 import json
 import shutil
+import signal
 from functools import partial
 
 import lightning
@@ -13,6 +14,7 @@ from forewarp.effects.view import ViewNetwork
 from forewarp.fields.radiance import FeatureRadiance
 from forewarp.methods.backward_warp import Deformation
 from forewarp.training import handover
+from forewarp.training.interruption import Interruption
 from tiny_scene import RATES, Interrupt, ball_data, forward_spec, make_run, stage
 
 
@@ -225,3 +227,68 @@ def test_a_sliding_ball_is_learned_at_all_times(tmp_path):
     x, y, z = (moved[1] - moved[0]).tolist()  # of the centre, which no view sees
     assert 0.3 < x < 1.2
     assert max(abs(y), abs(z)) < 0.25
+
+
+class CtrlC(lightning.Callback):
+    """Presses it once or more in the middle of a step."""
+
+    def __init__(self, stage, step, times=1):
+        self.stage, self.step, self.times = stage, step, times
+
+    def on_before_backward(self, trainer, module, loss):
+        if module.settings.name == self.stage and module.global_step == self.step:
+            for _ in range(self.times):
+                signal.raise_signal(signal.SIGINT)
+
+
+def pressed(folder, *presses):
+    """Run until Ctrl-C ends it; what Lightning turned into an exit was one."""
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(SystemExit) as leaving:
+        run(folder, [CtrlC(*presses)]).fit()
+    assert isinstance(leaving.value.__context__, KeyboardInterrupt)
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+@pytest.mark.parametrize(("name", "step"), [("coarse", 5), ("fine", 3), ("fine", 9)])
+def test_ctrl_c_keeps_the_step_that_it_met(tmp_path, whole, capsys, name, step):
+    pressed(tmp_path, name, step)
+    assert torch.load(tmp_path / name / "last.ckpt", weights_only=True)["global_step"] == step + 1
+    assert "ends this step and saves it; Ctrl-C again stops at once" in capsys.readouterr().err
+    ours, told = run(tmp_path), []
+    ours.tell = told.append
+    assert same(ours.fit(), whole[1])
+    before = ["coarse: finished before"] if name == "fine" else []
+    assert told == [*before, f"{name}: goes on at {10 * (step + 1)}%, step {step + 1}"]
+
+
+def test_a_second_ctrl_c_stops_at_once(tmp_path):
+    pressed(tmp_path, "coarse", 5, 2)
+    assert not (tmp_path / "coarse" / "last.ckpt").exists()
+
+
+def test_ctrl_c_that_no_step_follows_stops_before_the_next_stage(tmp_path, whole):
+    class AtTheEnd(lightning.Callback):
+        def on_train_end(self, trainer, module):
+            signal.raise_signal(signal.SIGINT)
+
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path, [AtTheEnd()]).fit()
+    assert (tmp_path / "coarse" / "done.json").is_file()
+    assert not (tmp_path / "fine").exists()
+    assert same(run(tmp_path).fit(), whole[1])
+
+
+def test_whoever_sees_to_signals_himself_is_left_alone():
+    def own(number, frame):
+        pass
+
+    before = signal.signal(signal.SIGINT, own)
+    try:
+        with Interruption() as interruption:
+            signal.raise_signal(signal.SIGINT)
+            assert signal.getsignal(signal.SIGINT) is own
+        assert signal.getsignal(signal.SIGINT) is own
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert not interruption.asked

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import os
 import socket
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TextIO
 
-from forewarp.data.fingerprint import difference
+from forewarp.data.fingerprint import LOCK, difference
 from forewarp.training.handover import read_json, write_json
 from forewarp.training.stages import Run
 
@@ -17,7 +19,7 @@ try:
 except ImportError:  # Windows
     fcntl = None
 
-LOCK, DATA = ".lock", "data.json"
+DATA = "data.json"
 CHOICES = ("refuse", "accept")
 
 
@@ -30,9 +32,9 @@ def alone(folder: Path) -> Iterator[None]:
 
     Raises:
         ValueError: where another process works on it, naming that.
+        OSError: where it cannot be made or written, naming the key ``run``.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    with open(folder / LOCK, "a+") as file:
+    with _lock_file(folder) as file:
         if fcntl is not None:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -46,6 +48,14 @@ def alone(folder: Path) -> Iterator[None]:
         file.write(f"process {os.getpid()} on {socket.gethostname()}\n")
         file.flush()
         yield
+
+
+def _lock_file(folder: Path) -> TextIO:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        return open(folder / LOCK, "a+")
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, f"run: {error.filename}") from None
 
 
 def same_data(run: Run, changed: str) -> None:
@@ -63,8 +73,8 @@ def same_data(run: Run, changed: str) -> None:
     path, now = Path(run.folder) / DATA, run.datamodule.fingerprint()
     if now is None:
         return
-    before, begun = read_json(path), any(Path(run.folder).glob("*/last.ckpt"))
-    found = difference(before, now) if before is not None and begun else None
+    before = read_json(path)
+    found = _change(run, before, now)
     if found and changed == "refuse":
         raise ValueError(
             f"{path}: expected the data that the run was begun with, but got others: {found}; "
@@ -72,3 +82,18 @@ def same_data(run: Run, changed: str) -> None:
         )
     if now != before:
         write_json(path, now)
+
+
+def tell_other_data(run: Run) -> None:
+    """Say so where the scene's files are no longer those that a run was begun with."""
+    path, now = Path(run.folder) / DATA, run.datamodule.fingerprint()
+    if now is not None and (found := _change(run, read_json(path), now)):
+        print(
+            f"warning: {path}: expected the data that the run was begun with, but got others: {found}",
+            file=sys.stderr,
+        )
+
+
+def _change(run: Run, before: dict | None, now: dict) -> str | None:
+    begun = any(Path(run.folder).glob("*/last.ckpt"))
+    return difference(before, now) if before is not None and begun else None

@@ -43,6 +43,9 @@ def table_of(runs: dict[str, dict]) -> Table:
             *(f"{v:.0%}" for v in shares),
             *_difference(shares, "+.0%"),
         )
+    steps = [metrics.get("steps") for metrics in runs.values()]
+    if all(steps):  # runs measured before they were noted have none
+        table.add_row("steps", *(f"{sum(of_stages.values()):,}" for of_stages in steps))
     table.add_row("seconds of training", *(f"{metrics['seconds']['train']:.0f}" for metrics in runs.values()))
     return table
 

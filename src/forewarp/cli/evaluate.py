@@ -22,14 +22,16 @@ What one types most:
 
 def evaluate(config) -> None:
     """Load and measure."""
-    from forewarp.cli.claims import alone
+    from forewarp.cli.claims import alone, tell_other_data
     from forewarp.cli.measure import measure
     from forewarp.cli.runs import build_run, saved_config
 
     saved = saved_config(config.run, config)
     run = build_run(saved)
     with alone(run.folder):
-        measure(run, run.load(), saved)
+        module = run.load()
+        tell_other_data(run)
+        measure(run, module, saved)
 
 
 def main() -> None:

@@ -18,6 +18,8 @@ from forewarp.scene.lens import Lens
 
 _SIZE, _DEPTH = (12, 8), np.full((8, 12), 3.0, np.float32)  # width and height, as images and arrays have them
 
+_SMALL = ("experiment=demo", "stage.coarse.voxels=[[0,64]]", "data.root=data", "logger=none", "trainer=cpu")
+
 
 @dataclass(frozen=True)
 class Target:
@@ -57,32 +59,33 @@ def run_targets(root: Path) -> list[Target]:
 
     from forewarp.cli.entry import ROOT_VARIABLE, project_root
     from forewarp.cli.runs import build_run, saved_config
-    from forewarp.training.checkpoints import check_state
+    from forewarp.training.checkpoints import check_state, load_weights
 
     os.environ[ROOT_VARIABLE] = str(project_root())
     root.joinpath("config").mkdir()
     root.joinpath("checkpoint").mkdir()
-    small = [
-        "experiment=demo",
-        "stage.coarse.voxels=[[0,64]]",
-        "data.root=data",
-        "logger=none",
-        "trainer=cpu",
-    ]
     with initialize_config_dir(str(project_root() / "conf"), version_base="1.3"):
-        config = compose("train", small)
+        config = compose("train", list(_SMALL))
     config = OmegaConf.create(OmegaConf.to_container(config, resolve=True))
     (root / "config" / "config.yaml").write_text(OmegaConf.to_yaml(config))
     scene = dnerf.read_scene(root, "dnerf")
     module = build_run(config).rebuilt("coarse", scene, 0.1)
-    content = {"state_dict": module.state_dict()}
+    content = {"state_dict": module.state_dict(), "global_step": 7}
     module.on_save_checkpoint(content)
     file = root / "checkpoint" / "last.ckpt"
     torch.save(content, file)
     nothing = OmegaConf.create({})
+    camera, white = scene.test[0].camera, torch.ones(3)
+
+    def draw() -> None:
+        """Read, take and use it: a kernel that believes what it should not ends the process."""
+        check_state(file, module)
+        load_weights(module, file)
+        module.render_image(camera, 0.5, white, pixels=torch.arange(4))
+
     return [
         Target("config", root / "config", lambda: saved_config(str(root / "config"), nothing), (ValueError,)),
-        Target("checkpoint", file.parent, lambda: check_state(file, module), (ValueError, OSError)),
+        Target("checkpoint", file.parent, draw, (ValueError, OSError)),
     ]
 
 

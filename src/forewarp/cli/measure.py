@@ -18,6 +18,8 @@ from forewarp.training.module import DynamicSceneModule
 from forewarp.training.progress import ProgressLine, time_text
 from forewarp.training.stages import Run
 
+FAMILIES = ("lpips", "ms_ssim", "depth")
+
 
 def measure(run: Run, module: DynamicSceneModule, config: DictConfig) -> dict:
     """Evaluate a fitted run into its folder and print the table."""
@@ -55,6 +57,15 @@ def device_of(accelerator: str) -> torch.device:
         raise ValueError("trainer.accelerator: expected a GPU, but found none; use trainer=cpu")
     wanted = accelerator in ("gpu", "cuda") or (accelerator == "auto" and torch.cuda.is_available())
     return torch.device("cuda" if wanted else "cpu")
+
+
+def check_precision(precision: object) -> None:
+    """Refuse float16: the slopes of an inpainter over constant volumes leave its range."""
+    if "16" in str(precision) and "bf16" not in str(precision):
+        raise ValueError(
+            f"trainer.precision: expected 32-true or bf16-mixed, but got {precision}; "
+            "float16 does not hold the gradients, use +trainer.precision=bf16-mixed"
+        )
 
 
 class Progress:
@@ -99,10 +110,23 @@ def show(metrics: dict, folder: Path, absent: dict[str, str]) -> None:
         lines.append(
             f"flow: moving points off by {error:.4f}, {error / motion:.0%} of their motion {motion:.4f}"
         )
-    for reason in dict.fromkeys(absent.values()):
-        lines.append(f"without {', '.join(name for name, why in absent.items() if why == reason)}: {reason}")
-    lines += [f"numbers  {Path(folder) / 'metrics.json'}", f"pictures {Path(folder) / 'images'}"]
+    if absent:
+        lines.append(without(absent))
+    images = Path(folder) / "images"
+    lines += [f"numbers  {Path(folder) / 'metrics.json'}", f"pictures {images}"]
+    if (images / "sheets").is_dir():
+        lines.append(f"sheets   {images / 'sheets'}: truth | prediction | error")
     console.print("\n".join(lines), highlight=False, soft_wrap=True)
+
+
+def without(absent: dict[str, str]) -> str:
+    """One line of the metrics that are left out and why; a family of them, all left out, is named once."""
+    reasons: dict[str, str] = {}
+    for name, reason in absent.items():
+        family = next((f for f in FAMILIES if name.startswith(f)), name)
+        whole = all(metric in absent for metric in METRICS if metric.startswith(family))
+        reasons.setdefault(family if whole else name, reason)
+    return "without " + ", ".join(f"{name} ({reason})" for name, reason in reasons.items())
 
 
 def table_of(metrics: dict) -> Table:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from forewarp.cli.entry import command
 
+LEAST_SIZE = 400  # pixels of the longer side, where none is asked for
+
 HELP = """
 forewarp-render makes a video of a finished run, into its videos/.
 
@@ -16,7 +18,7 @@ What one types most:
   path=orbit time=0.5           once around, at one time
   path=both                     once around while time passes
   path=trajectories             as fixed, with the ways that points of the moving surface took drawn over it
-  frames=N fps=N size=N         how many, how fast, pixels of the longer side
+  frames=N fps=N size=N         how many, how fast, pixels of the longer side (as the images, at least 400)
   view=N                        the test view that it shows or starts from
   format=mp4|gif|png            a film, a moving picture, stills
   points=N tail=SHARE           how many trajectories, and how much of the time they stay
@@ -29,6 +31,7 @@ def render(config) -> None:
     """Load, and write the video."""
     from pathlib import Path
 
+    from forewarp.cli.claims import tell_other_data
     from forewarp.cli.measure import Progress, device_of
     from forewarp.cli.runs import build_run, saved_config
     from forewarp.drawing.files import write_video
@@ -37,6 +40,7 @@ def render(config) -> None:
     saved = saved_config(config.run, config)
     run = build_run(saved)
     module = run.load().to(device_of(saved.trainer.accelerator))
+    tell_other_data(run)
     pictures = pictures_of(config, module, run.datamodule)
     file = Path(run.folder) / "videos" / f"{config.path}.{config.format}"
     with Progress(config.path) as progress:
@@ -57,7 +61,8 @@ def pictures_of(config, module, datamodule):
     target, paint = targets[config.view], None
     if config.path == "trajectories":
         paint = Trajectories(module, cameras, count=config.points, tail=float(config.tail))
-    start = target.frame.camera if config.size is None else sized(target.frame.camera, config.size)
+    camera = target.frame.camera
+    start = sized(camera, config.size or max(camera.width, camera.height, LEAST_SIZE))
     shots = make_shots(config.path, config.frames, float(config.time), start, cameras)
     return video(module, shots, target.background.to(module.device), paint)
 

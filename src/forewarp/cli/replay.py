@@ -21,6 +21,7 @@ def replay(path: Path) -> str:
 
     from forewarp.cli.runs import build_run, parsed
     from forewarp.training.bundle import read_bundle
+    from forewarp.training.checkpoints import misfits
     from forewarp.training.sentinel import diagnose
 
     bundle = read_bundle(path)
@@ -28,11 +29,21 @@ def replay(path: Path) -> str:
     config = parsed(bundle.config, path)
     config.trainer.accelerator = "auto"  # it may be another machine
     run = build_run(config)
+    if stage not in (names := [stage.settings.name for stage in run.stages]):
+        known = " or ".join(names)
+        raise ValueError(f"{path}: expected a step of stage {known}, but got one of {stage!r:.80}")
     module = run.rebuilt(stage, bundle.scene, bundle.unit)
+    if differ := misfits(module, bundle.state_dict):
+        raise ValueError(
+            f"{path}: expected weights that its config describes, but got others: {', '.join(differ[:3])}"
+        )
     module.load_state_dict(bundle.state_dict)
     trainer = replace(run, callbacks=lambda *_: []).make_trainer(path.parent, [])
-    module.generator.set_state(bundle.noted["random"]["samples"])
-    torch.set_rng_state(bundle.noted["random"]["torch"])
+    try:
+        module.generator.set_state(bundle.noted["random"]["samples"])
+        torch.set_rng_state(bundle.noted["random"]["torch"])
+    except (RuntimeError, TypeError):
+        raise ValueError(f"{path}: expected states of random generators, but got other bytes") from None
     device = trainer.strategy.root_device
     with trainer.precision_plugin.forward_context():
         found = diagnose(module.to(device), bundle.batch.to(device), number)

@@ -17,7 +17,7 @@ forewarp-report makes pages with tables and curves of runs that are already ther
 What one types most:
   kind=accuracy_time|price_list|paper   which page
   runs=FOLDER                      searched for runs (runs/accuracy_time; of kind=paper runs/paper)
-  out=FOLDER                       where the page goes (docs/results of the project)
+  out=FOLDER                       where the page goes (docs/results; of kind=paper runs/paper/results)
   target=DB                        accuracy_time: PSNR that every variant's seconds are listed for
   published=FILE                   accuracy_time: points that others report (docs/results/published.yaml);
                                    paper: what is printed (docs/results/paper.yaml)
@@ -42,12 +42,14 @@ def report(config) -> None:
     if not isinstance(config.target, int | float | None):
         raise ValueError(f"target: expected a number of dB or null, but got '{config.target}'")
     default = f"{config.paths.runs}/{'paper' if config.kind == 'paper' else 'accuracy_time'}"
-    runs, out = Path(config.runs or default), Path(config.out)
+    kept = Path(config.paths.root) / "docs" / "results"
+    runs = Path(config.runs or default)
+    # Tables that this project vouches for are not written over by whoever tries the command.
+    out = Path(config.out or (runs / "results" if config.kind == "paper" else kept))
     if config.kind == "price_list":
         files = write_price_list(runs, out)
     elif config.kind == "paper":
-        printed = config.published or f"{config.paths.root}/docs/results/paper.yaml"
-        files = write_paper(runs, out, Path(printed))
+        files = write_paper(runs, out, Path(config.published or kept / "paper.yaml"))
     else:
         published = [] if config.published is None else read_published(Path(config.published))
         files = write_accuracy_time(runs, out, target=config.target, published=published)

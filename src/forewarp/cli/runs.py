@@ -6,22 +6,29 @@ import hashlib
 import json
 import os
 import shlex
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import torch
 from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
-from forewarp.cli.measure import device_of
+from forewarp.cli.measure import check_precision, device_of
 from forewarp.cli.trusted import MOST_BYTES, trusted_config
-from forewarp.training.budget import share_out
+from forewarp.training.budget import seconds_after, share_out
+from forewarp.training.callbacks import StageProgress
 from forewarp.training.handover import read_json
 from forewarp.training.stages import Run
 
 # What makes two runs different; where they run and what is shown of them does not.
 IDENTITY = ("data", "model", "objective", "stage", "renderer", "budget", "seed")
+# Named first of what differs, as others follow from these.
+TYPED = ("data.scene", "data.root", "seed", "budget")
 HASH = "{hash}"
+OF_A_SWEEP = ("sweeps=", "seeds=", "launcher=")  # words that say how jobs are run, not what one is
 # What may be set beside resume=<run>.
 MAY_CHANGE = (
     *("trainer", "threads", "lpips_weights", "sheets", "evaluate", "checkpoint_seconds"),
@@ -35,6 +42,7 @@ def build_run(config: DictConfig) -> Run:
         if not (isinstance(config.threads, int) and config.threads >= 1):
             raise ValueError(f"threads: expected a whole number > 0 or null, but got {config.threads}")
         torch.set_num_threads(config.threads)
+    check_precision(config.trainer.get("precision"))
     parts = {key: instantiate(config[key], _convert_="all") for key in ("data", "model", "renderer", "stage")}
     watchers = [w for w in instantiate(config.callbacks, _convert_="all").values() if w is not None]
     trainer, logger = (instantiate(config[key], _convert_="all") for key in ("trainer", "logger"))
@@ -55,18 +63,29 @@ def build_run(config: DictConfig) -> Run:
             num_sanity_val_steps=0,
         )
 
-    return Run(
+    run = Run(
         datamodule=parts["data"],
         spec=parts["model"],
         stages=share_out(parts["stage"], minutes=config.budget.minutes, iterations=config.budget.iterations),
         renderer=parts["renderer"],
         folder=Path(config.run),
         make_trainer=make_trainer,
-        callbacks=lambda name, folder: [watcher() for watcher in watchers],
+        callbacks=lambda name, folder: watching(run, watchers, name),
         seed=config.seed,
         checkpoint_seconds=config.checkpoint_seconds,
         skip=config.get("sentinel", {"skip": 0})["skip"],
+        tell=partial(print, flush=True),
     )
+    return run
+
+
+def watching(run: Run, watchers: list[Callable], name: str) -> list:
+    """New watchers of the stage ``name``; the progress line learns what the later ones may take."""
+    made = [watcher() for watcher in watchers]
+    for line in made:
+        if isinstance(line, StageProgress):
+            line.later = seconds_after(run.stages, name)
+    return made
 
 
 def hashed(config: DictConfig) -> DictConfig:
@@ -120,27 +139,35 @@ def typed() -> str | None:
     if not HydraConfig.initialized():
         return None
     words = HydraConfig.get().overrides.task
-    return shlex.join(["forewarp-train", *(word for word in words if not word.startswith("sweeps="))])
+    return shlex.join(["forewarp-train", *(word for word in words if not word.startswith(OF_A_SWEEP))])
 
 
-def saved_config(run: str | None, changes: DictConfig) -> DictConfig:
+def refuse_seeds(config: DictConfig) -> None:
+    """Refuse ``seeds=`` where nothing repeats the run."""
+    alone = not (HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN)
+    if alone and config.get("seeds", 1) != 1:
+        raise ValueError(f"seeds: expected --multirun beside seeds={config.seeds}; add it, or use seed=N")
+
+
+def saved_config(run: str | None, changes: DictConfig, key: str = "run") -> DictConfig:
     """The config of the run in a folder, with what the command line changed.
 
     Args:
         run: the run's folder.
         changes: keys of the run's config; those that are null change nothing. Others are left out.
+        key: what named the folder.
     """
     if run is None:
         raise ValueError("run: expected the folder of a run, but got nothing; set run=runs/...")
     path = Path(run) / "config.yaml"
     if not path.is_file():
         raise ValueError(
-            f"{path}: expected the configuration of a run, but got none; set run=<a run's folder>"
+            f"{path}: expected the configuration of a run, but got none; set {key}=<a run's folder>"
         )
     saved = read_config(path)
-    for key in ("trainer", "threads", "lpips_weights", "sheets"):
-        if changes.get(key) is not None:
-            saved[key] = changes[key]
+    for name in ("trainer", "threads", "lpips_weights", "sheets"):
+        if changes.get(name) is not None:
+            saved[name] = changes[name]
     if (changes.get("data") or {}).get("root") is not None:
         saved.data.root = changes.data.root
     saved.run = str(run)
@@ -155,7 +182,7 @@ def resumed(config: DictConfig) -> DictConfig:
     """
     if config.get("resume") is None:
         return config
-    saved = saved_config(str(config.resume), OmegaConf.create({}))
+    saved = saved_config(str(config.resume), OmegaConf.create({}), "resume")
     saved.resume, saved.data_changed = str(config.resume), "refuse"
     words = HydraConfig.get().overrides.task if HydraConfig.initialized() else []
     for word in words:
@@ -200,10 +227,14 @@ def _make_absolute(config: DictConfig) -> None:
 
 def _refuse_another(path: Path, before: DictConfig, now: DictConfig) -> None:
     old, new = ({k: OmegaConf.to_container(c)[k] for k in IDENTITY} for c in (before, now))
-    found = next(_differences(old, new), None)
+    found = list(_differences(old, new))
     if found:
-        key, was, got = found
-        raise ValueError(f"{path}: {key}: expected {was}, but got {got}; use run=... or delete the folder")
+        key, was, got = min(found, key=lambda row: [not row[0].startswith(first) for first in TYPED])
+        more = f" (and {len(found) - 1} more keys)" if len(found) > 1 else ""
+        raise ValueError(
+            f"{path}: {key}: expected {was}, as the run that this folder holds, but got {got}{more}; "
+            "use run=<another folder>, or delete this one"
+        )
 
 
 def _differences(old, new, key: str = ""):

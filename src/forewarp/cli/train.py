@@ -29,10 +29,10 @@ What one types most:
   variant=NAME                        one change against budget=fast, as the price list has it
   scene=DATASET_NAME                  as scene=dnerf_hook: a scene of the paper below paths.scenes=FOLDER
   ablation=NAME                       what the paper takes away, from ablation=full
-  launcher=local|joblib|ray|slurm     of --multirun: where its jobs run
+  launcher=local|joblib|ray|slurm|submitit   of --multirun: where its jobs run
   ~stage.fine                         drop a stage
-  --multirun seed=0,1,2               one run after another; --multirun sweeps=methods: a prepared sweep
-  --multirun sweeps=accuracy_time variant=base,unet_16 seed=0,1     what choices cost: see forewarp-report
+  --multirun seeds=3                  one run after another; --multirun sweeps=methods: a prepared sweep
+  --multirun sweeps=accuracy_time variant=base,unet_16 seeds=2      what choices cost: see forewarp-report
 
 A run's folder holds config.yaml, a folder a stage (checkpoint, handover.json, TensorBoard events, images),
 images/ of the test views, per_image.json and metrics.json; with views set aside also accuracy_time.csv and
@@ -45,28 +45,47 @@ def train(config) -> None:
     from forewarp.cli.claims import alone, same_data
     from forewarp.cli.measure import measure
     from forewarp.cli.report import draw_run
-    from forewarp.cli.runs import build_run, claim, hashed, is_measured, resumed
+    from forewarp.cli.runs import build_run, claim, hashed, is_measured, refuse_seeds, resumed
 
+    refuse_seeds(config)
     config = hashed(resumed(config))
     run = build_run(config)
     if skips(run, config.get("absent", "refuse")):
         print(f"skipped: {run.datamodule.place}: no such scene")
         return
     if config.evaluate and is_measured(run):
-        claim(config)
+        with alone(run.folder):
+            claim(config)
         print(f"measured before: {run.folder}; again with forewarp-evaluate run={run.folder}")
         return
     run.datamodule.setup("fit")  # before the folder is made: a mistyped scene leaves nothing behind
     with alone(run.folder):
         claim(config)
         same_data(run, config.get("data_changed", "refuse"))
+        print(beginning(run, config), flush=True)
         module = run.fit()
         if config.evaluate:
             measure(run, module, config)
         else:
-            print(f"fitted: {run.folder}")
+            print(f"fitted: {run.folder}; measure it with forewarp-evaluate run={run.folder}")
         draw_run(run.folder)
     tell_skipped(run)
+
+
+def beginning(run, config) -> str:
+    """What is about to be trained, on what, and where it goes: two lines."""
+    from forewarp.cli.measure import device_of
+
+    scene, device = run.datamodule.scene, device_of(config.trainer.accelerator).type.upper()
+    views = f"{_images(scene.train, 'training')} and {_images(scene.test, 'test')}"
+    return f"{scene.name}: {views}, on the {device}\nrun: {run.folder}"
+
+
+def _images(frames, kind: str) -> str:
+    sizes = sorted({(frame.camera.width, frame.camera.height) for frame in frames})
+    ends = dict.fromkeys([*sizes[:1], *sizes[-1:]])
+    size = " to ".join(f"{width} x {height}" for width, height in ends)
+    return f"{len(frames)} {kind} images" + (f" ({size})" if size else "")
 
 
 def skips(run, absent: str) -> bool:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
-from contextlib import suppress
-from functools import reduce
+import re
 from pathlib import Path
 
 import yaml
@@ -13,18 +12,14 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 MOST_BYTES, MOST_LEVELS = 1 << 20, 40
-# Classes below these names may be made; functions may not, nor what these modules merely import.
-TARGETS = (
-    "forewarp.",
-    "torch.nn.",
-    "torch.optim.",
+# Beside the classes that modules of forewarp define. Whole names: through a prefix all of torch is reached.
+ELSEWHERE = {
     "lightning.Trainer",
     "lightning.pytorch.Trainer",
-    "lightning.pytorch.callbacks.",
-    "lightning.pytorch.loggers.",
-    "lightning.pytorch.profilers.",
-)
-_RESERVED = {"_target_", "_partial_", "_recursive_", "_convert_", "_args_"}
+    "lightning.pytorch.loggers.TensorBoardLogger",
+}
+_RESERVED = {"_target_", "_partial_", "_recursive_", "_convert_"}
+_PARTS = {"name", "version", "sub_dir"}  # of the path that a logger writes to
 
 
 def trusted_config(text: str, where: Path) -> DictConfig:
@@ -32,7 +27,8 @@ def trusted_config(text: str, where: Path) -> DictConfig:
 
     Raises:
         ValueError: for what is no YAML, no mapping, uses aliases or interpolations, is nested too deeply, or
-            names a ``_target_`` that is no class of ``TARGETS``.
+            names a ``_target_`` that is neither a class of forewarp, by the module that defines it, nor in
+            ``ELSEWHERE``, or sends a logger out of the folder of its stage.
     """
     try:
         _check_events(text, where)
@@ -70,6 +66,7 @@ def _check(node: object, where: Path, key: str) -> None:
             inner = f"{key}.{name}" if key else str(name)
             if name == "_target_":
                 _check_target(value, where, inner)
+                _check_logger(node, where, key)
             elif str(name).startswith("_") and name not in _RESERVED:
                 raise ValueError(f"{where}: {inner}: expected no key of this name; delete it")
             _check(value, where, inner)
@@ -80,25 +77,29 @@ def _check(node: object, where: Path, key: str) -> None:
         raise ValueError(f"{where}: {key}: expected a plain value, but got {node[:80]}; write the value")
 
 
-def _locate(name: str) -> object:
-    """What a dotted name leads to, as Hydra finds it, which would log what it does not find."""
-    parts = name.split(".")
-    for count in range(len(parts), 0, -1):
-        with suppress(ModuleNotFoundError):
-            found = importlib.import_module(".".join(parts[:count]))
-            break
-    return reduce(getattr, parts[count:], found)
-
-
 def _check_target(name: object, where: Path, key: str) -> None:
-    refusal = f"{where}: {key}: expected a class of forewarp, torch or lightning, but got {name!r:.80}"
-    if not isinstance(name, str) or not name.startswith(TARGETS):
+    if isinstance(name, str) and name in ELSEWHERE:
+        return
+    refusal = (
+        f"{where}: {key}: expected a class of forewarp, or one of {', '.join(sorted(ELSEWHERE))}, "
+        f"but got {name!r:.80}"
+    )
+    if not isinstance(name, str) or not name.startswith("forewarp."):
         raise ValueError(refusal)
+    home, _, last = name.rpartition(".")
     try:
-        found = _locate(name)
+        found = getattr(importlib.import_module(home), last)
     except Exception as error:  # what imports raise
         raise ValueError(f"{refusal} ({type(error).__name__})") from None
-    # ``forewarp.cli.entry.os.system`` begins with a name that may be trusted, and is none that may.
-    home = str(getattr(found, "__module__", "")).split(".")[0]
-    if not inspect.isclass(found) or home != name.split(".")[0]:
+    # Not what a module imports: ``forewarp.cli.entry.Path`` begins with a name of ours and is none of ours.
+    if not inspect.isclass(found) or found.__module__ != home:
         raise ValueError(refusal)
+
+
+def _check_logger(node: dict, where: Path, key: str) -> None:
+    """A logger joins what it is given to the folder of the stage."""
+    for name in _PARTS & node.keys() if node["_target_"].endswith("Logger") else ():
+        if not re.fullmatch(r"(\w[\w.-]*)?", str(node[name])):
+            raise ValueError(
+                f"{where}: {key}.{name}: expected the name of a folder, but got {node[name]!r:.80}"
+            )

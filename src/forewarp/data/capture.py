@@ -9,21 +9,19 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from reprlib import repr as short
 
-import numpy as np
 import torch
 
 from forewarp.data.files import frames_of, inside, number
 from forewarp.data.images import PngHeader, inspect_png
 from forewarp.data.jpeg import inspect_jpeg
-from forewarp.data.views import check_lens, pose_of
+from forewarp.data.views import FLIP, check_lens, pose_of
 from forewarp.scene.camera import Camera
 from forewarp.scene.errors import SceneError
 from forewarp.scene.lens import Lens
 
 SPLITS = ("train", "val", "test")
 MODELS = ("OPENCV", "PINHOLE", "RADIAL", "SIMPLE_RADIAL", "SIMPLE_PINHOLE")
-FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL's axes of a camera to OpenCV's, and back
-_SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
+SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 
 
 @dataclass(frozen=True)
@@ -96,7 +94,7 @@ def read_views(file: Path, content: dict, scale: int = 1) -> list[View]:
 def name_of(folder: Path, value: object, where: str) -> str:
     """What an image is called whose path a file tells: the path without its suffix."""
     path = inside(folder, value, where)
-    return path.relative_to(folder).as_posix().removesuffix(path.suffix if path.suffix in _SUFFIXES else "")
+    return path.relative_to(folder).as_posix().removesuffix(path.suffix if path.suffix in SUFFIXES else "")
 
 
 def spread_in_time(views: list[View]) -> list[View]:
@@ -131,8 +129,9 @@ def split_views(file: Path, content: dict, views: list[View], test_every: int) -
         parts |= {home: free} if home else {}
         how = "as listed in the file"
     else:
-        parts = {"train": [v for i, v in enumerate(views) if i % test_every != test_every // 2], "val": []}
-        parts["test"] = views[test_every // 2 :: test_every]
+        held = slice(test_every // 2, -1, test_every)
+        parts = {"train": views.copy(), "val": [], "test": views[held]}
+        del parts["train"][held]
         how = f"every {test_every}th frame held out"
     if sum(map(len, parts.values())) > len({v.name for part in parts.values() for v in part}):
         raise SceneError(f"{file}: expected lists of filenames that share none, but got one in two of them")
@@ -180,9 +179,9 @@ def _file(entry: _Entry, key: str, scale: int) -> tuple[Path, str]:
         raise SceneError(f"{where}: expected images in a folder, but got {name}; set data.scale=1")
     if scale > 1:
         path = path.parent.with_name(f"{path.parent.name}_{scale}") / path.name
-    if path.suffix in _SUFFIXES:
+    if path.suffix in SUFFIXES:
         return path, name
-    found = [p for p in (path.with_name(path.name + s) for s in _SUFFIXES) if os.path.isfile(p)]
+    found = [p for p in (path.with_name(path.name + s) for s in SUFFIXES) if os.path.isfile(p)]
     if not found:
         raise SceneError(f"{where}: expected an image, PNG or JPEG, but got no {path}.png or .jpg")
     return found[0], name

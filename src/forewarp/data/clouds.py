@@ -10,16 +10,19 @@ import numpy as np
 
 from forewarp.data.files import read_bytes, replace_file
 from forewarp.data.truth import load_numpy
+from forewarp.data.views import MOST_UNITS
 from forewarp.scene.errors import SceneError
 
 _MOST_BYTES = 1 << 28  # of text
 
 
 def read_cloud(path: Path, columns: int) -> np.ndarray:
-    """The points (N, columns) float32, N >= 1, of a .npy file or of the ``v`` lines of an .obj file.
+    """The points (N, columns) float32, N >= 1, of a .npy file or of the ``v`` lines of an .obj file; their
+    places come first.
 
     Raises:
-        SceneError: where the file is missing, has another shape, or values that are not finite.
+        SceneError: where the file is missing, has another shape, values that are not finite, or places beyond
+            ``MOST_UNITS``.
     """
     points = _obj_vertices(path, columns) if path.suffix == ".obj" else load_numpy(path)
     shape = getattr(points, "shape", None)
@@ -38,6 +41,13 @@ def read_cloud(path: Path, columns: int) -> np.ndarray:
         raise SceneError(
             f"{path}: expected finite numbers, but got {points[~finite][0].tolist()} in row "
             f"{int((~finite).argmax())} and {int((~finite).sum())} such rows; export it again"
+        )
+    farthest = np.abs(points[:, :3]).max(1)
+    if farthest.max() > MOST_UNITS:
+        row = int(farthest.argmax())
+        raise SceneError(
+            f"{path}: expected points within {MOST_UNITS:g} units, but got {farthest[row]:g} in row {row}; "
+            "export it again"
         )
     return points
 

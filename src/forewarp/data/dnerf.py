@@ -24,14 +24,13 @@ from torch import Tensor
 from forewarp.data.files import frames_of, inside, number, read_json, replace_file, scene_folder
 from forewarp.data.images import CachedImage, common_header, write_png
 from forewarp.data.truth import StoredDepth, read_truth, write_depth, write_truth
-from forewarp.data.views import box_of, check_range, frustum_box, pose_of
+from forewarp.data.views import FLIP, box_of, check_range, frustum_box, pose_of
 from forewarp.scene.camera import Camera
 from forewarp.scene.errors import SceneError
 from forewarp.scene.frame import Frame, Scene, Truth
 
 ABILITIES = ("space", "time", "canonical")
 _PUBLISHED_WIDTH = 400
-_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 @dataclass(frozen=True)
@@ -191,7 +190,7 @@ def _record(folder: Path, base: Path, entry: dict, angle: float, where: str) -> 
     return _Record(
         name=image.relative_to(folder).with_suffix("").as_posix(),
         time=number(entry["time"], f"{where}.time", 0, 1),
-        pose=pose_of(entry.get("transform_matrix"), f"{where}.transform_matrix") @ _FLIP,
+        pose=pose_of(entry.get("transform_matrix"), f"{where}.transform_matrix") @ FLIP,
         angle=angle,
         image=image,
         depth=depth,
@@ -238,7 +237,7 @@ def _write_shot(folder: Path, split: str, shot: Shot, files: dict, size: tuple[i
         raise ValueError(f"{path}: expected rgba {size[:2]} + (4,), but got {tuple(shot.rgba.shape)}")
     if np.asarray(shot.rgba).dtype != np.uint8:
         raise ValueError(f"{path}: expected uint8 pixels, but got {shot.rgba.dtype}")
-    pose = pose_of(np.asarray(shot.pose, np.float64), f"{path}: pose") @ _FLIP
+    pose = pose_of(np.asarray(shot.pose, np.float64), f"{path}: pose") @ FLIP
     entry = {"file_path": path, "rotation": 0.0, "time": number(shot.time, f"{path}: time", 0, 1)}
     entry["transform_matrix"] = pose.tolist()
     write_png(folder / f"{path}.png", shot.rgba)

@@ -51,23 +51,25 @@ def read_poses(path: Path) -> list[np.ndarray]:
 def read_lenses(path: Path) -> list[np.ndarray]:
     """The matrix (3, 3) of every block: fx s cx, 0 fy cy, 0 0 1, in pixels of the stored images.
 
-    Blank lines and blanks around mean nothing.
+    A block is a camera's number and nine numbers, however they are spread over lines; cameras count up from
+    0 or from 1.
 
     Raises:
-        SceneError: naming the line where a block is not a camera's number and three rows of three numbers.
+        SceneError: naming the line where a block is anything else.
     """
-    lines, matrices = _lines(path), []
-    for k, block in enumerate(lines[i : i + 4] for i in range(0, len(lines), 4)):
-        line, words = block[0]
-        if words != [str(k)]:
+    words = [(line, word) for line, row in _lines(path) for word in row]
+    first, matrices = int(words[0][1] == "1"), []
+    for k, block in enumerate((words[i : i + 10] for i in range(0, len(words), 10)), first):
+        line, word = block[0]
+        if word != str(k):
+            raise SceneError(f"{path}: line {line}: expected the number {k} of a camera, but got {word!r}")
+        if len(block) < 10:
             raise SceneError(
-                f"{path}: line {line}: expected the number {k} of a camera, but got {' '.join(words)!r}"
+                f"{path}: line {block[-1][0]}: expected nine numbers of camera {k}, but got the end of the "
+                f"file after {len(block) - 1}"
             )
-        if len(block) < 4:
-            raise SceneError(
-                f"{path}: line {block[-1][0]}: expected three rows of camera {k}, but got the end of the file"
-            )
-        matrices.append(_matrix(block[1:], path))
+        rows = (block[i : i + 3] for i in (1, 4, 7))
+        matrices.append(_matrix([(row[0][0], [word for _, word in row]) for row in rows], path))
     return matrices
 
 
@@ -103,7 +105,7 @@ def write_lenses(path: Path, cameras: Sequence[Camera]) -> None:
 
 def _lines(path: Path) -> list[tuple[int, list[str]]]:
     """The lines that are not blank, as their numbers from 1 and their words."""
-    text = read_bytes(path).decode(errors="replace")
+    text = read_bytes(path).decode("utf-8-sig", errors="replace")
     found = [(n, line.split()) for n, line in enumerate(text.split("\n"), 1) if line.strip()]
     if not found:
         raise SceneError(f"{path}: expected at least one camera, but got an empty file")

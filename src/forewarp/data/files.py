@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import math
+import operator
 import os
 import stat
 from pathlib import Path
@@ -89,12 +90,29 @@ def number(value: object, where: str, low: float = -math.inf, high: float = math
     return float(value)
 
 
+def whole(value: object, where: str, least: int, multiple: int = 1) -> int:
+    """A whole number of at least ``least`` that ``multiple`` divides; ``where`` names the key to set.
+
+    >>> whole(16, "size", 8)
+    16
+    """
+    try:
+        good = operator.index(value) >= least and value % multiple == 0 and not isinstance(value, bool)
+    except TypeError:
+        good = False
+    if not good:
+        kind = "a whole number" if multiple == 1 else f"a multiple of {multiple}"
+        raise SceneError(f"{where}: expected {kind} of at least {least}, but got {short(value)}; set {where}")
+    return operator.index(value)
+
+
 def inside(folder: Path, name: object, where: str) -> Path:
     """The path ``name`` says, relative to ``folder``; leaving the folder is an error.
 
-    Judged by the text alone, so a folder may link to where its images really are.
+    Judged by the text alone, so a folder may link to where its images really are. A backslash, which
+    elsewhere divides folders, is refused.
     """
-    if not isinstance(name, str) or not name or any(category(c) in _UNPRINTABLE for c in name):
+    if not isinstance(name, str) or not name or any(category(c) in _UNPRINTABLE or c == "\\" for c in name):
         raise SceneError(f"{where}: expected a path inside the scene folder, but got {short(name)}")
     normal = os.path.normpath(name)
     if os.path.isabs(normal) or normal.split(os.sep)[0] in ("..", "."):
@@ -113,7 +131,9 @@ def scene_folder(root: str | Path, scene: str, marker: str) -> Path:
         raise SceneError(f"data.root: expected an existing folder, but got {root}; set data.root")
     if not scene or not (root / scene / marker).is_file():
         there = ", ".join(sorted(p.name for p in root.iterdir() if (p / marker).is_file())) or "none"
-        raise SceneError(
-            f"{root / scene}: expected a scene with {marker}, but got none; scenes in {root}: {there}"
-        )
+        advice = f"scenes in {root}: {there}"
+        if (root / marker).is_file():
+            folder = root.resolve()
+            advice = f"did you mean data.root={folder.parent} data.scene={folder.name}?"
+        raise SceneError(f"{root / scene}: expected a scene with {marker}, but got none; {advice}")
     return root / scene

@@ -6,9 +6,10 @@ import hashlib
 import os
 from pathlib import Path
 
-from forewarp.data.files import read_bytes
+from forewarp.data.files import MOST_TEXT, read_bytes
 
 _READ = {".json", ".inf", ".txt", ".csv"}  # small and decisive: their content counts
+LOCK = ".lock"  # of every folder of a run
 _LISTED = {".png", ".jpg", ".jpeg", ".npy", ".npz", ".ply", ".obj"}  # name and size
 
 
@@ -16,17 +17,19 @@ def fingerprint(folder: Path) -> dict:
     """The scene's files in a few numbers: the SHA-256 of each text file by name, and of the list of names and
     sizes of all others, with how many and how large these are together.
 
-    Hidden files and those of other kinds do not count. Symbolic links to files count as the files.
+    A text larger than any that is read is one of the others. Hidden files and those of other kinds do not
+    count, nor does the folder of a run, which may lie below the scene's. Symbolic links to files count as the
+    files.
 
     Cost: reads the text files; a look at every other one, about 5 microseconds.
     """
     texts, listed = {}, []
     for path in _files(folder):
-        name, suffix = path.relative_to(folder).as_posix(), path.suffix.lower()
-        if suffix in _READ:
+        name, suffix, size = path.relative_to(folder).as_posix(), path.suffix.lower(), path.stat().st_size
+        if suffix in _READ and size <= MOST_TEXT:
             texts[name] = hashlib.sha256(read_bytes(path)).hexdigest()
-        elif suffix in _LISTED:
-            listed.append((name, path.stat().st_size))
+        elif suffix in _READ | _LISTED:
+            listed.append((name, size))
     digest = hashlib.sha256(
         "".join(f"{size} {name}\n" for name, size in listed).encode(errors="surrogatepass")
     )
@@ -52,7 +55,8 @@ def _files(folder: Path) -> list[Path]:
     found, been = [], set()
     for place, folders, names in os.walk(folder, followlinks=True):
         real = os.path.realpath(place)
-        if real in been:  # a link in a circle
+        of_a_run = LOCK in names and Path(place) != folder
+        if real in been or of_a_run:  # been: a link in a circle
             folders.clear()
             continue
         been.add(real)

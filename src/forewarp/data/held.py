@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from forewarp.data.files import whole
 from forewarp.scene.errors import SceneError
 from forewarp.scene.frame import Scene
 
@@ -21,9 +22,7 @@ def hold_out(scene: Scene, count: int) -> Scene:
     Raises:
         SceneError: where that is more than the scene can spare.
     """
-    if type(count) is not int or count < 0:
-        raise SceneError(f"data.held_out: expected a whole number of frames >= 0, but got {count}")
-    if count == 0:
+    if whole(count, "data.held_out", 0) == 0:
         return scene
     kept = {scene.times[0], scene.times[-1], scene.canonical_time}
     frames = sorted((f.time, i) for i, f in enumerate(scene.train) if f.time not in kept)

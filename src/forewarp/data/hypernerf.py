@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from forewarp.data.clouds import read_cloud, write_cloud
-from forewarp.data.files import inside, number, read_json, replace_file, scene_folder
+from forewarp.data.files import inside, number, read_json, replace_file, scene_folder, whole
 from forewarp.data.images import CachedImage, inspect_png, write_png
 from forewarp.data.nerfies_camera import numbers, read_camera, reduced, write_camera
 from forewarp.data.nerfies_items import read_split, read_times
@@ -57,12 +57,6 @@ class _World:
     def normalised(self, points: Tensor) -> Tensor:
         """Unscaled world (..., 3) to normalised, float64."""
         return (points.double() - self.center) * self.scale
-
-    def cloud(self, points: Tensor, path: Path) -> Tensor:
-        """Points of a file (..., 3) in normalised units, float32."""
-        if (farthest := float(points.abs().max())) > MOST_UNITS:
-            raise SceneError(f"{path}: expected points within {MOST_UNITS:g} units, but got {farthest:g}")
-        return self.normalised(points).float()
 
     def camera(self, path: Path) -> Camera:
         """The camera of a file in normalised units."""
@@ -116,9 +110,9 @@ def read_scene(root: str | Path, scene: str, *, scale: int = 2, box: Sequence[fl
     bounds = frustum_box(f.camera for f in train) if box is None else box_of(box)
     truth = read_truth(folder / "trajectories.npz", canonical)
     if truth is not None:
-        truth = replace(truth, points=world.cloud(truth.points, folder / "trajectories.npz"))
+        truth = replace(truth, points=world.normalised(truth.points).float())
     cloud = folder / "points.npy"
-    still = world.cloud(torch.from_numpy(read_cloud(cloud, 3)), cloud) if cloud.exists() else None
+    still = world.normalised(torch.from_numpy(read_cloud(cloud, 3))).float() if cloud.exists() else None
     return Scene(scene, train, (), test, bounds, canonical, False, truth, protocol, still)
 
 
@@ -174,9 +168,7 @@ def write_scene(
 
 
 def _image_folder(folder: Path, scale: int) -> Path:
-    if isinstance(scale, bool) or not isinstance(scale, int) or scale < 1:
-        raise SceneError(f"data.scale: expected a whole number of at least 1, but got {scale!r}")
-    images = folder / "rgb" / f"{scale}x"
+    images = folder / "rgb" / f"{whole(scale, 'data.scale', 1)}x"
     if not images.is_dir():
         there = sorted((p.name for p in folder.glob("rgb/*x") if p.is_dir()), key=lambda n: (len(n), n))
         raise SceneError(

@@ -72,7 +72,7 @@ def read_image(path: Path) -> Tensor:
     else:  # of another kind the size is known only to its decoder
         raise SceneError(f"{path}: expected a PNG or JPEG image, but got a file of another kind")
     try:
-        pixels = iio.imread(content, plugin="pillow", mode="RGBA")
+        pixels = iio.imread(content, index=0, plugin="pillow", mode="RGBA")  # of a film the first
     except Exception as error:  # decoders raise OSError, SyntaxError, struct.error and more
         raise SceneError(
             f"{path}: expected an image, but got data that cannot be decoded ({error})"
@@ -105,7 +105,7 @@ def read_gray16(path: Path) -> np.ndarray:
     content = _bytes(path)
     _inspect(content, path, gray16=True)
     try:
-        return np.asarray(iio.imread(content, plugin="pillow"), np.uint16)
+        return np.asarray(iio.imread(content, index=0, plugin="pillow"), np.uint16)
     except Exception as error:  # as in read_image
         raise SceneError(
             f"{path}: expected an image, but got data that cannot be decoded ({error})"
@@ -187,7 +187,10 @@ def _inspect(content: bytes, path: Path, gray16: bool = False) -> PngHeader:
             raise SceneError(
                 f"{path}: expected an unharmed PNG image, but got a wrong checksum; copy the file again"
             )
-        header = content[at + 8 : end] if kind == b"IHDR" else header
+        # Of two headers the decoder takes the first and looks at it wherever it stands.
+        if (kind == b"IHDR") != (at == 8):
+            raise SceneError(f"{path}: expected a PNG that begins with its only header, but got another")
+        header = content[at + 8 : end] if at == 8 else header
         transparent |= kind == b"tRNS"
         at = end + 4
     if len(header) != 13:

@@ -48,17 +48,21 @@ def jpeg_size(stream: BinaryIO, path: Path) -> tuple[int, int]:
         raise SceneError(f"{path}: expected an image, but got an empty file")
     if start != SIGNATURE:
         raise SceneError(f"{path}: expected a JPEG image, but got a file of another kind")
-    kind, length = _next_segment(stream, path)
-    while kind not in _FRAMES:
+    header, kind = b"", 0
+    while kind != _SCAN:
+        kind, length = _next_segment(stream, path)
         if kind in _OTHER_FRAMES:
             raise SceneError(
                 f"{path}: expected a baseline or progressive JPEG image, but got another kind; convert it"
             )
-        if kind == _SCAN:
-            raise SceneError(f"{path}: expected a JPEG image, but got one without a header")
-        stream.seek(length - 2, os.SEEK_CUR)
-        kind, length = _next_segment(stream, path)
-    header = stream.read(6)
+        if kind not in _FRAMES:
+            stream.seek(length - 2, os.SEEK_CUR)
+        elif header:  # of two sizes the decoder takes the last
+            raise SceneError(f"{path}: expected a JPEG image with one header, but got two")
+        else:
+            header = stream.read(length - 2) or b"-"
+    if not header:
+        raise SceneError(f"{path}: expected a JPEG image, but got one without a header")
     if len(header) < 6 or not _has_end(stream):
         raise SceneError(f"{path}: expected a whole JPEG image, but got a truncated one; copy the file again")
     bits, channels = header[0], header[5]

@@ -16,7 +16,8 @@ _FOREGROUND = 127  # a mask above it is foreground; masks are lossy, so never qu
 class MaskedImage:
     """An image cut out by a mask, decoded when asked for: uint8 (H, W, 4), 0 where alpha is.
 
-    Only the smallest rectangle that holds the foreground is kept, a fraction of most images.
+    Where the image has an alpha of its own, it counts inside the mask. Only the smallest rectangle that holds
+    the foreground is kept, a fraction of most images.
 
     Args:
         image, mask: files of one size; a mask's first channel counts, above 127 is foreground.
@@ -40,8 +41,7 @@ class MaskedImage:
     def _decode(self) -> Tensor:
         """The foreground's rectangle; notes where it lies."""
         rgba = read_sized(self.image, self.size)
-        on = read_sized(self.mask, self.size)[..., 0] > _FOREGROUND
-        rgba[..., 3] = 255
+        on = (read_sized(self.mask, self.size)[..., 0] > _FOREGROUND) & (rgba[..., 3] > 0)
         rgba *= on[..., None]
         if self.halve:
             rgba = halved_cutout(rgba)
@@ -60,7 +60,7 @@ def halved_cutout(rgba: Tensor) -> Tensor:
     What lies behind a cut-out is another place; averaged in, it would rim every silhouette.
 
     Args:
-        rgba: colour 0 wherever alpha is 0, alpha 0 or 255.
+        rgba: colour 0 wherever alpha is 0; where it is not, pixels count alike.
 
     >>> halved_cutout(torch.tensor([[[9, 9, 9, 255], [0] * 4], [[0] * 4, [3, 3, 3, 255]]], dtype=torch.uint8))
     tensor([[[  6,   6,   6, 128]]], dtype=torch.uint8)

@@ -59,16 +59,16 @@ def read_split(path: Path) -> Split:
 
 
 def read_times(path: Path, ids: list[str]) -> dict[str, float]:
-    """The time in [0, 1] of every item of a ``metadata.json``: ``time_id``, or where no item has one
-    ``warp_id``, over the greatest of them.
+    """The time in [0, 1] of every item of a ``metadata.json``: ``time_id``, or where none of ``ids`` has one
+    ``warp_id``, over the greatest of them. Entries of other items are not looked at.
 
     Raises:
         SceneError: for an item that is missing or has no time.
     """
     content, numbered = read_json(path), {}
-    key = "time_id" if any(isinstance(e, dict) and "time_id" in e for e in content.values()) else "warp_id"
-    for item in ids:
-        entry = content.get(item)
+    entries = [content.get(item) for item in ids]
+    key = "time_id" if any(isinstance(e, dict) and "time_id" in e for e in entries) else "warp_id"
+    for item, entry in zip(ids, entries):
         if not isinstance(entry, dict):
             raise SceneError(f"{path}: {item!r}: expected an object for this item, but got {short(entry)}")
         value = number(entry.get(key), f"{path}: {item!r}.{key}", 0, _MOST_MOMENTS)

@@ -18,11 +18,11 @@ import torch
 
 from forewarp.data.clouds import read_cloud, write_cloud
 from forewarp.data.dome_cameras import read_cameras, write_cameras
-from forewarp.data.files import scene_folder
+from forewarp.data.files import scene_folder, whole
 from forewarp.data.images import check_size
 from forewarp.data.jpeg import inspect_jpeg, write_jpeg
 from forewarp.data.masked import MaskedImage
-from forewarp.data.truth import read_truth, write_truth
+from forewarp.data.truth import read_truth, shortened, write_truth
 from forewarp.data.views import box_of
 from forewarp.scene.box import Box
 from forewarp.scene.camera import Camera
@@ -58,7 +58,7 @@ def read_scene(
     Args:
         half_resolution: average 2 x 2 pixels; an odd last row or column is cut off.
         box: x0 y0 z0 x1 y1 z1 in world units; None takes the bounds of all point clouds, 10 % wider per side.
-        frames: how many, from the first; where there are fewer, all.
+        frames: how many, from the first; where there are fewer, all. The last of them is at the time 1.
         test_views: numbers of the cameras held out; None spreads 6 of every 56 over them.
         test_every: measure every n-th frame only.
 
@@ -72,7 +72,7 @@ def read_scene(
         raise SceneError(f"data.half_resolution: expected true or false, but got {half_resolution!r}")
     poses, lenses = read_cameras(folder)
     held = _held_out(test_views, len(poses), folder)
-    every, moments = _positive(test_every, "data.test_every"), _moments(folder, frames)
+    every, (moments, there) = whole(test_every, "data.test_every", 1), _moments(folder, frames)
     sizes = _read_sizes(folder, moments, len(poses), half_resolution)
     bounds = _bounds(folder, moments) if box is None else box_of(box)
     cameras = [_camera(*of, half_resolution, bounds) for of in zip(sizes, lenses, poses, strict=True)]
@@ -95,7 +95,7 @@ def read_scene(
         "test_frames": len(test),
         "mask_box": True,
     }
-    truth = read_truth(folder / "trajectories.npz", 0.0)
+    truth = _trajectories(folder, moments, there)
     return Scene(scene, train, (), test, bounds, 0.0, True, truth, protocol)
 
 
@@ -149,12 +149,6 @@ def _remove(folder: Path) -> None:
             emptied.rmdir()
 
 
-def _positive(value: object, key: str) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-        raise SceneError(f"{key}: expected a whole number of at least 1, but got {value!r}")
-    return value
-
-
 def _held_out(views: Sequence[int] | None, count: int, folder: Path) -> list[int]:
     """The cameras that are measured, ascending."""
     if count < 2:
@@ -170,16 +164,24 @@ def _held_out(views: Sequence[int] | None, count: int, folder: Path) -> list[int
     return sorted(views)
 
 
-def _moments(folder: Path, frames: int) -> int:
-    """How many frames there are to read, numbered from 0 without a gap."""
-    wanted, place = _positive(frames, "data.frames"), folder / "img"
+def _moments(folder: Path, frames: int) -> tuple[int, int]:
+    """How many frames there are to read, numbered from 0 without a gap, and how many there are."""
+    wanted, place = whole(frames, "data.frames", 1), folder / "img"
     there = {p.name for p in place.iterdir() if p.is_dir()} if place.is_dir() else set()
     numbers = [int(name) for name in there if name.isdecimal() and name == str(int(name))]
     count = min(wanted, len(numbers))
     missing = [f for f in range(max(count, 1)) if str(f) not in there]
     if missing:
         raise SceneError(f"{place / str(missing[0])}: expected a folder of images, but got none")
-    return count
+    return count, len(numbers)
+
+
+def _trajectories(folder: Path, moments: int, there: int) -> Truth | None:
+    """The true ones of the first ``moments``; the file's times are those of all frames that are there."""
+    truth = read_truth(folder / "trajectories.npz", 0.0)
+    if truth is None or moments == there:
+        return truth
+    return shortened(truth, (moments - 1) / (there - 1))
 
 
 def _read_sizes(folder: Path, moments: int, views: int, halve: bool) -> list[tuple[int, int]]:

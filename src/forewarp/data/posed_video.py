@@ -17,13 +17,21 @@ from reprlib import repr as short
 import numpy as np
 from torch import Tensor
 
-from forewarp.data.capture import FLIP, SPLITS, View, read_views, split_views, spread_in_time
-from forewarp.data.files import number, read_json, replace_file, scene_folder
+from forewarp.data.capture import (
+    SPLITS,
+    SUFFIXES,
+    View,
+    name_of,
+    read_views,
+    split_views,
+    spread_in_time,
+)
+from forewarp.data.files import number, read_json, replace_file, scene_folder, whole
 from forewarp.data.images import CachedImage, write_png
 from forewarp.data.jpeg import write_jpeg
 from forewarp.data.masked import MaskedImage
 from forewarp.data.region import region_of
-from forewarp.data.views import MOST_UNITS, box_of, middle_of, pose_of
+from forewarp.data.views import FLIP, MOST_UNITS, box_of, middle_of, pose_of
 from forewarp.scene.box import Box
 from forewarp.scene.camera import Camera
 from forewarp.scene.errors import SceneError
@@ -62,6 +70,9 @@ def read_scene(
 ) -> Scene:
     """Read ``root/scene``; pixels are decoded when a frame is first loaded.
 
+    The subject is cut out where there are masks, or where some image's alpha lets anything through: of images
+    that have an alpha those up to the first such one are decoded.
+
     Without ``time`` in the frames they are spread evenly over [0, 1] in the order of their files' names.
 
     Args:
@@ -70,7 +81,8 @@ def read_scene(
         box: x0 y0 z0 x1 y1 z1 in the file's units; None takes the file's ``aabb``, or all that is seen.
         normalise: put what is looked at into the origin and the farthest camera at distance 1.
         canonical: the training time nearest to the ``middle``, or the ``first``.
-        test_every: every n-th frame is a test frame, where the file does not list ``<split>_filenames``.
+        test_every: every n-th frame is a test frame, the first and the last never, where the file does not
+            list ``<split>_filenames``.
 
     Raises:
         SceneError: for every file or value that is missing or wrong, with file and key.
@@ -83,7 +95,7 @@ def read_scene(
     views = spread_in_time(views) if spread else sorted(views, key=lambda v: v.time)
     parts, how = split_views(file, content, views, test_every)
     near, far, bounds = _limits(file, content, near, far, box)
-    has_alpha = views[0].mask is not None or bool((_load(views[0])()[..., 3] < 255).any())
+    has_alpha = any(v.mask is not None or _lets_through(v) for v in views)
     options = {"near": near, "far": far, "box": bounds, "normalise": normalise, "cut_out": has_alpha}
     region = region_of([v.camera for v in views], str(file), **options)
     train, val, test = (
@@ -120,12 +132,13 @@ def write_scene(
         near, far, aabb: where known, in the units of the cameras' places.
 
     Raises:
-        ValueError: for a shot that could not be read again.
+        ValueError: for a shot that could not be read again, whatever the others are.
     """
     folder = Path(folder)
     (folder / FILE).unlink(missing_ok=True)
-    entries, lists = [], {split: [] for split in SPLITS}
+    entries, lists, taken = [], {split: [] for split in SPLITS}, set()
     for shot in shots:
+        _check_shot(folder, shot, taken)
         entries.append(_write_shot(folder, shot))
         if shot.split:
             lists[shot.split].append(entries[-1]["file_path"])
@@ -139,17 +152,30 @@ def write_scene(
     replace_file(folder / FILE, json.dumps(content, indent=1).encode())
 
 
-def _write_shot(folder: Path, shot: PosedShot) -> dict:
-    """Write one image and give its entry."""
+def _check_shot(folder: Path, shot: PosedShot, taken: set[str]) -> None:
+    """Refuse what ``read_scene`` would; ``taken`` are the names of the shots before, and now this one's."""
     camera, pixels = shot.camera, np.asarray(shot.pixels)
+    suffix, name = Path(shot.name).suffix, name_of(folder, f"images/{shot.name}", f"shots: {shot.name!r}")
+    if suffix not in SUFFIXES:
+        raise ValueError(f"{shot.name}: expected a name in {', '.join(SUFFIXES)}, but got {suffix!r}")
+    if name in taken:
+        raise ValueError(f"{shot.name}: expected names that differ without their suffix, but got two alike")
+    taken.add(name)
     if shot.split not in ("", *SPLITS):
         raise ValueError(f"{shot.name}: expected a split of {', '.join(SPLITS)}, but got {shot.split!r}")
+    if pixels.shape[2:] == (4,) and not _is_png(shot.name):
+        raise ValueError(f"{shot.name}: expected 3 channels, as a JPEG has no alpha, but got 4; name it .png")
     shapes = [(camera.height, camera.width, channels) for channels in (3, 4)]
     if pixels.dtype != np.uint8 or pixels.shape not in shapes or camera.skew:
         raise ValueError(
             f"{shot.name}: expected uint8 pixels of shape {shapes[0]} or {shapes[1]} and no skew, but got "
             f"{pixels.dtype} of {pixels.shape} and a skew of {camera.skew:g}"
         )
+
+
+def _write_shot(folder: Path, shot: PosedShot) -> dict:
+    """Write one image and give its entry."""
+    camera = shot.camera
     entry = {"file_path": f"images/{shot.name}", "w": camera.width, "h": camera.height}
     entry |= {
         "fl_x": camera.fx,
@@ -163,9 +189,13 @@ def _write_shot(folder: Path, shot: PosedShot) -> dict:
     if shot.time is not None:
         entry["time"] = number(shot.time, f"{shot.name}: time", 0, 1)
     entry["transform_matrix"] = (pose_of(camera.camera_to_world.tolist(), shot.name) @ FLIP).tolist()
-    write = write_png if shot.name.endswith(".png") else write_jpeg
-    write(folder / entry["file_path"], pixels)
+    write = write_png if _is_png(shot.name) else write_jpeg
+    write(folder / entry["file_path"], np.asarray(shot.pixels))
     return entry
+
+
+def _is_png(name: str) -> bool:
+    return name.lower().endswith(".png")
 
 
 def _check(scale: int, canonical: str, test_every: int, normalise: bool) -> None:
@@ -174,8 +204,7 @@ def _check(scale: int, canonical: str, test_every: int, normalise: bool) -> None
         raise SceneError(f"data.scale: expected one of {SCALES}, but got {scale!r}")
     if canonical not in ("middle", "first"):
         raise SceneError(f"data.canonical: expected middle or first, but got {canonical!r}")
-    if type(test_every) is not int or test_every < 2:
-        raise SceneError(f"data.test_every: expected a whole number >= 2, but got {test_every!r}")
+    whole(test_every, "data.test_every", 2)
     if not isinstance(normalise, bool):
         raise SceneError(f"data.normalise: expected true or false, but got {normalise!r}")
 
@@ -183,6 +212,11 @@ def _check(scale: int, canonical: str, test_every: int, normalise: bool) -> None
 def _load(view: View) -> CachedImage | MaskedImage:
     size = (view.camera.width, view.camera.height)
     return CachedImage(view.image, size) if view.mask is None else MaskedImage(view.image, view.mask, size)
+
+
+def _lets_through(view: View) -> bool:
+    """Whether anything of an image is not opaque; decodes it where its header says that there is an alpha."""
+    return view.has_alpha and bool((_load(view)()[..., 3] < 255).any())
 
 
 def _limits(

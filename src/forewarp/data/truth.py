@@ -19,6 +19,7 @@ from forewarp.scene.errors import SceneError
 from forewarp.scene.frame import Truth
 
 _MOST_BYTES = 1 << 30  # of arrays, unpacked
+_SAME_TIME = 1e-6
 
 
 class StoredDepth:
@@ -82,12 +83,20 @@ def read_truth(path: Path, canonical_time: float) -> Truth | None:
     if points.ndim != 3 or points.shape[1:] != (times.size, 3) or times.ndim != 1 or not points.size:
         got = f"{points.shape} and {times.shape}"
         raise SceneError(f"{path}: expected points (N, T, 3) and times (T,), but got {got}")
-    if times.min() < 0 or times.max() > 1 or abs(times[0] - canonical_time) > 1e-6:
+    if times.min() < 0 or times.max() > 1 or abs(times[0] - canonical_time) > _SAME_TIME:
         raise SceneError(
             f"{path}: times: expected numbers in [0, 1] that begin at the canonical time {canonical_time:g}, "
             f"but got {times.min():g} to {times.max():g} beginning at {times[0]:g}"
         )
     return Truth(torch.from_numpy(points.astype(np.float32)), torch.from_numpy(times.astype(np.float64)))
+
+
+def shortened(truth: Truth, end: float) -> Truth | None:
+    """The trajectories up to the time ``end``, which becomes 1; None where fewer than two times are left."""
+    kept = truth.times <= end + _SAME_TIME
+    if end <= 0 or int(kept.sum()) < 2:
+        return None
+    return Truth(truth.points[:, kept], (truth.times[kept] / end).clamp(max=1))
 
 
 def write_truth(path: Path, truth: Truth) -> None:

@@ -13,6 +13,7 @@ from forewarp.scene.box import Box
 from forewarp.scene.camera import Camera
 from forewarp.scene.errors import SceneError
 
+FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL's axes of a camera to OpenCV's, and back
 MOST_UNITS = 1e9  # from the origin: farther off single precision is long lost
 _SAME_PIXEL = 0.01
 # Poses are stored with six digits or more; a scale or a shear in a pose is never this small.

@@ -87,3 +87,13 @@ def in_a_row(pictures: list[Tensor], gap: int = 4) -> Tensor:
     """Pictures (H, W_i, 3) of one height side by side, white between."""
     white = pictures[0].new_ones(pictures[0].shape[0], gap, 3)
     return torch.cat([part for picture in pictures for part in (white, picture)][1:], 1)
+
+
+def at_least(picture: Tensor, side: int) -> Tensor:
+    """The picture (H, W, 3) with every pixel repeated so often that its shorter side has ``side`` or more.
+
+    >>> at_least(torch.zeros(100, 120, 3), 300).shape
+    torch.Size([300, 360, 3])
+    """
+    times = max(1, math.ceil(side / min(picture.shape[:2])))
+    return picture.repeat_interleave(times, 0).repeat_interleave(times, 1)

@@ -36,6 +36,11 @@ class Together:
         """The static one's."""
         return self.still.lattice
 
+    @property
+    def pitch(self) -> float:
+        """Of the two that of the finer, whichever it is: what moves may lie in a small box."""
+        return min(self.moving.pitch, self.still.pitch)
+
     @cached_property
     def cells(self) -> Tensor:
         """Cells in which either may hold matter."""

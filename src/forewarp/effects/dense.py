@@ -44,7 +44,7 @@ def densify(grid: RadianceGrid, crop: Crop) -> Tensor:
     rows = grid.index[region].reshape(-1).long()
     padded = torch.cat([grid.values, grid.fill[None]])
     dense = padded.index_select(0, torch.where(rows < 0, len(padded) - 1, rows))
-    return dense.T.reshape(1, -1, *crop.shape)
+    return dense.reshape(1, *crop.shape, -1).permute(0, 4, 1, 2, 3)
 
 
 def sparsify(grid: RadianceGrid, lattice: Lattice, crop: Crop, dense: Tensor) -> RadianceGrid:
@@ -53,6 +53,5 @@ def sparsify(grid: RadianceGrid, lattice: Lattice, crop: Crop, dense: Tensor) ->
     count = dense[0, 0].numel()
     rows = torch.arange(count, dtype=torch.int32, device=dense.device).reshape(crop.shape)
     index[tuple(slice(l, h + 1) for l, h in zip(crop.low, crop.high))] = rows
-    return replace(
-        grid, lattice=lattice, index=index, values=dense.reshape(dense.shape[1], -1).T.contiguous()
-    )
+    values = dense[0].permute(1, 2, 3, 0).reshape(count, -1)
+    return replace(grid, lattice=lattice, index=index, values=values)

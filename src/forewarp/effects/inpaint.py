@@ -20,13 +20,26 @@ class ConvBlock(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """(1, I, x, y, z) -> (1, O, x, y, z)."""
-        normed = self.norm(x) if x[0, 0].numel() > 1 else x
-        return functional.relu(self.conv(normed))
+        if x[0, 0].numel() > 1:
+            # Of one volume the same as instance norm, which would put the channels first again.
+            x = functional.batch_norm(x, None, None, self.norm.weight, self.norm.bias, training=True)
+        return functional.relu(self.conv(x), inplace=True)
 
 
-def zero_head(inputs: int, outputs: int) -> nn.Conv3d:
+class Pointwise(nn.Conv3d):
+    """A convolution of one voxel: a product of matrices where the channels lie last."""
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__(inputs, outputs, 1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(1, I, x, y, z) -> (1, O, x, y, z), channels last."""
+        return functional.linear(x.movedim(1, -1), self.weight.flatten(1), self.bias).movedim(-1, 1)
+
+
+def zero_head(inputs: int, outputs: int) -> Pointwise:
     """A layer that says 0 until it has learned."""
-    head = nn.Conv3d(inputs, outputs, 1)
+    head = Pointwise(inputs, outputs)
     nn.init.zeros_(head.weight)
     nn.init.zeros_(head.bias)
     return head

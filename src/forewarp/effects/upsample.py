@@ -11,7 +11,7 @@ from torch.nn import functional
 from torch.utils.checkpoint import checkpoint
 
 from forewarp.effects.dense import Crop, densify, occupied_crop, sparsify
-from forewarp.effects.inpaint import ConvBlock, zero_head
+from forewarp.effects.inpaint import ConvBlock, Pointwise, zero_head
 from forewarp.ops.grid import index_of, occupied_cells, trilinear
 from forewarp.scene.box import Lattice
 from forewarp.scene.state import RadianceGrid
@@ -84,7 +84,7 @@ class LearnedUpsampler(TrilinearUpsampler):
                 f"model.upsampler.scale: the learned layer expects a whole number, but got {scale}"
             )
         self.scale, self.margin, self.recompute = int(scale), margin, recompute
-        self.project = nn.Conv3d(features or channels, width, 1)
+        self.project = Pointwise(features or channels, width)
         self.layers = nn.Sequential(ConvBlock(width, width), ConvBlock(width, width))
         self.head = zero_head(width, channels)
 

@@ -110,7 +110,33 @@ class VoxelGrid(nn.Module):
 
     def set_extra_state(self, state: dict) -> None:
         """Adopt a checkpoint's lattice."""
-        self.lattice = Lattice(Box(tuple(state["low"]), tuple(state["high"])), tuple(state["shape"]))
+        self.lattice = _lattice(state)
+
+    def misfit(self, state: dict, prefix: str) -> str | None:
+        """The entry of a stored state that does not fit the others; None where all do.
+
+        Kernels believe the index: one that points elsewhere would end the process and not the call.
+        """
+        try:
+            lattice = _lattice(state[prefix + "_extra_state"])
+        except (KeyError, TypeError, ValueError, OverflowError):
+            return "_extra_state"
+        voxels, index = (state.get(prefix + name) for name in ("voxels", "index"))
+        if not _is(voxels, torch.int64) or voxels.ndim != 2 or voxels.shape[1] != 3:
+            return "voxels"
+        last = torch.tensor(lattice.shape) - 1
+        if not bool(((voxels >= 0) & (voxels <= last)).all()):
+            return "voxels"
+        if not _is(index, torch.int32) or tuple(index.shape) != lattice.shape:
+            return "index"
+        if not torch.equal(index, index_of(voxels, lattice.shape)):
+            return "index"
+        for name in self.names:
+            values, own = state.get(prefix + name), self.parameter(name)
+            good = torch.is_tensor(values) and values.is_floating_point()
+            if not good or tuple(values.shape) != (len(voxels), own.shape[1]):
+                return name
+        return None
 
     def _load_from_state_dict(self, state_dict, prefix, *args, **kwargs) -> None:
         for name in ("voxels", "index"):
@@ -121,3 +147,11 @@ class VoxelGrid(nn.Module):
                 p = self.parameter(name)
                 p.data = p.data.new_empty(state_dict[prefix + name].shape)
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
+
+
+def _lattice(state: dict) -> Lattice:
+    return Lattice(Box(tuple(state["low"]), tuple(state["high"])), tuple(state["shape"]))
+
+
+def _is(value: object, dtype: torch.dtype) -> bool:
+    return torch.is_tensor(value) and value.dtype == dtype

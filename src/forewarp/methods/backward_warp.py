@@ -72,6 +72,11 @@ class MovedField:
         """The canonical lattice; points are given in it."""
         return self.canonical.lattice
 
+    @property
+    def pitch(self) -> float:
+        """The canonical lattice's."""
+        return self.canonical.pitch
+
     def _moved(self, points: Tensor) -> Tensor:
         displacement = self.deformation(self.lattice.to_world(points), self.time)
         return points + displacement / points.new_tensor(self.lattice.spacing)

@@ -6,14 +6,15 @@ from torch import Tensor
 
 
 def check_shape(name: str, tensor: Tensor, shape: tuple[int | str, ...]) -> None:
-    """Raise ValueError unless ``tensor`` has ``shape``; a letter stands for any size.
+    """Raise ValueError unless ``tensor`` has ``shape``; a letter stands for any size, "..." in front for any
+    number of them.
 
     >>> import torch
     >>> check_shape("points", torch.zeros(4, 3), ("P", 3))
     """
-    fits = tensor.dim() == len(shape) and all(
-        isinstance(s, str) or s == n for s, n in zip(shape, tensor.shape)
-    )
+    last = shape[1:] if shape[0] == "..." else shape
+    found = tuple(tensor.shape)[-len(last) :] if shape[0] == "..." else tuple(tensor.shape)
+    fits = len(found) == len(last) and all(isinstance(s, str) or s == n for s, n in zip(last, found))
     if not fits:
         wanted = "(" + ", ".join(str(s) for s in shape) + ")"
         raise ValueError(f"{name}: expected shape {wanted}, but got {tuple(tensor.shape)}")

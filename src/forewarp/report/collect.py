@@ -10,6 +10,8 @@ from pathlib import Path
 
 import yaml
 
+MOST_BYTES = 1 << 20  # of a config: ours have a few thousand
+
 
 @dataclass(frozen=True)
 class Point:
@@ -84,9 +86,10 @@ class Result:
     @property
     def ability(self) -> str:
         """The kind of test view that its numbers are of: ``all``, or, where a scene tells them apart,
-        ``time``: a new view between the training times.
+        ``time``: a new view between the training times; the kind it has where it has none of these.
         """
-        return "all" if "all" in self.metrics["test"] else "time"
+        known = self.metrics["test"]
+        return [*(kind for kind in ("all", "time") if kind in known), *known, "all"][0]
 
     @property
     def numbers(self) -> dict[str, float]:
@@ -128,7 +131,9 @@ def collect(root: Path, needed: Sequence[str] = ()) -> tuple[list[Result], list[
         absent = [name for name in needed if not (folder / name).is_file()]
         try:
             result = read_run(folder)
-        except (OSError, ValueError, KeyError, TypeError, AttributeError, yaml.YAMLError) as error:
+        except (
+            *(OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError, yaml.YAMLError),
+        ) as error:
             reason = f"no key {error}" if isinstance(error, KeyError) else str(error).split("\n")[0]
             without.append(f"{folder.relative_to(root)}: cannot be read ({reason})")
             continue
@@ -146,7 +151,10 @@ def collect(root: Path, needed: Sequence[str] = ()) -> tuple[list[Result], list[
 
 def read_run(folder: Path) -> Result:
     """One run; files that are not there leave their part empty."""
-    config = yaml.safe_load((folder / "config.yaml").read_text())
+    path = folder / "config.yaml"
+    if (size := path.stat().st_size) > MOST_BYTES:
+        raise ValueError(f"config.yaml: expected at most {MOST_BYTES} bytes, but got {size}")
+    config = yaml.safe_load(path.read_text())
     stages = {path.parent.name: _json(path) for path in sorted(folder.glob("*/done.json"))}
     result = Result(folder, config, stages, _json(folder / "metrics.json"), read_curve(folder))
     # Looked at here, so that what is spoiled is found while it can be named.

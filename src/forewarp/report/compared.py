@@ -43,6 +43,11 @@ class Measured:
         whole = [seed for seed in seeds if all((scene, seed) in found for scene in group.scenes)]
         return Estimate.of([fmean(found[scene, seed] for scene in group.scenes) for seed in whole])
 
+    @property
+    def seconds(self) -> float:
+        """Of training, the mean of its runs."""
+        return fmean(run.metrics["seconds"]["train"] for run in self.runs)
+
 
 def row_of(run: Result) -> tuple:
     """What runs of one row have in common."""
@@ -77,16 +82,17 @@ def comparison(table: PaperTable, results: Sequence[Result], *, difference: bool
     for row in measured(table, results):
         cells = [row.cell(group, metric) for group, metric in table.columns]
         ranked.append(len(rows))
-        rows.append([row.name, kinds[0], *cells])
+        rows.append([row.name, kinds[0], *cells, row.seconds])
         printed = _ours(table, row.variant)
         if difference and printed is not None and any(cells):
-            rows.append(["", kinds[1], *map(_difference, cells, printed)])
+            rows.append(["", kinds[1], *map(_difference, cells, printed), None])
     rules = [len(rows)] if rows else []
-    rows += [[row.name, kinds[2], *row.values] for row in table.rows]
+    rows += [[row.name, kinds[2], *row.values, None] for row in table.rows]
     columns = [
         Column("method"),
         Column("kind"),
         *(_column(*pair) for pair in table.columns),
+        Column("training, s a run", 0),
     ]
     return Table(columns, rows, marks=_marks(table, rows, ranked), rules=rules)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import datetime, timezone
@@ -21,6 +22,7 @@ INTRODUCTION = (
     "counterparts are procedural scenes in a dataset's format: their numbers are not "
     "comparable with printed ones."
 )
+COUNTERPART = ": synthetic counterpart"
 DATASETS = ("dnerf", "hypernerf", "nhr", "lego_complete")
 
 
@@ -39,7 +41,7 @@ def write_paper(runs: Path, out: Path, published: Path) -> list[Path]:
     results, older = newest(results)
     out.mkdir(parents=True, exist_ok=True)
     tables = [section for table in read_paper(published).values() for section in sections_of(table, results)]
-    figures, drawn = figures_of(results, out)
+    figures, drawn = figures_of(results, out, published.parent)
     sections = [*tables, *figures]
     if lines := [*without, *(f"{run.folder}: another run of the same is newer" for run in older)]:
         sections.append(Section("Left out", facts=lines))
@@ -73,7 +75,7 @@ def sections_of(table: PaperTable, results: Sequence[Result]) -> list[Section]:
     stand_in = counterpart(table, made)
     shown = [run for row in measured(table, made) for run in row.runs]
     if stand_in is not None and shown:
-        title = f"{table.title}: synthetic counterpart"
+        title = table.title + COUNTERPART
         found.append(Section(title, [comparison(stand_in, made)], facts(shown)))
     return found
 
@@ -94,16 +96,23 @@ def facts(runs: Sequence[Result]) -> list[str]:
     ]
 
 
-def figures_of(results: Sequence[Result], out: Path) -> tuple[list[Section], list[Path]]:
-    """What can be drawn from these runs; where matplotlib is absent, a section that says so."""
+def figures_of(results: Sequence[Result], out: Path, kept: Path) -> tuple[list[Section], list[Path]]:
+    """What can be drawn from these runs, and the curves that ``make accuracy-time`` left in ``kept``.
+
+    Where matplotlib is absent, a section that says so.
+    """
     try:
         found = _draw(results, out)
     except ImportError as error:
         return [Section("Figures", facts=[str(error)])], []
     found = [(title, path, facts(runs)) for title, path, runs in found if path is not None]
-    known = [path for path in sorted(out.glob("accuracy-time-*.png"))]
     sections = [Section(title, facts=lines, pictures=[path]) for title, path, lines in found]
-    sections += [Section("Accuracy against training time", pictures=known)] if known else []
+    for path in sorted(kept.glob("accuracy-time-*.png")):
+        if not (out / path.name).exists():
+            shutil.copyfile(path, out / path.name)
+    if curves := sorted(out.glob("accuracy-time-*.png")):
+        lines = ["runs of their own, with views set aside: make accuracy-time"]
+        sections.append(Section("Accuracy against training time", facts=lines, pictures=curves))
     return sections, [path for _, path, _ in found]
 
 
@@ -134,8 +143,9 @@ def _pairs(runs: Sequence[Result]) -> dict[str, list[Result]]:
 def _write_csv(sections: Sequence[Section], out: Path) -> list[Path]:
     files = []
     for section in sections:
-        name = "".join(c if c.isalnum() else "-" for c in section.title.split(",")[0].lower())
-        name += "-counterpart" * ("counterpart" in section.title and "counterpart" not in name)
+        title = section.title.removesuffix(COUNTERPART)
+        name = "".join(c if c.isalnum() else "-" for c in title.split(",")[0].lower())
+        name += "-counterpart" * (title != section.title)
         files.append(out / f"paper-{'-'.join(part for part in name.split('-') if part)}.csv")
         files[-1].write_text(replace(section.tables[0], marks={}).csv())
     return files
@@ -143,7 +153,9 @@ def _write_csv(sections: Sequence[Section], out: Path) -> list[Path]:
 
 def _protocol(run: Result) -> str:
     known = run.metrics.get("protocol", {})
-    size = "x".join(str(side) for side in known.get("resolution", []))
+    sizes = known.get("resolution", [])
+    sizes = sizes if sizes and isinstance(sizes[0], list) else [sizes]
+    size = " and ".join("x".join(map(str, sides)) for sides in sizes)
     words = [run.dataset, size, f"background {known.get('background', 'unknown')}", known.get("note", "")]
     return ", ".join(word for word in words if word)
 

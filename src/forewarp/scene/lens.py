@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from forewarp.ops.lens import distort, undistort
+from forewarp.ops.lens import distort, undistort, unfolded
 
-# Of the plane at distance 1 before the camera: far below a thousandth of a pixel.
-_SAME_PLACE = 1e-6
+# Of the plane at distance 1: outside every picture, and in pixels still a whole number of 64 bits.
+_OUTSIDE, _ON_AXIS = 1e9, 1e-9
 
 
 @dataclass(frozen=True)
@@ -37,14 +37,16 @@ class Lens:
     def bend(self, points: Tensor) -> Tensor:
         """Where points (..., 2) of the plane at distance 1 appear, the dtype of ``points``.
 
-        A point that lies beyond the lens's fold appears nowhere. It keeps its place, which is outside the
-        picture, where the polynomial would carry it back inside.
+        A point that lies beyond the lens's fold appears nowhere, though the polynomial would carry it back
+        into the picture. It is put far outside, in its own direction, and so is what appears farther off.
         """
         # Float64, as points beside the camera lie so far off that their sixth power needs its range.
-        bent = distort(points.double(), self.k, self.p)
-        error = (undistort(bent, self.k, self.p) - points.detach()).norm(dim=-1, keepdim=True)
-        return torch.where(error < _SAME_PLACE, bent, points.double()).to(points.dtype)
+        plane = points.double()
+        bent = distort(plane, self.k, self.p)
+        seen = unfolded(plane, self.k, self.p) & (bent.detach().norm(dim=-1) < _OUTSIDE)
+        away = plane * (_OUTSIDE / plane.detach().norm(dim=-1, keepdim=True).clamp(min=_ON_AXIS))
+        return torch.where(seen[..., None], bent, away).to(points.dtype)
 
     def straighten(self, points: Tensor) -> Tensor:
-        """The inverse of ``bend`` (..., 2), float64."""
+        """The inverse of ``bend`` (..., 2), float64: of what a picture can show."""
         return undistort(points, self.k, self.p)

@@ -29,6 +29,10 @@ class FieldAtTime(Protocol):
     lattice: Lattice
 
     @property
+    def pitch(self) -> float:
+        """The finest detail along a ray, world units: a step is a share of it."""
+
+    @property
     def cells(self) -> Tensor:
         """Where matter may be."""
 
@@ -80,6 +84,11 @@ class RadianceGrid:
     values: Tensor
     activation: Activation
     skip_alpha: float = 0.0
+
+    @property
+    def pitch(self) -> float:
+        """The lattice's."""
+        return self.lattice.pitch
 
     @property
     def raw_density(self) -> Tensor:

@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from forewarp.data.files import whole
 from forewarp.data.nhr import DomeFrame, write_scene
 from forewarp.scene.camera import Camera, look_at
-from forewarp.synth.arguments import check_motion, check_numbers, check_whole, check_workers
+from forewarp.synth.arguments import check_motion, check_numbers, check_workers
 from forewarp.synth.cameras import centers_of, stream
 from forewarp.synth.film import Exposure, Film, View
 from forewarp.synth.points import surface_points, trajectories
@@ -58,7 +59,7 @@ def synthesize(
     Raises:
         SceneError: for a bad argument or folder; ImportError: without ``forewarp[synth]``.
     """
-    check_whole("size", size, 24, multiple=24)
+    whole(size, "size", 24, multiple=24)
     check_numbers(frames=(frames, 2), seed=(seed, 0), points=(points, 1))
     check_numbers(samples_per_pixel=(samples_per_pixel, 1))
     check_motion(motion)

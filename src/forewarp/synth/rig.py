@@ -10,12 +10,13 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from forewarp.data.files import whole
 from forewarp.data.hypernerf import RigShot, write_scene
 from forewarp.scene.camera import Camera, look_at
 from forewarp.scene.errors import SceneError
 from forewarp.scene.frame import Truth
 from forewarp.scene.lens import Lens
-from forewarp.synth.arguments import check_motion, check_numbers, check_whole, check_workers
+from forewarp.synth.arguments import check_motion, check_numbers, check_workers
 from forewarp.synth.cameras import centers_of, stream
 from forewarp.synth.film import Exposure, Film, View
 from forewarp.synth.points import surface_points, trajectories
@@ -79,7 +80,7 @@ def synthesize(
     Raises:
         SceneError: for a bad argument or folder; ImportError: without ``forewarp[synth]``.
     """
-    check_whole("size", size, 16, multiple=8)
+    whole(size, "size", 16, multiple=8)
     check_numbers(frames=(frames, 3), seed=(seed, 0), samples_per_pixel=(samples_per_pixel, 1))
     if frames % 2 == 0:
         raise SceneError(f"frames: expected an odd number, one in the middle, but got {frames}; set frames")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from forewarp.training.objective import Objective
@@ -62,3 +62,10 @@ def share_out(
         )
         for name, plan in kept.items()
     ]
+
+
+def seconds_after(stages: Sequence[Stage], name: str) -> float | None:
+    """What the stages after ``name`` may take at most; None where minutes do not bound each of them."""
+    names = [stage.settings.name for stage in stages]
+    minutes = [stage.settings.minutes for stage in stages[names.index(name) + 1 :]]
+    return None if None in minutes else 60 * sum(minutes)

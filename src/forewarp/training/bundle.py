@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,9 +14,11 @@ from forewarp.scene.camera import Camera
 from forewarp.scene.frame import Frame, Scene
 from forewarp.scene.lens import Lens
 from forewarp.scene.rays import Rays
+from forewarp.training.archive import read_archive, write_archive
 from forewarp.training.module import DynamicSceneModule
 
 _OF_CAMERA = ("width", "height", "fx", "fy", "cx", "cy", "camera_to_world", "near", "far", "skew")
+_KINDS = {"unit": float, "state_dict": dict, "config": str, "noted": dict}
 
 
 @dataclass(frozen=True)
@@ -35,7 +37,11 @@ class Bundle:
 
 
 def write_bundle(path: Path, module: DynamicSceneModule, batch: Batch, scene: Scene, noted: dict) -> None:
-    """Write a step beside its place, then rename; ``path`` lies in ``<run>/<stage>/broken``."""
+    """Write a step, whole or not at all; ``path`` lies in ``<run>/<stage>/broken``.
+
+    Raises:
+        OSError: naming the file, where it cannot be written.
+    """
     config = path.parents[2] / "config.yaml"
     content = {
         "batch": _plain_batch(batch.to("cpu")),
@@ -45,10 +51,7 @@ def write_bundle(path: Path, module: DynamicSceneModule, batch: Batch, scene: Sc
         "config": config.read_text() if config.is_file() else "",
         "noted": noted,
     }
-    path.parent.mkdir(parents=True, exist_ok=True)
-    beside = path.with_name(path.name + ".part")
-    torch.save(content, beside)
-    os.replace(beside, path)
+    write_archive(path, content)
 
 
 def read_bundle(path: Path) -> Bundle:
@@ -58,23 +61,49 @@ def read_bundle(path: Path) -> Bundle:
         ValueError: where it is no such file.
     """
     try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
+        content = read_archive(path)
         batch, scene = _batch(content["batch"]), _scene(content["scene"])
-        rest = {name: content[name] for name in ("unit", "state_dict", "config", "noted")}
-        return Bundle(batch, scene, **rest)
+        rest = {name: content[name] for name in _KINDS}
+        bundle = Bundle(batch, scene, **rest)
+        _check(bundle)
+        return bundle
     except OSError:
         raise
-    except Exception as error:  # of unpickling alone there are half a dozen kinds
+    except Exception as error:  # cameras and boxes refuse in their own ways
+        detail = (str(error).splitlines() or [""])[0][:80]
         raise ValueError(
-            f"{path}: expected a step that a run left in broken/, but got {type(error).__name__}"
+            f"{path}: expected a step that a run left in broken/, but got {type(error).__name__} ({detail})"
         ) from None
+
+
+def _check(bundle: Bundle) -> None:
+    """Raise where a part is not what ``write_bundle`` puts there, naming it."""
+    noted, batch = bundle.noted, bundle.batch
+    for name, kind in _KINDS.items():
+        if not isinstance(getattr(bundle, name), kind):
+            raise TypeError(name)
+    for name, kind in (("found", str), ("stage", str), ("step", int), ("random", dict)):
+        if not isinstance(noted.get(name), kind):
+            raise TypeError(f"noted.{name}")
+    for name in ("samples", "torch"):
+        if not torch.is_tensor(noted["random"].get(name)) or noted["random"][name].dtype != torch.uint8:
+            raise TypeError(f"noted.random.{name}")
+    rays = batch.rays
+    if not rays.origins.shape == rays.directions.shape == batch.rgb.shape == (len(rays), 3):
+        raise ValueError("batch")
+    if type(batch.frame) is not int or not 0 <= batch.frame < len(bundle.scene.train):
+        raise ValueError("batch.frame")
+    if not 0 <= batch.time <= 1 or not 0 < bundle.unit < math.inf:
+        raise ValueError("batch.time, unit")
 
 
 def _plain_batch(batch: Batch) -> dict:
     rays = batch.rays
-    content = {"origins": rays.origins, "directions": rays.directions, "near": rays.near, "far": rays.far}
-    named = {"rgb": batch.rgb, "background": batch.background, "time": batch.time, "frame": batch.frame}
-    return content | named
+    # An origin that all rays share would be stored once, and read as more than the file holds.
+    content = {"origins": rays.origins.contiguous(), "directions": rays.directions.contiguous()}
+    content |= {"near": rays.near, "far": rays.far}
+    named = {"rgb": batch.rgb.contiguous(), "background": batch.background.contiguous()}
+    return content | named | {"time": batch.time, "frame": batch.frame}
 
 
 def _batch(content: dict) -> Batch:

@@ -21,11 +21,14 @@ class StageProgress(lightning.Callback):
         refresh: seconds between two drawings in a terminal.
         every: seconds between two lines elsewhere.
 
+    ``later`` may be set: the seconds that the stages after this one may take, for the time left of all.
+
     Cost: a step pays for a look at the clock; a drawing takes about a millisecond.
     """
 
     def __init__(self, *, refresh: float = 0.25, every: float = 10.0) -> None:
         self.refresh, self.every = refresh, every
+        self.later: float | None = None
         self._line: ProgressLine | None = None
 
     def on_train_start(self, trainer, module) -> None:
@@ -42,7 +45,9 @@ class StageProgress(lightning.Callback):
         if self._line.due():
             fraction, seconds = module.fraction, module.clock.seconds
             left = seconds * (1 - fraction) / fraction if fraction > 0 else None
-            self._line.show(fraction, left, self._text(module))
+            known = left is not None and self.later
+            whole = f"{time_text(left + self.later)} with what follows | " if known else ""
+            self._line.show(fraction, left, whole + self._text(module))
 
     def on_train_end(self, trainer, module) -> None:
         """Leave the last values behind."""
@@ -61,7 +66,7 @@ class StageProgress(lightning.Callback):
     def _text(self, module) -> str:
         last, playing = module.last, module.curriculum
         return (
-            f"psnr {self._psnr / max(self._seen, _SMOOTHING):.1f} | loss {last['loss']:.4f} | "
+            f"train psnr {self._psnr / max(self._seen, _SMOOTHING):.1f} | loss {last['loss']:.4f} | "
             f"frames {playing.in_play}/{len(playing.order)} | voxels {last['occupied_voxels']:,} | "
             f"{self._steps_a_second(module.global_step):.1f} steps/s"
         )

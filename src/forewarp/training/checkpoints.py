@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import zipfile
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -12,6 +11,8 @@ import lightning
 import torch
 
 from forewarp.fields.voxel_grid import VoxelGrid
+from forewarp.training.archive import read_archive
+from forewarp.training.interruption import Interruption
 from forewarp.training.module import DynamicSceneModule
 
 
@@ -22,6 +23,7 @@ class KeepCheckpoint(lightning.Callback):
         path: of the checkpoint.
         seconds: between two.
         check: raises where what would be saved is broken; the checkpoint before is then kept.
+        interruption: where it was asked for, the step's end is saved and the stage stopped.
     """
 
     def __init__(
@@ -29,16 +31,20 @@ class KeepCheckpoint(lightning.Callback):
         path: Path,
         seconds: float,
         check: Callable[[lightning.Trainer], None] = lambda trainer: None,
+        interruption: Interruption | None = None,
     ) -> None:
         self.path, self.every, self.check = Path(path), seconds, check
+        self.interruption = interruption or Interruption()
         self._next = seconds
 
     def on_train_batch_end(self, trainer, module, outputs, batch, batch_idx) -> None:
-        """Save when it is time."""
-        if module.clock.seconds >= self._next:
+        """Save when it is time, or the last one."""
+        if self.interruption.asked or module.clock.seconds >= self._next:
             self._next = module.clock.seconds + self.every
             with module.clock.paused():
                 self.save(trainer)
+        if self.interruption.asked:
+            raise KeyboardInterrupt
 
     def on_train_start(self, trainer, module) -> None:
         """Count from where a continued run stands."""
@@ -66,9 +72,7 @@ def check_checkpoint(path: Path, module: DynamicSceneModule) -> dict:
         ValueError: naming what does not fit.
     """
     content = _read(path)
-    own, theirs = _shapes(module.state_dict(), module), _shapes(content["state_dict"], module)
-    differ = sorted(k for k in {**own, **theirs} if k not in own or k not in theirs or own[k] != theirs[k])
-    if differ:
+    if differ := misfits(module, content["state_dict"]):
         raise ValueError(
             f"{path}: expected a checkpoint of this configuration, but got one that differs in "
             f"{', '.join(differ[:3])}; use another run folder, or the configuration that it was made with"
@@ -76,46 +80,70 @@ def check_checkpoint(path: Path, module: DynamicSceneModule) -> dict:
     return content
 
 
+def misfits(module: DynamicSceneModule, weights: dict) -> list[str]:
+    """The entries of stored weights that a module cannot take: others than its own, of another shape, or of a
+    voxel grid and not fitting together.
+    """
+    own, theirs = _shapes(module.state_dict(), module), _shapes(weights, module)
+    differ = sorted(str(k) for k in own | theirs if k not in own or k not in theirs or own[k] != theirs[k])
+    if not differ:
+        found = ((prefix, grid.misfit(weights, f"{prefix}.")) for prefix, grid in _grids(module))
+        differ = [f"{prefix}.{name}" for prefix, name in found if name is not None]
+    return differ
+
+
 def _read(path: Path) -> dict:
     try:
-        with zipfile.ZipFile(path) as archive:  # torch does not look at the checksums
-            if (harmed := archive.testzip()) is not None:
-                raise zipfile.BadZipFile(harmed)
-        content = torch.load(path, map_location="cpu", weights_only=True)
-        if not isinstance(content["state_dict"], dict):
-            raise TypeError
+        content = read_archive(path)
     except OSError:
         raise
-    except Exception as error:  # of unpickling alone there are half a dozen kinds
+    except ValueError as error:
         raise ValueError(
-            f"{path}: expected a checkpoint, but it cannot be read ({type(error).__name__}); delete it"
+            f"{path}: expected a checkpoint, but it cannot be read ({error}); delete it"
         ) from None
+    if not isinstance(content.get("state_dict"), dict):
+        raise ValueError(f"{path}: expected a checkpoint, but it holds no weights; delete it")
     return content
 
 
-def check_state(path: Path, module: DynamicSceneModule) -> None:
+def check_state(path: Path, module: DynamicSceneModule) -> tuple[int, float]:
     """Refuse a checkpoint that a stage cannot go on from, as one of an older version.
+
+    Returns:
+        steps and seconds of training that it holds.
 
     Raises:
         ValueError: naming what is missing.
     """
-    found, needed = check_checkpoint(path, module).get("forewarp", {}), {}
+    content, needed = check_checkpoint(path, module), {}
+    found = content.get("forewarp")
     module.on_save_checkpoint(needed)
-    missing = sorted(needed["forewarp"].keys() - found.keys())
+    missing = sorted(needed["forewarp"].keys() - (found.keys() if isinstance(found, dict) else ()))
     if missing:
         raise ValueError(
             f"{path}: expected a checkpoint of this version, but got one without {', '.join(missing)}; "
             "delete it to begin the stage anew"
         )
+    clock = found["clock"]
+    steps, seconds = content.get("global_step"), clock.get("seconds") if isinstance(clock, dict) else None
+    if type(steps) is not int or type(seconds) not in (int, float):
+        raise ValueError(
+            f"{path}: expected a checkpoint with its step and seconds, but got {steps} and {seconds}; "
+            "delete it to begin the stage anew"
+        )
+    return steps, seconds
 
 
 def _shapes(weights: dict, module: DynamicSceneModule) -> dict[str, tuple | None]:
     """Of every entry that must fit; None for those of voxel grids, which adopt a checkpoint's shapes."""
-    grids = [(prefix, m) for prefix, m in module.named_modules() if isinstance(m, VoxelGrid)]
-    adopted = {f"{prefix}.{name}" for prefix, m in grids for name in ("voxels", "index", *m.names)}
+    adopted = {f"{prefix}.{name}" for prefix, m in _grids(module) for name in ("voxels", "index", *m.names)}
     return {
         k: tuple(v.shape) if torch.is_tensor(v) and k not in adopted else None for k, v in weights.items()
     }
+
+
+def _grids(module: DynamicSceneModule) -> list[tuple[str, VoxelGrid]]:
+    return [(prefix, m) for prefix, m in module.named_modules() if isinstance(m, VoxelGrid)]
 
 
 def load_weights(module: DynamicSceneModule, path: Path) -> None:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from forewarp.drawing.colors import error_colors, in_a_row
+from forewarp.drawing.colors import at_least, error_colors, in_a_row
 from forewarp.drawing.files import write_png
 from forewarp.methods.spec import parameter_count
 from forewarp.metrics.flow import end_point_error
@@ -21,6 +21,8 @@ from forewarp.training.clock import now
 from forewarp.training.handover import write_json
 from forewarp.training.module import DynamicSceneModule, render_all
 from forewarp.training.protocol import device_name, versions
+
+_SHEET_SIDE = 300  # pixels that the shorter side of a picture on a sheet has at least
 
 
 @dataclass(frozen=True)
@@ -36,10 +38,13 @@ class Shown:
     seconds_again: float
 
 
-def draw(module: DynamicSceneModule, targets: list[Target]) -> Iterator[Shown]:
-    """Every target by every rendering, in the order of time: the warp is computed once a time."""
+def draw(module: DynamicSceneModule, targets: Sequence[Target]) -> Iterator[Shown]:
+    """Every target by every rendering, in the order of its frame's time: the warp is computed once a time.
+
+    ``targets`` decode at the first use and know their ``frames`` without it.
+    """
     state = None
-    for number in sorted(range(len(targets)), key=lambda i: targets[i].frame.time):
+    for number in sorted(range(len(targets)), key=lambda i: targets.frames[i].time):
         target = targets[number]
         begin = now()
         with torch.no_grad():
@@ -95,6 +100,7 @@ def evaluate(
     metrics = {
         "protocol": _protocol(module, scene, per_image, protocol or {}),
         "seconds": _seconds(per_image, finished),
+        "steps": {name: int(noted["steps"]) for name, noted in finished.items()},
         "peak_memory_bytes": max((int(s["peak_memory_bytes"]) for s in finished.values()), default=None),
         "parameters": parameter_count(module.method),
         **_means(per_image),
@@ -137,7 +143,8 @@ def _save(shown: Shown, folder: Path, on_sheet: bool) -> None:
     name = shown.target.frame.name + ".png"
     write_png(folder / name, image)
     if on_sheet:
-        sheet = in_a_row([target.rgb, image, error_colors(target.rgb, image)])
+        parts = [target.rgb, image, error_colors(target.rgb, image)]
+        sheet = in_a_row([at_least(part, _SHEET_SIDE) for part in parts])
         write_png(folder / "sheets" / name, sheet)
 
 

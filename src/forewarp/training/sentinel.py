@@ -126,7 +126,7 @@ class Sentinel(lightning.Callback):
         if not bool(loss.detach().isfinite()):
             raw = {name: v for name, v in module.last.items() if name.startswith("loss/")}
             terms = (name.removeprefix("loss/") for name, value in raw.items() if not math.isfinite(value))
-            self._skip_or_stop(trainer, module, Found("loss", "the loss", tuple(terms)))
+            self._stop(trainer, module, Found("loss", "the loss", tuple(terms)), may_skip=True)
 
     def on_before_optimizer_step(self, trainer, module, optimizer) -> None:
         """Look at the gradients; those of a step that is skipped are dropped, and Adam passes over them."""
@@ -134,7 +134,7 @@ class Sentinel(lightning.Callback):
             named = [(n, p.grad) for n, p in module.method.named_parameters() if p.grad is not None]
             # A norm may overflow where no entry's square does.
             if not all_finite(g for _, g in named) and (name := first_bad(named, squared=True)):
-                self._skip_or_stop(trainer, module, Found("gradient", name))
+                self._stop(trainer, module, Found("gradient", name), may_skip=True)
         if self._drop:
             for parameter in module.method.parameters():
                 parameter.grad = None
@@ -167,24 +167,26 @@ class Sentinel(lightning.Callback):
         if not all_finite(p for _, p in named) and (name := first_bad(named)):
             self._stop(trainer, module, Found("parameter", name))
 
-    def _skip_or_stop(self, trainer, module, seen: Found) -> None:
-        if self.skipped >= self.skip:
-            self._stop(trainer, module, seen)
-        self._keep(trainer, module, seen)
-        self.skipped, self._drop = self.skipped + 1, True
-
-    def _stop(self, trainer, module, seen: Found) -> None:
-        found, path = self._keep(trainer, module, seen)
+    def _stop(self, trainer, module, seen: Found, may_skip: bool = False) -> None:
+        found, path, refusal = self._keep(trainer, module, seen)
+        if may_skip and self.skipped < self.skip and refusal is None:
+            self.skipped, self._drop = self.skipped + 1, True
+            return
         batch, stage = self._batch, f"stage.{module.settings.name}"
         frame = trainer.datamodule.scene.train[batch.frame].name
+        again = f"python -m forewarp.replay {path} shows it again"
+        if refusal is not None:
+            again = f"{path} could not be written ({refusal})"
         raise BrokenStep(
             f"{stage}: expected finite numbers, but got {found} at step {self._number}, frame {frame} "
-            f"(time {batch.time:.4g}); python -m forewarp.replay {path} shows it again; begin anew with "
+            f"(time {batch.time:.4g}); {again}; begin anew with "
             f"lower {stage}.rates, or go on with resume={self.folder.parent} sentinel.skip=1"
         )
 
-    def _keep(self, trainer, module, seen: Found) -> tuple[str, Path]:
-        """Repeat the step, which says more than was seen at first, and write the bundle."""
+    def _keep(self, trainer, module, seen: Found) -> tuple[str, Path, str | None]:
+        """Repeat the step, which says more than was seen at first, and write the bundle; also why it could
+        not be written.
+        """
         after = module.generator.get_state()
         module.generator.set_state(self._random["samples"])
         with trainer.precision_plugin.forward_context(), torch.enable_grad():
@@ -193,8 +195,11 @@ class Sentinel(lightning.Callback):
         found = str(again or f"{seen}, though not when the step was repeated,")
         path = self.folder / "broken" / f"step_{self._number}.pt"
         noted = {"found": found, "stage": module.settings.name, "step": self._number, "random": self._random}
-        write_bundle(path, module, self._batch, trainer.datamodule.scene, noted)
-        return found, path
+        try:
+            write_bundle(path, module, self._batch, trainer.datamodule.scene, noted)
+        except OSError as error:  # what was found is still said
+            return found, path, error.strerror or str(error)
+        return found, path, None
 
 
 def _rescales(trainer: lightning.Trainer) -> bool:

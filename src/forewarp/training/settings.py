@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -75,6 +76,11 @@ class StageSettings:
 
     def __post_init__(self) -> None:
         where = f"stage.{self.name}"
+        if not isinstance(self.name, str) or not re.fullmatch(r"\w[\w-]*", self.name):
+            raise ValueError(
+                "stage: expected names of letters, digits, _ and -, as they name folders, "
+                f"but got {self.name!r}"
+            )
         if self.iterations is None and self.minutes is None:
             raise ValueError(
                 f"{where}: expected iterations or minutes, but got neither; set budget.minutes=10"

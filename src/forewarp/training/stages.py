@@ -24,6 +24,7 @@ from forewarp.training.handover import (
     save_handover,
     write_json,
 )
+from forewarp.training.interruption import Interruption
 from forewarp.training.module import DynamicSceneModule
 from forewarp.training.objective import Objective
 from forewarp.training.protocol import peak_memory_bytes, reset_peak_memory
@@ -54,6 +55,7 @@ class Run:
         seed: of everything random.
         checkpoint_seconds: between checkpoints of an unfinished stage.
         skip: steps of a stage that may be left out for a number that is not finite (see ``Sentinel``).
+        tell: takes a line that says where a stage stands which is not begun anew.
     """
 
     datamodule: lightning.LightningDataModule
@@ -66,6 +68,7 @@ class Run:
     seed: int = 0
     checkpoint_seconds: float = 60.0
     skip: int = 0
+    tell: Callable[[str], None] = lambda line: None
 
     def fit(self) -> DynamicSceneModule:
         """Run what is not finished; returns the last stage's module, fitted."""
@@ -80,6 +83,7 @@ class Run:
             module, unit = self._module(stage, module, handover, number)
             if self.is_finished(stage):
                 load_weights(module, folder / "last.ckpt")
+                self.tell(f"{stage.settings.name}: finished before")
             else:
                 self._fit_stage(stage, module, folder, unit)
             handover = load_handover(folder)
@@ -164,14 +168,18 @@ class Run:
     def _fit_stage(self, stage: Stage, module: DynamicSceneModule, folder: Path, unit: float) -> None:
         last = folder / "last.ckpt"
         sentinel = Sentinel(folder, skip=self.skip)
-        keeper = KeepCheckpoint(last, self.checkpoint_seconds, sentinel.check)
+        interruption = Interruption()
+        keeper = KeepCheckpoint(last, self.checkpoint_seconds, sentinel.check, interruption)
         watchers = [sentinel, *self.callbacks(stage.settings.name, folder), keeper]
         trainer = self.make_trainer(folder, watchers)
         checkpoint = last if last.is_file() else None
         if checkpoint is not None:
-            check_state(checkpoint, module)
+            steps, seconds = check_state(checkpoint, module)
+            done = stage.settings.fraction(steps, seconds)
+            self.tell(f"{stage.settings.name}: goes on at {done:.0%}, step {steps}")
         reset_peak_memory()
-        trainer.fit(module, datamodule=self.datamodule, ckpt_path=checkpoint, weights_only=True)
+        with interruption:
+            trainer.fit(module, datamodule=self.datamodule, ckpt_path=checkpoint, weights_only=True)
         if module.fraction < 1:
             raise KeyboardInterrupt
         keeper.save(trainer)
@@ -189,6 +197,8 @@ class Run:
                 "skipped_steps": sentinel.skipped,
             },
         )
+        if interruption.asked:  # too late for a step of this stage
+            raise KeyboardInterrupt
 
 
 def _noted(folder: Path) -> dict | None:

@@ -1,0 +1,149 @@
+"""What is timed: the paper's model of a ball that moves, on what is occupied, or densely as printed."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from forewarp.effects.inpaint import UNet3d
+from forewarp.effects.motion import Motion
+from forewarp.effects.upsample import LearnedUpsampler
+from forewarp.effects.view import ViewNetwork
+from forewarp.fields.radiance import FeatureRadiance
+from forewarp.fields.trajectory import TrajectoryField
+from forewarp.methods.forward_warp import ForwardWarp
+from forewarp.methods.spec import MethodSpec
+from forewarp.renderer import Renderer
+from forewarp.scene.batch import Batch
+from forewarp.scene.box import Box, Lattice
+from forewarp.scene.camera import Camera, look_at
+from forewarp.scene.rays import Rays
+from forewarp.scene.state import EMPTY
+from forewarp.training.curriculum import Curriculum
+from forewarp.training.module import DynamicSceneModule
+from forewarp.training.objective import Objective
+from forewarp.training.settings import StageSettings
+
+OCCUPANCY, TIME, SOLID = 0.1, 0.5, 6.0
+RADIUS = (6 * OCCUPANCY / math.pi) ** (1 / 3)
+WHITE = torch.ones(3)
+EFFECTS = ("motion", "view", "upsampler", "inpainter")
+# The paper's fine stage (METHOD 2).
+WEIGHTS = {"photo": 1.0, "point_color": 1e-2, "background_entropy": 1e-3, "flow_l1": 1e-5}
+WEIGHTS |= {"inpaint_diff": 1e-5, "tv_density": 1e-6, "tv_flow": 1e-3, "tv_depth": 1e-1}
+RATES = {"density": 0.1, "color": 0.1, "shading": 0.1, "grid": 0.1, "flow": 1e-3, "network": 1e-3}
+
+
+def body(lattice: Lattice, radius: float) -> Tensor:
+    """A ball (X, Y, Z) bool about the box's centre."""
+    points = lattice.to_world(lattice.all_voxels()) - torch.tensor(lattice.box.center)
+    return (points.norm(dim=-1) < radius).reshape(lattice.shape)
+
+
+def camera(size: int = 400) -> Camera:
+    """A square picture of the ball."""
+    pose = look_at(torch.tensor([3.2, 2.0, 1.4]), torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
+    return Camera(size, size, 1.39 * size, 1.39 * size, size / 2, size / 2, pose, 2.0, 6.0)
+
+
+def some_rays(count: int, seed: int = 0) -> Rays:
+    """Random pixels of the picture."""
+    pixels = torch.randint(160_000, (count,), generator=torch.Generator().manual_seed(seed))
+    return camera().rays(pixels)
+
+
+def lattice_of(side: int, box: float = 1.0) -> Lattice:
+    """``side`` voxels an axis of a box of 2; ``box`` times as many of the same size in a longer one."""
+    return Lattice(Box((-box,) * 3, (box,) * 3), (round(side * box),) * 3)
+
+
+def make_method(
+    lattice: Lattice, side: int, dense: bool, *, effects: tuple[str, ...], shift: float = 2.3
+) -> ForwardWarp:
+    """The paper's model of a solid ball, a tenth of a box of 2, moved by ``shift`` voxels at ``TIME``.
+
+    Args:
+        side: voxels along a box of 2.
+        dense: every voxel is active, nothing is skipped, the U-Net sees the whole lattice.
+        effects: those that are on.
+    """
+    ball = body(lattice, RADIUS)
+    margin = max(lattice.shape) if dense else 4
+    spec = MethodSpec(
+        radiance=partial(FeatureRadiance, alpha_init=1e-2, skip_alpha=0.0 if dense else 1e-4),
+        motion=Motion,
+        trajectory=partial(TrajectoryField, bases=15, nodes=0),
+        upsampler=partial(LearnedUpsampler, recompute=False),
+        inpainter=partial(UNet3d, width=16, margin=margin),
+        view=ViewNetwork,
+    )
+    method = spec.build(
+        lattice,
+        torch.ones_like(ball) if dense else ball,
+        unit=2 / (side - 1),
+        scene_box=lattice.box,
+        frames=50,
+        canonical_time=0.0,
+        effects=effects,
+    )
+    _paint(method, ball, shift)
+    return method
+
+
+@torch.no_grad()
+def _paint(method: ForwardWarp, ball: Tensor, shift: float) -> None:
+    """F1 says solid in the ball and empty elsewhere, F2 that everything moves along x."""
+    torch.manual_seed(0)
+    for layer in method.modules():  # again, now that how many voxels there are has had its draws
+        if hasattr(layer, "reset_parameters") and layer.weight.any():
+            layer.reset_parameters()
+    radiance, (first, second, last) = (
+        method.radiance,
+        [m for m in method.radiance.network if hasattr(m, "weight")],
+    )
+    for layer in (first, second):  # the first hidden unit hands on the first feature
+        layer.weight[0], layer.bias[0] = 0.0, 0.0
+    first.weight[0, first.in_features - radiance.features.shape[1]] = 1.0
+    second.weight[0, 0] = last.weight[0, 0] = 1.0
+    # Air has the colour that absent voxels read, so that leaving it out changes nothing.
+    last.weight[1:, 0] = 0.1 * torch.randn(len(last.weight) - 1)
+    last.bias[0] = EMPTY
+    x, y, z = radiance.voxels.unbind(-1)
+    radiance.features.copy_(_features(radiance.lattice, radiance.features.shape[1])[x, y, z])
+    radiance.features[:, 0] = torch.where(ball[x, y, z], SOLID - EMPTY, 0.0)
+    if method.motion is not None:
+        trajectory = method.motion.trajectory
+        basis = trajectory._basis(TIME)[0]
+        trajectory.network[-1].bias[0] = shift * radiance.lattice.spacing[0] / (trajectory.scale * basis)
+
+
+def _features(lattice: Lattice, channels: int) -> Tensor:
+    """The same at a voxel whether it is one of many or of few (X, Y, Z, channels)."""
+    return 0.1 * torch.randn(*lattice.shape, channels, generator=torch.Generator().manual_seed(1))
+
+
+def make_module(
+    side: int,
+    dense: bool,
+    *,
+    rays: int,
+    box: float = 1.0,
+    shift: float = 2.3,
+    threshold: float = 1e-4,
+    effects: tuple[str, ...] = EFFECTS,
+) -> tuple[DynamicSceneModule, Batch]:
+    """The paper's fine stage, and a batch for it: the U-Net 16 wide, twice the resolution, two renderings."""
+    method = make_method(lattice_of(side, box), side, dense, effects=effects, shift=shift)
+    module = DynamicSceneModule(
+        method,
+        renderer=Renderer(color_threshold=0.0 if dense else threshold, opaque=0.0 if dense else 1e-4),
+        objective=Objective(WEIGHTS),
+        settings=StageSettings("fine", voxels=[[0, side**3]], rates=RATES, iterations=100),
+        curriculum=Curriculum([i / 49 for i in range(50)], 0.0),
+        cameras=[camera()],
+    )
+    view = some_rays(rays)
+    return module, Batch(view, torch.full((rays, 3), 0.5), WHITE, TIME, 0)

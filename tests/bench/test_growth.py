@@ -1,0 +1,46 @@
+"""How each operator, a step and a frame grow: ``make bench`` (not part of ``make test``)."""
+
+import ctypes
+import gc
+import time
+from contextlib import suppress
+
+import pytest
+import torch
+
+from forewarp.cli.timed_cases import CASES
+from forewarp.ops.warmup import warm_up
+from forewarp.training.protocol import peak_memory_bytes, reset_peak_memory
+
+RUNS = [
+    (name, size, dense)
+    for name, case in CASES.items()
+    for size in case.sizes
+    for dense in (False, True)
+    if not dense or size in case.dense_sizes
+]
+
+
+def release():
+    """Give the system back what was freed, or what is allocated next would seem to cost nothing."""
+    with suppress(OSError, AttributeError):  # glibc's alone
+        ctypes.CDLL(None).malloc_trim(0)
+
+
+@pytest.mark.bench
+@pytest.mark.benchmark(timer=time.process_time)  # a shared machine does other things too
+@pytest.mark.parametrize(("name", "size", "dense"), RUNS)
+def test_growth(benchmark, name, size, dense):
+    warm_up()
+    work = CASES[name].make(size, dense)
+    gc.collect()
+    release()
+    reset_peak_memory()
+    before = peak_memory_bytes()
+    work()
+    peak = peak_memory_bytes() - before
+    benchmark.group = name
+    benchmark.extra_info.update(
+        {"name": name, "size": size, "dense": dense, "peak": peak, "threads": torch.get_num_threads()}
+    )
+    benchmark.pedantic(work, rounds=3 if dense else 5, warmup_rounds=1)
