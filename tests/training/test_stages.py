@@ -241,6 +241,14 @@ class CtrlC(lightning.Callback):
                 signal.raise_signal(signal.SIGINT)
 
 
+@pytest.fixture(autouse=True)
+def _listening():
+    """In the background of a shell Ctrl-C is ignored, and so it would be here."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 def pressed(folder, *presses):
     """Run until Ctrl-C ends it; what Lightning turned into an exit was one."""
     before = signal.getsignal(signal.SIGINT)

@@ -10,7 +10,8 @@ from torch.nn import functional
 class ConvBlock(nn.Module):
     """Instance norm, convolution, ReLU: the paper's convolution layer.
 
-    A volume of one voxel has no statistics, so the norm is left out there.
+    A volume of one voxel has no statistics, so the norm is left out there. Under autocast one of two voxels'
+    depth stays in float32: oneDNN's bfloat16 gradient of the weights reads memory there that nobody wrote.
     """
 
     def __init__(self, inputs: int, outputs: int) -> None:
@@ -23,7 +24,10 @@ class ConvBlock(nn.Module):
         if x[0, 0].numel() > 1:
             # Of one volume the same as instance norm, which would put the channels first again.
             x = functional.batch_norm(x, None, None, self.norm.weight, self.norm.bias, training=True)
-        return functional.relu(self.conv(x), inplace=True)
+        if x.shape[2] > 2:
+            return functional.relu(self.conv(x), inplace=True)
+        with torch.autocast(x.device.type, enabled=False):
+            return functional.relu(self.conv(x.float()), inplace=True)
 
 
 class Pointwise(nn.Conv3d):
