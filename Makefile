@@ -1,5 +1,5 @@
 .DEFAULT_GOAL := help
-.PHONY: help install install-launchers demo demo-lego-complete demo-hypernerf demo-nhr test test-stability bench bench-gpu accuracy-time price-list reproduce-tables lint format clean
+.PHONY: help install install-launchers demo demo-forward demo-backward demo-lego-complete demo-hypernerf demo-nhr test test-stability bench bench-gpu accuracy-time price-list reproduce-tables lint format clean
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -11,6 +11,7 @@ SCENE ?= jumpingjacks
 SCENES ?= jumpingjacks hook
 MINUTES ?= 3
 DEVICE ?= gpu
+SHELL := bash
 # Large pages, as the commands set them themselves; one thread, as threads that wait for a busy core tell nothing.
 MEASURE := OMP_NUM_THREADS=1 OMP_WAIT_POLICY=passive THP_MEM_ALLOC_ENABLE=1
 MORE = budget.minutes=$(MINUTES) $(if $(VARIANTS),variant=$(VARIANTS)) $(SEED) $(if $(THREADS),threads=$(THREADS))
@@ -37,11 +38,14 @@ install-launchers: ## add joblib, Ray and submitit, that sweeps may run on (laun
 	if [ -n "$$links" ]; then export UV_FIND_LINKS="$$links"; fi; \
 	VIRTUAL_ENV="$$PWD/.venv" $(BIN)/uv pip install -c constraints.txt -e '.[sweeps]'
 
-demo: ## fit the procedural vehicle forward and backward, compare, make a video (three minutes)
-	$(BIN)/forewarp-train experiment=demo run=$(DEMO)/forward
-	$(BIN)/forewarp-train experiment=demo model=backward run=$(DEMO)/backward
+demo: ## fit the procedural vehicle forward and backward, a core each, compare, make a video (two to three minutes)
+	@$(MAKE) --no-print-directory -j2 demo-forward demo-backward
 	$(BIN)/python -m forewarp.cli.compare $(DEMO)/forward $(DEMO)/backward
 	$(BIN)/forewarp-render run=$(DEMO)/forward path=both
+
+# Each line with the method it is about, as they take turns.
+demo-forward demo-backward: demo-%:
+	set -o pipefail; $(BIN)/forewarp-train experiment=demo model=$* threads=1 budget.minutes=1.25 run=$(DEMO)/$* 2>&1 | sed -u 's/^/$* | /'
 
 demo-lego-complete: ## make a small counterpart of Lego Complete, fit one of its scenes, measure, make a video
 demo-hypernerf: ## the same for a two-phone rig in a textured room, with a static background

@@ -1,5 +1,7 @@
 import inspect
 import json
+import time
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from hydra.utils import instantiate
@@ -10,6 +12,7 @@ from forewarp.cli.synthetic import (
     SyntheticHyperNeRFDataModule,
     SyntheticLegoCompleteDataModule,
     SyntheticNHRDataModule,
+    is_scene,
 )
 from configs import composed, options
 from forewarp.data.dnerf import read_scene
@@ -72,6 +75,22 @@ def test_the_data_module_writes_the_scene_at_first_use(tmp_path, capsys):
     SyntheticDataModule(tmp_path, "s", synthesis=ARGUMENTS, rays=8).setup("fit")
     assert (tmp_path / "s" / "transforms_train.json").stat().st_mtime_ns == before
     assert "writing s 100%" in capsys.readouterr().err
+
+
+def test_runs_that_begin_together_write_a_scene_once(tmp_path, monkeypatch):
+    written = []
+
+    def slow(folder, **arguments):
+        written.append(folder)
+        time.sleep(0.3)
+        write(folder, **arguments)
+
+    write = WRITERS["dnerf"]
+    monkeypatch.setitem(WRITERS, "dnerf", slow)
+    with ThreadPoolExecutor(3) as pool:
+        data = [SyntheticDataModule(tmp_path, "s", synthesis=ARGUMENTS, rays=8) for _ in range(3)]
+        list(pool.map(lambda one: one.prepare(), data))
+    assert len(written) == 1 and is_scene(tmp_path / "s")
 
 
 def test_a_scene_made_otherwise_is_refused(tmp_path, capsys):

@@ -8,7 +8,9 @@ import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
+from forewarp.cli.claims import in_turn
 from forewarp.data.files import read_json
+from forewarp.data.fingerprint import LOCK
 from forewarp.data.module import (
     DNeRFDataModule,
     HyperNeRFDataModule,
@@ -78,9 +80,14 @@ class Synthetic:
         self._read = lambda: (self.prepare(), reader())[1]
 
     def prepare(self) -> None:
-        """Make sure that the scene is there."""
+        """Make sure that the scene is there; several runs that begin together wait for the one that writes it."""
+        if not is_scene(self.folder):
+            with in_turn(self.folder.with_name(f".{self.folder.name}{LOCK}")):
+                self._write()
+        self._check()
+
+    def _write(self) -> None:
         if is_scene(self.folder):
-            self._check()
             return
         if self.folder.exists() and (not self.folder.is_dir() or any(self.folder.iterdir())):
             raise SceneError(
