@@ -12,6 +12,7 @@ SCENES ?= jumpingjacks hook
 MINUTES ?= 3
 DEVICE ?= gpu
 SHELL := bash
+.SHELLFLAGS := -o pipefail -c
 # Large pages, as the commands set them themselves; one thread, as threads that wait for a busy core tell nothing.
 MEASURE := OMP_NUM_THREADS=1 OMP_WAIT_POLICY=passive THP_MEM_ALLOC_ENABLE=1
 MORE = budget.minutes=$(MINUTES) $(if $(VARIANTS),variant=$(VARIANTS)) $(SEED) $(if $(THREADS),threads=$(THREADS))
@@ -45,7 +46,7 @@ demo: ## fit the procedural vehicle forward and backward, a core each, compare, 
 
 # Each line with the method it is about, as they take turns.
 demo-forward demo-backward: demo-%:
-	set -o pipefail; $(BIN)/forewarp-train experiment=demo model=$* threads=1 budget.minutes=1.25 run=$(DEMO)/$* 2>&1 | sed -u 's/^/$* | /'
+	$(BIN)/forewarp-train experiment=demo model=$* threads=1 budget.minutes=1.25 run=$(DEMO)/$* 2>&1 | sed -u 's/^/$* | /'
 
 demo-lego-complete: ## make a small counterpart of Lego Complete, fit one of its scenes, measure, make a video
 demo-hypernerf: ## the same for a two-phone rig in a textured room, with a static background
