@@ -90,7 +90,8 @@ def test_runs_that_begin_together_write_a_scene_once(tmp_path, monkeypatch):
     with ThreadPoolExecutor(3) as pool:
         data = [SyntheticDataModule(tmp_path, "s", synthesis=ARGUMENTS, rays=8) for _ in range(3)]
         list(pool.map(lambda one: one.prepare(), data))
-    assert len(written) == 1 and is_scene(tmp_path / "s")
+    assert len(written) == 1
+    assert is_scene(tmp_path / "s")
 
 
 def test_a_scene_made_otherwise_is_refused(tmp_path, capsys):

@@ -1,3 +1,4 @@
+import platform
 import os
 import resource
 import sys
@@ -35,3 +36,15 @@ def test_elsewhere_it_is_that_of_the_process(on_the_cpu, monkeypatch, tmp_path):
     reset_peak_memory()  # does nothing, and says nothing
     unit = 1 if sys.platform == "darwin" else 1024
     assert peak_memory_bytes() == resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
+
+
+NAMES = [("processor : 0\nmodel name\t: A Thing 9\n", "A Thing 9"), (None, "arm"), ("model name :\n", "arm")]
+
+
+@pytest.mark.parametrize(("lines", "name"), NAMES)
+def test_a_machine_is_called_by_its_processor(lines, name, monkeypatch, tmp_path):
+    monkeypatch.setattr(platform, "processor", lambda: "arm")
+    monkeypatch.setattr(protocol, "_PROCESSOR", tmp_path / "cpuinfo")
+    if lines is not None:
+        (tmp_path / "cpuinfo").write_text(lines)
+    assert protocol.device_name(torch.device("cpu")) == name

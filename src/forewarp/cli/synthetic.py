@@ -80,7 +80,7 @@ class Synthetic:
         self._read = lambda: (self.prepare(), reader())[1]
 
     def prepare(self) -> None:
-        """Make sure that the scene is there; several runs that begin together wait for the one that writes it."""
+        """Make sure that the scene is there; of several runs that need it at once one writes it."""
         if not is_scene(self.folder):
             with in_turn(self.folder.with_name(f".{self.folder.name}{LOCK}")):
                 self._write()

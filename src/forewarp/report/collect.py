@@ -198,7 +198,8 @@ def machine(results: Sequence[Result]) -> str:
     found = []
     for protocol in (result.metrics.get("protocol", {}) for result in results):
         torch = protocol.get("versions", {}).get("torch")
-        words = [protocol.get("device"), f"{protocol.get('threads')} threads", f"torch {torch}"]
+        threads = protocol.get("threads")
+        words = [protocol.get("device"), f"{threads} thread{'s' * (threads != 1)}", f"torch {torch}"]
         if protocol.get("device") and words not in found:
             found.append(words)
     return "; ".join(", ".join(words) for words in found) or "unknown"

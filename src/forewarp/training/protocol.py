@@ -14,7 +14,7 @@ import torch
 PACKAGES = ("forewarp", "torch", "lightning", "torchmetrics", "numba")
 
 
-_PROCESS = Path("/proc/self")  # Linux only
+_PROCESS, _PROCESSOR = Path("/proc/self"), Path("/proc/cpuinfo")  # Linux only
 
 
 def reset_peak_memory() -> None:
@@ -46,7 +46,12 @@ def device_name(device: torch.device) -> str:
     """What the numbers were computed on."""
     if device.type == "cuda":
         return torch.cuda.get_device_name(device)
-    return platform.processor() or platform.machine()
+    try:
+        lines = _PROCESSOR.read_text().splitlines()
+    except OSError:
+        lines = []
+    named = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return next(filter(None, named), None) or platform.processor() or platform.machine()
 
 
 def versions() -> dict[str, str]:
