@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import partial
 
 import torch
@@ -37,6 +38,21 @@ WEIGHTS |= {"inpaint_diff": 1e-5, "tv_density": 1e-6, "tv_flow": 1e-3, "tv_depth
 RATES = {"density": 0.1, "color": 0.1, "shading": 0.1, "grid": 0.1, "flow": 1e-3, "network": 1e-3}
 
 
+class PlainUNet(UNet3d):
+    """The same, with volumes as PyTorch lays them by itself: the channels first."""
+
+    def features(self, dense: Tensor) -> Tensor:
+        """See ``UNet3d``."""
+        return super().features(dense.contiguous())
+
+
+class PlainUpsampler(LearnedUpsampler):
+    """The same, the channels first."""
+
+    def _held(self, part: Callable[[Tensor], Tensor], volume: Tensor) -> Tensor:
+        return super()._held(part, volume.contiguous())
+
+
 def body(lattice: Lattice, radius: float) -> Tensor:
     """A ball (X, Y, Z) bool about the box's centre."""
     points = lattice.to_world(lattice.all_voxels()) - torch.tensor(lattice.box.center)
@@ -67,7 +83,7 @@ def make_method(
 
     Args:
         side: voxels along a box of 2.
-        dense: every voxel is active, nothing is skipped, the U-Net sees the whole lattice.
+        dense: every voxel is active, nothing is skipped, the U-Net sees the whole lattice, channels first.
         effects: those that are on.
     """
     ball = body(lattice, RADIUS)
@@ -76,8 +92,8 @@ def make_method(
         radiance=partial(FeatureRadiance, alpha_init=1e-2, skip_alpha=0.0 if dense else 1e-4),
         motion=Motion,
         trajectory=partial(TrajectoryField, bases=15, nodes=0),
-        upsampler=partial(LearnedUpsampler, recompute=False),
-        inpainter=partial(UNet3d, width=16, margin=margin),
+        upsampler=partial(PlainUpsampler if dense else LearnedUpsampler, recompute=False),
+        inpainter=partial(PlainUNet if dense else UNet3d, width=16, margin=margin),
         view=ViewNetwork,
     )
     method = spec.build(

@@ -100,7 +100,8 @@ class MethodSpec:
 
     @property
     def _learns_to_upsample(self) -> bool:
-        return getattr(self.upsampler, "func", self.upsampler) is LearnedUpsampler
+        made = getattr(self.upsampler, "func", self.upsampler)
+        return isinstance(made, type) and issubclass(made, LearnedUpsampler)
 
     def _upsampler(self, features, inpainter, effects, upsample) -> nn.Module | None:
         if upsample is not None:
