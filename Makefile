@@ -1,5 +1,5 @@
 .DEFAULT_GOAL := help
-.PHONY: help install install-launchers demo demo-forward demo-backward demo-lego-complete demo-hypernerf demo-nhr test test-stability bench bench-gpu accuracy-time price-list reproduce-tables lint format clean
+.PHONY: help install install-launchers demo demo-forward demo-backward tables-vehicle tables-captures demo-lego-complete demo-hypernerf demo-nhr test test-stability bench bench-gpu accuracy-time price-list reproduce-tables lint format clean
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -19,6 +19,8 @@ MORE = budget.minutes=$(MINUTES) $(if $(VARIANTS),variant=$(VARIANTS)) $(SEED) $
 comma := ,
 # SEEDS=3: each job three times; SEEDS=4,7: with these.
 SEED = $(if $(SEEDS),$(if $(findstring $(comma),$(SEEDS)),seed,seeds)=$(SEEDS))
+# Of what runs side by side, lines begin with whose they are; Ctrl-C is for the run, which has more to say.
+SAYS = 2>&1 | { trap '' INT; sed -u 's/^/$@ | /'; }
 SWEEP = $(BIN)/forewarp-train --multirun sweeps=accuracy_time
 space := $(subst ,, )
 # Jobs that failed have been named, and the report names what is missing; only an interruption ends it all.
@@ -44,9 +46,8 @@ demo: ## fit the procedural vehicle forward and backward, a core each, compare, 
 	$(BIN)/python -m forewarp.cli.compare $(DEMO)/forward $(DEMO)/backward
 	$(BIN)/forewarp-render run=$(DEMO)/forward path=both
 
-# Each line with the method it is about, as they take turns.
 demo-forward demo-backward: demo-%:
-	$(BIN)/forewarp-train experiment=demo model=$* threads=1 budget.minutes=1.25 run=$(DEMO)/$* 2>&1 | sed -u 's/^/$* | /'
+	$(BIN)/forewarp-train experiment=demo model=$* threads=1 budget.minutes=1.25 run=$(DEMO)/$* $(SAYS)
 
 demo-lego-complete: ## make a small counterpart of Lego Complete, fit one of its scenes, measure, make a video
 demo-hypernerf: ## the same for a two-phone rig in a textured room, with a static background
@@ -84,23 +85,17 @@ price-list: ## what each choice costs and brings, on the vehicle and two real sc
 	done
 	$(BIN)/forewarp-report kind=price_list
 
-# A counterpart of each dataset and 12 s a run: 27 runs.
+REPRODUCE = $(BIN)/forewarp-train --multirun budget=$(BUDGET) budget.minutes=$(MINUTES) $(SEED) $(if $(THREADS),threads=$(THREADS)) $(if $(LAUNCHER),launcher=$(LAUNCHER))
+# A counterpart of each dataset and 12 s a run: 27 runs, half of them on each of two cores.
 reproduce-tables: MINUTES := $(if $(filter command line,$(origin MINUTES)),$(MINUTES),$(if $(DATA),5,0.2))
 reproduce-tables: BUDGET ?= $(if $(DATA),fast,demo)
 reproduce-tables: SWEEPS ?= $(if $(SCENES_TYPED),dnerf,dnerf hypernerf nhr lego_complete)
 reproduce-tables: SCENES_TYPED := $(if $(filter command line,$(origin SCENES)),$(SCENES))
 reproduce-tables: SEEDS ?= 1
 reproduce-tables: OUT ?= runs/paper/results
-reproduce-tables: REPRODUCE = $(BIN)/forewarp-train --multirun budget=$(BUDGET) budget.minutes=$(MINUTES) $(SEED) $(if $(THREADS),threads=$(THREADS)) $(if $(LAUNCHER),launcher=$(LAUNCHER))
 reproduce-tables: ## the paper's tables and figures, measured beside printed [DATA= BUDGET= SCENES="hook lego" MINUTES= SEEDS=3 OUT=]
 ifeq ($(DATA),)
-	$(REPRODUCE) sweeps=methods scene=counterpart_dnerf $(GO_ON)
-	for dataset in hypernerf nhr lego_complete; do \
-		{ $(REPRODUCE) sweeps=$$dataset scene=counterpart_$$dataset $(GO_ON); } || exit; \
-	done
-	$(REPRODUCE) sweeps=ablation_losses scene=counterpart_dnerf $(GO_ON)
-	$(REPRODUCE) sweeps=ablation_modules scene=counterpart_dnerf,counterpart_hypernerf,counterpart_lego_complete $(GO_ON)
-	$(REPRODUCE) sweeps=resolution scene=counterpart_hypernerf $(GO_ON)
+	@$(MAKE) --no-print-directory -j2 tables-vehicle tables-captures BUDGET=$(BUDGET) MINUTES=$(MINUTES) SEEDS=$(SEEDS)
 else
 	for sweep in $(SWEEPS); do \
 		{ $(REPRODUCE) sweeps=$$sweep paths.scenes=$(DATA) \
@@ -108,6 +103,14 @@ else
 	done
 endif
 	$(BIN)/forewarp-report kind=paper out=$(OUT)
+
+tables-vehicle: PAIRS := methods:dnerf ablation_losses:dnerf ablation_modules:dnerf nhr:nhr
+tables-captures: PAIRS := hypernerf:hypernerf ablation_modules:hypernerf resolution:hypernerf lego_complete:lego_complete ablation_modules:lego_complete
+tables-vehicle tables-captures: THREADS ?= 1
+tables-vehicle tables-captures:
+	@for pair in $(PAIRS); do \
+		{ $(REPRODUCE) sweeps=$${pair%:*} scene=counterpart_$${pair#*:} $(GO_ON); } || exit; \
+	done $(SAYS)
 
 lint: ## look for mistakes and untidy code
 	$(BIN)/ruff check .
