@@ -23,8 +23,8 @@ SEED = $(if $(SEEDS),$(if $(findstring $(comma),$(SEEDS)),seed,seeds)=$(SEEDS))
 SAYS = 2>&1 | { trap '' INT; sed -u 's/^/$@ | /'; }
 SWEEP = $(BIN)/forewarp-train --multirun sweeps=accuracy_time
 space := $(subst ,, )
-# Jobs that failed have been named, and the report names what is missing; only an interruption ends it all.
-GO_ON = || [ $$? -ne 130 ]
+# A job that failed has been named and stops no other; make ends with its status. Only an interruption ends it all.
+GO_ON = || { status=$$?; [ $$status -lt 128 ] || exit $$status; }
 
 help: ## show this list
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 20
@@ -73,44 +73,48 @@ bench-gpu: ## steps, frames and PSNR against seconds on a GPU [DATA= SCENES="a b
 		$(if $(DATA),--data $(DATA) --scenes $(SCENES))
 
 accuracy-time: ## sweep choices against training time and draw it [DATA= SCENE= MINUTES= VARIANTS=a,b SEEDS=3]
-	$(SWEEP) $(if $(DATA),experiment=dnerf data.root=$(DATA) data.scene=$(SCENE)) $(MORE) $(GO_ON)
-	$(BIN)/forewarp-report kind=accuracy_time published=docs/results/published.yaml
+	status=0; $(SWEEP) $(if $(DATA),experiment=dnerf data.root=$(DATA) data.scene=$(SCENE)) $(MORE) $(GO_ON); \
+	$(BIN)/forewarp-report kind=accuracy_time published=docs/results/published.yaml && exit $$status
 
 price-list: SEEDS ?= 2
 price-list: ## what each choice costs and brings, on the vehicle and two real scenes [DATA= SCENES="a b" MINUTES=]
 	@test -n "$(DATA)" || { echo "price-list: expected DATA=<folder of D-NeRF scenes>"; exit 2; }
-	$(SWEEP) $(MORE) $(GO_ON)
+	status=0; $(SWEEP) $(MORE) $(GO_ON); \
 	for scene in $(SCENES); do \
-		{ $(SWEEP) experiment=dnerf data.root=$(DATA) data.scene=$$scene $(MORE) $(GO_ON); } || exit; \
-	done
-	$(BIN)/forewarp-report kind=price_list
+		$(SWEEP) experiment=dnerf data.root=$(DATA) data.scene=$$scene $(MORE) $(GO_ON); \
+	done; \
+	$(BIN)/forewarp-report kind=price_list && exit $$status
 
 REPRODUCE = $(BIN)/forewarp-train --multirun budget=$(BUDGET) budget.minutes=$(MINUTES) $(SEED) $(if $(THREADS),threads=$(THREADS)) $(if $(LAUNCHER),launcher=$(LAUNCHER))
 # A counterpart of each dataset and 12 s a run: 27 runs, half of them on each of two cores.
-reproduce-tables: MINUTES := $(if $(filter command line,$(origin MINUTES)),$(MINUTES),$(if $(DATA),5,0.2))
 reproduce-tables: BUDGET ?= $(if $(DATA),fast,demo)
+reproduce-tables: MINUTES := $(if $(filter command line,$(origin MINUTES)),$(MINUTES),$(if $(filter faithful,$(BUDGET)),null,$(if $(DATA),5,0.2)))
 reproduce-tables: SWEEPS ?= $(if $(SCENES_TYPED),dnerf,dnerf hypernerf nhr lego_complete)
+reproduce-tables: override SWEEPS := $(if $(filter all,$(SWEEPS)),dnerf hypernerf nhr lego_complete ablation_modules ablation_losses resolution methods,$(SWEEPS))
 reproduce-tables: SCENES_TYPED := $(if $(filter command line,$(origin SCENES)),$(SCENES))
 reproduce-tables: SEEDS ?= 1
 reproduce-tables: OUT ?= runs/paper/results
-reproduce-tables: ## the paper's tables and figures, measured beside printed [DATA= BUDGET= SCENES="hook lego" MINUTES= SEEDS=3 OUT=]
+reproduce-tables: ## the paper's tables and figures, measured beside printed [DATA= BUDGET= SCENES="hook lego" MINUTES= SEEDS=3 SWEEPS=all OUT=]
 ifeq ($(DATA),)
-	@$(MAKE) --no-print-directory -j2 tables-vehicle tables-captures BUDGET=$(BUDGET) MINUTES=$(MINUTES) SEEDS=$(SEEDS)
+	@status=0; $(MAKE) --no-print-directory -j2 tables-vehicle tables-captures \
+		BUDGET=$(BUDGET) MINUTES=$(MINUTES) SEEDS=$(SEEDS) $(GO_ON); \
+	$(BIN)/forewarp-report kind=paper out=$(OUT) && exit $$status
 else
-	for sweep in $(SWEEPS); do \
-		{ $(REPRODUCE) sweeps=$$sweep paths.scenes=$(DATA) \
-			$(if $(SCENES_TYPED),scene=$(subst $(space),$(comma),$(addprefix dnerf_,$(SCENES_TYPED)))) $(GO_ON); } || exit; \
-	done
+	@status=0; for sweep in $(SWEEPS); do \
+		$(REPRODUCE) sweeps=$$sweep paths.scenes=$(DATA) \
+			$(if $(filter faithful,$(BUDGET)),$$([ $$sweep = hypernerf ] && echo experiment=hypernerf_faithful)) \
+			$(if $(SCENES_TYPED),scene=$(subst $(space),$(comma),$(addprefix dnerf_,$(SCENES_TYPED)))) $(GO_ON); \
+	done; \
+	$(BIN)/forewarp-report kind=paper out=$(OUT) && exit $$status
 endif
-	$(BIN)/forewarp-report kind=paper out=$(OUT)
 
 tables-vehicle: PAIRS := methods:dnerf ablation_losses:dnerf ablation_modules:dnerf nhr:nhr
 tables-captures: PAIRS := hypernerf:hypernerf ablation_modules:hypernerf resolution:hypernerf lego_complete:lego_complete ablation_modules:lego_complete
 tables-vehicle tables-captures: THREADS ?= 1
 tables-vehicle tables-captures:
-	@for pair in $(PAIRS); do \
-		{ $(REPRODUCE) sweeps=$${pair%:*} scene=counterpart_$${pair#*:} $(GO_ON); } || exit; \
-	done $(SAYS)
+	@{ status=0; for pair in $(PAIRS); do \
+		$(REPRODUCE) sweeps=$${pair%:*} scene=counterpart_$${pair#*:} $(GO_ON); \
+	done; exit $$status; } $(SAYS)
 
 lint: ## look for mistakes and untidy code
 	$(BIN)/ruff check .

@@ -6,6 +6,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from configs import ROOT, composed
 from forewarp.cli.runs import build_run, hashed
+from forewarp.cli.train import refuse_budget
 
 PAPER = {
     "dnerf": 8,
@@ -15,7 +16,7 @@ PAPER = {
     "ablation_modules": 60,
     "ablation_losses": 32,
     "resolution": 16,
-    "methods": 4,
+    "methods": 32,
 }
 COUNTERPARTS = ["dnerf", "hypernerf", "nhr", "lego_complete"]
 
@@ -107,3 +108,43 @@ def test_a_job_is_known_by_what_it_computes():
 def test_the_canonical_middle_reaches_the_data():
     run = build_run(composed("scene=dnerf_hook", "ablation=canonical_middle"))
     assert run.datamodule._canonical == "middle"
+
+
+@pytest.mark.parametrize("budget", ["demo", "fast"])
+def test_what_stands_alone_begins_as_the_coarse_stage_would(budget):
+    common = ["scene=dnerf_hook", f"budget={budget}"]
+    coarse = composed(*common, "ablation=full").stage.coarse
+    full, alone = (composed(*common, f"ablation={name}").stage for name in ("full", "no_coarse"))
+    assert alone.coarse is None
+    changed = {key for key in full.fine if full.fine[key] != alone.fine[key]}
+    assert changed <= {"start", "hold", "bases", "hull_frames", "hull_grow", "confine", "curriculum", "rates"}
+    assert all(alone.fine[key] == coarse[key] for key in changed - {"rates"})
+    assert alone.fine.rates == {**full.fine.rates, "flow": coarse.rates.flow}
+
+
+@pytest.mark.parametrize("budget", ["demo", "fast", "faithful"])
+def test_the_voxel_networks_come_with_the_fine_stage(budget):
+    common = ["scene=dnerf_hook", f"budget={budget}"]
+    for name in ("full", "no_tv", "no_up_photo"):
+        stage = composed(*common, f"ablation={name}").stage
+        assert not {"upsampler", "inpainter"} & set(stage.coarse.effects)
+        assert {"upsampler", "inpainter"} <= set(stage.fine.effects)
+
+
+def test_a_capture_of_ten_minutes_is_not_called_faithful():
+    with pytest.raises(ValueError, match="expected demo or fast.*but got faithful.*hypernerf_faithful"):
+        refuse_budget(composed("scene=hypernerf_broom", "budget=faithful"))
+    faithful = composed("scene=hypernerf_broom", "budget=faithful", "experiment=hypernerf_faithful")
+    refuse_budget(faithful)
+    assert faithful.budget.bases == 25
+    assert faithful.model.view is not None
+    assert faithful.data.scene == "broom2"
+    refuse_budget(composed("scene=hypernerf_broom"))
+
+
+def test_where_minutes_bound_a_run_its_precision_counts():
+    full = ["sweeps=dnerf", "scene=dnerf_hook"]
+    half = "+trainer.precision=bf16-mixed"
+    assert hashed(composed(*full)).run != hashed(composed(*full, half)).run
+    steps = ["budget.minutes=null", "budget.iterations=5"]
+    assert hashed(composed(*full, *steps)).run == hashed(composed(*full, *steps, half)).run

@@ -132,10 +132,11 @@ def test_the_same_command_again_trains_nothing(forewarp, fitted, scenes, monkeyp
         raise AssertionError("trained again")
 
     monkeypatch.setattr(lightning.Trainer, "fit", never)
-    before = numbers(fitted)
-    done = forewarp(*arguments(scenes, fitted))
+    before, config = numbers(fitted), (fitted / "config.yaml").read_text()
+    done = forewarp(*arguments(scenes, fitted), "threads=1")
     assert done.status == 0, done.err
     assert numbers(fitted) == before
+    assert (fitted / "config.yaml").read_text() == config  # its numbers are not of one thread
     assert done.out.startswith(f"measured before: {fitted}; again with forewarp-evaluate run={fitted}")
 
 

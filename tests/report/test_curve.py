@@ -60,15 +60,15 @@ def test_a_scene_names_those_on_the_front_and_the_hardware_of_others(tmp_path, m
     write_run(tmp_path, "slow", curve=((30, 20.0), (60, 24.0)))
     write_run(tmp_path, "good", curve=((30, 20.0), (60, 28.0)))
     groups = grouped(collect(tmp_path)[0])
-    other = Published("other", 100.0, 32.0, "a GPU", "its paper")
+    other = Published("other", 100.0, 32.0, "a GPU", "its paper", "dnerf")
     legend = legend_of(monkeypatch, tmp_path / "scene.png", groups, "ball", [other])
     assert legend == ["base, 1 min", "good, 1 min", "Pareto front", "other (published, a GPU)"]
 
 
 def test_published_points_are_read_and_checked(tmp_path):
     path = tmp_path / "published.yaml"
-    path.write_text("- {name: a, seconds: 60, psnr: 30.5, hardware: g, source: s}\n")
-    assert read_published(path) == [Published("a", 60, 30.5, "g", "s")]
+    path.write_text("- {name: a, seconds: 60, psnr: 30.5, hardware: g, source: s, dataset: dnerf}\n")
+    assert read_published(path) == [Published("a", 60, 30.5, "g", "s", "dnerf")]
     for text in ("- {name: a}\n", "name: a\n"):
         path.write_text(text)
         with pytest.raises(ValueError, match=r"published.yaml: \[0\]: expected the keys name, seconds"):

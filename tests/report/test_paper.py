@@ -213,6 +213,53 @@ def test_of_runs_alike_the_newest_counts(tmp_path):
     assert str(new) not in text
 
 
+def altered(folder, **protocol):
+    """The run, measured otherwise."""
+    metrics = json.loads((folder / "metrics.json").read_text())
+    metrics["protocol"] |= protocol
+    (folder / "metrics.json").write_text(json.dumps(metrics))
+    return folder
+
+
+def test_no_mean_is_taken_over_unlike_images(tmp_path):
+    for scene in ALL:
+        altered(paper_run(tmp_path, scene), half_resolution=scene == "hook")
+    assert cells(table_of(tmp_path), "forewarp: forward, fast, 1 min") == ["", "", ""]
+    names = [column.name for column in table_of(tmp_path, "dnerf_scenes").columns]
+    row = dict(zip(names[2:], cells(table_of(tmp_path, "dnerf_scenes"), "forewarp: forward, fast, 1 min")))
+    assert row["Hook PSNR↑"] == "30.00"
+
+
+def test_machines_have_rows_of_their_own(tmp_path):
+    for number, scene in enumerate(ALL):
+        altered(paper_run(tmp_path, scene), device="a gpu" if number < 4 else "a cpu")
+    rows = [row for row in table_of(tmp_path).rows if row[1] == "measured"]
+    assert [row[0] for row in rows] == [
+        f"forewarp: forward, fast, 1 min, {name}" for name in ("a cpu", "a gpu")
+    ]
+    assert all(row[2] is None for row in rows)
+
+
+def test_a_synthesised_scene_is_a_counterpart_however_it_is_read(tmp_path):
+    altered(paper_run(tmp_path / "runs", "lift", dataset="lego_complete"), synthetic=True)
+    write_paper(tmp_path / "runs", tmp_path / "out", PRINTED)
+    text = (tmp_path / "out" / "paper.md").read_text()
+    assert "## Table 4: Lego Complete, by ability: synthetic counterpart" in text
+    assert "difference to the paper" not in text
+
+
+def test_other_variants_called_voxels_are_not_of_the_figure(tmp_path):
+    for side in (20, 40, "all"):
+        paper_run(tmp_path / "runs", "ball", f"voxels_{side}", dataset="hypernerf")
+    files = write_paper(tmp_path / "runs", tmp_path / "out", PRINTED)
+    assert tmp_path / "out" / "paper-resolution.png" in files
+
+
+def test_tables_by_themselves_say_how_they_came_about(whole):
+    assert "# machine: a cpu, 2 threads, torch 2" in (whole / "paper-table-1-d-nerf.csv").read_text()
+    assert r"\footnotesize machine: a cpu, 2 threads, torch 2" in (whole / "paper.tex").read_text()
+
+
 def test_measured_rows_keep_the_order_of_the_variants(tmp_path):
     for variant in ("no_inpainter", "full", "no_tv"):
         paper_run(tmp_path, "hook", variant)

@@ -15,7 +15,7 @@ from omegaconf import OmegaConf
 from forewarp.cli.endurance import SMALL
 from forewarp.cli.entry import ROOT_VARIABLE, project_root, quiet
 from forewarp.cli.measure import device_of
-from forewarp.cli.runs import build_run
+from forewarp.cli.runs import build_run, claim
 from forewarp.training.accuracy import FILE, read_rows
 from forewarp.training.clock import now
 from forewarp.training.module import DynamicSceneModule
@@ -39,18 +39,22 @@ TINY = (
 
 
 class StepTimes(lightning.Callback):
-    """Seconds from a step's beginning to its end, by stage; a GPU has then finished it."""
+    """Seconds from a step's end to the next one's, batch drawn and moved, by stage; a GPU has finished."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, list[float]] = {}
 
-    def on_train_batch_start(self, trainer, module, batch, batch_idx) -> None:
-        """Note the time."""
-        self._begin = now()
+    def on_train_start(self, trainer, module) -> None:
+        """Begin a stage."""
+        self._since = now()
 
     def on_train_batch_end(self, trainer, module, outputs, batch, batch_idx) -> None:
-        """And what has passed since."""
-        self.seconds.setdefault(module.settings.name, []).append(now() - self._begin)
+        """What has passed since the last."""
+        before, self._since = self._since, now()
+        self.seconds.setdefault(module.settings.name, []).append(self._since - before)
+
+    def __bool__(self) -> bool:
+        return bool(self.seconds)
 
     def __str__(self) -> str:
         # The second half: the first has compilers, growing lattices and few frames in it.
@@ -64,6 +68,7 @@ def fit(overrides: Sequence[str]) -> tuple[Run, DynamicSceneModule, StepTimes]:
     with initialize_config_dir(str(project_root() / "conf"), version_base="1.3"):
         config = compose("train", list(overrides))
     run, times = build_run(config), StepTimes()
+    claim(config)  # a folder fitted with other bounds is refused
     own = run.callbacks
     run.callbacks = lambda name, folder: [*own(name, folder), times]
     module = run.fit()
@@ -127,10 +132,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
         data = ["experiment=dnerf", f"data.root={given.data}", f"data.scene={scene}"] if given.data else []
         budget = ["budget=fast", "data.held_out=2"] if given.small else ["budget=fast", "data.held_out=8"]
         where = given.folder / scene
-        run, module, times = fit([*data, *common, *budget, *bounds, f"run={where / 'fast'}"])
+        name = f"fast-{given.minutes:g}min"
+        run, module, times = fit([*data, *common, *budget, *bounds, f"run={where / name}"])
         print(f"{scene}, fast")
         report(run, module, times, 40 if given.small else 400)
-        for row in read_rows(where / "fast" / FILE):
+        for row in read_rows(where / name / FILE):
             print(f"  after {float(row['seconds']):6.1f} s: {float(row['psnr']):.2f} dB of views set aside")
         scores = [float(module.psnr_of(target)) for target in run.datamodule.targets("test")]
         print(f"  test views: {statistics.mean(scores):.2f} dB{papers(scene)}")

@@ -1,10 +1,10 @@
 """``python -m forewarp.cli.limits RUN ...``: what keeps fitted scenes from the truth, as a table.
 
-A row a run. PSNR of the test views, and by their time: the first fifth of the sequence, the middle, the
-last fifth. PSNR of some training views: what motion between the given times and views between the
-given ones cost. PSNR of the truth itself, averaged over a voxel and linear between voxels: what the lattice
-allows. And where the squared error of the test views lies: outside of the true silhouettes, within two pixels
-of them, inside.
+A row a run. PSNR of the test views, and by their time: the first fifth of the sequence, the middle, the last
+fifth. PSNR of some training views: what motion between the given times and views between the given ones cost.
+PSNR of the nearest picture that is linear between points a voxel apart: roughly what the lattice allows. And
+where the squared error of the test views lies: outside of the true silhouettes, within two pixels of them,
+inside.
 """
 
 from __future__ import annotations

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import torch
 from hydra.core.hydra_config import HydraConfig
-from hydra.types import RunMode
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
@@ -91,11 +90,15 @@ def watching(run: Run, watchers: list[Callable], name: str) -> list:
 def hashed(config: DictConfig) -> DictConfig:
     """The config with ``{hash}`` in ``run`` replaced by ten digits of a SHA-256 of all that tells runs apart.
 
-    So a finished job is known by what it computed, and another config never meets its folder.
+    So a finished job is known by what it computed, and another config never meets its folder. Where minutes
+    bound a run, what it computes with is part of that.
     """
     if HASH in str(config.run):
         _make_absolute(config)
-        text = json.dumps({key: _plain(config[key]) for key in IDENTITY}, sort_keys=True)
+        content = {key: _plain(config[key]) for key in IDENTITY}
+        if config.budget.minutes is not None:
+            content["on"] = [device_of(config.trainer.accelerator).type, config.trainer.get("precision")]
+        text = json.dumps(content, sort_keys=True)
         config.run = str(config.run).replace(HASH, hashlib.sha256(text.encode()).hexdigest()[:10])
     return config
 
@@ -104,8 +107,8 @@ def _plain(value: object) -> object:
     return OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value
 
 
-def claim(config: DictConfig) -> None:
-    """Write the resolved config into the run's folder, or refuse a folder begun with another one."""
+def claim(config: DictConfig, *, finished: bool = False) -> None:
+    """Write the resolved config into the run's folder, unless ``finished``; refuse one of another run."""
     folder, path = Path(config.run), Path(config.run) / "config.yaml"
     _make_absolute(config)
     if config.get("resume") is None:
@@ -119,6 +122,8 @@ def claim(config: DictConfig) -> None:
         )
     if begun:
         _refuse_another(path, read_config(path), resolved)
+    if finished:  # its numbers are of how it was run, not of what is typed now
+        return
     folder.mkdir(parents=True, exist_ok=True)
     beside = path.with_name(path.name + ".part")
     beside.write_text(OmegaConf.to_yaml(resolved))
@@ -140,13 +145,6 @@ def typed() -> str | None:
         return None
     words = HydraConfig.get().overrides.task
     return shlex.join(["forewarp-train", *(word for word in words if not word.startswith(OF_A_SWEEP))])
-
-
-def refuse_seeds(config: DictConfig) -> None:
-    """Refuse ``seeds=`` where nothing repeats the run."""
-    alone = not (HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN)
-    if alone and config.get("seeds", 1) != 1:
-        raise ValueError(f"seeds: expected --multirun beside seeds={config.seeds}; add it, or use seed=N")
 
 
 def saved_config(run: str | None, changes: DictConfig, key: str = "run") -> DictConfig:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from forewarp.cli.claims import in_turn
 from forewarp.data.files import read_json
-from forewarp.data.fingerprint import LOCK
+from forewarp.data.fingerprint import LOCK, RECORD
 from forewarp.data.module import (
     DNeRFDataModule,
     HyperNeRFDataModule,
@@ -20,7 +20,6 @@ from forewarp.data.module import (
 from forewarp.scene.errors import SceneError
 from forewarp.synth import dome, lego_complete, rig, scenes
 
-RECORD = "synthesis.json"
 WRITERS = {
     "dnerf": scenes.synthesize,
     "lego_complete": lego_complete.synthesize,

@@ -45,9 +45,10 @@ def train(config) -> None:
     from forewarp.cli.claims import alone, same_data
     from forewarp.cli.measure import measure
     from forewarp.cli.report import draw_run
-    from forewarp.cli.runs import build_run, claim, hashed, is_measured, refuse_seeds, resumed
+    from forewarp.cli.runs import build_run, claim, hashed, is_measured, resumed
 
     refuse_seeds(config)
+    refuse_budget(config)
     config = hashed(resumed(config))
     run = build_run(config)
     if skips(run, config.get("absent", "refuse")):
@@ -55,7 +56,8 @@ def train(config) -> None:
         return
     if config.evaluate and is_measured(run):
         with alone(run.folder):
-            claim(config)
+            claim(config, finished=True)
+            same_data(run, config.get("data_changed", "refuse"))
         print(f"measured before: {run.folder}; again with forewarp-evaluate run={run.folder}")
         return
     run.datamodule.setup("fit")  # before the folder is made: a mistyped scene leaves nothing behind
@@ -70,6 +72,26 @@ def train(config) -> None:
             print(f"fitted: {run.folder}; measure it with forewarp-evaluate run={run.folder}")
         draw_run(run.folder)
     tell_skipped(run)
+
+
+def refuse_seeds(config) -> None:
+    """Refuse ``seeds=`` where nothing repeats the run."""
+    from hydra.core.hydra_config import HydraConfig
+    from hydra.types import RunMode
+
+    alone = not (HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN)
+    if alone and config.get("seeds", 1) != 1:
+        raise ValueError(f"seeds: expected --multirun beside seeds={config.seeds}; add it, or use seed=N")
+
+
+def refuse_budget(config) -> None:
+    """Refuse a budget that the experiment's numbers are not for, as the run would bear its name."""
+    suits = config.get("suits")
+    if suits is not None and config.budget.name not in suits:
+        raise ValueError(
+            f"budget: expected {' or '.join(suits)}, which this experiment's numbers are for, but got "
+            f"{config.budget.name}; use experiment=hypernerf_faithful for the paper's"
+        )
 
 
 def beginning(run, config) -> str:

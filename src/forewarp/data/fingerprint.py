@@ -9,6 +9,7 @@ from pathlib import Path
 from forewarp.data.files import MOST_TEXT, read_bytes
 
 _READ = {".json", ".inf", ".txt", ".csv"}  # small and decisive: their content counts
+RECORD = "synthesis.json"  # of every synthesised scene, or folder of them
 LOCK = ".lock"  # of every folder of a run
 _LISTED = {".png", ".jpg", ".jpeg", ".npy", ".npz", ".ply", ".obj"}  # name and size
 

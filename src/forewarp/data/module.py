@@ -13,7 +13,7 @@ from forewarp.data import dnerf, hypernerf, lego_complete, nhr, posed_video
 from forewarp.data.batches import RayBatches, Targets, color_of
 from forewarp.data.cache import CACHE
 from forewarp.data.canonical import with_canonical
-from forewarp.data.fingerprint import fingerprint
+from forewarp.data.fingerprint import RECORD, fingerprint
 from forewarp.data.held import hold_out
 from forewarp.scene.batch import Target
 from forewarp.scene.errors import SceneError
@@ -67,7 +67,10 @@ class SceneDataModule(LightningDataModule):
         """The scene, whose protocol names the background that it is measured on."""
         scene = hold_out(with_canonical(self._read(), self._canonical), self.held_out)
         behind = self.eval_background if scene.has_alpha else "none"
-        return replace(scene, protocol={**scene.protocol, "background": behind})
+        protocol = {**scene.protocol, "background": behind}
+        if self.place is not None and any((p / RECORD).is_file() for p in (self.place, self.place.parent)):
+            protocol["synthetic"] = True  # however it is read
+        return replace(scene, protocol=protocol)
 
     @cached_property
     def batches(self) -> RayBatches:

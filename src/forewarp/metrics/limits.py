@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 from torch.nn import functional
@@ -10,22 +12,29 @@ REGIONS = ("outside", "outline", "inside")
 
 
 def low_passed(image: Tensor, pixels: float) -> Tensor:
-    """What a lattice whose voxels are ``pixels`` wide in the picture could show at best.
+    """The nearest picture that is linear between points ``pixels`` apart, as slices of a trilinear grid are.
+
+    Not quite a bound: a grid's points lie elsewhere in every view, and its density makes edges of its own.
 
     Args:
         image: (H, W, 3) in [0, 1].
-        pixels: a voxel's width; up to 1 the image itself.
+        pixels: from point to point; up to 1 the image itself.
 
     Returns:
-        (H, W, 3): averaged over a voxel and linear between voxels, as a trilinear grid is.
+        (H, W, 3): the least squares fit.
     """
     if pixels <= 1:
         return image
-    height, width = image.shape[:2]
-    coarse = (max(round(height / pixels), 1), max(round(width / pixels), 1))
-    planes = image.movedim(-1, 0)[None]
-    sampled = functional.interpolate(planes, size=coarse, mode="area")
-    return functional.interpolate(sampled, size=(height, width), mode="bilinear")[0].movedim(0, -1)
+    rows, columns = (_projection(length, pixels) for length in image.shape[:2])
+    return torch.einsum("ab,bcd,ec->aed", rows, image.double(), columns).to(image.dtype)
+
+
+def _projection(length: int, pixels: float) -> Tensor:
+    """Onto what is linear between points (length, length), float64."""
+    places = (torch.arange(length).double() + 0.5) / pixels
+    points = torch.arange(math.ceil(length / pixels) + 1).double()
+    hats = (1 - (places[:, None] - points).abs()).clamp(min=0)
+    return hats @ torch.linalg.pinv(hats)
 
 
 def regions(foreground: Tensor, band: int = 2) -> dict[str, Tensor]:

@@ -37,12 +37,13 @@ def write_accuracy_time(
     Returns:
         the files.
     """
-    results, without = collect(runs, ["accuracy_time.csv"])
+    results, without = collect(runs, ["accuracy_time.csv", "metrics.json"])
     out.mkdir(parents=True, exist_ok=True)
     written, parts = [], [INTRODUCTION, f"Machine: {machine(results)}.\n"]
     for scene, found in by_scene(results).items():
         groups = grouped(found)
-        picture = draw_scene(out / f"accuracy-time-{scene}.png", groups, scene, published)
+        beside = [p for p in published if (p.dataset, False) == (found[0].dataset, found[0].is_counterpart)]
+        picture = draw_scene(out / f"accuracy-time-{scene}.png", groups, scene, beside)
         every = variants(groups, _target(groups) if target is None else target)
         file = out / f"accuracy-time-{scene}.csv"
         file.write_text(every.csv())
@@ -51,7 +52,8 @@ def write_accuracy_time(
         written += [picture, file]
     if published:
         lines = [f"* {p.name}: {p.psnr:g} dB, {p.seconds:g} s, {p.hardware}; {p.source}" for p in published]
-        parts += ["## Published by others\n", "\n".join(lines) + "\n"]
+        about = "Means over a dataset's scenes, by protocols of their own: for orientation.\n"
+        parts += ["## Published by others\n", about, "\n".join(lines) + "\n"]
     if without:
         parts += ["## Without a curve\n", "\n".join(f"* {line}" for line in without) + "\n"]
     page = out / "accuracy-time.md"

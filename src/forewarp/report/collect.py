@@ -50,7 +50,8 @@ class Result:
     @property
     def is_counterpart(self) -> bool:
         """Whether it is of a procedural scene that stands in for its dataset."""
-        return ".Synthetic" in str(self.config["data"].get("_target_", ""))
+        made = self.metrics.get("protocol", {}).get("synthetic", False)
+        return bool(made) or ".Synthetic" in str(self.config["data"].get("_target_", ""))
 
     @property
     def variant(self) -> str:
@@ -143,8 +144,7 @@ def collect(root: Path, needed: Sequence[str] = ()) -> tuple[list[Result], list[
             results.append(result)
     if not results and not without:
         raise ValueError(
-            f"{root}: expected folders of runs, but got none; "
-            "make some with make accuracy-time, or set runs=..."
+            f"{root}: expected folders of runs, but got none; make some with forewarp-train, or set runs=..."
         )
     return results, without
 

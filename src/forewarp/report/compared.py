@@ -32,13 +32,16 @@ class Measured:
     def cell(self, group: Group, metric: str) -> Estimate | None:
         """Over the seeds that all scenes of the group were measured with: the mean of the scenes' means.
 
-        None where there is no such seed.
+        None where there is no such seed, or where images were halved, or put before a background, unequally.
         """
-        found = {}
+        found, conditions = {}, set()
         for run in self.runs:
             scores = run.metrics["test"].get(group.ability or run.ability, {})
             if run.dataset == group.dataset and metric in scores:
                 found[run.scene, run.seed] = scores[metric] * METRICS[metric][3]
+                conditions |= {_conditions(run)} if run.scene in group.scenes else set()
+        if len(conditions) > 1:
+            return None
         seeds = sorted({seed for _, seed in found})
         whole = [seed for seed in seeds if all((scene, seed) in found for scene in group.scenes)]
         return Estimate.of([fmean(found[scene, seed] for scene in group.scenes) for seed in whole])
@@ -52,8 +55,9 @@ class Measured:
 def row_of(run: Result) -> tuple:
     """What runs of one row have in common."""
     budget = run.config["budget"]
-    known = (run.config.get("variant") or {}).get("name", "plain")
-    return known, run.config["model"]["warp"], budget["name"], budget["minutes"], budget.get("iterations")
+    known, protocol = (run.config.get("variant") or {}).get("name", "plain"), run.metrics.get("protocol", {})
+    bounds = budget["name"], budget["minutes"], budget.get("iterations")
+    return known, run.config["model"]["warp"], *bounds, protocol.get("held_out", 0), protocol.get("device")
 
 
 def measured(table: PaperTable, results: Sequence[Result]) -> list[Measured]:
@@ -65,7 +69,8 @@ def measured(table: PaperTable, results: Sequence[Result]) -> list[Measured]:
         if key[0] in table.variants and run.dataset in datasets:
             rows.setdefault(key, []).append(run)
     order = sorted(rows, key=lambda k: (table.variants.index(k[0]), *(str(part) for part in k[1:])))
-    return [Measured(_name(key, rows[key]), key[0], tuple(rows[key])) for key in order]
+    machines = {key[-1] for key in rows}
+    return [Measured(_name(key, rows[key], len(machines) > 1), key[0], tuple(rows[key])) for key in order]
 
 
 def comparison(table: PaperTable, results: Sequence[Result], *, difference: bool = True) -> Table:
@@ -124,12 +129,18 @@ def with_means(table: PaperTable, results: Sequence[Result]) -> PaperTable:
     return table
 
 
-def _name(key: tuple, runs: Sequence[Result]) -> str:
-    variant, warp, budget, minutes, iterations = key
+def _conditions(run: Result) -> tuple:
+    protocol = run.metrics.get("protocol", {})
+    return protocol.get("half_resolution"), protocol.get("background")
+
+
+def _name(key: tuple, runs: Sequence[Result], tell_device: bool) -> str:
+    variant, warp, budget, minutes, iterations, held_out, device = key
     bounds = [f"{minutes:g} min" if minutes else "", f"{iterations} steps" if iterations else ""]
     about = warp if variant == "plain" else (runs[0].about or variant)
     seeds = len({run.seed for run in runs})
     parts = [f"forewarp: {about}", budget, *bounds, f"{seeds} seeds" if seeds > 1 else ""]
+    parts += [f"{held_out} views set aside" if held_out else "", str(device) if tell_device else ""]
     return ", ".join(part for part in parts if part)
 
 

@@ -11,7 +11,7 @@ import yaml
 
 from forewarp.report.collect import Point, Result
 
-_KEYS = ("name", "seconds", "psnr", "hardware", "source")
+_KEYS = ("name", "seconds", "psnr", "hardware", "source", "dataset")
 
 
 def seconds_to(curve: Sequence[Point], psnr: float) -> float | None:
@@ -44,17 +44,18 @@ def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
 
 @dataclass(frozen=True)
 class Published:
-    """A number that others report: ``psnr`` (dB) after ``seconds`` on their ``hardware``, from ``source``."""
+    """What others report: ``psnr`` (dB) of a ``dataset`` after ``seconds`` on ``hardware``; ``source``."""
 
     name: str
     seconds: float
     psnr: float
     hardware: str
     source: str
+    dataset: str
 
 
 def read_published(path: Path) -> list[Published]:
-    """A YAML list of entries with the keys name, seconds, psnr, hardware, source.
+    """A YAML list of entries with the keys name, seconds, psnr, hardware, source, dataset.
 
     Raises:
         ValueError: an entry that lacks one.

@@ -76,9 +76,7 @@ def html(title: str, introduction: str, sections: Sequence[Section]) -> str:
 
 def latex(sections: Sequence[Section]) -> str:
     """A document with every table: booktabs, the best bold, the second underlined."""
-    tables = [
-        _latex_table(section.title, table, section.notes) for section in sections for table in section.tables
-    ]
+    tables = [_latex_table(section, table) for section in sections for table in section.tables]
     return LATEX_HEAD + "\n".join(tables) + "\\end{document}\n"
 
 
@@ -91,9 +89,9 @@ def latex_text(text: str) -> str:
     return "".join(_LATEX.get(c, c) for c in text)
 
 
-def _latex_table(title: str, table: Table, notes: Sequence[str]) -> str:
+def _latex_table(section: Section, table: Table) -> str:
     rows = table.texts({"best": "\\textbf{{{}}}", "second": "\\underline{{{}}}"}, latex_text)
-    caption = ". ".join(part.rstrip(".:") for part in (title, table.caption) if part)
+    caption = ". ".join(part.rstrip(".:") for part in (section.title, table.caption) if part)
     lines = ["\\begin{table}[p]", "\\centering", f"\\caption{{{latex_text(caption)}}}"]
     lines += ["\\resizebox{\\textwidth}{!}{%", f"\\begin{{tabular}}{{{_aligned(table)}}}", "\\toprule"]
     lines += [" & ".join(latex_text(column.name) for column in table.columns) + " \\\\", "\\midrule"]
@@ -101,7 +99,8 @@ def _latex_table(title: str, table: Table, notes: Sequence[str]) -> str:
         lines += ["\\midrule"] if number in table.rules and number else []
         lines.append(" & ".join(row) + " \\\\")
     lines += ["\\bottomrule", "\\end{tabular}}"]
-    lines += [f"\\par\\footnotesize $^{{{i}}}$~{latex_text(note)}" for i, note in enumerate(notes, 1)]
+    lines += [f"\\par\\footnotesize {latex_text(fact)}" for fact in section.facts]
+    lines += [f"\\par\\footnotesize $^{{{i}}}$~{latex_text(note)}" for i, note in enumerate(section.notes, 1)]
     return "\n".join([*lines, "\\end{table}", "\\clearpage", ""])
 
 

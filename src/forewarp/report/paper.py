@@ -23,6 +23,9 @@ INTRODUCTION = (
     "comparable with printed ones."
 )
 COUNTERPART = ": synthetic counterpart"
+# Of a run's protocol, what tells its numbers from others of the dataset.
+TOLD = ("half_resolution", "scale", "split", "frames", "views", "train_frames", "test_views", "test_frames")
+TOLD += ("held_out", "canonical_time", "mask_box")
 DATASETS = ("dnerf", "hypernerf", "nhr", "lego_complete")
 
 
@@ -108,7 +111,7 @@ def figures_of(results: Sequence[Result], out: Path, kept: Path) -> tuple[list[S
     found = [(title, path, facts(runs)) for title, path, runs in found if path is not None]
     sections = [Section(title, facts=lines, pictures=[path]) for title, path, lines in found]
     for path in sorted(kept.glob("accuracy-time-*.png")):
-        if not (out / path.name).exists():
+        if path.parent.resolve() != out.resolve():
             shutil.copyfile(path, out / path.name)
     if curves := sorted(out.glob("accuracy-time-*.png")):
         lines = ["runs of their own, with views set aside: make accuracy-time"]
@@ -147,7 +150,8 @@ def _write_csv(sections: Sequence[Section], out: Path) -> list[Path]:
         name = "".join(c if c.isalnum() else "-" for c in title.split(",")[0].lower())
         name += "-counterpart" * (title != section.title)
         files.append(out / f"paper-{'-'.join(part for part in name.split('-') if part)}.csv")
-        files[-1].write_text(replace(section.tables[0], marks={}).csv())
+        about = "".join(f"# {line}\n" for line in section.facts)
+        files[-1].write_text(replace(section.tables[0], marks={}).csv() + about)
     return files
 
 
@@ -156,8 +160,15 @@ def _protocol(run: Result) -> str:
     sizes = known.get("resolution", [])
     sizes = sizes if sizes and isinstance(sizes[0], list) else [sizes]
     size = " and ".join("x".join(map(str, sides)) for sides in sizes)
-    words = [run.dataset, size, f"background {known.get('background', 'unknown')}", known.get("note", "")]
-    return ", ".join(word for word in words if word)
+    words = [run.dataset, size, f"background {known.get('background', 'unknown')}"]
+    words += [f"{key.replace('_', ' ')} {_text(known[key])}" for key in TOLD if known.get(key)]
+    return ", ".join(word for word in [*words, known.get("note", "")] if word)
+
+
+def _text(value: object) -> str:
+    if isinstance(value, dict):
+        return ", ".join(f"{name} {part}" for name, part in value.items())
+    return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
 
 
 def _budget(run: Result) -> str:

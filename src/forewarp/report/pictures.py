@@ -10,6 +10,7 @@ import numpy as np
 
 from forewarp.report import curve
 from forewarp.report.collect import Result
+from forewarp.report.compared import row_of
 from forewarp.report.tables import Estimate
 
 GAP = 4  # pixels between the parts of a sheet
@@ -20,8 +21,9 @@ def draw_resolution(path: Path, results: Sequence[Result]) -> Path | None:
     scenes: dict[str, dict[int, list[float]]] = {}
     for run in results:
         name, _, side = run.variant.rpartition("_")
-        if name == "voxels" and "psnr" in run.numbers:
-            scenes.setdefault(run.scene, {}).setdefault(int(side), []).append(run.numbers["psnr"])
+        if name == "voxels" and side.isdigit() and "psnr" in run.numbers:
+            line = ", ".join([run.scene, *(str(part) for part in row_of(run)[1:4])])
+            scenes.setdefault(line, {}).setdefault(int(side), []).append(run.numbers["psnr"])
     scenes = {scene: sides for scene, sides in scenes.items() if len(sides) > 1}
     if not scenes:
         return None

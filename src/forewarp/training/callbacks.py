@@ -47,7 +47,8 @@ class StageProgress(lightning.Callback):
             left = seconds * (1 - fraction) / fraction if fraction > 0 else None
             known = left is not None and self.later
             whole = f"{time_text(left + self.later)} with what follows | " if known else ""
-            self._line.show(fraction, left, whole + self._text(module))
+            with module.clock.paused():
+                self._line.show(fraction, left, whole + self._text(module))
 
     def on_train_end(self, trainer, module) -> None:
         """Leave the last values behind."""
@@ -112,6 +113,7 @@ class TensorBoardScalars(lightning.Callback):
         motion = getattr(module.method, "motion", None)
         if motion is not None:
             scalars["train/bases_in_play"] = float(motion.trajectory.bases_in_play)
-        for logger in trainer.loggers:
-            if isinstance(logger, TensorBoardLogger):
-                logger.log_metrics(scalars, module.global_step)
+        with module.clock.paused():
+            for logger in trainer.loggers:
+                if isinstance(logger, TensorBoardLogger):
+                    logger.log_metrics(scalars, module.global_step)
