@@ -145,7 +145,6 @@ def test_what_was_not_measured_since_is_measured(forewarp, fitted, scenes, tmp_p
     (tmp_path / "run" / "metrics.json").unlink()
     assert forewarp(*arguments(scenes, tmp_path / "run")).status == 0
     assert numbers(tmp_path / "run") == numbers(fitted)
-    assert not (tmp_path / "run" / "accuracy_time.png").exists()
 
 
 def test_a_run_with_views_set_aside_leaves_its_curve(forewarp, scenes, tmp_path):

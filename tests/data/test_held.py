@@ -52,5 +52,6 @@ def test_batches_never_show_them():
     data = SceneDataModule(lambda: ball_scene(frames=8, size=8), rays=4, held_out=2)
     times = {frame.time for frame in data.scene.held}
     assert len(data.targets("held")) == len(times) == 2
+    assert data.watched().frames == data.targets("held").frames
     assert not {data.batches.draw().time for _ in range(200)} & times
     assert len(SceneDataModule(lambda: ball_scene(frames=8, size=8)).targets("held")) == 0

@@ -170,9 +170,27 @@ def test_seconds_add_up_over_stages(tmp_path):
     assert seconds_before(tmp_path / "fine") == pytest.approx(seconds[3], abs=5)
 
 
-def test_no_views_set_aside_no_curve(tmp_path):
-    run(tmp_path, held_out=0).fit()
+def test_no_views_set_aside_and_none_to_validate_no_curve(tmp_path):
+    run(tmp_path, held_out=0, scene=lambda: replace(scene_with_truth(), val=())).fit()
     assert not (tmp_path / "accuracy_time.csv").exists()
+
+
+def test_every_run_that_has_validation_views_has_a_curve(tmp_path):
+    run(tmp_path, held_out=0, scene=lambda: validated(scene_with_truth(), 1)).fit()
+    assert steps(tmp_path) == EXPECTED
+
+
+def validated(scene, count):
+    return replace(scene, val=(*scene.train, *scene.train)[:count])
+
+
+@pytest.mark.parametrize(
+    ("views", "watched"), [(1, [0]), (8, list(range(8))), (15, [0, 2, 4, 6, 8, 10, 12, 14])]
+)
+def test_eight_validation_views_are_spread_out(views, watched):
+    scene = validated(ball_scene(frames=8, size=8), views)
+    found = SceneDataModule(lambda: scene).watched().frames
+    assert [frame.name for frame in found] == [scene.val[i].name for i in watched]
 
 
 def test_an_unknown_truth_leaves_its_column_empty(tmp_path):

@@ -35,8 +35,9 @@ What one types most:
   --multirun sweeps=accuracy_time variant=base,unet_16 seeds=2      what choices cost: see forewarp-report
 
 A run's folder holds config.yaml, a folder a stage (checkpoint, handover.json, TensorBoard events, images),
-images/ of the test views, per_image.json and metrics.json; with views set aside also accuracy_time.csv and
-accuracy_time.png. Watch: tensorboard --logdir runs
+images/ of the test views, per_image.json and metrics.json; where there are views that nothing learns from
+(data.held_out, or validation views) also accuracy_time.csv and accuracy_time.png.
+Watch: tensorboard --logdir runs
 """
 
 

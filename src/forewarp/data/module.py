@@ -19,6 +19,8 @@ from forewarp.scene.batch import Target
 from forewarp.scene.errors import SceneError
 from forewarp.scene.frame import Scene
 
+WATCHED = 8  # views that a curve is of, at most, where none are set aside
+
 
 class SceneDataModule(LightningDataModule):
     """Serves one scene: ray batches to train on, whole images to compare with.
@@ -97,6 +99,15 @@ class SceneDataModule(LightningDataModule):
         if split not in ("train", "val", "test", "held"):
             raise SceneError(f"split: expected train, val, test or held, but got {split!r}")
         return Targets(getattr(self.scene, split), color_of(self.eval_background), self.scene.has_alpha)
+
+    def watched(self) -> Targets:
+        """Whose PSNR a run's curve is of: the views set aside, or else up to 8 of the validation views."""
+        if self.scene.held:
+            return self.targets("held")
+        val = self.targets("val")
+        few = min(len(val), WATCHED)
+        frames = [val.frames[round(i * (len(val) - 1) / max(few - 1, 1))] for i in range(few)]
+        return Targets(frames, val.background, val.has_alpha)
 
     def train_dataloader(self) -> RayBatches:
         """The stream of batches, each of one time."""

@@ -15,10 +15,11 @@ Groups = Mapping[tuple[str, float | None], Sequence[Result]]
 INTRODUCTION = """# Accuracy against training time
 
 Written by `forewarp-report kind=accuracy_time`. Seconds are of training alone: evaluation, logging and
-checkpoints are left out. PSNR is of training views set aside (`data.held_out`), each estimated from the same
-random pixels of the whole image; a value counts as reached once two evaluations in a row reach it. Over
-several seeds: mean ± standard deviation, and only where every seed gets there. A schedule follows the share
-of its minutes that is spent, so a run of ten minutes is not at its best after one.
+checkpoints are left out. PSNR is of training views set aside (`data.held_out`; without any, of validation
+views), each estimated from the same random pixels of the whole image; a value counts as reached once two
+evaluations in a row reach it. Over several seeds: mean ± standard deviation, and only where every seed gets
+there. A schedule follows the share of its minutes that is spent, so a run of ten minutes is not at its best
+after one.
 """
 
 

@@ -31,10 +31,11 @@ def next_moment(after: float, first: float, ratio: float) -> float:
 
 
 class AccuracyCurve(lightning.Callback):
-    """Writes ``accuracy_time.csv`` into the run's folder: how well views set aside are drawn, after how many
-    seconds of training, all stages together.
+    """Writes ``accuracy_time.csv`` into the run's folder: how well views that nothing learns from are drawn
+    after how many seconds of training, all stages together.
 
-    Only where the data set views aside (``data.held_out``). A row: training ``seconds`` (of the run's clock,
+    The views are those set aside (``data.held_out``), or validation views; without any of these nothing is
+    written. A row: training ``seconds`` (of the run's clock,
     which stands still meanwhile), ``stage``, ``step`` of the stage, ``psnr`` (dB, mean over the views, each
     from the same random pixels of the whole image), ``epe_moving`` (world units, empty where the scene has no
     true trajectories) and active ``voxels``. TensorBoard gets ``curve/psnr`` and ``curve/epe_moving`` at the
@@ -59,7 +60,7 @@ class AccuracyCurve(lightning.Callback):
 
     def on_train_start(self, trainer, module) -> None:
         """Go on where the rows end; forget those of work that was lost."""
-        if not len(trainer.datamodule.targets("held")):
+        if not len(trainer.datamodule.watched()):
             return
         folder = Path(trainer.default_root_dir)
         self._path, self._before = folder.parent / FILE, seconds_before(folder)
@@ -87,7 +88,7 @@ class AccuracyCurve(lightning.Callback):
     def _add(self, trainer, module) -> None:
         with module.clock.paused():
             scene, seconds = trainer.datamodule.scene, self._seconds(module)
-            scores = {"psnr": validation_psnr(module, trainer.datamodule.targets("held"), self.rays)}
+            scores = {"psnr": validation_psnr(module, trainer.datamodule.watched(), self.rays)}
             if scene.truth is not None:
                 scores["epe_moving"] = flow_error(module, scene)["epe_moving"]
             scores = {name: value for name, value in scores.items() if value is not None}
