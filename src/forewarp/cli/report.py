@@ -19,7 +19,7 @@ What one types most:
   runs=FOLDER                      searched for runs (runs/accuracy_time; of kind=paper runs/paper)
   out=FOLDER                       where the page goes (docs/results; of kind=paper runs/paper/results)
   target=DB                        accuracy_time: PSNR that every variant's seconds are listed for
-  published=FILE                   accuracy_time: points that others report (docs/results/published.yaml);
+  published=FILE                   accuracy_time: points that others report, as docs/results/published.yaml;
                                    paper: what is printed (docs/results/paper.yaml)
 
 The runs: make accuracy-time [DATA=FOLDER SCENE=NAME MINUTES=N], make price-list DATA=FOLDER,
