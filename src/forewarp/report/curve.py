@@ -96,18 +96,23 @@ def draw_scene(
     runs = [(key, run) for key, group in groups.items() for run in group]
     every = [(key, point) for key, run in runs for point in run.curve]
     front = [every[i] for i in pareto_front([(point.seconds, point.psnr) for _, point in every])]
-    colors = {key: f"C{number % 10}" for number, key in enumerate(dict.fromkeys(key for key, _ in front))}
+    known = enumerate(dict.fromkeys(key for key, _ in front))
+    styles = {key: {"color": f"C{i % 10}", "linestyle": "--" if i >= 10 else "-"} for i, key in known}
     figure, axes = _axes(any(point.epe is not None for _, point in every))
+    from matplotlib.ticker import LogLocator
+
     for key, run in runs:
-        style = {"color": colors[key], "linewidth": 1.5} if key in colors else {"color": "0.8", "zorder": 1}
-        _line(axes, run.curve, **style)
-    for key, color in colors.items():
-        axes[0].plot([], [], color=color, label=f"{key[0]}, {key[1]:g} min" if key[1] else key[0])
+        _line(axes, run.curve, **styles.get(key, {"color": "0.8", "zorder": 1}))
+    for key, style in styles.items():
+        axes[0].plot([], [], label=f"{key[0]}, {key[1]:g} min" if key[1] else key[0], **style)
     marks = [point.seconds for _, point in front], [point.psnr for _, point in front]
     axes[0].plot(*marks, "ko", markersize=4, label="Pareto front")
     for number, other in enumerate(published):
         label = f"{other.name} (published, {other.hardware})"
         axes[0].plot(other.seconds, other.psnr, "*", color=f"C{number % 10}", fillstyle="none", label=label)
+    low, high = axes[0].get_xlim()
+    for axis in axes:  # over many decades only their beginnings have room
+        axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if high < 1000 * low else (1,)))
     axes[0].legend(fontsize="x-small", loc="lower right")
     axes[0].set_title(title)
     return _save(figure, path)
