@@ -1,5 +1,6 @@
 """Tables of what was timed."""
 
+from forewarp.cli import performance
 from forewarp.cli.performance import WORDS, box_table, growth_tables, splat_error
 from forewarp.cli.timed_cases import CASES
 from forewarp.cli.workloads import make_module
@@ -48,3 +49,16 @@ def test_what_a_profiler_says_has_words():
     assert words[:2] == ["convolutions, backwards", "convolutions"]
     assert words[2] == "F1, F2, F4 and layers of one voxel"
     assert words[3] == "reads and scatters (Numba)"
+
+
+def test_the_goals_hold_against_the_dense_step_as_it_runs_by_itself(monkeypatch):
+    monkeypatch.setattr(performance, "by_itself", lambda side, rays: 1e6)
+    lines = performance.goals_table(side=8, rays=16, picture=12, frame_side=8).splitlines()
+    assert "1000000.0 s" in lines[3]
+    assert lines[3].endswith("| reached |")
+    assert lines[4].startswith("| densely with our large pages |  |")
+    assert lines[4].endswith("times |  |")
+
+
+def test_a_process_of_its_own_times_the_dense_step():
+    assert 0 < performance.by_itself(8, 16) < 60
