@@ -109,7 +109,7 @@ def test_it_says_first_what_is_trained_where(fitted):
 def test_without_evaluation_it_says_how_to_get_it_and_where_stages_stand(forewarp, scenes, in_tmp):
     words = arguments(scenes, "run", "budget.iterations=4", "evaluate=false")
     done = forewarp(*words)
-    assert done.out.endswith("fitted: run; measure it with forewarp-evaluate run=run\n")
+    assert "fitted: run; measure it with forewarp-evaluate run=run\n" in done.out
     Path("run/fine/done.json").unlink()
     lines = forewarp(*words).out.splitlines()
     assert lines[2] == "coarse: finished before"

@@ -114,7 +114,9 @@ def figures_of(results: Sequence[Result], out: Path, kept: Path) -> tuple[list[S
         if path.parent.resolve() != out.resolve():
             shutil.copyfile(path, out / path.name)
     if curves := sorted(out.glob("accuracy-time-*.png")):
-        lines = ["runs of their own, with views set aside: make accuracy-time"]
+        lines = [
+            "runs of their own, with views set aside, as kept beside the printed numbers: make accuracy-time"
+        ]
         sections.append(Section("Accuracy against training time", facts=lines, pictures=curves))
     return sections, [path for _, path, _ in found]
 
