@@ -108,8 +108,8 @@ else
 	$(BIN)/forewarp-report kind=paper out=$(OUT) && exit $$status
 endif
 
-tables-vehicle: PAIRS := methods:dnerf ablation_losses:dnerf ablation_modules:dnerf nhr:nhr
-tables-captures: PAIRS := hypernerf:hypernerf ablation_modules:hypernerf resolution:hypernerf lego_complete:lego_complete ablation_modules:lego_complete
+tables-vehicle: PAIRS := methods:dnerf ablation_losses:dnerf ablation_modules:dnerf nhr:nhr lego_complete:lego_complete ablation_modules:lego_complete
+tables-captures: PAIRS := hypernerf:hypernerf ablation_modules:hypernerf resolution:hypernerf
 tables-vehicle tables-captures: THREADS ?= 1
 tables-vehicle tables-captures:
 	@{ status=0; for pair in $(PAIRS); do \
