@@ -1,9 +1,6 @@
 """How each operator, a step and a frame grow: ``make bench`` (not part of ``make test``)."""
 
-import ctypes
-import gc
 import time
-from contextlib import suppress
 
 import pytest
 import torch
@@ -21,20 +18,12 @@ RUNS = [
 ]
 
 
-def release():
-    """Give the system back what was freed, or what is allocated next would seem to cost nothing."""
-    with suppress(OSError, AttributeError):  # glibc's alone
-        ctypes.CDLL(None).malloc_trim(0)
-
-
 @pytest.mark.bench
 @pytest.mark.benchmark(timer=time.process_time)  # a shared machine does other things too
 @pytest.mark.parametrize(("name", "size", "dense"), RUNS)
 def test_growth(benchmark, name, size, dense):
     warm_up()
     work = CASES[name].make(size, dense)
-    gc.collect()
-    release()
     reset_peak_memory()
     before = peak_memory_bytes()
     work()

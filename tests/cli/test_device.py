@@ -2,7 +2,7 @@
 
 import pytest
 
-from forewarp.cli.device import main, papers
+from forewarp.cli.device import StepTimes, main, papers
 
 
 @pytest.mark.slow
@@ -16,6 +16,13 @@ def test_it_runs_to_its_end_without_a_gpu(tmp_path, capsys):
         assert "of a kept grid" in block
     assert "dB of views set aside" in out
     assert "test views" in out
+
+
+def test_without_a_step_there_are_no_times():
+    times = StepTimes()
+    assert not times
+    times.seconds["fine"] = [3.0, 0.5, 0.5]
+    assert f"{times or 'fitted before'}" == "fine 500.0 ms"
 
 
 def test_a_missing_gpu_is_said_in_one_line(monkeypatch):

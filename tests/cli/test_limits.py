@@ -2,7 +2,8 @@ import math
 
 import pytest
 
-from forewarp.cli.limits import COLUMNS, by_time, limits_of, main, spread
+from forewarp.cli.limits import COLUMNS, by_time, limits_of, main
+from forewarp.scene.frame import spread
 from forewarp.synth.scenes import synthesize
 
 STEPS = ["budget.iterations=4", "stage.fine.voxels=[[0,4000]]", "stage.coarse.voxels=[[0,4000]]"]

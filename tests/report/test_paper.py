@@ -272,7 +272,7 @@ def test_measured_rows_keep_the_order_of_the_variants(tmp_path):
         paper_run(tmp_path, "hook", variant)
     results, _ = collect(tmp_path)
     found = measured(read_paper(PRINTED)["modules"], results)
-    assert [row.variant for row in found] == ["full", "no_tv", "no_inpainter"]
+    assert [row.row.variant for row in found] == ["full", "no_tv", "no_inpainter"]
 
 
 def test_a_sheet_falls_into_its_parts():

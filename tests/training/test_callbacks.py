@@ -11,6 +11,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from forewarp.data.module import SceneDataModule
 from forewarp.renderer import Renderer
 from forewarp.training.callbacks import StageProgress, TensorBoardScalars
+from forewarp.training.clock import Clock
 from forewarp.training.pictures import TensorBoardPictures
 from forewarp.training.progress import ProgressLine
 from forewarp.training.stages import Run
@@ -246,3 +247,24 @@ def test_bad_settings_are_named(make, text):
 def test_a_view_that_is_not_there_is_named(tmp_path):
     with pytest.raises(ValueError, match="callbacks.pictures.view: expected 0 to 0, but got 7"):
         watched_run(tmp_path, TensorBoardPictures(moments=(0.1,), view=7)).fit()
+
+
+def test_the_clock_stands_still_while_something_is_shown(tmp_path, monkeypatch):
+    running = []
+
+    def noted(of, name):
+        before = getattr(of, name)
+
+        def call(self, *arguments, **options):
+            running.append((name, clock._since is not None))
+            return before(self, *arguments, **options)
+
+        monkeypatch.setattr(of, name, call)
+
+    noted(ProgressLine, "show")
+    noted(TensorBoardLogger, "log_metrics")
+    monkeypatch.setattr("forewarp.training.module.Clock", lambda: clock)
+    clock = Clock()
+    watched_run(tmp_path, StageProgress(every=0), TensorBoardScalars(every=5)).fit()
+    assert {name for name, _ in running} == {"show", "log_metrics"}
+    assert not any(ticking for _, ticking in running)

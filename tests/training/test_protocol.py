@@ -1,4 +1,5 @@
 import platform
+import gc
 import os
 import resource
 import sys
@@ -29,6 +30,21 @@ def test_the_peak_counts_from_the_reset(on_the_cpu):
     assert during > before + 190e6
     reset_peak_memory()
     assert peak_memory_bytes() < during - 150e6
+
+
+@pytest.mark.skipif(not os.access(CLEARED, os.W_OK), reason=f"{CLEARED} cannot be written: not Linux")
+def test_what_earlier_runs_left_in_a_circle_does_not_count(on_the_cpu):
+    gc.collect()
+    gc.disable()
+    try:
+        circle = [torch.ones(50_000_000)]  # 200 MB
+        circle.append(circle)
+        before = peak_memory_bytes()
+        del circle
+        reset_peak_memory()
+        assert peak_memory_bytes() < before - 150e6
+    finally:
+        gc.enable()
 
 
 def test_elsewhere_it_is_that_of_the_process(on_the_cpu, monkeypatch, tmp_path):

@@ -26,6 +26,7 @@ from forewarp.cli.stability import table
 from forewarp.data.batches import Targets
 from forewarp.metrics.image import psnr
 from forewarp.metrics.limits import REGIONS, error_shares, low_passed
+from forewarp.scene.frame import spread
 from forewarp.training.evaluation import Shown, draw
 
 COLUMNS = (
@@ -84,16 +85,6 @@ def limits_of(folder: Path, views: int = 20) -> dict[str, float | str]:
     row |= {"voxel, pixels": fmean(one.voxel for one in tests)}
     row |= {"low-passed truth": fmean(one.bound for one in tests)}
     return row | {name: float(share) for name, share in shares(tests).items()}
-
-
-def spread(count: int, wanted: int) -> list[int]:
-    """``wanted`` of ``count`` numbers, evenly, the first and the last among them.
-
-    >>> spread(10, 4)
-    [0, 3, 6, 9]
-    """
-    wanted = min(count, wanted)
-    return [round(i * (count - 1) / max(wanted - 1, 1)) for i in range(wanted)]
 
 
 def by_time(tests: Sequence[Seen]) -> dict[str, float]:

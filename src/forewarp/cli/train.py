@@ -88,10 +88,10 @@ def refuse_seeds(config) -> None:
 def refuse_budget(config) -> None:
     """Refuse a budget that the experiment's numbers are not for, as the run would bear its name."""
     suits = config.get("suits")
-    if suits is not None and config.budget.name not in suits:
+    if suits is not None and config.budget.name not in suits.budgets:
         raise ValueError(
-            f"budget: expected {' or '.join(suits)}, which this experiment's numbers are for, but got "
-            f"{config.budget.name}; use experiment=hypernerf_faithful for the paper's"
+            f"budget: expected {' or '.join(suits.budgets)}, which this experiment is made for, but got "
+            f"{config.budget.name}; use {suits.otherwise}"
         )
 
 

@@ -17,7 +17,7 @@ from forewarp.data.fingerprint import RECORD, fingerprint
 from forewarp.data.held import hold_out
 from forewarp.scene.batch import Target
 from forewarp.scene.errors import SceneError
-from forewarp.scene.frame import Scene
+from forewarp.scene.frame import Scene, spread
 
 WATCHED = 8  # views that a curve is of, at most, where none are set aside
 
@@ -105,9 +105,7 @@ class SceneDataModule(LightningDataModule):
         if self.scene.held:
             return self.targets("held")
         val = self.targets("val")
-        few = min(len(val), WATCHED)
-        frames = [val.frames[round(i * (len(val) - 1) / max(few - 1, 1))] for i in range(few)]
-        return Targets(frames, val.background, val.has_alpha)
+        return Targets([val.frames[i] for i in spread(len(val), WATCHED)], val.background, val.has_alpha)
 
     def train_dataloader(self) -> RayBatches:
         """The stream of batches, each of one time."""

@@ -27,7 +27,7 @@ class ConvBlock(nn.Module):
         if x.shape[2] > 2:
             return functional.relu(self.conv(x), inplace=True)
         with torch.autocast(x.device.type, enabled=False):
-            return functional.relu(self.conv(x.float()), inplace=True)
+            return functional.relu(self.conv(x.to(self.conv.weight.dtype)), inplace=True)
 
 
 class Pointwise(nn.Conv3d):

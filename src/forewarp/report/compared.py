@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from statistics import fmean
+from typing import NamedTuple
 
 from forewarp.report.collect import Result
 from forewarp.report.published import Group, PaperTable
@@ -26,7 +27,7 @@ class Measured:
     """The runs of one row: equal in all but scene and seed."""
 
     name: str
-    variant: str
+    row: Row
     runs: tuple[Result, ...]
 
     def cell(self, group: Group, metric: str) -> Estimate | None:
@@ -47,22 +48,30 @@ class Measured:
         return Estimate.of([fmean(found[scene, seed] for scene in group.scenes) for seed in whole])
 
     @property
-    def warp(self) -> str:
-        """Its method."""
-        return self.runs[0].config["model"]["warp"]
-
-    @property
     def seconds(self) -> float:
         """Of training, the mean of its runs."""
         return fmean(run.metrics["seconds"]["train"] for run in self.runs)
 
 
-def row_of(run: Result) -> tuple:
+class Row(NamedTuple):
     """What runs of one row have in common."""
+
+    variant: str
+    warp: str
+    budget: str
+    minutes: float | None
+    iterations: int | None
+    held_out: int
+    device: str | None
+
+
+def row_of(run: Result) -> Row:
+    """The row that a run belongs to."""
     budget = run.config["budget"]
     known, protocol = (run.config.get("variant") or {}).get("name", "plain"), run.metrics.get("protocol", {})
     bounds = budget["name"], budget["minutes"], budget.get("iterations")
-    return known, run.config["model"]["warp"], *bounds, protocol.get("held_out", 0), protocol.get("device")
+    conditions = protocol.get("held_out", 0), protocol.get("device")
+    return Row(known, run.config["model"]["warp"], *bounds, *conditions)
 
 
 def measured(table: PaperTable, results: Sequence[Result]) -> list[Measured]:
@@ -71,11 +80,11 @@ def measured(table: PaperTable, results: Sequence[Result]) -> list[Measured]:
     datasets = {group.dataset for group in table.groups}
     for run in results:
         key = row_of(run)
-        if key[0] in table.variants and run.dataset in datasets:
+        if key.variant in table.variants and run.dataset in datasets:
             rows.setdefault(key, []).append(run)
-    order = sorted(rows, key=lambda k: (table.variants.index(k[0]), *(str(part) for part in k[1:])))
-    machines = {key[-1] for key in rows}
-    return [Measured(_name(key, rows[key], len(machines) > 1), key[0], tuple(rows[key])) for key in order]
+    order = sorted(rows, key=lambda k: (table.variants.index(k.variant), *map(str, k)))
+    machines = {key.device for key in rows}
+    return [Measured(_name(key, rows[key], len(machines) > 1), key, tuple(rows[key])) for key in order]
 
 
 def comparison(table: PaperTable, results: Sequence[Result], *, difference: bool = True) -> Table:
@@ -93,7 +102,8 @@ def comparison(table: PaperTable, results: Sequence[Result], *, difference: bool
         cells = [row.cell(group, metric) for group, metric in table.columns]
         ranked.append(len(rows))
         rows.append([row.name, kinds[0], *cells, row.seconds])
-        printed = _ours(table, row.variant) if row.warp == "forward" else None  # the paper's own method
+        papers_own = row.row.warp == "forward"
+        printed = _ours(table, row.row.variant) if papers_own else None
         if difference and printed is not None and any(cells):
             rows.append(["", kinds[1], *map(_difference, cells, printed), None])
     rules = [len(rows)] if rows else []
@@ -139,13 +149,14 @@ def _conditions(run: Result) -> tuple:
     return protocol.get("half_resolution"), protocol.get("background")
 
 
-def _name(key: tuple, runs: Sequence[Result], tell_device: bool) -> str:
-    variant, warp, budget, minutes, iterations, held_out, device = key
-    bounds = [f"{minutes:g} min" if minutes else "", f"{iterations} steps" if iterations else ""]
-    about = warp if variant == "plain" else (runs[0].about or variant)
+def _name(row: Row, runs: Sequence[Result], tell_device: bool) -> str:
+    minutes, steps = f"{row.minutes or 0:g} min", f"{row.iterations} steps"
+    bounds = [minutes if row.minutes else "", steps if row.iterations else ""]
+    about = row.warp if row.variant == "plain" else (runs[0].about or row.variant)
     seeds = len({run.seed for run in runs})
-    parts = [f"forewarp: {about}", budget, *bounds, f"{seeds} seeds" if seeds > 1 else ""]
-    parts += [f"{held_out} views set aside" if held_out else "", str(device) if tell_device else ""]
+    parts = [f"forewarp: {about}", row.budget, *bounds, f"{seeds} seeds" if seeds > 1 else ""]
+    parts.append(f"{row.held_out} views set aside" if row.held_out else "")
+    parts.append(str(row.device) if tell_device else "")
     return ", ".join(part for part in parts if part)
 
 

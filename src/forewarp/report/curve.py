@@ -98,9 +98,9 @@ def draw_scene(
     front = [every[i] for i in pareto_front([(point.seconds, point.psnr) for _, point in every])]
     known = enumerate(dict.fromkeys(key for key, _ in front))
     styles = {key: {"color": f"C{i % 10}", "linestyle": "--" if i >= 10 else "-"} for i, key in known}
-    figure, axes = _axes(any(point.epe is not None for _, point in every))
-    from matplotlib.ticker import LogLocator
-
+    seconds = [point.seconds for _, point in every] + [other.seconds for other in published]
+    wide = max(seconds) > 1000 * min(seconds)
+    figure, axes = _axes(any(point.epe is not None for _, point in every), wide)
     for key, run in runs:
         _line(axes, run.curve, **styles.get(key, {"color": "0.8", "zorder": 1}))
     for key, style in styles.items():
@@ -110,15 +110,12 @@ def draw_scene(
     for number, other in enumerate(published):
         label = f"{other.name} (published, {other.hardware})"
         axes[0].plot(other.seconds, other.psnr, "*", color=f"C{number % 10}", fillstyle="none", label=label)
-    low, high = axes[0].get_xlim()
-    for axis in axes:  # over many decades only their beginnings have room
-        axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if high < 1000 * low else (1,)))
     axes[0].legend(fontsize="x-small", loc="lower right")
     axes[0].set_title(title)
     return _save(figure, path)
 
 
-def _axes(with_flow: bool):
+def _axes(with_flow: bool, wide: bool = False):
     try:
         from matplotlib.figure import Figure
         from matplotlib.ticker import LogLocator, NullFormatter
@@ -130,7 +127,8 @@ def _axes(with_flow: bool):
     labels = ("PSNR of views set aside (dB)", "error of moving points (world units)")
     for axis, label in zip(axes, labels):
         axis.set(xscale="log", xlabel="seconds of training", ylabel=label)
-        axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        # Over many decades only their beginnings have room.
+        axis.xaxis.set_major_locator(LogLocator(subs=(1,) if wide else (1, 2, 5)))
         axis.xaxis.set_major_formatter("{x:g}")
         axis.xaxis.set_minor_formatter(NullFormatter())
         axis.grid(alpha=0.3)

@@ -62,7 +62,7 @@ def newest(results: Sequence[Result]) -> tuple[list[Result], list[Result]]:
     """Of runs that differ in nothing that a table tells, the one measured last; and the others."""
     kept: dict[tuple, Result] = {}
     for run in sorted(results, key=lambda run: (run.folder / "metrics.json").stat().st_mtime_ns):
-        kept[(run.dataset, run.is_counterpart, run.scene, run.seed) + row_of(run)] = run
+        kept[run.dataset, run.is_counterpart, run.scene, run.seed, row_of(run)] = run
     chosen = {run.folder for run in kept.values()}
     return [r for r in results if r.folder in chosen], [r for r in results if r.folder not in chosen]
 
@@ -124,7 +124,7 @@ def figures_of(results: Sequence[Result], out: Path, kept: Path) -> tuple[list[S
 def _draw(results: Sequence[Result], out: Path) -> list[tuple[str, Path | None, list[Result]]]:
     sides = [run for run in results if run.variant.startswith("voxels_")]
     found = [("Resolution", pictures.draw_resolution(out / "paper-resolution.png", sides), sides)]
-    plain = [run for run in results if row_of(run)[0] == "plain"]
+    plain = [run for run in results if row_of(run).variant == "plain"]
     for scene, both in _pairs(plain).items():
         path = pictures.draw_canonical(out / f"paper-canonical-{scene}.png", *both)
         found.append((f"Canonical comparison: {scene}", path, both))
@@ -140,7 +140,8 @@ def _pairs(runs: Sequence[Result]) -> dict[str, list[Result]]:
     """Scene -> a forward and a backward run of it, equal in budget and seed."""
     equal: dict[tuple, dict[str, Result]] = {}
     for run in runs:
-        equal.setdefault((run.scene, run.seed) + row_of(run)[2:], {})[run.config["model"]["warp"]] = run
+        row = row_of(run)
+        equal.setdefault((run.scene, run.seed, row._replace(warp="")), {})[row.warp] = run
     both = {key[0]: pair for key, pair in equal.items() if {"forward", "backward"} <= pair.keys()}
     return {scene: [pair["forward"], pair["backward"]] for scene, pair in sorted(both.items())}
 

@@ -22,7 +22,8 @@ def draw_resolution(path: Path, results: Sequence[Result]) -> Path | None:
     for run in results:
         name, _, side = run.variant.rpartition("_")
         if name == "voxels" and side.isdigit() and "psnr" in run.numbers:
-            line = ", ".join([run.scene, *(str(part) for part in row_of(run)[1:4])])
+            row = row_of(run)
+            line = f"{run.scene}, {row.warp}, {row.budget}, {row.minutes or row.iterations:g}"
             scenes.setdefault(line, {}).setdefault(int(side), []).append(run.numbers["psnr"])
     scenes = {scene: sides for scene, sides in scenes.items() if len(sides) > 1}
     if not scenes:

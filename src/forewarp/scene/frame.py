@@ -66,3 +66,13 @@ class Scene:
     def times(self) -> tuple[float, ...]:
         """The distinct training times, ascending."""
         return tuple(sorted({f.time for f in self.train}))
+
+
+def spread(count: int, wanted: int) -> list[int]:
+    """``wanted`` of ``count`` numbers, or all of fewer, evenly, the first and the last among them.
+
+    >>> spread(10, 4), spread(2, 4)
+    ([0, 3, 6, 9], [0, 1])
+    """
+    wanted = min(count, wanted)
+    return [round(i * (count - 1) / max(wanted - 1, 1)) for i in range(wanted)]

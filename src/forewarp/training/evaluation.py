@@ -15,7 +15,7 @@ from forewarp.methods.spec import parameter_count
 from forewarp.metrics.flow import end_point_error
 from forewarp.metrics.suite import ImageSuite, summarise
 from forewarp.scene.batch import Target
-from forewarp.scene.frame import Scene
+from forewarp.scene.frame import Scene, spread
 from forewarp.scene.state import Rendering
 from forewarp.training.clock import now
 from forewarp.training.handover import write_json
@@ -89,7 +89,7 @@ def evaluate(
         what ``metrics.json`` holds.
     """
     scene, targets, finished = datamodule.scene, datamodule.targets("test"), finished or {}
-    on_sheets = {round(i * (len(targets) - 1) / max(sheets - 1, 1)) for i in range(sheets)}
+    on_sheets = set(spread(len(targets), sheets))
     rows: dict[int, dict] = {}
     for shown in draw(module, targets):
         rows[shown.number] = _score(shown, suite)
