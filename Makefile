@@ -1,5 +1,5 @@
 .DEFAULT_GOAL := help
-.PHONY: help install install-launchers demo demo-forward demo-backward tables-vehicle tables-captures demo-lego-complete demo-hypernerf demo-nhr test test-stability bench bench-gpu accuracy-time price-list reproduce-tables lint format clean
+.PHONY: help install install-launchers demo demo-forward demo-backward tables-vehicle tables-captures demo-lego-complete demo-hypernerf demo-nhr test test-stability bench bench-gpu effects accuracy-time price-list reproduce-tables lint format clean
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -84,6 +84,23 @@ price-list: ## what each choice costs and brings, on the vehicle and two real sc
 		$(SWEEP) experiment=dnerf data.root=$(DATA) data.scene=$$scene $(MORE) $(GO_ON); \
 	done; \
 	$(BIN)/forewarp-report kind=price_list && exit $$status
+
+COMPARE = $(BIN)/forewarp-train --multirun sweeps=effects $(if $(THREADS),threads=$(THREADS))
+effects: MINUTES := $(if $(filter command line,$(origin MINUTES)),$(MINUTES),2)
+effects: SEEDS ?= 2
+effects: ## what scenes call for against every effect at once, on made scenes or real ones [DATA= SCENES="a b" MINUTES= SEEDS=]
+ifeq ($(DATA),)
+	@status=0; $(COMPARE) $(SEED) ablation=auto $(GO_ON); \
+	$(COMPARE) $(SEED) ablation=all_effects budget.minutes=$(MINUTES) $(GO_ON); \
+	$(BIN)/forewarp-report kind=effects && exit $$status
+else
+	@status=0; \
+	for choice in ablation=auto ablation=all_effects ablation=full "ablation=null variant=base"; do \
+		$(COMPARE) $(SEED) $$choice paths.scenes=$(DATA) scene=$(subst $(space),$(comma),$(addprefix dnerf_,$(SCENES))) \
+			budget.minutes=$(MINUTES) plan.minutes=$(MINUTES) plan.seconds=40 plan.trial_seconds=40 $(GO_ON); \
+	done; \
+	$(BIN)/forewarp-report kind=effects && exit $$status
+endif
 
 REPRODUCE = $(BIN)/forewarp-train --multirun budget=$(BUDGET) budget.minutes=$(MINUTES) $(SEED) $(if $(THREADS),threads=$(THREADS)) $(if $(LAUNCHER),launcher=$(LAUNCHER))
 # A counterpart of each dataset and 12 s a run: 27 runs, half of them on each of two cores.

@@ -45,7 +45,26 @@ def test_a_sweep_has_its_jobs(sweep, count):
 
 
 def test_no_sweep_is_forgotten():
-    assert {path.stem for path in (ROOT / "sweeps").glob("*.yaml")} == {*PAPER, "accuracy_time"}
+    assert {path.stem for path in (ROOT / "sweeps").glob("*.yaml")} == {*PAPER, "accuracy_time", "effects"}
+
+
+def test_effects_are_compared_on_every_specimen():
+    jobs = jobs_of("effects")
+    assert len(jobs) == 18
+    for job in jobs[:3]:
+        config = job_of("effects", *job)
+        assert config.run.startswith("runs/effects/still/")
+        assert config.variant.name in config.run
+    auto, every, paper = (
+        composed("sweeps=effects", "scene=specimen_room", f"ablation={a}")
+        for a in ("auto", "all_effects", "full")
+    )
+    assert auto.effects == "auto"
+    assert {
+        e for e in ("motion", "view", "upsampler", "inpainter", "background") if every.model[e] is None
+    } == set()
+    assert every.model.trajectory.features > 0
+    assert paper.model.background is None
 
 
 @pytest.mark.parametrize("sweep", ["dnerf", "methods"])

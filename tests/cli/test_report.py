@@ -15,7 +15,7 @@ def test_pages_are_written_and_named(forewarp, in_tmp):
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
-        (["kind=prices"], "kind: expected one of accuracy_time, price_list, paper, but got 'prices'"),
+        (["kind=prices"], "kind: expected one of accuracy_time, price_list, paper, effects, but got"),
         (["target=high"], "target: expected a number of dB or null, but got 'high'"),
         ([], "runs/accuracy_time: expected folders of runs, but got none"),
         (["published=none.yaml"], "none.yaml: expected a usable file or folder, but got No such file"),

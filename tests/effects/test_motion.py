@@ -5,6 +5,7 @@ import torch
 
 from forewarp.effects.motion import Motion
 from forewarp.fields.trajectory import TrajectoryField
+from forewarp.ops.splat import average_splat
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.state import EMPTY, Activation, RadianceGrid
 
@@ -84,5 +85,35 @@ def test_gradcheck():
 
 @pytest.mark.parametrize("wrong", [{"tau": 0.0}, {"tau": 2.0}, {"fade": -0.1}, {"fade": 1.5}])
 def test_refuses(wrong):
-    with pytest.raises(ValueError, match=r"model.motion: expected 0 < tau <= 1 and 0 <= fade <= 1, but got"):
+    with pytest.raises(
+        ValueError, match=r"model.motion: expected 0 < tau <= 1, 0 <= fade <= 1 and 0 <= rest < 0.5, but got"
+    ):
         motion(**wrong)
+
+
+def test_what_rests_is_copied_and_what_moves_is_splatted(monkeypatch):
+    canonical, flow = solid(), torch.zeros(60, 3)
+    flow[40:] = torch.tensor([0.3, 0.4, 0.0])
+    flow[:40] = 0.01  # 0.02 voxels along x at most
+    splatted = []
+
+    def noted(values, *others):
+        splatted.append(len(values))
+        return average_splat(values, *others)
+
+    monkeypatch.setattr("forewarp.effects.motion.average_splat", noted)
+    with torch.no_grad():
+        warped, coverage, _ = motion(rest=0.05).warp(canonical, LATTICE.all_voxels(), flow)
+        every, _, _ = motion(rest=0.0).warp(canonical, LATTICE.all_voxels(), flow)
+    assert splatted == [20, 60]
+    assert (warped.values[warped.index[:1].long()] == canonical.values[:20].reshape(1, 4, 5, 4)).all()
+    reached = (warped.index >= 0) & (every.index >= 0)
+    one, other = (grid.values[grid.index[reached].long()] for grid in (warped, every))
+    assert (one[:, 1:] - other[:, 1:]).abs().max() < 0.2  # 0.05 voxels of colours that are a few apart
+    motion(rest=0.05).warp(canonical, LATTICE.all_voxels(), flow.requires_grad_())
+    assert splatted == [20, 60, 60]  # or it would never learn to move
+
+
+def test_a_rest_of_half_a_voxel_is_refused():
+    with pytest.raises(ValueError, match="rest < 0.5"):
+        motion(rest=0.5)

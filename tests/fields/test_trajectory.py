@@ -97,4 +97,4 @@ def test_features_own_parameters_only_where_asked():
 
 
 def test_the_basis_lives_where_the_field_does():
-    assert field().to("meta")._basis(0.5).device.type == "meta"
+    assert field().to("meta").basis(0.5).device.type == "meta"

@@ -3,7 +3,7 @@ import torch
 from torch.autograd import gradcheck
 
 from forewarp.ops import splat
-from forewarp.ops.splat import average_splat
+from forewarp.ops.splat import average_splat, with_copies
 from reference import lattice_cells, splat_sums
 
 SHAPE = (3, 4, 5)
@@ -173,3 +173,31 @@ def test_refuses_other_shapes():
         average_splat(torch.zeros(4), torch.zeros(4, 3), SHAPE)
     with pytest.raises(ValueError, match=r"positions: expected shape \(4, 3\), but got \(5, 3\)"):
         average_splat(torch.zeros(4, 2), torch.zeros(5, 3), SHAPE)
+
+
+def test_copies_are_a_splat_onto_themselves(backend):
+    source, moved = random_source(), random_source(seed=1)[:7]
+    positions = random_positions(7, low=0.2, high=1.8)
+    stays = torch.randperm(60, generator=torch.Generator().manual_seed(4))[:20]
+    cells = VOXELS[stays].long()
+    together = average_splat(torch.cat([moved, source[:20]]), torch.cat([positions, cells.double()]), SHAPE)
+    copied = with_copies(average_splat(moved, positions, SHAPE), source[:20], cells)
+    reached = dense(together, together.coverage).nan_to_num() > 0  # a splat notes cells of weight 0 as well
+    assert torch.equal((copied.index >= 0) & reached, reached)
+    for kind in ("values", "coverage"):
+        one, other = (dense(result, getattr(result, kind))[reached] for result in (copied, together))
+        torch.testing.assert_close(one, other)
+
+
+def test_copies_alone_are_the_source(backend):
+    nothing = average_splat(random_source()[:0], VOXELS[:0], SHAPE)
+    copied = with_copies(nothing, random_source(), VOXELS.long())
+    assert torch.equal(copied.values, random_source())
+    assert torch.equal(copied.index.reshape(-1), torch.arange(60, dtype=torch.int32))
+    assert (copied.coverage == 1).all()
+
+
+def test_copies_refuse_other_shapes():
+    nothing = average_splat(random_source()[:0], VOXELS[:0], SHAPE)
+    with pytest.raises(ValueError, match="cells"):
+        with_copies(nothing, random_source(), VOXELS[:3].long())

@@ -16,7 +16,7 @@ from forewarp.ops.dct import dct_basis
 from forewarp.ops.encode import positional_encoding, spherical_harmonics_1
 from forewarp.ops.grid import corner_weights, neighbour_pairs, trilinear, trilinear_reference
 from forewarp.ops.lens import distort
-from forewarp.ops.splat import average_splat, scatter_reference
+from forewarp.ops.splat import average_splat, scatter_reference, with_copies
 from forewarp.ops.variation import patch_variation, total_variation
 from hard_cases import index_with
 
@@ -81,6 +81,14 @@ def check_splat(seed):
     assert gradcheck(lambda s, p: average_splat(s, p, shape)[:2], inputs)
 
 
+def check_copies(seed):
+    shape = sparse(seed)[0]
+    cells = torch.cartesian_prod(*(torch.arange(n) for n in shape))[seed % 3 :: 4]
+    moving, still = (draw(seed + i, n, 2).requires_grad_() for i, n in enumerate((6, len(cells))))
+    inputs = (moving, generic(seed, 6, shape).requires_grad_(), still)
+    assert gradcheck(lambda m, p, s: with_copies(average_splat(m, p, shape), s, cells)[:2], inputs)
+
+
 def check_scatter(seed):
     shape = sparse(seed)[0]
     inputs = (draw(seed, 6, 2).requires_grad_(), generic(seed, 6, shape).requires_grad_())
@@ -117,6 +125,7 @@ CHECKS = {
         lambda p: corner_weights(p, (3, 4, 5))[1], generic(seed, 4, (3, 4, 5)).requires_grad_()
     ),
     "average_splat": check_splat,
+    "with_copies": check_copies,
     "scatter_reference": check_scatter,
     "render_weights": check_weights,
     "accumulate": check_accumulate,

@@ -7,7 +7,7 @@ pytest.importorskip("embreex")
 from forewarp.synth import film as of_film
 from forewarp.synth.cameras import random_cameras
 from forewarp.synth.film import Exposure, Film, View
-from forewarp.synth.vehicle import World
+from forewarp.synth.world import World
 
 VIEWS = [
     View(str(i), i / 8, camera) for i, camera in enumerate(random_cameras(9, 12, np.random.default_rng(0)))

@@ -9,7 +9,7 @@ from forewarp.synth.motions import MOTIONS
 from forewarp.synth.points import surface_points, trajectories
 from forewarp.synth.raycast import render
 from forewarp.synth.cameras import orbit_camera, random_cameras
-from forewarp.synth.vehicle import World
+from forewarp.synth.world import World
 
 TIMES = np.linspace(0, 1, 41)
 

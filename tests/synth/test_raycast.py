@@ -10,7 +10,7 @@ pytest.importorskip("embreex")
 from forewarp.synth.motions import GROUND, joints
 from forewarp.synth.raycast import LIGHT_AT, Posed, camera_rays, render
 from forewarp.synth.cameras import orbit_camera
-from forewarp.synth.vehicle import World
+from forewarp.synth.world import World
 
 
 @pytest.fixture(scope="module")

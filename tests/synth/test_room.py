@@ -7,7 +7,7 @@ pytest.importorskip("embreex")
 from forewarp.synth.motions import GROUND, MOTIONS
 from forewarp.synth.raycast import LIGHT_AT, Posed
 from forewarp.synth.room import HIGH, LOW
-from forewarp.synth.vehicle import World
+from forewarp.synth.world import World
 
 
 @pytest.fixture(scope="module")

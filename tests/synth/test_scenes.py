@@ -73,7 +73,10 @@ def test_cameras_look_at_the_middle_from_above():
         ({"size": 20.5}, "size: expected a whole number"),
         ({"frames": 1}, "frames: expected a whole number of at least 2, but got 1"),
         ({"seed": -1}, "seed: expected a whole number of at least 0, but got -1"),
-        ({"motion": "fly"}, "motion: expected one of lift, lift_tilt, drive, but got 'fly'"),
+        (
+            {"motion": "fly"},
+            "motion: expected one of lift, lift_tilt, drive, still, rigid, band, glossy, room, quick",
+        ),
         ({"test_views": (1, 2)}, "test_views: expected three numbers"),
         ({"test_views": (0, 0, 0)}, "not all 0, but got"),
         ({"test_views": 5}, "test_views: expected three numbers"),

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from forewarp.synth.motions import GROUND, MOTIONS
-from forewarp.synth.vehicle import World
+from forewarp.synth.world import World
 
 
 @pytest.fixture(scope="module", params=MOTIONS)

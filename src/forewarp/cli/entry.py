@@ -36,7 +36,7 @@ def project_root() -> Path:
     return root
 
 
-def command(name: str, task: Callable, text: str) -> None:
+def command(name: str, task: Callable, text: str, *, config: str | None = None) -> None:
     """Run a console script: compose ``conf/<name>.yaml`` with the command line and hand it to ``task``.
 
     Never returns: exits with 0; with 2 and one line for a mistake of the user's; with 130 on Ctrl-C.
@@ -46,16 +46,17 @@ def command(name: str, task: Callable, text: str) -> None:
         name: of the config file and of the command after ``forewarp-``.
         task: takes the composed config.
         text: what ``--help`` says first.
+        config: the name of the config file where it is another.
     """
     quiet()
     try:
         root = project_root()
         os.environ[ROOT_VARIABLE] = str(root)
         if {"-h", "--help"} & set(sys.argv[1:]):
-            print(text.strip() + "\n\n" + choices(root / "conf", name), flush=True)
+            print(text.strip() + "\n\n" + choices(root / "conf", config or name), flush=True)
             sys.exit(0)
-        sys.argv[1:] = with_keys(name, sys.argv[1:])
-        failures = _run(name, task, root / "conf")
+        sys.argv[1:] = _words(name)
+        failures = _run(name, task, root / "conf", config or name)
     except KeyboardInterrupt:
         _interrupted(name)
     except BrokenPipeError:  # whoever read the output has seen enough
@@ -67,8 +68,18 @@ def command(name: str, task: Callable, text: str) -> None:
             _interrupted(name)
         raise
     except Exception as error:
-        failures = [_tell(name, error)]
+        failures = [_tell(name, error, config or name)]
     sys.exit(max(failures, default=0))
+
+
+def _words(name: str) -> list[str]:
+    """The words of the command line as Hydra takes them."""
+    words = with_keys(name, sys.argv[1:])
+    if any(word.startswith("plan=") for word in words):
+        from forewarp.cli.plan_file import with_plan
+
+        return with_plan(name, words)
+    return words
 
 
 def quiet() -> None:
@@ -88,7 +99,7 @@ def quiet() -> None:
         warnings.filterwarnings("ignore", message=".*LeafSpec.*", category=FutureWarning)
 
 
-def _run(name: str, task: Callable, conf: Path) -> list[int]:
+def _run(name: str, task: Callable, conf: Path, config_name: str) -> list[int]:
     """Exit statuses of the jobs that failed; with ``--multirun`` the others still run."""
     import hydra
     from hydra.core.hydra_config import HydraConfig
@@ -100,14 +111,14 @@ def _run(name: str, task: Callable, conf: Path) -> list[int]:
             quiet()  # a launcher's process begins here
             task(config)
         except Exception as error:
-            status = _tell(name, error)
+            status = _tell(name, error, config_name)
         with suppress(OSError), open(ended, "a") as file:
             file.write(f"{status} {' '.join(HydraConfig.get().overrides.task)}\n")
 
     # A file, as jobs may be other processes; those of another machine do not reach it.
     with tempfile.TemporaryDirectory(prefix="forewarp-") as folder:
         ended = os.path.join(folder, "ended")
-        hydra.main(version_base="1.3", config_path=str(conf), config_name=name)(job)()
+        hydra.main(version_base="1.3", config_path=str(conf), config_name=config_name)(job)()
         lines = Path(ended).read_text().splitlines() if os.path.exists(ended) else []
     jobs = [line.split(" ", 1) for line in lines]
     failed = [words for status, words in jobs if int(status)]
@@ -117,10 +128,10 @@ def _run(name: str, task: Callable, conf: Path) -> list[int]:
     return [int(status) for status, _ in jobs]
 
 
-def _tell(name: str, error: Exception) -> int:
+def _tell(name: str, error: Exception, config_name: str) -> int:
     """Say what went wrong and return the exit status."""
     conf = Path(os.environ.get(ROOT_VARIABLE, "")) / "conf"
-    line = unknown_key(error, conf, name, sys.argv[1:]) or one_line(error)
+    line = unknown_key(error, conf, config_name, sys.argv[1:]) or one_line(error)
     if line is None or os.environ.get(TRACEBACK_VARIABLE) == "1":
         traceback.print_exception(error)
     print(f"forewarp-{name}: error: {line or _bug(error)}", file=sys.stderr)

@@ -9,15 +9,15 @@ import os
 import statistics
 import subprocess
 import sys
-import time
 from collections.abc import Sequence
 from pathlib import Path
 
 import torch
 
 from forewarp.cli.entry import project_root, quiet
+from forewarp.cli.free import free_table
 from forewarp.cli.stability import replace_section, table
-from forewarp.cli.timed_cases import CASES, Work, frame_work, splat_work, step_work
+from forewarp.cli.timed_cases import CASES, frame_work, milliseconds, splat_work, step_work, timed
 from forewarp.cli.twin import implementation
 from forewarp.cli.workloads import OCCUPANCY
 from forewarp.ops.splat import average_splat
@@ -37,7 +37,6 @@ WORDS = (
     ("threshold_backward", "rectifiers"),
     ("adam", "optimiser"),
 )
-REPEATS = 5
 _VERDICTS = {True: "reached", False: "**missed**", None: ""}
 
 
@@ -49,28 +48,6 @@ def slope(amounts: Sequence[float], seconds: Sequence[float]) -> float:
     """
     x, y = [math.log(a) for a in amounts], [math.log(s) for s in seconds]
     return statistics.linear_regression(x, y).slope
-
-
-def timed(work: Work, repeats: int = REPEATS) -> float:
-    """Median seconds of the processor's time, after a first time that does not count: what else a shared
-    machine does is left out, and of one thread it is what a quiet one takes.
-    """
-    work()
-    taken = []
-    for _ in range(repeats):
-        begin = time.process_time()
-        work()
-        taken.append(time.process_time() - begin)
-    return statistics.median(taken)
-
-
-def milliseconds(seconds: float | None) -> str:
-    """Three digits.
-
-    >>> milliseconds(0.0123456), milliseconds(2.5), milliseconds(None)
-    ('12.3', '2500', '')
-    """
-    return "" if seconds is None else f"{1e3 * seconds:.3g}" if seconds < 1 else f"{1e3 * seconds:.0f}"
 
 
 def mebibytes(count: int) -> str:
@@ -186,7 +163,7 @@ def goals_table(side: int = 80, rays: int = 8192, picture: int = 400, frame_side
 def by_itself(side: int, rays: int) -> float:
     """Seconds of the dense step in a process without the large pages that the commands ask for."""
     work = f"step_work({side}, True, rays={rays})"
-    code = "from forewarp.cli.performance import timed; from forewarp.cli.timed_cases import step_work; "
+    code = "from forewarp.cli.timed_cases import step_work, timed; "
     plain = {name: value for name, value in os.environ.items() if name != "THP_MEM_ALLOC_ENABLE"}
     call = [sys.executable, "-c", f"{code}print(timed({work}, 2))"]
     return float(subprocess.run(call, env=plain, check=True, capture_output=True, text=True).stdout)
@@ -199,7 +176,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "--measured", type=Path, default=Path("runs/bench/growth.json"), help="of pytest-benchmark"
     )
     parser.add_argument("--document", type=Path, default=None, help="instead of docs/performance.md")
-    parser.add_argument("--only", nargs="*", default=("growth", "profile", "box", "goals"))
+    parser.add_argument("--only", nargs="*", default=("growth", "profile", "box", "goals", "free"))
     given = parser.parse_args(arguments)
     quiet()
     document = given.document or project_root() / "docs" / "performance.md"
@@ -209,6 +186,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "profile": profile_table,
         "box": box_table,
         "goals": goals_table,
+        "free": free_table,
     }
     for name in given.only:
         text = sections[name]()

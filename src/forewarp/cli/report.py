@@ -15,7 +15,7 @@ forewarp-report makes pages with tables and curves of runs that are already ther
   forewarp-report kind=price_list runs=FOLDER out=FOLDER
 
 What one types most:
-  kind=accuracy_time|price_list|paper   which page
+  kind=accuracy_time|price_list|paper|effects   which page
   runs=FOLDER                      searched for runs (runs/accuracy_time; of kind=paper runs/paper)
   out=FOLDER                       where the page goes (docs/results; of kind=paper runs/paper/results)
   target=DB                        accuracy_time: PSNR that every variant's seconds are listed for
@@ -27,13 +27,14 @@ make reproduce-tables [DATA=FOLDER]. One that has no
 results is named at the end of the page.
 """
 
-KINDS = ("accuracy_time", "price_list", "paper")
+KINDS = ("accuracy_time", "price_list", "paper", "effects")
 
 
 def report(config) -> None:
     """Write the page."""
     from forewarp.report.accuracy_time import write_accuracy_time
     from forewarp.report.curve import read_published
+    from forewarp.report.effects import write_effects
     from forewarp.report.paper import write_paper
     from forewarp.report.price_list import write_price_list
 
@@ -41,13 +42,15 @@ def report(config) -> None:
         raise ValueError(f"kind: expected one of {', '.join(KINDS)}, but got '{config.kind}'")
     if not isinstance(config.target, int | float | None):
         raise ValueError(f"target: expected a number of dB or null, but got '{config.target}'")
-    default = f"{config.paths.runs}/{'paper' if config.kind == 'paper' else 'accuracy_time'}"
+    default = f"{config.paths.runs}/{config.kind if config.kind in ('paper', 'effects') else 'accuracy_time'}"
     kept = Path(config.paths.root) / "docs" / "results"
     runs = Path(config.runs or default)
     # Tables that this project vouches for are not written over by whoever tries the command.
-    out = Path(config.out or (runs / "results" if config.kind == "paper" else kept))
+    out = Path(config.out or (runs / "results" if config.kind in ("paper", "effects") else kept))
     if config.kind == "price_list":
         files = write_price_list(runs, out)
+    elif config.kind == "effects":
+        files = write_effects(runs, out)
     elif config.kind == "paper":
         files = write_paper(runs, out, Path(config.published or kept / "paper.yaml"))
     else:

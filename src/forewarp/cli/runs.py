@@ -5,8 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import shlex
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from forewarp.cli.measure import check_precision, device_of
 from forewarp.cli.trusted import MOST_BYTES, trusted_config
+from forewarp.cli.words import as_typed, key_of, typed_words
 from forewarp.training.budget import seconds_after, share_out
 from forewarp.training.callbacks import StageProgress
 from forewarp.training.handover import read_json
@@ -27,7 +27,6 @@ IDENTITY = ("data", "model", "objective", "stage", "renderer", "budget", "seed")
 # Named first of what differs, as others follow from these.
 TYPED = ("data.scene", "data.root", "seed", "budget")
 HASH = "{hash}"
-OF_A_SWEEP = ("sweeps=", "seeds=", "launcher=")  # words that say how jobs are run, not what one is
 # What may be set beside resume=<run>.
 MAY_CHANGE = (
     *("trainer", "threads", "lpips_weights", "sheets", "evaluate", "checkpoint_seconds"),
@@ -94,13 +93,19 @@ def hashed(config: DictConfig) -> DictConfig:
     bound a run, what it computes with is part of that.
     """
     if HASH in str(config.run):
-        _make_absolute(config)
-        content = {key: _plain(config[key]) for key in IDENTITY}
-        if config.budget.minutes is not None:
-            content["on"] = [device_of(config.trainer.accelerator).type, config.trainer.get("precision")]
-        text = json.dumps(content, sort_keys=True)
-        config.run = str(config.run).replace(HASH, hashlib.sha256(text.encode()).hexdigest()[:10])
+        config.run = str(config.run).replace(HASH, content_hash(config))
     return config
+
+
+def content_hash(config: DictConfig, more: Sequence[str] = (), *others: object) -> str:
+    """Ten digits of a SHA-256 of what a run computes, of ``more`` keys of its config, and of ``others``."""
+    _make_absolute(config)
+    content = {key: _plain(config[key]) for key in (*IDENTITY, *more)}
+    if config.budget.minutes is not None:
+        content["on"] = [device_of(config.trainer.accelerator).type, config.trainer.get("precision")]
+    if others:
+        content["others"] = others
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:10]
 
 
 def _plain(value: object) -> object:
@@ -141,10 +146,7 @@ def is_measured(run: Run) -> bool:
 
 def typed() -> str | None:
     """The command line of this run alone; None where Hydra was not asked."""
-    if not HydraConfig.initialized():
-        return None
-    words = HydraConfig.get().overrides.task
-    return shlex.join(["forewarp-train", *(word for word in words if not word.startswith(OF_A_SWEEP))])
+    return as_typed("train", typed_words()) if HydraConfig.initialized() else None
 
 
 def saved_config(run: str | None, changes: DictConfig, key: str = "run") -> DictConfig:
@@ -184,7 +186,7 @@ def resumed(config: DictConfig) -> DictConfig:
     saved.resume, saved.data_changed = str(config.resume), "refuse"
     words = HydraConfig.get().overrides.task if HydraConfig.initialized() else []
     for word in words:
-        key = word.split("=")[0].lstrip("+~")
+        key = key_of(word)
         if key == "data.root":
             saved.data.root = config.data.root
         elif key.split(".")[0] in MAY_CHANGE:

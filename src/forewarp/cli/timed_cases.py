@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import statistics
+import time
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -28,6 +30,7 @@ from forewarp.renderer import Renderer
 from forewarp.training.module import render_all
 
 Work = Callable[[], object]
+REPEATS = 5
 
 
 @dataclass(frozen=True)
@@ -41,6 +44,28 @@ class Case:
     make: Callable[[float, bool], Work]
     work: Callable[[float], float] = float
     dense_sizes: tuple[float, ...] = ()
+
+
+def timed(work: Work, repeats: int = REPEATS) -> float:
+    """Median seconds of the processor's time, after a first time that does not count: what else a shared
+    machine does is left out, and of one thread it is what a quiet one takes.
+    """
+    work()
+    taken = []
+    for _ in range(repeats):
+        begin = time.process_time()
+        work()
+        taken.append(time.process_time() - begin)
+    return statistics.median(taken)
+
+
+def milliseconds(seconds: float | None) -> str:
+    """Three digits.
+
+    >>> milliseconds(0.0123456), milliseconds(2.5), milliseconds(None)
+    ('12.3', '2500', '')
+    """
+    return "" if seconds is None else f"{1e3 * seconds:.3g}" if seconds < 1 else f"{1e3 * seconds:.0f}"
 
 
 def backwards(dense: bool, work: Callable[[], Tensor]) -> Work:

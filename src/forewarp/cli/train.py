@@ -24,6 +24,8 @@ What one types most:
   resume=FOLDER                       go on with the run there; nothing else need be typed
   sentinel.skip=N                     leave out up to N steps of a stage that are not finite, and count them
   run=FOLDER                          where the run lives (runs/<scene>/<model>-<budget>-seed<seed>)
+  effects=auto                        find out what the scene calls for, then fit that: see forewarp-plan
+  plan=FILE                           as a plan says; what is typed beside it wins
   evaluate=false                      no test views at the end
   data.held_out=N                     set N training views aside: a curve of their PSNR against training time
   variant=NAME                        one change against budget=fast, as the price list has it
@@ -50,7 +52,7 @@ def train(config) -> None:
 
     refuse_seeds(config)
     refuse_budget(config)
-    config = hashed(resumed(config))
+    config = hashed(planned(resumed(config)))
     run = build_run(config)
     if skips(run, config.get("absent", "refuse")):
         print(f"skipped: {run.datamodule.place}: no such scene")
@@ -65,6 +67,7 @@ def train(config) -> None:
     with alone(run.folder):
         claim(config)
         same_data(run, config.get("data_changed", "refuse"))
+        keep_plan(config)
         print(beginning(run, config), flush=True)
         module = run.fit()
         if config.evaluate:
@@ -73,6 +76,37 @@ def train(config) -> None:
             print(f"fitted: {run.folder}; measure it with forewarp-evaluate run={run.folder}")
         draw_run(run.folder)
     tell_skipped(run)
+
+
+def planned(config):
+    """With ``effects=auto`` the config of the run that a plan says, made now where there is none yet."""
+    choice = config.get("effects", "given")
+    if choice not in ("given", "auto"):
+        raise ValueError(f"effects: expected given or auto, but got {choice}")
+    if choice == "given" or config.get("resume") is not None:
+        return config
+    from forewarp.cli.plan_file import tell
+    from forewarp.cli.planning import make_plan
+    from forewarp.cli.runs import build_run
+    from forewarp.cli.trials import composed
+    from forewarp.cli.words import merged, of_what_is_on, typed_words
+
+    if skips(build_run(config), config.get("absent", "refuse")):
+        return config
+    made = make_plan(config, typed_words())
+    tell(made)
+    config = composed(of_what_is_on(merged(made["words"], typed_words(all_of_them=True))))
+    config.planned = made["file"]
+    return config
+
+
+def keep_plan(config) -> None:
+    """Put the plan that a run follows into its folder."""
+    from pathlib import Path
+    from shutil import copyfile
+
+    if config.get("planned") is not None and Path(config.planned).is_file():
+        copyfile(config.planned, Path(config.run) / "plan.yaml")
 
 
 def refuse_seeds(config) -> None:

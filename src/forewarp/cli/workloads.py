@@ -132,7 +132,7 @@ def _paint(method: ForwardWarp, ball: Tensor, shift: float) -> None:
     radiance.features[:, 0] = torch.where(ball[x, y, z], SOLID - EMPTY, 0.0)
     if method.motion is not None:
         trajectory = method.motion.trajectory
-        basis = trajectory._basis(TIME)[0]
+        basis = trajectory.basis(TIME)[0]
         trajectory.network[-1].bias[0] = shift * radiance.lattice.spacing[0] / (trajectory.scale * basis)
 
 

@@ -13,7 +13,8 @@ def hold_out(scene: Scene, count: int) -> Scene:
     """The scene with ``count`` of its training frames in ``held``, spread evenly over the sequence.
 
     Always the same ones. The first and the last time and the canonical one keep all their frames: beyond what
-    was seen there is nothing to compare with, and a stage starts from the canonical time.
+    was seen there is nothing to compare with, and a stage starts from the canonical time. Where there is only
+    one time its frames are shared out.
 
     Args:
         scene: as read.
@@ -24,8 +25,7 @@ def hold_out(scene: Scene, count: int) -> Scene:
     """
     if whole(count, "data.held_out", 0) == 0:
         return scene
-    kept = {scene.times[0], scene.times[-1], scene.canonical_time}
-    frames = sorted((f.time, i) for i, f in enumerate(scene.train) if f.time not in kept)
+    frames = _spare(scene)
     if count > len(frames) // 2:
         raise SceneError(
             f"data.held_out: expected at most {len(frames) // 2} of the {len(scene.train)} training frames "
@@ -38,3 +38,14 @@ def hold_out(scene: Scene, count: int) -> Scene:
         held=tuple(scene.train[i] for i in sorted(chosen)),
         protocol={**scene.protocol, "held_out": count},
     )
+
+
+def most_held_out(scene: Scene) -> int:
+    """How many training frames a scene can spare."""
+    return len(_spare(scene)) // 2
+
+
+def _spare(scene: Scene) -> list[tuple[float, int]]:
+    """Time and number of the training frames some of which may be set aside, in the order of time."""
+    kept = {scene.times[0], scene.times[-1], scene.canonical_time} if len(scene.times) > 1 else set()
+    return sorted((f.time, i) for i, f in enumerate(scene.train) if f.time not in kept)

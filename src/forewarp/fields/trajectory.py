@@ -77,7 +77,8 @@ class TrajectoryField(nn.Module):
             inputs = torch.cat([inputs, read], -1)
         return self.scale * self.network(inputs).reshape(-1, 3, self.bases)
 
-    def _basis(self, time: float | Tensor) -> Tensor:
+    def basis(self, time: float | Tensor) -> Tensor:
+        """``dct_basis`` of the field at ``time`` (...,) -> (..., K); bases that are not in play are 0."""
         basis = dct_basis(time, self.bases, self.frames, self.canonical_time, self.padding)
         basis = basis.to(self.bases_in_play.device)
         return basis * (torch.arange(self.bases, device=basis.device) < self.bases_in_play)
@@ -88,7 +89,7 @@ class TrajectoryField(nn.Module):
         Cost: F2 on the nodes around the active voxels, then one trilinear read a voxel.
         """
         points, (nodes, index, coordinates) = self._around(voxels)
-        at_nodes = _matmul(self.coefficients(nodes if self.at_nodes else points), self._basis(time))
+        at_nodes = _matmul(self.coefficients(nodes if self.at_nodes else points), self.basis(time))
         if not self.at_nodes:
             return at_nodes
         return trilinear(at_nodes, index, coordinates, at_nodes.new_zeros(3))
@@ -110,12 +111,12 @@ class TrajectoryField(nn.Module):
     def trajectories(self, points: Tensor, times: Tensor) -> Tensor:
         """Paths (N, T, 3) of canonical points (N, 3) at ``times`` (T,), world units."""
         if not self.at_nodes:
-            flow = _matmul(self.coefficients(points), self._basis(times).T)  # (N, 3, T)
+            flow = _matmul(self.coefficients(points), self.basis(times).T)  # (N, 3, T)
             return points[:, None] + flow.transpose(1, 2)
         nodes, index, coordinates = self._nodes_around(points)
         at_nodes = self.coefficients(nodes).flatten(1)
         read = trilinear(at_nodes, index, coordinates, at_nodes.new_zeros(at_nodes.shape[1]))
-        flow = _matmul(read.reshape(-1, 3, self.bases), self._basis(times).T)
+        flow = _matmul(read.reshape(-1, 3, self.bases), self.basis(times).T)
         return points[:, None] + flow.transpose(1, 2)
 
 

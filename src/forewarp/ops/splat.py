@@ -56,6 +56,39 @@ def average_splat(source: Tensor, positions: Tensor, shape: tuple[int, int, int]
     return Splat(values, coverage, index, int(len(source) - int(inside.sum())))
 
 
+def with_copies(splat: Splat, source: Tensor, cells: Tensor, tau: float = 1e-2) -> Splat:
+    """A splat to which voxels are added that stay where they are: the one cell of each, with weight 1.
+
+    The same as if they had been splatted onto themselves, for an eighth of the work.
+
+    Args:
+        splat: of all that moves, with the same ``tau``.
+        source: (N, C) values of what stays.
+        cells: (N, 3) int64, where; each once.
+
+    Raises:
+        ValueError: for other shapes.
+
+    Cost: one cell of C + 1 channels a voxel.
+
+    >>> nothing = average_splat(torch.zeros(0, 1), torch.zeros(0, 3), (2, 2, 2))
+    >>> with_copies(nothing, torch.tensor([[7.0]]), torch.tensor([[0, 1, 1]])).values
+    tensor([[7.]])
+    """
+    check_shape("source", source, ("N", "C"))
+    check_shape("cells", cells, (len(source), 3))
+    index, rows = splat.index.clone(), splat.index[cells.unbind(-1)].long()
+    absent = (rows < 0).nonzero()[:, 0]
+    fresh = torch.arange(len(absent), device=rows.device) + len(splat.coverage)
+    rows = rows.index_copy(0, absent, fresh)
+    index[cells[absent].unbind(-1)] = fresh.int()
+    coverage = torch.cat([splat.coverage, splat.coverage.new_zeros(len(absent))])
+    sums = torch.cat([splat.values, splat.values.new_zeros(len(absent), splat.values.shape[1])])
+    sums = (sums * coverage.clamp(min=tau)[:, None]).index_add(0, rows, source)
+    coverage = coverage.index_add(0, rows, torch.ones_like(source[:, 0]))
+    return Splat(sums / coverage.clamp(min=tau)[:, None], coverage, index, splat.dropped)
+
+
 def scatter_reference(
     source: Tensor, positions: Tensor, shape: tuple[int, int, int]
 ) -> tuple[Tensor, Tensor]:

@@ -6,18 +6,19 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from forewarp.report.collect import Result, by_scene, collect, grouped, machine
+from forewarp.report.effect import DIFFERENCES, measure_effect
 from forewarp.report.tables import Column, Estimate, Table
 
-# Of a run's numbers: the title, the digits, and whether the change is a difference or a quotient.
+# Of a run's numbers: the title and the digits.
 MEASURES = {
-    "psnr": (Column("PSNR (dB)"), True),
-    "ssim": (Column("SSIM", 4), True),
-    "epe": (Column("EPE", 4), True),
-    "step": (Column("s/step", 3), False),
-    "frame": (Column("s/frame", 2), False),
-    "memory": (Column("GiB", 2), False),
-    "parameters": (Column("parameters (M)", 3), False),
-    "steps": (Column("steps", 0), False),
+    "psnr": Column("PSNR (dB)"),
+    "ssim": Column("SSIM", 4),
+    "epe": Column("EPE", 4),
+    "step": Column("s/step", 3),
+    "frame": Column("s/frame", 2),
+    "memory": Column("GiB", 2),
+    "parameters": Column("parameters (M)", 3),
+    "steps": Column("steps", 0),
 }
 
 INTRODUCTION = """# What each choice costs and brings
@@ -66,7 +67,7 @@ def references(results: Sequence[Result]) -> Table:
     columns = [Column("compared with"), Column("what"), Column("seeds", 0)]
     kind = {"all": "all test views", "time": "test views between the training times"}
     views = ", ".join(sorted({kind[result.ability] for result in results}))
-    return Table([*columns, *(column for column, _ in MEASURES.values())], rows, f"Of {views}:")
+    return Table([*columns, *MEASURES.values()], rows, f"Of {views}:")
 
 
 def changes(results: Sequence[Result]) -> Table:
@@ -77,13 +78,13 @@ def changes(results: Sequence[Result]) -> Table:
         if variant == group[0].against:
             continue
         pairs = [(result, own.get((result.against, result.seed))) for result in group]
-        pairs = [(result, before) for result, before in pairs if before is not None]
-        values = [_change(pairs, measure) for measure in MEASURES]
-        rows.append([variant, group[0].about, group[0].against, len(pairs), *values])
+        numbers = [(result.numbers, before.numbers) for result, before in pairs if before is not None]
+        values = [measure_effect(numbers, measure) for measure in MEASURES]
+        rows.append([variant, group[0].about, group[0].against, len(numbers), *values])
     columns = [Column("variant"), Column("what"), Column("against"), Column("seeds", 0)]
-    for column, difference in MEASURES.values():
+    for measure, column in MEASURES.items():
         signed = Column(column.name, column.digits, signed=True)
-        columns.append(signed if difference else Column(column.name, prefix="×"))
+        columns.append(signed if measure in DIFFERENCES else Column(column.name, prefix="×"))
     return Table(columns, rows, "Changes:")
 
 
@@ -95,17 +96,8 @@ def every_run(results: Sequence[Result]) -> Table:
         about = [result.scene, result.variant, result.minutes, result.seed, result.ability]
         rows.append([*about, *(numbers.get(measure) for measure in MEASURES), result.command])
     columns = [Column(name) for name in ("scene", "variant", "minutes", "seed", "views")]
-    return Table([*columns, *(column for column, _ in MEASURES.values()), Column("command")], rows)
+    return Table([*columns, *MEASURES.values(), Column("command")], rows)
 
 
 def _known(group: Sequence[Result], measure: str) -> list[float]:
     return [result.numbers[measure] for result in group if measure in result.numbers]
-
-
-def _change(pairs: Sequence[tuple[Result, Result]], measure: str) -> Estimate | None:
-    _, difference = MEASURES[measure]
-    both = [(result.numbers.get(measure), before.numbers.get(measure)) for result, before in pairs]
-    both = [(now, before) for now, before in both if None not in (now, before)]
-    if difference:
-        return Estimate.of([now - before for now, before in both])
-    return Estimate.of([now / before for now, before in both if before])

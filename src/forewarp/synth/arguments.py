@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from forewarp.data.files import whole
 from forewarp.scene.errors import SceneError
 from forewarp.synth.motions import MOTIONS
+from forewarp.synth.specimens import SPECIMENS
 
 
 def check_numbers(**numbers: tuple[int, int]) -> None:
@@ -21,10 +22,11 @@ def check_workers(workers: int | None) -> None:
         whole(workers, "workers", 1)
 
 
-def check_motion(motion: str, name: str = "motion") -> None:
-    """Refuse a motion that ``motions.MOTIONS`` does not have."""
-    if not isinstance(motion, str) or motion not in MOTIONS:
-        raise SceneError(f"{name}: expected one of {', '.join(MOTIONS)}, but got {motion!r}; set {name}")
+def check_motion(motion: str, name: str = "motion", *, specimens: bool = False) -> None:
+    """Refuse a motion that ``motions.MOTIONS`` does not have, nor, where they will do, ``SPECIMENS``."""
+    known = [*MOTIONS, *(SPECIMENS if specimens else ())]
+    if not isinstance(motion, str) or motion not in known:
+        raise SceneError(f"{name}: expected one of {', '.join(known)}, but got {motion!r}; set {name}")
 
 
 def check_counts(name: str, counts: Sequence[int], meaning: str) -> None:

@@ -11,7 +11,7 @@ from forewarp.scene.camera import Camera, look_at
 
 CAMERA_RADIUS, CAMERA_ANGLE_X = 4.0311, 0.6911112
 # Sine of the elevation: neither along the slab nor straight from above.
-_ELEVATION = (0.06, 0.96)
+ELEVATION = (0.06, 0.96)
 
 
 def orbit_camera(azimuth: float, sine: float, size: int) -> Camera:
@@ -31,10 +31,21 @@ def orbit_camera(azimuth: float, sine: float, size: int) -> Camera:
     return Camera(size, size, focal, focal, size / 2, size / 2, pose, 2.0, 6.0)
 
 
-def random_cameras(count: int, size: int, rng: np.random.Generator) -> list[Camera]:
-    """Cameras spread evenly by area over the upper half of the sphere."""
-    azimuth = rng.uniform(0, 2 * np.pi, count)
-    sine = rng.uniform(*_ELEVATION, count)
+def random_cameras(
+    count: int,
+    size: int,
+    rng: np.random.Generator,
+    azimuth: tuple[float, float] = (0.0, 360.0),
+    rise: tuple[float, float] = ELEVATION,
+) -> list[Camera]:
+    """Cameras spread evenly by area over the upper half of the sphere, or a part of it.
+
+    Args:
+        azimuth: degrees, from and to.
+        rise: sine of the elevation, from and to.
+    """
+    azimuth = rng.uniform(*np.radians(azimuth), count)
+    sine = rng.uniform(*rise, count)
     return [orbit_camera(float(a), float(s), size) for a, s in zip(azimuth, sine)]
 
 

@@ -18,7 +18,7 @@ from forewarp.synth.film import Exposure, Film, View
 from forewarp.synth.points import surface_points, trajectories
 from forewarp.synth.raycast import Hits, Posed, light_points
 from forewarp.synth.scenes import writing_to
-from forewarp.synth.vehicle import World
+from forewarp.synth.world import World
 
 POINTS = 4000
 CAMERAS, RADIUS, HEIGHTS = 20, 3.7, (0.55, 1.6)

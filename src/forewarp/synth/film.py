@@ -19,7 +19,7 @@ import torch
 
 from forewarp.scene.camera import Camera
 from forewarp.synth.raycast import SHADOW_RAYS, render
-from forewarp.synth.vehicle import World
+from forewarp.synth.world import World
 
 # A process takes seconds to start, and casts about two million samples in each.
 _SAMPLES_A_PROCESS = 4e7

@@ -15,7 +15,7 @@ from forewarp.synth.arguments import check_counts, check_motion, check_numbers, 
 from forewarp.synth.film import Exposure, Film
 from forewarp.synth.motions import MOTIONS
 from forewarp.synth.scenes import Views, spread, views_at, write_world
-from forewarp.synth.vehicle import World
+from forewarp.synth.world import World
 
 # Half of what a single scene gets: at this size a grey level is all one loses, and a quarter of the time.
 _SHADOW_RAYS = 3

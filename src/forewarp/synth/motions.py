@@ -75,13 +75,22 @@ def joints(motion: str, time: float) -> dict[str, np.ndarray]:
         motion: a name in MOTIONS.
         time: in [0, 1].
     """
-    now = MOTIONS[motion](time)
-    chassis = _along_arc(START[motion], now.travel, now.turn)
+    return placed(MOTIONS[motion](time), START[motion])
+
+
+def placed(now: Controls, start: tuple[float, float, float]) -> dict[str, np.ndarray]:
+    """Each joint's affine map (4, 4) from its rest frame to the world.
+
+    Args:
+        now: angles and lengths.
+        start: of the chassis: x, y, heading in degrees.
+    """
+    chassis = _along_arc(start, now.travel, now.turn)
     boom = chassis @ _shift(PIVOT) @ _raise(now.boom)
     stick = boom @ _shift((BOOM, 0, 0)) @ _raise(now.stick)
     bucket = stick @ _shift((STICK, 0, 0)) @ _raise(now.bucket)
     roll = -np.degrees(now.travel / WHEEL_RADIUS)
-    placed = {
+    maps = {
         "ground": _shift((0, 0, GROUND)),
         "chassis": chassis,
         "boom": boom,
@@ -89,10 +98,10 @@ def joints(motion: str, time: float) -> dict[str, np.ndarray]:
         "bucket": bucket,
     }
     for name, (x, side, z) in WHEELS.items():
-        placed[name] = chassis @ _shift((x, side * WHEEL_SIDE, z)) @ _raise(roll)
-    placed["ball"] = _ball(now)
-    placed["band"] = chassis @ _band(now)
-    return placed
+        maps[name] = chassis @ _shift((x, side * WHEEL_SIDE, z)) @ _raise(roll)
+    maps["ball"] = _ball(now)
+    maps["band"] = chassis @ _band(now)
+    return maps
 
 
 def _ball(now: Controls) -> np.ndarray:

@@ -7,7 +7,7 @@ import torch
 
 from forewarp.scene.frame import Truth
 from forewarp.synth.raycast import LIFT_OFF, Posed
-from forewarp.synth.vehicle import World
+from forewarp.synth.world import World
 
 # Candidates per point wanted: about half of the surface lies inside or below, and is never seen.
 _SPARE = 4

@@ -9,7 +9,7 @@ import torch
 
 from forewarp.scene.camera import Camera
 from forewarp.synth.textures import Surface, color_of
-from forewarp.synth.vehicle import World
+from forewarp.synth.world import World
 
 LIGHT_AT, LIGHT_RADIUS = np.array([2.2, -2.6, 4.6]), 0.45
 AMBIENT, SKY, DIFFUSE = 0.60, 0.10, 0.40
@@ -45,6 +45,7 @@ class Posed:
         self.area = 0.5 * np.linalg.norm(cross, axis=-1)
         self.normal = cross / (2 * self.area[:, None])
         self.corner_normal = _corner_normals(world, cross, self.normal)
+        self.finish = np.array([(p.material.gloss, p.material.shine) for p in world.parts])
         self._first = _intersector(self.corners)
         self._first_blocker = self._first if world.casts.all() else _intersector(self.corners[world.casts])
 
@@ -74,8 +75,10 @@ class Posed:
         weights = np.clip(np.stack([1 - v - w, v, w], -1), 0, 1)
         return weights / weights.sum(-1, keepdims=True)
 
-    def color(self, hits: Hits, lights: np.ndarray) -> np.ndarray:
-        """Lit colour (n, 3) in [0, 1] of hits; ``lights`` (L, 3) are points of the area light."""
+    def color(self, hits: Hits, lights: np.ndarray, directions: np.ndarray | None = None) -> np.ndarray:
+        """Lit colour (n, 3) in [0, 1] of hits; ``lights`` (L, 3) are points of the area light, ``directions``
+        (R, 3) the rays', without which nothing shines.
+        """
         normal = np.einsum("nc,ncd->nd", hits.barycentric, self.corner_normal[hits.face])
         normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
         point = np.einsum("nc,ncd->nd", hits.barycentric, self.corners[hits.face])
@@ -89,7 +92,19 @@ class Posed:
             free = self.is_free(point[lit] + LIFT_OFF * flat[lit], towards[lit])
             diffuse[lit] += cosine[lit] * free
         shade = AMBIENT + SKY * normal[:, 2] + DIFFUSE * diffuse / len(lights)
-        return np.clip(self._albedo(hits) * shade[:, None], 0, 1)
+        color = self._albedo(hits) * shade[:, None]
+        if directions is not None:
+            color += self._glint(hits, normal, directions[hits.ray])[:, None]
+        return np.clip(color, 0, 1)
+
+    def _glint(self, hits: Hits, normal: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """What glossy parts throw back of the light's middle (n,), whether or not something stands before it:
+        Phong's ``gloss * cos^shine`` of the angle to the mirrored ray.
+        """
+        gloss, shine = (self.finish[self.world.part_of_face[hits.face], i] for i in (0, 1))
+        mirrored = directions - 2 * np.einsum("nd,nd->n", directions, normal)[:, None] * normal
+        cosine = mirrored @ (LIGHT_AT / np.linalg.norm(LIGHT_AT))
+        return gloss * np.clip(cosine, 0, 1) ** shine
 
     def _albedo(self, hits: Hits) -> np.ndarray:
         world = self.world
@@ -134,8 +149,9 @@ def render(
     for i in range(samples_per_pixel):
         # The R1 sequence: any number of samples is spread evenly over the pixel; a single one is its centre.
         offset = ((i + 0.5) / samples_per_pixel, (0.5 + i * 0.6180339887498949) % 1.0)
-        hits = posed.first_hits(*camera_rays(camera, offset))
-        total[hits.ray] += posed.color(hits, lights[i::samples_per_pixel])
+        rays = camera_rays(camera, offset)
+        hits = posed.first_hits(*rays)
+        total[hits.ray] += posed.color(hits, lights[i::samples_per_pixel], rays[1])
         hit[hits.ray] += 1
     rgb = total / np.maximum(hit, 1)[:, None]
     rgba = np.concatenate([rgb, hit[:, None] / samples_per_pixel], -1)

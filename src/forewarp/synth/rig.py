@@ -22,7 +22,7 @@ from forewarp.synth.film import Exposure, Film, View
 from forewarp.synth.points import surface_points, trajectories
 from forewarp.synth.raycast import Posed, camera_rays
 from forewarp.synth.scenes import writing_to
-from forewarp.synth.vehicle import World
+from forewarp.synth.world import World
 
 # Of the still points drawn about a ninth lies in both pictures.
 POINTS, STILL_POINTS = 4000, 20000

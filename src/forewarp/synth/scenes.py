@@ -14,7 +14,8 @@ from forewarp.synth.arguments import check_counts, check_motion, check_numbers, 
 from forewarp.synth.cameras import CAMERA_ANGLE_X, centers_of, random_cameras, stream
 from forewarp.synth.film import Exposure, Film, View
 from forewarp.synth.points import surface_points, trajectories
-from forewarp.synth.vehicle import World
+from forewarp.synth.specimens import SPECIMENS, Specimen
+from forewarp.synth.world import World
 
 POINTS, POINT_VIEWS = 4000, 30
 # Streams of random numbers: the splits' cameras in turn, then the points'.
@@ -46,7 +47,7 @@ def synthesize(
     Args:
         folder: the scene's own; a scene already there is replaced.
         size: width and height in pixels, at least 8.
-        motion: one of ``motions.MOTIONS``.
+        motion: one of ``motions.MOTIONS``, or of ``specimens.SPECIMENS``, which takes the vehicle's place.
         samples_per_pixel: rays averaged into a pixel.
         workers, progress: as in ``film.Film``.
 
@@ -56,14 +57,14 @@ def synthesize(
     **Cost** about size^2 * samples_per_pixel * 7 rays an image, a million or two a second on one core.
     """
     check_numbers(size=(size, 8), frames=(frames, 2), seed=(seed, 0), val_views=(val_views, 0))
-    check_motion(motion)
+    check_motion(motion, specimens=True)
     check_counts("test_views", test_views, "space, time, canonical")
     check_numbers(samples_per_pixel=(samples_per_pixel, 1))
     check_workers(workers)
     times = np.linspace(0, 1, 2 * frames - 1)
     train, between = times[::2], times[1::2]
     test = spread(train, test_views[0]), spread(between, test_views[1]), np.zeros(test_views[2])
-    views = views_at((seed,), size, train, spread(train, val_views), test)
+    views = views_at((seed,), size, train, spread(train, val_views), test, SPECIMENS.get(motion))
     cameras = [view.camera for split in views.values() for view in split]
     with Film(Exposure(samples_per_pixel), cameras, workers, progress) as film:
         write_world(folder, World(motion), views, times, film, (seed,))
@@ -71,12 +72,20 @@ def synthesize(
 
 
 def views_at(
-    seed: tuple[int, ...], size: int, train: np.ndarray, val: np.ndarray, test: Sequence[np.ndarray]
+    seed: tuple[int, ...],
+    size: int,
+    train: np.ndarray,
+    val: np.ndarray,
+    test: Sequence[np.ndarray],
+    specimen: Specimen | None = None,
 ) -> Views:
-    """A random view at each of these times; ``test`` has the times of (space, time, canonical)."""
+    """A random view at each of these times, from where a ``specimen`` is to be seen; ``test`` has the times
+    of (space, time, canonical).
+    """
+    where = {} if specimen is None else {"azimuth": specimen.azimuth, "rise": specimen.rise}
 
     def views(number: int, times: np.ndarray, ability: str = "all") -> list[View]:
-        cameras = random_cameras(len(times), size, stream(*seed, number))
+        cameras = random_cameras(len(times), size, stream(*seed, number), **where)
         return [View(f"r_{i:03d}", float(t), c, ability) for i, (t, c) in enumerate(zip(times, cameras))]
 
     kinds = [view for i, times in enumerate(test) for view in views(_TEST + i, times, ABILITIES[i])]

@@ -9,11 +9,16 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Material:
-    """A ``pattern`` of PATTERNS, its ``colors`` (RGB in [0, 1]) and its ``scale`` in world units."""
+    """A ``pattern`` of PATTERNS, its ``colors`` (RGB in [0, 1]) and its ``scale`` in world units.
+
+    ``gloss`` is the light it throws back in one direction (0: it is matte), ``shine`` how narrowly.
+    """
 
     pattern: str
     colors: tuple[tuple[float, float, float], ...]
     scale: float = 0.1
+    gloss: float = 0.0
+    shine: float = 10.0
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""A toy excavator of bricks, a ball beside it and the slab under both: meshes, colours, places in time."""
+"""A toy excavator of bricks, a ball beside it and the slab under both: meshes and colours."""
 
 from __future__ import annotations
 
@@ -14,9 +14,7 @@ from forewarp.synth.motions import (
     STICK,
     WHEEL_RADIUS,
     WHEELS,
-    joints,
 )
-from forewarp.synth.room import room
 from forewarp.synth.shapes import Mesh, Part, box, cylinder, joined, prism, rounded_slab, sphere, studs
 from forewarp.synth.textures import Material
 
@@ -44,34 +42,9 @@ METAL = Material("bricks", (STEEL, (0.48, 0.51, 0.56)), 0.06)
 WARNING = Material("slanted", (YELLOW, CHARCOAL), 0.10)
 
 
-class World:
-    """Everything in the scene as one mesh of fixed topology, moved by ``motion``.
-
-    ``faces`` (F, 3) index the vertices of ``place``; ``part_of_face`` (F,) indexes ``parts``; ``rest``
-    (V, 3) are coordinates in each part's rest frame, by which it is coloured.
-
-    Args:
-        motion: a name in ``motions.MOTIONS``.
-        has_room: put a room around it, which never moves.
-    """
-
-    def __init__(self, motion: str = "lift_tilt", has_room: bool = False):
-        self.motion, self.has_room = motion, has_room
-        self.parts = _ground() + _chassis() + _arm() + _ball() + (room() if has_room else [])
-        self.rest, self.faces = joined([(p.vertices, p.faces) for p in self.parts])
-        self.part_of_face = np.repeat(np.arange(len(self.parts)), [len(p.faces) for p in self.parts])
-        self.smooth = np.array([p.smooth for p in self.parts])[self.part_of_face]
-        self.casts = np.array([p.casts for p in self.parts])[self.part_of_face]
-
-    def place(self, time: float) -> np.ndarray:
-        """World positions (V, 3) float64 of every vertex at any ``time`` in [0, 1]."""
-        at = joints(self.motion, time)
-        return np.concatenate([p.vertices @ at[p.joint][:3, :3].T + at[p.joint][:3, 3] for p in self.parts])
-
-    def points(self, faces: np.ndarray, barycentric: np.ndarray, time: float) -> np.ndarray:
-        """World positions (N, 3) at ``time`` of surface points given as (faces (N,), barycentric (N, 3))."""
-        corners = self.place(time)[self.faces[faces]]  # (N, 3, 3)
-        return np.einsum("nc,ncd->nd", barycentric, corners)
+def vehicle() -> list[Part]:
+    """All parts, the slab under it and the ball beside it."""
+    return _ground() + _chassis() + _arm() + _ball()
 
 
 def _ground() -> list[Part]:

@@ -74,13 +74,19 @@ def image_flow(module: DynamicSceneModule, camera: Camera, time: float) -> tuple
     return flow.reshape(*shape, 2), drawn.opacity.reshape(shape)
 
 
-def validation_psnr(module: DynamicSceneModule, targets: Sequence[Target], rays: int) -> float:
-    """Mean PSNR (dB) of images, each from the same ``rays`` pixels, drawn at random once for all."""
+def psnr_by_view(module: DynamicSceneModule, targets: Sequence[Target], rays: int) -> list[float]:
+    """PSNR (dB) of each image, from the same ``rays`` pixels, drawn at random once for all."""
     found = []
     for target in targets:
         every = target.frame.camera.width * target.frame.camera.height
         pixels = torch.randperm(every, generator=torch.Generator().manual_seed(0))[:rays]
         found.append(float(module.psnr_of(target, pixels)))
+    return found
+
+
+def validation_psnr(module: DynamicSceneModule, targets: Sequence[Target], rays: int) -> float:
+    """The mean of ``psnr_by_view``."""
+    found = psnr_by_view(module, targets, rays)
     return sum(found) / len(found)
 
 

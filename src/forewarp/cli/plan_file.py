@@ -1,0 +1,84 @@
+"""A plan as a file, as words of a command line, and on a screen."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import yaml
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from forewarp.cli.words import as_typed, key_of, merged, of_what_is_on
+from forewarp.training.progress import time_text
+
+MOST_BYTES = 1 << 20
+
+
+def write_plan(file: Path, made: dict) -> None:
+    """Write a plan with the command that made it, whole or not at all."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    about = f"# {as_typed('plan', made['typed'])}\n"
+    about += "# Fit it: forewarp-train plan=<this file>; any word typed beside that wins.\n"
+    beside = file.with_name(file.name + ".part")
+    beside.write_text(about + yaml.safe_dump(made, sort_keys=False, width=110, allow_unicode=True))
+    beside.replace(file)
+
+
+def read_plan(file: Path) -> dict:
+    """What a ``plan.yaml`` holds.
+
+    Raises:
+        ValueError: where it is none, or has words that no plan has.
+    """
+    try:
+        if file.stat().st_size > MOST_BYTES:
+            raise ValueError("too long")
+        made = yaml.safe_load(file.read_text())
+        words = [*made["typed"], *made["words"], f"of={made['of']}"]
+        allowed = all(isinstance(word, str) and _is_harmless(word) for word in words)
+    except (OSError, ValueError, yaml.YAMLError, TypeError, KeyError, RecursionError) as error:
+        reason = getattr(error, "strerror", None) or type(error).__name__
+        raise ValueError(
+            f"plan: expected a file that forewarp-plan wrote, but got {file} ({reason}); "
+            "use plan=<folder of a plan>/plan.yaml"
+        ) from error
+    if not allowed:
+        raise ValueError(f"plan: expected words that a plan has, but got others in {file}; make it anew")
+    return made
+
+
+def _is_harmless(word: str) -> bool:
+    """Whether a word may come from a file: none that names code, or how jobs are run, and no option."""
+    sets = re.match(r"\+{0,2}[A-Za-z][\w./@]*=", word) is not None
+    return sets and "_target_" not in word and not key_of(word).startswith("hydra")
+
+
+def with_plan(name: str, words: list[str]) -> list[str]:
+    """The words, with ``plan=FILE`` (of ``train``) replaced by what it says; those typed beside it win."""
+    files = [word.partition("=")[2] for word in words if word.startswith("plan=")]
+    if name != "train" or not files:
+        return words
+    made = read_plan(Path(files[-1]).expanduser())
+    typed = [word for word in words if not word.startswith("plan=")]
+    file = files[-1].replace("\\", "\\\\").replace("'", "\\'")
+    kept = [*planned_words(made), f"planned='{file}'", "effects=given"]
+    return of_what_is_on(merged(kept, typed))
+
+
+def planned_words(made: dict) -> list[str]:
+    """All words of the run that a plan says; those that were typed for it win."""
+    return merged(made["words"], made["typed"])
+
+
+def tell(made: dict) -> None:
+    """A plan on one screen."""
+    table = Table(box=box.SIMPLE, title=f"planned in {time_text(made['seconds'])}", title_justify="left")
+    for name in ("effect", "choice", "because"):
+        table.add_column(name, overflow="fold")
+    for effect, decision in made["effects"].items():
+        table.add_row(effect, decision["choice"], decision["because"])
+    console = Console()
+    console.print(table)
+    console.print(f"fit it: forewarp-train plan={made['file']}", soft_wrap=True, highlight=False)

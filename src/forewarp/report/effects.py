@@ -1,0 +1,162 @@
+"""The page that compares what scenes call for with every effect at once and with the paper's fixed set."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import yaml
+
+from forewarp.report.collect import Result, by_scene, collect, machine
+from forewarp.report.curve import seconds_to
+from forewarp.report.tables import Column, Estimate, Table
+
+CHOICES = {"auto": "planned", "all_effects": "every effect", "full": "the paper's set", "base": "the preset"}
+WITHIN = 0.3  # dB below every effect's PSNR that a plan's run should reach in less time
+
+INTRODUCTION = """# Only the effects a scene calls for
+
+Written by `forewarp-report kind=effects` from runs of `sweeps=effects`. *Planned* is what `effects=auto`
+found the scene to call for, *every effect* has all of them on, *the paper's set* is motion, inpainter,
+learned up-sampler, view network and all terms of its loss, *the preset* is the budget as it is. PSNR (dB) is
+of test views, which no plan has seen: between the training times where a scene tells its views apart. Minutes
+are of training; planning comes before and is listed apart. "Seconds to it": when the planned run's curve, of
+validation views, came within {within:g} dB of where every effect ended, "of" so many seconds.
+"""
+
+
+def write_effects(runs: Path, out: Path) -> list[Path]:
+    """Write ``effects.md`` and ``effects.csv`` (every run).
+
+    Args:
+        runs: folder of measured runs.
+        out: folder that they are written into.
+
+    Returns:
+        the files.
+    """
+    results, without = collect(runs, ["metrics.json"])
+    results = [result for result in results if result.variant in CHOICES]
+    out.mkdir(parents=True, exist_ok=True)
+    parts = [INTRODUCTION.format(within=WITHIN), f"Machine: {machine(results)}.\n"]
+    for title, own in (("Specimens", True), ("Other scenes", False)):
+        found = [r for r in results if (r.config.get("calls_for") is not None) == own]
+        if found:
+            parts += [f"## {title}\n", compared(found).markdown()]
+            parts += [called(found).markdown()] if own else []
+    parts += ["## Why\n", *reasons(results)]
+    if without:
+        parts += ["## Without numbers\n", "\n".join(f"* {line}" for line in without) + "\n"]
+    page, file = out / "effects.md", out / "effects.csv"
+    page.write_text("\n".join(parts))
+    file.write_text(every_run(results).csv())
+    return [page, file]
+
+
+def plan_of(result: Result) -> dict:
+    """The plan that a run follows; empty where it follows none."""
+    path = result.folder / "plan.yaml"
+    return yaml.safe_load(path.read_text()) if path.is_file() else {}
+
+
+def compared(results: Sequence[Result]) -> Table:
+    """A row a scene: what each choice reaches, mean over seeds, and the mean over scenes."""
+    rows, columns = [], [Column("scene"), Column("seeds", 0)]
+    columns += [Column(_title(results, choice)) for choice in CHOICES if _runs(results, choice)]
+    columns += [Column("planned - every effect", signed=True), Column("seconds to it", 0)]
+    columns += [Column("of", 0), Column("planning, s", 0)]
+    for scene, found in by_scene(results).items():
+        rows.append([scene, len(_runs(found, "auto")), *_cells(results, found)])
+    means = [_mean([row[i] for row in rows]) for i in range(2, len(columns))]
+    return Table(columns, [*rows, ["mean", None, *means]] if len(rows) > 1 else rows, "", rules=[len(rows)])
+
+
+def _cells(results: Sequence[Result], found: Sequence[Result]) -> list:
+    reached = [
+        Estimate.of([run.numbers["psnr"] for run in _runs(found, choice)])
+        for choice in CHOICES
+        if _runs(results, choice)
+    ]
+    pairs = _pairs(found, "all_effects")
+    gain = Estimate.of([a.numbers["psnr"] - b.numbers["psnr"] for a, b in pairs])
+    times = [seconds_to(a.curve, b.curve[-1].psnr - WITHIN) for a, b in pairs if a.curve and b.curve]
+    quick = Estimate.of(times) if times and None not in times else None
+    whole = Estimate.of([b.metrics["seconds"]["train"] for _, b in pairs])
+    planning = Estimate.of([plan_of(run)["seconds"] for run in _runs(found, "auto") if plan_of(run)])
+    return [*reached, gain, quick, whole and whole.mean, planning]
+
+
+def called(results: Sequence[Result]) -> Table:
+    """A row a plan: what it turned on, and what its scene was made to call for."""
+    rows = []
+    for run in _runs(results, "auto"):
+        wanted = sorted(run.config.get("calls_for") or [])
+        on = sorted(name for name, decision in plan_of(run).get("effects", {}).items() if decision["on"])
+        verdict = "as made" if on == wanted else "**otherwise**"
+        rows.append(
+            [run.scene, run.seed, ", ".join(wanted) or "nothing", ", ".join(on) or "nothing", verdict]
+        )
+    rows.sort(key=lambda row: (row[0], row[1]))
+    right = sum(row[-1] == "as made" for row in rows)
+    columns = [Column("scene"), Column("seed", 0), Column("made to call for"), Column("planned"), Column("")]
+    return Table(columns, rows, f"{right} of {len(rows)} plans turn on what is called for and nothing else:")
+
+
+def reasons(results: Sequence[Result]) -> list[str]:
+    """For every scene the decisions of its first plan."""
+    parts = []
+    for scene, found in by_scene(_runs(results, "auto")).items():
+        plan = plan_of(min(found, key=lambda run: run.seed))
+        lines = [f"* {e}: **{d['choice']}**. {d['because']}" for e, d in plan.get("effects", {}).items()]
+        parts.append(f"### {scene}\n\n" + "\n".join(lines) + "\n")
+    return parts
+
+
+def every_run(results: Sequence[Result]) -> Table:
+    """A row a run, nothing summed up."""
+    columns = [Column(name) for name in ("scene", "choice", "seed")]
+    columns += [
+        Column("minutes", 1),
+        Column("PSNR", 3),
+        Column("steps", 0),
+        Column("planning, s", 1),
+        Column("command"),
+    ]
+    rows = [
+        [
+            run.scene,
+            run.variant,
+            str(run.seed),
+            run.minutes,
+            run.numbers["psnr"],
+            run.numbers["steps"],
+            plan_of(run).get("seconds"),
+            run.command,
+        ]
+        for run in sorted(results, key=lambda run: (run.scene, run.variant, run.seed))
+    ]
+    return Table(columns, rows)
+
+
+def _runs(results: Sequence[Result], choice: str) -> list[Result]:
+    """Those of a choice; of a scene and a seed the one measured last."""
+    found = [result for result in results if result.variant == choice]
+    found.sort(key=lambda run: (run.folder / "metrics.json").stat().st_mtime_ns)
+    return list({(run.scene, run.seed): run for run in found}.values())
+
+
+def _pairs(results: Sequence[Result], choice: str) -> list[tuple[Result, Result]]:
+    """Planned runs and those of another choice, of the same scene and seed."""
+    others = {(run.scene, run.seed): run for run in _runs(results, choice)}
+    own = [(run, others.get((run.scene, run.seed))) for run in _runs(results, "auto")]
+    return [(run, other) for run, other in own if other is not None]
+
+
+def _title(results: Sequence[Result], choice: str) -> str:
+    minutes = sorted({run.minutes for run in _runs(results, choice) if run.minutes})
+    return CHOICES[choice] + (f", {' or '.join(f'{m:g}' for m in minutes)} min" if minutes else "")
+
+
+def _mean(cells: Sequence) -> float | None:
+    values = [cell.mean if isinstance(cell, Estimate) else cell for cell in cells]
+    return None if None in values or not values else sum(values) / len(values)

@@ -1,0 +1,119 @@
+"""Six small subjects, each of which calls for exactly one thing more than the one before it has.
+
+A plan made from their pictures should turn on what ``conf/scene/specimen_<name>.yaml`` says it calls for, and
+nothing else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from forewarp.synth.cameras import ELEVATION
+from forewarp.synth.motions import GROUND, Controls, placed
+from forewarp.synth.shapes import Part, box, rounded_slab, sphere
+from forewarp.synth.textures import Material
+
+INK, CHALK = (0.20, 0.21, 0.26), (0.93, 0.92, 0.88)
+STONES = ((0.72, 0.52, 0.34), (0.26, 0.42, 0.62), (0.86, 0.70, 0.50), (0.46, 0.62, 0.42), INK)
+TILES = ((0.62, 0.44, 0.60), (0.88, 0.78, 0.72), (0.42, 0.32, 0.50), (0.84, 0.80, 0.62), CHALK)
+LACQUER = ((0.58, 0.16, 0.18), (0.20, 0.30, 0.52), (0.30, 0.46, 0.26), (0.62, 0.48, 0.14), INK)
+
+
+@dataclass(frozen=True)
+class Specimen:
+    """A subject.
+
+    Args:
+        parts: its meshes; None: those of the vehicle.
+        joints: time in [0, 1] -> each joint's map (4, 4).
+        extra: parts beside the vehicle's.
+        azimuth, rise: where cameras stand, as ``random_cameras`` takes it.
+    """
+
+    joints: Callable[[float], dict[str, np.ndarray]]
+    parts: Callable[[], list[Part]] | None = None
+    extra: Callable[[], list[Part]] = list
+    azimuth: tuple[float, float] = (0.0, 360.0)
+    rise: tuple[float, float] = ELEVATION
+
+
+def _still(time: float) -> dict[str, np.ndarray]:
+    return placed(Controls(), (-0.22, 0.08, 18.0))
+
+
+def _rigid(time: float) -> dict[str, np.ndarray]:
+    """It drives along an arc; the arm stays as it is."""
+    go = 0.5 - 0.5 * np.cos(np.pi * time)
+    return placed(Controls(travel=0.42 * go, turn=32 * go), (-0.32, -0.02, 4.0))
+
+
+def _quick(time: float) -> dict[str, np.ndarray]:
+    """It goes forth and back three times; a few cosines do not hold that."""
+    return placed(Controls(travel=0.3 * (0.5 - 0.5 * np.cos(6 * np.pi * time))), (-0.32, -0.02, 4.0))
+
+
+def _map(scale: tuple[float, float, float], shift: tuple[float, float, float]) -> np.ndarray:
+    place = np.diag([*scale, 1.0])
+    place[:3, 3] = shift
+    return place
+
+
+def _band(time: float) -> dict[str, np.ndarray]:
+    """A sheet on a pillar that rests at first and is then drawn out to both sides, three times as wide."""
+    wide = 1 + 2 * (0.5 - 0.5 * np.cos(np.pi * max(0.0, (time - 0.2) / 0.8)))
+    return {"pillar": np.eye(4), "sheet": _map((wide, wide, 1), (0, 0, 0))}
+
+
+def _sheet() -> list[Part]:
+    pillar = Material("bricks", ((0.25, 0.26, 0.29), (0.62, 0.65, 0.70)), 0.08)
+    rubber = Material("checker", ((0.86, 0.45, 0.20), (0.26, 0.42, 0.62), INK), 0.11)
+    return [
+        Part("pillar", "pillar", *box((-0.14, -0.14, -0.5), (0.14, 0.14, -0.04)), pillar),
+        Part("sheet", "sheet", *box((-0.26, -0.22, -0.045), (0.26, 0.22, 0.045)), rubber),
+    ]
+
+
+def _globe() -> list[Part]:
+    lacquer = replace(Material("mosaic", LACQUER, 0.16), gloss=0.75, shine=5.0)
+    vertices, faces = sphere(0.52, rings=40, segments=64)
+    plate = rounded_slab(0.7, 0.2, -0.07, 0.0)
+    return [
+        Part("globe", "globe", vertices, faces, lacquer, smooth=True),
+        Part("plate", "ground", *plate, replace(lacquer, colors=TILES, gloss=0.6)),
+    ]
+
+
+def _globe_joints(time: float) -> dict[str, np.ndarray]:
+    return {"ground": _map((1, 1, 1), (0, 0, GROUND)), "globe": _map((1, 1, 1), (0, 0, GROUND + 0.5))}
+
+
+def _corner() -> list[Part]:
+    """A floor and two walls behind the subject, which fill every picture."""
+    low, high, thick = 1.1, 5.0, 0.1
+    floor = GROUND - 0.0702
+    walls = [
+        ("floor", (-low - thick, -low - thick, floor - thick), (high, high, floor), STONES),
+        ("wall_x", (-low - thick, -low - thick, floor), (-low, high, high), TILES),
+        ("wall_y", (-low, -low - thick, floor), (high, -low, high), LACQUER),
+    ]
+    return [
+        Part(name, "room", *box(start, end), Material("mosaic", colors, 0.22), casts=False)
+        for name, start, end, colors in walls
+    ]
+
+
+def _in_room(time: float) -> dict[str, np.ndarray]:
+    return _rigid(time) | {"room": np.eye(4)}
+
+
+SPECIMENS = {
+    "still": Specimen(_still),
+    "rigid": Specimen(_rigid),
+    "band": Specimen(_band, _sheet),
+    "glossy": Specimen(_globe_joints, _globe),
+    "room": Specimen(_in_room, extra=_corner, azimuth=(28.0, 62.0), rise=(0.28, 0.5)),
+    "quick": Specimen(_quick),
+}

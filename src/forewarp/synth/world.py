@@ -1,0 +1,47 @@
+"""What is seen: a subject, perhaps in a room, as one mesh that moves."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+
+from forewarp.synth.motions import joints
+from forewarp.synth.room import room
+from forewarp.synth.shapes import joined
+from forewarp.synth.specimens import SPECIMENS
+from forewarp.synth.vehicle import vehicle
+
+
+class World:
+    """Everything in the scene as one mesh of fixed topology, moved by ``motion``.
+
+    ``faces`` (F, 3) index the vertices of ``place``; ``part_of_face`` (F,) indexes ``parts``; ``rest``
+    (V, 3) are coordinates in each part's rest frame, by which it is coloured.
+
+    Args:
+        motion: a name in ``motions.MOTIONS``, of the vehicle, or in ``specimens.SPECIMENS``.
+        has_room: put a room around it, which never moves.
+    """
+
+    def __init__(self, motion: str = "lift_tilt", has_room: bool = False):
+        self.motion, self.has_room = motion, has_room
+        specimen = SPECIMENS.get(motion)
+        self.joints = partial(joints, motion) if specimen is None else specimen.joints
+        self.parts = vehicle() if specimen is None or specimen.parts is None else specimen.parts()
+        self.parts += [] if specimen is None else specimen.extra()
+        self.parts += room() if has_room else []
+        self.rest, self.faces = joined([(p.vertices, p.faces) for p in self.parts])
+        self.part_of_face = np.repeat(np.arange(len(self.parts)), [len(p.faces) for p in self.parts])
+        self.smooth = np.array([p.smooth for p in self.parts])[self.part_of_face]
+        self.casts = np.array([p.casts for p in self.parts])[self.part_of_face]
+
+    def place(self, time: float) -> np.ndarray:
+        """World positions (V, 3) float64 of every vertex at any ``time`` in [0, 1]."""
+        at = self.joints(time)
+        return np.concatenate([p.vertices @ at[p.joint][:3, :3].T + at[p.joint][:3, 3] for p in self.parts])
+
+    def points(self, faces: np.ndarray, barycentric: np.ndarray, time: float) -> np.ndarray:
+        """World positions (N, 3) at ``time`` of surface points given as (faces (N,), barycentric (N, 3))."""
+        corners = self.place(time)[self.faces[faces]]  # (N, 3, 3)
+        return np.einsum("nc,ncd->nd", barycentric, corners)

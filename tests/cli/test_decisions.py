@@ -1,0 +1,120 @@
+"""What evidence and trials come to, and the number that each decision names."""
+
+from dataclasses import replace
+
+import pytest
+
+from forewarp.cli import decisions
+from forewarp.cli.decisions import Evidence
+from forewarp.report.effect import Gain
+from forewarp.training.evidence import Movement, Pictures
+from forewarp.training.residual import Residual
+
+MOVING = Evidence(
+    Pictures(frames=50, times=50, cut_out=0.8, spread=160.0, disagreement=0.2),
+    Movement(moving=0.4, distance=0.3, torn=0.2, at=0.9, left_out=(4.0, 2.0, 0.4, 0.1, 0.0)),
+    Residual(psnr=28.0, by_direction=0.02, allowed=38.0),
+)
+YES, NO, UNSURE = Gain(1.0, 0.2, 2.0, 100), Gain(-0.1, 0.2, 20.0, 100), Gain(0.15, 0.2, 1.2, 100)
+
+
+def evidence(**changes):
+    return replace(MOVING, gains={}, **changes)
+
+
+def with_gains(**gains):
+    return replace(MOVING, gains=gains)
+
+
+def test_one_time_needs_no_trial_to_stand_still():
+    pictures = replace(MOVING.pictures, times=1)
+    found = decisions.of_motion(evidence(pictures=pictures, movement=None), "dct")
+    assert (found.choice, found.on, found.words) == ("none", False, ("model/motion=none",))
+    assert found.because == "1 time: nothing can be seen to move"
+
+
+@pytest.mark.parametrize(("gain", "choice"), [(YES, "dct"), (NO, "none"), (UNSURE, "none")])
+def test_a_trial_decides_and_is_named(gain, choice):
+    found = decisions.of_motion(with_gains(motion=gain), "dct")
+    assert found.choice == choice
+    assert found.because.endswith(f"; {gain}")
+    assert "20.0% of the foreground" in found.because
+    assert "40% of the solid voxels move, by 0.3" in found.because
+
+
+def test_without_trials_the_evidence_decides():
+    still = replace(MOVING.movement, moving=0.0)
+    agree = replace(MOVING.pictures, disagreement=0.0)
+    assert decisions.of_motion(evidence(), "dct").on
+    assert not decisions.of_motion(evidence(movement=still, pictures=agree), "dct").on
+    assert not decisions.of_view(evidence(), "sh").on
+    assert decisions.of_view(evidence(residual=replace(MOVING.residual, by_direction=0.2)), "sh").on
+    assert not decisions.of_inpainter(evidence(), "unet3d").on
+    assert decisions.of_inpainter(evidence(movement=replace(MOVING.movement, torn=0.5)), "unet3d").on
+    assert not decisions.of_upsampler(evidence(), "learned").on
+    limited = replace(MOVING.residual, allowed=28.5)
+    assert decisions.of_upsampler(evidence(residual=limited), "learned").choice == "learned"
+
+
+def test_only_what_is_open_is_tried():
+    assert decisions.open_questions(evidence()) == ["view", "inpainter"]
+    assert decisions.open_questions(evidence(movement=None)) == ["view"]
+    sure = Residual(psnr=28.0, by_direction=-0.01, allowed=30.0)
+    assert decisions.open_questions(evidence(movement=None, residual=sure)) == ["upsampler"]
+
+
+def test_cameras_that_stand_together_see_no_direction():
+    narrow = evidence(pictures=replace(MOVING.pictures, spread=6.0))
+    assert decisions.open_questions(narrow) == ["inpainter"]
+    found = decisions.of_view(replace(narrow, gains={"view": YES}), "sh")
+    assert (found.choice, found.because) == (
+        "none",
+        "all cameras lie within 6 degrees: direction is not seen",
+    )
+
+
+def test_bases_follow_the_spectrum_or_the_trial():
+    left = (4.0, 2.0, 1.5, 1.2, 0.0)  # the last of four has much to say
+    flat = replace(MOVING.movement, left_out=left)
+    assert decisions.of_bases(evidence(movement=flat), 4, 8).choice == "8"
+    assert decisions.of_bases(evidence(), 4, 8).choice == "4"
+    tried = decisions.of_bases(with_gains(bases=NO), 4, 8)
+    assert (tried.choice, tried.on) == ("4", False)
+    assert tried.because == f"2 of 4 cosines leave out no more than 0.5 voxels; 8 of them against 4: {NO}"
+    assert decisions.of_bases(with_gains(bases=YES), 4, 8).choice == "8"
+
+
+def test_a_background_needs_something_that_moves_before_it():
+    bare = replace(MOVING.pictures, cut_out=0.0)
+    start = ["stage.coarse.confine=0.0"]
+    assert decisions.of_background(evidence(), True, "grid", []).because.startswith("80% of the pixels")
+    assert not decisions.of_background(evidence(), True, "grid", []).on
+    found = decisions.of_background(evidence(pictures=bare), True, "grid", start)
+    assert (found.choice, found.words) == ("grid", ("model/background=grid", *start))
+    still = decisions.of_background(evidence(pictures=bare), False, "grid", start)
+    assert (still.on, still.words) == (False, ("model/background=none", *start))
+    against = replace(with_gains(background=NO), pictures=bare)
+    assert decisions.of_background(against, True, "grid", start).words == ("model/background=none", *start)
+
+
+def test_a_time_makes_dear_effects_dearer_the_shorter_it_is():
+    gain = Gain(0.6, 0.1, 20.0, 100)
+    known = {"slope": 0.4, "steps": 100, "step": 0.01}
+    free, long, short = (
+        replace(with_gains(inpainter=gain), minutes=minutes, **known) for minutes in (None, 100.0, 0.5)
+    )
+    assert free.price(gain) == 0
+    assert 0 < long.price(gain) < short.price(gain)
+    assert [e.pays("inpainter") for e in (free, long, short)] == [True, True, False]
+    assert (
+        f"whose steps are worth {short.price(gain):.2f} dB" in decisions.of_inpainter(short, "unet3d").because
+    )
+
+
+def test_the_price_is_what_fewer_steps_cost_on_the_curve_that_was_seen():
+    """PSNR = end - c / sqrt(steps), c from the slope between 50 and 100 steps of 0.1 s."""
+    c = 0.5 / (50**-0.5 - 100**-0.5)
+    found = replace(with_gains(), minutes=1.0, slope=0.5, steps=100, step=0.1)
+    assert found.price(Gain(0, 0, 4.0, 20)) == pytest.approx(c * (150**-0.5 - 600**-0.5))
+    assert found.price(Gain(0, 0, 0.5, 100)) == 0
+    assert found.price(Gain(0, 0, 4.0, None)) == 0  # the trial itself was of equal time

@@ -1,0 +1,174 @@
+"""From a scene to its plan, and from the plan to a run."""
+
+import json
+import shutil
+
+import pytest
+import yaml
+
+from forewarp.cli.plan_file import read_plan, with_plan, write_plan
+from forewarp.data.module import SceneDataModule
+from forewarp.synth.scenes import synthesize
+
+TINY = ["data=dnerf", "budget=demo", "trainer=cpu", "data.rays=64", "logger=none", "callbacks=default"]
+TINY += ["callbacks.pictures=null", "callbacks.accuracy=null", "threads=1"]
+LATTICES = ["stage.coarse.voxels=[[0,4000]]", "stage.fine.voxels=[[0,8000]]"]
+SHORT = ["plan.steps=24", "plan.trial_steps=6", "plan.seeds=2", "plan.held_out=3"]
+EFFECTS = ["motion", "bases", "background", "view", "inpainter", "upsampler"]
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory):
+    """A folder with the scene ``vehicle``, 24 x 24 pixels."""
+    root = tmp_path_factory.mktemp("scenes")
+    synthesize(root / "vehicle", size=24, frames=16, test_views=(1, 1, 0), val_views=0, samples_per_pixel=1)
+    return root
+
+
+@pytest.fixture
+def words(scenes, in_tmp):
+    """What one types of the tiny scene."""
+    return [*TINY, *LATTICES, f"data.root={scenes}", "data.scene=vehicle"]
+
+
+def test_a_plan_is_made_once_told_and_fitted(forewarp, words, monkeypatch, in_tmp):
+    kept = SceneDataModule.targets
+
+    def guarded(self, split):
+        assert split != "test", "a plan looked at test views"
+        return kept(self, split)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(SceneDataModule, "targets", guarded)
+        done = forewarp("plan", *words, *SHORT)
+    assert done.status == 0, done.err
+    (file,) = in_tmp.glob("runs/vehicle/plan-*/plan.yaml")
+    assert f"forewarp-train plan={file.relative_to(in_tmp)}" in done.out
+    made = yaml.safe_load(file.read_text())
+    assert [e for e in EFFECTS if e in made["effects"]] == list(made["effects"])
+    assert {"motion", "background", "view", "inpainter", "upsampler"} <= made["effects"].keys()
+    for effect, decision in made["effects"].items():
+        assert effect in done.out
+        assert decision["because"]
+        assert any(character.isdigit() for character in decision["because"])
+    assert made["evidence"]["pictures"]["times"] == 16
+    assert {"motion", "bases"} <= made["evidence"]["trials"].keys()
+
+    again = forewarp("plan", *words, *SHORT)
+    assert "coarse" not in again.out.partition("planned in")[0]  # what is there is read
+
+    short = ["budget.iterations=20", "budget.minutes=null"]
+    fitted = forewarp("train", f"plan={file}", *short, "run=fit", "model/view=mlp", "evaluate=false")
+    assert fitted.status == 0, fitted.err
+    config = yaml.safe_load((in_tmp / "fit" / "config.yaml").read_text())
+    assert config["data"]["scene"] == "vehicle"
+    assert config["model"]["view"]["_target_"].endswith("ViewNetwork")  # what is typed wins
+    assert (config["model"]["motion"] is not None) == made["effects"]["motion"]["on"]
+    assert (in_tmp / "fit" / "plan.yaml").read_text() == file.read_text()
+
+
+def test_every_question_is_asked_where_all_is_open(forewarp, words, in_tmp, monkeypatch):
+    """No alpha, and evidence that rules nothing out: each effect is tried, with its price."""
+    monkeypatch.setattr("forewarp.cli.planner.CUT_OUT", 2.0)
+    monkeypatch.setattr("forewarp.cli.decisions.CUT_OUT", 2.0)
+    monkeypatch.setattr("forewarp.cli.decisions.BY_DIRECTION", (-9.0, 9.0))
+    monkeypatch.setattr("forewarp.cli.decisions.TORN", (-1.0, 9.0))
+    monkeypatch.setattr("forewarp.cli.decisions.HEADROOM", (99.0, -99.0))
+    small = ["plan.steps=8", "plan.trial_steps=3", "plan.seeds=1", "plan.held_out=3", "plan.minutes=0.1"]
+    monkeypatch.setattr(
+        "forewarp.cli.decisions.Evidence.pays", lambda self, effect: effect in self.gains or None
+    )
+    done = forewarp("plan", *words, *small, "stage.coarse.start_alpha=2e-2")
+    assert done.status == 0, done.err
+    (file,) = in_tmp.glob("runs/vehicle/plan-*/plan.yaml")
+    made = yaml.safe_load(file.read_text())
+    assert made["evidence"]["trials"].keys() == set(EFFECTS)
+    assert all(decision["on"] for decision in made["effects"].values())
+    assert "stage.coarse.effects=[motion,background]" in made["words"]
+    assert "stage.fine.voxels=[[0,8000]]" in made["words"]
+    fitted = forewarp("train", f"plan={file}", "budget.iterations=4", "run=fit", "evaluate=false")
+    assert fitted.status == 0, fitted.err
+    config = yaml.safe_load((in_tmp / "fit" / "config.yaml").read_text())
+    assert config["stage"]["coarse"]["start_alpha"] == 2e-2  # typed before it was planned
+    assert None not in [config["model"][e] for e in EFFECTS if e != "bases"]
+
+
+def test_a_scene_of_one_time_is_planned_and_fitted_without_motion(forewarp, words, scenes, in_tmp):
+    shutil.copytree(scenes / "vehicle", in_tmp / "scenes" / "vehicle")
+    for path in (in_tmp / "scenes" / "vehicle").glob("transforms_*.json"):
+        content = json.loads(path.read_text())
+        content["frames"] = [frame | {"time": 0.0} for frame in content["frames"]]
+        path.write_text(json.dumps(content))
+    (in_tmp / "scenes" / "vehicle" / "trajectories.npz").unlink()
+    typed = [
+        *words,
+        "data.root=scenes",
+        *SHORT,
+        "budget.iterations=8",
+        "budget.minutes=null",
+        "evaluate=false",
+    ]
+    done = forewarp("train", *typed, "effects=auto", "run=still")
+    assert done.status == 0, done.err
+    made = yaml.safe_load((in_tmp / "still" / "plan.yaml").read_text())
+    assert made["effects"]["motion"]["because"].startswith("1 time")
+    config = yaml.safe_load((in_tmp / "still" / "config.yaml").read_text())
+    assert config["model"]["motion"] is None
+
+
+def test_auto_plans_and_fits_in_one_go(forewarp, words, in_tmp):
+    short = ["budget.iterations=20", "budget.minutes=null", "evaluate=false", "run=both"]
+    typed = [*words, *SHORT, *short, "plan.trials=false", "model/inpainter=none"]
+    done = forewarp("train", *typed, "effects=auto")
+    assert done.status == 0, done.err
+    made = yaml.safe_load((in_tmp / "both" / "plan.yaml").read_text())
+    assert made["effects"]["inpainter"]["because"].startswith("as typed; ")
+    assert "trials" not in str(made["words"])
+    assert made["evidence"]["trials"] == {}
+    assert (in_tmp / "both" / "fine" / "done.json").is_file()
+    assert {path.name for path in in_tmp.glob("runs/vehicle/plan-*/*")} == {"coarse", "plan.yaml"}
+    again = forewarp("train", *typed, "effects=auto")
+    assert "fine: finished before" in again.out
+
+
+def test_mistakes_are_one_line(refused, words, in_tmp):
+    assert "use model=forward" in refused("plan", *words, "model=backward")
+    assert refused("plan", *words, "~stage.fine").startswith("stage: expected a coarse stage and another")
+    assert refused("plan", *words, "plan.seeds=0") == "plan.seeds: expected a whole number >= 1, but got 0"
+    assert refused("train", *words, "effects=some") == "effects: expected given or auto, but got some"
+    missing = refused("train", "plan=nowhere.yaml")
+    assert missing.startswith("plan: expected a file that forewarp-plan wrote, but got nowhere.yaml")
+    (in_tmp / "bad.yaml").write_text(
+        "typed: []\nwords: ['hydra.run.dir=/']\neffects: {}\nseconds: 1\nof: x\n"
+    )
+    assert refused("train", "plan=bad.yaml").startswith("plan: expected words that a plan has")
+    assert not (in_tmp / "runs").exists()
+
+
+@pytest.mark.parametrize("text", ["", "[]", "words: [a=b]", "{", "typed: 3\nwords: 4", "\0"])
+def test_what_is_no_plan_is_refused(tmp_path, text):
+    (tmp_path / "plan.yaml").write_text(text)
+    with pytest.raises(ValueError, match="expected a file that forewarp-plan wrote"):
+        read_plan(tmp_path / "plan.yaml")
+
+
+@pytest.mark.parametrize(
+    "word", ["hydra/launcher=ray", "trainer._target_=os.system", "~stage.fine", "x", "--config-dir=/", "-x=1"]
+)
+def test_a_plan_sets_no_code(tmp_path, word):
+    write_plan(tmp_path / "plan.yaml", {"typed": ["data.scene=x"], "words": [word], "of": "0"})
+    with pytest.raises(ValueError, match="expected words that a plan has"):
+        read_plan(tmp_path / "plan.yaml")
+
+
+def test_what_is_typed_beside_a_plan_wins(tmp_path):
+    file = tmp_path / "plan.yaml"
+    words = ["model/view=sh", "model/inpainter=none", "model/motion=none", "stage.coarse.bases=[]"]
+    typed = ["data.scene=x", "seed=3", "model.trajectory.features=2", "stage.coarse.bases=[[0,4]]"]
+    write_plan(file, {"typed": typed, "words": words, "of": "0"})
+    found = with_plan("train", [f"plan={file}", "model/inpainter=unet3d", "seed=4"])
+    assert found == [
+        *("model/view=sh", "model/motion=none", "data.scene=x", "stage.coarse.bases=[[0,4]]"),
+        *(f"planned='{file}'", "effects=given", "model/inpainter=unet3d", "seed=4"),
+    ]
+    assert with_plan("plan", ["plan.seeds=1"]) == ["plan.seeds=1"]

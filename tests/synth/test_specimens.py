@@ -1,0 +1,83 @@
+"""Each specimen is what it is said to call for: measured on its meshes and its pictures."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip("trimesh")
+pytest.importorskip("embreex")
+
+from forewarp.synth.cameras import random_cameras, stream
+from forewarp.synth.raycast import Posed, camera_rays, light_points, render
+from forewarp.synth.specimens import SPECIMENS
+from forewarp.synth.world import World
+from configs import composed
+
+TIMES = np.linspace(0, 1, 41)
+
+
+def paths(name):
+    """Places (T, V, 3) of every vertex."""
+    world = World(name)
+    return np.stack([world.place(time) for time in TIMES])
+
+
+def calls_for(name):
+    """What a plan should find."""
+    return composed(f"scene=specimen_{name}").calls_for
+
+
+@pytest.mark.parametrize("name", SPECIMENS)
+def test_it_moves_exactly_where_motion_is_called_for(name):
+    moved = np.abs(paths(name) - paths(name)[0]).max()
+    assert (moved > 0.1) if "motion" in calls_for(name) else (moved == 0)
+
+
+@pytest.mark.parametrize("name", ["rigid", "quick", "room"])
+def test_parts_keep_their_shape(name):
+    world = World(name)
+    for part in np.unique(world.part_of_face):
+        faces = world.faces[world.part_of_face == part]
+        edges = np.concatenate([faces[:, :2], faces[:, 1:]])
+        lengths = [np.linalg.norm(at[edges[:, 0]] - at[edges[:, 1]], axis=-1) for at in paths(name)[::8]]
+        np.testing.assert_allclose(np.ptp(lengths, axis=0), 0, atol=1e-9)
+
+
+def test_the_band_is_drawn_out_beyond_what_a_splat_holds_together():
+    joints = SPECIMENS["band"].joints
+    assert max(np.linalg.norm(joints(time)["sheet"][:3, 0]) for time in TIMES) == pytest.approx(3.0)
+
+
+def test_the_quick_one_needs_more_cosines_than_the_slow_one():
+    steps = np.pi * (np.arange(len(TIMES)) + 0.5) / len(TIMES)
+    basis = np.cos(steps[:, None] * np.arange(7))
+    left = {}
+    for name in ("rigid", "quick"):
+        of_chassis = np.stack([SPECIMENS[name].joints(time)["chassis"] for time in TIMES]).reshape(
+            len(TIMES), -1
+        )
+        fitted = basis @ np.linalg.lstsq(basis, of_chassis, rcond=None)[0]
+        left[name] = np.abs(fitted - of_chassis).max()
+    assert left["rigid"] < 5e-3 < 0.015 < left["quick"]
+
+
+def test_only_the_glossy_one_has_gloss():
+    gloss = {name: max(part.material.gloss for part in World(name).parts) for name in SPECIMENS}
+    assert [name for name in gloss if gloss[name] > 0] == ["glossy"]
+
+
+def test_light_is_thrown_back_in_one_direction():
+    posed = Posed(World("glossy"), 0.0)
+    origins, directions = camera_rays(random_cameras(1, 60, stream(0, 2))[0])
+    hits = posed.first_hits(np.asarray(origins), directions)
+    matte, seen = posed.color(hits, light_points(6)), posed.color(hits, light_points(6), directions)
+    assert (seen >= matte - 1e-12).all()
+    assert (seen - matte).max() > 0.2
+    assert np.median(seen - matte) < 0.1
+
+
+def test_the_room_fills_every_picture():
+    specimen = SPECIMENS["room"]
+    for camera in random_cameras(6, 24, stream(0, 3), specimen.azimuth, specimen.rise):
+        rgba, depth = render(World("room"), 0.5, camera, 1, 1)
+        assert (rgba[..., 3] == 255).all()
+        assert (depth > 0).all()
