@@ -44,7 +44,7 @@ def test_parts_keep_their_shape(name):
 
 def test_the_band_is_drawn_out_beyond_what_a_splat_holds_together():
     joints = SPECIMENS["band"].joints
-    assert max(np.linalg.norm(joints(time)["sheet"][:3, 0]) for time in TIMES) == pytest.approx(3.0)
+    assert max(np.linalg.norm(joints(time)["sheet"][:3, 0]) for time in TIMES) == pytest.approx(5.0)
 
 
 def test_the_quick_one_needs_more_cosines_than_the_slow_one():

@@ -1,4 +1,4 @@
-"""Six small subjects, each of which calls for exactly one thing more than the one before it has.
+"""Six small subjects, each of which calls for one thing beside motion, or for nothing.
 
 A plan made from their pictures should turn on what ``conf/scene/specimen_<name>.yaml`` says it calls for, and
 nothing else.
@@ -62,17 +62,17 @@ def _map(scale: tuple[float, float, float], shift: tuple[float, float, float]) -
 
 
 def _band(time: float) -> dict[str, np.ndarray]:
-    """A sheet on a pillar that rests at first and is then drawn out to both sides, three times as wide."""
-    wide = 1 + 2 * (0.5 - 0.5 * np.cos(np.pi * max(0.0, (time - 0.2) / 0.8)))
+    """A sheet on a pillar that rests at first and is then drawn out to both sides, five times as wide."""
+    wide = 1 + 4 * (0.5 - 0.5 * np.cos(np.pi * max(0.0, (time - 0.2) / 0.8)))
     return {"pillar": np.eye(4), "sheet": _map((wide, wide, 1), (0, 0, 0))}
 
 
 def _sheet() -> list[Part]:
     pillar = Material("bricks", ((0.25, 0.26, 0.29), (0.62, 0.65, 0.70)), 0.08)
-    rubber = Material("checker", ((0.86, 0.45, 0.20), (0.26, 0.42, 0.62), INK), 0.11)
+    rubber = Material("checker", ((0.86, 0.45, 0.20), (0.26, 0.42, 0.62), INK), 0.13)
     return [
-        Part("pillar", "pillar", *box((-0.14, -0.14, -0.5), (0.14, 0.14, -0.04)), pillar),
-        Part("sheet", "sheet", *box((-0.26, -0.22, -0.045), (0.26, 0.22, 0.045)), rubber),
+        Part("pillar", "pillar", *box((-0.1, -0.1, -0.5), (0.1, 0.1, -0.04)), pillar),
+        Part("sheet", "sheet", *box((-0.13, -0.12, -0.05), (0.13, 0.12, 0.05)), rubber),
     ]
 
 
