@@ -9,6 +9,7 @@ forewarp-plan looks at a scene and says which effects it calls for, each with th
 reads the pictures, fits short coarse stages, looks at what these leave, and tries from there what is still
 open, scored on training views that it sets aside; test views are never looked at.
 
+  forewarp-plan scene=specimen_glossy                           a made scene that calls for one thing
   forewarp-plan experiment=dnerf data.root=../data/dnerf data.scene=hook
   forewarp-train plan=runs/hook/plan-0123456789/plan.yaml       the run that it says
   forewarp-train experiment=dnerf data.root=../data/dnerf data.scene=hook effects=auto     both in one go
