@@ -55,9 +55,13 @@ def test_a_plan_is_made_once_told_and_fitted(forewarp, words, monkeypatch, in_tm
     assert {"motion", "bases"} <= made["evidence"]["trials"].keys()
 
     again = forewarp("plan", *words, *SHORT)
-    assert "coarse" not in again.out.partition("planned in")[0]  # what is there is read
+    assert "coarse" not in again.out.partition("planned before, in")[0]  # what is there is read
+    assert "± is two standard errors" in again.out
 
     short = ["budget.iterations=20", "budget.minutes=null"]
+    for word in ("model/inpainter=none", "model/view=none"):  # each in a folder of its own
+        assert forewarp("train", f"plan={file}", *short, word, "evaluate=false").status == 0
+    assert len(list(in_tmp.glob("runs/vehicle/planned-*/fine/done.json"))) >= 1
     fitted = forewarp("train", f"plan={file}", *short, "run=fit", "model/view=mlp", "evaluate=false")
     assert fitted.status == 0, fitted.err
     config = yaml.safe_load((in_tmp / "fit" / "config.yaml").read_text())
@@ -169,6 +173,11 @@ def test_what_is_typed_beside_a_plan_wins(tmp_path):
     found = with_plan("train", [f"plan={file}", "model/inpainter=unet3d", "seed=4"])
     assert found == [
         *("model/view=sh", "model/motion=none", "data.scene=x", "stage.coarse.bases=[[0,4]]"),
-        *(f"planned='{file}'", "effects=given", "model/inpainter=unet3d", "seed=4"),
+        *(f"planned='{file}'", "effects=given", "run='${paths.runs}/${data.scene}/planned-{hash}'"),
+        *("model/inpainter=unet3d", "seed=4"),
     ]
+    assert f"run={tmp_path}" in with_plan("train", [f"plan={file}", f"run={tmp_path}"])
+    for word in ("model=backward", "resume=runs/x"):
+        with pytest.raises(ValueError, match=f"{word}: expected no such word beside plan="):
+            with_plan("train", [f"plan={file}", word])
     assert with_plan("plan", ["plan.seeds=1"]) == ["plan.seeds=1"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import yaml
@@ -19,7 +20,7 @@ MOST_BYTES = 1 << 20
 def write_plan(file: Path, made: dict) -> None:
     """Write a plan with the command that made it, whole or not at all."""
     file.parent.mkdir(parents=True, exist_ok=True)
-    about = f"# {as_typed('plan', made['typed'])}\n"
+    about = f"# {as_typed('plan', made.get('asked', made['typed']))}\n"
     about += "# Fit it: forewarp-train plan=<this file>; any word typed beside that wins.\n"
     beside = file.with_name(file.name + ".part")
     beside.write_text(about + yaml.safe_dump(made, sort_keys=False, width=110, allow_unicode=True))
@@ -62,9 +63,18 @@ def with_plan(name: str, words: list[str]) -> list[str]:
         return words
     made = read_plan(Path(files[-1]).expanduser())
     typed = [word for word in words if not word.startswith("plan=")]
+    for word in typed:
+        if word.startswith("resume=") or (word.startswith("model=") and word != "model=forward"):
+            raise ValueError(f"{word}: expected no such word beside plan={files[-1]}; leave one of them out")
     file = files[-1].replace("\\", "\\\\").replace("'", "\\'")
     kept = [*planned_words(made), f"planned='{file}'", "effects=given"]
-    return of_what_is_on(merged(kept, typed))
+    return of_what_is_on(merged([*kept, *own_folder(typed)], typed))
+
+
+def own_folder(typed: Sequence[str]) -> list[str]:
+    """The word that gives a planned run a folder of its own, where neither a word nor a sweep names one."""
+    named = any(key_of(word) in ("run", "sweeps") for word in typed)
+    return [] if named else ["run='${paths.runs}/${data.scene}/planned-{hash}'"]
 
 
 def planned_words(made: dict) -> list[str]:
@@ -72,13 +82,16 @@ def planned_words(made: dict) -> list[str]:
     return merged(made["words"], made["typed"])
 
 
-def tell(made: dict) -> None:
-    """A plan on one screen."""
-    table = Table(box=box.SIMPLE, title=f"planned in {time_text(made['seconds'])}", title_justify="left")
+def tell(made: dict, *, to_fit: bool = True) -> None:
+    """A plan on one screen; ``to_fit`` says how it is fitted."""
+    title = f"planned {'before, ' if made.get('found') else ''}in {time_text(made['seconds'])}"
+    caption = "± is two standard errors" if made["evidence"]["trials"] else "without trials: less sure"
+    table = Table(box=box.SIMPLE, title=title, caption=caption, title_justify="left", caption_justify="left")
     for name in ("effect", "choice", "because"):
         table.add_column(name, overflow="fold")
     for effect, decision in made["effects"].items():
         table.add_row(effect, decision["choice"], decision["because"])
     console = Console()
     console.print(table)
-    console.print(f"fit it: forewarp-train plan={made['file']}", soft_wrap=True, highlight=False)
+    if to_fit:
+        console.print(f"fit it: forewarp-train plan={made['file']}", soft_wrap=True, highlight=False)

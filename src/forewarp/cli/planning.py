@@ -33,6 +33,7 @@ def make_plan(config: DictConfig, words: Sequence[str]) -> dict:
         what ``plan.yaml`` holds: ``typed`` and ``words``, which together make the run, ``effects`` (choice,
         on, because), ``evidence``, ``seconds``, ``of`` (a hash of all that was asked); and ``file``.
     """
+    asked_as = list(words)
     words = [word for word in words if key_of(word).split(".")[0] not in NOT_OF_IT]
     refuse(config, words)
     run = build_run(config)
@@ -48,7 +49,7 @@ def make_plan(config: DictConfig, words: Sequence[str]) -> dict:
                 f"plan.folder: expected the plan of this command and data, but got another in {file}; "
                 "use another plan.folder, or delete it"
             )
-        return made | {"file": str(file)}
+        return made | {"file": str(file), "found": True}
     begin = time.perf_counter()
     trials = Trials(
         words,
@@ -62,7 +63,7 @@ def make_plan(config: DictConfig, words: Sequence[str]) -> dict:
     )
     made = Planner(config, words, trials, run.datamodule.scene).plan()
     seconds = time.perf_counter() - begin + trials.seconds_before
-    made |= {"seconds": round(seconds, 1), "of": asked}
+    made |= {"seconds": round(seconds, 1), "of": asked, "asked": asked_as}
     write_plan(file, made)
     return made | {"file": str(file)}
 

@@ -85,7 +85,7 @@ def planned(config):
         raise ValueError(f"effects: expected given or auto, but got {choice}")
     if choice == "given" or config.get("resume") is not None:
         return config
-    from forewarp.cli.plan_file import tell
+    from forewarp.cli.plan_file import own_folder, tell
     from forewarp.cli.planning import make_plan
     from forewarp.cli.runs import build_run
     from forewarp.cli.trials import composed
@@ -94,8 +94,9 @@ def planned(config):
     if skips(build_run(config), config.get("absent", "refuse")):
         return config
     made = make_plan(config, typed_words())
-    tell(made)
-    config = composed(of_what_is_on(merged(made["words"], typed_words(all_of_them=True))))
+    tell(made, to_fit=False)
+    words = typed_words(all_of_them=True)
+    config = composed(of_what_is_on(merged([*made["words"], *own_folder(words)], words)))
     config.planned = made["file"]
     return config
 
