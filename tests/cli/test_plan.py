@@ -7,6 +7,7 @@ import pytest
 import yaml
 
 from forewarp.cli.plan_file import read_plan, with_plan, write_plan
+from forewarp.cli.trials import Trials
 from forewarp.data.module import SceneDataModule
 from forewarp.synth.scenes import synthesize
 
@@ -82,8 +83,11 @@ def test_every_question_is_asked_where_all_is_open(forewarp, words, in_tmp, monk
     monkeypatch.setattr(
         "forewarp.cli.decisions.Evidence.pays", lambda self, effect: effect in self.gains or None
     )
+    fitted, kept = [], Trials._fitted
+    monkeypatch.setattr(Trials, "_fitted", lambda self, c, *a: (fitted.append(c.run), kept(self, c, *a))[1])
     done = forewarp("plan", *words, *small, "stage.coarse.start_alpha=2e-2")
     assert done.status == 0, done.err
+    assert len(fitted) == len(set(fitted))  # none of them twice
     (file,) = in_tmp.glob("runs/vehicle/plan-*/plan.yaml")
     made = yaml.safe_load(file.read_text())
     assert made["evidence"]["trials"].keys() == set(EFFECTS)

@@ -6,7 +6,7 @@ import os
 import shutil
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from hydra import compose
@@ -66,7 +66,8 @@ class Trials:
         held_out: training views set aside and scored.
         tell: takes a line before each.
 
-    ``seconds_before`` is what those took that were found finished.
+    ``seconds_before`` is what those took that were found finished; ``made`` are the fine ones so far:
+    several effects are compared with the same.
     """
 
     words: list[str]
@@ -78,6 +79,7 @@ class Trials:
     held_out: int
     tell: Callable[[str], None] = print
     seconds_before: float = 0.0
+    made: dict[str, Trial] = field(default_factory=dict)
 
     def coarse(self, name: str, changes: Sequence[str]) -> tuple[Trial, Run, DynamicSceneModule]:
         """A coarse stage with these words, its run and what it fitted."""
@@ -94,12 +96,15 @@ class Trials:
         Args:
             steps: exactly so many; None: ``fine_steps``, or as many as ``fine_seconds`` allow.
         """
+        if (known := self.made.get(f"{name}-seed{seed}")) is not None:
+            return known
         seconds = self.fine_seconds if steps is None else None
         config = self._config(f"{name}-seed{seed}", changes, seed, steps or self.fine_steps, seconds)
         first, last = list(config.stage)[0], list(config.stage)[-1]
         config.stage[first].share, config.stage[last].share = 1e-6, 1.0
         config.stage[last].voxels = [[0, config.stage[last].voxels[0][1]]]
-        return self._fitted(config, self.folder / after / first)[0]
+        self.made[f"{name}-seed{seed}"] = self._fitted(config, self.folder / after / first)[0]
+        return self.made[f"{name}-seed{seed}"]
 
     def _config(
         self, name: str, changes: Sequence[str], seed: int, steps: int, seconds: float | None
@@ -133,11 +138,9 @@ class Trials:
             known = read_json(file)
             if known is None:
                 noted = read_json(run.stage_folder(stage) / "done.json")
-                psnr, step = (
-                    psnr_by_view(module, run.datamodule.watched(), RAYS),
-                    noted["seconds"] / noted["steps"],
-                )
-                known = asdict(Trial(psnr, step, noted["steps"], time.perf_counter() - begin))
+                psnr = psnr_by_view(module, run.datamodule.watched(), RAYS)
+                step, took = noted["seconds"] / noted["steps"], time.perf_counter() - begin
+                known = asdict(Trial(psnr, step, noted["steps"], took))
                 write_json(file, known)
             else:
                 self.seconds_before += known["took"]

@@ -6,7 +6,8 @@ import math
 
 import torch
 from torch import Tensor
-from torch.nn import functional
+
+from forewarp.ops.grid import dilate
 
 REGIONS = ("outside", "outline", "inside")
 
@@ -48,11 +49,7 @@ def regions(foreground: Tensor, band: int = 2) -> dict[str, Tensor]:
         by the names of ``REGIONS``, (H, W) bool each.
     """
 
-    def grown(mask: Tensor) -> Tensor:
-        side = 2 * band + 1
-        return functional.max_pool2d(mask[None, None].float(), side, stride=1, padding=band)[0, 0] > 0
-
-    outline = grown(foreground) & grown(~foreground)
+    outline = dilate(foreground, band) & dilate(~foreground, band)
     return {"outside": ~foreground & ~outline, "outline": outline, "inside": foreground & ~outline}
 
 

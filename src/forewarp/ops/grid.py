@@ -124,10 +124,10 @@ def index_of(voxels: Tensor, shape: tuple[int, int, int]) -> Tensor:
 
 
 def dilate(mask: Tensor, by: int = 1) -> Tensor:
-    """A mask (X, Y, Z) grown by ``by`` voxels in every direction, diagonals included."""
+    """A mask (X, Y, Z), or of a picture (H, W), grown by ``by`` in every direction, diagonals included."""
     grown = mask.clone()
     for _ in range(by):
-        for axis in range(3):
+        for axis in range(mask.dim()):
             before = grown.clone()
             n = mask.shape[axis]
             grown.narrow(axis, 1, n - 1).logical_or_(before.narrow(axis, 0, n - 1))

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from forewarp.report.collect import Result, by_scene, collect, grouped, machine
+from forewarp.report.collect import Result, by_scene, collect, grouped, left_out, machine
 from forewarp.report.curve import Published, draw_scene, seconds_to
 from forewarp.report.tables import Column, Estimate, Table
 
@@ -55,8 +55,7 @@ def write_accuracy_time(
         lines = [f"* {p.name}: {p.psnr:g} dB, {p.seconds:g} s, {p.hardware}; {p.source}" for p in published]
         about = "Means over a dataset's scenes, by protocols of their own: for orientation.\n"
         parts += ["## Published by others\n", about, "\n".join(lines) + "\n"]
-    if without:
-        parts += ["## Without a curve\n", "\n".join(f"* {line}" for line in without) + "\n"]
+    parts += left_out("Without a curve", without)
     page = out / "accuracy-time.md"
     page.write_text("\n".join(parts))
     return [page, *written]

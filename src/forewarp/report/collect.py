@@ -193,6 +193,11 @@ def by_scene(results: Sequence[Result]) -> dict[str, list[Result]]:
     return {scene: [result for result in results if result.scene == scene] for scene in scenes}
 
 
+def left_out(title: str, lines: Sequence[str]) -> list[str]:
+    """The part of a page that lists what ``collect`` could not use; nothing where there is none."""
+    return [f"## {title}\n", "\n".join(f"* {line}" for line in lines) + "\n"] if lines else []
+
+
 def machine(results: Sequence[Result]) -> str:
     """What the runs were computed on, in one line."""
     found = []

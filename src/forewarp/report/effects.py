@@ -7,7 +7,7 @@ from pathlib import Path
 
 import yaml
 
-from forewarp.report.collect import Result, by_scene, collect, machine
+from forewarp.report.collect import Result, by_scene, collect, left_out, machine
 from forewarp.report.curve import seconds_to
 from forewarp.report.tables import Column, Estimate, Table
 
@@ -45,8 +45,7 @@ def write_effects(runs: Path, out: Path) -> list[Path]:
             parts += [f"## {title}\n", compared(found).markdown()]
             parts += [called(found).markdown()] if own else []
     parts += ["## Why\n", *reasons(results)]
-    if without:
-        parts += ["## Without numbers\n", "\n".join(f"* {line}" for line in without) + "\n"]
+    parts += left_out("Without numbers", without)
     page, file = out / "effects.md", out / "effects.csv"
     page.write_text("\n".join(parts))
     file.write_text(every_run(results).csv())

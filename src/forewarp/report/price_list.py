@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from forewarp.report.collect import Result, by_scene, collect, grouped, machine
+from forewarp.report.collect import Result, by_scene, collect, grouped, left_out, machine
 from forewarp.report.effect import DIFFERENCES, measure_effect
 from forewarp.report.tables import Column, Estimate, Table
 
@@ -48,8 +48,7 @@ def write_price_list(runs: Path, out: Path) -> list[Path]:
             equal = [result for result in found if result.minutes == minutes]
             bound = f"{minutes:g} minutes" if minutes else "bounded by steps"
             parts += [f"## {scene}, {bound}\n", references(equal).markdown(), changes(equal).markdown()]
-    if without:
-        parts += ["## Without numbers\n", "\n".join(f"* {line}" for line in without) + "\n"]
+    parts += left_out("Without numbers", without)
     page, file = out / "price-list.md", out / "price-list.csv"
     page.write_text("\n".join(parts))
     file.write_text(every_run(results).csv())

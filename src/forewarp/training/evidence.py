@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from forewarp.ops.grid import index_of, neighbour_pairs
+from forewarp.ops.grid import dilate, index_of, neighbour_pairs
 from forewarp.scene.box import Lattice
 from forewarp.scene.frame import Frame, Scene, spread
 from forewarp.scene.hull import visual_hull
@@ -61,7 +61,7 @@ def _disagreement(scene: Scene, frames: Sequence[Frame]) -> float:
     for frame in frames:
         depth = float(frame.camera.project(points.mean(0, keepdim=True))[1])
         reach.append(max(1, math.ceil(lattice.pitch * frame.camera.fx / max(depth, 1e-6))))
-        masks.append(_grown(frame.load()[..., 3] > 127, reach[-1]))
+        masks.append(dilate(frame.load()[..., 3] > 127, reach[-1]))
     points = points[visual_hull(points, [frame.camera for frame in frames], masks)]
     missed = total = 0
     for frame, pixels in zip(frames, reach):
@@ -71,13 +71,9 @@ def _disagreement(scene: Scene, frames: Sequence[Frame]) -> float:
         inside = (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height) & (depth > 0)
         covered = torch.zeros_like(foreground)
         covered[row[inside], column[inside]] = True
-        missed += int((foreground & ~_grown(covered, pixels)).sum())
+        missed += int((foreground & ~dilate(covered, pixels)).sum())
         total += int(foreground.sum())
     return missed / max(total, 1)
-
-
-def _grown(mask: Tensor, pixels: int) -> Tensor:
-    return functional.max_pool2d(mask[None].float(), 2 * pixels + 1, stride=1, padding=pixels)[0] > 0
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from forewarp.fields.voxel_grid import VoxelGrid
 from forewarp.methods.spec import MethodSpec
+from forewarp.ops.grid import dilate
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.frame import Scene
 from forewarp.scene.hull import visual_hull
@@ -203,9 +204,7 @@ def _hull(scene: Scene, lattice: Lattice, settings: StageSettings, frames: list[
     frames, masks = frames[:count], []
     for i in frames:
         pixels = max(1, round(settings.hull_grow * scene.train[i].camera.width))
-        alpha = (scene.train[i].load()[..., 3] > 127).float()
-        grown = torch.nn.functional.max_pool2d(alpha[None], 2 * pixels + 1, stride=1, padding=pixels)
-        masks.append(grown[0].bool())
+        masks.append(dilate(scene.train[i].load()[..., 3] > 127, pixels))
     points = lattice.to_world(lattice.all_voxels())
     hull = visual_hull(points, [scene.train[i].camera for i in frames], masks, settings.hull_misses)
     hull = hull.reshape(lattice.shape)
