@@ -2,15 +2,34 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
+
 import torch
 from torch import Tensor
 
+from forewarp.fields.radiance_grid import EMPTY, FieldAtTime, RadianceGrid, Shade
 from forewarp.ops.backend import use_numba
 from forewarp.ops.composite import accumulate, render_weights
 from forewarp.ops.march import march
 from forewarp.ops.trace import trace
 from forewarp.scene.rays import Rays
-from forewarp.scene.state import EMPTY, FieldAtTime, RadianceGrid, Rendering, View
+from forewarp.scene.view import Rendering
+
+
+@dataclass(frozen=True)
+class Marched(Rendering):
+    """A rendering with what lies along its rays: ``transmittance`` (R,); of the samples whose weight counts
+    their ``weights`` (S,), ``colors`` (S, 3) and ``ray_ids`` (S,); ``samples``, how many were read; where
+    asked for, ``all_weights`` and ``all_ray_ids`` (P,) of all samples, which lie in occupied cells.
+    """
+
+    transmittance: Tensor
+    weights: Tensor
+    colors: Tensor
+    ray_ids: Tensor
+    samples: int = 0
+    all_weights: Tensor | None = field(default=None, repr=False)
+    all_ray_ids: Tensor | None = field(default=None, repr=False)
 
 
 class Renderer:
@@ -42,23 +61,23 @@ class Renderer:
         field: FieldAtTime,
         rays: Rays,
         background: Tensor,
-        view: View | None = None,
+        shade: Shade | None = None,
         generator: torch.Generator | None = None,
         keep_all_weights: bool = False,
-    ) -> Rendering:
+    ) -> Marched:
         """Render rays.
 
         Args:
             field: density and features at one time.
             rays: R of them.
             background: (3,) or (R, 3), behind everything.
-            view: makes colour of features and directions; None: the first 3 features are it.
+            shade: makes colour of features and directions; None: the first 3 features are it.
             generator: jitters the samples by up to one step; None: the middle of each step.
             keep_all_weights: also return the weights and rays of every sample (P,).
         """
         plain = type(field) is RadianceGrid and not keep_all_weights and not torch.is_grad_enabled()
         if plain and use_numba(field.values):
-            return self._traced(field, rays, background, view, generator)
+            return self._traced(field, rays, background, shade, generator)
         count, step = len(rays), self.step * field.pitch
         ray_ids, distances, points = self._samples(field, rays, step, generator)
         weights, transmittance = render_weights(field.density(points) * step, ray_ids, count)
@@ -66,14 +85,14 @@ class Renderer:
         if self.color_threshold > 0:
             kept = (weights.detach() > self.color_threshold).nonzero()[:, 0]
         some_weights, some_rays = weights[kept], ray_ids[kept]
-        colors = field.colors(points[kept], rays.directions[some_rays], view)
+        colors = field.colors(points[kept], rays.directions[some_rays], shade)
         rgb = accumulate(some_weights, colors, some_rays, count) + transmittance[:, None] * background
         # Not 1 - transmittance: of thin matter that keeps no digit, and depth would leave the ray's stretch.
         moments = torch.stack([torch.ones_like(distances), distances], -1)
         opacity, depth = accumulate(weights, moments, ray_ids, count).unbind(-1)
         opacity = opacity.clamp(max=1)
         depth = depth / opacity.clamp(min=1e-6)
-        return Rendering(
+        return Marched(
             rgb=rgb,
             depth=depth,
             opacity=opacity,
@@ -91,9 +110,9 @@ class Renderer:
         grid: RadianceGrid,
         rays: Rays,
         background: Tensor,
-        view: View | None,
+        shade: Shade | None,
         generator: torch.Generator | None,
-    ) -> Rendering:
+    ) -> Marched:
         """The same without gradient, samples behind opaque matter left out: equal within ``opaque``."""
         step, activation = self.step * grid.pitch, grid.activation
         origins, directions, jitter = self._starts(grid, rays, generator)
@@ -115,9 +134,9 @@ class Renderer:
         )
         ray_ids, weights = found.ray_ids, found.weights
         points = origins[ray_ids] + found.distances[:, None] * directions[ray_ids]
-        colors = grid.colors(points, rays.directions[ray_ids], view)
+        colors = grid.colors(points, rays.directions[ray_ids], shade)
         opacity = found.opacity.clamp(max=1)
-        return Rendering(
+        return Marched(
             rgb=accumulate(weights, colors, ray_ids, len(rays)) + found.transmittance[:, None] * background,
             depth=found.distance / opacity.clamp(min=1e-6),
             opacity=opacity,
@@ -127,6 +146,22 @@ class Renderer:
             ray_ids=ray_ids,
             samples=found.samples,
         )
+
+    def picture(
+        self,
+        field: FieldAtTime,
+        rays: Rays,
+        background: Tensor,
+        shade: Shade | None = None,
+        chunk: int = 65536,
+    ) -> Rendering:
+        """Render many rays without gradients. Cost: linear in the rays, its memory in ``chunk``."""
+        with torch.no_grad():
+            parts = [
+                self(field, rays[begin : begin + chunk], background, shade)
+                for begin in range(0, len(rays), chunk)
+            ]
+        return Rendering(*(torch.cat([getattr(p, k) for p in parts]) for k in ("rgb", "depth", "opacity")))
 
     @staticmethod
     def _starts(

@@ -6,9 +6,9 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
+from forewarp.methods.voxel.evidence import Movement, Pictures
+from forewarp.methods.voxel.residual import Residual
 from forewarp.report.effect import Gain
-from forewarp.training.evidence import Movement, Pictures
-from forewarp.training.residual import Residual
 
 CUT_OUT = 0.001  # share of transparent pixels below which there is a real background
 MOVING = 0.02  # share of solid voxels that move, above which something does

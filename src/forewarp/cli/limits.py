@@ -17,13 +17,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
 
-import torch
 from torch import Tensor
 
 from forewarp.cli.entry import MISTAKE, one_line, quiet
 from forewarp.cli.runs import build_run, saved_config
 from forewarp.cli.stability import table
 from forewarp.data.batches import Targets
+from forewarp.methods.abilities import HasMatter
 from forewarp.metrics.image import psnr
 from forewarp.metrics.limits import REGIONS, error_shares, low_passed
 from forewarp.scene.frame import spread
@@ -72,12 +72,15 @@ def limits_of(folder: Path, views: int = 20) -> dict[str, float | str]:
         raise ValueError(
             f"{folder}: expected a scene whose images have alpha, but got one without silhouettes"
         )
-    lattice = list(module.method.at(0.0).fields.values())[-1].lattice
-    center = torch.tensor([(low + high) / 2 for low, high in zip(lattice.box.low, lattice.box.high)]).double()
+    if not isinstance(module.method, HasMatter):
+        raise ValueError(f"{folder}: expected a method that tells where matter is, but got none")
+    matter = module.method.matter()
+    low, high = matter.points.amin(0).double(), matter.points.amax(0).double()
+    center, pitch = ((low + high) / 2).cpu(), matter.size
     train = run.datamodule.targets("train")
     some = [train.frames[i] for i in spread(len(train), views)]
     tests, trained = (
-        [seen(shown, center, lattice.pitch) for shown in draw(module, targets)]
+        [seen(shown, center, pitch) for shown in draw(module, targets)]
         for targets in (run.datamodule.targets("test"), Targets(some, train.background, scene.has_alpha))
     )
     row = {"scene": scene.name, "seconds": sum(noted["seconds"] for noted in run.finished().values())}

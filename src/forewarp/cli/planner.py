@@ -13,11 +13,11 @@ from forewarp.cli import decisions
 from forewarp.cli.decisions import CUT_OUT, Decision, Evidence
 from forewarp.cli.trials import Trial, Trials, gain
 from forewarp.cli.words import key_of, merged
+from forewarp.methods.voxel.evidence import look_at, movement
+from forewarp.methods.voxel.residual import residual
 from forewarp.scene.box import Lattice
 from forewarp.scene.frame import Scene, spread
-from forewarp.training.evidence import look_at, movement
 from forewarp.training.handover import load_handover
-from forewarp.training.residual import residual
 
 # What each effect is switched on by where the configuration has it off.
 ON = {"motion": "dct", "background": "grid", "view": "sh", "inpainter": "unet3d", "upsampler": "learned"}
@@ -106,12 +106,12 @@ class Planner:
     def _look(self) -> None:
         """What the coarse stage says."""
         datamodule, moves = self.run.datamodule, self.module.method.motion is not None
-        self.evidence.movement = movement(self.module, datamodule.scene.times) if moves else None
+        self.evidence.movement = movement(self.module.method, datamodule.scene.times) if moves else None
         box = load_handover(self.run.stage_folder(self.run.stages[0])).box
         count = max(count for _, count in self.config.stage[self.last].voxels)
         views = datamodule.targets("train")
         some = [views[i] for i in spread(len(views), VIEWS)]
-        self.evidence.residual = residual(self.module, some, Lattice.of_count(box, count).pitch)
+        self.evidence.residual = residual(self.module.method, some, Lattice.of_count(box, count).pitch)
 
     def _try_fine(self) -> None:
         """From the coarse stage on: what is still open, with it and without, at equal steps."""

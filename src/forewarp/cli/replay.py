@@ -32,7 +32,7 @@ def replay(path: Path) -> str:
     if stage not in (names := [stage.settings.name for stage in run.stages]):
         known = " or ".join(names)
         raise ValueError(f"{path}: expected a step of stage {known}, but got one of {stage!r:.80}")
-    module = run.rebuilt(stage, bundle.scene, bundle.unit)
+    module = run.rebuilt(stage, bundle.scene)
     if differ := misfits(module, bundle.state_dict):
         raise ValueError(
             f"{path}: expected weights that its config describes, but got others: {', '.join(differ[:3])}"

@@ -23,7 +23,7 @@ from forewarp.training.handover import read_json
 from forewarp.training.stages import Run
 
 # What makes two runs different; where they run and what is shown of them does not.
-IDENTITY = ("data", "model", "objective", "stage", "renderer", "budget", "seed")
+IDENTITY = ("data", "model", "objective", "stage", "budget", "seed")
 # Named first of what differs, as others follow from these.
 TYPED = ("data.scene", "data.root", "seed", "budget")
 HASH = "{hash}"
@@ -41,7 +41,8 @@ def build_run(config: DictConfig) -> Run:
             raise ValueError(f"threads: expected a whole number > 0 or null, but got {config.threads}")
         torch.set_num_threads(config.threads)
     check_precision(config.trainer.get("precision"))
-    parts = {key: instantiate(config[key], _convert_="all") for key in ("data", "model", "renderer", "stage")}
+    parts = {key: instantiate(config[key], _convert_="all") for key in ("data", "stage")}
+    parts["model"] = model_of(config.model)
     watchers = [w for w in instantiate(config.callbacks, _convert_="all").values() if w is not None]
     trainer, logger = (instantiate(config[key], _convert_="all") for key in ("trainer", "logger"))
 
@@ -63,9 +64,8 @@ def build_run(config: DictConfig) -> Run:
 
     run = Run(
         datamodule=parts["data"],
-        spec=parts["model"],
+        model=parts["model"],
         stages=share_out(parts["stage"], minutes=config.budget.minutes, iterations=config.budget.iterations),
-        renderer=parts["renderer"],
         folder=Path(config.run),
         make_trainer=make_trainer,
         callbacks=lambda name, folder: watching(run, watchers, name),
@@ -75,6 +75,21 @@ def build_run(config: DictConfig) -> Run:
         tell=partial(print, flush=True),
     )
     return run
+
+
+def model_of(config: DictConfig) -> Callable:
+    """What makes a method of a stage's start, from the ``model`` part of a config."""
+    content = OmegaConf.to_container(config, resolve=True)
+    drop = {"name"}
+    if config.name == "backward":
+        drop |= {"motion", "trajectory", "upsampler", "inpainter"}
+    model = instantiate({key: value for key, value in content.items() if key not in drop}, _convert_="all")
+    if not callable(model):
+        raise ValueError(
+            f"model: expected a method that waits for its start, but got {type(model).__name__}; "
+            "add _partial_: true"
+        )
+    return model
 
 
 def watching(run: Run, watchers: list[Callable], name: str) -> list:

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 import torch
 from torch import Tensor
 
+from forewarp.fields.radiance_grid import Activation
 from forewarp.ops.backend import numba_installed
 from forewarp.ops.composite import accumulate, render_weights
 from forewarp.ops.dct import dct_basis
@@ -17,7 +18,6 @@ from forewarp.ops.grid import neighbour_pairs, trilinear
 from forewarp.ops.march import march
 from forewarp.ops.splat import average_splat
 from forewarp.ops.variation import patch_variation, total_variation
-from forewarp.scene.state import Activation
 
 Case = tuple[str, str, Callable[..., Tensor | tuple[Tensor, ...]], list[Tensor]]
 BACKENDS = ("reference", "Numba")

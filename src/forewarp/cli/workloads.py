@@ -9,20 +9,20 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from forewarp.effects.inpaint import UNet3d
-from forewarp.effects.motion import Motion
-from forewarp.effects.upsample import LearnedUpsampler
-from forewarp.effects.view import ViewNetwork
 from forewarp.fields.radiance import FeatureRadiance
+from forewarp.fields.radiance_grid import EMPTY
 from forewarp.fields.trajectory import TrajectoryField
 from forewarp.methods.forward_warp import ForwardWarp
 from forewarp.methods.spec import MethodSpec
+from forewarp.methods.voxel.effects.inpaint import UNet3d
+from forewarp.methods.voxel.effects.motion import Motion
+from forewarp.methods.voxel.effects.upsample import LearnedUpsampler
+from forewarp.methods.voxel.effects.view import ViewNetwork
 from forewarp.renderer import Renderer
 from forewarp.scene.batch import Batch
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.camera import Camera, look_at
 from forewarp.scene.rays import Rays
-from forewarp.scene.state import EMPTY
 from forewarp.training.curriculum import Curriculum
 from forewarp.training.module import DynamicSceneModule
 from forewarp.training.objective import Objective

@@ -1,4 +1,4 @@
-"""What training and evaluation draw from a scene: an endless stream of ray batches, and whole images."""
+"""What training and evaluation draw from a scene: an endless stream of batches, and whole images."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from torch import Tensor
 from torch.utils.data import IterableDataset
 
 from forewarp.data.images import composited
-from forewarp.scene.batch import Batch, Target
+from forewarp.scene.batch import Asks, Batch, Observation, Target
 from forewarp.scene.errors import SceneError
 from forewarp.scene.frame import Frame, Scene
-from forewarp.scene.rays import Rays
+from forewarp.scene.view import Moment, View
 
 COLORS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 
@@ -25,26 +25,19 @@ def color_of(background: str) -> Tensor:
     return torch.tensor(COLORS[background])
 
 
-def joined(parts: Sequence[Rays]) -> Rays:
-    """All rays after one another, with the range that holds for all of them."""
-    if len(parts) == 1:
-        return parts[0]
-    origins, directions = (torch.cat([getattr(p, name) for p in parts]) for name in ("origins", "directions"))
-    return Rays(origins, directions, min(p.near for p in parts), max(p.far for p in parts))
+class Sampler(IterableDataset):
+    """An endless stream of training batches over a background, of what a method ``asks`` for.
 
-
-class RayBatches(IterableDataset):
-    """An endless stream of batches, each ``rays`` random pixels of one time over a background.
-
-    ``picker()`` says of which frame, an index into ``scene.train``; None picks uniformly. With
-    ``views_per_step`` above 1 the pixels are shared out among up to so many frames of that frame's time,
-    itself and others at random: one warp serves them all. ``background`` is white, black or random: a colour
-    per ray, drawn at each step. A pixel without alpha is opaque, so a random colour behind it only says that
-    its ray must not let anything through.
+    ``picker()`` says which frame comes next, an index into ``scene.train``; None picks uniformly. Of single
+    pixels there are ``rays`` in a batch. With ``views_per_step`` above 1 the batch also sees up to so many
+    other frames of the picked one's time, at random, and pixels are shared out among them: one snapshot
+    serves them all. ``background`` is white, black or random: a colour a pixel (a picture or a crop has one
+    for all of it), drawn at each step. A pixel without alpha is opaque, so a random colour behind it only
+    says that its ray must not let anything through.
     A second ``iter`` goes on where the first stopped; ``state_dict`` holds all there is to continue exactly.
 
-    Cost: linear in ``rays``, below 2 ms for 8192; a frame is decoded when it is first picked, and kept while
-    there is room.
+    Cost: linear in the pixels, below 2 ms for 8192; a frame is decoded when it is first picked, and kept
+    while there is room.
     """
 
     def __init__(
@@ -56,6 +49,7 @@ class RayBatches(IterableDataset):
         seed: int = 0,
         picker: Callable[[], int] | None = None,
         views_per_step: int = 1,
+        asks: Asks | None = None,
     ) -> None:
         if int(rays) < 1:
             raise SceneError(f"data.rays: expected at least 1, but got {rays}")
@@ -64,10 +58,11 @@ class RayBatches(IterableDataset):
         if int(views_per_step) < 1:
             raise SceneError(f"data.views_per_step: expected at least 1, but got {views_per_step}")
         self.frames, self.rays, self.background, self.picker = scene.train, int(rays), background, picker
-        self.views_per_step = min(int(views_per_step), self.rays)
+        self.views_per_step, self.asks = min(int(views_per_step), self.rays), asks or Asks()
         self._of_time: dict[float, list[int]] = {}
         for index, frame in enumerate(scene.train):
             self._of_time.setdefault(frame.time, []).append(index)
+        self._times = sorted(self._of_time)
         self.seed, self._generator = seed, torch.Generator().manual_seed(seed)
 
     def __iter__(self) -> Iterator[Batch]:
@@ -83,15 +78,9 @@ class RayBatches(IterableDataset):
         index = self._uniform() if self.picker is None else int(self.picker())
         if not 0 <= index < len(self.frames):
             raise ValueError(f"picker: expected a training frame in [0, {len(self.frames)}), but got {index}")
-        views = self._views(index)
-        counts = [self.rays // len(views) + (i < self.rays % len(views)) for i in range(len(views))]
-        parts = [self._pixels(self.frames[view], count) for view, count in zip(views, counts, strict=True)]
-        if self.background == "random":
-            background = torch.rand(self.rays, 3, generator=self._generator)
-        else:
-            background = color_of(self.background)
-        rgb = composited(torch.cat([rgba for _, rgba in parts]), background)
-        return Batch(joined([rays for rays, _ in parts]), rgb, background, self.frames[index].time, index)
+        frames = [*self._views(index), *self._neighbours(self.frames[index].time)]
+        drawn = self._pixels(frames) if self.asks.kind == "pixels" else self._areas(frames)
+        return Batch(tuple(drawn), index, self._instant(index))
 
     def restart(self, number: int) -> None:
         """Draw from the beginning of stream ``number``; 0 is the one that is drawn from at first."""
@@ -113,14 +102,66 @@ class RayBatches(IterableDataset):
         order = torch.randperm(len(others), generator=self._generator)
         return [index, *(others[i] for i in order[: self.views_per_step - 1].tolist())]
 
-    def _pixels(self, frame: Frame, count: int) -> tuple[Rays, Tensor]:
-        """Random pixels of a frame: their rays and their values (count, 4)."""
-        camera = frame.camera
-        pixels = torch.randint(camera.width * camera.height, (count,), generator=self._generator)
-        return camera.rays(pixels), frame.load().reshape(-1, 4)[pixels]
+    def _neighbours(self, time: float) -> list[int]:
+        """A frame of each of the nearest other times, where the method asks for such: nearest first."""
+        if not self.asks.neighbours:
+            return []
+        place = self._times.index(time)
+        near = sorted(range(len(self._times)), key=lambda i: (abs(i - place), i))
+        chosen = [self._of_time[self._times[i]] for i in near[1 : self.asks.neighbours + 1]]
+        return [frames[self._whole(len(frames))] for frames in chosen]
+
+    def _pixels(self, frames: list[int]) -> Iterator[Observation]:
+        """Random pixels, shared out among frames."""
+        counts = [self.rays // len(frames) + (i < self.rays % len(frames)) for i in range(len(frames))]
+        views = []
+        for index, count in zip(frames, counts, strict=True):
+            camera = self.frames[index].camera
+            views.append(
+                View(camera, torch.randint(camera.width * camera.height, (count,), generator=self._generator))
+            )
+        behind = self._behind(self.rays).split(counts) if self.background == "random" else None
+        for number, (index, view) in enumerate(zip(frames, views)):
+            background = color_of(self.background) if behind is None else behind[number]
+            yield self._observed(index, view, background)
+
+    def _areas(self, frames: list[int]) -> Iterator[Observation]:
+        """A crop or the whole of each frame, over one colour."""
+        for index in frames:
+            camera, side = self.frames[index].camera, self.asks.side
+            view = View(camera)
+            if self.asks.kind == "crops":
+                height, width = min(side, camera.height), min(side, camera.width)
+                top, left = self._whole(camera.height - height + 1), self._whole(camera.width - width + 1)
+                view = View(camera, crop=(top, left, height, width))
+            yield self._observed(index, view, self._behind(1)[0])
+
+    def _instant(self, index: int) -> tuple[Observation, ...]:
+        """Whole pictures of the picked time over white, the picked one first."""
+        if not self.asks.instant:
+            return ()
+        others = [i for i in self._of_time[self.frames[index].time] if i != index]
+        white = COLORS["white"]
+        chosen = [index, *others][: self.asks.instant]
+        return tuple(self._observed(i, View(self.frames[i].camera), torch.tensor(white)) for i in chosen)
+
+    def _observed(self, index: int, view: View, background: Tensor) -> Observation:
+        frame, rows = self.frames[index], view.indices
+        rgba = frame.load().reshape(-1, 4)
+        rgb = composited(rgba if rows is None else rgba[rows], background)
+        return Observation(Moment(frame.time, index, frame.camera_id), view, rgb, background)
+
+    def _behind(self, count: int) -> Tensor:
+        """Colours (count, 3) behind pixels."""
+        if self.background != "random":
+            return color_of(self.background).expand(count, 3)
+        return torch.rand(count, 3, generator=self._generator)
+
+    def _whole(self, below: int) -> int:
+        return int(torch.randint(below, (), generator=self._generator))
 
     def _uniform(self) -> int:
-        return int(torch.randint(len(self.frames), (), generator=self._generator))
+        return self._whole(len(self.frames))
 
 
 class Targets(Sequence[Target]):

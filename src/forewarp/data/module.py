@@ -10,12 +10,12 @@ from pathlib import Path
 from lightning import LightningDataModule
 
 from forewarp.data import dnerf, hypernerf, lego_complete, nhr, posed_video
-from forewarp.data.batches import RayBatches, Targets, color_of
+from forewarp.data.batches import Sampler, Targets, color_of
 from forewarp.data.cache import CACHE
 from forewarp.data.canonical import with_canonical
 from forewarp.data.fingerprint import RECORD, fingerprint
 from forewarp.data.held import hold_out
-from forewarp.scene.batch import Target
+from forewarp.scene.batch import Asks, Target
 from forewarp.scene.errors import SceneError
 from forewarp.scene.frame import Scene, spread
 
@@ -23,15 +23,15 @@ WATCHED = 8  # views that a curve is of, at most, where none are set aside
 
 
 class SceneDataModule(LightningDataModule):
-    """Serves one scene: ray batches to train on, whole images to compare with.
+    """Serves one scene: batches to train on, whole images to compare with.
 
     The streams are handed out as they are, without a ``DataLoader``: a batch is a millisecond of tensor work,
     so worker processes would only cost.
 
     Args:
         read: gives the scene; called once, at the first use.
-        rays: per batch.
-        background: behind training rays: white, black or random (a colour per ray).
+        rays: pixels of a batch.
+        background: behind training pixels: white, black or random (a colour each).
         eval_background: behind whole images: white or black.
         seed: of the pixels, the background colours and the default choice of frames.
         views_per_step: training frames of one time that a batch's rays are shared out among.
@@ -75,9 +75,9 @@ class SceneDataModule(LightningDataModule):
         return replace(scene, protocol=protocol)
 
     @cached_property
-    def batches(self) -> RayBatches:
+    def batches(self) -> Sampler:
         """The one stream of training batches."""
-        return RayBatches(self.scene, **self._draw)
+        return Sampler(self.scene, **self._draw)
 
     @property
     def picker(self) -> Callable[[], int] | None:
@@ -87,6 +87,15 @@ class SceneDataModule(LightningDataModule):
     @picker.setter
     def picker(self, picker: Callable[[], int] | None) -> None:
         self.batches.picker = picker
+
+    @property
+    def asks(self) -> Asks:
+        """What the method that is trained wants of a batch."""
+        return self.batches.asks
+
+    @asks.setter
+    def asks(self, asks: Asks) -> None:
+        self.batches.asks = asks
 
     def setup(self, stage: str | None = None) -> None:
         """Read the scene, once, and refuse settings that it does not allow."""
@@ -107,8 +116,8 @@ class SceneDataModule(LightningDataModule):
         val = self.targets("val")
         return Targets([val.frames[i] for i in spread(len(val), WATCHED)], val.background, val.has_alpha)
 
-    def train_dataloader(self) -> RayBatches:
-        """The stream of batches, each of one time."""
+    def train_dataloader(self) -> Sampler:
+        """The stream of batches."""
         return self.batches
 
     def val_dataloader(self) -> Iterable[Target]:

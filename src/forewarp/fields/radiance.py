@@ -8,10 +8,10 @@ import torch
 from torch import Tensor, nn
 
 from forewarp.fields.mlp import mlp
+from forewarp.fields.radiance_grid import EMPTY, Activation, RadianceGrid
 from forewarp.fields.voxel_grid import VoxelGrid
 from forewarp.ops.encode import positional_encoding
 from forewarp.scene.box import Box, Lattice
-from forewarp.scene.state import EMPTY, Activation, RadianceGrid
 
 
 def density_shift(alpha_init: float) -> float:

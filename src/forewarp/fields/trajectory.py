@@ -67,6 +67,12 @@ class TrajectoryField(nn.Module):
         self.register_buffer("bases_in_play", torch.tensor(self.bases))
         self._nodes: tuple[Tensor, tuple[Tensor, Tensor, Tensor]] | None = None
 
+    def play(self, bases: float | None) -> int:
+        """Let so many bases play, all where None is given; how many these are."""
+        playing = self.bases if bases is None else min(int(bases), self.bases)
+        self.bases_in_play.fill_(playing)
+        return playing
+
     def coefficients(self, points: Tensor) -> Tensor:
         """DCT coefficients (N, 3, K) in world units at points (N, 3) in world units."""
         coordinates = self.lattice.to_lattice(points)

@@ -57,7 +57,7 @@ class Result:
     def variant(self) -> str:
         """What was changed; without a variant the method and the budget."""
         known = self.config.get("variant") or {}
-        return known.get("name") or f"{self.config['model']['warp']}-{self.config['budget']['name']}"
+        return known.get("name") or f"{self.config['model']['name']}-{self.config['budget']['name']}"
 
     @property
     def about(self) -> str:

@@ -71,7 +71,7 @@ def row_of(run: Result) -> Row:
     known, protocol = (run.config.get("variant") or {}).get("name", "plain"), run.metrics.get("protocol", {})
     bounds = budget["name"], budget["minutes"], budget.get("iterations")
     conditions = protocol.get("held_out", 0), protocol.get("device")
-    return Row(known, run.config["model"]["warp"], *bounds, *conditions)
+    return Row(known, run.config["model"]["name"], *bounds, *conditions)
 
 
 def measured(table: PaperTable, results: Sequence[Result]) -> list[Measured]:

@@ -129,7 +129,7 @@ def _draw(results: Sequence[Result], out: Path) -> list[tuple[str, Path | None, 
         path = pictures.draw_canonical(out / f"paper-canonical-{scene}.png", *both)
         found.append((f"Canonical comparison: {scene}", path, both))
     for dataset in DATASETS:
-        runs = [r for r in plain if r.dataset == dataset and r.config["model"]["warp"] == "forward"]
+        runs = [r for r in plain if r.dataset == dataset and r.config["model"]["name"] == "forward"]
         runs = list({run.scene: run for run in runs}.values())
         path = pictures.draw_sheet(out / f"paper-views-{dataset}.png", runs)
         found.append((f"Views: {dataset}", path, runs))

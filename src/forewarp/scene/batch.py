@@ -1,35 +1,78 @@
-"""What a training step sees."""
+"""What a training step sees, and what an evaluation compares with."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from torch import Tensor
 
 from forewarp.scene.frame import Frame
-from forewarp.scene.rays import Rays
+from forewarp.scene.view import Moment, View
+
+
+@dataclass(frozen=True)
+class Asks:
+    """What a method wants of the sampler: single ``pixels``, square ``crops`` of ``side`` pixels, or whole
+    ``pictures``; further observations of ``neighbours`` training times next to the picked one; and up to
+    ``instant`` whole training pictures of the picked time beside them.
+    """
+
+    kind: str = "pixels"
+    side: int = 64
+    neighbours: int = 0
+    instant: int = 0
+
+    def __post_init__(self) -> None:
+        kinds = ("pixels", "crops", "pictures")
+        if self.kind not in kinds or min(self.side - 1, self.neighbours, self.instant) < 0:
+            raise ValueError(
+                f"asks: expected a kind of {', '.join(kinds)}, side >= 1, neighbours >= 0 and instant >= 0, "
+                f"but got {self}"
+            )
+
+
+@dataclass(frozen=True)
+class Observation:
+    """Pixels of one picture: ``rgb`` (R, 3) in [0, 1], the truth over ``background`` (3,) or (R, 3), which is
+    what a pixel shows where nothing is met.
+    """
+
+    moment: Moment
+    view: View
+    rgb: Tensor
+    background: Tensor
+
+    def to(self, device) -> Observation:
+        """Move the truth to another device; the view stays where cameras are."""
+        return replace(self, rgb=self.rgb.to(device), background=self.background.to(device))
 
 
 @dataclass(frozen=True)
 class Batch:
-    """Rays of ONE time with their true colours.
+    """What one step is trained on, as the method asked for it.
 
-    ``rgb`` (R, 3) in [0, 1], already over ``background``; ``background`` (3,) or (R, 3) is what a ray
-    that meets nothing shows; ``time`` in [0, 1]; ``frame`` is the index of the training frame
-    that was picked, whose time others may share that gave rays too.
+    ``observations``: those of the picked frame's time first, of neighbouring times after them. ``frame``: the
+    index of the training frame that was picked. ``instant``: whole training pictures of that frame's time
+    over white, for methods that look at them to know the scene; empty where none were asked for.
     """
 
-    rays: Rays
-    rgb: Tensor
-    background: Tensor
-    time: float
+    observations: tuple[Observation, ...]
     frame: int
+    instant: tuple[Observation, ...] = ()
+
+    @property
+    def time(self) -> float:
+        """That of the picked frame."""
+        return self.observations[0].moment.time
+
+    def __len__(self) -> int:
+        return sum(len(one.view) for one in self.observations)
 
     def to(self, device) -> Batch:
-        """The same batch on another device."""
-        return Batch(
-            self.rays.to(device), self.rgb.to(device), self.background.to(device), self.time, self.frame
-        )
+        """Move all truth to another device."""
+        moved = (tuple(one.to(device) for one in part) for part in (self.observations, self.instant))
+        observations, instant = moved
+        return Batch(observations, self.frame, instant)
 
 
 @dataclass(frozen=True)
@@ -44,6 +87,16 @@ class Target:
     background: Tensor
     foreground: Tensor | None = None
     depth: Tensor | None = None
+
+    @property
+    def moment(self) -> Moment:
+        """When it was taken, and by which camera."""
+        return Moment(self.frame.time, camera=self.frame.camera_id)
+
+    @property
+    def view(self) -> View:
+        """All of its pixels."""
+        return View(self.frame.camera)
 
     def to(self, device) -> Target:
         """The same target with its tensors on another device."""

@@ -19,6 +19,7 @@ class Frame:
     camera's size; without an alpha channel on disk it is 255 everywhere. ``load_depth()``, where not None,
     gives exact ray depth (H, W) float32 in world units, 0 on the background. ``ability`` is what a test
     frame measures: ``space``, ``time``, ``canonical``, or ``all`` where a dataset does not say.
+    ``camera_id`` numbers the physical cameras from 0, where a dataset tells them apart.
     """
 
     name: str
@@ -27,6 +28,7 @@ class Frame:
     load: Callable[[], Tensor]
     load_depth: Callable[[], Tensor] | None = None
     ability: str = "all"
+    camera_id: int | None = None
 
 
 @dataclass(frozen=True)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 
@@ -27,3 +29,11 @@ class Rays:
     def to(self, device) -> Rays:
         """The same rays on another device."""
         return Rays(self.origins.to(device), self.directions.to(device), self.near, self.far)
+
+
+def joined(parts: Sequence[Rays]) -> Rays:
+    """Put all rays after one another, with the range that holds for all of them."""
+    if len(parts) == 1:
+        return parts[0]
+    origins, directions = (torch.cat([getattr(p, name) for p in parts]) for name in ("origins", "directions"))
+    return Rays(origins, directions, min(p.near for p in parts), max(p.far for p in parts))

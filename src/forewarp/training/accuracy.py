@@ -15,7 +15,7 @@ from forewarp.training.handover import read_json
 from forewarp.training.pictures import validation_psnr
 
 FILE = "accuracy_time.csv"
-COLUMNS = ("seconds", "stage", "step", "psnr", "epe_moving", "voxels")
+COLUMNS = ("seconds", "stage", "step", "psnr", "epe_moving", "size")
 
 
 def next_moment(after: float, first: float, ratio: float) -> float:
@@ -38,8 +38,9 @@ class AccuracyCurve(lightning.Callback):
     written. A row: training ``seconds`` (of the run's clock,
     which stands still meanwhile), ``stage``, ``step`` of the stage, ``psnr`` (dB, mean over the views, each
     from the same random pixels of the whole image), ``epe_moving`` (world units, empty where the scene has no
-    true trajectories) and active ``voxels``. TensorBoard gets ``curve/psnr`` and ``curve/epe_moving`` at the
-    training time in milliseconds in the place of the step. A continued run continues its rows.
+    true trajectories) and the method's ``size`` (voxels, particles, parameters). TensorBoard gets
+    ``curve/psnr`` and ``curve/epe_moving`` at the training time in milliseconds in the place of the step. A
+    continued run continues its rows.
 
     Args:
         first: seconds until the first row.
@@ -89,8 +90,8 @@ class AccuracyCurve(lightning.Callback):
         with module.clock.paused():
             scene, seconds = trainer.datamodule.scene, self._seconds(module)
             scores = {"psnr": validation_psnr(module, trainer.datamodule.watched(), self.rays)}
-            if scene.truth is not None:
-                scores["epe_moving"] = flow_error(module, scene)["epe_moving"]
+            if (flow := flow_error(module, scene)) is not None:
+                scores["epe_moving"] = flow["epe_moving"]
             scores = {name: value for name, value in scores.items() if value is not None}
             about = {
                 "seconds": f"{seconds:.3f}",
@@ -98,7 +99,7 @@ class AccuracyCurve(lightning.Callback):
                 "step": str(module.global_step),
             }
             numbers = {name: f"{value:.6g}" for name, value in scores.items()}
-            self._rows.append(about | numbers | {"voxels": str(len(module.method.radiance.voxels))})
+            self._rows.append(about | numbers | {"size": str(module.method.size[1])})
             write_rows(self._path, self._rows)
             for logger in trainer.loggers:
                 if isinstance(logger, TensorBoardLogger):

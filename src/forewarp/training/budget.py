@@ -7,7 +7,7 @@ from typing import Any
 
 from forewarp.training.objective import Objective
 from forewarp.training.settings import StageSettings
-from forewarp.training.stages import Stage
+from forewarp.training.stages import Model, Stage
 
 
 class StagePlan:
@@ -16,21 +16,19 @@ class StagePlan:
     Args:
         share: of the run's budget, against the other stages' shares.
         objective: of the stage.
-        settings: the other arguments of ``StageSettings``.
+        model: makes its method; None: the run's model.
+        settings: the other arguments of ``StageSettings``, and the method's own numbers.
     """
 
-    def __init__(self, *, share: float, objective: Objective, **settings: Any) -> None:
-        self.share, self.objective, self.settings = share, objective, settings
+    def __init__(
+        self, *, share: float, objective: Objective, model: Model | None = None, **settings: Any
+    ) -> None:
+        self.share, self.objective, self.model, self.settings = share, objective, model, settings
 
     def stage(self, name: str, minutes: float | None, iterations: int | None) -> Stage:
-        """The stage, bounded.
-
-        Raises:
-            TypeError: a key that ``StageSettings`` does not know.
-        """
-        return Stage(
-            StageSettings(name, minutes=minutes, iterations=iterations, **self.settings), self.objective
-        )
+        """The stage, bounded."""
+        settings = StageSettings.of(name, minutes=minutes, iterations=iterations, **self.settings)
+        return Stage(settings, self.objective, self.model)
 
 
 def share_out(

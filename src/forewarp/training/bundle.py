@@ -2,35 +2,33 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 
-from forewarp.scene.batch import Batch
+from forewarp.scene.batch import Batch, Observation
 from forewarp.scene.box import Box
 from forewarp.scene.camera import Camera
 from forewarp.scene.frame import Frame, Scene
 from forewarp.scene.lens import Lens
-from forewarp.scene.rays import Rays
+from forewarp.scene.view import Moment, View
 from forewarp.training.archive import read_archive, write_archive
 from forewarp.training.module import DynamicSceneModule
 
 _OF_CAMERA = ("width", "height", "fx", "fy", "cx", "cy", "camera_to_world", "near", "far", "skew")
-_KINDS = {"unit": float, "state_dict": dict, "config": str, "noted": dict}
+_KINDS = {"state_dict": dict, "config": str, "noted": dict}
 
 
 @dataclass(frozen=True)
 class Bundle:
-    """A stored step: the ``batch``, a ``scene`` whose frames have no pixels, the ``unit`` of density, the
-    stage's ``state_dict``, the run's ``config`` as YAML, and what else was ``noted``: ``found``, ``stage``,
-    ``step`` and ``random`` (states of the generators before the step).
+    """A stored step: the ``batch``, a ``scene`` whose frames have no pixels, the stage's ``state_dict``, the
+    run's ``config`` as YAML, and what else was ``noted``: ``found``, ``stage``, ``step`` and ``random``
+    (states of the generators before the step).
     """
 
     batch: Batch
     scene: Scene
-    unit: float
     state_dict: dict
     config: str
     noted: dict
@@ -46,7 +44,6 @@ def write_bundle(path: Path, module: DynamicSceneModule, batch: Batch, scene: Sc
     content = {
         "batch": _plain_batch(batch.to("cpu")),
         "scene": _plain_scene(scene),
-        "unit": module.method.radiance.activation.unit,
         "state_dict": module.state_dict(),
         "config": config.read_text() if config.is_file() else "",
         "noted": noted,
@@ -88,49 +85,74 @@ def _check(bundle: Bundle) -> None:
     for name in ("samples", "torch"):
         if not torch.is_tensor(noted["random"].get(name)) or noted["random"][name].dtype != torch.uint8:
             raise TypeError(f"noted.random.{name}")
-    rays = batch.rays
-    if not rays.origins.shape == rays.directions.shape == batch.rgb.shape == (len(rays), 3):
-        raise ValueError("batch")
+    for one in (*batch.observations, *batch.instant):
+        count = len(one.view)
+        if one.rgb.shape != (count, 3) or one.background.shape not in ((3,), (count, 3)):
+            raise ValueError("batch")
+        if not 0 <= one.moment.time <= 1:
+            raise ValueError("batch.time")
     if type(batch.frame) is not int or not 0 <= batch.frame < len(bundle.scene.train):
         raise ValueError("batch.frame")
-    if not 0 <= batch.time <= 1 or not 0 < bundle.unit < math.inf:
-        raise ValueError("batch.time, unit")
 
 
 def _plain_batch(batch: Batch) -> dict:
-    rays = batch.rays
-    # An origin that all rays share would be stored once, and read as more than the file holds.
-    content = {"origins": rays.origins.contiguous(), "directions": rays.directions.contiguous()}
-    content |= {"near": rays.near, "far": rays.far}
-    named = {"rgb": batch.rgb.contiguous(), "background": batch.background.contiguous()}
-    return content | named | {"time": batch.time, "frame": batch.frame}
+    parts = {name: [_plain(one) for one in getattr(batch, name)] for name in ("observations", "instant")}
+    return parts | {"frame": batch.frame}
 
 
 def _batch(content: dict) -> Batch:
-    rays = Rays(**{name: content[name] for name in ("origins", "directions", "near", "far")})
-    return Batch(rays, **{name: content[name] for name in ("rgb", "background", "time", "frame")})
+    observations, instant = (tuple(map(_observation, content[name])) for name in ("observations", "instant"))
+    if not observations:
+        raise ValueError("batch")
+    return Batch(observations, content["frame"], instant)
+
+
+def _plain(one: Observation) -> dict:
+    moment, view = one.moment, one.view
+    when = {"time": moment.time, "frame": moment.frame, "camera": moment.camera}
+    pixels = None if view.pixels is None else view.pixels.contiguous()
+    where = {"view": _plain_camera(view.camera), "pixels": pixels, "crop": view.crop}
+    return when | where | {"rgb": one.rgb.contiguous(), "background": one.background.contiguous()}
+
+
+def _observation(content: dict) -> Observation:
+    moment = Moment(**{name: content[name] for name in ("time", "frame", "camera")})
+    crop, pixels, camera = content["crop"], content["pixels"], _camera(content["view"])
+    if pixels is not None and not bool(((pixels >= 0) & (pixels < camera.width * camera.height)).all()):
+        raise ValueError("batch.pixels")
+    view = View(camera, pixels, None if crop is None else tuple(crop))
+    return Observation(moment, view, content["rgb"], content["background"])
+
+
+def _plain_camera(camera: Camera) -> dict:
+    lens = camera.lens
+    bent = None if lens is None else [list(lens.k), list(lens.p)]
+    return {name: getattr(camera, name) for name in _OF_CAMERA} | {"lens": bent}
+
+
+def _camera(content: dict) -> Camera:
+    lens = None if content["lens"] is None else Lens(*map(tuple, content["lens"]))
+    return Camera(**{name: content[name] for name in _OF_CAMERA}, lens=lens)
 
 
 def _plain_scene(scene: Scene) -> dict:
-    frames = []
-    for frame in scene.train:
-        camera, lens = frame.camera, frame.camera.lens
-        numbers = {name: getattr(camera, name) for name in _OF_CAMERA}
-        bent = None if lens is None else [list(lens.k), list(lens.p)]
-        frames.append({"name": frame.name, "time": frame.time, "camera": numbers, "lens": bent})
+    frames = [
+        {"name": f.name, "time": f.time, "camera_id": f.camera_id, "camera": _plain_camera(f.camera)}
+        for f in scene.train
+    ]
     box = [list(scene.box.low), list(scene.box.high)]
     about = {"name": scene.name, "canonical_time": scene.canonical_time, "still": scene.still}
     return {"frames": frames, "box": box, **about}
 
 
 def _scene(content: dict) -> Scene:
-    frames = []
-    for entry in content["frames"]:
-        lens = None if entry["lens"] is None else Lens(*map(tuple, entry["lens"]))
-        frames.append(Frame(entry["name"], entry["time"], Camera(**entry["camera"], lens=lens), _no_pixels))
+    frames = tuple(
+        Frame(one["name"], one["time"], _camera(one["camera"]), _no_pixels, camera_id=one["camera_id"])
+        for one in content["frames"]
+    )
     box = Box(*map(tuple, content["box"]))
     name, time = content["name"], content["canonical_time"]
-    return Scene(name, tuple(frames), (), (), box, time, False, still=content["still"])
+    return Scene(name, frames, (), (), box, time, False, still=content["still"])
 
 
 def _no_pixels():

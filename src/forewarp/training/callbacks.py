@@ -65,10 +65,10 @@ class StageProgress(lightning.Callback):
             self._line = None
 
     def _text(self, module) -> str:
-        last, playing = module.last, module.curriculum
+        last, playing, (kind, count) = module.last, module.curriculum, module.method.size
         return (
             f"train psnr {self._psnr / max(self._seen, _SMOOTHING):.1f} | loss {last['loss']:.4f} | "
-            f"frames {playing.in_play}/{len(playing.order)} | voxels {last['occupied_voxels']:,} | "
+            f"frames {playing.in_play}/{len(playing.order)} | {kind} {count:,} | "
             f"{self._steps_a_second(module.global_step):.1f} steps/s"
         )
 
@@ -84,7 +84,7 @@ class StageProgress(lightning.Callback):
 class TensorBoardScalars(lightning.Callback):
     """Logs the means over the last ``every`` steps: loss, each raw term, PSNR, rates and counts.
 
-    Keys: ``train/<value>`` for all in ``module.last``, ``train/bases_in_play``, ``lr/<kind>``.
+    Keys: ``train/<value>`` for all in ``module.last``, ``lr/<kind>``.
     """
 
     def __init__(self, *, every: int = 20) -> None:
@@ -110,9 +110,6 @@ class TensorBoardScalars(lightning.Callback):
         self._values.clear()
         for group in trainer.optimizers[0].param_groups:
             scalars[f"lr/{group['name']}"] = group["lr"]
-        motion = getattr(module.method, "motion", None)
-        if motion is not None:
-            scalars["train/bases_in_play"] = float(motion.trajectory.bases_in_play)
         with module.clock.paused():
             for logger in trainer.loggers:
                 if isinstance(logger, TensorBoardLogger):

@@ -10,7 +10,6 @@ from pathlib import Path
 import lightning
 import torch
 
-from forewarp.fields.voxel_grid import VoxelGrid
 from forewarp.training.archive import read_archive
 from forewarp.training.interruption import Interruption
 from forewarp.training.module import DynamicSceneModule
@@ -81,14 +80,15 @@ def check_checkpoint(path: Path, module: DynamicSceneModule) -> dict:
 
 
 def misfits(module: DynamicSceneModule, weights: dict) -> list[str]:
-    """The entries of stored weights that a module cannot take: others than its own, of another shape, or of a
-    voxel grid and not fitting together.
+    """The entries of stored weights that a module cannot take: others than its own, of another shape, or such
+    as its method says do not fit together.
     """
     own, theirs = _shapes(module.state_dict(), module), _shapes(weights, module)
     differ = sorted(str(k) for k in own | theirs if k not in own or k not in theirs or own[k] != theirs[k])
     if not differ:
-        found = ((prefix, grid.misfit(weights, f"{prefix}.")) for prefix, grid in _grids(module))
-        differ = [f"{prefix}.{name}" for prefix, name in found if name is not None]
+        own = {str(k).removeprefix("method."): v for k, v in weights.items()}
+        name = module.method.misfit(own)
+        differ = [] if name is None else [f"method.{name}"]
     return differ
 
 
@@ -135,15 +135,11 @@ def check_state(path: Path, module: DynamicSceneModule) -> tuple[int, float]:
 
 
 def _shapes(weights: dict, module: DynamicSceneModule) -> dict[str, tuple | None]:
-    """Of every entry that must fit; None for those of voxel grids, which adopt a checkpoint's shapes."""
-    adopted = {f"{prefix}.{name}" for prefix, m in _grids(module) for name in ("voxels", "index", *m.names)}
+    """Of every entry that must fit; None for those whose shapes a checkpoint says."""
+    adopted = {f"method.{name}" for name in module.method.adopted()}
     return {
         k: tuple(v.shape) if torch.is_tensor(v) and k not in adopted else None for k, v in weights.items()
     }
-
-
-def _grids(module: DynamicSceneModule) -> list[tuple[str, VoxelGrid]]:
-    return [(prefix, m) for prefix, m in module.named_modules() if isinstance(m, VoxelGrid)]
 
 
 def load_weights(module: DynamicSceneModule, path: Path) -> None:

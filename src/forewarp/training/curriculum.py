@@ -45,6 +45,7 @@ class Curriculum:
                 f"newest_part in (0, 1], but got {start=}, {all_in=}, {newest_share=}, {error_share=}, "
                 f"{newest_part=}"
             )
+        self.canonical_time = canonical_time
         self.order = sorted(range(len(times)), key=lambda i: (abs(times[i] - canonical_time), times[i], i))
         last_of_time = {times[i]: place for place, i in enumerate(self.order)}
         self._ends = [place + 1 for place in last_of_time.values()]  # frames, once so many times are in

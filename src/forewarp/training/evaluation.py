@@ -11,15 +11,16 @@ from torch import Tensor
 
 from forewarp.drawing.colors import at_least, error_colors, in_a_row
 from forewarp.drawing.files import write_png
-from forewarp.methods.spec import parameter_count
+from forewarp.methods.abilities import HasTrajectories
+from forewarp.methods.method import parameter_count
 from forewarp.metrics.flow import end_point_error
 from forewarp.metrics.suite import ImageSuite, summarise
 from forewarp.scene.batch import Target
 from forewarp.scene.frame import Scene, spread
-from forewarp.scene.state import Rendering
+from forewarp.scene.view import Rendering
 from forewarp.training.clock import now
 from forewarp.training.handover import write_json
-from forewarp.training.module import DynamicSceneModule, render_all
+from forewarp.training.module import DynamicSceneModule
 from forewarp.training.protocol import device_name, versions
 
 _SHEET_SIDE = 300  # pixels that the shorter side of a picture on a sheet has at least
@@ -39,22 +40,21 @@ class Shown:
 
 
 def draw(module: DynamicSceneModule, targets: Sequence[Target]) -> Iterator[Shown]:
-    """Every target by every rendering, in the order of its frame's time: the warp is computed once a time.
+    """Every target by every rendering, in the order of its frame's time: a snapshot is made once a time.
 
     ``targets`` decode at the first use and know their ``frames`` without it.
     """
-    state = None
+    snapshot = None
     for number in sorted(range(len(targets)), key=lambda i: targets.frames[i].time):
         target = targets[number]
         begin = now()
         with torch.no_grad():
-            if state is None or state.time != target.frame.time:
-                state = module.method.at(target.frame.time)
-            rays, behind = target.frame.camera.rays().to(module.device), target.background.to(module.device)
-            drawn, warped = {}, now() - begin
-            for name, field in state.fields.items():
+            if snapshot is None or not snapshot.holds(target.moment):
+                snapshot = module.method.at(target.moment)
+            behind, drawn, warped = target.background.to(module.device), {}, now() - begin
+            for name in snapshot.renderings:
                 begin = now()
-                drawn[name] = render_all(module.renderer, field, rays, behind, module.method.view)
+                drawn[name] = snapshot.render(target.view, behind, name)
                 again = now() - begin
         yield Shown(number, target, drawn, warped + again, again)
 
@@ -105,17 +105,21 @@ def evaluate(
         "parameters": parameter_count(module.method),
         **_means(per_image),
     }
-    if scene.truth is not None:
-        metrics["flow"] = flow_error(module, scene)
+    if (flow := flow_error(module, scene)) is not None:
+        metrics["flow"] = flow
     write_json(Path(folder) / "per_image.json", {"images": per_image})
     write_json(Path(folder) / "metrics.json", metrics)
     return metrics
 
 
 @torch.no_grad()
-def flow_error(module: DynamicSceneModule, scene: Scene) -> dict:
-    """End-point errors of the learned trajectories against the scene's true ones, world units."""
+def flow_error(module: DynamicSceneModule, scene: Scene) -> dict | None:
+    """End-point errors of the learned trajectories against the scene's true ones, world units; None where
+    there are no such.
+    """
     truth = scene.truth
+    if truth is None or not isinstance(module.method, HasTrajectories):
+        return None
     points, times = truth.points[:, 0].to(module.device), truth.times.float().to(module.device)
     return end_point_error(module.method.trajectories(points, times), truth.points)
 
@@ -170,6 +174,7 @@ def _protocol(module: DynamicSceneModule, scene: Scene, per_image: list[dict], p
         "scene": scene.name,
         **scene.protocol,
         **protocol,
+        **module.method.protocol(),
         "renderings": [*first["others"], first["rendering"]],
         "scored": first["rendering"],
         "device": device_name(module.device),

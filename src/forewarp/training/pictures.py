@@ -12,9 +12,11 @@ from torch import Tensor
 
 from forewarp.drawing.colors import depth_colors, error_colors, flow_colors, in_a_row, with_wheel
 from forewarp.drawing.files import write_png
+from forewarp.methods.abilities import HasTrajectories
 from forewarp.scene.batch import Target
 from forewarp.scene.camera import Camera
-from forewarp.training.module import DynamicSceneModule, render_all
+from forewarp.scene.view import Moment, View
+from forewarp.training.module import DynamicSceneModule
 
 
 def sized(camera: Camera, size: int) -> Camera:
@@ -31,45 +33,41 @@ def within(camera: Camera, size: int | None) -> Camera:
 def pictures_of(module: DynamicSceneModule, target: Target, size: int | None = None) -> dict[str, Tensor]:
     """Pictures (h, w, 3) in [0, 1] of one view by name.
 
-    ``compare`` is truth | prediction | error, ``depth`` is near bright, ``flow`` is the way in the picture
-    from the canonical time to the target's: hue is its direction, as the wheel shows, saturation its length.
+    ``compare`` is truth | prediction | error, ``depth`` is near bright; ``flow``, of methods with
+    trajectories, is the way in the picture from the canonical time to the target's: hue is its direction, as
+    the wheel shows, saturation its length.
     """
-    camera, time = within(target.frame.camera, size), target.frame.time
+    camera = within(target.frame.camera, size)
     shape = (camera.height, camera.width)
-    drawn = module.render_image(camera, time, target.background)
+    drawn = module.render(camera, target.moment, target.background)
     predicted = drawn.rgb.reshape(*shape, 3).clamp(0, 1)
     truth = target.rgb.to(predicted)
     if truth.shape != predicted.shape:
         channels_first = truth.permute(2, 0, 1)[None]
         truth = torch.nn.functional.interpolate(channels_first, shape, mode="area")[0].permute(1, 2, 0)
-    return {
+    pictures = {
         "compare": in_a_row([truth, predicted, error_colors(truth, predicted)]),
         "depth": depth_colors(drawn.depth.reshape(shape), drawn.opacity.reshape(shape)),
-        "flow": with_wheel(flow_colors(*image_flow(module, camera, time))),
     }
+    if isinstance(module.method, HasTrajectories):
+        pictures["flow"] = with_wheel(flow_colors(*image_flow(module, camera, target.moment.time)))
+    return pictures
 
 
 @torch.no_grad()
 def image_flow(module: DynamicSceneModule, camera: Camera, time: float) -> tuple[Tensor, Tensor]:
-    """The scene at its canonical time as ``camera`` sees it, and how that moves until ``time``.
-
-    Displacements are rendered in the place of colours, so the picture is as smooth as any other.
+    """The scene at its canonical time as ``camera`` sees it, and how the points seen move until ``time``.
 
     Returns:
         flow (H, W, 2) in pixels, opacity (H, W).
     """
-    method = module.method
-    canonical = method.radiance()
-    points = canonical.lattice.to_world(method.radiance.voxels)
-    displacement = method.trajectories(points, torch.tensor([time], device=points.device))[:, 0] - points
-    moving = canonical.with_values(torch.cat([canonical.raw_density[:, None], displacement], 1))
-    rays = camera.rays().to(module.device)
-    drawn = render_all(
-        module.renderer, moving, rays, points.new_zeros(3), lambda features, directions: features
-    )
+    view = View(camera)
+    canonical = Moment(module.curriculum.canonical_time)
+    drawn = module.render(view, canonical, torch.zeros(3))
+    rays = view.rays().to(module.device)
     at = rays.origins + drawn.depth[:, None] * rays.directions
-    moved = drawn.rgb / drawn.opacity.clamp(min=1e-6)[:, None]
-    flow = camera.project(at + moved)[0] - camera.project(at)[0]
+    moved = module.method.trajectories(at, torch.tensor([time], device=at.device))[:, 0]
+    flow = camera.project(moved)[0] - camera.project(at)[0]
     shape = (camera.height, camera.width)
     return flow.reshape(*shape, 2), drawn.opacity.reshape(shape)
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from forewarp.scene.batch import Batch
 from forewarp.training.bundle import write_bundle
 from forewarp.training.module import DynamicSceneModule
-from forewarp.training.objective import Step
+from forewarp.training.objective import parts
 
 
 class BrokenStep(ValueError):
@@ -63,12 +63,16 @@ def diagnose(module: DynamicSceneModule, batch: Batch, number: int) -> Found | N
     parameters = dict(module.method.named_parameters())
     if name := first_bad(parameters.items()):
         return Found("parameter", name)
-    step = module.look(batch)
-    parts = module.objective.parts(step, number)
-    bad = tuple(name for name, (value, _) in parts.items() if not bool(value.isfinite().all()))
+    factors = module.objective.factors(number)
+    step = module.look(batch, factors)
+    found = parts(step, factors)
+    bad = tuple(name for name, (value, _) in found.items() if not bool(value.isfinite().all()))
     if bad:
-        return Found("loss", first_bad(_tensors(step)) or f"the term {bad[0]}", bad)
-    slopes = {name: _slopes(value * factor, parameters) for name, (value, factor) in parts.items()}
+        return Found("loss", first_bad([*_tensors(batch), *step.tensors()]) or f"the term {bad[0]}", bad)
+    if step.gradients is not None:  # the method's own, of all terms together
+        name = first_bad(step.gradients.items(), squared=True)
+        return None if name is None else Found("gradient", name)
+    slopes = {name: _slopes(value * factor, parameters) for name, (value, factor) in found.items()}
     total = {p: sum(s[p] for s in slopes.values() if s[p] is not None) for p in parameters}
     name = first_bad(((p, g) for p, g in total.items() if torch.is_tensor(g)), squared=True)
     if name is None:
@@ -84,17 +88,14 @@ def _slopes(value: Tensor, parameters: dict[str, Tensor]) -> dict[str, Tensor | 
     return dict(zip(parameters, found))
 
 
-def _tensors(step: Step) -> Iterable[tuple[str, Tensor | None]]:
-    """What a step computed, from the batch to the pictures, each under its name."""
-    batch, state = step.batch, step.state
-    yield from (("batch.rgb", batch.rgb), ("batch.background", batch.background))
-    yield from (("batch.rays.origins", batch.rays.origins), ("batch.rays.directions", batch.rays.directions))
-    for name in ("flow", "coverage", "inpaint_difference"):
-        yield f"state.{name}", getattr(state, name)
-    grids = {"canonical": state.canonical, "background": state.background, **state.fields}
-    yield from ((f"state.{name}.values", getattr(grid, "values", None)) for name, grid in grids.items())
-    for name, drawn in step.renderings.items():
-        yield from ((f"{name}.{part}", getattr(drawn, part)) for part in ("rgb", "depth", "opacity"))
+def _tensors(batch: Batch) -> Iterable[tuple[str, Tensor | None]]:
+    """What a batch brings, each under its name."""
+    for number, one in enumerate(batch.observations):
+        yield from ((f"batch[{number}].{part}", getattr(one, part)) for part in ("rgb", "background"))
+        rays = one.view.rays()
+        yield from (
+            (f"batch[{number}].rays.{part}", getattr(rays, part)) for part in ("origins", "directions")
+        )
 
 
 class Sentinel(lightning.Callback):

@@ -9,21 +9,12 @@ from types import SimpleNamespace
 
 import lightning
 
-from forewarp.methods.spec import MethodSpec, parameter_count
-from forewarp.renderer import Renderer
+from forewarp.methods.method import Method, Start, parameter_count
+from forewarp.scene.cloud import Handover
 from forewarp.scene.frame import Scene
 from forewarp.training.checkpoints import KeepCheckpoint, check_state, load_weights
 from forewarp.training.curriculum import Curriculum
-from forewarp.training.handover import (
-    Handover,
-    carried_method,
-    fresh_method,
-    load_handover,
-    make_handover,
-    read_json,
-    save_handover,
-    write_json,
-)
+from forewarp.training.handover import load_handover, make_handover, read_json, save_handover, write_json
 from forewarp.training.interruption import Interruption
 from forewarp.training.module import DynamicSceneModule
 from forewarp.training.objective import Objective
@@ -31,13 +22,16 @@ from forewarp.training.protocol import peak_memory_bytes, reset_peak_memory
 from forewarp.training.sentinel import Sentinel
 from forewarp.training.settings import StageSettings
 
+Model = Callable[[Start], Method]
+
 
 @dataclass(frozen=True)
 class Stage:
-    """A stage's numbers and its objective."""
+    """A stage's numbers, its objective, and what makes its method; None: what makes the run's."""
 
     settings: StageSettings
     objective: Objective
+    model: Model | None = None
 
 
 @dataclass
@@ -46,9 +40,8 @@ class Run:
 
     Args:
         datamodule: serves the scene (``.scene``, ``.picker``, ``.restart``, batches).
-        spec: the method.
+        model: makes the method of a stage.
         stages: in order.
-        renderer: of training and evaluation.
         folder: where the run lives; a folder a stage.
         make_trainer: ``(stage folder, callbacks) -> lightning.Trainer``.
         callbacks: ``(stage name, stage folder) -> list`` of what watches a stage.
@@ -59,9 +52,8 @@ class Run:
     """
 
     datamodule: lightning.LightningDataModule
-    spec: MethodSpec
+    model: Model
     stages: Sequence[Stage]
-    renderer: Renderer
     folder: Path
     make_trainer: Callable[[Path, list], lightning.Trainer]
     callbacks: Callable[[str, Path], list] = field(default=lambda name, folder: [])
@@ -80,12 +72,14 @@ class Run:
             # Every stage draws anew, so that skipping a finished one changes nothing that follows.
             lightning.seed_everything(self.seed + number, verbose=False)
             self.datamodule.restart(number)
-            module, unit = self._module(stage, module, handover, number)
-            if self.is_finished(stage):
+            finished = self.is_finished(stage)
+            blank = finished or (folder / "last.ckpt").is_file()
+            module = self._module(stage, module, handover, number, blank=blank)
+            if finished:
                 load_weights(module, folder / "last.ckpt")
                 self.tell(f"{stage.settings.name}: finished before")
             else:
-                self._fit_stage(stage, module, folder, unit)
+                self._fit_stage(stage, module, folder, handover)
             handover = load_handover(folder)
         return module
 
@@ -104,7 +98,8 @@ class Run:
                 )
         stage = self.stages[-1]
         before = [load_handover(self.stage_folder(s)) for s in self.stages[:-1]]
-        module, _ = self._module(stage, None, before[-1] if before else None, len(self.stages) - 1)
+        handover = before[-1] if before else None
+        module = self._module(stage, None, handover, len(self.stages) - 1, blank=True)
         load_weights(module, self.stage_folder(stage) / "last.ckpt")
         return module
 
@@ -126,46 +121,55 @@ class Run:
         found = {stage.settings.name: _noted(self.stage_folder(stage)) for stage in self.stages}
         return {name: noted for name, noted in found.items() if noted is not None}
 
-    def rebuilt(self, name: str, scene: Scene, unit: float) -> DynamicSceneModule:
-        """A stage's module for a ``state_dict`` that brings its grids: nothing is asked of images or of the
-        stages before.
+    def rebuilt(self, name: str, scene: Scene) -> DynamicSceneModule:
+        """A stage's module for a ``state_dict`` that brings all it has learned: nothing is asked of images or
+        of the stages before.
 
         Args:
             name: of the stage.
             scene: cameras, times and box.
-            unit: of density, world units.
         """
         number, stage = next((i, s) for i, s in enumerate(self.stages) if s.settings.name == name)
-        plain = replace(stage, settings=replace(stage.settings, start="box", carry=False))
-        fresh = replace(self, datamodule=SimpleNamespace(scene=scene))
-        handover = Handover(scene.box.low, scene.box.high, unit, False, 0)
-        return fresh._module(plain, None, handover, number)[0]
+        return replace(self, datamodule=SimpleNamespace(scene=scene))._module(
+            stage, None, None, number, blank=True
+        )
 
     def _module(
-        self, stage: Stage, before: DynamicSceneModule | None, handover: Handover | None, number: int
-    ) -> tuple[DynamicSceneModule, float]:
+        self,
+        stage: Stage,
+        before: DynamicSceneModule | None,
+        handover: Handover | None,
+        number: int,
+        *,
+        blank: bool = False,
+    ) -> DynamicSceneModule:
         scene: Scene = self.datamodule.scene
-        settings = stage.settings
+        settings, objective = stage.settings, stage.objective
         times = [frame.time for frame in scene.train]
         curriculum = Curriculum(times, scene.canonical_time, seed=self.seed + number, **settings.curriculum)
-        if before is not None and settings.carry:
-            method, unit = carried_method(self.spec, settings, scene, before.method, handover), handover.unit
-        else:
-            box, unit = (scene.box, None) if handover is None else (handover.box, handover.unit)
-            method, unit = fresh_method(self.spec, settings, scene, box, unit, curriculum.frames())
-        module = DynamicSceneModule(
-            method,
-            renderer=self.renderer.with_threshold(settings.color_threshold),
-            objective=stage.objective,
+        start = Start(
+            scene,
+            settings.name,
+            settings.numbers,
+            curriculum.frames(),
+            handover,
+            None if before is None else before.method,
+            blank,
+            objective.weights,
+            objective.literal,
+            objective.photo_on,
+        )
+        return DynamicSceneModule(
+            (stage.model or self.model)(start),
+            objective=objective,
             settings=settings,
             curriculum=curriculum,
-            cameras=[frame.camera for frame in scene.train],
             seed=self.seed + number,
-            still=scene.still,
         )
-        return module, unit
 
-    def _fit_stage(self, stage: Stage, module: DynamicSceneModule, folder: Path, unit: float) -> None:
+    def _fit_stage(
+        self, stage: Stage, module: DynamicSceneModule, folder: Path, before: Handover | None
+    ) -> None:
         last = folder / "last.ckpt"
         sentinel = Sentinel(folder, skip=self.skip)
         interruption = Interruption()
@@ -183,9 +187,8 @@ class Run:
         if module.fraction < 1:
             raise KeyboardInterrupt
         keeper.save(trainer)
-        scene, in_play = self.datamodule.scene, module.curriculum.in_play
-        alpha = stage.settings.box_alpha
-        save_handover(make_handover(module.method, scene, unit, in_play, alpha=alpha), folder)
+        in_play = module.curriculum.in_play
+        save_handover(make_handover(module.method, self.datamodule.scene, before, in_play), folder)
         write_json(
             folder / "done.json",
             {

@@ -9,13 +9,12 @@ from torch import Tensor
 
 from forewarp.drawing.colors import hues
 from forewarp.drawing.lines import draw_discs, hidden, sample_lines
+from forewarp.methods.abilities import HasMatter, HasTrajectories
 from forewarp.scene.camera import Camera
-from forewarp.scene.state import Rendering
-from forewarp.training.module import DynamicSceneModule, render_all
+from forewarp.scene.view import Moment, Rendering, View
+from forewarp.training.module import DynamicSceneModule
 from forewarp.training.pictures import within
-from forewarp.training.structure import occupied
 
-_SOLID = 0.1  # opacity over a voxel that may be surface
 _VIEWS, _VIEW_SIZE = 24, 80  # what the surface is looked at from
 _STILL = 0.15  # moving points go at least so far, as a share of the farthest
 
@@ -40,9 +39,15 @@ class Trajectories:
         tail: float = 0.5,
         width: float = 0.004,
     ) -> None:
+        for ability in (HasTrajectories, HasMatter):
+            if not isinstance(module.method, ability):
+                name = type(module.method).__name__
+                raise ValueError(
+                    f"path: expected a method that knows trajectories, but got {name}; use path=fixed"
+                )
         self.method, self.tail, self.width = module.method, tail, width
-        # A rendered surface is soft: its depth is uncertain by about a voxel.
-        self.slack = 1.5 * module.method.radiance.lattice.pitch
+        # A rendered surface is soft: its depth is uncertain by about the size of what it is made of.
+        self.slack = 1.5 * module.method.matter().size
         self.points = moving_points(module, cameras, count)
         self.colors = hues(0.85 * order_of(self.points))
 
@@ -74,21 +79,24 @@ class Trajectories:
 
 @torch.no_grad()
 def surface_points(module: DynamicSceneModule, cameras: Sequence[Camera]) -> Tensor:
-    """Voxel centres (N, 3), world units, where a few of the cameras see the canonical surface."""
-    canonical = module.method.radiance()
-    lattice, black = canonical.lattice, torch.zeros(3, device=module.device)
-    found = []
+    """The method's points of matter (N, 3), world units, that a few cameras see at the canonical time."""
+    canonical = module.method.at(Moment(module.curriculum.canonical_time))
+    black, found = torch.zeros(3, device=module.device), []
     for camera in cameras[:: max(1, len(cameras) // _VIEWS)][:_VIEWS]:
-        rays = within(camera, _VIEW_SIZE).rays().to(module.device)
-        drawn = render_all(module.renderer, canonical, rays, black, module.method.view)
+        view = View(within(camera, _VIEW_SIZE))
+        drawn, rays = canonical.render(view, black), view.rays().to(module.device)
         hit = drawn.opacity > 0.5
         found.append(rays.origins[hit] + drawn.depth[hit, None] * rays.directions[hit])
-    last = torch.tensor(lattice.shape, device=module.device) - 1
-    nearest = lattice.to_lattice(torch.cat(found)).round().long()
-    voxels = torch.minimum(nearest.clamp(min=0), last).unique(dim=0)
-    # A mean depth across a silhouette's edge lies in empty space.
-    x, y, z = voxels.unbind(-1)
-    return lattice.to_world(voxels[occupied(module.method.radiance, _SOLID)[x, y, z]])
+    # A mean depth across a silhouette's edge lies in empty space, where there is no point of matter.
+    matter = module.method.matter()
+    cells, seen = _cells(matter.points, matter.size), _cells(torch.cat(found), matter.size)
+    return matter.points[torch.isin(cells, seen)]
+
+
+def _cells(points: Tensor, size: float) -> Tensor:
+    """A number (N,) for the cube of side ``size`` that each point lies in."""
+    x, y, z = (points / size).floor().long().clamp(-(1 << 20), (1 << 20) - 1).unbind(-1)
+    return (x << 42) + (y << 21) + z
 
 
 @torch.no_grad()
@@ -99,7 +107,7 @@ def moving_points(module: DynamicSceneModule, cameras: Sequence[Camera], count: 
         return points
     paths = module.method.trajectories(points, torch.linspace(0, 1, 33, device=points.device))
     reach = (paths - points[:, None]).norm(dim=-1).amax(1)
-    least = max(_STILL * float(reach.max()), module.method.radiance.lattice.pitch)
+    least = max(_STILL * float(reach.max()), module.method.matter().size)
     return spread(points[reach > least], count)
 
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from forewarp.scene.camera import Camera
 from forewarp.scene.paths import focus_point, mean_up, orbit
-from forewarp.scene.state import Rendering
+from forewarp.scene.view import Moment, Rendering, View
 from forewarp.training.module import DynamicSceneModule
 
 PATHS = ("fixed", "orbit", "both", "trajectories")
@@ -48,7 +48,7 @@ def make_shots(path: str, frames: int, time: float, camera: Camera, cameras: Seq
 def video(
     module: DynamicSceneModule, shots: Sequence[Shot], background: Tensor, paint: Paint | None = None
 ) -> Iterator[Tensor]:
-    """The pictures (H, W, 3) in [0, 1] of a video one by one; the warp is made once for a time.
+    """The pictures (H, W, 3) in [0, 1] of a video one by one; a snapshot is made once for a time.
 
     Args:
         module: the fitted scene.
@@ -56,11 +56,13 @@ def video(
         background: (3,).
         paint: draws over a picture, see ``Trajectories``.
     """
-    state = None
+    snapshot = None
     for camera, time in shots:
+        moment = Moment(time)
         with torch.no_grad():
-            state = state if state is not None and state.time == time else module.method.at(time)
-            drawn = module.render_image(camera, time, background, state)
+            if snapshot is None or not snapshot.holds(moment):
+                snapshot = module.method.at(moment)
+            drawn = snapshot.render(View(camera), background)
             picture = drawn.rgb.reshape(camera.height, camera.width, 3).clamp(0, 1)
             picture = picture if paint is None else paint(picture, drawn, camera, time)
         yield picture

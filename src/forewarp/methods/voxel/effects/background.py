@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from forewarp.fields.radiance import DirectRadiance
+from forewarp.fields.radiance_grid import FieldAtTime, RadianceGrid
 from forewarp.scene.box import Lattice
-from forewarp.scene.state import FieldAtTime, RadianceGrid
 
 
 class StaticBackground(DirectRadiance):
@@ -61,12 +61,12 @@ class Together:
         """Sigma (P,)."""
         return self.still.density(points) + self._moving_density(points)
 
-    def colors(self, points: Tensor, directions: Tensor, view: Callable | None) -> Tensor:
+    def colors(self, points: Tensor, directions: Tensor, shade: Callable | None) -> Tensor:
         """Colour (P, 3): each field's, weighted by its density."""
         own, inside = self._moved(points)
         rows = inside.nonzero()[:, 0]
         still = self.still.colors(points, directions, None)
-        moving = self.moving.colors(own[rows], directions[rows], view)
+        moving = self.moving.colors(own[rows], directions[rows], shade)
         sigma = self.moving.density(own[rows])
         # Where both are empty neither counts; the floor keeps 0 / 0 out of values and gradients.
         share = sigma / (sigma + self.still.density(points[rows])).clamp(min=torch.finfo(sigma.dtype).tiny)

@@ -5,17 +5,26 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from forewarp.effects.background import StaticBackground, Together
-from forewarp.effects.dense import densify, occupied_crop, sparsify
-from forewarp.effects.inpaint import UNet3d
-from forewarp.effects.motion import Motion
-from forewarp.effects.upsample import LearnedUpsampler, TrilinearUpsampler, interpolate_dense, refined
 from forewarp.fields.radiance import DirectRadiance, FeatureRadiance
-from forewarp.methods.checks import check_effect
-from forewarp.scene.state import RadianceGrid, State
+from forewarp.fields.radiance_grid import RadianceGrid
+from forewarp.methods.voxel.checks import check_effect
+from forewarp.methods.voxel.effects.background import StaticBackground, Together
+from forewarp.methods.voxel.effects.dense import densify, occupied_crop, sparsify
+from forewarp.methods.voxel.effects.inpaint import UNet3d
+from forewarp.methods.voxel.effects.motion import Motion
+from forewarp.methods.voxel.effects.upsample import (
+    LearnedUpsampler,
+    TrilinearUpsampler,
+    interpolate_dense,
+    refined,
+)
+from forewarp.methods.voxel.method import VoxelMethod
+from forewarp.methods.voxel.snapshot import VoxelSnapshot
+from forewarp.renderer import Renderer
+from forewarp.scene.view import Moment
 
 
-class ForwardWarp(nn.Module):
+class ForwardWarp(VoxelMethod):
     """Canonical radiance -> flow -> warped -> up-sampled (-> inpainted). An absent effect is None.
 
     Args:
@@ -26,6 +35,7 @@ class ForwardWarp(nn.Module):
         view: None: the colour features are the colour.
         background: all that stands still, on a grid of its own; None: a constant colour is behind everything.
         canonical_time: where no warp is needed.
+        renderer: makes pictures.
     """
 
     def __init__(
@@ -38,11 +48,12 @@ class ForwardWarp(nn.Module):
         inpainter: UNet3d | None = None,
         view: nn.Module | None = None,
         background: StaticBackground | None = None,
+        renderer: Renderer | None = None,
     ) -> None:
-        super().__init__()
-        effects = {"motion": motion, "upsampler": upsampler, "inpainter": inpainter, "view": view}
-        effects["background"] = background
-        for name, effect in effects.items():
+        super().__init__(
+            radiance, canonical_time=canonical_time, renderer=renderer, view=view, background=background
+        )
+        for name, effect in {"motion": motion, "upsampler": upsampler, "inpainter": inpainter}.items():
             check_effect(name, effect, f"model/{name}=none")
             setattr(self, name, effect)
         scale = getattr(upsampler, "scale", 1)
@@ -51,14 +62,13 @@ class ForwardWarp(nn.Module):
                 f"model.upsampler.scale: expected a whole number beside an inpainter, but got {scale}; "
                 "set it to 2, or choose model/inpainter=none"
             )
-        self.radiance, self.canonical_time = radiance, canonical_time
 
-    def at(self, time: float) -> State:
-        """The radiance at ``time``, under each of its renderings' names, the best last."""
+    def at(self, moment: Moment) -> VoxelSnapshot:
+        """The radiance at a moment, under each of its renderings' names, the best last."""
         canonical = self.radiance()
         warped, flow, coverage, dropped = canonical, None, None, 0
-        if self.motion is not None and time != self.canonical_time:
-            flow = self.motion.flow(self.radiance, time)
+        if self.motion is not None and moment.time != self.canonical_time:
+            flow = self.motion.flow(self.radiance, moment.time)
             warped, coverage, dropped = self.motion.warp(canonical, self.radiance.voxels, flow)
         if self.inpainter is None:
             fields, difference = {"upsampled": self._upsample(warped)}, None
@@ -68,8 +78,19 @@ class ForwardWarp(nn.Module):
         if self.background is not None:
             still = self.background()
             fields = {name: Together(field, still) for name, field in fields.items()}
-        length = 2 / 3 * self.unit if self.moves else 1.0
-        return State(time, fields, canonical, flow, coverage, dropped, difference, still, length)
+        return VoxelSnapshot(
+            moment,
+            fields,
+            canonical,
+            self.renderer,
+            self.view,
+            flow,
+            coverage,
+            dropped,
+            difference,
+            still,
+            length=2 / 3 * self.unit if self.moves else 1.0,
+        )
 
     def _upsample(self, warped: RadianceGrid) -> RadianceGrid:
         if self.upsampler is None:
@@ -104,11 +125,22 @@ class ForwardWarp(nn.Module):
         inpainted = sparsify(warped, lattice, region, dense + residual)
         return {"upsampled": upsampled, "inpainted": inpainted}, residual
 
+    def advance(self, progress: float, step: int, optimizer: torch.optim.Optimizer) -> dict[str, float]:
+        """Let more bases play, and follow the lattices' schedule."""
+        noted = super().advance(progress, step, optimizer)
+        if self.motion is None:
+            return noted
+        return noted | {"bases_in_play": self.motion.trajectory.play(self.stage.at("bases", progress))}
+
     def trajectories(self, points: Tensor, times: Tensor) -> Tensor:
         """Paths (N, T, 3) of canonical points (N, 3) at ``times`` (T,), world units."""
         if self.motion is None:
             return points[:, None].expand(-1, len(times), -1)
         return self.motion.trajectory.trajectories(points, times)
+
+    def moved(self, points: Tensor, rows: Tensor, time: float) -> Tensor:
+        """Where the voxels ``rows`` (N,) bool, which lie at ``points`` (M, 3), are at ``time`` (M, 3)."""
+        return points + self.motion.flow(self.radiance, time)[rows]
 
     @property
     def moves(self) -> bool:

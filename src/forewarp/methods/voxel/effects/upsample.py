@@ -10,11 +10,11 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.utils.checkpoint import checkpoint
 
-from forewarp.effects.dense import Crop, densify, occupied_crop, sparsify
-from forewarp.effects.inpaint import ConvBlock, Pointwise, zero_head
+from forewarp.fields.radiance_grid import RadianceGrid
+from forewarp.methods.voxel.effects.dense import Crop, densify, occupied_crop, sparsify
+from forewarp.methods.voxel.effects.inpaint import ConvBlock, Pointwise, zero_head
 from forewarp.ops.grid import index_of, occupied_cells, trilinear
 from forewarp.scene.box import Lattice
-from forewarp.scene.state import RadianceGrid
 
 
 def refined(lattice: Lattice, scale: float) -> Lattice:

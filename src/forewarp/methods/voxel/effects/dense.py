@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from forewarp.fields.radiance_grid import RadianceGrid
 from forewarp.scene.box import Lattice
-from forewarp.scene.state import RadianceGrid
 
 
 @dataclass(frozen=True)

@@ -7,14 +7,18 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from forewarp.effects.background import StaticBackground, Together
 from forewarp.fields.mlp import mlp
 from forewarp.fields.radiance import DirectRadiance
-from forewarp.methods.checks import check_effect
+from forewarp.fields.radiance_grid import RadianceGrid, Shade
+from forewarp.methods.voxel.checks import check_effect
+from forewarp.methods.voxel.effects.background import StaticBackground, Together
+from forewarp.methods.voxel.method import VoxelMethod
+from forewarp.methods.voxel.snapshot import VoxelSnapshot
 from forewarp.ops.encode import positional_encoding
 from forewarp.ops.grid import dilate
+from forewarp.renderer import Renderer
 from forewarp.scene.box import Box, Lattice
-from forewarp.scene.state import RadianceGrid, State, View
+from forewarp.scene.view import Moment
 
 
 class Deformation(nn.Module):
@@ -90,12 +94,12 @@ class MovedField:
         moved = self._moved(points)
         return self.canonical.density(moved) * self._inside(moved.detach())
 
-    def colors(self, points: Tensor, directions: Tensor, view: View | None) -> Tensor:
+    def colors(self, points: Tensor, directions: Tensor, shade: Shade | None) -> Tensor:
         """Colour (P, 3), seen along the directions as they are."""
-        return self.canonical.colors(self._moved(points), directions, view)
+        return self.canonical.colors(self._moved(points), directions, shade)
 
 
-class BackwardWarp(nn.Module):
+class BackwardWarp(VoxelMethod):
     """Canonical grid, and a deformation network on the samples.
 
     Args:
@@ -105,6 +109,7 @@ class BackwardWarp(nn.Module):
         background: as in ``ForwardWarp``.
         canonical_time: where nothing is displaced.
         mask_nodes: side of the lattice on which occupancy at a time is looked up.
+        renderer: makes pictures.
     """
 
     def __init__(
@@ -116,25 +121,27 @@ class BackwardWarp(nn.Module):
         view: nn.Module | None = None,
         background: StaticBackground | None = None,
         mask_nodes: int = 32,
+        renderer: Renderer | None = None,
     ) -> None:
-        super().__init__()
+        super().__init__(
+            radiance, canonical_time=canonical_time, renderer=renderer, view=view, background=background
+        )
         check_effect("deformation", deformation, "model=backward or another model")
-        check_effect("view", view, "model/view=none")
-        check_effect("background", background, "model/background=none")
-        self.radiance, self.deformation, self.view = radiance, deformation, view
-        self.background = background
-        self.canonical_time, self.mask_nodes = canonical_time, mask_nodes
+        self.deformation, self.mask_nodes = deformation, mask_nodes
 
-    def at(self, time: float) -> State:
+    def at(self, moment: Moment) -> VoxelSnapshot:
         """The moved canonical field, at the canonical time that itself, under the name ``backward``."""
         canonical = field = self.radiance()
+        time = moment.time
         if self.deformation is not None and time != self.canonical_time:
             field = MovedField(canonical, self.deformation, time, self._cells(canonical, time))
         still = None
         if self.background is not None:
             still = self.background()
             field = Together(field, still)
-        return State(time, {"backward": field}, canonical, background=still)
+        return VoxelSnapshot(
+            moment, {"backward": field}, canonical, self.renderer, self.view, background=still
+        )
 
     @torch.no_grad()
     def _cells(self, canonical: RadianceGrid, time: float) -> Tensor:
@@ -169,6 +176,10 @@ class BackwardWarp(nn.Module):
                 at = points - self.deformation(at, time)
             paths.append(at)
         return torch.stack(paths, 1)
+
+    def moved(self, points: Tensor, rows: Tensor, time: float) -> Tensor:
+        """Where the voxels ``rows`` (N,) bool, which lie at ``points`` (M, 3), are at ``time`` (M, 3)."""
+        return self.trajectories(points, torch.tensor([time]))[:, 0]
 
     @property
     def moves(self) -> bool:

@@ -1,9 +1,9 @@
-"""What a method answers at one time, and what the renderer makes of it."""
+"""Density and colour in space, as marched rays read them."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol
 
@@ -16,7 +16,7 @@ from forewarp.scene.box import Lattice
 EMPTY = -10.0  # raw density of an absent voxel: about exp(-10) of the opacity that raw 0 has
 
 
-View = Callable[[Tensor, Tensor], Tensor]  # features (P, C) and directions (P, 3) -> colour (P, 3)
+Shade = Callable[[Tensor, Tensor], Tensor]  # features (P, C) and directions (P, 3) -> colour (P, 3)
 
 
 class FieldAtTime(Protocol):
@@ -39,13 +39,13 @@ class FieldAtTime(Protocol):
     def density(self, points: Tensor) -> Tensor:
         """Sigma (P,)."""
 
-    def colors(self, points: Tensor, directions: Tensor, view: View | None) -> Tensor:
-        """Colour (P, 3); ``view`` makes it of the features and the directions."""
+    def colors(self, points: Tensor, directions: Tensor, shade: Shade | None) -> Tensor:
+        """Colour (P, 3); ``shade`` makes it of the features and the directions."""
 
 
-def shade(features: Tensor, directions: Tensor, view: View | None) -> Tensor:
-    """Features (P, C) seen along directions (P, 3) -> colour (P, 3); without ``view`` the first 3 are it."""
-    return torch.sigmoid(features[:, :3]) if view is None else view(features, directions)
+def shaded(features: Tensor, directions: Tensor, shade: Shade | None) -> Tensor:
+    """Features (P, C) seen along directions (P, 3) -> colour (P, 3); without ``shade`` the first 3 are it."""
+    return torch.sigmoid(features[:, :3]) if shade is None else shade(features, directions)
 
 
 @dataclass(frozen=True)
@@ -123,52 +123,10 @@ class RadianceGrid:
         # Of all channels at once: the colours alone would be a copy of the grid.
         return trilinear(self.values, self.index, points, self.fill)[:, 1:]
 
-    def colors(self, points: Tensor, directions: Tensor, view: View | None) -> Tensor:
+    def colors(self, points: Tensor, directions: Tensor, shade: Shade | None) -> Tensor:
         """Colour (P, 3) at lattice coordinates (P, 3) seen along unit directions (P, 3)."""
-        return shade(self.features(points), directions, view)
+        return shaded(self.features(points), directions, shade)
 
     def with_values(self, values: Tensor) -> RadianceGrid:
         """The same voxels with other values."""
         return replace(self, values=values)
-
-
-@dataclass(frozen=True)
-class State:
-    """Everything a method computed at one time.
-
-    ``fields`` are what is rendered, by name (``upsampled``, ``inpainted``, ``backward``), the best last;
-    ``flow`` (N, 3) world units from canonical to ``time`` on the canonical ``index``; ``coverage`` (M,) of
-    the warped voxels; ``dropped`` source voxels that left the box; ``background`` all that stands still. None
-    where a method has no such thing. ``length`` is what the loss measures flow in, world units: a third of
-    the scene's longest side, 1 for the usual box of 3, so that no weight depends on the scene's units.
-    """
-
-    time: float
-    fields: dict[str, FieldAtTime]
-    canonical: RadianceGrid
-    flow: Tensor | None = None
-    coverage: Tensor | None = None
-    dropped: int = 0
-    inpaint_difference: Tensor | None = None
-    background: RadianceGrid | None = None
-    length: float = 1.0
-
-
-@dataclass(frozen=True)
-class Rendering:
-    """``rgb`` (R, 3), ``depth`` (R,) mean distance along the ray in world units (0 where nothing is met),
-    ``opacity`` and ``transmittance`` (R,). Of the samples whose weight counts: ``weights`` (S,), their
-    ``colors`` (S, 3) and ``ray_ids`` (S,). ``samples`` is how many were read.
-    Where asked for, ``all_weights`` and ``all_ray_ids`` (P,) of all samples, which lie in occupied cells.
-    """
-
-    rgb: Tensor
-    depth: Tensor
-    opacity: Tensor
-    transmittance: Tensor
-    weights: Tensor
-    colors: Tensor
-    ray_ids: Tensor
-    samples: int = 0
-    all_weights: Tensor | None = field(default=None, repr=False)
-    all_ray_ids: Tensor | None = field(default=None, repr=False)

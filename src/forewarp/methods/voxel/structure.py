@@ -6,10 +6,10 @@ import torch
 from torch import Tensor
 from torch.nn import Parameter
 
+from forewarp.fields.radiance_grid import EMPTY
 from forewarp.fields.voxel_grid import VoxelGrid
 from forewarp.ops.grid import dilate, trilinear
 from forewarp.scene.box import Box, Lattice
-from forewarp.scene.state import EMPTY
 
 
 def seen_rows(radiance: VoxelGrid, optimizer: torch.optim.Optimizer) -> Tensor:
@@ -137,20 +137,14 @@ def box_of_all_times(method, times: list[float], *, alpha: float, pad: float) ->
 
     None where nothing is that opaque. Sources that left the box are counted by the warp, not here.
     """
-    radiance = method.radiance
-    grid = radiance()
+    grid = method.radiance()
     solid = grid.activation.alpha(grid.raw_density, grid.lattice.pitch) > alpha
     if not bool(solid.any()):
         return None
-    home = grid.lattice.to_world(radiance.voxels)[solid]
+    home = grid.lattice.to_world(method.radiance.voxels)[solid]
     low, high = home.amin(0), home.amax(0)
-    if getattr(method, "motion", None) is not None:
-        for time in times:
-            at = home + method.motion.flow(radiance, time)[solid]
-            low, high = torch.minimum(low, at.amin(0)), torch.maximum(high, at.amax(0))
-    elif hasattr(method, "deformation"):
-        for time in times:
-            at = method.trajectories(home, torch.tensor([time]))[:, 0]
-            low, high = torch.minimum(low, at.amin(0)), torch.maximum(high, at.amax(0))
+    for time in times if method.moves else ():
+        at = method.moved(home, solid, time)
+        low, high = torch.minimum(low, at.amin(0)), torch.maximum(high, at.amax(0))
     margin = pad * grid.lattice.pitch  # added first: a flat thing has no box of its own
     return Box(tuple((low - margin).tolist()), tuple((high + margin).tolist()))

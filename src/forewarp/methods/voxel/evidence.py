@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from forewarp.methods.voxel.forward_warp import ForwardWarp
 from forewarp.ops.grid import dilate, index_of, neighbour_pairs
 from forewarp.scene.box import Lattice
 from forewarp.scene.frame import Frame, Scene, spread
 from forewarp.scene.hull import visual_hull
-from forewarp.training.module import DynamicSceneModule
 
 SOLID = 0.1  # opacity over a voxel of what counts as matter here
 TORN = 2.0  # voxels from one to its neighbour; an average splat reaches one to either side
@@ -103,9 +103,8 @@ class Movement:
 
 
 @torch.no_grad()
-def movement(module: DynamicSceneModule, times: Sequence[float]) -> Movement:
-    """Evidence from a fitted stage that has motion. Cost: a flow a time, at most ``_VIEWS`` of them."""
-    method = module.method
+def movement(method: ForwardWarp, times: Sequence[float]) -> Movement:
+    """Evidence from a fitted method that has motion. Cost: a flow a time, at most ``_VIEWS`` of them."""
     grid, trajectory = method.radiance(), method.motion.trajectory
     lattice, voxels = grid.lattice, method.radiance.voxels
     solid = grid.activation.alpha(grid.raw_density, lattice.pitch) > SOLID

@@ -9,11 +9,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from forewarp.effects.background import Together
+from forewarp.fields.radiance_grid import FieldAtTime
+from forewarp.methods.voxel.effects.background import Together
+from forewarp.methods.voxel.forward_warp import ForwardWarp
 from forewarp.metrics.limits import low_passed
 from forewarp.scene.batch import Target
-from forewarp.scene.state import FieldAtTime
-from forewarp.training.module import DynamicSceneModule, render_all
+from forewarp.scene.view import View
 
 _WIDER = 4.0  # the box that places are told in: all that a static background holds lies in it
 
@@ -33,13 +34,11 @@ class Residual:
 
 
 @torch.no_grad()
-def residual(
-    module: DynamicSceneModule, targets: Sequence[Target], pitch: float, rays: int = 1500
-) -> Residual:
+def residual(method: ForwardWarp, targets: Sequence[Target], pitch: float, rays: int = 1500) -> Residual:
     """Evidence from what is left of some training pictures.
 
     Args:
-        module: fitted, without view dependence.
+        method: fitted, without view dependence.
         targets: training views.
         pitch: of the last stage's lattice, world units.
         rays: of each picture.
@@ -49,7 +48,7 @@ def residual(
     for number, target in enumerate(targets):
         camera = target.frame.camera
         pixels = torch.randperm(camera.width * camera.height, generator=generator)[:rays]
-        shown = _seen(module, target, pixels)
+        shown = _seen(method, target, pixels)
         error = target.rgb.reshape(-1, 3)[pixels] - shown[0]
         places.append(shown[1]), directions.append(camera.rays(pixels).directions), errors.append(error)
         views.append(torch.full((len(pixels),), number))
@@ -61,7 +60,7 @@ def residual(
         torch.cat(directions),
         error,
         torch.cat(views),
-        2 * module.method.radiance.lattice.pitch,
+        2 * method.radiance.lattice.pitch,
     )
     return Residual(_psnr(float(error.square().mean())), share, _psnr(sum(bounds) / len(bounds)))
 
@@ -70,15 +69,15 @@ def _psnr(error: float) -> float:
     return -10 * math.log10(max(error, 1e-10))
 
 
-def _seen(module: DynamicSceneModule, target: Target, pixels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _seen(method: ForwardWarp, target: Target, pixels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Of some pixels the colour drawn (R, 3), the canonical place (R, 3), NaN where nothing is met, and the
     median distance to what is met.
     """
-    camera, time = target.frame.camera, target.frame.time
-    drawn = module.render_image(camera, time, target.background, pixels=pixels)
-    place, box = _places(module, time), module.method.radiance.lattice.box
-    rays = camera.rays(pixels).to(module.device)
-    found = render_all(module.renderer, place, rays, rays.origins.new_zeros(3), None)
+    view, time = View(target.frame.camera, pixels), target.frame.time
+    drawn = method.at(target.moment).render(view, target.background.to(method.device))
+    place, box = _places(method, time), method.radiance.lattice.box
+    rays = view.rays().to(method.device)
+    found = method.renderer.picture(place, rays, rays.origins.new_zeros(3))
     solid = found.opacity > 0.5
     low, high = (found.rgb.new_tensor(end) for end in (box.scaled(_WIDER).low, box.scaled(_WIDER).high))
     at = low + (high - low) * found.rgb / found.opacity.clamp(min=1e-6)[:, None]
@@ -90,9 +89,8 @@ def _seen(module: DynamicSceneModule, target: Target, pixels: Tensor) -> tuple[T
     )
 
 
-def _places(module: DynamicSceneModule, time: float) -> FieldAtTime:
+def _places(method: ForwardWarp, time: float) -> FieldAtTime:
     """The radiance at a time with canonical places in the place of colours."""
-    method = module.method
     box = method.radiance.lattice.box.scaled(_WIDER)
 
     def placed(grid, voxels: Tensor):

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from forewarp.fields.voxel_grid import VoxelGrid
-from forewarp.training.settings import StageSettings
-from forewarp.training.structure import refresh, resample
+from forewarp.methods.voxel.stage import VoxelStage
+from forewarp.methods.voxel.structure import refresh, resample
 
 
 @dataclass
@@ -26,18 +26,19 @@ class Lattices:
     """The canonical grid, and the static background's where there is one.
 
     Args:
-        method: has ``radiance`` and perhaps ``background``.
+        radiance: the canonical grid.
+        background: the static one, or None.
         settings: the stage's numbers.
     """
 
-    def __init__(self, method: torch.nn.Module, settings: StageSettings) -> None:
+    def __init__(self, radiance: VoxelGrid, background: VoxelGrid | None, settings: VoxelStage) -> None:
         self.settings = settings
-        grids = {"voxels": method.radiance, "background_voxels": getattr(method, "background", None)}
+        grids = {"voxels": radiance, "background_voxels": background}
         self.followed = [
             _Followed(grid, key, settings.at(key, 0.0)) for key, grid in grids.items() if grid is not None
         ]
         # Where voxels were active at the start; only on that lattice does it mean anything.
-        self.home: Tensor = method.radiance.index >= 0
+        self.home: Tensor = radiance.index >= 0
 
     def follow(self, fraction: float, step: int, optimizer: torch.optim.Optimizer) -> None:
         """Change what is due at a fraction of the stage; the optimiser's moments follow."""

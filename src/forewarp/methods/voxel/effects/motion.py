@@ -7,10 +7,10 @@ from dataclasses import replace
 import torch
 from torch import Tensor, nn
 
+from forewarp.fields.radiance_grid import EMPTY, RadianceGrid
 from forewarp.fields.trajectory import TrajectoryField
 from forewarp.fields.voxel_grid import VoxelGrid
 from forewarp.ops.splat import Splat, average_splat, with_copies
-from forewarp.scene.state import EMPTY, RadianceGrid
 
 
 class Motion(nn.Module):

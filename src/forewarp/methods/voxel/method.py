@@ -1,0 +1,216 @@
+"""What forward and backward warping share: lattices that follow a schedule, marched rays, loss terms."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+
+import torch
+from torch import Tensor, nn
+
+from forewarp.fields.radiance import DirectRadiance, FeatureRadiance
+from forewarp.fields.radiance_grid import Activation
+from forewarp.fields.voxel_grid import VoxelGrid
+from forewarp.methods.method import Method, Start, Step
+from forewarp.methods.voxel.checks import check_effect
+from forewarp.methods.voxel.effects.background import StaticBackground
+from forewarp.methods.voxel.lattices import Lattices
+from forewarp.methods.voxel.snapshot import VoxelSnapshot
+from forewarp.methods.voxel.stage import VoxelStage
+from forewarp.methods.voxel.structure import box_of_all_times
+from forewarp.methods.voxel.terms import TERMS, Seen, voxel_terms
+from forewarp.ops.grid import neighbour_pairs
+from forewarp.renderer import Renderer
+from forewarp.scene.batch import Batch
+from forewarp.scene.box import Box
+from forewarp.scene.cloud import Cloud
+from forewarp.scene.paths import RandomPatches
+from forewarp.scene.rays import joined
+
+SOLID = 0.1  # opacity over a voxel of what counts as matter
+_STILL = 1024  # points known to stand still that a step looks at
+
+
+class VoxelMethod(Method):
+    """A canonical radiance grid, seen at other times by ``at``. An absent effect is None.
+
+    Args:
+        radiance: the canonical radiance field.
+        canonical_time: where nothing moves.
+        renderer: makes pictures.
+        view: None: the colour features are the colour.
+        background: all that stands still, on a grid of its own; None: a constant colour is behind everything.
+    """
+
+    terms = TERMS
+    moves: bool
+
+    def __init__(
+        self,
+        radiance: DirectRadiance | FeatureRadiance,
+        *,
+        canonical_time: float,
+        renderer: Renderer | None = None,
+        view: nn.Module | None = None,
+        background: StaticBackground | None = None,
+    ) -> None:
+        super().__init__()
+        check_effect("view", view, "model/view=none")
+        check_effect("background", background, "model/background=none")
+        self.radiance, self.view, self.background = radiance, view, background
+        self.canonical_time, self.renderer = canonical_time, renderer or Renderer()
+        self.lattices: Lattices | None = None
+
+    def begin(self, start: Start, stage: VoxelStage) -> VoxelMethod:
+        """Make ready for a stage: its schedule, its terms, and what they look at beside pictures."""
+        self.stage, self.renderer = stage, self.renderer.with_threshold(stage.color_threshold)
+        self.lattices = Lattices(self.radiance, self.background, stage)
+        self._terms, self._photo_on = voxel_terms(start.literal), start.photo_on
+        self._keep_all_weights = bool({"point_color", "background_entropy"} & set(start.literal))
+        cameras = [frame.camera for frame in start.scene.train]
+        self.patches = RandomPatches(cameras, patches=stage.patches) if cameras else None
+        self.still, self._pairs = start.scene.still, []
+        return self
+
+    def look(self, batch: Batch, factors: Mapping[str, float], generator: torch.Generator) -> Step:
+        """See ``Method``: all rays of a batch are of one time, and are marched together."""
+        seen = self._seen(batch, generator)
+        best, state = list(seen.renderings.values())[-1], seen.state
+        noted = {
+            "occupied_voxels": len(state.canonical.values),
+            "samples": best.samples,
+            "dropped_voxels": state.dropped,
+        }
+        if state.coverage is not None:
+            noted["coverage"] = float(state.coverage.detach().clamp(max=1).mean())
+        return Step(
+            {name: partial(term, seen) for name, term in self._terms.items()},
+            (best.rgb.detach() - seen.rgb).square().mean(),
+            noted,
+            tensors=seen.tensors,
+        )
+
+    def _seen(self, batch: Batch, generator: torch.Generator) -> Seen:
+        state = self.at(batch.observations[0].moment)
+        rays = joined([one.view.rays() for one in batch.observations]).to(self.device)
+        rgb, background = (
+            parts[0] if len(parts) == 1 or parts[0].dim() == 1 else torch.cat(parts)
+            for parts in ([getattr(one, key) for one in batch.observations] for key in ("rgb", "background"))
+        )
+        march = partial(
+            state.march,
+            rays=rays,
+            background=background,
+            generator=generator,
+            keep_all_weights=self._keep_all_weights,
+        )
+        renderings = {name: march(name) for name in self._wanted(state)}
+        return Seen(
+            rgb,
+            state,
+            renderings,
+            lambda: self._patches_of(state, generator),
+            lambda: self._stray(batch.time, generator),
+            self._neighbours,
+        )
+
+    def _wanted(self, state: VoxelSnapshot) -> list[str]:
+        """The renderings that the per-ray terms look at: those of ``photo_on``, or all."""
+        names = list(state.fields)
+        return [n for n in names if self._photo_on is None or n in self._photo_on] or names
+
+    def _patches_of(self, state: VoxelSnapshot, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        rays = self.patches.draw(generator).to(self.device)
+        shape = (self.patches.patches, self.patches.size, self.patches.size)
+        black = torch.zeros(3, device=self.device)
+        drawn = state.march(state.renderings[-1], rays, black, generator=generator)
+        return drawn.depth.reshape(shape) / (rays.far - rays.near), drawn.opacity.reshape(shape)
+
+    def _stray(self, time: float, generator: torch.Generator) -> Tensor | None:
+        """How far some of the points that stand still are displaced (N, 3), in half sides of the scene."""
+        if self.still is None or not self.moves:
+            return None
+        rows = torch.randint(len(self.still), (min(_STILL, len(self.still)),), generator=generator)
+        return self.displacement(self.still[rows].to(self.device), time) / self.unit
+
+    def _neighbours(self, index: Tensor) -> list[tuple[Tensor, Tensor]]:
+        for known, pairs in self._pairs:
+            if known is index:
+                return pairs
+        pairs = neighbour_pairs(index)
+        self._pairs = [*self._pairs[-1:], (index, pairs)]  # two grids at most; what changed is forgotten
+        return pairs
+
+    def param_groups(self) -> dict[str, list[nn.Parameter]]:
+        """Name rates: ``density``, ``color``, ``shading`` and ``grid`` (rows of voxel grids), ``flow`` (the
+        trajectory or deformation network), ``network`` (all other networks).
+        """
+        groups: dict[str, list[nn.Parameter]] = {}
+        for name, parameter in self.named_parameters():
+            head, last = name.split(".")[0], name.split(".")[-1]
+            if last in ("density", "color", "shading"):
+                kind = last
+            elif last in ("features", "grid"):
+                kind = "grid"
+            elif head in ("motion", "deformation"):
+                kind = "flow"
+            else:
+                kind = "network"
+            groups.setdefault(kind, []).append(parameter)
+        return groups
+
+    def advance(self, progress: float, step: int, optimizer: torch.optim.Optimizer) -> dict[str, float]:
+        """Follow the lattices' schedule."""
+        self.lattices.follow(progress, step, optimizer)
+        return {}
+
+    def bounds(self, times: list[float]) -> Box | None:
+        """Bound everything more opaque than the stage's ``box_alpha``, two voxels wider."""
+        return box_of_all_times(self, times, alpha=self.stage.box_alpha, pad=2.0)
+
+    @torch.no_grad()
+    def matter(self) -> Cloud:
+        """Give the centres of solid canonical voxels, seen from no side in particular."""
+        grid = self.radiance()
+        alpha = grid.activation.alpha(grid.raw_density, grid.lattice.pitch)
+        solid = alpha > SOLID
+        points = grid.lattice.to_world(self.radiance.voxels[solid])
+        colors = torch.sigmoid(grid.color[solid, :3])
+        return Cloud(points, colors, alpha[solid], grid.lattice.pitch)
+
+    def notes(self) -> dict[str, float]:
+        """Tell the unit of density."""
+        return {"unit": self.radiance.activation.unit}
+
+    @property
+    def size(self) -> tuple[str, int]:
+        """Active voxels."""
+        return "voxels", len(self.radiance.voxels)
+
+    def grids(self) -> dict[str, VoxelGrid]:
+        """Every voxel grid by its place in the ``state_dict``."""
+        return {name: part for name, part in self.named_modules() if isinstance(part, VoxelGrid)}
+
+    def adopted(self) -> set[str]:
+        """Voxel grids take a checkpoint's lattices."""
+        return {
+            f"{place}.{name}" for place, g in self.grids().items() for name in ("voxels", "index", *g.names)
+        }
+
+    def misfit(self, state: Mapping[str, Tensor]) -> str | None:
+        """Name what in a stored grid contradicts its lattice: kernels believe the index."""
+        found = ((place, grid.misfit(state, f"{place}.")) for place, grid in self.grids().items())
+        return next((f"{place}.{name}" for place, name in found if name is not None), None)
+
+    def get_extra_state(self) -> dict:
+        """The unit of density, and where the lattices' schedule stands."""
+        schedule = {} if self.lattices is None else self.lattices.state_dict()
+        return {"unit": self.radiance.activation.unit, "lattices": schedule}
+
+    def set_extra_state(self, state: dict) -> None:
+        """Adopt a checkpoint's."""
+        for grid in (self.radiance, self.background):
+            if grid is not None:
+                grid.activation = Activation(grid.activation.shift, float(state["unit"]))
+        if self.lattices is not None and state["lattices"]:
+            self.lattices.load_state_dict(state["lattices"])

@@ -1,0 +1,51 @@
+"""Matter as points, and what one stage hands to the next."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from torch import Tensor
+
+from forewarp.scene.box import Box
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """Points of the canonical matter: ``points`` (N, 3) world units, ``colors`` (N, 3) in [0, 1], ``opacity``
+    (N,) in [0, 1] of a point's own place, which is about ``size`` across, world units.
+    """
+
+    points: Tensor
+    colors: Tensor
+    opacity: Tensor
+    size: float
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def __getitem__(self, rows) -> Cloud:
+        return Cloud(self.points[rows], self.colors[rows], self.opacity[rows], self.size)
+
+
+@dataclass(frozen=True)
+class Handover:
+    """What a fitted stage leaves to the next, whatever method that is.
+
+    Attributes:
+        box: bounds of all matter at all training times, world units.
+        tight: False where the stage found nothing and its own box was kept.
+        frames_in_play: at its end.
+        cloud: a sample of the canonical matter; None where the method cannot tell.
+        times: (T,) some training times, and ``paths`` (N, T, 3), where the cloud's points are at these; None
+            where the method has no trajectories.
+        notes: numbers that only stages of the same method understand.
+    """
+
+    box: Box
+    tight: bool
+    frames_in_play: int
+    cloud: Cloud | None = None
+    times: Tensor | None = None
+    paths: Tensor | None = None
+    notes: Mapping[str, float] = field(default_factory=dict)
