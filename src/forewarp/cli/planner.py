@@ -3,61 +3,57 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, replace
+from dataclasses import asdict, fields, is_dataclass, replace
 from functools import partial
 
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from forewarp.cli import decisions
-from forewarp.cli.decisions import CUT_OUT, Decision, Evidence
 from forewarp.cli.trials import Trial, Trials, gain
 from forewarp.cli.words import key_of, merged
-from forewarp.methods.voxel.evidence import look_at, movement
-from forewarp.methods.voxel.residual import residual
-from forewarp.scene.box import Lattice
-from forewarp.scene.frame import Scene, spread
-from forewarp.training.handover import load_handover
-
-# What each effect is switched on by where the configuration has it off.
-ON = {"motion": "dct", "background": "grid", "view": "sh", "inpainter": "unet3d", "upsampler": "learned"}
-VIEWS = 24  # training views whose residual is looked at
-# Not asked while motion is learned: colour that depends on direction would explain it away.
-PLAIN = ("model/view=none", "model/inpainter=none", "model/upsampler=none")
+from forewarp.methods.effect import Asked, Begin, Decision, Effect, Planning, Rival
+from forewarp.scene.frame import Scene
+from forewarp.scene.pictures import look_at
 
 
 class Planner:
-    """Asks what a scene calls for.
+    """Asks what a scene calls for; which effects there are, and what speaks for them, the method says.
 
     Args:
         config: of the run that is planned.
         words: as typed, for it; what they fix is not asked.
         trials: runs what is tried.
         scene: as the run would read it.
+        planning: the method's.
     """
 
-    def __init__(self, config: DictConfig, words: list[str], trials: Trials, scene: Scene) -> None:
-        self.config, self.words, self.trials, self.settings = config, words, trials, config.plan
-        self.fixed = {key_of(word): word.partition("=")[2] for word in words}
-        stages = [name for name, stage in config.stage.items() if stage is not None]
-        self.coarse, self.last = stages[0], stages[-1]
+    def __init__(
+        self, config: DictConfig, words: list[str], trials: Trials, scene: Scene, planning: Planning
+    ) -> None:
+        self.words, self.trials, self.settings, self.planning = words, trials, config.plan, planning
+        self.effects: dict[str, Effect] = {effect.name: effect for effect in planning.effects}
+        typed = {key_of(word): word.partition("=")[2] for word in words}
+        stages = {name: stage for name, stage in config.stage.items() if stage is not None}
+        self.asked = Asked(
+            stages,
+            config.preset,
+            typed,
+            self._choose,
+            bool(config.plan.trials),
+        )
         # The run's share that the last stage has: what a dear effect of it takes its steps from.
-        shares = [config.stage[name].share for name in stages]
+        shares = [stage.share for stage in stages.values()]
         minutes = self.settings.minutes and self.settings.minutes * shares[-1] / sum(shares)
-        self.evidence = Evidence(look_at(scene), least=self.settings.least, minutes=minutes)
-        self.usual = int(config.budget.bases)
-        self.more = min(2 * self.usual, max(self.evidence.pictures.times - 1, 1))
-        # How a scene without silhouettes begins: faint matter everywhere.
-        faint = [f"stage.{self.coarse}.start_alpha=1e-2", f"stage.{self.coarse}.confine=0.0"]
-        self.start = faint if self.evidence.pictures.cut_out < CUT_OUT else []
+        self.evidence = planning.evidence(look_at(scene), least=self.settings.least, minutes=minutes)
 
     def plan(self) -> dict:
         """What the run is to be, and why."""
         self._fit_coarse()
-        self._look()
+        views = self.run.datamodule.targets("train")
+        self.planning.look(self.evidence, self.module.method, self.run.datamodule.scene, views, self.asked)
         if self.settings.trials:
             self._try_fine()
-        every = self._decide()
+        every = [self._as_tried(decision) for decision in self.planning.decide(self.evidence, self.asked)]
         return {
             "typed": list(self.words),
             "words": list(dict.fromkeys(word for decision in every for word in decision.words)),
@@ -66,64 +62,51 @@ class Planner:
         }
 
     def _fit_coarse(self) -> None:
-        """Coarse stages: in how many cosines does something move, does it, what stands still behind it?"""
-        pictures = self.evidence.pictures
-        if pictures.times < 2 or self.fixed.get("model/motion") == "none":
-            self._use("coarse-still", ["model/motion=none", "model/background=none", *PLAIN, *self.start])
-            return
-        behind = "model/background=" + (self._on("background") if self.start else "none")
-        self._use("coarse", [f"model/motion={self._on('motion')}", behind, *PLAIN, *self.start])
-        if not self.settings.trials:
-            return
-        if self.more > self.usual and not self.fixed.keys() & {"budget.bases", "model/motion"}:
-            self._rival("bases", "coarse-bases", self._more_bases(), it_is_more=True)
-        still = ["model/motion=none"]
-        moves = "model/motion" in self.fixed or self._rival("motion", "coarse-still", still)
-        if self.start and not moves:  # one field holds all that stands still
-            self._use("coarse-still-alone", merged(self.base, ["model/background=none"]))
-        elif self.start and "model/background" not in self.fixed:
-            self._rival("background", "coarse-alone", ["model/background=none"])
-
-    def _more_bases(self) -> list[str]:
-        return [f"budget.bases={self.more}", f"stage.{self.coarse}.bases=[[0,{self.more}]]"]
+        """Fit the coarse stages that the method names, and tell it of each rival whether it pays."""
+        stages, answer = self.planning.coarse(self.evidence, self.asked), None
+        while True:
+            try:
+                wanted = stages.send(answer)
+            except StopIteration:
+                return
+            if isinstance(wanted, Begin):
+                words = merged(self.base, wanted.words) if wanted.change else list(wanted.words)
+                answer = self._use(wanted.name, words)
+            else:
+                answer = self._rival(wanted)
 
     def _use(self, name: str, words: list[str]) -> None:
         """What the evidence is taken from and the trials begin from."""
         self.name, self.base = name, words
         self.reached, self.run, self.module = self.trials.coarse(name, words)
 
-    def _rival(self, effect: str, name: str, change: list[str], *, it_is_more: bool = False) -> bool:
-        """Fit another coarse stage, with an effect or without; go on with the better; whether it has it."""
-        words = merged(self.base, change)
-        rival = self.trials.coarse(name, words)
-        on, off = (rival[0], self.reached) if it_is_more else (self.reached, rival[0])
-        self.evidence.gains[effect] = gain([on], [off], equal_steps=False)
-        pays = self.evidence.pays(effect)
-        if pays == it_is_more:
-            self.name, self.base, (self.reached, self.run, self.module) = name, words, rival
+    def _rival(self, wanted: Rival) -> bool:
+        """Fit another coarse stage, go on with the better; whether the effect pays."""
+        words = merged(self.base, wanted.words)
+        rival = self.trials.coarse(wanted.name, words)
+        on, off = (rival[0], self.reached) if wanted.adds else (self.reached, rival[0])
+        self.evidence.gains[wanted.effect] = gain([on], [off], equal_steps=False)
+        pays = self.evidence.pays(wanted.effect)
+        if pays == wanted.adds:
+            self.name, self.base, (self.reached, self.run, self.module) = wanted.name, words, rival
         return pays
-
-    def _look(self) -> None:
-        """What the coarse stage says."""
-        datamodule, moves = self.run.datamodule, self.module.method.motion is not None
-        self.evidence.movement = movement(self.module.method, datamodule.scene.times) if moves else None
-        box = load_handover(self.run.stage_folder(self.run.stages[0])).box
-        count = max(count for _, count in self.config.stage[self.last].voxels)
-        views = datamodule.targets("train")
-        some = [views[i] for i in spread(len(views), VIEWS)]
-        self.evidence.residual = residual(self.module.method, some, Lattice.of_count(box, count).pitch)
 
     def _try_fine(self) -> None:
         """From the coarse stage on: what is still open, with it and without, at equal steps."""
         evidence, tried = self.evidence, partial(self._tried, "fine", self.base, 0)
-        asked = [e for e in decisions.open_questions(evidence) if f"model/{e}" not in self.fixed]
+        asked = [
+            effect
+            for effect in self.effects.values()
+            if effect.later and effect.group not in self.asked.typed and not effect.rules_out(evidence)
+        ]
         if asked and evidence.minutes is not None:
             plain = tried()
             half = self._tried("fine-half", self.base, 0, max(1, plain.steps // 2))
             evidence.slope, evidence.steps = gain([plain], [half]).psnr, plain.steps
             evidence.step = plain.step
         for effect in asked:
-            self._try(effect, merged(self.base, [f"model/{effect}={self._on(effect)}"]))
+            choice = f"{effect.group}={self._choose(effect.name)}"
+            self._try(effect.name, merged(self.base, [choice]))
 
     def _try(self, effect: str, words: list[str]) -> None:
         """An effect, seed by seed, as long as it is not plain that it brings nothing."""
@@ -140,49 +123,20 @@ class Planner:
     def _tried(self, name: str, words: list[str], seed: int, steps: int | None = None) -> Trial:
         return self.trials.fine(name, words, self.name, seed, steps)
 
-    def _on(self, effect: str) -> str:
+    def _choose(self, effect: str) -> str:
         """What an effect is switched on by: the configuration's own choice, or else a usual one."""
         own = HydraConfig.get().runtime.choices.get(f"model/{effect}")
-        return own if own not in (None, "none") else ON[effect]
+        return own if own not in (None, self.effects[effect].off) else self.effects[effect].on
 
-    def _decide(self) -> list[Decision]:
-        """All decisions, overruled where something was typed, with what makes the run as it was tried."""
-        evidence = self.evidence
-        motion = self._overruled(decisions.of_motion(evidence, self._on("motion")))
-        moves, found = motion.on and evidence.movement is not None, [motion]
-        if moves:
-            bases = decisions.of_bases(evidence, self.usual, self.more)
-            found.append(replace(bases, words=tuple(self._more_bases()) if bases.on else ()))
-        found += [
-            decisions.of_background(evidence, moves, self._on("background"), self.start),
-            decisions.of_view(evidence, self._on("view")),
-            decisions.of_inpainter(evidence, self._on("inpainter")),
-            decisions.of_upsampler(evidence, self._on("upsampler")),
-        ]
-        found = [motion, *(self._overruled(decision) for decision in found[1:])]
-        return [replace(d, words=d.words + self._as_tried(d.effect)) if d.on else d for d in found]
-
-    def _as_tried(self, effect: str) -> tuple[str, ...]:
-        """Later effects not while motion is learned; what is dear on the lattice that it was tried on."""
-        later = effect in decisions.LATER
-        words = [f"stage.{self.coarse}.effects=[motion,background]"] if later else []
-        if effect in decisions.DEAR:
-            words.append(f"stage.{self.last}.voxels=[[0,{self.config.stage[self.last].voxels[0][1]}]]")
-        return tuple(words)
-
-    def _overruled(self, decision: Decision) -> Decision:
-        """The decision, or what was typed in its place."""
-        key = "budget.bases" if decision.effect == "bases" else f"model/{decision.effect}"
-        if key not in self.fixed:
+    def _as_tried(self, decision: Decision) -> Decision:
+        """The decision with what makes the run as it was tried."""
+        effect = self.effects.get(decision.effect)
+        if effect is None or not decision.on:
             return decision
-        choice = self.fixed[key]
-        words = () if key == "budget.bases" else tuple(w for w in decision.words if key_of(w) != key)
-        on = choice != "none" and decision.effect != "bases"
-        return Decision(decision.effect, choice, words, f"as typed; {decision.because}", on)
+        return replace(decision, words=(*decision.words, *effect.with_it(self.asked)))
 
     def _numbers(self) -> dict:
-        evidence = self.evidence
-        known = {name: getattr(evidence, name) for name in ("pictures", "movement", "residual")}
-        found = {name: asdict(value) for name, value in known.items() if value is not None}
-        found["trials"] = {effect: asdict(one) for effect, one in evidence.gains.items()}
+        values = {f.name: getattr(self.evidence, f.name) for f in fields(self.evidence)}
+        found = {name: asdict(value) for name, value in values.items() if is_dataclass(value)}
+        found["trials"] = {effect: asdict(one) for effect, one in self.evidence.gains.items()}
         return json.loads(json.dumps(found))  # lists for tuples, as YAML has them

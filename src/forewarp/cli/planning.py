@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from omegaconf import DictConfig
@@ -14,6 +14,7 @@ from forewarp.cli.runs import HASH, build_run, content_hash
 from forewarp.cli.trials import Trials
 from forewarp.cli.words import key_of
 from forewarp.data.held import most_held_out
+from forewarp.methods.effect import Planning
 from forewarp.scene.frame import Scene
 
 # Keys that say where a run or its plan goes, not what it is.
@@ -37,6 +38,7 @@ def make_plan(config: DictConfig, words: Sequence[str]) -> dict:
     words = [word for word in words if key_of(word).split(".")[0] not in NOT_OF_IT]
     refuse(config, words)
     run = build_run(config)
+    planning = planning_of(run.model, config.model.name)
     run.datamodule.setup("fit")
     # What is typed is not asked, even where it is what the configuration has anyway.
     asked = content_hash(config, ("plan",), sorted(words), run.datamodule.fingerprint())
@@ -61,11 +63,26 @@ def make_plan(config: DictConfig, words: Sequence[str]) -> dict:
         held_out=spared(run.datamodule.scene, config.plan.held_out),
         tell=lambda name: print(f"{folder / name}", flush=True),
     )
-    made = Planner(config, words, trials, run.datamodule.scene).plan()
+    made = Planner(config, words, trials, run.datamodule.scene, planning).plan()
     seconds = time.perf_counter() - begin + trials.seconds_before
     made |= {"seconds": round(seconds, 1), "of": asked, "asked": asked_as}
     write_plan(file, made)
     return made | {"file": str(file)}
+
+
+def planning_of(model: Callable, name: str) -> Planning:
+    """How a method's effects are planned.
+
+    Raises:
+        ValueError: where it has none to plan.
+    """
+    planning = getattr(model, "planning", getattr(getattr(model, "func", None), "planning", None))
+    if planning is None:
+        raise ValueError(
+            f"model: expected a method whose effects can be planned, but {name} has none; use model=forward, "
+            "or leave out effects=auto"
+        )
+    return planning
 
 
 def spared(scene: Scene, wanted: int) -> int:
@@ -87,11 +104,6 @@ def refuse(config: DictConfig, words: Sequence[str]) -> None:
     """Refuse what cannot be planned, before anything is read."""
     if config.get("resume") is not None:
         raise ValueError("resume: expected nothing where a run is planned; leave it out")
-    if config.model.name != "forward":
-        raise ValueError(
-            f"model: expected forward, whose effects are planned, but got {config.model.name}; "
-            "use model=forward"
-        )
     if gone := [word for word in words if word.startswith("~") and not word.startswith("~stage.")]:
         raise ValueError(
             f"{gone[0]}: expected words that set something, as a plan is kept; use {gone[0][1:]}=null"

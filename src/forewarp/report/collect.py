@@ -70,6 +70,11 @@ class Result:
         return (self.config.get("variant") or {}).get("against", "base")
 
     @property
+    def effects(self) -> str:
+        """Those of its method's effects that were on, as it was measured; "" where it was not."""
+        return ", ".join(name for name, on in self.metrics.get("effects", {}).items() if on)
+
+    @property
     def seed(self) -> int:
         """Of everything random."""
         return int(self.config["seed"])

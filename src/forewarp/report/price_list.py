@@ -93,9 +93,10 @@ def every_run(results: Sequence[Result]) -> Table:
     for result in results:
         numbers = result.numbers
         about = [result.scene, result.variant, result.minutes, result.seed, result.ability]
-        rows.append([*about, *(numbers.get(measure) for measure in MEASURES), result.command])
+        end = [result.effects, result.command]
+        rows.append([*about, *(numbers.get(measure) for measure in MEASURES), *end])
     columns = [Column(name) for name in ("scene", "variant", "minutes", "seed", "views")]
-    return Table([*columns, *MEASURES.values(), Column("command")], rows)
+    return Table([*columns, *MEASURES.values(), Column("effects"), Column("command")], rows)
 
 
 def _known(group: Sequence[Result], measure: str) -> list[float]:

@@ -12,6 +12,7 @@ from torch import Tensor
 from forewarp.drawing.colors import at_least, error_colors, in_a_row
 from forewarp.drawing.files import write_png
 from forewarp.methods.abilities import HasTrajectories
+from forewarp.methods.effect import switched
 from forewarp.methods.method import parameter_count
 from forewarp.metrics.flow import end_point_error
 from forewarp.metrics.suite import ImageSuite, summarise
@@ -103,6 +104,7 @@ def evaluate(
         "steps": {name: int(noted["steps"]) for name, noted in finished.items()},
         "peak_memory_bytes": max((int(s["peak_memory_bytes"]) for s in finished.values()), default=None),
         "parameters": parameter_count(module.method),
+        "effects": switched(module.method),
         **_means(per_image),
     }
     if (flow := flow_error(module, scene)) is not None:

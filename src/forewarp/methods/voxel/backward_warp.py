@@ -13,6 +13,7 @@ from forewarp.fields.radiance_grid import RadianceGrid, Shade
 from forewarp.methods.voxel.checks import check_effect
 from forewarp.methods.voxel.effects.background import StaticBackground, Together
 from forewarp.methods.voxel.method import VoxelMethod
+from forewarp.methods.voxel.planning import EFFECTS
 from forewarp.methods.voxel.snapshot import VoxelSnapshot
 from forewarp.ops.encode import positional_encoding
 from forewarp.ops.grid import dilate
@@ -111,6 +112,8 @@ class BackwardWarp(VoxelMethod):
         mask_nodes: side of the lattice on which occupancy at a time is looked up.
         renderer: makes pictures.
     """
+
+    effects = tuple(effect for effect in EFFECTS if effect.name in ("view", "background"))
 
     def __init__(
         self,

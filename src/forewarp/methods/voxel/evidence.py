@@ -1,79 +1,23 @@
-"""What a scene's pictures, and the motion of a coarse stage fitted to them, say of what it calls for."""
+"""What the motion of a coarse stage says of what a scene calls for."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
-from forewarp.methods.voxel.forward_warp import ForwardWarp
-from forewarp.ops.grid import dilate, index_of, neighbour_pairs
-from forewarp.scene.box import Lattice
-from forewarp.scene.frame import Frame, Scene, spread
-from forewarp.scene.hull import visual_hull
+from forewarp.ops.grid import index_of, neighbour_pairs
+from forewarp.scene.frame import spread
+
+if TYPE_CHECKING:
+    from forewarp.methods.voxel.forward_warp import ForwardWarp
 
 SOLID = 0.1  # opacity over a voxel of what counts as matter here
 TORN = 2.0  # voxels from one to its neighbour; an average splat reaches one to either side
-_VIEWS, _SIDE = 40, 40
-
-
-@dataclass(frozen=True)
-class Pictures:
-    """What the pictures say before anything is fitted.
-
-    ``times`` distinct ones of ``frames``; ``cut_out``: share of transparent pixels, 0 where there is no alpha
-    or it says nothing; ``spread``: degrees between the two cameras that see the scene's middle from the most
-    different sides; ``disagreement``: share of the foreground that no still thing can explain, as no point
-    projects there that all silhouettes allow (0 without alpha).
-    """
-
-    frames: int
-    times: int
-    cut_out: float
-    spread: float
-    disagreement: float
-
-
-def look_at(scene: Scene) -> Pictures:
-    """Evidence from training frames alone. Cost: ``_VIEWS`` images, ``_SIDE``^3 points in each."""
-    frames = [scene.train[i] for i in spread(len(scene.train), _VIEWS)]
-    cut_out = 0.0
-    if scene.has_alpha:
-        cut_out = sum(float((f.load()[..., 3] < 128).float().mean()) for f in frames) / len(frames)
-    disagreement = _disagreement(scene, frames) if cut_out > 0 and len(frames) > 1 else 0.0
-    return Pictures(len(scene.train), len(scene.times), cut_out, _spread(scene), disagreement)
-
-
-def _spread(scene: Scene) -> float:
-    middle = torch.tensor([(low + high) / 2 for low, high in zip(scene.box.low, scene.box.high)]).double()
-    towards = torch.stack([frame.camera.center.double() - middle for frame in scene.train])
-    towards = functional.normalize(towards, dim=-1)
-    return math.degrees(math.acos(float((towards @ towards.T).min().clamp(-1, 1))))
-
-
-def _disagreement(scene: Scene, frames: Sequence[Frame]) -> float:
-    lattice = Lattice.of_count(scene.box, _SIDE**3)
-    points, masks, reach = lattice.to_world(lattice.all_voxels()), [], []
-    for frame in frames:
-        depth = float(frame.camera.project(points.mean(0, keepdim=True))[1])
-        reach.append(max(1, math.ceil(lattice.pitch * frame.camera.fx / max(depth, 1e-6))))
-        masks.append(dilate(frame.load()[..., 3] > 127, reach[-1]))
-    points = points[visual_hull(points, [frame.camera for frame in frames], masks)]
-    missed = total = 0
-    for frame, pixels in zip(frames, reach):
-        camera, foreground = frame.camera, frame.load()[..., 3] > 127
-        pixel, depth = camera.project(points)
-        column, row = pixel.floor().long().unbind(-1)
-        inside = (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height) & (depth > 0)
-        covered = torch.zeros_like(foreground)
-        covered[row[inside], column[inside]] = True
-        missed += int((foreground & ~dilate(covered, pixels)).sum())
-        total += int(foreground.sum())
-    return missed / max(total, 1)
+_VIEWS = 40  # times that are looked at, at most
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ from forewarp.methods.voxel.effects.upsample import (
     refined,
 )
 from forewarp.methods.voxel.method import VoxelMethod
+from forewarp.methods.voxel.planning import EFFECTS
 from forewarp.methods.voxel.snapshot import VoxelSnapshot
 from forewarp.renderer import Renderer
 from forewarp.scene.view import Moment
@@ -37,6 +38,8 @@ class ForwardWarp(VoxelMethod):
         canonical_time: where no warp is needed.
         renderer: makes pictures.
     """
+
+    effects = EFFECTS
 
     def __init__(
         self,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields
+from typing import ClassVar
 
 from torch import nn
 
@@ -15,6 +16,7 @@ from forewarp.methods.voxel.effects.motion import Motion
 from forewarp.methods.voxel.effects.upsample import LearnedUpsampler, TrilinearUpsampler
 from forewarp.methods.voxel.forward_warp import ForwardWarp
 from forewarp.methods.voxel.method import VoxelMethod
+from forewarp.methods.voxel.planning import VoxelPlanning
 from forewarp.methods.voxel.stage import VoxelStage
 from forewarp.methods.voxel.start import Ground, carried, ground_of, is_carried, set_start_density
 from forewarp.renderer import Renderer
@@ -71,6 +73,8 @@ class VoxelModel:
 @dataclass(frozen=True)
 class ForwardModel(VoxelModel):
     """The paper: a canonical grid warped forward, with its optional parts."""
+
+    planning: ClassVar[VoxelPlanning] = VoxelPlanning()
 
     motion: Callable[..., Motion] | None = None
     trajectory: Callable[..., TrajectoryField] | None = None

@@ -5,16 +5,19 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from forewarp.fields.radiance_grid import FieldAtTime
 from forewarp.methods.voxel.effects.background import Together
-from forewarp.methods.voxel.forward_warp import ForwardWarp
 from forewarp.metrics.limits import low_passed
 from forewarp.scene.batch import Target
 from forewarp.scene.view import View
+
+if TYPE_CHECKING:
+    from forewarp.methods.voxel.forward_warp import ForwardWarp
 
 _WIDER = 4.0  # the box that places are told in: all that a static background holds lies in it
 
