@@ -21,7 +21,7 @@ from forewarp.data.clouds import read_cloud, write_cloud
 from forewarp.data.files import inside, number, read_json, replace_file, scene_folder, whole
 from forewarp.data.images import CachedImage, inspect_png, write_png
 from forewarp.data.nerfies_camera import numbers, read_camera, reduced, write_camera
-from forewarp.data.nerfies_items import read_split, read_times
+from forewarp.data.nerfies_items import read_camera_ids, read_split, read_times
 from forewarp.data.truth import read_truth, write_truth
 from forewarp.data.views import MOST_UNITS, box_of, frustum_box, middle_of
 from forewarp.scene.camera import Camera
@@ -84,6 +84,7 @@ def read_scene(root: str | Path, scene: str, *, scale: int = 2, box: Sequence[fl
     images, world = _image_folder(folder, scale), _read_world(folder / "scene.json")
     split = read_split(folder / "dataset.json")
     times = read_times(folder / "metadata.json", split.ids)
+    camera_ids = read_camera_ids(folder / "metadata.json", split.ids)
 
     def frame(item: str) -> Frame:
         where = f"{folder / 'dataset.json'}: ids"
@@ -95,7 +96,7 @@ def read_scene(root: str | Path, scene: str, *, scale: int = 2, box: Sequence[fl
                 f"{path}: expected {size[0]} x {size[1]} pixels, the camera's image_size / {scale}, but got "
                 f"{found[0]} x {found[1]}"
             )
-        return Frame(item, times[item], camera, CachedImage(path, size))
+        return Frame(item, times[item], camera, CachedImage(path, size), camera_id=camera_ids[item])
 
     train, test = (tuple(map(frame, items)) for items in (split.train, split.test))
     canonical = middle_of(f.time for f in train)

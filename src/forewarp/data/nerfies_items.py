@@ -77,3 +77,19 @@ def read_times(path: Path, ids: list[str]) -> dict[str, float]:
         numbered[item] = value
     last = max(numbered.values()) or 1.0
     return {item: value / last for item, value in numbered.items()}
+
+
+def read_camera_ids(path: Path, ids: list[str]) -> dict[str, int | None]:
+    """Tell which camera took every item of a ``metadata.json``: its ``camera_id``; None where it has none.
+
+    Raises:
+        SceneError: for one that is no whole number >= 0.
+    """
+    content, found = read_json(path), {}
+    for item in ids:
+        entry = content.get(item)
+        value = entry.get("camera_id") if isinstance(entry, dict) else None
+        if value is not None and number(value, f"{path}: {item!r}.camera_id", 0, _MOST_MOMENTS) % 1:
+            raise SceneError(f"{path}: {item!r}.camera_id: expected a whole number, but got {value:g}")
+        found[item] = None if value is None else int(value)
+    return found

@@ -81,7 +81,9 @@ def read_scene(
         place, name = folder / "img" / str(f), f"img_{k:04d}.jpg"
         load = MaskedImage(place / name, place / "mask" / name, sizes[k], half_resolution)
         ability = "space" if k in held else "all"
-        return Frame(f"{f}/img_{k:04d}", f / max(moments - 1, 1), cameras[k], load, ability=ability)
+        return Frame(
+            f"{f}/img_{k:04d}", f / max(moments - 1, 1), cameras[k], load, ability=ability, camera_id=k
+        )
 
     train = tuple(view(f, k) for f in range(moments) for k in range(len(poses)) if k not in held)
     test = tuple(view(f, k) for f in range(0, moments, every) for k in held)
