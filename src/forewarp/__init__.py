@@ -1,1 +1,23 @@
-"""Reconstruct a moving scene from images by forward warping a canonical radiance field."""
+"""Reconstruct a moving scene from images, and see it from anywhere, at any time.
+
+``forewarp.load(run)`` opens a fitted scene; everything else is imported from the file that defines it.
+"""
+
+
+def load(run, *, trust=(), device="cpu"):
+    """Open a fitted run, to render it, follow its points and read its numbers.
+
+    Args:
+        run: the run's folder.
+        trust: packages whose code the run's config may name, beside forewarp; nothing else is imported.
+        device: where to compute: ``cpu`` or ``cuda``.
+
+    Returns:
+        a ``forewarp.cli.fitted.Fitted``.
+
+    Raises:
+        ValueError: where there is no finished run, or where it names code that is not trusted.
+    """
+    from forewarp.cli.fitted import open_run
+
+    return open_run(run, trust=trust, device=device)
