@@ -21,7 +21,8 @@ import torch
 from torch import Tensor
 
 from forewarp.cli.entry import MISTAKE, one_line, quiet
-from forewarp.cli.runs import build_run, saved_config
+from forewarp.cli.identity import saved_config
+from forewarp.cli.runs import build_run
 from forewarp.cli.stability import table
 from forewarp.data.batches import Targets
 from forewarp.metrics.image import psnr
