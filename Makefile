@@ -36,7 +36,7 @@ install: ## make .venv and put forewarp into it, with all its extras but the lau
 	if [ -n "$$links" ]; then export UV_FIND_LINKS="$$links"; fi; \
 	VIRTUAL_ENV="$$PWD/.venv" $(BIN)/uv pip install -c constraints.txt -e '.[cpu,synth,plots,dev]'
 
-install-launchers: ## add joblib, Ray and submitit, that sweeps may run on (launcher=...)
+install-launchers: ## add joblib, Ray and submitit, that sweeps may run on (launcher=...), and Optuna
 	links="$$($(BIN)/pip config get global.find-links 2>/dev/null || echo "$$PIP_FIND_LINKS")"; \
 	if [ -n "$$links" ]; then export UV_FIND_LINKS="$$links"; fi; \
 	VIRTUAL_ENV="$$PWD/.venv" $(BIN)/uv pip install -c constraints.txt -e '.[sweeps]'
@@ -74,7 +74,7 @@ bench-gpu: ## steps, frames and PSNR against seconds on a GPU [DATA= SCENES="a b
 
 accuracy-time: ## sweep choices against training time and draw it [DATA= SCENE= MINUTES= VARIANTS=a,b SEEDS=3]
 	status=0; $(SWEEP) $(if $(DATA),experiment=dnerf data.root=$(DATA) data.scene=$(SCENE)) $(MORE) $(GO_ON); \
-	$(BIN)/forewarp-report kind=accuracy_time published=docs/results/published.yaml && exit $$status
+	$(BIN)/forewarp-report kind=accuracy_time out=docs/results && exit $$status
 
 price-list: SEEDS ?= 2
 price-list: ## what each choice costs and brings, on the vehicle and two real scenes [DATA= SCENES="a b" MINUTES=]
@@ -83,7 +83,7 @@ price-list: ## what each choice costs and brings, on the vehicle and two real sc
 	for scene in $(SCENES); do \
 		$(SWEEP) experiment=dnerf data.root=$(DATA) data.scene=$$scene $(MORE) $(GO_ON); \
 	done; \
-	$(BIN)/forewarp-report kind=price_list && exit $$status
+	$(BIN)/forewarp-report kind=price_list out=docs/results && exit $$status
 
 COMPARE = $(BIN)/forewarp-train --multirun sweeps=effects $(if $(THREADS),threads=$(THREADS))
 effects: MINUTES := $(if $(filter command line,$(origin MINUTES)),$(MINUTES),2)
@@ -115,14 +115,14 @@ reproduce-tables: ## the paper's tables and figures, measured beside printed [DA
 ifeq ($(DATA),)
 	@status=0; $(MAKE) --no-print-directory -j2 tables-vehicle tables-captures \
 		BUDGET=$(BUDGET) MINUTES=$(MINUTES) SEEDS=$(SEEDS) $(GO_ON); \
-	$(BIN)/forewarp-report kind=paper out=$(OUT) && exit $$status
+	$(BIN)/forewarp-report kind=paper out=$(OUT) curves=docs/results && exit $$status
 else
 	@status=0; for sweep in $(SWEEPS); do \
 		$(REPRODUCE) sweeps=$$sweep paths.scenes=$(DATA) \
 			$(if $(filter faithful,$(BUDGET)),$$([ $$sweep = hypernerf ] && echo experiment=hypernerf_faithful)) \
 			$(if $(SCENES_TYPED),scene=$(subst $(space),$(comma),$(addprefix dnerf_,$(SCENES_TYPED)))) $(GO_ON); \
 	done; \
-	$(BIN)/forewarp-report kind=paper out=$(OUT) && exit $$status
+	$(BIN)/forewarp-report kind=paper out=$(OUT) curves=docs/results && exit $$status
 endif
 
 tables-vehicle: PAIRS := methods:dnerf ablation_losses:dnerf ablation_modules:dnerf nhr:nhr lego_complete:lego_complete ablation_modules:lego_complete

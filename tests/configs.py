@@ -1,10 +1,11 @@
 """Composes the project's configurations."""
 
-import os
 from pathlib import Path
 
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
+
+from forewarp.cli.folders import configurations
 
 ROOT = Path(__file__).parents[1]
 CONF = ROOT / "conf"
@@ -12,8 +13,7 @@ CONF = ROOT / "conf"
 
 def composed(*overrides: str, name: str = "train", hydra: bool = False) -> DictConfig:
     """The configuration that a command line composes; with Hydra's own part where asked for."""
-    os.environ.setdefault("FOREWARP_ROOT", str(ROOT))
-    with initialize_config_dir(str(CONF), version_base="1.3"):
+    with initialize_config_dir(str(configurations()), version_base="1.3"):
         return compose(name, list(overrides), return_hydra_config=hydra)
 
 

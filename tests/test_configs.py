@@ -4,6 +4,7 @@ import re
 from dataclasses import MISSING, fields
 from functools import cache
 from inspect import signature
+from pathlib import Path
 
 import pytest
 import torch
@@ -239,3 +240,11 @@ def test_every_dataset_takes_a_canonical_time_and_the_budgets_background(data):
 def test_run_folder_is_named_after_the_choices():
     config = composed("data.scene=hook", "data=dnerf", "model=backward", "budget=demo", "seed=3")
     assert config.run == "runs/hook/backward-demo-seed3"
+
+
+def test_the_repository_is_no_group_of_configurations():
+    sources = composed(hydra=True).hydra.runtime.config_sources
+    places = [source.path for source in sources if source.provider not in ("hydra", "schema")]
+    assert [Path(place) for place in places] == [CONF]
+    with pytest.raises(ConfigCompositionException, match="Could not find 'sweeps/nothing'"):
+        composed("sweeps=nothing")

@@ -5,7 +5,8 @@ from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from configs import ROOT, composed
-from forewarp.cli.runs import build_run, hashed
+from forewarp.cli.identity import hashed
+from forewarp.cli.runs import build_run
 from forewarp.cli.train import refuse_budget
 
 PAPER = {

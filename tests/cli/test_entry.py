@@ -1,9 +1,13 @@
 import errno
+import importlib
+import shutil
 
 import pytest
+from omegaconf import OmegaConf
 
-from configs import options
-from forewarp.cli.entry import one_line, project_root
+from configs import CONF, ROOT, options
+from forewarp.cli.entry import one_line
+from forewarp.cli.folders import project_root
 from forewarp.cli.misspelt import with_keys
 from forewarp.scene.errors import SceneError
 
@@ -34,6 +38,44 @@ def test_missing_conf_is_named(refused, monkeypatch, in_tmp):
 
 def test_the_root_holds_conf():
     assert (project_root() / "conf" / "train.yaml").is_file()
+
+
+@pytest.mark.parametrize("installed", [False, True])
+def test_data_lie_in_the_checkout_or_in_the_current_folder(forewarp, monkeypatch, in_tmp, installed):
+    if installed:
+        package = in_tmp / "site" / "forewarp"
+        shutil.copytree(CONF, package / "conf")
+        monkeypatch.setattr("forewarp.cli.folders.PACKAGE", package)
+    shown = OmegaConf.create(forewarp("train", "--cfg", "job", "--resolve").out)
+    assert shown.paths.data == ("./data" if installed else str(ROOT / "data"))
+    assert shown.run.startswith("runs/")
+
+
+@pytest.mark.parametrize("way", ["--config-dir", "file", "pkg"])
+def test_options_of_ones_own_stand_beside_ours(forewarp, way, in_tmp, monkeypatch):
+    conf = in_tmp / f"theirs_{way.strip('-')[:4]}" / "conf"
+    for group, text in (
+        ("experiment", "defaults:\n  - override /model: backward\n\nseed: 7\n"),
+        ("sweeps", "hydra: {sweeper: {params: {model: 'forward,backward'}}}\n"),
+    ):
+        (conf / group).mkdir(parents=True)
+        (conf / group / "mine.yaml").write_text(f"# @package _global_\n{text}")
+    for folder in (conf.parent, conf):
+        (folder / "__init__.py").touch()
+    monkeypatch.syspath_prepend(in_tmp)
+    importlib.invalidate_caches()
+    ways = {"file": f"file://{conf}", "pkg": f"pkg://{conf.parent.name}.conf"}
+    words = [way, conf] if way == "--config-dir" else [f"hydra.searchpath=[{ways[way]}]"]
+
+    def shown(*more):
+        done = forewarp("train", *words, *more, "--cfg", "all")
+        assert done.status == 0, done.err
+        return OmegaConf.create(done.out)
+
+    config = shown("experiment=mine", "budget=demo", "sweeps=mine")
+    assert (config.seed, config.model.warp, config.budget.name) == (7, "backward", "demo")
+    assert config.hydra.sweeper.params.model == "forward,backward"
+    assert shown("experiment=demo", "sweeps=methods").seeds == 2
 
 
 @pytest.mark.parametrize(

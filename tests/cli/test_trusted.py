@@ -6,7 +6,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from configs import CONF, composed
-from forewarp.cli.runs import read_config, saved_config
+from forewarp.cli.identity import read_config, saved_config
 from forewarp.cli.trusted import MOST_BYTES, trusted_config
 
 

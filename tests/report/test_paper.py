@@ -6,7 +6,6 @@ import os
 import re
 import shutil
 import subprocess
-from pathlib import Path
 
 import imageio.v3 as iio
 import numpy as np
@@ -18,10 +17,9 @@ from forewarp.report.collect import collect
 from forewarp.report.page import latex_text
 from forewarp.report.paper import write_paper
 from forewarp.report.pictures import thirds
-from forewarp.report.published import read_paper
+from forewarp.report.published import PAPER, read_paper
 from runs_on_disk import write_run
 
-PRINTED = Path(__file__).parents[2] / "docs" / "results" / "paper.yaml"
 ALL = ["hellwarrior", "mutant", "hook", "bouncingballs", "lego", "trex", "standup", "jumpingjacks"]
 
 
@@ -44,7 +42,7 @@ def paper_run(root, scene, variant=None, seed=0, *, dataset="dnerf", made=False,
 
 def table_of(root, key="dnerf", **options):
     results, _ = collect(root, ["metrics.json"])
-    return comparison(with_means(read_paper(PRINTED)[key], results), results, **options)
+    return comparison(with_means(read_paper(PAPER)[key], results), results, **options)
 
 
 def cells(table, name, kind="measured"):
@@ -114,7 +112,7 @@ def test_a_scene_with_one_kind_of_view_is_measured_by_it(tmp_path):
     metrics = json.loads((folder / "metrics.json").read_text())
     metrics["protocol"]["resolution"] = [[512, 384], [1024, 768]]
     (folder / "metrics.json").write_text(json.dumps(metrics))
-    write_paper(tmp_path, tmp_path / "out", PRINTED)
+    write_paper(tmp_path, tmp_path / "out")
     text = (tmp_path / "out" / "paper.md").read_text()
     assert "* protocol: nhr, 512x384 and 1024x768, background white" in text
 
@@ -122,7 +120,7 @@ def test_a_scene_with_one_kind_of_view_is_measured_by_it(tmp_path):
 def test_counterparts_never_meet_printed_numbers(tmp_path):
     paper_run(tmp_path, "vehicle", made=True, psnr=28.0)
     results, _ = collect(tmp_path, ["metrics.json"])
-    table = counterpart(read_paper(PRINTED)["dnerf"], results)
+    table = counterpart(read_paper(PAPER)["dnerf"], results)
     made = comparison(table, results)
     assert [column.name for column in made.columns[2:-1]] == [
         "vehicle PSNR↑",
@@ -130,7 +128,7 @@ def test_counterparts_never_meet_printed_numbers(tmp_path):
         "vehicle LPIPS↓",
     ]
     assert [row[1] for row in made.rows] == ["measured"]
-    write_paper(tmp_path, tmp_path / "out", PRINTED)
+    write_paper(tmp_path, tmp_path / "out")
     text = (tmp_path / "out" / "paper.md").read_text()
     first, second = text.split("## Table 1: D-NeRF, mean of eight scenes")[1:3]
     assert "28.00" not in first
@@ -152,8 +150,7 @@ def whole(tmp_path):
     for side, psnr in ((20, 18.0), (40, 20.0)):
         paper_run(runs, "vrig-chicken", f"voxels_{side}", dataset="hypernerf", psnr=psnr)
     write_run(runs, "failed", psnr=None)
-    printed = shutil.copy(PRINTED, tmp_path)  # away from the curves that are kept beside it
-    files = write_paper(runs, tmp_path / "out", Path(printed))
+    files = write_paper(runs, tmp_path / "out")
     assert all(file.is_file() for file in files)
     return tmp_path / "out"
 
@@ -207,7 +204,7 @@ def test_latex_compiles(whole):
 def test_of_runs_alike_the_newest_counts(tmp_path):
     old, new = paper_run(tmp_path / "a", "hook", psnr=10.0), paper_run(tmp_path / "b", "hook", psnr=20.0)
     os.utime(old / "metrics.json", (1, 1))
-    write_paper(tmp_path, tmp_path / "out", PRINTED)
+    write_paper(tmp_path, tmp_path / "out")
     text = (tmp_path / "out" / "paper.md").read_text()
     assert f"* {old}: another run of the same is newer" in text
     assert "20.00" in text
@@ -243,16 +240,26 @@ def test_machines_have_rows_of_their_own(tmp_path):
 
 def test_a_synthesised_scene_is_a_counterpart_however_it_is_read(tmp_path):
     altered(paper_run(tmp_path / "runs", "lift", dataset="lego_complete"), synthetic=True)
-    write_paper(tmp_path / "runs", tmp_path / "out", PRINTED)
+    write_paper(tmp_path / "runs", tmp_path / "out")
     text = (tmp_path / "out" / "paper.md").read_text()
     assert "## Table 4: Lego Complete, by ability: synthetic counterpart" in text
     assert "difference to the paper" not in text
 
 
+def test_curves_that_were_drawn_before_are_shown(tmp_path):
+    paper_run(tmp_path / "runs", "hook")
+    (tmp_path / "curves").mkdir()
+    iio.imwrite(tmp_path / "curves" / "accuracy-time-hook.png", np.zeros((2, 2, 3), np.uint8))
+    for folder in ("absent", "curves"):
+        write_paper(tmp_path / "runs", tmp_path / "out", curves=tmp_path / folder)
+        shown = "accuracy-time-hook.png" in (tmp_path / "out" / "paper.md").read_text()
+        assert shown is (folder == "curves")
+
+
 def test_other_variants_called_voxels_are_not_of_the_figure(tmp_path):
     for side in (20, 40, "all"):
         paper_run(tmp_path / "runs", "ball", f"voxels_{side}", dataset="hypernerf")
-    files = write_paper(tmp_path / "runs", tmp_path / "out", PRINTED)
+    files = write_paper(tmp_path / "runs", tmp_path / "out")
     assert tmp_path / "out" / "paper-resolution.png" in files
 
 
@@ -271,7 +278,7 @@ def test_measured_rows_keep_the_order_of_the_variants(tmp_path):
     for variant in ("no_inpainter", "full", "no_tv"):
         paper_run(tmp_path, "hook", variant)
     results, _ = collect(tmp_path)
-    found = measured(read_paper(PRINTED)["modules"], results)
+    found = measured(read_paper(PAPER)["modules"], results)
     assert [row.row.variant for row in found] == ["full", "no_tv", "no_inpainter"]
 
 

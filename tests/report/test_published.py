@@ -5,10 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from forewarp.report.published import read_paper
+from forewarp.report.published import PAPER, read_paper
 
 ROOT = Path(__file__).parents[2]
-FILE = ROOT / "docs" / "results" / "paper.yaml"
 TEXT = ROOT.parent / "shared" / "docs" / "paper.tex"
 needs_paper = pytest.mark.skipif(not TEXT.is_file(), reason="the paper's source text is not here")
 
@@ -27,13 +26,13 @@ def printed(label):
 
 
 def kept(key):
-    return [list(row.values) for row in read_paper(FILE)[key].rows]
+    return [list(row.values) for row in read_paper(PAPER)[key].rows]
 
 
 @needs_paper
 @pytest.mark.parametrize("key", ["dnerf", "hypernerf", "nhr", "lego_complete", "modules"])
 def test_every_number_is_the_printed_one(key):
-    assert kept(key) == printed(read_paper(FILE)[key].source)
+    assert kept(key) == printed(read_paper(PAPER)[key].source)
 
 
 @needs_paper
@@ -50,7 +49,7 @@ def test_the_losses_are_the_supplements_turned():
 
 
 def test_the_papers_slips_are_footnotes_that_its_numbers_bear_out():
-    tables = read_paper(FILE)
+    tables = read_paper(PAPER)
     scenes = tables["dnerf_scenes"]
     for name, those in scenes.means:
         scenes = scenes.with_mean(name, those)

@@ -8,11 +8,12 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TextIO
+from typing import TYPE_CHECKING, TextIO
 
 from forewarp.data.fingerprint import LOCK, difference
-from forewarp.training.handover import read_json, write_json
-from forewarp.training.stages import Run
+
+if TYPE_CHECKING:
+    from forewarp.training.stages import Run
 
 try:
     import fcntl
@@ -81,6 +82,8 @@ def same_data(run: Run, changed: str) -> None:
     Raises:
         ValueError: naming what changed.
     """
+    from forewarp.training.handover import read_json, write_json
+
     if changed not in CHOICES:
         raise ValueError(f"data_changed: expected one of {', '.join(CHOICES)}, but got {changed}")
     path, now = Path(run.folder) / DATA, run.datamodule.fingerprint()
@@ -99,6 +102,8 @@ def same_data(run: Run, changed: str) -> None:
 
 def tell_other_data(run: Run) -> None:
     """Say so where the scene's files are no longer those that a run was begun with."""
+    from forewarp.training.handover import read_json
+
     path, now = Path(run.folder) / DATA, run.datamodule.fingerprint()
     if now is not None and (found := _change(run, read_json(path), now)):
         print(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 import statistics
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,9 +12,12 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from forewarp.cli.endurance import SMALL
-from forewarp.cli.entry import ROOT_VARIABLE, project_root, quiet
+from forewarp.cli.entry import quiet
+from forewarp.cli.folders import configurations
+from forewarp.cli.identity import claim
 from forewarp.cli.measure import device_of
-from forewarp.cli.runs import build_run, claim
+from forewarp.cli.runs import build_run
+from forewarp.report.published import PAPER
 from forewarp.training.accuracy import FILE, read_rows
 from forewarp.training.clock import now
 from forewarp.training.module import DynamicSceneModule
@@ -64,8 +66,7 @@ class StepTimes(lightning.Callback):
 
 def fit(overrides: Sequence[str]) -> tuple[Run, DynamicSceneModule, StepTimes]:
     """The run that a command line of ``forewarp-train`` composes, fitted anew or as far as it is not."""
-    os.environ[ROOT_VARIABLE] = str(project_root())
-    with initialize_config_dir(str(project_root() / "conf"), version_base="1.3"):
+    with initialize_config_dir(str(configurations()), version_base="1.3"):
         config = compose("train", list(overrides))
     run, times = build_run(config), StepTimes()
     claim(config)  # a folder fitted with other bounds is refused
@@ -92,7 +93,7 @@ def frames(run: Run, module: DynamicSceneModule, size: int, repeats: int = 5) ->
 
 def papers(scene: str) -> str:
     """What the paper prints for a D-NeRF scene; empty for another."""
-    printed = OmegaConf.load(project_root() / "docs" / "results" / "paper.yaml").tables.dnerf_scenes
+    printed = OmegaConf.load(PAPER).tables.dnerf_scenes
     ours = next(row["values"] for row in printed.rows if row["name"] == "Ours")
     columns = {group["scenes"][0]: 3 * i for i, group in enumerate(printed.groups)}
     return f", the paper {ours[columns[scene]]:.2f}" if scene in columns else ""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import tempfile
 import time
 from collections.abc import Sequence
@@ -73,14 +72,13 @@ def trial(seed: int, rate: float, steps: int, data: Path) -> dict:
     """Fit once from a hostile start; PSNR of the test views, and the first thing that went wrong, if any."""
     from hydra import compose, initialize_config_dir
 
-    from forewarp.cli.entry import ROOT_VARIABLE, project_root
+    from forewarp.cli.folders import configurations
     from forewarp.cli.runs import build_run
     from forewarp.training.module import DynamicSceneModule
 
-    os.environ[ROOT_VARIABLE] = str(project_root())
     begin = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
-        with initialize_config_dir(str(project_root() / "conf"), version_base="1.3"):
+        with initialize_config_dir(str(configurations()), version_base="1.3"):
             config = compose("train", overrides(seed, rate, steps, data, Path(folder)))
         run = build_run(config)
         fit_stage = run._fit_stage

@@ -1,4 +1,4 @@
-"""What all commands share: where conf/ is, one line for a mistake, and the help."""
+"""What all commands share: one line for a mistake, and the help."""
 
 from __future__ import annotations
 
@@ -14,26 +14,11 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
+from forewarp.cli.folders import configurations, project_root
 from forewarp.cli.misspelt import unknown_key, with_keys
 
-ROOT_VARIABLE, TRACEBACK_VARIABLE = "FOREWARP_ROOT", "FOREWARP_TRACEBACK"
+TRACEBACK_VARIABLE = "FOREWARP_TRACEBACK"
 MISTAKE, INTERRUPTED = 2, 130
-
-
-def project_root() -> Path:
-    """The folder that holds ``conf/``: the checkout, or what ``FOREWARP_ROOT`` names.
-
-    Raises:
-        ValueError: where there is no ``conf/``.
-    """
-    named = os.environ.get(ROOT_VARIABLE)
-    root = Path(named).expanduser().resolve() if named else Path(__file__).resolve().parents[3]
-    if not (root / "conf" / "train.yaml").is_file():
-        raise ValueError(
-            f"{root / 'conf'}: expected the configuration files, but got none; "
-            f"install with pip install -e from a checkout, or set {ROOT_VARIABLE} to one"
-        )
-    return root
 
 
 def command(name: str, task: Callable, text: str, *, config: str | None = None) -> None:
@@ -50,13 +35,11 @@ def command(name: str, task: Callable, text: str, *, config: str | None = None) 
     """
     quiet()
     try:
-        root = project_root()
-        os.environ[ROOT_VARIABLE] = str(root)
         if {"-h", "--help"} & set(sys.argv[1:]):
-            print(text.strip() + "\n\n" + choices(root / "conf", config or name), flush=True)
+            print(text.strip() + "\n\n" + choices(project_root() / "conf", config or name), flush=True)
             sys.exit(0)
         sys.argv[1:] = _words(name)
-        failures = _run(name, task, root / "conf", config or name)
+        failures = _run(name, task, configurations(), config or name)
     except KeyboardInterrupt:
         _interrupted(name)
     except BrokenPipeError:  # whoever read the output has seen enough
@@ -130,8 +113,7 @@ def _run(name: str, task: Callable, conf: Path, config_name: str) -> list[int]:
 
 def _tell(name: str, error: Exception, config_name: str) -> int:
     """Say what went wrong and return the exit status."""
-    conf = Path(os.environ.get(ROOT_VARIABLE, "")) / "conf"
-    line = unknown_key(error, conf, config_name, sys.argv[1:]) or one_line(error)
+    line = unknown_key(error, config_name, sys.argv[1:]) or one_line(error)
     if line is None or os.environ.get(TRACEBACK_VARIABLE) == "1":
         traceback.print_exception(error)
     print(f"forewarp-{name}: error: {line or _bug(error)}", file=sys.stderr)

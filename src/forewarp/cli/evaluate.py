@@ -22,11 +22,14 @@ What one types most:
 
 def evaluate(config) -> None:
     """Load and measure."""
-    from forewarp.cli.claims import alone, tell_other_data
-    from forewarp.cli.measure import measure
-    from forewarp.cli.runs import build_run, saved_config
+    from forewarp.cli.identity import saved_config
 
     saved = saved_config(config.run, config)
+    # These load torch; what is mistyped has been answered before.
+    from forewarp.cli.claims import alone, tell_other_data
+    from forewarp.cli.measure import measure
+    from forewarp.cli.runs import build_run
+
     run = build_run(saved)
     with alone(run.folder):
         module = run.load()

@@ -10,7 +10,8 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
-from forewarp.cli.runs import build_run, saved_config
+from forewarp.cli.identity import saved_config
+from forewarp.cli.runs import build_run
 from forewarp.cli.trusted import trust_of
 from forewarp.data.batches import color_of
 from forewarp.methods.abilities import HasMatter, HasTrajectories

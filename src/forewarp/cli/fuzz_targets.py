@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -57,14 +56,14 @@ def run_targets(root: Path) -> list[Target]:
     from hydra import compose, initialize_config_dir
     from omegaconf import OmegaConf
 
-    from forewarp.cli.entry import ROOT_VARIABLE, project_root
-    from forewarp.cli.runs import build_run, saved_config
+    from forewarp.cli.folders import configurations
+    from forewarp.cli.identity import saved_config
+    from forewarp.cli.runs import build_run
     from forewarp.training.checkpoints import check_state, load_weights
 
-    os.environ[ROOT_VARIABLE] = str(project_root())
     root.joinpath("config").mkdir()
     root.joinpath("checkpoint").mkdir()
-    with initialize_config_dir(str(project_root() / "conf"), version_base="1.3"):
+    with initialize_config_dir(str(configurations()), version_base="1.3"):
         config = compose("train", list(_SMALL))
     config = OmegaConf.create(OmegaConf.to_container(config, resolve=True))
     (root / "config" / "config.yaml").write_text(OmegaConf.to_yaml(config))

@@ -20,7 +20,8 @@ from statistics import fmean
 from torch import Tensor
 
 from forewarp.cli.entry import MISTAKE, one_line, quiet
-from forewarp.cli.runs import build_run, saved_config
+from forewarp.cli.identity import saved_config
+from forewarp.cli.runs import build_run
 from forewarp.cli.stability import table
 from forewarp.data.batches import Targets
 from forewarp.methods.abilities import HasMatter

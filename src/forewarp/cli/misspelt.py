@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
+from forewarp.cli.folders import configurations
+
 FOLDERS = {"evaluate": "run", "render": "run", "train": "resume"}
 
 
@@ -26,13 +28,12 @@ def with_keys(name: str, words: list[str]) -> list[str]:
     return [f"{key}={word}" if is_bare else word for is_bare, word in zip(bare, words)]
 
 
-def unknown_key(error: Exception, conf: Path, name: str, words: list[str]) -> str | None:
+def unknown_key(error: Exception, name: str, words: list[str]) -> str | None:
     """One line for a key that the configuration has not, with the nearest that it has; None: it is not that.
 
     Args:
         error: what Hydra raised.
-        conf: the folder of the configuration.
-        name: of its file.
+        name: of the configuration's file.
         words: of the command line.
     """
     from hydra.errors import HydraException
@@ -40,7 +41,7 @@ def unknown_key(error: Exception, conf: Path, name: str, words: list[str]) -> st
     found = re.match(r"Could not override '([^'@]+)'", str(error))
     if found is None or not isinstance(error, HydraException):
         return None
-    key = found[1]
+    key, conf = found[1], configurations()
     known = [*_keys(_composed(conf, name, [w for w in words if w.split("=")[0] != key])), *_groups(conf)]
     near = difflib.get_close_matches(key, known, 1, cutoff=0.8)
     advice = f"did you mean {near[0]}?" if near else f"forewarp-{name} --cfg job prints all that there are"

@@ -14,7 +14,8 @@ from pathlib import Path
 
 import torch
 
-from forewarp.cli.entry import project_root, quiet
+from forewarp.cli.entry import quiet
+from forewarp.cli.folders import project_root
 from forewarp.cli.free import free_table
 from forewarp.cli.stability import replace_section, table
 from forewarp.cli.timed_cases import CASES, frame_work, milliseconds, splat_work, step_work, timed

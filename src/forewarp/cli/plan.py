@@ -27,8 +27,8 @@ Overrule it by one key: forewarp-train plan=FILE model/inpainter=unet3d
 
 def plan(config) -> None:
     """Plan and say so."""
+    from forewarp.cli.absent import refuse_absent
     from forewarp.cli.plan_file import tell
-    from forewarp.cli.planning import make_plan
     from forewarp.cli.train import refuse_budget, refuse_seeds
     from forewarp.cli.words import typed_words
 
@@ -38,6 +38,9 @@ def plan(config) -> None:
         )
     refuse_seeds(config)
     refuse_budget(config)
+    refuse_absent(config)
+    from forewarp.cli.planning import make_plan  # loads torch; what is mistyped has been answered before
+
     tell(make_plan(config, typed_words()))
 
 

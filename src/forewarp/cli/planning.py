@@ -8,9 +8,10 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
+from forewarp.cli.identity import HASH, content_hash
 from forewarp.cli.plan_file import read_plan, write_plan
 from forewarp.cli.planner import Planner
-from forewarp.cli.runs import HASH, build_run, content_hash
+from forewarp.cli.runs import build_run
 from forewarp.cli.trials import Trials
 from forewarp.cli.words import key_of
 from forewarp.data.held import most_held_out

@@ -31,13 +31,16 @@ def render(config) -> None:
     """Load, and write the video."""
     from pathlib import Path
 
+    from forewarp.cli.identity import saved_config
+
+    saved = saved_config(config.run, config)
+    check(config)
+    # These load torch; what is mistyped has been answered before.
     from forewarp.cli.claims import tell_other_data
     from forewarp.cli.measure import Progress, device_of
-    from forewarp.cli.runs import build_run, saved_config
+    from forewarp.cli.runs import build_run
     from forewarp.drawing.files import write_video
 
-    check(config)
-    saved = saved_config(config.run, config)
     run = build_run(saved)
     module = run.load().to(device_of(saved.trainer.accelerator))
     tell_other_data(run)

@@ -19,7 +19,8 @@ def replay(path: Path) -> str:
     """
     import torch
 
-    from forewarp.cli.runs import build_run, parsed
+    from forewarp.cli.identity import parsed
+    from forewarp.cli.runs import build_run
     from forewarp.training.bundle import read_bundle
     from forewarp.training.checkpoints import misfits
     from forewarp.training.sentinel import diagnose

@@ -17,10 +17,10 @@ forewarp-report makes pages with tables and curves of runs that are already ther
 What one types most:
   kind=accuracy_time|price_list|paper|effects   which page
   runs=FOLDER                      searched for runs (runs/accuracy_time; of kind=paper runs/paper)
-  out=FOLDER                       where the page goes (docs/results; of kind=paper runs/paper/results)
+  out=FOLDER                       where the page goes (results/ below the runs)
   target=DB                        accuracy_time: PSNR that every variant's seconds are listed for
-  published=FILE                   accuracy_time: points that others report, as docs/results/published.yaml;
-                                   paper: what is printed (docs/results/paper.yaml)
+  published=FILE                   accuracy_time: points that others report; paper: what is printed
+  curves=FOLDER                    paper: where accuracy_time put its pictures (runs/accuracy_time/results)
 
 The runs: make accuracy-time [DATA=FOLDER SCENE=NAME MINUTES=N], make price-list DATA=FOLDER,
 make reproduce-tables [DATA=FOLDER]. One that has no
@@ -32,32 +32,34 @@ KINDS = ("accuracy_time", "price_list", "paper", "effects")
 
 def report(config) -> None:
     """Write the page."""
-    from forewarp.report.accuracy_time import write_accuracy_time
-    from forewarp.report.curve import read_published
-    from forewarp.report.effects import write_effects
-    from forewarp.report.paper import write_paper
-    from forewarp.report.price_list import write_price_list
-
     if config.kind not in KINDS:
         raise ValueError(f"kind: expected one of {', '.join(KINDS)}, but got '{config.kind}'")
     if not isinstance(config.target, int | float | None):
         raise ValueError(f"target: expected a number of dB or null, but got '{config.target}'")
     default = f"{config.paths.runs}/{config.kind if config.kind in ('paper', 'effects') else 'accuracy_time'}"
-    kept = Path(config.paths.root) / "docs" / "results"
     runs = Path(config.runs or default)
-    # Tables that this project vouches for are not written over by whoever tries the command.
-    out = Path(config.out or (runs / "results" if config.kind in ("paper", "effects") else kept))
-    if config.kind == "price_list":
-        files = write_price_list(runs, out)
-    elif config.kind == "effects":
-        files = write_effects(runs, out)
-    elif config.kind == "paper":
-        files = write_paper(runs, out, Path(config.published or kept / "paper.yaml"))
-    else:
-        published = [] if config.published is None else read_published(Path(config.published))
-        files = write_accuracy_time(runs, out, target=config.target, published=published)
-    for file in files:
+    for file in _written(config, runs, Path(config.out or runs / "results")):
         print(f"written: {file}")
+
+
+def _written(config, runs: Path, out: Path) -> list[Path]:
+    """The files of the page of this kind."""
+    from forewarp.report.accuracy_time import write_accuracy_time
+    from forewarp.report.curve import OTHERS, read_published
+    from forewarp.report.effects import write_effects
+    from forewarp.report.paper import write_paper
+    from forewarp.report.price_list import write_price_list
+    from forewarp.report.published import PAPER
+
+    if config.kind == "price_list":
+        return write_price_list(runs, out)
+    if config.kind == "effects":
+        return write_effects(runs, out)
+    if config.kind == "paper":
+        curves = Path(config.curves or f"{config.paths.runs}/accuracy_time/results")
+        return write_paper(runs, out, Path(config.published or PAPER), curves)
+    published = read_published(Path(config.published or OTHERS))
+    return write_accuracy_time(runs, out, target=config.target, published=published)
 
 
 def draw_run(folder: Path) -> None:

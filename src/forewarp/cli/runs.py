@@ -1,37 +1,20 @@
-"""A run from its config, and its config from its folder."""
+"""A run, put together from its config."""
 
 from __future__ import annotations
 
-import hashlib
-import json
-import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
 import torch
-from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from forewarp.cli.measure import check_precision, device_of
-from forewarp.cli.trusted import MOST_BYTES, trusted_config
-from forewarp.cli.words import as_typed, key_of, typed_words
-from forewarp.training.budget import seconds_after, share_out
+from forewarp.training.budget import StagePlan, seconds_after, share_out
 from forewarp.training.callbacks import StageProgress
 from forewarp.training.handover import read_json
 from forewarp.training.stages import Run
-
-# What makes two runs different; where they run and what is shown of them does not.
-IDENTITY = ("data", "model", "objective", "stage", "budget", "seed")
-# Named first of what differs, as others follow from these.
-TYPED = ("data.scene", "data.root", "seed", "budget")
-HASH = "{hash}"
-# What may be set beside resume=<run>.
-MAY_CHANGE = (
-    *("trainer", "threads", "lpips_weights", "sheets", "evaluate", "checkpoint_seconds"),
-    *("sentinel", "data_changed"),
-)
 
 
 def build_run(config: DictConfig) -> Run:
@@ -41,8 +24,8 @@ def build_run(config: DictConfig) -> Run:
             raise ValueError(f"threads: expected a whole number > 0 or null, but got {config.threads}")
         torch.set_num_threads(config.threads)
     check_precision(config.trainer.get("precision"))
-    parts = {key: instantiate(config[key], _convert_="all") for key in ("data", "stage")}
-    parts["model"] = model_of(config.model)
+    data = instantiate(config.data, _convert_="all")
+    plans = {name: stage_of(stage) for name, stage in config.stage.items()}
     watchers = [w for w in instantiate(config.callbacks, _convert_="all").values() if w is not None]
     trainer, logger = (instantiate(config[key], _convert_="all") for key in ("trainer", "logger"))
 
@@ -63,9 +46,9 @@ def build_run(config: DictConfig) -> Run:
         )
 
     run = Run(
-        datamodule=parts["data"],
-        model=parts["model"],
-        stages=share_out(parts["stage"], minutes=config.budget.minutes, iterations=config.budget.iterations),
+        datamodule=data,
+        model=model_of(config.model),
+        stages=share_out(plans, minutes=config.budget.minutes, iterations=config.budget.iterations),
         folder=Path(config.run),
         make_trainer=make_trainer,
         callbacks=lambda name, folder: watching(run, watchers, name),
@@ -92,6 +75,17 @@ def model_of(config: DictConfig) -> Callable:
     return model
 
 
+def stage_of(config: DictConfig | None) -> StagePlan | None:
+    """A stage that waits for its budget, from its part of a config; one with a ``model`` has its own method."""
+    if config is None:
+        return None
+    content = OmegaConf.to_container(config, resolve=True)
+    own = content.pop("model", None)
+    plan = instantiate(content, _convert_="all")
+    plan.model = None if own is None else model_of(OmegaConf.create(own))
+    return plan
+
+
 def watching(run: Run, watchers: list[Callable], name: str) -> list:
     """New watchers of the stage ``name``; the progress line learns what the later ones may take."""
     made = [watcher() for watcher in watchers]
@@ -101,55 +95,6 @@ def watching(run: Run, watchers: list[Callable], name: str) -> list:
     return made
 
 
-def hashed(config: DictConfig) -> DictConfig:
-    """The config with ``{hash}`` in ``run`` replaced by ten digits of a SHA-256 of all that tells runs apart.
-
-    So a finished job is known by what it computed, and another config never meets its folder. Where minutes
-    bound a run, what it computes with is part of that.
-    """
-    if HASH in str(config.run):
-        config.run = str(config.run).replace(HASH, content_hash(config))
-    return config
-
-
-def content_hash(config: DictConfig, more: Sequence[str] = (), *others: object) -> str:
-    """Ten digits of a SHA-256 of what a run computes, of ``more`` keys of its config, and of ``others``."""
-    _make_absolute(config)
-    content = {key: _plain(config[key]) for key in (*IDENTITY, *more)}
-    if config.budget.minutes is not None:
-        content["on"] = [device_of(config.trainer.accelerator).type, config.trainer.get("precision")]
-    if others:
-        content["others"] = others
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:10]
-
-
-def _plain(value: object) -> object:
-    return OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value
-
-
-def claim(config: DictConfig, *, finished: bool = False) -> None:
-    """Write the resolved config into the run's folder, unless ``finished``; refuse one of another run."""
-    folder, path = Path(config.run), Path(config.run) / "config.yaml"
-    _make_absolute(config)
-    if config.get("resume") is None:
-        config.command = typed()
-    config.resume = None
-    resolved = OmegaConf.create(OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
-    begun = folder.is_dir() and any(folder.glob("*/last.ckpt"))
-    if begun and not path.is_file():
-        raise ValueError(
-            f"{path}: expected the configuration of the run, but got none; use run=... or delete the folder"
-        )
-    if begun:
-        _refuse_another(path, read_config(path), resolved)
-    if finished:  # its numbers are of how it was run, not of what is typed now
-        return
-    folder.mkdir(parents=True, exist_ok=True)
-    beside = path.with_name(path.name + ".part")
-    beside.write_text(OmegaConf.to_yaml(resolved))
-    os.replace(beside, path)
-
-
 def is_measured(run: Run) -> bool:
     """Whether a run is finished and was measured since."""
     metrics = Path(run.folder) / "metrics.json"
@@ -157,105 +102,3 @@ def is_measured(run: Run) -> bool:
         return False
     done = [run.stage_folder(stage) / "done.json" for stage in run.stages]
     return metrics.stat().st_mtime_ns >= max(path.stat().st_mtime_ns for path in done)
-
-
-def typed() -> str | None:
-    """The command line of this run alone; None where Hydra was not asked."""
-    return as_typed("train", typed_words()) if HydraConfig.initialized() else None
-
-
-def saved_config(run: str | None, changes: DictConfig, key: str = "run") -> DictConfig:
-    """The config of the run in a folder, with what the command line changed.
-
-    Args:
-        run: the run's folder.
-        changes: keys of the run's config; those that are null change nothing. Others are left out.
-        key: what named the folder.
-    """
-    if run is None:
-        raise ValueError("run: expected the folder of a run, but got nothing; set run=runs/...")
-    path = Path(run) / "config.yaml"
-    if not path.is_file():
-        raise ValueError(
-            f"{path}: expected the configuration of a run, but got none; set {key}=<a run's folder>"
-        )
-    saved = read_config(path)
-    for name in ("trainer", "threads", "lpips_weights", "sheets"):
-        if changes.get(name) is not None:
-            saved[name] = changes[name]
-    if (changes.get("data") or {}).get("root") is not None:
-        saved.data.root = changes.data.root
-    saved.run = str(run)
-    return saved
-
-
-def resumed(config: DictConfig) -> DictConfig:
-    """With ``resume=<folder>`` the config of the run there, and of what was typed only what may change.
-
-    Raises:
-        ValueError: for another key beside it, or a folder that is no run.
-    """
-    if config.get("resume") is None:
-        return config
-    saved = saved_config(str(config.resume), OmegaConf.create({}), "resume")
-    saved.resume, saved.data_changed = str(config.resume), "refuse"
-    words = HydraConfig.get().overrides.task if HydraConfig.initialized() else []
-    for word in words:
-        key = key_of(word)
-        if key == "data.root":
-            saved.data.root = config.data.root
-        elif key.split(".")[0] in MAY_CHANGE:
-            saved[key.split(".")[0]] = config[key.split(".")[0]]
-        elif key != "resume":
-            raise ValueError(
-                f"{key}: expected no such key beside resume=, whose config.yaml holds it, but got {word}; "
-                f"beside it go {', '.join(MAY_CHANGE)}, data.root"
-            )
-    return saved
-
-
-def read_config(path: Path) -> DictConfig:
-    """The config in a run's folder, or in a stored step.
-
-    Raises:
-        ValueError: where it is no config of a run, or one that is not to be trusted.
-    """
-    if (size := path.stat().st_size) > MOST_BYTES:
-        raise ValueError(f"{path}: expected at most {MOST_BYTES} bytes, but got {size}")
-    return parsed(path.read_bytes().decode(errors="replace"), path)
-
-
-def parsed(text: str, path: Path) -> DictConfig:
-    """As ``read_config``, of text; ``path`` names it in errors."""
-    config = trusted_config(text, path)
-    for key in (*IDENTITY, "trainer", "logger", "callbacks"):
-        if key not in config:
-            raise ValueError(f"{path}: expected the key {key}, but got none; delete the run's folder")
-    return config
-
-
-def _make_absolute(config: DictConfig) -> None:
-    """The data's place as seen from anywhere: a run may be evaluated from another folder."""
-    if not OmegaConf.is_missing(config.data, "root") and config.data.root is not None:
-        config.data.root = str(Path(config.data.root).expanduser().resolve())
-
-
-def _refuse_another(path: Path, before: DictConfig, now: DictConfig) -> None:
-    old, new = ({k: OmegaConf.to_container(c)[k] for k in IDENTITY} for c in (before, now))
-    found = list(_differences(old, new))
-    if found:
-        key, was, got = min(found, key=lambda row: [not row[0].startswith(first) for first in TYPED])
-        more = f" (and {len(found) - 1} more keys)" if len(found) > 1 else ""
-        raise ValueError(
-            f"{path}: {key}: expected {was}, as the run that this folder holds, but got {got}{more}; "
-            "use run=<another folder>, or delete this one"
-        )
-
-
-def _differences(old, new, key: str = ""):
-    if isinstance(old, dict) and isinstance(new, dict):
-        for name in [*old, *(n for n in new if n not in old)]:
-            inner = f"{key}.{name}" if key else name
-            yield from _differences(old.get(name, "nothing"), new.get(name, "nothing"), inner)
-    elif old != new:
-        yield key, old, new

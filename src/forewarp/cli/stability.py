@@ -10,7 +10,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from forewarp.cli.endurance import RATES, SEEDS, STEPS, endure
-from forewarp.cli.entry import project_root, quiet
+from forewarp.cli.entry import quiet
+from forewarp.cli.folders import project_root
 from forewarp.cli.fuzz import Outcome, fuzz
 from forewarp.cli.twin import BACKENDS, rows
 

@@ -38,8 +38,7 @@ def synthesize(config) -> None:
 
     from omegaconf import OmegaConf
 
-    from forewarp.cli.measure import Progress
-    from forewarp.cli.synthetic import is_scene, write_whole
+    from forewarp.data.fingerprint import RECORD
 
     arguments = OmegaConf.to_container(config, resolve=True)
     folder, overwrite = Path(arguments.pop("folder")), arguments.pop("overwrite")
@@ -47,9 +46,14 @@ def synthesize(config) -> None:
     arguments.pop("paths")
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"folder: expected a folder, but got the file {folder}; set folder=...")
-    if folder.is_dir() and any(folder.iterdir()) and not (is_scene(folder) and overwrite):
-        advice = "set overwrite=true or folder=..." if is_scene(folder) else "set folder=..."
+    is_scene = (folder / RECORD).is_file()
+    if folder.is_dir() and any(folder.iterdir()) and not (is_scene and overwrite):
+        advice = "set overwrite=true or folder=..." if is_scene else "set folder=..."
         raise ValueError(f"{folder}: expected a new or empty folder, but got one with files; {advice}")
+    # These load torch; what is mistyped has been answered before.
+    from forewarp.cli.measure import Progress
+    from forewarp.cli.synthetic import write_whole
+
     with Progress("images") as progress:
         write_whole(folder, dataset, arguments, workers=workers, progress=progress)
     print(f"written: {folder}")

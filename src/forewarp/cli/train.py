@@ -45,14 +45,20 @@ Watch: tensorboard --logdir runs
 
 def train(config) -> None:
     """Fit what is not finished, then measure what was not measured."""
-    from forewarp.cli.claims import alone, same_data
-    from forewarp.cli.measure import measure
-    from forewarp.cli.report import draw_run
-    from forewarp.cli.runs import build_run, claim, hashed, is_measured, resumed
+    from forewarp.cli.absent import refuse_absent
+    from forewarp.cli.identity import claim, hashed, resumed
 
     refuse_seeds(config)
     refuse_budget(config)
-    config = hashed(planned(resumed(config)))
+    config = resumed(config)
+    refuse_absent(config)
+    # These load torch; what is mistyped has been answered before.
+    from forewarp.cli.claims import alone, same_data
+    from forewarp.cli.measure import measure
+    from forewarp.cli.report import draw_run
+    from forewarp.cli.runs import build_run, is_measured
+
+    config = hashed(planned(config))
     run = build_run(config)
     if skips(run, config.get("absent", "refuse")):
         print(f"skipped: {run.datamodule.place}: no such scene")

@@ -13,8 +13,9 @@ from hydra import compose
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from forewarp.cli.claims import alone, same_data
+from forewarp.cli.identity import claim
 from forewarp.cli.measure import device_of
-from forewarp.cli.runs import build_run, claim
+from forewarp.cli.runs import build_run
 from forewarp.cli.words import merged, of_what_is_on
 from forewarp.report.effect import Gain, Numbers
 from forewarp.training.handover import read_json, write_json

@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from forewarp.data.files import frames_of, inside, number, read_json, replace_file, scene_folder
+from forewarp.data.files import MARKERS, frames_of, inside, number, read_json, replace_file, scene_folder
 from forewarp.data.images import CachedImage, common_header, write_png
 from forewarp.data.truth import StoredDepth, read_truth, write_depth, write_truth
 from forewarp.data.views import FLIP, box_of, check_range, frustum_box, pose_of
@@ -80,7 +80,7 @@ def read_scene(
         SceneError: for every file or value that is missing or wrong, with file and key.
     """
     check_range(near, far)
-    folder = scene_folder(root, scene, "transforms_train.json")
+    folder = scene_folder(root, scene, MARKERS["dnerf"])
     records = {split: _read_split(folder, split) for split in ("train", "val", "test")}
     header = common_header(r.image for split in records.values() for r in split)
     size, halve = header.size, _is_halved(header.size, half_resolution, folder)

@@ -16,6 +16,13 @@ from forewarp.scene.errors import SceneError
 
 MOST_TEXT = 1 << 26  # bytes: what is parsed takes up to thirty times as much memory
 MOST_FRAMES = 1_000_000
+MARKERS = {  # by the reader: the file that every scene of its format has
+    "dnerf": "transforms_train.json",
+    "lego_complete": "transforms_train.json",
+    "hypernerf": "dataset.json",
+    "nhr": "CamPose.inf",
+    "posed_video": "transforms.json",
+}
 _UNPRINTABLE = {"Cc", "Cs", "Zl", "Zp"}  # controls, halves of characters, separators of lines
 
 

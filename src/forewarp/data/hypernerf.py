@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from forewarp.data.clouds import read_cloud, write_cloud
-from forewarp.data.files import inside, number, read_json, replace_file, scene_folder, whole
+from forewarp.data.files import MARKERS, inside, number, read_json, replace_file, scene_folder, whole
 from forewarp.data.images import CachedImage, inspect_png, write_png
 from forewarp.data.nerfies_camera import numbers, read_camera, reduced, write_camera
 from forewarp.data.nerfies_items import read_camera_ids, read_split, read_times
@@ -80,7 +80,7 @@ def read_scene(root: str | Path, scene: str, *, scale: int = 2, box: Sequence[fl
     Raises:
         SceneError: for every file or value that is missing or wrong, with file and key.
     """
-    folder = scene_folder(root, scene, "dataset.json")
+    folder = scene_folder(root, scene, MARKERS["hypernerf"])
     images, world = _image_folder(folder, scale), _read_world(folder / "scene.json")
     split = read_split(folder / "dataset.json")
     times = read_times(folder / "metadata.json", split.ids)

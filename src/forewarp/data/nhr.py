@@ -18,7 +18,7 @@ import torch
 
 from forewarp.data.clouds import read_cloud, write_cloud
 from forewarp.data.dome_cameras import read_cameras, write_cameras
-from forewarp.data.files import scene_folder, whole
+from forewarp.data.files import MARKERS, scene_folder, whole
 from forewarp.data.images import check_size
 from forewarp.data.jpeg import inspect_jpeg, write_jpeg
 from forewarp.data.masked import MaskedImage
@@ -67,7 +67,7 @@ def read_scene(
 
     Cost: two small reads an image, for 100 frames of 56 cameras 0.4 s, and one of every point.
     """
-    folder = scene_folder(root, scene, "CamPose.inf")
+    folder = scene_folder(root, scene, MARKERS["nhr"])
     if not isinstance(half_resolution, bool):
         raise SceneError(f"data.half_resolution: expected true or false, but got {half_resolution!r}")
     poses, lenses = read_cameras(folder)

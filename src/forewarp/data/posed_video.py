@@ -26,7 +26,7 @@ from forewarp.data.capture import (
     split_views,
     spread_in_time,
 )
-from forewarp.data.files import number, read_json, replace_file, scene_folder, whole
+from forewarp.data.files import MARKERS, number, read_json, replace_file, scene_folder, whole
 from forewarp.data.images import CachedImage, write_png
 from forewarp.data.jpeg import write_jpeg
 from forewarp.data.masked import MaskedImage
@@ -37,7 +37,7 @@ from forewarp.scene.camera import Camera
 from forewarp.scene.errors import SceneError
 from forewarp.scene.frame import Frame, Scene
 
-FILE = "transforms.json"
+FILE = MARKERS["posed_video"]
 SCALES = (1, 2, 4, 8)
 _OF_CAMERA = {"w", "h", "fl_x", "fl_y", "cx", "cy", "camera_model", "k1", "k2", "k3", "p1", "p2"}
 

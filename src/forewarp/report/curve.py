@@ -11,6 +11,7 @@ import yaml
 
 from forewarp.report.collect import Point, Result
 
+OTHERS = Path(__file__).with_name("published.yaml")  # what others report
 _KEYS = ("name", "seconds", "psnr", "hardware", "source", "dataset")
 
 

@@ -12,7 +12,7 @@ from forewarp.report import page, pictures
 from forewarp.report.collect import Result, collect, machine
 from forewarp.report.compared import comparison, counterpart, measured, row_of, with_means
 from forewarp.report.page import Section
-from forewarp.report.published import PaperTable, read_paper
+from forewarp.report.published import PAPER, PaperTable, read_paper
 
 TITLE = "The paper's tables, measured"
 INTRODUCTION = (
@@ -29,13 +29,14 @@ TOLD += ("held_out", "canonical_time", "mask_box")
 DATASETS = ("dnerf", "hypernerf", "nhr", "lego_complete")
 
 
-def write_paper(runs: Path, out: Path, published: Path) -> list[Path]:
+def write_paper(runs: Path, out: Path, published: Path = PAPER, curves: Path | None = None) -> list[Path]:
     """Write ``paper.md``, ``paper.tex``, ``paper.html``, a CSV file a table, and the figures.
 
     Args:
         runs: folder of measured runs.
         out: folder that they are written into.
-        published: the printed numbers (``docs/results/paper.yaml``).
+        published: the printed numbers.
+        curves: folder whose pictures of accuracy against training time are shown too.
 
     Returns:
         the files.
@@ -44,7 +45,7 @@ def write_paper(runs: Path, out: Path, published: Path) -> list[Path]:
     results, older = newest(results)
     out.mkdir(parents=True, exist_ok=True)
     tables = [section for table in read_paper(published).values() for section in sections_of(table, results)]
-    figures, drawn = figures_of(results, out, published.parent)
+    figures, drawn = figures_of(results, out, curves)
     sections = [*tables, *figures]
     if lines := [*without, *(f"{run.folder}: another run of the same is newer" for run in older)]:
         sections.append(Section("Left out", facts=lines))
@@ -99,8 +100,8 @@ def facts(runs: Sequence[Result]) -> list[str]:
     ]
 
 
-def figures_of(results: Sequence[Result], out: Path, kept: Path) -> tuple[list[Section], list[Path]]:
-    """What can be drawn from these runs, and the curves that ``make accuracy-time`` left in ``kept``.
+def figures_of(results: Sequence[Result], out: Path, curves: Path | None) -> tuple[list[Section], list[Path]]:
+    """What can be drawn from these runs, and what ``make accuracy-time`` left in ``curves``.
 
     Where matplotlib is absent, a section that says so.
     """
@@ -110,14 +111,12 @@ def figures_of(results: Sequence[Result], out: Path, kept: Path) -> tuple[list[S
         return [Section("Figures", facts=[str(error)])], []
     found = [(title, path, facts(runs)) for title, path, runs in found if path is not None]
     sections = [Section(title, facts=lines, pictures=[path]) for title, path, lines in found]
-    for path in sorted(kept.glob("accuracy-time-*.png")):
+    for path in sorted(curves.glob("accuracy-time-*.png")) if curves is not None else ():
         if path.parent.resolve() != out.resolve():
             shutil.copyfile(path, out / path.name)
-    if curves := sorted(out.glob("accuracy-time-*.png")):
-        lines = [
-            "runs of their own, with views set aside, as kept beside the printed numbers: make accuracy-time"
-        ]
-        sections.append(Section("Accuracy against training time", facts=lines, pictures=curves))
+    if drawn := sorted(out.glob("accuracy-time-*.png")):
+        lines = ["runs of their own, with views set aside: forewarp-report kind=accuracy_time"]
+        sections.append(Section("Accuracy against training time", facts=lines, pictures=drawn))
     return sections, [path for _, path, _ in found]
 
 

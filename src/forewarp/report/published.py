@@ -8,6 +8,8 @@ from statistics import fmean
 
 import yaml
 
+PAPER = Path(__file__).with_name("paper.yaml")
+
 
 @dataclass(frozen=True)
 class Group:
@@ -69,7 +71,7 @@ class PaperTable:
 
 
 def read_paper(path: Path) -> dict[str, PaperTable]:
-    """The paper's tables from a YAML file as ``docs/results/paper.yaml``, by key.
+    """The paper's tables from a YAML file as ``PAPER``, by key.
 
     Raises:
         ValueError: what lacks a key, or a row of another length than its table.

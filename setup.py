@@ -1,0 +1,34 @@
+"""Put the configurations, which lie at the top of the repository, into the wheel as package data."""
+
+from pathlib import Path
+from shutil import rmtree
+
+from setuptools import setup
+from setuptools.command.build_py import build_py
+
+FOLDERS = ("conf", "sweeps")
+
+
+class WithConfigurations(build_py):
+    """Build, and copy the folders beside the modules; an editable install uses them where they are."""
+
+    def run(self):
+        """Leave nothing there of an earlier build."""
+        super().run()
+        if not self.editable_mode:
+            for folder in FOLDERS:
+                rmtree(Path(self.build_lib, "forewarp", folder), ignore_errors=True)
+            for file in self._configurations():
+                target = Path(self.build_lib, "forewarp", file)
+                self.mkpath(str(target.parent))
+                self.copy_file(file, str(target))
+
+    def get_source_files(self):
+        """All that goes into a source distribution too."""
+        return super().get_source_files() + self._configurations()
+
+    def _configurations(self):
+        return [str(file) for folder in FOLDERS for file in sorted(Path(folder).rglob("*.yaml"))]
+
+
+setup(cmdclass={"build_py": WithConfigurations})

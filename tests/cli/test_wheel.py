@@ -1,0 +1,97 @@
+"""The wheel, installed elsewhere, works in an empty folder."""
+
+import os
+import shutil
+import subprocess
+import sys
+import zipfile
+from types import SimpleNamespace
+
+import pytest
+
+from configs import CONF, ROOT
+
+SMALL = [
+    *("experiment=demo", "trainer=cpu", "threads=1", "sheets=1", "data.rays=256"),
+    *("data.synthesis.size=32", "data.synthesis.frames=5", "data.synthesis.test_views=[1,1,1]"),
+    *("data.synthesis.val_views=1", "data.synthesis.samples_per_pixel=1"),
+]
+
+
+def call(*command, cwd, **variables):
+    """A program in a process of its own, which must end well; what it printed."""
+    environment = {key: value for key, value in os.environ.items() if not key.startswith("FOREWARP_")}
+    options = {"capture_output": True, "text": True, "timeout": 300, "cwd": cwd}
+    done = subprocess.run(list(map(str, command)), env=environment | variables, **options)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def files(folder):
+    """All files below a folder but compiled ones, relative to it."""
+    return {
+        path.relative_to(folder).as_posix()
+        for path in folder.rglob("*")
+        if path.is_file() and "__pycache__" not in path.parts
+    }
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory):
+    """The wheel, built from a copy, as a build leaves folders behind."""
+    source, out = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("wheel")
+    for name in ("src", "conf", "sweeps"):
+        shutil.copytree(
+            ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__", "*.egg-info")
+        )
+    for name in ("pyproject.toml", "setup.py", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, source)
+    pip = (sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation")
+    call(*pip, "--wheel-dir", out, source, cwd=out)
+    (file,) = out.glob("forewarp-*.whl")
+    return file
+
+
+@pytest.fixture(scope="module")
+def installed(wheel, tmp_path_factory):
+    """``run("train", ...)`` runs a command of the wheel, which is in ``site``, in the empty ``folder``."""
+    site, folder = tmp_path_factory.mktemp("site"), tmp_path_factory.mktemp("empty")
+    pip = (sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index")
+    call(*pip, "--target", site, wheel, cwd=folder)
+
+    def command(name, *words):
+        return call(site / "bin" / f"forewarp-{name}", *words, cwd=folder, PYTHONPATH=str(site))
+
+    return SimpleNamespace(run=command, site=site, folder=folder)
+
+
+@pytest.mark.slow
+def test_the_wheel_holds_every_configuration_and_what_reports_need(wheel):
+    names = set(zipfile.ZipFile(wheel).namelist())
+    wanted = {f"forewarp/conf/{name}" for name in files(CONF)}
+    wanted |= {f"forewarp/sweeps/{name}" for name in files(ROOT / "sweeps")}
+    assert wanted | {"forewarp/report/paper.yaml", "forewarp/report/published.yaml"} <= names
+    assert {name.split("/")[0].partition("-")[0] for name in names} == {"forewarp"}
+
+
+@pytest.mark.slow
+def test_commands_work_in_an_empty_folder_and_write_nowhere_else(installed):
+    run, folder, site = installed.run, installed.folder, installed.site
+    before = files(site)
+    code = "import forewarp; print(forewarp.__file__)"
+    where = call(sys.executable, "-c", code, cwd=folder, PYTHONPATH=str(site))
+    assert where.strip() == str(site / "forewarp" / "__init__.py")
+    assert "methods (with --multirun)" in run("train", "--help")
+    assert list(folder.iterdir()) == []
+    run("train", *SMALL, "budget.minutes=0.05", "run=runs/demo")
+    assert "test views" in run("evaluate", "run=runs/demo", "trainer=cpu")
+    run("render", "run=runs/demo", "format=png", "frames=2", "size=32", "trainer=cpu")
+    assert len(list((folder / "runs" / "demo" / "videos" / "fixed").glob("*.png"))) == 2
+    words = ["sweeps=methods", "scene=counterpart_dnerf", *SMALL[1:], "evaluate=false", "seeds=1"]
+    run("train", "--multirun", *words, "budget=demo", "budget.minutes=null", "budget.iterations=2")
+    fitted = sorted(path.parents[0].name for path in (folder / "runs" / "paper").rglob("config.yaml"))
+    assert [name.split("-")[1] for name in fitted] == ["backward", "forward"]
+    run("report", "kind=paper", "runs=runs")
+    assert (folder / "runs" / "results" / "paper.md").is_file()
+    assert {path.name for path in folder.iterdir()} == {"data", "runs"}
+    assert files(site) == before
