@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.autograd import gradcheck
 
-from forewarp.ops.composite import accumulate, render_weights
+from forewarp.ops.composite import accumulate, dense_weights, render_weights
 from reference import composite
 
 IDS = torch.tensor([0, 0, 0, 2, 2, 4])  # rays 1, 3 and 5 have no sample
@@ -85,3 +85,37 @@ def test_refuses_other_shapes():
         render_weights(torch.zeros(2, 1), torch.zeros(2, dtype=torch.int64), 1)
     with pytest.raises(ValueError, match=r"values: expected shape \(2, C\), but got \(3, 1\)"):
         accumulate(torch.zeros(2), torch.zeros(3, 1), torch.zeros(2, dtype=torch.int64), 1)
+
+
+def test_dense_equals_packed():
+    optical = 3 * torch.rand(5, 4, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    weights, transmittance = dense_weights(optical)
+    packed, through = render_weights(optical.flatten(), torch.arange(5).repeat_interleave(4), 5)
+    torch.testing.assert_close(weights.flatten(), packed)
+    torch.testing.assert_close(transmittance, through)
+    torch.testing.assert_close(weights.sum(1) + transmittance, torch.ones(5, dtype=torch.float64))
+
+
+def test_dense_gradcheck():
+    optical = (3 * torch.rand(3, 4, dtype=torch.float64)).requires_grad_()
+    assert gradcheck(dense_weights, optical)
+
+
+def test_a_last_interval_without_end():
+    optical = torch.tensor(
+        [[math.log(2), 1e10], [math.log(2), 0.0], [math.inf, math.inf]], requires_grad=True
+    )
+    weights, transmittance = dense_weights(optical)
+    torch.testing.assert_close(weights, torch.tensor([[0.5, 0.5], [0.5, 0], [1, 0]]))
+    torch.testing.assert_close(transmittance, torch.tensor([0.0, 0.5, 0]), atol=1e-30, rtol=0)
+    (weights[:, 0].sum() + 2 * transmittance.sum()).backward()
+    assert optical.grad.isfinite().all()
+
+
+def test_dense_edges():
+    weights, transmittance = dense_weights(torch.zeros(2, 1))
+    assert weights.tolist() == [[0], [0]]
+    assert transmittance.tolist() == [1, 1]
+    assert dense_weights(torch.zeros(0, 4))[0].shape == (0, 4)
+    with pytest.raises(ValueError, match=r"optical: expected shape \(R, S\), but got \(3,\)"):
+        dense_weights(torch.zeros(3))

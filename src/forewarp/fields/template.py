@@ -1,0 +1,109 @@
+"""The network of NeRF and of its kin: a trunk that reads its input twice, density from it, then colour."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor, nn
+
+DENSITY: dict[str, Callable[[Tensor], Tensor]] = {"relu": torch.relu, "softplus": nn.functional.softplus}
+
+
+class Trunk(nn.Module):
+    """``layers`` linear layers, a ReLU after each; layer ``skip`` reads an input once more.
+
+    Args:
+        inputs: channels of the first layer.
+        width: of every layer.
+        layers: at least 1.
+        skip: number of the layer, counted from 1, that reads ``again`` beside the layer before: 6 in the
+            PyTorch family of NeRF, 5 in the JAX family; None: no layer.
+        again: channels that are read there; None: those of the first layer.
+
+    >>> sum(p.numel() for p in Trunk(72).parameters())
+    497664
+    """
+
+    def __init__(
+        self,
+        inputs: int,
+        *,
+        width: int = 256,
+        layers: int = 8,
+        skip: int | None = 6,
+        again: int | None = None,
+    ) -> None:
+        super().__init__()
+        if min(inputs, width, layers) < 1 or not (skip is None or 2 <= skip <= layers):
+            raise ValueError(
+                "trunk: expected inputs, width and layers >= 1 and a skip in [2, layers] or null, "
+                f"but got {inputs=}, {width=}, {layers=}, {skip=}"
+            )
+        self.skip = skip
+        more = inputs if again is None else again
+        sizes = [inputs, *[width] * (layers - 1)]
+        self.layers = nn.ModuleList(
+            nn.Linear(size + (more if number == skip else 0), width) for number, size in enumerate(sizes, 1)
+        )
+
+    def forward(self, x: Tensor, again: Tensor | None = None) -> Tensor:
+        """(..., I) -> (..., width); at the skip ``again`` (..., A) is read before the rest, None: ``x``."""
+        hidden = x
+        for number, layer in enumerate(self.layers, 1):
+            if number == self.skip:
+                hidden = torch.cat([x if again is None else again, hidden], -1)
+            hidden = torch.relu(layer(hidden))
+        return hidden
+
+
+class Template(nn.Module):
+    """Density and colour at a point: ``N(inputs, condition)``.
+
+    Density is linear on the trunk and sees no condition. Colour goes through a bottleneck without activation,
+    which the condition (a direction, a code) joins, one layer of half the width, and a sigmoid.
+
+    Args:
+        inputs: channels of the encoded point.
+        condition: channels that the colour alone sees; 0: none.
+        width, layers, skip: of the trunk.
+
+    >>> sum(p.numel() for p in Template(63, 27).parameters())
+    595844
+    """
+
+    def __init__(
+        self, inputs: int, condition: int, *, width: int = 256, layers: int = 8, skip: int | None = 6
+    ) -> None:
+        super().__init__()
+        if condition < 0 or width < 2:
+            raise ValueError(
+                f"template: expected condition >= 0 and width >= 2, but got {condition=}, {width=}"
+            )
+        self.trunk = Trunk(inputs, width=width, layers=layers, skip=skip)
+        self.density_head = nn.Linear(width, 1)
+        self.bottleneck = nn.Linear(width, width)
+        self.shading = nn.Linear(width + condition, width // 2)
+        self.color_head = nn.Linear(width // 2, 3)
+
+    def density(self, x: Tensor) -> Tensor:
+        """Encoded points (..., I) -> density before its activation (...,)."""
+        return self.density_head(self.trunk(x))[..., 0]
+
+    def forward(self, x: Tensor, condition: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Encoded points (..., I) and what colour depends on (..., D) -> density before its activation (...,)
+        and colour (..., 3) in [0, 1].
+        """
+        hidden = self.trunk(x)
+        color = self.bottleneck(hidden)
+        if condition is not None:
+            color = torch.cat([color, condition], -1)
+        color = torch.relu(self.shading(color))
+        return self.density_head(hidden)[..., 0], torch.sigmoid(self.color_head(color))
+
+
+def density_of(name: str) -> Callable[[Tensor], Tensor]:
+    """Find what makes density >= 0: ``relu`` or ``softplus``."""
+    if name not in DENSITY:
+        raise ValueError(f"model.density: expected {' or '.join(DENSITY)}, but got {name!r}")
+    return DENSITY[name]
