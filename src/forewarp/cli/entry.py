@@ -15,6 +15,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from forewarp.cli.misspelt import unknown_key, with_keys
+from forewarp.cli.renamed import refuse_renamed
 
 ROOT_VARIABLE, TRACEBACK_VARIABLE = "FOREWARP_ROOT", "FOREWARP_TRACEBACK"
 MISTAKE, INTERRUPTED = 2, 130
@@ -56,6 +57,8 @@ def command(name: str, task: Callable, text: str, *, config: str | None = None) 
             print(text.strip() + "\n\n" + choices(root / "conf", config or name), flush=True)
             sys.exit(0)
         sys.argv[1:] = _words(name)
+        if (config or name) == "train":
+            refuse_renamed(sys.argv[1:])
         failures = _run(name, task, root / "conf", config or name)
     except KeyboardInterrupt:
         _interrupted(name)
@@ -225,9 +228,9 @@ def choices(conf: Path, name: str) -> str:
     else:
         silent = {"hydra", "paths", "callbacks", "dataset"}
         folders = [path for path in sorted(conf.rglob("*")) if path.is_dir() and path.name != "one"]
-        groups = [
-            p.relative_to(conf).as_posix() for p in folders if p.relative_to(conf).parts[0] not in silent
-        ]
+        groups = [p.relative_to(conf).as_posix() for p in folders]
+        # model_preset and its like follow from what is chosen.
+        groups = [g for g in groups if g.split("/")[0] not in silent and not g.startswith("model_")]
     found = {group: sorted(path.stem for path in (conf / group).glob("*.yaml")) for group in groups}
     if name == "train":
         found["sweeps"] = [

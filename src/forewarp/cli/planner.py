@@ -45,7 +45,7 @@ class Planner:
         shares = [config.stage[name].share for name in stages]
         minutes = self.settings.minutes and self.settings.minutes * shares[-1] / sum(shares)
         self.evidence = Evidence(look_at(scene), least=self.settings.least, minutes=minutes)
-        self.usual = int(config.budget.bases)
+        self.usual = int(config.preset.bases)
         self.more = min(2 * self.usual, max(self.evidence.pictures.times - 1, 1))
         # How a scene without silhouettes begins: faint matter everywhere.
         faint = [f"stage.{self.coarse}.start_alpha=1e-2", f"stage.{self.coarse}.confine=0.0"]
@@ -75,7 +75,7 @@ class Planner:
         self._use("coarse", [f"model/motion={self._on('motion')}", behind, *PLAIN, *self.start])
         if not self.settings.trials:
             return
-        if self.more > self.usual and not self.fixed.keys() & {"budget.bases", "model/motion"}:
+        if self.more > self.usual and not self.fixed.keys() & {"preset.bases", "model/motion"}:
             self._rival("bases", "coarse-bases", self._more_bases(), it_is_more=True)
         still = ["model/motion=none"]
         moves = "model/motion" in self.fixed or self._rival("motion", "coarse-still", still)
@@ -85,7 +85,7 @@ class Planner:
             self._rival("background", "coarse-alone", ["model/background=none"])
 
     def _more_bases(self) -> list[str]:
-        return [f"budget.bases={self.more}", f"stage.{self.coarse}.bases=[[0,{self.more}]]"]
+        return [f"preset.bases={self.more}", f"stage.{self.coarse}.bases=[[0,{self.more}]]"]
 
     def _use(self, name: str, words: list[str]) -> None:
         """What the evidence is taken from and the trials begin from."""
@@ -172,11 +172,11 @@ class Planner:
 
     def _overruled(self, decision: Decision) -> Decision:
         """The decision, or what was typed in its place."""
-        key = "budget.bases" if decision.effect == "bases" else f"model/{decision.effect}"
+        key = "preset.bases" if decision.effect == "bases" else f"model/{decision.effect}"
         if key not in self.fixed:
             return decision
         choice = self.fixed[key]
-        words = () if key == "budget.bases" else tuple(w for w in decision.words if key_of(w) != key)
+        words = () if key == "preset.bases" else tuple(w for w in decision.words if key_of(w) != key)
         on = choice != "none" and decision.effect != "bases"
         return Decision(decision.effect, choice, words, f"as typed; {decision.because}", on)
 

@@ -87,9 +87,9 @@ def refuse(config: DictConfig, words: Sequence[str]) -> None:
     """Refuse what cannot be planned, before anything is read."""
     if config.get("resume") is not None:
         raise ValueError("resume: expected nothing where a run is planned; leave it out")
-    if config.model.warp != "forward":
+    if config.model.name != "forward":
         raise ValueError(
-            f"model: expected forward, whose effects are planned, but got {config.model.warp}; "
+            f"model: expected forward, whose effects are planned, but got {config.model.name}; "
             "use model=forward"
         )
     if gone := [word for word in words if word.startswith("~") and not word.startswith("~stage.")]:

@@ -17,15 +17,17 @@ from omegaconf import DictConfig, OmegaConf
 from forewarp.cli.measure import check_precision, device_of
 from forewarp.cli.trusted import MOST_BYTES, trusted_config
 from forewarp.cli.words import as_typed, key_of, typed_words
+from forewarp.methods.spec import MethodSpec
+from forewarp.renderer import Renderer
 from forewarp.training.budget import seconds_after, share_out
 from forewarp.training.callbacks import StageProgress
 from forewarp.training.handover import read_json
 from forewarp.training.stages import Run
 
 # What makes two runs different; where they run and what is shown of them does not.
-IDENTITY = ("data", "model", "objective", "stage", "renderer", "budget", "seed")
+IDENTITY = ("data", "model", "objective", "stage", "preset", "budget", "seed")
 # Named first of what differs, as others follow from these.
-TYPED = ("data.scene", "data.root", "seed", "budget")
+TYPED = ("data.scene", "data.root", "seed", "preset", "budget")
 HASH = "{hash}"
 # What may be set beside resume=<run>.
 MAY_CHANGE = (
@@ -41,7 +43,8 @@ def build_run(config: DictConfig) -> Run:
             raise ValueError(f"threads: expected a whole number > 0 or null, but got {config.threads}")
         torch.set_num_threads(config.threads)
     check_precision(config.trainer.get("precision"))
-    parts = {key: instantiate(config[key], _convert_="all") for key in ("data", "model", "renderer", "stage")}
+    parts = {key: instantiate(config[key], _convert_="all") for key in ("data", "stage")}
+    spec, renderer = method_of(config.model)
     watchers = [w for w in instantiate(config.callbacks, _convert_="all").values() if w is not None]
     trainer, logger = (instantiate(config[key], _convert_="all") for key in ("trainer", "logger"))
 
@@ -63,9 +66,9 @@ def build_run(config: DictConfig) -> Run:
 
     run = Run(
         datamodule=parts["data"],
-        spec=parts["model"],
+        spec=spec,
         stages=share_out(parts["stage"], minutes=config.budget.minutes, iterations=config.budget.iterations),
-        renderer=parts["renderer"],
+        renderer=renderer,
         folder=Path(config.run),
         make_trainer=make_trainer,
         callbacks=lambda name, folder: watching(run, watchers, name),
@@ -75,6 +78,16 @@ def build_run(config: DictConfig) -> Run:
         tell=partial(print, flush=True),
     )
     return run
+
+
+def method_of(model: DictConfig) -> tuple[MethodSpec, Renderer | None]:
+    """The method that ``model`` describes, and what makes pictures of it where it marches rays."""
+    resolved = OmegaConf.to_container(model, resolve=True, throw_on_missing=True)
+    model = OmegaConf.create({"model": resolved}).model  # under its key, for errors
+    renderer = instantiate(model.get("renderer"), _convert_="all")
+    for key in ("name", "renderer"):
+        model.pop(key, None)
+    return instantiate(model, _convert_="all"), renderer
 
 
 def watching(run: Run, watchers: list[Callable], name: str) -> list:
@@ -100,7 +113,7 @@ def hashed(config: DictConfig) -> DictConfig:
 def content_hash(config: DictConfig, more: Sequence[str] = (), *others: object) -> str:
     """Ten digits of a SHA-256 of what a run computes, of ``more`` keys of its config, and of ``others``."""
     _make_absolute(config)
-    content = {key: _plain(config[key]) for key in (*IDENTITY, *more)}
+    content = {key: _plain(config.get(key)) for key in (*IDENTITY, *more)}
     if config.budget.minutes is not None:
         content["on"] = [device_of(config.trainer.accelerator).type, config.trainer.get("precision")]
     if others:
@@ -214,7 +227,7 @@ def parsed(text: str, path: Path) -> DictConfig:
     """As ``read_config``, of text; ``path`` names it in errors."""
     config = trusted_config(text, path)
     for key in (*IDENTITY, "trainer", "logger", "callbacks"):
-        if key not in config:
+        if key not in config and key != "objective":  # a method may have none of its own
             raise ValueError(f"{path}: expected the key {key}, but got none; delete the run's folder")
     return config
 
@@ -226,7 +239,7 @@ def _make_absolute(config: DictConfig) -> None:
 
 
 def _refuse_another(path: Path, before: DictConfig, now: DictConfig) -> None:
-    old, new = ({k: OmegaConf.to_container(c)[k] for k in IDENTITY} for c in (before, now))
+    old, new = ({k: OmegaConf.to_container(c).get(k) for k in IDENTITY} for c in (before, now))
     found = list(_differences(old, new))
     if found:
         key, was, got = min(found, key=lambda row: [not row[0].startswith(first) for first in TYPED])

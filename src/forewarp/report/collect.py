@@ -55,9 +55,9 @@ class Result:
 
     @property
     def variant(self) -> str:
-        """What was changed; without a variant the method and the budget."""
+        """What was changed; without a variant the method and its preset."""
         known = self.config.get("variant") or {}
-        return known.get("name") or f"{self.config['model']['warp']}-{self.config['budget']['name']}"
+        return known.get("name") or f"{self.config['model']['name']}-{self.config['preset']['name']}"
 
     @property
     def about(self) -> str:
