@@ -3,9 +3,11 @@
 import re
 
 import pytest
+from omegaconf import OmegaConf
 
 from configs import composed
-from forewarp.cli.renamed import refuse_renamed
+from forewarp.cli.renamed import refuse_renamed, renewed
+from forewarp.cli.runs import build_run, method_of
 
 
 @pytest.mark.parametrize(
@@ -46,3 +48,16 @@ def test_words_of_today_are_not():
 )
 def test_what_is_advised_composes(word):
     assert composed("data.scene=x", word)
+
+
+def test_a_run_of_an_earlier_version_is_read():
+    now = OmegaConf.create(OmegaConf.to_container(composed("data.scene=x"), resolve=True))
+    old = OmegaConf.create(OmegaConf.to_container(now))
+    old.renderer, old.budget = old.model.pop("renderer"), {**old.pop("preset"), **old.budget}
+    del old.model["name"]
+    assert renewed(old) == now
+    assert vars(method_of(old.model)[1]) == vars(method_of(now.model)[1])
+    build_run(old)
+    assert renewed(now) == now
+    for spoiled in ({"model": None}, {"budget": 3, "model": {"warp": 1}, "renderer": {}}, {}):
+        assert renewed(OmegaConf.create(spoiled)) == spoiled

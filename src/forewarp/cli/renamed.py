@@ -1,8 +1,12 @@
-"""Words of earlier versions: each is refused with the one that took its place."""
+"""Words of earlier versions: typed, each is refused with the one in its place; in runs they are read."""
 
 from __future__ import annotations
 
 import re
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
 
 _OF_A_METHOD = "rays|background|bases|nodes|padding|skip_alpha|inpainter_width"
 # What a whole word was, what it is now (None: nothing in its place), why.
@@ -44,3 +48,16 @@ def refuse_renamed(words: list[str]) -> None:
             if found := re.fullmatch(old, plain, re.DOTALL):
                 now = "no such word" if new is None else sign + found.expand(new)
                 raise ValueError(f"{word}: expected {now}; {why}")
+
+
+def renewed(config: DictConfig) -> DictConfig:
+    """The config of a run's folder in today's keys, whatever version wrote it."""
+    from omegaconf import DictConfig, open_dict
+
+    model, budget, renderer = (config.get(key) for key in ("model", "budget", "renderer"))
+    if not all(isinstance(part, DictConfig) for part in (model, budget, renderer)) or "warp" not in model:
+        return config
+    with open_dict(config):
+        config.preset = {key: budget.pop(key) for key in list(budget) if key not in ("minutes", "iterations")}
+        model.name, model.renderer = model.warp, config.pop("renderer")
+    return config

@@ -15,6 +15,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from forewarp.cli.measure import check_precision, device_of
+from forewarp.cli.renamed import renewed
 from forewarp.cli.trusted import MOST_BYTES, trusted_config
 from forewarp.cli.words import as_typed, key_of, typed_words
 from forewarp.methods.spec import MethodSpec
@@ -225,7 +226,7 @@ def read_config(path: Path) -> DictConfig:
 
 def parsed(text: str, path: Path) -> DictConfig:
     """As ``read_config``, of text; ``path`` names it in errors."""
-    config = trusted_config(text, path)
+    config = renewed(trusted_config(text, path))
     for key in (*IDENTITY, "trainer", "logger", "callbacks"):
         if key not in config and key != "objective":  # a method may have none of its own
             raise ValueError(f"{path}: expected the key {key}, but got none; delete the run's folder")
