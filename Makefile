@@ -102,24 +102,23 @@ else
 	$(BIN)/forewarp-report kind=effects && exit $$status
 endif
 
-REPRODUCE = $(BIN)/forewarp-train --multirun budget=$(BUDGET) budget.minutes=$(MINUTES) $(SEED) $(if $(THREADS),threads=$(THREADS)) $(if $(LAUNCHER),launcher=$(LAUNCHER))
+REPRODUCE = $(BIN)/forewarp-train --multirun preset=$(PRESET) budget.minutes=$(MINUTES) $(SEED) $(if $(THREADS),threads=$(THREADS)) $(if $(LAUNCHER),launcher=$(LAUNCHER))
 # A counterpart of each dataset and 12 s a run: 27 runs, half of them on each of two cores.
-reproduce-tables: BUDGET ?= $(if $(DATA),fast,demo)
-reproduce-tables: MINUTES := $(if $(filter command line,$(origin MINUTES)),$(MINUTES),$(if $(filter faithful,$(BUDGET)),null,$(if $(DATA),5,0.2)))
+reproduce-tables: PRESET ?= $(if $(DATA),fast,demo)
+reproduce-tables: MINUTES := $(if $(filter command line,$(origin MINUTES)),$(MINUTES),$(if $(filter faithful,$(PRESET)),null,$(if $(DATA),5,0.2)))
 reproduce-tables: SWEEPS ?= $(if $(SCENES_TYPED),dnerf,dnerf hypernerf nhr lego_complete)
 reproduce-tables: override SWEEPS := $(if $(filter all,$(SWEEPS)),dnerf hypernerf nhr lego_complete ablation_modules ablation_losses resolution methods,$(SWEEPS))
 reproduce-tables: SCENES_TYPED := $(if $(filter command line,$(origin SCENES)),$(SCENES))
 reproduce-tables: SEEDS ?= 1
 reproduce-tables: OUT ?= runs/paper/results
-reproduce-tables: ## the paper's tables and figures, measured beside printed [DATA= BUDGET= SCENES="hook lego" MINUTES= SEEDS=3 SWEEPS=all OUT=]
+reproduce-tables: ## the paper's tables and figures, measured beside printed [DATA= PRESET= SCENES="hook lego" MINUTES= SEEDS=3 SWEEPS=all OUT=]
 ifeq ($(DATA),)
 	@status=0; $(MAKE) --no-print-directory -j2 tables-vehicle tables-captures \
-		BUDGET=$(BUDGET) MINUTES=$(MINUTES) SEEDS=$(SEEDS) $(GO_ON); \
+		PRESET=$(PRESET) MINUTES=$(MINUTES) SEEDS=$(SEEDS) $(GO_ON); \
 	$(BIN)/forewarp-report kind=paper out=$(OUT) curves=docs/results && exit $$status
 else
 	@status=0; for sweep in $(SWEEPS); do \
 		$(REPRODUCE) sweeps=$$sweep paths.scenes=$(DATA) \
-			$(if $(filter faithful,$(BUDGET)),$$([ $$sweep = hypernerf ] && echo experiment=hypernerf_faithful)) \
 			$(if $(SCENES_TYPED),scene=$(subst $(space),$(comma),$(addprefix dnerf_,$(SCENES_TYPED)))) $(GO_ON); \
 	done; \
 	$(BIN)/forewarp-report kind=paper out=$(OUT) curves=docs/results && exit $$status

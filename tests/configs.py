@@ -23,7 +23,10 @@ def options(group: str) -> list[str]:
 
 
 def groups() -> list[str]:
-    """Every group that one chooses from to train; ``dataset`` makes scenes, ``launcher`` needs packages."""
+    """Every group that one chooses from to train; ``dataset`` makes scenes, ``launcher`` needs packages, a
+    method's own numbers (``model_...``) follow from what is chosen.
+    """
     folders = [path.relative_to(CONF).as_posix() for path in CONF.rglob("*") if path.is_dir()]
     others = ("/one", "dataset", "launcher")
-    return sorted(group for group in folders if options(group) and not group.endswith(others))
+    chosen = [group for group in folders if options(group) and not group.startswith("model_")]
+    return sorted(group for group in chosen if not group.endswith(others))

@@ -26,8 +26,9 @@ def write_run(
     (folder / "coarse").mkdir(parents=True)
     config = {
         "data": {"scene": scene},
-        "model": {"warp": "forward"},
-        "budget": {"name": "fast", "minutes": minutes},
+        "model": {"name": "forward"},
+        "preset": {"name": "fast"},
+        "budget": {"minutes": minutes},
         "variant": {"name": variant, "about": f"the {variant}", "against": against},
         "seed": seed,
         "command": command or f"forewarp-train variant={variant} seed={seed}",

@@ -4,16 +4,17 @@ import re
 from dataclasses import MISSING, fields
 from functools import cache
 from inspect import signature
-from pathlib import Path
 
 import pytest
 import torch
 from hydra.errors import ConfigCompositionException
-from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
 from configs import CONF, ROOT, composed, groups, options
 from forewarp.cli.runs import build_run
+from forewarp.cli.runs import method_of as described
+from forewarp.data import dnerf, hypernerf, nhr, posed_video
+from forewarp.data.module import SceneDataModule
 from forewarp.effects.inpaint import UNet3d
 from forewarp.effects.upsample import LearnedUpsampler
 from forewarp.effects.view import SphericalHarmonics, ViewNetwork
@@ -21,7 +22,7 @@ from forewarp.renderer import Renderer
 from forewarp.scene.box import Box, Lattice
 from forewarp.training.settings import StageSettings
 
-BUDGETS, MODELS = options("budget"), options("model")
+PRESETS, MODELS = options("preset"), options("model")
 CHOICES = [(group, option) for group in groups() for option in options(group)]
 OFF = [
     ("inpainter", "unet3d"),
@@ -96,7 +97,7 @@ def test_a_variant_names_itself_and_changes_what_it_is_compared_with(name):
     assert config.run == f"{config.paths.runs}/accuracy_time/x/{name}-3min-seed0"
     assert (config.budget.minutes, config.data.held_out) == (3, 8)
     before = swept(config.variant.against)
-    parts = ("model", "stage", "objective", "budget", "data", "renderer", "trainer")
+    parts = ("model", "stage", "objective", "preset", "budget", "data", "trainer")
     same = all(config[key] == before[key] for key in parts)
     assert same is (name == "base")
 
@@ -107,7 +108,7 @@ def test_the_sweep_holds_every_variant_once():
     assert sorted(listed) == options("variant")
 
 
-def test_a_variant_wins_over_budget_and_experiment():
+def test_a_variant_wins_over_preset_and_experiment():
     common = ["experiment=dnerf", "data.scene=x"]
     assert method_of(run_of(*common, "variant=view_mlp").spec).view.__class__ is ViewNetwork
     assert composed(*common, "variant=preset_demo").budget.name == "demo"
@@ -116,11 +117,11 @@ def test_a_variant_wins_over_budget_and_experiment():
 
 
 @pytest.mark.parametrize("model", MODELS)
-@pytest.mark.parametrize("budget", BUDGETS)
-def test_budgets_go_with_models(budget, model):
-    config = composed("data.scene=x", f"budget={budget}", f"model={model}")
-    assert (config.budget.name, config.model.warp) == (budget, model)
-    spec = instantiate(config.model, _convert_="all")
+@pytest.mark.parametrize("preset", PRESETS)
+def test_presets_go_with_models(preset, model):
+    config = composed("data.scene=x", f"preset={preset}", f"model={model}")
+    assert (config.preset.name, config.model.name) == (preset, model)
+    spec = described(config.model)[0]
     if model == "backward":
         assert [spec.motion, spec.trajectory, spec.upsampler, spec.inpainter] == [None] * 4
         assert spec.deformation is not None
@@ -128,7 +129,7 @@ def test_budgets_go_with_models(budget, model):
 
 
 def test_faithful_is_the_papers_model():
-    method = method_of(run_of("budget=faithful").spec, frames=40)
+    method = method_of(run_of("preset=faithful").spec, frames=40)
     assert isinstance(method.inpainter, UNet3d)
     assert method.inpainter.width == 64
     assert isinstance(method.upsampler, LearnedUpsampler)
@@ -138,7 +139,7 @@ def test_faithful_is_the_papers_model():
 
 
 def test_faithful_stages_are_the_papers():
-    coarse, fine = run_of("budget=faithful").stages
+    coarse, fine = run_of("preset=faithful").stages
     assert (coarse.settings.iterations, fine.settings.iterations) == (20_000, 100_000)
     assert (coarse.settings.start_alpha, fine.settings.start_alpha) == (1e-6, 1e-2)
     assert coarse.settings.box_alpha == 1e-3
@@ -149,20 +150,20 @@ def test_faithful_stages_are_the_papers():
 
 
 @pytest.mark.parametrize(("effect", "on"), OFF)
-@pytest.mark.parametrize("budget", BUDGETS)
-def test_off_is_none_whatever_the_budget(budget, effect, on):
-    spec = run_of(f"budget={budget}", f"model/{effect}=none").spec
+@pytest.mark.parametrize("preset", PRESETS)
+def test_off_is_none_whatever_the_preset(preset, effect, on):
+    spec = run_of(f"preset={preset}", f"model/{effect}=none").spec
     assert getattr(spec, effect) is None
-    assert getattr(run_of(f"budget={budget}", f"model/{effect}={on}").spec, effect) is not None
+    assert getattr(run_of(f"preset={preset}", f"model/{effect}={on}").spec, effect) is not None
 
 
 def test_every_number_of_the_renderer_is_a_key_and_equals_its_default():
     defaults = {
         name: p.default for name, p in signature(Renderer.__init__).parameters.items() if name != "self"
     }
-    config = OmegaConf.to_container(composed("data.scene=x").renderer)
+    config = OmegaConf.to_container(composed("data.scene=x").model.renderer)
     assert config == {"_target_": "forewarp.renderer.Renderer"} | defaults
-    assert run_of("renderer.opaque=0").renderer.opaque == 0
+    assert run_of("model.renderer.opaque=0").renderer.opaque == 0
 
 
 def test_off_effects_own_nothing():
@@ -172,22 +173,22 @@ def test_off_effects_own_nothing():
 
 
 @pytest.mark.parametrize("order", [1, -1])
-def test_the_command_line_wins_over_the_budget(order):
-    overrides = ["budget=fast", "model/view=mlp"][::order]
-    assert method_of(run_of("budget=fast").spec).view.__class__ is SphericalHarmonics
+def test_the_command_line_wins_over_the_preset(order):
+    overrides = ["preset=fast", "model/view=mlp"][::order]
+    assert method_of(run_of("preset=fast").spec).view.__class__ is SphericalHarmonics
     assert method_of(run_of(*overrides).spec).view.__class__ is ViewNetwork
 
 
 def test_the_command_line_wins_over_the_experiment():
-    config = composed("experiment=dnerf", "data.scene=x", "budget=faithful", "data.box=null", "data.rays=7")
-    assert (config.budget.name, config.data.box, config.data.rays) == ("faithful", None, 7)
+    config = composed("experiment=dnerf", "data.scene=x", "preset=faithful", "data.box=null", "data.rays=7")
+    assert (config.preset.name, config.data.box, config.data.rays) == ("faithful", None, 7)
     assert composed("experiment=dnerf", "data.scene=x").data.box == [-1.5] * 3 + [1.5] * 3
 
 
 def test_a_ghost_is_refused():
     config = composed("model/inpainter=none", "+model.inpainter.width=32")
     with pytest.raises(Exception, match="model.inpainter: expected a factory or null, but got {'width': 32}"):
-        instantiate(config.model, _convert_="all")
+        described(config.model)
 
 
 def test_an_unknown_key_is_refused():
@@ -196,15 +197,15 @@ def test_an_unknown_key_is_refused():
 
 
 def test_budget_is_shared_out():
-    run = run_of("budget=fast", "budget.minutes=20", "budget.iterations=1000")
+    run = run_of("preset=fast", "budget.minutes=20", "budget.iterations=1000")
     assert [stage.settings.minutes for stage in run.stages] == pytest.approx([8, 12])
     assert [stage.settings.iterations for stage in run.stages] == [400, 600]
 
 
 def test_a_dropped_stage_leaves_its_share():
-    (only,) = run_of("budget=fast", "budget.minutes=20", "~stage.fine").stages
+    (only,) = run_of("preset=fast", "budget.minutes=20", "~stage.fine").stages
     assert (only.settings.name, only.settings.minutes) == ("coarse", 20)
-    (only,) = run_of("budget=fast", "stage.coarse=null").stages
+    (only,) = run_of("preset=fast", "stage.coarse=null").stages
     assert only.settings.name == "fine"
 
 
@@ -229,8 +230,8 @@ def test_every_weight_may_be_typed():
 
 
 @pytest.mark.parametrize("data", options("data"))
-def test_every_dataset_takes_a_canonical_time_and_the_budgets_background(data):
-    common = [f"data={data}", "data.scene=x", "budget.background=black"]
+def test_every_dataset_takes_a_canonical_time_and_the_presets_background(data):
+    common = [f"data={data}", "data.scene=x", "preset.background=black"]
     config = composed(*common, "data.canonical=middle")
     assert (config.data.canonical, config.data.background) == ("middle", "black")
     build_run(config)
@@ -238,13 +239,91 @@ def test_every_dataset_takes_a_canonical_time_and_the_budgets_background(data):
 
 
 def test_run_folder_is_named_after_the_choices():
-    config = composed("data.scene=hook", "data=dnerf", "model=backward", "budget=demo", "seed=3")
+    config = composed("data.scene=hook", "data=dnerf", "model=backward", "preset=demo", "seed=3")
     assert config.run == "runs/hook/backward-demo-seed3"
 
 
-def test_the_repository_is_no_group_of_configurations():
-    sources = composed(hydra=True).hydra.runtime.config_sources
-    places = [source.path for source in sources if source.provider not in ("hydra", "schema")]
-    assert [Path(place) for place in places] == [CONF]
-    with pytest.raises(ConfigCompositionException, match="Could not find 'sweeps/nothing'"):
-        composed("sweeps=nothing")
+@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("experiment", options("experiment"))
+@pytest.mark.parametrize("preset", PRESETS)
+def test_every_method_fits_every_experiment_in_every_preset(preset, experiment, model):
+    common = [f"experiment={experiment}", f"preset={preset}", f"model={model}", "data.scene=x"]
+    config = composed(*common)
+    assert (config.model.name, config.preset.name) == (model, preset)
+    build_run(config)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_each_number_of_a_method_is_taken_where_it_is_keyed(model):
+    hypernerf = ["experiment=hypernerf", "data.scene=x", f"model={model}"]
+    fast, faithful = composed(*hypernerf), composed(*hypernerf, "preset=faithful")
+    assert [c.preset.bases for c in (fast, faithful)] == [8, 25]  # model x preset x experiment
+    assert fast.objective.fine.weights.still_points == 1e-2  # model x experiment
+    assert (fast.preset.rays, faithful.budget.iterations) == (4096, 120000)  # model x preset
+    band, still = (composed(f"scene=specimen_{name}", f"model={model}") for name in ("band", "still"))
+    assert (band.stage.fine.voxels, still.stage.coarse.voxels) == ([[0, 15625]], [[0, 46656]])
+
+
+def test_effects_follow_the_pictures_and_the_command_line_wins():
+    def chosen(*words):
+        return composed("data.scene=x", *words, hydra=True).hydra.runtime.choices
+
+    assert chosen("experiment=hypernerf")["model/view"] == "none"
+    assert chosen("experiment=hypernerf")["model/background"] == "grid"
+    assert chosen("data=hypernerf")["model/background"] == "none"
+    assert chosen("experiment=video_with_poses")["model/view"] == "sh"
+    typed = ["experiment=hypernerf", "preset=demo", "model/view=mlp", "model/background=none"]
+    assert [chosen(*typed)[f"model/{effect}"] for effect in ("view", "background")] == ["mlp", "none"]
+    assert chosen("experiment=hypernerf", "variant=view_mlp")["model/view"] == "mlp"
+
+
+FOREIGN = {
+    "model/mine.yaml": "defaults:\n  - _self_\n\nname: mine\n_target_: mine.Method\nwidth: ${preset.width}\n",
+    "stage/mine_fast.yaml": "only: {share: 1.0}\n",
+    "model_preset/mine_fast.yaml": "# @package _global_\npreset: {rays: 7, background: white, width: 32}\n",
+    "model_experiment/mine_dnerf.yaml": "# @package _global_\npreset: {width: 48}\n",
+    "model_preset_experiment/mine_fast_nhr.yaml": "# @package _global_\npreset: {rays: 9}\n",
+    "model_scene/mine_dnerf_hook.yaml": "# @package _global_\npreset: {width: 64}\n",
+}
+
+
+def test_a_package_brings_a_method_and_its_numbers(tmp_path):
+    for name, text in FOREIGN.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text)
+
+    def mine(*words):
+        return composed(f"hydra.searchpath=[file://{tmp_path}]", "model=mine", "data.scene=x", *words)
+
+    plain, dnerf, nhr = mine(), mine("experiment=dnerf"), mine("experiment=nhr")
+    assert (plain.model.name, plain.run) == ("mine", "runs/x/mine-fast-seed0")
+    assert (list(plain.stage), "objective" in plain, "renderer" in plain.model) == (["only"], False, False)
+    assert [c.model.width for c in (plain, dnerf, nhr)] == [32, 48, 32]
+    assert [c.data.rays for c in (plain, dnerf, nhr)] == [7, 7, 9]
+    assert mine("scene=dnerf_hook").model.width == 64
+    with pytest.raises(ConfigCompositionException, match="Could not find 'stage/mine_demo'"):
+        mine("preset=demo")
+
+
+READERS = {
+    "dnerf": dnerf.read_scene,
+    "hypernerf": hypernerf.read_scene,
+    "nhr": nhr.read_scene,
+    "video_with_poses": posed_video.read_scene,
+}
+
+
+@pytest.mark.parametrize("data", READERS)
+def test_what_a_reader_takes_is_a_key_and_equals_its_default(data):
+    config = OmegaConf.load(CONF / "data" / f"{data}.yaml")
+    for name, parameter in signature(READERS[data]).parameters.items():
+        if parameter.kind is parameter.KEYWORD_ONLY:
+            assert config[name] == parameter.default, name
+    common = {n: p.default for n, p in signature(SceneDataModule.__init__).parameters.items()}
+    for name in ("held_out", "cache_bytes"):
+        assert config.get(name, common[name]) == common[name]
+
+
+def test_precision_is_a_key():
+    assert composed("data.scene=x").trainer.precision is None
+    assert composed("data.scene=x", "trainer.precision=bf16-mixed").trainer.precision == "bf16-mixed"

@@ -1,13 +1,13 @@
 """The sweeps behind the paper's tables: every job composes, and is known by what it computes."""
 
 import pytest
+from hydra._internal.config_repository import ConfigRepository
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
-from configs import ROOT, composed
+from configs import ROOT, composed, options
 from forewarp.cli.identity import hashed
 from forewarp.cli.runs import build_run
-from forewarp.cli.train import refuse_budget
 
 PAPER = {
     "dnerf": 8,
@@ -19,6 +19,13 @@ PAPER = {
     "resolution": 16,
     "methods": 32,
 }
+
+
+def names(group):
+    """The options of a group, sweeps among them."""
+    return sorted(p.stem for p in (ROOT / "sweeps").glob("*.yaml")) if group == "sweeps" else options(group)
+
+
 COUNTERPARTS = ["dnerf", "hypernerf", "nhr", "lego_complete"]
 
 
@@ -85,14 +92,40 @@ def test_every_job_composes_and_has_a_folder_of_its_own(sweep):
 
 @pytest.mark.parametrize("dataset", COUNTERPARTS)
 def test_a_counterpart_stands_in_for_each_dataset(dataset):
-    config = job_of("ablation_modules", f"scene=counterpart_{dataset}", "ablation=full", "budget=demo")
+    config = job_of("ablation_modules", f"scene=counterpart_{dataset}", "ablation=full", "preset=demo")
     assert "Synthetic" in config.data._target_
-    assert (config.budget.name, config.variant.name) == ("demo", "full")
+    assert (config.preset.name, config.variant.name) == ("demo", "full")
     assert config.stage.fine.voxels == [[0, 13824]]
 
 
+NAMING = [f"{group}={name}" for group in ("ablation", "variant", "sweeps") for name in names(group)]
+
+
+@pytest.mark.parametrize("choice", [choice for choice in NAMING if choice != "sweeps=methods"])
+def test_what_reproduces_the_paper_names_its_method(choice, monkeypatch):
+    expected = "backward" if choice == "variant=backward" else "forward"
+    load = ConfigRepository.load_config
+
+    def with_another_default(self, config_path):
+        found = load(self, config_path)
+        if config_path == "train":
+            (model,) = [d for d in found.defaults_list if getattr(d, "group", None) == "model"]
+            model.value = "backward" if expected == "forward" else "forward"
+        return found
+
+    monkeypatch.setattr(ConfigRepository, "load_config", with_another_default)
+    assert composed("data.scene=x", choice).model.name == expected
+
+
+def test_a_sweep_over_methods_has_both():
+    jobs = [composed("sweeps=methods", *job) for job in jobs_of("methods")[:2]]
+    assert sorted(config.model.name for config in jobs) == ["backward", "forward"]
+    assert composed("sweeps=dnerf", "data.scene=x", "model=backward").model.name == "backward"
+    assert composed("sweeps=accuracy_time", "data.scene=x", "variant=backward").model.name == "backward"
+
+
 def test_an_ablation_takes_one_thing_from_all():
-    common = ["scene=dnerf_hook", "budget=fast"]
+    common = ["scene=dnerf_hook", "preset=fast"]
     full = composed(*common, "ablation=full")
     assert None not in (full.model.upsampler, full.model.inpainter, full.model.view)
     without = {
@@ -130,9 +163,9 @@ def test_the_canonical_middle_reaches_the_data():
     assert run.datamodule._canonical == "middle"
 
 
-@pytest.mark.parametrize("budget", ["demo", "fast"])
-def test_what_stands_alone_begins_as_the_coarse_stage_would(budget):
-    common = ["scene=dnerf_hook", f"budget={budget}"]
+@pytest.mark.parametrize("preset", ["demo", "fast"])
+def test_what_stands_alone_begins_as_the_coarse_stage_would(preset):
+    common = ["scene=dnerf_hook", f"preset={preset}"]
     coarse = composed(*common, "ablation=full").stage.coarse
     full, alone = (composed(*common, f"ablation={name}").stage for name in ("full", "no_coarse"))
     assert alone.coarse is None
@@ -142,29 +175,30 @@ def test_what_stands_alone_begins_as_the_coarse_stage_would(budget):
     assert alone.fine.rates == {**full.fine.rates, "flow": coarse.rates.flow}
 
 
-@pytest.mark.parametrize("budget", ["demo", "fast", "faithful"])
-def test_the_voxel_networks_come_with_the_fine_stage(budget):
-    common = ["scene=dnerf_hook", f"budget={budget}"]
+@pytest.mark.parametrize("preset", ["demo", "fast", "faithful"])
+def test_the_voxel_networks_come_with_the_fine_stage(preset):
+    common = ["scene=dnerf_hook", f"preset={preset}"]
     for name in ("full", "no_tv", "no_up_photo"):
         stage = composed(*common, f"ablation={name}").stage
         assert not {"upsampler", "inpainter"} & set(stage.coarse.effects)
         assert {"upsampler", "inpainter"} <= set(stage.fine.effects)
 
 
-def test_a_capture_of_ten_minutes_is_not_called_faithful():
-    with pytest.raises(ValueError, match="expected demo or fast.*but got faithful.*hypernerf_faithful"):
-        refuse_budget(composed("scene=hypernerf_broom", "budget=faithful"))
-    faithful = composed("scene=hypernerf_broom", "budget=faithful", "experiment=hypernerf_faithful")
-    refuse_budget(faithful)
-    assert faithful.budget.bases == 25
+def test_captures_have_numbers_of_their_own_in_every_preset():
+    quick, faithful = composed("scene=hypernerf_broom"), composed("scene=hypernerf_broom", "preset=faithful")
+    assert (quick.preset.bases, faithful.preset.bases) == (8, 25)
+    assert quick.model.view is None
     assert faithful.model.view is not None
-    assert faithful.data.scene == "broom2"
-    refuse_budget(composed("scene=hypernerf_broom"))
+    for config in (quick, faithful):
+        assert config.data.scene == "broom2"
+        assert config.model.background is not None
+        assert config.stage.fine.voxels[-1][1] == 343000
+        assert config.objective.fine.weights.still_points == 1e-2
 
 
 def test_where_minutes_bound_a_run_its_precision_counts():
     full = ["sweeps=dnerf", "scene=dnerf_hook"]
-    half = "+trainer.precision=bf16-mixed"
+    half = "trainer.precision=bf16-mixed"
     assert hashed(composed(*full)).run != hashed(composed(*full, half)).run
     steps = ["budget.minutes=null", "budget.iterations=5"]
     assert hashed(composed(*full, *steps)).run == hashed(composed(*full, *steps, half)).run

@@ -23,7 +23,9 @@ def test_help_says_what_it_does_and_what_one_types(forewarp, name):
     assert done.err == ""
 
 
-@pytest.mark.parametrize("group", ["data", "model", "model/view", "budget", "experiment", "trainer"])
+@pytest.mark.parametrize(
+    "group", ["data", "model", "model/view", "preset", "capture", "experiment", "trainer"]
+)
 def test_help_lists_every_choice(forewarp, group):
     text = forewarp("train", "--help").out
     (line,) = [line for line in text.splitlines() if line.split()[:1] == [group]]
@@ -82,8 +84,8 @@ def test_options_of_ones_own_stand_beside_ours(forewarp, way, in_tmp, monkeypatc
     ("arguments", "line"),
     [
         (
-            ["budget=quick"],
-            "Could not find 'budget/quick'; Available options in 'budget': demo; faithful; fast",
+            ["preset=quick"],
+            "Could not find 'preset/quick'; Available options in 'preset': demo; faithful; fast",
         ),
         (
             ["data.nothing_like_it=1"],
@@ -109,7 +111,12 @@ def test_options_of_ones_own_stand_beside_ours(forewarp, way, in_tmp, monkeypatc
         (["~stage.coarse", "~stage.fine"], "stage: expected at least one stage, but got none"),
         (["stage.coarse.start=middle"], "stage.coarse.start: expected auto, box or hull, but got 'middle'"),
         (["+stage.coarse.bogus=1"], "got an unexpected keyword argument 'bogus'; leave that key out"),
-        (["+renderer.bogus=1"], "renderer: "),
+        (["+model.renderer.bogus=1"], "model.renderer: "),
+        (["budget=fast"], "budget=fast: expected preset=fast; the choice is called preset since 0.2"),
+        (
+            ["variant=backward", "ablation=full", "data.scene=x"],
+            "variant: expected none beside ablation=full, which is of model=forward, but got backward",
+        ),
         (["objective.coarse.literal=[foto]"], "objective.literal: expected some of photo"),
         (["+model.inpainter.width=16"], "model.inpainter: expected a factory or null, but got {'width': 16}"),
     ],

@@ -18,7 +18,7 @@ LAUNCHERS = {
     "submitit": [],
 }
 JOB = [
-    *("--multirun", "sweeps=dnerf", "paths.scenes=.", "budget=demo", "budget.minutes=null", "seeds=2"),
+    *("--multirun", "sweeps=dnerf", "paths.scenes=.", "preset=demo", "budget.minutes=null", "seeds=2"),
     *("trainer=cpu", "threads=1", "data.rays=64", "logger=none", "callbacks.pictures=null", "~stage.fine"),
     *("stage.coarse.voxels=[[0,800]]", "checkpoint_seconds=0", "sheets=0"),
 ]

@@ -7,7 +7,7 @@ from forewarp.scene.frame import spread
 from forewarp.synth.scenes import synthesize
 
 STEPS = ["budget.iterations=4", "stage.fine.voxels=[[0,4000]]", "stage.coarse.voxels=[[0,4000]]"]
-QUICK = ["budget=demo", "trainer=cpu", "data.rays=64", "logger=none", "callbacks.pictures=null"]
+QUICK = ["preset=demo", "trainer=cpu", "data.rays=64", "logger=none", "callbacks.pictures=null"]
 
 
 @pytest.fixture

@@ -56,7 +56,7 @@ def test_what_is_left_out_fits_one_line():
 def test_float16_is_refused(precision):
     text = f"trainer.precision: expected 32-true or bf16-mixed, but got {precision}; "
     with pytest.raises(ValueError, match=text):
-        build_run(composed(f"+trainer.precision={precision}"))
+        build_run(composed(f"trainer.precision={precision}"))
 
 
 @pytest.mark.parametrize("precision", [None, "32-true", 32, "bf16-mixed", "64-true"])

@@ -11,7 +11,7 @@ from forewarp.cli.trials import Trials
 from forewarp.data.module import SceneDataModule
 from forewarp.synth.scenes import synthesize
 
-TINY = ["data=dnerf", "budget=demo", "trainer=cpu", "data.rays=64", "logger=none", "callbacks=default"]
+TINY = ["data=dnerf", "preset=demo", "trainer=cpu", "data.rays=64", "logger=none", "callbacks=default"]
 TINY += ["callbacks.pictures=null", "callbacks.accuracy=null", "threads=1"]
 LATTICES = ["stage.coarse.voxels=[[0,4000]]", "stage.fine.voxels=[[0,8000]]"]
 SHORT = ["plan.steps=24", "plan.trial_steps=6", "plan.seeds=2", "plan.held_out=3"]

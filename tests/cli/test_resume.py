@@ -14,7 +14,7 @@ from forewarp.cli.replay import main as replay
 from forewarp.synth.scenes import synthesize
 
 SMALL = [
-    *("data=dnerf", "data.scene=vehicle", "budget=demo", "trainer=cpu", "data.rays=64", "logger=none"),
+    *("data=dnerf", "data.scene=vehicle", "preset=demo", "trainer=cpu", "data.rays=64", "logger=none"),
     *("budget.minutes=null", "budget.iterations=6", "stage.coarse.voxels=[[0,800]]", "~stage.fine"),
     *("callbacks.pictures=null", "evaluate=false", "checkpoint_seconds=0"),
 ]

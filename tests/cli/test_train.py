@@ -14,7 +14,7 @@ import yaml
 from dnerf_scene import edit, write_tiny
 from forewarp.synth.scenes import synthesize
 
-TINY = ["data=dnerf", "budget=demo", "trainer=cpu", "data.rays=128", "logger=none", "callbacks.pictures=null"]
+TINY = ["data=dnerf", "preset=demo", "trainer=cpu", "data.rays=128", "logger=none", "callbacks.pictures=null"]
 STEPS = ["budget.iterations=60", "stage.fine.voxels=[[0,8000]]", "stage.coarse.voxels=[[0,4000]]"]
 
 
@@ -76,7 +76,7 @@ def test_metrics_have_the_promised_shape(fitted):
     assert {"epe_moving", "epe_still", "motion_mean"} <= set(content["flow"])
     assert content["parameters"] > 1000
     assert content["peak_memory_bytes"] > 2**26
-    expected = {"scene": "vehicle", "budget": "demo", "seed": 0, "method": "forward", "scored": "upsampled"}
+    expected = {"scene": "vehicle", "preset": "demo", "seed": 0, "method": "forward", "scored": "upsampled"}
     assert expected.items() <= content["protocol"].items()
     assert {"device", "threads", "versions", "background", "resolution"} <= set(content["protocol"])
 

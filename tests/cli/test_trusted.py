@@ -107,7 +107,7 @@ def test_what_is_no_plain_config_is_refused_in_one_line(text, said):
         [],
         ["experiment=demo_hypernerf"],
         ["experiment=nhr", "data.scene=x", "model=backward"],
-        ["experiment=lego_complete", "data.scene=x", "budget=faithful", "trainer=gpu"],
+        ["experiment=lego_complete", "data.scene=x", "preset=faithful", "trainer=gpu"],
         ["experiment=video_with_poses", "data.scene=x", "model/motion=dct_features", "logger=none"],
     ],
 )

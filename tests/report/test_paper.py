@@ -29,7 +29,7 @@ def paper_run(root, scene, variant=None, seed=0, *, dataset="dnerf", made=False,
     folder = write_run(root, name, seed, scene=scene, curve=None)
     config = yaml.safe_load((folder / "config.yaml").read_text())
     config["variant"] = {"name": variant, "about": f"the {variant}", "against": "full"} if variant else None
-    config["model"]["warp"] = warp
+    config["model"]["name"] = warp
     config["data"]["_target_"] = f"forewarp.{'cli.synthetic.Synthetic' if made else 'data.module.'}DataModule"
     (folder / "config.yaml").write_text(yaml.safe_dump(config))
     metrics = json.loads((folder / "metrics.json").read_text())

@@ -21,10 +21,10 @@ KILLS = 24
 SMALL = [
     *("data=dnerf", "data.scene=vehicle", "data.rays=64", "data.half_resolution=false", "data.held_out=1"),
     *(
-        "budget=demo",
+        "preset=demo",
         "budget.minutes=null",
         "budget.iterations=36",
-        "budget.nodes=6",
+        "preset.nodes=6",
         "trainer=cpu",
         "threads=1",
     ),

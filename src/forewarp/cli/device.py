@@ -32,8 +32,8 @@ TINY = (
     "data.scene=tiny",
     "data.synthesis.frames=8",
     "data.synthesis.test_views=[1,1,1]",
-    "budget.rays=64",
-    "budget.inpainter_width=16",
+    "preset.rays=64",
+    "preset.inpainter_width=16",
     "stage.coarse.voxels=[[0,1000]]",
     "stage.fine.voxels=[[0,1500]]",
     "callbacks.accuracy.first=0.05",
@@ -115,7 +115,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m forewarp.cli.device", description=__doc__)
     parser.add_argument("--device", default="gpu", help="gpu, or cpu to see that it runs")
     parser.add_argument("--minutes", type=float, default=10.0, help="of training, a scene")
-    parser.add_argument("--steps", type=int, default=240, help="of budget=faithful, a sixth of them coarse")
+    parser.add_argument("--steps", type=int, default=240, help="of preset=faithful, a sixth of them coarse")
     parser.add_argument(
         "--data", default=None, help="a folder of D-NeRF scenes; none: the procedural vehicle"
     )
@@ -131,17 +131,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
     bounds = ["budget.iterations=12"] if given.small else [f"budget.minutes={given.minutes}"]
     for scene in given.scenes if given.data else ["vehicle"]:
         data = ["experiment=dnerf", f"data.root={given.data}", f"data.scene={scene}"] if given.data else []
-        budget = ["budget=fast", "data.held_out=2"] if given.small else ["budget=fast", "data.held_out=8"]
+        preset = ["preset=fast", "data.held_out=2" if given.small else "data.held_out=8"]
         where = given.folder / scene
         name = f"fast-{given.minutes:g}min"
-        run, module, times = fit([*data, *common, *budget, *bounds, f"run={where / name}"])
+        run, module, times = fit([*data, *common, *preset, *bounds, f"run={where / name}"])
         print(f"{scene}, fast")
         report(run, module, times, 40 if given.small else 400)
         for row in read_rows(where / name / FILE):
             print(f"  after {float(row['seconds']):6.1f} s: {float(row['psnr']):.2f} dB of views set aside")
         scores = [float(module.psnr_of(target)) for target in run.datamodule.targets("test")]
         print(f"  test views: {statistics.mean(scores):.2f} dB{papers(scene)}")
-        steps = ["budget=faithful", f"budget.iterations={12 if given.small else given.steps}"]
+        steps = ["preset=faithful", f"budget.iterations={12 if given.small else given.steps}"]
         run, module, times = fit([*data, *common, *steps, "budget.minutes=null", f"run={where / 'faithful'}"])
         print(f"{scene}, faithful")
         report(run, module, times, 40 if given.small else 400)

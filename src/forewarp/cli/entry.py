@@ -16,6 +16,7 @@ from pathlib import Path
 
 from forewarp.cli.folders import configurations, project_root
 from forewarp.cli.misspelt import unknown_key, with_keys
+from forewarp.cli.renamed import refuse_renamed
 
 TRACEBACK_VARIABLE = "FOREWARP_TRACEBACK"
 MISTAKE, INTERRUPTED = 2, 130
@@ -39,6 +40,8 @@ def command(name: str, task: Callable, text: str, *, config: str | None = None) 
             print(text.strip() + "\n\n" + choices(project_root() / "conf", config or name), flush=True)
             sys.exit(0)
         sys.argv[1:] = _words(name)
+        if (config or name) == "train":
+            refuse_renamed(sys.argv[1:])
         failures = _run(name, task, configurations(), config or name)
     except KeyboardInterrupt:
         _interrupted(name)
@@ -207,9 +210,9 @@ def choices(conf: Path, name: str) -> str:
     else:
         silent = {"hydra", "paths", "callbacks", "dataset"}
         folders = [path for path in sorted(conf.rglob("*")) if path.is_dir() and path.name != "one"]
-        groups = [
-            p.relative_to(conf).as_posix() for p in folders if p.relative_to(conf).parts[0] not in silent
-        ]
+        groups = [p.relative_to(conf).as_posix() for p in folders]
+        # model_preset and its like follow from what is chosen.
+        groups = [g for g in groups if g.split("/")[0] not in silent and not g.startswith("model_")]
     found = {group: sorted(path.stem for path in (conf / group).glob("*.yaml")) for group in groups}
     if name == "train":
         found["sweeps"] = [

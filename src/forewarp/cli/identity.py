@@ -18,9 +18,9 @@ from forewarp.cli.trusted import MOST_BYTES, trusted_config
 from forewarp.cli.words import as_typed, key_of, typed_words
 
 # What makes two runs different; where they run and what is shown of them does not.
-IDENTITY = ("data", "model", "objective", "stage", "budget", "seed")
+IDENTITY = ("data", "model", "objective", "stage", "preset", "budget", "seed")
 # Named first of what differs, as others follow from these.
-TYPED = ("data.scene", "data.root", "seed", "budget")
+TYPED = ("data.scene", "data.root", "seed", "preset", "budget")
 HASH = "{hash}"
 # What may be set beside resume=<run>.
 MAY_CHANGE = (
@@ -43,7 +43,7 @@ def hashed(config: DictConfig) -> DictConfig:
 def content_hash(config: DictConfig, more: Sequence[str] = (), *others: object) -> str:
     """Ten digits of a SHA-256 of what a run computes, of ``more`` keys of its config, and of ``others``."""
     _make_absolute(config)
-    content = {key: _plain(config[key]) for key in (*IDENTITY, *more)}
+    content = {key: _plain(config.get(key)) for key in (*IDENTITY, *more)}
     if config.budget.minutes is not None:
         from forewarp.cli.measure import device_of
 
@@ -150,7 +150,7 @@ def parsed(text: str, path: Path) -> DictConfig:
     """As ``read_config``, of text; ``path`` names it in errors."""
     config = trusted_config(text, path)
     for key in (*IDENTITY, "trainer", "logger", "callbacks"):
-        if key not in config:
+        if key not in config and key != "objective":  # a method may have none of its own
             raise ValueError(f"{path}: expected the key {key}, but got none; delete the run's folder")
     return config
 
@@ -162,7 +162,7 @@ def _make_absolute(config: DictConfig) -> None:
 
 
 def _refuse_another(path: Path, before: DictConfig, now: DictConfig) -> None:
-    old, new = ({k: OmegaConf.to_container(c)[k] for k in IDENTITY} for c in (before, now))
+    old, new = ({k: OmegaConf.to_container(c).get(k) for k in IDENTITY} for c in (before, now))
     found = list(_differences(old, new))
     if found:
         key, was, got = min(found, key=lambda row: [not row[0].startswith(first) for first in TYPED])

@@ -27,7 +27,7 @@ def measure(run: Run, module: DynamicSceneModule, config: DictConfig) -> dict:
     nets = find_lpips(extra=[extra] if isinstance(extra, str) else extra)
     suite = ImageSuite(nets, mask_box=run.datamodule.scene.protocol.get("mask_box", False))
     module.to(device_of(config.trainer.accelerator))
-    protocol = {"method": config.model.name, "budget": config.budget.name, "seed": config.seed}
+    protocol = {"method": config.model.name, "preset": config.preset.name, "seed": config.seed}
     protocol |= {"minutes": config.budget.minutes, "iterations": config.budget.iterations}
     with Progress("test views") as progress:
         metrics = evaluate(
@@ -64,7 +64,7 @@ def check_precision(precision: object) -> None:
     if "16" in str(precision) and "bf16" not in str(precision):
         raise ValueError(
             f"trainer.precision: expected 32-true or bf16-mixed, but got {precision}; "
-            "float16 does not hold the gradients, use +trainer.precision=bf16-mixed"
+            "float16 does not hold the gradients, use trainer.precision=bf16-mixed"
         )
 
 

@@ -29,7 +29,7 @@ def plan(config) -> None:
     """Plan and say so."""
     from forewarp.cli.absent import refuse_absent
     from forewarp.cli.plan_file import tell
-    from forewarp.cli.train import refuse_budget, refuse_seeds
+    from forewarp.cli.train import refuse_seeds, refuse_two_models
     from forewarp.cli.words import typed_words
 
     if isinstance(config.plan, str):
@@ -37,7 +37,7 @@ def plan(config) -> None:
             f"plan: expected keys as plan.minutes=10, but got {config.plan}; forewarp-train takes a file"
         )
     refuse_seeds(config)
-    refuse_budget(config)
+    refuse_two_models(config)
     refuse_absent(config)
     from forewarp.cli.planning import make_plan  # loads torch; what is mistyped has been answered before
 

@@ -62,11 +62,9 @@ def build_run(config: DictConfig) -> Run:
 
 def model_of(config: DictConfig) -> Callable:
     """What makes a method of a stage's start, from the ``model`` part of a config."""
-    content = OmegaConf.to_container(config, resolve=True)
-    drop = {"name"}
-    if config.name == "backward":
-        drop |= {"motion", "trajectory", "upsampler", "inpainter"}
-    model = instantiate({key: value for key, value in content.items() if key not in drop}, _convert_="all")
+    content = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    content.pop("name", None)
+    model = instantiate(OmegaConf.create({"model": content}).model, _convert_="all")  # its key, for errors
     if not callable(model):
         raise ValueError(
             f"model: expected a method that waits for its start, but got {type(model).__name__}; "
@@ -76,7 +74,7 @@ def model_of(config: DictConfig) -> Callable:
 
 
 def stage_of(config: DictConfig | None) -> StagePlan | None:
-    """A stage that waits for its budget, from its part of a config; one with a ``model`` has its own method."""
+    """A stage that waits for its budget; where it names a ``model``, one with a method of its own."""
     if config is None:
         return None
     content = OmegaConf.to_container(config, resolve=True)

@@ -136,7 +136,7 @@ def step_work(side: float, dense: bool, rays: int = 2048, box: float = 1.0) -> W
 def frame_work(size: float, dense: bool, first: bool = True, side: int = 64, plain: bool = False) -> Work:
     """A whole picture of ``size`` squared pixels; not the ``first`` of its time: the warped grid is there.
 
-    ``plain`` has neither U-Net nor up-sampler, as ``budget=fast``.
+    ``plain`` has neither U-Net nor up-sampler, as ``preset=fast``.
     """
     module, _ = make_module(side, dense, rays=1, effects=("motion", "view") if plain else EFFECTS)
     view = camera(int(size)).rays()

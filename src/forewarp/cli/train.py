@@ -14,7 +14,7 @@ The same command run again skips what is finished and goes on with what was inte
 
 What one types most:
   data.root=FOLDER data.scene=NAME    where the scenes are, and which one
-  budget=demo|fast|faithful           what the run may cost; fast is the default
+  preset=demo|fast|faithful           the method's numbers: small, cheap (the default), as printed
   budget.minutes=N                    of training, all stages together
   budget.iterations=N                 the same in steps; with both, what comes first (null switches one off)
   model=forward|backward              the paper's method, or its opponent
@@ -23,12 +23,12 @@ What one types most:
   trainer=cpu|gpu|auto                where
   resume=FOLDER                       go on with the run there; nothing else need be typed
   sentinel.skip=N                     leave out up to N steps of a stage that are not finite, and count them
-  run=FOLDER                          where the run lives (runs/<scene>/<model>-<budget>-seed<seed>)
+  run=FOLDER                          where the run lives (runs/<scene>/<model>-<preset>-seed<seed>)
   effects=auto                        find out what the scene calls for, then fit that: see forewarp-plan
   plan=FILE                           as a plan says; what is typed beside it wins
   evaluate=false                      no test views at the end
   data.held_out=N                     set N training views aside: a curve of their PSNR against training time
-  variant=NAME                        one change against budget=fast, as the price list has it
+  variant=NAME                        one change against preset=fast, as the price list has it
   scene=DATASET_NAME                  as scene=dnerf_hook: a scene of the paper below paths.scenes=FOLDER
   ablation=NAME                       what the paper takes away, from ablation=full
   launcher=local|joblib|ray|slurm|submitit   of --multirun: where its jobs run
@@ -49,7 +49,7 @@ def train(config) -> None:
     from forewarp.cli.identity import claim, hashed, resumed
 
     refuse_seeds(config)
-    refuse_budget(config)
+    refuse_two_models(config)
     config = resumed(config)
     refuse_absent(config)
     # These load torch; what is mistyped has been answered before.
@@ -126,13 +126,15 @@ def refuse_seeds(config) -> None:
         raise ValueError(f"seeds: expected --multirun beside seeds={config.seeds}; add it, or use seed=N")
 
 
-def refuse_budget(config) -> None:
-    """Refuse a budget that the experiment's numbers are not for, as the run would bear its name."""
-    suits = config.get("suits")
-    if suits is not None and config.budget.name not in suits.budgets:
+def refuse_two_models(config) -> None:
+    """Refuse ``variant=backward`` beside an ablation, which is of the forward method."""
+    from hydra.core.hydra_config import HydraConfig
+
+    chosen = HydraConfig.get().runtime.choices if HydraConfig.initialized() else {}
+    if chosen.get("variant") == "backward" and config.model.name != "backward":
         raise ValueError(
-            f"budget: expected {' or '.join(suits.budgets)}, which this experiment is made for, but got "
-            f"{config.budget.name}; use {suits.otherwise}"
+            f"variant: expected none beside ablation={chosen.get('ablation')}, which is of model=forward, "
+            "but got backward; leave one of them out, or use model=backward"
         )
 
 

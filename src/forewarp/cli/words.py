@@ -37,8 +37,8 @@ def key_of(word: str) -> str:
 def merged(words: Sequence[str], later: Sequence[str]) -> list[str]:
     """Words and later ones, which win where both set the same key.
 
-    >>> merged(["model/view=sh", "budget.bases=12"], ["model/view=none"])
-    ['budget.bases=12', 'model/view=none']
+    >>> merged(["model/view=sh", "preset.bases=12"], ["model/view=none"])
+    ['preset.bases=12', 'model/view=none']
     """
     known = {key_of(word) for word in later}
     return [word for word in words if key_of(word) not in known] + list(later)

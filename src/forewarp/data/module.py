@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import cached_property, partial
+from inspect import signature
 from pathlib import Path
 
 from lightning import LightningDataModule
@@ -146,87 +147,48 @@ class SceneDataModule(LightningDataModule):
         self.batches.load_state_dict(state_dict)
 
 
-class DNeRFDataModule(SceneDataModule):
-    """The D-NeRF scene ``root/scene``; arguments as in ``dnerf.read_scene`` and ``SceneDataModule``."""
+class _FolderDataModule(SceneDataModule):
+    """The scene ``root/scene``; other arguments as in its format's reader and in ``SceneDataModule``, which
+    hold their defaults.
+    """
 
-    _reader = staticmethod(dnerf.read_scene)
+    _reader: Callable[..., Scene]
+    _options: tuple[str, ...]  # what the reader takes
 
-    def __init__(
-        self,
-        root: str | Path,
-        scene: str,
-        *,
-        half_resolution: bool | str = "auto",
-        box: Sequence[float] | None = None,
-        near: float = 2.0,
-        far: float = 6.0,
-        **common,
-    ) -> None:
-        options = {"half_resolution": half_resolution, "box": box, "near": near, "far": far}
-        super().__init__(partial(self._reader, root, scene, **options), place=Path(root) / scene, **common)
+    def __init__(self, root: str | Path, scene: str, **options) -> None:
+        read = {name: options.pop(name) for name in self._options if name in options}
+        super().__init__(partial(self._reader, root, scene, **read), place=Path(root) / scene, **options)
+
+
+def _options_of(reader: Callable) -> tuple[str, ...]:
+    return tuple(name for name, p in signature(reader).parameters.items() if p.kind is p.KEYWORD_ONLY)
+
+
+class DNeRFDataModule(_FolderDataModule):
+    """A D-NeRF scene, as ``dnerf.read_scene`` reads it."""
+
+    _reader, _options = staticmethod(dnerf.read_scene), _options_of(dnerf.read_scene)
 
 
 class LegoCompleteDataModule(DNeRFDataModule):
-    """The Lego Complete scene ``root/scene``; arguments as in ``DNeRFDataModule``."""
+    """A Lego Complete scene; options as of D-NeRF's."""
 
     _reader = staticmethod(lego_complete.read_scene)
 
 
-class NHRDataModule(SceneDataModule):
-    """The NHR scene ``root/scene``; arguments as in ``nhr.read_scene`` and ``SceneDataModule``."""
+class NHRDataModule(_FolderDataModule):
+    """An NHR scene, as ``nhr.read_scene`` reads it."""
 
-    def __init__(
-        self,
-        root: str | Path,
-        scene: str,
-        *,
-        half_resolution: bool = True,
-        box: Sequence[float] | None = None,
-        frames: int = 100,
-        test_views: Sequence[int] | None = None,
-        test_every: int = 1,
-        **common,
-    ) -> None:
-        options = {"half_resolution": half_resolution, "box": box, "frames": frames}
-        options |= {"test_views": test_views, "test_every": test_every}
-        super().__init__(partial(nhr.read_scene, root, scene, **options), place=Path(root) / scene, **common)
+    _reader, _options = staticmethod(nhr.read_scene), _options_of(nhr.read_scene)
 
 
-class PosedVideoDataModule(SceneDataModule):
-    """The capture ``root/scene``; arguments as in ``posed_video.read_scene`` and ``SceneDataModule``."""
+class PosedVideoDataModule(_FolderDataModule):
+    """A capture with poses, as ``posed_video.read_scene`` reads it; ``canonical`` is the reader's."""
 
-    def __init__(
-        self,
-        root: str | Path,
-        scene: str,
-        *,
-        scale: int = 1,
-        near: float | None = None,
-        far: float | None = None,
-        box: Sequence[float] | None = None,
-        normalise: bool = True,
-        canonical: str = "middle",
-        test_every: int = 8,
-        **common,
-    ) -> None:
-        options = {"scale": scale, "near": near, "far": far, "box": box, "normalise": normalise}
-        options |= {"canonical": canonical, "test_every": test_every}
-        super().__init__(
-            partial(posed_video.read_scene, root, scene, **options), place=Path(root) / scene, **common
-        )
+    _reader, _options = staticmethod(posed_video.read_scene), _options_of(posed_video.read_scene)
 
 
-class HyperNeRFDataModule(SceneDataModule):
-    """The capture ``root/scene``; arguments as in ``hypernerf.read_scene`` and ``SceneDataModule``."""
+class HyperNeRFDataModule(_FolderDataModule):
+    """A HyperNeRF capture, as ``hypernerf.read_scene`` reads it."""
 
-    def __init__(
-        self,
-        root: str | Path,
-        scene: str,
-        *,
-        scale: int = 2,
-        box: Sequence[float] | None = None,
-        **common,
-    ) -> None:
-        read = partial(hypernerf.read_scene, root, scene, scale=scale, box=box)
-        super().__init__(read, place=Path(root) / scene, **common)
+    _reader, _options = staticmethod(hypernerf.read_scene), _options_of(hypernerf.read_scene)

@@ -55,9 +55,9 @@ class Result:
 
     @property
     def variant(self) -> str:
-        """What was changed; without a variant the method and the budget."""
+        """What was changed; without a variant the method and its preset."""
         known = self.config.get("variant") or {}
-        return known.get("name") or f"{self.config['model']['name']}-{self.config['budget']['name']}"
+        return known.get("name") or f"{self.config['model']['name']}-{self.config['preset']['name']}"
 
     @property
     def about(self) -> str:
@@ -160,6 +160,9 @@ def read_run(folder: Path) -> Result:
     if (size := path.stat().st_size) > MOST_BYTES:
         raise ValueError(f"config.yaml: expected at most {MOST_BYTES} bytes, but got {size}")
     config = yaml.safe_load(path.read_text())
+    if "preset" not in config and "warp" in config.get("model", {}):  # of a version before 0.2
+        config["preset"] = {"name": config["budget"]["name"]}
+        config["model"]["name"] = config["model"]["warp"]
     stages = {path.parent.name: _json(path) for path in sorted(folder.glob("*/done.json"))}
     result = Result(folder, config, stages, _json(folder / "metrics.json"), read_curve(folder))
     # Looked at here, so that what is spoiled is found while it can be named.

@@ -57,8 +57,8 @@ class Row(NamedTuple):
     """What runs of one row have in common."""
 
     variant: str
-    warp: str
-    budget: str
+    model: str
+    preset: str
     minutes: float | None
     iterations: int | None
     held_out: int
@@ -69,7 +69,7 @@ def row_of(run: Result) -> Row:
     """The row that a run belongs to."""
     budget = run.config["budget"]
     known, protocol = (run.config.get("variant") or {}).get("name", "plain"), run.metrics.get("protocol", {})
-    bounds = budget["name"], budget["minutes"], budget.get("iterations")
+    bounds = run.config["preset"]["name"], budget["minutes"], budget.get("iterations")
     conditions = protocol.get("held_out", 0), protocol.get("device")
     return Row(known, run.config["model"]["name"], *bounds, *conditions)
 
@@ -102,7 +102,7 @@ def comparison(table: PaperTable, results: Sequence[Result], *, difference: bool
         cells = [row.cell(group, metric) for group, metric in table.columns]
         ranked.append(len(rows))
         rows.append([row.name, kinds[0], *cells, row.seconds])
-        papers_own = row.row.warp == "forward"
+        papers_own = row.row.model == "forward"
         printed = _ours(table, row.row.variant) if papers_own else None
         if difference and printed is not None and any(cells):
             rows.append(["", kinds[1], *map(_difference, cells, printed), None])
@@ -152,9 +152,9 @@ def _conditions(run: Result) -> tuple:
 def _name(row: Row, runs: Sequence[Result], tell_device: bool) -> str:
     minutes, steps = f"{row.minutes or 0:g} min", f"{row.iterations} steps"
     bounds = [minutes if row.minutes else "", steps if row.iterations else ""]
-    about = row.warp if row.variant == "plain" else (runs[0].about or row.variant)
+    about = row.model if row.variant == "plain" else (runs[0].about or row.variant)
     seeds = len({run.seed for run in runs})
-    parts = [f"forewarp: {about}", row.budget, *bounds, f"{seeds} seeds" if seeds > 1 else ""]
+    parts = [f"forewarp: {about}", row.preset, *bounds, f"{seeds} seeds" if seeds > 1 else ""]
     parts.append(f"{row.held_out} views set aside" if row.held_out else "")
     parts.append(str(row.device) if tell_device else "")
     return ", ".join(part for part in parts if part)

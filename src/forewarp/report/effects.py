@@ -18,7 +18,7 @@ INTRODUCTION = """# Only the effects a scene calls for
 
 Written by `forewarp-report kind=effects` from runs of `sweeps=effects`. *Planned* is what `effects=auto`
 found the scene to call for, *every effect* has all of them on, *the paper's set* is motion, inpainter,
-learned up-sampler, view network and all terms of its loss, *the preset* is the budget as it is. PSNR (dB) is
+learned up-sampler, view network and all terms of its loss, *the preset* is the method as is. PSNR (dB) is
 of test views, which no plan has seen: between the training times where a scene tells its views apart. Minutes
 are of training; planning comes before and is listed apart. "Seconds to it": when the planned run's curve, of
 validation views, came within {within:g} dB of where every effect ended, "of" so many seconds.

@@ -136,11 +136,11 @@ def _draw(results: Sequence[Result], out: Path) -> list[tuple[str, Path | None, 
 
 
 def _pairs(runs: Sequence[Result]) -> dict[str, list[Result]]:
-    """Scene -> a forward and a backward run of it, equal in budget and seed."""
+    """Scene -> a forward and a backward run of it, equal in preset, budget and seed."""
     equal: dict[tuple, dict[str, Result]] = {}
     for run in runs:
         row = row_of(run)
-        equal.setdefault((run.scene, run.seed, row._replace(warp="")), {})[row.warp] = run
+        equal.setdefault((run.scene, run.seed, row._replace(model="")), {})[row.model] = run
     both = {key[0]: pair for key, pair in equal.items() if {"forward", "backward"} <= pair.keys()}
     return {scene: [pair["forward"], pair["backward"]] for scene, pair in sorted(both.items())}
 
@@ -177,7 +177,7 @@ def _budget(run: Result) -> str:
     budget = run.config["budget"]
     minutes = f"{budget['minutes']:g} min a run" if budget["minutes"] else ""
     steps = f"{budget['iterations']} steps" if budget.get("iterations") else ""
-    return ", ".join(word for word in (budget["name"], minutes, steps) if word)
+    return ", ".join(word for word in (run.config["preset"]["name"], minutes, steps) if word)
 
 
 def _day(run: Result) -> str:

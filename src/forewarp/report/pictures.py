@@ -23,7 +23,7 @@ def draw_resolution(path: Path, results: Sequence[Result]) -> Path | None:
         name, _, side = run.variant.rpartition("_")
         if name == "voxels" and side.isdigit() and "psnr" in run.numbers:
             row = row_of(run)
-            line = f"{run.scene}, {row.warp}, {row.budget}, {row.minutes or row.iterations:g}"
+            line = f"{run.scene}, {row.model}, {row.preset}, {row.minutes or row.iterations:g}"
             scenes.setdefault(line, {}).setdefault(int(side), []).append(run.numbers["psnr"])
     scenes = {scene: sides for scene, sides in scenes.items() if len(sides) > 1}
     if not scenes:

@@ -1,0 +1,60 @@
+"""Words and runs of earlier versions: each is refused, with what there is in its place."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
+_OF_A_METHOD = "rays|background|bases|nodes|padding|skip_alpha|inpainter_width"
+# What a whole word was, what it is now (None: nothing in its place), why.
+RENAMED = (
+    (
+        r"budget=(.*)",
+        r"preset=\1",
+        "the choice is called preset since 0.2; what may be spent is budget.minutes",
+    ),
+    (r"budget\.name=(.*)", r"preset=\1", "the choice is called preset since 0.2"),
+    (
+        rf"budget\.({_OF_A_METHOD})(=.*)?",
+        r"preset.\1\2",
+        "the method's numbers are called preset since 0.2",
+    ),
+    (r"experiment=hypernerf_faithful", "experiment=hypernerf preset=faithful", "one experiment since 0.2"),
+    (r"renderer([.=].*)?", r"model.renderer\1", "it is a part of the model since 0.2"),
+    (r"model\.warp=(.*)", r"model=\1", "the method's name is model.name since 0.2"),
+    (r"stage=(demo|fast|faithful)", r"stage=forward_\1", "each method has its own since 0.2"),
+    (r"objective=(fast|faithful)", r"objective=forward_\1", "each method has its own since 0.2"),
+    (r"suits([.=].*)?", None, "every experiment takes every preset since 0.2"),
+)
+
+
+def refuse_renamed(words: list[str]) -> None:
+    """Raise ValueError for a word of an earlier version.
+
+    Args:
+        words: of the command line, without the command.
+
+    >>> refuse_renamed(["preset=fast", "budget.minutes=3"])
+    >>> refuse_renamed(["budget.bases=12"])
+    Traceback (most recent call last):
+    ValueError: budget.bases=12: expected preset.bases=12; the method's numbers are called preset since 0.2
+    """
+    for word in words:
+        for old, new, why in RENAMED:
+            sign, plain = re.fullmatch(r"([+~]*)(.*)", word, re.DOTALL).groups()
+            if found := re.fullmatch(old, plain, re.DOTALL):
+                now = "no such word" if new is None else sign + found.expand(new)
+                raise ValueError(f"{word}: expected {now}; {why}")
+
+
+def refuse_old(config: DictConfig, path: Path) -> None:
+    """Raise ValueError for the config of a run that an earlier version made: its folder holds other things."""
+    if "warp" in (config.get("model") or {}):
+        raise ValueError(
+            f"{path}: expected a run of forewarp 0.2, but got one of 0.1, which version 0.1.0 reads; "
+            "run its command again into another folder, or install forewarp 0.1.0"
+        )
