@@ -17,6 +17,7 @@ from pathlib import Path
 from forewarp.cli.misspelt import unknown_key, with_keys
 
 ROOT_VARIABLE, TRACEBACK_VARIABLE = "FOREWARP_ROOT", "FOREWARP_TRACEBACK"
+TRUST_VARIABLE = "FOREWARP_TRUST"
 MISTAKE, INTERRUPTED = 2, 130
 
 
@@ -104,27 +105,34 @@ def _run(name: str, task: Callable, conf: Path, config_name: str) -> list[int]:
     import hydra
     from hydra.core.hydra_config import HydraConfig
 
-    def job(config) -> None:
+    # Goes along with the job, whatever of its environment a launcher hands on.
+    trust = {TRUST_VARIABLE: os.environ[TRUST_VARIABLE]} if TRUST_VARIABLE in os.environ else {}
+
+    def job(config) -> object:
         # Caught here, as Hydra would add a line of its own.
-        status = 0
+        status, result = 0, None
         try:
             quiet()  # a launcher's process begins here
-            task(config)
+            os.environ.update(trust)
+            result = task(config)
         except Exception as error:
             status = _tell(name, error, config_name)
         with suppress(OSError), open(ended, "a") as file:
             file.write(f"{status} {' '.join(HydraConfig.get().overrides.task)}\n")
+        return result
 
     # A file, as jobs may be other processes; those of another machine do not reach it.
     with tempfile.TemporaryDirectory(prefix="forewarp-") as folder:
         ended = os.path.join(folder, "ended")
-        hydra.main(version_base="1.3", config_path=str(conf), config_name=config_name)(job)()
-        lines = Path(ended).read_text().splitlines() if os.path.exists(ended) else []
-    jobs = [line.split(" ", 1) for line in lines]
-    failed = [words for status, words in jobs if int(status)]
-    if failed and len(jobs) > 1:
-        listed = "".join(f"\n  {words}" for words in failed)
-        print(f"forewarp-{name}: {len(failed)} of {len(jobs)} jobs failed:{listed}", file=sys.stderr)
+        try:
+            hydra.main(version_base="1.3", config_path=str(conf), config_name=config_name)(job)()
+        finally:  # a sweeper may end with an error of its own
+            lines = Path(ended).read_text().splitlines() if os.path.exists(ended) else []
+            jobs = [line.split(" ", 1) for line in lines]
+            failed = [words for status, words in jobs if int(status)]
+            if failed and len(jobs) > 1:
+                listed = "".join(f"\n  {words}" for words in failed)
+                print(f"forewarp-{name}: {len(failed)} of {len(jobs)} jobs failed:{listed}", file=sys.stderr)
     return [int(status) for status, _ in jobs]
 
 
