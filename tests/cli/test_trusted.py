@@ -60,9 +60,7 @@ TARGETS = [
 def test_what_is_no_class_of_ours_is_refused(target, where):
     node = {"_target_": target, "_partial_": True}
     text = OmegaConf.to_yaml({"a": node} if where == "top" else {"b": [{"c": {"d": [node]}}]})
-    with pytest.raises(
-        ValueError, match=r"_target_: expected a class of forewarp, but got"
-    ):
+    with pytest.raises(ValueError, match=r"_target_: expected a class of forewarp, but got"):
         read(text)
 
 

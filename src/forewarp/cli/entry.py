@@ -171,11 +171,11 @@ def one_line(error: BaseException) -> str | None:
         return f"{missing[1]}: expected a value, but got none; set {missing[1]}=..."
     if getattr(error, "override", None):  # what Hydra could not parse
         return f"{error.override}: {_flat(str(error))}"
-    if isinstance(error, HydraException) and (launcher := _absent_launcher(str(error))):
-        return (
-            f"launcher: expected the package of hydra/launcher={launcher}, but got none; "
-            "install forewarp[sweeps], or use launcher=local"
-        )
+    if isinstance(error, HydraException) and (found := _absent_plugin(str(error))):
+        kind, plugin = found
+        otherwise = ", or use launcher=local" if kind == "launcher" else ""
+        expected = f"{kind}: expected the package of hydra/{kind}={plugin}, but got none"
+        return f"{expected}; install forewarp[sweeps]{otherwise}"
     if isinstance(error, HydraException | OmegaConfBaseException):
         cause = error.__cause__
         detail = f" ({_flat(str(cause))})" if isinstance(cause, OmegaConfBaseException) else ""
@@ -199,9 +199,9 @@ def one_line(error: BaseException) -> str | None:
     return _flat(str(error)) if isinstance(error, ValueError) else None
 
 
-def _absent_launcher(text: str) -> str | None:
-    found = re.search(r"hydra/launcher[/'=:\s]+(joblib|ray|submitit_\w+)", text)
-    return found and found[1]
+def _absent_plugin(text: str) -> tuple[str, ...] | None:
+    found = re.search(r"hydra/(launcher|sweeper)[/'=:\s]+(joblib|ray|submitit_\w+|optuna)", text)
+    return found and found.groups()
 
 
 def _of_system(error: OSError) -> str:
