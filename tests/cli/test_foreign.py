@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from forewarp.cli.plan_file import with_plan, write_plan
 from forewarp.cli.stored import stored_run
 
 HERE = Path(__file__).parents[1] / "foreign"
@@ -110,6 +111,15 @@ def test_a_stored_run_is_measured_by_who_trusts_it(forewarp, refused, fitted, mo
         word = None
     done = forewarp("evaluate", "run=run", *filter(None, [word]))
     assert done.status == 0, done.err
+
+
+def test_a_plan_that_names_the_package_is_followed_by_who_trusts_it(tmp_path):
+    file, word = tmp_path / "plan.yaml", "model.view._target_=theirs.effects.Tint"
+    write_plan(file, {"typed": ["data.scene=x"], "words": [word], "of": "0"})
+    with pytest.raises(ValueError, match="expected a class of forewarp, but got 'theirs.effects.Tint'"):
+        with_plan("train", [f"plan={file}"])
+    assert "theirs" not in sys.modules
+    assert word in with_plan("train", [f"plan={file}", TRUST])
 
 
 def test_two_pictures_are_rendered(forewarp, refused, fitted):
