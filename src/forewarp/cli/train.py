@@ -129,10 +129,12 @@ def refuse_seeds(config) -> None:
         raise ValueError(f"seeds: expected --multirun beside seeds={config.seeds}; add it, or use seed=N")
     if not alone and "_optuna_" in str(HydraConfig.get().sweeper.get("_target_")):
         swept = str((HydraConfig.get().sweeper.get("params") or {}).get("seed", ""))
+        if config.get("seeds", 1) != 1:
+            raise ValueError(f"seeds: expected 1 of a search, but got {config.seeds}; use seed=N")
         if swept.startswith("range"):
             raise ValueError(
                 "hydra.sweeper.params.seed: expected one seed, as this sweeper would search among several, "
-                f"but got {swept}; add hydra.sweeper.params.seed={config.get('seed', 0)}"
+                f"but got {swept}; add hydra.sweeper.params.seed=0"
             )
 
 
