@@ -36,7 +36,7 @@ install: ## make .venv and put forewarp into it, with all its extras but the lau
 	if [ -n "$$links" ]; then export UV_FIND_LINKS="$$links"; fi; \
 	VIRTUAL_ENV="$$PWD/.venv" $(BIN)/uv pip install -c constraints.txt -e '.[cpu,synth,plots,dev]'
 
-install-launchers: ## add joblib, Ray and submitit, that sweeps may run on (launcher=...), and Optuna
+install-launchers: ## add joblib, Ray and submitit, that sweeps may run on (launcher=...), and Optuna (sweeps=search)
 	links="$$($(BIN)/pip config get global.find-links 2>/dev/null || echo "$$PIP_FIND_LINKS")"; \
 	if [ -n "$$links" ]; then export UV_FIND_LINKS="$$links"; fi; \
 	VIRTUAL_ENV="$$PWD/.venv" $(BIN)/uv pip install -c constraints.txt -e '.[sweeps]'

@@ -4,3 +4,5 @@ import sys
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent))
+
+collect_ignore = ["foreign"]  # the package that tests/cli/test_foreign.py imports as somebody else's

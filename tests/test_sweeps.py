@@ -53,7 +53,12 @@ def test_a_sweep_has_its_jobs(sweep, count):
 
 
 def test_no_sweep_is_forgotten():
-    assert {path.stem for path in (ROOT / "sweeps").glob("*.yaml")} == {*PAPER, "accuracy_time", "effects"}
+    assert {path.stem for path in (ROOT / "sweeps").glob("*.yaml")} == {
+        *PAPER,
+        "accuracy_time",
+        "effects",
+        "search",
+    }
 
 
 def test_effects_are_compared_on_every_specimen():

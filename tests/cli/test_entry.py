@@ -74,8 +74,8 @@ def test_options_of_ones_own_stand_beside_ours(forewarp, way, in_tmp, monkeypatc
         assert done.status == 0, done.err
         return OmegaConf.create(done.out)
 
-    config = shown("experiment=mine", "budget=demo", "sweeps=mine")
-    assert (config.seed, config.model.warp, config.budget.name) == (7, "backward", "demo")
+    config = shown("experiment=mine", "preset=demo", "sweeps=mine")
+    assert (config.seed, config.model.name, config.preset.name) == (7, "backward", "demo")
     assert config.hydra.sweeper.params.model == "forward,backward"
     assert shown("experiment=demo", "sweeps=methods").seeds == 2
 

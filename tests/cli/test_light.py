@@ -45,7 +45,7 @@ def test_help_is_light(tmp_path, name):
     ("words", "says"),
     [
         (["train", "data.scence=x"], "did you mean data.scene?"),
-        (["train", "budget=quick"], "Could not find 'budget/quick'"),
+        (["train", "preset=quick"], "Could not find 'preset/quick'"),
         (["train", "--unknown"], "unrecognized arguments: --unknown"),
         (["train", "sweeps=nothing"], "Could not find 'sweeps/nothing'"),
         (["train", "data=dnerf"], "data.scene: expected a value, but got none"),

@@ -169,6 +169,23 @@ def test_a_plan_sets_no_code(tmp_path, word):
         read_plan(tmp_path / "plan.yaml")
 
 
+def test_a_plan_names_code_of_trusted_packages_and_never_trust(tmp_path):
+    file = tmp_path / "plan.yaml"
+    word = "model.view._target_=theirs.Tint"
+    write_plan(file, {"typed": ["data.scene=x", "trust=[theirs]"], "words": [word], "of": "0"})
+    with pytest.raises(
+        ValueError, match=r"'theirs.Tint'; if you trust the package theirs, add trust=\[theirs\]"
+    ):
+        with_plan("train", [f"plan={file}"])
+    assert word in read_plan(file, typed=[word])["words"]  # what is typed now needs no trust
+    file.unlink()
+    write_plan(file, {"typed": ["trust=[os]"], "words": ["a.b=1"], "of": "0"})
+    assert read_plan(file)["typed"] == []
+    write_plan(file, {"typed": ["a.b={_target_:theirs.Tint}"], "words": [], "of": "0"})
+    with pytest.raises(ValueError, match="expected words that a plan has"):
+        read_plan(file, ["theirs"])
+
+
 def test_what_is_typed_beside_a_plan_wins(tmp_path):
     file = tmp_path / "plan.yaml"
     words = ["model/view=sh", "model/inpainter=none", "model/motion=none", "stage.coarse.bases=[]"]

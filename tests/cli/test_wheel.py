@@ -88,7 +88,7 @@ def test_commands_work_in_an_empty_folder_and_write_nowhere_else(installed):
     run("render", "run=runs/demo", "format=png", "frames=2", "size=32", "trainer=cpu")
     assert len(list((folder / "runs" / "demo" / "videos" / "fixed").glob("*.png"))) == 2
     words = ["sweeps=methods", "scene=counterpart_dnerf", *SMALL[1:], "evaluate=false", "seeds=1"]
-    run("train", "--multirun", *words, "budget=demo", "budget.minutes=null", "budget.iterations=2")
+    run("train", "--multirun", *words, "preset=demo", "budget.minutes=null", "budget.iterations=2")
     fitted = sorted(path.parents[0].name for path in (folder / "runs" / "paper").rglob("config.yaml"))
     assert [name.split("-")[1] for name in fitted] == ["backward", "forward"]
     run("report", "kind=paper", "runs=runs")

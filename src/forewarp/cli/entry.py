@@ -18,7 +18,7 @@ from forewarp.cli.folders import configurations, project_root
 from forewarp.cli.misspelt import unknown_key, with_keys
 from forewarp.cli.renamed import refuse_renamed
 
-TRACEBACK_VARIABLE = "FOREWARP_TRACEBACK"
+TRACEBACK_VARIABLE, TRUST_VARIABLE = "FOREWARP_TRACEBACK", "FOREWARP_TRUST"
 MISTAKE, INTERRUPTED = 2, 130
 
 
@@ -90,27 +90,34 @@ def _run(name: str, task: Callable, conf: Path, config_name: str) -> list[int]:
     import hydra
     from hydra.core.hydra_config import HydraConfig
 
-    def job(config) -> None:
+    # Goes along with the job, whatever of its environment a launcher hands on.
+    trust = {TRUST_VARIABLE: os.environ[TRUST_VARIABLE]} if TRUST_VARIABLE in os.environ else {}
+
+    def job(config) -> object:
         # Caught here, as Hydra would add a line of its own.
-        status = 0
+        status, result = 0, None
         try:
             quiet()  # a launcher's process begins here
-            task(config)
+            os.environ.update(trust)
+            result = task(config)
         except Exception as error:
             status = _tell(name, error, config_name)
         with suppress(OSError), open(ended, "a") as file:
             file.write(f"{status} {' '.join(HydraConfig.get().overrides.task)}\n")
+        return result
 
     # A file, as jobs may be other processes; those of another machine do not reach it.
     with tempfile.TemporaryDirectory(prefix="forewarp-") as folder:
         ended = os.path.join(folder, "ended")
-        hydra.main(version_base="1.3", config_path=str(conf), config_name=config_name)(job)()
-        lines = Path(ended).read_text().splitlines() if os.path.exists(ended) else []
-    jobs = [line.split(" ", 1) for line in lines]
-    failed = [words for status, words in jobs if int(status)]
-    if failed and len(jobs) > 1:
-        listed = "".join(f"\n  {words}" for words in failed)
-        print(f"forewarp-{name}: {len(failed)} of {len(jobs)} jobs failed:{listed}", file=sys.stderr)
+        try:
+            hydra.main(version_base="1.3", config_path=str(conf), config_name=config_name)(job)()
+        finally:  # a sweeper may end with an error of its own
+            lines = Path(ended).read_text().splitlines() if os.path.exists(ended) else []
+            jobs = [line.split(" ", 1) for line in lines]
+            failed = [words for status, words in jobs if int(status)]
+            if failed and len(jobs) > 1:
+                listed = "".join(f"\n  {words}" for words in failed)
+                print(f"forewarp-{name}: {len(failed)} of {len(jobs)} jobs failed:{listed}", file=sys.stderr)
     return [int(status) for status, _ in jobs]
 
 
@@ -148,11 +155,11 @@ def one_line(error: BaseException) -> str | None:
         return f"{missing[1]}: expected a value, but got none; set {missing[1]}=..."
     if getattr(error, "override", None):  # what Hydra could not parse
         return f"{error.override}: {_flat(str(error))}"
-    if isinstance(error, HydraException) and (launcher := _absent_launcher(str(error))):
-        return (
-            f"launcher: expected the package of hydra/launcher={launcher}, but got none; "
-            "install forewarp[sweeps], or use launcher=local"
-        )
+    if isinstance(error, HydraException) and (found := _absent_plugin(str(error))):
+        kind, plugin = found
+        otherwise = ", or use launcher=local" if kind == "launcher" else ""
+        expected = f"{kind}: expected the package of hydra/{kind}={plugin}, but got none"
+        return f"{expected}; install forewarp[sweeps]{otherwise}"
     if isinstance(error, HydraException | OmegaConfBaseException):
         cause = error.__cause__
         detail = f" ({_flat(str(cause))})" if isinstance(cause, OmegaConfBaseException) else ""
@@ -176,9 +183,9 @@ def one_line(error: BaseException) -> str | None:
     return _flat(str(error)) if isinstance(error, ValueError) else None
 
 
-def _absent_launcher(text: str) -> str | None:
-    found = re.search(r"hydra/launcher[/'=:\s]+(joblib|ray|submitit_\w+)", text)
-    return found and found[1]
+def _absent_plugin(text: str) -> tuple[str, ...] | None:
+    found = re.search(r"hydra/(launcher|sweeper)[/'=:\s]+(joblib|ray|submitit_\w+|optuna)", text)
+    return found and found.groups()
 
 
 def _of_system(error: OSError) -> str:

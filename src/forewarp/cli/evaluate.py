@@ -13,6 +13,7 @@ the run's own config.yaml; images/, per_image.json and metrics.json are written 
 
 What one types most:
   run=FOLDER               the run (needed)
+  trust=[PACKAGE]          code of other packages that the run's config may name
   data.root=FOLDER         where the data are now, if they moved
   lpips_weights=FILE       a backbone's weights, or a folder of them, for LPIPS
   sheets=N                 how many truth | prediction | error pictures

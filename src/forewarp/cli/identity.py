@@ -14,7 +14,8 @@ from pathlib import Path
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from forewarp.cli.trusted import MOST_BYTES, trusted_config
+from forewarp.cli.renamed import refuse_old
+from forewarp.cli.trusted import MOST_BYTES, trust_of, trusted_config
 from forewarp.cli.words import as_typed, key_of, typed_words
 
 # What makes two runs different; where they run and what is shown of them does not.
@@ -25,7 +26,7 @@ HASH = "{hash}"
 # What may be set beside resume=<run>.
 MAY_CHANGE = (
     *("trainer", "threads", "lpips_weights", "sheets", "evaluate", "checkpoint_seconds"),
-    *("sentinel", "data_changed"),
+    *("sentinel", "data_changed", "score"),
 )
 
 
@@ -64,6 +65,8 @@ def claim(config: DictConfig, *, finished: bool = False) -> None:
     if config.get("resume") is None:
         config.command = typed()
     config.resume = None
+    if "trust" in config:  # said by whoever runs it, never by a folder
+        config.trust = None
     resolved = OmegaConf.create(OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
     begun = folder.is_dir() and any(folder.glob("*/last.ckpt"))
     if begun and not path.is_file():
@@ -71,7 +74,7 @@ def claim(config: DictConfig, *, finished: bool = False) -> None:
             f"{path}: expected the configuration of the run, but got none; use run=... or delete the folder"
         )
     if begun:
-        _refuse_another(path, read_config(path), resolved)
+        _refuse_another(path, read_config(path, None), resolved)  # compared, and never instantiated
     if finished:  # its numbers are of how it was run, not of what is typed now
         return
     folder.mkdir(parents=True, exist_ok=True)
@@ -91,6 +94,7 @@ def saved_config(run: str | None, changes: DictConfig, key: str = "run") -> Dict
     Args:
         run: the run's folder.
         changes: keys of the run's config; those that are null change nothing. Others are left out.
+            ``trust`` names packages whose code the config may name.
         key: what named the folder.
     """
     if run is None:
@@ -100,7 +104,7 @@ def saved_config(run: str | None, changes: DictConfig, key: str = "run") -> Dict
         raise ValueError(
             f"{path}: expected the configuration of a run, but got none; set {key}=<a run's folder>"
         )
-    saved = read_config(path)
+    saved = read_config(path, trust_of(changes.get("trust")))
     for name in ("trainer", "threads", "lpips_weights", "sheets"):
         if changes.get(name) is not None:
             saved[name] = changes[name]
@@ -118,7 +122,8 @@ def resumed(config: DictConfig) -> DictConfig:
     """
     if config.get("resume") is None:
         return config
-    saved = saved_config(str(config.resume), OmegaConf.create({}), "resume")
+    trust = OmegaConf.create({"trust": config.get("trust")})
+    saved = saved_config(str(config.resume), trust, "resume")
     saved.resume, saved.data_changed = str(config.resume), "refuse"
     words = HydraConfig.get().overrides.task if HydraConfig.initialized() else []
     for word in words:
@@ -127,28 +132,29 @@ def resumed(config: DictConfig) -> DictConfig:
             saved.data.root = config.data.root
         elif key.split(".")[0] in MAY_CHANGE:
             saved[key.split(".")[0]] = config[key.split(".")[0]]
-        elif key != "resume":
+        elif key not in ("resume", "trust"):
             raise ValueError(
                 f"{key}: expected no such key beside resume=, whose config.yaml holds it, but got {word}; "
-                f"beside it go {', '.join(MAY_CHANGE)}, data.root"
+                f"beside it go {', '.join(MAY_CHANGE)}, data.root, trust"
             )
     return saved
 
 
-def read_config(path: Path) -> DictConfig:
-    """The config in a run's folder, or in a stored step.
+def read_config(path: Path, trust: Sequence[str] | None = ()) -> DictConfig:
+    """The config in a run's folder; ``trust`` as in ``trusted_config``.
 
     Raises:
         ValueError: where it is no config of a run, or one that is not to be trusted.
     """
     if (size := path.stat().st_size) > MOST_BYTES:
         raise ValueError(f"{path}: expected at most {MOST_BYTES} bytes, but got {size}")
-    return parsed(path.read_bytes().decode(errors="replace"), path)
+    return parsed(path.read_bytes().decode(errors="replace"), path, trust)
 
 
-def parsed(text: str, path: Path) -> DictConfig:
+def parsed(text: str, path: Path, trust: Sequence[str] | None = ()) -> DictConfig:
     """As ``read_config``, of text; ``path`` names it in errors."""
-    config = trusted_config(text, path)
+    refuse_old(trusted_config(text, path, None), path)
+    config = trusted_config(text, path, trust)
     for key in (*IDENTITY, "trainer", "logger", "callbacks"):
         if key not in config and key != "objective":  # a method may have none of its own
             raise ValueError(f"{path}: expected the key {key}, but got none; delete the run's folder")
@@ -157,7 +163,7 @@ def parsed(text: str, path: Path) -> DictConfig:
 
 def _make_absolute(config: DictConfig) -> None:
     """The data's place as seen from anywhere: a run may be evaluated from another folder."""
-    if not OmegaConf.is_missing(config.data, "root") and config.data.root is not None:
+    if not OmegaConf.is_missing(config.data, "root") and config.data.get("root") is not None:
         config.data.root = str(Path(config.data.root).expanduser().resolve())
 
 

@@ -20,9 +20,9 @@ from statistics import fmean
 from torch import Tensor
 
 from forewarp.cli.entry import MISTAKE, one_line, quiet
-from forewarp.cli.identity import saved_config
-from forewarp.cli.runs import build_run
 from forewarp.cli.stability import table
+from forewarp.cli.stored import stored_run
+from forewarp.cli.trusted import without_trust
 from forewarp.data.batches import Targets
 from forewarp.methods.abilities import HasMatter
 from forewarp.metrics.image import psnr
@@ -57,17 +57,18 @@ def seen(shown: Shown, center: Tensor, pitch: float) -> Seen:
     return Seen(target.frame.time, psnr(image, truth), voxel, psnr(low_passed(truth, voxel), truth), errors)
 
 
-def limits_of(folder: Path, views: int = 20) -> dict[str, float | str]:
+def limits_of(folder: Path, views: int = 20, trust: Sequence[str] = ()) -> dict[str, float | str]:
     """The row of a finished run, by ``COLUMNS``: PSNR (dB), mean of images, and shares of squared error.
 
     Args:
         folder: the run's.
         views: training views that are drawn.
+        trust: packages beside forewarp whose code the run's config may name.
 
     Raises:
         ValueError: where the scene's images have no alpha, so no silhouettes.
     """
-    run = build_run(saved_config(str(folder), {}))
+    run = stored_run(folder, trust)
     module, scene = run.load(), run.datamodule.scene
     if not scene.has_alpha:
         raise ValueError(
@@ -127,12 +128,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
         epilog=__doc__.partition("\n\n")[2],
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("runs", nargs="+", type=Path, help="folders of finished runs")
+    parser.add_argument("runs", nargs="+", type=Path, help="folders of finished runs; trust=[PACKAGE] beside")
     parser.add_argument("--views", type=int, default=20, help="training views to draw (%(default)s)")
-    given = parser.parse_args(arguments)
     quiet()
     try:
-        print(page(limits_of(folder, given.views) for folder in given.runs))
+        words, trust = without_trust(sys.argv[1:] if arguments is None else arguments)
+        given = parser.parse_args(words)
+        print(page(limits_of(folder, given.views, trust) for folder in given.runs))
     except Exception as error:
         line = one_line(error)
         if line is None:

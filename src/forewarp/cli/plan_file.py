@@ -11,6 +11,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from forewarp.cli.trusted import check_target, without_trust
 from forewarp.cli.words import as_typed, key_of, merged, of_what_is_on
 from forewarp.training.progress import time_text
 
@@ -27,8 +28,13 @@ def write_plan(file: Path, made: dict) -> None:
     beside.replace(file)
 
 
-def read_plan(file: Path) -> dict:
-    """What a ``plan.yaml`` holds.
+def read_plan(file: Path, trust: Sequence[str] = (), typed: Sequence[str] = ()) -> dict:
+    """What a ``plan.yaml`` holds; words of trust are left out, as a file has no say in that.
+
+    Args:
+        file: to read.
+        trust: packages beside forewarp whose code its words may name.
+        typed: words that were typed now, so that they may be in it whatever they name.
 
     Raises:
         ValueError: where it is none, or has words that no plan has.
@@ -38,7 +44,8 @@ def read_plan(file: Path) -> dict:
             raise ValueError("too long")
         made = yaml.safe_load(file.read_text())
         words = [*made["typed"], *made["words"], f"of={made['of']}"]
-        allowed = all(isinstance(word, str) and _is_harmless(word) for word in words)
+        others = [word for word in words if word not in typed]
+        allowed = all(isinstance(word, str) and _is_harmless(word) for word in others)
     except (OSError, ValueError, yaml.YAMLError, TypeError, KeyError, RecursionError) as error:
         reason = getattr(error, "strerror", None) or type(error).__name__
         raise ValueError(
@@ -47,13 +54,19 @@ def read_plan(file: Path) -> dict:
         ) from error
     if not allowed:
         raise ValueError(f"plan: expected words that a plan has, but got others in {file}; make it anew")
-    return made
+    for word in others:
+        if (key := key_of(word)).endswith("._target_"):
+            where = f"plan: expected words that a plan has, but got others in {file}"
+            check_target(word.partition("=")[2], where, key, trust)
+    kept = {name: [word for word in made[name] if key_of(word) != "trust"] for name in ("typed", "words")}
+    return made | kept
 
 
 def _is_harmless(word: str) -> bool:
-    """Whether a word may come from a file: none that names code, or how jobs are run, and no option."""
+    """Whether a word may come from a file: none that hides code, or says how jobs are run, and no option."""
     sets = re.match(r"\+{0,2}[A-Za-z][\w./@]*=", word) is not None
-    return sets and "_target_" not in word and not key_of(word).startswith("hydra")
+    hides = "_target_" in word and not (key_of(word).endswith("._target_") and word.count("_target_") == 1)
+    return sets and not hides and not key_of(word).startswith("hydra")
 
 
 def with_plan(name: str, words: list[str]) -> list[str]:
@@ -61,7 +74,7 @@ def with_plan(name: str, words: list[str]) -> list[str]:
     files = [word.partition("=")[2] for word in words if word.startswith("plan=")]
     if name != "train" or not files:
         return words
-    made = read_plan(Path(files[-1]).expanduser())
+    made = read_plan(Path(files[-1]).expanduser(), without_trust(words)[1])
     typed = [word for word in words if not word.startswith("plan=")]
     for word in typed:
         if word.startswith("resume=") or (word.startswith("model=") and word != "model=forward"):

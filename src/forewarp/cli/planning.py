@@ -13,13 +13,14 @@ from forewarp.cli.plan_file import read_plan, write_plan
 from forewarp.cli.planner import Planner
 from forewarp.cli.runs import build_run
 from forewarp.cli.trials import Trials
+from forewarp.cli.trusted import trust_of
 from forewarp.cli.words import key_of
 from forewarp.data.held import most_held_out
 from forewarp.methods.effect import Planning
 from forewarp.scene.frame import Scene
 
 # Keys that say where a run or its plan goes, not what it is.
-NOT_OF_IT = ("effects", "plan", "run", "evaluate", "sheets", "planned")
+NOT_OF_IT = ("effects", "plan", "run", "evaluate", "sheets", "planned", "trust", "score")
 LEAST = {"steps": 1, "trial_steps": 1, "seeds": 1, "held_out": 2}  # whole numbers
 AMOUNTS = ("seconds", "trial_seconds", "minutes", "least")
 
@@ -46,7 +47,7 @@ def make_plan(config: DictConfig, words: Sequence[str]) -> dict:
     folder = Path(str(config.plan.folder).replace(HASH, asked))
     file = folder / "plan.yaml"
     if file.is_file():
-        made = read_plan(file)
+        made = read_plan(file, trust_of(config.get("trust")), words)
         if made["of"] != asked:
             raise ValueError(
                 f"plan.folder: expected the plan of this command and data, but got another in {file}; "

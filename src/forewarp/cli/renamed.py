@@ -52,7 +52,7 @@ def refuse_renamed(words: list[str]) -> None:
 
 
 def refuse_old(config: DictConfig, path: Path) -> None:
-    """Raise ValueError for the config of a run that an earlier version made: its folder holds other things."""
+    """Raise ValueError for the config of a run that an earlier version made: its folder differs."""
     if "warp" in (config.get("model") or {}):
         raise ValueError(
             f"{path}: expected a run of forewarp 0.2, but got one of 0.1, which version 0.1.0 reads; "

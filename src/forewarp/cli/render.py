@@ -22,6 +22,7 @@ What one types most:
   view=N                        the test view that it shows or starts from
   format=mp4|gif|png            a film, a moving picture, stills
   points=N tail=SHARE           how many trajectories, and how much of the time they stay
+  trust=[PACKAGE]               code of other packages that the run's config may name
   data.root=FOLDER              where the data are now, if they moved
   threads=N trainer=cpu         what to compute with
 """

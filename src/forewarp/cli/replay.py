@@ -9,10 +9,15 @@ from dataclasses import replace
 from pathlib import Path
 
 from forewarp.cli.entry import one_line, quiet
+from forewarp.cli.trusted import without_trust
 
 
-def replay(path: Path) -> str:
+def replay(path: Path, trust: Sequence[str] = ()) -> str:
     """Take the step of a bundle again and say what is the first not finite, or that all is well.
+
+    Args:
+        path: of the bundle.
+        trust: packages beside forewarp whose code its config may name.
 
     Raises:
         ValueError: where the file is no such bundle.
@@ -27,7 +32,7 @@ def replay(path: Path) -> str:
 
     bundle = read_bundle(path)
     stage, number = bundle.noted["stage"], bundle.noted["step"]
-    config = parsed(bundle.config, path)
+    config = parsed(bundle.config, path, trust)
     config.trainer.accelerator = "auto"  # it may be another machine
     run = build_run(config)
     if stage not in (names := [stage.settings.name for stage in run.stages]):
@@ -59,11 +64,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
         prog="python -m forewarp.replay",
         description="Take a step again that met a number that is not finite, and name the first such tensor.",
     )
-    parser.add_argument("bundle", type=Path, help="<run>/<stage>/broken/step_<n>.pt")
-    given = parser.parse_args(arguments)
+    parser.add_argument("bundle", type=Path, help="<run>/<stage>/broken/step_<n>.pt; trust=[PACKAGE] beside")
     quiet()
     try:
-        print(replay(given.bundle))
+        words, trust = without_trust(sys.argv[1:] if arguments is None else arguments)
+        print(replay(parser.parse_args(words).bundle, trust))
     except Exception as error:
         line = one_line(error)
         if line is None:

@@ -22,6 +22,8 @@ What one types most:
   seed=N                              of everything random
   trainer=cpu|gpu|auto                where
   resume=FOLDER                       go on with the run there; nothing else need be typed
+  trust=[PACKAGE]                     beside resume=: code of other packages that the run's config may name
+  score=psnr|ssim|ms_ssim|...         what a job of --multirun returns, of views that nothing learns from
   sentinel.skip=N                     leave out up to N steps of a stage that are not finite, and count them
   run=FOLDER                          where the run lives (runs/<scene>/<model>-<preset>-seed<seed>)
   effects=auto                        find out what the scene calls for, then fit that: see forewarp-plan
@@ -43,13 +45,15 @@ Watch: tensorboard --logdir runs
 """
 
 
-def train(config) -> None:
-    """Fit what is not finished, then measure what was not measured."""
+def train(config) -> float | None:
+    """Fit what is not finished, then measure what was not; returns the score, where one is wanted."""
     from forewarp.cli.absent import refuse_absent
     from forewarp.cli.identity import claim, hashed, resumed
+    from forewarp.cli.trusted import trust_of
 
     refuse_seeds(config)
     refuse_two_models(config)
+    trust_of(config.get("trust"))
     config = resumed(config)
     refuse_absent(config)
     # These load torch; what is mistyped has been answered before.
@@ -57,19 +61,22 @@ def train(config) -> None:
     from forewarp.cli.measure import measure
     from forewarp.cli.report import draw_run
     from forewarp.cli.runs import build_run, is_measured
+    from forewarp.cli.score import Score, named
 
+    named(config.get("score"))
     config = hashed(planned(config))
     run = build_run(config)
     if skips(run, config.get("absent", "refuse")):
         print(f"skipped: {run.datamodule.place}: no such scene")
-        return
+        return None
     if config.evaluate and is_measured(run):
         with alone(run.folder):
             claim(config, finished=True)
             same_data(run, config.get("data_changed", "refuse"))
-        print(f"measured before: {run.folder}; again with forewarp-evaluate run={run.folder}")
-        return
+            print(f"measured before: {run.folder}; again with forewarp-evaluate run={run.folder}")
+            return Score(run, config).of()
     run.datamodule.setup("fit")  # before the folder is made: a mistyped scene leaves nothing behind
+    score = Score(run, config)
     with alone(run.folder):
         claim(config)
         same_data(run, config.get("data_changed", "refuse"))
@@ -81,7 +88,9 @@ def train(config) -> None:
         else:
             print(f"fitted: {run.folder}; measure it with forewarp-evaluate run={run.folder}")
         draw_run(run.folder)
+        value = score.of(module)
     tell_skipped(run)
+    return value
 
 
 def planned(config):
@@ -117,13 +126,22 @@ def keep_plan(config) -> None:
 
 
 def refuse_seeds(config) -> None:
-    """Refuse ``seeds=`` where nothing repeats the run."""
+    """Refuse ``seeds=`` where nothing repeats the run, or where a sweeper would search among them."""
     from hydra.core.hydra_config import HydraConfig
     from hydra.types import RunMode
 
     alone = not (HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN)
     if alone and config.get("seeds", 1) != 1:
         raise ValueError(f"seeds: expected --multirun beside seeds={config.seeds}; add it, or use seed=N")
+    if not alone and "_optuna_" in str(HydraConfig.get().sweeper.get("_target_")):
+        swept = str((HydraConfig.get().sweeper.get("params") or {}).get("seed", ""))
+        if config.get("seeds", 1) != 1:
+            raise ValueError(f"seeds: expected 1 of a search, but got {config.seeds}; use seed=N")
+        if swept.startswith("range"):
+            raise ValueError(
+                "hydra.sweeper.params.seed: expected one seed, as this sweeper would search among several, "
+                f"but got {swept}; add hydra.sweeper.params.seed=0"
+            )
 
 
 def refuse_two_models(config) -> None:

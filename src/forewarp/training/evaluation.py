@@ -114,6 +114,12 @@ def evaluate(
     return metrics
 
 
+def mean_scores(module: DynamicSceneModule, targets: Sequence[Target], suite: ImageSuite) -> dict[str, float]:
+    """The means over views of what the suite says of each one's best rendering; nothing is written."""
+    rows = [_score(shown, suite)["scores"] for shown in draw(module, targets)]
+    return summarise(("all", row) for row in rows).get("all", {})
+
+
 @torch.no_grad()
 def flow_error(module: DynamicSceneModule, scene: Scene) -> dict | None:
     """End-point errors of the learned trajectories against the scene's true ones, world units; None where

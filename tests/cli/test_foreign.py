@@ -1,0 +1,218 @@
+"""Somebody else's package, found on the path alone: data, an effect, a callback and Lightning's CSVLogger.
+
+A method of theirs will be tested here as well: ``theirs/methods.py``, ``conf/model/<name>.yaml`` and the word
+``model=<name>`` beside those of ``DISC``.
+"""
+
+import importlib
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+from forewarp.cli.plan_file import with_plan, write_plan
+from forewarp.cli.stored import stored_run
+
+HERE = Path(__file__).parents[1] / "foreign"
+DISC = [
+    *("hydra.searchpath=[pkg://theirs.conf]", "experiment=disc", "trainer=cpu", "data.rays=64", "threads=1"),
+    *("budget.minutes=null", "budget.iterations=6", "stage.coarse.voxels=[[0,800]]", "~stage.fine"),
+    *("checkpoint_seconds=0", "sheets=0"),
+]
+TRUST = "trust=[theirs]"
+ADVICE = (
+    "; if you trust the package theirs, add trust=[theirs] (or set FOREWARP_TRUST=theirs)"  # word for word
+)
+
+
+@pytest.fixture(autouse=True)
+def theirs(monkeypatch):
+    """The package can be imported, and nothing of it remains."""
+    monkeypatch.syspath_prepend(str(HERE))
+    monkeypatch.delenv("FOREWARP_TRUST", raising=False)
+    importlib.invalidate_caches()
+    yield
+    forget("theirs")
+
+
+def forget(package):
+    for name in [name for name in sys.modules if name.split(".")[0] == package]:
+        del sys.modules[name]
+
+
+@pytest.fixture
+def fitted(forewarp, in_tmp):
+    """A finished run, and a process that has not seen the package."""
+    done = forewarp("train", *DISC, "run=run")
+    assert done.status == 0, done.err
+    forget("theirs")
+    return in_tmp / "run"
+
+
+def steps_of(run):
+    return json.loads((run / "coarse" / "done.json").read_text())["steps"]
+
+
+def test_what_is_typed_trains_and_trains_again_without_trust(forewarp, fitted):
+    config = yaml.safe_load((fitted / "config.yaml").read_text())
+    assert config["data"]["_target_"] == "theirs.data.DiscDataModule"
+    assert config["model"]["view"]["_target_"] == "theirs.effects.Tint"
+    assert config["trust"] is None
+    assert (fitted / "coarse" / "steps.txt").read_text() == "6"
+    assert "theirs/step" in (fitted / "coarse" / "csv" / "metrics.csv").read_text()
+    again = forewarp("train", *DISC, "run=run")
+    assert (again.status, again.out.strip()[:15]) == (0, "measured before"), again
+    (fitted / "metrics.json").unlink()
+    again = forewarp("train", *DISC, "run=run")
+    assert again.status == 0, again.err
+    assert "coarse: finished before" in again.out
+
+
+def test_an_interrupted_run_goes_on(forewarp, refused, in_tmp):
+    stopped = forewarp("train", *DISC, "run=run", "callbacks.count.stop_at=3", "evaluate=false", TRUST)
+    assert stopped.status == 130, stopped
+    run = in_tmp / "run"
+    assert (run / "coarse" / "last.ckpt").is_file()
+    config = run / "config.yaml"
+    text = config.read_text()
+    assert yaml.safe_load(text)["trust"] is None  # a folder has no say in it
+    config.write_text(text.replace("stop_at: 3", "stop_at: null").replace("trust: null", "trust: [theirs]"))
+    forget("theirs")
+    assert refused("train", "resume=run").endswith(ADVICE)
+    assert "theirs" not in sys.modules
+    assert refused("train", "resume=run", "trust=[theirsother]").endswith(
+        "add trust=[theirsother,theirs] (or set FOREWARP_TRUST=theirsother,theirs)"
+    )
+    done = forewarp("train", "resume=run", TRUST)
+    assert done.status == 0, done.err
+    assert "coarse: goes on at 50%, step 3" in done.out
+    assert steps_of(run) == 6
+    (run / "coarse" / "done.json").unlink()
+    again = forewarp("train", *DISC, "run=run", "evaluate=false")  # the command needs no trust
+    assert again.status == 0, again.err
+
+
+@pytest.mark.parametrize(
+    "word", ["trust=theirs", TRUST, "trust=[other,theirs]", "FOREWARP_TRUST=other, theirs"]
+)
+def test_a_stored_run_is_measured_by_who_trusts_it(forewarp, refused, fitted, monkeypatch, word):
+    line = refused("evaluate", "run=run")
+    assert line.startswith(
+        "run/config.yaml: data._target_: expected a class of forewarp, but got 'theirs.data."
+    )
+    assert line.endswith(ADVICE)
+    assert "theirs" not in sys.modules
+    if word.startswith("FOREWARP_TRUST="):
+        monkeypatch.setenv(*word.split("=", 1))
+        word = None
+    done = forewarp("evaluate", "run=run", *filter(None, [word]))
+    assert done.status == 0, done.err
+
+
+def test_a_plan_that_names_the_package_is_followed_by_who_trusts_it(tmp_path):
+    file, word = tmp_path / "plan.yaml", "model.view._target_=theirs.effects.Tint"
+    write_plan(file, {"typed": ["data.scene=x"], "words": [word], "of": "0"})
+    with pytest.raises(ValueError, match="expected a class of forewarp, but got 'theirs.effects.Tint'"):
+        with_plan("train", [f"plan={file}"])
+    assert "theirs" not in sys.modules
+    assert word in with_plan("train", [f"plan={file}", TRUST])
+
+
+def test_two_pictures_are_rendered(forewarp, refused, fitted):
+    still = ["run=run", "format=png", "frames=2", "size=16", "threads=1"]
+    assert refused("render", *still).endswith(ADVICE)
+    done = forewarp("render", *still, TRUST)
+    assert done.status == 0, done.err
+    assert len(list((fitted / "videos").rglob("*.png"))) == 2
+
+
+def test_a_run_is_loaded_with_trust(fitted):
+    with pytest.raises(ValueError, match="expected a class of forewarp, but got 'theirs.data.Disc"):
+        stored_run(fitted)
+    module = stored_run(fitted, trust=["theirs"]).load()
+    assert type(module.method.view).__module__ == "theirs.effects"
+
+
+def test_the_tools_take_trust(fitted, capsys):
+    from forewarp.cli.limits import main as limits
+
+    with pytest.raises(SystemExit):
+        limits([str(fitted)])
+    assert capsys.readouterr().err.strip().endswith(ADVICE)
+    limits([str(fitted), "--views", "1", TRUST])
+    assert "| disc |" in capsys.readouterr().out
+
+
+def test_a_broken_step_is_taken_again_with_trust(refused, in_tmp, capsys):
+    from forewarp.cli.replay import main as replay
+
+    refused("train", *DISC, "run=run", "stage.coarse.rates.color=1e39", "evaluate=false")
+    bundle = str(next((in_tmp / "run").rglob("step_*.pt")))
+    forget("theirs")
+    with pytest.raises(SystemExit):
+        replay([bundle])
+    assert capsys.readouterr().err.strip().endswith(ADVICE)
+    assert "theirs" not in sys.modules
+    replay([bundle, "trust=theirs"])
+    assert "parameter: radiance.color" in capsys.readouterr().out
+
+
+def test_seeds_are_swept_scored_and_reported(forewarp, in_tmp, monkeypatch):
+    words = ["--multirun", *DISC, "seeds=2", "run=runs/disc/${variant.name}-seed${seed}", "variant=base"]
+    done = forewarp("train", *words)
+    assert done.status == 0, done.err
+    runs = sorted(in_tmp.glob("runs/disc/base-seed*"))
+    assert [run.name for run in runs] == ["base-seed0", "base-seed1"]
+    for run in runs:
+        assert set(json.loads((run / "score.json").read_text())["scores"]) >= {"psnr", "ssim"}
+    assert done.out.count("of 1 validation view") == 2
+    forget("theirs")
+    jobs = ",".join(str(run) for run in runs)
+    refusal = forewarp("evaluate", "--multirun", f"run={jobs}")
+    assert refusal.status == 2
+    assert "2 of 2 jobs failed" in refusal.err
+    assert forewarp("evaluate", "--multirun", f"run={jobs}", TRUST).status == 0
+    monkeypatch.setenv("FOREWARP_TRUST", "theirs")
+    assert forewarp("evaluate", "--multirun", f"run={jobs}").status == 0
+    told = forewarp("report", "kind=accuracy_time", f"runs={in_tmp / 'runs'}", f"out={in_tmp / 'page'}")
+    assert told.status == 0, told.err
+    assert "disc" in (in_tmp / "page" / "accuracy-time.md").read_text()
+
+
+def test_the_environment_goes_along_whatever_a_launcher_hands_on(forewarp, fitted, monkeypatch):
+    """A job of another process or machine: its environment is its own."""
+    import hydra
+
+    monkeypatch.setenv("FOREWARP_TRUST", "theirs")
+    begun = hydra.main
+
+    def elsewhere(**options):
+        def wrapped(job):
+            def launched(config):
+                os.environ.pop("FOREWARP_TRUST")
+                return job(config)
+
+            launched.__module__ = "__main__"
+            return begun(**options)(launched)
+
+        return wrapped
+
+    monkeypatch.setattr(hydra, "main", elsewhere)
+    done = forewarp("evaluate", "run=run")
+    assert done.status == 0, done.err
+
+
+@pytest.mark.slow
+def test_a_console_finds_the_package_by_its_folder(in_tmp):
+    """In a process of its own, with ``--config-dir`` in the place of the search path."""
+    code = "from forewarp.cli.train import main; main()"
+    words = ["--config-dir", str(HERE / "theirs" / "conf"), *DISC[1:], "run=run", "evaluate=false"]
+    done = subprocess.run(
+        [sys.executable, "-c", code, *words], env={**os.environ, "PYTHONPATH": str(HERE)}, check=False
+    )
+    assert done.returncode == 0
+    assert steps_of(in_tmp / "run") == 6

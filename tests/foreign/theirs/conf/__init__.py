@@ -1,0 +1,1 @@
+"""Configurations, found with ``hydra.searchpath=[pkg://theirs.conf]`` or ``--config-dir``."""
