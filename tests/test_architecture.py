@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 SOURCE = Path(__file__).parents[1] / "src" / "forewarp"
-LOWER = {"ops", "scene", "losses", "metrics", "fields", "drawing", "effects", "renderer"}
+LOWER = {"ops", "scene", "losses", "metrics", "fields", "drawing", "effects", "renderer", "quadrature"}
 MAY_IMPORT = {
     "ops": set(),
     "scene": {"ops"},
@@ -19,6 +19,7 @@ MAY_IMPORT = {
     "synth": {"ops", "scene", "data"},
     "effects": {"ops", "scene", "fields"},
     "renderer": {"ops", "scene", "fields"},
+    "quadrature": {"ops", "scene"},
     "methods": LOWER,
     "training": LOWER | {"methods"},
     "replay": {"cli"},

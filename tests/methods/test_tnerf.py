@@ -4,6 +4,8 @@ from pathlib import Path
 import lightning
 import pytest
 import torch
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
 
 from forewarp.data.module import SceneDataModule
 from forewarp.methods.method import Start, parameter_count
@@ -14,6 +16,7 @@ from forewarp.scene.box import Box
 from forewarp.scene.camera import Camera, look_at
 from forewarp.scene.frame import Frame, Scene
 from forewarp.scene.view import Moment, View
+from forewarp.training.budget import share_out
 from forewarp.training.objective import Objective
 from forewarp.training.settings import StageSettings
 from forewarp.training.stages import Run, Stage
@@ -184,6 +187,28 @@ def test_refuses(wrong, text):
         method(**wrong)
 
 
+CONF = Path(__file__).parents[2] / "conf"
+
+
+@pytest.mark.parametrize(
+    ("preset", "parameters"), [("demo", 23_652), ("fast", 127_940), ("faithful", 600_452)]
+)
+def test_its_presets(preset, parameters):
+    config = OmegaConf.load(CONF / "model_preset" / f"tnerf_{preset}.yaml")
+    config.model = OmegaConf.load(CONF / "model" / "tnerf.yaml")
+    config.objective = OmegaConf.load(CONF / "objective" / f"tnerf_{preset}.yaml")
+    config.stage = OmegaConf.load(CONF / "stage" / f"tnerf_{preset}.yaml")
+    made = OmegaConf.to_container(config, resolve=True)
+    name = made["model"].pop("name")
+    built = instantiate(made["model"], _convert_="all")(Start(moving_scene(), "fine", {}))
+    (stage,) = share_out(instantiate(made["stage"], _convert_="all"), minutes=1, iterations=None)
+    assert (name, stage.settings.name) == ("tnerf", "fine")
+    assert set(stage.settings.rates) == set(built.param_groups())
+    assert not stage.settings.numbers
+    assert stage.objective.weights == {"photo": 1.0}
+    assert parameter_count(built) == parameters
+
+
 def static_ceiling():
     """The train PSNR that no static model exceeds with a fixed camera."""
     images = torch.stack([picture(time).double() / 255 for time in TIMES])
@@ -219,10 +244,10 @@ def run(folder, iterations):
 
 
 def test_it_learns_what_moves(tmp_path):
-    made = run(tmp_path, 350)
+    made = run(tmp_path, 260)
     module = made.fit()
     psnr = [float(module.psnr_of(target)) for target in made.datamodule.targets("train")]
     assert sum(psnr) / len(psnr) > static_ceiling() + 3
-    again = run(tmp_path, 350).load()
+    again = run(tmp_path, 260).load()
     for name, value in module.method.state_dict().items():
         assert torch.equal(again.method.state_dict()[name], value)
