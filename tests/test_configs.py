@@ -13,9 +13,9 @@ from omegaconf import OmegaConf
 
 from configs import CONF, ROOT, composed, groups, options
 from forewarp.cli.runs import build_run
-from forewarp.effects.inpaint import UNet3d
-from forewarp.effects.upsample import LearnedUpsampler
-from forewarp.effects.view import SphericalHarmonics, ViewNetwork
+from forewarp.methods.voxel.effects.inpaint import UNet3d
+from forewarp.methods.voxel.effects.upsample import LearnedUpsampler
+from forewarp.methods.voxel.effects.view import SphericalHarmonics, ViewNetwork
 from forewarp.renderer import Renderer
 from forewarp.scene.box import Box, Lattice
 from forewarp.training.settings import StageSettings

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from forewarp import losses
-from forewarp.effects import background, inpaint, motion, upsample, view
+from forewarp.methods.voxel.effects import background, inpaint, motion, upsample, view
 from forewarp.fields.trajectory import TrajectoryField
 from forewarp.fields.voxel_grid import VoxelGrid
 from forewarp.renderer import Renderer
@@ -15,7 +15,7 @@ from forewarp.training.curriculum import Curriculum
 from forewarp.training.module import DynamicSceneModule
 from forewarp.training.objective import Objective
 from forewarp.training.settings import StageSettings
-from tiny_scene import BOX, RATES, ball_data, forward_spec
+from tiny_scene import BOX, RATES, ball_data, forward_model
 
 LATTICE = Lattice(BOX, (9, 8, 7))
 PARTS = {
@@ -45,7 +45,7 @@ def a_step(effects, weights=None, **choices):
     """Look at a batch of the ball through a method with these effects and no others, and learn from it."""
     torch.manual_seed(0)
     chosen = OFF | {key: value for effect in effects for key, value in ON[effect].items()} | choices
-    method = forward_spec(**chosen).build(
+    method = forward_model(**chosen).build(
         LATTICE,
         torch.ones(LATTICE.shape, dtype=torch.bool),
         unit=0.3,

@@ -11,7 +11,7 @@ from forewarp.renderer import Renderer
 from forewarp.scene.frame import Truth
 from forewarp.training.accuracy import COLUMNS, AccuracyCurve, read_rows, seconds_before
 from forewarp.training.stages import Run
-from tiny_scene import Interrupt, ball_scene, forward_spec, stage
+from tiny_scene import Interrupt, ball_scene, forward_model, stage
 
 STEPS = 12
 
@@ -62,7 +62,7 @@ def run(folder, *more, curve=True, held_out=3, scene=scene_with_truth, stages=("
     watchers = [Tick(), *([AccuracyCurve(first=2000, ratio=2.0, rays=100)] if curve else []), *more]
     return Run(
         SceneDataModule(scene, rays=64, held_out=held_out),
-        forward_spec(),
+        forward_model(),
         [stage(name, iterations=STEPS) for name in stages],
         Renderer(),
         folder,

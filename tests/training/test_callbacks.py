@@ -15,7 +15,7 @@ from forewarp.training.clock import Clock
 from forewarp.training.pictures import TensorBoardPictures
 from forewarp.training.progress import ProgressLine
 from forewarp.training.stages import Run
-from tiny_scene import Interrupt, ball_data, ball_scene, forward_spec, stage
+from tiny_scene import Interrupt, ball_data, ball_scene, forward_model, stage
 
 STEPS = 12
 
@@ -41,7 +41,7 @@ def watched_run(folder, *callbacks, steps=STEPS):
     stages = [stage(iterations=steps)]
     return Run(
         ball_data(),
-        forward_spec(),
+        forward_model(),
         stages,
         Renderer(),
         folder,

@@ -17,7 +17,7 @@ from forewarp.training.handover import (
     write_json,
 )
 from forewarp.training.settings import StageSettings
-from tiny_scene import BOX, RADIUS, RATES, ball_center, ball_scene, forward_spec
+from tiny_scene import BOX, RADIUS, RATES, ball_center, ball_scene, forward_model
 
 SCENE = ball_scene(frames=6, size=16)
 
@@ -29,7 +29,7 @@ def settings(**changes):
 
 
 def fresh(spec=None, **changes):
-    return fresh_method(spec or forward_spec(), settings(**changes), SCENE, BOX, None, list(range(6)))
+    return fresh_method(spec or forward_model(), settings(**changes), SCENE, BOX, None, list(range(6)))
 
 
 def ball(raw=8.0):
@@ -90,7 +90,7 @@ def test_a_fresh_method_starts_faint_everywhere():
 
 def test_a_network_starts_faint_as_well():
     radiance = partial(FeatureRadiance, alpha_init=1e-2, skip_alpha=0.0, width=4)
-    method, _ = fresh(forward_spec(radiance=radiance), start_alpha=0.03)
+    method, _ = fresh(forward_model(radiance=radiance), start_alpha=0.03)
     grid = method.radiance()
     alpha = grid.activation.alpha(grid.raw_density, grid.lattice.pitch)
     torch.testing.assert_close(alpha, torch.full_like(alpha, 0.03), rtol=1e-3, atol=0)
@@ -110,13 +110,13 @@ def test_the_hull_needs_alpha():
     with pytest.raises(
         ValueError, match="stage.coarse.start: expected box, since the images of 'ball' have no alpha"
     ):
-        fresh_method(forward_spec(), settings(start="hull"), scene, BOX, None, [0])
+        fresh_method(forward_model(), settings(start="hull"), scene, BOX, None, [0])
 
 
 def test_left_to_itself_it_starts_in_the_hull_where_there_is_alpha_and_in_the_box_elsewhere():
     for scene, start in ((SCENE, "hull"), (replace(SCENE, has_alpha=False), "box")):
         ours, expected = (
-            fresh_method(forward_spec(), settings(start=s, hull_frames=2), scene, BOX, None, [0, 1])[0]
+            fresh_method(forward_model(), settings(start=s, hull_frames=2), scene, BOX, None, [0, 1])[0]
             for s in ("auto", start)
         )
         assert torch.equal(ours.radiance.voxels, expected.radiance.voxels)
@@ -126,7 +126,9 @@ def test_the_hull_of_a_moment_is_that_of_all_its_views():
     frames = [replace(frame, time=0.0) for frame in SCENE.train[:3]]
     scene = replace(SCENE, train=(*frames, *SCENE.train[3:]))
     one, three = (
-        fresh_method(forward_spec(), settings(start="hull", hull_frames=n), scene, BOX, None, [0, 1, 2, 3])[0]
+        fresh_method(forward_model(), settings(start="hull", hull_frames=n), scene, BOX, None, [0, 1, 2, 3])[
+            0
+        ]
         for n in (1, 3)
     )
     assert torch.equal(one.radiance.voxels, three.radiance.voxels)
@@ -139,7 +141,9 @@ def test_carrying_keeps_matter_motion_and_unit():
     sigma, at = before.radiance().density, before.radiance.lattice.to_lattice
     points = ball_center(0.0) + 0.2 * (torch.rand(50, 3) - 0.5)
     expected = sigma(at(points)).detach()
-    after = carried_method(forward_spec(), settings(name="fine", voxels=[[0, 4000]]), SCENE, before, handover)
+    after = carried_method(
+        forward_model(), settings(name="fine", voxels=[[0, 4000]]), SCENE, before, handover
+    )
     assert after.radiance.lattice.box == handover.box
     assert after.radiance.activation.unit == unit
     assert after.radiance.lattice.count == pytest.approx(4000, rel=0.2)
@@ -149,18 +153,18 @@ def test_carrying_keeps_matter_motion_and_unit():
 
 
 def test_carrying_into_a_stage_with_more_effects():
-    plain = forward_spec(view=None)
+    plain = forward_model(view=None)
     before, unit = fresh(plain)
     before.radiance.density.data[:] = 3.0
     before.radiance.color.data[:] = 0.5
     handover = Handover(BOX.low, BOX.high, unit, True, 6)
-    after = carried_method(forward_spec(), settings(), SCENE, before, handover)
+    after = carried_method(forward_model(), settings(), SCENE, before, handover)
     assert (after.radiance.shading == 0).all()
     torch.testing.assert_close(after.radiance.color.data, torch.full_like(after.radiance.color, 0.5))
 
 
 def test_carrying_a_network():
-    spec = forward_spec(radiance=partial(FeatureRadiance, alpha_init=1e-2, skip_alpha=0.0, width=4))
+    spec = forward_model(radiance=partial(FeatureRadiance, alpha_init=1e-2, skip_alpha=0.0, width=4))
     before, unit = fresh(spec)
     torch.nn.init.normal_(before.radiance.network[-1].weight)
     handover = Handover(BOX.low, BOX.high, unit, True, 6)

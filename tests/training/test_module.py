@@ -4,20 +4,20 @@ from functools import partial
 import pytest
 import torch
 
-from forewarp.effects.inpaint import UNet3d
-from forewarp.methods.backward_warp import Deformation
+from forewarp.methods.voxel.effects.inpaint import UNet3d
+from forewarp.methods.voxel.backward_warp import Deformation
 from forewarp.ops.backend import numba_installed
 from forewarp.ops.warmup import warm_up
 from forewarp.renderer import Renderer
 from forewarp.scene.box import Lattice
 from forewarp.training.curriculum import Curriculum
 from forewarp.training.module import DynamicSceneModule, render_all
-from forewarp.training.settings import EFFECTS
-from forewarp.training.structure import resample
-from tiny_scene import BOX, RATES, ball_data, forward_spec, stage, trainer
+from forewarp.methods.voxel.stage import EFFECTS
+from forewarp.methods.voxel.structure import resample
+from tiny_scene import BOX, RATES, ball_data, forward_model, stage, trainer
 
 INPAINTER = partial(UNet3d, width=16, levels=2)
-BACKWARD = forward_spec(warp="backward", deformation=partial(Deformation, width=8, layers=2))
+BACKWARD = backward_model(deformation=partial(Deformation, width=8, layers=2))
 DATA = ball_data(rays=64, frames=5, size=16)
 
 
@@ -32,7 +32,7 @@ class CountingRenderer(Renderer):
 def module(spec=None, weights=None, renderer=None, **changes):
     torch.manual_seed(0)
     lattice = Lattice(BOX, (9, 7, 6))
-    method = (spec or forward_spec()).build(
+    method = (spec or forward_model()).build(
         lattice,
         torch.ones(lattice.shape, dtype=torch.bool),
         unit=0.2,
@@ -60,7 +60,7 @@ def batch(frame=3):
     return DATA.batches.draw()
 
 
-@pytest.mark.parametrize(("spec", "times"), [(forward_spec(), 1), (forward_spec(inpainter=INPAINTER), 2)])
+@pytest.mark.parametrize(("spec", "times"), [(forward_model(), 1), (forward_model(inpainter=INPAINTER), 2)])
 def test_without_an_inpainter_the_renderer_runs_once_a_step(spec, times):
     renderer = CountingRenderer()
     module(spec, renderer=renderer).training_step(batch(), 0)
@@ -69,7 +69,7 @@ def test_without_an_inpainter_the_renderer_runs_once_a_step(spec, times):
 
 def test_what_no_term_looks_at_is_not_rendered():
     renderer = CountingRenderer()
-    made = module(forward_spec(inpainter=INPAINTER), renderer=renderer)
+    made = module(forward_model(inpainter=INPAINTER), renderer=renderer)
     made.objective.photo_on = ("inpainted",)
     made.training_step(batch(), 0)
     assert renderer.calls == 1
@@ -108,7 +108,7 @@ def test_a_step_meets_warm_kernels_only(monkeypatch):
     assert torch.equal(torch.get_rng_state(), before)
     warm = met.copy()
     met.clear()
-    for spec in (forward_spec(), BACKWARD):
+    for spec in (forward_model(), BACKWARD):
         made = module(spec)
         made.training_step(batch(), 0).backward()
         resample(made.method.radiance, BOX, 500, keep_alpha=1e-2)
@@ -127,7 +127,7 @@ def test_random_views_are_rendered_only_for_their_term():
 def test_a_step_has_finite_gradients_for_all_terms():
     terms = ("photo", "point_color", "background_entropy", "flow_l1", "inpaint_diff")
     weights = dict.fromkeys((*terms, "tv_density", "tv_flow", "tv_depth"), 0.1)
-    made = module(forward_spec(inpainter=INPAINTER), weights, patches=2)
+    made = module(forward_model(inpainter=INPAINTER), weights, patches=2)
     torch.nn.init.normal_(made.method.motion.trajectory.network[-1].weight, std=1e-2)
     made.training_step(batch(), 0).backward()
     for name, parameter in made.method.named_parameters():

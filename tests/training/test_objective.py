@@ -6,7 +6,7 @@ from forewarp.ops.grid import neighbour_pairs
 from forewarp.scene.batch import Batch
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.rays import Rays
-from forewarp.scene.state import Activation, RadianceGrid, Rendering, State
+from forewarp.fields.radiance_grid import Activation, RadianceGrid, Rendering, State
 from forewarp.training.objective import Objective, Step
 
 TERMS = (

@@ -5,11 +5,11 @@ import lightning
 import pytest
 import torch
 
-from forewarp.effects.inpaint import UNet3d
+from forewarp.methods.voxel.effects.inpaint import UNet3d
 from forewarp.scene.lens import Lens
 from forewarp.training.bundle import read_bundle
 from forewarp.training.sentinel import BrokenStep, Sentinel, all_finite, diagnose, first_bad
-from tiny_scene import ball_data, forward_spec, make_run, stage
+from tiny_scene import ball_data, forward_model, make_run, stage
 
 NAN = float("nan")
 
@@ -174,7 +174,7 @@ def test_a_bundle_holds_lenses_and_is_refused_where_it_is_none(tmp_path):
 
 
 def test_an_inpainters_step_is_taken_again(tmp_path):
-    spec = forward_spec(inpainter=partial(UNet3d, width=16, levels=2))
+    spec = forward_model(inpainter=partial(UNet3d, width=16, levels=2))
     said, path = broken(tmp_path, Poison("batch", 5), spec=spec)
     bundle = read_bundle(path)
     module = make_run(tmp_path / "e", [stage()], spec=spec).rebuilt("coarse", bundle.scene, bundle.unit)

@@ -7,15 +7,15 @@ import lightning
 import pytest
 import torch
 
-from forewarp.effects.background import StaticBackground
-from forewarp.effects.inpaint import UNet3d
-from forewarp.effects.upsample import LearnedUpsampler, TrilinearUpsampler
-from forewarp.effects.view import ViewNetwork
+from forewarp.methods.voxel.effects.background import StaticBackground
+from forewarp.methods.voxel.effects.inpaint import UNet3d
+from forewarp.methods.voxel.effects.upsample import LearnedUpsampler, TrilinearUpsampler
+from forewarp.methods.voxel.effects.view import ViewNetwork
 from forewarp.fields.radiance import FeatureRadiance
-from forewarp.methods.backward_warp import Deformation
+from forewarp.methods.voxel.backward_warp import Deformation
 from forewarp.training import handover
 from forewarp.training.interruption import Interruption
-from tiny_scene import RATES, Interrupt, ball_data, forward_spec, make_run, stage
+from tiny_scene import RATES, Interrupt, ball_data, forward_model, make_run, stage
 
 
 def stages(**changes):
@@ -185,7 +185,7 @@ CHOICES = {
 @pytest.mark.parametrize("choice", CHOICES)
 def test_every_model_trains_carries_and_loads(tmp_path, choice):
     short = stages(iterations=4)
-    ours = make_run(tmp_path, short, data=ball_data(rays=64, size=16), spec=forward_spec(**CHOICES[choice]))
+    ours = make_run(tmp_path, short, data=ball_data(rays=64, size=16), spec=forward_model(**CHOICES[choice]))
     module = ours.fit()
     assert all(v.isfinite().all() for v in tensors(module).values() if v.is_floating_point())
     assert same(ours.load(), module)
