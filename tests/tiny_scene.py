@@ -118,7 +118,7 @@ def begun(method, scene, made):
     return method.begin(start, VoxelStage(name=settings.name, **settings.numbers))
 
 
-def stage(name="coarse", weights=None, **changes):
+def stage(name="coarse", weights=None, photo_on=None, **changes):
     """A stage of few steps on a small lattice."""
     numbers = {
         "voxels": [[0, 14**3]],
@@ -128,7 +128,8 @@ def stage(name="coarse", weights=None, **changes):
         "rates": RATES,
     }
     objective = Objective(
-        {"photo": 1.0, "point_color": 0.01, "tv_flow": 1e-3} if weights is None else weights
+        {"photo": 1.0, "point_color": 0.01, "tv_flow": 1e-3} if weights is None else weights,
+        photo_on=photo_on,
     )
     return Stage(StageSettings.of(name, **(numbers | changes)), objective)
 

@@ -9,7 +9,6 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from forewarp.data.module import SceneDataModule
-from forewarp.renderer import Renderer
 from forewarp.training.callbacks import StageProgress, TensorBoardScalars
 from forewarp.training.clock import Clock
 from forewarp.training.pictures import TensorBoardPictures
@@ -43,7 +42,6 @@ def watched_run(folder, *callbacks, steps=STEPS):
         ball_data(),
         forward_model(),
         stages,
-        Renderer(),
         folder,
         make_trainer,
         lambda name, where: list(callbacks),

@@ -12,15 +12,15 @@ def run(folder, callbacks=(), width=8, times=None):
     """A run of one short stage."""
     trajectory = partial(TrajectoryField, bases=2, nodes=8, width=width, layers=2)
     data = ball_data(rays=64, size=16, times=times)
-    spec = forward_model(trajectory=trajectory)
-    return make_run(folder, [stage(voxels=[[0, 1000]])], data=data, spec=spec, callbacks=callbacks)
+    model = forward_model(trajectory=trajectory)
+    return make_run(folder, [stage(voxels=[[0, 1000]])], data=data, model=model, callbacks=callbacks)
 
 
 def module(folder, **changes):
     """What such a run begins with."""
     ours = run(folder, **changes)
     ours.datamodule.setup()
-    return ours._module(ours.stages[0], None, None, 0)[0]
+    return ours._module(ours.stages[0], None, None, 0)
 
 
 @pytest.fixture(scope="module")
