@@ -3,34 +3,35 @@
 import torch
 
 from forewarp.fields.radiance import DirectRadiance
-from forewarp.renderer import Renderer
+from forewarp.methods.voxel.method import VoxelMethod
+from forewarp.methods.voxel.snapshot import VoxelSnapshot
 from forewarp.scene.box import Lattice
-from forewarp.scene.state import State
+from forewarp.training.curriculum import Curriculum
 from forewarp.training.module import DynamicSceneModule
-from tiny_scene import BOX, RADIUS, TRAVEL, ball_center
+from forewarp.training.objective import Objective
+from tiny_scene import BOX, RADIUS, TRAVEL, ball_center, stage
 
 
-class KnownBall(torch.nn.Module):
+class KnownBall(VoxelMethod):
     """Beside the ball a block stands still; ``asked`` are the times of ``at``."""
 
-    view, canonical_time = None, 0.0
+    moves = True
 
     def __init__(self, count=30**3):
-        super().__init__()
         lattice = Lattice.of_count(BOX, count)
         everywhere = torch.ones(lattice.shape, dtype=torch.bool)
         numbers = {"alpha_init": 1e-2, "unit": lattice.pitch, "skip_alpha": 1e-4}
-        self.radiance = DirectRadiance(lattice, everywhere, features=3, **numbers)
+        super().__init__(DirectRadiance(lattice, everywhere, features=3, **numbers), canonical_time=0.0)
         self.points = lattice.to_world(self.radiance.voxels)
         self.asked = []
 
-    def at(self, time):
+    def at(self, moment):
         """Moves the ball, exactly, by filling the grid anew."""
-        self.asked.append(time)
-        self.fill(time)
+        self.asked.append(moment.time)
+        self.fill(moment.time)
         grid = self.radiance()
         canonical = self.fill(0.0).radiance()
-        return State(time, {"upsampled": grid}, canonical)
+        return VoxelSnapshot(moment, {"upsampled": grid}, canonical, self.renderer)
 
     def fill(self, time):
         ball = (self.points - ball_center(time)).norm(dim=-1) < RADIUS
@@ -46,18 +47,11 @@ class KnownBall(torch.nn.Module):
         return torch.where(self.is_still(points, 0.27)[:, None, None], points[:, None], moved)
 
 
-class _Settings:
-    def at(self, key, fraction):
-        return None
-
-
 def known_ball():
     """A module over it."""
     return DynamicSceneModule(
         KnownBall().fill(0.0),
-        renderer=Renderer(),
-        objective=None,
-        settings=_Settings(),
-        curriculum=None,
-        cameras=[],
+        objective=Objective({}),
+        settings=stage().settings,
+        curriculum=Curriculum([0.0, 1.0], 0.0),
     )

@@ -1,21 +1,21 @@
 """What is off is never called: every part that a scene does not call for raises, and a step is made."""
 
+from dataclasses import replace
 from functools import partial
 
 import pytest
 import torch
 
 from forewarp import losses
-from forewarp.effects import background, inpaint, motion, upsample, view
+from forewarp.methods.voxel.effects import background, inpaint, motion, upsample, view
 from forewarp.fields.trajectory import TrajectoryField
 from forewarp.fields.voxel_grid import VoxelGrid
-from forewarp.renderer import Renderer
+from forewarp.methods.voxel.terms import TERMS
 from forewarp.scene.box import Lattice
 from forewarp.training.curriculum import Curriculum
 from forewarp.training.module import DynamicSceneModule
-from forewarp.training.objective import Objective
-from forewarp.training.settings import StageSettings
-from tiny_scene import BOX, RATES, ball_data, forward_spec
+from forewarp.training.objective import total
+from tiny_scene import BOX, ball_data, begun, built, forward_model, stage
 
 LATTICE = Lattice(BOX, (9, 8, 7))
 PARTS = {
@@ -38,36 +38,26 @@ ON = {
     "background": {"background": STILL},
 }
 OFF = {"motion": None, "view": None}
-TERMS = sorted(Objective({}).terms)
 
 
 def a_step(effects, weights=None, **choices):
     """Look at a batch of the ball through a method with these effects and no others, and learn from it."""
     torch.manual_seed(0)
     chosen = OFF | {key: value for effect in effects for key, value in ON[effect].items()} | choices
-    method = forward_spec(**chosen).build(
-        LATTICE,
-        torch.ones(LATTICE.shape, dtype=torch.bool),
-        unit=0.3,
-        scene_box=BOX,
-        frames=12,
-        canonical_time=0.0,
-        effects=tuple(ON),
-        still=(LATTICE, torch.ones(LATTICE.shape, dtype=torch.bool)),
-    )
+    still = (LATTICE, torch.ones(LATTICE.shape, dtype=torch.bool))
+    method = built(forward_model(**chosen), LATTICE, frames=12, still=still)
     data = ball_data(rays=32)
     data.setup("fit")
+    made = stage(weights=weights or {"photo": 1.0})
     module = DynamicSceneModule(
-        method,
-        renderer=Renderer(),
-        objective=Objective(weights or {"photo": 1.0}),
-        settings=StageSettings("fine", voxels=[[0, 500]], rates=RATES, iterations=10),
+        begun(method, replace(data.scene, still=torch.zeros(4, 3)), made),
+        objective=made.objective,
+        settings=made.settings,
         curriculum=Curriculum(list(data.scene.times), 0.0),
-        cameras=[frame.camera for frame in data.scene.train],
-        still=torch.zeros(4, 3),
     )
     data.picker = lambda: 7  # a time at which things have moved
-    loss, raw = module.objective(module.look(next(iter(data.train_dataloader()))), 0)
+    factors = module.objective.factors(0)
+    loss, raw = total(module.look(next(iter(data.train_dataloader())), factors), factors, {})
     loss.backward()
     return method, raw
 
@@ -116,7 +106,7 @@ def test_trajectory_features_that_are_off_are_no_grid():
     assert grids(0) == []
 
 
-@pytest.mark.parametrize("off", TERMS)
+@pytest.mark.parametrize("off", sorted(TERMS))
 def test_a_term_of_weight_zero_computes_nothing(off, monkeypatch):
     function = {"photo": "photometric"}.get(off, off)
     monkeypatch.setattr(losses, function, lambda *a, **k: pytest.fail(f"{off} was called"))

@@ -4,14 +4,14 @@ import math
 import pytest
 import torch
 
-from forewarp.effects.view import SphericalHarmonics
+from forewarp.methods.voxel.effects.view import SphericalHarmonics
 from forewarp.ops import backend
 from forewarp.ops.grid import index_of
 from forewarp.ops.trace import trace
 from forewarp.renderer import Renderer
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.rays import Rays
-from forewarp.scene.state import Activation, RadianceGrid, shade
+from forewarp.fields.radiance_grid import Activation, RadianceGrid, shaded
 from reference import composite, march_samples
 
 LATTICE = Lattice(Box((0, 0, 0), (1, 3, 8)), (3, 4, 5))  # spacings 1/2, 1, 2; pitch 1
@@ -31,7 +31,7 @@ class Slab:
         return torch.full((len(points),), self.sigma, dtype=points.dtype)
 
     def colors(self, points, directions, view):
-        return shade(torch.full((len(points), 3), self.feature, dtype=points.dtype), directions, view)
+        return shaded(torch.full((len(points), 3), self.feature, dtype=points.dtype), directions, view)
 
 
 def rays(origins, directions, near=0.0, far=20.0):

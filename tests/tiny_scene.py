@@ -8,12 +8,14 @@ import lightning
 import torch
 
 from forewarp.data.module import SceneDataModule
-from forewarp.effects.motion import Motion
-from forewarp.effects.view import SphericalHarmonics
+from forewarp.methods.voxel.effects.motion import Motion
+from forewarp.methods.voxel.effects.view import SphericalHarmonics
 from forewarp.fields.radiance import DirectRadiance
 from forewarp.fields.trajectory import TrajectoryField
-from forewarp.methods.spec import MethodSpec
-from forewarp.renderer import Renderer
+from forewarp.methods.method import Start
+from forewarp.methods.voxel.model import BackwardModel, ForwardModel
+from forewarp.methods.voxel.stage import VoxelStage
+from forewarp.methods.voxel.start import Ground
 from forewarp.scene.box import Box
 from forewarp.scene.camera import Camera, look_at
 from forewarp.scene.frame import Frame, Scene
@@ -76,18 +78,47 @@ def ball_data(rays=256, seed=0, **changes):
     return SceneDataModule(lambda: ball_scene(**changes), rays=rays, seed=seed)
 
 
-def forward_spec(**changes):
+RADIANCE = partial(DirectRadiance, alpha_init=1e-2, skip_alpha=1e-4)
+
+
+def forward_model(**changes):
     """The forward method, cheap: colours in the voxels, few bases."""
     choices = {
-        "radiance": partial(DirectRadiance, alpha_init=1e-2, skip_alpha=1e-4),
+        "radiance": RADIANCE,
         "motion": Motion,
         "trajectory": partial(TrajectoryField, bases=4, nodes=8, width=32, layers=3),
         "view": SphericalHarmonics,
     }
-    return MethodSpec(**(choices | changes))
+    return ForwardModel(**(choices | changes))
 
 
-def stage(name="coarse", weights=None, **changes):
+def backward_model(**changes):
+    """The backward method, as cheap; its ``deformation`` is to be named."""
+    return BackwardModel(**({"radiance": RADIANCE, "view": SphericalHarmonics} | changes))
+
+
+def built(model, lattice, active=None, *, unit=0.3, frames=5, canonical_time=0.0, still=None, **numbers):
+    """A model's method on a lattice, all of it active by default; ``numbers`` are of its stage."""
+    active = torch.ones(lattice.shape, dtype=torch.bool) if active is None else active
+    ground = Ground(lattice, active, unit, BOX, frames, canonical_time, still)
+    return model.build(ground, VoxelStage(**({"voxels": [[0, 500]]} | numbers)))
+
+
+def begun(method, scene, made):
+    """A method that was built, ready for the stage ``made`` of a scene."""
+    settings, objective = made.settings, made.objective
+    start = Start(
+        scene,
+        settings.name,
+        settings.numbers,
+        weights=objective.weights,
+        literal=objective.literal,
+        photo_on=objective.photo_on,
+    )
+    return method.begin(start, VoxelStage(name=settings.name, **settings.numbers))
+
+
+def stage(name="coarse", weights=None, photo_on=None, **changes):
     """A stage of few steps on a small lattice."""
     numbers = {
         "voxels": [[0, 14**3]],
@@ -97,9 +128,10 @@ def stage(name="coarse", weights=None, **changes):
         "rates": RATES,
     }
     objective = Objective(
-        {"photo": 1.0, "point_color": 0.01, "tv_flow": 1e-3} if weights is None else weights
+        {"photo": 1.0, "point_color": 0.01, "tv_flow": 1e-3} if weights is None else weights,
+        photo_on=photo_on,
     )
-    return Stage(StageSettings(name, **(numbers | changes)), objective)
+    return Stage(StageSettings.of(name, **(numbers | changes)), objective)
 
 
 def trainer(callbacks):
@@ -118,13 +150,12 @@ def trainer(callbacks):
     )
 
 
-def make_run(folder, stages, *, data=None, spec=None, callbacks=(), **changes):
+def make_run(folder, stages, *, data=None, model=None, callbacks=(), **changes):
     """A run over the ball scene in ``folder``."""
     return Run(
         data or ball_data(),
-        spec or forward_spec(),
+        model or forward_model(),
         stages,
-        Renderer(),
         Path(folder),
         lambda where, own: trainer(own),
         callbacks=lambda name, where: list(callbacks),

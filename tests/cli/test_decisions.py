@@ -7,8 +7,8 @@ import pytest
 from forewarp.cli import decisions
 from forewarp.cli.decisions import Evidence
 from forewarp.report.effect import Gain
-from forewarp.training.evidence import Movement, Pictures
-from forewarp.training.residual import Residual
+from forewarp.methods.voxel.evidence import Movement, Pictures
+from forewarp.methods.voxel.residual import Residual
 
 MOVING = Evidence(
     Pictures(frames=50, times=50, cut_out=0.8, spread=160.0, disagreement=0.2),

@@ -194,7 +194,10 @@ def test_another_dataset_is_refused_by_its_scene(refused, fitted, scenes):
 def test_a_checkpoint_of_another_configuration_is_refused(refused, fitted, scenes, tmp_path):
     shutil.copytree(fitted, tmp_path / "run")
     saved = yaml.safe_load((tmp_path / "run" / "config.yaml").read_text())
-    saved["model"]["view"] = {"_target_": "forewarp.effects.view.SphericalHarmonics", "_partial_": True}
+    saved["model"]["view"] = {
+        "_target_": "forewarp.methods.voxel.effects.view.SphericalHarmonics",
+        "_partial_": True,
+    }
     (tmp_path / "run" / "config.yaml").write_text(yaml.safe_dump(saved))
     line = refused("evaluate", f"run={tmp_path / 'run'}")
     assert "last.ckpt: expected a checkpoint of this configuration, but got one that differs in" in line

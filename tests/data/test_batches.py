@@ -2,17 +2,21 @@
 
 from dataclasses import replace
 from functools import partial
+from hashlib import sha256
 from itertools import islice
 
 import pytest
 import torch
 from dnerf_scene import write_tiny
 
-from forewarp.data.batches import RayBatches, Targets, color_of
+from forewarp.data.batches import Sampler, Targets, color_of
 from forewarp.data.dnerf import read_scene
 from forewarp.data.images import composited
+from forewarp.scene.batch import Asks
 from forewarp.scene.errors import SceneError
 from forewarp.scene.frame import Frame, Scene
+from forewarp.scene.rays import joined
+from forewarp.scene.view import Moment
 
 
 @pytest.fixture
@@ -33,72 +37,87 @@ def opaque(scene: Scene) -> Scene:
     return replace(scene, train=train, has_alpha=False)
 
 
+def rays_of(batch):
+    """Those of all its pixels, after one another."""
+    return joined([one.view.rays() for one in batch.observations])
+
+
+def rgb_of(batch):
+    return torch.cat([one.rgb for one in batch.observations])
+
+
+def behind(batch):
+    """The background of every pixel."""
+    return torch.cat([one.background.expand(len(one.view), 3) for one in batch.observations])
+
+
 def colours(batches, count=3):
-    return torch.stack([b.rgb for b in islice(batches, count)])
+    return torch.stack([rgb_of(b) for b in islice(batches, count)])
 
 
 @pytest.mark.parametrize("background", ["white", "black", "random"])
 def test_every_ray_carries_the_colour_of_its_pixel(scene, background):
-    batch = RayBatches(scene, rays=50, background=background).draw()
+    batch = Sampler(scene, rays=50, background=background).draw()
     frame = scene.train[batch.frame]
-    ahead = batch.rays.origins + batch.rays.directions
+    rays = rays_of(batch)
+    ahead = rays.origins + rays.directions
     pixel = frame.camera.project(ahead.double())[0].long()
     rgba = frame.load()[pixel[:, 1], pixel[:, 0]]
-    torch.testing.assert_close(batch.rgb, composited(rgba, batch.background))
+    torch.testing.assert_close(rgb_of(batch), composited(rgba, behind(batch)))
     assert batch.time == frame.time
-    assert batch.rays.directions.norm(dim=-1).allclose(torch.ones(50))
-    assert len(batch.rays) == 50
+    assert rays.directions.norm(dim=-1).allclose(torch.ones(50))
+    assert len(rays) == len(batch) == 50
 
 
 def test_backgrounds(scene):
-    assert torch.equal(RayBatches(scene, background="white").draw().background, torch.ones(3))
-    assert torch.equal(RayBatches(scene, background="black").draw().background, torch.zeros(3))
-    random = RayBatches(scene, rays=500, background="random")
-    first, second = random.draw().background, random.draw().background
+    white, black = (Sampler(scene, background=name).draw() for name in ("white", "black"))
+    assert torch.equal(white.observations[0].background, torch.ones(3))
+    assert torch.equal(black.observations[0].background, torch.zeros(3))
+    random = Sampler(scene, rays=500, background="random")
+    first, second = behind(random.draw()), behind(random.draw())
     assert first.shape == (500, 3)
     assert len(first.unique(dim=0)) == 500
     assert not torch.equal(first, second)
 
 
 def test_behind_an_opaque_pixel_a_random_colour_does_not_show(scene):
-    batch = RayBatches(opaque(scene), rays=60, background="random").draw()
-    assert len(batch.background.unique(dim=0)) == 60
+    batch = Sampler(opaque(scene), rays=60, background="random").draw()
+    assert len(behind(batch).unique(dim=0)) == 60
     frame = opaque(scene).train[batch.frame]
-    pixel = frame.camera.project((batch.rays.origins + batch.rays.directions).double())[0].long()
-    torch.testing.assert_close(batch.rgb, frame.load()[pixel[:, 1], pixel[:, 0], :3] / 255)
+    rays = rays_of(batch)
+    pixel = frame.camera.project((rays.origins + rays.directions).double())[0].long()
+    torch.testing.assert_close(rgb_of(batch), frame.load()[pixel[:, 1], pixel[:, 0], :3] / 255)
 
 
 def test_all_pixels_and_frames_are_drawn(scene):
-    batches = list(islice(RayBatches(scene, rays=400), 60))
+    batches = list(islice(Sampler(scene, rays=400), 60))
     assert {b.frame for b in batches} == {0, 1, 2, 3}
-    assert len(batches[0].rays.directions.unique(dim=0)) == 48
+    assert len(rays_of(batches[0]).directions.unique(dim=0)) == 48
 
 
 def test_the_seed_decides(scene):
-    assert torch.equal(colours(RayBatches(scene, rays=9, seed=1)), colours(RayBatches(scene, rays=9, seed=1)))
-    assert not torch.equal(
-        colours(RayBatches(scene, rays=9, seed=1)), colours(RayBatches(scene, rays=9, seed=2))
-    )
+    assert torch.equal(colours(Sampler(scene, rays=9, seed=1)), colours(Sampler(scene, rays=9, seed=1)))
+    assert not torch.equal(colours(Sampler(scene, rays=9, seed=1)), colours(Sampler(scene, rays=9, seed=2)))
 
 
 def test_the_global_generator_plays_no_part(scene):
     before = torch.get_rng_state()
-    RayBatches(scene, background="random").draw()
+    Sampler(scene, background="random").draw()
     assert torch.equal(torch.get_rng_state(), before)
 
 
 def test_a_saved_state_continues_exactly(scene):
-    batches = RayBatches(scene, rays=9, background="random")
+    batches = Sampler(scene, rays=9, background="random")
     colours(batches)
     state = batches.state_dict()
     expected = colours(batches)
-    other = RayBatches(scene, rays=9, background="random", seed=5)
+    other = Sampler(scene, rays=9, background="random", seed=5)
     other.load_state_dict(state)
     assert torch.equal(colours(other), expected)
 
 
 def test_the_picker_chooses_the_frame(scene):
-    batches = RayBatches(scene, rays=9)
+    batches = Sampler(scene, rays=9)
     order = iter([2, 0, 3])
     batches.picker = lambda: next(order)
     assert [b.frame for b in islice(batches, 3)] == [2, 0, 3]
@@ -109,9 +128,9 @@ def test_the_picker_chooses_the_frame(scene):
 
 def test_bad_settings(scene):
     with pytest.raises(SceneError, match="data.background: expected white, black or random, but got 'blue'"):
-        RayBatches(scene, background="blue")
+        Sampler(scene, background="blue")
     with pytest.raises(SceneError, match="data.rays: expected at least 1, but got 0"):
-        RayBatches(scene, rays=0)
+        Sampler(scene, rays=0)
     with pytest.raises(SceneError, match="data.eval_background: expected white or black, but got 'random'"):
         color_of("random")
 
@@ -148,12 +167,12 @@ def of_times(scene: Scene, *times: float) -> Scene:
 def frames_of(batch, scene):
     """Which training frame each ray starts in."""
     centers = torch.stack([f.camera.center.float() for f in scene.train])
-    return (batch.rays.origins[:, None] - centers).norm(dim=-1).argmin(-1)
+    return (rays_of(batch).origins[:, None] - centers).norm(dim=-1).argmin(-1)
 
 
 def test_a_batch_may_have_rays_of_several_frames_of_one_time(scene):
     scene = of_times(scene, 0.5, 0.0, 0.5, 0.5)
-    batches = RayBatches(scene, rays=50, background="random", views_per_step=2, picker=lambda: 2)
+    batches = Sampler(scene, rays=50, background="random", views_per_step=2, picker=lambda: 2)
     seen = set()
     for batch in islice(batches, 20):
         frames = frames_of(batch, scene)
@@ -162,34 +181,35 @@ def test_a_batch_may_have_rays_of_several_frames_of_one_time(scene):
         assert torch.bincount(frames).max() == 25
         seen |= {one, other}
         used = [scene.train[i].camera for i in (one, other)]
-        assert (batch.time, batch.frame, len(batch.rays)) == (0.5, 2, 50)
-        assert batch.rays.near == min(c.near for c in used)
-        assert batch.rays.far == max(c.far for c in used)
-        for i, rgb, direction, behind in zip(frames, batch.rgb, batch.rays.directions, batch.background):
+        rays = rays_of(batch)
+        assert (batch.time, batch.frame, len(rays)) == (0.5, 2, 50)
+        assert rays.near == min(c.near for c in used)
+        assert rays.far == max(c.far for c in used)
+        for i, rgb, direction, background in zip(frames, rgb_of(batch), rays.directions, behind(batch)):
             frame = scene.train[i]
             pixel = frame.camera.project(frame.camera.center + direction.double())[0].long()
-            torch.testing.assert_close(rgb, composited(frame.load()[pixel[1], pixel[0]], behind))
+            torch.testing.assert_close(rgb, composited(frame.load()[pixel[1], pixel[0]], background))
     assert seen == {0, 2, 3}
 
 
 def test_more_views_than_there_are_takes_all_of_the_time(scene):
     scene = of_times(scene, 0.5, 0.0, 0.5, 0.5)
-    batches = RayBatches(scene, rays=50, views_per_step=8)
+    batches = Sampler(scene, rays=50, views_per_step=8)
     picks = {batch.frame: frames_of(batch, scene).unique().tolist() for batch in islice(batches, 40)}
     assert picks == {0: [0, 2, 3], 1: [1], 2: [0, 2, 3], 3: [0, 2, 3]}
-    few = RayBatches(scene, rays=2, views_per_step=8, picker=lambda: 0).draw()
+    few = Sampler(scene, rays=2, views_per_step=8, picker=lambda: 0).draw()
     assert len(frames_of(few, scene).unique()) == 2
 
 
 def test_batches_of_several_views_repeat_and_continue_exactly(scene):
     scene = of_times(scene, 0.5, 0.5, 0.5, 0.5)
     options = {"rays": 9, "background": "random", "views_per_step": 3}
-    batches = RayBatches(scene, **options)
+    batches = Sampler(scene, **options)
     first = colours(batches)
     state = batches.state_dict()
     expected = colours(batches)
-    assert torch.equal(colours(RayBatches(scene, **options)), first)
-    other = RayBatches(scene, seed=5, **options)
+    assert torch.equal(colours(Sampler(scene, **options)), first)
+    other = Sampler(scene, seed=5, **options)
     other.load_state_dict(state)
     assert torch.equal(colours(other), expected)
 
@@ -197,6 +217,145 @@ def test_batches_of_several_views_repeat_and_continue_exactly(scene):
 def test_one_view_a_step_draws_what_it_always_drew(scene):
     """Times that are shared change nothing where one frame gives all rays."""
     same = of_times(scene, 0.5, 0.5, 0.5, 0.5)
-    assert torch.equal(colours(RayBatches(scene, rays=9)), colours(RayBatches(same, rays=9)))
+    assert torch.equal(colours(Sampler(scene, rays=9)), colours(Sampler(same, rays=9)))
     with pytest.raises(SceneError, match="data.views_per_step: expected at least 1, but got 0"):
-        RayBatches(scene, views_per_step=0)
+        Sampler(scene, views_per_step=0)
+
+
+def checksum(batches, scene):
+    """Of which pixels five batches have, their colours and what is behind them."""
+    found = sha256()
+    for batch in islice(batches, 5):
+        rays = rays_of(batch)
+        for i, along in zip(frames_of(batch, scene).tolist(), rays.directions):
+            camera = scene.train[i].camera
+            column, row = camera.project(camera.center + along.double())[0].long().tolist()
+            found.update(bytes([i, row, column]))
+        for values in (rgb_of(batch), behind(batch)):
+            found.update((values * 2**16).round().int().numpy().tobytes())
+        found.update(bytes([batch.frame]))
+    return found.hexdigest()[:16]
+
+
+@pytest.mark.parametrize(
+    ("options", "times", "expected"),
+    [
+        ({}, None, "311cea78d077bae3"),
+        ({"background": "random"}, None, "2805dc4f8b514939"),
+        ({"background": "random", "views_per_step": 3}, [0.5] * 4, "d996874363ebabeb"),
+    ],
+)
+def test_single_pixels_are_those_that_were_always_drawn(scene, options, times, expected):
+    """The sums are of what was drawn before a method could ask for anything."""
+    drawn = scene if times is None else of_times(scene, *times)
+    assert checksum(Sampler(drawn, rays=33, seed=3, **options), scene) == expected
+
+
+def shown(scene, one):
+    """What an observation should show, of its frame's own image."""
+    pixels = scene.train[one.moment.frame].load()
+    rows = one.view.indices
+    whole = pixels.reshape(-1, 4)
+    return composited(whole if rows is None else whole[rows], one.background)
+
+
+@pytest.mark.parametrize("background", ["white", "random"])
+def test_crops_are_square_parts_of_a_picture_over_one_colour(scene, background):
+    sampler = Sampler(scene, background=background, asks=Asks("crops", side=3))
+    corners = set()
+    for batch in islice(sampler, 400):
+        (one,) = batch.observations
+        top, left, height, width = one.view.crop
+        assert (height, width) == one.view.shape == (3, 3)
+        assert one.background.shape == (3,)
+        image = scene.train[batch.frame].load()[top : top + 3, left : left + 3].reshape(-1, 4)
+        torch.testing.assert_close(one.rgb, composited(image, one.background))
+        assert one.moment == Moment(scene.train[batch.frame].time, batch.frame, one.moment.camera)
+        corners.add((top, left))
+    assert corners == {(top, left) for top in range(4) for left in range(6)}  # of 6 x 8 pixels
+
+
+def test_a_crop_is_never_larger_than_its_picture(scene):
+    (one,) = Sampler(scene, asks=Asks("crops", side=7)).draw().observations
+    assert one.view.shape == (6, 7)
+    (whole,) = Sampler(scene, asks=Asks("crops", side=64)).draw().observations
+    assert whole.view.crop == (0, 0, 6, 8)
+
+
+def test_whole_pictures(scene):
+    scene = of_times(scene, 0.5, 0.0, 0.5, 0.5)
+    sampler = Sampler(scene, background="random", views_per_step=2, picker=lambda: 2, asks=Asks("pictures"))
+    batch = sampler.draw()
+    assert [one.view.shape for one in batch.observations] == [(6, 8)] * 2
+    assert len(batch) == 2 * 48
+    assert batch.observations[0].moment.frame == 2
+    assert {one.moment.time for one in batch.observations} == {0.5}
+    assert not torch.equal(*(one.background for one in batch.observations))
+    for one in batch.observations:
+        torch.testing.assert_close(one.rgb, shown(scene, one))
+
+
+@pytest.mark.parametrize("kind", ["pixels", "crops", "pictures"])
+def test_neighbouring_times_come_after_the_picked_one_nearest_first(scene, kind):
+    scene = of_times(scene, 0.0, 0.25, 0.5, 1.0)
+    sampler = Sampler(scene, rays=10, asks=Asks(kind, side=2, neighbours=2))
+    seen = {}
+    for batch in islice(sampler, 40):
+        times = [one.moment.time for one in batch.observations]
+        assert batch.time == times[0] == scene.train[batch.frame].time
+        seen[batch.frame] = times[1:]
+        for one in batch.observations:
+            torch.testing.assert_close(one.rgb, shown(scene, one))
+        assert kind != "pixels" or [len(one.view) for one in batch.observations] == [4, 3, 3]
+    assert seen == {0: [0.25, 0.5], 1: [0.0, 0.5], 2: [0.25, 1.0], 3: [0.5, 0.25]}
+
+
+def test_a_neighbouring_time_is_seen_from_any_of_its_cameras(scene):
+    scene = of_times(scene, 0.0, 1.0, 1.0, 1.0)
+    sampler = Sampler(scene, rays=4, picker=lambda: 0, asks=Asks(neighbours=3))
+    batches = list(islice(sampler, 40))
+    assert {len(batch.observations) for batch in batches} == {2}  # there is one other time
+    assert {batch.observations[1].moment.frame for batch in batches} == {1, 2, 3}
+
+
+def test_pictures_of_the_instant_are_whole_and_over_white(scene):
+    scene = of_times(scene, 0.5, 0.0, 0.5, 0.5)
+    plain = Sampler(scene, rays=9, background="random", picker=lambda: 2)
+    sampler = Sampler(scene, rays=9, background="random", picker=lambda: 2, asks=Asks(instant=2))
+    batch = sampler.draw()
+    assert torch.equal(rgb_of(batch), rgb_of(plain.draw()))  # they cost no random number
+    assert [one.moment.frame for one in batch.instant] == [2, 0]
+    for one in batch.instant:
+        assert one.view.shape == (6, 8)
+        assert torch.equal(one.background, torch.ones(3))
+        torch.testing.assert_close(one.rgb, shown(scene, one))
+    assert len(batch) == 9
+    assert plain.draw().instant == ()
+    alone = Sampler(scene, picker=lambda: 1, asks=Asks(instant=5)).draw()
+    assert [one.moment.frame for one in alone.instant] == [1]
+
+
+@pytest.mark.parametrize("kind", ["crops", "pictures"])
+def test_what_was_asked_for_repeats_and_continues_exactly(scene, kind):
+    options = {"background": "random", "asks": Asks(kind, side=4, neighbours=1)}
+    sampler = Sampler(scene, **options)
+    first = colours(sampler)
+    state = sampler.state_dict()
+    expected = colours(sampler)
+    assert torch.equal(colours(Sampler(scene, **options)), first)
+    other = Sampler(scene, seed=5, **options)
+    other.load_state_dict(state)
+    assert torch.equal(colours(other), expected)
+
+
+def test_moving_a_batch_keeps_what_it_is_of(scene):
+    batch = Sampler(scene, rays=9, asks=Asks(neighbours=1, instant=1)).draw()
+    moved = batch.to("cpu")
+    assert [one.moment for one in moved.observations] == [one.moment for one in batch.observations]
+    assert (moved.frame, len(moved.instant), len(moved)) == (batch.frame, 1, len(batch))
+
+
+@pytest.mark.parametrize("wrong", [{"kind": "blobs"}, {"side": 0}, {"neighbours": -1}, {"instant": -1}])
+def test_refuses_to_be_asked_for_what_there_is_not(wrong):
+    with pytest.raises(ValueError, match="asks: expected a kind of pixels, crops, pictures, side >= 1,"):
+        Asks(**wrong)

@@ -201,7 +201,7 @@ def test_the_module_reads_the_scale_it_is_told(tmp_path):
     )
     module.setup()
     batch = module.batches.draw()
-    assert (len(batch.rays), batch.background.shape) == (7, (7, 3))
+    assert (len(batch), batch.observations[0].background.shape) == (7, (7, 3))
     assert module.scene.protocol["background"] == "none"
     target = module.targets("test")[0]
     assert (target.rgb.shape, target.foreground) == ((8, 12, 3), None)

@@ -20,8 +20,9 @@ class Recorder(LightningModule):
         self.seen, self.targets = [], []
 
     def training_step(self, batch: Batch, index: int):
-        self.seen.append((batch.frame, batch.rgb))
-        return (self.level - batch.rgb).square().mean()
+        rgb = batch.observations[0].rgb
+        self.seen.append((batch.frame, rgb))
+        return (self.level - rgb).square().mean()
 
     def validation_step(self, target: Target, index: int):
         self.targets.append(target.frame.name)

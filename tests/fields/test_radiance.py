@@ -3,7 +3,7 @@ import torch
 
 from forewarp.fields.radiance import DirectRadiance, FeatureRadiance, density_shift
 from forewarp.scene.box import Box, Lattice
-from forewarp.scene.state import EMPTY
+from forewarp.fields.radiance_grid import EMPTY
 
 LATTICE = Lattice(Box((0, 0, 0), (2, 3, 4)), (3, 4, 5))
 ALL = torch.ones(LATTICE.shape, dtype=torch.bool)

@@ -5,16 +5,16 @@ from functools import partial
 import pytest
 import torch
 
-from forewarp.effects.inpaint import UNet3d
-from forewarp.effects.upsample import LearnedUpsampler
-from forewarp.effects.view import ViewNetwork
+from forewarp.methods.voxel.effects.inpaint import UNet3d
+from forewarp.methods.voxel.effects.upsample import LearnedUpsampler
+from forewarp.methods.voxel.effects.view import ViewNetwork
 from forewarp.fields.mlp import mlp
 from forewarp.fields.radiance import FeatureRadiance
-from forewarp.methods.backward_warp import Deformation
+from forewarp.methods.voxel.backward_warp import Deformation
 from forewarp.renderer import Renderer
 from forewarp.scene.box import Lattice
-from forewarp.training.settings import EFFECTS
-from tiny_scene import BOX, camera_at, forward_spec
+from forewarp.methods.voxel.stage import EFFECTS
+from tiny_scene import BOX, camera_at, forward_model
 
 pytestmark = pytest.mark.stability
 
@@ -38,7 +38,7 @@ SPECS = {
 def method_of(choice, device):
     torch.manual_seed(0)
     lattice = Lattice(BOX, (8, 7, 6))
-    made = forward_spec(**SPECS[choice]).build(
+    made = forward_model(**SPECS[choice]).build(
         lattice,
         torch.ones(lattice.shape, dtype=torch.bool),
         unit=lattice.pitch,

@@ -11,7 +11,7 @@ from forewarp.ops.march import march
 from forewarp.renderer import Renderer
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.camera import Camera, look_at
-from forewarp.scene.state import Activation
+from forewarp.fields.radiance_grid import Activation
 from hard_cases import LATTICE, check_finite, grid, index_with, rays, raw_of
 
 pytestmark = pytest.mark.stability

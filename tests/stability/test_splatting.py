@@ -5,11 +5,11 @@ import math
 import pytest
 import torch
 
-from forewarp.effects.motion import Motion
+from forewarp.methods.voxel.effects.motion import Motion
 from forewarp.fields.trajectory import TrajectoryField
 from forewarp.ops.splat import average_splat
 from forewarp.renderer import Renderer
-from forewarp.scene.state import EMPTY
+from forewarp.fields.radiance_grid import EMPTY
 from hard_cases import LATTICE, SHAPE, check_finite, grid, rays, voxels
 
 pytestmark = pytest.mark.stability

@@ -5,7 +5,7 @@ import torch
 
 from forewarp.fields.trajectory import TrajectoryField
 from forewarp.fields.voxel_grid import VoxelGrid
-from forewarp.methods.backward_warp import Deformation
+from forewarp.methods.voxel.backward_warp import Deformation
 from forewarp.ops.dct import dct_basis
 from forewarp.training.curriculum import Curriculum
 from hard_cases import LATTICE, check_finite, voxels

@@ -7,13 +7,13 @@ import pytest
 import torch
 
 from forewarp.data.module import SceneDataModule
-from forewarp.effects.background import StaticBackground
-from forewarp.effects.inpaint import UNet3d
+from forewarp.methods.voxel.effects.background import StaticBackground
+from forewarp.methods.voxel.effects.inpaint import UNet3d
 from forewarp.fields.trajectory import TrajectoryField
 from forewarp.scene.box import Box
 from forewarp.training.objective import Objective
 from hard_cases import check_finite
-from tiny_scene import RATES, ball_scene, forward_spec, make_run, stage
+from tiny_scene import RATES, ball_scene, forward_model, make_run, stage
 
 pytestmark = pytest.mark.stability
 
@@ -57,7 +57,7 @@ class Diary(Objective):
 def fit(folder, scene, iterations, weights=None, **changes):
     """A fitted module, the losses of its steps, and the mean PSNR of its test images."""
     data = SceneDataModule(lambda: scene, rays=changes.pop("rays", 128))
-    spec = changes.pop("spec", None) or forward_spec()
+    spec = changes.pop("spec", None) or forward_model()
     fitting = stage(iterations=iterations, weights=weights, **({"voxels": [[0, 12**3]]} | changes))
     diary = Diary(fitting.objective.weights)
     module = make_run(folder, [replace(fitting, objective=diary)], data=data, spec=spec).fit()
@@ -79,7 +79,7 @@ def test_no_term_of_the_loss_depends_on_the_unit_of_length(tmp_path, factor):
     weights = dict.fromkeys(TERMS, 0.1)
     assert set(TERMS) == set(Objective(weights).terms)
     options = {"iterations": 4, "weights": weights, "start": "hull", "patches": 2}
-    options |= {"spec": forward_spec(**ALL), "background_voxels": [[0, 12**3]]}
+    options |= {"spec": forward_model(**ALL), "background_voxels": [[0, 12**3]]}
     scene = replace(ball_scene(frames=6, size=16), still=torch.tensor([[0.9, 0.1, 0.2], [-0.8, 0.3, -0.2]]))
     _, plain, _ = fit(tmp_path / "a", scene, **options)
     _, other, _ = fit(tmp_path / "b", in_other_units(scene, factor), **options)

@@ -7,11 +7,10 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from forewarp.data.module import SceneDataModule
-from forewarp.renderer import Renderer
 from forewarp.scene.frame import Truth
 from forewarp.training.accuracy import COLUMNS, AccuracyCurve, read_rows, seconds_before
 from forewarp.training.stages import Run
-from tiny_scene import Interrupt, ball_scene, forward_spec, stage
+from tiny_scene import Interrupt, ball_scene, forward_model, stage
 
 STEPS = 12
 
@@ -62,9 +61,8 @@ def run(folder, *more, curve=True, held_out=3, scene=scene_with_truth, stages=("
     watchers = [Tick(), *([AccuracyCurve(first=2000, ratio=2.0, rays=100)] if curve else []), *more]
     return Run(
         SceneDataModule(scene, rays=64, held_out=held_out),
-        forward_spec(),
+        forward_model(),
         [stage(name, iterations=STEPS) for name in stages],
-        Renderer(),
         folder,
         make_trainer,
         lambda name, where: watchers,
@@ -100,7 +98,7 @@ def test_rows_lie_at_geometric_moments_and_at_the_end(watched):
     assert tuple(rows[0]) == COLUMNS
     assert steps(folder) == EXPECTED
     assert [round(float(row["seconds"]), -3) for row in rows] == [2000, 4000, 8000, 12000]
-    assert int(rows[-1]["voxels"]) == len(module.method.radiance.voxels)
+    assert int(rows[-1]["size"]) == len(module.method.radiance.voxels)
     assert all(0 < float(row["psnr"]) < 60 and float(row["epe_moving"]) > 0 for row in rows)
     assert not list(folder.glob("*.part"))
 

@@ -9,13 +9,12 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from forewarp.data.module import SceneDataModule
-from forewarp.renderer import Renderer
 from forewarp.training.callbacks import StageProgress, TensorBoardScalars
 from forewarp.training.clock import Clock
 from forewarp.training.pictures import TensorBoardPictures
 from forewarp.training.progress import ProgressLine
 from forewarp.training.stages import Run
-from tiny_scene import Interrupt, ball_data, ball_scene, forward_spec, stage
+from tiny_scene import Interrupt, ball_data, ball_scene, forward_model, stage
 
 STEPS = 12
 
@@ -41,9 +40,8 @@ def watched_run(folder, *callbacks, steps=STEPS):
     stages = [stage(iterations=steps)]
     return Run(
         ball_data(),
-        forward_spec(),
+        forward_model(),
         stages,
-        Renderer(),
         folder,
         make_trainer,
         lambda name, where: list(callbacks),

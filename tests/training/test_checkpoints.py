@@ -5,22 +5,22 @@ import torch
 
 from forewarp.fields.trajectory import TrajectoryField
 from forewarp.training.checkpoints import KeepCheckpoint, check_checkpoint, check_state, load_weights
-from tiny_scene import Interrupt, ball_data, forward_spec, make_run, stage
+from tiny_scene import Interrupt, ball_data, forward_model, make_run, stage
 
 
 def run(folder, callbacks=(), width=8, times=None):
     """A run of one short stage."""
     trajectory = partial(TrajectoryField, bases=2, nodes=8, width=width, layers=2)
     data = ball_data(rays=64, size=16, times=times)
-    spec = forward_spec(trajectory=trajectory)
-    return make_run(folder, [stage(voxels=[[0, 1000]])], data=data, spec=spec, callbacks=callbacks)
+    model = forward_model(trajectory=trajectory)
+    return make_run(folder, [stage(voxels=[[0, 1000]])], data=data, model=model, callbacks=callbacks)
 
 
 def module(folder, **changes):
     """What such a run begins with."""
     ours = run(folder, **changes)
     ours.datamodule.setup()
-    return ours._module(ours.stages[0], None, None, 0)[0]
+    return ours._module(ours.stages[0], None, None, 0)
 
 
 @pytest.fixture(scope="module")

@@ -39,7 +39,7 @@ def module(run):
 def warped(module, monkeypatch):
     """The times that were warped, as they come."""
     times, at = [], module.method.at
-    monkeypatch.setattr(module.method, "at", lambda time: times.append(time) or at(time))
+    monkeypatch.setattr(module.method, "at", lambda moment: times.append(moment.time) or at(moment))
     return times
 
 
@@ -52,7 +52,8 @@ def test_evaluation_warps_a_time_once_for_all_its_cameras(run, module, warped, t
 
 def test_training_warps_once_for_the_rays_of_several_cameras(run, module, warped, monkeypatch):
     batch = run.datamodule.batches.draw()
-    assert len(batch.rays.origins.unique(dim=0)) == 3
+    assert len({one.moment.frame for one in batch.observations}) == 3
+    assert len({one.view.camera.center for one in batch.observations}) == 3
     assert torch.isfinite(module.training_step(batch, 0))
     assert warped == [batch.time]
 

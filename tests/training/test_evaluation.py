@@ -5,10 +5,10 @@ import pytest
 import torch
 
 from forewarp.data.batches import Targets
+from forewarp.methods.voxel.snapshot import VoxelSnapshot
 from forewarp.metrics.suite import ImageSuite
 from forewarp.scene.frame import Truth
 from forewarp.training.evaluation import draw, evaluate, flow_error
-from forewarp.training.module import render_all
 from tiny_scene import ball_data, make_run, stage
 
 
@@ -66,19 +66,19 @@ def test_the_same_scene_gives_the_same_numbers(run, module, tmp_path):
 
 def test_warps_once_a_time(module, monkeypatch):
     targets = ball_data().targets("test")
-    times, at, clock = [], module.method.at, [0.0]
+    times, at, render, clock = [], module.method.at, VoxelSnapshot.render, [0.0]
 
-    def warped(time):
-        times.append(time)
+    def warped(moment):
+        times.append(moment.time)
         clock[0] += 10
-        return at(time)
+        return at(moment)
 
     def drawn(*arguments):
         clock[0] += 1
-        return render_all(*arguments)
+        return render(*arguments)
 
     monkeypatch.setattr(module.method, "at", warped)
-    monkeypatch.setattr("forewarp.training.evaluation.render_all", drawn)
+    monkeypatch.setattr(VoxelSnapshot, "render", drawn)
     monkeypatch.setattr("forewarp.training.evaluation.now", lambda: clock[0])
     frames = [targets.frames[i] for i in (2, 0, 2, 0)]
     shown = list(draw(module, Targets(frames, targets.background, targets.has_alpha)))

@@ -1,55 +1,88 @@
+"""What a stage leaves to the next: gathered as far as its method can tell, written and read whole."""
+
 import json
 from dataclasses import replace
-from functools import partial
 
 import pytest
 import torch
 
-from forewarp.fields.radiance import FeatureRadiance
+from forewarp.methods.method import Method, Start
 from forewarp.scene.box import Box
-from forewarp.training.handover import (
-    Handover,
-    carried_method,
-    fresh_method,
-    load_handover,
-    make_handover,
-    save_handover,
-    write_json,
-)
-from forewarp.training.settings import StageSettings
-from tiny_scene import BOX, RADIUS, RATES, ball_center, ball_scene, forward_spec
+from forewarp.scene.cloud import Cloud, Handover
+from forewarp.training.handover import load_handover, make_handover, save_handover, write_json
+from tiny_scene import BOX, RADIUS, ball_center, ball_scene, forward_model
 
 SCENE = ball_scene(frames=6, size=16)
 
 
-def settings(**changes):
-    return StageSettings(
-        **({"name": "coarse", "voxels": [[0, 1500]], "rates": RATES, "iterations": 5} | changes)
-    )
-
-
-def fresh(spec=None, **changes):
-    return fresh_method(spec or forward_spec(), settings(**changes), SCENE, BOX, None, list(range(6)))
-
-
-def ball(raw=8.0):
+def ball(raw=8.0, **numbers):
     """A method whose canonical grid is the ball, with some motion."""
     torch.manual_seed(0)
-    method, unit = fresh()
+    method = forward_model()(Start(SCENE, "coarse", {"voxels": [[0, 1500]]} | numbers, range(6)))
     points = method.radiance.lattice.to_world(method.radiance.voxels)
     inside = (points - ball_center(0.0)).norm(dim=-1) < RADIUS
     method.radiance.density.data = torch.where(inside, raw, -9.0)[:, None]
     torch.nn.init.normal_(method.radiance.color)
     torch.nn.init.normal_(method.motion.trajectory.network[-1].weight, std=1e-3)
-    return method, unit
+    return method
 
 
 def test_round_trip(tmp_path):
-    handover = Handover((-1.0, 0.25, 1 / 3), (1.0, 2.0, 3.0), 0.1, True, 17)
+    handover = Handover(Box((-1.0, 0.25, 1 / 3), (1.0, 2.0, 3.0)), True, 17, notes={"unit": 0.1})
     save_handover(handover, tmp_path)
+    assert load_handover(tmp_path) == handover
+
+
+@pytest.mark.parametrize("moving", [True, False])
+def test_round_trip_of_points_and_paths(tmp_path, moving):
+    cloud = Cloud(torch.rand(5, 3), torch.rand(5, 3), torch.rand(5), 0.25)
+    times, paths = (torch.rand(4), torch.rand(5, 4, 3)) if moving else (None, None)
+    save_handover(Handover(BOX, False, 3, cloud, times, paths), tmp_path)
     read = load_handover(tmp_path)
-    assert read.box == handover.box == Box((-1, 0.25, 1 / 3), (1, 2, 3))
-    assert replace(read, low=tuple(read.low), high=tuple(read.high)) == handover
+    assert (read.box, read.tight, read.frames_in_play, read.cloud.size) == (BOX, False, 3, 0.25)
+    for name in ("points", "colors", "opacity"):
+        assert torch.equal(getattr(read.cloud, name), getattr(cloud, name))
+    if moving:
+        assert torch.equal(read.times, times)
+        assert torch.equal(read.paths, paths)
+    else:
+        assert (read.times, read.paths) == (None, None)
+
+
+def _numbers(**changes):
+    return lambda folder: write_json(
+        folder / "handover.json", json.loads((folder / "handover.json").read_text()) | changes
+    )
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda folder: (folder / "handover.json").write_text("{"),
+        lambda folder: (folder / "handover.json").write_text("[1]"),
+        lambda folder: (folder / "handover.json").unlink(),
+        lambda folder: (folder / "handover.pt").unlink(),
+        lambda folder: (folder / "handover.pt").write_bytes(b"nonsense"),
+        lambda folder: (folder / "handover.json").write_text(
+            (folder / "handover.json").read_text().replace("0.1", "Infinity")
+        ),
+        _numbers(low=[1.0, 2.0]),
+        _numbers(low=[0, 0, "x"]),
+        _numbers(high=[-9, -9, -9]),
+        _numbers(notes=None),
+        _numbers(notes={"unit": "long"}),
+        _numbers(size=-1.0),
+    ],
+)
+def test_what_is_no_handover_is_refused_in_one_line(tmp_path, spoil):
+    cloud = Cloud(torch.rand(5, 3), torch.rand(5, 3), torch.rand(5), 0.25)
+    save_handover(Handover(BOX, True, 3, cloud, notes={"unit": 0.1}), tmp_path)
+    load_handover(tmp_path)
+    spoil(tmp_path)
+    with pytest.raises(
+        ValueError, match=r"handover\.\w+: expected what a stage leaves to the next, but got something"
+    ):
+        load_handover(tmp_path)
 
 
 def test_half_a_file_is_never_taken_for_one(tmp_path):
@@ -61,109 +94,71 @@ def test_half_a_file_is_never_taken_for_one(tmp_path):
 
 
 def test_a_stage_leaves_the_tight_box():
-    method, unit = ball()
-    handover = make_handover(method, SCENE, unit, 6, alpha=1e-2, pad=2.0)
+    method = ball()
+    handover = make_handover(method, SCENE, None, 6)
     assert handover.tight
-    assert handover.unit == unit
+    assert handover.notes == {"unit": method.radiance.activation.unit}
     assert handover.frames_in_play == 6
     center, margin = ball_center(0.0), RADIUS + 4 * method.radiance.lattice.pitch
-    for low, high, middle in zip(handover.low, handover.high, center.tolist()):
+    for low, high, middle in zip(handover.box.low, handover.box.high, center.tolist()):
         assert middle - margin < low < middle - 0.5 * RADIUS
         assert middle + 0.5 * RADIUS < high < middle + margin
 
 
-def test_a_stage_that_found_nothing_keeps_its_box_and_says_so():
-    method, unit = ball(raw=-9.0)
-    handover = make_handover(method, SCENE, unit, 6, alpha=1e-2)
+def test_the_box_holds_what_the_stage_calls_matter():
+    method, asked = ball(box_alpha=0.25), []
+    bounds = method.bounds
+    method.bounds = lambda times: asked.append(times) or bounds(times)
+    thin = ball(raw=2.0, box_alpha=0.25)  # an opacity of 0.07 over a voxel
+    assert make_handover(method, SCENE, None, 6).tight
+    assert asked == [list(SCENE.times)]
+    assert not make_handover(thin, SCENE, None, 6).tight
+    assert make_handover(ball(raw=2.0, box_alpha=0.01), SCENE, None, 6).tight
+
+
+def test_a_stage_leaves_its_matter_and_the_paths_of_it():
+    method = ball()
+    handover = make_handover(method, SCENE, None, 6)
+    cloud, matter = handover.cloud, method.matter()
+    assert 20 < len(cloud) == len(matter)
+    assert torch.equal(cloud.points, matter.points)
+    assert float((cloud.points - ball_center(0.0)).norm(dim=-1).max()) < RADIUS
+    assert cloud.size == method.radiance.lattice.pitch
+    assert handover.times.tolist() == pytest.approx(list(SCENE.times))
+    assert torch.equal(handover.paths, method.trajectories(cloud.points, handover.times))
+
+
+def test_of_much_matter_and_many_times_a_sample_is_left(monkeypatch):
+    monkeypatch.setattr("forewarp.training.handover._POINTS", 7)
+    monkeypatch.setattr("forewarp.training.handover._TIMES", 3)
+    handover = make_handover(ball(), SCENE, None, 6)
+    assert handover.paths.shape == (7, 3, 3)
+    assert handover.times.tolist() == pytest.approx([SCENE.times[i] for i in (0, 2, 4)], abs=0.21)
+
+
+@pytest.mark.parametrize("box", [None, BOX.scaled(0.5)])
+def test_a_stage_that_found_nothing_keeps_its_box_and_says_so(box):
+    before = None if box is None else Handover(box, True, 6)
+    method = forward_model()(Start(SCENE, "coarse", {"voxels": [[0, 1500]]}, range(6), before))
+    method.radiance.density.data[:] = -9.0
+    handover = make_handover(method, SCENE, before, 6)
     assert not handover.tight
-    assert handover.box == method.radiance.lattice.box
+    assert handover.box == method.radiance.lattice.box == (box or BOX)
+    assert len(handover.cloud) == 0
 
 
-def test_a_fresh_method_starts_faint_everywhere():
-    method, unit = fresh(start_alpha=0.03)
-    lattice = method.radiance.lattice
-    assert unit == lattice.pitch
-    grid = method.radiance()
-    alpha = grid.activation.alpha(grid.raw_density, lattice.pitch)
-    torch.testing.assert_close(alpha, torch.full((lattice.count,), 0.03), rtol=1e-3, atol=0)
+def test_of_a_method_that_can_tell_nothing_the_box_is_left(tmp_path):
+    class Least(Method):
+        pass
+
+    handover = make_handover(Least(), SCENE, None, 4)
+    assert handover == Handover(BOX, False, 4)
+    save_handover(handover, tmp_path)
+    assert load_handover(tmp_path) == handover
+    assert not (tmp_path / "handover.pt").exists()
 
 
-def test_a_network_starts_faint_as_well():
-    radiance = partial(FeatureRadiance, alpha_init=1e-2, skip_alpha=0.0, width=4)
-    method, _ = fresh(forward_spec(radiance=radiance), start_alpha=0.03)
-    grid = method.radiance()
-    alpha = grid.activation.alpha(grid.raw_density, grid.lattice.pitch)
-    torch.testing.assert_close(alpha, torch.full_like(alpha, 0.03), rtol=1e-3, atol=0)
-
-
-def test_the_hull_is_where_matter_may_be():
-    method, _ = fresh(start="hull", hull_frames=2, hull_grow=0.1)
-    points = method.radiance.lattice.to_world(method.radiance.voxels)
-    everywhere = method.radiance.lattice.to_world(method.radiance.lattice.all_voxels())
-    ball_now = (everywhere - ball_center(0.0)).norm(dim=-1) < 0.8 * RADIUS
-    assert (method.radiance.index.flatten()[ball_now] >= 0).all()
-    assert len(points) < 0.5 * len(everywhere)
-
-
-def test_the_hull_needs_alpha():
-    scene = replace(SCENE, has_alpha=False)
-    with pytest.raises(
-        ValueError, match="stage.coarse.start: expected box, since the images of 'ball' have no alpha"
-    ):
-        fresh_method(forward_spec(), settings(start="hull"), scene, BOX, None, [0])
-
-
-def test_left_to_itself_it_starts_in_the_hull_where_there_is_alpha_and_in_the_box_elsewhere():
-    for scene, start in ((SCENE, "hull"), (replace(SCENE, has_alpha=False), "box")):
-        ours, expected = (
-            fresh_method(forward_spec(), settings(start=s, hull_frames=2), scene, BOX, None, [0, 1])[0]
-            for s in ("auto", start)
-        )
-        assert torch.equal(ours.radiance.voxels, expected.radiance.voxels)
-
-
-def test_the_hull_of_a_moment_is_that_of_all_its_views():
-    frames = [replace(frame, time=0.0) for frame in SCENE.train[:3]]
-    scene = replace(SCENE, train=(*frames, *SCENE.train[3:]))
-    one, three = (
-        fresh_method(forward_spec(), settings(start="hull", hull_frames=n), scene, BOX, None, [0, 1, 2, 3])[0]
-        for n in (1, 3)
-    )
-    assert torch.equal(one.radiance.voxels, three.radiance.voxels)
-
-
-def test_carrying_keeps_matter_motion_and_unit():
-    before, unit = ball()
-    path = before.motion.trajectory.state_dict()
-    handover = make_handover(before, SCENE, unit, 6, alpha=1e-2)
-    sigma, at = before.radiance().density, before.radiance.lattice.to_lattice
-    points = ball_center(0.0) + 0.2 * (torch.rand(50, 3) - 0.5)
-    expected = sigma(at(points)).detach()
-    after = carried_method(forward_spec(), settings(name="fine", voxels=[[0, 4000]]), SCENE, before, handover)
-    assert after.radiance.lattice.box == handover.box
-    assert after.radiance.activation.unit == unit
-    assert after.radiance.lattice.count == pytest.approx(4000, rel=0.2)
-    torch.testing.assert_close(after.radiance().density(after.radiance.lattice.to_lattice(points)), expected)
-    for name, value in after.motion.trajectory.state_dict().items():
-        assert torch.equal(value, path[name])
-
-
-def test_carrying_into_a_stage_with_more_effects():
-    plain = forward_spec(view=None)
-    before, unit = fresh(plain)
-    before.radiance.density.data[:] = 3.0
-    before.radiance.color.data[:] = 0.5
-    handover = Handover(BOX.low, BOX.high, unit, True, 6)
-    after = carried_method(forward_spec(), settings(), SCENE, before, handover)
-    assert (after.radiance.shading == 0).all()
-    torch.testing.assert_close(after.radiance.color.data, torch.full_like(after.radiance.color, 0.5))
-
-
-def test_carrying_a_network():
-    spec = forward_spec(radiance=partial(FeatureRadiance, alpha_init=1e-2, skip_alpha=0.0, width=4))
-    before, unit = fresh(spec)
-    torch.nn.init.normal_(before.radiance.network[-1].weight)
-    handover = Handover(BOX.low, BOX.high, unit, True, 6)
-    after = carried_method(spec, settings(), SCENE, before, handover)
-    for ours, theirs in zip(after.radiance.network.parameters(), before.radiance.network.parameters()):
-        assert torch.equal(ours, theirs)
+def test_what_lies_outside_the_scene_is_cut_off():
+    far = replace(SCENE, box=BOX.scaled(0.3))
+    box = make_handover(ball(), far, None, 6).box
+    assert all(high <= edge + 1e-6 for high, edge in zip(box.high, far.box.scaled(1.05).high))

@@ -1,23 +1,24 @@
 import importlib
+from dataclasses import replace
 from functools import partial
 
 import pytest
 import torch
 
-from forewarp.effects.inpaint import UNet3d
-from forewarp.methods.backward_warp import Deformation
+from forewarp.methods.voxel.effects.inpaint import UNet3d
+from forewarp.methods.voxel.backward_warp import Deformation
 from forewarp.ops.backend import numba_installed
 from forewarp.ops.warmup import warm_up
 from forewarp.renderer import Renderer
 from forewarp.scene.box import Lattice
+from forewarp.scene.view import Moment, View
 from forewarp.training.curriculum import Curriculum
-from forewarp.training.module import DynamicSceneModule, render_all
-from forewarp.training.settings import EFFECTS
-from forewarp.training.structure import resample
-from tiny_scene import BOX, RATES, ball_data, forward_spec, stage, trainer
+from forewarp.training.module import DynamicSceneModule
+from forewarp.methods.voxel.structure import resample
+from tiny_scene import BOX, RATES, backward_model, ball_data, begun, built, forward_model, stage, trainer
 
 INPAINTER = partial(UNet3d, width=16, levels=2)
-BACKWARD = forward_spec(warp="backward", deformation=partial(Deformation, width=8, layers=2))
+BACKWARD = backward_model(deformation=partial(Deformation, width=8, layers=2))
 DATA = ball_data(rays=64, frames=5, size=16)
 
 
@@ -29,29 +30,18 @@ class CountingRenderer(Renderer):
         return super().__call__(*arguments, **named)
 
 
-def module(spec=None, weights=None, renderer=None, **changes):
+def module(model=None, weights=None, renderer=None, **changes):
     torch.manual_seed(0)
-    lattice = Lattice(BOX, (9, 7, 6))
-    method = (spec or forward_spec()).build(
-        lattice,
-        torch.ones(lattice.shape, dtype=torch.bool),
-        unit=0.2,
-        scene_box=BOX,
-        frames=5,
-        canonical_time=0.0,
-        effects=EFFECTS,
-    )
+    method = built(model or forward_model(), Lattice(BOX, (9, 7, 6)), unit=0.2)
     for name in method.radiance.names:
         torch.nn.init.normal_(method.radiance.parameter(name))
+    method.renderer = renderer or method.renderer
     made = stage(weights=weights, **changes)
-    train = DATA.scene.train
     return DynamicSceneModule(
-        method,
-        renderer=renderer or Renderer(),
+        begun(method, DATA.scene, made),
         objective=made.objective,
         settings=made.settings,
-        curriculum=Curriculum([f.time for f in train], 0.0),
-        cameras=[f.camera for f in train],
+        curriculum=Curriculum([f.time for f in DATA.scene.train], 0.0),
     )
 
 
@@ -60,17 +50,16 @@ def batch(frame=3):
     return DATA.batches.draw()
 
 
-@pytest.mark.parametrize(("spec", "times"), [(forward_spec(), 1), (forward_spec(inpainter=INPAINTER), 2)])
-def test_without_an_inpainter_the_renderer_runs_once_a_step(spec, times):
+@pytest.mark.parametrize(("model", "times"), [(forward_model(), 1), (forward_model(inpainter=INPAINTER), 2)])
+def test_without_an_inpainter_the_renderer_runs_once_a_step(model, times):
     renderer = CountingRenderer()
-    module(spec, renderer=renderer).training_step(batch(), 0)
+    module(model, renderer=renderer).training_step(batch(), 0)
     assert renderer.calls == times
 
 
 def test_what_no_term_looks_at_is_not_rendered():
     renderer = CountingRenderer()
-    made = module(forward_spec(inpainter=INPAINTER), renderer=renderer)
-    made.objective.photo_on = ("inpainted",)
+    made = module(forward_model(inpainter=INPAINTER), renderer=renderer, photo_on=["inpainted"])
     made.training_step(batch(), 0)
     assert renderer.calls == 1
 
@@ -108,8 +97,8 @@ def test_a_step_meets_warm_kernels_only(monkeypatch):
     assert torch.equal(torch.get_rng_state(), before)
     warm = met.copy()
     met.clear()
-    for spec in (forward_spec(), BACKWARD):
-        made = module(spec)
+    for model in (forward_model(), BACKWARD):
+        made = module(model)
         made.training_step(batch(), 0).backward()
         resample(made.method.radiance, BOX, 500, keep_alpha=1e-2)
     assert len({name for name, *_ in met}) == 9
@@ -127,7 +116,7 @@ def test_random_views_are_rendered_only_for_their_term():
 def test_a_step_has_finite_gradients_for_all_terms():
     terms = ("photo", "point_color", "background_entropy", "flow_l1", "inpaint_diff")
     weights = dict.fromkeys((*terms, "tv_density", "tv_flow", "tv_depth"), 0.1)
-    made = module(forward_spec(inpainter=INPAINTER), weights, patches=2)
+    made = module(forward_model(inpainter=INPAINTER), weights, patches=2)
     torch.nn.init.normal_(made.method.motion.trajectory.network[-1].weight, std=1e-2)
     made.training_step(batch(), 0).backward()
     for name, parameter in made.method.named_parameters():
@@ -154,10 +143,12 @@ def test_every_kind_has_its_rate():
     assert {g["name"]: g["base_rate"] for g in optimizer.param_groups} == {
         k: RATES[k] for k in ("density", "color", "shading", "flow")
     }
+    rates = {"color": 0.1, "density": 0.1, "shading": 0.1}
     with pytest.raises(
-        ValueError, match=r"stage.coarse.rates: expected a rate for 'flow', but got \['density'\]"
+        ValueError,
+        match=r"stage.coarse.rates: expected a rate for 'flow', but got \['color', 'density', 'shading'\]",
     ):
-        module(rates={"density": 0.1}).configure_optimizers()
+        module(rates=rates).configure_optimizers()
 
 
 def test_gradients_are_clipped_where_asked():
@@ -172,18 +163,27 @@ def test_gradients_are_clipped_where_asked():
 def test_an_image_in_chunks_is_the_image():
     made = module()
     target = DATA.targets("test")[1]
-    whole = made.render_image(target.frame.camera, target.frame.time, target.background)
-    field = made.method.at(target.frame.time).fields["upsampled"]
-    parts = render_all(
-        made.renderer, field, target.frame.camera.rays(), target.background, made.method.view, chunk=100
+    whole = made.render(target.frame.camera, target.moment, target.background)
+    field = made.method.at(target.moment).fields["upsampled"]
+    parts = made.method.renderer.picture(
+        field, target.frame.camera.rays(), target.background, made.method.view, chunk=100
     )
-    for name in ("rgb", "depth", "opacity", "transmittance"):
+    for name in ("rgb", "depth", "opacity"):
         torch.testing.assert_close(getattr(whole, name), getattr(parts, name))
-    assert parts.samples == whole.samples
-    state = made.method.at(0.0)
-    other = made.render_image(target.frame.camera, target.frame.time, target.background, state)
-    still = made.render_image(target.frame.camera, 0.0, target.background)
+    snapshot = made.method.at(Moment(0.0))
+    other = made.render(target.frame.camera, target.moment, target.background, snapshot)
+    still = made.render(target.frame.camera, Moment(0.0), target.background)
     assert torch.equal(other.rgb, still.rgb)
+
+
+def test_some_pixels_or_a_crop_are_those_of_the_whole():
+    made = module()
+    camera, moment, white = DATA.scene.test[1].camera, Moment(0.5), torch.ones(3)
+    whole = made.render(camera, moment, white).rgb.reshape(camera.height, camera.width, 3)
+    some = made.render(View(camera, torch.tensor([0, 17, 40])), moment, white).rgb
+    torch.testing.assert_close(some, whole.reshape(-1, 3)[[0, 17, 40]])
+    crop = made.render(View(camera, crop=(2, 3, 4, 5)), moment, white).rgb
+    torch.testing.assert_close(crop.reshape(4, 5, 3), whole[2:6, 3:8])
 
 
 def test_validation_logs_the_psnr_of_whole_images():
@@ -192,7 +192,7 @@ def test_validation_logs_the_psnr_of_whole_images():
     ours.limit_val_batches = 1.0
     (logged,) = ours.validate(made, datamodule=DATA, verbose=False)
     target = DATA.targets("val")[0]
-    drawn = made.render_image(target.frame.camera, target.frame.time, target.background).rgb
+    drawn = made.render(target.frame.camera, target.moment, target.background).rgb
     error = (drawn.reshape(target.rgb.shape) - target.rgb).square().mean()
     assert logged["val/psnr"] == pytest.approx(-10 * torch.log10(error).item(), abs=1e-3)
 
@@ -202,35 +202,39 @@ def test_a_checkpoint_holds_what_the_weights_do_not():
     first.training_step(batch(), 0)
     first.curriculum()
     first.clock.load_state_dict({"seconds": 12.5})
-    first.lattices.followed[0].voxels = 4096
+    first.method.lattices.followed[0].voxels = 4096
     checkpoint = {}
     first.on_save_checkpoint(checkpoint)
+    generator = torch.get_rng_state()
+    torch.rand(3)
     second.on_load_checkpoint(checkpoint)
+    assert torch.equal(torch.get_rng_state(), generator)
     assert torch.equal(first.generator.get_state(), second.generator.get_state())
     assert torch.equal(first.curriculum.generator.get_state(), second.curriculum.generator.get_state())
     assert second.clock.seconds == 12.5
-    assert second.lattices.followed[0].voxels == 4096
-    assert torch.equal(second.lattices.home, first.lattices.home)
+    second.load_state_dict(first.state_dict())
+    assert second.method.lattices.followed[0].voxels == 4096
+    assert torch.equal(second.method.lattices.home, first.method.lattices.home)
 
 
 def test_without_cameras_there_are_no_random_views():
     made = module()
+    method = begun(made.method, replace(DATA.scene, train=()), stage())
+    assert method.patches is None
     none = DynamicSceneModule(
-        made.method,
-        renderer=Renderer(),
-        objective=made.objective,
-        settings=made.settings,
-        curriculum=made.curriculum,
-        cameras=[],
+        method, objective=made.objective, settings=made.settings, curriculum=made.curriculum
     )
-    assert none.patches is None
     assert none.training_step(batch(), 0).isfinite()
 
 
 def test_without_a_schedule_all_bases_play():
     made = module(bases=[])
     made.method.motion.trajectory.bases_in_play.fill_(1)
-    optimizer = made.configure_optimizers()
-    made.optimizers = lambda: type("Wrapped", (), {"optimizer": optimizer})()
-    made._follow(0.5)
+    noted = made.method.advance(0.5, 0, made.configure_optimizers())
     assert int(made.method.motion.trajectory.bases_in_play) == made.method.motion.trajectory.bases
+    assert noted == {"bases_in_play": made.method.motion.trajectory.bases}
+
+
+def test_a_term_that_the_method_does_not_know_is_refused():
+    with pytest.raises(ValueError, match="objective: expected a term of photo, .*but got 'photos'"):
+        module(weights={"photos": 1.0})

@@ -5,11 +5,11 @@ import lightning
 import pytest
 import torch
 
-from forewarp.effects.inpaint import UNet3d
+from forewarp.methods.voxel.effects.inpaint import UNet3d
 from forewarp.scene.lens import Lens
 from forewarp.training.bundle import read_bundle
 from forewarp.training.sentinel import BrokenStep, Sentinel, all_finite, diagnose, first_bad
-from tiny_scene import ball_data, forward_spec, make_run, stage
+from tiny_scene import ball_data, forward_model, make_run, stage
 
 NAN = float("nan")
 
@@ -26,9 +26,9 @@ class Poison(lightning.Callback):
                 if self.what == "parameter":
                     module.method.radiance.color[0, 0] = NAN
                 if self.what == "batch":
-                    batch.rgb[3, 1] = NAN
+                    batch.observations[0].rgb[3, 1] = NAN
                 if self.what == "slope":  # finite values whose gradient is not
-                    module.objective.terms["tv_flow"] = lambda step: (0 * step.state.flow.sum()).sqrt()
+                    module.method._terms["tv_flow"] = lambda seen: (0 * seen.state.flow.sum()).sqrt()
 
     def on_after_backward(self, trainer, module):
         if self.what == "gradient" and module.global_step in self.steps:
@@ -41,12 +41,12 @@ class Poison(lightning.Callback):
 
 def run(folder, poison, iterations=12, **changes):
     """A run of one stage with a checkpoint after every step."""
-    spec = changes.pop("spec", None)
+    model = changes.pop("model", None)
     ours = make_run(
         folder,
         [stage(iterations=iterations)],
         data=ball_data(rays=64, size=16),
-        spec=spec,
+        model=model,
         callbacks=[poison],
     )
     ours.checkpoint_seconds = 0.0
@@ -66,7 +66,7 @@ def again(folder, path):
     """What a stored step shows when it is taken again by a run that has no data."""
     bundle = read_bundle(path)
     ours = make_run(folder / "elsewhere", [stage()], data=None)
-    module = ours.rebuilt("coarse", bundle.scene, bundle.unit)
+    module = ours.rebuilt("coarse", bundle.scene)
     module.load_state_dict(bundle.state_dict)
     module.generator.set_state(bundle.noted["random"]["samples"])
     return str(diagnose(module, bundle.batch, bundle.noted["step"])), bundle
@@ -74,12 +74,12 @@ def again(folder, path):
 
 def test_a_loss_that_is_not_finite_stops_the_stage(tmp_path):
     said, path = broken(tmp_path, Poison("batch", 5))
-    told = "stage.coarse: expected finite numbers, but got loss: batch.rgb (terms photo) at step 5,"
+    told = "stage.coarse: expected finite numbers, but got loss: batch[0].rgb (terms photo) at step 5,"
     assert said.startswith(told)
     assert "\n" not in said
     assert f"python -m forewarp.replay {path}" in said
     found, bundle = again(tmp_path, path)
-    assert found == bundle.noted["found"] == "loss: batch.rgb (terms photo)"
+    assert found == bundle.noted["found"] == "loss: batch[0].rgb (terms photo)"
     frame = bundle.scene.train[bundle.batch.frame]
     assert f"frame {frame.name} (time {frame.time:.4g})" in said
 
@@ -174,10 +174,10 @@ def test_a_bundle_holds_lenses_and_is_refused_where_it_is_none(tmp_path):
 
 
 def test_an_inpainters_step_is_taken_again(tmp_path):
-    spec = forward_spec(inpainter=partial(UNet3d, width=16, levels=2))
-    said, path = broken(tmp_path, Poison("batch", 5), spec=spec)
+    model = forward_model(inpainter=partial(UNet3d, width=16, levels=2))
+    said, path = broken(tmp_path, Poison("batch", 5), model=model)
     bundle = read_bundle(path)
-    module = make_run(tmp_path / "e", [stage()], spec=spec).rebuilt("coarse", bundle.scene, bundle.unit)
+    module = make_run(tmp_path / "e", [stage()], model=model).rebuilt("coarse", bundle.scene)
     module.load_state_dict(bundle.state_dict)
     assert str(diagnose(module, bundle.batch, 5)) == bundle.noted["found"]
 
@@ -202,7 +202,7 @@ def test_a_bundle_that_cannot_be_written_hides_nothing(tmp_path, skip):
     with pytest.raises(BrokenStep) as stopped:
         run(tmp_path, Poison("batch", 5), skip=skip).fit()
     said = str(stopped.value)
-    assert "expected finite numbers, but got loss: batch.rgb (terms photo) at step 5," in said
+    assert "expected finite numbers, but got loss: batch[0].rgb (terms photo) at step 5," in said
     assert "coarse/broken/step_5.pt could not be written (File exists); begin anew" in said
     assert "forewarp.replay" not in said
 
@@ -214,10 +214,15 @@ SPOIL = {
     "config": lambda c: c.update(config=None),
     "state_dict": lambda c: c.update(state_dict=[]),
     "batch.frame": lambda c: c["batch"].update(frame=99),
-    "batch": lambda c: c["batch"].update(rgb=torch.zeros(3)),
+    "batch": lambda c: c["batch"]["observations"][0].update(rgb=torch.zeros(3)),
+    "batch.observations": lambda c: c["batch"].update(observations=[]),
+    "batch.time": lambda c: c["batch"]["observations"][0].update(time=2.0),
+    "batch.pixels": lambda c: c["batch"]["observations"][0]["pixels"].fill_(10**6),
     "scene": lambda c: c.pop("scene"),
     "frames": lambda c: c["scene"].update(frames=[7]),
-    "TypeError": lambda c: c["batch"].update(rgb=torch.zeros(1).expand(64, 3)),  # more than the file holds
+    "TypeError": lambda c: c["batch"]["observations"][0].update(
+        rgb=torch.zeros(1).expand(64, 3)
+    ),  # more than the file holds
 }
 
 

@@ -7,15 +7,15 @@ import lightning
 import pytest
 import torch
 
-from forewarp.effects.background import StaticBackground
-from forewarp.effects.inpaint import UNet3d
-from forewarp.effects.upsample import LearnedUpsampler, TrilinearUpsampler
-from forewarp.effects.view import ViewNetwork
+from forewarp.methods.voxel.effects.background import StaticBackground
+from forewarp.methods.voxel.effects.inpaint import UNet3d
+from forewarp.methods.voxel.effects.upsample import LearnedUpsampler, TrilinearUpsampler
+from forewarp.methods.voxel.effects.view import ViewNetwork
 from forewarp.fields.radiance import FeatureRadiance
-from forewarp.methods.backward_warp import Deformation
-from forewarp.training import handover
+from forewarp.methods.voxel.backward_warp import Deformation
+from forewarp.methods.voxel.structure import box_of_all_times
 from forewarp.training.interruption import Interruption
-from tiny_scene import RATES, Interrupt, ball_data, forward_spec, make_run, stage
+from tiny_scene import RATES, Interrupt, backward_model, ball_data, forward_model, make_run, stage
 
 
 def stages(**changes):
@@ -140,7 +140,7 @@ def test_rates_bases_lattice_and_frames_follow_the_fraction(tmp_path):
 def test_a_stage_may_start_afresh_in_the_tight_box(tmp_path):
     module = run(tmp_path, carry=False).fit()
     handover = json.loads((tmp_path / "coarse" / "handover.json").read_text())
-    assert module.method.radiance.activation.unit == handover["unit"]
+    assert module.method.radiance.activation.unit == handover["notes"]["unit"]
 
 
 def test_an_unfinished_run_cannot_be_loaded(tmp_path):
@@ -160,32 +160,36 @@ def test_every_stage_counts_its_own_memory(tmp_path, monkeypatch):
 
 
 def test_the_next_box_holds_what_the_stage_calls_matter(tmp_path, monkeypatch):
-    asked, make = [], handover.make_handover
+    asked = []
     monkeypatch.setattr(
-        "forewarp.training.stages.make_handover", lambda *a, **k: asked.append(k["alpha"]) or make(*a, **k)
+        "forewarp.methods.voxel.method.box_of_all_times",
+        lambda *a, **k: asked.append(k["alpha"]) or box_of_all_times(*a, **k),
     )
     data = ball_data(rays=64, size=16)
     make_run(tmp_path, [stage(iterations=1, box_alpha=0.25)], data=data).fit()
     assert asked == [0.25]
 
 
-CHOICES = {
-    "static": {"motion": None, "trajectory": None},
-    "backward": {"warp": "backward", "deformation": partial(Deformation, width=8, layers=2)},
-    "network": {
-        "radiance": partial(FeatureRadiance, alpha_init=1e-2, skip_alpha=0.0, width=8),
-        "view": ViewNetwork,
-    },
-    "everything": {"upsampler": partial(LearnedUpsampler, width=8), "inpainter": partial(UNet3d, levels=2)},
-    "background": {"background": partial(StaticBackground, features=3, alpha_init=1e-2, skip_alpha=1e-4)},
-    "interpolated": {"upsampler": TrilinearUpsampler, "view": None},
+MODELS = {
+    "static": forward_model(motion=None, trajectory=None),
+    "backward": backward_model(deformation=partial(Deformation, width=8, layers=2)),
+    "network": forward_model(
+        radiance=partial(FeatureRadiance, alpha_init=1e-2, skip_alpha=0.0, width=8), view=ViewNetwork
+    ),
+    "everything": forward_model(
+        upsampler=partial(LearnedUpsampler, width=8), inpainter=partial(UNet3d, levels=2)
+    ),
+    "background": forward_model(
+        background=partial(StaticBackground, features=3, alpha_init=1e-2, skip_alpha=1e-4)
+    ),
+    "interpolated": forward_model(upsampler=TrilinearUpsampler, view=None),
 }
 
 
-@pytest.mark.parametrize("choice", CHOICES)
+@pytest.mark.parametrize("choice", MODELS)
 def test_every_model_trains_carries_and_loads(tmp_path, choice):
     short = stages(iterations=4)
-    ours = make_run(tmp_path, short, data=ball_data(rays=64, size=16), spec=forward_spec(**CHOICES[choice]))
+    ours = make_run(tmp_path, short, data=ball_data(rays=64, size=16), model=MODELS[choice])
     module = ours.fit()
     assert all(v.isfinite().all() for v in tensors(module).values() if v.is_floating_point())
     assert same(ours.load(), module)
@@ -202,7 +206,7 @@ def psnr(module, data):
     """Of every test image."""
     found = []
     for target in data.targets("test"):
-        drawn = module.render_image(target.frame.camera, target.frame.time, target.background).rgb
+        drawn = module.render(target.frame.camera, target.moment, target.background).rgb
         found.append(float(-10 * torch.log10((drawn.reshape(target.rgb.shape) - target.rgb).square().mean())))
     return found
 

@@ -12,13 +12,13 @@ from forewarp.cli.timed_cases import Work, milliseconds, timed
 from forewarp.cli.workloads import RATES, TIME, WHITE, body, camera, lattice_of, some_rays
 from forewarp.fields.radiance import DirectRadiance
 from forewarp.fields.trajectory import TrajectoryField
-from forewarp.methods.forward_warp import ForwardWarp
 from forewarp.methods.spec import MethodSpec
 from forewarp.methods.voxel.effects.background import StaticBackground
 from forewarp.methods.voxel.effects.inpaint import UNet3d
 from forewarp.methods.voxel.effects.motion import Motion
 from forewarp.methods.voxel.effects.upsample import LearnedUpsampler
 from forewarp.methods.voxel.effects.view import SphericalHarmonics
+from forewarp.methods.voxel.forward_warp import ForwardWarp
 from forewarp.renderer import Renderer
 from forewarp.scene.batch import Batch
 from forewarp.training.curriculum import Curriculum

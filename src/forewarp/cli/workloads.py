@@ -12,12 +12,12 @@ from torch import Tensor
 from forewarp.fields.radiance import FeatureRadiance
 from forewarp.fields.radiance_grid import EMPTY
 from forewarp.fields.trajectory import TrajectoryField
-from forewarp.methods.forward_warp import ForwardWarp
 from forewarp.methods.spec import MethodSpec
 from forewarp.methods.voxel.effects.inpaint import UNet3d
 from forewarp.methods.voxel.effects.motion import Motion
 from forewarp.methods.voxel.effects.upsample import LearnedUpsampler
 from forewarp.methods.voxel.effects.view import ViewNetwork
+from forewarp.methods.voxel.forward_warp import ForwardWarp
 from forewarp.renderer import Renderer
 from forewarp.scene.batch import Batch
 from forewarp.scene.box import Box, Lattice

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from forewarp.effects.inpaint import ConvBlock, UNet3d
+from forewarp.methods.voxel.effects.inpaint import ConvBlock, UNet3d
 
 
 @pytest.mark.parametrize("size", [(1, 1, 1), (1, 2, 5), (3, 4, 5), (7, 11, 9), (17, 8, 2)])

@@ -4,10 +4,9 @@ import pytest
 import torch
 
 from forewarp.fields.radiance import DirectRadiance, FeatureRadiance
-from forewarp.methods.backward_warp import Deformation
+from forewarp.methods.voxel.backward_warp import Deformation
 from forewarp.scene.box import Box, Lattice
-from forewarp.training.settings import EFFECTS
-from forewarp.training.structure import (
+from forewarp.methods.voxel.structure import (
     box_of_all_times,
     occupied,
     refresh,
@@ -15,7 +14,7 @@ from forewarp.training.structure import (
     resample,
     seen_rows,
 )
-from tiny_scene import BOX, forward_spec
+from tiny_scene import BOX, backward_model, built, forward_model
 
 SHAPE = (6, 5, 7)
 LATTICE = Lattice(Box((0, 0, 0), (5, 4, 6)), SHAPE)
@@ -215,21 +214,9 @@ def test_resample_of_a_constant_is_constant(kind):
 
 def moving(kind, shift):
     """A method in which everything moves by ``shift`` until time 1."""
-    choices = (
-        {"warp": "backward", "deformation": partial(Deformation, width=8, layers=2)}
-        if kind == "backward"
-        else {}
-    )
-    lattice = Lattice(BOX, (12, 9, 8))
-    method = forward_spec(**choices).build(
-        lattice,
-        torch.ones(lattice.shape, dtype=torch.bool),
-        unit=0.2,
-        scene_box=BOX,
-        frames=2,
-        canonical_time=0.0,
-        effects=EFFECTS,
-    )
+    backward = backward_model(deformation=partial(Deformation, width=8, layers=2))
+    model = backward if kind == "backward" else forward_model()
+    method = built(model, Lattice(BOX, (12, 9, 8)), unit=0.2, frames=2)
     method.radiance.density.data[:] = AIR
     method.radiance.density.data[method.radiance.index[3, 4, 4].long()] = SOLID
     if kind == "backward":

@@ -3,14 +3,15 @@ from functools import partial
 import pytest
 import torch
 
-from forewarp.effects.inpaint import UNet3d
-from forewarp.effects.upsample import LearnedUpsampler, TrilinearUpsampler
+from forewarp.methods.voxel.effects.inpaint import UNet3d
+from forewarp.methods.voxel.effects.upsample import LearnedUpsampler, TrilinearUpsampler
 from forewarp.fields.radiance import FeatureRadiance
-from forewarp.methods.forward_warp import ForwardWarp
+from forewarp.methods.voxel.forward_warp import ForwardWarp
 from forewarp.renderer import Renderer
 from forewarp.scene.box import Lattice
-from forewarp.training.settings import EFFECTS
-from tiny_scene import BOX, camera_at, forward_spec
+from forewarp.scene.view import Moment
+from forewarp.methods.voxel.stage import EFFECTS
+from tiny_scene import BOX, built, camera_at, forward_model
 
 LATTICE = Lattice(BOX, (7, 6, 5))
 INPAINTER = partial(UNet3d, width=16, levels=2)
@@ -21,8 +22,8 @@ def build(effects=EFFECTS, frames=5, seed=0, **choices):
     torch.manual_seed(seed)
     active = torch.zeros(LATTICE.shape, dtype=torch.bool)
     active[1:5, 1:5, 1:4] = True
-    method = forward_spec(**choices).build(
-        LATTICE, active, unit=0.3, scene_box=BOX, frames=frames, canonical_time=0.3, effects=effects
+    method = built(
+        forward_model(**choices), LATTICE, active, frames=frames, canonical_time=0.3, effects=effects
     )
     for name in method.radiance.names:
         torch.nn.init.normal_(method.radiance.parameter(name))
@@ -34,7 +35,7 @@ def build(effects=EFFECTS, frames=5, seed=0, **choices):
 def picture(method, time, field=-1):
     rays = camera_at(0.1).rays()
     with torch.no_grad():
-        fields = list(method.at(time).fields.values())
+        fields = list(method.at(Moment(time)).fields.values())
         return Renderer()(fields[field], rays, torch.ones(3), method.view).rgb
 
 
@@ -64,13 +65,13 @@ def test_at_the_canonical_time_the_picture_is_the_unwarped_one(choices):
     still.load_state_dict({k: v for k, v in moving.state_dict().items() if not k.startswith("motion.")})
     assert torch.equal(picture(moving, 0.3), picture(still, 0.3))
     assert not torch.equal(picture(moving, 0.9), picture(still, 0.9))
-    state = moving.at(0.3)
+    state = moving.at(Moment(0.3))
     assert state.flow is None
     assert state.dropped == 0
 
 
 def test_a_state_holds_what_was_computed():
-    state = build().at(0.9)
+    state = build().at(Moment(0.9))
     assert list(state.fields) == ["upsampled"]
     assert state.flow.shape == (4 * 4 * 3, 3)
     assert len(state.coverage) == len(state.fields["upsampled"].values)
@@ -86,7 +87,7 @@ UPSAMPLERS = {"none": None, "trilinear": TrilinearUpsampler, "learned": partial(
 def test_the_inpainter_starts_as_the_identity_to_the_bit(time, upsampler, coverage):
     inpainter = partial(INPAINTER, coverage_channel=coverage)
     method = build(inpainter=inpainter, upsampler=UPSAMPLERS[upsampler])
-    state = method.at(time)
+    state = method.at(Moment(time))
     assert list(state.fields) == ["upsampled", "inpainted"]
     first, second = state.fields.values()
     assert first.lattice == second.lattice
@@ -108,7 +109,7 @@ def test_without_an_inpainter_it_is_the_same_picture(upsampler):
 def test_every_part_learns():
     method = build(upsampler=UPSAMPLERS["learned"], inpainter=INPAINTER)
     torch.nn.init.normal_(method.upsampler.head.weight)
-    state = method.at(0.9)
+    state = method.at(Moment(0.9))
     drawn = Renderer()(state.fields["inpainted"], camera_at(0.1).rays(), torch.ones(3), method.view)
     drawn.rgb.square().sum().backward()
     without = {n for n, p in method.named_parameters() if p.grad is None or not p.grad.abs().sum() > 0}
@@ -118,14 +119,14 @@ def test_every_part_learns():
 
 def test_features_through_a_network_serve_as_well():
     radiance = partial(FeatureRadiance, alpha_init=1e-2, skip_alpha=0.0, grid_features=3, width=8)
-    state = build(radiance=radiance).at(0.9)
+    state = build(radiance=radiance).at(Moment(0.9))
     assert state.fields["upsampled"].values.shape[1] == 13
 
 
 def test_everything_outside_the_box_leaves_an_empty_field():
     method = build()
     torch.nn.init.constant_(method.motion.trajectory.network[-1].bias, 100.0)
-    state = method.at(0.9)
+    state = method.at(Moment(0.9))
     assert state.dropped == 48
     assert len(state.fields["upsampled"].values) == 0
     assert torch.equal(picture(method, 0.9), torch.ones(24 * 24, 3))

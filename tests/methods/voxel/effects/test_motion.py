@@ -3,11 +3,11 @@ import math
 import pytest
 import torch
 
-from forewarp.effects.motion import Motion
+from forewarp.methods.voxel.effects.motion import Motion
 from forewarp.fields.trajectory import TrajectoryField
 from forewarp.ops.splat import average_splat
 from forewarp.scene.box import Box, Lattice
-from forewarp.scene.state import EMPTY, Activation, RadianceGrid
+from forewarp.fields.radiance_grid import EMPTY, Activation, RadianceGrid
 
 BOX = Box((0, 0, 0), (1, 6, 8))  # spacings 1/2, 2, 2
 LATTICE = Lattice(BOX, (3, 4, 5))
@@ -101,7 +101,7 @@ def test_what_rests_is_copied_and_what_moves_is_splatted(monkeypatch):
         splatted.append(len(values))
         return average_splat(values, *others)
 
-    monkeypatch.setattr("forewarp.effects.motion.average_splat", noted)
+    monkeypatch.setattr("forewarp.methods.voxel.effects.motion.average_splat", noted)
     with torch.no_grad():
         warped, coverage, _ = motion(rest=0.05).warp(canonical, LATTICE.all_voxels(), flow)
         every, _, _ = motion(rest=0.0).warp(canonical, LATTICE.all_voxels(), flow)

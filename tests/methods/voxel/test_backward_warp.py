@@ -3,11 +3,11 @@ from functools import partial
 import pytest
 import torch
 
-from forewarp.methods.backward_warp import BackwardWarp, Deformation
+from forewarp.methods.voxel.backward_warp import BackwardWarp, Deformation
 from forewarp.renderer import Renderer
 from forewarp.scene.box import Lattice
-from forewarp.training.settings import EFFECTS
-from tiny_scene import BOX, camera_at, forward_spec
+from forewarp.scene.view import Moment
+from tiny_scene import BOX, backward_model, built, camera_at
 
 LATTICE = Lattice(BOX, (24, 20, 18))
 
@@ -16,16 +16,8 @@ def build(canonical_time=0.3, seed=0, frames=5):
     torch.manual_seed(seed)
     active = torch.zeros(LATTICE.shape, dtype=torch.bool)
     active[3:7, 3:7, 3:6] = True
-    spec = forward_spec(warp="backward", deformation=partial(Deformation, width=16, layers=2))
-    method = spec.build(
-        LATTICE,
-        active,
-        unit=0.3,
-        scene_box=BOX,
-        frames=frames,
-        canonical_time=canonical_time,
-        effects=EFFECTS,
-    )
+    model = backward_model(deformation=partial(Deformation, width=16, layers=2))
+    method = built(model, LATTICE, active, frames=frames, canonical_time=canonical_time)
     for name in method.radiance.names:
         torch.nn.init.normal_(method.radiance.parameter(name), mean=2.0)
     return method
@@ -52,7 +44,7 @@ def test_one_time_builds_no_deformation():
     method = build(frames=1)
     assert method.deformation is None
     assert {n.split(".")[0] for n, _ in method.named_parameters()} == {"radiance"}
-    field = method.at(0.9).fields["backward"]
+    field = method.at(Moment(0.9)).fields["backward"]
     assert torch.equal(picture(method, field), picture(method, method.radiance()))
     points = torch.rand(4, 3)
     assert torch.equal(method.trajectories(points, torch.rand(2)), points[:, None].expand(4, 2, 3))
@@ -69,17 +61,17 @@ def test_refuses_a_ghost_of_the_configuration(name, choose):
 
 def test_at_the_canonical_time_the_picture_is_the_unwarped_one():
     method = moved_by(build(), (0.4, 0.0, 0.0))
-    field = method.at(0.3).fields["backward"]
+    field = method.at(Moment(0.3)).fields["backward"]
     assert torch.equal(picture(method, field), picture(method, method.radiance()))
     assert not torch.equal(
-        picture(method, method.at(0.9).fields["backward"]), picture(method, method.radiance())
+        picture(method, method.at(Moment(0.9)).fields["backward"]), picture(method, method.radiance())
     )
 
 
 def test_a_known_translation_moves_density_colour_and_cells():
     shift = (2 * LATTICE.spacing[0], -LATTICE.spacing[1], 0.0)
     method = moved_by(build(), shift)
-    canonical, field = method.radiance(), method.at(0.9).fields["backward"]
+    canonical, field = method.radiance(), method.at(Moment(0.9)).fields["backward"]
     points = torch.rand(300, 3) * torch.tensor([6.0, 6.0, 4.0]) + torch.tensor([4.0, 1.0, 2.0])
     before = points - torch.tensor([2.0, -1.0, 0.0])
     torch.testing.assert_close(field.density(points), canonical.density(before), atol=1e-4, rtol=1e-4)
@@ -93,7 +85,7 @@ def test_a_known_translation_moves_density_colour_and_cells():
 
 def test_what_comes_from_outside_the_box_is_empty():
     method = moved_by(build(), (50.0, 0.0, 0.0))
-    field = method.at(0.9).fields["backward"]
+    field = method.at(Moment(0.9)).fields["backward"]
     assert (field.density(torch.rand(20, 3) * 8) == 0).all()
 
 
@@ -111,7 +103,7 @@ def test_paths_invert_the_displacement():
 @pytest.mark.parametrize("wild", [1e6, float("inf")])
 def test_a_wild_deformation_leaves_finite_values_and_gradients(wild):
     method = moved_by(build(), (wild, 0.0, 0.0))
-    field = method.at(0.9).fields["backward"]
+    field = method.at(Moment(0.9)).fields["backward"]
     density = field.density(torch.rand(20, 3) * 8)
     assert (density == 0).all()
     density.sum().backward()
@@ -120,7 +112,7 @@ def test_a_wild_deformation_leaves_finite_values_and_gradients(wild):
 
 def test_everything_learns():
     method = moved_by(build(), (0.1, 0.0, 0.0))
-    field = method.at(0.9).fields["backward"]
+    field = method.at(Moment(0.9)).fields["backward"]
     Renderer()(field, camera_at(0.1).rays(), torch.ones(3), method.view).rgb.square().sum().backward()
     for parameter in (method.radiance.density, method.radiance.color, method.deformation.network[-1].weight):
         assert parameter.grad.isfinite().all()

@@ -1,10 +1,15 @@
 import pytest
 import torch
 
-from forewarp.effects.dense import densify, occupied_crop, sparsify
-from forewarp.effects.upsample import LearnedUpsampler, TrilinearUpsampler, interpolate_dense, refined
+from forewarp.methods.voxel.effects.dense import densify, occupied_crop, sparsify
+from forewarp.methods.voxel.effects.upsample import (
+    LearnedUpsampler,
+    TrilinearUpsampler,
+    interpolate_dense,
+    refined,
+)
 from forewarp.scene.box import Box, Lattice
-from forewarp.scene.state import Activation, RadianceGrid
+from forewarp.fields.radiance_grid import Activation, RadianceGrid
 
 LATTICE = Lattice(Box((0, 0, 0), (2, 3, 4)), (3, 4, 5))
 

@@ -3,34 +3,27 @@ from functools import partial
 import pytest
 import torch
 
-from forewarp.effects.background import StaticBackground
-from forewarp.effects.inpaint import UNet3d
-from forewarp.effects.upsample import LearnedUpsampler, TrilinearUpsampler
-from forewarp.effects.view import ViewNetwork
+from forewarp.methods.voxel.effects.background import StaticBackground
+from forewarp.methods.voxel.effects.inpaint import UNet3d
+from forewarp.methods.voxel.effects.upsample import LearnedUpsampler, TrilinearUpsampler
+from forewarp.methods.voxel.effects.view import ViewNetwork
 from forewarp.fields.radiance import FeatureRadiance
 from forewarp.fields.trajectory import TrajectoryField
-from forewarp.methods.backward_warp import Deformation
-from forewarp.methods.spec import parameter_count, parameter_kinds
+from forewarp.methods.voxel.backward_warp import Deformation
+from forewarp.methods.method import parameter_count
 from forewarp.scene.box import Lattice
-from forewarp.training.settings import EFFECTS
-from tiny_scene import BOX, forward_spec
+from forewarp.methods.voxel.stage import EFFECTS
+from tiny_scene import BOX, backward_model, built, forward_model
 
 LATTICE = Lattice(BOX, (5, 4, 6))
 
 
-def build(spec, effects=EFFECTS, **changes):
-    options = {
-        "unit": 0.3,
-        "scene_box": BOX,
-        "frames": 5,
-        "canonical_time": 0.0,
-        "effects": effects,
-        "still": (LATTICE, torch.ones(LATTICE.shape, dtype=torch.bool)),
-    } | changes
-    return spec.build(LATTICE, torch.ones(LATTICE.shape, dtype=torch.bool), **options)
+def build(model, effects=EFFECTS, **numbers):
+    still = (LATTICE, torch.ones(LATTICE.shape, dtype=torch.bool))
+    return built(model, LATTICE, still=still, effects=effects, **numbers)
 
 
-FULL = forward_spec(
+FULL = forward_model(
     radiance=partial(FeatureRadiance, alpha_init=1e-2, skip_alpha=0.0, width=8),
     trajectory=partial(TrajectoryField, bases=3, nodes=8, features=2),
     view=ViewNetwork,
@@ -41,18 +34,18 @@ FULL = forward_spec(
 
 
 def test_every_parameter_has_one_kind():
-    kinds = parameter_kinds(build(FULL))
+    kinds = build(FULL).param_groups()
     assert set(kinds) == {"density", "color", "grid", "flow", "network"}
     listed = [id(p) for parameters in kinds.values() for p in parameters]
     assert len(listed) == len(set(listed)) == len(list(build(FULL).parameters()))
-    direct = parameter_kinds(build(forward_spec()))
+    direct = build(forward_model()).param_groups()
     assert set(direct) == {"density", "color", "shading", "flow"}
-    backward = forward_spec(warp="backward", deformation=Deformation, view=None)
-    assert set(parameter_kinds(build(backward))) == {"density", "color", "flow"}
+    backward = backward_model(deformation=Deformation, view=None)
+    assert set(build(backward).param_groups()) == {"density", "color", "flow"}
 
 
 def test_parameter_count():
-    method = build(forward_spec(motion=None, trajectory=None, view=None))
+    method = build(forward_model(motion=None, trajectory=None, view=None))
     assert parameter_count(method) == 5 * 4 * 6 * (1 + 3)
 
 
@@ -82,26 +75,32 @@ def test_one_layer_makes_the_residual_the_inpainters_or_the_up_layers():
 
 
 def test_density_is_measured_in_the_unit():
-    assert build(forward_spec()).radiance.activation.unit == 0.3
+    assert build(forward_model()).radiance.activation.unit == 0.3
 
 
 def test_backward_takes_none_of_the_forward_effects():
-    spec = forward_spec(warp="backward", deformation=Deformation, inpainter=partial(UNet3d, levels=2))
-    assert not hasattr(build(spec), "inpainter")
+    with pytest.raises(TypeError, match="unexpected keyword argument 'inpainter'"):
+        backward_model(deformation=Deformation, inpainter=partial(UNet3d, levels=2))
+    method = build(backward_model(deformation=Deformation))
+    assert not any(hasattr(method, name) for name in ("motion", "upsampler", "inpainter"))
 
 
-@pytest.mark.parametrize("name", ["motion", "trajectory", "upsampler", "inpainter", "view", "deformation"])
-def test_refuses_a_ghost_of_the_configuration(name):
+MODELS = {
+    forward_model: ("radiance", "motion", "trajectory", "upsampler", "inpainter", "view", "background"),
+    backward_model: ("radiance", "view", "background", "deformation"),
+}
+
+
+@pytest.mark.parametrize(("make", "name"), [(make, name) for make in MODELS for name in MODELS[make]])
+def test_refuses_a_ghost_of_the_configuration(make, name):
     with pytest.raises(
         ValueError, match=f"model.{name}: expected a factory or null, but got .*choose model/{name}=none"
     ):
-        forward_spec(**{name: {"width": 3}})
+        make(**{name: {"width": 3}})
 
 
 def test_refuses_half_a_choice():
-    with pytest.raises(ValueError, match="model.warp: expected forward or backward, but got 'sideways'"):
-        forward_spec(warp="sideways")
     with pytest.raises(ValueError, match="model.deformation: expected a factory, but got null"):
-        forward_spec(warp="backward")
+        backward_model()
     with pytest.raises(ValueError, match="model.trajectory: expected a factory, but got null"):
-        forward_spec(trajectory=None)
+        forward_model(trajectory=None)
