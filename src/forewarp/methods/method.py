@@ -106,7 +106,9 @@ class Method(nn.Module):
         return torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-8, fused=True)
 
     def advance(self, progress: float, step: int, optimizer: torch.optim.Optimizer) -> dict[str, float]:
-        """Follow the schedule before a step, at a ``progress`` in [0, 1] of the stage; numbers to log."""
+        """Follow the schedule before a step, at a ``progress`` in [0, 1] of the stage; numbers to log. What
+        is random here is drawn from torch's own generator on the CPU, which a checkpoint keeps.
+        """
         return {}
 
     def notes(self) -> dict[str, float]:
