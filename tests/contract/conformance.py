@@ -95,7 +95,7 @@ class Conformance:
         return min(outcomes, key=WORST.index, default="none")
 
 
-KINDS = ("size in", "asks for", "loss terms", "effects", "abilities", "stages", "loss falls to")
+KINDS = ("size in", "asks for", "loss terms", "effects", "abilities", "loss falls")
 
 
 def kinds_of(method, entry, losses):
@@ -114,7 +114,6 @@ def kinds_of(method, entry, losses):
         ", ".join(method.terms),
         ", ".join(entry.effects) or "none",
         ", ".join(word for word, ability in can.items() if isinstance(method, ability)) or "none",
-        "alone; after and before voxels",
         f"below {entry.falls:.0%} in {entry.steps} steps" if share < entry.falls else "**no**",
     )
     return dict(zip(KINDS, cells))

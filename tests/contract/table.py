@@ -30,9 +30,9 @@ class Effect:
 @dataclass(frozen=True)
 class Entry:
     """A small method. ``model`` makes it of a ``Start``; ``rates`` and ``numbers`` are its stage's,
-    ``weights`` its objective's; after ``steps`` its loss is below ``falls`` times what it was at first. ``effects``: its
-    optional parts by name, which is also how their parameters' names begin. ``toy``: not a method of the
-    project. ``gpu``: where it was proven on a GPU.
+    ``weights`` its objective's; after ``steps`` its loss is below ``falls`` times what it was at first.
+    ``effects``: its optional parts by name, which is also how their parameters' names begin. ``toy``: not a
+    method of the project. ``gpu``: where it was proven on a GPU.
     """
 
     model: Callable[[Start], Method]

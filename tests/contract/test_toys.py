@@ -12,6 +12,7 @@ from forewarp.methods.method import Start
 from forewarp.scene.batch import Batch
 from forewarp.scene.cloud import Cloud, Handover
 from forewarp.scene.view import Moment, View
+from forewarp.training.checkpoints import misfits
 from forewarp.training.objective import total
 
 
@@ -129,3 +130,12 @@ def test_what_it_asks_for_is_what_it_gets(data):
     module_of(METHODS["codes"], data)
     batch = next(iter(data.train_dataloader()))
     assert [len(one.view) for one in batch.observations] == [192]
+
+
+def test_a_checkpoint_may_have_other_rows_but_no_other_columns(data):
+    one, other = (splats_of(data, numbers={"count": count}) for count in (20, 30))
+    assert misfits(one, other.state_dict()) == []
+    one.load_state_dict(other.state_dict())
+    assert torch.equal(one.method.pull, other.method.pull)
+    wrong = other.state_dict() | {"method.color": torch.zeros(30, 4)}
+    assert misfits(one, wrong) == ["method.color"]

@@ -135,6 +135,10 @@ class Method(nn.Module):
 
     def misfit(self, state: Mapping[str, Tensor]) -> str | None:
         """Name an entry of a stored state that contradicts the others; None where all is well."""
+        for name in self.grows:
+            shape = tuple(getattr(state[name], "shape", ()))
+            if not shape or shape[1:] != tuple(getattr(self, name).shape[1:]):
+                return name
         return None
 
     def _load_from_state_dict(self, state_dict, prefix, *args, **kwargs) -> None:
