@@ -106,7 +106,9 @@ class Method(nn.Module):
         return torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-8, fused=True)
 
     def advance(self, progress: float, step: int, optimizer: torch.optim.Optimizer) -> dict[str, float]:
-        """Follow the schedule before a step, at a ``progress`` in [0, 1] of the stage; numbers to log."""
+        """Follow the schedule before a step, at a ``progress`` in [0, 1] of the stage; numbers to log. What
+        is random here is drawn from torch's own generator on the CPU, which a checkpoint keeps.
+        """
         return {}
 
     def notes(self) -> dict[str, float]:
@@ -133,6 +135,10 @@ class Method(nn.Module):
 
     def misfit(self, state: Mapping[str, Tensor]) -> str | None:
         """Name an entry of a stored state that contradicts the others; None where all is well."""
+        for name in self.grows:
+            shape = tuple(getattr(state[name], "shape", ()))
+            if not shape or shape[1:] != tuple(getattr(self, name).shape[1:]):
+                return name
         return None
 
     def _load_from_state_dict(self, state_dict, prefix, *args, **kwargs) -> None:

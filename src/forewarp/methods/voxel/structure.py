@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch.nn import Parameter
 
 from forewarp.fields.radiance_grid import EMPTY
 from forewarp.fields.voxel_grid import VoxelGrid
+from forewarp.methods.rows import renew_parameters
 from forewarp.ops.grid import dilate, trilinear
 from forewarp.scene.box import Box, Lattice
 
@@ -68,33 +68,6 @@ def refresh(
     rows = radiance.activate(active, radiance.births(birth_alpha))
     renew_parameters(optimizer, before, [radiance.parameter(n) for n in radiance.names], rows)
     return True
-
-
-def renew_parameters(
-    optimizer: torch.optim.Optimizer, before: list[Parameter], after: list[Parameter], rows: Tensor | None
-) -> None:
-    """Put ``after`` in the place of ``before``; moments go to the new rows (old row or -1), or start afresh.
-
-    Args:
-        optimizer: whose groups and moments are changed.
-        before, after: parameters (N, C) and (N', C), pairwise.
-        rows: (N',) int64, or None to start the moments afresh.
-    """
-    renewed = dict(zip(map(id, before), after))
-    for group in optimizer.param_groups:
-        group["params"] = [renewed.get(id(p), p) for p in group["params"]]
-    for old, new in zip(before, after):
-        state = optimizer.state.pop(old, None)
-        if state is None:
-            continue
-        for key, value in state.items():
-            if not torch.is_tensor(value) or value.dim() == 0:
-                continue
-            if rows is None or not len(value):
-                state[key] = torch.zeros_like(new)
-            else:
-                state[key] = torch.where((rows >= 0)[:, None], value[rows.clamp(min=0)], 0.0)
-        optimizer.state[new] = state
 
 
 @torch.no_grad()

@@ -1,0 +1,55 @@
+"""Parameters whose rows come and go while they are trained; the optimiser's moments follow."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn import Parameter
+
+
+@torch.no_grad()
+def take_rows(method: nn.Module, optimizer: torch.optim.Optimizer, rows: Tensor) -> None:
+    """Let every parameter and buffer named in ``method.grows`` hold the ``rows`` (N',) of its own N, in this
+    order; a row that is named twice is copied, one that is not named is gone.
+
+    Cost: one copy of each, and of its moments.
+    """
+    before, after = [], []
+    for name in method.grows:
+        value = getattr(method, name)
+        if isinstance(value, Parameter):
+            # A new Parameter: autograd remembers an old one's shape for as long as any graph lives.
+            before.append(value)
+            after.append(Parameter(value.data[rows]))
+            setattr(method, name, after[-1])
+        else:
+            setattr(method, name, value[rows])
+    renew_parameters(optimizer, before, after, rows)
+
+
+def renew_parameters(
+    optimizer: torch.optim.Optimizer, before: list[Parameter], after: list[Parameter], rows: Tensor | None
+) -> None:
+    """Put ``after`` in the place of ``before``; moments go to the new rows (old row or -1), or start afresh.
+
+    Args:
+        optimizer: whose groups and moments are changed.
+        before, after: parameters (N, ...) and (N', ...), pairwise.
+        rows: (N',) int64, or None to start the moments afresh.
+    """
+    renewed = dict(zip(map(id, before), after))
+    for group in optimizer.param_groups:
+        group["params"] = [renewed.get(id(p), p) for p in group["params"]]
+    for old, new in zip(before, after):
+        state = optimizer.state.pop(old, None)
+        if state is None:
+            continue
+        for key, value in state.items():
+            if not torch.is_tensor(value) or value.dim() == 0:
+                continue
+            if rows is None or not len(value):
+                state[key] = torch.zeros_like(new)
+            else:
+                known = (rows >= 0).reshape(-1, *[1] * (value.dim() - 1))
+                state[key] = torch.where(known, value[rows.clamp(min=0)], 0.0)
+        optimizer.state[new] = state

@@ -1,0 +1,125 @@
+"""Writes docs/conformance.md of what the contract suite found: a test that failed shows as such."""
+
+from collections import defaultdict
+from pathlib import Path
+
+import pytest
+
+from contract.scenes import DATASETS
+from contract.table import METHODS
+
+TITLES = {"dnerf": "D-NeRF", "hypernerf": "HyperNeRF", "nhr": "NHR", "lego_complete": "Lego Complete"}
+WORST = ("failed", "skipped", "not run", "passed")
+HEAD = """# Conformance
+
+What each method was seen to do by the contract suite (`tests/contract`), on one scene of 20 pixels and 6
+times in the format of each dataset. Written by `make conformance`; do not edit. How a method joins:
+[extending](extending.md).
+"""
+
+
+class Conformance:
+    """A plugin of pytest: takes down the outcome of every test that has a method."""
+
+    def __init__(self, path):
+        self.path, self.found, self.said = Path(path), defaultdict(dict), {}
+
+    def _note(self, item, outcome):
+        params = item.callspec.params if hasattr(item, "callspec") else {}
+        if "name" in params:
+            known = self.found[item.originalname, params["name"]]
+            key = (params.get("dataset"), item.nodeid)
+            known[key] = min(known.get(key, "passed"), outcome, key=WORST.index)
+
+    def pytest_deselected(self, items):
+        for item in items:
+            self._note(item, "not run")
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_makereport(self, item, call):
+        report = yield
+        self._note(item, report.outcome)
+        for key, value in report.user_properties:
+            self.said[item.callspec.params["name"], key] = value
+        return report
+
+    def pytest_sessionfinish(self, session, exitstatus):
+        if exitstatus in (pytest.ExitCode.OK, pytest.ExitCode.TESTS_FAILED):
+            self.path.write_text(self.page())
+
+    def page(self):
+        methods = [name for name, entry in METHODS.items() if not entry.toy]
+        return "\n".join(
+            [
+                HEAD,
+                "## Datasets\n",
+                *table(["method", *TITLES.values()], [self._on_datasets(m) for m in methods]),
+                "\n## Methods\n",
+                *table(["method", *KINDS, "GPU"], [self._kinds(m) for m in methods]),
+                "\n## Promises\n",
+                *table(["case", *methods], self._promises(methods)),
+                "",
+            ]
+        )
+
+    def _on_datasets(self, method):
+        cells = []
+        for dataset in DATASETS:
+            words = {"builds": "test_it_builds", "trains": "test_its_loss_falls"}
+            worst = {word: self._worst(case, method, dataset) for word, case in words.items()}
+            cells.append(", ".join(w if o == "passed" else f"**{w}: {o}**" for w, o in worst.items()))
+        return [method, *cells]
+
+    def _kinds(self, method):
+        return [
+            method,
+            *(self.said.get((method, kind), "**not run**") for kind in KINDS),
+            METHODS[method].gpu,
+        ]
+
+    def _promises(self, methods):
+        cases = list(dict.fromkeys(case for case, _ in self.found))
+        return [[case[5:].replace("_", " "), *(self._promise(case, m) for m in methods)] for case in cases]
+
+    def _promise(self, case, method):
+        results = self.found.get((case, method), {})
+        worst = self._worst(case, method)
+        if worst in ("none", "passed"):
+            return {"none": "nothing to test", "passed": "yes"}[worst]
+        where = sorted({TITLES[d] for (d, _), outcome in results.items() if outcome == worst and d})
+        return f"**{worst}**" + (f" ({', '.join(where)})" if where else "")
+
+    def _worst(self, case, method, dataset=None):
+        results = self.found.get((case, method), {}).items()
+        outcomes = [outcome for (of, _), outcome in results if dataset in (None, of)]
+        return min(outcomes, key=WORST.index, default="none")
+
+
+KINDS = ("size in", "asks for", "loss terms", "effects", "abilities", "loss falls")
+
+
+def kinds_of(method, entry, losses):
+    """What a method says of itself, in the words of the table."""
+    from forewarp.methods.abilities import HasBounds, HasMatter, HasTrajectories
+
+    can = {"trajectories": HasTrajectories, "bounds": HasBounds, "matter": HasMatter}
+    asks = method.asks
+    asked = [f"{asks.kind} of side {asks.side}" if asks.kind == "crops" else asks.kind]
+    asked += [f"{asks.neighbours} neighbouring times"] * bool(asks.neighbours)
+    asked += [f"up to {asks.instant} pictures of the time"] * bool(asks.instant)
+    share = sum(losses[-10:]) / 10 / (sum(losses[:5]) / 5)
+    cells = (
+        method.size[0],
+        ", ".join(asked),
+        ", ".join(method.terms),
+        ", ".join(entry.effects) or "none",
+        ", ".join(word for word, ability in can.items() if isinstance(method, ability)) or "none",
+        f"below {entry.falls:.0%} in {entry.steps} steps" if share < entry.falls else "**no**",
+    )
+    return dict(zip(KINDS, cells))
+
+
+def table(head, rows):
+    """Lines of a table in Markdown."""
+    rule = ["---"] * len(head)
+    return ["| " + " | ".join(map(str, row)) + " |" for row in (head, rule, *rows)]

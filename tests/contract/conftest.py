@@ -1,0 +1,48 @@
+"""Makes the small scenes once, fits every method once to each, and writes the conformance table.
+
+Tests share files and fitted methods alone, and change neither.
+"""
+
+from types import SimpleNamespace
+
+import pytest
+
+from contract.conformance import Conformance
+from contract.scenes import DATASETS, data_of
+
+
+def pytest_addoption(parser):
+    parser.addoption("--conformance", metavar="FILE", help="write the table of what the contract suite found")
+
+
+def pytest_configure(config):
+    if path := config.getoption("--conformance", None):
+        config.pluginmanager.register(Conformance(path))
+
+
+@pytest.fixture(scope="session")
+def scenes(tmp_path_factory):
+    """The folder that holds a scene of each dataset."""
+    root = tmp_path_factory.mktemp("scenes")
+    for name, (write, _) in DATASETS.items():
+        write(root / name)
+    return root
+
+
+@pytest.fixture(scope="session")
+def fitted(scenes, tmp_path_factory):
+    """``fitted(name, dataset)``: the run, its module after all steps of the table, and every step's loss."""
+    from contract.fitting import Losses, run_of, stage_of
+    from contract.table import METHODS
+
+    known = {}
+
+    def fit(name, dataset):
+        if (name, dataset) not in known:
+            losses = Losses()
+            folder = tmp_path_factory.mktemp(f"{name}_{dataset}")
+            run = run_of([stage_of(METHODS[name])], data_of(dataset, scenes), folder, losses)
+            known[name, dataset] = SimpleNamespace(run=run, module=run.fit(), losses=losses.values)
+        return known[name, dataset]
+
+    return fit

@@ -1,0 +1,80 @@
+"""How the contract suite makes a method, fits it to a small scene, and ends a run before its time."""
+
+import os
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import lightning
+import torch
+
+from contract.scenes import data_of
+from contract.table import METHODS
+from forewarp.training.objective import Objective
+from forewarp.training.settings import StageSettings
+from forewarp.training.stages import Run, Stage
+
+
+def stage_of(entry, name="fine", **changes):
+    """A stage of one method; ``changes`` are of the entry."""
+    entry = replace(entry, **changes)
+    settings = StageSettings.of(name, rates=entry.rates, iterations=entry.steps, **entry.numbers)
+    return Stage(settings, Objective(entry.weights), entry.model)
+
+
+def run_of(stages, data, folder, *watchers, **options):
+    """A silent run on the CPU."""
+
+    def trainer(where, callbacks):
+        off = ("logger", "enable_checkpointing", "enable_progress_bar", "enable_model_summary")
+        silent = dict.fromkeys(off, False) | {"limit_val_batches": 0, "num_sanity_val_steps": 0}
+        return lightning.Trainer(max_epochs=1, max_steps=-1, accelerator="cpu", callbacks=callbacks, **silent)
+
+    watch = lambda name, where: list(watchers)  # noqa: E731
+    return Run(data, None, stages, Path(folder), trainer, callbacks=watch, **options)
+
+
+def module_of(entry, data, **changes):
+    """A module at the beginning of its stage, outside of any run."""
+    data.setup("fit")
+    torch.manual_seed(0)
+    module = run_of([], data, ".")._module(stage_of(entry, **changes), None, None, 0)
+    data.picker, data.asks = module.curriculum, module.method.asks
+    return module
+
+
+class Losses(lightning.Callback):
+    """Remembers the loss of every step."""
+
+    def __init__(self):
+        self.values = []
+
+    def on_train_batch_end(self, trainer, module, *_):
+        self.values.append(module.last["loss"])
+
+
+class Stop(lightning.Callback):
+    """Saves and leaves after a step, as Ctrl-C does."""
+
+    def __init__(self, step):
+        self.step = step
+
+    def on_train_batch_end(self, trainer, module, *_):
+        if module.global_step == self.step:
+            next(c for c in trainer.callbacks if hasattr(c, "save")).save(trainer)
+            raise SystemExit
+
+
+class Die(Stop):
+    """Leaves no time for anything."""
+
+    def on_train_batch_end(self, trainer, module, *_):
+        if module.global_step == self.step:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+
+def killed(name, dataset, root, folder, step, steps):
+    """Be a run that is killed after a step; run in a process of its own."""
+    torch.set_num_threads(1)
+    stages = [stage_of(METHODS[name], steps=steps)]
+    run_of(stages, data_of(dataset, root), folder, Die(step), checkpoint_seconds=0.0).fit()

@@ -1,0 +1,87 @@
+"""The methods that the contract suite holds to the contract: one entry each, for scenes of 20 pixels."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+
+from contract.toys import Codes, Splats
+from forewarp.fields.radiance import DirectRadiance
+from forewarp.fields.trajectory import TrajectoryField
+from forewarp.methods.method import Method, Start
+from forewarp.methods.voxel.backward_warp import Deformation
+from forewarp.methods.voxel.effects.background import StaticBackground, Together
+from forewarp.methods.voxel.effects.inpaint import UNet3d
+from forewarp.methods.voxel.effects.motion import Motion
+from forewarp.methods.voxel.effects.upsample import LearnedUpsampler
+from forewarp.methods.voxel.effects.view import SphericalHarmonics
+from forewarp.methods.voxel.model import BackwardModel, ForwardModel
+
+
+@dataclass(frozen=True)
+class Effect:
+    """An optional part: what the model's fields are with it ``on`` (None is off), and its ``parts``, pairs of
+    a class and the name of a function of it, one of which at least is called in a step.
+    """
+
+    on: Mapping[str, object]
+    parts: tuple[tuple[type, str], ...]
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A small method. ``model`` makes it of a ``Start``; ``rates`` and ``numbers`` are its stage's,
+    ``weights`` its objective's; after ``steps`` its loss is below ``falls`` times what it was at first.
+    ``effects``: its optional parts by name, which is also how their parameters' names begin. ``toy``: not a
+    method of the project. ``gpu``: where it was proven on a GPU.
+    """
+
+    model: Callable[[Start], Method]
+    rates: Mapping[str, float]
+    weights: Mapping[str, float] = field(default_factory=lambda: {"photo": 1.0})
+    numbers: Mapping[str, object] = field(default_factory=dict)
+    falls: float = 0.5
+    steps: int = 60
+    effects: Mapping[str, Effect] = field(default_factory=dict)
+    toy: bool = False
+    gpu: str = "never"
+
+
+GRID = partial(DirectRadiance, alpha_init=1e-2, skip_alpha=1e-4)
+TRAJECTORY = partial(TrajectoryField, bases=4, nodes=6, width=24, layers=3)
+VOXELS = {
+    "numbers": {"voxels": [[0, 10**3], [0.6, 12**3]], "background_voxels": [[0, 6**3]], "keep_alpha": 1e-2}
+    | {"birth_alpha": 5e-3, "refresh_every": 5},
+    "rates": {"density": 0.3, "color": 0.1, "shading": 0.02, "flow": 5e-3, "network": 1e-3},
+    "weights": {"photo": 1.0, "point_color": 0.01, "background_entropy": 1e-3},
+    "steps": 100,
+}
+VIEW = Effect({"view": SphericalHarmonics}, ((SphericalHarmonics, "forward"),))
+BACKGROUND = Effect(
+    {"background": partial(StaticBackground, features=3, alpha_init=1e-2, skip_alpha=0.0)},
+    ((StaticBackground, "forward"), (Together, "density")),
+)
+WARP = {
+    "motion": Effect({"motion": Motion}, ((Motion, "flow"), (TrajectoryField, "coefficients"))),
+    "view": VIEW,
+    "upsampler": Effect({"upsampler": partial(LearnedUpsampler, width=8)}, ((LearnedUpsampler, "residual"),)),
+    "inpainter": Effect({"inpainter": partial(UNet3d, width=16, levels=2)}, ((UNet3d, "features"),)),
+    "background": BACKGROUND,
+}
+
+METHODS = {
+    "forward": Entry(ForwardModel(GRID, motion=Motion, trajectory=TRAJECTORY), **VOXELS, effects=WARP),
+    "backward": Entry(
+        BackwardModel(GRID, deformation=partial(Deformation, width=24, layers=3)),
+        **VOXELS,
+        effects={"view": VIEW, "background": BACKGROUND},
+    ),
+    # tnerf joins with methods/tnerf.py
+    "codes": Entry(Codes, {"codes": 1e-2, "network": 5e-3}, {"photo": 1.0, "smooth": 1e-3}, toy=True),
+    "splats": Entry(
+        Splats,
+        {"position": 0.01, "velocity": 0.02, "radius": 0.02, "color": 0.05, "opacity": 0.05},
+        {"photo": 1.0, "sparse": 1e-3},
+        {"every": 4, "most": 300},
+        toy=True,
+    ),
+}

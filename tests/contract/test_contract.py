@@ -1,0 +1,346 @@
+"""What every method of the table promises; a method passes by its entry there."""
+
+import multiprocessing
+import os
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from contract.conformance import kinds_of
+from contract.fitting import Stop, killed, module_of, run_of, stage_of
+from contract.scenes import DATASETS, TIMES, data_of
+from contract.table import METHODS
+from forewarp.methods.abilities import HasBounds, HasMatter, HasTrajectories
+from forewarp.scene.view import Moment, View
+from forewarp.training.checkpoints import load_weights
+from forewarp.training.handover import load_handover
+from forewarp.training.objective import total
+
+WHITE = torch.ones(3)
+each = pytest.mark.parametrize("name", METHODS)
+each_effect = pytest.mark.parametrize(
+    ("name", "effect"), [(n, e) for n in METHODS for e in METHODS[n].effects]
+)
+
+
+def on(datasets, first="dnerf"):
+    """Every method on every dataset; all but the first dataset are slow."""
+    return pytest.mark.parametrize(
+        ("name", "dataset"),
+        [
+            pytest.param(n, d, marks=() if d == first else pytest.mark.slow, id=f"{n}-{d}")
+            for n in METHODS
+            for d in datasets
+        ],
+    )
+
+
+def batch_of(data):
+    return next(iter(data.train_dataloader()))
+
+
+def backward(module, batch):
+    """The raw terms and the gradients of one step."""
+    module.zero_grad()
+    module.training_step(batch, 0).backward()
+    return {name: p.grad for name, p in module.method.named_parameters() if p.grad is not None}
+
+
+def assert_equal_states(one, other):
+    one, other = one.state_dict(), other.state_dict()
+    assert one.keys() == other.keys()
+    for key, value in one.items():
+        if torch.is_tensor(value):
+            assert torch.equal(value, other[key]), key
+
+
+@each
+@pytest.mark.parametrize("dataset", DATASETS)
+def test_it_builds(name, dataset, scenes):
+    data = data_of(dataset, scenes)
+    module = module_of(METHODS[name], data)
+    gradients = backward(module, batch_of(data))
+    assert module.last["loss"] > 0
+    assert any(bool(g.any()) for g in gradients.values())
+
+
+@on(DATASETS)
+def test_its_loss_falls(name, dataset, fitted):
+    losses = fitted(name, dataset).losses
+    assert len(losses) == METHODS[name].steps
+    first, last = sum(losses[:5]) / 5, sum(losses[-10:]) / 10
+    assert last < METHODS[name].falls * first
+
+
+@on(DATASETS)
+def test_a_checkpoint_gives_the_same_pictures(name, dataset, fitted):
+    found = fitted(name, dataset)
+    again = found.run.load()
+    assert_equal_states(found.module, again)
+    camera = data_camera(found)
+    for time in (0.0, 0.37, 1.0):
+        one, other = (m.render(camera, Moment(time), WHITE) for m in (found.module, again))
+        for part in ("rgb", "depth", "opacity"):
+            assert torch.equal(getattr(one, part), getattr(other, part)), (part, time)
+
+
+def data_camera(found):
+    return found.run.datamodule.scene.train[1].camera
+
+
+@on(DATASETS)
+def test_any_time_can_be_rendered(name, dataset, fitted):
+    found = fitted(name, dataset)
+    camera, times = data_camera(found), found.run.datamodule.scene.times
+    for moment in (*map(Moment, (0.0, 1.0, times[1], 0.5 * (times[1] + times[2]))), Moment(times[2], 2, 0)):
+        snapshot = found.module.method.at(moment)
+        assert snapshot.moment == moment
+        assert snapshot.holds(moment)
+        for rendering in (None, *snapshot.renderings):
+            with torch.no_grad():
+                drawn = snapshot.render(View(camera), torch.tensor([0.2, 0.5, 0.9]), rendering)
+            count = camera.width * camera.height
+            assert drawn.rgb.shape == (count, 3)
+            assert drawn.depth.shape == drawn.opacity.shape == (count,)
+            assert all(bool(part.isfinite().all()) for part in (drawn.rgb, drawn.depth, drawn.opacity))
+            assert bool(((drawn.opacity >= 0) & (drawn.opacity <= 1 + 1e-5)).all())
+            assert bool((drawn.depth >= 0).all())
+            assert drawn.opacity.amax() > 0.05  # something is there
+
+
+@on(DATASETS)
+def test_pixels_and_crops_are_parts_of_the_whole_picture(name, dataset, fitted):
+    found = fitted(name, dataset)
+    camera = data_camera(found)
+    background = torch.rand(camera.width * camera.height, 3, generator=torch.Generator().manual_seed(1))
+    pixels = torch.tensor([5, 3, 77, 5, camera.width * camera.height - 1])
+    whole = found.module.render(View(camera), Moment(0.3), background)
+    for view in (View(camera, pixels), View(camera, crop=(3, 2, 7, 9))):
+        part = found.module.render(view, Moment(0.3), background[view.indices])
+        for key in ("rgb", "depth", "opacity"):
+            torch.testing.assert_close(
+                getattr(part, key), getattr(whole, key)[view.indices], atol=1e-5, rtol=1e-5
+            )
+
+
+@each
+def test_gradients_and_all_terms_are_finite(name, scenes):
+    data, entry = data_of("dnerf", scenes), METHODS[name]
+    terms = module_of(entry, data).method.terms
+    module = module_of(entry, data, weights=dict.fromkeys(terms, 1e-2))
+    gradients = backward(module, batch_of(data))
+    assert gradients
+    assert all(bool(g.isfinite().all()) for g in gradients.values())
+    raw = {key: value for key, value in module.last.items() if key.startswith("loss")}
+    assert {"loss", "loss/photo"} <= raw.keys() <= {"loss", *(f"loss/{term}" for term in terms)}
+    assert all(torch.tensor(value).isfinite() for value in raw.values())
+
+
+@each
+def test_every_parameter_has_one_rate(name, scenes):
+    module = module_of(METHODS[name], data_of("dnerf", scenes))
+    grouped = [id(p) for group in module.method.param_groups().values() for p in group]
+    assert sorted(grouped) == sorted(map(id, module.method.parameters()))
+    assert sum(len(g["params"]) for g in module.configure_optimizers().param_groups) == len(grouped)
+
+
+@each
+def test_a_missing_rate_is_named(name, scenes):
+    module = module_of(METHODS[name], data_of("dnerf", scenes), rates={"else": 1.0})
+    kind = next(iter(module.method.param_groups()))
+    with pytest.raises(
+        ValueError, match=rf"stage.fine.rates: expected a rate for '{kind}', but got \['else'\]"
+    ):
+        module.configure_optimizers()
+
+
+@each
+def test_an_unknown_term_is_named_beside_those_there_are(name, scenes):
+    with pytest.raises(ValueError, match="objective: expected a term of .*photo.*, but got 'beauty'"):
+        module_of(METHODS[name], data_of("dnerf", scenes), weights={"photo": 1.0, "beauty": 1.0})
+
+
+@each
+def test_a_term_of_weight_zero_is_never_called(name, scenes):
+    data, entry = data_of("dnerf", scenes), METHODS[name]
+    terms = module_of(entry, data).method.terms
+    for off in terms:
+        module = module_of(entry, data, weights=dict.fromkeys(terms, 1e-2) | {off: 0.0})
+        factors, batch = module.objective.factors(0), batch_of(data)
+        assert off not in factors
+        step = module.look(batch, factors)
+        refusing = dict(step.terms) | {off: lambda off=off: pytest.fail(f"{off} was called")}
+        _, raw = total(replace(step, terms=refusing), factors, dict(module.method.named_parameters()))
+        assert off not in raw
+
+
+def full_model(entry):
+    """The model with all its effects."""
+    return replace(entry.model, **{k: v for e in entry.effects.values() for k, v in e.on.items()})
+
+
+def refuse(monkeypatch, effect):
+    for of, function in effect.parts:
+        monkeypatch.setattr(of, function, lambda *a, at=f"{of.__name__}.{function}", **k: pytest.fail(at))
+
+
+@each_effect
+def test_an_effect_that_is_off_is_absent(name, effect, scenes, monkeypatch):
+    entry, data = METHODS[name], data_of("dnerf", scenes)
+    part = entry.effects[effect]
+    refuse(monkeypatch, part)
+    without = replace(full_model(entry), **dict.fromkeys(part.on))
+    module = module_of(entry, data, model=without)
+    data.picker = lambda: TIMES - 1  # a time at which things have moved
+    backward(module, batch_of(data))
+    assert not [key for key in module.method.state_dict() if key.startswith(effect)]
+
+
+@each_effect
+def test_an_effect_that_is_on_is_called(name, effect, scenes, monkeypatch):
+    entry, data = METHODS[name], data_of("dnerf", scenes)
+    refuse(monkeypatch, entry.effects[effect])
+    module = module_of(entry, data, model=full_model(entry))
+    data.picker = lambda: TIMES - 1
+    with pytest.raises(pytest.fail.Exception):
+        backward(module, batch_of(data))
+
+
+STEPS, STOP = 14, 9
+
+
+@pytest.fixture(scope="module")
+def straight(scenes, tmp_path_factory):
+    """A method's uninterrupted run of a few steps, its checkpoint."""
+    known = {}
+
+    def fit(name, dataset):
+        if (name, dataset) not in known:
+            run = run_of(
+                [stage_of(METHODS[name], steps=STEPS)],
+                data_of(dataset, scenes),
+                tmp_path_factory.mktemp("run"),
+            )
+            known[name, dataset] = run.fit()
+        return known[name, dataset]
+
+    return fit
+
+
+@on(DATASETS)
+def test_two_runs_of_one_seed_are_equal(name, dataset, straight, scenes, tmp_path):
+    torch.manual_seed(5)  # nothing that was drawn before matters
+    again = run_of([stage_of(METHODS[name], steps=STEPS)], data_of(dataset, scenes), tmp_path).fit()
+    assert_equal_states(straight(name, dataset), again)
+    assert straight(name, dataset).last == again.last
+
+
+@on(DATASETS)
+def test_a_run_that_was_stopped_continues_exactly(name, dataset, straight, scenes, tmp_path):
+    stages = [stage_of(METHODS[name], steps=STEPS)]
+    with pytest.raises(SystemExit):
+        run_of(stages, data_of(dataset, scenes), tmp_path, Stop(STOP)).fit()
+    torch.manual_seed(5)
+    told = []
+    again = run_of(stages, data_of(dataset, scenes), tmp_path, tell=told.append).fit()
+    assert told == [f"fine: goes on at {STOP / STEPS:.0%}, step {STOP}"]
+    assert_equal_states(straight(name, dataset), again)
+    assert straight(name, dataset).last == again.last
+
+
+@pytest.fixture(scope="module")
+def clean():
+    """Starts processes from one that has imported everything and computed nothing: what a thread pool of
+    this one holds would be lost in a plain fork.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", str(Path(__file__).parents[1]))
+        patch.setenv("OMP_NUM_THREADS", "1")
+        context = multiprocessing.get_context("forkserver")
+        context.set_forkserver_preload(["contract.fitting"])
+        yield context
+
+
+@pytest.mark.slow
+@each
+def test_a_run_that_was_killed_continues_exactly(name, straight, scenes, tmp_path, clean):
+    whole = straight(name, "dnerf")  # first: reads kernels, so that the child finds them compiled
+    child = clean.Process(target=killed, args=(name, "dnerf", scenes, tmp_path, STOP, STEPS))
+    child.start()
+    child.join(300)  # on a busy machine the first one imports for a minute
+    assert child.exitcode == -signal.SIGKILL
+    assert os.listdir(tmp_path / "fine") == ["last.ckpt"]
+    again = run_of([stage_of(METHODS[name], steps=STEPS)], data_of("dnerf", scenes), tmp_path).fit()
+    assert_equal_states(whole, again)
+    assert whole.last == again.last
+
+
+@on(DATASETS)
+def test_it_follows_a_voxel_stage(name, dataset, scenes, tmp_path):
+    check_two_stages(("forward", name), data_of(dataset, scenes), tmp_path)
+
+
+@on(DATASETS)
+def test_a_voxel_stage_follows_it(name, dataset, scenes, tmp_path):
+    check_two_stages((name, "forward"), data_of(dataset, scenes), tmp_path)
+
+
+def check_two_stages(names, data, tmp_path):
+    """Fit a stage of each method, and find the second again without the first."""
+    stages = [stage_of(METHODS[n], s, steps=6) for n, s in zip(names, ("coarse", "fine"))]
+    run = run_of(stages, data, tmp_path)
+    module = run.fit()
+    check_handover(load_handover(tmp_path / "coarse"), data.scene)
+    check_handover(load_handover(tmp_path / "fine"), data.scene)
+    assert_equal_states(module, run.load())
+    load_weights(run.rebuilt("fine", data.scene), tmp_path / "fine" / "last.ckpt")
+
+
+def check_handover(handover, scene):
+    """Finite, and about where the scene is."""
+    around = scene.box.scaled(1.5)
+    low, high = torch.tensor(around.low), torch.tensor(around.high)
+    for corner in (handover.box.low, handover.box.high):
+        assert bool(((torch.tensor(corner) >= low) & (torch.tensor(corner) <= high)).all())
+    assert handover.frames_in_play == len(scene.train)
+    if handover.cloud is None:
+        return
+    cloud = handover.cloud
+    assert bool(((cloud.points >= low) & (cloud.points <= high)).all())
+    for share in (cloud.colors, cloud.opacity):
+        assert bool(((share >= 0) & (share <= 1)).all())
+    if handover.paths is not None:
+        assert handover.paths.shape == (len(cloud), len(handover.times), 3)
+        away = (handover.paths - cloud.points[:, None]).norm(dim=-1)
+        assert bool((away < scene.box.diagonal).all())  # which NaN is not
+        canonical = handover.times == torch.tensor(scene.canonical_time, dtype=handover.times.dtype)
+        assert bool((away[:, canonical] < 1e-4 * scene.box.diagonal).all())
+
+
+@each
+def test_what_it_says_it_can_do_it_does(name, fitted, record_property):
+    found = fitted(name, "dnerf")
+    method, scene = found.module.method, found.run.datamodule.scene
+    for key, value in kinds_of(method, METHODS[name], found.losses).items():
+        record_property(key, value)
+    what, much = method.size
+    assert isinstance(what, str)
+    assert much > 0
+    assert all(isinstance(v, str) for v in method.protocol().values())
+    with torch.no_grad():
+        if isinstance(method, HasMatter):
+            cloud = method.matter()
+            assert cloud.points.shape == cloud.colors.shape == (len(cloud), 3)
+            assert cloud.opacity.shape == (len(cloud),)
+            assert cloud.size > 0
+        if isinstance(method, HasTrajectories):
+            assert isinstance(method.moves, bool)
+            points = torch.tensor([scene.box.center]).repeat(4, 1)
+            paths = method.trajectories(points, torch.linspace(0, 1, 5))
+            assert paths.shape == (4, 5, 3)
+            assert bool(paths.isfinite().all())
+        if isinstance(method, HasBounds) and (box := method.bounds(list(scene.times))) is not None:
+            assert all(h > l for l, h in zip(box.low, box.high))
