@@ -116,7 +116,7 @@ def test_the_sweep_holds_every_variant_once():
 def test_a_variant_wins_over_preset_and_experiment():
     common = ["experiment=dnerf", "data.scene=x"]
     assert method_of(run_of(*common, "variant=view_mlp").model).view.__class__ is ViewNetwork
-    assert composed(*common, "variant=preset_demo").budget.name == "demo"
+    assert composed(*common, "variant=preset_demo").preset.name == "demo"
     assert run_of(*common, "variant=backward").model.deformation is not None
     assert run_of(*common, "variant=unet_32").model.inpainter is not None
 

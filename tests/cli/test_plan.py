@@ -74,14 +74,13 @@ def test_a_plan_is_made_once_told_and_fitted(forewarp, words, monkeypatch, in_tm
 
 def test_every_question_is_asked_where_all_is_open(forewarp, words, in_tmp, monkeypatch):
     """No alpha, and evidence that rules nothing out: each effect is tried, with its price."""
-    monkeypatch.setattr("forewarp.cli.planner.CUT_OUT", 2.0)
-    monkeypatch.setattr("forewarp.cli.decisions.CUT_OUT", 2.0)
-    monkeypatch.setattr("forewarp.cli.decisions.BY_DIRECTION", (-9.0, 9.0))
-    monkeypatch.setattr("forewarp.cli.decisions.TORN", (-1.0, 9.0))
-    monkeypatch.setattr("forewarp.cli.decisions.HEADROOM", (99.0, -99.0))
+    monkeypatch.setattr("forewarp.methods.voxel.planning.CUT_OUT", 2.0)
+    monkeypatch.setattr("forewarp.methods.voxel.planning.BY_DIRECTION", (-9.0, 9.0))
+    monkeypatch.setattr("forewarp.methods.voxel.planning.TORN", (-1.0, 9.0))
+    monkeypatch.setattr("forewarp.methods.voxel.planning.HEADROOM", (99.0, -99.0))
     small = ["plan.steps=8", "plan.trial_steps=3", "plan.seeds=1", "plan.held_out=3", "plan.minutes=0.1"]
     monkeypatch.setattr(
-        "forewarp.cli.decisions.Evidence.pays", lambda self, effect: effect in self.gains or None
+        "forewarp.methods.effect.Evidence.pays", lambda self, effect: effect in self.gains or None
     )
     fitted, kept = [], Trials._fitted
     monkeypatch.setattr(Trials, "_fitted", lambda self, c, *a: (fitted.append(c.run), kept(self, c, *a))[1])

@@ -3,11 +3,10 @@
 import re
 
 import pytest
-from omegaconf import OmegaConf
 
 from configs import composed
-from forewarp.cli.renamed import refuse_renamed, renewed
-from forewarp.cli.runs import build_run, method_of
+from forewarp.cli.identity import read_config
+from forewarp.cli.renamed import refuse_renamed
 
 
 @pytest.mark.parametrize(
@@ -50,14 +49,10 @@ def test_what_is_advised_composes(word):
     assert composed("data.scene=x", word)
 
 
-def test_a_run_of_an_earlier_version_is_read():
-    now = OmegaConf.create(OmegaConf.to_container(composed("data.scene=x"), resolve=True))
-    old = OmegaConf.create(OmegaConf.to_container(now))
-    old.renderer, old.budget = old.model.pop("renderer"), {**old.pop("preset"), **old.budget}
-    del old.model["name"]
-    assert renewed(old) == now
-    assert vars(method_of(old.model)[1]) == vars(method_of(now.model)[1])
-    build_run(old)
-    assert renewed(now) == now
-    for spoiled in ({"model": None}, {"budget": 3, "model": {"warp": 1}, "renderer": {}}, {}):
-        assert renewed(OmegaConf.create(spoiled)) == spoiled
+def test_a_run_of_an_earlier_version_is_refused_with_the_version_that_reads_it(tmp_path):
+    path = tmp_path / "config.yaml"
+    path.write_text("model: {_target_: forewarp.methods.spec.MethodSpec, warp: forward}\nseed: 0\n")
+    expected = f"{path}: expected a run of forewarp 0.2, but got one of 0.1, which version 0.1.0 reads"
+    with pytest.raises(ValueError, match=re.escape(expected)) as refusal:
+        read_config(path)
+    assert "\n" not in str(refusal.value)

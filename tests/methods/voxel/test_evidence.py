@@ -9,7 +9,8 @@ import torch
 from forewarp.fields.trajectory import TrajectoryField
 from forewarp.ops.dct import dct_basis
 from forewarp.scene.box import Lattice
-from forewarp.methods.voxel.evidence import Movement, look_at, movement
+from forewarp.methods.voxel.evidence import Movement, movement
+from forewarp.scene.pictures import look_at
 from tiny_scene import BOX, ball_scene, built, forward_model
 
 LATTICE = Lattice(BOX, (12, 9, 8))

@@ -56,16 +56,21 @@ def test_without_trials_the_evidence_decides():
     assert decisions.of_upsampler(evidence(residual=limited), "learned").choice == "learned"
 
 
+def open_questions(found):
+    """The later effects that the evidence does not rule out."""
+    return [e.name for e in decisions.EFFECTS if e.later and not e.rules_out(found)]
+
+
 def test_only_what_is_open_is_tried():
-    assert decisions.open_questions(evidence()) == ["view", "inpainter"]
-    assert decisions.open_questions(evidence(movement=None)) == ["view"]
+    assert open_questions(evidence()) == ["view", "inpainter"]
+    assert open_questions(evidence(movement=None)) == ["view"]
     sure = Residual(psnr=28.0, by_direction=-0.01, allowed=30.0)
-    assert decisions.open_questions(evidence(movement=None, residual=sure)) == ["upsampler"]
+    assert open_questions(evidence(movement=None, residual=sure)) == ["upsampler"]
 
 
 def test_cameras_that_stand_together_see_no_direction():
     narrow = evidence(pictures=replace(MOVING.pictures, spread=6.0))
-    assert decisions.open_questions(narrow) == ["inpainter"]
+    assert open_questions(narrow) == ["inpainter"]
     found = decisions.of_view(replace(narrow, gains={"view": YES}), "sh")
     assert (found.choice, found.because) == (
         "none",
@@ -118,3 +123,64 @@ def test_the_price_is_what_fewer_steps_cost_on_the_curve_that_was_seen():
     assert found.price(Gain(0, 0, 4.0, 20)) == pytest.approx(c * (150**-0.5 - 600**-0.5))
     assert found.price(Gain(0, 0, 0.5, 100)) == 0
     assert found.price(Gain(0, 0, 4.0, None)) == 0  # the trial itself was of equal time
+
+
+def asked(trials=True, **typed):
+    """A run that is planned, with what was typed for it."""
+    stages = {"coarse": {"voxels": [[0, 1000]]}, "fine": {"voxels": [[0, 8000], [0.5, 27000]]}}
+    on = {effect.name: effect.on for effect in decisions.EFFECTS}
+    typed = {key.replace("__", "/"): value for key, value in typed.items()}
+    return Asked(stages, {"bases": 10}, typed, on.get, trials)
+
+
+def walk(found, asked, *answers):
+    """The coarse stages that a plan asks for, where its rivals are answered so."""
+    steps, said, heard = VoxelPlanning().coarse(found, asked), [], iter(answers)
+    answer = None
+    while True:
+        try:
+            said.append(steps.send(answer))
+        except StopIteration:
+            return said
+        answer = next(heard) if isinstance(said[-1], Rival) else None
+
+
+def test_coarse_stages_ask_for_cosines_then_motion_then_the_background():
+    bare = replace(MOVING.pictures, cut_out=0.0)
+    first, *rivals = walk(evidence(pictures=bare), asked(), False, True, True)
+    assert first == Begin(
+        "coarse",
+        ["model/motion=dct", "model/background=grid", *decisions.PLAIN]
+        + ["stage.coarse.start_alpha=1e-2", "stage.coarse.confine=0.0"],
+    )
+    assert [(r.effect, r.adds) for r in rivals] == [("bases", True), ("motion", False), ("background", False)]
+    assert rivals[0].words == ["preset.bases=20", "stage.coarse.bases=[[0,20]]"]
+
+
+def test_what_stands_still_before_a_background_is_one_field():
+    bare = replace(MOVING.pictures, cut_out=0.0)
+    *_, last = walk(evidence(pictures=bare), asked(), False, False)
+    assert last == Begin("coarse-still-alone", ["model/background=none"], change=True)
+
+
+def test_what_is_typed_is_not_asked():
+    assert len(walk(evidence(), asked(trials=False))) == 1
+    assert [r.effect for r in walk(evidence(), asked(model__motion="dct"), True)[1:]] == []
+    (still,) = walk(evidence(), asked(model__motion="none"))
+    assert still.name == "coarse-still"
+
+
+def test_dear_effects_go_on_the_lattice_that_they_were_tried_on():
+    with_it = {effect.name: effect.with_it(asked()) for effect in decisions.EFFECTS}
+    coarse = "stage.coarse.effects=[motion,background]"
+    assert with_it["inpainter"] == with_it["upsampler"] == (coarse, "stage.fine.voxels=[[0,8000]]")
+    assert with_it["view"] == (coarse,)
+    assert with_it["motion"] == ()
+
+
+def test_what_is_typed_overrules():
+    found = with_gains(view=YES)
+    by_hand = {d.effect: d for d in VoxelPlanning().decide(found, asked(model__view="none"))}
+    assert (by_hand["view"].choice, by_hand["view"].on, by_hand["view"].words) == ("none", False, ())
+    assert by_hand["view"].because.startswith("as typed; ")
+    assert {d.effect: d for d in VoxelPlanning().decide(found, asked())}["view"].on
