@@ -191,7 +191,7 @@ CONF = Path(__file__).parents[2] / "conf"
 
 
 @pytest.mark.parametrize(
-    ("preset", "parameters"), [("demo", 23_652), ("fast", 127_940), ("faithful", 600_452)]
+    ("preset", "parameters"), [("demo", 18_724), ("fast", 127_940), ("faithful", 600_452)]
 )
 def test_its_presets(preset, parameters):
     config = OmegaConf.load(CONF / "model_preset" / f"tnerf_{preset}.yaml")
