@@ -111,6 +111,9 @@ class Method(nn.Module):
         """
         return {}
 
+    def warm_up(self) -> None:
+        """Do what is needed once before the clock runs, as compiling kernels."""
+
     def notes(self) -> dict[str, float]:
         """Tell the next stage of the same method what only that understands."""
         return {}

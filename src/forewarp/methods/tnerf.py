@@ -13,7 +13,7 @@ from forewarp.methods.method import Method, Snapshot, Start, Step
 from forewarp.ops.encode import positional_encoding
 from forewarp.quadrature import Quadrature, Sampled
 from forewarp.scene.batch import Batch
-from forewarp.scene.rays import Rays, joined
+from forewarp.scene.rays import Rays
 from forewarp.scene.view import Moment, Rendering, View
 
 _PATIENCE = 20  # steps in a row without any density, after which there will be none
@@ -75,11 +75,8 @@ class TNeRF(Method):
         Raises:
             ValueError: where the density is 0 everywhere, which has no gradient, step after step.
         """
-        observations = batch.observations
-        rays = joined([one.view.rays() for one in observations]).to(self.device)
-        rgb = torch.cat([one.rgb for one in observations])
-        background = torch.cat([one.background.expand(len(one.view), 3) for one in observations])
-        seen = self.at(observations[0].moment).sampled(rays, background, generator)
+        rays, rgb, background = batch.joined()
+        seen = self.at(batch.observations[0].moment).sampled(rays.to(self.device), background, generator)
         self._refuse_a_dead_start(seen.density)
         error = (seen.rgb - rgb).square().mean()
         return Step(

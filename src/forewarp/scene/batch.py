@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import torch
 from torch import Tensor
 
 from forewarp.scene.frame import Frame
+from forewarp.scene.rays import Rays, joined
 from forewarp.scene.view import Moment, View
 
 
@@ -64,6 +66,20 @@ class Batch:
     def time(self) -> float:
         """That of the picked frame."""
         return self.observations[0].moment.time
+
+    def joined(self) -> tuple[Rays, Tensor, Tensor]:
+        """Put the rays of all observations after one another, on the CPU, with their true colours (R, 3) and
+        backgrounds: (R, 3), or (3,) where one colour is behind all. For methods that ask for one time.
+        """
+        rays = joined([one.view.rays() for one in self.observations])
+        rgb = [one.rgb for one in self.observations]
+        behind = [one.background for one in self.observations]
+        if len(rgb) == 1:
+            return rays, rgb[0], behind[0]
+        if behind[0].dim() == 1 and all(torch.equal(behind[0], other) for other in behind[1:]):
+            return rays, torch.cat(rgb), behind[0]
+        each = [b.expand(len(one.view), 3) for b, one in zip(behind, self.observations)]
+        return rays, torch.cat(rgb), torch.cat(each)
 
     def __len__(self) -> int:
         return sum(len(one.view) for one in self.observations)

@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from forewarp.methods.method import Method, Snapshot, Step
-from forewarp.ops.warmup import warm_up
 from forewarp.scene.batch import Batch, Target
 from forewarp.scene.camera import Camera
 from forewarp.scene.view import Moment, Rendering, View
@@ -92,8 +91,8 @@ class DynamicSceneModule(lightning.LightningModule):
         self.trainer.datamodule.asks = self.method.asks
 
     def on_train_start(self) -> None:
-        """Start the training clock, once the kernels are there: compiling them is not training."""
-        warm_up(self.device)
+        """Start the training clock, once all is ready: compiling kernels is not training."""
+        self.method.warm_up()
         self.clock.start()
 
     def on_train_end(self) -> None:

@@ -4,16 +4,18 @@ from dataclasses import replace
 
 import pytest
 
-from forewarp.cli import decisions
-from forewarp.cli.decisions import Evidence
-from forewarp.report.effect import Gain
-from forewarp.methods.voxel.evidence import Movement, Pictures
+from forewarp.methods.effect import Asked, Begin, Rival
+from forewarp.methods.voxel import planning as decisions
+from forewarp.methods.voxel.evidence import Movement
+from forewarp.methods.voxel.planning import VoxelEvidence, VoxelPlanning
 from forewarp.methods.voxel.residual import Residual
+from forewarp.report.effect import Gain
+from forewarp.scene.pictures import Pictures
 
-MOVING = Evidence(
+MOVING = VoxelEvidence(
     Pictures(frames=50, times=50, cut_out=0.8, spread=160.0, disagreement=0.2),
-    Movement(moving=0.4, distance=0.3, torn=0.2, at=0.9, left_out=(4.0, 2.0, 0.4, 0.1, 0.0)),
-    Residual(psnr=28.0, by_direction=0.02, allowed=38.0),
+    movement=Movement(moving=0.4, distance=0.3, torn=0.2, at=0.9, left_out=(4.0, 2.0, 0.4, 0.1, 0.0)),
+    residual=Residual(psnr=28.0, by_direction=0.02, allowed=38.0),
 )
 YES, NO, UNSURE = Gain(1.0, 0.2, 2.0, 100), Gain(-0.1, 0.2, 20.0, 100), Gain(0.15, 0.2, 1.2, 100)
 

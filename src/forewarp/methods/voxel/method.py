@@ -20,12 +20,12 @@ from forewarp.methods.voxel.stage import VoxelStage
 from forewarp.methods.voxel.structure import box_of_all_times
 from forewarp.methods.voxel.terms import TERMS, Seen, voxel_terms
 from forewarp.ops.grid import neighbour_pairs
+from forewarp.ops.warmup import warm_up
 from forewarp.renderer import Renderer
 from forewarp.scene.batch import Batch
 from forewarp.scene.box import Box
 from forewarp.scene.cloud import Cloud
 from forewarp.scene.paths import RandomPatches
-from forewarp.scene.rays import joined
 
 SOLID = 0.1  # opacity over a voxel of what counts as matter
 _STILL = 1024  # points known to stand still that a step looks at
@@ -92,14 +92,10 @@ class VoxelMethod(Method):
 
     def _seen(self, batch: Batch, generator: torch.Generator) -> Seen:
         state = self.at(batch.observations[0].moment)
-        rays = joined([one.view.rays() for one in batch.observations]).to(self.device)
-        rgb, background = (
-            parts[0] if len(parts) == 1 or parts[0].dim() == 1 else torch.cat(parts)
-            for parts in ([getattr(one, key) for one in batch.observations] for key in ("rgb", "background"))
-        )
+        rays, rgb, background = batch.joined()
         march = partial(
             state.march,
-            rays=rays,
+            rays=rays.to(self.device),
             background=background,
             generator=generator,
             keep_all_weights=self._keep_all_weights,
@@ -163,6 +159,10 @@ class VoxelMethod(Method):
         """Follow the lattices' schedule."""
         self.lattices.follow(progress, step, optimizer)
         return {}
+
+    def warm_up(self) -> None:
+        """Compile the kernels that marching and splatting use."""
+        warm_up(self.device)
 
     def bounds(self, times: list[float]) -> Box | None:
         """Bound everything more opaque than the stage's ``box_alpha``, two voxels wider."""
