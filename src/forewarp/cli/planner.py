@@ -13,7 +13,7 @@ from forewarp.cli import decisions
 from forewarp.cli.decisions import CUT_OUT, Decision, Evidence
 from forewarp.cli.trials import Trial, Trials, gain
 from forewarp.cli.words import key_of, merged
-from forewarp.methods.voxel.evidence import look_at, movement
+from forewarp.methods.voxel.evidence import movement, survey
 from forewarp.methods.voxel.residual import residual
 from forewarp.scene.box import Lattice
 from forewarp.scene.frame import Scene, spread
@@ -44,7 +44,7 @@ class Planner:
         # The run's share that the last stage has: what a dear effect of it takes its steps from.
         shares = [config.stage[name].share for name in stages]
         minutes = self.settings.minutes and self.settings.minutes * shares[-1] / sum(shares)
-        self.evidence = Evidence(look_at(scene), least=self.settings.least, minutes=minutes)
+        self.evidence = Evidence(survey(scene), least=self.settings.least, minutes=minutes)
         self.usual = int(config.budget.bases)
         self.more = min(2 * self.usual, max(self.evidence.pictures.times - 1, 1))
         # How a scene without silhouettes begins: faint matter everywhere.
