@@ -27,7 +27,7 @@ def test_a_slope_is_of_the_work_and_a_ratio_of_the_same_size():
 def test_the_work_of_a_step_does_not_ask_how_large_the_box_is():
     small, large = (make_module(16, False, rays=200, box=box) for box in (1.0, 2.0))
     counts = [
-        (len(module.method.radiance.voxels), list(module.look(batch).renderings.values())[-1].samples)
+        (len(module.method.radiance.voxels), module.look(batch, {}).noted["samples"])
         for module, batch in (small, large)
     ]
     assert large[0].method.radiance.lattice.count == 8 * small[0].method.radiance.lattice.count

@@ -157,19 +157,19 @@ def test_a_broken_step_ends_in_one_line_and_is_seen_again(forewarp, refused, beg
 
 
 def test_skipped_steps_are_told(forewarp, begun, monkeypatch):
-    from forewarp.data.batches import RayBatches
+    from forewarp.data.batches import Sampler
 
-    draw, drawn = RayBatches.draw, []
+    draw, drawn = Sampler.draw, []
 
     def spoiled(self):
         batch = draw(self)
         drawn.append(batch)
         if len(drawn) == 2:
-            batch.rgb[0] = float("nan")
+            batch.observations[0].rgb[0] = float("nan")
         return batch
 
     shutil.rmtree(begun)
-    monkeypatch.setattr(RayBatches, "draw", spoiled)
+    monkeypatch.setattr(Sampler, "draw", spoiled)
     done = forewarp("train", *SMALL, "data.root=.", "run=run", "sentinel.skip=1")
     assert done.status == 0, done.err
     assert "coarse: 1 broken steps skipped; each lies in run/coarse/broken" in done.out

@@ -7,6 +7,7 @@ from forewarp.cli.timed_cases import CASES
 from forewarp.cli.twin import implementation
 from forewarp.cli.workloads import make_module
 from forewarp.ops.splat import average_splat
+from forewarp.training.objective import total
 
 SIDE, RAYS = 20, 400
 
@@ -15,14 +16,15 @@ def taken(dense, threshold=0.0):
     """A step's pictures, its loss, and the gradient of the features by voxel (X, Y, Z, C)."""
     module, batch = make_module(SIDE, dense, rays=RAYS, shift=2.0, threshold=threshold)
     with implementation("reference" if dense else "Numba"):
-        step = module.look(batch)
-        loss, _ = module.objective(step, 0)
-        loss.backward()
+        factors = module.objective.factors(0)
+        step = module.look(batch, factors)
+        total(step, factors, {})[0].backward()
     radiance = module.method.radiance
     gradient = torch.zeros(*radiance.lattice.shape, 12)
     x, y, z = radiance.voxels.unbind(-1)
     gradient[x, y, z] = radiance.features.grad
-    return {name: r.rgb.detach() for name, r in step.renderings.items()}, step, gradient, radiance
+    drawn = {name.removesuffix(".rgb"): t.detach() for name, t in step.tensors() if name.endswith(".rgb")}
+    return drawn, step, gradient, radiance
 
 
 # No colour for samples of less weight than 1e-4 is the one saving that is not exact.
@@ -31,8 +33,7 @@ def test_a_step_on_what_is_occupied_draws_what_the_dense_one_draws(threshold, mo
     pictures, step, _, radiance = taken(False, threshold)
     exact, whole, _, everything = taken(True)
     assert len(radiance.voxels) < 0.12 * len(everything.voxels)
-    best, best_whole = (list(s.renderings.values())[-1] for s in (step, whole))
-    assert best.samples < 0.5 * best_whole.samples
+    assert step.noted["samples"] < 0.5 * whole.noted["samples"]
     assert exact.keys() == pictures.keys() == {"upsampled", "inpainted"}
     for name, picture in exact.items():
         assert picture.std() > 0.05

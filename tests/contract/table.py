@@ -8,6 +8,7 @@ from contract.toys import Codes, Splats
 from forewarp.fields.radiance import DirectRadiance
 from forewarp.fields.trajectory import TrajectoryField
 from forewarp.methods.method import Method, Start
+from forewarp.methods.tnerf import TNeRF
 from forewarp.methods.voxel.backward_warp import Deformation
 from forewarp.methods.voxel.effects.background import StaticBackground, Together
 from forewarp.methods.voxel.effects.inpaint import UNet3d
@@ -67,6 +68,8 @@ WARP = {
     "inpainter": Effect({"inpainter": partial(UNet3d, width=16, levels=2)}, ((UNet3d, "features"),)),
     "background": BACKGROUND,
 }
+SMALL_NETWORK = {"width": 32, "layers": 3, "skip": None, "position_frequencies": 4}
+SMALL_NETWORK |= {"time_frequencies": 2, "samples": 16, "fine_samples": 16}
 
 METHODS = {
     "forward": Entry(ForwardModel(GRID, motion=Motion, trajectory=TRAJECTORY), **VOXELS, effects=WARP),
@@ -75,7 +78,11 @@ METHODS = {
         **VOXELS,
         effects={"view": VIEW, "background": BACKGROUND},
     ),
-    # tnerf joins with methods/tnerf.py
+    "tnerf": Entry(
+        partial(TNeRF, **SMALL_NETWORK, density="softplus", open_end=False, inside_box=True),
+        {"network": 2e-3},
+        steps=150,
+    ),
     "codes": Entry(Codes, {"codes": 1e-2, "network": 5e-3}, {"photo": 1.0, "smooth": 1e-3}, toy=True),
     "splats": Entry(
         Splats,

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from functools import partial
 
+import lightning
 import pytest
 import torch
 
@@ -10,8 +11,8 @@ from forewarp.data.module import SceneDataModule
 from forewarp.methods.voxel.effects.background import StaticBackground
 from forewarp.methods.voxel.effects.inpaint import UNet3d
 from forewarp.fields.trajectory import TrajectoryField
+from forewarp.methods.voxel.method import VoxelMethod
 from forewarp.scene.box import Box
-from forewarp.training.objective import Objective
 from hard_cases import check_finite
 from tiny_scene import RATES, ball_scene, forward_model, make_run, stage
 
@@ -45,25 +46,26 @@ ALL = {
 }
 
 
-class Diary(Objective):
+class Diary(lightning.Callback):
     """Notes the loss of every step."""
 
-    def __call__(self, *arguments):
-        loss, raw = super().__call__(*arguments)
-        self.losses = [*getattr(self, "losses", []), float(loss.detach())]
-        return loss, raw
+    def __init__(self):
+        self.losses = []
+
+    def on_before_backward(self, trainer, module, loss):
+        self.losses.append(float(loss.detach()))
 
 
 def fit(folder, scene, iterations, weights=None, **changes):
     """A fitted module, the losses of its steps, and the mean PSNR of its test images."""
     data = SceneDataModule(lambda: scene, rays=changes.pop("rays", 128))
-    spec = changes.pop("spec", None) or forward_model()
+    model = changes.pop("model", None) or forward_model()
     fitting = stage(iterations=iterations, weights=weights, **({"voxels": [[0, 12**3]]} | changes))
-    diary = Diary(fitting.objective.weights)
-    module = make_run(folder, [replace(fitting, objective=diary)], data=data, spec=spec).fit()
+    diary = Diary()
+    module = make_run(folder, [fitting], data=data, model=model, callbacks=[diary]).fit()
     scores = []
     for target in data.targets("test"):
-        drawn = module.render_image(target.frame.camera, target.frame.time, target.background).rgb
+        drawn = module.render(target.view, target.moment, target.background).rgb
         error = (drawn.clamp(0, 1).reshape(target.rgb.shape) - target.rgb).square().mean()
         scores.append(-10 * float(torch.log10(error)))
     return module, diary.losses, sum(scores) / len(scores)
@@ -77,9 +79,9 @@ def all_finite(module):
 def test_no_term_of_the_loss_depends_on_the_unit_of_length(tmp_path, factor):
     """The first steps, all terms on, are the same but for rounding."""
     weights = dict.fromkeys(TERMS, 0.1)
-    assert set(TERMS) == set(Objective(weights).terms)
+    assert set(TERMS) == set(VoxelMethod.terms)
     options = {"iterations": 4, "weights": weights, "start": "hull", "patches": 2}
-    options |= {"spec": forward_model(**ALL), "background_voxels": [[0, 12**3]]}
+    options |= {"model": forward_model(**ALL), "background_voxels": [[0, 12**3]]}
     scene = replace(ball_scene(frames=6, size=16), still=torch.tensor([[0.9, 0.1, 0.2], [-0.8, 0.3, -0.2]]))
     _, plain, _ = fit(tmp_path / "a", scene, **options)
     _, other, _ = fit(tmp_path / "b", in_other_units(scene, factor), **options)

@@ -7,6 +7,7 @@ import torch
 
 from forewarp.data.module import SceneDataModule
 from forewarp.metrics.suite import ImageSuite
+from forewarp.scene.rays import joined
 from forewarp.training.curriculum import Curriculum
 from forewarp.training.evaluation import evaluate
 from tiny_scene import ball_scene, frame_at, make_run, stage
@@ -53,7 +54,8 @@ def test_evaluation_warps_a_time_once_for_all_its_cameras(run, module, warped, t
 def test_training_warps_once_for_the_rays_of_several_cameras(run, module, warped, monkeypatch):
     batch = run.datamodule.batches.draw()
     assert len({one.moment.frame for one in batch.observations}) == 3
-    assert len({one.view.camera.center for one in batch.observations}) == 3
+    rays = joined([one.view.rays() for one in batch.observations])
+    assert (len(rays), len(rays.origins.unique(dim=0))) == (60, 3)
     assert torch.isfinite(module.training_step(batch, 0))
     assert warped == [batch.time]
 

@@ -106,6 +106,21 @@ def test_what_a_run_leaves(whole):
     assert module.method.motion.trajectory.bases_in_play == 4
 
 
+@pytest.mark.parametrize(
+    ("wrong", "text"),
+    [
+        ({"voxel": 1}, "unexpected keyword argument 'voxel'"),
+        ({"keep_alpha": 2.0}, "stage.fine: expected 0 < birth_alpha < keep_alpha < 1"),
+        ({"weights": {"photos": 1.0}}, "objective: expected a term of photo, .*but got 'photos'"),
+    ],
+)
+def test_a_mistake_in_a_later_stage_is_refused_before_anything_is_trained(tmp_path, wrong, text):
+    plan = [stage("coarse"), stage("fine", **wrong)]
+    with pytest.raises((TypeError, ValueError), match=text):
+        make_run(tmp_path, plan, data=ball_data(rays=64, size=16)).fit()
+    assert not (tmp_path / "coarse" / "last.ckpt").exists()
+
+
 class Diary(lightning.Callback):
     """Notes what every step was trained with."""
 

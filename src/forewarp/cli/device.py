@@ -82,10 +82,10 @@ def frames(run: Run, module: DynamicSceneModule, size: int, repeats: int = 5) ->
     view, first, again = target.frame.camera.resized(size, size), [], []
     for _ in range(repeats + 1):
         begin = now()
-        state = module.method.at(target.frame.time)
-        module.render_image(view, target.frame.time, target.background, state=state)
+        snapshot = module.method.at(target.moment)
+        module.render(view, target.moment, target.background, snapshot)
         middle = now()
-        module.render_image(view, target.frame.time, target.background, state=state)
+        module.render(view, target.moment, target.background, snapshot)
         first.append(middle - begin)
         again.append(now() - middle)
     return statistics.median(first[1:]), statistics.median(again[1:])

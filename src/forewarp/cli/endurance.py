@@ -110,7 +110,7 @@ def trial(seed: int, rate: float, steps: int, data: Path) -> dict:
 def _psnr(module, datamodule) -> float:
     scores = []
     for target in datamodule.targets("test"):
-        drawn = module.render_image(target.frame.camera, target.frame.time, target.background)
+        drawn = module.render(target.view, target.moment, target.background)
         error = (drawn.rgb.clamp(0, 1).reshape(target.rgb.shape) - target.rgb).square().mean()
         scores.append(float(-10 * torch.log10(error.clamp(min=1e-10))))
     return sum(scores) / len(scores)

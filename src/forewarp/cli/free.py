@@ -9,22 +9,21 @@ import torch
 
 from forewarp.cli.stability import table
 from forewarp.cli.timed_cases import Work, milliseconds, timed
-from forewarp.cli.workloads import RATES, TIME, WHITE, body, camera, lattice_of, some_rays
+from forewarp.cli.workloads import batch_of, body, lattice_of, module_of
 from forewarp.fields.radiance import DirectRadiance
 from forewarp.fields.trajectory import TrajectoryField
-from forewarp.methods.spec import MethodSpec
 from forewarp.methods.voxel.effects.background import StaticBackground
 from forewarp.methods.voxel.effects.inpaint import UNet3d
 from forewarp.methods.voxel.effects.motion import Motion
 from forewarp.methods.voxel.effects.upsample import LearnedUpsampler
 from forewarp.methods.voxel.effects.view import SphericalHarmonics
 from forewarp.methods.voxel.forward_warp import ForwardWarp
+from forewarp.methods.voxel.model import ForwardModel
+from forewarp.methods.voxel.stage import VoxelStage
+from forewarp.methods.voxel.start import Ground
+from forewarp.methods.voxel.terms import TERMS
 from forewarp.renderer import Renderer
-from forewarp.scene.batch import Batch
-from forewarp.training.curriculum import Curriculum
-from forewarp.training.module import DynamicSceneModule
-from forewarp.training.objective import Objective
-from forewarp.training.settings import StageSettings
+from forewarp.training.objective import total
 
 EFFECTS: Mapping[str, dict] = {
     "view": {"view": SphericalHarmonics},
@@ -44,17 +43,10 @@ def method_with(choices: Mapping, side: int) -> ForwardWarp:
     torch.manual_seed(0)
     lattice = lattice_of(side)
     active = body(lattice, 0.55)
-    spec = MethodSpec(radiance=partial(DirectRadiance, alpha_init=1e-2, skip_alpha=1e-4), **choices)
-    method = spec.build(
-        lattice,
-        active,
-        unit=2 / (side - 1),
-        scene_box=lattice.box,
-        frames=50,
-        canonical_time=0.0,
-        effects=("motion", "view", "upsampler", "inpainter", "background"),
-        still=(lattice, torch.ones_like(active)),
-    )
+    model = ForwardModel(radiance=partial(DirectRadiance, alpha_init=1e-2, skip_alpha=1e-4), **choices)
+    still = (lattice, torch.ones_like(active))
+    ground = Ground(lattice, active, 2 / (side - 1), lattice.box, 50, 0.0, still)
+    method = model.build(ground, VoxelStage(voxels=[[0, side**3]]))
     with torch.no_grad():
         method.radiance.parameter("density").fill_(6.0)
         if method.background is not None:
@@ -64,19 +56,13 @@ def method_with(choices: Mapping, side: int) -> ForwardWarp:
 
 def step_with(choices: Mapping, side: int, rays: int, weights: Mapping[str, float]) -> Work:
     """A step of training as the platform does it."""
-    module = DynamicSceneModule(
-        method_with(choices, side),
-        renderer=Renderer(),
-        objective=Objective(weights),
-        settings=StageSettings("fine", voxels=[[0, side**3]], rates=RATES, iterations=100),
-        curriculum=Curriculum([i / 49 for i in range(50)], 0.0),
-        cameras=[camera()],
-    )
+    module = module_of(method_with(choices, side), weights, side)
     optimizer, batch = module.configure_optimizers(), batch_of(rays)
 
     def step() -> None:
         optimizer.zero_grad()
-        module.objective(module.look(batch), 0)[0].backward()
+        factors = module.objective.factors(0)
+        total(module.look(batch, factors), factors, {})[0].backward()
         optimizer.step()
 
     return step
@@ -84,27 +70,23 @@ def step_with(choices: Mapping, side: int, rays: int, weights: Mapping[str, floa
 
 def step_by_hand(side: int, rays: int) -> Work:
     """The same of a static field without anything, written as if there were no effects and one term."""
-    radiance, renderer, batch = method_with({}, side).radiance, Renderer(), batch_of(rays)
+    radiance, renderer = method_with({}, side).radiance, Renderer()
+    (seen,) = batch_of(rays).observations
     generator = torch.Generator().manual_seed(0)
     optimizer = torch.optim.Adam(radiance.parameters(), lr=0.1, betas=(0.9, 0.99), eps=1e-8, fused=True)
 
     def step() -> None:
         optimizer.zero_grad()
-        drawn = renderer(radiance(), batch.rays, batch.background, None, generator)
-        (drawn.rgb - batch.rgb).square().mean().backward()
+        drawn = renderer(radiance(), seen.view.rays(), seen.background, None, generator)
+        (drawn.rgb - seen.rgb).square().mean().backward()
         optimizer.step()
 
     return step
 
 
-def batch_of(rays: int) -> Batch:
-    """Random pixels of a picture of the ball."""
-    return Batch(some_rays(rays), torch.full((rays, 3), 0.5), WHITE, TIME, 0)
-
-
 def free_table(side: int = 48, rays: int = 2048) -> str:
     """Milliseconds of a step, and how many times one that was written without any effect."""
-    photo, every = {"photo": 1.0}, dict.fromkeys(Objective({}).terms, 0.0)
+    photo, every = {"photo": 1.0}, dict.fromkeys(TERMS, 0.0)
     works = {
         "written without any of it": step_by_hand(side, rays),
         "everything off": step_with({}, side, rays, photo),

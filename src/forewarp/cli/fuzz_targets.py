@@ -14,6 +14,7 @@ from forewarp.scene.camera import Camera, look_at
 from forewarp.scene.errors import SceneError
 from forewarp.scene.frame import Scene, Truth
 from forewarp.scene.lens import Lens
+from forewarp.scene.view import Moment, View
 
 _SIZE, _DEPTH = (12, 8), np.full((8, 12), 3.0, np.float32)  # width and height, as images and arrays have them
 
@@ -68,7 +69,7 @@ def run_targets(root: Path) -> list[Target]:
     config = OmegaConf.create(OmegaConf.to_container(config, resolve=True))
     (root / "config" / "config.yaml").write_text(OmegaConf.to_yaml(config))
     scene = dnerf.read_scene(root, "dnerf")
-    module = build_run(config).rebuilt("coarse", scene, 0.1)
+    module = build_run(config).rebuilt("coarse", scene)
     content = {"state_dict": module.state_dict(), "global_step": 7}
     module.on_save_checkpoint(content)
     file = root / "checkpoint" / "last.ckpt"
@@ -80,7 +81,7 @@ def run_targets(root: Path) -> list[Target]:
         """Read, take and use it: a kernel that believes what it should not ends the process."""
         check_state(file, module)
         load_weights(module, file)
-        module.render_image(camera, 0.5, white, pixels=torch.arange(4))
+        module.render(View(camera, torch.arange(4)), Moment(0.5), white)
 
     return [
         Target("config", root / "config", lambda: saved_config(str(root / "config"), nothing), (ValueError,)),

@@ -13,7 +13,7 @@ from forewarp.cli.trials import Trial, Trials, gain
 from forewarp.cli.words import key_of, merged
 from forewarp.methods.effect import Asked, Begin, Decision, Effect, Planning, Rival
 from forewarp.scene.frame import Scene
-from forewarp.scene.pictures import look_at
+from forewarp.scene.pictures import survey
 
 
 class Planner:
@@ -44,7 +44,7 @@ class Planner:
         # The run's share that the last stage has: what a dear effect of it takes its steps from.
         shares = [stage.share for stage in stages.values()]
         minutes = self.settings.minutes and self.settings.minutes * shares[-1] / sum(shares)
-        self.evidence = planning.evidence(look_at(scene), least=self.settings.least, minutes=minutes)
+        self.evidence = planning.evidence(survey(scene), least=self.settings.least, minutes=minutes)
 
     def plan(self) -> dict:
         """What the run is to be, and why."""

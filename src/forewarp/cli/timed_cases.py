@@ -27,7 +27,8 @@ from forewarp.cli.workloads import (
 )
 from forewarp.ops.splat import average_splat
 from forewarp.renderer import Renderer
-from forewarp.training.module import render_all
+from forewarp.scene.view import Moment, View
+from forewarp.training.objective import total
 
 Work = Callable[[], object]
 REPEATS = 5
@@ -122,12 +123,12 @@ def render_work(rays: float, dense: bool, step: float = 0.5) -> Work:
 def step_work(side: float, dense: bool, rays: int = 2048, box: float = 1.0) -> Work:
     """A whole fine step: the paper's, the optimiser's included."""
     module, batch = make_module(int(side), dense, rays=rays, box=box)
-    optimizer = module.configure_optimizers()
+    optimizer, factors = module.configure_optimizers(), module.objective.factors(0)
 
     def step() -> None:
         with implementation("reference") if dense else nullcontext():
             optimizer.zero_grad()
-            module.objective(module.look(batch), 0)[0].backward()
+            total(module.look(batch, factors), factors, {})[0].backward()
             optimizer.step()
 
     return step
@@ -139,19 +140,16 @@ def frame_work(size: float, dense: bool, first: bool = True, side: int = 64, pla
     ``plain`` has neither U-Net nor up-sampler, as ``preset=fast``.
     """
     module, _ = make_module(side, dense, rays=1, effects=("motion", "view") if plain else EFFECTS)
-    view = camera(int(size)).rays()
+    view, moment = View(camera(int(size))), Moment(TIME)
 
     def frame() -> Tensor:
         with torch.no_grad(), implementation("reference") if dense else nullcontext():
-            state = known or module.method.at(TIME)
-            return render_all(
-                module.renderer, list(state.fields.values())[-1], view, WHITE, module.method.view
-            ).rgb
+            return (known or module.method.at(moment)).render(view, WHITE).rgb
 
     known = None
     if not first:
         with torch.no_grad():
-            known = module.method.at(TIME)
+            known = module.method.at(moment)
     return frame
 
 

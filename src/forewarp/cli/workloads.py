@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 
 import torch
@@ -12,17 +12,23 @@ from torch import Tensor
 from forewarp.fields.radiance import FeatureRadiance
 from forewarp.fields.radiance_grid import EMPTY
 from forewarp.fields.trajectory import TrajectoryField
-from forewarp.methods.spec import MethodSpec
+from forewarp.methods.method import Start
 from forewarp.methods.voxel.effects.inpaint import UNet3d
 from forewarp.methods.voxel.effects.motion import Motion
 from forewarp.methods.voxel.effects.upsample import LearnedUpsampler
 from forewarp.methods.voxel.effects.view import ViewNetwork
 from forewarp.methods.voxel.forward_warp import ForwardWarp
+from forewarp.methods.voxel.method import VoxelMethod
+from forewarp.methods.voxel.model import ForwardModel
+from forewarp.methods.voxel.stage import VoxelStage
+from forewarp.methods.voxel.start import Ground
 from forewarp.renderer import Renderer
-from forewarp.scene.batch import Batch
+from forewarp.scene.batch import Batch, Observation
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.camera import Camera, look_at
+from forewarp.scene.frame import Frame, Scene
 from forewarp.scene.rays import Rays
+from forewarp.scene.view import Moment, View
 from forewarp.training.curriculum import Curriculum
 from forewarp.training.module import DynamicSceneModule
 from forewarp.training.objective import Objective
@@ -65,10 +71,39 @@ def camera(size: int = 400) -> Camera:
     return Camera(size, size, 1.39 * size, 1.39 * size, size / 2, size / 2, pose, 2.0, 6.0)
 
 
-def some_rays(count: int, seed: int = 0) -> Rays:
+def some_pixels(count: int, seed: int = 0) -> View:
     """Random pixels of the picture."""
     pixels = torch.randint(160_000, (count,), generator=torch.Generator().manual_seed(seed))
-    return camera().rays(pixels)
+    return View(camera(), pixels)
+
+
+def some_rays(count: int) -> Rays:
+    """The rays through them."""
+    return some_pixels(count).rays()
+
+
+def batch_of(rays: int) -> Batch:
+    """Grey pixels of the picture."""
+    return Batch((Observation(Moment(TIME), some_pixels(rays), torch.full((rays, 3), 0.5), WHITE),), 0)
+
+
+def module_of(method: VoxelMethod, weights: Mapping[str, float], side: int) -> DynamicSceneModule:
+    """The method in the middle of a stage of its own, seen by one camera."""
+    settings = StageSettings.of("fine", voxels=[[0, side**3]], rates=RATES, iterations=100)
+    frame = Frame("0", 0.0, camera(), _no_picture)
+    scene = Scene("ball", (frame,), (), (), method.radiance.lattice.box, 0.0, has_alpha=True)
+    objective = Objective(weights)
+    start = Start(scene, settings.name, settings.numbers, weights=objective.weights)
+    return DynamicSceneModule(
+        method.begin(start, VoxelStage(name=settings.name, **settings.numbers)),
+        objective=objective,
+        settings=settings,
+        curriculum=Curriculum([i / 49 for i in range(50)], 0.0),
+    )
+
+
+def _no_picture() -> Tensor:
+    raise AssertionError("a timed step has its pixels")
 
 
 def lattice_of(side: int, box: float = 1.0) -> Lattice:
@@ -88,7 +123,7 @@ def make_method(
     """
     ball = body(lattice, RADIUS)
     margin = max(lattice.shape) if dense else 4
-    spec = MethodSpec(
+    model = ForwardModel(
         radiance=partial(FeatureRadiance, alpha_init=1e-2, skip_alpha=0.0 if dense else 1e-4),
         motion=Motion,
         trajectory=partial(TrajectoryField, bases=15, nodes=0),
@@ -96,15 +131,9 @@ def make_method(
         inpainter=partial(PlainUNet if dense else UNet3d, width=16, margin=margin),
         view=ViewNetwork,
     )
-    method = spec.build(
-        lattice,
-        torch.ones_like(ball) if dense else ball,
-        unit=2 / (side - 1),
-        scene_box=lattice.box,
-        frames=50,
-        canonical_time=0.0,
-        effects=effects,
-    )
+    active = torch.ones_like(ball) if dense else ball
+    ground = Ground(lattice, active, 2 / (side - 1), lattice.box, frames=50, canonical_time=0.0)
+    method = model.build(ground, VoxelStage(voxels=[[0, side**3]], effects=effects))
     _paint(method, ball, shift)
     return method
 
@@ -153,13 +182,5 @@ def make_module(
 ) -> tuple[DynamicSceneModule, Batch]:
     """The paper's fine stage, and a batch for it: the U-Net 16 wide, twice the resolution, two renderings."""
     method = make_method(lattice_of(side, box), side, dense, effects=effects, shift=shift)
-    module = DynamicSceneModule(
-        method,
-        renderer=Renderer(color_threshold=0.0 if dense else threshold, opaque=0.0 if dense else 1e-4),
-        objective=Objective(WEIGHTS),
-        settings=StageSettings("fine", voxels=[[0, side**3]], rates=RATES, iterations=100),
-        curriculum=Curriculum([i / 49 for i in range(50)], 0.0),
-        cameras=[camera()],
-    )
-    view = some_rays(rays)
-    return module, Batch(view, torch.full((rays, 3), 0.5), WHITE, TIME, 0)
+    method.renderer = Renderer(color_threshold=0.0 if dense else threshold, opaque=0.0 if dense else 1e-4)
+    return module_of(method, WEIGHTS, side), batch_of(rays)

@@ -34,7 +34,7 @@ class Pictures:
     disagreement: float
 
 
-def look_at(scene: Scene) -> Pictures:
+def survey(scene: Scene) -> Pictures:
     """Evidence from training frames alone. Cost: ``_VIEWS`` images, ``_SIDE``^3 points in each."""
     frames = [scene.train[i] for i in spread(len(scene.train), _VIEWS)]
     cut_out = 0.0

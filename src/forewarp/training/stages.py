@@ -65,6 +65,7 @@ class Run:
     def fit(self) -> DynamicSceneModule:
         """Run what is not finished; returns the last stage's module, fitted."""
         self.datamodule.setup("fit")
+        self._check_later_stages()
         module, handover = None, None
         for number, stage in enumerate(self.stages):
             folder = self.stage_folder(stage)
@@ -82,6 +83,14 @@ class Run:
                 self._fit_stage(stage, module, folder, handover)
             handover = load_handover(folder)
         return module
+
+    def _check_later_stages(self) -> None:
+        """Let what is wrong with a stage be said before the stages before it are trained: a method that
+        waits for a checkpoint is made of its numbers and thrown away.
+        """
+        for number, stage in enumerate(self.stages):
+            if number and not self.is_finished(stage):
+                self._module(stage, None, None, number, blank=True)
 
     def load(self) -> DynamicSceneModule:
         """The fitted last stage of a finished run.

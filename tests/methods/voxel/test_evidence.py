@@ -10,7 +10,7 @@ from forewarp.fields.trajectory import TrajectoryField
 from forewarp.ops.dct import dct_basis
 from forewarp.scene.box import Lattice
 from forewarp.methods.voxel.evidence import Movement, movement
-from forewarp.scene.pictures import look_at
+from forewarp.scene.pictures import survey
 from tiny_scene import BOX, ball_scene, built, forward_model
 
 LATTICE = Lattice(BOX, (12, 9, 8))
@@ -30,9 +30,9 @@ def fitted(flow):
 
 def test_a_scene_that_stands_still_is_explained_by_its_hull():
     still = ball_scene(times=[0.0] * 12)
-    assert look_at(still).times == 1
-    assert look_at(still).disagreement < 0.01
-    moving = look_at(ball_scene())
+    assert survey(still).times == 1
+    assert survey(still).disagreement < 0.01
+    moving = survey(ball_scene())
     assert (moving.frames, moving.times) == (12, 12)
     assert moving.disagreement > 0.1
     assert 0.7 < moving.cut_out < 1
@@ -43,9 +43,9 @@ def test_alpha_that_is_nowhere_transparent_says_nothing():
     scene = ball_scene()
     opaque = torch.full((24, 24, 4), 255, dtype=torch.uint8)
     filled = replace(scene, train=tuple(replace(f, load=lambda: opaque) for f in scene.train))
-    found = look_at(filled)
+    found = survey(filled)
     assert (found.cut_out, found.disagreement) == (0, 0)
-    assert look_at(replace(scene, has_alpha=False)).cut_out == 0
+    assert survey(replace(scene, has_alpha=False)).cut_out == 0
 
 
 def test_a_shift_moves_all_and_tears_nothing():
