@@ -38,9 +38,8 @@ ONLY_IN = {
     "matplotlib": {"report"},
     "torchvision": set(),
 }
-CONTRACT = {"method", "abilities", "effect"}  # files of methods/ that whoever stands above may name
+CONTRACT = {"method", "abilities", "effect", "rows"}  # files of methods/ that whoever stands above may name
 OWN_PARTS = {"radiance", "lattice", "lattices", "motion", "deformation", "inpainter"}  # of one method alone
-PLANS = {"planner", "decisions"}  # know the voxel methods, whose effects they choose
 TOOLS = {"free", "workloads", "timed_cases", "twin", "device", "endurance", "fuzz_targets", "stability"}
 TOOLS |= {"performance"}  # of the makers
 FUNCTION_LINES, FILE_LINES = 60, 350
@@ -77,7 +76,7 @@ def breaches(part: str, tree: ast.AST) -> list[str]:
 def above_methods(file: Path) -> bool:
     """Whether a file stands above the methods and may know their contract alone."""
     part = part_of(file)
-    return part in ("training", "data", "report", "cli") and file.stem not in PLANS | TOOLS
+    return part in ("training", "data", "report", "cli") and file.stem not in TOOLS
 
 
 def parts_named(tree: ast.AST) -> list[str]:
@@ -182,7 +181,7 @@ def test_the_check_of_methods_among_themselves(file, line, allowed):
     [
         ("training/module.py", True),
         ("cli/limits.py", True),
-        ("cli/planner.py", False),
+        ("cli/planner.py", True),
         ("cli/free.py", False),
     ],
 )
@@ -195,8 +194,11 @@ def test_every_folder_is_a_package():
     assert {f.parent for f in SOURCE.rglob("*.py")} == {f.parent for f in SOURCE.rglob("__init__.py")}
 
 
-def test_init_files_hold_one_sentence():
+def test_init_files_hold_one_sentence_but_for_the_public_door():
     for file in SOURCE.rglob("__init__.py"):
+        if file.parent == SOURCE:
+            assert list(imports(ast.parse(file.read_text()))) == ["forewarp.cli.fitted.open_run"]
+            continue
         body = ast.parse(file.read_text()).body
         assert len(body) == 1, file
         assert isinstance(body[0], ast.Expr), file
