@@ -13,8 +13,8 @@ from forewarp.fields.radiance import FeatureRadiance
 from forewarp.methods.voxel.backward_warp import Deformation
 from forewarp.renderer import Renderer
 from forewarp.scene.box import Lattice
-from forewarp.methods.voxel.stage import EFFECTS
-from tiny_scene import BOX, camera_at, forward_model
+from forewarp.scene.view import Moment
+from tiny_scene import BOX, backward_model, built, camera_at, forward_model
 
 pytestmark = pytest.mark.stability
 
@@ -23,44 +23,34 @@ NETWORKS = {
     "radiance": partial(FeatureRadiance, alpha_init=1e-2, skip_alpha=0.0, width=16, grid_features=4),
     "view": ViewNetwork,
 }
-SPECS = {
-    "everything": {
-        **NETWORKS,
-        "upsampler": partial(LearnedUpsampler, width=8),
-        "inpainter": partial(UNet3d, levels=2),
-    },
-    "inpainter": {"inpainter": partial(UNet3d, levels=2)},
-    "backward": {"warp": "backward", "deformation": partial(Deformation, width=16, layers=2)},
-    "forward": {},
+MODELS = {
+    "everything": forward_model(
+        **NETWORKS, upsampler=partial(LearnedUpsampler, width=8), inpainter=partial(UNet3d, levels=2)
+    ),
+    "inpainter": forward_model(inpainter=partial(UNet3d, levels=2)),
+    "backward": backward_model(deformation=partial(Deformation, width=16, layers=2)),
+    "forward": forward_model(),
 }
 
 
 def method_of(choice, device):
     torch.manual_seed(0)
     lattice = Lattice(BOX, (8, 7, 6))
-    made = forward_model(**SPECS[choice]).build(
-        lattice,
-        torch.ones(lattice.shape, dtype=torch.bool),
-        unit=lattice.pitch,
-        scene_box=BOX,
-        frames=5,
-        canonical_time=0.0,
-        effects=EFFECTS,
-    )
+    made = built(MODELS[choice], lattice, unit=lattice.pitch)
     for parameter in made.parameters():  # nothing starts from zero, or half of it has no gradient
         parameter.data += 0.05 * torch.randn(parameter.shape)
     return made.to(device)
 
 
 def picture(method, device):
-    state = method.at(0.7)
+    state = method.at(Moment(0.7))
     field = list(state.fields.values())[-1]
     drawn = Renderer()(field, camera_at(0.1, 8).rays().to(device), torch.ones(3, device=device), method.view)
     return state, drawn
 
 
 @pytest.mark.parametrize("half", HALVES, ids=str)
-@pytest.mark.parametrize("choice", SPECS)
+@pytest.mark.parametrize("choice", MODELS)
 def test_every_method_runs_under_autocast(device, choice, half):
     method = method_of(choice, device)
     with torch.autocast(device.type, dtype=half):
@@ -75,7 +65,7 @@ def test_every_method_runs_under_autocast(device, choice, half):
     assert state.flow is None or state.flow.dtype == torch.float32
 
 
-@pytest.mark.parametrize("choice", SPECS)
+@pytest.mark.parametrize("choice", MODELS)
 def test_autocast_changes_what_convolutions_say_and_no_place_and_no_density(device, choice):
     method = method_of(choice, device)
     with torch.no_grad():
@@ -85,7 +75,7 @@ def test_autocast_changes_what_convolutions_say_and_no_place_and_no_density(devi
     assert torch.equal(state.canonical.values, other.canonical.values)
     if state.flow is not None:
         assert torch.equal(state.flow, other.flow)
-    exact = "inpainter" not in SPECS[choice]
+    exact = getattr(MODELS[choice], "inpainter", None) is None
     assert torch.equal(drawn.rgb, half.rgb) == exact
     torch.testing.assert_close(drawn.rgb, half.rgb, atol=0.0 if exact else 0.05, rtol=0)
 

@@ -95,11 +95,13 @@ def end(folder):
         for row, moments in content["optimizer_states"][0]["state"].items():
             left |= {(stage, "moments", row, name): value for name, value in moments.items()}
         ours = content["forewarp"]
-        left[stage, "samples"] = ours["generator"]
+        left[stage, "samples"], left[stage, "torch"] = ours["generator"], ours["torch"]
         left |= {(stage, "frames", name): value for name, value in ours["curriculum"].items()}
-        left[stage, "home"], left[stage, "followed"] = ours["lattices"]["home"], ours["lattices"]["followed"]
+        lattices = content["state_dict"]["method._extra_state"]["lattices"]
+        left[stage, "home"], left[stage, "followed"] = lattices["home"], lattices["followed"]
         left[stage, "batches"] = content["DNeRFDataModule"]
         left[stage, "handover"] = (folder / stage / "handover.json").read_text()
+        left[stage, "points"] = torch.load(folder / stage / "handover.pt", weights_only=True)
     rows = json.loads((folder / "per_image.json").read_text())["images"]
     left["scores"] = [row["scores"] for row in rows]
     return left
@@ -143,6 +145,7 @@ def test_killed_while_a_checkpoint_takes_its_place(begin, whole, tmp_path, momen
 PHASES = {
     "checkpoint writing": ((1, "half", "coarse/last.ckpt"), "before coarse"),
     "coarse": ((2, "after", "coarse/last.ckpt"), "coarse"),
+    "points": ((1, "half", "coarse/handover.pt"), "coarse"),
     "handover": ((1, "half", "coarse/handover.json"), "coarse"),
     "between": ((1, "after", "coarse/done.json"), "before fine"),
     "fine": ((2, "after", "fine/last.ckpt"), "fine"),
@@ -207,7 +210,7 @@ def test_killed_at_every_kind_of_file(begin, whole, tmp_path):
     """From the last checkpoint of a stage on: handover, notes, pictures, numbers."""
     shutil.copytree(whole[0], tmp_path / "run")
     for stage in ("coarse", "fine"):
-        for name in ("handover.json", "done.json"):
+        for name in ("handover.pt", "handover.json", "done.json"):
             (tmp_path / "run" / stage / name).unlink()
     (tmp_path / "run" / "metrics.json").unlink()
     deaths, number = 0, 1
@@ -227,7 +230,8 @@ HARM = {"empty": lambda c: b"", "half": lambda c: c[: len(c) // 2], "nonsense": 
 @pytest.mark.parametrize("harm", HARM)
 def test_no_harmed_note_is_taken_for_one(begin, whole, tmp_path, harm):
     shutil.copytree(whole[0], tmp_path / "run")
-    for name in ("coarse/handover.json", "fine/done.json", "metrics.json", "per_image.json", "data.json"):
+    notes = ("coarse/handover.json", "fine/handover.pt", "fine/done.json")
+    for name in (*notes, "metrics.json", "per_image.json", "data.json"):
         path = tmp_path / "run" / name
         path.write_bytes(HARM[harm](path.read_bytes()))
     goes_on(begin, tmp_path / "run", whole)
