@@ -55,7 +55,10 @@ def test_nothing_is_written_twice():
 @pytest.mark.parametrize(
     ("operation", "home"),
     [
-        ("softplus", {"fields/radiance_grid.py"}),  # raw density to density
+        (
+            "softplus",
+            {"fields/radiance_grid.py", "fields/template.py"},
+        ),  # raw density: of voxels, of networks
         ("cumprod", set()),  # compositing is in log space, in ops/composite.py
         ("grid_sample", set()),  # trilinear reads are ops/grid.py's
         ("scatter_add_", set()),

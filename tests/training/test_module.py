@@ -67,7 +67,7 @@ def test_what_no_term_looks_at_is_not_rendered():
 def test_the_clock_starts_when_the_kernels_are_warm(monkeypatch):
     made, seen = module(), []
     monkeypatch.setattr(
-        "forewarp.training.module.warm_up", lambda device: seen.append((device, made.clock.seconds))
+        "forewarp.methods.voxel.method.warm_up", lambda device: seen.append((device, made.clock.seconds))
     )
     made.on_train_start()
     assert seen == [(made.device, 0)]

@@ -73,7 +73,7 @@ def dense_weights(optical: Tensor) -> tuple[Tensor, Tensor]:
     Cost: one pass over R S, no wider than its dtype.
 
     >>> w, t = dense_weights(torch.tensor([[0.0, 1e30, 1.0]]))
-    >>> w.tolist(), t.round(decimals=6).tolist()
+    >>> w.round(decimals=6).tolist(), t.round(decimals=6).tolist()
     ([[0.0, 1.0, 0.0]], [0.0])
     """
     check_shape("optical", optical, ("R", "S"))
