@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
 
+import torch
 from torch import Tensor
 
 from forewarp.cli.entry import MISTAKE, one_line, quiet
@@ -29,6 +30,7 @@ from forewarp.metrics.image import psnr
 from forewarp.metrics.limits import REGIONS, error_shares, low_passed
 from forewarp.scene.frame import spread
 from forewarp.training.evaluation import Shown, draw
+from forewarp.training.handover import load_handover
 
 COLUMNS = (
     *("scene", "seconds", "test views", "first fifth", "between", "last fifth", "training views"),
@@ -76,9 +78,9 @@ def limits_of(folder: Path, views: int = 20, trust: Sequence[str] = ()) -> dict[
         )
     if not isinstance(module.method, HasMatter):
         raise ValueError(f"{folder}: expected a method that tells where matter is, but got none")
-    matter = module.method.matter()
-    low, high = matter.points.amin(0).double(), matter.points.amax(0).double()
-    center, pitch = ((low + high) / 2).cpu(), matter.size
+    pitch = module.method.matter().size
+    before = [load_handover(run.stage_folder(stage)) for stage in run.stages[:-1]]
+    center = torch.tensor((before[-1].box if before else scene.box).center).double()
     train = run.datamodule.targets("train")
     some = [train.frames[i] for i in spread(len(train), views)]
     tests, trained = (
