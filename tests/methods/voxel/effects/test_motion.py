@@ -19,7 +19,8 @@ def motion(**changes):
 
 def solid(raw=6.0):
     index = torch.arange(60, dtype=torch.int32).reshape(LATTICE.shape)
-    values = torch.cat([torch.full((60, 1), raw), torch.randn(60, 3)], -1)
+    colors = torch.randn(60, 3, generator=torch.Generator().manual_seed(0))
+    values = torch.cat([torch.full((60, 1), raw), colors], -1)
     return RadianceGrid(LATTICE, index, values, Activation(-4.6, 1.0))
 
 
