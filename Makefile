@@ -1,5 +1,5 @@
 .DEFAULT_GOAL := help
-.PHONY: help install install-launchers demo demo-forward demo-backward tables-vehicle tables-captures demo-lego-complete demo-hypernerf demo-nhr test conformance test-stability bench bench-gpu effects accuracy-time price-list reproduce-tables lint format clean
+.PHONY: help install install-launchers demo demo-forward demo-backward tables-vehicle tables-captures demo-lego-complete demo-hypernerf demo-nhr test conformance test-slow test-stability bench bench-gpu effects accuracy-time price-list reproduce-tables lint format clean
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -58,6 +58,9 @@ demo-lego-complete demo-hypernerf demo-nhr:
 
 test: ## run the tests, but for the slow ones
 	$(BIN)/pytest --no-cov -m "not slow and not bench"
+
+test-slow: ## run the slow tests: killed runs, every method on every dataset, the wheel
+	$(BIN)/pytest --no-cov -m "slow and not bench"
 
 conformance: ## hold every method to the contract, also the slow cases, and write docs/conformance.md
 	OMP_NUM_THREADS=1 $(BIN)/pytest --no-cov -q tests/contract/test_contract.py --conformance=docs/conformance.md
