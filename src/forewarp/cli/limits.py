@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
 
+import torch
 from torch import Tensor
 
 from forewarp.cli.entry import MISTAKE, one_line, quiet
@@ -77,8 +78,10 @@ def limits_of(folder: Path, views: int = 20, trust: Sequence[str] = ()) -> dict[
     if not isinstance(module.method, HasMatter):
         raise ValueError(f"{folder}: expected a method that tells where matter is, but got none")
     matter = module.method.matter()
-    low, high = matter.points.amin(0).double(), matter.points.amax(0).double()
-    center, pitch = ((low + high) / 2).cpu(), matter.size
+    points = matter.points.cpu().double()
+    if not len(points):  # hardly fitted
+        points = torch.tensor([scene.box.low, scene.box.high], dtype=torch.float64)
+    center, pitch = (points.amin(0) + points.amax(0)) / 2, matter.size
     train = run.datamodule.targets("train")
     some = [train.frames[i] for i in spread(len(train), views)]
     tests, trained = (
