@@ -77,7 +77,8 @@ def limits_of(folder: Path, views: int = 20, trust: Sequence[str] = ()) -> dict[
         )
     if not isinstance(module.method, HasMatter):
         raise ValueError(f"{folder}: expected a method that tells where matter is, but got none")
-    matter = module.method.matter()
+    with torch.no_grad():
+        matter = module.method.matter()
     points = matter.points.cpu().double()
     if not len(points):  # hardly fitted
         points = torch.tensor([scene.box.low, scene.box.high], dtype=torch.float64)
