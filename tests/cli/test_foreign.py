@@ -1,8 +1,4 @@
-"""Somebody else's package, found on the path alone: data, an effect, a callback and Lightning's CSVLogger.
-
-A method of theirs will be tested here as well: ``theirs/methods.py``, ``conf/model/<name>.yaml`` and the word
-``model=<name>`` beside those of ``DISC``.
-"""
+"""Somebody else's package, found on the path alone: a method, data, an effect, a callback and a logger."""
 
 import importlib
 import json
@@ -12,17 +8,21 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 import yaml
 
+from forewarp import load
 from forewarp.cli.plan_file import with_plan, write_plan
 from forewarp.cli.stored import stored_run
+from forewarp.training.handover import load_handover
 
 HERE = Path(__file__).parents[1] / "foreign"
-DISC = [
-    *("hydra.searchpath=[pkg://theirs.conf]", "experiment=disc", "trainer=cpu", "data.rays=64", "threads=1"),
-    *("budget.minutes=null", "budget.iterations=6", "stage.coarse.voxels=[[0,800]]", "~stage.fine"),
-    *("checkpoint_seconds=0", "sheets=0"),
+SMALL = [
+    *("hydra.searchpath=[pkg://theirs.conf]", "trainer=cpu", "data.rays=64", "threads=1"),
+    *("budget.minutes=null", "budget.iterations=6", "checkpoint_seconds=0", "sheets=0"),
 ]
+DISC = [*SMALL, "experiment=disc", "model/view=tint", "~stage.fine"]
+MIST = [*SMALL, "experiment=disc", "model=mist"]
 TRUST = "trust=[theirs]"
 ADVICE = (
     "; if you trust the package theirs, add trust=[theirs] (or set FOREWARP_TRUST=theirs)"  # word for word
@@ -53,8 +53,17 @@ def fitted(forewarp, in_tmp):
     return in_tmp / "run"
 
 
-def steps_of(run):
-    return json.loads((run / "coarse" / "done.json").read_text())["steps"]
+@pytest.fixture
+def mist(forewarp, in_tmp):
+    """As ``fitted``, of their method."""
+    done = forewarp("train", *MIST, "run=run")
+    assert done.status == 0, done.err
+    forget("theirs")
+    return in_tmp / "run"
+
+
+def steps_of(run, stage="coarse"):
+    return json.loads((run / stage / "done.json").read_text())["steps"]
 
 
 def test_what_is_typed_trains_and_trains_again_without_trust(forewarp, fitted):
@@ -216,3 +225,60 @@ def test_a_console_finds_the_package_by_its_folder(in_tmp):
     )
     assert done.returncode == 0
     assert steps_of(in_tmp / "run") == 6
+
+
+def test_a_method_of_theirs_trains_once(forewarp, mist):
+    config = yaml.safe_load((mist / "config.yaml").read_text())
+    assert (config["model"]["name"], config["model"]["count"]) == ("mist", 8)
+    assert "objective" not in config
+    assert (steps_of(mist, "fine"), (mist / "fine" / "steps.txt").read_text()) == (6, "6")
+    again = forewarp("train", *MIST, "run=run")
+    assert (again.status, again.out.strip()[:15]) == (0, "measured before"), again
+
+
+def test_a_method_of_theirs_is_resumed_measured_and_rendered_with_trust(forewarp, refused, in_tmp):
+    stopped = forewarp("train", *MIST, "run=run", "callbacks.count.stop_at=3", "evaluate=false")
+    assert stopped.status == 130, stopped
+    config = in_tmp / "run" / "config.yaml"
+    config.write_text(config.read_text().replace("stop_at: 3", "stop_at: null"))
+    still = ["run=run", "format=png", "frames=2", "size=16", "threads=1"]
+    for words in (["train", "resume=run"], ["evaluate", "run=run"], ["render", *still]):
+        forget("theirs")
+        assert refused(*words).endswith(ADVICE)
+        done = forewarp(*words, TRUST)
+        assert done.status == 0, done.err
+        assert words[0] != "train" or "fine: goes on at 50%, step 3" in done.out
+    assert len(list((in_tmp / "run" / "videos").rglob("*.png"))) == 2
+
+
+def test_a_method_of_theirs_is_swept_beside_ours_and_reported(forewarp, in_tmp):
+    run = "run=runs/disc/${model.name}-seed${seed}"
+    done = forewarp("train", "--multirun", *SMALL, "experiment=disc", "model=forward,mist", "seeds=2", run)
+    assert done.status == 0, done.err
+    runs = sorted(path.name for path in in_tmp.glob("runs/disc/*-seed*"))
+    assert runs == ["forward-seed0", "forward-seed1", "mist-seed0", "mist-seed1"]
+    told = forewarp("report", "kind=accuracy_time", "runs=runs", "out=page")
+    assert told.status == 0, told.err
+    assert "mist-demo" in (in_tmp / "page" / "accuracy-time.md").read_text()
+
+
+def test_a_method_of_theirs_is_opened_with_trust(mist):
+    with pytest.raises(ValueError, match="expected a class of forewarp, but got 'theirs"):
+        load(mist)
+    assert "theirs" not in sys.modules
+    scene = load(mist, trust=["theirs"])
+    frame = scene.frames("test")[0]
+    assert scene.render(frame.camera, 0.5).shape == (16, 16, 3)
+    assert scene.trajectories(scene.matter().points, [0.0, 1.0]).shape == (8, 2, 3)
+
+
+def test_a_stage_has_a_method_of_its_own(forewarp, in_tmp):
+    done = forewarp("train", *SMALL, "experiment=disc_in_two", "run=run", "evaluate=false")
+    assert done.status == 0, done.err
+    run = in_tmp / "run"
+    assert [steps_of(run, stage) for stage in ("coarse", "fine")] == [3, 3]
+    module = stored_run(run, trust=["theirs"]).load()
+    left = load_handover(run / "coarse").cloud.points
+    assert torch.cdist(module.method.began, left).amin(-1).max() == 0
+    done = forewarp("evaluate", "run=run", TRUST)
+    assert done.status == 0, done.err

@@ -61,7 +61,7 @@ def test_a_run_leaves_what_it_promises(fitted):
 
 def test_metrics_have_the_promised_shape(fitted):
     content = json.loads((fitted / "metrics.json").read_text())
-    whole = {"protocol", "seconds", "steps", "peak_memory_bytes", "parameters", "test", "flow"}
+    whole = {"protocol", "seconds", "steps", "peak_memory_bytes", "parameters", "effects", "test", "flow"}
     assert set(content) == whole
     assert set(content["steps"]) == {"coarse", "fine"}
     frames = {"render_per_frame", "render_again_per_frame"}

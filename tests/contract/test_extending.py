@@ -45,7 +45,7 @@ def test_the_method_is_short_and_its_lines_fit():
 
 @pytest.mark.parametrize("dataset", ["dnerf", "hypernerf"])
 def test_the_method_of_the_page_learns(page, dataset, scenes, tmp_path):
-    line = block_of("A method", "text").strip().removesuffix(",")
+    line = block_of("How to test it", "text").strip().removesuffix(",")
     entry = eval("{" + line + "}", {"Entry": Entry, "Balls": page.Balls})["balls"]
     losses = Losses()
     run = run_of([stage_of(entry)], data_of(dataset, scenes), tmp_path, losses)

@@ -100,7 +100,8 @@ class Fitted:
 
     def matter(self) -> Cloud:
         """Give the canonical matter as points with colour and opacity."""
-        return self._able(HasMatter, "tells where matter is").matter()
+        with torch.no_grad():
+            return self._able(HasMatter, "tells where matter is").matter()
 
     def _able(self, ability: type, what: str) -> Method:
         if not isinstance(self.method, ability):

@@ -78,7 +78,8 @@ def limits_of(folder: Path, views: int = 20, trust: Sequence[str] = ()) -> dict[
         )
     if not isinstance(module.method, HasMatter):
         raise ValueError(f"{folder}: expected a method that tells where matter is, but got none")
-    pitch = module.method.matter().size
+    with torch.no_grad():
+        pitch = module.method.matter().size
     before = [load_handover(run.stage_folder(stage)) for stage in run.stages[:-1]]
     center = torch.tensor((before[-1].box if before else scene.box).center).double()
     train = run.datamodule.targets("train")

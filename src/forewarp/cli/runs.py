@@ -57,6 +57,7 @@ def build_run(config: DictConfig) -> Run:
         skip=config.get("sentinel", {"skip": 0})["skip"],
         tell=partial(print, flush=True),
     )
+    run.check()
     return run
 
 

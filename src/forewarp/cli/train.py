@@ -54,6 +54,10 @@ def train(config) -> float | None:
     refuse_seeds(config)
     refuse_two_models(config)
     trust_of(config.get("trust"))
+    if config.get("score") not in (None, "psnr"):
+        from forewarp.cli.score import named
+
+        named(config.score)
     config = resumed(config)
     refuse_absent(config)
     # These load torch; what is mistyped has been answered before.
@@ -61,9 +65,8 @@ def train(config) -> float | None:
     from forewarp.cli.measure import measure
     from forewarp.cli.report import draw_run
     from forewarp.cli.runs import build_run, is_measured
-    from forewarp.cli.score import Score, named
+    from forewarp.cli.score import Score
 
-    named(config.get("score"))
     config = hashed(planned(config))
     run = build_run(config)
     if skips(run, config.get("absent", "refuse")):

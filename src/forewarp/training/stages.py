@@ -84,6 +84,15 @@ class Run:
             handover = load_handover(folder)
         return module
 
+    def check(self) -> None:
+        """Refuse numbers that a stage's method does not take, before anything is read; of models that have a
+        ``check(stage, numbers, literal)``.
+        """
+        for stage in self.stages:
+            check = getattr(stage.model or self.model, "check", None)
+            if check is not None:
+                check(stage.settings.name, stage.settings.numbers, stage.objective.literal)
+
     def _check_later_stages(self) -> None:
         """Let what is wrong with a stage be said before the stages before it are trained: a method that
         waits for a checkpoint is made of its numbers and thrown away.

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from torch import nn
 
@@ -19,6 +19,7 @@ from forewarp.methods.voxel.method import VoxelMethod
 from forewarp.methods.voxel.planning import VoxelPlanning
 from forewarp.methods.voxel.stage import VoxelStage
 from forewarp.methods.voxel.start import Ground, carried, ground_of, is_carried, set_start_density
+from forewarp.methods.voxel.terms import voxel_terms
 from forewarp.renderer import Renderer
 
 
@@ -52,6 +53,11 @@ class VoxelModel:
         elif not start.blank:
             set_start_density(method, stage.start_alpha)
         return method.begin(start, stage)
+
+    def check(self, stage: str, numbers: Mapping[str, Any], literal: Sequence[str]) -> None:
+        """Refuse a stage's numbers, and terms without a printed form, before anything is read."""
+        VoxelStage(name=stage, **numbers)
+        voxel_terms(literal)
 
     def build(self, ground: Ground, stage: VoxelStage) -> VoxelMethod:
         """Make the method on lattices."""

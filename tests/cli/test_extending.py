@@ -1,0 +1,93 @@
+"""The files of docs/extending.md are written into a folder as the page says, and its commands are typed."""
+
+import importlib
+import json
+import re
+import sys
+from pathlib import Path
+
+import imageio.v3 as imageio
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from forewarp import load
+from forewarp.scene.camera import look_at
+
+PAGE = Path(__file__).parents[2] / "docs" / "extending.md"
+SMALL = [
+    *("data.root=scenes", "data.scene=toy", "trainer=cpu", "threads=1", "data.rays=32", "sheets=0"),
+    *("budget.minutes=null", "budget.iterations=10", "callbacks.pictures=null", "run=run"),
+]
+VOXELS = ["stage.coarse.voxels=[[0,800]]", "~stage.fine"]
+
+
+def files_of(page):
+    """Each file that the page gives whole: name -> text."""
+    return {name: text for name, text in re.findall(r"^`(mine/\S+)`\n\n```\w+\n(.*?)```", page, re.M | re.S)}
+
+
+def write_toy(folder):
+    """Sixteen pictures of a disc that rises, as the page's reader wants them."""
+    folder.mkdir(parents=True)
+    frames, rows = [], np.mgrid[:16, :16]
+    for i in range(16):
+        disc = np.hypot(rows[0] - 10 + i / 4, rows[1] - 8) < 3
+        imageio.imwrite(folder / f"{i}.png", disc[..., None] * np.array([128, 64, 128, 255], np.uint8))
+        turn = torch.tensor(0.4 * i)
+        center = torch.stack([3 * turn.cos(), 3 * turn.sin(), torch.tensor(1.0)])
+        pose = look_at(center, torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
+        frames.append({"image": f"{i}.png", "time": i / 15, "focal": 19.0, "pose": pose.tolist()})
+    content = {"size": [16, 16], "range": [1.0, 5.5], "box": [[-1] * 3, [1] * 3], "frames": frames}
+    (folder / "cameras.json").write_text(json.dumps(content))
+
+
+@pytest.fixture
+def work(in_tmp, monkeypatch):
+    """The page's folder, a scene in it, and a path that leads there."""
+    for name, text in files_of(PAGE.read_text()).items():
+        (in_tmp / name).parent.mkdir(parents=True, exist_ok=True)
+        (in_tmp / name).write_text(text)
+    for folder in ("mine", "mine/conf"):
+        (in_tmp / folder / "__init__.py").touch()
+    write_toy(in_tmp / "scenes" / "toy")
+    monkeypatch.syspath_prepend(str(in_tmp))
+    importlib.invalidate_caches()
+    yield in_tmp
+    for name in [name for name in sys.modules if name.split(".")[0] == "mine"]:
+        del sys.modules[name]
+
+
+def test_the_page_is_short_and_its_layout_is_what_it_gives():
+    page = PAGE.read_text()
+    assert len(page.splitlines()) <= 370
+    layout = page.split("```text\n")[1].split("```")[0]
+    for name, text in files_of(page).items():
+        assert re.search(rf"\b{Path(name).name}\b", layout), name
+        assert len([line for line in text.splitlines() if line.strip()]) <= 65
+        assert max(map(len, text.splitlines())) <= 110
+    assert len(files_of(page)) == 11
+
+
+@pytest.mark.parametrize("way", [["--config-dir", "mine/conf"], ["hydra.searchpath=[pkg://mine.conf]"]])
+def test_the_method_trains_on_the_data_of_the_page(forewarp, refused, work, way):
+    words = [*way, "experiment=mine", "model=balls", *SMALL]
+    shown = forewarp("train", *words, "--cfg", "job", "--resolve")
+    assert (shown.status, yaml.safe_load(shown.out)["model"]["count"]) == (0, 64)
+    done = forewarp("train", *words)
+    assert done.status == 0, done.err
+    assert "mine/psnr" in (work / "run" / "fine" / "csv" / "metrics.csv").read_text()
+    assert forewarp("train", *words).out.startswith("measured before")
+    assert "trust=[mine]" in refused("evaluate", "run=run")
+    assert forewarp("evaluate", "run=run", "trust=[mine]").status == 0
+    scene = load("run", trust=["mine"])
+    assert scene.trajectories(scene.matter().points, [0.0, 1.0]).shape == (64, 2, 3)
+
+
+def test_the_effect_is_switched_by_a_word(forewarp, work):
+    words = ["--config-dir", "mine/conf", "experiment=mine", *SMALL, *VOXELS, "evaluate=false"]
+    for choice, name in (("sheen", "Sheen"), ("none", "NoneType")):
+        done = forewarp("train", *words, f"model/view={choice}", f"run={choice}")
+        assert done.status == 0, done.err
+        assert type(load(choice, trust=["mine"]).method.view).__name__ == name
