@@ -118,6 +118,13 @@ def test_options_of_ones_own_stand_beside_ours(forewarp, way, in_tmp, monkeypatc
             "variant: expected none beside ablation=full, which is of model=forward, but got backward",
         ),
         (["objective.coarse.literal=[foto]"], "objective.literal: expected some of photo"),
+        (["+objective.coarse.weights.foto=1"], "objective: expected a term of photo, point_color"),
+        (["model=tnerf", "+stage.fine.hodl=0.3"], "stage.fine: expected a key of none, but got 'hodl'"),
+        (
+            ["model=tnerf", "variant=grid_64"],
+            "model: expected forward or backward, which grid_64 is",
+        ),
+        (["model=tnerf", "+stage.coarse.share=1"], "stage.coarse: expected a stage of the method, but got"),
         (["+model.inpainter.width=16"], "model.inpainter: expected a factory or null, but got {'width': 16}"),
     ],
 )

@@ -88,6 +88,9 @@ def test_every_question_is_asked_where_all_is_open(forewarp, words, in_tmp, monk
     assert done.status == 0, done.err
     assert len(fitted) == len(set(fitted))  # none of them twice
     (file,) = in_tmp.glob("runs/vehicle/plan-*/plan.yaml")
+    for trial in file.parent.glob("fine*"):  # a coarse stage is shared, and not fitted again
+        shared = trial / "coarse" / "last.ckpt"
+        assert any(shared.samefile(one) for one in file.parent.glob("coarse*/coarse/last.ckpt")), trial
     made = yaml.safe_load(file.read_text())
     assert made["evidence"]["trials"].keys() == set(EFFECTS)
     assert all(decision["on"] for decision in made["effects"].values())
@@ -160,12 +163,26 @@ def test_what_is_no_plan_is_refused(tmp_path, text):
 
 
 @pytest.mark.parametrize(
-    "word", ["hydra/launcher=ray", "trainer._target_=os.system", "~stage.fine", "x", "--config-dir=/", "-x=1"]
+    "word",
+    ["hydra/launcher=ray", "trainer._target_=os.system", "~stage.fine", "x", "--config-dir=/", "-x=1"]
+    + ["experiment=../../evil", "model/view=../../evil", "scene=/evil", "experiment@x=a/b", "a/../b=c"],
 )
 def test_a_plan_sets_no_code(tmp_path, word):
     write_plan(tmp_path / "plan.yaml", {"typed": ["data.scene=x"], "words": [word], "of": "0"})
     with pytest.raises(ValueError, match="expected words that a plan has"):
         read_plan(tmp_path / "plan.yaml")
+
+
+def test_what_a_plan_composes_names_no_code_of_others(refused, in_tmp):
+    """Whatever words lead there: the config of a planned run is looked at before anything is made of it."""
+    mine = in_tmp / "mine" / "callbacks"
+    mine.mkdir(parents=True)
+    (mine / "evil.yaml").write_text("x: {_target_: shutil.copyfile, src: a, dst: b, _partial_: true}\n")
+    file = in_tmp / "plan.yaml"
+    write_plan(file, {"typed": ["data.scene=x"], "words": ["callbacks=evil"], "of": "0"})
+    said = refused("train", f"plan={file}", f"--config-dir={mine.parent}", "evaluate=false")
+    assert "callbacks.x._target_: expected a class of forewarp, but got 'shutil.copyfile'" in said
+    assert not (in_tmp / "runs").exists()
 
 
 def test_a_plan_names_code_of_trusted_packages_and_never_trust(tmp_path):

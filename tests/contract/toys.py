@@ -71,6 +71,7 @@ class Splats(Method):
     density control ``every`` so many steps, ``most`` of them.
     """
 
+    numbers = ("count", "every", "most")
     terms = ("photo", "sparse")
     asks = Asks(kind="pictures", neighbours=1)
     grows = ("position", "velocity", "radius", "color", "opacity", "pull")

@@ -8,6 +8,7 @@ from itertools import islice
 import pytest
 import torch
 from dnerf_scene import write_tiny
+from tiny_scene import ball_scene
 
 from forewarp.data.batches import Sampler, Targets, color_of
 from forewarp.data.dnerf import read_scene
@@ -307,7 +308,7 @@ def test_neighbouring_times_come_after_the_picked_one_nearest_first(scene, kind)
         for one in batch.observations:
             torch.testing.assert_close(one.rgb, shown(scene, one))
         assert kind != "pixels" or [len(one.view) for one in batch.observations] == [4, 3, 3]
-    assert seen == {0: [0.25, 0.5], 1: [0.0, 0.5], 2: [0.25, 1.0], 3: [0.5, 0.25]}
+    assert seen == {0: [0.25, 0.5], 1: [0.0, 0.5], 2: [0.25, 0.0], 3: [0.5, 0.25]}
 
 
 def test_a_neighbouring_time_is_seen_from_any_of_its_cameras(scene):
@@ -359,3 +360,23 @@ def test_moving_a_batch_keeps_what_it_is_of(scene):
 def test_refuses_to_be_asked_for_what_there_is_not(wrong):
     with pytest.raises(ValueError, match="asks: expected a kind of pixels, crops, pictures, side >= 1,"):
         Asks(**wrong)
+
+
+def scene_of(times):
+    """A ball at these times, one picture each."""
+    return ball_scene(times=times, size=8)
+
+
+def test_neighbours_are_nearest_in_time_and_none_is_without_a_pixel():
+    scene = scene_of([0.0, 0.1, 0.2, 0.9, 1.0])
+    batch = Sampler(scene, rays=9, picker=lambda: 2, asks=Asks(neighbours=2)).draw()
+    assert {one.moment.time for one in batch.observations[1:]} == {0.0, 0.1}
+    few = Sampler(scene, rays=1, picker=lambda: 2, asks=Asks(neighbours=2)).draw()
+    assert [len(one.view) for one in few.observations] == [1]
+
+
+def test_a_training_picture_knows_which_it_is():
+    scene = scene_of([0.0, 0.5, 1.0])
+    white = torch.ones(3)
+    assert [t.moment.frame for t in Targets(scene.train, white, True, trained=True)] == [0, 1, 2]
+    assert Targets(scene.train, white, True)[1].moment.frame is None

@@ -2,6 +2,7 @@ import importlib
 from dataclasses import replace
 from functools import partial
 
+import lightning
 import pytest
 import torch
 
@@ -13,7 +14,9 @@ from forewarp.renderer import Renderer
 from forewarp.scene.box import Lattice
 from forewarp.scene.view import Moment, View
 from forewarp.training.curriculum import Curriculum
+from forewarp.methods.method import Step
 from forewarp.training.module import DynamicSceneModule
+from forewarp.training.objective import total
 from forewarp.methods.voxel.structure import resample
 from tiny_scene import BOX, RATES, backward_model, ball_data, begun, built, forward_model, stage, trainer
 
@@ -238,3 +241,37 @@ def test_without_a_schedule_all_bases_play():
 def test_a_term_that_the_method_does_not_know_is_refused():
     with pytest.raises(ValueError, match="objective: expected a term of photo, .*but got 'photos'"):
         module(weights={"photos": 1.0})
+
+
+class Drawing(lightning.Callback):
+    """Draws from torch's generator when training begins, as somebody else's may."""
+
+    def on_train_start(self, *_):
+        torch.rand(3)
+
+
+def test_what_is_drawn_when_training_begins_changes_nothing_after_it():
+    """A checkpoint's generator is put back last: a run that goes on draws as if it had not stopped."""
+    made = module()
+    checkpoint = _saved(made)
+    made.on_load_checkpoint(checkpoint)
+    Drawing().on_train_start()  # hooks of callbacks come before the module's
+    made.on_train_start()
+    made.on_train_end()
+    assert torch.equal(torch.get_rng_state(), checkpoint["forewarp"]["torch"])
+
+
+def _saved(made):
+    checkpoint = {}
+    made.on_save_checkpoint(checkpoint)
+    return checkpoint
+
+
+def test_gradients_and_terms_of_a_method_are_checked():
+    one = torch.ones(())
+    with pytest.raises(ValueError, match="expected gradients of some of a, but got none"):
+        total(Step({"photo": lambda: one}, one, gradients={}), {"photo": 1.0}, {"a": one})
+    with pytest.raises(ValueError, match="expected gradients of some of a, but got b"):
+        total(Step({"photo": lambda: one}, one, gradients={"b": one}), {"photo": 1.0}, {"a": one})
+    with pytest.raises(ValueError, match="expected look to give the term 'slow'"):
+        total(Step({"photo": lambda: one}, one), {"slow": 1.0}, {})

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from forewarp.methods.method import Step
+from forewarp.methods.method import Method, Step
 from forewarp.training.objective import Objective, parts, total
 
 
@@ -66,8 +66,12 @@ def test_a_method_may_bring_gradients_of_its_own():
 @pytest.mark.parametrize("given", [{"weights": {"photos": 1.0}}, {"weights": {}, "every": {"photos": 2}}])
 def test_a_term_that_the_method_does_not_know_is_refused(given):
     with pytest.raises(ValueError, match="objective: expected a term of photo, entropy, but got 'photos'"):
-        Objective(**given).check(("photo", "entropy"))
-    Objective({"photo": 1.0}).check(("photo", "entropy"))
+        Known.check("fine", (), Objective(**given).names)
+    Known.check("fine", (), Objective({"photo": 1.0}, every={"entropy": 2}).names)
+
+
+class Known(Method):
+    terms = ("photo", "entropy")
 
 
 @pytest.mark.parametrize("every", [0, 1.5])

@@ -27,7 +27,7 @@ def measure(run: Run, module: DynamicSceneModule, config: DictConfig) -> dict:
     nets = find_lpips(extra=[extra] if isinstance(extra, str) else extra)
     suite = ImageSuite(nets, mask_box=run.datamodule.scene.protocol.get("mask_box", False))
     module.to(device_of(config.trainer.accelerator))
-    protocol = {"method": config.model.name, "preset": config.preset.name, "seed": config.seed}
+    protocol = {"method": method_name(config), "preset": config.preset.name, "seed": config.seed}
     protocol |= {"minutes": config.budget.minutes, "iterations": config.budget.iterations}
     with Progress("test views") as progress:
         metrics = evaluate(
@@ -42,6 +42,12 @@ def measure(run: Run, module: DynamicSceneModule, config: DictConfig) -> dict:
         )
     show(metrics, run.folder, suite.absent)
     return metrics
+
+
+def method_name(config: DictConfig) -> str:
+    """Name the method that was measured: the last stage's own, or else the run's."""
+    own = [stage.get("model") for stage in config.stage.values() if stage is not None][-1]
+    return (own or config.model).get("name", config.model.name)
 
 
 def device_of(accelerator: str) -> torch.device:

@@ -16,6 +16,7 @@ from forewarp.cli.words import as_typed, key_of, merged, of_what_is_on
 from forewarp.training.progress import time_text
 
 MOST_BYTES = 1 << 20
+PATHS = ("lpips_weights",)  # keys of the first level that hold paths
 
 
 def write_plan(file: Path, made: dict) -> None:
@@ -65,8 +66,12 @@ def read_plan(file: Path, trust: Sequence[str] = (), typed: Sequence[str] = ()) 
 def _is_harmless(word: str) -> bool:
     """Whether a word may come from a file: none that hides code, or says how jobs are run, and no option."""
     sets = re.match(r"\+{0,2}[A-Za-z][\w./@]*=", word) is not None
-    hides = "_target_" in word and not (key_of(word).endswith("._target_") and word.count("_target_") == 1)
-    return sets and not hides and not key_of(word).startswith("hydra")
+    key, _, value = word.lstrip("+").partition("=")
+    hides = "_target_" in word and not (key.endswith("._target_") and word.count("_target_") == 1)
+    # A choice names a file below conf/, and none elsewhere.
+    chooses = "/" in key or "." not in key
+    climbs = chooses and key not in PATHS and re.fullmatch(r"[\w ,.+\-\[\]]*", value) is None
+    return sets and not hides and not climbs and ".." not in key and not key_of(word).startswith("hydra")
 
 
 def with_plan(name: str, words: list[str]) -> list[str]:
@@ -76,8 +81,9 @@ def with_plan(name: str, words: list[str]) -> list[str]:
         return words
     made = read_plan(Path(files[-1]).expanduser(), without_trust(words)[1])
     typed = [word for word in words if not word.startswith("plan=")]
+    planned = [word for word in planned_words(made) if word.startswith("model=")] or ["model=forward"]
     for word in typed:
-        if word.startswith("resume=") or (word.startswith("model=") and word != "model=forward"):
+        if word.startswith("resume=") or (word.startswith("model=") and word != planned[-1]):
             raise ValueError(f"{word}: expected no such word beside plan={files[-1]}; leave one of them out")
     file = files[-1].replace("\\", "\\\\").replace("'", "\\'")
     kept = [*planned_words(made), f"planned='{file}'", "effects=given"]

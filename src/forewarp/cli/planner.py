@@ -41,6 +41,7 @@ class Planner:
             self._choose,
             bool(config.plan.trials),
         )
+        trials.always, trials.always_fine = planning.always(self.asked)
         # The run's share that the last stage has: what a dear effect of it takes its steps from.
         shares = [stage.share for stage in stages.values()]
         minutes = self.settings.minutes and self.settings.minutes * shares[-1] / sum(shares)

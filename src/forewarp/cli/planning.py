@@ -38,9 +38,9 @@ def make_plan(config: DictConfig, words: Sequence[str]) -> dict:
     """
     asked_as = list(words)
     words = [word for word in words if key_of(word).split(".")[0] not in NOT_OF_IT]
-    refuse(config, words)
     run = build_run(config)
     planning = planning_of(run.model, config.model.name)
+    refuse(config, words)
     run.datamodule.setup("fit")
     # What is typed is not asked, even where it is what the configuration has anyway.
     asked = content_hash(config, ("plan",), sorted(words), run.datamodule.fingerprint())

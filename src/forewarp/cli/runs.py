@@ -25,7 +25,7 @@ def build_run(config: DictConfig) -> Run:
         torch.set_num_threads(config.threads)
     check_precision(config.trainer.get("precision"))
     data = instantiate(config.data, _convert_="all")
-    plans = {name: stage_of(stage) for name, stage in config.stage.items()}
+    plans = {name: stage_of(name, stage) for name, stage in config.stage.items()}
     watchers = [w for w in instantiate(config.callbacks, _convert_="all").values() if w is not None]
     trainer, logger = (instantiate(config[key], _convert_="all") for key in ("trainer", "logger"))
 
@@ -74,12 +74,17 @@ def model_of(config: DictConfig) -> Callable:
     return model
 
 
-def stage_of(config: DictConfig | None) -> StagePlan | None:
+def stage_of(name: str, config: DictConfig | None) -> StagePlan | None:
     """A stage that waits for its budget; where it names a ``model``, one with a method of its own."""
     if config is None:
         return None
     content = OmegaConf.to_container(config, resolve=True)
     own = content.pop("model", None)
+    if "_target_" not in content:
+        raise ValueError(
+            f"stage.{name}: expected a stage of the method, but got only {', '.join(content)}, which is of "
+            "another method's; leave out what sets it, or choose another model"
+        )
     plan = instantiate(content, _convert_="all")
     plan.model = None if own is None else model_of(OmegaConf.create(own))
     return plan

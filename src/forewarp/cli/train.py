@@ -49,11 +49,13 @@ def train(config) -> float | None:
     """Fit what is not finished, then measure what was not; returns the score, where one is wanted."""
     from forewarp.cli.absent import refuse_absent
     from forewarp.cli.identity import claim, hashed, resumed
-    from forewarp.cli.trusted import trust_of
+    from forewarp.cli.trusted import check_planned, trust_of
 
     refuse_seeds(config)
     refuse_two_models(config)
-    trust_of(config.get("trust"))
+    trust = trust_of(config.get("trust"))
+    if config.get("planned") is not None:
+        check_planned(config, trust)
     if config.get("score") not in (None, "psnr"):
         from forewarp.cli.score import named
 
@@ -148,14 +150,21 @@ def refuse_seeds(config) -> None:
 
 
 def refuse_two_models(config) -> None:
-    """Refuse ``variant=backward`` beside an ablation, which is of the forward method."""
+    """Refuse a variant or an ablation of another method, and ``variant=backward`` beside an ablation."""
     from hydra.core.hydra_config import HydraConfig
 
     chosen = HydraConfig.get().runtime.choices if HydraConfig.initialized() else {}
-    if chosen.get("variant") == "backward" and config.model.name != "backward":
+    both = chosen.get("variant") == "backward" and chosen.get("ablation") is not None
+    if both and config.model.name != "backward":
         raise ValueError(
             f"variant: expected none beside ablation={chosen.get('ablation')}, which is of model=forward, "
             "but got backward; leave one of them out, or use model=backward"
+        )
+    known = config.get("variant") or {}
+    if config.model.name not in known.get("of", [config.model.name]):
+        raise ValueError(
+            f"model: expected {' or '.join(known.of)}, which {known.name} is a change of, but got "
+            f"{config.model.name}; leave one of them out"
         )
 
 

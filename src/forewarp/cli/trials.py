@@ -18,7 +18,7 @@ from forewarp.cli.measure import device_of
 from forewarp.cli.runs import build_run
 from forewarp.cli.words import merged, of_what_is_on
 from forewarp.report.effect import Gain, Numbers
-from forewarp.training.handover import read_json, write_json
+from forewarp.training.handover import NUMBERS, POINTS, read_json, write_json
 from forewarp.training.module import DynamicSceneModule
 from forewarp.training.pictures import psnr_by_view
 from forewarp.training.stages import Run
@@ -67,8 +67,9 @@ class Trials:
         held_out: training views set aside and scored.
         tell: takes a line before each.
 
-    ``seconds_before`` is what those took that were found finished; ``made`` are the fine ones so far:
-    several effects are compared with the same.
+    ``always`` and ``always_fine`` are overrides of every trial and of every fine one, which the method's
+    planning says. ``seconds_before`` is what those took that were found finished; ``made`` are the fine ones
+    so far: several effects are compared with the same.
     """
 
     words: list[str]
@@ -81,10 +82,12 @@ class Trials:
     tell: Callable[[str], None] = print
     seconds_before: float = 0.0
     made: dict[str, Trial] = field(default_factory=dict)
+    always: Sequence[str] = ()
+    always_fine: Sequence[str] = ()
 
     def coarse(self, name: str, changes: Sequence[str]) -> tuple[Trial, Run, DynamicSceneModule]:
         """A coarse stage with these words, its run and what it fitted."""
-        config = self._config(name, changes, 0, self.steps, self.seconds)
+        config = self._config(name, changes, self.always, 0, self.steps, self.seconds)
         for later in list(config.stage)[1:]:
             config.stage[later] = None
         return self._fitted(config)
@@ -100,17 +103,23 @@ class Trials:
         if (known := self.made.get(f"{name}-seed{seed}")) is not None:
             return known
         seconds = self.fine_seconds if steps is None else None
-        config = self._config(f"{name}-seed{seed}", changes, seed, steps or self.fine_steps, seconds)
+        always = [*self.always, *self.always_fine]
+        config = self._config(f"{name}-seed{seed}", changes, always, seed, steps or self.fine_steps, seconds)
         first, last = list(config.stage)[0], list(config.stage)[-1]
         config.stage[first].share, config.stage[last].share = 1e-6, 1.0
-        config.stage[last].voxels = [[0, config.stage[last].voxels[0][1]]]
         self.made[f"{name}-seed{seed}"] = self._fitted(config, self.folder / after / first)[0]
         return self.made[f"{name}-seed{seed}"]
 
     def _config(
-        self, name: str, changes: Sequence[str], seed: int, steps: int, seconds: float | None
+        self,
+        name: str,
+        changes: Sequence[str],
+        always: Sequence[str],
+        seed: int,
+        steps: int,
+        seconds: float | None,
     ) -> DictConfig:
-        config = composed(of_what_is_on(merged(changes, self.words)))
+        config = composed(of_what_is_on(merged(merged(changes, self.words), always)))
         data = OmegaConf.to_container(config.data, resolve=True) | {"seed": config.seed + seed}
         with open_dict(config):
             config.data = data  # of the scene as planned, whatever it is drawn by
@@ -118,8 +127,6 @@ class Trials:
             config.budget.iterations, config.budget.minutes = steps, None if seconds is None else seconds / 60
             config.data.held_out, config.evaluate = self.held_out, False
             config.logger, config.callbacks = None, {"progress": config.callbacks.get("progress")}
-            # What is tried comes after: colour by direction would explain motion away.
-            config.stage[list(config.stage)[0]].effects = ["motion", "background"]
         self.tell(name)
         return config
 
@@ -155,7 +162,9 @@ def _share(source: Path, target: Path) -> None:
     beside = target.with_name(target.name + ".part")
     shutil.rmtree(beside, ignore_errors=True)
     beside.mkdir(parents=True)
-    for name in ("last.ckpt", "handover.json", "done.json"):
+    for name in ("last.ckpt", NUMBERS, POINTS, "done.json"):
+        if not (source / name).is_file():  # not every method leaves points
+            continue
         try:
             os.link(source / name, beside / name)
         except OSError:

@@ -97,6 +97,12 @@ def without_trust(words: Sequence[str]) -> tuple[list[str], tuple[str, ...]]:
     return rest, trust_of([name for text in lists for name in text.split(",")])
 
 
+def check_planned(config: DictConfig, trust: Sequence[str]) -> None:
+    """Refuse a composed config whose words came from a plan's file, where it could do more than a config."""
+    where = f"plan={config.planned}"
+    _check(OmegaConf.to_container(config, resolve=True), where, "", trust)
+
+
 def _check_events(text: str, where: Path) -> None:
     """Refuse what grows when it is built: aliases and endless nesting; of text too long nothing is parsed."""
     if len(text) > MOST_BYTES:

@@ -79,6 +79,8 @@ class Sampler(IterableDataset):
         if not 0 <= index < len(self.frames):
             raise ValueError(f"picker: expected a training frame in [0, {len(self.frames)}), but got {index}")
         frames = [*self._views(index), *self._neighbours(self.frames[index].time)]
+        if self.asks.kind == "pixels":
+            frames = frames[: self.rays]  # none without a pixel
         drawn = self._pixels(frames) if self.asks.kind == "pixels" else self._areas(frames)
         return Batch(tuple(drawn), index, self._instant(index))
 
@@ -106,9 +108,8 @@ class Sampler(IterableDataset):
         """A frame of each of the nearest other times, where the method asks for such: nearest first."""
         if not self.asks.neighbours:
             return []
-        place = self._times.index(time)
-        near = sorted(range(len(self._times)), key=lambda i: (abs(i - place), i))
-        chosen = [self._of_time[self._times[i]] for i in near[1 : self.asks.neighbours + 1]]
+        near = sorted((t for t in self._times if t != time), key=lambda other: abs(other - time))
+        chosen = [self._of_time[t] for t in near[: self.asks.neighbours]]
         return [frames[self._whole(len(frames))] for frames in chosen]
 
     def _pixels(self, frames: list[int]) -> Iterator[Observation]:
@@ -167,8 +168,11 @@ class Sampler(IterableDataset):
 class Targets(Sequence[Target]):
     """The frames as whole images over a constant background; decoded at the first use."""
 
-    def __init__(self, frames: Sequence[Frame], background: Tensor, has_alpha: bool) -> None:
+    def __init__(
+        self, frames: Sequence[Frame], background: Tensor, has_alpha: bool, *, trained: bool = False
+    ) -> None:
         self.frames, self.background, self.has_alpha = frames, background, has_alpha
+        self.trained = trained  # all training frames in their order, so that a frame's place is its index
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -180,4 +184,6 @@ class Targets(Sequence[Target]):
         foreground = None if depth is None else depth > 0
         if self.has_alpha:
             foreground = rgba[..., 3] > 127  # at least half covered
-        return Target(frame, composited(rgba, self.background), self.background, foreground, depth)
+        place = index % len(self.frames) if self.trained else None
+        rgb = composited(rgba, self.background)
+        return Target(frame, rgb, self.background, foreground, depth, place)

@@ -108,7 +108,8 @@ class SceneDataModule(LightningDataModule):
         """The whole images of ``train``, ``val``, ``test`` or ``held``."""
         if split not in ("train", "val", "test", "held"):
             raise SceneError(f"split: expected train, val, test or held, but got {split!r}")
-        return Targets(getattr(self.scene, split), color_of(self.eval_background), self.scene.has_alpha)
+        behind = color_of(self.eval_background)
+        return Targets(getattr(self.scene, split), behind, self.scene.has_alpha, trained=split == "train")
 
     def watched(self) -> Targets:
         """Whose PSNR a run's curve is of: the views set aside, or else up to 8 of the validation views."""

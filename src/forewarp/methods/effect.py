@@ -159,6 +159,9 @@ class Planning(Protocol):
     def evidence(self, pictures: Pictures, **bounds) -> Evidence:
         """Begin with what the pictures say."""
 
+    def always(self, asked: Asked) -> tuple[Sequence[str], Sequence[str]]:
+        """Name the overrides of every trial, and those of fine ones beside them."""
+
     def coarse(self, evidence: Evidence, asked: Asked) -> Generator[Begin | Rival, bool | None, None]:
         """Name the coarse stages to fit, one after the other, and hear of each rival whether it pays."""
 

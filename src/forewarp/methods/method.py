@@ -77,12 +77,16 @@ class Snapshot:
 class Method(nn.Module):
     """A scene that is learned. Give ``at`` and ``look``; the rest has defaults.
 
-    ``terms`` are the loss terms it knows; ``asks`` what it wants of the sampler; ``effects`` its optional
-    parts (see ``methods.effect``). Parameters named in ``grows`` may change their number of rows while they
-    are trained, and adopt a checkpoint's. Optional abilities are protocols in ``methods.abilities``.
+    ``terms`` are the loss terms it knows, ``literal`` those of them with a printed form of their own, and
+    ``numbers`` the keys of a stage; ``asks`` what it wants of the sampler; ``effects`` its optional parts
+    (see ``methods.effect``). Parameters and buffers named in ``grows``, dotted in parts of it, may change
+    their number of rows while they are trained, and adopt a checkpoint's. Optional abilities are protocols
+    in ``methods.abilities``.
     """
 
     terms: ClassVar[Sequence[str]] = ("photo",)
+    literal: ClassVar[Sequence[str]] = ()
+    numbers: ClassVar[Sequence[str]] = ()
     asks: Asks = Asks()
     effects: ClassVar[Sequence] = ()
     grows: ClassVar[Sequence[str]] = ()
@@ -93,7 +97,8 @@ class Method(nn.Module):
 
     def look(self, batch: Batch, factors: Mapping[str, float], generator: torch.Generator) -> Step:
         """Compare with a batch. ``factors`` are the terms that count in this step, with their weights; all
-        that is random is drawn from ``generator``.
+        that is random is drawn from ``generator``. A step may be looked at again where a number is not
+        finite, so what it counts lies in buffers, which are then put back.
         """
         raise NotImplementedError
 
@@ -137,19 +142,45 @@ class Method(nn.Module):
         return set(self.grows)
 
     def misfit(self, state: Mapping[str, Tensor]) -> str | None:
-        """Name an entry of a stored state that contradicts the others; None where all is well."""
+        """Name an entry of a stored state that contradicts the others; None where all is well. All that
+        ``grows`` has as many rows as the first: kernels read one by the row of the other.
+        """
+        rows = {tuple(getattr(state[name], "shape", ()))[:1] for name in self.grows[:1]}
         for name in self.grows:
-            shape = tuple(getattr(state[name], "shape", ()))
-            if not shape or shape[1:] != tuple(getattr(self, name).shape[1:]):
+            shape, own = tuple(getattr(state[name], "shape", ())), part_of(self, name)
+            if shape[:1] not in rows or not shape or shape[1:] != tuple(own.shape[1:]):
+                return name
+            if state[name].dtype != own.dtype:
                 return name
         return None
 
+    @classmethod
+    def check(
+        cls, stage: str, numbers: Iterable[str], terms: Iterable[str], literal: Iterable[str] = ()
+    ) -> None:
+        """Refuse what a stage says and this method does not know, before anything is read."""
+        for key, what, given, known in (
+            (f"stage.{stage}", "a key of", numbers, cls.numbers),
+            ("objective", "a term of", terms, cls.terms),
+            ("objective.literal", "some of", literal, cls.literal),
+        ):
+            for name in given:
+                if name not in known:
+                    there = ", ".join(known) or "none"
+                    raise ValueError(f"{key}: expected {what} {there}, but got '{name}'")
+
     def _load_from_state_dict(self, state_dict, prefix, *args, **kwargs) -> None:
-        for name in self.grows:
+        for name in self.grows:  # also of its parts, which load after it
             if prefix + name in state_dict:
-                parameter = getattr(self, name)
-                parameter.data = parameter.data.new_empty(state_dict[prefix + name].shape)
+                own = part_of(self, name)
+                own.data = own.data.new_empty(state_dict[prefix + name].shape)
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
+
+
+def part_of(method: nn.Module, name: str) -> Tensor:
+    """Find a parameter or buffer by its dotted name."""
+    place, _, last = name.rpartition(".")
+    return getattr(method.get_submodule(place), last)
 
 
 def parameter_count(method: nn.Module) -> int:

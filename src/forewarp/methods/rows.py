@@ -6,25 +6,45 @@ import torch
 from torch import Tensor, nn
 from torch.nn import Parameter
 
+from forewarp.methods.method import part_of
+
 
 @torch.no_grad()
-def take_rows(method: nn.Module, optimizer: torch.optim.Optimizer, rows: Tensor) -> None:
+def take_rows(
+    method: nn.Module, optimizer: torch.optim.Optimizer, rows: Tensor, fresh: Tensor | None = None
+) -> None:
     """Let every parameter and buffer named in ``method.grows`` hold the ``rows`` (N',) of its own N, in this
     order; a row that is named twice is copied, one that is not named is gone.
+
+    Args:
+        method: whose parts change.
+        optimizer: whose moments follow.
+        rows: int64, each in [0, N).
+        fresh: (N',) bool, rows whose moments start at 0; None: every row keeps those of its source.
+
+    Raises:
+        ValueError: for rows that there are not.
 
     Cost: one copy of each, and of its moments.
     """
     before, after = [], []
+    count = len(part_of(method, method.grows[0]))
+    if rows.dtype != torch.int64 or (len(rows) and not 0 <= int(rows.min()) <= int(rows.max()) < count):
+        raise ValueError(
+            f"rows: expected int64 in [0, {count}), but got {rows.dtype}: {rows[:5].tolist()} ..."
+        )
     for name in method.grows:
-        value = getattr(method, name)
+        place, _, last = name.rpartition(".")
+        owner, value = method.get_submodule(place), part_of(method, name)
+        taken = value.data[rows.to(value.device)]
         if isinstance(value, Parameter):
             # A new Parameter: autograd remembers an old one's shape for as long as any graph lives.
             before.append(value)
-            after.append(Parameter(value.data[rows]))
-            setattr(method, name, after[-1])
+            after.append(Parameter(taken, requires_grad=value.requires_grad))
+            setattr(owner, last, after[-1])
         else:
-            setattr(method, name, value[rows])
-    renew_parameters(optimizer, before, after, rows)
+            setattr(owner, last, taken)
+    renew_parameters(optimizer, before, after, rows if fresh is None else rows.masked_fill(fresh, -1))
 
 
 def renew_parameters(
@@ -50,6 +70,7 @@ def renew_parameters(
             if rows is None or not len(value):
                 state[key] = torch.zeros_like(new)
             else:
-                known = (rows >= 0).reshape(-1, *[1] * (value.dim() - 1))
-                state[key] = torch.where(known, value[rows.clamp(min=0)], 0.0)
+                at = rows.to(value.device)
+                known = (at >= 0).reshape(-1, *[1] * (value.dim() - 1))
+                state[key] = torch.where(known, value[at.clamp(min=0)], 0.0)
         optimizer.state[new] = state

@@ -69,15 +69,13 @@ class Batch:
 
     def joined(self) -> tuple[Rays, Tensor, Tensor]:
         """Put the rays of all observations after one another, on the CPU, with their true colours (R, 3) and
-        backgrounds: (R, 3), or (3,) where one colour is behind all. For methods that ask for one time.
+        backgrounds: (R, 3), or (3,) of a single one. For methods that ask for one time.
         """
         rays = joined([one.view.rays() for one in self.observations])
         rgb = [one.rgb for one in self.observations]
         behind = [one.background for one in self.observations]
         if len(rgb) == 1:
             return rays, rgb[0], behind[0]
-        if behind[0].dim() == 1 and all(torch.equal(behind[0], other) for other in behind[1:]):
-            return rays, torch.cat(rgb), behind[0]
         each = [b.expand(len(one.view), 3) for b, one in zip(behind, self.observations)]
         return rays, torch.cat(rgb), torch.cat(each)
 
@@ -95,7 +93,7 @@ class Batch:
 class Target:
     """A whole image to compare with: ``rgb`` (H, W, 3) in [0, 1] over ``background`` (3,);
     ``foreground`` (H, W) bool where the image tells it, ``depth`` (H, W) exact ray depth in world units
-    (0 on the background) where it is known.
+    (0 on the background) where it is known, ``index`` that of a training frame.
     """
 
     frame: Frame
@@ -103,11 +101,12 @@ class Target:
     background: Tensor
     foreground: Tensor | None = None
     depth: Tensor | None = None
+    index: int | None = None
 
     @property
     def moment(self) -> Moment:
         """When it was taken, and by which camera."""
-        return Moment(self.frame.time, camera=self.frame.camera_id)
+        return Moment(self.frame.time, self.index, self.frame.camera_id)
 
     @property
     def view(self) -> View:
@@ -117,4 +116,5 @@ class Target:
     def to(self, device) -> Target:
         """The same target with its tensors on another device."""
         foreground, depth = (None if t is None else t.to(device) for t in (self.foreground, self.depth))
-        return Target(self.frame, self.rgb.to(device), self.background.to(device), foreground, depth)
+        moved = self.rgb.to(device), self.background.to(device)
+        return Target(self.frame, *moved, foreground, depth, self.index)

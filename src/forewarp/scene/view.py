@@ -66,7 +66,11 @@ class View:
         return (rows + torch.arange(left, left + width)).flatten()
 
     def rays(self) -> Rays:
-        """The rays (R) through the centres of the pixels, on the CPU."""
+        """The rays (R) through the centres of the pixels, on the CPU; made once."""
+        return self._rays
+
+    @cached_property
+    def _rays(self) -> Rays:
         return self.camera.rays(self.indices)
 
 

@@ -42,7 +42,7 @@ def share_out(
     """
     kept = {name: plan for name, plan in plans.items() if plan is not None}
     if not kept:
-        raise ValueError("stage: expected at least one stage, but got none; choose stage=fast")
+        raise ValueError("stage: expected at least one stage, but got none; leave one of them on")
     for name, plan in kept.items():
         if not (isinstance(plan.share, int | float) and plan.share > 0):
             raise ValueError(

@@ -48,14 +48,15 @@ def draw(module: DynamicSceneModule, targets: Sequence[Target]) -> Iterator[Show
     snapshot = None
     for number in sorted(range(len(targets)), key=lambda i: targets.frames[i].time):
         target = targets[number]
-        begin = now()
+        begin, view = now(), target.view
         with torch.no_grad():
             if snapshot is None or not snapshot.holds(target.moment):
                 snapshot = module.method.at(target.moment)
+            view.rays()
             behind, drawn, warped = target.background.to(module.device), {}, now() - begin
             for name in snapshot.renderings:
                 begin = now()
-                drawn[name] = snapshot.render(target.view, behind, name)
+                drawn[name] = snapshot.render(view, behind, name)
                 again = now() - begin
         yield Shown(number, target, drawn, warped + again, again)
 

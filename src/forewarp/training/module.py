@@ -40,7 +40,7 @@ class DynamicSceneModule(lightning.LightningModule):
         seed: int = 0,
     ) -> None:
         super().__init__()
-        objective.check(method.terms)
+        method.check(settings.name, (), objective.names)
         self.method = method
         self.objective, self.settings = objective, settings
         self.curriculum = curriculum
@@ -48,6 +48,7 @@ class DynamicSceneModule(lightning.LightningModule):
         self.clock = Clock()
         self.last: dict[str, float] = {}
         self._noted: Mapping[str, float] = {}
+        self._torch_state: Tensor | None = None
 
     @property
     def fraction(self) -> float:
@@ -58,7 +59,9 @@ class DynamicSceneModule(lightning.LightningModule):
         """The loss of one batch."""
         factors = self.objective.factors(self.global_step)
         step = self.look(batch, factors)
-        loss, raw = total(step, factors, dict(self.method.named_parameters()) if step.gradients else {})
+        loss, raw = total(
+            step, factors, dict(self.method.named_parameters()) if step.gradients is not None else {}
+        )
         self._remember(batch, step, loss, raw)
         return loss
 
@@ -93,6 +96,9 @@ class DynamicSceneModule(lightning.LightningModule):
     def on_train_start(self) -> None:
         """Start the training clock, once all is ready: compiling kernels is not training."""
         self.method.warm_up()
+        if self._torch_state is not None:  # last, so that nothing above has drawn in between
+            torch.set_rng_state(self._torch_state)
+            self._torch_state = None
         self.clock.start()
 
     def on_train_end(self) -> None:
@@ -146,7 +152,8 @@ class DynamicSceneModule(lightning.LightningModule):
         """Continue from ``on_save_checkpoint``."""
         state = checkpoint["forewarp"]
         self.generator.set_state(state["generator"])
-        torch.set_rng_state(state["torch"])
+        self._torch_state = state["torch"]
+        torch.set_rng_state(self._torch_state)
         self.curriculum.load_state_dict(state["curriculum"])
         self.clock.load_state_dict(state["clock"])
 

@@ -34,11 +34,10 @@ class Objective:
         self.weights = {name: float(w) for name, w in weights.items()}
         self.literal, self.photo_on = tuple(literal), photo_on
 
-    def check(self, known: Sequence[str]) -> None:
-        """Refuse a term that a method does not know."""
-        for name in (*self.weights, *self.every):
-            if name not in known:
-                raise ValueError(f"objective: expected a term of {', '.join(known)}, but got '{name}'")
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Every term that is spoken of."""
+        return (*self.weights, *self.every)
 
     def factors(self, number: int) -> dict[str, float]:
         """The terms that count in step ``number``, with what each is multiplied by."""
@@ -54,6 +53,11 @@ def parts(step: Step, factors: Mapping[str, float]) -> dict[str, tuple[Tensor, f
     """Every term of a step that is evaluated, with its factor, by name."""
     found = {}
     for name, factor in factors.items():
+        if name not in step.terms:
+            raise ValueError(
+                f"model: expected look to give the term '{name}', as the method's terms say, but got "
+                f"{', '.join(step.terms) or 'none'}"
+            )
         value = step.terms[name]()
         if value is not None:  # else the effect that it measures is off
             found[name] = value, factor
@@ -73,10 +77,13 @@ def total(step: Step, factors: Mapping[str, float], parameters: Mapping[str, Ten
         raw[name] = value.detach()
         loss = loss.to(value) + factor * value
     if step.gradients is not None:
-        names = list(step.gradients)
-        loss = _Given.apply(
-            loss.detach(), [step.gradients[n] for n in names], *(parameters[n] for n in names)
-        )
+        if not step.gradients or not step.gradients.keys() <= parameters.keys():
+            raise ValueError(
+                f"model: expected gradients of some of {', '.join(parameters)}, but got "
+                f"{', '.join(step.gradients) or 'none'}"
+            )
+        names, gradients = zip(*step.gradients.items())
+        loss = _Given.apply(loss.detach(), gradients, *(parameters[name] for name in names))
     return loss, raw
 
 
@@ -90,4 +97,6 @@ class _Given(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, slope: Tensor) -> tuple:
+        if slope.device.type == "cpu" and float(slope) == 1:  # nobody scales it: no copies
+            return None, None, *ctx.gradients
         return None, None, *(slope * gradient for gradient in ctx.gradients)

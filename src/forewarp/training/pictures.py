@@ -18,6 +18,8 @@ from forewarp.scene.camera import Camera
 from forewarp.scene.view import Moment, View
 from forewarp.training.module import DynamicSceneModule
 
+_SEEN = 0.02  # opacity of a pixel whose motion is shown
+
 
 def sized(camera: Camera, size: int) -> Camera:
     """The same view with ``size`` pixels along its longer side."""
@@ -65,9 +67,11 @@ def image_flow(module: DynamicSceneModule, camera: Camera, time: float) -> tuple
     canonical = Moment(module.curriculum.canonical_time)
     drawn = module.render(view, canonical, torch.zeros(3))
     rays = view.rays().to(module.device)
-    at = rays.origins + drawn.depth[:, None] * rays.directions
+    seen = drawn.opacity > _SEEN
+    at = rays.origins[seen] + drawn.depth[seen, None] * rays.directions[seen]
     moved = module.method.trajectories(at, torch.tensor([time], device=at.device))[:, 0]
-    flow = camera.project(moved)[0] - camera.project(at)[0]
+    flow = drawn.rgb.new_zeros(len(seen), 2)
+    flow[seen] = (camera.project(moved)[0] - camera.project(at)[0]).to(flow)
     shape = (camera.height, camera.width)
     return flow.reshape(*shape, 2), drawn.opacity.reshape(shape)
 

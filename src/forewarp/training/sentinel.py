@@ -190,9 +190,12 @@ class Sentinel(lightning.Callback):
         """
         after = module.generator.get_state()
         module.generator.set_state(self._random["samples"])
+        counted = {name: value.clone() for name, value in module.method.named_buffers()}
         with trainer.precision_plugin.forward_context(), torch.enable_grad():
             again = diagnose(module, self._batch, self._number)
         module.generator.set_state(after)
+        for name, value in module.method.named_buffers():
+            value.copy_(counted[name])
         found = str(again or f"{seen}, though not when the step was repeated,")
         path = self.folder / "broken" / f"step_{self._number}.pt"
         noted = {"found": found, "stage": module.settings.name, "step": self._number, "random": self._random}

@@ -85,13 +85,13 @@ class Run:
         return module
 
     def check(self) -> None:
-        """Refuse numbers that a stage's method does not take, before anything is read; of models that have a
-        ``check(stage, numbers, literal)``.
-        """
+        """Refuse what a stage's method does not know, before anything is read; see ``Method.check``."""
         for stage in self.stages:
-            check = getattr(stage.model or self.model, "check", None)
+            model = stage.model or self.model
+            check = getattr(getattr(model, "func", model), "check", None)
             if check is not None:
-                check(stage.settings.name, stage.settings.numbers, stage.objective.literal)
+                objective = stage.objective
+                check(stage.settings.name, stage.settings.numbers, objective.names, objective.literal)
 
     def _check_later_stages(self) -> None:
         """Let what is wrong with a stage be said before the stages before it are trained: a method that

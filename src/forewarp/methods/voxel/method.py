@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from forewarp.fields.radiance import DirectRadiance, FeatureRadiance
-from forewarp.fields.radiance_grid import Activation
+from forewarp.fields.radiance_grid import Activation, shaded
 from forewarp.fields.voxel_grid import VoxelGrid
 from forewarp.methods.method import Method, Start, Step
 from forewarp.methods.voxel.checks import check_effect
@@ -18,7 +18,7 @@ from forewarp.methods.voxel.lattices import Lattices
 from forewarp.methods.voxel.snapshot import VoxelSnapshot
 from forewarp.methods.voxel.stage import VoxelStage
 from forewarp.methods.voxel.structure import box_of_all_times
-from forewarp.methods.voxel.terms import TERMS, Seen, voxel_terms
+from forewarp.methods.voxel.terms import LITERAL, TERMS, Seen, voxel_terms
 from forewarp.ops.grid import neighbour_pairs
 from forewarp.ops.warmup import warm_up
 from forewarp.renderer import Renderer
@@ -42,7 +42,7 @@ class VoxelMethod(Method):
         background: all that stands still, on a grid of its own; None: a constant colour is behind everything.
     """
 
-    terms = TERMS
+    terms, literal = TERMS, LITERAL
     moves: bool
 
     def __init__(
@@ -170,12 +170,13 @@ class VoxelMethod(Method):
 
     @torch.no_grad()
     def matter(self) -> Cloud:
-        """Give the centres of solid canonical voxels, seen from no side in particular."""
+        """Give the centres of solid canonical voxels; a colour is the mean of those seen from six sides."""
         grid = self.radiance()
         alpha = grid.activation.alpha(grid.raw_density, grid.lattice.pitch)
         solid = alpha > SOLID
         points = grid.lattice.to_world(self.radiance.voxels[solid])
-        colors = torch.sigmoid(grid.color[solid, :3])
+        towards = torch.cat([torch.eye(3), -torch.eye(3)]).to(grid.values)
+        colors = sum(shaded(grid.color[solid], d.expand(len(points), 3), self.view) for d in towards) / 6
         return Cloud(points, colors, alpha[solid], grid.lattice.pitch)
 
     def notes(self) -> dict[str, float]:

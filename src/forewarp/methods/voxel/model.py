@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar
 
@@ -19,7 +19,6 @@ from forewarp.methods.voxel.method import VoxelMethod
 from forewarp.methods.voxel.planning import VoxelPlanning
 from forewarp.methods.voxel.stage import VoxelStage
 from forewarp.methods.voxel.start import Ground, carried, ground_of, is_carried, set_start_density
-from forewarp.methods.voxel.terms import voxel_terms
 from forewarp.renderer import Renderer
 
 
@@ -54,10 +53,13 @@ class VoxelModel:
             set_start_density(method, stage.start_alpha)
         return method.begin(start, stage)
 
-    def check(self, stage: str, numbers: Mapping[str, Any], literal: Sequence[str]) -> None:
-        """Refuse a stage's numbers, and terms without a printed form, before anything is read."""
+    @staticmethod
+    def check(
+        stage: str, numbers: Mapping[str, Any], terms: Iterable[str], literal: Iterable[str] = ()
+    ) -> None:
+        """Refuse what a stage says and no voxel method knows, before anything is read."""
         VoxelStage(name=stage, **numbers)
-        voxel_terms(literal)
+        VoxelMethod.check(stage, (), terms, literal)
 
     def build(self, ground: Ground, stage: VoxelStage) -> VoxelMethod:
         """Make the method on lattices."""

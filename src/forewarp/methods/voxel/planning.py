@@ -131,8 +131,11 @@ def _not_in_coarse(asked: Asked) -> tuple[str, ...]:
 
 def _as_tried(asked: Asked) -> tuple[str, ...]:
     """What is dear sees whole volumes: on the lattice that it was tried on."""
-    voxels = asked.stages[asked.last]["voxels"][0][1]
-    return (*_not_in_coarse(asked), f"stage.{asked.last}.voxels=[[0,{voxels}]]")
+    return (*_not_in_coarse(asked), *_on_first_lattice(asked))
+
+
+def _on_first_lattice(asked: Asked) -> tuple[str, ...]:
+    return (f"stage.{asked.last}.voxels=[[0,{asked.stages[asked.last]['voxels'][0][1]}]]",)
 
 
 def _view_is_out(evidence: VoxelEvidence) -> bool:
@@ -164,6 +167,10 @@ class VoxelPlanning:
     def evidence(self, pictures: Pictures, **bounds) -> VoxelEvidence:
         """Begin with what the pictures say."""
         return VoxelEvidence(pictures, **bounds)
+
+    def always(self, asked: Asked) -> tuple[Sequence[str], Sequence[str]]:
+        """Try later effects after the coarse stage alone, and on the first lattice of the last one."""
+        return _not_in_coarse(asked), _on_first_lattice(asked)
 
     def coarse(self, evidence: VoxelEvidence, asked: Asked) -> Generator[Begin | Rival, bool | None, None]:
         """Ask: in how many cosines does something move, does it, what stands still behind it?"""

@@ -60,7 +60,12 @@ def ground_of(model: _HasBackground, start: Start, stage: VoxelStage) -> Ground:
     else:
         lattice = Lattice.of_count(box, stage.at("voxels", 0.0))
         known = {} if start.handover is None else start.handover.notes
-        unit, active = known.get("unit") or lattice.pitch, _first(start, lattice, stage)
+        unit, active = known.get("unit", lattice.pitch), _first(start, lattice, stage)
+        if not unit > 0:
+            raise ValueError(
+                f"stage.{start.stage}: expected a unit of density > 0 from the stage before, but got {unit}; "
+                "delete the folder of that stage"
+            )
     still = None
     if model.background is not None and "background" in stage.effects:
         still = _still(scene.box.scaled(1.05), stage, getattr(before, "background", None))
