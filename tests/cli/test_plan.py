@@ -180,7 +180,7 @@ def test_what_a_plan_composes_names_no_code_of_others(refused, in_tmp):
     (mine / "evil.yaml").write_text("x: {_target_: shutil.copyfile, src: a, dst: b, _partial_: true}\n")
     file = in_tmp / "plan.yaml"
     write_plan(file, {"typed": ["data.scene=x"], "words": ["callbacks=evil"], "of": "0"})
-    said = refused("train", f"plan={file}", f"--config-dir={mine.parent}", "evaluate=false")
+    said = refused("train", f"plan={file}", "evaluate=false", f"--config-dir={mine.parent}")
     assert "callbacks.x._target_: expected a class of forewarp, but got 'shutil.copyfile'" in said
     assert not (in_tmp / "runs").exists()
 
