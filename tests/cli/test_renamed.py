@@ -39,7 +39,7 @@ def test_words_of_today_are_not():
         "model.renderer.step=1",
         "stage=forward_demo",
     ]
-    refuse_renamed([*words, "--multirun", "experiment=hypernerf", "data.background=white"])
+    assert refuse_renamed([*words, "--multirun", "experiment=hypernerf", "data.background=white"]) is None
 
 
 @pytest.mark.parametrize(

@@ -177,7 +177,7 @@ def test_what_is_not_trusted_is_refused_before_it_is_imported(strangers):
 @pytest.mark.parametrize("name", ["Thing", "thing", "Thing.make", "Renderer"])
 def test_a_trusted_package_may_be_named(strangers, name):
     for trust in ("strangers", "strangers.module"):
-        read(target(f"strangers.module.{name}"), trust)
+        assert read(target(f"strangers.module.{name}"), trust) is not None
 
 
 @pytest.mark.parametrize(
