@@ -143,7 +143,8 @@ def test_targets_are_loaded_when_asked_for(scene):
         loads.append(1)
         return torch.tensor([[[255, 0, 0, 255], [255, 0, 0, 0], [255, 0, 0, 127]]], dtype=torch.uint8)
 
-    frame = Frame("a", 0.0, scene.train[0].camera, load, lambda: torch.tensor([[1.0, 0.0, 2.0]]))
+    camera = scene.train[0].camera.resized(3, 1)
+    frame = Frame("a", 0.0, camera, load, lambda: torch.tensor([[1.0, 0.0, 2.0]]))
     targets = Targets([frame], color_of("black"), has_alpha=True)
     assert (len(targets), loads) == (1, [])
     target = targets[0]

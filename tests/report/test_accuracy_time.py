@@ -42,7 +42,7 @@ def test_a_target_of_ones_own_and_what_has_no_curve(tmp_path):
     other = Published("other", 100.0, 32.0, "a GPU", "its paper", "dnerf")
     page = page_of(tmp_path, target=20.0, published=[other])
     assert rows(page, "base")[0][4:7] == ["10.0", "25.50", "0.2500"]
-    assert "* ball/failed-1.0-seed0: no accuracy_time.csv; run its command again" in page
+    assert "* ball/failed-1.0-seed0: no accuracy_time.csv; run its command with data.held_out=8" in page
     assert "* ball/killed-1.0-seed0: no metrics.json; run its command again" in page
     assert not rows(page, "killed")
     assert "* other: 32 dB, 100 s, a GPU; its paper" in page

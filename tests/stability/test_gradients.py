@@ -11,11 +11,12 @@ from torch.autograd import gradcheck
 
 from forewarp import ops
 from forewarp.ops import backend
-from forewarp.ops.composite import accumulate, render_weights
+from forewarp.ops.composite import accumulate, dense_weights, render_weights
 from forewarp.ops.dct import dct_basis
 from forewarp.ops.encode import positional_encoding, spherical_harmonics_1
 from forewarp.ops.grid import corner_weights, neighbour_pairs, trilinear, trilinear_reference
 from forewarp.ops.lens import distort
+from forewarp.ops.samples import midpoints, union
 from forewarp.ops.splat import average_splat, scatter_reference, with_copies
 from forewarp.ops.variation import patch_variation, total_variation
 from hard_cases import index_with
@@ -35,6 +36,9 @@ WITHOUT = {
     "march": "places samples; says so",
     "march_reference": "places samples; says so",
     "check_march": "a guard",
+    "stratified": "places samples",
+    "by_importance": "places samples; says so",
+    "clip_to_box": "of rays, which are not learned",
     "map_cells": "whole numbers",
     "unfolded": "a yes or no",
     "trace": "for pictures; says so",
@@ -129,6 +133,11 @@ CHECKS = {
     "scatter_reference": check_scatter,
     "render_weights": check_weights,
     "accumulate": check_accumulate,
+    "dense_weights": lambda seed: gradcheck(dense_weights, draw(seed, 3, 4).exp().requires_grad_()),
+    "midpoints": lambda seed: gradcheck(midpoints, draw(seed, 3, 4).requires_grad_()),
+    "union": lambda seed: gradcheck(
+        union, (draw(seed, 3, 4).requires_grad_(), draw(seed + 1, 3, 2).requires_grad_())
+    ),
     "total_variation": check_total_variation,
     "patch_variation": lambda seed: gradcheck(
         lambda d: patch_variation(d, draw(seed, 2, 3, 3).sigmoid()), draw(seed + 1, 2, 3, 3).requires_grad_()

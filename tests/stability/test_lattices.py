@@ -29,7 +29,7 @@ def radiance(lattice=LATTICE, raw=5.0, device="cpu"):
 class Still(torch.nn.Module):
     """A method without motion."""
 
-    motion = None
+    motion, moves = None, False
 
     def __init__(self, field):
         super().__init__()

@@ -179,8 +179,16 @@ def one_line(error: BaseException) -> str | None:
     if isinstance(error, TypeError) and "unexpected keyword argument" in str(error):
         return f"config: {error}; leave that key out"
     if isinstance(error, ImportError):
-        return _flat(str(error)) + ("" if "forewarp[" in str(error) else "; install it with make install")
+        return _flat(str(error)) + ("" if "forewarp[" in str(error) else _to_install(error))
     return _flat(str(error)) if isinstance(error, ValueError) else None
+
+
+def _to_install(error: ImportError) -> str:
+    """What to do about a package that is not there: of our own extras, or somebody else's."""
+    ours = ("numba", "trimesh", "embreex", "scipy", "matplotlib", "tensorboard", "imageio")
+    if error.name is None or error.name.partition(".")[0] in ours:
+        return "; install it with make install"
+    return f"; install {error.name.partition('.')[0]}, or put its folder on PYTHONPATH"
 
 
 def _absent_plugin(text: str) -> tuple[str, ...] | None:

@@ -54,9 +54,12 @@ def _composed(conf: Path, name: str, words: list[str]):
     from hydra.core.global_hydra import GlobalHydra
 
     GlobalHydra.instance().clear()
+    dirs = [word.partition("=")[2] for word in words if word.startswith("--config-dir=")]
+    dirs += [after for before, after in zip(words, words[1:]) if before == "--config-dir"]
+    more = [f"hydra.searchpath=[{','.join(f'file://{Path(d).resolve()}' for d in dirs)}]"] if dirs else []
     with hydra.initialize_config_dir(str(conf), version_base="1.3"):
         with suppress(Exception):  # the mistakes in them are not the one that is told
-            return hydra.compose(name, [word for word in words if "=" in word and word[:1] != "-"])
+            return hydra.compose(name, [*more, *(w for w in words if "=" in w and w[:1] != "-")])
         return hydra.compose(name)
 
 

@@ -103,7 +103,8 @@ class Score:
     def _leave_out(self, why: str) -> None:
         if searching():
             raise ValueError(f"score: expected {self.name}, which the sweeper needs, but got none: {why}")
-        print(f"no score: {why}", flush=True)
+        if any(key_of(word) == "score" for word in HydraConfig.get().overrides.task):
+            print(f"no score: {why}", flush=True)
 
 
 def named(score: object) -> str | None:

@@ -5,19 +5,19 @@ from __future__ import annotations
 from forewarp.cli.entry import command
 
 HELP = """
-forewarp-train fits a moving scene by forward warping, coarse and fine, and measures it on its test views.
-The same command run again skips what is finished and goes on with what was interrupted.
+forewarp-train fits a moving scene, stage by stage, by the method that model= names, and measures it on its
+test views. The same command run again skips what is finished and goes on with what was interrupted.
 
   forewarp-train                                     the procedural vehicle, written at first use
   forewarp-train experiment=demo                     the same in about a minute
   forewarp-train experiment=dnerf data.root=../data/dnerf data.scene=hook budget.minutes=5
 
-What one types most:
+What one types most (options such as --multirun or --config-dir=FOLDER stand before all of it):
   data.root=FOLDER data.scene=NAME    where the scenes are, and which one
   preset=demo|fast|faithful           the method's numbers: small, cheap (the default), as printed
   budget.minutes=N                    of training, all stages together
   budget.iterations=N                 the same in steps; with both, what comes first (null switches one off)
-  model=forward|backward              the paper's method, or its opponent
+  model=forward|backward|tnerf        the paper's method, its opponent, a network that is told the time
   model/view=none|sh|mlp              (and every other effect) switched by a word
   seed=N                              of everything random
   trainer=cpu|gpu|auto                where

@@ -25,6 +25,19 @@ def color_of(background: str) -> Tensor:
     return torch.tensor(COLORS[background])
 
 
+def pixels_of(frame: Frame) -> Tensor:
+    """Load a frame's picture.
+
+    Raises:
+        SceneError: where its reader gave something else than a uint8 tensor (H, W, 4) of the camera's size.
+    """
+    rgba, shape = frame.load(), (frame.camera.height, frame.camera.width, 4)
+    if not (isinstance(rgba, Tensor) and rgba.dtype == torch.uint8 and tuple(rgba.shape) == shape):
+        got = f"{type(rgba).__name__} {getattr(rgba, 'dtype', '')} {tuple(getattr(rgba, 'shape', ()))}"
+        raise SceneError(f"{frame.name}: expected a picture as a torch.uint8 tensor {shape}, but got {got}")
+    return rgba
+
+
 class Sampler(IterableDataset):
     """An endless stream of training batches over a background, of what a method ``asks`` for.
 
@@ -148,7 +161,7 @@ class Sampler(IterableDataset):
 
     def _observed(self, index: int, view: View, background: Tensor) -> Observation:
         frame, rows = self.frames[index], view.indices
-        rgba = frame.load().reshape(-1, 4)
+        rgba = pixels_of(frame).reshape(-1, 4)
         rgb = composited(rgba if rows is None else rgba[rows], background)
         return Observation(Moment(frame.time, index, frame.camera_id), view, rgb, background)
 
@@ -179,7 +192,7 @@ class Targets(Sequence[Target]):
 
     def __getitem__(self, index: int) -> Target:
         frame = self.frames[index]
-        rgba = frame.load()
+        rgba = pixels_of(frame)
         depth = frame.load_depth() if frame.load_depth else None
         foreground = None if depth is None else depth > 0
         if self.has_alpha:

@@ -144,7 +144,10 @@ def collect(root: Path, needed: Sequence[str] = ()) -> tuple[list[Result], list[
             without.append(f"{folder.relative_to(root)}: cannot be read ({reason})")
             continue
         if absent:
-            without.append(f"{folder.relative_to(root)}: no {', '.join(absent)}; run its command again")
+            again = "run its command again"
+            if absent == ["accuracy_time.csv"]:  # no views to draw it from
+                again = "run its command with data.held_out=8 into another folder"
+            without.append(f"{folder.relative_to(root)}: no {', '.join(absent)}; {again}")
         else:
             results.append(result)
     if not results and not without:
