@@ -60,7 +60,7 @@ test: ## run the tests, but for the slow ones
 	$(BIN)/pytest --no-cov -m "not slow and not bench"
 
 test-slow: ## run the slow tests: killed runs, every method on every dataset, the wheel
-	$(BIN)/pytest --no-cov -m "slow and not bench and not stability"
+	$(BIN)/pytest --no-cov -m slow tests/contract tests/cli/test_foreign.py tests/cli/test_wheel.py
 
 conformance: ## hold every method to the contract, also the slow cases, and write docs/conformance.md
 	OMP_NUM_THREADS=1 $(BIN)/pytest --no-cov -q tests/contract/test_contract.py --conformance=docs/conformance.md

@@ -89,6 +89,7 @@ METHODS = {
         {"position": 0.01, "velocity": 0.02, "radius": 0.02, "color": 0.05, "opacity": 0.05},
         {"photo": 1.0, "sparse": 1e-3},
         {"every": 4, "most": 300},
+        steps=120,
         toy=True,
     ),
 }
