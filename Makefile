@@ -71,11 +71,11 @@ test-stability: ## run the hard cases, those too that take their time
 bench: ## time every operator, a step and a frame, into docs/performance.md (a quarter of an hour)
 	mkdir -p runs/bench
 	$(MEASURE) $(BIN)/pytest --no-cov -m bench tests/bench --benchmark-json=runs/bench/growth.json
-	$(MEASURE) $(BIN)/python -m forewarp.cli.performance
+	$(MEASURE) $(BIN)/python -m tests.bench.performance
 
 bench-gpu: MINUTES := $(if $(filter command line,$(origin MINUTES)),$(MINUTES),10)
 bench-gpu: ## steps, frames and PSNR against seconds on a GPU [DATA= SCENES="a b" MINUTES= DEVICE=cpu SMALL=1]
-	$(BIN)/python -m forewarp.cli.device --device $(DEVICE) --minutes $(MINUTES) $(if $(SMALL),--small) \
+	$(BIN)/python -m tests.bench.device --device $(DEVICE) --minutes $(MINUTES) $(if $(SMALL),--small) \
 		$(if $(DATA),--data $(DATA) --scenes $(SCENES))
 
 accuracy-time: ## sweep choices against training time and draw it [DATA= SCENE= MINUTES= VARIANTS=a,b SEEDS=3]

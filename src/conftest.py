@@ -9,7 +9,7 @@ import pytest
 @pytest.fixture(scope="session")
 def fitted_run(tmp_path_factory):
     """The demo's vehicle in 32 pixels, 60 steps. Cost: about ten seconds."""
-    from forewarp.cli.endurance import SMALL
+    from tests.stability.endurance import SMALL
 
     folder = tmp_path_factory.mktemp("fitted")
     own = [

@@ -10,8 +10,6 @@ import torch
 from hydra.errors import ConfigCompositionException
 from omegaconf import OmegaConf
 
-from configs import CONF, ROOT, composed, groups, options
-from forewarp.cli.runs import build_run, model_of
 from forewarp.data import dnerf, hypernerf, nhr, posed_video
 from forewarp.data.module import SceneDataModule
 from forewarp.methods.voxel.effects.inpaint import UNet3d
@@ -21,8 +19,10 @@ from forewarp.methods.voxel.stage import EFFECTS, VoxelStage
 from forewarp.methods.voxel.start import Ground
 from forewarp.methods.voxel.terms import TERMS
 from forewarp.renderer import Renderer
+from forewarp.runs.build import build_run, model_of
 from forewarp.scene.box import Box, Lattice
 from forewarp.training.settings import StageSettings
+from tests.support.configs import CONF, ROOT, composed, groups, options
 
 PRESETS, MODELS = options("preset"), options("model")
 CHOICES = [(group, option) for group in groups() for option in options(group)]

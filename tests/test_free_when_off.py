@@ -7,15 +7,15 @@ import pytest
 import torch
 
 from forewarp import losses
-from forewarp.methods.voxel.effects import background, inpaint, motion, upsample, view
 from forewarp.fields.trajectory import TrajectoryField
 from forewarp.fields.voxel_grid import VoxelGrid
+from forewarp.methods.voxel.effects import background, inpaint, motion, upsample, view
 from forewarp.methods.voxel.terms import TERMS
 from forewarp.scene.box import Lattice
 from forewarp.training.curriculum import Curriculum
 from forewarp.training.module import DynamicSceneModule
 from forewarp.training.objective import total
-from tiny_scene import BOX, ball_data, begun, built, forward_model, stage
+from tests.support.tiny_scene import BOX, ball_data, begun, built, forward_model, stage
 
 LATTICE = Lattice(BOX, (9, 8, 7))
 PARTS = {

@@ -4,6 +4,7 @@ import math
 import pytest
 import torch
 
+from forewarp.fields.radiance_grid import Activation, RadianceGrid, shaded
 from forewarp.methods.voxel.effects.view import SphericalHarmonics
 from forewarp.ops import backend
 from forewarp.ops.grid import index_of
@@ -11,8 +12,7 @@ from forewarp.ops.trace import trace
 from forewarp.renderer import Renderer
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.rays import Rays
-from forewarp.fields.radiance_grid import Activation, RadianceGrid, shaded
-from reference import composite, march_samples
+from tests.support.reference import composite, march_samples
 
 LATTICE = Lattice(Box((0, 0, 0), (1, 3, 8)), (3, 4, 5))  # spacings 1/2, 1, 2; pitch 1
 

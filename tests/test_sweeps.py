@@ -5,9 +5,9 @@ from hydra._internal.config_repository import ConfigRepository
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
-from configs import ROOT, composed, options
-from forewarp.cli.identity import hashed
-from forewarp.cli.runs import build_run
+from forewarp.runs.build import build_run
+from forewarp.runs.identity import hashed
+from tests.support.configs import ROOT, composed, options
 
 PAPER = {
     "dnerf": 8,

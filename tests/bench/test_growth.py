@@ -5,9 +5,9 @@ import time
 import pytest
 import torch
 
-from forewarp.cli.timed_cases import CASES
 from forewarp.ops.warmup import warm_up
 from forewarp.training.protocol import peak_memory_bytes, reset_peak_memory
+from tests.bench.timed_cases import CASES
 
 RUNS = [
     (name, size, dense)

@@ -5,11 +5,11 @@ import shutil
 import pytest
 from omegaconf import OmegaConf
 
-from configs import CONF, ROOT, options
 from forewarp.cli.entry import one_line
-from forewarp.cli.folders import project_root
 from forewarp.cli.misspelt import with_keys
+from forewarp.runs.folders import project_root
 from forewarp.scene.errors import SceneError
+from tests.support.configs import CONF, ROOT, options
 
 COMMANDS = ("train", "evaluate", "render", "synthesize", "report")
 
@@ -47,7 +47,7 @@ def test_data_lie_in_the_checkout_or_in_the_current_folder(forewarp, monkeypatch
     if installed:
         package = in_tmp / "site" / "forewarp"
         shutil.copytree(CONF, package / "conf")
-        monkeypatch.setattr("forewarp.cli.folders.PACKAGE", package)
+        monkeypatch.setattr("forewarp.runs.folders.PACKAGE", package)
     shown = OmegaConf.create(forewarp("train", "--cfg", "job", "--resolve").out)
     assert shown.paths.data == ("./data" if installed else str(ROOT / "data"))
     assert shown.run.startswith("runs/")

@@ -12,8 +12,8 @@ import torch
 import yaml
 
 from forewarp import load
-from forewarp.cli.plan_file import with_plan, write_plan
-from forewarp.cli.stored import stored_run
+from forewarp.planning.plan_file import with_plan, write_plan
+from forewarp.runs.stored import stored_run
 from forewarp.training.handover import load_handover
 
 HERE = Path(__file__).parents[1] / "foreign"

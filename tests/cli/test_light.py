@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from configs import ROOT
+from tests.support.configs import ROOT
 
 HEAVY = {"torch", "lightning", "torchmetrics", "numba", "imageio", "matplotlib"}
 CODE = """

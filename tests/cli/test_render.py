@@ -4,10 +4,10 @@ from unittest.mock import patch
 import imageio.v3 as iio
 import pytest
 
-from films import read_film
 from forewarp.cli import render, train
 from forewarp.data.dnerf import Shot, write_scene
-from tiny_scene import ball_scene
+from tests.support.films import read_film
+from tests.support.tiny_scene import ball_scene
 
 SIZE = 24
 

@@ -1,6 +1,6 @@
 import pytest
 
-from runs_on_disk import write_run
+from tests.support.runs_on_disk import write_run
 
 
 def test_pages_are_written_and_named(forewarp, in_tmp):

@@ -9,8 +9,8 @@ import pytest
 import torch
 import yaml
 
-from forewarp.cli.claims import alone
 from forewarp.cli.replay import main as replay
+from forewarp.runs.lock import alone
 from forewarp.synth.scenes import synthesize
 
 SMALL = [

@@ -3,7 +3,7 @@
 import re
 from pathlib import Path
 
-from forewarp.cli.endurance import SMALL
+from tests.stability.endurance import SMALL
 
 PAGE = Path(__file__).parents[2] / "docs" / "scripts.md"
 

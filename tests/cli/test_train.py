@@ -11,8 +11,8 @@ import lightning
 import pytest
 import yaml
 
-from dnerf_scene import edit, write_tiny
 from forewarp.synth.scenes import synthesize
+from tests.support.dnerf_scene import edit, write_tiny
 
 TINY = ["data=dnerf", "preset=demo", "trainer=cpu", "data.rays=128", "logger=none", "callbacks.pictures=null"]
 STEPS = ["budget.iterations=60", "stage.fine.voxels=[[0,8000]]", "stage.coarse.voxels=[[0,4000]]"]

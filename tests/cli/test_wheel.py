@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from configs import CONF, ROOT
+from tests.support.configs import CONF, ROOT
 
 SMALL = [
     *("experiment=demo", "trainer=cpu", "threads=1", "sheets=1", "data.rays=256"),

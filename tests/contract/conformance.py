@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from contract.scenes import DATASETS
-from contract.table import METHODS
+from tests.contract.scenes import DATASETS
+from tests.contract.table import METHODS
 
 TITLES = {"dnerf": "D-NeRF", "hypernerf": "HyperNeRF", "nhr": "NHR", "lego_complete": "Lego Complete"}
 WORST = ("failed", "skipped", "not run", "passed")

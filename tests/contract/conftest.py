@@ -7,8 +7,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from contract.conformance import Conformance
-from contract.scenes import DATASETS, data_of
+from tests.contract.conformance import Conformance
+from tests.contract.scenes import DATASETS, data_of
 
 
 def pytest_addoption(parser):
@@ -32,8 +32,8 @@ def scenes(tmp_path_factory):
 @pytest.fixture(scope="session")
 def fitted(scenes, tmp_path_factory):
     """``fitted(name, dataset)``: the run, its module after all steps of the table, and every step's loss."""
-    from contract.fitting import Losses, run_of, stage_of
-    from contract.table import METHODS
+    from tests.contract.fitting import Losses, run_of, stage_of
+    from tests.contract.table import METHODS
 
     known = {}
 

@@ -8,11 +8,11 @@ from pathlib import Path
 import lightning
 import torch
 
-from contract.scenes import data_of
-from contract.table import METHODS
 from forewarp.training.objective import Objective
 from forewarp.training.settings import StageSettings
 from forewarp.training.stages import Run, Stage
+from tests.contract.scenes import data_of
+from tests.contract.table import METHODS
 
 
 def stage_of(entry, name="fine", **changes):

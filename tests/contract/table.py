@@ -4,7 +4,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 
-from contract.toys import Codes, Splats
 from forewarp.fields.radiance import DirectRadiance
 from forewarp.fields.trajectory import TrajectoryField
 from forewarp.methods.method import Method, Start
@@ -16,6 +15,7 @@ from forewarp.methods.voxel.effects.motion import Motion
 from forewarp.methods.voxel.effects.upsample import LearnedUpsampler
 from forewarp.methods.voxel.effects.view import SphericalHarmonics
 from forewarp.methods.voxel.model import BackwardModel, ForwardModel
+from tests.contract.toys import Codes, Splats
 
 
 @dataclass(frozen=True)

@@ -9,15 +9,15 @@ from pathlib import Path
 import pytest
 import torch
 
-from contract.conformance import kinds_of
-from contract.fitting import Stop, killed, module_of, run_of, stage_of
-from contract.scenes import DATASETS, TIMES, data_of
-from contract.table import METHODS
 from forewarp.methods.abilities import HasBounds, HasMatter, HasTrajectories
 from forewarp.scene.view import Moment, View
 from forewarp.training.checkpoints import load_weights
 from forewarp.training.handover import load_handover
 from forewarp.training.objective import total
+from tests.contract.conformance import kinds_of
+from tests.contract.fitting import Stop, killed, module_of, run_of, stage_of
+from tests.contract.scenes import DATASETS, TIMES, data_of
+from tests.contract.table import METHODS
 
 WHITE = torch.ones(3)
 each = pytest.mark.parametrize("name", METHODS)
@@ -257,10 +257,10 @@ def clean():
     this one holds would be lost in a plain fork.
     """
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PYTHONPATH", str(Path(__file__).parents[1]))
+        patch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))
         patch.setenv("OMP_NUM_THREADS", "1")
         context = multiprocessing.get_context("forkserver")
-        context.set_forkserver_preload(["contract.fitting"])
+        context.set_forkserver_preload(["tests.contract.fitting"])
         yield context
 
 

@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from contract.fitting import Losses, run_of, stage_of
-from contract.scenes import data_of
-from contract.table import Entry
 from forewarp.methods.abilities import HasMatter, HasTrajectories
 from forewarp.scene.view import Moment
 from forewarp.training.handover import load_handover
+from tests.contract.fitting import Losses, run_of, stage_of
+from tests.contract.scenes import data_of
+from tests.contract.table import Entry
 
 PAGE = Path(__file__).parents[2] / "docs" / "extending.md"
 

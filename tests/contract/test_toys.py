@@ -5,15 +5,15 @@ from dataclasses import replace
 import pytest
 import torch
 
-from contract.fitting import module_of
-from contract.scenes import data_of
-from contract.table import METHODS
 from forewarp.methods.method import Start
 from forewarp.scene.batch import Batch
 from forewarp.scene.cloud import Cloud, Handover
 from forewarp.scene.view import Moment, View
 from forewarp.training.checkpoints import misfits
 from forewarp.training.objective import total
+from tests.contract.fitting import module_of
+from tests.contract.scenes import data_of
+from tests.contract.table import METHODS
 
 
 @pytest.fixture

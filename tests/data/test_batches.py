@@ -7,8 +7,6 @@ from itertools import islice
 
 import pytest
 import torch
-from dnerf_scene import write_tiny
-from tiny_scene import ball_scene
 
 from forewarp.data.batches import Sampler, Targets, color_of
 from forewarp.data.dnerf import read_scene
@@ -18,6 +16,8 @@ from forewarp.scene.errors import SceneError
 from forewarp.scene.frame import Frame, Scene
 from forewarp.scene.rays import joined
 from forewarp.scene.view import Moment
+from tests.support.dnerf_scene import write_tiny
+from tests.support.tiny_scene import ball_scene
 
 
 @pytest.fixture

@@ -11,16 +11,16 @@ import zlib
 import numpy as np
 import pytest
 
-from dnerf_scene import ANGLE, edit, shots, truth, write_tiny
 from forewarp.data import capture, dnerf, hypernerf, lego_complete, nerfies_items, posed_video
 from forewarp.data import files as data_files
 from forewarp.data.files import MOST_FRAMES, frames_of, inside, read_bytes, read_json
 from forewarp.data.images import inspect_png, read_gray16, read_image
 from forewarp.data.truth import load_numpy
 from forewarp.scene.errors import SceneError
-from posed_scene import edit as edit_video
-from posed_scene import write_tiny as write_video
-from rig_scene import write_rig
+from tests.support.dnerf_scene import ANGLE, edit, shots, truth, write_tiny
+from tests.support.posed_scene import edit as edit_video
+from tests.support.posed_scene import write_tiny as write_video
+from tests.support.rig_scene import write_rig
 
 BIG = 60_000
 

@@ -5,10 +5,10 @@ from pathlib import Path
 import imageio.v3 as iio
 import numpy as np
 import pytest
-from dnerf_scene import edit, shots, write_tiny
 
 from forewarp.data.dnerf import Shot, read_scene, write_scene
 from forewarp.scene.errors import SceneError
+from tests.support.dnerf_scene import edit, shots, write_tiny
 
 
 def frame(**entries):

@@ -2,10 +2,10 @@ import os
 
 import pytest
 
-from dnerf_scene import write_tiny
 from forewarp.data.files import MOST_TEXT
 from forewarp.data.fingerprint import difference, fingerprint
 from forewarp.data.module import DNeRFDataModule, SceneDataModule
+from tests.support.dnerf_scene import write_tiny
 
 
 @pytest.fixture

@@ -3,7 +3,7 @@ import pytest
 from forewarp.data.held import hold_out
 from forewarp.data.module import SceneDataModule
 from forewarp.scene.errors import SceneError
-from tiny_scene import ball_scene
+from tests.support.tiny_scene import ball_scene
 
 
 def names(frames):

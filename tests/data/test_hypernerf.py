@@ -7,13 +7,13 @@ import shutil
 import numpy as np
 import pytest
 import torch
-from dnerf_scene import real
-from rig_scene import CENTER, FAR, LENS, NEAR, SCALE, edit, hand, phone, rig, truth, write_rig
 
 from forewarp.data.hypernerf import read_scene
 from forewarp.data.images import write_png
 from forewarp.data.module import HyperNeRFDataModule
 from forewarp.data.nerfies_camera import read_camera, reduced, write_camera
+from tests.support.dnerf_scene import real
+from tests.support.rig_scene import CENTER, FAR, LENS, NEAR, SCALE, edit, hand, phone, rig, truth, write_rig
 
 MIDDLE = torch.tensor(CENTER, dtype=torch.float64)
 

@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from rig_scene import edit, hand, rig, truth, write_rig
 
 from forewarp.data.hypernerf import read_scene
 from forewarp.data.images import write_png
 from forewarp.scene.errors import SceneError
 from forewarp.scene.lens import Lens
+from tests.support.rig_scene import edit, hand, rig, truth, write_rig
 
 CAMERA = "camera/left1_000000"
 ITEM = "left1_000001"

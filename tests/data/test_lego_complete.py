@@ -6,10 +6,10 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
-from dnerf_scene import ANGLE, edit, shots, truth
 from forewarp.data.lego_complete import read_scene, write_scene
 from forewarp.data.module import LegoCompleteDataModule
 from forewarp.scene.errors import SceneError
+from tests.support.dnerf_scene import ANGLE, edit, shots, truth
 
 FEW = {"space": 4, "time": 3, "canonical": 2}
 TIMES = {"space": [0.0, 0.5, 0.5, 1.0], "time": [0.1, 0.3, 0.6], "canonical": [0.0, 0.0]}
@@ -167,7 +167,7 @@ def test_depths_beyond_single_precision_are_refused(tmp_path):
 
 
 def test_a_stock_scene_is_refused(tmp_path):
-    from dnerf_scene import write_tiny as write_stock
+    from tests.support.dnerf_scene import write_tiny as write_stock
 
     write_stock(tmp_path / "lego")
     with pytest.raises(

@@ -13,15 +13,15 @@ import torch
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
-from dnerf_scene import shots, write_tiny
-from dnerf_scene import truth as known
 from forewarp.data import dnerf, hypernerf, lego_complete, nhr, posed_video
 from forewarp.scene.errors import SceneError
 from forewarp.scene.frame import Scene
-from nhr_scene import truth as in_dome
-from nhr_scene import write_dome
-from posed_scene import write_tiny as write_video
-from rig_scene import rig, truth, write_rig
+from tests.support.dnerf_scene import shots, write_tiny
+from tests.support.dnerf_scene import truth as known
+from tests.support.nhr_scene import truth as in_dome
+from tests.support.nhr_scene import write_dome
+from tests.support.posed_scene import write_tiny as write_video
+from tests.support.rig_scene import rig, truth, write_rig
 
 EXAMPLES = 120
 

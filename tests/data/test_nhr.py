@@ -12,7 +12,7 @@ import torch
 from forewarp.data.jpeg import write_jpeg
 from forewarp.data.nhr import DomeFrame, read_scene, write_scene
 from forewarp.scene.errors import SceneError
-from nhr_scene import BALLS, COLORS, STEP, dome, dome_frames, place, truth, write_dome
+from tests.support.nhr_scene import BALLS, COLORS, STEP, dome, dome_frames, place, truth, write_dome
 
 
 @pytest.fixture(scope="module")

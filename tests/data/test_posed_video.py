@@ -11,7 +11,7 @@ import torch
 from forewarp.data.images import write_png
 from forewarp.data.posed_video import PosedShot, read_scene, write_scene
 from forewarp.scene.box import Box
-from posed_scene import LENS, MIDDLE, cameras, edit, placed, shots, write_tiny
+from tests.support.posed_scene import LENS, MIDDLE, cameras, edit, placed, shots, write_tiny
 
 
 def frames_of(scene):

@@ -1,16 +1,16 @@
 """Bad captures are refused in one line that names file and key."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
-
-from dataclasses import replace
 
 from forewarp.data.images import write_png
 from forewarp.data.posed_video import PosedShot, read_scene, write_scene
 from forewarp.scene.camera import look_at
 from forewarp.scene.errors import SceneError
-from posed_scene import MIDDLE, UP, cameras, edit, shots, write_tiny
+from tests.support.posed_scene import MIDDLE, UP, cameras, edit, shots, write_tiny
 
 
 def frame(**entries):

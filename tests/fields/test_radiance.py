@@ -2,8 +2,8 @@ import pytest
 import torch
 
 from forewarp.fields.radiance import DirectRadiance, FeatureRadiance, density_shift
-from forewarp.scene.box import Box, Lattice
 from forewarp.fields.radiance_grid import EMPTY
+from forewarp.scene.box import Box, Lattice
 
 LATTICE = Lattice(Box((0, 0, 0), (2, 3, 4)), (3, 4, 5))
 ALL = torch.ones(LATTICE.shape, dtype=torch.bool)

@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from forewarp.fields.radiance import density_shift
+from forewarp.fields.radiance_grid import EMPTY, Activation, RadianceGrid
 from forewarp.ops.grid import occupied_cells
 from forewarp.scene.box import Box, Lattice
-from forewarp.fields.radiance_grid import EMPTY, Activation, RadianceGrid
 
 LATTICE = Lattice(Box((0, 0, 0), (2, 3, 4)), (3, 4, 5))
 

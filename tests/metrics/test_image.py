@@ -7,8 +7,8 @@ from torch.nn import functional as F
 from torchmetrics.functional.image import structural_similarity_index_measure
 from torchmetrics.image import PeakSignalNoiseRatio
 
-import reference
 from forewarp.metrics.image import PSNR_CAP, ms_ssim, ms_ssim_legacy, psnr, quantise, ssim
+from tests.support import reference
 
 
 def noise(*shape, seed=0):

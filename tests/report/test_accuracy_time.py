@@ -1,6 +1,6 @@
 from forewarp.report.accuracy_time import write_accuracy_time
 from forewarp.report.curve import Published
-from runs_on_disk import write_run
+from tests.support.runs_on_disk import write_run
 
 
 def page_of(root, **more):

@@ -2,7 +2,7 @@ import pytest
 import yaml
 
 from forewarp.report.collect import Point, by_scene, collect, grouped, machine, read_run
-from runs_on_disk import write_run
+from tests.support.runs_on_disk import write_run
 
 
 def test_a_run_is_read_whole(tmp_path):

@@ -4,9 +4,9 @@ import os
 
 import yaml
 
-from forewarp.report.effects import called, compared, plan_of, write_effects
 from forewarp.report.collect import collect
-from runs_on_disk import write_run
+from forewarp.report.effects import called, compared, plan_of, write_effects
+from tests.support.runs_on_disk import write_run
 
 SLOW, QUICK = ((10, 20.0), (20, 24.0), (40, 25.0)), ((5, 24.0), (10, 24.9), (20, 26.0))
 

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 import yaml
 
-from forewarp.report.compared import comparison, counterpart, measured, with_means
 from forewarp.report.collect import collect
+from forewarp.report.compared import comparison, counterpart, measured, with_means
 from forewarp.report.page import latex_text
 from forewarp.report.paper import write_paper
 from forewarp.report.pictures import thirds
 from forewarp.report.published import PAPER, read_paper
-from runs_on_disk import write_run
+from tests.support.runs_on_disk import write_run
 
 ALL = ["hellwarrior", "mutant", "hook", "bouncingballs", "lego", "trex", "standup", "jumpingjacks"]
 

@@ -1,5 +1,5 @@
 from forewarp.report.price_list import write_price_list
-from runs_on_disk import write_run
+from tests.support.runs_on_disk import write_run
 
 
 def rows(text, first):

@@ -2,8 +2,8 @@
 
 import pytest
 
-from forewarp.cli.fuzz import INPUTS, fuzz, fuzz_here
-from forewarp.cli.stability import fuzz_table
+from tests.stability.fuzz import INPUTS, fuzz, fuzz_here
+from tests.stability.report import fuzz_table
 
 pytestmark = pytest.mark.stability
 

@@ -19,7 +19,7 @@ from forewarp.ops.lens import distort
 from forewarp.ops.samples import midpoints, union
 from forewarp.ops.splat import average_splat, scatter_reference, with_copies
 from forewarp.ops.variation import patch_variation, total_variation
-from hard_cases import index_with
+from tests.support.hard_cases import index_with
 
 pytestmark = pytest.mark.stability
 

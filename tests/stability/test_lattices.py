@@ -6,15 +6,15 @@ from functools import partial
 import pytest
 import torch
 
+from forewarp.fields.radiance import DirectRadiance
+from forewarp.losses import tv_density, tv_flow
 from forewarp.methods.voxel.effects.dense import densify, occupied_crop, sparsify
 from forewarp.methods.voxel.effects.inpaint import UNet3d
 from forewarp.methods.voxel.effects.upsample import LearnedUpsampler, TrilinearUpsampler
-from forewarp.fields.radiance import DirectRadiance
-from forewarp.losses import tv_density, tv_flow
+from forewarp.methods.voxel.structure import box_of_all_times, occupied, refresh, resample
 from forewarp.ops.grid import dilate, neighbour_pairs, trilinear
 from forewarp.scene.box import Box, Lattice
-from forewarp.methods.voxel.structure import box_of_all_times, occupied, refresh, resample
-from hard_cases import LATTICE, check_finite, grid, index_with
+from tests.support.hard_cases import LATTICE, check_finite, grid, index_with
 
 pytestmark = pytest.mark.stability
 

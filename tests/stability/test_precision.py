@@ -5,16 +5,16 @@ from functools import partial
 import pytest
 import torch
 
-from forewarp.methods.voxel.effects.inpaint import UNet3d
-from forewarp.methods.voxel.effects.upsample import LearnedUpsampler
-from forewarp.methods.voxel.effects.view import ViewNetwork
 from forewarp.fields.mlp import mlp
 from forewarp.fields.radiance import FeatureRadiance
 from forewarp.methods.voxel.backward_warp import Deformation
+from forewarp.methods.voxel.effects.inpaint import UNet3d
+from forewarp.methods.voxel.effects.upsample import LearnedUpsampler
+from forewarp.methods.voxel.effects.view import ViewNetwork
 from forewarp.renderer import Renderer
 from forewarp.scene.box import Lattice
 from forewarp.scene.view import Moment
-from tiny_scene import BOX, backward_model, built, camera_at, forward_model
+from tests.support.tiny_scene import BOX, backward_model, built, camera_at, forward_model
 
 pytestmark = pytest.mark.stability
 

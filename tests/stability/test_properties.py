@@ -4,6 +4,7 @@ import pytest
 import torch
 from hypothesis import HealthCheck, given, settings, strategies
 
+from forewarp.fields.radiance_grid import Activation, RadianceGrid
 from forewarp.methods.voxel.effects.dense import densify
 from forewarp.ops.composite import accumulate, render_weights
 from forewarp.ops.march import march, march_reference
@@ -11,8 +12,7 @@ from forewarp.ops.splat import average_splat
 from forewarp.renderer import Renderer
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.rays import Rays
-from forewarp.fields.radiance_grid import Activation, RadianceGrid
-from hard_cases import SHAPE, index_with, voxels
+from tests.support.hard_cases import SHAPE, index_with, voxels
 
 pytestmark = pytest.mark.stability
 

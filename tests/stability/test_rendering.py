@@ -6,13 +6,13 @@ import pytest
 import torch
 
 from forewarp import losses
+from forewarp.fields.radiance_grid import Activation
 from forewarp.ops.composite import render_weights
 from forewarp.ops.march import march
 from forewarp.renderer import Renderer
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.camera import Camera, look_at
-from forewarp.fields.radiance_grid import Activation
-from hard_cases import LATTICE, check_finite, grid, index_with, rays, raw_of
+from tests.support.hard_cases import LATTICE, check_finite, grid, index_with, raw_of, rays
 
 pytestmark = pytest.mark.stability
 

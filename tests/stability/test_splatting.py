@@ -5,12 +5,12 @@ import math
 import pytest
 import torch
 
-from forewarp.methods.voxel.effects.motion import Motion
+from forewarp.fields.radiance_grid import EMPTY
 from forewarp.fields.trajectory import TrajectoryField
+from forewarp.methods.voxel.effects.motion import Motion
 from forewarp.ops.splat import average_splat
 from forewarp.renderer import Renderer
-from forewarp.fields.radiance_grid import EMPTY
-from hard_cases import LATTICE, SHAPE, check_finite, grid, rays, voxels
+from tests.support.hard_cases import LATTICE, SHAPE, check_finite, grid, rays, voxels
 
 pytestmark = pytest.mark.stability
 

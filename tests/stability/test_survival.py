@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from forewarp.synth.scenes import synthesize
-from zygote import Zygote
+from tests.support.zygote import Zygote
 
 pytestmark = pytest.mark.stability
 KILLS = 24
@@ -369,7 +369,7 @@ def test_two_in_one_folder_refuse_each_other(zygote, begin, scenes, whole, tmp_p
 HOLD = """
 import sys
 from pathlib import Path
-from forewarp.cli.claims import alone
+from forewarp.runs.lock import alone
 with alone(Path(sys.argv[1])):
     print("held", flush=True)
     sys.stdin.read()

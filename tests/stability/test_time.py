@@ -8,7 +8,7 @@ from forewarp.fields.voxel_grid import VoxelGrid
 from forewarp.methods.voxel.backward_warp import Deformation
 from forewarp.ops.dct import dct_basis
 from forewarp.training.curriculum import Curriculum
-from hard_cases import LATTICE, check_finite, voxels
+from tests.support.hard_cases import LATTICE, check_finite, voxels
 
 pytestmark = pytest.mark.stability
 

@@ -8,13 +8,13 @@ import pytest
 import torch
 
 from forewarp.data.module import SceneDataModule
+from forewarp.fields.trajectory import TrajectoryField
 from forewarp.methods.voxel.effects.background import StaticBackground
 from forewarp.methods.voxel.effects.inpaint import UNet3d
-from forewarp.fields.trajectory import TrajectoryField
 from forewarp.methods.voxel.method import VoxelMethod
 from forewarp.scene.box import Box
-from hard_cases import check_finite
-from tiny_scene import RATES, ball_scene, forward_model, make_run, stage
+from tests.support.hard_cases import check_finite
+from tests.support.tiny_scene import RATES, ball_scene, forward_model, make_run, stage
 
 pytestmark = pytest.mark.stability
 
@@ -190,7 +190,7 @@ def test_a_flat_scene_trains(tmp_path, thin):
 @pytest.mark.slow
 def test_a_hostile_start_at_ten_times_the_rates_ends_finite(tmp_path):
     pytest.importorskip("trimesh")
-    from forewarp.cli.endurance import endure
+    from tests.stability.endurance import endure
 
     (done,) = endure(tmp_path / "trials.jsonl", seconds=600, seeds=1, steps=60, rates=[10.0])
     assert done["wrong"] is None

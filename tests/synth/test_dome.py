@@ -15,7 +15,7 @@ from forewarp.synth.dome import dome_cameras, synthesize
 from forewarp.synth.motions import MOTIONS
 from forewarp.synth.points import surface_points
 from forewarp.synth.world import World
-from lit_points import color_errors, lit_points
+from tests.support.lit_points import color_errors, lit_points
 
 SMALL = {"size": 120, "frames": 2, "points": 300, "samples_per_pixel": 2}
 

@@ -15,7 +15,7 @@ from forewarp.synth.points import surface_points
 from forewarp.synth.raycast import Posed, camera_rays
 from forewarp.synth.rig import rig_cameras, synthesize
 from forewarp.synth.world import World
-from lit_points import color_errors, lit_points
+from tests.support.lit_points import color_errors, lit_points
 
 SMALL = {"size": 192, "frames": 5, "samples_per_pixel": 2}
 

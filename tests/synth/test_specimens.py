@@ -10,7 +10,7 @@ from forewarp.synth.cameras import random_cameras, stream
 from forewarp.synth.raycast import Posed, camera_rays, light_points, render
 from forewarp.synth.specimens import SPECIMENS
 from forewarp.synth.world import World
-from configs import composed
+from tests.support.configs import composed
 
 TIMES = np.linspace(0, 1, 41)
 

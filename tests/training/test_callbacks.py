@@ -9,12 +9,12 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from forewarp.data.module import SceneDataModule
+from forewarp.evaluation.pictures import TensorBoardPictures
+from forewarp.progress import ProgressLine
 from forewarp.training.callbacks import StageProgress, TensorBoardScalars
 from forewarp.training.clock import Clock
-from forewarp.training.pictures import TensorBoardPictures
-from forewarp.training.progress import ProgressLine
 from forewarp.training.stages import Run
-from tiny_scene import Interrupt, ball_data, ball_scene, forward_model, stage
+from tests.support.tiny_scene import Interrupt, ball_data, ball_scene, forward_model, stage
 
 STEPS = 12
 
@@ -107,7 +107,7 @@ def test_a_long_wait_between_lines_leaves_only_the_last(tmp_path, capsys):
 
 def test_a_terminal_gets_a_bar_that_is_not_drawn_too_often(monkeypatch):
     now = [100.0]
-    monkeypatch.setattr("forewarp.training.progress.time.perf_counter", lambda: now[0])
+    monkeypatch.setattr("forewarp.progress.time.perf_counter", lambda: now[0])
     stream = Terminal()
     line = ProgressLine("fine", refresh=0.25, stream=stream)
     assert line.due()
@@ -224,7 +224,7 @@ def test_the_clock_stands_still_for_pictures(tmp_path, monkeypatch):
         seen.append(module.clock.seconds - before)
         return {}
 
-    monkeypatch.setattr("forewarp.training.pictures.pictures_of", slow_pictures)
+    monkeypatch.setattr("forewarp.evaluation.pictures.pictures_of", slow_pictures)
     watched_run(tmp_path, TensorBoardPictures(moments=(0.5, 1.0))).fit()
     assert seen == [0, 0]
 

@@ -5,7 +5,7 @@ import torch
 
 from forewarp.fields.trajectory import TrajectoryField
 from forewarp.training.checkpoints import KeepCheckpoint, check_checkpoint, check_state, load_weights
-from tiny_scene import Interrupt, ball_data, forward_model, make_run, stage
+from tests.support.tiny_scene import Interrupt, ball_data, forward_model, make_run, stage
 
 
 def run(folder, callbacks=(), width=8, times=None):

@@ -10,7 +10,7 @@ from forewarp.methods.method import Method, Start
 from forewarp.scene.box import Box
 from forewarp.scene.cloud import Cloud, Handover
 from forewarp.training.handover import load_handover, make_handover, save_handover, write_json
-from tiny_scene import BOX, RADIUS, ball_center, ball_scene, forward_model
+from tests.support.tiny_scene import BOX, RADIUS, ball_center, ball_scene, forward_model
 
 SCENE = ball_scene(frames=6, size=16)
 

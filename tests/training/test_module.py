@@ -6,19 +6,29 @@ import lightning
 import pytest
 import torch
 
-from forewarp.methods.voxel.effects.inpaint import UNet3d
+from forewarp.methods.method import Step
 from forewarp.methods.voxel.backward_warp import Deformation
+from forewarp.methods.voxel.effects.inpaint import UNet3d
+from forewarp.methods.voxel.structure import resample
 from forewarp.ops.backend import numba_installed
 from forewarp.ops.warmup import warm_up
 from forewarp.renderer import Renderer
 from forewarp.scene.box import Lattice
 from forewarp.scene.view import Moment, View
 from forewarp.training.curriculum import Curriculum
-from forewarp.methods.method import Step
 from forewarp.training.module import DynamicSceneModule
 from forewarp.training.objective import total
-from forewarp.methods.voxel.structure import resample
-from tiny_scene import BOX, RATES, backward_model, ball_data, begun, built, forward_model, stage, trainer
+from tests.support.tiny_scene import (
+    BOX,
+    RATES,
+    backward_model,
+    ball_data,
+    begun,
+    built,
+    forward_model,
+    stage,
+    trainer,
+)
 
 INPAINTER = partial(UNet3d, width=16, levels=2)
 BACKWARD = backward_model(deformation=partial(Deformation, width=8, layers=2))

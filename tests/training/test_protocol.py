@@ -1,6 +1,6 @@
-import platform
 import gc
 import os
+import platform
 import resource
 import sys
 from pathlib import Path

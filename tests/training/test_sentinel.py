@@ -9,7 +9,7 @@ from forewarp.methods.voxel.effects.inpaint import UNet3d
 from forewarp.scene.lens import Lens
 from forewarp.training.bundle import read_bundle
 from forewarp.training.sentinel import BrokenStep, Sentinel, all_finite, diagnose, first_bad
-from tiny_scene import ball_data, forward_model, make_run, stage
+from tests.support.tiny_scene import ball_data, forward_model, make_run, stage
 
 NAN = float("nan")
 

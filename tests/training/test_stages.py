@@ -7,15 +7,23 @@ import lightning
 import pytest
 import torch
 
+from forewarp.fields.radiance import FeatureRadiance
+from forewarp.methods.voxel.backward_warp import Deformation
 from forewarp.methods.voxel.effects.background import StaticBackground
 from forewarp.methods.voxel.effects.inpaint import UNet3d
 from forewarp.methods.voxel.effects.upsample import LearnedUpsampler, TrilinearUpsampler
 from forewarp.methods.voxel.effects.view import ViewNetwork
-from forewarp.fields.radiance import FeatureRadiance
-from forewarp.methods.voxel.backward_warp import Deformation
 from forewarp.methods.voxel.structure import box_of_all_times
 from forewarp.training.interruption import Interruption
-from tiny_scene import RATES, Interrupt, backward_model, ball_data, forward_model, make_run, stage
+from tests.support.tiny_scene import (
+    RATES,
+    Interrupt,
+    backward_model,
+    ball_data,
+    forward_model,
+    make_run,
+    stage,
+)
 
 
 def stages(**changes):

@@ -14,11 +14,11 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
-from forewarp.cli.folders import configurations, project_root
 from forewarp.cli.misspelt import unknown_key, with_keys
-from forewarp.cli.renamed import refuse_renamed
+from forewarp.runs.folders import configurations, project_root
+from forewarp.runs.renamed import refuse_renamed
 
-TRACEBACK_VARIABLE, TRUST_VARIABLE = "FOREWARP_TRACEBACK", "FOREWARP_TRUST"
+TRACEBACK_VARIABLE = "FOREWARP_TRACEBACK"
 MISTAKE, INTERRUPTED = 2, 130
 
 
@@ -62,7 +62,7 @@ def _words(name: str) -> list[str]:
     """The words of the command line as Hydra takes them."""
     words = with_keys(name, sys.argv[1:])
     if any(word.startswith("plan=") for word in words):
-        from forewarp.cli.plan_file import with_plan
+        from forewarp.planning.plan_file import with_plan
 
         return with_plan(name, words)
     return words
@@ -89,6 +89,8 @@ def _run(name: str, task: Callable, conf: Path, config_name: str) -> list[int]:
     """Exit statuses of the jobs that failed; with ``--multirun`` the others still run."""
     import hydra
     from hydra.core.hydra_config import HydraConfig
+
+    from forewarp.runs.trust import TRUST_VARIABLE
 
     # Goes along with the job, whatever of its environment a launcher hands on.
     trust = {TRUST_VARIABLE: os.environ[TRUST_VARIABLE]} if TRUST_VARIABLE in os.environ else {}

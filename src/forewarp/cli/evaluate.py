@@ -23,19 +23,18 @@ What one types most:
 
 def evaluate(config) -> None:
     """Load and measure."""
-    from forewarp.cli.identity import saved_config
+    from forewarp.runs.identity import saved_config
 
     saved = saved_config(config.run, config)
     # These load torch; what is mistyped has been answered before.
-    from forewarp.cli.claims import alone, tell_other_data
-    from forewarp.cli.measure import measure
-    from forewarp.cli.runs import build_run
+    from forewarp.runs.build import build_run, measure_run
+    from forewarp.runs.lock import alone, tell_other_data
 
     run = build_run(saved)
     with alone(run.folder):
         module = run.load()
         tell_other_data(run)
-        measure(run, module, saved)
+        measure_run(run, module, saved)
 
 
 def main() -> None:

@@ -18,18 +18,18 @@ from pathlib import Path
 from statistics import fmean
 
 import torch
+from tabulate import tabulate
 from torch import Tensor
 
 from forewarp.cli.entry import MISTAKE, one_line, quiet
-from forewarp.cli.stability import table
-from forewarp.cli.stored import stored_run
-from forewarp.cli.trusted import without_trust
 from forewarp.data.batches import Targets
+from forewarp.evaluation.evaluate import Shown, draw
 from forewarp.methods.abilities import HasMatter
 from forewarp.metrics.image import psnr
 from forewarp.metrics.limits import REGIONS, error_shares, low_passed
+from forewarp.runs.stored import stored_run
+from forewarp.runs.trust import without_trust
 from forewarp.scene.frame import spread
-from forewarp.training.evaluation import Shown, draw
 from forewarp.training.handover import load_handover
 
 COLUMNS = (
@@ -120,7 +120,7 @@ def page(rows: Iterable[dict[str, float | str]]) -> str:
         texts = [f"{row[c]:.0%}" if c in REGIONS else f"{row[c]:.2f}" for c in COLUMNS[2:]]
         lines.append([row["scene"], f"{row['seconds']:.0f}", *texts])
         print("  ".join(lines[-1]), file=sys.stderr, flush=True)
-    return table(COLUMNS, lines)
+    return tabulate(lines, COLUMNS, tablefmt="github", disable_numparse=True)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

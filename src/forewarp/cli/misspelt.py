@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
-from forewarp.cli.folders import configurations
+from forewarp.runs.folders import configurations
 
 FOLDERS = {"evaluate": "run", "render": "run", "train": "resume"}
 

@@ -28,9 +28,9 @@ Overrule it by one key: forewarp-train plan=FILE model/inpainter=unet3d
 def plan(config) -> None:
     """Plan and say so."""
     from forewarp.cli.absent import refuse_absent
-    from forewarp.cli.plan_file import tell
     from forewarp.cli.train import refuse_seeds, refuse_two_models
-    from forewarp.cli.words import typed_words
+    from forewarp.planning.plan_file import tell
+    from forewarp.runs.overrides import typed_words
 
     if isinstance(config.plan, str):
         raise ValueError(
@@ -39,7 +39,7 @@ def plan(config) -> None:
     refuse_seeds(config)
     refuse_two_models(config)
     refuse_absent(config)
-    from forewarp.cli.planning import make_plan  # loads torch; what is mistyped has been answered before
+    from forewarp.planning.plan import make_plan  # loads torch; what is mistyped has been answered before
 
     tell(make_plan(config, typed_words()))
 

@@ -32,31 +32,32 @@ def render(config) -> None:
     """Load, and write the video."""
     from pathlib import Path
 
-    from forewarp.cli.identity import saved_config
+    from forewarp.runs.identity import saved_config
 
     saved = saved_config(config.run, config)
     check(config)
     # These load torch; what is mistyped has been answered before.
-    from forewarp.cli.claims import tell_other_data
-    from forewarp.cli.measure import Progress, device_of
-    from forewarp.cli.runs import build_run
     from forewarp.drawing.files import write_video
+    from forewarp.progress import Counted
+    from forewarp.runs.build import build_run
+    from forewarp.runs.lock import tell_other_data
+    from forewarp.training.device import device_of
 
     run = build_run(saved)
     module = run.load().to(device_of(saved.trainer.accelerator))
     tell_other_data(run)
     pictures = pictures_of(config, module, run.datamodule)
     file = Path(run.folder) / "videos" / f"{config.path}.{config.format}"
-    with Progress(config.path) as progress:
+    with Counted(config.path) as progress:
         written = write_video(file, counted(pictures, config.frames, progress), fps=float(config.fps))
     print(f"written: {written}")
 
 
 def pictures_of(config, module, datamodule):
     """The pictures of the video that the config describes."""
-    from forewarp.training.pictures import sized
-    from forewarp.training.trajectories import Trajectories
-    from forewarp.training.videos import make_shots, video
+    from forewarp.evaluation.pictures import sized
+    from forewarp.evaluation.trajectories import Trajectories
+    from forewarp.evaluation.videos import make_shots, video
 
     cameras = [frame.camera for frame in datamodule.scene.train]
     targets = datamodule.targets("test")
@@ -81,7 +82,7 @@ def counted(pictures, total: int, progress):
 def check(config) -> None:
     """Refuse what no video can be made of, before anything is loaded."""
     from forewarp.drawing.files import FORMATS
-    from forewarp.training.videos import PATHS
+    from forewarp.evaluation.videos import PATHS
 
     for key, known in (("path", PATHS), ("format", FORMATS)):
         if config[key] not in known:

@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from forewarp.cli.entry import one_line, quiet
-from forewarp.cli.trusted import without_trust
+from forewarp.runs.trust import without_trust
 
 
 def replay(path: Path, trust: Sequence[str] = ()) -> str:
@@ -24,8 +24,8 @@ def replay(path: Path, trust: Sequence[str] = ()) -> str:
     """
     import torch
 
-    from forewarp.cli.identity import parsed
-    from forewarp.cli.runs import build_run
+    from forewarp.runs.build import build_run
+    from forewarp.runs.identity import parsed
     from forewarp.training.bundle import read_bundle
     from forewarp.training.checkpoints import misfits
     from forewarp.training.sentinel import diagnose

@@ -51,10 +51,10 @@ def synthesize(config) -> None:
         advice = "set overwrite=true or folder=..." if is_scene else "set folder=..."
         raise ValueError(f"{folder}: expected a new or empty folder, but got one with files; {advice}")
     # These load torch; what is mistyped has been answered before.
-    from forewarp.cli.measure import Progress
-    from forewarp.cli.synthetic import write_whole
+    from forewarp.progress import Counted
+    from forewarp.synth.module import write_whole
 
-    with Progress("images") as progress:
+    with Counted("images") as progress:
         write_whole(folder, dataset, arguments, workers=workers, progress=progress)
     print(f"written: {folder}")
 

@@ -48,8 +48,8 @@ Watch: tensorboard --logdir runs
 def train(config) -> float | None:
     """Fit what is not finished, then measure what was not; returns the score, where one is wanted."""
     from forewarp.cli.absent import refuse_absent
-    from forewarp.cli.identity import claim, hashed, resumed
-    from forewarp.cli.trusted import check_planned, trust_of
+    from forewarp.runs.identity import claim, hashed, resumed
+    from forewarp.runs.trust import check_planned, trust_of
 
     refuse_seeds(config)
     refuse_two_models(config)
@@ -57,17 +57,16 @@ def train(config) -> float | None:
     if config.get("planned") is not None:
         check_planned(config, trust)
     if config.get("score") not in (None, "psnr"):
-        from forewarp.cli.score import named
+        from forewarp.runs.score import named
 
         named(config.score)
     config = resumed(config)
     refuse_absent(config)
     # These load torch; what is mistyped has been answered before.
-    from forewarp.cli.claims import alone, same_data
-    from forewarp.cli.measure import measure
     from forewarp.cli.report import draw_run
-    from forewarp.cli.runs import build_run, is_measured
-    from forewarp.cli.score import Score
+    from forewarp.runs.build import build_run, is_measured, measure_run
+    from forewarp.runs.lock import alone, same_data
+    from forewarp.runs.score import Score
 
     config = hashed(planned(config))
     run = build_run(config)
@@ -89,7 +88,7 @@ def train(config) -> float | None:
         print(beginning(run, config), flush=True)
         module = run.fit()
         if config.evaluate:
-            measure(run, module, config)
+            measure_run(run, module, config)
         else:
             print(f"fitted: {run.folder}; measure it with forewarp-evaluate run={run.folder}")
         draw_run(run.folder)
@@ -105,11 +104,11 @@ def planned(config):
         raise ValueError(f"effects: expected given or auto, but got {choice}")
     if choice == "given" or config.get("resume") is not None:
         return config
-    from forewarp.cli.plan_file import own_folder, tell
-    from forewarp.cli.planning import make_plan
-    from forewarp.cli.runs import build_run
-    from forewarp.cli.trials import composed
-    from forewarp.cli.words import merged, of_what_is_on, typed_words
+    from forewarp.planning.plan import make_plan
+    from forewarp.planning.plan_file import own_folder, tell
+    from forewarp.planning.trials import composed
+    from forewarp.runs.build import build_run
+    from forewarp.runs.overrides import merged, of_what_is_on, typed_words
 
     if skips(build_run(config), config.get("absent", "refuse")):
         return config
@@ -170,7 +169,7 @@ def refuse_two_models(config) -> None:
 
 def beginning(run, config) -> str:
     """What is about to be trained, on what, and where it goes: two lines."""
-    from forewarp.cli.measure import device_of
+    from forewarp.training.device import device_of
 
     scene, device = run.datamodule.scene, device_of(config.trainer.accelerator).type.upper()
     views = f"{_images(scene.train, 'training')} and {_images(scene.test, 'test')}"

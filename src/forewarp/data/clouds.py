@@ -8,9 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from forewarp.data.files import read_bytes, replace_file
+from forewarp.data.files import read_bytes
 from forewarp.data.truth import load_numpy
 from forewarp.data.views import MOST_UNITS
+from forewarp.files import replace_file
 from forewarp.scene.errors import SceneError
 
 _MOST_BYTES = 1 << 28  # of text

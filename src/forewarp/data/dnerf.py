@@ -21,10 +21,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from forewarp.data.files import MARKERS, frames_of, inside, number, read_json, replace_file, scene_folder
+from forewarp.data.files import MARKERS, frames_of, inside, number, read_json, scene_folder
 from forewarp.data.images import CachedImage, common_header, write_png
 from forewarp.data.truth import StoredDepth, read_truth, write_depth, write_truth
 from forewarp.data.views import FLIP, box_of, check_range, frustum_box, pose_of
+from forewarp.files import replace_file
 from forewarp.scene.camera import Camera
 from forewarp.scene.errors import SceneError
 from forewarp.scene.frame import Frame, Scene, Truth

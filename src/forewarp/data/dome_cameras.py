@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from forewarp.data.clouds import numbers_of
-from forewarp.data.files import number, read_bytes, replace_file
+from forewarp.data.files import number, read_bytes
 from forewarp.data.views import pose_of
+from forewarp.files import replace_file
 from forewarp.scene.camera import Camera
 from forewarp.scene.errors import SceneError
 

@@ -12,9 +12,9 @@ from pathlib import Path
 from reprlib import repr as short
 from unicodedata import category
 
+from forewarp.files import MOST_BYTES
 from forewarp.scene.errors import SceneError
 
-MOST_TEXT = 1 << 26  # bytes: what is parsed takes up to thirty times as much memory
 MOST_FRAMES = 1_000_000
 MARKERS = {  # by the reader: the file that every scene of its format has
     "dnerf": "transforms_train.json",
@@ -26,7 +26,7 @@ MARKERS = {  # by the reader: the file that every scene of its format has
 _UNPRINTABLE = {"Cc", "Cs", "Zl", "Zp"}  # controls, halves of characters, separators of lines
 
 
-def read_bytes(path: Path, most: int = MOST_TEXT, what: str = "a readable file") -> bytes:
+def read_bytes(path: Path, most: int = MOST_BYTES, what: str = "a readable file") -> bytes:
     """What a file holds; nothing is read of one that is larger than ``most`` bytes, or no file but a pipe.
 
     Raises:
@@ -71,14 +71,6 @@ def read_json(path: Path) -> dict:
     if not isinstance(content, dict):
         raise SceneError(f"{path}: expected a JSON object at the top, but got {type(content).__name__}")
     return content
-
-
-def replace_file(path: Path, content: bytes) -> None:
-    """Write a file so that nobody ever sees half of it: beside its place first, then renamed."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".partial")
-    partial.write_bytes(content)
-    os.replace(partial, path)
 
 
 def number(value: object, where: str, low: float = -math.inf, high: float = math.inf) -> float:

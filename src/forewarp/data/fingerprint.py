@@ -6,7 +6,8 @@ import hashlib
 import os
 from pathlib import Path
 
-from forewarp.data.files import MOST_TEXT, read_bytes
+from forewarp.data.files import read_bytes
+from forewarp.files import MOST_BYTES
 
 _READ = {".json", ".inf", ".txt", ".csv"}  # small and decisive: their content counts
 RECORD = "synthesis.json"  # of every synthesised scene, or folder of them
@@ -27,7 +28,7 @@ def fingerprint(folder: Path) -> dict:
     texts, listed = {}, []
     for path in _files(folder):
         name, suffix, size = path.relative_to(folder).as_posix(), path.suffix.lower(), path.stat().st_size
-        if suffix in _READ and size <= MOST_TEXT:
+        if suffix in _READ and size <= MOST_BYTES:
             texts[name] = hashlib.sha256(read_bytes(path)).hexdigest()
         elif suffix in _READ | _LISTED:
             listed.append((name, size))

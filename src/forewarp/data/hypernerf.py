@@ -18,12 +18,13 @@ import torch
 from torch import Tensor
 
 from forewarp.data.clouds import read_cloud, write_cloud
-from forewarp.data.files import MARKERS, inside, number, read_json, replace_file, scene_folder, whole
+from forewarp.data.files import MARKERS, inside, number, read_json, scene_folder, whole
 from forewarp.data.images import CachedImage, inspect_png, write_png
 from forewarp.data.nerfies_camera import numbers, read_camera, reduced, write_camera
 from forewarp.data.nerfies_items import read_camera_ids, read_split, read_times
 from forewarp.data.truth import read_truth, write_truth
 from forewarp.data.views import MOST_UNITS, box_of, frustum_box, middle_of
+from forewarp.files import replace_file
 from forewarp.scene.camera import Camera
 from forewarp.scene.errors import SceneError
 from forewarp.scene.frame import Frame, Scene, Truth

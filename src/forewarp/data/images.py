@@ -16,7 +16,8 @@ from torch import Tensor
 
 from forewarp.data import jpeg
 from forewarp.data.cache import CACHE
-from forewarp.data.files import read_bytes, replace_file
+from forewarp.data.files import read_bytes
+from forewarp.files import replace_file
 from forewarp.scene.errors import SceneError
 
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"

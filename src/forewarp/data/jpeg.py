@@ -10,7 +10,7 @@ import imageio.v3 as iio
 import numpy as np
 from torch import Tensor
 
-from forewarp.data.files import replace_file
+from forewarp.files import replace_file
 from forewarp.scene.errors import SceneError
 
 SIGNATURE = b"\xff\xd8"

@@ -14,8 +14,9 @@ from reprlib import repr as short
 import numpy as np
 import torch
 
-from forewarp.data.files import number, read_json, replace_file
+from forewarp.data.files import number, read_json
 from forewarp.data.views import check_lens, pose_of
+from forewarp.files import replace_file
 from forewarp.scene.camera import Camera
 from forewarp.scene.errors import SceneError
 from forewarp.scene.lens import Lens

@@ -26,12 +26,13 @@ from forewarp.data.capture import (
     split_views,
     spread_in_time,
 )
-from forewarp.data.files import MARKERS, number, read_json, replace_file, scene_folder, whole
+from forewarp.data.files import MARKERS, number, read_json, scene_folder, whole
 from forewarp.data.images import CachedImage, write_png
 from forewarp.data.jpeg import write_jpeg
 from forewarp.data.masked import MaskedImage
 from forewarp.data.region import region_of
 from forewarp.data.views import FLIP, MOST_UNITS, box_of, middle_of, pose_of
+from forewarp.files import replace_file
 from forewarp.scene.box import Box
 from forewarp.scene.camera import Camera
 from forewarp.scene.errors import SceneError

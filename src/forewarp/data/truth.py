@@ -12,9 +12,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from forewarp.data.files import read_bytes, replace_file
+from forewarp.data.files import read_bytes
 from forewarp.data.images import halved_depth, read_gray16
 from forewarp.data.views import MOST_UNITS
+from forewarp.files import replace_file
 from forewarp.scene.errors import SceneError
 from forewarp.scene.frame import Truth
 

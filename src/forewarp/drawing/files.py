@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import os
 from collections.abc import Iterable
 from itertools import chain
 from pathlib import Path
@@ -12,6 +11,8 @@ import imageio.v3 as iio
 import imageio_ffmpeg
 import numpy as np
 from torch import Tensor
+
+from forewarp.files import written_whole
 
 FORMATS = ("mp4", "gif", "png")
 
@@ -23,8 +24,8 @@ def to_bytes(picture: Tensor) -> np.ndarray:
 
 def write_png(path: Path, picture: Tensor) -> Path:
     """Write (H, W, 3) in [0, 1]; the folder is made."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    _replace(path, lambda beside: iio.imwrite(beside, to_bytes(picture), extension=".png"))
+    with written_whole(path) as beside:
+        iio.imwrite(beside, to_bytes(picture), extension=".png")
     return path
 
 
@@ -41,12 +42,12 @@ def write_video(path: Path, pictures: Iterable[Tensor], *, fps: float) -> Path:
         for number, picture in enumerate(pictures):
             write_png(folder / f"{number:04d}.png", picture)
         return folder
-    path.parent.mkdir(parents=True, exist_ok=True)
-    if path.suffix == ".gif":
-        frames = [to_bytes(picture) for picture in pictures]
-        _replace(path, lambda b: iio.imwrite(b, frames, extension=".gif", duration=1000 / fps, loop=0))
-    else:
-        _replace(path, lambda b: _write_mp4(b, map(to_bytes, pictures), fps))
+    with written_whole(path) as beside:
+        if path.suffix == ".gif":
+            frames = [to_bytes(picture) for picture in pictures]
+            iio.imwrite(beside, frames, extension=".gif", duration=1000 / fps, loop=0)
+        else:
+            _write_mp4(beside, map(to_bytes, pictures), fps)
     return path
 
 
@@ -70,12 +71,3 @@ def _write_mp4(path: Path, frames: Iterable[np.ndarray], fps: float) -> None:
 def _even(frame: np.ndarray) -> np.ndarray:
     height, width = frame.shape[:2]
     return np.ascontiguousarray(np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge"))
-
-
-def _replace(path: Path, write) -> None:
-    beside = path.with_name(f".{path.name}.part{path.suffix}")
-    try:
-        write(beside)
-        os.replace(beside, path)
-    finally:
-        beside.unlink(missing_ok=True)

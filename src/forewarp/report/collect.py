@@ -10,7 +10,7 @@ from pathlib import Path
 
 import yaml
 
-MOST_BYTES = 1 << 20  # of a config: ours have a few thousand
+from forewarp.files import MOST_CONFIG, read_text
 
 
 @dataclass(frozen=True)
@@ -160,9 +160,7 @@ def collect(root: Path, needed: Sequence[str] = ()) -> tuple[list[Result], list[
 def read_run(folder: Path) -> Result:
     """One run; files that are not there leave their part empty."""
     path = folder / "config.yaml"
-    if (size := path.stat().st_size) > MOST_BYTES:
-        raise ValueError(f"config.yaml: expected at most {MOST_BYTES} bytes, but got {size}")
-    config = yaml.safe_load(path.read_text())
+    config = yaml.safe_load(read_text(path, MOST_CONFIG))
     if "preset" not in config and "warp" in config.get("model", {}):  # of a version before 0.2
         config["preset"] = {"name": config["budget"]["name"]}
         config["model"]["name"] = config["model"]["warp"]
@@ -222,4 +220,4 @@ def machine(results: Sequence[Result]) -> str:
 
 
 def _json(path: Path) -> dict:
-    return json.loads(path.read_text()) if path.is_file() else {}
+    return json.loads(read_text(path)) if path.is_file() else {}

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import yaml
 
+from forewarp.files import written_whole
 from forewarp.report.collect import Point, Result
 
 OTHERS = Path(__file__).with_name("published.yaml")  # what others report
@@ -144,8 +144,6 @@ def _line(axes, curve: Sequence[Point], **style) -> None:
 
 
 def _save(figure, path: Path) -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    beside = path.with_name(f".{path.name}.part")
-    figure.savefig(beside, format="png", dpi=120)
-    os.replace(beside, path)
+    with written_whole(path) as beside:
+        figure.savefig(beside, format="png", dpi=120)
     return path

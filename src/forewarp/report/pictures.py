@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from forewarp.files import read_text
 from forewarp.report import curve
 from forewarp.report.collect import Result
 from forewarp.report.compared import row_of
@@ -90,7 +91,7 @@ def _sheets(run: Result) -> dict[str, Path]:
 
 def _images(run: Result) -> list[dict]:
     path = run.folder / "per_image.json"
-    return json.loads(path.read_text())["images"] if path.is_file() else []
+    return json.loads(read_text(path))["images"] if path.is_file() else []
 
 
 def _read(path: Path) -> np.ndarray:

@@ -3,33 +3,25 @@
 from __future__ import annotations
 
 import io
-import os
 import zipfile
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from forewarp.files import replace_file
+
 
 def write_archive(path: Path, content: dict) -> None:
-    """Write beside its place, then rename.
+    """Write a whole file.
 
     Raises:
         OSError: naming the file, where it cannot be written; nothing is then left beside.
     """
     packed = io.BytesIO()
     torch.save(content, packed)  # into a file it would hide why the system refused
-    beside = path.with_name(path.name + ".part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        beside.write_bytes(packed.getbuffer())
-        os.replace(beside, path)
-    except OSError as error:
-        with suppress(OSError):
-            beside.unlink()
-        raise OSError(error.errno, error.strerror or str(error), str(path)) from error
+    replace_file(path, packed.getbuffer())
 
 
 def read_archive(path: Path) -> dict:

@@ -9,7 +9,7 @@ from collections import defaultdict
 import lightning
 from lightning.pytorch.loggers import TensorBoardLogger
 
-from forewarp.training.progress import ProgressLine, time_text
+from forewarp.progress import ProgressLine, time_text
 
 _SMOOTHING = 0.02  # share of the newest step in the PSNR shown: about the last 50 count
 

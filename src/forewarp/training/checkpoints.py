@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
 
 import lightning
 import torch
 
+from forewarp.files import written_whole
 from forewarp.training.archive import read_archive
 from forewarp.training.interruption import Interruption
 from forewarp.training.module import DynamicSceneModule
@@ -52,16 +51,8 @@ class KeepCheckpoint(lightning.Callback):
     def save(self, trainer: lightning.Trainer) -> None:
         """Save now."""
         self.check(trainer)
-        beside = self.path.with_name(self.path.name + ".part")
-        try:
+        with written_whole(self.path, synced=True) as beside:
             trainer.save_checkpoint(beside)
-            with beside.open("rb+") as file:  # on the disk before it takes the other's name
-                os.fsync(file.fileno())
-            os.replace(beside, self.path)
-        except OSError as error:  # a full disk does not say which file
-            with suppress(OSError):
-                beside.unlink()
-            raise OSError(error.errno, error.strerror or str(error), str(self.path)) from error
 
 
 def check_checkpoint(path: Path, module: DynamicSceneModule) -> dict:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import math
-import os
 from pathlib import Path
 
 import torch
 
+from forewarp.files import read_json, write_json
 from forewarp.methods.abilities import HasBounds, HasMatter, HasTrajectories
 from forewarp.methods.method import Method
 from forewarp.scene.box import Box
@@ -16,16 +15,8 @@ from forewarp.scene.cloud import Cloud, Handover
 from forewarp.scene.frame import Scene, spread
 from forewarp.training.archive import read_archive, write_archive
 
-MOST_BYTES = 1 << 26  # of a file that is read whole
 NUMBERS, POINTS = "handover.json", "handover.pt"
 _POINTS, _TIMES = 10_000, 16  # at most, of the cloud and of its paths
-
-
-def write_json(path: Path, content: dict) -> None:
-    """Write beside, then rename, so that half a file is never taken for one."""
-    beside = path.with_name(path.name + ".part")
-    beside.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
-    os.replace(beside, path)
 
 
 @torch.no_grad()
@@ -106,12 +97,3 @@ def _points(content: dict, size: float) -> tuple:
     if not good or not 0 < size < math.inf:
         raise ValueError
     return Cloud(points, colors, opacity, size), times, paths
-
-
-def read_json(path: Path) -> dict | None:
-    """The object that a file of a run holds; None where there is no file, or none that is whole."""
-    try:
-        content = json.loads(path.read_text()) if path.stat().st_size <= MOST_BYTES else None
-    except (FileNotFoundError, NotADirectoryError, ValueError, RecursionError):
-        return None
-    return content if isinstance(content, dict) else None

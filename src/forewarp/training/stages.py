@@ -9,12 +9,13 @@ from types import SimpleNamespace
 
 import lightning
 
+from forewarp.files import read_json, write_json
 from forewarp.methods.method import Method, Start, parameter_count
 from forewarp.scene.cloud import Handover
 from forewarp.scene.frame import Scene
 from forewarp.training.checkpoints import KeepCheckpoint, check_state, load_weights
 from forewarp.training.curriculum import Curriculum
-from forewarp.training.handover import load_handover, make_handover, read_json, save_handover, write_json
+from forewarp.training.handover import load_handover, make_handover, save_handover
 from forewarp.training.interruption import Interruption
 from forewarp.training.module import DynamicSceneModule
 from forewarp.training.objective import Objective

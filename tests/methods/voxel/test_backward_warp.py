@@ -7,7 +7,7 @@ from forewarp.methods.voxel.backward_warp import BackwardWarp, Deformation
 from forewarp.renderer import Renderer
 from forewarp.scene.box import Lattice
 from forewarp.scene.view import Moment
-from tiny_scene import BOX, backward_model, built, camera_at
+from tests.support.tiny_scene import BOX, backward_model, built, camera_at
 
 LATTICE = Lattice(BOX, (24, 20, 18))
 

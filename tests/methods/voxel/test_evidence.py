@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from forewarp.fields.trajectory import TrajectoryField
+from forewarp.methods.voxel.evidence import Movement, movement
 from forewarp.ops.dct import dct_basis
 from forewarp.scene.box import Lattice
-from forewarp.methods.voxel.evidence import Movement, movement
 from forewarp.scene.pictures import survey
-from tiny_scene import BOX, ball_scene, built, forward_model
+from tests.support.tiny_scene import BOX, ball_scene, built, forward_model
 
 LATTICE = Lattice(BOX, (12, 9, 8))
 

@@ -3,17 +3,17 @@ from functools import partial
 import pytest
 import torch
 
+from forewarp.fields.radiance import FeatureRadiance
+from forewarp.fields.trajectory import TrajectoryField
+from forewarp.methods.method import parameter_count
+from forewarp.methods.voxel.backward_warp import Deformation
 from forewarp.methods.voxel.effects.background import StaticBackground
 from forewarp.methods.voxel.effects.inpaint import UNet3d
 from forewarp.methods.voxel.effects.upsample import LearnedUpsampler, TrilinearUpsampler
 from forewarp.methods.voxel.effects.view import ViewNetwork
-from forewarp.fields.radiance import FeatureRadiance
-from forewarp.fields.trajectory import TrajectoryField
-from forewarp.methods.voxel.backward_warp import Deformation
-from forewarp.methods.method import parameter_count
-from forewarp.scene.box import Lattice
 from forewarp.methods.voxel.stage import EFFECTS
-from tiny_scene import BOX, backward_model, built, forward_model
+from forewarp.scene.box import Lattice
+from tests.support.tiny_scene import BOX, backward_model, built, forward_model
 
 LATTICE = Lattice(BOX, (5, 4, 6))
 

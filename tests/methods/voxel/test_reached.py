@@ -15,7 +15,7 @@ from forewarp.methods.voxel.effects.view import SphericalHarmonics
 from forewarp.methods.voxel.forward_warp import ForwardWarp
 from forewarp.renderer import Renderer
 from forewarp.scene.view import Moment, View
-from tiny_scene import ball_data, forward_model, make_run, stage
+from tests.support.tiny_scene import ball_data, forward_model, make_run, stage
 
 RENDERER = Renderer(step=0.7)
 MODEL = forward_model(

@@ -3,7 +3,7 @@
 import torch
 
 from forewarp.methods.voxel.residual import _explained, residual
-from tiny_scene import ball_data, forward_model, make_run, stage
+from tests.support.tiny_scene import ball_data, forward_model, make_run, stage
 
 
 def samples(views=24, places=30, seed=0):

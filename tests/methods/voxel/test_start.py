@@ -10,7 +10,7 @@ from forewarp.fields.radiance import FeatureRadiance
 from forewarp.methods.method import Start
 from forewarp.scene.cloud import Handover
 from forewarp.training.handover import make_handover
-from tiny_scene import BOX, RADIUS, ball_center, ball_scene, forward_model
+from tests.support.tiny_scene import BOX, RADIUS, ball_center, ball_scene, forward_model
 
 SCENE = ball_scene(frames=6, size=16)
 

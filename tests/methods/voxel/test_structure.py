@@ -5,7 +5,6 @@ import torch
 
 from forewarp.fields.radiance import DirectRadiance, FeatureRadiance
 from forewarp.methods.voxel.backward_warp import Deformation
-from forewarp.scene.box import Box, Lattice
 from forewarp.methods.voxel.structure import (
     box_of_all_times,
     occupied,
@@ -14,7 +13,8 @@ from forewarp.methods.voxel.structure import (
     resample,
     seen_rows,
 )
-from tiny_scene import BOX, backward_model, built, forward_model
+from forewarp.scene.box import Box, Lattice
+from tests.support.tiny_scene import BOX, backward_model, built, forward_model
 
 SHAPE = (6, 5, 7)
 LATTICE = Lattice(Box((0, 0, 0), (5, 4, 6)), SHAPE)

@@ -17,7 +17,7 @@ from forewarp.renderer import Marched, Renderer
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.view import Moment
 from forewarp.training.objective import Objective, total
-from tiny_scene import ball_data, ball_scene, begun, built, forward_model, stage
+from tests.support.tiny_scene import ball_data, ball_scene, begun, built, forward_model, stage
 
 LATTICE = Lattice(Box((0, 0, 0), (2, 3, 4)), (3, 4, 5))
 

@@ -3,11 +3,11 @@ import math
 import pytest
 import torch
 
-from forewarp.methods.voxel.effects.motion import Motion
+from forewarp.fields.radiance_grid import EMPTY, Activation, RadianceGrid
 from forewarp.fields.trajectory import TrajectoryField
+from forewarp.methods.voxel.effects.motion import Motion
 from forewarp.ops.splat import average_splat
 from forewarp.scene.box import Box, Lattice
-from forewarp.fields.radiance_grid import EMPTY, Activation, RadianceGrid
 
 BOX = Box((0, 0, 0), (1, 6, 8))  # spacings 1/2, 2, 2
 LATTICE = Lattice(BOX, (3, 4, 5))

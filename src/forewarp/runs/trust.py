@@ -1,0 +1,215 @@
+"""Configs that come from a run's folder: read as data, and refused where they could do more than a config."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import os
+import re
+import sys
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import yaml
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from forewarp.files import MOST_CONFIG
+
+MOST_LEVELS = 40
+TRUST_VARIABLE = "FOREWARP_TRUST"
+# Beside the classes that modules of forewarp define. Whole names: through a prefix all of torch is reached.
+ELSEWHERE = {
+    "lightning.Trainer",
+    "lightning.pytorch.Trainer",
+    "lightning.pytorch.loggers.CSVLogger",
+    "lightning.pytorch.loggers.TensorBoardLogger",
+}
+_RESERVED = {"_target_", "_partial_", "_recursive_", "_convert_"}
+_PARTS = {"name", "version", "sub_dir"}  # of the path that a logger writes to
+
+
+def trusted_config(text: str, where: Path, trust: Sequence[str] | None = ()) -> DictConfig:
+    """A resolved config from its YAML.
+
+    Args:
+        text: the YAML.
+        where: it comes from, for errors.
+        trust: packages whose code it may name, as ``trust_of`` gives them; no other is imported. None: the
+            config is compared and never instantiated, so what its targets name is not looked at.
+
+    Raises:
+        ValueError: for what is no YAML, no mapping, uses aliases or interpolations, is nested too deeply, or
+            names a ``_target_`` that is neither a class of forewarp, by the module that defines it, nor in
+            ``ELSEWHERE``, nor defined in a package of ``trust``, or sends a logger out of its stage's folder.
+    """
+    try:
+        _check_events(text, where)
+        config = OmegaConf.create(text)
+        content = OmegaConf.to_container(config) if isinstance(config, DictConfig) else None
+    except (yaml.YAMLError, UnicodeError, OmegaConfBaseException, TypeError, AssertionError) as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise ValueError(f"{where}: expected YAML, but got {reason}; delete the run's folder") from None
+    except (ValueError, RecursionError, OverflowError) as error:
+        if str(error).startswith(f"{where}: "):
+            raise
+        raise ValueError(f"{where}: expected YAML, but got {error}; delete the run's folder") from None
+    if content is None:
+        raise ValueError(f"{where}: expected a mapping, but got another kind; delete the run's folder")
+    _check(content, where, "", trust)
+    return config
+
+
+def trust_of(named: str | Iterable[str] | None = None) -> tuple[str, ...]:
+    """The packages that are trusted: those named, and those of ``FOREWARP_TRUST``.
+
+    Args:
+        named: one name, or several with commas or as a list; None: none.
+
+    Raises:
+        ValueError: for what is no name of a package: an empty one, a wildcard.
+
+    >>> trust_of("theirs"), trust_of(["theirs", "other.part", "theirs"])
+    (('theirs',), ('theirs', 'other.part'))
+    """
+    found: dict[str, None] = {}
+    for source, given in (("trust", named), (TRUST_VARIABLE, os.environ.get(TRUST_VARIABLE) or None)):
+        names = given.split(",") if isinstance(given, str) else [] if given is None else given
+        for name in list(names) if isinstance(names, Iterable) else [names]:
+            name = name.strip() if isinstance(name, str) else name
+            if not isinstance(name, str) or not all(part.isidentifier() for part in name.split(".")):
+                example = "trust=[theirs]" if source == "trust" else f"{TRUST_VARIABLE}=theirs"
+                raise ValueError(
+                    f"{source}: expected names of packages, as {example}, but got {name!r:.80}; name each"
+                )
+            found[name] = None
+    return tuple(found)
+
+
+def without_trust(words: Sequence[str]) -> tuple[list[str], tuple[str, ...]]:
+    """The words of a command line that are no ``trust=...``, and the packages that those name.
+
+    >>> without_trust(["run", "trust=[theirs,other]"])
+    (['run'], ('theirs', 'other'))
+    """
+    named = [word.partition("=")[2] for word in words if word.startswith("trust=")]
+    lists = [re.sub(r"^\[(.*)\]$", r"\1", text) for text in named]
+    rest = [word for word in words if not word.startswith("trust=")]
+    return rest, trust_of([name for text in lists for name in text.split(",")])
+
+
+def check_planned(config: DictConfig, trust: Sequence[str]) -> None:
+    """Refuse a composed config whose words came from a plan's file, where it could do more than a config."""
+    where = f"plan={config.planned}"
+    _check(OmegaConf.to_container(config, resolve=True), where, "", trust)
+
+
+def _check_events(text: str, where: Path) -> None:
+    """Refuse what grows when it is built: aliases and endless nesting; of text too long nothing is parsed."""
+    if len(text) > MOST_CONFIG:
+        raise ValueError(f"{where}: expected at most {MOST_CONFIG} characters, but got {len(text)}")
+    level = 0
+    for event in yaml.parse(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader)):
+        if isinstance(event, yaml.AliasEvent):
+            raise ValueError(f"{where}: expected no aliases, but got *{event.anchor}; write it out")
+        level += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        if level > MOST_LEVELS:
+            raise ValueError(f"{where}: expected at most {MOST_LEVELS} levels, but got more")
+
+
+def _check(node: object, where: Path, key: str, trust: Sequence[str] | None) -> None:
+    if isinstance(node, dict):
+        for name, value in node.items():
+            inner = f"{key}.{name}" if key else str(name)
+            if name == "_target_" and trust is not None:
+                check_target(value, where, inner, trust)
+                _check_logger(node, where, key)
+            elif str(name).startswith("_") and name not in _RESERVED:
+                raise ValueError(f"{where}: {inner}: expected no key of this name; delete it")
+            _check(value, where, inner, trust)
+    elif isinstance(node, list):
+        for i, value in enumerate(node):
+            _check(value, where, f"{key}[{i}]", trust)
+    elif isinstance(node, str) and "${" in node:
+        raise ValueError(f"{where}: {key}: expected a plain value, but got {node[:80]}; write the value")
+
+
+def check_target(name: object, where: Path | str, key: str, trust: Sequence[str]) -> None:
+    """Refuse the name of what is neither forewarp's, nor in ``ELSEWHERE``, nor of a trusted package.
+
+    Raises:
+        ValueError: that says where it stands, and how to trust it.
+    """
+    if isinstance(name, str) and name in ELSEWHERE:
+        return
+    refusal = f"{where}: {key}: expected a class of forewarp, but got {name!r:.80}"
+    parts = name.split(".") if isinstance(name, str) else []
+    if len(parts) < 2 or not all(part.isidentifier() for part in parts):
+        raise ValueError(refusal)
+    if parts[0] != "forewarp":
+        _check_foreign(name, refusal, trust)
+        return
+    home, _, last = name.rpartition(".")
+    try:
+        found = getattr(importlib.import_module(home), last)
+    except Exception as error:  # what imports raise
+        raise ValueError(f"{refusal} ({type(error).__name__})") from None
+    # Not what a module imports: ``forewarp.cli.entry.Path`` begins with a name of ours and is none of ours.
+    if not inspect.isclass(found) or found.__module__ != home:
+        raise ValueError(refusal)
+
+
+def _check_foreign(name: str, refusal: str, trust: Sequence[str]) -> None:
+    """Refuse what no trusted package defines; before anything is imported where none has this name."""
+    if not _is_below(name, trust):
+        raise ValueError(refusal + advice(name, trust))
+    parts = name.split(".")
+    if any(part.startswith("__") for part in parts):
+        raise ValueError(refusal)
+    try:
+        found = _located(parts)
+    except Exception as error:  # what imports raise
+        reason = str(error).partition("\n")[0] or type(error).__name__
+        raise ValueError(f"{refusal}, which cannot be imported ({reason:.120})") from None
+    # Not what its modules import: through ``theirs.module.subprocess.run`` everything would be reached.
+    home = getattr(found, "__module__", None)
+    if not callable(found) or not isinstance(home, str):
+        raise ValueError(f"{refusal}, which is nothing to call that {parts[0]} defines")
+    if not _is_below(home, trust) and not (inspect.isclass(found) and _is_below(home, ["forewarp"])):
+        raise ValueError(f"{refusal}, which {home} defines{advice(home, trust)}")
+
+
+def _located(parts: Sequence[str]) -> object:
+    """What a dotted name means: modules as far as there are such, then attributes."""
+    found = importlib.import_module(parts[0])
+    for i, part in enumerate(parts[1:], 2):
+        if not hasattr(found, part) and inspect.ismodule(found):
+            importlib.import_module(".".join(parts[:i]))
+        found = getattr(found, part)
+    return found
+
+
+def _is_below(name: str, trust: Sequence[str]) -> bool:
+    return any(f"{name}.".startswith(f"{package}.") for package in trust)
+
+
+def advice(name: str, trust: Sequence[str] = ()) -> str:
+    """How to trust what a name begins with, beside what is trusted; nothing of Python's own modules.
+
+    >>> advice("theirs.Class", ["other"])
+    '; if you trust the package theirs, add trust=[other,theirs] (or set FOREWARP_TRUST=other,theirs)'
+    """
+    package = name.partition(".")[0]
+    if package in sys.stdlib_module_names:
+        return ""
+    names = ",".join([*trust, package])
+    return f"; if you trust the package {package}, add trust=[{names}] (or set {TRUST_VARIABLE}={names})"
+
+
+def _check_logger(node: dict, where: Path, key: str) -> None:
+    """A logger joins what it is given to the folder of the stage."""
+    for name in _PARTS & node.keys() if node["_target_"].endswith("Logger") else ():
+        if not re.fullmatch(r"(\w[\w.-]*)?", str(node[name])):
+            raise ValueError(
+                f"{where}: {key}.{name}: expected the name of a folder, but got {node[name]!r:.80}"
+            )

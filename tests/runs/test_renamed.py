@@ -1,0 +1,58 @@
+"""Words of earlier versions are answered with those that took their place."""
+
+import re
+
+import pytest
+
+from tests.support.configs import composed
+from forewarp.runs.identity import read_config
+from forewarp.runs.renamed import refuse_renamed
+
+
+@pytest.mark.parametrize(
+    ("word", "now"),
+    [
+        ("budget=fast", "preset=fast; the choice is called preset since 0.2"),
+        ("budget=demo,fast", "preset=demo,fast;"),
+        ("budget.bases=12", "preset.bases=12;"),
+        ("++budget.inpainter_width=8", "++preset.inpainter_width=8;"),
+        ("renderer.step=0.25", "model.renderer.step=0.25;"),
+        ("model.warp=backward", "model=backward;"),
+        ("experiment=hypernerf_faithful", "experiment=hypernerf preset=faithful;"),
+        ("stage=demo", "stage=forward_demo;"),
+        ("objective=faithful", "objective=forward_faithful;"),
+        ("suits.budgets=[fast]", "no such word;"),
+        ("~suits", "no such word;"),
+    ],
+)
+def test_a_renamed_word_is_refused_with_the_new_one(word, now):
+    with pytest.raises(ValueError, match=re.escape(f"{word}: expected {now}")) as refusal:
+        refuse_renamed(["data.scene=x", word])
+    assert "\n" not in str(refusal.value)
+
+
+def test_words_of_today_are_not():
+    words = [
+        "preset=fast",
+        "budget.minutes=3",
+        "~budget.iterations",
+        "model.renderer.step=1",
+        "stage=forward_demo",
+    ]
+    assert refuse_renamed([*words, "--multirun", "experiment=hypernerf", "data.background=white"]) is None
+
+
+@pytest.mark.parametrize(
+    "word", ["preset=fast", "preset.bases=12", "model.renderer.step=0.25", "stage=forward_demo"]
+)
+def test_what_is_advised_composes(word):
+    assert composed("data.scene=x", word)
+
+
+def test_a_run_of_an_earlier_version_is_refused_with_the_version_that_reads_it(tmp_path):
+    path = tmp_path / "config.yaml"
+    path.write_text("model: {_target_: forewarp.methods.spec.MethodSpec, warp: forward}\nseed: 0\n")
+    expected = f"{path}: expected a run of forewarp 0.2, but got one of 0.1, which version 0.1.0 reads"
+    with pytest.raises(ValueError, match=re.escape(expected)) as refusal:
+        read_config(path)
+    assert "\n" not in str(refusal.value)

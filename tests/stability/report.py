@@ -1,0 +1,122 @@
+"""``python -m tests.stability.report [--long] [--fuzz N]``: how stable all is, into docs/stability.md."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import re
+import statistics
+from collections.abc import Sequence
+from pathlib import Path
+
+from forewarp.cli.entry import quiet
+from forewarp.runs.folders import project_root
+from tests.stability.endurance import RATES, SEEDS, STEPS, endure
+from tests.stability.fuzz import Outcome, fuzz
+from tests.stability.twin import BACKENDS, rows
+
+COLUMNS = [f"{what}, {backend}" for backend in BACKENDS for what in ("values", "gradients")]
+
+
+def error_text(error: float | None) -> str:
+    """One digit and a power of ten, or what there is instead.
+
+    >>> error_text(3.14e-7), error_text(0.0), error_text(None), error_text(float("nan"))
+    ('3e-07', '0', '', 'not finite')
+    """
+    if error is None:
+        return ""
+    return "not finite" if math.isnan(error) else "0" if error == 0 else f"{error:.0e}"
+
+
+def table(header: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
+    """A table in Markdown."""
+    rule = ["---"] * len(header)
+    return "\n".join("| " + " | ".join(line) + " |" for line in (header, rule, *lines))
+
+
+def operator_table() -> str:
+    """Every operator's errors; printed as they come."""
+    lines = []
+    for row in rows():
+        lines.append([row["operator"], row["input"], *(error_text(row[c]) for c in COLUMNS)])
+        print("  ".join(lines[-1]), flush=True)
+    return table(["operator", "input", *COLUMNS], lines)
+
+
+def endurance_table(trials: Sequence[dict]) -> str:
+    """The spread of PSNR by learning rate, and how many broke."""
+    lines = []
+    for rate in sorted({t["rate"] for t in trials}):
+        own = [t for t in trials if t["rate"] == rate]
+        scores = [t["psnr"] for t in own if t["wrong"] is None]
+        spread = [f"{f(scores):.2f}" for f in (min, statistics.median, max)] if scores else [""] * 3
+        deviation = f"{statistics.pstdev(scores):.2f}" if scores else ""
+        lines.append([f"x{rate:g}", str(len(own)), str(len(own) - len(scores)), *spread, deviation])
+    return table(["rates", "seeds", "not finite", "least PSNR", "median", "most", "deviation"], lines)
+
+
+def fuzz_table(outcomes: Sequence[Outcome], grown: int) -> str:
+    """What became of harmed files, loader by loader, and of the memory."""
+    lines = [
+        [o.name, *(f"{n:,}" for n in (o.inputs, o.read, o.refused, len(o.faults))), f"{o.slowest:.2f}"]
+        for o in outcomes
+    ]
+    head = ["loader", "inputs", "read", "refused in one line", "anything else", "slowest, s"]
+    total = f"{sum(o.inputs for o in outcomes):,} inputs; the process grew by {grown / 2**20:.0f} MiB."
+    return table(head, lines) + "\n\n" + total
+
+
+def replace_section(path: Path, name: str, text: str) -> None:
+    """Put ``text`` between the marks ``<!-- name -->`` and ``<!-- end of name -->`` of a file.
+
+    Raises:
+        ValueError: where the marks are missing.
+    """
+    before = path.read_text()
+    marks = re.compile(f"(<!-- {name} -->\n).*?(<!-- end of {name} -->)", re.DOTALL)
+    if not marks.search(before):
+        raise ValueError(f"{path}: expected the marks of '{name}', but got none; put them back")
+    path.write_text(marks.sub(lambda found: f"{found[1]}\n{text}\n\n{found[2]}", before))
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Measure, and write the tables."""
+    parser = argparse.ArgumentParser(prog="python -m tests.stability.report", description=__doc__)
+    parser.add_argument(
+        "--long", action="store_true", help="also fit many seeds at high rates; goes on where it stopped"
+    )
+    parser.add_argument(
+        "--no-operators", dest="operators", action="store_false", help="leave them as they are"
+    )
+    parser.add_argument("--fuzz", type=int, default=0, metavar="N", help="also read so many harmed files")
+    parser.add_argument("--workers", type=int, default=1, help="processes that read them")
+    parser.add_argument("--seconds", type=float, default=math.inf, help="of the long runs at most, this time")
+    parser.add_argument("--seeds", type=int, default=SEEDS)
+    parser.add_argument("--steps", type=int, default=STEPS)
+    parser.add_argument(
+        "--trials", type=Path, default=Path("runs/stability/trials.jsonl"), help="of the long runs"
+    )
+    parser.add_argument("--document", type=Path, default=None, help="instead of docs/stability.md")
+    given = parser.parse_args(arguments)
+    quiet()
+    document = given.document or project_root() / "docs" / "stability.md"
+    if given.operators:
+        replace_section(document, "operators", operator_table())
+    if given.long:
+        trials = endure(given.trials, seconds=given.seconds, seeds=given.seeds, steps=given.steps)
+        text = endurance_table(trials)
+        wanted = given.seeds * len(RATES)
+        if len(trials) < wanted:
+            text += f"\n\n{len(trials)} of {wanted} done; the same command goes on."
+        replace_section(document, "long runs", text)
+    if given.fuzz:
+        outcomes, grown = fuzz(given.fuzz, workers=given.workers)
+        replace_section(document, "fuzzing", fuzz_table(outcomes, grown))
+        for fault in [fault for outcome in outcomes for fault in outcome.faults][:20]:
+            print(fault)
+    print(document)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,32 @@
+"""Composes the project's configurations."""
+
+from pathlib import Path
+
+from hydra import compose, initialize_config_dir
+from omegaconf import DictConfig
+
+from forewarp.runs.folders import configurations
+
+ROOT = Path(__file__).parents[2]
+CONF = ROOT / "conf"
+
+
+def composed(*overrides: str, name: str = "train", hydra: bool = False) -> DictConfig:
+    """The configuration that a command line composes; with Hydra's own part where asked for."""
+    with initialize_config_dir(str(configurations()), version_base="1.3"):
+        return compose(name, list(overrides), return_hydra_config=hydra)
+
+
+def options(group: str) -> list[str]:
+    """The names of a group's option files."""
+    return sorted(path.stem for path in (CONF / group).glob("*.yaml"))
+
+
+def groups() -> list[str]:
+    """Every group that one chooses from to train; ``dataset`` makes scenes, ``launcher`` needs packages, a
+    method's own numbers (``model_...``) follow from what is chosen.
+    """
+    folders = [path.relative_to(CONF).as_posix() for path in CONF.rglob("*") if path.is_dir()]
+    others = ("/one", "dataset", "launcher")
+    chosen = [group for group in folders if options(group) and not group.startswith("model_")]
+    return sorted(group for group in chosen if not group.endswith(others))
