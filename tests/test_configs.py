@@ -14,7 +14,7 @@ from forewarp.data import dnerf, hypernerf, nhr, posed_video
 from forewarp.data.module import SceneDataModule
 from forewarp.methods.voxel.effects.inpaint import UNet3d
 from forewarp.methods.voxel.effects.upsample import LearnedUpsampler
-from forewarp.methods.voxel.effects.view import SphericalHarmonics, ViewNetwork
+from forewarp.methods.voxel.effects.view_dependence import SphericalHarmonics, ViewNetwork
 from forewarp.methods.voxel.stage import EFFECTS, VoxelStage
 from forewarp.methods.voxel.start import Ground
 from forewarp.methods.voxel.terms import TERMS
@@ -29,7 +29,7 @@ CHOICES = [(group, option) for group in groups() for option in options(group)]
 OFF = [
     ("inpainter", "unet3d"),
     ("upsampler", "learned"),
-    ("view", "mlp"),
+    ("view_dependence", "mlp"),
     ("motion", "dct"),
     ("background", "grid"),
 ]
@@ -45,7 +45,7 @@ def method_of(model, frames=4):
     lattice = Lattice(Box((-1, -1, -1), (1, 1, 1)), (3, 4, 5))
     every = torch.ones(lattice.shape, dtype=torch.bool)
     ground = Ground(lattice, every, 0.5, lattice.box, frames, 0.0, (lattice, every))
-    return model.build(ground, VoxelStage(voxels=[[0, 60]], effects=EFFECTS))
+    return model.build(ground, VoxelStage(num_voxels=[[0, 60]], effects=EFFECTS))
 
 
 def model_for(group, option):
@@ -116,7 +116,7 @@ def test_the_sweep_holds_every_variant_once():
 
 def test_a_variant_wins_over_preset_and_experiment():
     common = ["experiment=dnerf", "data.scene=x"]
-    assert method_of(run_of(*common, "variant=view_mlp").model).view.__class__ is ViewNetwork
+    assert method_of(run_of(*common, "variant=view_mlp").model).view_dependence.__class__ is ViewNetwork
     assert composed(*common, "variant=preset_demo").preset.name == "demo"
     assert run_of(*common, "variant=backward").model.deformation is not None
     assert run_of(*common, "variant=unet_32").model.inpainter is not None
@@ -136,7 +136,7 @@ def test_faithful_is_the_papers_model():
     assert isinstance(method.inpainter, UNet3d)
     assert method.inpainter.width == 64
     assert isinstance(method.upsampler, LearnedUpsampler)
-    assert isinstance(method.view, ViewNetwork)
+    assert isinstance(method.view_dependence, ViewNetwork)
     assert method.motion.trajectory.bases == 15
     assert not method.motion.trajectory.at_nodes
 
@@ -167,7 +167,7 @@ def test_every_number_of_the_renderer_is_a_key_and_equals_its_default():
     }
     config = OmegaConf.to_container(composed("data.scene=x").model.renderer)
     assert config == {"_target_": "forewarp.renderer.Renderer"} | defaults
-    assert run_of("model.renderer.opaque=0").model.renderer.opaque == 0
+    assert run_of("model.renderer.early_stop_eps=0").model.renderer.early_stop_eps == 0
 
 
 def test_off_effects_own_nothing():
@@ -178,9 +178,9 @@ def test_off_effects_own_nothing():
 
 @pytest.mark.parametrize("order", [1, -1])
 def test_the_command_line_wins_over_the_preset(order):
-    overrides = ["preset=fast", "model/view=mlp"][::order]
-    assert method_of(run_of("preset=fast").model).view.__class__ is SphericalHarmonics
-    assert method_of(run_of(*overrides).model).view.__class__ is ViewNetwork
+    overrides = ["preset=fast", "model/view_dependence=mlp"][::order]
+    assert method_of(run_of("preset=fast").model).view_dependence.__class__ is SphericalHarmonics
+    assert method_of(run_of(*overrides).model).view_dependence.__class__ is ViewNetwork
 
 
 def test_the_command_line_wins_over_the_experiment():
@@ -266,20 +266,23 @@ def test_each_number_of_a_method_is_taken_where_it_is_keyed(model):
     assert fast.objective.fine.weights.still_points == 1e-2  # model x experiment
     assert (fast.preset.rays, faithful.budget.iterations) == (4096, 120000)  # model x preset
     band, still = (composed(f"scene=specimen_{name}", f"model={model}") for name in ("band", "still"))
-    assert (band.stage.fine.voxels, still.stage.coarse.voxels) == ([[0, 15625]], [[0, 46656]])
+    assert (band.stage.fine.num_voxels, still.stage.coarse.num_voxels) == ([[0, 15625]], [[0, 46656]])
 
 
 def test_effects_follow_the_pictures_and_the_command_line_wins():
     def chosen(*words):
         return composed("data.scene=x", *words, hydra=True).hydra.runtime.choices
 
-    assert chosen("experiment=hypernerf")["model/view"] == "none"
+    assert chosen("experiment=hypernerf")["model/view_dependence"] == "none"
     assert chosen("experiment=hypernerf")["model/background"] == "grid"
     assert chosen("data=hypernerf")["model/background"] == "none"
-    assert chosen("experiment=video_with_poses")["model/view"] == "sh"
-    typed = ["experiment=hypernerf", "preset=demo", "model/view=mlp", "model/background=none"]
-    assert [chosen(*typed)[f"model/{effect}"] for effect in ("view", "background")] == ["mlp", "none"]
-    assert chosen("experiment=hypernerf", "variant=view_mlp")["model/view"] == "mlp"
+    assert chosen("experiment=video_with_poses")["model/view_dependence"] == "sh"
+    typed = ["experiment=hypernerf", "preset=demo", "model/view_dependence=mlp", "model/background=none"]
+    assert [chosen(*typed)[f"model/{effect}"] for effect in ("view_dependence", "background")] == [
+        "mlp",
+        "none",
+    ]
+    assert chosen("experiment=hypernerf", "variant=view_mlp")["model/view_dependence"] == "mlp"
 
 
 FOREIGN = {

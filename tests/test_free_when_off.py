@@ -9,7 +9,7 @@ import torch
 from forewarp import losses
 from forewarp.fields.trajectory import TrajectoryField
 from forewarp.fields.voxel_grid import VoxelGrid
-from forewarp.methods.voxel.effects import background, inpaint, motion, upsample, view
+from forewarp.methods.voxel.effects import background, inpaint, motion, upsample, view_dependence
 from forewarp.methods.voxel.terms import TERMS
 from forewarp.scene.box import Lattice
 from forewarp.training.curriculum import Curriculum
@@ -20,7 +20,10 @@ from tests.support.tiny_scene import BOX, ball_data, begun, built, forward_model
 LATTICE = Lattice(BOX, (9, 8, 7))
 PARTS = {
     "motion": [(motion.Motion, "flow"), (motion.Motion, "warp"), (TrajectoryField, "coefficients")],
-    "view": [(view.SphericalHarmonics, "forward"), (view.ViewNetwork, "forward")],
+    "view_dependence": [
+        (view_dependence.SphericalHarmonics, "forward"),
+        (view_dependence.ViewNetwork, "forward"),
+    ],
     "upsampler": [
         (upsample.LearnedUpsampler, "alone"),
         (upsample.LearnedUpsampler, "residual"),
@@ -29,15 +32,15 @@ PARTS = {
     "inpainter": [(inpaint.UNet3d, "features"), (inpaint.UNet3d, "residual")],
     "background": [(background.StaticBackground, "forward"), (background.Together, "density")],
 }
-STILL = partial(background.StaticBackground, features=3, alpha_init=1e-2, skip_alpha=0.0)
+STILL = partial(background.StaticBackground, features=3, alpha_init=1e-2, alpha_threshold=0.0)
 ON = {
     "motion": {"motion": motion.Motion},
-    "view": {"view": view.SphericalHarmonics},
+    "view_dependence": {"view_dependence": view_dependence.SphericalHarmonics},
     "upsampler": {"upsampler": partial(upsample.LearnedUpsampler, width=8)},
     "inpainter": {"inpainter": partial(inpaint.UNet3d, width=16, levels=2)},
     "background": {"background": STILL},
 }
-OFF = {"motion": None, "view": None}
+OFF = {"motion": None, "view_dependence": None}
 
 
 def a_step(effects, weights=None, **choices):

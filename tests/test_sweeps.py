@@ -74,7 +74,9 @@ def test_effects_are_compared_on_every_specimen():
     )
     assert auto.effects == "auto"
     assert {
-        e for e in ("motion", "view", "upsampler", "inpainter", "background") if every.model[e] is None
+        e
+        for e in ("motion", "view_dependence", "upsampler", "inpainter", "background")
+        if every.model[e] is None
     } == set()
     assert every.model.trajectory.features > 0
     assert paper.model.background is None
@@ -100,7 +102,7 @@ def test_a_counterpart_stands_in_for_each_dataset(dataset):
     config = job_of("ablation_modules", f"scene=counterpart_{dataset}", "ablation=full", "preset=demo")
     assert "Synthetic" in config.data._target_
     assert (config.preset.name, config.variant.name) == ("demo", "full")
-    assert config.stage.fine.voxels == [[0, 13824]]
+    assert config.stage.fine.num_voxels == [[0, 13824]]
 
 
 NAMING = [f"{group}={name}" for group in ("ablation", "variant", "sweeps") for name in names(group)]
@@ -134,11 +136,11 @@ def test_a_sweep_over_methods_has_both():
 def test_an_ablation_takes_one_thing_from_all():
     common = ["scene=dnerf_hook", "preset=fast"]
     full = composed(*common, "ablation=full")
-    assert None not in (full.model.upsampler, full.model.inpainter, full.model.view)
+    assert None not in (full.model.upsampler, full.model.inpainter, full.model.view_dependence)
     without = {
         "no_upsampling": "upsampler",
         "no_inpainter": "inpainter",
-        "no_view": "view",
+        "no_view": "view_dependence",
     }
     for name, part in without.items():
         model = composed(*common, f"ablation={name}").model
@@ -177,9 +179,9 @@ def test_what_stands_alone_begins_as_the_coarse_stage_would(preset):
     full, alone = (composed(*common, f"ablation={name}").stage for name in ("full", "no_coarse"))
     assert alone.coarse is None
     changed = {key for key in full.fine if full.fine[key] != alone.fine[key]}
-    assert changed <= {"start", "hold", "bases", "hull_frames", "hull_grow", "confine", "curriculum", "rates"}
-    assert all(alone.fine[key] == coarse[key] for key in changed - {"rates"})
-    assert alone.fine.rates == {**full.fine.rates, "flow": coarse.rates.flow}
+    assert changed <= {"start", "lr_hold", "bases", "hull_frames", "hull_grow", "confine", "curriculum", "lr"}
+    assert all(alone.fine[key] == coarse[key] for key in changed - {"lr"})
+    assert alone.fine.lr == {**full.fine.lr, "flow": coarse.lr.flow}
 
 
 @pytest.mark.parametrize("preset", ["demo", "fast", "faithful"])
@@ -194,12 +196,12 @@ def test_the_voxel_networks_come_with_the_fine_stage(preset):
 def test_captures_have_numbers_of_their_own_in_every_preset():
     quick, faithful = composed("scene=hypernerf_broom"), composed("scene=hypernerf_broom", "preset=faithful")
     assert (quick.preset.bases, faithful.preset.bases) == (8, 25)
-    assert quick.model.view is None
-    assert faithful.model.view is not None
+    assert quick.model.view_dependence is None
+    assert faithful.model.view_dependence is not None
     for config in (quick, faithful):
         assert config.data.scene == "broom2"
         assert config.model.background is not None
-        assert config.stage.fine.voxels[-1][1] == 343000
+        assert config.stage.fine.num_voxels[-1][1] == 343000
         assert config.objective.fine.weights.still_points == 1e-2
 
 

@@ -38,23 +38,25 @@ class Renderer:
     Args:
         step: between samples, in voxels of the rendered field, of its finest where it has several.
         color_threshold: samples of less weight have no colour computed; 0 for all.
-        opaque: a ray that lets through less than this has ended, where no gradient is asked for and a kernel
-            looks for the end; 0: it never ends.
+        early_stop_eps: end a ray where its transmittance falls below this, if no gradient is needed and a
+            kernel can tell; 0: never.
     """
 
-    def __init__(self, *, step: float = 0.5, color_threshold: float = 1e-4, opaque: float = 1e-4) -> None:
-        if not step > 0 or not 0 <= color_threshold < 1 or not 0 <= opaque < 1:
+    def __init__(
+        self, *, step: float = 0.5, color_threshold: float = 1e-4, early_stop_eps: float = 1e-4
+    ) -> None:
+        if not step > 0 or not 0 <= color_threshold < 1 or not 0 <= early_stop_eps < 1:
             raise ValueError(
-                "renderer: expected step > 0 and 0 <= color_threshold < 1 and 0 <= opaque < 1, "
-                f"but got {step=}, {color_threshold=}, {opaque=}"
+                "renderer: expected step > 0 and 0 <= color_threshold < 1 and 0 <= early_stop_eps < 1, "
+                f"but got {step=}, {color_threshold=}, {early_stop_eps=}"
             )
-        self.step, self.color_threshold, self.opaque = step, color_threshold, opaque
+        self.step, self.color_threshold, self.early_stop_eps = step, color_threshold, early_stop_eps
 
     def with_threshold(self, color_threshold: float | None) -> Renderer:
         """The same renderer with another ``color_threshold``; None: this one."""
         if color_threshold is None:
             return self
-        return Renderer(step=self.step, color_threshold=color_threshold, opaque=self.opaque)
+        return Renderer(step=self.step, color_threshold=color_threshold, early_stop_eps=self.early_stop_eps)
 
     def __call__(
         self,
@@ -78,7 +80,7 @@ class Renderer:
         plain = type(field) is RadianceGrid and not keep_all_weights and not torch.is_grad_enabled()
         if plain and use_numba(field.values):
             return self._traced(field, rays, background, shade, generator)
-        count, step = len(rays), self.step * field.pitch
+        count, step = len(rays), self.step * field.voxel_size
         ray_ids, distances, points = self._samples(field, rays, step, generator)
         weights, transmittance = render_weights(field.density(points) * step, ray_ids, count)
         kept = slice(None)
@@ -113,8 +115,8 @@ class Renderer:
         shade: Shade | None,
         generator: torch.Generator | None,
     ) -> Marched:
-        """The same without gradient, samples behind opaque matter left out: equal within ``opaque``."""
-        step, activation = self.step * grid.pitch, grid.activation
+        """Render without gradient and leave out what opaque matter hides: equal within ``early_stop_eps``."""
+        step, activation = self.step * grid.voxel_size, grid.activation
         origins, directions, jitter = self._starts(grid, rays, generator)
         found = trace(
             origins,
@@ -128,8 +130,8 @@ class Renderer:
             index=grid.index,
             fill=EMPTY,
             shift=activation.shift,
-            scale=step / activation.unit,
-            opaque=self.opaque,
+            scale=step / activation.density_scale,
+            early_stop_eps=self.early_stop_eps,
             threshold=self.color_threshold or -1.0,  # 0 is all, also those without weight
         )
         ray_ids, weights = found.ray_ids, found.weights

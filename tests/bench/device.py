@@ -34,8 +34,8 @@ TINY = (
     "data.synthesis.test_views=[1,1,1]",
     "preset.rays=64",
     "preset.inpainter_width=16",
-    "stage.coarse.voxels=[[0,1000]]",
-    "stage.fine.voxels=[[0,1500]]",
+    "stage.coarse.num_voxels=[[0,1000]]",
+    "stage.fine.num_voxels=[[0,1500]]",
     "callbacks.accuracy.first=0.05",
 )
 

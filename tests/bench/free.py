@@ -13,7 +13,7 @@ from forewarp.methods.voxel.effects.background import StaticBackground
 from forewarp.methods.voxel.effects.inpaint import UNet3d
 from forewarp.methods.voxel.effects.motion import Motion
 from forewarp.methods.voxel.effects.upsample import LearnedUpsampler
-from forewarp.methods.voxel.effects.view import SphericalHarmonics
+from forewarp.methods.voxel.effects.view_dependence import SphericalHarmonics
 from forewarp.methods.voxel.forward_warp import ForwardWarp
 from forewarp.methods.voxel.model import ForwardModel
 from forewarp.methods.voxel.stage import VoxelStage
@@ -26,13 +26,15 @@ from tests.bench.workloads import batch_of, body, lattice_of, module_of
 from tests.stability.report import table
 
 EFFECTS: Mapping[str, dict] = {
-    "view": {"view": SphericalHarmonics},
+    "view_dependence": {"view_dependence": SphericalHarmonics},
     "motion": {"motion": Motion, "trajectory": partial(TrajectoryField, bases=10, padding=0.2)},
     "trajectory features": {
         "motion": Motion,
         "trajectory": partial(TrajectoryField, bases=10, padding=0.2, features=12),
     },
-    "background": {"background": partial(StaticBackground, features=3, alpha_init=1e-2, skip_alpha=1e-4)},
+    "background": {
+        "background": partial(StaticBackground, features=3, alpha_init=1e-2, alpha_threshold=1e-4)
+    },
     "upsampler": {"upsampler": partial(LearnedUpsampler, width=16)},
     "inpainter": {"inpainter": partial(UNet3d, width=16)},
 }
@@ -43,10 +45,10 @@ def method_with(choices: Mapping, side: int) -> ForwardWarp:
     torch.manual_seed(0)
     lattice = lattice_of(side)
     active = body(lattice, 0.55)
-    model = ForwardModel(radiance=partial(DirectRadiance, alpha_init=1e-2, skip_alpha=1e-4), **choices)
+    model = ForwardModel(radiance=partial(DirectRadiance, alpha_init=1e-2, alpha_threshold=1e-4), **choices)
     still = (lattice, torch.ones_like(active))
     ground = Ground(lattice, active, 2 / (side - 1), lattice.box, 50, 0.0, still)
-    method = model.build(ground, VoxelStage(voxels=[[0, side**3]]))
+    method = model.build(ground, VoxelStage(num_voxels=[[0, side**3]]))
     with torch.no_grad():
         method.radiance.parameter("density").fill_(6.0)
         if method.background is not None:

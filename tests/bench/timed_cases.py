@@ -91,7 +91,7 @@ def splat_work(side: float, dense: bool) -> Work:
 def fields_work(side: float, dense: bool) -> Work:
     """F1 and F2, and the cosines at a time."""
     lattice = lattice_of(int(side))
-    method = make_method(lattice, int(side), dense, effects=("motion", "view"))
+    method = make_method(lattice, int(side), dense, effects=("motion", "view_dependence"))
 
     def work() -> Tensor:
         return method.radiance().values.sum() + method.motion.flow(method.radiance, TIME).sum()
@@ -102,7 +102,7 @@ def fields_work(side: float, dense: bool) -> Work:
 def inpaint_work(side: float, dense: bool) -> Work:
     """The U-Net and the up-layer on the ball's box, or on all of it, without the warp."""
     lattice = lattice_of(int(side))
-    method = make_method(lattice, int(side), dense, effects=("view", "upsampler", "inpainter"))
+    method = make_method(lattice, int(side), dense, effects=("view_dependence", "upsampler", "inpainter"))
     warped = method.radiance().with_values(method.radiance().values.detach())
     return backwards(dense, lambda: method._inpaint(warped, None)[0]["inpainted"].values.square().mean())
 
@@ -110,11 +110,11 @@ def inpaint_work(side: float, dense: bool) -> Work:
 def render_work(rays: float, dense: bool, step: float = 0.5) -> Work:
     """One rendering of a lattice of 128 voxels an axis; the work is the number of rays."""
     lattice = lattice_of(128)
-    method = make_method(lattice, 128, dense, effects=("view",))
+    method = make_method(lattice, 128, dense, effects=("view_dependence",))
     grid, view = method.radiance(), some_rays(int(rays))
     values = grid.values.detach().requires_grad_()
     renderer = Renderer(step=step, color_threshold=0.0 if dense else 1e-4)
-    shaded = method.view
+    shaded = method.view_dependence
     return backwards(
         dense, lambda: renderer(grid.with_values(values), view, WHITE, shaded).rgb.square().mean()
     )
@@ -139,7 +139,7 @@ def frame_work(size: float, dense: bool, first: bool = True, side: int = 64, pla
 
     ``plain`` has neither U-Net nor up-sampler, as ``preset=fast``.
     """
-    module, _ = make_module(side, dense, rays=1, effects=("motion", "view") if plain else EFFECTS)
+    module, _ = make_module(side, dense, rays=1, effects=("motion", "view_dependence") if plain else EFFECTS)
     view, moment = View(camera(int(size))), Moment(TIME)
 
     def frame() -> Tensor:

@@ -16,7 +16,7 @@ from forewarp.methods.method import Start
 from forewarp.methods.voxel.effects.inpaint import UNet3d
 from forewarp.methods.voxel.effects.motion import Motion
 from forewarp.methods.voxel.effects.upsample import LearnedUpsampler
-from forewarp.methods.voxel.effects.view import ViewNetwork
+from forewarp.methods.voxel.effects.view_dependence import ViewNetwork
 from forewarp.methods.voxel.forward_warp import ForwardWarp
 from forewarp.methods.voxel.method import VoxelMethod
 from forewarp.methods.voxel.model import ForwardModel
@@ -37,7 +37,7 @@ from forewarp.training.settings import StageSettings
 OCCUPANCY, TIME, SOLID = 0.1, 0.5, 6.0
 RADIUS = (6 * OCCUPANCY / math.pi) ** (1 / 3)
 WHITE = torch.ones(3)
-EFFECTS = ("motion", "view", "upsampler", "inpainter")
+EFFECTS = ("motion", "view_dependence", "upsampler", "inpainter")
 # The paper's fine stage (METHOD 2).
 WEIGHTS = {"photo": 1.0, "point_color": 1e-2, "background_entropy": 1e-3, "flow_l1": 1e-5}
 WEIGHTS |= {"inpaint_diff": 1e-5, "tv_density": 1e-6, "tv_flow": 1e-3, "tv_depth": 1e-1}
@@ -89,7 +89,7 @@ def batch_of(rays: int) -> Batch:
 
 def module_of(method: VoxelMethod, weights: Mapping[str, float], side: int) -> DynamicSceneModule:
     """The method in the middle of a stage of its own, seen by one camera."""
-    settings = StageSettings.of("fine", voxels=[[0, side**3]], rates=RATES, iterations=100)
+    settings = StageSettings.of("fine", num_voxels=[[0, side**3]], lr=RATES, iterations=100)
     frame = Frame("0", 0.0, camera(), _no_picture)
     scene = Scene("ball", (frame,), (), (), method.radiance.lattice.box, 0.0, has_alpha=True)
     objective = Objective(weights)
@@ -124,16 +124,16 @@ def make_method(
     ball = body(lattice, RADIUS)
     margin = max(lattice.shape) if dense else 4
     model = ForwardModel(
-        radiance=partial(FeatureRadiance, alpha_init=1e-2, skip_alpha=0.0 if dense else 1e-4),
+        radiance=partial(FeatureRadiance, alpha_init=1e-2, alpha_threshold=0.0 if dense else 1e-4),
         motion=Motion,
         trajectory=partial(TrajectoryField, bases=15, nodes=0),
         upsampler=partial(PlainUpsampler if dense else LearnedUpsampler, recompute=False),
         inpainter=partial(PlainUNet if dense else UNet3d, width=16, margin=margin),
-        view=ViewNetwork,
+        view_dependence=ViewNetwork,
     )
     active = torch.ones_like(ball) if dense else ball
     ground = Ground(lattice, active, 2 / (side - 1), lattice.box, frames=50, canonical_time=0.0)
-    method = model.build(ground, VoxelStage(voxels=[[0, side**3]], effects=effects))
+    method = model.build(ground, VoxelStage(num_voxels=[[0, side**3]], effects=effects))
     _paint(method, ball, shift)
     return method
 
@@ -182,5 +182,7 @@ def make_module(
 ) -> tuple[DynamicSceneModule, Batch]:
     """The paper's fine stage, and a batch for it: the U-Net 16 wide, twice the resolution, two renderings."""
     method = make_method(lattice_of(side, box), side, dense, effects=effects, shift=shift)
-    method.renderer = Renderer(color_threshold=0.0 if dense else threshold, opaque=0.0 if dense else 1e-4)
+    method.renderer = Renderer(
+        color_threshold=0.0 if dense else threshold, early_stop_eps=0.0 if dense else 1e-4
+    )
     return module_of(method, WEIGHTS, side), batch_of(rays)

@@ -20,10 +20,10 @@ COMMON = [
     "budget.minutes=null",
     "budget.iterations=150",
     "preset.rays=512",
-    "stage.coarse.voxels=[[0,15625]]",
-    "stage.fine.voxels=[[0,27000]]",
-    "stage.coarse.background_voxels=[[0,15625]]",
-    "stage.fine.background_voxels=[[0,27000]]",
+    "stage.coarse.num_voxels=[[0,15625]]",
+    "stage.fine.num_voxels=[[0,27000]]",
+    "stage.coarse.background_num_voxels=[[0,15625]]",
+    "stage.fine.background_num_voxels=[[0,27000]]",
 ]
 
 SMALL = ["data.synthesis.samples_per_pixel=1"]

@@ -24,7 +24,7 @@ def test_help_says_what_it_does_and_what_one_types(forewarp, name):
 
 
 @pytest.mark.parametrize(
-    "group", ["data", "model", "model/view", "preset", "capture", "experiment", "trainer"]
+    "group", ["data", "model", "model/view_dependence", "preset", "capture", "experiment", "trainer"]
 )
 def test_help_lists_every_choice(forewarp, group):
     text = forewarp("train", "--help").out
@@ -98,8 +98,8 @@ def test_options_of_ones_own_stand_beside_ours(forewarp, way, in_tmp, monkeypatc
         ),
         (["data=hypernerf", "data.interp_capture=1"], "of this name"),
         (
-            ["modle/view=sh"],
-            "modle/view: expected a key of the configuration, but got none of this name; did you ",
+            ["modle/view_dependence=sh"],
+            "modle/view_dependence: expected a key of the configuration, but got none of this name; did you ",
         ),
         (["--multirun", "seed=0,1", "model=forward,backward", "budgt=fast"], "did you mean budget?"),
         (["data=dnerf"], "data.scene: expected a value, but got none; set data.scene=..."),

@@ -20,7 +20,7 @@ SMALL = [
     *("data.root=scenes", "data.scene=toy", "trainer=cpu", "threads=1", "data.rays=32", "sheets=0"),
     *("budget.minutes=null", "budget.iterations=10", "callbacks.pictures=null", "run=run"),
 ]
-VOXELS = ["stage.coarse.voxels=[[0,800]]", "~stage.fine"]
+VOXELS = ["stage.coarse.num_voxels=[[0,800]]", "~stage.fine"]
 
 
 def files_of(page):
@@ -88,6 +88,6 @@ def test_the_method_trains_on_the_data_of_the_page(forewarp, refused, work, way)
 def test_the_effect_is_switched_by_a_word(forewarp, work):
     words = ["--config-dir", "mine/conf", "experiment=mine", *SMALL, *VOXELS, "evaluate=false"]
     for choice, name in (("sheen", "Sheen"), ("none", "NoneType")):
-        done = forewarp("train", *words, f"model/view={choice}", f"run={choice}")
+        done = forewarp("train", *words, f"model/view_dependence={choice}", f"run={choice}")
         assert done.status == 0, done.err
-        assert type(load(choice, trust=["mine"]).method.view).__name__ == name
+        assert type(load(choice, trust=["mine"]).method.view_dependence).__name__ == name

@@ -21,7 +21,7 @@ SMALL = [
     *("hydra.searchpath=[pkg://theirs.conf]", "trainer=cpu", "data.rays=64", "threads=1"),
     *("budget.minutes=null", "budget.iterations=6", "checkpoint_seconds=0", "sheets=0"),
 ]
-DISC = [*SMALL, "experiment=disc", "model/view=tint", "~stage.fine"]
+DISC = [*SMALL, "experiment=disc", "model/view_dependence=tint", "~stage.fine"]
 MIST = [*SMALL, "experiment=disc", "model=mist"]
 TRUST = "trust=[theirs]"
 ADVICE = (
@@ -69,7 +69,7 @@ def steps_of(run, stage="coarse"):
 def test_what_is_typed_trains_and_trains_again_without_trust(forewarp, fitted):
     config = yaml.safe_load((fitted / "config.yaml").read_text())
     assert config["data"]["_target_"] == "theirs.data.DiscDataModule"
-    assert config["model"]["view"]["_target_"] == "theirs.effects.Tint"
+    assert config["model"]["view_dependence"]["_target_"] == "theirs.effects.Tint"
     assert config["trust"] is None
     assert (fitted / "coarse" / "steps.txt").read_text() == "6"
     assert "theirs/step" in (fitted / "coarse" / "csv" / "metrics.csv").read_text()
@@ -123,7 +123,7 @@ def test_a_stored_run_is_measured_by_who_trusts_it(forewarp, refused, fitted, mo
 
 
 def test_a_plan_that_names_the_package_is_followed_by_who_trusts_it(tmp_path):
-    file, word = tmp_path / "plan.yaml", "model.view._target_=theirs.effects.Tint"
+    file, word = tmp_path / "plan.yaml", "model.view_dependence._target_=theirs.effects.Tint"
     write_plan(file, {"typed": ["data.scene=x"], "words": [word], "of": "0"})
     with pytest.raises(ValueError, match="expected a class of forewarp, but got 'theirs.effects.Tint'"):
         with_plan("train", [f"plan={file}"])
@@ -143,7 +143,7 @@ def test_a_run_is_loaded_with_trust(fitted):
     with pytest.raises(ValueError, match="expected a class of forewarp, but got 'theirs.data.Disc"):
         stored_run(fitted)
     module = stored_run(fitted, trust=["theirs"]).load()
-    assert type(module.method.view).__module__ == "theirs.effects"
+    assert type(module.method.view_dependence).__module__ == "theirs.effects"
 
 
 def test_the_tools_take_trust(fitted, capsys):
@@ -153,13 +153,13 @@ def test_the_tools_take_trust(fitted, capsys):
         limits([str(fitted)])
     assert capsys.readouterr().err.strip().endswith(ADVICE)
     limits([str(fitted), "--views", "1", TRUST])
-    assert "| disc |" in capsys.readouterr().out
+    assert "| disc " in capsys.readouterr().out
 
 
 def test_a_broken_step_is_taken_again_with_trust(refused, in_tmp, capsys):
     from forewarp.cli.replay import main as replay
 
-    refused("train", *DISC, "run=run", "stage.coarse.rates.color=1e39", "evaluate=false")
+    refused("train", *DISC, "run=run", "stage.coarse.lr.color=1e39", "evaluate=false")
     bundle = str(next((in_tmp / "run").rglob("step_*.pt")))
     forget("theirs")
     with pytest.raises(SystemExit):

@@ -15,7 +15,7 @@ from forewarp.synth.scenes import synthesize
 
 SMALL = [
     *("data=dnerf", "data.scene=vehicle", "preset=demo", "trainer=cpu", "data.rays=64", "logger=none"),
-    *("budget.minutes=null", "budget.iterations=6", "stage.coarse.voxels=[[0,800]]", "~stage.fine"),
+    *("budget.minutes=null", "budget.iterations=6", "stage.coarse.num_voxels=[[0,800]]", "~stage.fine"),
     *("callbacks.pictures=null", "evaluate=false", "checkpoint_seconds=0"),
 ]
 
@@ -125,7 +125,7 @@ ODD = {
 
 def test_a_broken_step_ends_in_one_line_and_is_seen_again(forewarp, refused, begun, in_tmp, capsys):
     shutil.rmtree(in_tmp / "run")
-    broken = [*SMALL, "data.root=.", "run=run", "stage.coarse.rates.color=1e39"]
+    broken = [*SMALL, "data.root=.", "run=run", "stage.coarse.lr.color=1e39"]
     line = refused("train", *broken)
     assert line.startswith(
         "stage.coarse: expected finite numbers, but got parameter: radiance.color at step 0, "

@@ -15,7 +15,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]
 
 SEARCH = [
     *("--multirun", "sweeps=search", "data=dnerf", "data.root=.", "data.scene=vehicle", "trainer=cpu"),
-    *("threads=1", "data.rays=64", "budget.iterations=4", "stage.coarse.voxels=[[0,800]]", "~stage.fine"),
+    *("threads=1", "data.rays=64", "budget.iterations=4", "stage.coarse.num_voxels=[[0,800]]", "~stage.fine"),
 ]
 
 
@@ -38,7 +38,7 @@ def test_three_trials_find_a_best_one_and_go_on(forewarp, folder):
     found = yaml.safe_load((folder / "runs/search/vehicle/optimization_results.yaml").read_text())
     assert found["best_value"] == max(scores)
     assert set(found["best_params"]) == {
-        "stage.coarse.rates.flow",
+        "stage.coarse.lr.flow",
         "objective.coarse.weights.tv_flow",
         "preset.padding",
     }

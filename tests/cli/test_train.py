@@ -15,7 +15,7 @@ from forewarp.synth.scenes import synthesize
 from tests.support.dnerf_scene import edit, write_tiny
 
 TINY = ["data=dnerf", "preset=demo", "trainer=cpu", "data.rays=128", "logger=none", "callbacks.pictures=null"]
-STEPS = ["budget.iterations=60", "stage.fine.voxels=[[0,8000]]", "stage.coarse.voxels=[[0,4000]]"]
+STEPS = ["budget.iterations=60", "stage.fine.num_voxels=[[0,8000]]", "stage.coarse.num_voxels=[[0,4000]]"]
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +76,7 @@ def test_metrics_have_the_promised_shape(fitted):
     assert {"epe_moving", "epe_still", "motion_mean"} <= set(content["flow"])
     assert content["parameters"] > 1000
     assert content["peak_memory_bytes"] > 2**26
-    expected = {"scene": "vehicle", "preset": "demo", "seed": 0, "method": "forward", "scored": "upsampled"}
+    expected = {"scene": "vehicle", "preset": "demo", "seed": 0, "method": "forward", "scored": "warped"}
     assert expected.items() <= content["protocol"].items()
     assert {"device", "threads", "versions", "background", "resolution"} <= set(content["protocol"])
 
@@ -150,7 +150,7 @@ def test_what_was_not_measured_since_is_measured(forewarp, fitted, scenes, tmp_p
 def test_a_run_with_views_set_aside_leaves_its_curve(forewarp, scenes, tmp_path):
     run = tmp_path / "run"
     more = ["data.held_out=2", "callbacks.accuracy.first=0.001", "budget.iterations=4", "evaluate=false"]
-    done = forewarp(*arguments(scenes, run, *more, "stage.coarse.voxels=[[0,500]]", "~stage.fine"))
+    done = forewarp(*arguments(scenes, run, *more, "stage.coarse.num_voxels=[[0,500]]", "~stage.fine"))
     assert done.status == 0, done.err
     assert len((run / "accuracy_time.csv").read_text().splitlines()) > 1
     assert (run / "accuracy_time.png").stat().st_size > 1000
@@ -176,7 +176,7 @@ def test_what_does_not_matter_may_change(forewarp, fitted, scenes):
             "budget.minutes=9",
             "config.yaml: budget.minutes: expected 0.9, as the run that this folder holds, but got 9; use",
         ),
-        ("model/view=sh", "config.yaml: model.view: expected "),
+        ("model/view_dependence=sh", "config.yaml: model.view_dependence: expected "),
     ],
 )
 def test_another_configuration_is_refused(refused, fitted, scenes, change, line):
@@ -194,8 +194,8 @@ def test_another_dataset_is_refused_by_its_scene(refused, fitted, scenes):
 def test_a_checkpoint_of_another_configuration_is_refused(refused, fitted, scenes, tmp_path):
     shutil.copytree(fitted, tmp_path / "run")
     saved = yaml.safe_load((tmp_path / "run" / "config.yaml").read_text())
-    saved["model"]["view"] = {
-        "_target_": "forewarp.methods.voxel.effects.view.SphericalHarmonics",
+    saved["model"]["view_dependence"] = {
+        "_target_": "forewarp.methods.voxel.effects.view_dependence.SphericalHarmonics",
         "_partial_": True,
     }
     (tmp_path / "run" / "config.yaml").write_text(yaml.safe_dump(saved))
@@ -316,7 +316,7 @@ def test_settings_of_a_failed_start_do_not_bind(refused, forewarp, scenes, in_tm
 
 def test_renderings_of_an_inpainter_are_both_scored(forewarp, scenes, in_tmp):
     more = ["model/inpainter=unet3d", "model/upsampler=trilinear", "budget.iterations=2", "sheets=1"]
-    small = ["stage.coarse.voxels=[[0,500]]", "~stage.fine"]
+    small = ["stage.coarse.num_voxels=[[0,500]]", "~stage.fine"]
     done = forewarp("train", *TINY, f"data.root={scenes}", "data.scene=vehicle", "run=run", *more, *small)
     assert done.status == 0, done.err
     content = json.loads(Path("run/metrics.json").read_text())

@@ -18,7 +18,7 @@ from tests.contract.table import METHODS
 def stage_of(entry, name="fine", **changes):
     """A stage of one method; ``changes`` are of the entry."""
     entry = replace(entry, **changes)
-    settings = StageSettings.of(name, rates=entry.rates, iterations=entry.steps, **entry.numbers)
+    settings = StageSettings.of(name, lr=entry.lr, iterations=entry.steps, **entry.numbers)
     return Stage(settings, Objective(entry.weights), entry.model)
 
 

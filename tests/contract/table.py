@@ -13,7 +13,7 @@ from forewarp.methods.voxel.effects.background import StaticBackground, Together
 from forewarp.methods.voxel.effects.inpaint import UNet3d
 from forewarp.methods.voxel.effects.motion import Motion
 from forewarp.methods.voxel.effects.upsample import LearnedUpsampler
-from forewarp.methods.voxel.effects.view import SphericalHarmonics
+from forewarp.methods.voxel.effects.view_dependence import SphericalHarmonics
 from forewarp.methods.voxel.model import BackwardModel, ForwardModel
 from tests.contract.toys import Codes, Splats
 
@@ -37,7 +37,7 @@ class Entry:
     """
 
     model: Callable[[Start], Method]
-    rates: Mapping[str, float]
+    lr: Mapping[str, float]
     weights: Mapping[str, float] = field(default_factory=lambda: {"photo": 1.0})
     numbers: Mapping[str, object] = field(default_factory=dict)
     falls: float = 0.5
@@ -47,23 +47,27 @@ class Entry:
     gpu: str = "never"
 
 
-GRID = partial(DirectRadiance, alpha_init=1e-2, skip_alpha=1e-4)
+GRID = partial(DirectRadiance, alpha_init=1e-2, alpha_threshold=1e-4)
 TRAJECTORY = partial(TrajectoryField, bases=4, nodes=6, width=24, layers=3)
 VOXELS = {
-    "numbers": {"voxels": [[0, 10**3], [0.6, 12**3]], "background_voxels": [[0, 6**3]], "keep_alpha": 1e-2}
+    "numbers": {
+        "num_voxels": [[0, 10**3], [0.6, 12**3]],
+        "background_num_voxels": [[0, 6**3]],
+        "keep_alpha": 1e-2,
+    }
     | {"birth_alpha": 5e-3, "refresh_every": 5},
-    "rates": {"density": 0.3, "color": 0.1, "shading": 0.02, "flow": 5e-3, "network": 1e-3},
+    "lr": {"density": 0.3, "color": 0.1, "shading": 0.02, "flow": 5e-3, "network": 1e-3},
     "weights": {"photo": 1.0, "point_color": 0.01, "background_entropy": 1e-3},
     "steps": 100,
 }
-VIEW = Effect({"view": SphericalHarmonics}, ((SphericalHarmonics, "forward"),))
+VIEW = Effect({"view_dependence": SphericalHarmonics}, ((SphericalHarmonics, "forward"),))
 BACKGROUND = Effect(
-    {"background": partial(StaticBackground, features=3, alpha_init=1e-2, skip_alpha=0.0)},
+    {"background": partial(StaticBackground, features=3, alpha_init=1e-2, alpha_threshold=0.0)},
     ((StaticBackground, "forward"), (Together, "density")),
 )
 WARP = {
     "motion": Effect({"motion": Motion}, ((Motion, "flow"), (TrajectoryField, "coefficients"))),
-    "view": VIEW,
+    "view_dependence": VIEW,
     "upsampler": Effect({"upsampler": partial(LearnedUpsampler, width=8)}, ((LearnedUpsampler, "residual"),)),
     "inpainter": Effect({"inpainter": partial(UNet3d, width=16, levels=2)}, ((UNet3d, "features"),)),
     "background": BACKGROUND,
@@ -76,7 +80,7 @@ METHODS = {
     "backward": Entry(
         BackwardModel(GRID, deformation=partial(Deformation, width=24, layers=3)),
         **VOXELS,
-        effects={"view": VIEW, "background": BACKGROUND},
+        effects={"view_dependence": VIEW, "background": BACKGROUND},
     ),
     "tnerf": Entry(
         partial(TNeRF, **SMALL_NETWORK, density="softplus", open_end=False, inside_box=True),

@@ -149,11 +149,9 @@ def test_every_parameter_has_one_rate(name, scenes):
 
 @each
 def test_a_missing_rate_is_named(name, scenes):
-    module = module_of(METHODS[name], data_of("dnerf", scenes), rates={"else": 1.0})
+    module = module_of(METHODS[name], data_of("dnerf", scenes), lr={"else": 1.0})
     kind = next(iter(module.method.param_groups()))
-    with pytest.raises(
-        ValueError, match=rf"stage.fine.rates: expected a rate for '{kind}', but got \['else'\]"
-    ):
+    with pytest.raises(ValueError, match=rf"stage.fine.lr: expected a rate for '{kind}', but got \['else'\]"):
         module.configure_optimizers()
 
 

@@ -62,8 +62,8 @@ def test_points_lie_on_the_surface_that_moves(cameras):
     assert points.shape == (60, 3)
     assert not bool(module.method.is_still(points).any())
     from_center = (points - torch.tensor([-0.3, 0.1, 0.0])).norm(dim=-1)
-    assert float(from_center.min()) > 0.4 - 2 * module.method.radiance.lattice.pitch
-    assert float(from_center.max()) < 0.4 + module.method.radiance.lattice.pitch
+    assert float(from_center.min()) > 0.4 - 2 * module.method.radiance.lattice.voxel_size
+    assert float(from_center.max()) < 0.4 + module.method.radiance.lattice.voxel_size
     torch.testing.assert_close(points, moving_points(module, cameras, 60))
 
 

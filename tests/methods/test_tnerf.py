@@ -203,7 +203,7 @@ def test_its_presets(preset, parameters):
     built = instantiate(made["model"], _convert_="all")(Start(moving_scene(), "fine", {}))
     (stage,) = share_out(instantiate(made["stage"], _convert_="all"), minutes=1, iterations=None)
     assert (name, stage.settings.name) == ("tnerf", "fine")
-    assert set(stage.settings.rates) == set(built.param_groups())
+    assert set(stage.settings.lr) == set(built.param_groups())
     assert not stage.settings.numbers
     assert stage.objective.weights == {"photo": 1.0}
     assert parameter_count(built) == parameters
@@ -232,7 +232,7 @@ def run(folder, iterations):
         )
 
     settings = StageSettings.of(
-        "fine", rates={"network": 5e-3}, iterations=iterations, curriculum={"all_in": 0.0}
+        "fine", lr={"network": 5e-3}, iterations=iterations, curriculum={"all_in": 0.0}
     )
     return Run(
         SceneDataModule(moving_scene, rays=96),

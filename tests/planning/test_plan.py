@@ -13,9 +13,9 @@ from forewarp.synth.scenes import synthesize
 
 TINY = ["data=dnerf", "preset=demo", "trainer=cpu", "data.rays=64", "logger=none", "callbacks=default"]
 TINY += ["callbacks.pictures=null", "callbacks.accuracy=null", "threads=1"]
-LATTICES = ["stage.coarse.voxels=[[0,4000]]", "stage.fine.voxels=[[0,8000]]"]
+LATTICES = ["stage.coarse.num_voxels=[[0,4000]]", "stage.fine.num_voxels=[[0,8000]]"]
 SHORT = ["plan.steps=24", "plan.trial_steps=6", "plan.seeds=2", "plan.held_out=3"]
-EFFECTS = ["motion", "bases", "background", "view", "inpainter", "upsampler"]
+EFFECTS = ["motion", "bases", "background", "view_dependence", "inpainter", "upsampler"]
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +47,7 @@ def test_a_plan_is_made_once_told_and_fitted(forewarp, words, monkeypatch, in_tm
     assert f"forewarp-train plan={file.relative_to(in_tmp)}" in done.out
     made = yaml.safe_load(file.read_text())
     assert [e for e in EFFECTS if e in made["effects"]] == list(made["effects"])
-    assert {"motion", "background", "view", "inpainter", "upsampler"} <= made["effects"].keys()
+    assert {"motion", "background", "view_dependence", "inpainter", "upsampler"} <= made["effects"].keys()
     for effect, decision in made["effects"].items():
         assert effect in done.out
         assert decision["because"]
@@ -60,14 +60,16 @@ def test_a_plan_is_made_once_told_and_fitted(forewarp, words, monkeypatch, in_tm
     assert "± is two standard errors" in again.out
 
     short = ["budget.iterations=20", "budget.minutes=null"]
-    for word in ("model/inpainter=none", "model/view=none"):  # each in a folder of its own
+    for word in ("model/inpainter=none", "model/view_dependence=none"):  # each in a folder of its own
         assert forewarp("train", f"plan={file}", *short, word, "evaluate=false").status == 0
     assert len(list(in_tmp.glob("runs/vehicle/planned-*/fine/done.json"))) >= 1
-    fitted = forewarp("train", f"plan={file}", *short, "run=fit", "model/view=mlp", "evaluate=false")
+    fitted = forewarp(
+        "train", f"plan={file}", *short, "run=fit", "model/view_dependence=mlp", "evaluate=false"
+    )
     assert fitted.status == 0, fitted.err
     config = yaml.safe_load((in_tmp / "fit" / "config.yaml").read_text())
     assert config["data"]["scene"] == "vehicle"
-    assert config["model"]["view"]["_target_"].endswith("ViewNetwork")  # what is typed wins
+    assert config["model"]["view_dependence"]["_target_"].endswith("ViewNetwork")  # what is typed wins
     assert (config["model"]["motion"] is not None) == made["effects"]["motion"]["on"]
     assert (in_tmp / "fit" / "plan.yaml").read_text() == file.read_text()
 
@@ -95,7 +97,7 @@ def test_every_question_is_asked_where_all_is_open(forewarp, words, in_tmp, monk
     assert made["evidence"]["trials"].keys() == set(EFFECTS)
     assert all(decision["on"] for decision in made["effects"].values())
     assert "stage.coarse.effects=[motion,background]" in made["words"]
-    assert "stage.fine.voxels=[[0,8000]]" in made["words"]
+    assert "stage.fine.num_voxels=[[0,8000]]" in made["words"]
     fitted = forewarp("train", f"plan={file}", "budget.iterations=4", "run=fit", "evaluate=false")
     assert fitted.status == 0, fitted.err
     config = yaml.safe_load((in_tmp / "fit" / "config.yaml").read_text())
@@ -165,7 +167,13 @@ def test_what_is_no_plan_is_refused(tmp_path, text):
 @pytest.mark.parametrize(
     "word",
     ["hydra/launcher=ray", "trainer._target_=os.system", "~stage.fine", "x", "--config-dir=/", "-x=1"]
-    + ["experiment=../../evil", "model/view=../../evil", "scene=/evil", "experiment@x=a/b", "a/../b=c"],
+    + [
+        "experiment=../../evil",
+        "model/view_dependence=../../evil",
+        "scene=/evil",
+        "experiment@x=a/b",
+        "a/../b=c",
+    ],
 )
 def test_a_plan_sets_no_code(tmp_path, word):
     write_plan(tmp_path / "plan.yaml", {"typed": ["data.scene=x"], "words": [word], "of": "0"})
@@ -187,7 +195,7 @@ def test_what_a_plan_composes_names_no_code_of_others(refused, in_tmp):
 
 def test_a_plan_names_code_of_trusted_packages_and_never_trust(tmp_path):
     file = tmp_path / "plan.yaml"
-    word = "model.view._target_=theirs.Tint"
+    word = "model.view_dependence._target_=theirs.Tint"
     write_plan(file, {"typed": ["data.scene=x", "trust=[theirs]"], "words": [word], "of": "0"})
     with pytest.raises(
         ValueError, match=r"'theirs.Tint'; if you trust the package theirs, add trust=\[theirs\]"
@@ -204,12 +212,12 @@ def test_a_plan_names_code_of_trusted_packages_and_never_trust(tmp_path):
 
 def test_what_is_typed_beside_a_plan_wins(tmp_path):
     file = tmp_path / "plan.yaml"
-    words = ["model/view=sh", "model/inpainter=none", "model/motion=none", "stage.coarse.bases=[]"]
+    words = ["model/view_dependence=sh", "model/inpainter=none", "model/motion=none", "stage.coarse.bases=[]"]
     typed = ["data.scene=x", "seed=3", "model.trajectory.features=2", "stage.coarse.bases=[[0,4]]"]
     write_plan(file, {"typed": typed, "words": words, "of": "0"})
     found = with_plan("train", [f"plan={file}", "model/inpainter=unet3d", "seed=4"])
     assert found == [
-        *("model/view=sh", "model/motion=none", "data.scene=x", "stage.coarse.bases=[[0,4]]"),
+        *("model/view_dependence=sh", "model/motion=none", "data.scene=x", "stage.coarse.bases=[[0,4]]"),
         *(f"planned='{file}'", "effects=given", "run='${paths.runs}/${data.scene}/planned-{hash}'"),
         *("model/inpainter=unet3d", "seed=4"),
     ]

@@ -86,5 +86,5 @@ def test_a_config_that_is_no_config_of_ours_is_left_out(tmp_path):
     write_run(tmp_path, seed=2)
     results, without = collect(tmp_path)
     assert [result.seed for result in results] == [2]
-    assert "cannot be read (config.yaml: expected at most 1048576 bytes, but got 1048577)" in without[0]
+    assert "config.yaml: expected at most 1048576 bytes, but got 1048577)" in without[0]
     assert "cannot be read (" in without[1]

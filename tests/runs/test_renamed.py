@@ -22,6 +22,16 @@ from forewarp.runs.renamed import refuse_renamed
         ("stage=demo", "stage=forward_demo;"),
         ("objective=faithful", "objective=forward_faithful;"),
         ("suits.budgets=[fast]", "no such word;"),
+        ("stage.fine.rates.flow=1e-3", "stage.fine.lr.flow=1e-3;"),
+        ("+stage.fine.rates={}", "+stage.fine.lr={};"),
+        ("stage.coarse.final_rate=0.1", "stage.coarse.lr_final_factor=0.1;"),
+        ("stage.coarse.hold=0.5", "stage.coarse.lr_hold=0.5;"),
+        ("stage.fine.voxels=[[0,8000]]", "stage.fine.num_voxels=[[0,8000]];"),
+        ("stage.fine.background_voxels=[]", "stage.fine.background_num_voxels=[];"),
+        ("preset.skip_alpha=0", "preset.alpha_threshold=0;"),
+        ("model.renderer.opaque=0", "model.renderer.early_stop_eps=0;"),
+        ("model/view=none", "model/view_dependence=none;"),
+        ("model.view.width=32", "model.view_dependence.width=32;"),
         ("~suits", "no such word;"),
     ],
 )
@@ -49,10 +59,17 @@ def test_what_is_advised_composes(word):
     assert composed("data.scene=x", word)
 
 
-def test_a_run_of_an_earlier_version_is_refused_with_the_version_that_reads_it(tmp_path):
+@pytest.mark.parametrize(
+    ("text", "version"),
+    [
+        ("model: {_target_: forewarp.methods.spec.MethodSpec, warp: forward}\nseed: 0\n", "0.1"),
+        ("model: {name: forward}\nstage: {coarse: null, fine: {rates: {density: 0.3}}}\n", "0.2"),
+    ],
+)
+def test_a_run_of_an_earlier_version_is_refused_with_the_version_that_reads_it(text, version, tmp_path):
     path = tmp_path / "config.yaml"
-    path.write_text("model: {_target_: forewarp.methods.spec.MethodSpec, warp: forward}\nseed: 0\n")
-    expected = f"{path}: expected a run of forewarp 0.2, but got one of 0.1, which version 0.1.0 reads"
+    path.write_text(text)
+    expected = f"{path}: expected a run of forewarp 0.3, but got one of {version}, which version {version}.0 reads"
     with pytest.raises(ValueError, match=re.escape(expected)) as refusal:
         read_config(path)
     assert "\n" not in str(refusal.value)

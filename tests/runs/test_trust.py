@@ -9,7 +9,8 @@ from omegaconf import OmegaConf
 
 from tests.support.configs import CONF, composed
 from forewarp.runs.identity import read_config, saved_config
-from forewarp.runs.trust import MOST_BYTES, trust_of, trusted_config, without_trust
+from forewarp.files import MOST_CONFIG
+from forewarp.runs.trust import trust_of, trusted_config, without_trust
 
 
 def read(text, *trust):
@@ -88,7 +89,7 @@ def test_interpolations_are_refused(text):
     [
         ("a: &x [1]\nb: *x", "expected no aliases, but got"),
         ("a: " + "[" * 60 + "]" * 60, "expected at most 40 levels"),
-        ("a: " + "x" * MOST_BYTES, f"expected at most {MOST_BYTES} characters"),
+        ("a: " + "x" * MOST_CONFIG, f"expected at most {MOST_CONFIG} characters"),
         ("a: !!python/object/apply:os.system [false]", "expected YAML"),
         ("- 1", "expected a mapping"),
         ("a: {_args: [1]}", "_args: expected no key of this name"),
@@ -127,8 +128,8 @@ def test_every_target_of_ours_is_trusted():
 
 
 def test_a_large_file_is_not_read(tmp_path):
-    (tmp_path / "config.yaml").write_bytes(b"#" * (MOST_BYTES + 1))
-    with pytest.raises(ValueError, match=f"config.yaml: expected at most {MOST_BYTES} bytes"):
+    (tmp_path / "config.yaml").write_bytes(b"#" * (MOST_CONFIG + 1))
+    with pytest.raises(ValueError, match=f"config.yaml: expected at most {MOST_CONFIG} bytes"):
         read_config(tmp_path / "config.yaml")
     (tmp_path / "config.yaml").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(ValueError, match="config.yaml: expected"):

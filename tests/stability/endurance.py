@@ -23,8 +23,8 @@ SMALL = (
     "budget.minutes=null",
     "preset.rays=512",
     "preset.nodes=10",
-    "stage.coarse.voxels=[[0,8000]]",
-    "stage.fine.voxels=[[0,12000],[0.45,17576]]",
+    "stage.coarse.num_voxels=[[0,8000]]",
+    "stage.fine.num_voxels=[[0,12000],[0.45,17576]]",
     "callbacks.pictures=null",
     "callbacks.scalars=null",
     "callbacks.progress=null",
@@ -39,7 +39,7 @@ def overrides(seed: int, rate: float, steps: int, data: Path, folder: Path) -> l
     """The command line of one trial."""
     kinds = {"density": 0.1, "color": 0.1, "flow": 3e-3}, {"density": 0.1, "color": 0.1, "flow": 1e-3}
     rates = [
-        f"stage.{stage}.rates.{kind}={value * rate:g}"
+        f"stage.{stage}.lr.{kind}={value * rate:g}"
         for stage, values in zip(("coarse", "fine"), kinds)
         for kind, value in values.items()
     ]

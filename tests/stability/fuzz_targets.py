@@ -18,7 +18,13 @@ from forewarp.scene.view import Moment, View
 
 _SIZE, _DEPTH = (12, 8), np.full((8, 12), 3.0, np.float32)  # width and height, as images and arrays have them
 
-_SMALL = ("experiment=demo", "stage.coarse.voxels=[[0,64]]", "data.root=data", "logger=none", "trainer=cpu")
+_SMALL = (
+    "experiment=demo",
+    "stage.coarse.num_voxels=[[0,64]]",
+    "data.root=data",
+    "logger=none",
+    "trainer=cpu",
+)
 
 
 @dataclass(frozen=True)

@@ -53,7 +53,7 @@ def endurance_table(trials: Sequence[dict]) -> str:
         spread = [f"{f(scores):.2f}" for f in (min, statistics.median, max)] if scores else [""] * 3
         deviation = f"{statistics.pstdev(scores):.2f}" if scores else ""
         lines.append([f"x{rate:g}", str(len(own)), str(len(own) - len(scores)), *spread, deviation])
-    return table(["rates", "seeds", "not finite", "least PSNR", "median", "most", "deviation"], lines)
+    return table(["lr", "seeds", "not finite", "least PSNR", "median", "most", "deviation"], lines)
 
 
 def fuzz_table(outcomes: Sequence[Outcome], grown: int) -> str:

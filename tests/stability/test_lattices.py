@@ -21,7 +21,9 @@ pytestmark = pytest.mark.stability
 
 def radiance(lattice=LATTICE, raw=5.0, device="cpu"):
     active = torch.ones(lattice.shape, dtype=torch.bool)
-    made = DirectRadiance(lattice, active, features=3, alpha_init=1e-2, unit=lattice.pitch, skip_alpha=1e-4)
+    made = DirectRadiance(
+        lattice, active, features=3, alpha_init=1e-2, density_scale=lattice.voxel_size, alpha_threshold=1e-4
+    )
     torch.nn.init.constant_(made.density, raw)
     return made.to(device)
 
@@ -44,7 +46,7 @@ def test_one_voxel_of_matter_gives_a_box_with_room(device):
     field = radiance(raw=-20.0, device=device)
     field.density.data[31] = 9.0
     box = box_of_all_times(Still(field), [0.0], alpha=1e-2, pad=2.0)
-    assert min(box.size) == pytest.approx(4 * LATTICE.pitch)
+    assert min(box.size) == pytest.approx(4 * LATTICE.voxel_size)
 
 
 def test_an_empty_grid_does_not_vanish_for_good(device):
@@ -75,7 +77,7 @@ def test_a_flat_box_gets_the_voxels_asked_for_and_no_more(thin, axes):
         lattice = Lattice.of_count(box, count)
         assert min(lattice.shape) >= 4
         assert 0.4 * count < lattice.count < 2.5 * count
-        assert all(s > 0 and math.isfinite(s) for s in (*lattice.spacing, lattice.pitch))
+        assert all(s > 0 and math.isfinite(s) for s in (*lattice.spacing, lattice.voxel_size))
 
 
 @pytest.mark.parametrize("factor", [1e-3, 1.0, 1e3])
@@ -83,7 +85,7 @@ def test_the_lattice_of_a_box_does_not_depend_on_the_unit(factor):
     box = Box((-1.1 * factor, 0, 0), (1.2 * factor, 2.0 * factor, 0.7 * factor))
     plain = Lattice.of_count(Box((-1.1, 0, 0), (1.2, 2.0, 0.7)), 9e4)
     assert Lattice.of_count(box, 9e4).shape == plain.shape
-    assert Lattice.of_count(box, 9e4).pitch == pytest.approx(factor * plain.pitch)
+    assert Lattice.of_count(box, 9e4).voxel_size == pytest.approx(factor * plain.voxel_size)
 
 
 def test_the_border_voxel_counts_whole(place):
@@ -174,4 +176,4 @@ def test_total_variation_on_axes_of_one_voxel(device, shape):
 def test_density_of_an_opacity_next_to_one_over_a_tiny_length():
     activation = radiance().activation
     for length in (1e-6, 1e-3, 1.0):
-        assert math.isfinite(activation.raw(1 - 1e-12, length * activation.unit))
+        assert math.isfinite(activation.raw(1 - 1e-12, length * activation.density_scale))

@@ -109,11 +109,11 @@ def test_weights_and_opacity_lie_between_0_and_1_and_light_never_grows(device, s
         torch.testing.assert_close(reaches[bright], expected[told][bright], atol=0, rtol=1e-6)
 
 
-def field_of(seed, share=0.6, shape=(6, 7, 8), dtype=torch.float32, skip_alpha=0.0):
+def field_of(seed, share=0.6, shape=(6, 7, 8), dtype=torch.float32, alpha_threshold=0.0):
     lattice = Lattice(Box((-1, -1.2, -0.9), (1.0, 1.1, 1.3)), shape)
     index = index_with(random(seed, *shape) < share)
     values = random(seed + 1, int((index >= 0).sum()), 4, low=-3, high=6, dtype=dtype)
-    return RadianceGrid(lattice, index, values, Activation(-2.0, lattice.pitch), skip_alpha)
+    return RadianceGrid(lattice, index, values, Activation(-2.0, lattice.voxel_size), alpha_threshold)
 
 
 def rays_of(seed, count=40, dtype=torch.float32):
@@ -156,7 +156,7 @@ def drawn_on(field, view):
 
 def moved(field, place):
     return RadianceGrid(
-        field.lattice, field.index.to(place), field.values.to(place), field.activation, field.skip_alpha
+        field.lattice, field.index.to(place), field.values.to(place), field.activation, field.alpha_threshold
     )
 
 

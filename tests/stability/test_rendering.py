@@ -183,7 +183,7 @@ def test_an_endless_ray_is_refused(place, far):
 @pytest.mark.parametrize("thin", [1e-2, 1e-6, 1e-12])
 def test_a_flat_box_is_rendered(place, thin):
     lattice = Lattice(Box((-1, -1, 0), (1, 1, thin)), (5, 5, 4))
-    field = grid(5.0, lattice=lattice, unit=lattice.pitch, device=place)
+    field = grid(5.0, lattice=lattice, density_scale=lattice.voxel_size, device=place)
     view = rays([[0.1, 0.2, -3.0], [-3.0, 0.1, thin / 2]], [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]], device=place)
     drawn = draw(field, view)
     check_finite((drawn.rgb, drawn.depth), field.values)

@@ -73,11 +73,9 @@ def test_the_small_demo_composes(tmp_path):
     from tests.support.configs import composed
 
     config = composed(*endurance.overrides(3, 10.0, 40, tmp_path, tmp_path / "run"))
-    assert config.stage.coarse.rates.density == pytest.approx(
-        10 * composed("experiment=demo").stage.coarse.rates.density
+    assert config.stage.coarse.lr.density == pytest.approx(
+        10 * composed("experiment=demo").stage.coarse.lr.density
     )
-    assert config.stage.fine.rates.flow == pytest.approx(
-        10 * composed("experiment=demo").stage.fine.rates.flow
-    )
+    assert config.stage.fine.lr.flow == pytest.approx(10 * composed("experiment=demo").stage.fine.lr.flow)
     assert config.budget.iterations == 40
     assert config.budget.minutes is None

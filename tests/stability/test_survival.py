@@ -28,7 +28,7 @@ SMALL = [
         "trainer=cpu",
         "threads=1",
     ),
-    *("stage.coarse.voxels=[[0,800],[0.5,1500]]", "stage.fine.voxels=[[0,1500],[0.5,2500]]"),
+    *("stage.coarse.num_voxels=[[0,800],[0.5,1500]]", "stage.fine.num_voxels=[[0,1500],[0.5,2500]]"),
     *(
         "stage.coarse.share=0.5",
         "stage.fine.share=0.5",

@@ -42,7 +42,7 @@ TERMS = (
 
 ALL = {
     "inpainter": partial(UNet3d, levels=2),
-    "background": partial(StaticBackground, features=3, alpha_init=1e-2, skip_alpha=1e-4),
+    "background": partial(StaticBackground, features=3, alpha_init=1e-2, alpha_threshold=1e-4),
 }
 
 
@@ -60,7 +60,7 @@ def fit(folder, scene, iterations, weights=None, **changes):
     """A fitted module, the losses of its steps, and the mean PSNR of its test images."""
     data = SceneDataModule(lambda: scene, rays=changes.pop("rays", 128))
     model = changes.pop("model", None) or forward_model()
-    fitting = stage(iterations=iterations, weights=weights, **({"voxels": [[0, 12**3]]} | changes))
+    fitting = stage(iterations=iterations, weights=weights, **({"num_voxels": [[0, 12**3]]} | changes))
     diary = Diary()
     module = make_run(folder, [fitting], data=data, model=model, callbacks=[diary]).fit()
     scores = []
@@ -81,7 +81,7 @@ def test_no_term_of_the_loss_depends_on_the_unit_of_length(tmp_path, factor):
     weights = dict.fromkeys(TERMS, 0.1)
     assert set(TERMS) == set(VoxelMethod.terms)
     options = {"iterations": 4, "weights": weights, "start": "hull", "patches": 2}
-    options |= {"model": forward_model(**ALL), "background_voxels": [[0, 12**3]]}
+    options |= {"model": forward_model(**ALL), "background_num_voxels": [[0, 12**3]]}
     scene = replace(ball_scene(frames=6, size=16), still=torch.tensor([[0.9, 0.1, 0.2], [-0.8, 0.3, -0.2]]))
     _, plain, _ = fit(tmp_path / "a", scene, **options)
     _, other, _ = fit(tmp_path / "b", in_other_units(scene, factor), **options)
@@ -107,7 +107,7 @@ def test_a_scene_in_other_units_trains_to_the_same_psnr(tmp_path, factor):
     assert first > 20
     assert abs(first - second) < 0.5  # rounding alone makes two runs differ by as much
     reach = [
-        (m.method.trajectories(torch.zeros(1, 3), torch.ones(1)).norm() / m.method.unit).item()
+        (m.method.trajectories(torch.zeros(1, 3), torch.ones(1)).norm() / m.method.half_extent).item()
         for m in (small, large)
     ]
     assert reach[0] == pytest.approx(reach[1], rel=0.5)
@@ -173,7 +173,7 @@ def test_rates_far_too_high_stay_finite(tmp_path, boost):
     """Density walks far, voxels fly out of the box: softplus is linear, the splat drops what is gone."""
     rates = {kind: boost * rate for kind, rate in RATES.items()}
     scene = ball_scene(frames=6, size=16)
-    module, losses, _ = fit(tmp_path, scene, 40, rates=rates, start="hull", refresh_every=10)
+    module, losses, _ = fit(tmp_path, scene, 40, lr=rates, start="hull", refresh_every=10)
     assert all_finite(module)
     assert all(loss < 1e4 for loss in losses)
 

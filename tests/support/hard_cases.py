@@ -29,13 +29,13 @@ def voxels(shape=SHAPE, device="cpu"):
     return torch.cartesian_prod(*(torch.arange(float(n), device=device) for n in shape))
 
 
-def grid(raw, *, lattice=LATTICE, index=None, unit=1.0, device="cpu"):
+def grid(raw, *, lattice=LATTICE, index=None, density_scale=1.0, device="cpu"):
     """A radiance grid of constant raw density and grey features; ``index`` None: all voxels are present."""
     if index is None:
         index = torch.arange(lattice.count, dtype=torch.int32, device=device).reshape(lattice.shape)
     values = torch.zeros(int((index >= 0).sum()), 4, device=device)
     values[:, 0] = raw
-    return RadianceGrid(lattice, index.to(device), values.requires_grad_(), Activation(-4.6, unit))
+    return RadianceGrid(lattice, index.to(device), values.requires_grad_(), Activation(-4.6, density_scale))
 
 
 def index_with(present, device="cpu"):

@@ -20,7 +20,7 @@ class KnownBall(VoxelMethod):
     def __init__(self, count=30**3):
         lattice = Lattice.of_count(BOX, count)
         everywhere = torch.ones(lattice.shape, dtype=torch.bool)
-        numbers = {"alpha_init": 1e-2, "unit": lattice.pitch, "skip_alpha": 1e-4}
+        numbers = {"alpha_init": 1e-2, "density_scale": lattice.voxel_size, "alpha_threshold": 1e-4}
         super().__init__(DirectRadiance(lattice, everywhere, features=3, **numbers), canonical_time=0.0)
         self.points = lattice.to_world(self.radiance.voxels)
         self.asked = []

@@ -12,7 +12,7 @@ from forewarp.fields.radiance import DirectRadiance
 from forewarp.fields.trajectory import TrajectoryField
 from forewarp.methods.method import Start
 from forewarp.methods.voxel.effects.motion import Motion
-from forewarp.methods.voxel.effects.view import SphericalHarmonics
+from forewarp.methods.voxel.effects.view_dependence import SphericalHarmonics
 from forewarp.methods.voxel.model import BackwardModel, ForwardModel
 from forewarp.methods.voxel.stage import VoxelStage
 from forewarp.methods.voxel.start import Ground
@@ -78,7 +78,7 @@ def ball_data(rays=256, seed=0, **changes):
     return SceneDataModule(lambda: ball_scene(**changes), rays=rays, seed=seed)
 
 
-RADIANCE = partial(DirectRadiance, alpha_init=1e-2, skip_alpha=1e-4)
+RADIANCE = partial(DirectRadiance, alpha_init=1e-2, alpha_threshold=1e-4)
 
 
 def forward_model(**changes):
@@ -87,21 +87,23 @@ def forward_model(**changes):
         "radiance": RADIANCE,
         "motion": Motion,
         "trajectory": partial(TrajectoryField, bases=4, nodes=8, width=32, layers=3),
-        "view": SphericalHarmonics,
+        "view_dependence": SphericalHarmonics,
     }
     return ForwardModel(**(choices | changes))
 
 
 def backward_model(**changes):
     """The backward method, as cheap; its ``deformation`` is to be named."""
-    return BackwardModel(**({"radiance": RADIANCE, "view": SphericalHarmonics} | changes))
+    return BackwardModel(**({"radiance": RADIANCE, "view_dependence": SphericalHarmonics} | changes))
 
 
-def built(model, lattice, active=None, *, unit=0.3, frames=5, canonical_time=0.0, still=None, **numbers):
+def built(
+    model, lattice, active=None, *, density_scale=0.3, frames=5, canonical_time=0.0, still=None, **numbers
+):
     """A model's method on a lattice, all of it active by default; ``numbers`` are of its stage."""
     active = torch.ones(lattice.shape, dtype=torch.bool) if active is None else active
-    ground = Ground(lattice, active, unit, BOX, frames, canonical_time, still)
-    return model.build(ground, VoxelStage(**({"voxels": [[0, 500]]} | numbers)))
+    ground = Ground(lattice, active, density_scale, BOX, frames, canonical_time, still)
+    return model.build(ground, VoxelStage(**({"num_voxels": [[0, 500]]} | numbers)))
 
 
 def begun(method, scene, made):
@@ -121,11 +123,11 @@ def begun(method, scene, made):
 def stage(name="coarse", weights=None, photo_on=None, **changes):
     """A stage of few steps on a small lattice."""
     numbers = {
-        "voxels": [[0, 14**3]],
+        "num_voxels": [[0, 14**3]],
         "iterations": 12,
         "keep_alpha": 1e-2,
         "birth_alpha": 5e-3,
-        "rates": RATES,
+        "lr": RATES,
     }
     objective = Objective(
         {"photo": 1.0, "point_color": 0.01, "tv_flow": 1e-3} if weights is None else weights,

@@ -6,7 +6,7 @@ from forewarp.training.objective import Objective
 
 def plan(share=1.0, **changes):
     """A stage that waits for its budget."""
-    numbers = {"voxels": [[0, 64]], "rates": {}}
+    numbers = {"num_voxels": [[0, 64]], "lr": {}}
     return StagePlan(share=share, objective=Objective({"photo": 1.0}), **(numbers | changes))
 
 
@@ -50,4 +50,4 @@ def test_refusals(plans, minutes, match):
 
 def test_keys_that_the_platform_does_not_know_are_handed_to_the_method():
     (only,) = share_out({"a": plan(voxel=1)}, minutes=1, iterations=None)  # Run.fit refuses what is none
-    assert only.settings.numbers == {"voxels": [[0, 64]], "voxel": 1}
+    assert only.settings.numbers == {"num_voxels": [[0, 64]], "voxel": 1}

@@ -174,7 +174,7 @@ def test_curves_are_means_over_the_steps_between(tmp_path):
 def test_logged_values_are_those_of_the_stage(watched, events):
     module = watched[0]
     last = {tag: events.Scalars(tag)[-1].value for tag in events.Tags()["scalars"]}
-    assert last["lr/density"] == pytest.approx(0.3 * module.settings.rate_factor(11 / 12))
+    assert last["lr/density"] == pytest.approx(0.3 * module.settings.lr_factor(11 / 12))
     assert last["train/frames_in_play"] == 12
     assert last["train/bases_in_play"] == 4
 

@@ -13,7 +13,7 @@ def run(folder, callbacks=(), width=8, times=None):
     trajectory = partial(TrajectoryField, bases=2, nodes=8, width=width, layers=2)
     data = ball_data(rays=64, size=16, times=times)
     model = forward_model(trajectory=trajectory)
-    return make_run(folder, [stage(voxels=[[0, 1000]])], data=data, model=model, callbacks=callbacks)
+    return make_run(folder, [stage(num_voxels=[[0, 1000]])], data=data, model=model, callbacks=callbacks)
 
 
 def module(folder, **changes):

@@ -45,7 +45,7 @@ class CountingRenderer(Renderer):
 
 def module(model=None, weights=None, renderer=None, **changes):
     torch.manual_seed(0)
-    method = built(model or forward_model(), Lattice(BOX, (9, 7, 6)), unit=0.2)
+    method = built(model or forward_model(), Lattice(BOX, (9, 7, 6)), density_scale=0.2)
     for name in method.radiance.names:
         torch.nn.init.normal_(method.radiance.parameter(name))
     method.renderer = renderer or method.renderer
@@ -159,9 +159,9 @@ def test_every_kind_has_its_rate():
     rates = {"color": 0.1, "density": 0.1, "shading": 0.1}
     with pytest.raises(
         ValueError,
-        match=r"stage.coarse.rates: expected a rate for 'flow', but got \['color', 'density', 'shading'\]",
+        match=r"stage.coarse.lr: expected a rate for 'flow', but got \['color', 'density', 'shading'\]",
     ):
-        module(rates=rates).configure_optimizers()
+        module(lr=rates).configure_optimizers()
 
 
 def test_gradients_are_clipped_where_asked():
@@ -177,9 +177,9 @@ def test_an_image_in_chunks_is_the_image():
     made = module()
     target = DATA.targets("test")[1]
     whole = made.render(target.frame.camera, target.moment, target.background)
-    field = made.method.at(target.moment).fields["upsampled"]
+    field = made.method.at(target.moment).fields["warped"]
     parts = made.method.renderer.picture(
-        field, target.frame.camera.rays(), target.background, made.method.view, chunk=100
+        field, target.frame.camera.rays(), target.background, made.method.view_dependence, chunk=100
     )
     for name in ("rgb", "depth", "opacity"):
         torch.testing.assert_close(getattr(whole, name), getattr(parts, name))

@@ -4,21 +4,21 @@ from forewarp.training.settings import StageSettings
 
 
 def settings(**changes):
-    return StageSettings.of(**({"name": "coarse", "rates": {}, "iterations": 100} | changes))
+    return StageSettings.of(**({"name": "coarse", "lr": {}, "iterations": 100} | changes))
 
 
 def test_keys_that_the_platform_does_not_know_are_the_methods_own():
-    made = settings(hold=0.5, voxels=[[0, 8000]], max_gradient=2.0, patches=3)
-    assert made.numbers == {"voxels": [[0, 8000]], "patches": 3}
-    assert (made.hold, made.max_gradient) == (0.5, 2.0)
+    made = settings(lr_hold=0.5, num_voxels=[[0, 8000]], max_gradient=2.0, patches=3)
+    assert made.numbers == {"num_voxels": [[0, 8000]], "patches": 3}
+    assert (made.lr_hold, made.max_gradient) == (0.5, 2.0)
 
 
 def test_rates_hold_and_then_fall_exponentially():
-    made = settings(hold=0.5, final_rate=0.01)
-    assert [made.rate_factor(f) for f in (0, 0.5)] == [1, 1]
-    assert made.rate_factor(0.75) == pytest.approx(0.1)
-    assert made.rate_factor(1.0) == made.rate_factor(1.5) == pytest.approx(0.01)
-    assert settings(hold=1.0).rate_factor(1.0) == 1
+    made = settings(lr_hold=0.5, lr_final_factor=0.01)
+    assert [made.lr_factor(f) for f in (0, 0.5)] == [1, 1]
+    assert made.lr_factor(0.75) == pytest.approx(0.1)
+    assert made.lr_factor(1.0) == made.lr_factor(1.5) == pytest.approx(0.01)
+    assert settings(lr_hold=1.0).lr_factor(1.0) == 1
 
 
 @pytest.mark.parametrize(

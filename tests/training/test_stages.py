@@ -12,7 +12,7 @@ from forewarp.methods.voxel.backward_warp import Deformation
 from forewarp.methods.voxel.effects.background import StaticBackground
 from forewarp.methods.voxel.effects.inpaint import UNet3d
 from forewarp.methods.voxel.effects.upsample import LearnedUpsampler, TrilinearUpsampler
-from forewarp.methods.voxel.effects.view import ViewNetwork
+from forewarp.methods.voxel.effects.view_dependence import ViewNetwork
 from forewarp.methods.voxel.structure import box_of_all_times
 from forewarp.training.interruption import Interruption
 from tests.support.tiny_scene import (
@@ -29,8 +29,8 @@ from tests.support.tiny_scene import (
 def stages(**changes):
     """Two short stages; the lattice of the second grows halfway; voxels are refreshed every fourth step."""
     common = {"iterations": 10, "refresh_every": 4, "start": "hull", "hull_frames": 3, "hull_grow": 0.1}
-    coarse = stage("coarse", voxels=[[0, 10**3]], bases=[[0, 2], [0.5, 4]], **common)
-    return [coarse, stage("fine", voxels=[[0, 11**3], [0.5, 14**3]], **(common | changes))]
+    coarse = stage("coarse", num_voxels=[[0, 10**3]], bases=[[0, 2], [0.5, 4]], **common)
+    return [coarse, stage("fine", num_voxels=[[0, 11**3], [0.5, 14**3]], **(common | changes))]
 
 
 def run(folder, callbacks=(), **changes):
@@ -146,7 +146,7 @@ class Diary(lightning.Callback):
 
 def test_rates_bases_lattice_and_frames_follow_the_fraction(tmp_path):
     diary = Diary()
-    run(tmp_path, [diary], hold=0.5, curriculum={"start": 2, "all_in": 0.5}).fit()
+    run(tmp_path, [diary], lr_hold=0.5, curriculum={"start": 2, "all_in": 0.5}).fit()
     coarse = [s[1:] for s in diary.steps if s[0] == "coarse"]
     fine = [s[1:] for s in diary.steps if s[0] == "fine"]
     assert len(coarse) == len(fine) == 10
@@ -163,7 +163,7 @@ def test_rates_bases_lattice_and_frames_follow_the_fraction(tmp_path):
 def test_a_stage_may_start_afresh_in_the_tight_box(tmp_path):
     module = run(tmp_path, carry=False).fit()
     handover = json.loads((tmp_path / "coarse" / "handover.json").read_text())
-    assert module.method.radiance.activation.unit == handover["notes"]["unit"]
+    assert module.method.radiance.activation.density_scale == handover["notes"]["density_scale"]
 
 
 def test_an_unfinished_run_cannot_be_loaded(tmp_path):
@@ -197,15 +197,16 @@ MODELS = {
     "static": forward_model(motion=None, trajectory=None),
     "backward": backward_model(deformation=partial(Deformation, width=8, layers=2)),
     "network": forward_model(
-        radiance=partial(FeatureRadiance, alpha_init=1e-2, skip_alpha=0.0, width=8), view=ViewNetwork
+        radiance=partial(FeatureRadiance, alpha_init=1e-2, alpha_threshold=0.0, width=8),
+        view_dependence=ViewNetwork,
     ),
     "everything": forward_model(
         upsampler=partial(LearnedUpsampler, width=8), inpainter=partial(UNet3d, levels=2)
     ),
     "background": forward_model(
-        background=partial(StaticBackground, features=3, alpha_init=1e-2, skip_alpha=1e-4)
+        background=partial(StaticBackground, features=3, alpha_init=1e-2, alpha_threshold=1e-4)
     ),
-    "interpolated": forward_model(upsampler=TrilinearUpsampler, view=None),
+    "interpolated": forward_model(upsampler=TrilinearUpsampler, view_dependence=None),
 }
 
 
@@ -220,7 +221,7 @@ def test_every_model_trains_carries_and_loads(tmp_path, choice):
 
 def test_a_scene_of_one_time_needs_no_motion_and_no_rate_for_it(tmp_path):
     rates = {name: rate for name, rate in RATES.items() if name != "flow"}
-    still = [stage(iterations=4, rates=rates)]
+    still = [stage(iterations=4, lr=rates)]
     module = make_run(tmp_path, still, data=ball_data(rays=64, size=16, times=[0.0] * 4)).fit()
     assert module.method.motion is None
 
@@ -237,13 +238,13 @@ def psnr(module, data):
 def test_a_sliding_ball_is_learned_at_all_times(tmp_path):
     data = ball_data(rays=512, frames=16)
     fitting = stage(
-        voxels=[[0, 16**3]],
+        num_voxels=[[0, 16**3]],
         iterations=300,
         start="hull",
         hull_frames=4,
         hull_grow=0.08,
         refresh_every=25,
-        hold=0.5,
+        lr_hold=0.5,
         curriculum={"start": 4, "all_in": 0.5},
     )
     module = make_run(tmp_path, [fitting], data=data).fit()

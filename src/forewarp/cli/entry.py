@@ -176,7 +176,7 @@ def one_line(error: BaseException) -> str | None:
         wanted = re.search(r"allocate (\d+ bytes|[\d.]+ .iB)", str(error))
         return (
             f"memory: expected room for {wanted[1] if wanted else 'more'}, but got none; lower data.rays or "
-            "stage.*.voxels, and run the same command again"
+            "stage.*.num_voxels, and run the same command again"
         )
     if isinstance(error, TypeError) and "unexpected keyword argument" in str(error):
         return f"config: {error}; leave that key out"

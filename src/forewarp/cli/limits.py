@@ -49,12 +49,12 @@ class Seen:
     errors: dict[str, Tensor]
 
 
-def seen(shown: Shown, center: Tensor, pitch: float) -> Seen:
-    """Compare a drawn view, of voxels of ``pitch`` (world units) that lie as far as ``center`` (3,)."""
+def seen(shown: Shown, center: Tensor, voxel_size: float) -> Seen:
+    """Compare a drawn view, of voxels of ``voxel_size`` (world units) that lie as far as ``center`` (3,)."""
     target, camera = shown.target, shown.target.frame.camera
     truth = target.rgb.cpu()
     image = list(shown.renderings.values())[-1].rgb.clamp(0, 1).reshape(truth.shape).cpu()
-    voxel = pitch * camera.fx / float((center - camera.center).norm())
+    voxel = voxel_size * camera.fx / float((center - camera.center).norm())
     errors = error_shares(truth, image, target.foreground.cpu())
     return Seen(target.frame.time, psnr(image, truth), voxel, psnr(low_passed(truth, voxel), truth), errors)
 
@@ -79,13 +79,13 @@ def limits_of(folder: Path, views: int = 20, trust: Sequence[str] = ()) -> dict[
     if not isinstance(module.method, HasMatter):
         raise ValueError(f"{folder}: expected a method that tells where matter is, but got none")
     with torch.no_grad():
-        pitch = module.method.matter().size
+        voxel_size = module.method.matter().size
     before = [load_handover(run.stage_folder(stage)) for stage in run.stages[:-1]]
     center = torch.tensor((before[-1].box if before else scene.box).center).double()
     train = run.datamodule.targets("train")
     some = [train.frames[i] for i in spread(len(train), views)]
     tests, trained = (
-        [seen(shown, center, pitch) for shown in draw(module, targets)]
+        [seen(shown, center, voxel_size) for shown in draw(module, targets)]
         for targets in (run.datamodule.targets("test"), Targets(some, train.background, scene.has_alpha))
     )
     row = {"scene": scene.name, "seconds": sum(noted["seconds"] for noted in run.finished().values())}

@@ -32,9 +32,9 @@ class DirectRadiance(VoxelGrid):
         lattice: where voxels may be.
         active: (X, Y, Z) bool.
         features: colour channels; the first 3 are the colour, the rest its shading by direction.
-        alpha_init: opacity over ``unit`` at raw density 0.
-        unit: length that density is measured in, world units.
-        skip_alpha: cells more transparent than this over a voxel are not sampled.
+        alpha_init: opacity over ``density_scale`` at raw density 0.
+        density_scale: length that density is measured in, world units.
+        alpha_threshold: cells more transparent than this over a voxel are not sampled.
         box: the scene's; not needed without a network.
     """
 
@@ -45,13 +45,13 @@ class DirectRadiance(VoxelGrid):
         *,
         features: int,
         alpha_init: float,
-        unit: float,
-        skip_alpha: float,
+        density_scale: float,
+        alpha_threshold: float,
         box: Box | None = None,
     ) -> None:
         super().__init__(lattice, active, self._channels(features))
-        self.activation = Activation(density_shift(alpha_init), unit)
-        self.skip_alpha = skip_alpha
+        self.activation = Activation(density_shift(alpha_init), density_scale)
+        self.alpha_threshold = alpha_threshold
 
     @staticmethod
     def _channels(features: int) -> dict[str, int]:
@@ -61,11 +61,11 @@ class DirectRadiance(VoxelGrid):
     def forward(self) -> RadianceGrid:
         """The canonical radiance grid, values (N, 1 + C)."""
         values = torch.cat([self.parameter(name) for name in self.names], -1)
-        return RadianceGrid(self.lattice, self.index, values, self.activation, self.skip_alpha)
+        return RadianceGrid(self.lattice, self.index, values, self.activation, self.alpha_threshold)
 
     def births(self, alpha: float) -> dict[str, float]:
         """What a newly activated voxel starts from: density of opacity ``alpha``, its neighbours' colour."""
-        return {"density": self.activation.raw(alpha, self.lattice.pitch)}
+        return {"density": self.activation.raw(alpha, self.lattice.voxel_size)}
 
     def empties(self) -> dict[str, float]:
         """What absent voxels count as when the lattice changes."""
@@ -76,7 +76,7 @@ class FeatureRadiance(VoxelGrid):
     """The paper's F1: a feature grid and the encoded position through a small MLP give density and colour.
 
     Args:
-        lattice, active, features, alpha_init, unit, skip_alpha: as ``DirectRadiance``.
+        lattice, active, features, alpha_init, density_scale, alpha_threshold: as ``DirectRadiance``.
         grid_features: channels of the feature grid.
         width, layers: of F1.
         frequencies: of the positional encoding.
@@ -90,8 +90,8 @@ class FeatureRadiance(VoxelGrid):
         *,
         features: int,
         alpha_init: float,
-        unit: float,
-        skip_alpha: float,
+        density_scale: float,
+        alpha_threshold: float,
         grid_features: int = 12,
         width: int = 128,
         layers: int = 3,
@@ -109,14 +109,14 @@ class FeatureRadiance(VoxelGrid):
             zero_last=True,
         )
         self.frequencies = frequencies
-        self.activation = Activation(density_shift(alpha_init), unit)
-        self.skip_alpha = skip_alpha
+        self.activation = Activation(density_shift(alpha_init), density_scale)
+        self.alpha_threshold = alpha_threshold
         self._encoded: tuple[Tensor, Tensor] | None = None
 
     def forward(self) -> RadianceGrid:
         """The canonical radiance grid, values (N, 1 + C)."""
         values = self.network(torch.cat([self._positions(), self.features], -1))
-        return RadianceGrid(self.lattice, self.index, values, self.activation, self.skip_alpha)
+        return RadianceGrid(self.lattice, self.index, values, self.activation, self.alpha_threshold)
 
     def _positions(self) -> Tensor:
         # The tensor itself is the key: an id may be given again to the next one.

@@ -29,7 +29,7 @@ class FieldAtTime(Protocol):
     lattice: Lattice
 
     @property
-    def pitch(self) -> float:
+    def voxel_size(self) -> float:
         """The finest detail along a ray, world units: a step is a share of it."""
 
     @property
@@ -50,18 +50,18 @@ def shaded(features: Tensor, directions: Tensor, shade: Shade | None) -> Tensor:
 
 @dataclass(frozen=True)
 class Activation:
-    """Raw density to density: ``sigma = softplus(raw + shift) / unit``, per world unit of length.
+    """Raw density to density: ``sigma = softplus(raw + shift) / density_scale``, per world unit of length.
 
-    ``unit`` is a length (the coarse voxel), so that nothing depends on the scene's units; ``shift`` is such
-    that raw 0 has opacity ``alpha_init`` over one unit, ``log(1 / (1 - alpha_init) - 1)``.
+    ``density_scale`` is a length (the first stage's voxel), so that nothing depends on the scene's units;
+    ``shift`` gives raw 0 an opacity of ``alpha_init`` over that length: ``log(1 / (1 - alpha_init) - 1)``.
     """
 
     shift: float
-    unit: float
+    density_scale: float
 
     def sigma(self, raw: Tensor) -> Tensor:
         """Density per world unit, the shape of ``raw``."""
-        return torch.nn.functional.softplus(raw + self.shift) / self.unit
+        return torch.nn.functional.softplus(raw + self.shift) / self.density_scale
 
     def alpha(self, raw: Tensor, length: float) -> Tensor:
         """Opacity over ``length`` world units."""
@@ -69,7 +69,7 @@ class Activation:
 
     def raw(self, alpha: float, length: float) -> float:
         """The raw density whose opacity over ``length`` is ``alpha``."""
-        sigma = -torch.log1p(-torch.tensor(alpha, dtype=torch.float64)) / length * self.unit
+        sigma = -torch.log1p(-torch.tensor(alpha, dtype=torch.float64)) / length * self.density_scale
         return float(sigma + torch.log(-torch.expm1(-sigma)) - self.shift)  # expm1(sigma) may overflow
 
 
@@ -83,12 +83,12 @@ class RadianceGrid:
     index: Tensor
     values: Tensor
     activation: Activation
-    skip_alpha: float = 0.0
+    alpha_threshold: float = 0.0
 
     @property
-    def pitch(self) -> float:
+    def voxel_size(self) -> float:
         """The lattice's."""
-        return self.lattice.pitch
+        return self.lattice.voxel_size
 
     @property
     def raw_density(self) -> Tensor:
@@ -107,10 +107,10 @@ class RadianceGrid:
 
     @cached_property
     def cells(self) -> Tensor:
-        """Cells whose corners are present and may exceed ``skip_alpha`` over one voxel."""
-        if self.skip_alpha <= 0 or not len(self.values):
+        """Cells whose corners are present and may exceed ``alpha_threshold`` over one voxel."""
+        if self.alpha_threshold <= 0 or not len(self.values):
             return occupied_cells(self.index)
-        low = self.activation.raw(self.skip_alpha, self.lattice.pitch)
+        low = self.activation.raw(self.alpha_threshold, self.lattice.voxel_size)
         return occupied_cells(self.index, self.raw_density.detach() > low)
 
     def density(self, points: Tensor) -> Tensor:

@@ -103,7 +103,7 @@ class Method(nn.Module):
         raise NotImplementedError
 
     def param_groups(self) -> dict[str, list[nn.Parameter]]:
-        """Name every parameter's learning rate: a key of ``stage.<name>.rates``."""
+        """Name every parameter's learning rate: a key of ``stage.<name>.lr``."""
         return {"network": list(self.parameters())}
 
     def optimizer(self, groups: list[dict]) -> torch.optim.Optimizer:

@@ -35,7 +35,7 @@ def _optical(raw, shift, scale):
 @njit(parallel=True, cache=True)
 def trace(
     origins, directions, near, far, step, jitter, cells, reach, bounds, block, raw, index, fill,
-    shift, scale, opaque, threshold, sums, read, counts, firsts, starts, ray_ids, distances, weights,
+    shift, scale, early_stop_eps, threshold, sums, read, counts, firsts, starts, ray_ids, distances, weights,
 ):  # fmt: skip
     """With ``starts`` empty: each ray's sums (opacity, distance, transmittance), how many samples were read,
     and of those whose weight counts how many there are, the first's step, and the transmittance before it (in
@@ -52,7 +52,7 @@ def trace(
         k = _first(t0, near, step, jitter[r]) if counting else firsts[r]
         through = 1.0 if counting else sums[r, 3]
         opacity, distance, found, t = 0.0, 0.0, 0, near
-        while through >= opaque and (counting or found < counts[r]):
+        while through >= early_stop_eps and (counting or found < counts[r]):
             k, t = _seek(o, d, k, near, step, jitter[r], t1, cells, reach, block)
             if not t <= t1:
                 break

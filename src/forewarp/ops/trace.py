@@ -41,7 +41,7 @@ def trace(
     fill: float,
     shift: float,
     scale: float,
-    opaque: float = 0.0,
+    early_stop_eps: float = 0.0,
     threshold: float = 0.0,
 ) -> Traced:
     """``march``, ``trilinear`` and ``render_weights`` of ``x = softplus(raw + shift) * scale``, no gradient.
@@ -52,7 +52,7 @@ def trace(
         origins, directions, near, far, step, cells, jitter: as in ``march``.
         raw: (M,), one channel of a sparse lattice; ``index`` (X, Y, Z) int32; ``fill`` what is absent reads.
         shift, scale: of the optical depth of a step.
-        opaque: a ray ends where less than this is let through; the rest of it is what is missed. 0: never.
+        early_stop_eps: end a ray where its transmittance falls below this, and lose the rest; 0: never.
         threshold: samples of more weight than this are returned; below 0 all are.
 
     Cost: one read of 8 voxels a sample up to a ray's end, and again from its first counted one; memory P.
@@ -67,7 +67,7 @@ def trace(
     read, counts, firsts = torch.zeros(3, len(origins), dtype=torch.int64).unbind()
     common = (*(_array(v) for v in (origins, directions)), *map(float, (near, far, step)), _array(jitter))
     common = (*common, *map_cells(cells), _array(raw), _array(index))
-    common = (*common, *map(float, (fill, shift, scale, opaque, threshold)))
+    common = (*common, *map(float, (fill, shift, scale, early_stop_eps, threshold)))
     common = (*common, *(v.numpy() for v in (sums, read, counts, firsts)))
     ids, none = torch.zeros(0, dtype=torch.int64), origins.new_zeros(0)
     kernels.trace(*common, *(v.numpy() for v in (ids, ids, none, none)))

@@ -19,8 +19,8 @@ def typed_words(*, all_of_them: bool = False) -> list[str]:
 def as_typed(name: str, words: Sequence[str]) -> str:
     """A command line as a shell takes it.
 
-    >>> as_typed("train", ["data.scene=hook", "stage.fine.voxels=[[0,4000]]"])
-    "forewarp-train data.scene=hook 'stage.fine.voxels=[[0,4000]]'"
+    >>> as_typed("train", ["data.scene=hook", "stage.fine.num_voxels=[[0,4000]]"])
+    "forewarp-train data.scene=hook 'stage.fine.num_voxels=[[0,4000]]'"
     """
     return shlex.join([f"forewarp-{name}", *words])
 
@@ -37,19 +37,19 @@ def key_of(word: str) -> str:
 def merged(words: Sequence[str], later: Sequence[str]) -> list[str]:
     """Words and later ones, which win where both set the same key.
 
-    >>> merged(["model/view=sh", "preset.bases=12"], ["model/view=none"])
-    ['preset.bases=12', 'model/view=none']
+    >>> merged(["model/view_dependence=sh", "preset.bases=12"], ["model/view_dependence=none"])
+    ['preset.bases=12', 'model/view_dependence=none']
     """
     known = {key_of(word) for word in later}
     return [word for word in words if key_of(word) not in known] + list(later)
 
 
 def of_what_is_on(words: Sequence[str]) -> list[str]:
-    """Words without those that say more of an effect that they switch off: ``model.view.width`` beside
-    ``model/view=none``.
+    """Words without those that say more of an effect that they switch off: ``model.view_dependence.width`` beside
+    ``model/view_dependence=none``.
 
-    >>> of_what_is_on(["model/motion=none", "model.trajectory.features=12", "model.view.width=32"])
-    ['model/motion=none', 'model.view.width=32']
+    >>> of_what_is_on(["model/motion=none", "model.trajectory.features=12", "model.view_dependence.width=32"])
+    ['model/motion=none', 'model.view_dependence.width=32']
     """
     groups = [word.partition("=") for word in words if word.startswith("model/")]
     off = [group.removeprefix("model/") for group, _, choice in groups if choice == "none"]

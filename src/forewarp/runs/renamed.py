@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
-_OF_A_METHOD = "rays|background|bases|nodes|padding|skip_alpha|inpainter_width"
+_OF_A_METHOD = "rays|background|bases|nodes|padding|alpha_threshold|skip_alpha|inpainter_width"
+SINCE_3 = "renamed in 0.3"
 # What a whole word was, what it is now (None: nothing in its place), why.
 RENAMED = (
     (
@@ -29,6 +30,15 @@ RENAMED = (
     (r"stage=(demo|fast|faithful)", r"stage=forward_\1", "each method has its own since 0.2"),
     (r"objective=(fast|faithful)", r"objective=forward_\1", "each method has its own since 0.2"),
     (r"suits([.=].*)?", None, "every experiment takes every preset since 0.2"),
+    (r"(stage\.[\w-]+|modules\.alone)\.rates(\..*)?(=.*)?", r"\1.lr\2\3", SINCE_3),
+    (r"(stage\.[\w-]+)\.final_rate(=.*)?", r"\1.lr_final_factor\2", SINCE_3),
+    (r"(stage\.[\w-]+|modules\.alone)\.hold(=.*)?", r"\1.lr_hold\2", SINCE_3),
+    (r"(stage\.[\w-]+|modules)\.voxels(=.*)?", r"\1.num_voxels\2", SINCE_3),
+    (r"(stage\.[\w-]+)\.background_voxels(=.*)?", r"\1.background_num_voxels\2", SINCE_3),
+    (r"(preset|model\.radiance|model\.background)\.skip_alpha(=.*)?", r"\1.alpha_threshold\2", SINCE_3),
+    (r"model\.renderer\.opaque(=.*)?", r"model.renderer.early_stop_eps\1", SINCE_3),
+    (r"model/view(=.*)", r"model/view_dependence\1", SINCE_3),
+    (r"model\.view([.=].*)?", r"model.view_dependence\1", SINCE_3),
 )
 
 
@@ -53,8 +63,11 @@ def refuse_renamed(words: list[str]) -> None:
 
 def refuse_old(config: DictConfig, path: Path) -> None:
     """Raise ValueError for the config of a run that an earlier version made: its folder differs."""
-    if "warp" in (config.get("model") or {}):
+    stages = [stage for stage in (config.get("stage") or {}).values() if stage is not None]
+    old = "0.1" if "warp" in (config.get("model") or {}) else None
+    old = old or ("0.2" if any("rates" in stage for stage in stages) else None)
+    if old is not None:
         raise ValueError(
-            f"{path}: expected a run of forewarp 0.2, but got one of 0.1, which version 0.1.0 reads; "
-            "run its command again into another folder, or install forewarp 0.1.0"
+            f"{path}: expected a run of forewarp 0.3, but got one of {old}, which version {old}.0 reads; "
+            f"run its command again into another folder, or install forewarp {old}.0"
         )

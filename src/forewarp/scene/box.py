@@ -114,7 +114,7 @@ class Lattice:
         return tuple(s / (n - 1) for s, n in zip(self.box.size, self.shape))
 
     @property
-    def pitch(self) -> float:
+    def voxel_size(self) -> float:
         """One number for the spacing: its geometric mean, world units."""
         return math.prod(self.spacing) ** (1 / 3)
 

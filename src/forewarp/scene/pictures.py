@@ -56,7 +56,7 @@ def _disagreement(scene: Scene, frames: Sequence[Frame]) -> float:
     points, masks, reach = lattice.to_world(lattice.all_voxels()), [], []
     for frame in frames:
         depth = float(frame.camera.project(points.mean(0, keepdim=True))[1])
-        reach.append(max(1, math.ceil(lattice.pitch * frame.camera.fx / max(depth, 1e-6))))
+        reach.append(max(1, math.ceil(lattice.voxel_size * frame.camera.fx / max(depth, 1e-6))))
         masks.append(dilate(frame.load()[..., 3] > 127, reach[-1]))
     points = points[visual_hull(points, [frame.camera for frame in frames], masks)]
     missed = total = 0

@@ -113,7 +113,7 @@ class DynamicSceneModule(lightning.LightningModule):
             return -1
         self.curriculum.fraction = fraction
         optimizer = self.optimizers().optimizer
-        factor = self.settings.rate_factor(fraction)
+        factor = self.settings.lr_factor(fraction)
         for group in optimizer.param_groups:
             group["lr"] = group["base_rate"] * factor
         self._noted = self.method.advance(fraction, self.global_step, optimizer)
@@ -123,12 +123,12 @@ class DynamicSceneModule(lightning.LightningModule):
         """The method's optimiser, with the stage's rate for each of its groups."""
         groups = []
         for kind, parameters in self.method.param_groups().items():
-            if kind not in self.settings.rates:
+            if kind not in self.settings.lr:
                 raise ValueError(
-                    f"stage.{self.settings.name}.rates: expected a rate for '{kind}', "
-                    f"but got {sorted(self.settings.rates)}"
+                    f"stage.{self.settings.name}.lr: expected a rate for '{kind}', "
+                    f"but got {sorted(self.settings.lr)}"
                 )
-            rate = float(self.settings.rates[kind])
+            rate = float(self.settings.lr[kind])
             groups.append({"params": parameters, "lr": rate, "base_rate": rate, "name": kind})
         return self.method.optimizer(groups)
 

@@ -181,7 +181,7 @@ class Sentinel(lightning.Callback):
         raise BrokenStep(
             f"{stage}: expected finite numbers, but got {found} at step {self._number}, frame {frame} "
             f"(time {batch.time:.4g}); {again}; begin anew with "
-            f"lower {stage}.rates, or go on with resume={self.folder.parent} sentinel.skip=1"
+            f"lower {stage}.lr, or go on with resume={self.folder.parent} sentinel.skip=1"
         )
 
     def _keep(self, trainer, module, seen: Found) -> tuple[str, Path, str | None]:

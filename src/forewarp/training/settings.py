@@ -14,21 +14,22 @@ class StageSettings:
 
     Args:
         name: also the name of its folder.
-        rates: learning rate by the names of the method's ``param_groups``.
+        lr: learning rate by the names of the method's ``param_groups``.
         iterations: steps; null where minutes bound it.
         minutes: training minutes; null where iterations bound it. With both, what comes first.
-        hold: fraction up to which rates are constant; after it they fall exponentially to ``final_rate``.
+        lr_hold: fraction up to which learning rates are constant. After it they fall exponentially, to
+            ``lr_final_factor`` of what they were.
         curriculum: arguments of ``Curriculum``.
         max_gradient: norm that gradients are clipped to; 0: not at all.
         numbers: all other keys of the stage, which are the method's own.
     """
 
     name: str
-    rates: Mapping[str, float]
+    lr: Mapping[str, float]
     iterations: int | None = None
     minutes: float | None = None
-    hold: float = 0.0
-    final_rate: float = 0.1
+    lr_hold: float = 0.0
+    lr_final_factor: float = 0.1
     curriculum: Mapping[str, float] = field(default_factory=dict)
     max_gradient: float = 0.0
     numbers: Mapping[str, Any] = field(default_factory=dict)
@@ -55,11 +56,11 @@ class StageSettings:
         own = {key: keys.pop(key) for key in list(keys) if key in cls.__dataclass_fields__}
         return cls(name, **own, numbers=keys)
 
-    def rate_factor(self, fraction: float) -> float:
+    def lr_factor(self, fraction: float) -> float:
         """What learning rates are multiplied by at a fraction."""
-        if fraction <= self.hold:
+        if fraction <= self.lr_hold:
             return 1.0
-        return self.final_rate ** ((min(1.0, fraction) - self.hold) / (1 - self.hold))
+        return self.lr_final_factor ** ((min(1.0, fraction) - self.lr_hold) / (1 - self.lr_hold))
 
     def fraction(self, steps: int, seconds: float) -> float:
         """How much of the stage is done: the larger of the shares of its iterations and its minutes."""

@@ -21,7 +21,7 @@ def fitted(flow):
     active = torch.zeros(LATTICE.shape, dtype=torch.bool)
     active[3:8, 3:6, 3:6] = True
     model = forward_model(trajectory=partial(TrajectoryField, bases=8, nodes=8, width=16, layers=2))
-    method = built(model, LATTICE, active, unit=0.2, frames=20, effects=("motion",))
+    method = built(model, LATTICE, active, density_scale=0.2, frames=20, effects=("motion",))
     with torch.no_grad():
         method.radiance.parameter("density").fill_(8.0)
     method.motion.flow = lambda voxels, time: flow(LATTICE.to_world(voxels.voxels), time)

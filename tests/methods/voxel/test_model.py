@@ -10,7 +10,7 @@ from forewarp.methods.voxel.backward_warp import Deformation
 from forewarp.methods.voxel.effects.background import StaticBackground
 from forewarp.methods.voxel.effects.inpaint import UNet3d
 from forewarp.methods.voxel.effects.upsample import LearnedUpsampler, TrilinearUpsampler
-from forewarp.methods.voxel.effects.view import ViewNetwork
+from forewarp.methods.voxel.effects.view_dependence import ViewNetwork
 from forewarp.methods.voxel.stage import EFFECTS
 from forewarp.scene.box import Lattice
 from tests.support.tiny_scene import BOX, backward_model, built, forward_model
@@ -24,12 +24,12 @@ def build(model, effects=EFFECTS, **numbers):
 
 
 FULL = forward_model(
-    radiance=partial(FeatureRadiance, alpha_init=1e-2, skip_alpha=0.0, width=8),
+    radiance=partial(FeatureRadiance, alpha_init=1e-2, alpha_threshold=0.0, width=8),
     trajectory=partial(TrajectoryField, bases=3, nodes=8, features=2),
-    view=ViewNetwork,
+    view_dependence=ViewNetwork,
     upsampler=LearnedUpsampler,
     inpainter=partial(UNet3d, levels=2),
-    background=partial(StaticBackground, features=3, alpha_init=1e-2, skip_alpha=0.0),
+    background=partial(StaticBackground, features=3, alpha_init=1e-2, alpha_threshold=0.0),
 )
 
 
@@ -40,12 +40,12 @@ def test_every_parameter_has_one_kind():
     assert len(listed) == len(set(listed)) == len(list(build(FULL).parameters()))
     direct = build(forward_model()).param_groups()
     assert set(direct) == {"density", "color", "shading", "flow"}
-    backward = backward_model(deformation=Deformation, view=None)
+    backward = backward_model(deformation=Deformation, view_dependence=None)
     assert set(build(backward).param_groups()) == {"density", "color", "flow"}
 
 
 def test_parameter_count():
-    method = build(forward_model(motion=None, trajectory=None, view=None))
+    method = build(forward_model(motion=None, trajectory=None, view_dependence=None))
     assert parameter_count(method) == 5 * 4 * 6 * (1 + 3)
 
 
@@ -75,7 +75,7 @@ def test_one_layer_makes_the_residual_the_inpainters_or_the_up_layers():
 
 
 def test_density_is_measured_in_the_unit():
-    assert build(forward_model()).radiance.activation.unit == 0.3
+    assert build(forward_model()).radiance.activation.density_scale == 0.3
 
 
 def test_backward_takes_none_of_the_forward_effects():
@@ -86,8 +86,16 @@ def test_backward_takes_none_of_the_forward_effects():
 
 
 MODELS = {
-    forward_model: ("radiance", "motion", "trajectory", "upsampler", "inpainter", "view", "background"),
-    backward_model: ("radiance", "view", "background", "deformation"),
+    forward_model: (
+        "radiance",
+        "motion",
+        "trajectory",
+        "upsampler",
+        "inpainter",
+        "view_dependence",
+        "background",
+    ),
+    backward_model: ("radiance", "view_dependence", "background", "deformation"),
 }
 
 

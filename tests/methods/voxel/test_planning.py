@@ -64,8 +64,8 @@ def open_questions(found):
 
 
 def test_only_what_is_open_is_tried():
-    assert open_questions(evidence()) == ["view", "inpainter"]
-    assert open_questions(evidence(movement=None)) == ["view"]
+    assert open_questions(evidence()) == ["view_dependence", "inpainter"]
+    assert open_questions(evidence(movement=None)) == ["view_dependence"]
     sure = Residual(psnr=28.0, by_direction=-0.01, allowed=30.0)
     assert open_questions(evidence(movement=None, residual=sure)) == ["upsampler"]
 
@@ -73,7 +73,7 @@ def test_only_what_is_open_is_tried():
 def test_cameras_that_stand_together_see_no_direction():
     narrow = evidence(pictures=replace(MOVING.pictures, spread=6.0))
     assert open_questions(narrow) == ["inpainter"]
-    found = decisions.of_view(replace(narrow, gains={"view": YES}), "sh")
+    found = decisions.of_view(replace(narrow, gains={"view_dependence": YES}), "sh")
     assert (found.choice, found.because) == (
         "none",
         "all cameras lie within 6 degrees: direction is not seen",
@@ -129,7 +129,7 @@ def test_the_price_is_what_fewer_steps_cost_on_the_curve_that_was_seen():
 
 def asked(trials=True, **typed):
     """A run that is planned, with what was typed for it."""
-    stages = {"coarse": {"voxels": [[0, 1000]]}, "fine": {"voxels": [[0, 8000], [0.5, 27000]]}}
+    stages = {"coarse": {"num_voxels": [[0, 1000]]}, "fine": {"num_voxels": [[0, 8000], [0.5, 27000]]}}
     on = {effect.name: effect.on for effect in decisions.EFFECTS}
     typed = {key.replace("__", "/"): value for key, value in typed.items()}
     return Asked(stages, {"bases": 10}, typed, on.get, trials)
@@ -175,14 +175,18 @@ def test_what_is_typed_is_not_asked():
 def test_dear_effects_go_on_the_lattice_that_they_were_tried_on():
     with_it = {effect.name: effect.with_it(asked()) for effect in decisions.EFFECTS}
     coarse = "stage.coarse.effects=[motion,background]"
-    assert with_it["inpainter"] == with_it["upsampler"] == (coarse, "stage.fine.voxels=[[0,8000]]")
-    assert with_it["view"] == (coarse,)
+    assert with_it["inpainter"] == with_it["upsampler"] == (coarse, "stage.fine.num_voxels=[[0,8000]]")
+    assert with_it["view_dependence"] == (coarse,)
     assert with_it["motion"] == ()
 
 
 def test_what_is_typed_overrules():
-    found = with_gains(view=YES)
-    by_hand = {d.effect: d for d in VoxelPlanning().decide(found, asked(model__view="none"))}
-    assert (by_hand["view"].choice, by_hand["view"].on, by_hand["view"].words) == ("none", False, ())
-    assert by_hand["view"].because.startswith("as typed; ")
-    assert {d.effect: d for d in VoxelPlanning().decide(found, asked())}["view"].on
+    found = with_gains(view_dependence=YES)
+    by_hand = {d.effect: d for d in VoxelPlanning().decide(found, asked(model__view_dependence="none"))}
+    assert (
+        by_hand["view_dependence"].choice,
+        by_hand["view_dependence"].on,
+        by_hand["view_dependence"].words,
+    ) == ("none", False, ())
+    assert by_hand["view_dependence"].because.startswith("as typed; ")
+    assert {d.effect: d for d in VoxelPlanning().decide(found, asked())}["view_dependence"].on

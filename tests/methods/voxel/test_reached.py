@@ -11,7 +11,7 @@ from forewarp.methods.voxel.effects.background import StaticBackground, Together
 from forewarp.methods.voxel.effects.inpaint import UNet3d
 from forewarp.methods.voxel.effects.motion import Motion
 from forewarp.methods.voxel.effects.upsample import LearnedUpsampler
-from forewarp.methods.voxel.effects.view import SphericalHarmonics
+from forewarp.methods.voxel.effects.view_dependence import SphericalHarmonics
 from forewarp.methods.voxel.forward_warp import ForwardWarp
 from forewarp.renderer import Renderer
 from forewarp.scene.view import Moment, View
@@ -22,7 +22,7 @@ MODEL = forward_model(
     renderer=RENDERER,
     upsampler=partial(LearnedUpsampler, width=8),
     inpainter=partial(UNet3d, width=16, levels=2),
-    background=partial(StaticBackground, features=3, alpha_init=1e-2, skip_alpha=1e-4),
+    background=partial(StaticBackground, features=3, alpha_init=1e-2, alpha_threshold=1e-4),
 )
 
 
@@ -30,7 +30,7 @@ MODEL = forward_model(
 def module(tmp_path_factory):
     """A fitted run of the paper's method with all effects."""
     data = ball_data(rays=64, size=16)
-    fitting = stage(iterations=4, background_voxels=[[0, 8**3]])
+    fitting = stage(iterations=4, background_num_voxels=[[0, 8**3]])
     return make_run(tmp_path_factory.mktemp("run"), [fitting], data=data, model=MODEL).fit()
 
 
@@ -43,7 +43,7 @@ def test_a_module_wraps_fields_warper_inpainter_and_renderer(module):
         "motion": Motion,
         "upsampler": LearnedUpsampler,
         "inpainter": UNet3d,
-        "view": SphericalHarmonics,
+        "view_dependence": SphericalHarmonics,
         "background": StaticBackground,
     }
     for name, kind in kinds.items():
@@ -86,7 +86,7 @@ def test_a_newcomers_walk_from_the_canonical_field_to_a_picture(module):
         still = method.background()
         together = Together(fields["inpainted"], still)
         view = View(ball_data(size=16).scene.test[1].camera)
-        by_hand = method.renderer(together, view.rays(), torch.ones(3), method.view)
+        by_hand = method.renderer(together, view.rays(), torch.ones(3), method.view_dependence)
 
         snapshot = method.at(moment)
         assert snapshot.renderings == ("upsampled", "inpainted")

@@ -38,12 +38,12 @@ def test_what_is_met_nowhere_says_nothing():
 
 def test_of_a_fitted_ball(tmp_path):
     data = ball_data()
-    run = make_run(tmp_path, [stage(iterations=60)], data=data, model=forward_model(view=None))
+    run = make_run(tmp_path, [stage(iterations=60)], data=data, model=forward_model(view_dependence=None))
     module = run.fit()
     targets = [data.targets("train")[i] for i in range(6)]
-    found = residual(module.method, targets, pitch=0.05, rays=300)
+    found = residual(module.method, targets, voxel_size=0.05, rays=300)
     drawn = sum(float(10 ** (-module.psnr_of(target) / 10)) for target in targets) / 6
     assert abs(10 ** (-found.psnr / 10) / drawn - 1) < 0.3  # from half of the pixels
     assert found.by_direction < 0.3
-    coarser = residual(module.method, targets, pitch=0.4, rays=300)
+    coarser = residual(module.method, targets, voxel_size=0.4, rays=300)
     assert coarser.allowed < found.allowed

@@ -17,12 +17,14 @@ SCENE = ball_scene(frames=6, size=16)
 
 def fresh(model=None, scene=SCENE, frames=range(6), **numbers):
     """The method of a first stage."""
-    return (model or forward_model())(Start(scene, "coarse", {"voxels": [[0, 1500]]} | numbers, list(frames)))
+    return (model or forward_model())(
+        Start(scene, "coarse", {"num_voxels": [[0, 1500]]} | numbers, list(frames))
+    )
 
 
 def carried(before, handover, model=None, name="coarse", **numbers):
     """The method of a stage after another."""
-    numbers = {"voxels": [[0, 1500]]} | numbers
+    numbers = {"num_voxels": [[0, 1500]]} | numbers
     return (model or forward_model())(Start(SCENE, name, numbers, range(6), handover, before))
 
 
@@ -46,16 +48,16 @@ def known(raw=8.0):
 def test_a_fresh_method_starts_faint_everywhere():
     method = fresh(start_alpha=0.03)
     lattice = method.radiance.lattice
-    assert method.notes() == {"unit": lattice.pitch}
+    assert method.notes() == {"density_scale": lattice.voxel_size}
     grid = method.radiance()
-    alpha = grid.activation.alpha(grid.raw_density, lattice.pitch)
+    alpha = grid.activation.alpha(grid.raw_density, lattice.voxel_size)
     torch.testing.assert_close(alpha, torch.full((lattice.count,), 0.03), rtol=1e-3, atol=0)
 
 
 def test_a_network_starts_faint_as_well():
-    radiance = partial(FeatureRadiance, alpha_init=1e-2, skip_alpha=0.0, width=4)
+    radiance = partial(FeatureRadiance, alpha_init=1e-2, alpha_threshold=0.0, width=4)
     grid = fresh(forward_model(radiance=radiance), start_alpha=0.03).radiance()
-    alpha = grid.activation.alpha(grid.raw_density, grid.lattice.pitch)
+    alpha = grid.activation.alpha(grid.raw_density, grid.lattice.voxel_size)
     torch.testing.assert_close(alpha, torch.full_like(alpha, 0.03), rtol=1e-3, atol=0)
 
 
@@ -94,7 +96,9 @@ def test_what_only_waits_for_a_checkpoint_looks_at_no_picture():
         raise AssertionError("a picture was loaded")
 
     scene = replace(SCENE, train=tuple(replace(frame, load=refuse) for frame in SCENE.train))
-    blank = Start(scene, "fine", {"voxels": [[0, 1500]], "start": "hull"}, range(6), before=None, blank=True)
+    blank = Start(
+        scene, "fine", {"num_voxels": [[0, 1500]], "start": "hull"}, range(6), before=None, blank=True
+    )
     method = forward_model()(blank)
     assert len(method.radiance.voxels) == method.radiance.lattice.count
     with pytest.raises(AssertionError, match="a picture was loaded"):
@@ -103,14 +107,14 @@ def test_what_only_waits_for_a_checkpoint_looks_at_no_picture():
 
 def test_carrying_keeps_matter_motion_and_unit():
     before = known()
-    unit, path = before.radiance.activation.unit, before.motion.trajectory.state_dict()
+    unit, path = before.radiance.activation.density_scale, before.motion.trajectory.state_dict()
     handover = make_handover(before, SCENE, None, 6)
     sigma, at = before.radiance().density, before.radiance.lattice.to_lattice
     points = ball_center(0.0) + 0.2 * (torch.rand(50, 3) - 0.5)
     expected = sigma(at(points)).detach()
-    after = carried(before, handover, name="fine", voxels=[[0, 4000]])
+    after = carried(before, handover, name="fine", num_voxels=[[0, 4000]])
     assert after.radiance.lattice.box == handover.box
-    assert after.radiance.activation.unit == unit
+    assert after.radiance.activation.density_scale == unit
     assert after.radiance.lattice.count == pytest.approx(4000, rel=0.2)
     torch.testing.assert_close(after.radiance().density(after.radiance.lattice.to_lattice(points)), expected)
     for name, value in after.motion.trajectory.state_dict().items():
@@ -118,7 +122,7 @@ def test_carrying_keeps_matter_motion_and_unit():
 
 
 def test_carrying_into_a_stage_with_more_effects():
-    before = fresh(forward_model(view=None))
+    before = fresh(forward_model(view_dependence=None))
     before.radiance.density.data[:] = 3.0
     before.radiance.color.data[:] = 0.5
     after = carried(before, left(before))
@@ -127,7 +131,7 @@ def test_carrying_into_a_stage_with_more_effects():
 
 
 def test_carrying_a_network():
-    model = forward_model(radiance=partial(FeatureRadiance, alpha_init=1e-2, skip_alpha=0.0, width=4))
+    model = forward_model(radiance=partial(FeatureRadiance, alpha_init=1e-2, alpha_threshold=0.0, width=4))
     before = fresh(model)
     torch.nn.init.normal_(before.radiance.network[-1].weight)
     after = carried(before, left(before), model)
@@ -140,7 +144,7 @@ def test_where_nothing_is_carried_the_box_and_the_unit_are_kept():
     handover = make_handover(before, SCENE, None, 6)
     after = carried(before, handover, carry=False)
     assert after.radiance.lattice.box == handover.box
-    assert after.radiance.activation.unit == before.radiance.activation.unit
+    assert after.radiance.activation.density_scale == before.radiance.activation.density_scale
     assert (after.radiance.density == after.radiance.density[0]).all()
 
 
@@ -148,5 +152,5 @@ def test_after_a_stage_of_another_method_only_its_box_is_used():
     box = BOX.scaled(0.5)
     after = carried(torch.nn.Linear(1, 1), Handover(box, True, 6, notes={"particles": 3.0}))
     assert after.radiance.lattice.box == box
-    assert after.radiance.activation.unit == after.radiance.lattice.pitch
+    assert after.radiance.activation.density_scale == after.radiance.lattice.voxel_size
     assert (after.radiance.density == after.radiance.density[0]).all()

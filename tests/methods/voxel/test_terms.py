@@ -181,10 +181,10 @@ def test_the_rays_terms_may_look_at_some_renderings_only():
         method = method_for(objective, **choices)
         return method._wanted(method.at(moment))
 
-    assert wanted(Objective({}), **inpainter) == ["upsampled", "inpainted"]
+    assert wanted(Objective({}), **inpainter) == ["warped", "inpainted"]
     chosen = Objective({}, photo_on=["inpainted"])
     assert wanted(chosen, **inpainter) == ["inpainted"]
-    assert wanted(chosen) == ["upsampled"]  # what is not there cannot be looked at
+    assert wanted(chosen) == ["warped"]  # what is not there cannot be looked at
 
 
 def test_refuses_a_printed_form_that_is_none():

@@ -78,9 +78,9 @@ class MovedField:
         return self.canonical.lattice
 
     @property
-    def pitch(self) -> float:
+    def voxel_size(self) -> float:
         """The canonical lattice's."""
-        return self.canonical.pitch
+        return self.canonical.voxel_size
 
     def _moved(self, points: Tensor) -> Tensor:
         displacement = self.deformation(self.lattice.to_world(points), self.time)
@@ -106,14 +106,14 @@ class BackwardWarp(VoxelMethod):
     Args:
         radiance: the canonical radiance field.
         deformation: to the canonical time; None: a static radiance field.
-        view: None: the colour features are the colour.
+        view_dependence: None: the colour features are the colour.
         background: as in ``ForwardWarp``.
         canonical_time: where nothing is displaced.
         mask_nodes: side of the lattice on which occupancy at a time is looked up.
         renderer: makes pictures.
     """
 
-    effects = tuple(effect for effect in EFFECTS if effect.name in ("view", "background"))
+    effects = tuple(effect for effect in EFFECTS if effect.name in ("view_dependence", "background"))
 
     def __init__(
         self,
@@ -121,13 +121,17 @@ class BackwardWarp(VoxelMethod):
         *,
         canonical_time: float,
         deformation: Deformation | None,
-        view: nn.Module | None = None,
+        view_dependence: nn.Module | None = None,
         background: StaticBackground | None = None,
         mask_nodes: int = 32,
         renderer: Renderer | None = None,
     ) -> None:
         super().__init__(
-            radiance, canonical_time=canonical_time, renderer=renderer, view=view, background=background
+            radiance,
+            canonical_time=canonical_time,
+            renderer=renderer,
+            view_dependence=view_dependence,
+            background=background,
         )
         check_effect("deformation", deformation, "model=backward or another model")
         self.deformation, self.mask_nodes = deformation, mask_nodes
@@ -143,7 +147,7 @@ class BackwardWarp(VoxelMethod):
             still = self.background()
             field = Together(field, still)
         return VoxelSnapshot(
-            moment, {"backward": field}, canonical, self.renderer, self.view, background=still
+            moment, {"backward": field}, canonical, self.renderer, self.view_dependence, background=still
         )
 
     @torch.no_grad()
@@ -194,6 +198,6 @@ class BackwardWarp(VoxelMethod):
         return self.deformation(points, time)
 
     @property
-    def unit(self) -> float:
+    def half_extent(self) -> float:
         """Half the scene's longest side, world units."""
         return self.deformation.scale

@@ -51,14 +51,14 @@ def movement(method: ForwardWarp, times: Sequence[float]) -> Movement:
     """Evidence from a fitted method that has motion. Cost: a flow a time, at most ``_VIEWS`` of them."""
     grid, trajectory = method.radiance(), method.motion.trajectory
     lattice, voxels = grid.lattice, method.radiance.voxels
-    solid = grid.activation.alpha(grid.raw_density, lattice.pitch) > SOLID
+    solid = grid.activation.alpha(grid.raw_density, lattice.voxel_size) > SOLID
     if not bool(solid.any()):
         return Movement(0.0, 0.0, 0.0, trajectory.canonical_time, (0.0,))
     voxels = voxels[solid]
     some = [times[i] for i in spread(len(times), _VIEWS)]
     flows = [method.motion.flow(method.radiance, time)[solid] for time in some]
     far = torch.stack([flow.norm(dim=-1) for flow in flows]).amax(0)
-    moves = far > lattice.pitch
+    moves = far > lattice.voxel_size
     pairs = neighbour_pairs(index_of(voxels, lattice.shape))
     torn = [_torn(pairs, flow / flow.new_tensor(lattice.spacing)) for flow in flows]
     worst = max(range(len(torn)), key=torn.__getitem__)
@@ -67,7 +67,7 @@ def movement(method: ForwardWarp, times: Sequence[float]) -> Movement:
         distance=float(far[moves].mean()) if bool(moves.any()) else 0.0,
         torn=torn[worst],
         at=some[worst],
-        left_out=_left_out(trajectory, lattice.to_world(voxels[moves]), some, lattice.pitch),
+        left_out=_left_out(trajectory, lattice.to_world(voxels[moves]), some, lattice.voxel_size),
     )
 
 
@@ -82,7 +82,7 @@ def _torn(pairs: list[tuple[Tensor, Tensor]], flow: Tensor) -> float:
     return float(torn.float().mean())
 
 
-def _left_out(trajectory, points: Tensor, times: Sequence[float], pitch: float) -> tuple[float, ...]:
+def _left_out(trajectory, points: Tensor, times: Sequence[float], voxel_size: float) -> tuple[float, ...]:
     """RMS over points and times of what the cosines above the k-th add, for k = 0 ... K, in voxels."""
     if not len(points):
         return (0.0,)
@@ -91,5 +91,5 @@ def _left_out(trajectory, points: Tensor, times: Sequence[float], pitch: float) 
     rest = []
     for k in range(trajectory.bases + 1):
         left = coefficients[..., k:] @ basis[:, k:].T
-        rest.append(float(left.square().sum(1).mean().sqrt()) / pitch)
+        rest.append(float(left.square().sum(1).mean().sqrt()) / voxel_size)
     return tuple(rest)

@@ -33,7 +33,7 @@ class ForwardWarp(VoxelMethod):
         motion: trajectories and splat; None: a static radiance field.
         upsampler: None: rendered at the resolution of the warp.
         inpainter: None: one rendering instead of two.
-        view: None: the colour features are the colour.
+        view_dependence: None: the colour features are the colour.
         background: all that stands still, on a grid of its own; None: a constant colour is behind everything.
         canonical_time: where no warp is needed.
         renderer: makes pictures.
@@ -49,12 +49,16 @@ class ForwardWarp(VoxelMethod):
         motion: Motion | None = None,
         upsampler: TrilinearUpsampler | None = None,
         inpainter: UNet3d | None = None,
-        view: nn.Module | None = None,
+        view_dependence: nn.Module | None = None,
         background: StaticBackground | None = None,
         renderer: Renderer | None = None,
     ) -> None:
         super().__init__(
-            radiance, canonical_time=canonical_time, renderer=renderer, view=view, background=background
+            radiance,
+            canonical_time=canonical_time,
+            renderer=renderer,
+            view_dependence=view_dependence,
+            background=background,
         )
         for name, effect in {"motion": motion, "upsampler": upsampler, "inpainter": inpainter}.items():
             check_effect(name, effect, f"model/{name}=none")
@@ -74,7 +78,7 @@ class ForwardWarp(VoxelMethod):
             flow = self.motion.flow(self.radiance, moment.time)
             warped, coverage, dropped = self.motion.warp(canonical, self.radiance.voxels, flow)
         if self.inpainter is None:
-            fields, difference = {"upsampled": self._upsample(warped)}, None
+            fields, difference = {self.first_rendering: self._upsample(warped)}, None
         else:
             fields, difference = self._inpaint(warped, coverage)
         still = None
@@ -86,14 +90,19 @@ class ForwardWarp(VoxelMethod):
             fields,
             canonical,
             self.renderer,
-            self.view,
+            self.view_dependence,
             flow,
             coverage,
             dropped,
             difference,
             still,
-            length=2 / 3 * self.unit if self.moves else 1.0,
+            length=2 / 3 * self.half_extent if self.moves else 1.0,
         )
+
+    @property
+    def first_rendering(self) -> str:
+        """Name the rendering without the inpainter: ``warped``, or ``upsampled`` by an up-sampler."""
+        return "warped" if self.upsampler is None else "upsampled"
 
     def _upsample(self, warped: RadianceGrid) -> RadianceGrid:
         if self.upsampler is None:
@@ -126,7 +135,7 @@ class ForwardWarp(VoxelMethod):
                 residual = interpolate_dense(residual, crop, scale)
         upsampled = sparsify(warped, lattice, region, dense)
         inpainted = sparsify(warped, lattice, region, dense + residual)
-        return {"upsampled": upsampled, "inpainted": inpainted}, residual
+        return {self.first_rendering: upsampled, "inpainted": inpainted}, residual
 
     def advance(self, progress: float, step: int, optimizer: torch.optim.Optimizer) -> dict[str, float]:
         """Let more bases play, and follow the lattices' schedule."""
@@ -155,6 +164,6 @@ class ForwardWarp(VoxelMethod):
         return self.trajectories(points, points.new_tensor([time]))[:, 0] - points
 
     @property
-    def unit(self) -> float:
+    def half_extent(self) -> float:
         """Half the scene's longest side, world units."""
         return self.motion.trajectory.scale

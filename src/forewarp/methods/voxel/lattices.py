@@ -33,7 +33,7 @@ class Lattices:
 
     def __init__(self, radiance: VoxelGrid, background: VoxelGrid | None, settings: VoxelStage) -> None:
         self.settings = settings
-        grids = {"voxels": radiance, "background_voxels": background}
+        grids = {"num_voxels": radiance, "background_num_voxels": background}
         self.followed = [
             _Followed(grid, key, settings.at(key, 0.0)) for key, grid in grids.items() if grid is not None
         ]
@@ -57,7 +57,7 @@ class Lattices:
             resample(grid, grid.lattice.box, voxels, **common)
             followed.voxels, followed.step = voxels, step
         elif due and fraction >= settings.refresh_from:
-            confined = followed.key == "voxels" and fraction < settings.confine
+            confined = followed.key == "num_voxels" and fraction < settings.confine
             confined = confined and self.home.shape == grid.lattice.shape
             allowed = self.home.to(grid.index.device) if confined else None
             refresh(grid, birth_alpha=settings.birth_alpha, allowed=allowed, **common)

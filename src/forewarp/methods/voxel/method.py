@@ -38,7 +38,7 @@ class VoxelMethod(Method):
         radiance: the canonical radiance field.
         canonical_time: where nothing moves.
         renderer: makes pictures.
-        view: None: the colour features are the colour.
+        view_dependence: None: the colour features are the colour.
         background: all that stands still, on a grid of its own; None: a constant colour is behind everything.
     """
 
@@ -51,13 +51,13 @@ class VoxelMethod(Method):
         *,
         canonical_time: float,
         renderer: Renderer | None = None,
-        view: nn.Module | None = None,
+        view_dependence: nn.Module | None = None,
         background: StaticBackground | None = None,
     ) -> None:
         super().__init__()
-        check_effect("view", view, "model/view=none")
+        check_effect("view_dependence", view_dependence, "model/view_dependence=none")
         check_effect("background", background, "model/background=none")
-        self.radiance, self.view, self.background = radiance, view, background
+        self.radiance, self.view_dependence, self.background = radiance, view_dependence, background
         self.canonical_time, self.renderer = canonical_time, renderer or Renderer()
         self.lattices: Lattices | None = None
 
@@ -127,7 +127,7 @@ class VoxelMethod(Method):
         if self.still is None or not self.moves:
             return None
         rows = torch.randint(len(self.still), (min(_STILL, len(self.still)),), generator=generator)
-        return self.displacement(self.still[rows].to(self.device), time) / self.unit
+        return self.displacement(self.still[rows].to(self.device), time) / self.half_extent
 
     def _neighbours(self, index: Tensor) -> list[tuple[Tensor, Tensor]]:
         for known, pairs in self._pairs:
@@ -172,16 +172,19 @@ class VoxelMethod(Method):
     def matter(self) -> Cloud:
         """Give the centres of solid canonical voxels; a colour is the mean of those seen from six sides."""
         grid = self.radiance()
-        alpha = grid.activation.alpha(grid.raw_density, grid.lattice.pitch)
+        alpha = grid.activation.alpha(grid.raw_density, grid.lattice.voxel_size)
         solid = alpha > SOLID
         points = grid.lattice.to_world(self.radiance.voxels[solid])
         towards = torch.cat([torch.eye(3), -torch.eye(3)]).to(grid.values)
-        colors = sum(shaded(grid.color[solid], d.expand(len(points), 3), self.view) for d in towards) / 6
-        return Cloud(points, colors, alpha[solid], grid.lattice.pitch)
+        colors = (
+            sum(shaded(grid.color[solid], d.expand(len(points), 3), self.view_dependence) for d in towards)
+            / 6
+        )
+        return Cloud(points, colors, alpha[solid], grid.lattice.voxel_size)
 
     def notes(self) -> dict[str, float]:
         """Tell the unit of density."""
-        return {"unit": self.radiance.activation.unit}
+        return {"density_scale": self.radiance.activation.density_scale}
 
     @property
     def size(self) -> tuple[str, int]:
@@ -206,12 +209,12 @@ class VoxelMethod(Method):
     def get_extra_state(self) -> dict:
         """The unit of density, and where the lattices' schedule stands."""
         schedule = {} if self.lattices is None else self.lattices.state_dict()
-        return {"unit": self.radiance.activation.unit, "lattices": schedule}
+        return {"density_scale": self.radiance.activation.density_scale, "lattices": schedule}
 
     def set_extra_state(self, state: dict) -> None:
         """Adopt a checkpoint's."""
         for grid in (self.radiance, self.background):
             if grid is not None:
-                grid.activation = Activation(grid.activation.shift, float(state["unit"]))
+                grid.activation = Activation(grid.activation.shift, float(state["density_scale"]))
         if self.lattices is not None and state["lattices"]:
             self.lattices.load_state_dict(state["lattices"])

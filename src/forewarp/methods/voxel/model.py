@@ -30,7 +30,7 @@ class VoxelModel:
     """
 
     radiance: Callable[..., nn.Module]
-    view: Callable[..., nn.Module] | None = None
+    view_dependence: Callable[..., nn.Module] | None = None
     background: Callable[..., StaticBackground] | None = None
     renderer: Renderer | None = None
 
@@ -63,15 +63,25 @@ class VoxelModel:
 
     def build(self, ground: Ground, stage: VoxelStage) -> VoxelMethod:
         """Make the method on lattices."""
-        view = self.view() if self.view is not None and "view" in stage.effects else None
-        features = view.features if view is not None else 3
+        view_dependence = None
+        if self.view_dependence is not None and "view_dependence" in stage.effects:
+            view_dependence = self.view_dependence()
+        features = 3 if view_dependence is None else view_dependence.features
         radiance = self.radiance(
-            ground.lattice, ground.active, features=features, unit=ground.unit, box=ground.box
+            ground.lattice,
+            ground.active,
+            features=features,
+            density_scale=ground.density_scale,
+            box=ground.box,
         )
         background = None
         if self.background is not None and "background" in stage.effects:
-            background = self.background(*ground.still, unit=ground.unit)
-        common = {"canonical_time": ground.canonical_time, "view": view, "background": background}
+            background = self.background(*ground.still, density_scale=ground.density_scale)
+        common = {
+            "canonical_time": ground.canonical_time,
+            "view_dependence": view_dependence,
+            "background": background,
+        }
         return self._warp(radiance, ground, stage, features, common | {"renderer": self.renderer})
 
     def _warp(self, radiance, ground: Ground, stage: VoxelStage, features: int, common: dict) -> VoxelMethod:

@@ -29,7 +29,7 @@ TORN = (0.1, 0.3)  # share of solid voxels
 HEADROOM = (3.0, 1.0)  # dB that the last lattice allows beyond what is reached: below these, as above
 VIEWS = 24  # training views whose residual is looked at
 # Not asked while motion is learned: colour that depends on direction would explain it away.
-PLAIN = ("model/view=none", "model/inpainter=none", "model/upsampler=none")
+PLAIN = ("model/view_dependence=none", "model/inpainter=none", "model/upsampler=none")
 
 
 @dataclass
@@ -86,12 +86,12 @@ def of_view(evidence: VoxelEvidence, on: str) -> Decision:
     """Whether colour depends on direction."""
     if evidence.pictures.spread < SPREAD:
         why = f"all cameras lie within {evidence.pictures.spread:.0f} degrees: direction is not seen"
-        return Decision("view", "none", ("model/view=none",), why)
+        return Decision("view_dependence", "none", ("model/view_dependence=none",), why)
     share = evidence.residual.by_direction
     why = f"direction explains {max(share, 0):.1%} of what the coarse stage leaves" + evidence.of_trial(
-        "view"
+        "view_dependence"
     )
-    return _switch("view", _called(evidence, "view", share > BY_DIRECTION[1]), on, why)
+    return _switch("view_dependence", _called(evidence, "view_dependence", share > BY_DIRECTION[1]), on, why)
 
 
 def of_inpainter(evidence: VoxelEvidence, on: str) -> Decision:
@@ -135,7 +135,7 @@ def _as_tried(asked: Asked) -> tuple[str, ...]:
 
 
 def _on_first_lattice(asked: Asked) -> tuple[str, ...]:
-    return (f"stage.{asked.last}.voxels=[[0,{asked.stages[asked.last]['voxels'][0][1]}]]",)
+    return (f"stage.{asked.last}.num_voxels=[[0,{asked.stages[asked.last]['num_voxels'][0][1]}]]",)
 
 
 def _view_is_out(evidence: VoxelEvidence) -> bool:
@@ -153,7 +153,7 @@ def _upsampler_is_out(evidence: VoxelEvidence) -> bool:
 EFFECTS = (
     Effect("motion", "dct"),
     Effect("background", "grid"),
-    Effect("view", "sh", later=True, rules_out=_view_is_out, with_it=_not_in_coarse),
+    Effect("view_dependence", "sh", later=True, rules_out=_view_is_out, with_it=_not_in_coarse),
     Effect("inpainter", "unet3d", later=True, rules_out=_inpainter_is_out, with_it=_as_tried),
     Effect("upsampler", "learned", later=True, rules_out=_upsampler_is_out, with_it=_as_tried),
 )
@@ -206,9 +206,9 @@ class VoxelPlanning:
         evidence.movement = movement(method, scene.times) if method.moves else None
         box = method.bounds(list(scene.times))
         box = method.radiance.lattice.box if box is None else box.intersection(scene.box.scaled(1.05))
-        count = max(count for _, count in asked.stages[asked.last]["voxels"])
+        count = max(count for _, count in asked.stages[asked.last]["num_voxels"])
         some = [targets[i] for i in spread(len(targets), VIEWS)]
-        evidence.residual = residual(method, some, Lattice.of_count(box, count).pitch)
+        evidence.residual = residual(method, some, Lattice.of_count(box, count).voxel_size)
 
     def decide(self, evidence: VoxelEvidence, asked: Asked) -> list[Decision]:
         """Decide all, overruled where something was typed."""
@@ -221,7 +221,7 @@ class VoxelPlanning:
             found.append(replace(bases, words=tuple(_more_bases(more, asked)) if bases.on else ()))
         found += [
             of_background(evidence, moves, asked.choose("background"), start),
-            of_view(evidence, asked.choose("view")),
+            of_view(evidence, asked.choose("view_dependence")),
             of_inpainter(evidence, asked.choose("inpainter")),
             of_upsampler(evidence, asked.choose("upsampler")),
         ]

@@ -37,13 +37,13 @@ class Residual:
 
 
 @torch.no_grad()
-def residual(method: ForwardWarp, targets: Sequence[Target], pitch: float, rays: int = 1500) -> Residual:
+def residual(method: ForwardWarp, targets: Sequence[Target], voxel_size: float, rays: int = 1500) -> Residual:
     """Evidence from what is left of some training pictures.
 
     Args:
         method: fitted, without view dependence.
         targets: training views.
-        pitch: of the last stage's lattice, world units.
+        voxel_size: of the last stage's lattice, world units.
         rays: of each picture.
     """
     generator = torch.Generator().manual_seed(0)
@@ -55,7 +55,7 @@ def residual(method: ForwardWarp, targets: Sequence[Target], pitch: float, rays:
         error = target.rgb.reshape(-1, 3)[pixels] - shown[0]
         places.append(shown[1]), directions.append(camera.rays(pixels).directions), errors.append(error)
         views.append(torch.full((len(pixels),), number))
-        voxel = pitch * camera.fx / max(float(shown[2]), 1e-6)
+        voxel = voxel_size * camera.fx / max(float(shown[2]), 1e-6)
         bounds.append(float((low_passed(target.rgb, voxel) - target.rgb).square().mean()))
     error = torch.cat(errors)
     share = _explained(
@@ -63,7 +63,7 @@ def residual(method: ForwardWarp, targets: Sequence[Target], pitch: float, rays:
         torch.cat(directions),
         error,
         torch.cat(views),
-        2 * method.radiance.lattice.pitch,
+        2 * method.radiance.lattice.voxel_size,
     )
     return Residual(_psnr(float(error.square().mean())), share, _psnr(sum(bounds) / len(bounds)))
 

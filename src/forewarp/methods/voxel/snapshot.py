@@ -19,7 +19,8 @@ from forewarp.scene.view import Moment, Rendering, View
 class VoxelSnapshot(Snapshot):
     """Everything a voxel method computed at one time.
 
-    ``fields`` are what is rendered, by name (``upsampled``, ``inpainted``, ``backward``), the best last;
+    ``fields`` are what is rendered, by name, the best last: ``warped`` or ``upsampled``, then ``inpainted``;
+    ``backward`` of the opponent;
     ``flow`` (N, 3) world units from canonical to the moment on the canonical ``index``; ``coverage`` (M,) of
     the warped voxels; ``dropped`` source voxels that left the box; ``background`` all that stands still. None
     where a method has no such thing. ``length`` is what the loss measures flow in, world units: a third of

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-EFFECTS = ("motion", "view", "upsampler", "inpainter", "background")
+EFFECTS = ("motion", "view_dependence", "upsampler", "inpainter", "background")
 
 
 @dataclass(frozen=True)
@@ -13,10 +13,10 @@ class VoxelStage:
     """What a stage does with its lattices. Fractions are of the stage.
 
     Args:
-        voxels: ``[[fraction, count], ...]``: from that fraction on, about so many voxels in the box.
-        background_voxels: as ``voxels``, for the static background's grid over the whole scene's box.
-        effects: those of the model's that this stage uses, of ``motion, view, upsampler, inpainter,
-            background``.
+        num_voxels: ``[[fraction, count], ...]``: from that fraction on, about so many voxels in the box.
+        background_num_voxels: as ``num_voxels``, for the static background's grid over the scene's box.
+        effects: the model's effects that this stage uses: some of ``motion, view_dependence, upsampler,
+            inpainter, background``.
         upsample: plain interpolation by this factor in place of the model's up-sampler; null: the model's.
         carry: start from the stage before, where that is of voxels too; otherwise only its box is used.
         start: what is active at the beginning, ``box`` or ``hull`` (needs alpha); ``auto`` is the hull where
@@ -38,8 +38,8 @@ class VoxelStage:
         name: of the stage, for errors.
     """
 
-    voxels: Sequence[Sequence[float]]
-    background_voxels: Sequence[Sequence[float]] = ((0.0, 262144),)
+    num_voxels: Sequence[Sequence[float]]
+    background_num_voxels: Sequence[Sequence[float]] = ((0.0, 262144),)
     effects: Sequence[str] = EFFECTS
     upsample: float | None = None
     carry: bool = True
@@ -62,7 +62,7 @@ class VoxelStage:
 
     def __post_init__(self) -> None:
         where = f"stage.{self.name}"
-        for key in ("voxels", "background_voxels", "bases"):
+        for key in ("num_voxels", "background_num_voxels", "bases"):
             steps = [tuple(s) for s in getattr(self, key)]
             if (key != "bases" and not steps) or any(
                 len(s) != 2 or not 0 <= s[0] <= 1 or s[1] < 1 for s in steps

@@ -24,7 +24,7 @@ class Ground:
 
     Attributes:
         lattice: the canonical lattice. active: (X, Y, Z) bool.
-        unit: length that density is measured in, world units.
+        density_scale: length that density is measured in, world units.
         box: the scene's; normalises positions, the same in all stages.
         frames: distinct training times; with one there is no motion.
         canonical_time: in [0, 1].
@@ -33,7 +33,7 @@ class Ground:
 
     lattice: Lattice
     active: Tensor
-    unit: float
+    density_scale: float
     box: Box
     frames: int
     canonical_time: float
@@ -54,22 +54,22 @@ def ground_of(model: _HasBackground, start: Start, stage: VoxelStage) -> Ground:
     scene, before = start.scene, start.before if is_carried(start, stage) else None
     box = scene.box if start.handover is None else start.handover.box
     if before is not None:
-        resample(before.radiance, box, stage.at("voxels", 0.0), keep_alpha=stage.keep_alpha)
+        resample(before.radiance, box, stage.at("num_voxels", 0.0), keep_alpha=stage.keep_alpha)
         lattice, active = before.radiance.lattice, before.radiance.index >= 0
-        unit = before.radiance.activation.unit
+        density_scale = before.radiance.activation.density_scale
     else:
-        lattice = Lattice.of_count(box, stage.at("voxels", 0.0))
+        lattice = Lattice.of_count(box, stage.at("num_voxels", 0.0))
         known = {} if start.handover is None else start.handover.notes
-        unit, active = known.get("unit", lattice.pitch), _first(start, lattice, stage)
-        if not unit > 0:
+        density_scale, active = known.get("density_scale", lattice.voxel_size), _first(start, lattice, stage)
+        if not density_scale > 0:
             raise ValueError(
-                f"stage.{start.stage}: expected a unit of density > 0 from the stage before, but got {unit}; "
-                "delete the folder of that stage"
+                f"stage.{start.stage}: expected a density_scale > 0 from the stage before, "
+                f"but got {density_scale}; delete the folder of that stage"
             )
     still = None
     if model.background is not None and "background" in stage.effects:
         still = _still(scene.box.scaled(1.05), stage, getattr(before, "background", None))
-    return Ground(lattice, active, unit, scene.box, len(scene.times), scene.canonical_time, still)
+    return Ground(lattice, active, density_scale, scene.box, len(scene.times), scene.canonical_time, still)
 
 
 def carried(method: nn.Module, before: nn.Module) -> None:
@@ -93,7 +93,7 @@ def set_start_density(method: nn.Module, alpha: float) -> None:
     for grid in (method.radiance, method.background):
         if grid is None:
             continue
-        raw = grid.activation.raw(alpha, grid.lattice.pitch)
+        raw = grid.activation.raw(alpha, grid.lattice.voxel_size)
         with torch.no_grad():
             if "density" in grid.names:
                 grid.parameter("density").fill_(raw)
@@ -105,7 +105,7 @@ def _still(box: Box, stage: VoxelStage, before: VoxelGrid | None) -> tuple[Latti
     """Lattice and active voxels of the static background, whose box holds every stage's: continued from the
     stage before, or all active.
     """
-    voxels = stage.at("background_voxels", 0.0)
+    voxels = stage.at("background_num_voxels", 0.0)
     if before is None:
         lattice = Lattice.of_count(box, voxels)
         return lattice, torch.ones(lattice.shape, dtype=torch.bool)

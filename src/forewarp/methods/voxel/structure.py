@@ -25,7 +25,7 @@ def occupied(radiance: VoxelGrid, keep_alpha: float, seen: Tensor | None = None)
     """Voxels (X, Y, Z) bool that are more opaque than ``keep_alpha`` over one voxel, and ``seen`` (N,)."""
     with torch.no_grad():
         grid = radiance()
-    solid = grid.activation.alpha(grid.raw_density, grid.lattice.pitch) > keep_alpha
+    solid = grid.activation.alpha(grid.raw_density, grid.lattice.voxel_size) > keep_alpha
     solid = solid if seen is None else solid & seen
     mask = torch.zeros(grid.lattice.shape, dtype=torch.bool, device=solid.device)
     x, y, z = radiance.voxels[solid].unbind(-1)
@@ -94,7 +94,7 @@ def resample(
     last = torch.tensor(source.lattice.shape, device=points.device) - 1
     slack = 1e-3  # voxels: rounding must not cut off the border of the same box
     inside = ((points >= -slack) & (points <= last + slack)).all(-1)
-    solid = (source.activation.alpha(raw, source.lattice.pitch) > keep_alpha) & inside
+    solid = (source.activation.alpha(raw, source.lattice.voxel_size) > keep_alpha) & inside
     mask = dilate(solid.reshape(lattice.shape), 1)
     if not bool(mask.any()):
         mask = torch.ones_like(mask)
@@ -111,7 +111,7 @@ def box_of_all_times(method, times: list[float], *, alpha: float, pad: float) ->
     None where nothing is that opaque. Sources that left the box are counted by the warp, not here.
     """
     grid = method.radiance()
-    solid = grid.activation.alpha(grid.raw_density, grid.lattice.pitch) > alpha
+    solid = grid.activation.alpha(grid.raw_density, grid.lattice.voxel_size) > alpha
     if not bool(solid.any()):
         return None
     home = grid.lattice.to_world(method.radiance.voxels)[solid]
@@ -119,5 +119,5 @@ def box_of_all_times(method, times: list[float], *, alpha: float, pad: float) ->
     for time in times if method.moves else ():
         at = method.moved(home, solid, time)
         low, high = torch.minimum(low, at.amin(0)), torch.maximum(high, at.amax(0))
-    margin = pad * grid.lattice.pitch  # added first: a flat thing has no box of its own
+    margin = pad * grid.lattice.voxel_size  # added first: a flat thing has no box of its own
     return Box(tuple((low - margin).tolist()), tuple((high + margin).tolist()))

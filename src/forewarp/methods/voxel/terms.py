@@ -72,7 +72,7 @@ def _moving_opacity(seen: Seen) -> Tensor | None:
     if seen.state.background is None:
         return None
     grid = seen.state.canonical
-    return losses.moving_opacity(grid.activation.alpha(grid.raw_density, grid.lattice.pitch))
+    return losses.moving_opacity(grid.activation.alpha(grid.raw_density, grid.lattice.voxel_size))
 
 
 def _inpaint(seen: Seen) -> Tensor | None:

@@ -51,7 +51,7 @@ def test_holes_are_empty_and_not_fog(fade):
     warped, coverage, _ = motion(fade=fade).warp(canonical, LATTICE.all_voxels(), flow)
     padded = torch.cat([warped.raw_density, torch.tensor([EMPTY])])
     opened = padded[warped.index[:, :, 0].long()]
-    fog = 1 - math.exp(-80 * float(warped.activation.sigma(opened).max()) * LATTICE.pitch)
+    fog = 1 - math.exp(-80 * float(warped.activation.sigma(opened).max()) * LATTICE.voxel_size)
     assert fog < 1e-3
     assert warped.raw_density.max() == pytest.approx(6.0, abs=1e-4)
     assert 0 < coverage.min() < 2e-4

@@ -37,9 +37,9 @@ class Together:
         return self.still.lattice
 
     @property
-    def pitch(self) -> float:
+    def voxel_size(self) -> float:
         """Of the two that of the finer, whichever it is: what moves may lie in a small box."""
-        return min(self.moving.pitch, self.still.pitch)
+        return min(self.moving.voxel_size, self.still.voxel_size)
 
     @cached_property
     def cells(self) -> Tensor:
