@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from reprlib import repr as short
 
-MOST_BYTES = 1 << 26  # what a file that is parsed may have; parsing takes up to thirty times as much memory
+# The most bytes that are read of a file.
 MOST_CONFIG = 1 << 20  # of a config or a plan; ours have a few thousand
+MOST_BYTES = 1 << 26  # of a text that is parsed, which takes up to thirty times as much memory
+MOST_POINTS = 1 << 28  # of a cloud of points as text
+MOST_IMAGE = 1 << 29
+MOST_ARRAYS = 1 << 30  # of NumPy's files, also when unpacked
 
 
 @contextmanager
@@ -59,21 +66,59 @@ def write_json(path: Path, content: dict) -> None:
 
 
 def read_json(path: Path) -> dict | None:
-    """Read the object of a JSON file; None where there is none that is whole and within ``MOST_BYTES``."""
+    """Read the object of a JSON file; None where there is none, or none that ``load_json`` reads."""
     try:
-        content = json.loads(read_text(path))
-    except (FileNotFoundError, NotADirectoryError, ValueError, RecursionError):
+        return load_json(path)
+    except (FileNotFoundError, NotADirectoryError, ValueError):
         return None
-    return content if isinstance(content, dict) else None
 
 
-def read_text(path: Path, most: int = MOST_BYTES) -> str:
-    """Read a file as UTF-8; bytes that are none are replaced.
+def load_json(path: Path) -> dict:
+    """Read the object of a JSON file.
 
     Raises:
         OSError: where it cannot be read.
-        ValueError: where it has more than ``most`` bytes; nothing is then read.
+        ValueError: in one line, where it is too large, does not parse or holds no object.
     """
-    if (size := path.stat().st_size) > most:
-        raise ValueError(f"{path}: expected at most {most} bytes, but got {size}")
-    return path.read_bytes().decode(errors="replace")
+    raw = read_bytes(path)
+    try:
+        content = json.loads(raw.decode())
+    except json.JSONDecodeError as error:
+        raise ValueError(f"{path}: line {error.lineno}: expected JSON, but got {error.msg}") from error
+    except (ValueError, RecursionError) as error:  # bytes that are no text, absurd numbers or nesting
+        raise ValueError(f"{path}: expected JSON, but got {short(str(error))}") from error
+    if not isinstance(content, dict):
+        raise ValueError(f"{path}: expected a JSON object at the top, but got {type(content).__name__}")
+    return content
+
+
+def read_text(path: Path, most: int = MOST_BYTES) -> str:
+    """Read a file as UTF-8, as ``read_bytes`` does; bytes that are no text are replaced."""
+    return read_bytes(path, most).decode(errors="replace")
+
+
+def read_bytes(path: Path, most: int = MOST_BYTES) -> bytes:
+    """Read a regular file.
+
+    Raises:
+        OSError: where it cannot be read.
+        ValueError: as ``check_size``; nothing is then read.
+    """
+    check_size(path, most)
+    return path.read_bytes()
+
+
+def check_size(path: Path, most: int) -> None:
+    """Refuse a file that must not be opened.
+
+    Raises:
+        OSError: where there is none, or a folder.
+        ValueError: for a device, a pipe, and a file of more than ``most`` bytes.
+    """
+    about = path.stat()
+    if stat.S_ISDIR(about.st_mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    if not stat.S_ISREG(about.st_mode):
+        raise ValueError(f"{path}: expected a file, but got a device or a pipe")
+    if about.st_size > most:
+        raise ValueError(f"{path}: expected at most {most} bytes, but got {about.st_size}")

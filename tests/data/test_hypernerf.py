@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from forewarp.data.hypernerf import read_scene
+from forewarp.data.hypernerf import read_camera, read_scene, reduced, write_camera
 from forewarp.data.images import write_png
 from forewarp.data.module import HyperNeRFDataModule
-from forewarp.data.nerfies_camera import read_camera, reduced, write_camera
 from tests.support.dnerf_scene import real
 from tests.support.rig_scene import CENTER, FAR, LENS, NEAR, SCALE, edit, hand, phone, rig, truth, write_rig
 

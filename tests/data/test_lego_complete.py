@@ -140,10 +140,10 @@ def cut(path):
 
 
 DEPTHS = [
-    (eight_bits, "expected a grey PNG of 16 bits a pixel, but got 8"),
+    (eight_bits, "expected a grey PNG of 16 bits a pixel, but got mode L"),
     (other_size, r"expected finite depths >= 0 of shape \(6, 8\), but got shape \(6, 9\)"),
-    (cut, "expected a whole PNG image, but got a truncated one"),
-    (lambda path: path.write_bytes(b""), "expected an image, but got an empty file"),
+    (cut, "expected a whole image, but got a truncated or harmed one"),
+    (lambda path: path.write_bytes(b""), "expected a PNG or JPEG image, but got an empty file"),
 ]
 
 

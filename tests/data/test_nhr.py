@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from forewarp.data.jpeg import write_jpeg
+from forewarp.data.images import write_jpeg
 from forewarp.data.nhr import DomeFrame, read_scene, write_scene
 from forewarp.scene.errors import SceneError
 from tests.support.nhr_scene import BALLS, COLORS, STEP, dome, dome_frames, place, truth, write_dome
@@ -361,16 +361,16 @@ BAD_FILES = {
     ),
     "image size": ("img/1/img_0002.jpg", grown, r"expected 60 x 48 pixels as in .*, but got 62 x 48"),
     "mask size": ("img/0/mask/img_0002.jpg", grown, r"expected 60 x 48 pixels as in .*, but got 62 x 48"),
-    "truncated": ("img/1/img_0001.jpg", cut, r"expected a whole JPEG image, but got a truncated one"),
+    "truncated": ("img/1/img_0001.jpg", cut, r"expected a whole image, but got a truncated or harmed one"),
     "empty": (
         "img/1/img_0001.jpg",
         lambda p: p.write_bytes(b""),
-        r"expected an image, but got an empty file",
+        r"expected a PNG or JPEG image, but got an empty file",
     ),
     "text": (
         "img/1/img_0001.jpg",
         lambda p: p.write_text("x" * 99),
-        r"expected a JPEG image, but got a file",
+        r"expected a PNG or JPEG image, but got another kind of file",
     ),
     "no cloud": ("pointclouds/frame2.npy", Path.unlink, r"expected a NumPy file, but got No such file"),
     "cloud shape": (

@@ -13,9 +13,8 @@ from lightning import LightningDataModule
 from forewarp.data import dnerf, hypernerf, lego_complete, nhr, posed_video
 from forewarp.data.batches import Sampler, Targets, color_of
 from forewarp.data.cache import CACHE
-from forewarp.data.canonical import with_canonical
 from forewarp.data.fingerprint import RECORD, fingerprint
-from forewarp.data.held import hold_out
+from forewarp.data.options import hold_out, with_canonical
 from forewarp.scene.batch import Asks, Target
 from forewarp.scene.errors import SceneError
 from forewarp.scene.frame import Scene, spread

@@ -1,8 +1,14 @@
-import pytest
+"""Views held out and another canonical time."""
 
-from forewarp.data.held import hold_out
+from dataclasses import replace
+
+import pytest
+import torch
+
 from forewarp.data.module import SceneDataModule
+from forewarp.data.options import hold_out, with_canonical
 from forewarp.scene.errors import SceneError
+from forewarp.scene.frame import Truth
 from tests.support.tiny_scene import ball_scene
 
 
@@ -55,3 +61,21 @@ def test_batches_never_show_them():
     assert data.watched().frames == data.targets("held").frames
     assert not {data.batches.draw().time for _ in range(200)} & times
     assert len(SceneDataModule(lambda: ball_scene(frames=8, size=8)).targets("held")) == 0
+
+
+def moving(*times):
+    """A scene that begins at 0, with trajectories at ``times``."""
+    truth = Truth(torch.rand(3, len(times), 3), torch.tensor(times, dtype=torch.float64))
+    return replace(ball_scene(frames=5, size=8), truth=truth)
+
+
+def test_the_middle_training_time_becomes_canonical_and_leads_the_trajectories():
+    scene = moving(0.0, 0.25, 0.5, 1.0)
+    moved = with_canonical(scene, "middle")
+    assert moved.canonical_time == moved.protocol["canonical_time"] == 0.5
+    assert moved.truth.times.tolist() == [0.5, 0.0, 0.25, 1.0]
+    assert torch.equal(moved.truth.points, scene.truth.points[:, [2, 0, 1, 3]])
+    assert with_canonical(moving(0.0, 1.0), "middle").truth is None
+    assert with_canonical(scene, None) is scene
+    with pytest.raises(SceneError, match="data.canonical: expected middle or null, but got last"):
+        with_canonical(scene, "last")

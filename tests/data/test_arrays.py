@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from forewarp.data.truth import StoredDepth, read_truth, write_depth, write_truth
+from forewarp.data.arrays import StoredDepth, read_truth, write_array, write_truth
 from forewarp.scene.errors import SceneError
 from forewarp.scene.frame import Truth
 
@@ -18,7 +18,7 @@ from forewarp.scene.frame import Truth
     ],
 )
 def test_bad_depth(tmp_path, depth, match):
-    write_depth(tmp_path / "d.npy", depth)
+    write_array(tmp_path / "d.npy", depth)
     with pytest.raises(SceneError, match=match):
         StoredDepth(tmp_path / "d.npy", (3, 4))()
 

@@ -1,4 +1,4 @@
-"""Poses and boxes as files and configs give them, checked."""
+"""Check the poses, boxes, ranges and lenses that files and configs give."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from forewarp.scene.camera import Camera
 from forewarp.scene.errors import SceneError
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL's axes of a camera to OpenCV's, and back
-MOST_UNITS = 1e9  # from the origin: farther off single precision is long lost
+MOST_UNITS = 1e9  # largest coordinate: farther from the origin single precision is long lost
 _SAME_PIXEL = 0.01
 # Poses are stored with six digits or more; a scale or a shear in a pose is never this small.
 _ROTATION_TOLERANCE = 1e-3
 
 
 def pose_of(value: object, where: str) -> np.ndarray:
-    """A camera-to-world matrix (4, 4) float64 whose upper left part is a rotation.
+    """Check a camera-to-world matrix, whose upper left part must be a rotation: (4, 4) float64.
 
     Raises:
         SceneError: for another shape, entries that are no finite numbers, or no rotation.
@@ -50,7 +50,7 @@ def pose_of(value: object, where: str) -> np.ndarray:
 
 
 def box_of(values: Sequence[float]) -> Box:
-    """The box a config names by x0 y0 z0 x1 y1 z1 in world units.
+    """Make the box that a config gives as x0 y0 z0 x1 y1 z1 in world units.
 
     >>> box_of([-1, -1, -1, 1, 1, 2]).high
     (1.0, 1.0, 2.0)
@@ -64,10 +64,10 @@ def box_of(values: Sequence[float]) -> Box:
 
 
 def frustum_box(cameras: Iterable[Camera]) -> Box:
-    """The bounds of all rays between near and far, along the unit rays of 3 x 3 pixels a camera."""
+    """Bound all rays between near and far, by those of 3 x 3 pixels of each camera."""
     points = []
     for camera in cameras:
-        # Not corners alone: of rays of one length those through the middle of an edge reach further sideways.
+        # Corners are not enough: at equal length a ray through the middle of an edge reaches further.
         pixels = _nine_pixels(camera)
         rays = camera.rays(pixels, dtype=torch.float64)
         points += [rays.origins + distance * rays.directions for distance in (camera.near, camera.far)]
@@ -76,23 +76,13 @@ def frustum_box(cameras: Iterable[Camera]) -> Box:
 
 
 def check_range(near: float, far: float) -> None:
-    """Refuse a range of distances that is empty, negative or endless."""
+    """Refuse a range of distances that is empty, negative or infinite."""
     if not number(near, "data.near", 0, MOST_UNITS) < number(far, "data.far", 0, MOST_UNITS):
         raise SceneError(f"data.near, data.far: expected near < far, but got {near} and {far}")
 
 
-def middle_of(times: Iterable[float]) -> float:
-    """The time nearest to the middle between first and last, the earlier of two as near.
-
-    >>> middle_of([0.0, 0.1, 0.2, 0.8, 1.0])
-    0.2
-    """
-    times = sorted(set(times))
-    return min(times, key=lambda time: round(abs(time - 0.5 * (times[0] + times[-1])), 9))
-
-
 def check_lens(camera: Camera, where: str) -> None:
-    """Refuse a lens that cannot be undone all over the picture, which would give rays that mean nothing.
+    """Refuse a lens whose distortion cannot be undone all over the picture: its rays would be wrong.
 
     Cost: nine points of Newton's method.
     """
@@ -109,7 +99,7 @@ def check_lens(camera: Camera, where: str) -> None:
 
 
 def _nine_pixels(camera: Camera) -> torch.Tensor:
-    """The flat indices (9,) of corners, middles of edges and centre."""
+    """Flat indices (9,) of the corners, the middles of the edges and the centre."""
     columns = torch.tensor([0, camera.width // 2, camera.width - 1])
     rows = torch.tensor([0, camera.height // 2, camera.height - 1])
     return (rows[:, None] * camera.width + columns).flatten()

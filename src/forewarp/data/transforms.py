@@ -1,4 +1,4 @@
-"""What a ``transforms.json`` of nerfstudio's kind says of its images, each entry checked."""
+"""Read the entries of a nerfstudio-style ``transforms.json`` and check each of them."""
 
 from __future__ import annotations
 
@@ -12,9 +12,8 @@ from reprlib import repr as short
 import torch
 
 from forewarp.data.files import frames_of, inside, number
-from forewarp.data.images import PngHeader, inspect_png
-from forewarp.data.jpeg import inspect_jpeg
-from forewarp.data.views import FLIP, check_lens, pose_of
+from forewarp.data.geometry import FLIP, check_lens, pose_of
+from forewarp.data.images import inspect_image
 from forewarp.scene.camera import Camera
 from forewarp.scene.errors import SceneError
 from forewarp.scene.lens import Lens
@@ -25,8 +24,8 @@ SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 
 
 @dataclass(frozen=True)
-class View:
-    """One entry: ``camera`` in the file's units, at the size of the image that is read; near and far are 0.
+class ImageEntry:
+    """A checked entry: ``camera`` in the file's units, at the size of the image; its near and far are 0.
 
     ``name`` is the image's path without its suffix; ``has_alpha`` says what the image's header does.
     """
@@ -41,7 +40,7 @@ class View:
 
 @dataclass(frozen=True)
 class _Entry:
-    """A frame's keys, and where it has none those at the top of the file."""
+    """A frame's own keys, then those at the top of the file."""
 
     file: Path
     index: int
@@ -59,120 +58,120 @@ class _Entry:
         return number(self.get(key, default), self.where(key), low, high)
 
 
-def read_views(file: Path, content: dict, scale: int = 1) -> list[View]:
-    """All entries of a file in its order.
+def read_entries(file: Path, content: dict, scale: int = 1) -> list[ImageEntry]:
+    """Read all entries of a file in its order.
 
     Args:
         file: for errors and as the place that paths start from.
-        content: what it holds.
-        scale: take the images that are so many times smaller, ``images_4`` in place of ``images``.
+        content: of the file.
+        scale: take images that are ``scale`` times smaller, from ``images_4`` in place of ``images``.
 
     Raises:
         SceneError: for every key or image that is missing or wrong.
 
     Cost: one read of each PNG, of a JPEG's beginning and end.
     """
-    frames, views = frames_of(content, file), []
+    frames, entries = frames_of(content, file), []
     for i, own in enumerate(frames):
         if not isinstance(own, dict):
             raise SceneError(f"{file}: frames[{i}]: expected an object, but got {short(own)}")
-        views.append(_view(_Entry(file, i, own, content), scale))
+        entries.append(_image_entry(_Entry(file, i, own, content), scale))
     for key, given in (
-        ("time", [v.time is not None for v in views]),
-        ("mask_path", [v.mask is not None for v in views]),
-        ("file_path: alpha", [v.has_alpha or v.mask is not None for v in views]),
+        ("time", [e.time is not None for e in entries]),
+        ("mask_path", [e.mask is not None for e in entries]),
+        ("file_path: alpha", [e.has_alpha or e.mask is not None for e in entries]),
     ):
         if any(given) and not all(given):
             got = f"{sum(given)} of {len(given)} and none in frames[{given.index(False)}]"
             raise SceneError(f"{file}: frames: {key}: expected one in all frames or in none, but got {got}")
-    if len({v.name for v in views}) < len(views):
-        twice = next(v.name for i, v in enumerate(views) if v.name in {w.name for w in views[:i]})
+    if len({e.name for e in entries}) < len(entries):
+        twice = next(e.name for i, e in enumerate(entries) if e.name in {w.name for w in entries[:i]})
         raise SceneError(f"{file}: frames: expected each image once, but got {twice} twice; remove one")
-    return views
+    return entries
 
 
 def name_of(folder: Path, value: object, where: str) -> str:
-    """What an image is called whose path a file tells: the path without its suffix."""
+    """Name an image by its path without the suffix."""
     path = inside(folder, value, where)
     return path.relative_to(folder).as_posix().removesuffix(path.suffix if path.suffix in SUFFIXES else "")
 
 
-def spread_in_time(views: list[View]) -> list[View]:
-    """The views in the order of their names, numbers by their value, at even times."""
+def with_even_times(entries: list[ImageEntry]) -> list[ImageEntry]:
+    """Sort entries by name, numbers by value, and space their times evenly over [0, 1]."""
 
-    def order(view: View) -> list:
-        return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", view.name)]
+    def order(entry: ImageEntry) -> list:
+        return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", entry.name)]
 
-    views = sorted(views, key=order)
-    return [replace(view, time=i / max(len(views) - 1, 1)) for i, view in enumerate(views)]
+    entries = sorted(entries, key=order)
+    return [replace(entry, time=i / max(len(entries) - 1, 1)) for i, entry in enumerate(entries)]
 
 
-def split_views(file: Path, content: dict, views: list[View], test_every: int) -> tuple[dict, str]:
-    """The views of each split and in words how they were chosen.
+def split_entries(file: Path, content: dict, entries: list[ImageEntry], test_every: int) -> tuple[dict, str]:
+    """Split the entries; also say in words how.
 
     Args:
         file, content: where ``<split>_filenames`` may list frames; what no list names trains, or tests where
             the training frames are listed.
-        views: in the order of time.
+        entries: in the order of time.
         test_every: every n-th is a test frame where nothing is listed, the first and the last never.
 
     Raises:
         SceneError: for a list that names no frame or one of another list, and where a split is empty.
     """
     lists = {
-        s: _listed(file, content, f"{s}_filenames", views) for s in SPLITS if f"{s}_filenames" in content
+        s: _listed(file, content, f"{s}_filenames", entries) for s in SPLITS if f"{s}_filenames" in content
     }
     if lists:
         home = next((split for split in ("train", "test") if split not in lists), None)
-        parts = {split: [v for v in views if v.name in lists.get(split, ())] for split in SPLITS}
-        free = [v for v in views if all(v.name not in names for names in lists.values())]
+        parts = {split: [e for e in entries if e.name in lists.get(split, ())] for split in SPLITS}
+        free = [e for e in entries if all(e.name not in names for names in lists.values())]
         parts |= {home: free} if home else {}
         how = "as listed in the file"
     else:
         held = slice(test_every // 2, -1, test_every)
-        parts = {"train": views.copy(), "val": [], "test": views[held]}
+        parts = {"train": entries.copy(), "val": [], "test": entries[held]}
         del parts["train"][held]
         how = f"every {test_every}th frame held out"
-    if sum(map(len, parts.values())) > len({v.name for part in parts.values() for v in part}):
+    if sum(map(len, parts.values())) > len({e.name for part in parts.values() for e in part}):
         raise SceneError(f"{file}: expected lists of filenames that share none, but got one in two of them")
     for split in ("train", "test"):
         if not parts[split]:
             raise SceneError(
-                f"{file}: expected a frame to {split} on, but got none of {len(views)}; name some in "
+                f"{file}: expected a frame to {split} on, but got none of {len(entries)}; name some in "
                 f"{split}_filenames"
             )
     return parts, how
 
 
-def _listed(file: Path, content: dict, key: str, views: list[View]) -> set[str]:
-    """The names that a list of files holds."""
+def _listed(file: Path, content: dict, key: str, entries: list[ImageEntry]) -> set[str]:
+    """Read the names in a list of files."""
     value = content[key]
     if not isinstance(value, list):
         raise SceneError(f"{file}: {key}: expected a list of paths, but got {short(value)}")
     names = {name_of(file.parent, path, f"{file}: {key}[{i}]") for i, path in enumerate(value)}
-    if unknown := sorted(names - {view.name for view in views}):
+    if unknown := sorted(names - {entry.name for entry in entries}):
         raise SceneError(f"{file}: {key}: expected paths of frames, but got {short(unknown[0])}")
     return names
 
 
-def _view(entry: _Entry, scale: int) -> View:
+def _image_entry(entry: _Entry, scale: int) -> ImageEntry:
     image, name = _file(entry, "file_path", scale)
-    header = _header(image)
+    header = inspect_image(image)
     mask = None
     if "mask_path" in entry.own:
         mask, _ = _file(entry, "mask_path", scale)
-        if (size := _header(mask).size) != header.size:
+        if (size := inspect_image(mask).size) != header.size:
             got = f"{size[0]} x {size[1]}"
             raise SceneError(
                 f"{mask}: expected {header.size[0]} x {header.size[1]} pixels as {image.name}, but got {got}"
             )
     time = number(entry.own["time"], entry.where("time"), 0, 1) if "time" in entry.own else None
     camera = _camera(entry, header.size, scale, image)
-    return View(name, time, camera, image, mask, header.has_alpha)
+    return ImageEntry(name, time, camera, image, mask, header.has_alpha)
 
 
 def _file(entry: _Entry, key: str, scale: int) -> tuple[Path, str]:
-    """The image that a key names, with or without its suffix, and its name."""
+    """Find the image that a key names, with or without its suffix, and its name."""
     folder, where = entry.file.parent, entry.where(key)
     path, name = inside(folder, entry.own.get(key), where), name_of(folder, entry.own.get(key), where)
     if scale > 1 and path.parent == folder:
@@ -187,12 +186,8 @@ def _file(entry: _Entry, key: str, scale: int) -> tuple[Path, str]:
     return found[0], name
 
 
-def _header(path: Path) -> PngHeader:
-    return inspect_png(path) if path.suffix.lower() == ".png" else PngHeader(inspect_jpeg(path), False)
-
-
 def _camera(entry: _Entry, stored: tuple[int, int], scale: int, image: Path) -> Camera:
-    """The camera of an image of ``stored`` pixels whose entry speaks of one ``scale`` times as large."""
+    """Make the camera of an image of ``stored`` pixels; its entry is of one ``scale`` times as large."""
     model = entry.get("camera_model", "OPENCV")
     if model not in MODELS:
         raise SceneError(

@@ -1,4 +1,4 @@
-"""Exact depth and exact trajectories beside a scene's images."""
+"""Read and write the arrays beside a scene's images: exact depth, exact trajectories, clouds of points."""
 
 from __future__ import annotations
 
@@ -12,23 +12,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from forewarp.data.files import read_bytes
+from forewarp.data.files import numbers_of, read_bytes
+from forewarp.data.geometry import MOST_UNITS
 from forewarp.data.images import halved_depth, read_gray16
-from forewarp.data.views import MOST_UNITS
-from forewarp.files import replace_file
+from forewarp.files import MOST_ARRAYS, MOST_POINTS, written_whole
 from forewarp.scene.errors import SceneError
 from forewarp.scene.frame import Truth
 
-_MOST_BYTES = 1 << 30  # of arrays, unpacked
 _SAME_TIME = 1e-6
 
 
 class StoredDepth:
     """Ray depth (H, W) float32 in world units, 0 on the background; read at each call.
 
-    A .npy file, or a grey 16-bit PNG whose values times ``scale`` are world units (which ``scale`` that is
-    must be known: None is refused). ``size`` (width, height) is what the file must hold; with ``halve`` half
-    of that is given.
+    A .npy file, or a grey 16-bit PNG whose values times ``scale`` are world units (None is refused).
+    ``size`` (width, height) is what the file must hold; with ``halve`` half of that is given.
     """
 
     def __init__(
@@ -42,18 +40,12 @@ class StoredDepth:
         self.path, self.size, self.halve, self.scale = path, size, halve, scale
 
     def __call__(self) -> Tensor:
-        """The depth; raises SceneError where the file holds anything else."""
+        """Read the depth; SceneError where the file holds anything else."""
         depth = read_gray16(self.path) if self.path.suffix == ".png" else load_numpy(self.path)
         expected = f"{self.path}: expected finite depths >= 0 of shape {self.size[::-1]}"
-        if (
-            not isinstance(depth, np.ndarray)
-            or depth.shape != self.size[::-1]
-            or depth.dtype.kind not in "iuf"
-        ):
+        if getattr(depth, "shape", None) != self.size[::-1] or depth.dtype.kind not in "iuf":
             raise SceneError(f"{expected}, but got shape {getattr(depth, 'shape', None)}")
-        with np.errstate(
-            over="ignore", invalid="ignore"
-        ):  # what is too large for float32 is refused as infinite
+        with np.errstate(over="ignore", invalid="ignore"):  # too large for float32: refused as infinite
             depth = (depth * (1.0 if self.scale is None else self.scale)).astype(np.float32)
         if not np.isfinite(depth).all() or (depth < 0).any():
             raise SceneError(f"{expected}, but got values from {depth.min()} to {depth.max()}")
@@ -61,15 +53,8 @@ class StoredDepth:
         return halved_depth(tensor) if self.halve else tensor
 
 
-def write_depth(path: Path, depth: Tensor | np.ndarray) -> None:
-    """Write ray depth (H, W) as float32 .npy, whole or not at all."""
-    buffer = io.BytesIO()
-    np.save(buffer, np.asarray(depth, dtype=np.float32))
-    replace_file(path, buffer.getvalue())
-
-
 def read_truth(path: Path, canonical_time: float) -> Truth | None:
-    """The trajectories in an .npz with ``points`` (N, T, 3) and ``times`` (T,); None without the file.
+    """Read trajectories from an .npz with ``points`` (N, T, 3) and ``times`` (T,); None without the file.
 
     Raises:
         SceneError: for other keys, shapes or values, or a first time that is not the canonical one.
@@ -93,34 +78,68 @@ def read_truth(path: Path, canonical_time: float) -> Truth | None:
 
 
 def shortened(truth: Truth, end: float) -> Truth | None:
-    """The trajectories up to the time ``end``, which becomes 1; None where fewer than two times are left."""
+    """Cut trajectories off at the time ``end``, which becomes 1; None where fewer than two times are left."""
     kept = truth.times <= end + _SAME_TIME
     if end <= 0 or int(kept.sum()) < 2:
         return None
     return Truth(truth.points[:, kept], (truth.times[kept] / end).clamp(max=1))
 
 
+def read_cloud(path: Path, columns: int) -> np.ndarray:
+    """Read points (N, columns) float32, N >= 1, places first, from a .npy file or the ``v`` lines of an .obj.
+
+    Raises:
+        SceneError: where the file is missing, has another shape, values that are not finite, or places beyond
+            ``MOST_UNITS``.
+    """
+    points = _obj_vertices(path, columns) if path.suffix == ".obj" else load_numpy(path)
+    shape = getattr(points, "shape", ())
+    if len(shape) != 2 or shape[1] != columns or not shape[0] or points.dtype.kind not in "iuf":
+        got = f"shape {shape}" if hasattr(points, "shape") else "several arrays"
+        raise SceneError(f"{path}: expected points (N, {columns}), but got {got}; export it again")
+    with np.errstate(over="ignore", invalid="ignore"):
+        points = points.astype(np.float32)
+    finite = np.isfinite(points).all(1)
+    if not finite.all():
+        raise SceneError(
+            f"{path}: expected finite numbers, but got {points[~finite][0].tolist()} in row "
+            f"{int((~finite).argmax())} and {int((~finite).sum())} such rows; export it again"
+        )
+    farthest = np.abs(points[:, :3]).max(1)
+    if farthest.max() > MOST_UNITS:
+        row = int(farthest.argmax())
+        raise SceneError(
+            f"{path}: expected points within {MOST_UNITS:g} units, but got {farthest[row]:g} in row {row}; "
+            "export it again"
+        )
+    return points
+
+
+def write_array(path: Path, values: Tensor | np.ndarray) -> None:
+    """Write depth (H, W) or points (N, C) as float32 .npy, whole or not at all."""
+    with written_whole(path) as beside:
+        np.save(beside, np.asarray(values, np.float32))
+
+
 def write_truth(path: Path, truth: Truth) -> None:
     """Write trajectories for ``read_truth``, whole or not at all."""
-    buffer = io.BytesIO()
-    np.savez(buffer, points=np.asarray(truth.points, np.float32), times=np.asarray(truth.times, np.float64))
-    replace_file(path, buffer.getvalue())
+    points, times = np.asarray(truth.points, np.float32), np.asarray(truth.times, np.float64)
+    with written_whole(path) as beside:
+        np.savez(beside, points=points, times=times)
 
 
 def load_numpy(path: Path):
-    """What a .npy or .npz file holds, no objects; SceneError where it cannot be read."""
+    """Load a .npy or .npz file without objects; SceneError where it cannot be read."""
+    content = read_bytes(path, MOST_ARRAYS, "a NumPy file")
     try:
-        content = read_bytes(path, _MOST_BYTES, "a NumPy file")
         if zipfile.is_zipfile(io.BytesIO(content)):
             with zipfile.ZipFile(io.BytesIO(content)) as archive:
                 unpacked = sum(part.file_size for part in archive.infolist())
-            if unpacked > _MOST_BYTES:
+            if unpacked > MOST_ARRAYS:
                 raise ValueError(f"{unpacked} bytes unpacked")
         elif content.startswith(b"\x93NUMPY"):
             _check_length(content)
         return np.load(io.BytesIO(content), allow_pickle=False)
-    except SceneError:
-        raise
     except Exception as error:  # OSError, ValueError, MemoryError, BadZipFile, zlib.error and more
         raise SceneError(
             f"{path}: expected a NumPy file, but got one that cannot be read ({short(str(error))})"
@@ -138,6 +157,7 @@ def _check_length(content: bytes) -> None:
 
 
 def _numbers(arrays, name: str, path: Path) -> np.ndarray:
+    """Take the array ``name``, of finite numbers within ``MOST_UNITS``."""
     try:
         array = arrays[name]
         if not isinstance(array, np.ndarray):  # of a member of an archive that is none NumPy gives the bytes
@@ -152,3 +172,11 @@ def _numbers(arrays, name: str, path: Path) -> np.ndarray:
         expected = f"numbers within {MOST_UNITS:g}"
         raise SceneError(f"{path}: {name}: expected finite {expected}, but got {array.dtype} with others")
     return array
+
+
+def _obj_vertices(path: Path, columns: int) -> np.ndarray:
+    rows, lines = [], read_bytes(path, MOST_POINTS).decode(errors="replace").splitlines()
+    for number, line in enumerate(lines, 1):
+        if line.split(maxsplit=1)[:1] == ["v"]:
+            rows.append(numbers_of(line.split()[1:], columns, f"{path}: line {number}"))
+    return np.array(rows).reshape(-1, columns)
