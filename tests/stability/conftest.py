@@ -1,12 +1,22 @@
 """Hard cases run wherever they can: on every device, in both implementations of the operators."""
 
 import importlib.util
+from datetime import timedelta
 
 import pytest
 import torch
+from hypothesis import HealthCheck, settings
 
 from forewarp.ops import backend
 
+FUZZ = settings(
+    max_examples=3000,
+    deadline=timedelta(seconds=10),
+    database=None,
+    suppress_health_check=list(HealthCheck),
+    print_blob=True,
+)
+settings.register_profile("fuzz", FUZZ)
 PLACES = ["cpu-reference", "cpu-numba", *(["cuda-reference"] if torch.cuda.is_available() else [])]
 
 

@@ -1,4 +1,4 @@
-"""``python -m tests.stability.report [--long] [--fuzz N]``: how stable all is, into docs/stability.md."""
+"""``python -m tests.stability.report [--long]``: measure how stable all is, into docs/stability.md."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from pathlib import Path
 from forewarp.cli.entry import quiet
 from forewarp.runs.folders import project_root
 from tests.stability.endurance import RATES, SEEDS, STEPS, endure
-from tests.stability.fuzz import Outcome, fuzz
 from tests.stability.twin import BACKENDS, rows
 
 COLUMNS = [f"{what}, {backend}" for backend in BACKENDS for what in ("values", "gradients")]
@@ -56,17 +55,6 @@ def endurance_table(trials: Sequence[dict]) -> str:
     return table(["lr", "seeds", "not finite", "least PSNR", "median", "most", "deviation"], lines)
 
 
-def fuzz_table(outcomes: Sequence[Outcome], grown: int) -> str:
-    """What became of harmed files, loader by loader, and of the memory."""
-    lines = [
-        [o.name, *(f"{n:,}" for n in (o.inputs, o.read, o.refused, len(o.faults))), f"{o.slowest:.2f}"]
-        for o in outcomes
-    ]
-    head = ["loader", "inputs", "read", "refused in one line", "anything else", "slowest, s"]
-    total = f"{sum(o.inputs for o in outcomes):,} inputs; the process grew by {grown / 2**20:.0f} MiB."
-    return table(head, lines) + "\n\n" + total
-
-
 def replace_section(path: Path, name: str, text: str) -> None:
     """Put ``text`` between the marks ``<!-- name -->`` and ``<!-- end of name -->`` of a file.
 
@@ -89,8 +77,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument(
         "--no-operators", dest="operators", action="store_false", help="leave them as they are"
     )
-    parser.add_argument("--fuzz", type=int, default=0, metavar="N", help="also read so many harmed files")
-    parser.add_argument("--workers", type=int, default=1, help="processes that read them")
     parser.add_argument("--seconds", type=float, default=math.inf, help="of the long runs at most, this time")
     parser.add_argument("--seeds", type=int, default=SEEDS)
     parser.add_argument("--steps", type=int, default=STEPS)
@@ -110,11 +96,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if len(trials) < wanted:
             text += f"\n\n{len(trials)} of {wanted} done; the same command goes on."
         replace_section(document, "long runs", text)
-    if given.fuzz:
-        outcomes, grown = fuzz(given.fuzz, workers=given.workers)
-        replace_section(document, "fuzzing", fuzz_table(outcomes, grown))
-        for fault in [fault for outcome in outcomes for fault in outcome.faults][:20]:
-            print(fault)
     print(document)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from functools import lru_cache
 from reprlib import repr as short
 
 import numpy as np
@@ -12,6 +13,7 @@ from forewarp.data.files import number
 from forewarp.scene.box import Box
 from forewarp.scene.camera import Camera
 from forewarp.scene.errors import SceneError
+from forewarp.scene.lens import Lens
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL's axes of a camera to OpenCV's, and back
 MOST_UNITS = 1e9  # largest coordinate: farther from the origin single precision is long lost
@@ -84,18 +86,27 @@ def check_range(near: float, far: float) -> None:
 def check_lens(camera: Camera, where: str) -> None:
     """Refuse a lens whose distortion cannot be undone all over the picture: its rays would be wrong.
 
-    Cost: nine points of Newton's method.
+    Cost: nine points of Newton's method, once for all cameras of the same lens and size.
     """
-    if camera.lens is None:
-        return
-    pixels = _nine_pixels(camera)
-    u, v = pixels % camera.width + 0.5, torch.div(pixels, camera.width, rounding_mode="floor") + 0.5
-    again, _ = camera.project(camera.center + camera.directions(u, v))
-    if not bool(((again - torch.stack([u, v], -1)).abs() < _SAME_PIXEL).all()):
+    if camera.lens is not None and not _can_be_undone(
+        camera.lens, camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, camera.skew
+    ):
         raise SceneError(
             f"{where}: expected a lens that can be undone all over the picture, but got k={camera.lens.k} "
             f"and p={camera.lens.p}; undistort the images"
         )
+
+
+@lru_cache(1024)
+def _can_be_undone(
+    lens: Lens, width: int, height: int, fx: float, fy: float, cx: float, cy: float, skew: float
+) -> bool:
+    pose = torch.eye(4, dtype=torch.float64)
+    camera = Camera(width, height, fx, fy, cx, cy, pose, 0.0, 0.0, skew, lens)
+    pixels = _nine_pixels(camera)
+    u, v = pixels % width + 0.5, torch.div(pixels, width, rounding_mode="floor") + 0.5
+    again, _ = camera.project(camera.directions(u, v))
+    return bool(((again - torch.stack([u, v], -1)).abs() < _SAME_PIXEL).all())
 
 
 def _nine_pixels(camera: Camera) -> torch.Tensor:

@@ -128,9 +128,13 @@ def check_state(path: Path, module: DynamicSceneModule) -> tuple[int, float]:
 def _shapes(weights: dict, module: DynamicSceneModule) -> dict[str, tuple | None]:
     """Of every entry that must fit; None for those whose shapes a checkpoint says."""
     adopted = {f"method.{name}" for name in module.method.adopted()}
-    return {
-        k: tuple(v.shape) if torch.is_tensor(v) and k not in adopted else None for k, v in weights.items()
-    }
+
+    def shape(name: str, value: object) -> tuple | None:
+        if isinstance(value, dict):  # plain numbers by name
+            return tuple(sorted(map(str, value)))
+        return tuple(value.shape) if torch.is_tensor(value) and name not in adopted else None
+
+    return {name: shape(name, value) for name, value in weights.items()}
 
 
 def load_weights(module: DynamicSceneModule, path: Path) -> None:
