@@ -21,14 +21,14 @@ MOST_ARRAYS = 1 << 30  # of NumPy's files, also when unpacked
 
 @contextmanager
 def written_whole(path: Path, *, synced: bool = False) -> Iterator[Path]:
-    """Give a place beside ``path`` to write to, which becomes ``path`` at the end; make its folder.
+    """Write to the path that this gives, which is renamed to ``path`` at the end; make its folder.
 
     Args:
-        path: what appears whole or not at all. What was there is replaced.
-        synced: wait until the bytes are on the disk before the file takes its name.
+        path: appears whole or not at all; a file already there is replaced.
+        synced: wait until the bytes are on the disk before renaming.
 
     Raises:
-        OSError: naming ``path``, where it cannot be written; nothing is then left beside it.
+        OSError: naming ``path``, where it cannot be written; nothing is then left behind.
     """
     beside = path.with_name(f".{path.name}.part{path.suffix}")
     try:

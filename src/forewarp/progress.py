@@ -1,4 +1,4 @@
-"""One line that tells how far a job is: redrawn in a terminal, written now and then elsewhere."""
+"""Show progress in one line: redrawn in a terminal, printed from time to time elsewhere."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rich.table import Column
 
 
 def time_text(seconds: float) -> str:
-    """Minutes and seconds, with hours where there are any.
+    """Write a duration as minutes and seconds, with hours where there are any.
 
     >>> time_text(65.4), time_text(3725)
     ('1:05', '1:02:05')
@@ -23,13 +23,13 @@ def time_text(seconds: float) -> str:
 
 
 class ProgressLine:
-    """A title, how much is done, the time left and whatever else there is to say.
+    """A line with a title, the share that is done, the time left and a text.
 
     Args:
         title: what runs.
-        refresh: seconds between two drawings in a terminal.
-        every: seconds between two lines where the stream is no terminal.
-        stream: None is stderr.
+        refresh: seconds between two updates in a terminal.
+        every: seconds between two lines elsewhere.
+        stream: None: stderr.
     """
 
     def __init__(
@@ -42,16 +42,16 @@ class ProgressLine:
         self._bar: Progress | None = None
 
     def due(self) -> bool:
-        """Whether it is time to show something new; ask this before putting a text together."""
+        """Tell whether an update is due; ask this before making a text."""
         return time.perf_counter() >= self._next
 
     def show(self, fraction: float, left: float | None, text: str) -> None:
-        """Show now.
+        """Update the line now.
 
         Args:
             fraction: done, in [0, 1].
-            left: seconds; None where nobody knows.
-            text: the rest.
+            left: seconds; None: unknown.
+            text: shown at the end.
         """
         remaining = "-:--" if left is None else time_text(left)
         if self.terminal:
@@ -61,7 +61,7 @@ class ProgressLine:
         self._next = time.perf_counter() + self.interval
 
     def close(self, fraction: float, text: str) -> None:
-        """Leave a last line behind, and the terminal as it was."""
+        """Write the last line and release the terminal."""
         if self._bar is not None or self.terminal:
             self._draw(fraction, f"{fraction:4.0%} | {text}")
             self._bar.stop()
@@ -74,13 +74,13 @@ class ProgressLine:
 
     def _draw(self, fraction: float, text: str) -> None:
         if self._bar is None:
-            # In a narrow terminal the text is cut, not the title or the bar.
+            # A narrow terminal cuts the text, not the title or the bar.
             columns = (
                 TextColumn("{task.description}", table_column=Column(min_width=len(self.title))),
                 BarColumn(bar_width=12, table_column=Column(min_width=12)),
                 TextColumn("{task.fields[text]}", markup=False, table_column=Column(ratio=1, no_wrap=True)),
             )
-            # Without its own thread it costs nothing between two drawings.
+            # Without a thread of its own it costs nothing between two updates.
             console = Console(file=self.stream)
             self._bar = Progress(*columns, console=console, auto_refresh=False, expand=True)
             self._task = self._bar.add_task(self.title, total=1.0, text="")
@@ -89,18 +89,14 @@ class ProgressLine:
 
 
 class Counted:
-    """``progress(done, total)`` as a line with the time left; a context, after which all is as it was."""
+    """Show calls ``progress(done, total)`` as a line with the time left; a context manager."""
 
     def __init__(self, title: str, stream=None) -> None:
-        self.line, self.begin, self.done, self.total = (
-            ProgressLine(title, stream=stream),
-            time.perf_counter(),
-            0,
-            1,
-        )
+        self.line, self.begin = ProgressLine(title, stream=stream), time.perf_counter()
+        self.done, self.total = 0, 1
 
     def __call__(self, done: int, total: int) -> None:
-        """Show that ``done`` of ``total`` are done, where it is time to."""
+        """Show that ``done`` of ``total`` are done, where an update is due."""
         self.done, self.total = done, total
         if self.line.due():
             spent = time.perf_counter() - self.begin

@@ -100,8 +100,8 @@ def in_json(draw, content):
 
 
 def in_yaml(draw, content):
-    tree = yaml.load(content, yaml.CSafeLoader)
-    return yaml.dump(replanted(draw, tree), Dumper=yaml.CSafeDumper).encode(errors="surrogatepass")
+    """As JSON, which is YAML too."""
+    return json.dumps(replanted(draw, yaml.load(content, yaml.CSafeLoader))).encode()
 
 
 def saved(save, *arrays, **named):
@@ -129,7 +129,7 @@ def in_archive(draw, content):
     pickles = [name for name in parts if name.endswith("data.pkl")] * 10  # where most can go wrong
     name = draw(st.sampled_from([*pickles, *parts]))
     for _ in range(draw(st.sampled_from([1, 1, 2, 5]))):
-        at = draw(st.integers(0, len(parts[name]) - 1))
+        at = draw(st.integers(0, max(len(parts[name]) - 1, 0)))
         part = parts[name][at : at + 1]
         other = draw(st.sampled_from([b"", part * 2, bytes([draw(st.integers(0, 255))])]))
         parts[name] = parts[name][:at] + other + parts[name][at + 1 :]
@@ -151,13 +151,20 @@ WAYS = {
 }
 
 
+class Changes(dict):
+    """What files become; None: they are gone."""
+
+    def __repr__(self):
+        return f"{[path.name for path in self]}"  # not all their bytes
+
+
 @st.composite
-def harmed(draw, files: dict[Path, bytes]) -> dict[Path, bytes | None]:
-    """Draw one or two files and what they become; None: they are gone. Every kind of file is as likely."""
+def harmed(draw, files: dict[Path, bytes]) -> Changes:
+    """Draw one or two files and what they become. Every kind of file is as likely."""
     kinds: dict[str, list[Path]] = {}
     for path in files:
         kinds.setdefault(path.suffix, []).append(path)
-    changes = {}
+    changes = Changes()
     for _ in range(draw(st.sampled_from([1, 1, 2]))):
         path = draw(st.sampled_from(kinds[draw(st.sampled_from(sorted(kinds)))]))
         way = draw(st.sampled_from([*ANY, *WAYS.get(path.suffix, []), "other", "gone"]))

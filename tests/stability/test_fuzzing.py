@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 from hydra.core.global_hydra import GlobalHydra
-from hypothesis import given, note, settings
+from hypothesis import given, settings
 from omegaconf import OmegaConf
 
 from forewarp.cli.entry import one_line
@@ -161,7 +161,6 @@ def test_harmed_files_are_read_or_refused_in_one_line(loaders, bounded, name):
     @(FUZZ if settings.default is FUZZ else QUICK)
     @given(harmed(files))
     def run(changes):
-        note(f"changed: {[path.name for path in changes]}")
         said = None
         try:
             put(changes)

@@ -1,7 +1,7 @@
 """D-NeRF scenes (Blender style): one folder with ``transforms_<split>.json`` and RGBA images.
 
-A pose on disk is camera-to-world with OpenGL's axes (x right, y up, looking along -z); its y and z columns
-are negated on the way in and out. Beside the stock ``transforms_test.json`` a scene may bring one file per
+A pose on disk is camera-to-world with OpenGL's axes (x right, y up, looking along -z); reading and writing
+negate its y and z columns. Beside the stock ``transforms_test.json`` a scene may bring one file per
 ability (``transforms_test_space.json``, ``..._time.json``, ``..._canonical.json``), exact ray depth
 (``depth_file_path``: float32 .npy, or 16-bit PNG times the file's ``depth_scale``, 0 = background) and
 ``trajectories.npz`` (``points`` (N, T, 3), ``times`` (T,)). ``test_space/transforms.json`` serves as well.

@@ -251,7 +251,10 @@ def _identified(stream: BinaryIO, path: Path) -> Image.Image:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", Image.DecompressionBombWarning)
-            return Image.open(stream, formats=_FORMATS)
+            image = Image.open(stream, formats=_FORMATS)
+        if not image.tile:
+            raise UnidentifiedImageError
+        return image
     except (Image.DecompressionBombWarning, Image.DecompressionBombError) as error:
         raise SceneError(f"{path}: expected an image of 1 to {_MOST_PIXELS} pixels, but got more") from error
     except Exception as error:  # OSError, ValueError and more

@@ -1,4 +1,4 @@
-"""Pictures and videos on disk; a name appears only when its file is whole."""
+"""Write pictures and videos, whole or not at all."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ FORMATS = ("mp4", "gif", "png")
 
 
 def to_bytes(picture: Tensor) -> np.ndarray:
-    """(H, W, 3) in [0, 1] -> uint8 (H, W, 3), rounded."""
+    """Round (H, W, 3) in [0, 1] to uint8 (H, W, 3)."""
     return (picture.detach().clamp(0, 1) * 255).round().byte().cpu().numpy()
 
 
 def write_png(path: Path, picture: Tensor) -> Path:
-    """Write (H, W, 3) in [0, 1]; the folder is made."""
+    """Write (H, W, 3) in [0, 1]; make the folder."""
     with written_whole(path) as beside:
         iio.imwrite(beside, to_bytes(picture), extension=".png")
     return path
 
 
 def write_video(path: Path, pictures: Iterable[Tensor], *, fps: float) -> Path:
-    """Write pictures (H, W, 3) in [0, 1], drawn one by one, in the format that the suffix names.
+    """Write pictures (H, W, 3) in [0, 1], taken one by one, in the format that the suffix names.
 
-    ``.mp4`` and ``.gif`` are files; ``.png`` makes a folder of stills beside, named as the file without it.
+    ``.mp4`` and ``.gif`` are files; ``.png`` makes a folder of images, named like the file without suffix.
 
     Returns:
         the file or the folder.
@@ -55,14 +55,14 @@ def _write_mp4(path: Path, frames: Iterable[np.ndarray], fps: float) -> None:
     frames = map(_even, frames)
     first = next(frames)
     size = first.shape[1], first.shape[0]
-    # The default block of 16 would stretch the picture; 2 is the least that the codec takes.
+    # The default block of 16 would stretch the picture; 2 is the smallest that the codec allows.
     options = {"fps": fps, "quality": 8, "macro_block_size": 2, "ffmpeg_log_level": "error"}
     writer = imageio_ffmpeg.write_frames(str(path), size, **options)
     writer.send(None)
     try:
         for frame in chain([first], frames):
             writer.send(frame)
-    except OSError as error:  # of many lines, and without the file
+    except OSError as error:  # its message has many lines and does not name the file
         raise OSError(errno.EIO, "ffmpeg could not go on (is the disk full?)", str(path)) from error
     finally:
         writer.close()

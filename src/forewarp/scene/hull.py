@@ -1,4 +1,4 @@
-"""The visual hull: which points all silhouettes allow."""
+"""The visual hull: the points that lie inside all silhouettes."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from forewarp.scene.camera import Camera
 
 
 def visual_hull(points: Tensor, cameras: list[Camera], masks: list[Tensor], misses: int = 0) -> Tensor:
-    """Points that project onto the silhouette in all views but ``misses`` of those that see them.
+    """Select points that project onto the silhouette in all views that see them but ``misses``.
 
     Args:
         points: (N, 3) world units.
         cameras: V of them.
-        masks: V masks (H, W) bool, True on the foreground (grow them first where the scene moves).
+        masks: V masks (H, W) bool, True on the foreground; dilate them where the scene moves.
         misses: views that may disagree.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Procedural scenes as data: written whole at their first use, then read like any other."""
+"""Data modules of procedural scenes: write the scene at its first use, then read it like any other."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 
 from filelock import FileLock
@@ -18,7 +19,9 @@ from forewarp.data.module import (
     LegoCompleteDataModule,
     NHRDataModule,
 )
+from forewarp.progress import Counted
 from forewarp.scene.errors import SceneError
+from forewarp.scene.frame import Scene
 from forewarp.synth import dome, lego_complete, rig, scenes
 
 WRITERS = {
@@ -37,13 +40,13 @@ def write_whole(
     workers: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
-    """Synthesise beside ``folder``, then rename: it appears whole or not at all; what was there is replaced.
+    """Synthesise a scene under another name, then rename it, so that ``folder`` is never half written.
 
     Args:
-        folder: the scene's own.
+        folder: of the scene; one already there is replaced.
         dataset: a key of ``WRITERS``.
-        arguments: of its writer; kept in ``synthesis.json`` beside the scene.
-        workers, progress: of its writer; what is written does not depend on them.
+        arguments: of its writer; recorded in the scene's ``synthesis.json``.
+        workers, progress: of its writer; the files do not depend on them.
     """
     beside = folder.with_name(f".{folder.name}.part-{os.getpid()}")
     try:
@@ -58,15 +61,15 @@ def write_whole(
 
 
 def is_scene(folder: Path) -> bool:
-    """Whether a synthesised scene lies there."""
+    """Tell whether a folder holds a synthesised scene."""
     return (folder / RECORD).is_file()
 
 
 class Synthetic:
-    """What a data module needs to synthesise what it reads, where that is absent.
+    """Mix-in for a data module: synthesise the scene first where it is missing.
 
     Args:
-        root, scene: the scene's place.
+        root, scene: the scene is ``root/scene``.
         synthesis: arguments of its writer; a scene already there must have been made with the same.
         arguments: of the data module that reads it.
     """
@@ -76,34 +79,41 @@ class Synthetic:
     def __init__(self, root: str | Path, scene: str, *, synthesis: Mapping, **arguments) -> None:
         super().__init__(root, scene, **arguments)
         self.folder, self.synthesis = self._folder(Path(root), scene), dict(synthesis)
-        reader = self._read
-        self._read = lambda: (self.prepare(), reader())[1]
+        self._read = partial(self._prepared, self._read)
 
     def prepare(self) -> None:
-        """Make sure that the scene is there; of several runs that need it at once one writes it."""
+        """Write the scene where it is missing; of several runs that need it at once, one writes it.
+
+        Raises:
+            SceneError: where something else is there, or a scene made with other arguments.
+        """
         if not is_scene(self.folder):
             self.folder.parent.mkdir(parents=True, exist_ok=True)
             with FileLock(self.folder.with_name(f".{self.folder.name}{LOCK}")):
                 self._write()
         self._check()
 
+    def _prepared(self, read: Callable[[], Scene]) -> Scene:
+        self.prepare()
+        return read()
+
     def _write(self) -> None:
-        if is_scene(self.folder):
+        if is_scene(self.folder):  # written while this run waited for the lock
             return
         if self.folder.exists() and (not self.folder.is_dir() or any(self.folder.iterdir())):
             raise SceneError(
                 f"{self.folder}: expected a synthesised scene or nothing, but got something else; "
                 "use another data.root or data.scene"
             )
-        from forewarp.progress import Counted
-
         with Counted(f"writing {self.folder.name}") as progress:
             write_whole(self.folder, self.dataset, self.synthesis, progress=progress)
 
     def _folder(self, root: Path, scene: str) -> Path:
+        """Name the folder that one call of the writer fills."""
         return root / scene
 
     def _check(self) -> None:
+        """Refuse a scene that was made with other arguments."""
         record = self.folder / RECORD
         before = {"dataset": "dnerf", **read_json(record)}
         for key, value in {"dataset": self.dataset, **self.synthesis}.items():
@@ -117,7 +127,7 @@ class SyntheticDataModule(Synthetic, DNeRFDataModule):
 
 
 class SyntheticLegoCompleteDataModule(Synthetic, LegoCompleteDataModule):
-    """One of the procedural scenes in ``root``, which are synthesised together."""
+    """The procedural scene ``root/scene``, one of several that are synthesised together into ``root``."""
 
     dataset = "lego_complete"
 
@@ -126,12 +136,12 @@ class SyntheticLegoCompleteDataModule(Synthetic, LegoCompleteDataModule):
 
 
 class SyntheticHyperNeRFDataModule(Synthetic, HyperNeRFDataModule):
-    """The procedural capture ``root/scene`` of a two-phone rig in a room."""
+    """The procedural capture ``root/scene`` by a rig of two phones in a room."""
 
     dataset = "hypernerf"
 
 
 class SyntheticNHRDataModule(Synthetic, NHRDataModule):
-    """The procedural recording ``root/scene`` of a dome of cameras."""
+    """The procedural recording ``root/scene`` by a dome of cameras."""
 
     dataset = "nhr"
