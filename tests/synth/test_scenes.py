@@ -44,18 +44,13 @@ def test_equal_arguments_give_equal_bytes(folder, tmp_path):
     assert filecmp.cmpfiles(folder, again, names, shallow=False) == (names, [], [])
 
 
-def test_another_seed_gives_other_views(folder, tmp_path):
-    other = synthesize(tmp_path / "other", **SMALL, seed=1)
+def test_another_seed_gives_other_views_and_progress_counts_every_image(folder, tmp_path):
+    seen = []
+    few = {"frames": 4, "test_views": (1, 0, 1), "val_views": 1}
+    other = synthesize(tmp_path / "other", size=8, seed=1, **few, progress=lambda *n: seen.append(n))
     name = "transforms_train.json"
     assert (folder / name).read_bytes() != (other / name).read_bytes()
-
-
-def test_progress_counts_every_image(tmp_path):
-    seen = []
-    synthesize(
-        tmp_path, size=8, frames=2, test_views=(1, 0, 1), val_views=1, progress=lambda *n: seen.append(n)
-    )
-    assert seen == [(i, 5) for i in range(1, 6)]
+    assert seen == [(i, 7) for i in range(1, 8)]
 
 
 def test_cameras_look_at_the_middle_from_above():
