@@ -174,8 +174,22 @@ def test_pipes_and_devices_are_no_files(tmp_path):
     cheaply(lambda: read_json(tmp_path / "b.json"), "b.json: expected a file, but got a device")
 
 
-OUTSIDE = ["../x", "/etc/passwd", "a/../../x", "..", ".", "", "a\n", "a\x00b", "./../x", "..\\x", "a\\b"]
-OUTSIDE += [7, None, ["a"]]
+OUTSIDE = [
+    "./train/../../x",
+    "\ud800.png",
+    "../x",
+    "/etc/passwd",
+    "a/../../x",
+    "..",
+    ".",
+    "",
+    "a\n",
+    "a\x00b",
+    "./../x",
+    "..\\x",
+    "a\\b",
+]
+OUTSIDE += ["./train/../../x", "\ud800.png", 7, None, ["a"]]
 
 
 @pytest.mark.parametrize("name", OUTSIDE)

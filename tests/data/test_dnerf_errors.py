@@ -19,10 +19,6 @@ def without(key):
     return lambda content: content["frames"][1].pop(key)
 
 
-SCALED = np.diag([2.0, 2, 2, 1]).tolist()
-MIRRORED = np.diag([1.0, 1, -1, 1]).tolist()
-NAN = np.full((4, 4), np.nan).tolist()
-SLANTED = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 1, 1]]
 BAD_TRANSFORMS = {
     "no angle": (lambda c: c.pop("camera_angle_x"), r"camera_angle_x: expected a number .*got None"),
     "angle 0": (lambda c: c.update(camera_angle_x=0), r"camera_angle_x: expected radians inside \(0, pi\)"),
@@ -35,25 +31,8 @@ BAD_TRANSFORMS = {
         without("transform_matrix"),
         r"frames\[1\].transform_matrix: expected 4 x 4 finite numbers, but got None",
     ),
-    "3 x 4": (frame(transform_matrix=NAN[:3]), r"frames\[1\].transform_matrix: expected 4 x 4 finite"),
-    "ragged": (frame(transform_matrix=[[1], [1, 2]]), r"transform_matrix: expected 4 x 4 finite"),
-    "words": (frame(transform_matrix=[["a"] * 4] * 4), r"transform_matrix: expected 4 x 4 finite"),
-    "nan pose": (frame(transform_matrix=NAN), r"transform_matrix: expected 4 x 4 finite"),
-    "scale": (
-        frame(transform_matrix=SCALED),
-        r"transform_matrix: expected a rotation, but got determinant 8",
-    ),
-    "mirror": (frame(transform_matrix=MIRRORED), r"expected a rotation, but got determinant -1"),
-    "last row": (frame(transform_matrix=SLANTED), r"transform_matrix: expected the last row 0 0 0 1"),
     "late": (frame(time=1.5), r"frames\[1\].time: expected a number in \[0, 1\], but got 1.5"),
-    "nan time": (frame(time=float("nan")), r"frames\[1\].time: expected a number .*got nan"),
-    "word time": (frame(time="0.5"), r"frames\[1\].time: expected a number .*got '0.5'"),
-    "true time": (frame(time=True), r"frames\[1\].time: expected a number .*got True"),
-    "huge time": (frame(time=10**400), r"frames\[1\].time: expected a number"),
     "no path": (without("file_path"), r"frames\[1\].file_path: expected a path .*got None"),
-    "path up": (frame(file_path="./train/../../x"), r"file_path: expected a path inside the scene folder"),
-    "path root": (frame(file_path="/etc/x"), r"file_path: expected a path inside the scene folder"),
-    "path itself": (frame(file_path="./"), r"file_path: expected a path inside the scene folder"),
     "no image": (frame(file_path="./train/r_9"), r"r_9.png: expected an image, but got No such file"),
     "no depth": (frame(depth_file_path="d.npy"), r"frames\[1\].depth_file_path: expected an existing file"),
     "ability": (frame(ability="flight"), r"frames\[1\].ability: expected one of space, time, canonical"),
@@ -170,9 +149,7 @@ def test_stray_files_are_ignored(tmp_path):
 BAD_OPTIONS = [
     ({"half_resolution": "yes"}, "data.half_resolution: expected true, false or auto, but got 'yes'"),
     ({"near": 6, "far": 2}, "data.near, data.far: expected near < far, but got 6 and 2"),
-    ({"near": -1}, "data.near: expected a number"),
     ({"box": [1, 2]}, "data.box: expected six numbers"),
-    ({"box": [1, 1, 1, 0, 2, 2]}, "data.box: expected six numbers"),
 ]
 
 

@@ -260,24 +260,11 @@ def words(change):
 BAD_TEXT = {
     "eleven": ("CamPose.inf", 2, words(lambda w: w[:11]), r"line 2: expected 12 finite numbers, but got 11"),
     "word": ("CamPose.inf", 3, words(lambda w: ["x", *w[1:]]), r"line 3: expected 12 finite numbers"),
-    "nan": ("CamPose.inf", 1, words(lambda w: ["nan", *w[1:]]), r"line 1: expected 12 finite numbers"),
     "mirror": (
         "CamPose.inf",
         2,
         words(lambda w: [str(-float(v)) for v in w[:3]] + w[3:]),
         r"line 2: expected a rotation, but got determinant -1",
-    ),
-    "scale": (
-        "CamPose.inf",
-        4,
-        words(lambda w: [str(2 * float(v)) for v in w]),
-        r"line 4: expected a rotation, but got determinant 8",
-    ),
-    "far off": (
-        "CamPose.inf",
-        1,
-        words(lambda w: [*w[:11], "1e300"]),
-        r"line 1: expected a place within 1e\+09",
     ),
     "pose gone": ("CamPose.inf", 4, None, r"Intrinsic.inf: expected as many cameras .*got 4 there and 3 in"),
     "two in a row": (
@@ -285,12 +272,6 @@ BAD_TEXT = {
         2,
         words(lambda w: w[:2]),
         r"line 3: expected a row 0 fy cy, but got 71.5 23.2 0",
-    ),
-    "no number": (
-        "Intrinsic.inf",
-        3,
-        words(lambda w: ["0", "x", w[2]]),
-        r"line 3: expected 3 finite numbers",
     ),
     "another index": (
         "Intrinsic.inf",
@@ -308,7 +289,6 @@ BAD_TEXT = {
     "row gone": ("Intrinsic.inf", 3, None, r"line 3: focal length: expected a number .*got 0"),
     "last gone": ("Intrinsic.inf", 19, None, r"line 18: expected nine numbers of camera 3, .* after 6"),
     "focal 0": ("Intrinsic.inf", 2, words(lambda w: ["0", *w[1:]]), r"line 2: focal length: expected"),
-    "focal inf": ("Intrinsic.inf", 2, words(lambda w: ["inf", *w[1:]]), r"line 2: expected 3 finite"),
     "no pinhole": (
         "Intrinsic.inf",
         4,

@@ -1,5 +1,3 @@
-import filecmp
-
 import numpy as np
 import pytest
 import torch
@@ -8,7 +6,6 @@ pytest.importorskip("trimesh")
 pytest.importorskip("embreex")
 
 from forewarp.data.hypernerf import read_scene
-from forewarp.scene.errors import SceneError
 from forewarp.synth import rig
 from forewarp.synth.cameras import centers_of, stream
 from forewarp.synth.points import surface_points
@@ -104,27 +101,3 @@ def test_still_points_lie_on_what_never_moves(scene):
         pixel, depth = frame.camera.project(scene.still.double())
         assert (depth > 0).all()
         assert ((pixel > 0) & (pixel < torch.tensor([192, 144]))).all()
-
-
-def test_equal_arguments_give_equal_bytes(tmp_path):
-    tiny = {"size": 16, "frames": 3, "samples_per_pixel": 1}
-    folder, again = (synthesize(tmp_path / name, **tiny) for name in ("first", "again"))
-    names = sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file())
-    assert len(names) == 3 * 6 + 5
-    assert filecmp.cmpfiles(folder, again, names, shallow=False) == (names, [], [])
-
-
-@pytest.mark.parametrize(
-    ("change", "text"),
-    [
-        ({"size": 20}, "size: expected a multiple of 8 of at least 16, but got 20; set size"),
-        ({"frames": 4}, "frames: expected an odd number, one in the middle, but got 4; set frames"),
-        ({"motion": "fly"}, "motion: expected one of"),
-        ({"seed": -1}, "seed: expected a whole number of at least 0"),
-    ],
-)
-def test_bad_arguments_get_one_line(tmp_path, change, text):
-    with pytest.raises(SceneError, match=text) as caught:
-        synthesize(tmp_path / "scene", **{**SMALL, **change})
-    assert "\n" not in str(caught.value)
-    assert not (tmp_path / "scene").exists()
