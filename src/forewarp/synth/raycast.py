@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -143,7 +144,7 @@ def render(
 
     **Cost** H * W * samples_per_pixel * (1 + shadow_rays) rays at most.
     """
-    posed = Posed(world, time)
+    posed = _posed(world, time)
     count = camera.height * camera.width
     total, hit = np.zeros((count, 3)), np.zeros(count)
     lights = light_points(samples_per_pixel * shadow_rays)
@@ -161,6 +162,12 @@ def render(
     depth[centre.ray] = centre.distance
     shape = camera.height, camera.width
     return np.rint(255 * rgba).astype(np.uint8).reshape(*shape, 4), depth.reshape(shape)
+
+
+@lru_cache(1)
+def _posed(world: World, time: float) -> Posed:
+    """Pose a world once for all cameras of one time."""
+    return Posed(world, time)
 
 
 def camera_rays(camera: Camera, offset: tuple[float, float] = (0.5, 0.5)) -> tuple[np.ndarray, np.ndarray]:
