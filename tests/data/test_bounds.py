@@ -165,10 +165,7 @@ def test_arrays_are_as_long_as_their_files(tmp_path, monkeypatch):
 def test_pipes_and_devices_are_no_files(tmp_path):
     os.mkfifo(tmp_path / "a.json")
     os.mkfifo(tmp_path / "a.jpg")
-    cheaply(
-        lambda: read_bytes(tmp_path / "a.json"),
-        "a.json: expected a file, but got a device or a pipe",
-    )
+    cheaply(lambda: read_bytes(tmp_path / "a.json"), "a.json: expected a file, but got a device or a pipe")
     cheaply(lambda: inspect_image(tmp_path / "a.jpg"), "a.jpg: expected a file, but got a device or a pipe")
     (tmp_path / "b.json").symlink_to("/dev/zero")
     cheaply(lambda: read_json(tmp_path / "b.json"), "b.json: expected a file, but got a device")

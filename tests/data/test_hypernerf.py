@@ -77,12 +77,6 @@ def test_without_val_ids_every_fourth_is_trained_on(tmp_path):
     assert scene.protocol["split"] == "interpolation"
 
 
-def test_canonical_is_the_earlier_of_two_times_as_near_to_the_middle(tmp_path):
-    write_rig(tmp_path / "toy", hand(13))
-    scene = read_scene(tmp_path, "toy")
-    assert scene.canonical_time == scene.times[1] == pytest.approx(1 / 3)
-
-
 @pytest.mark.parametrize("write_time_id", [True, False])
 def test_time_id_counts_before_warp_id(tmp_path, write_time_id):
     folder = write_rig(tmp_path / "toy", hand(5), write_time_id=write_time_id)

@@ -110,10 +110,7 @@ HARM = {
     "text": (lambda c: b"version https://git-lfs", "expected a PNG or JPEG image, but got another kind"),
     "signature only": (lambda c: c[:2], "but got another kind of file or a harmed header"),
     "in the header": (lambda c: c[:100], "but got"),
-    "in the pixels": (
-        lambda c: c[: len(c) // 2],
-        WHOLE,
-    ),
+    "in the pixels": (lambda c: c[: len(c) // 2], WHOLE),
     "no end": (lambda c: c[:-13], WHOLE),
 }
 HARM_JPEG = {

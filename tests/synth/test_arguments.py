@@ -22,11 +22,7 @@ BAD = [
     (scenes, {"size": 20.5}, "size: expected a whole number"),
     (scenes, {"frames": 1}, "frames: expected a whole number of at least 2, but got 1"),
     (scenes, {"seed": -1}, "seed: expected a whole number of at least 0, but got -1"),
-    (
-        scenes,
-        {"motion": "fly"},
-        "motion: expected one of lift, lift_tilt, drive, still, rigid, band, ",
-    ),
+    (scenes, {"motion": "fly"}, "motion: expected one of lift, lift_tilt, drive, still, rigid, band, "),
     (scenes, {"test_views": (1, 2)}, "test_views: expected three numbers"),
     (scenes, {"test_views": (0, 0, 0)}, "not all 0, but got"),
     (scenes, {"test_views": 5}, "test_views: expected three numbers"),

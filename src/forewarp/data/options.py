@@ -75,6 +75,8 @@ def middle_of(times: Iterable[float]) -> float:
 
     >>> middle_of([0.0, 0.1, 0.2, 0.8, 1.0])
     0.2
+    >>> middle_of([0.0, 0.25, 0.75, 1.0])
+    0.25
     """
     times = sorted(set(times))
     return min(times, key=lambda time: round(abs(time - 0.5 * (times[0] + times[-1])), 9))

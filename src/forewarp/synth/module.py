@@ -13,12 +13,7 @@ from filelock import FileLock
 
 from forewarp.data.files import read_json
 from forewarp.data.fingerprint import LOCK, RECORD
-from forewarp.data.module import (
-    DNeRFDataModule,
-    HyperNeRFDataModule,
-    LegoCompleteDataModule,
-    NHRDataModule,
-)
+from forewarp.data.module import DNeRFDataModule, HyperNeRFDataModule, LegoCompleteDataModule, NHRDataModule
 from forewarp.progress import Counted
 from forewarp.scene.errors import SceneError
 from forewarp.scene.frame import Scene

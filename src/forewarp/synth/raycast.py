@@ -124,11 +124,7 @@ class Posed:
 
 
 def render(
-    world: World,
-    time: float,
-    camera: Camera,
-    samples_per_pixel: int = 4,
-    shadow_rays: int = SHADOW_RAYS,
+    world: World, time: float, camera: Camera, samples_per_pixel: int = 4, shadow_rays: int = SHADOW_RAYS
 ) -> tuple[np.ndarray, np.ndarray]:
     """Render one picture of the world at any time from any camera.
 
