@@ -3,6 +3,7 @@
 import importlib
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -13,8 +14,9 @@ import yaml
 
 from forewarp import load
 from forewarp.planning.plan_file import with_plan, write_plan
-from forewarp.runs.stored import stored_run
+from forewarp.runs.build import stored_run
 from forewarp.training.handover import load_handover
+from tests.support.commands import call
 
 HERE = Path(__file__).parents[1] / "foreign"
 SMALL = [
@@ -44,22 +46,29 @@ def forget(package):
         del sys.modules[name]
 
 
-@pytest.fixture
-def fitted(forewarp, in_tmp):
-    """A finished run, and a process that has not seen the package."""
-    done = forewarp("train", *DISC, "run=run")
-    assert done.status == 0, done.err
+@pytest.fixture(scope="module")
+def originals(tmp_path_factory):
+    """A finished run of their data and effect, and one of their method."""
+    root = tmp_path_factory.mktemp("theirs")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(HERE))
+        for name, overrides in (("disc", DISC), ("mist", MIST)):
+            done = call("train", *overrides, f"run={root / name}")
+            assert done.status == 0, done.err
     forget("theirs")
-    return in_tmp / "run"
+    return root
 
 
 @pytest.fixture
-def mist(forewarp, in_tmp):
+def fitted(originals, in_tmp):
+    """``run`` in the current folder: a finished run, in a process that has not seen the package."""
+    return shutil.copytree(originals / "disc", in_tmp / "run")
+
+
+@pytest.fixture
+def mist(originals, in_tmp):
     """As ``fitted``, of their method."""
-    done = forewarp("train", *MIST, "run=run")
-    assert done.status == 0, done.err
-    forget("theirs")
-    return in_tmp / "run"
+    return shutil.copytree(originals / "mist", in_tmp / "run")
 
 
 def steps_of(run, stage="coarse"):
@@ -105,26 +114,24 @@ def test_an_interrupted_run_goes_on(forewarp, refused, in_tmp):
     assert again.status == 0, again.err
 
 
-@pytest.mark.parametrize(
-    "word", ["trust=theirs", TRUST, "trust=[other,theirs]", "FOREWARP_TRUST=other, theirs"]
-)
-def test_a_stored_run_is_measured_by_who_trusts_it(forewarp, refused, fitted, monkeypatch, word):
+def test_a_stored_run_is_measured_by_who_trusts_it(forewarp, refused, fitted, monkeypatch):
     line = refused("evaluate", "run=run")
     assert line.startswith(
         "run/config.yaml: data._target_: expected a class of forewarp, but got 'theirs.data."
     )
     assert line.endswith(ADVICE)
     assert "theirs" not in sys.modules
-    if word.startswith("FOREWARP_TRUST="):
-        monkeypatch.setenv(*word.split("=", 1))
-        word = None
-    done = forewarp("evaluate", "run=run", *filter(None, [word]))
+    for override in ("trust=theirs", "trust=[other,theirs]"):
+        done = forewarp("evaluate", "run=run", override)
+        assert done.status == 0, done.err
+    monkeypatch.setenv("FOREWARP_TRUST", "other, theirs")
+    done = forewarp("evaluate", "run=run")
     assert done.status == 0, done.err
 
 
 def test_a_plan_that_names_the_package_is_followed_by_who_trusts_it(tmp_path):
     file, word = tmp_path / "plan.yaml", "model.view_dependence._target_=theirs.effects.Tint"
-    write_plan(file, {"typed": ["data.scene=x"], "words": [word], "of": "0"})
+    write_plan(file, {"typed": ["data.scene=x"], "overrides": [word], "of": "0"})
     with pytest.raises(ValueError, match="expected a class of forewarp, but got 'theirs.effects.Tint'"):
         with_plan("train", [f"plan={file}"])
     assert "theirs" not in sys.modules
@@ -146,18 +153,14 @@ def test_a_run_is_loaded_with_trust(fitted):
     assert type(module.method.view_dependence).__module__ == "theirs.effects"
 
 
-def test_the_tools_take_trust(fitted, capsys):
-    from forewarp.cli.limits import main as limits
-
-    with pytest.raises(SystemExit):
-        limits([str(fitted)])
-    assert capsys.readouterr().err.strip().endswith(ADVICE)
-    limits([str(fitted), "--views", "1", TRUST])
-    assert "| disc " in capsys.readouterr().out
+def test_the_limits_take_trust(forewarp, refused, fitted):
+    limits = ["report", "kind=limits", "runs=run", "views=1"]
+    assert refused(*limits).endswith(ADVICE)
+    assert "| disc " in forewarp(*limits, TRUST).out
 
 
 def test_a_broken_step_is_taken_again_with_trust(refused, in_tmp, capsys):
-    from forewarp.cli.replay import main as replay
+    from forewarp.replay import main as replay
 
     refused("train", *DISC, "run=run", "stage.coarse.lr.color=1e39", "evaluate=false")
     bundle = str(next((in_tmp / "run").rglob("step_*.pt")))

@@ -9,8 +9,8 @@ import pytest
 import torch
 import yaml
 
-from forewarp.cli.replay import main as replay
-from forewarp.runs.lock import alone
+from forewarp.replay import main as replay
+from forewarp.runs.lock import locked
 from forewarp.synth.scenes import synthesize
 
 SMALL = [
@@ -96,7 +96,7 @@ def test_what_is_measured_on_changed_data_says_so(forewarp, begun):
 
 
 def test_a_folder_in_work_is_refused(refused, begun):
-    with alone(begun):
+    with locked(begun):
         line = refused("train", f"resume={begun}")
         assert f"expected a run that nobody works on, but got one of process {os.getpid()} on " in line
         assert "nobody works on" in refused("evaluate", f"run={begun}")
@@ -104,7 +104,7 @@ def test_a_folder_in_work_is_refused(refused, begun):
 
 def test_a_measured_run_in_work_is_refused(forewarp, refused, begun):
     assert forewarp("train", f"resume={begun}", "evaluate=true").status == 0
-    with alone(begun):
+    with locked(begun):
         assert "nobody works on" in refused("train", f"resume={begun}", "evaluate=true")
 
 

@@ -64,8 +64,8 @@ def run_targets(root: Path) -> list[Target]:
     from omegaconf import OmegaConf
 
     from forewarp.runs.build import build_run
-    from forewarp.runs.folders import configurations
-    from forewarp.runs.identity import saved_config
+    from forewarp.runs.config import saved_config
+    from forewarp.runs.config_files import configurations
     from forewarp.training.checkpoints import check_state, load_weights
 
     root.joinpath("config").mkdir()
