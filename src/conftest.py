@@ -1,4 +1,4 @@
-"""What doctests may use: ``fitted_run``, the folder of a small finished run, made if a doctest asks for it."""
+"""What doctests may use: ``fitted_run``, the folder of a small finished run, made if one asks for it."""
 
 import pytest
 

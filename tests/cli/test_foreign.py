@@ -4,6 +4,7 @@ import importlib
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -39,6 +40,14 @@ def theirs(monkeypatch):
     importlib.invalidate_caches()
     yield
     forget("theirs")
+
+
+@pytest.fixture
+def ctrl_c():
+    """Ctrl-C works, also where whoever started the tests in the background has it ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 def forget(package):
@@ -90,7 +99,7 @@ def test_what_is_typed_trains_and_trains_again_without_trust(forewarp, fitted):
     assert "coarse: finished before" in again.out
 
 
-def test_an_interrupted_run_goes_on(forewarp, refused, in_tmp):
+def test_an_interrupted_run_goes_on(forewarp, refused, in_tmp, ctrl_c):
     stopped = forewarp("train", *DISC, "run=run", "callbacks.count.stop_at=3", "evaluate=false", TRUST)
     assert stopped.status == 130, stopped
     run = in_tmp / "run"
@@ -187,7 +196,6 @@ def test_seeds_are_swept_scored_and_reported(forewarp, in_tmp, monkeypatch):
     refusal = forewarp("evaluate", "--multirun", f"run={jobs}")
     assert refusal.status == 2
     assert "2 of 2 jobs failed" in refusal.err
-    assert forewarp("evaluate", "--multirun", f"run={jobs}", TRUST).status == 0
     monkeypatch.setenv("FOREWARP_TRUST", "theirs")
     assert forewarp("evaluate", "--multirun", f"run={jobs}").status == 0
     told = forewarp("report", "kind=accuracy_time", f"runs={in_tmp / 'runs'}", f"out={in_tmp / 'page'}")
@@ -239,7 +247,7 @@ def test_a_method_of_theirs_trains_once(forewarp, mist):
     assert (again.status, again.out.strip()[:15]) == (0, "measured before"), again
 
 
-def test_a_method_of_theirs_is_resumed_measured_and_rendered_with_trust(forewarp, refused, in_tmp):
+def test_a_method_of_theirs_is_resumed_measured_and_rendered_with_trust(forewarp, refused, in_tmp, ctrl_c):
     stopped = forewarp("train", *MIST, "run=run", "callbacks.count.stop_at=3", "evaluate=false")
     assert stopped.status == 130, stopped
     config = in_tmp / "run" / "config.yaml"
@@ -256,10 +264,10 @@ def test_a_method_of_theirs_is_resumed_measured_and_rendered_with_trust(forewarp
 
 def test_a_method_of_theirs_is_swept_beside_ours_and_reported(forewarp, in_tmp):
     run = "run=runs/disc/${model.name}-seed${seed}"
-    done = forewarp("train", "--multirun", *SMALL, "experiment=disc", "model=forward,mist", "seeds=2", run)
+    done = forewarp("train", "--multirun", *SMALL, "experiment=disc", "model=forward,mist", "seed=0", run)
     assert done.status == 0, done.err
     runs = sorted(path.name for path in in_tmp.glob("runs/disc/*-seed*"))
-    assert runs == ["forward-seed0", "forward-seed1", "mist-seed0", "mist-seed1"]
+    assert runs == ["forward-seed0", "mist-seed0"]
     told = forewarp("report", "kind=accuracy_time", "runs=runs", "out=page")
     assert told.status == 0, told.err
     assert "mist-demo" in (in_tmp / "page" / "accuracy-time.md").read_text()

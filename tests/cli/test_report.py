@@ -35,7 +35,10 @@ def test_limits_of_a_pattern_of_runs(forewarp, fitted):
         ([], "runs/accuracy_time: expected folders of runs, but got none"),
         (["published=none.yaml"], "none.yaml: expected a usable file or folder, but got No such file"),
         (["kind=compare"], "runs: expected folders of runs, but got none; set runs="),
-        (["kind=limits", "runs=none"], "config.yaml: expected the configuration of a run, but got none; set runs"),
+        (
+            ["kind=limits", "runs=none"],
+            "expected the configuration of a run, but got none; set runs",
+        ),
         (["kind=limits", "runs=none", "views=0"], "views: expected a whole number > 0, but got 0"),
     ],
 )
