@@ -34,16 +34,16 @@ install: ## make .venv and put forewarp into it, with all its extras but the lau
 	$(BIN)/pip install --quiet uv
 	links="$$($(BIN)/pip config get global.find-links 2>/dev/null || echo "$$PIP_FIND_LINKS")"; \
 	if [ -n "$$links" ]; then export UV_FIND_LINKS="$$links"; fi; \
-	VIRTUAL_ENV="$$PWD/.venv" $(BIN)/uv pip install -c constraints.txt -e '.[cpu,synth,plots,dev]'
+	VIRTUAL_ENV="$$PWD/.venv" $(BIN)/uv pip install --compile-bytecode -c constraints.txt -e '.[cpu,synth,plots,dev]'
 
 install-launchers: ## add joblib, Ray and submitit, that sweeps may run on (launcher=...), and Optuna (sweeps=search)
 	links="$$($(BIN)/pip config get global.find-links 2>/dev/null || echo "$$PIP_FIND_LINKS")"; \
 	if [ -n "$$links" ]; then export UV_FIND_LINKS="$$links"; fi; \
-	VIRTUAL_ENV="$$PWD/.venv" $(BIN)/uv pip install -c constraints.txt -e '.[sweeps]'
+	VIRTUAL_ENV="$$PWD/.venv" $(BIN)/uv pip install --compile-bytecode -c constraints.txt -e '.[sweeps]'
 
 demo: ## fit the procedural vehicle forward and backward, a core each, compare, make a video (two to three minutes)
 	@$(MAKE) --no-print-directory -j2 demo-forward demo-backward
-	$(BIN)/python -m forewarp.cli.compare $(DEMO)/forward $(DEMO)/backward
+	$(BIN)/forewarp-report kind=compare runs=[$(DEMO)/forward,$(DEMO)/backward]
 	$(BIN)/forewarp-render run=$(DEMO)/forward path=both
 
 demo-forward demo-backward: demo-%:

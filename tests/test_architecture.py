@@ -27,7 +27,7 @@ MAY_IMPORT = {
     "evaluation": LOWER | {"methods", "training"},
     "runs": LOWER | {"methods", "training", "evaluation", "data"},
     "planning": LOWER | {"methods", "training", "evaluation", "data", "report", "runs"},
-    "replay": {"cli"},
+    "replay": {"cli", "runs", "training"},
     "cli": LOWER | {"methods", "training", "evaluation", "data", "synth", "report", "runs", "planning"},
 }
 CONFIG = {"runs", "planning", "cli"}

@@ -6,7 +6,7 @@ from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from forewarp.runs.build import build_run
-from forewarp.runs.identity import hashed
+from forewarp.runs.config import hashed
 from tests.support.configs import ROOT, composed, options
 
 PAPER = {

@@ -15,8 +15,8 @@ from forewarp.cli.entry import quiet
 from forewarp.evaluation.accuracy_time import FILE, read_rows
 from forewarp.report.published import PAPER
 from forewarp.runs.build import build_run
-from forewarp.runs.folders import configurations
-from forewarp.runs.identity import claim
+from forewarp.runs.config import claim
+from forewarp.runs.config_files import configurations
 from forewarp.training.clock import now
 from forewarp.training.device import device_of
 from forewarp.training.module import DynamicSceneModule

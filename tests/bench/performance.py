@@ -16,7 +16,7 @@ import torch
 
 from forewarp.cli.entry import quiet
 from forewarp.ops.splat import average_splat
-from forewarp.runs.folders import project_root
+from forewarp.runs.config_files import project_root
 from tests.bench.free import free_table
 from tests.bench.timed_cases import CASES, frame_work, milliseconds, splat_work, step_work, timed
 from tests.bench.workloads import OCCUPANCY

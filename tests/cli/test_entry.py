@@ -7,7 +7,7 @@ from omegaconf import OmegaConf
 
 from forewarp.cli.entry import one_line
 from forewarp.cli.misspelt import with_keys
-from forewarp.runs.folders import project_root
+from forewarp.runs.config_files import project_root
 from forewarp.scene.errors import SceneError
 from tests.support.configs import CONF, ROOT, options
 
@@ -47,7 +47,7 @@ def test_data_lie_in_the_checkout_or_in_the_current_folder(forewarp, monkeypatch
     if installed:
         package = in_tmp / "site" / "forewarp"
         shutil.copytree(CONF, package / "conf")
-        monkeypatch.setattr("forewarp.runs.folders.PACKAGE", package)
+        monkeypatch.setattr("forewarp.runs.config_files.PACKAGE", package)
     shown = OmegaConf.create(forewarp("train", "--cfg", "job", "--resolve").out)
     assert shown.paths.data == ("./data" if installed else str(ROOT / "data"))
     assert shown.run.startswith("runs/")

@@ -73,7 +73,7 @@ def trial(seed: int, rate: float, steps: int, data: Path) -> dict:
     from hydra import compose, initialize_config_dir
 
     from forewarp.runs.build import build_run
-    from forewarp.runs.folders import configurations
+    from forewarp.runs.config_files import configurations
     from forewarp.training.module import DynamicSceneModule
 
     begin = time.perf_counter()

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from forewarp.cli.entry import quiet
-from forewarp.runs.folders import project_root
+from forewarp.runs.config_files import project_root
 from tests.stability.endurance import RATES, SEEDS, STEPS, endure
 from tests.stability.twin import BACKENDS, rows
 

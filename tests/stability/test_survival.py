@@ -369,8 +369,8 @@ def test_two_in_one_folder_refuse_each_other(zygote, begin, scenes, whole, tmp_p
 HOLD = """
 import sys
 from pathlib import Path
-from forewarp.runs.lock import alone
-with alone(Path(sys.argv[1])):
+from forewarp.runs.lock import locked
+with locked(Path(sys.argv[1])):
     print("held", flush=True)
     sys.stdin.read()
 """

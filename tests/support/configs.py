@@ -5,7 +5,7 @@ from pathlib import Path
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
-from forewarp.runs.folders import configurations
+from forewarp.runs.config_files import configurations
 
 ROOT = Path(__file__).parents[2]
 CONF = ROOT / "conf"

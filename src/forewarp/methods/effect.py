@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from forewarp.methods.method import Method
-from forewarp.report.effect import Gain
+from forewarp.report.gain import Gain
 from forewarp.scene.batch import Target
 from forewarp.scene.frame import Scene
 from forewarp.scene.pictures import Pictures
@@ -50,13 +50,13 @@ def switched(method: Method) -> dict[str, bool]:
 
 @dataclass(frozen=True)
 class Decision:
-    """``choice`` of an effect, the overrides (``words``) that make it, ``because``, and whether it is ``on``:
+    """``choice`` of an effect, the ``overrides`` that make it, ``because``, and whether it is ``on``:
     more than the least there can be.
     """
 
     effect: str
     choice: str
-    words: tuple[str, ...]
+    overrides: tuple[str, ...]
     because: str
     on: bool = False
 
@@ -130,24 +130,26 @@ class Asked:
 
 @dataclass(frozen=True)
 class Begin:
-    """Fit a coarse stage ``name`` with these ``words``, or change those of the one before where ``change``;
-    go on from it.
+    """Fit a coarse stage ``name`` and go on from it.
+
+    ``overrides`` are all of its overrides, or, with ``change``, changes to those of the stage before.
     """
 
     name: str
-    words: Sequence[str]
+    overrides: Sequence[str]
     change: bool = False
 
 
 @dataclass(frozen=True)
 class Rival:
-    """Fit another coarse stage ``name``, which differs in ``words``, and go on with the better. It is the one
-    with the ``effect``, or, where not ``adds``, without it. The answer is whether the effect pays.
+    """Fit another coarse stage ``name`` that differs in ``overrides``, and go on with the better.
+
+    It is the one with the ``effect`` if ``adds``, else the one without. The answer: whether the effect pays.
     """
 
     effect: str
     name: str
-    words: Sequence[str]
+    overrides: Sequence[str]
     adds: bool = False
 
 

@@ -1,15 +1,16 @@
-"""The price list: what each choice changes, against the same run without it."""
+"""Write the price list: what each choice changes, against the same run without it."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
 
+from forewarp.files import replace_file
 from forewarp.report.collect import Result, by_scene, collect, grouped, left_out, machine
-from forewarp.report.effect import DIFFERENCES, measure_effect
+from forewarp.report.gain import DIFFERENCES, measure_effect
 from forewarp.report.tables import Column, Estimate, Table
 
-# Of a run's numbers: the title and the digits.
+# The columns of a run's numbers.
 MEASURES = {
     "psnr": Column("PSNR (dB)"),
     "ssim": Column("SSIM", 4),
@@ -34,14 +35,13 @@ def write_price_list(runs: Path, out: Path) -> list[Path]:
     """Write ``price-list.md`` and ``price-list.csv`` (every run's own numbers).
 
     Args:
-        runs: folder of measured runs.
-        out: folder that they are written into.
+        runs: folder that is searched for measured runs.
+        out: folder to write to.
 
     Returns:
-        the files.
+        the files written.
     """
     results, without = collect(runs, ["metrics.json"])
-    out.mkdir(parents=True, exist_ok=True)
     parts = [INTRODUCTION, f"Machine: {machine(results)}.\n"]
     for scene, found in by_scene(results).items():
         for minutes in sorted({result.minutes for result in found}, key=lambda value: value or 0):
@@ -50,13 +50,13 @@ def write_price_list(runs: Path, out: Path) -> list[Path]:
             parts += [f"## {scene}, {bound}\n", references(equal).markdown(), changes(equal).markdown()]
     parts += left_out("Without numbers", without)
     page, file = out / "price-list.md", out / "price-list.csv"
-    page.write_text("\n".join(parts))
-    file.write_text(every_run(results).csv())
+    replace_file(page, "\n".join(parts))
+    replace_file(file, every_run(results).csv())
     return [page, file]
 
 
 def references(results: Sequence[Result]) -> Table:
-    """What the runs that others are compared with reach themselves."""
+    """List the numbers of the runs that others are compared with."""
     names = {result.against for result in results}
     rows = []
     for (variant, _), group in grouped(results).items():
@@ -70,7 +70,7 @@ def references(results: Sequence[Result]) -> Table:
 
 
 def changes(results: Sequence[Result]) -> Table:
-    """What every other variant changes."""
+    """List what every other variant changes."""
     own = {(result.variant, result.seed): result for result in results}
     rows = []
     for (variant, _), group in grouped(results).items():
@@ -88,7 +88,7 @@ def changes(results: Sequence[Result]) -> Table:
 
 
 def every_run(results: Sequence[Result]) -> Table:
-    """A row a run, nothing summed up."""
+    """List the numbers of every run."""
     rows = []
     for result in results:
         numbers = result.numbers

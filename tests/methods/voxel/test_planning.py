@@ -9,7 +9,7 @@ from forewarp.methods.voxel import planning as decisions
 from forewarp.methods.voxel.evidence import Movement
 from forewarp.methods.voxel.planning import VoxelEvidence, VoxelPlanning
 from forewarp.methods.voxel.residual import Residual
-from forewarp.report.effect import Gain
+from forewarp.report.gain import Gain
 from forewarp.scene.pictures import Pictures
 
 MOVING = VoxelEvidence(
@@ -31,7 +31,7 @@ def with_gains(**gains):
 def test_one_time_needs_no_trial_to_stand_still():
     pictures = replace(MOVING.pictures, times=1)
     found = decisions.of_motion(evidence(pictures=pictures, movement=None), "dct")
-    assert (found.choice, found.on, found.words) == ("none", False, ("model/motion=none",))
+    assert (found.choice, found.on, found.overrides) == ("none", False, ("model/motion=none",))
     assert found.because == "1 time: nothing can be seen to move"
 
 
@@ -97,11 +97,14 @@ def test_a_background_needs_something_that_moves_before_it():
     assert decisions.of_background(evidence(), True, "grid", []).because.startswith("80% of the pixels")
     assert not decisions.of_background(evidence(), True, "grid", []).on
     found = decisions.of_background(evidence(pictures=bare), True, "grid", start)
-    assert (found.choice, found.words) == ("grid", ("model/background=grid", *start))
+    assert (found.choice, found.overrides) == ("grid", ("model/background=grid", *start))
     still = decisions.of_background(evidence(pictures=bare), False, "grid", start)
-    assert (still.on, still.words) == (False, ("model/background=none", *start))
+    assert (still.on, still.overrides) == (False, ("model/background=none", *start))
     against = replace(with_gains(background=NO), pictures=bare)
-    assert decisions.of_background(against, True, "grid", start).words == ("model/background=none", *start)
+    assert decisions.of_background(against, True, "grid", start).overrides == (
+        "model/background=none",
+        *start,
+    )
 
 
 def test_a_time_makes_dear_effects_dearer_the_shorter_it_is():
@@ -156,7 +159,7 @@ def test_coarse_stages_ask_for_cosines_then_motion_then_the_background():
         + ["stage.coarse.start_alpha=1e-2", "stage.coarse.confine=0.0"],
     )
     assert [(r.effect, r.adds) for r in rivals] == [("bases", True), ("motion", False), ("background", False)]
-    assert rivals[0].words == ["preset.bases=20", "stage.coarse.bases=[[0,20]]"]
+    assert rivals[0].overrides == ["preset.bases=20", "stage.coarse.bases=[[0,20]]"]
 
 
 def test_what_stands_still_before_a_background_is_one_field():
@@ -186,7 +189,7 @@ def test_what_is_typed_overrules():
     assert (
         by_hand["view_dependence"].choice,
         by_hand["view_dependence"].on,
-        by_hand["view_dependence"].words,
+        by_hand["view_dependence"].overrides,
     ) == ("none", False, ())
     assert by_hand["view_dependence"].because.startswith("as typed; ")
     assert {d.effect: d for d in VoxelPlanning().decide(found, asked())}["view_dependence"].on

@@ -79,7 +79,7 @@ def of_background(evidence: VoxelEvidence, moves: bool, on: str, start: Sequence
         why += ", but nothing moves: one field holds all"
         return Decision("background", "none", ("model/background=none", *start), why)
     chosen = _switch("background", pays is not False, on, why + evidence.of_trial("background"))
-    return replace(chosen, words=(*chosen.words, *start))
+    return replace(chosen, overrides=(*chosen.overrides, *start))
 
 
 def of_view(evidence: VoxelEvidence, on: str) -> Decision:
@@ -218,7 +218,7 @@ class VoxelPlanning:
         if moves:
             usual, more = _bases(evidence, asked)
             bases = of_bases(evidence, usual, more)
-            found.append(replace(bases, words=tuple(_more_bases(more, asked)) if bases.on else ()))
+            found.append(replace(bases, overrides=tuple(_more_bases(more, asked)) if bases.on else ()))
         found += [
             of_background(evidence, moves, asked.choose("background"), start),
             of_view(evidence, asked.choose("view_dependence")),
@@ -234,9 +234,9 @@ def overruled(decision: Decision, asked: Asked) -> Decision:
     if key not in asked.typed:
         return decision
     choice = asked.typed[key]
-    words = () if key == "preset.bases" else tuple(w for w in decision.words if w.split("=")[0] != key)
+    kept = () if key == "preset.bases" else tuple(o for o in decision.overrides if o.split("=")[0] != key)
     on = choice != "none" and decision.effect != "bases"
-    return Decision(decision.effect, choice, words, f"as typed; {decision.because}", on)
+    return Decision(decision.effect, choice, kept, f"as typed; {decision.because}", on)
 
 
 def _start(evidence: VoxelEvidence, asked: Asked) -> list[str]:

@@ -1,4 +1,4 @@
-"""Where ``conf/`` and ``sweeps/`` are: in a checkout at its top, from a wheel inside the package."""
+"""Find the configuration files: ``conf/`` and ``sweeps/``, in a checkout or in the installed package."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ PACKAGE = Path(__file__).resolve().parents[1]
 
 
 def project_root() -> Path:
-    """The folder that holds ``conf/`` and ``sweeps/``: what ``FOREWARP_ROOT`` names, the package of a wheel,
-    or the checkout.
+    """Return the folder that holds ``conf/`` and ``sweeps/``.
+
+    It is what ``FOREWARP_ROOT`` names, or else the installed package, or else the checkout.
 
     Raises:
-        ValueError: where there is no ``conf/``.
+        ValueError: if that folder has no ``conf/``.
     """
     named = os.environ.get(ROOT_VARIABLE)
     installed = PACKAGE if _holds_conf(PACKAGE) else PACKAGE.parents[1]
@@ -28,13 +29,14 @@ def project_root() -> Path:
 
 
 def configurations() -> Path:
-    """The folder ``conf/``, ready to be composed from: ``sweeps=`` finds its options, and ``paths.root`` is
-    the checkout; from a wheel it stays the current folder.
+    """Return ``conf/``, ready for Hydra: ``sweeps=NAME`` is registered, and ``paths.root`` is set.
+
+    ``paths.root`` is the checkout; of an installed package it is the current folder.
     """
     root = project_root()
     if root != PACKAGE:
         os.environ[ROOT_VARIABLE] = str(root)
-    _offer(root / "sweeps")
+    _register(root / "sweeps")
     return root / "conf"
 
 
@@ -42,10 +44,10 @@ def _holds_conf(folder: Path) -> bool:
     return (folder / "conf" / "train.yaml").is_file()
 
 
-def _offer(folder: Path) -> None:
-    """Make a folder's files options of the group of its name.
+def _register(folder: Path) -> None:
+    """Make the files of a folder options of a config group named after it.
 
-    On Hydra's search path the folder above would have to stand, and with it all that lies there.
+    Adding the folder above to Hydra's search path would make everything in it a config group.
     """
     from hydra.core.config_store import ConfigStore
     from omegaconf import OmegaConf

@@ -1,4 +1,4 @@
-"""What an effect is worth: the same with it and without, pair by pair. Price list and plan both ask here."""
+"""Measure what an effect is worth: compare runs with it and without, pair by pair."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from dataclasses import dataclass
 
 from forewarp.report.tables import Estimate
 
-DIFFERENCES = ("psnr", "ssim", "epe")  # all else changes by a factor
+DIFFERENCES = ("psnr", "ssim", "epe")  # other measures change by a factor
 
 Numbers = Mapping[str, float]
 
 
 def measure_effect(pairs: Sequence[tuple[Numbers, Numbers]], measure: str) -> Estimate | None:
-    """How a measure changes, over pairs of (with, without) that are equal in all else.
+    """Return the change of a measure over pairs of (with, without) that are equal in all else.
 
     Args:
         pairs: numbers by name; a pair that lacks the measure is left out.
-        measure: of ``DIFFERENCES`` the change is a difference, of any other a quotient.
+        measure: its change is a difference if it is in ``DIFFERENCES``, else a quotient.
 
     >>> measure_effect([({"psnr": 31.0, "step": 0.2}, {"psnr": 30.0, "step": 0.1})], "step")
     Estimate(mean=2.0, deviation=None)
@@ -32,10 +32,14 @@ def measure_effect(pairs: Sequence[tuple[Numbers, Numbers]], measure: str) -> Es
 
 @dataclass(frozen=True)
 class Gain:
-    """What an effect brought in trials: ``psnr`` (dB, the mean change), ``noise`` (dB: two standard errors of
-    that, over all pairs or over the seeds' means, whichever is larger), ``times`` (seconds a step, by what
-    factor), ``steps`` that each of a pair had; None where time and not steps bound them: ``seconds`` that the
-    one had and the other.
+    """What an effect gained in trials.
+
+    Attributes:
+        psnr: dB, the mean change.
+        noise: dB, two standard errors of it, over all pairs or over the seeds' means, whichever is larger.
+        times: the factor by which a step takes longer.
+        steps: of each trial; None if the trials were of equal time.
+        seconds: of the trials with the effect and without.
     """
 
     psnr: float
@@ -51,10 +55,10 @@ class Gain:
         steps: int | None,
         seconds: tuple[float, float] = (0.0, 0.0),
     ) -> Gain:
-        """The gain over the pairs of each seed, one a view.
+        """Compute the gain from the pairs of each seed, one pair a view.
 
         Raises:
-            ValueError: for a single pair, whose noise nobody knows.
+            ValueError: for a single pair, as its noise is unknown.
         """
         every = [pair for of_seed in pairs for pair in of_seed]
         if len(every) < 2:

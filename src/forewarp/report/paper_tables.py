@@ -1,4 +1,4 @@
-"""Measured runs beside what the paper prints."""
+"""Put measured runs beside the paper's printed rows."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from forewarp.report.collect import Result
 from forewarp.report.published import Group, PaperTable
 from forewarp.report.tables import Cell, Column, Difference, Estimate, Table
 
-# Title, digits, whether more is better, and the factor to the unit that is printed.
+# Title, digits, whether more is better, and the factor to the printed unit.
 METRICS = {
     "psnr": ("PSNR", 2, True, 1),
     "ssim": ("SSIM", 3, True, 1),
@@ -24,16 +24,16 @@ METRICS = {
 
 @dataclass(frozen=True)
 class Measured:
-    """The runs of one row: equal in all but scene and seed."""
+    """The runs of one table row, equal in all but scene and seed."""
 
     name: str
     row: Row
     runs: tuple[Result, ...]
 
     def cell(self, group: Group, metric: str) -> Estimate | None:
-        """Over the seeds that all scenes of the group were measured with: the mean of the scenes' means.
+        """Estimate a metric's mean over the scenes of a group, over the seeds that all of them have.
 
-        None where there is no such seed, or where images were halved, or put before a background, unequally.
+        None if there is no such seed, or the scenes' images differ in size or background.
         """
         found, conditions = {}, set()
         for run in self.runs:
@@ -49,12 +49,12 @@ class Measured:
 
     @property
     def seconds(self) -> float:
-        """Of training, the mean of its runs."""
+        """The mean training time of its runs."""
         return fmean(run.metrics["seconds"]["train"] for run in self.runs)
 
 
 class Row(NamedTuple):
-    """What runs of one row have in common."""
+    """What the runs of one row have in common."""
 
     variant: str
     model: str
@@ -66,7 +66,7 @@ class Row(NamedTuple):
 
 
 def row_of(run: Result) -> Row:
-    """The row that a run belongs to."""
+    """Return the row that a run belongs to."""
     budget = run.config["budget"]
     known, protocol = (run.config.get("variant") or {}).get("name", "plain"), run.metrics.get("protocol", {})
     bounds = run.config["preset"]["name"], budget["minutes"], budget.get("iterations")
@@ -75,7 +75,7 @@ def row_of(run: Result) -> Row:
 
 
 def measured(table: PaperTable, results: Sequence[Result]) -> list[Measured]:
-    """The table's measured rows, in the order of its variants; those without a run are not there."""
+    """Return the table's measured rows, in the order of its variants."""
     rows = {}
     datasets = {group.dataset for group in table.groups}
     for run in results:
@@ -88,14 +88,14 @@ def measured(table: PaperTable, results: Sequence[Result]) -> list[Measured]:
 
 
 def comparison(table: PaperTable, results: Sequence[Result], *, difference: bool = True) -> Table:
-    """Measured rows, what they differ by from the paper's own, then the published ones.
+    """Make a table of the measured rows, then the published ones.
 
     The best and the second of each column are marked among the measured rows alone.
 
     Args:
         table: as printed.
         results: of its scenes.
-        difference: a row after each measured one with its distance from the paper's.
+        difference: add after each measured row its difference from the paper's.
     """
     rows, ranked, kinds = [], [], ["measured", "difference to the paper", "published"]
     for row in measured(table, results):
@@ -118,7 +118,7 @@ def comparison(table: PaperTable, results: Sequence[Result], *, difference: bool
 
 
 def counterpart(table: PaperTable, results: Sequence[Result]) -> PaperTable | None:
-    """The same table over the synthetic scenes that were measured, without printed rows; None without any."""
+    """Return the table for the measured synthetic scenes, without printed rows; None if none."""
     groups = {}
     for group in table.groups:
         for scene in sorted({run.scene for run in results if run.dataset == group.dataset}):
@@ -129,7 +129,7 @@ def counterpart(table: PaperTable, results: Sequence[Result]) -> PaperTable | No
 
 
 def with_means(table: PaperTable, results: Sequence[Result]) -> PaperTable:
-    """The table with the means that it asks for, and that of the scenes measured, where that is another."""
+    """Add the means that the table asks for, and that of the measured scenes if it is another."""
     if not table.means:
         return table
     scenes = max(
@@ -175,7 +175,7 @@ def _difference(cell: Estimate | None, printed: str) -> Difference | None:
 
 
 def _marks(table: PaperTable, rows: Sequence[Sequence[Cell]], ranked: Sequence[int]) -> dict:
-    """Best and second as they are written: what reads alike is alike."""
+    """Mark the best and the second of each column; numbers that round to the same text are equal."""
     marks = {}
     for number, (_, metric) in enumerate(table.columns, 2):
         _, digits, more, _ = METRICS[metric]

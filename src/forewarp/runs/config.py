@@ -1,30 +1,28 @@
-"""A run's config: what of it makes two runs different, and how it is kept in the run's folder and read back.
+"""Keep a run's config in its folder, read it back, and tell runs apart by it.
 
-Nothing here loads torch, so that what is mistyped is answered at once.
+Nothing here loads torch, so that a mistyped command is answered at once.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from forewarp.runs.renamed import refuse_old
 from forewarp.files import MOST_CONFIG, read_text, replace_file
+from forewarp.runs.overrides import command_line, key_of, typed_overrides
 from forewarp.runs.trust import trust_of, trusted_config
-from forewarp.runs.overrides import as_typed, key_of, typed_words
 
-# What makes two runs different; where they run and what is shown of them does not.
+# Two runs differ if these do; where they run and what is shown of them does not count.
 IDENTITY = ("data", "model", "objective", "stage", "preset", "budget", "seed")
-# Named first of what differs, as others follow from these.
+# Named first in a refusal, as other differences follow from these.
 TYPED = ("data.scene", "data.root", "seed", "preset", "budget")
 HASH = "{hash}"
-# What may be set beside resume=<run>.
+# May be set beside resume=<run>.
 MAY_CHANGE = (
     *("trainer", "threads", "lpips_weights", "sheets", "evaluate", "checkpoint_seconds"),
     *("sentinel", "data_changed", "score"),
@@ -32,10 +30,10 @@ MAY_CHANGE = (
 
 
 def hashed(config: DictConfig) -> DictConfig:
-    """The config with ``{hash}`` in ``run`` replaced by ten digits of a SHA-256 of all that tells runs apart.
+    """Replace ``{hash}`` in the key ``run`` by ten digits of a hash of all that tells runs apart.
 
-    So a finished job is known by what it computed, and another config never meets its folder. Where minutes
-    bound a run, what it computes with is part of that.
+    So each configuration has a folder of its own, and a finished job is found again. For a run bounded by
+    minutes the device counts too.
     """
     if HASH in str(config.run):
         config.run = str(config.run).replace(HASH, content_hash(config))
@@ -43,7 +41,7 @@ def hashed(config: DictConfig) -> DictConfig:
 
 
 def content_hash(config: DictConfig, more: Sequence[str] = (), *others: object) -> str:
-    """Ten digits of a SHA-256 of what a run computes, of ``more`` keys of its config, and of ``others``."""
+    """Return ten digits of a SHA-256 of ``IDENTITY`` and ``more`` keys of a config, and of ``others``."""
     _make_absolute(config)
     content = {key: _plain(config.get(key)) for key in (*IDENTITY, *more)}
     if config.budget.minutes is not None:
@@ -60,13 +58,21 @@ def _plain(value: object) -> object:
 
 
 def claim(config: DictConfig, *, finished: bool = False) -> None:
-    """Write the resolved config into the run's folder, unless ``finished``; refuse one of another run."""
+    """Write the resolved config into the run's folder, unless the folder holds another run.
+
+    Args:
+        config: of the run; its key ``run`` names the folder.
+        finished: only check; a finished run keeps the config it was measured with.
+
+    Raises:
+        ValueError: if the folder holds a run of another config, or checkpoints without a config.
+    """
     folder, path = Path(config.run), Path(config.run) / "config.yaml"
     _make_absolute(config)
     if config.get("resume") is None:
-        config.command = typed()
+        config.command = command_line("train", typed_overrides()) if HydraConfig.initialized() else None
     config.resume = None
-    if "trust" in config:  # said by whoever runs it, never by a folder
+    if "trust" in config:  # only who runs the command may trust, never a folder
         config.trust = None
     resolved = OmegaConf.create(OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
     begun = folder.is_dir() and any(folder.glob("*/last.ckpt"))
@@ -75,25 +81,23 @@ def claim(config: DictConfig, *, finished: bool = False) -> None:
             f"{path}: expected the configuration of the run, but got none; use run=... or delete the folder"
         )
     if begun:
-        _refuse_another(path, read_config(path, None), resolved)  # compared, and never instantiated
-    if finished:  # its numbers are of how it was run, not of what is typed now
-        return
-    replace_file(path, OmegaConf.to_yaml(resolved))
-
-
-def typed() -> str | None:
-    """The command line of this run alone; None where Hydra was not asked."""
-    return as_typed("train", typed_words()) if HydraConfig.initialized() else None
+        _refuse_another(path, read_config(path, None), resolved)
+    if not finished:
+        replace_file(path, OmegaConf.to_yaml(resolved))
 
 
 def saved_config(run: str | None, changes: DictConfig, key: str = "run") -> DictConfig:
-    """The config of the run in a folder, with what the command line changed.
+    """Read the config in a run's folder and apply what the command line may change of it.
 
     Args:
         run: the run's folder.
-        changes: keys of the run's config; those that are null change nothing. Others are left out.
-            ``trust`` names packages whose code the config may name.
-        key: what named the folder.
+        changes: the command's own config; of its keys ``trainer``, ``threads``, ``lpips_weights``, ``sheets``
+            and ``data.root`` are applied if they are not null. ``trust`` names packages whose code the run's
+            config may name.
+        key: that named the folder, for errors.
+
+    Raises:
+        ValueError: if there is no run, or its config names code that is not trusted.
     """
     if run is None:
         raise ValueError("run: expected the folder of a run, but got nothing; set run=runs/...")
@@ -113,52 +117,62 @@ def saved_config(run: str | None, changes: DictConfig, key: str = "run") -> Dict
 
 
 def resumed(config: DictConfig) -> DictConfig:
-    """With ``resume=<folder>`` the config of the run there, and of what was typed only what may change.
+    """With ``resume=<folder>``: return that run's config, with the typed keys that may change.
 
     Raises:
-        ValueError: for another key beside it, or a folder that is no run.
+        ValueError: if another key was typed, or the folder holds no run.
     """
     if config.get("resume") is None:
         return config
     trust = OmegaConf.create({"trust": config.get("trust")})
     saved = saved_config(str(config.resume), trust, "resume")
     saved.resume, saved.data_changed = str(config.resume), "refuse"
-    words = HydraConfig.get().overrides.task if HydraConfig.initialized() else []
-    for word in words:
-        key = key_of(word)
+    for override in typed_overrides(of_sweep=True) if HydraConfig.initialized() else []:
+        key = key_of(override)
         if key == "data.root":
             saved.data.root = config.data.root
         elif key.split(".")[0] in MAY_CHANGE:
             saved[key.split(".")[0]] = config[key.split(".")[0]]
         elif key not in ("resume", "trust"):
             raise ValueError(
-                f"{key}: expected no such key beside resume=, whose config.yaml holds it, but got {word}; "
-                f"beside it go {', '.join(MAY_CHANGE)}, data.root, trust"
+                f"{key}: expected no such key beside resume=, whose config.yaml holds it, but got "
+                f"{override}; beside it go {', '.join(MAY_CHANGE)}, data.root, trust"
             )
     return saved
 
 
 def read_config(path: Path, trust: Sequence[str] | None = ()) -> DictConfig:
-    """The config in a run's folder; ``trust`` as in ``trusted_config``.
+    """Read the config in a run's folder; ``trust`` as in ``trusted_config``.
 
     Raises:
-        ValueError: where it is no config of a run, or one that is not to be trusted.
+        ValueError: if it is no config of a run, is of an earlier version, or is not to be trusted.
     """
     return parsed(read_text(path, MOST_CONFIG), path, trust)
 
 
 def parsed(text: str, path: Path, trust: Sequence[str] | None = ()) -> DictConfig:
-    """As ``read_config``, of text; ``path`` names it in errors."""
-    refuse_old(trusted_config(text, path, None), path)
+    """Do as ``read_config`` with text; ``path`` names it in errors."""
+    _refuse_earlier_version(trusted_config(text, path, None), path)
     config = trusted_config(text, path, trust)
     for key in (*IDENTITY, "trainer", "logger", "callbacks"):
-        if key not in config and key != "objective":  # a method may have none of its own
+        if key not in config and key != "objective":  # a method may have no objective
             raise ValueError(f"{path}: expected the key {key}, but got none; delete the run's folder")
     return config
 
 
+def _refuse_earlier_version(config: DictConfig, path: Path) -> None:
+    stages = [stage for stage in (config.get("stage") or {}).values() if stage is not None]
+    old = "0.1" if "warp" in (config.get("model") or {}) else None
+    old = old or ("0.2" if any("rates" in stage for stage in stages) else None)
+    if old is not None:
+        raise ValueError(
+            f"{path}: expected a run of forewarp 0.3, but got one of {old}, which version {old}.0 reads; "
+            f"run its command again into another folder, or install forewarp {old}.0"
+        )
+
+
 def _make_absolute(config: DictConfig) -> None:
-    """The data's place as seen from anywhere: a run may be evaluated from another folder."""
+    """Make ``data.root`` absolute, as a run may be evaluated from another folder."""
     if not OmegaConf.is_missing(config.data, "root") and config.data.get("root") is not None:
         config.data.root = str(Path(config.data.root).expanduser().resolve())
 

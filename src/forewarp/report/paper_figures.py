@@ -1,24 +1,23 @@
-"""Figures of the paper's kind, from the pictures and numbers in run folders."""
+"""Draw the paper's figures from the pictures and numbers in run folders."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from forewarp.files import read_text
+from forewarp.files import read_json
 from forewarp.report import curve
 from forewarp.report.collect import Result
-from forewarp.report.compared import row_of
+from forewarp.report.paper_tables import row_of
 from forewarp.report.tables import Estimate
 
 GAP = 4  # pixels between the parts of a sheet
 
 
 def draw_resolution(path: Path, results: Sequence[Result]) -> Path | None:
-    """PSNR against the voxels along a side, a line a scene, of the variants ``voxels_<N>``; None of one."""
+    """Draw PSNR against the voxels along a side, of the variants ``voxels_<N>``; None of only one."""
     scenes: dict[str, dict[int, list[float]]] = {}
     for run in results:
         name, _, side = run.variant.rpartition("_")
@@ -43,9 +42,9 @@ def draw_resolution(path: Path, results: Sequence[Result]) -> Path | None:
 
 
 def draw_canonical(path: Path, forward: Result, backward: Result) -> Path | None:
-    """The view nearest to the canonical time: truth, forward, backward, and both errors.
+    """Draw the view nearest to the canonical time: truth, forward, backward, and both errors.
 
-    None where the two have no sheet of a view in common.
+    Returns None if the two runs have no sheet of a view in common.
     """
     both = sorted(set(_sheets(forward)) & set(_sheets(backward)))
     if not both:
@@ -65,7 +64,7 @@ def draw_canonical(path: Path, forward: Result, backward: Result) -> Path | None
 
 
 def draw_sheet(path: Path, results: Sequence[Result], columns: int = 3) -> Path | None:
-    """A row a scene: truth, result and error of a view in the middle of its sheets; None without any."""
+    """Draw a row for each scene: truth, result and error of a view; None if no run has a sheet."""
     found = {run.scene: _sheets(run) for run in sorted(results, key=lambda run: run.scene)}
     found = {scene: sheets for scene, sheets in found.items() if sheets}
     if not found:
@@ -79,7 +78,7 @@ def draw_sheet(path: Path, results: Sequence[Result], columns: int = 3) -> Path 
 
 
 def thirds(sheet: np.ndarray) -> list[np.ndarray]:
-    """The three pictures (H, W, C) of a sheet (H, 3 W + 2 GAP, C)."""
+    """Split a sheet (H, 3 W + 2 GAP, C) into its three pictures (H, W, C)."""
     width = (sheet.shape[1] - 2 * GAP) // 3
     return [sheet[:, i * (width + GAP) : i * (width + GAP) + width] for i in range(3)]
 
@@ -90,8 +89,7 @@ def _sheets(run: Result) -> dict[str, Path]:
 
 
 def _images(run: Result) -> list[dict]:
-    path = run.folder / "per_image.json"
-    return json.loads(read_text(path))["images"] if path.is_file() else []
+    return (read_json(run.folder / "per_image.json") or {}).get("images", [])
 
 
 def _read(path: Path) -> np.ndarray:
