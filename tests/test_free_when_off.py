@@ -12,9 +12,9 @@ from forewarp.fields.voxel_grid import VoxelGrid
 from forewarp.methods.voxel.effects import background, inpaint, motion, upsample, view_dependence
 from forewarp.methods.voxel.terms import TERMS
 from forewarp.scene.box import Lattice
-from forewarp.training.curriculum import Curriculum
 from forewarp.training.module import DynamicSceneModule
 from forewarp.training.objective import total
+from forewarp.training.schedule import Curriculum
 from tests.support.tiny_scene import BOX, ball_data, begun, built, forward_model, stage
 
 LATTICE = Lattice(BOX, (9, 8, 7))
@@ -47,8 +47,8 @@ def a_step(effects, weights=None, **choices):
     """Look at a batch of the ball through a method with these effects and no others, and learn from it."""
     torch.manual_seed(0)
     chosen = OFF | {key: value for effect in effects for key, value in ON[effect].items()} | choices
-    still = (LATTICE, torch.ones(LATTICE.shape, dtype=torch.bool))
-    method = built(forward_model(**chosen), LATTICE, frames=12, still=still)
+    static = (LATTICE, torch.ones(LATTICE.shape, dtype=torch.bool))
+    method = built(forward_model(**chosen), LATTICE, frames=12, static=static)
     data = ball_data(rays=32)
     data.setup("fit")
     made = stage(weights=weights or {"photo": 1.0})

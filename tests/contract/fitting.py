@@ -9,7 +9,7 @@ import lightning
 import torch
 
 from forewarp.training.objective import Objective
-from forewarp.training.settings import StageSettings
+from forewarp.training.schedule import StageSettings
 from forewarp.training.stages import Run, Stage
 from tests.contract.scenes import data_of
 from tests.contract.table import METHODS

@@ -16,9 +16,8 @@ from forewarp.scene.box import Box
 from forewarp.scene.camera import Camera, look_at
 from forewarp.scene.frame import Frame, Scene
 from forewarp.scene.view import Moment, View
-from forewarp.training.budget import share_out
 from forewarp.training.objective import Objective
-from forewarp.training.settings import StageSettings
+from forewarp.training.schedule import StageSettings, share_out
 from forewarp.training.stages import Run, Stage
 
 TIMES = (0.0, 0.5, 1.0)

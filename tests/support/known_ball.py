@@ -6,9 +6,9 @@ from forewarp.fields.radiance import DirectRadiance
 from forewarp.methods.voxel.method import VoxelMethod
 from forewarp.methods.voxel.snapshot import VoxelSnapshot
 from forewarp.scene.box import Lattice
-from forewarp.training.curriculum import Curriculum
 from forewarp.training.module import DynamicSceneModule
 from forewarp.training.objective import Objective
+from forewarp.training.schedule import Curriculum
 from tests.support.tiny_scene import BOX, RADIUS, TRAVEL, ball_center, stage
 
 

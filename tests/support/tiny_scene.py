@@ -13,14 +13,13 @@ from forewarp.fields.trajectory import TrajectoryField
 from forewarp.methods.method import Start
 from forewarp.methods.voxel.effects.motion import Motion
 from forewarp.methods.voxel.effects.view_dependence import SphericalHarmonics
-from forewarp.methods.voxel.model import BackwardModel, ForwardModel
+from forewarp.methods.voxel.model import BackwardModel, ForwardModel, Ground
 from forewarp.methods.voxel.stage import VoxelStage
-from forewarp.methods.voxel.start import Ground
 from forewarp.scene.box import Box
 from forewarp.scene.camera import Camera, look_at
 from forewarp.scene.frame import Frame, Scene
 from forewarp.training.objective import Objective
-from forewarp.training.settings import StageSettings
+from forewarp.training.schedule import StageSettings
 from forewarp.training.stages import Run, Stage
 
 RADIUS, TRAVEL = 0.4, (0.8, 0.0, 0.0)
@@ -98,11 +97,11 @@ def backward_model(**changes):
 
 
 def built(
-    model, lattice, active=None, *, density_scale=0.3, frames=5, canonical_time=0.0, still=None, **numbers
+    model, lattice, active=None, *, density_scale=0.3, frames=5, canonical_time=0.0, static=None, **numbers
 ):
     """A model's method on a lattice, all of it active by default; ``numbers`` are of its stage."""
     active = torch.ones(lattice.shape, dtype=torch.bool) if active is None else active
-    ground = Ground(lattice, active, density_scale, BOX, frames, canonical_time, still)
+    ground = Ground(lattice, active, density_scale, BOX, frames, canonical_time, static)
     return model.build(ground, VoxelStage(**({"num_voxels": [[0, 500]]} | numbers)))
 
 

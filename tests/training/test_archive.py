@@ -4,7 +4,7 @@ import zipfile
 import pytest
 import torch
 
-from forewarp.training.archive import read_archive, write_archive
+from forewarp.training.checkpoints import read_archive, write_archive
 
 CONTENT = {"a": torch.arange(1000.0), "b": {"c": [1, "x", None]}}
 

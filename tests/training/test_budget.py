@@ -1,7 +1,7 @@
 import pytest
 
-from forewarp.training.budget import StagePlan, seconds_after, share_out
 from forewarp.training.objective import Objective
+from forewarp.training.schedule import StagePlan, seconds_after, share_out
 
 
 def plan(share=1.0, **changes):

@@ -3,7 +3,7 @@ from collections import Counter
 import pytest
 import torch
 
-from forewarp.training.curriculum import Curriculum
+from forewarp.training.schedule import Curriculum
 
 TIMES = [0.0, 0.9, 0.5, 0.2, 0.7, 1.0, 0.4, 0.6, 0.1, 0.3]
 

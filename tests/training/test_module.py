@@ -15,9 +15,9 @@ from forewarp.ops.warmup import warm_up
 from forewarp.renderer import Renderer
 from forewarp.scene.box import Lattice
 from forewarp.scene.view import Moment, View
-from forewarp.training.curriculum import Curriculum
 from forewarp.training.module import DynamicSceneModule
 from forewarp.training.objective import total
+from forewarp.training.schedule import Curriculum
 from tests.support.tiny_scene import (
     BOX,
     RATES,
@@ -153,7 +153,7 @@ def test_an_empty_scene_trains_on():
 
 def test_every_kind_has_its_rate():
     optimizer = module().configure_optimizers()
-    assert {g["name"]: g["base_rate"] for g in optimizer.param_groups} == {
+    assert {g["name"]: g["base_lr"] for g in optimizer.param_groups} == {
         k: RATES[k] for k in ("density", "color", "shading", "flow")
     }
     rates = {"color": 0.1, "density": 0.1, "shading": 0.1}
@@ -215,7 +215,7 @@ def test_a_checkpoint_holds_what_the_weights_do_not():
     first.training_step(batch(), 0)
     first.curriculum()
     first.clock.load_state_dict({"seconds": 12.5})
-    first.method.lattices.followed[0].voxels = 4096
+    first.method.lattices.followed[0].num_voxels = 4096
     checkpoint = {}
     first.on_save_checkpoint(checkpoint)
     generator = torch.get_rng_state()
@@ -226,7 +226,7 @@ def test_a_checkpoint_holds_what_the_weights_do_not():
     assert torch.equal(first.curriculum.generator.get_state(), second.curriculum.generator.get_state())
     assert second.clock.seconds == 12.5
     second.load_state_dict(first.state_dict())
-    assert second.method.lattices.followed[0].voxels == 4096
+    assert second.method.lattices.followed[0].num_voxels == 4096
     assert torch.equal(second.method.lattices.home, first.method.lattices.home)
 
 

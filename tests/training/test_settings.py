@@ -1,6 +1,6 @@
 import pytest
 
-from forewarp.training.settings import StageSettings
+from forewarp.training.schedule import StageSettings
 
 
 def settings(**changes):

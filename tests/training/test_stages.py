@@ -136,7 +136,7 @@ class Diary(lightning.Callback):
         self.steps = []
 
     def on_before_optimizer_step(self, trainer, module, optimizer):
-        rates = {g["name"]: g["lr"] / g["base_rate"] for g in optimizer.param_groups}
+        rates = {g["name"]: g["lr"] / g["base_lr"] for g in optimizer.param_groups}
         parameters = {id(p) for g in optimizer.param_groups for p in g["params"]}
         assert parameters == {id(p) for p in module.method.parameters()}
         bases = int(module.method.motion.trajectory.bases_in_play)

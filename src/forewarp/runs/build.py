@@ -12,7 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from forewarp.training.device import check_precision
 from forewarp.training.device import device_of
-from forewarp.training.budget import StagePlan, seconds_after, share_out
+from forewarp.training.schedule import StagePlan, seconds_after, share_out
 from forewarp.evaluation.measure import measure
 from forewarp.training.callbacks import StageProgress
 from forewarp.files import read_json

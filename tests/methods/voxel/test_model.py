@@ -19,8 +19,8 @@ LATTICE = Lattice(BOX, (5, 4, 6))
 
 
 def build(model, effects=EFFECTS, **numbers):
-    still = (LATTICE, torch.ones(LATTICE.shape, dtype=torch.bool))
-    return built(model, LATTICE, still=still, effects=effects, **numbers)
+    static = (LATTICE, torch.ones(LATTICE.shape, dtype=torch.bool))
+    return built(model, LATTICE, static=static, effects=effects, **numbers)
 
 
 FULL = forward_model(

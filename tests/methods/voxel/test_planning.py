@@ -6,9 +6,8 @@ import pytest
 
 from forewarp.methods.effect import Asked, Begin, Rival
 from forewarp.methods.voxel import planning as decisions
-from forewarp.methods.voxel.evidence import Movement
+from forewarp.methods.voxel.evidence import Movement, Residual
 from forewarp.methods.voxel.planning import VoxelEvidence, VoxelPlanning
-from forewarp.methods.voxel.residual import Residual
 from forewarp.report.effect import Gain
 from forewarp.scene.pictures import Pictures
 

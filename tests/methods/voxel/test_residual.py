@@ -2,7 +2,7 @@
 
 import torch
 
-from forewarp.methods.voxel.residual import _explained, residual
+from forewarp.methods.voxel.evidence import _explained, residual
 from tests.support.tiny_scene import ball_data, forward_model, make_run, stage
 
 

@@ -92,7 +92,7 @@ def test_every_term_is_the_pure_function_of_its_parts():
         "tv_density": sum(losses.tv_density(grid.raw_density, pairs) for grid in grids),
         "tv_flow": losses.tv_flow(seen.state.flow, pairs),
         "tv_depth": losses.tv_depth(*seen.render_patches()),
-        "still_points": losses.still_points(seen.stray()),
+        "static_points": losses.static_points(seen.stray()),
         "moving_opacity": losses.moving_opacity(grids[0].activation.alpha(grids[0].raw_density, 1.0)),
     }
     for name, value in expected.items():
@@ -128,7 +128,7 @@ def test_each_nth_step_with_n_times_the_weight():
 def test_terms_of_effects_that_are_off_are_left_out():
     nothing = looked(inpainted=False, moving=False, background=False)
     _, raw = loss_of(Objective(dict.fromkeys(TERMS, 1.0)), nothing)
-    off = {"flow_l1", "tv_flow", "inpaint_diff", "still_points", "moving_opacity"}
+    off = {"flow_l1", "tv_flow", "inpaint_diff", "static_points", "moving_opacity"}
     assert set(raw) == set(TERMS) - off
 
 
