@@ -1,5 +1,6 @@
 """What every test may ask for: the commands in this process, an empty folder."""
 
+import gc
 import importlib
 import logging
 from types import SimpleNamespace
@@ -18,6 +19,13 @@ ENVIRONMENT = (
     "TF_CPP_MIN_LOG_LEVEL",
     "THP_MEM_ALLOC_ENABLE",
 )
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _imports_are_no_garbage():
+    """Collect garbage fast, as every stage of a run does before it starts: leave out what is imported."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture

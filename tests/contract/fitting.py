@@ -3,16 +3,16 @@
 import os
 import signal
 from dataclasses import replace
-from pathlib import Path
 
 import lightning
 import torch
 
 from forewarp.training.objective import Objective
 from forewarp.training.schedule import StageSettings
-from forewarp.training.stages import Run, Stage
+from forewarp.training.stages import Stage
 from tests.contract.scenes import data_of
 from tests.contract.table import METHODS
+from tests.support.tiny_scene import make_run
 
 
 def stage_of(entry, name="fine", **changes):
@@ -24,14 +24,7 @@ def stage_of(entry, name="fine", **changes):
 
 def run_of(stages, data, folder, *watchers, **options):
     """A silent run on the CPU."""
-
-    def trainer(where, callbacks):
-        off = ("logger", "enable_checkpointing", "enable_progress_bar", "enable_model_summary")
-        silent = dict.fromkeys(off, False) | {"limit_val_batches": 0, "num_sanity_val_steps": 0}
-        return lightning.Trainer(max_epochs=1, max_steps=-1, accelerator="cpu", callbacks=callbacks, **silent)
-
-    watch = lambda name, where: list(watchers)  # noqa: E731
-    return Run(data, None, stages, Path(folder), trainer, callbacks=watch, **options)
+    return make_run(folder, stages, data=data, callbacks=watchers, **options)
 
 
 def module_of(entry, data, **changes):

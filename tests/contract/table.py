@@ -12,10 +12,10 @@ from forewarp.methods.voxel.backward_warp import Deformation
 from forewarp.methods.voxel.effects.background import StaticBackground, Together
 from forewarp.methods.voxel.effects.inpaint import UNet3d
 from forewarp.methods.voxel.effects.motion import Motion
-from forewarp.methods.voxel.effects.upsample import LearnedUpsampler
-from forewarp.methods.voxel.effects.view_dependence import SphericalHarmonics
+from forewarp.methods.voxel.effects.upsample import LearnedUpsampler, TrilinearUpsampler
+from forewarp.methods.voxel.effects.view_dependence import SphericalHarmonics, ViewNetwork
 from forewarp.methods.voxel.model import BackwardModel, ForwardModel
-from tests.contract.toys import Codes, Splats
+from tests.contract.toys import Splats
 
 
 @dataclass(frozen=True)
@@ -60,16 +60,25 @@ VOXELS = {
     "weights": {"photo": 1.0, "point_color": 0.01, "background_entropy": 1e-3},
     "steps": 100,
 }
-VIEW = Effect({"view_dependence": SphericalHarmonics}, ((SphericalHarmonics, "forward"),))
+VIEW = Effect(
+    {"view_dependence": SphericalHarmonics}, ((SphericalHarmonics, "forward"), (ViewNetwork, "forward"))
+)
 BACKGROUND = Effect(
     {"background": partial(StaticBackground, features=3, alpha_init=1e-2, alpha_threshold=0.0)},
     ((StaticBackground, "forward"), (Together, "density")),
 )
 WARP = {
-    "motion": Effect({"motion": Motion}, ((Motion, "flow"), (TrajectoryField, "coefficients"))),
+    "motion": Effect(
+        {"motion": Motion}, ((Motion, "flow"), (Motion, "warp"), (TrajectoryField, "coefficients"))
+    ),
     "view_dependence": VIEW,
-    "upsampler": Effect({"upsampler": partial(LearnedUpsampler, width=8)}, ((LearnedUpsampler, "residual"),)),
-    "inpainter": Effect({"inpainter": partial(UNet3d, width=16, levels=2)}, ((UNet3d, "features"),)),
+    "upsampler": Effect(
+        {"upsampler": partial(LearnedUpsampler, width=8)},
+        ((LearnedUpsampler, "residual"), (LearnedUpsampler, "alone"), (TrilinearUpsampler, "forward")),
+    ),
+    "inpainter": Effect(
+        {"inpainter": partial(UNet3d, width=16, levels=2)}, ((UNet3d, "features"), (UNet3d, "residual"))
+    ),
     "background": BACKGROUND,
 }
 SMALL_NETWORK = {"width": 32, "layers": 3, "skip": None, "position_frequencies": 4}
@@ -87,7 +96,6 @@ METHODS = {
         {"network": 2e-3},
         steps=150,
     ),
-    "codes": Entry(Codes, {"codes": 1e-2, "network": 5e-3}, {"photo": 1.0, "smooth": 1e-3}, toy=True),
     "splats": Entry(
         Splats,
         {"position": 0.01, "velocity": 0.02, "radius": 0.02, "color": 0.05, "opacity": 0.05},

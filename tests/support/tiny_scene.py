@@ -135,20 +135,11 @@ def stage(name="coarse", weights=None, photo_on=None, **changes):
     return Stage(StageSettings.of(name, **(numbers | changes)), objective)
 
 
-def trainer(callbacks):
+def trainer(callbacks, logger=False):
     """A silent trainer on the CPU."""
-    return lightning.Trainer(
-        max_epochs=1,
-        max_steps=-1,
-        accelerator="cpu",
-        logger=False,
-        enable_checkpointing=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        callbacks=callbacks,
-        limit_val_batches=0,
-        num_sanity_val_steps=0,
-    )
+    off = dict.fromkeys(("enable_checkpointing", "enable_progress_bar", "enable_model_summary"), False)
+    off |= {"limit_val_batches": 0, "num_sanity_val_steps": 0, "logger": logger}
+    return lightning.Trainer(max_epochs=1, max_steps=-1, accelerator="cpu", callbacks=callbacks, **off)
 
 
 def make_run(folder, stages, *, data=None, model=None, callbacks=(), **changes):

@@ -85,14 +85,6 @@ def test_what_is_no_handover_is_refused_in_one_line(tmp_path, spoil):
         load_handover(tmp_path)
 
 
-def test_half_a_file_is_never_taken_for_one(tmp_path):
-    path = tmp_path / "done.json"
-    write_json(path, {"seconds": 1.0})
-    with pytest.raises(TypeError):
-        write_json(path, {"seconds": object()})
-    assert json.loads(path.read_text()) == {"seconds": 1.0}
-
-
 def test_a_stage_leaves_the_tight_box():
     method = ball()
     handover = make_handover(method, SCENE, None, 6)

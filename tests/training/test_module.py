@@ -14,7 +14,7 @@ from forewarp.ops.backend import numba_installed
 from forewarp.ops.warmup import warm_up
 from forewarp.renderer import Renderer
 from forewarp.scene.box import Lattice
-from forewarp.scene.view import Moment, View
+from forewarp.scene.view import Moment
 from forewarp.training.module import DynamicSceneModule
 from forewarp.training.objective import total
 from forewarp.training.schedule import Curriculum
@@ -189,16 +189,6 @@ def test_an_image_in_chunks_is_the_image():
     assert torch.equal(other.rgb, still.rgb)
 
 
-def test_some_pixels_or_a_crop_are_those_of_the_whole():
-    made = module()
-    camera, moment, white = DATA.scene.test[1].camera, Moment(0.5), torch.ones(3)
-    whole = made.render(camera, moment, white).rgb.reshape(camera.height, camera.width, 3)
-    some = made.render(View(camera, torch.tensor([0, 17, 40])), moment, white).rgb
-    torch.testing.assert_close(some, whole.reshape(-1, 3)[[0, 17, 40]])
-    crop = made.render(View(camera, crop=(2, 3, 4, 5)), moment, white).rgb
-    torch.testing.assert_close(crop.reshape(4, 5, 3), whole[2:6, 3:8])
-
-
 def test_validation_logs_the_psnr_of_whole_images():
     made = module()
     ours = trainer([])
@@ -246,11 +236,6 @@ def test_without_a_schedule_all_bases_play():
     noted = made.method.advance(0.5, 0, made.configure_optimizers())
     assert int(made.method.motion.trajectory.bases_in_play) == made.method.motion.trajectory.bases
     assert noted == {"bases_in_play": made.method.motion.trajectory.bases}
-
-
-def test_a_term_that_the_method_does_not_know_is_refused():
-    with pytest.raises(ValueError, match="objective: expected a term of photo, .*but got 'photos'"):
-        module(weights={"photos": 1.0})
 
 
 class Drawing(lightning.Callback):

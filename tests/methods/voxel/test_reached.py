@@ -53,24 +53,6 @@ def test_a_module_wraps_fields_warper_inpainter_and_renderer(module):
     assert {id(p) for p in method.parameters()} == {id(p) for p in module.parameters()}
 
 
-def test_what_is_reached_is_what_is_drawn_with(module, monkeypatch):
-    camera, moment, white = ball_data(size=16).scene.test[1].camera, Moment(0.45), torch.ones(3)
-    used = []
-    for name in ("motion", "inpainter", "radiance"):
-        part, attribute = getattr(module.method, name), {"motion": "warp", "inpainter": "features"}.get(name)
-        own = getattr(part, attribute or "forward")
-
-        def noted(*arguments, own=own, name=name):
-            used.append(name)
-            return own(*arguments)
-
-        monkeypatch.setattr(part, attribute or "forward", noted)
-    before = module.render(camera, moment, white).rgb
-    assert used == ["radiance", "motion", "inpainter"]
-    monkeypatch.setattr(module.method, "renderer", Renderer(step=0.2))
-    assert not torch.equal(module.render(camera, moment, white).rgb, before)
-
-
 def test_a_newcomers_walk_from_the_canonical_field_to_a_picture(module):
     """The lines of ``ForwardWarp.at``, one after another, by hand."""
     method, moment = module.method, Moment(0.45)

@@ -68,15 +68,6 @@ def loss_of(objective, seen, number=0, terms=None):
     return total(step, objective.factors(number), {})
 
 
-def test_the_loss_is_the_weighted_sum_of_the_raw_terms():
-    weights = {name: 0.1 * (i + 1) for i, name in enumerate(TERMS)}
-    loss, raw = loss_of(Objective(weights), looked())
-    assert set(raw) == set(TERMS)
-    assert loss.item() == pytest.approx(sum(weights[n] * v.item() for n, v in raw.items()), rel=1e-5)
-    assert loss.requires_grad
-    assert not any(v.requires_grad for v in raw.values())
-
-
 def test_every_term_is_the_pure_function_of_its_parts():
     seen = looked()
     _, raw = loss_of(Objective(dict.fromkeys(TERMS, 1.0)), seen)
@@ -113,16 +104,6 @@ def test_a_term_of_weight_zero_is_never_called(off, monkeypatch):
     for weights in ({n: 1.0 for n in TERMS if n != off}, {n: float(n != off) for n in TERMS}):
         _, raw = loss_of(Objective(weights), seen, terms=voxel_terms() | {off: forbid})
         assert set(raw) == set(TERMS) - {off}
-
-
-def test_each_nth_step_with_n_times_the_weight():
-    objective = Objective({"photo": 1.0, "tv_density": 0.5}, every={"tv_density": 3})
-    seen = looked()
-    (first, raw), (second, later) = loss_of(objective, seen, 6), loss_of(objective, seen, 7)
-    assert set(raw) == {"photo", "tv_density"}
-    assert set(later) == {"photo"}
-    assert first.item() == pytest.approx((raw["photo"] + 1.5 * raw["tv_density"]).item())
-    assert second.item() == pytest.approx(later["photo"].item())
 
 
 def test_terms_of_effects_that_are_off_are_left_out():
