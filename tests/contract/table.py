@@ -1,4 +1,4 @@
-"""The methods that the contract suite holds to the contract: one entry each, for scenes of 20 pixels."""
+"""The methods that the contract suite tests: one entry each, sized for images of 20 pixels."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -20,8 +20,10 @@ from tests.contract.toys import Splats
 
 @dataclass(frozen=True)
 class Effect:
-    """An optional part: what the model's fields are with it ``on`` (None is off), and its ``parts``, pairs of
-    a class and the name of a function of it, one of which at least is called in a step.
+    """An optional part of a method.
+
+    ``on`` are the model's fields that switch it on (None is off). ``parts`` are pairs of a class and a
+    function name: none is called with the effect off, at least one with it on.
     """
 
     on: Mapping[str, object]
@@ -30,10 +32,12 @@ class Effect:
 
 @dataclass(frozen=True)
 class Entry:
-    """A small method. ``model`` makes it of a ``Start``; ``rates`` and ``numbers`` are its stage's,
-    ``weights`` its objective's; after ``steps`` its loss is below ``falls`` times what it was at first.
-    ``effects``: its optional parts by name, which is also how their parameters' names begin. ``toy``: not a
-    method of the project. ``gpu``: where it was proven on a GPU.
+    """A small method to test.
+
+    ``model`` makes it; ``lr`` and ``numbers`` are of its stage, ``weights`` of its objective. After ``steps``
+    its loss must be below ``falls`` times the first. ``effects`` are its optional parts by name, with which
+    the names of their parameters begin. ``toy``: not a method of the project. ``gpu``: where it was run on a
+    GPU.
     """
 
     model: Callable[[Start], Method]

@@ -14,10 +14,10 @@ from forewarp.scene.view import Moment, Rendering, View
 
 
 class Splats(Method):
-    """Round Gaussians that move along lines. A ray sees each as it does where it passes it nearest.
+    """Round Gaussians that move along lines; a ray reads each at its nearest point.
 
-    Picture, loss and gradients are computed in one pass, without autograd. Stage numbers: ``count`` at first,
-    density control ``every`` so many steps, ``most`` of them.
+    Image, loss and gradients are computed in one pass, without autograd. Stage numbers: ``count`` splats at
+    first, at ``most`` so many, density control ``every`` n steps.
     """
 
     numbers = ("count", "every", "most")
@@ -68,7 +68,7 @@ class Splats(Method):
 
     @torch.no_grad()
     def advance(self, progress: float, step: int, optimizer: torch.optim.Optimizer) -> dict[str, float]:
-        """Forget what is hardly there; split the tenth that is pulled at most into two of half the size."""
+        """Remove faint splats; split the tenth with the largest gradients into two of half the size."""
         if step and step % self.every == 0:
             alive = (self.opacity > -4).nonzero()[:, 0]
             torn = alive[self.pull[alive].topk(min(len(alive) // 10, self.most - len(alive))).indices]
@@ -93,7 +93,7 @@ class Splats(Method):
         return "splats", len(self.position)
 
     def trajectories(self, points: Tensor, times: Tensor) -> Tensor:
-        """Every point moves as the splat next to it."""
+        """Move every point like its nearest splat."""
         nearest = torch.cdist(points, self.position).argmin(-1)
         return points[:, None] + self.velocity[nearest][:, None] * (times - self.canonical_time)[:, None]
 
@@ -118,7 +118,7 @@ class SplatsSnapshot(Snapshot):
         return self.trace(view, background)[0]
 
     def trace(self, view: View, background: Tensor):
-        """What a view sees, and a function from the slope of its colours (R, 3) to those of parameters."""
+        """Render a view; also return a function from gradients of colours (R, 3) to those of parameters."""
         rays, splats = view.rays().to(self.points.device), self.splats
         offset = self.points - rays.origins[0]
         order = offset.norm(dim=-1).argsort()  # all rays of a view begin at one place: one order for all

@@ -16,7 +16,7 @@ def noise(*shape, seed=0):
 
 
 def tinted(height, width):
-    """A warm-coloured picture textured all over, its spectrum falling with frequency as natural ones' do."""
+    """Make a warm-coloured textured image with the spectrum of natural images."""
     rows, columns = torch.fft.fftfreq(height)[:, None], torch.fft.rfftfreq(width)[None]
     falling = 1 / (rows**2 + columns**2).sqrt().clamp_min(1 / height)
     gray = torch.fft.irfft2(torch.fft.rfft2(noise(height, width) - 0.5) * falling, s=(height, width))

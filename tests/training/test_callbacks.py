@@ -23,7 +23,9 @@ def watched_run(folder, *callbacks, steps=STEPS):
     """A run of one short stage over the ball, with a TensorBoard logger as the command has it."""
     run = make_run(folder, [stage(iterations=steps)], callbacks=callbacks)
     logger = partial(TensorBoardLogger, name="tensorboard", version="")
-    run.make_trainer = lambda where, own: trainer(own, logger(save_dir=str(where)))
+    run.make_trainer = lambda where, own: trainer(
+        own, logger=logger(save_dir=str(where)), default_root_dir=str(where)
+    )
     return run
 
 
@@ -33,7 +35,7 @@ def all_watchers():
 
 @pytest.fixture(scope="module")
 def watched(tmp_path_factory):
-    """A finished stage that everything watched: its module and its folder."""
+    """Return the module and folder of a finished stage with all callbacks."""
     folder = tmp_path_factory.mktemp("watched")
     return watched_run(folder, *all_watchers()).fit(), folder / "coarse"
 
@@ -46,7 +48,7 @@ def events(watched):
 
 
 class Terminal(io.StringIO):
-    """Pretends to be one."""
+    """A stream that claims to be a terminal."""
 
     def isatty(self):
         return True

@@ -28,7 +28,7 @@ def run(folder, callbacks=(), width=8, times=None):
 
 
 def module(folder, **changes):
-    """What such a run begins with."""
+    """Make the module that such a run begins with."""
     ours = run(folder, **changes)
     ours.datamodule.setup()
     return ours._module(ours.stages[0], None, None, 0)
@@ -139,7 +139,7 @@ HARM = {
 
 @pytest.mark.parametrize("harm", HARM)
 def test_a_grid_whose_parts_do_not_fit_is_refused(tmp_path, interrupted, harm):
-    """The kernels would read where nothing is, which ends the process."""
+    """Kernels would read out of bounds and crash the process."""
     content = torch.load(interrupted, weights_only=True)
     name, change = HARM[harm]
     change(content["state_dict"][GRID + name], content["state_dict"])

@@ -1,4 +1,4 @@
-"""What a stage leaves to the next: gathered as far as its method can tell, written and read whole."""
+"""The handover of a stage: what it contains, and that it is written and read correctly."""
 
 import json
 from dataclasses import replace

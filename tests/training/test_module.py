@@ -239,14 +239,14 @@ def test_without_a_schedule_all_bases_play():
 
 
 class Drawing(lightning.Callback):
-    """Draws from torch's generator when training begins, as somebody else's may."""
+    """Draw from torch's generator when training begins."""
 
     def on_train_start(self, *_):
         torch.rand(3)
 
 
 def test_what_is_drawn_when_training_begins_changes_nothing_after_it():
-    """A checkpoint's generator is put back last: a run that goes on draws as if it had not stopped."""
+    """A checkpoint's generator state is restored last, so that a continued run draws the same numbers."""
     made = module()
     checkpoint = _saved(made)
     made.on_load_checkpoint(checkpoint)

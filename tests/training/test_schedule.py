@@ -60,7 +60,7 @@ def test_a_stage_has_no_name_that_leads_out_of_the_run(name):
 
 
 def plan(share=1.0, **changes):
-    """A stage that waits for its budget."""
+    """Make a stage without its share of the budget."""
     numbers = {"num_voxels": [[0, 64]], "lr": {}}
     return StagePlan(share=share, objective=Objective({"photo": 1.0}), **(numbers | changes))
 

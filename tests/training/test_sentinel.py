@@ -16,7 +16,7 @@ NAN = float("nan")
 
 
 class Poison(lightning.Callback):
-    """Breaks a number at one step, and notes the bytes of the checkpoint before."""
+    """Break a number at some steps."""
 
     def __init__(self, what, *steps):
         self.what, self.steps = what, steps
@@ -57,14 +57,14 @@ def run(folder, poison, iterations=12, **changes):
 
 
 def broken(folder, poison, **changes):
-    """The message of a run that stops, and the bundle of its step 5."""
+    """Return the message of a run that stops, and the file of its step 5."""
     with pytest.raises(BrokenStep) as stopped:
         run(folder, poison, **changes).fit()
     return str(stopped.value), folder / "coarse" / "broken" / "step_5.pt"
 
 
 def again(folder, path):
-    """What a stored step shows when it is taken again by a run that has no data."""
+    """Repeat a stored step by a run without data; return what is found."""
     bundle = read_bundle(path)
     ours = make_run(folder / "elsewhere", [stage()], data=None)
     module = ours.rebuilt("coarse", bundle.scene)
@@ -75,7 +75,7 @@ def again(folder, path):
 
 @pytest.fixture(scope="module")
 def stopped(tmp_path_factory):
-    """A run that met a broken batch at step 5: its folder, what it said, and the stored step."""
+    """Return folder, message and stored step of a run with a broken batch at step 5."""
     folder = tmp_path_factory.mktemp("stopped")
     return folder, *broken(folder, Poison("batch", 5))
 

@@ -52,7 +52,7 @@ def whole(tmp_path_factory):
 
 
 class Crash(lightning.Callback):
-    """Ends without saving when a stage begins."""
+    """Exit without saving when the fine stage begins."""
 
     def on_train_start(self, trainer, module):
         if module.settings.name == "fine":
@@ -122,7 +122,7 @@ def test_a_mistake_in_a_later_stage_is_refused_before_anything_is_trained(tmp_pa
 
 
 class Diary(lightning.Callback):
-    """Notes what every step was trained with."""
+    """Record learning rate, bases, lattice and frames of every step."""
 
     def __init__(self):
         self.steps = []
@@ -200,7 +200,7 @@ def test_a_scene_of_one_time_needs_no_motion_and_no_rate_for_it(tmp_path):
 
 
 def psnr(module, data):
-    """Of every test image."""
+    """Return the PSNR of every test image."""
     found = []
     for target in data.targets("test"):
         drawn = module.render(target.frame.camera, target.moment, target.background).rgb
@@ -231,7 +231,7 @@ def test_a_sliding_ball_is_learned_at_all_times(tmp_path):
 
 
 class CtrlC(lightning.Callback):
-    """Presses it once or more in the middle of a step."""
+    """Press Ctrl-C once or more in the middle of a step."""
 
     def __init__(self, stage, step, times=1):
         self.stage, self.step, self.times = stage, step, times
@@ -244,14 +244,14 @@ class CtrlC(lightning.Callback):
 
 @pytest.fixture(autouse=True)
 def _listening():
-    """In the background of a shell Ctrl-C is ignored, and so it would be here."""
+    """Handle Ctrl-C, which is ignored if the tests run in the background of a shell."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
 
 
 def pressed(folder, *presses):
-    """Run until Ctrl-C ends it; what Lightning turned into an exit was one."""
+    """Run until Ctrl-C ends it; Lightning turns KeyboardInterrupt into SystemExit."""
     before = signal.getsignal(signal.SIGINT)
     with pytest.raises(SystemExit) as leaving:
         run(folder, [CtrlC(*presses)]).fit()

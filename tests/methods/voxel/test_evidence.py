@@ -99,7 +99,7 @@ def test_a_wave_needs_its_own_cosine():
 
 
 def samples(views=24, places=30, seed=0):
-    """Places (P, 3), unit directions (P, 3) and the picture of each: every picture sees all from one side."""
+    """Return places (P, 3), directions (P, 3) and images (P,); each image sees all places from one side."""
     generator = torch.Generator().manual_seed(seed)
     where = torch.rand(places, 3, generator=generator).repeat(views, 1) + 0.01
     towards = torch.nn.functional.normalize(torch.randn(views, 3, generator=generator), dim=-1)

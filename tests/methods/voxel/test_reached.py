@@ -1,4 +1,4 @@
-"""Everything that a run wraps is reached where a user looks for it: ``module.method.<part>``."""
+"""All parts of a fitted method are reached as ``module.method.<part>``."""
 
 from functools import partial
 

@@ -1,4 +1,4 @@
-"""Every term of the voxel methods is the pure function of its parts, and only what counts is computed."""
+"""Each loss term of the voxel methods applies the right function, and only terms that count are computed."""
 
 from dataclasses import replace
 from functools import partial
@@ -33,7 +33,7 @@ def rendering(seed):
 
 
 def looked(inpainted=True, moving=True, background=True):
-    """What the terms look at, all of it made up."""
+    """Make up what the terms are computed from."""
     truth = torch.rand(4, 3, generator=torch.Generator().manual_seed(9))
     generator = torch.Generator().manual_seed(3)
     index = torch.arange(60, dtype=torch.int32).reshape(LATTICE.shape)
@@ -62,7 +62,7 @@ def looked(inpainted=True, moving=True, background=True):
 
 
 def loss_of(objective, seen, number=0, terms=None):
-    """The loss of what was seen, as the platform sums it, and every term evaluated, raw."""
+    """Return the loss and the unweighted terms."""
     terms = voxel_terms(objective.literal) if terms is None else terms
     step = Step({name: lambda term=term: term(seen) for name, term in terms.items()}, torch.zeros(()))
     return total(step, objective.factors(number), {})
