@@ -1,6 +1,5 @@
 """What every test may ask for: the commands in this process, an empty folder."""
 
-import gc
 import importlib
 import logging
 from types import SimpleNamespace
@@ -19,13 +18,6 @@ ENVIRONMENT = (
     "TF_CPP_MIN_LOG_LEVEL",
     "THP_MEM_ALLOC_ENABLE",
 )
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _imports_are_no_garbage():
-    """Collect garbage fast, as every stage of a run does before it starts: leave out what is imported."""
-    gc.collect()
-    gc.freeze()
 
 
 @pytest.fixture
@@ -72,3 +64,12 @@ def in_tmp(tmp_path, monkeypatch):
     """The current directory, empty."""
     monkeypatch.chdir(tmp_path)
     return tmp_path
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _imports_are_no_garbage():
+    """Exempt imported modules from garbage collection, which every stage of a run does before it starts."""
+    import gc
+
+    gc.collect()
+    gc.freeze()
