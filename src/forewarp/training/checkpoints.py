@@ -121,11 +121,15 @@ def misfits(module: DynamicSceneModule, weights: dict) -> list[str]:
 
 
 def _shapes(weights: dict, module: DynamicSceneModule) -> dict[str, tuple | None]:
-    """Shapes by name; None for the entries that adopt a checkpoint's shape."""
+    """Return shapes (for dicts their keys) by name; None for entries that adopt a checkpoint's shape."""
     adopted = {f"method.{name}" for name in module.method.adopted()}
-    return {
-        k: tuple(v.shape) if torch.is_tensor(v) and k not in adopted else None for k, v in weights.items()
-    }
+
+    def shape(name: str, value: object) -> tuple | None:
+        if isinstance(value, dict):  # plain numbers by name
+            return tuple(sorted(map(str, value)))
+        return tuple(value.shape) if torch.is_tensor(value) and name not in adopted else None
+
+    return {name: shape(name, value) for name, value in weights.items()}
 
 
 def _read(path: Path) -> dict:
