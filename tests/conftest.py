@@ -40,3 +40,12 @@ def in_tmp(tmp_path, monkeypatch):
     """The current directory, empty."""
     monkeypatch.chdir(tmp_path)
     return tmp_path
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _imports_are_no_garbage():
+    """Exempt imported modules from garbage collection, which every stage of a run does before it starts."""
+    import gc
+
+    gc.collect()
+    gc.freeze()

@@ -15,13 +15,13 @@ from forewarp.data.module import SceneDataModule
 from forewarp.methods.voxel.effects.inpaint import UNet3d
 from forewarp.methods.voxel.effects.upsample import LearnedUpsampler
 from forewarp.methods.voxel.effects.view_dependence import SphericalHarmonics, ViewNetwork
+from forewarp.methods.voxel.model import Ground
 from forewarp.methods.voxel.stage import EFFECTS, VoxelStage
-from forewarp.methods.voxel.start import Ground
 from forewarp.methods.voxel.terms import TERMS
 from forewarp.renderer import Renderer
 from forewarp.runs.build import build_run, model_of
 from forewarp.scene.box import Box, Lattice
-from forewarp.training.settings import StageSettings
+from forewarp.training.schedule import StageSettings
 from tests.support.configs import CONF, ROOT, composed, groups, options
 
 PRESETS, MODELS = options("preset"), options("model")
@@ -263,7 +263,7 @@ def test_each_number_of_a_method_is_taken_where_it_is_keyed(model):
     hypernerf = ["experiment=hypernerf", "data.scene=x", f"model={model}"]
     fast, faithful = composed(*hypernerf), composed(*hypernerf, "preset=faithful")
     assert [c.preset.bases for c in (fast, faithful)] == [8, 25]  # model x preset x experiment
-    assert fast.objective.fine.weights.still_points == 1e-2  # model x experiment
+    assert fast.objective.fine.weights.static_points == 1e-2  # model x experiment
     assert (fast.preset.rays, faithful.budget.iterations) == (4096, 120000)  # model x preset
     band, still = (composed(f"scene=specimen_{name}", f"model={model}") for name in ("band", "still"))
     assert (band.stage.fine.num_voxels, still.stage.coarse.num_voxels) == ([[0, 15625]], [[0, 46656]])

@@ -202,7 +202,7 @@ def test_captures_have_numbers_of_their_own_in_every_preset():
         assert config.data.scene == "broom2"
         assert config.model.background is not None
         assert config.stage.fine.num_voxels[-1][1] == 343000
-        assert config.objective.fine.weights.still_points == 1e-2
+        assert config.objective.fine.weights.static_points == 1e-2
 
 
 def test_where_minutes_bound_a_run_its_precision_counts():

@@ -18,9 +18,8 @@ from forewarp.runs.build import build_run
 from forewarp.runs.config import claim
 from forewarp.runs.config_files import configurations
 from forewarp.training.clock import now
-from forewarp.training.device import device_of
+from forewarp.training.device import device_name, device_of, peak_memory_bytes, versions
 from forewarp.training.module import DynamicSceneModule
-from forewarp.training.protocol import device_name, peak_memory_bytes, versions
 from forewarp.training.stages import Run
 from tests.stability.endurance import SMALL
 

@@ -15,9 +15,8 @@ from forewarp.methods.voxel.effects.motion import Motion
 from forewarp.methods.voxel.effects.upsample import LearnedUpsampler
 from forewarp.methods.voxel.effects.view_dependence import SphericalHarmonics
 from forewarp.methods.voxel.forward_warp import ForwardWarp
-from forewarp.methods.voxel.model import ForwardModel
+from forewarp.methods.voxel.model import ForwardModel, Ground
 from forewarp.methods.voxel.stage import VoxelStage
-from forewarp.methods.voxel.start import Ground
 from forewarp.methods.voxel.terms import TERMS
 from forewarp.renderer import Renderer
 from forewarp.training.objective import total

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from forewarp.ops.warmup import warm_up
-from forewarp.training.protocol import peak_memory_bytes, reset_peak_memory
+from forewarp.training.device import peak_memory_bytes, reset_peak_memory
 from tests.bench.timed_cases import CASES
 
 RUNS = [

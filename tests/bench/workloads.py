@@ -19,9 +19,8 @@ from forewarp.methods.voxel.effects.upsample import LearnedUpsampler
 from forewarp.methods.voxel.effects.view_dependence import ViewNetwork
 from forewarp.methods.voxel.forward_warp import ForwardWarp
 from forewarp.methods.voxel.method import VoxelMethod
-from forewarp.methods.voxel.model import ForwardModel
+from forewarp.methods.voxel.model import ForwardModel, Ground
 from forewarp.methods.voxel.stage import VoxelStage
-from forewarp.methods.voxel.start import Ground
 from forewarp.renderer import Renderer
 from forewarp.scene.batch import Batch, Observation
 from forewarp.scene.box import Box, Lattice
@@ -29,10 +28,9 @@ from forewarp.scene.camera import Camera, look_at
 from forewarp.scene.frame import Frame, Scene
 from forewarp.scene.rays import Rays
 from forewarp.scene.view import Moment, View
-from forewarp.training.curriculum import Curriculum
 from forewarp.training.module import DynamicSceneModule
 from forewarp.training.objective import Objective
-from forewarp.training.settings import StageSettings
+from forewarp.training.schedule import Curriculum, StageSettings
 
 OCCUPANCY, TIME, SOLID = 0.1, 0.5, 6.0
 RADIUS = (6 * OCCUPANCY / math.pi) ** (1 / 3)

@@ -1,4 +1,4 @@
-"""The method of docs/extending.md is taken from the page, fitted, and held to some of the contract."""
+"""Fit the example method of docs/extending.md and test it against a part of the contract."""
 
 import importlib.util
 import re

@@ -7,7 +7,7 @@ from forewarp.fields.trajectory import TrajectoryField
 from forewarp.fields.voxel_grid import VoxelGrid
 from forewarp.methods.voxel.backward_warp import Deformation
 from forewarp.ops.dct import dct_basis
-from forewarp.training.curriculum import Curriculum
+from forewarp.training.schedule import Curriculum
 from tests.support.hard_cases import LATTICE, check_finite, voxels
 
 pytestmark = pytest.mark.stability

@@ -36,7 +36,7 @@ def in_other_units(scene, factor):
 
 TERMS = (
     *("photo", "point_color", "background_entropy", "flow_l1", "tv_density", "tv_flow", "tv_depth"),
-    *("inpaint_diff", "still_points", "moving_opacity"),
+    *("inpaint_diff", "static_points", "moving_opacity"),
 )
 
 

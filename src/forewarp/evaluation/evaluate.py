@@ -21,8 +21,8 @@ from forewarp.scene.batch import Target
 from forewarp.scene.frame import Scene, spread
 from forewarp.scene.view import Rendering
 from forewarp.training.clock import now
+from forewarp.training.device import device_name, versions
 from forewarp.training.module import DynamicSceneModule
-from forewarp.training.protocol import device_name, versions
 
 _SHEET_SIDE = 300  # least pixels of the shorter side of a picture on a sheet
 

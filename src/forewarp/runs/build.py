@@ -13,10 +13,10 @@ from omegaconf import DictConfig, OmegaConf
 from forewarp.evaluation.measure import measure
 from forewarp.files import read_json
 from forewarp.runs.config import saved_config
-from forewarp.training.budget import StagePlan, seconds_after, share_out
 from forewarp.training.callbacks import StageProgress
 from forewarp.training.device import check_precision, device_of
 from forewarp.training.module import DynamicSceneModule
+from forewarp.training.schedule import StagePlan, seconds_after, share_out
 from forewarp.training.stages import Run
 
 

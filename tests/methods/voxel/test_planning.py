@@ -1,4 +1,4 @@
-"""What evidence and trials come to, and the number that each decision names."""
+"""Decisions from evidence and trials, and the numbers that justify them."""
 
 from dataclasses import replace
 
@@ -6,9 +6,8 @@ import pytest
 
 from forewarp.methods.effect import Asked, Begin, Rival
 from forewarp.methods.voxel import planning as decisions
-from forewarp.methods.voxel.evidence import Movement
+from forewarp.methods.voxel.evidence import Movement, Residual
 from forewarp.methods.voxel.planning import VoxelEvidence, VoxelPlanning
-from forewarp.methods.voxel.residual import Residual
 from forewarp.report.gain import Gain
 from forewarp.scene.pictures import Pictures
 
@@ -131,7 +130,7 @@ def test_the_price_is_what_fewer_steps_cost_on_the_curve_that_was_seen():
 
 
 def asked(trials=True, **typed):
-    """A run that is planned, with what was typed for it."""
+    """Make a run to plan, with overrides that the user typed."""
     stages = {"coarse": {"num_voxels": [[0, 1000]]}, "fine": {"num_voxels": [[0, 8000], [0.5, 27000]]}}
     on = {effect.name: effect.on for effect in decisions.EFFECTS}
     typed = {key.replace("__", "/"): value for key, value in typed.items()}
@@ -139,7 +138,7 @@ def asked(trials=True, **typed):
 
 
 def walk(found, asked, *answers):
-    """The coarse stages that a plan asks for, where its rivals are answered so."""
+    """Return the coarse stages that a plan asks for, given the answers to its rivals."""
     steps, said, heard = VoxelPlanning().coarse(found, asked), [], iter(answers)
     answer = None
     while True:

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from forewarp.training import protocol
-from forewarp.training.protocol import peak_memory_bytes, reset_peak_memory
+from forewarp.training import device
+from forewarp.training.device import peak_memory_bytes, reset_peak_memory
 
 CLEARED = Path("/proc/self/clear_refs")
 
@@ -48,7 +48,7 @@ def test_what_earlier_runs_left_in_a_circle_does_not_count(on_the_cpu):
 
 
 def test_elsewhere_it_is_that_of_the_process(on_the_cpu, monkeypatch, tmp_path):
-    monkeypatch.setattr(protocol, "_PROCESS", tmp_path / "nowhere")
+    monkeypatch.setattr(device, "_PROCESS", tmp_path / "nowhere")
     reset_peak_memory()  # does nothing, and says nothing
     unit = 1 if sys.platform == "darwin" else 1024
     assert peak_memory_bytes() == resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
@@ -60,7 +60,7 @@ NAMES = [("processor : 0\nmodel name\t: A Thing 9\n", "A Thing 9"), (None, "arm"
 @pytest.mark.parametrize(("lines", "name"), NAMES)
 def test_a_machine_is_called_by_its_processor(lines, name, monkeypatch, tmp_path):
     monkeypatch.setattr(platform, "processor", lambda: "arm")
-    monkeypatch.setattr(protocol, "_PROCESSOR", tmp_path / "cpuinfo")
+    monkeypatch.setattr(device, "_PROCESSOR", tmp_path / "cpuinfo")
     if lines is not None:
         (tmp_path / "cpuinfo").write_text(lines)
-    assert protocol.device_name(torch.device("cpu")) == name
+    assert device.device_name(torch.device("cpu")) == name
