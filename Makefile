@@ -4,8 +4,8 @@
 PYTHON ?= python3
 BIN := .venv/bin
 DEMO := runs/demo
-# Of accuracy-time and price-list: a folder of D-NeRF scenes (none: the procedural vehicle), a scene of it, minutes of
-# training a run, and, where not all of them are wanted, the variants (conf/variant) and how many seeds.
+# For accuracy-time and price-list: a folder of D-NeRF scenes (none: the procedural vehicle), a scene of it, minutes of
+# training a run, how many seeds, and, to compare less than sweeps/price_list.yaml does, CHANGES="preset.rays=1024,2048".
 DATA ?=
 SCENE ?= jumpingjacks
 SCENES ?= jumpingjacks hook
@@ -13,17 +13,19 @@ MINUTES ?= 3
 DEVICE ?= gpu
 SHELL := bash
 .SHELLFLAGS := -o pipefail -c
-# Large pages, as the commands set them themselves; one thread, as threads that wait for a busy core tell nothing.
+# Large memory pages, as the commands use; one thread, as threads that wait for a busy core spoil the timing.
 MEASURE := OMP_NUM_THREADS=1 OMP_WAIT_POLICY=passive THP_MEM_ALLOC_ENABLE=1
-MORE = budget.minutes=$(MINUTES) $(if $(VARIANTS),variant=$(VARIANTS)) $(SEED) $(if $(THREADS),threads=$(THREADS))
+MORE = budget.minutes=$(MINUTES) $(SEED) $(if $(THREADS),threads=$(THREADS))
 comma := ,
-# SEEDS=3: each job three times; SEEDS=4,7: with these.
+# SEEDS=3: run each job with seeds 0, 1 and 2; SEEDS=4,7: with these.
 SEED = $(if $(SEEDS),$(if $(findstring $(comma),$(SEEDS)),seed,seeds)=$(SEEDS))
-# Of what runs side by side, lines begin with whose they are; Ctrl-C is for the run, which has more to say.
+# Begin each line of jobs that run side by side with the job's name; leave Ctrl-C to the job itself.
 SAYS = 2>&1 | { trap '' INT; sed -u 's/^/$@ | /'; }
-SWEEP = $(BIN)/forewarp-train --multirun sweeps=accuracy_time
+# All changes of the price list; with CHANGES the reference, then these.
+SWEEP = sweep() { $(BIN)/forewarp-train --multirun "$$@" $(MORE); }; \
+	compare() { $(if $(CHANGES),sweep sweeps=accuracy_time "$$@" && sweep sweeps=accuracy_time "$$@" $(CHANGES),sweep sweeps=price_list "$$@"); }
 space := $(subst ,, )
-# A job that failed has been named and stops no other; make ends with its status. Only an interruption ends it all.
+# A failed job has printed its error and stops no other job; make ends with its status. Only Ctrl-C ends everything.
 GO_ON = || { status=$$?; [ $$status -lt 128 ] || exit $$status; }
 
 help: ## show this list
@@ -78,16 +80,16 @@ bench-gpu: ## steps, frames and PSNR against seconds on a GPU [DATA= SCENES="a b
 	$(BIN)/python -m tests.bench.device --device $(DEVICE) --minutes $(MINUTES) $(if $(SMALL),--small) \
 		$(if $(DATA),--data $(DATA) --scenes $(SCENES))
 
-accuracy-time: ## sweep choices against training time and draw it [DATA= SCENE= MINUTES= VARIANTS=a,b SEEDS=3]
-	status=0; $(SWEEP) $(if $(DATA),experiment=dnerf data.root=$(DATA) data.scene=$(SCENE)) $(MORE) $(GO_ON); \
+accuracy-time: ## sweep choices against training time and draw it [DATA= SCENE= MINUTES= CHANGES= SEEDS=3]
+	status=0; $(SWEEP); compare $(if $(DATA),experiment=dnerf data.root=$(DATA) data.scene=$(SCENE)) $(GO_ON); \
 	$(BIN)/forewarp-report kind=accuracy_time out=docs/results && exit $$status
 
 price-list: SEEDS ?= 2
 price-list: ## what each choice costs and brings, on the vehicle and two real scenes [DATA= SCENES="a b" MINUTES=]
 	@test -n "$(DATA)" || { echo "price-list: expected DATA=<folder of D-NeRF scenes>"; exit 2; }
-	status=0; $(SWEEP) $(MORE) $(GO_ON); \
+	status=0; $(SWEEP); compare $(GO_ON); \
 	for scene in $(SCENES); do \
-		$(SWEEP) experiment=dnerf data.root=$(DATA) data.scene=$$scene $(MORE) $(GO_ON); \
+		compare experiment=dnerf data.root=$(DATA) data.scene=$$scene $(GO_ON); \
 	done; \
 	$(BIN)/forewarp-report kind=price_list out=docs/results && exit $$status
 
@@ -101,7 +103,7 @@ ifeq ($(DATA),)
 	$(BIN)/forewarp-report kind=effects && exit $$status
 else
 	@status=0; \
-	for choice in ablation=auto ablation=all_effects ablation=full "ablation=null variant=base"; do \
+	for choice in ablation=auto ablation=all_effects ablation=full ablation=base; do \
 		$(COMPARE) $(SEED) $$choice paths.scenes=$(DATA) scene=$(subst $(space),$(comma),$(addprefix dnerf_,$(SCENES))) \
 			budget.minutes=$(MINUTES) plan.minutes=$(MINUTES) plan.seconds=40 plan.trial_seconds=40 $(GO_ON); \
 	done; \

@@ -30,13 +30,13 @@ What one types most (options such as --multirun or --config-dir=FOLDER stand bef
   plan=FILE                           as a plan says; what is typed beside it wins
   evaluate=false                      no test views at the end
   data.held_out=N                     set N training views aside: a curve of their PSNR against training time
-  variant=NAME                        one change against preset=fast, as the price list has it
   scene=DATASET_NAME                  as scene=dnerf_hook: a scene of the paper below paths.scenes=FOLDER
   ablation=NAME                       what the paper takes away, from ablation=full
   launcher=local|joblib|ray|slurm|submitit   of --multirun: where its jobs run
   ~stage.fine                         drop a stage
   --multirun seeds=3                  one run after another; --multirun sweeps=methods: a prepared sweep
-  --multirun sweeps=accuracy_time variant=base,unet_16 seeds=2      what choices cost: see forewarp-report
+  --multirun sweeps=accuracy_time preset.rays=1024,2048    what choices cost: see forewarp-report
+  --multirun sweeps=price_list seeds=2                     the same of every choice, one at a time
 
 A run's folder holds config.yaml, a folder a stage (checkpoint, handover.json, TensorBoard events, images),
 images/ of the test views, per_image.json and metrics.json; where there are views that nothing learns from
@@ -149,16 +149,7 @@ def refuse_seeds(config) -> None:
 
 
 def refuse_two_models(config) -> None:
-    """Refuse a variant or an ablation of another method, and ``variant=backward`` beside an ablation."""
-    from hydra.core.hydra_config import HydraConfig
-
-    chosen = HydraConfig.get().runtime.choices if HydraConfig.initialized() else {}
-    both = chosen.get("variant") == "backward" and chosen.get("ablation") is not None
-    if both and config.model.name != "backward":
-        raise ValueError(
-            f"variant: expected none beside ablation={chosen.get('ablation')}, which is of model=forward, "
-            "but got backward; leave one of them out, or use model=backward"
-        )
+    """Refuse an ablation of another method."""
     known = config.get("variant") or {}
     if config.model.name not in known.get("of", [config.model.name]):
         raise ValueError(
