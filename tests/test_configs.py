@@ -24,7 +24,7 @@ from tests.support.configs import CONF, composed, groups, options
 
 PRESETS, MODELS = options("preset"), options("model")
 EXPERIMENTS = options("experiment")
-# Crossed with each other below; or jobs of tests/test_sweeps.py (scene, ablation); or always on (callbacks, ...).
+# Crossed with each other below, jobs of tests/test_sweeps.py (scene, ablation), or always on.
 ELSEWHERE = {"preset", "model", "experiment", "stage", "objective", "data", "scene", "ablation"}
 ELSEWHERE |= {"callbacks", "hydra", "paths"}
 CHOICES = [(group, option) for group in groups() if group not in ELSEWHERE for option in options(group)]

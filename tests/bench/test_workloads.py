@@ -1,9 +1,10 @@
 """What is timed does what it says: the savings that are exact change nothing, and work follows matter."""
 
+from functools import cache
+
 import pytest
 import torch
 
-from forewarp.ops.splat import average_splat
 from forewarp.training.objective import total
 from tests.bench.timed_cases import CASES
 from tests.bench.workloads import make_module
@@ -12,8 +13,9 @@ from tests.stability.twin import implementation
 SIDE, RAYS = 20, 400
 
 
+@cache
 def taken(dense, threshold=0.0):
-    """A step's pictures, its loss, and the gradient of the features by voxel (X, Y, Z, C)."""
+    """Take a step; returns its pictures, what it looked at, the features' gradient (X, Y, Z, C) and the field."""
     module, batch = make_module(SIDE, dense, rays=RAYS, shift=2.0, threshold=threshold)
     with implementation("reference" if dense else "Numba"):
         factors = module.objective.factors(0)
@@ -59,15 +61,3 @@ def test_every_operator_can_be_timed(name, dense):
 
 def test_there_are_four_sizes_to_fit_a_slope_to():
     assert all(len(case.sizes) >= 4 and set(case.dense_sizes) <= set(case.sizes) for case in CASES.values())
-
-
-def test_a_splat_of_a_tenth_of_80_cubed_is_exact():
-    generator = torch.Generator().manual_seed(0)
-    voxels = (torch.rand(80, 80, 80, generator=generator) < 0.1).nonzero()
-    source = torch.randn(len(voxels), 13, generator=generator)
-    positions = (voxels + torch.randn(len(voxels), 3, generator=generator)).float()
-    with implementation("reference"):
-        exact = average_splat(source.double(), positions.double(), (80, 80, 80))
-    found = average_splat(source, positions, (80, 80, 80))
-    assert torch.equal(found.index, exact.index)
-    assert float((found.values - exact.values).abs().max()) < 1e-5

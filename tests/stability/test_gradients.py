@@ -153,11 +153,13 @@ CHECKS = {
 }
 
 
-@pytest.mark.parametrize("numba", [False, True])
-@pytest.mark.parametrize("operator", CHECKS)
+KERNELS = ("trilinear", "average_splat")
+
+
+@pytest.mark.parametrize(
+    ("operator", "numba"), [*((name, False) for name in CHECKS), *((name, True) for name in KERNELS)]
+)
 def test_gradients_equal_finite_differences(operator, numba, monkeypatch):
-    if numba and operator not in ("trilinear", "average_splat"):
-        pytest.skip("has no kernel")
     if numba:
         pytest.importorskip("numba")
     monkeypatch.setattr(backend, "numba_installed", lambda: numba)

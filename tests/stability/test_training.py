@@ -75,7 +75,7 @@ def all_finite(module):
     return all(p.isfinite().all() for p in module.parameters())
 
 
-@pytest.mark.parametrize("factor", [2.0**-10, 1e-3, 1e3, 2.0**20])
+@pytest.mark.parametrize("factor", [1e-3, 2.0**20])
 def test_no_term_of_the_loss_depends_on_the_unit_of_length(tmp_path, factor):
     """The first steps, all terms on, are the same but for rounding."""
     weights = dict.fromkeys(TERMS, 0.1)
