@@ -1,4 +1,4 @@
-"""Tables of what was timed."""
+"""The tables of the benchmark."""
 
 import pytest
 

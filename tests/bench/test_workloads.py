@@ -1,4 +1,4 @@
-"""What is timed does what it says: the savings that are exact change nothing, and work follows matter."""
+"""The sparse step that is timed computes what the dense one does, with less work."""
 
 from functools import cache
 
@@ -15,7 +15,7 @@ SIDE, RAYS = 20, 400
 
 @cache
 def taken(dense, threshold=0.0):
-    """Take a step; returns its pictures, what it looked at, the features' gradient (X, Y, Z, C) and the field."""
+    """Take a step; return its pictures, the step, the features' gradient (X, Y, Z, C) and the radiance."""
     module, batch = make_module(SIDE, dense, rays=RAYS, shift=2.0, threshold=threshold)
     with implementation("reference" if dense else "Numba"):
         factors = module.objective.factors(0)
@@ -29,7 +29,7 @@ def taken(dense, threshold=0.0):
     return drawn, step, gradient, radiance
 
 
-# No colour for samples of less weight than 1e-4 is the one saving that is not exact.
+# The one saving that is not exact: no colour for samples of less weight than 1e-4.
 @pytest.mark.parametrize(("threshold", "most"), [(0.0, 1e-4), (1e-4, 5e-4)])
 def test_a_step_on_what_is_occupied_draws_what_the_dense_one_draws(threshold, most):
     pictures, step, _, radiance = taken(False, threshold)

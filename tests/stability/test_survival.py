@@ -49,7 +49,7 @@ SMALL = [
 
 @pytest.fixture(scope="module")
 def scenes(tmp_path_factory):
-    """A folder with the scene ``vehicle``, 16 x 16 pixels."""
+    """Write the scene ``vehicle``, 16 x 16 pixels; return the folder above it."""
     root = tmp_path_factory.mktemp("scenes")
     synthesize(root / "vehicle", size=16, frames=8, test_views=(1, 1, 1), val_views=1, samples_per_pixel=1)
     return root
@@ -63,7 +63,7 @@ def zygote():
 
 @pytest.fixture(scope="module")
 def begin(zygote, scenes, tmp_path_factory):
-    """``begin(folder, *more, **limits)`` runs the command to its end: exit status and what it said."""
+    """``begin(folder, *more, **limits)`` runs the command to its end; returns exit status and output."""
     log = tmp_path_factory.mktemp("logs") / "log.txt"
 
     def call(folder, *more, **limits):
@@ -77,14 +77,14 @@ def begin(zygote, scenes, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def whole(begin, tmp_path_factory):
-    """The folder of an undisturbed run."""
+    """Return the folder of an undisturbed run."""
     folder = tmp_path_factory.mktemp("whole") / "run"
     assert begin(folder)[0] == 0, begin.log.read_text()
     return folder
 
 
 def end(folder):
-    """All that a run ends with and that no clock has touched."""
+    """Read all results of a run that do not depend on the clock."""
     left = {}
     for stage in ("coarse", "fine"):
         content = torch.load(folder / stage / "last.ckpt", weights_only=True)
@@ -120,7 +120,7 @@ def differences(folder, whole):
 
 
 def goes_on(begin, folder, whole):
-    """Continue a run to its end, which must be that of the undisturbed one."""
+    """Continue a run to its end; the result must equal the undisturbed run's."""
     status, said = begin(folder)
     assert status == 0, said
     assert differences(folder, whole) == []
@@ -142,7 +142,7 @@ def test_killed_while_a_checkpoint_takes_its_place(begin, whole, tmp_path, momen
     assert not list((tmp_path / "run").rglob("last.ckpt.part"))
 
 
-# Which file a run dies at, its number among those of that name and the moment; and where that leaves it.
+# (count, moment, file): die at the count-th write of that file; then the phase that the run is left in.
 PHASES = {
     "checkpoint writing": ((1, "half", "coarse/last.ckpt"), "before coarse"),
     "coarse": ((2, "after", "coarse/last.ckpt"), "coarse"),
@@ -158,7 +158,7 @@ PHASES = {
 
 @pytest.mark.slow
 def test_killed_in_every_phase(begin, whole, tmp_path):
-    """One run dies in one phase after the other."""
+    """One run is killed in one phase after another."""
     for phase, (die, left) in PHASES.items():
         assert begin(tmp_path / "run", die=die)[0] == -signal.SIGKILL, phase
         assert where(tmp_path / "run") == left, phase
@@ -197,13 +197,13 @@ def test_killed_at_random_moments(zygote, begin, scenes, whole, tmp_path, seed):
             run += 1
         else:
             deaths.append(where(folder))
-            kills += deaths[-1] != "before coarse"  # where there is nothing yet to be lost
+            kills += deaths[-1] != "before coarse"  # earlier kills lose nothing
     goes_on(begin, tmp_path / str(run), whole)
     print(f"\nseed {seed}: killed in {', '.join(deaths)}")
 
 
 def where(folder):
-    """The phase that a killed run had come to."""
+    """Return the phase that a killed run had reached."""
     done = [stage for stage in ("coarse", "fine") if (folder / stage / "done.json").is_file()]
     if "fine" in done:
         return "evaluation"
@@ -213,7 +213,7 @@ def where(folder):
 
 @pytest.mark.slow
 def test_killed_at_every_kind_of_file(begin, whole, tmp_path):
-    """From the last checkpoint of a stage on: handover, notes, pictures, numbers."""
+    """Kill while files after a stage's last checkpoint are written: handover, notes, pictures, numbers."""
     shutil.copytree(whole, tmp_path / "run")
     for stage in ("coarse", "fine"):
         for name in ("handover.pt", "handover.json", "done.json"):
@@ -245,7 +245,7 @@ def test_no_harmed_note_is_taken_for_one(begin, whole, tmp_path, harm):
 
 
 def refused(status, said, *words):
-    """Whether a command ended with one line of error that holds these words."""
+    """Assert that a command ended with one line of error that holds these words."""
     lines = [line for line in said.splitlines() if "error:" in line]
     assert status not in (0, 1), said
     assert "Traceback" not in said
@@ -269,7 +269,7 @@ def test_a_harmed_checkpoint_is_refused_by_name(begin, whole, tmp_path, harm):
 
 @pytest.fixture
 def small_disk(tmp_path):
-    """A file system of 600 KB."""
+    """Mount a file system of 600 KB."""
     place = tmp_path / "disk"
     place.mkdir()
     made = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=600k", "tmpfs", place], capture_output=True)
