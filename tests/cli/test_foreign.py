@@ -183,7 +183,7 @@ def test_a_broken_step_is_taken_again_with_trust(refused, in_tmp, capsys):
 
 
 def test_seeds_are_swept_scored_and_reported(forewarp, in_tmp, monkeypatch):
-    words = ["--multirun", *DISC, "seeds=2", "run=runs/disc/${variant.name}-seed${seed}", "variant=base"]
+    words = ["--multirun", *DISC, "seeds=2", "run=runs/disc/${variant.name}-seed${seed}", "ablation=base"]
     done = forewarp("train", *words)
     assert done.status == 0, done.err
     runs = sorted(in_tmp.glob("runs/disc/base-seed*"))

@@ -1,4 +1,4 @@
-"""The script of docs/scripts.md is taken from the page and run on a small run."""
+"""Run the script of docs/scripts.md on a small run."""
 
 import re
 import shutil

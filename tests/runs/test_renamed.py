@@ -33,6 +33,8 @@ from tests.support.configs import composed
         ("model/view=none", "model/view_dependence=none;"),
         ("model.view.width=32", "model.view_dependence.width=32;"),
         ("~suits", "no such word;"),
+        ("variant=base,unet_16", "no such word; type what a variant changed, as preset.rays=1024;"),
+        ("ablation=voxels_20,voxels_40", "no such word; sweeps=resolution has these sizes"),
     ],
 )
 def test_a_renamed_word_is_refused_with_the_new_one(word, now):

@@ -48,14 +48,7 @@ def refuse_seeds(config: DictConfig) -> None:
 
 
 def refuse_two_models(config: DictConfig) -> None:
-    """Refuse a variant or an ablation of another method than ``model``."""
-    chosen = HydraConfig.get().runtime.choices if HydraConfig.initialized() else {}
-    both = chosen.get("variant") == "backward" and chosen.get("ablation") is not None
-    if both and config.model.name != "backward":
-        raise ValueError(
-            f"variant: expected none beside ablation={chosen.get('ablation')}, which is of model=forward, "
-            "but got backward; leave one of them out, or use model=backward"
-        )
+    """Refuse an ablation of another method than ``model``."""
     known = config.get("variant") or {}
     if config.model.name not in known.get("of", [config.model.name]):
         raise ValueError(

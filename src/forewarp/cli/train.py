@@ -30,13 +30,13 @@ What one types most (options such as --multirun or --config-dir=FOLDER come firs
   plan=FILE                           fit what a plan says; an override typed beside it wins
   evaluate=false                      do not measure at the end
   data.held_out=N                     set N training views aside and record their PSNR against training time
-  variant=NAME                        one change to preset=fast, as in the price list
   scene=DATASET_NAME                  a scene of the paper below paths.scenes=FOLDER, such as scene=dnerf_hook
   ablation=NAME                       an ablation of the paper; ablation=full is its whole method
   launcher=local|joblib|ray|slurm|submitit   where the jobs of --multirun run
   ~stage.fine                         drop a stage
   --multirun seeds=3                  one run after another; --multirun sweeps=methods: a prepared sweep
-  --multirun sweeps=accuracy_time variant=base,unet_16 seeds=2      what choices cost; see forewarp-report
+  --multirun sweeps=accuracy_time preset.rays=1024,2048    what choices cost; see forewarp-report
+  --multirun sweeps=price_list seeds=2                     the same for every choice, one at a time
 
 A run's folder holds config.yaml, a folder for each stage (checkpoint, handover.json, TensorBoard events,
 images), images/ of the test views, per_image.json and metrics.json. With data.held_out or validation views it

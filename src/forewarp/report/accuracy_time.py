@@ -90,7 +90,6 @@ def variants(groups: Groups, target: float) -> Table:
         rows.append(
             [
                 variant,
-                group[0].about,
                 minutes,
                 len(group),
                 reached(group, target),
@@ -99,7 +98,7 @@ def variants(groups: Groups, target: float) -> Table:
                 Estimate.of([sum(d["steps"] for d in result.stages.values()) for result in group]),
             ]
         )
-    columns = [Column("variant"), Column("what"), Column("minutes", 1), Column("seeds", 0)]
+    columns = [Column("variant"), Column("minutes", 1), Column("seeds", 0)]
     columns += [Column(f"seconds to {target:g} dB", 1), Column("PSNR at the end"), Column("EPE", 4)]
     return Table([*columns, Column("steps", 0)], rows, "At equal minutes; the steps that were done in them:")
 

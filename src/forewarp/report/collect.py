@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -62,19 +62,35 @@ class Result:
 
     @property
     def variant(self) -> str:
-        """The variant's name; without one the method and its preset."""
+        """Name what tells this run from others of its scene.
+
+        That is its ablation; of ``sweeps=accuracy_time`` and ``price_list`` the overrides that were typed
+        (``base`` without any); of all other runs the method and its preset.
+        """
         known = self.config.get("variant") or {}
-        return known.get("name") or f"{self.config['model']['name']}-{self.config['preset']['name']}"
+        if "name" in known:
+            return known["name"] or "base"
+        return f"{self.config['model']['name']}-{self.config['preset']['name']}"
 
     @property
     def about(self) -> str:
         """What the variant changes, in a phrase."""
         return (self.config.get("variant") or {}).get("about", "")
 
-    @property
-    def against(self) -> str:
-        """The variant that this one is compared with."""
-        return (self.config.get("variant") or {}).get("against", "base")
+    def against(self, variants: Iterable[str]) -> str:
+        """Choose the one of ``variants`` that this run is compared with.
+
+        That is the one its config names, or else the one with most of this run's overrides and no others.
+
+        >>> run = Result(Path("run"), {"variant": {"name": "a=1 b=2 c=3"}})
+        >>> run.against(["base", "a=1", "a=1 b=2", "a=1 d=4", "a=1 b=2 c=3"])
+        'a=1 b=2'
+        """
+        if named := (self.config.get("variant") or {}).get("against"):
+            return named
+        own = set(self.variant.split())
+        inside = [name for name in variants if set(name.split()) < own]
+        return max(inside, key=lambda name: len(name.split()), default="base")
 
     @property
     def effects(self) -> str:

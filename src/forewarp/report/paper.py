@@ -118,7 +118,7 @@ def figures_of(results: Sequence[Result], out: Path, curves: Path | None) -> tup
 
 
 def _draw(results: Sequence[Result], out: Path) -> list[tuple[str, Path | None, list[Result]]]:
-    sides = [run for run in results if run.variant.startswith("voxels_")]
+    sides = [run for run in results if paper_figures.RESOLUTION.match(run.variant)]
     found = [("Resolution", paper_figures.draw_resolution(out / "paper-resolution.png", sides), sides)]
     plain = [run for run in results if row_of(run).variant == "plain"]
     for scene, both in _pairs(plain).items():

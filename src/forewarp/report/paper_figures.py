@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -13,18 +14,23 @@ from forewarp.report.collect import Result
 from forewarp.report.paper_tables import row_of
 from forewarp.report.tables import Estimate
 
+RESOLUTION = re.compile(r"resolution |voxels_\d")  # begins a variant of sweeps=resolution, now and before 0.3
 GAP = 4  # pixels between the parts of a sheet
 
 
 def draw_resolution(path: Path, results: Sequence[Result]) -> Path | None:
-    """Draw PSNR against the voxels along a side, of the variants ``voxels_<N>``; None of only one."""
+    """Draw PSNR against voxels along a side, a line a scene, of runs of ``sweeps=resolution``.
+
+    Returns None where no scene has two sizes.
+    """
     scenes: dict[str, dict[int, list[float]]] = {}
     for run in results:
-        name, _, side = run.variant.rpartition("_")
-        if name == "voxels" and side.isdigit() and "psnr" in run.numbers:
+        fine = run.config["stage"]["fine"]
+        side = round(fine.get("num_voxels", fine.get("voxels"))[-1][1] ** (1 / 3))
+        if "psnr" in run.numbers:
             row = row_of(run)
             line = f"{run.scene}, {row.model}, {row.preset}, {row.minutes or row.iterations:g}"
-            scenes.setdefault(line, {}).setdefault(int(side), []).append(run.numbers["psnr"])
+            scenes.setdefault(line, {}).setdefault(side, []).append(run.numbers["psnr"])
     scenes = {scene: sides for scene, sides in scenes.items() if len(sides) > 1}
     if not scenes:
         return None

@@ -57,13 +57,14 @@ def write_price_list(runs: Path, out: Path) -> list[Path]:
 
 def references(results: Sequence[Result]) -> Table:
     """List the numbers of the runs that others are compared with."""
-    names = {result.against for result in results}
+    variants = {result.variant for result in results}
+    names = {result.against(variants) for result in results}
     rows = []
     for (variant, _), group in grouped(results).items():
         if variant in names:
             values = [Estimate.of(_known(group, measure)) for measure in MEASURES]
-            rows.append([variant, group[0].about, len(group), *values])
-    columns = [Column("compared with"), Column("what"), Column("seeds", 0)]
+            rows.append([variant, len(group), *values])
+    columns = [Column("compared with"), Column("seeds", 0)]
     kind = {"all": "all test views", "time": "test views between the training times"}
     views = ", ".join(sorted({kind[result.ability] for result in results}))
     return Table([*columns, *MEASURES.values()], rows, f"Of {views}:")
@@ -72,15 +73,16 @@ def references(results: Sequence[Result]) -> Table:
 def changes(results: Sequence[Result]) -> Table:
     """List what every other variant changes."""
     own = {(result.variant, result.seed): result for result in results}
-    rows = []
+    variants, rows = sorted({result.variant for result in results}), []
     for (variant, _), group in grouped(results).items():
-        if variant == group[0].against:
+        against = group[0].against(variants)
+        if variant == against:
             continue
-        pairs = [(result, own.get((result.against, result.seed))) for result in group]
+        pairs = [(result, own.get((against, result.seed))) for result in group]
         numbers = [(result.numbers, before.numbers) for result, before in pairs if before is not None]
         values = [measure_effect(numbers, measure) for measure in MEASURES]
-        rows.append([variant, group[0].about, group[0].against, len(numbers), *values])
-    columns = [Column("variant"), Column("what"), Column("against"), Column("seeds", 0)]
+        rows.append([variant, against, len(numbers), *values])
+    columns = [Column("variant"), Column("against"), Column("seeds", 0)]
     for measure, column in MEASURES.items():
         signed = Column(column.name, column.digits, signed=True)
         columns.append(signed if measure in DIFFERENCES else Column(column.name, prefix="×"))

@@ -35,6 +35,17 @@ RENAMED = (
     (r"(objective(?:\.\w+)?\.weights)\.still_points(=.*)?", r"\1.static_points\2", SINCE_3),
     (r"model/view(=.*)", r"model/view_dependence\1", SINCE_3),
     (r"model\.view([.=].*)?", r"model.view_dependence\1", SINCE_3),
+    (r"variant=base", "ablation=base", SINCE_3),
+    (
+        r"variant=.*",
+        None,
+        "type what a variant changed, as preset.rays=1024; sweeps/price_list.yaml lists all that there were",
+    ),
+    (
+        r"ablation=.*voxels_\d+.*",
+        None,
+        "sweeps=resolution has these sizes since 0.3; one of them is stage.fine.num_voxels=[[0,512000]]",
+    ),
 )
 
 
