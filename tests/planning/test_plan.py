@@ -167,8 +167,8 @@ def test_what_is_no_plan_is_refused(tmp_path, text):
 def test_a_plan_of_an_earlier_version_is_to_be_made_anew(refused, in_tmp):
     (in_tmp / "plan.yaml").write_text("typed: [data.scene=x]\nwords: [model/motion=none]\nof: x\n")
     assert refused("train", "plan=plan.yaml") == (
-        "plan: expected the key overrides, but got words, as before version 0.3, in plan.yaml; make it anew with "
-        "forewarp-plan"
+        "plan: expected the key overrides, but got words, as before version 0.3, in plan.yaml; "
+        "make it anew with forewarp-plan"
     )
 
 
