@@ -1,4 +1,4 @@
-"""The house rules that a reader of imports and lengths can check."""
+"""Who imports whom, and how long files and functions are (docs/architecture.md)."""
 
 import ast
 from pathlib import Path
@@ -27,7 +27,7 @@ MAY_IMPORT = {
     "evaluation": LOWER | {"methods", "training"},
     "runs": LOWER | {"methods", "training", "evaluation", "data"},
     "planning": LOWER | {"methods", "training", "evaluation", "data", "report", "runs"},
-    "replay": {"cli"},
+    "replay": {"cli", "runs", "training"},
     "cli": LOWER | {"methods", "training", "evaluation", "data", "synth", "report", "runs", "planning"},
 }
 CONFIG = {"runs", "planning", "cli"}
@@ -46,19 +46,26 @@ ONLY_IN = {
     "matplotlib": {"report"},
     "torchvision": set(),
 }
-CONTRACT = {"method", "abilities", "effect", "rows"}  # files of methods/ that whoever stands above may name
-OWN_PARTS = {"radiance", "lattice", "lattices", "motion", "deformation", "inpainter"}  # of one method alone
+CONTRACT = {"method", "abilities", "effect", "rows"}  # files of methods/ that packages above may import
+OWN_PARTS = {
+    "radiance",
+    "lattice",
+    "lattices",
+    "motion",
+    "deformation",
+    "inpainter",
+}  # attributes of one method only
 FUNCTION_LINES, FILE_LINES = 60, 350
 REASON = "# long: "
 
 
 def part_of(file: Path) -> str:
-    """The package (or the module, at the top) that a file belongs to."""
+    """Return the package, or the module at the top, that a file belongs to."""
     return file.relative_to(SOURCE).parts[0].removesuffix(".py")
 
 
 def imports(tree: ast.AST):
-    """Every dotted module name that is imported, wherever it stands."""
+    """Yield every dotted name that is imported, also inside functions."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
@@ -68,7 +75,7 @@ def imports(tree: ast.AST):
 
 
 def breaches(part: str, tree: ast.AST) -> list[str]:
-    """Imports that the table does not allow to ``part``."""
+    """Return the imports that the table does not allow ``part``."""
     found = []
     for name in imports(tree):
         top, *rest = name.split(".")
@@ -80,12 +87,12 @@ def breaches(part: str, tree: ast.AST) -> list[str]:
 
 
 def above_methods(file: Path) -> bool:
-    """Whether a file stands above the methods and may know their contract alone."""
+    """Whether a file is above the methods, so that it may know only their contract."""
     return part_of(file) in ("training", "data", "report", "evaluation", "runs", "planning", "cli")
 
 
 def parts_named(tree: ast.AST) -> list[str]:
-    """What a file above the methods says of one method alone: imports beside the contract, and parts."""
+    """Return what a file above the methods names of a single method: imports and attributes."""
     found = [
         name
         for name in imports(tree)
@@ -95,7 +102,7 @@ def parts_named(tree: ast.AST) -> list[str]:
 
 
 def other_methods(file: Path, tree: ast.AST) -> list[str]:
-    """Imports of one method by another, or by the contract: what two share goes down a floor."""
+    """Return imports of one method by another, or by the contract."""
     own, names = file.relative_to(SOURCE / "methods").parts[0].removesuffix(".py"), []
     for name in imports(tree):
         if name.startswith("forewarp.methods.") and name.split(".")[2] not in CONTRACT | {own}:
@@ -104,13 +111,13 @@ def other_methods(file: Path, tree: ast.AST) -> list[str]:
 
 
 def own_lines(node: ast.FunctionDef) -> int:
-    """Lines of a function but for its docstring."""
+    """Count a function's lines without its docstring."""
     doc = node.body[0] if ast.get_docstring(node) else None
     return node.end_lineno - node.lineno + 1 - (doc.end_lineno - doc.lineno + 1 if doc else 0)
 
 
 def too_long(text: str) -> list[str]:
-    """What exceeds a ceiling without saying why."""
+    """Return what exceeds a limit without giving a reason."""
     lines = text.splitlines()
     found = [] if len(lines) <= FILE_LINES or REASON in lines[0] else [f"{len(lines)} lines"]
     for node in ast.walk(ast.parse(text)):

@@ -1,4 +1,4 @@
-"""``python -m tests.bench.device``: what a device reaches, printed: steps, frames, PSNR against seconds."""
+"""``python -m tests.bench.device``: print a device's seconds per step and frame, and PSNR against seconds."""
 
 from __future__ import annotations
 
@@ -15,12 +15,11 @@ from forewarp.cli.entry import quiet
 from forewarp.evaluation.accuracy_time import FILE, read_rows
 from forewarp.report.published import PAPER
 from forewarp.runs.build import build_run
-from forewarp.runs.folders import configurations
-from forewarp.runs.identity import claim
+from forewarp.runs.config import claim
+from forewarp.runs.config_files import configurations
 from forewarp.training.clock import now
-from forewarp.training.device import device_of
+from forewarp.training.device import device_name, device_of, peak_memory_bytes, versions
 from forewarp.training.module import DynamicSceneModule
-from forewarp.training.protocol import device_name, peak_memory_bytes, versions
 from forewarp.training.stages import Run
 from tests.stability.endurance import SMALL
 
@@ -41,17 +40,17 @@ TINY = (
 
 
 class StepTimes(lightning.Callback):
-    """Seconds from a step's end to the next one's, batch drawn and moved, by stage; a GPU has finished."""
+    """Record the seconds between the ends of steps, by stage, with the GPU synchronised."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, list[float]] = {}
 
     def on_train_start(self, trainer, module) -> None:
-        """Begin a stage."""
+        """Start the clock of a stage."""
         self._since = now()
 
     def on_train_batch_end(self, trainer, module, outputs, batch, batch_idx) -> None:
-        """What has passed since the last."""
+        """Record the seconds since the step before."""
         before, self._since = self._since, now()
         self.seconds.setdefault(module.settings.name, []).append(self._since - before)
 
@@ -59,17 +58,17 @@ class StepTimes(lightning.Callback):
         return bool(self.seconds)
 
     def __str__(self) -> str:
-        # The second half: the first has compilers, growing lattices and few frames in it.
+        # Of the second half: the first compiles, and has growing lattices and few frames.
         medians = {name: statistics.median(taken[len(taken) // 2 :]) for name, taken in self.seconds.items()}
         return ", ".join(f"{name} {1e3 * seconds:.1f} ms" for name, seconds in medians.items())
 
 
 def fit(overrides: Sequence[str]) -> tuple[Run, DynamicSceneModule, StepTimes]:
-    """The run that a command line of ``forewarp-train`` composes, fitted anew or as far as it is not."""
+    """Fit the run that these overrides of ``forewarp-train`` compose, or what is left of it."""
     with initialize_config_dir(str(configurations()), version_base="1.3"):
         config = compose("train", list(overrides))
     run, times = build_run(config), StepTimes()
-    claim(config)  # a folder fitted with other bounds is refused
+    claim(config)  # refuses a folder that was fitted with another config
     own = run.callbacks
     run.callbacks = lambda name, folder: [*own(name, folder), times]
     module = run.fit()
@@ -77,7 +76,7 @@ def fit(overrides: Sequence[str]) -> tuple[Run, DynamicSceneModule, StepTimes]:
 
 
 def frames(run: Run, module: DynamicSceneModule, size: int, repeats: int = 5) -> tuple[float, float]:
-    """Median seconds of a square picture: the first of its time, and another with the grid kept."""
+    """Return median seconds of a square picture: the first of its time, and another from the kept grid."""
     target = run.datamodule.targets("test")[0]
     view, first, again = target.frame.camera.resized(size, size), [], []
     for _ in range(repeats + 1):
@@ -92,7 +91,7 @@ def frames(run: Run, module: DynamicSceneModule, size: int, repeats: int = 5) ->
 
 
 def papers(scene: str) -> str:
-    """What the paper prints for a D-NeRF scene; empty for another."""
+    """Return the paper's PSNR of a D-NeRF scene as text; empty for other scenes."""
     printed = OmegaConf.load(PAPER).tables.dnerf_scenes
     ours = next(row["values"] for row in printed.rows if row["name"] == "Ours")
     columns = {group["scenes"][0]: 3 * i for i, group in enumerate(printed.groups)}
@@ -100,7 +99,7 @@ def papers(scene: str) -> str:
 
 
 def report(run: Run, module: DynamicSceneModule, times: StepTimes, size: int) -> None:
-    """Print steps and frames."""
+    """Print seconds per step and per frame."""
     first, again = frames(run, module, size)
     print(f"  steps: {times or 'fitted before'}; peak memory {peak_memory_bytes() / 2**30:.2f} GiB")
     print(
@@ -113,11 +112,11 @@ def report(run: Run, module: DynamicSceneModule, times: StepTimes, size: int) ->
 def main(arguments: Sequence[str] | None = None) -> None:
     """Fit and print."""
     parser = argparse.ArgumentParser(prog="python -m tests.bench.device", description=__doc__)
-    parser.add_argument("--device", default="gpu", help="gpu, or cpu to see that it runs")
-    parser.add_argument("--minutes", type=float, default=10.0, help="of training, a scene")
-    parser.add_argument("--steps", type=int, default=240, help="of preset=faithful, a sixth of them coarse")
+    parser.add_argument("--device", default="gpu", help="gpu, or cpu as a trial")
+    parser.add_argument("--minutes", type=float, default=10.0, help="of training for each scene")
+    parser.add_argument("--steps", type=int, default=240, help="with preset=faithful, a sixth of them coarse")
     parser.add_argument(
-        "--data", default=None, help="a folder of D-NeRF scenes; none: the procedural vehicle"
+        "--data", default=None, help="folder of D-NeRF scenes; default: the procedural vehicle"
     )
     parser.add_argument("--scenes", nargs="*", default=["jumpingjacks", "hook"])
     parser.add_argument("--folder", type=Path, default=Path("runs/bench-gpu"))

@@ -1,4 +1,4 @@
-"""``python -m tests.bench.performance``: what things cost, from ``make bench``, into docs/performance.md."""
+"""``python -m tests.bench.performance``: write the tables of docs/performance.md, as ``make bench`` does."""
 
 from __future__ import annotations
 
@@ -15,15 +15,25 @@ from pathlib import Path
 import torch
 
 from forewarp.cli.entry import quiet
+from forewarp.methods.voxel.terms import TERMS
 from forewarp.ops.splat import average_splat
-from forewarp.runs.folders import project_root
-from tests.bench.free import free_table
-from tests.bench.timed_cases import CASES, frame_work, milliseconds, splat_work, step_work, timed
+from forewarp.runs.config_files import project_root
+from tests.bench.timed_cases import (
+    ALONE,
+    CASES,
+    frame_work,
+    milliseconds,
+    splat_work,
+    step_by_hand,
+    step_with,
+    step_work,
+    timed,
+)
 from tests.bench.workloads import OCCUPANCY
 from tests.stability.report import replace_section, table
 from tests.stability.twin import implementation
 
-# What entries of the profiler are, in words; the first that fits.
+# Part of a profiler entry's name -> what it is called in the table; the first match counts.
 WORDS = (
     ("convolution_backward", "convolutions, backwards"),
     ("convolution", "convolutions"),
@@ -42,7 +52,7 @@ _VERDICTS = {True: "reached", False: "**missed**", None: ""}
 
 
 def slope(amounts: Sequence[float], seconds: Sequence[float]) -> float:
-    """Of the line through the logarithms: 1 where seconds grow as the amount of work.
+    """Fit the power with which seconds grow with the amount of work.
 
     >>> round(slope([1, 2, 4, 8], [3, 6, 12, 24]), 6)
     1.0
@@ -52,12 +62,12 @@ def slope(amounts: Sequence[float], seconds: Sequence[float]) -> float:
 
 
 def mebibytes(count: int) -> str:
-    """Whole ones."""
+    """Format bytes as whole MiB."""
     return f"{count / 2**20:.0f}"
 
 
 def growth_tables(measured: Sequence[dict]) -> str:
-    """A table a case: median, memory, the dense twin beside it, and the slope of the fit.
+    """Make a table for each case: median time, memory, the dense version beside it, and the fitted power.
 
     Args:
         measured: the entries of pytest-benchmark's file.
@@ -89,7 +99,7 @@ def growth_tables(measured: Sequence[dict]) -> str:
 
 
 def box_table(side: int = 40, rays: int = 2048) -> str:
-    """A step on the same object while the box around it grows, up to eight times the volume."""
+    """Time a step on one object while the box around it grows to eight times the volume."""
     volumes, seconds, lines = (1.0, 2.0, 4.0, 8.0), [], []
     for volume in volumes:
         seconds.append(timed(step_work(side, False, rays=rays, box=volume ** (1 / 3))))
@@ -101,7 +111,7 @@ def box_table(side: int = 40, rays: int = 2048) -> str:
 
 
 def profile_table(side: int = 80, rays: int = 8192) -> str:
-    """Where the time of a fine step goes, in words."""
+    """Say where the time of a fine step goes."""
     from torch.profiler import ProfilerActivity, profile
 
     step = step_work(side, False, rays=rays)
@@ -119,7 +129,7 @@ def profile_table(side: int = 80, rays: int = 8192) -> str:
 
 
 def splat_error(side: int = 80) -> float:
-    """The largest error of the splat's values against float64, in units of the source's deviation."""
+    """Measure the largest error of the splat against float64; the source has deviation 1."""
     generator = torch.Generator().manual_seed(0)
     voxels = (torch.rand(side, side, side, generator=generator) < OCCUPANCY).nonzero()
     source = torch.randn(len(voxels), 13, generator=generator)
@@ -130,7 +140,7 @@ def splat_error(side: int = 80) -> float:
 
 
 def goals_table(side: int = 80, rays: int = 8192, picture: int = 400, frame_side: int = 128) -> str:
-    """What the project promised, measured in this run."""
+    """Measure the project's goals."""
     step, dense = timed(step_work(side, False, rays=rays)), timed(step_work(side, True, rays=rays), 2)
     printed = by_itself(side, rays)
     splat = timed(splat_work(side, False))
@@ -161,8 +171,24 @@ def goals_table(side: int = 80, rays: int = 8192, picture: int = 400, frame_side
     return table(["what", "wanted", "measured", ""], [[*r[:3], _VERDICTS[r[3]]] for r in rows])
 
 
+def free_table(side: int = 48, rays: int = 2048) -> str:
+    """Time a step with each effect, relative to a step written by hand without the platform."""
+    photo, every = {"photo": 1.0}, dict.fromkeys(TERMS, 0.0)
+    works = {
+        "written without any of it": step_by_hand(side, rays),
+        "everything off": step_with({}, side, rays, photo),
+        "everything off, every loss term at weight 0": step_with({}, side, rays, every | photo),
+        **{f"{name} on": step_with(choice, side, rays, photo) for name, choice in ALONE.items()},
+    }
+    seconds = {name: timed(work) for name, work in works.items()}
+    first = next(iter(seconds.values()))
+    return table(
+        ["step", "ms", "times"], [[n, milliseconds(s), f"{s / first:.2f}"] for n, s in seconds.items()]
+    )
+
+
 def by_itself(side: int, rays: int) -> float:
-    """Seconds of the dense step in a process without the large pages that the commands ask for."""
+    """Time the dense step in a process without the large memory pages that the commands ask for."""
     work = f"step_work({side}, True, rays={rays})"
     code = "from tests.bench.timed_cases import step_work, timed; "
     plain = {name: value for name, value in os.environ.items() if name != "THP_MEM_ALLOC_ENABLE"}
@@ -171,7 +197,7 @@ def by_itself(side: int, rays: int) -> float:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Measure what ``make bench`` has not, and write the tables."""
+    """Measure, and write the tables."""
     parser = argparse.ArgumentParser(prog="python -m tests.bench.performance", description=__doc__)
     parser.add_argument(
         "--measured", type=Path, default=Path("runs/bench/growth.json"), help="of pytest-benchmark"

@@ -1,4 +1,4 @@
-"""What a GPU would be asked for, in tiny sizes on the CPU."""
+"""The GPU benchmark, in tiny sizes on the CPU."""
 
 import pytest
 

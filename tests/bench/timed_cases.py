@@ -1,10 +1,10 @@
-"""Every operator, a step and a frame at any size, as it runs and densely as the paper prints it."""
+"""Time operators, steps and frames at any size, sparse as they run and dense as printed in the paper."""
 
 from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
@@ -12,6 +12,16 @@ from functools import partial
 import torch
 from torch import Tensor
 
+from forewarp.fields.radiance import DirectRadiance
+from forewarp.fields.trajectory import TrajectoryField
+from forewarp.methods.voxel.effects.background import StaticBackground
+from forewarp.methods.voxel.effects.inpaint import UNet3d
+from forewarp.methods.voxel.effects.motion import Motion
+from forewarp.methods.voxel.effects.upsample import LearnedUpsampler
+from forewarp.methods.voxel.effects.view_dependence import SphericalHarmonics
+from forewarp.methods.voxel.forward_warp import ForwardWarp
+from forewarp.methods.voxel.model import ForwardModel, Ground
+from forewarp.methods.voxel.stage import VoxelStage
 from forewarp.ops.splat import average_splat
 from forewarp.renderer import Renderer
 from forewarp.scene.view import Moment, View
@@ -21,11 +31,13 @@ from tests.bench.workloads import (
     RADIUS,
     TIME,
     WHITE,
+    batch_of,
     body,
     camera,
     lattice_of,
     make_method,
     make_module,
+    module_of,
     some_rays,
 )
 from tests.stability.twin import implementation
@@ -36,8 +48,14 @@ REPEATS = 5
 
 @dataclass(frozen=True)
 class Case:
-    """``make(size, dense)`` gives what is timed; ``axis`` says in words what grows, ``work`` gives the amount
-    of it at a size, and only ``dense_sizes`` are also computed densely.
+    """What to time.
+
+    Args:
+        axis: what grows, for the table's head.
+        sizes: to time.
+        make: (size, dense) -> the function to time.
+        work: size -> amount of work.
+        dense_sizes: those that are timed densely too.
     """
 
     axis: str
@@ -48,8 +66,9 @@ class Case:
 
 
 def timed(work: Work, repeats: int = REPEATS) -> float:
-    """Median seconds of the processor's time, after a first time that does not count: what else a shared
-    machine does is left out, and of one thread it is what a quiet one takes.
+    """Return median seconds of processor time, after a first call that does not count.
+
+    Processor time leaves out what else a shared machine does.
     """
     work()
     taken = []
@@ -61,7 +80,7 @@ def timed(work: Work, repeats: int = REPEATS) -> float:
 
 
 def milliseconds(seconds: float | None) -> str:
-    """Three digits.
+    """Format with three digits.
 
     >>> milliseconds(0.0123456), milliseconds(2.5), milliseconds(None)
     ('12.3', '2500', '')
@@ -70,7 +89,7 @@ def milliseconds(seconds: float | None) -> str:
 
 
 def backwards(dense: bool, work: Callable[[], Tensor]) -> Work:
-    """``work`` and its gradient; what is dense is plain PyTorch."""
+    """Add the backward pass; dense work runs in plain PyTorch."""
 
     def both() -> None:
         with implementation("reference") if dense else nullcontext():
@@ -80,7 +99,7 @@ def backwards(dense: bool, work: Callable[[], Tensor]) -> Work:
 
 
 def splat_work(side: float, dense: bool) -> Work:
-    """13 channels of the ball, or of all voxels, carried by a smooth flow."""
+    """Splat 13 channels of the ball, or of all voxels, along a smooth flow."""
     lattice = lattice_of(int(side))
     voxels = lattice.all_voxels() if dense else body(lattice, RADIUS).nonzero()
     source = torch.randn(len(voxels), 13, generator=torch.Generator().manual_seed(0)).requires_grad_()
@@ -89,7 +108,7 @@ def splat_work(side: float, dense: bool) -> Work:
 
 
 def fields_work(side: float, dense: bool) -> Work:
-    """F1 and F2, and the cosines at a time."""
+    """Evaluate F1 and F2 and the cosines at a time."""
     lattice = lattice_of(int(side))
     method = make_method(lattice, int(side), dense, effects=("motion", "view_dependence"))
 
@@ -100,7 +119,7 @@ def fields_work(side: float, dense: bool) -> Work:
 
 
 def inpaint_work(side: float, dense: bool) -> Work:
-    """The U-Net and the up-layer on the ball's box, or on all of it, without the warp."""
+    """Run the U-Net and the up-layer on the ball's box, or on the whole lattice, without the warp."""
     lattice = lattice_of(int(side))
     method = make_method(lattice, int(side), dense, effects=("view_dependence", "upsampler", "inpainter"))
     warped = method.radiance().with_values(method.radiance().values.detach())
@@ -108,7 +127,7 @@ def inpaint_work(side: float, dense: bool) -> Work:
 
 
 def render_work(rays: float, dense: bool, step: float = 0.5) -> Work:
-    """One rendering of a lattice of 128 voxels an axis; the work is the number of rays."""
+    """Render a lattice of 128^3 voxels; the work is the number of rays."""
     lattice = lattice_of(128)
     method = make_method(lattice, 128, dense, effects=("view_dependence",))
     grid, view = method.radiance(), some_rays(int(rays))
@@ -121,7 +140,7 @@ def render_work(rays: float, dense: bool, step: float = 0.5) -> Work:
 
 
 def step_work(side: float, dense: bool, rays: int = 2048, box: float = 1.0) -> Work:
-    """A whole fine step: the paper's, the optimiser's included."""
+    """Take a whole fine step of the paper's, with the optimiser."""
     module, batch = make_module(int(side), dense, rays=rays, box=box)
     optimizer, factors = module.configure_optimizers(), module.objective.factors(0)
 
@@ -135,9 +154,11 @@ def step_work(side: float, dense: bool, rays: int = 2048, box: float = 1.0) -> W
 
 
 def frame_work(size: float, dense: bool, first: bool = True, side: int = 64, plain: bool = False) -> Work:
-    """A whole picture of ``size`` squared pixels; not the ``first`` of its time: the warped grid is there.
+    """Render a picture of ``size`` squared pixels.
 
-    ``plain`` has neither U-Net nor up-sampler, as ``preset=fast``.
+    Args:
+        first: the first of its time, so that the grid must be warped.
+        plain: without U-Net and up-sampler, as ``preset=fast``.
     """
     module, _ = make_module(side, dense, rays=1, effects=("motion", "view_dependence") if plain else EFFECTS)
     view, moment = View(camera(int(size))), Moment(TIME)
@@ -180,3 +201,64 @@ CASES = {
         "side of the picture", (50, 100, 200, 400), partial(frame_work, first=False), work=lambda n: n**2
     ),
 }
+
+# Each effect by itself, for what it costs a step.
+ALONE: Mapping[str, dict] = {
+    "view_dependence": {"view_dependence": SphericalHarmonics},
+    "motion": {"motion": Motion, "trajectory": partial(TrajectoryField, bases=10, padding=0.2)},
+    "trajectory features": {
+        "motion": Motion,
+        "trajectory": partial(TrajectoryField, bases=10, padding=0.2, features=12),
+    },
+    "background": {
+        "background": partial(StaticBackground, features=3, alpha_init=1e-2, alpha_threshold=1e-4)
+    },
+    "upsampler": {"upsampler": partial(LearnedUpsampler, width=16)},
+    "inpainter": {"inpainter": partial(UNet3d, width=16)},
+}
+
+
+def method_with(choices: Mapping, side: int) -> ForwardWarp:
+    """Make a solid ball that fills a tenth of ``side``^3 voxels, with the effects of ``choices``."""
+    torch.manual_seed(0)
+    lattice = lattice_of(side)
+    active = body(lattice, 0.55)
+    model = ForwardModel(radiance=partial(DirectRadiance, alpha_init=1e-2, alpha_threshold=1e-4), **choices)
+    still = (lattice, torch.ones_like(active))
+    ground = Ground(lattice, active, 2 / (side - 1), lattice.box, 50, 0.0, still)
+    method = model.build(ground, VoxelStage(num_voxels=[[0, side**3]]))
+    with torch.no_grad():
+        method.radiance.parameter("density").fill_(6.0)
+        if method.background is not None:
+            method.background.parameter("density").fill_(-8.0)
+    return method
+
+
+def step_with(choices: Mapping, side: int, rays: int, weights: Mapping[str, float]) -> Work:
+    """Take a training step as the platform does."""
+    module = module_of(method_with(choices, side), weights, side)
+    optimizer, batch = module.configure_optimizers(), batch_of(rays)
+
+    def step() -> None:
+        optimizer.zero_grad()
+        factors = module.objective.factors(0)
+        total(module.look(batch, factors), factors, {})[0].backward()
+        optimizer.step()
+
+    return step
+
+
+def step_by_hand(side: int, rays: int) -> Work:
+    """Take the same step of a static field, written by hand without effects and with one loss term."""
+    radiance, renderer = method_with({}, side).radiance, Renderer()
+    (seen,) = batch_of(rays).observations
+    generator = torch.Generator().manual_seed(0)
+    optimizer = torch.optim.Adam(radiance.parameters(), lr=0.1, betas=(0.9, 0.99), eps=1e-8, fused=True)
+
+    def step() -> None:
+        optimizer.zero_grad()
+        drawn = renderer(radiance(), seen.view.rays(), seen.background, None, generator)
+        (drawn.rgb - seen.rgb).square().mean().backward()
+        optimizer.step()
+
+    return step

@@ -1,4 +1,4 @@
-"""What is timed: the paper's model of a ball that moves, on what is occupied, or densely as printed."""
+"""The scene that is timed: the paper's model of a moving ball, sparse, or dense as printed."""
 
 from __future__ import annotations
 
@@ -19,9 +19,8 @@ from forewarp.methods.voxel.effects.upsample import LearnedUpsampler
 from forewarp.methods.voxel.effects.view_dependence import ViewNetwork
 from forewarp.methods.voxel.forward_warp import ForwardWarp
 from forewarp.methods.voxel.method import VoxelMethod
-from forewarp.methods.voxel.model import ForwardModel
+from forewarp.methods.voxel.model import ForwardModel, Ground
 from forewarp.methods.voxel.stage import VoxelStage
-from forewarp.methods.voxel.start import Ground
 from forewarp.renderer import Renderer
 from forewarp.scene.batch import Batch, Observation
 from forewarp.scene.box import Box, Lattice
@@ -29,23 +28,22 @@ from forewarp.scene.camera import Camera, look_at
 from forewarp.scene.frame import Frame, Scene
 from forewarp.scene.rays import Rays
 from forewarp.scene.view import Moment, View
-from forewarp.training.curriculum import Curriculum
 from forewarp.training.module import DynamicSceneModule
 from forewarp.training.objective import Objective
-from forewarp.training.settings import StageSettings
+from forewarp.training.schedule import Curriculum, StageSettings
 
 OCCUPANCY, TIME, SOLID = 0.1, 0.5, 6.0
 RADIUS = (6 * OCCUPANCY / math.pi) ** (1 / 3)
 WHITE = torch.ones(3)
 EFFECTS = ("motion", "view_dependence", "upsampler", "inpainter")
-# The paper's fine stage (METHOD 2).
+# Weights of the paper's fine stage.
 WEIGHTS = {"photo": 1.0, "point_color": 1e-2, "background_entropy": 1e-3, "flow_l1": 1e-5}
 WEIGHTS |= {"inpaint_diff": 1e-5, "tv_density": 1e-6, "tv_flow": 1e-3, "tv_depth": 1e-1}
 RATES = {"density": 0.1, "color": 0.1, "shading": 0.1, "grid": 0.1, "flow": 1e-3, "network": 1e-3}
 
 
 class PlainUNet(UNet3d):
-    """The same, with volumes as PyTorch lays them by itself: the channels first."""
+    """The same with the channels first, as PyTorch has them by default."""
 
     def features(self, dense: Tensor) -> Tensor:
         """See ``UNet3d``."""
@@ -53,42 +51,42 @@ class PlainUNet(UNet3d):
 
 
 class PlainUpsampler(LearnedUpsampler):
-    """The same, the channels first."""
+    """The same with the channels first."""
 
     def _held(self, part: Callable[[Tensor], Tensor], volume: Tensor) -> Tensor:
         return super()._held(part, volume.contiguous())
 
 
 def body(lattice: Lattice, radius: float) -> Tensor:
-    """A ball (X, Y, Z) bool about the box's centre."""
+    """Return the mask (X, Y, Z) of a ball around the box's centre."""
     points = lattice.to_world(lattice.all_voxels()) - torch.tensor(lattice.box.center)
     return (points.norm(dim=-1) < radius).reshape(lattice.shape)
 
 
 def camera(size: int = 400) -> Camera:
-    """A square picture of the ball."""
+    """Return the camera of a square picture of the ball."""
     pose = look_at(torch.tensor([3.2, 2.0, 1.4]), torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
     return Camera(size, size, 1.39 * size, 1.39 * size, size / 2, size / 2, pose, 2.0, 6.0)
 
 
 def some_pixels(count: int, seed: int = 0) -> View:
-    """Random pixels of the picture."""
+    """Draw random pixels of the picture."""
     pixels = torch.randint(160_000, (count,), generator=torch.Generator().manual_seed(seed))
     return View(camera(), pixels)
 
 
 def some_rays(count: int) -> Rays:
-    """The rays through them."""
+    """Return the rays through random pixels."""
     return some_pixels(count).rays()
 
 
 def batch_of(rays: int) -> Batch:
-    """Grey pixels of the picture."""
+    """Make a batch of grey pixels of the picture."""
     return Batch((Observation(Moment(TIME), some_pixels(rays), torch.full((rays, 3), 0.5), WHITE),), 0)
 
 
 def module_of(method: VoxelMethod, weights: Mapping[str, float], side: int) -> DynamicSceneModule:
-    """The method in the middle of a stage of its own, seen by one camera."""
+    """Put the method into a training module, in a stage with one camera."""
     settings = StageSettings.of("fine", num_voxels=[[0, side**3]], lr=RATES, iterations=100)
     frame = Frame("0", 0.0, camera(), _no_picture)
     scene = Scene("ball", (frame,), (), (), method.radiance.lattice.box, 0.0, has_alpha=True)
@@ -107,19 +105,21 @@ def _no_picture() -> Tensor:
 
 
 def lattice_of(side: int, box: float = 1.0) -> Lattice:
-    """``side`` voxels an axis of a box of 2; ``box`` times as many of the same size in a longer one."""
+    """Make a lattice of ``side * box`` voxels per axis in a box of length ``2 * box``."""
     return Lattice(Box((-box,) * 3, (box,) * 3), (round(side * box),) * 3)
 
 
 def make_method(
     lattice: Lattice, side: int, dense: bool, *, effects: tuple[str, ...], shift: float = 2.3
 ) -> ForwardWarp:
-    """The paper's model of a solid ball, a tenth of a box of 2, moved by ``shift`` voxels at ``TIME``.
+    """Make the paper's model of a solid ball in a tenth of a box of length 2.
+
+    At ``TIME`` it has moved by ``shift`` voxels.
 
     Args:
         side: voxels along a box of 2.
         dense: every voxel is active, nothing is skipped, the U-Net sees the whole lattice, channels first.
-        effects: those that are on.
+        effects: which are on.
     """
     ball = body(lattice, RADIUS)
     margin = max(lattice.shape) if dense else 4
@@ -140,20 +140,20 @@ def make_method(
 
 @torch.no_grad()
 def _paint(method: ForwardWarp, ball: Tensor, shift: float) -> None:
-    """F1 says solid in the ball and empty elsewhere, F2 that everything moves along x."""
+    """Set F1 to solid in the ball and empty elsewhere, and F2 to motion along x."""
     torch.manual_seed(0)
-    for layer in method.modules():  # again, now that how many voxels there are has had its draws
+    for layer in method.modules():  # draw weights anew, so that they do not depend on the number of voxels
         if hasattr(layer, "reset_parameters") and layer.weight.any():
             layer.reset_parameters()
     radiance, (first, second, last) = (
         method.radiance,
         [m for m in method.radiance.network if hasattr(m, "weight")],
     )
-    for layer in (first, second):  # the first hidden unit hands on the first feature
+    for layer in (first, second):  # the first hidden unit passes on the first feature
         layer.weight[0], layer.bias[0] = 0.0, 0.0
     first.weight[0, first.in_features - radiance.features.shape[1]] = 1.0
     second.weight[0, 0] = last.weight[0, 0] = 1.0
-    # Air has the colour that absent voxels read, so that leaving it out changes nothing.
+    # Air has the colour that absent voxels read, so that skipping it changes nothing.
     last.weight[1:, 0] = 0.1 * torch.randn(len(last.weight) - 1)
     last.bias[0] = EMPTY
     x, y, z = radiance.voxels.unbind(-1)
@@ -166,7 +166,7 @@ def _paint(method: ForwardWarp, ball: Tensor, shift: float) -> None:
 
 
 def _features(lattice: Lattice, channels: int) -> Tensor:
-    """The same at a voxel whether it is one of many or of few (X, Y, Z, channels)."""
+    """Draw features (X, Y, Z, channels) that do not depend on which voxels are active."""
     return 0.1 * torch.randn(*lattice.shape, channels, generator=torch.Generator().manual_seed(1))
 
 
@@ -180,7 +180,7 @@ def make_module(
     threshold: float = 1e-4,
     effects: tuple[str, ...] = EFFECTS,
 ) -> tuple[DynamicSceneModule, Batch]:
-    """The paper's fine stage, and a batch for it: the U-Net 16 wide, twice the resolution, two renderings."""
+    """Make the paper's fine stage (U-Net of 16 channels, doubled resolution, two renderings), and a batch."""
     method = make_method(lattice_of(side, box), side, dense, effects=effects, shift=shift)
     method.renderer = Renderer(
         color_threshold=0.0 if dense else threshold, early_stop_eps=0.0 if dense else 1e-4

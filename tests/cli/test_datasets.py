@@ -12,6 +12,7 @@ from forewarp.synth.cameras import random_cameras
 from forewarp.synth.raycast import render
 from forewarp.synth.world import World
 
+pytestmark = pytest.mark.slow  # tests/contract trains on every dataset, too
 COMMON = [
     "trainer=cpu",
     "logger=none",

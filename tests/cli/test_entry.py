@@ -7,7 +7,7 @@ from omegaconf import OmegaConf
 
 from forewarp.cli.entry import one_line
 from forewarp.cli.misspelt import with_keys
-from forewarp.runs.folders import project_root
+from forewarp.runs.config_files import project_root
 from forewarp.scene.errors import SceneError
 from tests.support.configs import CONF, ROOT, options
 
@@ -47,7 +47,7 @@ def test_data_lie_in_the_checkout_or_in_the_current_folder(forewarp, monkeypatch
     if installed:
         package = in_tmp / "site" / "forewarp"
         shutil.copytree(CONF, package / "conf")
-        monkeypatch.setattr("forewarp.runs.folders.PACKAGE", package)
+        monkeypatch.setattr("forewarp.runs.config_files.PACKAGE", package)
     shown = OmegaConf.create(forewarp("train", "--cfg", "job", "--resolve").out)
     assert shown.paths.data == ("./data" if installed else str(ROOT / "data"))
     assert shown.run.startswith("runs/")
@@ -113,16 +113,13 @@ def test_options_of_ones_own_stand_beside_ours(forewarp, way, in_tmp, monkeypatc
         (["+stage.coarse.bogus=1"], "got an unexpected keyword argument 'bogus'; leave that key out"),
         (["+model.renderer.bogus=1"], "model.renderer: "),
         (["budget=fast"], "budget=fast: expected preset=fast; the choice is called preset since 0.2"),
-        (
-            ["variant=backward", "ablation=full", "data.scene=x"],
-            "variant: expected none beside ablation=full, which is of model=forward, but got backward",
-        ),
+        (["variant=rays_1024"], "variant=rays_1024: expected no such word; type what a variant changed"),
         (["objective.coarse.literal=[foto]"], "objective.literal: expected some of photo"),
         (["+objective.coarse.weights.foto=1"], "objective: expected a term of photo, point_color"),
         (["model=tnerf", "+stage.fine.hodl=0.3"], "stage.fine: expected a key of none, but got 'hodl'"),
         (
-            ["model=tnerf", "variant=grid_64"],
-            "model: expected forward or backward, which grid_64 is",
+            ["model=tnerf", "ablation=base"],
+            "model: expected forward or backward, which base is",
         ),
         (["model=tnerf", "+stage.coarse.share=1"], "stage.coarse: expected a stage of the method, but got"),
         (["+model.inpainter.width=16"], "model.inpainter: expected a factory or null, but got {'width': 16}"),

@@ -1,4 +1,4 @@
-"""The files of docs/extending.md are written into a folder as the page says, and its commands are typed."""
+"""Write the files of docs/extending.md into a folder and run the page's commands."""
 
 import importlib
 import json
@@ -24,12 +24,12 @@ VOXELS = ["stage.coarse.num_voxels=[[0,800]]", "~stage.fine"]
 
 
 def files_of(page):
-    """Each file that the page gives whole: name -> text."""
+    """Return the files that the page gives whole: name -> text."""
     return {name: text for name, text in re.findall(r"^`(mine/\S+)`\n\n```\w+\n(.*?)```", page, re.M | re.S)}
 
 
 def write_toy(folder):
-    """Sixteen pictures of a disc that rises, as the page's reader wants them."""
+    """Write sixteen pictures of a rising disc in the format of the page's reader."""
     folder.mkdir(parents=True)
     frames, rows = [], np.mgrid[:16, :16]
     for i in range(16):
@@ -45,7 +45,7 @@ def write_toy(folder):
 
 @pytest.fixture
 def work(in_tmp, monkeypatch):
-    """The page's folder, a scene in it, and a path that leads there."""
+    """Write the page's files and a scene, and make them importable; return the folder."""
     for name, text in files_of(PAGE.read_text()).items():
         (in_tmp / name).parent.mkdir(parents=True, exist_ok=True)
         (in_tmp / name).write_text(text)

@@ -66,7 +66,10 @@ def test_help_is_light(tmp_path, name):
         (["evaluate", "run=."], "config.yaml: expected the configuration of a run, but got none"),
         (["render"], "run: expected the folder of a run, but got nothing"),
         (["render", "run=."], "config.yaml: expected the configuration of a run, but got none"),
-        (["report", "kind=prices"], "kind: expected one of accuracy_time, price_list, paper, effects"),
+        (
+            ["report", "kind=limits", "runs=[a]"],
+            "config.yaml: expected the configuration of a run, but got none",
+        ),
         (["report"], "runs/accuracy_time: expected folders of runs, but got none"),
         (["synthesize", "folder=."], "expected a new or empty folder, but got one with files"),
     ],

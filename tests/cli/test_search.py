@@ -1,4 +1,4 @@
-"""A search by Optuna: every trial is a job that returns its score."""
+"""A search by Optuna, in which every job returns a score."""
 
 import json
 
@@ -10,7 +10,7 @@ from forewarp.synth.scenes import synthesize
 pytest.importorskip(
     "hydra_plugins.hydra_optuna_sweeper", reason="needs hydra-optuna-sweeper: install forewarp[sweeps]"
 )
-# Optuna is old and warns of itself.
+# Optuna raises deprecation warnings of its own.
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]
 
 SEARCH = [
@@ -21,7 +21,7 @@ SEARCH = [
 
 @pytest.fixture
 def folder(in_tmp):
-    """Where the scene is; a search goes to ``runs/search/vehicle`` below it."""
+    """Write a scene; return its folder, below which a search writes ``runs/search/vehicle``."""
     synthesize(in_tmp / "vehicle", size=16, frames=6, test_views=(1, 0, 0), val_views=1, samples_per_pixel=1)
     return in_tmp
 

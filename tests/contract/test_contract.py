@@ -1,4 +1,4 @@
-"""What every method of the table promises; a method passes by its entry there."""
+"""The contract, tested for every method in the table."""
 
 import multiprocessing
 import os
@@ -43,7 +43,7 @@ def batch_of(data):
 
 
 def backward(module, batch):
-    """The raw terms and the gradients of one step."""
+    """Take one step and return the gradients."""
     module.zero_grad()
     module.training_step(batch, 0).backward()
     return {name: p.grad for name, p in module.method.named_parameters() if p.grad is not None}
@@ -176,7 +176,7 @@ def test_a_term_of_weight_zero_is_never_called(name, scenes):
 
 
 def full_model(entry):
-    """The model with all its effects."""
+    """Return the model with all its effects."""
     return replace(entry.model, **{k: v for e in entry.effects.values() for k, v in e.on.items()})
 
 
@@ -212,7 +212,7 @@ STEPS, STOP = 14, 9
 
 @pytest.fixture(scope="module")
 def straight(scenes, tmp_path_factory):
-    """A method's uninterrupted run of a few steps, its checkpoint."""
+    """``straight(name, dataset)`` returns the module after an uninterrupted run of a few steps."""
     known = {}
 
     def fit(name, dataset):
@@ -251,9 +251,7 @@ def test_a_run_that_was_stopped_continues_exactly(name, dataset, straight, scene
 
 @pytest.fixture(scope="module")
 def clean():
-    """Starts processes from one that has imported everything and computed nothing: what a thread pool of
-    this one holds would be lost in a plain fork.
-    """
+    """A process context that forks from a server with everything imported and no thread pool started."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))
         patch.setenv("OMP_NUM_THREADS", "1")
@@ -287,7 +285,7 @@ def test_a_voxel_stage_follows_it(name, dataset, scenes, tmp_path):
 
 
 def check_two_stages(names, data, tmp_path):
-    """Fit a stage of each method, and find the second again without the first."""
+    """Fit a stage of each method, then load the second without the first."""
     stages = [stage_of(METHODS[n], s, steps=6) for n, s in zip(names, ("coarse", "fine"))]
     run = run_of(stages, data, tmp_path)
     module = run.fit()
@@ -298,7 +296,7 @@ def check_two_stages(names, data, tmp_path):
 
 
 def check_handover(handover, scene):
-    """Finite, and about where the scene is."""
+    """Check that a handover is finite and near the scene."""
     around = scene.box.scaled(1.5)
     low, high = torch.tensor(around.low), torch.tensor(around.high)
     for corner in (handover.box.low, handover.box.high):

@@ -9,7 +9,7 @@ from forewarp.data.module import SceneDataModule
 from forewarp.evaluation.evaluate import evaluate
 from forewarp.metrics.suite import ImageSuite
 from forewarp.scene.rays import joined
-from forewarp.training.curriculum import Curriculum
+from forewarp.training.schedule import Curriculum
 from tests.support.tiny_scene import ball_scene, frame_at, make_run, stage
 
 TIMES = (0.0, 0.5, 1.0)

@@ -96,8 +96,8 @@ def test_every_question_is_asked_where_all_is_open(forewarp, words, in_tmp, monk
     made = yaml.safe_load(file.read_text())
     assert made["evidence"]["trials"].keys() == set(EFFECTS)
     assert all(decision["on"] for decision in made["effects"].values())
-    assert "stage.coarse.effects=[motion,background]" in made["words"]
-    assert "stage.fine.num_voxels=[[0,8000]]" in made["words"]
+    assert "stage.coarse.effects=[motion,background]" in made["overrides"]
+    assert "stage.fine.num_voxels=[[0,8000]]" in made["overrides"]
     fitted = forewarp("train", f"plan={file}", "budget.iterations=4", "run=fit", "evaluate=false")
     assert fitted.status == 0, fitted.err
     config = yaml.safe_load((in_tmp / "fit" / "config.yaml").read_text())
@@ -135,7 +135,7 @@ def test_auto_plans_and_fits_in_one_go(forewarp, words, in_tmp):
     assert done.status == 0, done.err
     made = yaml.safe_load((in_tmp / "both" / "plan.yaml").read_text())
     assert made["effects"]["inpainter"]["because"].startswith("as typed; ")
-    assert "trials" not in str(made["words"])
+    assert "trials" not in str(made["overrides"])
     assert made["evidence"]["trials"] == {}
     assert (in_tmp / "both" / "fine" / "done.json").is_file()
     assert {path.name for path in in_tmp.glob("runs/vehicle/plan-*/*")} == {"coarse", "plan.yaml"}
@@ -151,17 +151,25 @@ def test_mistakes_are_one_line(refused, words, in_tmp):
     missing = refused("train", "plan=nowhere.yaml")
     assert missing.startswith("plan: expected a file that forewarp-plan wrote, but got nowhere.yaml")
     (in_tmp / "bad.yaml").write_text(
-        "typed: []\nwords: ['hydra.run.dir=/']\neffects: {}\nseconds: 1\nof: x\n"
+        "typed: []\noverrides: ['hydra.run.dir=/']\neffects: {}\nseconds: 1\nof: x\n"
     )
-    assert refused("train", "plan=bad.yaml").startswith("plan: expected words that a plan has")
+    assert refused("train", "plan=bad.yaml").startswith("plan: expected overrides that a plan has")
     assert not (in_tmp / "runs").exists()
 
 
-@pytest.mark.parametrize("text", ["", "[]", "words: [a=b]", "{", "typed: 3\nwords: 4", "\0"])
+@pytest.mark.parametrize("text", ["", "[]", "overrides: [a=b]", "{", "typed: 3\noverrides: 4", "\0"])
 def test_what_is_no_plan_is_refused(tmp_path, text):
     (tmp_path / "plan.yaml").write_text(text)
     with pytest.raises(ValueError, match="expected a file that forewarp-plan wrote"):
         read_plan(tmp_path / "plan.yaml")
+
+
+def test_a_plan_of_an_earlier_version_is_to_be_made_anew(refused, in_tmp):
+    (in_tmp / "plan.yaml").write_text("typed: [data.scene=x]\nwords: [model/motion=none]\nof: x\n")
+    assert refused("train", "plan=plan.yaml") == (
+        "plan: expected the key overrides, but got words, as before version 0.3, in plan.yaml; "
+        "make it anew with forewarp-plan"
+    )
 
 
 @pytest.mark.parametrize(
@@ -176,8 +184,8 @@ def test_what_is_no_plan_is_refused(tmp_path, text):
     ],
 )
 def test_a_plan_sets_no_code(tmp_path, word):
-    write_plan(tmp_path / "plan.yaml", {"typed": ["data.scene=x"], "words": [word], "of": "0"})
-    with pytest.raises(ValueError, match="expected words that a plan has"):
+    write_plan(tmp_path / "plan.yaml", {"typed": ["data.scene=x"], "overrides": [word], "of": "0"})
+    with pytest.raises(ValueError, match="expected overrides that a plan has"):
         read_plan(tmp_path / "plan.yaml")
 
 
@@ -187,7 +195,7 @@ def test_what_a_plan_composes_names_no_code_of_others(refused, in_tmp):
     mine.mkdir(parents=True)
     (mine / "evil.yaml").write_text("x: {_target_: shutil.copyfile, src: a, dst: b, _partial_: true}\n")
     file = in_tmp / "plan.yaml"
-    write_plan(file, {"typed": ["data.scene=x"], "words": ["callbacks=evil"], "of": "0"})
+    write_plan(file, {"typed": ["data.scene=x"], "overrides": ["callbacks=evil"], "of": "0"})
     said = refused("train", f"plan={file}", "evaluate=false", f"--config-dir={mine.parent}")
     assert "callbacks.x._target_: expected a class of forewarp, but got 'shutil.copyfile'" in said
     assert not (in_tmp / "runs").exists()
@@ -196,25 +204,27 @@ def test_what_a_plan_composes_names_no_code_of_others(refused, in_tmp):
 def test_a_plan_names_code_of_trusted_packages_and_never_trust(tmp_path):
     file = tmp_path / "plan.yaml"
     word = "model.view_dependence._target_=theirs.Tint"
-    write_plan(file, {"typed": ["data.scene=x", "trust=[theirs]"], "words": [word], "of": "0"})
+    write_plan(file, {"typed": ["data.scene=x", "trust=[theirs]"], "overrides": [word], "of": "0"})
     with pytest.raises(
         ValueError, match=r"'theirs.Tint'; if you trust the package theirs, add trust=\[theirs\]"
     ):
         with_plan("train", [f"plan={file}"])
-    assert word in read_plan(file, typed=[word])["words"]  # what is typed now needs no trust
+    assert word in read_plan(file, typed=[word])["overrides"]  # what is typed now needs no trust
     file.unlink()
-    write_plan(file, {"typed": ["trust=[os]"], "words": ["a.b=1"], "of": "0"})
+    write_plan(file, {"typed": ["trust=[os]"], "overrides": ["a.b=1"], "of": "0"})
     assert read_plan(file)["typed"] == []
-    write_plan(file, {"typed": ["a.b={_target_:theirs.Tint}"], "words": [], "of": "0"})
-    with pytest.raises(ValueError, match="expected words that a plan has"):
+    write_plan(file, {"typed": ["a.b={_target_:theirs.Tint}"], "overrides": [], "of": "0"})
+    with pytest.raises(ValueError, match="expected overrides that a plan has"):
         read_plan(file, ["theirs"])
 
 
 def test_what_is_typed_beside_a_plan_wins(tmp_path):
     file = tmp_path / "plan.yaml"
-    words = ["model/view_dependence=sh", "model/inpainter=none", "model/motion=none", "stage.coarse.bases=[]"]
+    planned = [
+        *("model/view_dependence=sh", "model/inpainter=none", "model/motion=none", "stage.coarse.bases=[]")
+    ]
     typed = ["data.scene=x", "seed=3", "model.trajectory.features=2", "stage.coarse.bases=[[0,4]]"]
-    write_plan(file, {"typed": typed, "words": words, "of": "0"})
+    write_plan(file, {"typed": typed, "overrides": planned, "of": "0"})
     found = with_plan("train", [f"plan={file}", "model/inpainter=unet3d", "seed=4"])
     assert found == [
         *("model/view_dependence=sh", "model/motion=none", "data.scene=x", "stage.coarse.bases=[[0,4]]"),
@@ -223,6 +233,6 @@ def test_what_is_typed_beside_a_plan_wins(tmp_path):
     ]
     assert f"run={tmp_path}" in with_plan("train", [f"plan={file}", f"run={tmp_path}"])
     for word in ("model=backward", "resume=runs/x"):
-        with pytest.raises(ValueError, match=f"{word}: expected no such word beside plan="):
+        with pytest.raises(ValueError, match=f"{word}: expected no such override beside plan="):
             with_plan("train", [f"plan={file}", word])
     assert with_plan("plan", ["plan.seeds=1"]) == ["plan.seeds=1"]

@@ -7,7 +7,8 @@ from tests.support.runs_on_disk import write_run
 
 def test_a_run_is_read_whole(tmp_path):
     result = read_run(write_run(tmp_path, "unet_16", 3, epe=0.125, against="grid_64"))
-    assert (result.scene, result.variant, result.against, result.seed) == ("ball", "unet_16", "grid_64", 3)
+    assert (result.scene, result.variant, result.seed) == ("ball", "unet_16", 3)
+    assert result.against(["base"]) == "grid_64"
     assert (result.minutes, result.about) == (1.0, "the unet_16")
     assert result.curve[1] == Point(20.0, 25.0, 20, 0.125)
     assert result.numbers == {
@@ -41,7 +42,7 @@ def test_a_run_without_a_variant_is_named_after_its_choices(tmp_path):
     del config["variant"], config["command"]
     (folder / "config.yaml").write_text(yaml.safe_dump(config))
     result = read_run(folder)
-    assert (result.variant, result.about, result.against) == ("forward-fast", "", "base")
+    assert (result.variant, result.about, result.against([])) == ("forward-fast", "", "base")
     assert result.command.startswith("forewarp-train # as ")
 
 

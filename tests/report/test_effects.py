@@ -21,7 +21,7 @@ def write_choice(root, choice, *, scene="ball", seed=0, calls_for=None, on=(), p
             name: {"choice": "x" if name in on else "none", "on": name in on, "because": f"{name}, 3 %"}
             for name in ("motion", "view")
         }
-        plan = {"typed": [], "words": [], "effects": effects, "seconds": 12.5}
+        plan = {"typed": [], "overrides": [], "effects": effects, "seconds": 12.5}
         (folder / "plan.yaml").write_text(yaml.safe_dump(plan))
     return folder
 

@@ -4,9 +4,9 @@ import re
 
 import pytest
 
+from forewarp.runs.config import read_config
+from forewarp.runs.overrides import refuse_renamed
 from tests.support.configs import composed
-from forewarp.runs.identity import read_config
-from forewarp.runs.renamed import refuse_renamed
 
 
 @pytest.mark.parametrize(
@@ -33,6 +33,8 @@ from forewarp.runs.renamed import refuse_renamed
         ("model/view=none", "model/view_dependence=none;"),
         ("model.view.width=32", "model.view_dependence.width=32;"),
         ("~suits", "no such word;"),
+        ("variant=base,unet_16", "no such word; type what a variant changed, as preset.rays=1024;"),
+        ("ablation=voxels_20,voxels_40", "no such word; sweeps=resolution has these sizes"),
     ],
 )
 def test_a_renamed_word_is_refused_with_the_new_one(word, now):
@@ -69,7 +71,9 @@ def test_what_is_advised_composes(word):
 def test_a_run_of_an_earlier_version_is_refused_with_the_version_that_reads_it(text, version, tmp_path):
     path = tmp_path / "config.yaml"
     path.write_text(text)
-    expected = f"{path}: expected a run of forewarp 0.3, but got one of {version}, which version {version}.0 reads"
+    expected = (
+        f"{path}: expected a run of forewarp 0.3, but got one of {version}, which version {version}.0 reads"
+    )
     with pytest.raises(ValueError, match=re.escape(expected)) as refusal:
         read_config(path)
     assert "\n" not in str(refusal.value)

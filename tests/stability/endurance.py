@@ -1,4 +1,4 @@
-"""Long runs under hard conditions: many seeds, hostile starts, rates up to ten times the default."""
+"""Fit many seeds from bad starting values, at learning rates up to ten times the default."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ SMALL = (
 
 
 def overrides(seed: int, rate: float, steps: int, data: Path, folder: Path) -> list[str]:
-    """The command line of one trial."""
+    """Return the overrides of one trial."""
     kinds = {"density": 0.1, "color": 0.1, "flow": 3e-3}, {"density": 0.1, "color": 0.1, "flow": 1e-3}
     rates = [
         f"stage.{stage}.lr.{kind}={value * rate:g}"
@@ -54,9 +54,9 @@ def overrides(seed: int, rate: float, steps: int, data: Path, folder: Path) -> l
 
 
 def hostile(method: torch.nn.Module, seed: int) -> None:
-    """Start where no preset would: things fly about from the first step, and density is noise.
+    """Spoil a method's starting values: random flow and density noise.
 
-    The spread of the flow grows with the seed from nothing to a fifth of the scene, that of raw density to 6.
+    The deviation of the flow grows with the seed from 0 to a fifth of the scene, that of raw density to 6.
     """
     share = (seed % SEEDS) / (SEEDS - 1)
     generator = torch.Generator().manual_seed(seed)
@@ -69,11 +69,11 @@ def hostile(method: torch.nn.Module, seed: int) -> None:
 
 
 def trial(seed: int, rate: float, steps: int, data: Path) -> dict:
-    """Fit once from a hostile start; PSNR of the test views, and the first thing that went wrong, if any."""
+    """Fit once from bad starting values; return PSNR of the test views, and what went wrong, if anything."""
     from hydra import compose, initialize_config_dir
 
     from forewarp.runs.build import build_run
-    from forewarp.runs.folders import configurations
+    from forewarp.runs.config_files import configurations
     from forewarp.training.module import DynamicSceneModule
 
     begin = time.perf_counter()
@@ -117,7 +117,7 @@ def _psnr(module, datamodule) -> float:
 
 
 def read_trials(path: Path, steps: int) -> list[dict]:
-    """What is done of this many steps; half a line at the end of an interrupted file does not count."""
+    """Read the finished trials of this many steps; skip a line that an interruption cut."""
     done = []
     for line in path.read_text().splitlines() if path.is_file() else ():
         try:
@@ -130,7 +130,7 @@ def read_trials(path: Path, steps: int) -> list[dict]:
 def endure(
     path: Path, *, seconds: float, seeds: int = SEEDS, steps: int = STEPS, rates: Sequence[float] = RATES
 ) -> list[dict]:
-    """Run the trials not yet in ``path`` (a line each), for ``seconds`` at most; returns all done so far."""
+    """Run trials that are not in ``path`` yet (a line each), for at most ``seconds``; return all of them."""
     from forewarp.progress import time_text
 
     path.parent.mkdir(parents=True, exist_ok=True)

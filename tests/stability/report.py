@@ -1,4 +1,4 @@
-"""``python -m tests.stability.report [--long]``: measure how stable all is, into docs/stability.md."""
+"""``python -m tests.stability.report [--long]``: write the tables of docs/stability.md."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from forewarp.cli.entry import quiet
-from forewarp.runs.folders import project_root
+from forewarp.runs.config_files import project_root
 from tests.stability.endurance import RATES, SEEDS, STEPS, endure
 from tests.stability.twin import BACKENDS, rows
 
@@ -18,7 +18,7 @@ COLUMNS = [f"{what}, {backend}" for backend in BACKENDS for what in ("values", "
 
 
 def error_text(error: float | None) -> str:
-    """One digit and a power of ten, or what there is instead.
+    """Format an error with one digit.
 
     >>> error_text(3.14e-7), error_text(0.0), error_text(None), error_text(float("nan"))
     ('3e-07', '0', '', 'not finite')
@@ -29,13 +29,13 @@ def error_text(error: float | None) -> str:
 
 
 def table(header: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
-    """A table in Markdown."""
+    """Make a Markdown table."""
     rule = ["---"] * len(header)
     return "\n".join("| " + " | ".join(line) + " |" for line in (header, rule, *lines))
 
 
 def operator_table() -> str:
-    """Every operator's errors; printed as they come."""
+    """Measure every operator's errors, and print each."""
     lines = []
     for row in rows():
         lines.append([row["operator"], row["input"], *(error_text(row[c]) for c in COLUMNS)])
@@ -44,7 +44,7 @@ def operator_table() -> str:
 
 
 def endurance_table(trials: Sequence[dict]) -> str:
-    """The spread of PSNR by learning rate, and how many broke."""
+    """Summarise PSNR by learning rate, and how many runs failed."""
     lines = []
     for rate in sorted({t["rate"] for t in trials}):
         own = [t for t in trials if t["rate"] == rate]
@@ -56,7 +56,7 @@ def endurance_table(trials: Sequence[dict]) -> str:
 
 
 def replace_section(path: Path, name: str, text: str) -> None:
-    """Put ``text`` between the marks ``<!-- name -->`` and ``<!-- end of name -->`` of a file.
+    """Replace what is between ``<!-- name -->`` and ``<!-- end of name -->`` in a file by ``text``.
 
     Raises:
         ValueError: where the marks are missing.
@@ -72,16 +72,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Measure, and write the tables."""
     parser = argparse.ArgumentParser(prog="python -m tests.stability.report", description=__doc__)
     parser.add_argument(
-        "--long", action="store_true", help="also fit many seeds at high rates; goes on where it stopped"
+        "--long",
+        action="store_true",
+        help="also fit many seeds at high learning rates; continues where it stopped",
     )
     parser.add_argument(
-        "--no-operators", dest="operators", action="store_false", help="leave them as they are"
+        "--no-operators", dest="operators", action="store_false", help="keep the table of operators"
     )
-    parser.add_argument("--seconds", type=float, default=math.inf, help="of the long runs at most, this time")
+    parser.add_argument("--seconds", type=float, default=math.inf, help="most seconds for the long runs")
     parser.add_argument("--seeds", type=int, default=SEEDS)
     parser.add_argument("--steps", type=int, default=STEPS)
     parser.add_argument(
-        "--trials", type=Path, default=Path("runs/stability/trials.jsonl"), help="of the long runs"
+        "--trials", type=Path, default=Path("runs/stability/trials.jsonl"), help="file of the long runs"
     )
     parser.add_argument("--document", type=Path, default=None, help="instead of docs/stability.md")
     given = parser.parse_args(arguments)

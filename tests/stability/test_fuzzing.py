@@ -19,7 +19,7 @@ from omegaconf import OmegaConf
 from forewarp.cli.entry import one_line
 from forewarp.data import dnerf, hypernerf, lego_complete, nhr, posed_video
 from forewarp.runs.build import build_run
-from forewarp.runs.identity import saved_config
+from forewarp.runs.config import saved_config
 from forewarp.scene.errors import SceneError
 from forewarp.scene.frame import Scene
 from forewarp.scene.view import Moment, View

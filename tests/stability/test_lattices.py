@@ -29,7 +29,7 @@ def radiance(lattice=LATTICE, raw=5.0, device="cpu"):
 
 
 class Still(torch.nn.Module):
-    """A method without motion."""
+    """A voxel method without motion."""
 
     motion, moves = None, False
 
@@ -71,7 +71,7 @@ def test_occupancy_of_none_one_and_all(place, present):
 @pytest.mark.parametrize("thin", [1e-1, 1e-4, 1e-9, 1e-30])
 @pytest.mark.parametrize("axes", [1, 2])
 def test_a_flat_box_gets_the_voxels_asked_for_and_no_more(thin, axes):
-    """Cubic voxels of a sheet would be a thousand times as many."""
+    """Cubic voxels would need a thousand times as many for a flat box."""
     box = Box((0, 0, 0), (thin, thin if axes == 2 else 2.0, 3.0))
     for count in (1e3, 1e5, 2e6):
         lattice = Lattice.of_count(box, count)
@@ -89,7 +89,7 @@ def test_the_lattice_of_a_box_does_not_depend_on_the_unit(factor):
 
 
 def test_the_border_voxel_counts_whole(place):
-    """Zero padding would halve it."""
+    """Zero padding would halve the value."""
     index = torch.arange(60, dtype=torch.int32, device=place).reshape(LATTICE.shape)
     values = torch.ones(60, 1, device=place, requires_grad=True)
     points = torch.tensor([[0.0, 0, 0], [2, 3, 4], [2, 0, 3.999], [-0.3, 3.4, 9.0]], device=place)
@@ -100,7 +100,7 @@ def test_the_border_voxel_counts_whole(place):
 
 
 def test_a_place_that_is_no_number_reads_no_number(place):
-    """Nothing is masked silently: what reads it is not finite either."""
+    """A NaN position reads NaN; nothing is masked silently."""
     index = torch.arange(60, dtype=torch.int32, device=place).reshape(LATTICE.shape)
     points = torch.tensor([[math.nan, 1, 1], [1, 1, 1]], device=place)
     read = trilinear(torch.ones(60, 1, device=place), index, points, torch.zeros(1, device=place))
@@ -115,7 +115,7 @@ SIZES = [(1, 1, 1), (1, 1, 2), (2, 1, 1), (3, 5, 7), (5, 4, 9)]
     ("value", "precision"),
     [
         *((value, torch.float32) for value in ("constant", "zero", "huge", "random")),
-        # Each norm multiplies the slopes of what is constant by up to 316: half the digits do not bear that.
+        # No constant volumes: each norm multiplies their slopes by up to 316, too much for bfloat16.
         ("random", torch.bfloat16),
     ],
 )
@@ -132,11 +132,11 @@ def test_the_unet_on_any_volume(device, size, value, precision):
 
 
 def test_half_precision_reads_only_what_was_written(device):
-    """The library's gradient of the weights does not, of two voxels' depth: what lay in memory came in."""
+    """Torch's bfloat16 gradient of the weights reads unwritten memory for volumes two voxels deep."""
     net = UNet3d(channels=4, width=16, levels=3).to(device)
     for _ in range(20):
         junk = [torch.full((2**n,), math.nan, device=device) for n in range(4, 20) for _ in range(4)]
-        del junk  # what the allocator hands out next
+        del junk  # the allocator returns this memory next
         with torch.autocast(device.type, dtype=torch.bfloat16):
             out = net.features(torch.randn(1, 4, 3, 5, 7, device=device))
         check_finite(out, *(p for n, p in net.named_parameters() if "head" not in n))

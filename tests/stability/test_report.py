@@ -1,4 +1,4 @@
-"""The measuring command: its tables, its resumable file, its marks in the document."""
+"""The command that writes docs/stability.md: its tables, its resumable file, its marks."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""Every operator in float32 against its float64 twin, over hard inputs: how many digits are left."""
+"""Compare every operator in float32 with float64 on hard inputs: how many digits are left."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SHAPE = (9, 8, 7)
 
 @contextmanager
 def implementation(name: str) -> Iterator[None]:
-    """The operators' ``reference`` or ``Numba`` implementation inside."""
+    """Use the operators' ``reference`` or ``Numba`` implementation inside."""
     before = os.environ.get("FOREWARP_NUMBA")
     os.environ["FOREWARP_NUMBA"] = "1" if name == "Numba" else "0"
     numba_installed.cache_clear()
@@ -40,13 +40,13 @@ def implementation(name: str) -> Iterator[None]:
 
 
 def uniform(seed: int, *shape: int, low: float = 0.0, high: float = 1.0) -> Tensor:
-    """Numbers that float32 holds exactly, float64."""
+    """Draw float64 numbers that float32 represents exactly."""
     generator = torch.Generator().manual_seed(seed)
     return (low + (high - low) * torch.rand(shape, generator=generator)).double()
 
 
 def compositing_cases() -> Iterator[Case]:
-    """Density to picture."""
+    """Yield cases from density to picture."""
     for name, raw in (("-60", -60.0), ("-10: empty space", -10.0), ("0", 0.0), ("30", 30.0), ("1e30", 1e30)):
         inputs = [raw + uniform(0, 50)]
         yield (
@@ -70,7 +70,7 @@ def compositing_cases() -> Iterator[Case]:
 
 
 def splat_cases() -> Iterator[Case]:
-    """The average splat."""
+    """Yield cases of the averaging splat."""
 
     def splat(shape: tuple[int, int, int]) -> Callable[..., tuple[Tensor, ...]]:
         return lambda source, positions: average_splat(source, positions, shape)[:2]
@@ -94,7 +94,7 @@ def splat_cases() -> Iterator[Case]:
 
 
 def lattice_cases() -> Iterator[Case]:
-    """Trilinear reads, variation, marching."""
+    """Yield cases of trilinear reads, variation and marching."""
     for name, shape, low, high in (
         ("random places", SHAPE, 0.0, 6.0),
         ("far end of 256 voxels", (256, 256, 256), 250.0, 255.0),
@@ -126,7 +126,7 @@ def lattice_cases() -> Iterator[Case]:
 
 
 def encoding_cases() -> Iterator[Case]:
-    """Time and place."""
+    """Yield cases of encoded times and positions."""
     for name, times in (
         ("all times", uniform(16, 200)),
         ("1e-6 beside the canonical", 0.5 + 1e-6 * uniform(17, 200)),
@@ -141,7 +141,7 @@ def encoding_cases() -> Iterator[Case]:
 def answers(
     operator: Callable, inputs: list[Tensor], dtype: torch.dtype
 ) -> tuple[list[Tensor], list[Tensor]]:
-    """Outputs, and gradients of a fixed random weighting of them, both in float64."""
+    """Return outputs, and gradients of a fixed random weighting of them, both as float64."""
     leaves = [x.to(dtype).requires_grad_() for x in inputs]
     out = operator(*leaves)
     outputs = [o for o in (out if isinstance(out, tuple) else (out,))]
@@ -154,9 +154,9 @@ def answers(
 
 
 def relative_error(ours: list[Tensor], exact: list[Tensor]) -> float | None:
-    """The largest over tensors of the largest error by the largest entry; None without tensors.
+    """Return the largest error divided by the largest entry, over all tensors; None without tensors.
 
-    NaN where anything is not finite or a shape differs.
+    NaN where anything is not finite or shapes differ.
     """
     worst = None
     for a, b in zip(ours, exact, strict=True):
@@ -169,7 +169,7 @@ def relative_error(ours: list[Tensor], exact: list[Tensor]) -> float | None:
 
 
 def rows() -> Iterator[dict[str, float | str | None]]:
-    """A row a case: operator, input, and the errors of values and gradients by implementation."""
+    """Yield a row for each case: operator, input, errors of values and gradients by implementation."""
     for cases in (compositing_cases, splat_cases, lattice_cases, encoding_cases):
         for operator, name, function, inputs in cases():
             with implementation("reference"):

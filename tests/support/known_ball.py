@@ -1,4 +1,4 @@
-"""The ball of ``tiny_scene`` as a method that needs no training: a solid grid that truly slides."""
+"""The ball of ``tiny_scene`` as a method that needs no training: a solid grid with exact motion."""
 
 import torch
 
@@ -6,14 +6,14 @@ from forewarp.fields.radiance import DirectRadiance
 from forewarp.methods.voxel.method import VoxelMethod
 from forewarp.methods.voxel.snapshot import VoxelSnapshot
 from forewarp.scene.box import Lattice
-from forewarp.training.curriculum import Curriculum
 from forewarp.training.module import DynamicSceneModule
 from forewarp.training.objective import Objective
+from forewarp.training.schedule import Curriculum
 from tests.support.tiny_scene import BOX, RADIUS, TRAVEL, ball_center, stage
 
 
 class KnownBall(VoxelMethod):
-    """Beside the ball a block stands still; ``asked`` are the times of ``at``."""
+    """The moving ball and a static block; ``asked`` records the times passed to ``at``."""
 
     moves = True
 
@@ -26,7 +26,7 @@ class KnownBall(VoxelMethod):
         self.asked = []
 
     def at(self, moment):
-        """Moves the ball, exactly, by filling the grid anew."""
+        """Move the ball by filling the grid anew."""
         self.asked.append(moment.time)
         self.fill(moment.time)
         grid = self.radiance()
@@ -39,7 +39,7 @@ class KnownBall(VoxelMethod):
         return self
 
     def is_still(self, points, half=0.15):
-        """Whether points belong to the block."""
+        """Return whether points belong to the static block."""
         return (points - torch.tensor([-0.3, -0.6, -0.5])).abs().amax(-1) < half
 
     def trajectories(self, points, times):
@@ -48,7 +48,7 @@ class KnownBall(VoxelMethod):
 
 
 def known_ball():
-    """A module over it."""
+    """Make a module of it."""
     return DynamicSceneModule(
         KnownBall().fill(0.0),
         objective=Objective({}),

@@ -1,4 +1,4 @@
-"""Surface points as a camera must see them: their lit colours, and which of them nothing hides."""
+"""Expected colours of surface points, and which of them a camera sees."""
 
 import numpy as np
 import torch
@@ -7,7 +7,7 @@ from forewarp.synth.raycast import Hits, Posed, light_points
 
 
 def lit_points(world, faces, barycentric, time, center):
-    """Colours (N, 3) in [0, 1] at ``time`` and whether ``center`` (3,), in the vehicle's units, sees them."""
+    """Return colours (N, 3) in [0, 1] at ``time``, and whether each is visible from ``center`` (3,)."""
     posed = Posed(world, time)
     hits = Hits(np.arange(len(faces)), faces, barycentric, np.zeros(len(faces)))
     points = world.points(faces, barycentric, time)
@@ -20,7 +20,7 @@ def lit_points(world, faces, barycentric, time, center):
 
 
 def color_errors(rgb, camera, points, colors):
-    """How far pixels are from the ``colors`` of the points (N, 3) there, (M,) for those in the picture."""
+    """Return the colour errors (M,) of the pixels that show the points (N, 3) inside the image."""
     pixel, depth = camera.project(points.double())
     size = torch.tensor([camera.width, camera.height])
     inside = ((pixel > 0) & (pixel < size)).all(-1) & (depth > 0)

@@ -1,4 +1,4 @@
-"""Slow and obvious twins of what the package does fast."""
+"""Slow and obvious reference implementations."""
 
 import math
 

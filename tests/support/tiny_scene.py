@@ -1,4 +1,4 @@
-"""A moving scene made in memory: a ball, coloured by its surface, that slides along x. And a run over it."""
+"""A moving scene in memory (a coloured ball that slides along x), small methods, and runs over it."""
 
 import math
 from functools import partial
@@ -13,14 +13,13 @@ from forewarp.fields.trajectory import TrajectoryField
 from forewarp.methods.method import Start
 from forewarp.methods.voxel.effects.motion import Motion
 from forewarp.methods.voxel.effects.view_dependence import SphericalHarmonics
-from forewarp.methods.voxel.model import BackwardModel, ForwardModel
+from forewarp.methods.voxel.model import BackwardModel, ForwardModel, Ground
 from forewarp.methods.voxel.stage import VoxelStage
-from forewarp.methods.voxel.start import Ground
 from forewarp.scene.box import Box
 from forewarp.scene.camera import Camera, look_at
 from forewarp.scene.frame import Frame, Scene
 from forewarp.training.objective import Objective
-from forewarp.training.settings import StageSettings
+from forewarp.training.schedule import StageSettings
 from forewarp.training.stages import Run, Stage
 
 RADIUS, TRAVEL = 0.4, (0.8, 0.0, 0.0)
@@ -29,7 +28,7 @@ RATES = {"density": 0.3, "color": 0.1, "shading": 0.02, "flow": 5e-3, "network":
 
 
 def ball_center(time):
-    """Where the ball is at a time (3,)."""
+    """Return the centre (3,) of the ball at a time."""
     return torch.tensor([-0.3, 0.1, 0.0]) + time * torch.tensor(TRAVEL)
 
 
@@ -58,7 +57,7 @@ def camera_at(turn, size=24):
 
 
 def frame_at(name, turn, time, size=24):
-    """A frame whose image is already made."""
+    """Make a frame with its image."""
     camera = camera_at(turn, size)
     image = photograph(camera, time)
     return Frame(name, time, camera, lambda: image)
@@ -82,7 +81,7 @@ RADIANCE = partial(DirectRadiance, alpha_init=1e-2, alpha_threshold=1e-4)
 
 
 def forward_model(**changes):
-    """The forward method, cheap: colours in the voxels, few bases."""
+    """Make a cheap forward model: colours in the voxels, few bases."""
     choices = {
         "radiance": RADIANCE,
         "motion": Motion,
@@ -93,21 +92,21 @@ def forward_model(**changes):
 
 
 def backward_model(**changes):
-    """The backward method, as cheap; its ``deformation`` is to be named."""
+    """Make a cheap backward model; name its ``deformation``."""
     return BackwardModel(**({"radiance": RADIANCE, "view_dependence": SphericalHarmonics} | changes))
 
 
 def built(
-    model, lattice, active=None, *, density_scale=0.3, frames=5, canonical_time=0.0, still=None, **numbers
+    model, lattice, active=None, *, density_scale=0.3, frames=5, canonical_time=0.0, static=None, **numbers
 ):
-    """A model's method on a lattice, all of it active by default; ``numbers`` are of its stage."""
+    """Build a model's method on a lattice, by default fully active; ``numbers`` are of its stage."""
     active = torch.ones(lattice.shape, dtype=torch.bool) if active is None else active
-    ground = Ground(lattice, active, density_scale, BOX, frames, canonical_time, still)
+    ground = Ground(lattice, active, density_scale, BOX, frames, canonical_time, static)
     return model.build(ground, VoxelStage(**({"num_voxels": [[0, 500]]} | numbers)))
 
 
 def begun(method, scene, made):
-    """A method that was built, ready for the stage ``made`` of a scene."""
+    """Prepare a method for the stage ``made`` of a scene."""
     settings, objective = made.settings, made.objective
     start = Start(
         scene,
@@ -121,7 +120,7 @@ def begun(method, scene, made):
 
 
 def stage(name="coarse", weights=None, photo_on=None, **changes):
-    """A stage of few steps on a small lattice."""
+    """Make a stage of few steps on a small lattice."""
     numbers = {
         "num_voxels": [[0, 14**3]],
         "iterations": 12,
@@ -136,24 +135,16 @@ def stage(name="coarse", weights=None, photo_on=None, **changes):
     return Stage(StageSettings.of(name, **(numbers | changes)), objective)
 
 
-def trainer(callbacks):
+def trainer(callbacks, **changes):
     """A silent trainer on the CPU."""
-    return lightning.Trainer(
-        max_epochs=1,
-        max_steps=-1,
-        accelerator="cpu",
-        logger=False,
-        enable_checkpointing=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        callbacks=callbacks,
-        limit_val_batches=0,
-        num_sanity_val_steps=0,
-    )
+    off = dict.fromkeys(("enable_checkpointing", "enable_progress_bar", "enable_model_summary"), False)
+    off |= {"limit_val_batches": 0, "num_sanity_val_steps": 0, "logger": False}
+    common = {"max_epochs": 1, "max_steps": -1, "accelerator": "cpu"} | off | changes
+    return lightning.Trainer(callbacks=callbacks, **common)
 
 
 def make_run(folder, stages, *, data=None, model=None, callbacks=(), **changes):
-    """A run over the ball scene in ``folder``."""
+    """Make a run over the ball scene in ``folder``."""
     return Run(
         data or ball_data(),
         model or forward_model(),
@@ -166,7 +157,7 @@ def make_run(folder, stages, *, data=None, model=None, callbacks=(), **changes):
 
 
 class Interrupt(lightning.Callback):
-    """Saves and stops the process's run, so to say, after a step of a stage."""
+    """Save and exit after a step of a stage."""
 
     def __init__(self, stage, step):
         self.stage, self.step = stage, step

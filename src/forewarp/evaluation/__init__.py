@@ -1,1 +1,1 @@
-"""Measure and draw what was fitted: test views, videos, trajectories, accuracy against time."""
+"""Measure and draw fitted scenes: test views, videos, trajectories, accuracy against time, limits."""

@@ -1,4 +1,4 @@
-"""Accuracy against training seconds, while a run goes on."""
+"""Record accuracy against training seconds while a run is trained."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ COLUMNS = ("seconds", "stage", "step", "psnr", "epe_moving", "size")
 
 
 def next_moment(after: float, first: float, ratio: float) -> float:
-    """The first of ``first, first * ratio, first * ratio^2, ...`` that lies after a moment.
+    """Return the first of ``first, first * ratio, first * ratio^2, ...`` after a moment.
 
     >>> [next_moment(after, 2.0, 2.0) for after in (0.0, 2.0, 5.0, 31.0)]
     [2.0, 4.0, 8.0, 32.0]
@@ -30,23 +30,21 @@ def next_moment(after: float, first: float, ratio: float) -> float:
 
 
 class AccuracyCurve(lightning.Callback):
-    """Writes ``accuracy_time.csv`` into the run's folder: how well views that nothing learns from are drawn
-    after how many seconds of training, all stages together.
+    """Writes ``accuracy_time.csv`` into the run's folder: PSNR of views that are not trained on.
 
-    The views are those set aside (``data.held_out``), or validation views; without any of these nothing is
-    written. A row: training ``seconds`` (of the run's clock,
-    which stands still meanwhile), ``stage``, ``step`` of the stage, ``psnr`` (dB, mean over the views, each
-    from the same random pixels of the whole image), ``epe_moving`` (world units, empty where the scene has no
-    true trajectories) and the method's ``size`` (voxels, particles, parameters). TensorBoard gets
-    ``curve/psnr`` and ``curve/epe_moving`` at the training time in milliseconds in the place of the step. A
-    continued run continues its rows.
+    The views are those set aside (``data.held_out``), or validation views; without any nothing is written.
+    A row holds ``seconds`` of training over all stages (the clock stands still while a row is made),
+    ``stage``, ``step`` of the stage, ``psnr`` (dB, mean over the views, from the same random pixels of each),
+    ``epe_moving`` (world units; empty if the scene has no true trajectories) and the method's ``size``
+    (voxels, particles, parameters). TensorBoard gets ``curve/psnr`` and ``curve/epe_moving`` against
+    milliseconds of training. A resumed run continues its rows.
 
     Args:
         first: seconds until the first row.
-        ratio: each moment is so many times the one before; a stage's end has a row as well.
-        rays: pixels that are looked at in each view: those of a picture of 100 x 100.
+        ratio: of the time of each row to that of the row before; the end of a stage has a row, too.
+        rays: pixels rendered of each view.
 
-    Cost: ``rays`` and one warp a view; the seconds do not count, but pass.
+    Cost: ``rays`` and a snapshot for each view, not counted as training time.
     """
 
     def __init__(self, *, first: float = 2.0, ratio: float = 1.4, rays: int = 10_000) -> None:
@@ -59,7 +57,7 @@ class AccuracyCurve(lightning.Callback):
         self._before, self._next = 0.0, math.inf
 
     def on_train_start(self, trainer, module) -> None:
-        """Go on where the rows end; forget those of work that was lost."""
+        """Continue the rows of a resumed run; drop those of steps that were lost."""
         if not len(trainer.datamodule.watched()):
             return
         folder = Path(trainer.default_root_dir)
@@ -70,7 +68,7 @@ class AccuracyCurve(lightning.Callback):
         self._next = next_moment(last, self.first, self.ratio)
 
     def on_train_batch_end(self, trainer, module, outputs, batch, batch_idx) -> None:
-        """Add a row when it is time."""
+        """Add a row if it is due."""
         if self._before + module.clock.seconds >= self._next:
             self._add(trainer, module)
 
@@ -83,7 +81,7 @@ class AccuracyCurve(lightning.Callback):
             self._add(trainer, module)
 
     def _seconds(self, module) -> float:
-        return round(self._before + module.clock.seconds, 3)  # as written, or a row would lie after its time
+        return round(self._before + module.clock.seconds, 3)  # rounded as in the file
 
     def _add(self, trainer, module) -> None:
         with module.clock.paused():
@@ -108,13 +106,13 @@ class AccuracyCurve(lightning.Callback):
 
 
 def seconds_before(folder: Path) -> float:
-    """Training seconds of the finished stages beside a stage's folder: stages are trained in order."""
+    """Sum the training seconds of the finished stages beside a stage's folder."""
     done = [path for path in folder.parent.glob("*/done.json") if path.parent != folder]
     return sum(float((read_json(path) or {}).get("seconds", 0.0)) for path in done)
 
 
 def read_rows(path: Path) -> list[dict[str, str]]:
-    """The rows of an ``accuracy_time.csv``; none where there is no such file."""
+    """Read the rows of an ``accuracy_time.csv``; none if there is no such file."""
     if not path.is_file():
         return []
     with path.open(newline="") as file:
@@ -122,7 +120,7 @@ def read_rows(path: Path) -> list[dict[str, str]]:
 
 
 def write_rows(path: Path, rows: list[dict[str, str]]) -> None:
-    """Write them as a whole file."""
+    """Write an ``accuracy_time.csv`` whole."""
     with written_whole(path) as beside, beside.open("w", newline="") as file:
         writer = csv.DictWriter(file, COLUMNS, restval="")
         writer.writeheader()

@@ -1,4 +1,4 @@
-"""From a fitted scene to its numbers: pictures of the test views, scores by image and ability, flow error."""
+"""Measure a fitted scene on its test views: pictures, scores by image and ability, flow error."""
 
 from __future__ import annotations
 
@@ -21,16 +21,22 @@ from forewarp.scene.batch import Target
 from forewarp.scene.frame import Scene, spread
 from forewarp.scene.view import Rendering
 from forewarp.training.clock import now
+from forewarp.training.device import device_name, versions
 from forewarp.training.module import DynamicSceneModule
-from forewarp.training.protocol import device_name, versions
 
-_SHEET_SIDE = 300  # pixels that the shorter side of a picture on a sheet has at least
+_SHEET_SIDE = 300  # least pixels of the shorter side of a picture on a sheet
 
 
 @dataclass(frozen=True)
 class Shown:
-    """A test view as drawn: its number in the split, its renderings by name, the best last, and the seconds
-    that the best one took, the warp included where the view before had another time, and without it.
+    """A rendered view.
+
+    Attributes:
+        number: its index in the split.
+        target: the view and its true picture.
+        renderings: by name, the best last.
+        seconds: that the best rendering took, with its snapshot if the view before had another time.
+        seconds_again: the same without the snapshot.
     """
 
     number: int
@@ -40,13 +46,18 @@ class Shown:
     seconds_again: float
 
 
-def draw(module: DynamicSceneModule, targets: Sequence[Target]) -> Iterator[Shown]:
-    """Every target by every rendering, in the order of its frame's time: a snapshot is made once a time.
+def draw(
+    module: DynamicSceneModule, targets: Sequence[Target], numbers: Sequence[int] | None = None
+) -> Iterator[Shown]:
+    """Render views in the order of their times, so that each time needs one snapshot.
 
-    ``targets`` decode at the first use and know their ``frames`` without it.
+    Args:
+        module: fitted.
+        targets: with ``frames``, whose times are known before a picture is decoded.
+        numbers: indices of the views to render; None: all.
     """
-    snapshot = None
-    for number in sorted(range(len(targets)), key=lambda i: targets.frames[i].time):
+    snapshot, wanted = None, range(len(targets)) if numbers is None else numbers
+    for number in sorted(wanted, key=lambda i: targets.frames[i].time):
         target = targets[number]
         begin, view = now(), target.view
         with torch.no_grad():
@@ -72,23 +83,23 @@ def evaluate(
     sheets: int = 6,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict:
-    """Measure a fitted scene on its test views; the same scene gives the same numbers, seconds apart.
+    """Measure a fitted scene on its test views; all but the seconds is reproducible.
 
-    Writes ``images/<name>.png`` (the best rendering), ``images/sheets/<name>.png`` (truth | prediction |
-    error) of some, ``per_image.json``, and last ``metrics.json``.
+    Writes ``images/<name>.png`` (the best rendering), for some views ``images/sheets/<name>.png`` (truth |
+    prediction | error), ``per_image.json``, and last ``metrics.json``.
 
     Args:
-        module: fitted; on the device that is to be used.
+        module: fitted, on the device to use.
         datamodule: serves ``scene`` and ``targets("test")``.
-        folder: the run's.
+        folder: of the run.
         suite: scores an image.
-        protocol: what else is worth knowing of how the run came about.
-        finished: what the stages noted at their end (``Run.finished``).
-        sheets: how many, spread over the split.
+        protocol: what else to note about how the run was made.
+        finished: the ``done.json`` of each stage (``Run.finished``).
+        sheets: how many to write, spread over the split.
         progress: called with (images done, all images) after each image.
 
     Returns:
-        what ``metrics.json`` holds.
+        the content of ``metrics.json``.
     """
     scene, targets, finished = datamodule.scene, datamodule.targets("test"), finished or {}
     on_sheets = set(spread(len(targets), sheets))
@@ -116,15 +127,16 @@ def evaluate(
 
 
 def mean_scores(module: DynamicSceneModule, targets: Sequence[Target], suite: ImageSuite) -> dict[str, float]:
-    """The means over views of what the suite says of each one's best rendering; nothing is written."""
+    """Return the mean scores of the views' best renderings; write nothing."""
     rows = [_score(shown, suite)["scores"] for shown in draw(module, targets)]
     return summarise(("all", row) for row in rows).get("all", {})
 
 
 @torch.no_grad()
 def flow_error(module: DynamicSceneModule, scene: Scene) -> dict | None:
-    """End-point errors of the learned trajectories against the scene's true ones, world units; None where
-    there are no such.
+    """Compare the learned trajectories with the scene's true ones: end-point errors in world units.
+
+    Returns None if the scene has no true trajectories or the method no trajectories.
     """
     truth = scene.truth
     if truth is None or not isinstance(module.method, HasTrajectories):
@@ -138,7 +150,7 @@ def _image(rendering: Rendering, target: Target) -> Tensor:
 
 
 def _score(shown: Shown, suite: ImageSuite) -> dict:
-    """One image's entry: the best rendering's scores, the others' under their names."""
+    """Make the entry of one image: the best rendering's scores, and those of the others by name."""
     target, frame = shown.target, shown.target.frame
     scores = {
         name: suite.score(_image(r, target), target, r.depth.reshape(target.rgb.shape[:2]).cpu())
@@ -162,7 +174,7 @@ def _save(shown: Shown, folder: Path, on_sheet: bool) -> None:
 
 
 def _means(per_image: list[dict]) -> dict[str, dict]:
-    """``test`` of the best rendering, and ``test_<rendering>`` of every other one."""
+    """Average the scores: ``test`` of the best rendering, ``test_<rendering>`` of every other."""
     means = {"test": summarise((row["ability"], row["scores"]) for row in per_image)}
     for name in per_image[0]["others"]:
         means[f"test_{name}"] = summarise((row["ability"], row["others"][name]) for row in per_image)
@@ -170,7 +182,7 @@ def _means(per_image: list[dict]) -> dict[str, dict]:
 
 
 def _seconds(per_image: list[dict], finished: Mapping[str, Mapping]) -> dict[str, float]:
-    """Training by stage, and the mean of drawing an image: its time's first, and another of the same time."""
+    """Return seconds of training by stage, and of rendering an image: the first of its time, and another."""
     stages = {name: float(noted["seconds"]) for name, noted in finished.items()}
     drawing, again = (sum(r[key] for r in per_image) / len(per_image) for key in ("seconds", "seconds_again"))
     frames = {"render_per_frame": drawing, "render_again_per_frame": again}

@@ -1,4 +1,4 @@
-"""Evaluation with a progress line, and the table it ends with."""
+"""Evaluate a run with a progress line, and print the table of its numbers."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ def measure(
     """Evaluate a fitted run into its folder and print the table.
 
     Args:
-        run: whose test views are drawn.
-        module: what was fitted.
-        device: to draw them on.
-        protocol: what else to note of how the numbers came about.
-        lpips_weights: files or folders of backbone weights, beside the usual places.
-        sheets: as ``evaluate`` takes it.
+        run: whose test views are rendered.
+        module: fitted.
+        device: to render on.
+        protocol: what else to note about how the run was made.
+        lpips_weights: files or folders of backbone weights, searched beside the usual places.
+        sheets: as for ``evaluate``.
     """
     suite = ImageSuite(
         find_lpips(extra=lpips_weights), mask_box=run.datamodule.scene.protocol.get("mask_box", False)
@@ -59,7 +59,7 @@ def measure(
 
 
 def show(metrics: dict, folder: Path, absent: dict[str, str]) -> None:
-    """Print what was measured and where it is."""
+    """Print the numbers and where the files are."""
     console = Console()
     console.print(table_of(metrics))
     seconds, flow = metrics["seconds"], metrics.get("flow")
@@ -84,7 +84,7 @@ def show(metrics: dict, folder: Path, absent: dict[str, str]) -> None:
 
 
 def without(absent: dict[str, str]) -> str:
-    """One line of the metrics that are left out and why; a family of them, all left out, is named once."""
+    """Say in one line which metrics are missing and why; name a whole family once."""
     reasons: dict[str, str] = {}
     for name, reason in absent.items():
         family = next((f for f in FAMILIES if name.startswith(f)), name)
@@ -94,7 +94,7 @@ def without(absent: dict[str, str]) -> str:
 
 
 def table_of(metrics: dict) -> Table:
-    """A row for every rendering and kind of test view, a column for every metric."""
+    """Make a table with a row for every rendering and kind of test view, and a column for every metric."""
     blocks = {key: value for key, value in metrics.items() if key.split("_")[0] == "test"}
     names = [m for m in METRICS if any(m in scores for block in blocks.values() for scores in block.values())]
     table = Table(

@@ -1,4 +1,4 @@
-"""Pictures of a stage: truth, prediction and error, depth, and the flow from the canonical time."""
+"""Draw a stage: truth, prediction and error, depth, and the flow from the canonical time."""
 
 from __future__ import annotations
 
@@ -18,26 +18,26 @@ from forewarp.scene.camera import Camera
 from forewarp.scene.view import Moment, View
 from forewarp.training.module import DynamicSceneModule
 
-_SEEN = 0.02  # opacity of a pixel whose motion is shown
+_SEEN = 0.02  # least opacity of a pixel whose motion is shown
 
 
 def sized(camera: Camera, size: int) -> Camera:
-    """The same view with ``size`` pixels along its longer side."""
+    """Resize a camera to ``size`` pixels along its longer side."""
     scale = size / max(camera.width, camera.height)
     return camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
 
 
 def within(camera: Camera, size: int | None) -> Camera:
-    """The same view with at most ``size`` pixels along its longer side."""
+    """Resize a camera to at most ``size`` pixels along its longer side."""
     return camera if size is None or max(camera.width, camera.height) <= size else sized(camera, size)
 
 
 def pictures_of(module: DynamicSceneModule, target: Target, size: int | None = None) -> dict[str, Tensor]:
-    """Pictures (h, w, 3) in [0, 1] of one view by name.
+    """Draw one view: pictures (h, w, 3) in [0, 1] by name.
 
-    ``compare`` is truth | prediction | error, ``depth`` is near bright; ``flow``, of methods with
-    trajectories, is the way in the picture from the canonical time to the target's: hue is its direction, as
-    the wheel shows, saturation its length.
+    ``compare`` is truth | prediction | error; ``depth`` is bright where it is near; ``flow``, of methods with
+    trajectories, is the displacement in the picture from the canonical time to the target's: hue is its
+    direction, as on the wheel, saturation its length.
     """
     camera = within(target.frame.camera, size)
     shape = (camera.height, camera.width)
@@ -58,7 +58,7 @@ def pictures_of(module: DynamicSceneModule, target: Target, size: int | None = N
 
 @torch.no_grad()
 def image_flow(module: DynamicSceneModule, camera: Camera, time: float) -> tuple[Tensor, Tensor]:
-    """The scene at its canonical time as ``camera`` sees it, and how the points seen move until ``time``.
+    """Render the canonical scene and follow the visible points to ``time``.
 
     Returns:
         flow (H, W, 2) in pixels, opacity (H, W).
@@ -77,7 +77,7 @@ def image_flow(module: DynamicSceneModule, camera: Camera, time: float) -> tuple
 
 
 def psnr_by_view(module: DynamicSceneModule, targets: Sequence[Target], rays: int) -> list[float]:
-    """PSNR (dB) of each image, from the same ``rays`` pixels, drawn at random once for all."""
+    """Return PSNR (dB) of each image, from ``rays`` random pixels, the same in all."""
     found = []
     for target in targets:
         every = target.frame.camera.width * target.frame.camera.height
@@ -87,23 +87,23 @@ def psnr_by_view(module: DynamicSceneModule, targets: Sequence[Target], rays: in
 
 
 def validation_psnr(module: DynamicSceneModule, targets: Sequence[Target], rays: int) -> float:
-    """The mean of ``psnr_by_view``."""
+    """Return the mean of ``psnr_by_view``."""
     found = psnr_by_view(module, targets, rays)
     return sum(found) / len(found)
 
 
 class TensorBoardPictures(lightning.Callback):
-    """Pictures of one held-out view at a few moments, to TensorBoard and into the stage's ``images/``, and
-    ``val/psnr`` of a few validation views to TensorBoard where the scene has any.
+    """Draws one view at a few moments of a stage, and logs ``val/psnr`` of a few validation views.
 
-    The training clock stands still meanwhile, and nothing random is drawn: training goes on as without.
+    Pictures go to TensorBoard and into the stage's ``images/``. Training is not changed: its clock stands
+    still meanwhile, and no random number is drawn.
 
     Args:
         moments: fractions of the stage.
-        view: index into the validation images, or into the training images without any; None: the middle.
-        size: pixels of the longer side at most.
-        psnr_views: validation views, spread over the split, that ``val/psnr`` is the mean of; 0: no curve.
-        psnr_rays: pixels that are looked at in each.
+        view: index of the validation image, or of the training image if there are none; None: the middle.
+        size: most pixels of the longer side.
+        psnr_views: validation views, spread over the split, for ``val/psnr``; 0: no ``val/psnr``.
+        psnr_rays: pixels rendered of each.
     """
 
     def __init__(
@@ -129,16 +129,16 @@ class TensorBoardPictures(lightning.Callback):
         self._due: list[float] = []
 
     def on_train_start(self, trainer, module) -> None:
-        """Leave out the moments that a continued run is past."""
+        """Drop the moments that a resumed run is past."""
         done = module.fraction
         self._due = [moment for moment in self.moments if moment >= done]
 
     def on_train_batch_end(self, trainer, module, outputs, batch, batch_idx) -> None:
-        """Make the pictures when it is time."""
+        """Draw if it is due."""
         self._follow(trainer, module)
 
     def on_train_end(self, trainer, module) -> None:
-        """A stage bounded by minutes ends between two steps."""
+        """Draw the last pictures: a stage bounded by minutes ends between two steps."""
         self._follow(trainer, module)
 
     def _follow(self, trainer, module) -> None:

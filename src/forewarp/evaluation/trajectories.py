@@ -1,4 +1,4 @@
-"""The paper's figure: the ways that points of the surface take, drawn over the picture."""
+"""Draw the trajectories of points on the moving surface over a picture, as the paper's figure does."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from forewarp.scene.camera import Camera
 from forewarp.scene.view import Moment, Rendering, View
 from forewarp.training.module import DynamicSceneModule
 
-_VIEWS, _VIEW_SIZE = 24, 80  # what the surface is looked at from
-_STILL = 0.15  # moving points go at least so far, as a share of the farthest
+_VIEWS, _VIEW_SIZE = 24, 80  # views that find the surface, and their pixels
+_STILL = 0.15  # least travel of a moving point, as a share of the farthest
 
 
 class Trajectories:
-    """Draws a fading tail behind points of the moving surface, hidden where the scene stands before it.
+    """Draws a fading tail behind points of the moving surface, hidden where the scene occludes it.
 
     Args:
         module: the fitted scene.
-        cameras: the training cameras, which tell what is surface.
-        count: points at most.
+        cameras: the training cameras, which find the surface.
+        count: most points.
         tail: how long a tail lasts, as a share of the whole time.
         width: of a line, as a share of the picture's longer side.
     """
@@ -46,14 +46,14 @@ class Trajectories:
                     f"path: expected a method that knows trajectories, but got {name}; use path=fixed"
                 )
         self.method, self.tail, self.width = module.method, tail, width
-        # A rendered surface is soft: its depth is uncertain by about the size of what it is made of.
+        # The depth of a rendered surface is uncertain by about the size of its matter.
         self.slack = 1.5 * module.method.matter().size
         self.points = moving_points(module, cameras, count)
         self.colors = hues(0.85 * order_of(self.points))
 
     @torch.no_grad()
     def __call__(self, picture: Tensor, drawn: Rendering, camera: Camera, time: float) -> Tensor:
-        """``picture`` (H, W, 3) of ``camera`` at ``time``, rendered as ``drawn``, with its tails."""
+        """Draw the tails over ``picture`` (H, W, 3) of ``camera`` at ``time``; ``drawn`` is its rendering."""
         if not len(self.points):
             return picture
         begin = max(0.0, time - self.tail)
@@ -79,7 +79,7 @@ class Trajectories:
 
 @torch.no_grad()
 def surface_points(module: DynamicSceneModule, cameras: Sequence[Camera]) -> Tensor:
-    """The method's points of matter (N, 3), world units, that a few cameras see at the canonical time."""
+    """Return the points of matter (N, 3), world units, that a few cameras see at the canonical time."""
     canonical = module.method.at(Moment(module.curriculum.canonical_time))
     black, found = torch.zeros(3, device=module.device), []
     for camera in cameras[:: max(1, len(cameras) // _VIEWS)][:_VIEWS]:
@@ -87,21 +87,21 @@ def surface_points(module: DynamicSceneModule, cameras: Sequence[Camera]) -> Ten
         drawn, rays = canonical.render(view, black), view.rays().to(module.device)
         hit = drawn.opacity > 0.5
         found.append(rays.origins[hit] + drawn.depth[hit, None] * rays.directions[hit])
-    # A mean depth across a silhouette's edge lies in empty space, where there is no point of matter.
+    # At a silhouette the mean depth lies in empty space; points of matter do not.
     matter = module.method.matter()
     cells, seen = _cells(matter.points, matter.size), _cells(torch.cat(found), matter.size)
     return matter.points[torch.isin(cells, seen)]
 
 
 def _cells(points: Tensor, size: float) -> Tensor:
-    """A number (N,) for the cube of side ``size`` that each point lies in."""
+    """Number the cubes of side ``size`` and return that of each point (N,)."""
     x, y, z = (points / size).floor().long().clamp(-(1 << 20), (1 << 20) - 1).unbind(-1)
     return (x << 42) + (y << 21) + z
 
 
 @torch.no_grad()
 def moving_points(module: DynamicSceneModule, cameras: Sequence[Camera], count: int) -> Tensor:
-    """At most ``count`` canonical points (N, 3), evenly spread over the moving surface, always the same."""
+    """Choose at most ``count`` canonical points (N, 3), spread evenly over the moving surface."""
     points = surface_points(module, cameras)
     if not len(points):
         return points
@@ -112,7 +112,7 @@ def moving_points(module: DynamicSceneModule, cameras: Sequence[Camera], count: 
 
 
 def spread(points: Tensor, count: int) -> Tensor:
-    """``count`` of the points (N, 3), each the farthest from those before it, from the first on.
+    """Choose ``count`` of the points (N, 3): the first, then always the farthest from those chosen.
 
     Cost: N * count distances.
     """
@@ -127,7 +127,7 @@ def spread(points: Tensor, count: int) -> Tensor:
 
 
 def order_of(points: Tensor) -> Tensor:
-    """Where points (N, 3) lie along their longest extent (N,), evenly from 0 to 1."""
+    """Rank points (N, 3) along their longest extent: (N,), evenly from 0 to 1."""
     if len(points) < 2:
         return points.new_zeros(len(points))
     along = torch.linalg.svd(points - points.mean(0), full_matrices=False)[2][0]

@@ -1,4 +1,4 @@
-"""Videos of a fitted scene: through time, around it, or both at once."""
+"""Render videos of a fitted scene: through time, around it, or both at once."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from forewarp.training.module import DynamicSceneModule
 
 PATHS = ("fixed", "orbit", "both", "trajectories")
 
-Shot = tuple[Camera, float]  # from where, at which time
+Shot = tuple[Camera, float]  # camera and time
 Paint = Callable[[Tensor, Rendering, Camera, float], Tensor]
 
 
 def make_shots(path: str, frames: int, time: float, camera: Camera, cameras: Sequence[Camera]) -> list[Shot]:
-    """From where and when each frame of a video is seen.
+    """Return camera and time of each frame of a video.
 
     Args:
         path: ``fixed`` and ``trajectories`` go through time, ``orbit`` once around at ``time``; ``both``.
@@ -39,7 +39,7 @@ def make_shots(path: str, frames: int, time: float, camera: Camera, cameras: Seq
         raise ValueError(f"time: expected a number in [0, 1], but got {time}")
     views, times = [camera] * frames, torch.linspace(0, 1, frames).tolist()
     if path in ("orbit", "both"):
-        # Without the last turn, which is the first again: played in a loop it runs smoothly.
+        # Without the full turn, which repeats the first: it loops smoothly.
         turns = torch.arange(frames, dtype=torch.float64) / frames
         views = orbit(camera, focus_point(list(cameras)), mean_up(list(cameras)), turns)
     return list(zip(views, [time] * frames if path == "orbit" else times))
@@ -48,11 +48,11 @@ def make_shots(path: str, frames: int, time: float, camera: Camera, cameras: Seq
 def video(
     module: DynamicSceneModule, shots: Sequence[Shot], background: Tensor, paint: Paint | None = None
 ) -> Iterator[Tensor]:
-    """The pictures (H, W, 3) in [0, 1] of a video one by one; a snapshot is made once for a time.
+    """Render the pictures (H, W, 3) in [0, 1] of a video one by one, with one snapshot for each time.
 
     Args:
-        module: the fitted scene.
-        shots: from where and when.
+        module: fitted.
+        shots: camera and time of each picture.
         background: (3,).
         paint: draws over a picture, see ``Trajectories``.
     """

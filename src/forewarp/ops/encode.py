@@ -16,6 +16,9 @@ def positional_encoding(x: Tensor, frequencies: int) -> Tensor:
     Returns:
         (..., D * (1 + 2 F)). Differentiable in ``x``.
 
+    Raises:
+        ValueError: for F < 0.
+
     >>> positional_encoding(torch.zeros(1, 3), 5).shape
     torch.Size([1, 33])
     """
@@ -29,12 +32,12 @@ def positional_encoding(x: Tensor, frequencies: int) -> Tensor:
 
 
 def spherical_harmonics_1(directions: Tensor) -> Tensor:
-    """Real spherical harmonics of degree 1 without their constants: ``(y, z, x)`` of a unit direction.
+    """Spherical harmonics of degree 1 without their constant factors: ``(y, z, x)``.
 
     Args:
         directions: unit vectors (..., 3).
 
     Returns:
-        (..., 3). The constants are left to the learned coefficients.
+        (..., 3). Learned coefficients absorb the constants.
     """
     return directions[..., [1, 2, 0]]

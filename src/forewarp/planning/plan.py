@@ -1,4 +1,4 @@
-"""The plan of a run: made once, then read."""
+"""Make the plan of a run, or read it if it was made before."""
 
 from __future__ import annotations
 
@@ -14,40 +14,43 @@ from forewarp.planning.plan_file import read_plan, write_plan
 from forewarp.planning.planner import Planner
 from forewarp.planning.trials import Trials
 from forewarp.runs.build import build_run
-from forewarp.runs.identity import HASH, content_hash
+from forewarp.runs.config import HASH, content_hash
 from forewarp.runs.overrides import key_of
 from forewarp.runs.trust import trust_of
 from forewarp.scene.frame import Scene
 
-# Keys that say where a run or its plan goes, not what it is.
+# Keys that do not change what a run computes.
 NOT_OF_IT = ("effects", "plan", "run", "evaluate", "sheets", "planned", "trust", "score")
 LEAST = {"steps": 1, "trial_steps": 1, "seeds": 1, "held_out": 2}  # whole numbers
 AMOUNTS = ("seconds", "trial_seconds", "minutes", "least")
 
 
-def make_plan(config: DictConfig, words: Sequence[str]) -> dict:
-    """Look at a scene, try what is open, decide, and write ``plan.yaml``; a plan that is there is read.
+def make_plan(config: DictConfig, overrides: Sequence[str]) -> dict:
+    """Decide which effects a scene calls for and write ``plan.yaml``; read it if it was made before.
 
     Args:
-        config: of the run that is planned, as composed from ``words``.
-        words: as typed.
+        config: of the run that is planned, composed from ``overrides``.
+        overrides: as typed.
 
     Returns:
-        what ``plan.yaml`` holds: ``typed`` and ``words``, which together make the run, ``effects`` (choice,
-        on, because), ``evidence``, ``seconds``, ``of`` (a hash of all that was asked); and ``file``.
+        the content of ``plan.yaml``: ``typed`` and ``overrides``, which together make the run, ``effects``
+        (choice, on, because), ``evidence``, ``seconds``, ``of`` (a hash of the question); and ``file``.
+
+    Raises:
+        ValueError: if the run cannot be planned, or ``plan.folder`` holds the plan of another question.
     """
-    asked_as = list(words)
-    words = [word for word in words if key_of(word).split(".")[0] not in NOT_OF_IT]
+    asked_as = list(overrides)
+    typed = [override for override in overrides if key_of(override).split(".")[0] not in NOT_OF_IT]
     run = build_run(config)
     planning = planning_of(run.model, config.model.name)
-    refuse(config, words)
+    refuse(config, typed)
     run.datamodule.setup("fit")
-    # What is typed is not asked, even where it is what the configuration has anyway.
-    asked = content_hash(config, ("plan",), sorted(words), run.datamodule.fingerprint())
+    # A typed key is not decided by the plan, even if its value is the default.
+    asked = content_hash(config, ("plan",), sorted(typed), run.datamodule.fingerprint())
     folder = Path(str(config.plan.folder).replace(HASH, asked))
     file = folder / "plan.yaml"
     if file.is_file():
-        made = read_plan(file, trust_of(config.get("trust")), words)
+        made = read_plan(file, trust_of(config.get("trust")), typed)
         if made["of"] != asked:
             raise ValueError(
                 f"plan.folder: expected the plan of this command and data, but got another in {file}; "
@@ -56,7 +59,7 @@ def make_plan(config: DictConfig, words: Sequence[str]) -> dict:
         return made | {"file": str(file), "found": True}
     begin = time.perf_counter()
     trials = Trials(
-        words,
+        typed,
         folder,
         steps=config.plan.steps,
         seconds=config.plan.seconds,
@@ -65,7 +68,7 @@ def make_plan(config: DictConfig, words: Sequence[str]) -> dict:
         held_out=spared(run.datamodule.scene, config.plan.held_out),
         tell=lambda name: print(f"{folder / name}", flush=True),
     )
-    made = Planner(config, words, trials, run.datamodule.scene, planning).plan()
+    made = Planner(config, typed, trials, run.datamodule.scene, planning).plan()
     seconds = time.perf_counter() - begin + trials.seconds_before
     made |= {"seconds": round(seconds, 1), "of": asked, "asked": asked_as}
     write_plan(file, made)
@@ -73,10 +76,10 @@ def make_plan(config: DictConfig, words: Sequence[str]) -> dict:
 
 
 def planning_of(model: Callable, name: str) -> Planning:
-    """How a method's effects are planned.
+    """Return how a method's effects are planned.
 
     Raises:
-        ValueError: where it has none to plan.
+        ValueError: if it has no effects to plan.
     """
     planning = getattr(model, "planning", getattr(getattr(model, "func", None), "planning", None))
     if planning is None:
@@ -88,10 +91,10 @@ def planning_of(model: Callable, name: str) -> Planning:
 
 
 def spared(scene: Scene, wanted: int) -> int:
-    """How many training views are set aside: as many as wanted, or as the scene can spare.
+    """Return how many training views to set aside: as many as wanted, or as the scene can spare.
 
     Raises:
-        ValueError: where it can spare fewer than two.
+        ValueError: if it can spare fewer than two.
     """
     most = most_held_out(scene)
     if most < 2:
@@ -102,15 +105,15 @@ def spared(scene: Scene, wanted: int) -> int:
     return min(wanted, most)
 
 
-def refuse(config: DictConfig, words: Sequence[str]) -> None:
-    """Refuse what cannot be planned, before anything is read."""
+def refuse(config: DictConfig, typed: Sequence[str]) -> None:
+    """Refuse a run that cannot be planned, before its data are read."""
     if config.get("resume") is not None:
         raise ValueError("resume: expected nothing where a run is planned; leave it out")
-    if gone := [word for word in words if word.startswith("~") and not word.startswith("~stage.")]:
+    if gone := [one for one in typed if one.startswith("~") and not one.startswith("~stage.")]:
         raise ValueError(
-            f"{gone[0]}: expected words that set something, as a plan is kept; use {gone[0][1:]}=null"
+            f"{gone[0]}: expected overrides that set a key, as a plan keeps them; use {gone[0][1:]}=null"
         )
-    if any(word.startswith("~") for word in words) or len(config.stage) < 2:
+    if any(one.startswith("~") for one in typed) or len(config.stage) < 2:
         raise ValueError("stage: expected a coarse stage and another, but got one; leave out ~stage.<name>")
     for key, least in LEAST.items():
         if not (isinstance(config.plan[key], int) and config.plan[key] >= least):

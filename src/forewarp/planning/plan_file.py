@@ -1,4 +1,4 @@
-"""A plan as a file, as words of a command line, and on a screen."""
+"""Write a plan to ``plan.yaml``, read it, turn it into overrides, and print it."""
 
 from __future__ import annotations
 
@@ -7,97 +7,112 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import yaml
-from rich import box
-from rich.console import Console
-from rich.table import Table
 
 from forewarp.files import MOST_CONFIG, read_text, replace_file
-from forewarp.progress import time_text
-from forewarp.runs.overrides import as_typed, key_of, merged, of_what_is_on
+from forewarp.runs.overrides import command_line, key_of, merged, without_switched_off
 from forewarp.runs.trust import check_target, without_trust
 
-PATHS = ("lpips_weights",)  # keys of the first level that hold paths
+PATHS = ("lpips_weights",)  # top-level keys that hold paths
 
 
 def write_plan(file: Path, made: dict) -> None:
-    """Write a plan with the command that made it, whole or not at all."""
-    about = f"# {as_typed('plan', made.get('asked', made['typed']))}\n"
-    about += "# Fit it: forewarp-train plan=<this file>; any word typed beside that wins.\n"
+    """Write a plan, with the command that made it on top."""
+    about = f"# {command_line('plan', made.get('asked', made['typed']))}\n"
+    about += "# Fit it: forewarp-train plan=<this file>; an override typed beside that wins.\n"
     replace_file(file, about + yaml.safe_dump(made, sort_keys=False, width=110, allow_unicode=True))
 
 
 def read_plan(file: Path, trust: Sequence[str] = (), typed: Sequence[str] = ()) -> dict:
-    """What a ``plan.yaml`` holds; words of trust are left out, as a file has no say in that.
+    """Read a ``plan.yaml`` without its overrides of ``trust``: a file may not say what is trusted.
 
     Args:
         file: to read.
-        trust: packages beside forewarp whose code its words may name.
-        typed: words that were typed now, so that they may be in it whatever they name.
+        trust: packages beside forewarp whose code its overrides may name.
+        typed: overrides on the present command line; the file may repeat them whatever they name.
 
     Raises:
-        ValueError: where it is none, or has words that no plan has.
+        ValueError: if it is no plan, is of an earlier version, or has overrides that a plan may not have.
     """
     try:
         made = yaml.safe_load(read_text(file, MOST_CONFIG))
-        words = [*made["typed"], *made["words"], f"of={made['of']}"]
-        others = [word for word in words if word not in typed]
-        allowed = all(isinstance(word, str) and _is_harmless(word) for word in others)
+        if isinstance(made, dict) and "words" in made and "overrides" not in made:
+            raise ValueError(
+                f"plan: expected the key overrides, but got words, as before version 0.3, in {file}; make it "
+                "anew with forewarp-plan"
+            )
+        overrides = [*made["typed"], *made["overrides"], f"of={made['of']}"]
+        others = [override for override in overrides if override not in typed]
+        allowed = all(isinstance(override, str) and _is_harmless(override) for override in others)
     except (OSError, ValueError, yaml.YAMLError, TypeError, KeyError, RecursionError) as error:
+        if str(error).startswith("plan: "):
+            raise
         reason = getattr(error, "strerror", None) or type(error).__name__
         raise ValueError(
             f"plan: expected a file that forewarp-plan wrote, but got {file} ({reason}); "
             "use plan=<folder of a plan>/plan.yaml"
         ) from error
+    where = f"plan: expected overrides that a plan has, but got others in {file}"
     if not allowed:
-        raise ValueError(f"plan: expected words that a plan has, but got others in {file}; make it anew")
-    for word in others:
-        if (key := key_of(word)).endswith("._target_"):
-            where = f"plan: expected words that a plan has, but got others in {file}"
-            check_target(word.partition("=")[2], where, key, trust)
-    kept = {name: [word for word in made[name] if key_of(word) != "trust"] for name in ("typed", "words")}
-    return made | kept
+        raise ValueError(f"{where}; make it anew")
+    for override in others:
+        if (key := key_of(override)).endswith("._target_"):
+            check_target(override.partition("=")[2], where, key, trust)
+    names = ("typed", "overrides")
+    return made | {name: [one for one in made[name] if key_of(one) != "trust"] for name in names}
 
 
-def _is_harmless(word: str) -> bool:
-    """Whether a word may come from a file: none that hides code, or says how jobs are run, and no option."""
-    sets = re.match(r"\+{0,2}[A-Za-z][\w./@]*=", word) is not None
-    key, _, value = word.lstrip("+").partition("=")
-    hides = "_target_" in word and not (key.endswith("._target_") and word.count("_target_") == 1)
-    # A choice names a file below conf/, and none elsewhere.
+def _is_harmless(override: str) -> bool:
+    """Tell whether an override only sets a key: it names no code and does not say how jobs are run."""
+    sets = re.match(r"\+{0,2}[A-Za-z][\w./@]*=", override) is not None
+    key, _, value = override.lstrip("+").partition("=")
+    hides = "_target_" in override and not (key.endswith("._target_") and override.count("_target_") == 1)
+    # A choice names a file below conf/, never elsewhere.
     chooses = "/" in key or "." not in key
     climbs = chooses and key not in PATHS and re.fullmatch(r"[\w ,.+\-\[\]]*", value) is None
-    return sets and not hides and not climbs and ".." not in key and not key_of(word).startswith("hydra")
+    return sets and not hides and not climbs and ".." not in key and not key_of(override).startswith("hydra")
 
 
-def with_plan(name: str, words: list[str]) -> list[str]:
-    """The words, with ``plan=FILE`` (of ``train``) replaced by what it says; those typed beside it win."""
-    files = [word.partition("=")[2] for word in words if word.startswith("plan=")]
+def with_plan(name: str, arguments: list[str]) -> list[str]:
+    """Replace ``plan=FILE`` on the command line of ``forewarp-train`` by the plan's overrides.
+
+    Args:
+        name: of the command; of others the arguments are returned as they are.
+        arguments: of the command line; those typed beside ``plan=`` win over the plan.
+
+    Raises:
+        ValueError: if the file is no plan, or ``model=`` or ``resume=`` beside it contradicts it.
+    """
+    files = [argument.partition("=")[2] for argument in arguments if argument.startswith("plan=")]
     if name != "train" or not files:
-        return words
-    made = read_plan(Path(files[-1]).expanduser(), without_trust(words)[1])
-    typed = [word for word in words if not word.startswith("plan=")]
-    planned = [word for word in planned_words(made) if word.startswith("model=")] or ["model=forward"]
-    for word in typed:
-        if word.startswith("resume=") or (word.startswith("model=") and word != planned[-1]):
-            raise ValueError(f"{word}: expected no such word beside plan={files[-1]}; leave one of them out")
+        return arguments
+    made = read_plan(Path(files[-1]).expanduser(), without_trust(arguments)[1])
+    typed = [argument for argument in arguments if not argument.startswith("plan=")]
+    planned = merged(made["overrides"], made["typed"])
+    model = ([one for one in planned if one.startswith("model=")] or ["model=forward"])[-1]
+    for one in typed:
+        if one.startswith("resume=") or (one.startswith("model=") and one != model):
+            raise ValueError(
+                f"{one}: expected no such override beside plan={files[-1]}; leave one of them out"
+            )
     file = files[-1].replace("\\", "\\\\").replace("'", "\\'")
-    kept = [*planned_words(made), f"planned='{file}'", "effects=given"]
-    return of_what_is_on(merged([*kept, *own_folder(typed)], typed))
+    kept = [*planned, f"planned='{file}'", "effects=given"]
+    return without_switched_off(merged([*kept, *own_folder(typed)], typed))
 
 
 def own_folder(typed: Sequence[str]) -> list[str]:
-    """The word that gives a planned run a folder of its own, where neither a word nor a sweep names one."""
-    named = any(key_of(word) in ("run", "sweeps") for word in typed)
+    """Return the override that gives a planned run its own folder; none if ``run`` or a sweep names one."""
+    named = any(key_of(override) in ("run", "sweeps") for override in typed)
     return [] if named else ["run='${paths.runs}/${data.scene}/planned-{hash}'"]
 
 
-def planned_words(made: dict) -> list[str]:
-    """All words of the run that a plan says; those that were typed for it win."""
-    return merged(made["words"], made["typed"])
+def show_plan(made: dict, *, to_fit: bool = True) -> None:
+    """Print a plan as a table; ``to_fit`` adds the command that fits it."""
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
 
+    from forewarp.progress import time_text
 
-def tell(made: dict, *, to_fit: bool = True) -> None:
-    """A plan on one screen; ``to_fit`` says how it is fitted."""
     title = f"planned {'before, ' if made.get('found') else ''}in {time_text(made['seconds'])}"
     caption = "± is two standard errors" if made["evidence"]["trials"] else "without trials: less sure"
     table = Table(box=box.SIMPLE, title=title, caption=caption, title_justify="left", caption_justify="left")

@@ -1,4 +1,4 @@
-"""One scene's evidence as it is gathered: coarse stages, what they leave, trials, decisions."""
+"""Gather the evidence for a plan: fit coarse stages, run trials, and let the method decide."""
 
 from __future__ import annotations
 
@@ -17,38 +17,32 @@ from forewarp.scene.pictures import survey
 
 
 class Planner:
-    """Asks what a scene calls for; which effects there are, and what speaks for them, the method says.
+    """Plans one run; the method says which effects there are and what counts for each.
 
     Args:
         config: of the run that is planned.
-        words: as typed, for it; what they fix is not asked.
-        trials: runs what is tried.
+        typed: its overrides; the plan decides nothing that they fix.
+        trials: fits the short runs.
         scene: as the run would read it.
-        planning: the method's.
+        planning: of the method.
     """
 
     def __init__(
-        self, config: DictConfig, words: list[str], trials: Trials, scene: Scene, planning: Planning
+        self, config: DictConfig, typed: list[str], trials: Trials, scene: Scene, planning: Planning
     ) -> None:
-        self.words, self.trials, self.settings, self.planning = words, trials, config.plan, planning
+        self.typed, self.trials, self.settings, self.planning = typed, trials, config.plan, planning
         self.effects: dict[str, Effect] = {effect.name: effect for effect in planning.effects}
-        typed = {key_of(word): word.partition("=")[2] for word in words}
+        values = {key_of(override): override.partition("=")[2] for override in typed}
         stages = {name: stage for name, stage in config.stage.items() if stage is not None}
-        self.asked = Asked(
-            stages,
-            config.preset,
-            typed,
-            self._choose,
-            bool(config.plan.trials),
-        )
+        self.asked = Asked(stages, config.preset, values, self._choose, bool(config.plan.trials))
         trials.always, trials.always_fine = planning.always(self.asked)
-        # The run's share that the last stage has: what a dear effect of it takes its steps from.
+        # An effect of the last stage takes its time from that stage's share alone.
         shares = [stage.share for stage in stages.values()]
         minutes = self.settings.minutes and self.settings.minutes * shares[-1] / sum(shares)
         self.evidence = planning.evidence(survey(scene), least=self.settings.least, minutes=minutes)
 
     def plan(self) -> dict:
-        """What the run is to be, and why."""
+        """Return the plan without its seconds: overrides, effects with reasons, evidence."""
         self._fit_coarse()
         views = self.run.datamodule.targets("train")
         self.planning.look(self.evidence, self.module.method, self.run.datamodule.scene, views, self.asked)
@@ -56,14 +50,14 @@ class Planner:
             self._try_fine()
         every = [self._as_tried(decision) for decision in self.planning.decide(self.evidence, self.asked)]
         return {
-            "typed": list(self.words),
-            "words": list(dict.fromkeys(word for decision in every for word in decision.words)),
+            "typed": list(self.typed),
+            "overrides": list(dict.fromkeys(one for decision in every for one in decision.overrides)),
             "effects": {d.effect: {"choice": d.choice, "on": d.on, "because": d.because} for d in every},
             "evidence": self._numbers(),
         }
 
     def _fit_coarse(self) -> None:
-        """Fit the coarse stages that the method names, and tell it of each rival whether it pays."""
+        """Fit the coarse stages that the method asks for; answer for each rival whether it pays."""
         stages, answer = self.planning.coarse(self.evidence, self.asked), None
         while True:
             try:
@@ -71,29 +65,29 @@ class Planner:
             except StopIteration:
                 return
             if isinstance(wanted, Begin):
-                words = merged(self.base, wanted.words) if wanted.change else list(wanted.words)
-                answer = self._use(wanted.name, words)
+                overrides = list(wanted.overrides)
+                answer = self._use(wanted.name, merged(self.base, overrides) if wanted.change else overrides)
             else:
                 answer = self._rival(wanted)
 
-    def _use(self, name: str, words: list[str]) -> None:
-        """What the evidence is taken from and the trials begin from."""
-        self.name, self.base = name, words
-        self.reached, self.run, self.module = self.trials.coarse(name, words)
+    def _use(self, name: str, overrides: list[str]) -> None:
+        """Fit the coarse stage that gives the evidence and that fine trials begin from."""
+        self.name, self.base = name, overrides
+        self.reached, self.run, self.module = self.trials.coarse(name, overrides)
 
     def _rival(self, wanted: Rival) -> bool:
-        """Fit another coarse stage, go on with the better; whether the effect pays."""
-        words = merged(self.base, wanted.words)
-        rival = self.trials.coarse(wanted.name, words)
+        """Fit another coarse stage, go on with the better, and return whether the effect pays."""
+        overrides = merged(self.base, wanted.overrides)
+        rival = self.trials.coarse(wanted.name, overrides)
         on, off = (rival[0], self.reached) if wanted.adds else (self.reached, rival[0])
         self.evidence.gains[wanted.effect] = gain([on], [off], equal_steps=False)
         pays = self.evidence.pays(wanted.effect)
         if pays == wanted.adds:
-            self.name, self.base, (self.reached, self.run, self.module) = wanted.name, words, rival
+            self.name, self.base, (self.reached, self.run, self.module) = wanted.name, overrides, rival
         return pays
 
     def _try_fine(self) -> None:
-        """From the coarse stage on: what is still open, with it and without, at equal steps."""
+        """Try each effect that is still open in the fine stage, with it and without, at equal steps."""
         evidence, tried = self.evidence, partial(self._tried, "fine", self.base, 0)
         asked = [
             effect
@@ -109,32 +103,32 @@ class Planner:
             choice = f"{effect.group}={self._choose(effect.name)}"
             self._try(effect.name, merged(self.base, [choice]))
 
-    def _try(self, effect: str, words: list[str]) -> None:
-        """An effect, seed by seed, as long as it is not plain that it brings nothing."""
+    def _try(self, effect: str, overrides: list[str]) -> None:
+        """Try an effect seed by seed; stop once it is clear that it gains nothing."""
         on, off = [], []
         for seed in range(self.settings.seeds):
-            on.append(self._tried(f"fine-{effect}", words, seed, on[0].steps if on else None))
+            on.append(self._tried(f"fine-{effect}", overrides, seed, on[0].steps if on else None))
             off.append(self._tried("fine", self.base, seed))
-            if off[-1].steps != on[-1].steps:  # it had no time for more
+            if off[-1].steps != on[-1].steps:  # the effect had no time for more
                 off[-1] = self._tried(f"fine-{on[-1].steps}", self.base, seed, on[-1].steps)
             found = self.evidence.gains[effect] = gain(on, off)
             if found.psnr + found.noise < self.settings.least:
                 return
 
-    def _tried(self, name: str, words: list[str], seed: int, steps: int | None = None) -> Trial:
-        return self.trials.fine(name, words, self.name, seed, steps)
+    def _tried(self, name: str, overrides: list[str], seed: int, steps: int | None = None) -> Trial:
+        return self.trials.fine(name, overrides, self.name, seed, steps)
 
     def _choose(self, effect: str) -> str:
-        """What an effect is switched on by: the configuration's own choice, or else a usual one."""
+        """Return the option that switches an effect on: the configured one, or else its usual one."""
         own = HydraConfig.get().runtime.choices.get(f"model/{effect}")
         return own if own not in (None, self.effects[effect].off) else self.effects[effect].on
 
     def _as_tried(self, decision: Decision) -> Decision:
-        """The decision with what makes the run as it was tried."""
+        """Add the overrides that an effect was tried with."""
         effect = self.effects.get(decision.effect)
         if effect is None or not decision.on:
             return decision
-        return replace(decision, words=(*decision.words, *effect.with_it(self.asked)))
+        return replace(decision, overrides=(*decision.overrides, *effect.with_it(self.asked)))
 
     def _numbers(self) -> dict:
         values = {f.name: getattr(self.evidence, f.name) for f in fields(self.evidence)}

@@ -1,4 +1,4 @@
-"""Short runs that tell what an effect is worth: coarse stages, and fine ones that begin where these end."""
+"""Fit the short runs of a plan: coarse stages, and fine stages that begin where these end."""
 
 from __future__ import annotations
 
@@ -14,23 +14,29 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 
 from forewarp.evaluation.pictures import psnr_by_view
 from forewarp.files import read_json, write_json
-from forewarp.report.effect import Gain, Numbers
+from forewarp.report.gain import Gain, Numbers
 from forewarp.runs.build import build_run
-from forewarp.runs.identity import claim
-from forewarp.runs.lock import alone, same_data
-from forewarp.runs.overrides import merged, of_what_is_on
+from forewarp.runs.config import claim
+from forewarp.runs.data_check import check_data
+from forewarp.runs.lock import locked
+from forewarp.runs.overrides import merged, without_switched_off
 from forewarp.training.device import device_of
 from forewarp.training.handover import NUMBERS, POINTS
 from forewarp.training.module import DynamicSceneModule
 from forewarp.training.stages import Run
 
-RAYS = 10_000  # pixels that are looked at in each view set aside
+RAYS = 10_000  # pixels rendered of each view set aside
 
 
 @dataclass(frozen=True)
 class Trial:
-    """What a short run reached: ``psnr`` (dB) of each view set aside, ``step`` in seconds of training,
-    ``steps``; ``took`` seconds in all.
+    """The result of a short run.
+
+    Attributes:
+        psnr: dB, of each view set aside.
+        step: seconds of training for a step.
+        steps: that were done.
+        took: seconds in all.
     """
 
     psnr: tuple[float, ...]
@@ -40,40 +46,42 @@ class Trial:
 
     @property
     def numbers(self) -> list[Numbers]:
-        """Of each view."""
+        """The result as ``Gain`` takes it, for each view."""
         return [{"psnr": psnr, "step": self.step} for psnr in self.psnr]
 
 
 def gain(on: Sequence[Trial], off: Sequence[Trial], *, equal_steps: bool = True) -> Gain:
-    """What trials with an effect gain over those without, seed by seed and view by view."""
+    """Compare trials with an effect and without it, seed by seed and view by view."""
     pairs = [list(zip(a.numbers, b.numbers, strict=True)) for a, b in zip(on, off, strict=True)]
     seconds = on[0].step * on[0].steps, off[0].step * off[0].steps
     return Gain.of(pairs, on[0].steps if equal_steps else None, seconds)
 
 
-def composed(words: Sequence[str]) -> DictConfig:
-    """What ``forewarp-train`` would make of these words; Hydra must have been begun."""
-    return compose("train", list(words))
+def composed(overrides: Sequence[str]) -> DictConfig:
+    """Compose the config of ``forewarp-train`` with these overrides; Hydra must be initialised."""
+    return compose("train", list(overrides))
 
 
 @dataclass
 class Trials:
-    """All short runs of one plan; one that is finished is not run again.
+    """All short runs of one plan; a finished one is not run again.
 
     Args:
-        words: as typed, for the run that is planned.
-        folder: of the plan; a folder a trial.
-        steps: of a coarse stage. seconds: that it may take at most.
-        fine_steps, fine_seconds: the same of a fine one.
-        held_out: training views set aside and scored.
-        tell: takes a line before each.
-
-    ``always`` and ``always_fine`` are overrides of every trial and of every fine one, which the method's
-    planning says. ``seconds_before`` is what those took that were found finished; ``made`` are the fine ones
-    so far: several effects are compared with the same.
+        typed: overrides of the run that is planned.
+        folder: of the plan; each trial has a folder in it.
+        steps: of a coarse stage.
+        seconds: that a coarse stage may take at most.
+        fine_steps: of a fine stage.
+        fine_seconds: that a fine stage may take at most.
+        held_out: training views that are set aside and scored.
+        tell: called with the name of each trial before it runs.
+        seconds_before: that the trials found finished once took.
+        made: the fine trials so far, as several effects are compared with the same one.
+        always: overrides of every trial, given by the method.
+        always_fine: overrides of every fine trial, given by the method.
     """
 
-    words: list[str]
+    typed: list[str]
     folder: Path
     steps: int
     seconds: float
@@ -87,7 +95,7 @@ class Trials:
     always_fine: Sequence[str] = ()
 
     def coarse(self, name: str, changes: Sequence[str]) -> tuple[Trial, Run, DynamicSceneModule]:
-        """A coarse stage with these words, its run and what it fitted."""
+        """Fit a coarse stage with these overrides; return its result, its run and the fitted module."""
         config = self._config(name, changes, self.always, 0, self.steps, self.seconds)
         for later in list(config.stage)[1:]:
             config.stage[later] = None
@@ -96,10 +104,14 @@ class Trials:
     def fine(
         self, name: str, changes: Sequence[str], after: str, seed: int, steps: int | None = None
     ) -> Trial:
-        """A short fine stage that begins where the coarse one of the trial ``after`` ended.
+        """Fit a short fine stage that begins where the coarse stage of the trial ``after`` ended.
 
         Args:
-            steps: exactly so many; None: ``fine_steps``, or as many as ``fine_seconds`` allow.
+            name: of the trial.
+            changes: its overrides.
+            after: the trial whose coarse stage it goes on from.
+            seed: added to the run's seed.
+            steps: of the stage; None: ``fine_steps``, or fewer if ``fine_seconds`` are over before.
         """
         if (known := self.made.get(f"{name}-seed{seed}")) is not None:
             return known
@@ -120,10 +132,10 @@ class Trials:
         steps: int,
         seconds: float | None,
     ) -> DictConfig:
-        config = composed(of_what_is_on(merged(merged(changes, self.words), always)))
+        config = composed(without_switched_off(merged(merged(changes, self.typed), always)))
         data = OmegaConf.to_container(config.data, resolve=True) | {"seed": config.seed + seed}
         with open_dict(config):
-            config.data = data  # of the scene as planned, whatever it is drawn by
+            config.data = data  # resolved before: a scene made from the seed stays the planned one
             config.run, config.seed, config.effects = str(self.folder / name), config.seed + seed, "given"
             config.budget.iterations, config.budget.minutes = steps, None if seconds is None else seconds / 60
             config.data.held_out, config.evaluate = self.held_out, False
@@ -132,14 +144,14 @@ class Trials:
         return config
 
     def _fitted(self, config: DictConfig, begun: Path | None = None) -> tuple[Trial, Run, DynamicSceneModule]:
-        """Fit and score it, where that was not done; ``begun``: the folder of a stage finished before."""
+        """Fit and score a trial, or read its result; ``begun`` is the folder of its finished first stage."""
         begin = time.perf_counter()
         run = build_run(config)
         run.tell = lambda line: None
         run.datamodule.setup("fit")
-        with alone(run.folder):
+        with locked(run.folder):
             claim(config)
-            same_data(run, "refuse")
+            check_data(run, "refuse")
             if begun is not None:
                 _share(begun, run.folder / begun.name)
             module = run.fit().to(device_of(config.trainer.accelerator))
@@ -157,14 +169,14 @@ class Trials:
 
 
 def _share(source: Path, target: Path) -> None:
-    """A finished stage in another run, without a second copy where the system has links."""
+    """Put a finished stage into another run: by hard links, or as a copy if the system has none."""
     if target.is_dir():
         return
     beside = target.with_name(target.name + ".part")
     shutil.rmtree(beside, ignore_errors=True)
     beside.mkdir(parents=True)
     for name in ("last.ckpt", NUMBERS, POINTS, "done.json"):
-        if not (source / name).is_file():  # not every method leaves points
+        if not (source / name).is_file():  # not every method hands over points
             continue
         try:
             os.link(source / name, beside / name)

@@ -1,10 +1,10 @@
-"""What run folders hold, read as plain files."""
+"""Read run folders as plain files, without torch and without running their config."""
 
 from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -15,8 +15,9 @@ from forewarp.files import MOST_CONFIG, read_text
 
 @dataclass(frozen=True)
 class Point:
-    """A row of ``accuracy_time.csv``: PSNR (dB) of the views set aside after ``seconds`` of training;
-    ``epe`` is the moving points' error in world units, None where nobody knows the truth.
+    """A row of ``accuracy_time.csv``: PSNR (dB) of the views set aside after ``seconds`` of training.
+
+    ``epe`` is the error of moving points in world units; None if the truth is unknown.
     """
 
     seconds: float
@@ -27,8 +28,14 @@ class Point:
 
 @dataclass(frozen=True)
 class Result:
-    """One run: its resolved ``config``, what its stages noted at their end, its ``metrics.json`` (empty where
-    it was not measured) and its curve (empty where no views were set aside).
+    """One run.
+
+    Attributes:
+        folder: of the run.
+        config: resolved.
+        stages: the ``done.json`` of each finished stage.
+        metrics: its ``metrics.json``; empty if it was not measured.
+        curve: its ``accuracy_time.csv``; empty if no views were set aside.
     """
 
     folder: Path
@@ -39,68 +46,84 @@ class Result:
 
     @property
     def scene(self) -> str:
-        """Its name."""
+        """The scene's name."""
         return str(self.config["data"]["scene"])
 
     @property
     def dataset(self) -> str:
-        """What its scene is one of, as its numbers' protocol says; "" where it was not measured."""
+        """The dataset that its scene is of; "" if it was not measured."""
         return str(self.metrics.get("protocol", {}).get("dataset", ""))
 
     @property
     def is_counterpart(self) -> bool:
-        """Whether it is of a procedural scene that stands in for its dataset."""
+        """Whether its scene is a synthetic counterpart of a dataset."""
         made = self.metrics.get("protocol", {}).get("synthetic", False)
         return bool(made) or ".Synthetic" in str(self.config["data"].get("_target_", ""))
 
     @property
     def variant(self) -> str:
-        """What was changed; without a variant the method and its preset."""
+        """Name what tells this run from others of its scene.
+
+        That is its ablation; of ``sweeps=accuracy_time`` and ``price_list`` the overrides that were typed
+        (``base`` without any); of all other runs the method and its preset.
+        """
         known = self.config.get("variant") or {}
-        return known.get("name") or f"{self.config['model']['name']}-{self.config['preset']['name']}"
+        if "name" in known:
+            return known["name"] or "base"
+        return f"{self.config['model']['name']}-{self.config['preset']['name']}"
 
     @property
     def about(self) -> str:
-        """The change in words."""
+        """What the variant changes, in a phrase."""
         return (self.config.get("variant") or {}).get("about", "")
 
-    @property
-    def against(self) -> str:
-        """The variant that it is compared with."""
-        return (self.config.get("variant") or {}).get("against", "base")
+    def against(self, variants: Iterable[str]) -> str:
+        """Choose the one of ``variants`` that this run is compared with.
+
+        That is the one its config names, or else the one with most of this run's overrides and no others.
+
+        >>> run = Result(Path("run"), {"variant": {"name": "a=1 b=2 c=3"}})
+        >>> run.against(["base", "a=1", "a=1 b=2", "a=1 d=4", "a=1 b=2 c=3"])
+        'a=1 b=2'
+        """
+        if named := (self.config.get("variant") or {}).get("against"):
+            return named
+        own = set(self.variant.split())
+        inside = [name for name in variants if set(name.split()) < own]
+        return max(inside, key=lambda name: len(name.split()), default="base")
 
     @property
     def effects(self) -> str:
-        """Those of its method's effects that were on, as it was measured; "" where it was not."""
+        """The effects of its method that were on; "" if it was not measured."""
         return ", ".join(name for name, on in self.metrics.get("effects", {}).items() if on)
 
     @property
     def seed(self) -> int:
-        """Of everything random."""
+        """The seed of all random numbers."""
         return int(self.config["seed"])
 
     @property
     def minutes(self) -> float | None:
-        """What the run could spend; None where steps bound it."""
+        """The minutes of its budget; None if steps bound it."""
         return self.config["budget"]["minutes"]
 
     @property
     def command(self) -> str:
-        """What makes such a run, trained on all views."""
+        """The command that made it."""
         return self.config.get("command") or f"forewarp-train # as {self.folder / 'config.yaml'}"
 
     @property
     def ability(self) -> str:
-        """The kind of test view that its numbers are of: ``all``, or, where a scene tells them apart,
-        ``time``: a new view between the training times; the kind it has where it has none of these.
+        """The kind of test view that its numbers are of: ``all``, else ``time`` (between the training times),
+        else the kind it has.
         """
         known = self.metrics["test"]
         return [*(kind for kind in ("all", "time") if kind in known), *known, "all"][0]
 
     @property
     def numbers(self) -> dict[str, float]:
-        """Of a measured run: ``psnr ssim epe``, ``step`` and ``frame`` in seconds, ``memory`` in GiB,
-        ``parameters`` in millions and ``steps``; what is unknown is left out.
+        """The numbers of a measured run: ``psnr``, ``ssim``, ``epe``, ``step`` and ``frame`` (seconds),
+        ``memory`` (GiB), ``parameters`` (millions) and ``steps``; unknown ones are left out.
         """
         scores = self.metrics["test"].get(self.ability, {})
         seconds, steps = self.metrics["seconds"], sum(done["steps"] for done in self.stages.values())
@@ -119,17 +142,17 @@ class Result:
 
 
 def collect(root: Path, needed: Sequence[str] = ()) -> tuple[list[Result], list[str]]:
-    """All runs below a folder.
+    """Read all runs below a folder.
 
     Args:
         root: searched for ``config.yaml``.
-        needed: files that a run must hold, as ``metrics.json``.
+        needed: files that a run must hold, such as ``metrics.json``.
 
     Returns:
-        the runs in the order of their folders, and a line for each that cannot be used.
+        the runs in the order of their folders, and a line for each run that cannot be used.
 
     Raises:
-        ValueError: where there is no run at all.
+        ValueError: if there is no run at all.
     """
     results, without = [], []
     for path in sorted(Path(root).rglob("config.yaml")):
@@ -145,7 +168,7 @@ def collect(root: Path, needed: Sequence[str] = ()) -> tuple[list[Result], list[
             continue
         if absent:
             again = "run its command again"
-            if absent == ["accuracy_time.csv"]:  # no views to draw it from
+            if absent == ["accuracy_time.csv"]:  # it had no views for it
                 again = "run its command with data.held_out=8 into another folder"
             without.append(f"{folder.relative_to(root)}: no {', '.join(absent)}; {again}")
         else:
@@ -158,7 +181,7 @@ def collect(root: Path, needed: Sequence[str] = ()) -> tuple[list[Result], list[
 
 
 def read_run(folder: Path) -> Result:
-    """One run; files that are not there leave their part empty."""
+    """Read one run; parts whose files are missing are empty."""
     path = folder / "config.yaml"
     config = yaml.safe_load(read_text(path, MOST_CONFIG))
     if "preset" not in config and "warp" in config.get("model", {}):  # of a version before 0.2
@@ -166,13 +189,13 @@ def read_run(folder: Path) -> Result:
         config["model"]["name"] = config["model"]["warp"]
     stages = {path.parent.name: _json(path) for path in sorted(folder.glob("*/done.json"))}
     result = Result(folder, config, stages, _json(folder / "metrics.json"), read_curve(folder))
-    # Looked at here, so that what is spoiled is found while it can be named.
+    # Evaluated here, so that a broken file is noticed while its run can be named.
     _ = result.scene, result.variant, result.seed, result.minutes, result.metrics and result.numbers
     return result
 
 
 def read_curve(folder: Path) -> tuple[Point, ...]:
-    """The rows of a run's ``accuracy_time.csv``; none where it has none."""
+    """Read the rows of a run's ``accuracy_time.csv``; none if it has none."""
     path = folder / "accuracy_time.csv"
     if not path.is_file():
         return ()
@@ -189,7 +212,7 @@ def read_curve(folder: Path) -> tuple[Point, ...]:
 
 
 def grouped(results: Sequence[Result]) -> dict[tuple[str, float | None], list[Result]]:
-    """The runs that differ in nothing but the seed: (variant, minutes) -> runs by seed; the base first."""
+    """Group runs that differ only in the seed: (variant, minutes) -> runs by seed, the base first."""
     groups: dict[tuple[str, float | None], list[Result]] = {}
     for result in sorted(results, key=lambda r: (r.variant != "base", r.variant, r.minutes or 0, r.seed)):
         groups.setdefault((result.variant, result.minutes), []).append(result)
@@ -197,26 +220,26 @@ def grouped(results: Sequence[Result]) -> dict[tuple[str, float | None], list[Re
 
 
 def by_scene(results: Sequence[Result]) -> dict[str, list[Result]]:
-    """Scene -> its runs, by name."""
+    """Group runs by scene, sorted by name."""
     scenes = sorted({result.scene for result in results})
     return {scene: [result for result in results if result.scene == scene] for scene in scenes}
 
 
 def left_out(title: str, lines: Sequence[str]) -> list[str]:
-    """The part of a page that lists what ``collect`` could not use; nothing where there is none."""
+    """Return the part of a page that lists the runs that ``collect`` could not use."""
     return [f"## {title}\n", "\n".join(f"* {line}" for line in lines) + "\n"] if lines else []
 
 
 def machine(results: Sequence[Result]) -> str:
-    """What the runs were computed on, in one line."""
+    """Say in one line what the runs were computed on."""
     found = []
     for protocol in (result.metrics.get("protocol", {}) for result in results):
         torch = protocol.get("versions", {}).get("torch")
         threads = protocol.get("threads")
-        words = [protocol.get("device"), f"{threads} thread{'s' * (threads != 1)}", f"torch {torch}"]
-        if protocol.get("device") and words not in found:
-            found.append(words)
-    return "; ".join(", ".join(words) for words in found) or "unknown"
+        about = [protocol.get("device"), f"{threads} thread{'s' * (threads != 1)}", f"torch {torch}"]
+        if protocol.get("device") and about not in found:
+            found.append(about)
+    return "; ".join(", ".join(about) for about in found) or "unknown"
 
 
 def _json(path: Path) -> dict:

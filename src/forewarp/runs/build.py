@@ -1,8 +1,8 @@
-"""A run, put together from its config."""
+"""Build a run from its config, or from its folder, and measure it as the config says."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -10,18 +10,22 @@ import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
-from forewarp.training.device import check_precision
-from forewarp.training.device import device_of
-from forewarp.training.budget import StagePlan, seconds_after, share_out
 from forewarp.evaluation.measure import measure
-from forewarp.training.callbacks import StageProgress
 from forewarp.files import read_json
+from forewarp.runs.config import saved_config
+from forewarp.training.callbacks import StageProgress
+from forewarp.training.device import check_precision, device_of
 from forewarp.training.module import DynamicSceneModule
+from forewarp.training.schedule import StagePlan, seconds_after, share_out
 from forewarp.training.stages import Run
 
 
 def build_run(config: DictConfig) -> Run:
-    """Everything that a run needs, put together; nothing is read or computed yet."""
+    """Build a run from its config; nothing is read or computed yet.
+
+    Raises:
+        ValueError: naming the key of the config that is wrong.
+    """
     if config.threads is not None:
         if not (isinstance(config.threads, int) and config.threads >= 1):
             raise ValueError(f"threads: expected a whole number > 0 or null, but got {config.threads}")
@@ -34,7 +38,7 @@ def build_run(config: DictConfig) -> Run:
 
     def make_trainer(folder: Path, callbacks: list):
         return trainer(
-            # Not Lightning's own choice, which on a Mac would be a GPU without float64.
+            # Lightning would choose the GPU of a Mac, which has no float64.
             accelerator=device_of(config.trainer.accelerator).type,
             max_epochs=1,
             max_steps=-1,
@@ -54,7 +58,7 @@ def build_run(config: DictConfig) -> Run:
         stages=share_out(plans, minutes=config.budget.minutes, iterations=config.budget.iterations),
         folder=Path(config.run),
         make_trainer=make_trainer,
-        callbacks=lambda name, folder: watching(run, watchers, name),
+        callbacks=lambda name, folder: _callbacks(run, watchers, name),
         seed=config.seed,
         checkpoint_seconds=config.checkpoint_seconds,
         skip=config.get("sentinel", {"skip": 0})["skip"],
@@ -64,8 +68,22 @@ def build_run(config: DictConfig) -> Run:
     return run
 
 
+def stored_run(folder: str | Path, trust: str | Sequence[str] | None = None) -> Run:
+    """Build the run in a folder from its own config; nothing is read or computed yet.
+
+    Args:
+        folder: of the run.
+        trust: packages beside forewarp whose code its config may name, as ``trust_of`` takes them.
+
+    Raises:
+        ValueError: if it is no run, or its config names code that is not trusted.
+    """
+    trust = trust if trust is None or isinstance(trust, str) else list(trust)
+    return build_run(saved_config(str(folder), OmegaConf.create({"trust": trust})))
+
+
 def model_of(config: DictConfig) -> Callable:
-    """What makes a method of a stage's start, from the ``model`` part of a config."""
+    """Return the function that makes a stage's method, from the ``model`` part of a config."""
     content = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     content.pop("name", None)
     model = instantiate(OmegaConf.create({"model": content}).model, _convert_="all")  # its key, for errors
@@ -78,7 +96,7 @@ def model_of(config: DictConfig) -> Callable:
 
 
 def stage_of(name: str, config: DictConfig | None) -> StagePlan | None:
-    """A stage that waits for its budget; where it names a ``model``, one with a method of its own."""
+    """Make a stage without its budget; a stage that names a ``model`` has a method of its own."""
     if config is None:
         return None
     content = OmegaConf.to_container(config, resolve=True)
@@ -93,8 +111,8 @@ def stage_of(name: str, config: DictConfig | None) -> StagePlan | None:
     return plan
 
 
-def watching(run: Run, watchers: list[Callable], name: str) -> list:
-    """New watchers of the stage ``name``; the progress line learns what the later ones may take."""
+def _callbacks(run: Run, watchers: list[Callable], name: str) -> list:
+    """Make the callbacks of a stage; the progress line learns what the later stages may take."""
     made = [watcher() for watcher in watchers]
     for line in made:
         if isinstance(line, StageProgress):
@@ -103,7 +121,7 @@ def watching(run: Run, watchers: list[Callable], name: str) -> list:
 
 
 def measure_run(run: Run, module: DynamicSceneModule, config: DictConfig) -> dict:
-    """Evaluate a fitted run as its config says, print the table and return what ``metrics.json`` then holds."""
+    """Evaluate a fitted run as its config says; print and return the numbers."""
     protocol = {"method": method_name(config), "preset": config.preset.name, "seed": config.seed}
     protocol |= {"minutes": config.budget.minutes, "iterations": config.budget.iterations}
     extra = config.lpips_weights
@@ -118,15 +136,20 @@ def measure_run(run: Run, module: DynamicSceneModule, config: DictConfig) -> dic
 
 
 def method_name(config: DictConfig) -> str:
-    """Name the method that is measured: the last stage's own, or else the run's."""
+    """Name the method that is measured: that of the last stage, or else the run's."""
     own = [stage.get("model") for stage in config.stage.values() if stage is not None][-1]
     return (own or config.model).get("name", config.model.name)
 
 
 def is_measured(run: Run) -> bool:
-    """Whether a run is finished and was measured since."""
+    """Tell whether a run is finished and was measured since."""
     metrics = Path(run.folder) / "metrics.json"
-    if read_json(metrics) is None or not all(run.is_finished(stage) for stage in run.stages):
+    return read_json(metrics) is not None and is_current(metrics, run)
+
+
+def is_current(file: Path, run: Run) -> bool:
+    """Tell whether a run is finished and a file was written since."""
+    if not all(run.is_finished(stage) for stage in run.stages):
         return False
     done = [run.stage_folder(stage) / "done.json" for stage in run.stages]
-    return metrics.stat().st_mtime_ns >= max(path.stat().st_mtime_ns for path in done)
+    return file.stat().st_mtime_ns >= max(path.stat().st_mtime_ns for path in done)

@@ -1,4 +1,4 @@
-"""A fitted run as an object, for notebooks and scripts."""
+"""Open a fitted run as an object, for notebooks and scripts."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
-from forewarp.runs.identity import saved_config
-from forewarp.runs.build import build_run
-from forewarp.runs.trust import trust_of
 from forewarp.data.batches import color_of
+from forewarp.files import read_json
 from forewarp.methods.abilities import HasMatter, HasTrajectories
 from forewarp.methods.method import Method, Snapshot
+from forewarp.runs.build import build_run
+from forewarp.runs.config import saved_config
+from forewarp.runs.trust import trust_of
 from forewarp.scene.camera import Camera
 from forewarp.scene.cloud import Cloud
 from forewarp.scene.frame import Frame, Scene
 from forewarp.scene.view import Moment, View
-from forewarp.files import read_json
 from forewarp.training.module import DynamicSceneModule
 
 SPLITS = ("train", "val", "test", "held")
@@ -28,7 +28,7 @@ SPLITS = ("train", "val", "test", "held")
 
 @dataclass
 class Fitted:
-    """A fitted scene; ``forewarp.load(folder)`` makes it.
+    """A fitted scene, as ``forewarp.load(folder)`` returns it.
 
     >>> import forewarp
     >>> scene = forewarp.load(fitted_run)
@@ -44,8 +44,8 @@ class Fitted:
 
     Attributes:
         folder: of the run.
-        config: as it was run.
-        module: what was fitted; ``module.method`` is the method.
+        config: of the run.
+        module: the fitted module; ``module.method`` is the method.
         scene: cameras, times, box.
     """
 
@@ -57,12 +57,12 @@ class Fitted:
 
     @property
     def method(self) -> Method:
-        """What was learned."""
+        """The fitted method."""
         return self.module.method
 
     @property
     def metrics(self) -> dict:
-        """What ``metrics.json`` holds; empty where the run was not measured."""
+        """The content of ``metrics.json``; empty if the run was not measured."""
         return read_json(self.folder / "metrics.json") or {}
 
     def frames(self, split: str = "test") -> tuple[Frame, ...]:
@@ -72,14 +72,14 @@ class Fitted:
         return getattr(self.scene, split)
 
     def render(self, camera: Camera, time: float, background: str | Tensor = "white") -> Tensor:
-        """See the scene from a camera at a time: a picture (H, W, 3) in [0, 1], on the CPU.
+        """Render the scene from a camera at a time: a picture (H, W, 3) in [0, 1], on the CPU.
 
         Args:
             camera: ``frame.camera``, or one of your own; ``camera.resized(w, h)`` is another size of it.
             time: in [0, 1].
             background: white, black, or a colour (3,) in [0, 1].
 
-        Cost: pictures of one time, one after the other, share what is computed for that time.
+        Cost: consecutive pictures of one time share its snapshot.
         """
         if not 0 <= time <= 1:
             raise ValueError(f"time: expected a number in [0, 1], but got {time}")
@@ -92,14 +92,14 @@ class Fitted:
         return drawn.rgb.clamp(0, 1).reshape(camera.height, camera.width, 3).cpu()
 
     def trajectories(self, points: Tensor, times: Sequence[float]) -> Tensor:
-        """Follow canonical points (N, 3), world units: where they are at ``times`` (T,), (N, T, 3)."""
+        """Follow canonical points (N, 3), world units, to ``times`` (T,) in [0, 1]; returns (N, T, 3)."""
         method = self._able(HasTrajectories, "follows points")
         with torch.no_grad():
             at = torch.as_tensor(times, dtype=torch.float32, device=self.module.device)
             return method.trajectories(points.to(self.module.device), at).cpu()
 
     def matter(self) -> Cloud:
-        """Give the canonical matter as points with colour and opacity."""
+        """Return the canonical matter as points with colour and opacity."""
         with torch.no_grad():
             return self._able(HasMatter, "tells where matter is").matter()
 

@@ -1,4 +1,4 @@
-"""Configs that come from a run's folder: read as data, and refused where they could do more than a config."""
+"""Read configs from run folders safely: refuse what could run code that the user does not trust."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from forewarp.files import MOST_CONFIG
 
 MOST_LEVELS = 40
 TRUST_VARIABLE = "FOREWARP_TRUST"
-# Beside the classes that modules of forewarp define. Whole names: through a prefix all of torch is reached.
+# Allowed beside the classes of forewarp. Whole names, as all of torch can be reached through a prefix.
 ELSEWHERE = {
     "lightning.Trainer",
     "lightning.pytorch.Trainer",
@@ -30,18 +30,19 @@ _PARTS = {"name", "version", "sub_dir"}  # of the path that a logger writes to
 
 
 def trusted_config(text: str, where: Path, trust: Sequence[str] | None = ()) -> DictConfig:
-    """A resolved config from its YAML.
+    """Parse a resolved config and refuse it if it is not safe to instantiate.
 
     Args:
         text: the YAML.
         where: it comes from, for errors.
-        trust: packages whose code it may name, as ``trust_of`` gives them; no other is imported. None: the
-            config is compared and never instantiated, so what its targets name is not looked at.
+        trust: packages whose code it may name, as ``trust_of`` returns them; no other package is imported.
+            None: its targets are not checked, for a config that is only compared and never instantiated.
 
     Raises:
-        ValueError: for what is no YAML, no mapping, uses aliases or interpolations, is nested too deeply, or
-            names a ``_target_`` that is neither a class of forewarp, by the module that defines it, nor in
-            ``ELSEWHERE``, nor defined in a package of ``trust``, or sends a logger out of its stage's folder.
+        ValueError: if it is no YAML mapping, uses aliases or interpolations, or is nested too deeply; if a
+            ``_target_`` is neither a class of forewarp (named by the module that defines it), nor in
+            ``ELSEWHERE``, nor defined in a trusted package; or if a logger would write outside its stage's
+            folder.
     """
     try:
         _check_events(text, where)
@@ -61,13 +62,13 @@ def trusted_config(text: str, where: Path, trust: Sequence[str] | None = ()) -> 
 
 
 def trust_of(named: str | Iterable[str] | None = None) -> tuple[str, ...]:
-    """The packages that are trusted: those named, and those of ``FOREWARP_TRUST``.
+    """List the trusted packages: those named, then those in ``FOREWARP_TRUST``.
 
     Args:
-        named: one name, or several with commas or as a list; None: none.
+        named: a name, several separated by commas, or a list; None: none.
 
     Raises:
-        ValueError: for what is no name of a package: an empty one, a wildcard.
+        ValueError: if one is no package name, as an empty one or a wildcard.
 
     >>> trust_of("theirs"), trust_of(["theirs", "other.part", "theirs"])
     (('theirs',), ('theirs', 'other.part'))
@@ -86,26 +87,26 @@ def trust_of(named: str | Iterable[str] | None = None) -> tuple[str, ...]:
     return tuple(found)
 
 
-def without_trust(words: Sequence[str]) -> tuple[list[str], tuple[str, ...]]:
-    """The words of a command line that are no ``trust=...``, and the packages that those name.
+def without_trust(arguments: Sequence[str]) -> tuple[list[str], tuple[str, ...]]:
+    """Split a command line into the arguments that are no ``trust=...`` and the packages that those name.
 
     >>> without_trust(["run", "trust=[theirs,other]"])
     (['run'], ('theirs', 'other'))
     """
-    named = [word.partition("=")[2] for word in words if word.startswith("trust=")]
+    named = [argument.partition("=")[2] for argument in arguments if argument.startswith("trust=")]
     lists = [re.sub(r"^\[(.*)\]$", r"\1", text) for text in named]
-    rest = [word for word in words if not word.startswith("trust=")]
+    rest = [argument for argument in arguments if not argument.startswith("trust=")]
     return rest, trust_of([name for text in lists for name in text.split(",")])
 
 
 def check_planned(config: DictConfig, trust: Sequence[str]) -> None:
-    """Refuse a composed config whose words came from a plan's file, where it could do more than a config."""
+    """Check a composed config whose overrides came from a plan file, as a stored config is."""
     where = f"plan={config.planned}"
     _check(OmegaConf.to_container(config, resolve=True), where, "", trust)
 
 
 def _check_events(text: str, where: Path) -> None:
-    """Refuse what grows when it is built: aliases and endless nesting; of text too long nothing is parsed."""
+    """Refuse text that is too long to parse, and aliases and deep nesting, which grow when they are built."""
     if len(text) > MOST_CONFIG:
         raise ValueError(f"{where}: expected at most {MOST_CONFIG} characters, but got {len(text)}")
     level = 0
@@ -135,10 +136,10 @@ def _check(node: object, where: Path, key: str, trust: Sequence[str] | None) -> 
 
 
 def check_target(name: object, where: Path | str, key: str, trust: Sequence[str]) -> None:
-    """Refuse the name of what is neither forewarp's, nor in ``ELSEWHERE``, nor of a trusted package.
+    """Refuse a ``_target_`` that is no class of forewarp, not in ``ELSEWHERE``, and of no trusted package.
 
     Raises:
-        ValueError: that says where it stands, and how to trust it.
+        ValueError: saying where it stands, and how to trust its package.
     """
     if isinstance(name, str) and name in ELSEWHERE:
         return
@@ -152,15 +153,15 @@ def check_target(name: object, where: Path | str, key: str, trust: Sequence[str]
     home, _, last = name.rpartition(".")
     try:
         found = getattr(importlib.import_module(home), last)
-    except Exception as error:  # what imports raise
+    except Exception as error:  # an import may raise anything
         raise ValueError(f"{refusal} ({type(error).__name__})") from None
-    # Not what a module imports: ``forewarp.cli.entry.Path`` begins with a name of ours and is none of ours.
+    # A module's own imports do not count: ``forewarp.cli.entry.Path`` is not a class of forewarp.
     if not inspect.isclass(found) or found.__module__ != home:
         raise ValueError(refusal)
 
 
 def _check_foreign(name: str, refusal: str, trust: Sequence[str]) -> None:
-    """Refuse what no trusted package defines; before anything is imported where none has this name."""
+    """Refuse a target that no trusted package defines; import nothing of packages that are not trusted."""
     if not _is_below(name, trust):
         raise ValueError(refusal + advice(name, trust))
     parts = name.split(".")
@@ -168,10 +169,10 @@ def _check_foreign(name: str, refusal: str, trust: Sequence[str]) -> None:
         raise ValueError(refusal)
     try:
         found = _located(parts)
-    except Exception as error:  # what imports raise
+    except Exception as error:  # an import may raise anything
         reason = str(error).partition("\n")[0] or type(error).__name__
         raise ValueError(f"{refusal}, which cannot be imported ({reason:.120})") from None
-    # Not what its modules import: through ``theirs.module.subprocess.run`` everything would be reached.
+    # What its modules import does not count: ``theirs.module.subprocess.run`` would reach everything.
     home = getattr(found, "__module__", None)
     if not callable(found) or not isinstance(home, str):
         raise ValueError(f"{refusal}, which is nothing to call that {parts[0]} defines")
@@ -180,7 +181,7 @@ def _check_foreign(name: str, refusal: str, trust: Sequence[str]) -> None:
 
 
 def _located(parts: Sequence[str]) -> object:
-    """What a dotted name means: modules as far as there are such, then attributes."""
+    """Import a dotted name: modules as far as there are any, then attributes."""
     found = importlib.import_module(parts[0])
     for i, part in enumerate(parts[1:], 2):
         if not hasattr(found, part) and inspect.ismodule(found):
@@ -194,7 +195,7 @@ def _is_below(name: str, trust: Sequence[str]) -> bool:
 
 
 def advice(name: str, trust: Sequence[str] = ()) -> str:
-    """How to trust what a name begins with, beside what is trusted; nothing of Python's own modules.
+    """Say how to trust the package of a name; empty for modules of Python itself.
 
     >>> advice("theirs.Class", ["other"])
     '; if you trust the package theirs, add trust=[other,theirs] (or set FOREWARP_TRUST=other,theirs)'
@@ -207,7 +208,7 @@ def advice(name: str, trust: Sequence[str] = ()) -> str:
 
 
 def _check_logger(node: dict, where: Path, key: str) -> None:
-    """A logger joins what it is given to the folder of the stage."""
+    """Refuse a logger whose name would lead out of the stage's folder, to which it is joined."""
     for name in _PARTS & node.keys() if node["_target_"].endswith("Logger") else ():
         if not re.fullmatch(r"(\w[\w.-]*)?", str(node[name])):
             raise ValueError(

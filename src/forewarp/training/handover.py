@@ -1,4 +1,4 @@
-"""What a stage hands to the next, as files of its folder."""
+"""The handover: what a stage leaves to the next, as files in its folder."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from forewarp.methods.method import Method
 from forewarp.scene.box import Box
 from forewarp.scene.cloud import Cloud, Handover
 from forewarp.scene.frame import Scene, spread
-from forewarp.training.archive import read_archive, write_archive
+from forewarp.training.checkpoints import read_archive, write_archive
 
 NUMBERS, POINTS = "handover.json", "handover.pt"
-_POINTS, _TIMES = 10_000, 16  # at most, of the cloud and of its paths
+_POINTS, _TIMES = 10_000, 16  # at most this many points of the cloud, and times of their paths
 
 
 @torch.no_grad()
 def make_handover(method: Method, scene: Scene, before: Handover | None, frames_in_play: int) -> Handover:
-    """Gather what a fitted stage leaves, as far as its method can tell.
+    """Gather what a fitted stage leaves: its box, and points with colours and paths if the method has them.
 
     Args:
         method: fitted.
-        scene: what it was fitted to.
-        before: what the stage began with; None: the first.
-        frames_in_play: at its end.
+        scene: that it was fitted to.
+        before: the handover that the stage began with; None for the first stage.
+        frames_in_play: at the stage's end.
     """
     times = list(scene.times)
     box = method.bounds(times) if isinstance(method, HasBounds) else None
@@ -48,7 +48,7 @@ def make_handover(method: Method, scene: Scene, before: Handover | None, frames_
 
 
 def save_handover(handover: Handover, folder: Path) -> None:
-    """Write ``handover.pt`` (points), where there are any, then ``handover.json`` (numbers)."""
+    """Write ``handover.pt`` (points, if there are any), then ``handover.json`` (numbers)."""
     cloud = handover.cloud
     if cloud is not None:
         tensors = {"points": cloud.points, "colors": cloud.colors, "opacity": cloud.opacity}
@@ -70,7 +70,7 @@ def load_handover(folder: Path) -> Handover:
     """Read what ``save_handover`` wrote.
 
     Raises:
-        ValueError: where it is something else.
+        ValueError: naming the file that is missing, damaged, or something else.
     """
     path = folder / NUMBERS
     try:

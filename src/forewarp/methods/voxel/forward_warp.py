@@ -1,4 +1,4 @@
-"""The paper's method: a canonical radiance grid warped forward to any time."""
+"""The paper's method: a canonical radiance grid, warped forward along trajectories to any time."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from torch import Tensor, nn
 
 from forewarp.fields.radiance import DirectRadiance, FeatureRadiance
 from forewarp.fields.radiance_grid import RadianceGrid
-from forewarp.methods.voxel.checks import check_effect
 from forewarp.methods.voxel.effects.background import StaticBackground, Together
 from forewarp.methods.voxel.effects.dense import densify, occupied_crop, sparsify
 from forewarp.methods.voxel.effects.inpaint import UNet3d
@@ -18,7 +17,7 @@ from forewarp.methods.voxel.effects.upsample import (
     interpolate_dense,
     refined,
 )
-from forewarp.methods.voxel.method import VoxelMethod
+from forewarp.methods.voxel.method import VoxelMethod, check_effect
 from forewarp.methods.voxel.planning import EFFECTS
 from forewarp.methods.voxel.snapshot import VoxelSnapshot
 from forewarp.renderer import Renderer
@@ -26,17 +25,23 @@ from forewarp.scene.view import Moment
 
 
 class ForwardWarp(VoxelMethod):
-    """Canonical radiance -> flow -> warped -> up-sampled (-> inpainted). An absent effect is None.
+    """Forward warping: canonical radiance -> flow -> warped -> up-sampled (-> inpainted) -> rendered.
+
+    ``at`` is the whole pipeline. Every effect may be None, and is then absent.
 
     Args:
         radiance: the canonical radiance field.
-        motion: trajectories and splat; None: a static radiance field.
-        upsampler: None: rendered at the resolution of the warp.
-        inpainter: None: one rendering instead of two.
-        view_dependence: None: the colour features are the colour.
-        background: all that stands still, on a grid of its own; None: a constant colour is behind everything.
-        canonical_time: where no warp is needed.
-        renderer: makes pictures.
+        canonical_time: time of the canonical field, at which nothing is warped.
+        motion: trajectories and the forward splat; None: the scene is static.
+        upsampler: refines the warped grid; None: render at the resolution of the warp.
+        inpainter: fills holes; None: one rendering instead of two.
+        view_dependence: turns features and directions into colour; None: the features are the colour.
+        background: everything static, on a grid of its own; None: a constant background colour.
+        renderer: marches the rays.
+
+    Raises:
+        ValueError: for an effect that is neither a module nor None, or for an up-sampler whose scale is not
+            a whole number beside an inpainter.
     """
 
     effects = EFFECTS
@@ -71,7 +76,7 @@ class ForwardWarp(VoxelMethod):
             )
 
     def at(self, moment: Moment) -> VoxelSnapshot:
-        """The radiance at a moment, under each of its renderings' names, the best last."""
+        """Warp the canonical radiance to a moment; one field for each rendering, the best last."""
         canonical = self.radiance()
         warped, flow, coverage, dropped = canonical, None, None, 0
         if self.motion is not None and moment.time != self.canonical_time:
@@ -81,10 +86,10 @@ class ForwardWarp(VoxelMethod):
             fields, difference = {self.first_rendering: self._upsample(warped)}, None
         else:
             fields, difference = self._inpaint(warped, coverage)
-        still = None
+        static = None
         if self.background is not None:
-            still = self.background()
-            fields = {name: Together(field, still) for name, field in fields.items()}
+            static = self.background()
+            fields = {name: Together(field, static) for name, field in fields.items()}
         return VoxelSnapshot(
             moment,
             fields,
@@ -95,13 +100,13 @@ class ForwardWarp(VoxelMethod):
             coverage,
             dropped,
             difference,
-            still,
+            static,
             length=2 / 3 * self.half_extent if self.moves else 1.0,
         )
 
     @property
     def first_rendering(self) -> str:
-        """Name the rendering without the inpainter: ``warped``, or ``upsampled`` by an up-sampler."""
+        """Name of the rendering without inpainting: ``upsampled``, or ``warped`` without an up-sampler."""
         return "warped" if self.upsampler is None else "upsampled"
 
     def _upsample(self, warped: RadianceGrid) -> RadianceGrid:
@@ -138,32 +143,32 @@ class ForwardWarp(VoxelMethod):
         return {self.first_rendering: upsampled, "inpainted": inpainted}, residual
 
     def advance(self, progress: float, step: int, optimizer: torch.optim.Optimizer) -> dict[str, float]:
-        """Let more bases play, and follow the lattices' schedule."""
+        """Follow the schedules of the lattices and of the trajectory bases."""
         noted = super().advance(progress, step, optimizer)
         if self.motion is None:
             return noted
         return noted | {"bases_in_play": self.motion.trajectory.play(self.stage.at("bases", progress))}
 
     def trajectories(self, points: Tensor, times: Tensor) -> Tensor:
-        """Paths (N, T, 3) of canonical points (N, 3) at ``times`` (T,), world units."""
+        """Return the paths (N, T, 3) of canonical points (N, 3) at ``times`` (T,), in world units."""
         if self.motion is None:
             return points[:, None].expand(-1, len(times), -1)
         return self.motion.trajectory.trajectories(points, times)
 
     def moved(self, points: Tensor, rows: Tensor, time: float) -> Tensor:
-        """Where the voxels ``rows`` (N,) bool, which lie at ``points`` (M, 3), are at ``time`` (M, 3)."""
+        """Move the canonical voxels ``rows`` (N,) bool, at ``points`` (M, 3), to ``time`` (M, 3)."""
         return points + self.motion.flow(self.radiance, time)[rows]
 
     @property
     def moves(self) -> bool:
-        """Whether there is a motion to learn."""
+        """False if the scene is static."""
         return self.motion is not None
 
     def displacement(self, points: Tensor, time: float) -> Tensor:
-        """From canonical points (N, 3) to where they are at ``time`` (N, 3), world units; differentiable."""
+        """Return the displacement (N, 3) of canonical points at ``time``, in world units; differentiable."""
         return self.trajectories(points, points.new_tensor([time]))[:, 0] - points
 
     @property
     def half_extent(self) -> float:
-        """Half the scene's longest side, world units."""
+        """Half the scene's longest side, in world units."""
         return self.motion.trajectory.scale

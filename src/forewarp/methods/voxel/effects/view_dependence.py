@@ -1,4 +1,4 @@
-"""The view-dependence effect: colour features and a direction to colour. Without it features are colours."""
+"""The view-dependence effect: colour from features and a viewing direction."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from forewarp.ops.encode import positional_encoding, spherical_harmonics_1
 
 
 class SphericalHarmonics(nn.Module):
-    """Degree 1: ``sigmoid(c + sum_i Y_i(d) s_i)``, no network and no parameters of its own."""
+    """Spherical harmonics of degree 1: ``sigmoid(c + sum_i Y_i(d) s_i)``, without parameters of its own."""
 
     features = 12
 
@@ -22,10 +22,10 @@ class SphericalHarmonics(nn.Module):
 
 
 class ViewNetwork(nn.Module):
-    """The paper's F4: features and the encoded direction through a small MLP.
+    """The paper's F4: a small MLP of the features and the encoded direction.
 
     Args:
-        features: colour features.
+        features: number of colour features.
         width, layers: of the network.
         frequencies: of the encoding of the direction.
     """
