@@ -41,9 +41,6 @@ class Quadrature:
         open_end: give the last sample an endless interval, as published. A density that is never 0 (softplus)
             then hides the background. False: end the interval with the ray.
         box: treat space outside as empty, without evaluating it; None: evaluate all from near to far.
-
-    Raises:
-        ValueError: for numbers out of range.
     """
 
     samples: int = 64

@@ -47,9 +47,6 @@ class Renderer:
         color_threshold: compute no colour for samples of less weight; 0: compute all.
         early_stop_eps: end a ray once its transmittance is below this, in images (rendered without gradient
             by the CPU kernel); 0: never.
-
-    Raises:
-        ValueError: for numbers out of range.
     """
 
     def __init__(

@@ -142,6 +142,20 @@ def test_a_step_has_finite_gradients_for_all_terms():
     assert not made.curriculum.errors[3].isnan()
 
 
+@pytest.mark.parametrize("model", [forward_model(), BACKWARD], ids=["forward", "backward"])
+def test_points_known_to_be_static_hold_the_motion(model):
+    made = module(model, {"static_points": 1.0})
+    method = made.method
+    head = (method.motion.trajectory if hasattr(method, "motion") else method.deformation).network[-1]
+    torch.nn.init.constant_(head.bias, 0.1)
+    assert made.training_step(batch(), 0) == 0  # none is known
+    method.static_points = torch.tensor([[0.9, 0.1, 0.2], [-0.8, 0.3, -0.2]])
+    loss = made.training_step(batch(), 0)
+    loss.backward()
+    assert loss > 0
+    assert head.bias.grad.abs().sum() > 0
+
+
 def test_an_empty_scene_trains_on():
     made = module()
     made.method.radiance.density.data[:] = -30.0

@@ -75,6 +75,11 @@ def test_a_continued_run_equals_an_uninterrupted_one_to_the_bit(tmp_path, whole,
     assert same(run(tmp_path).fit(), whole[1])
 
 
+def test_another_seed_gives_another_run(tmp_path, whole):
+    other = make_run(tmp_path, stages(), data=ball_data(rays=64, size=16, seed=1), seed=1).fit()
+    assert not same(other, whole[1])
+
+
 def test_a_stage_that_ended_before_it_was_noted_only_notes_it(tmp_path, whole):
     shutil.copytree(whole[0], tmp_path, dirs_exist_ok=True)
     (tmp_path / "fine" / "done.json").unlink()

@@ -21,9 +21,6 @@ class Trunk(nn.Module):
             versions; None: no layer.
         again: channels read at the skip; None: those of the first layer.
 
-    Raises:
-        ValueError: for numbers out of range.
-
     >>> sum(p.numel() for p in Trunk(72).parameters())
     497664
     """

@@ -23,9 +23,6 @@ def render_weights(optical: Tensor, ray_ids: Tensor, rays: int) -> tuple[Tensor,
         weights (P,) and the final transmittance (R,), 1 for a ray without samples. Differentiable in
         ``optical``.
 
-    Raises:
-        ValueError: for other shapes.
-
     Cost: one pass over P.
 
     >>> w, t = render_weights(torch.tensor([0.0, 1e30]), torch.tensor([0, 0]), 2)

@@ -16,9 +16,6 @@ def positional_encoding(x: Tensor, frequencies: int) -> Tensor:
     Returns:
         (..., D * (1 + 2 F)). Differentiable in ``x``.
 
-    Raises:
-        ValueError: for F < 0.
-
     >>> positional_encoding(torch.zeros(1, 3), 5).shape
     torch.Size([1, 33])
     """

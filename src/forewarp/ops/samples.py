@@ -22,9 +22,6 @@ def stratified(near: Tensor, far: Tensor, count: int, generator: torch.Generator
     Returns:
         (R, S), ascending.
 
-    Raises:
-        ValueError: for other shapes or S < 2.
-
     >>> stratified(torch.tensor([2.0]), torch.tensor([6.0]), 3)
     tensor([[2., 4., 6.]])
     """
@@ -68,9 +65,6 @@ def by_importance(
 
     Returns:
         (R, S), ascending without a generator.
-
-    Raises:
-        ValueError: for other shapes or numbers out of range.
 
     Cost: R (B + S log B).
 

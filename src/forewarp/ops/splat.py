@@ -45,9 +45,6 @@ def average_splat(source: Tensor, positions: Tensor, shape: tuple[int, int, int]
         a ``Splat``; values and coverage are differentiable in ``source`` and ``positions``. A voxel without
         finite position contributes nothing, one outside the box only where its kernel reaches inside.
 
-    Raises:
-        ValueError: for other shapes.
-
     Cost: 8 voxels of C + 1 channels per source voxel; memory M (C + 1) for M touched voxels.
     """
     check_shape("source", source, ("N", "C"))
@@ -73,9 +70,6 @@ def with_copies(splat: Splat, source: Tensor, cells: Tensor, tau: float = 1e-2) 
         splat: of all moving voxels, with the same ``tau``.
         source: (N, C), values of the static voxels.
         cells: (N, 3) int64, their distinct positions.
-
-    Raises:
-        ValueError: for other shapes.
 
     Cost: one voxel of C + 1 channels per static voxel.
 

@@ -187,9 +187,8 @@ def _places(method: ForwardWarp, time: float) -> FieldAtTime:
 
     field = placed(method.radiance(), method.radiance.voxels)
     if method.motion is not None and time != method.canonical_time:
-        field = method.motion.warp(field, method.radiance.voxels, method.motion.flow(method.radiance, time))[
-            0
-        ]
+        flow = method.motion.flow(method.radiance, time)
+        field, _, _ = method.motion.warp(field, method.radiance.voxels, flow)
     if method.background is None:
         return field
     return Together(field, placed(method.background(), method.background.voxels))

@@ -77,15 +77,15 @@ class ForwardWarp(VoxelMethod):
 
     def at(self, moment: Moment) -> VoxelSnapshot:
         """Warp the canonical radiance to a moment; one field for each rendering, the best last."""
-        canonical = self.radiance()
-        warped, flow, coverage, dropped = canonical, None, None, 0
+        canonical = self.radiance()  # V_R = F1
+        warped, flow, coverage, dropped = canonical, None, None, 0  # V_R^t
         if self.motion is not None and moment.time != self.canonical_time:
-            flow = self.motion.flow(self.radiance, moment.time)
+            flow = self.motion.flow(self.radiance, moment.time)  # V_flow
             warped, coverage, dropped = self.motion.warp(canonical, self.radiance.voxels, flow)
         if self.inpainter is None:
-            fields, difference = {self.first_rendering: self._upsample(warped)}, None
+            fields, difference = {self.first_rendering: self._upsample(warped)}, None  # V_RUp
         else:
-            fields, difference = self._inpaint(warped, coverage)
+            fields, difference = self._inpaint(warped, coverage)  # V_RUp, V_RInp
         static = None
         if self.background is not None:
             static = self.background()
@@ -118,6 +118,7 @@ class ForwardWarp(VoxelMethod):
     def _inpaint(
         self, warped: RadianceGrid, coverage: Tensor | None
     ) -> tuple[dict[str, RadianceGrid], Tensor]:
+        """Return the grid before and after inpainting, and their difference, on the occupied box."""
         crop = occupied_crop(warped.index, self.inpainter.margin)
         dense = densify(warped, crop)
         inputs = dense

@@ -23,9 +23,6 @@ class Motion(nn.Module):
             to 0, and a raw density of 0 is fog.
         rest: copy voxels that move by less than this many voxels per axis instead of splatting them; only
             without gradient, or static voxels would never learn to move.
-
-    Raises:
-        ValueError: for numbers out of range.
     """
 
     def __init__(
