@@ -1,10 +1,17 @@
 """What every test may ask for: the commands in this process, a fitted run, an empty folder."""
 
+import gc
+
 import pytest
 
 from tests.support.commands import call, fitted_run
 
 collect_ignore = ["foreign"]  # the package that tests/cli/test_foreign.py imports as somebody else's
+
+
+def pytest_collection_finish():
+    """Leave what is imported out of garbage collections: each stage of a run begins with one."""
+    gc.freeze()
 
 
 @pytest.fixture

@@ -21,7 +21,7 @@ from tests.support.configs import composed
         ("experiment=hypernerf_faithful", "experiment=hypernerf preset=faithful;"),
         ("stage=demo", "stage=forward_demo;"),
         ("objective=faithful", "objective=forward_faithful;"),
-        ("suits.budgets=[fast]", "no such word;"),
+        ("suits.budgets=[fast]", "no such override;"),
         ("stage.fine.rates.flow=1e-3", "stage.fine.lr.flow=1e-3;"),
         ("+stage.fine.rates={}", "+stage.fine.lr={};"),
         ("stage.coarse.final_rate=0.1", "stage.coarse.lr_final_factor=0.1;"),
@@ -32,9 +32,9 @@ from tests.support.configs import composed
         ("model.renderer.opaque=0", "model.renderer.early_stop_eps=0;"),
         ("model/view=none", "model/view_dependence=none;"),
         ("model.view.width=32", "model.view_dependence.width=32;"),
-        ("~suits", "no such word;"),
-        ("variant=base,unet_16", "no such word; type what a variant changed, as preset.rays=1024;"),
-        ("ablation=voxels_20,voxels_40", "no such word; sweeps=resolution has these sizes"),
+        ("~suits", "no such override;"),
+        ("variant=base,unet_16", "no such override; type what a variant changed, as preset.rays=1024;"),
+        ("ablation=voxels_20,voxels_40", "no such override; sweeps=resolution has these sizes"),
     ],
 )
 def test_a_renamed_word_is_refused_with_the_new_one(word, now):

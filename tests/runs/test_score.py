@@ -11,7 +11,14 @@ from forewarp.synth.scenes import synthesize
 SMALL = [
     *("data=dnerf", "data.root=.", "data.scene=vehicle", "preset=demo", "trainer=cpu", "data.rays=64"),
     *("logger=none", "budget.minutes=null", "budget.iterations=4", "stage.coarse.num_voxels=[[0,800]]"),
-    *("~stage.fine", "callbacks.pictures=null", "callbacks.accuracy=null", "evaluate=false"),
+    *(
+        "~stage.fine",
+        "callbacks.pictures=null",
+        "callbacks.accuracy=null",
+        "callbacks.scalars=null",
+        "threads=1",
+        "evaluate=false",
+    ),
 ]
 ABSENT = "no score: the scene has no validation views and none are held out; set data.held_out=8"
 
