@@ -4,9 +4,9 @@ import re
 
 import pytest
 
-from tests.support.configs import composed
 from forewarp.runs.identity import read_config
 from forewarp.runs.renamed import refuse_renamed
+from tests.support.configs import composed
 
 
 @pytest.mark.parametrize(
@@ -71,7 +71,9 @@ def test_what_is_advised_composes(word):
 def test_a_run_of_an_earlier_version_is_refused_with_the_version_that_reads_it(text, version, tmp_path):
     path = tmp_path / "config.yaml"
     path.write_text(text)
-    expected = f"{path}: expected a run of forewarp 0.3, but got one of {version}, which version {version}.0 reads"
+    expected = (
+        f"{path}: expected a run of forewarp 0.3, but got one of {version}, which version {version}.0 reads"
+    )
     with pytest.raises(ValueError, match=re.escape(expected)) as refusal:
         read_config(path)
     assert "\n" not in str(refusal.value)

@@ -7,10 +7,10 @@ import sys
 import pytest
 from omegaconf import OmegaConf
 
-from tests.support.configs import CONF, composed
-from forewarp.runs.identity import read_config, saved_config
 from forewarp.files import MOST_CONFIG
+from forewarp.runs.identity import read_config, saved_config
 from forewarp.runs.trust import trust_of, trusted_config, without_trust
+from tests.support.configs import CONF, composed
 
 
 def read(text, *trust):
