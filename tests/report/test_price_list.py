@@ -15,9 +15,10 @@ def test_changes_are_against_the_same_seed(tmp_path):
     write_run(runs, "grid_64", 0, psnr=29.0, steps=200, epe=0.1)
     write_run(runs, "grid_64", 1, psnr=27.5, steps=200, epe=0.1)
     write_run(runs, "unet_16", 0, psnr=30.5, steps=50, against="grid_64")
-    write_run(runs, "", 2, psnr=20.0, against=None)
-    write_run(runs, "preset.rays=64", 2, psnr=21.0, against=None)
-    write_run(runs, "preset.rays=64 model=backward", 2, psnr=21.5, against=None)
+    # Named by what was typed; what all of them share is no part of their names.
+    write_run(runs, "data.box=null", 2, psnr=20.0, against=None)
+    write_run(runs, "data.box=null preset.rays=64", 2, psnr=21.0, against=None)
+    write_run(runs, "data.box=null model=backward preset.rays=64", 2, psnr=21.5, against=None)
     write_run(runs, "alone", 5)
     write_run(runs, "failed", psnr=None)
     page, file = write_price_list(runs, tmp_path / "out")
@@ -38,7 +39,7 @@ def test_changes_are_against_the_same_seed(tmp_path):
     ]
     assert rows(text, "unet_16")[0][1:6] == ["grid_64", "1", "+1.50", "+0.0000", ""]
     assert rows(text, "preset.rays=64")[1][1:4] == ["base", "1", "+1.00"]
-    assert rows(text, "preset.rays=64 model=backward")[0][1:4] == ["preset.rays=64", "1", "+0.50"]
+    assert rows(text, "model=backward preset.rays=64")[0][1:4] == ["preset.rays=64", "1", "+0.50"]
     assert len(rows(text, "base")) == 1
     assert rows(text, "alone")[0][2:4] == ["0", ""]  # nothing to compare it with
     assert "Of all test views:" in text

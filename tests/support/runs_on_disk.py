@@ -29,7 +29,7 @@ def write_run(
         "model": {"name": "forward"},
         "preset": {"name": "fast"},
         "budget": {"minutes": minutes},
-        "variant": {"name": variant, "about": f"the {variant}", "against": against},
+        "variant": {"name": variant} | ({"about": f"the {variant}", "against": against} if against else {}),
         "seed": seed,
         "command": command or f"forewarp-train variant={variant} seed={seed}",
     }

@@ -173,11 +173,22 @@ def collect(root: Path, needed: Sequence[str] = ()) -> tuple[list[Result], list[
             without.append(f"{folder.relative_to(root)}: no {', '.join(absent)}; {again}")
         else:
             results.append(result)
+    _shorten(results)
     if not results and not without:
         raise ValueError(
             f"{root}: expected folders of runs, but got none; make some with forewarp-train, or set runs=..."
         )
     return results, without
+
+
+def _shorten(results: Sequence[Result]) -> None:
+    """Drop from names that are typed overrides those that all such runs of a scene share."""
+    for found in by_scene(results).values():
+        typed = [known for run in found if set(known := run.config.get("variant") or {}) == {"name"}]
+        names = [(known["name"] or "").split() for known in typed]
+        shared = set.intersection(*map(set, names)) if len({*map(tuple, names)}) > 1 else set()
+        for known, name in zip(typed, names):
+            known["name"] = " ".join(word for word in name if word not in shared)
 
 
 def read_run(folder: Path) -> Result:
