@@ -161,9 +161,13 @@ def parsed(text: str, path: Path, trust: Sequence[str] | None = ()) -> DictConfi
 
 
 def _refuse_earlier_version(config: DictConfig, path: Path) -> None:
-    stages = [stage for stage in (config.get("stage") or {}).values() if stage is not None]
-    old = "0.1" if "warp" in (config.get("model") or {}) else None
-    old = old or ("0.2" if any("rates" in stage for stage in stages) else None)
+    def has(part: object, key: str) -> bool:
+        return isinstance(part, DictConfig) and key in part
+
+    stages = config.get("stage")
+    stages = stages.values() if isinstance(stages, DictConfig) else ()
+    old = "0.1" if has(config.get("model"), "warp") else None
+    old = old or ("0.2" if any(has(stage, "rates") for stage in stages) else None)
     if old is not None:
         raise ValueError(
             f"{path}: expected a run of forewarp 0.3, but got one of {old}, which version {old}.0 reads; "
