@@ -74,6 +74,7 @@ def test_a_plan_is_made_once_told_and_fitted(forewarp, words, monkeypatch, in_tm
     assert (in_tmp / "fit" / "plan.yaml").read_text() == file.read_text()
 
 
+@pytest.mark.slow
 def test_every_question_is_asked_where_all_is_open(forewarp, words, in_tmp, monkeypatch):
     """No alpha, and evidence that rules nothing out: each effect is tried, with its price."""
     monkeypatch.setattr("forewarp.methods.voxel.planning.CUT_OUT", 2.0)

@@ -31,8 +31,16 @@ def call(name, *arguments):
     """
     out, err, quiet = io.StringIO(), io.StringIO(), logging.getLogger("forewarp.metrics")
     level, disabled, threads = quiet.level, logging.root.manager.disable, torch.get_num_threads()
+    # Hydra composes the config once more to learn its hydra.mode, which only sweeps set.
+    sweeps = any(str(argument).startswith("sweeps=") for argument in arguments)
+    mode = (
+        contextlib.nullcontext()
+        if sweeps
+        else patch("hydra._internal.hydra.Hydra.get_mode", return_value=None)
+    )
     status = None
     with (
+        mode,
         patch.dict(os.environ),
         patch("sys.argv", [f"forewarp-{name}", *map(str, arguments)]),
         contextlib.redirect_stdout(out),
