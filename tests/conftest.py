@@ -9,11 +9,6 @@ from tests.support.commands import call, fitted_run
 collect_ignore = ["foreign"]  # the package that tests/cli/test_foreign.py imports as somebody else's
 
 
-def pytest_collection_finish():
-    """Leave what is imported out of garbage collections: each stage of a run begins with one."""
-    gc.freeze()
-
-
 @pytest.fixture
 def forewarp():
     """``forewarp("train", "data.scene=x")`` gives ``status``, ``out`` and ``err``; nothing global remains."""
@@ -52,7 +47,5 @@ def in_tmp(tmp_path, monkeypatch):
 @pytest.fixture(scope="module", autouse=True)
 def _imports_are_no_garbage():
     """Exempt imported modules from garbage collection, which every stage of a run does before it starts."""
-    import gc
-
     gc.collect()
     gc.freeze()
