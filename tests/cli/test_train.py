@@ -230,7 +230,7 @@ def drop_matrix(content):
 
 SPOILED = [
     (lambda f: (f / "train" / "r_1.png").unlink(), "train/r_1.png: expected an image, but got No such file"),
-    (spoil_image, "train/r_1.png: expected a whole PNG image, but got a truncated one"),
+    (spoil_image, "train/r_1.png: expected a whole image, but got a truncated or harmed one"),
     (lambda f: (f / "transforms_train.json").write_text("{"), "transforms_train.json: line 1: expected JSON"),
     (
         lambda f: edit(f, "train", drop_matrix),
