@@ -16,13 +16,15 @@ from forewarp.scene.view import Moment, View
 class Asks:
     """What a method wants of the sampler: single ``pixels``, square ``crops`` of ``side`` pixels, or whole
     ``pictures``; further observations of ``neighbours`` training times next to the picked one; and up to
-    ``instant`` whole training pictures of the picked time beside them.
+    ``instant`` whole training pictures of the picked time beside them. ``straight``: pixels as they are
+    stored, not yet over a background.
     """
 
     kind: str = "pixels"
     side: int = 64
     neighbours: int = 0
     instant: int = 0
+    straight: bool = False
 
     def __post_init__(self) -> None:
         kinds = ("pixels", "crops", "pictures")
@@ -36,7 +38,8 @@ class Asks:
 @dataclass(frozen=True)
 class Observation:
     """Pixels of one picture: ``rgb`` (R, 3) in [0, 1], the truth over ``background`` (3,) or (R, 3), which is
-    what a pixel shows where nothing is met.
+    what a pixel shows where nothing is met. Where the method asks for it ``straight``, ``rgb`` is (R, 4)
+    uint8: colour and alpha as they are stored.
     """
 
     moment: Moment

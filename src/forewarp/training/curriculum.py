@@ -19,6 +19,7 @@ class Curriculum:
         canonical_time: where training starts.
         start: distinct times in play at the beginning.
         all_in: fraction of the stage at which all are in play; 0: from the start.
+        most: times that ever come in; null: all.
         newest_share: share of the draws that goes to the newest part.
         newest_part: that part, as a share of the frames in play.
         error_share: share of the draws in which a frame's chance is its own last error, told by ``report``:
@@ -33,6 +34,7 @@ class Curriculum:
         *,
         start: int = 10,
         all_in: float = 0.6,
+        most: int | None = None,
         newest_share: float = 0.3,
         newest_part: float = 0.125,
         error_share: float = 0.0,
@@ -49,6 +51,10 @@ class Curriculum:
         self.order = sorted(range(len(times)), key=lambda i: (abs(times[i] - canonical_time), times[i], i))
         last_of_time = {times[i]: place for place, i in enumerate(self.order)}
         self._ends = [place + 1 for place in last_of_time.values()]  # frames, once so many times are in
+        if most is not None:
+            if most < 1:
+                raise ValueError(f"stage.curriculum.most: expected at least 1 or null, but got {most}")
+            self._ends = self._ends[:most]
         self.start, self.all_in = min(start, len(self._ends)), all_in
         self.newest_share, self.newest_part = newest_share, newest_part
         self.error_share = error_share

@@ -1,0 +1,391 @@
+"""The method: canonical particles, moved forward by nodes and rasterised."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor, nn
+
+from forewarp.fields.curves import Curve
+from forewarp.methods.method import Method, Snapshot, Start, Step
+from forewarp.methods.particles.camera import Pinholes
+from forewarp.methods.particles.density import renew
+from forewarp.methods.particles.nodes import Nodes, nearest
+from forewarp.methods.particles.rows_adam import RowsAdam
+from forewarp.methods.particles.settings import Numbers, counts
+from forewarp.methods.particles.snapshot import ParticlesSnapshot
+from forewarp.methods.particles.start import covered_pixels, first_points
+from forewarp.ops.compare import compare
+from forewarp.ops.nodes import node_maps, pull_nodes
+from forewarp.ops.project import Gaussians, Warp
+from forewarp.scene.batch import Asks, Batch
+from forewarp.scene.box import Box
+from forewarp.scene.cloud import Cloud
+from forewarp.scene.view import Moment
+
+_FLAT = 0.28209479177387814  # of the harmonics: what a colour's first coefficient is multiplied by
+_SOLID, _SEEN = 0.1, 0.02  # opacity from which matter bounds the scene; from which there is any
+
+
+class Particles(Method):
+    """N Gaussians in the state of the canonical time, and M nodes that carry them through time.
+
+    A step draws one whole picture, compares it, and has its gradients in one pass of ``ops.compare``; the
+    optimiser passes over what the picture did not show. Stage numbers: see ``settings.Numbers``.
+
+    Args:
+        start: what it is built from.
+        motion: ``spline``, ``dct`` or ``none``: the curves of the nodes.
+        turns: whether nodes turn, or only shift.
+        view: degree 0 to 3 of the harmonics by which colour depends on direction.
+        tints, fades: cosines over time of each particle's colour, and of its opacity; 0: none.
+        width: of the loss, where it turns from a square to a line.
+        blur: square pixels that every particle is blurred by.
+    """
+
+    terms = ("photo", "rigid", "smooth")
+    numbers = tuple(Numbers.__dataclass_fields__)
+    asks = Asks(kind="pictures", straight=True)
+
+    def __init__(
+        self,
+        start: Start,
+        *,
+        motion: str = "spline",
+        turns: bool = True,
+        view: int = 1,
+        tints: int = 0,
+        fades: int = 0,
+        width: float = 0.05,
+        blur: float = 0.3,
+    ) -> None:
+        super().__init__()
+        if view not in (0, 1, 2, 3) or min(tints, fades) < 0:
+            raise ValueError(
+                "model: expected view of 0 to 3, tints >= 0 and fades >= 0, "
+                f"but got {view=}, {tints=}, {fades=}"
+            )
+        self.numbers_of = Numbers(**start.numbers)
+        self.canonical_time, self.width = start.scene.canonical_time, width
+        self.pinholes = Pinholes(blur)
+        self.bases = {"tints": tints, "fades": fades}
+        times = start.scene.times
+        self.ends = min(times), max(times)
+        self.progress, self._optimizer = 0.0, None
+        before = start.before if isinstance(start.before, Particles) else None
+        fresh = None if start.blank or before is not None else self._measured(start)
+        self._make(before, fresh, (view + 1) ** 2, tints, fades)
+        self.nodes = None
+        if motion != "none" and self.numbers_of.moves and len(times) > 1:
+            count, knots = counts(len(self.means), len(times))
+            curve = Curve(motion, knots, len(times), self.canonical_time)
+            self.nodes = Nodes(None if start.blank else self.means.data, count, curve, turns=turns)
+            links, shares = self.nodes.links(self.means.data)
+            self.register_buffer("links", links)
+            self.register_buffer("shares", shares)
+        for name in ("pulled", "shown", "idle"):
+            self.register_buffer(name, torch.zeros(len(self.means)))
+        self.register_buffer("round", torch.zeros((), dtype=torch.int64))
+        self.grows = self._grows()
+
+    def _measured(self, start: Start) -> Cloud:
+        covered = covered_pixels(start.scene, list(start.frames))
+        most = self.numbers_of.most(covered)
+        cloud = first_points(start, round(self.numbers_of.first * most))
+        away = (cloud.points - cloud.points.mean(0)).square().sum(-1).mean().sqrt()
+        extent = float(away) or start.scene.box.diagonal
+        self._scalars(covered, extent, most)
+        return cloud
+
+    def _scalars(self, covered: float, extent: float, most: int) -> None:
+        """Pixels that show anything; root mean square of the distance from the middle; most particles."""
+        self.register_buffer("covered", torch.tensor(float(covered)))
+        self.register_buffer("extent", torch.tensor(float(extent)))
+        self.register_buffer("most", torch.tensor(float(most)))
+
+    def _make(
+        self, before: Particles | None, cloud: Cloud | None, plain: int, tints: int, fades: int
+    ) -> None:
+        """Give every parameter its first value: of the stage before, of points, or none at all."""
+        if before is not None:
+            self._scalars(float(before.covered), float(before.extent), int(before.most))
+            first = {name: p.data.clone() for name, p in before.named_parameters(recurse=False)}
+        elif cloud is not None:
+            first = first_values(cloud)
+        else:
+            self._scalars(1.0, 1.0, 1)
+            first = first_values(Cloud(torch.zeros(1, 3), torch.zeros(1, 3), torch.zeros(1), 1.0))
+        count = len(first["means"])
+        for name in ("means", "log_scales", "turns", "opacity", "color"):
+            setattr(self, name, nn.Parameter(first[name]))
+        for name, many in (("shade", plain - 1), ("tint", tints)):
+            value = first.get(name)
+            if value is None or value.shape[1] != many:
+                value = torch.zeros(count, many, 3)
+            setattr(self, name, nn.Parameter(value) if many else None)
+        value = first.get("fade")
+        self.fade = None
+        if fades:
+            fits = value is not None and value.shape[1] == fades
+            self.fade = nn.Parameter(value if fits else torch.zeros(count, fades))
+
+    def _grows(self) -> tuple[str, ...]:
+        names = ["means", "log_scales", "turns", "opacity", "color", "shade", "tint", "fade"]
+        names += ["pulled", "shown", "idle", *(["links", "shares"] if self.nodes is not None else [])]
+        return tuple(name for name in names if getattr(self, name) is not None)
+
+    @property
+    def moves(self) -> bool:
+        """Whether there is any motion."""
+        return self.nodes is not None
+
+    @property
+    def size(self) -> tuple[str, int]:
+        """See ``Method``."""
+        return "particles", len(self.means)
+
+    def adopted(self) -> set[str]:
+        """See ``Method``: nodes too are as many as a checkpoint says."""
+        return {*self.grows, *(f"nodes.{name}" for name in self._node_rows())}
+
+    def _node_rows(self) -> list[str]:
+        return [] if self.nodes is None else [n for n in Nodes.ROWS if getattr(self.nodes, n) is not None]
+
+    def misfit(self, state: Mapping[str, Tensor]) -> str | None:
+        """See ``Method``; the arrays of nodes have as many rows as their places, and nobody follows others."""
+        for name in self._node_rows():
+            own, theirs = getattr(self.nodes, name), state[f"nodes.{name}"]
+            many = len(state["nodes.places"])
+            free = 2 if name in ("edges", "edge_weights") else 1  # few nodes have few neighbours
+            if theirs.dtype != own.dtype or theirs.dim() != own.dim() or len(theirs) != many:
+                return f"nodes.{name}"
+            if theirs.shape[free:] != own.shape[free:]:
+                return f"nodes.{name}"
+        for name in ("nodes.edges", "links") if self.nodes is not None else ():
+            rows = state[name]
+            if rows.numel() and not 0 <= int(rows.min()) <= int(rows.max()) < len(state["nodes.places"]):
+                return name
+        return super().misfit(self._padded(state))
+
+    def _padded(self, state: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
+        """A state whose links are as wide as ours: fewer nodes have fewer."""
+        if self.nodes is None or state["links"].dim() != 2 or state["links"].shape != state["shares"].shape:
+            return state
+        return {**state, **{n: state[n][:, :1].expand(-1, self.links.shape[1]) for n in ("links", "shares")}}
+
+    def at(self, moment: Moment) -> Snapshot:
+        """Move every particle; nothing is drawn yet."""
+        tints, fades = self.over_time(moment.time)
+        return ParticlesSnapshot(
+            moment, self.gaussians(), self.warp(moment.time), tints, fades, self.pinholes
+        )
+
+    def gaussians(self) -> Gaussians:
+        """The particles as the operators read them."""
+        opacity = self.opacity if self.fade is None else torch.cat([self.opacity, self.fade], -1)
+        colors = [part for part in (self.color, self.shade, self.tint) if part is not None]
+        colors = colors[0] if len(colors) == 1 else torch.cat(colors, 1)
+        return Gaussians(self.means, self.log_scales, self.turns, opacity, colors)
+
+    def warp(self, time: float) -> Warp:
+        """How everything moves until a time."""
+        if self.nodes is None:
+            return self._still()
+        return Warp(self.nodes.maps(time), self.links, self.shares)
+
+    def _still(self) -> Warp:
+        none = self.means.new_zeros(len(self.means), 1)
+        return Warp(self.means.new_zeros(1, 12), none.int(), none)
+
+    def over_time(self, time: float) -> tuple[Tensor, Tensor]:
+        """What a time makes of colours (T,) and of opacity (1 + F,): cosines, 0 at the canonical time."""
+        tints, fades = (
+            [
+                math.cos(math.pi * k * time) - math.cos(math.pi * k * self.canonical_time)
+                for k in range(1, n + 1)
+            ]
+            for n in self.bases.values()
+        )
+        return self.means.new_tensor(tints), self.means.new_tensor([1.0, *fades])
+
+    @torch.no_grad()
+    def look(self, batch: Batch, factors: Mapping[str, float], generator: torch.Generator) -> Step:
+        """See ``Method``. Pictures are drawn one after the other; each is whole."""
+        total, squared, pixels = {}, 0.0, 0
+        terms = dict.fromkeys(self.terms, 0.0)
+        weight = factors.get("photo", 0.0) / (float(self.covered) * len(batch.observations))
+        for seen in batch.observations:
+            time = self._jittered(seen.moment.time, generator)
+            found, moved = self._compared(seen, time, weight, factors, total)
+            squared, pixels = squared + found.squared, pixels + 3 * len(seen.view)
+            terms["photo"] += found.loss / (float(self.covered) * len(batch.observations))
+            for name, value in moved.items():
+                terms[name] += value / len(batch.observations)
+        values = {name: (lambda v=v: self.means.new_tensor(v)) for name, v in terms.items()}
+        if self.nodes is None:
+            values["rigid"] = values["smooth"] = lambda: None
+        error = torch.tensor(squared / pixels, dtype=torch.float64)
+        return Step(values, error, {"particles": len(self.means)}, total)
+
+    def _jittered(self, time: float, generator: torch.Generator) -> float:
+        spread = self.numbers_of.jitter * max(0.0, 1 - self.progress / self.numbers_of.calm)
+        if self.nodes is None or spread == 0:
+            return time
+        return min(1.0, max(0.0, time + spread * float(torch.randn((), generator=generator))))
+
+    def _compared(self, seen, time: float, weight: float, factors, total: dict) -> tuple:
+        """Compare one picture; adds gradients to ``total``, and gives what the nodes' terms are."""
+        tints, fades = self.over_time(time)
+        moved, basis, warp = {}, None, None
+        if self.nodes is not None:
+            self.nodes.look_ahead(time, time)
+            basis = self.nodes.curve(time)
+            motion = self.nodes.motion(basis)
+            warp = Warp(node_maps(motion, self.nodes.places), self.links, self.shares)
+        found = compare(
+            self.gaussians(), warp or self._still(), self.pinholes(seen.view.camera), tints, fades,
+            seen.rgb, seen.background, width=self.width, factor=weight,
+        )  # fmt: skip
+        self.pulled[found.rows] += found.pull
+        self.shown[found.rows] += (found.pull > 0).float()
+        _add(total, self._by_name(found.particles))
+        if self.nodes is not None:
+            nodes, rigid = self.nodes, factors.get("rigid", 0.0) * self._loose()
+            slope, strain = pull_nodes(
+                motion, nodes.places, found.maps, nodes.edges, nodes.edge_weights, rigid
+            )
+            moved["rigid"] = strain
+            _add(total, nodes.spread_over_time(basis, slope))
+            moved["smooth"], bent = nodes.bent(time, factors.get("smooth", 0.0), float(self.extent))
+            _add(total, bent)
+        return found, moved
+
+    def _loose(self) -> float:
+        """What is left of the rigidity, by how much of the stage is done."""
+        return self.numbers_of.loose**self.progress
+
+    def _by_name(self, gradients: Gaussians) -> dict[str, Tensor]:
+        found = {"means": gradients.means, "log_scales": gradients.log_scales, "turns": gradients.quaternions}
+        if self.fade is None:
+            found["opacity"] = gradients.opacity
+        else:
+            found["opacity"], found["fade"] = gradients.opacity[:, :1], gradients.opacity[:, 1:]
+        at = 0
+        for name in ("color", "shade", "tint"):
+            part = getattr(self, name)
+            if part is not None:
+                found[name] = gradients.colors[:, at : at + part.shape[1]]
+                at += part.shape[1]
+        return found
+
+    def advance(self, progress: float, step: int, optimizer: torch.optim.Optimizer) -> dict[str, float]:
+        """Let rates fall, each as far as its kind should; renew particles where it is time."""
+        self.progress, numbers = progress, self.numbers_of
+        for group in optimizer.param_groups:
+            last = numbers.finals.get(group["name"], 1.0)
+            held = max(0.0, progress - numbers.hold_rates.get(group["name"], 0.0))
+            left = 1 - numbers.hold_rates.get(group["name"], 0.0)
+            group["lr"] *= last ** (held / left)
+            if group["name"] in ("means", "shifts"):
+                group["lr"] *= float(self.extent)
+        number = int(progress / numbers.every)
+        if number > int(self.round) and progress < numbers.settled:
+            self.round.fill_(number)
+            self._renew(progress, optimizer)
+        return {}
+
+    def _renew(self, progress: float, optimizer: torch.optim.Optimizer) -> None:
+        share = min(1.0, progress / numbers_until(self.numbers_of))
+        first = self.numbers_of.first
+        target = round(float(self.most) * (first + (1 - first) * share) * self.numbers_of.full)
+        low, high = self.ends if self.nodes is None else self.nodes.seen.tolist()
+        whole = low <= self.ends[0] + 0.02 and high >= self.ends[1] - 0.02
+        renew(self, optimizer, target, unseen=whole and self.nodes is not None, extent=float(self.extent))
+        if self.nodes is not None and int(self.round) % self.numbers_of.relink == 0:
+            self.links, self.shares = self.nodes.links(self.means.data)
+
+    def warm_up(self) -> None:
+        """Compile the operators' kernels."""
+        from forewarp.methods.particles.warmup import warm_up
+
+        warm_up(self)
+
+    def param_groups(self) -> dict[str, list[nn.Parameter]]:
+        """See ``Method``."""
+        groups = {
+            name: [getattr(self, name)] for name in ("means", "log_scales", "turns", "opacity", "color")
+        }
+        groups |= {
+            name: [getattr(self, name)]
+            for name in ("shade", "tint", "fade")
+            if getattr(self, name) is not None
+        }
+        if self.nodes is not None:
+            groups["shifts"] = [self.nodes.shift]
+            if self.nodes.turn is not None:
+                groups["node_turns"] = [self.nodes.turn]
+        return groups
+
+    def optimizer(self, groups: list[dict]) -> torch.optim.Optimizer:
+        """Adam by rows."""
+        return RowsAdam(groups)
+
+    @torch.no_grad()
+    def trajectories(self, points: Tensor, times: Tensor) -> Tensor:
+        """See ``HasTrajectories``: points follow the nodes beside them."""
+        if self.nodes is None:
+            return points[:, None].expand(-1, len(times), -1).clone()
+        return self.nodes.paths(points.float(), times)
+
+    @torch.no_grad()
+    def bounds(self, times: list[float]) -> Box | None:
+        """See ``HasBounds``."""
+        solid = torch.sigmoid(self.opacity[:, 0]) > _SOLID
+        if not bool(solid.any()):
+            return None
+        points = self.trajectories(self.means[solid], torch.tensor(times)).flatten(0, 1)
+        pad = 2 * float(self.log_scales[solid].exp().median()) + 1e-3 * float(self.extent)
+        low, high = points.amin(0) - pad, points.amax(0) + pad
+        return Box(tuple(low.tolist()), tuple(high.tolist()))
+
+    @torch.no_grad()
+    def matter(self) -> Cloud:
+        """See ``HasMatter``."""
+        solid = torch.sigmoid(self.opacity[:, 0])
+        keep = solid > _SEEN if bool((solid > _SEEN).any()) else solid >= 0
+        colors = (0.5 + _FLAT * self.color[keep, 0]).clamp(0, 1)
+        size = 2 * float(self.log_scales.exp().mean())
+        return Cloud(self.means.data[keep], colors, solid[keep], max(size, 1e-9))
+
+    def protocol(self) -> dict[str, str]:
+        """See ``Method``."""
+        return {"departures": "particles, rasterised, in the place of voxels that are marched through"}
+
+
+def numbers_until(numbers: Numbers) -> float:
+    """The share of the stage at which there are as many particles as there will be."""
+    return max(numbers.settled * 0.8, 1e-6)
+
+
+def _add(total: dict[str, Tensor], found: Mapping[str, Tensor]) -> None:
+    for name, value in found.items():
+        total[name] = value if name not in total else total[name] + value
+
+
+def first_values(cloud: Cloud) -> dict[str, Tensor]:
+    """Round particles at points, as large as the points are apart."""
+    points = cloud.points.float()
+    away, _ = nearest(points, points, 4)
+    apart = away[:, 1:].sqrt().mean(-1) if away.shape[1] > 1 else torch.full((len(points),), cloud.size)
+    middle = float(apart.median()) or cloud.size
+    turns = torch.zeros(len(points), 4)
+    turns[:, 0] = 1
+    return {
+        "means": points.clone(),
+        "log_scales": apart.clamp(0.1 * middle, 4 * middle).log()[:, None].repeat(1, 3),
+        "turns": turns,
+        "opacity": torch.zeros(len(points), 1),
+        "color": ((cloud.colors.float() - 0.5) / _FLAT)[:, None].clone(),
+    }

@@ -1,0 +1,165 @@
+"""How particles move: nodes with smooth curves of place and turn, and who follows which of them."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from forewarp.fields.curves import Curve
+from forewarp.ops.nodes import node_maps
+
+LINKS, EDGES = 4, 6  # nodes that a particle follows; neighbours that a node keeps its distance to
+_DAMP = 0.5  # of a curve's last stride, where it is continued to times not yet seen
+_FULL = 0.05  # share of a spline's basis at a time, from which on its knot counts as seen
+
+
+def spread_out(points: Tensor, count: int) -> Tensor:
+    """Rows (count,) of points (N, 3) that are far from one another: each the farthest from those before.
+
+    Cost: ``count`` looks at all points.
+    """
+    chosen = [int((points - points.mean(0)).square().sum(-1).argmax())]
+    away = (points - points[chosen[0]]).square().sum(-1)
+    for _ in range(min(count, len(points)) - 1):
+        chosen.append(int(away.argmax()))
+        away = torch.minimum(away, (points - points[chosen[-1]]).square().sum(-1))
+    return torch.tensor(chosen, dtype=torch.int64, device=points.device)
+
+
+def nearest(points: Tensor, places: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Squared distances and rows (N, count) of the places (M, 3) nearest to points (N, 3); less, where there
+    are fewer. Points in pieces of 4,096.
+    """
+    found = []
+    for part in points.split(4096):
+        away = (part.square().sum(-1)[:, None] + places.square().sum(-1) - 2 * part @ places.T).clamp(min=0)
+        found.append(away.topk(min(count, len(places)), dim=-1, largest=False))
+    if not found:
+        empty = points.new_zeros(0, min(count, len(places)))
+        return empty, empty.long()
+    return torch.cat([f.values for f in found]), torch.cat([f.indices for f in found])
+
+
+class Nodes(nn.Module):
+    """M nodes: rest ``places`` (M, 3), and coefficients (M, K, 3) of ``shift`` (world units) and of ``turn``
+    (Gibbs vectors), None where nodes do not turn.
+
+    Args:
+        points: (N, 3) canonical points that are to move; None: a checkpoint will say.
+        count: of nodes.
+        curve: of every node.
+        turns: whether nodes turn.
+    """
+
+    ROWS = ("places", "edges", "edge_weights", "spread", "shift", "turn")
+
+    def __init__(self, points: Tensor | None, count: int, curve: Curve, *, turns: bool = True) -> None:
+        super().__init__()
+        self.curve = curve
+        places = torch.zeros(1, 3) if points is None else points[spread_out(points, count)].clone()
+        self.register_buffer("places", places)
+        away, edges = nearest(places, places, EDGES + 1)
+        away, edges = away[:, 1:], edges[:, 1:]  # the nearest is the node itself
+        unit = away.mean().clamp(min=1e-20) if away.numel() else torch.tensor(1.0)
+        self.register_buffer("edges", edges.contiguous())
+        self.register_buffer("edge_weights", 1 / (away + 1e-3 * unit) / max(edges.numel(), 1))
+        near = away[:, :3].sqrt().mean(-1) if away.shape[1] else torch.ones(len(places))
+        self.register_buffer("spread", near.clamp(min=1e-6 * float(unit) ** 0.5))
+        self.shift = nn.Parameter(torch.zeros(len(places), curve.count, 3))
+        self.turn = nn.Parameter(torch.zeros(len(places), curve.count, 3)) if turns else None
+        self.register_buffer("seen", torch.tensor([curve.canonical_time] * 2))
+
+    def __len__(self) -> int:
+        return len(self.places)
+
+    def links(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Who points (N, 3) follow: rows (N, L) int32 of nodes, and their shares (N, L).
+
+        ``exp(-(d^2 - d_min^2) / (2 s^2))``, normalised, s the mean distance of a node to its nearest three.
+        """
+        away, rows = nearest(points, self.places, LINKS)
+        shares = torch.exp(-(away - away[:, :1]) / (2 * self.spread[rows] ** 2))
+        return rows.int(), (shares / shares.sum(-1, keepdim=True)).contiguous()
+
+    def motion(self, basis: Tensor) -> Tensor:
+        """Where nodes went and how they turned (M, 6), by a curve's basis (K,)."""
+        shift = torch.einsum("mkc,k->mc", self.shift, basis)
+        turn = torch.zeros_like(shift) if self.turn is None else torch.einsum("mkc,k->mc", self.turn, basis)
+        return torch.cat([shift, turn], -1)
+
+    def maps(self, time: float) -> Tensor:
+        """``ops.nodes.node_maps`` (M, 12) at a time."""
+        return node_maps(self.motion(self.curve(time).to(self.places)), self.places)
+
+    def paths(self, points: Tensor, times: Tensor) -> Tensor:
+        """Where canonical points (N, 3) are at times (T,): (N, T, 3)."""
+        rows, shares = self.links(points)
+        found = []
+        for time in times.tolist():
+            maps = self.maps(time)[rows.long()]
+            linear, shift = maps[..., :9].reshape(*maps.shape[:2], 3, 3), maps[..., 9:]
+            step = (linear @ points[:, None, :, None])[..., 0] + shift
+            found.append(points + (shares[..., None] * step).sum(1))
+        return torch.stack(found, 1) if found else points.new_zeros(len(points), 0, 3)
+
+    @torch.no_grad()
+    def look_ahead(self, low: float, high: float) -> None:
+        """Continue curves beyond the times [low, high] that have been seen: a knot beyond them starts as a
+        damped continuation of the two before it.
+        """
+        reach = self.curve.reach()
+        if reach is None:
+            return
+        if low >= float(self.seen[0]) and high <= float(self.seen[1]):
+            return
+        self.seen[0], self.seen[1] = min(low, float(self.seen[0])), max(high, float(self.seen[1]))
+        middle = reach.mean(-1)
+        slack = _FULL * float(reach[0, 1] - reach[0, 0])
+        after = (reach[:, 0] > float(self.seen[1]) - slack).nonzero()[:, 0].tolist()
+        before = (reach[:, 1] < float(self.seen[0]) + slack).nonzero()[:, 0].tolist()
+        for value in (self.shift, self.turn):
+            if value is None:
+                continue
+            for knots, step in ((after, -1), (before[::-1], 1)):
+                for j in knots:
+                    near, far = j + step, j + 2 * step
+                    if 0 <= far < len(middle):
+                        value[:, j] = value[:, near] + _DAMP * (value[:, near] - value[:, far])
+
+    def _load_from_state_dict(self, state, prefix, *args, **kwargs) -> None:
+        for name in self.ROWS:  # a checkpoint says how many nodes there are
+            own = getattr(self, name)
+            if own is not None and prefix + name in state:
+                own.data = own.data.new_empty(state[prefix + name].shape)
+        super()._load_from_state_dict(state, prefix, *args, **kwargs)
+
+    def spread_over_time(self, basis: Tensor, slope: Tensor) -> dict[str, Tensor]:
+        """From slopes (M, 6) by ``motion`` to those by coefficients, by name."""
+        found = {"nodes.shift": slope[:, None, :3] * basis[:, None]}
+        if self.turn is not None:
+            found["nodes.turn"] = slope[:, None, 3:] * basis[:, None]
+        return found
+
+    def bent(self, time: float, factor: float, unit: float) -> tuple[float, dict[str, Tensor]]:
+        """How much curves bend at a time, over a knot's reach, in shares of ``unit``; and ``factor`` times
+        the slopes of that.
+
+        ``mean |x(t + h) - 2 x(t) + x(t - h)|^2 / unit^2``, h a knot's distance to the next: only where and as
+        often as a curve is seen is it kept smooth.
+        """
+        step = 1 / max(self.curve.count - 3, 2)
+        low, high = float(self.seen[0]) + step, float(self.seen[1]) - step
+        if factor == 0 or low > high:
+            return 0.0, {}
+        middle = min(max(time, low), high)
+        times = torch.tensor([middle - step, middle, middle + step], dtype=torch.float64).clamp(0, 1)
+        before, now, after = self.curve(times).to(self.places)
+        basis, found, total = after - 2 * now + before, {}, 0.0
+        for name, scale in (("shift", unit), ("turn", 1.0)):
+            value = getattr(self, name)
+            if value is not None:
+                bend = torch.einsum("mkc,k->mc", value, basis) / scale
+                total += float(bend.square().mean())
+                slope = 2 * factor / (bend.numel() * scale) * bend
+                found[f"nodes.{name}"] = slope[:, None] * basis[:, None]
+        return total, found
