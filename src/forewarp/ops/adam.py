@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from forewarp.ops.backend import use_numba
+from forewarp.ops.backend import match_threads, use_numba
 
 
 def adam_rows(
@@ -28,9 +28,11 @@ def adam_rows(
     if fast:
         from forewarp.ops import kernels_adam
 
-        width = value.shape[-1]
+        match_threads()
+        width, betas = value.shape[-1], tuple(map(float, betas))
+        table = kernels_adam.biases(*betas)
         arrays = [t.detach().view(-1, width).numpy() for t in (value, gradient.contiguous(), mean, square)]
-        kernels_adam.adam(*arrays, steps.view(-1).numpy(), float(rate), *map(float, betas), float(eps))
+        kernels_adam.adam(*arrays, steps.view(-1).numpy(), float(rate), *betas, float(eps), table)
         return
     seen = (gradient != 0).any(-1)
     counted = steps[seen] + 1

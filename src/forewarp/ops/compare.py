@@ -15,8 +15,8 @@ from forewarp.ops.rasterize import SIDE, kept_for, rasterize_reference, sorted_t
 
 class Compared(NamedTuple):
     """``loss`` and ``squared``: sums over pixels and channels; ``particles``, ``maps`` and ``weights``: the
-    gradients of ``factor`` times the loss; ``rows`` (V,) int64 of the particles that the picture may show, and
-    ``pull`` (V,) how strongly that pulls each over the picture, per pixel.
+    gradients of ``factor`` times the loss; ``pull`` (N,) how strongly that pulls each over the
+    picture, per pixel; 0 of particles that the picture does not show.
     """
 
     loss: float
@@ -24,7 +24,6 @@ class Compared(NamedTuple):
     particles: Gaussians
     maps: Tensor
     weights: Tensor | None
-    rows: Tensor
     pull: Tensor
 
 
@@ -99,12 +98,10 @@ def compare_reference(
         loss = ((error.square() + width**2).sqrt() - width).sum()
         (factor * loss).backward()
     found = [torch.zeros_like(leaf) if leaf.grad is None else leaf.grad for leaf in leaves]
-    rows = (splats.reach[:, 0] > 0).nonzero()[:, 0]
-    rows = rows[splats.numbers.detach()[rows, 9].sort(stable=True).indices]
-    pull = splats.numbers.grad[rows, :2].norm(dim=-1)
+    pull = splats.numbers.grad[:, :2].norm(dim=-1)
     squared = float(error.detach().square().sum())
     weights = found[6] if by_weights else None
-    return Compared(float(loss.detach()), squared, Gaussians(*found[:5]), found[5], weights, rows, pull)
+    return Compared(float(loss.detach()), squared, Gaussians(*found[:5]), found[5], weights, pull)
 
 
 def _compare_numba(
@@ -133,14 +130,13 @@ def _compare_numba(
         kernels_rasterize.np.float32(width),
         *arrays(kept, sums, found),
     )
-    by_splat = torch.empty(len(tiles.order), kernels_chain.SLOPES)
-    kernels_chain.slopes_of(splats.numpy(), tiles.order, sums.numpy(), factor, by_splat.numpy())
+    by_splat, pull = torch.empty(len(tiles.order), kernels_chain.SLOPES), torch.zeros(len(splats))
+    kernels_chain.slopes_of(splats.numpy(), tiles.order, sums.numpy(), factor, by_splat.numpy(), pull.numpy())
     gradients = [torch.zeros_like(t) for t in particles]
     maps = torch.zeros(threads, *padded.shape)
     weights = torch.zeros_like(warp.weights) if by_weights else warp.weights.new_zeros(0, 0)
     ranks = kernels_chain.ranks_of(tiles.order, len(splats))
     kernels_chain.chain(*inputs, splats.numpy(), ranks, by_splat.numpy(), *arrays(*gradients, maps, weights))
-    rows = torch.from_numpy(tiles.order).long()
     loss, squared = found.sum(0).tolist()
     return Compared(
         loss,
@@ -148,6 +144,5 @@ def _compare_numba(
         Gaussians(*gradients),
         maps.sum(0)[:, :12],
         weights if by_weights else None,
-        rows,
-        by_splat[:, :2].norm(dim=-1),
+        pull,
     )

@@ -28,25 +28,28 @@ SLOPES = 10  # by u, v, A, B, C, opacity, colour (3) and distance
 
 
 @njit(cache=True)
-def slopes_of(splats, order, sums, factor, slopes):
+def slopes_of(splats, order, sums, factor, slopes, pull):
     """From the sums over pixels (S, V, 16) of splats in their order to ``factor`` times the slopes
     by their numbers (V, 10).
 
     The sums are of q, q dx, q dy, q dx^2, q dx dy, q dy^2, with q the slope by the exponent and dx, dy from
-    the splat to the pixel, then those by colour and distance.
+    the splat to the pixel, then those by colour and distance. ``pull`` (N,) takes the lengths of those by
+    u, v.
     """
     for k in range(len(order)):
-        i = order[k]
+        i = np.uintp(order[k])
         a, b, c, solid = splats[i, 2], splats[i, 3], splats[i, 4], splats[i, 5]
         for j in range(SLOPES):
             value = ZERO
             for share in range(sums.shape[0]):
                 value += sums[share, k, j]
             slopes[k, j] = np.float32(factor) * value
-        s, sx, sy, sxx, sxy, syy = slopes[k, :6]
+        s, sx, sy = slopes[k, 0], slopes[k, 1], slopes[k, 2]
+        sxx, sxy, syy = slopes[k, 3], slopes[k, 4], slopes[k, 5]
         slopes[k, 0], slopes[k, 1] = a * sx + b * sy, b * sx + c * sy
         slopes[k, 2], slopes[k, 3], slopes[k, 4] = -HALF * sxx, -sxy, -HALF * syy
         slopes[k, 5] = s / solid
+        pull[i] = math.sqrt(slopes[k, 0] * slopes[k, 0] + slopes[k, 1] * slopes[k, 1])
 
 
 @njit(cache=True)
@@ -168,7 +171,7 @@ def chain(
         jacobian, moved, rows, scales, local = room(6), room(6), room(6), room(3), room(3)
         by_point, by_rows, by_turn, by_four = room(3), room(6), room(9), room(4)
         by_moved, by_jacobian = room(6), room(6)
-        plain, count = colors.shape[1] - len(tints), len(ranks)
+        plain, count, own_maps = colors.shape[1] - len(tints), len(ranks), to_maps[share]
         for row in range(count * share // shares, count * (share + 1) // shares):
             i = np.uintp(row)
             if ranks[i] < 0:
@@ -215,7 +218,7 @@ def chain(
             for n in range(links.shape[1]):
                 w, node = weights[i, n], links[i, n]
                 if w != 0:
-                    add_row(to_maps[share], node, w, by_warp)
+                    add_row(own_maps, node, w, by_warp)
                 if len(to_weights):
                     value = ZERO
                     for j in range(12):

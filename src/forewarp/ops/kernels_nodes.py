@@ -57,3 +57,25 @@ def pull(motion, places, by_maps, edges, weights, found, factor):
         for r in range(3):
             found[m, 3 + r] += s * (by[r] - 2.0 * trace * turn[r] + across[r] - along * turn[r])
     return total
+
+
+@njit(cache=True)
+def carry(shift, turn, basis, places, motion, maps):
+    """Fill ``motion`` (M, 6) and ``maps`` (M, 12); see ``nodes.carried``. Without turns ``turn`` is empty."""
+    linear = np.empty(9)
+    for m in range(shift.shape[0]):
+        for c in range(3):
+            went, turned = 0.0, 0.0
+            for k in range(shift.shape[1]):
+                if basis[k] != 0:
+                    went += basis[k] * shift[m, k, c]
+                    if len(turn):
+                        turned += basis[k] * turn[m, k, c]
+            motion[m, c], motion[m, 3 + c] = went, turned
+        _linear(motion, m, linear)
+        for r in range(3):
+            rest = motion[m, r]
+            for c in range(3):
+                maps[m, 3 * r + c] = linear[3 * r + c]
+                rest -= linear[3 * r + c] * places[m, c]
+            maps[m, 9 + r] = rest

@@ -14,6 +14,7 @@ from numba import njit
 from forewarp.ops.kernels_rasterize import LEAST_LOG, RECORD, SIDE
 
 _DIGIT = 11  # bits that are sorted by at once
+_ZERO = np.float32(0)
 
 
 @njit(cache=True)
@@ -69,15 +70,11 @@ def _span(center, reach, count):
 
 
 @njit(inline="always")
-def _highest(record, left, top):
-    """The largest exponent of a splat within a tile, -(A dx^2 + 2 B dx dy + C dy^2) / 2."""
-    x0, y0 = left - record[0], top - record[1]
+def _highest(a, b, c, x0, y0):
+    """The largest exponent ``a x^2 + b x y + c y^2`` of a splat in a tile that begins at x0, y0 from it."""
     x1, y1 = x0 + np.float32(SIDE), y0 + np.float32(SIDE)
-    x, y = min(max(np.float32(0), x0), x1), min(max(np.float32(0), y0), y1)
-    if x == 0 and y == 0:
-        return np.float32(0)
-    a, b, c = record[2], record[3], record[4]
-    best = np.float32(-np.inf)
+    x, y = min(max(_ZERO, x0), x1), min(max(_ZERO, y0), y1)
+    best = _ZERO if x == 0 and y == 0 else np.float32(-np.inf)
     if x != 0:  # along the nearer upright edge
         at = min(max(np.float32(-0.5) * b * x / c, y0), y1)
         best = a * x * x + at * (b * x + c * at)
@@ -88,40 +85,45 @@ def _highest(record, left, top):
 
 
 @njit(cache=True)
+def _spans(splats, order, across, down):
+    """The tiles (V, 4) that the box of each splat touches, first and after the last, and how many in all."""
+    spans, most = np.empty((len(order), 4), np.int32), 0
+    for k in range(len(order)):
+        i = np.uintp(order[k])
+        spans[k, 0], spans[k, 1] = _span(splats[i, 0], splats[i, 10], across)
+        spans[k, 2], spans[k, 3] = _span(splats[i, 1], splats[i, 11], down)
+        most += max(0, spans[k, 1] - spans[k, 0]) * max(0, spans[k, 3] - spans[k, 2])
+    return spans, most
+
+
+@njit(cache=True, fastmath={"contract"})
 def sort_into_tiles(splats, order, records, across, down):
     """Which splats each tile has to look at, from near to far: ``entries``, and where each tile's begin.
 
     A tile that the ellipse of a splat, at a 255th of a pixel, does not touch is left out.
     """
-    count = len(order)
-    most = 0
-    for k in range(count):
-        s = splats[order[k]]
-        first, last = _span(s[0], s[10], across)
-        top, bottom = _span(s[1], s[11], down)
-        most += max(0, last - first) * max(0, bottom - top)
+    spans, most = _spans(splats, order, across, down)
     tiles, owners = np.empty(most, np.int32), np.empty(most, np.int32)
     ends = np.zeros(across * down + 1, np.int64)
     pairs = 0
-    for k in range(count):
-        s = splats[order[k]]
-        first, last = _span(s[0], s[10], across)
-        top, bottom = _span(s[1], s[11], down)
+    for k in range(len(order)):
+        first, last, top, bottom = spans[k, 0], spans[k, 1], spans[k, 2], spans[k, 3]
         small = last - first <= 1 and bottom - top <= 1
+        u, v, a, b, c = records[k, 0], records[k, 1], records[k, 2], records[k, 3], records[k, 4]
         least = np.float32(LEAST_LOG) - records[k, 5]
         for row in range(top, bottom):
+            y = np.float32(SIDE * row) - v
             for column in range(first, last):
-                left, above = np.float32(SIDE * column), np.float32(SIDE * row)
-                if small or _highest(records[k], left, above) >= least:
-                    tile = row * across + column
+                if small or _highest(a, b, c, np.float32(SIDE * column) - u, y) >= least:
+                    tile = np.uintp(row * across + column)
                     tiles[pairs], owners[pairs] = tile, k
-                    ends[tile + 1] += 1
+                    ends[tile + np.uintp(1)] += 1
                     pairs += 1
     for tile in range(across * down):
         ends[tile + 1] += ends[tile]
     entries, place = np.empty(pairs, np.int32), ends[:-1].copy()
     for pair in range(pairs):
-        tile = tiles[pair]
+        tile = np.uintp(tiles[pair])
         entries[place[tile]] = owners[pair]
         place[tile] += 1
     return entries, ends

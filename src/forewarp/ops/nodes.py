@@ -44,6 +44,34 @@ def node_maps(motion: Tensor, places: Tensor) -> Tensor:
     return torch.cat([linear.reshape(-1, 9), rest], -1)
 
 
+def carried(shift: Tensor, turn: Tensor | None, basis: Tensor, places: Tensor) -> tuple[Tensor, Tensor]:
+    """Where nodes are at a time, from their curves: ``motion`` (M, 6) and its ``node_maps`` (M, 12).
+
+    Args:
+        shift, turn: (M, K, 3) coefficients; None where nothing turns.
+        basis: (K,) of the time.
+        places: (M, 3).
+
+    Returns:
+        both; where a gradient is asked for, with their graph.
+
+    Cost: 6 numbers a node and coefficient that is not 0.
+    """
+    check_shape("shift", shift, (len(places), len(basis), 3))
+    asks = torch.is_grad_enabled() and (shift.requires_grad or (turn is not None and turn.requires_grad))
+    if use_numba(shift) and shift.dtype == torch.float32 and not asks:
+        from forewarp.ops import kernels_nodes
+
+        motion, maps = shift.new_empty(len(places), 6), shift.new_empty(len(places), 12)
+        arrays = (shift, shift[:0] if turn is None else turn, basis, places, motion, maps)
+        kernels_nodes.carry(*(a.detach().numpy() for a in arrays))
+        return motion, maps
+    went = torch.einsum("mkc,k->mc", shift, basis)
+    turned = torch.zeros_like(went) if turn is None else torch.einsum("mkc,k->mc", turn, basis)
+    motion = torch.cat([went, turned], -1)
+    return motion, node_maps(motion, places)
+
+
 def stiffness(motion: Tensor, places: Tensor, edges: Tensor, weights: Tensor) -> Tensor:
     """How far nodes are from moving rigidly together: ``sum w |v_l - v_m - D_m (p_l - p_m)|^2``.
 

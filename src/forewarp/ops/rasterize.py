@@ -139,8 +139,10 @@ class _Rasterize(torch.autograd.Function):
             kept.numpy(),
             sums.numpy(),
         )
-        by_splat = torch.empty(len(tiles.order), kernels_chain.SLOPES)
-        kernels_chain.slopes_of(ctx.splats.numpy(), tiles.order, sums.numpy(), 1.0, by_splat.numpy())
+        by_splat, pull = torch.empty(len(tiles.order), kernels_chain.SLOPES), torch.empty(len(ctx.splats))
+        kernels_chain.slopes_of(
+            ctx.splats.numpy(), tiles.order, sums.numpy(), 1.0, by_splat.numpy(), pull.numpy()
+        )
         found = slopes.new_zeros(len(ctx.splats), kernels_chain.SLOPES)
         found[torch.from_numpy(tiles.order).long()] = by_splat
         return found, None, None, None

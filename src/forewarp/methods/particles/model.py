@@ -18,7 +18,7 @@ from forewarp.methods.particles.settings import Numbers, counts
 from forewarp.methods.particles.snapshot import ParticlesSnapshot
 from forewarp.methods.particles.start import covered_pixels, first_points
 from forewarp.ops.compare import compare
-from forewarp.ops.nodes import node_maps, pull_nodes
+from forewarp.ops.nodes import pull_nodes
 from forewarp.ops.project import Gaussians, Warp
 from forewarp.scene.batch import Asks, Batch
 from forewarp.scene.box import Box
@@ -242,14 +242,14 @@ class Particles(Method):
         if self.nodes is not None:
             self.nodes.look_ahead(time, time)
             basis = self.nodes.curve(time)
-            motion = self.nodes.motion(basis)
-            warp = Warp(node_maps(motion, self.nodes.places), self.links, self.shares)
+            motion, maps = self.nodes.carried(basis)
+            warp = Warp(maps, self.links, self.shares)
         found = compare(
             self.gaussians(), warp or self._still(), self.pinholes(seen.view.camera), tints, fades,
             seen.rgb, seen.background, width=self.width, factor=weight,
         )  # fmt: skip
-        self.pulled[found.rows] += found.pull
-        self.shown[found.rows] += (found.pull > 0).float()
+        self.pulled += found.pull
+        self.shown += found.pull > 0
         _add(total, self._by_name(found.particles))
         if self.nodes is not None:
             nodes, rigid = self.nodes, factors.get("rigid", 0.0) * self._loose()

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from forewarp.fields.curves import Curve
-from forewarp.ops.nodes import node_maps
+from forewarp.ops.nodes import carried
 
 LINKS, EDGES = 4, 6  # nodes that a particle follows; neighbours that a node keeps its distance to
 _DAMP = 0.5  # of a curve's last stride, where it is continued to times not yet seen
@@ -81,15 +81,13 @@ class Nodes(nn.Module):
         shares = torch.exp(-(away - away[:, :1]) / (2 * self.spread[rows] ** 2))
         return rows.int(), (shares / shares.sum(-1, keepdim=True)).contiguous()
 
-    def motion(self, basis: Tensor) -> Tensor:
-        """Where nodes went and how they turned (M, 6), by a curve's basis (K,)."""
-        shift = torch.einsum("mkc,k->mc", self.shift, basis)
-        turn = torch.zeros_like(shift) if self.turn is None else torch.einsum("mkc,k->mc", self.turn, basis)
-        return torch.cat([shift, turn], -1)
+    def carried(self, basis: Tensor) -> tuple[Tensor, Tensor]:
+        """Where nodes went and how they turned (M, 6), by a curve's basis (K,), and their maps (M, 12)."""
+        return carried(self.shift, self.turn, basis, self.places)
 
     def maps(self, time: float) -> Tensor:
         """``ops.nodes.node_maps`` (M, 12) at a time."""
-        return node_maps(self.motion(self.curve(time).to(self.places)), self.places)
+        return self.carried(self.curve(time).to(self.places))[1]
 
     def paths(self, points: Tensor, times: Tensor) -> Tensor:
         """Where canonical points (N, 3) are at times (T,): (N, T, 3)."""

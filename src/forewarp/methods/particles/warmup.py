@@ -6,7 +6,7 @@ import torch
 
 from forewarp.ops.adam import adam_rows
 from forewarp.ops.compare import compare
-from forewarp.ops.nodes import pull_nodes
+from forewarp.ops.nodes import carried, pull_nodes
 from forewarp.ops.project import Gaussians, Pinhole, Warp, project
 from forewarp.ops.rasterize import rasterize
 
@@ -23,6 +23,7 @@ def warm_up(method: torch.nn.Module) -> None:
     compare(particles, warp, pinhole, none, first, torch.zeros(72, 4, dtype=torch.uint8), torch.ones(3))
     rasterize(project(particles, warp, pinhole, none, first), 9, 8)
     edges = torch.zeros(1, 1, dtype=torch.int64)
+    carried(zero[:, None], zero[:, None], first, zero)
     pull_nodes(torch.zeros(1, 6), zero, torch.zeros(1, 12), edges, one, 1.0)
     adam_rows(
         torch.zeros(1, 3),
