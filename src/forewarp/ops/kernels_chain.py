@@ -164,7 +164,7 @@ def chain(
     splats, ranks, slopes,
     to_means, to_scales, to_quaternions, to_opacity, to_colors, to_maps, to_weights,
 ):  # fmt: skip  # long: one particle's way back, step by step, in the order of the way there
-    """From slopes (V, 10), ``ranks`` (N,) the row of a particle or -1, to those by particles and by maps (S, M, 16)."""
+    """From slopes (V, 10), a particle's in the row ``ranks`` (N,) or -1, to those by particles and maps."""
     shares = to_maps.shape[0]
     for share in prange(shares):
         warp, turn, by_warp, basis = room(12), room(9), room(12), room(16)

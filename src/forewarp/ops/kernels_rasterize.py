@@ -115,7 +115,6 @@ def _walk_back(records, entries, first, count, column, y, kept, slopes, behind, 
 def _draw_tile(records, entries, first, last, x, y):
     """Composite a tile: what is let through, colour, and distance times coverage."""
     through, red, green, blue, far = lanes(1.0), lanes(0.0), lanes(0.0), lanes(0.0), lanes(0.0)
-    count = 0
     for at in range(first, min(last, first + MOST)):
         i = entries[at]
         weight = _alpha(records, i, x, y) * through
@@ -124,8 +123,7 @@ def _draw_tile(records, entries, first, last, x, y):
         blue = fma(weight, records[i, 8], blue)
         far = fma(weight, records[i, 9], far)
         through = through - weight
-        count += 1
-        if count & 3 == 0 and not any_above(through, np.float32(_OVER)):
+        if (at - first) & 3 == 3 and not any_above(through, np.float32(_OVER)):
             break
     return through, red, green, blue, far
 

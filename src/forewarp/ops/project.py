@@ -198,21 +198,30 @@ def project_reference(
     )
     rows = slopes.detach() @ flat @ rotation @ linear @ rotations(quaternions)  # (N, 2, 3)
     root = rows * log_scales.exp()[:, None]
-    covariance = root @ root.mT
-    a, b, c = covariance[:, 0, 0] + pinhole.blur, covariance[:, 0, 1], covariance[:, 1, 1] + pinhole.blur
-    normal = torch.linalg.cross(root[:, 0], root[:, 1])
-    determinant = normal.square().sum(-1) + pinhole.blur * (a + c - pinhole.blur)
-    seen = seen & (determinant.detach() > 0) & (determinant.detach() < 1e30)
+    determinant = _covariance(root.detach(), pinhole.blur)[3]
+    seen = seen & (determinant > 0) & (determinant < 1e30)
+    a, b, c, determinant = _covariance(torch.where(seen[:, None, None], root, 0.0), pinhole.blur)
     distance = away.square().sum(-1).clamp(min=1e-30).sqrt()
     directions = (away / distance[:, None]).detach()
     plain = colors.shape[1] - len(tints)
     color = torch.einsum("nk,nkc->nc", harmonics(directions, plain), colors[:, :plain]) + 0.5
     color = (color + torch.einsum("k,nkc->nc", tints, colors[:, plain:])).clamp(min=0)
-    conic = torch.stack([c, -b, a], -1) / torch.where(seen, determinant, 1.0)[:, None]
+    conic = torch.stack([c, -b, a], -1) / determinant[:, None]
     numbers = torch.cat([pixel, conic, solid[:, None], color, distance[:, None]], -1)
     reach = 2 * torch.log((255 * solid.detach()).clamp(min=1))
     reach = (reach[:, None] * torch.stack([a, c], -1).detach()).sqrt()
     return Splats(torch.where(seen[:, None], numbers, 0.0), torch.where(seen[:, None], reach, 0.0))
+
+
+def _covariance(root: Tensor, blur: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """a, b, c (N,) of ``root root^t + blur I`` of roots (N, 2, 3), and its determinant.
+
+    The determinant's first part is the cross product's square: of a needle, a c - b b loses all digits.
+    """
+    covariance = root @ root.mT
+    a, b, c = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
+    normal = torch.linalg.cross(root[:, 0], root[:, 1])
+    return a + blur, b, c + blur, normal.square().sum(-1) + blur * (a + c + blur)
 
 
 def _through_lens(pinhole: Pinhole, plane: Tensor) -> tuple[Tensor, Tensor]:

@@ -70,11 +70,10 @@ def rasterize_reference(splats: Splats, width: int, height: int) -> Tensor:
     dy = (torch.arange(height).to(numbers) + 0.5)[:, None] - v  # (V, H, 1)
     power = -0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy + solid.log()
     alpha = torch.where(power > _LEAST, power.exp(), 0.0)
-    passed = torch.cumprod(torch.cat([torch.ones_like(alpha[:1]), 1 - alpha]), 0)
+    passed = torch.cumprod(torch.cat([alpha.new_ones(1, height, width), 1 - alpha]), 0)
     weights = alpha * passed[:-1]
     shown = torch.einsum("vhw,vk->khw", weights, numbers[order, 6:])
-    last = passed[-1:] if len(passed) else torch.ones_like(alpha[:1])
-    return torch.cat([shown, last])
+    return torch.cat([shown, passed[-1:]])
 
 
 class Tiles(NamedTuple):

@@ -32,7 +32,7 @@ def spline_basis(time: Tensor | float, knots: int, canonical_time: float) -> Ten
     if knots < 4:
         raise ValueError(f"spline: expected at least 4 knots, but got {knots}")
     if isinstance(time, float) and 0 <= time <= 1:  # as in every step: plain numbers are faster
-        now, then = _shares(time, knots), _shares(float(torch.tensor(canonical_time)), knots)
+        now, then = _shares(time, knots), _shares(canonical_time, knots)
         return torch.tensor([a - b for a, b in zip(now, then)])
     t = torch.as_tensor(time)
     t = t if t.is_floating_point() else t.float()
