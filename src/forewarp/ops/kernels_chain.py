@@ -22,7 +22,7 @@ from forewarp.ops.kernels_project import (
     _turn,
     harmonics,
 )
-from forewarp.ops.lanes import add_row, room
+from forewarp.ops.lanes_arrays import add_row, room
 
 SLOPES = 10  # by u, v, A, B, C, opacity, colour (3) and distance
 
@@ -159,11 +159,11 @@ def _of_colors(view, warp, mean, i, slopes, splats, plain, tints, basis, out):
 
 
 @njit(parallel=True, cache=True, fastmath={"contract"})
-def chain(
+def chain(  # long: one particle's way back, step by step
     means, log_scales, quaternions, opacity, colors, maps, links, weights, view, tints, fades,
     splats, ranks, slopes,
     to_means, to_scales, to_quaternions, to_opacity, to_colors, to_maps, to_weights,
-):  # fmt: skip  # long: one particle's way back, step by step, in the order of the way there
+):  # fmt: skip
     """From slopes (V, 10), a particle's in the row ``ranks`` (N,) or -1, to those by particles and maps."""
     shares = to_maps.shape[0]
     for share in prange(shares):

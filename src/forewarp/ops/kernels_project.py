@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from forewarp.ops.lanes import room, take_row
+from forewarp.ops.lanes_arrays import room, take_row
 
 SPLAT = 12
 ONE, TWO = np.float32(1), np.float32(2)  # whole numbers would make float64 of all they meet

@@ -10,24 +10,19 @@ import numpy as np
 from numba import njit, prange
 
 from forewarp.ops.lanes import (
-    add_sums,
     any_above,
     columns,
     exp_down,
     fma,
     fold,
-    get,
-    get_channel,
-    get_tile,
     lanes,
     narrow_columns,
-    put,
-    put_tile,
     root,
     rows,
     total,
     where_above,
 )
+from forewarp.ops.lanes_arrays import add_sums, get, get_channel, get_tile, put, put_tile
 
 SIDE = 8
 RECORD, GRADIENT = 10, 16  # numbers of a record; of a row of sums

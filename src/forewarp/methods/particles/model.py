@@ -12,11 +12,11 @@ from forewarp.fields.curves import Curve
 from forewarp.methods.method import Method, Snapshot, Start, Step
 from forewarp.methods.particles.camera import Pinholes
 from forewarp.methods.particles.density import renew
-from forewarp.methods.particles.nodes import Nodes, nearest
+from forewarp.methods.particles.nodes import Nodes
 from forewarp.methods.particles.rows_adam import RowsAdam
 from forewarp.methods.particles.settings import Numbers, counts
 from forewarp.methods.particles.snapshot import ParticlesSnapshot
-from forewarp.methods.particles.start import covered_pixels, first_points
+from forewarp.methods.particles.start import covered_pixels, first_points, first_values
 from forewarp.ops.compare import compare
 from forewarp.ops.nodes import pull_nodes
 from forewarp.ops.project import Gaussians, Warp
@@ -148,32 +148,16 @@ class Particles(Method):
 
     def adopted(self) -> set[str]:
         """See ``Method``: nodes too are as many as a checkpoint says."""
-        return {*self.grows, *(f"nodes.{name}" for name in self._node_rows())}
-
-    def _node_rows(self) -> list[str]:
-        return [] if self.nodes is None else [n for n in Nodes.ROWS if getattr(self.nodes, n) is not None]
+        nodes = () if self.nodes is None else self.nodes.rows()
+        return {*self.grows, *(f"nodes.{name}" for name in nodes)}
 
     def misfit(self, state: Mapping[str, Tensor]) -> str | None:
-        """See ``Method``; the arrays of nodes have as many rows as their places, and nobody follows others."""
-        for name in self._node_rows():
-            own, theirs = getattr(self.nodes, name), state[f"nodes.{name}"]
-            many = len(state["nodes.places"])
-            free = 2 if name in ("edges", "edge_weights") else 1  # few nodes have few neighbours
-            if theirs.dtype != own.dtype or theirs.dim() != own.dim() or len(theirs) != many:
-                return f"nodes.{name}"
-            if theirs.shape[free:] != own.shape[free:]:
-                return f"nodes.{name}"
-        for name in ("nodes.edges", "links") if self.nodes is not None else ():
-            rows = state[name]
-            if rows.numel() and not 0 <= int(rows.min()) <= int(rows.max()) < len(state["nodes.places"]):
-                return name
-        return super().misfit(self._padded(state))
-
-    def _padded(self, state: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
-        """A state whose links are as wide as ours: fewer nodes have fewer."""
-        if self.nodes is None or state["links"].dim() != 2 or state["links"].shape != state["shares"].shape:
-            return state
-        return {**state, **{n: state[n][:, :1].expand(-1, self.links.shape[1]) for n in ("links", "shares")}}
+        """See ``Method``; what is stored of nodes must go together, too."""
+        if self.nodes is None:
+            return super().misfit(state)
+        own, wide = self.nodes, self.links.shape[1]
+        links = {n: state[n][:, :1].expand(-1, wide) for n in ("links", "shares") if state[n].dim() == 2}
+        return own.misfit(state, "nodes.", state["links"]) or super().misfit({**state, **links})
 
     def at(self, moment: Moment) -> Snapshot:
         """Move every particle; nothing is drawn yet."""
@@ -297,9 +281,7 @@ class Particles(Method):
         return {}
 
     def _renew(self, progress: float, optimizer: torch.optim.Optimizer) -> None:
-        share = min(1.0, progress / numbers_until(self.numbers_of))
-        first = self.numbers_of.first
-        target = round(float(self.most) * (first + (1 - first) * share) * self.numbers_of.full)
+        target = round(float(self.most) * self.numbers_of.share_at(progress))
         low, high = self.ends if self.nodes is None else self.nodes.seen.tolist()
         whole = low <= self.ends[0] + 0.02 and high >= self.ends[1] - 0.02
         renew(self, optimizer, target, unseen=whole and self.nodes is not None, extent=float(self.extent))
@@ -314,18 +296,10 @@ class Particles(Method):
 
     def param_groups(self) -> dict[str, list[nn.Parameter]]:
         """See ``Method``."""
-        groups = {
-            name: [getattr(self, name)] for name in ("means", "log_scales", "turns", "opacity", "color")
-        }
-        groups |= {
-            name: [getattr(self, name)]
-            for name in ("shade", "tint", "fade")
-            if getattr(self, name) is not None
-        }
+        groups = {name: [p] for name, p in self.named_parameters(recurse=False)}
         if self.nodes is not None:
             groups["shifts"] = [self.nodes.shift]
-            if self.nodes.turn is not None:
-                groups["node_turns"] = [self.nodes.turn]
+            groups |= {} if self.nodes.turn is None else {"node_turns": [self.nodes.turn]}
         return groups
 
     def optimizer(self, groups: list[dict]) -> torch.optim.Optimizer:
@@ -364,28 +338,6 @@ class Particles(Method):
         return {"departures": "particles, rasterised, in the place of voxels that are marched through"}
 
 
-def numbers_until(numbers: Numbers) -> float:
-    """The share of the stage at which there are as many particles as there will be."""
-    return max(numbers.settled * 0.8, 1e-6)
-
-
 def _add(total: dict[str, Tensor], found: Mapping[str, Tensor]) -> None:
     for name, value in found.items():
         total[name] = value if name not in total else total[name] + value
-
-
-def first_values(cloud: Cloud) -> dict[str, Tensor]:
-    """Round particles at points, as large as the points are apart."""
-    points = cloud.points.float()
-    away, _ = nearest(points, points, 4)
-    apart = away[:, 1:].sqrt().mean(-1) if away.shape[1] > 1 else torch.full((len(points),), cloud.size)
-    middle = float(apart.median()) or cloud.size
-    turns = torch.zeros(len(points), 4)
-    turns[:, 0] = 1
-    return {
-        "means": points.clone(),
-        "log_scales": apart.clamp(0.1 * middle, 4 * middle).log()[:, None].repeat(1, 3),
-        "turns": turns,
-        "opacity": torch.zeros(len(points), 1),
-        "color": ((cloud.colors.float() - 0.5) / _FLAT)[:, None].clone(),
-    }

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
 from torch import Tensor, nn
 
@@ -124,6 +126,29 @@ class Nodes(nn.Module):
                     if 0 <= far < len(middle):
                         value[:, j] = value[:, near] + _DAMP * (value[:, near] - value[:, far])
 
+    def rows(self) -> list[str]:
+        """What has a row a node."""
+        return [name for name in self.ROWS if getattr(self, name) is not None]
+
+    def misfit(self, state: Mapping[str, Tensor], prefix: str, links: Tensor) -> str | None:
+        """Name an entry of a stored state that contradicts the others; None where all is well.
+
+        All have as many rows as there are places, and nothing points at a node that there is not.
+        """
+        many = len(state[prefix + "places"])
+        for name in self.rows():
+            own, theirs = getattr(self, name), state[prefix + name]
+            free = 2 if name in ("edges", "edge_weights") else 1  # few nodes have few neighbours
+            fits = theirs.dtype == own.dtype and theirs.dim() == own.dim() and len(theirs) == many
+            if not fits or theirs.shape[free:] != own.shape[free:]:
+                return prefix + name
+        if state[prefix + "edges"].shape != state[prefix + "edge_weights"].shape:
+            return prefix + "edges"
+        for name, rows in ((prefix + "edges", state[prefix + "edges"]), ("links", links)):
+            if rows.numel() and not 0 <= int(rows.min()) <= int(rows.max()) < many:
+                return name
+        return None
+
     def _load_from_state_dict(self, state, prefix, *args, **kwargs) -> None:
         for name in self.ROWS:  # a checkpoint says how many nodes there are
             own = getattr(self, name)
@@ -138,6 +163,7 @@ class Nodes(nn.Module):
             found["nodes.turn"] = slope[:, None, 3:] * basis[:, None]
         return found
 
+    @torch.no_grad()
     def bent(self, time: float, factor: float, unit: float) -> tuple[float, dict[str, Tensor]]:
         """How much curves bend at a time, over a knot's reach, in shares of ``unit``; and ``factor`` times
         the slopes of that.

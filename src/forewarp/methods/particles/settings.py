@@ -56,6 +56,11 @@ class Numbers:
         """
         return max(32, round(self.density * math.sqrt(covered)))
 
+    def share_at(self, progress: float) -> float:
+        """The share of them that there should be: on a line from ``first``; soon before ``settled``, all."""
+        done = min(1.0, progress / max(0.8 * self.settled, 1e-6))
+        return self.full * (self.first + (1 - self.first) * done)
+
 
 def counts(particles: int, times: int) -> tuple[int, int]:
     """How many nodes, and how many coefficients each has.

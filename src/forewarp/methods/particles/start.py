@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from forewarp.methods.method import Start
+from forewarp.methods.particles.nodes import nearest
 from forewarp.methods.particles.sweep import swept
 from forewarp.ops.grid import dilate
 from forewarp.scene.box import Box, Lattice
@@ -17,6 +18,7 @@ _FRAMES = 12  # whose silhouettes are looked at
 _DRIFT = 0.2  # share of a picture's width by which a silhouette is taken to move in all the time there is
 _ROUGH, _FINE = 48, 112  # voxels along the mean side of the box, and of what is left of it
 _FEW = 16  # points that are too few to begin with
+_FLAT = 0.28209479177387814  # of the harmonics: what a colour's first coefficient is multiplied by
 
 
 def first_points(start: Start, count: int) -> Cloud:
@@ -119,3 +121,20 @@ def covered_pixels(scene: Scene, frames: list[int]) -> float:
     """How many pixels of a picture show anything, the mean over some frames."""
     shown = [float((scene.train[i].load()[..., 3] > 127).sum()) for i in frames[:_FRAMES]]
     return max(sum(shown) / len(shown), 1.0)
+
+
+def first_values(cloud: Cloud) -> dict[str, Tensor]:
+    """Round particles at points, as large as the points are apart."""
+    points = cloud.points.float()
+    away, _ = nearest(points, points, 4)
+    apart = away[:, 1:].sqrt().mean(-1) if away.shape[1] > 1 else torch.full((len(points),), cloud.size)
+    middle = float(apart.median()) or cloud.size
+    turns = torch.zeros(len(points), 4)
+    turns[:, 0] = 1
+    return {
+        "means": points.clone(),
+        "log_scales": apart.clamp(0.1 * middle, 4 * middle).log()[:, None].repeat(1, 3),
+        "turns": turns,
+        "opacity": torch.zeros(len(points), 1),
+        "color": ((cloud.colors.float() - 0.5) / _FLAT)[:, None].clone(),
+    }
