@@ -7,7 +7,7 @@ from contract.fitting import module_of
 from contract.scenes import data_of, write_dnerf
 from contract.table import METHODS
 from forewarp.methods.particles.model import Particles
-from forewarp.methods.particles.settings import Numbers, counts
+from forewarp.methods.particles.settings import Numbers
 from forewarp.scene.view import Moment, View
 
 ENTRY = METHODS["particles"]
@@ -135,8 +135,8 @@ def test_numbers_follow_the_pictures():
     assert numbers.most(4.0) == 180
     assert numbers.share_at(0.0) == 0.5
     assert numbers.share_at(1.0) == 1.0
-    assert counts(100, 2)[1] == 4
-    assert counts(20_000, 200)[0] > counts(5_000, 200)[0]
+    assert numbers.motion(100, 2)[1] == 4
+    assert numbers.motion(20_000, 200)[0] > numbers.motion(5_000, 200)[0]
 
 
 def test_two_views_of_a_time_count_as_one_step(data):

@@ -7,7 +7,7 @@ import torch
 from forewarp.ops.project import Pinhole
 from forewarp.scene.camera import Camera
 
-_NEAR, _LEAST = 0.1, 1e-4  # of the camera's near, and at least of its far: closer particles fill the picture
+_NEAR, _LEAST = 0.1, 0.02  # of the camera's near, and at least of its far: closer particles fill the picture
 _BESIDE = 0.125  # share of the longer side; what lies farther beside the picture is left out
 _SLACK = 1.3  # of the square from the axis that a lens's picture reaches
 _BORDER = 16  # points along each side of a picture

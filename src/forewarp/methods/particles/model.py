@@ -14,7 +14,7 @@ from forewarp.methods.particles.camera import Pinholes
 from forewarp.methods.particles.density import renew
 from forewarp.methods.particles.nodes import Nodes
 from forewarp.methods.particles.rows_adam import RowsAdam
-from forewarp.methods.particles.settings import Numbers, counts
+from forewarp.methods.particles.settings import Numbers
 from forewarp.methods.particles.snapshot import ParticlesSnapshot
 from forewarp.methods.particles.start import covered_pixels, first_points, first_values
 from forewarp.ops.compare import compare
@@ -79,9 +79,10 @@ class Particles(Method):
         self._make(before, fresh, (view + 1) ** 2, tints, fades)
         self.nodes = None
         if motion != "none" and self.numbers_of.moves and len(times) > 1:
-            count, knots = counts(len(self.means), len(times))
+            count, knots = self.numbers_of.motion(len(self.means), len(times))
             curve = Curve(motion, knots, len(times), self.canonical_time)
-            self.nodes = Nodes(None if start.blank else self.means.data, count, curve, turns=turns)
+            points, edges = None if start.blank else self.means.data, self.numbers_of.edges
+            self.nodes = Nodes(points, count, curve, turns=turns, edges=edges)
             links, shares = self.nodes.links(self.means.data)
             self.register_buffer("links", links)
             self.register_buffer("shares", shares)

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from forewarp.fields.curves import Curve
 from forewarp.ops.nodes import carried
 
-LINKS, EDGES = 4, 6  # nodes that a particle follows; neighbours that a node keeps its distance to
+LINKS = 4  # nodes that a particle follows
 _DAMP = 0.5  # of a curve's last stride, where it is continued to times not yet seen
 _FULL = 0.05  # share of a spline's basis at a time, from which on its knot counts as seen
 
@@ -51,20 +51,23 @@ class Nodes(nn.Module):
         count: of nodes.
         curve: of every node.
         turns: whether nodes turn.
+        edges: neighbours that a node is kept rigid with.
     """
 
     ROWS = ("places", "edges", "edge_weights", "spread", "shift", "turn")
 
-    def __init__(self, points: Tensor | None, count: int, curve: Curve, *, turns: bool = True) -> None:
+    def __init__(
+        self, points: Tensor | None, count: int, curve: Curve, *, turns: bool = True, edges: int = 6
+    ) -> None:
         super().__init__()
         self.curve = curve
         places = torch.zeros(1, 3) if points is None else points[spread_out(points, count)].clone()
         self.register_buffer("places", places)
-        away, edges = nearest(places, places, EDGES + 1)
-        away, edges = away[:, 1:], edges[:, 1:]  # the nearest is the node itself
+        away, beside = nearest(places, places, edges + 1)
+        away, beside = away[:, 1:], beside[:, 1:]  # the nearest is the node itself
         unit = away.mean().clamp(min=1e-20) if away.numel() else torch.tensor(1.0)
-        self.register_buffer("edges", edges.contiguous())
-        self.register_buffer("edge_weights", 1 / (away + 1e-3 * unit) / max(edges.numel(), 1))
+        self.register_buffer("edges", beside.contiguous())
+        self.register_buffer("edge_weights", 1 / (away + 1e-3 * unit) / max(beside.numel(), 1))
         near = away[:, :3].sqrt().mean(-1) if away.shape[1] else torch.ones(len(places))
         self.register_buffer("spread", near.clamp(min=1e-6 * float(unit) ** 0.5))
         self.shift = nn.Parameter(torch.zeros(len(places), curve.count, 3))

@@ -12,6 +12,7 @@ from forewarp.scene.frame import Scene, spread
 _DEPTHS = 48  # planes, evenly in inverse depth
 _SIDE = 64  # lattice points along the longer side of a picture
 _VIEWS, _OTHERS = 10, 8  # pictures that are swept; neighbours in time of each
+_LEAST = 0.02  # share of the far plane at which planes begin at the earliest
 _NEW = 0.05  # share by which a point must lie nearer or farther than what is there to be a new one
 
 
@@ -68,19 +69,28 @@ def _sweep(scene: Scene, i: int, side: int) -> tuple[Tensor, Tensor, Tensor]:
     )
     rays = camera.rays((rows * camera.width + columns).flatten())
     color = rgb[rows, columns].reshape(-1, 3)
-    near, far = max(camera.near, 1e-3 * camera.far), camera.far
-    depths = 1 / torch.linspace(1 / near, 1 / far, _DEPTHS)
-    places = rays.origins[:, None] + depths[:, None] * rays.directions[:, None]  # (P, D, 3)
     time = scene.train[i].time
     others = sorted(
         (j for j in range(len(scene.train)) if j != i),
         key=lambda j: (abs(scene.train[j].time - time), abs(j - i)),
     )[:_OTHERS]
+    near = _nearest_plane(camera, [scene.train[j].camera for j in others])
+    depths = 1 / torch.linspace(1 / near, 1 / camera.far, _DEPTHS)
+    places = rays.origins[:, None] + depths[:, None] * rays.directions[:, None]  # (P, D, 3)
     costs = torch.stack([_difference(scene, j, side, places, color) for j in others])
     best = costs.sort(0).values[: max(1, len(others) // 2)].mean(0)
     depth = depths[best.argmin(-1)]
     points = rays.origins + depth[:, None] * rays.directions
     return points, color, depth.median() * step / camera.fx
+
+
+def _nearest_plane(camera, others: list) -> float:
+    """Where planes begin: not before the camera's near, nor where what the neighbours see has shifted by half
+    a picture, which nothing could tell.
+    """
+    apart = [float((other.center - camera.center).norm()) for other in others]
+    shifted = 2 * camera.fx * sorted(apart)[len(apart) // 2] / max(camera.width, camera.height)
+    return min(max(camera.near, shifted, _LEAST * camera.far), 0.5 * camera.far)
 
 
 def _difference(scene: Scene, j: int, side: int, places: Tensor, color: Tensor) -> Tensor:
