@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.autograd import gradcheck
 
-from forewarp.ops.nodes import carried, node_maps, pull_nodes, stiffness
+from forewarp.ops.nodes import carry_nodes, node_maps, pull_nodes, stiffness
 
 
 def some(count=7, dtype=torch.float64, seed=0):
@@ -67,7 +67,7 @@ def test_kernel_equals_reference():
 def test_curves_carry_nodes(backend, turns):
     _, places, *_ = some(5, torch.float32)
     shift, turn, basis = torch.randn(5, 4, 3), torch.randn(5, 4, 3), torch.tensor([0.0, 0.5, -1.0, 0.0])
-    motion, maps = carried(shift, turn if turns else None, basis, places)
+    motion, maps = carry_nodes(shift, turn if turns else None, basis, places)
     torch.testing.assert_close(motion[:, :3], 0.5 * shift[:, 1] - shift[:, 2])
     torch.testing.assert_close(motion[:, 3:], (0.5 * turn[:, 1] - turn[:, 2]) * turns)
     torch.testing.assert_close(maps, node_maps(motion, places))
@@ -89,4 +89,4 @@ def test_shapes_that_do_not_go_together_are_refused():
     with pytest.raises(ValueError, match=r"by_maps: expected shape \(7, 12\)"):
         pull_nodes(motion, places, torch.zeros(7, 9), edges, weights, 1.0)
     with pytest.raises(ValueError, match=r"shift: expected shape \(7, 2, 3\)"):
-        carried(torch.zeros(7, 3, 3), None, torch.zeros(2), places)
+        carry_nodes(torch.zeros(7, 3, 3), None, torch.zeros(2), places)

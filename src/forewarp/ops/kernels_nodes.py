@@ -61,7 +61,7 @@ def pull(motion, places, by_maps, edges, weights, found, factor):
 
 @njit(cache=True)
 def carry(shift, turn, basis, places, motion, maps):
-    """Fill ``motion`` (M, 6) and ``maps`` (M, 12); see ``nodes.carried``. Without turns ``turn`` is empty."""
+    """Fill ``motion`` (M, 6) and ``maps`` (M, 12), as ``nodes.carry_nodes``; ``turn`` may be empty."""
     linear = np.empty(9)
     for m in range(shift.shape[0]):
         for c in range(3):

@@ -44,7 +44,7 @@ def node_maps(motion: Tensor, places: Tensor) -> Tensor:
     return torch.cat([linear.reshape(-1, 9), rest], -1)
 
 
-def carried(shift: Tensor, turn: Tensor | None, basis: Tensor, places: Tensor) -> tuple[Tensor, Tensor]:
+def carry_nodes(shift: Tensor, turn: Tensor | None, basis: Tensor, places: Tensor) -> tuple[Tensor, Tensor]:
     """Where nodes are at a time, from their curves: ``motion`` (M, 6) and its ``node_maps`` (M, 12).
 
     Args:

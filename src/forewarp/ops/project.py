@@ -134,8 +134,8 @@ def _check(particles: Gaussians, warp: Warp, tints: Tensor, fades: Tensor) -> No
 def harmonics(directions: Tensor, count: int) -> Tensor:
     """Real spherical harmonics (N, count) of unit directions (N, 3); count is 1, 4, 9 or 16.
 
-    >>> harmonics(torch.tensor([[0.0, 0.0, 1.0]]), 4)
-    tensor([[ 0.2821, -0.0000,  0.4886, -0.0000]])
+    >>> harmonics(torch.tensor([[0.0, 0.0, 1.0]]), 4)[0, ::2]
+    tensor([0.2821, 0.4886])
     """
     from_one = math.sqrt(1 / (4 * math.pi))
     x, y, z = directions.unbind(-1)

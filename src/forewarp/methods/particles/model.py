@@ -291,9 +291,9 @@ class Particles(Method):
 
     def warm_up(self) -> None:
         """Compile the operators' kernels."""
-        from forewarp.methods.particles.warmup import warm_up
+        from forewarp.methods.particles.warmup import compile_kernels
 
-        warm_up(self)
+        compile_kernels(self)
 
     def param_groups(self) -> dict[str, list[nn.Parameter]]:
         """See ``Method``."""

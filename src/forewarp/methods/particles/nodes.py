@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from forewarp.fields.curves import Curve
-from forewarp.ops.nodes import carried
+from forewarp.ops.nodes import carry_nodes
 
 LINKS = 4  # nodes that a particle follows
 _DAMP = 0.5  # of a curve's last stride, where it is continued to times not yet seen
@@ -88,7 +88,7 @@ class Nodes(nn.Module):
 
     def carried(self, basis: Tensor) -> tuple[Tensor, Tensor]:
         """Where nodes went and how they turned (M, 6), by a curve's basis (K,), and their maps (M, 12)."""
-        return carried(self.shift, self.turn, basis, self.places)
+        return carry_nodes(self.shift, self.turn, basis, self.places)
 
     def maps(self, time: float) -> Tensor:
         """``ops.nodes.node_maps`` (M, 12) at a time."""

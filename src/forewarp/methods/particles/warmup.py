@@ -6,13 +6,13 @@ import torch
 
 from forewarp.ops.adam import adam_rows
 from forewarp.ops.compare import compare
-from forewarp.ops.nodes import carried, pull_nodes
+from forewarp.ops.nodes import carry_nodes, pull_nodes
 from forewarp.ops.project import Gaussians, Pinhole, Warp, project
 from forewarp.ops.rasterize import rasterize
 
 
 @torch.no_grad()
-def warm_up(method: torch.nn.Module) -> None:
+def compile_kernels(method: torch.nn.Module) -> None:
     """Run each operator once; nothing is drawn at random, nothing of the method is touched."""
     zero, one = torch.zeros(1, 3), torch.ones(1, 1)
     particles = Gaussians(zero, zero, torch.ones(1, 4), one, torch.zeros(1, 1, 3))
@@ -23,7 +23,7 @@ def warm_up(method: torch.nn.Module) -> None:
     compare(particles, warp, pinhole, none, first, torch.zeros(72, 4, dtype=torch.uint8), torch.ones(3))
     rasterize(project(particles, warp, pinhole, none, first), 9, 8)
     edges = torch.zeros(1, 1, dtype=torch.int64)
-    carried(zero[:, None], zero[:, None], first, zero)
+    carry_nodes(zero[:, None], zero[:, None], first, zero)
     pull_nodes(torch.zeros(1, 6), zero, torch.zeros(1, 12), edges, one, 1.0)
     adam_rows(
         torch.zeros(1, 3),
