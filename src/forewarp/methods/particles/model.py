@@ -95,13 +95,13 @@ class Particles(Method):
         covered = covered_pixels(start.scene, list(start.frames))
         most = self.numbers_of.most(covered)
         cloud = first_points(start, round(self.numbers_of.first * most))
-        away = (cloud.points - cloud.points.mean(0)).square().sum(-1).mean().sqrt()
+        away = (cloud.points - cloud.points.median(0).values).norm(dim=-1).median()
         extent = float(away) or start.scene.box.diagonal
         self._scalars(covered, extent, most)
         return cloud
 
     def _scalars(self, covered: float, extent: float, most: int) -> None:
-        """Pixels that show anything; root mean square of the distance from the middle; most particles."""
+        """Pixels that show anything; median distance from the middle; most particles."""
         self.register_buffer("covered", torch.tensor(float(covered)))
         self.register_buffer("extent", torch.tensor(float(extent)))
         self.register_buffer("most", torch.tensor(float(most)))
