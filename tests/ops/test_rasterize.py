@@ -143,6 +143,12 @@ def test_pictures_without_pixels_are_refused(size, text):
         rasterize(splat(), *size)
 
 
+def test_without_kernels_what_is_not_feasible_is_refused():
+    many = Splats(splat().numbers.double().repeat(2000, 1), torch.ones(2000, 2, dtype=torch.float64))
+    with pytest.raises(ValueError, match=r"2,000 x 400 x 400; install forewarp\[cpu\]"):
+        rasterize(many, 400, 400)
+
+
 def test_splats_of_another_shape_are_refused():
     with pytest.raises(ValueError, match=r"splats.numbers: expected shape \(N, 10\)"):
         rasterize(Splats(torch.zeros(2, 9), torch.zeros(2, 2)), 4, 4)

@@ -15,6 +15,7 @@ from forewarp.ops.project import Splats
 
 SIDE = 8  # pixels of a tile along both axes
 _LEAST = -math.log(255.0)
+_FEASIBLE = 1 << 28  # numbers that the reference holds several times
 
 
 class Picture(NamedTuple):
@@ -64,6 +65,11 @@ def rasterize_reference(splats: Splats, width: int, height: int) -> Tensor:
     """``rasterize`` in plain PyTorch: planes (5, H, W) of colour, distance, and what is let through."""
     numbers = splats.numbers
     seen = (splats.reach[:, 0] > 0).nonzero()[:, 0]
+    if len(seen) * width * height > _FEASIBLE:
+        raise ValueError(
+            f"rasterize: expected at most {_FEASIBLE:,} splats times pixels without the kernels, but got "
+            f"{len(seen):,} x {width} x {height}; install forewarp[cpu] and compute on the CPU, in float32"
+        )
     order = seen[numbers.detach()[seen, 9].sort(stable=True).indices]
     u, v, a, b, c, solid = (numbers[order, k, None, None] for k in range(6))
     dx = torch.arange(width).to(numbers) + 0.5 - u  # (V, 1, W)
