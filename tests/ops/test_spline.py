@@ -41,3 +41,9 @@ def test_smooth_between_spans():
 def test_refused(time, knots, text):
     with pytest.raises(ValueError, match=text):
         spline_basis(time, knots, 0.0)
+
+
+@pytest.mark.parametrize("time", [0.3, torch.tensor([0.0, 0.3, 1.0])])
+def test_without_a_canonical_time_shares_sum_to_one(time):
+    total = spline_basis(time, 6).sum(-1)
+    torch.testing.assert_close(total, torch.ones_like(total))

@@ -13,7 +13,8 @@ _PADDING = 0.2  # of the sequence, imagined before and after it: a cosine stands
 
 
 class Curve:
-    """``sum_k c_k b_k(t)``, exactly 0 at the canonical time.
+    """``sum_k c_k b_k(t)``. Cosines are exactly 0 at the canonical time; a spline is not: pictures of that
+    time bend their own knots, and not what all others share.
 
     Args:
         kind: ``spline``, whose knots bend their neighbourhood in time alone, or ``dct``, the paper's cosines.
@@ -39,7 +40,7 @@ class Curve:
     def __call__(self, time: float | Tensor) -> Tensor:
         """The basis (..., K) at a time in [0, 1]."""
         if self.kind == "spline":
-            return spline_basis(time, self.count, self.canonical_time)
+            return spline_basis(time, self.count)
         return dct_basis(time, self.count, self.times, self.canonical_time, _PADDING)
 
     def reach(self) -> Tensor | None:

@@ -64,7 +64,7 @@ def test_nothing_has_moved_at_the_canonical_time(kind, canonical):
 
 
 def test_paths_are_where_the_maps_lead():
-    nodes, points = nodes_of(), torch.randn(7, 3)
+    nodes, points = nodes_of(kind="dct"), torch.randn(7, 3)
     rows, shares = nodes.links(points)
     maps = nodes.maps(0.7)
     expected = points.clone()

@@ -19,7 +19,7 @@ from forewarp.methods.particles.snapshot import ParticlesSnapshot
 from forewarp.methods.particles.start import covered_pixels, first_points, first_values
 from forewarp.ops.compare import compare
 from forewarp.ops.nodes import pull_nodes
-from forewarp.ops.project import Gaussians, Warp
+from forewarp.ops.project import Gaussians, Warp, moved
 from forewarp.scene.batch import Asks, Batch
 from forewarp.scene.box import Box
 from forewarp.scene.cloud import Cloud
@@ -30,7 +30,7 @@ _SOLID, _SEEN = 0.1, 0.02  # opacity from which matter bounds the scene; from wh
 
 
 class Particles(Method):
-    """N Gaussians in the state of the canonical time, and M nodes that carry them through time.
+    """N Gaussians of a template near the canonical state, and M nodes that carry them through time.
 
     A step draws one whole picture, compares it, and has its gradients in one pass of ``ops.compare``; the
     optimiser passes over what the picture did not show. Stage numbers: see ``settings.Numbers``.
@@ -203,10 +203,10 @@ class Particles(Method):
         weight = factors.get("photo", 0.0) / (float(self.covered) * len(batch.observations))
         for seen in batch.observations:
             time = self._jittered(seen.moment.time, generator)
-            found, moved = self._compared(seen, time, weight, factors, total)
+            found, own = self._compared(seen, time, weight, factors, total)
             squared, pixels = squared + found.squared, pixels + 3 * len(seen.view)
             terms["photo"] += found.loss / (float(self.covered) * len(batch.observations))
-            for name, value in moved.items():
+            for name, value in own.items():
                 terms[name] += value / len(batch.observations)
         values = {name: (lambda v=v: self.means.new_tensor(v)) for name, v in terms.items()}
         if self.nodes is None:
@@ -223,7 +223,7 @@ class Particles(Method):
     def _compared(self, seen, time: float, weight: float, factors, total: dict) -> tuple:
         """Compare one picture; adds gradients to ``total``, and gives what the nodes' terms are."""
         tints, fades = self.over_time(time)
-        moved, basis, warp = {}, None, None
+        own, basis, warp = {}, None, None
         if self.nodes is not None:
             self.nodes.look_ahead(time, time)
             basis = self.nodes.curve(time)
@@ -241,11 +241,11 @@ class Particles(Method):
             slope, strain = pull_nodes(
                 motion, nodes.places, found.maps, nodes.edges, nodes.edge_weights, rigid
             )
-            moved["rigid"] = strain
+            own["rigid"] = strain
             _add(total, nodes.spread_over_time(basis, slope))
-            moved["smooth"], bent = nodes.bent(time, factors.get("smooth", 0.0), float(self.extent))
+            own["smooth"], bent = nodes.bent(time, factors.get("smooth", 0.0), float(self.extent))
             _add(total, bent)
-        return found, moved
+        return found, own
 
     def _loose(self) -> float:
         """What is left of the rigidity, by how much of the stage is done."""
@@ -320,10 +320,14 @@ class Particles(Method):
         solid = torch.sigmoid(self.opacity[:, 0]) > _SOLID
         if not bool(solid.any()):
             return None
-        points = self.trajectories(self.means[solid], torch.tensor(times)).flatten(0, 1)
+        points = self.trajectories(self._canonical()[solid], torch.tensor(times)).flatten(0, 1)
         pad = 2 * float(self.log_scales[solid].exp().median()) + 1e-3 * float(self.extent)
         low, high = points.amin(0) - pad, points.amax(0) + pad
         return Box(tuple(low.tolist()), tuple(high.tolist()))
+
+    def _canonical(self) -> Tensor:
+        """Where particles are at the canonical time (N, 3)."""
+        return moved(self.means.data, self.warp(self.canonical_time))[0]
 
     @torch.no_grad()
     def matter(self) -> Cloud:
@@ -332,7 +336,7 @@ class Particles(Method):
         keep = solid > _SEEN if bool((solid > _SEEN).any()) else solid >= 0
         colors = (0.5 + _FLAT * self.color[keep, 0]).clamp(0, 1)
         size = 2 * float(self.log_scales.exp().mean())
-        return Cloud(self.means.data[keep], colors, solid[keep], max(size, 1e-9))
+        return Cloud(self._canonical()[keep], colors, solid[keep], max(size, 1e-9))
 
     def protocol(self) -> dict[str, str]:
         """See ``Method``."""

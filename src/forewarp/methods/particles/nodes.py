@@ -82,7 +82,10 @@ class Nodes(nn.Module):
 
         ``exp(-(d^2 - d_min^2) / (2 s^2))``, normalised, s the mean distance of a node to its nearest three.
         """
-        away, rows = nearest(points, self.places, LINKS)
+        return self._links(points, self.places)
+
+    def _links(self, points: Tensor, places: Tensor) -> tuple[Tensor, Tensor]:
+        away, rows = nearest(points, places, LINKS)
         shares = torch.exp(-(away - away[:, :1]) / (2 * self.spread[rows] ** 2))
         return rows.int(), (shares / shares.sum(-1, keepdim=True)).contiguous()
 
@@ -95,15 +98,27 @@ class Nodes(nn.Module):
         return self.carried(self.curve(time).to(self.places))[1]
 
     def paths(self, points: Tensor, times: Tensor) -> Tensor:
-        """Where canonical points (N, 3) are at times (T,): (N, T, 3)."""
-        rows, shares = self.links(points)
+        """Where points (N, 3) of the canonical time are at times (T,): (N, T, 3).
+
+        A node takes a point from where it was then: ``R_t R_c^t (y - p - v_c) + p + v_t``; those of the nodes
+        that were nearest then are blended. At the canonical time that is y itself.
+        """
+        motion = self.carried(self.curve(self.curve.canonical_time).to(self.places))
+        then, turned = self._frames(motion)
+        rows, shares = self._links(points, then)
+        rows = rows.long()
+        local = (turned.mT[rows] @ (points[:, None] - then[rows])[..., None])[..., 0]
         found = []
         for time in times.tolist():
-            maps = self.maps(time)[rows.long()]
-            linear, shift = maps[..., :9].reshape(*maps.shape[:2], 3, 3), maps[..., 9:]
-            step = (linear @ points[:, None, :, None])[..., 0] + shift
-            found.append(points + (shares[..., None] * step).sum(1))
+            at, turn = self._frames(self.carried(self.curve(time).to(self.places)))
+            went = (turn[rows] @ local[..., None])[..., 0] + at[rows]
+            found.append((shares[..., None] * went).sum(1))
         return torch.stack(found, 1) if found else points.new_zeros(len(points), 0, 3)
+
+    def _frames(self, carried: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+        """Where nodes are (M, 3) and their rotations (M, 3, 3)."""
+        motion, maps = carried
+        return self.places + motion[:, :3], maps[:, :9].reshape(-1, 3, 3) + torch.eye(3).to(maps)
 
     @torch.no_grad()
     def look_ahead(self, low: float, high: float) -> None:
