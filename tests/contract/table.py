@@ -7,6 +7,7 @@ from functools import partial
 from forewarp.fields.radiance import DirectRadiance
 from forewarp.fields.trajectory import TrajectoryField
 from forewarp.methods.method import Method, Start
+from forewarp.methods.particles.model import Particles
 from forewarp.methods.tnerf import TNeRF
 from forewarp.methods.voxel.backward_warp import Deformation
 from forewarp.methods.voxel.effects.background import StaticBackground, Together
@@ -98,6 +99,14 @@ METHODS = {
     "tnerf": Entry(
         partial(TNeRF, **SMALL_NETWORK, density="softplus", open_end=False, inside_box=True),
         {"network": 2e-3},
+        steps=150,
+    ),
+    "particles": Entry(
+        partial(Particles, tints=1, fades=1),
+        {"means": 1.5e-3, "log_scales": 5e-3, "turns": 3e-3, "opacity": 5e-2, "color": 3e-2, "shade": 1e-3}
+        | {"tint": 1e-3, "fade": 3e-3, "shifts": 7e-3, "node_turns": 8e-3},
+        {"photo": 1.0, "rigid": 3.0, "smooth": 0.1},
+        {"every": 0.05, "settled": 0.9, "finals": {"means": 0.1}},
         steps=150,
     ),
     "splats": Entry(

@@ -161,7 +161,8 @@ class Sampler(IterableDataset):
     def _observed(self, index: int, view: View, background: Tensor) -> Observation:
         frame, rows = self.frames[index], view.indices
         rgba = pixels_of(frame).reshape(-1, 4)
-        rgb = composited(rgba if rows is None else rgba[rows], background)
+        rgba = rgba if rows is None else rgba[rows]
+        rgb = rgba if self.asks.straight else composited(rgba, background)
         return Observation(Moment(frame.time, index, frame.camera_id), view, rgb, background)
 
     def _behind(self, count: int) -> Tensor:

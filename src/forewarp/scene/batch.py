@@ -18,13 +18,14 @@ class Asks:
 
     ``kind``: single ``pixels``, square ``crops`` of ``side`` pixels, or whole ``pictures``. ``neighbours``:
     how many of the nearest other training times to observe too. ``instant``: up to how many whole training
-    pictures of the picked time to add.
+    pictures of the picked time to add. ``straight``: give pixels as stored, not composited.
     """
 
     kind: str = "pixels"
     side: int = 64
     neighbours: int = 0
     instant: int = 0
+    straight: bool = False
 
     def __post_init__(self) -> None:
         kinds = ("pixels", "crops", "pictures")
@@ -38,7 +39,8 @@ class Asks:
 @dataclass(frozen=True)
 class Observation:
     """Pixels of one picture: the true ``rgb`` (R, 3) in [0, 1] over ``background`` (3,) or (R, 3), the colour
-    where the ray meets nothing.
+    where the ray meets nothing. If the method asks for ``straight`` pixels, ``rgb`` is (R, 4) uint8: colour
+    and alpha as stored.
     """
 
     moment: Moment

@@ -164,6 +164,7 @@ class Curriculum:
         canonical_time: where training starts.
         start: distinct times in play at the beginning.
         all_in: fraction of the stage at which all times are in play; 0: from the start.
+        most: number of times that ever come into play; null: all.
         newest_share: share of the draws that goes to the newest frames, while frames still come in.
         newest_part: share of the frames in play that counts as the newest.
         error_share: share of the draws that picks a frame with a probability proportional to its latest
@@ -178,6 +179,7 @@ class Curriculum:
         *,
         start: int = 10,
         all_in: float = 0.6,
+        most: int | None = None,
         newest_share: float = 0.3,
         newest_part: float = 0.125,
         error_share: float = 0.0,
@@ -194,6 +196,10 @@ class Curriculum:
         self.order = sorted(range(len(times)), key=lambda i: (abs(times[i] - canonical_time), times[i], i))
         last_of_time = {times[i]: place for place, i in enumerate(self.order)}
         self._ends = [place + 1 for place in last_of_time.values()]  # frames in play, by number of times
+        if most is not None:
+            if most < 1:
+                raise ValueError(f"stage.curriculum.most: expected at least 1 or null, but got {most}")
+            self._ends = self._ends[:most]
         self.start, self.all_in = min(start, len(self._ends)), all_in
         self.newest_share, self.newest_part = newest_share, newest_part
         self.error_share = error_share
