@@ -23,7 +23,7 @@ SEED = $(if $(SEEDS),$(if $(findstring $(comma),$(SEEDS)),seed,seeds)=$(SEEDS))
 SAYS = 2>&1 | { trap '' INT; sed -u 's/^/$@ | /'; }
 # All changes of the price list; with CHANGES the reference, then these.
 SWEEP = sweep() { $(BIN)/forewarp-train --multirun "$$@" $(MORE); }; \
-	compare() { $(if $(CHANGES),sweep sweeps=accuracy_time "$$@" && sweep sweeps=accuracy_time "$$@" $(CHANGES),sweep sweeps=price_list "$$@"); }
+	compare() { $(if $(CHANGES),sweep sweeps=accuracy_time "$$@" $(GO_ON); sweep sweeps=accuracy_time "$$@" $(CHANGES),sweep sweeps=price_list "$$@"); }
 space := $(subst ,, )
 # A failed job has printed its error and stops no other job; make ends with its status. Only Ctrl-C ends everything.
 GO_ON = || { status=$$?; [ $$status -lt 128 ] || exit $$status; }
@@ -80,12 +80,15 @@ bench-gpu: ## steps, frames and PSNR against seconds on a GPU [DATA= SCENES="a b
 	$(BIN)/python -m tests.bench.device --device $(DEVICE) --minutes $(MINUTES) $(if $(SMALL),--small) \
 		$(if $(DATA),--data $(DATA) --scenes $(SCENES))
 
+RENAMED = $(if $(VARIANTS),$(error VARIANTS: expected CHANGES="preset.rays=1024$(comma)2048"; variants are gone since 0.3))
 accuracy-time: ## accuracy of each choice against training time [DATA= SCENE= MINUTES= CHANGES= SEEDS=3]
+	@$(RENAMED)
 	status=0; $(SWEEP); compare $(if $(DATA),experiment=dnerf data.root=$(DATA) data.scene=$(SCENE)) $(GO_ON); \
 	$(BIN)/forewarp-report kind=accuracy_time out=docs/results && exit $$status
 
 price-list: SEEDS ?= 2
 price-list: ## what each choice costs and brings, on the vehicle and real scenes [DATA= SCENES="a b" MINUTES= CHANGES=]
+	@$(RENAMED)
 	@test -n "$(DATA)" || { echo "price-list: expected DATA=<folder of D-NeRF scenes>"; exit 2; }
 	status=0; $(SWEEP); compare $(GO_ON); \
 	for scene in $(SCENES); do \

@@ -24,7 +24,7 @@ def written_whole(path: Path, *, synced: bool = False) -> Iterator[Path]:
     """Write to the path that this gives, which is renamed to ``path`` at the end; make its folder.
 
     Args:
-        path: appears whole or not at all; a file already there is replaced.
+        path: appears whole or not at all; a file or a link already there is replaced.
         synced: wait until the bytes are on the disk before renaming.
 
     Raises:
@@ -39,6 +39,8 @@ def written_whole(path: Path, *, synced: bool = False) -> Iterator[Path]:
                 os.fsync(file.fileno())
         os.replace(beside, path)
     except OSError as error:  # a full disk does not say which file
+        if error.filename not in (None, str(beside), str(path)):
+            raise
         raise OSError(error.errno, error.strerror or str(error), str(path)) from error
     finally:
         with suppress(OSError):

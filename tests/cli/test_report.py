@@ -34,6 +34,7 @@ def test_limits_of_a_pattern_of_runs(forewarp, fitted):
         (["target=high"], "target: expected a number of dB or null, but got 'high'"),
         ([], "runs/accuracy_time: expected folders of runs, but got none"),
         (["published=none.yaml"], "none.yaml: expected a usable file or folder, but got No such file"),
+        (["kind=paper", "runs=[a,b]"], "runs: expected one folder for kind=paper, but got a list"),
         (["kind=compare"], "runs: expected folders of runs, but got none; set runs="),
         (
             ["kind=limits", "runs=none"],

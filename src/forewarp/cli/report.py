@@ -49,6 +49,8 @@ def report(config) -> None:
     if config.kind in ("compare", "limits"):
         print(_table(config, _folders(config.runs)))
         return
+    if not isinstance(config.runs, str | None):
+        raise ValueError(f"runs: expected one folder for kind={config.kind}, but got a list; name one folder")
     default = config.kind if config.kind in ("paper", "effects") else "accuracy_time"
     runs = Path(config.runs or f"{config.paths.runs}/{default}")
     for file in _written(config, runs, Path(config.out or runs / "results")):
@@ -81,9 +83,14 @@ def _table(config, folders: list[str]) -> str:
 
     rows = []
     with Counted("runs") as progress:
-        for one in saved:
-            rows.append(limits_of(build_run(one), config.views))
-            progress(len(rows), len(saved))
+        try:
+            for one in saved:
+                rows.append(limits_of(build_run(one), config.views))
+                progress(len(rows), len(saved))
+        except Exception:  # each row takes minutes: those that there are must not be lost
+            if rows:
+                print(limits_table(rows))
+            raise
     return limits_table(rows)
 
 

@@ -91,7 +91,7 @@ def thirds(sheet: np.ndarray) -> list[np.ndarray]:
 
 def _sheets(run: Result) -> dict[str, Path]:
     folder = run.folder / "images" / "sheets"
-    return {path.relative_to(folder).with_suffix("").as_posix(): path for path in folder.rglob("*.png")}
+    return {path.relative_to(folder).with_suffix("").as_posix(): path for path in folder.rglob("[!.]*.png")}
 
 
 def _images(run: Result) -> list[dict]:

@@ -12,6 +12,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from forewarp.data.fingerprint import LOCK
+from forewarp.files import read_text, replace_file
 
 
 @contextmanager
@@ -29,18 +30,36 @@ def locked(folder: Path) -> Iterator[None]:
     holder, lock = folder / LOCK, FileLock(folder / f"{LOCK}.held", timeout=0, fallback_to_soft=False)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        lock.acquire()
+        _acquire(lock)
+        replace_file(holder, f"process {os.getpid()} on {socket.gethostname()}\n")
     except Timeout:
-        name = holder.read_text()[:200].strip() if holder.is_file() else "another process"
         raise ValueError(
-            f"{folder}: expected a run that nobody works on, but got one of {name}; wait for it, or "
-            "use run=..."
+            f"{folder}: expected a run that nobody works on, but got one of {_holder(holder)}; wait for it, "
+            "or use run=..."
         ) from None
     except OSError as error:
-        if error.errno != errno.ENOSYS:
-            raise OSError(error.errno, error.strerror, f"run: {error.filename or folder}") from None
+        lock.release()
+        raise OSError(error.errno, error.strerror, f"run: {error.filename or folder}") from None
     try:
-        holder.write_text(f"process {os.getpid()} on {socket.gethostname()}\n")
         yield
     finally:
         lock.release()
+
+
+def _acquire(lock: FileLock) -> None:
+    """Acquire a lock, where the file system has locks."""
+    try:
+        lock.acquire()
+    except Timeout:
+        raise
+    except OSError as error:
+        if error.errno != errno.ENOSYS:
+            raise
+
+
+def _holder(path: Path) -> str:
+    """Return what a lock's file says of the process that holds it."""
+    try:
+        return read_text(path, 1000)[:200].strip() or "another process"
+    except (OSError, ValueError):
+        return "another process"

@@ -166,6 +166,8 @@ def test_the_rays_terms_may_look_at_some_renderings_only():
     chosen = Objective({}, photo_on=["inpainted"])
     assert wanted(chosen, **inpainter) == ["inpainted"]
     assert wanted(chosen) == ["warped"]  # what is not there cannot be looked at
+    for first in ("warped", "upsampled"):  # with an up-sampler or without
+        assert wanted(Objective({}, photo_on=[first]), **inpainter) == ["warped"]
 
 
 def test_refuses_a_printed_form_that_is_none():

@@ -109,9 +109,15 @@ class VoxelMethod(Method):
         )
 
     def _wanted(self, state: VoxelSnapshot) -> list[str]:
-        """Names of the renderings that the per-ray terms compare: those in ``photo_on``, or all."""
+        """Names of the renderings that the per-ray terms compare: those in ``photo_on``, or all.
+
+        A stage without up-sampler has ``warped`` in the place of ``upsampled``.
+        """
         names = list(state.fields)
-        return [n for n in names if self._photo_on is None or n in self._photo_on] or names
+        if self._photo_on is None:
+            return names
+        known = {"upsampled", "warped"} if {"upsampled", "warped"} & set(self._photo_on) else set()
+        return [n for n in names if n in {*self._photo_on, *known}] or names
 
     def _patches_of(self, state: VoxelSnapshot, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         rays = self.patches.draw(generator).to(self.device)
