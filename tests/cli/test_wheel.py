@@ -92,7 +92,7 @@ def test_commands_work_in_an_empty_folder_and_write_nowhere_else(installed):
     run("train", "--multirun", *words, "preset=demo", "budget.minutes=null", "budget.iterations=2")
     fitted = sorted(path.parents[0].name for path in (folder / "runs" / "paper").rglob("config.yaml"))
     assert [name.split("-")[1] for name in fitted] == ["backward", "forward"]
-    changes = ["hydra/sweeper=one_at_a_time", "hydra.sweeper.changes=[preset.rays=64]", "run=runs/one"]
+    changes = ["hydra/sweeper=one_at_a_time", 'hydra.sweeper.changes=["preset.rays=64"]', "run=runs/one"]
     steps = ["evaluate=false", "budget.minutes=null", "budget.iterations=2"]
     run("train", "--multirun", *changes, *SMALL, *steps)  # our own sweeper, from the wheel
     assert "rays: 64" in (folder / "runs" / "one" / "config.yaml").read_text()
