@@ -17,8 +17,10 @@ What one types most (options such as --multirun or --config-dir=FOLDER come firs
   preset=demo|fast|faithful           the method's numbers: small, cheap (the default), as in the paper
   budget.minutes=N                    of training, all stages together
   budget.iterations=N                 the same in steps; the first that is reached ends training
-  model=forward|backward|tnerf        the paper's method, backward warping, a network that takes the time
+  model=forward|backward|tnerf        the paper's method (default), backward warping, a network of time
   model/view_dependence=none|sh|mlp   switch an effect; all others work alike
+  stage.NAME.lr.GROUP=RATE            a learning rate; groups: density, color, shading, grid, flow, network;
+                                      of tnerf: network
   seed=N                              of all random numbers
   trainer=cpu|gpu|auto                the device
   resume=FOLDER                       go on with the run in a folder; no other override is needed
