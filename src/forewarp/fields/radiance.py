@@ -37,7 +37,7 @@ class DirectRadiance(VoxelGrid):
         features: colour channels: 3 of the colour, the rest of its shading by direction.
         alpha_init: opacity over ``density_scale`` at raw density 0.
         density_scale: length that density is measured in, world units.
-        alpha_threshold: opacity over one voxel below which a cell is not sampled.
+        alpha_threshold: skip cells whose eight voxels all have at most this opacity over one voxel.
         box: unused, as there is no network.
     """
 

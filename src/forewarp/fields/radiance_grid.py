@@ -84,7 +84,7 @@ class RadianceGrid:
         index: (X, Y, Z) int32, the row of each voxel in ``values``, -1 where space is empty.
         values: (M, 1 + C), raw density, then colour features.
         activation: turns raw density into density.
-        alpha_threshold: opacity over one voxel below which a cell is not sampled.
+        alpha_threshold: skip cells whose eight voxels all have at most this opacity over one voxel.
     """
 
     lattice: Lattice
