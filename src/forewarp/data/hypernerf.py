@@ -2,8 +2,9 @@
 
 ``dataset.json`` names the items and the split, ``metadata.json`` each item's time, ``scene.json`` the world's
 ``center`` and ``scale``, ``camera/<id>.json`` the camera, ``rgb/<s>x/<id>.png`` the image, s times smaller.
-``points.npy`` (N, 3), where there is one, holds points that never move, and ``trajectories.npz`` what
-``data.arrays`` reads. A scene's world units are normalised, ``(X - center) * scale``; the files' are not.
+The optional ``points.npy`` (N, 3) holds points that never move, the optional ``trajectories.npz`` true
+trajectories (see ``data.arrays``). Scene coordinates are normalised, ``(X - center) * scale``; coordinates
+in the files are not.
 
 A camera file's ``orientation`` is world-to-camera with OpenCV's axes, ``position`` the camera's centre in the
 unscaled world; all else is in pixels of the full-size image. Old files say ``tangential`` for

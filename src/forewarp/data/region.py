@@ -27,7 +27,10 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Region:
-    """``X_scene = (X - center) * scale``; ``near``, ``far`` and ``box`` are in the scene's units."""
+    """The part of the file's world that becomes the scene, and the map ``X_scene = (X - center) * scale``.
+
+    ``near``, ``far`` and ``box`` are in scene units.
+    """
 
     center: tuple[float, float, float]
     scale: float

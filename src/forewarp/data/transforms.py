@@ -144,7 +144,7 @@ def split_entries(file: Path, content: dict, entries: list[ImageEntry], test_eve
 
 
 def _listed(file: Path, content: dict, key: str, entries: list[ImageEntry]) -> set[str]:
-    """Read the names in a list of files."""
+    """Read the frame names in the list of paths ``content[key]``; refuse names that are no frame."""
     value = content[key]
     if not isinstance(value, list):
         raise SceneError(f"{file}: {key}: expected a list of paths, but got {short(value)}")

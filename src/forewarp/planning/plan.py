@@ -76,10 +76,10 @@ def make_plan(config: DictConfig, overrides: Sequence[str]) -> dict:
 
 
 def planning_of(model: Callable, name: str) -> Planning:
-    """Return how a method's effects are planned.
+    """Return the ``Planning`` of a method: what decides which effects to switch on.
 
     Raises:
-        ValueError: if it has no effects to plan.
+        ValueError: if the method has no effects to plan.
     """
     planning = getattr(model, "planning", getattr(getattr(model, "func", None), "planning", None))
     if planning is None:

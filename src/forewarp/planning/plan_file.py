@@ -28,7 +28,7 @@ def read_plan(file: Path, trust: Sequence[str] = (), typed: Sequence[str] = ()) 
     Args:
         file: to read.
         trust: packages beside forewarp whose code its overrides may name.
-        typed: overrides on the present command line; the file may repeat them whatever they name.
+        typed: overrides on this command line; the same ones in the file are accepted unchecked.
 
     Raises:
         ValueError: if it is no plan, is of an earlier version, or has overrides that a plan may not have.

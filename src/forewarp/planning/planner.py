@@ -20,11 +20,11 @@ class Planner:
     """Plans one run; the method says which effects there are and what counts for each.
 
     Args:
-        config: of the run that is planned.
-        typed: its overrides; the plan decides nothing that they fix.
+        config: the config of the run to plan.
+        typed: the run's overrides; the plan decides nothing that they fix.
         trials: fits the short runs.
-        scene: as the run would read it.
-        planning: of the method.
+        scene: the scene as the run would read it.
+        planning: the method's ``Planning``.
     """
 
     def __init__(
@@ -124,7 +124,7 @@ class Planner:
         return own if own not in (None, self.effects[effect].off) else self.effects[effect].on
 
     def _as_tried(self, decision: Decision) -> Decision:
-        """Add the overrides that an effect was tried with."""
+        """Return the decision with the overrides of its trial added; unchanged if the effect stays off."""
         effect = self.effects.get(decision.effect)
         if effect is None or not decision.on:
             return decision

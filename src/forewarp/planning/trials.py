@@ -33,10 +33,10 @@ class Trial:
     """The result of a short run.
 
     Attributes:
-        psnr: dB, of each view set aside.
-        step: seconds of training for a step.
-        steps: that were done.
-        took: seconds in all.
+        psnr: PSNR of each view set aside, dB.
+        step: training seconds per step.
+        steps: number of steps done.
+        took: seconds in all, with loading and scoring.
     """
 
     psnr: tuple[float, ...]

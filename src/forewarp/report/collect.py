@@ -94,7 +94,7 @@ class Result:
 
     @property
     def effects(self) -> str:
-        """The effects of its method that were on; "" if it was not measured."""
+        """Names of the method's effects that were on; "" if the run was not measured."""
         return ", ".join(name for name, on in self.metrics.get("effects", {}).items() if on)
 
     @property

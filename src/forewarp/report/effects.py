@@ -139,7 +139,7 @@ def _runs(results: Sequence[Result], choice: str) -> list[Result]:
 
 
 def _pairs(results: Sequence[Result], choice: str) -> list[tuple[Result, Result]]:
-    """Pair planned runs with those of another choice, of the same scene and seed."""
+    """Pair each planned run with the run of ``choice`` that has the same scene and seed."""
     others = {(run.scene, run.seed): run for run in _runs(results, choice)}
     own = [(run, others.get((run.scene, run.seed))) for run in _runs(results, "auto")]
     return [(run, other) for run, other in own if other is not None]

@@ -55,7 +55,7 @@ class Gain:
         steps: int | None,
         seconds: tuple[float, float] = (0.0, 0.0),
     ) -> Gain:
-        """Compute the gain from the pairs of each seed, one pair a view.
+        """Compute the gain; ``pairs`` has for each seed a (with, without) pair for each held-out view.
 
         Raises:
             ValueError: for a single pair, as its noise is unknown.

@@ -62,7 +62,7 @@ def claim(config: DictConfig, *, finished: bool = False) -> None:
 
     Args:
         config: of the run; its key ``run`` names the folder.
-        finished: only check; a finished run keeps the config it was measured with.
+        finished: if true, check but write nothing: a finished run keeps the config it was measured with.
 
     Raises:
         ValueError: if the folder holds a run of another config, or checkpoints without a config.

@@ -72,7 +72,7 @@ class Score:
         return f"{count} {'held out' if held else 'validation'} view{'s' * (count != 1)}"
 
     def _lacks(self) -> str | None:
-        """Say why there can be no score, as far as it is known before training; None if there can."""
+        """Return why the run can have no score, as far as this is known before training, or None."""
         if not len(self.run.datamodule.watched()):
             return f"the scene has no validation views and none are held out; {ADVICE}"
         nets = [net for net in NETS if f"lpips_{net}" == self.name]
@@ -103,10 +103,11 @@ class Score:
 
 
 def named(score: object) -> str | None:
-    """Return the metric that ``score`` names; None for none.
+    """Return the metric, or None if ``score`` is null.
 
     Raises:
-        ValueError: if it is no metric of validation views, or the sweeper would maximise a distance.
+        ValueError: if ``score`` is no metric of validation views, or the sweeper maximises a metric whose
+            smaller values are better (LPIPS).
     """
     if score is None:
         return None

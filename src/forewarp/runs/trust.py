@@ -208,7 +208,7 @@ def advice(name: str, trust: Sequence[str] = ()) -> str:
 
 
 def _check_logger(node: dict, where: Path, key: str) -> None:
-    """Refuse a logger whose name would lead out of the stage's folder, to which it is joined."""
+    """Refuse a logger whose name, appended to the stage's folder, would lead out of it."""
     for name in _PARTS & node.keys() if node["_target_"].endswith("Logger") else ():
         if not re.fullmatch(r"(\w[\w.-]*)?", str(node[name])):
             raise ValueError(

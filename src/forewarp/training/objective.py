@@ -1,4 +1,4 @@
-"""The objective: the weighted sum of a method's loss terms. Only here is a weight compared with 0."""
+"""The objective: the weighted sum of a method's loss terms. No other module checks weights for 0."""
 
 from __future__ import annotations
 

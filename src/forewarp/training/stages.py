@@ -139,7 +139,7 @@ class Run:
         )
 
     def _check_later_stages(self) -> None:
-        """Build the later stages once without training, so that their mistakes are reported first."""
+        """Build the later stages once, so that errors in their settings are reported before training."""
         for number, stage in enumerate(self.stages):
             if number and not self.is_finished(stage):
                 self._module(stage, None, None, number, blank=True)
@@ -194,7 +194,7 @@ class Run:
         reset_peak_memory()
         with interruption:
             trainer.fit(module, datamodule=self.datamodule, ckpt_path=checkpoint, weights_only=True)
-        if module.fraction < 1:
+        if module.fraction < 1:  # fit returned early, as when a callback stops it: the stage is not finished
             raise KeyboardInterrupt
         keeper.save(trainer)
         in_play = module.curriculum.in_play

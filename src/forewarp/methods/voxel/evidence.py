@@ -111,8 +111,8 @@ class Residual:
 
     Attributes:
         psnr: of the coarse stage.
-        by_direction: share of the squared error that a colour linear in the viewing direction, fitted per
-            place to other images, removes; below 0 it only adds noise.
+        by_direction: share of the squared error that view-dependent colour would remove: at each place a
+            colour linear in the viewing direction is fitted to other images. Negative: the fit adds noise.
         allowed: PSNR of the best images that the last stage's lattice can represent.
     """
 

@@ -10,7 +10,10 @@ from forewarp.ops.encode import positional_encoding, spherical_harmonics_1
 
 
 class SphericalHarmonics(nn.Module):
-    """Spherical harmonics of degree 1: ``sigmoid(c + sum_i Y_i(d) s_i)``, without parameters of its own."""
+    """Spherical harmonics of degree 1: ``sigmoid(c + sum_i Y_i(d) s_i)``; no parameters of its own.
+
+    ``c`` and ``s_i`` are a voxel's features, ``Y_i(d)`` the basis in direction ``d``.
+    """
 
     features = 12
 
