@@ -31,7 +31,7 @@ What one types most (options such as --multirun or --config-dir=FOLDER come firs
   effects=auto                        find out what the scene calls for, then fit that: see forewarp-plan
   plan=FILE                           fit what a plan says; an override typed beside it wins
   evaluate=false                      do not measure at the end
-  data.held_out=N                     set N training views aside and record their PSNR against training time
+  data.held_out=N                     hold N training views out and record their PSNR against training time
   scene=DATASET_NAME                  a scene of the paper below paths.scenes=FOLDER, such as scene=dnerf_hook
   ablation=NAME                       an ablation of the paper; ablation=full is its whole method
   launcher=local|joblib|ray|slurm|submitit   where the jobs of --multirun run
