@@ -19,8 +19,7 @@ What one types most (options such as --multirun or --config-dir=FOLDER come firs
   budget.iterations=N                 the same in steps; the first that is reached ends training
   model=forward|backward|tnerf        the paper's method (default), backward warping, a network of time
   model/view_dependence=none|sh|mlp   switch an effect; all others work alike
-  stage.NAME.lr.GROUP=RATE            a learning rate; groups: density, color, shading, grid, flow, network;
-                                      of tnerf: network
+  stage.NAME.lr.GROUP=RATE            a learning rate; groups: density, color, shading, grid, flow, network
   seed=N                              of all random numbers
   trainer=cpu|gpu|auto                the device
   resume=FOLDER                       go on with the run in a folder; no other override is needed

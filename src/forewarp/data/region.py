@@ -65,7 +65,7 @@ def region_of(
     """Find the region that cameras look at.
 
     Args:
-        cameras: of all frames; their near and far are not used.
+        cameras: cameras of all frames; their near and far are not used.
         where: the file, for errors.
         near, far, box: what is known, in the file's units; None is derived: ``near`` and ``far`` from the
             distance to the focus, the point looked at; the box holds all rays between them.

@@ -63,7 +63,7 @@ def read_entries(file: Path, content: dict, scale: int = 1) -> list[ImageEntry]:
 
     Args:
         file: for errors and as the place that paths start from.
-        content: of the file.
+        content: content of the file.
         scale: take images that are ``scale`` times smaller, from ``images_4`` in place of ``images``.
 
     Raises:

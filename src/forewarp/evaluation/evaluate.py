@@ -134,10 +134,7 @@ def mean_scores(module: DynamicSceneModule, targets: Sequence[Target], suite: Im
 
 @torch.no_grad()
 def flow_error(module: DynamicSceneModule, scene: Scene) -> dict | None:
-    """Compare learned and true trajectories: end-point errors in world units.
-
-    Return None if the scene has no true trajectories or the method no trajectories.
-    """
+    """Return end-point errors of the learned trajectories, world units; None without them or true ones."""
     truth = scene.truth
     if truth is None or not isinstance(module.method, HasTrajectories):
         return None

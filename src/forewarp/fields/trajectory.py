@@ -27,8 +27,7 @@ class TrajectoryField(nn.Module):
         canonical_time: time at which flow is exactly 0.
         nodes: number of nodes along the box's mean side, at least 8; 0: no nodes.
         features: channels of the deformation feature grid; 0: none.
-        width, layers: size of F2.
-        frequencies: octaves of the positional encoding.
+        width, layers, frequencies: size of F2, octaves of the positional encoding.
         padding: lets objects move at the first and last frame (see ``dct_basis``).
 
     Raises:

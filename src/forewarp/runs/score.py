@@ -106,8 +106,7 @@ def named(score: object) -> str | None:
     """Return the metric, or None if ``score`` is null.
 
     Raises:
-        ValueError: if ``score`` is no metric of validation views, or the sweeper maximises a metric whose
-            smaller values are better (LPIPS).
+        ValueError: if ``score`` is no validation metric, or the sweeper maximises a distance (LPIPS).
     """
     if score is None:
         return None

@@ -72,7 +72,7 @@ def total(step: Step, factors: Mapping[str, float], parameters: Mapping[str, Ten
 
     Args:
         step: the method's answer to a batch.
-        factors: of its terms (see ``Objective.factors``).
+        factors: factors of the step's terms (see ``Objective.factors``).
         parameters: by name; needed if the method computed its gradients itself.
 
     Raises:

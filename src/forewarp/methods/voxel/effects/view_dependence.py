@@ -29,8 +29,8 @@ class ViewNetwork(nn.Module):
 
     Args:
         features: number of colour features.
-        width, layers: of the network.
-        frequencies: of the encoding of the direction.
+        width, layers: size of the network.
+        frequencies: octaves of the direction's encoding.
     """
 
     def __init__(self, *, features: int = 12, width: int = 64, layers: int = 2, frequencies: int = 4) -> None:
