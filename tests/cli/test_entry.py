@@ -105,7 +105,7 @@ def test_options_of_ones_own_stand_beside_ours(forewarp, way, in_tmp, monkeypatc
         (["+stage.coarse.bogus=1"], "got an unexpected keyword argument 'bogus'; leave that key out"),
         (["+model.renderer.bogus=1"], "model.renderer: "),
         (["budget=fast"], "budget=fast: expected preset=fast; the choice is called preset since 0.2"),
-        (["variant=rays_1024"], "variant=rays_1024: expected no such word; type what a variant changed"),
+        (["variant=rays_1024"], "variant=rays_1024: expected no such override; type what a variant changed"),
         (["objective.coarse.literal=[foto]"], "objective.literal: expected some of photo"),
         (["+objective.coarse.weights.foto=1"], "objective: expected a term of photo, point_color"),
         (["model=tnerf", "+stage.fine.hodl=0.3"], "stage.fine: expected a key of none, but got 'hodl'"),
