@@ -28,7 +28,7 @@ class Found:
     Attributes:
         kind: the check that failed: ``parameter``, ``loss``, ``gradient`` or ``optimizer``.
         tensor: name of the first tensor that is not finite.
-        terms: loss terms that depend on the tensor.
+        terms: loss terms whose value or gradient is not finite.
     """
 
     kind: str
