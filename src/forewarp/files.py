@@ -68,7 +68,7 @@ def write_json(path: Path, content: dict) -> None:
 
 
 def read_json(path: Path) -> dict | None:
-    """Read the object of a JSON file; None where there is none, or none that ``load_json`` reads."""
+    """Read the object of a JSON file; None if the file is missing or refused by ``load_json``."""
     try:
         return load_json(path)
     except (FileNotFoundError, NotADirectoryError, ValueError):
@@ -80,7 +80,7 @@ def load_json(path: Path) -> dict:
 
     Raises:
         OSError: where it cannot be read.
-        ValueError: in one line, where it is too large, does not parse or holds no object.
+        ValueError: in one line, if the file is too large, does not parse or holds no object.
     """
     raw = read_bytes(path)
     try:

@@ -36,7 +36,7 @@ class Quadrature:
     """Place samples on rays, evaluate a network there, and composite (NeRF's quadrature).
 
     Args:
-        samples: of the first pass, at least 3.
+        samples: samples of the first pass, at least 3.
         fine_samples: added by the second pass where the first found weight; 0: one pass only.
         open_end: give the last sample an endless interval, as published. A density that is never 0 (softplus)
             then hides the background. False: end the interval with the ray.

@@ -17,7 +17,7 @@ def replay(path: Path, trust: Sequence[str] = ()) -> str:
     """Repeat the step of a bundle; name the first tensor that is not finite, or say that all are finite.
 
     Args:
-        path: of the bundle, a file in <run>/<stage>/broken/.
+        path: path of the bundle, a file in <run>/<stage>/broken/.
         trust: packages beside forewarp whose code its config may name.
 
     Raises:

@@ -28,7 +28,7 @@ def command(name: str, task: Callable, text: str, *, config: str | None = None) 
     bug, with its traceback; 130 after Ctrl-C. ``FOREWARP_TRACEBACK=1`` always shows the traceback.
 
     Args:
-        name: of the command after ``forewarp-``, and of its config file.
+        name: the command's name after ``forewarp-``, and the config file's.
         task: takes the composed config.
         text: the beginning of ``--help``.
         config: the name of the config file if it is another.

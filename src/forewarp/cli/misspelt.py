@@ -17,8 +17,8 @@ def with_run_key(name: str, arguments: list[str]) -> list[str]:
     """Put ``run=`` (for ``train``: ``resume=``) before a bare folder.
 
     Args:
-        name: of the command.
-        arguments: of the command line.
+        name: name of the command.
+        arguments: arguments of the command line.
     """
     key, before = FOLDERS.get(name), ["", *arguments]
     bare = [
@@ -33,8 +33,8 @@ def unknown_key(error: Exception, name: str, arguments: list[str]) -> str | None
 
     Args:
         error: raised by Hydra.
-        name: of the config file.
-        arguments: of the command line.
+        name: name of the config file.
+        arguments: arguments of the command line.
     """
     from hydra.errors import HydraException
 

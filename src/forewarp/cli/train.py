@@ -17,8 +17,9 @@ What one types most (options such as --multirun or --config-dir=FOLDER come firs
   preset=demo|fast|faithful           the method's numbers: small, cheap (the default), as in the paper
   budget.minutes=N                    of training, all stages together
   budget.iterations=N                 the same in steps; the first that is reached ends training
-  model=forward|backward|tnerf        the paper's method, backward warping, a network that takes the time
+  model=forward|backward|tnerf        the paper's method (default), backward warping, a network of time
   model/view_dependence=none|sh|mlp   switch an effect; all others work alike
+  stage.NAME.lr.GROUP=RATE            a learning rate; groups: density, color, shading, grid, flow, network
   seed=N                              of all random numbers
   trainer=cpu|gpu|auto                the device
   resume=FOLDER                       go on with the run in a folder; no other override is needed
@@ -29,7 +30,7 @@ What one types most (options such as --multirun or --config-dir=FOLDER come firs
   effects=auto                        find out what the scene calls for, then fit that: see forewarp-plan
   plan=FILE                           fit what a plan says; an override typed beside it wins
   evaluate=false                      do not measure at the end
-  data.held_out=N                     set N training views aside and record their PSNR against training time
+  data.held_out=N                     hold N training views out and record their PSNR against training time
   scene=DATASET_NAME                  a scene of the paper below paths.scenes=FOLDER, such as scene=dnerf_hook
   ablation=NAME                       an ablation of the paper; ablation=full is its whole method
   launcher=local|joblib|ray|slurm|submitit   where the jobs of --multirun run

@@ -78,7 +78,7 @@ def read_truth(path: Path, canonical_time: float) -> Truth | None:
 
 
 def shortened(truth: Truth, end: float) -> Truth | None:
-    """Cut trajectories off at the time ``end``, which becomes 1; None where fewer than two times are left."""
+    """Keep trajectories up to time ``end``, rescaled to 1; return None if fewer than two times remain."""
     kept = truth.times <= end + _SAME_TIME
     if end <= 0 or int(kept.sum()) < 2:
         return None
@@ -147,7 +147,7 @@ def load_numpy(path: Path):
 
 
 def _check_length(content: bytes) -> None:
-    """Refuse a .npy file whose header promises more than is there, before room is made for it."""
+    """Refuse a .npy file whose header declares more data than it holds, before memory is allocated."""
     stream = io.BytesIO(content)
     major, _ = np.lib.format.read_magic(stream)
     read = np.lib.format.read_array_header_1_0 if major == 1 else np.lib.format.read_array_header_2_0

@@ -42,11 +42,11 @@ class Sampler(IterableDataset):
     """An endless stream of training batches, of what a method ``asks`` for.
 
     ``picker()`` chooses the next frame, an index into ``scene.train``; None picks uniformly. A batch of
-    single pixels has ``rays`` of them. With ``views_per_step`` above 1 they are shared out among up to that
-    many random frames of the picked one's time, which one snapshot renders. ``background`` is white, black
-    or random: a colour per pixel, or one for all of a picture or crop, drawn at each step. Pixels of images
-    without alpha are opaque; a random colour behind them teaches the model to let nothing shine through.
-    A second ``iter`` goes on where the first stopped; ``state_dict`` holds what an exact continuation needs.
+    single pixels has ``rays`` of them. If ``views_per_step`` is above 1, the rays are divided among up to
+    that many random frames of the picked frame's time, so one snapshot serves them all. ``background`` is
+    white, black or random: a colour per pixel, or one for a whole picture or crop, drawn at each step. An
+    image without alpha hides the colour, so a random one penalises transparency in the rendering. A second
+    ``iter`` goes on where the first stopped; ``state_dict`` holds what an exact continuation needs.
 
     Cost: linear in the pixels, below 2 ms for 8192; a frame is decoded when it is first picked, and kept
     while there is room.
@@ -109,7 +109,7 @@ class Sampler(IterableDataset):
         self._generator.set_state(state["generator"].cpu())
 
     def _views(self, index: int) -> list[int]:
-        """Choose a batch's frames: the picked one, and others of its time where several are asked for."""
+        """Choose a batch's frames: the picked one; if ``views_per_step`` > 1, also others of its time."""
         others = [i for i in self._of_time[self.frames[index].time] if i != index]
         if self.views_per_step == 1 or not others:
             return [index]

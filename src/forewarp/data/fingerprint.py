@@ -41,7 +41,7 @@ def fingerprint(folder: Path) -> dict:
 
 
 def difference(before: dict, now: dict) -> str | None:
-    """Say in a few words what two fingerprints differ in; None where they are equal."""
+    """Say in a few words how two fingerprints differ; None if they are equal."""
     old, new = before.get("texts", {}), now["texts"]
     if changed := sorted(name for name in {*old, *new} if old.get(name) != new.get(name)):
         return ", ".join(changed[:3]) + (f" and {len(changed) - 3} more" if len(changed) > 3 else "")

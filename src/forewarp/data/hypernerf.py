@@ -2,8 +2,8 @@
 
 ``dataset.json`` names the items and the split, ``metadata.json`` each item's time, ``scene.json`` the world's
 ``center`` and ``scale``, ``camera/<id>.json`` the camera, ``rgb/<s>x/<id>.png`` the image, s times smaller.
-``points.npy`` (N, 3), where there is one, holds points that never move, and ``trajectories.npz`` what
-``data.arrays`` reads. A scene's world units are normalised, ``(X - center) * scale``; the files' are not.
+The optional ``points.npy`` (N, 3) holds points that never move, the optional ``trajectories.npz`` true
+trajectories (see ``data.arrays``). Scene coordinates are ``(X - center) * scale`` of those in the files.
 
 A camera file's ``orientation`` is world-to-camera with OpenCV's axes, ``position`` the camera's centre in the
 unscaled world; all else is in pixels of the full-size image. Old files say ``tangential`` for
@@ -146,7 +146,7 @@ def write_scene(
         center, scale: the normalised world is ``(X - center) * scale``.
         near, far: along the unit ray, normalised units.
         points: (N, 3) that never move, unscaled world.
-        scales: of the images to write; every side is a multiple of all of them.
+        scales: scales of the images to write; every side is a multiple of all of them.
         trajectories: unscaled world, the canonical time first.
         write_time_id: also the key ``time_id`` beside ``warp_id``.
     """
@@ -322,7 +322,7 @@ def _pose(content: dict, path: Path) -> np.ndarray:
 
 
 def _lens(content: dict, path: Path) -> Lens | None:
-    """None where nothing is bent."""
+    """Read the lens; return None if it does not distort."""
     name = "tangential" if "tangential" in content else "tangential_distortion"
     bent = {"radial_distortion": [0.0] * 3, name: [0.0] * 2} | content
     radial = numbers(bent, "radial_distortion", 3, path, -_MOST_BENT, _MOST_BENT)

@@ -128,7 +128,7 @@ def halved_cutout(rgba: Tensor) -> Tensor:
     What lies behind a cut-out is another place; averaged in, it would rim every silhouette.
 
     Args:
-        rgba: colour 0 wherever alpha is 0; where it is not, pixels count alike.
+        rgba: colour is 0 wherever alpha is 0; all other pixels count alike.
 
     >>> halved_cutout(torch.tensor([[[9, 9, 9, 255], [0] * 4], [[0] * 4, [3, 3, 3, 255]]], dtype=torch.uint8))
     tensor([[[  6,   6,   6, 128]]], dtype=torch.uint8)

@@ -24,7 +24,7 @@ _SAME_TIME = 1e-4  # times are stored with four digits or more; neighbours are 1
 def read_scene(root: str | Path, scene: str, **options) -> Scene:
     """Read ``root/scene``; ``options`` as in ``dnerf.read_scene``.
 
-    A scene of other counts is read too; the ``note`` in its protocol says what differs.
+    A scene with other numbers of images or other times is read too; ``protocol["note"]`` says what differs.
 
     Raises:
         SceneError: as ``dnerf.read_scene``, and for a test view without an ability.

@@ -32,9 +32,9 @@ class SceneDataModule(LightningDataModule):
         rays: pixels of a batch.
         background: behind training pixels: white, black or random (a colour each).
         eval_background: behind whole images: white or black.
-        seed: of the pixels, the background colours and the default choice of frames.
+        seed: seed of the pixels, the background colours and the default choice of frames.
         views_per_step: training frames of one time that share a batch's rays.
-        cache_bytes: of decoded images to keep, for the whole process: the last module's number counts.
+        cache_bytes: most bytes of decoded images kept in the process; the last module's number counts.
         held_out: training frames that are never trained on (``hold_out``).
         canonical: ``middle``: the training time in the middle is canonical; None: the format's own choice.
         place: the scene's folder, where it has one.
@@ -134,7 +134,7 @@ class SceneDataModule(LightningDataModule):
         self.batches.restart(number)
 
     def fingerprint(self) -> dict | None:
-        """Take the fingerprint of the scene's files; None where there are none."""
+        """Take the fingerprint of the scene's files; None if there are no files."""
         return None if self.place is None else fingerprint(self.place)
 
     def state_dict(self) -> dict:

@@ -162,7 +162,7 @@ def _write_cameras(folder: Path, cameras: Sequence[Camera]) -> None:
 
 
 def _read_cameras(folder: Path) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Read as many poses (4, 4) as lenses (3, 3), float64, from ``CamPose.inf`` and ``Intrinsic.inf``."""
+    """Read the poses (4, 4) and intrinsic matrices (3, 3), float64; refuse files with unequal numbers."""
     poses, lenses = _read_poses(folder / "CamPose.inf"), _read_lenses(folder / "Intrinsic.inf")
     if len(poses) != len(lenses):
         got = f"{len(lenses)} there and {len(poses)} in CamPose.inf"

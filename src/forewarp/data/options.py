@@ -83,13 +83,13 @@ def middle_of(times: Iterable[float]) -> float:
 
 
 def _spare(scene: Scene) -> list[tuple[float, int]]:
-    """List time and index of the training frames some of which may be held out, in the order of time."""
+    """List (time, index) of the frames that may be held out: not those at first, last and canonical time."""
     kept = {scene.times[0], scene.times[-1], scene.canonical_time} if len(scene.times) > 1 else set()
     return sorted((f.time, i) for i, f in enumerate(scene.train) if f.time not in kept)
 
 
 def _beginning_at(truth: Truth | None, time: float) -> Truth | None:
-    """Put ``time`` first; None where the trajectories do not hold it."""
+    """Put ``time`` first; return None if the trajectories lack it."""
     at = (
         [] if truth is None else [i for i, t in enumerate(truth.times.tolist()) if abs(t - time) < _SAME_TIME]
     )

@@ -27,7 +27,10 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Region:
-    """``X_scene = (X - center) * scale``; ``near``, ``far`` and ``box`` are in the scene's units."""
+    """The part of the file's world that becomes the scene, and the map ``X_scene = (X - center) * scale``.
+
+    ``near``, ``far`` and ``box`` are in scene units.
+    """
 
     center: tuple[float, float, float]
     scale: float
@@ -62,7 +65,7 @@ def region_of(
     """Find the region that cameras look at.
 
     Args:
-        cameras: of all frames; their near and far are not used.
+        cameras: cameras of all frames; their near and far are not used.
         where: the file, for errors.
         near, far, box: what is known, in the file's units; None is derived: ``near`` and ``far`` from the
             distance to the focus, the point looked at; the box holds all rays between them.

@@ -63,7 +63,7 @@ def read_entries(file: Path, content: dict, scale: int = 1) -> list[ImageEntry]:
 
     Args:
         file: for errors and as the place that paths start from.
-        content: of the file.
+        content: content of the file.
         scale: take images that are ``scale`` times smaller, from ``images_4`` in place of ``images``.
 
     Raises:
@@ -144,7 +144,7 @@ def split_entries(file: Path, content: dict, entries: list[ImageEntry], test_eve
 
 
 def _listed(file: Path, content: dict, key: str, entries: list[ImageEntry]) -> set[str]:
-    """Read the names in a list of files."""
+    """Read the frame names in the list of paths ``content[key]``; refuse names that are no frame."""
     value = content[key]
     if not isinstance(value, list):
         raise SceneError(f"{file}: {key}: expected a list of paths, but got {short(value)}")

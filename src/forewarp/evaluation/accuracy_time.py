@@ -30,9 +30,9 @@ def next_moment(after: float, first: float, ratio: float) -> float:
 
 
 class AccuracyCurve(lightning.Callback):
-    """Writes ``accuracy_time.csv`` into the run's folder: PSNR of views that are not trained on.
+    """Write ``accuracy_time.csv`` into the run's folder: PSNR of views that are not trained on.
 
-    The views are those set aside (``data.held_out``), or validation views; without any nothing is written.
+    Use the held-out views (``data.held_out``), else validation views; without either write nothing.
     A row holds ``seconds`` of training over all stages (the clock stands still while a row is made),
     ``stage``, ``step`` of the stage, ``psnr`` (dB, mean over the views, from the same random pixels of each),
     ``epe_moving`` (world units; empty if the scene has no true trajectories) and the method's ``size``
@@ -41,10 +41,10 @@ class AccuracyCurve(lightning.Callback):
 
     Args:
         first: seconds until the first row.
-        ratio: of the time of each row to that of the row before; the end of a stage has a row, too.
+        ratio: each row comes this many times later than the one before; a stage's end has a row, too.
         rays: pixels rendered of each view.
 
-    Cost: ``rays`` and a snapshot for each view, not counted as training time.
+    Cost: ``rays`` pixels and one snapshot for each view, not counted as training time.
     """
 
     def __init__(self, *, first: float = 2.0, ratio: float = 1.4, rays: int = 10_000) -> None:
@@ -57,7 +57,7 @@ class AccuracyCurve(lightning.Callback):
         self._before, self._next = 0.0, math.inf
 
     def on_train_start(self, trainer, module) -> None:
-        """Continue the rows of a resumed run; drop those of steps that were lost."""
+        """Continue the rows of a resumed run; drop rows of steps that were lost."""
         if not len(trainer.datamodule.watched()):
             return
         folder = Path(trainer.default_root_dir)
@@ -112,7 +112,7 @@ def seconds_before(folder: Path) -> float:
 
 
 def read_rows(path: Path) -> list[dict[str, str]]:
-    """Read the rows of an ``accuracy_time.csv``; none if there is no such file."""
+    """Read the rows of an ``accuracy_time.csv``; a missing file has none."""
     if not path.is_file():
         return []
     with path.open(newline="") as file:

@@ -32,11 +32,11 @@ class Shown:
     """A rendered view.
 
     Attributes:
-        number: its index in the split.
-        target: the view and its true picture.
-        renderings: by name, the best last.
-        seconds: that the best rendering took, with its snapshot if the view before had another time.
-        seconds_again: the same without the snapshot.
+        number: index of the view in the split.
+        target: the view and the true picture.
+        renderings: renderings by name, the best last.
+        seconds: time of the best rendering, including the snapshot if the view before had another time.
+        seconds_again: time of the best rendering without the snapshot.
     """
 
     number: int
@@ -52,8 +52,8 @@ def draw(
     """Render views in the order of their times, so that each time needs one snapshot.
 
     Args:
-        module: fitted.
-        targets: with ``frames``, whose times are known before a picture is decoded.
+        module: the fitted scene.
+        targets: views to render; times are read from ``targets.frames``, without decoding pictures.
         numbers: indices of the views to render; None: all.
     """
     snapshot, wanted = None, range(len(targets)) if numbers is None else numbers
@@ -83,19 +83,19 @@ def evaluate(
     sheets: int = 6,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict:
-    """Measure a fitted scene on its test views; all but the seconds is reproducible.
+    """Measure a fitted scene on its test views; all numbers but the seconds are reproducible.
 
-    Writes ``images/<name>.png`` (the best rendering), for some views ``images/sheets/<name>.png`` (truth |
+    Write ``images/<name>.png`` (the best rendering), for some views ``images/sheets/<name>.png`` (truth |
     prediction | error), ``per_image.json``, and last ``metrics.json``.
 
     Args:
-        module: fitted, on the device to use.
+        module: the fitted scene, on the device to use.
         datamodule: serves ``scene`` and ``targets("test")``.
-        folder: of the run.
-        suite: scores an image.
-        protocol: what else to note about how the run was made.
+        folder: the run's folder.
+        suite: computes the metrics of an image.
+        protocol: further entries of ``protocol``: how the run was made.
         finished: the ``done.json`` of each stage (``Run.finished``).
-        sheets: how many to write, spread over the split.
+        sheets: number of sheets to write, spread over the split.
         progress: called with (images done, all images) after each image.
 
     Returns:
@@ -134,10 +134,7 @@ def mean_scores(module: DynamicSceneModule, targets: Sequence[Target], suite: Im
 
 @torch.no_grad()
 def flow_error(module: DynamicSceneModule, scene: Scene) -> dict | None:
-    """Compare the learned trajectories with the scene's true ones: end-point errors in world units.
-
-    Returns None if the scene has no true trajectories or the method no trajectories.
-    """
+    """Return end-point errors of the learned trajectories, world units; None without them or true ones."""
     truth = scene.truth
     if truth is None or not isinstance(module.method, HasTrajectories):
         return None
@@ -150,7 +147,7 @@ def _image(rendering: Rendering, target: Target) -> Tensor:
 
 
 def _score(shown: Shown, suite: ImageSuite) -> dict:
-    """Make the entry of one image: the best rendering's scores, and those of the others by name."""
+    """Make the entry of one image: scores of the best rendering, and of the others by name."""
     target, frame = shown.target, shown.target.frame
     scores = {
         name: suite.score(_image(r, target), target, r.depth.reshape(target.rgb.shape[:2]).cpu())
@@ -174,7 +171,7 @@ def _save(shown: Shown, folder: Path, on_sheet: bool) -> None:
 
 
 def _means(per_image: list[dict]) -> dict[str, dict]:
-    """Average the scores: ``test`` of the best rendering, ``test_<rendering>`` of every other."""
+    """Average the scores of the best rendering (``test``) and of every other (``test_<rendering>``)."""
     means = {"test": summarise((row["ability"], row["scores"]) for row in per_image)}
     for name in per_image[0]["others"]:
         means[f"test_{name}"] = summarise((row["ability"], row["others"][name]) for row in per_image)
@@ -182,7 +179,7 @@ def _means(per_image: list[dict]) -> dict[str, dict]:
 
 
 def _seconds(per_image: list[dict], finished: Mapping[str, Mapping]) -> dict[str, float]:
-    """Return seconds of training by stage, and of rendering an image: the first of its time, and another."""
+    """Return seconds of training by stage, and of rendering an image: the first of a time, and another."""
     stages = {name: float(noted["seconds"]) for name, noted in finished.items()}
     drawing, again = (sum(r[key] for r in per_image) / len(per_image) for key in ("seconds", "seconds_again"))
     frames = {"render_per_frame": drawing, "render_again_per_frame": again}

@@ -1,4 +1,4 @@
-"""Find what keeps fitted runs from the truth: time, views, resolution, or regions of the picture."""
+"""Find what limits the accuracy of fitted runs: time, views, resolution, or regions of the picture."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ class Seen:
     """The numbers of one rendered view.
 
     Attributes:
-        time: of the view, in [0, 1].
-        psnr: dB.
-        voxel: pixels that a voxel covers.
-        bound: PSNR (dB) of the truth low-passed to a voxel.
+        time: time of the view, in [0, 1].
+        psnr: PSNR of the rendering, dB.
+        voxel: voxel size in pixels.
+        bound: PSNR (dB) of the true picture low-passed to the voxel size.
         errors: squared error by region.
     """
 
@@ -49,7 +49,7 @@ def seen(shown: Shown, center: Tensor, voxel_size: float) -> Seen:
 
     Args:
         shown: the view.
-        center: (3,), world units; voxels are taken to be as far from the camera as this.
+        center: (3,), world units; the voxel size in pixels is taken at this distance from the camera.
         voxel_size: world units.
     """
     target, camera = shown.target, shown.target.frame.camera
@@ -63,17 +63,17 @@ def seen(shown: Shown, center: Tensor, voxel_size: float) -> Seen:
 def limits_of(run: Run, views: int = 20) -> dict[str, float | str]:
     """Return the table row of a finished run, by ``COLUMNS``.
 
-    PSNR (dB, mean of images) is of all test views and of those in the first fifth of the sequence, between,
-    and in the last fifth; of some training views; and of the truth low-passed to a voxel, roughly what the
-    lattice allows. The last columns split the squared error of the test views: outside the true silhouettes,
-    within two pixels of them, inside.
+    PSNR (dB, mean over images) is given for all test views; for those in the first fifth of the sequence, in
+    the last fifth, and between; for some training views; and for the true pictures low-passed to the voxel
+    size, about what the lattice allows. The last columns split the squared error of the test views: outside
+    the true silhouettes, within two pixels of them, inside.
 
     Args:
-        run: finished.
-        views: training views to render.
+        run: a finished run.
+        views: number of training views to render.
 
     Raises:
-        ValueError: if the images have no alpha, or the method does not know where matter is.
+        ValueError: if the images have no alpha, or the method has no ``matter``.
     """
     module, scene = run.load(), run.datamodule.scene
     if not scene.has_alpha:
@@ -99,7 +99,7 @@ def limits_of(run: Run, views: int = 20) -> dict[str, float | str]:
 
 
 def by_time(tests: Sequence[Seen]) -> dict[str, float]:
-    """Return the mean PSNR of all views, and of the first fifth of the time, between, and the last."""
+    """Return the mean PSNR of all views, and of those in the first fifth of the time, between, and last."""
     parts = {
         "first fifth": lambda t: t < 0.2,
         "between": lambda t: 0.2 <= t <= 0.8,

@@ -32,12 +32,12 @@ def measure(
     """Evaluate a fitted run into its folder and print the table.
 
     Args:
-        run: whose test views are rendered.
-        module: fitted.
-        device: to render on.
-        protocol: what else to note about how the run was made.
-        lpips_weights: files or folders of backbone weights, searched beside the usual places.
-        sheets: as for ``evaluate``.
+        run: the run to measure.
+        module: the fitted scene.
+        device: device to render on.
+        protocol: further entries of ``protocol``: how the run was made.
+        lpips_weights: files or folders of backbone weights, searched before the usual places.
+        sheets: number of sheets; see ``evaluate``.
     """
     suite = ImageSuite(
         find_lpips(extra=lpips_weights), mask_box=run.datamodule.scene.protocol.get("mask_box", False)
@@ -59,7 +59,7 @@ def measure(
 
 
 def show(metrics: dict, folder: Path, absent: dict[str, str]) -> None:
-    """Print the numbers and where the files are."""
+    """Print the numbers and the paths of the files."""
     console = Console()
     console.print(table_of(metrics))
     seconds, flow = metrics["seconds"], metrics.get("flow")

@@ -18,7 +18,7 @@ from forewarp.scene.camera import Camera
 from forewarp.scene.view import Moment, View
 from forewarp.training.module import DynamicSceneModule
 
-_SEEN = 0.02  # least opacity of a pixel whose motion is shown
+_SEEN = 0.02  # show the motion of pixels at least this opaque
 
 
 def sized(camera: Camera, size: int) -> Camera:
@@ -35,9 +35,9 @@ def within(camera: Camera, size: int | None) -> Camera:
 def pictures_of(module: DynamicSceneModule, target: Target, size: int | None = None) -> dict[str, Tensor]:
     """Draw one view: pictures (h, w, 3) in [0, 1] by name.
 
-    ``compare`` is truth | prediction | error; ``depth`` is bright where it is near; ``flow``, of methods with
-    trajectories, is the displacement in the picture from the canonical time to the target's: hue is its
-    direction, as on the wheel, saturation its length.
+    ``compare`` is truth | prediction | error; near points are bright in ``depth``; ``flow``, for methods
+    with trajectories, is the displacement in the picture from the canonical time to the target's time: hue is
+    the direction, saturation the length.
     """
     camera = within(target.frame.camera, size)
     shape = (camera.height, camera.width)
@@ -93,17 +93,17 @@ def validation_psnr(module: DynamicSceneModule, targets: Sequence[Target], rays:
 
 
 class TensorBoardPictures(lightning.Callback):
-    """Draws one view at a few moments of a stage, and logs ``val/psnr`` of a few validation views.
+    """Draw one view at a few moments of a stage, and log ``val/psnr`` of a few validation views.
 
-    Pictures go to TensorBoard and into the stage's ``images/``. Training is not changed: its clock stands
-    still meanwhile, and no random number is drawn.
+    Pictures go to TensorBoard and into the stage's ``images/``. Training is not changed: the clock is paused
+    and no random number is drawn.
 
     Args:
-        moments: fractions of the stage.
+        moments: fractions of the stage at which to draw.
         view: index of the validation image, or of the training image if there are none; None: the middle.
         size: most pixels of the longer side.
         psnr_views: validation views, spread over the split, for ``val/psnr``; 0: no ``val/psnr``.
-        psnr_rays: pixels rendered of each.
+        psnr_rays: pixels rendered of each of these views.
     """
 
     def __init__(
@@ -134,7 +134,7 @@ class TensorBoardPictures(lightning.Callback):
         self._due = [moment for moment in self.moments if moment >= done]
 
     def on_train_batch_end(self, trainer, module, outputs, batch, batch_idx) -> None:
-        """Draw if it is due."""
+        """Draw if a moment is reached."""
         self._follow(trainer, module)
 
     def on_train_end(self, trainer, module) -> None:

@@ -15,19 +15,19 @@ from forewarp.scene.camera import Camera
 from forewarp.scene.view import Moment, Rendering, View
 from forewarp.training.module import DynamicSceneModule
 
-_VIEWS, _VIEW_SIZE = 24, 80  # views that find the surface, and their pixels
-_STILL = 0.15  # least travel of a moving point, as a share of the farthest
+_VIEWS, _VIEW_SIZE = 24, 80  # number and pixels of the views that find the surface
+_STILL = 0.15  # a moving point travels at least this share of the farthest travel
 
 
 class Trajectories:
-    """Draws a fading tail behind points of the moving surface, hidden where the scene occludes it.
+    """Draw a fading tail behind points of the moving surface; occluded parts of a tail are hidden.
 
     Args:
         module: the fitted scene.
         cameras: the training cameras, which find the surface.
-        count: most points.
-        tail: how long a tail lasts, as a share of the whole time.
-        width: of a line, as a share of the picture's longer side.
+        count: most points to draw.
+        tail: duration of a tail, as a share of the whole time.
+        width: line width, as a share of the picture's longer side.
     """
 
     def __init__(
@@ -79,7 +79,7 @@ class Trajectories:
 
 @torch.no_grad()
 def surface_points(module: DynamicSceneModule, cameras: Sequence[Camera]) -> Tensor:
-    """Return the points of matter (N, 3), world units, that a few cameras see at the canonical time."""
+    """Return the points of matter (N, 3), world units, seen by a few cameras at the canonical time."""
     canonical = module.method.at(Moment(module.curriculum.canonical_time))
     black, found = torch.zeros(3, device=module.device), []
     for camera in cameras[:: max(1, len(cameras) // _VIEWS)][:_VIEWS]:
@@ -94,7 +94,7 @@ def surface_points(module: DynamicSceneModule, cameras: Sequence[Camera]) -> Ten
 
 
 def _cells(points: Tensor, size: float) -> Tensor:
-    """Number the cubes of side ``size`` and return that of each point (N,)."""
+    """Return for each point (N,) the number of the cube of side ``size`` that holds it."""
     x, y, z = (points / size).floor().long().clamp(-(1 << 20), (1 << 20) - 1).unbind(-1)
     return (x << 42) + (y << 21) + z
 
@@ -112,7 +112,7 @@ def moving_points(module: DynamicSceneModule, cameras: Sequence[Camera], count: 
 
 
 def spread(points: Tensor, count: int) -> Tensor:
-    """Choose ``count`` of the points (N, 3): the first, then always the farthest from those chosen.
+    """Choose ``count`` of the points (N, 3): the first, then repeatedly the one farthest from those chosen.
 
     Cost: N * count distances.
     """
@@ -127,7 +127,7 @@ def spread(points: Tensor, count: int) -> Tensor:
 
 
 def order_of(points: Tensor) -> Tensor:
-    """Rank points (N, 3) along their longest extent: (N,), evenly from 0 to 1."""
+    """Rank points (N, 3) along their principal axis: (N,), evenly from 0 to 1."""
     if len(points) < 2:
         return points.new_zeros(len(points))
     along = torch.linalg.svd(points - points.mean(0), full_matrices=False)[2][0]

@@ -23,10 +23,10 @@ def make_shots(path: str, frames: int, time: float, camera: Camera, cameras: Seq
 
     Args:
         path: ``fixed`` and ``trajectories`` go through time, ``orbit`` once around at ``time``; ``both``.
-        frames: of the video.
-        time: in [0, 1].
-        camera: where the video starts.
-        cameras: the training cameras, which tell what to look at and where up is.
+        frames: number of frames.
+        time: the time of ``orbit``, in [0, 1].
+        camera: camera of the first frame.
+        cameras: the training cameras, from which focus and up direction are computed.
 
     Raises:
         ValueError: naming the key that is wrong.
@@ -39,7 +39,7 @@ def make_shots(path: str, frames: int, time: float, camera: Camera, cameras: Seq
         raise ValueError(f"time: expected a number in [0, 1], but got {time}")
     views, times = [camera] * frames, torch.linspace(0, 1, frames).tolist()
     if path in ("orbit", "both"):
-        # Without the full turn, which repeats the first: it loops smoothly.
+        # Leave out the full turn, which repeats the first frame, so that the video loops smoothly.
         turns = torch.arange(frames, dtype=torch.float64) / frames
         views = orbit(camera, focus_point(list(cameras)), mean_up(list(cameras)), turns)
     return list(zip(views, [time] * frames if path == "orbit" else times))
@@ -51,10 +51,10 @@ def video(
     """Render the pictures (H, W, 3) in [0, 1] of a video one by one, with one snapshot for each time.
 
     Args:
-        module: fitted.
+        module: the fitted scene.
         shots: camera and time of each picture.
-        background: (3,).
-        paint: draws over a picture, see ``Trajectories``.
+        background: colour (3,).
+        paint: draws over a picture; see ``Trajectories``.
     """
     snapshot = None
     for camera, time in shots:

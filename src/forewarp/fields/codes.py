@@ -12,15 +12,15 @@ from torch import Tensor, nn
 class FrameCodes(nn.Module):
     """A code for each distinct training time, interpolated linearly between them.
 
-    A training time has exactly its own code; times before the first or after the last have the nearest.
+    Times before the first or after the last training time have the nearest code.
 
     Args:
-        times: of the training frames, in any order; equal times share a code.
+        times: times of the training frames, in any order; equal times share a code.
         width: channels of a code.
         init_scale: codes start uniformly in ``[0, init_scale)``.
 
     Raises:
-        ValueError: without a time or a channel.
+        ValueError: if there is no time, or ``width`` is below 1.
 
     >>> codes = FrameCodes([0.0, 1.0, 0.5, 0.5], 8)
     >>> codes.codes.shape, torch.equal(codes(0.5), codes.codes[1])

@@ -21,12 +21,12 @@ def mlp(
     """``layers`` linear layers, ReLU between them.
 
     Args:
-        inputs, outputs: channels.
-        width: of the hidden layers.
-        layers: linear layers in all, at least 1.
+        inputs, outputs: numbers of channels.
+        width: channels of the hidden layers.
+        layers: number of linear layers, at least 1.
         zero_last: start from zero outputs.
-        leaky: use LeakyReLU with slope 0.01. At the learning rates of motion a single step may otherwise
-            kill every ReLU of the last hidden layer, and everything then moves alike.
+        leaky: use LeakyReLU with slope 0.01. Otherwise, at the learning rates of motion, one step may
+            kill every ReLU of the last hidden layer, and all points then move alike.
 
     Raises:
         ValueError: for ``layers`` or ``width`` below 1.

@@ -29,15 +29,15 @@ def density_shift(alpha_init: float) -> float:
 
 
 class DirectRadiance(VoxelGrid):
-    """Density and colour stored in the voxels themselves: no network, the cheap choice.
+    """Density and colour stored in the voxels, without a network: the cheap choice.
 
     Args:
-        lattice: where voxels may be.
+        lattice: possible voxel positions.
         active: (X, Y, Z) bool, the active voxels.
-        features: colour channels: 3 of the colour, the rest of its shading by direction.
+        features: colour channels: 3 for colour, the rest for shading by direction.
         alpha_init: opacity over ``density_scale`` at raw density 0.
-        density_scale: length that density is measured in, world units.
-        alpha_threshold: opacity over one voxel below which a cell is not sampled.
+        density_scale: unit of length of densities, in world units.
+        alpha_threshold: skip cells whose eight voxels all have at most this opacity over one voxel.
         box: unused, as there is no network.
     """
 
@@ -79,10 +79,10 @@ class FeatureRadiance(VoxelGrid):
     """The paper's F1: density and colour from a feature grid and the encoded position by a small MLP.
 
     Args:
-        lattice, active, features, alpha_init, density_scale, alpha_threshold: as for ``DirectRadiance``.
+        lattice, active, features, alpha_init, density_scale, alpha_threshold: see ``DirectRadiance``.
         grid_features: channels of the feature grid.
-        width, layers: of F1.
-        frequencies: of the positional encoding.
+        width, layers: size of F1.
+        frequencies: octaves of the positional encoding.
         box: normalises positions to [-1, 1] on all lattices; None: the first lattice's box.
     """
 

@@ -29,7 +29,7 @@ class FieldAtTime(Protocol):
 
     @property
     def voxel_size(self) -> float:
-        """Size of the finest voxels, in world units; a ray's step is a share of it."""
+        """Size of the finest voxels, in world units; a ray's step is a share of this."""
 
     @property
     def cells(self) -> Tensor:
@@ -39,11 +39,11 @@ class FieldAtTime(Protocol):
         """Density (P,), per world unit of length."""
 
     def colors(self, points: Tensor, directions: Tensor, shade: Shade | None) -> Tensor:
-        """Colour (P, 3); ``shade`` computes it from features and directions."""
+        """Colour (P, 3); ``shade`` computes colour from features and directions."""
 
 
 def shaded(features: Tensor, directions: Tensor, shade: Shade | None) -> Tensor:
-    """Features (P, C) and directions (P, 3) -> colour (P, 3); without ``shade``, of the first 3 features."""
+    """Features (P, C) and directions (P, 3) -> colour (P, 3); without ``shade`` from the first 3 features."""
     return torch.sigmoid(features[:, :3]) if shade is None else shade(features, directions)
 
 
@@ -80,11 +80,11 @@ class RadianceGrid:
     """Radiance on a sparse lattice.
 
     Attributes:
-        lattice: where voxels may be.
-        index: (X, Y, Z) int32, the row of each voxel in ``values``, -1 where space is empty.
+        lattice: possible voxel positions.
+        index: (X, Y, Z) int32, the row of each voxel in ``values``, -1 for absent voxels.
         values: (M, 1 + C), raw density, then colour features.
         activation: turns raw density into density.
-        alpha_threshold: opacity over one voxel below which a cell is not sampled.
+        alpha_threshold: skip cells whose eight voxels all have at most this opacity over one voxel.
     """
 
     lattice: Lattice

@@ -14,12 +14,12 @@ class Trunk(nn.Module):
     """``layers`` linear layers with ReLU; layer ``skip`` reads an input again.
 
     Args:
-        inputs: channels of the first layer.
-        width: of every layer.
-        layers: at least 1.
+        inputs: channels read by the first layer.
+        width: channels of every layer.
+        layers: number of layers, at least 1.
         skip: number of the layer, from 1, that also reads ``again``: 6 in PyTorch versions of NeRF, 5 in JAX
             versions; None: no layer.
-        again: channels read at the skip; None: those of the first layer.
+        again: channels read at the skip; None: ``inputs``.
 
     >>> sum(p.numel() for p in Trunk(72).parameters())
     497664
@@ -66,7 +66,7 @@ class Template(nn.Module):
     Args:
         inputs: channels of the encoded point.
         condition: channels that only colour depends on; 0: none.
-        width, layers, skip: of the trunk.
+        width, layers, skip: see ``Trunk``.
 
     >>> sum(p.numel() for p in Template(63, 27).parameters())
     595844

@@ -18,16 +18,16 @@ class TrajectoryField(nn.Module):
 
     Coefficients are evaluated at the nodes of a coarse lattice and interpolated to the voxels, which also
     smooths the motion. With ``nodes=0`` they are evaluated at every voxel, as in the paper. Bases beyond
-    ``bases_in_play`` have no effect yet.
+    ``bases_in_play`` are 0.
 
     Args:
         box: normalises positions to [-1, 1]; the same in all stages, so that the network carries over.
         bases: K, reduced to ``frames - 1`` if larger.
         frames: T, the number of distinct training times.
-        canonical_time: at which flow is exactly 0.
+        canonical_time: time at which flow is exactly 0.
         nodes: number of nodes along the box's mean side, at least 8; 0: no nodes.
         features: channels of the deformation feature grid; 0: none.
-        width, layers, frequencies: of F2 and its encoding.
+        width, layers, frequencies: size of F2, octaves of the positional encoding.
         padding: lets objects move at the first and last frame (see ``dct_basis``).
 
     Raises:
@@ -71,7 +71,7 @@ class TrajectoryField(nn.Module):
         self._nodes: tuple[Tensor, tuple[Tensor, Tensor, Tensor]] | None = None
 
     def play(self, bases: float | None) -> int:
-        """Use this number of bases, or all for None; return the number."""
+        """Use the first ``bases`` bases, all for None; return their number."""
         playing = self.bases if bases is None else min(int(bases), self.bases)
         self.bases_in_play.fill_(playing)
         return playing

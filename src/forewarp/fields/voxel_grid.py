@@ -10,13 +10,13 @@ from forewarp.scene.box import Box, Lattice
 
 
 class VoxelGrid(nn.Module):
-    """Parameters (N, C) with one row per active voxel, and the buffers that place them.
+    """Parameters (N, C) with one row per active voxel, and buffers with the voxels' positions.
 
     ``voxels`` (N, 3) are the active voxels' lattice positions, ``index`` (X, Y, Z) their rows or -1. Both
     change during training (``activate``, ``resample``), so loading adopts a checkpoint's lattice and shapes.
 
     Args:
-        lattice: where voxels may be.
+        lattice: possible voxel positions.
         active: (X, Y, Z) bool, the active voxels.
         channels: number of channels C by parameter name.
     """
@@ -80,7 +80,7 @@ class VoxelGrid(nn.Module):
         self._place(lattice, voxels)
 
     def _renew(self, name: str, values: Tensor) -> None:
-        # A new Parameter: autograd remembers an old one's shape for as long as any graph lives.
+        # A new Parameter, as autograd keeps the shape of the old one while any graph lives.
         setattr(self, name, nn.Parameter(values))
 
     def _place(self, lattice: Lattice, voxels: Tensor) -> None:
@@ -113,7 +113,7 @@ class VoxelGrid(nn.Module):
         self.lattice = _lattice(state)
 
     def misfit(self, state: dict, prefix: str) -> str | None:
-        """Return the name of a stored entry that does not fit the others; None if all fit.
+        """Return the name of a stored entry that contradicts the others, or None.
 
         Kernels do not check the index: a wrong one would crash the process.
         """

@@ -19,9 +19,9 @@ class Effect:
     """An optional part of a method; off, it has no parameters and costs no time.
 
     Attributes:
-        name: of its config group ``model/<name>``.
+        name: name of the config group ``model/<name>``.
         on, off: the usual options that switch it on and off.
-        attribute: of the method, None while the effect is off; by default ``name``.
+        attribute: the method's attribute that is None while the effect is off; by default ``name``.
         later: True: decide it after the coarse stage, by a trial with and without it. False: decide it by
             comparing coarse stages.
         rules_out: returns True if the evidence makes a trial of a ``later`` effect pointless.
@@ -38,11 +38,11 @@ class Effect:
 
     @property
     def group(self) -> str:
-        """Name of its config group."""
+        """Name of the effect's config group."""
         return f"model/{self.name}"
 
     def is_on(self, method: Method) -> bool:
-        """Return whether a method has it."""
+        """Return whether the effect is on in a method."""
         return getattr(method, self.attribute or self.name, None) is not None
 
 
@@ -75,7 +75,7 @@ class Evidence:
         least: dB; a smaller gain counts as none.
         minutes: planned for the last stage; None: choose the cheapest option within noise of the best.
         slope: dB that the fine trial without effects gained in the second half of its ``steps``.
-        steps: of that trial.
+        steps: steps of that trial.
         step: seconds per step of that trial; None if unknown.
     """
 

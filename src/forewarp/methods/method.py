@@ -28,7 +28,7 @@ class Start:
         before: the fitted method of the stage before, if it is at hand.
         blank: a checkpoint is about to be loaded: build parts of the right shape only, from no image and
             no earlier stage.
-        weights, literal, photo_on: of the stage's ``Objective``.
+        weights, literal, photo_on: see ``Objective``.
     """
 
     scene: Scene
@@ -50,9 +50,9 @@ class Step:
     Attributes:
         terms: a function for each loss term by name, which computes it, () tensor, or returns None if the
             effect that it measures is off.
-        squared_error: of the best rendering, mean over pixels and channels.
+        squared_error: error of the best rendering, mean over pixels and channels.
         noted: numbers to log.
-        gradients: of the weighted sum by parameter name, if the method computes them itself; its terms then
+        gradients: of the weighted sum, by parameter name, if the method computes them itself; its terms then
             need no graph. None: autograd computes them.
         tensors: yields intermediate results by name, to find the first that is not finite.
     """

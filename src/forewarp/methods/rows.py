@@ -18,8 +18,8 @@ def take_rows(
     A row that is named twice is copied; a row that is not named is removed.
 
     Args:
-        method: whose parameters change.
-        optimizer: whose moments follow.
+        method: the method whose parameters change.
+        optimizer: the optimizer whose moments follow.
         rows: (N',) int64, each in [0, N).
         fresh: (N',) bool, rows whose moments start at 0; None: every row keeps the moments of its source.
 
@@ -54,7 +54,7 @@ def renew_parameters(
     """Replace parameters in an optimiser, and carry their moments over row by row.
 
     Args:
-        optimizer: whose groups and moments change.
+        optimizer: the optimizer whose groups and moments change.
         before, after: parameters (N, ...) and (N', ...), pairwise.
         rows: (N',) int64, the old row of each new row, -1 for none; None: all moments start at 0.
     """

@@ -27,10 +27,10 @@ class TNeRF(Method):
 
     Args:
         start: scene, stage and numbers.
-        width, layers, skip: of the trunk (see ``fields.template.Trunk``).
-        position_frequencies, time_frequencies, direction_frequencies: of the encodings.
+        width, layers, skip: see ``fields.template.Trunk``.
+        position_frequencies, time_frequencies, direction_frequencies: octaves of the encodings.
         density: ``relu`` as published, with which some seeds start dead, or ``softplus``.
-        samples, fine_samples, open_end: of the two passes (see ``Quadrature``).
+        samples, fine_samples, open_end: see ``Quadrature``.
         inside_box: treat space outside the scene's box as empty, to save samples; not as published.
     """
 

@@ -1,4 +1,4 @@
-"""Depth accuracy."""
+"""Accuracy of depth maps."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ def depth_delta(
     Args:
         prediction: ray depth (H, W), world units; values that are not finite and positive count as wrong.
         truth: exact ray depth (H, W), same units, 0 on the background.
-        foreground: (H, W) bool; None: every pixel with a true depth. Pixels without one never count.
+        foreground: (H, W) bool; None: all pixels. Pixels without a true depth never count.
         thresholds: each above 1.
 
     Returns:
-        one fraction in [0, 1] per threshold, or None without any foreground.
+        one fraction in [0, 1] per threshold, or None if there is no foreground.
 
     Raises:
         ValueError: for shapes that differ, or a threshold <= 1, which nothing can meet.

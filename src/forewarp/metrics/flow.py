@@ -15,7 +15,7 @@ def end_point_error(
 
     .. math:: \mathrm{EPE} = \frac{1}{|P| (T - 1)} \sum_{p \in P} \sum_{t \ge 1} |x_{pt} - x^*_{pt}|
 
-    The first time is canonical, where a method is exact by construction; it is left out.
+    The first time is left out: it is canonical, where a method is exact by construction.
 
     Args:
         predicted: positions (N, T, 3), world units.
@@ -25,7 +25,7 @@ def end_point_error(
 
     Returns:
         ``epe_moving``, ``epe_still`` (of static points) and ``motion_mean`` (the mean true displacement of
-        moving points, which a static prediction scores), in world units, None without such points;
+        moving points, which a static prediction scores), in world units, None if there are no such points;
         ``count_moving``, ``count_still``; ``moving_threshold`` as used.
 
     Raises:

@@ -60,7 +60,7 @@ def image_pair(prediction: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
 def psnr(prediction: Tensor, target: Tensor) -> float:
     r"""Peak signal-to-noise ratio of one image in dB, :math:`-10 \log_{10} \mathrm{MSE}`, at most 100.
 
-    Report its mean over images. Pooling the MSE of all images first, as torchmetrics' class does by default,
+    Report the mean over images. Pooling the MSE of all images first, as torchmetrics' class does by default,
     gives a smaller number. The cap keeps the mean finite for equal images.
 
     >>> round(psnr(torch.zeros(2, 2, 3), torch.full((2, 2, 3), 0.2)), 6)
@@ -74,11 +74,11 @@ def psnr(prediction: Tensor, target: Tensor) -> float:
 def ssim(prediction: Tensor, target: Tensor) -> float | None:
     """Structural similarity: Gaussian window of 11 pixels and sigma 1.5, data range 1, mean over all pixels.
 
-    Borders are reflected. It equals torchmetrics' function in float64, which does not replace it: for 800 x
-    800 pixels that takes about four times the time and three times the memory.
+    Borders are reflected. Equal to torchmetrics' function in float64, which takes about four times the time
+    and three times the memory for 800 x 800 pixels.
 
     Returns:
-        None for an image with a side below 11 pixels, where the window does not fit.
+        None for an image with a side below 11 pixels, as the window does not fit.
 
     Cost: 22 multiply-adds per pixel and channel, for each of five blurred images.
     """
@@ -96,7 +96,7 @@ def ms_ssim(prediction: Tensor, target: Tensor) -> float | None:
     borders and odd sides differently.)
 
     Returns:
-        None for an image with a side below 161 pixels, where the window does not fit the coarsest scale.
+        None for an image with a side below 161 pixels, as the window does not fit the coarsest scale.
     """
     a, b = (x.permute(2, 0, 1) for x in image_pair(prediction, target))
     return _multi_scale(a, b, lambda x: F.avg_pool2d(x, 2, ceil_mode=True))
@@ -105,9 +105,9 @@ def ms_ssim(prediction: Tensor, target: Tensor) -> float | None:
 def ms_ssim_legacy(prediction: Tensor, target: Tensor) -> float | None:
     """MS-SSIM as TiNeuVox and NDVG compute it, only for comparison with their published numbers.
 
-    They reshape (H, W, 3) to (3, H, W) without a permute, so each "channel" is a third of the image with
+    Their code reshapes (H, W, 3) to (3, H, W) without a permute, so a "channel" is a third of the image with
     interleaved colours. That raises the score of a blurred or shifted image by up to 0.07; for an object on
-    white it may lower it.
+    white it may lower the score.
 
     Returns:
         None for an image with a side below 161 pixels.

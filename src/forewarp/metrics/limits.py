@@ -1,4 +1,4 @@
-"""Where errors come from: resolution, outlines, or the inside of objects."""
+"""Find where errors come from: resolution, outlines, or the inside of objects."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ REGIONS = ("outside", "outline", "inside")
 def low_passed(image: Tensor, pixels: float) -> Tensor:
     """Fit an image that is linear between points ``pixels`` apart, like a slice of a trilinear grid.
 
-    Not a strict bound for a grid: its points lie elsewhere in every view, and its density makes edges.
+    Not a strict bound for a grid: grid points lie elsewhere in every view, and density makes edges.
 
     Args:
         image: (H, W, 3) in [0, 1].
@@ -43,7 +43,7 @@ def regions(foreground: Tensor, band: int = 2) -> dict[str, Tensor]:
 
     Args:
         foreground: (H, W) bool.
-        band: pixels on either side of the outline that belong to it.
+        band: half the width of the outline, in pixels.
 
     Returns:
         disjoint masks (H, W) bool by the names in ``REGIONS``.
@@ -53,11 +53,11 @@ def regions(foreground: Tensor, band: int = 2) -> dict[str, Tensor]:
 
 
 def error_shares(truth: Tensor, image: Tensor, foreground: Tensor) -> dict[str, Tensor]:
-    """Sum the squared error in each region; together they are the error of the image.
+    """Sum the squared error in each region; the sums add up to the error of the image.
 
     Args:
         truth, image: (H, W, 3).
-        foreground: (H, W) bool, of the truth.
+        foreground: (H, W) bool, the true foreground.
     """
     error = (truth - image).square().mean(-1)
     return {name: torch.where(mask, error, 0.0).sum() for name, mask in regions(foreground).items()}

@@ -1,7 +1,7 @@
 """Learned perceptual image patch similarity (LPIPS, version 0.1), on three backbones.
 
 Distances of different backbones are not comparable, so every name contains the net; papers report
-``lpips_vgg``. Backbone weights are files in torchvision's format, which are never downloaded; the small
+``lpips_vgg``. Backbone weights are files in torchvision's format and never downloaded; the small
 linear heads come with torchmetrics. (torchmetrics' own LPIPS needs torchvision.)
 """
 
@@ -107,11 +107,11 @@ class LPIPS(nn.Module):
 
     Args:
         net: ``squeeze``, ``vgg`` or ``alex``.
-        backbone: weight file of that net in torchvision's format, of the whole model or of its ``features``.
+        backbone: weight file in torchvision's format, of the whole model or of its ``features``.
         heads: file of linear heads ``lin<k>.model.1.weight``; None: torchmetrics' own.
 
     Raises:
-        ValueError: for an unknown net, or a file that does not hold its weights.
+        ValueError: for an unknown net, or a file without the net's weights.
     """
 
     shift: Tensor
@@ -156,9 +156,9 @@ class LPIPS(nn.Module):
 
 
 def find_lpips_weights(net: str, extra: Iterable[str | Path] | str | Path | None = ()) -> Path | None:
-    """Find the weight file of a net's backbone by its name; None if there is none.
+    """Find the weight file of a net's backbone by file name, or return None.
 
-    Search the given files and folders, then the one in ``FOREWARP_LPIPS_WEIGHTS``, then torch hub's cache,
+    Search the given files and folders, then ``FOREWARP_LPIPS_WEIGHTS``, then torch hub's cache,
     where torchvision stores its downloads.
 
     Raises:

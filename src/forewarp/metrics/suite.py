@@ -30,7 +30,7 @@ class ImageSuite:
         mask_box: also compute ``psnr_box``, in the bounding rectangle of the foreground.
 
     Raises:
-        ValueError: for a name other than ``lpips_<net>``, or one of another net.
+        ValueError: for a name other than ``lpips_<net>`` of the given net.
     """
 
     def __init__(self, lpips: Mapping[str, LPIPS | None] | None = None, *, mask_box: bool = False) -> None:
@@ -49,7 +49,7 @@ class ImageSuite:
     def score(
         self, prediction: Tensor, target: Target, predicted_depth: Tensor | None = None
     ) -> dict[str, float]:
-        """Compute all metrics that one image allows, in the order of ``METRICS``.
+        """Compute all metrics that the image's size and truth allow, in the order of ``METRICS``.
 
         Args:
             prediction: (H, W, 3) in [0, 1].
@@ -91,8 +91,8 @@ def summarise(rows: Iterable[tuple[str, Mapping[str, float]]]) -> dict[str, dict
         rows: the ability (``space``, ``time``, ``canonical`` or ``all``) and the scores of each image.
 
     Returns:
-        ``{ability: {metric: mean}}`` in fixed order. A metric that some images lack is averaged over the
-        others.
+        ``{ability: {metric: mean}}`` in fixed order. A metric that some images lack is the mean over
+        the others.
 
     Raises:
         ValueError: for an unknown ability or metric, or a score that is not finite.
@@ -123,7 +123,7 @@ def _depth_scores(predicted: Tensor, target: Target) -> dict[str, float | None]:
 
 
 def _box_score(prediction: Tensor, target: Target) -> float | None:
-    """PSNR in the bounding rectangle of the foreground; None without any foreground."""
+    """PSNR in the bounding rectangle of the foreground, or None without foreground."""
     if target.foreground is None or not bool(target.foreground.any()):
         return None
     rows, columns = (target.foreground.any(axis).nonzero()[:, 0] for axis in (1, 0))

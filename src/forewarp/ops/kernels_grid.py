@@ -64,7 +64,7 @@ def gather_backward_values(index, points, grad, out):
 
 @njit(parallel=True, cache=True)
 def gather_backward_points(values, index, points, fill, grad, out):
-    """out[p] = gradient with respect to the point's lattice coordinate; 0 where it is clamped."""
+    """out[p] = gradient with respect to the point's lattice coordinate; 0 where clamped."""
     channels = values.shape[1]
     nx, ny, nz = index.shape
     for p in prange(points.shape[0]):

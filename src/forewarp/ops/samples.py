@@ -101,7 +101,7 @@ def clip_to_box(
 
     Args:
         origins, directions: (R, 3).
-        near, far: of all rays, in multiples of a direction's length.
+        near, far: range of all rays, in multiples of a direction's length.
         low, high: (3,) corners of the box.
 
     Returns:

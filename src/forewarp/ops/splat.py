@@ -67,7 +67,7 @@ def with_copies(splat: Splat, source: Tensor, cells: Tensor, tau: float = 1e-2) 
     Equal to splatting them onto themselves, for an eighth of the work.
 
     Args:
-        splat: of all moving voxels, with the same ``tau``.
+        splat: the splat of all moving voxels, with the same ``tau``.
         source: (N, C), values of the static voxels.
         cells: (N, 3) int64, their distinct positions.
 

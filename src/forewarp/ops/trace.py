@@ -57,7 +57,7 @@ def trace(
         raw: (M,), one channel of a sparse lattice.
         index: (X, Y, Z) int32, its rows or -1.
         fill: value of an absent voxel.
-        shift, scale: of the optical depth of a step.
+        shift, scale: shift and scale of a step's optical depth.
         early_stop_eps: end a ray once its transmittance is below this; 0: never.
         threshold: return samples of more weight than this; below 0: all.
 

@@ -1,4 +1,4 @@
-"""Make the plan of a run, or read it if it was made before."""
+"""Make the plan of a run, or read the plan made before."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ AMOUNTS = ("seconds", "trial_seconds", "minutes", "least")
 
 
 def make_plan(config: DictConfig, overrides: Sequence[str]) -> dict:
-    """Decide which effects a scene calls for and write ``plan.yaml``; read it if it was made before.
+    """Decide which effects a scene calls for and write ``plan.yaml``, or read an existing ``plan.yaml``.
 
     Args:
-        config: of the run that is planned, composed from ``overrides``.
-        overrides: as typed.
+        config: the config of the run to plan, composed from ``overrides``.
+        overrides: the typed overrides.
 
     Returns:
         the content of ``plan.yaml``: ``typed`` and ``overrides``, which together make the run, ``effects``
-        (choice, on, because), ``evidence``, ``seconds``, ``of`` (a hash of the question); and ``file``.
+        (choice, on, because), ``evidence``, ``seconds``, ``of`` (a hash of config and data); and ``file``.
 
     Raises:
-        ValueError: if the run cannot be planned, or ``plan.folder`` holds the plan of another question.
+        ValueError: if the run cannot be planned, or ``plan.folder`` holds a plan of another config or data.
     """
     asked_as = list(overrides)
     typed = [override for override in overrides if key_of(override).split(".")[0] not in NOT_OF_IT]
@@ -76,10 +76,10 @@ def make_plan(config: DictConfig, overrides: Sequence[str]) -> dict:
 
 
 def planning_of(model: Callable, name: str) -> Planning:
-    """Return how a method's effects are planned.
+    """Return the ``Planning`` of a method: what decides which effects to switch on.
 
     Raises:
-        ValueError: if it has no effects to plan.
+        ValueError: if the method has no effects to plan.
     """
     planning = getattr(model, "planning", getattr(getattr(model, "func", None), "planning", None))
     if planning is None:
@@ -91,10 +91,10 @@ def planning_of(model: Callable, name: str) -> Planning:
 
 
 def spared(scene: Scene, wanted: int) -> int:
-    """Return how many training views to set aside: as many as wanted, or as the scene can spare.
+    """Return how many training views to hold out: as many as wanted, or as the scene can spare.
 
     Raises:
-        ValueError: if it can spare fewer than two.
+        ValueError: if the scene can spare fewer than two.
     """
     most = most_held_out(scene)
     if most < 2:

@@ -16,22 +16,22 @@ PATHS = ("lpips_weights",)  # top-level keys that hold paths
 
 
 def write_plan(file: Path, made: dict) -> None:
-    """Write a plan, with the command that made it on top."""
+    """Write a plan, with the command that made the plan on top."""
     about = f"# {command_line('plan', made.get('asked', made['typed']))}\n"
     about += "# Fit it: forewarp-train plan=<this file>; an override typed beside that wins.\n"
     replace_file(file, about + yaml.safe_dump(made, sort_keys=False, width=110, allow_unicode=True))
 
 
 def read_plan(file: Path, trust: Sequence[str] = (), typed: Sequence[str] = ()) -> dict:
-    """Read a ``plan.yaml`` without its overrides of ``trust``: a file may not say what is trusted.
+    """Read a ``plan.yaml``; drop overrides of ``trust``, as a file may not say what is trusted.
 
     Args:
-        file: to read.
-        trust: packages beside forewarp whose code its overrides may name.
-        typed: overrides on the present command line; the file may repeat them whatever they name.
+        file: the file to read.
+        trust: packages beside forewarp whose code the overrides may name.
+        typed: overrides on this command line; the same ones in the file are accepted unchecked.
 
     Raises:
-        ValueError: if it is no plan, is of an earlier version, or has overrides that a plan may not have.
+        ValueError: if the file is no plan, is of an earlier version, or has overrides no plan may have.
     """
     try:
         made = yaml.safe_load(read_text(file, MOST_CONFIG))
@@ -62,7 +62,7 @@ def read_plan(file: Path, trust: Sequence[str] = (), typed: Sequence[str] = ()) 
 
 
 def _is_harmless(override: str) -> bool:
-    """Tell whether an override only sets a key: it names no code and does not say how jobs are run."""
+    """Tell whether an override only sets a key, names no code and does not change how jobs run."""
     sets = re.match(r"\+{0,2}[A-Za-z][\w./@]*=", override) is not None
     key, _, value = override.lstrip("+").partition("=")
     hides = "_target_" in override and not (key.endswith("._target_") and override.count("_target_") == 1)
@@ -76,8 +76,8 @@ def with_plan(name: str, arguments: list[str]) -> list[str]:
     """Replace ``plan=FILE`` on the command line of ``forewarp-train`` by the plan's overrides.
 
     Args:
-        name: of the command; of others the arguments are returned as they are.
-        arguments: of the command line; those typed beside ``plan=`` win over the plan.
+        name: the command; for other commands the arguments are returned unchanged.
+        arguments: the command line's arguments; those typed beside ``plan=`` win over the plan.
 
     Raises:
         ValueError: if the file is no plan, or ``model=`` or ``resume=`` beside it contradicts it.

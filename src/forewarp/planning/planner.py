@@ -17,14 +17,14 @@ from forewarp.scene.pictures import survey
 
 
 class Planner:
-    """Plans one run; the method says which effects there are and what counts for each.
+    """Plan one run; the method says which effects there are and what counts for each.
 
     Args:
-        config: of the run that is planned.
-        typed: its overrides; the plan decides nothing that they fix.
+        config: the config of the run to plan.
+        typed: the run's overrides; the plan decides nothing that they fix.
         trials: fits the short runs.
-        scene: as the run would read it.
-        planning: of the method.
+        scene: the scene as the run would read it.
+        planning: the method's ``Planning``.
     """
 
     def __init__(
@@ -36,13 +36,13 @@ class Planner:
         stages = {name: stage for name, stage in config.stage.items() if stage is not None}
         self.asked = Asked(stages, config.preset, values, self._choose, bool(config.plan.trials))
         trials.always, trials.always_fine = planning.always(self.asked)
-        # An effect of the last stage takes its time from that stage's share alone.
+        # An effect of the last stage costs time of the last stage only.
         shares = [stage.share for stage in stages.values()]
         minutes = self.settings.minutes and self.settings.minutes * shares[-1] / sum(shares)
         self.evidence = planning.evidence(survey(scene), least=self.settings.least, minutes=minutes)
 
     def plan(self) -> dict:
-        """Return the plan without its seconds: overrides, effects with reasons, evidence."""
+        """Return the plan, without seconds: overrides, effects with reasons, evidence."""
         self._fit_coarse()
         views = self.run.datamodule.targets("train")
         self.planning.look(self.evidence, self.module.method, self.run.datamodule.scene, views, self.asked)
@@ -57,7 +57,7 @@ class Planner:
         }
 
     def _fit_coarse(self) -> None:
-        """Fit the coarse stages that the method asks for; answer for each rival whether it pays."""
+        """Fit the coarse stages that the method asks for; tell the method of each rival whether it pays."""
         stages, answer = self.planning.coarse(self.evidence, self.asked), None
         while True:
             try:
@@ -71,7 +71,7 @@ class Planner:
                 answer = self._rival(wanted)
 
     def _use(self, name: str, overrides: list[str]) -> None:
-        """Fit the coarse stage that gives the evidence and that fine trials begin from."""
+        """Fit the coarse stage that evidence is taken from and fine trials begin from."""
         self.name, self.base = name, overrides
         self.reached, self.run, self.module = self.trials.coarse(name, overrides)
 
@@ -87,7 +87,7 @@ class Planner:
         return pays
 
     def _try_fine(self) -> None:
-        """Try each effect that is still open in the fine stage, with it and without, at equal steps."""
+        """Try each undecided effect in the fine stage: with and without the effect, at equal steps."""
         evidence, tried = self.evidence, partial(self._tried, "fine", self.base, 0)
         asked = [
             effect
@@ -104,12 +104,12 @@ class Planner:
             self._try(effect.name, merged(self.base, [choice]))
 
     def _try(self, effect: str, overrides: list[str]) -> None:
-        """Try an effect seed by seed; stop once it is clear that it gains nothing."""
+        """Try an effect seed by seed; stop once the gain is clearly below ``plan.least``."""
         on, off = [], []
         for seed in range(self.settings.seeds):
             on.append(self._tried(f"fine-{effect}", overrides, seed, on[0].steps if on else None))
             off.append(self._tried("fine", self.base, seed))
-            if off[-1].steps != on[-1].steps:  # the effect had no time for more
+            if off[-1].steps != on[-1].steps:  # the trial with the effect ran out of time
                 off[-1] = self._tried(f"fine-{on[-1].steps}", self.base, seed, on[-1].steps)
             found = self.evidence.gains[effect] = gain(on, off)
             if found.psnr + found.noise < self.settings.least:
@@ -119,12 +119,12 @@ class Planner:
         return self.trials.fine(name, overrides, self.name, seed, steps)
 
     def _choose(self, effect: str) -> str:
-        """Return the option that switches an effect on: the configured one, or else its usual one."""
+        """Return the option that switches an effect on: the configured one, else ``Effect.on``."""
         own = HydraConfig.get().runtime.choices.get(f"model/{effect}")
         return own if own not in (None, self.effects[effect].off) else self.effects[effect].on
 
     def _as_tried(self, decision: Decision) -> Decision:
-        """Add the overrides that an effect was tried with."""
+        """Return the decision with the overrides of its trial added; unchanged if the effect stays off."""
         effect = self.effects.get(decision.effect)
         if effect is None or not decision.on:
             return decision

@@ -1,4 +1,4 @@
-"""Fit the short runs of a plan: coarse stages, and fine stages that begin where these end."""
+"""Fit the short runs of a plan: coarse stages, and fine stages that begin where the coarse ones end."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from forewarp.training.handover import NUMBERS, POINTS
 from forewarp.training.module import DynamicSceneModule
 from forewarp.training.stages import Run
 
-RAYS = 10_000  # pixels rendered of each view set aside
+RAYS = 10_000  # pixels rendered of each held-out view
 
 
 @dataclass(frozen=True)
@@ -33,10 +33,10 @@ class Trial:
     """The result of a short run.
 
     Attributes:
-        psnr: dB, of each view set aside.
-        step: seconds of training for a step.
-        steps: that were done.
-        took: seconds in all.
+        psnr: PSNR of each held-out view, dB.
+        step: training seconds per step.
+        steps: number of steps done.
+        took: seconds in all, with loading and scoring.
     """
 
     psnr: tuple[float, ...]
@@ -46,12 +46,12 @@ class Trial:
 
     @property
     def numbers(self) -> list[Numbers]:
-        """The result as ``Gain`` takes it, for each view."""
+        """Numbers of each view, as ``Gain.of`` takes them."""
         return [{"psnr": psnr, "step": self.step} for psnr in self.psnr]
 
 
 def gain(on: Sequence[Trial], off: Sequence[Trial], *, equal_steps: bool = True) -> Gain:
-    """Compare trials with an effect and without it, seed by seed and view by view."""
+    """Compare trials with and without an effect, seed by seed and view by view."""
     pairs = [list(zip(a.numbers, b.numbers, strict=True)) for a, b in zip(on, off, strict=True)]
     seconds = on[0].step * on[0].steps, off[0].step * off[0].steps
     return Gain.of(pairs, on[0].steps if equal_steps else None, seconds)
@@ -64,21 +64,21 @@ def composed(overrides: Sequence[str]) -> DictConfig:
 
 @dataclass
 class Trials:
-    """All short runs of one plan; a finished one is not run again.
+    """Run all short runs of one plan; finished ones are not run again.
 
     Args:
-        typed: overrides of the run that is planned.
-        folder: of the plan; each trial has a folder in it.
-        steps: of a coarse stage.
-        seconds: that a coarse stage may take at most.
-        fine_steps: of a fine stage.
-        fine_seconds: that a fine stage may take at most.
-        held_out: training views that are set aside and scored.
-        tell: called with the name of each trial before it runs.
-        seconds_before: that the trials found finished once took.
-        made: the fine trials so far, as several effects are compared with the same one.
-        always: overrides of every trial, given by the method.
-        always_fine: overrides of every fine trial, given by the method.
+        typed: overrides of the run to plan.
+        folder: the plan's folder, with one folder for each trial.
+        steps: steps of a coarse stage.
+        seconds: most seconds of a coarse stage.
+        fine_steps: steps of a fine stage.
+        fine_seconds: most seconds of a fine stage.
+        held_out: number of training views to hold out and score.
+        tell: called with the name of each trial before the trial runs.
+        seconds_before: total seconds of the trials that were finished before.
+        made: the fine trials so far, as several effects are compared with the same trial.
+        always: the method's overrides of every trial.
+        always_fine: the method's overrides of every fine trial.
     """
 
     typed: list[str]
@@ -107,11 +107,11 @@ class Trials:
         """Fit a short fine stage that begins where the coarse stage of the trial ``after`` ended.
 
         Args:
-            name: of the trial.
-            changes: its overrides.
-            after: the trial whose coarse stage it goes on from.
+            name: name of the trial.
+            changes: overrides of the trial.
+            after: name of the trial whose coarse stage to continue.
             seed: added to the run's seed.
-            steps: of the stage; None: ``fine_steps``, or fewer if ``fine_seconds`` are over before.
+            steps: steps of the stage; None: ``fine_steps``, or fewer if ``fine_seconds`` end first.
         """
         if (known := self.made.get(f"{name}-seed{seed}")) is not None:
             return known
@@ -135,7 +135,7 @@ class Trials:
         config = composed(without_switched_off(merged(merged(changes, self.typed), always)))
         data = OmegaConf.to_container(config.data, resolve=True) | {"seed": config.seed + seed}
         with open_dict(config):
-            config.data = data  # resolved before: a scene made from the seed stays the planned one
+            config.data = data  # resolved before the seed changes, as synthetic scenes are made from the seed
             config.run, config.seed, config.effects = str(self.folder / name), config.seed + seed, "given"
             config.budget.iterations, config.budget.minutes = steps, None if seconds is None else seconds / 60
             config.data.held_out, config.evaluate = self.held_out, False
@@ -144,7 +144,7 @@ class Trials:
         return config
 
     def _fitted(self, config: DictConfig, begun: Path | None = None) -> tuple[Trial, Run, DynamicSceneModule]:
-        """Fit and score a trial, or read its result; ``begun`` is the folder of its finished first stage."""
+        """Fit and score a trial, or read the stored result; ``begun``: folder of a finished first stage."""
         begin = time.perf_counter()
         run = build_run(config)
         run.tell = lambda line: None
@@ -169,7 +169,7 @@ class Trials:
 
 
 def _share(source: Path, target: Path) -> None:
-    """Put a finished stage into another run: by hard links, or as a copy if the system has none."""
+    """Link a finished stage into another run, or copy it if the file system has no hard links."""
     if target.is_dir():
         return
     beside = target.with_name(target.name + ".part")

@@ -16,7 +16,7 @@ Groups = Mapping[tuple[str, float | None], Sequence[Result]]
 INTRODUCTION = """# Accuracy against training time
 
 Written by `forewarp-report kind=accuracy_time`. Seconds are of training alone: evaluation, logging and
-checkpoints are left out. PSNR is of training views set aside (`data.held_out`; without any, of validation
+checkpoints are left out. PSNR is of training views held out (`data.held_out`; without any, of validation
 views), each estimated from the same random pixels of the whole image; a value counts as reached once two
 evaluations in a row reach it. Over several seeds: mean ± standard deviation, and only where every seed gets
 there. A schedule follows the share of its minutes that is spent, so a run of ten minutes is not at its best
@@ -30,10 +30,10 @@ def write_accuracy_time(
     """Write ``accuracy-time.md``, and a picture and a CSV file a scene.
 
     Args:
-        runs: folder that is searched for runs.
+        runs: folder to search for runs.
         out: folder to write to.
-        target: PSNR (dB) that every variant's time is listed for; None: the last whole dB that the base, or
-            else the best run, reached.
+        target: list each variant's seconds to this PSNR (dB); None: the last whole dB that the base, or else
+            the best run, reached.
         published: results of others, drawn as stars.
 
     Returns:
@@ -62,13 +62,13 @@ def write_accuracy_time(
 
 
 def reached(group: Sequence[Result], psnr: float) -> Estimate | None:
-    """Return the seconds to a PSNR over the seeds; None if one of them does not reach it."""
+    """Return the seconds to a PSNR over the seeds; None if a seed does not reach this PSNR."""
     times = [seconds_to(result.curve, psnr) for result in group]
     return None if None in times else Estimate.of(times)
 
 
 def cheapest(groups: Groups) -> Table:
-    """List for every whole dB the variant that reaches it first, and its command."""
+    """List for every whole dB the variant that reaches it first, with the command."""
     rows = []
     values = [point.psnr for group in groups.values() for result in group for point in result.curve]
     for psnr in range(math.ceil(min(values)), math.floor(max(values)) + 1):
@@ -82,7 +82,7 @@ def cheapest(groups: Groups) -> Table:
 
 
 def variants(groups: Groups, target: float) -> Table:
-    """List for every variant the seconds to the target, and what it ends with."""
+    """List for every variant the seconds to the target PSNR and the final numbers."""
     rows = []
     for (variant, minutes), group in groups.items():
         last = [result.curve[-1] for result in group if result.curve]

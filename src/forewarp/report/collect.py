@@ -15,7 +15,7 @@ from forewarp.files import MOST_CONFIG, read_text
 
 @dataclass(frozen=True)
 class Point:
-    """A row of ``accuracy_time.csv``: PSNR (dB) of the views set aside after ``seconds`` of training.
+    """A row of ``accuracy_time.csv``: PSNR (dB) of the held-out views after ``seconds`` of training.
 
     ``epe`` is the error of moving points in world units; None if the truth is unknown.
     """
@@ -31,11 +31,11 @@ class Result:
     """One run.
 
     Attributes:
-        folder: of the run.
-        config: resolved.
+        folder: the run's folder.
+        config: the resolved config.
         stages: the ``done.json`` of each finished stage.
-        metrics: its ``metrics.json``; empty if it was not measured.
-        curve: its ``accuracy_time.csv``; empty if no views were set aside.
+        metrics: content of ``metrics.json``; empty if the run was not measured.
+        curve: rows of ``accuracy_time.csv``; empty if no views were held out.
     """
 
     folder: Path
@@ -51,12 +51,12 @@ class Result:
 
     @property
     def dataset(self) -> str:
-        """The dataset that its scene is of; "" if it was not measured."""
+        """The dataset of the scene; "" if the run was not measured."""
         return str(self.metrics.get("protocol", {}).get("dataset", ""))
 
     @property
     def is_counterpart(self) -> bool:
-        """Whether its scene is a synthetic counterpart of a dataset."""
+        """Whether the scene is a synthetic counterpart of a dataset."""
         made = self.metrics.get("protocol", {}).get("synthetic", False)
         return bool(made) or ".Synthetic" in str(self.config["data"].get("_target_", ""))
 
@@ -64,8 +64,8 @@ class Result:
     def variant(self) -> str:
         """Name what tells this run from others of its scene.
 
-        That is its ablation; of ``sweeps=accuracy_time`` and ``price_list`` the overrides that were typed
-        (``base`` without any); of all other runs the method and its preset.
+        The name of an ablation; for runs of ``sweeps=accuracy_time`` and ``price_list`` the typed overrides
+        (``base`` without any); for all other runs the method and the preset.
         """
         known = self.config.get("variant") or {}
         if "name" in known:
@@ -78,9 +78,9 @@ class Result:
         return (self.config.get("variant") or {}).get("about", "")
 
     def against(self, variants: Iterable[str]) -> str:
-        """Choose the one of ``variants`` that this run is compared with.
+        """Choose from ``variants`` the one to compare this run with.
 
-        That is the one its config names, or else the one with most of this run's overrides and no others.
+        The one that the run's config names, or else the one with most of the run's overrides and no others.
 
         >>> run = Result(Path("run"), {"variant": {"name": "a=1 b=2 c=3"}})
         >>> run.against(["base", "a=1", "a=1 b=2", "a=1 d=4", "a=1 b=2 c=3"])
@@ -94,7 +94,7 @@ class Result:
 
     @property
     def effects(self) -> str:
-        """The effects of its method that were on; "" if it was not measured."""
+        """Names of the method's effects that were on; "" if the run was not measured."""
         return ", ".join(name for name, on in self.metrics.get("effects", {}).items() if on)
 
     @property
@@ -104,18 +104,18 @@ class Result:
 
     @property
     def minutes(self) -> float | None:
-        """The minutes of its budget; None if steps bound it."""
+        """The minutes of the budget; None if only steps bound the run."""
         return self.config["budget"]["minutes"]
 
     @property
     def command(self) -> str:
-        """The command that made it."""
+        """The command that made the run."""
         return self.config.get("command") or f"forewarp-train # as {self.folder / 'config.yaml'}"
 
     @property
     def ability(self) -> str:
-        """The kind of test view that its numbers are of: ``all``, else ``time`` (between the training times),
-        else the kind it has.
+        """The kind of test view that ``numbers`` averages: ``all``, else ``time`` (between training times),
+        else the first kind there is.
         """
         known = self.metrics["test"]
         return [*(kind for kind in ("all", "time") if kind in known), *known, "all"][0]
@@ -145,7 +145,7 @@ def collect(root: Path, needed: Sequence[str] = ()) -> tuple[list[Result], list[
     """Read all runs below a folder.
 
     Args:
-        root: searched for ``config.yaml``.
+        root: folder to search for ``config.yaml``.
         needed: files that a run must hold, such as ``metrics.json``.
 
     Returns:
@@ -168,7 +168,7 @@ def collect(root: Path, needed: Sequence[str] = ()) -> tuple[list[Result], list[
             continue
         if absent:
             again = "run its command again"
-            if absent == ["accuracy_time.csv"]:  # it had no views for it
+            if absent == ["accuracy_time.csv"]:  # no views were held out
                 again = "run its command with data.held_out=8 into another folder"
             without.append(f"{folder.relative_to(root)}: no {', '.join(absent)}; {again}")
         else:
@@ -182,7 +182,7 @@ def collect(root: Path, needed: Sequence[str] = ()) -> tuple[list[Result], list[
 
 
 def _shorten(results: Sequence[Result]) -> None:
-    """Drop from names that are typed overrides those that all such runs of a scene share."""
+    """In names that are typed overrides, drop the overrides that all such runs of a scene share."""
     for found in by_scene(results).values():
         typed = [known for run in found if set(known := run.config.get("variant") or {}) == {"name"}]
         names = [(known["name"] or "").split() for known in typed]
@@ -206,7 +206,7 @@ def read_run(folder: Path) -> Result:
 
 
 def read_curve(folder: Path) -> tuple[Point, ...]:
-    """Read the rows of a run's ``accuracy_time.csv``; none if it has none."""
+    """Read the rows of a run's ``accuracy_time.csv``; a missing file has none."""
     path = folder / "accuracy_time.csv"
     if not path.is_file():
         return ()
@@ -237,7 +237,7 @@ def by_scene(results: Sequence[Result]) -> dict[str, list[Result]]:
 
 
 def left_out(title: str, lines: Sequence[str]) -> list[str]:
-    """Return the part of a page that lists the runs that ``collect`` could not use."""
+    """Return the section of a page that lists the runs ``collect`` could not use."""
     return [f"## {title}\n", "\n".join(f"* {line}" for line in lines) + "\n"] if lines else []
 
 

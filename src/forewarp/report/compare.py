@@ -20,13 +20,13 @@ _KEYS = ("protocol", "seconds", "test")
 def compare(folders: Sequence[Path]) -> Table:
     """Make a table with a row for each measure and a column for each run.
 
-    PSNR is of test views, in dB; with two runs their difference is added.
+    PSNR is that of the test views, in dB; for two runs a column with the difference is added.
 
     Args:
-        folders: of measured runs.
+        folders: folders of measured runs.
 
     Raises:
-        ValueError: if there are none, or one has no whole ``metrics.json``.
+        ValueError: if ``folders`` is empty, or a ``metrics.json`` is missing or incomplete.
     """
     if not folders:
         raise ValueError("runs: expected folders of runs, but got none; set runs=[FOLDER,FOLDER]")
@@ -70,7 +70,7 @@ def read_metrics(folder: Path) -> dict:
     """Read a run's ``metrics.json``.
 
     Raises:
-        ValueError: if there is none, or it lacks what ``forewarp-evaluate`` writes.
+        ValueError: if the file is missing, or lacks keys that ``forewarp-evaluate`` writes.
     """
     path = folder / "metrics.json"
     if not path.is_file():

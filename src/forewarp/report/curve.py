@@ -1,4 +1,4 @@
-"""Draw accuracy against training time, and find when a PSNR is reached and the Pareto front."""
+"""Draw accuracy against training time; find when a PSNR is reached, and the Pareto front."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _KEYS = ("name", "seconds", "psnr", "hardware", "source", "dataset")
 
 
 def seconds_to(curve: Sequence[Point], psnr: float) -> float | None:
-    """Return the seconds until a PSNR (dB) is first reached by two evaluations in a row; None if it never is.
+    """Return the seconds until two evaluations in a row first reach a PSNR (dB); None if none do.
 
     >>> curve = [Point(s, p, 0) for s, p in [(1, 20), (2, 25), (4, 24), (8, 26), (16, 27)]]
     >>> seconds_to(curve, 25), seconds_to(curve, 27)
@@ -29,7 +29,7 @@ def seconds_to(curve: Sequence[Point], psnr: float) -> float | None:
 
 
 def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
-    """Return the indices of the (seconds, psnr) that no other beats in both, in the order of time.
+    """Return the indices, by time, of the (seconds, psnr) points that no other point beats in both.
 
     >>> pareto_front([(2, 20), (1, 21), (4, 25), (3, 25)])
     [1, 3]
@@ -71,7 +71,7 @@ def read_published(path: Path) -> list[Published]:
 
 
 def draw_own(folder: Path) -> None:
-    """Draw a run's own curve into its ``accuracy_time.png``, if it has one and matplotlib is installed."""
+    """Draw a run's curve into ``accuracy_time.png``, if there is a curve and matplotlib is installed."""
     if points := read_curve(folder):
         try:
             print(f"curve    {draw_run(folder / 'accuracy_time.png', points, folder.name)}")
@@ -80,7 +80,7 @@ def draw_own(folder: Path) -> None:
 
 
 def draw_run(path: Path, curve: Sequence[Point], title: str) -> Path:
-    """Draw a run's PSNR against seconds, and its flow error if it is known."""
+    """Draw a run's PSNR, and the flow error if known, against seconds."""
     figure, axes = _axes(any(point.epe is not None for point in curve))
     _line(axes, curve, color="C0", linewidth=2)
     axes[0].set_title(title)
@@ -96,9 +96,9 @@ def draw_scene(
     """Draw all runs of a scene; color and name the groups on the Pareto front, and mark the front.
 
     Args:
-        path: of the picture.
-        groups: as ``collect.grouped`` returns them; a line for each run, a color for each group.
-        title: above the picture.
+        path: file of the picture.
+        groups: runs as grouped by ``collect.grouped``; a line for each run, a color for each group.
+        title: title above the picture.
         published: results of others, drawn as stars with their hardware; they may be of other scenes.
     """
     runs = [(key, run) for key, group in groups.items() for run in group]
@@ -132,10 +132,10 @@ def _axes(with_flow: bool, wide: bool = False):
     # Without pyplot, which keeps global state and looks for a display.
     figure = Figure(figsize=(7, 7.5 if with_flow else 4.5), layout="constrained")
     axes = figure.subplots(2 if with_flow else 1, 1, squeeze=False)[:, 0]
-    labels = ("PSNR of views set aside (dB)", "error of moving points (world units)")
+    labels = ("PSNR of held-out views (dB)", "error of moving points (world units)")
     for axis, label in zip(axes, labels):
         axis.set(xscale="log", xlabel="seconds of training", ylabel=label)
-        # Over many decades there is room for one tick each.
+        # An axis of many decades has room for one tick per decade.
         axis.xaxis.set_major_locator(LogLocator(subs=(1,) if wide else (1, 2, 5)))
         axis.xaxis.set_major_formatter("{x:g}")
         axis.xaxis.set_minor_formatter(NullFormatter())

@@ -13,7 +13,7 @@ from forewarp.report.curve import seconds_to
 from forewarp.report.tables import Column, Estimate, Table
 
 CHOICES = {"auto": "planned", "all_effects": "every effect", "full": "the paper's set", "base": "the preset"}
-WITHIN = 0.3  # dB below the PSNR of every effect at once that a planned run should reach in less time
+WITHIN = 0.3  # a planned run should come within this many dB of every effect at once, in less time
 
 INTRODUCTION = """# Only the effects a scene calls for
 
@@ -30,7 +30,7 @@ def write_effects(runs: Path, out: Path) -> list[Path]:
     """Write ``effects.md`` and ``effects.csv`` (every run).
 
     Args:
-        runs: folder that is searched for measured runs.
+        runs: folder to search for measured runs.
         out: folder to write to.
 
     Returns:
@@ -53,13 +53,13 @@ def write_effects(runs: Path, out: Path) -> list[Path]:
 
 
 def plan_of(result: Result) -> dict:
-    """Read the plan that a run follows; empty if it follows none."""
+    """Read the plan that a run follows; empty if there is none."""
     path = result.folder / "plan.yaml"
     return yaml.safe_load(read_text(path, MOST_CONFIG)) if path.is_file() else {}
 
 
 def compared(results: Sequence[Result]) -> Table:
-    """List for every scene what each choice reaches, mean over seeds, and last the mean over scenes."""
+    """List for every scene the numbers of each choice, mean over seeds; then the mean over scenes."""
     rows, columns = [], [Column("scene"), Column("seeds", 0)]
     columns += [Column(_title(results, choice)) for choice in CHOICES if _runs(results, choice)]
     columns += [Column("planned - every effect", signed=True), Column("seconds to it", 0)]
@@ -86,7 +86,7 @@ def _cells(results: Sequence[Result], found: Sequence[Result]) -> list:
 
 
 def called(results: Sequence[Result]) -> Table:
-    """List for every plan what it turned on, and what its scene was made to call for."""
+    """List for every plan the effects switched on, and the effects that the scene was made to call for."""
     rows = []
     for run in _runs(results, "auto"):
         wanted = sorted(run.config.get("calls_for") or [])
@@ -132,14 +132,14 @@ def every_run(results: Sequence[Result]) -> Table:
 
 
 def _runs(results: Sequence[Result], choice: str) -> list[Result]:
-    """Select the runs of a choice; of each scene and seed the one measured last."""
+    """Select the runs of a choice; for each scene and seed the one measured last."""
     found = [result for result in results if result.variant == choice]
     found.sort(key=lambda run: (run.folder / "metrics.json").stat().st_mtime_ns)
     return list({(run.scene, run.seed): run for run in found}.values())
 
 
 def _pairs(results: Sequence[Result], choice: str) -> list[tuple[Result, Result]]:
-    """Pair planned runs with those of another choice, of the same scene and seed."""
+    """Pair each planned run with the run of ``choice`` that has the same scene and seed."""
     others = {(run.scene, run.seed): run for run in _runs(results, choice)}
     own = [(run, others.get((run.scene, run.seed))) for run in _runs(results, "auto")]
     return [(run, other) for run, other in own if other is not None]

@@ -1,4 +1,4 @@
-"""Measure what an effect is worth: compare runs with it and without, pair by pair."""
+"""Measure the gain of an effect: compare runs with and without the effect, pair by pair."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ def measure_effect(pairs: Sequence[tuple[Numbers, Numbers]], measure: str) -> Es
     """Return the change of a measure over pairs of (with, without) that are equal in all else.
 
     Args:
-        pairs: numbers by name; a pair that lacks the measure is left out.
-        measure: its change is a difference if it is in ``DIFFERENCES``, else a quotient.
+        pairs: pairs of numbers by name; pairs without the measure are left out.
+        measure: name; if in ``DIFFERENCES`` the change is a difference, else a quotient.
 
     >>> measure_effect([({"psnr": 31.0, "step": 0.2}, {"psnr": 30.0, "step": 0.1})], "step")
     Estimate(mean=2.0, deviation=None)
@@ -32,14 +32,14 @@ def measure_effect(pairs: Sequence[tuple[Numbers, Numbers]], measure: str) -> Es
 
 @dataclass(frozen=True)
 class Gain:
-    """What an effect gained in trials.
+    """The gain of an effect in trials.
 
     Attributes:
-        psnr: dB, the mean change.
-        noise: dB, two standard errors of it, over all pairs or over the seeds' means, whichever is larger.
-        times: the factor by which a step takes longer.
-        steps: of each trial; None if the trials were of equal time.
-        seconds: of the trials with the effect and without.
+        psnr: mean change of PSNR, dB.
+        noise: two standard errors of ``psnr``, over all pairs or over the seeds' means, whichever is larger.
+        times: factor by which a step takes longer.
+        steps: steps of each trial; None if the trials had equal time.
+        seconds: seconds of the trials with and without the effect.
     """
 
     psnr: float
@@ -55,14 +55,14 @@ class Gain:
         steps: int | None,
         seconds: tuple[float, float] = (0.0, 0.0),
     ) -> Gain:
-        """Compute the gain from the pairs of each seed, one pair a view.
+        """Compute the gain; ``pairs`` has for each seed a (with, without) pair for each held-out view.
 
         Raises:
             ValueError: for a single pair, as its noise is unknown.
         """
         every = [pair for of_seed in pairs for pair in of_seed]
         if len(every) < 2:
-            raise ValueError(f"effect: expected at least 2 pairs, but got {len(every)}; set more views aside")
+            raise ValueError(f"effect: expected at least 2 pairs, but got {len(every)}; hold more views out")
         change = measure_effect(every, "psnr")
         means = Estimate.of([measure_effect(of_seed, "psnr").mean for of_seed in pairs])
         errors = [

@@ -24,7 +24,7 @@ INTRODUCTION = (
     "comparable with printed ones."
 )
 COUNTERPART = ": synthetic counterpart"
-# Entries of a run's protocol that the page tells.
+# Entries of a run's protocol that the page shows.
 TOLD = ("half_resolution", "scale", "split", "frames", "views", "train_frames", "test_views", "test_frames")
 TOLD += ("held_out", "canonical_time", "mask_box")
 DATASETS = ("dnerf", "hypernerf", "nhr", "lego_complete")
@@ -34,10 +34,10 @@ def write_paper(runs: Path, out: Path, published: Path = PAPER, curves: Path | N
     """Write ``paper.md``, ``paper.tex``, ``paper.html``, a CSV file a table, and the figures.
 
     Args:
-        runs: folder that is searched for measured runs.
+        runs: folder to search for measured runs.
         out: folder to write to.
         published: file of the printed numbers.
-        curves: folder of the pictures that ``kind=accuracy_time`` drew, which are shown too.
+        curves: folder of the pictures drawn by ``kind=accuracy_time``, shown too.
 
     Returns:
         the files written.
@@ -60,7 +60,7 @@ def write_paper(runs: Path, out: Path, published: Path = PAPER, curves: Path | N
 
 
 def newest(results: Sequence[Result]) -> tuple[list[Result], list[Result]]:
-    """Split runs into the last measured of those with equal table entries, and the others."""
+    """Of runs with the same table entry select the one measured last; return these runs, and the others."""
     kept: dict[tuple, Result] = {}
     for run in sorted(results, key=lambda run: (run.folder / "metrics.json").stat().st_mtime_ns):
         kept[run.dataset, run.is_counterpart, run.scene, run.seed, row_of(run)] = run
@@ -69,7 +69,7 @@ def newest(results: Sequence[Result]) -> tuple[list[Result], list[Result]]:
 
 
 def sections_of(table: PaperTable, results: Sequence[Result]) -> list[Section]:
-    """Make the table as the paper has it, and that of the synthetic counterparts that were measured."""
+    """Make the paper's table, and a table of the synthetic counterparts if any were measured."""
     real = [run for run in results if not run.is_counterpart]
     made = [run for run in results if run.is_counterpart]
     printed = with_means(table, real)
@@ -85,7 +85,7 @@ def sections_of(table: PaperTable, results: Sequence[Result]) -> list[Section]:
 
 
 def facts(runs: Sequence[Result]) -> list[str]:
-    """Tell how the numbers came about: protocol, machine, budget, date and command."""
+    """State protocol, machine, budget, date and command of the runs."""
     if not runs:
         return ["measured: nothing yet"]
     days = sorted({_day(run) for run in runs})
@@ -101,7 +101,7 @@ def facts(runs: Sequence[Result]) -> list[str]:
 
 
 def figures_of(results: Sequence[Result], out: Path, curves: Path | None) -> tuple[list[Section], list[Path]]:
-    """Draw what these runs allow, and add the pictures in ``curves``; without matplotlib say so."""
+    """Draw what these runs allow, and add the pictures in ``curves``; say if matplotlib is missing."""
     try:
         found = _draw(results, out)
     except ImportError as error:
@@ -112,7 +112,7 @@ def figures_of(results: Sequence[Result], out: Path, curves: Path | None) -> tup
         if path.parent.resolve() != out.resolve():
             shutil.copyfile(path, out / path.name)
     if drawn := sorted(out.glob("accuracy-time-*.png")):
-        lines = ["runs of their own, with views set aside: forewarp-report kind=accuracy_time"]
+        lines = ["separate runs, with views held out: forewarp-report kind=accuracy_time"]
         sections.append(Section("Accuracy against training time", facts=lines, pictures=drawn))
     return sections, [path for _, path, _ in found]
 
@@ -133,7 +133,7 @@ def _draw(results: Sequence[Result], out: Path) -> list[tuple[str, Path | None, 
 
 
 def _pairs(runs: Sequence[Result]) -> dict[str, list[Result]]:
-    """Return scene -> a forward and a backward run of it, equal in preset, budget and seed."""
+    """Return for each scene a forward and a backward run, equal in preset, budget and seed."""
     equal: dict[tuple, dict[str, Result]] = {}
     for run in runs:
         row = row_of(run)

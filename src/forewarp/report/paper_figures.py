@@ -14,14 +14,14 @@ from forewarp.report.collect import Result
 from forewarp.report.paper_tables import row_of
 from forewarp.report.tables import Estimate
 
-RESOLUTION = re.compile(r"resolution |voxels_\d")  # begins a variant of sweeps=resolution, now and before 0.3
+RESOLUTION = re.compile(r"resolution |voxels_\d")  # variants of sweeps=resolution, now and before 0.3
 GAP = 4  # pixels between the parts of a sheet
 
 
 def draw_resolution(path: Path, results: Sequence[Result]) -> Path | None:
-    """Draw PSNR against voxels along a side, a line a scene, of runs of ``sweeps=resolution``.
+    """Draw PSNR against voxels along a side for runs of ``sweeps=resolution``, one line per scene.
 
-    Returns None where no scene has two sizes.
+    Return None if no scene has two sizes.
     """
     scenes: dict[str, dict[int, list[float]]] = {}
     for run in results:
@@ -50,7 +50,7 @@ def draw_resolution(path: Path, results: Sequence[Result]) -> Path | None:
 def draw_canonical(path: Path, forward: Result, backward: Result) -> Path | None:
     """Draw the view nearest to the canonical time: truth, forward, backward, and both errors.
 
-    Returns None if the two runs have no sheet of a view in common.
+    Return None if the two runs share no view with a sheet.
     """
     both = sorted(set(_sheets(forward)) & set(_sheets(backward)))
     if not both:

@@ -31,9 +31,9 @@ class Measured:
     runs: tuple[Result, ...]
 
     def cell(self, group: Group, metric: str) -> Estimate | None:
-        """Estimate a metric's mean over the scenes of a group, over the seeds that all of them have.
+        """Estimate a metric's mean over the scenes of a group, over the seeds that all scenes have.
 
-        None if there is no such seed, or the scenes' images differ in size or background.
+        Return None if there is no such seed, or the scenes' images differ in size or background.
         """
         found, conditions = {}, set()
         for run in self.runs:
@@ -49,7 +49,7 @@ class Measured:
 
     @property
     def seconds(self) -> float:
-        """The mean training time of its runs."""
+        """The mean training seconds of the runs."""
         return fmean(run.metrics["seconds"]["train"] for run in self.runs)
 
 
@@ -90,12 +90,12 @@ def measured(table: PaperTable, results: Sequence[Result]) -> list[Measured]:
 def comparison(table: PaperTable, results: Sequence[Result], *, difference: bool = True) -> Table:
     """Make a table of the measured rows, then the published ones.
 
-    The best and the second of each column are marked among the measured rows alone.
+    In each column mark the best and the second best of the measured rows.
 
     Args:
-        table: as printed.
-        results: of its scenes.
-        difference: add after each measured row its difference from the paper's.
+        table: the paper's table.
+        results: the runs of the table's scenes.
+        difference: after each measured row add the difference from the paper's row.
     """
     rows, ranked, kinds = [], [], ["measured", "difference to the paper", "published"]
     for row in measured(table, results):
@@ -118,7 +118,7 @@ def comparison(table: PaperTable, results: Sequence[Result], *, difference: bool
 
 
 def counterpart(table: PaperTable, results: Sequence[Result]) -> PaperTable | None:
-    """Return the table for the measured synthetic scenes, without printed rows; None if none."""
+    """Return the table for the measured synthetic scenes, without printed rows, or None."""
     groups = {}
     for group in table.groups:
         for scene in sorted({run.scene for run in results if run.dataset == group.dataset}):
@@ -129,7 +129,7 @@ def counterpart(table: PaperTable, results: Sequence[Result]) -> PaperTable | No
 
 
 def with_means(table: PaperTable, results: Sequence[Result]) -> PaperTable:
-    """Add the means that the table asks for, and that of the measured scenes if it is another."""
+    """Add the means that the table asks for, and the mean of the measured scenes if these are others."""
     if not table.means:
         return table
     scenes = max(
@@ -155,7 +155,7 @@ def _name(row: Row, runs: Sequence[Result], tell_device: bool) -> str:
     about = row.model if row.variant == "plain" else (runs[0].about or row.variant)
     seeds = len({run.seed for run in runs})
     parts = [f"forewarp: {about}", row.preset, *bounds, f"{seeds} seeds" if seeds > 1 else ""]
-    parts.append(f"{row.held_out} views set aside" if row.held_out else "")
+    parts.append(f"{row.held_out} views held out" if row.held_out else "")
     parts.append(str(row.device) if tell_device else "")
     return ", ".join(part for part in parts if part)
 
@@ -175,7 +175,7 @@ def _difference(cell: Estimate | None, printed: str) -> Difference | None:
 
 
 def _marks(table: PaperTable, rows: Sequence[Sequence[Cell]], ranked: Sequence[int]) -> dict:
-    """Mark the best and the second of each column; numbers that round to the same text are equal."""
+    """Mark the best and the second best of each column; numbers that round to the same text tie."""
     marks = {}
     for number, (_, metric) in enumerate(table.columns, 2):
         _, digits, more, _ = METRICS[metric]

@@ -1,4 +1,4 @@
-"""Write the price list: what each choice changes, against the same run without it."""
+"""Write the price list: what each choice changes, compared with the same run without the choice."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def write_price_list(runs: Path, out: Path) -> list[Path]:
     """Write ``price-list.md`` and ``price-list.csv`` (every run's own numbers).
 
     Args:
-        runs: folder that is searched for measured runs.
+        runs: folder to search for measured runs.
         out: folder to write to.
 
     Returns:
@@ -56,7 +56,7 @@ def write_price_list(runs: Path, out: Path) -> list[Path]:
 
 
 def references(results: Sequence[Result]) -> Table:
-    """List the numbers of the runs that others are compared with."""
+    """List the numbers of the reference runs."""
     variants = {result.variant for result in results}
     names = {result.against(variants) for result in results}
     rows = []
@@ -71,7 +71,7 @@ def references(results: Sequence[Result]) -> Table:
 
 
 def changes(results: Sequence[Result]) -> Table:
-    """List what every other variant changes."""
+    """List the changes of every other variant against its reference."""
     own = {(result.variant, result.seed): result for result in results}
     variants, rows = sorted({result.variant for result in results}), []
     for (variant, _), group in grouped(results).items():

@@ -17,8 +17,7 @@ PAPER = Path(__file__).with_name("paper.yaml")
 class Group:
     """Columns that are a mean over ``scenes`` of a dataset.
 
-    ``ability`` is the kind of test view; None: all, or those between the training times if a scene tells its
-    views apart.
+    ``ability`` is the kind of test view; None: all, or ``time`` if a scene has several kinds.
     """
 
     name: str
@@ -30,9 +29,9 @@ class Group:
 
 @dataclass(frozen=True)
 class Row:
-    """A printed row, its numbers as text, "" for none.
+    """A printed row, numbers as text, "" for a missing number.
 
-    ``variant`` names the measured runs that are compared with it; None for methods of others.
+    ``variant`` names the measured runs to compare with the row; None for methods of others.
     """
 
     name: str
@@ -44,8 +43,7 @@ class Row:
 class PaperTable:
     """One of the paper's tables.
 
-    ``variants`` are those whose measured rows belong to it; ``means`` are more groups to compute, as name and
-    scenes.
+    ``variants``: the measured variants to show; ``means``: more groups to compute, as name and scenes.
     """
 
     key: str
@@ -63,7 +61,7 @@ class PaperTable:
         return [(group, metric) for group in self.groups for metric in group.metrics]
 
     def with_mean(self, name: str, scenes: tuple[str, ...]) -> PaperTable:
-        """Add a group that is the mean of groups of one scene each; printed rows keep their digits."""
+        """Add a group: the mean of groups of one scene each; printed rows keep their digits."""
         found = [group for group in self.groups if len(group.scenes) == 1 and group.scenes[0] in scenes]
         metrics = found[0].metrics
         more = Group(name, found[0].dataset, metrics, tuple(scenes))
@@ -79,9 +77,9 @@ def read_paper(path: Path) -> dict[str, PaperTable]:
     """Read tables by key from a YAML file such as ``PAPER``.
 
     Raises:
-        ValueError: if the file is no YAML or lacks a key, or a row is of another length than its table.
+        ValueError: if the file is no YAML or lacks a key, or a row has another length than its table.
     """
-    # Without types, so that 30.50 stays as printed.
+    # Read all values as text, so that 30.50 stays as printed.
     try:
         content = yaml.load(read_text(Path(path), MOST_CONFIG), Loader=yaml.BaseLoader)
         return {key: _table(key, entry, content["datasets"]) for key, entry in content["tables"].items()}

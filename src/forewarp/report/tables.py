@@ -31,7 +31,7 @@ class Estimate:
 
 
 class Difference(float):
-    """A number that is written with its sign."""
+    """A number, written with its sign."""
 
 
 Cell = Estimate | float | int | str | None
@@ -40,7 +40,7 @@ MARKS = {"best": "**{}**", "second": "<u>{}</u>"}  # in Markdown
 
 @dataclass(frozen=True)
 class Column:
-    """A column's title and how its numbers are written; ``prefix`` stands before each of them."""
+    """A column's title and number format; ``prefix`` stands before each number."""
 
     name: str
     digits: int = 2
@@ -67,11 +67,11 @@ class Table:
     """A table with a caption.
 
     Attributes:
-        columns: from left to right.
-        rows: each with as many cells as there are columns; a published number is a string, as printed.
-        caption: stands above the table.
+        columns: the columns, from left to right.
+        rows: rows of cells, one per column; a published number is a string, as printed.
+        caption: text above the table.
         marks: (row, column) -> ``best`` or ``second``.
-        rules: rows with a line above them, in LaTeX and HTML.
+        rules: indices of rows with a line above, in LaTeX and HTML.
     """
 
     columns: Sequence[Column]
@@ -101,15 +101,15 @@ class Table:
 
     @property
     def numeric(self) -> list[bool]:
-        """Which columns hold only numbers."""
+        """Whether each column holds only numbers."""
         return [all(_is_number(row[i]) for row in self.rows) for i in range(len(self.columns))]
 
     def texts(self, marks: Mapping[str, str], escape: Callable[[str], str] = str) -> list[list[str]]:
         """Format all cells.
 
         Args:
-            marks: mark -> how a marked cell is written, with ``{}`` for its text.
-            escape: applied to the text of each cell before that.
+            marks: mark -> format of a marked cell, with ``{}`` for the text.
+            escape: function applied to the text of each cell first.
         """
         return [
             [

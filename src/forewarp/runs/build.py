@@ -24,7 +24,7 @@ def build_run(config: DictConfig) -> Run:
     """Build a run from its config; nothing is read or computed yet.
 
     Raises:
-        ValueError: naming the key of the config that is wrong.
+        ValueError: naming the wrong key of the config.
     """
     if config.threads is not None:
         if not (isinstance(config.threads, int) and config.threads >= 1):
@@ -38,7 +38,7 @@ def build_run(config: DictConfig) -> Run:
 
     def make_trainer(folder: Path, callbacks: list):
         return trainer(
-            # Lightning would choose the GPU of a Mac, which has no float64.
+            # With auto, Lightning would choose a Mac's GPU, which lacks float64.
             accelerator=device_of(config.trainer.accelerator).type,
             max_epochs=1,
             max_steps=-1,
@@ -69,14 +69,14 @@ def build_run(config: DictConfig) -> Run:
 
 
 def stored_run(folder: str | Path, trust: str | Sequence[str] | None = None) -> Run:
-    """Build the run in a folder from its own config; nothing is read or computed yet.
+    """Build the run in a folder from the config stored there; nothing is read or computed yet.
 
     Args:
-        folder: of the run.
-        trust: packages beside forewarp whose code its config may name, as ``trust_of`` takes them.
+        folder: the run's folder.
+        trust: packages beside forewarp whose code the config may name, as for ``trust_of``.
 
     Raises:
-        ValueError: if it is no run, or its config names code that is not trusted.
+        ValueError: if the folder holds no run, or the config names code that is not trusted.
     """
     trust = trust if trust is None or isinstance(trust, str) else list(trust)
     return build_run(saved_config(str(folder), OmegaConf.create({"trust": trust})))
@@ -86,7 +86,7 @@ def model_of(config: DictConfig) -> Callable:
     """Return the function that makes a stage's method, from the ``model`` part of a config."""
     content = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     content.pop("name", None)
-    model = instantiate(OmegaConf.create({"model": content}).model, _convert_="all")  # its key, for errors
+    model = instantiate(OmegaConf.create({"model": content}).model, _convert_="all")  # errors name the key
     if not callable(model):
         raise ValueError(
             f"model: expected a method that waits for its start, but got {type(model).__name__}; "
@@ -96,7 +96,7 @@ def model_of(config: DictConfig) -> Callable:
 
 
 def stage_of(name: str, config: DictConfig | None) -> StagePlan | None:
-    """Make a stage without its budget; a stage that names a ``model`` has a method of its own."""
+    """Make a stage, without budget; a stage with a ``model`` has a method of its own."""
     if config is None:
         return None
     content = OmegaConf.to_container(config, resolve=True)
@@ -112,7 +112,7 @@ def stage_of(name: str, config: DictConfig | None) -> StagePlan | None:
 
 
 def _callbacks(run: Run, watchers: list[Callable], name: str) -> list:
-    """Make the callbacks of a stage; the progress line learns what the later stages may take."""
+    """Make the callbacks of a stage; tell the progress line how long the later stages may take."""
     made = [watcher() for watcher in watchers]
     for line in made:
         if isinstance(line, StageProgress):
@@ -121,7 +121,7 @@ def _callbacks(run: Run, watchers: list[Callable], name: str) -> list:
 
 
 def measure_run(run: Run, module: DynamicSceneModule, config: DictConfig) -> dict:
-    """Evaluate a fitted run as its config says; print and return the numbers."""
+    """Evaluate a fitted run by its config; print and return the numbers."""
     protocol = {"method": method_name(config), "preset": config.preset.name, "seed": config.seed}
     protocol |= {"minutes": config.budget.minutes, "iterations": config.budget.iterations}
     extra = config.lpips_weights
@@ -136,19 +136,19 @@ def measure_run(run: Run, module: DynamicSceneModule, config: DictConfig) -> dic
 
 
 def method_name(config: DictConfig) -> str:
-    """Name the method that is measured: that of the last stage, or else the run's."""
+    """Name the measured method: the last stage's own method, else the run's."""
     own = [stage.get("model") for stage in config.stage.values() if stage is not None][-1]
     return (own or config.model).get("name", config.model.name)
 
 
 def is_measured(run: Run) -> bool:
-    """Tell whether a run is finished and was measured since."""
+    """Tell whether a run is finished and was measured after that."""
     metrics = Path(run.folder) / "metrics.json"
     return read_json(metrics) is not None and is_current(metrics, run)
 
 
 def is_current(file: Path, run: Run) -> bool:
-    """Tell whether a run is finished and a file was written since."""
+    """Tell whether a run is finished and a file was written after that."""
     if not all(run.is_finished(stage) for stage in run.stages):
         return False
     done = [run.stage_folder(stage) / "done.json" for stage in run.stages]

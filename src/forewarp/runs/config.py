@@ -1,4 +1,4 @@
-"""Keep a run's config in its folder, read it back, and tell runs apart by it.
+"""Keep a run's config in its folder, read it back, and tell runs apart by their configs.
 
 Nothing here loads torch, so that a mistyped command is answered at once.
 """
@@ -17,7 +17,7 @@ from forewarp.files import MOST_CONFIG, read_text, replace_file
 from forewarp.runs.overrides import command_line, key_of, typed_overrides
 from forewarp.runs.trust import trust_of, trusted_config
 
-# Two runs differ if these do; where they run and what is shown of them does not count.
+# Two runs differ if these keys differ; device, folder and what is shown do not count.
 IDENTITY = ("data", "model", "objective", "stage", "preset", "budget", "seed")
 # Named first in a refusal, as other differences follow from these.
 TYPED = ("data.scene", "data.root", "seed", "preset", "budget")
@@ -30,10 +30,10 @@ MAY_CHANGE = (
 
 
 def hashed(config: DictConfig) -> DictConfig:
-    """Replace ``{hash}`` in the key ``run`` by ten digits of a hash of all that tells runs apart.
+    """Replace ``{hash}`` in the key ``run`` by ten digits of a hash of the keys that tell runs apart.
 
-    So each configuration has a folder of its own, and a finished job is found again. For a run bounded by
-    minutes the device counts too.
+    So each config has a folder of its own, and a finished job is found again. For a run bounded by minutes
+    the device and the precision count too.
     """
     if HASH in str(config.run):
         config.run = str(config.run).replace(HASH, content_hash(config))
@@ -61,8 +61,8 @@ def claim(config: DictConfig, *, finished: bool = False) -> None:
     """Write the resolved config into the run's folder, unless the folder holds another run.
 
     Args:
-        config: of the run; its key ``run`` names the folder.
-        finished: only check; a finished run keeps the config it was measured with.
+        config: the run's config; the key ``run`` names the folder.
+        finished: if true, check but write nothing: a finished run keeps the config it was measured with.
 
     Raises:
         ValueError: if the folder holds a run of another config, or checkpoints without a config.
@@ -87,17 +87,17 @@ def claim(config: DictConfig, *, finished: bool = False) -> None:
 
 
 def saved_config(run: str | None, changes: DictConfig, key: str = "run") -> DictConfig:
-    """Read the config in a run's folder and apply what the command line may change of it.
+    """Read the config in a run's folder and apply the changes that the command line may make.
 
     Args:
         run: the run's folder.
-        changes: the command's own config; of its keys ``trainer``, ``threads``, ``lpips_weights``, ``sheets``
+        changes: the command's own config; the keys ``trainer``, ``threads``, ``lpips_weights``, ``sheets``
             and ``data.root`` are applied if they are not null. ``trust`` names packages whose code the run's
             config may name.
-        key: that named the folder, for errors.
+        key: name of the key that holds the folder, for errors.
 
     Raises:
-        ValueError: if there is no run, or its config names code that is not trusted.
+        ValueError: if there is no run, or the config names code that is not trusted.
     """
     if run is None:
         raise ValueError("run: expected the folder of a run, but got nothing; set run=runs/...")
@@ -117,7 +117,7 @@ def saved_config(run: str | None, changes: DictConfig, key: str = "run") -> Dict
 
 
 def resumed(config: DictConfig) -> DictConfig:
-    """With ``resume=<folder>``: return that run's config, with the typed keys that may change.
+    """With ``resume=<folder>``: return the config in the folder, with the typed keys that may change.
 
     Raises:
         ValueError: if another key was typed, or the folder holds no run.
@@ -145,13 +145,13 @@ def read_config(path: Path, trust: Sequence[str] | None = ()) -> DictConfig:
     """Read the config in a run's folder; ``trust`` as in ``trusted_config``.
 
     Raises:
-        ValueError: if it is no config of a run, is of an earlier version, or is not to be trusted.
+        ValueError: if the file is no config of a run, is of an earlier version, or names untrusted code.
     """
     return parsed(read_text(path, MOST_CONFIG), path, trust)
 
 
 def parsed(text: str, path: Path, trust: Sequence[str] | None = ()) -> DictConfig:
-    """Do as ``read_config`` with text; ``path`` names it in errors."""
+    """Parse the text of a config like ``read_config``; ``path`` is named in errors."""
     _refuse_earlier_version(trusted_config(text, path, None), path)
     config = trusted_config(text, path, trust)
     for key in (*IDENTITY, "trainer", "logger", "callbacks"):

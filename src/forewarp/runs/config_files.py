@@ -12,7 +12,7 @@ PACKAGE = Path(__file__).resolve().parents[1]
 def project_root() -> Path:
     """Return the folder that holds ``conf/`` and ``sweeps/``.
 
-    It is what ``FOREWARP_ROOT`` names, or else the installed package, or else the checkout.
+    The folder that ``FOREWARP_ROOT`` names, else the installed package, else the checkout.
 
     Raises:
         ValueError: if that folder has no ``conf/``.
@@ -31,7 +31,7 @@ def project_root() -> Path:
 def configurations() -> Path:
     """Return ``conf/``, ready for Hydra: ``sweeps=NAME`` is registered, and ``paths.root`` is set.
 
-    ``paths.root`` is the checkout; of an installed package it is the current folder.
+    ``paths.root`` is the checkout, or the current folder for an installed package.
     """
     root = project_root()
     if root != PACKAGE:

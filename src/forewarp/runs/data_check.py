@@ -1,4 +1,4 @@
-"""Note the data that a run begins with, and notice when they change."""
+"""Record the data that a run begins with, and notice changes."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ CHOICES = ("refuse", "accept")
 
 
 def check_data(run: Run, changed: str) -> None:
-    """Compare the scene's files with those that the run began with, and note them in ``data.json``.
+    """Compare the scene's files with those recorded in the run's ``data.json``; record them at first.
 
     Args:
-        run: whose data are compared.
-        changed: what to do if they differ: ``refuse``, or ``accept`` and note them anew.
+        run: the run whose data are compared.
+        changed: what to do if files differ: ``refuse``, or ``accept`` and record them anew.
 
     Raises:
         ValueError: naming what changed.
@@ -40,7 +40,7 @@ def check_data(run: Run, changed: str) -> None:
 
 
 def warn_if_changed(run: Run) -> None:
-    """Warn on stderr if the scene's files differ from those that the run began with."""
+    """Warn on stderr if the scene's files differ from those in ``data.json``."""
     path, now = Path(run.folder) / FILE, run.datamodule.fingerprint()
     if now is not None and (found := _change(run, read_json(path), now)):
         print(

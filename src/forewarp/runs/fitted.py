@@ -43,8 +43,8 @@ class Fitted:
     ['canonical', 'space', 'time']
 
     Attributes:
-        folder: of the run.
-        config: of the run.
+        folder: the run's folder.
+        config: the run's config.
         module: the fitted module; ``module.method`` is the method.
         scene: cameras, times, box.
     """
@@ -75,11 +75,11 @@ class Fitted:
         """Render the scene from a camera at a time: a picture (H, W, 3) in [0, 1], on the CPU.
 
         Args:
-            camera: ``frame.camera``, or one of your own; ``camera.resized(w, h)`` is another size of it.
-            time: in [0, 1].
+            camera: ``frame.camera``, or one of your own; ``camera.resized(w, h)`` changes the size.
+            time: time in [0, 1].
             background: white, black, or a colour (3,) in [0, 1].
 
-        Cost: consecutive pictures of one time share its snapshot.
+        Cost: consecutive pictures of one time share one snapshot.
         """
         if not 0 <= time <= 1:
             raise ValueError(f"time: expected a number in [0, 1], but got {time}")
@@ -92,7 +92,7 @@ class Fitted:
         return drawn.rgb.clamp(0, 1).reshape(camera.height, camera.width, 3).cpu()
 
     def trajectories(self, points: Tensor, times: Sequence[float]) -> Tensor:
-        """Follow canonical points (N, 3), world units, to ``times`` (T,) in [0, 1]; returns (N, T, 3)."""
+        """Follow canonical points (N, 3), world units, to ``times`` (T,) in [0, 1]; return (N, T, 3)."""
         method = self._able(HasTrajectories, "follows points")
         with torch.no_grad():
             at = torch.as_tensor(times, dtype=torch.float32, device=self.module.device)

@@ -19,8 +19,8 @@ from forewarp.files import read_text, replace_file
 def locked(folder: Path) -> Iterator[None]:
     """Lock a run's folder for the duration of the block; make the folder if it is missing.
 
-    The system holds the lock, so it ends with the process, even if that is killed. A file system without
-    locks is used without one. ``.lock`` names the process and stays behind.
+    The system holds the lock, so it ends with the process, even if killed. On a file system that does
+    not support locks, go on unlocked. ``.lock`` names the process and stays behind.
 
     Raises:
         ValueError: if another process holds the lock; names it.

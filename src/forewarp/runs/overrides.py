@@ -1,4 +1,4 @@
-"""The overrides of a command line: what was typed, which of two wins, and names that earlier versions had."""
+"""The overrides of a command line: list and merge them, and refuse names of earlier versions."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import re
 import shlex
 from collections.abc import Sequence
 
-OF_A_SWEEP = ("sweeps=", "seeds=", "launcher=")  # say how jobs are run, not what one is
+OF_A_SWEEP = ("sweeps=", "seeds=", "launcher=")  # these say how jobs are run, not what a job computes
 
 _OF_PRESET = "rays|background|bases|nodes|padding|alpha_threshold|skip_alpha|inpainter_width"
 SINCE_3 = "renamed in 0.3"

@@ -1,4 +1,4 @@
-"""Score a job of a sweep on views that nothing was trained on."""
+"""Score a job of a sweep on views that were not trained on."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ ADVICE = "set data.held_out=8"
 class Score:
     """The number that a job returns in ``--multirun``, or if ``score`` was typed.
 
-    It is the mean of a metric over whole pictures: of the views held out (``data.held_out``), or else of up
-    to 8 validation views, never of test views. It is kept in the run's ``score.json``.
+    The mean of a metric over whole pictures: of the held-out views (``data.held_out``), or else of up to 8
+    validation views, never of test views. Stored in the run's ``score.json``.
 
     Args:
-        run: with its scene read.
+        run: the run, its scene already read.
         config: ``score`` (the metric), ``lpips_weights`` and ``trainer``.
 
     Raises:
-        ValueError: if the metric is no validation metric, or a sweeper needs a score that there cannot be.
+        ValueError: if the metric is no validation metric, or the sweeper needs a score and there can be none.
     """
 
     def __init__(self, run: Run, config: DictConfig) -> None:
@@ -50,7 +50,7 @@ class Score:
         """Return the score, measured now or read from ``score.json``; None if there is none.
 
         Args:
-            module: the fitted module; None: loaded if it is needed.
+            module: the fitted module; None: load the module if needed.
         """
         if self.without:
             return None
@@ -62,7 +62,7 @@ class Score:
         return value
 
     def _stored(self) -> dict:
-        """Read the scores in ``score.json``, if they are of the run as it is now."""
+        """Read the scores in ``score.json``, unless the run was trained after they were written."""
         path = Path(self.run.folder) / FILE
         scores = (read_json(path) or {}).get("scores")
         return scores if isinstance(scores, dict) and is_current(path, self.run) else {}
@@ -72,7 +72,7 @@ class Score:
         return f"{count} {'held out' if held else 'validation'} view{'s' * (count != 1)}"
 
     def _lacks(self) -> str | None:
-        """Say why there can be no score, as far as it is known before training; None if there can."""
+        """Return why the run can have no score, as far as this is known before training, or None."""
         if not len(self.run.datamodule.watched()):
             return f"the scene has no validation views and none are held out; {ADVICE}"
         nets = [net for net in NETS if f"lpips_{net}" == self.name]
@@ -103,10 +103,10 @@ class Score:
 
 
 def named(score: object) -> str | None:
-    """Return the metric that ``score`` names; None for none.
+    """Return the metric, or None if ``score`` is null.
 
     Raises:
-        ValueError: if it is no metric of validation views, or the sweeper would maximise a distance.
+        ValueError: if ``score`` is no validation metric, or the sweeper maximises a distance (LPIPS).
     """
     if score is None:
         return None
@@ -123,7 +123,7 @@ def named(score: object) -> str | None:
 
 
 def wanted() -> bool:
-    """Tell whether anyone uses the score: a sweep, or who typed it."""
+    """Tell whether the score is used: in a sweep, or if ``score`` was typed."""
     return HydraConfig.initialized() and (HydraConfig.get().mode == RunMode.MULTIRUN or _is_typed())
 
 
@@ -132,7 +132,7 @@ def _is_typed() -> bool:
 
 
 def searching() -> bool:
-    """Tell whether the sweeper chooses jobs by the scores of earlier ones."""
+    """Tell whether the sweeper chooses jobs by the scores of earlier jobs."""
     return "_target_" in (sweeper := _sweeper()) and not sweeper._target_.endswith(".BasicSweeper")
 
 
@@ -143,7 +143,7 @@ def _sweeper() -> DictConfig:
 
 
 class TellBest(Callback):
-    """Names the best job at the end of a search."""
+    """Print the best job at the end of a search."""
 
     def on_multirun_end(self, config: DictConfig, **_) -> None:
         """Print the best job from the sweeper's ``optimization_results.yaml``."""

@@ -18,7 +18,7 @@ from forewarp.files import MOST_CONFIG
 
 MOST_LEVELS = 40
 TRUST_VARIABLE = "FOREWARP_TRUST"
-# Allowed beside the classes of forewarp. Whole names, as all of torch can be reached through a prefix.
+# Allowed beside the classes of forewarp. Listed by full name, as a prefix would allow all of torch.
 ELSEWHERE = {
     "lightning.Trainer",
     "lightning.pytorch.Trainer",
@@ -26,20 +26,20 @@ ELSEWHERE = {
     "lightning.pytorch.loggers.TensorBoardLogger",
 }
 _RESERVED = {"_target_", "_partial_", "_recursive_", "_convert_"}
-_PARTS = {"name", "version", "sub_dir"}  # of the path that a logger writes to
+_PARTS = {"name", "version", "sub_dir"}  # keys that make up the path a logger writes to
 
 
 def trusted_config(text: str, where: Path, trust: Sequence[str] | None = ()) -> DictConfig:
-    """Parse a resolved config and refuse it if it is not safe to instantiate.
+    """Parse a resolved config; refuse a config that is not safe to instantiate.
 
     Args:
         text: the YAML.
-        where: it comes from, for errors.
-        trust: packages whose code it may name, as ``trust_of`` returns them; no other package is imported.
-            None: its targets are not checked, for a config that is only compared and never instantiated.
+        where: the file, named in errors.
+        trust: packages whose code the config may name; no other package is imported.
+            None: do not check targets, for a config that is only compared and never instantiated.
 
     Raises:
-        ValueError: if it is no YAML mapping, uses aliases or interpolations, or is nested too deeply; if a
+        ValueError: if the text is no YAML mapping, has aliases or interpolations, or is nested too deep; if a
             ``_target_`` is neither a class of forewarp (named by the module that defines it), nor in
             ``ELSEWHERE``, nor defined in a trusted package; or if a logger would write outside its stage's
             folder.
@@ -68,7 +68,7 @@ def trust_of(named: str | Iterable[str] | None = None) -> tuple[str, ...]:
         named: a name, several separated by commas, or a list; None: none.
 
     Raises:
-        ValueError: if one is no package name, as an empty one or a wildcard.
+        ValueError: for a name that is no package name, such as an empty one or a wildcard.
 
     >>> trust_of("theirs"), trust_of(["theirs", "other.part", "theirs"])
     (('theirs',), ('theirs', 'other.part'))
@@ -88,7 +88,7 @@ def trust_of(named: str | Iterable[str] | None = None) -> tuple[str, ...]:
 
 
 def without_trust(arguments: Sequence[str]) -> tuple[list[str], tuple[str, ...]]:
-    """Split a command line into the arguments that are no ``trust=...`` and the packages that those name.
+    """Split a command line into the arguments other than ``trust=...`` and the packages to trust.
 
     >>> without_trust(["run", "trust=[theirs,other]"])
     (['run'], ('theirs', 'other'))
@@ -100,13 +100,13 @@ def without_trust(arguments: Sequence[str]) -> tuple[list[str], tuple[str, ...]]
 
 
 def check_planned(config: DictConfig, trust: Sequence[str]) -> None:
-    """Check a composed config whose overrides came from a plan file, as a stored config is."""
+    """Check a config composed with overrides from a plan file, like a stored config."""
     where = f"plan={config.planned}"
     _check(OmegaConf.to_container(config, resolve=True), where, "", trust)
 
 
 def _check_events(text: str, where: Path) -> None:
-    """Refuse text that is too long to parse, and aliases and deep nesting, which grow when they are built."""
+    """Refuse long texts, aliases and deep nesting, which can exhaust memory or the stack."""
     if len(text) > MOST_CONFIG:
         raise ValueError(f"{where}: expected at most {MOST_CONFIG} characters, but got {len(text)}")
     level = 0
@@ -136,10 +136,10 @@ def _check(node: object, where: Path, key: str, trust: Sequence[str] | None) -> 
 
 
 def check_target(name: object, where: Path | str, key: str, trust: Sequence[str]) -> None:
-    """Refuse a ``_target_`` that is no class of forewarp, not in ``ELSEWHERE``, and of no trusted package.
+    """Refuse a ``_target_`` unless it is a class of forewarp, in ``ELSEWHERE``, or of a trusted package.
 
     Raises:
-        ValueError: saying where it stands, and how to trust its package.
+        ValueError: naming file and key, and how to trust the package.
     """
     if isinstance(name, str) and name in ELSEWHERE:
         return
@@ -172,7 +172,7 @@ def _check_foreign(name: str, refusal: str, trust: Sequence[str]) -> None:
     except Exception as error:  # an import may raise anything
         reason = str(error).partition("\n")[0] or type(error).__name__
         raise ValueError(f"{refusal}, which cannot be imported ({reason:.120})") from None
-    # What its modules import does not count: ``theirs.module.subprocess.run`` would reach everything.
+    # A module's own imports do not count, or ``theirs.module.subprocess.run`` would be allowed.
     home = getattr(found, "__module__", None)
     if not callable(found) or not isinstance(home, str):
         raise ValueError(f"{refusal}, which is nothing to call that {parts[0]} defines")
@@ -181,7 +181,7 @@ def _check_foreign(name: str, refusal: str, trust: Sequence[str]) -> None:
 
 
 def _located(parts: Sequence[str]) -> object:
-    """Import a dotted name: modules as far as there are any, then attributes."""
+    """Import a dotted name: first modules, then attributes."""
     found = importlib.import_module(parts[0])
     for i, part in enumerate(parts[1:], 2):
         if not hasattr(found, part) and inspect.ismodule(found):
@@ -195,7 +195,7 @@ def _is_below(name: str, trust: Sequence[str]) -> bool:
 
 
 def advice(name: str, trust: Sequence[str] = ()) -> str:
-    """Say how to trust the package of a name; empty for modules of Python itself.
+    """Say how to trust the package of a name; return "" for Python's own modules.
 
     >>> advice("theirs.Class", ["other"])
     '; if you trust the package theirs, add trust=[other,theirs] (or set FOREWARP_TRUST=other,theirs)'
@@ -208,7 +208,7 @@ def advice(name: str, trust: Sequence[str] = ()) -> str:
 
 
 def _check_logger(node: dict, where: Path, key: str) -> None:
-    """Refuse a logger whose name would lead out of the stage's folder, to which it is joined."""
+    """Refuse a logger whose name, appended to the stage's folder, would lead out of it."""
     for name in _PARTS & node.keys() if node["_target_"].endswith("Logger") else ():
         if not re.fullmatch(r"(\w[\w.-]*)?", str(node[name])):
             raise ValueError(

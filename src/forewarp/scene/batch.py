@@ -14,7 +14,7 @@ from forewarp.scene.view import Moment, View
 
 @dataclass(frozen=True)
 class Asks:
-    """What a method wants in a batch.
+    """What a method asks for in a batch.
 
     ``kind``: single ``pixels``, square ``crops`` of ``side`` pixels, or whole ``pictures``. ``neighbours``:
     how many of the nearest other training times to observe too. ``instant``: up to how many whole training
@@ -39,7 +39,7 @@ class Asks:
 @dataclass(frozen=True)
 class Observation:
     """Pixels of one picture: the true ``rgb`` (R, 3) in [0, 1] over ``background`` (3,) or (R, 3), the colour
-    where the ray meets nothing. If the method asks for ``straight`` pixels, ``rgb`` is (R, 4) uint8: colour
+    of rays that hit nothing. If the method asks for ``straight`` pixels, ``rgb`` is (R, 4) uint8: colour
     and alpha as stored.
     """
 
@@ -58,8 +58,8 @@ class Batch:
     """What one training step uses, as the method asked for it.
 
     ``observations``: first of the picked frame's time, then of neighbouring times. ``frame``: the index of
-    the picked training frame. ``instant``: whole training pictures of its time over white, for methods that
-    encode them; empty unless asked for.
+    the picked training frame. ``instant``: whole training pictures of that time over white, for methods
+    that encode them; empty unless asked for.
     """
 
     observations: tuple[Observation, ...]
@@ -73,7 +73,7 @@ class Batch:
 
     def joined(self) -> tuple[Rays, Tensor, Tensor]:
         """Concatenate the rays of all observations, on the CPU, with their true colours (R, 3) and
-        backgrounds (R, 3), or (3,) of a single one. For methods that ask for one time.
+        backgrounds (R, 3), or (3,) of a single observation. For methods that ask for one time.
         """
         rays = joined([one.view.rays() for one in self.observations])
         rgb = [one.rgb for one in self.observations]
@@ -97,7 +97,7 @@ class Batch:
 class Target:
     """A whole image to compare with: ``rgb`` (H, W, 3) in [0, 1] over ``background`` (3,).
 
-    Where known: ``foreground`` (H, W) bool, ``depth`` (H, W) exact ray depth in world units (0 on the
+    If known: ``foreground`` (H, W) bool, ``depth`` (H, W) exact ray depth in world units (0 on the
     background), ``index`` among the training frames.
     """
 
@@ -115,7 +115,7 @@ class Target:
 
     @property
     def view(self) -> View:
-        """The view of all its pixels."""
+        """The view of all the image's pixels."""
         return View(self.frame.camera)
 
     def to(self, device) -> Target:

@@ -1,4 +1,4 @@
-"""An axis-aligned box in world units, and the regular lattice of voxel centres inside one."""
+"""An axis-aligned box in world units, and the regular lattice of voxel centres in a box."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class Box:
     """An axis-aligned box: ``low`` and ``high`` are tuples of three floats in world units.
 
     Raises:
-        ValueError: where a side has no extent or a corner is not finite.
+        ValueError: if a side has no extent or a corner is not finite.
 
     >>> Box((-1, -1, -1), (1, 2, 1)).size
     (2.0, 3.0, 2.0)
@@ -86,7 +86,7 @@ class Lattice:
 
     @classmethod
     def of_count(cls, box: Box, count: float, least: int = 4) -> Lattice:
-        """Make a lattice of about ``count`` cubic voxels over a box; axes too flat for them get ``least``.
+        """Make a lattice of about ``count`` cubic voxels over a box; axes too flat get ``least`` voxels.
 
         >>> Lattice.of_count(Box((0, 0, 0), (1, 2, 1)), 2000).shape
         (10, 20, 10)
@@ -95,7 +95,7 @@ class Lattice:
         """
         flat: list[float] = []
         while len(flat) < 3:
-            # Take flat axes off first, or a planar scene gets a thousand times the voxels asked for.
+            # Take flat axes off first, or a planar scene gets a thousand times as many voxels.
             free = sorted(box.size)[len(flat) :]
             side = (math.prod(free) / (float(count) / least ** len(flat))) ** (1 / len(free))
             if round(free[0] / side) >= least:

@@ -44,7 +44,7 @@ class Camera:
 
         Args:
             pixels: flat indices (R,) into the row-major image, or None for all H*W.
-            dtype: of the result.
+            dtype: dtype of the result.
         """
         if pixels is None:
             pixels = torch.arange(self.width * self.height)
@@ -66,13 +66,13 @@ class Camera:
 
     def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Project world points (..., 3): pixel coordinates (..., 2) from the top-left corner, and depth along
-        the optical axis (...,); a point is visible only where that depth is positive.
+        the optical axis (...,); a point is visible only if this depth is positive.
         """
         pose = self.camera_to_world.to(points)
         local = (points - pose[:3, 3]) @ pose[:3, :3]
         z = local[..., 2]
         scale, shift = points.new_tensor([self.fx, self.fy]), points.new_tensor([self.cx, self.cy])
-        # A point beside the camera lies very far off in the picture; the bound is relative, so any unit does.
+        # A point beside the camera projects very far off; the bound is relative, so any unit of length works.
         least = torch.finfo(z.dtype).eps * local.detach().abs().amax(-1)
         safe = torch.where(z.abs() > least, z, torch.where(least > 0, least, 1.0))
         plane = local[..., :2] / safe[..., None]

@@ -30,14 +30,14 @@ class Cloud:
 
 @dataclass(frozen=True)
 class Handover:
-    """What a fitted stage passes on to the next, of any method.
+    """What a fitted stage passes on to the next stage, whatever their methods.
 
     Attributes:
         box: bounds of all matter at all training times, world units.
-        tight: False where the stage found no matter and kept its box.
+        tight: False if the stage found no matter and kept its own box.
         frames_in_play: training frames in use at the end of the stage.
-        cloud: a sample of the canonical matter; None where the method has none.
-        times: (T,) some training times, and ``paths`` (N, T, 3), the cloud's points at these; None where the
+        cloud: a sample of the canonical matter; None if the method has no ``matter``.
+        times: (T,) some training times, and ``paths`` (N, T, 3), the cloud's points at these; None if the
             method has no trajectories.
         notes: numbers for stages of the same method.
     """

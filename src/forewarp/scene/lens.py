@@ -10,7 +10,7 @@ from torch import Tensor
 
 from forewarp.ops.lens import distort, undistort, unfolded
 
-# In the plane at distance 1: outside every picture, yet in pixels still a 64-bit integer.
+# In the plane at distance 1: outside every picture, but small enough for 64-bit integers in pixels.
 _OUTSIDE, _ON_AXIS = 1e9, 1e-9
 
 
@@ -21,7 +21,7 @@ class Lens:
     Independent of the image size.
 
     Raises:
-        ValueError: for other counts or numbers that are not finite.
+        ValueError: for other numbers of coefficients, or coefficients that are not finite.
     """
 
     k: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -37,8 +37,8 @@ class Lens:
     def bend(self, points: Tensor) -> Tensor:
         """Distort points (..., 2) of the plane at distance 1; keeps the dtype.
 
-        A point beyond the lens's fold is invisible, though the polynomial would bring it back into the
-        picture: it is put far outside, in its own direction, as is what appears farther off.
+        Beyond the lens's fold points are invisible, though the polynomial would map them back into the
+        picture; such points, and points mapped still farther, are put far outside in their own direction.
         """
         # Float64, as the sixth power of points beside the camera exceeds the range of float32.
         plane = points.double()

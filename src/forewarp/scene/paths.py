@@ -15,7 +15,7 @@ from forewarp.scene.rays import Rays
 def focus_point(cameras: list[Camera]) -> Tensor:
     """Find the point nearest to all optical axes, least squares (3,), float64.
 
-    A single axis, or parallel ones, leave it free along them: it then lies midway between near and far.
+    For a single axis, or parallel ones, take the point midway between near and far.
     """
     centers = torch.stack([c.center.double() for c in cameras])
     axes = torch.stack([c.camera_to_world[:3, 2].double() for c in cameras])
@@ -27,13 +27,13 @@ def focus_point(cameras: list[Camera]) -> Tensor:
 
 
 def mean_up(cameras: list[Camera]) -> Tensor:
-    """Average the upward directions of the pictures (3,), float64, unit length; z where they cancel."""
+    """Average the upward directions of the pictures (3,), float64, unit length; z if they cancel."""
     up = -torch.stack([c.camera_to_world[:3, 1].double() for c in cameras]).mean(0)
     return up / up.norm() if up.norm() > 0.1 else torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 
 
 def _moved(camera: Camera, center: Tensor, focus: Tensor, up: Tensor) -> Camera:
-    """Move a camera to ``center`` and turn it to ``focus``; keep it unchanged where the two coincide."""
+    """Move a camera to ``center``, facing ``focus``; keep the camera if the two coincide."""
     if float((center - focus).norm()) < 1e-6 * camera.far:
         return camera
     return replace(camera, camera_to_world=look_at(center, focus, up))
@@ -42,11 +42,11 @@ def _moved(camera: Camera, center: Tensor, focus: Tensor, up: Tensor) -> Camera:
 class RandomPatches:
     """Rays of small patches seen from random poses on the training cameras' sphere (RegNeRF).
 
-    A pose lies between two random training cameras, at their distance from the focus, and looks at it.
+    A pose lies between two random training cameras, at their distance from the focus, and faces the focus.
 
     Args:
         cameras: the training cameras.
-        patches: patches a draw.
+        patches: patches per draw.
         size: pixels per side, at most those of the smallest image.
     """
 
@@ -78,7 +78,7 @@ def orbit(camera: Camera, focus: Tensor, up: Tensor, turns: Tensor) -> list[Came
     A camera at the focus keeps its pose.
 
     Args:
-        camera: gives the start and the lens.
+        camera: gives the first pose and the lens.
         focus, up: (3,).
         turns: (N,) fractions of a full turn from the start.
     """

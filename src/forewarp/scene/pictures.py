@@ -1,4 +1,4 @@
-"""Measure a scene's pictures before anything is fitted to them."""
+"""Measure properties of a scene's pictures before fitting."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ _VIEWS, _SIDE = 40, 40
 
 @dataclass(frozen=True)
 class Pictures:
-    """What the training pictures show.
+    """Properties of the training pictures.
 
-    ``times``: distinct ones among ``frames``. ``cut_out``: share of transparent pixels, 0 without alpha.
+    ``times``: distinct times of the ``frames``. ``cut_out``: share of transparent pixels, 0 without alpha.
     ``spread``: largest angle between two cameras, seen from the scene's middle, degrees. ``disagreement``:
-    share of the foreground that no still object can explain, as no point of the visual hull projects there
+    share of the foreground that no static object can explain, as no point of the visual hull projects there
     (0 without alpha).
     """
 

@@ -1,4 +1,4 @@
-"""Rays."""
+"""Rays with near and far distances."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Rays:
 
 
 def joined(parts: Sequence[Rays]) -> Rays:
-    """Concatenate rays; near and far enclose those of all of them."""
+    """Concatenate rays; take the least near and the greatest far."""
     if len(parts) == 1:
         return parts[0]
     origins, directions = (torch.cat([getattr(p, name) for p in parts]) for name in ("origins", "directions"))

@@ -1,4 +1,4 @@
-"""When and from where a scene is seen, and its rendering."""
+"""A moment, a view (camera and pixels), and a rendering."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from forewarp.scene.rays import Rays
 
 @dataclass(frozen=True)
 class Moment:
-    """A ``time`` in [0, 1] and, where known, the index of the training ``frame`` and the id of the physical
+    """A ``time`` in [0, 1] and, if known, the index of the training ``frame`` and the id of the physical
     ``camera`` that took it.
     """
 
@@ -58,7 +58,7 @@ class View:
 
     @cached_property
     def indices(self) -> Tensor | None:
-        """Flat indices (R,) of the pixels into the whole picture; None where they are all of it."""
+        """Flat indices (R,) of the pixels in the whole picture; None for all pixels."""
         if self.crop is None:
             return self.pixels
         top, left, height, width = self.crop
@@ -66,7 +66,7 @@ class View:
         return (rows + torch.arange(left, left + width)).flatten()
 
     def rays(self) -> Rays:
-        """Give the rays (R) through the pixels' centres, on the CPU; made once."""
+        """Return the rays (R) through the pixels' centres, on the CPU; computed once."""
         return self._rays
 
     @cached_property
@@ -76,8 +76,8 @@ class View:
 
 @dataclass(frozen=True)
 class Rendering:
-    """What a view shows, a row per pixel: ``rgb`` (R, 3) over the background; ``depth`` (R,), the mean
-    distance along the ray in world units, 0 where it meets nothing; ``opacity`` (R,) in [0, 1].
+    """A rendered view, one row per pixel: ``rgb`` (R, 3) over the background; ``depth`` (R,), the mean
+    distance along the ray in world units, 0 if the ray hits nothing; ``opacity`` (R,) in [0, 1].
     """
 
     rgb: Tensor

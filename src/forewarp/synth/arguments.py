@@ -1,4 +1,4 @@
-"""Check the arguments of the generators; errors are one line that names the key."""
+"""Check the arguments of the generators; an error is one line naming the key."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def check_workers(workers: int | None) -> None:
 
 
 def check_motion(motion: str, name: str = "motion", *, specimens: bool = False) -> None:
-    """Check that a motion is one of ``motions.MOTIONS`` or, where these may be used, of ``SPECIMENS``."""
+    """Check that a motion is one of ``motions.MOTIONS`` or, if allowed, of ``SPECIMENS``."""
     known = [*MOTIONS, *(SPECIMENS if specimens else ())]
     if not isinstance(motion, str) or motion not in known:
         raise SceneError(f"{name}: expected one of {', '.join(known)}, but got {motion!r}; set {name}")

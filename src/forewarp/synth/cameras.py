@@ -1,4 +1,4 @@
-"""Cameras on the sphere from which D-NeRF's scenes are seen, and random streams."""
+"""Cameras on a sphere around the scene, as in D-NeRF, and streams of random numbers."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import torch
 from forewarp.scene.camera import Camera, look_at
 
 CAMERA_RADIUS, CAMERA_ANGLE_X = 4.0311, 0.6911112
-# Sines of the elevation, from and to: neither along the slab nor straight from above.
+# Least and greatest sine of the elevation: neither along the slab nor straight from above.
 ELEVATION = (0.06, 0.96)
 
 
@@ -19,8 +19,8 @@ def orbit_camera(azimuth: float, sine: float, size: int) -> Camera:
 
     Args:
         azimuth: radians from x towards y.
-        sine: of the elevation above the ground.
-        size: pixels.
+        sine: sine of the elevation above the ground.
+        size: width and height in pixels.
     """
     level = math.sqrt(1 - sine * sine)
     center = CAMERA_RADIUS * torch.tensor(
@@ -41,8 +41,8 @@ def random_cameras(
     """Draw cameras uniformly by area on the upper half of the sphere, or a part of it.
 
     Args:
-        azimuth: degrees, from and to.
-        rise: sine of the elevation, from and to.
+        azimuth: least and greatest azimuth, degrees.
+        rise: least and greatest sine of the elevation.
     """
     azimuth = rng.uniform(*np.radians(azimuth), count)
     sine = rng.uniform(*rise, count)
@@ -55,5 +55,5 @@ def centers_of(cameras: list[Camera]) -> np.ndarray:
 
 
 def stream(seed: int, *number: int) -> np.random.Generator:
-    """Start a random stream for one purpose: drawing more from it leaves the others unchanged."""
+    """Start a random stream for one purpose; drawing from one stream leaves the others unchanged."""
     return np.random.default_rng([seed, *number])

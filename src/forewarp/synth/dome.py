@@ -23,8 +23,8 @@ from forewarp.synth.world import World
 POINTS = 4000
 CAMERAS, RADIUS, HEIGHTS = 20, 3.7, (0.55, 1.6)
 TARGET = (0.0, 0.0, -0.05)
-VIEW_ANGLE = 36.0  # vertical, degrees: the whole scene fits, with some room
-STUDIO = (0.38, 0.50, 0.42)  # the cloth behind; cut-outs show a trace of it at their rim
+VIEW_ANGLE = 36.0  # vertical field of view, degrees: the whole scene fits, with a margin
+STUDIO = (0.38, 0.50, 0.42)  # colour of the backdrop; a trace of it shows at the rim of cut-outs
 _LENSES, _POINTS, _CLOUDS = 0, 1, 2
 _CLOUD_LIGHTS = 24
 
@@ -45,16 +45,16 @@ def synthesize(
 
     20 cameras stand on a cylinder, alternately low and high; by fours their images are ``size`` by 5/6 of it,
     or 5/6 by 5/8. All take a picture at each of ``frames`` times, evenly spaced over [0, 1]. Every frame has
-    masks and a coloured cloud of points that some camera sees. Trajectories hold all times, 0 first. Equal
+    masks and a coloured cloud of visible points. Trajectories hold all times, 0 first. Equal
     arguments give equal files; ``seed`` draws lenses and points.
 
     Args:
-        folder: of the recording; one already there is replaced.
+        folder: folder of the recording; an existing one is replaced.
         size: pixels across of the larger images, a multiple of 24.
         motion: one of ``motions.MOTIONS``.
-        points: in the cloud of each frame.
+        points: number of points in the cloud of each frame.
         samples_per_pixel: rays averaged into a pixel.
-        workers, progress: as in ``film.Film``.
+        workers, progress: see ``film.Film``.
 
     Raises:
         SceneError: for a bad argument or folder; ImportError: without ``forewarp[synth]``.
@@ -93,7 +93,7 @@ def dome_cameras(size: int, seed: int) -> list[Camera]:
 
 
 def cloud(world: World, time: float, count: int, centers: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Draw points (N, 6) float32 that are visible at ``time``: x y z in world units, lit r g b of 255."""
+    """Draw points (N, 6) float32 that are visible at ``time``: x y z in world units, lit r g b, 0-255."""
     face, barycentric = surface_points(world, count, centers, rng, time)
     hits = Hits(np.arange(len(face)), face, barycentric, np.zeros(len(face)))
     color = Posed(world, time).color(hits, light_points(_CLOUD_LIGHTS))
@@ -109,6 +109,6 @@ def _frames(film: Film, world: World, times, cameras: list[Camera], clouds) -> I
 
 
 def _in_studio(rgba: np.ndarray) -> np.ndarray:
-    """Lay a picture uint8 (H, W, 4) over the studio's cloth: uint8 (H, W, 3)."""
+    """Composite a picture uint8 (H, W, 4) over the backdrop: uint8 (H, W, 3)."""
     alpha = rgba[..., 3:] / 255
     return np.rint(alpha * rgba[..., :3] + (1 - alpha) * 255 * np.array(STUDIO)).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""Render many pictures of moving worlds, in several processes where that pays."""
+"""Render many pictures of moving worlds, in several processes if that is faster."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from forewarp.synth.world import World
 
 # A process takes seconds to start and casts about two million samples a second.
 _SAMPLES_A_PROCESS = 4e7
-# Pictures a process that may wait to be written: enough that none idles, few enough for the memory.
+# Pictures per process waiting to be written: enough that no process idles, few enough for the memory.
 _AHEAD = 3
 
 
@@ -38,22 +38,22 @@ class ImageSpec(NamedTuple):
 
 @dataclass(frozen=True)
 class Exposure:
-    """The rays averaged into a pixel, and the shadow rays of each."""
+    """The rays averaged into a pixel, and the shadow rays of each ray."""
 
     samples_per_pixel: int = 4
     shadow_rays: int = SHADOW_RAYS
 
 
 class Film:
-    """Render pictures in order; a context manager, which ends its processes.
+    """Render pictures in order; a context manager that ends the processes on exit.
 
-    The pictures do not depend on the number of processes. With more than one, a script that calls this needs
+    The pictures do not depend on the number of processes. With more than one, a calling script needs
     the guard ``if __name__ == "__main__"``, as always with Python's processes.
 
     Args:
-        exposure: of every picture.
-        cameras: of all pictures to come: tells how much there is to do.
-        workers: processes; None: one per processor, fewer where there is little to do; 1: this process.
+        exposure: exposure of every picture.
+        cameras: cameras of all pictures to come, from which the amount of work is known.
+        workers: processes; None: one per processor, fewer for little work; 1: this process.
         progress: called with (pictures done, all pictures) after each.
     """
 
@@ -103,7 +103,7 @@ class Film:
 
 
 def _worth(samples: float) -> int:
-    """Choose the number of processes for so many samples."""
+    """Choose the number of processes by the number of samples."""
     affinity = getattr(os, "sched_getaffinity", None)
     processors = len(affinity(0)) if affinity else os.cpu_count() or 1
     return max(1, min(processors, math.floor(samples / _SAMPLES_A_PROCESS)))

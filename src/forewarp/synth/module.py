@@ -1,4 +1,4 @@
-"""Data modules of procedural scenes: write the scene at its first use, then read it like any other."""
+"""Data modules of procedural scenes: write the scene at first use, then read the files like any other's."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ def write_whole(
     workers: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
-    """Synthesise a scene under another name, then rename it, so that ``folder`` is never half written.
+    """Synthesise a scene in another folder, then rename that, so that ``folder`` is never half written.
 
     Args:
-        folder: of the scene; one already there is replaced.
+        folder: folder of the scene; an existing one is replaced.
         dataset: a key of ``WRITERS``.
-        arguments: of its writer; recorded in the scene's ``synthesis.json``.
-        workers, progress: of its writer; the files do not depend on them.
+        arguments: arguments of the writer; recorded in the scene's ``synthesis.json``.
+        workers, progress: see ``film.Film``; the files do not depend on them.
     """
     beside = folder.with_name(f".{folder.name}.part-{os.getpid()}")
     try:
@@ -61,12 +61,12 @@ def is_scene(folder: Path) -> bool:
 
 
 class Synthetic:
-    """Mix-in for a data module: synthesise the scene first where it is missing.
+    """Mix-in for a data module: synthesise the scene first if it is missing.
 
     Args:
         root, scene: the scene is ``root/scene``.
-        synthesis: arguments of its writer; a scene already there must have been made with the same.
-        arguments: of the data module that reads it.
+        synthesis: arguments of the writer; an existing scene must have been made with the same.
+        arguments: arguments of the data module that reads the scene.
     """
 
     dataset = "dnerf"
@@ -77,10 +77,10 @@ class Synthetic:
         self._read = partial(self._prepared, self._read)
 
     def prepare(self) -> None:
-        """Write the scene where it is missing; of several runs that need it at once, one writes it.
+        """Write the scene if it is missing; if several runs need the scene at once, one writes.
 
         Raises:
-            SceneError: where something else is there, or a scene made with other arguments.
+            SceneError: if the folder holds something else, or a scene made with other arguments.
         """
         if not is_scene(self.folder):
             self.folder.parent.mkdir(parents=True, exist_ok=True)
@@ -104,7 +104,7 @@ class Synthetic:
             write_whole(self.folder, self.dataset, self.synthesis, progress=progress)
 
     def _folder(self, root: Path, scene: str) -> Path:
-        """Name the folder that one call of the writer fills."""
+        """Return the folder that one call of the writer fills."""
         return root / scene
 
     def _check(self) -> None:

@@ -1,6 +1,6 @@
 """Move the vehicle's joints: smooth functions of a continuous time in [0, 1].
 
-Every joint is an affine map, so every point of a part has an exact place at every time. The controls are
+Every joint is an affine map, so every point of a part has an exact position at every time. The controls are
 sums of cosines of at most three half periods, which a few low DCT frequencies span.
 """
 
@@ -83,7 +83,7 @@ def placed(now: Controls, start: tuple[float, float, float]) -> dict[str, np.nda
 
     Args:
         now: angles and lengths.
-        start: of the chassis: x, y, heading in degrees.
+        start: the chassis's x, y and heading in degrees.
     """
     chassis = _along_arc(start, now.travel, now.turn)
     boom = chassis @ _shift(PIVOT) @ _raise(now.boom)
@@ -114,8 +114,8 @@ def _ball(now: Controls) -> np.ndarray:
 
 
 def _band(now: Controls) -> np.ndarray:
-    """Map a cylinder of length and radius 1 along x to the span between two pins, in the chassis frame; it
-    gets thinner as it stretches, keeping its volume.
+    """Map a cylinder of length and radius 1 along x to the span between two pins, in the chassis frame;
+    it gets thinner as it stretches, keeping its volume.
     """
     angle = np.radians([now.boom, now.boom + now.stick])
     pin = np.array([PIVOT[0], PIVOT[2]]) + BOOM * _point(angle[0]) + BAND_ALONG_STICK * _point(angle[1])

@@ -9,7 +9,7 @@ from forewarp.scene.frame import Truth
 from forewarp.synth.raycast import LIFT_OFF, Posed
 from forewarp.synth.world import World
 
-# Candidates per point wanted: about half of the surface lies inside or below and is never seen.
+# Candidates per wanted point: about half of the surface is never visible.
 _SPARE = 4
 
 
@@ -24,12 +24,12 @@ def surface_points(
     """Draw points uniformly by area on the surface that is visible at one time.
 
     Args:
-        world: whose surface.
-        count: how many; fewer only where hardly anything is visible.
-        centers: camera centres (C, 3); a point is visible where at least one of them sees it.
+        world: the world.
+        count: number of points; fewer are drawn only if hardly anything is visible.
+        centers: camera centres (C, 3); a point is visible if at least one camera sees it.
         rng: the same state gives the same points.
-        time: when they must be visible.
-        among: which faces (F,) bool they may lie on; None is all.
+        time: time at which points must be visible.
+        among: (F,) bool, faces to draw from; None: all.
 
     Returns:
         faces (N,) and barycentric coordinates (N, 3), which ``World.points`` places at any time.

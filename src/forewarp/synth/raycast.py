@@ -14,7 +14,7 @@ from forewarp.synth.world import World
 
 LIGHT_AT, LIGHT_RADIUS = np.array([2.2, -2.6, 4.6]), 0.45
 AMBIENT, SKY, DIFFUSE = 0.60, 0.10, 0.40
-# Per sample; four samples a pixel see two dozen points of the light, so shadows show no steps.
+# Per sample; four samples per pixel see two dozen points of the light, so shadows show no steps.
 SHADOW_RAYS = 6
 # Far above the error of float32, which embree computes in, and far below anything visible.
 LIFT_OFF = 2e-4
@@ -36,7 +36,7 @@ class Posed:
     """A world at one time, ready for ray casting.
 
     Raises:
-        ImportError: where the optional packages of ``forewarp[synth]`` are not installed.
+        ImportError: if the optional packages of ``forewarp[synth]`` are not installed.
     """
 
     def __init__(self, world: World, time: float):
@@ -61,7 +61,7 @@ class Posed:
         return Hits(ray, face, barycentric, distance)
 
     def is_free(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Tell which rays (n, 3), (n, 3) leave the world (n,); parts that cast no shadow stop none."""
+        """Tell which rays (n, 3), (n, 3) leave the world (n,); parts that cast no shadow are ignored."""
         return self._first_blocker(origins, directions) < 0
 
     def _barycentric(self, face: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
@@ -79,7 +79,7 @@ class Posed:
     def color(self, hits: Hits, lights: np.ndarray, directions: np.ndarray | None = None) -> np.ndarray:
         """Light hits: colours (n, 3) in [0, 1]; ``lights`` (L, 3) are points of the area light.
 
-        Without ``directions`` (R, 3), those of the rays, nothing is glossy.
+        ``directions`` (R, 3): the rays' directions; without them nothing is glossy.
         """
         normal = np.einsum("nc,ncd->nd", hits.barycentric, self.corner_normal[hits.face])
         normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
@@ -129,14 +129,14 @@ def render(
     """Render one picture of the world at any time from any camera.
 
     Args:
-        world: to render.
-        time: in [0, 1].
-        camera: its size, lens and pose; near and far are ignored.
-        samples_per_pixel: rays averaged into a pixel, each with ``shadow_rays`` of its own.
+        world: the world to render.
+        time: time in [0, 1].
+        camera: gives size, lens and pose; near and far are ignored.
+        samples_per_pixel: rays averaged into a pixel, each with ``shadow_rays`` shadow rays.
 
     Returns:
         rgba (H, W, 4) uint8, straight alpha, alpha the share of the samples that hit; and depth (H, W)
-        float32, the distance along the unit ray through the pixel centre, 0 where it meets nothing.
+        float32, the distance along the unit ray through the pixel centre, 0 if it hits nothing.
 
     **Cost** H * W * samples_per_pixel * (1 + shadow_rays) rays at most.
     """
@@ -145,7 +145,7 @@ def render(
     total, hit = np.zeros((count, 3)), np.zeros(count)
     lights = light_points(samples_per_pixel * shadow_rays)
     for i in range(samples_per_pixel):
-        # The R1 sequence covers the pixel evenly with any number of samples; a single one is its centre.
+        # The R1 sequence covers the pixel evenly with any number of samples; a single sample is the centre.
         offset = ((i + 0.5) / samples_per_pixel, (0.5 + i * 0.6180339887498949) % 1.0)
         rays = camera_rays(camera, offset)
         hits = posed.first_hits(*rays)
@@ -178,7 +178,7 @@ def camera_rays(camera: Camera, offset: tuple[float, float] = (0.5, 0.5)) -> tup
 def light_points(count: int) -> np.ndarray:
     """Place points (count, 3) evenly on the light's disc, which faces the origin.
 
-    They are the same for every pixel, so that a shadow looks alike from all cameras.
+    The points are the same for every pixel, so that shadows look alike from all cameras.
     """
     i = np.arange(count)
     radius, angle = LIGHT_RADIUS * np.sqrt((i + 0.5) / count), 2.399963229728653 * i  # golden angle

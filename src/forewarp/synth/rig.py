@@ -24,11 +24,11 @@ from forewarp.synth.raycast import Posed, camera_rays
 from forewarp.synth.scenes import writing_to
 from forewarp.synth.world import World
 
-# About a ninth of the still points drawn lies in both pictures.
+# About a ninth of the drawn static points is in both pictures.
 POINTS, STILL_POINTS = 4000, 20000
 # The arc, in the vehicle's units and degrees from x towards y.
 RADIUS, ARC, FOCUS, BASELINE = 3.0, (-118.0, -62.0), (0.0, 0.0, -0.08), 0.26
-VIEW_ANGLE = 52.0  # horizontal, degrees
+VIEW_ANGLE = 52.0  # horizontal field of view, degrees
 # Two phones of one make: pixel aspect, focal length and principal point differ a little, as do the lenses.
 PHONES = (
     {
@@ -64,18 +64,18 @@ def synthesize(
 ) -> Path:
     """Write a capture by a validation rig into ``folder`` and return that folder.
 
-    Both phones take a picture at each of ``frames`` times, evenly spaced over [0, 1]; by turns one is trained
-    on and the other held out. Lenses distort, pixels are not square, the world is scaled and shifted.
+    Both phones take a picture at each of ``frames`` times, evenly spaced over [0, 1]; by turns one is for
+    training and the other held out. Lenses distort, pixels are not square, the world is scaled and shifted.
     ``points.npy`` has points of the room and the slab; trajectories follow vehicle, ball and slab, the middle
     time first. Equal arguments give equal files, byte by byte; ``seed`` draws hand shake and points.
 
     Args:
-        folder: of the capture; one already there is replaced.
-        size: pixels across, a multiple of 8; three quarters of that high. Half-size images are written too.
-        frames: odd, so that one is at the canonical time 1/2.
+        folder: folder of the capture; an existing one is replaced.
+        size: width in pixels, a multiple of 8; the height is 3/4 of it. Half-size images are written too.
+        frames: number of times, odd, so that one is the canonical time 1/2.
         motion: one of ``motions.MOTIONS``.
         samples_per_pixel: rays averaged into a pixel.
-        workers, progress: as in ``film.Film``.
+        workers, progress: see ``film.Film``.
 
     Raises:
         SceneError: for a bad argument or folder; ImportError: without ``forewarp[synth]``.

@@ -18,7 +18,7 @@ from forewarp.synth.specimens import SPECIMENS, Specimen
 from forewarp.synth.world import World
 
 POINTS, POINT_VIEWS = 4000, 30
-# Streams of random numbers: the splits' cameras in turn, then the points'.
+# Seeds of the random streams: the cameras of each split, then the points.
 _TRAIN, _VAL, _TEST, _POINT_VIEWS, _POINTS = 0, 1, 2, 9, 10
 
 Views = dict[str, list[ImageSpec]]  # by split
@@ -45,16 +45,16 @@ def synthesize(
     canonical time 0: ``test_views`` counts (space, time, canonical). Trajectories hold all those times.
 
     Args:
-        folder: of the scene; one already there is replaced.
+        folder: folder of the scene; an existing one is replaced.
         size: width and height in pixels, at least 8.
-        motion: one of ``motions.MOTIONS``, or of ``specimens.SPECIMENS``, which takes the vehicle's place.
+        motion: one of ``motions.MOTIONS``, or of ``specimens.SPECIMENS``, which replaces the vehicle.
         samples_per_pixel: rays averaged into a pixel.
-        workers, progress: as in ``film.Film``.
+        workers, progress: see ``film.Film``.
 
     Raises:
         SceneError: for a bad argument or folder; ImportError: without ``forewarp[synth]``.
 
-    **Cost** about size^2 * samples_per_pixel * 7 rays an image, a million or two a second on one core.
+    **Cost** about size^2 * samples_per_pixel * 7 rays an image, at one to two million a second on one core.
     """
     check_numbers(size=(size, 8), frames=(frames, 2), seed=(seed, 0), val_views=(val_views, 0))
     check_motion(motion, specimens=True)
@@ -93,7 +93,7 @@ def views_at(
 
 
 def chosen(times: np.ndarray, count: int) -> np.ndarray:
-    """Choose ``count`` evenly spaced times, the first and the last among them where there are two or more."""
+    """Choose ``count`` evenly spaced times, including the first and the last if ``count`` is 2 or more."""
     return times[np.rint(np.linspace(0, len(times) - 1, count)).astype(np.int64)]
 
 
@@ -116,7 +116,7 @@ def _shots(film: Film, world: World, views: list[ImageSpec]) -> Iterator[Shot]:
 
 @contextmanager
 def writing_to(folder: str | Path) -> Iterator[Path]:
-    """Make a folder to write to; turn what fails there into a SceneError."""
+    """Make a folder to write to; turn errors of the file system into SceneErrors."""
     folder = Path(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)

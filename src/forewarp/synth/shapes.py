@@ -16,7 +16,7 @@ class Part:
     """A coloured piece that follows one joint.
 
     ``vertices`` (V, 3) float64 are in the joint's rest frame, ``faces`` (F, 3) index them; a ``smooth``
-    part is shaded with interpolated normals; one that does not cast shadows (``casts``) lets light through.
+    part is shaded with interpolated normals; a part without ``casts`` throws no shadow.
     """
 
     name: str

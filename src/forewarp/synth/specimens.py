@@ -1,7 +1,7 @@
 """Six small subjects that each call for one effect beside motion, or for none.
 
-A plan made from a specimen's pictures should turn on what ``conf/scene/specimen_<name>.yaml`` lists, and
-nothing else.
+A plan made from a specimen's pictures should switch on only the effects that
+``conf/scene/specimen_<name>.yaml`` lists.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ class Specimen:
 
     Args:
         joints: time in [0, 1] -> each joint's map (4, 4).
-        parts: its meshes; None: those of the vehicle.
+        parts: meshes; None: the vehicle's.
         extra: parts beside the vehicle's.
-        azimuth, rise: where cameras may stand, as for ``random_cameras``.
+        azimuth, rise: range of camera positions; see ``random_cameras``.
     """
 
     joints: Callable[[float], dict[str, np.ndarray]]
@@ -51,7 +51,7 @@ def _rigid(time: float) -> dict[str, np.ndarray]:
 
 
 def _quick(time: float) -> dict[str, np.ndarray]:
-    """Go forth and back three times: more than a few cosines can follow."""
+    """Drive forth and back three times: more than a few cosines can represent."""
     return placed(Controls(travel=0.3 * (0.5 - 0.5 * np.cos(6 * np.pi * time))), (-0.32, -0.02, 4.0))
 
 
@@ -91,7 +91,7 @@ def _globe_joints(time: float) -> dict[str, np.ndarray]:
 
 
 def _corner() -> list[Part]:
-    """Make a floor and two walls behind the subject, which fill every picture."""
+    """Make a floor and two walls behind the subject; they fill every picture."""
     low, high, thick = 1.1, 5.0, 0.1
     floor = GROUND - 0.0702
     walls = [

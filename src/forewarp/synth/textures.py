@@ -11,7 +11,7 @@ import numpy as np
 class Material:
     """A ``pattern`` of PATTERNS, its ``colors`` (RGB in [0, 1]) and its ``scale`` in world units.
 
-    ``gloss`` is the strength of its highlight (0: matte), ``shine`` how narrow that is.
+    ``gloss`` is the strength of the highlight (0: matte), ``shine`` its narrowness.
     """
 
     pattern: str
@@ -41,7 +41,7 @@ class Surface:
 
 
 def checker(at: Surface, scale: float) -> np.ndarray:
-    """Squares, with thin joints as a third colour."""
+    """Two-coloured squares, with thin joints as a third colour."""
     u, v = (c / scale for c in at.flat(at.position))
     joint = np.minimum(np.abs(u - np.rint(u)), np.abs(v - np.rint(v))) < 0.03
     return np.where(joint, 2, (np.floor(u) + np.floor(v)).astype(np.int64) % 2)

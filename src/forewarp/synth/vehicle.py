@@ -1,4 +1,4 @@
-"""A toy excavator of bricks, a ball beside it and the slab under both: meshes and colours."""
+"""A toy excavator of bricks, a ball and the slab under both: meshes and colours."""
 
 from __future__ import annotations
 

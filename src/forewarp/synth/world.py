@@ -17,11 +17,11 @@ class World:
     """Everything in the scene as one mesh of fixed topology that moves by ``motion``.
 
     ``faces`` (F, 3) index the vertices of ``place``; ``part_of_face`` (F,) indexes ``parts``; ``rest``
-    (V, 3) are coordinates in each part's rest frame, by which it is coloured.
+    (V, 3) are coordinates in each part's rest frame, from which colours are computed.
 
     Args:
-        motion: a name in ``motions.MOTIONS``, of the vehicle, or in ``specimens.SPECIMENS``.
-        has_room: put a still room around it.
+        motion: a name in ``motions.MOTIONS`` (the vehicle) or in ``specimens.SPECIMENS``.
+        has_room: put a static room around the subject.
     """
 
     def __init__(self, motion: str = "lift_tilt", has_room: bool = False):

@@ -25,10 +25,10 @@ class Bundle:
     """A stored step.
 
     Attributes:
-        batch: of the step.
+        batch: the step's batch.
         scene: cameras, times and box; its frames have no images.
-        state_dict: of the stage's module.
-        config: of the run, as YAML.
+        state_dict: state of the stage's module.
+        config: the run's config, as YAML.
         noted: ``found`` (what is not finite), ``stage``, ``step`` and ``random`` (the states of the random
             generators before the step).
     """

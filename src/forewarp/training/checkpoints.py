@@ -24,8 +24,8 @@ class KeepCheckpoint(lightning.Callback):
     """Save a checkpoint at regular intervals of training time, and after the step that Ctrl-C interrupts.
 
     Args:
-        path: of the checkpoint, which is replaced each time.
-        seconds: of training between two checkpoints.
+        path: file of the checkpoint, replaced each time.
+        seconds: training seconds between two checkpoints.
         check: called before saving; raises if the state is broken, so that the last checkpoint stays.
         interruption: once it is ``asked`` for, save after this step and stop.
     """

@@ -82,9 +82,9 @@ def reset_peak_memory() -> None:
 
 
 def peak_memory_bytes() -> int:
-    """Return the peak memory since ``reset_peak_memory``, or of the whole process where that does nothing.
+    """Return the peak memory in bytes, of the GPU if one was used, else of the process.
 
-    It is the GPU's memory if a GPU was used, else the process's.
+    Measured since ``reset_peak_memory``, or since the process began if the system cannot reset the peak.
     """
     if torch.cuda.is_available() and torch.cuda.max_memory_allocated() > 0:
         return torch.cuda.max_memory_allocated()

@@ -25,7 +25,7 @@ def make_handover(method: Method, scene: Scene, before: Handover | None, frames_
 
     Args:
         method: fitted.
-        scene: that it was fitted to.
+        scene: the scene that the method was fitted to.
         before: the handover that the stage began with; None for the first stage.
         frames_in_play: at the stage's end.
     """

@@ -25,7 +25,7 @@ class DynamicSceneModule(lightning.LightningModule):
         objective: the weights of its loss terms.
         settings: the numbers of the stage.
         curriculum: draws the frame of every step.
-        seed: of the random numbers that the method draws.
+        seed: seed of the random numbers that the method draws.
 
     ``last`` holds the values of the last step, by the names under which they are logged.
     """
@@ -176,7 +176,7 @@ class DynamicSceneModule(lightning.LightningModule):
             view: a camera, or some of its pixels.
             moment: the time, and the frame and camera where known.
             background: colour (3,) or (R, 3) behind everything.
-            snapshot: of this moment, if there is one already.
+            snapshot: a snapshot of this moment, if already made.
         """
         view = view if isinstance(view, View) else View(view)
         snapshot = snapshot or self.method.at(moment)

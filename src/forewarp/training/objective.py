@@ -1,4 +1,4 @@
-"""The objective: the weighted sum of a method's loss terms. Only here is a weight compared with 0."""
+"""The objective: the weighted sum of a method's loss terms. No other module checks weights for 0."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def total(step: Step, factors: Mapping[str, float], parameters: Mapping[str, Ten
 
     Args:
         step: the method's answer to a batch.
-        factors: of its terms (see ``Objective.factors``).
+        factors: factors of the step's terms (see ``Objective.factors``).
         parameters: by name; needed if the method computed its gradients itself.
 
     Raises:

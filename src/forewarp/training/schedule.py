@@ -19,7 +19,7 @@ class StageSettings:
     """The numbers of one stage. Fractions are fractions of the stage.
 
     Args:
-        name: of the stage and of its folder.
+        name: name of the stage and of its folder.
         lr: learning rate of each of the method's ``param_groups``.
         iterations: steps; None if only minutes bound the stage.
         minutes: training minutes; None if only iterations bound it. With both, the stage ends at the first.
@@ -95,7 +95,7 @@ class StagePlan:
 
     Args:
         share: weight of this stage when the run's budget is divided.
-        objective: of the stage.
+        objective: the stage's objective.
         model: makes the stage's method; None: the run's model.
         settings: the other arguments of ``StageSettings``, and the method's own numbers.
     """
@@ -118,7 +118,7 @@ def share_out(
 
     Args:
         plans: by name; None leaves a stage out.
-        minutes, iterations: of the run; None: unbounded. With both, each stage ends at the first.
+        minutes, iterations: the run's budget; None: unbounded. With both, each stage ends at the first.
 
     Raises:
         ValueError: without any stage, for a share that is not > 0, or for a bound that is not > 0.
@@ -160,7 +160,7 @@ class Curriculum:
     minutes sees them all too. A share of the draws goes to the newest frames, whose motion is unknown yet.
 
     Args:
-        times: of every training frame.
+        times: time of every training frame.
         canonical_time: where training starts.
         start: distinct times in play at the beginning.
         all_in: fraction of the stage at which all times are in play; 0: from the start.
@@ -169,7 +169,7 @@ class Curriculum:
         newest_part: share of the frames in play that counts as the newest.
         error_share: share of the draws that picks a frame with a probability proportional to its latest
             error (see ``report``): the few frames at the ends of a sequence are hard.
-        seed: of the draws.
+        seed: seed of the draws.
     """
 
     def __init__(

@@ -23,12 +23,12 @@ class BrokenStep(ValueError):
 
 @dataclass(frozen=True)
 class Found:
-    """What is not finite in a step.
+    """The first number found that is not finite in a step.
 
     Attributes:
-        kind: of the check that found it: ``parameter``, ``loss``, ``gradient`` or ``optimizer``.
+        kind: the check that failed: ``parameter``, ``loss``, ``gradient`` or ``optimizer``.
         tensor: name of the first tensor that is not finite.
-        terms: loss terms that it reaches.
+        terms: loss terms whose value or gradient is not finite.
     """
 
     kind: str
@@ -109,7 +109,7 @@ class Sentinel(lightning.Callback):
     ``forewarp.replay``), and the last checkpoint stays as it is.
 
     Args:
-        folder: of the stage.
+        folder: the stage's folder.
         skip: number of broken steps to skip instead: store each, count it in ``skipped``, learn nothing.
         every: steps between two checks of the parameters, which only broken gradients can break.
 

@@ -33,11 +33,11 @@ class Run:
         datamodule: serves the scene (``.scene``, ``.picker``, ``.restart``, batches).
         model: makes the method of a stage that names no model of its own.
         stages: in order.
-        folder: of the run; each stage has a folder in it.
+        folder: the run's folder, with one folder for each stage.
         make_trainer: ``(stage folder, callbacks) -> lightning.Trainer``.
         callbacks: ``(stage name, stage folder) -> list`` of callbacks to add.
-        seed: of all random numbers.
-        checkpoint_seconds: of training between two checkpoints.
+        seed: seed of all random numbers.
+        checkpoint_seconds: training seconds between two checkpoints.
         skip: steps per stage that may be skipped because of numbers that are not finite (see ``Sentinel``).
         tell: called with a line for each stage that is loaded or continued.
     """
@@ -130,7 +130,7 @@ class Run:
         """Build the module of a stage for a ``state_dict``, without images and without earlier stages.
 
         Args:
-            name: of the stage.
+            name: name of the stage.
             scene: cameras, times and box; its frames need no images.
         """
         number, stage = next((i, s) for i, s in enumerate(self.stages) if s.settings.name == name)
@@ -139,7 +139,7 @@ class Run:
         )
 
     def _check_later_stages(self) -> None:
-        """Build the later stages once without training, so that their mistakes are reported first."""
+        """Build the later stages once, so that errors in their settings are reported before training."""
         for number, stage in enumerate(self.stages):
             if number and not self.is_finished(stage):
                 self._module(stage, None, None, number, blank=True)
@@ -194,7 +194,7 @@ class Run:
         reset_peak_memory()
         with interruption:
             trainer.fit(module, datamodule=self.datamodule, ckpt_path=checkpoint, weights_only=True)
-        if module.fraction < 1:
+        if module.fraction < 1:  # fit returned early, as when a callback stops it: the stage is not finished
             raise KeyboardInterrupt
         keeper.save(trainer)
         in_play = module.curriculum.in_play

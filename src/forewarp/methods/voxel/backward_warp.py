@@ -29,8 +29,8 @@ class Deformation(nn.Module):
     Args:
         box: normalises positions.
         canonical_time: in [0, 1].
-        width, layers: of the network.
-        frequencies, time_frequencies: of the encodings.
+        width, layers: size of the network.
+        frequencies, time_frequencies: octaves of the encodings.
     """
 
     def __init__(

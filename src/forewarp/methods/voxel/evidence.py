@@ -110,9 +110,9 @@ class Residual:
     """The errors that a coarse stage without view dependence leaves in its training images.
 
     Attributes:
-        psnr: of the coarse stage.
-        by_direction: share of the squared error that a colour linear in the viewing direction, fitted per
-            place to other images, removes; below 0 it only adds noise.
+        psnr: PSNR of the coarse stage, dB.
+        by_direction: share of the squared error that view-dependent colour would remove: at each place a
+            colour linear in the viewing direction is fitted to other images. Negative: the fit adds noise.
         allowed: PSNR of the best images that the last stage's lattice can represent.
     """
 
@@ -128,7 +128,7 @@ def residual(method: ForwardWarp, targets: Sequence[Target], voxel_size: float, 
     Args:
         method: fitted, without view dependence.
         targets: training views.
-        voxel_size: of the last stage's lattice, world units.
+        voxel_size: voxel size of the last stage's lattice, world units.
         rays: number of pixels of each image.
     """
     generator = torch.Generator().manual_seed(0)

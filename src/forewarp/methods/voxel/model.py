@@ -160,10 +160,10 @@ class Ground:
     """The lattices that a voxel method is built on.
 
     Attributes:
-        lattice: of the canonical grid.
+        lattice: lattice of the canonical grid.
         active: (X, Y, Z) bool, its active voxels.
         density_scale: length that density is measured in, world units.
-        box: of the scene; normalises positions in all stages.
+        box: the scene's box; normalises positions in all stages.
         frames: number of distinct training times; with one there is no motion.
         canonical_time: in [0, 1].
         static: lattice and active voxels of the static background, if the model has one.

@@ -20,7 +20,7 @@ class VoxelSnapshot(Snapshot):
     """Everything a voxel method computed at one time; None for what it does not have.
 
     Attributes:
-        moment: of the snapshot.
+        moment: the snapshot's moment.
         fields: what is rendered, by name, the best last: ``warped`` or ``upsampled``, then ``inpainted``;
             ``backward`` alone for backward warping.
         canonical: the canonical grid.

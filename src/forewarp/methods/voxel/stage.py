@@ -35,10 +35,10 @@ class VoxelStage:
             never.
         box_alpha: opacity of the matter that the next stage's box must hold.
         start_alpha: opacity of the first active voxels.
-        color_threshold: of the renderer in this stage; None: unchanged.
+        color_threshold: the renderer's threshold in this stage; None: unchanged.
         bases: ``[[fraction, K], ...]``: use K trajectory bases from ``fraction`` on; empty: all.
         patches: number of patches that the depth term renders.
-        name: of the stage, for errors.
+        name: name of the stage, for errors.
 
     Raises:
         ValueError: naming the key that is out of range.

@@ -23,7 +23,7 @@ class Seen:
     Attributes:
         rgb: the true colours (R, 3).
         state: the method at the batch's time.
-        renderings: of the batch's rays, by name.
+        renderings: renderings of the batch's rays, by name.
         render_patches: renders depth and opacity (B, S, S) of patches from random views at this time.
         stray: returns the displacement (N, 3) of points known to be static; None if none are known.
         neighbours: returns the pairs of neighbouring voxels of an index.

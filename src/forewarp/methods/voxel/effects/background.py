@@ -78,7 +78,7 @@ def overlapped(cells: Tensor, source: Lattice, target: Lattice) -> Tensor:
     """Find the cells of lattice ``target`` that overlap a True cell of lattice ``source``.
 
     Args:
-        cells: of ``source``, (X-1, Y-1, Z-1) bool.
+        cells: cells of ``source``, (X-1, Y-1, Z-1) bool.
 
     Returns:
         cells of ``target``, (X'-1, Y'-1, Z'-1) bool.

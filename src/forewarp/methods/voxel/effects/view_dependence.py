@@ -10,7 +10,10 @@ from forewarp.ops.encode import positional_encoding, spherical_harmonics_1
 
 
 class SphericalHarmonics(nn.Module):
-    """Spherical harmonics of degree 1: ``sigmoid(c + sum_i Y_i(d) s_i)``, without parameters of its own."""
+    """Spherical harmonics of degree 1: ``sigmoid(c + sum_i Y_i(d) s_i)``; no parameters of its own.
+
+    ``c`` and ``s_i`` are a voxel's features, ``Y_i(d)`` the basis in direction ``d``.
+    """
 
     features = 12
 
@@ -26,8 +29,8 @@ class ViewNetwork(nn.Module):
 
     Args:
         features: number of colour features.
-        width, layers: of the network.
-        frequencies: of the encoding of the direction.
+        width, layers: size of the network.
+        frequencies: octaves of the direction's encoding.
     """
 
     def __init__(self, *, features: int = 12, width: int = 64, layers: int = 2, frequencies: int = 4) -> None:
