@@ -1,6 +1,7 @@
 """The sweeps behind the tables: every job composes, and its folder is named by what it computes."""
 
 import re
+import shlex
 from copy import deepcopy
 
 import pytest
@@ -98,6 +99,16 @@ def test_every_job_composes_and_has_a_folder_of_its_own(sweep):
     assert len(set(folders)) == len(folders)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("budget", ["budget.minutes=3", "budget.iterations=300"])
+def test_every_job_of_the_price_list_has_a_folder_of_its_own(budget):
+    bounds = ["budget.minutes=null", budget]
+    jobs = (
+        composed("sweeps=price_list", "data.scene=x", *bounds, *shlex.split(change)) for change in CHANGES
+    )
+    assert len({hashed(job).run for job in jobs}) == len(CHANGES)
+
+
 @pytest.mark.parametrize("dataset", COUNTERPARTS)
 def test_a_counterpart_stands_in_for_each_dataset(dataset):
     config = job_of("ablation_modules", f"scene=counterpart_{dataset}", "ablation=full", "preset=demo")
@@ -142,6 +153,22 @@ def test_a_job_of_the_price_list_is_named_by_what_was_typed(forewarp, in_tmp):
     for typed in ([], ["preset.rays=64"], ["model/motion=dct_features", "preset.bases=5"]):
         shown = forewarp("train", "sweeps=price_list", *scene, *typed, "--cfg", "job", "--resolve")
         assert yaml.safe_load(shown.out)["variant"] == {"name": " ".join(sorted(typed))}
+
+
+def test_a_job_is_not_named_by_how_it_runs(forewarp, in_tmp):
+    how = [
+        *(
+            "checkpoint_seconds=9",
+            "score=ssim",
+            "evaluate=false",
+            "sentinel.skip=1",
+            "absent=skip",
+            "trust=[x]",
+        ),
+        *("data_changed=accept", "callbacks=default", "callbacks.pictures=null", "callbacks.accuracy=null"),
+    ]
+    shown = forewarp("train", "sweeps=accuracy_time", *how, "--cfg", "job", "--resolve")
+    assert yaml.safe_load(shown.out)["variant"] == {"name": ""}
 
 
 @pytest.mark.parametrize(
@@ -202,11 +229,15 @@ def test_a_job_is_known_by_what_it_computes():
     assert folder_of(plain) == "runs/x/forward-fast-seed0"
 
 
-def test_where_minutes_bound_a_run_its_precision_counts():
-    job, half = composed("sweeps=dnerf", "scene=dnerf_hook"), {"trainer__precision": "bf16-mixed"}
-    assert folder_of(job) != folder_of(job, **half)
-    steps = {"budget__minutes": None, "budget__iterations": 5}
-    assert folder_of(job, **steps) == folder_of(job, **steps, **half)
+@pytest.mark.parametrize("budget", [{}, {"budget__minutes": None, "budget__iterations": 5}])
+def test_the_precision_of_a_run_counts(budget):
+    job = composed("sweeps=dnerf", "scene=dnerf_hook")
+    assert folder_of(job, **budget) != folder_of(job, **budget, trainer__precision="bf16-mixed")
+
+
+def test_full_precision_bounded_by_steps_keeps_its_folder():
+    job = composed("sweeps=dnerf", "scene=dnerf_hook", "budget.minutes=null", "budget.iterations=5")
+    assert folder_of(job) == folder_of(job, trainer__precision="32-true")
 
 
 def test_the_canonical_middle_reaches_the_data():

@@ -15,12 +15,19 @@ class OneAtATime(BasicSweeper):
         max_batch_size: jobs launched together; None: all.
         params: as of Hydra's sweeper: key -> comma-separated values, all crossed with one another.
         changes: a string for each change, holding its overrides as one types them ("" for none).
+
+    Raises:
+        ValueError: if there is no change, and so no job.
     """
 
     def __init__(
         self, max_batch_size: int | None, params: dict[str, str] | None = None, changes: Sequence[str] = ("",)
     ) -> None:
         super().__init__(max_batch_size, params)
+        if not changes:
+            raise ValueError(
+                "hydra.sweeper.changes: expected at least one change, but got []; use [''] for the plain job"
+            )
         self.changes = changes
 
     def split_arguments(self, overrides, max_batch_size):

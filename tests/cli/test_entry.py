@@ -106,6 +106,19 @@ def test_options_of_ones_own_stand_beside_ours(forewarp, way, in_tmp, monkeypatc
         (["+model.renderer.bogus=1"], "model.renderer: "),
         (["budget=fast"], "budget=fast: expected preset=fast; the choice is called preset since 0.2"),
         (["variant=rays_1024"], "variant=rays_1024: expected no such override; type what a variant changed"),
+        (["preset={skip_alpha:0.1}"], "preset.skip_alpha: expected preset.alpha_threshold; renamed in 0.3"),
+        (["stage.coarse={rates:{flow:1}}"], "stage.coarse.rates: expected stage.coarse.lr; renamed in 0.3"),
+        (["stage.fine.rates.flow=1"], "stage.fine.rates.flow=1: expected stage.fine.lr.flow=1; renamed in"),
+        (["~stage.fine.rates"], "stage.fine.rates: expected stage.fine.lr; renamed in 0.3"),
+        (["~model/view"], "model/view: expected model/view_dependence; renamed in 0.3"),
+        (
+            ["--multirun", "hydra.sweeper.params.preset.skip_alpha=1"],
+            "expected hydra.sweeper.params.preset.alpha_",
+        ),
+        (
+            ["--multirun", "hydra/sweeper=one_at_a_time", "hydra.sweeper.changes=[]"],
+            "hydra.sweeper.changes: expected at least one change, but got []",
+        ),
         (["objective.coarse.literal=[foto]"], "objective.literal: expected some of photo"),
         (["+objective.coarse.weights.foto=1"], "objective: expected a term of photo, point_color"),
         (["model=tnerf", "+stage.fine.hodl=0.3"], "stage.fine: expected a key of none, but got 'hodl'"),
@@ -120,6 +133,27 @@ def test_options_of_ones_own_stand_beside_ours(forewarp, way, in_tmp, monkeypatc
 def test_a_mistyped_command_ends_in_one_line(refused, in_tmp, arguments, line):
     assert line in refused("train", *arguments, "paths.data=data")
     assert list(in_tmp.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["train", "plan"])
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("stage: {fine: {voxels: []}}", "stage.fine.voxels: expected stage.fine.num_voxels; renamed in 0.3"),
+        (
+            "defaults:\n  - override /model/view: mlp",
+            "model/view: expected model/view_dependence; renamed in 0.3",
+        ),
+    ],
+)
+def test_renamed_keys_of_ones_own_files_are_named(refused, in_tmp, name, text, line):
+    (in_tmp / "experiment").mkdir()
+    (in_tmp / "experiment" / "mine.yaml").write_text(f"# @package _global_\n{text}\n")
+    assert refused(name, "--config-dir", ".", "experiment=mine") == line
+
+
+def test_a_method_of_today_may_have_a_key_that_another_had(refused, in_tmp):
+    assert refused("train", "model=particles", "model.view=1", "seeds=2").startswith("seeds: ")
 
 
 def test_keys_of_what_was_chosen_are_suggested(refused, in_tmp):

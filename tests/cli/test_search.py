@@ -65,7 +65,7 @@ def test_a_search_without_views_or_with_seeds_says_what_to_set(forewarp, folder)
     assert "score: expected psnr, which the sweeper needs, but got none: " in done.err
     assert "set data.held_out=8" in done.err
     done = forewarp("train", *SEARCH, "hydra.sweeper.n_trials=1", "seeds=2")
-    assert "seeds: expected 1 of a search, but got 2; use seed=N" in done.err
+    assert "seeds: expected 1 in a search, but got 2; use seed=N" in done.err
     plain = [word for word in SEARCH if word != "sweeps=search"]
     done = forewarp("train", *plain, "hydra/sweeper=optuna", "hydra.sweeper.n_trials=1")
     assert "but got range(0, 1); add hydra.sweeper.params.seed=0" in done.err

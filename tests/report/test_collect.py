@@ -30,6 +30,15 @@ def test_abilities_are_not_mixed(tmp_path):
     assert read_run(write_run(tmp_path, seed=1)).ability == "all"
 
 
+def test_names_do_not_depend_on_spaces_within_an_override(tmp_path):
+    plain, spaced = "size=[[0,8000]]", "size=[[0, 8000]]"
+    for name in ("", spaced, f"rays=64 {plain}", f"data.box=null {spaced}"):
+        write_run(tmp_path, name, against=None)
+    names = [result.variant for result in collect(tmp_path)[0]]
+    assert sorted(names) == ["base", f"data.box=null {plain}", f"rays=64 {plain}", plain]
+    assert {result.against(names) for result in collect(tmp_path)[0]} == {"base", plain}
+
+
 def test_what_is_not_known_is_left_out(tmp_path):
     folder = write_run(tmp_path, epe=None, curve=None)
     assert "epe" not in read_run(folder).numbers

@@ -4,6 +4,7 @@ import re
 
 import pytest
 
+from forewarp.cli.checks import refuse_renamed_keys
 from forewarp.runs.config import read_config
 from forewarp.runs.overrides import refuse_renamed
 from tests.support.configs import composed
@@ -33,6 +34,10 @@ from tests.support.configs import composed
         ("model/view=none", "model/view_dependence=none;"),
         ("model.view.width=32", "model.view_dependence.width=32;"),
         ("~suits", "no such override;"),
+        ("budget.skip_alpha=0", "preset.alpha_threshold=0; the method's numbers are called preset since 0.2"),
+        ("hydra.sweeper.params.stage.fine.rates.flow=1", "hydra.sweeper.params.stage.fine.lr.flow=1;"),
+        ("variant=base", "ablation=base;"),
+        ("+variant=mine", "+ablation=mine; move your file from variant/ to ablation/"),
         ("variant=base,unet_16", "no such override; type what a variant changed, as preset.rays=1024;"),
         ("ablation=voxels_20,voxels_40", "no such override; sweeps=resolution has these sizes"),
     ],
@@ -50,6 +55,8 @@ def test_words_of_today_are_not():
         "~budget.iterations",
         "model.renderer.step=1",
         "stage=forward_demo",
+        "ablation=my_voxels_2",
+        "+variant={name: mine}",
     ]
     assert refuse_renamed([*words, "--multirun", "experiment=hypernerf", "data.background=white"]) is None
 
@@ -59,6 +66,31 @@ def test_words_of_today_are_not():
 )
 def test_what_is_advised_composes(word):
     assert composed("data.scene=x", word)
+
+
+@pytest.mark.parametrize(
+    ("typed", "line"),
+    [
+        ("+preset={skip_alpha: 0.0}", "preset.skip_alpha: expected preset.alpha_threshold;"),
+        ("+modules.voxels=[]", "modules.voxels: expected modules.num_voxels;"),
+        ("+modules.alone.hold=0", "modules.alone.hold: expected modules.alone.lr_hold;"),
+        ("+stage={fine: {voxels: []}}", "stage.fine.voxels: expected stage.fine.num_voxels;"),
+        ("+stage.fine.rates.flow=1", "stage.fine.rates: expected stage.fine.lr;"),
+        ("+model.renderer.opaque=0", "model.renderer.opaque: expected model.renderer.early_stop_eps;"),
+        ("+model.view.width=3", "model.view: expected model.view_dependence;"),
+    ],
+)
+def test_keys_of_a_composed_config_are_refused_unless_the_method_is_anothers(typed, line):
+    config = composed(typed)
+    with pytest.raises(ValueError, match=re.escape(line)):
+        refuse_renamed_keys(config)
+    config.model._target_ = "theirs.methods.Mist"
+    assert refuse_renamed_keys(config) is None
+
+
+@pytest.mark.parametrize("model", ["forward", "backward", "tnerf", "particles"])
+def test_no_key_of_today_is_refused(model):
+    assert refuse_renamed_keys(composed(f"model={model}")) is None
 
 
 @pytest.mark.parametrize(

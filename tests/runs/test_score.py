@@ -108,6 +108,13 @@ def test_without_views_there_is_none(forewarp, scene, returned):
     assert returned == [None, None]
 
 
+def test_one_job_for_each_change_needs_no_score(forewarp, scene):
+    scene(0)
+    sweep = ["--multirun", "hydra/sweeper=one_at_a_time", "hydra.sweeper.changes=['seed=3']"]
+    done = forewarp("train", *sweep, *SMALL, "run=run")
+    assert done.status == 0, done.err
+
+
 @pytest.mark.parametrize("word", ["test/psnr", "val/loss", "3", "depth", "[psnr]"])
 def test_another_metric_is_refused_with_a_list(refused, in_tmp, word):
     line = refused("train", *SMALL, f"score={word}")

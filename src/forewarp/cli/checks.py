@@ -8,7 +8,9 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
+from forewarp.cli.misspelt import every_key
 from forewarp.data.files import MARKERS, scene_folder
+from forewarp.runs.overrides import refuse_renamed
 
 # Data modules that are not listed, such as those that make their scene, check for themselves.
 READERS = {
@@ -18,6 +20,17 @@ READERS = {
     "forewarp.data.module.NHRDataModule": "nhr",
     "forewarp.data.module.PosedVideoDataModule": "posed_video",
 }
+
+
+def refuse_renamed_keys(config: DictConfig) -> None:
+    """Refuse keys of earlier versions, such as those of a user's own files.
+
+    A method of another package may have keys of these names.
+    """
+    target = str(config.model.get("_target_"))
+    voxel = target.startswith("forewarp.methods.voxel.")  # only these methods' options were renamed
+    if target.startswith("forewarp."):
+        refuse_renamed([key for key in every_key(config) if voxel or not key.startswith("model.")])
 
 
 def refuse_missing_scene(config: DictConfig) -> None:

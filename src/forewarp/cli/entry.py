@@ -13,9 +13,9 @@ from contextlib import suppress
 from pathlib import Path
 
 from forewarp.cli.errors import flat, one_line
-from forewarp.cli.misspelt import unknown_key, with_run_key
+from forewarp.cli.misspelt import renamed_key, unknown_key, with_run_key
 from forewarp.runs.config_files import configurations, project_root
-from forewarp.runs.overrides import refuse_renamed
+from forewarp.runs.overrides import key_of, refuse_renamed
 
 TRACEBACK_VARIABLE = "FOREWARP_TRACEBACK"
 MISTAKE, INTERRUPTED = 2, 130
@@ -40,7 +40,8 @@ def command(name: str, task: Callable, text: str, *, config: str | None = None) 
             sys.exit(0)
         sys.argv[1:] = _arguments(name)
         if (config or name) == "train":
-            refuse_renamed(sys.argv[1:])
+            # Choices; whether another package's method has a key is known once the config is composed.
+            refuse_renamed([argument for argument in sys.argv[1:] if "." not in key_of(argument)])
         failures = _run(name, task, configurations(), config or name)
     except KeyboardInterrupt:
         _interrupted(name)
@@ -124,7 +125,7 @@ def _run(name: str, task: Callable, conf: Path, config_name: str) -> list[int]:
 
 def _tell(name: str, error: Exception, config_name: str) -> int:
     """Print what went wrong and return the exit status."""
-    line = unknown_key(error, config_name, sys.argv[1:]) or one_line(error)
+    line = renamed_key(error) or unknown_key(error, config_name, sys.argv[1:]) or one_line(error)
     if line is None or os.environ.get(TRACEBACK_VARIABLE) == "1":
         traceback.print_exception(error)
     print(f"forewarp-{name}: error: {line or _bug(error)}", file=sys.stderr)

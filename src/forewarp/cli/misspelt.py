@@ -9,6 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from forewarp.runs.config_files import configurations
+from forewarp.runs.overrides import key_of, refuse_renamed
 
 FOLDERS = {"evaluate": "run", "render": "run", "train": "resume"}
 
@@ -28,6 +29,32 @@ def with_run_key(name: str, arguments: list[str]) -> list[str]:
     return [f"{key}={one}" if is_bare else one for is_bare, one in zip(bare, arguments)]
 
 
+def renamed_key(error: Exception) -> str | None:
+    """Return the line for a key of an earlier version that Hydra did not find; None for any other error."""
+    from hydra.errors import HydraException
+
+    found = re.search(r"Could not (?:override|delete(?: from config\.)?) '([^'@]+)'", str(error))
+    if found is None or not isinstance(error, HydraException):
+        return None
+    # Hydra quotes the override, unless the name is in a file.
+    quoted = re.search(r"To append to your config use \+(.*)", str(error), re.DOTALL)
+    try:
+        refuse_renamed(_spread(quoted[1]) if quoted else [found[1]])
+    except ValueError as refusal:
+        return str(refusal)
+    return None
+
+
+def _spread(override: str) -> list[str]:
+    """Return an override and, if its value is a dictionary, the dotted keys of that."""
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from omegaconf import OmegaConf
+
+    value = OverridesParser.create().parse_override(override).value()
+    inner = every_key(OmegaConf.create(value), f"{key_of(override)}.") if isinstance(value, dict) else ()
+    return [override, *inner]
+
+
 def unknown_key(error: Exception, name: str, arguments: list[str]) -> str | None:
     """Return the line for an unknown key, with the nearest known one; None for any other error.
 
@@ -42,7 +69,10 @@ def unknown_key(error: Exception, name: str, arguments: list[str]) -> str | None
     if found is None or not isinstance(error, HydraException):
         return None
     key, conf = found[1], configurations()
-    known = [*_keys(_composed(conf, name, [a for a in arguments if a.split("=")[0] != key])), *_groups(conf)]
+    known = [
+        *every_key(_composed(conf, name, [a for a in arguments if a.split("=")[0] != key])),
+        *_groups(conf),
+    ]
     near = difflib.get_close_matches(key, known, 1, cutoff=0.8)
     advice = f"did you mean {near[0]}?" if near else f"forewarp-{name} --cfg job prints all keys"
     return f"{key}: expected a key of the configuration, but got none of this name; {advice}"
@@ -63,14 +93,15 @@ def _composed(conf: Path, name: str, arguments: list[str]):
         return hydra.compose(name)
 
 
-def _keys(node, prefix: str = "") -> Iterator[str]:
+def every_key(node, prefix: str = "") -> Iterator[str]:
+    """Yield the dotted keys of a config, each before those within it."""
     from omegaconf import DictConfig
 
     for key in (key for key in node if not str(key).startswith("_")):
         yield f"{prefix}{key}"
         inner = node._get_node(key)
         if isinstance(inner, DictConfig) and not (inner._is_none() or inner._is_missing()):
-            yield from _keys(inner, f"{prefix}{key}.")
+            yield from every_key(inner, f"{prefix}{key}.")
 
 
 def _groups(conf: Path) -> Iterator[str]:

@@ -48,10 +48,11 @@ Watch: tensorboard --logdir runs
 
 def train(config) -> float | None:
     """Fit the stages that are not finished and measure the run; return its score if one is asked for."""
-    from forewarp.cli.checks import refuse_missing_scene, refuse_seeds, refuse_two_models
+    from forewarp.cli.checks import refuse_missing_scene, refuse_renamed_keys, refuse_seeds, refuse_two_models
     from forewarp.runs.config import claim, hashed, resumed
     from forewarp.runs.trust import check_planned, trust_of
 
+    refuse_renamed_keys(config)
     refuse_seeds(config)
     refuse_two_models(config)
     trust = trust_of(config.get("trust"))

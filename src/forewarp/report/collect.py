@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -88,9 +89,9 @@ class Result:
         """
         if named := (self.config.get("variant") or {}).get("against"):
             return named
-        own = set(self.variant.split())
-        inside = [name for name in variants if set(name.split()) < own]
-        return max(inside, key=lambda name: len(name.split()), default="base")
+        own = set(_overrides(self.variant))
+        inside = [name for name in variants if set(_overrides(name)) < own]
+        return max(inside, key=lambda name: len(_overrides(name)), default="base")
 
     @property
     def effects(self) -> str:
@@ -185,10 +186,19 @@ def _shorten(results: Sequence[Result]) -> None:
     """In names that are typed overrides, drop the overrides that all such runs of a scene share."""
     for found in by_scene(results).values():
         typed = [known for run in found if set(known := run.config.get("variant") or {}) == {"name"}]
-        names = [(known["name"] or "").split() for known in typed]
+        names = [_overrides(known["name"] or "") for known in typed]
         shared = set.intersection(*map(set, names)) if len({*map(tuple, names)}) > 1 else set()
         for known, name in zip(typed, names):
-            known["name"] = " ".join(word for word in name if word not in shared)
+            known["name"] = " ".join(override for override in name if override not in shared)
+
+
+def _overrides(name: str) -> list[str]:
+    """Split a name into its overrides, without spaces inside them.
+
+    >>> _overrides("preset.rays=64 stage.fine.num_voxels=[[0, 8000]] ~stage.coarse")
+    ['preset.rays=64', 'stage.fine.num_voxels=[[0,8000]]', '~stage.coarse']
+    """
+    return [re.sub(r"\s", "", one) for one in re.split(r"\s+(?=[+~]|[\w./]+=)", name) if one]
 
 
 def read_run(folder: Path) -> Result:

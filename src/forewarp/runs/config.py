@@ -32,8 +32,8 @@ MAY_CHANGE = (
 def hashed(config: DictConfig) -> DictConfig:
     """Replace ``{hash}`` in the key ``run`` by ten digits of a hash of the keys that tell runs apart.
 
-    So each config has a folder of its own, and a finished job is found again. For a run bounded by minutes
-    the device and the precision count too.
+    So each configuration has a folder of its own, and a finished job is found again. A precision other than
+    32-true counts too, and for a run bounded by minutes the device.
     """
     if HASH in str(config.run):
         config.run = str(config.run).replace(HASH, content_hash(config))
@@ -44,10 +44,13 @@ def content_hash(config: DictConfig, more: Sequence[str] = (), *others: object) 
     """Return ten digits of a SHA-256 of ``IDENTITY`` and ``more`` keys of a config, and of ``others``."""
     _make_absolute(config)
     content = {key: _plain(config.get(key)) for key in (*IDENTITY, *more)}
+    precision = config.trainer.get("precision")
     if config.budget.minutes is not None:
         from forewarp.training.device import device_of
 
-        content["on"] = [device_of(config.trainer.accelerator).type, config.trainer.get("precision")]
+        content["on"] = [device_of(config.trainer.accelerator).type, precision]
+    elif precision not in (None, "32-true"):
+        content["precision"] = precision
     if others:
         content["others"] = others
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:10]

@@ -10,7 +10,14 @@ OF_A_SWEEP = ("sweeps=", "seeds=", "launcher=")  # these say how jobs are run, n
 
 _OF_PRESET = "rays|background|bases|nodes|padding|alpha_threshold|skip_alpha|inpainter_width"
 SINCE_3 = "renamed in 0.3"
-# Pattern of a whole override, its replacement (None: there is none), and the reason.
+_VARIANTS = (  # that forewarp had
+    r"background_grid|backward|bases_(5|15|20)|carry_off|coarse_[268]0|color_all|confine|frames_all|grid_(64|96|160)|"
+    r"loss_(no_entropy|no_point_color|no_tv_flow|tv_density|tv_depth)|motion_(features|none)|nodes_0|padding_0|"
+    r"preset_(demo|faithful)|radiance_mlp|rays_(1024|2048|8192|whole)|recompute_off|see_off|skip_off|start_box|"
+    r"tv_depth_every_4|unet_(16|16_half|32|64)|upsampler_(learned|trilinear)|view_(mlp|none)|voxels_all"
+)
+# Pattern of a whole override, its replacement (None: there is none), and the reason. Oldest version first,
+# as a later one may rename again what an earlier one renamed.
 RENAMED = (
     (
         r"budget=(.*)",
@@ -33,16 +40,21 @@ RENAMED = (
     (r"(preset|model\.radiance|model\.background)\.skip_alpha(=.*)?", r"\1.alpha_threshold\2", SINCE_3),
     (r"model\.renderer\.opaque(=.*)?", r"model.renderer.early_stop_eps\1", SINCE_3),
     (r"(objective(?:\.\w+)?\.weights)\.still_points(=.*)?", r"\1.static_points\2", SINCE_3),
-    (r"model/view(=.*)", r"model/view_dependence\1", SINCE_3),
+    (r"model/view(=.*)?", r"model/view_dependence\1", SINCE_3),
     (r"model\.view([.=].*)?", r"model.view_dependence\1", SINCE_3),
-    (r"variant=base", "ablation=base", SINCE_3),
     (
-        r"variant=.*",
+        rf"variant=(.*,)?({_VARIANTS})(,.*)?",
         None,
         "type what a variant changed, as preset.rays=1024; sweeps/price_list.yaml lists all that there were",
     ),
+    (r"variant=base", "ablation=base", SINCE_3),
     (
-        r"ablation=.*voxels_\d+.*",
+        r"variant=([^{]*)",
+        r"ablation=\1",
+        "move your file from variant/ to ablation/, as the group is called since 0.3",
+    ),
+    (
+        r"ablation=(.*,)?voxels_(20|40|60|80)(,.*)?",
         None,
         "sweeps=resolution has these sizes since 0.3; one of them is stage.fine.num_voxels=[[0,512000]]",
     ),
@@ -109,8 +121,12 @@ def refuse_renamed(overrides: Sequence[str]) -> None:
     ValueError: budget.bases=12: expected preset.bases=12; the method's numbers are called preset since 0.2
     """
     for override in overrides:
-        sign, plain = re.fullmatch(r"([+~]*)(.*)", override, re.DOTALL).groups()
+        before, now = re.fullmatch(r"([+~]*(?:hydra\.sweeper\.params\.)?)(.*)", override, re.DOTALL).groups()
+        reason = None
         for old, new, why in RENAMED:
-            if found := re.fullmatch(old, plain, re.DOTALL):
-                now = "no such override" if new is None else sign + found.expand(new)
-                raise ValueError(f"{override}: expected {now}; {why}")
+            if found := re.fullmatch(old, now, re.DOTALL):
+                if new is None:
+                    raise ValueError(f"{override}: expected no such override; {why}")
+                now, reason = found.expand(new), reason or why
+        if reason:
+            raise ValueError(f"{override}: expected {before}{now}; {reason}")

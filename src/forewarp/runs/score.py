@@ -8,6 +8,7 @@ from pathlib import Path
 from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
+from hydra.utils import get_class
 from omegaconf import DictConfig, OmegaConf
 
 from forewarp.evaluation.evaluate import mean_scores
@@ -132,8 +133,12 @@ def _is_typed() -> bool:
 
 
 def searching() -> bool:
-    """Tell whether the sweeper chooses jobs by the scores of earlier jobs."""
-    return "_target_" in (sweeper := _sweeper()) and not sweeper._target_.endswith(".BasicSweeper")
+    """Tell whether the sweeper chooses jobs by the scores of earlier ones, as all but Hydra's own do."""
+    # Here, as Hydra defines its sweepers anew when it looks for plugins.
+    from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+
+    target = _sweeper().get("_target_")
+    return target is not None and not issubclass(get_class(target), BasicSweeper)
 
 
 def _sweeper() -> DictConfig:
