@@ -27,13 +27,14 @@ def test_what_fails_leaves_the_old_file_and_nothing_beside(tmp_path):
 
 
 def test_an_error_names_the_file_that_it_is_of(tmp_path):
-    def full(beside):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    def full(*name):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), *name)
 
     path = tmp_path / "a.txt"
-    with pytest.raises(OSError, match="No space left") as caught, written_whole(path) as beside:
-        full(beside)
-    assert caught.value.filename == str(path)
+    for name in ((), ("/tmp/of-a-library",)):
+        with pytest.raises(OSError, match="No space left") as caught, written_whole(path):
+            full(*name)
+        assert caught.value.filename == str(path)
     with pytest.raises(FileNotFoundError) as caught, written_whole(path):
         (tmp_path / "other").read_text()
     assert caught.value.filename == str(tmp_path / "other")

@@ -38,8 +38,10 @@ def written_whole(path: Path, *, synced: bool = False) -> Iterator[Path]:
             with beside.open("rb+") as file:
                 os.fsync(file.fileno())
         os.replace(beside, path)
-    except OSError as error:  # a full disk does not say which file
-        if error.filename not in (None, str(beside), str(path)):
+    except OSError as error:
+        # A full disk names no file, or a temporary one of a library's.
+        full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+        if not full and error.filename not in (None, str(beside), str(path)):
             raise
         raise OSError(error.errno, error.strerror or str(error), str(path)) from error
     finally:
