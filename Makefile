@@ -4,8 +4,8 @@
 PYTHON ?= python3
 BIN := .venv/bin
 DEMO := runs/demo
-# Of accuracy-time and price-list: a folder of D-NeRF scenes (none: the procedural vehicle), a scene of it, minutes of
-# training a run, and, where not all of them are wanted, the variants (conf/variant) and how many seeds.
+# For accuracy-time and price-list: a folder of D-NeRF scenes (none: the procedural vehicle), a scene of it, minutes of
+# training a run, how many seeds, and, to compare less than sweeps/price_list.yaml does, CHANGES="preset.rays=1024,2048".
 DATA ?=
 SCENE ?= jumpingjacks
 SCENES ?= jumpingjacks hook
@@ -13,95 +13,100 @@ MINUTES ?= 3
 DEVICE ?= gpu
 SHELL := bash
 .SHELLFLAGS := -o pipefail -c
-# Large pages, as the commands set them themselves; one thread, as threads that wait for a busy core tell nothing.
+# Large memory pages, as the commands use; one thread, as threads that wait for a busy core spoil the timing.
 MEASURE := OMP_NUM_THREADS=1 OMP_WAIT_POLICY=passive THP_MEM_ALLOC_ENABLE=1
-MORE = budget.minutes=$(MINUTES) $(if $(VARIANTS),variant=$(VARIANTS)) $(SEED) $(if $(THREADS),threads=$(THREADS))
+MORE = budget.minutes=$(MINUTES) $(SEED) $(if $(THREADS),threads=$(THREADS))
 comma := ,
-# SEEDS=3: each job three times; SEEDS=4,7: with these.
+# SEEDS=3: run each job with seeds 0, 1 and 2; SEEDS=4,7: with these.
 SEED = $(if $(SEEDS),$(if $(findstring $(comma),$(SEEDS)),seed,seeds)=$(SEEDS))
-# Of what runs side by side, lines begin with whose they are; Ctrl-C is for the run, which has more to say.
+# Begin each line of jobs that run side by side with the job's name; leave Ctrl-C to the job itself.
 SAYS = 2>&1 | { trap '' INT; sed -u 's/^/$@ | /'; }
-SWEEP = $(BIN)/forewarp-train --multirun sweeps=accuracy_time
+# All changes of the price list; with CHANGES the reference, then these.
+SWEEP = sweep() { $(BIN)/forewarp-train --multirun "$$@" $(MORE); }; \
+	compare() { $(if $(CHANGES),sweep sweeps=accuracy_time "$$@" $(GO_ON); sweep sweeps=accuracy_time "$$@" $(CHANGES),sweep sweeps=price_list "$$@"); }
 space := $(subst ,, )
-# A job that failed has been named and stops no other; make ends with its status. Only an interruption ends it all.
+# A failed job has printed its error and stops no other job; make ends with its status. Only Ctrl-C ends everything.
 GO_ON = || { status=$$?; [ $$status -lt 128 ] || exit $$status; }
 
 help: ## show this list
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 20
 
-install: ## make .venv and put forewarp into it, with all its extras but the launchers of sweeps
+install: ## create .venv with forewarp and all extras except the launchers of sweeps
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
 	$(BIN)/pip install --quiet uv
 	links="$$($(BIN)/pip config get global.find-links 2>/dev/null || echo "$$PIP_FIND_LINKS")"; \
 	if [ -n "$$links" ]; then export UV_FIND_LINKS="$$links"; fi; \
-	VIRTUAL_ENV="$$PWD/.venv" $(BIN)/uv pip install -c constraints.txt -e '.[cpu,synth,plots,dev]'
+	VIRTUAL_ENV="$$PWD/.venv" $(BIN)/uv pip install --compile-bytecode -c constraints.txt -e '.[cpu,synth,plots,dev]'
 
-install-launchers: ## add joblib, Ray and submitit, that sweeps may run on (launcher=...), and Optuna (sweeps=search)
+install-launchers: ## add joblib, Ray and submitit for sweeps (launcher=...), and Optuna (sweeps=search)
 	links="$$($(BIN)/pip config get global.find-links 2>/dev/null || echo "$$PIP_FIND_LINKS")"; \
 	if [ -n "$$links" ]; then export UV_FIND_LINKS="$$links"; fi; \
-	VIRTUAL_ENV="$$PWD/.venv" $(BIN)/uv pip install -c constraints.txt -e '.[sweeps]'
+	VIRTUAL_ENV="$$PWD/.venv" $(BIN)/uv pip install --compile-bytecode -c constraints.txt -e '.[sweeps]'
 
-demo: ## fit the procedural vehicle forward and backward, a core each, compare, make a video (two to three minutes)
+demo: ## fit the procedural vehicle forward and backward, one core each, compare, make a video (three minutes)
 	@$(MAKE) --no-print-directory -j2 demo-forward demo-backward
-	$(BIN)/python -m forewarp.cli.compare $(DEMO)/forward $(DEMO)/backward
+	$(BIN)/forewarp-report kind=compare runs=[$(DEMO)/forward,$(DEMO)/backward]
 	$(BIN)/forewarp-render run=$(DEMO)/forward path=both
 
 demo-forward demo-backward: demo-%:
 	$(BIN)/forewarp-train experiment=demo model=$* threads=1 budget.minutes=1.25 run=$(DEMO)/$* $(SAYS)
 
-demo-lego-complete: ## make a small counterpart of Lego Complete, fit one of its scenes, measure, make a video
+demo-lego-complete: ## build a small counterpart of Lego Complete, fit a scene, evaluate, make a video
 demo-hypernerf: ## the same for a two-phone rig in a textured room, with a static background
 demo-nhr: ## the same for a dome of cameras with masks
 demo-lego-complete demo-hypernerf demo-nhr:
 	$(BIN)/forewarp-train experiment=$(subst -,_,$@) run=runs/$@
 	$(BIN)/forewarp-render run=runs/$@ path=both
 
-test: ## run the tests, but for the slow ones
+test: ## run the tests except the slow ones
 	$(BIN)/pytest --no-cov -m "not slow and not bench"
 
-test-slow: ## run the slow tests: killed runs, every method on every dataset, the wheel
-	$(BIN)/pytest --no-cov -m slow tests/contract tests/cli/test_foreign.py tests/cli/test_wheel.py
+test-slow: ## run the slow tests: killed runs, every method on every dataset, every sweep's jobs, the wheel
+	$(BIN)/pytest --no-cov -m "slow and not bench"
 
-conformance: ## hold every method to the contract, also the slow cases, and write docs/conformance.md
+conformance: ## test every method against the contract, slow cases too, and write docs/conformance.md
 	OMP_NUM_THREADS=1 $(BIN)/pytest --no-cov -q tests/contract/test_contract.py --conformance=docs/conformance.md
 
-test-stability: ## run the hard cases, those too that take their time
+test-stability: ## run the numerical hard cases and killed runs, slow ones too
 	$(BIN)/pytest --no-cov -m stability tests/stability
 
 bench: ## time every operator, a step and a frame, into docs/performance.md (a quarter of an hour)
 	mkdir -p runs/bench
 	$(MEASURE) $(BIN)/pytest --no-cov -m bench tests/bench --benchmark-json=runs/bench/growth.json
-	$(MEASURE) $(BIN)/python -m forewarp.cli.performance
+	$(MEASURE) $(BIN)/python -m tests.bench.performance
 
 bench-gpu: MINUTES := $(if $(filter command line,$(origin MINUTES)),$(MINUTES),10)
 bench-gpu: ## steps, frames and PSNR against seconds on a GPU [DATA= SCENES="a b" MINUTES= DEVICE=cpu SMALL=1]
-	$(BIN)/python -m forewarp.cli.device --device $(DEVICE) --minutes $(MINUTES) $(if $(SMALL),--small) \
+	$(BIN)/python -m tests.bench.device --device $(DEVICE) --minutes $(MINUTES) $(if $(SMALL),--small) \
 		$(if $(DATA),--data $(DATA) --scenes $(SCENES))
 
-accuracy-time: ## sweep choices against training time and draw it [DATA= SCENE= MINUTES= VARIANTS=a,b SEEDS=3]
-	status=0; $(SWEEP) $(if $(DATA),experiment=dnerf data.root=$(DATA) data.scene=$(SCENE)) $(MORE) $(GO_ON); \
+RENAMED = $(if $(VARIANTS),$(error VARIANTS: expected CHANGES="preset.rays=1024$(comma)2048"; variants are gone since 0.3))
+accuracy-time: ## accuracy of each choice against training time [DATA= SCENE= MINUTES= CHANGES= SEEDS=3]
+	@$(RENAMED)
+	status=0; $(SWEEP); compare $(if $(DATA),experiment=dnerf data.root=$(DATA) data.scene=$(SCENE)) $(GO_ON); \
 	$(BIN)/forewarp-report kind=accuracy_time out=docs/results && exit $$status
 
 price-list: SEEDS ?= 2
-price-list: ## what each choice costs and brings, on the vehicle and two real scenes [DATA= SCENES="a b" MINUTES=]
+price-list: ## what each choice costs and brings, on the vehicle and real scenes [DATA= SCENES="a b" MINUTES= CHANGES=]
+	@$(RENAMED)
 	@test -n "$(DATA)" || { echo "price-list: expected DATA=<folder of D-NeRF scenes>"; exit 2; }
-	status=0; $(SWEEP) $(MORE) $(GO_ON); \
+	status=0; $(SWEEP); compare $(GO_ON); \
 	for scene in $(SCENES); do \
-		$(SWEEP) experiment=dnerf data.root=$(DATA) data.scene=$$scene $(MORE) $(GO_ON); \
+		compare experiment=dnerf data.root=$(DATA) data.scene=$$scene $(GO_ON); \
 	done; \
 	$(BIN)/forewarp-report kind=price_list out=docs/results && exit $$status
 
 COMPARE = $(BIN)/forewarp-train --multirun sweeps=effects $(if $(THREADS),threads=$(THREADS))
 effects: MINUTES := $(if $(filter command line,$(origin MINUTES)),$(MINUTES),2)
 effects: SEEDS ?= 2
-effects: ## what scenes call for against every effect at once, on made scenes or real ones [DATA= SCENES="a b" MINUTES= SEEDS=]
+effects: ## planned effects against all effects, on procedural or real scenes [DATA= SCENES="a b" MINUTES= SEEDS=]
 ifeq ($(DATA),)
 	@status=0; $(COMPARE) $(SEED) ablation=auto $(GO_ON); \
 	$(COMPARE) $(SEED) ablation=all_effects budget.minutes=$(MINUTES) $(GO_ON); \
 	$(BIN)/forewarp-report kind=effects && exit $$status
 else
 	@status=0; \
-	for choice in ablation=auto ablation=all_effects ablation=full "ablation=null variant=base"; do \
+	for choice in ablation=auto ablation=all_effects ablation=full ablation=base; do \
 		$(COMPARE) $(SEED) $$choice paths.scenes=$(DATA) scene=$(subst $(space),$(comma),$(addprefix dnerf_,$(SCENES))) \
 			budget.minutes=$(MINUTES) plan.minutes=$(MINUTES) plan.seconds=40 plan.trial_seconds=40 $(GO_ON); \
 	done; \
@@ -109,7 +114,7 @@ else
 endif
 
 REPRODUCE = $(BIN)/forewarp-train --multirun preset=$(PRESET) budget.minutes=$(MINUTES) $(SEED) $(if $(THREADS),threads=$(THREADS)) $(if $(LAUNCHER),launcher=$(LAUNCHER))
-# A counterpart of each dataset and 12 s a run: 27 runs, half of them on each of two cores.
+# Without DATA: a counterpart of each dataset, 27 runs of 12 s, half of them on each of two cores.
 reproduce-tables: PRESET ?= $(if $(DATA),fast,demo)
 reproduce-tables: MINUTES := $(if $(filter command line,$(origin MINUTES)),$(MINUTES),$(if $(filter faithful,$(PRESET)),null,$(if $(DATA),5,0.2)))
 reproduce-tables: SWEEPS ?= $(if $(SCENES_TYPED),dnerf,dnerf hypernerf nhr lego_complete)
@@ -117,7 +122,7 @@ reproduce-tables: override SWEEPS := $(if $(filter all,$(SWEEPS)),dnerf hyperner
 reproduce-tables: SCENES_TYPED := $(if $(filter command line,$(origin SCENES)),$(SCENES))
 reproduce-tables: SEEDS ?= 1
 reproduce-tables: OUT ?= runs/paper/results
-reproduce-tables: ## the paper's tables and figures, measured beside printed [DATA= PRESET= SCENES="hook lego" MINUTES= SEEDS=3 SWEEPS=all OUT=]
+reproduce-tables: ## the paper's tables and figures, measured beside published [DATA= PRESET= SCENES="hook lego" MINUTES= SEEDS=3 SWEEPS=all OUT=]
 ifeq ($(DATA),)
 	@status=0; $(MAKE) --no-print-directory -j2 tables-vehicle tables-captures \
 		PRESET=$(PRESET) MINUTES=$(MINUTES) SEEDS=$(SEEDS) $(GO_ON); \
@@ -138,14 +143,14 @@ tables-vehicle tables-captures:
 		$(REPRODUCE) sweeps=$${pair%:*} scene=counterpart_$${pair#*:} $(GO_ON); \
 	done; exit $$status; } $(SAYS)
 
-lint: ## look for mistakes and untidy code
+lint: ## check code and format
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 
-format: ## tidy the code
+format: ## fix what can be fixed, and format
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-clean: ## remove what tests and tools leave behind; runs/ and data/ stay
+clean: ## remove caches and builds; runs/ and data/ stay
 	rm -rf .pytest_cache .ruff_cache .hypothesis .coverage build dist
 	find src tests -name __pycache__ -type d -prune -exec rm -rf {} +

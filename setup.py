@@ -13,11 +13,12 @@ class WithConfigurations(build_py):
     """Build, and copy the folders beside the modules; an editable install uses them where they are."""
 
     def run(self):
-        """Leave nothing there of an earlier build."""
+        """Leave nothing there of an earlier build, whose modules may have moved since."""
+        if not self.editable_mode:
+            for package in ("forewarp", "hydra_plugins"):
+                rmtree(Path(self.build_lib, package), ignore_errors=True)
         super().run()
         if not self.editable_mode:
-            for folder in FOLDERS:
-                rmtree(Path(self.build_lib, "forewarp", folder), ignore_errors=True)
             for file in self._configurations():
                 target = Path(self.build_lib, "forewarp", file)
                 self.mkpath(str(target.parent))

@@ -1,8 +1,51 @@
-"""Lets every test import ``reference``, whatever pytest's import mode."""
+"""What every test may ask for: the commands in this process, a fitted run, an empty folder."""
 
-import sys
-from pathlib import Path
+import gc
 
-sys.path.insert(0, str(Path(__file__).parent))
+import pytest
+
+from tests.support.commands import call, fitted_run
 
 collect_ignore = ["foreign"]  # the package that tests/cli/test_foreign.py imports as somebody else's
+
+
+@pytest.fixture
+def forewarp():
+    """``forewarp("train", "data.scene=x")`` gives ``status``, ``out`` and ``err``; nothing global remains."""
+    return call
+
+
+@pytest.fixture
+def refused():
+    """Call a command that must end in one line and status 2; returns that line."""
+
+    def refuse(name, *arguments):
+        done = call(name, *arguments)
+        lines = done.err.strip().splitlines()
+        assert done.status == 2, done
+        assert "Traceback" not in done.err
+        assert lines[-1].startswith(f"forewarp-{name}: error: "), done.err
+        assert [line for line in lines[:-1] if "%" not in line] == []  # nothing but a progress line before it
+        return lines[-1].removeprefix(f"forewarp-{name}: error: ")
+
+    return refuse
+
+
+@pytest.fixture(scope="session")
+def fitted(tmp_path_factory):
+    """The folder of a finished run that all tests share; see ``fitted_run``."""
+    return fitted_run(tmp_path_factory)
+
+
+@pytest.fixture
+def in_tmp(tmp_path, monkeypatch):
+    """The current directory, empty."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _imports_are_no_garbage():
+    """Exempt imported modules from garbage collection, which every stage of a run does before it starts."""
+    gc.collect()
+    gc.freeze()

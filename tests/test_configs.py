@@ -1,35 +1,45 @@
 """Every configuration composes and instantiates; the command line wins; off is off."""
 
-import re
 from dataclasses import MISSING, fields
-from functools import cache
 from inspect import signature
 
 import pytest
 import torch
 from hydra.errors import ConfigCompositionException
+from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
-from configs import CONF, ROOT, composed, groups, options
-from forewarp.cli.runs import build_run, model_of
 from forewarp.data import dnerf, hypernerf, nhr, posed_video
 from forewarp.data.module import SceneDataModule
 from forewarp.methods.voxel.effects.inpaint import UNet3d
 from forewarp.methods.voxel.effects.upsample import LearnedUpsampler
-from forewarp.methods.voxel.effects.view import SphericalHarmonics, ViewNetwork
+from forewarp.methods.voxel.effects.view_dependence import SphericalHarmonics, ViewNetwork
+from forewarp.methods.voxel.model import Ground
 from forewarp.methods.voxel.stage import EFFECTS, VoxelStage
-from forewarp.methods.voxel.start import Ground
 from forewarp.methods.voxel.terms import TERMS
 from forewarp.renderer import Renderer
+from forewarp.runs.build import build_run, model_of
 from forewarp.scene.box import Box, Lattice
-from forewarp.training.settings import StageSettings
+from forewarp.training.schedule import StageSettings
+from tests.support.configs import CONF, composed, groups, options
 
 PRESETS, MODELS = options("preset"), options("model")
-CHOICES = [(group, option) for group in groups() for option in options(group)]
+EXPERIMENTS = options("experiment")
+# Crossed with each other below, jobs of tests/test_sweeps.py (scene, ablation), or always on.
+ELSEWHERE = {"preset", "model", "experiment", "stage", "objective", "data", "scene", "ablation"}
+ELSEWHERE |= {"callbacks", "hydra", "paths"}
+DEFAULTS = {
+    ("capture", "cut_out"),
+    ("logger", "tensorboard"),
+    ("trainer", "auto"),
+    ("model/renderer", "march"),
+}
+CHOICES = {(group, option) for group in groups() if group not in ELSEWHERE for option in options(group)}
+CHOICES = sorted(CHOICES - DEFAULTS)
 OFF = [
     ("inpainter", "unet3d"),
     ("upsampler", "learned"),
-    ("view", "mlp"),
+    ("view_dependence", "mlp"),
     ("motion", "dct"),
     ("background", "grid"),
 ]
@@ -45,20 +55,13 @@ def method_of(model, frames=4):
     lattice = Lattice(Box((-1, -1, -1), (1, 1, 1)), (3, 4, 5))
     every = torch.ones(lattice.shape, dtype=torch.bool)
     ground = Ground(lattice, every, 0.5, lattice.box, frames, 0.0, (lattice, every))
-    return model.build(ground, VoxelStage(voxels=[[0, 60]], effects=EFFECTS))
-
-
-def model_for(group, option):
-    """The method whose file an option is, where its name says so."""
-    named = [m for m in MODELS if option.startswith(f"{m}_")]
-    return [f"model={named[0]}"] if group.startswith(("stage", "objective", "model_")) and named else []
+    return model.build(ground, VoxelStage(num_voxels=[[0, 60]], effects=EFFECTS))
 
 
 @pytest.mark.parametrize(("group", "option"), CHOICES)
 def test_every_option_composes_and_instantiates(group, option):
-    run = run_of(f"{group}={option}", *model_for(group, option))
-    one = option == "no_coarse" or "tnerf" in f"{group}={option}"
-    assert [stage.settings.name for stage in run.stages] == (["fine"] if one else ["coarse", "fine"])
+    run = run_of(f"{group}={option}")
+    assert [stage.settings.name for stage in run.stages] == ["coarse", "fine"]
     if group.startswith("model/"):
         assert isinstance(method_of(run.model), torch.nn.Module)
 
@@ -69,66 +72,14 @@ def test_every_command_has_a_config(name):
     assert OmegaConf.to_container(config, resolve=True, throw_on_missing=True)["paths"]
 
 
-# A search has ranges in the place of options, and needs Optuna: tests/cli/test_search.py.
-GRIDS = sorted(path.stem for path in (ROOT / "sweeps").glob("*.yaml") if path.stem != "search")
-
-
-@pytest.mark.parametrize("sweep", GRIDS)
-def test_every_sweep_is_found_and_names_options(sweep):
-    params = composed(f"sweeps={sweep}", hydra=True).hydra.sweeper.params
-    assert len(params) > 0
-    for key, values in params.items():
-        names = [value.strip() for value in str(values).split(",")]
-        if key == "seed":
-            assert re.fullmatch(r"range\(0, ?\d+\)", str(values))
-        elif key in groups():  # each option composes, as is tested above
-            assert set(names) <= set(options(key))
-        else:
-            for name in names:
-                run_of(f"{key}={name}")
-
-
-@cache
-def swept(variant):
-    """What a job of the sweep over variants composes."""
-    common = ["experiment=dnerf", "data.scene=x", "sweeps=accuracy_time", "budget.minutes=3"]
-    return composed(*common, f"variant={variant}")
-
-
-@pytest.mark.parametrize("name", options("variant"))
-def test_a_variant_names_itself_and_changes_what_it_is_compared_with(name):
-    config = swept(name)
-    assert config.variant.name == name
-    assert config.variant.against in options("variant")
-    assert config.run == f"{config.paths.runs}/accuracy_time/x/{name}-3min-seed0"
-    assert (config.budget.minutes, config.data.held_out) == (3, 8)
-    before = swept(config.variant.against)
-    parts = ("model", "stage", "objective", "preset", "budget", "data", "trainer")
-    same = all(config[key] == before[key] for key in parts)
-    assert same is (name == "base")
-
-
-def test_the_sweep_holds_every_variant_once():
-    config = composed("sweeps=accuracy_time", hydra=True)
-    listed = [name.strip() for name in config.hydra.sweeper.params.variant.split(",")]
-    assert sorted(listed) == options("variant")
-
-
-def test_a_variant_wins_over_preset_and_experiment():
-    common = ["experiment=dnerf", "data.scene=x"]
-    assert method_of(run_of(*common, "variant=view_mlp").model).view.__class__ is ViewNetwork
-    assert composed(*common, "variant=preset_demo").preset.name == "demo"
-    assert run_of(*common, "variant=backward").model.deformation is not None
-    assert run_of(*common, "variant=unet_32").model.inpainter is not None
-
-
 @pytest.mark.parametrize("model", MODELS)
 @pytest.mark.parametrize("preset", PRESETS)
 def test_presets_go_with_models(preset, model):
     config = composed("data.scene=x", f"preset={preset}", f"model={model}")
     assert (config.preset.name, config.model.name) == (preset, model)
     assert callable(model_of(config.model))
-    assert build_run(config).stages
+    expected = ["fine"] if model == "tnerf" else ["coarse", "fine"]
+    assert [stage.settings.name for stage in build_run(config).stages] == expected
 
 
 def test_faithful_is_the_papers_model():
@@ -136,7 +87,7 @@ def test_faithful_is_the_papers_model():
     assert isinstance(method.inpainter, UNet3d)
     assert method.inpainter.width == 64
     assert isinstance(method.upsampler, LearnedUpsampler)
-    assert isinstance(method.view, ViewNetwork)
+    assert isinstance(method.view_dependence, ViewNetwork)
     assert method.motion.trajectory.bases == 15
     assert not method.motion.trajectory.at_nodes
 
@@ -153,12 +104,14 @@ def test_faithful_stages_are_the_papers():
     assert (coarse.objective.weights["point_color"], fine.objective.weights["point_color"]) == (1e-1, 1e-2)
 
 
-@pytest.mark.parametrize(("effect", "on"), OFF)
 @pytest.mark.parametrize("preset", PRESETS)
-def test_off_is_none_whatever_the_preset(preset, effect, on):
-    model = run_of(f"preset={preset}", f"model/{effect}=none").model
-    assert getattr(model, effect) is None
-    assert getattr(run_of(f"preset={preset}", f"model/{effect}={on}").model, effect) is not None
+def test_off_is_none_whatever_the_preset(preset):
+    off = run_of(f"preset={preset}", *(f"model/{effect}=none" for effect, _ in OFF)).model
+    on = run_of(f"preset={preset}", *(f"model/{effect}={choice}" for effect, choice in OFF)).model
+    for effect, _ in OFF:
+        assert getattr(off, effect) is None
+        assert getattr(on, effect) is not None
+    assert {name.split(".")[0] for name, _ in method_of(off).named_parameters()} == {"radiance"}
 
 
 def test_every_number_of_the_renderer_is_a_key_and_equals_its_default():
@@ -167,20 +120,14 @@ def test_every_number_of_the_renderer_is_a_key_and_equals_its_default():
     }
     config = OmegaConf.to_container(composed("data.scene=x").model.renderer)
     assert config == {"_target_": "forewarp.renderer.Renderer"} | defaults
-    assert run_of("model.renderer.opaque=0").model.renderer.opaque == 0
-
-
-def test_off_effects_own_nothing():
-    off = [f"model/{effect}=none" for effect, _ in OFF]
-    method = method_of(run_of(*off).model)
-    assert {name.split(".")[0] for name, _ in method.named_parameters()} == {"radiance"}
+    assert run_of("model.renderer.early_stop_eps=0").model.renderer.early_stop_eps == 0
 
 
 @pytest.mark.parametrize("order", [1, -1])
 def test_the_command_line_wins_over_the_preset(order):
-    overrides = ["preset=fast", "model/view=mlp"][::order]
-    assert method_of(run_of("preset=fast").model).view.__class__ is SphericalHarmonics
-    assert method_of(run_of(*overrides).model).view.__class__ is ViewNetwork
+    overrides = ["preset=fast", "model/view_dependence=mlp"][::order]
+    assert method_of(run_of("preset=fast").model).view_dependence.__class__ is SphericalHarmonics
+    assert method_of(run_of(*overrides).model).view_dependence.__class__ is ViewNetwork
 
 
 def test_the_command_line_wins_over_the_experiment():
@@ -239,8 +186,7 @@ def test_every_dataset_takes_a_canonical_time_and_the_presets_background(data):
     common = [f"data={data}", "data.scene=x", "preset.background=black"]
     config = composed(*common, "data.canonical=middle")
     assert (config.data.canonical, config.data.background) == ("middle", "black")
-    build_run(config)
-    assert composed(*common, "ablation=canonical_middle").data.canonical == "middle"
+    assert isinstance(instantiate(config.data, _convert_="all"), SceneDataModule)
 
 
 def test_run_folder_is_named_after_the_choices():
@@ -248,10 +194,17 @@ def test_run_folder_is_named_after_the_choices():
     assert config.run == "runs/hook/backward-demo-seed3"
 
 
-@pytest.mark.parametrize("model", MODELS)
-@pytest.mark.parametrize("experiment", options("experiment"))
-@pytest.mark.parametrize("preset", PRESETS)
-def test_every_method_fits_every_experiment_in_every_preset(preset, experiment, model):
+def every_experiment():
+    """Every method with every experiment and preset; those that say nothing new are slow."""
+    for i, experiment in enumerate(EXPERIMENTS):
+        for j, model in enumerate(MODELS):
+            for k, preset in enumerate(PRESETS):
+                quick = k == i % 3 and (model == "forward" or j == i % 3)
+                yield pytest.param(experiment, model, preset, marks=[] if quick else pytest.mark.slow)
+
+
+@pytest.mark.parametrize(("experiment", "model", "preset"), list(every_experiment()))
+def test_every_method_fits_every_experiment_in_every_preset(experiment, model, preset):
     common = [f"experiment={experiment}", f"preset={preset}", f"model={model}", "data.scene=x"]
     config = composed(*common)
     assert (config.model.name, config.preset.name) == (model, preset)
@@ -263,23 +216,26 @@ def test_each_number_of_a_method_is_taken_where_it_is_keyed(model):
     hypernerf = ["experiment=hypernerf", "data.scene=x", f"model={model}"]
     fast, faithful = composed(*hypernerf), composed(*hypernerf, "preset=faithful")
     assert [c.preset.bases for c in (fast, faithful)] == [8, 25]  # model x preset x experiment
-    assert fast.objective.fine.weights.still_points == 1e-2  # model x experiment
+    assert fast.objective.fine.weights.static_points == 1e-2  # model x experiment
     assert (fast.preset.rays, faithful.budget.iterations) == (4096, 120000)  # model x preset
     band, still = (composed(f"scene=specimen_{name}", f"model={model}") for name in ("band", "still"))
-    assert (band.stage.fine.voxels, still.stage.coarse.voxels) == ([[0, 15625]], [[0, 46656]])
+    assert (band.stage.fine.num_voxels, still.stage.coarse.num_voxels) == ([[0, 15625]], [[0, 46656]])
 
 
 def test_effects_follow_the_pictures_and_the_command_line_wins():
     def chosen(*words):
         return composed("data.scene=x", *words, hydra=True).hydra.runtime.choices
 
-    assert chosen("experiment=hypernerf")["model/view"] == "none"
+    assert chosen("experiment=hypernerf")["model/view_dependence"] == "none"
     assert chosen("experiment=hypernerf")["model/background"] == "grid"
     assert chosen("data=hypernerf")["model/background"] == "none"
-    assert chosen("experiment=video_with_poses")["model/view"] == "sh"
-    typed = ["experiment=hypernerf", "preset=demo", "model/view=mlp", "model/background=none"]
-    assert [chosen(*typed)[f"model/{effect}"] for effect in ("view", "background")] == ["mlp", "none"]
-    assert chosen("experiment=hypernerf", "variant=view_mlp")["model/view"] == "mlp"
+    assert chosen("experiment=video_with_poses")["model/view_dependence"] == "sh"
+    typed = ["experiment=hypernerf", "preset=demo", "model/view_dependence=mlp", "model/background=none"]
+    assert [chosen(*typed)[f"model/{effect}"] for effect in ("view_dependence", "background")] == [
+        "mlp",
+        "none",
+    ]
+    assert chosen("experiment=hypernerf", "ablation=full")["model/view_dependence"] == "mlp"
 
 
 FOREIGN = {

@@ -53,7 +53,7 @@ def test_flow_and_inpainting_hand_worked():
 
 
 def test_what_stands_still_hand_worked():
-    assert losses.still_points(torch.tensor([[3.0, 0.0, 4.0], [0.0, 0.0, 0.0]])).item() == 12.5
+    assert losses.static_points(torch.tensor([[3.0, 0.0, 4.0], [0.0, 0.0, 0.0]])).item() == 12.5
     assert losses.moving_opacity(torch.tensor([0.0, 1.0, 0.5])).item() == 0.5
 
 
@@ -92,7 +92,7 @@ def test_gradcheck():
     assert gradcheck(losses.background_entropy, draw(5))
     assert gradcheck(losses.sample_entropy, draw(5))
     assert gradcheck(losses.flow_l1, draw(5, 3))
-    assert gradcheck(losses.still_points, draw(5, 3))
+    assert gradcheck(losses.static_points, draw(5, 3))
     assert gradcheck(losses.inpaint_diff, draw(1, 2, 3, 4, 5))
     assert gradcheck(lambda d: losses.tv_density(d, pairs), draw(60))
     assert gradcheck(lambda f: losses.tv_flow(f, pairs), draw(60, 3))

@@ -4,24 +4,24 @@ import math
 import pytest
 import torch
 
-from forewarp.methods.voxel.effects.view import SphericalHarmonics
+from forewarp.fields.radiance_grid import Activation, RadianceGrid, shaded
+from forewarp.methods.voxel.effects.view_dependence import SphericalHarmonics
 from forewarp.ops import backend
 from forewarp.ops.grid import index_of
 from forewarp.ops.trace import trace
 from forewarp.renderer import Renderer
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.rays import Rays
-from forewarp.fields.radiance_grid import Activation, RadianceGrid, shaded
-from reference import composite, march_samples
+from tests.support.reference import composite, march_samples
 
-LATTICE = Lattice(Box((0, 0, 0), (1, 3, 8)), (3, 4, 5))  # spacings 1/2, 1, 2; pitch 1
+LATTICE = Lattice(Box((0, 0, 0), (1, 3, 8)), (3, 4, 5))  # spacings 1/2, 1, 2; voxel_size 1
 
 
 class Slab:
     """Constant density and colour in the whole box."""
 
     lattice = LATTICE
-    pitch = LATTICE.pitch
+    voxel_size = LATTICE.voxel_size
     cells = torch.ones(2, 3, 4, dtype=torch.bool)
 
     def __init__(self, sigma, feature=0.0):
@@ -152,8 +152,8 @@ def test_jitter_follows_the_generator():
 def test_another_threshold_by_stage():
     renderer = Renderer(step=0.3)
     assert renderer.with_threshold(None) is renderer
-    other = Renderer(step=0.3, opaque=0.1).with_threshold(0.0)
-    assert (other.step, other.color_threshold, other.opaque) == (0.3, 0.0, 0.1)
+    other = Renderer(step=0.3, early_stop_eps=0.1).with_threshold(0.0)
+    assert (other.step, other.color_threshold, other.early_stop_eps) == (0.3, 0.0, 0.1)
 
 
 def blocks(shape, strength, seed=3):
@@ -162,7 +162,7 @@ def blocks(shape, strength, seed=3):
     lattice = Lattice(Box((-1, -1, -2), (1, 2, 1)), shape)
     voxels = (torch.rand(shape, generator=generator) < 0.4).nonzero()
     values = strength * torch.randn(len(voxels), 13, generator=generator)
-    grid = RadianceGrid(lattice, index_of(voxels, shape), values, Activation(0.0, lattice.pitch))
+    grid = RadianceGrid(lattice, index_of(voxels, shape), values, Activation(0.0, lattice.voxel_size))
     origins = torch.nn.functional.normalize(torch.randn(300, 3, generator=generator), dim=-1) * 5
     directions = torch.nn.functional.normalize(torch.randn(300, 3, generator=generator) - origins, dim=-1)
     face = torch.tensor([[-4, -1, -0.5], [-4, 2, 1], [-4, 0.1, -2]])
@@ -179,7 +179,7 @@ def test_without_gradient_the_kernel_draws_the_same(monkeypatch, strength, thres
     shading = SphericalHarmonics()
     with torch.no_grad():
         fast = renderer(grid, view, behind, shading)
-        whole = Renderer(color_threshold=threshold, opaque=0.0)(grid, view, behind, shading)
+        whole = Renderer(color_threshold=threshold, early_stop_eps=0.0)(grid, view, behind, shading)
         jittered = [
             renderer(grid, view, behind, generator=torch.Generator().manual_seed(s)).rgb for s in (1, 1, 2)
         ]
@@ -212,10 +212,10 @@ def test_the_kernel_serves_only_where_nothing_else_is_asked_for(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"step": 0.0}, {"color_threshold": 1.0}, {"color_threshold": -0.1}, {"opaque": 1.0}]
+    "wrong", [{"step": 0.0}, {"color_threshold": 1.0}, {"color_threshold": -0.1}, {"early_stop_eps": 1.0}]
 )
 def test_refuses(wrong):
     with pytest.raises(
-        ValueError, match="renderer: expected step > 0 and 0 <= color_threshold < 1 and 0 <= opa"
+        ValueError, match="renderer: expected step > 0 and 0 <= color_threshold < 1 and 0 <= early"
     ):
         Renderer(**wrong)

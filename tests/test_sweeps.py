@@ -1,13 +1,19 @@
-"""The sweeps behind the paper's tables: every job composes, and is known by what it computes."""
+"""The sweeps behind the tables: every job composes, and its folder is named by what it computes."""
+
+import re
+import shlex
+from copy import deepcopy
 
 import pytest
-from hydra._internal.config_repository import ConfigRepository
+import yaml
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import OmegaConf
 
-from configs import ROOT, composed, options
-from forewarp.cli.identity import hashed
-from forewarp.cli.runs import build_run
+from forewarp.runs.build import build_run
+from forewarp.runs.config import hashed
+from hydra_plugins.forewarp_one_at_a_time import changed
+from tests.support.configs import CONF, ROOT, composed, groups, options
 
 PAPER = {
     "dnerf": 8,
@@ -19,11 +25,6 @@ PAPER = {
     "resolution": 16,
     "methods": 32,
 }
-
-
-def names(group):
-    """The options of a group, sweeps among them."""
-    return sorted(p.stem for p in (ROOT / "sweeps").glob("*.yaml")) if group == "sweeps" else options(group)
 
 
 COUNTERPARTS = ["dnerf", "hypernerf", "nhr", "lego_complete"]
@@ -45,6 +46,9 @@ def job_of(sweep, *overrides):
 
 @pytest.mark.parametrize(("sweep", "count"), PAPER.items())
 def test_a_sweep_has_its_jobs(sweep, count):
+    for key, values in composed(f"sweeps={sweep}", hydra=True).hydra.sweeper.params.items():
+        if key in groups():
+            assert {value.strip() for value in values.split(",")} <= set(options(key))
     jobs = jobs_of(sweep)
     assert len(jobs) == len({tuple(job) for job in jobs}) == count
     config = job_of(sweep, *jobs[-1])
@@ -57,6 +61,7 @@ def test_no_sweep_is_forgotten():
         *PAPER,
         "accuracy_time",
         "effects",
+        "price_list",
         "search",
     }
 
@@ -64,17 +69,16 @@ def test_no_sweep_is_forgotten():
 def test_effects_are_compared_on_every_specimen():
     jobs = jobs_of("effects")
     assert len(jobs) == 18
-    for job in jobs[:3]:
-        config = job_of("effects", *job)
-        assert config.run.startswith("runs/effects/still/")
+    room = [job for job in jobs if "scene=specimen_room" in job]
+    auto, every, paper = (job_of("effects", *job) for job in room)
+    for config in (auto, every, paper):
+        assert config.run.startswith("runs/effects/room/")
         assert config.variant.name in config.run
-    auto, every, paper = (
-        composed("sweeps=effects", "scene=specimen_room", f"ablation={a}")
-        for a in ("auto", "all_effects", "full")
-    )
     assert auto.effects == "auto"
     assert {
-        e for e in ("motion", "view", "upsampler", "inpainter", "background") if every.model[e] is None
+        e
+        for e in ("motion", "view_dependence", "upsampler", "inpainter", "background")
+        if every.model[e] is None
     } == set()
     assert every.model.trajectory.features > 0
     assert paper.model.background is None
@@ -95,50 +99,103 @@ def test_every_job_composes_and_has_a_folder_of_its_own(sweep):
     assert len(set(folders)) == len(folders)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("budget", ["budget.minutes=3", "budget.iterations=300"])
+def test_every_job_of_the_price_list_has_a_folder_of_its_own(budget):
+    bounds = ["budget.minutes=null", budget]
+    jobs = (
+        composed("sweeps=price_list", "data.scene=x", *bounds, *shlex.split(change)) for change in CHANGES
+    )
+    assert len({hashed(job).run for job in jobs}) == len(CHANGES)
+
+
 @pytest.mark.parametrize("dataset", COUNTERPARTS)
 def test_a_counterpart_stands_in_for_each_dataset(dataset):
     config = job_of("ablation_modules", f"scene=counterpart_{dataset}", "ablation=full", "preset=demo")
     assert "Synthetic" in config.data._target_
     assert (config.preset.name, config.variant.name) == ("demo", "full")
-    assert config.stage.fine.voxels == [[0, 13824]]
+    assert config.stage.fine.num_voxels == [[0, 13824]]
 
 
-NAMING = [f"{group}={name}" for group in ("ablation", "variant", "sweeps") for name in names(group)]
+CHANGES = yaml.safe_load((ROOT / "sweeps" / "price_list.yaml").read_text())["hydra"]["sweeper"]["changes"]
 
 
-@pytest.mark.parametrize("choice", [choice for choice in NAMING if choice != "sweeps=methods"])
-def test_what_reproduces_the_paper_names_its_method(choice, monkeypatch):
-    if choice == "sweeps=search":
-        pytest.importorskip("hydra_plugins.hydra_optuna_sweeper")
-    expected = "backward" if choice == "variant=backward" else "forward"
-    load = ConfigRepository.load_config
+def test_the_price_list_changes_one_thing_at_a_time():
+    assert CHANGES[0] == ""
+    assert len({frozenset(change.split()) for change in CHANGES}) == len(CHANGES) == 46
+    jobs = changed(jobs_of("price_list", "seeds=2"), CHANGES)
+    assert len(jobs) == 92
+    assert jobs[2:4] == [
+        ["seed=0", "budget.minutes=3", CHANGES[1]],
+        ["seed=1", "budget.minutes=3", CHANGES[1]],
+    ]
 
-    def with_another_default(self, config_path):
-        found = load(self, config_path)
-        if config_path == "train":
-            (model,) = [d for d in found.defaults_list if getattr(d, "group", None) == "model"]
-            model.value = "backward" if expected == "forward" else "forward"
-        return found
 
-    monkeypatch.setattr(ConfigRepository, "load_config", with_another_default)
-    assert composed("data.scene=x", choice).model.name == expected
+@pytest.mark.parametrize(
+    "change",
+    [
+        pytest.param(
+            change, marks=[] if re.search(r"every|precision|recompute", change) else pytest.mark.slow
+        )
+        for change in CHANGES[1:]
+    ],
+)
+def test_every_change_composes_and_changes_what_is_computed(change):
+    common = ["sweeps=price_list", "experiment=dnerf", "data.scene=x", "budget.minutes=3"]
+    config, before = (composed(*common, *words) for words in (change.split(), []))
+    build_run(config)
+    assert (config.budget.minutes, config.data.held_out) == (3, 8)
+    assert hashed(config).run != hashed(before).run
+
+
+def test_a_job_of_the_price_list_is_named_by_what_was_typed(forewarp, in_tmp):
+    scene = ["data=dnerf", "data.root=nowhere", "data.scene=x", "seed=3", "budget.minutes=2"]
+    for typed in ([], ["preset.rays=64"], ["model/motion=dct_features", "preset.bases=5"]):
+        shown = forewarp("train", "sweeps=price_list", *scene, *typed, "--cfg", "job", "--resolve")
+        assert yaml.safe_load(shown.out)["variant"] == {"name": " ".join(sorted(typed))}
+
+
+def test_a_job_is_not_named_by_how_it_runs(forewarp, in_tmp):
+    how = [
+        *(
+            "checkpoint_seconds=9",
+            "score=ssim",
+            "evaluate=false",
+            "sentinel.skip=1",
+            "absent=skip",
+            "trust=[x]",
+        ),
+        *("data_changed=accept", "callbacks=default", "callbacks.pictures=null", "callbacks.accuracy=null"),
+    ]
+    shown = forewarp("train", "sweeps=accuracy_time", *how, "--cfg", "job", "--resolve")
+    assert yaml.safe_load(shown.out)["variant"] == {"name": ""}
+
+
+@pytest.mark.parametrize(
+    "path",
+    [*(CONF / "ablation").glob("*.yaml"), *(ROOT / "sweeps").glob("*.yaml")],
+    ids=lambda path: path.stem,
+)
+def test_what_reproduces_a_table_names_its_method(path):
+    text = path.read_text()
+    inherited = re.search(r"^  - (full|accuracy_time)$", text, re.MULTILINE)
+    assert inherited or "\n  - override /model: forward\n" in text or path.stem == "methods"
 
 
 def test_a_sweep_over_methods_has_both():
     jobs = [composed("sweeps=methods", *job) for job in jobs_of("methods")[:2]]
     assert sorted(config.model.name for config in jobs) == ["backward", "forward"]
-    assert composed("sweeps=dnerf", "data.scene=x", "model=backward").model.name == "backward"
-    assert composed("sweeps=accuracy_time", "data.scene=x", "variant=backward").model.name == "backward"
+    assert composed("sweeps=accuracy_time", "data.scene=x", "model=backward").model.name == "backward"
 
 
 def test_an_ablation_takes_one_thing_from_all():
     common = ["scene=dnerf_hook", "preset=fast"]
     full = composed(*common, "ablation=full")
-    assert None not in (full.model.upsampler, full.model.inpainter, full.model.view)
+    assert None not in (full.model.upsampler, full.model.inpainter, full.model.view_dependence)
     without = {
         "no_upsampling": "upsampler",
         "no_inpainter": "inpainter",
-        "no_view": "view",
+        "no_view": "view_dependence",
     }
     for name, part in without.items():
         model = composed(*common, f"ablation={name}").model
@@ -151,18 +208,36 @@ def test_an_ablation_takes_one_thing_from_all():
         assert all(weights[term] == 0 for term in terms)
 
 
+def folder_of(config, **changes):
+    """The folder of a job whose config was changed at these keys (dots written as __)."""
+    config = deepcopy(config)
+    for key, value in changes.items():
+        OmegaConf.update(config, key.replace("__", "."), value)
+    return hashed(config).run
+
+
 def test_a_job_is_known_by_what_it_computes():
     full = ["scene=dnerf_hook", "ablation=full"]
-    same = [hashed(composed(f"sweeps={s}", *full)).run for s in ("ablation_modules", "ablation_losses")]
-    assert same[0] == same[1]
-    assert "{hash}" not in same[0]
-    others = (["seed=1"], ["budget.minutes=3"], ["data.rays=7"], ["stage.fine.share=0.1"])
-    changed = {hashed(composed("sweeps=ablation_losses", *full, *more)).run for more in others}
-    assert len(changed - set(same)) == len(others)
-    shown = hashed(composed("sweeps=ablation_losses", *full, "sheets=1", "threads=1", "trainer=cpu")).run
-    assert shown == same[0]
+    job, other = (composed(f"sweeps=ablation_{sweep}", *full) for sweep in ("losses", "modules"))
+    same = folder_of(job)
+    assert same == folder_of(other)
+    assert "{hash}" not in same
+    others = ({"seed": 1}, {"budget__minutes": 3}, {"data__rays": 7}, {"stage__fine__share": 0.1})
+    assert len({same, *(folder_of(job, **changes) for changes in others)}) == 1 + len(others)
+    assert folder_of(job, sheets=1, threads=1, trainer__accelerator="cpu") == same
     plain = composed("data.scene=x", "data=dnerf")
-    assert hashed(plain).run == "runs/x/forward-fast-seed0"
+    assert folder_of(plain) == "runs/x/forward-fast-seed0"
+
+
+@pytest.mark.parametrize("budget", [{}, {"budget__minutes": None, "budget__iterations": 5}])
+def test_the_precision_of_a_run_counts(budget):
+    job = composed("sweeps=dnerf", "scene=dnerf_hook")
+    assert folder_of(job, **budget) != folder_of(job, **budget, trainer__precision="bf16-mixed")
+
+
+def test_full_precision_bounded_by_steps_keeps_its_folder():
+    job = composed("sweeps=dnerf", "scene=dnerf_hook", "budget.minutes=null", "budget.iterations=5")
+    assert folder_of(job) == folder_of(job, trainer__precision="32-true")
 
 
 def test_the_canonical_middle_reaches_the_data():
@@ -177,35 +252,26 @@ def test_what_stands_alone_begins_as_the_coarse_stage_would(preset):
     full, alone = (composed(*common, f"ablation={name}").stage for name in ("full", "no_coarse"))
     assert alone.coarse is None
     changed = {key for key in full.fine if full.fine[key] != alone.fine[key]}
-    assert changed <= {"start", "hold", "bases", "hull_frames", "hull_grow", "confine", "curriculum", "rates"}
-    assert all(alone.fine[key] == coarse[key] for key in changed - {"rates"})
-    assert alone.fine.rates == {**full.fine.rates, "flow": coarse.rates.flow}
+    assert changed <= {"start", "lr_hold", "bases", "hull_frames", "hull_grow", "confine", "curriculum", "lr"}
+    assert all(alone.fine[key] == coarse[key] for key in changed - {"lr"})
+    assert alone.fine.lr == {**full.fine.lr, "flow": coarse.lr.flow}
 
 
 @pytest.mark.parametrize("preset", ["demo", "fast", "faithful"])
 def test_the_voxel_networks_come_with_the_fine_stage(preset):
     common = ["scene=dnerf_hook", f"preset={preset}"]
-    for name in ("full", "no_tv", "no_up_photo"):
-        stage = composed(*common, f"ablation={name}").stage
-        assert not {"upsampler", "inpainter"} & set(stage.coarse.effects)
-        assert {"upsampler", "inpainter"} <= set(stage.fine.effects)
+    stage = composed(*common, "ablation=full").stage
+    assert not {"upsampler", "inpainter"} & set(stage.coarse.effects)
+    assert {"upsampler", "inpainter"} <= set(stage.fine.effects)
 
 
 def test_captures_have_numbers_of_their_own_in_every_preset():
     quick, faithful = composed("scene=hypernerf_broom"), composed("scene=hypernerf_broom", "preset=faithful")
     assert (quick.preset.bases, faithful.preset.bases) == (8, 25)
-    assert quick.model.view is None
-    assert faithful.model.view is not None
+    assert quick.model.view_dependence is None
+    assert faithful.model.view_dependence is not None
     for config in (quick, faithful):
         assert config.data.scene == "broom2"
         assert config.model.background is not None
-        assert config.stage.fine.voxels[-1][1] == 343000
-        assert config.objective.fine.weights.still_points == 1e-2
-
-
-def test_where_minutes_bound_a_run_its_precision_counts():
-    full = ["sweeps=dnerf", "scene=dnerf_hook"]
-    half = "trainer.precision=bf16-mixed"
-    assert hashed(composed(*full)).run != hashed(composed(*full, half)).run
-    steps = ["budget.minutes=null", "budget.iterations=5"]
-    assert hashed(composed(*full, *steps)).run == hashed(composed(*full, *steps, half)).run
+        assert config.stage.fine.num_voxels[-1][1] == 343000
+        assert config.objective.fine.weights.static_points == 1e-2

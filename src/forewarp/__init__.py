@@ -13,11 +13,11 @@ def load(run, *, trust=(), device="cpu"):
         device: where to compute: ``cpu`` or ``cuda``.
 
     Returns:
-        a ``forewarp.cli.fitted.Fitted``.
+        a ``forewarp.runs.fitted.Fitted``.
 
     Raises:
         ValueError: where there is no finished run, or where it names code that is not trusted.
     """
-    from forewarp.cli.fitted import open_run
+    from forewarp.runs.fitted import open_run
 
     return open_run(run, trust=trust, device=device)

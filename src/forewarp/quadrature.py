@@ -1,4 +1,4 @@
-"""Volume rendering of what can only be asked at points: even samples, then more where matter was found."""
+"""Volume rendering of a network: samples along the whole ray, then more of them where matter was found."""
 
 from __future__ import annotations
 
@@ -19,14 +19,12 @@ Density = Callable[[Tensor], Tensor]
 # Points (R, S, 3) and unit directions (R, 3) -> density (R, S) and colour (R, S, 3).
 Radiance = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 _FAR = 1e10  # the published length of the last interval
-_POINTS = 1 << 17  # that a picture asks for at once
+_POINTS = 1 << 17  # evaluated at once for an image
 
 
 @dataclass(frozen=True)
 class Sampled(Rendering):
-    """A rendering with what lies along the K of its rays that were followed: ``depths``, ``density`` and
-    ``weights`` (K, S).
-    """
+    """A rendering, with ``depths``, ``density`` and ``weights`` (K, S) along the K rays that meet the box."""
 
     depths: Tensor
     density: Tensor
@@ -35,14 +33,14 @@ class Sampled(Rendering):
 
 @dataclass(frozen=True)
 class Quadrature:
-    """Places samples on rays and sums up what a network says there.
+    """Place samples on rays, evaluate a network there, and composite (NeRF's quadrature).
 
     Args:
-        samples: of the first pass, at least 3.
-        fine_samples: that the second pass adds, where the first found weight; 0: there is one pass alone.
-        open_end: the last sample stands for all that lies behind it, as published: with a density that is
-            never 0, as softplus, nothing is seen of a background. False: it ends at the end of the ray.
-        box: what lies outside is empty, and is not asked for; None: all between near and far is.
+        samples: samples of the first pass, at least 3.
+        fine_samples: added by the second pass where the first found weight; 0: one pass only.
+        open_end: give the last sample an endless interval, as published. A density that is never 0 (softplus)
+            then hides the background. False: end the interval with the ray.
+        box: treat space outside as empty, without evaluating it; None: evaluate all from near to far.
     """
 
     samples: int = 64
@@ -65,14 +63,14 @@ class Quadrature:
         background: Tensor,
         generator: torch.Generator | None = None,
     ) -> Sampled:
-        """Render rays.
+        """Render R rays.
 
         Args:
-            density: asked by the first pass, without gradient.
-            radiance: asked by the second pass, at the samples of both.
-            rays: R of them.
-            background: (3,) or (R, 3), behind everything.
-            generator: jitters the samples; None: they are evenly spread.
+            density: evaluated by the first pass, without gradient.
+            radiance: evaluated by the second pass, at the samples of both passes.
+            rays: origins, unit directions, near and far.
+            background: colour (3,) or (R, 3) behind everything.
+            generator: jitters the samples; None: place them evenly.
         """
         near, far = self._stretch(rays)
         met = (far > near).nonzero()[:, 0]
@@ -98,7 +96,7 @@ class Quadrature:
     def refined(
         self, density: Density, rays: Rays, depths: Tensor, far: Tensor, generator: torch.Generator | None
     ) -> Tensor:
-        """Add samples (R, S + F) where a first look at ``depths`` (R, S) finds weight; no gradient passes."""
+        """Add F samples to ``depths`` (R, S) where density is found, (R, S + F); no gradient passes."""
         weights, _ = dense_weights(density(_points(rays, depths)) * self._intervals(depths, far))
         more = by_importance(midpoints(depths), weights[:, 1:-1], self.fine_samples, generator)
         return union(depths, more)
@@ -106,7 +104,7 @@ class Quadrature:
     def composite(
         self, radiance: Radiance, rays: Rays, depths: Tensor, far: Tensor, background: Tensor
     ) -> Sampled:
-        """Sum up what is met at ``depths`` (R, S) of rays that end at ``far`` (R,)."""
+        """Composite the samples at ``depths`` (R, S) of rays that end at ``far`` (R,)."""
         density, color = radiance(_points(rays, depths), rays.directions)
         weights, through = dense_weights(density * self._intervals(depths, far))
         rgb = (weights[..., None] * color).sum(1) + through[:, None] * background
@@ -116,7 +114,7 @@ class Quadrature:
 
     @torch.no_grad()
     def picture(self, density: Density, radiance: Radiance, rays: Rays, background: Tensor) -> Rendering:
-        """Render many rays without gradient. Cost: linear in the rays, its memory bounded."""
+        """Render an image's rays without gradient. Cost: time linear in the rays, memory bounded."""
         chunk = max(1, _POINTS // (self.samples + self.fine_samples))
         behind = background.expand(len(rays), 3)
         parts = [
@@ -128,18 +126,18 @@ class Quadrature:
         )
 
     def _stretch(self, rays: Rays) -> tuple[Tensor, Tensor]:
-        """From where to where each ray is followed, (R,) each."""
+        """Return where each ray starts and ends, (R,) each."""
         if self.box is None:
             return tuple(rays.origins.new_full((len(rays),), end) for end in (rays.near, rays.far))
         corners = (rays.origins.new_tensor(corner) for corner in (self.box.low, self.box.high))
         return clip_to_box(rays.origins, rays.directions, rays.near, rays.far, *corners)
 
     def _intervals(self, depths: Tensor, far: Tensor) -> Tensor:
-        """The length (R, S) that each sample stands for: up to the next one."""
+        """Return the length (R, S) of each sample's interval: up to the next sample."""
         last = torch.full_like(far, _FAR) if self.open_end else (far - depths[:, -1]).clamp(min=0)
         return torch.cat([depths[:, 1:] - depths[:, :-1], last[:, None]], 1)
 
 
 def _points(rays: Rays, depths: Tensor) -> Tensor:
-    """World points (R, S, 3) at distances (R, S) along rays."""
+    """Return the world points (R, S, 3) at distances (R, S) along rays."""
     return rays.origins[:, None] + depths[..., None] * rays.directions[:, None]

@@ -1,4 +1,4 @@
-"""Volume rendering of a field at one time."""
+"""Volume rendering of a voxel field at one time: march rays, composite what they meet."""
 
 from __future__ import annotations
 
@@ -18,9 +18,13 @@ from forewarp.scene.view import Rendering
 
 @dataclass(frozen=True)
 class Marched(Rendering):
-    """A rendering with what lies along its rays: ``transmittance`` (R,); of the samples whose weight counts
-    their ``weights`` (S,), ``colors`` (S, 3) and ``ray_ids`` (S,); ``samples``, how many were read; where
-    asked for, ``all_weights`` and ``all_ray_ids`` (P,) of all samples, which lie in occupied cells.
+    """A rendering, with the samples along its rays.
+
+    Attributes:
+        transmittance: (R,), what is left of a ray behind everything.
+        weights, colors, ray_ids: (S,), (S, 3), (S,), of the samples heavy enough to have a colour.
+        samples: number of samples whose density was read.
+        all_weights, all_ray_ids: (P,), of all samples, if asked for.
     """
 
     transmittance: Tensor
@@ -33,28 +37,33 @@ class Marched(Rendering):
 
 
 class Renderer:
-    """Marches rays through the occupied cells and composites what they meet.
+    """March rays through occupied cells and composite the samples.
+
+    ``w_k = T_k (1 - exp(-sigma_k delta))``, ``T_k = exp(-sum_{j<k} sigma_j delta)``,
+    ``C = sum_k w_k c_k + T_end background``.
 
     Args:
-        step: between samples, in voxels of the rendered field, of its finest where it has several.
-        color_threshold: samples of less weight have no colour computed; 0 for all.
-        opaque: a ray that lets through less than this has ended, where no gradient is asked for and a kernel
-            looks for the end; 0: it never ends.
+        step: distance between samples, in voxels of the field (of the finest, if it has several).
+        color_threshold: compute no colour for samples of less weight; 0: compute all.
+        early_stop_eps: end a ray once its transmittance is below this, in images (rendered without gradient
+            by the CPU kernel); 0: never.
     """
 
-    def __init__(self, *, step: float = 0.5, color_threshold: float = 1e-4, opaque: float = 1e-4) -> None:
-        if not step > 0 or not 0 <= color_threshold < 1 or not 0 <= opaque < 1:
+    def __init__(
+        self, *, step: float = 0.5, color_threshold: float = 1e-4, early_stop_eps: float = 1e-4
+    ) -> None:
+        if not step > 0 or not 0 <= color_threshold < 1 or not 0 <= early_stop_eps < 1:
             raise ValueError(
-                "renderer: expected step > 0 and 0 <= color_threshold < 1 and 0 <= opaque < 1, "
-                f"but got {step=}, {color_threshold=}, {opaque=}"
+                "renderer: expected step > 0 and 0 <= color_threshold < 1 and 0 <= early_stop_eps < 1, "
+                f"but got {step=}, {color_threshold=}, {early_stop_eps=}"
             )
-        self.step, self.color_threshold, self.opaque = step, color_threshold, opaque
+        self.step, self.color_threshold, self.early_stop_eps = step, color_threshold, early_stop_eps
 
     def with_threshold(self, color_threshold: float | None) -> Renderer:
-        """The same renderer with another ``color_threshold``; None: this one."""
+        """Return a renderer with another ``color_threshold``; this one for None."""
         if color_threshold is None:
             return self
-        return Renderer(step=self.step, color_threshold=color_threshold, opaque=self.opaque)
+        return Renderer(step=self.step, color_threshold=color_threshold, early_stop_eps=self.early_stop_eps)
 
     def __call__(
         self,
@@ -65,20 +74,24 @@ class Renderer:
         generator: torch.Generator | None = None,
         keep_all_weights: bool = False,
     ) -> Marched:
-        """Render rays.
+        """Render R rays.
 
         Args:
-            field: density and features at one time.
-            rays: R of them.
-            background: (3,) or (R, 3), behind everything.
-            shade: makes colour of features and directions; None: the first 3 features are it.
-            generator: jitters the samples by up to one step; None: the middle of each step.
-            keep_all_weights: also return the weights and rays of every sample (P,).
+            field: density and colour at one time.
+            rays: origins, unit directions, near and far.
+            background: colour (3,) or (R, 3) behind everything.
+            shade: turns features and directions into colour; None: the first 3 features are the colour.
+            generator: shifts each ray's samples by up to one step; None: sample the middle of each step.
+            keep_all_weights: also return the weights and rays of all samples.
+
+        Returns:
+            colour, depth and opacity, differentiable in the field, with the samples. Depth is the mean
+            distance of what is met, 0 where nothing is.
         """
         plain = type(field) is RadianceGrid and not keep_all_weights and not torch.is_grad_enabled()
         if plain and use_numba(field.values):
             return self._traced(field, rays, background, shade, generator)
-        count, step = len(rays), self.step * field.pitch
+        count, step = len(rays), self.step * field.voxel_size
         ray_ids, distances, points = self._samples(field, rays, step, generator)
         weights, transmittance = render_weights(field.density(points) * step, ray_ids, count)
         kept = slice(None)
@@ -87,7 +100,7 @@ class Renderer:
         some_weights, some_rays = weights[kept], ray_ids[kept]
         colors = field.colors(points[kept], rays.directions[some_rays], shade)
         rgb = accumulate(some_weights, colors, some_rays, count) + transmittance[:, None] * background
-        # Not 1 - transmittance: of thin matter that keeps no digit, and depth would leave the ray's stretch.
+        # Not 1 - transmittance: it rounds to 0 for thin matter, and depth would leave [near, far].
         moments = torch.stack([torch.ones_like(distances), distances], -1)
         opacity, depth = accumulate(weights, moments, ray_ids, count).unbind(-1)
         opacity = opacity.clamp(max=1)
@@ -113,8 +126,8 @@ class Renderer:
         shade: Shade | None,
         generator: torch.Generator | None,
     ) -> Marched:
-        """The same without gradient, samples behind opaque matter left out: equal within ``opaque``."""
-        step, activation = self.step * grid.pitch, grid.activation
+        """Render without gradient by one kernel, equal within ``early_stop_eps``: skip what is hidden."""
+        step, activation = self.step * grid.voxel_size, grid.activation
         origins, directions, jitter = self._starts(grid, rays, generator)
         found = trace(
             origins,
@@ -128,9 +141,9 @@ class Renderer:
             index=grid.index,
             fill=EMPTY,
             shift=activation.shift,
-            scale=step / activation.unit,
-            opaque=self.opaque,
-            threshold=self.color_threshold or -1.0,  # 0 is all, also those without weight
+            scale=step / activation.density_scale,
+            early_stop_eps=self.early_stop_eps,
+            threshold=self.color_threshold or -1.0,  # 0 keeps all samples, even those of weight 0
         )
         ray_ids, weights = found.ray_ids, found.weights
         points = origins[ray_ids] + found.distances[:, None] * directions[ray_ids]
@@ -155,7 +168,7 @@ class Renderer:
         shade: Shade | None = None,
         chunk: int = 65536,
     ) -> Rendering:
-        """Render many rays without gradients. Cost: linear in the rays, its memory in ``chunk``."""
+        """Render an image's rays without gradient. Cost: time linear in the rays, memory in ``chunk``."""
         with torch.no_grad():
             parts = [
                 self(field, rays[begin : begin + chunk], background, shade)
@@ -167,7 +180,7 @@ class Renderer:
     def _starts(
         field: FieldAtTime, rays: Rays, generator: torch.Generator | None
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Origins and directions (R, 3) in lattice coordinates, and the shift (R,) of a ray's samples."""
+        """Origins and directions (R, 3) in lattice coordinates, and the jitter (R,) of the samples."""
         lattice, count = field.lattice, len(rays)
         spacing = rays.origins.new_tensor(lattice.spacing)
         origins, directions = lattice.to_lattice(rays.origins), rays.directions / spacing
@@ -178,7 +191,7 @@ class Renderer:
     def _samples(
         cls, field: FieldAtTime, rays: Rays, step: float, generator: torch.Generator | None
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Ray (P,), distance (P,) and lattice coordinates (P, 3) of every sample."""
+        """Ray (P,), distance (P,) and lattice coordinates (P, 3) of each sample."""
         origins, directions, jitter = cls._starts(field, rays, generator)
         ray_ids, distances = march(origins, directions, rays.near, rays.far, step, field.cells, jitter)
         return ray_ids, distances, origins[ray_ids] + distances[:, None] * directions[ray_ids]

@@ -1,13 +1,13 @@
-"""How each operator, a step and a frame grow: ``make bench`` (not part of ``make test``)."""
+"""Time how operators, a step and a frame grow with size: ``make bench``, not ``make test``."""
 
 import time
 
 import pytest
 import torch
 
-from forewarp.cli.timed_cases import CASES
 from forewarp.ops.warmup import warm_up
-from forewarp.training.protocol import peak_memory_bytes, reset_peak_memory
+from forewarp.training.device import peak_memory_bytes, reset_peak_memory
+from tests.bench.timed_cases import CASES
 
 RUNS = [
     (name, size, dense)
@@ -19,7 +19,7 @@ RUNS = [
 
 
 @pytest.mark.bench
-@pytest.mark.benchmark(timer=time.process_time)  # a shared machine does other things too
+@pytest.mark.benchmark(timer=time.process_time)  # leaves out what else the machine does
 @pytest.mark.parametrize(("name", "size", "dense"), RUNS)
 def test_growth(benchmark, name, size, dense):
     warm_up()

@@ -12,6 +12,7 @@ from forewarp.synth.cameras import random_cameras
 from forewarp.synth.raycast import render
 from forewarp.synth.world import World
 
+pytestmark = pytest.mark.slow  # tests/contract trains on every dataset, too
 COMMON = [
     "trainer=cpu",
     "logger=none",
@@ -20,10 +21,10 @@ COMMON = [
     "budget.minutes=null",
     "budget.iterations=150",
     "preset.rays=512",
-    "stage.coarse.voxels=[[0,15625]]",
-    "stage.fine.voxels=[[0,27000]]",
-    "stage.coarse.background_voxels=[[0,15625]]",
-    "stage.fine.background_voxels=[[0,27000]]",
+    "stage.coarse.num_voxels=[[0,15625]]",
+    "stage.fine.num_voxels=[[0,27000]]",
+    "stage.coarse.background_num_voxels=[[0,15625]]",
+    "stage.fine.background_num_voxels=[[0,27000]]",
 ]
 
 SMALL = ["data.synthesis.samples_per_pixel=1"]

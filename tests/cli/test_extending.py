@@ -1,4 +1,4 @@
-"""The files of docs/extending.md are written into a folder as the page says, and its commands are typed."""
+"""Write the files of docs/extending.md into a folder and run the page's commands."""
 
 import importlib
 import json
@@ -20,16 +20,16 @@ SMALL = [
     *("data.root=scenes", "data.scene=toy", "trainer=cpu", "threads=1", "data.rays=32", "sheets=0"),
     *("budget.minutes=null", "budget.iterations=10", "callbacks.pictures=null", "run=run"),
 ]
-VOXELS = ["stage.coarse.voxels=[[0,800]]", "~stage.fine"]
+VOXELS = ["stage.coarse.num_voxels=[[0,800]]", "~stage.fine"]
 
 
 def files_of(page):
-    """Each file that the page gives whole: name -> text."""
+    """Return the files that the page gives whole: name -> text."""
     return {name: text for name, text in re.findall(r"^`(mine/\S+)`\n\n```\w+\n(.*?)```", page, re.M | re.S)}
 
 
 def write_toy(folder):
-    """Sixteen pictures of a disc that rises, as the page's reader wants them."""
+    """Write sixteen pictures of a rising disc in the format of the page's reader."""
     folder.mkdir(parents=True)
     frames, rows = [], np.mgrid[:16, :16]
     for i in range(16):
@@ -45,7 +45,7 @@ def write_toy(folder):
 
 @pytest.fixture
 def work(in_tmp, monkeypatch):
-    """The page's folder, a scene in it, and a path that leads there."""
+    """Write the page's files and a scene, and make them importable; return the folder."""
     for name, text in files_of(PAGE.read_text()).items():
         (in_tmp / name).parent.mkdir(parents=True, exist_ok=True)
         (in_tmp / name).write_text(text)
@@ -88,6 +88,6 @@ def test_the_method_trains_on_the_data_of_the_page(forewarp, refused, work, way)
 def test_the_effect_is_switched_by_a_word(forewarp, work):
     words = ["--config-dir", "mine/conf", "experiment=mine", *SMALL, *VOXELS, "evaluate=false"]
     for choice, name in (("sheen", "Sheen"), ("none", "NoneType")):
-        done = forewarp("train", *words, f"model/view={choice}", f"run={choice}")
+        done = forewarp("train", *words, f"model/view_dependence={choice}", f"run={choice}")
         assert done.status == 0, done.err
-        assert type(load(choice, trust=["mine"]).method.view).__name__ == name
+        assert type(load(choice, trust=["mine"]).method.view_dependence).__name__ == name

@@ -20,7 +20,7 @@ LAUNCHERS = {
 JOB = [
     *("--multirun", "sweeps=dnerf", "paths.scenes=.", "preset=demo", "budget.minutes=null", "seeds=2"),
     *("trainer=cpu", "threads=1", "data.rays=64", "logger=none", "callbacks.pictures=null", "~stage.fine"),
-    *("stage.coarse.voxels=[[0,800]]", "checkpoint_seconds=0", "sheets=0"),
+    *("stage.coarse.num_voxels=[[0,800]]", "checkpoint_seconds=0", "sheets=0"),
 ]
 SHORT_AND_LONG = ["scene=dnerf_hook", "budget.iterations=5,600"]
 

@@ -1,6 +1,8 @@
 import pytest
 
-from runs_on_disk import write_run
+from tests.support.runs_on_disk import write_run
+
+KINDS = "accuracy_time, price_list, paper, effects, compare, limits"
 
 
 def test_pages_are_written_and_named(forewarp, in_tmp):
@@ -12,13 +14,33 @@ def test_pages_are_written_and_named(forewarp, in_tmp):
         assert (in_tmp / "out" / page).read_text().startswith("# ")
 
 
+def test_the_help_has_a_line_for_each_kind(forewarp):
+    text = forewarp("report", "--help").out
+    for kind in KINDS.split(", "):
+        assert len([line for line in text.splitlines() if line.split()[:1] == [f"kind={kind}"]]) == 1
+
+
+def test_limits_of_a_pattern_of_runs(forewarp, fitted):
+    done = forewarp("report", "kind=limits", f"runs={fitted.parent}/r*", "views=1")
+    assert done.status == 0, done.err
+    head, _, row = ([cell.strip() for cell in line.split("|")[1:-1]] for line in done.out.splitlines())
+    assert (head[0], row[0], len(row)) == ("scene", "vehicle", len(head))
+
+
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
-        (["kind=prices"], "kind: expected one of accuracy_time, price_list, paper, effects, but got"),
+        (["kind=prices"], f"kind: expected one of {KINDS}, but got"),
         (["target=high"], "target: expected a number of dB or null, but got 'high'"),
         ([], "runs/accuracy_time: expected folders of runs, but got none"),
         (["published=none.yaml"], "none.yaml: expected a usable file or folder, but got No such file"),
+        (["kind=paper", "runs=[a,b]"], "runs: expected one folder for kind=paper, but got a list"),
+        (["kind=compare"], "runs: expected folders of runs, but got none; set runs="),
+        (
+            ["kind=limits", "runs=none"],
+            "expected the configuration of a run, but got none; set runs",
+        ),
+        (["kind=limits", "runs=none", "views=0"], "views: expected a whole number > 0, but got 0"),
     ],
 )
 def test_mistakes_end_in_one_line(refused, in_tmp, arguments, line):

@@ -1,6 +1,7 @@
 """``resume=<run>``, data that changed, broken steps, as one types them."""
 
 import copy
+import errno
 import json
 import os
 import shutil
@@ -8,25 +9,37 @@ import shutil
 import pytest
 import torch
 import yaml
+from filelock import FileLock
 
-from forewarp.cli.claims import alone
-from forewarp.cli.replay import main as replay
+from forewarp.replay import main as replay
+from forewarp.runs.lock import locked
 from forewarp.synth.scenes import synthesize
+from tests.support.commands import call
 
 SMALL = [
     *("data=dnerf", "data.scene=vehicle", "preset=demo", "trainer=cpu", "data.rays=64", "logger=none"),
-    *("budget.minutes=null", "budget.iterations=6", "stage.coarse.voxels=[[0,800]]", "~stage.fine"),
-    *("callbacks.pictures=null", "evaluate=false", "checkpoint_seconds=0"),
+    *("budget.minutes=null", "budget.iterations=6", "stage.coarse.num_voxels=[[0,800]]", "~stage.fine"),
+    *("callbacks.pictures=null", "callbacks.accuracy=null", "evaluate=false", "checkpoint_seconds=0"),
 ]
 
 
-@pytest.fixture
-def begun(forewarp, in_tmp):
-    """A run that was interrupted at its end; scene and run are in the current folder."""
-    synthesize(in_tmp / "vehicle", size=16, frames=4, test_views=(1, 1, 1), val_views=1, samples_per_pixel=1)
-    done = forewarp("train", *SMALL, "data.root=.", "run=run")
+@pytest.fixture(scope="module")
+def original(tmp_path_factory):
+    """A folder with a scene and a run that was interrupted at its end."""
+    folder = tmp_path_factory.mktemp("begun")
+    synthesize(folder / "vehicle", size=16, frames=4, test_views=(1, 1, 1), val_views=1, samples_per_pixel=1)
+    done = call("train", *SMALL, f"data.root={folder}", f"run={folder / 'run'}")
     assert done.status == 0, done.err
-    (in_tmp / "run" / "coarse" / "done.json").unlink()
+    (folder / "run" / "coarse" / "done.json").unlink()
+    return folder
+
+
+@pytest.fixture
+def begun(original, in_tmp):
+    """A copy of it in the current folder; returns the run."""
+    shutil.copytree(original, in_tmp, dirs_exist_ok=True)
+    path = in_tmp / "run" / "config.yaml"
+    path.write_text(path.read_text().replace(str(original), str(in_tmp)))
     return in_tmp / "run"
 
 
@@ -39,7 +52,7 @@ def test_a_run_is_resumed_by_its_folder_alone(forewarp, begun):
     done = forewarp("train", f"resume={begun}")
     assert done.status == 0, done.err
     assert json.loads((begun / "coarse" / "done.json").read_text())["steps"] == 6
-    assert {**config(begun), "run": "run"} == before
+    assert config(begun) == before
     assert "forewarp-train data=dnerf" in before["command"]
 
 
@@ -62,16 +75,13 @@ def test_changed_data_are_refused_unless_accepted(forewarp, refused, begun):
         line = refused("train", *words)
         assert "data.json: expected the data that the run was begun with, but got others" in line
         assert "transforms_train.json; use run=..., or go on with data_changed=accept" in line
+    line = refused("train", f"resume={begun}", "data_changed=x")
+    assert "data_changed: expected one of refuse, accept, but got x" in line
     done = forewarp("train", f"resume={begun}", "data_changed=accept")
     assert done.status == 0, done.err
-    (begun / "coarse" / "done.json").unlink()
     assert forewarp("train", f"resume={begun}").status == 0  # it was accepted once for all
     path.write_text(path.read_text() + " ")
-    (begun / "coarse" / "done.json").unlink()
     assert "expected the data" in refused("train", f"resume={begun}")  # and not what comes later
-    assert "data_changed: expected one of refuse, accept, but got x" in refused(
-        "train", f"resume={begun}", "data_changed=x"
-    )
 
 
 def test_a_run_begun_inside_its_scene_goes_on(forewarp, begun, monkeypatch):
@@ -95,17 +105,24 @@ def test_what_is_measured_on_changed_data_says_so(forewarp, begun):
     assert f"{said}transforms_test_time.json" in done.err
 
 
-def test_a_folder_in_work_is_refused(refused, begun):
-    with alone(begun):
+def test_a_folder_in_work_is_refused(forewarp, refused, begun):
+    with locked(begun):
         line = refused("train", f"resume={begun}")
         assert f"expected a run that nobody works on, but got one of process {os.getpid()} on " in line
         assert "nobody works on" in refused("evaluate", f"run={begun}")
-
-
-def test_a_measured_run_in_work_is_refused(forewarp, refused, begun):
-    assert forewarp("train", f"resume={begun}", "evaluate=true").status == 0
-    with alone(begun):
+    done = forewarp("train", f"resume={begun}", "evaluate=true")
+    assert done.status == 0, done.err
+    with locked(begun):  # measured
         assert "nobody works on" in refused("train", f"resume={begun}", "evaluate=true")
+
+
+def test_a_file_system_without_locks_is_used_without(begun, monkeypatch):
+    def missing(lock):
+        raise OSError(errno.ENOSYS, "Function not implemented")
+
+    monkeypatch.setattr(FileLock, "_acquire", missing)
+    with locked(begun), locked(begun):
+        pass
 
 
 ODD = {
@@ -125,7 +142,7 @@ ODD = {
 
 def test_a_broken_step_ends_in_one_line_and_is_seen_again(forewarp, refused, begun, in_tmp, capsys):
     shutil.rmtree(in_tmp / "run")
-    broken = [*SMALL, "data.root=.", "run=run", "stage.coarse.rates.color=1e39"]
+    broken = [*SMALL, "data.root=.", "run=run", "stage.coarse.lr.color=1e39"]
     line = refused("train", *broken)
     assert line.startswith(
         "stage.coarse: expected finite numbers, but got parameter: radiance.color at step 0, "

@@ -1,4 +1,4 @@
-"""A search by Optuna: every trial is a job that returns its score."""
+"""A search by Optuna, in which every job returns a score."""
 
 import json
 
@@ -10,18 +10,18 @@ from forewarp.synth.scenes import synthesize
 pytest.importorskip(
     "hydra_plugins.hydra_optuna_sweeper", reason="needs hydra-optuna-sweeper: install forewarp[sweeps]"
 )
-# Optuna is old and warns of itself.
+# Optuna raises deprecation warnings of its own.
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]
 
 SEARCH = [
     *("--multirun", "sweeps=search", "data=dnerf", "data.root=.", "data.scene=vehicle", "trainer=cpu"),
-    *("threads=1", "data.rays=64", "budget.iterations=4", "stage.coarse.voxels=[[0,800]]", "~stage.fine"),
+    *("threads=1", "data.rays=64", "budget.iterations=4", "stage.coarse.num_voxels=[[0,800]]", "~stage.fine"),
 ]
 
 
 @pytest.fixture
 def folder(in_tmp):
-    """Where the scene is; a search goes to ``runs/search/vehicle`` below it."""
+    """Write a scene; return its folder, below which a search writes ``runs/search/vehicle``."""
     synthesize(in_tmp / "vehicle", size=16, frames=6, test_views=(1, 0, 0), val_views=1, samples_per_pixel=1)
     return in_tmp
 
@@ -38,7 +38,7 @@ def test_three_trials_find_a_best_one_and_go_on(forewarp, folder):
     found = yaml.safe_load((folder / "runs/search/vehicle/optimization_results.yaml").read_text())
     assert found["best_value"] == max(scores)
     assert set(found["best_params"]) == {
-        "stage.coarse.rates.flow",
+        "stage.coarse.lr.flow",
         "objective.coarse.weights.tv_flow",
         "preset.padding",
     }
@@ -65,7 +65,7 @@ def test_a_search_without_views_or_with_seeds_says_what_to_set(forewarp, folder)
     assert "score: expected psnr, which the sweeper needs, but got none: " in done.err
     assert "set data.held_out=8" in done.err
     done = forewarp("train", *SEARCH, "hydra.sweeper.n_trials=1", "seeds=2")
-    assert "seeds: expected 1 of a search, but got 2; use seed=N" in done.err
+    assert "seeds: expected 1 in a search, but got 2; use seed=N" in done.err
     plain = [word for word in SEARCH if word != "sweeps=search"]
     done = forewarp("train", *plain, "hydra/sweeper=optuna", "hydra.sweeper.n_trials=1")
     assert "but got range(0, 1); add hydra.sweeper.params.seed=0" in done.err

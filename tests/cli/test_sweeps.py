@@ -1,4 +1,4 @@
-"""Sweeps over scenes that are not there, and launchers that are not installed."""
+"""Sweeps over absent scenes, and launchers that are not installed."""
 
 import pytest
 

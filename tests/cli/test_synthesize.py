@@ -6,7 +6,9 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 from hydra.utils import instantiate
 
-from forewarp.cli.synthetic import (
+from forewarp.data.dnerf import read_scene
+from forewarp.scene.errors import SceneError
+from forewarp.synth.module import (
     WRITERS,
     SyntheticDataModule,
     SyntheticHyperNeRFDataModule,
@@ -14,9 +16,7 @@ from forewarp.cli.synthetic import (
     SyntheticNHRDataModule,
     is_scene,
 )
-from configs import composed, options
-from forewarp.data.dnerf import read_scene
-from forewarp.scene.errors import SceneError
+from tests.support.configs import composed, options
 
 SMALL = ["size=16", "frames=3", "test_views=[1,1,1]", "val_views=0", "samples_per_pixel=1"]
 ARGUMENTS = {"size": 16, "frames": 3, "test_views": [1, 1, 1], "val_views": 0, "samples_per_pixel": 1}

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from configs import CONF, ROOT
+from tests.support.configs import CONF, ROOT
 
 SMALL = [
     *("experiment=demo", "trainer=cpu", "threads=1", "sheets=1", "data.rays=256"),
@@ -71,7 +71,8 @@ def test_the_wheel_holds_every_configuration_and_what_reports_need(wheel):
     wanted = {f"forewarp/conf/{name}" for name in files(CONF)}
     wanted |= {f"forewarp/sweeps/{name}" for name in files(ROOT / "sweeps")}
     assert wanted | {"forewarp/report/paper.yaml", "forewarp/report/published.yaml"} <= names
-    assert {name.split("/")[0].partition("-")[0] for name in names} == {"forewarp"}
+    assert {name.split("/")[0].partition("-")[0] for name in names} == {"forewarp", "hydra_plugins"}
+    assert "hydra_plugins/forewarp_one_at_a_time.py" in names
 
 
 @pytest.mark.slow
@@ -91,6 +92,10 @@ def test_commands_work_in_an_empty_folder_and_write_nowhere_else(installed):
     run("train", "--multirun", *words, "preset=demo", "budget.minutes=null", "budget.iterations=2")
     fitted = sorted(path.parents[0].name for path in (folder / "runs" / "paper").rglob("config.yaml"))
     assert [name.split("-")[1] for name in fitted] == ["backward", "forward"]
+    changes = ["hydra/sweeper=one_at_a_time", 'hydra.sweeper.changes=["preset.rays=64"]', "run=runs/one"]
+    steps = ["evaluate=false", "budget.minutes=null", "budget.iterations=2"]
+    run("train", "--multirun", *changes, *SMALL, *steps)  # our own sweeper, from the wheel
+    assert "rays: 64" in (folder / "runs" / "one" / "config.yaml").read_text()
     run("report", "kind=paper", "runs=runs")
     assert (folder / "runs" / "results" / "paper.md").is_file()
     assert {path.name for path in folder.iterdir()} == {"data", "runs"}

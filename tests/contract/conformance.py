@@ -1,12 +1,12 @@
-"""Writes docs/conformance.md of what the contract suite found: a test that failed shows as such."""
+"""Write docs/conformance.md from the results of the contract suite, failures included."""
 
 from collections import defaultdict
 from pathlib import Path
 
 import pytest
 
-from contract.scenes import DATASETS
-from contract.table import METHODS
+from tests.contract.scenes import DATASETS
+from tests.contract.table import METHODS
 
 TITLES = {"dnerf": "D-NeRF", "hypernerf": "HyperNeRF", "nhr": "NHR", "lego_complete": "Lego Complete"}
 WORST = ("failed", "skipped", "not run", "passed")
@@ -19,7 +19,7 @@ times in the format of each dataset. Written by `make conformance`; do not edit.
 
 
 class Conformance:
-    """A plugin of pytest: takes down the outcome of every test that has a method."""
+    """A pytest plugin that records the outcome of every test of a method."""
 
     def __init__(self, path):
         self.path, self.found, self.said = Path(path), defaultdict(dict), {}
@@ -99,7 +99,7 @@ KINDS = ("size in", "asks for", "loss terms", "effects", "abilities", "loss fall
 
 
 def kinds_of(method, entry, losses):
-    """What a method says of itself, in the words of the table."""
+    """Return what a method says of itself, as cells of the table."""
     from forewarp.methods.abilities import HasBounds, HasMatter, HasTrajectories
 
     can = {"trajectories": HasTrajectories, "bounds": HasBounds, "matter": HasMatter}
@@ -120,6 +120,6 @@ def kinds_of(method, entry, losses):
 
 
 def table(head, rows):
-    """Lines of a table in Markdown."""
+    """Return the lines of a Markdown table."""
     rule = ["---"] * len(head)
     return ["| " + " | ".join(map(str, row)) + " |" for row in (head, rule, *rows)]

@@ -1,14 +1,14 @@
-"""Makes the small scenes once, fits every method once to each, and writes the conformance table.
+"""Write the small scenes once, fit every method once to each, and write the conformance table.
 
-Tests share files and fitted methods alone, and change neither.
+Tests share these files and fitted methods and must not change them.
 """
 
 from types import SimpleNamespace
 
 import pytest
 
-from contract.conformance import Conformance
-from contract.scenes import DATASETS, data_of
+from tests.contract.conformance import Conformance
+from tests.contract.scenes import DATASETS, data_of
 
 
 def pytest_addoption(parser):
@@ -22,7 +22,7 @@ def pytest_configure(config):
 
 @pytest.fixture(scope="session")
 def scenes(tmp_path_factory):
-    """The folder that holds a scene of each dataset."""
+    """Return the folder with a scene of each dataset."""
     root = tmp_path_factory.mktemp("scenes")
     for name, (write, _) in DATASETS.items():
         write(root / name)
@@ -31,9 +31,9 @@ def scenes(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def fitted(scenes, tmp_path_factory):
-    """``fitted(name, dataset)``: the run, its module after all steps of the table, and every step's loss."""
-    from contract.fitting import Losses, run_of, stage_of
-    from contract.table import METHODS
+    """``fitted(name, dataset)`` returns the run, its fitted module, and the loss of every step."""
+    from tests.contract.fitting import Losses, run_of, stage_of
+    from tests.contract.table import METHODS
 
     known = {}
 

@@ -1,41 +1,34 @@
-"""How the contract suite makes a method, fits it to a small scene, and ends a run before its time."""
+"""Make a method, fit it to a small scene, and interrupt or kill its run."""
 
 import os
 import signal
 from dataclasses import replace
-from pathlib import Path
 
 import lightning
 import torch
 
-from contract.scenes import data_of
-from contract.table import METHODS
 from forewarp.training.objective import Objective
-from forewarp.training.settings import StageSettings
-from forewarp.training.stages import Run, Stage
+from forewarp.training.schedule import StageSettings
+from forewarp.training.stages import Stage
+from tests.contract.scenes import data_of
+from tests.contract.table import METHODS
+from tests.support.tiny_scene import make_run
 
 
 def stage_of(entry, name="fine", **changes):
-    """A stage of one method; ``changes`` are of the entry."""
+    """Make a stage for an entry of the table, with ``changes`` to the entry."""
     entry = replace(entry, **changes)
-    settings = StageSettings.of(name, rates=entry.rates, iterations=entry.steps, **entry.numbers)
+    settings = StageSettings.of(name, lr=entry.lr, iterations=entry.steps, **entry.numbers)
     return Stage(settings, Objective(entry.weights), entry.model)
 
 
 def run_of(stages, data, folder, *watchers, **options):
-    """A silent run on the CPU."""
-
-    def trainer(where, callbacks):
-        off = ("logger", "enable_checkpointing", "enable_progress_bar", "enable_model_summary")
-        silent = dict.fromkeys(off, False) | {"limit_val_batches": 0, "num_sanity_val_steps": 0}
-        return lightning.Trainer(max_epochs=1, max_steps=-1, accelerator="cpu", callbacks=callbacks, **silent)
-
-    watch = lambda name, where: list(watchers)  # noqa: E731
-    return Run(data, None, stages, Path(folder), trainer, callbacks=watch, **options)
+    """Make a silent run on the CPU."""
+    return make_run(folder, stages, data=data, callbacks=watchers, **options)
 
 
 def module_of(entry, data, **changes):
-    """A module at the beginning of its stage, outside of any run."""
+    """Make a module as it is at the beginning of its stage."""
     data.setup("fit")
     torch.manual_seed(0)
     module = run_of([], data, ".")._module(stage_of(entry, **changes), None, None, 0)
@@ -44,7 +37,7 @@ def module_of(entry, data, **changes):
 
 
 class Losses(lightning.Callback):
-    """Remembers the loss of every step."""
+    """Record the loss of every step."""
 
     def __init__(self):
         self.values = []
@@ -54,7 +47,7 @@ class Losses(lightning.Callback):
 
 
 class Stop(lightning.Callback):
-    """Saves and leaves after a step, as Ctrl-C does."""
+    """Save and exit after a step, like Ctrl-C."""
 
     def __init__(self, step):
         self.step = step
@@ -66,7 +59,7 @@ class Stop(lightning.Callback):
 
 
 class Die(Stop):
-    """Leaves no time for anything."""
+    """Kill the process after a step."""
 
     def on_train_batch_end(self, trainer, module, *_):
         if module.global_step == self.step:
@@ -74,7 +67,7 @@ class Die(Stop):
 
 
 def killed(name, dataset, root, folder, step, steps):
-    """Be a run that is killed after a step; run in a process of its own."""
+    """Start a run that is killed after a step; call it in a process of its own."""
     torch.set_num_threads(1)
     stages = [stage_of(METHODS[name], steps=steps)]
     run_of(stages, data_of(dataset, root), folder, Die(step), checkpoint_seconds=0.0).fit()

@@ -32,7 +32,7 @@ def camera_at(turn, size=(SIZE, SIZE), lens=None):
 
 
 def photograph(camera, time):
-    """What a camera sees: straight RGBA (H, W, 4) uint8, and the distance along rays (H, W), 0 beside it."""
+    """Render the ball: straight RGBA (H, W, 4) uint8, and ray depth (H, W), 0 on the background."""
     rays = camera.rays()
     offset = rays.origins - ball_center(time)
     along = (offset * rays.directions).sum(-1)
@@ -47,12 +47,12 @@ def photograph(camera, time):
 
 
 def before_wall(rgba):
-    """A picture (H, W, 3) of what has no alpha."""
+    """Composite an RGBA image over the wall (H, W, 3), for formats without alpha."""
     return np.where(rgba[..., 3:] > 0, rgba[..., :3], np.array(WALL, np.uint8))
 
 
 def shots(count, offset, ability="all"):
-    """Views of a made scene, one a time."""
+    """Yield views of the ball, one for each time."""
     for i in range(count):
         camera, time = camera_at(0.381966 * i + offset), i / (count - 1)
         rgba, depth = photograph(camera, time)

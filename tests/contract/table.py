@@ -1,27 +1,30 @@
-"""The methods that the contract suite holds to the contract: one entry each, for scenes of 20 pixels."""
+"""The methods that the contract suite tests: one entry each, sized for images of 20 pixels."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 
-from contract.toys import Codes, Splats
 from forewarp.fields.radiance import DirectRadiance
 from forewarp.fields.trajectory import TrajectoryField
 from forewarp.methods.method import Method, Start
+from forewarp.methods.particles.model import Particles
 from forewarp.methods.tnerf import TNeRF
 from forewarp.methods.voxel.backward_warp import Deformation
 from forewarp.methods.voxel.effects.background import StaticBackground, Together
 from forewarp.methods.voxel.effects.inpaint import UNet3d
 from forewarp.methods.voxel.effects.motion import Motion
-from forewarp.methods.voxel.effects.upsample import LearnedUpsampler
-from forewarp.methods.voxel.effects.view import SphericalHarmonics
+from forewarp.methods.voxel.effects.upsample import LearnedUpsampler, TrilinearUpsampler
+from forewarp.methods.voxel.effects.view_dependence import SphericalHarmonics, ViewNetwork
 from forewarp.methods.voxel.model import BackwardModel, ForwardModel
+from tests.contract.toys import Splats
 
 
 @dataclass(frozen=True)
 class Effect:
-    """An optional part: what the model's fields are with it ``on`` (None is off), and its ``parts``, pairs of
-    a class and the name of a function of it, one of which at least is called in a step.
+    """An optional part of a method.
+
+    ``on`` are the model's fields that switch it on (None is off). ``parts`` are pairs of a class and a
+    function name: none is called with the effect off, at least one with it on.
     """
 
     on: Mapping[str, object]
@@ -30,14 +33,16 @@ class Effect:
 
 @dataclass(frozen=True)
 class Entry:
-    """A small method. ``model`` makes it of a ``Start``; ``rates`` and ``numbers`` are its stage's,
-    ``weights`` its objective's; after ``steps`` its loss is below ``falls`` times what it was at first.
-    ``effects``: its optional parts by name, which is also how their parameters' names begin. ``toy``: not a
-    method of the project. ``gpu``: where it was proven on a GPU.
+    """A small method to test.
+
+    ``model`` makes it; ``lr`` and ``numbers`` are of its stage, ``weights`` of its objective. After ``steps``
+    its loss must be below ``falls`` times the first. ``effects`` are its optional parts by name, with which
+    the names of their parameters begin. ``toy``: not a method of the project. ``gpu``: where it was run on a
+    GPU.
     """
 
     model: Callable[[Start], Method]
-    rates: Mapping[str, float]
+    lr: Mapping[str, float]
     weights: Mapping[str, float] = field(default_factory=lambda: {"photo": 1.0})
     numbers: Mapping[str, object] = field(default_factory=dict)
     falls: float = 0.5
@@ -47,25 +52,38 @@ class Entry:
     gpu: str = "never"
 
 
-GRID = partial(DirectRadiance, alpha_init=1e-2, skip_alpha=1e-4)
+GRID = partial(DirectRadiance, alpha_init=1e-2, alpha_threshold=1e-4)
 TRAJECTORY = partial(TrajectoryField, bases=4, nodes=6, width=24, layers=3)
 VOXELS = {
-    "numbers": {"voxels": [[0, 10**3], [0.6, 12**3]], "background_voxels": [[0, 6**3]], "keep_alpha": 1e-2}
+    "numbers": {
+        "num_voxels": [[0, 10**3], [0.6, 12**3]],
+        "background_num_voxels": [[0, 6**3]],
+        "keep_alpha": 1e-2,
+    }
     | {"birth_alpha": 5e-3, "refresh_every": 5},
-    "rates": {"density": 0.3, "color": 0.1, "shading": 0.02, "flow": 5e-3, "network": 1e-3},
+    "lr": {"density": 0.3, "color": 0.1, "shading": 0.02, "flow": 5e-3, "network": 1e-3},
     "weights": {"photo": 1.0, "point_color": 0.01, "background_entropy": 1e-3},
     "steps": 100,
 }
-VIEW = Effect({"view": SphericalHarmonics}, ((SphericalHarmonics, "forward"),))
+VIEW = Effect(
+    {"view_dependence": SphericalHarmonics}, ((SphericalHarmonics, "forward"), (ViewNetwork, "forward"))
+)
 BACKGROUND = Effect(
-    {"background": partial(StaticBackground, features=3, alpha_init=1e-2, skip_alpha=0.0)},
+    {"background": partial(StaticBackground, features=3, alpha_init=1e-2, alpha_threshold=0.0)},
     ((StaticBackground, "forward"), (Together, "density")),
 )
 WARP = {
-    "motion": Effect({"motion": Motion}, ((Motion, "flow"), (TrajectoryField, "coefficients"))),
-    "view": VIEW,
-    "upsampler": Effect({"upsampler": partial(LearnedUpsampler, width=8)}, ((LearnedUpsampler, "residual"),)),
-    "inpainter": Effect({"inpainter": partial(UNet3d, width=16, levels=2)}, ((UNet3d, "features"),)),
+    "motion": Effect(
+        {"motion": Motion}, ((Motion, "flow"), (Motion, "warp"), (TrajectoryField, "coefficients"))
+    ),
+    "view_dependence": VIEW,
+    "upsampler": Effect(
+        {"upsampler": partial(LearnedUpsampler, width=8)},
+        ((LearnedUpsampler, "residual"), (LearnedUpsampler, "alone"), (TrilinearUpsampler, "forward")),
+    ),
+    "inpainter": Effect(
+        {"inpainter": partial(UNet3d, width=16, levels=2)}, ((UNet3d, "features"), (UNet3d, "residual"))
+    ),
     "background": BACKGROUND,
 }
 SMALL_NETWORK = {"width": 32, "layers": 3, "skip": None, "position_frequencies": 4}
@@ -76,14 +94,21 @@ METHODS = {
     "backward": Entry(
         BackwardModel(GRID, deformation=partial(Deformation, width=24, layers=3)),
         **VOXELS,
-        effects={"view": VIEW, "background": BACKGROUND},
+        effects={"view_dependence": VIEW, "background": BACKGROUND},
     ),
     "tnerf": Entry(
         partial(TNeRF, **SMALL_NETWORK, density="softplus", open_end=False, inside_box=True),
         {"network": 2e-3},
         steps=150,
     ),
-    "codes": Entry(Codes, {"codes": 1e-2, "network": 5e-3}, {"photo": 1.0, "smooth": 1e-3}, toy=True),
+    "particles": Entry(
+        partial(Particles, tints=1, fades=1),
+        {"means": 1.5e-3, "log_scales": 5e-3, "turns": 3e-3, "opacity": 5e-2, "color": 3e-2, "shade": 1e-3}
+        | {"tint": 1e-3, "fade": 3e-3, "shifts": 7e-3, "node_turns": 8e-3},
+        {"photo": 1.0, "rigid": 3.0, "smooth": 0.1},
+        {"every": 0.05, "settled": 0.9, "finals": {"means": 0.1}},
+        steps=150,
+    ),
     "splats": Entry(
         Splats,
         {"position": 0.01, "velocity": 0.02, "radius": 0.02, "color": 0.05, "opacity": 0.05},

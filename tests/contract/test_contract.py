@@ -1,4 +1,4 @@
-"""What every method of the table promises; a method passes by its entry there."""
+"""The contract, tested for every method in the table."""
 
 import multiprocessing
 import os
@@ -9,15 +9,15 @@ from pathlib import Path
 import pytest
 import torch
 
-from contract.conformance import kinds_of
-from contract.fitting import Stop, killed, module_of, run_of, stage_of
-from contract.scenes import DATASETS, TIMES, data_of
-from contract.table import METHODS
 from forewarp.methods.abilities import HasBounds, HasMatter, HasTrajectories
 from forewarp.scene.view import Moment, View
 from forewarp.training.checkpoints import load_weights
 from forewarp.training.handover import load_handover
 from forewarp.training.objective import total
+from tests.contract.conformance import kinds_of
+from tests.contract.fitting import Stop, killed, module_of, run_of, stage_of
+from tests.contract.scenes import DATASETS, TIMES, data_of
+from tests.contract.table import METHODS
 
 WHITE = torch.ones(3)
 each = pytest.mark.parametrize("name", METHODS)
@@ -43,7 +43,7 @@ def batch_of(data):
 
 
 def backward(module, batch):
-    """The raw terms and the gradients of one step."""
+    """Take one step and return the gradients."""
     module.zero_grad()
     module.training_step(batch, 0).backward()
     return {name: p.grad for name, p in module.method.named_parameters() if p.grad is not None}
@@ -149,11 +149,9 @@ def test_every_parameter_has_one_rate(name, scenes):
 
 @each
 def test_a_missing_rate_is_named(name, scenes):
-    module = module_of(METHODS[name], data_of("dnerf", scenes), rates={"else": 1.0})
+    module = module_of(METHODS[name], data_of("dnerf", scenes), lr={"else": 1.0})
     kind = next(iter(module.method.param_groups()))
-    with pytest.raises(
-        ValueError, match=rf"stage.fine.rates: expected a rate for '{kind}', but got \['else'\]"
-    ):
+    with pytest.raises(ValueError, match=rf"stage.fine.lr: expected a rate for '{kind}', but got \['else'\]"):
         module.configure_optimizers()
 
 
@@ -178,7 +176,7 @@ def test_a_term_of_weight_zero_is_never_called(name, scenes):
 
 
 def full_model(entry):
-    """The model with all its effects."""
+    """Return the model with all its effects."""
     return replace(entry.model, **{k: v for e in entry.effects.values() for k, v in e.on.items()})
 
 
@@ -214,7 +212,7 @@ STEPS, STOP = 14, 9
 
 @pytest.fixture(scope="module")
 def straight(scenes, tmp_path_factory):
-    """A method's uninterrupted run of a few steps, its checkpoint."""
+    """``straight(name, dataset)`` returns the module after an uninterrupted run of a few steps."""
     known = {}
 
     def fit(name, dataset):
@@ -253,14 +251,12 @@ def test_a_run_that_was_stopped_continues_exactly(name, dataset, straight, scene
 
 @pytest.fixture(scope="module")
 def clean():
-    """Starts processes from one that has imported everything and computed nothing: what a thread pool of
-    this one holds would be lost in a plain fork.
-    """
+    """A process context that forks from a server with everything imported and no thread pool started."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PYTHONPATH", str(Path(__file__).parents[1]))
+        patch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))
         patch.setenv("OMP_NUM_THREADS", "1")
         context = multiprocessing.get_context("forkserver")
-        context.set_forkserver_preload(["contract.fitting"])
+        context.set_forkserver_preload(["tests.contract.fitting"])
         yield context
 
 
@@ -289,7 +285,7 @@ def test_a_voxel_stage_follows_it(name, dataset, scenes, tmp_path):
 
 
 def check_two_stages(names, data, tmp_path):
-    """Fit a stage of each method, and find the second again without the first."""
+    """Fit a stage of each method, then load the second without the first."""
     stages = [stage_of(METHODS[n], s, steps=6) for n, s in zip(names, ("coarse", "fine"))]
     run = run_of(stages, data, tmp_path)
     module = run.fit()
@@ -300,7 +296,7 @@ def check_two_stages(names, data, tmp_path):
 
 
 def check_handover(handover, scene):
-    """Finite, and about where the scene is."""
+    """Check that a handover is finite and near the scene."""
     around = scene.box.scaled(1.5)
     low, high = torch.tensor(around.low), torch.tensor(around.high)
     for corner in (handover.box.low, handover.box.high):

@@ -1,4 +1,4 @@
-"""The method of docs/extending.md is taken from the page, fitted, and held to some of the contract."""
+"""Fit the example method of docs/extending.md and test it against a part of the contract."""
 
 import importlib.util
 import re
@@ -8,18 +8,18 @@ from pathlib import Path
 import pytest
 import torch
 
-from contract.fitting import Losses, run_of, stage_of
-from contract.scenes import data_of
-from contract.table import Entry
 from forewarp.methods.abilities import HasMatter, HasTrajectories
 from forewarp.scene.view import Moment
 from forewarp.training.handover import load_handover
+from tests.contract.fitting import Losses, run_of, stage_of
+from tests.contract.scenes import data_of
+from tests.contract.table import Entry
 
 PAGE = Path(__file__).parents[2] / "docs" / "extending.md"
 
 
 def block_of(title, language="python"):
-    """The first block of code under a heading."""
+    """Return the first code block under a heading."""
     section = re.split(r"^## ", PAGE.read_text(), flags=re.MULTILINE)
     text = next(part for part in section if part.startswith(title + "\n"))
     return re.search(rf"```{language}\n(.*?)```", text, re.DOTALL)[1]
@@ -27,7 +27,7 @@ def block_of(title, language="python"):
 
 @pytest.fixture
 def page(tmp_path, monkeypatch):
-    """The block as a module of its own."""
+    """Import the method's code block as a module."""
     path = tmp_path / "page_of_extending.py"
     path.write_text(block_of("A method"))
     spec = importlib.util.spec_from_file_location(path.stem, path)

@@ -1,19 +1,18 @@
-"""What the two toys are there to show."""
+"""What the toy method shows: gradients of its own, rows that come and go, neighbouring pictures."""
 
 from dataclasses import replace
 
 import pytest
 import torch
 
-from contract.fitting import module_of
-from contract.scenes import data_of
-from contract.table import METHODS
 from forewarp.methods.method import Start
 from forewarp.scene.batch import Batch
 from forewarp.scene.cloud import Cloud, Handover
-from forewarp.scene.view import Moment, View
 from forewarp.training.checkpoints import misfits
 from forewarp.training.objective import total
+from tests.contract.fitting import module_of
+from tests.contract.scenes import data_of
+from tests.contract.table import METHODS
 
 
 @pytest.fixture
@@ -28,25 +27,6 @@ def splats_of(data, **changes):
         for parameter in module.method.parameters():
             parameter += 0.3 * torch.randn(parameter.shape)
     return module
-
-
-def test_a_code_is_interpolated_between_training_times(data):
-    method = module_of(METHODS["codes"], data).method
-    times, codes = data.scene.times, method.codes
-    for row, time in enumerate(times):
-        torch.testing.assert_close(method.code(time), codes[row])
-    between = method.code(0.75 * times[2] + 0.25 * times[3])
-    torch.testing.assert_close(between, 0.75 * codes[2] + 0.25 * codes[3])
-    torch.testing.assert_close(method.code(-1.0), codes[0])
-    torch.testing.assert_close(method.code(2.0), codes[-1])
-    assert "linearly interpolated" in method.protocol()["time"]
-
-
-def test_a_moment_between_two_times_teaches_both_of_their_codes(data):
-    method = module_of(METHODS["codes"], data).method
-    drawn = method.at(Moment(0.3)).render(View(data.scene.train[0].camera), torch.ones(3))
-    drawn.rgb.sum().backward()
-    assert method.codes.grad.abs().sum(-1).nonzero()[:, 0].tolist() == [1, 2]  # of 0.2 and 0.4
 
 
 @pytest.mark.parametrize("dataset", ["dnerf", "hypernerf"])  # without a lens and with one
@@ -127,7 +107,7 @@ def test_what_it_asks_for_is_what_it_gets(data):
     assert batch.observations[0].view.shape == (camera.height, camera.width)
     times = [one.moment.time for one in batch.observations]
     assert abs(times[0] - times[1]) == pytest.approx(0.2)
-    module_of(METHODS["codes"], data)
+    module_of(METHODS["forward"], data)
     batch = next(iter(data.train_dataloader()))
     assert [len(one.view) for one in batch.observations] == [192]
 

@@ -1,11 +1,10 @@
-"""Two methods as unlike voxels as can be: what the contract must not make awkward."""
+"""A method as unlike voxels as can be: what the contract must not make awkward."""
 
 from functools import partial
 
 import torch
 from torch import Tensor, nn
 
-from forewarp.fields.mlp import mlp
 from forewarp.methods.method import Method, Snapshot, Start, Step
 from forewarp.methods.rows import take_rows
 from forewarp.scene.batch import Asks, Batch
@@ -14,61 +13,11 @@ from forewarp.scene.cloud import Cloud
 from forewarp.scene.view import Moment, Rendering, View
 
 
-class Codes(Method):
-    """A light field with a learned code per training time: ray and code -> colour, opacity, distance."""
-
-    terms = ("photo", "smooth")
-
-    def __init__(self, start: Start, *, length: int = 8, width: int = 48) -> None:
-        super().__init__()
-        self.register_buffer("times", torch.tensor(start.scene.times))
-        self.codes = nn.Parameter(0.1 * torch.randn(len(self.times), length))
-        self.network = mlp(6 + length, 5, width=width, layers=4)
-
-    def code(self, time: float) -> Tensor:
-        """That of a time (C,), between the two nearest training times; before the first it is the first's."""
-        right = int(torch.searchsorted(self.times, time).clamp(1, len(self.times) - 1))
-        before, after = self.times[right - 1], self.times[right]
-        share = ((time - before) / (after - before)).clamp(0, 1)
-        return torch.lerp(self.codes[right - 1], self.codes[right], share)
-
-    def at(self, moment: Moment) -> Snapshot:
-        return CodesSnapshot(moment, self.network, self.code(moment.time))
-
-    def look(self, batch: Batch, factors, generator: torch.Generator) -> Step:
-        seen, snapshot = batch.observations[0], self.at(batch.observations[0].moment)
-        photo = (snapshot.render(seen.view, seen.background).rgb - seen.rgb).square().mean()
-        smooth = lambda: self.codes.diff(dim=0).square().mean()  # noqa: E731
-        return Step({"photo": lambda: photo, "smooth": smooth}, photo.detach())
-
-    def param_groups(self) -> dict[str, list[nn.Parameter]]:
-        return {"codes": [self.codes], "network": list(self.network.parameters())}
-
-    def protocol(self) -> dict[str, str]:
-        return {"time": "a code per training time, linearly interpolated between them"}
-
-
-class CodesSnapshot(Snapshot):
-    """A light field of one code."""
-
-    def __init__(self, moment: Moment, network: nn.Module, code: Tensor) -> None:
-        self.moment, self.network, self.code = moment, network, code
-
-    def render(self, view: View, background: Tensor, rendering: str | None = None) -> Rendering:
-        rays = view.rays().to(self.code.device)
-        # A ray's direction and its moment about the origin: the same wherever on it the camera stands.
-        line = torch.cat([rays.directions, torch.linalg.cross(rays.origins, rays.directions)], -1)
-        out = self.network(torch.cat([line, self.code.expand(len(line), -1)], -1))
-        color, opacity, along = torch.sigmoid(out).split([3, 1, 1], -1)
-        depth = torch.where(opacity > 0.5, rays.near + (rays.far - rays.near) * along, 0.0)[:, 0]
-        return Rendering(opacity * color + (1 - opacity) * background, depth, opacity[:, 0])
-
-
 class Splats(Method):
-    """Round Gaussians that move along lines. A ray sees each as it does where it passes it nearest.
+    """Round Gaussians that move along lines; a ray reads each at its nearest point.
 
-    Picture, loss and gradients are computed in one pass, without autograd. Stage numbers: ``count`` at first,
-    density control ``every`` so many steps, ``most`` of them.
+    Image, loss and gradients are computed in one pass, without autograd. Stage numbers: ``count`` splats at
+    first, at ``most`` so many, density control ``every`` n steps.
     """
 
     numbers = ("count", "every", "most")
@@ -119,7 +68,7 @@ class Splats(Method):
 
     @torch.no_grad()
     def advance(self, progress: float, step: int, optimizer: torch.optim.Optimizer) -> dict[str, float]:
-        """Forget what is hardly there; split the tenth that is pulled at most into two of half the size."""
+        """Remove faint splats; split the tenth with the largest gradients into two of half the size."""
         if step and step % self.every == 0:
             alive = (self.opacity > -4).nonzero()[:, 0]
             torn = alive[self.pull[alive].topk(min(len(alive) // 10, self.most - len(alive))).indices]
@@ -144,7 +93,7 @@ class Splats(Method):
         return "splats", len(self.position)
 
     def trajectories(self, points: Tensor, times: Tensor) -> Tensor:
-        """Every point moves as the splat next to it."""
+        """Move every point like its nearest splat."""
         nearest = torch.cdist(points, self.position).argmin(-1)
         return points[:, None] + self.velocity[nearest][:, None] * (times - self.canonical_time)[:, None]
 
@@ -169,7 +118,7 @@ class SplatsSnapshot(Snapshot):
         return self.trace(view, background)[0]
 
     def trace(self, view: View, background: Tensor):
-        """What a view sees, and a function from the slope of its colours (R, 3) to those of parameters."""
+        """Render a view; also return a function from gradients of colours (R, 3) to those of parameters."""
         rays, splats = view.rays().to(self.points.device), self.splats
         offset = self.points - rays.origins[0]
         order = offset.norm(dim=-1).argsort()  # all rays of a view begin at one place: one order for all

@@ -7,8 +7,6 @@ from itertools import islice
 
 import pytest
 import torch
-from dnerf_scene import write_tiny
-from tiny_scene import ball_scene
 
 from forewarp.data.batches import Sampler, Targets, color_of
 from forewarp.data.dnerf import read_scene
@@ -18,6 +16,8 @@ from forewarp.scene.errors import SceneError
 from forewarp.scene.frame import Frame, Scene
 from forewarp.scene.rays import joined
 from forewarp.scene.view import Moment
+from tests.support.dnerf_scene import write_tiny
+from tests.support.tiny_scene import ball_scene
 
 
 @pytest.fixture
@@ -96,25 +96,10 @@ def test_all_pixels_and_frames_are_drawn(scene):
     assert len(rays_of(batches[0]).directions.unique(dim=0)) == 48
 
 
-def test_the_seed_decides(scene):
-    assert torch.equal(colours(Sampler(scene, rays=9, seed=1)), colours(Sampler(scene, rays=9, seed=1)))
-    assert not torch.equal(colours(Sampler(scene, rays=9, seed=1)), colours(Sampler(scene, rays=9, seed=2)))
-
-
 def test_the_global_generator_plays_no_part(scene):
     before = torch.get_rng_state()
     Sampler(scene, background="random").draw()
     assert torch.equal(torch.get_rng_state(), before)
-
-
-def test_a_saved_state_continues_exactly(scene):
-    batches = Sampler(scene, rays=9, background="random")
-    colours(batches)
-    state = batches.state_dict()
-    expected = colours(batches)
-    other = Sampler(scene, rays=9, background="random", seed=5)
-    other.load_state_dict(state)
-    assert torch.equal(colours(other), expected)
 
 
 def test_the_picker_chooses_the_frame(scene):
@@ -201,19 +186,6 @@ def test_more_views_than_there_are_takes_all_of_the_time(scene):
     assert picks == {0: [0, 2, 3], 1: [1], 2: [0, 2, 3], 3: [0, 2, 3]}
     few = Sampler(scene, rays=2, views_per_step=8, picker=lambda: 0).draw()
     assert len(frames_of(few, scene).unique()) == 2
-
-
-def test_batches_of_several_views_repeat_and_continue_exactly(scene):
-    scene = of_times(scene, 0.5, 0.5, 0.5, 0.5)
-    options = {"rays": 9, "background": "random", "views_per_step": 3}
-    batches = Sampler(scene, **options)
-    first = colours(batches)
-    state = batches.state_dict()
-    expected = colours(batches)
-    assert torch.equal(colours(Sampler(scene, **options)), first)
-    other = Sampler(scene, seed=5, **options)
-    other.load_state_dict(state)
-    assert torch.equal(colours(other), expected)
 
 
 def test_one_view_a_step_draws_what_it_always_drew(scene):
@@ -337,15 +309,25 @@ def test_pictures_of_the_instant_are_whole_and_over_white(scene):
     assert [one.moment.frame for one in alone.instant] == [1]
 
 
-@pytest.mark.parametrize("kind", ["crops", "pictures"])
-def test_what_was_asked_for_repeats_and_continues_exactly(scene, kind):
-    options = {"background": "random", "asks": Asks(kind, side=4, neighbours=1)}
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"rays": 9},
+        {"rays": 9, "views_per_step": 3},
+        {"asks": Asks("crops", side=4, neighbours=1)},
+        {"asks": Asks("pictures", side=4, neighbours=1)},
+    ],
+)
+def test_batches_repeat_and_continue_exactly(scene, options):
+    scene = of_times(scene, 0.5, 0.5, 0.5, 1.0) if "views_per_step" in options else scene
+    options = {"background": "random", **options}
     sampler = Sampler(scene, **options)
     first = colours(sampler)
     state = sampler.state_dict()
     expected = colours(sampler)
     assert torch.equal(colours(Sampler(scene, **options)), first)
     other = Sampler(scene, seed=5, **options)
+    assert not torch.equal(colours(other), first)
     other.load_state_dict(state)
     assert torch.equal(colours(other), expected)
 

@@ -5,10 +5,10 @@ import json
 import numpy as np
 import pytest
 import torch
-from dnerf_scene import ANGLE, REAL_SCENES, edit, real, shots, truth, write_tiny
 
 from forewarp.data.dnerf import read_scene, write_scene
 from forewarp.scene.errors import SceneError
+from tests.support.dnerf_scene import ANGLE, REAL_SCENES, edit, real, shots, truth, write_tiny
 
 
 def test_round_trip_of_a_stock_scene(tmp_path):

@@ -2,13 +2,12 @@
 
 from pathlib import Path
 
-import imageio.v3 as iio
 import numpy as np
 import pytest
-from dnerf_scene import edit, shots, write_tiny
 
 from forewarp.data.dnerf import Shot, read_scene, write_scene
 from forewarp.scene.errors import SceneError
+from tests.support.dnerf_scene import edit, shots, write_tiny
 
 
 def frame(**entries):
@@ -19,10 +18,6 @@ def without(key):
     return lambda content: content["frames"][1].pop(key)
 
 
-SCALED = np.diag([2.0, 2, 2, 1]).tolist()
-MIRRORED = np.diag([1.0, 1, -1, 1]).tolist()
-NAN = np.full((4, 4), np.nan).tolist()
-SLANTED = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 1, 1]]
 BAD_TRANSFORMS = {
     "no angle": (lambda c: c.pop("camera_angle_x"), r"camera_angle_x: expected a number .*got None"),
     "angle 0": (lambda c: c.update(camera_angle_x=0), r"camera_angle_x: expected radians inside \(0, pi\)"),
@@ -35,25 +30,8 @@ BAD_TRANSFORMS = {
         without("transform_matrix"),
         r"frames\[1\].transform_matrix: expected 4 x 4 finite numbers, but got None",
     ),
-    "3 x 4": (frame(transform_matrix=NAN[:3]), r"frames\[1\].transform_matrix: expected 4 x 4 finite"),
-    "ragged": (frame(transform_matrix=[[1], [1, 2]]), r"transform_matrix: expected 4 x 4 finite"),
-    "words": (frame(transform_matrix=[["a"] * 4] * 4), r"transform_matrix: expected 4 x 4 finite"),
-    "nan pose": (frame(transform_matrix=NAN), r"transform_matrix: expected 4 x 4 finite"),
-    "scale": (
-        frame(transform_matrix=SCALED),
-        r"transform_matrix: expected a rotation, but got determinant 8",
-    ),
-    "mirror": (frame(transform_matrix=MIRRORED), r"expected a rotation, but got determinant -1"),
-    "last row": (frame(transform_matrix=SLANTED), r"transform_matrix: expected the last row 0 0 0 1"),
     "late": (frame(time=1.5), r"frames\[1\].time: expected a number in \[0, 1\], but got 1.5"),
-    "nan time": (frame(time=float("nan")), r"frames\[1\].time: expected a number .*got nan"),
-    "word time": (frame(time="0.5"), r"frames\[1\].time: expected a number .*got '0.5'"),
-    "true time": (frame(time=True), r"frames\[1\].time: expected a number .*got True"),
-    "huge time": (frame(time=10**400), r"frames\[1\].time: expected a number"),
     "no path": (without("file_path"), r"frames\[1\].file_path: expected a path .*got None"),
-    "path up": (frame(file_path="./train/../../x"), r"file_path: expected a path inside the scene folder"),
-    "path root": (frame(file_path="/etc/x"), r"file_path: expected a path inside the scene folder"),
-    "path itself": (frame(file_path="./"), r"file_path: expected a path inside the scene folder"),
     "no image": (frame(file_path="./train/r_9"), r"r_9.png: expected an image, but got No such file"),
     "no depth": (frame(depth_file_path="d.npy"), r"frames\[1\].depth_file_path: expected an existing file"),
     "ability": (frame(ability="flight"), r"frames\[1\].ability: expected one of space, time, canonical"),
@@ -85,18 +63,10 @@ def other_size(path: Path) -> None:
     path.write_bytes((path.parents[2] / "other" / "train" / path.name).read_bytes())
 
 
-def deep(path: Path) -> None:
-    iio.imwrite(path, np.zeros((6, 8), np.uint16), extension=".png")
-
-
 BAD_IMAGES = {
-    "empty": (lambda p: p.write_bytes(b""), "expected an image, but got an empty file"),
-    "truncated": (lambda p: cut(p, 0.7), "expected a whole PNG image, but got a truncated one"),
-    "no end": (lambda p: cut(p, 0.97), "expected a whole PNG image, but got a truncated one"),
-    "harmed": (flip, "expected an unharmed PNG image, but got a wrong checksum"),
-    "text": (lambda p: p.write_text("version https://git-lfs"), "expected a PNG image"),
+    "truncated": (lambda p: cut(p, 0.7), "expected a whole image, but got a truncated or harmed one"),
+    "harmed": (flip, "expected a whole image, but got a truncated or harmed one"),
     "size": (other_size, "expected 8 x 6 pixels as the first, but got 4 x 4"),
-    "16 bit": (deep, "expected 8 bits a channel, but got 16"),
 }
 
 
@@ -109,7 +79,7 @@ def test_bad_images_are_found_when_the_scene_is_read(tmp_path, case):
 
 
 @pytest.mark.parametrize(
-    ("case", "match"), [("harmed", "checksum"), ("size", "expected 8 x 6 pixels, but got")]
+    ("case", "match"), [("harmed", "harmed one; copy"), ("size", "expected 8 x 6 pixels, but got")]
 )
 def test_images_that_go_bad_later_are_refused_too(tmp_path, case, match):
     write_tiny(tmp_path / "toy")
@@ -167,9 +137,7 @@ def test_stray_files_are_ignored(tmp_path):
 BAD_OPTIONS = [
     ({"half_resolution": "yes"}, "data.half_resolution: expected true, false or auto, but got 'yes'"),
     ({"near": 6, "far": 2}, "data.near, data.far: expected near < far, but got 6 and 2"),
-    ({"near": -1}, "data.near: expected a number"),
     ({"box": [1, 2]}, "data.box: expected six numbers"),
-    ({"box": [1, 1, 1, 0, 2, 2]}, "data.box: expected six numbers"),
 ]
 
 

@@ -2,10 +2,10 @@ import os
 
 import pytest
 
-from dnerf_scene import write_tiny
-from forewarp.data.files import MOST_TEXT
+from forewarp.data.files import MOST_BYTES
 from forewarp.data.fingerprint import difference, fingerprint
 from forewarp.data.module import DNeRFDataModule, SceneDataModule
+from tests.support.dnerf_scene import write_tiny
 
 
 @pytest.fixture
@@ -67,11 +67,11 @@ def test_a_text_too_large_to_read_counts_by_its_size(scene):
     large, before = scene / "sparse" / "images.txt", fingerprint(scene)
     large.parent.mkdir()
     large.touch()
-    os.truncate(large, MOST_TEXT + 1)
+    os.truncate(large, MOST_BYTES + 1)
     found = fingerprint(scene)
     assert found["texts"] == before["texts"]
-    assert found["images"]["bytes"] == before["images"]["bytes"] + MOST_TEXT + 1
-    os.truncate(large, MOST_TEXT + 2)
+    assert found["images"]["bytes"] == before["images"]["bytes"] + MOST_BYTES + 1
+    os.truncate(large, MOST_BYTES + 2)
     assert difference(found, fingerprint(scene)).startswith("images: 10 files of")
 
 

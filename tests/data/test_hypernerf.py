@@ -7,13 +7,12 @@ import shutil
 import numpy as np
 import pytest
 import torch
-from dnerf_scene import real
-from rig_scene import CENTER, FAR, LENS, NEAR, SCALE, edit, hand, phone, rig, truth, write_rig
 
-from forewarp.data.hypernerf import read_scene
+from forewarp.data.hypernerf import read_camera, read_scene, reduced, write_camera
 from forewarp.data.images import write_png
 from forewarp.data.module import HyperNeRFDataModule
-from forewarp.data.nerfies_camera import read_camera, reduced, write_camera
+from tests.support.dnerf_scene import real
+from tests.support.rig_scene import CENTER, FAR, LENS, NEAR, SCALE, edit, hand, phone, rig, truth, write_rig
 
 MIDDLE = torch.tensor(CENTER, dtype=torch.float64)
 
@@ -76,12 +75,6 @@ def test_without_val_ids_every_fourth_is_trained_on(tmp_path):
     assert scene.times == pytest.approx((0.0, 0.4, 0.8))  # of all items the last is at 1
     assert scene.canonical_time == 0.4
     assert scene.protocol["split"] == "interpolation"
-
-
-def test_canonical_is_the_earlier_of_two_times_as_near_to_the_middle(tmp_path):
-    write_rig(tmp_path / "toy", hand(13))
-    scene = read_scene(tmp_path, "toy")
-    assert scene.canonical_time == scene.times[1] == pytest.approx(1 / 3)
 
 
 @pytest.mark.parametrize("write_time_id", [True, False])

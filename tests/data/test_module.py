@@ -4,11 +4,11 @@ import pytest
 import torch
 from lightning import LightningModule, Trainer
 
-from dnerf_scene import shots, write_tiny
 from forewarp.data.dnerf import read_scene
 from forewarp.data.module import DNeRFDataModule, SceneDataModule
 from forewarp.scene.batch import Batch, Target
 from forewarp.scene.errors import SceneError
+from tests.support.dnerf_scene import shots, write_tiny
 
 
 class Recorder(LightningModule):

@@ -1,16 +1,16 @@
 """Bad captures are refused in one line that names file and key."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
-
-from dataclasses import replace
 
 from forewarp.data.images import write_png
 from forewarp.data.posed_video import PosedShot, read_scene, write_scene
 from forewarp.scene.camera import look_at
 from forewarp.scene.errors import SceneError
-from posed_scene import MIDDLE, UP, cameras, edit, shots, write_tiny
+from tests.support.posed_scene import MIDDLE, UP, cameras, edit, shots, write_tiny
 
 
 def frame(**entries):
@@ -25,25 +25,13 @@ def without(key):
     return lambda content: content["frames"][1].pop(key)
 
 
-NAN = np.full((4, 4), np.nan).tolist()
-FAR_OFF = [[1, 0, 0, 1e12], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
 BAD = {
     "no frames": (lambda c: c.pop("frames"), r"frames: expected a list of at least one frame, but got None"),
     "empty": (top(frames=[]), r"frames: expected a list of at least one"),
     "word": (lambda c: c["frames"].append("x"), r"frames\[10\]: expected an object, but got 'x'"),
     "one": (lambda c: c.update(frames=c["frames"][:1]), r"expected a frame to test on, but got none of 1"),
     "no pose": (without("transform_matrix"), r"frames\[1\].transform_matrix: expected 4 x 4 finite .*None"),
-    "nan pose": (frame(transform_matrix=NAN), r"frames\[1\].transform_matrix: expected 4 x 4 finite"),
-    "scale": (
-        frame(transform_matrix=np.diag([2.0, 2, 2, 1]).tolist()),
-        r"expected a rotation.*determinant 8",
-    ),
-    "mirror": (frame(transform_matrix=np.diag([1.0, 1, -1, 1]).tolist()), r"rotation.*determinant -1"),
-    "far off": (frame(transform_matrix=FAR_OFF), r"transform_matrix: expected a place within 1e\+09 units"),
     "no path": (without("file_path"), r"frames\[1\].file_path: expected a path .*got None"),
-    "path up": (frame(file_path="../x.png"), r"file_path: expected a path inside the scene folder"),
-    "path lines": (frame(file_path="a\nb.png"), r"file_path: expected a path inside the scene folder"),
-    "path half": (frame(file_path="\ud800.png"), r"file_path: expected a path inside the scene folder"),
     "no image": (frame(file_path="images/x.png"), r"x.png: expected an image, but got No such file"),
     "no jpeg": (frame(file_path="images/x.jpg"), r"x.jpg: expected an image, but got No such file"),
     "no suffix": (frame(file_path="images/x"), r"file_path: expected an image, PNG or JPEG, but got no"),
@@ -60,20 +48,16 @@ BAD = {
         r"frames: time: expected one in all frames or in none, but got 1 of 10 and",
     ),
     "late": (frame(time=3), r"frames\[1\].time: expected a number in \[0, 1\], but got 3"),
-    "word time": (frame(time="0"), r"frames\[1\].time: expected a number in \[0, 1\], but got '0'"),
     "no focal": (lambda c: c.pop("fl_x"), r"frames\[0\].fl_x: expected a number in .*got None"),
     "focal 0": (top(fl_x=0), r"json: fl_x: expected a number in \[0.3, 3000\], but got 0"),
     "own focal": (frame(fl_x=-30), r"frames\[1\].fl_x: expected a number in .*got -30"),
-    "nan focal": (top(fl_y=float("nan")), r"json: fl_y: expected a number .*got nan"),
     "far centre": (top(cx=3000), r"json: cx: expected a number in \[-30, 60\], but got 3000"),
     "size": (top(w=60), r"frame_1.png: expected 60 x 20 pixels as .*json: w and h say, but got 30 x 20"),
     "own size": (frame(h=10), r"frame_2.png: expected 30 x 10 pixels"),
-    "word size": (top(w="30"), r"json: w: expected a number"),
     "fisheye": (top(camera_model="OPENCV_FISHEYE"), r"json: camera_model: expected one of OPENCV, .*FISHEYE"),
     "own model": (frame(camera_model=["x"]), r"frames\[1\].camera_model: expected one of OPENCV"),
     "k4": (top(k4=0.1), r"json: k4: expected 0, but got 0.1; undistort the images"),
     "fold": (top(k1=-40.0), r"json: k1: expected a lens that can be undone all over the picture, but got"),
-    "word lens": (top(p1="0"), r"json: p1: expected a number"),
     "near": (top(near=-1), r"json: near: expected a number in \[0, 1e\+09\], but got -1"),
     "far": (top(far=float("inf")), r"json: far: expected a number .*got inf"),
     "ends": (top(near=7, far=6), r"json: expected near < far, but got 7 and 6"),

@@ -2,8 +2,8 @@ import imageio.v3 as iio
 import pytest
 import torch
 
-from films import read_film
 from forewarp.drawing.files import write_png, write_video
+from tests.support.films import read_film
 
 
 def pictures(count, height=18, width=22):

@@ -2,12 +2,12 @@ import pytest
 import torch
 
 from forewarp.fields.radiance import DirectRadiance, FeatureRadiance, density_shift
-from forewarp.scene.box import Box, Lattice
 from forewarp.fields.radiance_grid import EMPTY
+from forewarp.scene.box import Box, Lattice
 
 LATTICE = Lattice(Box((0, 0, 0), (2, 3, 4)), (3, 4, 5))
 ALL = torch.ones(LATTICE.shape, dtype=torch.bool)
-COMMON = {"alpha_init": 1e-2, "unit": 0.5, "skip_alpha": 0.0}
+COMMON = {"alpha_init": 1e-2, "density_scale": 0.5, "alpha_threshold": 0.0}
 
 
 @pytest.mark.parametrize(
@@ -24,7 +24,7 @@ def test_direct_radiance_owns_what_it_uses(features, names):
 def test_direct_radiance_births_have_their_opacity_over_a_voxel():
     radiance = DirectRadiance(LATTICE, ALL, features=3, **COMMON)
     raw = torch.tensor(radiance.births(5e-3)["density"])
-    assert radiance.activation.alpha(raw, LATTICE.pitch).item() == pytest.approx(5e-3, rel=1e-3)
+    assert radiance.activation.alpha(raw, LATTICE.voxel_size).item() == pytest.approx(5e-3, rel=1e-3)
     assert radiance.empties() == {"density": EMPTY}
 
 

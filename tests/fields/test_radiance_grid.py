@@ -4,29 +4,29 @@ import pytest
 import torch
 
 from forewarp.fields.radiance import density_shift
+from forewarp.fields.radiance_grid import EMPTY, Activation, RadianceGrid
 from forewarp.ops.grid import occupied_cells
 from forewarp.scene.box import Box, Lattice
-from forewarp.fields.radiance_grid import EMPTY, Activation, RadianceGrid
 
 LATTICE = Lattice(Box((0, 0, 0), (2, 3, 4)), (3, 4, 5))
 
 
-def grid(raw=3.0, present=None, skip_alpha=0.0):
+def grid(raw=3.0, present=None, alpha_threshold=0.0):
     present = torch.ones(LATTICE.shape, dtype=torch.bool) if present is None else present
     index = torch.where(present.flatten(), present.flatten().cumsum(0) - 1, -1).reshape(LATTICE.shape).int()
     values = torch.cat([torch.full((int(present.sum()), 1), raw), torch.ones(int(present.sum()), 3)], -1)
-    return RadianceGrid(LATTICE, index, values, Activation(density_shift(1e-2), 1.0), skip_alpha)
+    return RadianceGrid(LATTICE, index, values, Activation(density_shift(1e-2), 1.0), alpha_threshold)
 
 
 def test_raw_zero_has_the_initial_opacity_over_one_unit():
     for alpha in (1e-6, 1e-2, 0.5):
-        activation = Activation(density_shift(alpha), unit=0.3)
+        activation = Activation(density_shift(alpha), density_scale=0.3)
         assert activation.alpha(torch.zeros(1), 0.3).item() == pytest.approx(alpha, rel=1e-3)
 
 
 @pytest.mark.parametrize("alpha", [1e-5, 1e-2, 0.5, 0.99])
 def test_raw_inverts_alpha(alpha):
-    activation = Activation(density_shift(1e-2), unit=0.1)
+    activation = Activation(density_shift(1e-2), density_scale=0.1)
     raw = activation.raw(alpha, 0.05)
     assert activation.alpha(torch.tensor([raw]), 0.05).item() == pytest.approx(alpha, rel=1e-3)
 
@@ -65,10 +65,10 @@ def test_density_and_features_are_read_from_the_voxels():
 
 
 def test_cells_too_transparent_are_skipped():
-    assert grid(raw=3.0, skip_alpha=1e-3).cells.all()
-    assert not grid(raw=-9.0, skip_alpha=1e-3).cells.any()
+    assert grid(raw=3.0, alpha_threshold=1e-3).cells.all()
+    assert not grid(raw=-9.0, alpha_threshold=1e-3).cells.any()
     assert grid(raw=-9.0).cells.all()
-    one = grid(raw=-9.0, skip_alpha=1e-3)
+    one = grid(raw=-9.0, alpha_threshold=1e-3)
     one.values[one.index[1, 1, 1], 0] = 5.0
     present = torch.full(LATTICE.shape, -1, dtype=torch.int32)
     present[1, 1, 1] = 0

@@ -1,4 +1,4 @@
-"""Rows that come and go: parameters, buffers and moments follow, and states that disagree are named."""
+"""Rows of parameters, buffers and moments are added and removed together; contradictions are named."""
 
 import pytest
 import torch

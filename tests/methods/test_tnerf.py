@@ -1,11 +1,7 @@
 from functools import partial
-from pathlib import Path
 
-import lightning
 import pytest
 import torch
-from hydra.utils import instantiate
-from omegaconf import OmegaConf
 
 from forewarp.data.module import SceneDataModule
 from forewarp.methods.method import Start, parameter_count
@@ -16,10 +12,10 @@ from forewarp.scene.box import Box
 from forewarp.scene.camera import Camera, look_at
 from forewarp.scene.frame import Frame, Scene
 from forewarp.scene.view import Moment, View
-from forewarp.training.budget import share_out
 from forewarp.training.objective import Objective
-from forewarp.training.settings import StageSettings
-from forewarp.training.stages import Run, Stage
+from forewarp.training.schedule import StageSettings
+from forewarp.training.stages import Stage
+from tests.support.tiny_scene import make_run
 
 TIMES = (0.0, 0.5, 1.0)
 SMALL = {"width": 32, "layers": 3, "skip": None, "position_frequencies": 3, "time_frequencies": 2}
@@ -111,15 +107,6 @@ def test_the_snapshot_asks_the_network_in_world_units():
     assert not snapshot.holds(Moment(0.2))
 
 
-def test_a_crop_and_pixels_are_parts_of_the_picture():
-    made = method(**GENTLE)
-    whole = drawn(made, 0.5)
-    rows = torch.tensor([77, 3, 140])
-    torch.testing.assert_close(drawn(made, 0.5, View(camera(), rows)).rgb, whole.rgb[rows])
-    crop = drawn(made, 0.5, View(camera(), crop=(2, 3, 4, 5))).rgb.reshape(4, 5, 3)
-    torch.testing.assert_close(crop, whole.rgb.reshape(12, 12, 3)[2:6, 3:8])
-
-
 @pytest.mark.parametrize("inside_box", [False, True])
 def test_a_step_gives_the_loss_of_the_fine_pass(inside_box):
     made = method(inside_box=inside_box, **GENTLE)
@@ -187,28 +174,6 @@ def test_refuses(wrong, text):
         method(**wrong)
 
 
-CONF = Path(__file__).parents[2] / "conf"
-
-
-@pytest.mark.parametrize(
-    ("preset", "parameters"), [("demo", 18_724), ("fast", 127_940), ("faithful", 600_452)]
-)
-def test_its_presets(preset, parameters):
-    config = OmegaConf.load(CONF / "model_preset" / f"tnerf_{preset}.yaml")
-    config.model = OmegaConf.load(CONF / "model" / "tnerf.yaml")
-    config.objective = OmegaConf.load(CONF / "objective" / f"tnerf_{preset}.yaml")
-    config.stage = OmegaConf.load(CONF / "stage" / f"tnerf_{preset}.yaml")
-    made = OmegaConf.to_container(config, resolve=True)
-    name = made["model"].pop("name")
-    built = instantiate(made["model"], _convert_="all")(Start(moving_scene(), "fine", {}))
-    (stage,) = share_out(instantiate(made["stage"], _convert_="all"), minutes=1, iterations=None)
-    assert (name, stage.settings.name) == ("tnerf", "fine")
-    assert set(stage.settings.rates) == set(built.param_groups())
-    assert not stage.settings.numbers
-    assert stage.objective.weights == {"photo": 1.0}
-    assert parameter_count(built) == parameters
-
-
 def static_ceiling():
     """The train PSNR that no static model exceeds with a fixed camera."""
     images = torch.stack([picture(time).double() / 255 for time in TIMES])
@@ -216,38 +181,10 @@ def static_ceiling():
     return float(-10 * torch.log10(rgb.var(0, unbiased=False).mean()))
 
 
-def run(folder, iterations):
-    def make_trainer(where, callbacks):
-        return lightning.Trainer(
-            max_epochs=1,
-            max_steps=-1,
-            accelerator="cpu",
-            logger=False,
-            enable_checkpointing=False,
-            enable_progress_bar=False,
-            enable_model_summary=False,
-            callbacks=callbacks,
-            limit_val_batches=0,
-            num_sanity_val_steps=0,
-        )
-
-    settings = StageSettings.of(
-        "fine", rates={"network": 5e-3}, iterations=iterations, curriculum={"all_in": 0.0}
-    )
-    return Run(
-        SceneDataModule(moving_scene, rays=96),
-        partial(TNeRF, **(SMALL | GENTLE)),
-        [Stage(settings, Objective({"photo": 1.0}))],
-        Path(folder),
-        make_trainer,
-    )
-
-
 def test_it_learns_what_moves(tmp_path):
-    made = run(tmp_path, 260)
-    module = made.fit()
-    psnr = [float(module.psnr_of(target)) for target in made.datamodule.targets("train")]
+    settings = StageSettings.of("fine", lr={"network": 5e-3}, iterations=260, curriculum={"all_in": 0.0})
+    stages = [Stage(settings, Objective({"photo": 1.0}))]
+    data, model = SceneDataModule(moving_scene, rays=96), partial(TNeRF, **(SMALL | GENTLE))
+    module = make_run(tmp_path, stages, data=data, model=model).fit()
+    psnr = [float(module.psnr_of(target)) for target in data.targets("train")]
     assert sum(psnr) / len(psnr) > static_ceiling() + 3
-    again = run(tmp_path, 260).load()
-    for name, value in module.method.state_dict().items():
-        assert torch.equal(again.method.state_dict()[name], value)

@@ -3,8 +3,8 @@ import math
 import pytest
 import torch
 
-import reference
 from forewarp.metrics.depth import THRESHOLDS, depth_delta
+from tests.support import reference
 
 
 def test_by_hand():

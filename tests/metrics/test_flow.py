@@ -3,8 +3,8 @@ import math
 import pytest
 import torch
 
-import reference
 from forewarp.metrics.flow import end_point_error
+from tests.support import reference
 
 
 def walks(count=7, times=4, seed=0):

@@ -5,9 +5,9 @@ import imageio.v3 as iio
 import pytest
 import torch
 
-import reference
 from forewarp.metrics import lpips
 from forewarp.metrics.lpips import LPIPS, NETS, find_lpips, find_lpips_weights
+from tests.support import reference
 
 
 def weights_folder():

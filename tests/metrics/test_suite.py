@@ -52,8 +52,8 @@ def test_what_an_image_does_not_allow_is_left_out_and_said_once(caplog, monkeypa
     for name in ("forewarp", "forewarp.metrics", "forewarp.metrics.suite"):
         for key, value in (("disabled", False), ("propagate", True), ("level", logging.NOTSET)):
             monkeypatch.setattr(logging.getLogger(name), key, value)
-    suite = ImageSuite({"lpips_vgg": None})
     with caplog.at_level(logging.WARNING):
+        suite = ImageSuite({"lpips_vgg": None})
         for _ in range(3):
             scores = suite.score(target().rgb, target(depth=torch.zeros(34, 40)), torch.ones(34, 40))
     assert scores == {"psnr": image.PSNR_CAP, "ssim": pytest.approx(1)}

@@ -5,7 +5,7 @@ import torch
 from torch.autograd import gradcheck
 
 from forewarp.ops.composite import accumulate, dense_weights, render_weights
-from reference import composite
+from tests.support.reference import composite
 
 IDS = torch.tensor([0, 0, 0, 2, 2, 4])  # rays 1, 3 and 5 have no sample
 

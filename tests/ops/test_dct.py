@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from forewarp.ops.dct import dct_basis
-from reference import dct_difference
+from tests.support.reference import dct_difference
 
 
 def test_hand_worked():

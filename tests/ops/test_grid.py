@@ -4,7 +4,7 @@ import torch
 from torch.autograd import gradcheck
 
 from forewarp.ops import grid
-from reference import lattice_cells, trilinear_read
+from tests.support.reference import lattice_cells, trilinear_read
 
 SHAPE = (3, 4, 5)
 

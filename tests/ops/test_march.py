@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from forewarp.ops.march import march
-from reference import march_samples
+from tests.support.reference import march_samples
 
 
 def rays(origins, directions):

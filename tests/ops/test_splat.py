@@ -4,7 +4,7 @@ from torch.autograd import gradcheck
 
 from forewarp.ops import splat
 from forewarp.ops.splat import average_splat, with_copies
-from reference import lattice_cells, splat_sums
+from tests.support.reference import lattice_cells, splat_sums
 
 SHAPE = (3, 4, 5)
 VOXELS = torch.tensor(lattice_cells(SHAPE), dtype=torch.float64)

@@ -85,7 +85,7 @@ def test_returns_what_counts(threshold):
 def test_ends_where_a_ray_ends():
     index, raw = matter(60.0)
     scene = (*beams(), occupied_cells(index), index, raw)
-    whole, ended = (traced(*scene, threshold=-1.0, opaque=v) for v in (0.0, 1e-3))
+    whole, ended = (traced(*scene, threshold=-1.0, early_stop_eps=v) for v in (0.0, 1e-3))
     assert ended.samples == len(ended.weights) < 0.8 * whole.samples
     for name in ("opacity", "transmittance"):
         torch.testing.assert_close(getattr(ended, name), getattr(whole, name), atol=1e-3, rtol=0)
@@ -114,7 +114,9 @@ def test_nothing_to_see():
     origins, directions, jitter = beams()
     cells = occupied_cells(index)
     for rays, matters in ((slice(0, 0), cells), (slice(None), torch.zeros_like(cells))):
-        found = traced(origins[rays], directions[rays], jitter[rays], matters, index, raw, opaque=1e-4)
+        found = traced(
+            origins[rays], directions[rays], jitter[rays], matters, index, raw, early_stop_eps=1e-4
+        )
         assert found.samples == len(found.weights) == 0
         assert (found.transmittance == 1).all()
         assert (found.opacity == 0).all()

@@ -5,7 +5,7 @@ from torch.autograd import gradcheck
 
 from forewarp.ops.grid import neighbour_pairs
 from forewarp.ops.variation import patch_variation, total_variation
-from reference import patch_roughness, variation
+from tests.support.reference import patch_roughness, variation
 
 
 def test_hand_worked():

@@ -2,12 +2,13 @@ import pytest
 import yaml
 
 from forewarp.report.collect import Point, by_scene, collect, grouped, machine, read_run
-from runs_on_disk import write_run
+from tests.support.runs_on_disk import write_run
 
 
 def test_a_run_is_read_whole(tmp_path):
     result = read_run(write_run(tmp_path, "unet_16", 3, epe=0.125, against="grid_64"))
-    assert (result.scene, result.variant, result.against, result.seed) == ("ball", "unet_16", "grid_64", 3)
+    assert (result.scene, result.variant, result.seed) == ("ball", "unet_16", 3)
+    assert result.against(["base"]) == "grid_64"
     assert (result.minutes, result.about) == (1.0, "the unet_16")
     assert result.curve[1] == Point(20.0, 25.0, 20, 0.125)
     assert result.numbers == {
@@ -29,6 +30,15 @@ def test_abilities_are_not_mixed(tmp_path):
     assert read_run(write_run(tmp_path, seed=1)).ability == "all"
 
 
+def test_names_do_not_depend_on_spaces_within_an_override(tmp_path):
+    plain, spaced = "size=[[0,8000]]", "size=[[0, 8000]]"
+    for name in ("", spaced, f"rays=64 {plain}", f"data.box=null {spaced}"):
+        write_run(tmp_path, name, against=None)
+    names = [result.variant for result in collect(tmp_path)[0]]
+    assert sorted(names) == ["base", f"data.box=null {plain}", f"rays=64 {plain}", plain]
+    assert {result.against(names) for result in collect(tmp_path)[0]} == {"base", plain}
+
+
 def test_what_is_not_known_is_left_out(tmp_path):
     folder = write_run(tmp_path, epe=None, curve=None)
     assert "epe" not in read_run(folder).numbers
@@ -41,7 +51,7 @@ def test_a_run_without_a_variant_is_named_after_its_choices(tmp_path):
     del config["variant"], config["command"]
     (folder / "config.yaml").write_text(yaml.safe_dump(config))
     result = read_run(folder)
-    assert (result.variant, result.about, result.against) == ("forward-fast", "", "base")
+    assert (result.variant, result.about, result.against([])) == ("forward-fast", "", "base")
     assert result.command.startswith("forewarp-train # as ")
 
 
@@ -86,5 +96,5 @@ def test_a_config_that_is_no_config_of_ours_is_left_out(tmp_path):
     write_run(tmp_path, seed=2)
     results, without = collect(tmp_path)
     assert [result.seed for result in results] == [2]
-    assert "cannot be read (config.yaml: expected at most 1048576 bytes, but got 1048577)" in without[0]
+    assert "config.yaml: expected at most 1048576 bytes, but got 1048577)" in without[0]
     assert "cannot be read (" in without[1]

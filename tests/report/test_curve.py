@@ -5,7 +5,7 @@ import pytest
 
 from forewarp.report.collect import Point, collect, grouped
 from forewarp.report.curve import Published, draw_run, draw_scene, pareto_front, read_published, seconds_to
-from runs_on_disk import write_run
+from tests.support.runs_on_disk import write_run
 
 
 def curve(*pairs):

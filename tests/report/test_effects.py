@@ -4,9 +4,9 @@ import os
 
 import yaml
 
-from forewarp.report.effects import called, compared, plan_of, write_effects
 from forewarp.report.collect import collect
-from runs_on_disk import write_run
+from forewarp.report.effects import called, compared, plan_of, write_effects
+from tests.support.runs_on_disk import write_run
 
 SLOW, QUICK = ((10, 20.0), (20, 24.0), (40, 25.0)), ((5, 24.0), (10, 24.9), (20, 26.0))
 
@@ -21,7 +21,7 @@ def write_choice(root, choice, *, scene="ball", seed=0, calls_for=None, on=(), p
             name: {"choice": "x" if name in on else "none", "on": name in on, "because": f"{name}, 3 %"}
             for name in ("motion", "view")
         }
-        plan = {"typed": [], "words": [], "effects": effects, "seconds": 12.5}
+        plan = {"typed": [], "overrides": [], "effects": effects, "seconds": 12.5}
         (folder / "plan.yaml").write_text(yaml.safe_dump(plan))
     return folder
 

@@ -1,11 +1,11 @@
 from forewarp.report.price_list import write_price_list
-from runs_on_disk import write_run
+from tests.support.runs_on_disk import write_run
 
 
 def rows(text, first):
     """The cells of rows that begin with ``first``."""
-    lines = [line for line in text.splitlines() if line.startswith(f"| {first} |")]
-    return [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines]
+    cells = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines()]
+    return [row for row in cells if row[:1] == [first]]
 
 
 def test_changes_are_against_the_same_seed(tmp_path):
@@ -15,13 +15,17 @@ def test_changes_are_against_the_same_seed(tmp_path):
     write_run(runs, "grid_64", 0, psnr=29.0, steps=200, epe=0.1)
     write_run(runs, "grid_64", 1, psnr=27.5, steps=200, epe=0.1)
     write_run(runs, "unet_16", 0, psnr=30.5, steps=50, against="grid_64")
+    # Named by what was typed; what all of them share is no part of their names.
+    write_run(runs, "data.box=null", 2, psnr=20.0, against=None)
+    write_run(runs, "data.box=null preset.rays=64", 2, psnr=21.0, against=None)
+    write_run(runs, "data.box=null model=backward preset.rays=64", 2, psnr=21.5, against=None)
     write_run(runs, "alone", 5)
     write_run(runs, "failed", psnr=None)
     page, file = write_price_list(runs, tmp_path / "out")
     text = page.read_text()
     own, change = rows(text, "grid_64")
-    assert own[2:4] == ["2", "28.25 ± 1.06"]
-    assert change[2:] == [
+    assert own[1:3] == ["2", "28.25 ± 1.06"]
+    assert change[1:] == [
         "base",
         "2",
         "-0.75 ± 0.35",
@@ -33,14 +37,16 @@ def test_changes_are_against_the_same_seed(tmp_path):
         "×1.00 ± 0.00",
         "×2.00 ± 0.00",
     ]
-    assert rows(text, "unet_16")[0][2:7] == ["grid_64", "1", "+1.50", "+0.0000", ""]
+    assert rows(text, "unet_16")[0][1:6] == ["grid_64", "1", "+1.50", "+0.0000", ""]
+    assert rows(text, "preset.rays=64")[1][1:4] == ["base", "1", "+1.00"]
+    assert rows(text, "model=backward preset.rays=64")[0][1:4] == ["preset.rays=64", "1", "+0.50"]
     assert len(rows(text, "base")) == 1
-    assert rows(text, "alone")[0][3:5] == ["0", ""]  # nothing to compare it with
+    assert rows(text, "alone")[0][2:4] == ["0", ""]  # nothing to compare it with
     assert "Of all test views:" in text
     assert "* ball/failed-1.0-seed0: no metrics.json" in text
     lines = file.read_text().splitlines()
     assert lines[0].startswith("scene,variant,minutes,seed,views,PSNR (dB),SSIM,EPE,s/step,")
-    assert len(lines) == 7
+    assert len(lines) == 10
 
 
 def test_scenes_and_minutes_stand_apart(tmp_path):

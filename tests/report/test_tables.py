@@ -13,11 +13,15 @@ def test_markdown_rounds_aligns_and_escapes():
     assert TABLE.markdown().splitlines() == [
         "Of two:",
         "",
-        "| name | PSNR | steps | s |",
-        "|---|---:|---:|---:|",
-        "| a\\|b | +0.50 ± 0.25 | 10 | ×1.23 |",
-        "| c | -1.00 |  | ×2.00 |",
+        "| name   |         PSNR |   steps |     s |",
+        "|:-------|-------------:|--------:|------:|",
+        "| a\\|b   | +0.50 ± 0.25 |      10 | ×1.23 |",
+        "| c      |        -1.00 |         | ×2.00 |",
     ]
+
+
+def test_a_table_without_rows_has_its_head():
+    assert Table([Column("a")], []).markdown().splitlines() == ["| a   |", "|-----|"]
 
 
 def test_csv_keeps_all_digits_and_the_spread_apart():

@@ -40,7 +40,7 @@ def test_the_outermost_points_lie_on_the_faces():
     assert world[1].tolist() == [-1, 0, 3]  # the last axis runs fastest
     assert lattice.count == 60
     assert lattice.spacing == (1, 1, 1)
-    assert lattice.pitch == pytest.approx(1)
+    assert lattice.voxel_size == pytest.approx(1)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

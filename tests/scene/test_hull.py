@@ -3,7 +3,7 @@ import torch
 
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.hull import visual_hull
-from tiny_scene import RADIUS, ball_center, camera_at, photograph
+from tests.support.tiny_scene import RADIUS, ball_center, camera_at, photograph
 
 
 def views(count=6):

@@ -5,7 +5,7 @@ import torch
 
 from forewarp.scene.camera import Camera, look_at
 from forewarp.scene.paths import RandomPatches, focus_point, mean_up, orbit
-from tiny_scene import camera_at
+from tests.support.tiny_scene import camera_at
 
 Z = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 

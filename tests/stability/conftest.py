@@ -1,18 +1,28 @@
-"""Hard cases run wherever they can: on every device, in both implementations of the operators."""
+"""Fixtures that run hard cases on every device, in both implementations of the operators."""
 
 import importlib.util
+from datetime import timedelta
 
 import pytest
 import torch
+from hypothesis import HealthCheck, settings
 
 from forewarp.ops import backend
 
+FUZZ = settings(
+    max_examples=3000,
+    deadline=timedelta(seconds=10),
+    database=None,
+    suppress_health_check=list(HealthCheck),
+    print_blob=True,
+)
+settings.register_profile("fuzz", FUZZ)
 PLACES = ["cpu-reference", "cpu-numba", *(["cuda-reference"] if torch.cuda.is_available() else [])]
 
 
 @pytest.fixture(params=PLACES)
 def place(request, monkeypatch):
-    """The device; the operators' implementation is chosen along with it."""
+    """Return a device, and choose an implementation of the operators."""
     device, kind = request.param.split("-")
     if kind == "numba" and importlib.util.find_spec("numba") is None:
         pytest.skip("Numba is not installed")
@@ -22,5 +32,5 @@ def place(request, monkeypatch):
 
 @pytest.fixture(params=["cpu", *(["cuda"] if torch.cuda.is_available() else [])])
 def device(request):
-    """Every device there is."""
+    """Return each device there is."""
     return torch.device(request.param)

@@ -1,31 +1,177 @@
-"""Harmed files of every kind are read or refused, nothing else."""
+"""Harmed files of every kind are read or refused in one line, soon and in little memory.
 
+``pytest tests/stability/test_fuzzing.py --hypothesis-profile=fuzz`` tries many more.
+"""
+
+import resource
+import shutil
+from collections import Counter
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
 import pytest
+import torch
+from hydra.core.global_hydra import GlobalHydra
+from hypothesis import given, settings
+from omegaconf import OmegaConf
 
-from forewarp.cli.fuzz import INPUTS, fuzz, fuzz_here
-from forewarp.cli.stability import fuzz_table
+from forewarp.cli.entry import one_line
+from forewarp.data import dnerf, hypernerf, lego_complete, nhr, posed_video
+from forewarp.runs.build import build_run
+from forewarp.runs.config import saved_config
+from forewarp.scene.errors import SceneError
+from forewarp.scene.frame import Scene
+from forewarp.scene.view import Moment, View
+from forewarp.training.checkpoints import check_state, load_weights
+from tests.stability.harm import harmed
+from tests.support import dnerf_scene, nhr_scene, posed_scene, rig_scene
+from tests.support.configs import composed
 
 pytestmark = pytest.mark.stability
 
-
-def check(outcomes, count):
-    assert sum(o.inputs for o in outcomes) == count
-    assert [fault for o in outcomes for fault in o.faults][:3] == []
-    for outcome in outcomes:
-        # Neither harmless nor hopeless.
-        assert outcome.refused > 0.2 * outcome.inputs, outcome.name
-        assert outcome.read > 0.001 * outcome.inputs, outcome.name
+MEMORY = 1 << 30
+FUZZ = settings.get_profile("fuzz")  # of conftest.py
+QUICK = settings(FUZZ, max_examples=30, derandomize=True, deadline=60_000)  # other tests may share the core
 
 
-def test_some_harmed_files():
-    outcomes, grown = fuzz_here(350, seed=7)
-    check(outcomes, 350)
-    assert "350 inputs" in fuzz_table(outcomes, grown)
+def three_kinds(folder):
+    test = [s for i, a in enumerate(dnerf.ABILITIES) for s in dnerf_scene.shots(2, i, ability=a, depth=True)]
+    splits, truth = {"train": dnerf_scene.shots(3), "test": test}, dnerf_scene.truth()
+    lego_complete.write_scene(folder, splits, camera_angle_x=0.7, trajectories=truth)
 
 
-@pytest.mark.slow
-def test_many_harmed_files():
-    outcomes, grown = fuzz(INPUTS, workers=2)
-    check(outcomes, INPUTS)
-    assert grown < 2**30
-    print("\n" + fuzz_table(outcomes, grown))
+def two_phones(folder):
+    points = np.arange(12.0).reshape(4, 3)
+    rig_scene.write_rig(folder, rig_scene.rig(3), points=points, trajectories=rig_scene.truth())
+
+
+def dome(folder):
+    cameras = nhr_scene.dome(3, sizes=((24, 18), (18, 24)))
+    nhr_scene.write_dome(folder, cameras, 2, trajectories=nhr_scene.truth(2))
+
+
+def video(folder):
+    posed_scene.write_tiny(folder, times=[i / 9 for i in range(10)], channels=4)
+
+
+FORMATS = {
+    "dnerf": (dnerf_scene.write_tiny, dnerf.read_scene),
+    "lego_complete": (three_kinds, lego_complete.read_scene),
+    "hypernerf": (two_phones, hypernerf.read_scene),
+    "nhr": (dome, nhr.read_scene),
+    "video_with_poses": (video, posed_video.read_scene),
+}
+
+
+def check_whole(scene):
+    """All that a run would use is finite and fits together."""
+    assert isinstance(scene, Scene)
+    assert scene.train
+    assert scene.test
+    assert scene.canonical_time in scene.times
+    assert scene.box.diagonal < 1e16  # places within 1e9, at most 1e6 times as large
+    for frame in (*scene.train, *scene.val, *scene.test):
+        camera = frame.camera
+        pixels, rays = frame.load(), camera.rays(torch.arange(3))
+        assert (tuple(pixels.shape), pixels.dtype) == ((camera.height, camera.width, 4), torch.uint8)
+        assert torch.isfinite(rays.origins).all()
+        assert (rays.directions.norm(dim=-1) - 1).abs().max() < 1e-4
+        assert 0 <= camera.near < camera.far < np.inf
+        assert 0 <= frame.time <= 1
+        if frame.load_depth is not None:
+            depth = frame.load_depth()
+            assert tuple(depth.shape) == (camera.height, camera.width)
+            assert torch.isfinite(depth).all()
+    for points in (scene.still, scene.truth and scene.truth.points):
+        assert points is None or torch.isfinite(points).all()
+
+
+def of_run(root):
+    """A run's config and its checkpoint, each with what reads it."""
+    small = ("experiment=demo", "stage.coarse.num_voxels=[[0,64]]", "data.root=data", "logger=none")
+    config = OmegaConf.to_container(composed(*small, "trainer=cpu"), resolve=True)
+    GlobalHydra.instance().clear()
+    config, nothing = OmegaConf.create(config), OmegaConf.create({})
+    for name in ("config", "checkpoint"):
+        (root / name).mkdir()
+    (root / "config" / "config.yaml").write_text(OmegaConf.to_yaml(config))
+    dnerf_scene.write_tiny(root / "toy")
+    scene = dnerf.read_scene(root, "toy")
+    module = build_run(config).rebuilt("coarse", scene)
+    content = {"state_dict": module.state_dict(), "global_step": 7}
+    module.on_save_checkpoint(content)
+    file = root / "checkpoint" / "last.ckpt"
+    torch.save(content, file)
+
+    def render():
+        """Read, take and use it: a kernel that trusts wrong indices ends the process."""
+        check_state(file, module)
+        load_weights(module, file)
+        module.render(View(scene.test[0].camera, torch.arange(4)), Moment(0.5), torch.ones(3))
+
+    return {
+        "config": (lambda: saved_config(str(root / "config"), nothing), ValueError),
+        "checkpoint": (render, (ValueError, OSError)),
+    }
+
+
+@pytest.fixture(scope="module")
+def loaders(tmp_path_factory):
+    """By name: the folder of the files, what reads them, and how it refuses them."""
+    root = tmp_path_factory.mktemp("fuzzing")
+    found = {}
+    for name, (write, read) in FORMATS.items():
+        write(root / name)
+        found[name] = (lambda read=read, name=name: check_whole(read(root, name)), SceneError)
+    found |= of_run(root)
+    return {
+        name: SimpleNamespace(folder=root / name, read=read, refusal=refusal)
+        for name, (read, refusal) in found.items()
+    }
+
+
+@pytest.fixture
+def bounded():
+    """No more memory than so much beyond what is in use."""
+    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (used + MEMORY, before[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_AS, before)
+
+
+def put(changes):
+    """Write files, or take them away."""
+    for path, content in changes.items():
+        if path.is_dir():
+            shutil.rmtree(path)
+        if content is None:
+            path.unlink(missing_ok=True)
+        else:
+            path.write_bytes(content)
+
+
+@pytest.mark.parametrize("name", [*FORMATS, "config", "checkpoint"])
+def test_harmed_files_are_read_or_refused_in_one_line(loaders, bounded, name):
+    loader, outcomes = loaders[name], Counter()
+    files = {path: path.read_bytes() for path in sorted(loader.folder.rglob("*")) if path.is_file()}
+    loader.read()  # unharmed
+
+    @(FUZZ if settings.default is FUZZ else QUICK)
+    @given(harmed(files))
+    def run(changes):
+        said = None
+        try:
+            put(changes)
+            loader.read()
+        except loader.refusal as error:
+            said = one_line(error) or ""
+        finally:
+            put({path: files[path] for path in changes})
+        outcomes["read" if said is None else "refused"] += 1
+        assert said is None or (": expected " in said and len(said.splitlines()) == 1)
+
+    run()
+    print(f"{name}: {dict(outcomes)}")
+    assert min(outcomes["read"], outcomes["refused"]) > 0.02 * sum(outcomes.values())  # neither hopeless

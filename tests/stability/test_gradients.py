@@ -1,4 +1,4 @@
-"""Gradients against finite differences in float64, for every operator there is, at many random places."""
+"""Gradients of every operator equal finite differences in float64, at random inputs."""
 
 import ast
 import importlib
@@ -16,17 +16,21 @@ from forewarp.ops.dct import dct_basis
 from forewarp.ops.encode import positional_encoding, spherical_harmonics_1
 from forewarp.ops.grid import corner_weights, neighbour_pairs, trilinear, trilinear_reference
 from forewarp.ops.lens import distort
+from forewarp.ops.nodes import carry_nodes, node_maps, stiffness
+from forewarp.ops.project import Gaussians, Splats, Warp, moved, project, project_reference, rotations
+from forewarp.ops.rasterize import rasterize, rasterize_reference
 from forewarp.ops.samples import midpoints, union
 from forewarp.ops.splat import average_splat, scatter_reference, with_copies
 from forewarp.ops.variation import patch_variation, total_variation
-from hard_cases import index_with
+from tests.support.gaussians import crowd, pinhole
+from tests.support.hard_cases import index_with
 
 pytestmark = pytest.mark.stability
 
 MANY = settings(derandomize=True, deadline=None, database=None, max_examples=8)
 SEEDS = strategies.integers(0, 10_000)
 
-# What has no gradient, and why.
+# Operators without a gradient, and why.
 WITHOUT = {
     "check_shape": "a guard",
     "numba_installed": "a switch",
@@ -48,11 +52,20 @@ WITHOUT = {
     "occupied_cells_reference": "yes or no",
     "neighbour_pairs": "whole numbers",
     "undistort": "made once for the rays; says so",
+    "adam_rows": "an optimiser's step",
+    "compare": "gives its gradients itself: tests/ops/test_compare.py compares them with finite differences",
+    "compare_reference": "as compare",
+    "pull_nodes": "gives its gradients itself: tests/ops/test_nodes.py compares them with the reference",
+    "spline_basis": "of times, which are not learned",
+    "harmonics": "of directions, which have no gradient in project",
+    "sorted_tiles": "whole numbers",
+    "kept_for": "room in memory",
+    "arrays": "views of tensors",
 }
 
 
 def generic(seed, count, shape):
-    """Positions (count, 3) inside a lattice and off the kinks at whole coordinates, float64."""
+    """Draw float64 positions (count, 3) inside a lattice, away from whole coordinates, where slopes jump."""
     generator = torch.Generator().manual_seed(seed)
     cell = torch.stack([torch.randint(0, n - 1, (count,), generator=generator) for n in shape], -1)
     return cell + 0.1 + 0.8 * torch.rand(count, 3, generator=generator, dtype=torch.float64)
@@ -64,7 +77,7 @@ def draw(seed, *shape):
 
 
 def sparse(seed):
-    """A random shape, an index over it with absent voxels, and values (M, 2)."""
+    """Draw a shape, an index over it with absent voxels, and values (M, 2)."""
     generator = torch.Generator().manual_seed(seed)
     shape = tuple(torch.randint(2, 5, (3,), generator=generator).tolist())
     present = torch.rand(shape, generator=generator) < 0.7
@@ -153,11 +166,66 @@ CHECKS = {
 }
 
 
-@pytest.mark.parametrize("numba", [False, True])
-@pytest.mark.parametrize("operator", CHECKS)
+def check_projection(seed, see=project):
+    """Gradients of all that a splat is made of: particles, nodes' maps, shares of nodes."""
+    particles, warp, tints, fades = crowd(count=3, degree=0, seed=seed)
+
+    def numbers(*leaves):
+        moving = Warp(leaves[5], warp.links, leaves[6])
+        return see(Gaussians(*leaves[:5]), moving, pinhole(), tints, fades).numbers
+
+    leaves = [leaf.clone().requires_grad_() for leaf in (*particles, warp.maps, warp.weights)]
+    return gradcheck(numbers, leaves, atol=1e-6)
+
+
+def check_rasterizing(seed, draw=rasterize):
+    """Gradients of pictures by the numbers of splats."""
+    particles, warp, tints, fades = crowd(4, scale=-1.0, seed=seed)
+    splats = project(particles, warp, pinhole(), tints, fades)
+    inside = lambda numbers: draw(Splats(numbers, splats.reach), 3, 4)  # noqa: E731
+    return gradcheck(inside, splats.numbers.clone().requires_grad_(), atol=1e-6)
+
+
+def check_stiffness(seed):
+    """Gradients of the strain between nodes by their motion."""
+    places, edges = draw(seed, 4, 3), torch.tensor([[1, 2], [2, 3], [3, 0], [0, 1]])
+    motion = 0.3 * draw(seed + 1, 4, 6)
+    return gradcheck(
+        lambda m: stiffness(m, places, edges, torch.full((4, 2), 0.5).double()), motion.requires_grad_()
+    )
+
+
+def check_moved(seed):
+    """Gradients of where particles go by their means and the nodes' maps."""
+    particles, warp, *_ = crowd(count=3, seed=seed)
+    leaves = [leaf.clone().requires_grad_() for leaf in (particles.means, warp.maps)]
+    return gradcheck(lambda means, maps: moved(means, Warp(maps, warp.links, warp.weights)), leaves)
+
+
+CHECKS |= {
+    "project": check_projection,
+    "project_reference": lambda seed: check_projection(seed, project_reference),
+    "rasterize": check_rasterizing,
+    "rasterize_reference": lambda seed: check_rasterizing(seed, rasterize_reference),
+    "stiffness": check_stiffness,
+    "moved": check_moved,
+    "rotations": lambda seed: gradcheck(rotations, draw(seed, 3, 4).requires_grad_()),
+    "node_maps": lambda seed: gradcheck(
+        lambda m: node_maps(m, draw(seed, 3, 3)), draw(seed + 1, 3, 6).requires_grad_()
+    ),
+    "carry_nodes": lambda seed: gradcheck(
+        lambda s, t: carry_nodes(s, t, draw(seed, 4), draw(seed, 3, 3)),
+        (draw(seed + 1, 3, 4, 3).requires_grad_(), draw(seed + 2, 3, 4, 3).requires_grad_()),
+    ),
+}
+
+KERNELS = ("trilinear", "average_splat")
+
+
+@pytest.mark.parametrize(
+    ("operator", "numba"), [*((name, False) for name in CHECKS), *((name, True) for name in KERNELS)]
+)
 def test_gradients_equal_finite_differences(operator, numba, monkeypatch):
-    if numba and operator not in ("trilinear", "average_splat"):
-        pytest.skip("has no kernel")
     if numba:
         pytest.importorskip("numba")
     monkeypatch.setattr(backend, "numba_installed", lambda: numba)
@@ -173,7 +241,7 @@ def test_gradients_equal_finite_differences(operator, numba, monkeypatch):
 def test_every_operator_is_checked_or_has_no_gradient():
     found = set()
     for path in Path(ops.__path__[0]).glob("*.py"):
-        if path.stem.startswith(("kernels_", "__")):
+        if path.stem.startswith(("kernels_", "lanes", "__")):
             continue
         importlib.import_module(f"forewarp.ops.{path.stem}")
         tree = ast.parse(path.read_text())

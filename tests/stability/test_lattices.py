@@ -6,28 +6,30 @@ from functools import partial
 import pytest
 import torch
 
+from forewarp.fields.radiance import DirectRadiance
+from forewarp.losses import tv_density, tv_flow
 from forewarp.methods.voxel.effects.dense import densify, occupied_crop, sparsify
 from forewarp.methods.voxel.effects.inpaint import UNet3d
 from forewarp.methods.voxel.effects.upsample import LearnedUpsampler, TrilinearUpsampler
-from forewarp.fields.radiance import DirectRadiance
-from forewarp.losses import tv_density, tv_flow
+from forewarp.methods.voxel.structure import box_of_all_times, occupied, refresh, resample
 from forewarp.ops.grid import dilate, neighbour_pairs, trilinear
 from forewarp.scene.box import Box, Lattice
-from forewarp.methods.voxel.structure import box_of_all_times, occupied, refresh, resample
-from hard_cases import LATTICE, check_finite, grid, index_with
+from tests.support.hard_cases import LATTICE, check_finite, grid, index_with
 
 pytestmark = pytest.mark.stability
 
 
 def radiance(lattice=LATTICE, raw=5.0, device="cpu"):
     active = torch.ones(lattice.shape, dtype=torch.bool)
-    made = DirectRadiance(lattice, active, features=3, alpha_init=1e-2, unit=lattice.pitch, skip_alpha=1e-4)
+    made = DirectRadiance(
+        lattice, active, features=3, alpha_init=1e-2, density_scale=lattice.voxel_size, alpha_threshold=1e-4
+    )
     torch.nn.init.constant_(made.density, raw)
     return made.to(device)
 
 
 class Still(torch.nn.Module):
-    """A method without motion."""
+    """A voxel method without motion."""
 
     motion, moves = None, False
 
@@ -44,7 +46,7 @@ def test_one_voxel_of_matter_gives_a_box_with_room(device):
     field = radiance(raw=-20.0, device=device)
     field.density.data[31] = 9.0
     box = box_of_all_times(Still(field), [0.0], alpha=1e-2, pad=2.0)
-    assert min(box.size) == pytest.approx(4 * LATTICE.pitch)
+    assert min(box.size) == pytest.approx(4 * LATTICE.voxel_size)
 
 
 def test_an_empty_grid_does_not_vanish_for_good(device):
@@ -69,13 +71,13 @@ def test_occupancy_of_none_one_and_all(place, present):
 @pytest.mark.parametrize("thin", [1e-1, 1e-4, 1e-9, 1e-30])
 @pytest.mark.parametrize("axes", [1, 2])
 def test_a_flat_box_gets_the_voxels_asked_for_and_no_more(thin, axes):
-    """Cubic voxels of a sheet would be a thousand times as many."""
+    """Cubic voxels would need a thousand times as many for a flat box."""
     box = Box((0, 0, 0), (thin, thin if axes == 2 else 2.0, 3.0))
     for count in (1e3, 1e5, 2e6):
         lattice = Lattice.of_count(box, count)
         assert min(lattice.shape) >= 4
         assert 0.4 * count < lattice.count < 2.5 * count
-        assert all(s > 0 and math.isfinite(s) for s in (*lattice.spacing, lattice.pitch))
+        assert all(s > 0 and math.isfinite(s) for s in (*lattice.spacing, lattice.voxel_size))
 
 
 @pytest.mark.parametrize("factor", [1e-3, 1.0, 1e3])
@@ -83,11 +85,11 @@ def test_the_lattice_of_a_box_does_not_depend_on_the_unit(factor):
     box = Box((-1.1 * factor, 0, 0), (1.2 * factor, 2.0 * factor, 0.7 * factor))
     plain = Lattice.of_count(Box((-1.1, 0, 0), (1.2, 2.0, 0.7)), 9e4)
     assert Lattice.of_count(box, 9e4).shape == plain.shape
-    assert Lattice.of_count(box, 9e4).pitch == pytest.approx(factor * plain.pitch)
+    assert Lattice.of_count(box, 9e4).voxel_size == pytest.approx(factor * plain.voxel_size)
 
 
 def test_the_border_voxel_counts_whole(place):
-    """Zero padding would halve it."""
+    """Zero padding would halve the value."""
     index = torch.arange(60, dtype=torch.int32, device=place).reshape(LATTICE.shape)
     values = torch.ones(60, 1, device=place, requires_grad=True)
     points = torch.tensor([[0.0, 0, 0], [2, 3, 4], [2, 0, 3.999], [-0.3, 3.4, 9.0]], device=place)
@@ -98,7 +100,7 @@ def test_the_border_voxel_counts_whole(place):
 
 
 def test_a_place_that_is_no_number_reads_no_number(place):
-    """Nothing is masked silently: what reads it is not finite either."""
+    """A NaN position reads NaN; nothing is masked silently."""
     index = torch.arange(60, dtype=torch.int32, device=place).reshape(LATTICE.shape)
     points = torch.tensor([[math.nan, 1, 1], [1, 1, 1]], device=place)
     read = trilinear(torch.ones(60, 1, device=place), index, points, torch.zeros(1, device=place))
@@ -113,7 +115,7 @@ SIZES = [(1, 1, 1), (1, 1, 2), (2, 1, 1), (3, 5, 7), (5, 4, 9)]
     ("value", "precision"),
     [
         *((value, torch.float32) for value in ("constant", "zero", "huge", "random")),
-        # Each norm multiplies the slopes of what is constant by up to 316: half the digits do not bear that.
+        # No constant volumes: each norm multiplies their slopes by up to 316, too much for bfloat16.
         ("random", torch.bfloat16),
     ],
 )
@@ -130,11 +132,11 @@ def test_the_unet_on_any_volume(device, size, value, precision):
 
 
 def test_half_precision_reads_only_what_was_written(device):
-    """The library's gradient of the weights does not, of two voxels' depth: what lay in memory came in."""
+    """Torch's bfloat16 gradient of the weights reads unwritten memory for volumes two voxels deep."""
     net = UNet3d(channels=4, width=16, levels=3).to(device)
     for _ in range(20):
         junk = [torch.full((2**n,), math.nan, device=device) for n in range(4, 20) for _ in range(4)]
-        del junk  # what the allocator hands out next
+        del junk  # the allocator returns this memory next
         with torch.autocast(device.type, dtype=torch.bfloat16):
             out = net.features(torch.randn(1, 4, 3, 5, 7, device=device))
         check_finite(out, *(p for n, p in net.named_parameters() if "head" not in n))
@@ -174,4 +176,4 @@ def test_total_variation_on_axes_of_one_voxel(device, shape):
 def test_density_of_an_opacity_next_to_one_over_a_tiny_length():
     activation = radiance().activation
     for length in (1e-6, 1e-3, 1.0):
-        assert math.isfinite(activation.raw(1 - 1e-12, length * activation.unit))
+        assert math.isfinite(activation.raw(1 - 1e-12, length * activation.density_scale))

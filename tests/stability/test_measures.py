@@ -11,7 +11,7 @@ from forewarp.metrics.depth import depth_delta
 from forewarp.metrics.image import PSNR_CAP, ms_ssim, ms_ssim_legacy, psnr, ssim
 from forewarp.scene.camera import Camera, look_at
 from forewarp.scene.paths import RandomPatches, focus_point, mean_up, orbit
-from hard_cases import check_finite
+from tests.support.hard_cases import check_finite
 
 pytestmark = pytest.mark.stability
 

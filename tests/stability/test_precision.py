@@ -5,23 +5,23 @@ from functools import partial
 import pytest
 import torch
 
-from forewarp.methods.voxel.effects.inpaint import UNet3d
-from forewarp.methods.voxel.effects.upsample import LearnedUpsampler
-from forewarp.methods.voxel.effects.view import ViewNetwork
 from forewarp.fields.mlp import mlp
 from forewarp.fields.radiance import FeatureRadiance
 from forewarp.methods.voxel.backward_warp import Deformation
+from forewarp.methods.voxel.effects.inpaint import UNet3d
+from forewarp.methods.voxel.effects.upsample import LearnedUpsampler
+from forewarp.methods.voxel.effects.view_dependence import ViewNetwork
 from forewarp.renderer import Renderer
 from forewarp.scene.box import Lattice
 from forewarp.scene.view import Moment
-from tiny_scene import BOX, backward_model, built, camera_at, forward_model
+from tests.support.tiny_scene import BOX, backward_model, built, camera_at, forward_model
 
 pytestmark = pytest.mark.stability
 
 HALVES = [torch.bfloat16, torch.float16]
 NETWORKS = {
-    "radiance": partial(FeatureRadiance, alpha_init=1e-2, skip_alpha=0.0, width=16, grid_features=4),
-    "view": ViewNetwork,
+    "radiance": partial(FeatureRadiance, alpha_init=1e-2, alpha_threshold=0.0, width=16, grid_features=4),
+    "view_dependence": ViewNetwork,
 }
 MODELS = {
     "everything": forward_model(
@@ -36,7 +36,7 @@ MODELS = {
 def method_of(choice, device):
     torch.manual_seed(0)
     lattice = Lattice(BOX, (8, 7, 6))
-    made = built(MODELS[choice], lattice, unit=lattice.pitch)
+    made = built(MODELS[choice], lattice, density_scale=lattice.voxel_size)
     for parameter in made.parameters():  # nothing starts from zero, or half of it has no gradient
         parameter.data += 0.05 * torch.randn(parameter.shape)
     return made.to(device)
@@ -45,7 +45,9 @@ def method_of(choice, device):
 def picture(method, device):
     state = method.at(Moment(0.7))
     field = list(state.fields.values())[-1]
-    drawn = Renderer()(field, camera_at(0.1, 8).rays().to(device), torch.ones(3, device=device), method.view)
+    drawn = Renderer()(
+        field, camera_at(0.1, 8).rays().to(device), torch.ones(3, device=device), method.view_dependence
+    )
     return state, drawn
 
 

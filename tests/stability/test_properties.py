@@ -1,9 +1,10 @@
-"""What holds for all inputs, tried on many (hypothesis, always the same examples)."""
+"""Properties that hold for all inputs, tested by hypothesis on fixed examples."""
 
 import pytest
 import torch
 from hypothesis import HealthCheck, given, settings, strategies
 
+from forewarp.fields.radiance_grid import Activation, RadianceGrid
 from forewarp.methods.voxel.effects.dense import densify
 from forewarp.ops.composite import accumulate, render_weights
 from forewarp.ops.march import march, march_reference
@@ -11,8 +12,7 @@ from forewarp.ops.splat import average_splat
 from forewarp.renderer import Renderer
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.rays import Rays
-from forewarp.fields.radiance_grid import Activation, RadianceGrid
-from hard_cases import SHAPE, index_with, voxels
+from tests.support.hard_cases import SHAPE, index_with, voxels
 
 pytestmark = pytest.mark.stability
 
@@ -34,7 +34,7 @@ def random(seed, *shape, low=0.0, high=1.0, dtype=torch.float32):
 
 
 def as_dense(result, shape=SHAPE):
-    """Sums that arrived (X, Y, Z, C) and coverage (X, Y, Z), 0 where nothing did."""
+    """Return a splat's values (X, Y, Z, C) and coverage (X, Y, Z) densely, 0 where nothing arrived."""
     rows = result.index.long()
     values = torch.cat([result.values, result.values.new_zeros(1, result.values.shape[1])])
     coverage = torch.cat([result.coverage, result.coverage.new_zeros(1)])
@@ -102,18 +102,18 @@ def test_weights_and_opacity_lie_between_0_and_1_and_light_never_grows(device, s
     for ray in range(rays):  # what reaches each sample
         x, w = optical[ids == ray].double(), weights[ids == ray].double()
         expected = torch.exp(x - x.cumsum(0))
-        told = (x > 1e-20) & (w > 1e-36)  # below, float32 has no weight to tell it by
+        told = (x > 1e-20) & (w > 1e-36)  # below, float32 cannot represent the weight
         reaches = (w / -torch.expm1(-x))[told]
         assert (reaches.diff() <= 1e-6 * reaches[:-1]).all()
-        bright = expected[told] > 1e-30  # beyond an optical depth of 80 all is opaque alike
+        bright = expected[told] > 1e-30  # beyond an optical depth of 80 everything is opaque
         torch.testing.assert_close(reaches[bright], expected[told][bright], atol=0, rtol=1e-6)
 
 
-def field_of(seed, share=0.6, shape=(6, 7, 8), dtype=torch.float32, skip_alpha=0.0):
+def field_of(seed, share=0.6, shape=(6, 7, 8), dtype=torch.float32, alpha_threshold=0.0):
     lattice = Lattice(Box((-1, -1.2, -0.9), (1.0, 1.1, 1.3)), shape)
     index = index_with(random(seed, *shape) < share)
     values = random(seed + 1, int((index >= 0).sum()), 4, low=-3, high=6, dtype=dtype)
-    return RadianceGrid(lattice, index, values, Activation(-2.0, lattice.pitch), skip_alpha)
+    return RadianceGrid(lattice, index, values, Activation(-2.0, lattice.voxel_size), alpha_threshold)
 
 
 def rays_of(seed, count=40, dtype=torch.float32):
@@ -129,7 +129,7 @@ def drawn(field, view, **changes):
 @MANY
 @given(SEEDS, strategies.integers(1, 40))
 def test_rays_in_chunks_are_the_rays(place, seed, chunk):
-    """Pictures to 1e-6; gradients, sums over the rays in another order, to 1e-5 of the largest."""
+    """Pictures agree to 1e-6; gradients, summed in another order, to 1e-5 of the largest."""
     field, view = moved(field_of(seed), place), rays_of(seed).to(place)
     field.values.requires_grad_()
     whole = drawn_on(field, view)
@@ -141,7 +141,7 @@ def test_rays_in_chunks_are_the_rays(place, seed, chunk):
 
 
 def slopes(pictures, values, names=("rgb", "depth", "opacity")):
-    """The gradient of a mixture of what is drawn."""
+    """Return the gradient of the summed squares of the pictures."""
     return torch.autograd.grad(sum(getattr(p, n).square().sum() for p in pictures for n in names), values)[0]
 
 
@@ -156,16 +156,14 @@ def drawn_on(field, view):
 
 def moved(field, place):
     return RadianceGrid(
-        field.lattice, field.index.to(place), field.values.to(place), field.activation, field.skip_alpha
+        field.lattice, field.index.to(place), field.values.to(place), field.activation, field.alpha_threshold
     )
 
 
 @MANY
 @given(SEEDS)
 def test_the_order_of_the_rays_does_not_matter(place, seed):
-    """Samples are packed one ray behind the other: another packing is the same picture to 1e-6, of the same
-    gradient to 1e-5 of its largest.
-    """
+    """Samples are packed ray by ray; another order gives the same picture to 1e-6 and gradient to 1e-5."""
     field, view = moved(field_of(seed), place), rays_of(seed).to(place)
     field.values.requires_grad_()
     order = torch.randperm(len(view), generator=torch.Generator().manual_seed(seed)).to(place)
@@ -178,8 +176,9 @@ def test_the_order_of_the_rays_does_not_matter(place, seed):
 @MANY
 @given(SEEDS)
 def test_packed_samples_in_occupied_cells_equal_every_sample_of_the_dense_grid(place, seed):
-    """Empty space that is skipped is as empty where it is not: the same picture from the dense grid to 1e-4,
-    which is what absent voxels show where they are drawn, and the same gradient to 1e-3 of its largest.
+    """Skipping empty cells gives the dense grid's picture to 1e-4 and its gradient to 1e-3 of the largest.
+
+    The difference is the faint density that absent voxels have where they are drawn.
     """
     sparse = moved(field_of(seed, share=0.1), place)
     whole = type("Crop", (), {"low": (0, 0, 0), "high": tuple(n - 1 for n in sparse.lattice.shape)})
@@ -194,7 +193,7 @@ def test_packed_samples_in_occupied_cells_equal_every_sample_of_the_dense_grid(p
     assert first.samples <= second.samples
     torch.testing.assert_close(first.rgb, second.rgb, atol=1e-4, rtol=0)
     torch.testing.assert_close(first.opacity, second.opacity, atol=1e-4, rtol=0)
-    names = ("rgb", "opacity")  # the depth of a ray that meets next to nothing is where that is
+    names = ("rgb", "opacity")  # no depth: on nearly empty rays it depends on the faintest voxels
     check_slopes(slopes([first], sparse.values, names), slopes([second], dense.values, names)[here], 1e-3)
 
 

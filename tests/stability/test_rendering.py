@@ -1,4 +1,4 @@
-"""Rays and densities at their ends (cases 5 to 9, 12 to 14)."""
+"""Extreme rays and densities (cases 5 to 9, 12 to 14)."""
 
 import math
 
@@ -6,13 +6,13 @@ import pytest
 import torch
 
 from forewarp import losses
+from forewarp.fields.radiance_grid import Activation
 from forewarp.ops.composite import render_weights
 from forewarp.ops.march import march
 from forewarp.renderer import Renderer
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.camera import Camera, look_at
-from forewarp.fields.radiance_grid import Activation
-from hard_cases import LATTICE, check_finite, grid, index_with, rays, raw_of
+from tests.support.hard_cases import LATTICE, check_finite, grid, index_with, raw_of, rays
 
 pytestmark = pytest.mark.stability
 
@@ -84,7 +84,7 @@ def test_opacity_zero_and_one_exactly(device):
     assert weights.tolist() == [0, 0, 1, pytest.approx(0, abs=1e-30), 0]
     assert [round(t, 30) for t in transmittance.tolist()] == [1, 0, 1]
     (slope,) = torch.autograd.grad(weights.sum(), optical)
-    # At opacity 0 a sample's own weight grows as fast as it does, and nothing is divided at opacity 1.
+    # At opacity 0 a weight has slope 1; at opacity 1 nothing is divided by zero.
     assert slope.tolist() == [1, 1, 0, pytest.approx(0, abs=1e-30), 1]
 
 
@@ -114,7 +114,7 @@ def test_occupancies(place, occupancy):
 
 @pytest.mark.parametrize("raw", [-16.0, -14.0, -11.0])
 def test_depth_in_the_thinnest_fog_stays_on_the_ray(place, raw):
-    """1 - transmittance keeps no digit of an opacity of a millionth; the sum of weights keeps them all."""
+    """At an opacity of 1e-6, 1 - transmittance has no digits left; the sum of weights keeps them."""
     field = grid(raw, device=place)
     drawn = draw(field, rays([[0.0, 0.5, -5.0]], [[0.0, 0.0, 1.0]], device=place), color_threshold=0.0)
     exact = -torch.expm1(-field.activation.sigma(torch.tensor(raw, dtype=torch.float64)) * 4)
@@ -165,7 +165,7 @@ def test_entropy_at_both_ends(device, entropy, t):
 
 
 def test_one_ray_without_samples_among_many(place):
-    """An empty ray takes no part, and the loss stays attached to the others."""
+    """An empty ray does not change the others."""
     field = grid(2.0, device=place)
     both = draw(field, all_rays(place))
     alone = draw(field, all_rays(place)[:6])
@@ -174,7 +174,7 @@ def test_one_ray_without_samples_among_many(place):
 
 @pytest.mark.parametrize("far", [math.inf, math.nan])
 def test_an_endless_ray_is_refused(place, far):
-    """A ray that stands still in the box would never come to its end."""
+    """A ray of direction 0 would never leave the box."""
     one = torch.ones(1, 3, device=place)
     with pytest.raises(ValueError, match="0 <= near < far, but got"):
         march(one, 0 * one, 0.0, far, 0.5, torch.ones(2, 3, 4, dtype=torch.bool, device=place), one[:, 0] * 0)
@@ -183,7 +183,7 @@ def test_an_endless_ray_is_refused(place, far):
 @pytest.mark.parametrize("thin", [1e-2, 1e-6, 1e-12])
 def test_a_flat_box_is_rendered(place, thin):
     lattice = Lattice(Box((-1, -1, 0), (1, 1, thin)), (5, 5, 4))
-    field = grid(5.0, lattice=lattice, unit=lattice.pitch, device=place)
+    field = grid(5.0, lattice=lattice, density_scale=lattice.voxel_size, device=place)
     view = rays([[0.1, 0.2, -3.0], [-3.0, 0.1, thin / 2]], [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]], device=place)
     drawn = draw(field, view)
     check_finite((drawn.rgb, drawn.depth), field.values)

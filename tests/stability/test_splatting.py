@@ -1,16 +1,16 @@
-"""Forward warping where nothing arrives, almost nothing, or far too much (cases 1 to 4, 22 and 29)."""
+"""Forward warping where nothing, almost nothing or far too much arrives (cases 1 to 4, 22 and 29)."""
 
 import math
 
 import pytest
 import torch
 
-from forewarp.methods.voxel.effects.motion import Motion
+from forewarp.fields.radiance_grid import EMPTY
 from forewarp.fields.trajectory import TrajectoryField
+from forewarp.methods.voxel.effects.motion import Motion
 from forewarp.ops.splat import average_splat
 from forewarp.renderer import Renderer
-from forewarp.fields.radiance_grid import EMPTY
-from hard_cases import LATTICE, SHAPE, check_finite, grid, rays, voxels
+from tests.support.hard_cases import LATTICE, SHAPE, check_finite, grid, rays, voxels
 
 pytestmark = pytest.mark.stability
 
@@ -92,7 +92,7 @@ def test_everything_leaves_the_box(place):
 
 
 def test_a_hole_is_not_fog(place):
-    """Raw density 0 has 1 % a voxel, 55 % over 80: a hole must not fade to it."""
+    """Raw density 0 is 1 % opaque per voxel, 55 % over 80 voxels: a hole must not fade to it."""
     canonical = grid(6.0, device=place)
     flow = torch.zeros(60, 3, device=place)
     flow[:, 2] = (1 - 1e-6) * LATTICE.spacing[2]

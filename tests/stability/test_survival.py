@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from forewarp.synth.scenes import synthesize
-from zygote import Zygote
+from tests.support.zygote import Zygote
 
 pytestmark = pytest.mark.stability
 KILLS = 24
@@ -28,7 +28,7 @@ SMALL = [
         "trainer=cpu",
         "threads=1",
     ),
-    *("stage.coarse.voxels=[[0,800],[0.5,1500]]", "stage.fine.voxels=[[0,1500],[0.5,2500]]"),
+    *("stage.coarse.num_voxels=[[0,800],[0.5,1500]]", "stage.fine.num_voxels=[[0,1500],[0.5,2500]]"),
     *(
         "stage.coarse.share=0.5",
         "stage.fine.share=0.5",
@@ -49,7 +49,7 @@ SMALL = [
 
 @pytest.fixture(scope="module")
 def scenes(tmp_path_factory):
-    """A folder with the scene ``vehicle``, 16 x 16 pixels."""
+    """Write the scene ``vehicle``, 16 x 16 pixels; return the folder above it."""
     root = tmp_path_factory.mktemp("scenes")
     synthesize(root / "vehicle", size=16, frames=8, test_views=(1, 1, 1), val_views=1, samples_per_pixel=1)
     return root
@@ -63,7 +63,7 @@ def zygote():
 
 @pytest.fixture(scope="module")
 def begin(zygote, scenes, tmp_path_factory):
-    """``begin(folder, *more, **limits)`` runs the command to its end: exit status and what it said."""
+    """``begin(folder, *more, **limits)`` runs the command to its end; returns exit status and output."""
     log = tmp_path_factory.mktemp("logs") / "log.txt"
 
     def call(folder, *more, **limits):
@@ -77,16 +77,14 @@ def begin(zygote, scenes, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def whole(begin, tmp_path_factory):
-    """The undisturbed run, and the seconds of a second one, whose kernels are warm."""
-    root = tmp_path_factory.mktemp("whole")
-    assert begin(root / "first")[0] == 0, begin.log.read_text()
-    since = time.perf_counter()
-    assert begin(root / "second")[0] == 0
-    return root / "first", time.perf_counter() - since
+    """Return the folder of an undisturbed run."""
+    folder = tmp_path_factory.mktemp("whole") / "run"
+    assert begin(folder)[0] == 0, begin.log.read_text()
+    return folder
 
 
 def end(folder):
-    """All that a run ends with and that no clock has touched."""
+    """Read all results of a run that do not depend on the clock."""
     left = {}
     for stage in ("coarse", "fine"):
         content = torch.load(folder / stage / "last.ckpt", weights_only=True)
@@ -116,32 +114,35 @@ def equal(a, b):
 
 
 def differences(folder, whole):
-    ours, theirs = end(folder), end(whole[0])
+    ours, theirs = end(folder), end(whole)
     assert ours.keys() == theirs.keys()
     return [name for name in theirs if not equal(ours[name], theirs[name])]
 
 
 def goes_on(begin, folder, whole):
-    """Continue a run to its end, which must be that of the undisturbed one."""
+    """Continue a run to its end; the result must equal the undisturbed run's."""
     status, said = begin(folder)
     assert status == 0, said
     assert differences(folder, whole) == []
 
 
-def test_two_undisturbed_runs_are_alike(whole):
-    assert differences(whole[0].parent / "second", whole) == []
+@pytest.mark.slow
+def test_two_undisturbed_runs_are_alike(begin, whole, tmp_path):
+    goes_on(begin, tmp_path / "run", whole)
 
 
-@pytest.mark.parametrize("moment", ["before", "half", "after"])
+@pytest.mark.parametrize(
+    "moment", ["half", *(pytest.param(moment, marks=pytest.mark.slow) for moment in ("before", "after"))]
+)
 def test_killed_while_a_checkpoint_takes_its_place(begin, whole, tmp_path, moment):
     # The first two files are config.yaml and data.json, the third and the ninth are checkpoints.
     for number in (3, 9):
         assert begin(tmp_path / "run", die=[number, moment])[0] == -signal.SIGKILL
     goes_on(begin, tmp_path / "run", whole)
-    assert not list((tmp_path / "run").rglob("last.ckpt.part"))
+    assert not list((tmp_path / "run").rglob("*.part*"))
 
 
-# Which file a run dies at, its number among those of that name and the moment; and where that leaves it.
+# (count, moment, file): die at the count-th write of that file; then the phase that the run is left in.
 PHASES = {
     "checkpoint writing": ((1, "half", "coarse/last.ckpt"), "before coarse"),
     "coarse": ((2, "after", "coarse/last.ckpt"), "coarse"),
@@ -155,21 +156,23 @@ PHASES = {
 }
 
 
+@pytest.mark.slow
 def test_killed_in_every_phase(begin, whole, tmp_path):
-    """One run dies in one phase after the other."""
+    """One run is killed in one phase after another."""
     for phase, (die, left) in PHASES.items():
         assert begin(tmp_path / "run", die=die)[0] == -signal.SIGKILL, phase
         assert where(tmp_path / "run") == left, phase
     goes_on(begin, tmp_path / "run", whole)
 
 
+@pytest.mark.slow
 def test_killed_with_an_inpainter_and_a_logger(begin, tmp_path):
     more = ["model/inpainter=unet3d", "logger=tensorboard"]
     assert begin(tmp_path / "whole", *more)[0] == 0, begin.log.read_text()
     for die in ((2, "after", "coarse/last.ckpt"), (2, "half", "fine/last.ckpt")):
         assert begin(tmp_path / "run", *more, die=die)[0] == -signal.SIGKILL
     assert begin(tmp_path / "run", *more)[0] == 0, begin.log.read_text()
-    assert differences(tmp_path / "run", [tmp_path / "whole"]) == []
+    assert differences(tmp_path / "run", tmp_path / "whole") == []
     names = end(tmp_path / "run")
     assert any("inpainter" in name[2] for name in names if name[1:2] == ("weights",))
     assert list((tmp_path / "run" / "fine").rglob("events.out.*"))
@@ -180,10 +183,13 @@ def test_killed_with_an_inpainter_and_a_logger(begin, tmp_path):
 def test_killed_at_random_moments(zygote, begin, scenes, whole, tmp_path, seed):
     draw, kills, run, deaths = random.Random(seed), 0, 0, []
     arguments = [*SMALL, f"data.root={scenes}"]
+    since = time.perf_counter()
+    assert begin(tmp_path / "timed")[0] == 0
+    seconds = time.perf_counter() - since
     while kills < KILLS // 4:
         folder = tmp_path / str(run)
         pid = zygote.start([*arguments, f"run={folder}"], begin.log)
-        time.sleep(draw.uniform(0.1, 0.9) * whole[1])
+        time.sleep(draw.uniform(0.1, 0.9) * seconds)
         with contextlib.suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
         if zygote.status() == 0:
@@ -191,13 +197,13 @@ def test_killed_at_random_moments(zygote, begin, scenes, whole, tmp_path, seed):
             run += 1
         else:
             deaths.append(where(folder))
-            kills += deaths[-1] != "before coarse"  # where there is nothing yet to be lost
+            kills += deaths[-1] != "before coarse"  # earlier kills lose nothing
     goes_on(begin, tmp_path / str(run), whole)
     print(f"\nseed {seed}: killed in {', '.join(deaths)}")
 
 
 def where(folder):
-    """The phase that a killed run had come to."""
+    """Return the phase that a killed run had reached."""
     done = [stage for stage in ("coarse", "fine") if (folder / stage / "done.json").is_file()]
     if "fine" in done:
         return "evaluation"
@@ -207,8 +213,8 @@ def where(folder):
 
 @pytest.mark.slow
 def test_killed_at_every_kind_of_file(begin, whole, tmp_path):
-    """From the last checkpoint of a stage on: handover, notes, pictures, numbers."""
-    shutil.copytree(whole[0], tmp_path / "run")
+    """Kill while files after a stage's last checkpoint are written: handover, notes, pictures, numbers."""
+    shutil.copytree(whole, tmp_path / "run")
     for stage in ("coarse", "fine"):
         for name in ("handover.pt", "handover.json", "done.json"):
             (tmp_path / "run" / stage / name).unlink()
@@ -228,8 +234,9 @@ HARM = {"empty": lambda c: b"", "half": lambda c: c[: len(c) // 2], "nonsense": 
 
 
 @pytest.mark.parametrize("harm", HARM)
+@pytest.mark.slow
 def test_no_harmed_note_is_taken_for_one(begin, whole, tmp_path, harm):
-    shutil.copytree(whole[0], tmp_path / "run")
+    shutil.copytree(whole, tmp_path / "run")
     notes = ("coarse/handover.json", "fine/handover.pt", "fine/done.json")
     for name in (*notes, "metrics.json", "per_image.json", "data.json"):
         path = tmp_path / "run" / name
@@ -238,7 +245,7 @@ def test_no_harmed_note_is_taken_for_one(begin, whole, tmp_path, harm):
 
 
 def refused(status, said, *words):
-    """Whether a command ended with one line of error that holds these words."""
+    """Assert that a command ended with one line of error that holds these words."""
     lines = [line for line in said.splitlines() if "error:" in line]
     assert status not in (0, 1), said
     assert "Traceback" not in said
@@ -246,9 +253,10 @@ def refused(status, said, *words):
     assert all(word in lines[0] for word in words), lines[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("harm", HARM)
 def test_a_harmed_checkpoint_is_refused_by_name(begin, whole, tmp_path, harm):
-    shutil.copytree(whole[0], tmp_path / "run")
+    shutil.copytree(whole, tmp_path / "run")
     (tmp_path / "run" / "fine" / "done.json").unlink()
     path = tmp_path / "run" / "fine" / "last.ckpt"
     path.write_bytes(HARM[harm](path.read_bytes()))
@@ -261,7 +269,7 @@ def test_a_harmed_checkpoint_is_refused_by_name(begin, whole, tmp_path, harm):
 
 @pytest.fixture
 def small_disk(tmp_path):
-    """A file system of 600 KB."""
+    """Mount a file system of 600 KB."""
     place = tmp_path / "disk"
     place.mkdir()
     made = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=600k", "tmpfs", place], capture_output=True)
@@ -275,8 +283,9 @@ def step_of(path):
     return torch.load(path, weights_only=True)["global_step"]
 
 
+@pytest.mark.slow
 def test_a_full_disk_ends_in_one_line_and_the_run_goes_on_elsewhere(begin, whole, small_disk, tmp_path):
-    size = (whole[0] / "coarse" / "last.ckpt").stat().st_size
+    size = (whole / "coarse" / "last.ckpt").stat().st_size
     (small_disk / "ballast").write_bytes(b"x" * (600 * 1024 - 24 * 1024 - int(1.6 * size)))
     refused(*begin(small_disk / "run"), "last.ckpt: expected room to write, but got No space left on device")
     assert step_of(small_disk / "run" / "coarse" / "last.ckpt") > 0
@@ -284,19 +293,21 @@ def test_a_full_disk_ends_in_one_line_and_the_run_goes_on_elsewhere(begin, whole
     goes_on(begin, tmp_path / "run", whole)
 
 
+@pytest.mark.slow
 def test_a_limit_on_files_is_a_full_disk(begin, whole, tmp_path):
-    size = (whole[0] / "coarse" / "last.ckpt").stat().st_size
+    size = (whole / "coarse" / "last.ckpt").stat().st_size
     refused(
         *begin(tmp_path / "run", file=size // 2), "last.ckpt: expected room to write, but got File too large"
     )
-    assert list((tmp_path / "run" / "coarse").glob("last*")) == []
+    assert list((tmp_path / "run" / "coarse").glob("*last*")) == []
 
 
+@pytest.mark.slow
 def test_a_place_that_cannot_be_written(begin, whole, tmp_path):
-    shutil.copytree(whole[0], tmp_path / "run")
+    shutil.copytree(whole, tmp_path / "run")
     (tmp_path / "run" / "fine" / "done.json").unlink()
     before = (tmp_path / "run" / "fine" / "last.ckpt").read_bytes()
-    (tmp_path / "run" / "fine" / "last.ckpt.part").mkdir()
+    (tmp_path / "run" / "fine" / ".last.ckpt.part.ckpt").mkdir()  # where it would be written first
     refused(
         *begin(tmp_path / "run"), "fine/last.ckpt: expected a usable file or folder, but got Is a directory"
     )
@@ -305,9 +316,10 @@ def test_a_place_that_cannot_be_written(begin, whole, tmp_path):
     refused(*begin(tmp_path / "file" / "run"), "file/run", "Not a directory")
 
 
+@pytest.mark.slow
 def test_a_read_only_file_system(begin, whole, tmp_path):
     place = tmp_path / "disk"
-    shutil.copytree(whole[0], place / "run")
+    shutil.copytree(whole, place / "run")
     (place / "run" / "fine" / "done.json").unlink()
     for options in (["--bind"], ["-o", "remount,bind,ro"]):
         made = subprocess.run(["mount", *options, place, place], capture_output=True)
@@ -319,6 +331,7 @@ def test_a_read_only_file_system(begin, whole, tmp_path):
         subprocess.run(["umount", place], check=True)
 
 
+@pytest.mark.slow
 def test_starved_halfway_a_run_keeps_its_checkpoint_and_goes_on(begin, tmp_path):
     run, more, die = (
         tmp_path / "run",
@@ -334,11 +347,13 @@ def test_starved_halfway_a_run_keeps_its_checkpoint_and_goes_on(begin, tmp_path)
     assert step_of(last) > step
 
 
+@pytest.mark.slow
 def test_too_little_memory_ends_in_one_line(begin, whole, tmp_path):
     status, said = begin(tmp_path / "run", "data.rays=4000000", memory=400 * 2**20)
     refused(status, said, "memory: expected room for", "lower data.rays")
 
 
+@pytest.mark.slow
 def test_an_interruption_keeps_the_last_checkpoint(zygote, begin, scenes, whole, tmp_path):
     folder, log = tmp_path / "run", tmp_path / "log.txt"
     pid = zygote.start([*SMALL, f"data.root={scenes}", f"run={folder}"], log)
@@ -353,6 +368,7 @@ def test_an_interruption_keeps_the_last_checkpoint(zygote, begin, scenes, whole,
     goes_on(begin, folder, whole)
 
 
+@pytest.mark.slow
 def test_two_in_one_folder_refuse_each_other(zygote, begin, scenes, whole, tmp_path):
     folder = tmp_path / "run"
     call = [sys.executable, "-c", HOLD, folder]
@@ -369,8 +385,8 @@ def test_two_in_one_folder_refuse_each_other(zygote, begin, scenes, whole, tmp_p
 HOLD = """
 import sys
 from pathlib import Path
-from forewarp.cli.claims import alone
-with alone(Path(sys.argv[1])):
+from forewarp.runs.lock import locked
+with locked(Path(sys.argv[1])):
     print("held", flush=True)
     sys.stdin.read()
 """

@@ -7,8 +7,8 @@ from forewarp.fields.trajectory import TrajectoryField
 from forewarp.fields.voxel_grid import VoxelGrid
 from forewarp.methods.voxel.backward_warp import Deformation
 from forewarp.ops.dct import dct_basis
-from forewarp.training.curriculum import Curriculum
-from hard_cases import LATTICE, check_finite, voxels
+from forewarp.training.schedule import Curriculum
+from tests.support.hard_cases import LATTICE, check_finite, voxels
 
 pytestmark = pytest.mark.stability
 
@@ -36,7 +36,7 @@ def test_at_and_beside_the_canonical_time(place, time):
     check_finite(paths, *moving.network.parameters())
     assert torch.equal(paths[:, 0], points)
     reach = float((paths.detach()[:, 1] - points).norm(dim=-1).max())
-    assert reach <= 100 * time**0.5 + 1e-6 * LATTICE.box.diagonal  # it begins at nothing
+    assert reach <= 100 * time**0.5 + 1e-6 * LATTICE.box.diagonal  # no jump at the canonical time
 
 
 @pytest.mark.parametrize("time", [-1e-3, 1.001, float("nan"), float("inf")])

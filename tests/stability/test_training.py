@@ -1,4 +1,4 @@
-"""Training under hostile conditions: rates far too high, odd scenes, other units (cases 27 to 30)."""
+"""Training under bad conditions: learning rates far too high, odd scenes, other units (cases 27 to 30)."""
 
 from dataclasses import replace
 from functools import partial
@@ -8,19 +8,19 @@ import pytest
 import torch
 
 from forewarp.data.module import SceneDataModule
+from forewarp.fields.trajectory import TrajectoryField
 from forewarp.methods.voxel.effects.background import StaticBackground
 from forewarp.methods.voxel.effects.inpaint import UNet3d
-from forewarp.fields.trajectory import TrajectoryField
 from forewarp.methods.voxel.method import VoxelMethod
 from forewarp.scene.box import Box
-from hard_cases import check_finite
-from tiny_scene import RATES, ball_scene, forward_model, make_run, stage
+from tests.support.hard_cases import check_finite
+from tests.support.tiny_scene import RATES, ball_scene, forward_model, make_run, stage
 
 pytestmark = pytest.mark.stability
 
 
 def in_other_units(scene, factor):
-    """The same scene with every length multiplied."""
+    """Multiply every length of a scene."""
 
     def grown(frame):
         pose = frame.camera.camera_to_world.clone()
@@ -36,13 +36,13 @@ def in_other_units(scene, factor):
 
 TERMS = (
     *("photo", "point_color", "background_entropy", "flow_l1", "tv_density", "tv_flow", "tv_depth"),
-    *("inpaint_diff", "still_points", "moving_opacity"),
+    *("inpaint_diff", "static_points", "moving_opacity"),
 )
 
 
 ALL = {
     "inpainter": partial(UNet3d, levels=2),
-    "background": partial(StaticBackground, features=3, alpha_init=1e-2, skip_alpha=1e-4),
+    "background": partial(StaticBackground, features=3, alpha_init=1e-2, alpha_threshold=1e-4),
 }
 
 
@@ -60,7 +60,7 @@ def fit(folder, scene, iterations, weights=None, **changes):
     """A fitted module, the losses of its steps, and the mean PSNR of its test images."""
     data = SceneDataModule(lambda: scene, rays=changes.pop("rays", 128))
     model = changes.pop("model", None) or forward_model()
-    fitting = stage(iterations=iterations, weights=weights, **({"voxels": [[0, 12**3]]} | changes))
+    fitting = stage(iterations=iterations, weights=weights, **({"num_voxels": [[0, 12**3]]} | changes))
     diary = Diary()
     module = make_run(folder, [fitting], data=data, model=model, callbacks=[diary]).fit()
     scores = []
@@ -75,13 +75,13 @@ def all_finite(module):
     return all(p.isfinite().all() for p in module.parameters())
 
 
-@pytest.mark.parametrize("factor", [2.0**-10, 1e-3, 1e3, 2.0**20])
+@pytest.mark.parametrize("factor", [1e-3, 2.0**20])
 def test_no_term_of_the_loss_depends_on_the_unit_of_length(tmp_path, factor):
-    """The first steps, all terms on, are the same but for rounding."""
+    """With all terms on, the first steps are equal except for rounding."""
     weights = dict.fromkeys(TERMS, 0.1)
     assert set(TERMS) == set(VoxelMethod.terms)
     options = {"iterations": 4, "weights": weights, "start": "hull", "patches": 2}
-    options |= {"model": forward_model(**ALL), "background_voxels": [[0, 12**3]]}
+    options |= {"model": forward_model(**ALL), "background_num_voxels": [[0, 12**3]]}
     scene = replace(ball_scene(frames=6, size=16), still=torch.tensor([[0.9, 0.1, 0.2], [-0.8, 0.3, -0.2]]))
     _, plain, _ = fit(tmp_path / "a", scene, **options)
     _, other, _ = fit(tmp_path / "b", in_other_units(scene, factor), **options)
@@ -107,14 +107,14 @@ def test_a_scene_in_other_units_trains_to_the_same_psnr(tmp_path, factor):
     assert first > 20
     assert abs(first - second) < 0.5  # rounding alone makes two runs differ by as much
     reach = [
-        (m.method.trajectories(torch.zeros(1, 3), torch.ones(1)).norm() / m.method.unit).item()
+        (m.method.trajectories(torch.zeros(1, 3), torch.ones(1)).norm() / m.method.half_extent).item()
         for m in (small, large)
     ]
     assert reach[0] == pytest.approx(reach[1], rel=0.5)
 
 
 def paths_of(factor):
-    """Of the same random network over the box of the D-NeRF scenes in another unit."""
+    """Return trajectories of one random network over the D-NeRF box in another unit of length."""
     torch.manual_seed(0)
     box = Box((-1.5 * factor,) * 3, (1.5 * factor,) * 3)
     field = TrajectoryField(box, bases=3, frames=8, canonical_time=0.0, nodes=8, width=16, layers=2)
@@ -139,7 +139,7 @@ def test_few_and_equal_times_train(tmp_path, times):
 
 @pytest.mark.parametrize("color", [255, 0])
 def test_images_of_one_colour_train(tmp_path, color):
-    """White on white, and black: no matter is called for."""
+    """White on white, and black: nothing needs to be there."""
     scene = ball_scene(frames=4, size=16)
 
     def plain(frame):
@@ -153,7 +153,7 @@ def test_images_of_one_colour_train(tmp_path, color):
 
 
 def test_images_without_matter_train(tmp_path):
-    """Alpha 0 everywhere: the hull is empty, the box is used, all fades."""
+    """Alpha is 0 everywhere: the hull is empty, so the box is used, and everything fades."""
     scene = ball_scene(frames=4, size=16)
     nothing = torch.zeros(16, 16, 4, dtype=torch.uint8)
     scene = replace(scene, train=tuple(replace(f, load=lambda: nothing) for f in scene.train))
@@ -170,10 +170,10 @@ def test_a_camera_inside_the_box_trains(tmp_path):
 
 @pytest.mark.parametrize("boost", [10.0, 300.0])
 def test_rates_far_too_high_stay_finite(tmp_path, boost):
-    """Density walks far, voxels fly out of the box: softplus is linear, the splat drops what is gone."""
+    """Density grows far and voxels leave the box: softplus is linear, the splat drops what is outside."""
     rates = {kind: boost * rate for kind, rate in RATES.items()}
     scene = ball_scene(frames=6, size=16)
-    module, losses, _ = fit(tmp_path, scene, 40, rates=rates, start="hull", refresh_every=10)
+    module, losses, _ = fit(tmp_path, scene, 40, lr=rates, start="hull", refresh_every=10)
     assert all_finite(module)
     assert all(loss < 1e4 for loss in losses)
 
@@ -190,7 +190,7 @@ def test_a_flat_scene_trains(tmp_path, thin):
 @pytest.mark.slow
 def test_a_hostile_start_at_ten_times_the_rates_ends_finite(tmp_path):
     pytest.importorskip("trimesh")
-    from forewarp.cli.endurance import endure
+    from tests.stability.endurance import endure
 
     (done,) = endure(tmp_path / "trials.jsonl", seconds=600, seeds=1, steps=60, rates=[10.0])
     assert done["wrong"] is None

@@ -1,5 +1,3 @@
-import filecmp
-
 import numpy as np
 import pytest
 import torch
@@ -8,14 +6,13 @@ pytest.importorskip("trimesh")
 pytest.importorskip("embreex")
 
 from forewarp.data.nhr import read_scene
-from forewarp.scene.errors import SceneError
 from forewarp.synth import dome
 from forewarp.synth.cameras import centers_of, stream
 from forewarp.synth.dome import dome_cameras, synthesize
 from forewarp.synth.motions import MOTIONS
 from forewarp.synth.points import surface_points
 from forewarp.synth.world import World
-from lit_points import color_errors, lit_points
+from tests.support.lit_points import color_errors, lit_points
 
 SMALL = {"size": 120, "frames": 2, "points": 300, "samples_per_pixel": 2}
 
@@ -74,26 +71,3 @@ def test_clouds_lie_on_what_moves_with_the_frame(folder):
         assert (cloud[:, :3] >= placed.min(0) - 1e-5).all()
         assert (cloud[:, :3] <= placed.max(0) + 1e-5).all()
     assert not np.array_equal(first, last)
-
-
-def test_equal_arguments_give_equal_bytes(folder, tmp_path):
-    again = synthesize(tmp_path / "again", **SMALL)
-    names = sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file())
-    assert len(names) == 2 * (2 * 20 + 1) + 3
-    assert filecmp.cmpfiles(folder, again, names, shallow=False) == (names, [], [])
-
-
-@pytest.mark.parametrize(
-    ("change", "text"),
-    [
-        ({"size": 100}, "size: expected a multiple of 24 of at least 24, but got 100; set size"),
-        ({"frames": 1}, "frames: expected a whole number of at least 2"),
-        ({"points": 0}, "points: expected a whole number of at least 1"),
-        ({"motion": 3}, "motion: expected one of"),
-    ],
-)
-def test_bad_arguments_get_one_line(tmp_path, change, text):
-    with pytest.raises(SceneError, match=text) as caught:
-        synthesize(tmp_path / "scene", **{**SMALL, **change})
-    assert "\n" not in str(caught.value)
-    assert not (tmp_path / "scene").exists()

@@ -5,10 +5,10 @@ import torch
 pytest.importorskip("trimesh")
 pytest.importorskip("embreex")
 
+from forewarp.synth.cameras import orbit_camera, random_cameras
 from forewarp.synth.motions import MOTIONS
 from forewarp.synth.points import surface_points, trajectories
 from forewarp.synth.raycast import render
-from forewarp.synth.cameras import orbit_camera, random_cameras
 from forewarp.synth.world import World
 
 TIMES = np.linspace(0, 1, 41)

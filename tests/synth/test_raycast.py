@@ -7,9 +7,9 @@ import pytest
 pytest.importorskip("trimesh")
 pytest.importorskip("embreex")
 
+from forewarp.synth.cameras import orbit_camera
 from forewarp.synth.motions import GROUND, joints
 from forewarp.synth.raycast import LIGHT_AT, Posed, camera_rays, render
-from forewarp.synth.cameras import orbit_camera
 from forewarp.synth.world import World
 
 

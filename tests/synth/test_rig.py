@@ -1,5 +1,3 @@
-import filecmp
-
 import numpy as np
 import pytest
 import torch
@@ -8,14 +6,13 @@ pytest.importorskip("trimesh")
 pytest.importorskip("embreex")
 
 from forewarp.data.hypernerf import read_scene
-from forewarp.scene.errors import SceneError
 from forewarp.synth import rig
 from forewarp.synth.cameras import centers_of, stream
 from forewarp.synth.points import surface_points
 from forewarp.synth.raycast import Posed, camera_rays
 from forewarp.synth.rig import rig_cameras, synthesize
 from forewarp.synth.world import World
-from lit_points import color_errors, lit_points
+from tests.support.lit_points import color_errors, lit_points
 
 SMALL = {"size": 192, "frames": 5, "samples_per_pixel": 2}
 
@@ -104,26 +101,3 @@ def test_still_points_lie_on_what_never_moves(scene):
         pixel, depth = frame.camera.project(scene.still.double())
         assert (depth > 0).all()
         assert ((pixel > 0) & (pixel < torch.tensor([192, 144]))).all()
-
-
-def test_equal_arguments_give_equal_bytes(folder, tmp_path):
-    again = synthesize(tmp_path / "again", **SMALL)
-    names = sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file())
-    assert len(names) == 3 * 10 + 5
-    assert filecmp.cmpfiles(folder, again, names, shallow=False) == (names, [], [])
-
-
-@pytest.mark.parametrize(
-    ("change", "text"),
-    [
-        ({"size": 20}, "size: expected a multiple of 8 of at least 16, but got 20; set size"),
-        ({"frames": 4}, "frames: expected an odd number, one in the middle, but got 4; set frames"),
-        ({"motion": "fly"}, "motion: expected one of"),
-        ({"seed": -1}, "seed: expected a whole number of at least 0"),
-    ],
-)
-def test_bad_arguments_get_one_line(tmp_path, change, text):
-    with pytest.raises(SceneError, match=text) as caught:
-        synthesize(tmp_path / "scene", **{**SMALL, **change})
-    assert "\n" not in str(caught.value)
-    assert not (tmp_path / "scene").exists()

@@ -10,15 +10,15 @@ from forewarp.synth.cameras import random_cameras, stream
 from forewarp.synth.raycast import Posed, camera_rays, light_points, render
 from forewarp.synth.specimens import SPECIMENS
 from forewarp.synth.world import World
-from configs import composed
+from tests.support.configs import composed
 
 TIMES = np.linspace(0, 1, 41)
 
 
 def paths(name):
-    """Places (T, V, 3) of every vertex."""
+    """Places (6, V, 3) of every vertex."""
     world = World(name)
-    return np.stack([world.place(time) for time in TIMES])
+    return np.stack([world.place(time) for time in TIMES[::8]])
 
 
 def calls_for(name):
@@ -28,17 +28,18 @@ def calls_for(name):
 
 @pytest.mark.parametrize("name", SPECIMENS)
 def test_it_moves_exactly_where_motion_is_called_for(name):
-    moved = np.abs(paths(name) - paths(name)[0]).max()
+    places = paths(name)
+    moved = np.abs(places - places[0]).max()
     assert (moved > 0.1) if "motion" in calls_for(name) else (moved == 0)
 
 
 @pytest.mark.parametrize("name", ["rigid", "quick", "room"])
 def test_parts_keep_their_shape(name):
-    world = World(name)
+    world, places = World(name), paths(name)
     for part in np.unique(world.part_of_face):
         faces = world.faces[world.part_of_face == part]
         edges = np.concatenate([faces[:, :2], faces[:, 1:]])
-        lengths = [np.linalg.norm(at[edges[:, 0]] - at[edges[:, 1]], axis=-1) for at in paths(name)[::8]]
+        lengths = [np.linalg.norm(at[edges[:, 0]] - at[edges[:, 1]], axis=-1) for at in places]
         np.testing.assert_allclose(np.ptp(lengths, axis=0), 0, atol=1e-9)
 
 

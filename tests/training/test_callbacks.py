@@ -1,6 +1,7 @@
 import io
 import re
 from dataclasses import replace
+from functools import partial
 
 import lightning
 import pytest
@@ -9,43 +10,23 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from forewarp.data.module import SceneDataModule
+from forewarp.evaluation.pictures import TensorBoardPictures
+from forewarp.progress import ProgressLine
 from forewarp.training.callbacks import StageProgress, TensorBoardScalars
 from forewarp.training.clock import Clock
-from forewarp.training.pictures import TensorBoardPictures
-from forewarp.training.progress import ProgressLine
-from forewarp.training.stages import Run
-from tiny_scene import Interrupt, ball_data, ball_scene, forward_model, stage
+from tests.support.tiny_scene import Interrupt, ball_data, ball_scene, make_run, stage, trainer
 
 STEPS = 12
 
 
 def watched_run(folder, *callbacks, steps=STEPS):
     """A run of one short stage over the ball, with a TensorBoard logger as the command has it."""
-
-    def make_trainer(where, own):
-        return lightning.Trainer(
-            max_epochs=1,
-            max_steps=-1,
-            accelerator="cpu",
-            logger=TensorBoardLogger(save_dir=str(where), name="tensorboard", version=""),
-            default_root_dir=str(where),
-            enable_checkpointing=False,
-            enable_progress_bar=False,
-            enable_model_summary=False,
-            callbacks=own,
-            limit_val_batches=0,
-            num_sanity_val_steps=0,
-        )
-
-    stages = [stage(iterations=steps)]
-    return Run(
-        ball_data(),
-        forward_model(),
-        stages,
-        folder,
-        make_trainer,
-        lambda name, where: list(callbacks),
+    run = make_run(folder, [stage(iterations=steps)], callbacks=callbacks)
+    logger = partial(TensorBoardLogger, name="tensorboard", version="")
+    run.make_trainer = lambda where, own: trainer(
+        own, logger=logger(save_dir=str(where)), default_root_dir=str(where)
     )
+    return run
 
 
 def all_watchers():
@@ -54,7 +35,7 @@ def all_watchers():
 
 @pytest.fixture(scope="module")
 def watched(tmp_path_factory):
-    """A finished stage that everything watched: its module and its folder."""
+    """Return the module and folder of a finished stage with all callbacks."""
     folder = tmp_path_factory.mktemp("watched")
     return watched_run(folder, *all_watchers()).fit(), folder / "coarse"
 
@@ -67,7 +48,7 @@ def events(watched):
 
 
 class Terminal(io.StringIO):
-    """Pretends to be one."""
+    """A stream that claims to be a terminal."""
 
     def isatty(self):
         return True
@@ -100,14 +81,9 @@ def test_the_time_left_of_all_stages(tmp_path, capsys):
     assert "0:00 left | 2:00:00 with what follows" in lines[-2]
 
 
-def test_a_long_wait_between_lines_leaves_only_the_last(tmp_path, capsys):
-    watched_run(tmp_path, StageProgress(every=1000)).fit()
-    assert len(capsys.readouterr().err.splitlines()) == 1
-
-
 def test_a_terminal_gets_a_bar_that_is_not_drawn_too_often(monkeypatch):
     now = [100.0]
-    monkeypatch.setattr("forewarp.training.progress.time.perf_counter", lambda: now[0])
+    monkeypatch.setattr("forewarp.progress.time.perf_counter", lambda: now[0])
     stream = Terminal()
     line = ProgressLine("fine", refresh=0.25, stream=stream)
     assert line.due()
@@ -174,7 +150,7 @@ def test_curves_are_means_over_the_steps_between(tmp_path):
 def test_logged_values_are_those_of_the_stage(watched, events):
     module = watched[0]
     last = {tag: events.Scalars(tag)[-1].value for tag in events.Tags()["scalars"]}
-    assert last["lr/density"] == pytest.approx(0.3 * module.settings.rate_factor(11 / 12))
+    assert last["lr/density"] == pytest.approx(0.3 * module.settings.lr_factor(11 / 12))
     assert last["train/frames_in_play"] == 12
     assert last["train/bases_in_play"] == 4
 
@@ -199,10 +175,6 @@ def assert_same(one, other):
     assert all(torch.equal(one[key], other[key]) for key in tensors)
 
 
-def test_watching_changes_no_weight(watched, unwatched):
-    assert_same(unwatched, watched[0].state_dict())
-
-
 def test_an_interrupted_watched_run_ends_as_an_unwatched_one(tmp_path, unwatched):
     with pytest.raises(SystemExit):
         watched_run(tmp_path, *all_watchers(), Interrupt("coarse", 4)).fit()
@@ -224,7 +196,7 @@ def test_the_clock_stands_still_for_pictures(tmp_path, monkeypatch):
         seen.append(module.clock.seconds - before)
         return {}
 
-    monkeypatch.setattr("forewarp.training.pictures.pictures_of", slow_pictures)
+    monkeypatch.setattr("forewarp.evaluation.pictures.pictures_of", slow_pictures)
     watched_run(tmp_path, TensorBoardPictures(moments=(0.5, 1.0))).fit()
     assert seen == [0, 0]
 

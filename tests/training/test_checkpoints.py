@@ -1,11 +1,22 @@
+"""Checkpoints: exact, refused if they do not fit, and read without trust in the file."""
+
+import resource
+import zipfile
 from functools import partial
 
 import pytest
 import torch
 
 from forewarp.fields.trajectory import TrajectoryField
-from forewarp.training.checkpoints import KeepCheckpoint, check_checkpoint, check_state, load_weights
-from tiny_scene import Interrupt, ball_data, forward_model, make_run, stage
+from forewarp.training.checkpoints import (
+    KeepCheckpoint,
+    check_checkpoint,
+    check_state,
+    load_weights,
+    read_archive,
+    write_archive,
+)
+from tests.support.tiny_scene import Interrupt, ball_data, forward_model, make_run, stage
 
 
 def run(folder, callbacks=(), width=8, times=None):
@@ -13,11 +24,11 @@ def run(folder, callbacks=(), width=8, times=None):
     trajectory = partial(TrajectoryField, bases=2, nodes=8, width=width, layers=2)
     data = ball_data(rays=64, size=16, times=times)
     model = forward_model(trajectory=trajectory)
-    return make_run(folder, [stage(voxels=[[0, 1000]])], data=data, model=model, callbacks=callbacks)
+    return make_run(folder, [stage(num_voxels=[[0, 1000]])], data=data, model=model, callbacks=callbacks)
 
 
 def module(folder, **changes):
-    """What such a run begins with."""
+    """Make the module that such a run begins with."""
     ours = run(folder, **changes)
     ours.datamodule.setup()
     return ours._module(ours.stages[0], None, None, 0)
@@ -128,7 +139,7 @@ HARM = {
 
 @pytest.mark.parametrize("harm", HARM)
 def test_a_grid_whose_parts_do_not_fit_is_refused(tmp_path, interrupted, harm):
-    """The kernels would read where nothing is, which ends the process."""
+    """Kernels would read out of bounds and crash the process."""
     content = torch.load(interrupted, weights_only=True)
     name, change = HARM[harm]
     change(content["state_dict"][GRID + name], content["state_dict"])
@@ -154,3 +165,63 @@ def test_odd_parts_are_refused_in_one_line(tmp_path, interrupted, change, said):
     torch.save(content, tmp_path / "last.ckpt")
     with pytest.raises(ValueError, match=f"last.ckpt: .*{said}"):
         check_state(tmp_path / "last.ckpt", module(tmp_path))
+
+
+CONTENT = {"a": torch.arange(1000.0), "b": {"c": [1, "x", None]}}
+
+
+def test_what_is_written_is_read(tmp_path):
+    write_archive(tmp_path / "deep" / "a.pt", CONTENT)
+    found = read_archive(tmp_path / "deep" / "a.pt")
+    assert torch.equal(found["a"], CONTENT["a"])
+    assert found["b"] == CONTENT["b"]
+    assert [path.name for path in (tmp_path / "deep").iterdir()] == ["a.pt"]
+
+
+def test_a_full_disk_is_told_and_leaves_what_was_there(tmp_path):
+    path = tmp_path / "a.pt"
+    write_archive(path, {"a": 1})
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2048, before[1]))
+    try:
+        with pytest.raises(OSError, match="File too large") as refusal:
+            write_archive(path, CONTENT)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert refusal.value.filename == str(path)
+    assert read_archive(path) == {"a": 1}
+    assert [path.name for path in tmp_path.iterdir()] == ["a.pt"]
+
+
+def test_a_packed_archive_is_not_unpacked(tmp_path):
+    """Zeros of 16 MB in a file of 16 KB."""
+    torch.save({"a": torch.zeros(1 << 22)}, tmp_path / "plain.pt")
+    with (
+        zipfile.ZipFile(tmp_path / "plain.pt") as plain,
+        zipfile.ZipFile(tmp_path / "a.pt", "w", zipfile.ZIP_DEFLATED) as packed,
+    ):
+        for name in plain.namelist():
+            packed.writestr(name, plain.read(name))
+    assert torch.load(tmp_path / "a.pt", weights_only=True)["a"].shape == (1 << 22,)  # torch would
+    with pytest.raises(ValueError, match="BadZipFile"):
+        read_archive(tmp_path / "a.pt")
+
+
+def test_no_tensor_is_larger_than_the_file(tmp_path):
+    torch.save({"a": [{"b": torch.zeros(1).expand(400, 1000, 1000)}]}, tmp_path / "a.pt")
+    with pytest.raises(ValueError, match="TypeError"):
+        read_archive(tmp_path / "a.pt")
+    torch.save({"a": torch.zeros(6, 5).T, "b": torch.zeros(0, 3)}, tmp_path / "a.pt")
+    assert read_archive(tmp_path / "a.pt")["a"].shape == (5, 6)
+
+
+@pytest.mark.parametrize("content", [b"", b"nonsense", [1], torch.zeros(3), {"a": torch.eye(3).to_sparse()}])
+def test_what_is_no_such_file_is_refused(tmp_path, content):
+    if isinstance(content, bytes):
+        (tmp_path / "a.pt").write_bytes(content)
+    else:
+        torch.save(content, tmp_path / "a.pt")
+    with pytest.raises(ValueError, match="^[A-Z]\\w+$"):
+        read_archive(tmp_path / "a.pt")
+    with pytest.raises(FileNotFoundError):
+        read_archive(tmp_path / "b.pt")

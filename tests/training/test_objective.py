@@ -1,4 +1,4 @@
-"""The weighted sum of what a method says: which terms count in a step, and whose gradients they are."""
+"""The objective: which terms count in a step, their weights, and gradients that a method brings."""
 
 import pytest
 import torch
@@ -8,7 +8,7 @@ from forewarp.training.objective import Objective, parts, total
 
 
 def step_of(gradients=None, **values):
-    """A step whose terms have these values; ``called`` says which were computed."""
+    """Make a step whose terms have these values; ``called`` lists the computed ones."""
     called = []
 
     def term(name, value):

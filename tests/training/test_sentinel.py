@@ -1,4 +1,5 @@
 import json
+import shutil
 from functools import partial
 
 import lightning
@@ -9,13 +10,13 @@ from forewarp.methods.voxel.effects.inpaint import UNet3d
 from forewarp.scene.lens import Lens
 from forewarp.training.bundle import read_bundle
 from forewarp.training.sentinel import BrokenStep, Sentinel, all_finite, diagnose, first_bad
-from tiny_scene import ball_data, forward_model, make_run, stage
+from tests.support.tiny_scene import ball_data, forward_model, make_run, stage
 
 NAN = float("nan")
 
 
 class Poison(lightning.Callback):
-    """Breaks a number at one step, and notes the bytes of the checkpoint before."""
+    """Break a number at some steps."""
 
     def __init__(self, what, *steps):
         self.what, self.steps = what, steps
@@ -56,14 +57,14 @@ def run(folder, poison, iterations=12, **changes):
 
 
 def broken(folder, poison, **changes):
-    """The message of a run that stops, and the bundle of its step 5."""
+    """Return the message of a run that stops, and the file of its step 5."""
     with pytest.raises(BrokenStep) as stopped:
         run(folder, poison, **changes).fit()
     return str(stopped.value), folder / "coarse" / "broken" / "step_5.pt"
 
 
 def again(folder, path):
-    """What a stored step shows when it is taken again by a run that has no data."""
+    """Repeat a stored step by a run without data; return what is found."""
     bundle = read_bundle(path)
     ours = make_run(folder / "elsewhere", [stage()], data=None)
     module = ours.rebuilt("coarse", bundle.scene)
@@ -72,20 +73,27 @@ def again(folder, path):
     return str(diagnose(module, bundle.batch, bundle.noted["step"])), bundle
 
 
-def test_a_loss_that_is_not_finite_stops_the_stage(tmp_path):
-    said, path = broken(tmp_path, Poison("batch", 5))
+@pytest.fixture(scope="module")
+def stopped(tmp_path_factory):
+    """Return folder, message and stored step of a run with a broken batch at step 5."""
+    folder = tmp_path_factory.mktemp("stopped")
+    return folder, *broken(folder, Poison("batch", 5))
+
+
+def test_a_loss_that_is_not_finite_stops_the_stage(stopped):
+    folder, said, path = stopped
     told = "stage.coarse: expected finite numbers, but got loss: batch[0].rgb (terms photo) at step 5,"
     assert said.startswith(told)
     assert "\n" not in said
     assert f"python -m forewarp.replay {path}" in said
-    found, bundle = again(tmp_path, path)
+    found, bundle = again(folder, path)
     assert found == bundle.noted["found"] == "loss: batch[0].rgb (terms photo)"
     frame = bundle.scene.train[bundle.batch.frame]
     assert f"frame {frame.name} (time {frame.time:.4g})" in said
 
 
-def test_the_last_checkpoint_is_the_one_before_and_the_run_goes_on_from_it(tmp_path):
-    broken(tmp_path, Poison("batch", 5))
+def test_the_last_checkpoint_is_the_one_before_and_the_run_goes_on_from_it(stopped, tmp_path):
+    shutil.copytree(stopped[0], tmp_path, dirs_exist_ok=True)
     kept = torch.load(tmp_path / "coarse" / "last.ckpt", weights_only=True)
     assert kept["global_step"] == 5
     assert all(v.isfinite().all() for v in kept["state_dict"].values() if torch.is_tensor(v))
@@ -93,6 +101,26 @@ def test_the_last_checkpoint_is_the_one_before_and_the_run_goes_on_from_it(tmp_p
     whole = run(tmp_path / "whole", Poison("nothing")).fit()
     ours, theirs = ({k: v for k, v in m.state_dict().items() if torch.is_tensor(v)} for m in (module, whole))
     assert all(torch.equal(ours[k], theirs[k]) for k in theirs)
+
+
+def test_steps_are_skipped_where_asked_counted_and_change_no_weight(tmp_path):
+    class Diary(Poison):
+        weights = {}
+
+        def on_train_batch_end(self, trainer, module, *_):
+            self.weights[module.global_step] = {n: p.detach().clone() for n, p in module.named_parameters()}
+
+    diary = Diary("batch", 3, 5)
+    ours = run(tmp_path, diary, skip=2)
+    module = ours.fit()
+    assert all(p.isfinite().all() for p in module.parameters())
+    assert ours.finished()["coarse"]["skipped_steps"] == 2
+    assert ours.finished()["coarse"]["steps"] == 12
+    assert sorted(p.name for p in (tmp_path / "coarse" / "broken").iterdir()) == ["step_3.pt", "step_5.pt"]
+    same = {
+        a: all(torch.equal(v, diary.weights[a + 1][k]) for k, v in diary.weights[a].items()) for a in (5, 6)
+    }
+    assert same == {5: True, 6: False}
 
 
 def test_a_parameter_that_is_not_finite_is_named(tmp_path):
@@ -122,15 +150,6 @@ def test_a_broken_optimizer_is_never_saved(tmp_path):
     assert all(v.isfinite().all() for s in states for v in s.values())
 
 
-def test_steps_are_skipped_where_asked_and_counted(tmp_path):
-    ours = run(tmp_path, Poison("batch", 3, 5), skip=2)
-    module = ours.fit()
-    assert all(p.isfinite().all() for p in module.parameters())
-    assert ours.finished()["coarse"]["skipped_steps"] == 2
-    assert ours.finished()["coarse"]["steps"] == 12
-    assert sorted(p.name for p in (tmp_path / "coarse" / "broken").iterdir()) == ["step_3.pt", "step_5.pt"]
-
-
 def test_one_too_many_stops_and_the_count_is_continued(tmp_path):
     with pytest.raises(BrokenStep, match="at step 5"):
         run(tmp_path, Poison("batch", 3, 5), skip=1).fit()
@@ -139,21 +158,6 @@ def test_one_too_many_stops_and_the_count_is_continued(tmp_path):
     done = run(tmp_path, Poison("batch", 7), skip=2)
     done.fit()
     assert done.finished()["coarse"]["skipped_steps"] == 2
-
-
-def test_a_skipped_step_changes_no_weight(tmp_path):
-    class Diary(Poison):
-        weights = {}
-
-        def on_train_batch_end(self, trainer, module, *_):
-            self.weights[module.global_step] = {n: p.detach().clone() for n, p in module.named_parameters()}
-
-    diary = Diary("batch", 5)
-    run(tmp_path, diary, skip=1).fit()
-    same = {
-        a: all(torch.equal(v, diary.weights[a + 1][k]) for k, v in diary.weights[a].items()) for a in (5, 6)
-    }
-    assert same == {5: True, 6: False}
 
 
 def test_a_bundle_holds_lenses_and_is_refused_where_it_is_none(tmp_path):
@@ -227,16 +231,10 @@ SPOIL = {
 
 
 @pytest.mark.parametrize("name", SPOIL)
-def test_a_bundle_with_a_wrong_part_is_refused_in_one_line(bundle, tmp_path, name):
-    content = torch.load(bundle, weights_only=True)
+def test_a_bundle_with_a_wrong_part_is_refused_in_one_line(stopped, tmp_path, name):
+    content = torch.load(stopped[2], weights_only=True)
     SPOIL[name](content)
     torch.save(content, tmp_path / "a.pt")
     with pytest.raises(ValueError, match="a.pt: expected a step that a run left in broken/, but got") as no:
         read_bundle(tmp_path / "a.pt")
     assert len(str(no.value).splitlines()) == 1
-
-
-@pytest.fixture(scope="module")
-def bundle(tmp_path_factory):
-    """A stored step."""
-    return broken(tmp_path_factory.mktemp("broken"), Poison("batch", 5))[1]

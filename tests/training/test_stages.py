@@ -7,22 +7,28 @@ import lightning
 import pytest
 import torch
 
+from forewarp.fields.radiance import FeatureRadiance
 from forewarp.methods.voxel.effects.background import StaticBackground
 from forewarp.methods.voxel.effects.inpaint import UNet3d
-from forewarp.methods.voxel.effects.upsample import LearnedUpsampler, TrilinearUpsampler
-from forewarp.methods.voxel.effects.view import ViewNetwork
-from forewarp.fields.radiance import FeatureRadiance
-from forewarp.methods.voxel.backward_warp import Deformation
-from forewarp.methods.voxel.structure import box_of_all_times
+from forewarp.methods.voxel.effects.upsample import LearnedUpsampler
+from forewarp.methods.voxel.effects.view_dependence import ViewNetwork
 from forewarp.training.interruption import Interruption
-from tiny_scene import RATES, Interrupt, backward_model, ball_data, forward_model, make_run, stage
+from tests.support.tiny_scene import (
+    RATES,
+    Interrupt,
+    ball_data,
+    forward_model,
+    make_run,
+    stage,
+)
 
 
 def stages(**changes):
     """Two short stages; the lattice of the second grows halfway; voxels are refreshed every fourth step."""
     common = {"iterations": 10, "refresh_every": 4, "start": "hull", "hull_frames": 3, "hull_grow": 0.1}
-    coarse = stage("coarse", voxels=[[0, 10**3]], bases=[[0, 2], [0.5, 4]], **common)
-    return [coarse, stage("fine", voxels=[[0, 11**3], [0.5, 14**3]], **(common | changes))]
+    common["background_num_voxels"] = [[0, 8**3]]
+    coarse = stage("coarse", num_voxels=[[0, 10**3]], bases=[[0, 2], [0.5, 4]], **common)
+    return [coarse, stage("fine", num_voxels=[[0, 11**3], [0.5, 14**3]], **(common | changes))]
 
 
 def run(folder, callbacks=(), **changes):
@@ -46,7 +52,7 @@ def whole(tmp_path_factory):
 
 
 class Crash(lightning.Callback):
-    """Ends without saving when a stage begins."""
+    """Exit without saving when the fine stage begins."""
 
     def on_train_start(self, trainer, module):
         if module.settings.name == "fine":
@@ -56,12 +62,11 @@ class Crash(lightning.Callback):
 @pytest.mark.parametrize(
     "interruptions",
     [
-        [Interrupt("coarse", 6)],
         [Crash()],
         [Interrupt("fine", 3), Interrupt("fine", 7)],  # before and after the lattice grows
         [Interrupt("coarse", 9), Interrupt("fine", 5)],  # at the last step, and as the lattice grows
     ],
-    ids=["coarse", "between", "fine", "edges"],
+    ids=["between", "fine", "edges"],
 )
 def test_a_continued_run_equals_an_uninterrupted_one_to_the_bit(tmp_path, whole, interruptions):
     for interruption in interruptions:
@@ -70,7 +75,7 @@ def test_a_continued_run_equals_an_uninterrupted_one_to_the_bit(tmp_path, whole,
     assert same(run(tmp_path).fit(), whole[1])
 
 
-def test_a_run_is_the_same_each_time_and_another_with_another_seed(tmp_path, whole):
+def test_another_seed_gives_another_run(tmp_path, whole):
     other = make_run(tmp_path, stages(), data=ball_data(rays=64, size=16, seed=1), seed=1).fit()
     assert not same(other, whole[1])
 
@@ -122,13 +127,13 @@ def test_a_mistake_in_a_later_stage_is_refused_before_anything_is_trained(tmp_pa
 
 
 class Diary(lightning.Callback):
-    """Notes what every step was trained with."""
+    """Record learning rate, bases, lattice and frames of every step."""
 
     def __init__(self):
         self.steps = []
 
     def on_before_optimizer_step(self, trainer, module, optimizer):
-        rates = {g["name"]: g["lr"] / g["base_rate"] for g in optimizer.param_groups}
+        rates = {g["name"]: g["lr"] / g["base_lr"] for g in optimizer.param_groups}
         parameters = {id(p) for g in optimizer.param_groups for p in g["params"]}
         assert parameters == {id(p) for p in module.method.parameters()}
         bases = int(module.method.motion.trajectory.bases_in_play)
@@ -138,7 +143,7 @@ class Diary(lightning.Callback):
 
 def test_rates_bases_lattice_and_frames_follow_the_fraction(tmp_path):
     diary = Diary()
-    run(tmp_path, [diary], hold=0.5, curriculum={"start": 2, "all_in": 0.5}).fit()
+    run(tmp_path, [diary], lr_hold=0.5, curriculum={"start": 2, "all_in": 0.5}).fit()
     coarse = [s[1:] for s in diary.steps if s[0] == "coarse"]
     fine = [s[1:] for s in diary.steps if s[0] == "fine"]
     assert len(coarse) == len(fine) == 10
@@ -150,12 +155,6 @@ def test_rates_bases_lattice_and_frames_follow_the_fraction(tmp_path):
     assert len(set(lattices[:5])) == len(set(lattices[5:])) == 1
     assert lattices[5] > lattices[4]
     assert playing == (2, 4, 6, 8, 10, 12, 12, 12, 12, 12)
-
-
-def test_a_stage_may_start_afresh_in_the_tight_box(tmp_path):
-    module = run(tmp_path, carry=False).fit()
-    handover = json.loads((tmp_path / "coarse" / "handover.json").read_text())
-    assert module.method.radiance.activation.unit == handover["notes"]["unit"]
 
 
 def test_an_unfinished_run_cannot_be_loaded(tmp_path):
@@ -174,30 +173,18 @@ def test_every_stage_counts_its_own_memory(tmp_path, monkeypatch):
     assert ours.finished()["fine"]["peak_memory_bytes"] == 7
 
 
-def test_the_next_box_holds_what_the_stage_calls_matter(tmp_path, monkeypatch):
-    asked = []
-    monkeypatch.setattr(
-        "forewarp.methods.voxel.method.box_of_all_times",
-        lambda *a, **k: asked.append(k["alpha"]) or box_of_all_times(*a, **k),
-    )
-    data = ball_data(rays=64, size=16)
-    make_run(tmp_path, [stage(iterations=1, box_alpha=0.25)], data=data).fit()
-    assert asked == [0.25]
-
-
 MODELS = {
     "static": forward_model(motion=None, trajectory=None),
-    "backward": backward_model(deformation=partial(Deformation, width=8, layers=2)),
     "network": forward_model(
-        radiance=partial(FeatureRadiance, alpha_init=1e-2, skip_alpha=0.0, width=8), view=ViewNetwork
+        radiance=partial(FeatureRadiance, alpha_init=1e-2, alpha_threshold=0.0, width=8),
+        view_dependence=ViewNetwork,
     ),
     "everything": forward_model(
         upsampler=partial(LearnedUpsampler, width=8), inpainter=partial(UNet3d, levels=2)
     ),
     "background": forward_model(
-        background=partial(StaticBackground, features=3, alpha_init=1e-2, skip_alpha=1e-4)
+        background=partial(StaticBackground, features=3, alpha_init=1e-2, alpha_threshold=1e-4)
     ),
-    "interpolated": forward_model(upsampler=TrilinearUpsampler, view=None),
 }
 
 
@@ -212,13 +199,13 @@ def test_every_model_trains_carries_and_loads(tmp_path, choice):
 
 def test_a_scene_of_one_time_needs_no_motion_and_no_rate_for_it(tmp_path):
     rates = {name: rate for name, rate in RATES.items() if name != "flow"}
-    still = [stage(iterations=4, rates=rates)]
+    still = [stage(iterations=4, lr=rates)]
     module = make_run(tmp_path, still, data=ball_data(rays=64, size=16, times=[0.0] * 4)).fit()
     assert module.method.motion is None
 
 
 def psnr(module, data):
-    """Of every test image."""
+    """Return the PSNR of every test image."""
     found = []
     for target in data.targets("test"):
         drawn = module.render(target.frame.camera, target.moment, target.background).rgb
@@ -229,13 +216,13 @@ def psnr(module, data):
 def test_a_sliding_ball_is_learned_at_all_times(tmp_path):
     data = ball_data(rays=512, frames=16)
     fitting = stage(
-        voxels=[[0, 16**3]],
+        num_voxels=[[0, 16**3]],
         iterations=300,
         start="hull",
         hull_frames=4,
         hull_grow=0.08,
         refresh_every=25,
-        hold=0.5,
+        lr_hold=0.5,
         curriculum={"start": 4, "all_in": 0.5},
     )
     module = make_run(tmp_path, [fitting], data=data).fit()
@@ -249,7 +236,7 @@ def test_a_sliding_ball_is_learned_at_all_times(tmp_path):
 
 
 class CtrlC(lightning.Callback):
-    """Presses it once or more in the middle of a step."""
+    """Press Ctrl-C once or more in the middle of a step."""
 
     def __init__(self, stage, step, times=1):
         self.stage, self.step, self.times = stage, step, times
@@ -262,14 +249,14 @@ class CtrlC(lightning.Callback):
 
 @pytest.fixture(autouse=True)
 def _listening():
-    """In the background of a shell Ctrl-C is ignored, and so it would be here."""
+    """Handle Ctrl-C, which is ignored if the tests run in the background of a shell."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
 
 
 def pressed(folder, *presses):
-    """Run until Ctrl-C ends it; what Lightning turned into an exit was one."""
+    """Run until Ctrl-C ends it; Lightning turns KeyboardInterrupt into SystemExit."""
     before = signal.getsignal(signal.SIGINT)
     with pytest.raises(SystemExit) as leaving:
         run(folder, [CtrlC(*presses)]).fit()
@@ -277,7 +264,7 @@ def pressed(folder, *presses):
     assert signal.getsignal(signal.SIGINT) is before
 
 
-@pytest.mark.parametrize(("name", "step"), [("coarse", 5), ("fine", 3), ("fine", 9)])
+@pytest.mark.parametrize(("name", "step"), [("coarse", 5), ("fine", 9)])
 def test_ctrl_c_keeps_the_step_that_it_met(tmp_path, whole, capsys, name, step):
     pressed(tmp_path, name, step)
     assert torch.load(tmp_path / name / "last.ckpt", weights_only=True)["global_step"] == step + 1

@@ -1,1 +1,1 @@
-"""The command line: Hydra entry points and nothing else."""
+"""The six commands, and what only they need."""

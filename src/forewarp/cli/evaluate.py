@@ -6,7 +6,7 @@ from forewarp.cli.entry import command
 
 HELP = """
 forewarp-evaluate measures a finished run on its test views and prints the table. Everything is rebuilt from
-the run's own config.yaml; images/, per_image.json and metrics.json are written anew.
+the run's own config.yaml; images/, per_image.json and metrics.json are written again.
 
   forewarp-evaluate run=runs/vehicle/forward-demo-seed0
   forewarp-evaluate run=FOLDER data.root=../elsewhere/dnerf
@@ -16,30 +16,30 @@ What one types most:
   trust=[PACKAGE]          code of other packages that the run's config may name
   data.root=FOLDER         where the data are now, if they moved
   lpips_weights=FILE       a backbone's weights, or a folder of them, for LPIPS
-  sheets=N                 how many truth | prediction | error pictures
-  threads=N trainer=cpu    what to compute with
+  sheets=N                 how many pictures of truth | prediction | error
+  threads=N trainer=cpu    threads and device to compute with
 """
 
 
 def evaluate(config) -> None:
-    """Load and measure."""
-    from forewarp.cli.identity import saved_config
+    """Load a run and measure it."""
+    from forewarp.runs.config import saved_config
 
     saved = saved_config(config.run, config)
-    # These load torch; what is mistyped has been answered before.
-    from forewarp.cli.claims import alone, tell_other_data
-    from forewarp.cli.measure import measure
-    from forewarp.cli.runs import build_run
+    # These load torch; mistakes have been answered before.
+    from forewarp.runs.build import build_run, measure_run
+    from forewarp.runs.data_check import warn_if_changed
+    from forewarp.runs.lock import locked
 
     run = build_run(saved)
-    with alone(run.folder):
+    with locked(run.folder):
         module = run.load()
-        tell_other_data(run)
-        measure(run, module, saved)
+        warn_if_changed(run)
+        measure_run(run, module, saved)
 
 
 def main() -> None:
-    """The console script."""
+    """Run the console script."""
     command("evaluate", evaluate, HELP)
 
 

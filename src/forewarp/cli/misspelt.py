@@ -1,4 +1,4 @@
-"""Words of a command line that are nearly right: a key with a slip in it, a folder without its key."""
+"""Help with a command line that is nearly right: a misspelt key, or a run's folder without its key."""
 
 from __future__ import annotations
 
@@ -8,33 +8,60 @@ from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
-from forewarp.cli.folders import configurations
+from forewarp.runs.config_files import configurations
+from forewarp.runs.overrides import key_of, refuse_renamed
 
 FOLDERS = {"evaluate": "run", "render": "run", "train": "resume"}
 
 
-def with_keys(name: str, words: list[str]) -> list[str]:
-    """The words, with ``run=`` (of ``train``: ``resume=``) put before a bare folder.
+def with_run_key(name: str, arguments: list[str]) -> list[str]:
+    """Put ``run=`` (for ``train``: ``resume=``) before a bare folder.
 
     Args:
-        name: of the command.
-        words: as typed, without the command.
+        name: name of the command.
+        arguments: arguments of the command line.
     """
-    key, before = FOLDERS.get(name), ["", *words]
+    key, before = FOLDERS.get(name), ["", *arguments]
     bare = [
-        key and "=" not in word and word[:1] not in "-+~" and before[i][:1] != "-" and Path(word).is_dir()
-        for i, word in enumerate(words)
+        key and "=" not in one and one[:1] not in "-+~" and before[i][:1] != "-" and Path(one).is_dir()
+        for i, one in enumerate(arguments)
     ]
-    return [f"{key}={word}" if is_bare else word for is_bare, word in zip(bare, words)]
+    return [f"{key}={one}" if is_bare else one for is_bare, one in zip(bare, arguments)]
 
 
-def unknown_key(error: Exception, name: str, words: list[str]) -> str | None:
-    """One line for a key that the configuration has not, with the nearest that it has; None: it is not that.
+def renamed_key(error: Exception) -> str | None:
+    """Return the line for a key of an earlier version that Hydra did not find; None for any other error."""
+    from hydra.errors import HydraException
+
+    found = re.search(r"Could not (?:override|delete(?: from config\.)?) '([^'@]+)'", str(error))
+    if found is None or not isinstance(error, HydraException):
+        return None
+    # Hydra quotes the override, unless the name is in a file.
+    quoted = re.search(r"To append to your config use \+(.*)", str(error), re.DOTALL)
+    try:
+        refuse_renamed(_spread(quoted[1]) if quoted else [found[1]])
+    except ValueError as refusal:
+        return str(refusal)
+    return None
+
+
+def _spread(override: str) -> list[str]:
+    """Return an override and, if its value is a dictionary, the dotted keys of that."""
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from omegaconf import OmegaConf
+
+    value = OverridesParser.create().parse_override(override).value()
+    inner = every_key(OmegaConf.create(value), f"{key_of(override)}.") if isinstance(value, dict) else ()
+    return [override, *inner]
+
+
+def unknown_key(error: Exception, name: str, arguments: list[str]) -> str | None:
+    """Return the line for an unknown key, with the nearest known one; None for any other error.
 
     Args:
-        error: what Hydra raised.
-        name: of the configuration's file.
-        words: of the command line.
+        error: raised by Hydra.
+        name: name of the config file.
+        arguments: arguments of the command line.
     """
     from hydra.errors import HydraException
 
@@ -42,35 +69,39 @@ def unknown_key(error: Exception, name: str, words: list[str]) -> str | None:
     if found is None or not isinstance(error, HydraException):
         return None
     key, conf = found[1], configurations()
-    known = [*_keys(_composed(conf, name, [w for w in words if w.split("=")[0] != key])), *_groups(conf)]
+    known = [
+        *every_key(_composed(conf, name, [a for a in arguments if a.split("=")[0] != key])),
+        *_groups(conf),
+    ]
     near = difflib.get_close_matches(key, known, 1, cutoff=0.8)
-    advice = f"did you mean {near[0]}?" if near else f"forewarp-{name} --cfg job prints all that there are"
+    advice = f"did you mean {near[0]}?" if near else f"forewarp-{name} --cfg job prints all keys"
     return f"{key}: expected a key of the configuration, but got none of this name; {advice}"
 
 
-def _composed(conf: Path, name: str, words: list[str]):
-    """The configuration that the other words make, or the plain one where they make none."""
+def _composed(conf: Path, name: str, arguments: list[str]):
+    """Compose the config with the other arguments, or without them if they are wrong, too."""
     import hydra
     from hydra.core.global_hydra import GlobalHydra
 
     GlobalHydra.instance().clear()
-    dirs = [word.partition("=")[2] for word in words if word.startswith("--config-dir=")]
-    dirs += [after for before, after in zip(words, words[1:]) if before == "--config-dir"]
+    dirs = [one.partition("=")[2] for one in arguments if one.startswith("--config-dir=")]
+    dirs += [after for before, after in zip(arguments, arguments[1:]) if before == "--config-dir"]
     more = [f"hydra.searchpath=[{','.join(f'file://{Path(d).resolve()}' for d in dirs)}]"] if dirs else []
     with hydra.initialize_config_dir(str(conf), version_base="1.3"):
-        with suppress(Exception):  # the mistakes in them are not the one that is told
-            return hydra.compose(name, [*more, *(w for w in words if "=" in w and w[:1] != "-")])
+        with suppress(Exception):
+            return hydra.compose(name, [*more, *(one for one in arguments if "=" in one and one[:1] != "-")])
         return hydra.compose(name)
 
 
-def _keys(node, prefix: str = "") -> Iterator[str]:
+def every_key(node, prefix: str = "") -> Iterator[str]:
+    """Yield the dotted keys of a config, each before those within it."""
     from omegaconf import DictConfig
 
     for key in (key for key in node if not str(key).startswith("_")):
         yield f"{prefix}{key}"
         inner = node._get_node(key)
         if isinstance(inner, DictConfig) and not (inner._is_none() or inner._is_missing()):
-            yield from _keys(inner, f"{prefix}{key}.")
+            yield from every_key(inner, f"{prefix}{key}.")
 
 
 def _groups(conf: Path) -> Iterator[str]:

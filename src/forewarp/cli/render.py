@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from forewarp.cli.entry import command
 
-LEAST_SIZE = 400  # pixels of the longer side, where none is asked for
+LEAST_SIZE = 400  # pixels of the longer side, unless size= asks for another
 
 HELP = """
 forewarp-render makes a video of a finished run, into its videos/.
@@ -17,46 +17,47 @@ What one types most:
   path=fixed                    one camera, through time
   path=orbit time=0.5           once around, at one time
   path=both                     once around while time passes
-  path=trajectories             as fixed, with the ways that points of the moving surface took drawn over it
+  path=trajectories             as fixed, with the trajectories of points on the moving surface drawn over it
   frames=N fps=N size=N         how many, how fast, pixels of the longer side (as the images, at least 400)
   view=N                        the test view that it shows or starts from
-  format=mp4|gif|png            a film, a moving picture, stills
-  points=N tail=SHARE           how many trajectories, and how much of the time they stay
+  format=mp4|gif|png            a video, an animated picture, one picture a frame
+  points=N tail=SHARE           how many trajectories, and for what share of the time they stay visible
   trust=[PACKAGE]               code of other packages that the run's config may name
   data.root=FOLDER              where the data are now, if they moved
-  threads=N trainer=cpu         what to compute with
+  threads=N trainer=cpu         threads and device to compute with
 """
 
 
 def render(config) -> None:
-    """Load, and write the video."""
+    """Load a run and write the video."""
     from pathlib import Path
 
-    from forewarp.cli.identity import saved_config
+    from forewarp.runs.config import saved_config
 
     saved = saved_config(config.run, config)
     check(config)
-    # These load torch; what is mistyped has been answered before.
-    from forewarp.cli.claims import tell_other_data
-    from forewarp.cli.measure import Progress, device_of
-    from forewarp.cli.runs import build_run
+    # These load torch; mistakes have been answered before.
     from forewarp.drawing.files import write_video
+    from forewarp.progress import Counted
+    from forewarp.runs.build import build_run
+    from forewarp.runs.data_check import warn_if_changed
+    from forewarp.training.device import device_of
 
     run = build_run(saved)
     module = run.load().to(device_of(saved.trainer.accelerator))
-    tell_other_data(run)
+    warn_if_changed(run)
     pictures = pictures_of(config, module, run.datamodule)
     file = Path(run.folder) / "videos" / f"{config.path}.{config.format}"
-    with Progress(config.path) as progress:
+    with Counted(config.path) as progress:
         written = write_video(file, counted(pictures, config.frames, progress), fps=float(config.fps))
     print(f"written: {written}")
 
 
 def pictures_of(config, module, datamodule):
-    """The pictures of the video that the config describes."""
-    from forewarp.training.pictures import sized
-    from forewarp.training.trajectories import Trajectories
-    from forewarp.training.videos import make_shots, video
+    """Render the pictures of the video that the config describes."""
+    from forewarp.evaluation.pictures import sized
+    from forewarp.evaluation.trajectories import Trajectories
+    from forewarp.evaluation.videos import make_shots, video
 
     cameras = [frame.camera for frame in datamodule.scene.train]
     targets = datamodule.targets("test")
@@ -72,16 +73,16 @@ def pictures_of(config, module, datamodule):
 
 
 def counted(pictures, total: int, progress):
-    """The same pictures; each is reported once it is there."""
+    """Yield the pictures and report each to ``progress``."""
     for done, picture in enumerate(pictures, 1):
         progress(done, total)
         yield picture
 
 
 def check(config) -> None:
-    """Refuse what no video can be made of, before anything is loaded."""
+    """Refuse settings of which no video can be made, before anything is loaded."""
     from forewarp.drawing.files import FORMATS
-    from forewarp.training.videos import PATHS
+    from forewarp.evaluation.videos import PATHS
 
     for key, known in (("path", PATHS), ("format", FORMATS)):
         if config[key] not in known:
@@ -97,7 +98,7 @@ def check(config) -> None:
 
 
 def main() -> None:
-    """The console script."""
+    """Run the console script."""
     command("render", render, HELP)
 
 

@@ -2,48 +2,100 @@
 
 from __future__ import annotations
 
+from glob import glob
 from pathlib import Path
 
 from forewarp.cli.entry import command
 
-HELP = """
-forewarp-report makes pages with tables and curves of runs that are already there. It computes nothing anew.
+KINDS = {
+    "accuracy_time": "accuracy against training time, and the cheapest way to each dB",
+    "price_list": "what each choice costs and brings, with the spread over seeds",
+    "paper": "the paper's tables and figures: Markdown, LaTeX, CSV, HTML",
+    "effects": "planned runs against every effect at once and the paper's fixed set",
+    "compare": "a few runs side by side, printed",
+    "limits": "what keeps a few runs from the truth, printed: time, views, voxel size, regions",
+}
 
-  forewarp-report kind=accuracy_time        accuracy against training time, and the cheapest way to each dB
-  forewarp-report kind=price_list           what each choice costs and brings, with the spread over seeds
-  forewarp-report kind=paper                the paper's tables and figures: Markdown, LaTeX, CSV, HTML
+HELP = f"""
+forewarp-report makes tables and curves of runs that are already there. Only kind=limits renders anything.
+
+{chr(10).join(f"  kind={kind:<14} {about}" for kind, about in KINDS.items())}
+
   forewarp-report kind=price_list runs=FOLDER out=FOLDER
+  forewarp-report kind=compare runs=[runs/demo/forward,runs/demo/backward]
+  forewarp-report kind=limits 'runs=runs/paper/*/plain-forward-fast-*'
 
 What one types most:
-  kind=accuracy_time|price_list|paper|effects   which page
-  runs=FOLDER                      searched for runs (runs/accuracy_time; of kind=paper runs/paper)
-  out=FOLDER                       where the page goes (results/ below the runs)
-  target=DB                        accuracy_time: PSNR that every variant's seconds are listed for
-  published=FILE                   accuracy_time: points that others report; paper: what is printed
-  curves=FOLDER                    paper: where accuracy_time put its pictures (runs/accuracy_time/results)
+  runs=FOLDER            searched for runs (runs/accuracy_time, runs/paper or runs/effects)
+  runs=[FOLDER,FOLDER]   compare, limits: the runs themselves; patterns with * are expanded
+  out=FOLDER             where the page goes (results/ below the runs)
+  target=DB              accuracy_time: PSNR that every variant's seconds are listed for
+  published=FILE         accuracy_time: results of others to show; paper: the printed numbers
+  curves=FOLDER          paper: where accuracy_time put its pictures (runs/accuracy_time/results)
+  views=N                limits: training views to render
+  trust=[PACKAGE]        limits: code of other packages that a run's config may name
 
 The runs: make accuracy-time [DATA=FOLDER SCENE=NAME MINUTES=N], make price-list DATA=FOLDER,
-make reproduce-tables [DATA=FOLDER]. One that has no
-results is named at the end of the page.
+make reproduce-tables [DATA=FOLDER], make effects. Runs without results are listed at the end of the page.
 """
-
-KINDS = ("accuracy_time", "price_list", "paper", "effects")
 
 
 def report(config) -> None:
-    """Write the page."""
+    """Write the page, or print the table."""
     if config.kind not in KINDS:
         raise ValueError(f"kind: expected one of {', '.join(KINDS)}, but got '{config.kind}'")
     if not isinstance(config.target, int | float | None):
         raise ValueError(f"target: expected a number of dB or null, but got '{config.target}'")
-    default = f"{config.paths.runs}/{config.kind if config.kind in ('paper', 'effects') else 'accuracy_time'}"
-    runs = Path(config.runs or default)
+    if config.kind in ("compare", "limits"):
+        print(_table(config, _folders(config.runs)))
+        return
+    if not isinstance(config.runs, str | None):
+        raise ValueError(f"runs: expected one folder for kind={config.kind}, but got a list; name one folder")
+    default = config.kind if config.kind in ("paper", "effects") else "accuracy_time"
+    runs = Path(config.runs or f"{config.paths.runs}/{default}")
     for file in _written(config, runs, Path(config.out or runs / "results")):
         print(f"written: {file}")
 
 
+def _folders(runs) -> list[str]:
+    """List the runs named by ``runs``: a folder, a pattern, or a list of them."""
+    named = [] if runs is None else [runs] if isinstance(runs, str) else list(runs)
+    if not named:
+        raise ValueError("runs: expected folders of runs, but got none; set runs=[FOLDER,FOLDER]")
+    return [folder for one in named for folder in sorted(glob(str(one))) or [str(one)]]
+
+
+def _table(config, folders: list[str]) -> str:
+    """Return the table of ``kind=compare`` or ``kind=limits``."""
+    if config.kind == "compare":
+        from forewarp.report.compare import compare
+
+        return compare(folders).plain()
+    if type(config.views) is not int or config.views < 1:
+        raise ValueError(f"views: expected a whole number > 0, but got {config.views}")
+    from forewarp.runs.config import saved_config
+
+    saved = [saved_config(folder, config, "runs") for folder in folders]
+    # These load torch; mistakes have been answered before.
+    from forewarp.evaluation.limits import limits_of, limits_table
+    from forewarp.progress import Counted
+    from forewarp.runs.build import build_run
+
+    rows = []
+    with Counted("runs") as progress:
+        try:
+            for one in saved:
+                rows.append(limits_of(build_run(one), config.views))
+                progress(len(rows), len(saved))
+        except Exception:  # each row takes minutes: those that there are must not be lost
+            if rows:
+                print(limits_table(rows))
+            raise
+    return limits_table(rows)
+
+
 def _written(config, runs: Path, out: Path) -> list[Path]:
-    """The files of the page of this kind."""
+    """Write the page of this kind and return its files."""
     from forewarp.report.accuracy_time import write_accuracy_time
     from forewarp.report.curve import OTHERS, read_published
     from forewarp.report.effects import write_effects
@@ -62,22 +114,8 @@ def _written(config, runs: Path, out: Path) -> list[Path]:
     return write_accuracy_time(runs, out, target=config.target, published=published)
 
 
-def draw_run(folder: Path) -> None:
-    """Draw a run's own curve into ``accuracy_time.png``, where it has one."""
-    from forewarp.report import curve
-    from forewarp.report.collect import read_curve
-
-    points = read_curve(folder)
-    if not points:
-        return
-    try:
-        print(f"curve    {curve.draw_run(folder / 'accuracy_time.png', points, folder.name)}")
-    except ImportError as error:
-        print(f"without accuracy_time.png: {error}")
-
-
 def main() -> None:
-    """The console script."""
+    """Run the console script."""
     command("report", report, HELP)
 
 

@@ -6,34 +6,34 @@ from forewarp.cli.entry import command
 
 HELP = """
 forewarp-synthesize writes a procedural brick vehicle whose arm lifts, whose rubber band stretches and whose
-ball bounces, with exact point trajectories, in one of four layouts. Equal keys give equal files, whatever the
-number of processes.
+ball bounces, with exact point trajectories, in the format of one of four datasets. The files depend on the
+keys alone, not on the number of processes.
 
   forewarp-synthesize                                data/vehicle in the project
   forewarp-synthesize folder=scenes/large size=400 frames=100
   forewarp-synthesize dataset=lego_complete          three scenes at full size: minutes, 0.9 GB
 
 What one types most:
-  dataset=dnerf          one scene, a random camera a time, exact depth
+  dataset=dnerf          one scene, a random camera for each time, exact depth
           lego_complete  three scenes with 200 + 197 + 50 test views and exact depth: a counterpart of the
                          paper's data, not the authors' files
           hypernerf      two phones on a rig in a textured room: lens distortion, no alpha, static points
           nhr            20 cameras of two image sizes around it: masks, point clouds
   folder=FOLDER          the scene's own folder
-  size=N frames=N seed=N pixels a side or across, times, cameras
+  size=N frames=N seed=N pixels, times, random cameras
   motion=lift|lift_tilt|drive      how it moves; motions=[...] for lego_complete
   test_views=[10,10,10]            dnerf: at training times, between them, at the canonical time
   test_views=[4,4,50]              lego_complete: a training time, steps between two of them, canonical
   samples_per_pixel=N              rays averaged into a pixel
-  workers=N                        processes; left out: one a processor where there is enough to do
-  overwrite=true                   replace the scene that is there
+  workers=N                        processes; left out: one for each processor if there is enough to do
+  overwrite=true                   replace the scene in the folder
 
 Train on it: forewarp-train data=dnerf data.root=scenes data.scene=large
 """
 
 
 def synthesize(config) -> None:
-    """Write the scene."""
+    """Write a procedural scene."""
     from pathlib import Path
 
     from omegaconf import OmegaConf
@@ -50,17 +50,17 @@ def synthesize(config) -> None:
     if folder.is_dir() and any(folder.iterdir()) and not (is_scene and overwrite):
         advice = "set overwrite=true or folder=..." if is_scene else "set folder=..."
         raise ValueError(f"{folder}: expected a new or empty folder, but got one with files; {advice}")
-    # These load torch; what is mistyped has been answered before.
-    from forewarp.cli.measure import Progress
-    from forewarp.cli.synthetic import write_whole
+    # These load torch; mistakes have been answered before.
+    from forewarp.progress import Counted
+    from forewarp.synth.module import write_whole
 
-    with Progress("images") as progress:
+    with Counted("images") as progress:
         write_whole(folder, dataset, arguments, workers=workers, progress=progress)
     print(f"written: {folder}")
 
 
 def main() -> None:
-    """The console script."""
+    """Run the console script."""
     command("synthesize", synthesize, HELP)
 
 

@@ -12,117 +12,121 @@ test views. The same command run again skips what is finished and goes on with w
   forewarp-train experiment=demo                     the same in about a minute
   forewarp-train experiment=dnerf data.root=../data/dnerf data.scene=hook budget.minutes=5
 
-What one types most (options such as --multirun or --config-dir=FOLDER stand before all of it):
+What one types most (options such as --multirun or --config-dir=FOLDER come first):
   data.root=FOLDER data.scene=NAME    where the scenes are, and which one
-  preset=demo|fast|faithful           the method's numbers: small, cheap (the default), as printed
+  preset=demo|fast|faithful           the method's numbers: small, cheap (the default), as in the paper
   budget.minutes=N                    of training, all stages together
-  budget.iterations=N                 the same in steps; with both, what comes first (null switches one off)
-  model=forward|backward|tnerf        the paper's method, its opponent, a network that is told the time
-  model/view=none|sh|mlp              (and every other effect) switched by a word
-  seed=N                              of everything random
-  trainer=cpu|gpu|auto                where
-  resume=FOLDER                       go on with the run there; nothing else need be typed
+  budget.iterations=N                 the same in steps; the first that is reached ends training
+  model=forward|backward|tnerf|particles   the paper's method (default), its opponent, a network, Gaussians
+  model/view_dependence=none|sh|mlp   switch an effect; all others work alike
+  stage.NAME.lr.GROUP=RATE            a learning rate; groups: density, color, shading, grid, flow, network
+  seed=N                              of all random numbers
+  trainer=cpu|gpu|auto                the device
+  resume=FOLDER                       go on with the run in a folder; no other override is needed
   trust=[PACKAGE]                     beside resume=: code of other packages that the run's config may name
-  score=psnr|ssim|ms_ssim|...         what a job of --multirun returns, of views that nothing learns from
-  sentinel.skip=N                     leave out up to N steps of a stage that are not finite, and count them
-  run=FOLDER                          where the run lives (runs/<scene>/<model>-<preset>-seed<seed>)
+  score=psnr|ssim|ms_ssim|...         metric that a job of --multirun returns, on views not trained on
+  sentinel.skip=N                     skip up to N steps of a stage whose numbers are not finite
+  run=FOLDER                          the run's folder (runs/<scene>/<model>-<preset>-seed<seed>)
   effects=auto                        find out what the scene calls for, then fit that: see forewarp-plan
-  plan=FILE                           as a plan says; what is typed beside it wins
-  evaluate=false                      no test views at the end
-  data.held_out=N                     set N training views aside: a curve of their PSNR against training time
-  variant=NAME                        one change against preset=fast, as the price list has it
-  scene=DATASET_NAME                  as scene=dnerf_hook: a scene of the paper below paths.scenes=FOLDER
-  ablation=NAME                       what the paper takes away, from ablation=full
-  launcher=local|joblib|ray|slurm|submitit   of --multirun: where its jobs run
+  plan=FILE                           fit what a plan says; an override typed beside it wins
+  evaluate=false                      do not measure at the end
+  data.held_out=N                     hold N training views out and record their PSNR against training time
+  scene=DATASET_NAME                  a scene of the paper below paths.scenes=FOLDER, such as scene=dnerf_hook
+  ablation=NAME                       an ablation of the paper; ablation=full is its whole method
+  launcher=local|joblib|ray|slurm|submitit   where the jobs of --multirun run
   ~stage.fine                         drop a stage
   --multirun seeds=3                  one run after another; --multirun sweeps=methods: a prepared sweep
-  --multirun sweeps=accuracy_time variant=base,unet_16 seeds=2      what choices cost: see forewarp-report
+  --multirun sweeps=accuracy_time preset.rays=1024,2048    what choices cost; see forewarp-report
+  --multirun sweeps=price_list seeds=2                     the same for every choice, one at a time
 
-A run's folder holds config.yaml, a folder a stage (checkpoint, handover.json, TensorBoard events, images),
-images/ of the test views, per_image.json and metrics.json; where there are views that nothing learns from
-(data.held_out, or validation views) also accuracy_time.csv and accuracy_time.png.
+A run's folder holds config.yaml, a folder for each stage (checkpoint, handover.json, TensorBoard events,
+images), images/ of the test views, per_image.json and metrics.json. With data.held_out or validation views it
+also holds accuracy_time.csv and accuracy_time.png.
 Watch: tensorboard --logdir runs
 """
 
 
 def train(config) -> float | None:
-    """Fit what is not finished, then measure what was not; returns the score, where one is wanted."""
-    from forewarp.cli.absent import refuse_absent
-    from forewarp.cli.identity import claim, hashed, resumed
-    from forewarp.cli.trusted import check_planned, trust_of
+    """Fit the stages that are not finished and measure the run; return its score if one is asked for."""
+    from forewarp.cli.checks import refuse_missing_scene, refuse_renamed_keys, refuse_seeds, refuse_two_models
+    from forewarp.runs.config import claim, hashed, resumed
+    from forewarp.runs.trust import check_planned, trust_of
 
+    refuse_renamed_keys(config)
     refuse_seeds(config)
     refuse_two_models(config)
     trust = trust_of(config.get("trust"))
     if config.get("planned") is not None:
         check_planned(config, trust)
     if config.get("score") not in (None, "psnr"):
-        from forewarp.cli.score import named
+        from forewarp.runs.score import named
 
         named(config.score)
     config = resumed(config)
-    refuse_absent(config)
-    # These load torch; what is mistyped has been answered before.
-    from forewarp.cli.claims import alone, same_data
-    from forewarp.cli.measure import measure
-    from forewarp.cli.report import draw_run
-    from forewarp.cli.runs import build_run, is_measured
-    from forewarp.cli.score import Score
+    refuse_missing_scene(config)
+    # These load torch; mistakes have been answered before.
+    from forewarp.report.curve import draw_own
+    from forewarp.runs.build import build_run, is_measured, measure_run
+    from forewarp.runs.data_check import check_data
+    from forewarp.runs.lock import locked
+    from forewarp.runs.score import Score
 
     config = hashed(planned(config))
-    run = build_run(config)
-    if skips(run, config.get("absent", "refuse")):
+    run, changed = build_run(config), config.get("data_changed", "refuse")
+    if is_skipped(run, config.get("absent", "refuse")):
         print(f"skipped: {run.datamodule.place}: no such scene")
         return None
     if config.evaluate and is_measured(run):
-        with alone(run.folder):
+        with locked(run.folder):
             claim(config, finished=True)
-            same_data(run, config.get("data_changed", "refuse"))
+            check_data(run, changed)
             print(f"measured before: {run.folder}; again with forewarp-evaluate run={run.folder}")
             return Score(run, config).of()
     run.datamodule.setup("fit")  # before the folder is made: a mistyped scene leaves nothing behind
     score = Score(run, config)
-    with alone(run.folder):
+    with locked(run.folder):
         claim(config)
-        same_data(run, config.get("data_changed", "refuse"))
+        check_data(run, changed)
         keep_plan(config)
         print(beginning(run, config), flush=True)
         module = run.fit()
         if config.evaluate:
-            measure(run, module, config)
+            measure_run(run, module, config)
         else:
             print(f"fitted: {run.folder}; measure it with forewarp-evaluate run={run.folder}")
-        draw_run(run.folder)
+        draw_own(run.folder)
         value = score.of(module)
-    tell_skipped(run)
+    for name, noted in run.finished().items():
+        if steps := noted.get("skipped_steps"):
+            print(f"{name}: {steps} broken steps skipped; each lies in {run.folder / name / 'broken'}")
     return value
 
 
 def planned(config):
-    """With ``effects=auto`` the config of the run that a plan says, made now where there is none yet."""
+    """With ``effects=auto``: make or read the plan, and return the config of the run that it says."""
     choice = config.get("effects", "given")
     if choice not in ("given", "auto"):
         raise ValueError(f"effects: expected given or auto, but got {choice}")
     if choice == "given" or config.get("resume") is not None:
         return config
-    from forewarp.cli.plan_file import own_folder, tell
-    from forewarp.cli.planning import make_plan
-    from forewarp.cli.runs import build_run
-    from forewarp.cli.trials import composed
-    from forewarp.cli.words import merged, of_what_is_on, typed_words
+    from forewarp.planning.plan import make_plan
+    from forewarp.planning.plan_file import own_folder, show_plan
+    from forewarp.planning.trials import composed
+    from forewarp.runs.build import build_run
+    from forewarp.runs.overrides import merged, typed_overrides, without_switched_off
 
-    if skips(build_run(config), config.get("absent", "refuse")):
+    if is_skipped(build_run(config), config.get("absent", "refuse")):
         return config
-    made = make_plan(config, typed_words())
-    tell(made, to_fit=False)
-    words = typed_words(all_of_them=True)
-    config = composed(of_what_is_on(merged([*made["words"], *own_folder(words)], words)))
+    made = make_plan(config, typed_overrides())
+    show_plan(made, to_fit=False)
+    typed = typed_overrides(of_sweep=True)
+    config = composed(without_switched_off(merged([*made["overrides"], *own_folder(typed)], typed)))
     config.planned = made["file"]
     return config
 
 
 def keep_plan(config) -> None:
-    """Put the plan that a run follows into its folder."""
+    """Copy the plan that a run follows into its folder."""
     from pathlib import Path
     from shutil import copyfile
 
@@ -130,47 +134,9 @@ def keep_plan(config) -> None:
         copyfile(config.planned, Path(config.run) / "plan.yaml")
 
 
-def refuse_seeds(config) -> None:
-    """Refuse ``seeds=`` where nothing repeats the run, or where a sweeper would search among them."""
-    from hydra.core.hydra_config import HydraConfig
-    from hydra.types import RunMode
-
-    alone = not (HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN)
-    if alone and config.get("seeds", 1) != 1:
-        raise ValueError(f"seeds: expected --multirun beside seeds={config.seeds}; add it, or use seed=N")
-    if not alone and "_optuna_" in str(HydraConfig.get().sweeper.get("_target_")):
-        swept = str((HydraConfig.get().sweeper.get("params") or {}).get("seed", ""))
-        if config.get("seeds", 1) != 1:
-            raise ValueError(f"seeds: expected 1 of a search, but got {config.seeds}; use seed=N")
-        if swept.startswith("range"):
-            raise ValueError(
-                "hydra.sweeper.params.seed: expected one seed, as this sweeper would search among several, "
-                f"but got {swept}; add hydra.sweeper.params.seed=0"
-            )
-
-
-def refuse_two_models(config) -> None:
-    """Refuse a variant or an ablation of another method, and ``variant=backward`` beside an ablation."""
-    from hydra.core.hydra_config import HydraConfig
-
-    chosen = HydraConfig.get().runtime.choices if HydraConfig.initialized() else {}
-    both = chosen.get("variant") == "backward" and chosen.get("ablation") is not None
-    if both and config.model.name != "backward":
-        raise ValueError(
-            f"variant: expected none beside ablation={chosen.get('ablation')}, which is of model=forward, "
-            "but got backward; leave one of them out, or use model=backward"
-        )
-    known = config.get("variant") or {}
-    if config.model.name not in known.get("of", [config.model.name]):
-        raise ValueError(
-            f"model: expected {' or '.join(known.of)}, which {known.name} is a change of, but got "
-            f"{config.model.name}; leave one of them out"
-        )
-
-
 def beginning(run, config) -> str:
-    """What is about to be trained, on what, and where it goes: two lines."""
-    from forewarp.cli.measure import device_of
+    """Say in two lines what is about to be trained, on what device, and into which folder."""
+    from forewarp.training.device import device_of
 
     scene, device = run.datamodule.scene, device_of(config.trainer.accelerator).type.upper()
     views = f"{_images(scene.train, 'training')} and {_images(scene.test, 'test')}"
@@ -184,8 +150,8 @@ def _images(frames, kind: str) -> str:
     return f"{len(frames)} {kind} images" + (f" ({size})" if size else "")
 
 
-def skips(run, absent: str) -> bool:
-    """Whether a job of a sweep is left out, as its scene is not there; what makes its own scene never is."""
+def is_skipped(run, absent: str) -> bool:
+    """Skip this sweep job if its scene is missing; synthetic scenes are never skipped."""
     if absent not in ("refuse", "skip"):
         raise ValueError(f"absent: expected refuse or skip, but got {absent}")
     if absent == "refuse" or hasattr(run.datamodule, "prepare"):
@@ -193,15 +159,8 @@ def skips(run, absent: str) -> bool:
     return run.datamodule.place is not None and not run.datamodule.place.is_dir()
 
 
-def tell_skipped(run) -> None:
-    """Say of every stage how many steps were left out, where any were."""
-    for name, noted in run.finished().items():
-        if steps := noted.get("skipped_steps"):
-            print(f"{name}: {steps} broken steps skipped; each lies in {run.folder / name / 'broken'}")
-
-
 def main() -> None:
-    """The console script."""
+    """Run the console script."""
     command("train", train, HELP)
 
 

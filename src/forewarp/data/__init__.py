@@ -1,1 +1,1 @@
-"""One file a format, each a reader and its writer, and the module that serves rays."""
+"""Read and write datasets, one file per format, and serve batches from them."""

@@ -1,4 +1,4 @@
-"""What training and evaluation draw from a scene: an endless stream of batches, and whole images."""
+"""Draw from a scene: an endless stream of batches to train on, whole images to evaluate on."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ COLORS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 
 
 def color_of(background: str) -> Tensor:
-    """The constant background colour (3,) of a name: white or black."""
+    """Look up the background colour (3,) white or black."""
     if background not in COLORS:
         raise SceneError(f"data.eval_background: expected white or black, but got {background!r}")
     return torch.tensor(COLORS[background])
@@ -29,7 +29,7 @@ def pixels_of(frame: Frame) -> Tensor:
     """Load a frame's picture.
 
     Raises:
-        SceneError: where its reader gave something else than a uint8 tensor (H, W, 4) of the camera's size.
+        SceneError: unless its reader gives a uint8 tensor (H, W, 4) of the camera's size.
     """
     rgba, shape = frame.load(), (frame.camera.height, frame.camera.width, 4)
     if not (isinstance(rgba, Tensor) and rgba.dtype == torch.uint8 and tuple(rgba.shape) == shape):
@@ -39,15 +39,14 @@ def pixels_of(frame: Frame) -> Tensor:
 
 
 class Sampler(IterableDataset):
-    """An endless stream of training batches over a background, of what a method ``asks`` for.
+    """An endless stream of training batches, of what a method ``asks`` for.
 
-    ``picker()`` says which frame comes next, an index into ``scene.train``; None picks uniformly. Of single
-    pixels there are ``rays`` in a batch. With ``views_per_step`` above 1 the batch also sees up to so many
-    other frames of the picked one's time, at random, and pixels are shared out among them: one snapshot
-    serves them all. ``background`` is white, black or random: a colour a pixel (a picture or a crop has one
-    for all of it), drawn at each step. A pixel without alpha is opaque, so a random colour behind it only
-    says that its ray must not let anything through.
-    A second ``iter`` goes on where the first stopped; ``state_dict`` holds all there is to continue exactly.
+    ``picker()`` chooses the next frame, an index into ``scene.train``; None picks uniformly. A batch of
+    single pixels has ``rays`` of them. If ``views_per_step`` is above 1, the rays are divided among up to
+    that many random frames of the picked frame's time, so one snapshot serves them all. ``background`` is
+    white, black or random: a colour per pixel, or one for a whole picture or crop, drawn at each step. An
+    image without alpha hides the colour, so a random one penalises transparency in the rendering. A second
+    ``iter`` goes on where the first stopped; ``state_dict`` holds what an exact continuation needs.
 
     Cost: linear in the pixels, below 2 ms for 8192; a frame is decoded when it is first picked, and kept
     while there is room.
@@ -87,7 +86,7 @@ class Sampler(IterableDataset):
         return sys.maxsize
 
     def draw(self) -> Batch:
-        """The next batch."""
+        """Draw the next batch."""
         index = self._uniform() if self.picker is None else int(self.picker())
         if not 0 <= index < len(self.frames):
             raise ValueError(f"picker: expected a training frame in [0, {len(self.frames)}), but got {index}")
@@ -98,19 +97,19 @@ class Sampler(IterableDataset):
         return Batch(tuple(drawn), index, self._instant(index))
 
     def restart(self, number: int) -> None:
-        """Draw from the beginning of stream ``number``; 0 is the one that is drawn from at first."""
+        """Start random stream ``number`` from its beginning; the first stream is 0."""
         self._generator.manual_seed(self.seed + number)
 
     def state_dict(self) -> dict[str, Tensor]:
-        """The random generator's state."""
+        """Save the random generator's state."""
         return {"generator": self._generator.get_state()}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Continue where ``state_dict`` was taken."""
+        """Continue where ``state_dict`` was saved."""
         self._generator.set_state(state["generator"].cpu())
 
     def _views(self, index: int) -> list[int]:
-        """The picked frame, and others of its time where a batch may have them."""
+        """Choose a batch's frames: the picked one; if ``views_per_step`` > 1, also others of its time."""
         others = [i for i in self._of_time[self.frames[index].time] if i != index]
         if self.views_per_step == 1 or not others:
             return [index]
@@ -118,7 +117,7 @@ class Sampler(IterableDataset):
         return [index, *(others[i] for i in order[: self.views_per_step - 1].tolist())]
 
     def _neighbours(self, time: float) -> list[int]:
-        """A frame of each of the nearest other times, where the method asks for such: nearest first."""
+        """Choose a frame of each of the nearest other times that the method asks for, nearest first."""
         if not self.asks.neighbours:
             return []
         near = sorted((t for t in self._times if t != time), key=lambda other: abs(other - time))
@@ -126,7 +125,7 @@ class Sampler(IterableDataset):
         return [frames[self._whole(len(frames))] for frames in chosen]
 
     def _pixels(self, frames: list[int]) -> Iterator[Observation]:
-        """Random pixels, shared out among frames."""
+        """Draw random pixels, shared out among frames."""
         counts = [self.rays // len(frames) + (i < self.rays % len(frames)) for i in range(len(frames))]
         views = []
         for index, count in zip(frames, counts, strict=True):
@@ -140,7 +139,7 @@ class Sampler(IterableDataset):
             yield self._observed(index, view, background)
 
     def _areas(self, frames: list[int]) -> Iterator[Observation]:
-        """A crop or the whole of each frame, over one colour."""
+        """Draw a crop or the whole of each frame, over one colour."""
         for index in frames:
             camera, side = self.frames[index].camera, self.asks.side
             view = View(camera)
@@ -151,7 +150,7 @@ class Sampler(IterableDataset):
             yield self._observed(index, view, self._behind(1)[0])
 
     def _instant(self, index: int) -> tuple[Observation, ...]:
-        """Whole pictures of the picked time over white, the picked one first."""
+        """Take whole pictures of the picked time over white, the picked one first."""
         if not self.asks.instant:
             return ()
         others = [i for i in self._of_time[self.frames[index].time] if i != index]
@@ -162,11 +161,12 @@ class Sampler(IterableDataset):
     def _observed(self, index: int, view: View, background: Tensor) -> Observation:
         frame, rows = self.frames[index], view.indices
         rgba = pixels_of(frame).reshape(-1, 4)
-        rgb = composited(rgba if rows is None else rgba[rows], background)
+        rgba = rgba if rows is None else rgba[rows]
+        rgb = rgba if self.asks.straight else composited(rgba, background)
         return Observation(Moment(frame.time, index, frame.camera_id), view, rgb, background)
 
     def _behind(self, count: int) -> Tensor:
-        """Colours (count, 3) behind pixels."""
+        """Choose colours (count, 3) behind pixels."""
         if self.background != "random":
             return color_of(self.background).expand(count, 3)
         return torch.rand(count, 3, generator=self._generator)
@@ -185,7 +185,7 @@ class Targets(Sequence[Target]):
         self, frames: Sequence[Frame], background: Tensor, has_alpha: bool, *, trained: bool = False
     ) -> None:
         self.frames, self.background, self.has_alpha = frames, background, has_alpha
-        self.trained = trained  # all training frames in their order, so that a frame's place is its index
+        self.trained = trained  # ``frames`` are all training frames in order: a target's place is its index
 
     def __len__(self) -> int:
         return len(self.frames)

@@ -1,4 +1,4 @@
-"""Decoded images kept in a bounded share of the memory, whatever scene they belong to."""
+"""Keep decoded images of all scenes within a bounded amount of memory."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ from forewarp.scene.errors import SceneError
 
 
 class ImageCache:
-    """Keeps what was made for an owner as long as the owner lives and the sum of all stays below ``limit``
-    bytes; what was not asked for the longest goes first. What is larger than ``limit`` is never kept.
+    """Keep a tensor for each owner while the owner lives and all together take at most ``limit`` bytes.
+
+    The least recently used goes first. What is larger than ``limit`` is never kept.
 
     >>> import torch
     >>> class Owner: pass
@@ -29,14 +30,14 @@ class ImageCache:
         self.bytes, self.limit = 0, limit
 
     def get(self, owner: object, make: Callable[[], Tensor]) -> Tensor:
-        """What ``make`` gives, remembered for ``owner``; treat it as read-only."""
+        """Give what is kept for ``owner``, or make and keep it; treat it as read-only."""
         key = id(owner)
         if key in self._kept:
             self._kept.move_to_end(key)
             return self._kept[key][1]
         made = make()
         if made.nbytes <= self.limit:
-            # The owner's end frees its image at once; until then nothing else can have the same id.
+            # Freed as soon as the owner dies; until then no other object can have its id.
             self._kept[key] = (weakref.ref(owner, lambda _: self._drop(key)), made)
             self.bytes += made.nbytes
             self._shrink()

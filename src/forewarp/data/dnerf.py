@@ -1,7 +1,7 @@
 """D-NeRF scenes (Blender style): one folder with ``transforms_<split>.json`` and RGBA images.
 
-A pose on disk is camera-to-world with OpenGL's axes (x right, y up, looking along -z); its y and z columns
-are negated on the way in and out. Beside the stock ``transforms_test.json`` a scene may bring one file per
+A pose on disk is camera-to-world with OpenGL's axes (x right, y up, looking along -z); reading and writing
+negate its y and z columns. Beside the stock ``transforms_test.json`` a scene may bring one file per
 ability (``transforms_test_space.json``, ``..._time.json``, ``..._canonical.json``), exact ray depth
 (``depth_file_path``: float32 .npy, or 16-bit PNG times the file's ``depth_scale``, 0 = background) and
 ``trajectories.npz`` (``points`` (N, T, 3), ``times`` (T,)). ``test_space/transforms.json`` serves as well.
@@ -9,7 +9,6 @@ ability (``transforms_test_space.json``, ``..._time.json``, ``..._canonical.json
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from collections.abc import Iterable, Mapping, Sequence
@@ -21,10 +20,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from forewarp.data.files import MARKERS, frames_of, inside, number, read_json, replace_file, scene_folder
+from forewarp.data.arrays import StoredDepth, read_truth, write_array, write_truth
+from forewarp.data.files import MARKERS, frames_of, inside, number, read_json, scene_folder
+from forewarp.data.geometry import FLIP, box_of, check_range, frustum_box, pose_of
 from forewarp.data.images import CachedImage, common_header, write_png
-from forewarp.data.truth import StoredDepth, read_truth, write_depth, write_truth
-from forewarp.data.views import FLIP, box_of, check_range, frustum_box, pose_of
+from forewarp.files import write_json
 from forewarp.scene.camera import Camera
 from forewarp.scene.errors import SceneError
 from forewarp.scene.frame import Frame, Scene, Truth
@@ -35,7 +35,7 @@ _PUBLISHED_WIDTH = 400
 
 @dataclass(frozen=True)
 class Shot:
-    """One image to write: ``pose`` (4, 4) camera-to-world with OpenCV's axes, ``rgba`` uint8 (H, W, 4)
+    """An image to write: ``pose`` (4, 4) camera-to-world with OpenCV's axes, ``rgba`` uint8 (H, W, 4)
     straight alpha, ``depth`` (H, W) ray depth in world units (0 = background), ``time`` in [0, 1].
     """
 
@@ -49,7 +49,7 @@ class Shot:
 
 @dataclass(frozen=True)
 class _Record:
-    """One checked entry of a transforms file; the pose has OpenCV's axes, ``angle`` is the field of view."""
+    """A checked entry of a transforms file; the pose has OpenCV's axes, ``angle`` is the field of view."""
 
     name: str
     time: float
@@ -108,12 +108,12 @@ def write_scene(
 ) -> None:
     """Write a scene that ``read_scene`` reads; each file appears whole or not at all.
 
-    A scene already in ``folder`` is replaced: its transforms go first and the new ones come last, so that a
-    run cut short leaves nothing that reads well and is wrong.
+    A scene already in ``folder`` is replaced: its transforms are removed first and written last, so that an
+    interrupted call leaves nothing that could be read by mistake.
 
     Args:
         splits: ``train``, ``test`` and perhaps ``val``, any iterables of shots, consumed one by one. Test
-            shots go to one transforms file per ability, or to the stock file where they have none ("all").
+            shots go to one transforms file per ability, or to the stock file where it is "all".
         camera_angle_x: horizontal field of view, radians.
         trajectories: exact point trajectories, the canonical time first.
     """
@@ -133,11 +133,11 @@ def write_scene(
         write_truth(folder / "trajectories.npz", trajectories)
     for part, frames in files.items():
         content = {"camera_angle_x": float(camera_angle_x), "frames": list(frames.values())}
-        replace_file(folder / f"transforms_{part}.json", json.dumps(content, indent=1).encode())
+        write_json(folder / f"transforms_{part}.json", content)
 
 
 def _read_split(folder: Path, split: str) -> list[_Record]:
-    """The records of a split; ``val`` may be absent, ``test`` may be one file per ability."""
+    """Read the records of a split; ``val`` may be absent, ``test`` may be one file per ability."""
     stock = folder / f"transforms_{split}.json"
     files = {stock: "all"} if stock.is_file() else {}
     if split == "test":
@@ -153,7 +153,7 @@ def _read_split(folder: Path, split: str) -> list[_Record]:
 
 
 def _ability_files(folder: Path, ability: str) -> list[Path]:
-    """The transforms file of an ability, beside the others or in its folder; none where there is none."""
+    """Find the transforms file of an ability, beside the others or in its folder, if there is one."""
     places = folder / f"transforms_test_{ability}.json", folder / f"test_{ability}" / "transforms.json"
     return [path for path in places if path.is_file()][:1]
 
@@ -242,6 +242,6 @@ def _write_shot(folder: Path, split: str, shot: Shot, files: dict, size: tuple[i
     entry["transform_matrix"] = pose.tolist()
     write_png(folder / f"{path}.png", shot.rgba)
     if shot.depth is not None:
-        write_depth(folder / f"{path}_depth.npy", shot.depth)
+        write_array(folder / f"{path}_depth.npy", shot.depth)
         entry["depth_file_path"] = f"{path}_depth.npy"
     files[part][path] = entry

@@ -1,51 +1,58 @@
-"""Reading and writing the small files of a dataset, with errors that name file and key."""
+"""Read the small files of a dataset and check what they hold; errors name file and key."""
 
 from __future__ import annotations
 
-import errno
-import json
 import math
 import operator
 import os
-import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from reprlib import repr as short
+from typing import BinaryIO
 from unicodedata import category
 
+from forewarp.files import MOST_BYTES, check_size, load_json
 from forewarp.scene.errors import SceneError
 
-MOST_TEXT = 1 << 26  # bytes: what is parsed takes up to thirty times as much memory
 MOST_FRAMES = 1_000_000
-MARKERS = {  # by the reader: the file that every scene of its format has
+MARKERS = {  # by reader: the file that every scene of its format has
     "dnerf": "transforms_train.json",
     "lego_complete": "transforms_train.json",
     "hypernerf": "dataset.json",
     "nhr": "CamPose.inf",
     "posed_video": "transforms.json",
 }
-_UNPRINTABLE = {"Cc", "Cs", "Zl", "Zp"}  # controls, halves of characters, separators of lines
+_UNPRINTABLE = {"Cc", "Cs", "Zl", "Zp"}  # control characters, surrogates, line and paragraph separators
 
 
-def read_bytes(path: Path, most: int = MOST_TEXT, what: str = "a readable file") -> bytes:
-    """What a file holds; nothing is read of one that is larger than ``most`` bytes, or no file but a pipe.
+@contextmanager
+def opened(path: Path, most: int = MOST_BYTES, what: str = "a readable file") -> Iterator[BinaryIO]:
+    """Open a regular file of at most ``most`` bytes.
 
     Raises:
         SceneError: where it cannot be read, naming ``what`` was expected.
     """
     try:
-        about = path.stat()
-        if not stat.S_ISREG(about.st_mode):
-            got = os.strerror(errno.EISDIR) if stat.S_ISDIR(about.st_mode) else "a device or a pipe"
-            raise SceneError(f"{path}: expected {what}, but got {got}")
-        if about.st_size > most:
-            raise SceneError(f"{path}: expected at most {most} bytes, but got {about.st_size}")
-        return path.read_bytes()
+        check_size(path, most)
+        with path.open("rb") as stream:
+            yield stream
+    except SceneError:
+        raise
     except OSError as error:
         raise SceneError(f"{path}: expected {what}, but got {error.strerror or error}") from error
+    except ValueError as error:
+        raise SceneError(str(error)) from error
+
+
+def read_bytes(path: Path, most: int = MOST_BYTES, what: str = "a readable file") -> bytes:
+    """Read a file; SceneError as ``opened``."""
+    with opened(path, most, what) as stream:
+        return stream.read()
 
 
 def frames_of(content: dict, path: Path) -> list:
-    """The list ``frames`` of a file, which has from one to a million entries."""
+    """Check the list ``frames`` of a file, which has from one to a million entries."""
     frames = content.get("frames")
     if not isinstance(frames, list) or not frames:
         raise SceneError(f"{path}: frames: expected a list of at least one frame, but got {short(frames)}")
@@ -55,34 +62,21 @@ def frames_of(content: dict, path: Path) -> list:
 
 
 def read_json(path: Path) -> dict:
-    """The object a JSON file holds.
+    """Read the object of a JSON file.
 
     Raises:
         SceneError: where the file is missing, too large, does not parse (with the line) or holds no object.
     """
     try:
-        content = json.loads(read_bytes(path).decode())
-    except SceneError:  # which is a ValueError too
-        raise
-    except json.JSONDecodeError as error:
-        raise SceneError(f"{path}: line {error.lineno}: expected JSON, but got {error.msg}") from error
-    except (ValueError, RecursionError) as error:  # bytes that are no text, absurd numbers or nesting
-        raise SceneError(f"{path}: expected JSON, but got {short(str(error))}") from error
-    if not isinstance(content, dict):
-        raise SceneError(f"{path}: expected a JSON object at the top, but got {type(content).__name__}")
-    return content
-
-
-def replace_file(path: Path, content: bytes) -> None:
-    """Write a file so that nobody ever sees half of it: beside its place first, then renamed."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".partial")
-    partial.write_bytes(content)
-    os.replace(partial, path)
+        return load_json(path)
+    except OSError as error:
+        raise SceneError(f"{path}: expected a readable file, but got {error.strerror or error}") from error
+    except ValueError as error:
+        raise SceneError(str(error)) from error
 
 
 def number(value: object, where: str, low: float = -math.inf, high: float = math.inf) -> float:
-    """A finite number of a file, ``low <= value <= high``; ``where`` names file and key.
+    """Check a finite number, ``low <= value <= high``; ``where`` names file and key.
 
     >>> number(1, "a.json: time", 0, 1)
     1.0
@@ -97,8 +91,34 @@ def number(value: object, where: str, low: float = -math.inf, high: float = math
     return float(value)
 
 
+def numbers_of(words: list[str], count: int, where: str) -> list[float]:
+    """Parse ``count`` finite numbers of a line of text.
+
+    >>> numbers_of(["1", "2.5"], 2, "a.txt: line 1")
+    [1.0, 2.5]
+    """
+    try:
+        values = [float(word) for word in words]
+    except ValueError:
+        values = None
+    if values is None or len(values) != count or not all(map(math.isfinite, values)):
+        got = f"{len(words)} values" if values and len(values) != count else repr(" ".join(words))[:60]
+        raise SceneError(f"{where}: expected {count} finite numbers, but got {got}")
+    return values
+
+
+def numbers(
+    content: dict, key: str, count: int, path: Path, low: float = -math.inf, high: float = math.inf
+) -> list[float]:
+    """Check that a file holds ``count`` finite numbers, ``low <= value <= high``, under ``key``."""
+    values = content.get(key)
+    if not isinstance(values, list) or len(values) != count:
+        raise SceneError(f"{path}: {key}: expected {count} numbers, but got {short(values)}")
+    return [number(value, f"{path}: {key}[{i}]", low, high) for i, value in enumerate(values)]
+
+
 def whole(value: object, where: str, least: int, multiple: int = 1) -> int:
-    """A whole number of at least ``least`` that ``multiple`` divides; ``where`` names the key to set.
+    """Check a whole number of at least ``least`` that ``multiple`` divides; ``where`` names the key to set.
 
     >>> whole(16, "size", 8)
     16
@@ -114,10 +134,10 @@ def whole(value: object, where: str, least: int, multiple: int = 1) -> int:
 
 
 def inside(folder: Path, name: object, where: str) -> Path:
-    """The path ``name`` says, relative to ``folder``; leaving the folder is an error.
+    """Join a relative path to ``folder``; refuse one that leads out of it.
 
-    Judged by the text alone, so a folder may link to where its images really are. A backslash, which
-    elsewhere divides folders, is refused.
+    Judged by the text alone, so a folder may link to where its images really are. A backslash, which Windows
+    takes for a separator, is refused.
     """
     if not isinstance(name, str) or not name or any(category(c) in _UNPRINTABLE or c == "\\" for c in name):
         raise SceneError(f"{where}: expected a path inside the scene folder, but got {short(name)}")
@@ -128,10 +148,10 @@ def inside(folder: Path, name: object, where: str) -> Path:
 
 
 def scene_folder(root: str | Path, scene: str, marker: str) -> Path:
-    """The folder ``root/scene``, which must hold the file ``marker``.
+    """Find the folder ``root/scene``, which must hold the file ``marker``.
 
     Raises:
-        SceneError: with the scenes that are there, where this one is not.
+        SceneError: where there is none, naming the scenes that there are.
     """
     root = Path(root)
     if not root.is_dir():

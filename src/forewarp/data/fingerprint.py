@@ -1,4 +1,4 @@
-"""What a scene's files were when a run began."""
+"""Take a fingerprint of a scene's files, to notice that they changed since a run began."""
 
 from __future__ import annotations
 
@@ -6,28 +6,27 @@ import hashlib
 import os
 from pathlib import Path
 
-from forewarp.data.files import MOST_TEXT, read_bytes
+from forewarp.data.files import read_bytes
+from forewarp.files import MOST_BYTES
 
-_READ = {".json", ".inf", ".txt", ".csv"}  # small and decisive: their content counts
+_READ = {".json", ".inf", ".txt", ".csv"}  # small: their content counts
 RECORD = "synthesis.json"  # of every synthesised scene, or folder of them
 LOCK = ".lock"  # of every folder of a run
-_LISTED = {".png", ".jpg", ".jpeg", ".npy", ".npz", ".ply", ".obj"}  # name and size
+_LISTED = {".png", ".jpg", ".jpeg", ".npy", ".npz", ".ply", ".obj"}  # large: name and size count
 
 
 def fingerprint(folder: Path) -> dict:
-    """The scene's files in a few numbers: the SHA-256 of each text file by name, and of the list of names and
-    sizes of all others, with how many and how large these are together.
+    """Hash the scene's files: each text file by name, and the list of names and sizes of all others.
 
-    A text larger than any that is read is one of the others. Hidden files and those of other kinds do not
-    count, nor does the folder of a run, which may lie below the scene's. Symbolic links to files count as the
-    files.
+    Also counts the others and their bytes. A text too large to be read is one of them. Hidden files and other
+    kinds do not count, nor do runs in folders below the scene's. Symbolic links count as what they point to.
 
-    Cost: reads the text files; a look at every other one, about 5 microseconds.
+    Cost: reads the text files; about 5 microseconds for every other one.
     """
     texts, listed = {}, []
     for path in _files(folder):
         name, suffix, size = path.relative_to(folder).as_posix(), path.suffix.lower(), path.stat().st_size
-        if suffix in _READ and size <= MOST_TEXT:
+        if suffix in _READ and size <= MOST_BYTES:
             texts[name] = hashlib.sha256(read_bytes(path)).hexdigest()
         elif suffix in _READ | _LISTED:
             listed.append((name, size))
@@ -42,7 +41,7 @@ def fingerprint(folder: Path) -> dict:
 
 
 def difference(before: dict, now: dict) -> str | None:
-    """In a few words what two fingerprints differ in; None where they do not."""
+    """Say in a few words how two fingerprints differ; None if they are equal."""
     old, new = before.get("texts", {}), now["texts"]
     if changed := sorted(name for name in {*old, *new} if old.get(name) != new.get(name)):
         return ", ".join(changed[:3]) + (f" and {len(changed) - 3} more" if len(changed) > 3 else "")
@@ -57,7 +56,7 @@ def _files(folder: Path) -> list[Path]:
     for place, folders, names in os.walk(folder, followlinks=True):
         real = os.path.realpath(place)
         of_a_run = LOCK in names and Path(place) != folder
-        if real in been or of_a_run:  # been: a link in a circle
+        if real in been or of_a_run:  # links may form a circle
             folders.clear()
             continue
         been.add(real)

@@ -1,127 +1,108 @@
-"""Images on disk and in memory: checked, decoded once, halved, laid over a background."""
+"""Read, check and write images; halve them and lay them over a background."""
 
 from __future__ import annotations
 
 import io
-import struct
-import zlib
+import os
+import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
-import imageio.v3 as iio
 import numpy as np
 import torch
+from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
-from forewarp.data import jpeg
 from forewarp.data.cache import CACHE
-from forewarp.data.files import read_bytes, replace_file
+from forewarp.data.files import opened
+from forewarp.files import MOST_IMAGE, written_whole
 from forewarp.scene.errors import SceneError
 
-_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-_MOST_PIXELS = 80_000_000  # of a larger image the decoder warns
-_MOST_BYTES = 1 << 29
+_FORMATS = ("PNG", "JPEG")
+_MOST_PIXELS = 80_000_000  # Pillow warns a little above
+_JPEG_END, _JPEG_TAIL = b"\xff\xd9", 4096  # some cameras write a little behind the end
+_FOREGROUND = 127  # a mask above it is foreground; masks are lossy, so never quite 0 or 255
 
 
 @dataclass(frozen=True)
-class PngHeader:
-    """What a PNG says of itself: ``size`` is (width, height) in pixels."""
+class Header:
+    """What an image says of itself: ``size`` is (width, height) in pixels."""
 
     size: tuple[int, int]
     has_alpha: bool
 
 
-def inspect_png(path: Path) -> PngHeader:
-    """Size and kind of a PNG whose bytes are all there and unharmed; nothing is decoded.
+def inspect_image(path: Path) -> Header:
+    """Check that a PNG or JPEG is whole and of a kind that is read; decode nothing.
 
     Raises:
-        SceneError: where the file is missing, empty, truncated, harmed or not a PNG of 8 bits a channel.
+        SceneError: where the file is missing, empty, truncated, harmed, too large or of another kind.
 
-    Cost: one read of the file.
+    Cost: one read of a PNG, whose checksums are compared; two small reads of a JPEG, which has none.
     """
-    return _inspect(_bytes(path), path)
+    with opened(path, MOST_IMAGE, "an image") as stream:
+        return _inspect(stream, path)
 
 
-def common_header(paths: Iterable[Path]) -> PngHeader:
-    """The one size of all these PNGs; alpha where all of them have it.
+def common_header(paths: Iterable[Path]) -> Header:
+    """Check images that must have one size; alpha where all of them have it.
 
     Raises:
-        SceneError: where one is no good (see ``inspect_png``) or differs in size from the first.
+        SceneError: as ``inspect_image``, and where one differs in size from the first.
     """
-    headers = {path: inspect_png(path) for path in paths}
+    headers = {path: inspect_image(path) for path in paths}
     size = next(iter(headers.values())).size
     for path, header in headers.items():
         if header.size != size:
-            got = f"{header.size[0]} x {header.size[1]}"
-            raise SceneError(f"{path}: expected {size[0]} x {size[1]} pixels as the first, but got {got}")
-    return PngHeader(size, all(h.has_alpha for h in headers.values()))
+            raise SceneError(f"{path}: expected {_by(size)} pixels as the first, but got {_by(header.size)}")
+    return Header(size, all(h.has_alpha for h in headers.values()))
 
 
 def read_image(path: Path) -> Tensor:
-    """A decoded image, uint8 (H, W, 4), straight alpha; without an alpha channel it is 255.
+    """Decode a PNG or JPEG: uint8 (H, W, 4), straight alpha; without an alpha channel it is 255.
 
     Raises:
-        SceneError: where the file is missing or its pixels cannot be decoded.
+        SceneError: as ``inspect_image``, and where the pixels cannot be decoded.
     """
-    content = _bytes(path)
-    if path.suffix.lower() == ".png":
-        _inspect(content, path)  # the decoder does not look at the checksums of pixel data
-    elif content.startswith(jpeg.SIGNATURE):
-        check_size(jpeg.jpeg_size(io.BytesIO(content), path), path)
-    else:  # of another kind the size is known only to its decoder
-        raise SceneError(f"{path}: expected a PNG or JPEG image, but got a file of another kind")
-    try:
-        pixels = iio.imread(content, index=0, plugin="pillow", mode="RGBA")  # of a film the first
-    except Exception as error:  # decoders raise OSError, SyntaxError, struct.error and more
-        raise SceneError(
-            f"{path}: expected an image, but got data that cannot be decoded ({error})"
-        ) from error
-    return torch.from_numpy(np.array(pixels))
+    return torch.from_numpy(_decode(path, "RGBA"))
 
 
 def read_sized(path: Path, size: tuple[int, int]) -> Tensor:
     """``read_image`` of a file that must hold ``size`` (width, height); SceneError where it does not."""
     pixels = read_image(path)
-    if (pixels.shape[1], pixels.shape[0]) != size:
-        got = f"{pixels.shape[1]} x {pixels.shape[0]}"
-        raise SceneError(f"{path}: expected {size[0]} x {size[1]} pixels, but got {got}")
+    if (got := (pixels.shape[1], pixels.shape[0])) != size:
+        raise SceneError(f"{path}: expected {_by(size)} pixels, but got {_by(got)}")
     return pixels
 
 
-def check_size(size: tuple[int, int], path: Path) -> None:
-    """Refuse an image without pixels or with absurdly many, before it is decoded."""
-    if not 0 < size[0] * size[1] <= _MOST_PIXELS:
-        got = f"{size[0]} x {size[1]}"
-        raise SceneError(f"{path}: expected an image of 1 to {_MOST_PIXELS} pixels, but got {got}")
-
-
 def read_gray16(path: Path) -> np.ndarray:
-    """A decoded grey PNG of 16 bits a pixel, uint16 (H, W).
+    """Decode a grey PNG of 16 bits a pixel: uint16 (H, W).
 
     Raises:
-        SceneError: where the file is missing, harmed or of another kind.
+        SceneError: as ``read_image``, and for an image of another kind.
     """
-    content = _bytes(path)
-    _inspect(content, path, gray16=True)
-    try:
-        return np.asarray(iio.imread(content, index=0, plugin="pillow"), np.uint16)
-    except Exception as error:  # as in read_image
-        raise SceneError(
-            f"{path}: expected an image, but got data that cannot be decoded ({error})"
-        ) from error
+    return _decode(path, "I;16").astype(np.uint16)
 
 
 def write_png(path: Path, pixels: Tensor | np.ndarray) -> None:
     """Write uint8 (H, W, 4) or (H, W, 3) as a PNG with or without alpha, whole or not at all."""
-    mode = "RGBA" if pixels.shape[-1] == 4 else "RGB"
-    replace_file(
-        path, iio.imwrite("<bytes>", np.asarray(pixels), extension=".png", plugin="pillow", mode=mode)
-    )
+    with written_whole(path) as beside:
+        Image.fromarray(np.ascontiguousarray(pixels)).save(beside, "PNG")
+
+
+def write_jpeg(path: Path, pixels: Tensor | np.ndarray, quality: int = 97) -> None:
+    """Write uint8 (H, W, 3) or (H, W) as a JPEG of full colour resolution, whole or not at all."""
+    pixels = np.ascontiguousarray(pixels)
+    if pixels.dtype != np.uint8:
+        raise ValueError(f"{path}: expected uint8 pixels, but got {pixels.dtype}")
+    with written_whole(path) as beside:
+        Image.fromarray(pixels).save(beside, "JPEG", quality=quality, subsampling=0)
 
 
 def halved(rgba: Tensor) -> Tensor:
-    """The mean of each 2 x 2 block of *straight* RGBA, uint8 (H, W, 4) -> (H/2, W/2, 4), rounded.
+    """Average each 2 x 2 block of *straight* RGBA, uint8 (H, W, 4) -> (H/2, W/2, 4), rounded.
 
     Averaging before the alpha is applied darkens silhouettes a little; the published numbers do so.
 
@@ -135,10 +116,29 @@ def halved(rgba: Tensor) -> Tensor:
 
 
 def halved_depth(depth: Tensor) -> Tensor:
-    """The mean of the foreground (> 0) of each 2 x 2 block, (H, W) -> (H/2, W/2); 0 where there is none."""
+    """Average the foreground (> 0) of each 2 x 2 block, (H, W) -> (H/2, W/2); 0 where there is none."""
     h, w = depth.shape
     blocks = depth.reshape(h // 2, 2, w // 2, 2)
     return blocks.sum((1, 3)) / (blocks > 0).sum((1, 3)).clamp(min=1)
+
+
+def halved_cutout(rgba: Tensor) -> Tensor:
+    """Average each 2 x 2 block, uint8 (H, W, 4) -> (H // 2, W // 2, 4); the colour is the foreground's.
+
+    What lies behind a cut-out is another place; averaged in, it would rim every silhouette.
+
+    Args:
+        rgba: colour is 0 wherever alpha is 0; all other pixels count alike.
+
+    >>> halved_cutout(torch.tensor([[[9, 9, 9, 255], [0] * 4], [[0] * 4, [3, 3, 3, 255]]], dtype=torch.uint8))
+    tensor([[[  6,   6,   6, 128]]], dtype=torch.uint8)
+    """
+    height, width = (n // 2 * 2 for n in rgba.shape[:2])
+    rgba = rgba[:height, :width]
+    blocks = rgba[..., :3].reshape(height // 2, 2, width // 2, 2, 3).int().sum((1, 3))
+    count = (rgba[..., 3] > 0).reshape(height // 2, 2, width // 2, 2).sum((1, 3))[..., None].clamp(min=1)
+    color = torch.div(blocks + count // 2, count, rounding_mode="floor").to(torch.uint8)
+    return torch.cat([color, halved(rgba[..., 3:])], -1)
 
 
 def composited(rgba: Tensor, background: Tensor) -> Tensor:
@@ -157,7 +157,7 @@ class CachedImage:
         self.path, self.size, self.halve = path, size, halve
 
     def __call__(self) -> Tensor:
-        """The pixels; raises SceneError where the file cannot be decoded or has another size."""
+        """Give the pixels; SceneError where the file cannot be decoded or has another size."""
         return CACHE.get(self, self._decode)
 
     def _decode(self) -> Tensor:
@@ -165,40 +165,115 @@ class CachedImage:
         return halved(pixels) if self.halve else pixels
 
 
-def _bytes(path: Path) -> bytes:
-    content = read_bytes(path, _MOST_BYTES, "an image")
-    if not content:
-        raise SceneError(f"{path}: expected an image, but got an empty file")
-    return content
+class MaskedImage:
+    """An image cut out by a mask in another file, decoded when asked for: uint8 (H, W, 4), 0 where alpha is.
+
+    Where the image has an alpha of its own, it counts inside the mask. Only the smallest rectangle that holds
+    the foreground is kept, a fraction of most images.
+
+    Args:
+        image, mask: files of one size; a mask's first channel counts, above 127 is foreground.
+        size: (width, height), what both must hold.
+        halve: average 2 x 2 pixels; an odd last row or column is cut off.
+    """
+
+    def __init__(self, image: Path, mask: Path, size: tuple[int, int], halve: bool = False) -> None:
+        self.image, self.mask, self.size, self.halve = image, mask, size, halve
+        self._corner = (0, 0)
+
+    def __call__(self) -> Tensor:
+        """Give the pixels; SceneError where a file cannot be decoded or has another size."""
+        part = CACHE.get(self, self._decode)
+        (row, column), (rows, columns) = self._corner, part.shape[:2]
+        width, height = (n // 2 if self.halve else n for n in self.size)
+        whole = torch.zeros(height, width, 4, dtype=torch.uint8)
+        whole[row : row + rows, column : column + columns] = part
+        return whole
+
+    def _decode(self) -> Tensor:
+        """Cut out the foreground's rectangle and note where it lies."""
+        rgba = read_sized(self.image, self.size)
+        on = (read_sized(self.mask, self.size)[..., 0] > _FOREGROUND) & (rgba[..., 3] > 0)
+        rgba *= on[..., None]
+        if self.halve:
+            rgba = halved_cutout(rgba)
+        foreground = rgba[..., 3] > 0
+        if not bool(foreground.any()):
+            return rgba[:0, :0].clone()
+        rows, columns = (foreground.any(axis).nonzero()[:, 0] for axis in (1, 0))
+        self._corner = (int(rows[0]), int(columns[0]))
+        part = rgba[self._corner[0] : int(rows[-1]) + 1, self._corner[1] : int(columns[-1]) + 1]
+        return part.clone()
 
 
-def _inspect(content: bytes, path: Path, gray16: bool = False) -> PngHeader:
-    if content[:8] != _SIGNATURE:
-        raise SceneError(f"{path}: expected a PNG image, but got a file of another kind")
-    at, kind, header, transparent = 8, b"", b"", False
-    while kind != b"IEND":  # each chunk: length, kind, body, checksum of kind and body
-        length = int.from_bytes(content[at : at + 4], "big")
-        kind, end = content[at + 4 : at + 8], at + 8 + length
-        if end + 4 > len(content):
-            raise SceneError(
-                f"{path}: expected a whole PNG image, but got a truncated one; copy the file again"
-            )
-        if zlib.crc32(memoryview(content)[at + 4 : end]) != int.from_bytes(content[end : end + 4], "big"):
-            raise SceneError(
-                f"{path}: expected an unharmed PNG image, but got a wrong checksum; copy the file again"
-            )
-        # Of two headers the decoder takes the first and looks at it wherever it stands.
-        if (kind == b"IHDR") != (at == 8):
-            raise SceneError(f"{path}: expected a PNG that begins with its only header, but got another")
-        header = content[at + 8 : end] if at == 8 else header
-        transparent |= kind == b"tRNS"
-        at = end + 4
-    if len(header) != 13:
-        raise SceneError(f"{path}: expected a PNG image, but got one without a header")
-    width, height, bits, color = struct.unpack(">IIBB", header[:10])
-    check_size((width, height), path)
-    if gray16 and (bits, color) != (16, 0):
-        raise SceneError(f"{path}: expected a grey PNG of 16 bits a pixel, but got {bits} bits a channel")
-    if bits > 8 and not gray16:
-        raise SceneError(f"{path}: expected 8 bits a channel, but got {bits}; convert the image")
-    return PngHeader((width, height), transparent or color in (4, 6))
+def _decode(path: Path, mode: str) -> np.ndarray:
+    """Decode the first picture of a file in one of Pillow's modes."""
+    with opened(path, MOST_IMAGE, "an image") as stream:
+        content = io.BytesIO(stream.read())
+    _inspect(content, path, mode)
+    content.seek(0)
+    try:
+        # In one expression: while a name keeps the image alive, its memory is not used again.
+        return np.array(Image.open(content, formats=_FORMATS).convert(mode))
+    except Exception as error:  # decoders raise OSError, SyntaxError, struct.error and more
+        raise SceneError(
+            f"{path}: expected an image, but got data that cannot be decoded ({error})"
+        ) from error
+
+
+def _inspect(stream: BinaryIO, path: Path, mode: str = "RGBA") -> Header:
+    """Check an open image, which is to be read in one of Pillow's modes."""
+    image = _identified(stream, path)
+    if not 0 < image.width * image.height <= _MOST_PIXELS:
+        raise SceneError(
+            f"{path}: expected an image of 1 to {_MOST_PIXELS} pixels, but got {_by(image.size)}"
+        )
+    has_16_bits = ";16" in str(image.tile[0][3])  # the mode alone hides it
+    if mode == "I;16" and not (has_16_bits and image.mode.startswith("I")):
+        raise SceneError(f"{path}: expected a grey PNG of 16 bits a pixel, but got mode {image.mode}")
+    if mode == "RGBA" and (has_16_bits or image.mode == "CMYK"):
+        got = "16 bits" if has_16_bits else "CMYK"
+        raise SceneError(f"{path}: expected 8 bits a channel, grey or RGB, but got {got}; convert the image")
+    header = Header(image.size, image.has_transparency_data)
+    try:
+        whole = image.verify() is None if image.format == "PNG" else _has_jpeg_end(stream)
+    except Exception:  # OSError, SyntaxError and more
+        whole = False
+    if not whole:
+        raise SceneError(
+            f"{path}: expected a whole image, but got a truncated or harmed one; copy the file again"
+        )
+    return header
+
+
+def _identified(stream: BinaryIO, path: Path) -> Image.Image:
+    """Read an image's header."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", Image.DecompressionBombWarning)
+            image = Image.open(stream, formats=_FORMATS)
+        if not image.tile:
+            raise UnidentifiedImageError
+        return image
+    except (Image.DecompressionBombWarning, Image.DecompressionBombError) as error:
+        raise SceneError(f"{path}: expected an image of 1 to {_MOST_PIXELS} pixels, but got more") from error
+    except Exception as error:  # OSError, ValueError and more
+        got = str(error)
+        if isinstance(error, UnidentifiedImageError):
+            empty = not stream.seek(0, os.SEEK_END)
+            got = "an empty file" if empty else "another kind of file or a harmed header"
+        raise SceneError(f"{path}: expected a PNG or JPEG image, but got {got}") from error
+
+
+def _has_jpeg_end(stream: BinaryIO) -> bool:
+    """Tell whether the end's marker follows, which cannot occur among the pixels; Pillow does not look."""
+    here, size = stream.tell(), stream.seek(0, os.SEEK_END)
+    for begin in (max(here, size - _JPEG_TAIL), here):
+        stream.seek(begin)
+        if _JPEG_END in stream.read():
+            return True
+    return False
+
+
+def _by(size: tuple[int, int]) -> str:
+    return f"{size[0]} x {size[1]}"

@@ -1,7 +1,7 @@
 """Lego Complete scenes: D-NeRF's layout with three kinds of test view, each with exact ray depth.
 
-What the layout is made of stands in ``dnerf``; here is what makes numbers comparable: 50 training times, and
-test views at training times (``space``), all through (``time``) and at the canonical time (``canonical``).
+``dnerf`` reads the layout. Numbers are comparable with 50 training times and test views at training times
+(``space``), at all times (``time``) and at the canonical time (``canonical``).
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ _SAME_TIME = 1e-4  # times are stored with four digits or more; neighbours are 1
 def read_scene(root: str | Path, scene: str, **options) -> Scene:
     """Read ``root/scene``; ``options`` as in ``dnerf.read_scene``.
 
-    A scene of other counts is read, and its protocol has a ``note`` that says so.
+    A scene with other numbers of images or other times is read too; ``protocol["note"]`` says what differs.
 
     Raises:
-        SceneError: as ``dnerf.read_scene``, and for a test view whose ability is not known.
+        SceneError: as ``dnerf.read_scene``, and for a test view without an ability.
     """
     found = dnerf.read_scene(root, scene, **options)
     for frame in found.test:
@@ -66,7 +66,7 @@ def write_scene(
 
 
 def _differences(scene: Scene, protocol: dict) -> list[str]:
-    """How a scene differs from what was published, in words."""
+    """Say how a scene differs from the published protocol."""
     said = []
     if protocol["training_times"] != TRAINING_TIMES:
         said.append(f"{protocol['training_times']} training times instead of {TRAINING_TIMES}")

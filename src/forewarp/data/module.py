@@ -1,4 +1,4 @@
-"""Data modules: one does all the work, the others name a reader and its arguments."""
+"""Data modules: one does the work, the others name a reader and its arguments."""
 
 from __future__ import annotations
 
@@ -13,35 +13,33 @@ from lightning import LightningDataModule
 from forewarp.data import dnerf, hypernerf, lego_complete, nhr, posed_video
 from forewarp.data.batches import Sampler, Targets, color_of
 from forewarp.data.cache import CACHE
-from forewarp.data.canonical import with_canonical
 from forewarp.data.fingerprint import RECORD, fingerprint
-from forewarp.data.held import hold_out
+from forewarp.data.options import hold_out, with_canonical
 from forewarp.scene.batch import Asks, Target
 from forewarp.scene.errors import SceneError
 from forewarp.scene.frame import Scene, spread
 
-WATCHED = 8  # views that a curve is of, at most, where none are set aside
+WATCHED = 8  # validation views at most that a run's PSNR curve measures where no views are held out
 
 
 class SceneDataModule(LightningDataModule):
-    """Serves one scene: batches to train on, whole images to compare with.
+    """Serve one scene: batches to train on, whole images to compare with.
 
-    The streams are handed out as they are, without a ``DataLoader``: a batch is a millisecond of tensor work,
-    so worker processes would only cost.
+    There is no ``DataLoader``: a batch is a millisecond of tensor work, so worker processes would only cost.
 
     Args:
         read: gives the scene; called once, at the first use.
         rays: pixels of a batch.
         background: behind training pixels: white, black or random (a colour each).
         eval_background: behind whole images: white or black.
-        seed: of the pixels, the background colours and the default choice of frames.
-        views_per_step: training frames of one time that a batch's rays are shared out among.
-        cache_bytes: of decoded images to keep; of the process, so of several modules the last one's.
-        held_out: training frames set aside (``hold_out``).
-        canonical: ``middle``: the canonical time is the training time in the middle; None: the format's own.
+        seed: seed of the pixels, the background colours and the default choice of frames.
+        views_per_step: training frames of one time that share a batch's rays.
+        cache_bytes: most bytes of decoded images kept in the process; the last module's number counts.
+        held_out: training frames that are never trained on (``hold_out``).
+        canonical: ``middle``: the training time in the middle is canonical; None: the format's own choice.
         place: the scene's folder, where it has one.
 
-    ``picker`` may be set at any time: a callable that says from which training frame the next batch comes.
+    ``picker`` may be set at any time: a callable that chooses the training frame of the next batch.
     """
 
     def __init__(
@@ -67,7 +65,7 @@ class SceneDataModule(LightningDataModule):
 
     @cached_property
     def scene(self) -> Scene:
-        """The scene, whose protocol names the background that it is measured on."""
+        """The scene; its protocol names the background that it is measured on."""
         scene = hold_out(with_canonical(self._read(), self._canonical), self.held_out)
         behind = self.eval_background if scene.has_alpha else "none"
         protocol = {**scene.protocol, "background": behind}
@@ -77,12 +75,12 @@ class SceneDataModule(LightningDataModule):
 
     @cached_property
     def batches(self) -> Sampler:
-        """The one stream of training batches."""
+        """The stream of training batches."""
         return Sampler(self.scene, **self._draw)
 
     @property
     def picker(self) -> Callable[[], int] | None:
-        """Says from which training frame the next batch comes; None is uniformly at random."""
+        """Chooses the training frame of the next batch; None: uniformly at random."""
         return self.batches.picker
 
     @picker.setter
@@ -91,7 +89,7 @@ class SceneDataModule(LightningDataModule):
 
     @property
     def asks(self) -> Asks:
-        """What the method that is trained wants of a batch."""
+        """What the trained method wants of a batch."""
         return self.batches.asks
 
     @asks.setter
@@ -99,58 +97,58 @@ class SceneDataModule(LightningDataModule):
         self.batches.asks = asks
 
     def setup(self, stage: str | None = None) -> None:
-        """Read the scene, once, and refuse settings that it does not allow."""
+        """Read the scene, once, and refuse bad settings."""
         color_of(self.eval_background)
         CACHE.resize(self.cache_bytes)
         _ = self.batches
 
     def targets(self, split: str) -> Targets:
-        """The whole images of ``train``, ``val``, ``test`` or ``held``."""
+        """Give the whole images of ``train``, ``val``, ``test`` or ``held``."""
         if split not in ("train", "val", "test", "held"):
             raise SceneError(f"split: expected train, val, test or held, but got {split!r}")
         behind = color_of(self.eval_background)
         return Targets(getattr(self.scene, split), behind, self.scene.has_alpha, trained=split == "train")
 
     def watched(self) -> Targets:
-        """Whose PSNR a run's curve is of: the views set aside, or else up to 8 of the validation views."""
+        """Choose the views of a run's PSNR curve: those held out, else up to 8 validation views."""
         if self.scene.held:
             return self.targets("held")
         val = self.targets("val")
         return Targets([val.frames[i] for i in spread(len(val), WATCHED)], val.background, val.has_alpha)
 
     def train_dataloader(self) -> Sampler:
-        """The stream of batches."""
+        """Give the stream of batches."""
         return self.batches
 
     def val_dataloader(self) -> Iterable[Target]:
-        """The validation images one by one; nothing where the scene has none."""
-        # An empty iterator, as Lightning warns of what has the length 0.
+        """Give the validation images one by one; nothing where the scene has none."""
+        # An empty iterator, as Lightning warns of a length of 0.
         return self.targets("val") if self.scene.val else iter(())
 
     def test_dataloader(self) -> Targets:
-        """The test images one by one."""
+        """Give the test images one by one."""
         return self.targets("test")
 
     def restart(self, number: int) -> None:
-        """Let the next batches be those of stream ``number``, whatever was drawn before."""
+        """Draw the next batches from the beginning of random stream ``number``."""
         self.batches.restart(number)
 
     def fingerprint(self) -> dict | None:
-        """What the scene's files are now (see ``data.fingerprint``); None where there are none."""
+        """Take the fingerprint of the scene's files; None if there are no files."""
         return None if self.place is None else fingerprint(self.place)
 
     def state_dict(self) -> dict:
-        """What an interrupted run needs to draw on bit for bit."""
+        """Save what an interrupted run needs to continue bit for bit."""
         return self.batches.state_dict()
 
     def load_state_dict(self, state_dict: dict) -> None:
-        """Draw on where ``state_dict`` was taken."""
+        """Continue where ``state_dict`` was saved."""
         self.batches.load_state_dict(state_dict)
 
 
 class _FolderDataModule(SceneDataModule):
-    """The scene ``root/scene``; other arguments as in its format's reader and in ``SceneDataModule``, which
-    hold their defaults.
+    """The scene ``root/scene``; other arguments and their defaults are those of its format's reader and of
+    ``SceneDataModule``.
     """
 
     _reader: Callable[..., Scene]

@@ -16,25 +16,24 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from forewarp.data.clouds import read_cloud, write_cloud
-from forewarp.data.dome_cameras import read_cameras, write_cameras
-from forewarp.data.files import MARKERS, scene_folder, whole
-from forewarp.data.images import check_size
-from forewarp.data.jpeg import inspect_jpeg, write_jpeg
-from forewarp.data.masked import MaskedImage
-from forewarp.data.truth import read_truth, shortened, write_truth
-from forewarp.data.views import box_of
+from forewarp.data.arrays import read_cloud, read_truth, shortened, write_array, write_truth
+from forewarp.data.files import MARKERS, number, numbers_of, read_bytes, scene_folder, whole
+from forewarp.data.geometry import box_of, pose_of
+from forewarp.data.images import MaskedImage, inspect_image, write_jpeg
+from forewarp.files import replace_file
 from forewarp.scene.box import Box
 from forewarp.scene.camera import Camera
 from forewarp.scene.errors import SceneError
 from forewarp.scene.frame import Frame, Scene, Truth
 
 _PADDING = 0.1  # of the points' extent, on every side
+_ORDER = [2, 0, 1, 3]  # of a pose's columns in a line: z axis, x axis, y axis, centre
+_MOST_PIXELS_OFF = 1e7  # beyond it a lens is wrong
 
 
 @dataclass(frozen=True)
 class DomeFrame:
-    """One moment to write: per camera an image uint8 (H, W, 3) and a mask uint8 (H, W), 255 on the
+    """A moment to write: per camera an image uint8 (H, W, 3) and a mask uint8 (H, W), 255 on the
     foreground, and ``points`` (N, 6), x y z in world units and r g b of 255.
     """
 
@@ -65,12 +64,12 @@ def read_scene(
     Raises:
         SceneError: for every file or value that is missing or wrong, with file and line.
 
-    Cost: two small reads an image, for 100 frames of 56 cameras 0.4 s, and one of every point.
+    Cost: two small reads an image and one of every point.
     """
     folder = scene_folder(root, scene, MARKERS["nhr"])
     if not isinstance(half_resolution, bool):
         raise SceneError(f"data.half_resolution: expected true or false, but got {half_resolution!r}")
-    poses, lenses = read_cameras(folder)
+    poses, lenses = _read_cameras(folder)
     held = _held_out(test_views, len(poses), folder)
     every, (moments, there) = whole(test_every, "data.test_every", 1), _moments(folder, frames)
     sizes = _read_sizes(folder, moments, len(poses), half_resolution)
@@ -110,8 +109,8 @@ def write_scene(
 ) -> None:
     """Write a scene that ``read_scene`` reads; each file appears whole or not at all.
 
-    A scene already in ``folder`` is replaced: its poses go first and the new ones come last, so that a run
-    cut short leaves nothing that reads well and is wrong. Near and far of the cameras are not stored.
+    A scene already in ``folder`` is replaced: its poses are removed first and written last, so that an
+    interrupted call leaves nothing that could be read by mistake. Near and far of the cameras are not stored.
     """
     folder = Path(folder)
     if any(camera.lens is not None for camera in cameras):
@@ -121,7 +120,7 @@ def write_scene(
         _write_frame(folder, f, frame, cameras)
     if trajectories is not None:
         write_truth(folder / "trajectories.npz", trajectories)
-    write_cameras(folder, cameras)
+    _write_cameras(folder, cameras)
 
 
 def _write_frame(folder: Path, f: int, frame: DomeFrame, cameras: Sequence[Camera]) -> None:
@@ -136,11 +135,11 @@ def _write_frame(folder: Path, f: int, frame: DomeFrame, cameras: Sequence[Camer
             raise ValueError(f"frame {f}: {name}: expected the camera's size {shape}, but got {got}")
         write_jpeg(place / name, image)
         write_jpeg(place / "mask" / name, mask)
-    write_cloud(folder / "pointclouds" / f"frame{f + 1}.npy", frame.points)
+    write_array(folder / "pointclouds" / f"frame{f + 1}.npy", frame.points)
 
 
 def _remove(folder: Path) -> None:
-    """Take away the scene that is there, poses first; files that are none of its stay."""
+    """Remove the scene that is there, poses first; other files stay."""
     for name in ("CamPose.inf", "Intrinsic.inf", "trajectories.npz"):
         (folder / name).unlink(missing_ok=True)
     for pattern in ("img/*/img_*.jpg", "img/*/mask/img_*.jpg", "pointclouds/frame*.*"):
@@ -151,8 +150,93 @@ def _remove(folder: Path) -> None:
             emptied.rmdir()
 
 
+def _write_cameras(folder: Path, cameras: Sequence[Camera]) -> None:
+    """Write what ``_read_cameras`` reads, with all digits, the poses last."""
+    lenses = [
+        f"{k}\n{c.fx!r} {c.skew!r} {c.cx!r}\n0.0 {c.fy!r} {c.cy!r}\n0.0 0.0 1.0\n\n"
+        for k, c in enumerate(cameras)
+    ]
+    replace_file(folder / "Intrinsic.inf", "".join(lenses))
+    poses = [camera.camera_to_world[:3, _ORDER].double().T.flatten().tolist() for camera in cameras]
+    replace_file(folder / "CamPose.inf", "".join(" ".join(map(repr, pose)) + "\n" for pose in poses))
+
+
+def _read_cameras(folder: Path) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Read the poses (4, 4) and intrinsic matrices (3, 3), float64; refuse files with unequal numbers."""
+    poses, lenses = _read_poses(folder / "CamPose.inf"), _read_lenses(folder / "Intrinsic.inf")
+    if len(poses) != len(lenses):
+        got = f"{len(lenses)} there and {len(poses)} in CamPose.inf"
+        raise SceneError(f"{folder / 'Intrinsic.inf'}: expected as many cameras as poses, but got {got}")
+    return poses, lenses
+
+
+def _read_poses(path: Path) -> list[np.ndarray]:
+    """Read camera-to-world matrices (4, 4) float64 with OpenCV's axes, one a line.
+
+    Raises:
+        SceneError: naming the line that does not hold 12 numbers, or no rotation.
+    """
+    poses = []
+    for line, words in _lines(path):
+        where = f"{path}: line {line}"
+        columns = np.array(numbers_of(words, 12, where)).reshape(4, 3).T
+        matrix = np.eye(4)
+        matrix[:3, _ORDER] = columns
+        poses.append(pose_of(matrix, where))
+    return poses
+
+
+def _read_lenses(path: Path) -> list[np.ndarray]:
+    """Read the matrix (3, 3) of every block: fx s cx, 0 fy cy, 0 0 1, in pixels of the stored images.
+
+    A block is a camera's number and nine numbers, however they are spread over lines; cameras count up from
+    0 or from 1.
+
+    Raises:
+        SceneError: naming the line where a block is anything else.
+    """
+    words = [(line, word) for line, row in _lines(path) for word in row]
+    first, matrices = int(words[0][1] == "1"), []
+    for k, block in enumerate((words[i : i + 10] for i in range(0, len(words), 10)), first):
+        line, word = block[0]
+        if word != str(k):
+            raise SceneError(f"{path}: line {line}: expected the number {k} of a camera, but got {word!r}")
+        if len(block) < 10:
+            raise SceneError(
+                f"{path}: line {block[-1][0]}: expected nine numbers of camera {k}, but got the end of the "
+                f"file after {len(block) - 1}"
+            )
+        rows = (block[i : i + 3] for i in (1, 4, 7))
+        matrices.append(_matrix([(row[0][0], [word for _, word in row]) for row in rows], path))
+    return matrices
+
+
+def _matrix(rows: list[tuple[int, list[str]]], path: Path) -> np.ndarray:
+    """Check the numbered rows fx s cx, 0 fy cy, 0 0 1 and make a matrix (3, 3)."""
+    where = [f"{path}: line {line}" for line, _ in rows]
+    (fx, skew, cx), (zero, fy, cy), last = (numbers_of(words, 3, at) for at, (_, words) in zip(where, rows))
+    for at, focal, *others in ((where[0], fx, skew, cx), (where[1], fy, cy)):
+        number(focal, f"{at}: focal length", 1e-3, _MOST_PIXELS_OFF)
+        for value in others:
+            number(value, f"{at}: principal point and skew", -_MOST_PIXELS_OFF, _MOST_PIXELS_OFF)
+    if zero != 0:
+        raise SceneError(f"{where[1]}: expected a row 0 fy cy, but got {zero:g} {fy:g} {cy:g}")
+    if last != [0, 0, 1]:
+        raise SceneError(f"{where[2]}: expected the row 0 0 1, but got {' '.join(f'{v:g}' for v in last)}")
+    return np.array([[fx, skew, cx], [zero, fy, cy], last])
+
+
+def _lines(path: Path) -> list[tuple[int, list[str]]]:
+    """List the lines that are not blank: their numbers from 1 and their words."""
+    text = read_bytes(path).decode("utf-8-sig", errors="replace")
+    found = [(n, line.split()) for n, line in enumerate(text.split("\n"), 1) if line.strip()]
+    if not found:
+        raise SceneError(f"{path}: expected at least one camera, but got an empty file")
+    return found
+
+
 def _held_out(views: Sequence[int] | None, count: int, folder: Path) -> list[int]:
-    """The cameras that are measured, ascending."""
+    """Choose the cameras that are measured, ascending."""
     if count < 2:
         raise SceneError(f"{folder / 'CamPose.inf'}: expected at least 2 cameras, one to measure, but got 1")
     if views is None:
@@ -167,7 +251,7 @@ def _held_out(views: Sequence[int] | None, count: int, folder: Path) -> list[int
 
 
 def _moments(folder: Path, frames: int) -> tuple[int, int]:
-    """How many frames there are to read, numbered from 0 without a gap, and how many there are."""
+    """Count the frames to read, numbered from 0 without a gap, and those on disk."""
     wanted, place = whole(frames, "data.frames", 1), folder / "img"
     there = {p.name for p in place.iterdir() if p.is_dir()} if place.is_dir() else set()
     numbers = [int(name) for name in there if name.isdecimal() and name == str(int(name))]
@@ -179,7 +263,7 @@ def _moments(folder: Path, frames: int) -> tuple[int, int]:
 
 
 def _trajectories(folder: Path, moments: int, there: int) -> Truth | None:
-    """The true ones of the first ``moments``; the file's times are those of all frames that are there."""
+    """Read the trajectories of the first ``moments``; the file's times are those of all frames on disk."""
     truth = read_truth(folder / "trajectories.npz", 0.0)
     if truth is None or moments == there:
         return truth
@@ -187,23 +271,24 @@ def _trajectories(folder: Path, moments: int, there: int) -> Truth | None:
 
 
 def _read_sizes(folder: Path, moments: int, views: int, halve: bool) -> list[tuple[int, int]]:
-    """The size (width, height) of every camera's images, all of which are looked at."""
+    """Read the size (width, height) of every camera's images and check that all have it."""
     names = [f"img_{k:04d}.jpg" for k in range(views)]
     sizes: list[tuple[int, int]] = []
     for f in range(moments):
         for place in (folder / "img" / str(f), folder / "img" / str(f) / "mask"):
             _check_names(place, names)
-            found = [inspect_jpeg(place / name) for name in names]
-            if not sizes:
-                sizes = found
-                for name, (w, h) in zip(names, sizes):
-                    check_size((w, h), place / name)
-                    check_size((w // 2, h // 2) if halve else (w, h), place / name)
+            found = [inspect_image(place / name).size for name in names]
+            sizes = sizes or found
             for name, size, expected in zip(names, found, sizes, strict=True):
                 if size != expected:
                     raise SceneError(
                         f"{place / name}: expected {expected[0]} x {expected[1]} pixels as in "
                         f"img/0/{name}, but got {size[0]} x {size[1]}"
+                    )
+                if halve and min(size) < 2:
+                    got = f"{size[0]} x {size[1]}"
+                    raise SceneError(
+                        f"{place / name}: expected at least 2 x 2 pixels to halve, but got {got}"
                     )
     return sizes
 
@@ -222,7 +307,7 @@ def _check_names(place: Path, names: list[str]) -> None:
 
 
 def _bounds(folder: Path, moments: int) -> Box:
-    """The box around the points of all frames, and a little more."""
+    """Put a box around the points of all frames, with some padding."""
     corners = []
     for f in range(1, moments + 1):
         path, old = (folder / "pointclouds" / f"frame{f}{suffix}" for suffix in (".npy", ".obj"))
@@ -240,7 +325,7 @@ def _bounds(folder: Path, moments: int) -> Box:
 
 
 def _camera(size: tuple[int, int], lens: np.ndarray, pose: np.ndarray, halve: bool, box: Box) -> Camera:
-    """The camera; its range is that of the sphere around the box, and so holds every ray's way through it."""
+    """Make a camera whose near and far enclose the sphere around the box."""
     scale = 0.5 if halve else 1.0  # exactly, whatever an odd side loses
     width, height = (n // 2 if halve else n for n in size)
     fx, skew, cx, _, fy, cy = (scale * lens[:2]).flatten().tolist()

@@ -2,13 +2,12 @@
 
 A pose on disk is camera-to-world with OpenGL's axes (x right, y up, looking along -z). The camera
 (``w h fl_x fl_y cx cy k1 k2 k3 p1 p2 camera_model``) stands at the top or, where it differs, in a frame. All
-lengths (``near``, ``far``, ``aabb``; ``data.near``, ``data.far``, ``data.box``) are in the file's units, of
-whatever kind; the scene's own are such that nothing depends on them.
+lengths (``near``, ``far``, ``aabb``; ``data.near``, ``data.far``, ``data.box``) are in the file's units,
+which may be any: the scene is normalised.
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,21 +16,21 @@ from reprlib import repr as short
 import numpy as np
 from torch import Tensor
 
-from forewarp.data.capture import (
+from forewarp.data.files import MARKERS, number, read_json, scene_folder, whole
+from forewarp.data.geometry import FLIP, MOST_UNITS, box_of, pose_of
+from forewarp.data.images import CachedImage, MaskedImage, write_jpeg, write_png
+from forewarp.data.options import middle_of
+from forewarp.data.region import region_of
+from forewarp.data.transforms import (
     SPLITS,
     SUFFIXES,
-    View,
+    ImageEntry,
     name_of,
-    read_views,
-    split_views,
-    spread_in_time,
+    read_entries,
+    split_entries,
+    with_even_times,
 )
-from forewarp.data.files import MARKERS, number, read_json, replace_file, scene_folder, whole
-from forewarp.data.images import CachedImage, write_png
-from forewarp.data.jpeg import write_jpeg
-from forewarp.data.masked import MaskedImage
-from forewarp.data.region import region_of
-from forewarp.data.views import FLIP, MOST_UNITS, box_of, middle_of, pose_of
+from forewarp.files import write_json
 from forewarp.scene.box import Box
 from forewarp.scene.camera import Camera
 from forewarp.scene.errors import SceneError
@@ -44,7 +43,7 @@ _OF_CAMERA = {"w", "h", "fl_x", "fl_y", "cx", "cy", "camera_model", "k1", "k2", 
 
 @dataclass(frozen=True)
 class PosedShot:
-    """One image to write: ``name`` its file, .png or .jpg; ``pixels`` uint8 (H, W, 3), or (H, W, 4) of
+    """An image to write: ``name`` its file, .png or .jpg; ``pixels`` uint8 (H, W, 3), or (H, W, 4) of
     straight alpha; ``camera`` of that size, its near and far are not written; ``time`` in [0, 1] or None;
     ``split`` train, val or test, or "" where the reader is to choose.
     """
@@ -70,10 +69,10 @@ def read_scene(
 ) -> Scene:
     """Read ``root/scene``; pixels are decoded when a frame is first loaded.
 
-    The subject is cut out where there are masks, or where some image's alpha lets anything through: of images
-    that have an alpha those up to the first such one are decoded.
+    The subject is cut out where there are masks, or where some image has a pixel that is not opaque: images
+    with an alpha channel are decoded until one such is found.
 
-    Without ``time`` in the frames they are spread evenly over [0, 1] in the order of their files' names.
+    Without ``time`` in the file the frames are evenly spaced over [0, 1] in the order of their names.
 
     Args:
         scale: 1, 2, 4 or 8: take the smaller images in ``images_<scale>`` beside ``images``.
@@ -90,23 +89,23 @@ def read_scene(
     _check(scale, canonical, test_every, normalise)
     file = scene_folder(root, scene, FILE) / FILE
     content = read_json(file)
-    views = read_views(file, content, scale)
-    spread = views[0].time is None
-    views = spread_in_time(views) if spread else sorted(views, key=lambda v: v.time)
-    parts, how = split_views(file, content, views, test_every)
+    entries = read_entries(file, content, scale)
+    timeless = entries[0].time is None
+    entries = with_even_times(entries) if timeless else sorted(entries, key=lambda e: e.time)
+    parts, how = split_entries(file, content, entries, test_every)
     near, far, bounds = _limits(file, content, near, far, box)
-    has_alpha = any(v.mask is not None or _lets_through(v) for v in views)
+    has_alpha = any(e.mask is not None or _is_transparent(e) for e in entries)
     options = {"near": near, "far": far, "box": bounds, "normalise": normalise, "cut_out": has_alpha}
-    region = region_of([v.camera for v in views], str(file), **options)
+    region = region_of([e.camera for e in entries], str(file), **options)
     train, val, test = (
-        tuple(Frame(v.name, v.time, region.placed(v.camera), _load(v)) for v in parts[split])
+        tuple(Frame(e.name, e.time, region.placed(e.camera), _load(e)) for e in parts[split])
         for split in SPLITS
     )
     start = (min if canonical == "first" else middle_of)([frame.time for frame in train])
     protocol = {
         "dataset": "video_with_poses",
         "resolution": [train[0].camera.width, train[0].camera.height],
-        "times": "spread in the order of the files' names" if spread else "as given",
+        "times": "spread in the order of the files' names" if timeless else "as given",
         "split": how,
         "test_frames": len(test),
         "normalisation": {"center": list(region.center), "scale": region.scale},
@@ -125,14 +124,14 @@ def write_scene(
     far: float | None = None,
     aabb: Box | None = None,
 ) -> None:
-    """Write a scene that ``read_scene`` reads; ``transforms.json`` goes first and comes last.
+    """Write a scene that ``read_scene`` reads; ``transforms.json`` is removed first and written last.
 
     Args:
         shots: consumed one by one; all or none have a split.
         near, far, aabb: where known, in the units of the cameras' places.
 
     Raises:
-        ValueError: for a shot that could not be read again, whatever the others are.
+        ValueError: for a shot that ``read_scene`` would refuse.
     """
     folder = Path(folder)
     (folder / FILE).unlink(missing_ok=True)
@@ -149,11 +148,11 @@ def write_scene(
     content |= {key: value for key, value in (("near", near), ("far", far)) if value is not None}
     content |= {} if aabb is None else {"aabb": [aabb.low, aabb.high]}
     content["frames"] = [{k: v for k, v in entry.items() if k not in common} for entry in entries]
-    replace_file(folder / FILE, json.dumps(content, indent=1).encode())
+    write_json(folder / FILE, content)
 
 
 def _check_shot(folder: Path, shot: PosedShot, taken: set[str]) -> None:
-    """Refuse what ``read_scene`` would; ``taken`` are the names of the shots before, and now this one's."""
+    """Refuse what ``read_scene`` would; ``taken`` are the names so far, to which this one's is added."""
     camera, pixels = shot.camera, np.asarray(shot.pixels)
     suffix, name = Path(shot.name).suffix, name_of(folder, f"images/{shot.name}", f"shots: {shot.name!r}")
     if suffix not in SUFFIXES:
@@ -174,7 +173,7 @@ def _check_shot(folder: Path, shot: PosedShot, taken: set[str]) -> None:
 
 
 def _write_shot(folder: Path, shot: PosedShot) -> dict:
-    """Write one image and give its entry."""
+    """Write an image and make its entry."""
     camera = shot.camera
     entry = {"file_path": f"images/{shot.name}", "w": camera.width, "h": camera.height}
     entry |= {
@@ -199,7 +198,7 @@ def _is_png(name: str) -> bool:
 
 
 def _check(scale: int, canonical: str, test_every: int, normalise: bool) -> None:
-    """Refuse options that mean nothing."""
+    """Refuse options that have no meaning."""
     if type(scale) is not int or scale not in SCALES:
         raise SceneError(f"data.scale: expected one of {SCALES}, but got {scale!r}")
     if canonical not in ("middle", "first"):
@@ -209,20 +208,22 @@ def _check(scale: int, canonical: str, test_every: int, normalise: bool) -> None
         raise SceneError(f"data.normalise: expected true or false, but got {normalise!r}")
 
 
-def _load(view: View) -> CachedImage | MaskedImage:
-    size = (view.camera.width, view.camera.height)
-    return CachedImage(view.image, size) if view.mask is None else MaskedImage(view.image, view.mask, size)
+def _load(entry: ImageEntry) -> CachedImage | MaskedImage:
+    size = (entry.camera.width, entry.camera.height)
+    return (
+        CachedImage(entry.image, size) if entry.mask is None else MaskedImage(entry.image, entry.mask, size)
+    )
 
 
-def _lets_through(view: View) -> bool:
-    """Whether anything of an image is not opaque; decodes it where its header says that there is an alpha."""
-    return view.has_alpha and bool((_load(view)()[..., 3] < 255).any())
+def _is_transparent(entry: ImageEntry) -> bool:
+    """Tell whether any pixel is not opaque; decode the image only where its header says it has alpha."""
+    return entry.has_alpha and bool((_load(entry)()[..., 3] < 255).any())
 
 
 def _limits(
     file: Path, content: dict, near: float | None, far: float | None, box: Sequence[float] | None
 ) -> tuple[float | None, float | None, Box | None]:
-    """Near, far and box in the file's units: of the config, else of the file, else None."""
+    """Take near, far and box, in the file's units, from the config, else from the file, else None."""
     least = {"near": 0.0, "far": 1 / MOST_UNITS}
     found = []
     for key, value in (("near", near), ("far", far)):

@@ -1,4 +1,4 @@
-"""Where a capture of unknown scale happens: its middle, its size, how near and how far one sees."""
+"""Find the region that cameras of unknown scale look at: its middle, its size, near and far."""
 
 from __future__ import annotations
 
@@ -9,25 +9,28 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from forewarp.data.views import frustum_box
+from forewarp.data.geometry import frustum_box
 from forewarp.scene.box import Box
 from forewarp.scene.camera import Camera
 from forewarp.scene.errors import SceneError
 from forewarp.scene.paths import focus_point
 
-# Shares of the cameras' distance from what they look at, where nothing else is known. Two real captures whose
-# ends were given had the near one at 0.01 and 0.55 and the far one at 2.4 and 2.2.
+# Near and far as shares of the cameras' distance from what they look at, where nothing else is known. Two
+# real captures that gave them had near at 0.01 and 0.55 and far at 2.4 and 2.2.
 _NEAR, _FAR = 0.2, 2.5
-_LEAST, _MOST = 1e-3, 50.0  # of how far ahead is supposed: nearer or farther the axes do not say it
-_STILL = 1e-9
-_AHEAD = 4.0  # of the cameras' spread: how far ahead they look where their axes do not say
+_LEAST, _MOST = 1e-3, 50.0  # a focus outside these shares of the assumed distance is not trusted
+_SAME_PLACE = 1e-9
+_AHEAD = 4.0  # assumed distance of what is looked at, in radii of the cameras' places
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Region:
-    """``X_scene = (X - center) * scale``; ``near``, ``far`` and ``box`` are the scene's."""
+    """The part of the file's world that becomes the scene, and the map ``X_scene = (X - center) * scale``.
+
+    ``near``, ``far`` and ``box`` are in scene units.
+    """
 
     center: tuple[float, float, float]
     scale: float
@@ -36,13 +39,13 @@ class Region:
     box: Box
 
     def placed(self, camera: Camera) -> Camera:
-        """A camera of the file in the scene."""
+        """Move a camera from the file's units to the scene's."""
         pose = camera.camera_to_world.clone()
         pose[:3, 3] = (pose[:3, 3] - torch.tensor(self.center, dtype=torch.float64)) * self.scale
         return replace(camera, camera_to_world=pose, near=self.near, far=self.far)
 
     def moved(self, box: Box) -> Box:
-        """A box of the file in the scene."""
+        """Move a box from the file's units to the scene's."""
         low, high = (
             tuple((v - c) * self.scale for v, c in zip(end, self.center)) for end in (box.low, box.high)
         )
@@ -59,18 +62,18 @@ def region_of(
     normalise: bool = True,
     cut_out: bool = False,
 ) -> Region:
-    """The region that cameras look at.
+    """Find the region that cameras look at.
 
     Args:
-        cameras: of all frames; their near and far are not looked at.
+        cameras: cameras of all frames; their near and far are not used.
         where: the file, for errors.
-        near, far, box: what is known, in the file's units; None is derived. ``near`` and ``far`` are shares
-            of the distance to the point that is looked at; the box holds all rays between them.
-        cut_out: the subject is; then the box holds no more than the pictures show about that point.
-        normalise: put that point at the origin and the farthest camera at distance 1.
+        near, far, box: what is known, in the file's units; None is derived: ``near`` and ``far`` from the
+            distance to the focus, the point looked at; the box holds all rays between them.
+        cut_out: the images are cut out; then the box holds only what they show around the focus.
+        normalise: put the focus at the origin and the farthest camera at distance 1.
 
     Raises:
-        SceneError: where something is to be derived and the cameras do not say it.
+        SceneError: where something cannot be derived from the cameras.
     """
     focus, distances = _focus(cameras, near, far, where)
     near, far = _range(distances, near, far, where)
@@ -91,19 +94,19 @@ def region_of(
 def _focus(
     cameras: Sequence[Camera], near: float | None, far: float | None, where: str
 ) -> tuple[Tensor, Tensor]:
-    """The point looked at (3,) and its distances along those optical axes that it lies before, float64."""
+    """Find the focus (3,) and its distances along the optical axes of the cameras that face it, float64."""
     centers = torch.stack([camera.center for camera in cameras])
     axes = torch.stack([camera.camera_to_world[:3, 2] for camera in cameras])
-    spread = float((centers - centers.mean(0)).norm(dim=-1).max())
-    ahead = _AHEAD * spread if near is None or far is None else 0.5 * (near + far)
-    if spread <= _STILL * (1 + float(centers.abs().max())) and (near is None or far is None):
+    radius = float((centers - centers.mean(0)).norm(dim=-1).max())
+    ahead = _AHEAD * radius if near is None or far is None else 0.5 * (near + far)
+    if radius <= _SAME_PLACE * (1 + float(centers.abs().max())) and (near is None or far is None):
         raise SceneError(
             f"{where}: expected cameras that move, but got one place; set data.near and data.far"
         )
     focus = focus_point([replace(camera, near=0.0, far=2 * ahead) for camera in cameras])
     distances = ((focus - centers) * axes).sum(-1)
     if not _LEAST * ahead < float(distances.median()) < _MOST * ahead:
-        # The axes are nearly parallel or part: they say no more than whither the cameras look.
+        # The axes are nearly parallel or diverge: only the direction of view can be trusted.
         axis = axes.mean(0)
         focus = centers.mean(0) + ahead * axis / axis.norm().clamp(min=0.1)
         distances = ((focus - centers) * axes).sum(-1)
@@ -117,7 +120,7 @@ def _focus(
 
 
 def _range(distances: Tensor, near: float | None, far: float | None, where: str) -> tuple[float, float]:
-    """Near and far in the file's units; what is derived is said."""
+    """Choose near and far in the file's units; log what is derived."""
     derived = [name for name, value in (("near", near), ("far", far)) if value is None]
     low, high = _NEAR * float(distances.min()), _FAR * float(distances.max())
     near, far = (
@@ -141,7 +144,7 @@ def _range(distances: Tensor, near: float | None, far: float | None, where: str)
 
 
 def _shown(focus: Tensor, distances: Tensor, cameras: Sequence[Camera]) -> Box:
-    """The cube about the focus point that holds what all pictures show of it."""
+    """Make the cube around the focus that holds what all pictures show of it."""
     width = max(max(camera.width / camera.fx, camera.height / camera.fy) for camera in cameras)
     half = 0.5 * float(distances.max()) * width
     low, high = ([v + sign * half for v in focus.tolist()] for sign in (-1, 1))

@@ -1,4 +1,4 @@
-"""Numbers as colours: depth, error and flow pictures (H, W, 3) in [0, 1]."""
+"""Turn depth, error and flow into pictures (H, W, 3) in [0, 1]."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ import math
 import torch
 from torch import Tensor
 
-# Far to near, of steadily rising lightness, so that it also reads in grey.
+# Far to near, steadily lighter, so that it also works in grey.
 _DEPTH = ((0.16, 0.11, 0.33), (0.17, 0.36, 0.55), (0.16, 0.61, 0.57), (0.55, 0.80, 0.36), (0.99, 0.91, 0.45))
 _ERROR = ((0.0, 0.0, 0.0), (0.45, 0.05, 0.25), (0.90, 0.30, 0.10), (1.0, 0.78, 0.25), (1.0, 1.0, 0.9))
-_STILL = 0.88  # grey of what does not move, to be told from the white where nothing is
+_STILL = 0.88  # grey of what does not move; white is empty
 
 
 def ramp(values: Tensor, anchors: tuple[tuple[float, float, float], ...]) -> Tensor:
-    """Values (...) in [0, 1] on the broken line through ``anchors`` (..., 3).
+    """Map values (...) in [0, 1] to colours (..., 3), piecewise linear through ``anchors``.
 
     >>> ramp(torch.tensor(0.5), ((0.0, 0.0, 0.0), (1.0, 0.5, 0.0))).tolist()
     [0.5, 0.25, 0.0]
@@ -26,13 +26,13 @@ def ramp(values: Tensor, anchors: tuple[tuple[float, float, float], ...]) -> Ten
 
 
 def hues(turns: Tensor) -> Tensor:
-    """Hues (..., 3) by fractions of a turn (...) around the colour wheel; 0 is red."""
+    """Map fractions of a turn (...) around the colour wheel to hues (..., 3); 0 is red."""
     thirds = torch.arange(3, device=turns.device) / 3
     return 0.5 + 0.45 * torch.cos(2 * math.pi * (turns[..., None] - thirds))
 
 
 def depth_colors(depth: Tensor, opacity: Tensor) -> Tensor:
-    """Depth (H, W) over white, near bright; the scale spans what is opaque, but for 1 % at either end."""
+    """Draw depth (H, W) over white, near bright; the scale spans opaque pixels but 1 % at either end."""
     solid = depth[opacity > 0.5]
     if not len(solid):
         return depth.new_ones(*depth.shape, 3)
@@ -43,17 +43,17 @@ def depth_colors(depth: Tensor, opacity: Tensor) -> Tensor:
 
 
 def error_colors(a: Tensor, b: Tensor, full: float = 0.25) -> Tensor:
-    """The mean absolute difference of two pictures (H, W, 3): black is none, white ``full`` and more."""
+    """Draw the mean absolute difference of two pictures (H, W, 3): black is 0, white ``full`` or more."""
     return ramp((a - b).abs().mean(-1) / full, _ERROR)
 
 
 def flow_colors(flow: Tensor, opacity: Tensor, full: float | None = None) -> Tensor:
-    """Flow (H, W, 2) in pixels over white: hue is the direction, saturation the length.
+    """Draw flow (H, W, 2) in pixels over white: hue is the direction, saturation the length.
 
     Args:
         flow: right and down.
-        opacity: (H, W), where there is anything.
-        full: length of full saturation; None: the 98 % quantile, but at least a pixel.
+        opacity: (H, W).
+        full: length of full saturation; None: the 98 % quantile, at least a pixel.
     """
     length = flow.norm(dim=-1)
     if full is None:
@@ -66,7 +66,7 @@ def flow_colors(flow: Tensor, opacity: Tensor, full: float | None = None) -> Ten
 
 
 def with_wheel(picture: Tensor, share: float = 0.16) -> Tensor:
-    """The picture (H, W, 3) with the wheel of flow colours in its lower right corner."""
+    """Draw the wheel of flow colours into the lower right corner of a picture (H, W, 3)."""
     height, width = picture.shape[:2]
     size = max(8, int(share * min(height, width)))
     if size + 4 > min(height, width):
@@ -84,13 +84,13 @@ def with_wheel(picture: Tensor, share: float = 0.16) -> Tensor:
 
 
 def in_a_row(pictures: list[Tensor], gap: int = 4) -> Tensor:
-    """Pictures (H, W_i, 3) of one height side by side, white between."""
+    """Put pictures (H, W_i, 3) of one height side by side, with white gaps."""
     white = pictures[0].new_ones(pictures[0].shape[0], gap, 3)
     return torch.cat([part for picture in pictures for part in (white, picture)][1:], 1)
 
 
 def at_least(picture: Tensor, side: int) -> Tensor:
-    """The picture (H, W, 3) with every pixel repeated so often that its shorter side has ``side`` or more.
+    """Repeat every pixel of a picture (H, W, 3) so often that its shorter side has ``side`` or more.
 
     >>> at_least(torch.zeros(100, 120, 3), 300).shape
     torch.Size([300, 360, 3])

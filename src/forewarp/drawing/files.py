@@ -1,9 +1,8 @@
-"""Pictures and videos on disk; a name appears only when its file is whole."""
+"""Write pictures and videos, whole or not at all."""
 
 from __future__ import annotations
 
 import errno
-import os
 from collections.abc import Iterable
 from itertools import chain
 from pathlib import Path
@@ -13,25 +12,27 @@ import imageio_ffmpeg
 import numpy as np
 from torch import Tensor
 
+from forewarp.files import written_whole
+
 FORMATS = ("mp4", "gif", "png")
 
 
 def to_bytes(picture: Tensor) -> np.ndarray:
-    """(H, W, 3) in [0, 1] -> uint8 (H, W, 3), rounded."""
+    """Round (H, W, 3) in [0, 1] to uint8 (H, W, 3)."""
     return (picture.detach().clamp(0, 1) * 255).round().byte().cpu().numpy()
 
 
 def write_png(path: Path, picture: Tensor) -> Path:
-    """Write (H, W, 3) in [0, 1]; the folder is made."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    _replace(path, lambda beside: iio.imwrite(beside, to_bytes(picture), extension=".png"))
+    """Write (H, W, 3) in [0, 1]; make the folder."""
+    with written_whole(path) as beside:
+        iio.imwrite(beside, to_bytes(picture), extension=".png")
     return path
 
 
 def write_video(path: Path, pictures: Iterable[Tensor], *, fps: float) -> Path:
-    """Write pictures (H, W, 3) in [0, 1], drawn one by one, in the format that the suffix names.
+    """Write pictures (H, W, 3) in [0, 1], taken one by one, in the format that the suffix names.
 
-    ``.mp4`` and ``.gif`` are files; ``.png`` makes a folder of stills beside, named as the file without it.
+    ``.mp4`` and ``.gif`` are files; ``.png`` makes a folder of images, named like the file without suffix.
 
     Returns:
         the file or the folder.
@@ -41,12 +42,12 @@ def write_video(path: Path, pictures: Iterable[Tensor], *, fps: float) -> Path:
         for number, picture in enumerate(pictures):
             write_png(folder / f"{number:04d}.png", picture)
         return folder
-    path.parent.mkdir(parents=True, exist_ok=True)
-    if path.suffix == ".gif":
-        frames = [to_bytes(picture) for picture in pictures]
-        _replace(path, lambda b: iio.imwrite(b, frames, extension=".gif", duration=1000 / fps, loop=0))
-    else:
-        _replace(path, lambda b: _write_mp4(b, map(to_bytes, pictures), fps))
+    with written_whole(path) as beside:
+        if path.suffix == ".gif":
+            frames = [to_bytes(picture) for picture in pictures]
+            iio.imwrite(beside, frames, extension=".gif", duration=1000 / fps, loop=0)
+        else:
+            _write_mp4(beside, map(to_bytes, pictures), fps)
     return path
 
 
@@ -54,14 +55,14 @@ def _write_mp4(path: Path, frames: Iterable[np.ndarray], fps: float) -> None:
     frames = map(_even, frames)
     first = next(frames)
     size = first.shape[1], first.shape[0]
-    # The default block of 16 would stretch the picture; 2 is the least that the codec takes.
+    # The default block of 16 would stretch the picture; 2 is the smallest that the codec allows.
     options = {"fps": fps, "quality": 8, "macro_block_size": 2, "ffmpeg_log_level": "error"}
     writer = imageio_ffmpeg.write_frames(str(path), size, **options)
     writer.send(None)
     try:
         for frame in chain([first], frames):
             writer.send(frame)
-    except OSError as error:  # of many lines, and without the file
+    except OSError as error:  # its message has many lines and does not name the file
         raise OSError(errno.EIO, "ffmpeg could not go on (is the disk full?)", str(path)) from error
     finally:
         writer.close()
@@ -70,12 +71,3 @@ def _write_mp4(path: Path, frames: Iterable[np.ndarray], fps: float) -> None:
 def _even(frame: np.ndarray) -> np.ndarray:
     height, width = frame.shape[:2]
     return np.ascontiguousarray(np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge"))
-
-
-def _replace(path: Path, write) -> None:
-    beside = path.with_name(f".{path.name}.part{path.suffix}")
-    try:
-        write(beside)
-        os.replace(beside, path)
-    finally:
-        beside.unlink(missing_ok=True)

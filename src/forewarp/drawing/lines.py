@@ -1,20 +1,20 @@
-"""Antialiased lines and discs over a picture, hidden where the scene stands before them."""
+"""Draw antialiased lines and discs over a picture, hidden where the scene occludes them."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-_SPACING = 0.5  # pixels between the discs that make a line: closer than the eye tells
-_MOST = 2048  # discs a segment; longer ones run far outside any picture
+_SPACING = 0.5  # pixels between the discs that make a line
+_MOST = 2048  # discs per segment; longer ones leave any picture
 
 
 def draw_discs(picture: Tensor, at: Tensor, colors: Tensor, alpha: Tensor, radius: float) -> Tensor:
-    """Discs over a picture. Where they overlap, colours are averaged and the most opaque one counts.
+    """Draw discs over a picture. Where they overlap, average the colours and take the largest opacity.
 
     Args:
         picture: (H, W, 3).
-        at: centres (M, 2) in pixels, top-left corner the origin.
+        at: centres (M, 2) in pixels from the top-left corner.
         colors: (M, 3).
         alpha: (M,).
         radius: in pixels.
@@ -38,13 +38,13 @@ def draw_discs(picture: Tensor, at: Tensor, colors: Tensor, alpha: Tensor, radiu
 
 
 def sample_lines(vertices: Tensor) -> tuple[Tensor, Tensor]:
-    """Points along polylines, half a pixel apart.
+    """Sample points along polylines, half a pixel apart.
 
     Args:
         vertices: (N, T, C); the first two channels are pixels, all are interpolated.
 
     Returns:
-        (M, C) and the line of each (M,).
+        points (M, C) and the line of each (M,).
     """
     begin, end = vertices[:, :-1].flatten(0, 1), vertices[:, 1:].flatten(0, 1)
     count = ((end - begin)[:, :2].norm(dim=-1) / _SPACING).ceil().long().clamp(1, _MOST)
@@ -55,7 +55,7 @@ def sample_lines(vertices: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def hidden(at: Tensor, distance: Tensor, depth: Tensor, slack: float) -> Tensor:
-    """Points (M,) bool that lie more than ``slack`` behind the surface.
+    """Tell which points lie more than ``slack`` behind the surface: (M,) bool.
 
     Args:
         at: (M, 2) pixels.

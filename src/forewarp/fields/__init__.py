@@ -1,1 +1,1 @@
-"""What is learned: radiance and trajectories on a canonical lattice."""
+"""What several methods learn: voxel grids, radiance, trajectories, networks, codes."""

@@ -1,4 +1,4 @@
-"""Small networks."""
+"""Small multilayer perceptrons."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from torch import Tensor, nn
 
 
 class Network(nn.Sequential):
-    """Layers that stay in full precision under autocast: eight bits of a trajectory are a blur of a voxel."""
+    """Layers that stay in float32 under autocast: bfloat16 would blur a trajectory by a voxel."""
 
     def forward(self, x: Tensor) -> Tensor:
-        """(..., I) -> (..., O), never in half precision."""
+        """(..., I) -> (..., O), in full precision."""
         with torch.autocast(x.device.type, enabled=False):
             return super().forward(x.float() if x.dtype in (torch.float16, torch.bfloat16) else x)
 
@@ -21,12 +21,15 @@ def mlp(
     """``layers`` linear layers, ReLU between them.
 
     Args:
-        inputs, outputs: channels.
-        width: of the hidden layers.
-        layers: linear layers in all, at least 1.
-        zero_last: start from zero outputs, so that training starts from the identity.
-        leaky: a slope of 0.01 below zero. At the rates that motion needs, every ReLU of the last hidden layer
-            may die in one unlucky step, and what is left can only move everything alike.
+        inputs, outputs: numbers of channels.
+        width: channels of the hidden layers.
+        layers: number of linear layers, at least 1.
+        zero_last: start from zero outputs.
+        leaky: use LeakyReLU with slope 0.01. Otherwise, at the learning rates of motion, one step may
+            kill every ReLU of the last hidden layer, and all points then move alike.
+
+    Raises:
+        ValueError: for ``layers`` or ``width`` below 1.
 
     >>> len([m for m in mlp(33, 4, width=128, layers=3) if isinstance(m, nn.Linear)])
     3

@@ -15,7 +15,10 @@ from forewarp.scene.box import Box, Lattice
 
 
 def density_shift(alpha_init: float) -> float:
-    """``log(1 / (1 - alpha_init) - 1)``: raw density 0 has opacity ``alpha_init`` over one unit.
+    """Return ``log(1 / (1 - alpha_init) - 1)``, the ``shift`` of ``Activation``.
+
+    Raises:
+        ValueError: for an opacity outside (0, 1).
 
     >>> round(density_shift(0.5), 6)
     0.0
@@ -26,16 +29,16 @@ def density_shift(alpha_init: float) -> float:
 
 
 class DirectRadiance(VoxelGrid):
-    """Density and colour held in the voxels themselves: no network, the cheap choice.
+    """Density and colour stored in the voxels, without a network: the cheap choice.
 
     Args:
-        lattice: where voxels may be.
-        active: (X, Y, Z) bool.
-        features: colour channels; the first 3 are the colour, the rest its shading by direction.
-        alpha_init: opacity over ``unit`` at raw density 0.
-        unit: length that density is measured in, world units.
-        skip_alpha: cells more transparent than this over a voxel are not sampled.
-        box: the scene's; not needed without a network.
+        lattice: possible voxel positions.
+        active: (X, Y, Z) bool, the active voxels.
+        features: colour channels: 3 for colour, the rest for shading by direction.
+        alpha_init: opacity over ``density_scale`` at raw density 0.
+        density_scale: unit of length of densities, in world units.
+        alpha_threshold: skip cells whose eight voxels all have at most this opacity over one voxel.
+        box: unused, as there is no network.
     """
 
     def __init__(
@@ -45,13 +48,13 @@ class DirectRadiance(VoxelGrid):
         *,
         features: int,
         alpha_init: float,
-        unit: float,
-        skip_alpha: float,
+        density_scale: float,
+        alpha_threshold: float,
         box: Box | None = None,
     ) -> None:
         super().__init__(lattice, active, self._channels(features))
-        self.activation = Activation(density_shift(alpha_init), unit)
-        self.skip_alpha = skip_alpha
+        self.activation = Activation(density_shift(alpha_init), density_scale)
+        self.alpha_threshold = alpha_threshold
 
     @staticmethod
     def _channels(features: int) -> dict[str, int]:
@@ -59,28 +62,28 @@ class DirectRadiance(VoxelGrid):
         return channels | {"shading": features - 3} if features > 3 else channels
 
     def forward(self) -> RadianceGrid:
-        """The canonical radiance grid, values (N, 1 + C)."""
+        """Return the canonical radiance grid, values (N, 1 + C)."""
         values = torch.cat([self.parameter(name) for name in self.names], -1)
-        return RadianceGrid(self.lattice, self.index, values, self.activation, self.skip_alpha)
+        return RadianceGrid(self.lattice, self.index, values, self.activation, self.alpha_threshold)
 
     def births(self, alpha: float) -> dict[str, float]:
-        """What a newly activated voxel starts from: density of opacity ``alpha``, its neighbours' colour."""
-        return {"density": self.activation.raw(alpha, self.lattice.pitch)}
+        """Return the values of new voxels by name: the density of opacity ``alpha``; colour is averaged."""
+        return {"density": self.activation.raw(alpha, self.lattice.voxel_size)}
 
     def empties(self) -> dict[str, float]:
-        """What absent voxels count as when the lattice changes."""
+        """Return the values of absent voxels by name, for resampling."""
         return {"density": EMPTY}
 
 
 class FeatureRadiance(VoxelGrid):
-    """The paper's F1: a feature grid and the encoded position through a small MLP give density and colour.
+    """The paper's F1: density and colour from a feature grid and the encoded position by a small MLP.
 
     Args:
-        lattice, active, features, alpha_init, unit, skip_alpha: as ``DirectRadiance``.
+        lattice, active, features, alpha_init, density_scale, alpha_threshold: see ``DirectRadiance``.
         grid_features: channels of the feature grid.
-        width, layers: of F1.
-        frequencies: of the positional encoding.
-        box: normalises positions to [-1, 1], kept when the lattice changes; None: the lattice's own.
+        width, layers: size of F1.
+        frequencies: octaves of the positional encoding.
+        box: normalises positions to [-1, 1] on all lattices; None: the first lattice's box.
     """
 
     def __init__(
@@ -90,8 +93,8 @@ class FeatureRadiance(VoxelGrid):
         *,
         features: int,
         alpha_init: float,
-        unit: float,
-        skip_alpha: float,
+        density_scale: float,
+        alpha_threshold: float,
         grid_features: int = 12,
         width: int = 128,
         layers: int = 3,
@@ -109,17 +112,17 @@ class FeatureRadiance(VoxelGrid):
             zero_last=True,
         )
         self.frequencies = frequencies
-        self.activation = Activation(density_shift(alpha_init), unit)
-        self.skip_alpha = skip_alpha
+        self.activation = Activation(density_shift(alpha_init), density_scale)
+        self.alpha_threshold = alpha_threshold
         self._encoded: tuple[Tensor, Tensor] | None = None
 
     def forward(self) -> RadianceGrid:
-        """The canonical radiance grid, values (N, 1 + C)."""
+        """Return the canonical radiance grid, values (N, 1 + C)."""
         values = self.network(torch.cat([self._positions(), self.features], -1))
-        return RadianceGrid(self.lattice, self.index, values, self.activation, self.skip_alpha)
+        return RadianceGrid(self.lattice, self.index, values, self.activation, self.alpha_threshold)
 
     def _positions(self) -> Tensor:
-        # The tensor itself is the key: an id may be given again to the next one.
+        # Compare the tensor itself, as an id may be reused.
         if self._encoded is None or self._encoded[0] is not self.voxels:
             points = self.reference.to_lattice(self.lattice.to_world(self.voxels))
             encoded = positional_encoding(self.reference.normalised(points), self.frequencies)
@@ -127,9 +130,9 @@ class FeatureRadiance(VoxelGrid):
         return self._encoded[1]
 
     def births(self, alpha: float) -> dict[str, float]:
-        """Features are averaged from the neighbours; F1 decides their density."""
+        """Return nothing: new voxels get the mean features of their neighbours."""
         return {}
 
     def empties(self) -> dict[str, float]:
-        """Features are averaged over the voxels present."""
+        """Return nothing: resampling averages over the present voxels."""
         return {}

@@ -1,4 +1,4 @@
-"""Density and colour in space, as marched rays read them."""
+"""Density and colour in space, as the renderer reads them."""
 
 from __future__ import annotations
 
@@ -13,86 +13,94 @@ from torch import Tensor
 from forewarp.ops.grid import occupied_cells, trilinear
 from forewarp.scene.box import Lattice
 
-EMPTY = -10.0  # raw density of an absent voxel: about exp(-10) of the opacity that raw 0 has
+EMPTY = -10.0  # raw density of an absent voxel: about exp(-10) times the density at raw 0
 
 
 Shade = Callable[[Tensor, Tensor], Tensor]  # features (P, C) and directions (P, 3) -> colour (P, 3)
 
 
 class FieldAtTime(Protocol):
-    """Density and colour anywhere in ``lattice`` at one time; all that the renderer needs.
+    """Density and colour anywhere in ``lattice`` at one time: all that the renderer needs.
 
-    ``cells`` (X-1, Y-1, Z-1) bool are those that may hold matter. ``density`` gives sigma (P,) per world
-    unit and ``colors`` (P, 3) at points (P, 3) in lattice coordinates, seen along unit directions (P, 3).
+    Points (P, 3) are in lattice coordinates; directions (P, 3) have length 1.
     """
 
     lattice: Lattice
 
     @property
-    def pitch(self) -> float:
-        """The finest detail along a ray, world units: a step is a share of it."""
+    def voxel_size(self) -> float:
+        """Size of the finest voxels, in world units; a ray's step is a share of this."""
 
     @property
     def cells(self) -> Tensor:
-        """Where matter may be."""
+        """Cells (X-1, Y-1, Z-1) bool that may hold matter."""
 
     def density(self, points: Tensor) -> Tensor:
-        """Sigma (P,)."""
+        """Density (P,), per world unit of length."""
 
     def colors(self, points: Tensor, directions: Tensor, shade: Shade | None) -> Tensor:
-        """Colour (P, 3); ``shade`` makes it of the features and the directions."""
+        """Colour (P, 3); ``shade`` computes colour from features and directions."""
 
 
 def shaded(features: Tensor, directions: Tensor, shade: Shade | None) -> Tensor:
-    """Features (P, C) seen along directions (P, 3) -> colour (P, 3); without ``shade`` the first 3 are it."""
+    """Features (P, C) and directions (P, 3) -> colour (P, 3); without ``shade`` from the first 3 features."""
     return torch.sigmoid(features[:, :3]) if shade is None else shade(features, directions)
 
 
 @dataclass(frozen=True)
 class Activation:
-    """Raw density to density: ``sigma = softplus(raw + shift) / unit``, per world unit of length.
+    """The density activation ``sigma = softplus(raw + shift) / density_scale`` (DirectVoxGO's).
 
-    ``unit`` is a length (the coarse voxel), so that nothing depends on the scene's units; ``shift`` is such
-    that raw 0 has opacity ``alpha_init`` over one unit, ``log(1 / (1 - alpha_init) - 1)``.
+    Attributes:
+        shift: ``log(1 / (1 - alpha_init) - 1)``, so that raw 0 has opacity ``alpha_init`` over
+            ``density_scale``.
+        density_scale: a length in world units (the first stage's voxel size), so that learned values do not
+            depend on the scene's scale.
     """
 
     shift: float
-    unit: float
+    density_scale: float
 
     def sigma(self, raw: Tensor) -> Tensor:
-        """Density per world unit, the shape of ``raw``."""
-        return torch.nn.functional.softplus(raw + self.shift) / self.unit
+        """Return the density per world unit of length, in the shape of ``raw``."""
+        return torch.nn.functional.softplus(raw + self.shift) / self.density_scale
 
     def alpha(self, raw: Tensor, length: float) -> Tensor:
-        """Opacity over ``length`` world units."""
+        """Return the opacity over ``length`` world units."""
         return -torch.expm1(-self.sigma(raw) * length)
 
     def raw(self, alpha: float, length: float) -> float:
-        """The raw density whose opacity over ``length`` is ``alpha``."""
-        sigma = -torch.log1p(-torch.tensor(alpha, dtype=torch.float64)) / length * self.unit
+        """Return the raw density whose opacity over ``length`` is ``alpha``."""
+        sigma = -torch.log1p(-torch.tensor(alpha, dtype=torch.float64)) / length * self.density_scale
         return float(sigma + torch.log(-torch.expm1(-sigma)) - self.shift)  # expm1(sigma) may overflow
 
 
 @dataclass(frozen=True)
 class RadianceGrid:
-    """Radiance on a sparse lattice: ``values`` (M, 1 + C) are raw density, then colour features;
-    ``index`` (X, Y, Z) int32 holds a voxel's row, or -1 where space is empty.
+    """Radiance on a sparse lattice.
+
+    Attributes:
+        lattice: possible voxel positions.
+        index: (X, Y, Z) int32, the row of each voxel in ``values``, -1 for absent voxels.
+        values: (M, 1 + C), raw density, then colour features.
+        activation: turns raw density into density.
+        alpha_threshold: skip cells whose eight voxels all have at most this opacity over one voxel.
     """
 
     lattice: Lattice
     index: Tensor
     values: Tensor
     activation: Activation
-    skip_alpha: float = 0.0
+    alpha_threshold: float = 0.0
 
     @property
-    def pitch(self) -> float:
-        """The lattice's."""
-        return self.lattice.pitch
+    def voxel_size(self) -> float:
+        """Voxel size of the lattice."""
+        return self.lattice.voxel_size
 
     @property
     def raw_density(self) -> Tensor:
-        """(M,)."""
+        """Raw density (M,)."""
         return self.values[:, 0]
 
     @property
@@ -102,25 +110,25 @@ class RadianceGrid:
 
     @property
     def fill(self) -> Tensor:
-        """What an absent voxel reads (1 + C,)."""
+        """Values (1 + C,) of an absent voxel."""
         return torch.nn.functional.pad(self.values.new_full((1,), EMPTY), (0, self.values.shape[1] - 1))
 
     @cached_property
     def cells(self) -> Tensor:
-        """Cells whose corners are present and may exceed ``skip_alpha`` over one voxel."""
-        if self.skip_alpha <= 0 or not len(self.values):
+        """Cells with a corner whose opacity over one voxel exceeds ``alpha_threshold``."""
+        if self.alpha_threshold <= 0 or not len(self.values):
             return occupied_cells(self.index)
-        low = self.activation.raw(self.skip_alpha, self.lattice.pitch)
+        low = self.activation.raw(self.alpha_threshold, self.lattice.voxel_size)
         return occupied_cells(self.index, self.raw_density.detach() > low)
 
     def density(self, points: Tensor) -> Tensor:
-        """Sigma (P,) at lattice coordinates (P, 3)."""
+        """Density (P,) at lattice coordinates (P, 3)."""
         raw = trilinear(self.values[:, :1].contiguous(), self.index, points, self.fill[:1])
         return self.activation.sigma(raw[:, 0])
 
     def features(self, points: Tensor) -> Tensor:
         """Colour features (P, C) at lattice coordinates (P, 3)."""
-        # Of all channels at once: the colours alone would be a copy of the grid.
+        # Read all channels, as a slice of the colours would copy the grid.
         return trilinear(self.values, self.index, points, self.fill)[:, 1:]
 
     def colors(self, points: Tensor, directions: Tensor, shade: Shade | None) -> Tensor:
@@ -128,5 +136,5 @@ class RadianceGrid:
         return shaded(self.features(points), directions, shade)
 
     def with_values(self, values: Tensor) -> RadianceGrid:
-        """The same voxels with other values."""
+        """Return the same voxels with other values."""
         return replace(self, values=values)

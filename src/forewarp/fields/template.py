@@ -1,4 +1,4 @@
-"""The network of NeRF and of its kin: a trunk that reads its input twice, density from it, then colour."""
+"""The network of NeRF and its successors: a trunk with a skip, then density, then colour."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ DENSITY: dict[str, Callable[[Tensor], Tensor]] = {"relu": torch.relu, "softplus"
 
 
 class Trunk(nn.Module):
-    """``layers`` linear layers, a ReLU after each; layer ``skip`` reads an input once more.
+    """``layers`` linear layers with ReLU; layer ``skip`` reads an input again.
 
     Args:
-        inputs: channels of the first layer.
-        width: of every layer.
-        layers: at least 1.
-        skip: number of the layer, counted from 1, that reads ``again`` beside the layer before: 6 in the
-            PyTorch family of NeRF, 5 in the JAX family; None: no layer.
-        again: channels that are read there; None: those of the first layer.
+        inputs: channels read by the first layer.
+        width: channels of every layer.
+        layers: number of layers, at least 1.
+        skip: number of the layer, from 1, that also reads ``again``: 6 in PyTorch versions of NeRF, 5 in JAX
+            versions; None: no layer.
+        again: channels read at the skip; None: ``inputs``.
 
     >>> sum(p.numel() for p in Trunk(72).parameters())
     497664
@@ -48,7 +48,7 @@ class Trunk(nn.Module):
         )
 
     def forward(self, x: Tensor, again: Tensor | None = None) -> Tensor:
-        """(..., I) -> (..., width); at the skip ``again`` (..., A) is read before the rest, None: ``x``."""
+        """(..., I) -> (..., width); the skip reads ``again`` (..., A), or ``x`` for None."""
         hidden = x
         for number, layer in enumerate(self.layers, 1):
             if number == self.skip:
@@ -58,15 +58,15 @@ class Trunk(nn.Module):
 
 
 class Template(nn.Module):
-    """Density and colour at a point: ``N(inputs, condition)``.
+    """Density and colour at a point.
 
-    Density is linear on the trunk and sees no condition. Colour goes through a bottleneck without activation,
-    which the condition (a direction, a code) joins, one layer of half the width, and a sigmoid.
+    Density is linear in the trunk's output and ignores the condition (a direction, a code). Colour passes a
+    linear bottleneck, one layer of half the width that also reads the condition, and a sigmoid.
 
     Args:
         inputs: channels of the encoded point.
-        condition: channels that the colour alone sees; 0: none.
-        width, layers, skip: of the trunk.
+        condition: channels that only colour depends on; 0: none.
+        width, layers, skip: see ``Trunk``.
 
     >>> sum(p.numel() for p in Template(63, 27).parameters())
     595844
@@ -87,13 +87,11 @@ class Template(nn.Module):
         self.color_head = nn.Linear(width // 2, 3)
 
     def density(self, x: Tensor) -> Tensor:
-        """Encoded points (..., I) -> density before its activation (...,)."""
+        """Encoded points (..., I) -> raw density (...,)."""
         return self.density_head(self.trunk(x))[..., 0]
 
     def forward(self, x: Tensor, condition: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Encoded points (..., I) and what colour depends on (..., D) -> density before its activation (...,)
-        and colour (..., 3) in [0, 1].
-        """
+        """Encoded points (..., I), condition (..., D) -> raw density (...,), colour (..., 3) in [0, 1]."""
         hidden = self.trunk(x)
         color = self.bottleneck(hidden)
         if condition is not None:
@@ -103,7 +101,7 @@ class Template(nn.Module):
 
 
 def density_of(name: str) -> Callable[[Tensor], Tensor]:
-    """Find what makes density >= 0: ``relu`` or ``softplus``."""
+    """Return the density activation ``relu`` or ``softplus``; ValueError for another name."""
     if name not in DENSITY:
         raise ValueError(f"model.density: expected {' or '.join(DENSITY)}, but got {name!r}")
     return DENSITY[name]

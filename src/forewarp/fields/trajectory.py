@@ -1,4 +1,4 @@
-"""The canonical trajectory field: every voxel's path through time in a few cosines."""
+"""The canonical trajectory field: the path of every voxel through time, in a few cosines."""
 
 from __future__ import annotations
 
@@ -14,21 +14,24 @@ from forewarp.scene.box import Box, Lattice
 
 
 class TrajectoryField(nn.Module):
-    """F2: encoded position (and optional grid features) -> DCT coefficients (N, 3, K) of world-unit flow.
+    """The paper's F2: encoded position (and grid features) -> DCT coefficients (N, 3, K) of the flow.
 
     Coefficients are evaluated at the nodes of a coarse lattice and interpolated to the voxels, which also
-    keeps neighbours' motion alike; with ``nodes=0`` they are evaluated at every voxel, as printed. Bases
-    beyond ``bases_in_play`` are silent and start at 0 when they are let in.
+    smooths the motion. With ``nodes=0`` they are evaluated at every voxel, as in the paper. Bases beyond
+    ``bases_in_play`` are 0.
 
     Args:
-        box: normalises positions to [-1, 1]; kept through all stages so that the network carries over.
-        bases: K, at most ``frames - 1``.
+        box: normalises positions to [-1, 1]; the same in all stages, so that the network carries over.
+        bases: K, reduced to ``frames - 1`` if larger.
         frames: T, the number of distinct training times.
-        canonical_time: where flow is exactly 0.
-        nodes: about how many nodes along the box's mean side, at least 8; 0 for none.
-        features: channels of the deformation feature grid; 0 for none.
-        width, layers, frequencies: of F2 and its encoding.
-        padding: see ``dct_basis``: lets things move at the first and last frame.
+        canonical_time: time at which flow is exactly 0.
+        nodes: number of nodes along the box's mean side, at least 8; 0: no nodes.
+        features: channels of the deformation feature grid; 0: none.
+        width, layers, frequencies: size of F2, octaves of the positional encoding.
+        padding: lets objects move at the first and last frame (see ``dct_basis``).
+
+    Raises:
+        ValueError: with a single training time.
     """
 
     def __init__(
@@ -68,13 +71,13 @@ class TrajectoryField(nn.Module):
         self._nodes: tuple[Tensor, tuple[Tensor, Tensor, Tensor]] | None = None
 
     def play(self, bases: float | None) -> int:
-        """Let so many bases play, all where None is given; how many these are."""
+        """Use the first ``bases`` bases, all for None; return their number."""
         playing = self.bases if bases is None else min(int(bases), self.bases)
         self.bases_in_play.fill_(playing)
         return playing
 
     def coefficients(self, points: Tensor) -> Tensor:
-        """DCT coefficients (N, 3, K) in world units at points (N, 3) in world units."""
+        """Return the DCT coefficients (N, 3, K) at points (N, 3), in world units."""
         coordinates = self.lattice.to_lattice(points)
         inputs = positional_encoding(self.lattice.normalised(coordinates), self.frequencies)
         if self.features is not None:
@@ -84,26 +87,26 @@ class TrajectoryField(nn.Module):
         return self.scale * self.network(inputs).reshape(-1, 3, self.bases)
 
     def basis(self, time: float | Tensor) -> Tensor:
-        """``dct_basis`` of the field at ``time`` (...,) -> (..., K); bases that are not in play are 0."""
+        """Return ``dct_basis`` at ``time`` (...,) as (..., K), 0 for bases not in play."""
         basis = dct_basis(time, self.bases, self.frames, self.canonical_time, self.padding)
         basis = basis.to(self.bases_in_play.device)
         return basis * (torch.arange(self.bases, device=basis.device) < self.bases_in_play)
 
-    def flow(self, voxels: VoxelGrid, time: float) -> Tensor:
-        """Flow (N, 3) in world units from the canonical time to ``time`` for a grid's active voxels.
+    def flow(self, grid: VoxelGrid, time: float) -> Tensor:
+        """Return the flow (N, 3) of a grid's active voxels from the canonical time, in world units.
 
-        Cost: F2 on the nodes around the active voxels, then one trilinear read a voxel.
+        Cost: F2 on the nodes around the active voxels, then one trilinear read per voxel.
         """
-        points, (nodes, index, coordinates) = self._around(voxels)
+        points, (nodes, index, coordinates) = self._around(grid)
         at_nodes = _matmul(self.coefficients(nodes if self.at_nodes else points), self.basis(time))
         if not self.at_nodes:
             return at_nodes
         return trilinear(at_nodes, index, coordinates, at_nodes.new_zeros(3))
 
-    def _around(self, voxels: VoxelGrid):
-        if self._nodes is None or self._nodes[0] is not voxels.voxels:
-            points = voxels.lattice.to_world(voxels.voxels)
-            self._nodes = (voxels.voxels, (points, self._nodes_around(points)))
+    def _around(self, grid: VoxelGrid):
+        if self._nodes is None or self._nodes[0] is not grid.voxels:
+            points = grid.lattice.to_world(grid.voxels)
+            self._nodes = (grid.voxels, (points, self._nodes_around(points)))
         return self._nodes[1]
 
     def _nodes_around(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -115,7 +118,7 @@ class TrajectoryField(nn.Module):
         return self.lattice.to_world(nodes), index_of(nodes, self.lattice.shape), coordinates
 
     def trajectories(self, points: Tensor, times: Tensor) -> Tensor:
-        """Paths (N, T, 3) of canonical points (N, 3) at ``times`` (T,), world units."""
+        """Return the paths (N, T, 3) of canonical points (N, 3) at ``times`` (T,), in world units."""
         if not self.at_nodes:
             flow = _matmul(self.coefficients(points), self.basis(times).T)  # (N, 3, T)
             return points[:, None] + flow.transpose(1, 2)
@@ -127,6 +130,6 @@ class TrajectoryField(nn.Module):
 
 
 def _matmul(coefficients: Tensor, basis: Tensor) -> Tensor:
-    """``coefficients @ basis``, where autocast must not take what ``Network`` kept from it."""
+    """Return ``coefficients @ basis``, in full precision under autocast as in ``Network``."""
     with torch.autocast(coefficients.device.type, enabled=False):
         return coefficients @ basis

@@ -1,4 +1,4 @@
-"""Learned values on the active voxels of a lattice: dense where all are active, sparse elsewhere."""
+"""Learned values on the active voxels of a lattice, dense or sparse."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from forewarp.scene.box import Box, Lattice
 
 
 class VoxelGrid(nn.Module):
-    """Parameters (N, C) by name, one row an active voxel, and the buffers that place them.
+    """Parameters (N, C) with one row per active voxel, and buffers with the voxels' positions.
 
-    The lattice and its active voxels change while training (``activate``, ``resample``); a checkpoint
-    brings its own, so shapes are adopted on loading.
+    ``voxels`` (N, 3) are the active voxels' lattice positions, ``index`` (X, Y, Z) their rows or -1. Both
+    change during training (``activate``, ``resample``), so loading adopts a checkpoint's lattice and shapes.
 
     Args:
-        lattice: where voxels may be.
-        active: (X, Y, Z) bool.
-        channels: name -> C.
+        lattice: possible voxel positions.
+        active: (X, Y, Z) bool, the active voxels.
+        channels: number of channels C by parameter name.
     """
 
     def __init__(self, lattice: Lattice, active: Tensor, channels: dict[str, int]) -> None:
@@ -32,21 +32,21 @@ class VoxelGrid(nn.Module):
             self.register_parameter(name, nn.Parameter(torch.zeros(len(voxels), c)))
 
     def extra_repr(self) -> str:
-        """Shape, share of active voxels, channels."""
+        """Describe shape, share of active voxels and parameters."""
         return f"{self.lattice.shape}, active={len(self.voxels) / self.lattice.count:.1%}, {self.names}"
 
     def parameter(self, name: str) -> nn.Parameter:
-        """The parameter (N, C) of that name."""
+        """Return a parameter (N, C) by name."""
         return getattr(self, name)
 
     @torch.no_grad()
     def activate(self, active: Tensor, births: dict[str, float]) -> Tensor:
-        """Make exactly the voxels in ``active`` (X, Y, Z) the active ones.
+        """Make the voxels in ``active`` (X, Y, Z) the active ones.
 
-        New voxels get ``births[name]``, or the mean of their active neighbours where a name is not in it.
+        New voxels get ``births[name]``, or the mean of their active neighbours for names not in it.
 
         Returns:
-            (N',) int64: the row each voxel had before, -1 where it is new.
+            (N',) int64, the former row of each voxel, -1 for new ones.
         """
         voxels = active.nonzero().to(self.voxels.device)
         rows = self.index[voxels[:, 0], voxels[:, 1], voxels[:, 2]].long()
@@ -64,9 +64,9 @@ class VoxelGrid(nn.Module):
 
     @torch.no_grad()
     def resample(self, lattice: Lattice, active: Tensor, empty: dict[str, float]) -> None:
-        """Carry the values to another lattice by trilinear interpolation.
+        """Interpolate the values to another lattice, trilinearly.
 
-        Absent voxels read ``empty[name]``; names not in it are averaged over the voxels present.
+        Absent voxels count as ``empty[name]``; names not in it are averaged over the present voxels.
         """
         voxels = active.nonzero().to(self.voxels.device)
         points = self.lattice.to_lattice(lattice.to_world(voxels))
@@ -80,7 +80,7 @@ class VoxelGrid(nn.Module):
         self._place(lattice, voxels)
 
     def _renew(self, name: str, values: Tensor) -> None:
-        # A new Parameter: autograd remembers an old one's shape for as long as any graph lives.
+        # A new Parameter, as autograd keeps the shape of the old one while any graph lives.
         setattr(self, name, nn.Parameter(values))
 
     def _place(self, lattice: Lattice, voxels: Tensor) -> None:
@@ -104,7 +104,7 @@ class VoxelGrid(nn.Module):
         return total / count.clamp(min=1)
 
     def get_extra_state(self) -> dict:
-        """The lattice, in plain numbers."""
+        """Return the lattice in plain numbers."""
         box = self.lattice.box
         return {"low": list(box.low), "high": list(box.high), "shape": list(self.lattice.shape)}
 
@@ -113,9 +113,9 @@ class VoxelGrid(nn.Module):
         self.lattice = _lattice(state)
 
     def misfit(self, state: dict, prefix: str) -> str | None:
-        """The entry of a stored state that does not fit the others; None where all do.
+        """Return the name of a stored entry that contradicts the others, or None.
 
-        Kernels believe the index: one that points elsewhere would end the process and not the call.
+        Kernels do not check the index: a wrong one would crash the process.
         """
         try:
             lattice = _lattice(state[prefix + "_extra_state"])

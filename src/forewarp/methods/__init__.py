@@ -1,1 +1,1 @@
-"""Answers to one question: at this time, what is where?"""
+"""Methods: what a scene is learned by. Each renders any view at any time, through one contract."""

@@ -1,4 +1,4 @@
-"""What a method may be able to do beside the contract; what asks for it says so where it cannot."""
+"""Optional abilities of a method, beside the contract: trajectories, bounds, points."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ from forewarp.scene.cloud import Cloud
 
 @runtime_checkable
 class HasTrajectories(Protocol):
-    """Follows points of the canonical matter."""
+    """Follow points through time."""
 
-    moves: bool  # whether there is any motion
+    moves: bool  # False if the scene is static
 
     def trajectories(self, points: Tensor, times: Tensor) -> Tensor:
-        """Give the paths (N, T, 3) of canonical points (N, 3) at ``times`` (T,), world units."""
+        """Return the paths (N, T, 3) of canonical points (N, 3) at ``times`` (T,), in world units."""
 
 
 @runtime_checkable
 class HasBounds(Protocol):
-    """Knows where its matter is."""
+    """Bound all matter."""
 
     def bounds(self, times: list[float]) -> Box | None:
-        """Bound all matter at all of these times, world units; None where there is none."""
+        """Return the box that holds all matter at all ``times``, in world units; None if there is none."""
 
 
 @runtime_checkable
 class HasMatter(Protocol):
-    """Gives the occupied part, for drawing, export, and the stage that follows."""
+    """Give the matter as points, for drawing, export and the next stage."""
 
     def matter(self) -> Cloud:
-        """Give all canonical matter as points."""
+        """Return all canonical matter as points."""

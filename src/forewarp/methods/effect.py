@@ -1,4 +1,4 @@
-"""A method's optional parts, and how a plan finds out which of them a scene calls for."""
+"""Effects: a method's optional parts, and how a plan decides which of them a scene needs."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from forewarp.methods.method import Method
-from forewarp.report.effect import Gain
+from forewarp.report.gain import Gain
 from forewarp.scene.batch import Target
 from forewarp.scene.frame import Scene
 from forewarp.scene.pictures import Pictures
@@ -16,13 +16,16 @@ from forewarp.scene.pictures import Pictures
 
 @dataclass(frozen=True)
 class Effect:
-    """An optional part of a method, absent and free where it is off.
+    """An optional part of a method; off, it has no parameters and costs no time.
 
-    ``name`` is its config group ``model/<name>`` and, where ``attribute`` names no other, the attribute of
-    the method that is None where it is off; ``on`` is what it is usually switched on by, ``off`` what
-    switches it off. ``later``: tried from the coarse stage on, with it and without, unless ``rules_out``
-    says that the evidence speaks against it; otherwise decided while coarse stages are compared. ``with_it``
-    are further overrides that make a run as it was tried.
+    Attributes:
+        name: name of the config group ``model/<name>``.
+        on, off: the usual options that switch it on and off.
+        attribute: the method's attribute that is None while the effect is off; by default ``name``.
+        later: True: decide it after the coarse stage, by a trial with and without it. False: decide it by
+            comparing coarse stages.
+        rules_out: returns True if the evidence makes a trial of a ``later`` effect pointless.
+        with_it: returns further overrides, for the final run to be as its trial was.
     """
 
     name: str
@@ -35,39 +38,45 @@ class Effect:
 
     @property
     def group(self) -> str:
-        """Its config group."""
+        """Name of the effect's config group."""
         return f"model/{self.name}"
 
     def is_on(self, method: Method) -> bool:
-        """Tell whether a method has it."""
+        """Return whether the effect is on in a method."""
         return getattr(method, self.attribute or self.name, None) is not None
 
 
 def switched(method: Method) -> dict[str, bool]:
-    """Tell of each of a method's effects whether it is on."""
+    """Return which of a method's effects are on."""
     return {effect.name: effect.is_on(method) for effect in method.effects}
 
 
 @dataclass(frozen=True)
 class Decision:
-    """``choice`` of an effect, the overrides (``words``) that make it, ``because``, and whether it is ``on``:
-    more than the least there can be.
+    """The decision on an effect: the option chosen, the overrides (``overrides``) that choose it, the reason.
+
+    ``on`` is False for the least that can be chosen.
     """
 
     effect: str
     choice: str
-    words: tuple[str, ...]
+    overrides: tuple[str, ...]
     because: str
     on: bool = False
 
 
 @dataclass
 class Evidence:
-    """All that is known of a scene so far; a method's planning adds what it looks at. ``gains`` by effect.
+    """What is known of a scene so far; a method's planning may extend it.
 
-    ``least`` (dB): a gain below it is none, however sure. ``minutes``: of the last stage that is planned;
-    None: the cheapest within noise of the best. ``slope`` (dB): what ``steps`` bring the fine trial without
-    any effect over half of them, ``step`` its seconds a step.
+    Attributes:
+        pictures: what the images alone say.
+        gains: result of each trial, by effect.
+        least: dB; a smaller gain counts as none.
+        minutes: planned for the last stage; None: choose the cheapest option within noise of the best.
+        slope: dB that the fine trial without effects gained in the second half of its ``steps``.
+        steps: steps of that trial.
+        step: seconds per step of that trial; None if unknown.
     """
 
     pictures: Pictures
@@ -79,10 +88,10 @@ class Evidence:
     step: float | None = None
 
     def price(self, gain: Gain) -> float:
-        """What the steps are worth that an effect leaves no time for, dB; 0 where no time is given, or the
-        trial was of equal time.
+        """Return the PSNR (dB) lost to the steps that an effect's extra time displaces.
 
-        PSNR is taken to approach its end as ``1 / sqrt(steps)``, fitted to the trials' ``slope``.
+        Assume that PSNR approaches its limit as ``1 / sqrt(steps)``, fitted to ``slope``. The price is 0 if
+        no minutes are given, or if the trials had equal time.
         """
         if None in (self.minutes, self.step, gain.steps) or gain.times <= 1:
             return 0.0
@@ -91,12 +100,12 @@ class Evidence:
         return scale / math.sqrt(steps) * (math.sqrt(gain.times) - 1)
 
     def pays(self, effect: str) -> bool | None:
-        """Whether an effect's trial beats its noise and its price; None where there was none."""
+        """Return whether an effect's gain exceeds its noise and its price; None without a trial."""
         gain = self.gains.get(effect)
         return None if gain is None else gain.psnr > max(gain.noise, self.least) + self.price(gain)
 
     def of_trial(self, effect: str) -> str:
-        """The trial in words; nothing where there was none."""
+        """Describe an effect's trial; an empty string without one."""
         gain = self.gains.get(effect)
         if gain is None:
             return ""
@@ -106,9 +115,14 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Asked:
-    """The run that is planned: its ``stages`` in order, each with its numbers as configured; the ``preset``'s
-    numbers; what was ``typed`` (key -> value), which is not asked; ``choose(effect)``, the option that
-    switches an effect on; and whether there may be ``trials``.
+    """The run to plan.
+
+    Attributes:
+        stages: the configured numbers of each stage, in order.
+        preset: the preset's numbers.
+        typed: overrides that the user typed (key -> value); they are kept, not decided.
+        choose: returns the option that switches an effect on.
+        trials: whether trials may be run.
     """
 
     stages: Mapping[str, Mapping]
@@ -119,56 +133,58 @@ class Asked:
 
     @property
     def coarse(self) -> str:
-        """The first stage's name."""
+        """Name of the first stage."""
         return next(iter(self.stages))
 
     @property
     def last(self) -> str:
-        """The last stage's name."""
+        """Name of the last stage."""
         return list(self.stages)[-1]
 
 
 @dataclass(frozen=True)
 class Begin:
-    """Fit a coarse stage ``name`` with these ``words``, or change those of the one before where ``change``;
-    go on from it.
+    """Fit the coarse stage ``name`` with the overrides ``overrides`` and continue from it.
+
+    With ``change`` the ``overrides`` are added to those of the coarse stage before.
     """
 
     name: str
-    words: Sequence[str]
+    overrides: Sequence[str]
     change: bool = False
 
 
 @dataclass(frozen=True)
 class Rival:
-    """Fit another coarse stage ``name``, which differs in ``words``, and go on with the better. It is the one
-    with the ``effect``, or, where not ``adds``, without it. The answer is whether the effect pays.
+    """Fit another coarse stage ``name`` that differs in ``overrides``; continue from the better one.
+
+    The rival has the ``effect`` if ``adds``, else it lacks it. The answer is whether the effect pays.
     """
 
     effect: str
     name: str
-    words: Sequence[str]
+    overrides: Sequence[str]
     adds: bool = False
 
 
 class Planning(Protocol):
-    """How a method's effects are decided; the attribute ``planning`` of its model."""
+    """How a method's effects are decided: the attribute ``planning`` of its model."""
 
     effects: Sequence[Effect]
 
     def evidence(self, pictures: Pictures, **bounds) -> Evidence:
-        """Begin with what the pictures say."""
+        """Begin the evidence with what the images say."""
 
     def always(self, asked: Asked) -> tuple[Sequence[str], Sequence[str]]:
-        """Name the overrides of every trial, and those of fine ones beside them."""
+        """Return the overrides of every trial, and the additional ones of fine trials."""
 
     def coarse(self, evidence: Evidence, asked: Asked) -> Generator[Begin | Rival, bool | None, None]:
-        """Name the coarse stages to fit, one after the other, and hear of each rival whether it pays."""
+        """Yield the coarse stages to fit, one by one; receive for each rival whether its effect pays."""
 
     def look(
         self, evidence: Evidence, method: Method, scene: Scene, targets: Sequence[Target], asked: Asked
     ) -> None:
-        """Add what the chosen coarse stage says."""
+        """Add to the evidence what the chosen coarse stage shows."""
 
     def decide(self, evidence: Evidence, asked: Asked) -> list[Decision]:
-        """Decide every effect."""
+        """Decide on every effect."""

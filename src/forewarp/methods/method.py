@@ -1,4 +1,4 @@
-"""The contract of a method: at a moment, what does a view see, and how is that learned?"""
+"""The contract of a method: render any view at any moment, and learn from batches of images."""
 
 from __future__ import annotations
 
@@ -17,13 +17,18 @@ from forewarp.scene.view import Moment, Rendering, View
 
 @dataclass(frozen=True)
 class Start:
-    """What a method is built from: the first argument of its constructor, before its own options.
+    """Everything a method is built from: the first argument of its constructor, before its own options.
 
-    ``scene`` (cameras, times, box, points known to stand still; pictures through ``Frame.load``); the stage's
-    name and its own ``numbers``; ``weights``, ``literal`` and ``photo_on`` of the objective; ``frames`` in
-    play at first, nearest to the canonical time first; the ``handover`` and the fitted method of the stage
-    ``before``, where there are such. A ``blank`` method is about to load a checkpoint: it needs the shape
-    of its parts only, and looks at no picture and no stage before.
+    Attributes:
+        scene: cameras, times, box, points known to be static; images through ``Frame.load``.
+        stage: name of the stage.
+        numbers: the method's own keys of the stage.
+        frames: indices of the training frames in play at first, nearest to the canonical time first.
+        handover: what the stage before left; None in the first stage.
+        before: the fitted method of the stage before, if it is at hand.
+        blank: a checkpoint is about to be loaded: build parts of the right shape only, from no image and
+            no earlier stage.
+        weights, literal, photo_on: see ``Objective``.
     """
 
     scene: Scene
@@ -40,13 +45,16 @@ class Start:
 
 @dataclass(frozen=True)
 class Step:
-    """What a method makes of a batch.
+    """What a method answers to a batch.
 
-    ``terms``: each loss term by name, computed when it is called, () tensor; None from one whose effect is
-    off. ``squared_error``: mean over pixels and channels, of the best rendering. ``noted``: numbers to log.
-    ``gradients``: None, or those of the weighted sum by parameter name, where the method computes them
-    itself; what the terms then give needs no graph. ``tensors``: intermediate results by name, looked
-    through where a number is not finite.
+    Attributes:
+        terms: a function for each loss term by name, which computes it, () tensor, or returns None if the
+            effect that it measures is off.
+        squared_error: error of the best rendering, mean over pixels and channels.
+        noted: numbers to log.
+        gradients: of the weighted sum, by parameter name, if the method computes them itself; its terms then
+            need no graph. None: autograd computes them.
+        tensors: yields intermediate results by name, to find the first that is not finite.
     """
 
     terms: Mapping[str, Callable[[], Tensor | None]]
@@ -57,31 +65,36 @@ class Step:
 
 
 class Snapshot:
-    """The scene frozen at a ``moment``; differentiable where gradients are on.
+    """The scene frozen at one ``moment``; differentiable if gradients are on.
 
-    ``renderings`` names the pictures that it can give, the best last.
+    ``renderings`` names the renderings that ``render`` can give, the best one last.
     """
 
     moment: Moment
     renderings: Sequence[str] = ("rendered",)
 
     def render(self, view: View, background: Tensor, rendering: str | None = None) -> Rendering:
-        """See ``view`` over ``background`` (3,) or (R, 3); by the best rendering where none is named."""
+        """Render ``view`` over ``background`` (3,) or (R, 3); by default the best rendering."""
         raise NotImplementedError
 
     def holds(self, moment: Moment) -> bool:
-        """Tell whether this is also the scene at another moment."""
+        """Return whether this snapshot also shows the scene at another moment."""
         return moment == self.moment
 
 
 class Method(nn.Module):
-    """A scene that is learned. Give ``at`` and ``look``; the rest has defaults.
+    """A scene that can be learned: implement ``at`` and ``look``, everything else has a default.
 
-    ``terms`` are the loss terms it knows, ``literal`` those of them with a printed form of their own, and
-    ``numbers`` the keys of a stage; ``asks`` what it wants of the sampler; ``effects`` its optional parts
-    (see ``methods.effect``). Parameters and buffers named in ``grows``, dotted in parts of it, may change
-    their number of rows while they are trained, and adopt a checkpoint's. Optional abilities are protocols
-    in ``methods.abilities``.
+    Optional abilities (trajectories, bounds, points) are protocols in ``methods.abilities``.
+
+    Attributes:
+        terms: names of its loss terms.
+        literal: terms that also have the form printed in the paper.
+        numbers: its own keys of a stage.
+        asks: what a batch should hold.
+        effects: its optional parts (see ``methods.effect``).
+        grows: dotted names of the parameters and buffers whose number of rows may change during training;
+            they adopt a checkpoint's.
     """
 
     terms: ClassVar[Sequence[str]] = ("photo",)
@@ -92,58 +105,71 @@ class Method(nn.Module):
     grows: ClassVar[Sequence[str]] = ()
 
     def at(self, moment: Moment) -> Snapshot:
-        """Freeze the scene."""
+        """Freeze the scene at a moment."""
         raise NotImplementedError
 
     def look(self, batch: Batch, factors: Mapping[str, float], generator: torch.Generator) -> Step:
-        """Compare with a batch. ``factors`` are the terms that count in this step, with their weights; all
-        that is random is drawn from ``generator``. A step may be looked at again where a number is not
-        finite, so what it counts lies in buffers, which are then put back.
+        """Compare the scene with a batch.
+
+        A step whose numbers are not finite is repeated. Keep what a step counts in buffers, which are then
+        restored.
+
+        Args:
+            batch: observations of one or several moments.
+            factors: the weights of the terms that count in this step.
+            generator: draws all random numbers.
         """
         raise NotImplementedError
 
     def param_groups(self) -> dict[str, list[nn.Parameter]]:
-        """Name every parameter's learning rate: a key of ``stage.<name>.rates``."""
+        """Group all parameters by learning rate, a key of ``stage.<name>.lr``."""
         return {"network": list(self.parameters())}
 
     def optimizer(self, groups: list[dict]) -> torch.optim.Optimizer:
-        """Make what steps along the gradients, from groups of ``params`` with their ``lr``."""
+        """Make the optimiser from groups of ``params`` with their ``lr``."""
         return torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-8, fused=True)
 
     def advance(self, progress: float, step: int, optimizer: torch.optim.Optimizer) -> dict[str, float]:
-        """Follow the schedule before a step, at a ``progress`` in [0, 1] of the stage; numbers to log. What
-        is random here is drawn from torch's own generator on the CPU, which a checkpoint keeps.
+        """Follow the method's schedule before a step; return numbers to log.
+
+        Draw random numbers from torch's default generator on the CPU, which a checkpoint keeps.
+
+        Args:
+            progress: fraction of the stage that is done, in [0, 1].
+            step: number of the step.
+            optimizer: to change if parameters are replaced.
         """
         return {}
 
     def warm_up(self) -> None:
-        """Do what is needed once before the clock runs, as compiling kernels."""
+        """Do once what should not count as training time, for example compile kernels."""
 
     def notes(self) -> dict[str, float]:
-        """Tell the next stage of the same method what only that understands."""
+        """Return numbers for the next stage, which only the same method understands."""
         return {}
 
     def protocol(self) -> dict[str, str]:
-        """Say what a reader of its numbers should know, beside the dataset's protocol."""
+        """Return what readers of the method's results should know, for example departures from the paper."""
         return {}
 
     @property
     def size(self) -> tuple[str, int]:
-        """What its cost follows, in a word, and how much of it there is: voxels, particles, parameters."""
+        """What the cost grows with, and how many there are: voxels, particles, parameters."""
         return "parameters", parameter_count(self)
 
     @property
     def device(self) -> torch.device:
-        """Where it is computed."""
+        """Device of the parameters."""
         return next(self.parameters()).device
 
     def adopted(self) -> set[str]:
-        """Name the entries of ``state_dict`` whose shapes are a checkpoint's to say."""
+        """Return the names in ``state_dict`` that adopt a checkpoint's shape."""
         return set(self.grows)
 
     def misfit(self, state: Mapping[str, Tensor]) -> str | None:
-        """Name an entry of a stored state that contradicts the others; None where all is well. All that
-        ``grows`` has as many rows as the first: kernels read one by the row of the other.
+        """Return the name of a stored entry that contradicts the others; None if there is none.
+
+        All tensors in ``grows`` need the same number of rows, as kernels index one by the rows of another.
         """
         rows = {tuple(getattr(state[name], "shape", ()))[:1] for name in self.grows[:1]}
         for name in self.grows:
@@ -158,7 +184,11 @@ class Method(nn.Module):
     def check(
         cls, stage: str, numbers: Iterable[str], terms: Iterable[str], literal: Iterable[str] = ()
     ) -> None:
-        """Refuse what a stage says and this method does not know, before anything is read."""
+        """Refuse keys, terms and literal forms that this method does not know, before anything is read.
+
+        Raises:
+            ValueError: naming the first unknown one, and those that are known.
+        """
         for key, what, given, known in (
             (f"stage.{stage}", "a key of", numbers, cls.numbers),
             ("objective", "a term of", terms, cls.terms),
@@ -170,7 +200,7 @@ class Method(nn.Module):
                     raise ValueError(f"{key}: expected {what} {there}, but got '{name}'")
 
     def _load_from_state_dict(self, state_dict, prefix, *args, **kwargs) -> None:
-        for name in self.grows:  # also of its parts, which load after it
+        for name in self.grows:  # including those of submodules, which load later
             if prefix + name in state_dict:
                 own = part_of(self, name)
                 own.data = own.data.new_empty(state_dict[prefix + name].shape)
@@ -178,11 +208,14 @@ class Method(nn.Module):
 
 
 def part_of(method: nn.Module, name: str) -> Tensor:
-    """Find a parameter or buffer by its dotted name."""
+    """Return a parameter or buffer by its dotted name."""
     place, _, last = name.rpartition(".")
     return getattr(method.get_submodule(place), last)
 
 
 def parameter_count(method: nn.Module) -> int:
-    """Count the learned numbers."""
+    """Return the number of learned parameters."""
     return sum(p.numel() for p in method.parameters())
+
+
+Model = Callable[[Start], Method]  # makes the method of a stage

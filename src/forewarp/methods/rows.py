@@ -1,4 +1,4 @@
-"""Parameters whose rows come and go while they are trained; the optimiser's moments follow."""
+"""Add and remove rows of parameters during training, with the optimiser's moments."""
 
 from __future__ import annotations
 
@@ -13,19 +13,20 @@ from forewarp.methods.method import part_of
 def take_rows(
     method: nn.Module, optimizer: torch.optim.Optimizer, rows: Tensor, fresh: Tensor | None = None
 ) -> None:
-    """Let every parameter and buffer named in ``method.grows`` hold the ``rows`` (N',) of its own N, in this
-    order; a row that is named twice is copied, one that is not named is gone.
+    """Replace every parameter and buffer in ``method.grows`` by its ``rows``, and the moments likewise.
+
+    A row that is named twice is copied; a row that is not named is removed.
 
     Args:
-        method: whose parts change.
-        optimizer: whose moments follow.
-        rows: int64, each in [0, N).
-        fresh: (N',) bool, rows whose moments start at 0; None: every row keeps those of its source.
+        method: the method whose parameters change.
+        optimizer: the optimizer whose moments follow.
+        rows: (N',) int64, each in [0, N).
+        fresh: (N',) bool, rows whose moments start at 0; None: every row keeps the moments of its source.
 
     Raises:
-        ValueError: for rows that there are not.
+        ValueError: for rows out of range.
 
-    Cost: one copy of each, and of its moments.
+    Cost: one copy of each parameter and of its moments.
     """
     before, after = [], []
     count = len(part_of(method, method.grows[0]))
@@ -50,12 +51,12 @@ def take_rows(
 def renew_parameters(
     optimizer: torch.optim.Optimizer, before: list[Parameter], after: list[Parameter], rows: Tensor | None
 ) -> None:
-    """Put ``after`` in the place of ``before``; moments go to the new rows (old row or -1), or start afresh.
+    """Replace parameters in an optimiser, and carry their moments over row by row.
 
     Args:
-        optimizer: whose groups and moments are changed.
+        optimizer: the optimizer whose groups and moments change.
         before, after: parameters (N, ...) and (N', ...), pairwise.
-        rows: (N',) int64, or None to start the moments afresh.
+        rows: (N',) int64, the old row of each new row, -1 for none; None: all moments start at 0.
     """
     renewed = dict(zip(map(id, before), after))
     for group in optimizer.param_groups:

@@ -1,4 +1,4 @@
-"""T-NeRF: one network that is told the time, and no warp of any kind."""
+"""T-NeRF: a NeRF whose network also takes the time, without any warp."""
 
 from __future__ import annotations
 
@@ -16,23 +16,22 @@ from forewarp.scene.batch import Batch
 from forewarp.scene.rays import Rays
 from forewarp.scene.view import Moment, Rendering, View
 
-_PATIENCE = 20  # steps in a row without any density, after which there will be none
+_PATIENCE = 20  # steps in a row without any density, after which the network is dead
 
 
 class TNeRF(Method):
     """``(x, d, t) -> (density, colour)``: ``N([PE(x), PE(t)], PE(d))``, the time at the skip as well.
 
-    One network serves both passes: the first places samples and has no gradient. Coordinates are world units
-    as they are, directions unit vectors, encodings without a factor of pi.
+    One network serves both passes; the first places the samples and has no gradient. Coordinates are in world
+    units, directions have length 1, and the encodings have no factor of pi.
 
     Args:
-        start: what it is built from.
-        width, layers, skip: of the trunk (see ``fields.template.Trunk``).
-        position_frequencies, time_frequencies, direction_frequencies: of the encodings.
-        density: ``relu``, as published, which some seeds leave dead from the start, or ``softplus``.
-        samples, fine_samples, open_end: of the two passes (see ``Quadrature``).
-        inside_box: what lies outside the scene's box is taken for empty, which saves samples; as published it
-            is not.
+        start: scene, stage and numbers.
+        width, layers, skip: see ``fields.template.Trunk``.
+        position_frequencies, time_frequencies, direction_frequencies: octaves of the encodings.
+        density: ``relu`` as published, with which some seeds start dead, or ``softplus``.
+        samples, fine_samples, open_end: see ``Quadrature``.
+        inside_box: treat space outside the scene's box as empty, to save samples; not as published.
     """
 
     terms = ("photo",)
@@ -66,14 +65,14 @@ class TNeRF(Method):
         self._blank_steps = 0
 
     def at(self, moment: Moment) -> TNeRFSnapshot:
-        """Fix the time; nothing is computed yet."""
+        """Fix the time; compute nothing yet."""
         return TNeRFSnapshot(moment, self)
 
     def look(self, batch: Batch, factors: Mapping[str, float], generator: torch.Generator) -> Step:
-        """See ``Method``: a batch is of one time, as no neighbours are asked for.
+        """See ``Method.look``; a batch holds one time, as no neighbours are asked for.
 
         Raises:
-            ValueError: where the density is 0 everywhere, which has no gradient, step after step.
+            ValueError: if the density is 0 everywhere for many steps, as it then has no gradient.
         """
         rays, rgb, background = batch.joined()
         seen = self.at(batch.observations[0].moment).sampled(rays.to(self.device), background, generator)
@@ -97,11 +96,11 @@ class TNeRF(Method):
             )
 
     def optimizer(self, groups: list[dict]) -> torch.optim.Optimizer:
-        """Adam as published."""
+        """Make Adam with the published betas."""
         return torch.optim.Adam(groups, betas=(0.9, 0.999), eps=1e-8, fused=True)
 
     def protocol(self) -> dict[str, str]:
-        """Say where it departs from what is known of the publication, whose code was never released."""
+        """List the departures from the paper, whose code was never released."""
         notes = ["pixel centres at +0.5", "near and far along unit rays", "no centre crop at first"]
         if self.density_name != "relu":
             notes.append(f"{self.density_name} density")
@@ -114,7 +113,7 @@ class TNeRF(Method):
 
 @dataclass(frozen=True)
 class TNeRFSnapshot(Snapshot):
-    """A T-NeRF asked at one time. A picture costs all its samples, at every time alike."""
+    """A T-NeRF at one time. An image costs the same at every time: all its samples."""
 
     moment: Moment
     method: TNeRF
@@ -133,11 +132,11 @@ class TNeRFSnapshot(Snapshot):
         return method.activation(raw), color
 
     def sampled(self, rays: Rays, background: Tensor, generator: torch.Generator | None = None) -> Sampled:
-        """Render rays with what lies along them."""
+        """Render rays; also return what lies along them."""
         return self.method.quadrature(self.density, self.radiance, rays, background, generator)
 
     def render(self, view: View, background: Tensor, rendering: str | None = None) -> Rendering:
-        """See ``Snapshot``; without gradients in chunks of rays, so that a picture may be of any size."""
+        """See ``Snapshot.render``; without gradients in chunks of rays, for images of any size."""
         rays = view.rays().to(self.method.device)
         background = background.to(rays.origins)
         if torch.is_grad_enabled():
@@ -145,11 +144,11 @@ class TNeRFSnapshot(Snapshot):
         return self.method.quadrature.picture(self.density, self.radiance, rays, background)
 
     def holds(self, moment: Moment) -> bool:
-        """Tell whether it is the same time; which camera looks does not matter."""
+        """Return whether it is the same time; the camera does not matter."""
         return moment.time == self.moment.time
 
     def _encoded(self, points: Tensor) -> Tensor:
-        """What the trunk reads (..., I) of world points: the encoded points, then the encoded time."""
+        """Encode world points and the time for the trunk (..., I)."""
         position, time, _ = self.method.frequencies
         moment = positional_encoding(points.new_tensor([self.moment.time]), time)
         return torch.cat([positional_encoding(points, position), moment.expand(*points.shape[:-1], -1)], -1)

@@ -1,1 +1,1 @@
-"""How good a picture, a depth map or a motion is, by the papers' conventions."""
+"""Metrics of images, depth maps and motion, by the conventions of the papers."""

@@ -1,4 +1,4 @@
-"""How often a depth is right."""
+"""Accuracy of depth maps."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ def depth_delta(
     foreground: Tensor | None = None,
     thresholds: tuple[float, ...] = THRESHOLDS,
 ) -> tuple[float, ...] | None:
-    r"""The fraction of foreground pixels with :math:`\max(d / d^*, d^* / d)` below each threshold.
+    r"""Return the fraction of foreground pixels with :math:`\max(d / d^*, d^* / d)` below each threshold.
 
     Args:
-        prediction: ray depth (H, W), world units; a value that is not finite and positive counts as wrong.
+        prediction: ray depth (H, W), world units; values that are not finite and positive count as wrong.
         truth: exact ray depth (H, W), same units, 0 on the background.
-        foreground: (H, W) bool, or None for every pixel with a true depth. A pixel without one never counts.
+        foreground: (H, W) bool; None: all pixels. Pixels without a true depth never count.
         thresholds: each above 1.
 
     Returns:
-        One fraction in [0, 1] per threshold, or None where there is no foreground.
+        one fraction in [0, 1] per threshold, or None if there is no foreground.
 
     Raises:
-        ValueError: shapes that differ, or a threshold that nothing can meet.
+        ValueError: for shapes that differ, or a threshold <= 1, which nothing can meet.
 
     >>> depth_delta(torch.tensor([[1.0, 1.2, 9.0]]), torch.tensor([[1.0, 1.0, 0.0]]), thresholds=(1.1, 1.25))
     (0.5, 1.0)

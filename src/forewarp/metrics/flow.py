@@ -1,4 +1,4 @@
-"""How well points are followed through time."""
+"""Accuracy of point trajectories."""
 
 from __future__ import annotations
 
@@ -11,25 +11,25 @@ MOVING_FRACTION = 0.02
 def end_point_error(
     predicted: Tensor, truth: Tensor, moving_threshold: float | None = None
 ) -> dict[str, float | int | None]:
-    r"""Mean distance of followed points from their true places, apart for moving and for still points.
+    r"""Mean distance of tracked points from their true positions, separately for moving and static points.
 
     .. math:: \mathrm{EPE} = \frac{1}{|P| (T - 1)} \sum_{p \in P} \sum_{t \ge 1} |x_{pt} - x^*_{pt}|
 
-    The first column is the canonical time, where a method is right by construction; it is left out.
+    The first time is left out: it is canonical, where a method is exact by construction.
 
     Args:
-        predicted: places (N, T, 3), world units.
-        truth: true places (N, T, 3) at the same times, the first of them canonical.
-        moving_threshold: world units; a point moves if its true displacement from the canonical place ever
-            exceeds this. None takes 0.02 of the diagonal of the points' canonical bounding box.
+        predicted: positions (N, T, 3), world units.
+        truth: true positions (N, T, 3) at the same times, the first canonical.
+        moving_threshold: world units; a point moves if its true displacement from its canonical position ever
+            exceeds this. None: 0.02 of the diagonal of the points' canonical bounding box.
 
     Returns:
-        ``epe_moving``, ``epe_still`` and ``motion_mean`` (the true displacement of moving points: what no
-        motion at all scores) in world units, None without such points; ``count_moving``, ``count_still``;
-        ``moving_threshold`` as used.
+        ``epe_moving``, ``epe_still`` (of static points) and ``motion_mean`` (the mean true displacement of
+        moving points, which a static prediction scores), in world units, None if there are no such points;
+        ``count_moving``, ``count_still``; ``moving_threshold`` as used.
 
     Raises:
-        ValueError: shapes that are not (N, T, 3) with T >= 2, shapes that differ, values that are not finite.
+        ValueError: for shapes other than (N, T, 3) with T >= 2, shapes that differ, or values not finite.
 
     >>> truth = torch.tensor([[[0.0, 0, 0], [1, 0, 0]], [[0, 0, 1], [0, 0, 1]]])
     >>> scores = end_point_error(truth[:, :1].expand(2, 2, 3), truth, moving_threshold=0.1)

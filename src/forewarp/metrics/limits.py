@@ -1,4 +1,4 @@
-"""What keeps a picture from its truth: resolution, silhouettes, or what lies within them."""
+"""Find where errors come from: resolution, outlines, or the inside of objects."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ REGIONS = ("outside", "outline", "inside")
 
 
 def low_passed(image: Tensor, pixels: float) -> Tensor:
-    """The nearest picture that is linear between points ``pixels`` apart, as slices of a trilinear grid are.
+    """Fit an image that is linear between points ``pixels`` apart, like a slice of a trilinear grid.
 
-    Not quite a bound: a grid's points lie elsewhere in every view, and its density makes edges of its own.
+    Not a strict bound for a grid: grid points lie elsewhere in every view, and density makes edges.
 
     Args:
         image: (H, W, 3) in [0, 1].
-        pixels: from point to point; up to 1 the image itself.
+        pixels: distance of the points; at most 1 returns the image itself.
 
     Returns:
-        (H, W, 3): the least squares fit.
+        (H, W, 3), the least-squares fit.
     """
     if pixels <= 1:
         return image
@@ -31,7 +31,7 @@ def low_passed(image: Tensor, pixels: float) -> Tensor:
 
 
 def _projection(length: int, pixels: float) -> Tensor:
-    """Onto what is linear between points (length, length), float64."""
+    """Return the projection (length, length) onto functions linear between the points, float64."""
     places = (torch.arange(length).double() + 0.5) / pixels
     points = torch.arange(math.ceil(length / pixels) + 1).double()
     hats = (1 - (places[:, None] - points).abs()).clamp(min=0)
@@ -39,26 +39,25 @@ def _projection(length: int, pixels: float) -> Tensor:
 
 
 def regions(foreground: Tensor, band: int = 2) -> dict[str, Tensor]:
-    """Where the truth shows nothing, where its outline lies, and what is within: masks that share no pixel.
+    """Divide an image into the outside, the outline and the inside of its foreground.
 
     Args:
         foreground: (H, W) bool.
-        band: pixels on either side of the outline that belong to it.
+        band: half the width of the outline, in pixels.
 
     Returns:
-        by the names of ``REGIONS``, (H, W) bool each.
+        disjoint masks (H, W) bool by the names in ``REGIONS``.
     """
-
     outline = dilate(foreground, band) & dilate(~foreground, band)
     return {"outside": ~foreground & ~outline, "outline": outline, "inside": foreground & ~outline}
 
 
 def error_shares(truth: Tensor, image: Tensor, foreground: Tensor) -> dict[str, Tensor]:
-    """The squared error of each region, summed: their sum is the picture's.
+    """Sum the squared error in each region; the sums add up to the error of the image.
 
     Args:
         truth, image: (H, W, 3).
-        foreground: (H, W) bool, of the truth.
+        foreground: (H, W) bool, the true foreground.
     """
     error = (truth - image).square().mean(-1)
     return {name: torch.where(mask, error, 0.0).sum() for name, mask in regions(foreground).items()}

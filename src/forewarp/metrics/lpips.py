@@ -1,8 +1,8 @@
 """Learned perceptual image patch similarity (LPIPS, version 0.1), on three backbones.
 
-Distances of different backbones are not comparable, so the net is part of every name: ``lpips_vgg`` is what
-papers print. Backbone weights are files in torchvision's format, looked for but never downloaded; the small
-linear heads come with torchmetrics.
+Distances of different backbones are not comparable, so every name contains the net; papers report
+``lpips_vgg``. Backbone weights are files in torchvision's format and never downloaded; the small
+linear heads come with torchmetrics. (torchmetrics' own LPIPS needs torchvision.)
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ _FILE_PATTERNS = {
     "vgg": ("vgg16-*.pth", "vgg16.pth", "vgg.backbone.pth"),
     "alex": ("alexnet*.pth", "alex.backbone.pth"),
 }
-# The layers whose output is compared, as indices into torchvision's ``features``.
+# The layers whose outputs are compared, as indices into torchvision's ``features``.
 _TAPS = {
     "squeeze": (1, 4, 7, 9, 10, 11, 12),
     "vgg": (3, 8, 15, 22, 29),
     "alex": (1, 4, 7, 9, 11),
 }
-_UNIT_EPSILON = 1e-10
+_EPSILON = 1e-10
 
 
 class Fire(nn.Module):
@@ -107,11 +107,11 @@ class LPIPS(nn.Module):
 
     Args:
         net: ``squeeze``, ``vgg`` or ``alex``.
-        backbone: a torchvision-format weight file of that net, of the whole model or of its ``features``.
-        heads: a file of linear heads ``lin<k>.model.1.weight``; None takes torchmetrics' own.
+        backbone: weight file in torchvision's format, of the whole model or of its ``features``.
+        heads: file of linear heads ``lin<k>.model.1.weight``; None: torchmetrics' own.
 
     Raises:
-        ValueError: an unknown net, or a file that does not hold its weights.
+        ValueError: for an unknown net, or a file without the net's weights.
     """
 
     shift: Tensor
@@ -133,7 +133,7 @@ class LPIPS(nn.Module):
     def distance(self, first: Tensor, second: Tensor) -> Tensor:
         """Distances (B,) of image pairs (B, 3, H, W) in [-1, 1]; no gradient.
 
-        **Cost** one pass of the backbone over both; only two neighbouring layers are held at a time.
+        Cost: one pass of the backbone over both images, holding two layers at a time.
         """
         x = (torch.cat([first, second]) - self.shift) / self.scale
         total = x.new_zeros(len(first))
@@ -141,13 +141,13 @@ class LPIPS(nn.Module):
             x = layer(x)
             if index in _TAPS[self.net]:
                 head = getattr(self, f"head{_TAPS[self.net].index(index)}")
-                unit = x / (torch.linalg.vector_norm(x, dim=1, keepdim=True) + _UNIT_EPSILON)
-                a, b = unit.chunk(2)
+                normalised = x / (torch.linalg.vector_norm(x, dim=1, keepdim=True) + _EPSILON)
+                a, b = normalised.chunk(2)
                 total = total + F.conv2d((a - b).square(), head).mean((1, 2, 3))
         return total
 
     def forward(self, prediction: Tensor, target: Tensor) -> float | None:
-        """Distance of two images (H, W, 3) in [0, 1], as 8-bit files; None below 32 pixels a side."""
+        """Distance of two images (H, W, 3) in [0, 1], rounded to 8 bits; None for a side below 32 pixels."""
         pair = image_pair(prediction, target)
         if min(prediction.shape[:2]) < LPIPS_LEAST_SIDE:
             return None
@@ -156,13 +156,13 @@ class LPIPS(nn.Module):
 
 
 def find_lpips_weights(net: str, extra: Iterable[str | Path] | str | Path | None = ()) -> Path | None:
-    """The backbone file of a net, or None.
+    """Find the weight file of a net's backbone by file name, or return None.
 
-    Looks at the given files and folders, then at the one named by ``FOREWARP_LPIPS_WEIGHTS``, then at torch
-    hub's cache, where torchvision leaves what it downloaded. A file counts for the net it is named after.
+    Search the given files and folders, then ``FOREWARP_LPIPS_WEIGHTS``, then torch hub's cache,
+    where torchvision stores its downloads.
 
     Raises:
-        ValueError: an unknown net; a given place that does not exist, or a given file named after no net.
+        ValueError: for an unknown net, a given place that does not exist, or a given file named after no net.
     """
     _check_net(net)
     extra = [extra] if isinstance(extra, str | Path) else extra or ()
@@ -189,7 +189,7 @@ def _is_named_after(file: Path, net: str) -> bool:
 def find_lpips(
     nets: Iterable[str] = NETS, extra: Iterable[str | Path] | str | Path | None = ()
 ) -> dict[str, LPIPS | None]:
-    """``{"lpips_<net>": LPIPS or None}`` for the nets asked for; None where no weights are found."""
+    """Return ``{"lpips_<net>": LPIPS}`` for the nets asked for, with None for nets without weights."""
     files = {net: find_lpips_weights(net, extra) for net in nets}
     return {f"lpips_{net}": LPIPS(net, file) if file else None for net, file in files.items()}
 
@@ -200,7 +200,7 @@ def _check_net(net: str) -> None:
 
 
 def _read(file: Path, what: str) -> dict[str, Tensor]:
-    """A state dict; nothing but tensors is unpickled."""
+    """Read a state dict; unpickle tensors only."""
     try:
         state = torch.load(file, map_location="cpu", weights_only=True)
     except (OSError, RuntimeError, EOFError, pickle.UnpicklingError) as error:
@@ -223,7 +223,7 @@ def _load_backbone(features: nn.Sequential, file: Path, net: str) -> None:
 
 
 def _read_heads(net: str, heads: str | Path | None) -> list[Tensor]:
-    """The heads (1, C, 1, 1), one per tap."""
+    """Read the heads (1, C, 1, 1), one per tap."""
     if heads is None:
         heads = resources.files("torchmetrics") / "functional" / "image" / "lpips_models" / f"{net}.pth"
     what = f"LPIPS heads of {net}"

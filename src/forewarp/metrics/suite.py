@@ -1,4 +1,4 @@
-"""All metrics of an image at once, and their means per ability."""
+"""All metrics of an image, and their means per ability."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ log = logging.getLogger(__name__)
 
 
 class ImageSuite:
-    """Scores rendered images.
+    """Score rendered images.
+
+    ``absent`` holds the reason for every metric left out so far; each is logged once.
 
     Args:
-        lpips: ``{"lpips_<net>": LPIPS or None}`` as ``find_lpips`` gives it; a None is left out.
-        mask_box: also score ``psnr_box``, inside the smallest rectangle that holds the foreground.
-
-    ``absent`` says of every metric left out so far why; each is logged once.
+        lpips: ``{"lpips_<net>": LPIPS or None}`` as ``find_lpips`` returns it; None leaves a net out.
+        mask_box: also compute ``psnr_box``, in the bounding rectangle of the foreground.
 
     Raises:
-        ValueError: a name that is not ``lpips_<net>``, or that names another net than its module.
+        ValueError: for a name other than ``lpips_<net>`` of the given net.
     """
 
     def __init__(self, lpips: Mapping[str, LPIPS | None] | None = None, *, mask_box: bool = False) -> None:
@@ -49,15 +49,15 @@ class ImageSuite:
     def score(
         self, prediction: Tensor, target: Target, predicted_depth: Tensor | None = None
     ) -> dict[str, float]:
-        """The metrics of one image that it allows, in the order of ``METRICS``.
+        """Compute all metrics that the image's size and truth allow, in the order of ``METRICS``.
 
         Args:
             prediction: (H, W, 3) in [0, 1].
-            target: what it should be.
-            predicted_depth: ray depth (H, W), world units; scored where the target has a depth.
+            target: the true image, and its depth and foreground if known.
+            predicted_depth: ray depth (H, W), world units; scored if the target has a depth.
 
         Raises:
-            ValueError: naming the frame, where a shape differs or a colour is not finite.
+            ValueError: naming the frame, for a shape that differs or a colour that is not finite.
         """
         try:
             values = {
@@ -85,17 +85,17 @@ class ImageSuite:
 
 
 def summarise(rows: Iterable[tuple[str, Mapping[str, float]]]) -> dict[str, dict[str, float]]:
-    """Means over images, per ability.
+    """Average the scores of images per ability; abilities are never averaged together.
 
     Args:
-        rows: per image its ability (``space``, ``time``, ``canonical`` or ``all``) and its scores.
+        rows: the ability (``space``, ``time``, ``canonical`` or ``all``) and the scores of each image.
 
     Returns:
-        ``{ability: {metric: mean}}`` for the abilities that occur, in fixed order. A metric that some images
-        lack is averaged over those that have it. Abilities are never averaged together.
+        ``{ability: {metric: mean}}`` in fixed order. A metric that some images lack is the mean over
+        the others.
 
     Raises:
-        ValueError: an unknown ability or metric, or a score that is not finite.
+        ValueError: for an unknown ability or metric, or a score that is not finite.
 
     >>> summarise([("time", {"psnr": 30.0}), ("space", {"psnr": 20.0}), ("time", {"psnr": 20.0})])
     {'space': {'psnr': 20.0}, 'time': {'psnr': 25.0}}
@@ -123,7 +123,7 @@ def _depth_scores(predicted: Tensor, target: Target) -> dict[str, float | None]:
 
 
 def _box_score(prediction: Tensor, target: Target) -> float | None:
-    """PSNR inside the foreground's rectangle; None where there is no foreground."""
+    """PSNR in the bounding rectangle of the foreground, or None without foreground."""
     if target.foreground is None or not bool(target.foreground.any()):
         return None
     rows, columns = (target.foreground.any(axis).nonzero()[:, 0] for axis in (1, 0))
@@ -132,7 +132,7 @@ def _box_score(prediction: Tensor, target: Target) -> float | None:
 
 
 def _reason(name: str, target: Target) -> str:
-    """Why an image has no score of this name."""
+    """Say why an image lacks a metric."""
     if name in (*DEPTH_METRICS, "psnr_box"):
         return f"frame {target.frame.name} has no foreground"
     if name in LPIPS_METRICS:

@@ -1,1 +1,1 @@
-"""Pure functions on tensors: the mathematics, without state."""
+"""Pure functions on tensors; ``kernels_*`` are their Numba versions for the CPU."""

@@ -1,6 +1,6 @@
-"""Which implementation of an operator runs: PyTorch's everywhere, Numba's on the CPU where it is installed.
+"""Choose the implementation of an operator: Numba's on the CPU if it is installed, PyTorch's otherwise.
 
-``FOREWARP_NUMBA=0`` switches Numba off. Both are held to each other in values and gradients by the tests.
+``FOREWARP_NUMBA=0`` switches Numba off. Tests hold both to the same values and gradients.
 """
 
 from __future__ import annotations
@@ -15,17 +15,17 @@ from torch import Tensor
 
 @cache
 def numba_installed() -> bool:
-    """True where Numba can be imported and ``FOREWARP_NUMBA`` is not 0."""
+    """Return whether Numba is installed and ``FOREWARP_NUMBA`` is not 0."""
     return os.environ.get("FOREWARP_NUMBA", "1") != "0" and importlib.util.find_spec("numba") is not None
 
 
 def use_numba(tensor: Tensor) -> bool:
-    """True where the Numba kernel serves ``tensor``."""
+    """Return whether to use the Numba kernel for ``tensor``."""
     return tensor.device.type == "cpu" and numba_installed()
 
 
 def match_threads() -> int:
-    """Let Numba use as many threads as PyTorch does; returns that number."""
+    """Let Numba use as many threads as PyTorch; return their number."""
     from numba import config, get_num_threads, set_num_threads
 
     asked = torch.get_num_threads()

@@ -1,4 +1,4 @@
-"""Guards for callers' mistakes: one line that says what was expected and what came."""
+"""Check arguments; errors say in one line what was expected and what was given."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ from torch import Tensor
 
 
 def check_shape(name: str, tensor: Tensor, shape: tuple[int | str, ...]) -> None:
-    """Raise ValueError unless ``tensor`` has ``shape``; a letter stands for any size, "..." in front for any
-    number of them.
+    """Raise ValueError unless ``tensor`` has ``shape``.
+
+    A letter stands for any size, "..." in front for any number of sizes.
 
     >>> import torch
     >>> check_shape("points", torch.zeros(4, 3), ("P", 3))

@@ -29,12 +29,12 @@ def positional_encoding(x: Tensor, frequencies: int) -> Tensor:
 
 
 def spherical_harmonics_1(directions: Tensor) -> Tensor:
-    """Real spherical harmonics of degree 1 without their constants: ``(y, z, x)`` of a unit direction.
+    """Spherical harmonics of degree 1 without their constant factors: ``(y, z, x)``.
 
     Args:
         directions: unit vectors (..., 3).
 
     Returns:
-        (..., 3). The constants are left to the learned coefficients.
+        (..., 3). Learned coefficients absorb the constants.
     """
     return directions[..., [1, 2, 0]]

@@ -1,7 +1,7 @@
-"""Sparse lattices: trilinear reads, neighbourhoods, occupied cells.
+"""Sparse lattices: trilinear reads, neighbours, occupied cells.
 
-A sparse lattice is ``values`` (M, C) and ``index`` (X, Y, Z) int32 that holds a voxel's row, or -1 where the
-voxel is absent. A dense grid is the case in which no entry is -1. Points are in lattice coordinates.
+A sparse lattice is ``values`` (M, C) and ``index`` (X, Y, Z) int32, which holds the row of each voxel, or -1
+if it is absent; a dense grid has no -1. Points are in lattice coordinates.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ _CORNERS = [(a, b, c) for a in (0, 1) for b in (0, 1) for c in (0, 1)]
 
 
 def corner_weights(points: Tensor, shape: tuple[int, int, int]) -> tuple[Tensor, Tensor]:
-    """The 8 corners around each point and their trilinear weights; points outside are clamped to the border.
+    """Return the 8 corners around each point and their trilinear weights; clamp points to the border.
 
     Args:
         points: (P, 3) lattice coordinates.
@@ -27,7 +27,7 @@ def corner_weights(points: Tensor, shape: tuple[int, int, int]) -> tuple[Tensor,
         corners (P, 8, 3) int64 and weights (P, 8), differentiable in ``points``.
     """
     last = torch.tensor(shape, device=points.device) - 2
-    # Clamped before it is a whole number: a far point has none.
+    # Clamp before the conversion, as a far point has no int64.
     base = torch.minimum(points.detach().nan_to_num().floor().clamp(min=0), last).long()
     fraction = (points - base).clamp(0, 1)
     offsets = torch.tensor(_CORNERS, device=points.device)
@@ -36,18 +36,21 @@ def corner_weights(points: Tensor, shape: tuple[int, int, int]) -> tuple[Tensor,
 
 
 def trilinear(values: Tensor, index: Tensor, points: Tensor, fill: Tensor) -> Tensor:
-    """Trilinear read: ``sum_corners w(corner) values[index[corner]]``, ``fill`` where a voxel is absent.
+    """Interpolate trilinearly: ``sum_corners w(corner) values[index[corner]]``, ``fill`` for absent voxels.
 
     Args:
         values: (M, C).
         index: (X, Y, Z) int32, rows of ``values`` or -1.
-        points: (P, 3) lattice coordinates; outside they are clamped to the border.
-        fill: (C,), what an absent voxel reads.
+        points: (P, 3) lattice coordinates; clamped to the border.
+        fill: (C,), value of an absent voxel.
 
     Returns:
         (P, C). Differentiable in ``values`` and ``points``, not in ``fill``.
 
-    Cost: 8 reads of C channels a point; the gradient of ``values`` is an (M, C) scatter.
+    Raises:
+        ValueError: for other shapes, or an axis with a single voxel.
+
+    Cost: 8 reads of C channels per point; the gradient of ``values`` is an (M, C) scatter.
 
     >>> v, i = torch.tensor([[1.0], [3.0]]), torch.arange(2, dtype=torch.int32).reshape(2, 1, 1)
     >>> trilinear(v, i.expand(2, 2, 2).contiguous(), torch.tensor([[0.5, 0.25, 0.75]]), torch.zeros(1))
@@ -65,7 +68,7 @@ def trilinear(values: Tensor, index: Tensor, points: Tensor, fill: Tensor) -> Te
 
 
 def trilinear_reference(values: Tensor, index: Tensor, points: Tensor, fill: Tensor) -> Tensor:
-    """``trilinear`` in plain PyTorch: runs on any device."""
+    """``trilinear`` in plain PyTorch, for any device."""
     corners, weights = corner_weights(points, tuple(index.shape))
     rows = index[corners[..., 0], corners[..., 1], corners[..., 2]].long()  # (P, 8)
     padded = torch.cat([values, fill[None].to(values)])
@@ -82,7 +85,7 @@ class _NumbaTrilinear(torch.autograd.Function):
         from forewarp.ops import kernels_grid as kernels
 
         match_threads()
-        # The values serve only the points' gradient, and are large.
+        # Keep the large values only if the points need a gradient.
         ctx.save_for_backward(values if ctx.needs_input_grad[2] else None, index, points, fill)
         ctx.shape = values.shape
         out = values.new_empty(len(points), values.shape[1])
@@ -115,7 +118,7 @@ def _array(tensor: Tensor):
 
 
 def index_of(voxels: Tensor, shape: tuple[int, int, int]) -> Tensor:
-    """The index (X, Y, Z) int32 of a list of distinct voxels (N, 3): their row, -1 elsewhere."""
+    """Return the index (X, Y, Z) int32 of distinct voxels (N, 3): their row, -1 elsewhere."""
     check_shape("voxels", voxels, ("N", 3))
     index = torch.full(shape, -1, dtype=torch.int32, device=voxels.device)
     x, y, z = voxels.long().unbind(-1)
@@ -124,7 +127,7 @@ def index_of(voxels: Tensor, shape: tuple[int, int, int]) -> Tensor:
 
 
 def dilate(mask: Tensor, by: int = 1) -> Tensor:
-    """A mask (X, Y, Z), or of a picture (H, W), grown by ``by`` in every direction, diagonals included."""
+    """Grow a mask (X, Y, Z) or (H, W) by ``by`` in every direction, diagonals included."""
     grown = mask.clone()
     for _ in range(by):
         for axis in range(mask.dim()):
@@ -136,11 +139,11 @@ def dilate(mask: Tensor, by: int = 1) -> Tensor:
 
 
 def occupied_cells(index: Tensor, keep: Tensor | None = None) -> Tensor:
-    """Cells (X-1, Y-1, Z-1) bool of which at least one corner is present, and kept.
+    """Return the cells (X-1, Y-1, Z-1) bool with at least one corner that is present and kept.
 
     Args:
         index: (X, Y, Z) int32.
-        keep: (M,) bool over the rows; None keeps all.
+        keep: (M,) bool over the rows; None: keep all.
     """
     if use_numba(index):
         from forewarp.ops import kernels_grid as kernels
@@ -165,7 +168,7 @@ def occupied_cells_reference(index: Tensor, keep: Tensor | None = None) -> Tenso
 
 
 def neighbour_pairs(index: Tensor) -> list[tuple[Tensor, Tensor]]:
-    """Rows of neighbouring present voxels, a pair of (E,) int64 lists per axis; empty on one-voxel axes."""
+    """Return the rows of neighbouring present voxels: a pair of (E,) int64 tensors per axis."""
     pairs = []
     for axis in range(3):
         n = index.shape[axis] - 1

@@ -1,8 +1,8 @@
 """Numba kernels behind ``grid``. Imported only where Numba is installed.
 
-Arrays are NumPy views of contiguous CPU tensors. Loops over points run in parallel where they only read;
-sums into shared cells run in a fixed number of chunks, each into its own copy, so that results do not depend
-on scheduling.
+Arrays are NumPy views of contiguous CPU tensors. Loops that write one entry per point run in parallel. Sums
+into shared voxels run in a fixed number of chunks, each into its own copy, so that results do not depend on
+scheduling.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from numba import njit, prange
 @njit(inline="always")
 def _corner(x, n):
     base = int(min(max(np.floor(x), 0.0), n - 2.0))
-    base = min(max(base, 0), n - 2)  # NaN has no whole number
+    base = min(max(base, 0), n - 2)  # NaN converts to any integer
     return base, min(max(x - base, 0.0), 1.0)
 
 
@@ -64,7 +64,7 @@ def gather_backward_values(index, points, grad, out):
 
 @njit(parallel=True, cache=True)
 def gather_backward_points(values, index, points, fill, grad, out):
-    """out[p] = gradient with respect to the point's lattice coordinate; 0 where it is clamped."""
+    """out[p] = gradient with respect to the point's lattice coordinate; 0 where clamped."""
     channels = values.shape[1]
     nx, ny, nz = index.shape
     for p in prange(points.shape[0]):

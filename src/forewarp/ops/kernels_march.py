@@ -8,7 +8,7 @@ from numba import njit, prange
 
 @njit(cache=True)
 def _span(o, d, near, far, bounds):
-    """The stretch of a ray within ``bounds`` (2, 3); empty, its end before its start, where it misses."""
+    """Return the interval of a ray within ``bounds`` (2, 3); its end precedes its start if it misses."""
     t0, t1 = near, far
     for axis in range(3):
         low, high = bounds[0, axis], bounds[1, axis]
@@ -23,13 +23,13 @@ def _span(o, d, near, far, bounds):
 
 @njit(cache=True)
 def _first(t, near, step, jitter):
-    """The first step at or after distance ``t``."""
+    """Return the first step at or after distance ``t``."""
     return max(int(np.ceil((t - near) / step - jitter)), 0)
 
 
 @njit(cache=True)
 def _leap(o, d, x, y, z, reach, block, end):
-    """The distance at which a ray leaves the empty blocks, ``reach`` of them all around the one it is in."""
+    """Return the distance at which a ray leaves the empty blocks around it, ``reach`` in all directions."""
     for axis in range(3):
         if d[axis] != 0.0:
             at = (x, y, z)[axis] // block
@@ -42,7 +42,7 @@ def _leap(o, d, x, y, z, reach, block, end):
 
 @njit(cache=True)
 def _seek(o, d, k, near, step, jitter, end, cells, reach, block):
-    """The next step from ``k`` on that lies in an occupied cell, and its distance; beyond ``end``: none."""
+    """Return the next step from ``k`` on in an occupied cell, and its distance; beyond ``end`` if none."""
     nx, ny, nz = cells.shape
     t = near + (k + jitter) * step
     while t <= end:
@@ -56,7 +56,7 @@ def _seek(o, d, k, near, step, jitter, end, cells, reach, block):
             k += 1
         else:
             to = _leap(o, d, x, y, z, blocks, block, end + 2 * step)
-            k = max(k + 1, _first(to - 1e-6 * step, near, step, jitter))  # rounding must not leap too far
+            k = max(k + 1, _first(to - 1e-6 * step, near, step, jitter))  # not too far, in spite of rounding
         t = near + (k + jitter) * step
     return k, t
 
@@ -66,8 +66,8 @@ def march(
     origins, directions, near, far, step, jitter, cells, reach, bounds, block, counts, firsts, starts,
     ray_ids, distances,
 ):  # fmt: skip
-    """Samples in occupied cells only. With ``starts`` empty it counts and notes each ray's first step, else
-    it writes from ``starts[r]``.
+    """Count each ray's samples and note its first step if ``starts`` is empty; else write the samples from
+    ``starts[r]`` on.
     """
     counting = starts.shape[0] == 0
     for r in prange(origins.shape[0]):
@@ -96,8 +96,8 @@ def march(
 
 @njit(cache=True)
 def pool_blocks(cells, reach, block, bounds):
-    """``reach``: how many blocks of ``block`` cubed cells from one to the nearest that holds an occupied
-    cell, diagonals counted as one; ``bounds`` (2, 3): what the occupied cells lie within, low > high if none.
+    """Fill ``reach``, the chessboard distance of each block (``block`` cells a side) to the nearest occupied
+    block, and ``bounds`` (2, 3) of the occupied cells, low > high if there are none.
     """
     nx, ny, nz = cells.shape
     far = 255
@@ -112,13 +112,13 @@ def pool_blocks(cells, reach, block, bounds):
                     bounds[0, 0], bounds[1, 0] = min(bounds[0, 0], x), max(bounds[1, 0], x + 1)
                     bounds[0, 1], bounds[1, 1] = min(bounds[0, 1], y), max(bounds[1, 1], y + 1)
                     bounds[0, 2], bounds[1, 2] = min(bounds[0, 2], z), max(bounds[1, 2], z + 1)
-    _spread(reach, 1)
-    _spread(reach, -1)
+    _sweep(reach, 1)
+    _sweep(reach, -1)
 
 
 @njit(cache=True)
-def _spread(reach, sign):
-    """One sweep of the exact chessboard distance, forwards or backwards."""
+def _sweep(reach, sign):
+    """Sweep the chessboard distance transform, forwards or backwards."""
     nx, ny, nz = reach.shape
     for i in range(nx):
         x = i if sign > 0 else nx - 1 - i
@@ -129,7 +129,7 @@ def _spread(reach, sign):
                 least = int(reach[x, y, z])
                 if least == 0:
                     continue
-                for n in range(13):  # of the 27 around it those that the sweep has passed
+                for n in range(13):  # of the 27 around it, those already swept
                     a, b, c = x + sign * (n // 9 - 1), y + sign * (n // 3 % 3 - 1), z + sign * (n % 3 - 1)
                     if 0 <= a < nx and 0 <= b < ny and 0 <= c < nz:
                         least = min(least, reach[a, b, c] + 1)

@@ -13,9 +13,9 @@ def _floor(position):
 
 @njit(cache=True)
 def number_touched(positions, index):
-    """Give every cell that a kernel touches a row, in the lattice's order. ``index`` starts at -1.
+    """Number the voxels that a kernel touches, in lattice order, in ``index`` (-1 at first); return how many.
 
-    Positions are NaN where a voxel contributes nothing. Returns the number of rows.
+    Voxels whose positions are NaN contribute nothing.
     """
     nx, ny, nz = index.shape
     for q in range(positions.shape[0]):
@@ -63,7 +63,7 @@ def scatter(source, positions, index, out):
 
 @njit(parallel=True, cache=True)
 def scatter_backward(source, positions, index, grad, grad_source, grad_positions):
-    """Gradients of ``scatter`` with respect to the values and the positions."""
+    """Compute the gradients of ``scatter`` with respect to values and positions."""
     channels = source.shape[1]
     nx, ny, nz = index.shape
     for q in prange(positions.shape[0]):

@@ -11,7 +11,7 @@ from forewarp.ops.kernels_march import _first, _seek, _span
 
 @njit(cache=True)
 def _raw(raw, index, fill, x, y, z):
-    """One trilinear read of a sparse lattice of one channel."""
+    """Interpolate one channel of a sparse lattice."""
     nx, ny, nz = index.shape
     x0, fx = _corner(x, nx)
     y0, fy = _corner(y, ny)
@@ -27,7 +27,7 @@ def _raw(raw, index, fill, x, y, z):
 
 @njit(cache=True)
 def _optical(raw, shift, scale):
-    """Optical depth of a step: ``softplus(raw + shift) * scale``, capped as in ``render_weights``."""
+    """Return the optical depth of a step, ``softplus(raw + shift) * scale``, at most 80."""
     v = raw + shift
     return min((v if v > 20 else np.log1p(np.exp(v))) * scale, 80.0)
 
@@ -35,11 +35,11 @@ def _optical(raw, shift, scale):
 @njit(parallel=True, cache=True)
 def trace(
     origins, directions, near, far, step, jitter, cells, reach, bounds, block, raw, index, fill,
-    shift, scale, opaque, threshold, sums, read, counts, firsts, starts, ray_ids, distances, weights,
+    shift, scale, early_stop_eps, threshold, sums, read, counts, firsts, starts, ray_ids, distances, weights,
 ):  # fmt: skip
-    """With ``starts`` empty: each ray's sums (opacity, distance, transmittance), how many samples were read,
-    and of those whose weight counts how many there are, the first's step, and the transmittance before it (in
-    the last column of ``sums``). Else these are written from ``starts[r]``.
+    """If ``starts`` is empty, compute each ray's ``sums`` (opacity, distance, transmittance), the number of
+    samples read, and of those above the threshold the number, the first step and the transmittance before it
+    (last column of ``sums``). Else write the samples above the threshold from ``starts[r]`` on.
     """
     counting = starts.shape[0] == 0
     for r in prange(origins.shape[0]):
@@ -52,7 +52,7 @@ def trace(
         k = _first(t0, near, step, jitter[r]) if counting else firsts[r]
         through = 1.0 if counting else sums[r, 3]
         opacity, distance, found, t = 0.0, 0.0, 0, near
-        while through >= opaque and (counting or found < counts[r]):
+        while through >= early_stop_eps and (counting or found < counts[r]):
             k, t = _seek(o, d, k, near, step, jitter[r], t1, cells, reach, block)
             if not t <= t1:
                 break

@@ -10,19 +10,19 @@ from forewarp.ops.checks import check_shape
 Radial = tuple[float, float, float]
 Tangential = tuple[float, float]
 
-_STEPS = 40  # at most; where the lens is mild five do
+_STEPS = 40  # at most; a mild lens needs five
 _CLOSE_ENOUGH = 1e-14
-_LOOKS, _APART = 16, 0.75  # along the way from the axis: where, as shares of what is left
+_CHECKS, _RATIO = 16, 0.75  # points checked between the axis and a point, at 1, 0.75, 0.75^2, ... of it
 
 
 def distort(points: Tensor, radial: Radial, tangential: Tangential) -> Tensor:
-    """Where a lens puts a point of the plane at distance 1 before the camera.
+    """Distort points on the plane at distance 1 in front of the camera (Brown-Conrady).
 
-    With ``s = 1 + k1 r^2 + k2 r^4 + k3 r^6`` a point goes to ``x s + 2 p1 x y + p2 (r^2 + 2 x^2)``,
+    With ``s = 1 + k1 r^2 + k2 r^4 + k3 r^6`` a point (x, y) moves to ``x s + 2 p1 x y + p2 (r^2 + 2 x^2)``,
     ``y s + 2 p2 x y + p1 (r^2 + 2 y^2)``.
 
     Args:
-        points: (..., 2), x to the right and y down, in units of the distance.
+        points: (..., 2), x to the right and y down, divided by the distance.
         radial: k1, k2, k3.
         tangential: p1, p2.
 
@@ -32,7 +32,7 @@ def distort(points: Tensor, radial: Radial, tangential: Tangential) -> Tensor:
     Raises:
         ValueError: for points of another shape.
 
-    **Cost** about 20 operations a point.
+    Cost: about 20 operations per point.
 
     >>> distort(torch.tensor([0.5, 0.0]), (0.4, 0.0, 0.0), (0.0, 0.1))
     tensor([0.6250, 0.0000])
@@ -42,10 +42,10 @@ def distort(points: Tensor, radial: Radial, tangential: Tangential) -> Tensor:
 
 
 def unfolded(points: Tensor, radial: Radial, tangential: Tangential) -> Tensor:
-    """Whether a lens still spreads the picture all the way from its axis to a point.
+    """Return whether the distortion is invertible all the way from the axis to a point.
 
     The Jacobian of ``distort`` is symmetric, and positive definite on the axis. Where it first is not, the
-    picture folds: what lies beyond, the polynomial carries back over what lies before.
+    image folds: points further out are mapped back onto points further in.
 
     Args:
         points: (..., 2), as for ``distort``.
@@ -57,43 +57,42 @@ def unfolded(points: Tensor, radial: Radial, tangential: Tangential) -> Tensor:
     Raises:
         ValueError: for points of another shape.
 
-    **Cost** 16 evaluations of ``distort``: at the point and at shares of the way that shrink by a quarter.
+    Cost: 16 evaluations of ``distort``, at the point and ever closer to the axis.
 
     >>> unfolded(torch.tensor([[1.0, 0.0], [1.2, 0.0]]), (-0.25, 0.0, 0.0), (0.0, 0.0))  # until 2 / sqrt(3)
     tensor([ True, False])
     """
     check_shape("points", points, ("...", 2))
     place = points.detach().double()
-    spread = torch.ones_like(place[..., 0], dtype=torch.bool)
-    for look in range(_LOOKS):
-        spread &= _spreads(_bent(_APART**look * place, radial, tangential)[1])
-    return spread
+    regular = torch.ones_like(place[..., 0], dtype=torch.bool)
+    for k in range(_CHECKS):
+        regular &= _is_regular(_bent(_RATIO**k * place, radial, tangential)[1])
+    return regular
 
 
 def undistort(points: Tensor, radial: Radial, tangential: Tangential) -> Tensor:
-    """The inverse of ``distort`` by Newton's method with the exact 2 x 2 Jacobian, in float64.
+    """Invert ``distort`` by Newton's method with the exact 2 x 2 Jacobian, in float64.
 
-    A step that does not come closer, or leads where the picture is folded (see ``unfolded``), is halved and
-    tried again. Where the lens puts no point at all (beyond its fold) the result is the nearest that was
-    met: finite, but ``distort`` of it is not the point.
+    A step that does not reduce the error, or enters the fold (see ``unfolded``), is halved and repeated. A
+    point beyond the fold has no inverse: the result is then finite, but ``distort`` of it is another point.
 
     Args:
         points: (..., 2) distorted.
         radial, tangential: as for ``distort``.
 
     Returns:
-        (..., 2) float64, to 1e-10 and mostly to 1e-14. Not differentiable.
+        (..., 2) float64, exact to 1e-10, mostly to 1e-14. Not differentiable.
 
     Raises:
         ValueError: for points of another shape.
 
-    **Cost** a few evaluations of ``distort``; up to 40 where some point has no inverse.
+    Cost: a few evaluations of ``distort``; up to 40 if a point has no inverse.
     """
     check_shape("points", points, ("...", 2))
     goal = points.detach().double()
     rate = torch.ones_like(goal[..., :1])
-    ahead = _spreads(_bent(goal, radial, tangential)[1])[..., None]
-    place = torch.where(ahead, goal, 0.0)  # from the far side of a fold one would find what lies there
+    ahead = _is_regular(_bent(goal, radial, tangential)[1])[..., None]
+    place = torch.where(ahead, goal, 0.0)  # start on the near side of a fold
     bent, jacobian = _bent(place, radial, tangential)
     error = (bent - goal).norm(dim=-1, keepdim=True)
     for _ in range(_STEPS):
@@ -102,7 +101,7 @@ def undistort(points: Tensor, radial: Radial, tangential: Tangential) -> Tensor:
         tried = place - rate * _solved(jacobian, bent - goal)
         bent_there, jacobian_there = _bent(tried, radial, tangential)
         error_there = (bent_there - goal).norm(dim=-1, keepdim=True)
-        closer = (error_there < error) & _spreads(jacobian_there)[..., None]  # and not NaN
+        closer = (error_there < error) & _is_regular(jacobian_there)[..., None]  # False for NaN
         place, bent = torch.where(closer, tried, place), torch.where(closer, bent_there, bent)
         error = torch.where(closer, error_there, error)
         jacobian = tuple(torch.where(closer[..., 0], b, a) for a, b in zip(jacobian, jacobian_there))
@@ -113,7 +112,7 @@ def undistort(points: Tensor, radial: Radial, tangential: Tangential) -> Tensor:
 def _bent(
     points: Tensor, radial: Radial, tangential: Tangential
 ) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor]]:
-    """The distorted points and the Jacobian's three entries dx/dx, dx/dy = dy/dx and dy/dy, each (...,)."""
+    """Return the distorted points and the Jacobian: dx/dx, dx/dy = dy/dx and dy/dy, each (...,)."""
     (k1, k2, k3), (p1, p2) = radial, tangential
     x, y = points.unbind(-1)
     r2 = x * x + y * y
@@ -127,14 +126,14 @@ def _bent(
     return torch.stack([bent_x, bent_y], -1), (xx, xy, yy)
 
 
-def _spreads(jacobian: tuple[Tensor, Tensor, Tensor]) -> Tensor:
-    """Whether the Jacobian is positive definite, (...,) bool; what is not finite is not."""
+def _is_regular(jacobian: tuple[Tensor, Tensor, Tensor]) -> Tensor:
+    """Return whether the Jacobian is positive definite, (...,) bool; False if it is not finite."""
     xx, xy, yy = jacobian
     return (xx > 0) & (xx * yy - xy * xy > 0)
 
 
 def _solved(jacobian: tuple[Tensor, Tensor, Tensor], offset: Tensor) -> Tensor:
-    """The Newton step (..., 2); none where the Jacobian is singular, and never an endless one."""
+    """Return the Newton step (..., 2); 0 where the Jacobian is singular."""
     (xx, xy, yy), (a, b) = jacobian, offset.unbind(-1)
     determinant = xx * yy - xy * xy
     step = torch.stack([yy * a - xy * b, xx * b - xy * a], -1) / determinant[..., None]

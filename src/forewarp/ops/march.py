@@ -1,4 +1,4 @@
-"""Ray marching through occupied cells: samples in empty space are never made."""
+"""Ray marching: sample rays in occupied cells only."""
 
 from __future__ import annotations
 
@@ -11,28 +11,31 @@ from forewarp.ops.backend import match_threads, use_numba
 from forewarp.ops.checks import check_shape
 from forewarp.ops.grid import _array
 
-_BLOCK = 4  # cells per side of the coarse occupancy that lets a ray leap over empty space
+_BLOCK = 4  # side, in cells, of the blocks of a coarse occupancy map, by which rays skip empty space
 _MARGIN = 1e-3  # cells
 
 
 def march(
     origins: Tensor, directions: Tensor, near: float, far: float, step: float, cells: Tensor, jitter: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Samples ``t_k = near + (k + jitter) step``, k = 0, 1, ..., in occupied cells and before ``far``.
+    """Sample rays at ``t_k = near + (k + jitter) step`` < ``far``, k = 0, 1, ..., in occupied cells.
 
     Args:
         origins: (R, 3), lattice coordinates.
-        directions: (R, 3), lattice coordinates per world unit of distance (not unit vectors).
+        directions: (R, 3), lattice coordinates per world unit (not unit vectors).
         near, far: distances, world units.
         step: between samples, world units, > 0.
         cells: (X-1, Y-1, Z-1) bool, see ``occupied_cells``.
         jitter: (R,) in [0, 1).
 
     Returns:
-        ray_ids (P,) int64, ascending, and distances (P,) of ``origins``' dtype, ascending within a ray.
-        Not differentiable. A ray that misses, or lies beyond, has no sample.
+        ray_ids (P,) int64, ascending, and distances (P,) in the dtype of ``origins``, ascending within a
+        ray. A ray that misses all cells has no sample. Not differentiable.
 
-    Cost: one test a step inside the box, one a block where the block is empty; memory P.
+    Raises:
+        ValueError: for other shapes, ``step`` <= 0, or near and far out of order.
+
+    Cost: one test per step in blocks with occupied cells, one per empty block; memory P.
     """
     check_march(origins, directions, near, far, step, jitter)
     run = _numba_march if use_numba(origins) else march_reference
@@ -42,7 +45,7 @@ def march(
 def check_march(
     origins: Tensor, directions: Tensor, near: float, far: float, step: float, jitter: Tensor
 ) -> None:
-    """Raise ValueError where rays cannot be marched along."""
+    """Raise ValueError for rays that cannot be marched (see ``march``)."""
     check_shape("origins", origins, ("R", 3))
     check_shape("directions", directions, (len(origins), 3))
     check_shape("jitter", jitter, (len(origins),))
@@ -52,18 +55,18 @@ def check_march(
 
 def _span(origins: Tensor, directions: Tensor, near: float, far: float, shape) -> tuple[Tensor, Tensor]:
     last = torch.tensor([float(n) for n in shape], dtype=origins.dtype, device=origins.device)
-    still = directions == 0
-    safe = torch.where(still, torch.ones_like(directions), directions)
+    level = directions == 0
+    safe = torch.where(level, torch.ones_like(directions), directions)
     a, b = -origins / safe, (last - origins) / safe
     inf = torch.full_like(a, math.inf)
-    outside = still & ((origins < 0) | (origins > last))
-    enter = torch.where(outside, inf, torch.where(still, -inf, torch.minimum(a, b)))
-    leave = torch.where(outside, -inf, torch.where(still, inf, torch.maximum(a, b)))
+    outside = level & ((origins < 0) | (origins > last))
+    enter = torch.where(outside, inf, torch.where(level, -inf, torch.minimum(a, b)))
+    leave = torch.where(outside, -inf, torch.where(level, inf, torch.maximum(a, b)))
     return enter.amax(-1).clamp(min=near), leave.amin(-1).clamp(max=far)
 
 
 def march_reference(origins, directions, near, far, step, cells, jitter) -> tuple[Tensor, Tensor]:
-    """``march`` in plain PyTorch: makes every step inside the box, then keeps those in occupied cells."""
+    """``march`` in plain PyTorch: make every step inside the box, keep those in occupied cells."""
     enter, leave = _span(origins, directions, near, far, cells.shape)
     hit = enter <= leave
     first = torch.where(hit, ((enter - near) / step - jitter).ceil().clamp(min=0), torch.zeros_like(enter))
@@ -98,8 +101,11 @@ def _numba_march(origins, directions, near, far, step, cells, jitter) -> tuple[T
 
 
 def map_cells(cells: Tensor) -> tuple:
-    """What the kernels march through: the cells, how far from each block to the next occupied one, the bounds
-    of all occupied cells, and the block's side.
+    """Return what the kernels march through.
+
+    Returns:
+        the cells, the distance from each block to the next occupied block, the bounds of all occupied cells,
+        and the side of a block.
     """
     from forewarp.ops import kernels_march as kernels
 
@@ -107,7 +113,7 @@ def map_cells(cells: Tensor) -> tuple:
     reach = torch.empty([-(-n // _BLOCK) for n in cells.shape], dtype=torch.uint8).numpy()
     bounds = torch.empty(2, 3, dtype=torch.float64).numpy()
     kernels.pool_blocks(array, reach, _BLOCK, bounds)
-    # A sample that rounding puts just outside its cell is not lost; the box itself stays the limit.
+    # Keep samples that rounding moves just outside their cell; the box itself stays the limit.
     bounds[0] = (bounds[0] - _MARGIN).clip(min=0)
     bounds[1] = (bounds[1] + _MARGIN).clip(max=cells.shape)
     return array, reach, bounds, _BLOCK

@@ -1,4 +1,4 @@
-"""Where along its ray a network is asked: spread evenly first, then where matter was found."""
+"""Sample distances along rays: evenly, or by importance."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from forewarp.ops.checks import check_shape
 
 
 def stratified(near: Tensor, far: Tensor, count: int, generator: torch.Generator | None = None) -> Tensor:
-    """Spread ``count`` distances over ``[near, far]``, one in each bin.
+    """Stratified sampling (NeRF): one distance in each of ``count`` bins between ``near`` and ``far``.
 
-    The bins meet in the middle between the points of ``linspace(near, far, count)``, so that the first and
-    the last are half as wide as the others.
+    The bins meet midway between the points of ``linspace(near, far, count)``, so the first and the last are
+    half as wide as the others.
 
     Args:
         near, far: (R,) of each ray.
         count: S >= 2.
-        generator: draws a distance uniformly in its bin; None: the points of the linspace themselves.
+        generator: draws each distance uniformly in its bin; None: return the linspace.
 
     Returns:
         (R, S), ascending.
@@ -39,7 +39,7 @@ def stratified(near: Tensor, far: Tensor, count: int, generator: torch.Generator
 
 
 def midpoints(depths: Tensor) -> Tensor:
-    """Find the middles (R, S - 1) between neighbouring distances (R, S)."""
+    """Return the midpoints (R, S - 1) of neighbouring distances (R, S)."""
     return 0.5 * (depths[:, 1:] + depths[:, :-1])
 
 
@@ -51,18 +51,20 @@ def by_importance(
     generator: torch.Generator | None = None,
     floor: float = 1e-5,
 ) -> Tensor:
-    """Spread ``count`` distances as a piecewise constant density has it: its inverse distribution function,
-    linear within a bin, at uniform numbers. No gradient passes.
+    """Importance sampling (NeRF): draw ``count`` distances from a piecewise constant density.
+
+    Evaluate the inverse of its distribution function, linear within a bin, at uniform numbers. No gradient
+    passes.
 
     Args:
         edges: (R, B + 1) of the bins, ascending.
-        weights: (R, B) >= 0 of the bins, in any unit.
+        weights: (R, B) >= 0 of the bins, not normalised.
         count: S >= 1.
-        generator: draws the uniform numbers; None: evenly from 0 to 1.
-        floor: > 0, added to every weight, so that no bin is forgotten.
+        generator: draws the uniform numbers; None: take them evenly from 0 to 1.
+        floor: > 0, added to every weight, so that every bin can be drawn.
 
     Returns:
-        (R, S), ascending where no generator is given.
+        (R, S), ascending without a generator.
 
     Cost: R (B + S log B).
 
@@ -88,22 +90,22 @@ def by_importance(
 
 
 def union(*depths: Tensor) -> Tensor:
-    """Put several sets of distances (R, S_i) of the same rays into one, ascending (R, sum of S_i)."""
+    """Merge sets of distances (R, S_i) of the same rays into one, ascending (R, sum of S_i)."""
     return torch.cat(depths, 1).sort(1).values
 
 
 def clip_to_box(
     origins: Tensor, directions: Tensor, near: float, far: float, low: Tensor, high: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Keep what of a ray's stretch ``[near, far]`` lies in an axis-aligned box.
+    """Clip the interval ``[near, far]`` of each ray to an axis-aligned box.
 
     Args:
         origins, directions: (R, 3).
-        near, far: of all rays, in lengths of a direction.
+        near, far: range of all rays, in multiples of a direction's length.
         low, high: (3,) corners of the box.
 
     Returns:
-        near (R,) and far (R,); a ray that misses has far <= near.
+        near (R,) and far (R,); far <= near for a ray that misses the box.
     """
     check_shape("origins", origins, ("R", 3))
     check_shape("directions", directions, tuple(origins.shape))
@@ -111,12 +113,12 @@ def clip_to_box(
     inside = (to_low <= 0) & (to_high >= 0)
     level = directions == 0
     safe = torch.where(level, torch.ones_like(directions), directions)
-    never = torch.where(inside, -torch.inf, torch.inf).to(origins)  # where a ray runs along a face
+    never = torch.where(inside, -torch.inf, torch.inf).to(origins)  # for rays parallel to a face
     enter = torch.where(level, never, torch.minimum(to_low / safe, to_high / safe))
     leave = torch.where(level, -never, torch.maximum(to_low / safe, to_high / safe))
     return enter.amax(1).clamp(near, far), leave.amin(1).clamp(near, far)
 
 
 def _uniform(like: Tensor, generator: torch.Generator) -> Tensor:
-    """Draw numbers in [0, 1) where the generator is, in the shape of a tensor that may be elsewhere."""
+    """Draw numbers in [0, 1) on the generator's device, with shape, dtype and device of a tensor."""
     return torch.rand(like.shape, generator=generator, device=generator.device, dtype=like.dtype).to(like)

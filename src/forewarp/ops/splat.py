@@ -1,4 +1,4 @@
-"""Forward warping: the average splat with a trilinear kernel."""
+"""Forward warping: average splatting with a trilinear kernel."""
 
 from __future__ import annotations
 
@@ -14,8 +14,13 @@ from forewarp.ops.grid import _CORNERS, _array
 
 
 class Splat(NamedTuple):
-    """A sparse target: ``values`` (M, C) averaged, ``coverage`` (M,), ``index`` (X, Y, Z) int32, and
-    ``dropped``, how many of the source voxels left the box or had no finite position.
+    """The sparse result of a splat.
+
+    Attributes:
+        values: (M, C), averages.
+        coverage: (M,), summed weights.
+        index: (X, Y, Z) int32, row of each voxel or -1.
+        dropped: number of source voxels that left the box or had no finite position.
     """
 
     values: Tensor
@@ -25,22 +30,22 @@ class Splat(NamedTuple):
 
 
 def average_splat(source: Tensor, positions: Tensor, shape: tuple[int, int, int], tau: float = 1e-2) -> Splat:
-    """Average splatting (the paper's three warping equations), sums divided by ``max(coverage, tau)``.
+    """Average splatting (the paper's three warping equations), with sums divided by ``max(coverage, tau)``.
 
     ``target[p] = sum_q b(u) source[q] / sum_q b(u)``, ``b(u) = prod max(0, 1 - |u_i|)``,
-    ``u = positions[q] - p``. Cells that nothing reaches are absent from the sparse result.
+    ``u = positions[q] - p``. Voxels that nothing reaches are absent from the sparse result.
 
     Args:
-        source: (N, C) values to carry.
-        positions: (N, 3) where they land, lattice coordinates.
+        source: (N, C), values to move.
+        positions: (N, 3), where they land, lattice coordinates.
         shape: (X, Y, Z) of the target.
-        tau: least divisor. It bounds the gradient with respect to positions by about 1/tau.
+        tau: lower bound of the divisor. It bounds the gradient with respect to positions by about 1/tau.
 
     Returns:
-        A ``Splat``. Values and coverage are differentiable in ``source`` and ``positions``. A voxel with a
-        non-finite position contributes nothing; one outside the box contributes what its kernel reaches.
+        a ``Splat``; values and coverage are differentiable in ``source`` and ``positions``. A voxel without
+        finite position contributes nothing, one outside the box only where its kernel reaches inside.
 
-    Cost: 8 cells of C + 1 channels a source voxel; memory M (C + 1) for M touched cells.
+    Cost: 8 voxels of C + 1 channels per source voxel; memory M (C + 1) for M touched voxels.
     """
     check_shape("source", source, ("N", "C"))
     check_shape("positions", positions, (len(source), 3))
@@ -57,19 +62,16 @@ def average_splat(source: Tensor, positions: Tensor, shape: tuple[int, int, int]
 
 
 def with_copies(splat: Splat, source: Tensor, cells: Tensor, tau: float = 1e-2) -> Splat:
-    """A splat to which voxels are added that stay where they are: the one cell of each, with weight 1.
+    """Add static voxels to a splat, each to its own voxel with weight 1.
 
-    The same as if they had been splatted onto themselves, for an eighth of the work.
+    Equal to splatting them onto themselves, for an eighth of the work.
 
     Args:
-        splat: of all that moves, with the same ``tau``.
-        source: (N, C) values of what stays.
-        cells: (N, 3) int64, where; each once.
+        splat: the splat of all moving voxels, with the same ``tau``.
+        source: (N, C), values of the static voxels.
+        cells: (N, 3) int64, their distinct positions.
 
-    Raises:
-        ValueError: for other shapes.
-
-    Cost: one cell of C + 1 channels a voxel.
+    Cost: one voxel of C + 1 channels per static voxel.
 
     >>> nothing = average_splat(torch.zeros(0, 1), torch.zeros(0, 3), (2, 2, 2))
     >>> with_copies(nothing, torch.tensor([[7.0]]), torch.tensor([[0, 1, 1]])).values
@@ -92,9 +94,9 @@ def with_copies(splat: Splat, source: Tensor, cells: Tensor, tau: float = 1e-2) 
 def scatter_reference(
     source: Tensor, positions: Tensor, shape: tuple[int, int, int]
 ) -> tuple[Tensor, Tensor]:
-    """Sums (M, C + 1), coverage last, and the index of the touched cells, in plain PyTorch on any device.
+    """Return sums (M, C + 1), coverage last, and the index of the touched voxels, in plain PyTorch.
 
-    ``positions`` are NaN where a voxel contributes nothing.
+    Voxels whose ``positions`` are NaN contribute nothing.
     """
     keep = (~positions.detach().isnan().any(-1)).nonzero()[:, 0]
     source, positions = source[keep], positions[keep]

@@ -1,4 +1,4 @@
-"""March, read and absorb in one pass that ends where a ray ends: the CPU's way to a picture."""
+"""March, interpolate and composite in one pass, for images on the CPU."""
 
 from __future__ import annotations
 
@@ -14,8 +14,12 @@ from forewarp.ops.march import check_march, map_cells
 
 
 class Traced(NamedTuple):
-    """Of R rays ``opacity``, ``distance`` (the sum of weight times distance) and ``transmittance`` (R,); of
-    the P samples whose weight counts ``ray_ids``, ``distances`` and ``weights`` (P,); ``samples`` were read.
+    """What ``trace`` finds along R rays.
+
+    Attributes:
+        opacity, distance, transmittance: (R,); ``distance`` is the sum of weight times distance.
+        ray_ids, distances, weights: (P,), of the samples above the threshold.
+        samples: number of samples read.
     """
 
     opacity: Tensor
@@ -41,21 +45,26 @@ def trace(
     fill: float,
     shift: float,
     scale: float,
-    opaque: float = 0.0,
+    early_stop_eps: float = 0.0,
     threshold: float = 0.0,
 ) -> Traced:
-    """``march``, ``trilinear`` and ``render_weights`` of ``x = softplus(raw + shift) * scale``, no gradient.
+    """Do ``march``, ``trilinear`` and ``render_weights`` of ``softplus(raw + shift) * scale`` in one kernel.
 
-    Numba only: in plain PyTorch the three are called one by one, and the tests hold this to them.
+    Numba only, without gradient; elsewhere the three operators are called one by one.
 
     Args:
-        origins, directions, near, far, step, cells, jitter: as in ``march``.
-        raw: (M,), one channel of a sparse lattice; ``index`` (X, Y, Z) int32; ``fill`` what is absent reads.
-        shift, scale: of the optical depth of a step.
-        opaque: a ray ends where less than this is let through; the rest of it is what is missed. 0: never.
-        threshold: samples of more weight than this are returned; below 0 all are.
+        origins, directions, near, far, step, cells, jitter: as for ``march``.
+        raw: (M,), one channel of a sparse lattice.
+        index: (X, Y, Z) int32, its rows or -1.
+        fill: value of an absent voxel.
+        shift, scale: shift and scale of a step's optical depth.
+        early_stop_eps: end a ray once its transmittance is below this; 0: never.
+        threshold: return samples of more weight than this; below 0: all.
 
-    Cost: one read of 8 voxels a sample up to a ray's end, and again from its first counted one; memory P.
+    Raises:
+        ValueError: for other shapes, or rays that cannot be marched.
+
+    Cost: one read of 8 voxels per sample up to a ray's end, twice for returned samples; memory P.
     """
     check_march(origins, directions, near, far, step, jitter)
     check_shape("raw", raw, ("M",))
@@ -67,7 +76,7 @@ def trace(
     read, counts, firsts = torch.zeros(3, len(origins), dtype=torch.int64).unbind()
     common = (*(_array(v) for v in (origins, directions)), *map(float, (near, far, step)), _array(jitter))
     common = (*common, *map_cells(cells), _array(raw), _array(index))
-    common = (*common, *map(float, (fill, shift, scale, opaque, threshold)))
+    common = (*common, *map(float, (fill, shift, scale, early_stop_eps, threshold)))
     common = (*common, *(v.numpy() for v in (sums, read, counts, firsts)))
     ids, none = torch.zeros(0, dtype=torch.int64), origins.new_zeros(0)
     kernels.trace(*common, *(v.numpy() for v in (ids, ids, none, none)))

@@ -1,4 +1,4 @@
-"""Total variation, invariant to resolution: means of first differences."""
+"""Total variation, as means of first differences, which do not depend on the resolution."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from forewarp.ops.checks import check_shape
 
 
 def total_variation(values: Tensor, pairs: list[tuple[Tensor, Tensor]]) -> Tensor:
-    """Mean absolute first difference per axis, summed over the axes that have neighbours.
+    """Return the mean absolute first difference per axis, summed over axes.
 
     Args:
         values: (M, C) on a sparse lattice.
-        pairs: rows of neighbours per axis, see ``grid.neighbour_pairs``.
+        pairs: rows of neighbours per axis (see ``grid.neighbour_pairs``).
 
     Returns:
-        A scalar, 0 where there are no neighbours. Differentiable.
+        (), 0 without neighbours. Differentiable.
 
-    Cost: two reads of C channels a pair.
+    Cost: two reads of C channels per pair.
     """
     check_shape("values", values, ("M", "C"))
     total = values.new_zeros(())
@@ -29,16 +29,16 @@ def total_variation(values: Tensor, pairs: list[tuple[Tensor, Tensor]]) -> Tenso
 
 
 def patch_variation(depth: Tensor, opacity: Tensor) -> Tensor:
-    """RegNeRF's depth term: squared first differences in small patches, weighted by opacity without gradient.
+    """RegNeRF's depth term: squared first differences in patches, weighted by opacity without gradient.
 
     Args:
         depth: (B, S, S), in fractions of far - near.
         opacity: (B, S, S) in [0, 1].
 
     Returns:
-        A scalar: for each direction the mean over all pairs of weight times difference, not divided by the
-        weights; the two added. A pair weighs what its less opaque pixel does. 0 for single pixels.
-        Differentiable in ``depth``.
+        (), the mean over horizontal pairs plus the mean over vertical pairs of weight times squared
+        difference; the weight of a pair is its lower opacity. 0 for single pixels. Differentiable in
+        ``depth``.
     """
     check_shape("depth", depth, ("B", "S", "S"))
     mask = opacity.detach()

@@ -1,4 +1,4 @@
-"""Compiling ahead of time: a tiny call of every operator that has a kernel."""
+"""Compile the kernels before training, by a tiny call of each."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from forewarp.ops.trace import trace
 
 
 def warm_up(device: torch.device | str = "cpu") -> None:
-    """Run each operator forwards and backwards once, on two voxels an axis; nothing is drawn at random.
+    """Run each operator forwards and backwards once, on two voxels per axis, without random numbers.
 
-    Numba compiles a kernel, or reads it from its cache, at the first call: seconds that are not training.
+    Numba compiles a kernel, or reads it from its cache, at the first call, which takes seconds.
     """
     voxels = torch.cartesian_prod(*[torch.arange(2, device=device)] * 3)
     positions = voxels.float().requires_grad_()

@@ -1,1 +1,1 @@
-"""From run folders to tables and curves."""
+"""Turn run folders into tables, curves and pages."""

@@ -1,4 +1,4 @@
-"""The page that says what accuracy costs in time: for so many dB so many seconds, by which command."""
+"""Write the page of accuracy against training time: the cheapest way to each PSNR."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from forewarp.files import replace_file
 from forewarp.report.collect import Result, by_scene, collect, grouped, left_out, machine
 from forewarp.report.curve import Published, draw_scene, seconds_to
 from forewarp.report.tables import Column, Estimate, Table
@@ -15,7 +16,7 @@ Groups = Mapping[tuple[str, float | None], Sequence[Result]]
 INTRODUCTION = """# Accuracy against training time
 
 Written by `forewarp-report kind=accuracy_time`. Seconds are of training alone: evaluation, logging and
-checkpoints are left out. PSNR is of training views set aside (`data.held_out`; without any, of validation
+checkpoints are left out. PSNR is of training views held out (`data.held_out`; without any, of validation
 views), each estimated from the same random pixels of the whole image; a value counts as reached once two
 evaluations in a row reach it. Over several seeds: mean ± standard deviation, and only where every seed gets
 there. A schedule follows the share of its minutes that is spent, so a run of ten minutes is not at its best
@@ -29,17 +30,16 @@ def write_accuracy_time(
     """Write ``accuracy-time.md``, and a picture and a CSV file a scene.
 
     Args:
-        runs: folder of runs.
-        out: folder that they are written into.
-        target: PSNR (dB) that every variant's time is listed for; None: the last whole one that the base, or
-            without one the best run, reached.
-        published: drawn beside, apart.
+        runs: folder to search for runs.
+        out: folder to write to.
+        target: list each variant's seconds to this PSNR (dB); None: the last whole dB that the base, or else
+            the best run, reached.
+        published: results of others, drawn as stars.
 
     Returns:
-        the files.
+        the files written.
     """
     results, without = collect(runs, ["accuracy_time.csv", "metrics.json"])
-    out.mkdir(parents=True, exist_ok=True)
     written, parts = [], [INTRODUCTION, f"Machine: {machine(results)}.\n"]
     for scene, found in by_scene(results).items():
         groups = grouped(found)
@@ -47,7 +47,7 @@ def write_accuracy_time(
         picture = draw_scene(out / f"accuracy-time-{scene}.png", groups, scene, beside)
         every = variants(groups, _target(groups) if target is None else target)
         file = out / f"accuracy-time-{scene}.csv"
-        file.write_text(every.csv())
+        replace_file(file, every.csv())
         parts += [f"## {scene}\n", f"![PSNR against seconds]({picture.name})\n"]
         parts += [cheapest(groups).markdown(), every.markdown()]
         written += [picture, file]
@@ -57,18 +57,18 @@ def write_accuracy_time(
         parts += ["## Published by others\n", about, "\n".join(lines) + "\n"]
     parts += left_out("Without a curve", without)
     page = out / "accuracy-time.md"
-    page.write_text("\n".join(parts))
+    replace_file(page, "\n".join(parts))
     return [page, *written]
 
 
 def reached(group: Sequence[Result], psnr: float) -> Estimate | None:
-    """Seconds to a PSNR over the seeds; None where one of them does not get there."""
+    """Return the seconds to a PSNR over the seeds; None if a seed does not reach this PSNR."""
     times = [seconds_to(result.curve, psnr) for result in group]
     return None if None in times else Estimate.of(times)
 
 
 def cheapest(groups: Groups) -> Table:
-    """For every whole dB that any variant reaches: the one that is there first, and its command."""
+    """List for every whole dB the variant that reaches it first, with the command."""
     rows = []
     values = [point.psnr for group in groups.values() for result in group for point in result.curve]
     for psnr in range(math.ceil(min(values)), math.floor(max(values)) + 1):
@@ -82,7 +82,7 @@ def cheapest(groups: Groups) -> Table:
 
 
 def variants(groups: Groups, target: float) -> Table:
-    """Every variant: how long to the target, and what it ends with."""
+    """List for every variant the seconds to the target PSNR and the final numbers."""
     rows = []
     for (variant, minutes), group in groups.items():
         last = [result.curve[-1] for result in group if result.curve]
@@ -90,7 +90,6 @@ def variants(groups: Groups, target: float) -> Table:
         rows.append(
             [
                 variant,
-                group[0].about,
                 minutes,
                 len(group),
                 reached(group, target),
@@ -99,7 +98,7 @@ def variants(groups: Groups, target: float) -> Table:
                 Estimate.of([sum(d["steps"] for d in result.stages.values()) for result in group]),
             ]
         )
-    columns = [Column("variant"), Column("what"), Column("minutes", 1), Column("seeds", 0)]
+    columns = [Column("variant"), Column("minutes", 1), Column("seeds", 0)]
     columns += [Column(f"seconds to {target:g} dB", 1), Column("PSNR at the end"), Column("EPE", 4)]
     return Table([*columns, Column("steps", 0)], rows, "At equal minutes; the steps that were done in them:")
 

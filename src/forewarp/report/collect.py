@@ -1,22 +1,24 @@
-"""What run folders hold, read as plain files."""
+"""Read run folders as plain files, without torch and without running their config."""
 
 from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Sequence
+import re
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import yaml
 
-MOST_BYTES = 1 << 20  # of a config: ours have a few thousand
+from forewarp.files import MOST_CONFIG, read_text
 
 
 @dataclass(frozen=True)
 class Point:
-    """A row of ``accuracy_time.csv``: PSNR (dB) of the views set aside after ``seconds`` of training;
-    ``epe`` is the moving points' error in world units, None where nobody knows the truth.
+    """A row of ``accuracy_time.csv``: PSNR (dB) of the held-out views after ``seconds`` of training.
+
+    ``epe`` is the error of moving points in world units; None if the truth is unknown.
     """
 
     seconds: float
@@ -27,8 +29,14 @@ class Point:
 
 @dataclass(frozen=True)
 class Result:
-    """One run: its resolved ``config``, what its stages noted at their end, its ``metrics.json`` (empty where
-    it was not measured) and its curve (empty where no views were set aside).
+    """One run.
+
+    Attributes:
+        folder: the run's folder.
+        config: the resolved config.
+        stages: the ``done.json`` of each finished stage.
+        metrics: content of ``metrics.json``; empty if the run was not measured.
+        curve: rows of ``accuracy_time.csv``; empty if no views were held out.
     """
 
     folder: Path
@@ -39,68 +47,84 @@ class Result:
 
     @property
     def scene(self) -> str:
-        """Its name."""
+        """The scene's name."""
         return str(self.config["data"]["scene"])
 
     @property
     def dataset(self) -> str:
-        """What its scene is one of, as its numbers' protocol says; "" where it was not measured."""
+        """The dataset of the scene; "" if the run was not measured."""
         return str(self.metrics.get("protocol", {}).get("dataset", ""))
 
     @property
     def is_counterpart(self) -> bool:
-        """Whether it is of a procedural scene that stands in for its dataset."""
+        """Whether the scene is a synthetic counterpart of a dataset."""
         made = self.metrics.get("protocol", {}).get("synthetic", False)
         return bool(made) or ".Synthetic" in str(self.config["data"].get("_target_", ""))
 
     @property
     def variant(self) -> str:
-        """What was changed; without a variant the method and its preset."""
+        """Name what tells this run from others of its scene.
+
+        The name of an ablation; for runs of ``sweeps=accuracy_time`` and ``price_list`` the typed overrides
+        (``base`` without any); for all other runs the method and the preset.
+        """
         known = self.config.get("variant") or {}
-        return known.get("name") or f"{self.config['model']['name']}-{self.config['preset']['name']}"
+        if "name" in known:
+            return known["name"] or "base"
+        return f"{self.config['model']['name']}-{self.config['preset']['name']}"
 
     @property
     def about(self) -> str:
-        """The change in words."""
+        """What the variant changes, in a phrase."""
         return (self.config.get("variant") or {}).get("about", "")
 
-    @property
-    def against(self) -> str:
-        """The variant that it is compared with."""
-        return (self.config.get("variant") or {}).get("against", "base")
+    def against(self, variants: Iterable[str]) -> str:
+        """Choose from ``variants`` the one to compare this run with.
+
+        The one that the run's config names, or else the one with most of the run's overrides and no others.
+
+        >>> run = Result(Path("run"), {"variant": {"name": "a=1 b=2 c=3"}})
+        >>> run.against(["base", "a=1", "a=1 b=2", "a=1 d=4", "a=1 b=2 c=3"])
+        'a=1 b=2'
+        """
+        if named := (self.config.get("variant") or {}).get("against"):
+            return named
+        own = set(_overrides(self.variant))
+        inside = [name for name in variants if set(_overrides(name)) < own]
+        return max(inside, key=lambda name: len(_overrides(name)), default="base")
 
     @property
     def effects(self) -> str:
-        """Those of its method's effects that were on, as it was measured; "" where it was not."""
+        """Names of the method's effects that were on; "" if the run was not measured."""
         return ", ".join(name for name, on in self.metrics.get("effects", {}).items() if on)
 
     @property
     def seed(self) -> int:
-        """Of everything random."""
+        """The seed of all random numbers."""
         return int(self.config["seed"])
 
     @property
     def minutes(self) -> float | None:
-        """What the run could spend; None where steps bound it."""
+        """The minutes of the budget; None if only steps bound the run."""
         return self.config["budget"]["minutes"]
 
     @property
     def command(self) -> str:
-        """What makes such a run, trained on all views."""
+        """The command that made the run."""
         return self.config.get("command") or f"forewarp-train # as {self.folder / 'config.yaml'}"
 
     @property
     def ability(self) -> str:
-        """The kind of test view that its numbers are of: ``all``, or, where a scene tells them apart,
-        ``time``: a new view between the training times; the kind it has where it has none of these.
+        """The kind of test view that ``numbers`` averages: ``all``, else ``time`` (between training times),
+        else the first kind there is.
         """
         known = self.metrics["test"]
         return [*(kind for kind in ("all", "time") if kind in known), *known, "all"][0]
 
     @property
     def numbers(self) -> dict[str, float]:
-        """Of a measured run: ``psnr ssim epe``, ``step`` and ``frame`` in seconds, ``memory`` in GiB,
-        ``parameters`` in millions and ``steps``; what is unknown is left out.
+        """The numbers of a measured run: ``psnr``, ``ssim``, ``epe``, ``step`` and ``frame`` (seconds),
+        ``memory`` (GiB), ``parameters`` (millions) and ``steps``; unknown ones are left out.
         """
         scores = self.metrics["test"].get(self.ability, {})
         seconds, steps = self.metrics["seconds"], sum(done["steps"] for done in self.stages.values())
@@ -119,17 +143,17 @@ class Result:
 
 
 def collect(root: Path, needed: Sequence[str] = ()) -> tuple[list[Result], list[str]]:
-    """All runs below a folder.
+    """Read all runs below a folder.
 
     Args:
-        root: searched for ``config.yaml``.
-        needed: files that a run must hold, as ``metrics.json``.
+        root: folder to search for ``config.yaml``.
+        needed: files that a run must hold, such as ``metrics.json``.
 
     Returns:
-        the runs in the order of their folders, and a line for each that cannot be used.
+        the runs in the order of their folders, and a line for each run that cannot be used.
 
     Raises:
-        ValueError: where there is no run at all.
+        ValueError: if there is no run at all.
     """
     results, without = [], []
     for path in sorted(Path(root).rglob("config.yaml")):
@@ -145,11 +169,12 @@ def collect(root: Path, needed: Sequence[str] = ()) -> tuple[list[Result], list[
             continue
         if absent:
             again = "run its command again"
-            if absent == ["accuracy_time.csv"]:  # no views to draw it from
+            if absent == ["accuracy_time.csv"]:  # no views were held out
                 again = "run its command with data.held_out=8 into another folder"
             without.append(f"{folder.relative_to(root)}: no {', '.join(absent)}; {again}")
         else:
             results.append(result)
+    _shorten(results)
     if not results and not without:
         raise ValueError(
             f"{root}: expected folders of runs, but got none; make some with forewarp-train, or set runs=..."
@@ -157,24 +182,41 @@ def collect(root: Path, needed: Sequence[str] = ()) -> tuple[list[Result], list[
     return results, without
 
 
+def _shorten(results: Sequence[Result]) -> None:
+    """In names that are typed overrides, drop the overrides that all such runs of a scene share."""
+    for found in by_scene(results).values():
+        typed = [known for run in found if set(known := run.config.get("variant") or {}) == {"name"}]
+        names = [_overrides(known["name"] or "") for known in typed]
+        shared = set.intersection(*map(set, names)) if len({*map(tuple, names)}) > 1 else set()
+        for known, name in zip(typed, names):
+            known["name"] = " ".join(override for override in name if override not in shared)
+
+
+def _overrides(name: str) -> list[str]:
+    """Split a name into its overrides, without spaces inside them.
+
+    >>> _overrides("preset.rays=64 stage.fine.num_voxels=[[0, 8000]] ~stage.coarse")
+    ['preset.rays=64', 'stage.fine.num_voxels=[[0,8000]]', '~stage.coarse']
+    """
+    return [re.sub(r"\s", "", one) for one in re.split(r"\s+(?=[+~]|[\w./]+=)", name) if one]
+
+
 def read_run(folder: Path) -> Result:
-    """One run; files that are not there leave their part empty."""
+    """Read one run; parts whose files are missing are empty."""
     path = folder / "config.yaml"
-    if (size := path.stat().st_size) > MOST_BYTES:
-        raise ValueError(f"config.yaml: expected at most {MOST_BYTES} bytes, but got {size}")
-    config = yaml.safe_load(path.read_text())
+    config = yaml.safe_load(read_text(path, MOST_CONFIG))
     if "preset" not in config and "warp" in config.get("model", {}):  # of a version before 0.2
         config["preset"] = {"name": config["budget"]["name"]}
         config["model"]["name"] = config["model"]["warp"]
     stages = {path.parent.name: _json(path) for path in sorted(folder.glob("*/done.json"))}
     result = Result(folder, config, stages, _json(folder / "metrics.json"), read_curve(folder))
-    # Looked at here, so that what is spoiled is found while it can be named.
+    # Evaluated here, so that a broken file is noticed while its run can be named.
     _ = result.scene, result.variant, result.seed, result.minutes, result.metrics and result.numbers
     return result
 
 
 def read_curve(folder: Path) -> tuple[Point, ...]:
-    """The rows of a run's ``accuracy_time.csv``; none where it has none."""
+    """Read the rows of a run's ``accuracy_time.csv``; a missing file has none."""
     path = folder / "accuracy_time.csv"
     if not path.is_file():
         return ()
@@ -191,7 +233,7 @@ def read_curve(folder: Path) -> tuple[Point, ...]:
 
 
 def grouped(results: Sequence[Result]) -> dict[tuple[str, float | None], list[Result]]:
-    """The runs that differ in nothing but the seed: (variant, minutes) -> runs by seed; the base first."""
+    """Group runs that differ only in the seed: (variant, minutes) -> runs by seed, the base first."""
     groups: dict[tuple[str, float | None], list[Result]] = {}
     for result in sorted(results, key=lambda r: (r.variant != "base", r.variant, r.minutes or 0, r.seed)):
         groups.setdefault((result.variant, result.minutes), []).append(result)
@@ -199,27 +241,27 @@ def grouped(results: Sequence[Result]) -> dict[tuple[str, float | None], list[Re
 
 
 def by_scene(results: Sequence[Result]) -> dict[str, list[Result]]:
-    """Scene -> its runs, by name."""
+    """Group runs by scene, sorted by name."""
     scenes = sorted({result.scene for result in results})
     return {scene: [result for result in results if result.scene == scene] for scene in scenes}
 
 
 def left_out(title: str, lines: Sequence[str]) -> list[str]:
-    """The part of a page that lists what ``collect`` could not use; nothing where there is none."""
+    """Return the section of a page that lists the runs ``collect`` could not use."""
     return [f"## {title}\n", "\n".join(f"* {line}" for line in lines) + "\n"] if lines else []
 
 
 def machine(results: Sequence[Result]) -> str:
-    """What the runs were computed on, in one line."""
+    """Say in one line what the runs were computed on."""
     found = []
     for protocol in (result.metrics.get("protocol", {}) for result in results):
         torch = protocol.get("versions", {}).get("torch")
         threads = protocol.get("threads")
-        words = [protocol.get("device"), f"{threads} thread{'s' * (threads != 1)}", f"torch {torch}"]
-        if protocol.get("device") and words not in found:
-            found.append(words)
-    return "; ".join(", ".join(words) for words in found) or "unknown"
+        about = [protocol.get("device"), f"{threads} thread{'s' * (threads != 1)}", f"torch {torch}"]
+        if protocol.get("device") and about not in found:
+            found.append(about)
+    return "; ".join(", ".join(about) for about in found) or "unknown"
 
 
 def _json(path: Path) -> dict:
-    return json.loads(path.read_text()) if path.is_file() else {}
+    return json.loads(read_text(path)) if path.is_file() else {}

@@ -1,24 +1,22 @@
-"""Accuracy against training time: what is reached when, the Pareto front, and pictures of both."""
+"""Draw accuracy against training time; find when a PSNR is reached, and the Pareto front."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import yaml
 
-from forewarp.report.collect import Point, Result
+from forewarp.files import MOST_CONFIG, read_text, written_whole
+from forewarp.report.collect import Point, Result, read_curve
 
-OTHERS = Path(__file__).with_name("published.yaml")  # what others report
+OTHERS = Path(__file__).with_name("published.yaml")  # results of others
 _KEYS = ("name", "seconds", "psnr", "hardware", "source", "dataset")
 
 
 def seconds_to(curve: Sequence[Point], psnr: float) -> float | None:
-    """Seconds until a PSNR (dB) is first reached on two evaluations in a row: those of the first of the two.
-
-    None where that never happens.
+    """Return the seconds until two evaluations in a row first reach a PSNR (dB); None if none do.
 
     >>> curve = [Point(s, p, 0) for s, p in [(1, 20), (2, 25), (4, 24), (8, 26), (16, 27)]]
     >>> seconds_to(curve, 25), seconds_to(curve, 27)
@@ -31,7 +29,7 @@ def seconds_to(curve: Sequence[Point], psnr: float) -> float | None:
 
 
 def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
-    """Which of (seconds, psnr) no other one beats in both, in the order of time.
+    """Return the indices, by time, of the (seconds, psnr) points that no other point beats in both.
 
     >>> pareto_front([(2, 20), (1, 21), (4, 25), (3, 25)])
     [1, 3]
@@ -45,7 +43,7 @@ def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
 
 @dataclass(frozen=True)
 class Published:
-    """What others report: ``psnr`` (dB) of a ``dataset`` after ``seconds`` on ``hardware``; ``source``."""
+    """A result of others: PSNR (dB) on a dataset after ``seconds`` on some hardware."""
 
     name: str
     seconds: float
@@ -56,13 +54,13 @@ class Published:
 
 
 def read_published(path: Path) -> list[Published]:
-    """A YAML list of entries with the keys name, seconds, psnr, hardware, source, dataset.
+    """Read a YAML list of entries with the keys name, seconds, psnr, hardware, source, dataset.
 
     Raises:
-        ValueError: an entry that lacks one.
+        ValueError: if the file is no YAML, or an entry has other keys.
     """
     try:
-        entries = yaml.safe_load(Path(path).read_text())
+        entries = yaml.safe_load(read_text(Path(path), MOST_CONFIG))
     except yaml.YAMLError as error:
         raise ValueError(f"{path}: expected YAML, but got {str(error).splitlines()[0]}") from None
     for number, entry in enumerate(entries if isinstance(entries, list) else [None]):
@@ -72,8 +70,17 @@ def read_published(path: Path) -> list[Published]:
     return [Published(**entry) for entry in entries]
 
 
+def draw_own(folder: Path) -> None:
+    """Draw a run's curve into ``accuracy_time.png``, if there is a curve and matplotlib is installed."""
+    if points := read_curve(folder):
+        try:
+            print(f"curve    {draw_run(folder / 'accuracy_time.png', points, folder.name)}")
+        except ImportError as error:
+            print(f"without accuracy_time.png: {error}")
+
+
 def draw_run(path: Path, curve: Sequence[Point], title: str) -> Path:
-    """One run's PSNR against seconds, and its flow error where that is known."""
+    """Draw a run's PSNR, and the flow error if known, against seconds."""
     figure, axes = _axes(any(point.epe is not None for point in curve))
     _line(axes, curve, color="C0", linewidth=2)
     axes[0].set_title(title)
@@ -86,13 +93,13 @@ def draw_scene(
     title: str,
     published: Sequence[Published] = (),
 ) -> Path:
-    """All runs of a scene; those on the Pareto front are coloured and named, the front is marked.
+    """Draw all runs of a scene; color and name the groups on the Pareto front, and mark the front.
 
     Args:
-        path: of the picture.
-        groups: as ``collect.grouped``; a line a run, a colour a group.
-        title: over it.
-        published: drawn apart, as stars, each with its hardware; they need not be of this scene.
+        path: file of the picture.
+        groups: runs as grouped by ``collect.grouped``; a line for each run, a color for each group.
+        title: title above the picture.
+        published: results of others, drawn as stars with their hardware; they may be of other scenes.
     """
     runs = [(key, run) for key, group in groups.items() for run in group]
     every = [(key, point) for key, run in runs for point in run.curve]
@@ -122,13 +129,13 @@ def _axes(with_flow: bool, wide: bool = False):
         from matplotlib.ticker import LogLocator, NullFormatter
     except ImportError:
         raise ImportError("expected matplotlib for plots; install forewarp[plots]") from None
-    # No pyplot: nothing global is left behind, and no display is looked for.
+    # Without pyplot, which keeps global state and looks for a display.
     figure = Figure(figsize=(7, 7.5 if with_flow else 4.5), layout="constrained")
     axes = figure.subplots(2 if with_flow else 1, 1, squeeze=False)[:, 0]
-    labels = ("PSNR of views set aside (dB)", "error of moving points (world units)")
+    labels = ("PSNR of held-out views (dB)", "error of moving points (world units)")
     for axis, label in zip(axes, labels):
         axis.set(xscale="log", xlabel="seconds of training", ylabel=label)
-        # Over many decades only their beginnings have room.
+        # An axis of many decades has room for one tick per decade.
         axis.xaxis.set_major_locator(LogLocator(subs=(1,) if wide else (1, 2, 5)))
         axis.xaxis.set_major_formatter("{x:g}")
         axis.xaxis.set_minor_formatter(NullFormatter())
@@ -144,8 +151,6 @@ def _line(axes, curve: Sequence[Point], **style) -> None:
 
 
 def _save(figure, path: Path) -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    beside = path.with_name(f".{path.name}.part")
-    figure.savefig(beside, format="png", dpi=120)
-    os.replace(beside, path)
+    with written_whole(path) as beside:
+        figure.savefig(beside, format="png", dpi=120)
     return path

@@ -1,4 +1,4 @@
-"""The page that compares what scenes call for with every effect at once and with the paper's fixed set."""
+"""Write the page that compares planned runs with every effect at once and with the paper's fixed set."""
 
 from __future__ import annotations
 
@@ -7,12 +7,13 @@ from pathlib import Path
 
 import yaml
 
+from forewarp.files import MOST_CONFIG, read_text, replace_file
 from forewarp.report.collect import Result, by_scene, collect, left_out, machine
 from forewarp.report.curve import seconds_to
 from forewarp.report.tables import Column, Estimate, Table
 
 CHOICES = {"auto": "planned", "all_effects": "every effect", "full": "the paper's set", "base": "the preset"}
-WITHIN = 0.3  # dB below every effect's PSNR that a plan's run should reach in less time
+WITHIN = 0.3  # a planned run should come within this many dB of every effect at once, in less time
 
 INTRODUCTION = """# Only the effects a scene calls for
 
@@ -29,15 +30,14 @@ def write_effects(runs: Path, out: Path) -> list[Path]:
     """Write ``effects.md`` and ``effects.csv`` (every run).
 
     Args:
-        runs: folder of measured runs.
-        out: folder that they are written into.
+        runs: folder to search for measured runs.
+        out: folder to write to.
 
     Returns:
-        the files.
+        the files written.
     """
     results, without = collect(runs, ["metrics.json"])
     results = [result for result in results if result.variant in CHOICES]
-    out.mkdir(parents=True, exist_ok=True)
     parts = [INTRODUCTION.format(within=WITHIN), f"Machine: {machine(results)}.\n"]
     for title, own in (("Specimens", True), ("Other scenes", False)):
         found = [r for r in results if (r.config.get("calls_for") is not None) == own]
@@ -47,19 +47,19 @@ def write_effects(runs: Path, out: Path) -> list[Path]:
     parts += ["## Why\n", *reasons(results)]
     parts += left_out("Without numbers", without)
     page, file = out / "effects.md", out / "effects.csv"
-    page.write_text("\n".join(parts))
-    file.write_text(every_run(results).csv())
+    replace_file(page, "\n".join(parts))
+    replace_file(file, every_run(results).csv())
     return [page, file]
 
 
 def plan_of(result: Result) -> dict:
-    """The plan that a run follows; empty where it follows none."""
+    """Read the plan that a run follows; empty if there is none."""
     path = result.folder / "plan.yaml"
-    return yaml.safe_load(path.read_text()) if path.is_file() else {}
+    return yaml.safe_load(read_text(path, MOST_CONFIG)) if path.is_file() else {}
 
 
 def compared(results: Sequence[Result]) -> Table:
-    """A row a scene: what each choice reaches, mean over seeds, and the mean over scenes."""
+    """List for every scene the numbers of each choice, mean over seeds; then the mean over scenes."""
     rows, columns = [], [Column("scene"), Column("seeds", 0)]
     columns += [Column(_title(results, choice)) for choice in CHOICES if _runs(results, choice)]
     columns += [Column("planned - every effect", signed=True), Column("seconds to it", 0)]
@@ -86,7 +86,7 @@ def _cells(results: Sequence[Result], found: Sequence[Result]) -> list:
 
 
 def called(results: Sequence[Result]) -> Table:
-    """A row a plan: what it turned on, and what its scene was made to call for."""
+    """List for every plan the effects switched on, and the effects that the scene was made to call for."""
     rows = []
     for run in _runs(results, "auto"):
         wanted = sorted(run.config.get("calls_for") or [])
@@ -102,7 +102,7 @@ def called(results: Sequence[Result]) -> Table:
 
 
 def reasons(results: Sequence[Result]) -> list[str]:
-    """For every scene the decisions of its first plan."""
+    """List for every scene the decisions of its first plan."""
     parts = []
     for scene, found in by_scene(_runs(results, "auto")).items():
         plan = plan_of(min(found, key=lambda run: run.seed))
@@ -112,15 +112,9 @@ def reasons(results: Sequence[Result]) -> list[str]:
 
 
 def every_run(results: Sequence[Result]) -> Table:
-    """A row a run, nothing summed up."""
+    """List the numbers of every run."""
     columns = [Column(name) for name in ("scene", "choice", "seed")]
-    columns += [
-        Column("minutes", 1),
-        Column("PSNR", 3),
-        Column("steps", 0),
-        Column("planning, s", 1),
-        Column("command"),
-    ]
+    columns += [Column("minutes", 1), Column("PSNR", 3), Column("steps", 0), Column("planning, s", 1)]
     rows = [
         [
             run.scene,
@@ -134,18 +128,18 @@ def every_run(results: Sequence[Result]) -> Table:
         ]
         for run in sorted(results, key=lambda run: (run.scene, run.variant, run.seed))
     ]
-    return Table(columns, rows)
+    return Table([*columns, Column("command")], rows)
 
 
 def _runs(results: Sequence[Result], choice: str) -> list[Result]:
-    """Those of a choice; of a scene and a seed the one measured last."""
+    """Select the runs of a choice; for each scene and seed the one measured last."""
     found = [result for result in results if result.variant == choice]
     found.sort(key=lambda run: (run.folder / "metrics.json").stat().st_mtime_ns)
     return list({(run.scene, run.seed): run for run in found}.values())
 
 
 def _pairs(results: Sequence[Result], choice: str) -> list[tuple[Result, Result]]:
-    """Planned runs and those of another choice, of the same scene and seed."""
+    """Pair each planned run with the run of ``choice`` that has the same scene and seed."""
     others = {(run.scene, run.seed): run for run in _runs(results, choice)}
     own = [(run, others.get((run.scene, run.seed))) for run in _runs(results, "auto")]
     return [(run, other) for run, other in own if other is not None]

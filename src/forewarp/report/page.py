@@ -1,4 +1,4 @@
-"""A report's sections as Markdown, as LaTeX tables, and as one HTML file that holds everything."""
+"""Write a report's sections as Markdown, as LaTeX tables, and as one HTML file with its pictures."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _LATEX = {
 
 @dataclass(frozen=True)
 class Section:
-    """A heading, tables and pictures below it, ``facts`` of how they came about, ``notes`` at their foot."""
+    """A heading with tables and pictures, ``facts`` on how they came about, and footnotes."""
 
     title: str
     tables: Sequence[Table] = ()
@@ -48,7 +48,7 @@ class Section:
 
 
 def markdown(title: str, introduction: str, sections: Sequence[Section]) -> str:
-    """The page; pictures are named, not held."""
+    """Return the page as Markdown, with links to its pictures."""
     parts = [f"# {title}\n", introduction + "\n"]
     for section in sections:
         parts += [f"## {section.title}\n", *(table.markdown() for table in section.tables)]
@@ -60,7 +60,7 @@ def markdown(title: str, introduction: str, sections: Sequence[Section]) -> str:
 
 
 def html(title: str, introduction: str, sections: Sequence[Section]) -> str:
-    """The page in one file: nothing is fetched from anywhere."""
+    """Return the page as HTML that holds its pictures and fetches nothing."""
     parts = [f"<!doctype html>\n<html lang=en><meta charset=utf-8><title>{escape(title)}</title>"]
     parts += [f"<style>{STYLE}</style>", f"<h1>{escape(title)}</h1><p>{escape(introduction)}</p>"]
     for section in sections:
@@ -75,13 +75,13 @@ def html(title: str, introduction: str, sections: Sequence[Section]) -> str:
 
 
 def latex(sections: Sequence[Section]) -> str:
-    """A document with every table: booktabs, the best bold, the second underlined."""
+    """Return a document with every table: booktabs, the best bold, the second underlined."""
     tables = [_latex_table(section, table) for section in sections for table in section.tables]
     return LATEX_HEAD + "\n".join(tables) + "\\end{document}\n"
 
 
 def latex_text(text: str) -> str:
-    """Text as LaTeX reads it.
+    """Escape text for LaTeX.
 
     >>> latex_text("50 % of a_b")
     '50 \\\\% of a\\\\_b'

@@ -1,4 +1,4 @@
-"""The paper's tables and figures, measured and printed side by side."""
+"""Write the paper's tables and figures with measured and printed numbers side by side."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ from dataclasses import replace
 from datetime import datetime, timezone
 from pathlib import Path
 
-from forewarp.report import page, pictures
+from forewarp.files import replace_file
+from forewarp.report import page, paper_figures
 from forewarp.report.collect import Result, collect, machine
-from forewarp.report.compared import comparison, counterpart, measured, row_of, with_means
 from forewarp.report.page import Section
+from forewarp.report.paper_tables import comparison, counterpart, measured, row_of, with_means
 from forewarp.report.published import PAPER, PaperTable, read_paper
 
 TITLE = "The paper's tables, measured"
@@ -23,7 +24,7 @@ INTRODUCTION = (
     "comparable with printed ones."
 )
 COUNTERPART = ": synthetic counterpart"
-# Of a run's protocol, what tells its numbers from others of the dataset.
+# Entries of a run's protocol that the page shows.
 TOLD = ("half_resolution", "scale", "split", "frames", "views", "train_frames", "test_views", "test_frames")
 TOLD += ("held_out", "canonical_time", "mask_box")
 DATASETS = ("dnerf", "hypernerf", "nhr", "lego_complete")
@@ -33,17 +34,16 @@ def write_paper(runs: Path, out: Path, published: Path = PAPER, curves: Path | N
     """Write ``paper.md``, ``paper.tex``, ``paper.html``, a CSV file a table, and the figures.
 
     Args:
-        runs: folder of measured runs.
-        out: folder that they are written into.
-        published: the printed numbers.
-        curves: folder whose pictures of accuracy against training time are shown too.
+        runs: folder to search for measured runs.
+        out: folder to write to.
+        published: file of the printed numbers.
+        curves: folder of the pictures drawn by ``kind=accuracy_time``, shown too.
 
     Returns:
-        the files.
+        the files written.
     """
     results, without = collect(runs, ["metrics.json"])
     results, older = newest(results)
-    out.mkdir(parents=True, exist_ok=True)
     tables = [section for table in read_paper(published).values() for section in sections_of(table, results)]
     figures, drawn = figures_of(results, out, curves)
     sections = [*tables, *figures]
@@ -55,12 +55,12 @@ def write_paper(runs: Path, out: Path, published: Path = PAPER, curves: Path | N
         "paper.tex": page.latex(tables),
     }
     for name, text in files.items():
-        (out / name).write_text(text)
+        replace_file(out / name, text)
     return [out / name for name in files] + _write_csv(tables, out) + drawn
 
 
 def newest(results: Sequence[Result]) -> tuple[list[Result], list[Result]]:
-    """Of runs that differ in nothing that a table tells, the one measured last; and the others."""
+    """Of runs with the same table entry select the one measured last; return these runs, and the others."""
     kept: dict[tuple, Result] = {}
     for run in sorted(results, key=lambda run: (run.folder / "metrics.json").stat().st_mtime_ns):
         kept[run.dataset, run.is_counterpart, run.scene, run.seed, row_of(run)] = run
@@ -69,7 +69,7 @@ def newest(results: Sequence[Result]) -> tuple[list[Result], list[Result]]:
 
 
 def sections_of(table: PaperTable, results: Sequence[Result]) -> list[Section]:
-    """The table as the paper has it, and that of the synthetic counterpart where one was measured."""
+    """Make the paper's table, and a table of the synthetic counterparts if any were measured."""
     real = [run for run in results if not run.is_counterpart]
     made = [run for run in results if run.is_counterpart]
     printed = with_means(table, real)
@@ -85,7 +85,7 @@ def sections_of(table: PaperTable, results: Sequence[Result]) -> list[Section]:
 
 
 def facts(runs: Sequence[Result]) -> list[str]:
-    """How numbers came about: protocol, machine, budget, date and command."""
+    """State protocol, machine, budget, date and command of the runs."""
     if not runs:
         return ["measured: nothing yet"]
     days = sorted({_day(run) for run in runs})
@@ -101,10 +101,7 @@ def facts(runs: Sequence[Result]) -> list[str]:
 
 
 def figures_of(results: Sequence[Result], out: Path, curves: Path | None) -> tuple[list[Section], list[Path]]:
-    """What can be drawn from these runs, and what ``make accuracy-time`` left in ``curves``.
-
-    Where matplotlib is absent, a section that says so.
-    """
+    """Draw what these runs allow, and add the pictures in ``curves``; say if matplotlib is missing."""
     try:
         found = _draw(results, out)
     except ImportError as error:
@@ -115,28 +112,28 @@ def figures_of(results: Sequence[Result], out: Path, curves: Path | None) -> tup
         if path.parent.resolve() != out.resolve():
             shutil.copyfile(path, out / path.name)
     if drawn := sorted(out.glob("accuracy-time-*.png")):
-        lines = ["runs of their own, with views set aside: forewarp-report kind=accuracy_time"]
+        lines = ["separate runs, with views held out: forewarp-report kind=accuracy_time"]
         sections.append(Section("Accuracy against training time", facts=lines, pictures=drawn))
     return sections, [path for _, path, _ in found]
 
 
 def _draw(results: Sequence[Result], out: Path) -> list[tuple[str, Path | None, list[Result]]]:
-    sides = [run for run in results if run.variant.startswith("voxels_")]
-    found = [("Resolution", pictures.draw_resolution(out / "paper-resolution.png", sides), sides)]
+    sides = [run for run in results if paper_figures.RESOLUTION.match(run.variant)]
+    found = [("Resolution", paper_figures.draw_resolution(out / "paper-resolution.png", sides), sides)]
     plain = [run for run in results if row_of(run).variant == "plain"]
     for scene, both in _pairs(plain).items():
-        path = pictures.draw_canonical(out / f"paper-canonical-{scene}.png", *both)
+        path = paper_figures.draw_canonical(out / f"paper-canonical-{scene}.png", *both)
         found.append((f"Canonical comparison: {scene}", path, both))
     for dataset in DATASETS:
         runs = [r for r in plain if r.dataset == dataset and r.config["model"]["name"] == "forward"]
         runs = list({run.scene: run for run in runs}.values())
-        path = pictures.draw_sheet(out / f"paper-views-{dataset}.png", runs)
+        path = paper_figures.draw_sheet(out / f"paper-views-{dataset}.png", runs)
         found.append((f"Views: {dataset}", path, runs))
     return found
 
 
 def _pairs(runs: Sequence[Result]) -> dict[str, list[Result]]:
-    """Scene -> a forward and a backward run of it, equal in preset, budget and seed."""
+    """Return for each scene a forward and a backward run, equal in preset, budget and seed."""
     equal: dict[tuple, dict[str, Result]] = {}
     for run in runs:
         row = row_of(run)
@@ -153,7 +150,7 @@ def _write_csv(sections: Sequence[Section], out: Path) -> list[Path]:
         name += "-counterpart" * (title != section.title)
         files.append(out / f"paper-{'-'.join(part for part in name.split('-') if part)}.csv")
         about = "".join(f"# {line}\n" for line in section.facts)
-        files[-1].write_text(replace(section.tables[0], marks={}).csv() + about)
+        replace_file(files[-1], replace(section.tables[0], marks={}).csv() + about)
     return files
 
 

@@ -1,15 +1,16 @@
-"""The price list: what each choice changes, against the same run without it."""
+"""Write the price list: what each choice changes, compared with the same run without the choice."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
 
+from forewarp.files import replace_file
 from forewarp.report.collect import Result, by_scene, collect, grouped, left_out, machine
-from forewarp.report.effect import DIFFERENCES, measure_effect
+from forewarp.report.gain import DIFFERENCES, measure_effect
 from forewarp.report.tables import Column, Estimate, Table
 
-# Of a run's numbers: the title and the digits.
+# The columns of a run's numbers.
 MEASURES = {
     "psnr": Column("PSNR (dB)"),
     "ssim": Column("SSIM", 4),
@@ -34,14 +35,13 @@ def write_price_list(runs: Path, out: Path) -> list[Path]:
     """Write ``price-list.md`` and ``price-list.csv`` (every run's own numbers).
 
     Args:
-        runs: folder of measured runs.
-        out: folder that they are written into.
+        runs: folder to search for measured runs.
+        out: folder to write to.
 
     Returns:
-        the files.
+        the files written.
     """
     results, without = collect(runs, ["metrics.json"])
-    out.mkdir(parents=True, exist_ok=True)
     parts = [INTRODUCTION, f"Machine: {machine(results)}.\n"]
     for scene, found in by_scene(results).items():
         for minutes in sorted({result.minutes for result in found}, key=lambda value: value or 0):
@@ -50,37 +50,39 @@ def write_price_list(runs: Path, out: Path) -> list[Path]:
             parts += [f"## {scene}, {bound}\n", references(equal).markdown(), changes(equal).markdown()]
     parts += left_out("Without numbers", without)
     page, file = out / "price-list.md", out / "price-list.csv"
-    page.write_text("\n".join(parts))
-    file.write_text(every_run(results).csv())
+    replace_file(page, "\n".join(parts))
+    replace_file(file, every_run(results).csv())
     return [page, file]
 
 
 def references(results: Sequence[Result]) -> Table:
-    """What the runs that others are compared with reach themselves."""
-    names = {result.against for result in results}
+    """List the numbers of the reference runs."""
+    variants = {result.variant for result in results}
+    names = {result.against(variants) for result in results}
     rows = []
     for (variant, _), group in grouped(results).items():
         if variant in names:
             values = [Estimate.of(_known(group, measure)) for measure in MEASURES]
-            rows.append([variant, group[0].about, len(group), *values])
-    columns = [Column("compared with"), Column("what"), Column("seeds", 0)]
+            rows.append([variant, len(group), *values])
+    columns = [Column("compared with"), Column("seeds", 0)]
     kind = {"all": "all test views", "time": "test views between the training times"}
     views = ", ".join(sorted({kind[result.ability] for result in results}))
     return Table([*columns, *MEASURES.values()], rows, f"Of {views}:")
 
 
 def changes(results: Sequence[Result]) -> Table:
-    """What every other variant changes."""
+    """List the changes of every other variant against its reference."""
     own = {(result.variant, result.seed): result for result in results}
-    rows = []
+    variants, rows = sorted({result.variant for result in results}), []
     for (variant, _), group in grouped(results).items():
-        if variant == group[0].against:
+        against = group[0].against(variants)
+        if variant == against:
             continue
-        pairs = [(result, own.get((result.against, result.seed))) for result in group]
+        pairs = [(result, own.get((against, result.seed))) for result in group]
         numbers = [(result.numbers, before.numbers) for result, before in pairs if before is not None]
         values = [measure_effect(numbers, measure) for measure in MEASURES]
-        rows.append([variant, group[0].about, group[0].against, len(numbers), *values])
-    columns = [Column("variant"), Column("what"), Column("against"), Column("seeds", 0)]
+        rows.append([variant, against, len(numbers), *values])
+    columns = [Column("variant"), Column("against"), Column("seeds", 0)]
     for measure, column in MEASURES.items():
         signed = Column(column.name, column.digits, signed=True)
         columns.append(signed if measure in DIFFERENCES else Column(column.name, prefix="×"))
@@ -88,7 +90,7 @@ def changes(results: Sequence[Result]) -> Table:
 
 
 def every_run(results: Sequence[Result]) -> Table:
-    """A row a run, nothing summed up."""
+    """List the numbers of every run."""
     rows = []
     for result in results:
         numbers = result.numbers

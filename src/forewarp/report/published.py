@@ -1,4 +1,4 @@
-"""What the paper prints, kept as data."""
+"""Read the paper's printed tables from YAML."""
 
 from __future__ import annotations
 
@@ -8,13 +8,16 @@ from statistics import fmean
 
 import yaml
 
+from forewarp.files import MOST_CONFIG, read_text
+
 PAPER = Path(__file__).with_name("paper.yaml")
 
 
 @dataclass(frozen=True)
 class Group:
-    """What a few columns are the mean of: scenes of a dataset, and one kind of test view (None: all, or,
-    where a scene tells them apart, those between the training times).
+    """Columns that are a mean over ``scenes`` of a dataset.
+
+    ``ability`` is the kind of test view; None: all, or ``time`` if a scene has several kinds.
     """
 
     name: str
@@ -26,8 +29,9 @@ class Group:
 
 @dataclass(frozen=True)
 class Row:
-    """A printed row: its numbers as they were written, "" where none was; ``variant``: what measured rows are
-    compared with it, None for others' methods.
+    """A printed row, numbers as text, "" for a missing number.
+
+    ``variant`` names the measured runs to compare with the row; None for methods of others.
     """
 
     name: str
@@ -37,8 +41,9 @@ class Row:
 
 @dataclass(frozen=True)
 class PaperTable:
-    """One of the paper's tables; ``variants`` are those whose measured rows belong into it, ``means`` more
-    groups to be calculated: name -> scenes.
+    """One of the paper's tables.
+
+    ``variants``: the measured variants to show; ``means``: more groups to compute, as name and scenes.
     """
 
     key: str
@@ -52,13 +57,11 @@ class PaperTable:
 
     @property
     def columns(self) -> list[tuple[Group, str]]:
-        """Group and metric of every column."""
+        """The group and metric of every column."""
         return [(group, metric) for group in self.groups for metric in group.metrics]
 
     def with_mean(self, name: str, scenes: tuple[str, ...]) -> PaperTable:
-        """The table with one more group, the mean of some that hold one scene each; printed rows get theirs
-        with the digits that their scenes have.
-        """
+        """Add a group: the mean of groups of one scene each; printed rows keep their digits."""
         found = [group for group in self.groups if len(group.scenes) == 1 and group.scenes[0] in scenes]
         metrics = found[0].metrics
         more = Group(name, found[0].dataset, metrics, tuple(scenes))
@@ -71,14 +74,14 @@ class PaperTable:
 
 
 def read_paper(path: Path) -> dict[str, PaperTable]:
-    """The paper's tables from a YAML file as ``PAPER``, by key.
+    """Read tables by key from a YAML file such as ``PAPER``.
 
     Raises:
-        ValueError: what lacks a key, or a row of another length than its table.
+        ValueError: if the file is no YAML or lacks a key, or a row has another length than its table.
     """
-    # Without types: 30.50 is to stay what was printed.
+    # Read all values as text, so that 30.50 stays as printed.
     try:
-        content = yaml.load(Path(path).read_text(), Loader=yaml.BaseLoader)
+        content = yaml.load(read_text(Path(path), MOST_CONFIG), Loader=yaml.BaseLoader)
         return {key: _table(key, entry, content["datasets"]) for key, entry in content["tables"].items()}
     except yaml.YAMLError as error:
         raise ValueError(f"{path}: expected YAML, but got {str(error).splitlines()[0]}") from None

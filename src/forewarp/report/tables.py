@@ -1,4 +1,4 @@
-"""Tables of numbers with their spread, as Markdown and CSV."""
+"""Tables of numbers with their spread over repetitions, as Markdown, plain text and CSV."""
 
 from __future__ import annotations
 
@@ -8,17 +8,19 @@ import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
+from tabulate import tabulate
+
 
 @dataclass(frozen=True)
 class Estimate:
-    """A mean over repetitions with the sample's standard deviation, None of a single one."""
+    """A mean over repetitions, and the sample's standard deviation; None for a single repetition."""
 
     mean: float
     deviation: float | None = None
 
     @classmethod
     def of(cls, values: Sequence[float]) -> Estimate | None:
-        """The estimate from values; None where there are none.
+        """Estimate from values; None if there are none.
 
         >>> Estimate.of([1.0, 3.0])
         Estimate(mean=2.0, deviation=1.4142135623730951)
@@ -29,16 +31,16 @@ class Estimate:
 
 
 class Difference(float):
-    """A number that is written with its sign."""
+    """A number, written with its sign."""
 
 
 Cell = Estimate | float | int | str | None
-MARKS = {"best": "**{}**", "second": "<u>{}</u>"}  # of Markdown
+MARKS = {"best": "**{}**", "second": "<u>{}</u>"}  # in Markdown
 
 
 @dataclass(frozen=True)
 class Column:
-    """A column: its title and how its numbers are written. ``prefix`` stands before each of them."""
+    """A column's title and number format; ``prefix`` stands before each number."""
 
     name: str
     digits: int = 2
@@ -46,7 +48,7 @@ class Column:
     prefix: str = ""
 
     def text(self, value: Cell) -> str:
-        """A cell as one reads it; empty where there is nothing.
+        """Format a cell; None is empty.
 
         >>> Column("PSNR", signed=True).text(Estimate(0.5, 0.1))
         '+0.50 ± 0.10'
@@ -54,18 +56,22 @@ class Column:
         if value is None or isinstance(value, str):
             return value or ""
         if isinstance(value, Estimate):
-            spread = "" if value.deviation is None else f" ± {value.deviation:.{self.digits}f}"
-            return self.text(value.mean) + spread
+            deviation = "" if value.deviation is None else f" ± {value.deviation:.{self.digits}f}"
+            return self.text(value.mean) + deviation
         sign = "+" if self.signed or isinstance(value, Difference) else ""
         return f"{self.prefix}{value:{sign}.{self.digits}f}"
 
 
 @dataclass(frozen=True)
 class Table:
-    """Columns and rows of as many cells; ``caption`` says what they are.
+    """A table with a caption.
 
-    ``marks``: (row, column) -> ``best`` or ``second``. ``rules``: rows that a line stands above, where there
-    are lines. A number that others printed is a string, as they wrote it.
+    Attributes:
+        columns: the columns, from left to right.
+        rows: rows of cells, one per column; a published number is a string, as printed.
+        caption: text above the table.
+        marks: (row, column) -> ``best`` or ``second``.
+        rules: indices of rows with a line above, in LaTeX and HTML.
     """
 
     columns: Sequence[Column]
@@ -80,38 +86,44 @@ class Table:
                 raise ValueError(f"a table: expected rows of {len(self.columns)} cells, but got {row}")
 
     def markdown(self) -> str:
-        """For a page; numbers to the right."""
-        lines = [self.caption, ""] if self.caption else []
-        lines.append(_line(column.name for column in self.columns))
-        lines.append("|" + "|".join("---:" if right else "---" for right in self.numeric) + "|")
-        lines += [_line(row) for row in self.texts(MARKS)]
-        return "\n".join(lines) + "\n"
+        """Return the table for a Markdown page, numbers aligned to the right."""
+        escaped = [[cell.replace("|", "\\|") for cell in row] for row in self.texts(MARKS)]
+        return (f"{self.caption}\n\n" if self.caption else "") + self._tabulated(escaped, "pipe") + "\n"
+
+    def plain(self) -> str:
+        """Return the table for a terminal."""
+        return self._tabulated(self.texts({}), "simple")
+
+    def _tabulated(self, texts: list[list[str]], form: str) -> str:
+        names = [column.name for column in self.columns]
+        sides = ["right" if numeric else "left" for numeric in self.numeric]
+        return tabulate(texts, names, form, disable_numparse=True, colalign=sides if texts else None)
 
     @property
     def numeric(self) -> list[bool]:
-        """Which columns hold numbers, and nothing else."""
+        """Whether each column holds only numbers."""
         return [all(_is_number(row[i]) for row in self.rows) for i in range(len(self.columns))]
 
-    def texts(self, marks: Mapping[str, str], plain: Callable[[str], str] = str) -> list[list[str]]:
-        """The cells as one reads them.
+    def texts(self, marks: Mapping[str, str], escape: Callable[[str], str] = str) -> list[list[str]]:
+        """Format all cells.
 
         Args:
-            marks: the form of a marked cell by its mark, with ``{}`` for the text.
-            plain: what the text itself goes through first.
+            marks: mark -> format of a marked cell, with ``{}`` for the text.
+            escape: function applied to the text of each cell first.
         """
         return [
             [
-                marks.get(self.marks.get((i, j)), "{}").format(plain(self.columns[j].text(value)))
+                marks.get(self.marks.get((i, j)), "{}").format(escape(self.columns[j].text(value)))
                 for j, value in enumerate(row)
             ]
             for i, row in enumerate(self.rows)
         ]
 
     def csv(self) -> str:
-        """All digits; an estimate's standard deviation has a column of its own."""
+        """Return all digits as CSV; the standard deviation of an estimate has a column of its own."""
         spread = [any(isinstance(row[i], Estimate) for row in self.rows) for i in range(len(self.columns))]
         names = [[c.name, f"{c.name} sd"] if s else [c.name] for c, s in zip(self.columns, spread)]
-        rows = [[part for v, s in zip(row, spread) for part in _plain(v, s)] for row in self.rows]
+        rows = [[part for v, s in zip(row, spread) for part in _parts(v, s)] for row in self.rows]
         file = io.StringIO()
         csv.writer(file, lineterminator="\n").writerows([[name for pair in names for name in pair], *rows])
         return file.getvalue()
@@ -123,13 +135,7 @@ def _is_number(value: Cell) -> bool:
     return value.replace(".", "", 1).isdigit()
 
 
-def _line(cells) -> str:
-    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
-
-
-def _plain(value: Cell, spread: bool) -> list:
-    if not spread:
-        return ["" if value is None else value]
-    if not isinstance(value, Estimate):
-        return ["" if value is None else value, ""]
-    return [value.mean, "" if value.deviation is None else value.deviation]
+def _parts(value: Cell, spread: bool) -> list:
+    if isinstance(value, Estimate):
+        return [value.mean, "" if value.deviation is None else value.deviation]
+    return ["" if value is None else value, *([""] if spread else [])]

@@ -1,1 +1,1 @@
-"""The nouns: boxes, cameras, rays, frames, batches and what a method answers."""
+"""Data types: boxes, cameras, rays, frames, batches, views and renderings."""

@@ -1,4 +1,4 @@
-"""What a training step sees, and what an evaluation compares with."""
+"""Batches to train on and targets to compare with."""
 
 from __future__ import annotations
 
@@ -14,15 +14,18 @@ from forewarp.scene.view import Moment, View
 
 @dataclass(frozen=True)
 class Asks:
-    """What a method wants of the sampler: single ``pixels``, square ``crops`` of ``side`` pixels, or whole
-    ``pictures``; further observations of ``neighbours`` training times next to the picked one; and up to
-    ``instant`` whole training pictures of the picked time beside them.
+    """What a method asks for in a batch.
+
+    ``kind``: single ``pixels``, square ``crops`` of ``side`` pixels, or whole ``pictures``. ``neighbours``:
+    how many of the nearest other training times to observe too. ``instant``: up to how many whole training
+    pictures of the picked time to add. ``straight``: give pixels as stored, not composited.
     """
 
     kind: str = "pixels"
     side: int = 64
     neighbours: int = 0
     instant: int = 0
+    straight: bool = False
 
     def __post_init__(self) -> None:
         kinds = ("pixels", "crops", "pictures")
@@ -35,8 +38,9 @@ class Asks:
 
 @dataclass(frozen=True)
 class Observation:
-    """Pixels of one picture: ``rgb`` (R, 3) in [0, 1], the truth over ``background`` (3,) or (R, 3), which is
-    what a pixel shows where nothing is met.
+    """Pixels of one picture: the true ``rgb`` (R, 3) in [0, 1] over ``background`` (3,) or (R, 3), the colour
+    of rays that hit nothing. If the method asks for ``straight`` pixels, ``rgb`` is (R, 4) uint8: colour
+    and alpha as stored.
     """
 
     moment: Moment
@@ -45,17 +49,17 @@ class Observation:
     background: Tensor
 
     def to(self, device) -> Observation:
-        """Move the truth to another device; the view stays where cameras are."""
+        """Move the colours to another device; the view stays on the CPU."""
         return replace(self, rgb=self.rgb.to(device), background=self.background.to(device))
 
 
 @dataclass(frozen=True)
 class Batch:
-    """What one step is trained on, as the method asked for it.
+    """What one training step uses, as the method asked for it.
 
-    ``observations``: those of the picked frame's time first, of neighbouring times after them. ``frame``: the
-    index of the training frame that was picked. ``instant``: whole training pictures of that frame's time
-    over white, for methods that look at them to know the scene; empty where none were asked for.
+    ``observations``: first of the picked frame's time, then of neighbouring times. ``frame``: the index of
+    the picked training frame. ``instant``: whole training pictures of that time over white, for methods
+    that encode them; empty unless asked for.
     """
 
     observations: tuple[Observation, ...]
@@ -64,12 +68,12 @@ class Batch:
 
     @property
     def time(self) -> float:
-        """That of the picked frame."""
+        """The time of the picked frame."""
         return self.observations[0].moment.time
 
     def joined(self) -> tuple[Rays, Tensor, Tensor]:
-        """Put the rays of all observations after one another, on the CPU, with their true colours (R, 3) and
-        backgrounds: (R, 3), or (3,) of a single one. For methods that ask for one time.
+        """Concatenate the rays of all observations, on the CPU, with their true colours (R, 3) and
+        backgrounds (R, 3), or (3,) of a single observation. For methods that ask for one time.
         """
         rays = joined([one.view.rays() for one in self.observations])
         rgb = [one.rgb for one in self.observations]
@@ -83,7 +87,7 @@ class Batch:
         return sum(len(one.view) for one in self.observations)
 
     def to(self, device) -> Batch:
-        """Move all truth to another device."""
+        """Move all colours to another device."""
         moved = (tuple(one.to(device) for one in part) for part in (self.observations, self.instant))
         observations, instant = moved
         return Batch(observations, self.frame, instant)
@@ -91,9 +95,10 @@ class Batch:
 
 @dataclass(frozen=True)
 class Target:
-    """A whole image to compare with: ``rgb`` (H, W, 3) in [0, 1] over ``background`` (3,);
-    ``foreground`` (H, W) bool where the image tells it, ``depth`` (H, W) exact ray depth in world units
-    (0 on the background) where it is known, ``index`` that of a training frame.
+    """A whole image to compare with: ``rgb`` (H, W, 3) in [0, 1] over ``background`` (3,).
+
+    If known: ``foreground`` (H, W) bool, ``depth`` (H, W) exact ray depth in world units (0 on the
+    background), ``index`` among the training frames.
     """
 
     frame: Frame
@@ -105,16 +110,16 @@ class Target:
 
     @property
     def moment(self) -> Moment:
-        """When it was taken, and by which camera."""
+        """The time and the camera of the image."""
         return Moment(self.frame.time, self.index, self.frame.camera_id)
 
     @property
     def view(self) -> View:
-        """All of its pixels."""
+        """The view of all the image's pixels."""
         return View(self.frame.camera)
 
     def to(self, device) -> Target:
-        """The same target with its tensors on another device."""
+        """Move the tensors to another device."""
         foreground, depth = (None if t is None else t.to(device) for t in (self.foreground, self.depth))
         moved = self.rgb.to(device), self.background.to(device)
         return Target(self.frame, *moved, foreground, depth, self.index)

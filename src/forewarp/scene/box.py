@@ -1,4 +1,4 @@
-"""An axis-aligned box in world units, and the regular lattice of voxel centres inside one."""
+"""An axis-aligned box in world units, and the regular lattice of voxel centres in a box."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class Box:
     """An axis-aligned box: ``low`` and ``high`` are tuples of three floats in world units.
 
     Raises:
-        ValueError: where a side has no extent or a corner is not finite.
+        ValueError: if a side has no extent or a corner is not finite.
 
     >>> Box((-1, -1, -1), (1, 2, 1)).size
     (2.0, 3.0, 2.0)
@@ -45,22 +45,22 @@ class Box:
 
     @property
     def diagonal(self) -> float:
-        """Length of the diagonal: the scene's unit of length."""
+        """Length of the diagonal, world units."""
         return math.sqrt(sum(s * s for s in self.size))
 
     def scaled(self, factor: float) -> Box:
-        """The box grown about its centre."""
+        """Scale the box about its centre."""
         half = [0.5 * factor * s for s in self.size]
         return Box(
             tuple(c - h for c, h in zip(self.center, half)), tuple(c + h for c, h in zip(self.center, half))
         )
 
     def padded(self, by: float) -> Box:
-        """The box with ``by`` world units added on every side."""
+        """Add ``by`` world units on every side."""
         return Box(tuple(v - by for v in self.low), tuple(v + by for v in self.high))
 
     def intersection(self, other: Box) -> Box:
-        """The common part of two boxes."""
+        """Intersect two boxes."""
         return Box(
             tuple(max(a, b) for a, b in zip(self.low, other.low)),
             tuple(min(a, b) for a, b in zip(self.high, other.high)),
@@ -69,9 +69,9 @@ class Box:
 
 @dataclass(frozen=True)
 class Lattice:
-    """``shape`` points spread evenly over ``box``, the outermost on its faces (align-corners).
+    """``shape`` points on a regular grid over ``box``, the outermost on its faces (align-corners).
 
-    A point's *lattice coordinate* runs from 0 to ``n - 1`` per axis; every operator in ``ops`` speaks it.
+    A point's *lattice coordinate* runs from 0 to ``n - 1`` per axis; the operators in ``ops`` use it.
     """
 
     box: Box
@@ -86,7 +86,7 @@ class Lattice:
 
     @classmethod
     def of_count(cls, box: Box, count: float, least: int = 4) -> Lattice:
-        """The lattice of about ``count`` cubic voxels over a box, ``least`` on an axis too flat for them.
+        """Make a lattice of about ``count`` cubic voxels over a box; axes too flat get ``least`` voxels.
 
         >>> Lattice.of_count(Box((0, 0, 0), (1, 2, 1)), 2000).shape
         (10, 20, 10)
@@ -95,7 +95,7 @@ class Lattice:
         """
         flat: list[float] = []
         while len(flat) < 3:
-            # The flat axes come off first, or a planar scene has a thousand times the voxels asked for.
+            # Take flat axes off first, or a planar scene gets a thousand times as many voxels.
             free = sorted(box.size)[len(flat) :]
             side = (math.prod(free) / (float(count) / least ** len(flat))) ** (1 / len(free))
             if round(free[0] / side) >= least:
@@ -114,27 +114,27 @@ class Lattice:
         return tuple(s / (n - 1) for s, n in zip(self.box.size, self.shape))
 
     @property
-    def pitch(self) -> float:
-        """One number for the spacing: its geometric mean, world units."""
+    def voxel_size(self) -> float:
+        """Geometric mean of the spacing, world units."""
         return math.prod(self.spacing) ** (1 / 3)
 
     def to_lattice(self, points: Tensor) -> Tensor:
-        """World (..., 3) -> lattice coordinates (..., 3)."""
+        """Convert world (..., 3) to lattice coordinates (..., 3)."""
         low = points.new_tensor(self.box.low)
         return (points - low) / points.new_tensor(self.spacing)
 
     def to_world(self, coordinates: Tensor) -> Tensor:
-        """Lattice coordinates (..., 3) -> world (..., 3)."""
+        """Convert lattice coordinates (..., 3) to world (..., 3)."""
         dtype = coordinates.dtype if coordinates.is_floating_point() else torch.get_default_dtype()
         c = coordinates.to(dtype)
         return c * c.new_tensor(self.spacing) + c.new_tensor(self.box.low)
 
     def normalised(self, coordinates: Tensor) -> Tensor:
-        """Lattice coordinates (..., 3) -> [-1, 1] per axis, for positional encoding."""
+        """Scale lattice coordinates (..., 3) to [-1, 1] per axis, for positional encoding."""
         last = torch.tensor([n - 1 for n in self.shape], device=coordinates.device)
         return 2.0 * coordinates / last - 1.0  # divided last: keeps float64 exact
 
     def all_voxels(self, device: torch.device | str = "cpu") -> Tensor:
-        """Every voxel's integer coordinate (X*Y*Z, 3), last axis fastest."""
+        """List every voxel's integer coordinates (X*Y*Z, 3), last axis fastest."""
         axes = [torch.arange(n, device=device) for n in self.shape]
         return torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)

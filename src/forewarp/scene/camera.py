@@ -1,4 +1,4 @@
-"""A camera: a pinhole, perhaps behind a lens.
+"""A pinhole camera, optionally with a distorting lens.
 
 Axes are OpenCV's: x right, y down, z forward. Pixel centres lie at +0.5. Distances are along the unit ray.
 """
@@ -40,11 +40,11 @@ class Camera:
         return self.camera_to_world[:3, 3]
 
     def rays(self, pixels: Tensor | None = None, dtype: torch.dtype = torch.float32) -> Rays:
-        """Rays through pixel centres.
+        """Make rays through pixel centres.
 
         Args:
             pixels: flat indices (R,) into the row-major image, or None for all H*W.
-            dtype: of the result.
+            dtype: dtype of the result.
         """
         if pixels is None:
             pixels = torch.arange(self.width * self.height)
@@ -54,8 +54,8 @@ class Camera:
         return Rays(self.center.expand_as(directions).to(dtype), directions.to(dtype), self.near, self.far)
 
     def directions(self, u: Tensor, v: Tensor) -> Tensor:
-        """Unit world directions (..., 3) float64 through pixel coordinates ``u v`` (...,), the top-left
-        corner of the picture the origin; lens and skew are undone.
+        """Make unit world directions (..., 3) float64 through pixel coordinates ``u v`` (...,), measured from
+        the picture's top-left corner; lens and skew are undone.
         """
         y = (v.double() - self.cy) / self.fy
         x = (u.double() - self.cx - self.skew * y) / self.fx
@@ -65,14 +65,14 @@ class Camera:
         return torch.nn.functional.normalize(local @ self.camera_to_world[:3, :3].T, dim=-1)
 
     def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """World points (..., 3) -> pixel coordinates (..., 2), top-left corner the origin, and the
-        depth along the optical axis (...,); a point is visible only where that depth is positive.
+        """Project world points (..., 3): pixel coordinates (..., 2) from the top-left corner, and depth along
+        the optical axis (...,); a point is visible only if this depth is positive.
         """
         pose = self.camera_to_world.to(points)
         local = (points - pose[:3, 3]) @ pose[:3, :3]
         z = local[..., 2]
         scale, shift = points.new_tensor([self.fx, self.fy]), points.new_tensor([self.cx, self.cy])
-        # Beside the camera a point lies very far off in the picture; how far depends on no unit of length.
+        # A point beside the camera projects very far off; the bound is relative, so any unit of length works.
         least = torch.finfo(z.dtype).eps * local.detach().abs().amax(-1)
         safe = torch.where(z.abs() > least, z, torch.where(least > 0, least, 1.0))
         plane = local[..., :2] / safe[..., None]
@@ -83,7 +83,7 @@ class Camera:
         return pixel, z
 
     def resized(self, width: int, height: int) -> Camera:
-        """The same view at another image size."""
+        """Change the image size, keeping the view."""
         sx, sy = width / self.width, height / self.height
         return replace(
             self,
@@ -98,9 +98,9 @@ class Camera:
 
 
 def look_at(center: Tensor, target: Tensor, up: Tensor) -> Tensor:
-    """The pose (4, 4) of a camera at ``center`` that looks at ``target`` with ``up`` upwards in the picture.
+    """Make the pose (4, 4) of a camera at ``center`` that looks at ``target``, with ``up`` upwards.
 
-    All are (3,). Where the view runs along ``up`` any horizontal axis serves.
+    All are (3,). A camera that looks along ``up`` gets any horizontal axis.
     """
     forward = torch.nn.functional.normalize(target.double() - center.double(), dim=0)
     right = torch.linalg.cross(forward, up.double())

@@ -1,4 +1,4 @@
-"""Matter as points, and what one stage hands to the next."""
+"""Matter as points, and the handover from one stage to the next."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from forewarp.scene.box import Box
 @dataclass(frozen=True)
 class Cloud:
     """Points of the canonical matter: ``points`` (N, 3) world units, ``colors`` (N, 3) in [0, 1], ``opacity``
-    (N,) in [0, 1] of a point's own place, which is about ``size`` across, world units.
+    (N,) in [0, 1] of a cell about ``size`` world units across.
     """
 
     points: Tensor
@@ -30,16 +30,16 @@ class Cloud:
 
 @dataclass(frozen=True)
 class Handover:
-    """What a fitted stage leaves to the next, whatever method that is.
+    """What a fitted stage passes on to the next stage, whatever their methods.
 
     Attributes:
         box: bounds of all matter at all training times, world units.
-        tight: False where the stage found nothing and its own box was kept.
-        frames_in_play: at its end.
-        cloud: a sample of the canonical matter; None where the method cannot tell.
-        times: (T,) some training times, and ``paths`` (N, T, 3), where the cloud's points are at these; None
-            where the method has no trajectories.
-        notes: numbers that only stages of the same method understand.
+        tight: False if the stage found no matter and kept its own box.
+        frames_in_play: training frames in use at the end of the stage.
+        cloud: a sample of the canonical matter; None if the method has no ``matter``.
+        times: (T,) some training times, and ``paths`` (N, T, 3), the cloud's points at these; None if the
+            method has no trajectories.
+        notes: numbers for stages of the same method.
     """
 
     box: Box

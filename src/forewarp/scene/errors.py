@@ -1,4 +1,4 @@
-"""The one exception that is the user's business."""
+"""The exception for mistakes in the user's input."""
 
 from __future__ import annotations
 

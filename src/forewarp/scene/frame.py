@@ -1,4 +1,4 @@
-"""A frame and the scene it belongs to."""
+"""Frames, and the scene they belong to."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ class Frame:
     """One image with its camera and time.
 
     ``load()`` gives the image as a uint8 tensor (H, W, 4), straight (not premultiplied) alpha, at the
-    camera's size; without an alpha channel on disk it is 255 everywhere. ``load_depth()``, where not None,
+    camera's size; without an alpha channel on disk alpha is 255. ``load_depth()``, if not None,
     gives exact ray depth (H, W) float32 in world units, 0 on the background. ``ability`` is what a test
-    frame measures: ``space``, ``time``, ``canonical``, or ``all`` where a dataset does not say.
-    ``camera_id`` numbers the physical cameras from 0, where a dataset tells them apart.
+    frame measures: ``space``, ``time``, ``canonical``, or ``all`` if the dataset does not say.
+    ``camera_id`` numbers the physical cameras from 0, if the dataset tells them apart.
     """
 
     name: str
@@ -46,10 +46,9 @@ class Truth:
 class Scene:
     """All frames of one subject, read once.
 
-    ``box`` bounds everything that may be seen; ``canonical_time`` in [0, 1]; ``has_alpha`` says that the
-    images tell foreground from background; ``protocol`` names how the numbers are to be measured; ``still``
-    (N, 3) float32 are points that never move, world units, where a dataset knows such;
-    ``held`` are training frames set aside, never trained on.
+    ``box`` bounds everything visible; ``canonical_time`` in [0, 1]; ``has_alpha``: the images separate
+    foreground from background; ``protocol`` says how numbers are measured; ``still`` (N, 3) float32: points
+    that never move, world units, if known; ``held``: held-out frames, never trained on.
     """
 
     name: str
@@ -71,7 +70,7 @@ class Scene:
 
 
 def spread(count: int, wanted: int) -> list[int]:
-    """``wanted`` of ``count`` numbers, or all of fewer, evenly, the first and the last among them.
+    """Choose ``wanted`` evenly spaced indices below ``count``, first and last included; all if too few.
 
     >>> spread(10, 4), spread(2, 4)
     ([0, 3, 6, 9], [0, 1])

@@ -1,4 +1,4 @@
-"""The visual hull: which points all silhouettes allow."""
+"""The visual hull: the points that lie inside all silhouettes."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from forewarp.scene.camera import Camera
 
 
 def visual_hull(points: Tensor, cameras: list[Camera], masks: list[Tensor], misses: int = 0) -> Tensor:
-    """Points that project onto the silhouette in all views but ``misses`` of those that see them.
+    """Select points inside the silhouette in all but ``misses`` of the views that see them.
 
     Args:
         points: (N, 3) world units.
-        cameras: V of them.
-        masks: V masks (H, W) bool, True on the foreground (grow them first where the scene moves).
-        misses: views that may disagree.
+        cameras: V cameras.
+        masks: V masks (H, W) bool, True on the foreground; dilate them if the scene moves.
+        misses: number of views that may disagree.
 
     Returns:
         (N,) bool. A point that fewer than half of the views see is outside.

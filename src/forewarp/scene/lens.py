@@ -1,4 +1,4 @@
-"""How a lens bends the picture."""
+"""Lens distortion."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor
 
 from forewarp.ops.lens import distort, undistort, unfolded
 
-# Of the plane at distance 1: outside every picture, and in pixels still a whole number of 64 bits.
+# In the plane at distance 1: outside every picture, but small enough for 64-bit integers in pixels.
 _OUTSIDE, _ON_AXIS = 1e9, 1e-9
 
 
@@ -18,10 +18,10 @@ _OUTSIDE, _ON_AXIS = 1e9, 1e-9
 class Lens:
     """Radial distortion ``k`` (k1, k2, k3) and tangential distortion ``p`` (p1, p2), as in ``ops.lens``.
 
-    They know no pixels: the same numbers hold at every image size.
+    Independent of the image size.
 
     Raises:
-        ValueError: for other counts or numbers that are not finite.
+        ValueError: for other numbers of coefficients, or coefficients that are not finite.
     """
 
     k: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -35,12 +35,12 @@ class Lens:
             object.__setattr__(self, name, values)
 
     def bend(self, points: Tensor) -> Tensor:
-        """Where points (..., 2) of the plane at distance 1 appear, the dtype of ``points``.
+        """Distort points (..., 2) of the plane at distance 1; keeps the dtype.
 
-        A point that lies beyond the lens's fold appears nowhere, though the polynomial would carry it back
-        into the picture. It is put far outside, in its own direction, and so is what appears farther off.
+        Beyond the lens's fold points are invisible, though the polynomial would map them back into the
+        picture; such points, and points mapped still farther, are put far outside in their own direction.
         """
-        # Float64, as points beside the camera lie so far off that their sixth power needs its range.
+        # Float64, as the sixth power of points beside the camera exceeds the range of float32.
         plane = points.double()
         bent = distort(plane, self.k, self.p)
         seen = unfolded(plane, self.k, self.p) & (bent.detach().norm(dim=-1) < _OUTSIDE)
@@ -48,5 +48,5 @@ class Lens:
         return torch.where(seen[..., None], bent, away).to(points.dtype)
 
     def straighten(self, points: Tensor) -> Tensor:
-        """The inverse of ``bend`` (..., 2), float64: of what a picture can show."""
+        """Invert ``bend`` for points (..., 2) inside a picture, float64."""
         return undistort(points, self.k, self.p)

@@ -1,4 +1,4 @@
-"""Poses that no image was taken from: random views for regularisation, paths for videos."""
+"""New camera poses: random views for regularisation, paths for videos."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from forewarp.scene.rays import Rays
 
 
 def focus_point(cameras: list[Camera]) -> Tensor:
-    """The point nearest to all optical axes, least squares (3,), float64.
+    """Find the point nearest to all optical axes, least squares (3,), float64.
 
-    A single axis, or parallel ones, leave it undetermined along them: it lies midway between near and far.
+    For a single axis, or parallel ones, take the point midway between near and far.
     """
     centers = torch.stack([c.center.double() for c in cameras])
     axes = torch.stack([c.camera_to_world[:3, 2].double() for c in cameras])
@@ -27,13 +27,13 @@ def focus_point(cameras: list[Camera]) -> Tensor:
 
 
 def mean_up(cameras: list[Camera]) -> Tensor:
-    """The mean upward direction of the pictures (3,), float64, unit length; z where they cancel."""
+    """Average the upward directions of the pictures (3,), float64, unit length; z if they cancel."""
     up = -torch.stack([c.camera_to_world[:3, 1].double() for c in cameras]).mean(0)
     return up / up.norm() if up.norm() > 0.1 else torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 
 
 def _moved(camera: Camera, center: Tensor, focus: Tensor, up: Tensor) -> Camera:
-    """The lens at ``center`` looking at ``focus``; as it stands where the two coincide: no way to look."""
+    """Move a camera to ``center``, facing ``focus``; keep the camera if the two coincide."""
     if float((center - focus).norm()) < 1e-6 * camera.far:
         return camera
     return replace(camera, camera_to_world=look_at(center, focus, up))
@@ -42,12 +42,12 @@ def _moved(camera: Camera, center: Tensor, focus: Tensor, up: Tensor) -> Camera:
 class RandomPatches:
     """Rays of small patches seen from random poses on the training cameras' sphere (RegNeRF).
 
-    A pose lies between two random training cameras, at their distance from the focus point, and looks at it.
+    A pose lies between two random training cameras, at their distance from the focus, and faces the focus.
 
     Args:
         cameras: the training cameras.
-        patches: patches a draw.
-        size: pixels a side, at most those of the smallest image.
+        patches: patches per draw.
+        size: pixels per side, at most those of the smallest image.
     """
 
     def __init__(self, cameras: list[Camera], *, patches: int = 16, size: int = 8) -> None:
@@ -56,7 +56,7 @@ class RandomPatches:
         self.focus, self.up = focus_point(cameras), mean_up(cameras)
 
     def draw(self, generator: torch.Generator) -> Rays:
-        """Rays (patches * size * size), patch by patch, all from one pose."""
+        """Draw rays (patches * size * size), patch by patch, all from one pose."""
         i, j = torch.randint(len(self.cameras), (2,), generator=generator).tolist()
         share = torch.rand((), generator=generator, dtype=torch.float64)
         a, b = (self.cameras[k].center.double() - self.focus for k in (i, j))
@@ -73,12 +73,12 @@ class RandomPatches:
 
 
 def orbit(camera: Camera, focus: Tensor, up: Tensor, turns: Tensor) -> list[Camera]:
-    """Cameras that circle ``focus`` about ``up`` at ``camera``'s height and distance.
+    """Make cameras that circle ``focus`` about ``up`` at the height and distance of ``camera``.
 
-    One that stands on the focus has nothing to circle and keeps its pose.
+    A camera at the focus keeps its pose.
 
     Args:
-        camera: gives the start and the lens.
+        camera: gives the first pose and the lens.
         focus, up: (3,).
         turns: (N,) fractions of a full turn from the start.
     """

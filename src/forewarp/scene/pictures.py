@@ -1,4 +1,4 @@
-"""What a scene's pictures say before anything is fitted to them."""
+"""Measure properties of a scene's pictures before fitting."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ _VIEWS, _SIDE = 40, 40
 
 @dataclass(frozen=True)
 class Pictures:
-    """What the pictures say before anything is fitted.
+    """Properties of the training pictures.
 
-    ``times`` distinct ones of ``frames``; ``cut_out``: share of transparent pixels, 0 where there is no alpha
-    or it says nothing; ``spread``: degrees between the two cameras that see the scene's middle from the most
-    different sides; ``disagreement``: share of the foreground that no still thing can explain, as no point
-    projects there that all silhouettes allow (0 without alpha).
+    ``times``: distinct times of the ``frames``. ``cut_out``: share of transparent pixels, 0 without alpha.
+    ``spread``: largest angle between two cameras, seen from the scene's middle, degrees. ``disagreement``:
+    share of the foreground that no static object can explain, as no point of the visual hull projects there
+    (0 without alpha).
     """
 
     frames: int
@@ -35,7 +35,7 @@ class Pictures:
 
 
 def survey(scene: Scene) -> Pictures:
-    """Evidence from training frames alone. Cost: ``_VIEWS`` images, ``_SIDE``^3 points in each."""
+    """Measure the training frames. Cost: ``_VIEWS`` images, ``_SIDE``^3 points in each."""
     frames = [scene.train[i] for i in spread(len(scene.train), _VIEWS)]
     cut_out = 0.0
     if scene.has_alpha:
@@ -56,7 +56,7 @@ def _disagreement(scene: Scene, frames: Sequence[Frame]) -> float:
     points, masks, reach = lattice.to_world(lattice.all_voxels()), [], []
     for frame in frames:
         depth = float(frame.camera.project(points.mean(0, keepdim=True))[1])
-        reach.append(max(1, math.ceil(lattice.pitch * frame.camera.fx / max(depth, 1e-6))))
+        reach.append(max(1, math.ceil(lattice.voxel_size * frame.camera.fx / max(depth, 1e-6))))
         masks.append(dilate(frame.load()[..., 3] > 127, reach[-1]))
     points = points[visual_hull(points, [frame.camera for frame in frames], masks)]
     missed = total = 0

@@ -1,4 +1,4 @@
-"""Rays."""
+"""Rays with near and far distances."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import Tensor
 @dataclass(frozen=True)
 class Rays:
     """R rays: ``origins`` (R, 3) and unit ``directions`` (R, 3) in world units; ``near`` and ``far``
-    are distances along the unit direction that hold for all of them.
+    are distances along the unit direction, shared by all.
     """
 
     origins: Tensor
@@ -27,12 +27,12 @@ class Rays:
         return Rays(self.origins[rows], self.directions[rows], self.near, self.far)
 
     def to(self, device) -> Rays:
-        """The same rays on another device."""
+        """Move the rays to another device."""
         return Rays(self.origins.to(device), self.directions.to(device), self.near, self.far)
 
 
 def joined(parts: Sequence[Rays]) -> Rays:
-    """Put all rays after one another, with the range that holds for all of them."""
+    """Concatenate rays; take the least near and the greatest far."""
     if len(parts) == 1:
         return parts[0]
     origins, directions = (torch.cat([getattr(p, name) for p in parts]) for name in ("origins", "directions"))

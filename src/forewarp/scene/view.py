@@ -1,4 +1,4 @@
-"""From when and from where a scene is seen, and the picture of it."""
+"""A moment, a view (camera and pixels), and a rendering."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from forewarp.scene.rays import Rays
 
 @dataclass(frozen=True)
 class Moment:
-    """A ``time`` in [0, 1] and, where they are known, the index of the training ``frame`` and the id of the
-    physical ``camera`` that took it.
+    """A ``time`` in [0, 1] and, if known, the index of the training ``frame`` and the id of the physical
+    ``camera`` that took it.
     """
 
     time: float
@@ -25,8 +25,8 @@ class Moment:
 
 @dataclass(frozen=True)
 class View:
-    """A camera and which of its pixels are looked at: flat row-major indices ``pixels`` (R,); or a ``crop``
-    (top, left, height, width); or, with neither, all of them.
+    """A camera and some of its pixels: flat row-major indices ``pixels`` (R,), or a ``crop`` (top, left,
+    height, width), or, with neither, all of them.
     """
 
     camera: Camera
@@ -51,14 +51,14 @@ class View:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Of the picture: (R,) of single pixels, else (height, width)."""
+        """Shape of the picture: (R,) of single pixels, else (height, width)."""
         if self.pixels is not None:
             return (len(self.pixels),)
         return (self.camera.height, self.camera.width) if self.crop is None else self.crop[2:]
 
     @cached_property
     def indices(self) -> Tensor | None:
-        """Flat indices (R,) of the pixels into the whole picture; None where they are all of it."""
+        """Flat indices (R,) of the pixels in the whole picture; None for all pixels."""
         if self.crop is None:
             return self.pixels
         top, left, height, width = self.crop
@@ -66,7 +66,7 @@ class View:
         return (rows + torch.arange(left, left + width)).flatten()
 
     def rays(self) -> Rays:
-        """The rays (R) through the centres of the pixels, on the CPU; made once."""
+        """Return the rays (R) through the pixels' centres, on the CPU; computed once."""
         return self._rays
 
     @cached_property
@@ -76,8 +76,8 @@ class View:
 
 @dataclass(frozen=True)
 class Rendering:
-    """What a view shows, a row a pixel: ``rgb`` (R, 3) over the background; ``depth`` (R,), the mean distance
-    along the ray in world units, 0 where nothing is met; ``opacity`` (R,) in [0, 1].
+    """A rendered view, one row per pixel: ``rgb`` (R, 3) over the background; ``depth`` (R,), the mean
+    distance along the ray in world units, 0 if the ray hits nothing; ``opacity`` (R,) in [0, 1].
     """
 
     rgb: Tensor

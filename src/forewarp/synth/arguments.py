@@ -1,4 +1,4 @@
-"""Arguments of the generators, checked: one line that names the key."""
+"""Check the arguments of the generators; an error is one line naming the key."""
 
 from __future__ import annotations
 
@@ -11,26 +11,26 @@ from forewarp.synth.specimens import SPECIMENS
 
 
 def check_numbers(**numbers: tuple[int, int]) -> None:
-    """Refuse what is no whole number or too small; ``numbers`` are (value, least) by name."""
+    """Check whole numbers against their least value; ``numbers`` are (value, least) by name."""
     for name, (value, least) in numbers.items():
         whole(value, name, least)
 
 
 def check_workers(workers: int | None) -> None:
-    """Refuse a number of processes that is neither None nor a whole number of at least 1."""
+    """Check a number of processes: None or at least 1."""
     if workers is not None:
         whole(workers, "workers", 1)
 
 
 def check_motion(motion: str, name: str = "motion", *, specimens: bool = False) -> None:
-    """Refuse a motion that ``motions.MOTIONS`` does not have, nor, where they will do, ``SPECIMENS``."""
+    """Check that a motion is one of ``motions.MOTIONS`` or, if allowed, of ``SPECIMENS``."""
     known = [*MOTIONS, *(SPECIMENS if specimens else ())]
     if not isinstance(motion, str) or motion not in known:
         raise SceneError(f"{name}: expected one of {', '.join(known)}, but got {motion!r}; set {name}")
 
 
 def check_counts(name: str, counts: Sequence[int], meaning: str) -> None:
-    """Refuse what is not three whole numbers, some of them above 0; ``meaning`` says what they count."""
+    """Check three counts, not all of them 0; ``meaning`` says what they count."""
     try:
         good = [whole(n, name, 0) for n in counts]
     except TypeError:

@@ -1,4 +1,4 @@
-"""Cameras on the sphere that D-NeRF's scenes are seen from, and streams of random numbers."""
+"""Cameras on a sphere around the scene, as in D-NeRF, and streams of random numbers."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ import torch
 from forewarp.scene.camera import Camera, look_at
 
 CAMERA_RADIUS, CAMERA_ANGLE_X = 4.0311, 0.6911112
-# Sine of the elevation: neither along the slab nor straight from above.
+# Least and greatest sine of the elevation: neither along the slab nor straight from above.
 ELEVATION = (0.06, 0.96)
 
 
 def orbit_camera(azimuth: float, sine: float, size: int) -> Camera:
-    """A square camera on the sphere that looks at the origin, z upwards.
+    """Place a square camera on the sphere, looking at the origin, z upwards.
 
     Args:
         azimuth: radians from x towards y.
-        sine: of the elevation above the ground.
-        size: pixels.
+        sine: sine of the elevation above the ground.
+        size: width and height in pixels.
     """
     level = math.sqrt(1 - sine * sine)
     center = CAMERA_RADIUS * torch.tensor(
@@ -38,11 +38,11 @@ def random_cameras(
     azimuth: tuple[float, float] = (0.0, 360.0),
     rise: tuple[float, float] = ELEVATION,
 ) -> list[Camera]:
-    """Cameras spread evenly by area over the upper half of the sphere, or a part of it.
+    """Draw cameras uniformly by area on the upper half of the sphere, or a part of it.
 
     Args:
-        azimuth: degrees, from and to.
-        rise: sine of the elevation, from and to.
+        azimuth: least and greatest azimuth, degrees.
+        rise: least and greatest sine of the elevation.
     """
     azimuth = rng.uniform(*np.radians(azimuth), count)
     sine = rng.uniform(*rise, count)
@@ -50,10 +50,10 @@ def random_cameras(
 
 
 def centers_of(cameras: list[Camera]) -> np.ndarray:
-    """Their centres (C, 3) float64, world units."""
+    """Stack the cameras' centres (C, 3) float64, world units."""
     return np.stack([np.asarray(camera.center) for camera in cameras])
 
 
 def stream(seed: int, *number: int) -> np.random.Generator:
-    """A stream of random numbers for one purpose, so that a count changed in one moves no other."""
+    """Start a random stream for one purpose; drawing from one stream leaves the others unchanged."""
     return np.random.default_rng([seed, *number])

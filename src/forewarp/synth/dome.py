@@ -14,7 +14,7 @@ from forewarp.data.nhr import DomeFrame, write_scene
 from forewarp.scene.camera import Camera, look_at
 from forewarp.synth.arguments import check_motion, check_numbers, check_workers
 from forewarp.synth.cameras import centers_of, stream
-from forewarp.synth.film import Exposure, Film, View
+from forewarp.synth.film import Exposure, Film, ImageSpec
 from forewarp.synth.points import surface_points, trajectories
 from forewarp.synth.raycast import Hits, Posed, light_points
 from forewarp.synth.scenes import writing_to
@@ -23,8 +23,8 @@ from forewarp.synth.world import World
 POINTS = 4000
 CAMERAS, RADIUS, HEIGHTS = 20, 3.7, (0.55, 1.6)
 TARGET = (0.0, 0.0, -0.05)
-VIEW_ANGLE = 36.0  # vertical, degrees: all that may be seen fits, with some room
-STUDIO = (0.38, 0.50, 0.42)  # the cloth behind; what is cut out shows a trace of it at its rim
+VIEW_ANGLE = 36.0  # vertical field of view, degrees: the whole scene fits, with a margin
+STUDIO = (0.38, 0.50, 0.42)  # colour of the backdrop; a trace of it shows at the rim of cut-outs
 _LENSES, _POINTS, _CLOUDS = 0, 1, 2
 _CLOUD_LIGHTS = 24
 
@@ -43,18 +43,18 @@ def synthesize(
 ) -> Path:
     """Write a dome's recording into ``folder`` and return that folder.
 
-    20 cameras stand on a cylinder, by turns low and high and, four by four, with two image sizes: ``size``
-    by 5/6 of it, and 5/6 by 5/8. All take a picture at each of ``frames`` times spread evenly over [0, 1].
-    Every frame brings masks and a cloud of points that some camera sees, with their colours. Trajectories
-    hold all times, 0 first. Equal arguments give equal files; ``seed`` draws lenses and points.
+    20 cameras stand on a cylinder, alternately low and high; by fours their images are ``size`` by 5/6 of it,
+    or 5/6 by 5/8. All take a picture at each of ``frames`` times, evenly spaced over [0, 1]. Every frame has
+    masks and a coloured cloud of visible points. Trajectories hold all times, 0 first. Equal
+    arguments give equal files; ``seed`` draws lenses and points.
 
     Args:
-        folder: the recording's own; one already there is replaced.
+        folder: folder of the recording; an existing one is replaced.
         size: pixels across of the larger images, a multiple of 24.
         motion: one of ``motions.MOTIONS``.
-        points: in the cloud of each frame.
+        points: number of points in the cloud of each frame.
         samples_per_pixel: rays averaged into a pixel.
-        workers, progress: as in ``film.Film``.
+        workers, progress: see ``film.Film``.
 
     Raises:
         SceneError: for a bad argument or folder; ImportError: without ``forewarp[synth]``.
@@ -77,7 +77,7 @@ def synthesize(
 
 
 def dome_cameras(size: int, seed: int) -> list[Camera]:
-    """The cameras, each with a lens slightly its own."""
+    """Make the cameras; their lenses differ slightly."""
     rng, cameras = stream(seed, _LENSES), []
     for k in range(CAMERAS):
         azimuth, height = 2 * math.pi * k / CAMERAS, HEIGHTS[k % 2]
@@ -93,7 +93,7 @@ def dome_cameras(size: int, seed: int) -> list[Camera]:
 
 
 def cloud(world: World, time: float, count: int, centers: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Points (N, 6) float32 that can be seen at ``time``: x y z in world units and lit r g b of 255."""
+    """Draw points (N, 6) float32 that are visible at ``time``: x y z in world units, lit r g b, 0-255."""
     face, barycentric = surface_points(world, count, centers, rng, time)
     hits = Hits(np.arange(len(face)), face, barycentric, np.zeros(len(face)))
     color = Posed(world, time).color(hits, light_points(_CLOUD_LIGHTS))
@@ -101,7 +101,7 @@ def cloud(world: World, time: float, count: int, centers: np.ndarray, rng: np.ra
 
 
 def _frames(film: Film, world: World, times, cameras: list[Camera], clouds) -> Iterator[DomeFrame]:
-    views = [View("", float(time), camera) for time in times for camera in cameras]
+    views = [ImageSpec("", float(time), camera) for time in times for camera in cameras]
     pictures = film.pictures(world, views)
     for points in clouds:
         rgba = [next(pictures)[0] for _ in cameras]
@@ -109,6 +109,6 @@ def _frames(film: Film, world: World, times, cameras: list[Camera], clouds) -> I
 
 
 def _in_studio(rgba: np.ndarray) -> np.ndarray:
-    """A picture uint8 (H, W, 4) before the studio's cloth, uint8 (H, W, 3)."""
+    """Composite a picture uint8 (H, W, 4) over the backdrop: uint8 (H, W, 3)."""
     alpha = rgba[..., 3:] / 255
     return np.rint(alpha * rgba[..., :3] + (1 - alpha) * 255 * np.array(STUDIO)).astype(np.uint8)

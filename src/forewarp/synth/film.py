@@ -1,4 +1,4 @@
-"""Many pictures of moving worlds, taken by several processes where that is worth it."""
+"""Render many pictures of moving worlds, in several processes if that is faster."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from forewarp.scene.camera import Camera
 from forewarp.synth.raycast import SHADOW_RAYS, render
 from forewarp.synth.world import World
 
-# A process takes seconds to start, and casts about two million samples in each.
+# A process takes seconds to start and casts about two million samples a second.
 _SAMPLES_A_PROCESS = 4e7
-# Pictures waiting for whoever writes them: enough that no process idles, few enough for any memory.
+# Pictures per process waiting to be written: enough that no process idles, few enough for the memory.
 _AHEAD = 3
 
 
-class View(NamedTuple):
-    """A picture to take: at ``time`` in [0, 1] by ``camera``; ``ability`` as in ``scene.Frame``."""
+class ImageSpec(NamedTuple):
+    """An image to render: at ``time`` in [0, 1] by ``camera``; ``ability`` as in ``scene.Frame``."""
 
     name: str
     time: float
@@ -38,22 +38,22 @@ class View(NamedTuple):
 
 @dataclass(frozen=True)
 class Exposure:
-    """How a picture is taken: rays averaged into a pixel, and shadow rays of each."""
+    """The rays averaged into a pixel, and the shadow rays of each ray."""
 
     samples_per_pixel: int = 4
     shadow_rays: int = SHADOW_RAYS
 
 
 class Film:
-    """Takes pictures in order; a context, which ends its processes.
+    """Render pictures in order; a context manager that ends the processes on exit.
 
-    The pictures are the same whatever the number of processes. With more than one, a script that calls this
-    needs the guard ``if __name__ == "__main__"``, as all of Python's processes do.
+    The pictures do not depend on the number of processes. With more than one, a calling script needs
+    the guard ``if __name__ == "__main__"``, as always with Python's processes.
 
     Args:
-        exposure: of every picture.
-        cameras: of all pictures there will be: how much there is to do.
-        workers: processes; None is one a processor, fewer where there is little to do; 1 is this process.
+        exposure: exposure of every picture.
+        cameras: cameras of all pictures to come, from which the amount of work is known.
+        workers: processes; None: one per processor, fewer for little work; 1: this process.
         progress: called with (pictures done, all pictures) after each.
     """
 
@@ -78,22 +78,22 @@ class Film:
         if self._pool is not None:
             self._pool.shutdown(cancel_futures=True)
 
-    def pictures(self, world: World, views: Iterable[View]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """What ``raycast.render`` gives for each view, in order."""
+    def pictures(self, world: World, views: Iterable[ImageSpec]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Render each view as ``raycast.render`` does, in order."""
         for picture in self._taken(world, views):
             self.done += 1
             if self.progress is not None:
                 self.progress(self.done, self.total)
             yield picture
 
-    def _taken(self, world: World, views: Iterable[View]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    def _taken(self, world: World, views: Iterable[ImageSpec]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         exposure = self.exposure.samples_per_pixel, self.exposure.shadow_rays
         if self._pool is None:
             yield from (render(world, view.time, view.camera, *exposure) for view in views)
             return
         waiting: deque = deque()
         for view in views:
-            # Pickled here, as an executor would send tensors through shared memory, a file each.
+            # Pickled here: an executor would send each tensor through a file in shared memory.
             job = pickle.dumps((view.time, view.camera, *exposure))
             waiting.append(self._pool.submit(_take, world.motion, world.has_room, job))
             if len(waiting) > _AHEAD * self.workers:
@@ -103,14 +103,14 @@ class Film:
 
 
 def _worth(samples: float) -> int:
-    """How many processes so many samples are worth."""
+    """Choose the number of processes by the number of samples."""
     affinity = getattr(os, "sched_getaffinity", None)
     processors = len(affinity(0)) if affinity else os.cpu_count() or 1
     return max(1, min(processors, math.floor(samples / _SAMPLES_A_PROCESS)))
 
 
 def _begin() -> None:
-    """In a new process: Ctrl-C is the parent's business, and one thread is all it uses."""
+    """Set up a new process: leave Ctrl-C to the parent, and use one thread."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     torch.set_num_threads(1)
 

@@ -1,6 +1,6 @@
 """A counterpart of the Lego Complete data: three scenes of one vehicle with three kinds of test view each.
 
-The authors' files cannot be had; counts and kinds of views are theirs, vehicle and motions are ours.
+The authors' files are not available. Numbers and kinds of views are as published, vehicle and motions ours.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from forewarp.scene.errors import SceneError
 from forewarp.synth.arguments import check_counts, check_motion, check_numbers, check_workers
 from forewarp.synth.film import Exposure, Film
 from forewarp.synth.motions import MOTIONS
-from forewarp.synth.scenes import Views, spread, views_at, write_world
+from forewarp.synth.scenes import Views, chosen, views_at, write_world
 from forewarp.synth.world import World
 
-# Half of what a single scene gets: at this size a grey level is all one loses, and a quarter of the time.
+# Half of a single scene's samples: costs one grey level at this size and saves a quarter of the time.
 _SHADOW_RAYS = 3
 
 
@@ -34,21 +34,21 @@ def synthesize(
     workers: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
-    """Write one scene a motion into ``folder``, each in its own folder of that name; returns ``folder``.
+    """Write one scene per motion into ``folder/<motion>``; return ``folder``.
 
-    ``frames`` training images, a random camera each, stand at times spread evenly over [0, 1]. Test images
-    have exact ray depth. The default counts are the published ones: 4 * 50 views at training times, one at
-    each of 4 * 49 + 1 equally spaced times, 50 at the canonical time 0. Trajectories hold all times.
+    ``frames`` training images, each from a random camera, are evenly spaced over the times [0, 1]. Test
+    images have exact ray depth. The default counts are the published ones: 4 * 50 views at training times,
+    one at each of 4 * 49 + 1 equally spaced times, 50 at the canonical time 0. Trajectories hold all times.
 
     Args:
-        folder: of all scenes; scenes already there are replaced.
+        folder: parent folder of the scenes; existing ones are replaced.
         size: width and height in pixels, at least 8.
-        motions: of ``motions.MOTIONS``: lift; lift_tilt, with the band stretching and the ball bouncing;
+        motions: names in ``motions.MOTIONS``: lift; lift_tilt, where band and ball move too;
             drive, driving and turning while the arm moves.
         test_views: views at each training time; steps from one training time to the next; canonical views.
-        val_views: views at training times to watch the training by.
+        val_views: validation views, at training times.
         samples_per_pixel: rays averaged into a pixel.
-        workers, progress: as in ``film.Film``.
+        workers, progress: see ``film.Film``.
 
     Raises:
         SceneError: for a bad argument or folder; ImportError: without ``forewarp[synth]``.
@@ -74,7 +74,7 @@ def synthesize(
 def _views(seed: tuple[int, ...], size: int, times: np.ndarray, steps: int, test_views, val_views) -> Views:
     train = times[::steps]
     test = np.repeat(train, test_views[0]), times[: len(times) * (test_views[1] > 0)], np.zeros(test_views[2])
-    return views_at(seed, size, train, spread(train, val_views), test)
+    return views_at(seed, size, train, chosen(train, val_views), test)
 
 
 def _check(motions: Sequence[str], test_views: Sequence[int]) -> None:

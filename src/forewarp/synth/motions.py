@@ -1,6 +1,6 @@
-"""How the vehicle's joints move: smooth functions of a continuous time in [0, 1].
+"""Move the vehicle's joints: smooth functions of a continuous time in [0, 1].
 
-Every joint is an affine map, so every point of a part has an exact place at every time. The controls are
+Every joint is an affine map, so every point of a part has an exact position at every time. The controls are
 sums of cosines of at most three half periods, which a few low DCT frequencies span.
 """
 
@@ -22,8 +22,8 @@ BAND_FROM, BAND_ALONG_STICK, BAND_SIDE, BAND_RADIUS = (-0.05, 0.52), 0.36, 0.125
 
 @dataclass(frozen=True)
 class Controls:
-    """Angles in degrees, each against the link before it; ``travel`` and ``height`` in world units; ``turn``
-    in degrees; ``squash`` the ball's height over its diameter.
+    """Angles in degrees, each relative to the link before it; ``travel`` and ``height`` in world units;
+    ``turn`` in degrees; ``squash`` the ball's height over its diameter.
     """
 
     boom: float = 40.0
@@ -69,7 +69,7 @@ START = {"lift": (-0.22, 0.08, 18.0), "lift_tilt": (-0.22, 0.08, 18.0), "drive":
 
 
 def joints(motion: str, time: float) -> dict[str, np.ndarray]:
-    """Each joint's affine map (4, 4) from its rest frame to the world at ``time``.
+    """Compute each joint's affine map (4, 4) from its rest frame to the world at ``time``.
 
     Args:
         motion: a name in MOTIONS.
@@ -79,11 +79,11 @@ def joints(motion: str, time: float) -> dict[str, np.ndarray]:
 
 
 def placed(now: Controls, start: tuple[float, float, float]) -> dict[str, np.ndarray]:
-    """Each joint's affine map (4, 4) from its rest frame to the world.
+    """Compute each joint's affine map (4, 4) from its rest frame to the world.
 
     Args:
         now: angles and lengths.
-        start: of the chassis: x, y, heading in degrees.
+        start: the chassis's x, y and heading in degrees.
     """
     chassis = _along_arc(start, now.travel, now.turn)
     boom = chassis @ _shift(PIVOT) @ _raise(now.boom)
@@ -105,7 +105,7 @@ def placed(now: Controls, start: tuple[float, float, float]) -> dict[str, np.nda
 
 
 def _ball(now: Controls) -> np.ndarray:
-    """Squashed along z and widened across, so that the volume stays what it is at rest."""
+    """Squash the ball along z and widen it across, keeping its volume."""
     wide = now.squash**-0.5
     x, y = BALL_AT
     return _shift((x - now.drift, y, GROUND + 0.002 + BALL_RADIUS * now.squash + now.height)) @ np.diag(
@@ -114,8 +114,8 @@ def _ball(now: Controls) -> np.ndarray:
 
 
 def _band(now: Controls) -> np.ndarray:
-    """From a rest cylinder of length and radius 1 along x to the span between two pins, in the chassis frame;
-    thinner as it stretches, so that the volume stays.
+    """Map a cylinder of length and radius 1 along x to the span between two pins, in the chassis frame;
+    it gets thinner as it stretches, keeping its volume.
     """
     angle = np.radians([now.boom, now.boom + now.stick])
     pin = np.array([PIVOT[0], PIVOT[2]]) + BOOM * _point(angle[0]) + BAND_ALONG_STICK * _point(angle[1])
@@ -132,7 +132,7 @@ def _band(now: Controls) -> np.ndarray:
 
 
 def _along_arc(start: tuple[float, float, float], travel: float, turn: float) -> np.ndarray:
-    """The chassis after ``travel`` along a circular arc that turns it by ``turn`` degrees."""
+    """Move the chassis by ``travel`` along a circular arc that turns it by ``turn`` degrees."""
     x, y, heading = start
     half = np.radians(turn / 2)
     chord = travel * np.sinc(half / np.pi)
@@ -154,7 +154,7 @@ def _shift(by) -> np.ndarray:
 
 
 def _raise(degrees: float) -> np.ndarray:
-    """A turn about y that lifts the x axis towards z."""
+    """Rotate about y, lifting the x axis towards z."""
     c, s = _point(np.radians(degrees))
     place = np.eye(4)
     place[0, [0, 2]] = c, -s

@@ -1,4 +1,4 @@
-"""Exact trajectories of points that stay on the surface."""
+"""Sample surface points and follow their exact trajectories."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from forewarp.scene.frame import Truth
 from forewarp.synth.raycast import LIFT_OFF, Posed
 from forewarp.synth.world import World
 
-# Candidates per point wanted: about half of the surface lies inside or below, and is never seen.
+# Candidates per wanted point: about half of the surface is never visible.
 _SPARE = 4
 
 
@@ -21,15 +21,15 @@ def surface_points(
     time: float = 0.0,
     among: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Points spread evenly by area over what can be seen at one time.
+    """Draw points uniformly by area on the surface that is visible at one time.
 
     Args:
-        world: whose surface.
-        count: how many; fewer come back only where hardly anything can be seen.
-        centers: camera centres (C, 3); a point counts as seen where at least one of them sees it.
+        world: the world.
+        count: number of points; fewer are drawn only if hardly anything is visible.
+        centers: camera centres (C, 3); a point is visible if at least one camera sees it.
         rng: the same state gives the same points.
-        time: when they are to be seen.
-        among: which faces (F,) bool they may lie on; None is all.
+        time: time at which points must be visible.
+        among: (F,) bool, faces to draw from; None: all.
 
     Returns:
         faces (N,) and barycentric coordinates (N, 3), which ``World.points`` places at any time.
@@ -46,7 +46,7 @@ def surface_points(
 
 
 def trajectories(world: World, faces: np.ndarray, barycentric: np.ndarray, times: np.ndarray) -> Truth:
-    """Where surface points (N) are at ``times`` (T,), the canonical time first; float32 world units."""
+    """Follow surface points (N) over ``times`` (T,), the canonical time first; float32 world units."""
     points = np.stack([world.points(faces, barycentric, t) for t in times], 1)
     return Truth(torch.from_numpy(points.astype(np.float32)), torch.from_numpy(np.asarray(times, np.float64)))
 

@@ -1,8 +1,9 @@
-"""Exact ray casting of a posed world: what a ray meets first, where, and how the light falls there."""
+"""Cast rays exactly into a posed world: find the first hit of each and its lit colour."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -13,16 +14,16 @@ from forewarp.synth.world import World
 
 LIGHT_AT, LIGHT_RADIUS = np.array([2.2, -2.6, 4.6]), 0.45
 AMBIENT, SKY, DIFFUSE = 0.60, 0.10, 0.40
-# Per sample; with four samples a pixel sees two dozen points of the light, and no edge shows in a shadow.
+# Per sample; four samples per pixel see two dozen points of the light, so shadows show no steps.
 SHADOW_RAYS = 6
-# Far above float32 error, in which embree works, and far below anything visible.
+# Far above the error of float32, which embree computes in, and far below anything visible.
 LIFT_OFF = 2e-4
 
 
 @dataclass(frozen=True)
 class Hits:
-    """Where n of the rays given to ``Posed.first_hits`` met the world: ``ray`` (n,) their indices, ``face``
-    (n,), ``barycentric`` (n, 3), ``distance`` (n,) along the unit ray, world units.
+    """The hits of n of the rays given to ``Posed.first_hits``: ``ray`` (n,) their indices, ``face`` (n,),
+    ``barycentric`` (n, 3), ``distance`` (n,) along the unit ray, world units.
     """
 
     ray: np.ndarray
@@ -32,10 +33,10 @@ class Hits:
 
 
 class Posed:
-    """A world at one time, ready to be cast into.
+    """A world at one time, ready for ray casting.
 
     Raises:
-        ImportError: where the optional packages of ``forewarp[synth]`` are not installed.
+        ImportError: if the optional packages of ``forewarp[synth]`` are not installed.
     """
 
     def __init__(self, world: World, time: float):
@@ -50,7 +51,7 @@ class Posed:
         self._first_blocker = self._first if world.casts.all() else _intersector(self.corners[world.casts])
 
     def first_hits(self, origins: np.ndarray, directions: np.ndarray) -> Hits:
-        """What rays from ``origins`` (n, 3) along unit ``directions`` (n, 3) meet first."""
+        """Find the first hits of rays from ``origins`` (n, 3) along unit ``directions`` (n, 3)."""
         face = self._first(origins, directions)
         ray = np.flatnonzero(face >= 0)
         face = face[ray]
@@ -60,11 +61,11 @@ class Posed:
         return Hits(ray, face, barycentric, distance)
 
     def is_free(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Whether rays (n, 3), (n, 3) leave the world (n,); what casts no shadow stops none."""
+        """Tell which rays (n, 3), (n, 3) leave the world (n,); parts that cast no shadow are ignored."""
         return self._first_blocker(origins, directions) < 0
 
     def _barycentric(self, face: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """The hit in float64 (embree tells only the face), clamped: a grazing ray stays on its face."""
+        """Compute the hits in float64, as embree gives only the face; clamp grazing rays to their face."""
         a, b, c = (self.corners[face, i] for i in range(3))
         normal = 2 * self.area[face, None] * self.normal[face]
         across = np.cross(directions, origins - a)
@@ -76,8 +77,9 @@ class Posed:
         return weights / weights.sum(-1, keepdims=True)
 
     def color(self, hits: Hits, lights: np.ndarray, directions: np.ndarray | None = None) -> np.ndarray:
-        """Lit colour (n, 3) in [0, 1] of hits; ``lights`` (L, 3) are points of the area light, ``directions``
-        (R, 3) the rays', without which nothing shines.
+        """Light hits: colours (n, 3) in [0, 1]; ``lights`` (L, 3) are points of the area light.
+
+        ``directions`` (R, 3): the rays' directions; without them nothing is glossy.
         """
         normal = np.einsum("nc,ncd->nd", hits.barycentric, self.corner_normal[hits.face])
         normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
@@ -98,8 +100,8 @@ class Posed:
         return np.clip(color, 0, 1)
 
     def _glint(self, hits: Hits, normal: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """What glossy parts throw back of the light's middle (n,), whether or not something stands before it:
-        Phong's ``gloss * cos^shine`` of the angle to the mirrored ray.
+        """Compute the highlights of glossy parts (n,): Phong's ``gloss * cos^shine`` of the angle between the
+        mirrored ray and the light's middle; shadows are ignored.
         """
         gloss, shine = (self.finish[self.world.part_of_face[hits.face], i] for i in (0, 1))
         mirrored = directions - 2 * np.einsum("nd,nd->n", directions, normal)[:, None] * normal
@@ -122,32 +124,28 @@ class Posed:
 
 
 def render(
-    world: World,
-    time: float,
-    camera: Camera,
-    samples_per_pixel: int = 4,
-    shadow_rays: int = SHADOW_RAYS,
+    world: World, time: float, camera: Camera, samples_per_pixel: int = 4, shadow_rays: int = SHADOW_RAYS
 ) -> tuple[np.ndarray, np.ndarray]:
-    """One picture of the world at any time from any camera.
+    """Render one picture of the world at any time from any camera.
 
     Args:
-        world: what is seen.
-        time: in [0, 1].
-        camera: its size, lens and pose; near and far are ignored.
-        samples_per_pixel: rays averaged into a pixel, each with ``shadow_rays`` of its own.
+        world: the world to render.
+        time: time in [0, 1].
+        camera: gives size, lens and pose; near and far are ignored.
+        samples_per_pixel: rays averaged into a pixel, each with ``shadow_rays`` shadow rays.
 
     Returns:
         rgba (H, W, 4) uint8, straight alpha, alpha the share of the samples that hit; and depth (H, W)
-        float32, the distance along the unit ray through the pixel centre, 0 where it meets nothing.
+        float32, the distance along the unit ray through the pixel centre, 0 if it hits nothing.
 
     **Cost** H * W * samples_per_pixel * (1 + shadow_rays) rays at most.
     """
-    posed = Posed(world, time)
+    posed = _posed(world, time)
     count = camera.height * camera.width
     total, hit = np.zeros((count, 3)), np.zeros(count)
     lights = light_points(samples_per_pixel * shadow_rays)
     for i in range(samples_per_pixel):
-        # The R1 sequence: any number of samples is spread evenly over the pixel; a single one is its centre.
+        # The R1 sequence covers the pixel evenly with any number of samples; a single sample is the centre.
         offset = ((i + 0.5) / samples_per_pixel, (0.5 + i * 0.6180339887498949) % 1.0)
         rays = camera_rays(camera, offset)
         hits = posed.first_hits(*rays)
@@ -162,8 +160,14 @@ def render(
     return np.rint(255 * rgba).astype(np.uint8).reshape(*shape, 4), depth.reshape(shape)
 
 
+@lru_cache(1)
+def _posed(world: World, time: float) -> Posed:
+    """Pose a world once for all cameras of one time."""
+    return Posed(world, time)
+
+
 def camera_rays(camera: Camera, offset: tuple[float, float] = (0.5, 0.5)) -> tuple[np.ndarray, np.ndarray]:
-    """Origins and unit directions (H*W, 3) float64 through one spot of every pixel, row by row."""
+    """Make origins and unit directions (H*W, 3) float64 through one spot of every pixel, row by row."""
     columns = torch.arange(camera.width, dtype=torch.float64) + offset[0]
     rows = torch.arange(camera.height, dtype=torch.float64) + offset[1]
     v, u = torch.meshgrid(rows, columns, indexing="ij")
@@ -172,9 +176,9 @@ def camera_rays(camera: Camera, offset: tuple[float, float] = (0.5, 0.5)) -> tup
 
 
 def light_points(count: int) -> np.ndarray:
-    """Points (count, 3) spread evenly over the light's disc, which faces the origin.
+    """Place points (count, 3) evenly on the light's disc, which faces the origin.
 
-    They are the same for every pixel, so a shadow on a surface looks alike from all sides.
+    The points are the same for every pixel, so that shadows look alike from all cameras.
     """
     i = np.arange(count)
     radius, angle = LIGHT_RADIUS * np.sqrt((i + 0.5) / count), 2.399963229728653 * i  # golden angle
@@ -186,7 +190,7 @@ def light_points(count: int) -> np.ndarray:
 
 
 def _corner_normals(world: World, cross: np.ndarray, flat: np.ndarray) -> np.ndarray:
-    """Normals (F, 3, 3) at the corners of every face: averaged over neighbours in smooth parts, else flat."""
+    """Compute normals (F, 3, 3) at the corners of faces: averaged in smooth parts, else flat."""
     normals = np.repeat(flat[:, None], 3, axis=1)
     faces = world.faces[world.smooth]
     summed = np.zeros((len(world.rest), 3))
@@ -197,7 +201,7 @@ def _corner_normals(world: World, cross: np.ndarray, flat: np.ndarray) -> np.nda
 
 
 def _intersector(corners: np.ndarray):
-    """A function (origins, directions) -> index (n,) of the first face met, -1 for none."""
+    """Make a function (origins, directions) -> index (n,) of the first face hit, -1 for none."""
     try:
         import trimesh
         from trimesh.ray.ray_pyembree import RayMeshIntersector

@@ -18,17 +18,17 @@ from forewarp.scene.frame import Truth
 from forewarp.scene.lens import Lens
 from forewarp.synth.arguments import check_motion, check_numbers, check_workers
 from forewarp.synth.cameras import centers_of, stream
-from forewarp.synth.film import Exposure, Film, View
+from forewarp.synth.film import Exposure, Film, ImageSpec
 from forewarp.synth.points import surface_points, trajectories
 from forewarp.synth.raycast import Posed, camera_rays
 from forewarp.synth.scenes import writing_to
 from forewarp.synth.world import World
 
-# Of the still points drawn about a ninth lies in both pictures.
+# About a ninth of the drawn static points is in both pictures.
 POINTS, STILL_POINTS = 4000, 20000
 # The arc, in the vehicle's units and degrees from x towards y.
 RADIUS, ARC, FOCUS, BASELINE = 3.0, (-118.0, -62.0), (0.0, 0.0, -0.08), 0.26
-VIEW_ANGLE = 52.0  # horizontal, degrees
+VIEW_ANGLE = 52.0  # horizontal field of view, degrees
 # Two phones of one make: pixel aspect, focal length and principal point differ a little, as do the lenses.
 PHONES = (
     {
@@ -44,7 +44,7 @@ PHONES = (
         "lens": Lens((0.08, -0.05, 0.0), (-0.003, 0.004)),
     },
 )
-# The capture's own world: as a reconstruction leaves it, neither centred nor of any known scale.
+# The capture's own world: neither centred nor of known scale, as a reconstruction leaves it.
 WORLD_SCALE, WORLD_AT = 2.4, (3.1, -1.7, 0.9)
 SCENE_CENTER, SCENE_SCALE = (2.9, -1.4, 1.1), 0.2
 _SHAKE, _POINTS, _STILL = 0, 1, 2
@@ -64,18 +64,18 @@ def synthesize(
 ) -> Path:
     """Write a capture by a validation rig into ``folder`` and return that folder.
 
-    Both phones take a picture at each of ``frames`` times spread evenly over [0, 1]; one is trained on and
-    the other held out, in turns. Lenses distort, pixels are not square, the world is scaled and shifted.
-    ``points.npy`` has points of the room and the slab, trajectories follow vehicle, ball and slab from the
-    middle time on. Equal arguments give equal files, byte by byte; ``seed`` draws hand shake and points.
+    Both phones take a picture at each of ``frames`` times, evenly spaced over [0, 1]; by turns one is for
+    training and the other held out. Lenses distort, pixels are not square, the world is scaled and shifted.
+    ``points.npy`` has points of the room and the slab; trajectories follow vehicle, ball and slab, the middle
+    time first. Equal arguments give equal files, byte by byte; ``seed`` draws hand shake and points.
 
     Args:
-        folder: the capture's own; one already there is replaced.
-        size: pixels across, a multiple of 8; three quarters of that high. Half-size images are written too.
-        frames: odd, so that one of them is at the canonical time 1/2.
+        folder: folder of the capture; an existing one is replaced.
+        size: width in pixels, a multiple of 8; the height is 3/4 of it. Half-size images are written too.
+        frames: number of times, odd, so that one is the canonical time 1/2.
         motion: one of ``motions.MOTIONS``.
         samples_per_pixel: rays averaged into a pixel.
-        workers, progress: as in ``film.Film``.
+        workers, progress: see ``film.Film``.
 
     Raises:
         SceneError: for a bad argument or folder; ImportError: without ``forewarp[synth]``.
@@ -90,7 +90,7 @@ def synthesize(
     pairs = rig_cameras(size, times, seed)
     near, far = _seen_range(world, pairs)
     views = [
-        View(_name(t, k), float(times[t]), camera)
+        ImageSpec(_name(t, k), float(times[t]), camera)
         for t, pair in enumerate(pairs)
         for k, camera in enumerate(pair)
     ]
@@ -112,7 +112,7 @@ def synthesize(
 
 
 def rig_cameras(size: int, times: np.ndarray, seed: int) -> list[tuple[Camera, Camera]]:
-    """Left and right camera at each time, in the vehicle's units: along an arc, with a slow shake."""
+    """Place the left and right camera at each time, in the vehicle's units: along an arc, shaking slowly."""
     rng = stream(seed, _SHAKE)
     phase, rate = rng.uniform(0, 2 * np.pi, 4), rng.uniform(1.0, 2.2, 4)
     pairs = []
@@ -140,7 +140,7 @@ def _name(t: int, k: int) -> str:
     return f"{('left', 'right')[k]}1_{t:06d}"
 
 
-def _shots(film: Film, world: World, views: list[View]) -> Iterator[RigShot]:
+def _shots(film: Film, world: World, views: list[ImageSpec]) -> Iterator[RigShot]:
     for i, (view, (rgba, _)) in enumerate(zip(views, film.pictures(world, views))):
         t, k = divmod(i, 2)
         camera = replace(view.camera, camera_to_world=_pose_in_capture(view.camera))
@@ -154,12 +154,12 @@ def _pose_in_capture(camera: Camera) -> torch.Tensor:
 
 
 def _in_capture(points: np.ndarray) -> np.ndarray:
-    """Points (..., 3) of the vehicle's units in the capture's world."""
+    """Move points (..., 3) from the vehicle's units to the capture's world."""
     return WORLD_SCALE * points + np.array(WORLD_AT)
 
 
 def _seen_range(world: World, pairs: list[tuple[Camera, Camera]]) -> tuple[float, float]:
-    """The least and the greatest distance that any picture shows, and a margin; every ray ends somewhere."""
+    """Find the least and the greatest distance in any picture, with a margin."""
     seen = []
     for i, pair in enumerate(pairs):
         posed = Posed(world, i / (len(pairs) - 1))
@@ -171,7 +171,7 @@ def _seen_range(world: World, pairs: list[tuple[Camera, Camera]]) -> tuple[float
 
 
 def _truth(world: World, times: np.ndarray, pairs, rng: np.random.Generator) -> Truth:
-    """Trajectories of what is no wall, the middle time first."""
+    """Follow points that are not on a wall, the middle time first."""
     middle = len(times) // 2
     order = [middle, *(i for i in range(len(times)) if i != middle)]
     centers = centers_of([camera for pair in pairs for camera in pair])
@@ -181,7 +181,7 @@ def _truth(world: World, times: np.ndarray, pairs, rng: np.random.Generator) -> 
 
 
 def _still_points(world: World, pairs, rng: np.random.Generator) -> np.ndarray:
-    """Points (N, 3) float32 of room and slab, in the capture's world, in the pictures of both phones."""
+    """Draw points (N, 3) float32 of room and slab that both phones see, in the capture's world."""
     still = np.array([part.joint == "ground" for part in world.parts])[world.part_of_face]
     pair = pairs[len(pairs) // 2]
     faces, barycentric = surface_points(world, STILL_POINTS, centers_of(list(pair)), rng, 0.5, still)

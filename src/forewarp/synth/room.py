@@ -1,4 +1,4 @@
-"""A room around the vehicle: floor, four walls and ceiling, all strongly textured, none of which moves."""
+"""A room around the vehicle: floor, four walls and ceiling, strongly textured and still."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ CEILING = Material("mosaic", (CHALK, (0.80, 0.82, 0.84), (0.86, 0.84, 0.78), (0.
 
 
 def room() -> list[Part]:
-    """Six thin boxes, closed as all parts are. They cast no shadow, as the light stands outside."""
+    """Make six thin closed boxes, which cast no shadow, as the light is outside."""
     (x0, y0, z0), (x1, y1, z1), t = LOW, HIGH, _THICK
     walls = [
         ("floor", (x0 - t, y0 - t, z0 - t), (x1 + t, y1 + t, z0), FLOOR),

@@ -12,16 +12,16 @@ from forewarp.data.dnerf import ABILITIES, Shot, write_scene
 from forewarp.scene.errors import SceneError
 from forewarp.synth.arguments import check_counts, check_motion, check_numbers, check_workers
 from forewarp.synth.cameras import CAMERA_ANGLE_X, centers_of, random_cameras, stream
-from forewarp.synth.film import Exposure, Film, View
+from forewarp.synth.film import Exposure, Film, ImageSpec
 from forewarp.synth.points import surface_points, trajectories
 from forewarp.synth.specimens import SPECIMENS, Specimen
 from forewarp.synth.world import World
 
 POINTS, POINT_VIEWS = 4000, 30
-# Streams of random numbers: the splits' cameras in turn, then the points'.
+# Seeds of the random streams: the cameras of each split, then the points.
 _TRAIN, _VAL, _TEST, _POINT_VIEWS, _POINTS = 0, 1, 2, 9, 10
 
-Views = dict[str, list[View]]  # by split
+Views = dict[str, list[ImageSpec]]  # by split
 
 
 def synthesize(
@@ -40,21 +40,21 @@ def synthesize(
     """Write a moving scene with its exact truth into ``folder`` and return that folder.
 
     The vehicle is always the same; ``seed`` draws the cameras and the trajectories' points. Equal arguments
-    give equal files, byte by byte. ``frames`` training images stand at times spread evenly over [0, 1], one
+    give equal files, byte by byte. ``frames`` training images are evenly spaced over the times [0, 1], one
     camera each. Test images, with depth, are new views at training times, at times midway, and at the
     canonical time 0: ``test_views`` counts (space, time, canonical). Trajectories hold all those times.
 
     Args:
-        folder: the scene's own; a scene already there is replaced.
+        folder: folder of the scene; an existing one is replaced.
         size: width and height in pixels, at least 8.
-        motion: one of ``motions.MOTIONS``, or of ``specimens.SPECIMENS``, which takes the vehicle's place.
+        motion: one of ``motions.MOTIONS``, or of ``specimens.SPECIMENS``, which replaces the vehicle.
         samples_per_pixel: rays averaged into a pixel.
-        workers, progress: as in ``film.Film``.
+        workers, progress: see ``film.Film``.
 
     Raises:
         SceneError: for a bad argument or folder; ImportError: without ``forewarp[synth]``.
 
-    **Cost** about size^2 * samples_per_pixel * 7 rays an image, a million or two a second on one core.
+    **Cost** about size^2 * samples_per_pixel * 7 rays an image, at one to two million a second on one core.
     """
     check_numbers(size=(size, 8), frames=(frames, 2), seed=(seed, 0), val_views=(val_views, 0))
     check_motion(motion, specimens=True)
@@ -63,8 +63,8 @@ def synthesize(
     check_workers(workers)
     times = np.linspace(0, 1, 2 * frames - 1)
     train, between = times[::2], times[1::2]
-    test = spread(train, test_views[0]), spread(between, test_views[1]), np.zeros(test_views[2])
-    views = views_at((seed,), size, train, spread(train, val_views), test, SPECIMENS.get(motion))
+    test = chosen(train, test_views[0]), chosen(between, test_views[1]), np.zeros(test_views[2])
+    views = views_at((seed,), size, train, chosen(train, val_views), test, SPECIMENS.get(motion))
     cameras = [view.camera for split in views.values() for view in split]
     with Film(Exposure(samples_per_pixel), cameras, workers, progress) as film:
         write_world(folder, World(motion), views, times, film, (seed,))
@@ -79,21 +79,21 @@ def views_at(
     test: Sequence[np.ndarray],
     specimen: Specimen | None = None,
 ) -> Views:
-    """A random view at each of these times, from where a ``specimen`` is to be seen; ``test`` has the times
-    of (space, time, canonical).
+    """Draw a random view at each of these times, from the part of the sphere that a ``specimen`` allows;
+    ``test`` has the times of (space, time, canonical).
     """
     where = {} if specimen is None else {"azimuth": specimen.azimuth, "rise": specimen.rise}
 
-    def views(number: int, times: np.ndarray, ability: str = "all") -> list[View]:
+    def views(number: int, times: np.ndarray, ability: str = "all") -> list[ImageSpec]:
         cameras = random_cameras(len(times), size, stream(*seed, number), **where)
-        return [View(f"r_{i:03d}", float(t), c, ability) for i, (t, c) in enumerate(zip(times, cameras))]
+        return [ImageSpec(f"r_{i:03d}", float(t), c, ability) for i, (t, c) in enumerate(zip(times, cameras))]
 
     kinds = [view for i, times in enumerate(test) for view in views(_TEST + i, times, ABILITIES[i])]
     return {"train": views(_TRAIN, train), "val": views(_VAL, val), "test": kinds}
 
 
-def spread(times: np.ndarray, count: int) -> np.ndarray:
-    """``count`` of the times, the first and the last among them where there are two or more."""
+def chosen(times: np.ndarray, count: int) -> np.ndarray:
+    """Choose ``count`` evenly spaced times, including the first and the last if ``count`` is 2 or more."""
     return times[np.rint(np.linspace(0, len(times) - 1, count)).astype(np.int64)]
 
 
@@ -108,7 +108,7 @@ def write_world(
         write_scene(place, shots, camera_angle_x=CAMERA_ANGLE_X, trajectories=truth)
 
 
-def _shots(film: Film, world: World, views: list[View]) -> Iterator[Shot]:
+def _shots(film: Film, world: World, views: list[ImageSpec]) -> Iterator[Shot]:
     for view, (rgba, depth) in zip(views, film.pictures(world, views)):
         known = None if view.ability == "all" else depth
         yield Shot(view.name, view.time, view.camera.camera_to_world, rgba, known, view.ability)
@@ -116,7 +116,7 @@ def _shots(film: Film, world: World, views: list[View]) -> Iterator[Shot]:
 
 @contextmanager
 def writing_to(folder: str | Path) -> Iterator[Path]:
-    """Makes the folder; what cannot be written is one line."""
+    """Make a folder to write to; turn errors of the file system into SceneErrors."""
     folder = Path(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""Closed triangle meshes as plain arrays: vertices (V, 3) float64 and faces (F, 3) int64, turned outwards."""
+"""Make closed triangle meshes: vertices (V, 3) float64 and faces (F, 3) int64, turned outwards."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ Mesh = tuple[np.ndarray, np.ndarray]
 
 @dataclass(frozen=True)
 class Part:
-    """One coloured piece that follows one joint of the rig.
+    """A coloured piece that follows one joint.
 
     ``vertices`` (V, 3) float64 are in the joint's rest frame, ``faces`` (F, 3) index them; a ``smooth``
-    part is shaded with interpolated normals; one that ``casts`` no shadow lets the light through.
+    part is shaded with interpolated normals; a part without ``casts`` throws no shadow.
     """
 
     name: str
@@ -29,7 +29,7 @@ class Part:
 
 
 def prism(outline, low: float, high: float, axis: int = 2) -> Mesh:
-    """A convex ``outline`` (P, 2), counter-clockwise, swept along ``axis`` from ``low`` to ``high``.
+    """Sweep a convex ``outline`` (P, 2), counter-clockwise, along ``axis`` from ``low`` to ``high``.
 
     The outline's two coordinates are the remaining axes in cyclic order: axis 2 takes (x, y), axis 0
     takes (y, z), axis 1 takes (z, x).
@@ -59,13 +59,13 @@ def prism(outline, low: float, high: float, axis: int = 2) -> Mesh:
 
 
 def box(low, high) -> Mesh:
-    """An axis-aligned box between two corners (3,)."""
+    """Make an axis-aligned box between two corners (3,)."""
     (x0, y0, z0), (x1, y1, z1) = low, high
     return prism([(x0, y0), (x1, y0), (x1, y1), (x0, y1)], z0, z1)
 
 
 def cylinder(center, radius: float, length: float, axis: int = 2, segments: int = 24) -> Mesh:
-    """A cylinder about ``center`` (3,) along ``axis``."""
+    """Make a cylinder about ``center`` (3,) along ``axis``."""
     angle = 2 * np.pi * np.arange(segments) / segments
     vertices, faces = prism(
         radius * np.stack([np.cos(angle), np.sin(angle)], -1), -length / 2, length / 2, axis
@@ -74,7 +74,7 @@ def cylinder(center, radius: float, length: float, axis: int = 2, segments: int 
 
 
 def rounded_slab(half: float, corner: float, low: float, high: float, steps: int = 8) -> Mesh:
-    """A square plate of half width ``half`` whose corners have radius ``corner``."""
+    """Make a square plate of half width ``half`` whose corners have radius ``corner``."""
     turn = np.linspace(0, np.pi / 2, steps + 1)
     outline = [
         (half - corner) * np.array(sign) + corner * np.array([np.cos(a), np.sin(a)])
@@ -85,7 +85,7 @@ def rounded_slab(half: float, corner: float, low: float, high: float, steps: int
 
 
 def sphere(radius: float, rings: int = 24, segments: int = 40) -> Mesh:
-    """A sphere about the origin of latitude ``rings``."""
+    """Make a sphere about the origin with ``rings`` of latitude."""
     latitude = np.linspace(-np.pi / 2, np.pi / 2, rings + 1)[1:-1, None]
     longitude = (2 * np.pi * np.arange(segments) / segments)[None]
     grid = np.stack(
@@ -108,7 +108,7 @@ def sphere(radius: float, rings: int = 24, segments: int = 40) -> Mesh:
 
 
 def joined(meshes: list[Mesh]) -> Mesh:
-    """Several meshes as one."""
+    """Join several meshes into one."""
     offsets = np.cumsum([0] + [len(v) for v, _ in meshes])
     return (
         np.concatenate([v for v, _ in meshes]),
@@ -117,8 +117,8 @@ def joined(meshes: list[Mesh]) -> Mesh:
 
 
 def studs(xs, ys, z: float, radius: float = 0.032, height: float = 0.026) -> Mesh:
-    """Brick studs at every (x, y) of two lists, standing on height ``z``."""
-    # Sunk a little, so that the foot never lies in the plane it stands on.
+    """Put brick studs at every (x, y) of two lists, at height ``z``."""
+    # Sunk a little, so that the foot does not lie in the plane below.
     return joined(
         [
             cylinder((x, y, z + height / 2 - 0.002), radius, height + 0.004, segments=16)

@@ -1,7 +1,7 @@
-"""Six small subjects, each of which calls for one thing beside motion, or for nothing.
+"""Six small subjects that each call for one effect beside motion, or for none.
 
-A plan made from their pictures should turn on what ``conf/scene/specimen_<name>.yaml`` says it calls for, and
-nothing else.
+A plan made from a specimen's pictures should switch on only the effects that
+``conf/scene/specimen_<name>.yaml`` lists.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ class Specimen:
     """A subject.
 
     Args:
-        parts: its meshes; None: those of the vehicle.
         joints: time in [0, 1] -> each joint's map (4, 4).
+        parts: meshes; None: the vehicle's.
         extra: parts beside the vehicle's.
-        azimuth, rise: where cameras stand, as ``random_cameras`` takes it.
+        azimuth, rise: range of camera positions; see ``random_cameras``.
     """
 
     joints: Callable[[float], dict[str, np.ndarray]]
@@ -45,13 +45,13 @@ def _still(time: float) -> dict[str, np.ndarray]:
 
 
 def _rigid(time: float) -> dict[str, np.ndarray]:
-    """It drives along an arc; the arm stays as it is."""
+    """Drive along an arc with the arm fixed."""
     go = 0.5 - 0.5 * np.cos(np.pi * time)
     return placed(Controls(travel=0.42 * go, turn=32 * go), (-0.32, -0.02, 4.0))
 
 
 def _quick(time: float) -> dict[str, np.ndarray]:
-    """It goes forth and back three times; a few cosines do not hold that."""
+    """Drive forth and back three times: more than a few cosines can represent."""
     return placed(Controls(travel=0.3 * (0.5 - 0.5 * np.cos(6 * np.pi * time))), (-0.32, -0.02, 4.0))
 
 
@@ -62,7 +62,7 @@ def _map(scale: tuple[float, float, float], shift: tuple[float, float, float]) -
 
 
 def _band(time: float) -> dict[str, np.ndarray]:
-    """A sheet on a pillar that rests at first and is then drawn out to both sides, five times as wide."""
+    """Let a sheet on a pillar rest at first, then stretch it to five times its width."""
     wide = 1 + 4 * (0.5 - 0.5 * np.cos(np.pi * max(0.0, (time - 0.2) / 0.8)))
     return {"pillar": np.eye(4), "sheet": _map((wide, wide, 1), (0, 0, 0))}
 
@@ -91,7 +91,7 @@ def _globe_joints(time: float) -> dict[str, np.ndarray]:
 
 
 def _corner() -> list[Part]:
-    """A floor and two walls behind the subject, which fill every picture."""
+    """Make a floor and two walls behind the subject; they fill every picture."""
     low, high, thick = 1.1, 5.0, 0.1
     floor = GROUND - 0.0702
     walls = [

@@ -1,4 +1,4 @@
-"""Procedural colour by surface coordinates of the rest pose, so that it moves with the surface."""
+"""Procedural colour by coordinates of the rest pose, so that it moves with the surface."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 class Material:
     """A ``pattern`` of PATTERNS, its ``colors`` (RGB in [0, 1]) and its ``scale`` in world units.
 
-    ``gloss`` is the light it throws back in one direction (0: it is matte), ``shine`` how narrowly.
+    ``gloss`` is the strength of the highlight (0: matte), ``shine`` its narrowness.
     """
 
     pattern: str
@@ -23,17 +23,17 @@ class Material:
 
 @dataclass(frozen=True)
 class Surface:
-    """n surface points at rest: ``position`` (n, 3), ``unit`` (n, 3) the position in the part's bounding
-    box as [0, 1], ``normal`` (n, 3).
+    """n surface points at rest: ``position`` (n, 3), ``relative`` (n, 3) the position in the part's
+    bounding box as [0, 1], ``normal`` (n, 3).
     """
 
     position: np.ndarray
-    unit: np.ndarray
+    relative: np.ndarray
     normal: np.ndarray
 
     def flat(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The two coordinates of ``values`` (n, 3) across the normal's main axis; the second one is height
-        wherever the face is upright.
+        """Take the two coordinates of ``values`` (n, 3) across the normal's main axis; on upright faces the
+        second one is the height.
         """
         main = np.abs(self.normal).argmax(-1)
         first = np.where(main == 0, values[:, 1], values[:, 0])
@@ -41,7 +41,7 @@ class Surface:
 
 
 def checker(at: Surface, scale: float) -> np.ndarray:
-    """Squares, with a thin joint between them as a third colour."""
+    """Two-coloured squares, with thin joints as a third colour."""
     u, v = (c / scale for c in at.flat(at.position))
     joint = np.minimum(np.abs(u - np.rint(u)), np.abs(v - np.rint(v))) < 0.03
     return np.where(joint, 2, (np.floor(u) + np.floor(v)).astype(np.int64) % 2)
@@ -57,8 +57,8 @@ def bricks(at: Surface, scale: float) -> np.ndarray:
 
 
 def cabin(at: Surface, scale: float) -> np.ndarray:
-    """Bricks with a framed pane of glass on every upright face and a streak of light in it."""
-    h, v = at.flat(at.unit)
+    """Bricks with a framed pane of glass and a streak of light on every upright face."""
+    h, v = at.flat(at.relative)
     upright = np.abs(at.normal[:, 2]) < 0.5
     frame = upright & (np.abs(h - 0.5) < 0.42) & (v > 0.32) & (v < 0.96)
     glass = upright & (np.abs(h - 0.5) < 0.35) & (v > 0.38) & (v < 0.90)
@@ -74,7 +74,7 @@ def slanted(at: Surface, scale: float) -> np.ndarray:
 
 
 def rings(at: Surface, scale: float) -> np.ndarray:
-    """Bands along x, which widen where the part stretches."""
+    """Bands along x, which widen as the part stretches."""
     return np.floor(at.position[:, 0] / scale).astype(np.int64) % 2
 
 
@@ -99,10 +99,10 @@ def beach(at: Surface, scale: float) -> np.ndarray:
 
 
 def mosaic(at: Surface, scale: float) -> np.ndarray:
-    """Squares of four colours in an order that never repeats, with a fifth for the joints."""
+    """Squares of four colours in an order that never repeats, with joints as a fifth colour."""
     u, v = (c / scale for c in at.flat(at.position))
     joint = np.minimum(np.abs(u - np.rint(u)), np.abs(v - np.rint(v))) < 0.04
-    # Large odd factors scatter neighbours; a product's low bits least, so high ones are folded in.
+    # Large odd factors scatter neighbours, but the low bits of a product least: fold the high ones in.
     mixed = (np.floor(u).astype(np.int64) * 374761393 + np.floor(v).astype(np.int64) * 668265263) & 0xFFFFFFFF
     mixed = ((mixed ^ (mixed >> 13)) * 1274126177) & 0xFFFFFFFF
     return np.where(joint, 4, (mixed ^ (mixed >> 16)) % 4)

@@ -1,4 +1,4 @@
-"""A toy excavator of bricks, a ball beside it and the slab under both: meshes and colours."""
+"""A toy excavator of bricks, a ball and the slab under both: meshes and colours."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ WARNING = Material("slanted", (YELLOW, CHARCOAL), 0.10)
 
 
 def vehicle() -> list[Part]:
-    """All parts, the slab under it and the ball beside it."""
+    """Make all parts, the slab below and the ball beside."""
     return _ground() + _chassis() + _arm() + _ball()
 
 
@@ -128,13 +128,13 @@ def _arm() -> list[Part]:
 
 
 def _upright(outline, half: float, at: float = 0.0) -> Mesh:
-    """A counter-clockwise outline in (x, z), thickened to ``half`` on either side of y = ``at``."""
-    # A prism along y reads its outline as (z, x), which mirrors it, so the order is turned as well.
+    """Thicken a counter-clockwise outline in (x, z) to ``half`` on either side of y = ``at``."""
+    # A prism along y reads its outline as (z, x), which mirrors it, so the order is reversed too.
     return prism([(z, x) for x, z in reversed(outline)], at - half, at + half, axis=1)
 
 
 def _bucket() -> Mesh:
-    """An open scoop hung by its back at the origin: a bent shell between two cheeks, teeth on its lip."""
+    """Make an open scoop that hangs by its back at the origin: a bent shell, two cheeks, teeth on its lip."""
     angle = np.radians(np.linspace(95, 300, 13))
     rim = np.stack([0.105 + 0.15 * np.cos(angle), -0.10 + 0.15 * np.sin(angle)], -1)
     along = np.array([np.cos(np.pi / 6), np.sin(np.pi / 6)])

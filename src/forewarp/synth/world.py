@@ -1,4 +1,4 @@
-"""What is seen: a subject, perhaps in a room, as one mesh that moves."""
+"""A subject, perhaps in a room, as one moving mesh."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from forewarp.synth.vehicle import vehicle
 
 
 class World:
-    """Everything in the scene as one mesh of fixed topology, moved by ``motion``.
+    """Everything in the scene as one mesh of fixed topology that moves by ``motion``.
 
     ``faces`` (F, 3) index the vertices of ``place``; ``part_of_face`` (F,) indexes ``parts``; ``rest``
-    (V, 3) are coordinates in each part's rest frame, by which it is coloured.
+    (V, 3) are coordinates in each part's rest frame, from which colours are computed.
 
     Args:
-        motion: a name in ``motions.MOTIONS``, of the vehicle, or in ``specimens.SPECIMENS``.
-        has_room: put a room around it, which never moves.
+        motion: a name in ``motions.MOTIONS`` (the vehicle) or in ``specimens.SPECIMENS``.
+        has_room: put a static room around the subject.
     """
 
     def __init__(self, motion: str = "lift_tilt", has_room: bool = False):
@@ -37,11 +37,11 @@ class World:
         self.casts = np.array([p.casts for p in self.parts])[self.part_of_face]
 
     def place(self, time: float) -> np.ndarray:
-        """World positions (V, 3) float64 of every vertex at any ``time`` in [0, 1]."""
+        """Place every vertex at any ``time`` in [0, 1]: world positions (V, 3) float64."""
         at = self.joints(time)
         return np.concatenate([p.vertices @ at[p.joint][:3, :3].T + at[p.joint][:3, 3] for p in self.parts])
 
     def points(self, faces: np.ndarray, barycentric: np.ndarray, time: float) -> np.ndarray:
-        """World positions (N, 3) at ``time`` of surface points given as (faces (N,), barycentric (N, 3))."""
+        """Place surface points, given as faces (N,) and barycentric (N, 3), at ``time``: (N, 3)."""
         corners = self.place(time)[self.faces[faces]]  # (N, 3, 3)
         return np.einsum("nc,ncd->nd", barycentric, corners)

@@ -1,1 +1,1 @@
-"""The objective, the Lightning module, the stages and what one sees of them."""
+"""Train a method: objective, schedules, the Lightning module, stages, checkpoints, what is shown."""

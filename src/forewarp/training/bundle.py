@@ -1,4 +1,4 @@
-"""A step put into a file: all that it takes to take it again, without the data."""
+"""A step in a file: all that is needed to repeat it without the dataset."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from forewarp.scene.camera import Camera
 from forewarp.scene.frame import Frame, Scene
 from forewarp.scene.lens import Lens
 from forewarp.scene.view import Moment, View
-from forewarp.training.archive import read_archive, write_archive
+from forewarp.training.checkpoints import read_archive, write_archive
 from forewarp.training.module import DynamicSceneModule
 
 _OF_CAMERA = ("width", "height", "fx", "fy", "cx", "cy", "camera_to_world", "near", "far", "skew")
@@ -22,9 +22,15 @@ _KINDS = {"state_dict": dict, "config": str, "noted": dict}
 
 @dataclass(frozen=True)
 class Bundle:
-    """A stored step: the ``batch``, a ``scene`` whose frames have no pixels, the stage's ``state_dict``, the
-    run's ``config`` as YAML, and what else was ``noted``: ``found``, ``stage``, ``step`` and ``random``
-    (states of the generators before the step).
+    """A stored step.
+
+    Attributes:
+        batch: the step's batch.
+        scene: cameras, times and box; its frames have no images.
+        state_dict: state of the stage's module.
+        config: the run's config, as YAML.
+        noted: ``found`` (what is not finite), ``stage``, ``step`` and ``random`` (the states of the random
+            generators before the step).
     """
 
     batch: Batch
@@ -35,10 +41,10 @@ class Bundle:
 
 
 def write_bundle(path: Path, module: DynamicSceneModule, batch: Batch, scene: Scene, noted: dict) -> None:
-    """Write a step, whole or not at all; ``path`` lies in ``<run>/<stage>/broken``.
+    """Write a step as a whole file; ``path`` lies in ``<run>/<stage>/broken``.
 
     Raises:
-        OSError: naming the file, where it cannot be written.
+        OSError: naming the file, if it cannot be written.
     """
     config = path.parents[2] / "config.yaml"
     content = {
@@ -55,7 +61,7 @@ def read_bundle(path: Path) -> Bundle:
     """Read what ``write_bundle`` wrote; nothing in the file is executed.
 
     Raises:
-        ValueError: where it is no such file.
+        ValueError: in one line, if the file is no such step.
     """
     try:
         content = read_archive(path)
@@ -66,7 +72,7 @@ def read_bundle(path: Path) -> Bundle:
         return bundle
     except OSError:
         raise
-    except Exception as error:  # cameras and boxes refuse in their own ways
+    except Exception as error:  # cameras and boxes raise errors of their own
         detail = (str(error).splitlines() or [""])[0][:80]
         raise ValueError(
             f"{path}: expected a step that a run left in broken/, but got {type(error).__name__} ({detail})"
@@ -74,7 +80,7 @@ def read_bundle(path: Path) -> Bundle:
 
 
 def _check(bundle: Bundle) -> None:
-    """Raise where a part is not what ``write_bundle`` puts there, naming it."""
+    """Raise, naming the part, unless every part is of the kind that ``write_bundle`` writes."""
     noted, batch = bundle.noted, bundle.batch
     for name, kind in _KINDS.items():
         if not isinstance(getattr(bundle, name), kind):

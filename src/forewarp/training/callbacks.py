@@ -1,4 +1,7 @@
-"""What one sees of a stage while it is trained: a progress line and TensorBoard's curves."""
+"""What is shown of a stage during training: a progress line and TensorBoard's curves.
+
+``StageProgress`` stands in for Lightning's bars: they count batches, know no minutes and need a terminal.
+"""
 
 from __future__ import annotations
 
@@ -9,21 +12,21 @@ from collections import defaultdict
 import lightning
 from lightning.pytorch.loggers import TensorBoardLogger
 
-from forewarp.training.progress import ProgressLine, time_text
+from forewarp.progress import ProgressLine, time_text
 
-_SMOOTHING = 0.02  # share of the newest step in the PSNR shown: about the last 50 count
+_SMOOTHING = 0.02  # weight of the newest step in the PSNR shown: a mean over about 50 steps
 
 
 class StageProgress(lightning.Callback):
-    """A progress bar; where stderr is no terminal, a line every ``every`` seconds.
+    """Show a progress bar with the time left, or a line now and then if stderr is no terminal.
 
     Args:
-        refresh: seconds between two drawings in a terminal.
-        every: seconds between two lines elsewhere.
+        refresh: seconds between two drawings of the bar.
+        every: seconds between two lines.
 
-    ``later`` may be set: the seconds that the stages after this one may take, for the time left of all.
+    Set ``later`` to the seconds that the following stages may take, to show the time left of all stages.
 
-    Cost: a step pays for a look at the clock; a drawing takes about a millisecond.
+    Cost: a step reads the clock; a drawing takes about a millisecond.
     """
 
     def __init__(self, *, refresh: float = 0.25, every: float = 10.0) -> None:
@@ -32,14 +35,14 @@ class StageProgress(lightning.Callback):
         self._line: ProgressLine | None = None
 
     def on_train_start(self, trainer, module) -> None:
-        """Begin a line for this stage."""
+        """Begin the line of this stage."""
         self._line = ProgressLine(module.settings.name, refresh=self.refresh, every=self.every)
         self._psnr, self._seen, self._speed = 0.0, 0.0, None
         self._since = time.perf_counter(), module.global_step
 
     def on_train_batch_end(self, trainer, module, outputs, batch, batch_idx) -> None:
-        """Follow the PSNR; show where it is time."""
-        if math.isfinite(module.last["psnr"]):  # else the step was skipped
+        """Update the mean PSNR; draw if it is time."""
+        if math.isfinite(module.last["psnr"]):  # not finite in a skipped step
             self._psnr += _SMOOTHING * (module.last["psnr"] - self._psnr)
             self._seen += _SMOOTHING * (1 - self._seen)
         if self._line.due():
@@ -51,11 +54,11 @@ class StageProgress(lightning.Callback):
                 self._line.show(fraction, left, whole + self._text(module))
 
     def on_train_end(self, trainer, module) -> None:
-        """Leave the last values behind."""
+        """Leave a last line with the final values."""
         self._close(module)
 
     def on_exception(self, trainer, module, exception) -> None:
-        """Leave the terminal as it was."""
+        """Restore the terminal."""
         self._close(module)
 
     def _close(self, module) -> None:
@@ -82,9 +85,9 @@ class StageProgress(lightning.Callback):
 
 
 class TensorBoardScalars(lightning.Callback):
-    """Logs the means over the last ``every`` steps: loss, each raw term, PSNR, rates and counts.
+    """Log the means over the last ``every`` steps: loss, unweighted terms, PSNR, learning rates and counts.
 
-    Keys: ``train/<value>`` for all in ``module.last``, ``lr/<kind>``.
+    Keys: ``train/<name>`` for all values in ``module.last``, ``lr/<parameter group>``.
     """
 
     def __init__(self, *, every: int = 20) -> None:
@@ -94,14 +97,14 @@ class TensorBoardScalars(lightning.Callback):
         self._values: dict[str, list[float]] = defaultdict(list)
 
     def on_train_batch_end(self, trainer, module, outputs, batch, batch_idx) -> None:
-        """Remember the step's values; log them where it is time."""
+        """Collect the values of the step; log their means if it is time."""
         for name, value in module.last.items():
             self._values[name].append(value)
         if module.global_step % self.every == 0:
             self._log(trainer, module)
 
     def on_train_end(self, trainer, module) -> None:
-        """Log what is left."""
+        """Log the means of the remaining steps."""
         if self._values:
             self._log(trainer, module)
 

@@ -1,4 +1,4 @@
-"""The training clock: counts training only."""
+"""The training clock, which counts training only."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ import torch
 
 
 def now() -> float:
-    """Seconds from an arbitrary beginning, once a GPU has finished what it was told to do."""
+    """Return a time in seconds, after waiting for the GPU to finish its work."""
     if torch.cuda.is_initialized():
         torch.cuda.synchronize()
     return time.perf_counter()
 
 
 class Clock:
-    """Seconds spent training, over interruptions; ``paused()`` leaves out what is not training."""
+    """Count the seconds of training across interruptions; leave out what runs inside ``paused()``."""
 
     def __init__(self) -> None:
         self._done = 0.0
@@ -25,12 +25,12 @@ class Clock:
 
     @property
     def seconds(self) -> float:
-        """Training seconds so far; never waits for a GPU, so that it may be looked at in every step."""
+        """Training seconds so far; reading it never waits for a GPU."""
         running = 0.0 if self._since is None else time.perf_counter() - self._since
         return self._done + running
 
     def start(self) -> None:
-        """Count from now."""
+        """Start counting."""
         self._since = now()
 
     def stop(self) -> None:
@@ -40,7 +40,7 @@ class Clock:
 
     @contextmanager
     def paused(self) -> Iterator[None]:
-        """Leave out what runs inside."""
+        """Do not count what runs inside."""
         running = self._since is not None
         self.stop()
         try:
@@ -50,9 +50,9 @@ class Clock:
                 self.start()
 
     def state_dict(self) -> dict:
-        """Seconds so far."""
+        """Return the seconds so far."""
         return {"seconds": self.seconds}
 
     def load_state_dict(self, state: dict) -> None:
-        """Continue from there."""
+        """Continue from a ``state_dict``."""
         self._done, self._since = float(state["seconds"]), None

@@ -1,42 +1,33 @@
-"""What a stage hands to the next, as files of its folder."""
+"""The handover: what a stage leaves to the next, as files in its folder."""
 
 from __future__ import annotations
 
-import json
 import math
-import os
 from pathlib import Path
 
 import torch
 
+from forewarp.files import read_json, write_json
 from forewarp.methods.abilities import HasBounds, HasMatter, HasTrajectories
 from forewarp.methods.method import Method
 from forewarp.scene.box import Box
 from forewarp.scene.cloud import Cloud, Handover
 from forewarp.scene.frame import Scene, spread
-from forewarp.training.archive import read_archive, write_archive
+from forewarp.training.checkpoints import read_archive, write_archive
 
-MOST_BYTES = 1 << 26  # of a file that is read whole
 NUMBERS, POINTS = "handover.json", "handover.pt"
-_POINTS, _TIMES = 10_000, 16  # at most, of the cloud and of its paths
-
-
-def write_json(path: Path, content: dict) -> None:
-    """Write beside, then rename, so that half a file is never taken for one."""
-    beside = path.with_name(path.name + ".part")
-    beside.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
-    os.replace(beside, path)
+_POINTS, _TIMES = 10_000, 16  # at most this many points of the cloud, and times of their paths
 
 
 @torch.no_grad()
 def make_handover(method: Method, scene: Scene, before: Handover | None, frames_in_play: int) -> Handover:
-    """Gather what a fitted stage leaves, as far as its method can tell.
+    """Gather what a fitted stage leaves: its box, and points with colours and paths if the method has them.
 
     Args:
         method: fitted.
-        scene: what it was fitted to.
-        before: what the stage began with; None: the first.
-        frames_in_play: at its end.
+        scene: the scene that the method was fitted to.
+        before: the handover that the stage began with; None for the first stage.
+        frames_in_play: at the stage's end.
     """
     times = list(scene.times)
     box = method.bounds(times) if isinstance(method, HasBounds) else None
@@ -57,7 +48,7 @@ def make_handover(method: Method, scene: Scene, before: Handover | None, frames_
 
 
 def save_handover(handover: Handover, folder: Path) -> None:
-    """Write ``handover.pt`` (points), where there are any, then ``handover.json`` (numbers)."""
+    """Write ``handover.pt`` (points, if there are any), then ``handover.json`` (numbers)."""
     cloud = handover.cloud
     if cloud is not None:
         tensors = {"points": cloud.points, "colors": cloud.colors, "opacity": cloud.opacity}
@@ -79,7 +70,7 @@ def load_handover(folder: Path) -> Handover:
     """Read what ``save_handover`` wrote.
 
     Raises:
-        ValueError: where it is something else.
+        ValueError: naming the file that is missing, damaged, or something else.
     """
     path = folder / NUMBERS
     try:
@@ -106,12 +97,3 @@ def _points(content: dict, size: float) -> tuple:
     if not good or not 0 < size < math.inf:
         raise ValueError
     return Cloud(points, colors, opacity, size), times, paths
-
-
-def read_json(path: Path) -> dict | None:
-    """The object that a file of a run holds; None where there is no file, or none that is whole."""
-    try:
-        content = json.loads(path.read_text()) if path.stat().st_size <= MOST_BYTES else None
-    except (FileNotFoundError, NotADirectoryError, ValueError, RecursionError):
-        return None
-    return content if isinstance(content, dict) else None

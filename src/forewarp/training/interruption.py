@@ -1,4 +1,4 @@
-"""Ctrl-C while a stage is trained: the step is ended and kept before the run stops."""
+"""Ctrl-C during training: finish the step and save it before the run stops."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from contextlib import suppress
 
 
 class Interruption:
-    """A context in which the first Ctrl-C only sets ``asked``; the next one stops at once, as outside.
+    """A context in which the first Ctrl-C only sets ``asked``; a second one stops the process at once.
 
-    Whoever sees to signals in another way, or ignores them, is left alone: nothing is done then, nor in
-    another thread than the first, where Python hands no signals to.
+    Do nothing if the program handles or ignores Ctrl-C itself, or in a thread other than the main one,
+    which receives no signals.
     """
 
     def __init__(self) -> None:
@@ -20,17 +20,17 @@ class Interruption:
     def __enter__(self) -> Interruption:
         self._installed = False
         if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-            with suppress(ValueError):  # of another thread
+            with suppress(ValueError):  # raised in another thread
                 signal.signal(signal.SIGINT, self._ask)
                 self._installed = True
         return self
 
     def __exit__(self, *error) -> None:
-        if self._installed:  # Lightning may have put one of its own in its place
+        if self._installed:  # Lightning may have replaced it
             signal.signal(signal.SIGINT, signal.default_int_handler)
 
     def _ask(self, number, frame) -> None:
         signal.signal(signal.SIGINT, signal.default_int_handler)
         self.asked = True
-        with suppress(OSError, RuntimeError):  # it may come in the middle of another print
+        with suppress(OSError, RuntimeError):  # it may interrupt another print
             print("\nends this step and saves it; Ctrl-C again stops at once", file=sys.stderr, flush=True)

@@ -1,4 +1,4 @@
-"""The LightningModule: a method, of which it knows the contract alone, and the step that trains it."""
+"""The LightningModule: one training step of any method, through the contract of ``Method`` alone."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from forewarp.scene.batch import Batch, Target
 from forewarp.scene.camera import Camera
 from forewarp.scene.view import Moment, Rendering, View
 from forewarp.training.clock import Clock
-from forewarp.training.curriculum import Curriculum
 from forewarp.training.objective import Objective, total
-from forewarp.training.settings import StageSettings
+from forewarp.training.schedule import Curriculum, StageSettings
 
 
 class DynamicSceneModule(lightning.LightningModule):
-    """One stage of one scene.
+    """Train a method for one stage of one scene.
 
     Args:
-        method: what is learned. Of the paper's method ``module.method`` has ``radiance``, ``motion``,
-            ``inpainter`` and ``renderer``.
-        objective: the weights of its terms.
-        settings: the stage's numbers.
-        curriculum: which frames are in play.
-        seed: of what a method draws while it learns.
+        method: the scene to learn; the paper's has ``radiance``, ``motion``, ``inpainter`` and ``renderer``.
+        objective: the weights of its loss terms.
+        settings: the numbers of the stage.
+        curriculum: draws the frame of every step.
+        seed: seed of the random numbers that the method draws.
+
+    ``last`` holds the values of the last step, by the names under which they are logged.
     """
 
     def __init__(
@@ -52,11 +52,11 @@ class DynamicSceneModule(lightning.LightningModule):
 
     @property
     def fraction(self) -> float:
-        """How much of the stage is done."""
+        """Fraction of the stage that is done, in [0, 1]."""
         return self.settings.fraction(self.global_step, self.clock.seconds)
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        """The loss of one batch."""
+        """Return the loss of one batch: the weighted sum of the method's terms."""
         factors = self.objective.factors(self.global_step)
         step = self.look(batch, factors)
         loss, raw = total(
@@ -66,12 +66,13 @@ class DynamicSceneModule(lightning.LightningModule):
         return loss
 
     def look(self, batch: Batch, factors: Mapping[str, float]) -> Step:
-        """What the method makes of a batch."""
+        """Let the method compare itself with a batch."""
         return self.method.look(batch, factors, self.generator)
 
     def validation_step(self, target: Target, batch_idx: int) -> Tensor:
-        """PSNR of one whole image; logged as ``val/psnr``, the mean over images. For ``trainer.validate``:
-        a run does not stop for it, ``TensorBoardPictures`` logs the curve.
+        """Log the PSNR of one whole image as ``val/psnr``, for ``trainer.validate``.
+
+        A run does not pause to validate: its curve ``val/psnr`` comes from ``TensorBoardPictures``.
         """
         psnr = self.psnr_of(target)
         self.log("val/psnr", psnr, batch_size=1, prog_bar=True)
@@ -89,58 +90,58 @@ class DynamicSceneModule(lightning.LightningModule):
         } | {f"loss/{name}": float(value) for name, value in raw.items()}
 
     def on_fit_start(self) -> None:
-        """Let the data follow the curriculum, and give what the method asks for."""
+        """Let the curriculum pick the frames, and the method say what a batch holds."""
         self.trainer.datamodule.picker = self.curriculum
         self.trainer.datamodule.asks = self.method.asks
 
     def on_train_start(self) -> None:
-        """Start the training clock, once all is ready: compiling kernels is not training."""
+        """Compile the kernels, then start the training clock."""
         self.method.warm_up()
-        if self._torch_state is not None:  # last, so that nothing above has drawn in between
+        if self._torch_state is not None:  # restored last: callbacks may have drawn random numbers
             torch.set_rng_state(self._torch_state)
             self._torch_state = None
         self.clock.start()
 
     def on_train_end(self) -> None:
-        """Stop it."""
+        """Stop the training clock."""
         self.clock.stop()
 
     def on_train_batch_start(self, batch: Batch, batch_idx: int) -> int | None:
-        """Set what depends on the fraction done: rates, and whatever the method's schedule says."""
+        """Set learning rates, curriculum and the method's own schedule; end the stage when it is done."""
         fraction = self.fraction
         if fraction >= 1:
             self.trainer.should_stop = True
             return -1
         self.curriculum.fraction = fraction
         optimizer = self.optimizers().optimizer
-        factor = self.settings.rate_factor(fraction)
+        factor = self.settings.lr_factor(fraction)
         for group in optimizer.param_groups:
-            group["lr"] = group["base_rate"] * factor
+            group["lr"] = group["base_lr"] * factor
         self._noted = self.method.advance(fraction, self.global_step, optimizer)
         return None
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
-        """The method's optimiser, with the stage's rate for each of its groups."""
+        """Make the method's optimiser, with the stage's learning rate for each parameter group."""
         groups = []
         for kind, parameters in self.method.param_groups().items():
-            if kind not in self.settings.rates:
+            if kind not in self.settings.lr:
                 raise ValueError(
-                    f"stage.{self.settings.name}.rates: expected a rate for '{kind}', "
-                    f"but got {sorted(self.settings.rates)}"
+                    f"stage.{self.settings.name}.lr: expected a rate for '{kind}', "
+                    f"but got {sorted(self.settings.lr)}"
                 )
-            rate = float(self.settings.rates[kind])
-            groups.append({"params": parameters, "lr": rate, "base_rate": rate, "name": kind})
+            lr = float(self.settings.lr[kind])
+            groups.append({"params": parameters, "lr": lr, "base_lr": lr, "name": kind})
         return self.method.optimizer(groups)
 
     def configure_gradient_clipping(
         self, optimizer, gradient_clip_val=None, gradient_clip_algorithm=None
     ) -> None:
-        """Clip the gradients' norm where the stage asks for it."""
+        """Clip the gradients' norm to the stage's ``max_gradient``."""
         if self.settings.max_gradient > 0:
             torch.nn.utils.clip_grad_norm_(self.method.parameters(), self.settings.max_gradient)
 
     def on_save_checkpoint(self, checkpoint: dict) -> None:
-        """All that a continued run needs to equal an uninterrupted one."""
+        """Add all that a continued run needs to equal an uninterrupted one to the bit."""
         checkpoint["forewarp"] = {
             "generator": self.generator.get_state(),
             "torch": torch.get_rng_state(),
@@ -149,7 +150,7 @@ class DynamicSceneModule(lightning.LightningModule):
         }
 
     def on_load_checkpoint(self, checkpoint: dict) -> None:
-        """Continue from ``on_save_checkpoint``."""
+        """Restore what ``on_save_checkpoint`` added."""
         state = checkpoint["forewarp"]
         self.generator.set_state(state["generator"])
         self._torch_state = state["torch"]
@@ -158,7 +159,7 @@ class DynamicSceneModule(lightning.LightningModule):
         self.clock.load_state_dict(state["clock"])
 
     def psnr_of(self, target: Target, pixels: Tensor | None = None) -> Tensor:
-        """PSNR (dB) of an image, or of its flat ``pixels`` (R,) alone, by the best rendering."""
+        """Return the PSNR (dB) of the best rendering of an image, or of its flat ``pixels`` (R,) alone."""
         truth = target.rgb.reshape(-1, 3)
         truth = truth if pixels is None else truth[pixels]
         drawn = self.render(View(target.frame.camera, pixels), target.moment, target.background)
@@ -169,7 +170,14 @@ class DynamicSceneModule(lightning.LightningModule):
     def render(
         self, view: View | Camera, moment: Moment, background: Tensor, snapshot: Snapshot | None = None
     ) -> Rendering:
-        """See a view at a moment by the best rendering; a ``snapshot`` of it, handed in, saves making one."""
+        """Render a view at a moment, by the best rendering and without gradient.
+
+        Args:
+            view: a camera, or some of its pixels.
+            moment: the time, and the frame and camera where known.
+            background: colour (3,) or (R, 3) behind everything.
+            snapshot: a snapshot of this moment, if already made.
+        """
         view = view if isinstance(view, View) else View(view)
         snapshot = snapshot or self.method.at(moment)
         return snapshot.render(view, background.to(self.device))

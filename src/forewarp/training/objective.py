@@ -1,4 +1,4 @@
-"""The weighted sum of a method's terms. The only place where a weight is compared with 0."""
+"""The objective: the weighted sum of a method's loss terms. No other module checks weights for 0."""
 
 from __future__ import annotations
 
@@ -14,10 +14,13 @@ class Objective:
     """``loss = sum_i w_i term_i``; a term of weight 0 is never called.
 
     Args:
-        weights: term -> weight; terms not named have weight 0. Which there are is the method's to say.
-        every: term -> n: evaluated each n-th step with n times the weight.
-        literal: terms in the printed form where a method has another by default.
-        photo_on: renderings that the per-ray terms look at, where a method has several; null: all.
+        weights: weight by term, of the method's ``terms``; terms not named have weight 0.
+        every: ``{term: n}`` evaluates a term at each n-th step only, with n times its weight.
+        literal: terms to compute in the form printed in the paper, where the default differs.
+        photo_on: renderings that the per-ray terms compare, for a method with several; None: all.
+
+    Raises:
+        ValueError: for an ``every`` that is not a whole number >= 1.
     """
 
     def __init__(
@@ -36,11 +39,11 @@ class Objective:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Every term that is spoken of."""
+        """All terms named in ``weights`` or ``every``."""
         return (*self.weights, *self.every)
 
     def factors(self, number: int) -> dict[str, float]:
-        """The terms that count in step ``number``, with what each is multiplied by."""
+        """Return the factor of each term that counts in step ``number``."""
         found = {}
         for name, weight in self.weights.items():
             every = self.every.get(name, 1)
@@ -50,7 +53,7 @@ class Objective:
 
 
 def parts(step: Step, factors: Mapping[str, float]) -> dict[str, tuple[Tensor, float]]:
-    """Every term of a step that is evaluated, with its factor, by name."""
+    """Evaluate the terms of a step; return value and factor by name, without terms whose effect is off."""
     found = {}
     for name, factor in factors.items():
         if name not in step.terms:
@@ -65,12 +68,15 @@ def parts(step: Step, factors: Mapping[str, float]) -> dict[str, tuple[Tensor, f
 
 
 def total(step: Step, factors: Mapping[str, float], parameters: Mapping[str, Tensor]) -> tuple[Tensor, dict]:
-    """The loss of a step and every term evaluated, raw, by name.
+    """Return the loss of a step, and its unweighted terms by name.
 
     Args:
-        step: what the method made of its batch.
-        factors: of its terms.
-        parameters: by name, for gradients that the method computed itself.
+        step: the method's answer to a batch.
+        factors: factors of the step's terms (see ``Objective.factors``).
+        parameters: by name; needed if the method computed its gradients itself.
+
+    Raises:
+        ValueError: for a term or a gradient that the step should have given.
     """
     loss, raw = torch.zeros(()), {}
     for name, (value, factor) in parts(step, factors).items():
@@ -88,7 +94,7 @@ def total(step: Step, factors: Mapping[str, float], parameters: Mapping[str, Ten
 
 
 class _Given(torch.autograd.Function):
-    """A loss whose gradients are known already."""
+    """Attach gradients that the method computed itself to the loss."""
 
     @staticmethod
     def forward(ctx, loss: Tensor, gradients: tuple[Tensor, ...], *parameters: Tensor) -> Tensor:
@@ -97,6 +103,6 @@ class _Given(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, slope: Tensor) -> tuple:
-        if slope.device.type == "cpu" and float(slope) == 1:  # nobody scales it: no copies
+        if slope.device.type == "cpu" and float(slope) == 1:  # not scaled: no copies
             return None, None, *ctx.gradients
         return None, None, *(slope * gradient for gradient in ctx.gradients)

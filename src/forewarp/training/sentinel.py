@@ -1,4 +1,4 @@
-"""Stops a stage at the first number that is not finite, and keeps what it takes to see that step again."""
+"""The sentinel: stop a stage at the first number that is not finite, and store that step."""
 
 from __future__ import annotations
 
@@ -18,13 +18,17 @@ from forewarp.training.objective import parts
 
 
 class BrokenStep(ValueError):
-    """A step met a number that is not finite."""
+    """A step produced a number that is not finite."""
 
 
 @dataclass(frozen=True)
 class Found:
-    """The first ``tensor`` of a step that is not finite, which ``kind`` of check saw it (``parameter``,
-    ``loss``, ``gradient`` or ``optimizer``) and the ``terms`` of the loss that it is in.
+    """The first number found that is not finite in a step.
+
+    Attributes:
+        kind: the check that failed: ``parameter``, ``loss``, ``gradient`` or ``optimizer``.
+        tensor: name of the first tensor that is not finite.
+        terms: loss terms whose value or gradient is not finite.
     """
 
     kind: str
@@ -36,7 +40,7 @@ class Found:
 
 
 def all_finite(tensors: Iterable[Tensor]) -> bool:
-    """Whether the sum of squares of each tensor is finite.
+    """Check that the sum of squares of each tensor is finite.
 
     Cost: one pass in a few fused calls and one wait for a GPU: 0.4 ms a million floats.
     """
@@ -45,7 +49,7 @@ def all_finite(tensors: Iterable[Tensor]) -> bool:
 
 
 def first_bad(named: Iterable[tuple[str, Tensor | None]], squared: bool = False) -> str | None:
-    """The name of the first tensor with an entry that is not finite, or, where asked, whose square is not."""
+    """Return the name of the first tensor with an entry (or, if ``squared``, a square) that is not finite."""
     for name, tensor in named:
         if tensor is not None and tensor.is_floating_point():
             values = tensor.detach().square() if squared else tensor.detach()
@@ -55,10 +59,10 @@ def first_bad(named: Iterable[tuple[str, Tensor | None]], squared: bool = False)
 
 
 def diagnose(module: DynamicSceneModule, batch: Batch, number: int) -> Found | None:
-    """Take step ``number`` again, as far as its gradients, and find what is not finite; None: all is well.
+    """Repeat step ``number`` up to its gradients and find what is not finite; None if nothing is.
 
-    A gradient counts as broken once its square overflows, since Adam keeps that. The generator of the module
-    must stand where it stood before the step; weights and gradients are left as they are.
+    A gradient counts as broken once its square overflows, as Adam stores squares. Reset the module's
+    generator to its state before the step; weights and gradients do not change.
     """
     parameters = dict(module.method.named_parameters())
     if name := first_bad(parameters.items()):
@@ -89,7 +93,7 @@ def _slopes(value: Tensor, parameters: dict[str, Tensor]) -> dict[str, Tensor | 
 
 
 def _tensors(batch: Batch) -> Iterable[tuple[str, Tensor | None]]:
-    """What a batch brings, each under its name."""
+    """Yield the colours and rays of a batch by name."""
     for number, one in enumerate(batch.observations):
         yield from ((f"batch[{number}].{part}", getattr(one, part)) for part in ("rgb", "background"))
         rays = one.view.rays()
@@ -99,15 +103,18 @@ def _tensors(batch: Batch) -> Iterable[tuple[str, Tensor | None]]:
 
 
 class Sentinel(lightning.Callback):
-    """Looks at every step's loss and gradients, at the parameters every so many steps, and at all of it
-    before a checkpoint is written. What is not finite ends the stage; ``broken/step_<n>.pt`` then holds the
-    step (see ``forewarp.replay``), and the last checkpoint stays as it is.
+    """Check the loss and gradients of every step, the parameters now and then, and all before a checkpoint.
+
+    A number that is not finite ends the stage. The step is stored as ``broken/step_<n>.pt`` (repeat it with
+    ``forewarp.replay``), and the last checkpoint stays as it is.
 
     Args:
-        folder: of the stage.
-        skip: so many bad steps are left out instead: nothing is learned of them, they are counted in
-            ``skipped``, and each leaves its bundle.
-        every: steps between two looks at the parameters, which only broken gradients break.
+        folder: the stage's folder.
+        skip: number of broken steps to skip instead: store each, count it in ``skipped``, learn nothing.
+        every: steps between two checks of the parameters, which only broken gradients can break.
+
+    Raises:
+        ValueError: for a ``skip`` that is not a whole number >= 0.
     """
 
     def __init__(self, folder: Path, *, skip: int = 0, every: int = 10) -> None:
@@ -116,21 +123,21 @@ class Sentinel(lightning.Callback):
         self.folder, self.skip, self.every, self.skipped = Path(folder), skip, every, 0
 
     def on_train_batch_start(self, trainer, module, batch, batch_idx) -> None:
-        """Note where random numbers stand; look at the parameters where it is time."""
+        """Note the states of the random generators; check the parameters if it is time."""
         self._batch, self._number, self._drop = batch, module.global_step, False
         self._random = {"samples": module.generator.get_state(), "torch": torch.get_rng_state()}
         if self._number % self.every == 0:
             self._check_parameters(trainer, module)
 
     def on_before_backward(self, trainer, module, loss) -> None:
-        """Look at the loss."""
+        """Check the loss."""
         if not bool(loss.detach().isfinite()):
             raw = {name: v for name, v in module.last.items() if name.startswith("loss/")}
             terms = (name.removeprefix("loss/") for name, value in raw.items() if not math.isfinite(value))
             self._stop(trainer, module, Found("loss", "the loss", tuple(terms)), may_skip=True)
 
     def on_before_optimizer_step(self, trainer, module, optimizer) -> None:
-        """Look at the gradients; those of a step that is skipped are dropped, and Adam passes over them."""
+        """Check the gradients; drop those of a step to skip, so that Adam does nothing."""
         if not self._drop and not _rescales(trainer):
             named = [(n, p.grad) for n, p in module.method.named_parameters() if p.grad is not None]
             # A norm may overflow where no entry's square does.
@@ -141,7 +148,7 @@ class Sentinel(lightning.Callback):
                 parameter.grad = None
 
     def check(self, trainer: lightning.Trainer) -> None:
-        """Look at all that a checkpoint would hold."""
+        """Check all that a checkpoint would hold."""
         module = trainer.lightning_module
         self._check_parameters(trainer, module)
         names = {id(p): name for name, p in module.method.named_parameters()}
@@ -156,11 +163,11 @@ class Sentinel(lightning.Callback):
             self._stop(trainer, module, Found("optimizer", name))
 
     def state_dict(self) -> dict:
-        """How many steps were skipped."""
+        """Return the number of skipped steps."""
         return {"skipped": self.skipped}
 
     def load_state_dict(self, state: dict) -> None:
-        """Count on."""
+        """Continue the count."""
         self.skipped = int(state["skipped"])
 
     def _check_parameters(self, trainer, module) -> None:
@@ -181,12 +188,14 @@ class Sentinel(lightning.Callback):
         raise BrokenStep(
             f"{stage}: expected finite numbers, but got {found} at step {self._number}, frame {frame} "
             f"(time {batch.time:.4g}); {again}; begin anew with "
-            f"lower {stage}.rates, or go on with resume={self.folder.parent} sentinel.skip=1"
+            f"lower {stage}.lr, or go on with resume={self.folder.parent} sentinel.skip=1"
         )
 
     def _keep(self, trainer, module, seen: Found) -> tuple[str, Path, str | None]:
-        """Repeat the step, which says more than was seen at first, and write the bundle; also why it could
-        not be written.
+        """Repeat the step to find the first broken tensor, and store it.
+
+        Returns:
+            what was found, the file, and why it could not be written (None if it was).
         """
         after = module.generator.get_state()
         module.generator.set_state(self._random["samples"])
@@ -201,11 +210,11 @@ class Sentinel(lightning.Callback):
         noted = {"found": found, "stage": module.settings.name, "step": self._number, "random": self._random}
         try:
             write_bundle(path, module, self._batch, trainer.datamodule.scene, noted)
-        except OSError as error:  # what was found is still said
+        except OSError as error:  # report what was found all the same
             return found, path, error.strerror or str(error)
         return found, path, None
 
 
 def _rescales(trainer: lightning.Trainer) -> bool:
-    """Whether a scaler looks after float16 gradients: it passes over steps that overflow, by design."""
+    """Return whether a float16 gradient scaler is active, which skips overflowing steps by design."""
     return getattr(trainer.precision_plugin, "scaler", None) is not None

@@ -1,4 +1,4 @@
-"""A run: all stages of one scene in one folder. What is finished is not run again, the rest goes on."""
+"""A run: all stages of one scene, in one folder. Finished stages are loaded, unfinished ones continue."""
 
 from __future__ import annotations
 
@@ -9,46 +9,37 @@ from types import SimpleNamespace
 
 import lightning
 
-from forewarp.methods.method import Method, Start, parameter_count
+from forewarp.files import read_json, write_json
+from forewarp.methods.method import Model, Start, parameter_count
 from forewarp.scene.cloud import Handover
 from forewarp.scene.frame import Scene
 from forewarp.training.checkpoints import KeepCheckpoint, check_state, load_weights
-from forewarp.training.curriculum import Curriculum
-from forewarp.training.handover import load_handover, make_handover, read_json, save_handover, write_json
+from forewarp.training.device import peak_memory_bytes, reset_peak_memory
+from forewarp.training.handover import load_handover, make_handover, save_handover
 from forewarp.training.interruption import Interruption
 from forewarp.training.module import DynamicSceneModule
-from forewarp.training.objective import Objective
-from forewarp.training.protocol import peak_memory_bytes, reset_peak_memory
+from forewarp.training.schedule import Curriculum, Stage
 from forewarp.training.sentinel import Sentinel
-from forewarp.training.settings import StageSettings
-
-Model = Callable[[Start], Method]
-
-
-@dataclass(frozen=True)
-class Stage:
-    """A stage's numbers, its objective, and what makes its method; None: what makes the run's."""
-
-    settings: StageSettings
-    objective: Objective
-    model: Model | None = None
 
 
 @dataclass
 class Run:
-    """All stages of one scene.
+    """Train the stages of one scene, one after the other.
+
+    A stage's folder holds ``last.ckpt`` while it is trained. At its end ``handover.json`` (and ``.pt``) and
+    ``done.json`` are added: the stage is then finished and is never trained again.
 
     Args:
         datamodule: serves the scene (``.scene``, ``.picker``, ``.restart``, batches).
-        model: makes the method of a stage.
+        model: makes the method of a stage that names no model of its own.
         stages: in order.
-        folder: where the run lives; a folder a stage.
+        folder: the run's folder, with one folder for each stage.
         make_trainer: ``(stage folder, callbacks) -> lightning.Trainer``.
-        callbacks: ``(stage name, stage folder) -> list`` of what watches a stage.
-        seed: of everything random.
-        checkpoint_seconds: between checkpoints of an unfinished stage.
-        skip: steps of a stage that may be left out for a number that is not finite (see ``Sentinel``).
-        tell: takes a line that says where a stage stands which is not begun anew.
+        callbacks: ``(stage name, stage folder) -> list`` of callbacks to add.
+        seed: seed of all random numbers.
+        checkpoint_seconds: training seconds between two checkpoints.
+        skip: steps per stage that may be skipped because of numbers that are not finite (see ``Sentinel``).
+        tell: called with a line for each stage that is loaded or continued.
     """
 
     datamodule: lightning.LightningDataModule
@@ -62,15 +53,28 @@ class Run:
     skip: int = 0
     tell: Callable[[str], None] = lambda line: None
 
+    def check(self) -> None:
+        """Refuse keys and terms that a stage's method does not know, before anything is read.
+
+        Raises:
+            ValueError: see ``Method.check``.
+        """
+        for stage in self.stages:
+            model = stage.model or self.model
+            check = getattr(getattr(model, "func", model), "check", None)
+            if check is not None:
+                objective = stage.objective
+                check(stage.settings.name, stage.settings.numbers, objective.names, objective.literal)
+
     def fit(self) -> DynamicSceneModule:
-        """Run what is not finished; returns the last stage's module, fitted."""
+        """Train all stages that are not finished; return the module of the last one."""
         self.datamodule.setup("fit")
         self._check_later_stages()
         module, handover = None, None
         for number, stage in enumerate(self.stages):
             folder = self.stage_folder(stage)
             folder.mkdir(parents=True, exist_ok=True)
-            # Every stage draws anew, so that skipping a finished one changes nothing that follows.
+            # Every stage seeds anew, so that loading a finished one changes nothing that follows.
             lightning.seed_everything(self.seed + number, verbose=False)
             self.datamodule.restart(number)
             finished = self.is_finished(stage)
@@ -84,28 +88,11 @@ class Run:
             handover = load_handover(folder)
         return module
 
-    def check(self) -> None:
-        """Refuse what a stage's method does not know, before anything is read; see ``Method.check``."""
-        for stage in self.stages:
-            model = stage.model or self.model
-            check = getattr(getattr(model, "func", model), "check", None)
-            if check is not None:
-                objective = stage.objective
-                check(stage.settings.name, stage.settings.numbers, objective.names, objective.literal)
-
-    def _check_later_stages(self) -> None:
-        """Let what is wrong with a stage be said before the stages before it are trained: a method that
-        waits for a checkpoint is made of its numbers and thrown away.
-        """
-        for number, stage in enumerate(self.stages):
-            if number and not self.is_finished(stage):
-                self._module(stage, None, None, number, blank=True)
-
     def load(self) -> DynamicSceneModule:
-        """The fitted last stage of a finished run.
+        """Load the last stage of a finished run.
 
         Raises:
-            ValueError: where a stage is not finished.
+            ValueError: if a stage is not finished.
         """
         self.datamodule.setup("test")
         for stage in self.stages:
@@ -122,11 +109,11 @@ class Run:
         return module
 
     def stage_folder(self, stage: Stage) -> Path:
-        """Where a stage lives."""
+        """Return the folder of a stage."""
         return Path(self.folder) / stage.settings.name
 
     def is_finished(self, stage: Stage) -> bool:
-        """Whether a stage was fitted to its end, and left all that it should; else it goes on."""
+        """Return whether a stage was trained to its end and has written all its files."""
         folder = self.stage_folder(stage)
         try:
             load_handover(folder)
@@ -135,22 +122,27 @@ class Run:
         return _noted(folder) is not None and (folder / "last.ckpt").is_file()
 
     def finished(self) -> dict[str, dict]:
-        """What finished stages noted at their end, by name: seconds, steps, peak memory and so on."""
+        """Return the contents of ``done.json`` by stage: seconds, steps, peak memory and so on."""
         found = {stage.settings.name: _noted(self.stage_folder(stage)) for stage in self.stages}
         return {name: noted for name, noted in found.items() if noted is not None}
 
     def rebuilt(self, name: str, scene: Scene) -> DynamicSceneModule:
-        """A stage's module for a ``state_dict`` that brings all it has learned: nothing is asked of images or
-        of the stages before.
+        """Build the module of a stage for a ``state_dict``, without images and without earlier stages.
 
         Args:
-            name: of the stage.
-            scene: cameras, times and box.
+            name: name of the stage.
+            scene: cameras, times and box; its frames need no images.
         """
         number, stage = next((i, s) for i, s in enumerate(self.stages) if s.settings.name == name)
         return replace(self, datamodule=SimpleNamespace(scene=scene))._module(
             stage, None, None, number, blank=True
         )
+
+    def _check_later_stages(self) -> None:
+        """Build the later stages once, so that errors in their settings are reported before training."""
+        for number, stage in enumerate(self.stages):
+            if number and not self.is_finished(stage):
+                self._module(stage, None, None, number, blank=True)
 
     def _module(
         self,
@@ -202,7 +194,7 @@ class Run:
         reset_peak_memory()
         with interruption:
             trainer.fit(module, datamodule=self.datamodule, ckpt_path=checkpoint, weights_only=True)
-        if module.fraction < 1:
+        if module.fraction < 1:  # fit returned early, as when a callback stops it: the stage is not finished
             raise KeyboardInterrupt
         keeper.save(trainer)
         in_play = module.curriculum.in_play
@@ -218,11 +210,11 @@ class Run:
                 "skipped_steps": sentinel.skipped,
             },
         )
-        if interruption.asked:  # too late for a step of this stage
+        if interruption.asked:  # pressed after the stage's last step
             raise KeyboardInterrupt
 
 
 def _noted(folder: Path) -> dict | None:
-    """What a stage noted at its end; None where it did not come to it."""
+    """Read a stage's ``done.json``; None if the stage has not ended."""
     noted = read_json(folder / "done.json")
     return noted if noted is not None and {"seconds", "steps"} <= noted.keys() else None

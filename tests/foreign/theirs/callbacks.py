@@ -1,6 +1,5 @@
 """A callback that counts steps, and can interrupt a run as Ctrl-C does."""
 
-import os
 import signal
 from pathlib import Path
 
@@ -18,9 +17,9 @@ class Count(lightning.Callback):
         self.stop_at = stop_at
 
     def on_train_batch_end(self, trainer, module, *_):
-        """Note it, log a number, and perhaps interrupt."""
+        """Note the step, log a number, and interrupt if it is time."""
         Path(trainer.default_root_dir, "steps.txt").write_text(str(module.global_step))
         for logger in trainer.loggers:
             logger.log_metrics({"theirs/step": module.global_step}, module.global_step)
         if module.global_step == self.stop_at:
-            os.kill(os.getpid(), signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)

@@ -7,7 +7,7 @@ from forewarp.methods.voxel.backward_warp import BackwardWarp, Deformation
 from forewarp.renderer import Renderer
 from forewarp.scene.box import Lattice
 from forewarp.scene.view import Moment
-from tiny_scene import BOX, backward_model, built, camera_at
+from tests.support.tiny_scene import BOX, backward_model, built, camera_at
 
 LATTICE = Lattice(BOX, (24, 20, 18))
 
@@ -31,7 +31,7 @@ def moved_by(method, shift):
 
 def picture(method, field):
     with torch.no_grad():
-        return Renderer()(field, camera_at(0.1).rays(), torch.ones(3), method.view).rgb
+        return Renderer()(field, camera_at(0.1).rays(), torch.ones(3), method.view_dependence).rgb
 
 
 def test_it_owns_radiance_and_deformation_only():
@@ -50,7 +50,9 @@ def test_one_time_builds_no_deformation():
     assert torch.equal(method.trajectories(points, torch.rand(2)), points[:, None].expand(4, 2, 3))
 
 
-@pytest.mark.parametrize(("name", "choose"), [("deformation", "model=backward"), ("view", "model/view=none")])
+@pytest.mark.parametrize(
+    ("name", "choose"), [("deformation", "model=backward"), ("view_dependence", "model/view_dependence=none")]
+)
 def test_refuses_a_ghost_of_the_configuration(name, choose):
     given = {"deformation": None, name: {"width": 16}}
     with pytest.raises(
@@ -113,7 +115,9 @@ def test_a_wild_deformation_leaves_finite_values_and_gradients(wild):
 def test_everything_learns():
     method = moved_by(build(), (0.1, 0.0, 0.0))
     field = method.at(Moment(0.9)).fields["backward"]
-    Renderer()(field, camera_at(0.1).rays(), torch.ones(3), method.view).rgb.square().sum().backward()
+    Renderer()(
+        field, camera_at(0.1).rays(), torch.ones(3), method.view_dependence
+    ).rgb.square().sum().backward()
     for parameter in (method.radiance.density, method.radiance.color, method.deformation.network[-1].weight):
         assert parameter.grad.isfinite().all()
         assert parameter.grad.abs().sum() > 0

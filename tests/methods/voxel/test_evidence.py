@@ -1,4 +1,4 @@
-"""What pictures and a coarse stage's motion say, on balls and fields whose answer is known."""
+"""What images, motion and errors of a coarse stage say, where the answer is known."""
 
 from dataclasses import replace
 from functools import partial
@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from forewarp.fields.trajectory import TrajectoryField
+from forewarp.methods.voxel.evidence import Movement, _explained, movement, residual
 from forewarp.ops.dct import dct_basis
 from forewarp.scene.box import Lattice
-from forewarp.methods.voxel.evidence import Movement, movement
 from forewarp.scene.pictures import survey
-from tiny_scene import BOX, ball_scene, built, forward_model
+from tests.support.tiny_scene import BOX, ball_data, ball_scene, built, forward_model, make_run, stage
 
 LATTICE = Lattice(BOX, (12, 9, 8))
 
@@ -21,7 +21,7 @@ def fitted(flow):
     active = torch.zeros(LATTICE.shape, dtype=torch.bool)
     active[3:8, 3:6, 3:6] = True
     model = forward_model(trajectory=partial(TrajectoryField, bases=8, nodes=8, width=16, layers=2))
-    method = built(model, LATTICE, active, unit=0.2, frames=20, effects=("motion",))
+    method = built(model, LATTICE, active, density_scale=0.2, frames=20, effects=("motion",))
     with torch.no_grad():
         method.radiance.parameter("density").fill_(8.0)
     method.motion.flow = lambda voxels, time: flow(LATTICE.to_world(voxels.voxels), time)
@@ -96,3 +96,46 @@ def test_a_wave_needs_its_own_cosine():
     assert found.bases() == 5
     assert found.left_out[4] == pytest.approx(found.left_out[0])
     assert found.left_out[5:] == (0, 0, 0, 0)
+
+
+def samples(views=24, places=30, seed=0):
+    """Return places (P, 3), directions (P, 3) and images (P,); each image sees all places from one side."""
+    generator = torch.Generator().manual_seed(seed)
+    where = torch.rand(places, 3, generator=generator).repeat(views, 1) + 0.01
+    towards = torch.nn.functional.normalize(torch.randn(views, 3, generator=generator), dim=-1)
+    return where, towards.repeat_interleave(places, 0), torch.arange(views).repeat_interleave(places)
+
+
+def test_an_error_linear_in_direction_is_explained():
+    where, towards, views = samples()
+    slope = torch.randn(3, 3, generator=torch.Generator().manual_seed(1))
+    assert _explained(where, towards, towards @ slope, views, 0.05) > 0.6
+
+
+def test_noise_is_not():
+    where, towards, views = samples()
+    noise = torch.randn(len(where), 3, generator=torch.Generator().manual_seed(2))
+    assert _explained(where, towards, noise, views, 0.05) < 0.02
+
+
+def test_an_error_of_the_place_alone_is_not():
+    where, towards, views = samples()
+    assert abs(_explained(where, towards, where.sin(), views, 0.05)) < 0.02
+
+
+def test_what_is_met_nowhere_says_nothing():
+    where, towards, views = samples()
+    assert _explained(where * float("nan"), towards, where, views, 0.05) == 0
+
+
+def test_of_a_fitted_ball(tmp_path):
+    data = ball_data()
+    run = make_run(tmp_path, [stage(iterations=60)], data=data, model=forward_model(view_dependence=None))
+    module = run.fit()
+    targets = [data.targets("train")[i] for i in range(6)]
+    found = residual(module.method, targets, voxel_size=0.05, rays=300)
+    drawn = sum(float(10 ** (-module.psnr_of(target) / 10)) for target in targets) / 6
+    assert abs(10 ** (-found.psnr / 10) / drawn - 1) < 0.3  # from half of the pixels
+    assert found.by_direction < 0.3
+    coarser = residual(module.method, targets, voxel_size=0.4, rays=300)
+    assert coarser.allowed < found.allowed

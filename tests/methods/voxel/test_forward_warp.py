@@ -3,15 +3,15 @@ from functools import partial
 import pytest
 import torch
 
+from forewarp.fields.radiance import FeatureRadiance
 from forewarp.methods.voxel.effects.inpaint import UNet3d
 from forewarp.methods.voxel.effects.upsample import LearnedUpsampler, TrilinearUpsampler
-from forewarp.fields.radiance import FeatureRadiance
 from forewarp.methods.voxel.forward_warp import ForwardWarp
+from forewarp.methods.voxel.stage import EFFECTS
 from forewarp.renderer import Renderer
 from forewarp.scene.box import Lattice
 from forewarp.scene.view import Moment
-from forewarp.methods.voxel.stage import EFFECTS
-from tiny_scene import BOX, built, camera_at, forward_model
+from tests.support.tiny_scene import BOX, built, camera_at, forward_model
 
 LATTICE = Lattice(BOX, (7, 6, 5))
 INPAINTER = partial(UNet3d, width=16, levels=2)
@@ -36,7 +36,7 @@ def picture(method, time, field=-1):
     rays = camera_at(0.1).rays()
     with torch.no_grad():
         fields = list(method.at(Moment(time)).fields.values())
-        return Renderer()(fields[field], rays, torch.ones(3), method.view).rgb
+        return Renderer()(fields[field], rays, torch.ones(3), method.view_dependence).rgb
 
 
 def heads(method):
@@ -44,9 +44,9 @@ def heads(method):
 
 
 def test_effects_that_are_off_own_no_parameters_and_no_buffers():
-    off = build(motion=None, trajectory=None, view=None)
+    off = build(motion=None, trajectory=None, view_dependence=None)
     assert heads(off) == {"radiance"}
-    assert (off.motion, off.upsampler, off.inpainter, off.view) == (None, None, None, None)
+    assert (off.motion, off.upsampler, off.inpainter, off.view_dependence) == (None, None, None, None)
     assert {n for n, _ in off.radiance.named_parameters()} == {"density", "color"}
     full = build(upsampler=partial(LearnedUpsampler, width=8), inpainter=INPAINTER)
     assert heads(full) == {"radiance", "motion", "upsampler", "inpainter"}  # harmonics own nothing
@@ -72,9 +72,9 @@ def test_at_the_canonical_time_the_picture_is_the_unwarped_one(choices):
 
 def test_a_state_holds_what_was_computed():
     state = build().at(Moment(0.9))
-    assert list(state.fields) == ["upsampled"]
+    assert list(state.fields) == ["warped"]
     assert state.flow.shape == (4 * 4 * 3, 3)
-    assert len(state.coverage) == len(state.fields["upsampled"].values)
+    assert len(state.coverage) == len(state.fields["warped"].values)
     assert state.inpaint_difference is None
 
 
@@ -88,7 +88,7 @@ def test_the_inpainter_starts_as_the_identity_to_the_bit(time, upsampler, covera
     inpainter = partial(INPAINTER, coverage_channel=coverage)
     method = build(inpainter=inpainter, upsampler=UPSAMPLERS[upsampler])
     state = method.at(Moment(time))
-    assert list(state.fields) == ["upsampled", "inpainted"]
+    assert list(state.fields) == ["warped" if upsampler == "none" else "upsampled", "inpainted"]
     first, second = state.fields.values()
     assert first.lattice == second.lattice
     assert first.lattice.shape == ((7, 6, 5) if upsampler == "none" else (13, 11, 9))
@@ -110,7 +110,9 @@ def test_every_part_learns():
     method = build(upsampler=UPSAMPLERS["learned"], inpainter=INPAINTER)
     torch.nn.init.normal_(method.upsampler.head.weight)
     state = method.at(Moment(0.9))
-    drawn = Renderer()(state.fields["inpainted"], camera_at(0.1).rays(), torch.ones(3), method.view)
+    drawn = Renderer()(
+        state.fields["inpainted"], camera_at(0.1).rays(), torch.ones(3), method.view_dependence
+    )
     drawn.rgb.square().sum().backward()
     without = {n for n, p in method.named_parameters() if p.grad is None or not p.grad.abs().sum() > 0}
     assert without == set()
@@ -118,9 +120,9 @@ def test_every_part_learns():
 
 
 def test_features_through_a_network_serve_as_well():
-    radiance = partial(FeatureRadiance, alpha_init=1e-2, skip_alpha=0.0, grid_features=3, width=8)
+    radiance = partial(FeatureRadiance, alpha_init=1e-2, alpha_threshold=0.0, grid_features=3, width=8)
     state = build(radiance=radiance).at(Moment(0.9))
-    assert state.fields["upsampled"].values.shape[1] == 13
+    assert state.fields["warped"].values.shape[1] == 13
 
 
 def test_everything_outside_the_box_leaves_an_empty_field():
@@ -128,7 +130,7 @@ def test_everything_outside_the_box_leaves_an_empty_field():
     torch.nn.init.constant_(method.motion.trajectory.network[-1].bias, 100.0)
     state = method.at(Moment(0.9))
     assert state.dropped == 48
-    assert len(state.fields["upsampled"].values) == 0
+    assert len(state.fields["warped"].values) == 0
     assert torch.equal(picture(method, 0.9), torch.ones(24 * 24, 3))
 
 
@@ -141,7 +143,7 @@ def test_paths():
     assert not torch.equal(moving[:, 1], points)
 
 
-@pytest.mark.parametrize("name", ["motion", "upsampler", "inpainter", "view"])
+@pytest.mark.parametrize("name", ["motion", "upsampler", "inpainter", "view_dependence"])
 def test_refuses_a_ghost_of_the_configuration(name):
     with pytest.raises(
         ValueError, match=f"model.{name}: expected a module or null, but got dict; choose model/{name}=none"

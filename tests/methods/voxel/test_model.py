@@ -1,35 +1,48 @@
+"""How a voxel method is built for a stage: from its options, its start, and the stage before."""
+
+from dataclasses import replace
 from functools import partial
 
 import pytest
 import torch
 
+from forewarp.fields.radiance import FeatureRadiance
+from forewarp.fields.trajectory import TrajectoryField
+from forewarp.methods.method import Start, parameter_count
+from forewarp.methods.voxel.backward_warp import Deformation
 from forewarp.methods.voxel.effects.background import StaticBackground
 from forewarp.methods.voxel.effects.inpaint import UNet3d
 from forewarp.methods.voxel.effects.upsample import LearnedUpsampler, TrilinearUpsampler
-from forewarp.methods.voxel.effects.view import ViewNetwork
-from forewarp.fields.radiance import FeatureRadiance
-from forewarp.fields.trajectory import TrajectoryField
-from forewarp.methods.voxel.backward_warp import Deformation
-from forewarp.methods.method import parameter_count
-from forewarp.scene.box import Lattice
+from forewarp.methods.voxel.effects.view_dependence import ViewNetwork
 from forewarp.methods.voxel.stage import EFFECTS
-from tiny_scene import BOX, backward_model, built, forward_model
+from forewarp.scene.box import Lattice
+from forewarp.scene.cloud import Handover
+from forewarp.training.handover import make_handover
+from tests.support.tiny_scene import (
+    BOX,
+    RADIUS,
+    backward_model,
+    ball_center,
+    ball_scene,
+    built,
+    forward_model,
+)
 
 LATTICE = Lattice(BOX, (5, 4, 6))
 
 
 def build(model, effects=EFFECTS, **numbers):
-    still = (LATTICE, torch.ones(LATTICE.shape, dtype=torch.bool))
-    return built(model, LATTICE, still=still, effects=effects, **numbers)
+    static = (LATTICE, torch.ones(LATTICE.shape, dtype=torch.bool))
+    return built(model, LATTICE, static=static, effects=effects, **numbers)
 
 
 FULL = forward_model(
-    radiance=partial(FeatureRadiance, alpha_init=1e-2, skip_alpha=0.0, width=8),
+    radiance=partial(FeatureRadiance, alpha_init=1e-2, alpha_threshold=0.0, width=8),
     trajectory=partial(TrajectoryField, bases=3, nodes=8, features=2),
-    view=ViewNetwork,
+    view_dependence=ViewNetwork,
     upsampler=LearnedUpsampler,
     inpainter=partial(UNet3d, levels=2),
-    background=partial(StaticBackground, features=3, alpha_init=1e-2, skip_alpha=0.0),
+    background=partial(StaticBackground, features=3, alpha_init=1e-2, alpha_threshold=0.0),
 )
 
 
@@ -40,12 +53,12 @@ def test_every_parameter_has_one_kind():
     assert len(listed) == len(set(listed)) == len(list(build(FULL).parameters()))
     direct = build(forward_model()).param_groups()
     assert set(direct) == {"density", "color", "shading", "flow"}
-    backward = backward_model(deformation=Deformation, view=None)
+    backward = backward_model(deformation=Deformation, view_dependence=None)
     assert set(build(backward).param_groups()) == {"density", "color", "flow"}
 
 
 def test_parameter_count():
-    method = build(forward_model(motion=None, trajectory=None, view=None))
+    method = build(forward_model(motion=None, trajectory=None, view_dependence=None))
     assert parameter_count(method) == 5 * 4 * 6 * (1 + 3)
 
 
@@ -75,7 +88,7 @@ def test_one_layer_makes_the_residual_the_inpainters_or_the_up_layers():
 
 
 def test_density_is_measured_in_the_unit():
-    assert build(forward_model()).radiance.activation.unit == 0.3
+    assert build(forward_model()).radiance.activation.density_scale == 0.3
 
 
 def test_backward_takes_none_of_the_forward_effects():
@@ -86,8 +99,16 @@ def test_backward_takes_none_of_the_forward_effects():
 
 
 MODELS = {
-    forward_model: ("radiance", "motion", "trajectory", "upsampler", "inpainter", "view", "background"),
-    backward_model: ("radiance", "view", "background", "deformation"),
+    forward_model: (
+        "radiance",
+        "motion",
+        "trajectory",
+        "upsampler",
+        "inpainter",
+        "view_dependence",
+        "background",
+    ),
+    backward_model: ("radiance", "view_dependence", "background", "deformation"),
 }
 
 
@@ -104,3 +125,147 @@ def test_refuses_half_a_choice():
         backward_model()
     with pytest.raises(ValueError, match="model.trajectory: expected a factory, but got null"):
         forward_model(trajectory=None)
+
+
+SCENE = ball_scene(frames=6, size=16)
+
+
+def fresh(model=None, scene=SCENE, frames=range(6), **numbers):
+    """The method of a first stage."""
+    return (model or forward_model())(
+        Start(scene, "coarse", {"num_voxels": [[0, 1500]]} | numbers, list(frames))
+    )
+
+
+def carried(before, handover, model=None, name="coarse", **numbers):
+    """The method of a stage after another."""
+    numbers = {"num_voxels": [[0, 1500]]} | numbers
+    return (model or forward_model())(Start(SCENE, name, numbers, range(6), handover, before))
+
+
+def left(method):
+    """What a stage of this method leaves where all of the box is full."""
+    return Handover(BOX, True, 6, notes=method.notes())
+
+
+def known(raw=8.0):
+    """A method whose canonical grid is the ball, with some motion."""
+    torch.manual_seed(0)
+    method = fresh()
+    points = method.radiance.lattice.to_world(method.radiance.voxels)
+    inside = (points - ball_center(0.0)).norm(dim=-1) < RADIUS
+    method.radiance.density.data = torch.where(inside, raw, -9.0)[:, None]
+    torch.nn.init.normal_(method.radiance.color)
+    torch.nn.init.normal_(method.motion.trajectory.network[-1].weight, std=1e-3)
+    return method
+
+
+def test_a_fresh_method_starts_faint_everywhere():
+    method = fresh(start_alpha=0.03)
+    lattice = method.radiance.lattice
+    assert method.notes() == {"density_scale": lattice.voxel_size}
+    grid = method.radiance()
+    alpha = grid.activation.alpha(grid.raw_density, lattice.voxel_size)
+    torch.testing.assert_close(alpha, torch.full((lattice.count,), 0.03), rtol=1e-3, atol=0)
+
+
+def test_a_network_starts_faint_as_well():
+    radiance = partial(FeatureRadiance, alpha_init=1e-2, alpha_threshold=0.0, width=4)
+    grid = fresh(forward_model(radiance=radiance), start_alpha=0.03).radiance()
+    alpha = grid.activation.alpha(grid.raw_density, grid.lattice.voxel_size)
+    torch.testing.assert_close(alpha, torch.full_like(alpha, 0.03), rtol=1e-3, atol=0)
+
+
+def test_the_hull_is_where_matter_may_be():
+    method = fresh(start="hull", hull_frames=2, hull_grow=0.1)
+    points = method.radiance.lattice.to_world(method.radiance.voxels)
+    everywhere = method.radiance.lattice.to_world(method.radiance.lattice.all_voxels())
+    ball_now = (everywhere - ball_center(0.0)).norm(dim=-1) < 0.8 * RADIUS
+    assert (method.radiance.index.flatten()[ball_now] >= 0).all()
+    assert len(points) < 0.5 * len(everywhere)
+
+
+def test_the_hull_needs_alpha():
+    scene = replace(SCENE, has_alpha=False)
+    with pytest.raises(
+        ValueError, match="stage.coarse.start: expected box, since the images of 'ball' have no alpha"
+    ):
+        fresh(scene=scene, frames=[0], start="hull")
+
+
+def test_left_to_itself_it_starts_in_the_hull_where_there_is_alpha_and_in_the_box_elsewhere():
+    for scene, start in ((SCENE, "hull"), (replace(SCENE, has_alpha=False), "box")):
+        ours, expected = (fresh(scene=scene, frames=[0, 1], start=s, hull_frames=2) for s in ("auto", start))
+        assert torch.equal(ours.radiance.voxels, expected.radiance.voxels)
+
+
+def test_the_hull_of_a_moment_is_that_of_all_its_views():
+    frames = [replace(frame, time=0.0) for frame in SCENE.train[:3]]
+    scene = replace(SCENE, train=(*frames, *SCENE.train[3:]))
+    one, three = (fresh(scene=scene, frames=range(4), start="hull", hull_frames=n) for n in (1, 3))
+    assert torch.equal(one.radiance.voxels, three.radiance.voxels)
+
+
+def test_what_only_waits_for_a_checkpoint_looks_at_no_picture():
+    def refuse():
+        raise AssertionError("a picture was loaded")
+
+    scene = replace(SCENE, train=tuple(replace(frame, load=refuse) for frame in SCENE.train))
+    blank = Start(
+        scene, "fine", {"num_voxels": [[0, 1500]], "start": "hull"}, range(6), before=None, blank=True
+    )
+    method = forward_model()(blank)
+    assert len(method.radiance.voxels) == method.radiance.lattice.count
+    with pytest.raises(AssertionError, match="a picture was loaded"):
+        fresh(scene=scene, start="hull")
+
+
+def test_carrying_keeps_matter_motion_and_unit():
+    before = known()
+    unit, path = before.radiance.activation.density_scale, before.motion.trajectory.state_dict()
+    handover = make_handover(before, SCENE, None, 6)
+    sigma, at = before.radiance().density, before.radiance.lattice.to_lattice
+    points = ball_center(0.0) + 0.2 * (torch.rand(50, 3) - 0.5)
+    expected = sigma(at(points)).detach()
+    after = carried(before, handover, name="fine", num_voxels=[[0, 4000]])
+    assert after.radiance.lattice.box == handover.box
+    assert after.radiance.activation.density_scale == unit
+    assert after.radiance.lattice.count == pytest.approx(4000, rel=0.2)
+    torch.testing.assert_close(after.radiance().density(after.radiance.lattice.to_lattice(points)), expected)
+    for name, value in after.motion.trajectory.state_dict().items():
+        assert torch.equal(value, path[name])
+
+
+def test_carrying_into_a_stage_with_more_effects():
+    before = fresh(forward_model(view_dependence=None))
+    before.radiance.density.data[:] = 3.0
+    before.radiance.color.data[:] = 0.5
+    after = carried(before, left(before))
+    assert (after.radiance.shading == 0).all()
+    torch.testing.assert_close(after.radiance.color.data, torch.full_like(after.radiance.color, 0.5))
+
+
+def test_carrying_a_network():
+    model = forward_model(radiance=partial(FeatureRadiance, alpha_init=1e-2, alpha_threshold=0.0, width=4))
+    before = fresh(model)
+    torch.nn.init.normal_(before.radiance.network[-1].weight)
+    after = carried(before, left(before), model)
+    for ours, theirs in zip(after.radiance.network.parameters(), before.radiance.network.parameters()):
+        assert torch.equal(ours, theirs)
+
+
+def test_where_nothing_is_carried_the_box_and_the_unit_are_kept():
+    before = known()
+    handover = make_handover(before, SCENE, None, 6)
+    after = carried(before, handover, carry=False)
+    assert after.radiance.lattice.box == handover.box
+    assert after.radiance.activation.density_scale == before.radiance.activation.density_scale
+    assert (after.radiance.density == after.radiance.density[0]).all()
+
+
+def test_after_a_stage_of_another_method_only_its_box_is_used():
+    box = BOX.scaled(0.5)
+    after = carried(torch.nn.Linear(1, 1), Handover(box, True, 6, notes={"particles": 3.0}))
+    assert after.radiance.lattice.box == box
+    assert after.radiance.activation.density_scale == after.radiance.lattice.voxel_size
+    assert (after.radiance.density == after.radiance.density[0]).all()

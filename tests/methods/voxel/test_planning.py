@@ -1,4 +1,4 @@
-"""What evidence and trials come to, and the number that each decision names."""
+"""Decisions from evidence and trials, and the numbers that justify them."""
 
 from dataclasses import replace
 
@@ -6,10 +6,9 @@ import pytest
 
 from forewarp.methods.effect import Asked, Begin, Rival
 from forewarp.methods.voxel import planning as decisions
-from forewarp.methods.voxel.evidence import Movement
+from forewarp.methods.voxel.evidence import Movement, Residual
 from forewarp.methods.voxel.planning import VoxelEvidence, VoxelPlanning
-from forewarp.methods.voxel.residual import Residual
-from forewarp.report.effect import Gain
+from forewarp.report.gain import Gain
 from forewarp.scene.pictures import Pictures
 
 MOVING = VoxelEvidence(
@@ -31,7 +30,7 @@ def with_gains(**gains):
 def test_one_time_needs_no_trial_to_stand_still():
     pictures = replace(MOVING.pictures, times=1)
     found = decisions.of_motion(evidence(pictures=pictures, movement=None), "dct")
-    assert (found.choice, found.on, found.words) == ("none", False, ("model/motion=none",))
+    assert (found.choice, found.on, found.overrides) == ("none", False, ("model/motion=none",))
     assert found.because == "1 time: nothing can be seen to move"
 
 
@@ -64,8 +63,8 @@ def open_questions(found):
 
 
 def test_only_what_is_open_is_tried():
-    assert open_questions(evidence()) == ["view", "inpainter"]
-    assert open_questions(evidence(movement=None)) == ["view"]
+    assert open_questions(evidence()) == ["view_dependence", "inpainter"]
+    assert open_questions(evidence(movement=None)) == ["view_dependence"]
     sure = Residual(psnr=28.0, by_direction=-0.01, allowed=30.0)
     assert open_questions(evidence(movement=None, residual=sure)) == ["upsampler"]
 
@@ -73,7 +72,7 @@ def test_only_what_is_open_is_tried():
 def test_cameras_that_stand_together_see_no_direction():
     narrow = evidence(pictures=replace(MOVING.pictures, spread=6.0))
     assert open_questions(narrow) == ["inpainter"]
-    found = decisions.of_view(replace(narrow, gains={"view": YES}), "sh")
+    found = decisions.of_view(replace(narrow, gains={"view_dependence": YES}), "sh")
     assert (found.choice, found.because) == (
         "none",
         "all cameras lie within 6 degrees: direction is not seen",
@@ -97,11 +96,14 @@ def test_a_background_needs_something_that_moves_before_it():
     assert decisions.of_background(evidence(), True, "grid", []).because.startswith("80% of the pixels")
     assert not decisions.of_background(evidence(), True, "grid", []).on
     found = decisions.of_background(evidence(pictures=bare), True, "grid", start)
-    assert (found.choice, found.words) == ("grid", ("model/background=grid", *start))
+    assert (found.choice, found.overrides) == ("grid", ("model/background=grid", *start))
     still = decisions.of_background(evidence(pictures=bare), False, "grid", start)
-    assert (still.on, still.words) == (False, ("model/background=none", *start))
+    assert (still.on, still.overrides) == (False, ("model/background=none", *start))
     against = replace(with_gains(background=NO), pictures=bare)
-    assert decisions.of_background(against, True, "grid", start).words == ("model/background=none", *start)
+    assert decisions.of_background(against, True, "grid", start).overrides == (
+        "model/background=none",
+        *start,
+    )
 
 
 def test_a_time_makes_dear_effects_dearer_the_shorter_it_is():
@@ -128,15 +130,15 @@ def test_the_price_is_what_fewer_steps_cost_on_the_curve_that_was_seen():
 
 
 def asked(trials=True, **typed):
-    """A run that is planned, with what was typed for it."""
-    stages = {"coarse": {"voxels": [[0, 1000]]}, "fine": {"voxels": [[0, 8000], [0.5, 27000]]}}
+    """Make a run to plan, with overrides that the user typed."""
+    stages = {"coarse": {"num_voxels": [[0, 1000]]}, "fine": {"num_voxels": [[0, 8000], [0.5, 27000]]}}
     on = {effect.name: effect.on for effect in decisions.EFFECTS}
     typed = {key.replace("__", "/"): value for key, value in typed.items()}
     return Asked(stages, {"bases": 10}, typed, on.get, trials)
 
 
 def walk(found, asked, *answers):
-    """The coarse stages that a plan asks for, where its rivals are answered so."""
+    """Return the coarse stages that a plan asks for, given the answers to its rivals."""
     steps, said, heard = VoxelPlanning().coarse(found, asked), [], iter(answers)
     answer = None
     while True:
@@ -156,7 +158,7 @@ def test_coarse_stages_ask_for_cosines_then_motion_then_the_background():
         + ["stage.coarse.start_alpha=1e-2", "stage.coarse.confine=0.0"],
     )
     assert [(r.effect, r.adds) for r in rivals] == [("bases", True), ("motion", False), ("background", False)]
-    assert rivals[0].words == ["preset.bases=20", "stage.coarse.bases=[[0,20]]"]
+    assert rivals[0].overrides == ["preset.bases=20", "stage.coarse.bases=[[0,20]]"]
 
 
 def test_what_stands_still_before_a_background_is_one_field():
@@ -175,14 +177,18 @@ def test_what_is_typed_is_not_asked():
 def test_dear_effects_go_on_the_lattice_that_they_were_tried_on():
     with_it = {effect.name: effect.with_it(asked()) for effect in decisions.EFFECTS}
     coarse = "stage.coarse.effects=[motion,background]"
-    assert with_it["inpainter"] == with_it["upsampler"] == (coarse, "stage.fine.voxels=[[0,8000]]")
-    assert with_it["view"] == (coarse,)
+    assert with_it["inpainter"] == with_it["upsampler"] == (coarse, "stage.fine.num_voxels=[[0,8000]]")
+    assert with_it["view_dependence"] == (coarse,)
     assert with_it["motion"] == ()
 
 
 def test_what_is_typed_overrules():
-    found = with_gains(view=YES)
-    by_hand = {d.effect: d for d in VoxelPlanning().decide(found, asked(model__view="none"))}
-    assert (by_hand["view"].choice, by_hand["view"].on, by_hand["view"].words) == ("none", False, ())
-    assert by_hand["view"].because.startswith("as typed; ")
-    assert {d.effect: d for d in VoxelPlanning().decide(found, asked())}["view"].on
+    found = with_gains(view_dependence=YES)
+    by_hand = {d.effect: d for d in VoxelPlanning().decide(found, asked(model__view_dependence="none"))}
+    assert (
+        by_hand["view_dependence"].choice,
+        by_hand["view_dependence"].on,
+        by_hand["view_dependence"].overrides,
+    ) == ("none", False, ())
+    assert by_hand["view_dependence"].because.startswith("as typed; ")
+    assert {d.effect: d for d in VoxelPlanning().decide(found, asked())}["view_dependence"].on

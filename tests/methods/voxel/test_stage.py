@@ -6,26 +6,26 @@ from forewarp.methods.voxel.stage import VoxelStage
 
 
 def numbers(**changes):
-    return VoxelStage(**({"name": "coarse", "voxels": [[0, 8000]]} | changes))
+    return VoxelStage(**({"name": "coarse", "num_voxels": [[0, 8000]]} | changes))
 
 
 def test_schedules_hold_until_the_next_entry():
-    made = numbers(voxels=[[0, 10], [0.5, 20], [0.75, 30]])
-    assert [made.at("voxels", f) for f in (0, 0.49, 0.5, 0.74, 0.75, 1)] == [10, 10, 20, 20, 30, 30]
+    made = numbers(num_voxels=[[0, 10], [0.5, 20], [0.75, 30]])
+    assert [made.at("num_voxels", f) for f in (0, 0.49, 0.5, 0.74, 0.75, 1)] == [10, 10, 20, 20, 30, 30]
     assert made.at("bases", 0.5) is None
-    assert numbers(voxels=[[0.2, 10]]).at("voxels", 0.0) == 10  # the first holds from the beginning
+    assert numbers(num_voxels=[[0.2, 10]]).at("num_voxels", 0.0) == 10  # the first holds from the beginning
 
 
 @pytest.mark.parametrize(
     ("wrong", "text"),
     [
-        ({"voxels": []}, r"stage.coarse.voxels: expected \[\[fraction, count\], ...\], but got \[\]"),
-        ({"voxels": [[2, 100]]}, "stage.coarse.voxels: expected"),
-        ({"voxels": [[0, 0]]}, "stage.coarse.voxels: expected"),
+        ({"num_voxels": []}, r"stage.coarse.num_voxels: expected \[\[fraction, count\], ...\], but got \[\]"),
+        ({"num_voxels": [[2, 100]]}, "stage.coarse.num_voxels: expected"),
+        ({"num_voxels": [[0, 0]]}, "stage.coarse.num_voxels: expected"),
         ({"bases": [[0, 1, 2]]}, "stage.coarse.bases: expected"),
         (
             {"effects": ["motion", "shine"]},
-            r"stage.coarse.effects: expected some of motion, view, .* got \['motion', 'shine'\]",
+            r"stage.coarse.effects: expected some of motion, view_dependence, .* got \['motion', 'shine'\]",
         ),
         ({"start": "points"}, "stage.coarse.start: expected auto, box or hull, but got 'points'"),
         ({"confine": 1.5}, r"stage.coarse.confine: expected a fraction in \[0, 1\], but got 1.5"),

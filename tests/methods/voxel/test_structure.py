@@ -5,7 +5,6 @@ import torch
 
 from forewarp.fields.radiance import DirectRadiance, FeatureRadiance
 from forewarp.methods.voxel.backward_warp import Deformation
-from forewarp.scene.box import Box, Lattice
 from forewarp.methods.voxel.structure import (
     box_of_all_times,
     occupied,
@@ -14,11 +13,12 @@ from forewarp.methods.voxel.structure import (
     resample,
     seen_rows,
 )
-from tiny_scene import BOX, backward_model, built, forward_model
+from forewarp.scene.box import Box, Lattice
+from tests.support.tiny_scene import BOX, backward_model, built, forward_model
 
 SHAPE = (6, 5, 7)
 LATTICE = Lattice(Box((0, 0, 0), (5, 4, 6)), SHAPE)
-COMMON = {"features": 3, "alpha_init": 1e-2, "unit": 1.0, "skip_alpha": 0.0}
+COMMON = {"features": 3, "alpha_init": 1e-2, "density_scale": 1.0, "alpha_threshold": 0.0}
 SOLID, AIR = 8.0, -9.0
 
 
@@ -90,7 +90,7 @@ def test_refresh_gives_births_to_new_voxels_and_no_moments():
     assert refresh(made, optimizer, keep_alpha=1e-2, birth_alpha=5e-3)
     assert torch.equal(made.index >= 0, around((2, 2, 3)) | around((3, 3, 4)))
     new = torch.tensor([not bool(old[tuple(v)]) for v in made.voxels.tolist()])
-    alpha = made.activation.alpha(made.density[new, 0], LATTICE.pitch)
+    alpha = made.activation.alpha(made.density[new, 0], LATTICE.voxel_size)
     torch.testing.assert_close(alpha, torch.full_like(alpha, 5e-3), rtol=1e-3, atol=0)
     x, y, z = (3, 3, 5)
     neighbours = rows_before[x - 1 : x + 2, y - 1 : y + 2, z - 1 : z + 2].flatten()
@@ -216,7 +216,7 @@ def moving(kind, shift):
     """A method in which everything moves by ``shift`` until time 1."""
     backward = backward_model(deformation=partial(Deformation, width=8, layers=2))
     model = backward if kind == "backward" else forward_model()
-    method = built(model, Lattice(BOX, (12, 9, 8)), unit=0.2, frames=2)
+    method = built(model, Lattice(BOX, (12, 9, 8)), density_scale=0.2, frames=2)
     method.radiance.density.data[:] = AIR
     method.radiance.density.data[method.radiance.index[3, 4, 4].long()] = SOLID
     if kind == "backward":
@@ -231,14 +231,14 @@ def moving(kind, shift):
 def test_the_box_of_all_times_of_a_known_translation(kind):
     method = moving(kind, (0.7, -0.3, 0.0))
     home = method.radiance.lattice.to_world(torch.tensor([3.0, 4.0, 4.0]))
-    pitch = method.radiance.lattice.pitch
+    voxel_size = method.radiance.lattice.voxel_size
     box = box_of_all_times(method, [0.0, 1.0], alpha=1e-2, pad=1.5)
-    low = home + torch.tensor([0.0, -0.3, 0.0]) - 1.5 * pitch
-    high = home + torch.tensor([0.7, 0.0, 0.0]) + 1.5 * pitch
+    low = home + torch.tensor([0.0, -0.3, 0.0]) - 1.5 * voxel_size
+    high = home + torch.tensor([0.7, 0.0, 0.0]) + 1.5 * voxel_size
     assert box.low == pytest.approx(low.tolist(), abs=1e-5)
     assert box.high == pytest.approx(high.tolist(), abs=1e-5)
     still = box_of_all_times(method, [0.0], alpha=1e-2, pad=1.5)
-    assert still.size == pytest.approx([3 * pitch] * 3, abs=1e-5)
+    assert still.size == pytest.approx([3 * voxel_size] * 3, abs=1e-5)
 
 
 def test_nothing_has_no_box():

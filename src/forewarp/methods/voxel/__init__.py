@@ -1,1 +1,1 @@
-"""Canonical matter in voxels, warped forward or backward: the paper's method and its opponent."""
+"""Radiance on a canonical voxel grid, warped forward (the paper's method) or backward (the baseline)."""

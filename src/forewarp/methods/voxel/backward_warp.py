@@ -1,4 +1,4 @@
-"""The opponent: every sample asks a network where it was at the canonical time (as NDVG)."""
+"""Backward warping, the baseline: a network moves every sample to the canonical time (as in NDVG)."""
 
 from __future__ import annotations
 
@@ -10,9 +10,8 @@ from torch import Tensor, nn
 from forewarp.fields.mlp import mlp
 from forewarp.fields.radiance import DirectRadiance
 from forewarp.fields.radiance_grid import RadianceGrid, Shade
-from forewarp.methods.voxel.checks import check_effect
 from forewarp.methods.voxel.effects.background import StaticBackground, Together
-from forewarp.methods.voxel.method import VoxelMethod
+from forewarp.methods.voxel.method import VoxelMethod, check_effect
 from forewarp.methods.voxel.planning import EFFECTS
 from forewarp.methods.voxel.snapshot import VoxelSnapshot
 from forewarp.ops.encode import positional_encoding
@@ -23,14 +22,15 @@ from forewarp.scene.view import Moment
 
 
 class Deformation(nn.Module):
-    """Encoded position and time -> displacement to the canonical time, world units.
+    """The displacement of a point to the canonical time: encoded position and time -> world units.
 
-    It is exactly 0 at the canonical time: the printed opponents add a penalty for that.
+    It is exactly 0 at the canonical time; published methods add a penalty instead.
 
     Args:
         box: normalises positions.
         canonical_time: in [0, 1].
-        width, layers, frequencies, time_frequencies: of the network and its encodings.
+        width, layers: size of the network.
+        frequencies, time_frequencies: octaves of the encodings.
     """
 
     def __init__(
@@ -58,14 +58,14 @@ class Deformation(nn.Module):
         )
         clock = positional_encoding(points.new_tensor([[2 * time - 1]]), self.time_frequencies)
         inputs = torch.cat([position, clock.expand(len(points), -1)], -1)
-        # Fades in over a twentieth of the sequence, so that the field stays continuous in time.
+        # Fade in over a twentieth of the sequence, to be continuous in time.
         gate = min(1.0, abs(time - self.canonical_time) * 20)
         return gate * self.scale * self.network(inputs)
 
 
 @dataclass(frozen=True)
 class MovedField:
-    """A canonical grid read at displaced points."""
+    """The canonical grid, read at points displaced to the canonical time."""
 
     canonical: RadianceGrid
     deformation: Deformation
@@ -74,13 +74,13 @@ class MovedField:
 
     @property
     def lattice(self) -> Lattice:
-        """The canonical lattice; points are given in it."""
+        """The canonical lattice, in whose coordinates points are given."""
         return self.canonical.lattice
 
     @property
-    def pitch(self) -> float:
-        """The canonical lattice's."""
-        return self.canonical.pitch
+    def voxel_size(self) -> float:
+        """Voxel size of the canonical lattice."""
+        return self.canonical.voxel_size
 
     def _moved(self, points: Tensor) -> Tensor:
         displacement = self.deformation(self.lattice.to_world(points), self.time)
@@ -91,29 +91,25 @@ class MovedField:
         return ((points >= 0) & (points <= last)).all(-1)
 
     def density(self, points: Tensor) -> Tensor:
-        """Sigma (P,); 0 where the canonical position lies outside the box."""
+        """Density (P,); 0 where the canonical position lies outside the box."""
         moved = self._moved(points)
         return self.canonical.density(moved) * self._inside(moved.detach())
 
     def colors(self, points: Tensor, directions: Tensor, shade: Shade | None) -> Tensor:
-        """Colour (P, 3), seen along the directions as they are."""
+        """Colour (P, 3); directions are not warped."""
         return self.canonical.colors(self._moved(points), directions, shade)
 
 
 class BackwardWarp(VoxelMethod):
-    """Canonical grid, and a deformation network on the samples.
+    """Backward warping: the canonical grid, read at samples that a deformation network displaces.
 
     Args:
-        radiance: the canonical radiance field.
-        deformation: to the canonical time; None: a static radiance field.
-        view: None: the colour features are the colour.
-        background: as in ``ForwardWarp``.
-        canonical_time: where nothing is displaced.
-        mask_nodes: side of the lattice on which occupancy at a time is looked up.
-        renderer: makes pictures.
+        radiance, canonical_time, view_dependence, background, renderer: as for ``ForwardWarp``.
+        deformation: displaces samples to the canonical time; None: the scene is static.
+        mask_nodes: side of the lattice on which the occupied cells at a time are found.
     """
 
-    effects = tuple(effect for effect in EFFECTS if effect.name in ("view", "background"))
+    effects = tuple(effect for effect in EFFECTS if effect.name in ("view_dependence", "background"))
 
     def __init__(
         self,
@@ -121,34 +117,38 @@ class BackwardWarp(VoxelMethod):
         *,
         canonical_time: float,
         deformation: Deformation | None,
-        view: nn.Module | None = None,
+        view_dependence: nn.Module | None = None,
         background: StaticBackground | None = None,
         mask_nodes: int = 32,
         renderer: Renderer | None = None,
     ) -> None:
         super().__init__(
-            radiance, canonical_time=canonical_time, renderer=renderer, view=view, background=background
+            radiance,
+            canonical_time=canonical_time,
+            renderer=renderer,
+            view_dependence=view_dependence,
+            background=background,
         )
         check_effect("deformation", deformation, "model=backward or another model")
         self.deformation, self.mask_nodes = deformation, mask_nodes
 
     def at(self, moment: Moment) -> VoxelSnapshot:
-        """The moved canonical field, at the canonical time that itself, under the name ``backward``."""
+        """Return the field ``backward``: the displaced one, or the canonical one at the canonical time."""
         canonical = field = self.radiance()
         time = moment.time
         if self.deformation is not None and time != self.canonical_time:
             field = MovedField(canonical, self.deformation, time, self._cells(canonical, time))
-        still = None
+        static = None
         if self.background is not None:
-            still = self.background()
-            field = Together(field, still)
+            static = self.background()
+            field = Together(field, static)
         return VoxelSnapshot(
-            moment, {"backward": field}, canonical, self.renderer, self.view, background=still
+            moment, {"backward": field}, canonical, self.renderer, self.view_dependence, background=static
         )
 
     @torch.no_grad()
     def _cells(self, canonical: RadianceGrid, time: float) -> Tensor:
-        """Cells at ``time`` that the displacement carries near an occupied canonical cell."""
+        """Find the cells at ``time`` that the displacement carries near an occupied canonical cell."""
         source = canonical.cells
         lattice = canonical.lattice
         coarse = Lattice(lattice.box, tuple(min(n, self.mask_nodes) for n in lattice.shape))
@@ -167,11 +167,11 @@ class BackwardWarp(VoxelMethod):
 
     @torch.no_grad()
     def trajectories(self, points: Tensor, times: Tensor) -> Tensor:
-        """Paths (N, T, 3): the inverse of the displacement, by fixed-point iteration."""
+        """Return the paths (N, T, 3): invert the displacement by fixed-point iteration."""
         if self.deformation is None:
             return points[:, None].expand(-1, len(times), -1)
         paths = []
-        # The canonical time, rounded as ``times`` are, is itself: nothing at all is displaced there.
+        # In float32 the canonical time is rounded; it must still displace nothing.
         canonical = times == times.new_tensor(self.canonical_time)
         for time in torch.where(canonical, self.canonical_time, times.double()).tolist():
             at = points.clone()
@@ -181,19 +181,19 @@ class BackwardWarp(VoxelMethod):
         return torch.stack(paths, 1)
 
     def moved(self, points: Tensor, rows: Tensor, time: float) -> Tensor:
-        """Where the voxels ``rows`` (N,) bool, which lie at ``points`` (M, 3), are at ``time`` (M, 3)."""
+        """Move the canonical voxels ``rows`` (N,) bool, at ``points`` (M, 3), to ``time`` (M, 3)."""
         return self.trajectories(points, torch.tensor([time]))[:, 0]
 
     @property
     def moves(self) -> bool:
-        """Whether there is a motion to learn."""
+        """False if the scene is static."""
         return self.deformation is not None
 
     def displacement(self, points: Tensor, time: float) -> Tensor:
-        """From points (N, 3) at ``time`` to where they were at the canonical time (N, 3); differentiable."""
+        """Return the displacement (N, 3) of points at ``time`` to the canonical time; differentiable."""
         return self.deformation(points, time)
 
     @property
-    def unit(self) -> float:
-        """Half the scene's longest side, world units."""
+    def half_extent(self) -> float:
+        """Half the scene's longest side, in world units."""
         return self.deformation.scale

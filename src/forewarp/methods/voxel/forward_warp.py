@@ -1,4 +1,4 @@
-"""The paper's method: a canonical radiance grid warped forward to any time."""
+"""The paper's method: a canonical radiance grid, warped forward along trajectories to any time."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from torch import Tensor, nn
 
 from forewarp.fields.radiance import DirectRadiance, FeatureRadiance
 from forewarp.fields.radiance_grid import RadianceGrid
-from forewarp.methods.voxel.checks import check_effect
 from forewarp.methods.voxel.effects.background import StaticBackground, Together
 from forewarp.methods.voxel.effects.dense import densify, occupied_crop, sparsify
 from forewarp.methods.voxel.effects.inpaint import UNet3d
@@ -18,7 +17,7 @@ from forewarp.methods.voxel.effects.upsample import (
     interpolate_dense,
     refined,
 )
-from forewarp.methods.voxel.method import VoxelMethod
+from forewarp.methods.voxel.method import VoxelMethod, check_effect
 from forewarp.methods.voxel.planning import EFFECTS
 from forewarp.methods.voxel.snapshot import VoxelSnapshot
 from forewarp.renderer import Renderer
@@ -26,17 +25,23 @@ from forewarp.scene.view import Moment
 
 
 class ForwardWarp(VoxelMethod):
-    """Canonical radiance -> flow -> warped -> up-sampled (-> inpainted). An absent effect is None.
+    """Forward warping: canonical radiance -> flow -> warped -> up-sampled (-> inpainted) -> rendered.
+
+    ``at`` is the whole pipeline. Every effect may be None, and is then absent.
 
     Args:
         radiance: the canonical radiance field.
-        motion: trajectories and splat; None: a static radiance field.
-        upsampler: None: rendered at the resolution of the warp.
-        inpainter: None: one rendering instead of two.
-        view: None: the colour features are the colour.
-        background: all that stands still, on a grid of its own; None: a constant colour is behind everything.
-        canonical_time: where no warp is needed.
-        renderer: makes pictures.
+        canonical_time: time of the canonical field, at which nothing is warped.
+        motion: trajectories and the forward splat; None: the scene is static.
+        upsampler: refines the warped grid; None: render at the resolution of the warp.
+        inpainter: fills holes; None: one rendering instead of two.
+        view_dependence: turns features and directions into colour; None: the features are the colour.
+        background: everything static, on a grid of its own; None: a constant background colour.
+        renderer: marches the rays.
+
+    Raises:
+        ValueError: for an effect that is neither a module nor None, or for an up-sampler whose scale is not
+            a whole number beside an inpainter.
     """
 
     effects = EFFECTS
@@ -49,12 +54,16 @@ class ForwardWarp(VoxelMethod):
         motion: Motion | None = None,
         upsampler: TrilinearUpsampler | None = None,
         inpainter: UNet3d | None = None,
-        view: nn.Module | None = None,
+        view_dependence: nn.Module | None = None,
         background: StaticBackground | None = None,
         renderer: Renderer | None = None,
     ) -> None:
         super().__init__(
-            radiance, canonical_time=canonical_time, renderer=renderer, view=view, background=background
+            radiance,
+            canonical_time=canonical_time,
+            renderer=renderer,
+            view_dependence=view_dependence,
+            background=background,
         )
         for name, effect in {"motion": motion, "upsampler": upsampler, "inpainter": inpainter}.items():
             check_effect(name, effect, f"model/{name}=none")
@@ -67,33 +76,38 @@ class ForwardWarp(VoxelMethod):
             )
 
     def at(self, moment: Moment) -> VoxelSnapshot:
-        """The radiance at a moment, under each of its renderings' names, the best last."""
-        canonical = self.radiance()
-        warped, flow, coverage, dropped = canonical, None, None, 0
+        """Warp the canonical radiance to a moment; one field for each rendering, the best last."""
+        canonical = self.radiance()  # V_R = F1
+        warped, flow, coverage, dropped = canonical, None, None, 0  # V_R^t
         if self.motion is not None and moment.time != self.canonical_time:
-            flow = self.motion.flow(self.radiance, moment.time)
+            flow = self.motion.flow(self.radiance, moment.time)  # V_flow
             warped, coverage, dropped = self.motion.warp(canonical, self.radiance.voxels, flow)
         if self.inpainter is None:
-            fields, difference = {"upsampled": self._upsample(warped)}, None
+            fields, difference = {self.first_rendering: self._upsample(warped)}, None  # V_RUp
         else:
-            fields, difference = self._inpaint(warped, coverage)
-        still = None
+            fields, difference = self._inpaint(warped, coverage)  # V_RUp, V_RInp
+        static = None
         if self.background is not None:
-            still = self.background()
-            fields = {name: Together(field, still) for name, field in fields.items()}
+            static = self.background()
+            fields = {name: Together(field, static) for name, field in fields.items()}
         return VoxelSnapshot(
             moment,
             fields,
             canonical,
             self.renderer,
-            self.view,
+            self.view_dependence,
             flow,
             coverage,
             dropped,
             difference,
-            still,
-            length=2 / 3 * self.unit if self.moves else 1.0,
+            static,
+            length=2 / 3 * self.half_extent if self.moves else 1.0,
         )
+
+    @property
+    def first_rendering(self) -> str:
+        """Name of the rendering without inpainting: ``upsampled``, or ``warped`` without an up-sampler."""
+        return "warped" if self.upsampler is None else "upsampled"
 
     def _upsample(self, warped: RadianceGrid) -> RadianceGrid:
         if self.upsampler is None:
@@ -104,6 +118,7 @@ class ForwardWarp(VoxelMethod):
     def _inpaint(
         self, warped: RadianceGrid, coverage: Tensor | None
     ) -> tuple[dict[str, RadianceGrid], Tensor]:
+        """Return the grid before and after inpainting, and their difference, on the occupied box."""
         crop = occupied_crop(warped.index, self.inpainter.margin)
         dense = densify(warped, crop)
         inputs = dense
@@ -126,35 +141,35 @@ class ForwardWarp(VoxelMethod):
                 residual = interpolate_dense(residual, crop, scale)
         upsampled = sparsify(warped, lattice, region, dense)
         inpainted = sparsify(warped, lattice, region, dense + residual)
-        return {"upsampled": upsampled, "inpainted": inpainted}, residual
+        return {self.first_rendering: upsampled, "inpainted": inpainted}, residual
 
     def advance(self, progress: float, step: int, optimizer: torch.optim.Optimizer) -> dict[str, float]:
-        """Let more bases play, and follow the lattices' schedule."""
+        """Follow the schedules of the lattices and of the trajectory bases."""
         noted = super().advance(progress, step, optimizer)
         if self.motion is None:
             return noted
         return noted | {"bases_in_play": self.motion.trajectory.play(self.stage.at("bases", progress))}
 
     def trajectories(self, points: Tensor, times: Tensor) -> Tensor:
-        """Paths (N, T, 3) of canonical points (N, 3) at ``times`` (T,), world units."""
+        """Return the paths (N, T, 3) of canonical points (N, 3) at ``times`` (T,), in world units."""
         if self.motion is None:
             return points[:, None].expand(-1, len(times), -1)
         return self.motion.trajectory.trajectories(points, times)
 
     def moved(self, points: Tensor, rows: Tensor, time: float) -> Tensor:
-        """Where the voxels ``rows`` (N,) bool, which lie at ``points`` (M, 3), are at ``time`` (M, 3)."""
+        """Move the canonical voxels ``rows`` (N,) bool, at ``points`` (M, 3), to ``time`` (M, 3)."""
         return points + self.motion.flow(self.radiance, time)[rows]
 
     @property
     def moves(self) -> bool:
-        """Whether there is a motion to learn."""
+        """False if the scene is static."""
         return self.motion is not None
 
     def displacement(self, points: Tensor, time: float) -> Tensor:
-        """From canonical points (N, 3) to where they are at ``time`` (N, 3), world units; differentiable."""
+        """Return the displacement (N, 3) of canonical points at ``time``, in world units; differentiable."""
         return self.trajectories(points, points.new_tensor([time]))[:, 0] - points
 
     @property
-    def unit(self) -> float:
-        """Half the scene's longest side, world units."""
+    def half_extent(self) -> float:
+        """Half the scene's longest side, in world units."""
         return self.motion.trajectory.scale

@@ -1,4 +1,4 @@
-"""What forward and backward warping share: lattices that follow a schedule, marched rays, loss terms."""
+"""What forward and backward warping share: grids that follow a schedule, ray marching, loss terms."""
 
 from __future__ import annotations
 
@@ -12,12 +12,10 @@ from forewarp.fields.radiance import DirectRadiance, FeatureRadiance
 from forewarp.fields.radiance_grid import Activation, shaded
 from forewarp.fields.voxel_grid import VoxelGrid
 from forewarp.methods.method import Method, Start, Step
-from forewarp.methods.voxel.checks import check_effect
 from forewarp.methods.voxel.effects.background import StaticBackground
-from forewarp.methods.voxel.lattices import Lattices
 from forewarp.methods.voxel.snapshot import VoxelSnapshot
 from forewarp.methods.voxel.stage import VoxelStage
-from forewarp.methods.voxel.structure import box_of_all_times
+from forewarp.methods.voxel.structure import Lattices, box_of_all_times
 from forewarp.methods.voxel.terms import LITERAL, TERMS, Seen, voxel_terms
 from forewarp.ops.grid import neighbour_pairs
 from forewarp.ops.warmup import warm_up
@@ -27,19 +25,19 @@ from forewarp.scene.box import Box
 from forewarp.scene.cloud import Cloud
 from forewarp.scene.paths import RandomPatches
 
-SOLID = 0.1  # opacity over a voxel of what counts as matter
-_STILL = 1024  # points known to stand still that a step looks at
+SOLID = 0.1  # opacity over one voxel above which it counts as matter
+_STATIC_POINTS = 1024  # at most this many points known to be static in a step
 
 
 class VoxelMethod(Method):
-    """A canonical radiance grid, seen at other times by ``at``. An absent effect is None.
+    """A canonical radiance grid that ``at`` warps to other times. An absent effect is None.
 
     Args:
         radiance: the canonical radiance field.
-        canonical_time: where nothing moves.
-        renderer: makes pictures.
-        view: None: the colour features are the colour.
-        background: all that stands still, on a grid of its own; None: a constant colour is behind everything.
+        canonical_time: at which nothing is warped.
+        renderer: marches the rays.
+        view_dependence: turns features and directions into colour; None: the features are the colour.
+        background: everything static, on a grid of its own; None: a constant background colour.
     """
 
     terms, literal = TERMS, LITERAL
@@ -51,29 +49,29 @@ class VoxelMethod(Method):
         *,
         canonical_time: float,
         renderer: Renderer | None = None,
-        view: nn.Module | None = None,
+        view_dependence: nn.Module | None = None,
         background: StaticBackground | None = None,
     ) -> None:
         super().__init__()
-        check_effect("view", view, "model/view=none")
+        check_effect("view_dependence", view_dependence, "model/view_dependence=none")
         check_effect("background", background, "model/background=none")
-        self.radiance, self.view, self.background = radiance, view, background
+        self.radiance, self.view_dependence, self.background = radiance, view_dependence, background
         self.canonical_time, self.renderer = canonical_time, renderer or Renderer()
         self.lattices: Lattices | None = None
 
     def begin(self, start: Start, stage: VoxelStage) -> VoxelMethod:
-        """Make ready for a stage: its schedule, its terms, and what they look at beside pictures."""
+        """Prepare for a stage: its schedule, its loss terms, and what these need beside images."""
         self.stage, self.renderer = stage, self.renderer.with_threshold(stage.color_threshold)
         self.lattices = Lattices(self.radiance, self.background, stage)
         self._terms, self._photo_on = voxel_terms(start.literal), start.photo_on
         self._keep_all_weights = bool({"point_color", "background_entropy"} & set(start.literal))
         cameras = [frame.camera for frame in start.scene.train]
         self.patches = RandomPatches(cameras, patches=stage.patches) if cameras else None
-        self.still, self._pairs = start.scene.still, []
+        self.static_points, self._pairs = start.scene.still, []
         return self
 
     def look(self, batch: Batch, factors: Mapping[str, float], generator: torch.Generator) -> Step:
-        """See ``Method``: all rays of a batch are of one time, and are marched together."""
+        """See ``Method.look``; all rays of a batch have one time and are marched together."""
         seen = self._seen(batch, generator)
         best, state = list(seen.renderings.values())[-1], seen.state
         noted = {
@@ -111,9 +109,15 @@ class VoxelMethod(Method):
         )
 
     def _wanted(self, state: VoxelSnapshot) -> list[str]:
-        """The renderings that the per-ray terms look at: those of ``photo_on``, or all."""
+        """Names of the renderings that the per-ray terms compare: those in ``photo_on``, or all.
+
+        A stage without up-sampler has ``warped`` in the place of ``upsampled``.
+        """
         names = list(state.fields)
-        return [n for n in names if self._photo_on is None or n in self._photo_on] or names
+        if self._photo_on is None:
+            return names
+        known = {"upsampled", "warped"} if {"upsampled", "warped"} & set(self._photo_on) else set()
+        return [n for n in names if n in {*self._photo_on, *known}] or names
 
     def _patches_of(self, state: VoxelSnapshot, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         rays = self.patches.draw(generator).to(self.device)
@@ -123,23 +127,27 @@ class VoxelMethod(Method):
         return drawn.depth.reshape(shape) / (rays.far - rays.near), drawn.opacity.reshape(shape)
 
     def _stray(self, time: float, generator: torch.Generator) -> Tensor | None:
-        """How far some of the points that stand still are displaced (N, 3), in half sides of the scene."""
-        if self.still is None or not self.moves:
+        """Displacement (N, 3) of some of the static points, divided by half the scene's longest side."""
+        if self.static_points is None or not self.moves:
             return None
-        rows = torch.randint(len(self.still), (min(_STILL, len(self.still)),), generator=generator)
-        return self.displacement(self.still[rows].to(self.device), time) / self.unit
+        count = len(self.static_points)
+        rows = torch.randint(count, (min(_STATIC_POINTS, count),), generator=generator)
+        return self.displacement(self.static_points[rows].to(self.device), time) / self.half_extent
 
     def _neighbours(self, index: Tensor) -> list[tuple[Tensor, Tensor]]:
         for known, pairs in self._pairs:
             if known is index:
                 return pairs
         pairs = neighbour_pairs(index)
-        self._pairs = [*self._pairs[-1:], (index, pairs)]  # two grids at most; what changed is forgotten
+        self._pairs = [
+            *self._pairs[-1:],
+            (index, pairs),
+        ]  # of two grids at most; a changed grid replaces the older
         return pairs
 
     def param_groups(self) -> dict[str, list[nn.Parameter]]:
-        """Name rates: ``density``, ``color``, ``shading`` and ``grid`` (rows of voxel grids), ``flow`` (the
-        trajectory or deformation network), ``network`` (all other networks).
+        """Group parameters: ``density``, ``color``, ``shading`` and ``grid`` (rows of voxel grids), ``flow``
+        (the trajectory or deformation network) and ``network`` (all other networks).
         """
         groups: dict[str, list[nn.Parameter]] = {}
         for name, parameter in self.named_parameters():
@@ -156,62 +164,79 @@ class VoxelMethod(Method):
         return groups
 
     def advance(self, progress: float, step: int, optimizer: torch.optim.Optimizer) -> dict[str, float]:
-        """Follow the lattices' schedule."""
+        """Follow the schedule of the lattices."""
         self.lattices.follow(progress, step, optimizer)
         return {}
 
     def warm_up(self) -> None:
-        """Compile the kernels that marching and splatting use."""
+        """Compile the kernels."""
         warm_up(self.device)
 
     def bounds(self, times: list[float]) -> Box | None:
-        """Bound everything more opaque than the stage's ``box_alpha``, two voxels wider."""
+        """Bound all matter more opaque than the stage's ``box_alpha``, with a margin of two voxels."""
         return box_of_all_times(self, times, alpha=self.stage.box_alpha, pad=2.0)
 
     @torch.no_grad()
     def matter(self) -> Cloud:
-        """Give the centres of solid canonical voxels; a colour is the mean of those seen from six sides."""
+        """Return the centres of solid canonical voxels; their colours are means over six directions."""
         grid = self.radiance()
-        alpha = grid.activation.alpha(grid.raw_density, grid.lattice.pitch)
+        alpha = grid.activation.alpha(grid.raw_density, grid.lattice.voxel_size)
         solid = alpha > SOLID
         points = grid.lattice.to_world(self.radiance.voxels[solid])
         towards = torch.cat([torch.eye(3), -torch.eye(3)]).to(grid.values)
-        colors = sum(shaded(grid.color[solid], d.expand(len(points), 3), self.view) for d in towards) / 6
-        return Cloud(points, colors, alpha[solid], grid.lattice.pitch)
+        colors = (
+            sum(shaded(grid.color[solid], d.expand(len(points), 3), self.view_dependence) for d in towards)
+            / 6
+        )
+        return Cloud(points, colors, alpha[solid], grid.lattice.voxel_size)
 
     def notes(self) -> dict[str, float]:
-        """Tell the unit of density."""
-        return {"unit": self.radiance.activation.unit}
+        """Pass on the length that density is measured in."""
+        return {"density_scale": self.radiance.activation.density_scale}
 
     @property
     def size(self) -> tuple[str, int]:
-        """Active voxels."""
+        """Number of active voxels."""
         return "voxels", len(self.radiance.voxels)
 
     def grids(self) -> dict[str, VoxelGrid]:
-        """Every voxel grid by its place in the ``state_dict``."""
+        """Return all voxel grids by their names in ``state_dict``."""
         return {name: part for name, part in self.named_modules() if isinstance(part, VoxelGrid)}
 
     def adopted(self) -> set[str]:
-        """Voxel grids take a checkpoint's lattices."""
+        """Let voxel grids adopt a checkpoint's lattices."""
         return {
             f"{place}.{name}" for place, g in self.grids().items() for name in ("voxels", "index", *g.names)
         }
 
     def misfit(self, state: Mapping[str, Tensor]) -> str | None:
-        """Name what in a stored grid contradicts its lattice: kernels believe the index."""
+        """Return what in a stored grid contradicts its lattice, as kernels do not check the index."""
         found = ((place, grid.misfit(state, f"{place}.")) for place, grid in self.grids().items())
         return next((f"{place}.{name}" for place, name in found if name is not None), None)
 
     def get_extra_state(self) -> dict:
-        """The unit of density, and where the lattices' schedule stands."""
+        """Return the length that density is measured in, and the state of the lattices' schedule."""
         schedule = {} if self.lattices is None else self.lattices.state_dict()
-        return {"unit": self.radiance.activation.unit, "lattices": schedule}
+        return {"density_scale": self.radiance.activation.density_scale, "lattices": schedule}
 
     def set_extra_state(self, state: dict) -> None:
-        """Adopt a checkpoint's."""
+        """Adopt a checkpoint's state."""
         for grid in (self.radiance, self.background):
             if grid is not None:
-                grid.activation = Activation(grid.activation.shift, float(state["unit"]))
+                grid.activation = Activation(grid.activation.shift, float(state["density_scale"]))
         if self.lattices is not None and state["lattices"]:
             self.lattices.load_state_dict(state["lattices"])
+
+
+def check_effect(name: str, effect: object, choose: str) -> None:
+    """Raise ValueError unless ``effect`` is a module or None: keys of an option that is off leave a dict.
+
+    Args:
+        name: key of the effect in ``model``.
+        effect: what was given.
+        choose: override to suggest.
+    """
+    if effect is not None and not isinstance(effect, nn.Module):
+        raise ValueError(
+            f"model.{name}: expected a module or null, but got {type(effect).__name__}; choose {choose}"
+        )

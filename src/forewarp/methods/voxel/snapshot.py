@@ -1,4 +1,4 @@
-"""What a voxel method computed at one time, and the pictures of it."""
+"""A voxel method at one time: what it computed, and how it is rendered."""
 
 from __future__ import annotations
 
@@ -17,13 +17,21 @@ from forewarp.scene.view import Moment, Rendering, View
 
 @dataclass(frozen=True)
 class VoxelSnapshot(Snapshot):
-    """Everything a voxel method computed at one time.
+    """Everything a voxel method computed at one time; None for what it does not have.
 
-    ``fields`` are what is rendered, by name (``upsampled``, ``inpainted``, ``backward``), the best last;
-    ``flow`` (N, 3) world units from canonical to the moment on the canonical ``index``; ``coverage`` (M,) of
-    the warped voxels; ``dropped`` source voxels that left the box; ``background`` all that stands still. None
-    where a method has no such thing. ``length`` is what the loss measures flow in, world units: a third of
-    the scene's longest side, 1 for the usual box of 3, so that no weight depends on the scene's units.
+    Attributes:
+        moment: the snapshot's moment.
+        fields: what is rendered, by name, the best last: ``warped`` or ``upsampled``, then ``inpainted``;
+            ``backward`` alone for backward warping.
+        canonical: the canonical grid.
+        renderer, shade: how fields are rendered.
+        flow: (N, 3), from each canonical voxel to the moment, world units.
+        coverage: (M,), summed splat weight of each warped voxel.
+        dropped: number of canonical voxels that left the box.
+        inpaint_difference: what the inpainter adds.
+        background: the static grid.
+        length: the losses divide flow by it, so that their weights do not depend on the scene's scale: a
+            third of the scene's longest side, in world units.
     """
 
     moment: Moment
@@ -40,20 +48,20 @@ class VoxelSnapshot(Snapshot):
 
     @property
     def renderings(self) -> Sequence[str]:
-        """The fields' names."""
+        """Names of the fields."""
         return tuple(self.fields)
 
     def render(self, view: View, background: Tensor, rendering: str | None = None) -> Rendering:
-        """See ``Snapshot``; without gradients in chunks of rays, so that a picture may be of any size."""
+        """See ``Snapshot.render``; without gradients in chunks of rays, for images of any size."""
         field = self.fields[rendering or self.renderings[-1]]
         rays = view.rays().to(self.canonical.values.device)
         draw = self.renderer if torch.is_grad_enabled() else self.renderer.picture
         return draw(field, rays, background.to(rays.origins), self.shade)
 
     def march(self, name: str, rays: Rays, background: Tensor, **options):
-        """Render one field along any rays, with what lies along them."""
+        """Render one field along any rays; also return the samples."""
         return self.renderer(self.fields[name], rays, background, self.shade, **options)
 
     def holds(self, moment: Moment) -> bool:
-        """Tell whether it is the same time; which camera looks does not matter."""
+        """Return whether it is the same time; the camera does not matter."""
         return moment.time == self.moment.time

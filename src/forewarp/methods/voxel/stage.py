@@ -1,45 +1,51 @@
-"""The numbers of one stage of a voxel method, checked once."""
+"""The numbers of one stage of a voxel method: its schedules of lattices and bases, its start."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-EFFECTS = ("motion", "view", "upsampler", "inpainter", "background")
+EFFECTS = ("motion", "view_dependence", "upsampler", "inpainter", "background")
 
 
 @dataclass(frozen=True)
 class VoxelStage:
-    """What a stage does with its lattices. Fractions are of the stage.
+    """The numbers of a stage. Fractions are fractions of the stage; opacities are over one voxel.
 
     Args:
-        voxels: ``[[fraction, count], ...]``: from that fraction on, about so many voxels in the box.
-        background_voxels: as ``voxels``, for the static background's grid over the whole scene's box.
-        effects: those of the model's that this stage uses, of ``motion, view, upsampler, inpainter,
-            background``.
-        upsample: plain interpolation by this factor in place of the model's up-sampler; null: the model's.
-        carry: start from the stage before, where that is of voxels too; otherwise only its box is used.
-        start: what is active at the beginning, ``box`` or ``hull`` (needs alpha); ``auto`` is the hull where
-            the images have alpha, else the box.
-        hull_frames: the hull is that of so many frames nearest to the canonical time, and of all that share a
-            time with them; few, or what moves fast is carved away. hull_grow: share of the image's width by
-            which silhouettes are grown, since the scene moves. hull_misses: views that may disagree.
-        refresh_every: steps between updates of the active voxels; 0: never. refresh_from: fraction.
-        keep_alpha, birth_alpha: opacity over a voxel that is kept, and that new voxels start with.
-        confine: fraction up to which voxels are born only where some were active at the start, so that new
-            matter cannot stand in for motion; 0: anywhere.
-        see_steps: once a lattice has stood for so many steps, a refresh, or the next lattice, also forgets
-            voxels that no view has seen since it changed, or since they were born; 0: never.
-        box_alpha: opacity over a voxel of what the next stage's box must hold.
-        start_alpha: opacity over a voxel of the first active voxels.
-        color_threshold: the renderer's in this stage; null: as elsewhere.
-        bases: ``[[fraction, K], ...]``: how many bases play from that fraction on; empty: all.
-        patches: patches a draw for the depth term.
-        name: of the stage, for errors.
+        num_voxels: ``[[fraction, count], ...]``: about ``count`` voxels in the box from ``fraction`` on.
+        background_num_voxels: as ``num_voxels``, for the static background's grid over the scene's box.
+        effects: effects of the model to use in this stage, some of ``motion, view_dependence, upsampler,
+            inpainter, background``.
+        upsample: interpolate by this factor instead of the model's up-sampler; None: use the model's.
+        carry: continue with the grids of the stage before, if it was a voxel method; False: use its box only.
+        start: voxels that are active at first: ``box`` (all), ``hull`` (the visual hull; needs alpha), or
+            ``auto`` (the hull if the images have alpha, else the box).
+        hull_grow: dilate the hull's silhouettes by this share of the image's width, as the scene moves.
+        hull_misses: number of views that may disagree about a voxel of the hull.
+        hull_frames: make the hull from this many frames nearest to the canonical time, and all frames of the
+            same times. With many frames, objects that move fast are carved away.
+        refresh_every: steps between updates of the active voxels; 0: never.
+        refresh_from: fraction from which they are updated.
+        keep_alpha: opacity above which a voxel stays active.
+        birth_alpha: opacity of new voxels, below ``keep_alpha``.
+        confine: fraction up to which new voxels appear only where voxels were active at the start, so that
+            new matter cannot stand in for motion; 0: anywhere.
+        see_steps: once a lattice is this many steps old, also deactivate voxels that no view has seen; 0:
+            never.
+        box_alpha: opacity of the matter that the next stage's box must hold.
+        start_alpha: opacity of the first active voxels.
+        color_threshold: the renderer's threshold in this stage; None: unchanged.
+        bases: ``[[fraction, K], ...]``: use K trajectory bases from ``fraction`` on; empty: all.
+        patches: number of patches that the depth term renders.
+        name: name of the stage, for errors.
+
+    Raises:
+        ValueError: naming the key that is out of range.
     """
 
-    voxels: Sequence[Sequence[float]]
-    background_voxels: Sequence[Sequence[float]] = ((0.0, 262144),)
+    num_voxels: Sequence[Sequence[float]]
+    background_num_voxels: Sequence[Sequence[float]] = ((0.0, 262144),)
     effects: Sequence[str] = EFFECTS
     upsample: float | None = None
     carry: bool = True
@@ -62,7 +68,7 @@ class VoxelStage:
 
     def __post_init__(self) -> None:
         where = f"stage.{self.name}"
-        for key in ("voxels", "background_voxels", "bases"):
+        for key in ("num_voxels", "background_num_voxels", "bases"):
             steps = [tuple(s) for s in getattr(self, key)]
             if (key != "bases" and not steps) or any(
                 len(s) != 2 or not 0 <= s[0] <= 1 or s[1] < 1 for s in steps
@@ -88,7 +94,7 @@ class VoxelStage:
             )
 
     def at(self, key: str, fraction: float) -> float | None:
-        """The value of the schedule ``key`` at a fraction; None where it is empty."""
+        """Return the value of the schedule ``key`` at a fraction; None if it is empty."""
         value = None
         for begin, number in getattr(self, key):
             if fraction >= begin or value is None:

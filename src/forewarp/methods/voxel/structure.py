@@ -1,6 +1,8 @@
-"""How the canonical grid changes while it is trained: which voxels are active, how fine the lattice is."""
+"""How voxel grids change during training: which voxels are active, and how fine the lattice is."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -8,12 +10,74 @@ from torch import Tensor
 from forewarp.fields.radiance_grid import EMPTY
 from forewarp.fields.voxel_grid import VoxelGrid
 from forewarp.methods.rows import renew_parameters
+from forewarp.methods.voxel.stage import VoxelStage
 from forewarp.ops.grid import dilate, trilinear
 from forewarp.scene.box import Box, Lattice
 
 
+@dataclass
+class _Followed:
+    """A grid, the key of its schedule, its present number of voxels and the step at which it got them."""
+
+    grid: VoxelGrid
+    key: str
+    num_voxels: float
+    step: int = 0
+
+
+class Lattices:
+    """Let the canonical grid, and the static background's, follow the schedule of a stage.
+
+    Args:
+        radiance: the canonical grid.
+        background: the static grid, or None.
+        settings: the numbers of the stage.
+    """
+
+    def __init__(self, radiance: VoxelGrid, background: VoxelGrid | None, settings: VoxelStage) -> None:
+        self.settings = settings
+        grids = {"num_voxels": radiance, "background_num_voxels": background}
+        self.followed = [
+            _Followed(grid, key, settings.at(key, 0.0)) for key, grid in grids.items() if grid is not None
+        ]
+        # Voxels that were active at the start; meaningful on the first lattice only.
+        self.home: Tensor = radiance.index >= 0
+
+    def follow(self, fraction: float, step: int, optimizer: torch.optim.Optimizer) -> None:
+        """Resample or refresh the grids that are due at a fraction of the stage."""
+        for followed in self.followed:
+            self._follow(followed, fraction, step, optimizer)
+
+    def _follow(
+        self, followed: _Followed, fraction: float, step: int, optimizer: torch.optim.Optimizer
+    ) -> None:
+        settings, grid = self.settings, followed.grid
+        only_seen = settings.see_steps > 0 and step - followed.step >= settings.see_steps
+        common = {"keep_alpha": settings.keep_alpha, "optimizer": optimizer, "only_seen": only_seen}
+        num_voxels = settings.at(followed.key, fraction)
+        due = settings.refresh_every and step and step % settings.refresh_every == 0
+        if num_voxels != followed.num_voxels:
+            resample(grid, grid.lattice.box, num_voxels, **common)
+            followed.num_voxels, followed.step = num_voxels, step
+        elif due and fraction >= settings.refresh_from:
+            confined = followed.key == "num_voxels" and fraction < settings.confine
+            confined = confined and self.home.shape == grid.lattice.shape
+            allowed = self.home.to(grid.index.device) if confined else None
+            refresh(grid, birth_alpha=settings.birth_alpha, allowed=allowed, **common)
+
+    def state_dict(self) -> dict:
+        """Return all that is needed to continue."""
+        return {"home": self.home, "followed": {f.key: [f.num_voxels, f.step] for f in self.followed}}
+
+    def load_state_dict(self, state: dict) -> None:
+        """Continue from a ``state_dict``."""
+        self.home = state["home"]
+        for followed in self.followed:
+            followed.num_voxels, followed.step = state["followed"][followed.key]
+
+
 def seen_rows(radiance: VoxelGrid, optimizer: torch.optim.Optimizer) -> Tensor:
-    """Voxels (N,) bool whose colour has had a gradient since the moments began: some view has seen them."""
+    """Voxels (N,) bool that some view has seen: their colour has had a gradient since the moments began."""
     name = "color" if "color" in radiance.names else radiance.names[0]
     moments = optimizer.state.get(radiance.parameter(name), {}).get("exp_avg_sq")
     if moments is None:
@@ -22,10 +86,10 @@ def seen_rows(radiance: VoxelGrid, optimizer: torch.optim.Optimizer) -> Tensor:
 
 
 def occupied(radiance: VoxelGrid, keep_alpha: float, seen: Tensor | None = None) -> Tensor:
-    """Voxels (X, Y, Z) bool that are more opaque than ``keep_alpha`` over one voxel, and ``seen`` (N,)."""
+    """Voxels (X, Y, Z) bool with an opacity above ``keep_alpha`` over one voxel that are ``seen`` (N,)."""
     with torch.no_grad():
         grid = radiance()
-    solid = grid.activation.alpha(grid.raw_density, grid.lattice.pitch) > keep_alpha
+    solid = grid.activation.alpha(grid.raw_density, grid.lattice.voxel_size) > keep_alpha
     solid = solid if seen is None else solid & seen
     mask = torch.zeros(grid.lattice.shape, dtype=torch.bool, device=solid.device)
     x, y, z = radiance.voxels[solid].unbind(-1)
@@ -43,20 +107,20 @@ def refresh(
     only_seen: bool = False,
     allowed: Tensor | None = None,
 ) -> bool:
-    """Keep what is occupied and one voxel around it; forget the rest. The optimiser's moments follow.
+    """Activate the occupied voxels and their neighbours, and deactivate all others.
 
-    An empty grid is left as it is, so that a scene which has not begun to appear cannot vanish for good.
+    Leave an empty grid as it is, so that a scene that has not appeared yet can still appear.
 
     Args:
-        radiance: the canonical field; its active set changes in place.
-        optimizer: holds moments by row.
+        radiance: the grid; its active voxels change in place.
+        optimizer: its moments follow the rows.
         keep_alpha: opacity over one voxel above which a voxel is occupied.
-        birth_alpha: what a new voxel starts with; below ``keep_alpha``, or fog spreads.
-        only_seen: also forget what no view has seen since the moments began, the inside of things.
-        allowed: (X, Y, Z) bool, where voxels may be born; None: anywhere.
+        birth_alpha: opacity of a new voxel; below ``keep_alpha``, or fog spreads.
+        only_seen: also deactivate voxels that no view has seen, inside of solid objects.
+        allowed: (X, Y, Z) bool, where voxels may become active; None: anywhere.
 
     Returns:
-        Whether the active set changed.
+        whether the active voxels changed.
     """
     mask = occupied(radiance, keep_alpha, seen_rows(radiance, optimizer) if only_seen else None)
     if not bool(mask.any()):
@@ -74,27 +138,28 @@ def refresh(
 def resample(
     radiance: VoxelGrid,
     box: Box,
-    voxels: float,
+    num_voxels: float,
     *,
     keep_alpha: float,
     optimizer: torch.optim.Optimizer | None = None,
     only_seen: bool = False,
 ) -> None:
-    """Carry the field to a lattice of about ``voxels`` over ``box``; what is occupied is active, dilated.
+    """Resample the grid to a lattice of about ``num_voxels`` over ``box``.
 
-    An empty field becomes active everywhere. The optimiser's moments of the grid start afresh.
+    Activate the occupied voxels and their neighbours; if none is occupied, all. The grid's moments in the
+    optimiser start at 0.
     """
     source = radiance()
-    lattice = Lattice.of_count(box, voxels)
+    lattice = Lattice.of_count(box, num_voxels)
     points = source.lattice.to_lattice(lattice.to_world(lattice.all_voxels(source.values.device)))
     raw = source.values[:, :1].detach()
     if only_seen and optimizer is not None:
         raw = torch.where(seen_rows(radiance, optimizer)[:, None], raw, EMPTY)
     raw = trilinear(raw.contiguous(), source.index, points, source.fill[:1])[:, 0]
     last = torch.tensor(source.lattice.shape, device=points.device) - 1
-    slack = 1e-3  # voxels: rounding must not cut off the border of the same box
+    slack = 1e-3  # in voxels: keep the border of an equal box in spite of rounding
     inside = ((points >= -slack) & (points <= last + slack)).all(-1)
-    solid = (source.activation.alpha(raw, source.lattice.pitch) > keep_alpha) & inside
+    solid = (source.activation.alpha(raw, source.lattice.voxel_size) > keep_alpha) & inside
     mask = dilate(solid.reshape(lattice.shape), 1)
     if not bool(mask.any()):
         mask = torch.ones_like(mask)
@@ -106,12 +171,12 @@ def resample(
 
 @torch.no_grad()
 def box_of_all_times(method, times: list[float], *, alpha: float, pad: float) -> Box | None:
-    """The box around everything more opaque than ``alpha`` at any of ``times``, ``pad`` voxels wider.
+    """Bound all voxels more opaque than ``alpha`` at all ``times``, with a margin of ``pad`` voxels.
 
-    None where nothing is that opaque. Sources that left the box are counted by the warp, not here.
+    Return None if no voxel is that opaque.
     """
     grid = method.radiance()
-    solid = grid.activation.alpha(grid.raw_density, grid.lattice.pitch) > alpha
+    solid = grid.activation.alpha(grid.raw_density, grid.lattice.voxel_size) > alpha
     if not bool(solid.any()):
         return None
     home = grid.lattice.to_world(method.radiance.voxels)[solid]
@@ -119,5 +184,5 @@ def box_of_all_times(method, times: list[float], *, alpha: float, pad: float) ->
     for time in times if method.moves else ():
         at = method.moved(home, solid, time)
         low, high = torch.minimum(low, at.amin(0)), torch.maximum(high, at.amax(0))
-    margin = pad * grid.lattice.pitch  # added first: a flat thing has no box of its own
+    margin = pad * grid.lattice.voxel_size  # added first, as a flat object has no box of its own
     return Box(tuple((low - margin).tolist()), tuple((high + margin).tolist()))

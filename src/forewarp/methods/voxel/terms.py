@@ -1,4 +1,4 @@
-"""The voxel methods' loss terms: which function of ``losses`` sees what."""
+"""The loss terms of the voxel methods: which function of ``losses`` is applied to what."""
 
 from __future__ import annotations
 
@@ -13,15 +13,20 @@ from forewarp.methods.voxel.snapshot import VoxelSnapshot
 from forewarp.renderer import Marched
 
 Pairs = list[tuple[Tensor, Tensor]]
-LITERAL = ("photo", "point_color", "background_entropy")  # terms with a printed form of their own
+LITERAL = ("photo", "point_color", "background_entropy")  # terms whose printed form differs
 
 
 @dataclass(frozen=True)
 class Seen:
-    """What the terms look at: the true colours ``rgb`` (R, 3), the ``state`` at the batch's time and the
-    ``renderings`` of it; ``render_patches`` renders depth and opacity (B, S, S) of patches from random views
-    at this time; ``stray`` gives how far points that stand still are displaced (N, 3), None where none is
-    known; ``neighbours`` gives the pairs of neighbouring voxels of an index.
+    """What the terms are computed from.
+
+    Attributes:
+        rgb: the true colours (R, 3).
+        state: the method at the batch's time.
+        renderings: renderings of the batch's rays, by name.
+        render_patches: renders depth and opacity (B, S, S) of patches from random views at this time.
+        stray: returns the displacement (N, 3) of points known to be static; None if none are known.
+        neighbours: returns the pairs of neighbouring voxels of an index.
     """
 
     rgb: Tensor
@@ -33,16 +38,16 @@ class Seen:
 
     @property
     def pairs(self) -> Pairs:
-        """Neighbouring canonical voxels."""
+        """Pairs of neighbouring canonical voxels."""
         return self.neighbours(self.state.canonical.index)
 
     @property
     def grids(self) -> list[RadianceGrid]:
-        """The canonical grid, and the static background's where there is one."""
+        """The canonical grid, and the static background's if there is one."""
         return [g for g in (self.state.canonical, self.state.background) if g is not None]
 
     def tensors(self) -> Iterable[tuple[str, Tensor | None]]:
-        """Everything that was computed, from the state to the pictures, each under its name."""
+        """Yield everything that was computed, from the grids to the renderings, by name."""
         state = self.state
         for name in ("flow", "coverage", "inpaint_difference"):
             yield f"state.{name}", getattr(state, name)
@@ -63,16 +68,16 @@ def _flow(term: Callable[[Seen, Tensor], Tensor]) -> Term:
     return lambda seen: None if seen.state.flow is None else term(seen, seen.state.flow / seen.state.length)
 
 
-def _still_points(seen: Seen) -> Tensor | None:
+def _static_points(seen: Seen) -> Tensor | None:
     stray = seen.stray()
-    return None if stray is None else losses.still_points(stray)
+    return None if stray is None else losses.static_points(stray)
 
 
 def _moving_opacity(seen: Seen) -> Tensor | None:
     if seen.state.background is None:
         return None
     grid = seen.state.canonical
-    return losses.moving_opacity(grid.activation.alpha(grid.raw_density, grid.lattice.pitch))
+    return losses.moving_opacity(grid.activation.alpha(grid.raw_density, grid.lattice.voxel_size))
 
 
 def _inpaint(seen: Seen) -> Tensor | None:
@@ -81,7 +86,11 @@ def _inpaint(seen: Seen) -> Tensor | None:
 
 
 def voxel_terms(literal: Iterable[str] = ()) -> dict[str, Term]:
-    """Every term by name; those in ``literal`` in the printed form where that differs (see ``losses``)."""
+    """Return all terms by name; those in ``literal`` in the form printed in the paper (see ``losses``).
+
+    Raises:
+        ValueError: for a literal term that has no printed form of its own.
+    """
     literal = frozenset(literal)
     if not literal <= set(LITERAL):
         raise ValueError(
@@ -110,7 +119,7 @@ def voxel_terms(literal: Iterable[str] = ()) -> dict[str, Term]:
         ),
         "tv_flow": _flow(lambda seen, flow: losses.tv_flow(flow, seen.pairs)),
         "tv_depth": lambda seen: losses.tv_depth(*seen.render_patches()),
-        "still_points": _still_points,
+        "static_points": _static_points,
         "moving_opacity": _moving_opacity,
     }
 

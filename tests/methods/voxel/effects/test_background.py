@@ -1,12 +1,12 @@
 import pytest
 import torch
 
+from forewarp.fields.radiance_grid import Activation, RadianceGrid
 from forewarp.methods.voxel.effects.background import StaticBackground, Together, overlapped
 from forewarp.ops.grid import index_of
 from forewarp.renderer import Renderer
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.rays import Rays
-from forewarp.fields.radiance_grid import Activation, RadianceGrid
 
 WIDE = Lattice(Box((-2, -2, -2), (2, 3, 2)), (9, 11, 7))
 SMALL = Lattice(Box((-1, -0.5, -1), (1, 1, 0.7)), (5, 4, 6))
@@ -49,9 +49,11 @@ def test_what_is_thin_and_moves_is_not_stepped_over():
     lattice = Lattice(Box((-0.2, -0.2, -0.2), (0.2, 0.2, 0.2)), (33, 33, 33))
     sheet = torch.cartesian_prod(torch.tensor([16]), torch.arange(33), torch.arange(33))
     values = torch.tensor([[20.0, 0, 0, 0]], dtype=torch.float64).repeat(len(sheet), 1)
-    moving = RadianceGrid(lattice, index_of(sheet, lattice.shape), values, Activation(0.0, lattice.pitch / 9))
+    moving = RadianceGrid(
+        lattice, index_of(sheet, lattice.shape), values, Activation(0.0, lattice.voxel_size / 9)
+    )
     still = grid_on(WIDE, -50.0, (0, 0, 0))
-    assert WIDE.pitch > 30 * lattice.pitch
+    assert WIDE.voxel_size > 30 * lattice.voxel_size
     y, z = torch.rand(2, 200, generator=torch.Generator().manual_seed(2), dtype=torch.float64) * 0.3 - 0.15
     origins = torch.stack([torch.full_like(y, -2.0), y, z], -1)
     directions = torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64).expand(200, 3)
@@ -106,7 +108,7 @@ def test_an_empty_moving_grid_leaves_the_still_one():
         9.0,
     )
     both = Renderer()(Together(empty, still), rays, torch.ones(3, dtype=torch.float64))
-    same = Renderer(step=0.5 * SMALL.pitch / WIDE.pitch)  # the steps of the finer of the two
+    same = Renderer(step=0.5 * SMALL.voxel_size / WIDE.voxel_size)  # the steps of the finer of the two
     alone = same(still, rays, torch.ones(3, dtype=torch.float64))
     torch.testing.assert_close(both.rgb, alone.rgb, atol=1e-5, rtol=0)  # an absent voxel has 1e-6 of opacity
     assert not empty.cells.any()
@@ -139,5 +141,7 @@ def test_gradients_agree_with_finite_differences():
 
 def test_it_is_a_grid_of_four_channels():
     active = torch.ones(WIDE.shape, dtype=torch.bool)
-    background = StaticBackground(WIDE, active, features=3, alpha_init=1e-2, unit=0.3, skip_alpha=0.0)
+    background = StaticBackground(
+        WIDE, active, features=3, alpha_init=1e-2, density_scale=0.3, alpha_threshold=0.0
+    )
     assert sum(p.numel() for p in background.parameters()) == 4 * WIDE.count

@@ -1,9 +1,9 @@
 import pytest
 import torch
 
+from forewarp.fields.radiance_grid import EMPTY, Activation, RadianceGrid
 from forewarp.methods.voxel.effects.dense import Crop, densify, occupied_crop, sparsify
 from forewarp.scene.box import Box, Lattice
-from forewarp.fields.radiance_grid import EMPTY, Activation, RadianceGrid
 
 SHAPE = (5, 6, 7)
 LATTICE = Lattice(Box((0, 0, 0), (4, 5, 6)), SHAPE)

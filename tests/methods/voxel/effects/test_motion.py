@@ -3,11 +3,11 @@ import math
 import pytest
 import torch
 
-from forewarp.methods.voxel.effects.motion import Motion
+from forewarp.fields.radiance_grid import EMPTY, Activation, RadianceGrid
 from forewarp.fields.trajectory import TrajectoryField
+from forewarp.methods.voxel.effects.motion import Motion
 from forewarp.ops.splat import average_splat
 from forewarp.scene.box import Box, Lattice
-from forewarp.fields.radiance_grid import EMPTY, Activation, RadianceGrid
 
 BOX = Box((0, 0, 0), (1, 6, 8))  # spacings 1/2, 2, 2
 LATTICE = Lattice(BOX, (3, 4, 5))
@@ -51,7 +51,7 @@ def test_holes_are_empty_and_not_fog(fade):
     warped, coverage, _ = motion(fade=fade).warp(canonical, LATTICE.all_voxels(), flow)
     padded = torch.cat([warped.raw_density, torch.tensor([EMPTY])])
     opened = padded[warped.index[:, :, 0].long()]
-    fog = 1 - math.exp(-80 * float(warped.activation.sigma(opened).max()) * LATTICE.pitch)
+    fog = 1 - math.exp(-80 * float(warped.activation.sigma(opened).max()) * LATTICE.voxel_size)
     assert fog < 1e-3
     assert warped.raw_density.max() == pytest.approx(6.0, abs=1e-4)
     assert 0 < coverage.min() < 2e-4

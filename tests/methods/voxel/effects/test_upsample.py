@@ -1,6 +1,7 @@
 import pytest
 import torch
 
+from forewarp.fields.radiance_grid import Activation, RadianceGrid
 from forewarp.methods.voxel.effects.dense import densify, occupied_crop, sparsify
 from forewarp.methods.voxel.effects.upsample import (
     LearnedUpsampler,
@@ -9,7 +10,6 @@ from forewarp.methods.voxel.effects.upsample import (
     refined,
 )
 from forewarp.scene.box import Box, Lattice
-from forewarp.fields.radiance_grid import Activation, RadianceGrid
 
 LATTICE = Lattice(Box((0, 0, 0), (2, 3, 4)), (3, 4, 5))
 

@@ -1,1 +1,1 @@
-"""The optional parts of a scene: motion, up-sampling, inpainting, view dependence."""
+"""The effects of the voxel methods: motion, up-sampling, inpainting, view dependence, background."""

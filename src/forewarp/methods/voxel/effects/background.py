@@ -1,4 +1,4 @@
-"""The static background effect: a grid that never moves, marched together with the one that does."""
+"""The static background effect: a second grid that never moves, rendered together with the moving one."""
 
 from __future__ import annotations
 
@@ -15,39 +15,39 @@ from forewarp.scene.box import Lattice
 
 
 class StaticBackground(DirectRadiance):
-    """Density and colour of all that stands still, over the whole scene's box; usually finer than what moves.
+    """Density and colour of everything static, over the whole scene's box; usually the finer grid.
 
-    Arguments as ``DirectRadiance``; its colour has three channels and does not depend on direction.
+    Arguments as for ``DirectRadiance``; the colour has three channels and does not depend on direction.
     """
 
 
 @dataclass(frozen=True)
 class Together:
-    """Two fields in one space: ``sigma = sigma_m + sigma_s``, ``c = (sigma_m c_m + sigma_s c_s) / sigma``.
+    """Two fields in one: ``sigma = sigma_m + sigma_s``, ``c = (sigma_m c_m + sigma_s c_s) / sigma``.
 
-    Points are given in the lattice of ``still``, whose box must hold that of ``moving``.
+    Points are in coordinates of the ``static`` lattice, whose box must contain that of ``moving``.
     """
 
     moving: FieldAtTime
-    still: RadianceGrid
+    static: RadianceGrid
 
     @property
     def lattice(self) -> Lattice:
-        """The static one's."""
-        return self.still.lattice
+        """Lattice of the static grid."""
+        return self.static.lattice
 
     @property
-    def pitch(self) -> float:
-        """Of the two that of the finer, whichever it is: what moves may lie in a small box."""
-        return min(self.moving.pitch, self.still.pitch)
+    def voxel_size(self) -> float:
+        """The smaller of the two voxel sizes."""
+        return min(self.moving.voxel_size, self.static.voxel_size)
 
     @cached_property
     def cells(self) -> Tensor:
-        """Cells in which either may hold matter."""
-        return self.still.cells | overlapped(self.moving.cells, self.moving.lattice, self.lattice)
+        """Cells in which either field may hold matter."""
+        return self.static.cells | overlapped(self.moving.cells, self.moving.lattice, self.lattice)
 
     def _moved(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """The points in the moving field's lattice, and which lie in it."""
+        """Return the points in coordinates of the moving lattice, and which of them lie inside."""
         own = self.moving.lattice.to_lattice(self.lattice.to_world(points))
         last = torch.tensor(self.moving.lattice.shape, device=own.device) - 1
         return own, ((own >= 0) & (own <= last)).all(-1)
@@ -58,32 +58,32 @@ class Together:
         return points.new_zeros(len(points)).index_copy(0, rows, self.moving.density(own[rows]))
 
     def density(self, points: Tensor) -> Tensor:
-        """Sigma (P,)."""
-        return self.still.density(points) + self._moving_density(points)
+        """Density (P,)."""
+        return self.static.density(points) + self._moving_density(points)
 
     def colors(self, points: Tensor, directions: Tensor, shade: Callable | None) -> Tensor:
-        """Colour (P, 3): each field's, weighted by its density."""
+        """Colour (P, 3): the mean of both fields' colours, weighted by density."""
         own, inside = self._moved(points)
         rows = inside.nonzero()[:, 0]
-        still = self.still.colors(points, directions, None)
+        static = self.static.colors(points, directions, None)
         moving = self.moving.colors(own[rows], directions[rows], shade)
         sigma = self.moving.density(own[rows])
-        # Where both are empty neither counts; the floor keeps 0 / 0 out of values and gradients.
-        share = sigma / (sigma + self.still.density(points[rows])).clamp(min=torch.finfo(sigma.dtype).tiny)
-        mixed = torch.lerp(still[rows], moving, share[:, None])
-        return still.index_copy(0, rows, mixed)
+        # The floor avoids 0 / 0 where both fields are empty.
+        share = sigma / (sigma + self.static.density(points[rows])).clamp(min=torch.finfo(sigma.dtype).tiny)
+        mixed = torch.lerp(static[rows], moving, share[:, None])
+        return static.index_copy(0, rows, mixed)
 
 
 def overlapped(cells: Tensor, source: Lattice, target: Lattice) -> Tensor:
-    """Cells of ``target`` that share space with a cell of ``source`` that is True.
+    """Find the cells of lattice ``target`` that overlap a True cell of lattice ``source``.
 
     Args:
-        cells: of ``source`` (X-1, Y-1, Z-1) bool.
+        cells: cells of ``source``, (X-1, Y-1, Z-1) bool.
 
     Returns:
-        of ``target`` (X'-1, Y'-1, Z'-1) bool.
+        cells of ``target``, (X'-1, Y'-1, Z'-1) bool.
 
-    Cost: eight reads a target cell inside the source's box, one running sum of the source's cells.
+    Cost: eight reads per target cell inside the source's box, and one cumulative sum of the source's cells.
     """
     total = torch.nn.functional.pad(cells.int(), (1, 0, 1, 0, 1, 0))
     for axis in range(3):
@@ -106,7 +106,7 @@ def overlapped(cells: Tensor, source: Lattice, target: Lattice) -> Tensor:
 
 
 def _box_counts(total: Tensor, bounds: list[tuple[Tensor, Tensor]]) -> Tensor:
-    """How many are set in every box of ``bounds``, from the running sum over all three axes."""
+    """Count the True cells in every box of ``bounds``, from their cumulative sum over all axes."""
     for axis, (low, high) in enumerate(bounds):
         total = total.index_select(axis, high) - total.index_select(axis, low)
     return total

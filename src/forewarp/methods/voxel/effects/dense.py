@@ -1,4 +1,4 @@
-"""Between sparse lattices and the dense boxes that convolutions need."""
+"""Convert between sparse grids and the dense volumes that convolutions need."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ class Crop:
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """Voxels per axis."""
+        """Number of voxels per axis."""
         return tuple(h - l + 1 for l, h in zip(self.low, self.high))
 
     def scaled(self, scale: int) -> Crop:
-        """The same region of the lattice refined ``scale`` times, its corners on the same points."""
+        """Return the same region on a lattice refined ``scale`` times; its corners do not move."""
         return Crop(tuple(v * scale for v in self.low), tuple(v * scale for v in self.high))
 
 
 def occupied_crop(index: Tensor, margin: int) -> Crop:
-    """The box around the present voxels, ``margin`` wider, at least 2 voxels an axis; all where none is."""
+    """Crop to the present voxels and a ``margin``, at least 2 voxels per axis; all if none is present."""
     present = (index >= 0).nonzero()
     if not len(present):
         return Crop((0, 0, 0), tuple(n - 1 for n in index.shape))
@@ -39,7 +39,7 @@ def occupied_crop(index: Tensor, margin: int) -> Crop:
 
 
 def densify(grid: RadianceGrid, crop: Crop) -> Tensor:
-    """The crop's values (1, 1 + C, x, y, z), absent voxels filled with empty space. Differentiable."""
+    """Return the crop's values (1, 1 + C, x, y, z); absent voxels are empty space. Differentiable."""
     region = tuple(slice(l, h + 1) for l, h in zip(crop.low, crop.high))
     rows = grid.index[region].reshape(-1).long()
     padded = torch.cat([grid.values, grid.fill[None]])
@@ -48,7 +48,7 @@ def densify(grid: RadianceGrid, crop: Crop) -> Tensor:
 
 
 def sparsify(grid: RadianceGrid, lattice: Lattice, crop: Crop, dense: Tensor) -> RadianceGrid:
-    """A grid on ``lattice`` that holds ``dense`` (1, 1 + C, x, y, z) in ``crop`` and is empty elsewhere."""
+    """Make a grid on ``lattice`` with ``dense`` (1, 1 + C, x, y, z) in ``crop`` and nothing elsewhere."""
     index = torch.full(lattice.shape, -1, dtype=torch.int32, device=dense.device)
     count = dense[0, 0].numel()
     rows = torch.arange(count, dtype=torch.int32, device=dense.device).reshape(crop.shape)

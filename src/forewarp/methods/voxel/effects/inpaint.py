@@ -1,4 +1,4 @@
-"""The inpainting effect: a 3D U-Net that fills what the forward warp left open."""
+"""The inpainting effect: a 3D U-Net that fills the holes of the forward warp."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from torch.nn import functional
 class ConvBlock(nn.Module):
     """Instance norm, convolution, ReLU: the paper's convolution layer.
 
-    A volume of one voxel has no statistics, so the norm is left out there. Under autocast one of two voxels'
-    depth stays in float32: oneDNN's bfloat16 gradient of the weights reads memory there that nobody wrote.
+    A single voxel is not normalised, as it has no statistics. Volumes at most 2 voxels deep stay in float32
+    under autocast, as oneDNN's bfloat16 gradient of the weights reads uninitialised memory there.
     """
 
     def __init__(self, inputs: int, outputs: int) -> None:
@@ -22,7 +22,7 @@ class ConvBlock(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """(1, I, x, y, z) -> (1, O, x, y, z)."""
         if x[0, 0].numel() > 1:
-            # Of one volume the same as instance norm, which would put the channels first again.
+            # Equal to instance norm for one volume, and keeps the channels last.
             x = functional.batch_norm(x, None, None, self.norm.weight, self.norm.bias, training=True)
         if x.shape[2] > 2:
             return functional.relu(self.conv(x), inplace=True)
@@ -31,7 +31,7 @@ class ConvBlock(nn.Module):
 
 
 class Pointwise(nn.Conv3d):
-    """A convolution of one voxel: a product of matrices where the channels lie last."""
+    """A 1 x 1 x 1 convolution, as a matrix product over the last channels."""
 
     def __init__(self, inputs: int, outputs: int) -> None:
         super().__init__(inputs, outputs, 1)
@@ -42,7 +42,7 @@ class Pointwise(nn.Conv3d):
 
 
 def zero_head(inputs: int, outputs: int) -> Pointwise:
-    """A layer that says 0 until it has learned."""
+    """Make a pointwise layer that starts as 0."""
     head = Pointwise(inputs, outputs)
     nn.init.zeros_(head.weight)
     nn.init.zeros_(head.bias)
@@ -50,18 +50,18 @@ def zero_head(inputs: int, outputs: int) -> Pointwise:
 
 
 class UNet3d(nn.Module):
-    """The inpainter: 4 encode levels and 3 decode levels, on the occupied box only.
+    """The inpainter: a U-Net with 4 encoder and 3 decoder levels, on the occupied box only.
 
-    It sees the warped grid alone, no time, so that it cannot learn to move things. Its output is features for
-    a learned up-sampler, or, without one, a residual whose layer starts at zero: at first it is the identity.
+    It sees the warped grid but not the time, so that it cannot learn motion. It outputs features for a
+    learned up-sampler, or, without one, a residual that starts as 0.
 
     Args:
         channels: 1 + C of the radiance grid.
-        width: channels of the first level, doubled at each deeper one; a multiple of 16.
-        levels: encode levels.
+        width: channels of the first level, doubled at each further level; a multiple of 16.
+        levels: encoder levels.
         margin: voxels around the occupied box.
-        coverage_channel: also feed the splat's coverage.
-        head: with the layer that makes the residual; a learned up-sampler has its own.
+        coverage_channel: also feed in the splat's coverage.
+        head: own the layer that makes the residual; False for a learned up-sampler, which has one.
     """
 
     def __init__(
@@ -104,11 +104,11 @@ class UNet3d(nn.Module):
             x = block(x)
             skips.append(x)
         for block, skip in zip(self.decode, skips[-2::-1]):
-            # To the skip's size, not by a factor of 2: odd sizes are common.
+            # To the size of the skip, as odd sizes do not double.
             x = functional.interpolate(x, size=skip.shape[2:], mode="nearest")
             x = block(torch.cat([x, skip], 1))
         return x
 
     def residual(self, features: Tensor) -> Tensor:
-        """Features (1, width, x, y, z) -> what to add to the warped grid (1, 1 + C, x, y, z)."""
+        """Features (1, width, x, y, z) -> residual of the warped grid (1, 1 + C, x, y, z)."""
         return self.head(features).to(self.head.weight.dtype)  # half precision ends with the convolutions

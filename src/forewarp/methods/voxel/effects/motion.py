@@ -1,4 +1,4 @@
-"""The motion effect: trajectories, and the forward splat that follows them."""
+"""The motion effect: splat the canonical radiance forward along its trajectories."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from forewarp.ops.splat import Splat, average_splat, with_copies
 
 
 class Motion(nn.Module):
-    """Carries the canonical radiance along its trajectories.
+    """Warp the canonical radiance to any time.
 
     Args:
         trajectory: the canonical trajectory field.
-        tau: least divisor of the splat; bounds its gradient.
-        fade: coverage below which a target voxel fades to empty space, at least ``tau``: below that the
-            averages shrink to 0, which as raw density is fog and not empty space.
-        rest: what moves by less than this, in voxels along each axis, is copied and not splatted. Where a
-            gradient is asked for all is splatted, or what rests at first would never learn to move.
+        tau: lower bound of the splat's divisor; bounds its gradient.
+        fade: coverage below which a voxel fades to empty space. At coverages below ``tau`` averages shrink
+            to 0, and a raw density of 0 is fog.
+        rest: copy voxels that move by less than this many voxels per axis instead of splatting them; only
+            without gradient, or static voxels would never learn to move.
     """
 
     def __init__(
@@ -36,16 +36,20 @@ class Motion(nn.Module):
             )
         self.trajectory, self.tau, self.fade, self.rest = trajectory, tau, fade, rest
 
-    def flow(self, voxels: VoxelGrid, time: float) -> Tensor:
-        """Flow (N, 3) from the canonical time, world units."""
-        return self.trajectory.flow(voxels, time)
+    def flow(self, grid: VoxelGrid, time: float) -> Tensor:
+        """Return the flow (N, 3) of a grid's active voxels from the canonical time, in world units."""
+        return self.trajectory.flow(grid, time)
 
     def warp(self, canonical: RadianceGrid, voxels: Tensor, flow: Tensor) -> tuple[RadianceGrid, Tensor, int]:
-        """Average-splat ``canonical``, whose rows lie at ``voxels`` (N, 3), along ``flow`` (N, 3); what rests
-        is copied.
+        """Average-splat ``canonical`` along a flow.
+
+        Args:
+            canonical: the grid to warp.
+            voxels: (N, 3), positions of its rows on the lattice.
+            flow: (N, 3), world units.
 
         Returns:
-            the warped grid, its coverage (M,), and how many voxels left the box.
+            the warped grid, its coverage (M,), and the number of voxels that left the box.
         """
         splat = self._splat(canonical, voxels, flow / flow.new_tensor(canonical.lattice.spacing))
         share = (splat.coverage / max(self.fade, self.tau)).clamp(max=1.0)[:, None]
@@ -54,7 +58,7 @@ class Motion(nn.Module):
         return replace(canonical, index=splat.index, values=values), splat.coverage, splat.dropped
 
     def _splat(self, canonical: RadianceGrid, voxels: Tensor, flow: Tensor) -> Splat:
-        """Along a flow (N, 3) in voxels."""
+        """Splat along a flow (N, 3) in voxels."""
         values, shape = canonical.values, canonical.lattice.shape
         asks = torch.is_grad_enabled() and (values.requires_grad or flow.requires_grad)
         moves = None if asks or self.rest == 0 else ~(flow.abs() < self.rest).all(-1)

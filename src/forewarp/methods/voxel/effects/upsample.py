@@ -18,12 +18,12 @@ from forewarp.scene.box import Lattice
 
 
 def refined(lattice: Lattice, scale: float) -> Lattice:
-    """The lattice of the same box with spacing divided by ``scale``."""
+    """Return the lattice of the same box with the spacing divided by ``scale``."""
     return Lattice(lattice.box, tuple(max(2, round((n - 1) * scale) + 1) for n in lattice.shape))
 
 
 class TrilinearUpsampler(nn.Module):
-    """Plain interpolation to a lattice ``scale`` times finer, in occupied cells only.
+    """Interpolate to a lattice ``scale`` times finer, in occupied cells only.
 
     Args:
         scale: > 1, not necessarily whole.
@@ -38,9 +38,9 @@ class TrilinearUpsampler(nn.Module):
         self.scale = scale
 
     def forward(self, grid: RadianceGrid) -> RadianceGrid:
-        """The grid on the finer lattice; differentiable in its values.
+        """Return the grid on the finer lattice; differentiable in its values.
 
-        Cost: one trilinear read a fine voxel in occupied cells.
+        Cost: one trilinear read per fine voxel in occupied cells.
         """
         fine = refined(grid.lattice, self.scale)
         cells = occupied_cells(grid.index)
@@ -55,17 +55,18 @@ class TrilinearUpsampler(nn.Module):
 
 
 class LearnedUpsampler(TrilinearUpsampler):
-    """Interpolation, then two convolutions at the fine resolution that add detail: the paper's up-layer.
+    """Interpolate, then add detail by two convolutions at the fine resolution: the paper's up-layer.
 
-    Its last layer starts at zero, so the first step equals plain interpolation.
+    Its last layer starts as 0, so that training starts from plain interpolation.
 
     Args:
         scale: a whole number > 1.
         channels: 1 + C of the radiance grid.
-        width: channels of the features that it refines (an inpainter's, or the warped grid's own).
+        width: channels at the fine resolution.
         margin: voxels around the occupied box.
-        recompute: hold one volume of the fine resolution for the backward pass and compute the other four
-            again there, for a third more of the convolutions' time.
+        features: channels of the inpainter's features; 0: read the warped grid.
+        recompute: save memory: keep one fine volume for the backward pass instead of five, for a third more
+            of the convolutions' time.
     """
 
     def __init__(
@@ -98,7 +99,7 @@ class LearnedUpsampler(TrilinearUpsampler):
         def finish(fine: Tensor) -> Tensor:
             return self.head(second(fine))
 
-        # Project to few channels before the fine resolution, where all the cost is.
+        # Project to few channels first, as all the cost is at the fine resolution.
         detail = self._held(finish, self._held(refine, self.project(features)))
         return detail.to(self.head.weight.dtype)  # half precision ends with the convolutions
 
@@ -108,7 +109,7 @@ class LearnedUpsampler(TrilinearUpsampler):
         return checkpoint(part, volume, use_reentrant=False, preserve_rng_state=False)
 
     def alone(self, grid: RadianceGrid) -> RadianceGrid:
-        """Up-sample without an inpainter: interpolation plus learned detail."""
+        """Up-sample a warped grid without an inpainter: interpolation plus learned detail."""
         crop = occupied_crop(grid.index, self.margin)
         dense = densify(grid, crop)
         fine = interpolate_dense(dense, crop, self.scale) + self.residual(dense, crop)
@@ -116,5 +117,5 @@ class LearnedUpsampler(TrilinearUpsampler):
 
 
 def interpolate_dense(dense: Tensor, crop: Crop, scale: int) -> Tensor:
-    """(1, C, x, y, z) of ``crop`` on the lattice ``scale`` times finer."""
+    """Interpolate (1, C, x, y, z) of ``crop`` to the lattice ``scale`` times finer."""
     return functional.interpolate(dense, size=crop.scaled(scale).shape, mode="trilinear", align_corners=True)

@@ -1,0 +1,70 @@
+"""Refuse a composed config that cannot work before torch is loaded."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
+from omegaconf import DictConfig
+
+from forewarp.cli.misspelt import every_key
+from forewarp.data.files import MARKERS, scene_folder
+from forewarp.runs.overrides import refuse_renamed
+
+# Data modules that are not listed, such as those that make their scene, check for themselves.
+READERS = {
+    "forewarp.data.module.DNeRFDataModule": "dnerf",
+    "forewarp.data.module.LegoCompleteDataModule": "lego_complete",
+    "forewarp.data.module.HyperNeRFDataModule": "hypernerf",
+    "forewarp.data.module.NHRDataModule": "nhr",
+    "forewarp.data.module.PosedVideoDataModule": "posed_video",
+}
+
+
+def refuse_renamed_keys(config: DictConfig) -> None:
+    """Refuse keys of earlier versions, such as those of a user's own files.
+
+    A method of another package may have keys of these names.
+    """
+    target = str(config.model.get("_target_"))
+    voxel = target.startswith("forewarp.methods.voxel.")  # only these methods' options were renamed
+    if target.startswith("forewarp."):
+        refuse_renamed([key for key in every_key(config) if voxel or not key.startswith("model.")])
+
+
+def refuse_missing_scene(config: DictConfig) -> None:
+    """Refuse a scene whose folder is missing, unless ``absent`` says to skip it.
+
+    Raises:
+        SceneError: listing the scenes that are there.
+    """
+    reader = READERS.get(config.data.get("_target_"))
+    if reader is not None and config.get("absent", "refuse") == "refuse":
+        scene_folder(Path(config.data.root).expanduser(), str(config.data.scene), MARKERS[reader])
+
+
+def refuse_seeds(config: DictConfig) -> None:
+    """Refuse ``seeds=`` without ``--multirun``, which repeats the run, and in a search by a sweeper."""
+    alone = not (HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN)
+    if alone and config.get("seeds", 1) != 1:
+        raise ValueError(f"seeds: expected --multirun beside seeds={config.seeds}; add it, or use seed=N")
+    if not alone and "_optuna_" in str(HydraConfig.get().sweeper.get("_target_")):
+        swept = str((HydraConfig.get().sweeper.get("params") or {}).get("seed", ""))
+        if config.get("seeds", 1) != 1:
+            raise ValueError(f"seeds: expected 1 in a search, but got {config.seeds}; use seed=N")
+        if swept.startswith("range"):
+            raise ValueError(
+                "hydra.sweeper.params.seed: expected one seed, as this sweeper would search among several, "
+                f"but got {swept}; add hydra.sweeper.params.seed=0"
+            )
+
+
+def refuse_two_models(config: DictConfig) -> None:
+    """Refuse an ablation of another method than ``model``."""
+    known = config.get("variant") or {}
+    if config.model.name not in known.get("of", [config.model.name]):
+        raise ValueError(
+            f"model: expected {' or '.join(known.of)}, which {known.name} is a change of, but got "
+            f"{config.model.name}; leave one of them out"
+        )

@@ -1,0 +1,217 @@
+"""Read the entries of a nerfstudio-style ``transforms.json`` and check each of them."""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from dataclasses import dataclass, replace
+from pathlib import Path
+from reprlib import repr as short
+
+import torch
+
+from forewarp.data.files import frames_of, inside, number
+from forewarp.data.geometry import FLIP, check_lens, pose_of
+from forewarp.data.images import inspect_image
+from forewarp.scene.camera import Camera
+from forewarp.scene.errors import SceneError
+from forewarp.scene.lens import Lens
+
+SPLITS = ("train", "val", "test")
+MODELS = ("OPENCV", "PINHOLE", "RADIAL", "SIMPLE_RADIAL", "SIMPLE_PINHOLE")
+SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
+
+
+@dataclass(frozen=True)
+class ImageEntry:
+    """A checked entry: ``camera`` in the file's units, at the size of the image; its near and far are 0.
+
+    ``name`` is the image's path without its suffix; ``has_alpha`` says what the image's header does.
+    """
+
+    name: str
+    time: float | None
+    camera: Camera
+    image: Path
+    mask: Path | None
+    has_alpha: bool
+
+
+@dataclass(frozen=True)
+class _Entry:
+    """A frame's own keys, then those at the top of the file."""
+
+    file: Path
+    index: int
+    own: dict
+    common: dict
+
+    def where(self, key: str) -> str:
+        shared = key in self.common and key not in self.own
+        return f"{self.file}: {key}" if shared else f"{self.file}: frames[{self.index}].{key}"
+
+    def get(self, key: str, default: object = None) -> object:
+        return self.own.get(key, self.common.get(key, default))
+
+    def number(self, key: str, default: object, low: float = -math.inf, high: float = math.inf) -> float:
+        return number(self.get(key, default), self.where(key), low, high)
+
+
+def read_entries(file: Path, content: dict, scale: int = 1) -> list[ImageEntry]:
+    """Read all entries of a file in its order.
+
+    Args:
+        file: for errors and as the place that paths start from.
+        content: content of the file.
+        scale: take images that are ``scale`` times smaller, from ``images_4`` in place of ``images``.
+
+    Raises:
+        SceneError: for every key or image that is missing or wrong.
+
+    Cost: one read of each PNG, of a JPEG's beginning and end.
+    """
+    frames, entries = frames_of(content, file), []
+    for i, own in enumerate(frames):
+        if not isinstance(own, dict):
+            raise SceneError(f"{file}: frames[{i}]: expected an object, but got {short(own)}")
+        entries.append(_image_entry(_Entry(file, i, own, content), scale))
+    for key, given in (
+        ("time", [e.time is not None for e in entries]),
+        ("mask_path", [e.mask is not None for e in entries]),
+        ("file_path: alpha", [e.has_alpha or e.mask is not None for e in entries]),
+    ):
+        if any(given) and not all(given):
+            got = f"{sum(given)} of {len(given)} and none in frames[{given.index(False)}]"
+            raise SceneError(f"{file}: frames: {key}: expected one in all frames or in none, but got {got}")
+    if len({e.name for e in entries}) < len(entries):
+        twice = next(e.name for i, e in enumerate(entries) if e.name in {w.name for w in entries[:i]})
+        raise SceneError(f"{file}: frames: expected each image once, but got {twice} twice; remove one")
+    return entries
+
+
+def name_of(folder: Path, value: object, where: str) -> str:
+    """Name an image by its path without the suffix."""
+    path = inside(folder, value, where)
+    return path.relative_to(folder).as_posix().removesuffix(path.suffix if path.suffix in SUFFIXES else "")
+
+
+def with_even_times(entries: list[ImageEntry]) -> list[ImageEntry]:
+    """Sort entries by name, numbers by value, and space their times evenly over [0, 1]."""
+
+    def order(entry: ImageEntry) -> list:
+        return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", entry.name)]
+
+    entries = sorted(entries, key=order)
+    return [replace(entry, time=i / max(len(entries) - 1, 1)) for i, entry in enumerate(entries)]
+
+
+def split_entries(file: Path, content: dict, entries: list[ImageEntry], test_every: int) -> tuple[dict, str]:
+    """Split the entries; also say in words how.
+
+    Args:
+        file, content: where ``<split>_filenames`` may list frames; what no list names trains, or tests where
+            the training frames are listed.
+        entries: in the order of time.
+        test_every: every n-th is a test frame where nothing is listed, the first and the last never.
+
+    Raises:
+        SceneError: for a list that names no frame or one of another list, and where a split is empty.
+    """
+    lists = {
+        s: _listed(file, content, f"{s}_filenames", entries) for s in SPLITS if f"{s}_filenames" in content
+    }
+    if lists:
+        home = next((split for split in ("train", "test") if split not in lists), None)
+        parts = {split: [e for e in entries if e.name in lists.get(split, ())] for split in SPLITS}
+        free = [e for e in entries if all(e.name not in names for names in lists.values())]
+        parts |= {home: free} if home else {}
+        how = "as listed in the file"
+    else:
+        held = slice(test_every // 2, -1, test_every)
+        parts = {"train": entries.copy(), "val": [], "test": entries[held]}
+        del parts["train"][held]
+        how = f"every {test_every}th frame held out"
+    if sum(map(len, parts.values())) > len({e.name for part in parts.values() for e in part}):
+        raise SceneError(f"{file}: expected lists of filenames that share none, but got one in two of them")
+    for split in ("train", "test"):
+        if not parts[split]:
+            raise SceneError(
+                f"{file}: expected a frame to {split} on, but got none of {len(entries)}; name some in "
+                f"{split}_filenames"
+            )
+    return parts, how
+
+
+def _listed(file: Path, content: dict, key: str, entries: list[ImageEntry]) -> set[str]:
+    """Read the frame names in the list of paths ``content[key]``; refuse names that are no frame."""
+    value = content[key]
+    if not isinstance(value, list):
+        raise SceneError(f"{file}: {key}: expected a list of paths, but got {short(value)}")
+    names = {name_of(file.parent, path, f"{file}: {key}[{i}]") for i, path in enumerate(value)}
+    if unknown := sorted(names - {entry.name for entry in entries}):
+        raise SceneError(f"{file}: {key}: expected paths of frames, but got {short(unknown[0])}")
+    return names
+
+
+def _image_entry(entry: _Entry, scale: int) -> ImageEntry:
+    image, name = _file(entry, "file_path", scale)
+    header = inspect_image(image)
+    mask = None
+    if "mask_path" in entry.own:
+        mask, _ = _file(entry, "mask_path", scale)
+        if (size := inspect_image(mask).size) != header.size:
+            got = f"{size[0]} x {size[1]}"
+            raise SceneError(
+                f"{mask}: expected {header.size[0]} x {header.size[1]} pixels as {image.name}, but got {got}"
+            )
+    time = number(entry.own["time"], entry.where("time"), 0, 1) if "time" in entry.own else None
+    camera = _camera(entry, header.size, scale, image)
+    return ImageEntry(name, time, camera, image, mask, header.has_alpha)
+
+
+def _file(entry: _Entry, key: str, scale: int) -> tuple[Path, str]:
+    """Find the image that a key names, with or without its suffix, and its name."""
+    folder, where = entry.file.parent, entry.where(key)
+    path, name = inside(folder, entry.own.get(key), where), name_of(folder, entry.own.get(key), where)
+    if scale > 1 and path.parent == folder:
+        raise SceneError(f"{where}: expected images in a folder, but got {name}; set data.scale=1")
+    if scale > 1:
+        path = path.parent.with_name(f"{path.parent.name}_{scale}") / path.name
+    if path.suffix in SUFFIXES:
+        return path, name
+    found = [p for p in (path.with_name(path.name + s) for s in SUFFIXES) if os.path.isfile(p)]
+    if not found:
+        raise SceneError(f"{where}: expected an image, PNG or JPEG, but got no {path}.png or .jpg")
+    return found[0], name
+
+
+def _camera(entry: _Entry, stored: tuple[int, int], scale: int, image: Path) -> Camera:
+    """Make the camera of an image of ``stored`` pixels; its entry is of one ``scale`` times as large."""
+    model = entry.get("camera_model", "OPENCV")
+    if model not in MODELS:
+        raise SceneError(
+            f"{entry.where('camera_model')}: expected one of {', '.join(MODELS)}, but got {short(model)}; "
+            "undistort the images"
+        )
+    sizes = [entry.number(key, n * scale, 1, 1e6) for key, n in zip("wh", stored)]
+    if any(abs(n - size / scale) >= 1 for n, size in zip(stored, sizes)):
+        expected = " x ".join(f"{size / scale:g}" for size in sizes)
+        raise SceneError(
+            f"{image}: expected {expected} pixels as {entry.where('w')} and h say, but got "
+            f"{stored[0]} x {stored[1]}"
+        )
+    width, height = (round(size) for size in sizes)
+    fx = entry.number("fl_x", None, 0.01 * width, 100 * width)
+    fy = entry.number("fl_y", fx, 0.01 * height, 100 * height)
+    cx, cy = (entry.number(key, n / 2, -n, 2 * n) for key, n in (("cx", width), ("cy", height)))
+    k = [entry.number(key, 0.0, -1e6, 1e6) for key in ("k1", "k2", "k3")]
+    p = [entry.number(key, 0.0, -1e6, 1e6) for key in ("p1", "p2")]
+    if entry.number("k4", 0.0) != 0:
+        raise SceneError(f"{entry.where('k4')}: expected 0, but got {entry.get('k4')}; undistort the images")
+    lens = Lens(tuple(k), tuple(p)) if any(k + p) else None
+    where = f"{entry.file}: frames[{entry.index}].transform_matrix"
+    pose = torch.from_numpy(pose_of(entry.own.get("transform_matrix"), where) @ FLIP)
+    camera = Camera(width, height, fx, fy, cx, cy, pose, 0.0, 0.0, lens=lens).resized(*stored)
+    check_lens(camera, entry.where("k1"))
+    return camera

@@ -1,0 +1,201 @@
+"""Measure a fitted scene on its test views: pictures, scores by image and ability, flow error."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from forewarp.drawing.colors import at_least, error_colors, in_a_row
+from forewarp.drawing.files import write_png
+from forewarp.files import write_json
+from forewarp.methods.abilities import HasTrajectories
+from forewarp.methods.effect import switched
+from forewarp.methods.method import parameter_count
+from forewarp.metrics.flow import end_point_error
+from forewarp.metrics.suite import ImageSuite, summarise
+from forewarp.scene.batch import Target
+from forewarp.scene.frame import Scene, spread
+from forewarp.scene.view import Rendering
+from forewarp.training.clock import now
+from forewarp.training.device import device_name, versions
+from forewarp.training.module import DynamicSceneModule
+
+_SHEET_SIDE = 300  # least pixels of the shorter side of a picture on a sheet
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A rendered view.
+
+    Attributes:
+        number: index of the view in the split.
+        target: the view and the true picture.
+        renderings: renderings by name, the best last.
+        seconds: time of the best rendering, including the snapshot if the view before had another time.
+        seconds_again: time of the best rendering without the snapshot.
+    """
+
+    number: int
+    target: Target
+    renderings: dict[str, Rendering]
+    seconds: float
+    seconds_again: float
+
+
+def draw(
+    module: DynamicSceneModule, targets: Sequence[Target], numbers: Sequence[int] | None = None
+) -> Iterator[Shown]:
+    """Render views in the order of their times, so that each time needs one snapshot.
+
+    Args:
+        module: the fitted scene.
+        targets: views to render; times are read from ``targets.frames``, without decoding pictures.
+        numbers: indices of the views to render; None: all.
+    """
+    snapshot, wanted = None, range(len(targets)) if numbers is None else numbers
+    for number in sorted(wanted, key=lambda i: targets.frames[i].time):
+        target = targets[number]
+        begin, view = now(), target.view
+        with torch.no_grad():
+            if snapshot is None or not snapshot.holds(target.moment):
+                snapshot = module.method.at(target.moment)
+            view.rays()
+            behind, drawn, warped = target.background.to(module.device), {}, now() - begin
+            for name in snapshot.renderings:
+                begin = now()
+                drawn[name] = snapshot.render(view, behind, name)
+                again = now() - begin
+        yield Shown(number, target, drawn, warped + again, again)
+
+
+def evaluate(
+    module: DynamicSceneModule,
+    datamodule,
+    folder: Path,
+    suite: ImageSuite,
+    *,
+    protocol: Mapping | None = None,
+    finished: Mapping[str, Mapping] | None = None,
+    sheets: int = 6,
+    progress: Callable[[int, int], None] | None = None,
+) -> dict:
+    """Measure a fitted scene on its test views; all numbers but the seconds are reproducible.
+
+    Write ``images/<name>.png`` (the best rendering), for some views ``images/sheets/<name>.png`` (truth |
+    prediction | error), ``per_image.json``, and last ``metrics.json``.
+
+    Args:
+        module: the fitted scene, on the device to use.
+        datamodule: serves ``scene`` and ``targets("test")``.
+        folder: the run's folder.
+        suite: computes the metrics of an image.
+        protocol: further entries of ``protocol``: how the run was made.
+        finished: the ``done.json`` of each stage (``Run.finished``).
+        sheets: number of sheets to write, spread over the split.
+        progress: called with (images done, all images) after each image.
+
+    Returns:
+        the content of ``metrics.json``.
+    """
+    scene, targets, finished = datamodule.scene, datamodule.targets("test"), finished or {}
+    on_sheets = set(spread(len(targets), sheets))
+    rows: dict[int, dict] = {}
+    for shown in draw(module, targets):
+        rows[shown.number] = _score(shown, suite)
+        _save(shown, Path(folder) / "images", shown.number in on_sheets)
+        if progress is not None:
+            progress(len(rows), len(targets))
+    per_image = [rows[number] for number in sorted(rows)]
+    metrics = {
+        "protocol": _protocol(module, scene, per_image, protocol or {}),
+        "seconds": _seconds(per_image, finished),
+        "steps": {name: int(noted["steps"]) for name, noted in finished.items()},
+        "peak_memory_bytes": max((int(s["peak_memory_bytes"]) for s in finished.values()), default=None),
+        "parameters": parameter_count(module.method),
+        "effects": switched(module.method),
+        **_means(per_image),
+    }
+    if (flow := flow_error(module, scene)) is not None:
+        metrics["flow"] = flow
+    write_json(Path(folder) / "per_image.json", {"images": per_image})
+    write_json(Path(folder) / "metrics.json", metrics)
+    return metrics
+
+
+def mean_scores(module: DynamicSceneModule, targets: Sequence[Target], suite: ImageSuite) -> dict[str, float]:
+    """Return the mean scores of the views' best renderings; write nothing."""
+    rows = [_score(shown, suite)["scores"] for shown in draw(module, targets)]
+    return summarise(("all", row) for row in rows).get("all", {})
+
+
+@torch.no_grad()
+def flow_error(module: DynamicSceneModule, scene: Scene) -> dict | None:
+    """Return end-point errors of the learned trajectories, world units; None without them or true ones."""
+    truth = scene.truth
+    if truth is None or not isinstance(module.method, HasTrajectories):
+        return None
+    points, times = truth.points[:, 0].to(module.device), truth.times.float().to(module.device)
+    return end_point_error(module.method.trajectories(points, times), truth.points)
+
+
+def _image(rendering: Rendering, target: Target) -> Tensor:
+    return rendering.rgb.clamp(0, 1).reshape(target.rgb.shape).cpu()
+
+
+def _score(shown: Shown, suite: ImageSuite) -> dict:
+    """Make the entry of one image: scores of the best rendering, and of the others by name."""
+    target, frame = shown.target, shown.target.frame
+    scores = {
+        name: suite.score(_image(r, target), target, r.depth.reshape(target.rgb.shape[:2]).cpu())
+        for name, r in shown.renderings.items()
+    }
+    best = list(scores)[-1]
+    about = {"name": frame.name, "time": frame.time, "ability": frame.ability, "rendering": best}
+    others = {name: values for name, values in scores.items() if name != best}
+    seconds = {"seconds": shown.seconds, "seconds_again": shown.seconds_again}
+    return {**about, **seconds, "scores": scores[best], "others": others}
+
+
+def _save(shown: Shown, folder: Path, on_sheet: bool) -> None:
+    target, image = shown.target, _image(list(shown.renderings.values())[-1], shown.target)
+    name = shown.target.frame.name + ".png"
+    write_png(folder / name, image)
+    if on_sheet:
+        parts = [target.rgb, image, error_colors(target.rgb, image)]
+        sheet = in_a_row([at_least(part, _SHEET_SIDE) for part in parts])
+        write_png(folder / "sheets" / name, sheet)
+
+
+def _means(per_image: list[dict]) -> dict[str, dict]:
+    """Average the scores of the best rendering (``test``) and of every other (``test_<rendering>``)."""
+    means = {"test": summarise((row["ability"], row["scores"]) for row in per_image)}
+    for name in per_image[0]["others"]:
+        means[f"test_{name}"] = summarise((row["ability"], row["others"][name]) for row in per_image)
+    return means
+
+
+def _seconds(per_image: list[dict], finished: Mapping[str, Mapping]) -> dict[str, float]:
+    """Return seconds of training by stage, and of rendering an image: the first of a time, and another."""
+    stages = {name: float(noted["seconds"]) for name, noted in finished.items()}
+    drawing, again = (sum(r[key] for r in per_image) / len(per_image) for key in ("seconds", "seconds_again"))
+    frames = {"render_per_frame": drawing, "render_again_per_frame": again}
+    return {"train": sum(stages.values()), **stages, **frames}
+
+
+def _protocol(module: DynamicSceneModule, scene: Scene, per_image: list[dict], protocol: Mapping) -> dict:
+    first = per_image[0]
+    return {
+        "scene": scene.name,
+        **scene.protocol,
+        **protocol,
+        **module.method.protocol(),
+        "renderings": [*first["others"], first["rendering"]],
+        "scored": first["rendering"],
+        "device": device_name(module.device),
+        "threads": torch.get_num_threads(),
+        "versions": versions(),
+    }

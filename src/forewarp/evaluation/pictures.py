@@ -1,0 +1,182 @@
+"""Draw a stage: truth, prediction and error, depth, and the flow from the canonical time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import lightning
+import torch
+from lightning.pytorch.loggers import TensorBoardLogger
+from torch import Tensor
+
+from forewarp.drawing.colors import depth_colors, error_colors, flow_colors, in_a_row, with_wheel
+from forewarp.drawing.files import write_png
+from forewarp.methods.abilities import HasTrajectories
+from forewarp.scene.batch import Target
+from forewarp.scene.camera import Camera
+from forewarp.scene.view import Moment, View
+from forewarp.training.module import DynamicSceneModule
+
+_SEEN = 0.02  # show the motion of pixels at least this opaque
+
+
+def sized(camera: Camera, size: int) -> Camera:
+    """Resize a camera to ``size`` pixels along its longer side."""
+    scale = size / max(camera.width, camera.height)
+    return camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
+
+
+def within(camera: Camera, size: int | None) -> Camera:
+    """Resize a camera to at most ``size`` pixels along its longer side."""
+    return camera if size is None or max(camera.width, camera.height) <= size else sized(camera, size)
+
+
+def pictures_of(module: DynamicSceneModule, target: Target, size: int | None = None) -> dict[str, Tensor]:
+    """Draw one view: pictures (h, w, 3) in [0, 1] by name.
+
+    ``compare`` is truth | prediction | error; near points are bright in ``depth``; ``flow``, for methods
+    with trajectories, is the displacement in the picture from the canonical time to the target's time: hue is
+    the direction, saturation the length.
+    """
+    camera = within(target.frame.camera, size)
+    shape = (camera.height, camera.width)
+    drawn = module.render(camera, target.moment, target.background)
+    predicted = drawn.rgb.reshape(*shape, 3).clamp(0, 1)
+    truth = target.rgb.to(predicted)
+    if truth.shape != predicted.shape:
+        channels_first = truth.permute(2, 0, 1)[None]
+        truth = torch.nn.functional.interpolate(channels_first, shape, mode="area")[0].permute(1, 2, 0)
+    pictures = {
+        "compare": in_a_row([truth, predicted, error_colors(truth, predicted)]),
+        "depth": depth_colors(drawn.depth.reshape(shape), drawn.opacity.reshape(shape)),
+    }
+    if isinstance(module.method, HasTrajectories):
+        pictures["flow"] = with_wheel(flow_colors(*image_flow(module, camera, target.moment.time)))
+    return pictures
+
+
+@torch.no_grad()
+def image_flow(module: DynamicSceneModule, camera: Camera, time: float) -> tuple[Tensor, Tensor]:
+    """Render the canonical scene and follow the visible points to ``time``.
+
+    Returns:
+        flow (H, W, 2) in pixels, opacity (H, W).
+    """
+    view = View(camera)
+    canonical = Moment(module.curriculum.canonical_time)
+    drawn = module.render(view, canonical, torch.zeros(3))
+    rays = view.rays().to(module.device)
+    seen = drawn.opacity > _SEEN
+    at = rays.origins[seen] + drawn.depth[seen, None] * rays.directions[seen]
+    moved = module.method.trajectories(at, torch.tensor([time], device=at.device))[:, 0]
+    flow = drawn.rgb.new_zeros(len(seen), 2)
+    flow[seen] = (camera.project(moved)[0] - camera.project(at)[0]).to(flow)
+    shape = (camera.height, camera.width)
+    return flow.reshape(*shape, 2), drawn.opacity.reshape(shape)
+
+
+def psnr_by_view(module: DynamicSceneModule, targets: Sequence[Target], rays: int) -> list[float]:
+    """Return PSNR (dB) of each image, from ``rays`` random pixels, the same in all."""
+    found = []
+    for target in targets:
+        every = target.frame.camera.width * target.frame.camera.height
+        pixels = torch.randperm(every, generator=torch.Generator().manual_seed(0))[:rays]
+        found.append(float(module.psnr_of(target, pixels)))
+    return found
+
+
+def validation_psnr(module: DynamicSceneModule, targets: Sequence[Target], rays: int) -> float:
+    """Return the mean of ``psnr_by_view``."""
+    found = psnr_by_view(module, targets, rays)
+    return sum(found) / len(found)
+
+
+class TensorBoardPictures(lightning.Callback):
+    """Draw one view at a few moments of a stage, and log ``val/psnr`` of a few validation views.
+
+    Pictures go to TensorBoard and into the stage's ``images/``. Training is not changed: the clock is paused
+    and no random number is drawn.
+
+    Args:
+        moments: fractions of the stage at which to draw.
+        view: index of the validation image, or of the training image if there are none; None: the middle.
+        size: most pixels of the longer side.
+        psnr_views: validation views, spread over the split, for ``val/psnr``; 0: no ``val/psnr``.
+        psnr_rays: pixels rendered of each of these views.
+    """
+
+    def __init__(
+        self,
+        *,
+        moments: Sequence[float] = (0.1, 0.25, 0.5, 0.75, 1.0),
+        view: int | None = None,
+        size: int = 400,
+        psnr_views: int = 4,
+        psnr_rays: int = 4096,
+    ) -> None:
+        if not all(0 <= moment <= 1 for moment in moments):
+            raise ValueError(
+                f"callbacks.pictures.moments: expected numbers in [0, 1], but got {list(moments)}"
+            )
+        if psnr_views < 0 or psnr_rays < 1:
+            raise ValueError(
+                "callbacks.pictures: expected psnr_views >= 0 and psnr_rays >= 1, "
+                f"but got {psnr_views=}, {psnr_rays=}"
+            )
+        self.moments, self.view, self.size = sorted(moments), view, size
+        self.psnr_views, self.psnr_rays = psnr_views, psnr_rays
+        self._due: list[float] = []
+
+    def on_train_start(self, trainer, module) -> None:
+        """Drop the moments that a resumed run is past."""
+        done = module.fraction
+        self._due = [moment for moment in self.moments if moment >= done]
+
+    def on_train_batch_end(self, trainer, module, outputs, batch, batch_idx) -> None:
+        """Draw if a moment is reached."""
+        self._follow(trainer, module)
+
+    def on_train_end(self, trainer, module) -> None:
+        """Draw the last pictures: a stage bounded by minutes ends between two steps."""
+        self._follow(trainer, module)
+
+    def _follow(self, trainer, module) -> None:
+        passed = [moment for moment in self._due if moment <= module.fraction]
+        if passed:
+            self._due = self._due[len(passed) :]
+            with module.clock.paused():
+                self._make(trainer, module, passed[-1])
+
+    def _make(self, trainer, module, moment: float) -> None:
+        pictures = pictures_of(module, self._target(trainer.datamodule), self.size)
+        for name, picture in pictures.items():
+            write_png(
+                Path(trainer.default_root_dir) / "images" / f"{round(100 * moment):03d}_{name}.png", picture
+            )
+            for logger in trainer.loggers:
+                if isinstance(logger, TensorBoardLogger):
+                    logger.experiment.add_image(
+                        f"images/{name}", picture, module.global_step, dataformats="HWC"
+                    )
+        self._log_psnr(trainer, module)
+
+    def _log_psnr(self, trainer, module) -> None:
+        loggers = [logger for logger in trainer.loggers if isinstance(logger, TensorBoardLogger)]
+        views = trainer.datamodule.targets("val")
+        count = min(self.psnr_views, len(views))
+        if not loggers or not count:
+            return
+        spread = [views[i * len(views) // count] for i in range(count)]
+        psnr = validation_psnr(module, spread, self.psnr_rays)
+        for logger in loggers:
+            logger.log_metrics({"val/psnr": psnr}, module.global_step)
+
+    def _target(self, datamodule) -> Target:
+        targets = datamodule.targets("val" if datamodule.scene.val else "train")
+        view = len(targets) // 2 if self.view is None else self.view
+        if not 0 <= view < len(targets):
+            raise ValueError(
+                f"callbacks.pictures.view: expected 0 to {len(targets) - 1}, but got {view}; use null"
+            )
+        return targets[view]

@@ -1,0 +1,134 @@
+"""Draw the trajectories of points on the moving surface over a picture, as the paper's figure does."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from forewarp.drawing.colors import hues
+from forewarp.drawing.lines import draw_discs, hidden, sample_lines
+from forewarp.evaluation.pictures import within
+from forewarp.methods.abilities import HasMatter, HasTrajectories
+from forewarp.scene.camera import Camera
+from forewarp.scene.view import Moment, Rendering, View
+from forewarp.training.module import DynamicSceneModule
+
+_VIEWS, _VIEW_SIZE = 24, 80  # number and pixels of the views that find the surface
+_STILL = 0.15  # a moving point travels at least this share of the farthest travel
+
+
+class Trajectories:
+    """Draw a fading tail behind points of the moving surface; occluded parts of a tail are hidden.
+
+    Args:
+        module: the fitted scene.
+        cameras: the training cameras, which find the surface.
+        count: most points to draw.
+        tail: duration of a tail, as a share of the whole time.
+        width: line width, as a share of the picture's longer side.
+    """
+
+    def __init__(
+        self,
+        module: DynamicSceneModule,
+        cameras: Sequence[Camera],
+        *,
+        count: int = 300,
+        tail: float = 0.5,
+        width: float = 0.004,
+    ) -> None:
+        for ability in (HasTrajectories, HasMatter):
+            if not isinstance(module.method, ability):
+                name = type(module.method).__name__
+                raise ValueError(
+                    f"path: expected a method that knows trajectories, but got {name}; use path=fixed"
+                )
+        self.method, self.tail, self.width = module.method, tail, width
+        # The depth of a rendered surface is uncertain by about the size of its matter.
+        self.slack = 1.5 * module.method.matter().size
+        self.points = moving_points(module, cameras, count)
+        self.colors = hues(0.85 * order_of(self.points))
+
+    @torch.no_grad()
+    def __call__(self, picture: Tensor, drawn: Rendering, camera: Camera, time: float) -> Tensor:
+        """Draw the tails over ``picture`` (H, W, 3) of ``camera`` at ``time``; ``drawn`` is its rendering."""
+        if not len(self.points):
+            return picture
+        begin = max(0.0, time - self.tail)
+        times = torch.linspace(begin, time, 2 + int(60 * (time - begin)), device=self.points.device)
+        paths = self.method.trajectories(self.points, times)
+        pixels, z = camera.project(paths)
+        distance = (paths - camera.center.to(paths)).norm(dim=-1)
+        strength = (1 - (time - times) / self.tail).clamp(0, 1).expand_as(distance)
+        vertices = torch.cat([pixels, distance[..., None], strength[..., None]], -1)
+        before = (z > 0).all(1)
+        vertices, colors = vertices[before], self.colors[before]
+        surface = torch.where(drawn.opacity > 0.5, drawn.depth, float("inf")).reshape(picture.shape[:2])
+        marks, line = sample_lines(vertices)
+        radius = max(0.35, 0.5 * self.width * max(picture.shape[:2]))
+        picture = self._draw(picture, marks, colors[line], surface, radius)
+        return self._draw(picture, vertices[:, -1], colors, surface, 1.8 * radius)
+
+    def _draw(self, picture: Tensor, marks: Tensor, colors: Tensor, surface: Tensor, radius: float) -> Tensor:
+        at, distance, strength = marks[:, :2], marks[:, 2], marks[:, 3]
+        seen = strength * ~hidden(at, distance, surface, self.slack)
+        return draw_discs(picture, at, colors, seen, radius)
+
+
+@torch.no_grad()
+def surface_points(module: DynamicSceneModule, cameras: Sequence[Camera]) -> Tensor:
+    """Return the points of matter (N, 3), world units, seen by a few cameras at the canonical time."""
+    canonical = module.method.at(Moment(module.curriculum.canonical_time))
+    black, found = torch.zeros(3, device=module.device), []
+    for camera in cameras[:: max(1, len(cameras) // _VIEWS)][:_VIEWS]:
+        view = View(within(camera, _VIEW_SIZE))
+        drawn, rays = canonical.render(view, black), view.rays().to(module.device)
+        hit = drawn.opacity > 0.5
+        found.append(rays.origins[hit] + drawn.depth[hit, None] * rays.directions[hit])
+    # At a silhouette the mean depth lies in empty space; points of matter do not.
+    matter = module.method.matter()
+    cells, seen = _cells(matter.points, matter.size), _cells(torch.cat(found), matter.size)
+    return matter.points[torch.isin(cells, seen)]
+
+
+def _cells(points: Tensor, size: float) -> Tensor:
+    """Return for each point (N,) the number of the cube of side ``size`` that holds it."""
+    x, y, z = (points / size).floor().long().clamp(-(1 << 20), (1 << 20) - 1).unbind(-1)
+    return (x << 42) + (y << 21) + z
+
+
+@torch.no_grad()
+def moving_points(module: DynamicSceneModule, cameras: Sequence[Camera], count: int) -> Tensor:
+    """Choose at most ``count`` canonical points (N, 3), spread evenly over the moving surface."""
+    points = surface_points(module, cameras)
+    if not len(points):
+        return points
+    paths = module.method.trajectories(points, torch.linspace(0, 1, 33, device=points.device))
+    reach = (paths - points[:, None]).norm(dim=-1).amax(1)
+    least = max(_STILL * float(reach.max()), module.method.matter().size)
+    return spread(points[reach > least], count)
+
+
+def spread(points: Tensor, count: int) -> Tensor:
+    """Choose ``count`` of the points (N, 3): the first, then repeatedly the one farthest from those chosen.
+
+    Cost: N * count distances.
+    """
+    if len(points) <= count:
+        return points
+    chosen = [0]
+    nearest = (points - points[0]).square().sum(-1)
+    for _ in range(count - 1):
+        chosen.append(int(nearest.argmax()))
+        nearest = torch.minimum(nearest, (points - points[chosen[-1]]).square().sum(-1))
+    return points[torch.tensor(chosen, device=points.device)]
+
+
+def order_of(points: Tensor) -> Tensor:
+    """Rank points (N, 3) along their principal axis: (N,), evenly from 0 to 1."""
+    if len(points) < 2:
+        return points.new_zeros(len(points))
+    along = torch.linalg.svd(points - points.mean(0), full_matrices=False)[2][0]
+    return (points @ along).argsort().argsort() / (len(points) - 1)

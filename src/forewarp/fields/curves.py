@@ -1,0 +1,51 @@
+"""Smooth curves over time by a few coefficients: which basis, and how many."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from forewarp.ops.dct import dct_basis
+from forewarp.ops.spline import spline_basis
+
+KINDS = ("spline", "dct")
+_PADDING = 0.2  # of the sequence, imagined before and after it: a cosine stands still at both ends
+
+
+class Curve:
+    """``sum_k c_k b_k(t)``. Cosines are exactly 0 at the canonical time; a spline is not: pictures of that
+    time bend their own knots, and not what all others share.
+
+    Args:
+        kind: ``spline``, whose knots bend their neighbourhood in time alone, or ``dct``, the paper's cosines.
+        count: of coefficients; a spline has at least 4, a DCT at most one less than there are times.
+        times: how many distinct training times there are.
+        canonical_time: in [0, 1].
+
+    Raises:
+        ValueError: for another kind, or a single time, over which nothing moves.
+    """
+
+    def __init__(self, kind: str, count: int, times: int, canonical_time: float) -> None:
+        if kind not in KINDS:
+            raise ValueError(f"model.motion: expected {', '.join(KINDS)} or none, but got {kind!r}")
+        if times < 2:
+            raise ValueError(
+                f"model.motion: expected at least 2 distinct training times, but got {times}; "
+                "use model.motion=none"
+            )
+        self.kind, self.times, self.canonical_time = kind, times, canonical_time
+        self.count = max(4, count) if kind == "spline" else max(1, min(count, times - 1))
+
+    def __call__(self, time: float | Tensor) -> Tensor:
+        """The basis (..., K) at a time in [0, 1]."""
+        if self.kind == "spline":
+            return spline_basis(time, self.count)
+        return dct_basis(time, self.count, self.times, self.canonical_time, _PADDING)
+
+    def reach(self) -> Tensor | None:
+        """From when to when (K, 2) each coefficient bends the curve; None where all do so at all times."""
+        if self.kind == "dct":
+            return None
+        knots = torch.arange(self.count, dtype=torch.float32)
+        return torch.stack([knots - 3, knots + 1], -1) / (self.count - 3)

@@ -1,0 +1,1 @@
+"""Canonical Gaussian particles, moved forward by nodes and rasterised."""

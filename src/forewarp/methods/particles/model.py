@@ -1,0 +1,348 @@
+"""The method: canonical particles, moved forward by nodes and rasterised."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor, nn
+
+from forewarp.fields.curves import Curve
+from forewarp.methods.method import Method, Snapshot, Start, Step
+from forewarp.methods.particles.camera import Pinholes
+from forewarp.methods.particles.density import renew
+from forewarp.methods.particles.nodes import Nodes
+from forewarp.methods.particles.rows_adam import RowsAdam
+from forewarp.methods.particles.settings import Numbers
+from forewarp.methods.particles.snapshot import ParticlesSnapshot
+from forewarp.methods.particles.start import covered_pixels, first_points, first_values
+from forewarp.ops.compare import compare
+from forewarp.ops.nodes import pull_nodes
+from forewarp.ops.project import Gaussians, Warp, moved
+from forewarp.scene.batch import Asks, Batch
+from forewarp.scene.box import Box
+from forewarp.scene.cloud import Cloud
+from forewarp.scene.view import Moment
+
+_FLAT = 0.28209479177387814  # of the harmonics: what a colour's first coefficient is multiplied by
+_SOLID, _SEEN = 0.1, 0.02  # opacity from which matter bounds the scene; from which there is any
+
+
+class Particles(Method):
+    """N Gaussians of a template near the canonical state, and M nodes that carry them through time.
+
+    A step draws one whole picture, compares it, and has its gradients in one pass of ``ops.compare``; the
+    optimiser passes over what the picture did not show. Stage numbers: see ``settings.Numbers``.
+
+    Args:
+        start: what it is built from.
+        motion: ``spline``, ``dct`` or ``none``: the curves of the nodes.
+        turns: whether nodes turn, or only shift.
+        view: degree 0 to 3 of the harmonics by which colour depends on direction.
+        tints, fades: cosines over time of each particle's colour, and of its opacity; 0: none.
+        width: of the loss, where it turns from a square to a line.
+        blur: square pixels that every particle is blurred by.
+    """
+
+    terms = ("photo", "rigid", "smooth")
+    numbers = tuple(Numbers.__dataclass_fields__)
+    asks = Asks(kind="pictures", straight=True)
+
+    def __init__(
+        self,
+        start: Start,
+        *,
+        motion: str = "spline",
+        turns: bool = True,
+        view: int = 1,
+        tints: int = 0,
+        fades: int = 0,
+        width: float = 0.05,
+        blur: float = 0.3,
+    ) -> None:
+        super().__init__()
+        if view not in (0, 1, 2, 3) or min(tints, fades) < 0:
+            raise ValueError(
+                "model: expected view of 0 to 3, tints >= 0 and fades >= 0, "
+                f"but got {view=}, {tints=}, {fades=}"
+            )
+        self.numbers_of = Numbers(**start.numbers)
+        self.canonical_time, self.width = start.scene.canonical_time, width
+        self.pinholes = Pinholes(blur)
+        self.bases = {"tints": tints, "fades": fades}
+        times = start.scene.times
+        self.ends = min(times), max(times)
+        self.progress, self._optimizer = 0.0, None
+        before = start.before if isinstance(start.before, Particles) else None
+        fresh = None if start.blank or before is not None else self._measured(start)
+        self._make(before, fresh, (view + 1) ** 2, tints, fades)
+        self.nodes = None
+        if motion != "none" and self.numbers_of.moves and len(times) > 1:
+            count, knots = self.numbers_of.motion(len(self.means), len(times))
+            curve = Curve(motion, knots, len(times), self.canonical_time)
+            points, edges = None if start.blank else self.means.data, self.numbers_of.edges
+            self.nodes = Nodes(points, count, curve, turns=turns, edges=edges)
+            links, shares = self.nodes.links(self.means.data)
+            self.register_buffer("links", links)
+            self.register_buffer("shares", shares)
+        for name in ("pulled", "shown", "idle"):
+            self.register_buffer(name, torch.zeros(len(self.means)))
+        self.register_buffer("round", torch.zeros((), dtype=torch.int64))
+        self.grows = self._grows()
+
+    def _measured(self, start: Start) -> Cloud:
+        covered = covered_pixels(start.scene, list(start.frames))
+        most = self.numbers_of.most(covered)
+        cloud = first_points(start, round(self.numbers_of.first * most))
+        away = (cloud.points - cloud.points.median(0).values).norm(dim=-1).median()
+        extent = float(away) or start.scene.box.diagonal
+        self._scalars(covered, extent, most)
+        return cloud
+
+    def _scalars(self, covered: float, extent: float, most: int) -> None:
+        """Pixels that show anything; median distance from the middle; most particles."""
+        self.register_buffer("covered", torch.tensor(float(covered)))
+        self.register_buffer("extent", torch.tensor(float(extent)))
+        self.register_buffer("most", torch.tensor(float(most)))
+
+    def _make(
+        self, before: Particles | None, cloud: Cloud | None, plain: int, tints: int, fades: int
+    ) -> None:
+        """Give every parameter its first value: of the stage before, of points, or none at all."""
+        if before is not None:
+            self._scalars(float(before.covered), float(before.extent), int(before.most))
+            first = {name: p.data.clone() for name, p in before.named_parameters(recurse=False)}
+        elif cloud is not None:
+            first = first_values(cloud)
+        else:
+            self._scalars(1.0, 1.0, 1)
+            first = first_values(Cloud(torch.zeros(1, 3), torch.zeros(1, 3), torch.zeros(1), 1.0))
+        count = len(first["means"])
+        for name in ("means", "log_scales", "turns", "opacity", "color"):
+            setattr(self, name, nn.Parameter(first[name]))
+        for name, many in (("shade", plain - 1), ("tint", tints)):
+            value = first.get(name)
+            if value is None or value.shape[1] != many:
+                value = torch.zeros(count, many, 3)
+            setattr(self, name, nn.Parameter(value) if many else None)
+        value = first.get("fade")
+        self.fade = None
+        if fades:
+            fits = value is not None and value.shape[1] == fades
+            self.fade = nn.Parameter(value if fits else torch.zeros(count, fades))
+
+    def _grows(self) -> tuple[str, ...]:
+        names = ["means", "log_scales", "turns", "opacity", "color", "shade", "tint", "fade"]
+        names += ["pulled", "shown", "idle", *(["links", "shares"] if self.nodes is not None else [])]
+        return tuple(name for name in names if getattr(self, name) is not None)
+
+    @property
+    def moves(self) -> bool:
+        """Whether there is any motion."""
+        return self.nodes is not None
+
+    @property
+    def size(self) -> tuple[str, int]:
+        """See ``Method``."""
+        return "particles", len(self.means)
+
+    def adopted(self) -> set[str]:
+        """See ``Method``: nodes too are as many as a checkpoint says."""
+        nodes = () if self.nodes is None else self.nodes.rows()
+        return {*self.grows, *(f"nodes.{name}" for name in nodes)}
+
+    def misfit(self, state: Mapping[str, Tensor]) -> str | None:
+        """See ``Method``; what is stored of nodes must go together, too."""
+        if self.nodes is None:
+            return super().misfit(state)
+        own, wide = self.nodes, self.links.shape[1]
+        links = {n: state[n][:, :1].expand(-1, wide) for n in ("links", "shares") if state[n].dim() == 2}
+        return own.misfit(state, "nodes.", state["links"]) or super().misfit({**state, **links})
+
+    def at(self, moment: Moment) -> Snapshot:
+        """Move every particle; nothing is drawn yet."""
+        tints, fades = self.over_time(moment.time)
+        return ParticlesSnapshot(
+            moment, self.gaussians(), self.warp(moment.time), tints, fades, self.pinholes
+        )
+
+    def gaussians(self) -> Gaussians:
+        """The particles as the operators read them."""
+        opacity = self.opacity if self.fade is None else torch.cat([self.opacity, self.fade], -1)
+        colors = [part for part in (self.color, self.shade, self.tint) if part is not None]
+        colors = colors[0] if len(colors) == 1 else torch.cat(colors, 1)
+        return Gaussians(self.means, self.log_scales, self.turns, opacity, colors)
+
+    def warp(self, time: float) -> Warp:
+        """How everything moves until a time."""
+        if self.nodes is None:
+            return self._still()
+        return Warp(self.nodes.maps(time), self.links, self.shares)
+
+    def _still(self) -> Warp:
+        none = self.means.new_zeros(len(self.means), 1)
+        return Warp(self.means.new_zeros(1, 12), none.int(), none)
+
+    def over_time(self, time: float) -> tuple[Tensor, Tensor]:
+        """What a time makes of colours (T,) and of opacity (1 + F,): cosines, 0 at the canonical time."""
+        tints, fades = (
+            [
+                math.cos(math.pi * k * time) - math.cos(math.pi * k * self.canonical_time)
+                for k in range(1, n + 1)
+            ]
+            for n in self.bases.values()
+        )
+        return self.means.new_tensor(tints), self.means.new_tensor([1.0, *fades])
+
+    @torch.no_grad()
+    def look(self, batch: Batch, factors: Mapping[str, float], generator: torch.Generator) -> Step:
+        """See ``Method``. Pictures are drawn one after the other; each is whole."""
+        total, squared, pixels = {}, 0.0, 0
+        terms = dict.fromkeys(self.terms, 0.0)
+        weight = factors.get("photo", 0.0) / (float(self.covered) * len(batch.observations))
+        for seen in batch.observations:
+            time = self._jittered(seen.moment.time, generator)
+            found, own = self._compared(seen, time, weight, factors, total)
+            squared, pixels = squared + found.squared, pixels + 3 * len(seen.view)
+            terms["photo"] += found.loss / (float(self.covered) * len(batch.observations))
+            for name, value in own.items():
+                terms[name] += value / len(batch.observations)
+        values = {name: (lambda v=v: self.means.new_tensor(v)) for name, v in terms.items()}
+        if self.nodes is None:
+            values["rigid"] = values["smooth"] = lambda: None
+        error = torch.tensor(squared / pixels, dtype=torch.float64)
+        return Step(values, error, {"particles": len(self.means)}, total)
+
+    def _jittered(self, time: float, generator: torch.Generator) -> float:
+        spread = self.numbers_of.jitter * max(0.0, 1 - self.progress / self.numbers_of.calm)
+        if self.nodes is None or spread == 0:
+            return time
+        return min(1.0, max(0.0, time + spread * float(torch.randn((), generator=generator))))
+
+    def _compared(self, seen, time: float, weight: float, factors, total: dict) -> tuple:
+        """Compare one picture; adds gradients to ``total``, and gives what the nodes' terms are."""
+        tints, fades = self.over_time(time)
+        own, basis, warp = {}, None, None
+        if self.nodes is not None:
+            self.nodes.look_ahead(time, time)
+            basis = self.nodes.curve(time)
+            motion, maps = self.nodes.carried(basis)
+            warp = Warp(maps, self.links, self.shares)
+        found = compare(
+            self.gaussians(), warp or self._still(), self.pinholes(seen.view.camera), tints, fades,
+            seen.rgb, seen.background, width=self.width, factor=weight,
+        )  # fmt: skip
+        self.pulled += found.pull
+        self.shown += found.pull > 0
+        _add(total, self._by_name(found.particles))
+        if self.nodes is not None:
+            nodes, rigid = self.nodes, factors.get("rigid", 0.0) * self._loose()
+            slope, strain = pull_nodes(
+                motion, nodes.places, found.maps, nodes.edges, nodes.edge_weights, rigid
+            )
+            own["rigid"] = strain
+            _add(total, nodes.spread_over_time(basis, slope))
+            own["smooth"], bent = nodes.bent(time, factors.get("smooth", 0.0), float(self.extent))
+            _add(total, bent)
+        return found, own
+
+    def _loose(self) -> float:
+        """What is left of the rigidity, by how much of the stage is done."""
+        return self.numbers_of.loose**self.progress
+
+    def _by_name(self, gradients: Gaussians) -> dict[str, Tensor]:
+        found = {"means": gradients.means, "log_scales": gradients.log_scales, "turns": gradients.quaternions}
+        if self.fade is None:
+            found["opacity"] = gradients.opacity
+        else:
+            found["opacity"], found["fade"] = gradients.opacity[:, :1], gradients.opacity[:, 1:]
+        at = 0
+        for name in ("color", "shade", "tint"):
+            part = getattr(self, name)
+            if part is not None:
+                found[name] = gradients.colors[:, at : at + part.shape[1]]
+                at += part.shape[1]
+        return found
+
+    def advance(self, progress: float, step: int, optimizer: torch.optim.Optimizer) -> dict[str, float]:
+        """Let rates fall, each as far as its kind should; renew particles where it is time."""
+        self.progress, numbers = progress, self.numbers_of
+        for group in optimizer.param_groups:
+            last = numbers.finals.get(group["name"], 1.0)
+            held = max(0.0, progress - numbers.hold_rates.get(group["name"], 0.0))
+            left = 1 - numbers.hold_rates.get(group["name"], 0.0)
+            group["lr"] *= last ** (held / left)
+            if group["name"] in ("means", "shifts"):
+                group["lr"] *= float(self.extent)
+        number = int(progress / numbers.every)
+        if number > int(self.round) and progress < numbers.settled:
+            self.round.fill_(number)
+            self._renew(progress, optimizer)
+        return {}
+
+    def _renew(self, progress: float, optimizer: torch.optim.Optimizer) -> None:
+        target = round(float(self.most) * self.numbers_of.share_at(progress))
+        low, high = self.ends if self.nodes is None else self.nodes.seen.tolist()
+        whole = low <= self.ends[0] + 0.02 and high >= self.ends[1] - 0.02
+        renew(self, optimizer, target, unseen=whole and self.nodes is not None, extent=float(self.extent))
+        if self.nodes is not None and int(self.round) % self.numbers_of.relink == 0:
+            self.links, self.shares = self.nodes.links(self.means.data)
+
+    def warm_up(self) -> None:
+        """Compile the operators' kernels."""
+        from forewarp.methods.particles.warmup import compile_kernels
+
+        compile_kernels(self)
+
+    def param_groups(self) -> dict[str, list[nn.Parameter]]:
+        """See ``Method``."""
+        groups = {name: [p] for name, p in self.named_parameters(recurse=False)}
+        if self.nodes is not None:
+            groups["shifts"] = [self.nodes.shift]
+            groups |= {} if self.nodes.turn is None else {"node_turns": [self.nodes.turn]}
+        return groups
+
+    def optimizer(self, groups: list[dict]) -> torch.optim.Optimizer:
+        """Adam by rows."""
+        return RowsAdam(groups)
+
+    @torch.no_grad()
+    def trajectories(self, points: Tensor, times: Tensor) -> Tensor:
+        """See ``HasTrajectories``: points follow the nodes beside them."""
+        if self.nodes is None:
+            return points[:, None].expand(-1, len(times), -1).clone()
+        return self.nodes.paths(points.float(), times)
+
+    @torch.no_grad()
+    def bounds(self, times: list[float]) -> Box | None:
+        """See ``HasBounds``."""
+        solid = torch.sigmoid(self.opacity[:, 0]) > _SOLID
+        if not bool(solid.any()):
+            return None
+        points = self.trajectories(self._canonical()[solid], torch.tensor(times)).flatten(0, 1)
+        pad = 2 * float(self.log_scales[solid].exp().median()) + 1e-3 * float(self.extent)
+        low, high = points.amin(0) - pad, points.amax(0) + pad
+        return Box(tuple(low.tolist()), tuple(high.tolist()))
+
+    def _canonical(self) -> Tensor:
+        """Where particles are at the canonical time (N, 3)."""
+        return moved(self.means.data, self.warp(self.canonical_time))[0]
+
+    @torch.no_grad()
+    def matter(self) -> Cloud:
+        """See ``HasMatter``."""
+        solid = torch.sigmoid(self.opacity[:, 0])
+        keep = solid > _SEEN if bool((solid > _SEEN).any()) else solid >= 0
+        colors = (0.5 + _FLAT * self.color[keep, 0]).clamp(0, 1)
+        size = 2 * float(self.log_scales.exp().mean())
+        return Cloud(self._canonical()[keep], colors, solid[keep], max(size, 1e-9))
+
+    def protocol(self) -> dict[str, str]:
+        """See ``Method``."""
+        return {"departures": "particles, rasterised, in the place of voxels that are marched through"}
+
+
+def _add(total: dict[str, Tensor], found: Mapping[str, Tensor]) -> None:
+    for name, value in found.items():
+        total[name] = value if name not in total else total[name] + value

@@ -1,0 +1,207 @@
+"""How particles move: nodes with smooth curves of place and turn, and who follows which of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor, nn
+
+from forewarp.fields.curves import Curve
+from forewarp.ops.nodes import carry_nodes
+
+LINKS = 4  # nodes that a particle follows
+_DAMP = 0.5  # of a curve's last stride, where it is continued to times not yet seen
+_FULL = 0.05  # share of a spline's basis at a time, from which on its knot counts as seen
+
+
+def spread_out(points: Tensor, count: int) -> Tensor:
+    """Rows (count,) of points (N, 3) that are far from one another: each the farthest from those before.
+
+    Cost: ``count`` looks at all points.
+    """
+    chosen = [int((points - points.mean(0)).square().sum(-1).argmax())]
+    away = (points - points[chosen[0]]).square().sum(-1)
+    for _ in range(min(count, len(points)) - 1):
+        chosen.append(int(away.argmax()))
+        away = torch.minimum(away, (points - points[chosen[-1]]).square().sum(-1))
+    return torch.tensor(chosen, dtype=torch.int64, device=points.device)
+
+
+def nearest(points: Tensor, places: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Squared distances and rows (N, count) of the places (M, 3) nearest to points (N, 3); less, where there
+    are fewer. Points in pieces of 4,096.
+    """
+    found = []
+    for part in points.split(4096):
+        away = (part.square().sum(-1)[:, None] + places.square().sum(-1) - 2 * part @ places.T).clamp(min=0)
+        found.append(away.topk(min(count, len(places)), dim=-1, largest=False))
+    if not found:
+        empty = points.new_zeros(0, min(count, len(places)))
+        return empty, empty.long()
+    return torch.cat([f.values for f in found]), torch.cat([f.indices for f in found])
+
+
+class Nodes(nn.Module):
+    """M nodes: rest ``places`` (M, 3), and coefficients (M, K, 3) of ``shift`` (world units) and of ``turn``
+    (Gibbs vectors), None where nodes do not turn.
+
+    Args:
+        points: (N, 3) canonical points that are to move; None: a checkpoint will say.
+        count: of nodes.
+        curve: of every node.
+        turns: whether nodes turn.
+        edges: neighbours that a node is kept rigid with.
+    """
+
+    ROWS = ("places", "edges", "edge_weights", "spread", "shift", "turn")
+
+    def __init__(
+        self, points: Tensor | None, count: int, curve: Curve, *, turns: bool = True, edges: int = 6
+    ) -> None:
+        super().__init__()
+        self.curve = curve
+        places = torch.zeros(1, 3) if points is None else points[spread_out(points, count)].clone()
+        self.register_buffer("places", places)
+        away, beside = nearest(places, places, edges + 1)
+        away, beside = away[:, 1:], beside[:, 1:]  # the nearest is the node itself
+        unit = away.mean().clamp(min=1e-20) if away.numel() else torch.tensor(1.0)
+        self.register_buffer("edges", beside.contiguous())
+        self.register_buffer("edge_weights", 1 / (away + 1e-3 * unit) / max(beside.numel(), 1))
+        near = away[:, :3].sqrt().mean(-1) if away.shape[1] else torch.ones(len(places))
+        self.register_buffer("spread", near.clamp(min=1e-6 * float(unit) ** 0.5))
+        self.shift = nn.Parameter(torch.zeros(len(places), curve.count, 3))
+        self.turn = nn.Parameter(torch.zeros(len(places), curve.count, 3)) if turns else None
+        self.register_buffer("seen", torch.tensor([curve.canonical_time] * 2))
+
+    def __len__(self) -> int:
+        return len(self.places)
+
+    def links(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Who points (N, 3) follow: rows (N, L) int32 of nodes, and their shares (N, L).
+
+        ``exp(-(d^2 - d_min^2) / (2 s^2))``, normalised, s the mean distance of a node to its nearest three.
+        """
+        return self._links(points, self.places)
+
+    def _links(self, points: Tensor, places: Tensor) -> tuple[Tensor, Tensor]:
+        away, rows = nearest(points, places, LINKS)
+        shares = torch.exp(-(away - away[:, :1]) / (2 * self.spread[rows] ** 2))
+        return rows.int(), (shares / shares.sum(-1, keepdim=True)).contiguous()
+
+    def carried(self, basis: Tensor) -> tuple[Tensor, Tensor]:
+        """Where nodes went and how they turned (M, 6), by a curve's basis (K,), and their maps (M, 12)."""
+        return carry_nodes(self.shift, self.turn, basis, self.places)
+
+    def maps(self, time: float) -> Tensor:
+        """``ops.nodes.node_maps`` (M, 12) at a time."""
+        return self.carried(self.curve(time).to(self.places))[1]
+
+    def paths(self, points: Tensor, times: Tensor) -> Tensor:
+        """Where points (N, 3) of the canonical time are at times (T,): (N, T, 3).
+
+        A node takes a point from where it was then: ``R_t R_c^t (y - p - v_c) + p + v_t``; those of the nodes
+        that were nearest then are blended. At the canonical time that is y itself.
+        """
+        motion = self.carried(self.curve(self.curve.canonical_time).to(self.places))
+        then, turned = self._frames(motion)
+        rows, shares = self._links(points, then)
+        rows = rows.long()
+        local = (turned.mT[rows] @ (points[:, None] - then[rows])[..., None])[..., 0]
+        found = []
+        for time in times.tolist():
+            at, turn = self._frames(self.carried(self.curve(time).to(self.places)))
+            went = (turn[rows] @ local[..., None])[..., 0] + at[rows]
+            found.append((shares[..., None] * went).sum(1))
+        return torch.stack(found, 1) if found else points.new_zeros(len(points), 0, 3)
+
+    def _frames(self, carried: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+        """Where nodes are (M, 3) and their rotations (M, 3, 3)."""
+        motion, maps = carried
+        return self.places + motion[:, :3], maps[:, :9].reshape(-1, 3, 3) + torch.eye(3).to(maps)
+
+    @torch.no_grad()
+    def look_ahead(self, low: float, high: float) -> None:
+        """Continue curves beyond the times [low, high] that have been seen: a knot beyond them starts as a
+        damped continuation of the two before it.
+        """
+        reach = self.curve.reach()
+        if reach is None:
+            return
+        if low >= float(self.seen[0]) and high <= float(self.seen[1]):
+            return
+        self.seen[0], self.seen[1] = min(low, float(self.seen[0])), max(high, float(self.seen[1]))
+        middle = reach.mean(-1)
+        slack = _FULL * float(reach[0, 1] - reach[0, 0])
+        after = (reach[:, 0] > float(self.seen[1]) - slack).nonzero()[:, 0].tolist()
+        before = (reach[:, 1] < float(self.seen[0]) + slack).nonzero()[:, 0].tolist()
+        for value in (self.shift, self.turn):
+            if value is None:
+                continue
+            for knots, step in ((after, -1), (before[::-1], 1)):
+                for j in knots:
+                    near, far = j + step, j + 2 * step
+                    if 0 <= far < len(middle):
+                        value[:, j] = value[:, near] + _DAMP * (value[:, near] - value[:, far])
+
+    def rows(self) -> list[str]:
+        """What has a row a node."""
+        return [name for name in self.ROWS if getattr(self, name) is not None]
+
+    def misfit(self, state: Mapping[str, Tensor], prefix: str, links: Tensor) -> str | None:
+        """Name an entry of a stored state that contradicts the others; None where all is well.
+
+        All have as many rows as there are places, and nothing points at a node that there is not.
+        """
+        many = len(state[prefix + "places"])
+        for name in self.rows():
+            own, theirs = getattr(self, name), state[prefix + name]
+            free = 2 if name in ("edges", "edge_weights") else 1  # few nodes have few neighbours
+            fits = theirs.dtype == own.dtype and theirs.dim() == own.dim() and len(theirs) == many
+            if not fits or theirs.shape[free:] != own.shape[free:]:
+                return prefix + name
+        if state[prefix + "edges"].shape != state[prefix + "edge_weights"].shape:
+            return prefix + "edges"
+        for name, rows in ((prefix + "edges", state[prefix + "edges"]), ("links", links)):
+            if rows.numel() and not 0 <= int(rows.min()) <= int(rows.max()) < many:
+                return name
+        return None
+
+    def _load_from_state_dict(self, state, prefix, *args, **kwargs) -> None:
+        for name in self.ROWS:  # a checkpoint says how many nodes there are
+            own = getattr(self, name)
+            if own is not None and prefix + name in state:
+                own.data = own.data.new_empty(state[prefix + name].shape)
+        super()._load_from_state_dict(state, prefix, *args, **kwargs)
+
+    def spread_over_time(self, basis: Tensor, slope: Tensor) -> dict[str, Tensor]:
+        """From slopes (M, 6) by ``motion`` to those by coefficients, by name."""
+        found = {"nodes.shift": slope[:, None, :3] * basis[:, None]}
+        if self.turn is not None:
+            found["nodes.turn"] = slope[:, None, 3:] * basis[:, None]
+        return found
+
+    @torch.no_grad()
+    def bent(self, time: float, factor: float, unit: float) -> tuple[float, dict[str, Tensor]]:
+        """How much curves bend at a time, over a knot's reach, in shares of ``unit``; and ``factor`` times
+        the slopes of that.
+
+        ``mean |x(t + h) - 2 x(t) + x(t - h)|^2 / unit^2``, h a knot's distance to the next: only where and as
+        often as a curve is seen is it kept smooth.
+        """
+        step = 1 / max(self.curve.count - 3, 2)
+        low, high = float(self.seen[0]) + step, float(self.seen[1]) - step
+        if factor == 0 or low > high:
+            return 0.0, {}
+        middle = min(max(time, low), high)
+        times = torch.tensor([middle - step, middle, middle + step], dtype=torch.float64).clamp(0, 1)
+        before, now, after = self.curve(times).to(self.places)
+        basis, found, total = after - 2 * now + before, {}, 0.0
+        for name, scale in (("shift", unit), ("turn", 1.0)):
+            value = getattr(self, name)
+            if value is not None:
+                bend = torch.einsum("mkc,k->mc", value, basis) / scale
+                total += float(bend.square().mean())
+                slope = 2 * factor / (bend.numel() * scale) * bend
+                found[f"nodes.{name}"] = slope[:, None] * basis[:, None]
+        return total, found

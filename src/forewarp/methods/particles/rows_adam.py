@@ -1,0 +1,33 @@
+"""Adam by rows: what a step does not see keeps its moments and its own count of steps."""
+
+from __future__ import annotations
+
+import torch
+
+from forewarp.ops.adam import adam_rows
+
+
+class RowsAdam(torch.optim.Optimizer):
+    """See ``ops.adam``; a row is of a parameter's last axis. Its state follows ``methods.rows``."""
+
+    def __init__(self, groups: list[dict], *, betas=(0.9, 0.99), eps: float = 1e-15) -> None:
+        super().__init__(groups, {"lr": 1e-3, "betas": betas, "eps": eps})
+
+    @torch.no_grad()
+    def step(self, closure=None):
+        """One step; see ``torch.optim.Optimizer``."""
+        loss = None
+        if closure is not None:
+            with torch.enable_grad():
+                loss = closure()
+        for group in self.param_groups:
+            for p in group["params"]:
+                if p.grad is None or not p.numel():
+                    continue
+                state = self.state[p]
+                if not state:
+                    state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(p), torch.zeros_like(p)
+                    state["steps"] = torch.zeros_like(p[..., 0])
+                moments = state["exp_avg"], state["exp_avg_sq"], state["steps"]
+                adam_rows(p, p.grad, *moments, group["lr"], group["betas"], group["eps"])
+        return loss

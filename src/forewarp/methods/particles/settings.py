@@ -1,0 +1,82 @@
+"""A stage's numbers, checked once, and what follows from the pictures."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True)
+class Numbers:
+    """The numbers of a stage that are the method's own. Shares are of the stage.
+
+    Args:
+        moves: whether particles move; a stage that only shapes them has no nodes.
+        density: particles there are in the end, times the square root of the pixels that show anything.
+        first: share of them to begin with.
+        full: share of them that this stage ends with.
+        nodes: how many there are, times the square root of the particles at the beginning.
+        knots: coefficients of each node's curve, times the square root of the times.
+        edges: neighbours that a node is kept rigid with.
+        every: share between two rounds of density control, up to ``settled``.
+        relink: rounds after which particles look again for the nodes beside them.
+        jitter, calm: spread of the random shift of a picture's time, which falls to 0 at the share ``calm``.
+        loose: what is left of the weight of ``rigid`` at the end.
+        finals: what is left at the end of a learning rate, by its name; the others stay.
+        hold_rates: share up to which such a rate stays.
+    """
+
+    moves: bool = True
+    density: float = 90.0
+    first: float = 0.5
+    full: float = 1.0
+    nodes: float = 4.95
+    knots: float = 2.2
+    edges: int = 6
+    every: float = 0.01
+    settled: float = 0.6
+    relink: int = 5
+    jitter: float = 0.01
+    calm: float = 0.4
+    loose: float = 0.17
+    finals: Mapping[str, float] = field(default_factory=dict)
+    hold_rates: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        shares = ("first", "every", "loose", "full")
+        for name in shares:
+            if not 0 < getattr(self, name) <= 1:
+                raise ValueError(f"stage.{name}: expected a number in (0, 1], but got {getattr(self, name)}")
+        if not (self.nodes > 0 and self.knots > 0 and self.edges >= 1):
+            raise ValueError(
+                "stage: expected nodes > 0, knots > 0 and edges >= 1, "
+                f"but got {self.nodes}, {self.knots}, {self.edges}"
+            )
+        if not (self.density > 0 and self.relink >= 1 and self.jitter >= 0 and self.calm > 0):
+            raise ValueError(
+                "stage: expected density > 0, relink >= 1, jitter >= 0 and calm > 0, but got "
+                f"{self.density}, {self.relink}, {self.jitter}, {self.calm}"
+            )
+
+    def most(self, covered: float) -> int:
+        """How many particles there are in the end.
+
+        >>> Numbers().most(20_000.0)
+        12728
+        """
+        return max(32, round(self.density * math.sqrt(covered)))
+
+    def share_at(self, progress: float) -> float:
+        """The share of them that there should be: on a line from ``first``; soon before ``settled``, all."""
+        done = min(1.0, progress / max(0.8 * self.settled, 1e-6))
+        return self.full * (self.first + (1 - self.first) * done)
+
+    def motion(self, particles: int, times: int) -> tuple[int, int]:
+        """How many nodes, and how many coefficients each has.
+
+        >>> Numbers().motion(6364, 100)
+        (395, 22)
+        """
+        knots = min(times + 2, round(self.knots * math.sqrt(times)))
+        return max(4, round(self.nodes * math.sqrt(particles))), max(4, knots)

@@ -1,0 +1,148 @@
+"""Particles drawn, compared with a picture, and the gradients of that, in one pass."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from forewarp.ops.backend import match_threads, use_numba
+from forewarp.ops.checks import check_shape
+from forewarp.ops.project import Gaussians, Pinhole, Warp, _check, arrays, project_reference
+from forewarp.ops.rasterize import SIDE, kept_for, rasterize_reference, sorted_tiles
+
+
+class Compared(NamedTuple):
+    """``loss`` and ``squared``: sums over pixels and channels; ``particles``, ``maps`` and ``weights``: the
+    gradients of ``factor`` times the loss; ``pull`` (N,) how strongly that pulls each over the
+    picture, per pixel; 0 of particles that the picture does not show.
+    """
+
+    loss: float
+    squared: float
+    particles: Gaussians
+    maps: Tensor
+    weights: Tensor | None
+    pull: Tensor
+
+
+def compare(
+    particles: Gaussians,
+    warp: Warp,
+    pinhole: Pinhole,
+    tints: Tensor,
+    fades: Tensor,
+    pixels: Tensor,
+    background: Tensor,
+    *,
+    width: float = 0.05,
+    factor: float = 1.0,
+    by_weights: bool = False,
+) -> Compared:
+    """The loss ``sum sqrt(e^2 + width^2) - width`` over pixels and channels, and its gradients.
+
+    ``e`` is the picture of ``project`` and ``rasterize`` over ``background`` less the truth over the same:
+    near 0 the loss is a square, far from it the error itself.
+
+    Args:
+        particles, warp, pinhole, tints, fades: as of ``project``.
+        pixels: (H W, 4) uint8, the truth as straight RGBA.
+        background: (3,).
+        width: where the loss turns from a square to a line, > 0.
+        factor: of the gradients.
+        by_weights: whether gradients by the shares of nodes are wanted.
+
+    Returns:
+        ``Compared``; nothing in it has a graph.
+
+    Raises:
+        ValueError: for shapes that do not go together, or another kind of pixels.
+
+    Cost: that of ``rasterize`` twice and of ``project`` thrice.
+    """
+    _check(particles, warp, tints, fades)
+    check_shape("pixels", pixels, (pinhole.size[0] * pinhole.size[1], 4))
+    check_shape("background", background, (3,))
+    if pixels.dtype != torch.uint8 or not width > 0:
+        raise ValueError(f"compare: expected uint8 pixels and width > 0, but got {pixels.dtype}, {width=}")
+    fast = use_numba(particles.means) and particles.means.dtype == torch.float32
+    run = _compare_numba if fast else compare_reference
+    return run(particles, warp, pinhole, tints, fades, pixels, background, width, factor, by_weights)
+
+
+def compare_reference(
+    particles: Gaussians,
+    warp: Warp,
+    pinhole: Pinhole,
+    tints: Tensor,
+    fades: Tensor,
+    pixels: Tensor,
+    background: Tensor,
+    width: float,
+    factor: float,
+    by_weights: bool,
+) -> Compared:
+    """``compare`` in plain PyTorch, on any device and in any precision."""
+    leaves = [t.detach().clone().requires_grad_() for t in (*particles, warp.maps, warp.weights)]
+    with torch.enable_grad():
+        own, own_warp = Gaussians(*leaves[:5]), Warp(leaves[5], warp.links, leaves[6])
+        splats = project_reference(own, own_warp, pinhole, tints, fades)
+        splats.numbers.retain_grad()
+        planes = rasterize_reference(splats, *pinhole.size)
+        behind = background.to(planes)
+        drawn = planes[:3] + planes[4] * behind[:, None, None]
+        straight = pixels.to(planes) / 255
+        truth = torch.lerp(behind.expand_as(straight[:, :3]), straight[:, :3], straight[:, 3:])
+        error = drawn.reshape(3, -1).T - truth
+        loss = ((error.square() + width**2).sqrt() - width).sum()
+        (factor * loss).backward()
+    found = [torch.zeros_like(leaf) if leaf.grad is None else leaf.grad for leaf in leaves]
+    pull = splats.numbers.grad[:, :2].norm(dim=-1)
+    squared = float(error.detach().square().sum())
+    weights = found[6] if by_weights else None
+    return Compared(float(loss.detach()), squared, Gaussians(*found[:5]), found[5], weights, pull)
+
+
+def _compare_numba(
+    particles, warp, pinhole, tints, fades, pixels, background, width, factor, by_weights
+) -> Compared:
+    from forewarp.ops import kernels_chain, kernels_project, kernels_rasterize
+
+    threads = match_threads()
+    view = pinhole.row(particles.means)
+    padded = torch.nn.functional.pad(warp.maps, (0, 4))
+    inputs = arrays(*particles, padded, warp.links, warp.weights, view, tints, fades)
+    splats = torch.empty(len(particles.means), kernels_project.SPLAT)
+    kernels_project.project(*inputs, splats.numpy())
+    size = pinhole.size
+    tiles = sorted_tiles(splats.numpy(), -(-size[0] // SIDE), -(-size[1] // SIDE), threads)
+    sums = torch.zeros(threads, len(tiles.order), kernels_rasterize.GRADIENT)
+    found, kept = torch.zeros(threads, 2, dtype=torch.float64), kept_for(tiles, threads)
+    picture = pixels.contiguous().view(torch.int32).reshape(size[1], size[0]).numpy().view("uint32")
+    kernels_rasterize.compare(
+        tiles.records,
+        tiles.entries,
+        tiles.ends,
+        tiles.shares,
+        picture,
+        *arrays(background.float()),
+        kernels_rasterize.np.float32(width),
+        *arrays(kept, sums, found),
+    )
+    by_splat, pull = torch.empty(len(tiles.order), kernels_chain.SLOPES), torch.zeros(len(splats))
+    kernels_chain.slopes_of(splats.numpy(), tiles.order, sums.numpy(), factor, by_splat.numpy(), pull.numpy())
+    gradients = [torch.zeros_like(t) for t in particles]
+    maps = torch.zeros(threads, *padded.shape)
+    weights = torch.zeros_like(warp.weights) if by_weights else warp.weights.new_zeros(0, 0)
+    ranks = kernels_chain.ranks_of(tiles.order, len(splats))
+    kernels_chain.chain(*inputs, splats.numpy(), ranks, by_splat.numpy(), *arrays(*gradients, maps, weights))
+    loss, squared = found.sum(0).tolist()
+    return Compared(
+        loss,
+        squared,
+        Gaussians(*gradients),
+        maps.sum(0)[:, :12],
+        weights if by_weights else None,
+        pull,
+    )

@@ -1,0 +1,1 @@
+"""Find out which effects a scene calls for."""

@@ -1,0 +1,126 @@
+"""Write a plan to ``plan.yaml``, read it, turn it into overrides, and print it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import yaml
+
+from forewarp.files import MOST_CONFIG, read_text, replace_file
+from forewarp.runs.overrides import command_line, key_of, merged, without_switched_off
+from forewarp.runs.trust import check_target, without_trust
+
+PATHS = ("lpips_weights",)  # top-level keys that hold paths
+
+
+def write_plan(file: Path, made: dict) -> None:
+    """Write a plan, with the command that made the plan on top."""
+    about = f"# {command_line('plan', made.get('asked', made['typed']))}\n"
+    about += "# Fit it: forewarp-train plan=<this file>; an override typed beside that wins.\n"
+    replace_file(file, about + yaml.safe_dump(made, sort_keys=False, width=110, allow_unicode=True))
+
+
+def read_plan(file: Path, trust: Sequence[str] = (), typed: Sequence[str] = ()) -> dict:
+    """Read a ``plan.yaml``; drop overrides of ``trust``, as a file may not say what is trusted.
+
+    Args:
+        file: the file to read.
+        trust: packages beside forewarp whose code the overrides may name.
+        typed: overrides on this command line; the same ones in the file are accepted unchecked.
+
+    Raises:
+        ValueError: if the file is no plan, is of an earlier version, or has overrides no plan may have.
+    """
+    try:
+        made = yaml.safe_load(read_text(file, MOST_CONFIG))
+        if isinstance(made, dict) and "words" in made and "overrides" not in made:
+            raise ValueError(
+                f"plan: expected the key overrides, but got words, as before version 0.3, in {file}; make it "
+                "anew with forewarp-plan"
+            )
+        overrides = [*made["typed"], *made["overrides"], f"of={made['of']}"]
+        others = [override for override in overrides if override not in typed]
+        allowed = all(isinstance(override, str) and _is_harmless(override) for override in others)
+    except (OSError, ValueError, yaml.YAMLError, TypeError, KeyError, RecursionError) as error:
+        if str(error).startswith("plan: "):
+            raise
+        reason = getattr(error, "strerror", None) or type(error).__name__
+        raise ValueError(
+            f"plan: expected a file that forewarp-plan wrote, but got {file} ({reason}); "
+            "use plan=<folder of a plan>/plan.yaml"
+        ) from error
+    where = f"plan: expected overrides that a plan has, but got others in {file}"
+    if not allowed:
+        raise ValueError(f"{where}; make it anew")
+    for override in others:
+        if (key := key_of(override)).endswith("._target_"):
+            check_target(override.partition("=")[2], where, key, trust)
+    names = ("typed", "overrides")
+    return made | {name: [one for one in made[name] if key_of(one) != "trust"] for name in names}
+
+
+def _is_harmless(override: str) -> bool:
+    """Tell whether an override only sets a key, names no code and does not change how jobs run."""
+    sets = re.match(r"\+{0,2}[A-Za-z][\w./@]*=", override) is not None
+    key, _, value = override.lstrip("+").partition("=")
+    hides = "_target_" in override and not (key.endswith("._target_") and override.count("_target_") == 1)
+    # A choice names a file below conf/, never elsewhere.
+    chooses = "/" in key or "." not in key
+    climbs = chooses and key not in PATHS and re.fullmatch(r"[\w ,.+\-\[\]]*", value) is None
+    return sets and not hides and not climbs and ".." not in key and not key_of(override).startswith("hydra")
+
+
+def with_plan(name: str, arguments: list[str]) -> list[str]:
+    """Replace ``plan=FILE`` on the command line of ``forewarp-train`` by the plan's overrides.
+
+    Args:
+        name: the command; for other commands the arguments are returned unchanged.
+        arguments: the command line's arguments; those typed beside ``plan=`` win over the plan.
+
+    Raises:
+        ValueError: if the file is no plan, or ``model=`` or ``resume=`` beside it contradicts it.
+    """
+    files = [argument.partition("=")[2] for argument in arguments if argument.startswith("plan=")]
+    if name != "train" or not files:
+        return arguments
+    made = read_plan(Path(files[-1]).expanduser(), without_trust(arguments)[1])
+    typed = [argument for argument in arguments if not argument.startswith("plan=")]
+    planned = merged(made["overrides"], made["typed"])
+    model = ([one for one in planned if one.startswith("model=")] or ["model=forward"])[-1]
+    for one in typed:
+        if one.startswith("resume=") or (one.startswith("model=") and one != model):
+            raise ValueError(
+                f"{one}: expected no such override beside plan={files[-1]}; leave one of them out"
+            )
+    file = files[-1].replace("\\", "\\\\").replace("'", "\\'")
+    kept = [*planned, f"planned='{file}'", "effects=given"]
+    return without_switched_off(merged([*kept, *own_folder(typed)], typed))
+
+
+def own_folder(typed: Sequence[str]) -> list[str]:
+    """Return the override that gives a planned run its own folder; none if ``run`` or a sweep names one."""
+    named = any(key_of(override) in ("run", "sweeps") for override in typed)
+    return [] if named else ["run='${paths.runs}/${data.scene}/planned-{hash}'"]
+
+
+def show_plan(made: dict, *, to_fit: bool = True) -> None:
+    """Print a plan as a table; ``to_fit`` adds the command that fits it."""
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    from forewarp.progress import time_text
+
+    title = f"planned {'before, ' if made.get('found') else ''}in {time_text(made['seconds'])}"
+    caption = "± is two standard errors" if made["evidence"]["trials"] else "without trials: less sure"
+    table = Table(box=box.SIMPLE, title=title, caption=caption, title_justify="left", caption_justify="left")
+    for name in ("effect", "choice", "because"):
+        table.add_column(name, overflow="fold")
+    for effect, decision in made["effects"].items():
+        table.add_row(effect, decision["choice"], decision["because"])
+    console = Console()
+    console.print(table)
+    if to_fit:
+        console.print(f"fit it: forewarp-train plan={made['file']}", soft_wrap=True, highlight=False)

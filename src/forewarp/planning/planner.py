@@ -1,0 +1,137 @@
+"""Gather the evidence for a plan: fit coarse stages, run trials, and let the method decide."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, fields, is_dataclass, replace
+from functools import partial
+
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+
+from forewarp.methods.effect import Asked, Begin, Decision, Effect, Planning, Rival
+from forewarp.planning.trials import Trial, Trials, gain
+from forewarp.runs.overrides import key_of, merged
+from forewarp.scene.frame import Scene
+from forewarp.scene.pictures import survey
+
+
+class Planner:
+    """Plan one run; the method says which effects there are and what counts for each.
+
+    Args:
+        config: the config of the run to plan.
+        typed: the run's overrides; the plan decides nothing that they fix.
+        trials: fits the short runs.
+        scene: the scene as the run would read it.
+        planning: the method's ``Planning``.
+    """
+
+    def __init__(
+        self, config: DictConfig, typed: list[str], trials: Trials, scene: Scene, planning: Planning
+    ) -> None:
+        self.typed, self.trials, self.settings, self.planning = typed, trials, config.plan, planning
+        self.effects: dict[str, Effect] = {effect.name: effect for effect in planning.effects}
+        values = {key_of(override): override.partition("=")[2] for override in typed}
+        stages = {name: stage for name, stage in config.stage.items() if stage is not None}
+        self.asked = Asked(stages, config.preset, values, self._choose, bool(config.plan.trials))
+        trials.always, trials.always_fine = planning.always(self.asked)
+        # An effect of the last stage costs time of the last stage only.
+        shares = [stage.share for stage in stages.values()]
+        minutes = self.settings.minutes and self.settings.minutes * shares[-1] / sum(shares)
+        self.evidence = planning.evidence(survey(scene), least=self.settings.least, minutes=minutes)
+
+    def plan(self) -> dict:
+        """Return the plan, without seconds: overrides, effects with reasons, evidence."""
+        self._fit_coarse()
+        views = self.run.datamodule.targets("train")
+        self.planning.look(self.evidence, self.module.method, self.run.datamodule.scene, views, self.asked)
+        if self.settings.trials:
+            self._try_fine()
+        every = [self._as_tried(decision) for decision in self.planning.decide(self.evidence, self.asked)]
+        return {
+            "typed": list(self.typed),
+            "overrides": list(dict.fromkeys(one for decision in every for one in decision.overrides)),
+            "effects": {d.effect: {"choice": d.choice, "on": d.on, "because": d.because} for d in every},
+            "evidence": self._numbers(),
+        }
+
+    def _fit_coarse(self) -> None:
+        """Fit the coarse stages that the method asks for; tell the method of each rival whether it pays."""
+        stages, answer = self.planning.coarse(self.evidence, self.asked), None
+        while True:
+            try:
+                wanted = stages.send(answer)
+            except StopIteration:
+                return
+            if isinstance(wanted, Begin):
+                overrides = list(wanted.overrides)
+                answer = self._use(wanted.name, merged(self.base, overrides) if wanted.change else overrides)
+            else:
+                answer = self._rival(wanted)
+
+    def _use(self, name: str, overrides: list[str]) -> None:
+        """Fit the coarse stage that evidence is taken from and fine trials begin from."""
+        self.name, self.base = name, overrides
+        self.reached, self.run, self.module = self.trials.coarse(name, overrides)
+
+    def _rival(self, wanted: Rival) -> bool:
+        """Fit another coarse stage, go on with the better, and return whether the effect pays."""
+        overrides = merged(self.base, wanted.overrides)
+        rival = self.trials.coarse(wanted.name, overrides)
+        on, off = (rival[0], self.reached) if wanted.adds else (self.reached, rival[0])
+        self.evidence.gains[wanted.effect] = gain([on], [off], equal_steps=False)
+        pays = self.evidence.pays(wanted.effect)
+        if pays == wanted.adds:
+            self.name, self.base, (self.reached, self.run, self.module) = wanted.name, overrides, rival
+        return pays
+
+    def _try_fine(self) -> None:
+        """Try each undecided effect in the fine stage: with and without the effect, at equal steps."""
+        evidence, tried = self.evidence, partial(self._tried, "fine", self.base, 0)
+        asked = [
+            effect
+            for effect in self.effects.values()
+            if effect.later and effect.group not in self.asked.typed and not effect.rules_out(evidence)
+        ]
+        if asked and evidence.minutes is not None:
+            plain = tried()
+            half = self._tried("fine-half", self.base, 0, max(1, plain.steps // 2))
+            evidence.slope, evidence.steps = gain([plain], [half]).psnr, plain.steps
+            evidence.step = plain.step
+        for effect in asked:
+            choice = f"{effect.group}={self._choose(effect.name)}"
+            self._try(effect.name, merged(self.base, [choice]))
+
+    def _try(self, effect: str, overrides: list[str]) -> None:
+        """Try an effect seed by seed; stop once the gain is clearly below ``plan.least``."""
+        on, off = [], []
+        for seed in range(self.settings.seeds):
+            on.append(self._tried(f"fine-{effect}", overrides, seed, on[0].steps if on else None))
+            off.append(self._tried("fine", self.base, seed))
+            if off[-1].steps != on[-1].steps:  # the trial with the effect ran out of time
+                off[-1] = self._tried(f"fine-{on[-1].steps}", self.base, seed, on[-1].steps)
+            found = self.evidence.gains[effect] = gain(on, off)
+            if found.psnr + found.noise < self.settings.least:
+                return
+
+    def _tried(self, name: str, overrides: list[str], seed: int, steps: int | None = None) -> Trial:
+        return self.trials.fine(name, overrides, self.name, seed, steps)
+
+    def _choose(self, effect: str) -> str:
+        """Return the option that switches an effect on: the configured one, else ``Effect.on``."""
+        own = HydraConfig.get().runtime.choices.get(f"model/{effect}")
+        return own if own not in (None, self.effects[effect].off) else self.effects[effect].on
+
+    def _as_tried(self, decision: Decision) -> Decision:
+        """Return the decision with the overrides of its trial added; unchanged if the effect stays off."""
+        effect = self.effects.get(decision.effect)
+        if effect is None or not decision.on:
+            return decision
+        return replace(decision, overrides=(*decision.overrides, *effect.with_it(self.asked)))
+
+    def _numbers(self) -> dict:
+        values = {f.name: getattr(self.evidence, f.name) for f in fields(self.evidence)}
+        found = {name: asdict(value) for name, value in values.items() if is_dataclass(value)}
+        found["trials"] = {effect: asdict(one) for effect, one in self.evidence.gains.items()}
+        return json.loads(json.dumps(found))  # lists for tuples, as YAML has them

@@ -1,0 +1,185 @@
+"""Fit the short runs of a plan: coarse stages, and fine stages that begin where the coarse ones end."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+from hydra import compose
+from omegaconf import DictConfig, OmegaConf, open_dict
+
+from forewarp.evaluation.pictures import psnr_by_view
+from forewarp.files import read_json, write_json
+from forewarp.report.gain import Gain, Numbers
+from forewarp.runs.build import build_run
+from forewarp.runs.config import claim
+from forewarp.runs.data_check import check_data
+from forewarp.runs.lock import locked
+from forewarp.runs.overrides import merged, without_switched_off
+from forewarp.training.device import device_of
+from forewarp.training.handover import NUMBERS, POINTS
+from forewarp.training.module import DynamicSceneModule
+from forewarp.training.stages import Run
+
+RAYS = 10_000  # pixels rendered of each held-out view
+
+
+@dataclass(frozen=True)
+class Trial:
+    """The result of a short run.
+
+    Attributes:
+        psnr: PSNR of each held-out view, dB.
+        step: training seconds per step.
+        steps: number of steps done.
+        took: seconds in all, with loading and scoring.
+    """
+
+    psnr: tuple[float, ...]
+    step: float
+    steps: int
+    took: float
+
+    @property
+    def numbers(self) -> list[Numbers]:
+        """Numbers of each view, as ``Gain.of`` takes them."""
+        return [{"psnr": psnr, "step": self.step} for psnr in self.psnr]
+
+
+def gain(on: Sequence[Trial], off: Sequence[Trial], *, equal_steps: bool = True) -> Gain:
+    """Compare trials with and without an effect, seed by seed and view by view."""
+    pairs = [list(zip(a.numbers, b.numbers, strict=True)) for a, b in zip(on, off, strict=True)]
+    seconds = on[0].step * on[0].steps, off[0].step * off[0].steps
+    return Gain.of(pairs, on[0].steps if equal_steps else None, seconds)
+
+
+def composed(overrides: Sequence[str]) -> DictConfig:
+    """Compose the config of ``forewarp-train`` with these overrides; Hydra must be initialised."""
+    return compose("train", list(overrides))
+
+
+@dataclass
+class Trials:
+    """Run all short runs of one plan; finished ones are not run again.
+
+    Args:
+        typed: overrides of the run to plan.
+        folder: the plan's folder, with one folder for each trial.
+        steps: steps of a coarse stage.
+        seconds: most seconds of a coarse stage.
+        fine_steps: steps of a fine stage.
+        fine_seconds: most seconds of a fine stage.
+        held_out: number of training views to hold out and score.
+        tell: called with the name of each trial before the trial runs.
+        seconds_before: total seconds of the trials that were finished before.
+        made: the fine trials so far, as several effects are compared with the same trial.
+        always: the method's overrides of every trial.
+        always_fine: the method's overrides of every fine trial.
+    """
+
+    typed: list[str]
+    folder: Path
+    steps: int
+    seconds: float
+    fine_steps: int
+    fine_seconds: float
+    held_out: int
+    tell: Callable[[str], None] = print
+    seconds_before: float = 0.0
+    made: dict[str, Trial] = field(default_factory=dict)
+    always: Sequence[str] = ()
+    always_fine: Sequence[str] = ()
+
+    def coarse(self, name: str, changes: Sequence[str]) -> tuple[Trial, Run, DynamicSceneModule]:
+        """Fit a coarse stage with these overrides; return its result, its run and the fitted module."""
+        config = self._config(name, changes, self.always, 0, self.steps, self.seconds)
+        for later in list(config.stage)[1:]:
+            config.stage[later] = None
+        return self._fitted(config)
+
+    def fine(
+        self, name: str, changes: Sequence[str], after: str, seed: int, steps: int | None = None
+    ) -> Trial:
+        """Fit a short fine stage that begins where the coarse stage of the trial ``after`` ended.
+
+        Args:
+            name: name of the trial.
+            changes: overrides of the trial.
+            after: name of the trial whose coarse stage to continue.
+            seed: added to the run's seed.
+            steps: steps of the stage; None: ``fine_steps``, or fewer if ``fine_seconds`` end first.
+        """
+        if (known := self.made.get(f"{name}-seed{seed}")) is not None:
+            return known
+        seconds = self.fine_seconds if steps is None else None
+        always = [*self.always, *self.always_fine]
+        config = self._config(f"{name}-seed{seed}", changes, always, seed, steps or self.fine_steps, seconds)
+        first, last = list(config.stage)[0], list(config.stage)[-1]
+        config.stage[first].share, config.stage[last].share = 1e-6, 1.0
+        self.made[f"{name}-seed{seed}"] = self._fitted(config, self.folder / after / first)[0]
+        return self.made[f"{name}-seed{seed}"]
+
+    def _config(
+        self,
+        name: str,
+        changes: Sequence[str],
+        always: Sequence[str],
+        seed: int,
+        steps: int,
+        seconds: float | None,
+    ) -> DictConfig:
+        config = composed(without_switched_off(merged(merged(changes, self.typed), always)))
+        data = OmegaConf.to_container(config.data, resolve=True) | {"seed": config.seed + seed}
+        with open_dict(config):
+            config.data = data  # resolved before the seed changes, as synthetic scenes are made from the seed
+            config.run, config.seed, config.effects = str(self.folder / name), config.seed + seed, "given"
+            config.budget.iterations, config.budget.minutes = steps, None if seconds is None else seconds / 60
+            config.data.held_out, config.evaluate = self.held_out, False
+            config.logger, config.callbacks = None, {"progress": config.callbacks.get("progress")}
+        self.tell(name)
+        return config
+
+    def _fitted(self, config: DictConfig, begun: Path | None = None) -> tuple[Trial, Run, DynamicSceneModule]:
+        """Fit and score a trial, or read the stored result; ``begun``: folder of a finished first stage."""
+        begin = time.perf_counter()
+        run = build_run(config)
+        run.tell = lambda line: None
+        run.datamodule.setup("fit")
+        with locked(run.folder):
+            claim(config)
+            check_data(run, "refuse")
+            if begun is not None:
+                _share(begun, run.folder / begun.name)
+            module = run.fit().to(device_of(config.trainer.accelerator))
+            file, stage = run.folder / "trial.json", run.stages[-1]
+            known = read_json(file)
+            if known is None:
+                noted = read_json(run.stage_folder(stage) / "done.json")
+                psnr = psnr_by_view(module, run.datamodule.watched(), RAYS)
+                step, took = noted["seconds"] / noted["steps"], time.perf_counter() - begin
+                known = asdict(Trial(psnr, step, noted["steps"], took))
+                write_json(file, known)
+            else:
+                self.seconds_before += known["took"]
+        return Trial(**known | {"psnr": tuple(known["psnr"])}), run, module
+
+
+def _share(source: Path, target: Path) -> None:
+    """Link a finished stage into another run, or copy it if the file system has no hard links."""
+    if target.is_dir():
+        return
+    beside = target.with_name(target.name + ".part")
+    shutil.rmtree(beside, ignore_errors=True)
+    beside.mkdir(parents=True)
+    for name in ("last.ckpt", NUMBERS, POINTS, "done.json"):
+        if not (source / name).is_file():  # not every method hands over points
+            continue
+        try:
+            os.link(source / name, beside / name)
+        except OSError:
+            shutil.copyfile(source / name, beside / name)
+    beside.rename(target)

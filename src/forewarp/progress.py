@@ -1,0 +1,110 @@
+"""Show progress in one line: redrawn in a terminal, printed from time to time elsewhere."""
+
+from __future__ import annotations
+
+import sys
+import time
+from typing import TextIO
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn
+from rich.table import Column
+
+
+def time_text(seconds: float) -> str:
+    """Write a duration as minutes and seconds, with hours where there are any.
+
+    >>> time_text(65.4), time_text(3725)
+    ('1:05', '1:02:05')
+    """
+    minutes, seconds = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{seconds:02d}" if hours else f"{minutes}:{seconds:02d}"
+
+
+class ProgressLine:
+    """A line with a title, the share that is done, the time left and a text.
+
+    Args:
+        title: what runs.
+        refresh: seconds between two updates in a terminal.
+        every: seconds between two lines elsewhere.
+        stream: None: stderr.
+    """
+
+    def __init__(
+        self, title: str, *, refresh: float = 0.25, every: float = 10.0, stream: TextIO | None = None
+    ) -> None:
+        self.title, self.stream = title, stream or sys.stderr
+        self.terminal = self.stream.isatty()
+        self.interval = refresh if self.terminal else every
+        self._next = time.perf_counter() + (0.0 if self.terminal else every)
+        self._bar: Progress | None = None
+
+    def due(self) -> bool:
+        """Tell whether an update is due; ask this before making a text."""
+        return time.perf_counter() >= self._next
+
+    def show(self, fraction: float, left: float | None, text: str) -> None:
+        """Update the line now.
+
+        Args:
+            fraction: done, in [0, 1].
+            left: seconds; None: unknown.
+            text: shown at the end.
+        """
+        remaining = "-:--" if left is None else time_text(left)
+        if self.terminal:
+            self._draw(fraction, f"{fraction:4.0%} | {remaining} left | {text}")
+        else:
+            self._write(f"{self.title} {fraction:4.0%} | {remaining} left | {text}")
+        self._next = time.perf_counter() + self.interval
+
+    def close(self, fraction: float, text: str) -> None:
+        """Write the last line and release the terminal."""
+        if self._bar is not None or self.terminal:
+            self._draw(fraction, f"{fraction:4.0%} | {text}")
+            self._bar.stop()
+            self._bar = None
+        else:
+            self._write(f"{self.title} {fraction:4.0%} | {text}")
+
+    def _write(self, line: str) -> None:
+        print(line, file=self.stream, flush=True)
+
+    def _draw(self, fraction: float, text: str) -> None:
+        if self._bar is None:
+            # A narrow terminal cuts the text, not the title or the bar.
+            columns = (
+                TextColumn("{task.description}", table_column=Column(min_width=len(self.title))),
+                BarColumn(bar_width=12, table_column=Column(min_width=12)),
+                TextColumn("{task.fields[text]}", markup=False, table_column=Column(ratio=1, no_wrap=True)),
+            )
+            # Without a thread of its own it costs nothing between two updates.
+            console = Console(file=self.stream)
+            self._bar = Progress(*columns, console=console, auto_refresh=False, expand=True)
+            self._task = self._bar.add_task(self.title, total=1.0, text="")
+            self._bar.start()
+        self._bar.update(self._task, completed=fraction, text=text, refresh=True)
+
+
+class Counted:
+    """Show calls ``progress(done, total)`` as a line with the time left; a context manager."""
+
+    def __init__(self, title: str, stream=None) -> None:
+        self.line, self.begin = ProgressLine(title, stream=stream), time.perf_counter()
+        self.done, self.total = 0, 1
+
+    def __call__(self, done: int, total: int) -> None:
+        """Show that ``done`` of ``total`` are done, where an update is due."""
+        self.done, self.total = done, total
+        if self.line.due():
+            spent = time.perf_counter() - self.begin
+            self.line.show(done / total, spent / done * (total - done) if done else None, f"{done}/{total}")
+
+    def __enter__(self) -> Counted:
+        return self
+
+    def __exit__(self, *error) -> None:
+        spent = time_text(time.perf_counter() - self.begin)
+        self.line.close(self.done / self.total, f"{self.done}/{self.total} in {spent}")

@@ -1,0 +1,103 @@
+"""Put the numbers of several runs side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from forewarp.files import read_json
+from forewarp.report.tables import Column, Difference, Table
+
+_ABILITIES = {
+    "space": "at training times",
+    "time": "between them",
+    "canonical": "canonical time",
+    "all": "all",
+}
+_KEYS = ("protocol", "seconds", "test")
+
+
+def compare(folders: Sequence[Path]) -> Table:
+    """Make a table with a row for each measure and a column for each run.
+
+    PSNR is that of the test views, in dB; for two runs a column with the difference is added.
+
+    Args:
+        folders: folders of measured runs.
+
+    Raises:
+        ValueError: if ``folders`` is empty, or a ``metrics.json`` is missing or incomplete.
+    """
+    if not folders:
+        raise ValueError("runs: expected folders of runs, but got none; set runs=[FOLDER,FOLDER]")
+    metrics = [read_metrics(Path(folder)) for folder in folders]
+    rows = []
+    for ability, name in _ABILITIES.items():
+        _add(rows, name, [found["test"].get(ability, {}).get("psnr") for found in metrics], 2)
+    shares = [_flow_share(found) for found in metrics]
+    _add(rows, "moving points' error, % of motion", [share and 100 * share for share in shares], 0)
+    steps = [sum((found.get("steps") or {}).values()) or None for found in metrics]
+    _add(rows, "steps", steps, 0, with_difference=False)
+    _add(
+        rows,
+        "seconds of training",
+        [found["seconds"]["train"] for found in metrics],
+        0,
+        with_difference=False,
+    )
+    columns = ["PSNR (dB) of test views", *names_of(folders, metrics)]
+    columns += ["difference"] if len(folders) == 2 else []
+    return Table([Column(name) for name in columns], rows)
+
+
+def _add(rows: list, name: str, values: list, digits: int, *, with_difference: bool = True) -> None:
+    """Add a row, unless a run lacks the measure."""
+    if None in values:
+        return
+    written = Column("", digits)
+    cells = [written.text(float(value)) for value in values]
+    if len(values) == 2:
+        cells.append(written.text(Difference(values[0] - values[1])) if with_difference else None)
+    rows.append([name, *cells])
+
+
+def _flow_share(metrics: dict) -> float | None:
+    flow = metrics.get("flow") or {}
+    return flow["epe_moving"] / flow["motion_mean"] if flow.get("epe_moving") is not None else None
+
+
+def read_metrics(folder: Path) -> dict:
+    """Read a run's ``metrics.json``.
+
+    Raises:
+        ValueError: if the file is missing, or lacks keys that ``forewarp-evaluate`` writes.
+    """
+    path = folder / "metrics.json"
+    if not path.is_file():
+        raise ValueError(
+            f"{path}: expected a run's numbers, but got none; make them with forewarp-evaluate run={folder}"
+        )
+    metrics = read_json(path) or {}
+    for key in _KEYS:
+        if not isinstance(metrics.get(key), dict):
+            raise ValueError(
+                f"{path}: expected the key {key}, but got none; make it anew with forewarp-evaluate "
+                f"run={folder}"
+            )
+    return metrics
+
+
+def names_of(folders: Sequence[Path], metrics: Sequence[dict]) -> list[str]:
+    """Name runs by their methods if these differ, else by as much of their folders as needed.
+
+    >>> names_of(["a/x", "b/x"], [{"protocol": {"method": "forward"}}] * 2)
+    ['a/x', 'b/x']
+    """
+    paths = [Path(folder) for folder in folders]
+    choices = (
+        [content["protocol"].get("method", path.name) for path, content in zip(paths, metrics)],
+        [path.resolve().name for path in paths],
+        [path.as_posix() for path in paths],
+        [f"{number} {path.as_posix()}" for number, path in enumerate(paths, 1)],
+    )
+    return next(names for names in choices if len(set(names)) == len(names))

@@ -1,0 +1,142 @@
+"""Data modules of procedural scenes: write the scene at first use, then read the files like any other's."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+
+from filelock import FileLock
+
+from forewarp.data.files import read_json
+from forewarp.data.fingerprint import LOCK, RECORD
+from forewarp.data.module import DNeRFDataModule, HyperNeRFDataModule, LegoCompleteDataModule, NHRDataModule
+from forewarp.progress import Counted
+from forewarp.scene.errors import SceneError
+from forewarp.scene.frame import Scene
+from forewarp.synth import dome, lego_complete, rig, scenes
+
+WRITERS = {
+    "dnerf": scenes.synthesize,
+    "lego_complete": lego_complete.synthesize,
+    "hypernerf": rig.synthesize,
+    "nhr": dome.synthesize,
+}
+
+
+def write_whole(
+    folder: Path,
+    dataset: str,
+    arguments: Mapping,
+    *,
+    workers: int | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Path:
+    """Synthesise a scene in another folder, then rename that, so that ``folder`` is never half written.
+
+    Args:
+        folder: folder of the scene; an existing one is replaced.
+        dataset: a key of ``WRITERS``.
+        arguments: arguments of the writer; recorded in the scene's ``synthesis.json``.
+        workers, progress: see ``film.Film``; the files do not depend on them.
+    """
+    beside = folder.with_name(f".{folder.name}.part-{os.getpid()}")
+    try:
+        WRITERS[dataset](beside, **arguments, workers=workers, progress=progress)
+        (beside / RECORD).write_text(json.dumps({"dataset": dataset, **arguments}, indent=2) + "\n")
+        if folder.exists():
+            shutil.rmtree(folder)
+        os.replace(beside, folder)
+    finally:
+        shutil.rmtree(beside, ignore_errors=True)
+    return folder
+
+
+def is_scene(folder: Path) -> bool:
+    """Tell whether a folder holds a synthesised scene."""
+    return (folder / RECORD).is_file()
+
+
+class Synthetic:
+    """Mix-in for a data module: synthesise the scene first if it is missing.
+
+    Args:
+        root, scene: the scene is ``root/scene``.
+        synthesis: arguments of the writer; an existing scene must have been made with the same.
+        arguments: arguments of the data module that reads the scene.
+    """
+
+    dataset = "dnerf"
+
+    def __init__(self, root: str | Path, scene: str, *, synthesis: Mapping, **arguments) -> None:
+        super().__init__(root, scene, **arguments)
+        self.folder, self.synthesis = self._folder(Path(root), scene), dict(synthesis)
+        self._read = partial(self._prepared, self._read)
+
+    def prepare(self) -> None:
+        """Write the scene if it is missing; if several runs need the scene at once, one writes.
+
+        Raises:
+            SceneError: if the folder holds something else, or a scene made with other arguments.
+        """
+        if not is_scene(self.folder):
+            self.folder.parent.mkdir(parents=True, exist_ok=True)
+            with FileLock(self.folder.with_name(f".{self.folder.name}{LOCK}")):
+                self._write()
+        self._check()
+
+    def _prepared(self, read: Callable[[], Scene]) -> Scene:
+        self.prepare()
+        return read()
+
+    def _write(self) -> None:
+        if is_scene(self.folder):  # written while this run waited for the lock
+            return
+        if self.folder.exists() and (not self.folder.is_dir() or any(self.folder.iterdir())):
+            raise SceneError(
+                f"{self.folder}: expected a synthesised scene or nothing, but got something else; "
+                "use another data.root or data.scene"
+            )
+        with Counted(f"writing {self.folder.name}") as progress:
+            write_whole(self.folder, self.dataset, self.synthesis, progress=progress)
+
+    def _folder(self, root: Path, scene: str) -> Path:
+        """Return the folder that one call of the writer fills."""
+        return root / scene
+
+    def _check(self) -> None:
+        """Refuse a scene that was made with other arguments."""
+        record = self.folder / RECORD
+        before = {"dataset": "dnerf", **read_json(record)}
+        for key, value in {"dataset": self.dataset, **self.synthesis}.items():
+            if key in before and before[key] != value:
+                got = f"{before[key]}; use another data.scene or delete the scene"
+                raise SceneError(f"{record}: {key}: expected {value}, but got {got}")
+
+
+class SyntheticDataModule(Synthetic, DNeRFDataModule):
+    """The procedural scene ``root/scene`` in D-NeRF's layout."""
+
+
+class SyntheticLegoCompleteDataModule(Synthetic, LegoCompleteDataModule):
+    """The procedural scene ``root/scene``, one of several that are synthesised together into ``root``."""
+
+    dataset = "lego_complete"
+
+    def _folder(self, root: Path, scene: str) -> Path:
+        return root
+
+
+class SyntheticHyperNeRFDataModule(Synthetic, HyperNeRFDataModule):
+    """The procedural capture ``root/scene`` by a rig of two phones in a room."""
+
+    dataset = "hypernerf"
+
+
+class SyntheticNHRDataModule(Synthetic, NHRDataModule):
+    """The procedural recording ``root/scene`` by a dome of cameras."""
+
+    dataset = "nhr"

@@ -1,0 +1,258 @@
+"""The schedules of a stage: its budget of minutes and steps, its learning rates, its curriculum of frames."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+
+from forewarp.methods.method import Model
+from forewarp.training.objective import Objective
+
+
+@dataclass(frozen=True)
+class StageSettings:
+    """The numbers of one stage. Fractions are fractions of the stage.
+
+    Args:
+        name: name of the stage and of its folder.
+        lr: learning rate of each of the method's ``param_groups``.
+        iterations: steps; None if only minutes bound the stage.
+        minutes: training minutes; None if only iterations bound it. With both, the stage ends at the first.
+        lr_hold: keep the learning rates constant up to this fraction, then let them fall exponentially.
+        lr_final_factor: the learning rates end at this multiple of their initial values.
+        curriculum: arguments of ``Curriculum``.
+        max_gradient: clip the gradients' norm to this; 0 does not clip.
+        numbers: all other keys of the stage, which belong to the method.
+
+    Raises:
+        ValueError: for a name that is no folder name, or a stage without a bound.
+    """
+
+    name: str
+    lr: Mapping[str, float]
+    iterations: int | None = None
+    minutes: float | None = None
+    lr_hold: float = 0.0
+    lr_final_factor: float = 0.1
+    curriculum: Mapping[str, float] = field(default_factory=dict)
+    max_gradient: float = 0.0
+    numbers: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        where = f"stage.{self.name}"
+        if not isinstance(self.name, str) or not re.fullmatch(r"\w[\w-]*", self.name):
+            raise ValueError(
+                "stage: expected names of letters, digits, _ and -, as they name folders, "
+                f"but got {self.name!r}"
+            )
+        if self.iterations is None and self.minutes is None:
+            raise ValueError(
+                f"{where}: expected iterations or minutes, but got neither; set budget.minutes=10"
+            )
+        for key in ("iterations", "minutes"):
+            value = getattr(self, key)
+            if value is not None and not value > 0:
+                raise ValueError(f"{where}.{key}: expected a number > 0, but got {value}")
+
+    @classmethod
+    def of(cls, name: str, **keys: Any) -> StageSettings:
+        """Make settings from a stage's keys; keys that are not fields go to ``numbers``."""
+        own = {key: keys.pop(key) for key in list(keys) if key in cls.__dataclass_fields__}
+        return cls(name, **own, numbers=keys)
+
+    def lr_factor(self, fraction: float) -> float:
+        """Return what the learning rates are multiplied by at ``fraction`` of the stage."""
+        if fraction <= self.lr_hold:
+            return 1.0
+        return self.lr_final_factor ** ((min(1.0, fraction) - self.lr_hold) / (1 - self.lr_hold))
+
+    def fraction(self, steps: int, seconds: float) -> float:
+        """Return the fraction done, in [0, 1]: of the iterations or of the minutes, whichever is larger."""
+        done = 0.0
+        if self.iterations is not None:
+            done = steps / self.iterations
+        if self.minutes is not None:
+            done = max(done, seconds / (60 * self.minutes))
+        return min(1.0, done)
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A stage: its numbers, its objective, and the factory of its method (None: the run's ``model``)."""
+
+    settings: StageSettings
+    objective: Objective
+    model: Model | None = None
+
+
+class StagePlan:
+    """A stage as configured, before it is given its share of the budget.
+
+    Args:
+        share: weight of this stage when the run's budget is divided.
+        objective: the stage's objective.
+        model: makes the stage's method; None: the run's model.
+        settings: the other arguments of ``StageSettings``, and the method's own numbers.
+    """
+
+    def __init__(
+        self, *, share: float, objective: Objective, model: Model | None = None, **settings: Any
+    ) -> None:
+        self.share, self.objective, self.model, self.settings = share, objective, model, settings
+
+    def stage(self, name: str, minutes: float | None, iterations: int | None) -> Stage:
+        """Make the stage with these bounds."""
+        settings = StageSettings.of(name, minutes=minutes, iterations=iterations, **self.settings)
+        return Stage(settings, self.objective, self.model)
+
+
+def share_out(
+    plans: Mapping[str, StagePlan | None], *, minutes: float | None, iterations: int | None
+) -> list[Stage]:
+    """Divide the run's minutes and iterations among its stages by their shares; keep their order.
+
+    Args:
+        plans: by name; None leaves a stage out.
+        minutes, iterations: the run's budget; None: unbounded. With both, each stage ends at the first.
+
+    Raises:
+        ValueError: without any stage, for a share that is not > 0, or for a bound that is not > 0.
+    """
+    kept = {name: plan for name, plan in plans.items() if plan is not None}
+    if not kept:
+        raise ValueError("stage: expected at least one stage, but got none; leave one of them on")
+    for name, plan in kept.items():
+        if not (isinstance(plan.share, int | float) and plan.share > 0):
+            raise ValueError(
+                f"stage.{name}.share: expected a number > 0, but got {plan.share}; drop it with ~stage.{name}"
+            )
+    for key, value in (("minutes", minutes), ("iterations", iterations)):
+        if value is not None and not (isinstance(value, int | float) and value > 0):
+            raise ValueError(f"budget.{key}: expected a number > 0 or null, but got {value}")
+    whole = sum(plan.share for plan in kept.values())
+    return [
+        plan.stage(
+            name,
+            None if minutes is None else minutes * plan.share / whole,
+            None if iterations is None else max(1, round(iterations * plan.share / whole)),
+        )
+        for name, plan in kept.items()
+    ]
+
+
+def seconds_after(stages: Sequence[Stage], name: str) -> float | None:
+    """Return the most seconds that the stages after ``name`` may take; None if minutes do not bound them."""
+    names = [stage.settings.name for stage in stages]
+    minutes = [stage.settings.minutes for stage in stages[names.index(name) + 1 :]]
+    return None if None in minutes else 60 * sum(minutes)
+
+
+class Curriculum:
+    """Progressive training: sample frames near the canonical time first, then ever more of the others.
+
+    Call it for the index of the next training frame. The number of distinct times in play grows linearly
+    with the fraction of the stage that is done, and each time brings all its frames, so a run bounded by
+    minutes sees them all too. A share of the draws goes to the newest frames, whose motion is unknown yet.
+
+    Args:
+        times: time of every training frame.
+        canonical_time: where training starts.
+        start: distinct times in play at the beginning.
+        all_in: fraction of the stage at which all times are in play; 0: from the start.
+        most: number of times that ever come into play; null: all.
+        newest_share: share of the draws that goes to the newest frames, while frames still come in.
+        newest_part: share of the frames in play that counts as the newest.
+        error_share: share of the draws that picks a frame with a probability proportional to its latest
+            error (see ``report``): the few frames at the ends of a sequence are hard.
+        seed: seed of the draws.
+    """
+
+    def __init__(
+        self,
+        times: list[float],
+        canonical_time: float,
+        *,
+        start: int = 10,
+        all_in: float = 0.6,
+        most: int | None = None,
+        newest_share: float = 0.3,
+        newest_part: float = 0.125,
+        error_share: float = 0.0,
+        seed: int = 0,
+    ) -> None:
+        shares = all(0 <= share <= 1 for share in (all_in, newest_share, error_share))
+        if not (start >= 1 and shares and 0 < newest_part <= 1):
+            raise ValueError(
+                "stage.curriculum: expected start >= 1, all_in, newest_share and error_share in [0, 1] and "
+                f"newest_part in (0, 1], but got {start=}, {all_in=}, {newest_share=}, {error_share=}, "
+                f"{newest_part=}"
+            )
+        self.canonical_time = canonical_time
+        self.order = sorted(range(len(times)), key=lambda i: (abs(times[i] - canonical_time), times[i], i))
+        last_of_time = {times[i]: place for place, i in enumerate(self.order)}
+        self._ends = [place + 1 for place in last_of_time.values()]  # frames in play, by number of times
+        if most is not None:
+            if most < 1:
+                raise ValueError(f"stage.curriculum.most: expected at least 1 or null, but got {most}")
+            self._ends = self._ends[:most]
+        self.start, self.all_in = min(start, len(self._ends)), all_in
+        self.newest_share, self.newest_part = newest_share, newest_part
+        self.error_share = error_share
+        self.errors = torch.full((len(times),), float("nan"))
+        self.fraction = 0.0
+        self.generator = torch.Generator().manual_seed(seed)
+
+    @property
+    def in_play(self) -> int:
+        """Number of frames that may be drawn now."""
+        done = 1.0 if self.all_in == 0 else min(1.0, self.fraction / self.all_in)
+        return self._ends[self.start + int((len(self._ends) - self.start) * done) - 1]
+
+    def frames(self) -> list[int]:
+        """Return the frames in play, nearest to the canonical time first."""
+        return self.order[: self.in_play]
+
+    def __call__(self) -> int:
+        """Draw the next training frame."""
+        playing = self.in_play
+        if self.error_share > 0 and float(torch.rand((), generator=self.generator)) < self.error_share:
+            return self._by_error()
+        newest = max(1, int(playing * self.newest_part))
+        growing = playing < len(self.order)
+        favour = growing and float(torch.rand((), generator=self.generator)) < self.newest_share
+        low = playing - newest if favour else 0
+        return self.order[int(torch.randint(low, playing, (), generator=self.generator))]
+
+    def report(self, frame: int, error: float) -> None:
+        """Record the squared error of a frame after a step on it; ignore errors that are not finite."""
+        if not math.isfinite(error):
+            return
+        before = float(self.errors[frame])
+        self.errors[frame] = error if before != before else 0.5 * (before + error)
+
+    def _by_error(self) -> int:
+        frames = self.order[: self.in_play]
+        errors = self.errors[frames]
+        known = errors[~errors.isnan()]
+        # A frame not yet seen counts as the worst one.
+        chance = torch.nan_to_num(errors, nan=float(known.max()) if len(known) else 1.0) + 1e-8
+        return frames[int(torch.multinomial(chance, 1, generator=self.generator))]
+
+    def state_dict(self) -> dict:
+        """Return the generator's state, the fraction done and the frames' errors."""
+        return {
+            "generator": self.generator.get_state(),
+            "fraction": self.fraction,
+            "errors": self.errors.clone(),
+        }
+
+    def load_state_dict(self, state: dict) -> None:
+        """Continue from a ``state_dict``."""
+        self.generator.set_state(state["generator"])
+        self.fraction = state["fraction"]
+        self.errors = state["errors"].clone()

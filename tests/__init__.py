@@ -1,0 +1,1 @@
+"""Tests, mirroring src/forewarp, and what they share."""

@@ -1,0 +1,226 @@
+"""``python -m tests.bench.performance``: write the tables of docs/performance.md, as ``make bench`` does."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import statistics
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+
+from forewarp.cli.entry import quiet
+from forewarp.methods.voxel.terms import TERMS
+from forewarp.ops.splat import average_splat
+from forewarp.runs.config_files import project_root
+from tests.bench.timed_cases import (
+    ALONE,
+    CASES,
+    frame_work,
+    milliseconds,
+    splat_work,
+    step_by_hand,
+    step_with,
+    step_work,
+    timed,
+)
+from tests.bench.workloads import OCCUPANCY
+from tests.stability.report import replace_section, table
+from tests.stability.twin import implementation
+
+# Part of a profiler entry's name -> what it is called in the table; the first match counts.
+WORDS = (
+    ("convolution_backward", "convolutions, backwards"),
+    ("convolution", "convolutions"),
+    ("conv3d", "convolutions"),
+    ("upsample_trilinear", "interpolation of the up-layer"),
+    ("batch_norm", "norms"),
+    ("Numba", "reads and scatters (Numba)"),
+    ("mm", "F1, F2, F4 and layers of one voxel"),
+    ("copy", "copies"),
+    ("add", "sums, of gradients above all"),
+    ("clamp_min", "rectifiers"),
+    ("threshold_backward", "rectifiers"),
+    ("adam", "optimiser"),
+)
+_VERDICTS = {True: "reached", False: "**missed**", None: ""}
+
+
+def slope(amounts: Sequence[float], seconds: Sequence[float]) -> float:
+    """Fit the power with which seconds grow with the amount of work.
+
+    >>> round(slope([1, 2, 4, 8], [3, 6, 12, 24]), 6)
+    1.0
+    """
+    x, y = [math.log(a) for a in amounts], [math.log(s) for s in seconds]
+    return statistics.linear_regression(x, y).slope
+
+
+def mebibytes(count: int) -> str:
+    """Format bytes as whole MiB."""
+    return f"{count / 2**20:.0f}"
+
+
+def growth_tables(measured: Sequence[dict]) -> str:
+    """Make a table for each case: median time, memory, the dense version beside it, and the fitted power.
+
+    Args:
+        measured: the entries of pytest-benchmark's file.
+    """
+    found = {}
+    for entry in measured:
+        about = entry["extra_info"]
+        found[about["name"], about["size"], about["dense"]] = entry["stats"]["median"], about["peak"]
+    parts = []
+    for name, case in CASES.items():
+        sizes = [size for size in case.sizes if (name, size, False) in found]
+        if len(sizes) < 2:
+            continue
+        lines = []
+        for size in sizes:
+            own, dense = found[name, size, False], found.get((name, size, True))
+            beside = ["", "", ""]
+            if dense is not None:
+                beside = [milliseconds(dense[0]), mebibytes(dense[1]), f"{dense[0] / own[0]:.1f}"]
+            lines.append([f"{size:g}", milliseconds(own[0]), mebibytes(own[1]), *beside])
+        amounts = [case.work(size) for size in sizes]
+        fitted = slope(amounts, [found[name, size, False][0] for size in sizes])
+        against = "its cube" if case.work(2) == 8 else "its square" if case.work(2) == 4 else "it"
+        head = [case.axis, "ms", "MiB", "dense, ms", "dense, MiB", "times cheaper"]
+        parts.append(
+            f"**{name}**: seconds grow as {against} to the power {fitted:.2f}\n\n{table(head, lines)}"
+        )
+    return "\n\n".join(parts)
+
+
+def box_table(side: int = 40, rays: int = 2048) -> str:
+    """Time a step on one object while the box around it grows to eight times the volume."""
+    volumes, seconds, lines = (1.0, 2.0, 4.0, 8.0), [], []
+    for volume in volumes:
+        seconds.append(timed(step_work(side, False, rays=rays, box=volume ** (1 / 3))))
+        share = seconds[-1] / seconds[0]
+        lattice = f"{round(side * volume ** (1 / 3))}^3"
+        lines.append([f"x{volume:g}", lattice, milliseconds(seconds[-1]), f"{share:.2f}"])
+    head = table(["volume of the box", "lattice", "ms a step", "against the first"], lines)
+    return f"{head}\n\nA step grows as the box's volume to the power {slope(volumes, seconds):.2f}."
+
+
+def profile_table(side: int = 80, rays: int = 8192) -> str:
+    """Say where the time of a fine step goes."""
+    from torch.profiler import ProfilerActivity, profile
+
+    step = step_work(side, False, rays=rays)
+    step()
+    with profile(activities=[ProfilerActivity.CPU]) as taken:
+        step()
+    spent: dict[str, float] = {}
+    for event in taken.key_averages():
+        word = next((word for part, word in WORDS if part in event.key), "all else, in small pieces")
+        spent[word] = spent.get(word, 0.0) + event.self_cpu_time_total * 1e-6
+    whole = sum(spent.values())
+    ranked = sorted(spent.items(), key=lambda item: -item[1])
+    lines = [[word, milliseconds(s), f"{s / whole:.0%}"] for word, s in ranked]
+    return table(["part", "ms", "share"], [*lines, ["sum", milliseconds(whole), ""]])
+
+
+def splat_error(side: int = 80) -> float:
+    """Measure the largest error of the splat against float64; the source has deviation 1."""
+    generator = torch.Generator().manual_seed(0)
+    voxels = (torch.rand(side, side, side, generator=generator) < OCCUPANCY).nonzero()
+    source = torch.randn(len(voxels), 13, generator=generator)
+    positions = voxels + torch.randn(len(voxels), 3, generator=generator)
+    with implementation("reference"):
+        exact = average_splat(source.double(), positions.double(), (side,) * 3).values
+    return float((average_splat(source, positions, (side,) * 3).values - exact).abs().max())
+
+
+def goals_table(side: int = 80, rays: int = 8192, picture: int = 400, frame_side: int = 128) -> str:
+    """Measure the project's goals."""
+    step, dense = timed(step_work(side, False, rays=rays)), timed(step_work(side, True, rays=rays), 2)
+    printed = by_itself(side, rays)
+    splat = timed(splat_work(side, False))
+    first, again = (
+        timed(frame_work(picture, False, first, frame_side, plain=True)) for first in (True, False)
+    )
+    full = timed(frame_work(picture, False, side=side), 3)
+    rows = [
+        [f"fine step, {side}^3 to {2 * side}^3, {rays} rays", "< 3.5 s", f"{step:.2f} s", step < 3.5],
+        [
+            "the same densely, plain PyTorch as it runs by itself",
+            "12 times that",
+            f"{printed:.1f} s, {printed / step:.1f} times",
+            printed > 12 * step,
+        ],
+        ["densely with our large pages", "", f"{dense:.1f} s, {dense / step:.1f} times", None],
+        [f"splat of {side}^3, a tenth occupied, and back", "< 0.15 s", f"{splat:.4f} s", splat < 0.15],
+        ["its error against float64", "<= 1e-5", f"{splat_error(side):.0e}", splat_error(side) <= 1e-5],
+        [
+            f"{picture}^2 picture of {frame_side}^3, first of its time",
+            "< 1.5 s",
+            f"{first:.2f} s",
+            first < 1.5,
+        ],
+        ["another view of that time", "< 0.5 s", f"{again:.2f} s", again < 0.5],
+        [f"first picture with the U-Net, {side}^3 to {2 * side}^3", "< 1.5 s", f"{full:.2f} s", full < 1.5],
+    ]
+    return table(["what", "wanted", "measured", ""], [[*r[:3], _VERDICTS[r[3]]] for r in rows])
+
+
+def free_table(side: int = 48, rays: int = 2048) -> str:
+    """Time a step with each effect, relative to a step written by hand without the platform."""
+    photo, every = {"photo": 1.0}, dict.fromkeys(TERMS, 0.0)
+    works = {
+        "written without any of it": step_by_hand(side, rays),
+        "everything off": step_with({}, side, rays, photo),
+        "everything off, every loss term at weight 0": step_with({}, side, rays, every | photo),
+        **{f"{name} on": step_with(choice, side, rays, photo) for name, choice in ALONE.items()},
+    }
+    seconds = {name: timed(work) for name, work in works.items()}
+    first = next(iter(seconds.values()))
+    return table(
+        ["step", "ms", "times"], [[n, milliseconds(s), f"{s / first:.2f}"] for n, s in seconds.items()]
+    )
+
+
+def by_itself(side: int, rays: int) -> float:
+    """Time the dense step in a process without the large memory pages that the commands ask for."""
+    work = f"step_work({side}, True, rays={rays})"
+    code = "from tests.bench.timed_cases import step_work, timed; "
+    plain = {name: value for name, value in os.environ.items() if name != "THP_MEM_ALLOC_ENABLE"}
+    call = [sys.executable, "-c", f"{code}print(timed({work}, 2))"]
+    return float(subprocess.run(call, env=plain, check=True, capture_output=True, text=True).stdout)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Measure, and write the tables."""
+    parser = argparse.ArgumentParser(prog="python -m tests.bench.performance", description=__doc__)
+    parser.add_argument(
+        "--measured", type=Path, default=Path("runs/bench/growth.json"), help="of pytest-benchmark"
+    )
+    parser.add_argument("--document", type=Path, default=None, help="instead of docs/performance.md")
+    parser.add_argument("--only", nargs="*", default=("growth", "profile", "box", "goals", "free"))
+    given = parser.parse_args(arguments)
+    quiet()
+    document = given.document or project_root() / "docs" / "performance.md"
+    measured = given.measured
+    sections = {
+        "growth": lambda: growth_tables(json.loads(measured.read_text())["benchmarks"]),
+        "profile": profile_table,
+        "box": box_table,
+        "goals": goals_table,
+        "free": free_table,
+    }
+    for name in given.only:
+        text = sections[name]()
+        print(f"{name}\n{text}\n", flush=True)
+        replace_section(document, name, text)
+    print(document)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,120 @@
+import math
+
+import pytest
+import torch
+
+from forewarp.evaluation.trajectories import Trajectories, moving_points, order_of, spread
+from forewarp.evaluation.videos import make_shots, video
+from tests.support.known_ball import known_ball
+from tests.support.tiny_scene import ball_scene, camera_at
+
+WHITE = torch.ones(3)
+
+
+@pytest.fixture(scope="module")
+def cameras():
+    return [frame.camera for frame in ball_scene(frames=12, size=24).train]
+
+
+def test_fixed_goes_through_all_time(cameras):
+    shots = make_shots("fixed", 5, 0.5, cameras[0], cameras)
+    assert all(camera is cameras[0] for camera, _ in shots)
+    assert [time for _, time in shots] == [0, 0.25, 0.5, 0.75, 1]
+
+
+@pytest.mark.parametrize(("path", "times"), [("orbit", [0.3] * 4), ("both", [0, 1 / 3, 2 / 3, 1])])
+def test_a_turn_starts_at_the_view_and_stops_before_it_comes_again(cameras, path, times):
+    shots = make_shots(path, 4, 0.3, cameras[0], cameras)
+    assert [time for _, time in shots] == pytest.approx(times)
+    centers = torch.stack([camera.center for camera, _ in shots])
+    torch.testing.assert_close(centers[0], cameras[0].center)
+    middle = (centers[0] + centers[2]) / 2
+    torch.testing.assert_close(middle, (centers[1] + centers[3]) / 2)
+    assert float((centers - middle).norm(dim=-1).min()) > 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (("spiral", 4, 0.5), "path: expected one of fixed, orbit, both, trajectories, but got 'spiral'"),
+        (("fixed", 1, 0.5), "frames: expected at least 2, but got 1"),
+        (("orbit", 4, 1.5), r"time: expected a number in \[0, 1\], but got 1.5"),
+    ],
+)
+def test_bad_arguments_are_named(cameras, arguments, text):
+    with pytest.raises(ValueError, match=text):
+        make_shots(*arguments, cameras[0], cameras)
+
+
+def test_the_warp_is_made_once_a_time(cameras):
+    module = known_ball()
+    pictures = list(video(module, make_shots("orbit", 3, 0.5, cameras[0], cameras), WHITE))
+    assert module.method.asked == [0.5]
+    assert [tuple(p.shape) for p in pictures] == [(24, 24, 3)] * 3
+    assert not torch.equal(pictures[0], pictures[1])
+    list(video(module, make_shots("fixed", 3, 0.5, cameras[0], cameras), WHITE))
+    assert module.method.asked == [0.5, 0, 0.5, 1]
+
+
+def test_points_lie_on_the_surface_that_moves(cameras):
+    module = known_ball()
+    points = moving_points(module, cameras, 60)
+    assert points.shape == (60, 3)
+    assert not bool(module.method.is_still(points).any())
+    from_center = (points - torch.tensor([-0.3, 0.1, 0.0])).norm(dim=-1)
+    assert float(from_center.min()) > 0.4 - 2 * module.method.radiance.lattice.voxel_size
+    assert float(from_center.max()) < 0.4 + module.method.radiance.lattice.voxel_size
+    torch.testing.assert_close(points, moving_points(module, cameras, 60))
+
+
+def test_tails_follow_the_ball_and_nothing_is_drawn_before_it_moves(cameras):
+    module = known_ball()
+    camera = camera_at(0.75, size=60)  # looks along y: the ball slides across the picture
+    paint = Trajectories(module, cameras, count=80, tail=1.0)
+    shots = [(camera, 0.0), (camera, 1.0)]
+    plain = list(video(module, shots, WHITE))
+    drawn = list(video(module, shots, WHITE, paint))
+    ink = [(a - b).abs().amax(-1) > 0.05 for a, b in zip(plain, drawn)]
+    before, after = camera.project(torch.tensor([[-0.3, 0.1, 0.0], [0.5, 0.1, 0.0]]))[0][:, 0].tolist()
+    assert abs(before - after) > 10
+    columns = [mask.any(0).nonzero()[:, 0].float() for mask in ink]
+    radius = 0.4 / 3 * 1.2 * 60 + 3
+    assert float((columns[0] - before).abs().max()) < radius  # heads only
+    assert float((columns[1] - before).abs().min()) < 3  # a tail back to where it came from
+    assert float((columns[1] - after).abs().min()) < 3
+    assert int(ink[1].sum()) > 2 * int(ink[0].sum())
+
+
+def test_what_stands_behind_the_ball_is_not_drawn(cameras):
+    module = known_ball()
+    camera = camera_at(0.75, size=60)
+    paint = Trajectories(module, cameras, count=80)
+    behind = (paint.points - torch.tensor([-0.3, 0.1, 0.0])) @ camera.camera_to_world[:3, 2].float() > 0.2
+    assert int(behind.sum()) > 5
+    paint.points, paint.colors = paint.points[behind], paint.colors[behind]
+    plain, drawn = (next(video(module, [(camera, 0.0)], WHITE, p)) for p in (None, paint))
+    torch.testing.assert_close(plain, drawn)
+
+
+def test_a_still_scene_is_left_as_it_is(cameras):
+    module = known_ball()
+    module.method.trajectories = lambda points, times: points[:, None].expand(-1, len(times), 3)
+    paint = Trajectories(module, cameras)
+    assert len(paint.points) == 0
+    picture = torch.rand(4, 4, 3, generator=torch.Generator().manual_seed(0))
+    assert paint(picture, None, cameras[0], 0.5) is picture
+
+
+def test_spread_takes_the_farthest_next():
+    points = torch.tensor([[0.0, 0, 0], [1, 0, 0], [10, 0, 0], [5, 0, 0]])
+    assert spread(points, 3)[:, 0].tolist() == [0, 10, 5]
+    assert spread(points, 9) is points
+
+
+def test_order_is_along_the_longest_extent():
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand(9, 3, generator=generator) * torch.tensor([0.1, 5.0, 0.2])
+    order = order_of(points)
+    assert sorted(order.tolist()) == pytest.approx([i / 8 for i in range(9)])
+    expected = points[:, 1].argsort().argsort() / 8
+    assert math.isclose(abs(float(torch.corrcoef(torch.stack([order, expected]))[0, 1])), 1, abs_tol=0.05)

@@ -1,0 +1,149 @@
+from functools import partial
+
+import pytest
+import torch
+
+from forewarp.methods.particles.model import Particles
+from forewarp.methods.particles.settings import Numbers
+from forewarp.scene.view import Moment, View
+from tests.contract.fitting import module_of
+from tests.contract.scenes import data_of, write_dnerf
+from tests.contract.table import METHODS
+
+ENTRY = METHODS["particles"]
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    root = tmp_path_factory.mktemp("scenes")
+    write_dnerf(root / "dnerf")
+    return data_of("dnerf", root)
+
+
+def module_with(data, **changes):
+    """A module whose method has these options; ``numbers`` and ``weights`` are its stage's."""
+    of_entry = {key: changes.pop(key) for key in ("numbers", "weights") if key in changes}
+    return module_of(ENTRY, data, model=partial(Particles, **changes), **of_entry)
+
+
+def look(module, data, index=None, factors=None):
+    if index is not None:
+        data.picker = lambda: index
+    batch = next(iter(data.train_dataloader()))
+    factors = {"photo": 1.0, "rigid": 3.0, "smooth": 0.1} if factors is None else factors
+    return module.method.look(batch, factors, module.generator)
+
+
+@pytest.mark.parametrize("options", [{}, {"tints": 2, "fades": 2, "view": 2}, {"turns": False}, {"view": 0}])
+def test_gradients_are_those_of_autograd(data, options):
+    """What a step gives by itself, against the picture's graph; without jitter both see the same time."""
+    module = module_with(data, numbers={"jitter": 0.0}, **options)
+    method = module.method
+    generator = torch.Generator().manual_seed(0)
+    for name, p in method.named_parameters():
+        if name != "means":  # round particles have no turn
+            p.data += 0.1 * torch.randn(p.shape, generator=generator)
+    method.nodes.seen.copy_(torch.tensor([0.0, 1.0]))
+    data.picker = lambda: 3
+    batch = next(iter(data.train_dataloader()))
+    step = method.look(batch, {"photo": 1.0}, module.generator)
+    seen = batch.observations[0]
+    drawn = method.at(seen.moment).render(View(seen.view.camera), seen.background)
+    straight = seen.rgb.float() / 255
+    truth = torch.lerp(seen.background.expand(len(straight), 3), straight[:, :3], straight[:, 3:])
+    loss = ((drawn.rgb - truth).square() + 0.05**2).sqrt().sub(0.05).sum() / method.covered
+    loss.backward()
+    assert float(step.terms["photo"]()) == pytest.approx(float(loss.detach()), rel=1e-3)
+    for name, p in method.named_parameters():
+        error = float((p.grad - step.gradients[name]).norm() / p.grad.norm().clamp(min=1e-9))
+        assert error < 2e-3, name
+
+
+def test_what_is_off_is_absent(data):
+    method = module_with(data, motion="none", view=0).method
+    assert method.nodes is None
+    assert not method.moves
+    names = {name for name, _ in method.named_parameters()}
+    assert names == {"means", "log_scales", "turns", "opacity", "color"}
+    assert not {name for name, _ in method.named_buffers()} & {"links", "shares"}
+
+
+def test_without_motion_its_terms_are_none(data):
+    step = look(module_with(data, motion="none"), data)
+    assert step.terms["rigid"]() is None
+    assert step.terms["smooth"]() is None
+
+
+@pytest.mark.parametrize("motion", ["spline", "dct"])
+def test_the_canonical_state_is_the_particles_themselves(data, motion):
+    method = module_with(data, motion=motion).method
+    for p in (method.nodes.shift, method.nodes.turn):
+        p.data.normal_()
+    paths = method.trajectories(method.means.data[:5], torch.tensor([method.canonical_time, 1.0]))
+    torch.testing.assert_close(paths[:, 0], method.means.data[:5])
+    assert float((paths[:, 1] - paths[:, 0]).norm(dim=-1).amin()) > 0.01
+
+
+def test_a_snapshot_holds_its_time(data):
+    snapshot = module_with(data).method.at(Moment(0.5, 2, 0))
+    assert snapshot.holds(Moment(0.5))
+    assert not snapshot.holds(Moment(0.51))
+
+
+def test_rates_fall_each_by_itself(data):
+    numbers = {"finals": {"means": 0.01, "shifts": 0.25}, "hold_rates": {"shifts": 0.5}}
+    module = module_with(data, numbers=numbers)
+    optimizer = module.configure_optimizers()
+    for progress, expected in ((0.0, (1, 1, 1)), (0.5, (0.1, 1, 1)), (0.75, (0.01**0.75, 0.5, 1))):
+        for group in optimizer.param_groups:
+            group["lr"] = group["base_lr"]
+        module.method.advance(progress, 0, optimizer)
+        rates = {g["name"]: g["lr"] / g["base_lr"] for g in optimizer.param_groups}
+        extent = float(module.method.extent)
+        found = (rates["means"] / extent, rates["shifts"] / extent, rates["opacity"])
+        assert found == pytest.approx(expected, rel=1e-5)
+
+
+def test_particles_grow_to_what_the_pictures_call_for(data):
+    module = module_with(data, numbers={"every": 0.1, "first": 0.5, "settled": 1.0})
+    method, optimizer = module.method, module.configure_optimizers()
+    assert len(method.means) == round(0.5 * float(method.most))
+    for number in range(1, 10):
+        look(module, data)
+        method.advance(number / 10, number, optimizer)
+    assert len(method.means) == pytest.approx(float(method.most), rel=0.05)
+    assert len(method.links) == len(method.pulled) == len(method.means)
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"view": 4}, "view of 0 to 3"),
+        ({"tints": -1}, "tints >= 0"),
+        ({"motion": "wobble"}, "model.motion: expected spline, dct or none, but got 'wobble'"),
+        ({"numbers": {"first": 0.0}}, r"stage.first: expected a number in \(0, 1\], but got 0.0"),
+        ({"numbers": {"density": -1.0}}, "expected density > 0"),
+    ],
+)
+def test_refused(data, changes, text):
+    with pytest.raises(ValueError, match=text):
+        module_with(data, **changes)
+
+
+def test_numbers_follow_the_pictures():
+    numbers = Numbers()
+    assert numbers.most(4.0) == 180
+    assert numbers.share_at(0.0) == 0.5
+    assert numbers.share_at(1.0) == 1.0
+    assert numbers.motion(100, 2)[1] == 4
+    assert numbers.motion(20_000, 200)[0] > numbers.motion(5_000, 200)[0]
+
+
+def test_two_views_of_a_time_count_as_one_step(data):
+    module = module_with(data, numbers={"jitter": 0.0})
+    data.picker = lambda: 2
+    batch = next(iter(data.train_dataloader()))
+    twice = type(batch)(batch.observations * 2, batch.frame)
+    one, two = (module.method.look(b, {"photo": 1.0}, module.generator) for b in (batch, twice))
+    assert float(one.terms["photo"]()) == pytest.approx(float(two.terms["photo"]()), rel=1e-5)
+    torch.testing.assert_close(one.gradients["means"], two.gradients["means"], rtol=1e-3, atol=1e-6)

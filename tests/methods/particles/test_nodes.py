@@ -1,0 +1,145 @@
+import math
+
+import pytest
+import torch
+
+from forewarp.fields.curves import Curve
+from forewarp.methods.particles.nodes import Nodes, nearest, spread_out
+
+
+def grid(side=4):
+    axis = torch.linspace(-1, 1, side)
+    return torch.cartesian_prod(axis, axis, axis)
+
+
+def nodes_of(count=12, kind="spline", knots=8, canonical=0.0, turns=True):
+    nodes = Nodes(grid(), count, Curve(kind, knots, 20, canonical), turns=turns)
+    generator = torch.Generator().manual_seed(0)
+    for value in (nodes.shift, nodes.turn):
+        if value is not None:
+            value.data = 0.1 * torch.randn(value.shape, generator=generator)
+    return nodes
+
+
+def test_places_are_far_from_one_another():
+    points = torch.randn(500, 3)
+    chosen = spread_out(points, 20)
+    places = points[chosen]
+    apart = torch.cdist(places, places) + 1e9 * torch.eye(20)
+    # No point is farther from the places than they are from one another.
+    assert float(torch.cdist(points, places).amin(-1).max()) <= float(apart.min()) + 1e-5
+
+
+def test_fewer_points_than_nodes():
+    assert len(Nodes(torch.randn(3, 3), 10, Curve("spline", 5, 9, 0.0))) == 3
+    alone = Nodes(torch.zeros(1, 3), 10, Curve("spline", 5, 9, 0.0))
+    rows, shares = alone.links(torch.randn(4, 3))
+    assert rows.tolist() == [[0]] * 4
+    assert shares.tolist() == [[1.0]] * 4
+
+
+def test_nearest_is_nearest():
+    points, places = torch.randn(5000, 3), torch.randn(30, 3)
+    away, rows = nearest(points, places, 4)
+    exact = torch.cdist(points, places).square().sort(-1)
+    torch.testing.assert_close(away, exact.values[:, :4], atol=1e-4, rtol=1e-4)
+    assert (rows == exact.indices[:, :4]).float().mean() > 0.999
+
+
+def test_shares_sum_to_one_and_prefer_the_nearest():
+    nodes = nodes_of()
+    rows, shares = nodes.links(nodes.places + 0.01)
+    torch.testing.assert_close(shares.sum(-1), torch.ones(12))
+    assert torch.equal(rows[:, 0].long(), torch.arange(12))
+    assert bool((shares[:, 0] >= shares[:, 1:].amax(-1)).all())
+
+
+@pytest.mark.parametrize("kind", ["spline", "dct"])
+@pytest.mark.parametrize("canonical", [0.0, 0.4])
+def test_nothing_has_moved_at_the_canonical_time(kind, canonical):
+    nodes, points = nodes_of(kind=kind, canonical=canonical), torch.randn(7, 3)
+    paths = nodes.paths(points, torch.tensor([canonical, 1.0], dtype=torch.float64))
+    torch.testing.assert_close(paths[:, 0], points)
+    assert float((paths[:, 1] - points).detach().norm(dim=-1).amin()) > 1e-3
+
+
+def test_paths_are_where_the_maps_lead():
+    nodes, points = nodes_of(kind="dct"), torch.randn(7, 3)
+    rows, shares = nodes.links(points)
+    maps = nodes.maps(0.7)
+    expected = points.clone()
+    for i in range(7):
+        for row, share in zip(rows[i].tolist(), shares[i]):
+            linear, shift = maps[row, :9].reshape(3, 3), maps[row, 9:]
+            expected[i] += share * (linear @ points[i] + shift)
+    torch.testing.assert_close(nodes.paths(points, torch.tensor([0.7]))[:, 0], expected)
+
+
+@pytest.mark.parametrize("turns", [True, False])
+def test_slopes_over_time_are_those_of_autograd(turns):
+    nodes = nodes_of(turns=turns)
+    basis = nodes.curve(0.6)
+    motion, _ = nodes.carried(basis)
+    slope = torch.randn(motion.shape)
+    (motion * slope).sum().backward()
+    found = nodes.spread_over_time(basis, slope)
+    torch.testing.assert_close(found["nodes.shift"], nodes.shift.grad)
+    assert ("nodes.turn" in found) == turns
+    if turns:
+        torch.testing.assert_close(found["nodes.turn"], nodes.turn.grad)
+
+
+def test_slopes_of_bending_are_those_of_autograd():
+    nodes = nodes_of()
+    nodes.seen.copy_(torch.tensor([0.0, 1.0]))
+    value, found = nodes.bent(0.5, 3.0, unit=2.0)
+    step = 1 / 5
+    before, now, after = (nodes.curve(t) for t in (0.5 - step, 0.5, 0.5 + step))
+    basis = after - 2 * now + before
+    bend = [torch.einsum("mkc,k->mc", v, basis) / s for v, s in ((nodes.shift, 2.0), (nodes.turn, 1.0))]
+    total = sum(b.square().mean() for b in bend)
+    (3.0 * total).backward()
+    assert value == pytest.approx(float(total.detach()), rel=1e-4)
+    torch.testing.assert_close(found["nodes.shift"], nodes.shift.grad, atol=1e-6, rtol=1e-3)
+    torch.testing.assert_close(found["nodes.turn"], nodes.turn.grad, atol=1e-6, rtol=1e-3)
+
+
+def test_straight_motion_does_not_bend():
+    nodes = nodes_of()
+    nodes.seen.copy_(torch.tensor([0.0, 1.0]))
+    line = torch.arange(8.0)[:, None].expand(8, 3)
+    nodes.shift.data = line.expand(12, 8, 3).clone()
+    nodes.turn.data.zero_()
+    assert nodes.bent(0.4, 1.0, 1.0)[0] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_curve_is_continued_to_times_not_yet_seen():
+    nodes = nodes_of(knots=10)
+    for value in (nodes.shift, nodes.turn):
+        value.data.zero_()
+    nodes.shift.data[:, :5, 0] = torch.arange(5.0)
+    nodes.look_ahead(0.0, 0.29)  # the third span is the last that is seen
+    assert nodes.shift[0, :5, 0].tolist() == [0, 1, 2, 3, 4]
+    expected, stride = 4.0, 1.0
+    for j in range(5, 10):
+        stride *= 0.5
+        expected += stride
+        # The sixth knot is seen already, though at 0; what lies beyond follows it.
+        if j > 5:
+            assert math.isfinite(nodes.shift[0, j, 0].item())
+    assert nodes.seen.tolist() == pytest.approx([0.0, 0.29])
+
+
+def test_what_was_seen_is_not_continued_anew():
+    nodes = nodes_of()
+    nodes.look_ahead(0.0, 1.0)
+    before = nodes.shift.clone()
+    nodes.look_ahead(0.2, 0.9)
+    assert torch.equal(nodes.shift, before)
+
+
+def test_another_kind_of_curve_is_refused():
+    with pytest.raises(ValueError, match="model.motion: expected spline, dct or none, but got 'fourier'"):
+        Curve("fourier", 8, 20, 0.0)
+    with pytest.raises(ValueError, match="at least 2 distinct training times, but got 1"):
+        Curve("spline", 8, 1, 0.0)

@@ -1,0 +1,72 @@
+import torch
+
+from forewarp.ops.adam import adam_rows
+
+
+def state(shape=(6, 3), seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    value = torch.randn(*shape, generator=generator)
+    return value, torch.zeros(shape), torch.zeros(shape), torch.zeros(shape[:-1])
+
+
+def step(parts, gradient, rate=0.1):
+    value, mean, square, steps = parts
+    adam_rows(value, gradient, mean, square, steps, rate, (0.9, 0.99), 1e-15)
+
+
+def test_it_is_adam_where_every_row_has_a_gradient(backend):
+    parts = state()
+    twin = torch.nn.Parameter(parts[0].clone())
+    known = torch.optim.Adam([twin], lr=0.1, betas=(0.9, 0.99), eps=1e-15)
+    for number in range(5):
+        gradient = torch.randn(6, 3, generator=torch.Generator().manual_seed(number))
+        twin.grad = gradient.clone()
+        known.step()
+        step(parts, gradient)
+    torch.testing.assert_close(parts[0], twin.data)
+
+
+def test_rows_without_a_gradient_stay_as_they_are(backend):
+    parts, gradient = state(), torch.ones(6, 3)
+    gradient[2] = 0
+    gradient[4, :2] = 0  # a part of it has one
+    before = [part.clone() for part in parts]
+    step(parts, gradient)
+    for now, then in zip(parts, before):
+        assert torch.equal(now[2], then[2])
+    assert parts[3].tolist() == [1, 1, 0, 1, 1, 1]
+    torch.testing.assert_close(parts[0][0], before[0][0] - 0.1)
+
+
+def test_each_row_counts_its_own_steps(backend):
+    parts = state()
+    first = torch.ones(6, 3)
+    first[0] = 0
+    step(parts, first)
+    before = parts[0].clone()
+    step(parts, torch.ones(6, 3))
+    # For the first row it is the first step: a whole rate, as for all at their first.
+    torch.testing.assert_close(parts[0], before - 0.1)
+
+
+def test_of_more_axes_the_last_is_a_row(backend):
+    parts, gradient = state((4, 5, 3)), torch.ones(4, 5, 3)
+    gradient[1, 2] = 0
+    step(parts, gradient)
+    assert parts[3].sum() == 19
+
+
+def test_both_agree_after_many_steps():
+    fast, exact = state(), [part.double() for part in state()]
+    for number in range(2100):
+        gradient = torch.randn(6, 3, generator=torch.Generator().manual_seed(number))
+        step(fast, gradient, 1e-3)
+        step(exact, gradient.double(), 1e-3)
+    torch.testing.assert_close(fast[0].double(), exact[0], rtol=1e-3, atol=1e-3)
+
+
+def test_not_a_number_is_kept(backend):
+    parts, gradient = state(), torch.ones(6, 3)
+    gradient[3, 1] = float("nan")
+    step(parts, gradient)
+    assert bool(parts[0][3, 1].isnan())

@@ -1,0 +1,118 @@
+import math
+
+import pytest
+import torch
+
+from forewarp.ops.compare import compare
+from forewarp.ops.project import Gaussians
+from tests.support.gaussians import NO_FADES, NO_TINTS, SIZE, crowd, one, pinhole, still, straight
+
+
+def pixels(size=SIZE, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randint(0, 256, (size[0] * size[1], 4), generator=generator).to(torch.uint8)
+
+
+BEHIND = torch.tensor([0.2, 0.5, 0.9])
+
+
+def run(kind, truth=None, **options):
+    particles, warp, tints, fades = crowd(dtype=kind)
+    truth = pixels() if truth is None else truth
+    return compare(
+        particles, warp, pinhole(), tints, fades, truth, BEHIND.to(kind), by_weights=True, **options
+    )
+
+
+@pytest.mark.parametrize("options", [{}, {"width": 0.5, "factor": 0.01}])
+def test_kernel_equals_reference(options):
+    exact, fast = run(torch.float64, **options), run(torch.float32, **options)
+    assert fast.loss == pytest.approx(exact.loss, rel=1e-5)
+    assert fast.squared == pytest.approx(exact.squared, rel=1e-5)
+    pairs = [*zip(exact.particles, fast.particles), (exact.maps, fast.maps), (exact.weights, fast.weights)]
+    for one_part, other in [*pairs, (exact.pull, fast.pull)]:
+        assert float((one_part - other).norm() / one_part.norm()) < 2e-5
+
+
+def test_the_loss_of_nothing(backend):
+    nothing = Gaussians(*(t[:0] for t in one()))
+    truth = torch.tensor([[255, 0, 0, 255], [0, 0, 0, 0]], dtype=torch.uint8)
+    camera = straight((2, 1))
+    found = compare(nothing, still(nothing), camera, NO_TINTS, NO_FADES, truth, torch.zeros(3), width=0.1)
+    # Red before black; what is transparent shows what is behind it.
+    assert found.squared == pytest.approx(1.0)
+    assert found.loss == pytest.approx(math.sqrt(1.01) - 0.1, rel=1e-5)
+
+
+def test_finite_differences():
+    """In float64, of every parameter: the reference, to which kernels are held."""
+    particles, warp, tints, fades = crowd(count=6, degree=0, tints=1)
+    arguments = (warp, pinhole(), tints, fades, pixels(), BEHIND.double())
+    found = compare(particles, *arguments)
+    step = 1e-6
+    for name in ("means", "log_scales", "quaternions", "opacity", "colors"):
+        slope = torch.randn(getattr(particles, name).shape, dtype=torch.float64)
+        sides = [
+            compare(
+                particles._replace(**{name: getattr(particles, name) + sign * step * slope}), *arguments
+            ).loss
+            for sign in (1, -1)
+        ]
+        along = float((getattr(found.particles, name) * slope).sum())
+        assert (sides[0] - sides[1]) / (2 * step) == pytest.approx(along, rel=1e-4, abs=1e-4), name
+
+
+def test_a_perfect_picture_has_no_loss_and_no_gradient(backend):
+    nothing = one((0.0, 0.0, -9.0))
+    truth = torch.zeros(64, 4, dtype=torch.uint8)
+    found = compare(nothing, still(nothing), straight((8, 8)), NO_TINTS, NO_FADES, truth, torch.ones(3))
+    assert (found.loss, found.squared) == (0.0, 0.0)
+    assert not any(bool(gradient.any()) for gradient in found.particles)
+    assert not bool(found.pull.any())
+
+
+def test_opaque_pictures_pull_at_what_is_seen(backend):
+    particle = one(opacity=0.0)
+    truth = torch.full((256, 4), 255, dtype=torch.uint8)
+    found = compare(particle, still(particle), straight(), NO_TINTS, NO_FADES, truth, torch.zeros(3))
+    assert found.particles.opacity.item() < 0  # more of it would be nearer to white
+    assert bool((found.particles.colors[0, 0] < 0).all())
+    assert found.pull.item() < 1e-3 * abs(found.particles.opacity.item()) + 1  # it stands in the middle
+
+
+def test_random_backgrounds_say_where_nothing_is(backend):
+    particle = one(opacity=0.0)
+    truth = torch.zeros(256, 4, dtype=torch.uint8)
+    found = compare(particle, still(particle), straight(), NO_TINTS, NO_FADES, truth, torch.ones(3))
+    assert found.particles.opacity.item() > 0  # less of it
+
+
+def test_not_a_number_is_told(backend):
+    particle = one(opacity=0.0)
+    broken = particle._replace(colors=particle.colors * float("nan"))
+    truth = torch.zeros(256, 4, dtype=torch.uint8)
+    found = compare(broken, still(broken), straight(), NO_TINTS, NO_FADES, truth, torch.ones(3))
+    assert not math.isfinite(found.loss)
+
+
+def test_two_threads_give_the_same(two_threads):
+    first, again = run(torch.float32), run(torch.float32)
+    assert first.loss == again.loss
+    assert all(torch.equal(a, b) for a, b in zip(first.particles, again.particles))
+    torch.set_num_threads(1)
+    alone = run(torch.float32)
+    for a, b in zip(first.particles, alone.particles):
+        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("truth", "options", "text"),
+    [
+        (pixels()[:-1], {}, r"pixels: expected shape \(609, 4\)"),
+        (pixels().float(), {}, "expected uint8 pixels"),
+        (pixels(), {"width": 0.0}, "width > 0"),
+    ],
+)
+def test_what_cannot_be_compared_is_refused(truth, options, text):
+    with pytest.raises(ValueError, match=text):
+        run(torch.float32, truth, **options)

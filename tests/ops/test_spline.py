@@ -1,0 +1,49 @@
+import pytest
+import torch
+
+from forewarp.ops.spline import spline_basis
+
+
+def test_hand_worked():
+    # Five knots are two spans; their middle, 1/2, lies on a knot: shares 1/6, 4/6, 1/6.
+    found = spline_basis(0.5, 5, canonical_time=0.0) * 6
+    assert found.tolist() == pytest.approx([-1, 1 - 4, 4 - 1, 1, 0], abs=1e-6)
+
+
+@pytest.mark.parametrize("canonical", [0.0, 0.31, 1.0])
+def test_zero_at_the_canonical_time_and_in_sum(canonical):
+    assert not bool(spline_basis(canonical, 9, canonical).any())
+    basis = spline_basis(torch.linspace(0, 1, 41, dtype=torch.float64), 9, canonical)
+    torch.testing.assert_close(basis.sum(-1), torch.zeros(41, dtype=torch.float64))
+
+
+def test_straight_lines_are_straight():
+    times = torch.linspace(0, 1, 17, dtype=torch.float64)
+    path = spline_basis(times, 8, 0.25) @ torch.arange(8, dtype=torch.float64)
+    torch.testing.assert_close(path, 5 * (times - 0.25))
+
+
+def test_a_number_and_a_tensor_give_the_same():
+    for time in (0.0, 0.123, 0.5, 1.0):
+        torch.testing.assert_close(spline_basis(time, 7, 0.4), spline_basis(torch.tensor(time), 7, 0.4))
+
+
+def test_smooth_between_spans():
+    times = torch.linspace(0, 1, 2001, dtype=torch.float64)
+    bend = spline_basis(times, 9, 0.0).diff(n=2, dim=0) / (times[1] - times[0]) ** 2
+    assert float(bend.diff(dim=0).abs().amax()) < 1.0  # the second derivative has no jumps
+
+
+@pytest.mark.parametrize(
+    ("time", "knots", "text"),
+    [(0.5, 3, "at least 4 knots, but got 3"), (1.01, 5, r"times in \[0, 1\]"), (float("nan"), 5, "times in")],
+)
+def test_refused(time, knots, text):
+    with pytest.raises(ValueError, match=text):
+        spline_basis(time, knots, 0.0)
+
+
+@pytest.mark.parametrize("time", [0.3, torch.tensor([0.0, 0.3, 1.0])])
+def test_without_a_canonical_time_shares_sum_to_one(time):
+    total = spline_basis(time, 6).sum(-1)
+    torch.testing.assert_close(total, torch.ones_like(total))

@@ -1,0 +1,238 @@
+"""From a scene to its plan, and from the plan to a run."""
+
+import json
+import shutil
+
+import pytest
+import yaml
+
+from forewarp.data.module import SceneDataModule
+from forewarp.planning.plan_file import read_plan, with_plan, write_plan
+from forewarp.planning.trials import Trials
+from forewarp.synth.scenes import synthesize
+
+TINY = ["data=dnerf", "preset=demo", "trainer=cpu", "data.rays=64", "logger=none", "callbacks=default"]
+TINY += ["callbacks.pictures=null", "callbacks.accuracy=null", "callbacks.scalars=null", "threads=1"]
+LATTICES = ["stage.coarse.num_voxels=[[0,800]]", "stage.fine.num_voxels=[[0,1000]]"]
+SHORT = ["plan.steps=8", "plan.trial_steps=3", "plan.seeds=1", "plan.held_out=3"]
+EFFECTS = ["motion", "bases", "background", "view_dependence", "inpainter", "upsampler"]
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory):
+    """A folder with the scene ``vehicle``, 24 x 24 pixels."""
+    root = tmp_path_factory.mktemp("scenes")
+    synthesize(root / "vehicle", size=24, frames=16, test_views=(1, 1, 0), val_views=0, samples_per_pixel=1)
+    return root
+
+
+@pytest.fixture
+def words(scenes, in_tmp):
+    """What one types of the tiny scene."""
+    return [*TINY, *LATTICES, f"data.root={scenes}", "data.scene=vehicle"]
+
+
+def test_a_plan_is_made_once_told_and_fitted(forewarp, words, monkeypatch, in_tmp):
+    kept = SceneDataModule.targets
+
+    def guarded(self, split):
+        assert split != "test", "a plan looked at test views"
+        return kept(self, split)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(SceneDataModule, "targets", guarded)
+        done = forewarp("plan", *words, *SHORT)
+    assert done.status == 0, done.err
+    (file,) = in_tmp.glob("runs/vehicle/plan-*/plan.yaml")
+    assert f"forewarp-train plan={file.relative_to(in_tmp)}" in done.out
+    made = yaml.safe_load(file.read_text())
+    assert [e for e in EFFECTS if e in made["effects"]] == list(made["effects"])
+    assert {"motion", "background", "view_dependence", "inpainter", "upsampler"} <= made["effects"].keys()
+    for effect, decision in made["effects"].items():
+        assert effect in done.out
+        assert decision["because"]
+        assert any(character.isdigit() for character in decision["because"])
+    assert made["evidence"]["pictures"]["times"] == 16
+    assert {"motion", "bases"} <= made["evidence"]["trials"].keys()
+
+    again = forewarp("plan", *words, *SHORT)
+    assert "coarse" not in again.out.partition("planned before, in")[0]  # what is there is read
+    assert "± is two standard errors" in again.out
+
+    short = ["budget.iterations=4", "budget.minutes=null"]
+    done = forewarp("train", f"plan={file}", *short, "model/inpainter=none", "evaluate=false")
+    assert done.status == 0, done.err
+    assert len(list(in_tmp.glob("runs/vehicle/planned-*/fine/done.json"))) == 1  # in a folder of its own
+    fitted = forewarp(
+        "train", f"plan={file}", *short, "run=fit", "model/view_dependence=mlp", "evaluate=false"
+    )
+    assert fitted.status == 0, fitted.err
+    config = yaml.safe_load((in_tmp / "fit" / "config.yaml").read_text())
+    assert config["data"]["scene"] == "vehicle"
+    assert config["model"]["view_dependence"]["_target_"].endswith("ViewNetwork")  # what is typed wins
+    assert (config["model"]["motion"] is not None) == made["effects"]["motion"]["on"]
+    assert (in_tmp / "fit" / "plan.yaml").read_text() == file.read_text()
+
+
+@pytest.mark.slow
+def test_every_question_is_asked_where_all_is_open(forewarp, words, in_tmp, monkeypatch):
+    """No alpha, and evidence that rules nothing out: each effect is tried, with its price."""
+    monkeypatch.setattr("forewarp.methods.voxel.planning.CUT_OUT", 2.0)
+    monkeypatch.setattr("forewarp.methods.voxel.planning.BY_DIRECTION", (-9.0, 9.0))
+    monkeypatch.setattr("forewarp.methods.voxel.planning.TORN", (-1.0, 9.0))
+    monkeypatch.setattr("forewarp.methods.voxel.planning.HEADROOM", (99.0, -99.0))
+    monkeypatch.setattr(
+        "forewarp.methods.effect.Evidence.pays", lambda self, effect: effect in self.gains or None
+    )
+    fitted, kept = [], Trials._fitted
+    monkeypatch.setattr(Trials, "_fitted", lambda self, c, *a: (fitted.append(c.run), kept(self, c, *a))[1])
+    done = forewarp("plan", *words, *SHORT, "plan.minutes=0.1", "stage.coarse.start_alpha=2e-2")
+    assert done.status == 0, done.err
+    assert len(fitted) == len(set(fitted))  # none of them twice
+    (file,) = in_tmp.glob("runs/vehicle/plan-*/plan.yaml")
+    for trial in file.parent.glob("fine*"):  # a coarse stage is shared, and not fitted again
+        shared = trial / "coarse" / "last.ckpt"
+        assert any(shared.samefile(one) for one in file.parent.glob("coarse*/coarse/last.ckpt")), trial
+    made = yaml.safe_load(file.read_text())
+    assert made["evidence"]["trials"].keys() == set(EFFECTS)
+    assert all(decision["on"] for decision in made["effects"].values())
+    assert "stage.coarse.effects=[motion,background]" in made["overrides"]
+    assert "stage.fine.num_voxels=[[0,1000]]" in made["overrides"]
+    fitted = forewarp("train", f"plan={file}", "budget.iterations=4", "run=fit", "evaluate=false")
+    assert fitted.status == 0, fitted.err
+    config = yaml.safe_load((in_tmp / "fit" / "config.yaml").read_text())
+    assert config["stage"]["coarse"]["start_alpha"] == 2e-2  # typed before it was planned
+    assert None not in [config["model"][e] for e in EFFECTS if e != "bases"]
+
+
+def test_a_scene_of_one_time_is_planned_and_fitted_without_motion(forewarp, words, scenes, in_tmp):
+    shutil.copytree(scenes / "vehicle", in_tmp / "scenes" / "vehicle")
+    for path in (in_tmp / "scenes" / "vehicle").glob("transforms_*.json"):
+        content = json.loads(path.read_text())
+        content["frames"] = [frame | {"time": 0.0} for frame in content["frames"]]
+        path.write_text(json.dumps(content))
+    (in_tmp / "scenes" / "vehicle" / "trajectories.npz").unlink()
+    typed = [
+        *words,
+        "data.root=scenes",
+        *SHORT,
+        "budget.iterations=8",
+        "budget.minutes=null",
+        "evaluate=false",
+    ]
+    done = forewarp("train", *typed, "effects=auto", "run=still")
+    assert done.status == 0, done.err
+    made = yaml.safe_load((in_tmp / "still" / "plan.yaml").read_text())
+    assert made["effects"]["motion"]["because"].startswith("1 time")
+    config = yaml.safe_load((in_tmp / "still" / "config.yaml").read_text())
+    assert config["model"]["motion"] is None
+
+
+def test_auto_plans_and_fits_in_one_go(forewarp, words, in_tmp):
+    short = ["budget.iterations=4", "budget.minutes=null", "evaluate=false", "run=both"]
+    typed = [*words, *SHORT, *short, "plan.trials=false", "model/inpainter=none"]
+    done = forewarp("train", *typed, "effects=auto")
+    assert done.status == 0, done.err
+    made = yaml.safe_load((in_tmp / "both" / "plan.yaml").read_text())
+    assert made["effects"]["inpainter"]["because"].startswith("as typed; ")
+    assert "trials" not in str(made["overrides"])
+    assert made["evidence"]["trials"] == {}
+    assert (in_tmp / "both" / "fine" / "done.json").is_file()
+    assert {path.name for path in in_tmp.glob("runs/vehicle/plan-*/*")} == {"coarse", "plan.yaml"}
+    again = forewarp("train", *typed, "effects=auto")
+    assert "fine: finished before" in again.out
+
+
+def test_mistakes_are_one_line(refused, words, in_tmp):
+    assert "use model=forward" in refused("plan", *words, "model=backward")
+    assert refused("plan", *words, "~stage.fine").startswith("stage: expected a coarse stage and another")
+    assert refused("plan", *words, "plan.seeds=0") == "plan.seeds: expected a whole number >= 1, but got 0"
+    assert refused("train", *words, "effects=some") == "effects: expected given or auto, but got some"
+    missing = refused("train", "plan=nowhere.yaml")
+    assert missing.startswith("plan: expected a file that forewarp-plan wrote, but got nowhere.yaml")
+    (in_tmp / "bad.yaml").write_text(
+        "typed: []\noverrides: ['hydra.run.dir=/']\neffects: {}\nseconds: 1\nof: x\n"
+    )
+    assert refused("train", "plan=bad.yaml").startswith("plan: expected overrides that a plan has")
+    assert not (in_tmp / "runs").exists()
+
+
+@pytest.mark.parametrize("text", ["", "[]", "overrides: [a=b]", "{", "typed: 3\noverrides: 4", "\0"])
+def test_what_is_no_plan_is_refused(tmp_path, text):
+    (tmp_path / "plan.yaml").write_text(text)
+    with pytest.raises(ValueError, match="expected a file that forewarp-plan wrote"):
+        read_plan(tmp_path / "plan.yaml")
+
+
+def test_a_plan_of_an_earlier_version_is_to_be_made_anew(refused, in_tmp):
+    (in_tmp / "plan.yaml").write_text("typed: [data.scene=x]\nwords: [model/motion=none]\nof: x\n")
+    assert refused("train", "plan=plan.yaml") == (
+        "plan: expected the key overrides, but got words, as before version 0.3, in plan.yaml; "
+        "make it anew with forewarp-plan"
+    )
+
+
+@pytest.mark.parametrize(
+    "word",
+    ["hydra/launcher=ray", "trainer._target_=os.system", "~stage.fine", "x", "--config-dir=/", "-x=1"]
+    + [
+        "experiment=../../evil",
+        "model/view_dependence=../../evil",
+        "scene=/evil",
+        "experiment@x=a/b",
+        "a/../b=c",
+    ],
+)
+def test_a_plan_sets_no_code(tmp_path, word):
+    write_plan(tmp_path / "plan.yaml", {"typed": ["data.scene=x"], "overrides": [word], "of": "0"})
+    with pytest.raises(ValueError, match="expected overrides that a plan has"):
+        read_plan(tmp_path / "plan.yaml")
+
+
+def test_what_a_plan_composes_names_no_code_of_others(refused, in_tmp):
+    """Whatever words lead there: the config of a planned run is looked at before anything is made of it."""
+    mine = in_tmp / "mine" / "callbacks"
+    mine.mkdir(parents=True)
+    (mine / "evil.yaml").write_text("x: {_target_: shutil.copyfile, src: a, dst: b, _partial_: true}\n")
+    file = in_tmp / "plan.yaml"
+    write_plan(file, {"typed": ["data.scene=x"], "overrides": ["callbacks=evil"], "of": "0"})
+    said = refused("train", f"plan={file}", "evaluate=false", f"--config-dir={mine.parent}")
+    assert "callbacks.x._target_: expected a class of forewarp, but got 'shutil.copyfile'" in said
+    assert not (in_tmp / "runs").exists()
+
+
+def test_a_plan_names_code_of_trusted_packages_and_never_trust(tmp_path):
+    file = tmp_path / "plan.yaml"
+    word = "model.view_dependence._target_=theirs.Tint"
+    write_plan(file, {"typed": ["data.scene=x", "trust=[theirs]"], "overrides": [word], "of": "0"})
+    with pytest.raises(
+        ValueError, match=r"'theirs.Tint'; if you trust the package theirs, add trust=\[theirs\]"
+    ):
+        with_plan("train", [f"plan={file}"])
+    assert word in read_plan(file, typed=[word])["overrides"]  # what is typed now needs no trust
+    file.unlink()
+    write_plan(file, {"typed": ["trust=[os]"], "overrides": ["a.b=1"], "of": "0"})
+    assert read_plan(file)["typed"] == []
+    write_plan(file, {"typed": ["a.b={_target_:theirs.Tint}"], "overrides": [], "of": "0"})
+    with pytest.raises(ValueError, match="expected overrides that a plan has"):
+        read_plan(file, ["theirs"])
+
+
+def test_what_is_typed_beside_a_plan_wins(tmp_path):
+    file = tmp_path / "plan.yaml"
+    planned = [
+        *("model/view_dependence=sh", "model/inpainter=none", "model/motion=none", "stage.coarse.bases=[]")
+    ]
+    typed = ["data.scene=x", "seed=3", "model.trajectory.features=2", "stage.coarse.bases=[[0,4]]"]
+    write_plan(file, {"typed": typed, "overrides": planned, "of": "0"})
+    found = with_plan("train", [f"plan={file}", "model/inpainter=unet3d", "seed=4"])
+    assert found == [
+        *("model/view_dependence=sh", "model/motion=none", "data.scene=x", "stage.coarse.bases=[[0,4]]"),
+        *(f"planned='{file}'", "effects=given", "run='${paths.runs}/${data.scene}/planned-{hash}'"),
+        *("model/inpainter=unet3d", "seed=4"),
+    ]
+    assert f"run={tmp_path}" in with_plan("train", [f"plan={file}", f"run={tmp_path}"])
+    for word in ("model=backward", "resume=runs/x"):
+        with pytest.raises(ValueError, match=f"{word}: expected no such override beside plan="):
+            with_plan("train", [f"plan={file}", word])
+    assert with_plan("plan", ["plan.seeds=1"]) == ["plan.seeds=1"]

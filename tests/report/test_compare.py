@@ -1,0 +1,83 @@
+import json
+
+import pytest
+
+from forewarp.report.compare import compare, names_of
+
+
+def metrics(method, psnr=30.0, **more):
+    return {
+        "protocol": {"method": method},
+        "seconds": {"train": 60.0},
+        "test": {"all": {"psnr": psnr}},
+    } | more
+
+
+@pytest.fixture
+def runs(in_tmp):
+    """Call with folder -> content of its metrics.json; the current directory holds the folders."""
+
+    def write(**contents):
+        for name, content in contents.items():
+            (in_tmp / name).mkdir()
+            text = content if isinstance(content, str) else json.dumps(content)
+            (in_tmp / name / "metrics.json").write_text(text)
+        return list(contents)
+
+    return write
+
+
+def test_two_runs_side_by_side_with_their_difference(forewarp, runs):
+    more = {"flow": {"epe_moving": 0.1, "motion_mean": 0.4}, "steps": {"coarse": 400, "fine": 900}}
+    runs(one=metrics("forward", 31.5, **more), two=metrics("backward", 30.0, **more))
+    done = forewarp("report", "kind=compare", "runs=[one,two]")
+    assert done.status == 0, done.err
+    head, _, *rows = (line.split() for line in done.out.splitlines())
+    assert head == ["PSNR", "(dB)", "of", "test", "views", "forward", "backward", "difference"]
+    assert rows == [
+        ["all", "31.50", "30.00", "+1.50"],
+        ["moving", "points'", "error,", "%", "of", "motion", "25", "25", "+0"],
+        ["steps", "1300", "1300"],
+        ["seconds", "of", "training", "60", "60"],
+    ]
+
+
+def test_a_measure_that_a_run_lacks_has_no_row(runs):
+    folders = runs(new=metrics("forward", steps={"coarse": 4}), old=metrics("forward"), other=metrics("x"))
+    table = compare(folders)
+    assert [row[0] for row in table.rows] == ["all", "seconds of training"]
+    assert [column.name for column in table.columns[1:]] == folders
+
+
+@pytest.mark.parametrize(
+    ("folders", "methods", "names"),
+    [
+        (["a/x", "b/y"], ["forward", "backward"], ["forward", "backward"]),
+        (["a/x", "b/y"], ["forward", "forward"], ["x", "y"]),
+        (["a/x", "b/x"], ["forward", "forward"], ["a/x", "b/x"]),
+        (["a/x", "a/x"], ["forward", "forward"], ["1 a/x", "2 a/x"]),
+    ],
+)
+def test_columns_are_named_as_far_as_needed(folders, methods, names):
+    assert names_of(folders, [metrics(method) for method in methods]) == names
+
+
+@pytest.mark.parametrize(
+    ("content", "line"),
+    [
+        (None, "run/metrics.json: expected a run's numbers, but got none; make them with forewarp-evaluate"),
+        ("{", "run/metrics.json: expected the key protocol, but got none; make it anew with forewarp-eval"),
+        ("[]", "run/metrics.json: expected the key protocol, but got none"),
+        ({"protocol": {}, "test": {}}, "run/metrics.json: expected the key seconds, but got none"),
+    ],
+)
+def test_what_is_no_run_is_refused(runs, content, line):
+    if content is not None:
+        runs(run=content)
+    with pytest.raises(ValueError, match=line):
+        compare(["run"])
+
+
+def test_no_runs_are_refused():
+    with pytest.raises(ValueError, match="runs: expected folders of runs, but got none; set runs="):
+        compare([])

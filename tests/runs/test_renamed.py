@@ -1,0 +1,111 @@
+"""Words of earlier versions are answered with those that took their place."""
+
+import re
+
+import pytest
+
+from forewarp.cli.checks import refuse_renamed_keys
+from forewarp.runs.config import read_config
+from forewarp.runs.overrides import refuse_renamed
+from tests.support.configs import composed
+
+
+@pytest.mark.parametrize(
+    ("word", "now"),
+    [
+        ("budget=fast", "preset=fast; the choice is called preset since 0.2"),
+        ("budget=demo,fast", "preset=demo,fast;"),
+        ("budget.bases=12", "preset.bases=12;"),
+        ("++budget.inpainter_width=8", "++preset.inpainter_width=8;"),
+        ("renderer.step=0.25", "model.renderer.step=0.25;"),
+        ("model.warp=backward", "model=backward;"),
+        ("experiment=hypernerf_faithful", "experiment=hypernerf preset=faithful;"),
+        ("stage=demo", "stage=forward_demo;"),
+        ("objective=faithful", "objective=forward_faithful;"),
+        ("suits.budgets=[fast]", "no such override;"),
+        ("stage.fine.rates.flow=1e-3", "stage.fine.lr.flow=1e-3;"),
+        ("+stage.fine.rates={}", "+stage.fine.lr={};"),
+        ("stage.coarse.final_rate=0.1", "stage.coarse.lr_final_factor=0.1;"),
+        ("stage.coarse.hold=0.5", "stage.coarse.lr_hold=0.5;"),
+        ("stage.fine.voxels=[[0,8000]]", "stage.fine.num_voxels=[[0,8000]];"),
+        ("stage.fine.background_voxels=[]", "stage.fine.background_num_voxels=[];"),
+        ("preset.skip_alpha=0", "preset.alpha_threshold=0;"),
+        ("model.renderer.opaque=0", "model.renderer.early_stop_eps=0;"),
+        ("model/view=none", "model/view_dependence=none;"),
+        ("model.view.width=32", "model.view_dependence.width=32;"),
+        ("~suits", "no such override;"),
+        ("budget.skip_alpha=0", "preset.alpha_threshold=0; the method's numbers are called preset since 0.2"),
+        ("hydra.sweeper.params.stage.fine.rates.flow=1", "hydra.sweeper.params.stage.fine.lr.flow=1;"),
+        ("variant=base", "ablation=base;"),
+        ("+variant=mine", "+ablation=mine; move your file from variant/ to ablation/"),
+        ("variant=base,unet_16", "no such override; type what a variant changed, as preset.rays=1024;"),
+        ("ablation=voxels_20,voxels_40", "no such override; sweeps=resolution has these sizes"),
+    ],
+)
+def test_a_renamed_word_is_refused_with_the_new_one(word, now):
+    with pytest.raises(ValueError, match=re.escape(f"{word}: expected {now}")) as refusal:
+        refuse_renamed(["data.scene=x", word])
+    assert "\n" not in str(refusal.value)
+
+
+def test_words_of_today_are_not():
+    words = [
+        "preset=fast",
+        "budget.minutes=3",
+        "~budget.iterations",
+        "model.renderer.step=1",
+        "stage=forward_demo",
+        "ablation=my_voxels_2",
+        "+variant={name: mine}",
+    ]
+    assert refuse_renamed([*words, "--multirun", "experiment=hypernerf", "data.background=white"]) is None
+
+
+@pytest.mark.parametrize(
+    "word", ["preset=fast", "preset.bases=12", "model.renderer.step=0.25", "stage=forward_demo"]
+)
+def test_what_is_advised_composes(word):
+    assert composed("data.scene=x", word)
+
+
+@pytest.mark.parametrize(
+    ("typed", "line"),
+    [
+        ("+preset={skip_alpha: 0.0}", "preset.skip_alpha: expected preset.alpha_threshold;"),
+        ("+modules.voxels=[]", "modules.voxels: expected modules.num_voxels;"),
+        ("+modules.alone.hold=0", "modules.alone.hold: expected modules.alone.lr_hold;"),
+        ("+stage={fine: {voxels: []}}", "stage.fine.voxels: expected stage.fine.num_voxels;"),
+        ("+stage.fine.rates.flow=1", "stage.fine.rates: expected stage.fine.lr;"),
+        ("+model.renderer.opaque=0", "model.renderer.opaque: expected model.renderer.early_stop_eps;"),
+        ("+model.view.width=3", "model.view: expected model.view_dependence;"),
+    ],
+)
+def test_keys_of_a_composed_config_are_refused_unless_the_method_is_anothers(typed, line):
+    config = composed(typed)
+    with pytest.raises(ValueError, match=re.escape(line)):
+        refuse_renamed_keys(config)
+    config.model._target_ = "theirs.methods.Mist"
+    assert refuse_renamed_keys(config) is None
+
+
+@pytest.mark.parametrize("model", ["forward", "backward", "tnerf", "particles"])
+def test_no_key_of_today_is_refused(model):
+    assert refuse_renamed_keys(composed(f"model={model}")) is None
+
+
+@pytest.mark.parametrize(
+    ("text", "version"),
+    [
+        ("model: {_target_: forewarp.methods.spec.MethodSpec, warp: forward}\nseed: 0\n", "0.1"),
+        ("model: {name: forward}\nstage: {coarse: null, fine: {rates: {density: 0.3}}}\n", "0.2"),
+    ],
+)
+def test_a_run_of_an_earlier_version_is_refused_with_the_version_that_reads_it(text, version, tmp_path):
+    path = tmp_path / "config.yaml"
+    path.write_text(text)
+    expected = (
+        f"{path}: expected a run of forewarp 0.3, but got one of {version}, which version {version}.0 reads"
+    )
+    with pytest.raises(ValueError, match=re.escape(expected)) as refusal:
+        read_config(path)
+    assert "\n" not in str(refusal.value)

@@ -1,0 +1,1 @@
+"""What several tests share: obvious twins of operators, tiny scenes, small runs."""

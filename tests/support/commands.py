@@ -1,0 +1,77 @@
+"""Call the commands in this process, from tests and fixtures of any scope; share one fitted run."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import io
+import logging
+import os
+import shutil
+import subprocess
+import sys
+from types import SimpleNamespace
+from unittest.mock import patch
+
+import torch
+from hydra.core.global_hydra import GlobalHydra
+
+# A scene of 32 x 32 pixels, with test views of all three kinds.
+SCENE = {"size": 32, "frames": 6, "test_views": (2, 1, 2), "val_views": 1, "samples_per_pixel": 1}
+TINY = [
+    *("data=dnerf", "data.scene=vehicle", "preset=demo", "trainer=cpu", "data.rays=128", "threads=1"),
+    *("budget.iterations=60", "stage.fine.num_voxels=[[0,8000]]", "stage.coarse.num_voxels=[[0,4000]]"),
+]
+
+
+def call(name, *arguments):
+    """Run a command; ``call("train", "data.scene=x")`` gives ``status``, ``out`` and ``err``.
+
+    Environment, logging, threads and Hydra are as before afterwards.
+    """
+    out, err, quiet = io.StringIO(), io.StringIO(), logging.getLogger("forewarp.metrics")
+    level, disabled, threads = quiet.level, logging.root.manager.disable, torch.get_num_threads()
+    # Hydra composes the config once more to learn its hydra.mode, which only sweeps set.
+    sweeps = any(str(argument).startswith("sweeps=") for argument in arguments)
+    mode = (
+        contextlib.nullcontext()
+        if sweeps
+        else patch("hydra._internal.hydra.Hydra.get_mode", return_value=None)
+    )
+    status = None
+    with (
+        mode,
+        patch.dict(os.environ),
+        patch("sys.argv", [f"forewarp-{name}", *map(str, arguments)]),
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(err),
+    ):
+        try:
+            importlib.import_module(f"forewarp.cli.{name}").main()
+        except SystemExit as leaving:
+            status = leaving.code
+        finally:
+            GlobalHydra.instance().clear()
+            quiet.setLevel(level)
+            logging.disable(disabled)
+            torch.set_num_threads(threads)
+    return SimpleNamespace(status=status, out=out.getvalue(), err=err.getvalue())
+
+
+def fitted_run(factory):
+    """The folder of a small finished run, made once a session by ``forewarp-train`` in its own process.
+
+    Its scene is in ``scenes/vehicle`` beside it, and what the command printed in ``said.txt``. It is shared:
+    copy it before changing anything in it.
+    """
+    from forewarp.synth.scenes import synthesize
+
+    run = factory.getbasetemp() / "fitted" / "run"
+    if not run.is_dir():
+        shutil.rmtree(run.parent, ignore_errors=True)
+        synthesize(run.parent / "scenes" / "vehicle", **SCENE)
+        command = [sys.executable, "-m", "forewarp.cli.train", *TINY, f"data.root={run.parent}/scenes"]
+        done = subprocess.run([*command, f"run={run}"], capture_output=True, text=True, cwd=run.parent)
+        assert done.returncode == 0, done.stderr
+        (run / "said.txt").write_text(done.stdout + "\n---\n" + done.stderr)
+    return run

@@ -1,0 +1,53 @@
+"""Writes what a finished run leaves, without training anything."""
+
+import json
+from pathlib import Path
+
+import yaml
+
+
+def write_run(
+    root,
+    variant="base",
+    seed=0,
+    *,
+    scene="ball",
+    minutes=1.0,
+    against="base",
+    psnr=30.0,
+    curve=((10, 20.0), (20, 25.0), (40, 25.5)),
+    steps=100,
+    epe=None,
+    ability="all",
+    command=None,
+):
+    """A run's folder; None for ``psnr`` or ``curve`` leaves out what would hold it."""
+    folder = Path(root) / scene / f"{variant}-{minutes}-seed{seed}"
+    (folder / "coarse").mkdir(parents=True)
+    config = {
+        "data": {"scene": scene},
+        "model": {"name": "forward"},
+        "preset": {"name": "fast"},
+        "budget": {"minutes": minutes},
+        "variant": {"name": variant} | ({"about": f"the {variant}", "against": against} if against else {}),
+        "seed": seed,
+        "command": command or f"forewarp-train variant={variant} seed={seed}",
+    }
+    (folder / "config.yaml").write_text(yaml.safe_dump(config))
+    (folder / "coarse" / "done.json").write_text(json.dumps({"steps": steps, "seconds": 50.0}))
+    if psnr is not None:
+        metrics = {
+            "protocol": {"device": "a cpu", "threads": 2, "versions": {"torch": "2"}},
+            "seconds": {"train": 50.0, "render_per_frame": 0.5},
+            "peak_memory_bytes": 2**30,
+            "parameters": 2_000_000,
+            "test": {ability: {"psnr": psnr, "ssim": 0.9}},
+        }
+        if epe is not None:
+            metrics["flow"] = {"epe_moving": epe}
+        (folder / "metrics.json").write_text(json.dumps(metrics))
+    if curve is not None:
+        lines = [f"{s},coarse,{s},{p},{'' if epe is None else epe},100" for s, p in curve]
+        text = "\n".join(["seconds,stage,step,psnr,epe_moving,voxels", *lines])
+        (folder / "accuracy_time.csv").write_text(text + "\n")
+    return folder

@@ -1,0 +1,170 @@
+"""A moving scene in memory (a coloured ball that slides along x), small methods, and runs over it."""
+
+import math
+from functools import partial
+from pathlib import Path
+
+import lightning
+import torch
+
+from forewarp.data.module import SceneDataModule
+from forewarp.fields.radiance import DirectRadiance
+from forewarp.fields.trajectory import TrajectoryField
+from forewarp.methods.method import Start
+from forewarp.methods.voxel.effects.motion import Motion
+from forewarp.methods.voxel.effects.view_dependence import SphericalHarmonics
+from forewarp.methods.voxel.model import BackwardModel, ForwardModel, Ground
+from forewarp.methods.voxel.stage import VoxelStage
+from forewarp.scene.box import Box
+from forewarp.scene.camera import Camera, look_at
+from forewarp.scene.frame import Frame, Scene
+from forewarp.training.objective import Objective
+from forewarp.training.schedule import StageSettings
+from forewarp.training.stages import Run, Stage
+
+RADIUS, TRAVEL = 0.4, (0.8, 0.0, 0.0)
+BOX = Box((-1, -0.8, -0.7), (1.2, 0.8, 0.7))
+RATES = {"density": 0.3, "color": 0.1, "shading": 0.02, "flow": 5e-3, "network": 1e-3, "grid": 0.1}
+
+
+def ball_center(time):
+    """Return the centre (3,) of the ball at a time."""
+    return torch.tensor([-0.3, 0.1, 0.0]) + time * torch.tensor(TRAVEL)
+
+
+def photograph(camera, time, finer=3):
+    """The exact image (H, W, 4) uint8: the mean of ``finer`` squared rays, alpha the share of hits."""
+    big = camera.resized(camera.width * finer, camera.height * finer)
+    rays = big.rays()
+    offset = rays.origins - ball_center(time)
+    along = (offset * rays.directions).sum(-1)
+    inside = along**2 - (offset**2).sum(-1) + RADIUS**2
+    hit = inside > 0
+    normal = (offset + (-along - inside.clamp(min=0).sqrt())[:, None] * rays.directions) / RADIUS
+    rgba = torch.cat([0.5 + 0.4 * normal, torch.ones(len(rays), 1)], -1) * hit[:, None]
+    shape = (camera.height, finer, camera.width, finer, 4)
+    mean = rgba.reshape(shape).mean((1, 3))
+    mean[..., :3] /= mean[..., 3:].clamp(min=1e-6)
+    return (mean * 255).round().to(torch.uint8)
+
+
+def camera_at(turn, size=24):
+    """A camera of ``size`` x ``size`` pixels on a slanted circle about the origin."""
+    angle = 2 * math.pi * turn
+    center = torch.tensor([3 * math.cos(angle), 3 * math.sin(angle), 1.2 + 0.8 * math.sin(2 * angle)])
+    pose = look_at(center, torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
+    return Camera(size, size, 1.2 * size, 1.2 * size, size / 2, size / 2, pose, 1.0, 5.5)
+
+
+def frame_at(name, turn, time, size=24):
+    """Make a frame with its image."""
+    camera = camera_at(turn, size)
+    image = photograph(camera, time)
+    return Frame(name, time, camera, lambda: image)
+
+
+def ball_scene(frames=12, size=24, canonical_time=0.0, times=None):
+    """``frames`` training frames from everywhere, one validation frame, three test frames between them."""
+    if times is None:
+        times = [i / (frames - 1) for i in range(frames)]
+    train = tuple(frame_at(f"r_{i}", 0.381966 * i, t, size) for i, t in enumerate(times))
+    test = tuple(frame_at(f"t_{i}", 0.13 + 0.31 * i, t, size) for i, t in enumerate((0.0, 0.45, 1.0)))
+    return Scene("ball", train, test[1:2], test, BOX, canonical_time, has_alpha=True)
+
+
+def ball_data(rays=256, seed=0, **changes):
+    """A data module over a fresh ball scene."""
+    return SceneDataModule(lambda: ball_scene(**changes), rays=rays, seed=seed)
+
+
+RADIANCE = partial(DirectRadiance, alpha_init=1e-2, alpha_threshold=1e-4)
+
+
+def forward_model(**changes):
+    """Make a cheap forward model: colours in the voxels, few bases."""
+    choices = {
+        "radiance": RADIANCE,
+        "motion": Motion,
+        "trajectory": partial(TrajectoryField, bases=4, nodes=8, width=32, layers=3),
+        "view_dependence": SphericalHarmonics,
+    }
+    return ForwardModel(**(choices | changes))
+
+
+def backward_model(**changes):
+    """Make a cheap backward model; name its ``deformation``."""
+    return BackwardModel(**({"radiance": RADIANCE, "view_dependence": SphericalHarmonics} | changes))
+
+
+def built(
+    model, lattice, active=None, *, density_scale=0.3, frames=5, canonical_time=0.0, static=None, **numbers
+):
+    """Build a model's method on a lattice, by default fully active; ``numbers`` are of its stage."""
+    active = torch.ones(lattice.shape, dtype=torch.bool) if active is None else active
+    ground = Ground(lattice, active, density_scale, BOX, frames, canonical_time, static)
+    return model.build(ground, VoxelStage(**({"num_voxels": [[0, 500]]} | numbers)))
+
+
+def begun(method, scene, made):
+    """Prepare a method for the stage ``made`` of a scene."""
+    settings, objective = made.settings, made.objective
+    start = Start(
+        scene,
+        settings.name,
+        settings.numbers,
+        weights=objective.weights,
+        literal=objective.literal,
+        photo_on=objective.photo_on,
+    )
+    return method.begin(start, VoxelStage(name=settings.name, **settings.numbers))
+
+
+def stage(name="coarse", weights=None, photo_on=None, **changes):
+    """Make a stage of few steps on a small lattice."""
+    numbers = {
+        "num_voxels": [[0, 14**3]],
+        "iterations": 12,
+        "keep_alpha": 1e-2,
+        "birth_alpha": 5e-3,
+        "lr": RATES,
+    }
+    objective = Objective(
+        {"photo": 1.0, "point_color": 0.01, "tv_flow": 1e-3} if weights is None else weights,
+        photo_on=photo_on,
+    )
+    return Stage(StageSettings.of(name, **(numbers | changes)), objective)
+
+
+def trainer(callbacks, **changes):
+    """A silent trainer on the CPU."""
+    off = dict.fromkeys(("enable_checkpointing", "enable_progress_bar", "enable_model_summary"), False)
+    off |= {"limit_val_batches": 0, "num_sanity_val_steps": 0, "logger": False}
+    common = {"max_epochs": 1, "max_steps": -1, "accelerator": "cpu"} | off | changes
+    return lightning.Trainer(callbacks=callbacks, **common)
+
+
+def make_run(folder, stages, *, data=None, model=None, callbacks=(), **changes):
+    """Make a run over the ball scene in ``folder``."""
+    return Run(
+        data or ball_data(),
+        model or forward_model(),
+        stages,
+        Path(folder),
+        lambda where, own: trainer(own),
+        callbacks=lambda name, where: list(callbacks),
+        **changes,
+    )
+
+
+class Interrupt(lightning.Callback):
+    """Save and exit after a step of a stage."""
+
+    def __init__(self, stage, step):
+        self.stage, self.step = stage, step
+
+    def on_train_batch_end(self, trainer, module, *_):
+        if module.settings.name == self.stage and module.global_step == self.step:
+            for callback in trainer.callbacks:
+                if hasattr(callback, "save"):
+                    callback.save(trainer)
+            raise SystemExit

@@ -1,0 +1,68 @@
+"""Files appear whole or not at all, and are read only up to a size."""
+
+import errno
+import os
+
+import pytest
+
+from forewarp.files import load_json, read_json, read_text, replace_file, write_json, written_whole
+
+
+def test_a_file_appears_whole_with_its_folder(tmp_path):
+    path = tmp_path / "new" / "a.json"
+    write_json(path, {"a": 1})
+    assert read_json(path) == {"a": 1}
+    replace_file(path, "{}")
+    assert read_json(path) == {}
+    assert [p.name for p in path.parent.iterdir()] == ["a.json"]
+
+
+def test_what_fails_leaves_the_old_file_and_nothing_beside(tmp_path):
+    path = tmp_path / "a.txt"
+    path.write_text("old")
+    with pytest.raises(ZeroDivisionError), written_whole(path) as beside:
+        beside.write_text("half") // 0
+    assert path.read_text() == "old"
+    assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
+
+
+def test_an_error_names_the_file_that_it_is_of(tmp_path):
+    def full(*name):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), *name)
+
+    path = tmp_path / "a.txt"
+    for name in ((), ("/tmp/of-a-library",)):
+        with pytest.raises(OSError, match="No space left") as caught, written_whole(path):
+            full(*name)
+        assert caught.value.filename == str(path)
+    with pytest.raises(FileNotFoundError) as caught, written_whole(path):
+        (tmp_path / "other").read_text()
+    assert caught.value.filename == str(tmp_path / "other")
+
+
+def test_numbers_that_json_has_not_are_refused(tmp_path):
+    with pytest.raises(ValueError, match="nan"):
+        write_json(tmp_path / "a.json", {"a": float("nan")})
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("text", ["{", "[1]", "\ufffe", "[" * 100_000])
+def test_what_is_no_object_is_none(tmp_path, text):
+    path = tmp_path / "a.json"
+    path.write_text(text)
+    assert read_json(path) is None
+    with pytest.raises(ValueError, match=f"{path}: .*expected"):
+        load_json(path)
+
+
+def test_nothing_is_read_of_a_file_that_is_too_large_or_no_file(tmp_path):
+    path = tmp_path / "a.txt"
+    path.write_text("12345")
+    assert read_text(path, 5) == "12345"
+    with pytest.raises(ValueError, match="expected at most 4 bytes, but got 5"):
+        read_text(path, 4)
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(ValueError, match="a device or a pipe"):
+        read_text(tmp_path / "pipe")
+    with pytest.raises(IsADirectoryError):
+        read_text(tmp_path)

@@ -1,0 +1,228 @@
+"""Budget, learning rates and curriculum of a stage."""
+
+from collections import Counter
+
+import pytest
+import torch
+
+from forewarp.training.objective import Objective
+from forewarp.training.schedule import Curriculum, StagePlan, StageSettings, seconds_after, share_out
+
+
+def settings(**changes):
+    return StageSettings.of(**({"name": "coarse", "lr": {}, "iterations": 100} | changes))
+
+
+def test_keys_that_the_platform_does_not_know_are_the_methods_own():
+    made = settings(lr_hold=0.5, num_voxels=[[0, 8000]], max_gradient=2.0, patches=3)
+    assert made.numbers == {"num_voxels": [[0, 8000]], "patches": 3}
+    assert (made.lr_hold, made.max_gradient) == (0.5, 2.0)
+
+
+def test_rates_hold_and_then_fall_exponentially():
+    made = settings(lr_hold=0.5, lr_final_factor=0.01)
+    assert [made.lr_factor(f) for f in (0, 0.5)] == [1, 1]
+    assert made.lr_factor(0.75) == pytest.approx(0.1)
+    assert made.lr_factor(1.0) == made.lr_factor(1.5) == pytest.approx(0.01)
+    assert settings(lr_hold=1.0).lr_factor(1.0) == 1
+
+
+@pytest.mark.parametrize(
+    ("bounds", "fraction"),
+    [
+        ({"iterations": 100, "minutes": None}, 0.25),
+        ({"iterations": None, "minutes": 1.0}, 0.5),
+        ({"iterations": 100, "minutes": 1.0}, 0.5),
+        ({"iterations": 10, "minutes": 1.0}, 1.0),
+    ],
+)
+def test_the_fraction_is_of_what_comes_first(bounds, fraction):
+    assert settings(**bounds).fraction(25, 30.0) == fraction
+
+
+@pytest.mark.parametrize(
+    ("wrong", "text"),
+    [
+        ({"iterations": None}, "stage.coarse: expected iterations or minutes, but got neither"),
+        ({"iterations": 0}, "stage.coarse.iterations: expected a number > 0, but got 0"),
+        ({"minutes": -1.0}, "stage.coarse.minutes: expected a number > 0, but got -1.0"),
+    ],
+)
+def test_refuses_by_the_name_of_the_key(wrong, text):
+    with pytest.raises(ValueError, match=text):
+        settings(**wrong)
+
+
+@pytest.mark.parametrize("name", ["/tmp/x", "..", "../x", "a/b", "a\\b", "", "-a", "a b", "a\n", 7])
+def test_a_stage_has_no_name_that_leads_out_of_the_run(name):
+    with pytest.raises(ValueError, match="stage: expected names of letters, digits, _ and -"):
+        settings(name=name)
+
+
+def plan(share=1.0, **changes):
+    """Make a stage without its share of the budget."""
+    numbers = {"num_voxels": [[0, 64]], "lr": {}}
+    return StagePlan(share=share, objective=Objective({"photo": 1.0}), **(numbers | changes))
+
+
+def test_minutes_and_iterations_go_by_share():
+    first, second = share_out({"a": plan(1), "b": plan(3)}, minutes=2.0, iterations=10)
+    assert (first.settings.name, first.settings.minutes, first.settings.iterations) == ("a", 0.5, 2)
+    assert (second.settings.name, second.settings.minutes, second.settings.iterations) == ("b", 1.5, 8)
+
+
+def test_what_the_stages_after_one_may_take():
+    stages = share_out({"a": plan(1), "b": plan(2), "c": plan(1)}, minutes=2.0, iterations=10)
+    assert [seconds_after(stages, name) for name in "abc"] == [90, 30, 0]
+    steps = share_out({"a": plan(), "b": plan()}, minutes=None, iterations=10)
+    assert [seconds_after(steps, name) for name in "ab"] == [None, 0]
+
+
+def test_a_bound_may_be_left_to_the_other():
+    (only,) = share_out({"a": plan(), "b": None}, minutes=None, iterations=7)
+    assert (only.settings.minutes, only.settings.iterations) == (None, 7)
+
+
+def test_a_stage_has_at_least_one_step():
+    first, _ = share_out({"a": plan(1), "b": plan(999)}, minutes=None, iterations=3)
+    assert first.settings.iterations == 1
+
+
+@pytest.mark.parametrize(
+    ("plans", "minutes", "match"),
+    [
+        ({}, 1, "stage: expected at least one stage, but got none"),
+        ({"a": plan(0)}, 1, r"stage\.a\.share: expected a number > 0, but got 0"),
+        ({"a": plan()}, 0, r"budget\.minutes: expected a number > 0 or null, but got 0"),
+        ({"a": plan()}, "soon", r"budget\.minutes: expected a number > 0 or null, but got soon"),
+        ({"a": plan()}, None, r"stage\.a: expected iterations or minutes, but got neither"),
+    ],
+)
+def test_refusals(plans, minutes, match):
+    with pytest.raises(ValueError, match=match):
+        share_out(plans, minutes=minutes, iterations=None)
+
+
+def test_keys_that_the_platform_does_not_know_are_handed_to_the_method():
+    (only,) = share_out({"a": plan(voxel=1)}, minutes=1, iterations=None)  # Run.fit refuses what is none
+    assert only.settings.numbers == {"num_voxels": [[0, 64]], "voxel": 1}
+
+
+TIMES = [0.0, 0.9, 0.5, 0.2, 0.7, 1.0, 0.4, 0.6, 0.1, 0.3]
+
+
+def draws(curriculum, fraction, count=2000):
+    curriculum.fraction = fraction
+    return Counter(curriculum() for _ in range(count))
+
+
+def test_frames_come_in_from_the_canonical_time_outwards():
+    curriculum = Curriculum(TIMES, 0.5, start=3)
+    assert curriculum.frames() == [2, 6, 7]  # 0.5, then 0.4 and 0.6
+    curriculum.fraction = 0.3  # half of the way in
+    assert [TIMES[i] for i in curriculum.frames()] == [0.5, 0.4, 0.6, 0.7, 0.3, 0.2]
+    curriculum.fraction = 0.6
+    assert sorted(curriculum.frames()) == list(range(10))
+
+
+def test_nothing_is_drawn_before_it_is_in_play():
+    assert set(draws(Curriculum(TIMES, 0.5, start=3), 0.0)) == {2, 6, 7}
+    assert set(draws(Curriculum(TIMES, 0.5, start=3), 1.0)) == set(range(10))
+
+
+def test_all_at_once():
+    curriculum = Curriculum(TIMES, 0.0, start=1, all_in=0.0)
+    assert curriculum.in_play == 10
+
+
+def test_the_newest_get_their_share_while_frames_come_in():
+    curriculum = Curriculum(TIMES, 0.5, start=8, newest_share=0.5, newest_part=0.125)
+    counts = draws(curriculum, 0.0)
+    newest = curriculum.frames()[-1]
+    assert counts[newest] / 2000 == pytest.approx(0.5 + 0.5 / 8, abs=0.04)
+    counts = draws(curriculum, 1.0)
+    assert max(counts.values()) < 300  # even, once all are in
+
+
+def test_frames_with_large_errors_come_more_often():
+    curriculum = Curriculum(TIMES, 0.0, all_in=0.0, error_share=1.0)
+    for frame in range(10):
+        curriculum.report(frame, 0.9 if frame == 4 else 0.1)
+    assert draws(curriculum, 0.0)[4] / 2000 == pytest.approx(0.5, abs=0.04)
+    curriculum.report(4, 0.1)  # halfway to the new error
+    assert draws(curriculum, 0.0)[4] / 2000 == pytest.approx(0.5 / 1.4, abs=0.04)
+
+
+def test_frames_without_an_error_count_as_the_worst():
+    curriculum = Curriculum(TIMES, 0.0, all_in=0.0, error_share=1.0)
+    assert len(draws(curriculum, 0.0)) == 10
+    for frame in range(9):
+        curriculum.report(frame, 1e-9)
+    curriculum.report(0, 1.0)
+    assert draws(curriculum, 0.0)[9] > 500
+
+
+@pytest.mark.parametrize("error", [float("nan"), float("inf"), -float("inf")])
+def test_an_error_that_is_not_finite_tells_nothing(error):
+    curriculum = Curriculum(TIMES, 0.0, all_in=0.0, error_share=1.0)
+    curriculum.report(3, 0.5)
+    curriculum.report(3, error)
+    curriculum.report(4, error)
+    assert curriculum.errors[3] == 0.5
+    assert len(draws(curriculum, 0.0)) == 10
+
+
+def test_frames_of_one_time_come_in_together():
+    times = [t for _ in range(3) for t in (0.0, 0.25, 0.5, 0.75, 1.0)]  # three cameras
+    curriculum = Curriculum(times, 0.5, start=2, all_in=1.0)
+    played = []
+    for fraction in (0.0, 0.34, 0.67, 1.0):
+        curriculum.fraction = fraction
+        played.append([times[i] for i in curriculum.frames()])
+        assert curriculum.in_play == len(played[-1])
+    assert played[0] == [0.5] * 3 + [0.25] * 3
+    assert [len(p) for p in played] == [6, 9, 12, 15]
+    assert played[1] == played[0] + [0.75] * 3
+
+
+def test_goes_on_where_it_was_saved():
+    first, second = (Curriculum(TIMES, 0.5, seed=s, error_share=0.3) for s in (1, 2))
+    draws(first, 0.4, 17)
+    first.report(3, 0.2)
+    second.load_state_dict(first.state_dict())
+    assert second.fraction == 0.4
+    assert [first() for _ in range(50)] == [second() for _ in range(50)]
+
+
+def test_a_saved_state_does_not_change_afterwards():
+    curriculum = Curriculum(TIMES, 0.5)
+    state = curriculum.state_dict()
+    curriculum.report(3, 0.2)
+    assert state["errors"].isnan().all()
+
+
+def test_fewer_frames_than_the_start():
+    curriculum = Curriculum([0.3], 0.0, start=10)
+    assert (curriculum(), curriculum.in_play) == (0, 1)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"start": 0},
+        {"all_in": 1.5},
+        {"newest_share": -0.1},
+        {"newest_part": 0.0},
+        {"newest_part": 2.0},
+        {"error_share": 1.5},
+        {"error_share": float("nan")},
+    ],
+)
+def test_refuses(wrong):
+    with pytest.raises(ValueError, match=r"stage.curriculum: expected start >= 1, .*but got"):
+        Curriculum(TIMES, 0.0, **wrong)
+
+
+def test_the_draws_are_plain_integers():
+    assert type(Curriculum(TIMES, 0.0)()) is int
+    assert not isinstance(Curriculum(TIMES, 0.0)(), torch.Tensor)
