@@ -15,7 +15,6 @@ import yaml
 
 from forewarp import load
 from forewarp.planning.plan_file import with_plan, write_plan
-from forewarp.runs.build import stored_run
 from forewarp.training.handover import load_handover
 from tests.support.commands import call
 
@@ -157,8 +156,8 @@ def test_two_pictures_are_rendered(forewarp, refused, fitted):
 
 def test_a_run_is_loaded_with_trust(fitted):
     with pytest.raises(ValueError, match="expected a class of forewarp, but got 'theirs.data.Disc"):
-        stored_run(fitted)
-    module = stored_run(fitted, trust=["theirs"]).load()
+        load(fitted)
+    module = load(fitted, trust=["theirs"]).module
     assert type(module.method.view_dependence).__module__ == "theirs.effects"
 
 
@@ -288,7 +287,7 @@ def test_a_stage_has_a_method_of_its_own(forewarp, in_tmp):
     assert done.status == 0, done.err
     run = in_tmp / "run"
     assert [steps_of(run, stage) for stage in ("coarse", "fine")] == [3, 3]
-    module = stored_run(run, trust=["theirs"]).load()
+    module = load(run, trust=["theirs"]).module
     left = load_handover(run / "coarse").cloud.points
     assert torch.cdist(module.method.began, left).amin(-1).max() == 0
     done = forewarp("evaluate", "run=run", TRUST)

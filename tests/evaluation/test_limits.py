@@ -1,13 +1,15 @@
 import math
 
 import pytest
+from omegaconf import OmegaConf
 
 from forewarp.evaluation.limits import COLUMNS, by_time, limits_of
-from forewarp.runs.build import stored_run
+from forewarp.runs.build import build_run
+from forewarp.runs.config import saved_config
 
 
 def test_a_run_has_a_row(fitted):
-    row = limits_of(stored_run(fitted), views=2)
+    row = limits_of(build_run(saved_config(str(fitted), OmegaConf.create())), views=2)
     assert set(row) == set(COLUMNS)
     assert row["outside"] + row["outline"] + row["inside"] == pytest.approx(1)
     assert row["low-passed truth"] > row["test views"] > 5

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -12,7 +12,6 @@ from omegaconf import DictConfig, OmegaConf
 
 from forewarp.evaluation.measure import measure
 from forewarp.files import read_json
-from forewarp.runs.config import saved_config
 from forewarp.training.callbacks import StageProgress
 from forewarp.training.device import check_precision, device_of
 from forewarp.training.module import DynamicSceneModule
@@ -66,20 +65,6 @@ def build_run(config: DictConfig) -> Run:
     )
     run.check()
     return run
-
-
-def stored_run(folder: str | Path, trust: str | Sequence[str] | None = None) -> Run:
-    """Build the run in a folder from the config stored there; nothing is read or computed yet.
-
-    Args:
-        folder: the run's folder.
-        trust: packages beside forewarp whose code the config may name, as for ``trust_of``.
-
-    Raises:
-        ValueError: if the folder holds no run, or the config names code that is not trusted.
-    """
-    trust = trust if trust is None or isinstance(trust, str) else list(trust)
-    return build_run(saved_config(str(folder), OmegaConf.create({"trust": trust})))
 
 
 def model_of(config: DictConfig) -> Callable:
