@@ -14,7 +14,9 @@ from numba import njit
 from forewarp.ops.kernels_rasterize import LEAST_LOG, RECORD, SIDE
 
 _DIGIT = 11  # bits that are sorted by at once
-_ZERO = np.float32(0)
+_ZERO, _SHARE = np.float32(0), np.float32(1 / SIDE)
+_FIRST, _LAST = np.float32(0.5), np.float32(SIDE - 0.5)  # a tile's pixels' centres
+_SLACK = np.float32(1e-3)  # pixels that rounding may move an edge by
 
 
 @njit(cache=True)
@@ -55,43 +57,29 @@ def records_of(splats, order):
         records[k, 0], records[k, 1] = splats[i, 0], splats[i, 1]
         records[k, 2], records[k, 3] = np.float32(-0.5) * splats[i, 2], -splats[i, 3]
         records[k, 4] = np.float32(-0.5) * splats[i, 4]
-        records[k, 5] = math.log(splats[i, 5])
+        records[k, 5] = splats[i, 12]
         for j in range(6, RECORD):
             records[k, j] = splats[i, j]
     return records
 
 
 @njit(inline="always")
-def _span(center, reach, count):
-    """The first tile that an interval of pixels touches, and the one after the last."""
-    low = min(max(center - reach, np.float32(0)), np.float32(SIDE * count))
-    high = min(max(center + reach, np.float32(0)), np.float32(SIDE * count))
-    return int(low) // SIDE, min(int(high) // SIDE + 1, count)
-
-
-@njit(inline="always")
-def _highest(a, b, c, x0, y0):
-    """The largest exponent ``a x^2 + b x y + c y^2`` of a splat in a tile that begins at x0, y0 from it."""
-    x1, y1 = x0 + np.float32(SIDE), y0 + np.float32(SIDE)
-    x, y = min(max(_ZERO, x0), x1), min(max(_ZERO, y0), y1)
-    best = _ZERO if x == 0 and y == 0 else np.float32(-np.inf)
-    if x != 0:  # along the nearer upright edge
-        at = min(max(np.float32(-0.5) * b * x / c, y0), y1)
-        best = a * x * x + at * (b * x + c * at)
-    if y != 0:
-        at = min(max(np.float32(-0.5) * b * y / a, x0), x1)
-        best = max(best, c * y * y + at * (b * y + a * at))
-    return best
+def _span(low, high, count):
+    """The first tile with a pixel's centre in an interval, and the one after the last."""
+    most = np.float32(SIDE * count)
+    low = min(max(low - _SLACK - _LAST, -_LAST), most)
+    high = min(max(high + _SLACK - _FIRST, -_LAST), most)
+    return max(int(math.ceil(low * _SHARE)), 0), min(int(math.floor(high * _SHARE)) + 1, count)
 
 
 @njit(cache=True)
-def _spans(splats, order, across, down):
+def _spans(records, splats, order, across, down):
     """The tiles (V, 4) that the box of each splat touches, first and after the last, and how many in all."""
     spans, most = np.empty((len(order), 4), np.int32), 0
     for k in range(len(order)):
-        i = np.uintp(order[k])
-        spans[k, 0], spans[k, 1] = _span(splats[i, 0], splats[i, 10], across)
-        spans[k, 2], spans[k, 3] = _span(splats[i, 1], splats[i, 11], down)
+        i, u, v = np.uintp(order[k]), records[k, 0], records[k, 1]
+        spans[k, 0], spans[k, 1] = _span(u - splats[i, 10], u + splats[i, 10], across)
+        spans[k, 2], spans[k, 3] = _span(v - splats[i, 11], v + splats[i, 11], down)
         most += max(0, spans[k, 1] - spans[k, 0]) * max(0, spans[k, 3] - spans[k, 2])
     return spans, most
 
@@ -100,25 +88,36 @@ def _spans(splats, order, across, down):
 def sort_into_tiles(splats, order, records, across, down):
     """Which splats each tile has to look at, from near to far: ``entries``, and where each tile's begin.
 
-    A tile that the ellipse of a splat, at a 255th of a pixel, does not touch is left out.
+    A tile without a pixel's centre in the box of the part of a splat's ellipse, at a 255th of a pixel, that
+    lies in the tile's rows is left out.
     """
-    spans, most = _spans(splats, order, across, down)
+    spans, most = _spans(records, splats, order, across, down)
     tiles, owners = np.empty(most, np.int32), np.empty(most, np.int32)
     ends = np.zeros(across * down + 1, np.int64)
     pairs = 0
     for k in range(len(order)):
         first, last, top, bottom = spans[k, 0], spans[k, 1], spans[k, 2], spans[k, 3]
-        small = last - first <= 1 and bottom - top <= 1
         u, v, a, b, c = records[k, 0], records[k, 1], records[k, 2], records[k, 3], records[k, 4]
         least = np.float32(LEAST_LOG) - records[k, 5]
+        single = last - first <= 1 or bottom - top <= 1  # then the box is as good
+        # A level of a x^2 + b x y + c y^2 ends at (b y +- sqrt(bend y^2 + rest)) half, right end at tip.
+        half, bend = np.float32(-0.5) / a, b * b - np.float32(4) * a * c
+        rest, slope = np.float32(4) * a * least, b * half
+        tip = np.float32(-0.5) * b / c * splats[np.uintp(order[k]), 10]
         for row in range(top, bottom):
-            y = np.float32(SIDE * row) - v
-            for column in range(first, last):
-                if small or _highest(a, b, c, np.float32(SIDE * column) - u, y) >= least:
-                    tile = np.uintp(row * across + column)
-                    tiles[pairs], owners[pairs] = tile, k
-                    ends[tile + np.uintp(1)] += 1
-                    pairs += 1
+            low, high = first, last
+            if not single:
+                y0, y1 = np.float32(SIDE * row) + _FIRST - v, np.float32(SIDE * row) + _LAST - v
+                at, to = min(max(-tip, y0), y1), min(max(tip, y0), y1)
+                left = slope * at - half * math.sqrt(max(bend * at * at + rest, _ZERO))
+                right = slope * to + half * math.sqrt(max(bend * to * to + rest, _ZERO))
+                low, high = _span(u + left, u + right, across)
+                low, high = max(low, first), min(high, last)
+            for column in range(low, high):
+                tile = np.uintp(row * across + column)
+                tiles[pairs], owners[pairs] = tile, k
+                ends[tile + np.uintp(1)] += 1
+                pairs += 1
     for tile in range(across * down):
         ends[tile + 1] += ends[tile]
     entries, place = np.empty(pairs, np.int32), ends[:-1].copy()
