@@ -103,7 +103,7 @@ def set_row(typing, place, index, value):
 
 @intrinsic
 def get_row(typing, array, row):
-    """Read ``array[row, :16]``."""
+    """Read ``array[row, :16]``, or ``array[row : row + 16]``."""
 
     def code(context, builder, sig, args):
         return builder.load(_array_row(context, builder, sig.args[0], *args), align=4)
@@ -113,7 +113,7 @@ def get_row(typing, array, row):
 
 @intrinsic
 def put_row(typing, array, row, value):
-    """Write 16 numbers to ``array[row, :16]``."""
+    """Write 16 numbers to ``array[row, :16]``, or ``array[row : row + 16]``."""
 
     def code(context, builder, sig, args):
         builder.store(args[2], _array_row(context, builder, sig.args[0], *args[:2]), align=4)
@@ -123,7 +123,8 @@ def put_row(typing, array, row, value):
 
 
 def _array_row(context, builder, kind, array, row):
-    pointer = _address(context, builder, kind, array, [row, context.get_constant(types.intp, 0)])
+    zeros = [context.get_constant(types.intp, 0)] * (kind.ndim - 1)
+    pointer = _address(context, builder, kind, array, [row, *zeros])
     return builder.bitcast(pointer, ir.VectorType(FLOAT, NARROW).as_pointer())
 
 
