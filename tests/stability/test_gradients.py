@@ -56,6 +56,8 @@ WITHOUT = {
     "compare": "gives its gradients itself: tests/ops/test_compare.py compares them with finite differences",
     "compare_reference": "as compare",
     "pull_nodes": "gives its gradients itself: tests/ops/test_nodes.py compares them with the reference",
+    "spread_nodes": "as pull_nodes",
+    "whole": "a count",
     "spline_basis": "of times, which are not learned",
     "harmonics": "of directions, which have no gradient in project",
     "sorted_tiles": "whole numbers",

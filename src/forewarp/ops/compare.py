@@ -137,9 +137,7 @@ def _compare_numba(
     gradients = [torch.zeros_like(t) for t in particles]
     maps = torch.zeros(threads, *padded.shape)
     weights = torch.zeros_like(warp.weights) if by_weights else warp.weights.new_zeros(0, 0)
-    kernels_chain.chain(
-        *inputs, splats.numpy(), seen, by_splat.numpy(), *arrays(*gradients, maps, weights)
-    )
+    kernels_chain.chain(*inputs, splats.numpy(), seen, by_splat.numpy(), *arrays(*gradients, maps, weights))
     loss, squared = found.sum(0).tolist()
     return Compared(
         loss,

@@ -253,7 +253,12 @@ def chain(  # long: sixteen particles' way back, step by step
             moved, turn, scales = product(jacobian, warp), turned(place), scales_of(log_scales, which, place)
             rows = product(moved, turn)
             by_root = _of_covariance(
-                view, rows, scales, row_of(place, _SLOPE + 2), row_of(place, _SLOPE + 3), row_of(place, _SLOPE + 4)
+                view,
+                rows,
+                scales,
+                row_of(place, _SLOPE + 2),
+                row_of(place, _SLOPE + 3),
+                row_of(place, _SLOPE + 4),
             )
             r0, r1, r2 = by_root[0] * scales[0], by_root[1] * scales[1], by_root[2] * scales[2]
             r3, r4, r5 = by_root[3] * scales[0], by_root[4] * scales[1], by_root[5] * scales[2]
@@ -274,7 +279,9 @@ def chain(  # long: sixteen particles' way back, step by step
             _scattered(place, QUATERNION, 4, to_quaternions, which, valid)
             back = (r0, r1, r2, r3, r4, r5)
             by_moved = product(back, _transposed(turn))
-            by_point = _of_place(view, local, inverse, px, py, bent, place, product(by_moved, _transposed(warp)))
+            by_point = _of_place(
+                view, local, inverse, px, py, bent, place, product(by_moved, _transposed(warp))
+            )
             set_row(place, ANY, warp[0] * by_point[0] + warp[3] * by_point[1] + warp[6] * by_point[2])
             set_row(place, ANY + 1, warp[1] * by_point[0] + warp[4] * by_point[1] + warp[7] * by_point[2])
             set_row(place, ANY + 2, warp[2] * by_point[0] + warp[5] * by_point[1] + warp[8] * by_point[2])
@@ -294,7 +301,9 @@ def chain(  # long: sixteen particles' way back, step by step
             )
             for lane in range(valid):
                 i = np.uintp(which[lane])
-                slope = place[SIDE_BY_SIDE * (_SLOPE + 5) + lane] * splats[i, 5] * (np.float32(1) - splats[i, 5])
+                slope = (
+                    place[SIDE_BY_SIDE * (_SLOPE + 5) + lane] * splats[i, 5] * (np.float32(1) - splats[i, 5])
+                )
                 for j in range(len(fades)):
                     to_opacity[i, j] = slope * fades[j]
             for r in range(3):

@@ -88,7 +88,17 @@ def _walk_back(records, entries, first, count, column, y, kept, slopes, far, beh
         dx = beside + (column - records[i, 0])
         s, sy, syy = fold(slope), fold(low), fold(low * dy)
         sx = s * dx
-        found = (s, sx, sy, sx * dx, sy * dx, syy, fold(weight * red), fold(weight * green), fold(weight * blue))
+        found = (
+            s,
+            sx,
+            sy,
+            sx * dx,
+            sy * dx,
+            syy,
+            fold(weight * red),
+            fold(weight * green),
+            fold(weight * blue),
+        )
         if far is None:
             add_sums(sums, i, found)
         else:
@@ -151,7 +161,17 @@ def pull(records, entries, ends, shares, slopes, kept, sums):
             )
             far, behind = get_tile(slopes[3], row, column), get_tile(slopes[4], row, column)
             _walk_back(
-                records, entries, first, count, np.float32(column), y, kept[share], of, far, behind, sums[share]
+                records,
+                entries,
+                first,
+                count,
+                np.float32(column),
+                y,
+                kept[share],
+                of,
+                far,
+                behind,
+                sums[share],
             )
 
 

@@ -15,7 +15,7 @@ from forewarp.ops.kernels_rasterize import LEAST_LOG, RECORD, SIDE
 
 _DIGIT = 11  # bits that are sorted by at once
 _ZERO, _SHARE = np.float32(0), np.float32(1 / SIDE)
-_FIRST, _LAST = np.float32(0.5), np.float32(SIDE - 0.5)  # a tile's pixels' centres
+_HALF = np.float32(0.5)  # a tile's first pixel's centre
 _SLACK = np.float32(1e-3)  # pixels that rounding may move an edge by
 
 
@@ -66,10 +66,10 @@ def records_of(splats, order):
 @njit(inline="always")
 def _span(low, high, count):
     """The first tile with a pixel's centre in an interval, and the one after the last."""
-    most = np.float32(SIDE * count)
-    low = min(max(low - _SLACK - _LAST, -_LAST), most)
-    high = min(max(high + _SLACK - _FIRST, -_LAST), most)
-    return max(int(math.ceil(low * _SHARE)), 0), min(int(math.floor(high * _SHARE)) + 1, count)
+    most = np.float32(SIDE * (count + 1))
+    low, high = low + (_HALF - _SLACK), high + (np.float32(SIDE) - _HALF + _SLACK)
+    first = int(min(max(low, _ZERO), most) * _SHARE)
+    return first, min(int(min(max(high, _ZERO), most) * _SHARE), count)
 
 
 @njit(cache=True)
@@ -107,7 +107,8 @@ def sort_into_tiles(splats, order, records, across, down):
         for row in range(top, bottom):
             low, high = first, last
             if not single:
-                y0, y1 = np.float32(SIDE * row) + _FIRST - v, np.float32(SIDE * row) + _LAST - v
+                y0 = np.float32(SIDE * row) + _HALF - v
+                y1 = y0 + np.float32(SIDE - 1)
                 at, to = min(max(-tip, y0), y1), min(max(tip, y0), y1)
                 left = slope * at - half * math.sqrt(max(bend * at * at + rest, _ZERO))
                 right = slope * to + half * math.sqrt(max(bend * to * to + rest, _ZERO))

@@ -110,7 +110,9 @@ def test_straight_motion_does_not_bend():
     line = torch.arange(8.0)[:, None].expand(8, 3)
     nodes.shift.data = line.expand(12, 8, 3).clone()
     nodes.turn.data.zero_()
-    assert nodes.spread_over_time(0.4, nodes.curve(0.4), torch.zeros(12, 6), 1.0, 1.0)[0] == pytest.approx(0.0, abs=1e-9)
+    assert nodes.spread_over_time(0.4, nodes.curve(0.4), torch.zeros(12, 6), 1.0, 1.0)[0] == pytest.approx(
+        0.0, abs=1e-9
+    )
 
 
 def test_a_curve_is_continued_to_times_not_yet_seen():

@@ -196,7 +196,6 @@ class Nodes(nn.Module):
             return self.places.new_zeros(self.curve.count)
         middle = min(max(time, low), high)
         before, now, after = (
-            self.curve(min(max(t, 0.0), 1.0)).to(self.places)
-            for t in (middle - step, middle, middle + step)
+            self.curve(min(max(t, 0.0), 1.0)).to(self.places) for t in (middle - step, middle, middle + step)
         )
         return after - 2 * now + before
