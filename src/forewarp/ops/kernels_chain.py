@@ -92,7 +92,7 @@ def slopes_of(splats, rows, ranks, sums, factor, slopes, pull):
                 pull[rows[first + lane]] = conics[lane]
 
 
-@njit(inline="always")
+@njit(forceinline=True)
 def _scattered(place, first, count, array, which, valid):
     """Copy rows from ``first`` on to the columns (N, count) of the particles they belong to."""
     for lane in range(valid):
@@ -101,7 +101,7 @@ def _scattered(place, first, count, array, which, valid):
             array[i, c] = place[SIDE_BY_SIDE * (first + c) + lane]
 
 
-@njit(inline="always")
+@njit(forceinline=True)
 def _of_covariance(view, rows, scales, by_a, by_b, by_c):
     """From slopes by the conic A, B, C to those by rows (2, 3) times scales.
 
@@ -125,7 +125,7 @@ def _of_covariance(view, rows, scales, by_a, by_b, by_c):
     )
 
 
-@njit(inline="always")
+@njit(forceinline=True)
 def _of_turn(place, d):
     """From slopes (9) by rotations to those by gathered quaternions (4), whatever their length."""
     w, x, y, z = (
@@ -150,7 +150,7 @@ def _of_turn(place, d):
     )
 
 
-@njit(inline="always")
+@njit(forceinline=True)
 def _of_place(view, local, inverse, px, py, bent, place, by_jacobian):
     """Slopes (3) by the world point, of the pixel, of its own slopes (2, 3) and of the distance.
 
@@ -181,7 +181,7 @@ def _of_place(view, local, inverse, px, py, bent, place, by_jacobian):
     )
 
 
-@njit(inline="always")
+@njit(forceinline=True)
 def _of_colors(dx, dy, dz, splats, tints, which, valid, place, to_colors):
     """Slopes by the coefficients of colour; direction has none."""
     plain = to_colors.shape[1] - len(tints)
@@ -205,7 +205,7 @@ def _of_colors(dx, dy, dz, splats, tints, which, valid, place, to_colors):
                 to_colors[i, k, c] = place[SIDE_BY_SIDE * (ANY + c) + lane]
 
 
-@njit(inline="always")
+@njit(forceinline=True)
 def _of_maps(maps, links, weights, which, valid, place, to_maps, to_weights):
     """Add the slopes of blended maps, a particle's in a row of ``place``, to those by maps and shares."""
     for lane in range(valid):
@@ -318,7 +318,7 @@ def chain(  # long: sixteen particles' way back, step by step
             _of_maps(maps, links, weights, which, valid, place, to_maps[share], to_weights)
 
 
-@njit(inline="always")
+@njit(forceinline=True)
 def _transposed(m):
     """The transpose of (3, 3) in 9 numbers."""
     return m[0], m[3], m[6], m[1], m[4], m[7], m[2], m[5], m[8]

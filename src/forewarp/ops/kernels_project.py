@@ -27,7 +27,7 @@ C30, C31, C32 = (np.float32(c) for c in (0.5900435899266435, 2.890611442640554, 
 C33, C34 = (np.float32(c) for c in (0.3731763325901154, 1.445305721320277))
 
 
-@njit(inline="always")
+@njit(forceinline=True)
 def harmonics(x, y, z, count, place):
     """Real spherical harmonics of unit directions into the rows from ``BASIS`` on; count is 1, 4, 9 or 16."""
     set_row(place, BASIS, sixteen(C0))
@@ -52,7 +52,7 @@ def harmonics(x, y, z, count, place):
             set_row(place, BASIS + 15, x * (xx - yy * 3.0) * -C30)
 
 
-@njit(inline="always")
+@njit(forceinline=True)
 def gathered(array, which, place, first, count):
     """Copy the columns (N, count) of 16 particles to the rows from ``first`` on."""
     for lane in range(SIDE_BY_SIDE):
@@ -61,7 +61,7 @@ def gathered(array, which, place, first, count):
             place[SIDE_BY_SIDE * (first + c) + lane] = array[i, c]
 
 
-@njit(inline="always")
+@njit(forceinline=True)
 def followed(means, maps, links, weights, which, place):
     """Blend the maps (M, 16) of 16 particles' nodes into 12 rows: I + sum w D row by row, then the shift.
 
@@ -85,7 +85,7 @@ def followed(means, maps, links, weights, which, place):
     )
 
 
-@njit(inline="always")
+@njit(forceinline=True)
 def through_lens(view, x, y):
     """Where a lens puts a point of the plane, in pixels, and the 2 x 2 slopes of that."""
     k1, k2, k3 = view[RADIAL], view[RADIAL + 1], view[RADIAL + 2]
@@ -110,7 +110,7 @@ def through_lens(view, x, y):
     )
 
 
-@njit(inline="always")
+@njit(forceinline=True)
 def turned(place):
     """The rotations (9) of 16 gathered quaternions (w, x, y, z) of any length; of length 0 there is none."""
     w, x, y, z = (
@@ -130,7 +130,7 @@ def turned(place):
     )  # fmt: skip
 
 
-@njit(inline="always")
+@njit(forceinline=True)
 def product(a, b):
     """``a b`` of (2, 3) and (3, 3), row by row in 6, 9 and 6 numbers."""
     return (
@@ -143,7 +143,7 @@ def product(a, b):
     )
 
 
-@njit(inline="always")
+@njit(forceinline=True)
 def seen_from(view, x, y, z):
     """World points in the camera's axes."""
     x, y, z = x - view[CENTER], y - view[CENTER + 1], z - view[CENTER + 2]
@@ -154,7 +154,7 @@ def seen_from(view, x, y, z):
     )
 
 
-@njit(inline="always")
+@njit(forceinline=True)
 def slopes_of_pixel(view, inverse, px, py, bent):
     """The slopes (2, 3) of pixels by the world point, at 1 / z and a point of the plane."""
     a, b, d, e = bent[2] * inverse, bent[3] * inverse, bent[4] * inverse, bent[5] * inverse
@@ -169,7 +169,7 @@ def slopes_of_pixel(view, inverse, px, py, bent):
     )
 
 
-@njit(inline="always")
+@njit(forceinline=True)
 def linear_of(place):
     """The linear part (9) of the blended maps."""
     return (
@@ -178,7 +178,7 @@ def linear_of(place):
     )  # fmt: skip
 
 
-@njit(inline="always")
+@njit(forceinline=True)
 def covariance(view, rows, scales):
     """a, b, c of the covariance (a, b; b, c) of rows (2, 3) times scales, and its determinant."""
     x0, x1, x2 = rows[0] * scales[0], rows[1] * scales[1], rows[2] * scales[2]
@@ -191,14 +191,14 @@ def covariance(view, rows, scales):
     return a + blur, b, c + blur, determinant
 
 
-@njit(inline="always")
+@njit(forceinline=True)
 def scales_of(log_scales, which, place):
     """The scales (3) of 16 particles."""
     gathered(log_scales, which, place, SCALE, 3)
     return exp(row_of(place, SCALE)), exp(row_of(place, SCALE + 1)), exp(row_of(place, SCALE + 2))
 
 
-@njit(inline="always")
+@njit(forceinline=True)
 def _solid(opacity, which, fades, place):
     """The opacities of 16 particles."""
     logit = sixteen(0.0)
@@ -209,7 +209,7 @@ def _solid(opacity, which, fades, place):
     return sixteen(1.0) / (exp(logit * -1.0) + 1.0)
 
 
-@njit(inline="always")
+@njit(forceinline=True)
 def _paint(dx, dy, dz, colors, tints, which, place):
     """The colours of 16 splats: what direction and time make of their coefficients."""
     plain = colors.shape[1] - len(tints)

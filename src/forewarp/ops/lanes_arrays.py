@@ -7,7 +7,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from forewarp.ops.lanes import FLAGS, FLOAT, INT, NARROW, ROW, SUMS, TILE, WIDE, constant, repeated, shuffled
+from forewarp.ops.lanes import FLAGS, FLOAT, INT, NARROW, ROW, SUMS, TILE, WIDE, constant, shuffled
 
 
 def _combined(builder, a, b, size: int):
