@@ -26,10 +26,10 @@ def biases(first: float, second: float) -> np.ndarray:
 @njit(inline="always")
 def _seen(gradient, row, width):
     """Whether a row has a gradient."""
+    found = False
     for c in range(width):
-        if gradient[row * width + c] != 0:
-            return True
-    return False
+        found |= gradient[row * width + c] != 0
+    return found
 
 
 @njit(parallel=True, cache=True)

@@ -1,4 +1,7 @@
-"""Exponentials and logarithms of vectors; see ``lanes``. Coefficients are fitted for the least relative error."""
+"""Exponentials and logarithms of vectors; see ``lanes``.
+
+Coefficients are fitted for the least relative error.
+"""
 
 from __future__ import annotations
 

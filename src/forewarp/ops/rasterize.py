@@ -96,7 +96,7 @@ class Tiles(NamedTuple):
 
 
 def sorted_tiles(splats, across: int, down: int, threads: int) -> Tiles:
-    """Sort splats (N, 16) of ``kernels_project``, a numpy array, into ``across`` x ``down`` tiles; needs Numba."""
+    """Sort splats (N, 16), a numpy array of ``kernels_project``, into ``across`` x ``down`` tiles."""
     from forewarp.ops import kernels_tiles as kernels
 
     order = kernels.by_depth(splats)
