@@ -64,12 +64,12 @@ def test_header_and_pixels_of_a_png(tmp_path, kind):
     assert (image[..., 3] == (255 * (pixels != pixels[0, 0]) if options else expected)).all()
 
 
-@pytest.mark.parametrize(
-    "options", [{}, {"progressive": True}, {"optimize": True}, {"comment": b"c" * 60000}]
-)
+@pytest.mark.parametrize("options", [{}, {"progressive": True}, {"comment": b"c" * 60000}])
 def test_header_and_pixels_of_a_jpeg(tmp_path, options):
     for pixels in (NOISE, NOISE[..., 0]):
         iio.imwrite(tmp_path / "a.jpg", pixels, plugin="pillow", quality=97, subsampling=0, **options)
+        with (tmp_path / "a.jpg").open("ab") as file:
+            file.write(bytes(9000))  # what follows the end does no harm
         header = inspect_image(tmp_path / "a.jpg")
         assert (header.size, header.has_alpha) == ((53, 37), False)
         rgba = read_image(tmp_path / "a.jpg").numpy()
@@ -87,14 +87,6 @@ def test_what_is_written_is_read(tmp_path):
     assert np.array_equal(read_gray16(tmp_path / "d.png"), steps)
 
 
-def test_what_follows_the_end_of_a_jpeg_does_no_harm(tmp_path):
-    write_jpeg(tmp_path / "a.jpg", NOISE)
-    with (tmp_path / "a.jpg").open("ab") as file:
-        file.write(bytes(9000))
-    assert inspect_image(tmp_path / "a.jpg").size == (53, 37)
-    assert read_image(tmp_path / "a.jpg").shape == (37, 53, 4)
-
-
 def with_byte(content, at, value):
     return content[:at] + bytes([value]) + content[at + 1 :]
 
@@ -105,7 +97,7 @@ def frame_at(content):
 
 
 WHOLE = "expected a whole image, but got a truncated or harmed one"
-HARM = {
+HARM = {  # of a PNG and of a JPEG
     "empty": (lambda c: b"", "but got an empty file"),
     "text": (lambda c: b"version https://git-lfs", "expected a PNG or JPEG image, but got another kind"),
     "signature only": (lambda c: c[:2], "but got another kind of file or a harmed header"),
@@ -116,10 +108,6 @@ HARM = {
 HARM_JPEG = {
     "12 bits": (lambda c: with_byte(c, frame_at(c) + 4, 12), "a harmed header"),
     "no frame": (lambda c: c[:2] + c[c.index(b"\xff\xda") :], "a harmed header"),
-    "wide": (
-        lambda c: c[: frame_at(c) + 5] + b"\xff\xff\xff\xff" + c[frame_at(c) + 9 :],
-        "expected an image of 1 to 80000000 pixels, but got",
-    ),
 }
 CASES = [(n, h) for n in ("a.png", "a.jpg") for h in HARM] + [("a.jpg", h) for h in HARM_JPEG]
 
@@ -134,14 +122,6 @@ def test_bad_images_are_refused_in_one_line(tmp_path, name, harm):
         with pytest.raises(SceneError, match=rf"{name}: .*{match}") as caught:
             read(tmp_path / name)
         assert "\n" not in str(caught.value)
-
-
-def test_a_flipped_bit_of_a_png_is_found(tmp_path):
-    write_png(tmp_path / "a.png", NOISE)
-    content = (tmp_path / "a.png").read_bytes()
-    (tmp_path / "a.png").write_bytes(with_byte(content, len(content) // 2, content[len(content) // 2] ^ 255))
-    with pytest.raises(SceneError, match="a.png: expected a whole image, but got a truncated or harmed one"):
-        read_image(tmp_path / "a.png")
 
 
 def test_other_kinds_of_pixel_and_missing_files_are_refused(tmp_path):
