@@ -105,7 +105,6 @@ BAD = {
         ({"frames.1": [1]}, r"frames\[1\]: expected an object, but got \[1\]"),
         ({"frames.1.transform_matrix": GONE}, r"frames\[1\].transform_matrix: expected 4 x 4 .*None"),
         ({"frames.1.time": 1.5}, r"frames\[1\].time: expected a number in \[0, 1\], but got 1.5"),
-        ({"frames.1.file_path": GONE}, rf"frames\[1\].file_path: {OUT} .*got None"),
         ({"frames.1.file_path": "../../x"}, rf"frames\[1\].file_path: {OUT}"),
         ({"frames.1.file_path": "r_9"}, "r_9.png: expected an image, but got No such file"),
         ({"frames.1.depth_file_path": "/etc/x"}, f"depth_file_path: {OUT}"),
@@ -113,16 +112,13 @@ BAD = {
         ({"frames.1.ability": "flight"}, "ability: expected one of space, time, canonical"),
     ],
     ("dnerf", "train/r_2.png"): [
-        (cut, f"r_2.png: {WHOLE}"),
         (flip, f"r_2.png: {WHOLE}"),
         (PIXELS[:4, :4], "r_2.png: expected 8 x 6 pixels as the first, but got 4 x 4"),
     ],
     ("dnerf", "transforms_test_time.json"): [
-        (b"{}", "test.json: expected it or one file per ability, but got both"),
+        (b"{}", "test.json: expected it or one file per ability, but got both")
     ],
-    ("dnerf", "transforms_test.json"): [
-        (None, "but got neither"),
-    ],
+    ("dnerf", "transforms_test.json"): [(None, "but got neither")],
     ("lego", TIME): [
         ({"frames.0.ability": "all"}, "got test_time/r_0 without an ability; use data=dnerf"),
         ({"frames.0.depth_file_path": "train/r_0.png"}, "r_0.png: expected depth_scale in the transf"),
@@ -136,34 +132,23 @@ BAD = {
         ({"points": TWO[None], "times": [0, 2]}, "but got 0 to 2"),
         (b"", "trajectories.npz: expected a NumPy file"),
     ],
-    ("rig", TRUTH): [
-        ({"points": TWO[None], "times": [0.25, 1]}, "begin at the canonical time 0.5"),
-    ],
+    ("rig", TRUTH): [({"points": TWO[None], "times": [0.25, 1]}, "begin at the canonical time 0.5")],
     ("rig", CAMERA): [
         (None, "left1_000000.json: expected a readable file, but got No such file"),
         ({"orientation": GONE}, "orientation: expected 3 x 3 numbers, but got None"),
-        ({"orientation": [["a"] * 3] * 3}, "orientation: expected a number, but got 'a'"),
         ({"orientation.0": [2, 0, 0]}, "orientation: expected a rotation"),
         ({"position": [1, 2]}, r"position: expected 3 numbers, but got \[1, 2\]"),
         ({"focal_length": 0}, "focal_length: expected a number in"),
-        ({"pixel_aspect_ratio": 0}, "pixel_aspect_ratio: expected a number in"),
-        ({"skew": "none"}, "skew: expected a number .*got 'none'"),
-        ({"principal_point": [4]}, "principal_point: expected 2 numbers"),
-        ({"radial_distortion": [0.1, 0.2]}, "radial_distortion: expected 3 numbers"),
         ({"tangential": [0.1]}, "tangential: expected 2 numbers"),
         ({"radial_distortion": [-30, 0, 0]}, "radial_distortion: expected a lens that can be undone"),
-        ({"image_size": [12]}, "image_size: expected 2 numbers"),
         ({"image_size": [12.5, 8]}, "image_size: expected whole numbers"),
         ({"image_size": [24, 8]}, "png: expected 12 x 4 pixels, the camera's .* got 6 x 4"),
     ],
     ("rig", WORLD): [
         ({"scale": GONE}, "scene.json: scale: expected a number .*got None"),
-        ({"center": [0, 0]}, "scene.json: center: expected 3 numbers"),
-        ({"near": -1}, "scene.json: near: expected a number in"),
         ({"near": 9}, "scene.json: near, far: expected near < far, but got 9 and 1.4"),
     ],
     ("rig", ITEMS): [
-        ({"ids": 5}, "ids: expected a list of different names, but got 5"),
         (lambda c: c["ids"].append(ITEM), "ids: expected a list of different names"),
         ({"train_ids": ["x"]}, "train_ids: expected items of ids, but got 'x'"),
         ({"val_ids": ["left1_000000"]}, "val_ids: expected none of train_ids, but got 'left1"),
@@ -175,16 +160,12 @@ BAD = {
         ({f"{ITEM}.time_id": GONE}, rf"'{ITEM}'.time_id: expected a number"),
         ({f"{ITEM}.time_id": 0.5}, "time_id: expected a whole number, but got 0.5"),
     ],
-    ("rig", f"rgb/2x/{ITEM}.png"): [
-        (None, f"{ITEM}.png: expected an image, but got No such file"),
-    ],
+    ("rig", f"rgb/2x/{ITEM}.png"): [(None, f"{ITEM}.png: expected an image, but got No such file")],
     ("rig", "points.npy"): [
         (TWO[:, :2], r"points.npy: expected points \(N, 3\), but got shape \(2, 2\)"),
-        (TWO[:0], r"points.npy: expected points \(N, 3\)"),
-        (b"version https://git-lfs", "points.npy: expected a NumPy file"),
     ],
     ("video", "images/frame_1.png"): [
-        (np.zeros((20, 30, 4), np.uint8), "alpha: expected one in all frames or in none"),
+        (np.zeros((20, 30, 4), np.uint8), "alpha: expected one in all frames or in none")
     ],
     ("dome", POSES): [
         (b" \n", "expected at least one camera"),
@@ -193,7 +174,7 @@ BAD = {
         (line(4, None), "Intrinsic.inf: expected as many cameras .*got 4 there and 3 in"),
     ],
     ("dome", "."): [
-        (lambda p: nhr_scene.write_dome(p, nhr_scene.dome(1), 1), "expected at least 2 cameras, one to"),
+        (lambda p: nhr_scene.write_dome(p, nhr_scene.dome(1), 1), "expected at least 2 cameras, one to")
     ],
     ("dome", LENSES): [
         (None, "expected a readable file, but got No such file"),
@@ -203,32 +184,22 @@ BAD = {
         (line(6, lambda w: "2"), "line 6: expected the number 1 of a camera, but got '2'"),
         (line(19, None), "line 18: expected nine numbers of camera 3, .* after 6"),
     ],
-    ("dome", "img"): [
-        (None, "img/0: expected a folder of images, but got none"),
-    ],
-    ("dome", "img/1"): [
-        (None, "img/1: expected a folder of images, but got none"),
-    ],
+    ("dome", "img"): [(None, "img/0: expected a folder of images, but got none")],
+    ("dome", "img/1"): [(None, "img/1: expected a folder of images, but got none")],
     ("dome", "img/1/mask/img_0002.jpg"): [
-        (None, "img_0002.jpg: expected an image of every camera .*, but got none"),
+        (None, "img_0002.jpg: expected an image of every camera .*, but got none")
     ],
     ("dome", "img/1/img_0004.jpg"): [
-        (PIXELS[..., 0], "expected images of the 4 cameras of CamPose.inf, but got anot"),
+        (PIXELS[..., 0], "expected images of the 4 cameras of CamPose.inf, but got anot")
     ],
-    ("dome", "img/1/img_0002.jpg"): [
-        (PIXELS[..., 0], "expected 60 x 48 pixels as in .*, but got 8 x 6"),
-    ],
-    ("dome", "img/1/img_0001.jpg"): [
-        (cut, f"img_0001.jpg: {WHOLE}"),
-    ],
+    ("dome", "img/1/img_0002.jpg"): [(PIXELS[..., 0], "expected 60 x 48 pixels as in .*, but got 8 x 6")],
+    ("dome", "img/1/img_0001.jpg"): [(cut, f"img_0001.jpg: {WHOLE}")],
     ("dome", CLOUD): [
         (None, "frame2.npy: expected a NumPy file, but got No such file"),
         (np.full((2, 6), np.nan), "frame2.npy: expected finite numbers, .*in row 0"),
         (np.diag([0, 1e30, 0, 0, 0, 0]), r"expected points within 1e\+09 units, but got 1e\+30 in row 1"),
     ],
-    ("dome", ALL_CLOUDS): [
-        (flat, "pointclouds: expected points that span a box, .*; set data.box"),
-    ],
+    ("dome", ALL_CLOUDS): [(flat, "pointclouds: expected points that span a box, .*; set data.box")],
     ("video", FRAMES): [
         ({"frames.1": "x"}, r"frames\[1\]: expected an object, but got 'x'"),
         (lambda c: c.update(frames=c["frames"][:1]), "expected a frame to test on, but got none of 1"),
@@ -237,21 +208,18 @@ BAD = {
         ({"frames.1.file_path": "images/x.jpg"}, "x.jpg: expected an image, but got No such file"),
         ({"frames.1.file_path": "x" * 999}, "file_path: expected an image, PNG or JPEG, but got no"),
         ({"frames.1.file_path": "./images/frame_1.png"}, "expected each image once, but got images/fr"),
-        ({"frames.1.mask_path": "/x.png"}, f"mask_path: {OUT}"),
         ({"frames.1.mask_path": "images/frame_1.png"}, "mask_path: expected one in all frames or.*1 of"),
         (lambda c: [e.update(mask_path="m.png") for e in c["frames"]], "m.png: expected 30 x 20 pixels as"),
         ({"frames.1.time": 0.5}, "frames: time: expected one in all frames or in none, but got 1 of 10"),
         ({"frames.1.time": 3}, r"frames\[1\].time: expected a number in \[0, 1\], but got 3"),
         ({"fl_x": GONE}, r"frames\[0\].fl_x: expected a number in .*got None"),
         ({"frames.1.fl_x": -30}, r"frames\[1\].fl_x: expected a number in .*got -30"),
-        ({"cx": 3000}, r"json: cx: expected a number in \[-30, 60\], but got 3000"),
         ({"w": 60}, "frame_1.png: expected 60 x 20 pixels as .*json: w and h say, but got 30 x 20"),
         ({"camera_model": "OPENCV_FISHEYE"}, "json: camera_model: expected one of OPENCV, .*FISHEYE"),
         ({"k4": 0.1}, "json: k4: expected 0, but got 0.1; undistort the images"),
         ({"k1": -40}, "json: k1: expected a lens that can be undone all over the picture, but got"),
         ({"near": -1}, r"json: near: expected a number in \[0, 1e\+09\], but got -1"),
         ({"near": 7, "far": 6}, "json: expected near < far, but got 7 and 6"),
-        ({"aabb": [1, 2]}, r"json: aabb: expected \[\[x0, y0, z0\], \[x1, y1, z1\]\]"),
         ({"aabb": [[0, 0, 1], [1, 1, 0]]}, "aabb: expected .* each low end below its high end"),
         ({"test_filenames": "images/frame_1.png"}, "test_filenames: expected a list of paths"),
         ({"test_filenames": ["images/x.png"]}, "test_filenames: expected paths of frames.*images/x"),
@@ -286,7 +254,7 @@ LATER = {
         (PIXELS[:4], "r_2.png: expected 8 x 6 pixels, but got 8 x 4"),
     ],
     ("dome", "img/0/mask/img_0001.jpg"): [
-        (PIXELS[..., 0], "img_0001.jpg: expected 48 x 60 pixels, but got 8 x 6"),
+        (PIXELS[..., 0], "img_0001.jpg: expected 48 x 60 pixels, but got 8 x 6")
     ],
     ("lego", DEPTH): [
         (b"", "r_0_depth.npy: expected a NumPy file"),
@@ -326,29 +294,23 @@ OPTIONS = {
     "rig": [
         ({"scale": 0}, "data.scale: expected a whole number of at least 1, but got 0"),
         ({"scale": 8}, "8x: expected a folder of images.* set data.scale .*: 1x, 2x$"),
-        ({"box": [1, 2]}, "data.box: expected six numbers"),
     ],
     "dome": [
         ({"test_views": [4]}, r"data.test_views: expected different cameras of 0 to 3, not all, but .*\[4\]"),
         ({"test_views": [0, 1, 2, 3]}, "data.test_views: expected"),
-        ({"test_views": []}, "data.test_views: expected"),
         ({"test_views": [1, 1]}, "data.test_views: expected"),
         ({"frames": 0}, "data.frames: expected a whole number of at least 1, but got 0"),
         ({"test_every": 1.5}, "data.test_every: expected a whole number of at least 1, but got 1.5"),
         ({"half_resolution": "auto"}, "data.half_resolution: expected true or false, but got 'auto'"),
-        ({"box": [1, 2, 3]}, "data.box: expected six numbers"),
     ],
     "video": [
         ({"scale": 3}, r"data.scale: expected one of \(1, 2, 4, 8\), but got 3"),
         ({"scale": 2}, "images_2/frame_1.png: expected an image, but got No such file"),
-        ({"near": -1}, "data.near: expected a number"),
         ({"near": 200}, "expected near < far, but got 200 and 120; set data.near, data.far"),
         ({"far": 0}, "data.far: expected a number"),
-        ({"box": [1, 2]}, "data.box: expected six numbers"),
         ({"normalise": "yes"}, "data.normalise: expected true or false, but got 'yes'"),
         ({"canonical": "last"}, "data.canonical: expected middle or first, but got 'last'"),
         ({"test_every": 1}, "data.test_every: expected a whole number of at least 2, but got 1"),
-        ({"test_every": 21}, "expected a frame to test on, but got none of 10; name some in test_filenames"),
     ],
 }
 
@@ -406,13 +368,10 @@ UNWRITABLE = {
         ({"training": []}, r"splits: expected train, val and test, but got \['training'\]"),
         ({"train": [shot(), shot()]}, "expected shots of different names"),
         ({"train": [shot(rgba=PIXELS / 1.0)]}, "expected uint8 pixels"),
-        ({"train": [shot(rgba=PIXELS[..., :3])]}, r"expected rgba \(6, 8\) \+ \(4,\)"),
         ({"train": [shot(), shot("b", rgba=PIXELS[:2])]}, "expected rgba"),
-        ({"train": [shot(time=2)]}, r"train/a: time: expected a number in \[0, 1\]"),
         ({"train": [shot(pose=2 * np.eye(4))]}, "train/a: pose: expected a rotation"),
         ({"train": [shot(ability="time")]}, "in test only"),
         ({"test": [shot(), shot("b", ability="time")]}, "both kinds"),
-        ({"test": [shot(ability="time"), shot("b")]}, "both kinds"),
     ],
     write_lego: [
         (dnerf_scene.shots(1, depth=True), "r_0: expected .* an ability and a depth, but got no ability"),
@@ -430,7 +389,6 @@ UNWRITABLE = {
     ],
     posed_video.write_scene: [
         ([replace(POSED, pixels=RGB / 1.0)], "a.png: expected uint8 pixels of shape"),
-        ([replace(POSED, pixels=RGB[:4])], "a.png: expected uint8 pixels of shape"),
         ([replace(POSED, camera=replace(ONE, skew=1.0))], "no skew, but got .* a skew of 1"),
         ([replace(POSED, camera=replace(ONE, camera_to_world=torch.zeros(4, 4)))], "a rotation"),
         ([replace(POSED, time=2.0)], "a.png: time: expected a number in"),

@@ -1,24 +1,6 @@
-import math
-
 import torch
 
-from forewarp.drawing.colors import (
-    at_least,
-    depth_colors,
-    error_colors,
-    flow_colors,
-    hues,
-    in_a_row,
-    ramp,
-    with_wheel,
-)
-
-
-def test_ramp_meets_its_anchors_and_clamps():
-    anchors = ((0.0, 0.0, 0.0), (1.0, 0.5, 0.0), (1.0, 1.0, 1.0))
-    found = ramp(torch.tensor([-1.0, 0.0, 0.25, 0.5, 1.0, 7.0]), anchors)
-    expected = [[0, 0, 0], [0, 0, 0], [0.5, 0.25, 0], [1, 0.5, 0], [1, 1, 1], [1, 1, 1]]
-    torch.testing.assert_close(found, torch.tensor(expected, dtype=torch.float32))
+from forewarp.drawing.colors import depth_colors, error_colors, flow_colors, hues, in_a_row, with_wheel
 
 
 def test_depth_is_bright_near_and_white_where_nothing_is():
@@ -27,9 +9,6 @@ def test_depth_is_bright_near_and_white_where_nothing_is():
     lightness = colors[0].mean(-1)
     assert lightness[0] > lightness[1] > lightness[2]
     assert colors[0, 3].tolist() == [1, 1, 1]
-
-
-def test_depth_of_nothing_is_white():
     assert bool((depth_colors(torch.zeros(2, 3), torch.zeros(2, 3)) == 1).all())
 
 
@@ -46,11 +25,7 @@ def test_flow_hue_is_direction_and_saturation_is_length():
     torch.testing.assert_close(left, hues(torch.tensor(0.5)))
     torch.testing.assert_close(slow, 0.5 * (right + still))
     assert still[0] == still[1] == still[2] < 1  # grey, to be told from the white of nothing
-
-
-def test_flow_over_nothing_is_white():
-    flow = torch.full((2, 2, 2), math.pi)
-    assert bool((flow_colors(flow, torch.zeros(2, 2)) == 1).all())
+    assert bool((flow_colors(flow, torch.zeros(1, 4)) == 1).all())
 
 
 def test_the_wheel_stands_in_the_corner_only():
@@ -67,11 +42,3 @@ def test_a_row_keeps_the_pictures_and_parts_them():
     torch.testing.assert_close(row[:, :3], a)
     torch.testing.assert_close(row[:, 3:7], torch.ones(2, 4, 3))
     torch.testing.assert_close(row[:, 7:], b)
-
-
-def test_pixels_are_repeated_whole():
-    picture = torch.rand(2, 3, 3)
-    large = at_least(picture, 5)
-    assert large.shape == (6, 9, 3)
-    assert bool((large[3:6, 6:9] == picture[1, 2]).all())
-    assert torch.equal(at_least(picture, 2), picture)
