@@ -94,140 +94,111 @@ POSES, LENSES, CLOUD, ALL_CLOUDS = "CamPose.inf", "Intrinsic.inf", "pointclouds/
 TRUTH, DEPTH, PIXELS = "trajectories.npz", "test_time/r_0_depth.npy", np.zeros((6, 8, 4), np.uint8)
 TWO = np.zeros((2, 3))
 BAD = {
-    ("dnerf", T): [
-        (None, "expected a scene with transforms_train.json, but got none; scenes in .*: none"),
-        (b'{\n"a": 1,\n}', "transforms_train.json: line 3: expected JSON, but got"),
-        (b"[1]", "expected a JSON object at the top, but got list"),
-        (b"\xff\xfe\x00", "expected JSON, but got"),
-        ({"camera_angle_x": GONE}, "camera_angle_x: expected a number .*got None"),
-        ({"camera_angle_x": 0}, r"camera_angle_x: expected radians inside \(0, pi\)"),
-        ({"frames": []}, "frames: expected a list of at least one frame"),
-        ({"frames.1": [1]}, r"frames\[1\]: expected an object, but got \[1\]"),
-        ({"frames.1.transform_matrix": GONE}, r"frames\[1\].transform_matrix: expected 4 x 4 .*None"),
-        ({"frames.1.time": 1.5}, r"frames\[1\].time: expected a number in \[0, 1\], but got 1.5"),
-        ({"frames.1.file_path": "../../x"}, rf"frames\[1\].file_path: {OUT}"),
-        ({"frames.1.file_path": "r_9"}, "r_9.png: expected an image, but got No such file"),
-        ({"frames.1.depth_file_path": "/etc/x"}, f"depth_file_path: {OUT}"),
-        ({"frames.1.depth_file_path": "e" * 999}, "depth_file_path: expected an existing file"),
-        ({"frames.1.ability": "flight"}, "ability: expected one of space, time, canonical"),
+    "dnerf": [
+        (T, None, "expected a scene with transforms_train.json, but got none; scenes in .*: none"),
+        (T, b'{\n"a": 1,\n}', "transforms_train.json: line 3: expected JSON, but got"),
+        (T, b"[1]", "expected a JSON object at the top, but got list"),
+        (T, b"\xff\xfe\x00", "expected JSON, but got"),
+        (T, {"camera_angle_x": GONE}, "camera_angle_x: expected a number .*got None"),
+        (T, {"camera_angle_x": 0}, r"camera_angle_x: expected radians inside \(0, pi\)"),
+        (T, {"frames": []}, "frames: expected a list of at least one frame"),
+        (T, {"frames.1": [1]}, r"frames\[1\]: expected an object, but got \[1\]"),
+        (T, {"frames.1.transform_matrix": GONE}, r"frames\[1\].transform_matrix: expected 4 x 4 .*None"),
+        (T, {"frames.1.time": 1.5}, r"frames\[1\].time: expected a number in \[0, 1\], but got 1.5"),
+        (T, {"frames.1.file_path": "../../x"}, rf"frames\[1\].file_path: {OUT}"),
+        (T, {"frames.1.file_path": "r_9"}, "r_9.png: expected an image, but got No such file"),
+        (T, {"frames.1.depth_file_path": "/etc/x"}, f"depth_file_path: {OUT}"),
+        (T, {"frames.1.depth_file_path": "e" * 999}, "depth_file_path: expected an existing file"),
+        (T, {"frames.1.ability": "flight"}, "ability: expected one of space, time, canonical"),
+        ("train/r_2.png", flip, f"r_2.png: {WHOLE}"),
+        ("train/r_2.png", PIXELS[:4, :4], "r_2.png: expected 8 x 6 pixels as the first, but got 4 x 4"),
+        ("transforms_test_time.json", b"{}", "test.json: expected it or one file per ability, but got both"),
+        ("transforms_test.json", None, "but got neither"),
     ],
-    ("dnerf", "train/r_2.png"): [
-        (flip, f"r_2.png: {WHOLE}"),
-        (PIXELS[:4, :4], "r_2.png: expected 8 x 6 pixels as the first, but got 4 x 4"),
+    "lego": [
+        (TIME, {"frames.0.ability": "all"}, "got test_time/r_0 without an ability; use data=dnerf"),
+        (TIME, {"frames.0.depth_file_path": "train/r_0.png"}, "r_0.png: expected depth_scale in the transf"),
+        (TIME, {"frames.0.depth_scale": 0}, r"frames\[0\].depth_scale: expected a number in"),
+        (TRUTH, {"points": TWO}, r"expected arrays points and times, but got \['points'\]"),
+        (TRUTH, {"points": TWO, "times": [0, 1]}, r"expected points \(N, T, 3\) and times \(T,\)"),
+        (TRUTH, {"points": np.full((2, 1, 3), np.inf), "times": [0]}, "points: expected finite numbers"),
+        (TRUTH, {"points": np.array([None]), "times": [0]}, "points: expected an array"),
+        (TRUTH, {"points": TWO[None], "times": [0, 2]}, "but got 0 to 2"),
+        (TRUTH, b"", "trajectories.npz: expected a NumPy file"),
     ],
-    ("dnerf", "transforms_test_time.json"): [
-        (b"{}", "test.json: expected it or one file per ability, but got both")
+    "rig": [
+        (TRUTH, {"points": TWO[None], "times": [0.25, 1]}, "begin at the canonical time 0.5"),
+        (CAMERA, None, "left1_000000.json: expected a readable file, but got No such file"),
+        (CAMERA, {"orientation": GONE}, "orientation: expected 3 x 3 numbers, but got None"),
+        (CAMERA, {"orientation.0": [2, 0, 0]}, "orientation: expected a rotation"),
+        (CAMERA, {"position": [1, 2]}, r"position: expected 3 numbers, but got \[1, 2\]"),
+        (CAMERA, {"focal_length": 0}, "focal_length: expected a number in"),
+        (CAMERA, {"tangential": [0.1]}, "tangential: expected 2 numbers"),
+        (CAMERA, {"radial_distortion": [-30, 0, 0]}, "radial_distortion: expected a lens that can be undone"),
+        (CAMERA, {"image_size": [12.5, 8]}, "image_size: expected whole numbers"),
+        (CAMERA, {"image_size": [24, 8]}, "png: expected 12 x 4 pixels, the camera's .* got 6 x 4"),
+        (WORLD, {"scale": GONE}, "scene.json: scale: expected a number .*got None"),
+        (WORLD, {"near": 9}, "scene.json: near, far: expected near < far, but got 9 and 1.4"),
+        (ITEMS, lambda c: c["ids"].append(ITEM), "ids: expected a list of different names"),
+        (ITEMS, {"train_ids": ["x"]}, "train_ids: expected items of ids, but got 'x'"),
+        (ITEMS, {"val_ids": ["left1_000000"]}, "val_ids: expected none of train_ids, but got 'left1"),
+        (ITEMS, {"train_ids": []}, "train_ids: expected at least one beside val_ids"),
+        (ITEMS, {"ids": [ITEM], "train_ids": [], "val_ids": []}, "ids: expected more than 4 items"),
+        (ITEMS, lambda c: c["ids"].append("a\nb"), r"'a\\nb': expected an object for this item"),
+        ("metadata.json", {f"{ITEM}.time_id": GONE}, rf"'{ITEM}'.time_id: expected a number"),
+        ("metadata.json", {f"{ITEM}.time_id": 0.5}, "time_id: expected a whole number, but got 0.5"),
+        (f"rgb/2x/{ITEM}.png", None, f"{ITEM}.png: expected an image, but got No such file"),
+        ("points.npy", TWO[:, :2], r"points.npy: expected points \(N, 3\), but got shape \(2, 2\)"),
     ],
-    ("dnerf", "transforms_test.json"): [(None, "but got neither")],
-    ("lego", TIME): [
-        ({"frames.0.ability": "all"}, "got test_time/r_0 without an ability; use data=dnerf"),
-        ({"frames.0.depth_file_path": "train/r_0.png"}, "r_0.png: expected depth_scale in the transf"),
-        ({"frames.0.depth_scale": 0}, r"frames\[0\].depth_scale: expected a number in \[1e-12, 1e\+06\]"),
+    "video": [
+        ("images/frame_1.png", np.zeros((20, 30, 4), np.uint8), "alpha: expected one in all frames or"),
+        (FRAMES, {"frames.1": "x"}, r"frames\[1\]: expected an object, but got 'x'"),
+        (FRAMES, lambda c: c.update(frames=c["frames"][:1]), "a frame to test on, but got none of 1"),
+        (FRAMES, {"frames.1.transform_matrix": GONE}, r"frames\[1\].transform_matrix: expected 4 x 4 .*None"),
+        (FRAMES, {"frames.1.file_path": "../x.png"}, f"file_path: {OUT}"),
+        (FRAMES, {"frames.1.file_path": "images/x.jpg"}, "x.jpg: expected an image, but got No such file"),
+        (FRAMES, {"frames.1.file_path": "x" * 999}, "file_path: expected an image, PNG or JPEG, but got no"),
+        (FRAMES, {"frames.1.file_path": "./images/frame_1.png"}, "expected each image once, but got imag"),
+        (FRAMES, {"frames.1.mask_path": "images/frame_1.png"}, "mask_path: expected one in all .*1 of"),
+        (FRAMES, lambda c: [e.update(mask_path="m.png") for e in c["frames"]], "m.png: expected 30 x 20 "),
+        (FRAMES, {"frames.1.time": 0.5}, "frames: time: expected one in all .*1 of 10"),
+        (FRAMES, {"frames.1.time": 3}, r"frames\[1\].time: expected a number in \[0, 1\], but got 3"),
+        (FRAMES, {"fl_x": GONE}, r"frames\[0\].fl_x: expected a number in .*got None"),
+        (FRAMES, {"frames.1.fl_x": -30}, r"frames\[1\].fl_x: expected a number in .*got -30"),
+        (FRAMES, {"w": 60}, "frame_1.png: expected 60 x 20 pixels as .*json: w and h say, but got 30 x 20"),
+        (FRAMES, {"camera_model": "OPENCV_FISHEYE"}, "json: camera_model: expected one of OPENCV, .*FISHEYE"),
+        (FRAMES, {"k4": 0.1}, "json: k4: expected 0, but got 0.1; undistort the images"),
+        (FRAMES, {"k1": -40}, "json: k1: expected a lens that can be undone all over the picture, but got"),
+        (FRAMES, {"near": -1}, r"json: near: expected a number in \[0, 1e\+09\], but got -1"),
+        (FRAMES, {"near": 7, "far": 6}, "json: expected near < far, but got 7 and 6"),
+        (FRAMES, {"aabb": [[0, 0, 1], [1, 1, 0]]}, "aabb: expected .* each low end below its high end"),
+        (FRAMES, {"test_filenames": "images/frame_1.png"}, "test_filenames: expected a list of paths"),
+        (FRAMES, {"test_filenames": ["images/x.png"]}, "test_filenames: expected paths of frames.*images/x"),
+        (FRAMES, {"test_filenames": []}, "expected a frame to test on, but got none of 10"),
+        (FRAMES, dict.fromkeys(["train_filenames", "test_filenames"], ["images/frame_1"]), "share none"),
     ],
-    ("lego", TRUTH): [
-        ({"points": TWO}, r"expected arrays points and times, but got \['points'\]"),
-        ({"points": TWO, "times": [0, 1]}, r"expected points \(N, T, 3\) and times \(T,\)"),
-        ({"points": np.full((2, 1, 3), np.inf), "times": [0]}, "points: expected finite numbers"),
-        ({"points": np.array([None]), "times": [0]}, "points: expected an array"),
-        ({"points": TWO[None], "times": [0, 2]}, "but got 0 to 2"),
-        (b"", "trajectories.npz: expected a NumPy file"),
-    ],
-    ("rig", TRUTH): [({"points": TWO[None], "times": [0.25, 1]}, "begin at the canonical time 0.5")],
-    ("rig", CAMERA): [
-        (None, "left1_000000.json: expected a readable file, but got No such file"),
-        ({"orientation": GONE}, "orientation: expected 3 x 3 numbers, but got None"),
-        ({"orientation.0": [2, 0, 0]}, "orientation: expected a rotation"),
-        ({"position": [1, 2]}, r"position: expected 3 numbers, but got \[1, 2\]"),
-        ({"focal_length": 0}, "focal_length: expected a number in"),
-        ({"tangential": [0.1]}, "tangential: expected 2 numbers"),
-        ({"radial_distortion": [-30, 0, 0]}, "radial_distortion: expected a lens that can be undone"),
-        ({"image_size": [12.5, 8]}, "image_size: expected whole numbers"),
-        ({"image_size": [24, 8]}, "png: expected 12 x 4 pixels, the camera's .* got 6 x 4"),
-    ],
-    ("rig", WORLD): [
-        ({"scale": GONE}, "scene.json: scale: expected a number .*got None"),
-        ({"near": 9}, "scene.json: near, far: expected near < far, but got 9 and 1.4"),
-    ],
-    ("rig", ITEMS): [
-        (lambda c: c["ids"].append(ITEM), "ids: expected a list of different names"),
-        ({"train_ids": ["x"]}, "train_ids: expected items of ids, but got 'x'"),
-        ({"val_ids": ["left1_000000"]}, "val_ids: expected none of train_ids, but got 'left1"),
-        ({"train_ids": []}, "train_ids: expected at least one beside val_ids"),
-        ({"ids": [ITEM], "train_ids": [], "val_ids": []}, "ids: expected more than 4 items"),
-        (lambda c: c["ids"].append("a\nb"), r"'a\\nb': expected an object for this item"),
-    ],
-    ("rig", "metadata.json"): [
-        ({f"{ITEM}.time_id": GONE}, rf"'{ITEM}'.time_id: expected a number"),
-        ({f"{ITEM}.time_id": 0.5}, "time_id: expected a whole number, but got 0.5"),
-    ],
-    ("rig", f"rgb/2x/{ITEM}.png"): [(None, f"{ITEM}.png: expected an image, but got No such file")],
-    ("rig", "points.npy"): [
-        (TWO[:, :2], r"points.npy: expected points \(N, 3\), but got shape \(2, 2\)"),
-    ],
-    ("video", "images/frame_1.png"): [
-        (np.zeros((20, 30, 4), np.uint8), "alpha: expected one in all frames or in none")
-    ],
-    ("dome", POSES): [
-        (b" \n", "expected at least one camera"),
-        (line(2, lambda w: w[:11]), "inf: line 2: expected 12 finite numbers, but got 11"),
-        (line(2, lambda w: [w[0] + "0", *w[1:3], *w[:3], *w[6:]]), "line 2: expected a rotation"),
-        (line(4, None), "Intrinsic.inf: expected as many cameras .*got 4 there and 3 in"),
-    ],
-    ("dome", "."): [
-        (lambda p: nhr_scene.write_dome(p, nhr_scene.dome(1), 1), "expected at least 2 cameras, one to")
-    ],
-    ("dome", LENSES): [
-        (None, "expected a readable file, but got No such file"),
-        (line(2, lambda w: w[:2]), "line 3: expected a row 0 fy cy, but got 71.5 23.2 0"),
-        (line(2, lambda w: ["0", *w[1:]]), "line 2: focal length: expected"),
-        (line(4, lambda w: "002"), "line 4: expected the row 0 0 1, but got 0 0 2"),
-        (line(6, lambda w: "2"), "line 6: expected the number 1 of a camera, but got '2'"),
-        (line(19, None), "line 18: expected nine numbers of camera 3, .* after 6"),
-    ],
-    ("dome", "img"): [(None, "img/0: expected a folder of images, but got none")],
-    ("dome", "img/1"): [(None, "img/1: expected a folder of images, but got none")],
-    ("dome", "img/1/mask/img_0002.jpg"): [
-        (None, "img_0002.jpg: expected an image of every camera .*, but got none")
-    ],
-    ("dome", "img/1/img_0004.jpg"): [
-        (PIXELS[..., 0], "expected images of the 4 cameras of CamPose.inf, but got anot")
-    ],
-    ("dome", "img/1/img_0002.jpg"): [(PIXELS[..., 0], "expected 60 x 48 pixels as in .*, but got 8 x 6")],
-    ("dome", "img/1/img_0001.jpg"): [(cut, f"img_0001.jpg: {WHOLE}")],
-    ("dome", CLOUD): [
-        (None, "frame2.npy: expected a NumPy file, but got No such file"),
-        (np.full((2, 6), np.nan), "frame2.npy: expected finite numbers, .*in row 0"),
-        (np.diag([0, 1e30, 0, 0, 0, 0]), r"expected points within 1e\+09 units, but got 1e\+30 in row 1"),
-    ],
-    ("dome", ALL_CLOUDS): [(flat, "pointclouds: expected points that span a box, .*; set data.box")],
-    ("video", FRAMES): [
-        ({"frames.1": "x"}, r"frames\[1\]: expected an object, but got 'x'"),
-        (lambda c: c.update(frames=c["frames"][:1]), "expected a frame to test on, but got none of 1"),
-        ({"frames.1.transform_matrix": GONE}, r"frames\[1\].transform_matrix: expected 4 x 4 .*None"),
-        ({"frames.1.file_path": "../x.png"}, f"file_path: {OUT}"),
-        ({"frames.1.file_path": "images/x.jpg"}, "x.jpg: expected an image, but got No such file"),
-        ({"frames.1.file_path": "x" * 999}, "file_path: expected an image, PNG or JPEG, but got no"),
-        ({"frames.1.file_path": "./images/frame_1.png"}, "expected each image once, but got images/fr"),
-        ({"frames.1.mask_path": "images/frame_1.png"}, "mask_path: expected one in all frames or.*1 of"),
-        (lambda c: [e.update(mask_path="m.png") for e in c["frames"]], "m.png: expected 30 x 20 pixels as"),
-        ({"frames.1.time": 0.5}, "frames: time: expected one in all frames or in none, but got 1 of 10"),
-        ({"frames.1.time": 3}, r"frames\[1\].time: expected a number in \[0, 1\], but got 3"),
-        ({"fl_x": GONE}, r"frames\[0\].fl_x: expected a number in .*got None"),
-        ({"frames.1.fl_x": -30}, r"frames\[1\].fl_x: expected a number in .*got -30"),
-        ({"w": 60}, "frame_1.png: expected 60 x 20 pixels as .*json: w and h say, but got 30 x 20"),
-        ({"camera_model": "OPENCV_FISHEYE"}, "json: camera_model: expected one of OPENCV, .*FISHEYE"),
-        ({"k4": 0.1}, "json: k4: expected 0, but got 0.1; undistort the images"),
-        ({"k1": -40}, "json: k1: expected a lens that can be undone all over the picture, but got"),
-        ({"near": -1}, r"json: near: expected a number in \[0, 1e\+09\], but got -1"),
-        ({"near": 7, "far": 6}, "json: expected near < far, but got 7 and 6"),
-        ({"aabb": [[0, 0, 1], [1, 1, 0]]}, "aabb: expected .* each low end below its high end"),
-        ({"test_filenames": "images/frame_1.png"}, "test_filenames: expected a list of paths"),
-        ({"test_filenames": ["images/x.png"]}, "test_filenames: expected paths of frames.*images/x"),
-        ({"test_filenames": []}, "expected a frame to test on, but got none of 10"),
-        (
-            dict.fromkeys(["train_filenames", "test_filenames"], ["images/frame_1"]),
-            "expected lists .* share none",
-        ),
+    "dome": [
+        (POSES, b" \n", "expected at least one camera"),
+        (POSES, line(2, lambda w: w[:11]), "inf: line 2: expected 12 finite numbers, but got 11"),
+        (POSES, line(2, lambda w: [w[0] + "0", *w[1:3], *w[:3], *w[6:]]), "line 2: expected a rotation"),
+        (POSES, line(4, None), "Intrinsic.inf: expected as many cameras .*got 4 there and 3 in"),
+        (".", lambda p: nhr_scene.write_dome(p, nhr_scene.dome(1), 1), "expected at least 2 cameras, one to"),
+        (LENSES, None, "expected a readable file, but got No such file"),
+        (LENSES, line(2, lambda w: w[:2]), "line 3: expected a row 0 fy cy, but got 71.5 23.2 0"),
+        (LENSES, line(2, lambda w: ["0", *w[1:]]), "line 2: focal length: expected"),
+        (LENSES, line(4, lambda w: "002"), "line 4: expected the row 0 0 1, but got 0 0 2"),
+        (LENSES, line(6, lambda w: "2"), "line 6: expected the number 1 of a camera, but got '2'"),
+        (LENSES, line(19, None), "line 18: expected nine numbers of camera 3, .* after 6"),
+        ("img", None, "img/0: expected a folder of images, but got none"),
+        ("img/1", None, "img/1: expected a folder of images, but got none"),
+        ("img/1/mask/img_0002.jpg", None, "img_0002.jpg: expected an image of every camera .*, but got none"),
+        ("img/1/img_0004.jpg", PIXELS[..., 0], "expected images of the 4 cameras of CamPose.inf, but got"),
+        ("img/1/img_0002.jpg", PIXELS[..., 0], "expected 60 x 48 pixels as in .*, but got 8 x 6"),
+        ("img/1/img_0001.jpg", cut, f"img_0001.jpg: {WHOLE}"),
+        (CLOUD, None, "frame2.npy: expected a NumPy file, but got No such file"),
+        (CLOUD, np.full((2, 6), np.nan), "frame2.npy: expected finite numbers, .*in row 0"),
+        (CLOUD, np.diag([0, 1e30, 0, 0, 0, 0]), r"within 1e\+09 units, but got 1e\+30 in row 1"),
+        (ALL_CLOUDS, flat, "pointclouds: expected points that span a box, .*; set data.box"),
     ],
 }
 
@@ -237,9 +208,8 @@ def rows(table):
     return [(key, *row) for key, group in table.items() for row in group]
 
 
-@pytest.mark.parametrize(("place", "how", "match"), rows(BAD))
-def test_a_harmed_scene_is_refused_when_it_is_read(scene, place, how, match):
-    name, file = place
+@pytest.mark.parametrize(("name", "file", "how", "match"), rows(BAD))
+def test_a_harmed_scene_is_refused_when_it_is_read(scene, name, file, how, match):
     folder = scene(name)
     harm(folder / file, how)
     with pytest.raises(SceneError, match=match) as caught:
@@ -249,30 +219,27 @@ def test_a_harmed_scene_is_refused_when_it_is_read(scene, place, how, match):
 
 
 LATER = {
-    ("dnerf", "train/r_2.png"): [
-        (flip, "harmed one; copy"),
-        (PIXELS[:4], "r_2.png: expected 8 x 6 pixels, but got 8 x 4"),
+    "dnerf": [
+        ("train/r_2.png", flip, "harmed one; copy"),
+        ("train/r_2.png", PIXELS[:4], "r_2.png: expected 8 x 6 pixels, but got 8 x 4"),
     ],
-    ("dome", "img/0/mask/img_0001.jpg"): [
-        (PIXELS[..., 0], "img_0001.jpg: expected 48 x 60 pixels, but got 8 x 6")
+    "dome": [
+        ("img/0/mask/img_0001.jpg", PIXELS[..., 0], "img_0001.jpg: expected 48 x 60 pixels, but got 8 x 6"),
     ],
-    ("lego", DEPTH): [
-        (b"", "r_0_depth.npy: expected a NumPy file"),
-        (np.ones((8, 6)), r"shape \(6, 8\), but got shape \(8, 6\)"),
-        (np.full((6, 8), np.nan), "expected finite depths >= 0"),
-        (np.full((6, 8), 1e300), "expected finite depths >= 0"),  # beyond single precision
-        (-np.ones((6, 8)), "but got values from -1.0 to -1.0"),
-    ],
-    ("lego", "d.png"): [
-        (PIXELS[..., 0], "d.png: expected a grey PNG of 16 bits a pixel, but got mode L"),
-        (np.zeros((6, 9), np.uint16), r"shape \(6, 8\), but got shape \(6, 9\)"),
+    "lego": [
+        (DEPTH, b"", "r_0_depth.npy: expected a NumPy file"),
+        (DEPTH, np.ones((8, 6)), r"shape \(6, 8\), but got shape \(8, 6\)"),
+        (DEPTH, np.full((6, 8), np.nan), "expected finite depths >= 0"),
+        (DEPTH, np.full((6, 8), 1e300), "expected finite depths >= 0"),  # beyond single precision
+        (DEPTH, -np.ones((6, 8)), "but got values from -1.0 to -1.0"),
+        ("d.png", PIXELS[..., 0], "d.png: expected a grey PNG of 16 bits a pixel, but got mode L"),
+        ("d.png", np.zeros((6, 9), np.uint16), r"shape \(6, 8\), but got shape \(6, 9\)"),
     ],
 }
 
 
-@pytest.mark.parametrize(("place", "how", "match"), rows(LATER))
-def test_what_goes_bad_later_is_refused_when_it_is_loaded(scene, place, how, match):
-    name, file = place
+@pytest.mark.parametrize(("name", "file", "how", "match"), rows(LATER))
+def test_what_goes_bad_later_is_refused_when_it_is_loaded(scene, name, file, how, match):
     folder = scene(name)
     if file == "d.png":
         iio.imwrite(folder / file, np.zeros((6, 8), np.uint16))
