@@ -73,20 +73,14 @@ def test_without_val_ids_every_fourth_is_trained_on(tmp_path):
     assert scene.protocol["split"] == "interpolation"
 
 
-@pytest.mark.parametrize("write_time_id", [True, False])
-def test_time_id_counts_before_warp_id(tmp_path, write_time_id):
-    folder = write_rig(tmp_path / "toy", hand(5), write_time_id=write_time_id)
-    edit(folder / "metadata.json", lambda c: [e.update(warp_id=e["warp_id"] ** 2) for e in c.values()])
-    scene = read_scene(tmp_path, "toy")
-    assert scene.test[0].time == (0.5 if write_time_id else 0.25)
-
-
-def test_entries_that_no_item_has_decide_nothing(tmp_path):
-    folder = write_rig(tmp_path / "toy", hand(5), write_time_id=False)
-    expected = read_scene(tmp_path, "toy").test[0].time
-    edit(folder / "metadata.json", lambda c: c.update(ghost={"time_id": 90, "warp_id": 90}, other=3))
-    (folder / "camera" / "ghost.json").write_text("none")
-    assert read_scene(tmp_path, "toy").test[0].time == expected
+def test_time_id_counts_before_warp_id_and_entries_of_no_item_not_at_all(tmp_path):
+    file = write_rig(tmp_path / "toy", hand(5)) / "metadata.json"
+    edit(file, lambda c: [e.update(warp_id=e["warp_id"] ** 2) for e in c.values()])
+    assert read_scene(tmp_path, "toy").test[0].time == 0.5
+    edit(file, lambda c: [e.pop("time_id") for e in c.values()])
+    edit(file, {"ghost": {"time_id": 90, "warp_id": 90}, "other": 3})
+    (tmp_path / "toy" / "camera" / "ghost.json").write_text("none")
+    assert read_scene(tmp_path, "toy").test[0].time == 0.25
 
 
 def test_no_item_leaves_the_scene(tmp_path):

@@ -1,6 +1,14 @@
 import torch
 
-from forewarp.drawing.colors import depth_colors, error_colors, flow_colors, hues, in_a_row, with_wheel
+from forewarp.drawing.colors import (
+    at_least,
+    depth_colors,
+    error_colors,
+    flow_colors,
+    hues,
+    in_a_row,
+    with_wheel,
+)
 
 
 def test_depth_is_bright_near_and_white_where_nothing_is():
@@ -42,3 +50,10 @@ def test_a_row_keeps_the_pictures_and_parts_them():
     torch.testing.assert_close(row[:, :3], a)
     torch.testing.assert_close(row[:, 3:7], torch.ones(2, 4, 3))
     torch.testing.assert_close(row[:, 7:], b)
+
+
+def test_pixels_are_repeated_whole():
+    picture = torch.rand(2, 3, 3)
+    large = at_least(picture, 5)
+    assert large.shape == (6, 9, 3)
+    assert bool((large[3:6, 6:9] == picture[1, 2]).all())

@@ -4,9 +4,6 @@ import filecmp
 
 import pytest
 
-pytest.importorskip("trimesh")
-pytest.importorskip("embreex")
-
 from forewarp.scene.errors import SceneError
 from forewarp.synth import dome, lego_complete, rig, scenes
 

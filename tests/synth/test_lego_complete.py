@@ -2,9 +2,6 @@ import numpy as np
 import pytest
 import torch
 
-pytest.importorskip("trimesh")
-pytest.importorskip("embreex")
-
 from forewarp.data.lego_complete import read_scene
 from forewarp.synth.lego_complete import _views, synthesize
 

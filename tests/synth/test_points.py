@@ -1,9 +1,6 @@
 import numpy as np
 import pytest
 
-pytest.importorskip("trimesh")
-pytest.importorskip("embreex")
-
 from forewarp.synth.cameras import centers_of, random_cameras
 from forewarp.synth.motions import MOTIONS
 from forewarp.synth.points import surface_points, trajectories

@@ -3,9 +3,6 @@ import builtins
 import numpy as np
 import pytest
 
-pytest.importorskip("trimesh")
-pytest.importorskip("embreex")
-
 from forewarp.synth.cameras import orbit_camera
 from forewarp.synth.motions import GROUND, joints
 from forewarp.synth.raycast import LIGHT_AT, Posed, camera_rays, render

@@ -2,9 +2,6 @@ import numpy as np
 import pytest
 import torch
 
-pytest.importorskip("trimesh")
-pytest.importorskip("embreex")
-
 from forewarp.data.hypernerf import read_scene
 from forewarp.synth import rig
 from forewarp.synth.cameras import centers_of, stream

@@ -1,9 +1,6 @@
 import numpy as np
 import pytest
 
-pytest.importorskip("trimesh")
-pytest.importorskip("embreex")
-
 from forewarp.synth.raycast import LIGHT_AT, Posed
 from forewarp.synth.room import HIGH, LOW
 from forewarp.synth.world import World

@@ -1,9 +1,6 @@
 import numpy as np
 import pytest
 
-pytest.importorskip("trimesh")
-pytest.importorskip("embreex")
-
 from forewarp.data.dnerf import read_scene
 from forewarp.synth.scenes import synthesize
 

@@ -3,9 +3,6 @@
 import numpy as np
 import pytest
 
-pytest.importorskip("trimesh")
-pytest.importorskip("embreex")
-
 from forewarp.synth.cameras import random_cameras, stream
 from forewarp.synth.raycast import Posed, camera_rays, light_points, render
 from forewarp.synth.specimens import SPECIMENS
