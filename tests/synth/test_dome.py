@@ -11,7 +11,7 @@ from forewarp.synth.points import surface_points
 from forewarp.synth.world import World
 from tests.support.lit_points import color_errors, lit_points
 
-SMALL = {"size": 120, "frames": 2, "points": 300, "samples_per_pixel": 2}
+SMALL = {"size": 120, "frames": 2, "points": 300, "samples_per_pixel": 1}
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ from forewarp.synth.rig import rig_cameras, synthesize
 from forewarp.synth.world import World
 from tests.support.lit_points import color_errors, lit_points
 
-SMALL = {"size": 192, "frames": 5, "samples_per_pixel": 2}
+SMALL = {"size": 192, "frames": 5, "samples_per_pixel": 1}
 
 
 @pytest.fixture(scope="module")
