@@ -25,18 +25,8 @@ def test_changes_are_against_the_same_seed(tmp_path):
     text = page.read_text()
     own, change = rows(text, "grid_64")
     assert own[1:3] == ["2", "28.25 ± 1.06"]
-    assert change[1:] == [
-        "base",
-        "2",
-        "-0.75 ± 0.35",
-        "+0.0000 ± 0.0000",
-        "-0.1000 ± 0.0000",
-        "×0.50 ± 0.00",
-        "×1.00 ± 0.00",
-        "×1.00 ± 0.00",
-        "×1.00 ± 0.00",
-        "×2.00 ± 0.00",
-    ]
+    assert change[1:5] == ["base", "2", "-0.75 ± 0.35", "+0.0000 ± 0.0000"]
+    assert change[5:] == ["-0.1000 ± 0.0000", "×0.50 ± 0.00", *["×1.00 ± 0.00"] * 3, "×2.00 ± 0.00"]
     assert rows(text, "unet_16")[0][1:6] == ["grid_64", "1", "+1.50", "+0.0000", ""]
     assert rows(text, "preset.rays=64")[1][1:4] == ["base", "1", "+1.00"]
     assert rows(text, "model=backward preset.rays=64")[0][1:4] == ["preset.rays=64", "1", "+0.50"]
