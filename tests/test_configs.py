@@ -176,6 +176,8 @@ def test_each_number_of_a_method_is_taken_where_it_is_keyed(model):
     assert [c.preset.bases for c in (fast, faithful)] == [8, 25]  # model x preset x experiment
     assert fast.objective.fine.weights.static_points == 1e-2  # model x experiment
     assert (fast.preset.rays, faithful.budget.iterations) == (4096, 120000)  # model x preset
+    broom = composed("scene=hypernerf_broom", f"model={model}")  # scene
+    assert (broom.data.scene, broom.stage.fine.num_voxels[-1][1]) == ("broom2", 343000)
     band, still = (composed(f"scene=specimen_{name}", f"model={model}") for name in ("band", "still"))
     assert (band.stage.fine.num_voxels, still.stage.coarse.num_voxels) == ([[0, 15625]], [[0, 46656]])
 

@@ -181,15 +181,3 @@ def test_the_voxel_networks_come_with_the_fine_stage(preset):
     networks = {"upsampler", "inpainter"}
     assert networks.isdisjoint(stage.coarse.effects)
     assert networks <= set(stage.fine.effects)
-
-
-def test_captures_have_numbers_of_their_own_in_every_preset():
-    quick, faithful = composed("scene=hypernerf_broom"), composed("scene=hypernerf_broom", "preset=faithful")
-    assert (quick.preset.bases, faithful.preset.bases) == (8, 25)
-    assert quick.model.view_dependence is None
-    assert faithful.model.view_dependence is not None
-    for config in (quick, faithful):
-        assert config.data.scene == "broom2"
-        assert config.model.background is not None
-        assert config.stage.fine.num_voxels[-1][1] == 343000
-        assert config.objective.fine.weights.static_points == 1e-2

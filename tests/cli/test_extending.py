@@ -59,20 +59,8 @@ def work(in_tmp, monkeypatch):
         del sys.modules[name]
 
 
-def test_the_page_is_short_and_its_layout_is_what_it_gives():
-    page = PAGE.read_text()
-    assert len(page.splitlines()) <= 400
-    layout = page.split("```text\n")[1].split("```")[0]
-    for name, text in files_of(page).items():
-        assert re.search(rf"\b{Path(name).name}\b", layout), name
-        assert len([line for line in text.splitlines() if line.strip()]) <= 65
-        assert max(map(len, text.splitlines())) <= 110
-    assert len(files_of(page)) == 11
-
-
-@pytest.mark.parametrize("way", [["--config-dir", "mine/conf"], ["hydra.searchpath=[pkg://mine.conf]"]])
-def test_the_method_trains_on_the_data_of_the_page(forewarp, ok, refused, work, way):
-    words = [*way, "experiment=mine", "model=balls", *SMALL]
+def test_the_method_trains_on_the_data_of_the_page(forewarp, ok, refused, work):
+    words = ["--config-dir", "mine/conf", "experiment=mine", "model=balls", *SMALL]
     shown = forewarp("train", *words, "--cfg", "job", "--resolve")
     assert (shown.status, yaml.safe_load(shown.out)["model"]["count"]) == (0, 64)
     ok("train", *words)

@@ -134,12 +134,19 @@ ODD = {
 }
 
 
+def refused_replay(bundle, capsys):
+    with pytest.raises(SystemExit) as leaving:
+        replay([str(bundle)])
+    assert leaving.value.code == 2
+    return capsys.readouterr().err
+
+
 def test_a_broken_step_ends_in_one_line_and_is_seen_again(forewarp, refused, begun, in_tmp, capsys):
     shutil.rmtree(in_tmp / "run")
     broken = [*SMALL, "data.root=.", "run=run", "stage.coarse.lr.color=1e39"]
     line = refused("train", *broken)
     assert line.startswith(
-        "stage.coarse: expected finite numbers, but got parameter: radiance.color at step 0, "
+        "stage.coarse: expected finite numbers, but got parameter: radiance.color at step 0,"
     )
     bundle = in_tmp / "run" / "coarse" / "broken" / "step_0.pt"
     assert f"python -m forewarp.replay {bundle.relative_to(in_tmp)} shows it again" in line
@@ -152,19 +159,12 @@ def test_a_broken_step_ends_in_one_line_and_is_seen_again(forewarp, refused, beg
         changed = copy.deepcopy(content)
         told[0](changed)
         torch.save(changed, in_tmp / "odd.pt")
-        with pytest.raises(SystemExit) as leaving:
-            replay([str(in_tmp / "odd.pt")])
-        assert leaving.value.code == 2
-        line = capsys.readouterr().err
+        line = refused_replay(in_tmp / "odd.pt", capsys)
         assert line.startswith(f"forewarp.replay: error: {in_tmp}/odd.pt: "), spoil
         assert f"expected {told[1]}" in line, spoil
         assert len(line.splitlines()) == 1
     bundle.write_bytes(b"x")
-    with pytest.raises(SystemExit) as leaving:
-        replay([str(bundle)])
-    assert leaving.value.code == 2
-    said = capsys.readouterr().err
-    assert said.startswith(f"forewarp.replay: error: {bundle}: expected a step that a run left in broken/")
+    assert f"{bundle}: expected a step that a run left in broken/" in refused_replay(bundle, capsys)
 
 
 def test_skipped_steps_are_told(ok, begun, monkeypatch):

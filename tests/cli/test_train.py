@@ -109,8 +109,7 @@ def test_what_was_not_measured_since_is_measured_and_where_stages_stand_is_told(
     lines = done.out.splitlines()
     assert lines[2] == "coarse: finished before"
     assert lines[3].startswith("fine: goes on at 100%, step ")
-    found, expected = numbers(copied), numbers(fitted)
-    assert found["test"] == expected["test"]
+    assert numbers(copied)["test"] == numbers(fitted)["test"]
 
 
 def test_a_run_with_views_set_aside_leaves_its_curve(ok, scenes, tmp_path):
@@ -132,10 +131,9 @@ def test_what_does_not_matter_may_change(forewarp, copied, scenes):
 
 def test_another_configuration_is_refused(refused, fitted, scenes):
     line = refused(*arguments(scenes, fitted, "seed=1"))
-    assert line.endswith(
-        "config.yaml: seed: expected 0, as the run that this folder holds, but got 1 (and 1 more keys); "
-        "use run=<another folder>, or delete this one"
-    )
+    line, _, advice = line.partition("; ")
+    assert line.endswith("seed: expected 0, as the run that this folder holds, but got 1 (and 1 more keys)")
+    assert advice == "use run=<another folder>, or delete this one"
     assert "budget.minutes: expected 0.9, as" in refused(*arguments(scenes, fitted, "budget.minutes=9"))
 
 
@@ -173,9 +171,7 @@ def test_a_full_disk_names_the_file_and_leaves_no_half(refused, scenes, in_tmp, 
 
     monkeypatch.setattr(lightning.Trainer, "save_checkpoint", full)
     line = refused(*arguments(scenes, "run", "budget.iterations=2"))
-    assert line.startswith(
-        "run/coarse/last.ckpt: expected room to write, but got No space left on device; free some"
-    )
+    assert line.startswith("run/coarse/last.ckpt: expected room to write, but got No space left on device;")
     assert [path.name for path in Path("run/coarse").iterdir() if "ckpt" in path.name] == []
 
 

@@ -52,7 +52,7 @@ class Conformance:
             [
                 HEAD,
                 "## Methods\n",
-                *table(["method", *KINDS, "GPU"], [self._kinds(m) for m in methods]),
+                *table(["method", *KINDS], [self._kinds(m) for m in methods]),
                 "\n## Promises\n",
                 *table(["case", *methods], self._promises(methods)),
                 "",
@@ -60,11 +60,7 @@ class Conformance:
         )
 
     def _kinds(self, method):
-        return [
-            method,
-            *(self.said.get((method, kind), "**not run**") for kind in KINDS),
-            METHODS[method].gpu,
-        ]
+        return [method, *(self.said.get((method, kind), "**not run**") for kind in KINDS)]
 
     def _promises(self, methods):
         cases = list(dict.fromkeys(case for case, _ in self.found))

@@ -36,7 +36,7 @@ class Entry:
 
     ``model`` makes it; ``lr`` and ``numbers`` are of its stage, ``weights`` of its objective. After ``steps``
     its loss must be below ``falls`` times the first. ``effects`` are its optional parts by name, with which
-    the names of their parameters begin. ``gpu``: where it was run on a GPU.
+    the names of their parameters begin.
     """
 
     model: Callable[[Start], Method]
@@ -46,7 +46,6 @@ class Entry:
     falls: float = 0.5
     steps: int = 60
     effects: Mapping[str, Effect] = field(default_factory=dict)
-    gpu: str = "never"
 
 
 GRID = partial(DirectRadiance, alpha_init=1e-2, alpha_threshold=1e-4)

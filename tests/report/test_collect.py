@@ -1,5 +1,4 @@
 import pytest
-import yaml
 
 from forewarp.report.collect import Point, by_scene, collect, grouped, machine, read_run
 from tests.support.runs_on_disk import write_run
@@ -30,10 +29,8 @@ def test_names_do_not_depend_on_spaces_within_an_override(tmp_path):
 
 
 def test_a_run_without_a_variant_is_named_after_its_choices(tmp_path):
-    folder = write_run(tmp_path, ability="time", curve=None)
-    config = yaml.safe_load((folder / "config.yaml").read_text())
-    del config["variant"], config["command"]
-    (folder / "config.yaml").write_text(yaml.safe_dump(config))
+    config = {"variant": None, "command": None}
+    folder = write_run(tmp_path, ability="time", curve=None, config=config)
     result = read_run(folder)
     assert (result.variant, result.about, result.against([])) == ("forward-fast", "", "base")
     assert result.command.startswith("forewarp-train # as ")

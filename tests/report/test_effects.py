@@ -13,9 +13,8 @@ SLOW, QUICK = ((10, 20.0), (20, 24.0), (40, 25.0)), ((5, 24.0), (10, 24.9), (20,
 
 def write_choice(root, choice, *, scene="ball", seed=0, calls_for=None, on=(), psnr=30.0, curve=SLOW):
     """A run of a choice; of ``auto`` with its plan."""
-    folder = write_run(root, choice, seed, scene=scene, psnr=psnr, curve=curve, against="all_effects")
-    config = yaml.safe_load((folder / "config.yaml").read_text()) | {"calls_for": calls_for}
-    (folder / "config.yaml").write_text(yaml.safe_dump(config))
+    more = {"scene": scene, "psnr": psnr, "curve": curve, "against": "all_effects"}
+    folder = write_run(root, choice, seed, **more, config={"calls_for": calls_for})
     if choice == "auto":
         effects = {
             name: {"choice": "x" if name in on else "none", "on": name in on, "because": f"{name}, 3 %"}

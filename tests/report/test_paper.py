@@ -8,7 +8,6 @@ import re
 import imageio.v3 as iio
 import numpy as np
 import pytest
-import yaml
 
 from forewarp.report.collect import collect
 from forewarp.report.page import latex_text
@@ -21,31 +20,20 @@ from tests.support.runs_on_disk import write_run
 ALL = ["hellwarrior", "mutant", "hook", "bouncingballs", "lego", "trex", "standup", "jumpingjacks"]
 
 
-def paper_run(root, scene, variant=None, seed=0, *, dataset="dnerf", made=False, warp="forward", **scores):
+def paper_run(
+    root, scene, variant=None, seed=0, *, dataset="dnerf", made=False, warp="forward", protocol=None, **scores
+):
     """A run as a sweep of the paper leaves it; ``variant`` None is the plain method."""
     name = f"{variant or 'plain'}-{warp}"
-    folder = write_run(root, name, seed, scene=scene, curve=None)
-    config = yaml.safe_load((folder / "config.yaml").read_text())
+    module = f"forewarp.{'cli.synthetic.Synthetic' if made else 'data.module.'}DataModule"
+    config = {"model": {"name": warp}, "data": {"scene": scene, "_target_": module}}
     config["variant"] = {"name": variant, "about": f"the {variant}", "against": "full"} if variant else None
-    config["model"]["name"] = warp
     if sizes := re.search(r"resolution (.*)", variant or ""):
         config["stage"] = {"fine": {"num_voxels": json.loads(sizes[1])}}
-    config["data"]["_target_"] = f"forewarp.{'cli.synthetic.Synthetic' if made else 'data.module.'}DataModule"
-    (folder / "config.yaml").write_text(yaml.safe_dump(config))
-    metrics = json.loads((folder / "metrics.json").read_text())
-    metrics["protocol"] |= {"dataset": dataset, "resolution": [4, 3], "background": "white"}
     abilities = {k: v for k, v in scores.items() if isinstance(v, dict)}
-    metrics["test"] = abilities or {"all": {"psnr": 30.0, "ssim": 0.9, **scores}}
-    (folder / "metrics.json").write_text(json.dumps(metrics))
-    return folder
-
-
-def altered(folder, **protocol):
-    """The run, measured otherwise."""
-    metrics = json.loads((folder / "metrics.json").read_text())
-    metrics["protocol"] |= protocol
-    (folder / "metrics.json").write_text(json.dumps(metrics))
-    return folder
+    metrics = {"test": abilities or {"all": {"psnr": 30.0, "ssim": 0.9, **scores}}}
+    metrics["protocol"] = {"dataset": dataset, "resolution": [4, 3], "background": "white"} | (protocol or {})
+    return write_run(root, name, seed, scene=scene, curve=None, config=config, metrics=metrics)
 
 
 def table_of(root, key="dnerf", **options):
@@ -163,10 +151,11 @@ def test_pages_tell_how_numbers_came_about(whole):
 
 def test_a_scene_with_one_kind_of_view_is_measured_by_it(tmp_path):
     for number, scene in enumerate(("sport_1", "sport_2", "sport_3", "basketball")):
-        folder = paper_run(tmp_path, scene, dataset="nhr", space={"psnr": 20.0 + number})
+        sizes = [[512, 384], [1024, 768]] if number == 3 else [4, 3]
+        space = {"psnr": 20.0 + number}
+        paper_run(tmp_path, scene, dataset="nhr", protocol={"resolution": sizes}, space=space)
     row = cells(table_of(tmp_path, "nhr"), "forewarp: forward, fast, 1 min")
     assert row == ["20.00", "", "", "21.00", "", "", "22.00", "", "", "23.00", "", "", "21.50", "", ""]
-    altered(folder, resolution=[[512, 384], [1024, 768]])
     write_paper(tmp_path, tmp_path / "out")
     text = (tmp_path / "out" / "paper.md").read_text()
     assert "* protocol: nhr, 512x384 and 1024x768, background white" in text
@@ -174,7 +163,7 @@ def test_a_scene_with_one_kind_of_view_is_measured_by_it(tmp_path):
 
 def test_counterparts_never_meet_printed_numbers(tmp_path):
     paper_run(tmp_path, "vehicle", made=True, psnr=28.0)
-    altered(paper_run(tmp_path, "lift", dataset="lego_complete"), synthetic=True)  # however it is read
+    paper_run(tmp_path, "lift", dataset="lego_complete", protocol={"synthetic": True})  # however it is read
     results, _ = collect(tmp_path, ["metrics.json"])
     made = comparison(counterpart(read_paper(PAPER)["dnerf"], results), results)
     assert [column.name for column in made.columns[2:-1]] == [
@@ -202,7 +191,7 @@ def test_of_runs_alike_the_newest_counts(tmp_path):
 
 def test_no_mean_is_taken_over_unlike_images(tmp_path):
     for scene in ALL:
-        altered(paper_run(tmp_path, scene), half_resolution=scene == "hook")
+        paper_run(tmp_path, scene, protocol={"half_resolution": scene == "hook"})
     assert cells(table_of(tmp_path), "forewarp: forward, fast, 1 min") == ["", "", ""]
     names = [column.name for column in table_of(tmp_path, "dnerf_scenes").columns]
     row = dict(zip(names[2:], cells(table_of(tmp_path, "dnerf_scenes"), "forewarp: forward, fast, 1 min")))
@@ -211,7 +200,7 @@ def test_no_mean_is_taken_over_unlike_images(tmp_path):
 
 def test_machines_have_rows_of_their_own(tmp_path):
     for number, scene in enumerate(ALL):
-        altered(paper_run(tmp_path, scene), device="a gpu" if number < 4 else "a cpu")
+        paper_run(tmp_path, scene, protocol={"device": "a gpu" if number < 4 else "a cpu"})
     rows = [row for row in table_of(tmp_path).rows if row[1] == "measured"]
     assert [row[0][-5:] for row in rows] == ["a cpu", "a gpu"]
     assert all(row[2] is None for row in rows)
