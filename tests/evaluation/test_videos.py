@@ -31,6 +31,19 @@ def test_a_turn_starts_at_the_view_and_stops_before_it_comes_again(cameras, path
     assert float((centers - middle).norm(dim=-1).min()) > 1
 
 
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (("spiral", 4, 0.5), "path: expected one of fixed, orbit, both, trajectories, but got 'spiral'"),
+        (("fixed", 1, 0.5), "frames: expected at least 2, but got 1"),
+        (("orbit", 4, 1.5), r"time: expected a number in \[0, 1\], but got 1.5"),
+    ],
+)
+def test_bad_arguments_are_named(cameras, arguments, text):
+    with pytest.raises(ValueError, match=text):
+        make_shots(*arguments, cameras[0], cameras)
+
+
 def test_the_warp_is_made_once_a_time(cameras):
     module = known_ball()
     pictures = list(video(module, make_shots("orbit", 3, 0.5, cameras[0], cameras), WHITE))

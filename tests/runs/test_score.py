@@ -5,6 +5,7 @@ import os
 
 import pytest
 
+from forewarp.runs.score import named
 from forewarp.synth.scenes import synthesize
 
 SMALL = [
@@ -93,3 +94,7 @@ def test_another_metric_is_refused_with_a_list(refused, in_tmp, word):
     assert line.startswith("score: expected a metric of validation views (psnr, psnr_box, ssim, ms_ssim, ")
     assert "lpips_squeeze" in line
     assert not list(in_tmp.iterdir())
+
+
+def test_null_is_no_metric():
+    assert named(None) is None
