@@ -21,20 +21,17 @@ from forewarp.training.clock import now
 from forewarp.training.device import device_name, device_of, peak_memory_bytes, versions
 from forewarp.training.module import DynamicSceneModule
 from forewarp.training.stages import Run
-from tests.stability.endurance import SMALL
 
 GOALS = (
     "goals on an H200: faithful step 30 ms, fast step 8 ms, kept frame 15 ms, the paper's PSNR in 10 minutes"
 )
 TINY = (
-    *SMALL,
-    "data.scene=tiny",
-    "data.synthesis.frames=8",
-    "data.synthesis.test_views=[1,1,1]",
-    "preset.rays=64",
-    "preset.inpainter_width=16",
-    "stage.coarse.num_voxels=[[0,1000]]",
-    "stage.fine.num_voxels=[[0,1500]]",
+    *("experiment=demo", "data.scene=tiny", "data.synthesis.size=32", "data.synthesis.frames=8"),
+    *("data.synthesis.val_views=1", "data.synthesis.samples_per_pixel=2", "budget.minutes=null"),
+    *("preset.nodes=10", "logger=none", "trainer=cpu", "threads=1"),
+    *("callbacks.pictures=null", "callbacks.scalars=null", "callbacks.progress=null", "evaluate=false"),
+    *("data.synthesis.test_views=[1,1,1]", "preset.rays=64", "preset.inpainter_width=16"),
+    *("stage.coarse.num_voxels=[[0,1000]]", "stage.fine.num_voxels=[[0,1500]]"),
     "callbacks.accuracy.first=0.05",
 )
 
