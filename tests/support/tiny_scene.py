@@ -105,6 +105,19 @@ def built(
     return model.build(ground, VoxelStage(**({"num_voxels": [[0, 500]]} | numbers)))
 
 
+def ball_method(scene, raw=8.0, **numbers):
+    """Make a first stage's method whose canonical grid is the ball, with some motion."""
+    torch.manual_seed(0)
+    numbers = {"num_voxels": [[0, 1500]]} | numbers
+    method = forward_model()(Start(scene, "coarse", numbers, range(len(scene.train))))
+    points = method.radiance.lattice.to_world(method.radiance.voxels)
+    inside = (points - ball_center(0.0)).norm(dim=-1) < RADIUS
+    method.radiance.density.data = torch.where(inside, raw, -9.0)[:, None]
+    torch.nn.init.normal_(method.radiance.color)
+    torch.nn.init.normal_(method.motion.trajectory.network[-1].weight, std=1e-3)
+    return method
+
+
 def begun(method, scene, made):
     """Prepare a method for the stage ``made`` of a scene."""
     settings, objective = made.settings, made.objective
@@ -154,6 +167,12 @@ def make_run(folder, stages, *, data=None, model=None, callbacks=(), **changes):
         callbacks=lambda name, where: list(callbacks),
         **changes,
     )
+
+
+def same(one, other):
+    """Return whether two modules hold the same tensors, bit for bit."""
+    one, other = ({k: v for k, v in m.state_dict().items() if torch.is_tensor(v)} for m in (one, other))
+    return one.keys() == other.keys() and all(torch.equal(one[k], other[k]) for k in one)
 
 
 class Interrupt(lightning.Callback):

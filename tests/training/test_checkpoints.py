@@ -43,11 +43,6 @@ def interrupted(tmp_path_factory):
     return folder / "coarse" / "last.ckpt"
 
 
-def test_what_fits_is_taken(tmp_path, interrupted):
-    check_state(interrupted, module(tmp_path))
-    assert set(check_checkpoint(interrupted, module(tmp_path))) >= {"state_dict", "forewarp"}
-
-
 @pytest.mark.parametrize(
     ("changes", "name"),
     [({"width": 16}, "method.motion.trajectory.network.0.bias"), ({"times": [0.0] * 3}, "method.motion")],
@@ -57,13 +52,6 @@ def test_another_configuration_is_refused_by_what_differs(tmp_path, interrupted,
     text = f"expected a checkpoint of this configuration, but got one that differs in {name}"
     with pytest.raises(ValueError, match=text):
         load_weights(module(tmp_path, **changes), interrupted)
-
-
-def test_half_a_file_is_refused(tmp_path, interrupted):
-    broken = tmp_path / "last.ckpt"
-    broken.write_bytes(interrupted.read_bytes()[:500])
-    with pytest.raises(ValueError, match="last.ckpt: expected a checkpoint, but it cannot be read"):
-        check_checkpoint(broken, module(tmp_path))
 
 
 def test_one_flipped_bit_is_refused(tmp_path, interrupted):
@@ -168,14 +156,6 @@ def test_odd_parts_are_refused_in_one_line(tmp_path, interrupted, change, said):
 
 
 CONTENT = {"a": torch.arange(1000.0), "b": {"c": [1, "x", None]}}
-
-
-def test_what_is_written_is_read(tmp_path):
-    write_archive(tmp_path / "deep" / "a.pt", CONTENT)
-    found = read_archive(tmp_path / "deep" / "a.pt")
-    assert torch.equal(found["a"], CONTENT["a"])
-    assert found["b"] == CONTENT["b"]
-    assert [path.name for path in (tmp_path / "deep").iterdir()] == ["a.pt"]
 
 
 def test_a_full_disk_is_told_and_leaves_what_was_there(tmp_path):

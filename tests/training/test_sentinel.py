@@ -9,7 +9,7 @@ import torch
 from forewarp.methods.voxel.effects.inpaint import UNet3d
 from forewarp.scene.lens import Lens
 from forewarp.training.bundle import read_bundle
-from forewarp.training.sentinel import BrokenStep, Sentinel, all_finite, diagnose, first_bad
+from forewarp.training.sentinel import BrokenStep, diagnose
 from tests.support.tiny_scene import ball_data, forward_model, make_run, stage
 
 NAN = float("nan")
@@ -184,19 +184,6 @@ def test_an_inpainters_step_is_taken_again(tmp_path):
     module = make_run(tmp_path / "e", [stage()], model=model).rebuilt("coarse", bundle.scene)
     module.load_state_dict(bundle.state_dict)
     assert str(diagnose(module, bundle.batch, 5)) == bundle.noted["found"]
-
-
-def test_the_checks_by_hand():
-    good, bad = torch.ones(3), torch.tensor([1.0, NAN])
-    assert all_finite([])
-    assert all_finite([good, torch.zeros(0)])
-    assert not all_finite([good, bad])
-    assert first_bad([("a", None), ("b", torch.arange(3)), ("c", good)]) is None
-    assert first_bad([("c", good), ("d", bad)]) == "d"
-    assert first_bad([("e", torch.tensor([1e20]))]) is None
-    assert first_bad([("e", torch.tensor([1e20]))], squared=True) == "e"
-    with pytest.raises(ValueError, match="sentinel.skip: expected a whole number of steps >= 0, but got -1"):
-        Sentinel(".", skip=-1)
 
 
 @pytest.mark.parametrize("skip", [0, 2])
