@@ -1,31 +1,12 @@
-import pytest
 import torch
 from torch.autograd import gradcheck
 
 from forewarp.fields.template import Template, Trunk
 
 
-def count(module):
-    return sum(p.numel() for p in module.parameters())
-
-
 def small(**changes):
     torch.manual_seed(0)
     return Template(5, 4, **({"width": 6, "layers": 4, "skip": 3} | changes)).double()
-
-
-@pytest.mark.parametrize(
-    ("inputs", "condition", "skip", "expected"),
-    [
-        (63, 27, 6, 595_844),  # NeRF
-        (72, 27, 6, 600_452),  # T-NeRF
-        (84, 27, 6, 606_596),  # T-NeRF, ten frequencies of time
-        (51, 27 + 2, 5, 589_956),  # Nerfies
-        (55, 27, 5, 591_748),  # HyperNeRF
-    ],
-)
-def test_published_counts(inputs, condition, skip, expected):
-    assert count(Template(inputs, condition, skip=skip)) == expected
 
 
 def test_the_skip_enters_the_layer_that_is_named():

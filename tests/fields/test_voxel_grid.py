@@ -56,6 +56,14 @@ def test_a_new_voxel_gets_the_mean_colour_of_its_active_neighbours():
     assert grid.color[grid.index[2, 3, 0]].tolist() == [0, 0]
 
 
+def test_an_empty_grid_can_be_filled():
+    grid = VoxelGrid(LATTICE, torch.zeros(SHAPE, dtype=torch.bool), {"density": 1, "color": 2})
+    rows = grid.activate(third(), {"density": 1.0})
+    assert (rows == -1).all()
+    assert (grid.density == 1).all()
+    assert (grid.color == 0).all()
+
+
 def test_resampling_a_linear_field_is_exact_and_absent_voxels_read_empty():
     grid = VoxelGrid(LATTICE, torch.ones(SHAPE, dtype=torch.bool), {"density": 1})
     slope = torch.tensor([1.0, -2.0, 0.5])

@@ -118,20 +118,6 @@ def test_its_protocol_names_departures():
     assert "softplus density; the last interval ends with the ray; empty outside" in changed
 
 
-@pytest.mark.parametrize(
-    ("wrong", "text"),
-    [
-        ({"density": "exp"}, "model.density: expected relu or softplus"),
-        ({"time_frequencies": -1}, "expected frequencies >= 0"),
-        ({"samples": 2}, "model.samples: expected samples >= 3"),
-        ({"skip": 9}, "a skip in"),
-    ],
-)
-def test_refuses(wrong, text):
-    with pytest.raises(ValueError, match=text):
-        method(**wrong)
-
-
 def static_ceiling():
     """The train PSNR that no static model exceeds with a fixed camera."""
     images = torch.stack([picture(time).double() / 255 for time in TIMES])

@@ -28,14 +28,6 @@ def test_a_flat_box_gets_the_voxels_asked_for_and_no_more(thin, axes):
         assert all(s > 0 and math.isfinite(s) for s in (*lattice.spacing, lattice.voxel_size))
 
 
-@pytest.mark.parametrize("factor", [1e-3, 1.0, 1e3])
-def test_the_lattice_of_a_box_does_not_depend_on_the_unit(factor):
-    box = Box((-1.1 * factor, 0, 0), (1.2 * factor, 2.0 * factor, 0.7 * factor))
-    plain = Lattice.of_count(Box((-1.1, 0, 0), (1.2, 2.0, 0.7)), 9e4)
-    assert Lattice.of_count(box, 9e4).shape == plain.shape
-    assert Lattice.of_count(box, 9e4).voxel_size == pytest.approx(factor * plain.voxel_size)
-
-
 def test_a_place_that_is_no_number_reads_no_number(place):
     """A NaN position reads NaN; nothing is masked silently."""
     index = torch.arange(60, dtype=torch.int32, device=place).reshape(LATTICE.shape)

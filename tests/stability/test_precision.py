@@ -6,27 +6,25 @@ import pytest
 import torch
 
 from forewarp.fields.mlp import mlp
-from forewarp.fields.radiance import FeatureRadiance
 from forewarp.methods.voxel.backward_warp import Deformation
-from forewarp.methods.voxel.effects.inpaint import UNet3d
-from forewarp.methods.voxel.effects.upsample import LearnedUpsampler
-from forewarp.methods.voxel.effects.view_dependence import ViewNetwork
 from forewarp.renderer import Renderer
 from forewarp.scene.box import Lattice
 from forewarp.scene.view import Moment
-from tests.support.tiny_scene import BOX, backward_model, built, camera_at, forward_model
+from tests.support.tiny_scene import (
+    BOX,
+    EVERYTHING,
+    INPAINTER,
+    backward_model,
+    built,
+    camera_at,
+    forward_model,
+)
 
 pytestmark = pytest.mark.stability
 
-NETWORKS = {
-    "radiance": partial(FeatureRadiance, alpha_init=1e-2, alpha_threshold=0.0, width=16, grid_features=4),
-    "view_dependence": ViewNetwork,
-}
 MODELS = {
-    "everything": forward_model(
-        **NETWORKS, upsampler=partial(LearnedUpsampler, width=8), inpainter=partial(UNet3d, levels=2)
-    ),
-    "inpainter": forward_model(inpainter=partial(UNet3d, levels=2)),
+    "everything": forward_model(**EVERYTHING | {"background": None}),
+    "inpainter": forward_model(inpainter=INPAINTER),
     "backward": backward_model(deformation=partial(Deformation, width=16, layers=2)),
     "forward": forward_model(),
 }

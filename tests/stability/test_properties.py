@@ -75,7 +75,7 @@ def test_zero_flow_is_the_identity(place, seed):
 
 @MANY
 @given(SEEDS, strategies.floats(-30, 12))
-def test_weights_and_opacity_lie_between_0_and_1_and_light_never_grows(device, seed, power):
+def test_weights_and_opacity_lie_between_0_and_1(device, seed, power):
     count, rays = 200, 12
     ids = (random(seed, count) * rays).long().sort().values.to(device)
     optical = (random(seed + 1, count) * 10.0**power).to(device)
@@ -85,14 +85,6 @@ def test_weights_and_opacity_lie_between_0_and_1_and_light_never_grows(device, s
     opacity = accumulate(weights, torch.ones(count, 1, device=device), ids, rays)[:, 0]
     assert float(opacity.max()) <= 1 + 1e-6
     torch.testing.assert_close(opacity + transmittance, torch.ones_like(opacity), atol=1e-6, rtol=0)
-    for ray in range(rays):  # what reaches each sample
-        x, w = optical[ids == ray].double(), weights[ids == ray].double()
-        expected = torch.exp(x - x.cumsum(0))
-        told = (x > 1e-20) & (w > 1e-36)  # below, float32 cannot represent the weight
-        reaches = (w / -torch.expm1(-x))[told]
-        assert (reaches.diff() <= 1e-6 * reaches[:-1]).all()
-        bright = expected[told] > 1e-30  # beyond an optical depth of 80 everything is opaque
-        torch.testing.assert_close(reaches[bright], expected[told][bright], atol=0, rtol=1e-6)
 
 
 def field_of(seed, place, share=0.6, shape=(6, 7, 8)):

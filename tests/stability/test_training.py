@@ -1,7 +1,6 @@
 """Training under bad conditions: learning rates far too high, odd scenes, other units (cases 27 to 30)."""
 
 from dataclasses import replace
-from functools import partial
 
 import lightning
 import pytest
@@ -9,12 +8,10 @@ import torch
 
 from forewarp.data.module import SceneDataModule
 from forewarp.fields.trajectory import TrajectoryField
-from forewarp.methods.voxel.effects.background import StaticBackground
-from forewarp.methods.voxel.effects.inpaint import UNet3d
 from forewarp.methods.voxel.method import VoxelMethod
 from forewarp.scene.box import Box
 from tests.support.hard_cases import check_finite
-from tests.support.tiny_scene import RATES, ball_scene, forward_model, make_run, stage
+from tests.support.tiny_scene import EVERYTHING, RATES, ball_scene, forward_model, make_run, stage
 
 pytestmark = pytest.mark.stability
 
@@ -32,12 +29,6 @@ def in_other_units(scene, factor):
     splits = {name: tuple(map(grown, getattr(scene, name))) for name in ("train", "val", "test")}
     still = None if scene.still is None else scene.still * factor
     return replace(scene, box=box, still=still, **splits)
-
-
-ALL = {
-    "inpainter": partial(UNet3d, levels=2),
-    "background": partial(StaticBackground, features=3, alpha_init=1e-2, alpha_threshold=1e-4),
-}
 
 
 class Diary(lightning.Callback):
@@ -62,7 +53,10 @@ def test_no_term_of_the_loss_depends_on_the_unit_of_length(tmp_path, factor):
     """With all terms on, the first steps are equal except for rounding."""
     weights = dict.fromkeys(VoxelMethod.terms, 0.1)
     options = {"iterations": 4, "weights": weights, "start": "hull", "patches": 2, "refresh_every": 2}
-    options |= {"model": forward_model(**ALL), "background_num_voxels": [[0, 12**3]]}
+    options |= {
+        "model": forward_model(**{name: EVERYTHING[name] for name in ("inpainter", "background")}),
+        "background_num_voxels": [[0, 12**3]],
+    }
     scene = replace(ball_scene(frames=6, size=16), still=torch.tensor([[0.9, 0.1, 0.2], [-0.8, 0.3, -0.2]]))
     _, plain = fit(tmp_path / "a", scene, **options)
     _, other = fit(tmp_path / "b", in_other_units(scene, factor), **options)

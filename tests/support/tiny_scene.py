@@ -8,11 +8,14 @@ import lightning
 import torch
 
 from forewarp.data.module import SceneDataModule
-from forewarp.fields.radiance import DirectRadiance
+from forewarp.fields.radiance import DirectRadiance, FeatureRadiance
 from forewarp.fields.trajectory import TrajectoryField
 from forewarp.methods.method import Start
+from forewarp.methods.voxel.effects.background import StaticBackground
+from forewarp.methods.voxel.effects.inpaint import UNet3d
 from forewarp.methods.voxel.effects.motion import Motion
-from forewarp.methods.voxel.effects.view_dependence import SphericalHarmonics
+from forewarp.methods.voxel.effects.upsample import LearnedUpsampler
+from forewarp.methods.voxel.effects.view_dependence import SphericalHarmonics, ViewNetwork
 from forewarp.methods.voxel.model import BackwardModel, ForwardModel, Ground
 from forewarp.methods.voxel.stage import VoxelStage
 from forewarp.scene.box import Box
@@ -78,6 +81,15 @@ def ball_data(rays=256, seed=0, **changes):
 
 
 RADIANCE = partial(DirectRadiance, alpha_init=1e-2, alpha_threshold=1e-4)
+FEATURES = partial(FeatureRadiance, alpha_init=1e-2, alpha_threshold=0.0, width=8)
+INPAINTER = partial(UNet3d, levels=2)
+EVERYTHING = {
+    "radiance": FEATURES,
+    "view_dependence": ViewNetwork,
+    "upsampler": partial(LearnedUpsampler, width=8),
+    "inpainter": INPAINTER,
+    "background": partial(StaticBackground, features=3, alpha_init=1e-2, alpha_threshold=1e-4),
+}
 
 
 def forward_model(**changes):

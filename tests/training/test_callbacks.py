@@ -184,11 +184,13 @@ def test_the_clock_stands_still_while_something_is_shown(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("wrong", "text"),
     [
+        ({"every": 0}, "every: expected at least 1 step, but got 0"),
         ({"moments": (0.5, 1.5)}, r"moments: expected numbers in \[0, 1\], but got"),
         ({"psnr_rays": 0}, "expected psnr_views >= 0 and psnr_rays >= 1, but got"),
         ({"view": 7}, "callbacks.pictures.view: expected 0 to 0, but got 7"),
     ],
 )
 def test_bad_settings_are_named(tmp_path, wrong, text):
+    made = TensorBoardScalars if "every" in wrong else partial(TensorBoardPictures, moments=(0.1,))
     with pytest.raises(ValueError, match=text):
-        watched_run(tmp_path, TensorBoardPictures(**({"moments": (0.1,)} | wrong))).fit()
+        watched_run(tmp_path, made(**wrong)).fit()

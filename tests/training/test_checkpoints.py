@@ -77,16 +77,6 @@ def test_a_checkpoint_cannot_execute_code(tmp_path):
     assert not (tmp_path / "deed").exists()
 
 
-def test_a_voxel_grid_adopts_other_shapes(tmp_path, interrupted):
-    grown = module(tmp_path)
-    everywhere = torch.ones(grown.method.radiance.lattice.shape, dtype=torch.bool)
-    grown.method.radiance.activate(everywhere, {})
-    grown.method.radiance.activate(everywhere & (torch.rand(everywhere.shape) > 0.5), {})
-    load_weights(grown, interrupted)
-    stored = torch.load(interrupted, weights_only=True)["state_dict"]["method.radiance.density"]
-    assert torch.equal(grown.method.radiance.density, stored)
-
-
 def test_an_older_checkpoint_is_refused_by_what_it_lacks(tmp_path, interrupted):
     content = torch.load(interrupted, weights_only=True)
     content["forewarp"].pop("curriculum")

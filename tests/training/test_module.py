@@ -7,7 +7,6 @@ import torch
 
 from forewarp.methods.method import Step
 from forewarp.methods.voxel.backward_warp import Deformation
-from forewarp.methods.voxel.effects.inpaint import UNet3d
 from forewarp.methods.voxel.structure import resample
 from forewarp.ops.backend import numba_installed
 from forewarp.ops.warmup import warm_up
@@ -18,6 +17,7 @@ from forewarp.training.objective import total
 from forewarp.training.schedule import Curriculum
 from tests.support.tiny_scene import (
     BOX,
+    INPAINTER,
     backward_model,
     ball_data,
     begun,
@@ -27,7 +27,6 @@ from tests.support.tiny_scene import (
     trainer,
 )
 
-INPAINTER = partial(UNet3d, width=16, levels=2)
 BACKWARD = backward_model(deformation=partial(Deformation, width=8, layers=2))
 DATA = ball_data(rays=64, frames=5, size=16)
 

@@ -1,19 +1,22 @@
 import json
 import shutil
 import signal
-from functools import partial
 
 import lightning
 import pytest
 import torch
 
-from forewarp.fields.radiance import FeatureRadiance
-from forewarp.methods.voxel.effects.background import StaticBackground
-from forewarp.methods.voxel.effects.inpaint import UNet3d
-from forewarp.methods.voxel.effects.upsample import LearnedUpsampler
-from forewarp.methods.voxel.effects.view_dependence import ViewNetwork
 from forewarp.training.interruption import Interruption
-from tests.support.tiny_scene import RATES, Interrupt, ball_data, forward_model, make_run, same, stage
+from tests.support.tiny_scene import (
+    EVERYTHING,
+    RATES,
+    Interrupt,
+    ball_data,
+    forward_model,
+    make_run,
+    same,
+    stage,
+)
 
 
 def stages(**changes):
@@ -155,15 +158,6 @@ def test_every_stage_counts_its_own_memory(tmp_path, monkeypatch):
     ours.fit()  # all is finished
     assert order == ["reset", "peak"] * 2
     assert ours.finished()["fine"]["peak_memory_bytes"] == 7
-
-
-EVERYTHING = {
-    "radiance": partial(FeatureRadiance, alpha_init=1e-2, alpha_threshold=0.0, width=8),
-    "view_dependence": ViewNetwork,
-    "upsampler": partial(LearnedUpsampler, width=8),
-    "inpainter": partial(UNet3d, levels=2),
-    "background": partial(StaticBackground, features=3, alpha_init=1e-2, alpha_threshold=1e-4),
-}
 
 
 @pytest.mark.parametrize("choices", [{"motion": None, "trajectory": None}, EVERYTHING], ids=["static", "all"])

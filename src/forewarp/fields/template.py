@@ -55,7 +55,7 @@ class Template(nn.Module):
 
     Args:
         inputs: channels of the encoded point.
-        condition: channels that only colour depends on; 0: none.
+        condition: channels that only colour depends on.
         width, layers, skip: see ``Trunk``.
 
     >>> sum(p.numel() for p in Template(63, 27).parameters())
@@ -66,9 +66,9 @@ class Template(nn.Module):
         self, inputs: int, condition: int, *, width: int = 256, layers: int = 8, skip: int | None = 6
     ) -> None:
         super().__init__()
-        if condition < 0 or width < 2:
+        if condition < 1 or width < 2:
             raise ValueError(
-                f"template: expected condition >= 0 and width >= 2, but got {condition=}, {width=}"
+                f"template: expected condition >= 1 and width >= 2, but got {condition=}, {width=}"
             )
         self.trunk = Trunk(inputs, width=width, layers=layers, skip=skip)
         self.density_head = nn.Linear(width, 1)
@@ -80,13 +80,10 @@ class Template(nn.Module):
         """Encoded points (..., I) -> raw density (...,)."""
         return self.density_head(self.trunk(x))[..., 0]
 
-    def forward(self, x: Tensor, condition: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def forward(self, x: Tensor, condition: Tensor) -> tuple[Tensor, Tensor]:
         """Encoded points (..., I), condition (..., D) -> raw density (...,), colour (..., 3) in [0, 1]."""
         hidden = self.trunk(x)
-        color = self.bottleneck(hidden)
-        if condition is not None:
-            color = torch.cat([color, condition], -1)
-        color = torch.relu(self.shading(color))
+        color = torch.relu(self.shading(torch.cat([self.bottleneck(hidden), condition], -1)))
         return self.density_head(hidden)[..., 0], torch.sigmoid(self.color_head(color))
 
 

@@ -34,6 +34,12 @@ def picture(method, field):
         return Renderer()(field, camera_at(0.1).rays(), torch.ones(3), method.view_dependence).rgb
 
 
+def test_one_time_builds_no_deformation():
+    method, points = build(frames=1), torch.rand(4, 3)
+    assert method.deformation is None
+    assert torch.equal(method.trajectories(points, torch.rand(2)), points[:, None].expand(4, 2, 3))
+
+
 def test_at_the_canonical_time_the_picture_is_the_unwarped_one():
     method = moved_by(build(), (0.4, 0.0, 0.0))
     field = method.at(Moment(0.3)).fields["backward"]

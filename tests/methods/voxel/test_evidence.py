@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from forewarp.fields.trajectory import TrajectoryField
-from forewarp.methods.voxel.evidence import _explained, movement, residual
+from forewarp.methods.voxel.evidence import Movement, _explained, movement, residual
 from forewarp.ops.dct import dct_basis
 from forewarp.scene.box import Lattice
 from forewarp.scene.pictures import survey
@@ -70,6 +70,13 @@ def test_nothing_moves_where_nothing_does():
     found = movement(fitted(lambda at, time: torch.zeros_like(at)), [0, 1])
     assert (found.moving, found.distance, found.torn, found.left_out) == (0, 0, 0, (0.0,))
     assert found.bases() == 0
+
+
+def test_no_matter_does_not_move():
+    method = fitted(lambda at, time: torch.ones_like(at))
+    with torch.no_grad():
+        method.radiance.parameter("density").fill_(-8.0)
+    assert movement(method, [0, 1]) == Movement(0, 0, 0, 0.0, (0.0,))
 
 
 def test_a_wave_needs_its_own_cosine():

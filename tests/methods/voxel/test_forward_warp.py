@@ -3,16 +3,14 @@ from functools import partial
 import pytest
 import torch
 
-from forewarp.methods.voxel.effects.inpaint import UNet3d
 from forewarp.methods.voxel.effects.upsample import LearnedUpsampler, TrilinearUpsampler
 from forewarp.methods.voxel.stage import EFFECTS
 from forewarp.renderer import Renderer
 from forewarp.scene.box import Lattice
 from forewarp.scene.view import Moment
-from tests.support.tiny_scene import BOX, built, camera_at, forward_model
+from tests.support.tiny_scene import BOX, INPAINTER, built, camera_at, forward_model
 
 LATTICE = Lattice(BOX, (7, 6, 5))
-INPAINTER = partial(UNet3d, width=16, levels=2)
 
 
 def build(effects=EFFECTS, frames=5, seed=0, **choices):

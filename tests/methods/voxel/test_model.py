@@ -6,19 +6,17 @@ from functools import partial
 import pytest
 import torch
 
-from forewarp.fields.radiance import FeatureRadiance
 from forewarp.fields.trajectory import TrajectoryField
 from forewarp.methods.method import Start
-from forewarp.methods.voxel.effects.background import StaticBackground
-from forewarp.methods.voxel.effects.inpaint import UNet3d
-from forewarp.methods.voxel.effects.upsample import LearnedUpsampler, TrilinearUpsampler
-from forewarp.methods.voxel.effects.view_dependence import ViewNetwork
+from forewarp.methods.voxel.effects.upsample import TrilinearUpsampler
 from forewarp.methods.voxel.stage import EFFECTS
 from forewarp.scene.box import Lattice
 from forewarp.scene.cloud import Handover
 from forewarp.training.handover import make_handover
 from tests.support.tiny_scene import (
     BOX,
+    EVERYTHING,
+    FEATURES,
     RADIANCE,
     RADIUS,
     ball_center,
@@ -36,15 +34,7 @@ def build(model, effects=EFFECTS, **numbers):
     return built(model, LATTICE, static=static, effects=effects, **numbers)
 
 
-FEATURES = partial(FeatureRadiance, alpha_init=1e-2, alpha_threshold=0.0, width=8)
-FULL = forward_model(
-    radiance=FEATURES,
-    trajectory=partial(TrajectoryField, bases=3, nodes=8, features=2),
-    view_dependence=ViewNetwork,
-    upsampler=LearnedUpsampler,
-    inpainter=partial(UNet3d, levels=2),
-    background=partial(StaticBackground, features=3, alpha_init=1e-2, alpha_threshold=0.0),
-)
+FULL = forward_model(**EVERYTHING, trajectory=partial(TrajectoryField, bases=3, nodes=8, features=2))
 
 
 @pytest.mark.parametrize("effect", EFFECTS)

@@ -13,11 +13,11 @@ from forewarp.methods.voxel.effects.upsample import LearnedUpsampler, TrilinearU
 from forewarp.methods.voxel.stage import VoxelStage
 from forewarp.methods.voxel.terms import voxel_terms
 from forewarp.scene.box import Lattice
-from tests.support.tiny_scene import BOX, backward_model, ball_scene, built, forward_model
+from tests.support.tiny_scene import BOX, INPAINTER, backward_model, ball_scene, built, forward_model
 
 SCENE = replace(ball_scene(frames=2, size=8), has_alpha=False)
 PATHS = partial(TrajectoryField, BOX, bases=2, frames=5, canonical_time=0.0, nodes=8)
-ODD = forward_model(upsampler=partial(TrilinearUpsampler, scale=1.5), inpainter=partial(UNet3d, levels=2))
+ODD = forward_model(upsampler=partial(TrilinearUpsampler, scale=1.5), inpainter=INPAINTER)
 OPACITIES, OPACITY = (
     "stage.coarse: expected 0 < birth_alpha < keep_alpha < 1",
     r"expected a number in \(0, 1\), but",
