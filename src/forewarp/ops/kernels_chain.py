@@ -53,7 +53,7 @@ def ranked(order, count):
     return rows, ranks
 
 
-@njit(cache=True)
+@njit(parallel=True, cache=True)
 def slopes_of(splats, rows, ranks, sums, factor, slopes, pull):
     """From the sums over pixels (S, V, 16) of splats in the order of depth to ``factor`` times the slopes
     by the numbers (V', 16) of ``rows``, whose places in that order are ``ranks``; V' is V or more, a
@@ -63,8 +63,9 @@ def slopes_of(splats, rows, ranks, sums, factor, slopes, pull):
     the splat to the pixel, then those by colour and distance. ``pull`` (N,) takes the lengths of those by
     u, v.
     """
-    count, place, conics = len(rows), room(16), room(16)
-    for first in range(0, count, SIDE_BY_SIDE):
+    count = len(rows)
+    for block in prange(slopes.shape[0] // SIDE_BY_SIDE):
+        first, place, conics = SIDE_BY_SIDE * block, room(16), room(16)
         for lane in range(SIDE_BY_SIDE):
             k = min(first + lane, count - 1)
             set_row(conics, lane, get_row(splats, rows[k]))

@@ -100,8 +100,7 @@ def sorted_tiles(splats, across: int, down: int, threads: int) -> Tiles:
     from forewarp.ops import kernels_tiles as kernels
 
     order = kernels.by_depth(splats)
-    records = kernels.records_of(splats, order)
-    entries, ends = kernels.sort_into_tiles(splats, order, records, across, down)
+    records, entries, ends = kernels.sort_into_tiles(splats, order, across, down, threads)
     shares, longest = kernels.shared_out(ends, threads)
     return Tiles(order, records, entries, ends, shares, int(longest))
 
