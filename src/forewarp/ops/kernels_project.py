@@ -227,6 +227,19 @@ def _paint(dx, dy, dz, colors, tints, which, place):
     return at_least(red, 0.0), at_least(green, 0.0), at_least(blue, 0.0)
 
 
+@njit(forceinline=True)
+def _reach(view, ahead, beside, bent, determinant, solid, log_solid):
+    """Twice the logarithm of 255 times the opacity, 0 of what is not seen."""
+    reach = where_above(solid, np.float32(1 / 255), (log_solid + np.float32(LOG_FULL)) * 2.0)
+    reach = where_above(ahead, view[NEAR], reach)
+    reach = where_above(view[REACH] - beside, np.float32(0), reach)
+    for side, size in ((bent[0], view[SIZE]), (bent[1], view[SIZE + 1])):
+        reach = where_above(side, -view[MARGIN], reach)
+        reach = where_above(view[MARGIN] + size - side, np.float32(0), reach)
+    reach = where_above(determinant, np.float32(0), reach)
+    return where_above(np.float32(1e30) - determinant, np.float32(0), reach)
+
+
 @njit(parallel=True, cache=True)
 def project(means, log_scales, quaternions, opacity, colors, maps, links, weights, view, tints, fades, out):
     """Fill ``out`` (N', 16) with splats; see ``project.project``. N' is N or more, a multiple of 16.
@@ -264,15 +277,7 @@ def project(means, log_scales, quaternions, opacity, colors, maps, links, weight
                 which,
                 place,
             )
-            # 2 log(255 opacity), 0 of what is not seen.
-            reach = where_above(solid, np.float32(1 / 255), (least + np.float32(LOG_FULL)) * 2.0)
-            reach = where_above(local[2], view[NEAR], reach)
-            reach = where_above(view[REACH] - (px * px + py * py), np.float32(0), reach)
-            for side, size in ((bent[0], view[SIZE]), (bent[1], view[SIZE + 1])):
-                reach = where_above(side, -view[MARGIN], reach)
-                reach = where_above(view[MARGIN] + size - side, np.float32(0), reach)
-            reach = where_above(determinant, np.float32(0), reach)
-            reach = where_above(np.float32(1e30) - determinant, np.float32(0), reach)
+            reach = _reach(view, local[2], px * px + py * py, bent, determinant, solid, least)
             inverse = sixteen(1.0) / determinant
             set_row(place, 0, bent[0])
             set_row(place, 1, bent[1])
