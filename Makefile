@@ -59,10 +59,10 @@ demo-lego-complete demo-hypernerf demo-nhr:
 	$(BIN)/forewarp-render run=runs/$@ path=both
 
 test: ## run the tests except the slow ones
-	$(BIN)/pytest --no-cov -m "not slow and not bench"
+	$(BIN)/pytest --no-cov -m "not slow"
 
 test-slow: ## run the slow tests: killed runs, every method on every dataset, every sweep's jobs, the wheel
-	$(BIN)/pytest --no-cov -m "slow and not bench"
+	$(BIN)/pytest --no-cov -m slow
 
 conformance: ## test every method against the contract, slow cases too, and write docs/conformance.md
 	OMP_NUM_THREADS=1 $(BIN)/pytest --no-cov -q tests/contract/test_contract.py --conformance=docs/conformance.md
@@ -71,14 +71,22 @@ test-stability: ## run the numerical hard cases and killed runs, slow ones too
 	$(BIN)/pytest --no-cov -m stability tests/stability
 
 bench: ## time every operator, a step and a frame, into docs/performance.md (a quarter of an hour)
-	mkdir -p runs/bench
-	$(MEASURE) $(BIN)/pytest --no-cov -m bench tests/bench --benchmark-json=runs/bench/growth.json
 	$(MEASURE) $(BIN)/python -m tests.bench.performance
 
+TINY = data.scene=tiny paths.data=runs/bench-gpu data.synthesis.size=32 data.synthesis.frames=8 \
+	data.synthesis.test_views=[1,1,1] preset.rays=64 preset.inpainter_width=16 data.held_out=2 budget.iterations=12 \
+	stage.coarse.num_voxels=[[0,1000]] stage.fine.num_voxels=[[0,1500]]
 bench-gpu: MINUTES := $(if $(filter command line,$(origin MINUTES)),$(MINUTES),10)
-bench-gpu: ## steps, frames and PSNR against seconds on a GPU [DATA= SCENES="a b" MINUTES= DEVICE=cpu SMALL=1]
-	$(BIN)/python -m tests.bench.device --device $(DEVICE) --minutes $(MINUTES) $(if $(SMALL),--small) \
-		$(if $(DATA),--data $(DATA) --scenes $(SCENES))
+bench-gpu: ## seconds of steps and frames, and PSNR against seconds, on a GPU [DATA= SCENES="a b" MINUTES= DEVICE=cpu SMALL=1]
+	status=0; for scene in $(if $(DATA),$(SCENES),vehicle); do \
+		bench() { $(BIN)/forewarp-train trainer=$(DEVICE) $(if $(DATA),experiment=dnerf data.root=$(DATA)) data.scene=$$scene \
+			+variant.name=base "$$@" $(if $(SMALL),$(TINY)) $(GO_ON); }; \
+		bench preset=fast data.held_out=8 budget.minutes=$(MINUTES) run=runs/bench-gpu/$$scene-fast; \
+		bench preset=faithful budget.minutes=null budget.iterations=240 run=runs/bench-gpu/$$scene-faithful; \
+	done; \
+	for kind in accuracy_time price_list; do \
+		$(BIN)/forewarp-report kind=$$kind runs=runs/bench-gpu out=runs/bench-gpu/results $(GO_ON); \
+	done; exit $$status
 
 RENAMED = $(if $(VARIANTS),$(error VARIANTS: expected CHANGES="preset.rays=1024$(comma)2048"; variants are gone since 0.3))
 accuracy-time: ## accuracy of each choice against training time [DATA= SCENE= MINUTES= CHANGES= SEEDS=3]

@@ -16,6 +16,18 @@ def forewarp():
 
 
 @pytest.fixture
+def ok():
+    """As ``forewarp``, of a command that must end well."""
+
+    def end_well(name, *arguments):
+        done = call(name, *arguments)
+        assert done.status == 0, done
+        return done
+
+    return end_well
+
+
+@pytest.fixture
 def refused():
     """Call a command that must end in one line and status 2; returns that line."""
 

@@ -9,20 +9,14 @@ SOURCE = Path(__file__).parents[1] / "src" / "forewarp"
 BOTTOM = {"files", "progress"}  # open to all
 LOWER = {"ops", "scene", "losses", "metrics", "fields", "drawing", "renderer", "quadrature"}
 MAY_IMPORT = {
-    "files": set(),
-    "progress": set(),
-    "ops": set(),
+    **dict.fromkeys(["files", "progress", "ops"], set()),
     "scene": {"ops"},
     "losses": {"ops"},
-    "metrics": {"ops", "scene"},
-    "drawing": {"ops", "scene"},
-    "report": {"drawing"},
-    "fields": {"ops", "scene"},
-    "data": {"ops", "scene"},
+    **dict.fromkeys(["metrics", "drawing", "fields", "data", "quadrature"], {"ops", "scene"}),
+    "report": {"drawing", "metrics"},
     "synth": {"ops", "scene", "data"},
     "renderer": {"ops", "scene", "fields"},
-    "quadrature": {"ops", "scene"},
-    "methods": LOWER | {"report"},
+    "methods": LOWER,
     "training": LOWER | {"methods"},
     "evaluation": LOWER | {"methods", "training"},
     "runs": LOWER | {"methods", "training", "evaluation", "data"},
@@ -32,29 +26,17 @@ MAY_IMPORT = {
 }
 CONFIG = {"runs", "planning", "cli"}
 ONLY_IN = {
-    "hydra": CONFIG,
-    "omegaconf": CONFIG,
+    **dict.fromkeys(["hydra", "omegaconf"], CONFIG),
     "lightning": {"data", "training", "evaluation", "runs", "planning", "cli"},
-    "torchmetrics": {"metrics"},
-    "numba": {"ops"},
-    "trimesh": {"synth"},
-    "embreex": {"synth"},
-    "imageio": {"drawing", "evaluation", "cli"},
-    "PIL": {"data"},
-    "imageio_ffmpeg": {"drawing", "cli"},
+    **{"torchmetrics": {"metrics"}, "numba": {"ops"}, "PIL": {"data"}, "matplotlib": {"report"}},
+    **{"trimesh": {"synth"}, "embreex": {"synth"}, "torchvision": set()},
+    **{"imageio": {"drawing", "evaluation", "cli"}, "imageio_ffmpeg": {"drawing", "cli"}},
     "rich": {"progress", "training", "evaluation", "planning", "cli"},
-    "matplotlib": {"report"},
-    "torchvision": set(),
 }
 CONTRACT = {"method", "abilities", "effect", "rows"}  # files of methods/ that packages above may import
-OWN_PARTS = {
-    "radiance",
-    "lattice",
-    "lattices",
-    "motion",
-    "deformation",
-    "inpainter",
-}  # attributes of one method only
+# Attributes of one method only.
+OWN_PARTS = {"radiance", "lattice", "lattices", "motion", "deformation", "inpainter"}
+ABOVE = {"training", "data", "report", "evaluation", "runs", "planning", "cli"}
 FUNCTION_LINES, FILE_LINES = 60, 350
 REASON = "# long: "
 
@@ -86,28 +68,18 @@ def breaches(part: str, tree: ast.AST) -> list[str]:
     return found
 
 
-def above_methods(file: Path) -> bool:
-    """Whether a file is above the methods, so that it may know only their contract."""
-    return part_of(file) in ("training", "data", "report", "evaluation", "runs", "planning", "cli")
-
-
 def parts_named(tree: ast.AST) -> list[str]:
     """Return what a file above the methods names of a single method: imports and attributes."""
-    found = [
-        name
-        for name in imports(tree)
-        if name.startswith("forewarp.methods.") and name.split(".")[2] not in CONTRACT
-    ]
+    names = (name for name in imports(tree) if name.startswith("forewarp.methods."))
+    found = [name for name in names if name.split(".")[2] not in CONTRACT]
     return found + [n.attr for n in ast.walk(tree) if isinstance(n, ast.Attribute) and n.attr in OWN_PARTS]
 
 
 def other_methods(file: Path, tree: ast.AST) -> list[str]:
     """Return imports of one method by another, or by the contract."""
-    own, names = file.relative_to(SOURCE / "methods").parts[0].removesuffix(".py"), []
-    for name in imports(tree):
-        if name.startswith("forewarp.methods.") and name.split(".")[2] not in CONTRACT | {own}:
-            names.append(name)
-    return names
+    known = CONTRACT | {file.relative_to(SOURCE / "methods").parts[0].removesuffix(".py")}
+    names = (name for name in imports(tree) if name.startswith("forewarp.methods."))
+    return [name for name in names if name.split(".")[2] not in known]
 
 
 def own_lines(node: ast.FunctionDef) -> int:
@@ -134,108 +106,56 @@ FILES = sorted(path for path in SOURCE.rglob("*.py") if path.parent != SOURCE or
 @pytest.mark.parametrize("file", FILES, ids=lambda file: file.relative_to(SOURCE).as_posix())
 def test_imports_point_down_and_lengths_keep_their_ceilings(file):
     text = file.read_text()
-    assert breaches(part_of(file), ast.parse(text)) == []
+    tree, part = ast.parse(text), part_of(file)
+    assert breaches(part, tree) == []
     assert too_long(text) == []
-
-
-@pytest.mark.parametrize(
-    "file", [f for f in FILES if above_methods(f)], ids=lambda file: file.relative_to(SOURCE).as_posix()
-)
-def test_above_the_methods_only_their_contract_is_named(file):
-    assert parts_named(ast.parse(file.read_text())) == []
-
-
-@pytest.mark.parametrize(
-    "file",
-    [f for f in FILES if part_of(f) == "methods"],
-    ids=lambda file: file.relative_to(SOURCE).as_posix(),
-)
-def test_no_method_imports_another(file):
-    assert other_methods(file, ast.parse(file.read_text())) == []
-
-
-@pytest.mark.parametrize(
-    ("line", "allowed"),
-    [
-        ("from forewarp.methods.method import Method", True),
-        ("from forewarp.methods.abilities import HasMatter", True),
-        ("from forewarp.methods.effect import Effect", True),
-        ("from forewarp.methods.voxel.terms import TERMS", False),
-        ("from forewarp.methods import voxel", False),
-        ("def f():\n    import forewarp.methods.voxel.method", False),
-        ("module.method.radiance", False),
-        ("module.method.radiance.lattice", False),
-        ("grid.lattice", False),
-        ("module.method.size", True),
-        ("from forewarp.fields.radiance import DirectRadiance", True),
-    ],
-)
-def test_the_check_of_what_stands_above(line, allowed):
-    assert (parts_named(ast.parse(line)) == []) is allowed
-
-
-@pytest.mark.parametrize(
-    ("file", "line", "allowed"),
-    [
-        ("voxel/start.py", "from forewarp.methods.voxel.stage import VoxelStage", True),
-        ("voxel/start.py", "from forewarp.methods.method import Start", True),
-        ("voxel/start.py", "from forewarp.methods.particles.model import Particles", False),
-        ("particles/model.py", "from forewarp.methods.voxel.method import VoxelMethod", False),
-        ("method.py", "from forewarp.methods.voxel.method import VoxelMethod", False),
-    ],
-)
-def test_the_check_of_methods_among_themselves(file, line, allowed):
-    assert (other_methods(SOURCE / "methods" / file, ast.parse(line)) == []) is allowed
-
-
-@pytest.mark.parametrize(
-    ("file", "above"),
-    [
-        ("training/module.py", True),
-        ("evaluation/evaluate.py", True),
-        ("planning/planner.py", True),
-        ("methods/tnerf.py", False),
-    ],
-)
-def test_who_stands_above_the_methods(file, above):
-    assert above_methods(SOURCE / file) is above
-    assert (SOURCE / file).is_file()
-
-
-def test_every_folder_is_a_package():
-    assert {f.parent for f in SOURCE.rglob("*.py")} == {f.parent for f in SOURCE.rglob("__init__.py")}
+    assert part not in ABOVE or parts_named(tree) == []  # above the methods only their contract is known
+    assert part != "methods" or other_methods(file, tree) == []
 
 
 def test_init_files_hold_one_sentence_but_for_the_public_door():
-    for file in SOURCE.rglob("__init__.py"):
-        if file.parent == SOURCE:
-            assert list(imports(ast.parse(file.read_text()))) == ["forewarp.runs.fitted.open_run"]
-            continue
-        body = ast.parse(file.read_text()).body
-        assert len(body) == 1, file
-        assert isinstance(body[0], ast.Expr), file
+    folders = {file.parent: ast.parse(file.read_text()) for file in SOURCE.rglob("__init__.py")}
+    assert {file.parent for file in SOURCE.rglob("*.py")} == folders.keys()
+    assert list(imports(folders.pop(SOURCE))) == ["forewarp.runs.fitted.open_run"]
+    assert {folder for folder, tree in folders.items() if [*map(type, tree.body)] != [ast.Expr]} == set()
+
+
+def above(line):
+    return parts_named(ast.parse(line))
+
+
+def within(file):
+    return lambda line: other_methods(SOURCE / "methods" / file, ast.parse(line))
+
+
+def of(part):
+    return lambda line: breaches(part, ast.parse(line))
 
 
 @pytest.mark.parametrize(
-    ("part", "line", "allowed"),
+    ("check", "line", "allowed"),
     [
-        ("ops", "from forewarp.scene.box import Box", False),
-        ("training", "from forewarp.data.module import SceneDataModule", False),
-        ("training", "def f():\n    import hydra", False),
-        ("synth", "from forewarp.data.dnerf import write_scene", True),
-        ("cli", "import hydra", True),
-        ("scene", "import torch", True),
-        ("report", "from forewarp.scene.box import Box", False),
-        ("training", "from forewarp.report.collect import collect", False),
-        ("training", "import matplotlib", False),
-        ("methods", "from forewarp.training.module import DynamicSceneModule", False),
-        ("methods", "from forewarp.renderer import Renderer", True),
-        ("fields", "from forewarp.renderer import Renderer", False),
-        ("renderer", "from forewarp.methods.method import Method", False),
+        (above, "from forewarp.methods.method import Method", True),
+        (above, "from forewarp.methods.voxel.terms import TERMS", False),
+        (above, "from forewarp.methods import voxel", False),
+        (above, "def f():\n    import forewarp.methods.voxel.method", False),
+        (above, "module.method.radiance.shape", False),
+        (above, "module.method.size", True),
+        (within("voxel/start.py"), "from forewarp.methods.voxel.stage import VoxelStage", True),
+        (within("voxel/start.py"), "from forewarp.methods.method import Start", True),
+        (within("voxel/start.py"), "from forewarp.methods.particles.model import Particles", False),
+        (within("method.py"), "from forewarp.methods.voxel.method import VoxelMethod", False),
+        (of("ops"), "from forewarp.scene.box import Box", False),
+        (of("training"), "from forewarp.data.module import SceneDataModule", False),
+        (of("training"), "def f():\n    import hydra", False),
+        (of("cli"), "import hydra", True),
+        (of("scene"), "import torch", True),
+        (of("methods"), "from forewarp.renderer import Renderer", True),
+        (of("renderer"), "from forewarp.methods.method import Method", False),
     ],
 )
-def test_the_check_itself(part, line, allowed):
-    assert (breaches(part, ast.parse(line)) == []) is allowed
+def test_the_checks_themselves(check, line, allowed):
+    assert (check(line) == []) is allowed
 
 
 def test_a_long_function_needs_a_reason():

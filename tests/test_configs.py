@@ -18,7 +18,7 @@ from forewarp.methods.voxel.model import Ground
 from forewarp.methods.voxel.stage import EFFECTS, VoxelStage
 from forewarp.methods.voxel.terms import TERMS
 from forewarp.renderer import Renderer
-from forewarp.runs.build import build_run, model_of
+from forewarp.runs.build import build_run
 from forewarp.scene.box import Box, Lattice
 from forewarp.training.schedule import StageSettings
 from tests.support.configs import CONF, composed, groups, options
@@ -28,21 +28,12 @@ EXPERIMENTS = options("experiment")
 # Crossed with each other below, jobs of tests/test_sweeps.py (scene, ablation), or always on.
 ELSEWHERE = {"preset", "model", "experiment", "stage", "objective", "data", "scene", "ablation"}
 ELSEWHERE |= {"callbacks", "hydra", "paths"}
-DEFAULTS = {
-    ("capture", "cut_out"),
-    ("logger", "tensorboard"),
-    ("trainer", "auto"),
-    ("model/renderer", "march"),
-}
+DEFAULTS = {("capture", "cut_out"), ("logger", "tensorboard"), ("trainer", "auto")}
+DEFAULTS |= {("model/renderer", "march")}
 CHOICES = {(group, option) for group in groups() if group not in ELSEWHERE for option in options(group)}
 CHOICES = sorted(CHOICES - DEFAULTS)
-OFF = [
-    ("inpainter", "unet3d"),
-    ("upsampler", "learned"),
-    ("view_dependence", "mlp"),
-    ("motion", "dct"),
-    ("background", "grid"),
-]
+OFF = [("inpainter", "unet3d"), ("upsampler", "learned"), ("view_dependence", "mlp"), ("motion", "dct")]
+OFF += [("background", "grid")]
 
 
 def run_of(*overrides):
@@ -70,16 +61,6 @@ def test_every_option_composes_and_instantiates(group, option):
 def test_every_command_has_a_config(name):
     config = composed("data.scene=x", name=name) if name == "train" else composed(name=name)
     assert OmegaConf.to_container(config, resolve=True, throw_on_missing=True)["paths"]
-
-
-@pytest.mark.parametrize("model", MODELS)
-@pytest.mark.parametrize("preset", PRESETS)
-def test_presets_go_with_models(preset, model):
-    config = composed("data.scene=x", f"preset={preset}", f"model={model}")
-    assert (config.preset.name, config.model.name) == (preset, model)
-    assert callable(model_of(config.model))
-    expected = ["fine"] if model == "tnerf" else ["coarse", "fine"]
-    assert [stage.settings.name for stage in build_run(config).stages] == expected
 
 
 def test_faithful_is_the_papers_model():
@@ -124,36 +105,19 @@ def test_every_number_of_the_renderer_is_a_key_and_equals_its_default():
 
 
 @pytest.mark.parametrize("order", [1, -1])
-def test_the_command_line_wins_over_the_preset(order):
+def test_the_command_line_wins_over_the_preset_and_the_experiment(order):
     overrides = ["preset=fast", "model/view_dependence=mlp"][::order]
-    assert method_of(run_of("preset=fast").model).view_dependence.__class__ is SphericalHarmonics
-    assert method_of(run_of(*overrides).model).view_dependence.__class__ is ViewNetwork
-
-
-def test_the_command_line_wins_over_the_experiment():
-    config = composed("experiment=dnerf", "data.scene=x", "preset=faithful", "data.box=null", "data.rays=7")
+    assert type(method_of(run_of("preset=fast").model).view_dependence) is SphericalHarmonics
+    assert type(method_of(run_of(*overrides).model).view_dependence) is ViewNetwork
+    words = ["experiment=dnerf", "data.scene=x", "preset=faithful", "data.box=null", "data.rays=7"][::order]
+    config = composed(*words)
     assert (config.preset.name, config.data.box, config.data.rays) == ("faithful", None, 7)
-    assert composed("experiment=dnerf", "data.scene=x").data.box == [-1.5] * 3 + [1.5] * 3
-
-
-def test_a_ghost_is_refused():
-    config = composed("model/inpainter=none", "+model.inpainter.width=32")
-    with pytest.raises(Exception, match="model.inpainter: expected a factory or null, but got {'width': 32}"):
-        model_of(config.model)
-
-
-def test_an_unknown_key_is_refused():
-    with pytest.raises(ConfigCompositionException, match=r"data\.scence"):
-        composed("data.scence=x")
 
 
 def test_budget_is_shared_out():
     run = run_of("preset=fast", "budget.minutes=20", "budget.iterations=1000")
     assert [stage.settings.minutes for stage in run.stages] == pytest.approx([8, 12])
     assert [stage.settings.iterations for stage in run.stages] == [400, 600]
-
-
-def test_a_dropped_stage_leaves_its_share():
     (only,) = run_of("preset=fast", "budget.minutes=20", "~stage.fine").stages
     assert (only.settings.name, only.settings.minutes) == ("coarse", 20)
     (only,) = run_of("preset=fast", "stage.coarse=null").stages
@@ -168,8 +132,7 @@ def test_every_stage_key_may_be_typed_and_starts_from_the_same():
             continue
         assert field.name in base
         if field.default is not MISSING:
-            given = [base[field.name], field.default]
-            ours, expected = OmegaConf.to_container(OmegaConf.create(given))
+            ours, expected = OmegaConf.to_container(OmegaConf.create([base[field.name], field.default]))
             assert ours == expected, field.name
 
 
@@ -189,17 +152,12 @@ def test_every_dataset_takes_a_canonical_time_and_the_presets_background(data):
     assert isinstance(instantiate(config.data, _convert_="all"), SceneDataModule)
 
 
-def test_run_folder_is_named_after_the_choices():
-    config = composed("data.scene=hook", "data=dnerf", "model=backward", "preset=demo", "seed=3")
-    assert config.run == "runs/hook/backward-demo-seed3"
-
-
 def every_experiment():
     """Every method with every experiment and preset; those that say nothing new are slow."""
     for i, experiment in enumerate(EXPERIMENTS):
         for j, model in enumerate(MODELS):
             for k, preset in enumerate(PRESETS):
-                quick = k == i % 3 and (model == "forward" or j == i % 3)
+                quick = k == (i + j) % 3 and (model == "forward" or i < 3)
                 yield pytest.param(experiment, model, preset, marks=[] if quick else pytest.mark.slow)
 
 
@@ -218,6 +176,8 @@ def test_each_number_of_a_method_is_taken_where_it_is_keyed(model):
     assert [c.preset.bases for c in (fast, faithful)] == [8, 25]  # model x preset x experiment
     assert fast.objective.fine.weights.static_points == 1e-2  # model x experiment
     assert (fast.preset.rays, faithful.budget.iterations) == (4096, 120000)  # model x preset
+    broom = composed("scene=hypernerf_broom", f"model={model}")  # scene
+    assert (broom.data.scene, broom.stage.fine.num_voxels[-1][1]) == ("broom2", 343000)
     band, still = (composed(f"scene=specimen_{name}", f"model={model}") for name in ("band", "still"))
     assert (band.stage.fine.num_voxels, still.stage.coarse.num_voxels) == ([[0, 15625]], [[0, 46656]])
 
@@ -231,10 +191,7 @@ def test_effects_follow_the_pictures_and_the_command_line_wins():
     assert chosen("data=hypernerf")["model/background"] == "none"
     assert chosen("experiment=video_with_poses")["model/view_dependence"] == "sh"
     typed = ["experiment=hypernerf", "preset=demo", "model/view_dependence=mlp", "model/background=none"]
-    assert [chosen(*typed)[f"model/{effect}"] for effect in ("view_dependence", "background")] == [
-        "mlp",
-        "none",
-    ]
+    assert chosen(*typed).items() >= {"model/view_dependence": "mlp", "model/background": "none"}.items()
     assert chosen("experiment=hypernerf", "ablation=full")["model/view_dependence"] == "mlp"
 
 
@@ -266,25 +223,15 @@ def test_a_package_brings_a_method_and_its_numbers(tmp_path):
         mine("preset=demo")
 
 
-READERS = {
-    "dnerf": dnerf.read_scene,
-    "hypernerf": hypernerf.read_scene,
-    "nhr": nhr.read_scene,
-    "video_with_poses": posed_video.read_scene,
-}
+READERS = {"dnerf": dnerf, "hypernerf": hypernerf, "nhr": nhr, "video_with_poses": posed_video}
 
 
 @pytest.mark.parametrize("data", READERS)
 def test_what_a_reader_takes_is_a_key_and_equals_its_default(data):
     config = OmegaConf.load(CONF / "data" / f"{data}.yaml")
-    for name, parameter in signature(READERS[data]).parameters.items():
+    for name, parameter in signature(READERS[data].read_scene).parameters.items():
         if parameter.kind is parameter.KEYWORD_ONLY:
             assert config[name] == parameter.default, name
     common = {n: p.default for n, p in signature(SceneDataModule.__init__).parameters.items()}
     for name in ("held_out", "cache_bytes"):
         assert config.get(name, common[name]) == common[name]
-
-
-def test_precision_is_a_key():
-    assert composed("data.scene=x").trainer.precision is None
-    assert composed("data.scene=x", "trainer.precision=bf16-mixed").trainer.precision == "bf16-mixed"

@@ -118,13 +118,6 @@ def test_all_rays_may_miss():
     assert weight.grad == 0
 
 
-def test_the_box_changes_nothing_where_it_holds_all_matter():
-    box = Box((-0.6, -2, -2), (0.6, 2, 2))
-    whole, inner = (Quadrature(600, 600, False, b)(*slab(2.0), rays(), WHITE) for b in (None, box))
-    torch.testing.assert_close(whole.rgb, inner.rgb, atol=5e-3, rtol=0)
-    torch.testing.assert_close(whole.depth, inner.depth, atol=0.02, rtol=0)
-
-
 def test_pictures_in_pieces_and_permuted(monkeypatch):
     quadrature, some = Quadrature(12, 12), rays(9)
     behind = torch.rand(9, 3)

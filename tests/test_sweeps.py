@@ -15,19 +15,10 @@ from forewarp.runs.config import hashed
 from hydra_plugins.forewarp_one_at_a_time import changed
 from tests.support.configs import CONF, ROOT, composed, groups, options
 
-PAPER = {
-    "dnerf": 8,
-    "hypernerf": 4,
-    "nhr": 4,
-    "lego_complete": 3,
-    "ablation_modules": 60,
-    "ablation_losses": 32,
-    "resolution": 16,
-    "methods": 32,
-}
-
-
-COUNTERPARTS = ["dnerf", "hypernerf", "nhr", "lego_complete"]
+PAPER = {"dnerf": 8, "hypernerf": 4, "nhr": 4, "lego_complete": 3, "ablation_modules": 60}
+PAPER |= {"ablation_losses": 32, "resolution": 16, "methods": 32}
+OTHERS = {"accuracy_time", "effects", "price_list", "search"}
+CHANGES = yaml.safe_load((ROOT / "sweeps" / "price_list.yaml").read_text())["hydra"]["sweeper"]["changes"]
 
 
 def jobs_of(sweep, *words):
@@ -57,39 +48,28 @@ def test_a_sweep_has_its_jobs(sweep, count):
 
 
 def test_no_sweep_is_forgotten():
-    assert {path.stem for path in (ROOT / "sweeps").glob("*.yaml")} == {
-        *PAPER,
-        "accuracy_time",
-        "effects",
-        "price_list",
-        "search",
-    }
+    assert {path.stem for path in (ROOT / "sweeps").glob("*.yaml")} == PAPER.keys() | OTHERS
 
 
 def test_effects_are_compared_on_every_specimen():
     jobs = jobs_of("effects")
     assert len(jobs) == 18
-    room = [job for job in jobs if "scene=specimen_room" in job]
-    auto, every, paper = (job_of("effects", *job) for job in room)
+    auto, every, paper = (job_of("effects", *job) for job in jobs if "scene=specimen_room" in job)
     for config in (auto, every, paper):
         assert config.run.startswith("runs/effects/room/")
         assert config.variant.name in config.run
     assert auto.effects == "auto"
-    assert {
-        e
-        for e in ("motion", "view_dependence", "upsampler", "inpainter", "background")
-        if every.model[e] is None
-    } == set()
+    effects = ("motion", "view_dependence", "upsampler", "inpainter", "background")
+    assert None not in [every.model[effect] for effect in effects]
     assert every.model.trajectory.features > 0
     assert paper.model.background is None
 
 
-@pytest.mark.parametrize("sweep", ["dnerf", "methods"])
-def test_seeds_repeat_every_job(sweep):
-    once, thrice = ({tuple(sorted(job)) for job in jobs_of(sweep, f"seeds={n}")} for n in (1, 3))
+def test_seeds_repeat_every_job():
+    once, thrice = ({tuple(sorted(job)) for job in jobs_of("dnerf", f"seeds={n}")} for n in (1, 3))
+    again = [{tuple(word.replace("seed=0", f"seed={n}") for word in job) for job in once} for n in range(3)]
+    assert set.union(*again) == thrice
     assert len(thrice) == 3 * len(once)
-    for seed in range(3):
-        assert {tuple(word.replace("seed=0", f"seed={seed}") for word in job) for job in once} <= thrice
 
 
 @pytest.mark.slow
@@ -99,17 +79,18 @@ def test_every_job_composes_and_has_a_folder_of_its_own(sweep):
     assert len(set(folders)) == len(folders)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("budget", ["budget.minutes=3", "budget.iterations=300"])
-def test_every_job_of_the_price_list_has_a_folder_of_its_own(budget):
-    bounds = ["budget.minutes=null", budget]
-    jobs = (
-        composed("sweeps=price_list", "data.scene=x", *bounds, *shlex.split(change)) for change in CHANGES
-    )
-    assert len({hashed(job).run for job in jobs}) == len(CHANGES)
+every_change = pytest.param(CHANGES, marks=pytest.mark.slow)
 
 
-@pytest.mark.parametrize("dataset", COUNTERPARTS)
+@pytest.mark.parametrize("changes", [CHANGES[::40], every_change], ids=["some", "all"])
+def test_every_change_composes_and_has_a_folder_of_its_own(changes):
+    common = ["experiment=dnerf", "data.scene=x", "budget.minutes=3"]
+    jobs = [job_of("price_list", *common, *shlex.split(change)) for change in changes]
+    assert len({hashed(job).run for job in jobs}) == len(changes)
+    assert {(job.budget.minutes, job.data.held_out) for job in jobs} == {(3, 8)}
+
+
+@pytest.mark.parametrize("dataset", ["dnerf", "hypernerf", "nhr", "lego_complete"])
 def test_a_counterpart_stands_in_for_each_dataset(dataset):
     config = job_of("ablation_modules", f"scene=counterpart_{dataset}", "ablation=full", "preset=demo")
     assert "Synthetic" in config.data._target_
@@ -117,87 +98,38 @@ def test_a_counterpart_stands_in_for_each_dataset(dataset):
     assert config.stage.fine.num_voxels == [[0, 13824]]
 
 
-CHANGES = yaml.safe_load((ROOT / "sweeps" / "price_list.yaml").read_text())["hydra"]["sweeper"]["changes"]
-
-
 def test_the_price_list_changes_one_thing_at_a_time():
     assert CHANGES[0] == ""
     assert len({frozenset(change.split()) for change in CHANGES}) == len(CHANGES) == 46
     jobs = changed(jobs_of("price_list", "seeds=2"), CHANGES)
     assert len(jobs) == 92
-    assert jobs[2:4] == [
-        ["seed=0", "budget.minutes=3", CHANGES[1]],
-        ["seed=1", "budget.minutes=3", CHANGES[1]],
-    ]
+    assert jobs[2:4] == [[f"seed={seed}", "budget.minutes=3", CHANGES[1]] for seed in (0, 1)]
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        pytest.param(
-            change, marks=[] if re.search(r"every|precision|recompute", change) else pytest.mark.slow
-        )
-        for change in CHANGES[1:]
-    ],
-)
-def test_every_change_composes_and_changes_what_is_computed(change):
-    common = ["sweeps=price_list", "experiment=dnerf", "data.scene=x", "budget.minutes=3"]
-    config, before = (composed(*common, *words) for words in (change.split(), []))
-    build_run(config)
-    assert (config.budget.minutes, config.data.held_out) == (3, 8)
-    assert hashed(config).run != hashed(before).run
-
-
-def test_a_job_of_the_price_list_is_named_by_what_was_typed(forewarp, in_tmp):
+def test_a_job_is_named_by_what_was_typed_but_not_by_how_it_runs(forewarp, in_tmp):
     scene = ["data=dnerf", "data.root=nowhere", "data.scene=x", "seed=3", "budget.minutes=2"]
-    for typed in ([], ["preset.rays=64"], ["model/motion=dct_features", "preset.bases=5"]):
-        shown = forewarp("train", "sweeps=price_list", *scene, *typed, "--cfg", "job", "--resolve")
-        assert yaml.safe_load(shown.out)["variant"] == {"name": " ".join(sorted(typed))}
+    how = ["checkpoint_seconds=9", "score=ssim", "evaluate=false", "sentinel.skip=1", "trust=[x]"]
+    how += [f"callbacks{word}" for word in ("=default", ".pictures=null", ".accuracy=null")]
+    how += ["absent=skip", "data_changed=accept"]
+    for typed in ([], ["model/motion=dct_features", "preset.bases=5"]):
+        shown = forewarp("train", "sweeps=price_list", *scene, *how, *typed, "--cfg", "job", "--resolve")
+        assert yaml.safe_load(shown.out)["variant"] == {"name": " ".join(typed)}
 
 
-def test_a_job_is_not_named_by_how_it_runs(forewarp, in_tmp):
-    how = [
-        *(
-            "checkpoint_seconds=9",
-            "score=ssim",
-            "evaluate=false",
-            "sentinel.skip=1",
-            "absent=skip",
-            "trust=[x]",
-        ),
-        *("data_changed=accept", "callbacks=default", "callbacks.pictures=null", "callbacks.accuracy=null"),
-    ]
-    shown = forewarp("train", "sweeps=accuracy_time", *how, "--cfg", "job", "--resolve")
-    assert yaml.safe_load(shown.out)["variant"] == {"name": ""}
-
-
-@pytest.mark.parametrize(
-    "path",
-    [*(CONF / "ablation").glob("*.yaml"), *(ROOT / "sweeps").glob("*.yaml")],
-    ids=lambda path: path.stem,
-)
-def test_what_reproduces_a_table_names_its_method(path):
-    text = path.read_text()
-    inherited = re.search(r"^  - (full|accuracy_time)$", text, re.MULTILINE)
-    assert inherited or "\n  - override /model: forward\n" in text or path.stem == "methods"
-
-
-def test_a_sweep_over_methods_has_both():
-    jobs = [composed("sweeps=methods", *job) for job in jobs_of("methods")[:2]]
-    assert sorted(config.model.name for config in jobs) == ["backward", "forward"]
-    assert composed("sweeps=accuracy_time", "data.scene=x", "model=backward").model.name == "backward"
+@pytest.mark.parametrize("folder", [CONF / "ablation", ROOT / "sweeps"], ids=["ablation", "sweeps"])
+def test_what_reproduces_a_table_names_its_method(folder):
+    for path in folder.glob("*.yaml"):
+        text = path.read_text()
+        inherited = re.search(r"^  - (full|accuracy_time)$", text, re.MULTILINE)
+        assert inherited or "\n  - override /model: forward\n" in text or path.stem == "methods", path
 
 
 def test_an_ablation_takes_one_thing_from_all():
     common = ["scene=dnerf_hook", "preset=fast"]
     full = composed(*common, "ablation=full")
     assert None not in (full.model.upsampler, full.model.inpainter, full.model.view_dependence)
-    without = {
-        "no_upsampling": "upsampler",
-        "no_inpainter": "inpainter",
-        "no_view": "view_dependence",
-    }
-    for name, part in without.items():
+    parts = {"no_upsampling": "upsampler", "no_inpainter": "inpainter", "no_view": "view_dependence"}
+    for name, part in parts.items():
         model = composed(*common, f"ablation={name}").model
         assert [key for key in full.model if full.model[key] != model[key]] == [part]
         assert model[part] is None
@@ -206,6 +138,7 @@ def test_an_ablation_takes_one_thing_from_all():
         before = full.objective.fine.weights
         assert [term for term in before if before[term] != weights[term]] == terms
         assert all(weights[term] == 0 for term in terms)
+    assert composed(*common, "ablation=canonical_middle").data.canonical == "middle"
 
 
 def folder_of(config, **changes):
@@ -222,56 +155,29 @@ def test_a_job_is_known_by_what_it_computes():
     same = folder_of(job)
     assert same == folder_of(other)
     assert "{hash}" not in same
-    others = ({"seed": 1}, {"budget__minutes": 3}, {"data__rays": 7}, {"stage__fine__share": 0.1})
+    others = [{"seed": 1}, {"budget__minutes": 3}, {"data__rays": 7}, {"stage__fine__share": 0.1}]
+    others += [{"trainer__precision": "bf16-mixed"}]
     assert len({same, *(folder_of(job, **changes) for changes in others)}) == 1 + len(others)
     assert folder_of(job, sheets=1, threads=1, trainer__accelerator="cpu") == same
-    plain = composed("data.scene=x", "data=dnerf")
-    assert folder_of(plain) == "runs/x/forward-fast-seed0"
+    steps = {"budget__minutes": None, "budget__iterations": 5}  # without minutes the machine does not count
+    folders = [folder_of(job, **steps, trainer__precision=p) for p in (None, "32-true", "bf16-mixed")]
+    assert folders[0] == folders[1] != folders[2]
+    assert folder_of(composed("data.scene=x", "data=dnerf")) == "runs/x/forward-fast-seed0"
 
 
-@pytest.mark.parametrize("budget", [{}, {"budget__minutes": None, "budget__iterations": 5}])
-def test_the_precision_of_a_run_counts(budget):
-    job = composed("sweeps=dnerf", "scene=dnerf_hook")
-    assert folder_of(job, **budget) != folder_of(job, **budget, trainer__precision="bf16-mixed")
-
-
-def test_full_precision_bounded_by_steps_keeps_its_folder():
-    job = composed("sweeps=dnerf", "scene=dnerf_hook", "budget.minutes=null", "budget.iterations=5")
-    assert folder_of(job) == folder_of(job, trainer__precision="32-true")
-
-
-def test_the_canonical_middle_reaches_the_data():
-    run = build_run(composed("scene=dnerf_hook", "ablation=canonical_middle"))
-    assert run.datamodule._canonical == "middle"
-
-
-@pytest.mark.parametrize("preset", ["demo", "fast"])
-def test_what_stands_alone_begins_as_the_coarse_stage_would(preset):
-    common = ["scene=dnerf_hook", f"preset={preset}"]
-    coarse = composed(*common, "ablation=full").stage.coarse
+def test_what_stands_alone_begins_as_the_coarse_stage_would():
+    common = ["scene=dnerf_hook", "preset=fast"]
     full, alone = (composed(*common, f"ablation={name}").stage for name in ("full", "no_coarse"))
     assert alone.coarse is None
     changed = {key for key in full.fine if full.fine[key] != alone.fine[key]}
     assert changed <= {"start", "lr_hold", "bases", "hull_frames", "hull_grow", "confine", "curriculum", "lr"}
-    assert all(alone.fine[key] == coarse[key] for key in changed - {"lr"})
-    assert alone.fine.lr == {**full.fine.lr, "flow": coarse.lr.flow}
+    assert all(alone.fine[key] == full.coarse[key] for key in changed - {"lr"})
+    assert alone.fine.lr == {**full.fine.lr, "flow": full.coarse.lr.flow}
 
 
 @pytest.mark.parametrize("preset", ["demo", "fast", "faithful"])
 def test_the_voxel_networks_come_with_the_fine_stage(preset):
-    common = ["scene=dnerf_hook", f"preset={preset}"]
-    stage = composed(*common, "ablation=full").stage
-    assert not {"upsampler", "inpainter"} & set(stage.coarse.effects)
-    assert {"upsampler", "inpainter"} <= set(stage.fine.effects)
-
-
-def test_captures_have_numbers_of_their_own_in_every_preset():
-    quick, faithful = composed("scene=hypernerf_broom"), composed("scene=hypernerf_broom", "preset=faithful")
-    assert (quick.preset.bases, faithful.preset.bases) == (8, 25)
-    assert quick.model.view_dependence is None
-    assert faithful.model.view_dependence is not None
-    for config in (quick, faithful):
-        assert config.data.scene == "broom2"
-        assert config.model.background is not None
-        assert config.stage.fine.num_voxels[-1][1] == 343000
-        assert config.objective.fine.weights.static_points == 1e-2
+    stage = composed("scene=dnerf_hook", f"preset={preset}", "ablation=full").stage
+    networks = {"upsampler", "inpainter"}
+    assert networks.isdisjoint(stage.coarse.effects)
+    assert networks <= set(stage.fine.effects)

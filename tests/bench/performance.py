@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import os
 import statistics
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import torch
@@ -17,10 +16,14 @@ import torch
 from forewarp.cli.entry import quiet
 from forewarp.methods.voxel.terms import TERMS
 from forewarp.ops.splat import average_splat
+from forewarp.ops.warmup import warm_up
 from forewarp.runs.config_files import project_root
+from forewarp.training.device import peak_memory_bytes, reset_peak_memory
 from tests.bench.timed_cases import (
     ALONE,
     CASES,
+    REPEATS,
+    Case,
     frame_work,
     milliseconds,
     splat_work,
@@ -66,35 +69,33 @@ def mebibytes(count: int) -> str:
     return f"{count / 2**20:.0f}"
 
 
-def growth_tables(measured: Sequence[dict]) -> str:
-    """Make a table for each case: median time, memory, the dense version beside it, and the fitted power.
+def cost_of(case: Case, size: float, dense: bool) -> tuple[float, int]:
+    """Return median seconds, and bytes that the work needs at its peak."""
+    work = case.make(size, dense)
+    reset_peak_memory()
+    before = peak_memory_bytes()
+    work()
+    peak = peak_memory_bytes() - before
+    return timed(work, 3 if dense else REPEATS), peak
 
-    Args:
-        measured: the entries of pytest-benchmark's file.
-    """
-    found = {}
-    for entry in measured:
-        about = entry["extra_info"]
-        found[about["name"], about["size"], about["dense"]] = entry["stats"]["median"], about["peak"]
+
+def growth_tables(cases: Mapping[str, Case] = CASES) -> str:
+    """Make a table for each case: median time, memory, the dense version beside it, and the fitted power."""
+    warm_up()
     parts = []
-    for name, case in CASES.items():
-        sizes = [size for size in case.sizes if (name, size, False) in found]
-        if len(sizes) < 2:
-            continue
-        lines = []
-        for size in sizes:
-            own, dense = found[name, size, False], found.get((name, size, True))
+    for name, case in cases.items():
+        own, lines = [cost_of(case, size, False) for size in case.sizes], []
+        for size, (seconds, peak) in zip(case.sizes, own):
             beside = ["", "", ""]
-            if dense is not None:
-                beside = [milliseconds(dense[0]), mebibytes(dense[1]), f"{dense[0] / own[0]:.1f}"]
-            lines.append([f"{size:g}", milliseconds(own[0]), mebibytes(own[1]), *beside])
-        amounts = [case.work(size) for size in sizes]
-        fitted = slope(amounts, [found[name, size, False][0] for size in sizes])
-        against = "its cube" if case.work(2) == 8 else "its square" if case.work(2) == 4 else "it"
+            if size in case.dense_sizes:
+                slow, much = cost_of(case, size, True)
+                beside = [milliseconds(slow), mebibytes(much), f"{slow / seconds:.1f}"]
+            lines.append([f"{size:g}", milliseconds(seconds), mebibytes(peak), *beside])
+        fitted = slope([case.work(size) for size in case.sizes], [seconds for seconds, _ in own])
+        against = {2: "it", 4: "its square", 8: "its cube"}[case.work(2)]
         head = [case.axis, "ms", "MiB", "dense, ms", "dense, MiB", "times cheaper"]
-        parts.append(
-            f"**{name}**: seconds grow as {against} to the power {fitted:.2f}\n\n{table(head, lines)}"
-        )
+        title = f"**{name}**: seconds grow as {against} to the power {fitted:.2f}"
+        parts.append(f"{title}\n\n{table(head, lines)}")
     return "\n\n".join(parts)
 
 
@@ -148,23 +149,15 @@ def goals_table(side: int = 80, rays: int = 8192, picture: int = 400, frame_side
         timed(frame_work(picture, False, first, frame_side, plain=True)) for first in (True, False)
     )
     full = timed(frame_work(picture, False, side=side), 3)
+    against = f"{printed:.1f} s, {printed / step:.1f} times"
+    frame, error = f"{picture}^2 picture of {frame_side}^3, first of its time", splat_error(side)
     rows = [
         [f"fine step, {side}^3 to {2 * side}^3, {rays} rays", "< 3.5 s", f"{step:.2f} s", step < 3.5],
-        [
-            "the same densely, plain PyTorch as it runs by itself",
-            "12 times that",
-            f"{printed:.1f} s, {printed / step:.1f} times",
-            printed > 12 * step,
-        ],
+        ["the same densely, PyTorch by itself", "12 times that", against, printed > 12 * step],
         ["densely with our large pages", "", f"{dense:.1f} s, {dense / step:.1f} times", None],
         [f"splat of {side}^3, a tenth occupied, and back", "< 0.15 s", f"{splat:.4f} s", splat < 0.15],
-        ["its error against float64", "<= 1e-5", f"{splat_error(side):.0e}", splat_error(side) <= 1e-5],
-        [
-            f"{picture}^2 picture of {frame_side}^3, first of its time",
-            "< 1.5 s",
-            f"{first:.2f} s",
-            first < 1.5,
-        ],
+        ["its error against float64", "<= 1e-5", f"{error:.0e}", error <= 1e-5],
+        [frame, "< 1.5 s", f"{first:.2f} s", first < 1.5],
         ["another view of that time", "< 0.5 s", f"{again:.2f} s", again < 0.5],
         [f"first picture with the U-Net, {side}^3 to {2 * side}^3", "< 1.5 s", f"{full:.2f} s", full < 1.5],
     ]
@@ -199,17 +192,13 @@ def by_itself(side: int, rays: int) -> float:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure, and write the tables."""
     parser = argparse.ArgumentParser(prog="python -m tests.bench.performance", description=__doc__)
-    parser.add_argument(
-        "--measured", type=Path, default=Path("runs/bench/growth.json"), help="of pytest-benchmark"
-    )
     parser.add_argument("--document", type=Path, default=None, help="instead of docs/performance.md")
     parser.add_argument("--only", nargs="*", default=("growth", "profile", "box", "goals", "free"))
     given = parser.parse_args(arguments)
     quiet()
     document = given.document or project_root() / "docs" / "performance.md"
-    measured = given.measured
     sections = {
-        "growth": lambda: growth_tables(json.loads(measured.read_text())["benchmarks"]),
+        "growth": growth_tables,
         "profile": profile_table,
         "box": box_table,
         "goals": goals_table,

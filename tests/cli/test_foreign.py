@@ -5,7 +5,6 @@ import json
 import os
 import shutil
 import signal
-import subprocess
 import sys
 from pathlib import Path
 
@@ -14,7 +13,6 @@ import torch
 import yaml
 
 from forewarp import load
-from forewarp.planning.plan_file import with_plan, write_plan
 from forewarp.training.handover import load_handover
 from tests.support.commands import call
 
@@ -26,9 +24,7 @@ SMALL = [
 DISC = [*SMALL, "experiment=disc", "model/view_dependence=tint", "~stage.fine"]
 MIST = [*SMALL, "experiment=disc", "model=mist"]
 TRUST = "trust=[theirs]"
-ADVICE = (
-    "; if you trust the package theirs, add trust=[theirs] (or set FOREWARP_TRUST=theirs)"  # word for word
-)
+ADVICE = "; if you trust the package theirs, add trust=[theirs] (or set FOREWARP_TRUST=theirs)"
 
 
 @pytest.fixture(autouse=True)
@@ -83,7 +79,7 @@ def steps_of(run, stage="coarse"):
     return json.loads((run / stage / "done.json").read_text())["steps"]
 
 
-def test_what_is_typed_trains_and_trains_again_without_trust(forewarp, fitted):
+def test_what_is_typed_trains_and_trains_again_without_trust(forewarp, ok, fitted):
     config = yaml.safe_load((fitted / "config.yaml").read_text())
     assert config["data"]["_target_"] == "theirs.data.DiscDataModule"
     assert config["model"]["view_dependence"]["_target_"] == "theirs.effects.Tint"
@@ -93,12 +89,11 @@ def test_what_is_typed_trains_and_trains_again_without_trust(forewarp, fitted):
     again = forewarp("train", *DISC, "run=run")
     assert (again.status, again.out.strip()[:15]) == (0, "measured before"), again
     (fitted / "metrics.json").unlink()
-    again = forewarp("train", *DISC, "run=run")
-    assert again.status == 0, again.err
+    again = ok("train", *DISC, "run=run")
     assert "coarse: finished before" in again.out
 
 
-def test_an_interrupted_run_goes_on(forewarp, refused, in_tmp, ctrl_c):
+def test_an_interrupted_run_goes_on(forewarp, ok, refused, in_tmp, ctrl_c):
     stopped = forewarp("train", *DISC, "run=run", "callbacks.count.stop_at=3", "evaluate=false", TRUST)
     assert stopped.status == 130, stopped
     run = in_tmp / "run"
@@ -110,19 +105,12 @@ def test_an_interrupted_run_goes_on(forewarp, refused, in_tmp, ctrl_c):
     forget("theirs")
     assert refused("train", "resume=run").endswith(ADVICE)
     assert "theirs" not in sys.modules
-    assert refused("train", "resume=run", "trust=[theirsother]").endswith(
-        "add trust=[theirsother,theirs] (or set FOREWARP_TRUST=theirsother,theirs)"
-    )
-    done = forewarp("train", "resume=run", TRUST)
-    assert done.status == 0, done.err
+    done = ok("train", "resume=run", TRUST)
     assert "coarse: goes on at 50%, step 3" in done.out
     assert steps_of(run) == 6
-    (run / "coarse" / "done.json").unlink()
-    again = forewarp("train", *DISC, "run=run", "evaluate=false")  # the command needs no trust
-    assert again.status == 0, again.err
 
 
-def test_a_stored_run_is_measured_by_who_trusts_it(forewarp, refused, fitted, monkeypatch):
+def test_a_stored_run_is_measured_by_who_trusts_it(ok, refused, fitted, monkeypatch):
     line = refused("evaluate", "run=run")
     assert line.startswith(
         "run/config.yaml: data._target_: expected a class of forewarp, but got 'theirs.data."
@@ -130,35 +118,9 @@ def test_a_stored_run_is_measured_by_who_trusts_it(forewarp, refused, fitted, mo
     assert line.endswith(ADVICE)
     assert "theirs" not in sys.modules
     for override in ("trust=theirs", "trust=[other,theirs]"):
-        done = forewarp("evaluate", "run=run", override)
-        assert done.status == 0, done.err
+        ok("evaluate", "run=run", override)
     monkeypatch.setenv("FOREWARP_TRUST", "other, theirs")
-    done = forewarp("evaluate", "run=run")
-    assert done.status == 0, done.err
-
-
-def test_a_plan_that_names_the_package_is_followed_by_who_trusts_it(tmp_path):
-    file, word = tmp_path / "plan.yaml", "model.view_dependence._target_=theirs.effects.Tint"
-    write_plan(file, {"typed": ["data.scene=x"], "overrides": [word], "of": "0"})
-    with pytest.raises(ValueError, match="expected a class of forewarp, but got 'theirs.effects.Tint'"):
-        with_plan("train", [f"plan={file}"])
-    assert "theirs" not in sys.modules
-    assert word in with_plan("train", [f"plan={file}", TRUST])
-
-
-def test_two_pictures_are_rendered(forewarp, refused, fitted):
-    still = ["run=run", "format=png", "frames=2", "size=16", "threads=1"]
-    assert refused("render", *still).endswith(ADVICE)
-    done = forewarp("render", *still, TRUST)
-    assert done.status == 0, done.err
-    assert len(list((fitted / "videos").rglob("*.png"))) == 2
-
-
-def test_a_run_is_loaded_with_trust(fitted):
-    with pytest.raises(ValueError, match="expected a class of forewarp, but got 'theirs.data.Disc"):
-        load(fitted)
-    module = load(fitted, trust=["theirs"]).module
-    assert type(module.method.view_dependence).__module__ == "theirs.effects"
+    ok("evaluate", "run=run")
 
 
 def test_the_limits_take_trust(forewarp, refused, fitted):
@@ -181,28 +143,7 @@ def test_a_broken_step_is_taken_again_with_trust(refused, in_tmp, capsys):
     assert "parameter: radiance.color" in capsys.readouterr().out
 
 
-def test_seeds_are_swept_scored_and_reported(forewarp, in_tmp, monkeypatch):
-    words = ["--multirun", *DISC, "seeds=2", "run=runs/disc/${variant.name}-seed${seed}", "ablation=base"]
-    done = forewarp("train", *words)
-    assert done.status == 0, done.err
-    runs = sorted(in_tmp.glob("runs/disc/base-seed*"))
-    assert [run.name for run in runs] == ["base-seed0", "base-seed1"]
-    for run in runs:
-        assert set(json.loads((run / "score.json").read_text())["scores"]) >= {"psnr", "ssim"}
-    assert done.out.count("of 1 validation view") == 2
-    forget("theirs")
-    jobs = ",".join(str(run) for run in runs)
-    refusal = forewarp("evaluate", "--multirun", f"run={jobs}")
-    assert refusal.status == 2
-    assert "2 of 2 jobs failed" in refusal.err
-    monkeypatch.setenv("FOREWARP_TRUST", "theirs")
-    assert forewarp("evaluate", "--multirun", f"run={jobs}").status == 0
-    told = forewarp("report", "kind=accuracy_time", f"runs={in_tmp / 'runs'}", f"out={in_tmp / 'page'}")
-    assert told.status == 0, told.err
-    assert "disc" in (in_tmp / "page" / "accuracy-time.md").read_text()
-
-
-def test_the_environment_goes_along_whatever_a_launcher_hands_on(forewarp, fitted, monkeypatch):
+def test_the_environment_goes_along_whatever_a_launcher_hands_on(ok, fitted, monkeypatch):
     """A job of another process or machine: its environment is its own."""
     import hydra
 
@@ -221,54 +162,25 @@ def test_the_environment_goes_along_whatever_a_launcher_hands_on(forewarp, fitte
         return wrapped
 
     monkeypatch.setattr(hydra, "main", elsewhere)
-    done = forewarp("evaluate", "run=run")
-    assert done.status == 0, done.err
+    ok("evaluate", "run=run")
 
 
-@pytest.mark.slow
-def test_a_console_finds_the_package_by_its_folder(in_tmp):
-    """In a process of its own, with ``--config-dir`` in the place of the search path."""
-    code = "from forewarp.cli.train import main; main()"
-    words = ["--config-dir", str(HERE / "theirs" / "conf"), *DISC[1:], "run=run", "evaluate=false"]
-    done = subprocess.run(
-        [sys.executable, "-c", code, *words], env={**os.environ, "PYTHONPATH": str(HERE)}, check=False
-    )
-    assert done.returncode == 0
-    assert steps_of(in_tmp / "run") == 6
-
-
-def test_a_method_of_theirs_trains_once(forewarp, mist):
-    config = yaml.safe_load((mist / "config.yaml").read_text())
-    assert (config["model"]["name"], config["model"]["count"]) == ("mist", 8)
-    assert "objective" not in config
-    assert (steps_of(mist, "fine"), (mist / "fine" / "steps.txt").read_text()) == (6, "6")
-    again = forewarp("train", *MIST, "run=run")
-    assert (again.status, again.out.strip()[:15]) == (0, "measured before"), again
-
-
-def test_a_method_of_theirs_is_resumed_measured_and_rendered_with_trust(forewarp, refused, in_tmp, ctrl_c):
-    stopped = forewarp("train", *MIST, "run=run", "callbacks.count.stop_at=3", "evaluate=false")
-    assert stopped.status == 130, stopped
-    config = in_tmp / "run" / "config.yaml"
-    config.write_text(config.read_text().replace("stop_at: 3", "stop_at: null"))
-    still = ["run=run", "format=png", "frames=2", "size=16", "threads=1"]
-    for words in (["train", "resume=run"], ["evaluate", "run=run"], ["render", *still]):
+def test_a_method_of_theirs_is_measured_and_rendered_with_trust(ok, refused, mist):
+    assert steps_of(mist, "fine") == 6
+    still = ["format=png", "frames=2", "size=16", "threads=1"]
+    for words in (["evaluate", "run=run"], ["render", "run=run", *still]):
         forget("theirs")
         assert refused(*words).endswith(ADVICE)
-        done = forewarp(*words, TRUST)
-        assert done.status == 0, done.err
-        assert words[0] != "train" or "fine: goes on at 50%, step 3" in done.out
-    assert len(list((in_tmp / "run" / "videos").rglob("*.png"))) == 2
+        ok(*words, TRUST)
+    assert len(list((mist / "videos").rglob("*.png"))) == 2
 
 
-def test_a_method_of_theirs_is_swept_beside_ours_and_reported(forewarp, in_tmp):
+def test_a_method_of_theirs_is_swept_beside_ours_and_reported(ok, in_tmp):
     run = "run=runs/disc/${model.name}-seed${seed}"
-    done = forewarp("train", "--multirun", *SMALL, "experiment=disc", "model=forward,mist", "seed=0", run)
-    assert done.status == 0, done.err
-    runs = sorted(path.name for path in in_tmp.glob("runs/disc/*-seed*"))
-    assert runs == ["forward-seed0", "mist-seed0"]
-    told = forewarp("report", "kind=accuracy_time", "runs=runs", "out=page")
-    assert told.status == 0, told.err
+    done = ok("train", "--multirun", *SMALL, "experiment=disc", "model=forward,mist", run)
+    assert done.out.count("of 1 validation view") == 2  # and scored
+    assert {path.name for path in in_tmp.glob("runs/disc/*-seed*")} == {"forward-seed0", "mist-seed0"}
+    ok("report", "kind=accuracy_time", "runs=runs", "out=page")
     assert "mist-demo" in (in_tmp / "page" / "accuracy-time.md").read_text()
 
 
@@ -282,13 +194,11 @@ def test_a_method_of_theirs_is_opened_with_trust(mist):
     assert scene.trajectories(scene.matter().points, [0.0, 1.0]).shape == (8, 2, 3)
 
 
-def test_a_stage_has_a_method_of_its_own(forewarp, in_tmp):
-    done = forewarp("train", *SMALL, "experiment=disc_in_two", "run=run", "evaluate=false")
-    assert done.status == 0, done.err
+def test_a_stage_has_a_method_of_its_own(ok, in_tmp):
+    ok("train", *SMALL, "experiment=disc_in_two", "run=run", "evaluate=false")
     run = in_tmp / "run"
     assert [steps_of(run, stage) for stage in ("coarse", "fine")] == [3, 3]
     module = load(run, trust=["theirs"]).module
     left = load_handover(run / "coarse").cloud.points
     assert torch.cdist(module.method.began, left).amin(-1).max() == 0
-    done = forewarp("evaluate", "run=run", TRUST)
-    assert done.status == 0, done.err
+    ok("evaluate", "run=run", TRUST)

@@ -11,12 +11,7 @@ import pytest
 
 from forewarp.synth.scenes import synthesize
 
-LAUNCHERS = {
-    "local": [],
-    "joblib": [],
-    "ray": ["+hydra.launcher.ray.init.num_cpus=2"],
-    "submitit": [],
-}
+LAUNCHERS = {"local": [], "joblib": [], "ray": ["+hydra.launcher.ray.init.num_cpus=2"], "submitit": []}
 JOB = [
     *("--multirun", "sweeps=dnerf", "paths.scenes=.", "preset=demo", "budget.minutes=null", "seeds=2"),
     *("trainer=cpu", "threads=1", "data.rays=64", "logger=none", "callbacks.pictures=null", "~stage.fine"),

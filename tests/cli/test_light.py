@@ -22,33 +22,22 @@ for name, *words in json.load(sys.stdin):
     print(json.dumps([status, err.getvalue(), sorted(sys.modules)]), flush=True)
 """
 COMMANDS = ("train", "plan", "evaluate", "render", "report", "synthesize")
+NOWHERE = ["data=dnerf", "data.root=nowhere", "data.scene=x"]
 REFUSED = [
     (["train", "data.scence=x"], "did you mean data.scene?"),
-    (["train", "preset=quick"], "Could not find 'preset/quick'"),
     (["train", "--unknown"], "unrecognized arguments: --unknown"),
     (["train", "sweeps=nothing"], "Could not find 'sweeps/nothing'"),
     (["train", "data=dnerf"], "data.scene: expected a value, but got none"),
-    (
-        ["train", "data=dnerf", "data.root=nowhere", "data.scene=x"],
-        "data.root: expected an existing folder",
-    ),
+    (["train", *NOWHERE], "data.root: expected an existing folder"),
     (["train", "data=nhr", "data.root=.", "data.scene=x"], "x: expected a scene with CamPose.inf"),
     (["train", "resume=nowhere"], "expected the configuration of a run, but got none"),
     (["train", "seeds=2"], "seeds: expected --multirun beside seeds=2"),
     (["train", "plan=nowhere.yaml"], "plan: expected a file that forewarp-plan wrote"),
-    (
-        ["plan", "data=dnerf", "data.root=nowhere", "data.scene=x"],
-        "data.root: expected an existing folder",
-    ),
-    (["plan", "data.scence=x"], "did you mean data.scene?"),
+    (["plan", *NOWHERE], "data.root: expected an existing folder"),
     (["evaluate"], "run: expected the folder of a run, but got nothing"),
     (["evaluate", "run=."], "config.yaml: expected the configuration of a run, but got none"),
-    (["render"], "run: expected the folder of a run, but got nothing"),
     (["render", "run=."], "config.yaml: expected the configuration of a run, but got none"),
-    (
-        ["report", "kind=limits", "runs=[a]"],
-        "config.yaml: expected the configuration of a run, but got none",
-    ),
+    (["report", "kind=limits", "runs=[a]"], "config.yaml: expected the configuration of a run, but got none"),
     (["report"], "runs/accuracy_time: expected folders of runs, but got none"),
     (["synthesize", "folder=."], "expected a new or empty folder, but got one with files"),
 ]

@@ -15,7 +15,7 @@ def run(fitted, tmp_path_factory):
     return shutil.copytree(fitted, tmp_path_factory.mktemp("runs") / "vehicle")
 
 
-@pytest.mark.parametrize("path", ["fixed", "orbit", "both", "trajectories"])
+@pytest.mark.parametrize("path", ["orbit", "both"])
 def test_a_film_of_each_path(forewarp, run, path):
     done = forewarp("render", f"run={run}", f"path={path}", "frames=5", "size=32")
     file = run / "videos" / f"{path}.mp4"
@@ -27,36 +27,28 @@ def test_a_film_of_each_path(forewarp, run, path):
     assert abs(film[1:] - film[:-1]).max((1, 2, 3)).min() > 10  # which moves
 
 
-def test_trajectories_are_drawn_over_fixed(forewarp, run):
+def test_trajectories_are_drawn_over_fixed(ok, run):
     for path in ("fixed", "trajectories"):
-        assert (
-            forewarp("render", f"run={run}", f"path={path}", "frames=3", "format=png", "size=48").status == 0
-        )
+        ok("render", f"run={run}", f"path={path}", "frames=3", "format=png", "size=48")
     plain, drawn = (
-        iio.imread(run / "videos" / path / "0002.png").astype(int) for path in ("fixed", "trajectories")
+        iio.imread(run / f"videos/{path}/0002.png").astype(int) for path in ("fixed", "trajectories")
     )
     assert plain.shape == drawn.shape == (48, 48, 3)
     assert (abs(plain - drawn).max(-1) > 20).sum() > 20
 
 
-def test_a_gif_of_small_images_is_larger(forewarp, run):
-    assert forewarp("render", f"run={run}", "frames=2", "format=gif", "fps=10").status == 0
-    assert iio.imread(run / "videos" / "fixed.gif").shape[:3] == (2, 400, 400)
-
-
-def test_large_images_keep_their_size(forewarp, run, monkeypatch):
-    monkeypatch.setattr(render, "LEAST_SIZE", 16)
-    assert forewarp("render", str(run), "frames=2", "format=gif").status == 0  # a bare folder is one, too
-    assert iio.imread(run / "videos" / "fixed.gif").shape[:3] == (2, SIZE, SIZE)
+def test_a_gif_of_small_images_is_larger_and_large_images_keep_their_size(ok, run, monkeypatch):
+    for least, side in ((render.LEAST_SIZE, 400), (16, SIZE)):
+        monkeypatch.setattr(render, "LEAST_SIZE", least)
+        ok("render", str(run), "frames=2", "format=gif")  # a bare folder is one, too
+        assert iio.imread(run / "videos" / "fixed.gif").shape[:3] == (2, side, side)
 
 
 @pytest.mark.parametrize(
     ("word", "says"),
     [
         ("path=spiral", "path: expected one of fixed, orbit, both, trajectories, but got 'spiral'"),
-        ("time=1.5", "time: expected a number in [0, 1], but got 1.5"),
         ("time=soon", "time: expected a number in [0, 1], but got soon"),
-        ("frames=1", "frames: expected a whole number of at least 2, but got 1"),
         ("frames=2.5", "frames: expected a whole number of at least 2, but got 2.5"),
         ("fps=0", "fps: expected a number in [0.1, 1000], but got 0"),
         ("format=avi", "format: expected one of mp4, gif, png, but got 'avi'"),

@@ -5,11 +5,10 @@ from tests.support.runs_on_disk import write_run
 KINDS = "accuracy_time, price_list, paper, effects, compare, limits"
 
 
-def test_pages_are_written_and_named(forewarp, in_tmp):
+def test_pages_are_written_and_named(ok, in_tmp):
     write_run("runs/accuracy_time")
     for kind, page in (("accuracy_time", "accuracy-time.md"), ("price_list", "price-list.md")):
-        done = forewarp("report", f"kind={kind}", "out=out")
-        assert done.status == 0, done.err
+        done = ok("report", f"kind={kind}", "out=out")
         assert done.out.splitlines()[0] == f"written: out/{page}"
         assert (in_tmp / "out" / page).read_text().startswith("# ")
 
@@ -20,9 +19,8 @@ def test_the_help_has_a_line_for_each_kind(forewarp):
         assert len([line for line in text.splitlines() if line.split()[:1] == [f"kind={kind}"]]) == 1
 
 
-def test_limits_of_a_pattern_of_runs(forewarp, fitted):
-    done = forewarp("report", "kind=limits", f"runs={fitted.parent}/r*", "views=1")
-    assert done.status == 0, done.err
+def test_limits_of_a_pattern_of_runs(ok, fitted):
+    done = ok("report", "kind=limits", f"runs={fitted.parent}/r*", "views=1")
     head, _, row = ([cell.strip() for cell in line.split("|")[1:-1]] for line in done.out.splitlines())
     assert (head[0], row[0], len(row)) == ("scene", "vehicle", len(head))
 
@@ -36,10 +34,7 @@ def test_limits_of_a_pattern_of_runs(forewarp, fitted):
         (["published=none.yaml"], "none.yaml: expected a usable file or folder, but got No such file"),
         (["kind=paper", "runs=[a,b]"], "runs: expected one folder for kind=paper, but got a list"),
         (["kind=compare"], "runs: expected folders of runs, but got none; set runs="),
-        (
-            ["kind=limits", "runs=none"],
-            "expected the configuration of a run, but got none; set runs",
-        ),
+        (["kind=limits", "runs=none"], "expected the configuration of a run, but got none; set runs"),
         (["kind=limits", "runs=none", "views=0"], "views: expected a whole number > 0, but got 0"),
     ],
 )

@@ -47,18 +47,16 @@ def config(run):
     return yaml.safe_load((run / "config.yaml").read_text())
 
 
-def test_a_run_is_resumed_by_its_folder_alone(forewarp, begun):
+def test_a_run_is_resumed_by_its_folder_alone(ok, begun):
     before = config(begun)
-    done = forewarp("train", f"resume={begun}")
-    assert done.status == 0, done.err
+    ok("train", f"resume={begun}")
     assert json.loads((begun / "coarse" / "done.json").read_text())["steps"] == 6
     assert config(begun) == before
     assert "forewarp-train data=dnerf" in before["command"]
 
 
-def test_beside_it_stands_only_what_may_change(forewarp, refused, begun):
-    done = forewarp("train", f"resume={begun}", "threads=1", "sentinel.skip=3", "trainer=cpu")
-    assert done.status == 0, done.err
+def test_beside_it_stands_only_what_may_change(ok, refused, begun):
+    ok("train", f"resume={begun}", "threads=1", "sentinel.skip=3", "trainer=cpu")
     assert (config(begun)["threads"], config(begun)["sentinel"]) == (1, {"skip": 3})
     line = refused("train", f"resume={begun}", "seed=3")
     assert line.startswith(
@@ -68,7 +66,7 @@ def test_beside_it_stands_only_what_may_change(forewarp, refused, begun):
     assert line.endswith("expected the configuration of a run, but got none; set resume=<a run's folder>")
 
 
-def test_changed_data_are_refused_unless_accepted(forewarp, refused, begun):
+def test_changed_data_are_refused_unless_accepted(ok, refused, begun):
     path = begun.parent / "vehicle" / "transforms_train.json"
     path.write_text(path.read_text() + " ")
     for words in ([f"resume={begun}"], [*SMALL, "data.root=.", "run=run"]):
@@ -77,41 +75,37 @@ def test_changed_data_are_refused_unless_accepted(forewarp, refused, begun):
         assert "transforms_train.json; use run=..., or go on with data_changed=accept" in line
     line = refused("train", f"resume={begun}", "data_changed=x")
     assert "data_changed: expected one of refuse, accept, but got x" in line
-    done = forewarp("train", f"resume={begun}", "data_changed=accept")
-    assert done.status == 0, done.err
-    assert forewarp("train", f"resume={begun}").status == 0  # it was accepted once for all
+    ok("train", f"resume={begun}", "data_changed=accept")
+    ok("train", f"resume={begun}")  # it was accepted once for all
     path.write_text(path.read_text() + " ")
     assert "expected the data" in refused("train", f"resume={begun}")  # and not what comes later
 
 
-def test_a_run_begun_inside_its_scene_goes_on(forewarp, begun, monkeypatch):
+def test_a_run_begun_inside_its_scene_goes_on(ok, begun, monkeypatch):
     scene = begun.parent / "vehicle"
     shutil.rmtree(begun)
     monkeypatch.chdir(scene)
-    assert forewarp("train", *SMALL, "data.root=..", "run=runs/a").status == 0
+    ok("train", *SMALL, "data.root=..", "run=runs/a")
     (scene / "runs" / "a" / "coarse" / "done.json").unlink()
-    done = forewarp("train", "resume=runs/a")
-    assert done.status == 0, done.err
+    ok("train", "resume=runs/a")
 
 
-def test_what_is_measured_on_changed_data_says_so(forewarp, begun):
-    assert forewarp("train", f"resume={begun}").status == 0
+def test_what_is_measured_on_changed_data_says_so(forewarp, ok, begun):
+    ok("train", f"resume={begun}")
     path = begun.parent / "vehicle" / "transforms_test_time.json"
     assert "warning:" not in forewarp("evaluate", f"run={begun}").err
     path.write_text(path.read_text() + " ")
-    done = forewarp("evaluate", f"run={begun}")
-    assert done.status == 0, done.err
+    done = ok("evaluate", f"run={begun}")
     said = f"warning: {begun}/data.json: expected the data that the run was begun with, but got others: "
     assert f"{said}transforms_test_time.json" in done.err
 
 
-def test_a_folder_in_work_is_refused(forewarp, refused, begun):
+def test_a_folder_in_work_is_refused(ok, refused, begun):
     with locked(begun):
         line = refused("train", f"resume={begun}")
         assert f"expected a run that nobody works on, but got one of process {os.getpid()} on " in line
         assert "nobody works on" in refused("evaluate", f"run={begun}")
-    done = forewarp("train", f"resume={begun}", "evaluate=true")
-    assert done.status == 0, done.err
+    ok("train", f"resume={begun}", "evaluate=true")
     with locked(begun):  # measured
         assert "nobody works on" in refused("train", f"resume={begun}", "evaluate=true")
 
@@ -140,12 +134,19 @@ ODD = {
 }
 
 
+def refused_replay(bundle, capsys):
+    with pytest.raises(SystemExit) as leaving:
+        replay([str(bundle)])
+    assert leaving.value.code == 2
+    return capsys.readouterr().err
+
+
 def test_a_broken_step_ends_in_one_line_and_is_seen_again(forewarp, refused, begun, in_tmp, capsys):
     shutil.rmtree(in_tmp / "run")
     broken = [*SMALL, "data.root=.", "run=run", "stage.coarse.lr.color=1e39"]
     line = refused("train", *broken)
     assert line.startswith(
-        "stage.coarse: expected finite numbers, but got parameter: radiance.color at step 0, "
+        "stage.coarse: expected finite numbers, but got parameter: radiance.color at step 0,"
     )
     bundle = in_tmp / "run" / "coarse" / "broken" / "step_0.pt"
     assert f"python -m forewarp.replay {bundle.relative_to(in_tmp)} shows it again" in line
@@ -158,22 +159,15 @@ def test_a_broken_step_ends_in_one_line_and_is_seen_again(forewarp, refused, beg
         changed = copy.deepcopy(content)
         told[0](changed)
         torch.save(changed, in_tmp / "odd.pt")
-        with pytest.raises(SystemExit) as leaving:
-            replay([str(in_tmp / "odd.pt")])
-        assert leaving.value.code == 2
-        line = capsys.readouterr().err
+        line = refused_replay(in_tmp / "odd.pt", capsys)
         assert line.startswith(f"forewarp.replay: error: {in_tmp}/odd.pt: "), spoil
         assert f"expected {told[1]}" in line, spoil
         assert len(line.splitlines()) == 1
     bundle.write_bytes(b"x")
-    with pytest.raises(SystemExit) as leaving:
-        replay([str(bundle)])
-    assert leaving.value.code == 2
-    said = capsys.readouterr().err
-    assert said.startswith(f"forewarp.replay: error: {bundle}: expected a step that a run left in broken/")
+    assert f"{bundle}: expected a step that a run left in broken/" in refused_replay(bundle, capsys)
 
 
-def test_skipped_steps_are_told(forewarp, begun, monkeypatch):
+def test_skipped_steps_are_told(ok, begun, monkeypatch):
     from forewarp.data.batches import Sampler
 
     draw, drawn = Sampler.draw, []
@@ -187,6 +181,5 @@ def test_skipped_steps_are_told(forewarp, begun, monkeypatch):
 
     shutil.rmtree(begun)
     monkeypatch.setattr(Sampler, "draw", spoiled)
-    done = forewarp("train", *SMALL, "data.root=.", "run=run", "sentinel.skip=1")
-    assert done.status == 0, done.err
+    done = ok("train", *SMALL, "data.root=.", "run=run", "sentinel.skip=1")
     assert "coarse: 1 broken steps skipped; each lies in run/coarse/broken" in done.out

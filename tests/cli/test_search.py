@@ -26,11 +26,9 @@ def folder(in_tmp):
     return in_tmp
 
 
-def test_three_trials_find_a_best_one_and_go_on(forewarp, folder):
-    done = forewarp("train", *SEARCH, "hydra.sweeper.n_trials=2")
-    assert done.status == 0, done.err
-    done = forewarp("train", *SEARCH, "hydra.sweeper.n_trials=3")
-    assert done.status == 0, done.err
+def test_three_trials_find_a_best_one_and_go_on(ok, folder):
+    ok("train", *SEARCH, "hydra.sweeper.n_trials=2")
+    done = ok("train", *SEARCH, "hydra.sweeper.n_trials=3")
     assert done.out.count("finished before") == 2
     runs = list(folder.glob("runs/search/vehicle/forward-demo-seed0-*"))
     assert len(runs) == 3

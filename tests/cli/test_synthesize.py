@@ -30,11 +30,11 @@ def test_writes_a_scene_that_reads(forewarp, in_tmp):
     assert [path.name for path in in_tmp.joinpath("a").iterdir()] == ["s"]
 
 
-def test_keeps_a_scene_unless_told_otherwise(forewarp, refused, in_tmp):
+def test_keeps_a_scene_unless_told_otherwise(forewarp, ok, refused, in_tmp):
     forewarp("synthesize", "folder=s", *SMALL)
     assert "s: expected a new or empty folder" in refused("synthesize", "folder=s", *SMALL, "seed=1")
     assert json.loads((in_tmp / "s" / "synthesis.json").read_text())["seed"] == 0
-    assert forewarp("synthesize", "folder=s", *SMALL, "seed=1", "overwrite=true").status == 0
+    ok("synthesize", "folder=s", *SMALL, "seed=1", "overwrite=true")
     assert json.loads((in_tmp / "s" / "synthesis.json").read_text())["seed"] == 1
 
 
@@ -44,37 +44,6 @@ def test_never_overwrites_what_is_no_scene(refused, in_tmp):
     assert "expected a new or empty folder" in refused("synthesize", "folder=s", *SMALL, "overwrite=true")
     assert (in_tmp / "s" / "thesis.txt").read_text() == "dear"
     assert "expected a folder, but got the file" in refused("synthesize", "folder=s/thesis.txt")
-
-
-@pytest.mark.parametrize(
-    ("argument", "line"),
-    [
-        ("motion=fly", "motion: expected one of"),
-        ("size=2", "size: expected a whole number of at least 8, but got 2"),
-    ],
-)
-def test_bad_arguments_leave_nothing(refused, in_tmp, argument, line):
-    assert line in refused("synthesize", "folder=s", argument)
-    assert list(in_tmp.iterdir()) == []
-
-
-def test_a_missing_extra_is_named(refused, in_tmp, monkeypatch):
-    def absent(*_, **__):
-        raise ImportError("expected trimesh and embreex; pip install 'forewarp[synth]'")
-
-    monkeypatch.setitem(WRITERS, "dnerf", absent)
-    assert refused("synthesize", "folder=s") == "expected trimesh and embreex; pip install 'forewarp[synth]'"
-
-
-def test_the_data_module_writes_the_scene_at_first_use(tmp_path, capsys):
-    data = SyntheticDataModule(tmp_path, "s", synthesis=ARGUMENTS, rays=8)
-    assert not (tmp_path / "s").exists()
-    data.setup("fit")
-    assert len(data.scene.train) == 3
-    before = (tmp_path / "s" / "transforms_train.json").stat().st_mtime_ns
-    SyntheticDataModule(tmp_path, "s", synthesis=ARGUMENTS, rays=8).setup("fit")
-    assert (tmp_path / "s" / "transforms_train.json").stat().st_mtime_ns == before
-    assert "writing s 100%" in capsys.readouterr().err
 
 
 def test_runs_that_begin_together_write_a_scene_once(tmp_path, monkeypatch):
@@ -94,15 +63,6 @@ def test_runs_that_begin_together_write_a_scene_once(tmp_path, monkeypatch):
     assert is_scene(tmp_path / "s")
 
 
-def test_a_scene_made_otherwise_is_refused(tmp_path, capsys):
-    SyntheticDataModule(tmp_path, "s", synthesis=ARGUMENTS).setup("fit")
-    other = SyntheticDataModule(tmp_path, "s", synthesis=ARGUMENTS | {"frames": 4})
-    with pytest.raises(
-        SceneError, match=r"synthesis\.json: frames: expected 4, but got 3; use another data\.scene"
-    ):
-        other.setup("fit")
-
-
 def test_every_dataset_has_a_writer_whose_defaults_are_the_configs():
     assert sorted(WRITERS) == options("dataset")
     for name, writer in WRITERS.items():
@@ -111,69 +71,6 @@ def test_every_dataset_has_a_writer_whose_defaults_are_the_configs():
             if key not in ("folder", "progress"):
                 default = parameter.default
                 assert config[key] == (list(default) if isinstance(default, tuple) else default), (name, key)
-
-
-@pytest.mark.parametrize(
-    ("dataset", "keys", "marker"),
-    [
-        (
-            "lego_complete",
-            ["size=8", "frames=2", "motions=[lift]", "test_views=[1,1,1]"],
-            "lift/transforms_train.json",
-        ),
-        ("hypernerf", ["size=16", "frames=3"], "dataset.json"),
-        ("nhr", ["size=24", "frames=2", "points=20"], "CamPose.inf"),
-    ],
-)
-def test_every_dataset_is_written_whole_and_replaced_when_told(
-    forewarp, refused, in_tmp, dataset, keys, marker
-):
-    command = ["synthesize", f"dataset={dataset}", "folder=s", "samples_per_pixel=1", *keys]
-    done = forewarp(*command)
-    assert (done.status, done.out) == (0, "written: s\n")
-    assert "images 100%" in done.err
-    assert (in_tmp / "s" / marker).is_file()
-    assert json.loads((in_tmp / "s" / "synthesis.json").read_text())["dataset"] == dataset
-    assert "set overwrite=true" in refused(*command)
-    assert forewarp(*command, "overwrite=true").status == 0
-    assert [path.name for path in in_tmp.iterdir()] == ["s"]
-
-
-def test_keys_of_another_dataset_are_refused(refused, in_tmp):
-    assert "motions" in refused("synthesize", "dataset=nhr", "motions=[lift]")
-    assert "hypernerf" in refused("synthesize", "dataset=foo")
-    assert list(in_tmp.iterdir()) == []
-
-
-def test_the_help_says_what_each_dataset_is(forewarp):
-    out = forewarp("synthesize", "--help").out
-    assert all(f"{name} " in out for name in WRITERS)
-    assert "dataset           dnerf | hypernerf | lego_complete | nhr" in out
-
-
-@pytest.mark.parametrize(
-    ("kind", "scene", "synthesis", "counts"),
-    [
-        (
-            SyntheticLegoCompleteDataModule,
-            "drive",
-            {"size": 8, "frames": 2, "motions": ["lift", "drive"], "test_views": [1, 2, 1], "val_views": 0},
-            (2, 2 + 3 + 1),
-        ),
-        (SyntheticHyperNeRFDataModule, "s", {"size": 16, "frames": 3}, (3, 3)),
-        (SyntheticNHRDataModule, "s", {"size": 24, "frames": 2, "points": 20}, (36, 4)),
-    ],
-)
-def test_every_dataset_is_synthesised_at_first_use(tmp_path, capsys, kind, scene, synthesis, counts):
-    synthesis = {**synthesis, "samples_per_pixel": 1}
-    data = kind(tmp_path / "root", scene, synthesis=synthesis, rays=8)
-    data.setup("fit")
-    assert (len(data.scene.train), len(data.scene.test)) == counts
-    assert "100%" in capsys.readouterr().err
-    kind(tmp_path / "root", scene, synthesis=synthesis, rays=8).setup("fit")
-    assert capsys.readouterr().err == ""
-    with pytest.raises(SceneError, match="frames: expected 7"):
-        kind(tmp_path / "root", scene, synthesis={**synthesis, "frames": 7}).setup("fit")
 
 
 def test_a_folder_of_something_else_is_left_alone(tmp_path):
@@ -188,3 +85,55 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path):
 def test_synthetic_data_names_arguments_of_its_writer(name, tmp_path):
     data = instantiate(composed(f"data={name}", f"data.root={tmp_path}").data, _convert_="all")
     assert set(data.synthesis) <= set(inspect.signature(WRITERS[data.dataset]).parameters)
+
+
+def test_bad_arguments_leave_nothing(refused, in_tmp):
+    line = refused("synthesize", "folder=s", "size=2")
+    assert line == "size: expected a whole number of at least 8, but got 2; set size"
+    assert list(in_tmp.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("dataset", "keys", "marker"),
+    [
+        ("lego_complete", ["size=8", "frames=2", "motions=[lift]", "test_views=[1,1,1]"], "lift"),
+        ("hypernerf", ["size=16", "frames=3"], "dataset.json"),
+        ("nhr", ["size=24", "frames=2", "points=20"], "CamPose.inf"),
+    ],
+)
+def test_every_dataset_is_written_whole_and_replaced_when_told(
+    forewarp, ok, refused, in_tmp, dataset, keys, marker
+):
+    command = ["synthesize", f"dataset={dataset}", "folder=s", "samples_per_pixel=1", *keys]
+    done = forewarp(*command)
+    assert (done.status, done.out) == (0, "written: s\n")
+    assert "images 100%" in done.err
+    assert (in_tmp / "s" / marker).exists()
+    assert "set overwrite=true" in refused(*command)
+    ok(*command, "overwrite=true")
+    assert [path.name for path in in_tmp.iterdir()] == ["s"]
+
+
+LEGO = {"size": 8, "frames": 2, "motions": ["lift", "drive"], "test_views": [1, 2, 1], "val_views": 0}
+
+
+@pytest.mark.parametrize(
+    ("kind", "scene", "synthesis", "counts"),
+    [
+        (SyntheticDataModule, "s", ARGUMENTS, (3, 3)),
+        (SyntheticLegoCompleteDataModule, "drive", LEGO, (2, 2 + 3 + 1)),
+        (SyntheticHyperNeRFDataModule, "s", {"size": 16, "frames": 3}, (3, 3)),
+        (SyntheticNHRDataModule, "s", {"size": 24, "frames": 2, "points": 20}, (36, 4)),
+    ],
+)
+def test_every_dataset_is_synthesised_at_first_use(tmp_path, capsys, kind, scene, synthesis, counts):
+    synthesis = {**synthesis, "samples_per_pixel": 1}
+    data = kind(tmp_path / "root", scene, synthesis=synthesis, rays=8)
+    assert not (tmp_path / "root").exists()
+    data.setup("fit")
+    assert (len(data.scene.train), len(data.scene.test)) == counts
+    assert "100%" in capsys.readouterr().err
+    kind(tmp_path / "root", scene, synthesis=synthesis, rays=8).setup("fit")
+    assert capsys.readouterr().err == ""
+    with pytest.raises(SceneError, match=r"synthesis\.json: frames: expected 7, but got .; use another data"):
+        kind(tmp_path / "root", scene, synthesis={**synthesis, "frames": 7}).setup("fit")

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import pytest
 
-from tests.contract.scenes import DATASETS
 from tests.contract.table import METHODS
 
 TITLES = {"dnerf": "D-NeRF", "hypernerf": "HyperNeRF", "nhr": "NHR", "lego_complete": "Lego Complete"}
@@ -13,8 +12,8 @@ WORST = ("failed", "skipped", "not run", "passed")
 HEAD = """# Conformance
 
 What each method was seen to do by the contract suite (`tests/contract`), on one scene of 20 pixels and 6
-times in the format of each dataset. Written by `make conformance`; do not edit. How a method joins:
-[extending](extending.md).
+times in the format of each dataset: D-NeRF, HyperNeRF, NHR, Lego Complete. Written by `make conformance`;
+do not edit. How a method joins: [extending](extending.md).
 """
 
 
@@ -48,51 +47,34 @@ class Conformance:
             self.path.write_text(self.page())
 
     def page(self):
-        methods = [name for name, entry in METHODS.items() if not entry.toy]
+        methods = list(METHODS)
         return "\n".join(
             [
                 HEAD,
-                "## Datasets\n",
-                *table(["method", *TITLES.values()], [self._on_datasets(m) for m in methods]),
-                "\n## Methods\n",
-                *table(["method", *KINDS, "GPU"], [self._kinds(m) for m in methods]),
+                "## Methods\n",
+                *table(["method", *KINDS], [self._kinds(m) for m in methods]),
                 "\n## Promises\n",
                 *table(["case", *methods], self._promises(methods)),
                 "",
             ]
         )
 
-    def _on_datasets(self, method):
-        cells = []
-        for dataset in DATASETS:
-            words = {"builds": "test_it_builds", "trains": "test_its_loss_falls"}
-            worst = {word: self._worst(case, method, dataset) for word, case in words.items()}
-            cells.append(", ".join(w if o == "passed" else f"**{w}: {o}**" for w, o in worst.items()))
-        return [method, *cells]
-
     def _kinds(self, method):
-        return [
-            method,
-            *(self.said.get((method, kind), "**not run**") for kind in KINDS),
-            METHODS[method].gpu,
-        ]
+        return [method, *(self.said.get((method, kind), "**not run**") for kind in KINDS)]
 
     def _promises(self, methods):
         cases = list(dict.fromkeys(case for case, _ in self.found))
         return [[case[5:].replace("_", " "), *(self._promise(case, m) for m in methods)] for case in cases]
 
     def _promise(self, case, method):
-        results = self.found.get((case, method), {})
-        worst = self._worst(case, method)
-        if worst in ("none", "passed"):
-            return {"none": "nothing to test", "passed": "yes"}[worst]
+        results = self.found.get((case, method))
+        if not results:
+            return "nothing to test"
+        worst = min(results.values(), key=WORST.index)
+        if worst == "passed":
+            return "yes"
         where = sorted({TITLES[d] for (d, _), outcome in results.items() if outcome == worst and d})
         return f"**{worst}**" + (f" ({', '.join(where)})" if where else "")
-
-    def _worst(self, case, method, dataset=None):
-        results = self.found.get((case, method), {}).items()
-        outcomes = [outcome for (of, _), outcome in results if dataset in (None, of)]
-        return min(outcomes, key=WORST.index, default="none")
 
 
 KINDS = ("size in", "asks for", "loss terms", "effects", "abilities", "loss falls")

@@ -3,6 +3,7 @@
 Tests share these files and fitted methods and must not change them.
 """
 
+from functools import cache
 from types import SimpleNamespace
 
 import pytest
@@ -35,14 +36,10 @@ def fitted(scenes, tmp_path_factory):
     from tests.contract.fitting import Losses, run_of, stage_of
     from tests.contract.table import METHODS
 
-    known = {}
-
+    @cache
     def fit(name, dataset):
-        if (name, dataset) not in known:
-            losses = Losses()
-            folder = tmp_path_factory.mktemp(f"{name}_{dataset}")
-            run = run_of([stage_of(METHODS[name])], data_of(dataset, scenes), folder, losses)
-            known[name, dataset] = SimpleNamespace(run=run, module=run.fit(), losses=losses.values)
-        return known[name, dataset]
+        losses, folder = Losses(), tmp_path_factory.mktemp(f"{name}_{dataset}")
+        run = run_of([stage_of(METHODS[name])], data_of(dataset, scenes), folder, losses)
+        return SimpleNamespace(run=run, module=run.fit(), losses=losses.values)
 
     return fit

@@ -16,7 +16,6 @@ from forewarp.methods.voxel.effects.motion import Motion
 from forewarp.methods.voxel.effects.upsample import LearnedUpsampler, TrilinearUpsampler
 from forewarp.methods.voxel.effects.view_dependence import SphericalHarmonics, ViewNetwork
 from forewarp.methods.voxel.model import BackwardModel, ForwardModel
-from tests.contract.toys import Splats
 
 
 @dataclass(frozen=True)
@@ -37,8 +36,7 @@ class Entry:
 
     ``model`` makes it; ``lr`` and ``numbers`` are of its stage, ``weights`` of its objective. After ``steps``
     its loss must be below ``falls`` times the first. ``effects`` are its optional parts by name, with which
-    the names of their parameters begin. ``toy``: not a method of the project. ``gpu``: where it was run on a
-    GPU.
+    the names of their parameters begin.
     """
 
     model: Callable[[Start], Method]
@@ -48,8 +46,6 @@ class Entry:
     falls: float = 0.5
     steps: int = 60
     effects: Mapping[str, Effect] = field(default_factory=dict)
-    toy: bool = False
-    gpu: str = "never"
 
 
 GRID = partial(DirectRadiance, alpha_init=1e-2, alpha_threshold=1e-4)
@@ -108,13 +104,5 @@ METHODS = {
         {"photo": 1.0, "rigid": 3.0, "smooth": 0.1},
         {"every": 0.05, "settled": 0.9, "finals": {"means": 0.1}},
         steps=150,
-    ),
-    "splats": Entry(
-        Splats,
-        {"position": 0.01, "velocity": 0.02, "radius": 0.02, "color": 0.05, "opacity": 0.05},
-        {"photo": 1.0, "sparse": 1e-3},
-        {"every": 4, "most": 300},
-        steps=120,
-        toy=True,
     ),
 }

@@ -4,6 +4,7 @@ import multiprocessing
 import os
 import signal
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -148,20 +149,6 @@ def test_every_parameter_has_one_rate(name, scenes):
 
 
 @each
-def test_a_missing_rate_is_named(name, scenes):
-    module = module_of(METHODS[name], data_of("dnerf", scenes), lr={"else": 1.0})
-    kind = next(iter(module.method.param_groups()))
-    with pytest.raises(ValueError, match=rf"stage.fine.lr: expected a rate for '{kind}', but got \['else'\]"):
-        module.configure_optimizers()
-
-
-@each
-def test_an_unknown_term_is_named_beside_those_there_are(name, scenes):
-    with pytest.raises(ValueError, match="objective: expected a term of .*photo.*, but got 'beauty'"):
-        module_of(METHODS[name], data_of("dnerf", scenes), weights={"photo": 1.0, "beauty": 1.0})
-
-
-@each
 def test_a_term_of_weight_zero_is_never_called(name, scenes):
     data, entry = data_of("dnerf", scenes), METHODS[name]
     terms = module_of(entry, data).method.terms
@@ -180,29 +167,17 @@ def full_model(entry):
     return replace(entry.model, **{k: v for e in entry.effects.values() for k, v in e.on.items()})
 
 
-def refuse(monkeypatch, effect):
-    for of, function in effect.parts:
-        monkeypatch.setattr(of, function, lambda *a, at=f"{of.__name__}.{function}", **k: pytest.fail(at))
-
-
 @each_effect
-def test_an_effect_that_is_off_is_absent(name, effect, scenes, monkeypatch):
+def test_an_effect_that_is_off_is_absent_and_one_that_is_on_is_called(name, effect, scenes, monkeypatch):
     entry, data = METHODS[name], data_of("dnerf", scenes)
     part = entry.effects[effect]
-    refuse(monkeypatch, part)
-    without = replace(full_model(entry), **dict.fromkeys(part.on))
-    module = module_of(entry, data, model=without)
+    for of, function in part.parts:
+        monkeypatch.setattr(of, function, lambda *a, at=f"{of.__name__}.{function}", **k: pytest.fail(at))
+    module = module_of(entry, data, model=replace(full_model(entry), **dict.fromkeys(part.on)))
     data.picker = lambda: TIMES - 1  # a time at which things have moved
     backward(module, batch_of(data))
     assert not [key for key in module.method.state_dict() if key.startswith(effect)]
-
-
-@each_effect
-def test_an_effect_that_is_on_is_called(name, effect, scenes, monkeypatch):
-    entry, data = METHODS[name], data_of("dnerf", scenes)
-    refuse(monkeypatch, entry.effects[effect])
     module = module_of(entry, data, model=full_model(entry))
-    data.picker = lambda: TIMES - 1
     with pytest.raises(pytest.fail.Exception):
         backward(module, batch_of(data))
 
@@ -213,17 +188,11 @@ STEPS, STOP = 14, 9
 @pytest.fixture(scope="module")
 def straight(scenes, tmp_path_factory):
     """``straight(name, dataset)`` returns the module after an uninterrupted run of a few steps."""
-    known = {}
 
+    @cache
     def fit(name, dataset):
-        if (name, dataset) not in known:
-            run = run_of(
-                [stage_of(METHODS[name], steps=STEPS)],
-                data_of(dataset, scenes),
-                tmp_path_factory.mktemp("run"),
-            )
-            known[name, dataset] = run.fit()
-        return known[name, dataset]
+        stages = [stage_of(METHODS[name], steps=STEPS)]
+        return run_of(stages, data_of(dataset, scenes), tmp_path_factory.mktemp("run")).fit()
 
     return fit
 
@@ -274,18 +243,11 @@ def test_a_run_that_was_killed_continues_exactly(name, straight, scenes, tmp_pat
     assert whole.last == again.last
 
 
+@pytest.mark.parametrize("place", ["after", "before"])
 @on(DATASETS)
-def test_it_follows_a_voxel_stage(name, dataset, scenes, tmp_path):
-    check_two_stages(("forward", name), data_of(dataset, scenes), tmp_path)
-
-
-@on(DATASETS)
-def test_a_voxel_stage_follows_it(name, dataset, scenes, tmp_path):
-    check_two_stages((name, "forward"), data_of(dataset, scenes), tmp_path)
-
-
-def check_two_stages(names, data, tmp_path):
+def test_it_works_beside_a_voxel_stage(name, dataset, place, scenes, tmp_path):
     """Fit a stage of each method, then load the second without the first."""
+    names, data = ("forward", name) if place == "after" else (name, "forward"), data_of(dataset, scenes)
     stages = [stage_of(METHODS[n], s, steps=6) for n, s in zip(names, ("coarse", "fine"))]
     run = run_of(stages, data, tmp_path)
     module = run.fit()

@@ -17,16 +17,12 @@ def append(path):
     path.write_bytes(path.read_bytes() + b" ")
 
 
-def rename(folder):
-    (folder / "train" / "r_0.png").rename(folder / "train" / "r_9.png")
-
-
 CHANGES = {
     "text": (lambda f: append(f / "transforms_val.json"), "transforms_val.json"),
     "gone": (lambda f: (f / "transforms_val.json").unlink(), "transforms_val.json"),
     "size": (lambda f: append(f / "train" / "r_0.png"), "images: 9 files of"),
     "fewer": (lambda f: (f / "train" / "r_0.png").unlink(), "images: 8 files of"),
-    "name": (rename, "images: 9 files of"),
+    "name": (lambda f: (f / "train" / "r_0.png").rename(f / "train" / "r_9.png"), "images: 9 files of"),
     "new": (lambda f: (f / "b.json").write_text("{}"), "b.json"),
 }
 
@@ -40,25 +36,14 @@ def test_a_change_is_seen_and_named(scene, change):
 
 
 def test_what_is_no_part_of_the_scene_does_not_count(scene):
-    before = fingerprint(scene)
-    (scene / ".cache.json").write_text("x")
-    (scene / ".hidden").mkdir()
-    (scene / ".hidden" / "a.png").write_text("x")
-    (scene / "notes.md").write_text("x")
+    before, run = fingerprint(scene), scene / "runs" / "a"
+    others = [scene / name for name in (".cache.json", ".hidden/a.png", "notes.md")]
+    for path in (*others, *(run / name for name in (".lock", "data.json", "metrics.json", "images/0.png"))):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("{}")
     os.utime(scene / "transforms_train.json")
     assert fingerprint(scene) == before
-
-
-def test_a_run_below_the_scene_is_no_part_of_it(scene):
-    before = fingerprint(scene)
-    run = scene / "runs" / "a"
-    run.mkdir(parents=True)
-    for name in (".lock", "data.json", "metrics.json"):
-        (run / name).write_text("{}")
-    (run / "images").mkdir()
-    (run / "images" / "0.png").write_text("x")
-    assert fingerprint(scene) == before
-    (scene / ".lock").write_text("")
+    (scene / ".lock").write_text("")  # a scene that is locked is still one
     (scene / "new.json").write_text("{}")
     assert difference(before, fingerprint(scene)) == "new.json"
 

@@ -44,32 +44,30 @@ def test_halving_is_the_rounded_mean_of_straight_values():
     assert halved_cutout(torch.zeros(3, 5, 4, dtype=torch.uint8)).tolist() == [[[0] * 4] * 2]
 
 
-KINDS = {
-    "rgb": (NOISE, {}, False),
-    "rgba": (np.concatenate([NOISE, NOISE[..., :1]], -1), {}, True),
-    "grey": (NOISE[..., 0], {}, False),
-    "transparent grey": (NOISE[..., 0], {"transparency": int(NOISE[0, 0, 0])}, True),
-}
+RGBA = np.dstack([NOISE, NOISE[..., 0]])
+GREY = NOISE[..., 0].clip(1)
+KINDS = [  # what is written, how, and the pixels read
+    (NOISE, {}, np.insert(NOISE, 3, 255, -1)),
+    (RGBA, {}, RGBA),
+    (GREY, {}, np.dstack([GREY, GREY, GREY, np.full_like(GREY, 255)])),
+    (GREY, {"transparency": 1}, np.dstack([GREY, GREY, GREY, 255 * (GREY > 1).astype(np.uint8)])),
+]
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_header_and_pixels_of_a_png(tmp_path, kind):
-    pixels, options, alpha = KINDS[kind]
+@pytest.mark.parametrize(("pixels", "options", "expected"), KINDS)
+def test_header_and_pixels_of_a_png(tmp_path, pixels, options, expected):
     iio.imwrite(tmp_path / "a.png", pixels, **options)
-    header, image = inspect_image(tmp_path / "a.png"), read_image(tmp_path / "a.png").numpy()
-    assert (header.size, header.has_alpha, image.dtype) == ((53, 37), alpha, np.uint8)
-    straight = pixels[..., :3] if pixels.ndim == 3 else pixels[..., None]
-    assert (image[..., :3] == straight).all()
-    expected = pixels[..., 3] if pixels.shape[-1] == 4 else 255
-    assert (image[..., 3] == (255 * (pixels != pixels[0, 0]) if options else expected)).all()
+    header = inspect_image(tmp_path / "a.png")
+    assert (header.size, header.has_alpha) == ((53, 37), bool((expected[..., 3] < 255).any()))
+    assert np.array_equal(read_image(tmp_path / "a.png"), expected)
 
 
-@pytest.mark.parametrize(
-    "options", [{}, {"progressive": True}, {"optimize": True}, {"comment": b"c" * 60000}]
-)
+@pytest.mark.parametrize("options", [{}, {"progressive": True}, {"comment": b"c" * 60000}])
 def test_header_and_pixels_of_a_jpeg(tmp_path, options):
     for pixels in (NOISE, NOISE[..., 0]):
         iio.imwrite(tmp_path / "a.jpg", pixels, plugin="pillow", quality=97, subsampling=0, **options)
+        with (tmp_path / "a.jpg").open("ab") as file:
+            file.write(bytes(9000))  # what follows the end does no harm
         header = inspect_image(tmp_path / "a.jpg")
         assert (header.size, header.has_alpha) == ((53, 37), False)
         rgba = read_image(tmp_path / "a.jpg").numpy()
@@ -87,25 +85,8 @@ def test_what_is_written_is_read(tmp_path):
     assert np.array_equal(read_gray16(tmp_path / "d.png"), steps)
 
 
-def test_what_follows_the_end_of_a_jpeg_does_no_harm(tmp_path):
-    write_jpeg(tmp_path / "a.jpg", NOISE)
-    with (tmp_path / "a.jpg").open("ab") as file:
-        file.write(bytes(9000))
-    assert inspect_image(tmp_path / "a.jpg").size == (53, 37)
-    assert read_image(tmp_path / "a.jpg").shape == (37, 53, 4)
-
-
-def with_byte(content, at, value):
-    return content[:at] + bytes([value]) + content[at + 1 :]
-
-
-def frame_at(content):
-    """Where a JPEG's header stands that holds its size."""
-    return content.index(b"\xff\xc0")
-
-
 WHOLE = "expected a whole image, but got a truncated or harmed one"
-HARM = {
+HARM = {  # of a PNG and of a JPEG
     "empty": (lambda c: b"", "but got an empty file"),
     "text": (lambda c: b"version https://git-lfs", "expected a PNG or JPEG image, but got another kind"),
     "signature only": (lambda c: c[:2], "but got another kind of file or a harmed header"),
@@ -113,13 +94,10 @@ HARM = {
     "in the pixels": (lambda c: c[: len(c) // 2], WHOLE),
     "no end": (lambda c: c[:-13], WHOLE),
 }
+SIZE = b"\xff\xc0\x00\x11"  # begins the header of a JPEG that holds its size; its bits follow
 HARM_JPEG = {
-    "12 bits": (lambda c: with_byte(c, frame_at(c) + 4, 12), "a harmed header"),
+    "12 bits": (lambda c: c.replace(SIZE + b"\x08", SIZE + b"\x0c"), "a harmed header"),
     "no frame": (lambda c: c[:2] + c[c.index(b"\xff\xda") :], "a harmed header"),
-    "wide": (
-        lambda c: c[: frame_at(c) + 5] + b"\xff\xff\xff\xff" + c[frame_at(c) + 9 :],
-        "expected an image of 1 to 80000000 pixels, but got",
-    ),
 }
 CASES = [(n, h) for n in ("a.png", "a.jpg") for h in HARM] + [("a.jpg", h) for h in HARM_JPEG]
 
@@ -134,14 +112,6 @@ def test_bad_images_are_refused_in_one_line(tmp_path, name, harm):
         with pytest.raises(SceneError, match=rf"{name}: .*{match}") as caught:
             read(tmp_path / name)
         assert "\n" not in str(caught.value)
-
-
-def test_a_flipped_bit_of_a_png_is_found(tmp_path):
-    write_png(tmp_path / "a.png", NOISE)
-    content = (tmp_path / "a.png").read_bytes()
-    (tmp_path / "a.png").write_bytes(with_byte(content, len(content) // 2, content[len(content) // 2] ^ 255))
-    with pytest.raises(SceneError, match="a.png: expected a whole image, but got a truncated or harmed one"):
-        read_image(tmp_path / "a.png")
 
 
 def test_other_kinds_of_pixel_and_missing_files_are_refused(tmp_path):

@@ -34,13 +34,10 @@ class Recorder(LightningModule):
 
 
 def trainer(steps, **options) -> Trainer:
-    quiet = {
-        "logger": False,
-        "enable_progress_bar": False,
-        "enable_model_summary": False,
-        "accelerator": "cpu",
-    }
-    return Trainer(max_steps=steps, **{"enable_checkpointing": False, **quiet, **options})
+    off = dict.fromkeys(
+        ["logger", "enable_progress_bar", "enable_model_summary", "enable_checkpointing"], False
+    )
+    return Trainer(max_steps=steps, accelerator="cpu", **off, **options)
 
 
 @pytest.fixture
@@ -60,14 +57,6 @@ def test_a_run_validates_and_tests(make):
     assert model.targets == ["test/r_0", "test/r_1", "test/r_2"]
 
 
-def test_a_scene_without_validation_trains(tmp_path):
-    write_tiny(tmp_path / "toy", val=())
-    model = Recorder()
-    loop = trainer(4, val_check_interval=2, check_val_every_n_epoch=None)
-    loop.fit(model, datamodule=DNeRFDataModule(tmp_path, "toy", rays=4))
-    assert (len(model.seen), model.targets) == (4, [])
-
-
 def test_an_interrupted_run_sees_what_an_unbroken_one_sees(make, tmp_path):
     whole = Recorder()
     trainer(6).fit(whole, datamodule=make(background="random"))
@@ -81,12 +70,12 @@ def test_an_interrupted_run_sees_what_an_unbroken_one_sees(make, tmp_path):
     assert all(torch.equal(a, b) for (_, a), (_, b) in zip(both, whole.seen, strict=True))
 
 
-def test_the_picker_is_asked_once_for_each_step(make):
-    calls = []
-    model, data = Recorder(), make()
+def test_a_scene_without_validation_trains_and_the_picker_is_asked_once_a_step(tmp_path):
+    write_tiny(tmp_path / "toy", val=())
+    calls, model, data = [], Recorder(), DNeRFDataModule(tmp_path, "toy", rays=4)
     data.picker = lambda: calls.append(1) or 2
-    trainer(3).fit(model, datamodule=data)
-    assert ([frame for frame, _ in model.seen], len(calls)) == ([2, 2, 2], 3)
+    trainer(4, val_check_interval=2, check_val_every_n_epoch=None).fit(model, datamodule=data)
+    assert ([frame for frame, _ in model.seen], len(calls), model.targets) == ([2] * 4, 4, [])
 
 
 def test_the_scene_is_read_once(tmp_path):
@@ -112,20 +101,19 @@ def test_targets_by_split(tmp_path):
     assert [len(data.targets(s)) for s in ("train", "val", "test")] == [4, 2, 2]
     target = data.targets("test")[1]
     assert (target.frame.ability, target.rgb.shape, target.depth.shape) == ("time", (6, 8, 3), (6, 8))
-    moved = target.to("cpu")
-    assert torch.equal(moved.rgb, target.rgb)
+    assert torch.equal(target.to("cpu").rgb, target.rgb)
     with pytest.raises(SceneError, match="split: expected train, val, test or held, but got 'all'"):
         data.targets("all")
 
 
-@pytest.mark.parametrize(
-    ("options", "match"),
-    [
-        ({"background": "red"}, "data.background: expected"),
-        ({"eval_background": "random"}, "data.eval_background: expected white or black"),
-        ({"half_resolution": 3}, "data.half_resolution: expected"),
-    ],
-)
+BAD = [
+    ({"background": "red"}, "data.background: expected"),
+    ({"eval_background": "random"}, "data.eval_background: expected white or black"),
+    ({"half_resolution": 3}, "data.half_resolution: expected"),
+]
+
+
+@pytest.mark.parametrize(("options", "match"), BAD)
 def test_bad_settings_are_refused_at_setup(make, options, match):
     with pytest.raises(SceneError, match=match):
         make(**options).setup()

@@ -24,12 +24,9 @@ def test_mp4_holds_every_frame_unstretched(tmp_path, size):
     assert abs(float(frames[6].mean()) - 255 * (0.2 + 0.8 * 6 / 7)) < 4
 
 
-def test_gif_holds_every_frame(tmp_path):
+def test_gifs_and_folders_of_stills_hold_every_frame(tmp_path):
     path = write_video(tmp_path / "a.gif", iter(pictures(4)), fps=10)
     assert iio.imread(path).shape[:3] == (4, 18, 22)
-
-
-def test_stills_are_a_folder(tmp_path):
     folder = write_video(tmp_path / "a.png", iter(pictures(3)), fps=1)
     assert [p.name for p in sorted(folder.iterdir())] == ["0000.png", "0001.png", "0002.png"]
 

@@ -9,7 +9,6 @@ from forewarp.data.module import SceneDataModule
 from forewarp.evaluation.evaluate import evaluate
 from forewarp.metrics.suite import ImageSuite
 from forewarp.scene.rays import joined
-from forewarp.training.schedule import Curriculum
 from tests.support.tiny_scene import ball_scene, frame_at, make_run, stage
 
 TIMES = (0.0, 0.5, 1.0)
@@ -58,13 +57,3 @@ def test_training_warps_once_for_the_rays_of_several_cameras(run, module, warped
     assert (len(rays), len(rays.origins.unique(dim=0))) == (60, 3)
     assert torch.isfinite(module.training_step(batch, 0))
     assert warped == [batch.time]
-
-
-def test_a_time_comes_in_with_all_its_cameras():
-    scene = dome_scene()
-    curriculum = Curriculum([f.time for f in scene.train], 0.0, start=1, all_in=1.0)
-    assert curriculum.frames() == [0, 1, 2, 3]
-    curriculum.fraction = 0.6
-    assert curriculum.frames() == list(range(8))
-    curriculum.fraction = 1.0
-    assert curriculum.frames() == list(range(12))

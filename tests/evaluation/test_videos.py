@@ -1,9 +1,7 @@
-import math
-
 import pytest
 import torch
 
-from forewarp.evaluation.trajectories import Trajectories, moving_points, order_of, spread
+from forewarp.evaluation.trajectories import Trajectories, moving_points
 from forewarp.evaluation.videos import make_shots, video
 from tests.support.known_ball import known_ball
 from tests.support.tiny_scene import ball_scene, camera_at
@@ -103,18 +101,3 @@ def test_a_still_scene_is_left_as_it_is(cameras):
     assert len(paint.points) == 0
     picture = torch.rand(4, 4, 3, generator=torch.Generator().manual_seed(0))
     assert paint(picture, None, cameras[0], 0.5) is picture
-
-
-def test_spread_takes_the_farthest_next():
-    points = torch.tensor([[0.0, 0, 0], [1, 0, 0], [10, 0, 0], [5, 0, 0]])
-    assert spread(points, 3)[:, 0].tolist() == [0, 10, 5]
-    assert spread(points, 9) is points
-
-
-def test_order_is_along_the_longest_extent():
-    generator = torch.Generator().manual_seed(0)
-    points = torch.rand(9, 3, generator=generator) * torch.tensor([0.1, 5.0, 0.2])
-    order = order_of(points)
-    assert sorted(order.tolist()) == pytest.approx([i / 8 for i in range(9)])
-    expected = points[:, 1].argsort().argsort() / 8
-    assert math.isclose(abs(float(torch.corrcoef(torch.stack([order, expected]))[0, 1])), 1, abs_tol=0.05)

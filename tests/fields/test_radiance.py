@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from forewarp.fields.radiance import DirectRadiance, FeatureRadiance, density_shift
+from forewarp.fields.radiance import DirectRadiance, FeatureRadiance
 from forewarp.fields.radiance_grid import EMPTY
 from forewarp.scene.box import Box, Lattice
 
@@ -51,14 +51,6 @@ def test_positions_follow_the_active_voxels():
     fresh.network = radiance.network
     fresh.features.data[:] = 0
     torch.testing.assert_close(radiance().values, fresh().values)
-
-
-@pytest.mark.parametrize("alpha", [0.0, 1.0, -1.0, 2.0])
-def test_refuses_an_opacity_out_of_range(alpha):
-    with pytest.raises(
-        ValueError, match=r"model.radiance.alpha_init: expected a number in \(0, 1\), but got"
-    ):
-        density_shift(alpha)
 
 
 def test_feature_radiance_knows_where_it_is_on_any_lattice():

@@ -77,24 +77,3 @@ def test_the_cache_follows_the_voxels():
     active[2:] = True
     grid.activate(active, {})
     torch.testing.assert_close(moving.flow(grid, 0.9), field().flow(voxels(slice(2, None)), 0.9))
-
-
-def test_bases_are_at_most_one_less_than_the_times():
-    assert field(bases=20, frames=5).bases == 4
-    assert field(bases=20, frames=5).flow(voxels(), 0.5).isfinite().all()
-
-
-def test_one_time_has_no_motion():
-    with pytest.raises(
-        ValueError, match="expected at least 2 distinct training times, but got 1; use model/motion=none"
-    ):
-        field(frames=1)
-
-
-def test_features_own_parameters_only_where_asked():
-    assert not any("features" in n for n, _ in field().named_parameters())
-    assert any("features.grid" in n for n, _ in field(features=2).named_parameters())
-
-
-def test_the_basis_lives_where_the_field_does():
-    assert field().to("meta").basis(0.5).device.type == "meta"

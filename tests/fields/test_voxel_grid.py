@@ -1,4 +1,3 @@
-import pytest
 import torch
 
 from forewarp.fields.voxel_grid import VoxelGrid
@@ -65,18 +64,6 @@ def test_an_empty_grid_can_be_filled():
     assert (grid.color == 0).all()
 
 
-@pytest.mark.parametrize("active", [torch.ones(SHAPE, dtype=torch.bool), third()])
-def test_resampling_a_constant_is_constant(active):
-    grid = numbered(active)
-    grid.color.data[:] = torch.tensor([0.25, -4.0])
-    grid.density.data[:] = 3.0
-    finer = Lattice(Box((0.2, 0.1, 0.5), (1.9, 2.5, 4.0)), (5, 7, 6))
-    everywhere = torch.ones(finer.shape, dtype=torch.bool)
-    grid.resample(finer, everywhere, {"density": 3.0})
-    torch.testing.assert_close(grid.density.data, torch.full((210, 1), 3.0))
-    torch.testing.assert_close(grid.color.data, torch.tensor([[0.25, -4.0]]).expand(210, 2))
-
-
 def test_resampling_a_linear_field_is_exact_and_absent_voxels_read_empty():
     grid = VoxelGrid(LATTICE, torch.ones(SHAPE, dtype=torch.bool), {"density": 1})
     slope = torch.tensor([1.0, -2.0, 0.5])
@@ -87,13 +74,6 @@ def test_resampling_a_linear_field_is_exact_and_absent_voxels_read_empty():
     none = VoxelGrid(LATTICE, torch.zeros(SHAPE, dtype=torch.bool), {"density": 1})
     none.resample(finer, torch.ones(finer.shape, dtype=torch.bool), {"density": -10.0})
     torch.testing.assert_close(none.density.data, torch.full((315, 1), -10.0))
-
-
-def test_resampling_to_the_same_lattice_changes_nothing():
-    grid = numbered(third())
-    before = grid.density.detach().clone()
-    grid.resample(LATTICE, third(), {"density": -10.0})
-    torch.testing.assert_close(grid.density.data, before)
 
 
 def test_a_checkpoint_brings_its_own_lattice():

@@ -56,39 +56,10 @@ def batch(time=0.5):
     return Batch((Observation(Moment(time), View(camera()), rgb, torch.ones(3)),), 0)
 
 
-def drawn(made, time, view=None):
-    with torch.no_grad():
-        return made.at(Moment(time)).render(view or View(camera()), torch.ones(3))
-
-
 def test_published_counts():
     start = Start(moving_scene(), "fine", {})
     assert parameter_count(TNeRF(start)) == 600_452
     assert parameter_count(TNeRF(start, time_frequencies=10)) == 606_596
-
-
-def test_without_its_columns_time_changes_nothing():
-    made = method(layers=4, skip=3, **GENTLE)
-    before = [drawn(made, time).rgb for time in (0.0, 0.7)]
-    assert not torch.allclose(*before, atol=1e-6)
-    position, inputs = 3 * (1 + 2 * 3), 3 * (1 + 2 * 3) + (1 + 2 * 2)
-    with torch.no_grad():
-        for number in (0, 2):
-            made.network.trunk.layers[number].weight[:, position:inputs] = 0
-    assert torch.equal(drawn(made, 0.0).rgb, drawn(made, 0.7).rgb)
-
-
-def test_at_the_start_it_depends_on_time():
-    made = method(**GENTLE)
-    points = torch.rand(20, 1, 3)
-    slopes = []
-    for name in ("density", "color"):
-        time = torch.tensor([0.3], requires_grad=True)
-        moment = positional_encoding(time, 2).expand(20, 1, -1)
-        found = made.network(torch.cat([positional_encoding(points, 3), moment], -1), torch.zeros(20, 1, 9))
-        found[name == "color"].sum().backward()
-        slopes.append(float(time.grad.abs()))
-    assert min(slopes) > 1e-4
 
 
 def test_the_snapshot_asks_the_network_in_world_units():
@@ -139,39 +110,12 @@ def test_a_start_that_comes_alive_is_none():
         made.look(batch(), {"photo": 1.0}, generator)
 
 
-def test_seeds_that_start_dead_do_so_everywhere_and_softplus_never_does():
-    start, points = Start(moving_scene(), "fine", {}), 3 * torch.rand(2000, 1, 3) - 1.5
-    dead = []
-    for seed in range(8):
-        torch.manual_seed(seed)
-        with torch.no_grad():
-            snapshot = TNeRF(start).at(Moment(0.3))
-            dead.append(not bool((snapshot.density(points) > 0).any()))
-            snapshot.method.activation = torch.nn.functional.softplus
-            assert (snapshot.density(points) > 0).all()
-    assert 1 <= sum(dead) <= 4
-
-
 def test_its_protocol_names_departures():
     published = method().protocol()["departures"]
     changed = method(inside_box=True, **GENTLE).protocol()["departures"]
     assert "softplus" not in published
     assert changed.startswith(published)
     assert "softplus density; the last interval ends with the ray; empty outside" in changed
-
-
-@pytest.mark.parametrize(
-    ("wrong", "text"),
-    [
-        ({"density": "exp"}, "model.density: expected relu or softplus"),
-        ({"time_frequencies": -1}, "expected frequencies >= 0"),
-        ({"samples": 2}, "model.samples: expected samples >= 3"),
-        ({"skip": 9}, "a skip in"),
-    ],
-)
-def test_refuses(wrong, text):
-    with pytest.raises(ValueError, match=text):
-        method(**wrong)
 
 
 def static_ceiling():

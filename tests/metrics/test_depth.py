@@ -12,30 +12,8 @@ def test_by_hand():
     # Ratios 1.01, 1.1, 1.3 (too near), 1.6 (too far), 1 and background.
     prediction = torch.tensor([[1.01, 1.1, 2.0 / 1.3], [3.2, 4.0, 7.0]])
     assert depth_delta(prediction, truth) == (0.4, 0.6, 0.8)
-
-
-def test_a_ratio_on_the_threshold_is_not_below_it():
+    # A ratio on the threshold is not below it.
     assert depth_delta(torch.tensor([[2.5]]), torch.tensor([[2.0]]), thresholds=(1.25, 1.2501)) == (0.0, 1.0)
-
-
-@pytest.mark.parametrize("wrong", [0.0, -1.0, math.nan, math.inf])
-def test_unusable_depth_is_wrong(wrong):
-    truth = torch.ones(1, 4)
-    prediction = torch.tensor([[1.0, wrong, 1.0, 1.0]])
-    assert depth_delta(prediction, truth) == (0.75, 0.75, 0.75)
-
-
-def test_only_foreground_with_a_true_depth_counts():
-    truth = torch.tensor([[1.0, 1.0, 0.0, 1.0]])
-    foreground = torch.tensor([[True, False, True, True]])
-    prediction = torch.tensor([[1.0, 9.0, 9.0, 9.0]])
-    assert depth_delta(prediction, truth, foreground) == (0.5, 0.5, 0.5)
-
-
-def test_empty_foreground_has_no_fraction():
-    image = torch.ones(3, 4)
-    assert depth_delta(image, torch.zeros(3, 4)) is None
-    assert depth_delta(image, image, torch.zeros(3, 4, dtype=torch.bool)) is None
 
 
 def test_is_its_twin():
@@ -44,11 +22,17 @@ def test_is_its_twin():
     truth[torch.rand(9, 7, generator=generator) < 0.3] = 0
     foreground = torch.rand(9, 7, generator=generator) < 0.8
     prediction = truth.clamp_min(1) * (1 + 0.6 * (torch.rand(9, 7, generator=generator) - 0.4))
-    prediction[0, :3] = torch.tensor([math.nan, 0.0, math.inf])
+    prediction[0, :4] = torch.tensor([math.nan, 0.0, math.inf, -1.0])  # all of them wrong
     found = depth_delta(prediction, truth, foreground)
     twin = reference.depth_delta(prediction.double(), truth.double(), foreground, THRESHOLDS)
     assert found == pytest.approx(twin)
     assert 0 < found[0] < found[1] < found[2] < 1
+
+
+def test_empty_foreground_has_no_fraction():
+    image = torch.ones(3, 4)
+    assert depth_delta(image, torch.zeros(3, 4)) is None
+    assert depth_delta(image, image, torch.zeros(3, 4, dtype=torch.bool)) is None
 
 
 def test_refusals():

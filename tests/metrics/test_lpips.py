@@ -20,9 +20,7 @@ def weights_folder():
 def squeeze():
     file = weights_folder() / "squeeze.backbone.pth"
     if not file.exists():
-        pytest.skip(
-            "the SqueezeNet backbone weights are not here (set FOREWARP_DATA to the folder beside them)"
-        )
+        pytest.skip("no SqueezeNet backbone weights; set FOREWARP_DATA to the folder beside them")
     return LPIPS("squeeze", file)
 
 
@@ -46,10 +44,7 @@ def example(name):
 
 
 def images(height=48, width=56):
-    generator = torch.Generator().manual_seed(3)
-    return torch.rand(height, width, 3, generator=generator), torch.rand(
-        height, width, 3, generator=generator
-    )
+    return torch.rand(2, height, width, 3, generator=torch.Generator().manual_seed(3))
 
 
 def test_published_values_of_random_images(squeeze):
@@ -64,20 +59,19 @@ def test_published_values_of_the_example_images(squeeze, name, distance):
 
 
 def test_heads_of_torchmetrics_are_version_0_1(squeeze):
-    original = LPIPS(
-        "squeeze", weights_folder() / "squeeze.backbone.pth", weights_folder() / "lin_v0.1/squeeze.pth"
-    )
+    folder = weights_folder()
+    original = LPIPS("squeeze", folder / "squeeze.backbone.pth", folder / "lin_v0.1/squeeze.pth")
     assert all(torch.equal(squeeze.state_dict()[k], v) for k, v in original.state_dict().items())
 
 
-@pytest.mark.parametrize(
-    ("net", "parameters", "taps"),
-    [
-        ("squeeze", 722_496, [64, 128, 256, 384, 384, 512, 512]),
-        ("vgg", 14_714_688, [64, 128, 256, 512, 512]),
-        ("alex", 2_469_696, [64, 192, 384, 256, 256]),
-    ],
-)
+ARCHITECTURES = [
+    ("squeeze", 722_496, [64, 128, 256, 384, 384, 512, 512]),
+    ("vgg", 14_714_688, [64, 128, 256, 512, 512]),
+    ("alex", 2_469_696, [64, 192, 384, 256, 256]),
+]
+
+
+@pytest.mark.parametrize(("net", "parameters", "taps"), ARCHITECTURES)
 def test_architectures(net, parameters, taps):
     features = lpips._BACKBONES[net]()
     assert sum(p.numel() for p in features.parameters()) == parameters
@@ -107,32 +101,17 @@ def test_equal_and_white_images_are_at_no_distance(alex_file):
     white = torch.ones(40, 40, 3)
     assert net(first, first) == net(white, white) == 0
     assert net(first, second) == pytest.approx(net(second, first), rel=1e-5)
-
-
-def test_too_small_an_image_has_no_distance(alex_file):
-    net = LPIPS("alex", alex_file)
-    assert net(*images(31, 64)) is None
+    assert net(*images(31, 64)) is None  # too small
     assert net(*images(32, 32)) > 0
+    assert not any(p.requires_grad for p in net.parameters())
 
 
 def test_whole_model_files_are_read(alex_file, tmp_path):
     bare = torch.load(alex_file, weights_only=True)
-    whole = {f"features.{key}": value for key, value in bare.items()} | {
-        "classifier.1.weight": torch.zeros(2)
-    }
-    torch.save(whole, tmp_path / "alexnet-whole.pth")
+    whole = {f"features.{key}": value for key, value in bare.items()}
+    torch.save(whole | {"classifier.1.weight": torch.zeros(2)}, tmp_path / "alexnet-whole.pth")
     pair = images()
     assert LPIPS("alex", tmp_path / "alexnet-whole.pth")(*pair) == LPIPS("alex", alex_file)(*pair)
-
-
-def test_nothing_is_trained(alex_file):
-    net = LPIPS("alex", alex_file)
-    assert not any(p.requires_grad for p in net.parameters())
-
-
-def test_no_weights_is_none():
-    assert [find_lpips_weights(net) for net in NETS] == [None, None, None]
-    assert find_lpips() == {"lpips_squeeze": None, "lpips_vgg": None, "lpips_alex": None}
 
 
 def test_weights_are_found_in_order(alex_file, tmp_path, monkeypatch):
@@ -142,12 +121,14 @@ def test_weights_are_found_in_order(alex_file, tmp_path, monkeypatch):
         path.touch()
         return path
 
+    assert find_lpips() == {"lpips_squeeze": None, "lpips_vgg": None, "lpips_alex": None}
     in_hub = {
         "squeeze": touch("hub/checkpoints", "squeezenet1_1-b8a52dc0.pth"),
         "vgg": touch("hub/checkpoints", "vgg16-397923af.pth"),
         "alex": touch("hub/checkpoints", "alexnet-owt-7be5be79.pth"),
     }
     touch("hub/checkpoints", "vgg16_bn-6c64b313.pth")
+    touch("hub/checkpoints", "alex.pth")  # heads are not taken for a backbone
     assert {net: find_lpips_weights(net) for net in NETS} == in_hub
     named = touch("named", "vgg16-1.pth")
     monkeypatch.setenv(lpips.WEIGHTS_VARIABLE, str(named.parent))
@@ -157,11 +138,6 @@ def test_weights_are_found_in_order(alex_file, tmp_path, monkeypatch):
     assert find_lpips_weights("alex", [None, alex_file.parent]) == alex_file
     assert find_lpips_weights("vgg", [alex_file]) == named
     assert find_lpips(["alex"], alex_file)["lpips_alex"].net == "alex"
-
-
-def test_heads_are_not_taken_for_a_backbone(tmp_path):
-    (tmp_path / "squeeze.pth").touch()
-    assert find_lpips_weights("squeeze", [tmp_path]) is None
 
 
 def test_refusals(alex_file, tmp_path, monkeypatch):
@@ -175,12 +151,15 @@ def test_refusals(alex_file, tmp_path, monkeypatch):
     monkeypatch.setenv(lpips.WEIGHTS_VARIABLE, str(tmp_path / "gone"))
     with pytest.raises(ValueError, match="FOREWARP_LPIPS_WEIGHTS: expected an existing"):
         find_lpips_weights("vgg")
-    with pytest.raises(ValueError, match="expected weights of squeeze's features with '0.weight' of shape"):
-        LPIPS("squeeze", alex_file)
-    with pytest.raises(ValueError, match="mine.pth: expected weights of alex's features, but got EOFError"):
-        LPIPS("alex", tmp_path / "mine.pth")
     (tmp_path / "text.pth").write_text("not a model")
-    with pytest.raises(ValueError, match="text.pth: expected weights of alex's features, but got Unpickling"):
-        LPIPS("alex", tmp_path / "text.pth")
-    with pytest.raises(ValueError, match="expected LPIPS heads of alex, but got no 'lin0.model.1.weight'"):
-        LPIPS("alex", alex_file, alex_file)
+    for arguments, match in (
+        (("squeeze", alex_file), "expected weights of squeeze's features with '0.weight' of shape"),
+        (("alex", tmp_path / "mine.pth"), "mine.pth: expected weights of alex's features, but got EOFError"),
+        (
+            ("alex", tmp_path / "text.pth"),
+            "text.pth: expected weights of alex's features, but got Unpickling",
+        ),
+        (("alex", alex_file, alex_file), "expected LPIPS heads of alex, but got no 'lin0.model.1.weight'"),
+    ):
+        with pytest.raises(ValueError, match=match):
+            LPIPS(*arguments)

@@ -1,3 +1,4 @@
+import pytest
 import torch
 
 from forewarp.ops.adam import adam_rows
@@ -14,27 +15,29 @@ def step(parts, gradient, rate=0.1):
     adam_rows(value, gradient, mean, square, steps, rate, (0.9, 0.99), 1e-15)
 
 
-def test_it_is_adam_where_every_row_has_a_gradient(backend):
-    parts = state()
+@pytest.mark.parametrize("shape", [(6, 3), (37, 4), (40, 1), (33, 17)])
+def test_it_is_adam_where_every_row_has_a_gradient(backend, shape):
+    parts = state(shape)
     twin = torch.nn.Parameter(parts[0].clone())
     known = torch.optim.Adam([twin], lr=0.1, betas=(0.9, 0.99), eps=1e-15)
     for number in range(5):
-        gradient = torch.randn(6, 3, generator=torch.Generator().manual_seed(number))
+        gradient = torch.randn(*shape, generator=torch.Generator().manual_seed(number))
         twin.grad = gradient.clone()
         known.step()
         step(parts, gradient)
     torch.testing.assert_close(parts[0], twin.data)
 
 
-def test_rows_without_a_gradient_stay_as_they_are(backend):
-    parts, gradient = state(), torch.ones(6, 3)
+@pytest.mark.parametrize("rows", [6, 32])
+def test_rows_without_a_gradient_stay_as_they_are(backend, rows):
+    parts, gradient = state((rows, 3)), torch.ones(rows, 3)
     gradient[2] = 0
     gradient[4, :2] = 0  # a part of it has one
     before = [part.clone() for part in parts]
     step(parts, gradient)
     for now, then in zip(parts, before):
         assert torch.equal(now[2], then[2])
-    assert parts[3].tolist() == [1, 1, 0, 1, 1, 1]
+    assert parts[3].tolist() == [1, 1, 0, 1, 1, 1] + [1] * (rows - 6)
     torch.testing.assert_close(parts[0][0], before[0][0] - 0.1)
 
 
@@ -57,9 +60,9 @@ def test_of_more_axes_the_last_is_a_row(backend):
 
 
 def test_both_agree_after_many_steps():
-    fast, exact = state(), [part.double() for part in state()]
+    fast, exact = state((19, 3)), [part.double() for part in state((19, 3))]
     for number in range(2100):
-        gradient = torch.randn(6, 3, generator=torch.Generator().manual_seed(number))
+        gradient = torch.randn(19, 3, generator=torch.Generator().manual_seed(number))
         step(fast, gradient, 1e-3)
         step(exact, gradient.double(), 1e-3)
     torch.testing.assert_close(fast[0].double(), exact[0], rtol=1e-3, atol=1e-3)

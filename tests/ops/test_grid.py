@@ -1,7 +1,6 @@
 import numpy as np
 import pytest
 import torch
-from torch.autograd import gradcheck
 
 from forewarp.ops import grid
 from tests.support.reference import lattice_cells, trilinear_read
@@ -12,14 +11,6 @@ SHAPE = (3, 4, 5)
 def random_points(count=20, seed=1, low=-1.0, high=5.0):
     generator = torch.Generator().manual_seed(seed)
     return low + (high - low) * torch.rand(count, 3, generator=generator, dtype=torch.float64)
-
-
-def test_hand_worked(backend):
-    index = torch.arange(8, dtype=torch.int32).reshape(2, 2, 2)
-    values = torch.arange(8.0)[:, None]  # 4 x + 2 y + z
-    points = torch.tensor([[0.5, 0.0, 0.0], [0.25, 0.5, 0.75], [1.0, 1.0, 1.0]])
-    read = grid.trilinear(values, index, points, torch.zeros(1))
-    torch.testing.assert_close(read[:, 0], torch.tensor([2.0, 1.0 + 1.0 + 0.75, 7.0]))
 
 
 def test_equals_the_slow_twin(backend, sparse):
@@ -36,25 +27,6 @@ def test_a_voxel_reads_itself_and_an_absent_one_the_fill(backend, sparse):
     rows = index.reshape(-1).long()
     assert torch.equal(read[rows >= 0], values[rows[rows >= 0]])
     assert (read[rows < 0] == fill).all()
-
-
-def test_linear_fields_are_read_exactly_and_constant_ones_stay_so(backend):
-    cells = torch.tensor(lattice_cells(SHAPE), dtype=torch.float64)
-    index = torch.arange(60, dtype=torch.int32).reshape(SHAPE)
-    points = random_points(low=0.0, high=2.0)
-    slope = torch.tensor([2.0, -3.0, 0.5], dtype=torch.float64)
-    values = torch.stack([cells @ slope, torch.full((60,), 4.0, dtype=torch.float64)], -1)
-    read = grid.trilinear(values, index, points, values.new_zeros(2))
-    torch.testing.assert_close(read[:, 0], points @ slope)
-    torch.testing.assert_close(read[:, 1], torch.full((20,), 4.0, dtype=torch.float64))
-
-
-def test_gradcheck(backend, sparse):
-    values, index, fill = sparse
-    points = random_points(6, low=0.1, high=1.9)  # away from the kinks at whole coordinates
-    values.requires_grad_()
-    points.requires_grad_()
-    assert gradcheck(lambda v, p: grid.trilinear(v, index, p, fill), (values, points))
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -116,27 +88,6 @@ def test_a_second_derivative_is_refused_and_not_silently_zero(sparse):
         slope.sum().backward()
 
 
-@pytest.mark.parametrize(
-    ("change", "text"),
-    [
-        ({"values": torch.zeros(4)}, r"values: expected shape \(M, C\)"),
-        ({"index": torch.zeros(3, 4, dtype=torch.int32)}, r"index: expected shape \(X, Y, Z\)"),
-        ({"points": torch.zeros(5, 2)}, r"points: expected shape \(P, 3\), but got \(5, 2\)"),
-        ({"fill": torch.zeros(3)}, r"fill: expected shape \(2\)"),
-        ({"index": torch.zeros(1, 4, 5, dtype=torch.int32)}, "expected at least 2 voxels an axis"),
-    ],
-)
-def test_refuses_other_shapes(change, text):
-    fine = {
-        "values": torch.zeros(60, 2),
-        "index": torch.zeros(SHAPE, dtype=torch.int32),
-        "points": torch.zeros(5, 3),
-        "fill": torch.zeros(2),
-    }
-    with pytest.raises(ValueError, match=text):
-        grid.trilinear(**(fine | change))
-
-
 def test_index_of_inverts_the_list_of_voxels():
     voxels = torch.tensor([[2, 3, 4], [0, 0, 0], [1, 2, 0]])
     index = grid.index_of(voxels, SHAPE)
@@ -157,10 +108,6 @@ def test_dilate_equals_the_largest_distance():
         assert (grid.dilate(mask, by).numpy() == expected).all()
 
 
-def test_dilate_keeps_one_voxel_axes():
-    assert grid.dilate(torch.tensor([[[True, False, False]]])).tolist() == [[[True, True, False]]]
-
-
 @pytest.mark.parametrize("keeping", [None, torch.arange(40) % 7 == 3, torch.zeros(40, dtype=torch.bool)])
 def test_occupied_cells_have_a_corner_that_is_present_and_kept(backend, sparse, keeping):
     index = sparse[1].clone()
@@ -170,10 +117,6 @@ def test_occupied_cells_have_a_corner_that_is_present_and_kept(backend, sparse, 
     for x, y, z in lattice_cells((2, 3, 4)):
         rows = index[x : x + 2, y : y + 2, z : z + 2].flatten().tolist()
         assert bool(cells[x, y, z]) == any(row >= 0 and keep[row] for row in rows)
-
-
-def test_an_empty_lattice_has_no_occupied_cells(backend):
-    assert not grid.occupied_cells(torch.full(SHAPE, -1, dtype=torch.int32)).any()
 
 
 def test_neighbour_pairs_are_all_pairs_at_distance_one(sparse):
@@ -187,8 +130,3 @@ def test_neighbour_pairs_are_all_pairs_at_distance_one(sparse):
         if sum(abs(i - j) for i, j in zip(a, b)) == 1
     }
     assert found == expected
-
-
-def test_one_voxel_axes_have_no_pairs():
-    pairs = grid.neighbour_pairs(torch.arange(4, dtype=torch.int32).reshape(1, 4, 1))
-    assert [len(a) for a, _ in pairs] == [0, 3, 0]

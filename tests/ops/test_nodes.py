@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.autograd import gradcheck
 
-from forewarp.ops.nodes import carry_nodes, node_maps, pull_nodes, stiffness
+from forewarp.ops.nodes import carry_nodes, node_maps, pull_nodes, spread_nodes, stiffness
 
 
 def some(count=7, dtype=torch.float64, seed=0):
@@ -90,3 +90,23 @@ def test_shapes_that_do_not_go_together_are_refused():
         pull_nodes(motion, places, torch.zeros(7, 9), edges, weights, 1.0)
     with pytest.raises(ValueError, match=r"shift: expected shape \(7, 2, 3\)"):
         carry_nodes(torch.zeros(7, 3, 3), None, torch.zeros(2), places)
+
+
+@pytest.mark.parametrize("turns", [True, False])
+def test_spread_over_curves_equals_autograd(backend, turns):
+    shift, turn = (torch.randn(5, 7, 3, requires_grad=True) for _ in range(2))
+    slope, basis, bend = torch.randn(5, 6), torch.rand(7), torch.randn(7)
+    parts = ((shift, slope[:, :3], 2.0), (turn, slope[:, 3:], 1.0))[: 1 + turns]
+    loss = value = 0.0
+    for curve, own, unit in parts:
+        squared = (torch.einsum("mkc,k->mc", curve, bend) / unit).square().mean()
+        loss = loss + (torch.einsum("mkc,k->mc", curve, basis) * own).sum() + 3.0 * squared
+        value += float(squared.detach())
+    loss.backward()
+    *found, bent = spread_nodes(shift, turn if turns else None, slope, basis, bend, 3.0, 2.0)
+    assert bent == pytest.approx(value, rel=1e-5)
+    torch.testing.assert_close(found[0], shift.grad)
+    if turns:
+        torch.testing.assert_close(found[1], turn.grad)
+    else:
+        assert found[1] is None

@@ -1,5 +1,3 @@
-import math
-
 import pytest
 import torch
 
@@ -30,12 +28,6 @@ def test_with_jitter_each_lies_in_its_bin_and_the_outer_bins_are_half_as_wide():
     torch.testing.assert_close(depths.mean(0), (edges[1:] + edges[:-1]) / 2, atol=0.02, rtol=0)
     assert (depths.amax(0) - depths.amin(0) > 0.98 * (edges[1:] - edges[:-1])).all()
     assert (depths.diff(dim=1) >= 0).all()
-
-
-def test_a_generator_decides_the_jitter():
-    draw = [stratified(ones(3), ones(3, 2.0), 4, generator(seed)) for seed in (1, 1, 2)]
-    assert torch.equal(draw[0], draw[1])
-    assert not torch.equal(draw[0], draw[2])
 
 
 def test_no_rays_and_no_stretch():
@@ -81,17 +73,6 @@ def test_they_stay_inside_and_finite(weight):
     assert (depths <= 5).all()
 
 
-def test_a_ray_does_not_depend_on_its_neighbours():
-    edges, weights = torch.rand(5, 4, generator=generator()).cumsum(1), torch.rand(5, 3)
-    whole = by_importance(edges, weights, 9)
-    assert torch.equal(whole[[3]], by_importance(edges[[3]], weights[[3]], 9))
-
-
-def test_no_gradient_passes():
-    weights = torch.ones(1, 2, requires_grad=True)
-    assert not by_importance(torch.tensor([[0.0, 1, 2]]), weights, 3).requires_grad
-
-
 # clip_to_box -----------------------------------------------------------------------------------------------
 
 LOW, HIGH = torch.tensor([-1.0, -2, -3]), torch.tensor([1.0, 2, 3])
@@ -122,12 +103,6 @@ def test_clipping_hand_worked(origin, direction, expected):
         assert (begin, end) == pytest.approx(expected)
 
 
-def test_clipping_keeps_near_and_far():
-    assert clipped((-4.0, 0.0, 0.0), (1.0, 0.0, 0.0), 3.5, 4.5) == (3.5, 4.5)
-    begin, end = clipped((-4.0, 0.0, 0.0), (1.0, 0.0, 0.0), 0.0, 2.5)
-    assert end <= begin
-
-
 def test_points_between_lie_in_the_box():
     origins = 4 * torch.randn(500, 3, generator=generator(), dtype=torch.float64)
     directions = torch.nn.functional.normalize(torch.randn(500, 3, generator=generator(1)).double(), dim=1)
@@ -137,19 +112,3 @@ def test_points_between_lie_in_the_box():
     inside = ((points > LOW) & (points < HIGH)).all(-1)
     begin, end = begin[:, None], end[:, None]
     assert torch.equal(inside, (end > begin) & (along >= begin) & (along <= end))
-
-
-@pytest.mark.parametrize(
-    ("call", "text"),
-    [
-        (lambda: stratified(ones(), ones(), 1), "expected count >= 2, but got 1"),
-        (lambda: stratified(ones(2), ones(3), 4), r"far: expected shape \(2\), but got \(3,\)"),
-        (lambda: by_importance(torch.zeros(1, 3), torch.zeros(1, 3), 4), r"weights: expected shape \(1, 2\)"),
-        (lambda: by_importance(torch.zeros(1, 1), torch.zeros(1, 0), 4), "expected a bin"),
-        (lambda: by_importance(torch.zeros(1, 3), torch.zeros(1, 2), 4, floor=0.0), "floor > 0"),
-        (lambda: clip_to_box(torch.zeros(2, 3), torch.zeros(1, 3), 0, math.inf, LOW, HIGH), "directions"),
-    ],
-)
-def test_refuses(call, text):
-    with pytest.raises(ValueError, match=text):
-        call()

@@ -70,18 +70,6 @@ def test_equals_the_operators_one_by_one(strength, dtype):
     assert found.weights.dtype == found.opacity.dtype == dtype
 
 
-@pytest.mark.parametrize("threshold", [1e-4, 0.05])
-def test_returns_what_counts(threshold):
-    index, raw = matter(6.0)
-    scene = (*beams(), occupied_cells(index), index, raw)
-    found, (rays, distances, weights, _) = traced(*scene, threshold=threshold), plainly(*scene)
-    kept = weights > threshold
-    assert torch.equal(found.ray_ids, rays[kept])
-    torch.testing.assert_close(found.distances, distances[kept])
-    torch.testing.assert_close(found.weights, weights[kept])
-    assert found.samples == len(rays) > len(found.weights) > 0
-
-
 def test_ends_where_a_ray_ends():
     index, raw = matter(60.0)
     scene = (*beams(), occupied_cells(index), index, raw)
@@ -120,15 +108,3 @@ def test_nothing_to_see():
         assert found.samples == len(found.weights) == 0
         assert (found.transmittance == 1).all()
         assert (found.opacity == 0).all()
-
-
-def test_refuses():
-    index, raw = matter(1.0)
-    origins, directions, jitter = beams()
-    cells = occupied_cells(index)
-    with pytest.raises(ValueError, match=r"raw: expected shape \(M\)"):
-        traced(origins, directions, jitter, cells, index, raw[:, None])
-    with pytest.raises(ValueError, match=r"index: expected shape \(12, 15, 9\)"):
-        traced(origins, directions, jitter, cells, index[:5], raw)
-    with pytest.raises(ValueError, match=r"jitter: expected shape"):
-        traced(origins, directions, jitter[:2], cells, index, raw)

@@ -27,11 +27,10 @@ def runs(in_tmp):
     return write
 
 
-def test_two_runs_side_by_side_with_their_difference(forewarp, runs):
+def test_two_runs_side_by_side_with_their_difference(ok, runs):
     more = {"flow": {"epe_moving": 0.1, "motion_mean": 0.4}, "steps": {"coarse": 400, "fine": 900}}
     runs(one=metrics("forward", 31.5, **more), two=metrics("backward", 30.0, **more))
-    done = forewarp("report", "kind=compare", "runs=[one,two]")
-    assert done.status == 0, done.err
+    done = ok("report", "kind=compare", "runs=[one,two]")
     head, _, *rows = (line.split() for line in done.out.splitlines())
     assert head == ["PSNR", "(dB)", "of", "test", "views", "forward", "backward", "difference"]
     assert rows == [
@@ -66,8 +65,7 @@ def test_columns_are_named_as_far_as_needed(folders, methods, names):
     ("content", "line"),
     [
         (None, "run/metrics.json: expected a run's numbers, but got none; make them with forewarp-evaluate"),
-        ("{", "run/metrics.json: expected the key protocol, but got none; make it anew with forewarp-eval"),
-        ("[]", "run/metrics.json: expected the key protocol, but got none"),
+        ("[]", "run/metrics.json: expected the key protocol, but got none; make it anew with forewarp-eval"),
         ({"protocol": {}, "test": {}}, "run/metrics.json: expected the key seconds, but got none"),
     ],
 )

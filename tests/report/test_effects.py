@@ -13,9 +13,8 @@ SLOW, QUICK = ((10, 20.0), (20, 24.0), (40, 25.0)), ((5, 24.0), (10, 24.9), (20,
 
 def write_choice(root, choice, *, scene="ball", seed=0, calls_for=None, on=(), psnr=30.0, curve=SLOW):
     """A run of a choice; of ``auto`` with its plan."""
-    folder = write_run(root, choice, seed, scene=scene, psnr=psnr, curve=curve, against="all_effects")
-    config = yaml.safe_load((folder / "config.yaml").read_text()) | {"calls_for": calls_for}
-    (folder / "config.yaml").write_text(yaml.safe_dump(config))
+    more = {"scene": scene, "psnr": psnr, "curve": curve, "against": "all_effects"}
+    folder = write_run(root, choice, seed, **more, config={"calls_for": calls_for})
     if choice == "auto":
         effects = {
             name: {"choice": "x" if name in on else "none", "on": name in on, "because": f"{name}, 3 %"}
@@ -65,10 +64,7 @@ def test_seeds_are_paired_and_what_is_missing_is_empty(tmp_path):
     assert rows[0][4].mean == 0.5  # of the second seed alone
     assert rows[1][3:7] == [None, None, None, None]
     assert rows[2][3] is None
-    assert {run.variant: plan_of(run).get("seconds") for run in results} == {
-        "auto": 12.5,
-        "all_effects": None,
-    }
+    assert [plan_of(run).get("seconds") for run in results if run.variant == "auto"] == [12.5] * 3
 
 
 def test_of_two_runs_of_a_kind_the_last_one_counts(tmp_path):
@@ -77,10 +73,3 @@ def test_of_two_runs_of_a_kind_the_last_one_counts(tmp_path):
     os.utime(last / "metrics.json", (2e9, 2e9))
     results, _ = collect(tmp_path)
     assert compared(results).rows[0][2].mean == 31.0
-
-
-def test_without_a_curve_there_is_no_time_to_it(tmp_path):
-    write_choice(tmp_path, "auto", curve=None)
-    write_choice(tmp_path, "all_effects", curve=None)
-    results, _ = collect(tmp_path)
-    assert compared(results).rows[0][5] is None

@@ -1,11 +1,5 @@
 from forewarp.report.price_list import write_price_list
-from tests.support.runs_on_disk import write_run
-
-
-def rows(text, first):
-    """The cells of rows that begin with ``first``."""
-    cells = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines()]
-    return [row for row in cells if row[:1] == [first]]
+from tests.support.runs_on_disk import rows_of, write_run
 
 
 def test_changes_are_against_the_same_seed(tmp_path):
@@ -23,25 +17,15 @@ def test_changes_are_against_the_same_seed(tmp_path):
     write_run(runs, "failed", psnr=None)
     page, file = write_price_list(runs, tmp_path / "out")
     text = page.read_text()
-    own, change = rows(text, "grid_64")
+    own, change = rows_of(text, "grid_64")
     assert own[1:3] == ["2", "28.25 ± 1.06"]
-    assert change[1:] == [
-        "base",
-        "2",
-        "-0.75 ± 0.35",
-        "+0.0000 ± 0.0000",
-        "-0.1000 ± 0.0000",
-        "×0.50 ± 0.00",
-        "×1.00 ± 0.00",
-        "×1.00 ± 0.00",
-        "×1.00 ± 0.00",
-        "×2.00 ± 0.00",
-    ]
-    assert rows(text, "unet_16")[0][1:6] == ["grid_64", "1", "+1.50", "+0.0000", ""]
-    assert rows(text, "preset.rays=64")[1][1:4] == ["base", "1", "+1.00"]
-    assert rows(text, "model=backward preset.rays=64")[0][1:4] == ["preset.rays=64", "1", "+0.50"]
-    assert len(rows(text, "base")) == 1
-    assert rows(text, "alone")[0][2:4] == ["0", ""]  # nothing to compare it with
+    assert change[1:5] == ["base", "2", "-0.75 ± 0.35", "+0.0000 ± 0.0000"]
+    assert change[5:] == ["-0.1000 ± 0.0000", "×0.50 ± 0.00", *["×1.00 ± 0.00"] * 3, "×2.00 ± 0.00"]
+    assert rows_of(text, "unet_16")[0][1:6] == ["grid_64", "1", "+1.50", "+0.0000", ""]
+    assert rows_of(text, "preset.rays=64")[1][1:4] == ["base", "1", "+1.00"]
+    assert rows_of(text, "model=backward preset.rays=64")[0][1:4] == ["preset.rays=64", "1", "+0.50"]
+    assert len(rows_of(text, "base")) == 1
+    assert rows_of(text, "alone")[0][2:4] == ["0", ""]  # nothing to compare it with
     assert "Of all test views:" in text
     assert "* ball/failed-1.0-seed0: no metrics.json" in text
     lines = file.read_text().splitlines()

@@ -1,6 +1,7 @@
 import pytest
 
-from forewarp.report.tables import Column, Estimate, Table
+from forewarp.metrics.gain import Estimate
+from forewarp.report.tables import Column, Table
 
 TABLE = Table(
     [Column("name"), Column("PSNR", signed=True), Column("steps", 0), Column("s", prefix="×")],
@@ -25,11 +26,7 @@ def test_a_table_without_rows_has_its_head():
 
 
 def test_csv_keeps_all_digits_and_the_spread_apart():
-    assert TABLE.csv().splitlines() == [
-        "name,PSNR,PSNR sd,steps,s",
-        "a|b,0.5,0.25,10,1.234",
-        "c,-1.0,,,2.0",
-    ]
+    assert TABLE.csv().splitlines() == ["name,PSNR,PSNR sd,steps,s", "a|b,0.5,0.25,10,1.234", "c,-1.0,,,2.0"]
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,3 @@
-import pytest
 import torch
 
 from forewarp.scene.box import Box, Lattice
@@ -35,9 +34,3 @@ def test_what_no_view_sees_is_outside():
     far = torch.tensor([[0.0, 0.0, 50.0]])
     assert not visual_hull(far, cameras, [torch.ones_like(m) for m in masks]).any()
     assert visual_hull(POINTS[:0], cameras, masks).shape == (0,)
-
-
-def test_refuses_a_mask_too_few():
-    cameras, masks = views(2)
-    with pytest.raises(ValueError, match="zip"):
-        visual_hull(POINTS, cameras, masks[:1])

@@ -15,22 +15,7 @@ ODD = [
     *("os.system", [], [1], [[1.0] * 4] * 4, {}, {"a": 1}, {"_args_": [1]}),
     {"_target_": "os.system", "command": "false"},
 ]
-WORDS = [
-    b"",
-    b"nan",
-    b"inf",
-    b"-1",
-    b"0",
-    b"1e300",
-    b"1e400",
-    b"x",
-    b"1 2",
-    b"\n",
-    b"\0",
-    b"*a",
-    b"&a",
-    b"!!",
-]
+WORDS = [*b" nan inf -1 0 1e300 1e400 x *a &a !!".split(b" "), b"1 2", b"\n", b"\0"]
 NAN_SIGNALLING = np.full((6, 8), 0x7F800001, np.uint32).view(np.float32)
 ARRAYS = [
     *(np.full((6, 8), np.nan, np.float32), NAN_SIGNALLING, NAN_SIGNALLING[:2, :3], np.full((6, 8), 1e300)),

@@ -1,17 +1,14 @@
-"""``python -m tests.stability.report [--long]``: write the tables of docs/stability.md."""
+"""``python -m tests.stability.report``: write the table of operators of docs/stability.md."""
 
 from __future__ import annotations
 
-import argparse
 import math
 import re
-import statistics
 from collections.abc import Sequence
 from pathlib import Path
 
 from forewarp.cli.entry import quiet
 from forewarp.runs.config_files import project_root
-from tests.stability.endurance import RATES, SEEDS, STEPS, endure
 from tests.stability.twin import BACKENDS, rows
 
 COLUMNS = [f"{what}, {backend}" for backend in BACKENDS for what in ("values", "gradients")]
@@ -43,18 +40,6 @@ def operator_table() -> str:
     return table(["operator", "input", *COLUMNS], lines)
 
 
-def endurance_table(trials: Sequence[dict]) -> str:
-    """Summarise PSNR by learning rate, and how many runs failed."""
-    lines = []
-    for rate in sorted({t["rate"] for t in trials}):
-        own = [t for t in trials if t["rate"] == rate]
-        scores = [t["psnr"] for t in own if t["wrong"] is None]
-        spread = [f"{f(scores):.2f}" for f in (min, statistics.median, max)] if scores else [""] * 3
-        deviation = f"{statistics.pstdev(scores):.2f}" if scores else ""
-        lines.append([f"x{rate:g}", str(len(own)), str(len(own) - len(scores)), *spread, deviation])
-    return table(["lr", "seeds", "not finite", "least PSNR", "median", "most", "deviation"], lines)
-
-
 def replace_section(path: Path, name: str, text: str) -> None:
     """Replace what is between ``<!-- name -->`` and ``<!-- end of name -->`` in a file by ``text``.
 
@@ -68,36 +53,11 @@ def replace_section(path: Path, name: str, text: str) -> None:
     path.write_text(marks.sub(lambda found: f"{found[1]}\n{text}\n\n{found[2]}", before))
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Measure, and write the tables."""
-    parser = argparse.ArgumentParser(prog="python -m tests.stability.report", description=__doc__)
-    parser.add_argument(
-        "--long",
-        action="store_true",
-        help="also fit many seeds at high learning rates; continues where it stopped",
-    )
-    parser.add_argument(
-        "--no-operators", dest="operators", action="store_false", help="keep the table of operators"
-    )
-    parser.add_argument("--seconds", type=float, default=math.inf, help="most seconds for the long runs")
-    parser.add_argument("--seeds", type=int, default=SEEDS)
-    parser.add_argument("--steps", type=int, default=STEPS)
-    parser.add_argument(
-        "--trials", type=Path, default=Path("runs/stability/trials.jsonl"), help="file of the long runs"
-    )
-    parser.add_argument("--document", type=Path, default=None, help="instead of docs/stability.md")
-    given = parser.parse_args(arguments)
+def main() -> None:
+    """Measure, and write the table."""
     quiet()
-    document = given.document or project_root() / "docs" / "stability.md"
-    if given.operators:
-        replace_section(document, "operators", operator_table())
-    if given.long:
-        trials = endure(given.trials, seconds=given.seconds, seeds=given.seeds, steps=given.steps)
-        text = endurance_table(trials)
-        wanted = given.seeds * len(RATES)
-        if len(trials) < wanted:
-            text += f"\n\n{len(trials)} of {wanted} done; the same command goes on."
-        replace_section(document, "long runs", text)
+    document = project_root() / "docs" / "stability.md"
+    replace_section(document, "operators", operator_table())
     print(document)
 
 

@@ -6,66 +6,14 @@ from functools import partial
 import pytest
 import torch
 
-from forewarp.fields.radiance import DirectRadiance
 from forewarp.losses import tv_density, tv_flow
-from forewarp.methods.voxel.effects.dense import densify, occupied_crop, sparsify
 from forewarp.methods.voxel.effects.inpaint import UNet3d
 from forewarp.methods.voxel.effects.upsample import LearnedUpsampler, TrilinearUpsampler
-from forewarp.methods.voxel.structure import box_of_all_times, occupied, refresh, resample
-from forewarp.ops.grid import dilate, neighbour_pairs, trilinear
+from forewarp.ops.grid import neighbour_pairs, trilinear
 from forewarp.scene.box import Box, Lattice
 from tests.support.hard_cases import LATTICE, check_finite, grid, index_with
 
 pytestmark = pytest.mark.stability
-
-
-def radiance(lattice=LATTICE, raw=5.0, device="cpu"):
-    active = torch.ones(lattice.shape, dtype=torch.bool)
-    made = DirectRadiance(
-        lattice, active, features=3, alpha_init=1e-2, density_scale=lattice.voxel_size, alpha_threshold=1e-4
-    )
-    torch.nn.init.constant_(made.density, raw)
-    return made.to(device)
-
-
-class Still(torch.nn.Module):
-    """A voxel method without motion."""
-
-    motion, moves = None, False
-
-    def __init__(self, field):
-        super().__init__()
-        self.radiance = field
-
-
-def test_no_matter_gives_no_box(device):
-    assert box_of_all_times(Still(radiance(raw=-20.0, device=device)), [0.0, 1.0], alpha=1e-2, pad=2) is None
-
-
-def test_one_voxel_of_matter_gives_a_box_with_room(device):
-    field = radiance(raw=-20.0, device=device)
-    field.density.data[31] = 9.0
-    box = box_of_all_times(Still(field), [0.0], alpha=1e-2, pad=2.0)
-    assert min(box.size) == pytest.approx(4 * LATTICE.voxel_size)
-
-
-def test_an_empty_grid_does_not_vanish_for_good(device):
-    field = radiance(raw=-20.0, device=device)
-    optimizer = torch.optim.Adam(field.parameters())
-    assert not refresh(field, optimizer, keep_alpha=1e-2, birth_alpha=1e-3)
-    assert len(field.voxels) == LATTICE.count
-    resample(field, LATTICE.box, 100, keep_alpha=1e-2)
-    assert len(field.voxels) == field.lattice.count
-
-
-@pytest.mark.parametrize("present", ["none", "one", "all"])
-def test_occupancy_of_none_one_and_all(place, present):
-    field = radiance(raw={"none": -20.0, "one": -20.0, "all": 5.0}[present], device=place)
-    if present == "one":
-        field.density.data[0] = 9.0
-    mask = occupied(field, 1e-2)
-    assert int(mask.sum()) == {"none": 0, "one": 1, "all": 60}[present]
-    assert int(dilate(mask).sum()) == {"none": 0, "one": 8, "all": 60}[present]
 
 
 @pytest.mark.parametrize("thin", [1e-1, 1e-4, 1e-9, 1e-30])
@@ -78,25 +26,6 @@ def test_a_flat_box_gets_the_voxels_asked_for_and_no_more(thin, axes):
         assert min(lattice.shape) >= 4
         assert 0.4 * count < lattice.count < 2.5 * count
         assert all(s > 0 and math.isfinite(s) for s in (*lattice.spacing, lattice.voxel_size))
-
-
-@pytest.mark.parametrize("factor", [1e-3, 1.0, 1e3])
-def test_the_lattice_of_a_box_does_not_depend_on_the_unit(factor):
-    box = Box((-1.1 * factor, 0, 0), (1.2 * factor, 2.0 * factor, 0.7 * factor))
-    plain = Lattice.of_count(Box((-1.1, 0, 0), (1.2, 2.0, 0.7)), 9e4)
-    assert Lattice.of_count(box, 9e4).shape == plain.shape
-    assert Lattice.of_count(box, 9e4).voxel_size == pytest.approx(factor * plain.voxel_size)
-
-
-def test_the_border_voxel_counts_whole(place):
-    """Zero padding would halve the value."""
-    index = torch.arange(60, dtype=torch.int32, device=place).reshape(LATTICE.shape)
-    values = torch.ones(60, 1, device=place, requires_grad=True)
-    points = torch.tensor([[0.0, 0, 0], [2, 3, 4], [2, 0, 3.999], [-0.3, 3.4, 9.0]], device=place)
-    points.requires_grad_()
-    read = trilinear(values, index, points, torch.zeros(1, device=place))
-    torch.testing.assert_close(read, torch.ones_like(read))
-    check_finite(read, values, points)
 
 
 def test_a_place_that_is_no_number_reads_no_number(place):
@@ -154,15 +83,6 @@ def test_upsampling_of_odd_grids(place, upsampler, present):
     assert fine.lattice.shape == (5, 7, 9)
 
 
-def test_an_empty_grid_through_the_dense_box(place):
-    field = grid(3.0, index=torch.full(LATTICE.shape, -1, dtype=torch.int32), device=place)
-    crop = occupied_crop(field.index, 2)
-    dense = densify(field, crop)
-    back = sparsify(field, LATTICE, crop, dense)
-    assert back.values.isfinite().all()
-    assert not (back.activation.alpha(back.raw_density, 1.0) > 1e-5).any()
-
-
 @pytest.mark.parametrize("shape", [(1, 1, 1), (1, 4, 1), (2, 1, 3)])
 def test_total_variation_on_axes_of_one_voxel(device, shape):
     index = torch.arange(math.prod(shape), dtype=torch.int32, device=device).reshape(shape)
@@ -171,9 +91,3 @@ def test_total_variation_on_axes_of_one_voxel(device, shape):
     check_finite(tv_flow(flow, pairs), flow)
     density = flow.detach()[:, 0].clone().requires_grad_()
     check_finite(tv_density(density, pairs), density)
-
-
-def test_density_of_an_opacity_next_to_one_over_a_tiny_length():
-    activation = radiance().activation
-    for length in (1e-6, 1e-3, 1.0):
-        assert math.isfinite(activation.raw(1 - 1e-12, length * activation.density_scale))

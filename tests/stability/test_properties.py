@@ -5,9 +5,8 @@ import torch
 from hypothesis import HealthCheck, given, settings, strategies
 
 from forewarp.fields.radiance_grid import Activation, RadianceGrid
-from forewarp.methods.voxel.effects.dense import densify
+from forewarp.methods.voxel.effects.dense import Crop, densify
 from forewarp.ops.composite import accumulate, render_weights
-from forewarp.ops.march import march, march_reference
 from forewarp.ops.splat import average_splat
 from forewarp.renderer import Renderer
 from forewarp.scene.box import Box, Lattice
@@ -24,7 +23,6 @@ MANY = settings(
     suppress_health_check=[HealthCheck.function_scoped_fixture],  # the implementation stays the same
 )
 SEEDS = strategies.integers(0, 1_000_000)
-AXES = strategies.permutations([0, 1, 2])
 SHIFTS = strategies.tuples(*[strategies.integers(-3, 3)] * 3)
 
 
@@ -67,18 +65,6 @@ def test_the_splat_commutes_with_whole_voxel_shifts(place, seed, shift):
 
 
 @MANY
-@given(SEEDS, AXES)
-def test_the_splat_commutes_with_swapped_axes(place, seed, axes):
-    positions = random(seed, 60, 3, low=-1.5, high=5.5).to(place)
-    source = random(seed + 1, 60, 2).to(place)
-    plain = as_dense(average_splat(source, positions, SHAPE))
-    shape = tuple(SHAPE[a] for a in axes)
-    swapped = as_dense(average_splat(source, positions[:, axes], shape), shape)
-    torch.testing.assert_close(plain[0].permute(*axes, 3), swapped[0], atol=2e-5, rtol=1e-4)
-    torch.testing.assert_close(plain[1].permute(*axes), swapped[1], atol=1e-6, rtol=1e-5)
-
-
-@MANY
 @given(SEEDS)
 def test_zero_flow_is_the_identity(place, seed):
     source = random(seed, 60, 3, low=-1e3, high=1e3).to(place)
@@ -89,7 +75,7 @@ def test_zero_flow_is_the_identity(place, seed):
 
 @MANY
 @given(SEEDS, strategies.floats(-30, 12))
-def test_weights_and_opacity_lie_between_0_and_1_and_light_never_grows(device, seed, power):
+def test_weights_and_opacity_lie_between_0_and_1(device, seed, power):
     count, rays = 200, 12
     ids = (random(seed, count) * rays).long().sort().values.to(device)
     optical = (random(seed + 1, count) * 10.0**power).to(device)
@@ -99,45 +85,23 @@ def test_weights_and_opacity_lie_between_0_and_1_and_light_never_grows(device, s
     opacity = accumulate(weights, torch.ones(count, 1, device=device), ids, rays)[:, 0]
     assert float(opacity.max()) <= 1 + 1e-6
     torch.testing.assert_close(opacity + transmittance, torch.ones_like(opacity), atol=1e-6, rtol=0)
-    for ray in range(rays):  # what reaches each sample
-        x, w = optical[ids == ray].double(), weights[ids == ray].double()
-        expected = torch.exp(x - x.cumsum(0))
-        told = (x > 1e-20) & (w > 1e-36)  # below, float32 cannot represent the weight
-        reaches = (w / -torch.expm1(-x))[told]
-        assert (reaches.diff() <= 1e-6 * reaches[:-1]).all()
-        bright = expected[told] > 1e-30  # beyond an optical depth of 80 everything is opaque
-        torch.testing.assert_close(reaches[bright], expected[told][bright], atol=0, rtol=1e-6)
 
 
-def field_of(seed, share=0.6, shape=(6, 7, 8), dtype=torch.float32, alpha_threshold=0.0):
+def field_of(seed, place, share=0.6, shape=(6, 7, 8)):
     lattice = Lattice(Box((-1, -1.2, -0.9), (1.0, 1.1, 1.3)), shape)
-    index = index_with(random(seed, *shape) < share)
-    values = random(seed + 1, int((index >= 0).sum()), 4, low=-3, high=6, dtype=dtype)
-    return RadianceGrid(lattice, index, values, Activation(-2.0, lattice.voxel_size), alpha_threshold)
+    index = index_with(random(seed, *shape) < share, place)
+    values = random(seed + 1, int((index >= 0).sum()), 4, low=-3, high=6).to(place).requires_grad_()
+    return RadianceGrid(lattice, index, values, Activation(-2.0, lattice.voxel_size))
 
 
-def rays_of(seed, count=40, dtype=torch.float32):
-    origins = 4 * torch.nn.functional.normalize(random(seed, count, 3, low=-1, dtype=dtype), dim=-1)
-    targets = random(seed + 1, count, 3, low=-0.8, high=0.8, dtype=dtype)
-    return Rays(origins, torch.nn.functional.normalize(targets - origins, dim=-1), 1.0, 7.0)
+def rays_of(seed, place, count=40):
+    origins = 4 * torch.nn.functional.normalize(random(seed, count, 3, low=-1), dim=-1)
+    targets = random(seed + 1, count, 3, low=-0.8, high=0.8)
+    return Rays(origins, torch.nn.functional.normalize(targets - origins, dim=-1), 1.0, 7.0).to(place)
 
 
-def drawn(field, view, **changes):
-    return Renderer(color_threshold=0.0, **changes)(field, view, torch.ones(3, dtype=view.origins.dtype))
-
-
-@MANY
-@given(SEEDS, strategies.integers(1, 40))
-def test_rays_in_chunks_are_the_rays(place, seed, chunk):
-    """Pictures agree to 1e-6; gradients, summed in another order, to 1e-5 of the largest."""
-    field, view = moved(field_of(seed), place), rays_of(seed).to(place)
-    field.values.requires_grad_()
-    whole = drawn_on(field, view)
-    parts = [drawn_on(field, view[i : i + chunk]) for i in range(0, len(view), chunk)]
-    for name in ("rgb", "depth", "opacity", "transmittance"):
-        joined = torch.cat([getattr(p, name) for p in parts])
-        torch.testing.assert_close(getattr(whole, name), joined, atol=1e-6, rtol=1e-6)
-    check_slopes(slopes([whole], field.values), slopes(parts, field.values), 1e-5)
+def drawn(field, view):
+    return Renderer(color_threshold=0.0)(field, view, torch.ones(3, device=view.origins.device))
 
 
 def slopes(pictures, values, names=("rgb", "depth", "opacity")):
@@ -150,27 +114,17 @@ def check_slopes(ours, theirs, share):
     torch.testing.assert_close(ours, theirs, atol=share * float(theirs.abs().max()), rtol=0)
 
 
-def drawn_on(field, view):
-    return Renderer(color_threshold=0.0)(field, view, torch.ones(3, device=view.origins.device))
-
-
-def moved(field, place):
-    return RadianceGrid(
-        field.lattice, field.index.to(place), field.values.to(place), field.activation, field.alpha_threshold
-    )
-
-
 @MANY
-@given(SEEDS)
-def test_the_order_of_the_rays_does_not_matter(place, seed):
-    """Samples are packed ray by ray; another order gives the same picture to 1e-6 and gradient to 1e-5."""
-    field, view = moved(field_of(seed), place), rays_of(seed).to(place)
-    field.values.requires_grad_()
-    order = torch.randperm(len(view), generator=torch.Generator().manual_seed(seed)).to(place)
-    first, second = drawn_on(field, view), drawn_on(field, view[order])
-    torch.testing.assert_close(first.rgb[order], second.rgb, atol=1e-6, rtol=1e-6)
-    torch.testing.assert_close(first.depth[order], second.depth, atol=1e-5, rtol=1e-6)
-    check_slopes(slopes([first], field.values), slopes([second], field.values), 1e-5)
+@given(SEEDS, strategies.integers(1, 40))
+def test_rays_in_chunks_are_the_rays(place, seed, chunk):
+    """Pictures agree to 1e-6; gradients, summed in another order, to 1e-5 of the largest."""
+    field, view = field_of(seed, place), rays_of(seed, place)
+    whole = drawn(field, view)
+    parts = [drawn(field, view[i : i + chunk]) for i in range(0, len(view), chunk)]
+    for name in ("rgb", "depth", "opacity", "transmittance"):
+        joined = torch.cat([getattr(p, name) for p in parts])
+        torch.testing.assert_close(getattr(whole, name), joined, atol=1e-6, rtol=1e-6)
+    check_slopes(slopes([whole], field.values), slopes(parts, field.values), 1e-5)
 
 
 @MANY
@@ -180,58 +134,15 @@ def test_packed_samples_in_occupied_cells_equal_every_sample_of_the_dense_grid(p
 
     The difference is the faint density that absent voxels have where they are drawn.
     """
-    sparse = moved(field_of(seed, share=0.1), place)
-    whole = type("Crop", (), {"low": (0, 0, 0), "high": tuple(n - 1 for n in sparse.lattice.shape)})
-    whole.shape = sparse.lattice.shape
+    sparse = field_of(seed, place, share=0.1)
+    whole = Crop((0, 0, 0), tuple(n - 1 for n in sparse.lattice.shape))
     everywhere = torch.arange(sparse.lattice.count, dtype=torch.int32, device=place)
-    rows = densify(sparse, whole)[0].flatten(1).T.contiguous()
+    rows = densify(sparse, whole)[0].flatten(1).T.detach().contiguous().requires_grad_()
     dense = RadianceGrid(sparse.lattice, everywhere.reshape(sparse.index.shape), rows, sparse.activation)
-    view, here = rays_of(seed).to(place), (sparse.index >= 0).flatten()
-    sparse.values.requires_grad_()
-    dense.values.requires_grad_()
-    first, second = drawn_on(sparse, view), drawn_on(dense, view)
+    view, here = rays_of(seed, place), (sparse.index >= 0).flatten()
+    first, second = drawn(sparse, view), drawn(dense, view)
     assert first.samples <= second.samples
     torch.testing.assert_close(first.rgb, second.rgb, atol=1e-4, rtol=0)
     torch.testing.assert_close(first.opacity, second.opacity, atol=1e-4, rtol=0)
     names = ("rgb", "opacity")  # no depth: on nearly empty rays it depends on the faintest voxels
     check_slopes(slopes([first], sparse.values, names), slopes([second], dense.values, names)[here], 1e-3)
-
-
-@MANY
-@given(SEEDS)
-def test_both_renderers_agree(seed):
-    pytest.importorskip("numba")
-    from forewarp.ops import march as module
-
-    field = field_of(seed, share=0.2, dtype=torch.float64)
-    field.values.requires_grad_()
-    view = rays_of(seed, dtype=torch.float64)
-    results = []
-    before = module.use_numba
-    try:
-        for numba in (True, False):
-            module.use_numba = lambda tensor, numba=numba: numba
-            picture = drawn(field, view)
-            slope = torch.autograd.grad(picture.rgb.sum() + picture.depth.sum(), field.values)[0]
-            results.append((picture.rgb, picture.depth, picture.opacity, slope))
-    finally:
-        module.use_numba = before
-    for ours, reference in zip(*results):
-        torch.testing.assert_close(ours, reference, atol=1e-9, rtol=1e-9)
-
-
-@MANY
-@given(SEEDS, strategies.floats(0.05, 2.0))
-def test_samples_lie_in_occupied_cells_and_are_all_of_them(place, seed, step):
-    cells = (random(seed, 5, 6, 7) < 0.3).to(place)
-    origins = random(seed + 1, 20, 3, low=-4, high=10, dtype=torch.float64).to(place)
-    directions = random(seed + 2, 20, 3, low=-1, dtype=torch.float64).to(place)
-    jitter = random(seed + 3, 20, dtype=torch.float64).to(place)
-    arguments = (origins, directions, 0.1, 30.0, step, cells, jitter)
-    ids, distances = march(*arguments)
-    expected_ids, expected = march_reference(*arguments)
-    assert torch.equal(ids, expected_ids)
-    torch.testing.assert_close(distances, expected)
-    at = origins[ids] + distances[:, None] * directions[ids]
-    last = torch.tensor(cells.shape, device=place)
-    assert ((at > -1e-9) & (at < last + 1e-9)).all()

@@ -24,17 +24,3 @@ def test_all_thirty_cases_have_a_row():
     rows = [line.split("|")[1] for line in DOCUMENT.splitlines() if line.startswith("|")]
     numbers = {int(n) for row in rows for n in re.findall(r"\b\d+\b", re.split(r"[a-zA-Z]", row)[0])}
     assert set(range(1, 31)) <= numbers
-
-
-def column(name, head):
-    """The cells below ``head`` in the table between the marks ``name``."""
-    text = DOCUMENT.split(f"<!-- {name} -->")[1].split(f"<!-- end of {name} -->")[0]
-    lines = [line for line in text.splitlines() if line.startswith("|")]
-    heads, _, *rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines]
-    return [row[heads.index(head)] for row in rows]
-
-
-def test_what_is_recorded_is_finished_and_without_a_fault():
-    assert "the same command goes on" not in DOCUMENT
-    broken = column("long runs", "not finite")
-    assert (len(broken), set(broken)) == (3, {"0"})

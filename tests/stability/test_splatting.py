@@ -9,8 +9,7 @@ from forewarp.fields.radiance_grid import EMPTY
 from forewarp.fields.trajectory import TrajectoryField
 from forewarp.methods.voxel.effects.motion import Motion
 from forewarp.ops.splat import average_splat
-from forewarp.renderer import Renderer
-from tests.support.hard_cases import LATTICE, SHAPE, check_finite, grid, rays, voxels
+from tests.support.hard_cases import LATTICE, SHAPE, check_finite, grid, voxels
 
 pytestmark = pytest.mark.stability
 
@@ -49,12 +48,6 @@ def test_all_voxels_land_in_one_cell(place):
     torch.testing.assert_close(result.values.double(), exact.values, atol=1e-4, rtol=1e-3)
 
 
-def test_a_constant_is_still_itself_where_all_land_in_one_cell(place):
-    positions = (1.2 + 0.6 * torch.rand(100_000, 3, generator=torch.Generator().manual_seed(2))).to(place)
-    result = average_splat(torch.full((100_000, 1), 7.0, device=place), positions, SHAPE)
-    torch.testing.assert_close(result.values, torch.full_like(result.values, 7.0), rtol=1e-4, atol=0)
-
-
 def test_expansion_opens_holes_everywhere(place):
     canonical = grid(6.0, device=place)
     home = voxels(device=place)
@@ -76,37 +69,6 @@ def test_flow_far_outside_infinite_and_nan(place, bad):
     warped, coverage, dropped = motion().warp(canonical, voxels(device=place).long(), flow)
     gradients = check_finite((warped.values, coverage), canonical.values, flow)
     assert dropped == 30  # counted, not silent
+    assert torch.equal(warped.values[coverage == 1], canonical.values[:30])  # where the other half stays
+    assert int((coverage != 0).sum()) == 30
     assert (gradients[1][::2] == 0).all()
-
-
-def test_everything_leaves_the_box(place):
-    canonical = grid(6.0, device=place)
-    flow = torch.full((60, 3), 99.0, device=place, requires_grad=True)
-    warped, _, dropped = motion().warp(canonical, voxels(device=place).long(), flow)
-    assert dropped == 60
-    assert len(warped.values) == 0
-    view = rays([[0.0, 0.5, -5.0]], [[0.0, 0.0, 1.0]], device=place)
-    drawn = Renderer()(warped, view, torch.ones(3, device=place))
-    assert drawn.rgb.tolist() == [[1, 1, 1]]
-    check_finite(drawn.rgb + 0 * flow.sum(), flow)
-
-
-def test_a_hole_is_not_fog(place):
-    """Raw density 0 is 1 % opaque per voxel, 55 % over 80 voxels: a hole must not fade to it."""
-    canonical = grid(6.0, device=place)
-    flow = torch.zeros(60, 3, device=place)
-    flow[:, 2] = (1 - 1e-6) * LATTICE.spacing[2]
-    warped, coverage, _ = motion().warp(canonical, voxels(device=place).long(), flow)
-    hole = warped.index[:, :, 0].flatten().long()
-    sigma = warped.activation.sigma(warped.raw_density)[hole]
-    assert float(coverage[hole].detach().max()) < 1e-5
-    assert float(-torch.expm1(-80 * sigma.detach().max())) < 1e-4
-    check_finite(sigma, canonical.values)
-
-
-def test_the_sum_is_the_same_each_time(place):
-    if place.type == "cuda":
-        pytest.skip("atomics on a GPU add in any order")
-    source, positions = source_of(5000, place), 4 * torch.rand(5000, 3)
-    first, second = (average_splat(source, positions, SHAPE).values for _ in range(2))
-    assert torch.equal(first, second)

@@ -1,6 +1,5 @@
 """A tiny written D-NeRF scene for tests, and the place of the real ones."""
 
-import json
 import os
 from pathlib import Path
 
@@ -8,11 +7,15 @@ import numpy as np
 import pytest
 import torch
 
+from forewarp.data import lego_complete
 from forewarp.data.dnerf import Shot, write_scene
 from forewarp.scene.camera import look_at
 from forewarp.scene.frame import Truth
+from tests.support.edits import edit as edit_file
 
 ANGLE = 0.6911112
+FEW = {"space": 4, "time": 3, "canonical": 2}
+TIMES = {"space": [0.0, 0.5, 0.5, 1.0], "time": [0.1, 0.3, 0.6], "canonical": [0.0, 0.0]}
 _REAL = Path(os.environ.get("FOREWARP_DATA", Path(__file__).parents[3] / "shared" / "data"))
 REAL_SCENES = ("bouncingballs", "hellwarrior", "hook", "jumpingjacks", "lego", "mutant")
 
@@ -43,6 +46,19 @@ def write_tiny(folder: Path, size=(6, 8), **changes) -> Path:
     return folder
 
 
+def write_kinds(folder: Path, **changes) -> Path:
+    """A Lego Complete scene: 3 training images, 9 test views of three kinds with depth, trajectories."""
+    splits = {"train": shots(3), "test": views()} | changes
+    lego_complete.write_scene(folder, splits, camera_angle_x=ANGLE, trajectories=truth())
+    return folder
+
+
+def views(counts=FEW):
+    """Shots of each ability at its times, with depth."""
+    for seed, (ability, count) in enumerate(counts.items()):
+        yield from shots(count, 10 + seed, ability=ability, depth=True, times=TIMES[ability])
+
+
 def truth() -> Truth:
     """Two points at three times."""
     return Truth(torch.arange(18.0).reshape(2, 3, 3), torch.tensor([0.0, 0.5, 1.0], dtype=torch.float64))
@@ -50,7 +66,4 @@ def truth() -> Truth:
 
 def edit(folder: Path, split: str, change) -> None:
     """Change what a transforms file holds."""
-    path = folder / f"transforms_{split}.json"
-    content = json.loads(path.read_text())
-    change(content)
-    path.write_text(json.dumps(content))
+    edit_file(folder / f"transforms_{split}.json", change)

@@ -1,6 +1,5 @@
 """A tiny written capture with poses for tests."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,9 +10,8 @@ from forewarp.data.posed_video import PosedShot, write_scene
 from forewarp.scene.camera import Camera, look_at
 from forewarp.scene.lens import Lens
 
-MIDDLE = torch.tensor(
-    [30.0, -20.0, 5.0], dtype=torch.float64
-)  # of a world whose unit and origin mean nothing
+# Of a world whose unit and origin mean nothing.
+MIDDLE = torch.tensor([30.0, -20.0, 5.0], dtype=torch.float64)
 UP = torch.tensor([0.0, 0.0, 1.0])
 LENS = Lens((0.1, -0.08, 0.01), (-0.02, 0.004))
 
@@ -43,14 +41,6 @@ def write_tiny(folder: Path, near=20.0, far=120.0, aabb=None, **options) -> Path
     """Ten frames of 30 x 20 pixels whose range is known."""
     write_scene(folder, shots(**options), near=near, far=far, aabb=aabb)
     return folder
-
-
-def edit(folder: Path, change) -> None:
-    """Change what the transforms file holds."""
-    path = folder / "transforms.json"
-    content = json.loads(path.read_text())
-    change(content)
-    path.write_text(json.dumps(content))
 
 
 def placed(scene, camera: Camera) -> Camera:

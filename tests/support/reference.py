@@ -8,26 +8,20 @@ import torch
 # metrics ---------------------------------------------------------------------------------------------------
 
 
-def similarity_at_window(a, b):
-    """Similarity and contrast of two 11 x 11 float64 numpy patches, straight from the definition."""
+def similarity_means(a, b):
+    """Mean similarity and contrast of the 11 x 11 windows of two planes (H, W), as they are defined."""
     x = np.arange(-5, 6)
     weights = np.exp(-(x[:, None] ** 2 + x[None, :] ** 2) / (2 * 1.5**2))
-    weights /= weights.sum()
-    mean_a, mean_b = (weights * a).sum(), (weights * b).sum()
-    var_a, var_b = (weights * (a - mean_a) ** 2).sum(), (weights * (b - mean_b) ** 2).sum()
-    cov = (weights * (a - mean_a) * (b - mean_b)).sum()
+    a, b = (np.lib.stride_tricks.sliding_window_view(plane, (11, 11)) for plane in (a, b))
+
+    def mean(windows):
+        return (weights * windows).sum((-2, -1), keepdims=True) / weights.sum()
+
+    mean_a, mean_b = mean(a), mean(b)
+    var_a, var_b, cov = mean((a - mean_a) ** 2), mean((b - mean_b) ** 2), mean((a - mean_a) * (b - mean_b))
     contrast = (2 * cov + 0.03**2) / (var_a + var_b + 0.03**2)
-    return contrast * (2 * mean_a * mean_b + 0.01**2) / (mean_a**2 + mean_b**2 + 0.01**2), contrast
-
-
-def similarity_means(a, b):
-    """Mean similarity and contrast over the full windows of two planes (H, W)."""
-    both = [
-        similarity_at_window(a[i : i + 11, j : j + 11], b[i : i + 11, j : j + 11])
-        for i in range(a.shape[0] - 10)
-        for j in range(a.shape[1] - 10)
-    ]
-    return np.mean(both, axis=0)
+    similarity = contrast * (2 * mean_a * mean_b + 0.01**2) / (mean_a**2 + mean_b**2 + 0.01**2)
+    return similarity.mean(), contrast.mean()
 
 
 def halved(plane):
@@ -83,6 +77,18 @@ def end_point_error(predicted, truth, threshold):
         else:
             still += errors
     return tuple(sum(v) / len(v) for v in (moving, still, motion))
+
+
+# cameras ---------------------------------------------------------------------------------------------------
+
+
+def bend(x, y, k, p):
+    """Where OpenCV's lens puts a point of the plane z = 1."""
+    r2 = x * x + y * y
+    s = 1 + k[0] * r2 + k[1] * r2**2 + k[2] * r2**3
+    return x * s + 2 * p[0] * x * y + p[1] * (r2 + 2 * x * x), y * s + 2 * p[1] * x * y + p[0] * (
+        r2 + 2 * y * y
+    )
 
 
 # the core --------------------------------------------------------------------------------------------------

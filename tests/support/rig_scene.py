@@ -1,6 +1,5 @@
 """A tiny written HyperNeRF capture for tests: two phones with lenses before a world of its own scale."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -22,19 +21,8 @@ def phone(index, size=(12, 8), skew=0.0, lens=LENS):
     middle = torch.tensor(CENTER, dtype=torch.float64)
     pose = look_at(middle + offset, middle, torch.tensor([0.0, 0.0, 1.0]))
     width, height = size
-    focal = 1.1 * width
-    return Camera(
-        *size,
-        focal,
-        1.026 * focal,
-        0.52 * width,
-        0.47 * height,
-        pose,
-        NEAR,
-        FAR,
-        skew,
-        lens if index % 2 else None,
-    )
+    inner = (1.1 * width, 1.026 * 1.1 * width, 0.52 * width, 0.47 * height)
+    return Camera(*size, *inner, pose, NEAR, FAR, skew, lens if index % 2 else None)
 
 
 def rig(times=5, **options):
@@ -67,11 +55,3 @@ def write_rig(folder: Path, shots=None, **changes) -> Path:
     options = {"center": CENTER, "scale": SCALE, "near": NEAR, "far": FAR} | changes
     write_scene(folder, rig() if shots is None else shots, **options)
     return folder
-
-
-def edit(folder: Path, name: str, change) -> None:
-    """Change what one of the JSON files holds."""
-    path = folder / f"{name}.json"
-    content = json.loads(path.read_text())
-    change(content)
-    path.write_text(json.dumps(content))

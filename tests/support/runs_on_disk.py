@@ -20,11 +20,16 @@ def write_run(
     epe=None,
     ability="all",
     command=None,
+    config=None,
+    metrics=None,
 ):
-    """A run's folder; None for ``psnr`` or ``curve`` leaves out what would hold it."""
+    """A run's folder; None for ``psnr`` or ``curve`` leaves out what would hold it.
+
+    ``config`` and ``metrics`` are merged into what is written.
+    """
     folder = Path(root) / scene / f"{variant}-{minutes}-seed{seed}"
     (folder / "coarse").mkdir(parents=True)
-    config = {
+    whole = {
         "data": {"scene": scene},
         "model": {"name": "forward"},
         "preset": {"name": "fast"},
@@ -33,10 +38,10 @@ def write_run(
         "seed": seed,
         "command": command or f"forewarp-train variant={variant} seed={seed}",
     }
-    (folder / "config.yaml").write_text(yaml.safe_dump(config))
+    (folder / "config.yaml").write_text(yaml.safe_dump(whole | (config or {})))
     (folder / "coarse" / "done.json").write_text(json.dumps({"steps": steps, "seconds": 50.0}))
     if psnr is not None:
-        metrics = {
+        numbers = {
             "protocol": {"device": "a cpu", "threads": 2, "versions": {"torch": "2"}},
             "seconds": {"train": 50.0, "render_per_frame": 0.5},
             "peak_memory_bytes": 2**30,
@@ -44,10 +49,18 @@ def write_run(
             "test": {ability: {"psnr": psnr, "ssim": 0.9}},
         }
         if epe is not None:
-            metrics["flow"] = {"epe_moving": epe}
-        (folder / "metrics.json").write_text(json.dumps(metrics))
+            numbers["flow"] = {"epe_moving": epe}
+        more = metrics or {}
+        numbers |= more | {"protocol": numbers["protocol"] | more.get("protocol", {})}
+        (folder / "metrics.json").write_text(json.dumps(numbers))
     if curve is not None:
         lines = [f"{s},coarse,{s},{p},{'' if epe is None else epe},100" for s, p in curve]
         text = "\n".join(["seconds,stage,step,psnr,epe_moving,voxels", *lines])
         (folder / "accuracy_time.csv").write_text(text + "\n")
     return folder
+
+
+def rows_of(text, first):
+    """The cells of a Markdown table's rows that begin with ``first``."""
+    cells = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines()]
+    return [row for row in cells if row[:1] == [first]]

@@ -8,11 +8,14 @@ import lightning
 import torch
 
 from forewarp.data.module import SceneDataModule
-from forewarp.fields.radiance import DirectRadiance
+from forewarp.fields.radiance import DirectRadiance, FeatureRadiance
 from forewarp.fields.trajectory import TrajectoryField
 from forewarp.methods.method import Start
+from forewarp.methods.voxel.effects.background import StaticBackground
+from forewarp.methods.voxel.effects.inpaint import UNet3d
 from forewarp.methods.voxel.effects.motion import Motion
-from forewarp.methods.voxel.effects.view_dependence import SphericalHarmonics
+from forewarp.methods.voxel.effects.upsample import LearnedUpsampler
+from forewarp.methods.voxel.effects.view_dependence import SphericalHarmonics, ViewNetwork
 from forewarp.methods.voxel.model import BackwardModel, ForwardModel, Ground
 from forewarp.methods.voxel.stage import VoxelStage
 from forewarp.scene.box import Box
@@ -78,6 +81,15 @@ def ball_data(rays=256, seed=0, **changes):
 
 
 RADIANCE = partial(DirectRadiance, alpha_init=1e-2, alpha_threshold=1e-4)
+FEATURES = partial(FeatureRadiance, alpha_init=1e-2, alpha_threshold=0.0, width=8)
+INPAINTER = partial(UNet3d, levels=2)
+EVERYTHING = {
+    "radiance": FEATURES,
+    "view_dependence": ViewNetwork,
+    "upsampler": partial(LearnedUpsampler, width=8),
+    "inpainter": INPAINTER,
+    "background": partial(StaticBackground, features=3, alpha_init=1e-2, alpha_threshold=1e-4),
+}
 
 
 def forward_model(**changes):
@@ -103,6 +115,19 @@ def built(
     active = torch.ones(lattice.shape, dtype=torch.bool) if active is None else active
     ground = Ground(lattice, active, density_scale, BOX, frames, canonical_time, static)
     return model.build(ground, VoxelStage(**({"num_voxels": [[0, 500]]} | numbers)))
+
+
+def ball_method(scene, raw=8.0, **numbers):
+    """Make a first stage's method whose canonical grid is the ball, with some motion."""
+    torch.manual_seed(0)
+    numbers = {"num_voxels": [[0, 1500]]} | numbers
+    method = forward_model()(Start(scene, "coarse", numbers, range(len(scene.train))))
+    points = method.radiance.lattice.to_world(method.radiance.voxels)
+    inside = (points - ball_center(0.0)).norm(dim=-1) < RADIUS
+    method.radiance.density.data = torch.where(inside, raw, -9.0)[:, None]
+    torch.nn.init.normal_(method.radiance.color)
+    torch.nn.init.normal_(method.motion.trajectory.network[-1].weight, std=1e-3)
+    return method
 
 
 def begun(method, scene, made):
@@ -154,6 +179,12 @@ def make_run(folder, stages, *, data=None, model=None, callbacks=(), **changes):
         callbacks=lambda name, where: list(callbacks),
         **changes,
     )
+
+
+def same(one, other):
+    """Return whether two modules hold the same tensors, bit for bit."""
+    one, other = ({k: v for k, v in m.state_dict().items() if torch.is_tensor(v)} for m in (one, other))
+    return one.keys() == other.keys() and all(torch.equal(one[k], other[k]) for k in one)
 
 
 class Interrupt(lightning.Callback):

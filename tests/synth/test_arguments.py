@@ -4,9 +4,6 @@ import filecmp
 
 import pytest
 
-pytest.importorskip("trimesh")
-pytest.importorskip("embreex")
-
 from forewarp.scene.errors import SceneError
 from forewarp.synth import dome, lego_complete, rig, scenes
 
@@ -19,7 +16,6 @@ TINY = {
 }
 BAD = [
     (scenes, {"size": 7}, "size: expected a whole number of at least 8, but got 7"),
-    (scenes, {"size": 20.5}, "size: expected a whole number"),
     (scenes, {"frames": 1}, "frames: expected a whole number of at least 2, but got 1"),
     (scenes, {"seed": -1}, "seed: expected a whole number of at least 0, but got -1"),
     (scenes, {"motion": "fly"}, "motion: expected one of lift, lift_tilt, drive, still, rigid, band, "),
@@ -27,19 +23,15 @@ BAD = [
     (scenes, {"test_views": (0, 0, 0)}, "not all 0, but got"),
     (scenes, {"test_views": 5}, "test_views: expected three numbers"),
     (scenes, {"test_views": (1, -2, 3)}, "test_views: expected a whole number of at least 0, but got -2"),
-    (scenes, {"samples_per_pixel": 0}, "samples_per_pixel: expected a whole number of at least 1, but got 0"),
     (lego_complete, {"motions": ["fly"]}, "motions: expected one of lift, lift_tilt, drive, but got 'fly'"),
     (lego_complete, {"motions": []}, "motions: expected a list of"),
     (lego_complete, {"motions": "lift"}, "motions: expected a list of"),
     (lego_complete, {"motions": ["lift", "lift"]}, "motions: expected each once"),
-    (lego_complete, {"test_views": (1, 2)}, "test_views: expected three numbers"),
     (lego_complete, {"workers": 0}, "workers: expected a whole number of at least 1, but got 0"),
     (rig, {"size": 20}, "size: expected a multiple of 8 of at least 16, but got 20; set size"),
     (rig, {"frames": 4}, "frames: expected an odd number, one in the middle, but got 4; set frames"),
     (rig, {"motion": "still"}, "motion: expected one of lift, lift_tilt, drive, but got 'still'"),
     (dome, {"size": 100}, "size: expected a multiple of 24 of at least 24, but got 100; set size"),
-    (dome, {"points": 0}, "points: expected a whole number of at least 1"),
-    (dome, {"motion": 3}, "motion: expected one of"),
 ]
 
 
@@ -51,15 +43,10 @@ def test_bad_arguments_get_one_line(tmp_path, generator, change, text):
     assert not (tmp_path / "scene").exists()
 
 
-@pytest.mark.parametrize(
-    ("generator", "count"),
-    [
-        (scenes, 2 + 1 + 2 * 3 + 5 + 1),
-        (lego_complete, 2 * 19),
-        (rig, 3 * 6 + 5),
-        (dome, 2 * (2 * 20 + 1) + 3),
-    ],
-)
+FILES = {scenes: 2 + 1 + 2 * 3 + 5 + 1, lego_complete: 2 * 19, rig: 3 * 6 + 5, dome: 2 * (2 * 20 + 1) + 3}
+
+
+@pytest.mark.parametrize(("generator", "count"), FILES.items())
 def test_equal_arguments_give_equal_bytes(tmp_path, monkeypatch, generator, count):
     for module in (scenes, rig, dome):
         monkeypatch.setattr(module, "POINTS", 200)  # of the trajectories

@@ -2,9 +2,6 @@ import numpy as np
 import pytest
 import torch
 
-pytest.importorskip("trimesh")
-pytest.importorskip("embreex")
-
 from forewarp.data.nhr import read_scene
 from forewarp.synth import dome
 from forewarp.synth.cameras import centers_of, stream
@@ -14,7 +11,7 @@ from forewarp.synth.points import surface_points
 from forewarp.synth.world import World
 from tests.support.lit_points import color_errors, lit_points
 
-SMALL = {"size": 120, "frames": 2, "points": 300, "samples_per_pixel": 2}
+SMALL = {"size": 120, "frames": 2, "points": 300, "samples_per_pixel": 1}
 
 
 @pytest.fixture(scope="module")

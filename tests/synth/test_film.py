@@ -1,10 +1,7 @@
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
-
-pytest.importorskip("trimesh")
-pytest.importorskip("embreex")
-
-from concurrent.futures import ThreadPoolExecutor
 
 from forewarp.synth import film as of_film
 from forewarp.synth.cameras import random_cameras

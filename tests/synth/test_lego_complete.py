@@ -2,9 +2,6 @@ import numpy as np
 import pytest
 import torch
 
-pytest.importorskip("trimesh")
-pytest.importorskip("embreex")
-
 from forewarp.data.lego_complete import read_scene
 from forewarp.synth.lego_complete import _views, synthesize
 
@@ -19,6 +16,7 @@ def folder(tmp_path_factory):
 
 def test_every_motion_is_a_scene_with_three_kinds_of_view(folder):
     assert sorted(p.name for p in folder.iterdir()) == ["drive", "lift"]
+    places = []
     for name in SMALL["motions"]:
         scene = read_scene(folder, name)
         assert [f.time for f in scene.train] == pytest.approx([0, 0.5, 1])
@@ -27,8 +25,8 @@ def test_every_motion_is_a_scene_with_three_kinds_of_view(folder):
         assert times["time"] == pytest.approx(np.linspace(0, 1, 9))
         assert times["canonical"] == [0] * 3
         assert scene.truth.times.tolist() == pytest.approx(np.linspace(0, 1, 9))
-        places = torch.stack([f.camera.center for f in scene.train + scene.test])
-        assert len(torch.unique(places, dim=0)) == len(places)
+        places += [f.camera.center for f in scene.train + scene.test]
+    assert len(torch.unique(torch.stack(places), dim=0)) == len(places)
 
 
 def test_the_default_counts_are_the_published_ones():
@@ -37,16 +35,6 @@ def test_the_default_counts_are_the_published_ones():
     assert counts == {"space": 200, "time": 197, "canonical": 50}
     assert len(views["train"]) == len({v.time for v in views["train"]}) == 50
     assert {v.time for v in views["train"]} <= {v.time for v in views["test"] if v.ability == "time"}
-
-
-def test_scenes_move_differently_and_are_seen_from_different_places(folder):
-    lift, drive = (read_scene(folder, name) for name in SMALL["motions"])
-    assert not torch.equal(lift.train[0].camera.center, drive.train[0].camera.center)
-    moved = [
-        (s.truth.points[:, -1] - s.truth.points[:, 0]).norm(dim=-1).gt(0.02).float().mean()
-        for s in (lift, drive)
-    ]
-    assert 0 < moved[0] < moved[1]
 
 
 @pytest.mark.parametrize("name", SMALL["motions"])

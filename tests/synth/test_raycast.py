@@ -1,11 +1,7 @@
 import builtins
-import math
 
 import numpy as np
 import pytest
-
-pytest.importorskip("trimesh")
-pytest.importorskip("embreex")
 
 from forewarp.synth.cameras import orbit_camera
 from forewarp.synth.motions import GROUND, joints
@@ -51,19 +47,13 @@ def test_a_hit_lies_on_its_ray_and_its_face(world, shot):
     camera, _, depth = shot
     posed = Posed(world, 0.4)
     origins, directions = camera_rays(camera)
+    np.testing.assert_allclose(origins, camera.rays().origins.numpy(), atol=1e-6)
+    np.testing.assert_allclose(directions, camera.rays().directions.numpy(), atol=1e-6)
     hits = posed.first_hits(origins, directions)
     on_face = np.einsum("nc,ncd->nd", hits.barycentric, posed.corners[hits.face])
     on_ray = origins[hits.ray] + hits.distance[:, None] * directions[hits.ray]
     assert np.linalg.norm(on_face - on_ray, axis=-1).max() < 1e-4
     np.testing.assert_allclose(depth.ravel()[hits.ray], hits.distance, rtol=1e-6)
-
-
-def test_camera_rays_are_the_cameras(shot):
-    camera = shot[0]
-    origins, directions = camera_rays(camera)
-    rays = camera.rays()
-    np.testing.assert_allclose(origins, rays.origins.numpy(), atol=1e-6)
-    np.testing.assert_allclose(directions, rays.directions.numpy(), atol=1e-6)
 
 
 def test_a_shadow_falls_behind_the_ball(world):
@@ -74,15 +64,6 @@ def test_a_shadow_falls_behind_the_ball(world):
     towards = LIGHT_AT - ground
     towards /= np.linalg.norm(towards, axis=-1, keepdims=True)
     assert Posed(world, 0.0).is_free(ground, towards).tolist() == [False, True]
-
-
-def test_more_samples_change_the_edges_only(world):
-    camera = orbit_camera(2.0, 0.7, 24)
-    one, many = render(world, 0.2, camera, 1), render(world, 0.2, camera, 9)
-    np.testing.assert_array_equal(one[1], many[1])
-    assert set(np.unique(one[0][..., 3])) == {0, 255}
-    assert len(np.unique(many[0][..., 3])) > 5
-    assert math.isclose((one[0][..., 3] / 255).mean(), (many[0][..., 3] / 255).mean(), abs_tol=0.02)
 
 
 def test_without_the_packages_one_line_says_what_to_install(world, monkeypatch):

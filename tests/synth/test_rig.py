@@ -2,9 +2,6 @@ import numpy as np
 import pytest
 import torch
 
-pytest.importorskip("trimesh")
-pytest.importorskip("embreex")
-
 from forewarp.data.hypernerf import read_scene
 from forewarp.synth import rig
 from forewarp.synth.cameras import centers_of, stream
@@ -14,7 +11,7 @@ from forewarp.synth.rig import rig_cameras, synthesize
 from forewarp.synth.world import World
 from tests.support.lit_points import color_errors, lit_points
 
-SMALL = {"size": 192, "frames": 5, "samples_per_pixel": 2}
+SMALL = {"size": 192, "frames": 5, "samples_per_pixel": 1}
 
 
 @pytest.fixture(scope="module")
@@ -34,11 +31,8 @@ def in_vehicle_units(points):
 
 
 def test_the_phones_take_turns(scene, folder):
-    assert (
-        [f.time for f in scene.train]
-        == [f.time for f in scene.test]
-        == pytest.approx([0, 0.25, 0.5, 0.75, 1])
-    )
+    times = ([f.time for f in split] for split in (scene.train, scene.test))
+    assert next(times) == next(times) == pytest.approx([0, 0.25, 0.5, 0.75, 1])
     assert [f.name[:4] for f in scene.train] == ["left", "righ", "left", "righ", "left"]
     assert [f.name[:4] for f in scene.test] == ["righ", "left", "righ", "left", "righ"]
     assert scene.canonical_time == 0.5
@@ -49,17 +43,6 @@ def test_the_phones_take_turns(scene, folder):
         assert frame.load().shape == (144, 192, 4)
     halved = read_scene(folder.parent, folder.name, scale=2).train[0]
     assert halved.load().shape == (72, 96, 4)
-
-
-def test_cameras_read_back_as_they_were(scene):
-    pairs = rig_cameras(192, np.linspace(0, 1, 5), 0)
-    for t, frame in enumerate(scene.train):
-        made = pairs[t][t % 2]
-        np.testing.assert_allclose(in_vehicle_units(frame.camera.center), made.center, atol=1e-9)
-        u = torch.tensor([3.0, 100.0, 190.0], dtype=torch.float64)
-        torch.testing.assert_close(
-            frame.camera.directions(u, u * 0.7), made.directions(u, u * 0.7), atol=1e-9, rtol=0
-        )
 
 
 def test_all_that_is_seen_lies_between_near_and_far(scene):
@@ -80,9 +63,8 @@ def test_true_points_have_the_colour_of_their_pixels(scene):
     faces, barycentric = surface_points(world, rig.POINTS, centers, stream(0, rig._POINTS), 0.5, world.casts)
     for frame in scene.train + scene.test:
         points = scene.truth.points[:, int((scene.truth.times - frame.time).abs().argmin())]
-        colors, visible = lit_points(
-            world, faces, barycentric, frame.time, in_vehicle_units(frame.camera.center)
-        )
+        place = in_vehicle_units(frame.camera.center)
+        colors, visible = lit_points(world, faces, barycentric, frame.time, place)
         errors = color_errors(frame.load(), frame.camera, points[visible], colors[visible])
         assert len(errors) > 800
         # Half a pixel off an edge is another colour; a swapped axis gives a median above 0.2.

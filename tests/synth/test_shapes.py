@@ -22,9 +22,8 @@ def test_volumes_by_hand():
     assert volume(sphere(0.5, 60, 60)) == pytest.approx(4 / 3 * np.pi / 8, rel=5e-3)
     assert volume(cylinder((5, 6, 7), 0.5, 2, axis=1, segments=90)) == pytest.approx(np.pi / 2, rel=2e-3)
     # A square less its corners' squares, plus a disc of four quarters.
-    assert volume(rounded_slab(1, 0.4, 0, 0.5, steps=40)) == pytest.approx(
-        (4 - 0.64 + 0.16 * np.pi) / 2, rel=1e-3
-    )
+    slab = rounded_slab(1, 0.4, 0, 0.5, steps=40)
+    assert volume(slab) == pytest.approx((4 - 0.64 + 0.16 * np.pi) / 2, rel=1e-3)
 
 
 def test_joined_meshes_keep_their_own_vertices():

@@ -5,7 +5,6 @@ from functools import partial
 
 import lightning
 import pytest
-import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -14,7 +13,7 @@ from forewarp.evaluation.pictures import TensorBoardPictures
 from forewarp.progress import ProgressLine
 from forewarp.training.callbacks import StageProgress, TensorBoardScalars
 from forewarp.training.clock import Clock
-from tests.support.tiny_scene import Interrupt, ball_data, ball_scene, make_run, stage, trainer
+from tests.support.tiny_scene import Interrupt, ball_data, ball_scene, make_run, same, stage, trainer
 
 STEPS = 12
 
@@ -33,18 +32,32 @@ def all_watchers():
     return StageProgress(every=0), TensorBoardScalars(every=5), TensorBoardPictures(moments=(0.25, 0.5, 1.0))
 
 
+class Record(lightning.Callback):
+    """Note the loss of every step."""
+
+    def __init__(self):
+        self.losses = []
+
+    def on_train_batch_end(self, trainer, module, *_):
+        self.losses.append(module.last["loss"])
+
+
+def events_of(folder):
+    accumulator = EventAccumulator(str(folder / "coarse" / "tensorboard"))
+    accumulator.Reload()
+    return accumulator
+
+
 @pytest.fixture(scope="module")
 def watched(tmp_path_factory):
-    """Return the module and folder of a finished stage with all callbacks."""
-    folder = tmp_path_factory.mktemp("watched")
-    return watched_run(folder, *all_watchers()).fit(), folder / "coarse"
+    """Return the module, folder and losses of a finished stage with all callbacks."""
+    folder, record = tmp_path_factory.mktemp("watched"), Record()
+    return watched_run(folder, *all_watchers(), record).fit(), folder, record.losses
 
 
 @pytest.fixture(scope="module")
 def events(watched):
-    accumulator = EventAccumulator(str(watched[1] / "tensorboard"))
-    accumulator.Reload()
-    return accumulator
+    return events_of(watched[1])
 
 
 class Terminal(io.StringIO):
@@ -55,7 +68,9 @@ class Terminal(io.StringIO):
 
 
 def test_lines_where_there_is_no_terminal(tmp_path, capsys):
-    watched_run(tmp_path, StageProgress(every=0)).fit()
+    progress = StageProgress(every=0)
+    progress.later = 7200.0
+    watched_run(tmp_path, progress).fit()
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == STEPS + 1
     shape = (
@@ -64,21 +79,14 @@ def test_lines_where_there_is_no_terminal(tmp_path, capsys):
     )
     found = [re.fullmatch(shape, line) for line in lines]
     assert all(found), lines
-    assert all(re.fullmatch(r"\d+:\d\d left", match[2]) for match in found[:-1])
+    assert all(
+        re.fullmatch(r"\d+:\d\d left \| 2:\d\d:\d\d with what follows", match[2]) for match in found[:-1]
+    )
     assert re.fullmatch(r"\d+:\d\d trained", found[-1][2])
     percents = [int(match[1]) for match in found]
     assert percents == sorted(percents)
     assert percents[-2:] == [100, 100]
     assert [found[0][3], found[-1][3]] == ["10", "12"]
-
-
-def test_the_time_left_of_all_stages(tmp_path, capsys):
-    progress = StageProgress(every=0)
-    progress.later = 7200.0
-    watched_run(tmp_path, progress).fit()
-    lines = capsys.readouterr().err.splitlines()
-    assert re.search(r"\| \d+:\d\d left \| 2:\d\d:\d\d with what follows \| train psnr", lines[0])
-    assert "0:00 left | 2:00:00 with what follows" in lines[-2]
 
 
 def test_a_terminal_gets_a_bar_that_is_not_drawn_too_often(monkeypatch):
@@ -95,13 +103,6 @@ def test_a_terminal_gets_a_bar_that_is_not_drawn_too_often(monkeypatch):
     text = stream.getvalue()
     assert all(part in text for part in ("fine", "50% | 1:05 left | psnr 30 dB", "100% | done", "━"))
     assert text.endswith("\x1b[?25h")  # the cursor is back
-
-
-def test_an_error_leaves_the_line_closed(tmp_path, capsys):
-    progress = StageProgress(every=0)
-    with pytest.raises(SystemExit):
-        watched_run(tmp_path, progress, Interrupt("coarse", 3)).fit()
-    assert "25% | 0:0" in capsys.readouterr().err.splitlines()[-1]
 
 
 def test_every_named_curve_is_there(watched, events):
@@ -125,98 +126,38 @@ def test_without_validation_views_there_is_no_validation_curve(tmp_path):
     ours = watched_run(tmp_path, TensorBoardPictures(moments=(1.0,)), steps=2)
     ours.datamodule = SceneDataModule(lambda: scene, rays=64)
     ours.fit()
-    accumulator = EventAccumulator(str(tmp_path / "coarse" / "tensorboard"))
-    accumulator.Reload()
-    assert accumulator.Tags()["images"]
-    assert "val/psnr" not in accumulator.Tags()["scalars"]
+    tags = events_of(tmp_path).Tags()
+    assert tags["images"]
+    assert "val/psnr" not in tags["scalars"]
 
 
-def test_curves_are_means_over_the_steps_between(tmp_path):
-    class Record(lightning.Callback):
-        losses = []
-
-        def on_train_batch_end(self, trainer, module, *_):
-            self.losses.append(module.last["loss"])
-
-    watched_run(tmp_path, Record(), TensorBoardScalars(every=5)).fit()
-    accumulator = EventAccumulator(str(tmp_path / "coarse" / "tensorboard"))
-    accumulator.Reload()
-    curve = accumulator.Scalars("train/loss")
+def test_curves_are_means_over_the_steps_between(watched, events):
+    curve, losses = events.Scalars("train/loss"), watched[2]
     assert [point.step for point in curve] == [5, 10, 12]
-    assert curve[1].value == pytest.approx(sum(Record.losses[5:10]) / 5, rel=1e-5)
-    assert curve[2].value == pytest.approx(sum(Record.losses[10:]) / 2, rel=1e-5)
-
-
-def test_logged_values_are_those_of_the_stage(watched, events):
-    module = watched[0]
-    last = {tag: events.Scalars(tag)[-1].value for tag in events.Tags()["scalars"]}
-    assert last["lr/density"] == pytest.approx(0.3 * module.settings.lr_factor(11 / 12))
-    assert last["train/frames_in_play"] == 12
-    assert last["train/bases_in_play"] == 4
+    assert curve[1].value == pytest.approx(sum(losses[5:10]) / 5, rel=1e-5)
+    assert curve[2].value == pytest.approx(sum(losses[10:]) / 2, rel=1e-5)
 
 
 def test_pictures_are_in_tensorboard_and_on_disk(watched, events):
     names = ("compare", "depth", "flow")
-    files = sorted(path.name for path in (watched[1] / "images").iterdir())
+    files = sorted(path.name for path in (watched[1] / "coarse" / "images").iterdir())
     assert files == sorted(f"{moment}_{name}.png" for moment in ("025", "050", "100") for name in names)
     for name in names:
         assert [image.step for image in events.Images(f"images/{name}")] == [3, 6, 12]
 
 
-@pytest.fixture(scope="module")
-def unwatched(tmp_path_factory):
-    return watched_run(tmp_path_factory.mktemp("unwatched")).fit().state_dict()
-
-
-def assert_same(one, other):
-    tensors = [key for key in one if torch.is_tensor(one[key])]
-    assert tensors
-    assert one.keys() == other.keys()
-    assert all(torch.equal(one[key], other[key]) for key in tensors)
-
-
-def test_an_interrupted_watched_run_ends_as_an_unwatched_one(tmp_path, unwatched):
+def test_an_interrupted_watched_run_ends_as_an_unwatched_one(tmp_path, tmp_path_factory, capsys):
     with pytest.raises(SystemExit):
         watched_run(tmp_path, *all_watchers(), Interrupt("coarse", 4)).fit()
+    assert "33% | 0:0" in capsys.readouterr().err.splitlines()[-1]  # an error leaves the line closed
     before = sorted(path.name for path in (tmp_path / "coarse" / "images").iterdir())
     assert before[0] == "025_compare.png"
     (tmp_path / "coarse" / "images" / "025_compare.png").unlink()
-    assert_same(unwatched, watched_run(tmp_path, *all_watchers()).fit().state_dict())
+    unwatched = watched_run(tmp_path_factory.mktemp("unwatched")).fit()
+    assert same(watched_run(tmp_path, *all_watchers()).fit(), unwatched)
     after = {path.name for path in (tmp_path / "coarse" / "images").iterdir()}
     assert "100_compare.png" in after
     assert "025_compare.png" not in after  # that moment was past
-
-
-def test_the_clock_stands_still_for_pictures(tmp_path, monkeypatch):
-    seen = []
-
-    def slow_pictures(module, target, size):
-        before = module.clock.seconds
-        torch.ones(200, 200).matmul(torch.ones(200, 200))
-        seen.append(module.clock.seconds - before)
-        return {}
-
-    monkeypatch.setattr("forewarp.evaluation.pictures.pictures_of", slow_pictures)
-    watched_run(tmp_path, TensorBoardPictures(moments=(0.5, 1.0))).fit()
-    assert seen == [0, 0]
-
-
-@pytest.mark.parametrize(
-    ("make", "text"),
-    [
-        (lambda: TensorBoardPictures(moments=(0.5, 1.5)), r"moments: expected numbers in \[0, 1\], but got"),
-        (lambda: TensorBoardPictures(psnr_rays=0), "expected psnr_views >= 0 and psnr_rays >= 1, but got"),
-        (lambda: TensorBoardScalars(every=0), "every: expected at least 1 step, but got 0"),
-    ],
-)
-def test_bad_settings_are_named(make, text):
-    with pytest.raises(ValueError, match=text):
-        make()
-
-
-def test_a_view_that_is_not_there_is_named(tmp_path):
-    with pytest.raises(ValueError, match="callbacks.pictures.view: expected 0 to 0, but got 7"):
-        watched_run(tmp_path, TensorBoardPictures(moments=(0.1,), view=7)).fit()
 
 
 def test_the_clock_stands_still_while_something_is_shown(tmp_path, monkeypatch):
@@ -238,3 +179,18 @@ def test_the_clock_stands_still_while_something_is_shown(tmp_path, monkeypatch):
     watched_run(tmp_path, StageProgress(every=0), TensorBoardScalars(every=5)).fit()
     assert {name for name, _ in running} == {"show", "log_metrics"}
     assert not any(ticking for _, ticking in running)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "text"),
+    [
+        ({"every": 0}, "every: expected at least 1 step, but got 0"),
+        ({"moments": (0.5, 1.5)}, r"moments: expected numbers in \[0, 1\], but got"),
+        ({"psnr_rays": 0}, "expected psnr_views >= 0 and psnr_rays >= 1, but got"),
+        ({"view": 7}, "callbacks.pictures.view: expected 0 to 0, but got 7"),
+    ],
+)
+def test_bad_settings_are_named(tmp_path, wrong, text):
+    made = TensorBoardScalars if "every" in wrong else partial(TensorBoardPictures, moments=(0.1,))
+    with pytest.raises(ValueError, match=text):
+        watched_run(tmp_path, made(**wrong)).fit()

@@ -43,11 +43,6 @@ def interrupted(tmp_path_factory):
     return folder / "coarse" / "last.ckpt"
 
 
-def test_what_fits_is_taken(tmp_path, interrupted):
-    check_state(interrupted, module(tmp_path))
-    assert set(check_checkpoint(interrupted, module(tmp_path))) >= {"state_dict", "forewarp"}
-
-
 @pytest.mark.parametrize(
     ("changes", "name"),
     [({"width": 16}, "method.motion.trajectory.network.0.bias"), ({"times": [0.0] * 3}, "method.motion")],
@@ -57,13 +52,6 @@ def test_another_configuration_is_refused_by_what_differs(tmp_path, interrupted,
     text = f"expected a checkpoint of this configuration, but got one that differs in {name}"
     with pytest.raises(ValueError, match=text):
         load_weights(module(tmp_path, **changes), interrupted)
-
-
-def test_half_a_file_is_refused(tmp_path, interrupted):
-    broken = tmp_path / "last.ckpt"
-    broken.write_bytes(interrupted.read_bytes()[:500])
-    with pytest.raises(ValueError, match="last.ckpt: expected a checkpoint, but it cannot be read"):
-        check_checkpoint(broken, module(tmp_path))
 
 
 def test_one_flipped_bit_is_refused(tmp_path, interrupted):
@@ -87,16 +75,6 @@ def test_a_checkpoint_cannot_execute_code(tmp_path):
     with pytest.raises(ValueError, match="last.ckpt: expected a checkpoint, but it cannot be read"):
         check_checkpoint(tmp_path / "last.ckpt", module(tmp_path))
     assert not (tmp_path / "deed").exists()
-
-
-def test_a_voxel_grid_adopts_other_shapes(tmp_path, interrupted):
-    grown = module(tmp_path)
-    everywhere = torch.ones(grown.method.radiance.lattice.shape, dtype=torch.bool)
-    grown.method.radiance.activate(everywhere, {})
-    grown.method.radiance.activate(everywhere & (torch.rand(everywhere.shape) > 0.5), {})
-    load_weights(grown, interrupted)
-    stored = torch.load(interrupted, weights_only=True)["state_dict"]["method.radiance.density"]
-    assert torch.equal(grown.method.radiance.density, stored)
 
 
 def test_an_older_checkpoint_is_refused_by_what_it_lacks(tmp_path, interrupted):
@@ -168,14 +146,6 @@ def test_odd_parts_are_refused_in_one_line(tmp_path, interrupted, change, said):
 
 
 CONTENT = {"a": torch.arange(1000.0), "b": {"c": [1, "x", None]}}
-
-
-def test_what_is_written_is_read(tmp_path):
-    write_archive(tmp_path / "deep" / "a.pt", CONTENT)
-    found = read_archive(tmp_path / "deep" / "a.pt")
-    assert torch.equal(found["a"], CONTENT["a"])
-    assert found["b"] == CONTENT["b"]
-    assert [path.name for path in (tmp_path / "deep").iterdir()] == ["a.pt"]
 
 
 def test_a_full_disk_is_told_and_leaves_what_was_there(tmp_path):

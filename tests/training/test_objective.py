@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from forewarp.methods.method import Method, Step
+from forewarp.methods.method import Step
 from forewarp.training.objective import Objective, parts, total
 
 
@@ -30,14 +30,6 @@ def test_the_loss_is_the_weighted_sum_of_the_raw_terms():
     assert (photo.grad.item(), entropy.grad.item()) == (1.0, 0.25)
 
 
-def test_a_term_of_weight_zero_is_never_called():
-    step, called = step_of(photo=torch.ones(()), entropy=torch.ones(()))
-    for weights in ({"photo": 1.0}, {"photo": 1.0, "entropy": 0.0}):
-        called.clear()
-        _, raw = total(step, Objective(weights).factors(0), {})
-        assert (called, list(raw)) == (["photo"], ["photo"])
-
-
 def test_each_nth_step_with_n_times_the_weight():
     objective = Objective({"photo": 1.0, "entropy": 0.5, "never": 0.0}, every={"entropy": 3})
     assert objective.factors(6) == {"photo": 1.0, "entropy": 1.5}
@@ -61,17 +53,6 @@ def test_a_method_may_bring_gradients_of_its_own():
     (2 * loss).backward()
     assert first.grad is None
     assert second.grad.tolist() == [2.0, -4.0]
-
-
-@pytest.mark.parametrize("given", [{"weights": {"photos": 1.0}}, {"weights": {}, "every": {"photos": 2}}])
-def test_a_term_that_the_method_does_not_know_is_refused(given):
-    with pytest.raises(ValueError, match="objective: expected a term of photo, entropy, but got 'photos'"):
-        Known.check("fine", (), Objective(**given).names)
-    Known.check("fine", (), Objective({"photo": 1.0}, every={"entropy": 2}).names)
-
-
-class Known(Method):
-    terms = ("photo", "entropy")
 
 
 @pytest.mark.parametrize("every", [0, 1.5])

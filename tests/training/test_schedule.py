@@ -1,9 +1,9 @@
 """Budget, learning rates and curriculum of a stage."""
 
 from collections import Counter
+from functools import partial
 
 import pytest
-import torch
 
 from forewarp.training.objective import Objective
 from forewarp.training.schedule import Curriculum, StagePlan, StageSettings, seconds_after, share_out
@@ -40,29 +40,14 @@ def test_the_fraction_is_of_what_comes_first(bounds, fraction):
     assert settings(**bounds).fraction(25, 30.0) == fraction
 
 
-@pytest.mark.parametrize(
-    ("wrong", "text"),
-    [
-        ({"iterations": None}, "stage.coarse: expected iterations or minutes, but got neither"),
-        ({"iterations": 0}, "stage.coarse.iterations: expected a number > 0, but got 0"),
-        ({"minutes": -1.0}, "stage.coarse.minutes: expected a number > 0, but got -1.0"),
-    ],
-)
-def test_refuses_by_the_name_of_the_key(wrong, text):
-    with pytest.raises(ValueError, match=text):
-        settings(**wrong)
-
-
-@pytest.mark.parametrize("name", ["/tmp/x", "..", "../x", "a/b", "a\\b", "", "-a", "a b", "a\n", 7])
-def test_a_stage_has_no_name_that_leads_out_of_the_run(name):
-    with pytest.raises(ValueError, match="stage: expected names of letters, digits, _ and -"):
-        settings(name=name)
-
-
 def plan(share=1.0, **changes):
     """Make a stage without its share of the budget."""
     numbers = {"num_voxels": [[0, 64]], "lr": {}}
     return StagePlan(share=share, objective=Objective({"photo": 1.0}), **(numbers | changes))
+
+
+def shared(plans=None, minutes=1):
+    return share_out({"a": plan()} if plans is None else plans, minutes=minutes, iterations=None)
 
 
 def test_minutes_and_iterations_go_by_share():
@@ -74,38 +59,9 @@ def test_minutes_and_iterations_go_by_share():
 def test_what_the_stages_after_one_may_take():
     stages = share_out({"a": plan(1), "b": plan(2), "c": plan(1)}, minutes=2.0, iterations=10)
     assert [seconds_after(stages, name) for name in "abc"] == [90, 30, 0]
-    steps = share_out({"a": plan(), "b": plan()}, minutes=None, iterations=10)
+    steps = share_out({"a": plan(1), "b": plan(999), "c": None}, minutes=None, iterations=10)
     assert [seconds_after(steps, name) for name in "ab"] == [None, 0]
-
-
-def test_a_bound_may_be_left_to_the_other():
-    (only,) = share_out({"a": plan(), "b": None}, minutes=None, iterations=7)
-    assert (only.settings.minutes, only.settings.iterations) == (None, 7)
-
-
-def test_a_stage_has_at_least_one_step():
-    first, _ = share_out({"a": plan(1), "b": plan(999)}, minutes=None, iterations=3)
-    assert first.settings.iterations == 1
-
-
-@pytest.mark.parametrize(
-    ("plans", "minutes", "match"),
-    [
-        ({}, 1, "stage: expected at least one stage, but got none"),
-        ({"a": plan(0)}, 1, r"stage\.a\.share: expected a number > 0, but got 0"),
-        ({"a": plan()}, 0, r"budget\.minutes: expected a number > 0 or null, but got 0"),
-        ({"a": plan()}, "soon", r"budget\.minutes: expected a number > 0 or null, but got soon"),
-        ({"a": plan()}, None, r"stage\.a: expected iterations or minutes, but got neither"),
-    ],
-)
-def test_refusals(plans, minutes, match):
-    with pytest.raises(ValueError, match=match):
-        share_out(plans, minutes=minutes, iterations=None)
-
-
-def test_keys_that_the_platform_does_not_know_are_handed_to_the_method():
-    (only,) = share_out({"a": plan(voxel=1)}, minutes=1, iterations=None)  # Run.fit refuses what is none
-    assert only.settings.numbers == {"num_voxels": [[0, 64]], "voxel": 1}
+    assert [(s.settings.minutes, s.settings.iterations) for s in steps] == [(None, 1), (None, 10)]
 
 
 TIMES = [0.0, 0.9, 0.5, 0.2, 0.7, 1.0, 0.4, 0.6, 0.1, 0.3]
@@ -123,16 +79,6 @@ def test_frames_come_in_from_the_canonical_time_outwards():
     assert [TIMES[i] for i in curriculum.frames()] == [0.5, 0.4, 0.6, 0.7, 0.3, 0.2]
     curriculum.fraction = 0.6
     assert sorted(curriculum.frames()) == list(range(10))
-
-
-def test_nothing_is_drawn_before_it_is_in_play():
-    assert set(draws(Curriculum(TIMES, 0.5, start=3), 0.0)) == {2, 6, 7}
-    assert set(draws(Curriculum(TIMES, 0.5, start=3), 1.0)) == set(range(10))
-
-
-def test_all_at_once():
-    curriculum = Curriculum(TIMES, 0.0, start=1, all_in=0.0)
-    assert curriculum.in_play == 10
 
 
 def test_the_newest_get_their_share_while_frames_come_in():
@@ -201,28 +147,26 @@ def test_a_saved_state_does_not_change_afterwards():
     assert state["errors"].isnan().all()
 
 
-def test_fewer_frames_than_the_start():
-    curriculum = Curriculum([0.3], 0.0, start=10)
-    assert (curriculum(), curriculum.in_play) == (0, 1)
+NAMES = ("/tmp/x", "..", "../x", "a/b", "a\\b", "", "-a", "a b", "a\n", 7)
+ODD = ({"start": 0}, {"all_in": 1.5}, {"newest_share": -0.1}, {"newest_part": 0.0}, {"newest_part": 2.0})
+REFUSED = [
+    (settings, {"iterations": None}, "stage.coarse: expected iterations or minutes, but got neither"),
+    (settings, {"iterations": 0}, "stage.coarse.iterations: expected a number > 0, but got 0"),
+    (settings, {"minutes": -1.0}, "stage.coarse.minutes: expected a number > 0, but got -1.0"),
+    *((settings, {"name": name}, "stage: expected names of letters, digits, _ and -") for name in NAMES),
+    (shared, {"plans": {}}, "stage: expected at least one stage, but got none"),
+    (shared, {"plans": {"a": plan(0)}}, r"stage\.a\.share: expected a number > 0, but got 0"),
+    (shared, {"minutes": 0}, r"budget\.minutes: expected a number > 0 or null, but got 0"),
+    (shared, {"minutes": "soon"}, r"budget\.minutes: expected a number > 0 or null, but got soon"),
+    (shared, {"minutes": None}, r"stage\.a: expected iterations or minutes, but got neither"),
+    *(
+        (partial(Curriculum, TIMES, 0.0), wrong, r"stage.curriculum: expected start >= 1, .*but got")
+        for wrong in (*ODD, {"error_share": 1.5}, {"error_share": float("nan")})
+    ),
+]
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"start": 0},
-        {"all_in": 1.5},
-        {"newest_share": -0.1},
-        {"newest_part": 0.0},
-        {"newest_part": 2.0},
-        {"error_share": 1.5},
-        {"error_share": float("nan")},
-    ],
-)
-def test_refuses(wrong):
-    with pytest.raises(ValueError, match=r"stage.curriculum: expected start >= 1, .*but got"):
-        Curriculum(TIMES, 0.0, **wrong)
-
-
-def test_the_draws_are_plain_integers():
-    assert type(Curriculum(TIMES, 0.0)()) is int
-    assert not isinstance(Curriculum(TIMES, 0.0)(), torch.Tensor)
+@pytest.mark.parametrize(("make", "wrong", "text"), REFUSED)
+def test_refuses_by_the_name_of_the_key(make, wrong, text):
+    with pytest.raises(ValueError, match=text):
+        make(**wrong)

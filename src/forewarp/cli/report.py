@@ -100,8 +100,8 @@ def _written(config, runs: Path, out: Path) -> list[Path]:
     from forewarp.report.curve import OTHERS, read_published
     from forewarp.report.effects import write_effects
     from forewarp.report.paper import write_paper
+    from forewarp.report.paper_printed import PAPER
     from forewarp.report.price_list import write_price_list
-    from forewarp.report.published import PAPER
 
     if config.kind == "price_list":
         return write_price_list(runs, out)

@@ -27,22 +27,27 @@ _UNPRINTABLE = {"Cc", "Cs", "Zl", "Zp"}  # control characters, surrogates, line 
 
 
 @contextmanager
+def refused(path: Path, what: str) -> Iterator[None]:
+    """Turn errors of reading a file into SceneErrors; an OSError is told as ``what`` was expected."""
+    try:
+        yield
+    except OSError as error:
+        raise SceneError(f"{path}: expected {what}, but got {error.strerror or error}") from error
+    except ValueError as error:
+        raise error if isinstance(error, SceneError) else SceneError(str(error)) from error
+
+
+@contextmanager
 def opened(path: Path, most: int = MOST_BYTES, what: str = "a readable file") -> Iterator[BinaryIO]:
     """Open a regular file of at most ``most`` bytes.
 
     Raises:
         SceneError: where it cannot be read, naming ``what`` was expected.
     """
-    try:
+    with refused(path, what):
         check_size(path, most)
         with path.open("rb") as stream:
             yield stream
-    except SceneError:
-        raise
-    except OSError as error:
-        raise SceneError(f"{path}: expected {what}, but got {error.strerror or error}") from error
-    except ValueError as error:
-        raise SceneError(str(error)) from error
 
 
 def read_bytes(path: Path, most: int = MOST_BYTES, what: str = "a readable file") -> bytes:
@@ -67,12 +72,8 @@ def read_json(path: Path) -> dict:
     Raises:
         SceneError: where the file is missing, too large, does not parse (with the line) or holds no object.
     """
-    try:
+    with refused(path, "a readable file"):
         return load_json(path)
-    except OSError as error:
-        raise SceneError(f"{path}: expected a readable file, but got {error.strerror or error}") from error
-    except ValueError as error:
-        raise SceneError(str(error)) from error
 
 
 def number(value: object, where: str, low: float = -math.inf, high: float = math.inf) -> float:

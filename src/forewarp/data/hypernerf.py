@@ -134,7 +134,6 @@ def write_scene(
     points: np.ndarray | Tensor | None = None,
     scales: Sequence[int] = (1, 2),
     trajectories: Truth | None = None,
-    write_time_id: bool = True,
 ) -> None:
     """Write a capture that ``read_scene`` reads; each file appears whole or not at all.
 
@@ -148,7 +147,6 @@ def write_scene(
         points: (N, 3) that never move, unscaled world.
         scales: scales of the images to write; every side is a multiple of all of them.
         trajectories: unscaled world, the canonical time first.
-        write_time_id: also the key ``time_id`` beside ``warp_id``.
     """
     folder = Path(folder)
     _remove(folder)
@@ -160,8 +158,8 @@ def write_scene(
             raise ValueError(f"shots: expected different names, each of train, val or '', but got {got}")
         _write_shot(folder, shot, scales)
         parts[shot.split].append(shot.name)
-        entry = dict.fromkeys(("warp_id", "appearance_id"), int(shot.time_id)) | {"camera_id": shot.camera_id}
-        metadata[shot.name] = entry | ({"time_id": int(shot.time_id)} if write_time_id else {})
+        times = dict.fromkeys(("time_id", "warp_id", "appearance_id"), int(shot.time_id))
+        metadata[shot.name] = times | {"camera_id": shot.camera_id}
     if points is not None:
         write_array(folder / "points.npy", points)
     if trajectories is not None:

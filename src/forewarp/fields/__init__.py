@@ -1,1 +1,1 @@
-"""What several methods learn: voxel grids, radiance, trajectories, networks, codes."""
+"""What several methods learn: voxel grids, radiance, trajectories, networks."""

@@ -11,29 +11,20 @@ DENSITY: dict[str, Callable[[Tensor], Tensor]] = {"relu": torch.relu, "softplus"
 
 
 class Trunk(nn.Module):
-    """``layers`` linear layers with ReLU; layer ``skip`` reads an input again.
+    """``layers`` linear layers with ReLU; layer ``skip`` reads the input again.
 
     Args:
         inputs: channels read by the first layer.
         width: channels of every layer.
         layers: number of layers, at least 1.
-        skip: number of the layer, from 1, that also reads ``again``: 6 in PyTorch versions of NeRF, 5 in JAX
+        skip: number of the layer, from 1, that also reads the input: 6 in PyTorch versions of NeRF, 5 in JAX
             versions; None: no layer.
-        again: channels read at the skip; None: ``inputs``.
 
     >>> sum(p.numel() for p in Trunk(72).parameters())
     497664
     """
 
-    def __init__(
-        self,
-        inputs: int,
-        *,
-        width: int = 256,
-        layers: int = 8,
-        skip: int | None = 6,
-        again: int | None = None,
-    ) -> None:
+    def __init__(self, inputs: int, *, width: int = 256, layers: int = 8, skip: int | None = 6) -> None:
         super().__init__()
         if min(inputs, width, layers) < 1 or not (skip is None or 2 <= skip <= layers):
             raise ValueError(
@@ -41,18 +32,17 @@ class Trunk(nn.Module):
                 f"but got {inputs=}, {width=}, {layers=}, {skip=}"
             )
         self.skip = skip
-        more = inputs if again is None else again
         sizes = [inputs, *[width] * (layers - 1)]
         self.layers = nn.ModuleList(
-            nn.Linear(size + (more if number == skip else 0), width) for number, size in enumerate(sizes, 1)
+            nn.Linear(size + (inputs if number == skip else 0), width) for number, size in enumerate(sizes, 1)
         )
 
-    def forward(self, x: Tensor, again: Tensor | None = None) -> Tensor:
-        """(..., I) -> (..., width); the skip reads ``again`` (..., A), or ``x`` for None."""
+    def forward(self, x: Tensor) -> Tensor:
+        """(..., I) -> (..., width)."""
         hidden = x
         for number, layer in enumerate(self.layers, 1):
             if number == self.skip:
-                hidden = torch.cat([x if again is None else again, hidden], -1)
+                hidden = torch.cat([x, hidden], -1)
             hidden = torch.relu(layer(hidden))
         return hidden
 
@@ -65,7 +55,7 @@ class Template(nn.Module):
 
     Args:
         inputs: channels of the encoded point.
-        condition: channels that only colour depends on; 0: none.
+        condition: channels that only colour depends on.
         width, layers, skip: see ``Trunk``.
 
     >>> sum(p.numel() for p in Template(63, 27).parameters())
@@ -76,9 +66,9 @@ class Template(nn.Module):
         self, inputs: int, condition: int, *, width: int = 256, layers: int = 8, skip: int | None = 6
     ) -> None:
         super().__init__()
-        if condition < 0 or width < 2:
+        if condition < 1 or width < 2:
             raise ValueError(
-                f"template: expected condition >= 0 and width >= 2, but got {condition=}, {width=}"
+                f"template: expected condition >= 1 and width >= 2, but got {condition=}, {width=}"
             )
         self.trunk = Trunk(inputs, width=width, layers=layers, skip=skip)
         self.density_head = nn.Linear(width, 1)
@@ -90,13 +80,10 @@ class Template(nn.Module):
         """Encoded points (..., I) -> raw density (...,)."""
         return self.density_head(self.trunk(x))[..., 0]
 
-    def forward(self, x: Tensor, condition: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def forward(self, x: Tensor, condition: Tensor) -> tuple[Tensor, Tensor]:
         """Encoded points (..., I), condition (..., D) -> raw density (...,), colour (..., 3) in [0, 1]."""
         hidden = self.trunk(x)
-        color = self.bottleneck(hidden)
-        if condition is not None:
-            color = torch.cat([color, condition], -1)
-        color = torch.relu(self.shading(color))
+        color = torch.relu(self.shading(torch.cat([self.bottleneck(hidden), condition], -1)))
         return self.density_head(hidden)[..., 0], torch.sigmoid(self.color_head(color))
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from forewarp.methods.method import Method
-from forewarp.report.gain import Gain
+from forewarp.metrics.gain import Gain
 from forewarp.scene.batch import Target
 from forewarp.scene.frame import Scene
 from forewarp.scene.pictures import Pictures

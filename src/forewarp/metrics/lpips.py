@@ -28,11 +28,7 @@ _FILE_PATTERNS = {
     "alex": ("alexnet*.pth", "alex.backbone.pth"),
 }
 # The layers whose outputs are compared, as indices into torchvision's ``features``.
-_TAPS = {
-    "squeeze": (1, 4, 7, 9, 10, 11, 12),
-    "vgg": (3, 8, 15, 22, 29),
-    "alex": (1, 4, 7, 9, 11),
-}
+_TAPS = {"squeeze": (1, 4, 7, 9, 10, 11, 12), "vgg": (3, 8, 15, 22, 29), "alex": (1, 4, 7, 9, 11)}
 _EPSILON = 1e-10
 
 

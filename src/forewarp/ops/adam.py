@@ -29,9 +29,9 @@ def adam_rows(
         from forewarp.ops import kernels_adam
 
         match_threads()
-        width, betas = value.shape[-1], tuple(map(float, betas))
+        betas = tuple(map(float, betas))
         table = kernels_adam.biases(*betas)
-        arrays = [t.detach().view(-1, width).numpy() for t in (value, gradient.contiguous(), mean, square)]
+        arrays = [t.detach().view(-1).numpy() for t in (value, gradient.contiguous(), mean, square)]
         kernels_adam.adam(*arrays, steps.view(-1).numpy(), float(rate), *betas, float(eps), table)
         return
     seen = (gradient != 0).any(-1)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from forewarp.ops.backend import match_threads, use_numba
 from forewarp.ops.checks import check_shape
-from forewarp.ops.project import Gaussians, Pinhole, Warp, _check, arrays, project_reference
+from forewarp.ops.project import Gaussians, Pinhole, Warp, _check, arrays, project_reference, whole
 from forewarp.ops.rasterize import SIDE, kept_for, rasterize_reference, sorted_tiles
 
 
@@ -113,7 +113,7 @@ def _compare_numba(
     view = pinhole.row(particles.means)
     padded = torch.nn.functional.pad(warp.maps, (0, 4))
     inputs = arrays(*particles, padded, warp.links, warp.weights, view, tints, fades)
-    splats = torch.empty(len(particles.means), kernels_project.SPLAT)
+    splats = torch.empty(whole(len(particles.means)), kernels_project.SPLAT)
     kernels_project.project(*inputs, splats.numpy())
     size = pinhole.size
     tiles = sorted_tiles(splats.numpy(), -(-size[0] // SIDE), -(-size[1] // SIDE), threads)
@@ -130,13 +130,14 @@ def _compare_numba(
         kernels_rasterize.np.float32(width),
         *arrays(kept, sums, found),
     )
-    by_splat, pull = torch.empty(len(tiles.order), kernels_chain.SLOPES), torch.zeros(len(splats))
-    kernels_chain.slopes_of(splats.numpy(), tiles.order, sums.numpy(), factor, by_splat.numpy(), pull.numpy())
+    seen, ranks = kernels_chain.ranked(tiles.order, len(particles.means))
+    by_splat = torch.empty(whole(len(seen)), kernels_chain.SLOPES)
+    pull = torch.zeros(len(particles.means))
+    kernels_chain.slopes_of(splats.numpy(), seen, ranks, sums.numpy(), factor, by_splat.numpy(), pull.numpy())
     gradients = [torch.zeros_like(t) for t in particles]
     maps = torch.zeros(threads, *padded.shape)
     weights = torch.zeros_like(warp.weights) if by_weights else warp.weights.new_zeros(0, 0)
-    ranks = kernels_chain.ranks_of(tiles.order, len(splats))
-    kernels_chain.chain(*inputs, splats.numpy(), ranks, by_splat.numpy(), *arrays(*gradients, maps, weights))
+    kernels_chain.chain(*inputs, splats.numpy(), seen, by_splat.numpy(), *arrays(*gradients, maps, weights))
     loss, squared = found.sum(0).tolist()
     return Compared(
         loss,

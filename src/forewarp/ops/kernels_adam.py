@@ -8,6 +8,10 @@ from functools import cache
 import numpy as np
 from numba import njit, prange
 
+from forewarp.ops.lanes import root, where_above
+from forewarp.ops.lanes_arrays import get_row, put_row, room, row_of
+
+_WIDEST = 16  # numbers of a row that are treated so
 KNOWN = 2048  # steps after which a beta's power is taken for 0
 
 
@@ -19,27 +23,57 @@ def biases(first: float, second: float) -> np.ndarray:
     return np.ascontiguousarray(np.concatenate([np.ones((1, 2), np.float32), found]))
 
 
-@njit(parallel=True, cache=True, fastmath={"contract"})
+@njit(inline="always")
+def _seen(gradient, row, width):
+    """Whether a row has a gradient."""
+    found = False
+    for c in range(width):
+        found |= gradient[row * width + c] != 0
+    return found
+
+
+@njit(parallel=True, cache=True)
 def adam(value, gradient, mean, square, steps, rate, first, second, eps, bias):
-    """See ``adam.adam_rows``; all are (R, C), steps (R,), ``bias`` as of ``biases``."""
-    rows, width = value.shape
+    """See ``adam.adam_rows``; all are (R C,), steps (R,), ``bias`` as of ``biases``.
+
+    Sixteen rows at once, whose numbers lie side by side in C vectors; what is beyond the last sixteen, or
+    wider than a room, number by number.
+    """
+    rows = len(steps)
+    width = len(value) // max(rows, 1)
     b1, b2, c1, c2 = np.float32(first), np.float32(second), np.float32(1 - first), np.float32(1 - second)
     small, whole = np.float32(eps), np.float32(rate)
+    blocks = rows // 16 if width <= _WIDEST else 0
     for chunk in prange(64):
-        for r in range(rows * chunk // 64, rows * (chunk + 1) // 64):
-            i = np.uintp(r)
-            seen = False
-            for c in range(width):
-                seen |= gradient[i, c] != 0
-            if not seen:
+        paces, scales = room(_WIDEST), room(_WIDEST)
+        for block in range(blocks * chunk // 64, blocks * (chunk + 1) // 64):
+            any_seen = False
+            for lane in range(16):
+                row, pace, scale = 16 * block + lane, np.float32(0), np.float32(0)  # 0: not seen
+                if _seen(gradient, row, width):
+                    any_seen = True
+                    steps[row] += np.float32(1)
+                    n = min(int(steps[row]), KNOWN)
+                    pace, scale = whole * bias[n, 0], bias[n, 1]
+                for c in range(width):
+                    paces[width * lane + c], scales[width * lane + c] = pace, scale
+            if not any_seen:
                 continue
-            steps[i] += np.float32(1)
-            n = min(int(steps[i]), KNOWN)
-            pace = whole * bias[n, 0]
-            scale = bias[n, 1]
             for c in range(width):
-                g = gradient[i, c]
-                m = b1 * mean[i, c] + c1 * g
-                v = b2 * square[i, c] + c2 * g * g
-                mean[i, c], square[i, c] = m, v
-                value[i, c] -= pace * m / (scale * math.sqrt(v) + small)
+                at = 16 * (width * block + c)
+                pace, scale, g = row_of(paces, c), row_of(scales, c), get_row(gradient, at)
+                m, v = get_row(mean, at), get_row(square, at)
+                put_row(mean, at, m + where_above(scale, np.float32(0), (g - m) * c1))
+                put_row(square, at, v + where_above(scale, np.float32(0), (g * g - v) * c2))
+                m, v = get_row(mean, at), get_row(square, at)
+                step = where_above(scale, np.float32(0), pace * m / (scale * root(v) + small))
+                put_row(value, at, get_row(value, at) - step)
+    for row in range(16 * blocks, rows):
+        if not _seen(gradient, row, width):
+            continue
+        steps[row] += np.float32(1)
+        n = min(int(steps[row]), KNOWN)
+        for i in range(row * width, (row + 1) * width):
+            g = gradient[i]
+            mean[i], square[i] = b1 * mean[i] + c1 * g, b2 * square[i] + c2 * g * g
+            value[i] -= whole * bias[n, 0] * mean[i] / (bias[n, 1] * math.sqrt(square[i]) + small)

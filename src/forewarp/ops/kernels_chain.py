@@ -1,230 +1,325 @@
-"""Numba kernels that carry gradients from splats to particles and nodes, by the rules of ``kernels_grid``."""
+"""Numba kernels that carry gradients from splats to particles and nodes, by the rules of ``kernels_grid``.
+
+As in ``kernels_project``, sixteen particles are treated side by side.
+"""
 
 from __future__ import annotations
-
-import math
 
 import numpy as np
 from numba import njit, prange
 
 from forewarp.ops.kernels_project import (
+    ANY,
+    BASIS,
     CENTER,
-    HALF,
-    ONE,
-    TWO,
-    ZERO,
-    _covariance,
-    _follow,
-    _lens,
-    _seen_from,
-    _slopes_of_pixel,
-    _times,
-    _turn,
+    MEAN,
+    QUATERNION,
+    ROWS,
+    SIDE_BY_SIDE,
+    covariance,
+    followed,
+    gathered,
     harmonics,
+    linear_of,
+    product,
+    scales_of,
+    seen_from,
+    slopes_of_pixel,
+    through_lens,
+    turned,
 )
-from forewarp.ops.lanes_arrays import add_row, room
+from forewarp.ops.lanes import fma, root, sixteen, where_above
+from forewarp.ops.lanes_arrays import get_row, put_row, room, row_of, set_row, transpose
 
-SLOPES = 10  # by u, v, A, B, C, opacity, colour (3) and distance
+SLOPES = 16  # by u, v, A, B, C, opacity, colour (3) and distance; the last six are 0
+_SLOPE, _ROWS = ROWS, ROWS + SLOPES  # where they begin in a room, and how many rows it has
 
 
 @njit(cache=True)
-def slopes_of(splats, order, sums, factor, slopes, pull):
-    """From the sums over pixels (S, V, 16) of splats in their order to ``factor`` times the slopes
-    by their numbers (V, 10).
+def ranked(order, count):
+    """Rows (V,) int32 of ``count`` that are in an order, the lowest first, and their places (V,) in it.
+
+    What is read row by row should lie side by side: in the order of depth half of the time would be waiting.
+    """
+    places = np.full(count, -1, np.int32)
+    for k in range(len(order)):
+        places[order[k]] = k
+    rows, ranks = np.empty(len(order), np.int32), np.empty(len(order), np.int32)
+    found = 0
+    for i in range(count):
+        if places[i] >= 0:
+            rows[found], ranks[found] = i, places[i]
+            found += 1
+    return rows, ranks
+
+
+@njit(parallel=True, cache=True)
+def slopes_of(splats, rows, ranks, sums, factor, slopes, pull):
+    """From the sums over pixels (S, V, 16) of splats in the order of depth to ``factor`` times the slopes
+    by the numbers (V', 16) of ``rows``, whose places in that order are ``ranks``; V' is V or more, a
+    multiple of 16.
 
     The sums are of q, q dx, q dy, q dx^2, q dx dy, q dy^2, with q the slope by the exponent and dx, dy from
     the splat to the pixel, then those by colour and distance. ``pull`` (N,) takes the lengths of those by
     u, v.
     """
-    for k in range(len(order)):
-        i = np.uintp(order[k])
-        a, b, c, solid = splats[i, 2], splats[i, 3], splats[i, 4], splats[i, 5]
-        for j in range(SLOPES):
-            value = ZERO
-            for share in range(sums.shape[0]):
-                value += sums[share, k, j]
-            slopes[k, j] = np.float32(factor) * value
-        s, sx, sy = slopes[k, 0], slopes[k, 1], slopes[k, 2]
-        sxx, sxy, syy = slopes[k, 3], slopes[k, 4], slopes[k, 5]
-        slopes[k, 0], slopes[k, 1] = a * sx + b * sy, b * sx + c * sy
-        slopes[k, 2], slopes[k, 3], slopes[k, 4] = -HALF * sxx, -sxy, -HALF * syy
-        slopes[k, 5] = s / solid
-        pull[i] = math.sqrt(slopes[k, 0] * slopes[k, 0] + slopes[k, 1] * slopes[k, 1])
+    count = len(rows)
+    for block in prange(slopes.shape[0] // SIDE_BY_SIDE):
+        first, place, conics = SIDE_BY_SIDE * block, room(16), room(16)
+        for lane in range(SIDE_BY_SIDE):
+            k = min(first + lane, count - 1)
+            set_row(conics, lane, get_row(splats, rows[k]))
+            found = get_row(sums[0], ranks[k])
+            for share in range(1, sums.shape[0]):
+                found = found + get_row(sums[share], ranks[k])
+            set_row(place, lane, found * factor)
+        transpose(place)
+        transpose(conics)
+        a, b, c = row_of(conics, 2), row_of(conics, 3), row_of(conics, 4)
+        s, sx, sy = row_of(place, 0), row_of(place, 1), row_of(place, 2)
+        sxx, sxy, syy = row_of(place, 3), row_of(place, 4), row_of(place, 5)
+        along, upright = a * sx + b * sy, b * sx + c * sy
+        set_row(place, 0, along)
+        set_row(place, 1, upright)
+        set_row(place, 2, sxx * -0.5)
+        set_row(place, 3, sxy * -1.0)
+        set_row(place, 4, syy * -0.5)
+        set_row(place, 5, s / row_of(conics, 5))
+        set_row(conics, 0, root(along * along + upright * upright))
+        transpose(place)
+        for lane in range(SIDE_BY_SIDE):
+            put_row(slopes, first + lane, row_of(place, lane))
+            if first + lane < count:
+                pull[rows[first + lane]] = conics[lane]
 
 
-@njit(cache=True)
-def ranks_of(order, count):
-    """The place of each of ``count`` rows in an order; -1 where it has none."""
-    ranks = np.full(count, -1, np.int32)
-    for k in range(len(order)):
-        ranks[order[k]] = k
-    return ranks
+@njit(forceinline=True)
+def _scattered(place, first, count, array, which, valid):
+    """Copy rows from ``first`` on to the columns (N, count) of the particles they belong to."""
+    for lane in range(valid):
+        i = np.uintp(which[lane])
+        for c in range(count):
+            array[i, c] = place[SIDE_BY_SIDE * (first + c) + lane]
 
 
-@njit(inline="always", fastmath={"contract"})
-def _of_covariance(view, rows, scales, slopes, out):
-    """From slopes by the conic A, B, C to those by rows (2, 3) times scales, ``out`` (6).
+@njit(forceinline=True)
+def _of_covariance(view, rows, scales, by_a, by_b, by_c):
+    """From slopes by the conic A, B, C to those by rows (2, 3) times scales.
 
     Of the inverse X of a covariance: dL/dcov = -X G X, with G the slopes by X, half of B's on each side.
     """
-    a, b, c, determinant = _covariance(view, rows, scales)
-    x, y, z = c / determinant, -b / determinant, a / determinant
-    g, h, k = slopes[2], slopes[3] * HALF, slopes[4]
-    p0, p1, q0, q1 = g * x + h * y, g * y + h * z, h * x + k * y, h * y + k * z
-    first, beside, second = -(x * p0 + y * q0), -(x * p1 + y * q1), -(y * p1 + z * q1)
-    for j in range(3):
-        u, v = rows[j] * scales[j], rows[3 + j] * scales[j]
-        out[j] = TWO * (first * u + beside * v)
-        out[3 + j] = TWO * (beside * u + second * v)
+    a, b, c, determinant = covariance(view, rows, scales)
+    inverse = sixteen(1.0) / determinant
+    x, y, z = c * inverse, b * inverse * -1.0, a * inverse
+    h = by_b * 0.5
+    p0, p1, q0, q1 = by_a * x + h * y, by_a * y + h * z, h * x + by_c * y, h * y + by_c * z
+    first, beside, second = (x * p0 + y * q0) * -2.0, (x * p1 + y * q1) * -2.0, (y * p1 + z * q1) * -2.0
+    u0, u1, u2 = rows[0] * scales[0], rows[1] * scales[1], rows[2] * scales[2]
+    v0, v1, v2 = rows[3] * scales[0], rows[4] * scales[1], rows[5] * scales[2]
+    return (
+        first * u0 + beside * v0,
+        first * u1 + beside * v1,
+        first * u2 + beside * v2,
+        beside * u0 + second * v0,
+        beside * u1 + second * v1,
+        beside * u2 + second * v2,
+    )
 
 
-@njit(inline="always", fastmath={"contract"})
-def _of_turn(quaternions, i, d, out):
-    """From slopes (9) by a rotation to those by its quaternion (4), whatever its length."""
-    w, x, y, z = quaternions[i, 0], quaternions[i, 1], quaternions[i, 2], quaternions[i, 3]
+@njit(forceinline=True)
+def _of_turn(place, d):
+    """From slopes (9) by rotations to those by gathered quaternions (4), whatever their length."""
+    w, x, y, z = (
+        row_of(place, QUATERNION),
+        row_of(place, QUATERNION + 1),
+        row_of(place, QUATERNION + 2),
+        row_of(place, QUATERNION + 3),
+    )
     square = w * w + x * x + y * y + z * z
-    if not square > 1e-24:
-        out[0], out[1], out[2], out[3] = ZERO, ZERO, ZERO, ZERO
-        return
-    length = ONE / math.sqrt(square)
+    length = where_above(square, np.float32(1e-24), sixteen(1.0) / root(square))
     w, x, y, z = w * length, x * length, y * length, z * length
-    gw = TWO * (x * (d[7] - d[5]) + y * (d[2] - d[6]) + z * (d[3] - d[1]))
-    gx = TWO * (w * (d[7] - d[5]) + y * (d[1] + d[3]) + z * (d[2] + d[6]) - TWO * x * (d[4] + d[8]))
-    gy = TWO * (w * (d[2] - d[6]) + x * (d[1] + d[3]) + z * (d[5] + d[7]) - TWO * y * (d[0] + d[8]))
-    gz = TWO * (w * (d[3] - d[1]) + x * (d[2] + d[6]) + y * (d[5] + d[7]) - TWO * z * (d[0] + d[4]))
+    gw = (x * (d[7] - d[5]) + y * (d[2] - d[6]) + z * (d[3] - d[1])) * 2.0
+    gx = (w * (d[7] - d[5]) + y * (d[1] + d[3]) + z * (d[2] + d[6]) - x * (d[4] + d[8]) * 2.0) * 2.0
+    gy = (w * (d[2] - d[6]) + x * (d[1] + d[3]) + z * (d[5] + d[7]) - y * (d[0] + d[8]) * 2.0) * 2.0
+    gz = (w * (d[3] - d[1]) + x * (d[2] + d[6]) + y * (d[5] + d[7]) - z * (d[0] + d[4]) * 2.0) * 2.0
     along = gw * w + gx * x + gy * y + gz * z
-    out[0], out[1] = length * (gw - along * w), length * (gx - along * x)
-    out[2], out[3] = length * (gy - along * y), length * (gz - along * z)
+    return (
+        (gw - along * w) * length,
+        (gx - along * x) * length,
+        (gy - along * y) * length,
+        (gz - along * z) * length,
+    )
 
 
-@njit(inline="always", fastmath={"contract"})
-def _of_place(view, local, bent, slopes, by_jacobian, out):
+@njit(forceinline=True)
+def _of_place(view, local, inverse, px, py, bent, place, by_jacobian):
     """Slopes (3) by the world point, of the pixel, of its own slopes (2, 3) and of the distance.
 
     How the lens bends is taken to be the same around the point.
     """
-    inverse = ONE / local[2]
-    px, py = local[0] * inverse, local[1] * inverse
     a, b, c, d = bent[2], bent[3], bent[4], bent[5]
-    gx, gy = a * slopes[0] + c * slopes[1], b * slopes[0] + d * slopes[1]
-    lx, ly, lz = gx * inverse, gy * inverse, -(gx * px + gy * py) * inverse
+    by_u, by_v, by_far = row_of(place, _SLOPE), row_of(place, _SLOPE + 1), row_of(place, _SLOPE + 9)
+    gx, gy = a * by_u + c * by_v, b * by_u + d * by_v
     # By the slopes of the plane's point: (1/z, 0, -x/z^2) and (0, 1/z, -y/z^2).
-    across, upright, ahead_x, ahead_y = ZERO, ZERO, ZERO, ZERO
-    for k in range(3):
-        first = a * by_jacobian[k] + c * by_jacobian[3 + k]
-        second = b * by_jacobian[k] + d * by_jacobian[3 + k]
-        across += first * view[k]
-        upright += second * view[3 + k]
-        ahead_x += first * view[6 + k]
-        ahead_y += second * view[6 + k]
+    first0, first1 = a * by_jacobian[0] + c * by_jacobian[3], a * by_jacobian[1] + c * by_jacobian[4]
+    first2, second0 = a * by_jacobian[2] + c * by_jacobian[5], b * by_jacobian[0] + d * by_jacobian[3]
+    second1, second2 = b * by_jacobian[1] + d * by_jacobian[4], b * by_jacobian[2] + d * by_jacobian[5]
+    across = first0 * view[0] + first1 * view[1] + first2 * view[2]
+    upright = second0 * view[3] + second1 * view[4] + second2 * view[5]
+    ahead_x = first0 * view[6] + first1 * view[7] + first2 * view[8]
+    ahead_y = second0 * view[6] + second1 * view[7] + second2 * view[8]
     square = inverse * inverse
-    lx -= ahead_x * square
-    ly -= ahead_y * square
-    lz += (TWO * (px * ahead_x + py * ahead_y) - across - upright) * square
-    far = slopes[9] / math.sqrt(local[0] * local[0] + local[1] * local[1] + local[2] * local[2])
-    lx, ly, lz = lx + far * local[0], ly + far * local[1], lz + far * local[2]
-    for k in range(3):
-        out[k] = view[k] * lx + view[3 + k] * ly + view[6 + k] * lz
+    squared = fma(local[0], local[0], fma(local[1], local[1], local[2] * local[2]))
+    far = by_far / root(squared)
+    lx = gx * inverse - ahead_x * square + far * local[0]
+    ly = gy * inverse - ahead_y * square + far * local[1]
+    turn = (px * ahead_x + py * ahead_y) * 2.0 - across - upright
+    lz = turn * square - (gx * px + gy * py) * inverse + far * local[2]
+    return (
+        lx * view[0] + ly * view[3] + lz * view[6],
+        lx * view[1] + ly * view[4] + lz * view[7],
+        lx * view[2] + ly * view[5] + lz * view[8],
+    )
 
 
-@njit(inline="always", fastmath={"contract"})
-def _of_warp(moved, by_moved, jacobian, warp, by_point, mean, i, out):
-    """Slopes (12) by the blended map, of the covariance's and the point's; those by the Jacobian (6)."""
-    for r in range(3):
-        for c in range(3):
-            value = by_point[r] * mean[i, c]
-            for row in range(2):
-                value += jacobian[3 * row + r] * by_moved[3 * row + c]
-            out[3 * r + c] = value
-        out[9 + r] = by_point[r]
-    for j in range(12, 16):
-        out[j] = ZERO
-
-
-@njit(inline="always", fastmath={"contract"})
-def _of_colors(view, warp, mean, i, slopes, splats, plain, tints, basis, out):
+@njit(forceinline=True)
+def _of_colors(dx, dy, dz, splats, tints, which, valid, place, to_colors):
     """Slopes by the coefficients of colour; direction has none."""
-    x, y, z = mean[i, 0], mean[i, 1], mean[i, 2]
-    dx = warp[0] * x + warp[1] * y + warp[2] * z + warp[9] - view[CENTER]
-    dy = warp[3] * x + warp[4] * y + warp[5] * z + warp[10] - view[CENTER + 1]
-    dz = warp[6] * x + warp[7] * y + warp[8] * z + warp[11] - view[CENTER + 2]
-    inverse = ONE / splats[i, 9]
-    harmonics(dx * inverse, dy * inverse, dz * inverse, plain, basis)
-    for channel in range(3):
-        slope = slopes[6 + channel] if splats[i, 6 + channel] > 0 else ZERO
-        for k in range(plain):
-            out[i, k, channel] = basis[k] * slope
-        for k in range(len(tints)):
-            out[i, plain + k, channel] = tints[k] * slope
+    plain = to_colors.shape[1] - len(tints)
+    harmonics(dx, dy, dz, plain, place)
+    for lane in range(SIDE_BY_SIDE):
+        i = np.uintp(which[lane])
+        for c in range(3):
+            place[SIDE_BY_SIDE * (ANY + c) + lane] = splats[i, 6 + c]
+    zero = np.float32(0)
+    red = where_above(row_of(place, ANY), zero, row_of(place, _SLOPE + 6))
+    green = where_above(row_of(place, ANY + 1), zero, row_of(place, _SLOPE + 7))
+    blue = where_above(row_of(place, ANY + 2), zero, row_of(place, _SLOPE + 8))
+    for k in range(to_colors.shape[1]):
+        factor = row_of(place, BASIS + k) if k < plain else sixteen(tints[k - plain])
+        set_row(place, ANY, factor * red)
+        set_row(place, ANY + 1, factor * green)
+        set_row(place, ANY + 2, factor * blue)
+        for lane in range(valid):
+            i = np.uintp(which[lane])
+            for c in range(3):
+                to_colors[i, k, c] = place[SIDE_BY_SIDE * (ANY + c) + lane]
 
 
-@njit(parallel=True, cache=True, fastmath={"contract"})
-def chain(  # long: one particle's way back, step by step
+@njit(forceinline=True)
+def _of_maps(maps, links, weights, which, valid, place, to_maps, to_weights):
+    """Add the slopes of blended maps, a particle's in a row of ``place``, to those by maps and shares."""
+    for lane in range(valid):
+        i, own = np.uintp(which[lane]), row_of(place, lane)
+        for n in range(links.shape[1]):
+            node = links[i, n]
+            put_row(to_maps, node, fma(own, weights[i, n], get_row(to_maps, node)))
+            if len(to_weights):
+                value = np.float32(0)
+                for j in range(12):
+                    value += place[SIDE_BY_SIDE * lane + j] * maps[node, j]
+                to_weights[i, n] = value
+
+
+@njit(parallel=True, cache=True)
+def chain(  # long: sixteen particles' way back, step by step
     means, log_scales, quaternions, opacity, colors, maps, links, weights, view, tints, fades,
-    splats, ranks, slopes,
+    splats, seen, slopes,
     to_means, to_scales, to_quaternions, to_opacity, to_colors, to_maps, to_weights,
 ):  # fmt: skip
-    """From slopes (V, 10), a particle's in the row ``ranks`` (N,) or -1, to those by particles and maps."""
-    shares = to_maps.shape[0]
+    """From slopes (V', 16) of the particles ``seen`` (V,) to those by all particles, and by maps.
+
+    ``to_maps`` (S, M, 16): each thread has its own.
+    """
+    count, shares = len(seen), to_maps.shape[0]
+    blocks = (count + SIDE_BY_SIDE - 1) // SIDE_BY_SIDE
     for share in prange(shares):
-        warp, turn, by_warp, basis = room(12), room(9), room(12), room(16)
-        jacobian, moved, rows, scales, local = room(6), room(6), room(6), room(3), room(3)
-        by_point, by_rows, by_turn, by_four = room(3), room(6), room(9), room(4)
-        by_moved, by_jacobian = room(6), room(6)
-        plain, count, own_maps = colors.shape[1] - len(tints), len(ranks), to_maps[share]
-        for row in range(count * share // shares, count * (share + 1) // shares):
-            i = np.uintp(row)
-            if ranks[i] < 0:
-                continue
-            slope = slopes[np.uintp(ranks[i])]
-            x, y, z = _follow(means, maps, links, weights, i, warp)
-            _seen_from(view, x, y, z, local)
-            bent = _lens(view, local[0] / local[2], local[1] / local[2])
-            _slopes_of_pixel(view, local, bent, jacobian)
-            _times(jacobian, warp, moved)
-            _turn(quaternions, i, turn)
-            _times(moved, turn, rows)
-            for j in range(3):
-                scales[j] = math.exp(log_scales[i, j])
-            _of_covariance(view, rows, scales, slope, by_rows)
-            for j in range(3):
-                by_rows[j] *= scales[j]
-                by_rows[3 + j] *= scales[j]
-                to_scales[i, j] = by_rows[j] * rows[j] + by_rows[3 + j] * rows[3 + j]
+        place, which = room(_ROWS), np.empty(SIDE_BY_SIDE, np.intp)
+        for block in range(blocks * share // shares, blocks * (share + 1) // shares):
+            start = SIDE_BY_SIDE * block
+            valid = min(SIDE_BY_SIDE, count - start)
+            for lane in range(SIDE_BY_SIDE):
+                which[lane] = seen[min(start + lane, count - 1)]
+                set_row(place, lane, get_row(slopes, start + lane))
+            transpose(place)
+            for j in range(SIDE_BY_SIDE):
+                set_row(place, _SLOPE + j, row_of(place, j))
+            x, y, z = followed(means, maps, links, weights, which, place)
+            local = seen_from(view, x, y, z)
+            inverse = sixteen(1.0) / local[2]
+            px, py = local[0] * inverse, local[1] * inverse
+            bent = through_lens(view, px, py)
+            jacobian, warp = slopes_of_pixel(view, inverse, px, py, bent), linear_of(place)
+            gathered(quaternions, which, place, QUATERNION, 4)
+            moved, turn, scales = product(jacobian, warp), turned(place), scales_of(log_scales, which, place)
+            rows = product(moved, turn)
+            by_root = _of_covariance(
+                view,
+                rows,
+                scales,
+                row_of(place, _SLOPE + 2),
+                row_of(place, _SLOPE + 3),
+                row_of(place, _SLOPE + 4),
+            )
+            r0, r1, r2 = by_root[0] * scales[0], by_root[1] * scales[1], by_root[2] * scales[2]
+            r3, r4, r5 = by_root[3] * scales[0], by_root[4] * scales[1], by_root[5] * scales[2]
+            set_row(place, ANY, r0 * rows[0] + r3 * rows[3])
+            set_row(place, ANY + 1, r1 * rows[1] + r4 * rows[4])
+            set_row(place, ANY + 2, r2 * rows[2] + r5 * rows[5])
+            _scattered(place, ANY, 3, to_scales, which, valid)
+            by_turn = (
+                moved[0] * r0 + moved[3] * r3, moved[0] * r1 + moved[3] * r4, moved[0] * r2 + moved[3] * r5,
+                moved[1] * r0 + moved[4] * r3, moved[1] * r1 + moved[4] * r4, moved[1] * r2 + moved[4] * r5,
+                moved[2] * r0 + moved[5] * r3, moved[2] * r1 + moved[5] * r4, moved[2] * r2 + moved[5] * r5,
+            )  # fmt: skip
+            by_four = _of_turn(place, by_turn)
+            set_row(place, QUATERNION, by_four[0])
+            set_row(place, QUATERNION + 1, by_four[1])
+            set_row(place, QUATERNION + 2, by_four[2])
+            set_row(place, QUATERNION + 3, by_four[3])
+            _scattered(place, QUATERNION, 4, to_quaternions, which, valid)
+            back = (r0, r1, r2, r3, r4, r5)
+            by_moved = product(back, _transposed(turn))
+            by_point = _of_place(
+                view, local, inverse, px, py, bent, place, product(by_moved, _transposed(warp))
+            )
+            set_row(place, ANY, warp[0] * by_point[0] + warp[3] * by_point[1] + warp[6] * by_point[2])
+            set_row(place, ANY + 1, warp[1] * by_point[0] + warp[4] * by_point[1] + warp[7] * by_point[2])
+            set_row(place, ANY + 2, warp[2] * by_point[0] + warp[5] * by_point[1] + warp[8] * by_point[2])
+            _scattered(place, ANY, 3, to_means, which, valid)
+            squared = fma(local[0], local[0], fma(local[1], local[1], local[2] * local[2]))
+            apart = sixteen(1.0) / root(squared)
+            _of_colors(
+                (x - view[CENTER]) * apart,
+                (y - view[CENTER + 1]) * apart,
+                (z - view[CENTER + 2]) * apart,
+                splats,
+                tints,
+                which,
+                valid,
+                place,
+                to_colors,
+            )
+            for lane in range(valid):
+                i = np.uintp(which[lane])
+                slope = (
+                    place[SIDE_BY_SIDE * (_SLOPE + 5) + lane] * splats[i, 5] * (np.float32(1) - splats[i, 5])
+                )
+                for j in range(len(fades)):
+                    to_opacity[i, j] = slope * fades[j]
             for r in range(3):
                 for c in range(3):
-                    by_turn[3 * r + c] = moved[r] * by_rows[c] + moved[3 + r] * by_rows[3 + c]
-                    # (2, 3) times the transposed rotation
-                for row in range(2):
-                    by_moved[3 * row + r] = (
-                        by_rows[3 * row] * turn[3 * r]
-                        + by_rows[3 * row + 1] * turn[3 * r + 1]
-                        + by_rows[3 * row + 2] * turn[3 * r + 2]
-                    )
-            _of_turn(quaternions, i, by_turn, by_four)
-            for j in range(4):
-                to_quaternions[i, j] = by_four[j]
-            for row in range(2):
-                for r in range(3):
-                    by_jacobian[3 * row + r] = (
-                        by_moved[3 * row] * warp[3 * r]
-                        + by_moved[3 * row + 1] * warp[3 * r + 1]
-                        + by_moved[3 * row + 2] * warp[3 * r + 2]
-                    )
-            _of_place(view, local, bent, slope, by_jacobian, by_point)
-            _of_warp(moved, by_moved, jacobian, warp, by_point, means, i, by_warp)
-            for j in range(3):
-                to_means[i, j] = warp[j] * by_point[0] + warp[3 + j] * by_point[1] + warp[6 + j] * by_point[2]
-            for n in range(links.shape[1]):
-                w, node = weights[i, n], links[i, n]
-                if w != 0:
-                    add_row(own_maps, node, w, by_warp)
-                if len(to_weights):
-                    value = ZERO
-                    for j in range(12):
-                        value += by_warp[j] * maps[node, j]
-                    to_weights[i, n] = value
-            solid = splats[i, 5]
-            for j in range(opacity.shape[1]):
-                to_opacity[i, j] = slope[5] * solid * (ONE - solid) * fades[j]
-            _of_colors(view, warp, means, i, slope, splats, plain, tints, basis, to_colors)
+                    value = by_point[r] * row_of(place, MEAN + c)
+                    value = fma(jacobian[r], by_moved[c], fma(jacobian[3 + r], by_moved[3 + c], value))
+                    set_row(place, 3 * r + c, value)
+                set_row(place, 9 + r, by_point[r])
+            for j in range(12, SIDE_BY_SIDE):
+                set_row(place, j, sixteen(0.0))
+            transpose(place)
+            _of_maps(maps, links, weights, which, valid, place, to_maps[share], to_weights)
+
+
+@njit(forceinline=True)
+def _transposed(m):
+    """The transpose of (3, 3) in 9 numbers."""
+    return m[0], m[3], m[6], m[1], m[4], m[7], m[2], m[5], m[8]

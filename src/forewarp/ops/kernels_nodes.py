@@ -79,3 +79,21 @@ def carry(shift, turn, basis, places, motion, maps):
                 maps[m, 3 * r + c] = linear[3 * r + c]
                 rest -= linear[3 * r + c] * places[m, c]
             maps[m, 9 + r] = rest
+
+
+@njit(cache=True)
+def spread(value, slope, basis, bend, gradient, factor, scale):
+    """Fill ``gradient`` (M, K, 3); returns the mean of the squared bend. See ``nodes.spread_nodes``."""
+    total, many = 0.0, 3 * value.shape[0]
+    for m in range(value.shape[0]):
+        for c in range(3):
+            bent = 0.0
+            for k in range(value.shape[1]):
+                if bend[k] != 0:
+                    bent += bend[k] * value[m, k, c]
+            bent /= scale
+            total += bent * bent
+            pulled = 2.0 * factor / (many * scale) * bent
+            for k in range(value.shape[1]):
+                gradient[m, k, c] = slope[m, c] * basis[k] + pulled * bend[k]
+    return total / many

@@ -1,135 +1,185 @@
-"""Numba kernels behind ``project``, by the rules of ``kernels_grid``. The equations stand there."""
+"""Numba kernels behind ``project``, by the rules of ``kernels_grid``. The equations stand there.
+
+Sixteen particles are treated side by side: a *row* of a ``room`` has one number of each of them.
+"""
 
 from __future__ import annotations
-
-import math
 
 import numpy as np
 from numba import njit, prange
 
-from forewarp.ops.lanes_arrays import room, take_row
+from forewarp.ops.lanes import at_least, fma, root, sixteen, where_above
+from forewarp.ops.lanes_arrays import get_row, put_row, room, row_of, set_row, transpose
+from forewarp.ops.lanes_math import exp, log
 
-SPLAT = 12
-ONE, TWO = np.float32(1), np.float32(2)  # whole numbers would make float64 of all they meet
+SIDE_BY_SIDE = 16
+SPLAT = 16  # numbers of a splat; the last three are 0
 # Where the numbers of a view lie in its row; see ``project.View.row``.
 ROTATION, CENTER, FOCAL, SKEW, MIDDLE, SIZE, NEAR, BLUR, MARGIN, RADIAL, TANGENTIAL, REACH = (
     0, 9, 12, 14, 15, 17, 19, 20, 21, 22, 25, 27,
 )  # fmt: skip
+# Rows of a room: the blended map, then what is gathered of the particles, then harmonics.
+MEAN, SCALE, QUATERNION, ANY, BASIS, ROWS = 16, 19, 22, 26, 29, 45
+LOG_FULL = 5.541263545158426  # log(255): what adds less than a 255th to a pixel is not seen
 C0, C1 = np.float32(0.28209479177387814), np.float32(0.4886025119029199)
 C20, C21, C22 = (np.float32(c) for c in (1.0925484305920792, 0.31539156525252005, 0.5462742152960396))
 C30, C31, C32 = (np.float32(c) for c in (0.5900435899266435, 2.890611442640554, 0.4570457994644658))
 C33, C34 = (np.float32(c) for c in (0.3731763325901154, 1.445305721320277))
-ZERO, HALF, THREE, FOUR, FULL = (np.float32(c) for c in (0, 0.5, 3, 4, 255))
 
 
-@njit(inline="always", fastmath={"contract"})
-def harmonics(x, y, z, count, out):
-    """Real spherical harmonics of a unit direction into ``out[:count]``; count is 1, 4, 9 or 16."""
-    out[0] = C0
+@njit(forceinline=True)
+def harmonics(x, y, z, count, place):
+    """Real spherical harmonics of unit directions into the rows from ``BASIS`` on; count is 1, 4, 9 or 16."""
+    set_row(place, BASIS, sixteen(C0))
     if count > 1:
-        out[1], out[2], out[3] = -C1 * y, C1 * z, -C1 * x
+        set_row(place, BASIS + 1, y * -C1)
+        set_row(place, BASIS + 2, z * C1)
+        set_row(place, BASIS + 3, x * -C1)
     if count > 4:
         xx, yy, zz = x * x, y * y, z * z
-        out[4], out[5] = C20 * x * y, -C20 * y * z
-        out[6] = C21 * (TWO * zz - xx - yy)
-        out[7], out[8] = -C20 * x * z, C22 * (xx - yy)
+        set_row(place, BASIS + 4, x * y * C20)
+        set_row(place, BASIS + 5, y * z * -C20)
+        set_row(place, BASIS + 6, (zz * 2.0 - xx - yy) * C21)
+        set_row(place, BASIS + 7, x * z * -C20)
+        set_row(place, BASIS + 8, (xx - yy) * C22)
         if count > 9:
-            out[9] = -C30 * y * (THREE * xx - yy)
-            out[10] = C31 * x * y * z
-            out[11] = -C32 * y * (FOUR * zz - xx - yy)
-            out[12] = C33 * z * (TWO * zz - THREE * xx - THREE * yy)
-            out[13] = -C32 * x * (FOUR * zz - xx - yy)
-            out[14] = C34 * z * (xx - yy)
-            out[15] = -C30 * x * (xx - THREE * yy)
+            set_row(place, BASIS + 9, y * (xx * 3.0 - yy) * -C30)
+            set_row(place, BASIS + 10, x * y * z * C31)
+            set_row(place, BASIS + 11, y * (zz * 4.0 - xx - yy) * -C32)
+            set_row(place, BASIS + 12, z * (zz * 2.0 - xx * 3.0 - yy * 3.0) * C33)
+            set_row(place, BASIS + 13, x * (zz * 4.0 - xx - yy) * -C32)
+            set_row(place, BASIS + 14, z * (xx - yy) * C34)
+            set_row(place, BASIS + 15, x * (xx - yy * 3.0) * -C30)
 
 
-@njit(inline="always", fastmath={"contract"})
-def _follow(mean, maps, links, weights, i, warp):
-    """Blend the maps (M, 16) of a particle's nodes into ``warp``: I + sum w D row by row, then the shift."""
-    for j in range(16):
-        warp[j] = np.float32(0)
-    for k in range(links.shape[1]):
-        w = weights[i, k]
-        if w != 0:
-            take_row(maps, links[i, k], w, warp)
-    warp[0] += ONE
-    warp[4] += ONE
-    warp[8] += ONE
-    x, y, z = mean[i, 0], mean[i, 1], mean[i, 2]
+@njit(forceinline=True)
+def gathered(array, which, place, first, count):
+    """Copy the columns (N, count) of 16 particles to the rows from ``first`` on."""
+    for lane in range(SIDE_BY_SIDE):
+        i = np.uintp(which[lane])
+        for c in range(count):
+            place[SIDE_BY_SIDE * (first + c) + lane] = array[i, c]
+
+
+@njit(forceinline=True)
+def followed(means, maps, links, weights, which, place):
+    """Blend the maps (M, 16) of 16 particles' nodes into 12 rows: I + sum w D row by row, then the shift.
+
+    Returns where the particles go.
+    """
+    for lane in range(SIDE_BY_SIDE):
+        i = np.uintp(which[lane])
+        blend = sixteen(0.0)
+        for k in range(links.shape[1]):
+            blend = fma(get_row(maps, links[i, k]), weights[i, k], blend)
+        set_row(place, lane, blend)
+    transpose(place)
+    for j in range(0, 9, 4):
+        set_row(place, j, row_of(place, j) + 1.0)
+    gathered(means, which, place, MEAN, 3)
+    x, y, z = row_of(place, MEAN), row_of(place, MEAN + 1), row_of(place, MEAN + 2)
     return (
-        warp[0] * x + warp[1] * y + warp[2] * z + warp[9],
-        warp[3] * x + warp[4] * y + warp[5] * z + warp[10],
-        warp[6] * x + warp[7] * y + warp[8] * z + warp[11],
+        fma(row_of(place, 0), x, fma(row_of(place, 1), y, fma(row_of(place, 2), z, row_of(place, 9)))),
+        fma(row_of(place, 3), x, fma(row_of(place, 4), y, fma(row_of(place, 5), z, row_of(place, 10)))),
+        fma(row_of(place, 6), x, fma(row_of(place, 7), y, fma(row_of(place, 8), z, row_of(place, 11)))),
     )
 
 
-@njit(inline="always", fastmath={"contract"})
-def _lens(view, x, y):
+@njit(forceinline=True)
+def through_lens(view, x, y):
     """Where a lens puts a point of the plane, in pixels, and the 2 x 2 slopes of that."""
     k1, k2, k3 = view[RADIAL], view[RADIAL + 1], view[RADIAL + 2]
     p1, p2 = view[TANGENTIAL], view[TANGENTIAL + 1]
-    r2 = x * x + y * y
-    scale = ONE + r2 * (k1 + r2 * (k2 + r2 * k3))
-    slope = TWO * (k1 + r2 * (TWO * k2 + r2 * THREE * k3))
-    u = x * scale + TWO * p1 * x * y + p2 * (r2 + TWO * x * x)
-    v = y * scale + TWO * p2 * x * y + p1 * (r2 + TWO * y * y)
-    xx = scale + slope * x * x + TWO * p1 * y + TWO * THREE * p2 * x
-    xy = slope * x * y + TWO * p1 * x + TWO * p2 * y
-    yy = scale + slope * y * y + TWO * p2 * x + TWO * THREE * p1 * y
+    xx, xy, yy = x * x, x * y, y * y
+    r2 = xx + yy
+    scale = fma(r2, fma(r2, fma(r2, k3, sixteen(k2)), sixteen(k1)), sixteen(1.0))
+    slope = fma(r2, fma(r2, k3 * 6.0, sixteen(k2 * 4.0)), sixteen(k1 * 2.0))
+    u = x * scale + xy * (p1 * 2.0) + (r2 + xx * 2.0) * p2
+    v = y * scale + xy * (p2 * 2.0) + (r2 + yy * 2.0) * p1
+    along = scale + slope * xx + y * (p1 * 2.0) + x * (p2 * 6.0)
+    beside = slope * xy + x * (p1 * 2.0) + y * (p2 * 2.0)
+    upright = scale + slope * yy + x * (p2 * 2.0) + y * (p1 * 6.0)
     fx, fy, skew = view[FOCAL], view[FOCAL + 1], view[SKEW]
     return (
-        fx * u + skew * v + view[MIDDLE],
-        fy * v + view[MIDDLE + 1],
-        fx * xx + skew * xy,
-        fx * xy + skew * yy,
-        fy * xy,
-        fy * yy,
+        u * fx + v * skew + view[MIDDLE],
+        v * fy + view[MIDDLE + 1],
+        along * fx + beside * skew,
+        beside * fx + upright * skew,
+        beside * fy,
+        upright * fy,
     )
 
 
-@njit(inline="always", fastmath={"contract"})
-def _turn(quaternions, i, out):
-    """The rotation (9) of a quaternion (w, x, y, z) of any length; of length 0 it is none."""
-    w, x, y, z = quaternions[i, 0], quaternions[i, 1], quaternions[i, 2], quaternions[i, 3]
+@njit(forceinline=True)
+def turned(place):
+    """The rotations (9) of 16 gathered quaternions (w, x, y, z) of any length; of length 0 there is none."""
+    w, x, y, z = (
+        row_of(place, QUATERNION),
+        row_of(place, QUATERNION + 1),
+        row_of(place, QUATERNION + 2),
+        row_of(place, QUATERNION + 3),
+    )
     square = w * w + x * x + y * y + z * z
-    if not square > 1e-24:
-        w, x, y, z, square = ONE, ZERO, ZERO, ZERO, ONE
-    s = TWO / square
-    out[0], out[1], out[2] = ONE - s * (y * y + z * z), s * (x * y - w * z), s * (x * z + w * y)
-    out[3], out[4], out[5] = s * (x * y + w * z), ONE - s * (x * x + z * z), s * (y * z - w * x)
-    out[6], out[7], out[8] = s * (x * z - w * y), s * (y * z + w * x), ONE - s * (x * x + y * y)
+    s = where_above(square, np.float32(1e-24), sixteen(2.0) / square)
+    xx, yy, zz = x * x, y * y, z * z
+    xy, xz, yz, wx, wy, wz = x * y, x * z, y * z, w * x, w * y, w * z
+    return (
+        1.0 - s * (yy + zz), s * (xy - wz), s * (xz + wy),
+        s * (xy + wz), 1.0 - s * (xx + zz), s * (yz - wx),
+        s * (xz - wy), s * (yz + wx), 1.0 - s * (xx + yy),
+    )  # fmt: skip
 
 
-@njit(inline="always", fastmath={"contract"})
-def _times(a, b, out):
-    """``out = a b`` of (2, 3) and (3, 3), row by row in 6, 9 and 6 numbers."""
-    for r in range(2):
-        for c in range(3):
-            out[3 * r + c] = a[3 * r] * b[c] + a[3 * r + 1] * b[3 + c] + a[3 * r + 2] * b[6 + c]
+@njit(forceinline=True)
+def product(a, b):
+    """``a b`` of (2, 3) and (3, 3), row by row in 6, 9 and 6 numbers."""
+    return (
+        fma(a[0], b[0], fma(a[1], b[3], a[2] * b[6])),
+        fma(a[0], b[1], fma(a[1], b[4], a[2] * b[7])),
+        fma(a[0], b[2], fma(a[1], b[5], a[2] * b[8])),
+        fma(a[3], b[0], fma(a[4], b[3], a[5] * b[6])),
+        fma(a[3], b[1], fma(a[4], b[4], a[5] * b[7])),
+        fma(a[3], b[2], fma(a[4], b[5], a[5] * b[8])),
+    )
 
 
-@njit(inline="always", fastmath={"contract"})
-def _seen_from(view, x, y, z, local):
-    """A world point in the camera's axes, into ``local`` (3)."""
+@njit(forceinline=True)
+def seen_from(view, x, y, z):
+    """World points in the camera's axes."""
     x, y, z = x - view[CENTER], y - view[CENTER + 1], z - view[CENTER + 2]
-    for r in range(3):
-        local[r] = view[3 * r] * x + view[3 * r + 1] * y + view[3 * r + 2] * z
+    return (
+        x * view[0] + y * view[1] + z * view[2],
+        x * view[3] + y * view[4] + z * view[5],
+        x * view[6] + y * view[7] + z * view[8],
+    )
 
 
-@njit(inline="always", fastmath={"contract"})
-def _slopes_of_pixel(view, local, bent, jacobian):
-    """The slopes (2, 3) of the pixel by the world point."""
-    inverse = ONE / local[2]
-    px, py = local[0] * inverse, local[1] * inverse
-    for r in range(2):
-        a, b = bent[2 + 2 * r] * inverse, bent[3 + 2 * r] * inverse
-        c = -(a * px + b * py)
-        for k in range(3):
-            jacobian[3 * r + k] = a * view[k] + b * view[3 + k] + c * view[6 + k]
+@njit(forceinline=True)
+def slopes_of_pixel(view, inverse, px, py, bent):
+    """The slopes (2, 3) of pixels by the world point, at 1 / z and a point of the plane."""
+    a, b, d, e = bent[2] * inverse, bent[3] * inverse, bent[4] * inverse, bent[5] * inverse
+    c, f = a * px + b * py, d * px + e * py
+    return (
+        a * view[0] + b * view[3] - c * view[6],
+        a * view[1] + b * view[4] - c * view[7],
+        a * view[2] + b * view[5] - c * view[8],
+        d * view[0] + e * view[3] - f * view[6],
+        d * view[1] + e * view[4] - f * view[7],
+        d * view[2] + e * view[5] - f * view[8],
+    )
 
 
-@njit(inline="always", fastmath={"contract"})
-def _covariance(view, rows, scales):
+@njit(forceinline=True)
+def linear_of(place):
+    """The linear part (9) of the blended maps."""
+    return (
+        row_of(place, 0), row_of(place, 1), row_of(place, 2), row_of(place, 3), row_of(place, 4),
+        row_of(place, 5), row_of(place, 6), row_of(place, 7), row_of(place, 8),
+    )  # fmt: skip
+
+
+@njit(forceinline=True)
+def covariance(view, rows, scales):
     """a, b, c of the covariance (a, b; b, c) of rows (2, 3) times scales, and its determinant."""
     x0, x1, x2 = rows[0] * scales[0], rows[1] * scales[1], rows[2] * scales[2]
     y0, y1, y2 = rows[3] * scales[0], rows[4] * scales[1], rows[5] * scales[2]
@@ -137,72 +187,116 @@ def _covariance(view, rows, scales):
     a, b, c = x0 * x0 + x1 * x1 + x2 * x2, x0 * y0 + x1 * y1 + x2 * y2, y0 * y0 + y1 * y1 + y2 * y2
     # The first part is the cross product's square: of a needle, a c - b b loses all digits.
     n0, n1, n2 = x1 * y2 - x2 * y1, x2 * y0 - x0 * y2, x0 * y1 - x1 * y0
-    determinant = n0 * n0 + n1 * n1 + n2 * n2 + blur * (a + c) + blur * blur
+    determinant = n0 * n0 + n1 * n1 + n2 * n2 + (a + c + blur) * blur
     return a + blur, b, c + blur, determinant
 
 
-@njit(inline="always", fastmath={"contract"})
-def _logit(opacity, i, fades):
-    value = ZERO
-    for k in range(opacity.shape[1]):
-        value += opacity[i, k] * fades[k]
-    return value
+@njit(forceinline=True)
+def scales_of(log_scales, which, place):
+    """The scales (3) of 16 particles."""
+    gathered(log_scales, which, place, SCALE, 3)
+    return exp(row_of(place, SCALE)), exp(row_of(place, SCALE + 1)), exp(row_of(place, SCALE + 2))
 
 
-@njit(parallel=True, cache=True, fastmath={"contract"})
+@njit(forceinline=True)
+def _solid(opacity, which, fades, place):
+    """The opacities of 16 particles."""
+    logit = sixteen(0.0)
+    for k in range(len(fades)):
+        for lane in range(SIDE_BY_SIDE):
+            place[SIDE_BY_SIDE * ANY + lane] = opacity[np.uintp(which[lane]), k]
+        logit = fma(row_of(place, ANY), fades[k], logit)
+    return sixteen(1.0) / (exp(logit * -1.0) + 1.0)
+
+
+@njit(forceinline=True)
+def _paint(dx, dy, dz, colors, tints, which, place):
+    """The colours of 16 splats: what direction and time make of their coefficients."""
+    plain = colors.shape[1] - len(tints)
+    harmonics(dx, dy, dz, plain, place)
+    red, green, blue = sixteen(0.5), sixteen(0.5), sixteen(0.5)
+    for k in range(colors.shape[1]):
+        for lane in range(SIDE_BY_SIDE):
+            i = np.uintp(which[lane])
+            for c in range(3):
+                place[SIDE_BY_SIDE * (ANY + c) + lane] = colors[i, k, c]
+        factor = row_of(place, BASIS + k) if k < plain else sixteen(tints[k - plain])
+        red = fma(factor, row_of(place, ANY), red)
+        green = fma(factor, row_of(place, ANY + 1), green)
+        blue = fma(factor, row_of(place, ANY + 2), blue)
+    return at_least(red, 0.0), at_least(green, 0.0), at_least(blue, 0.0)
+
+
+@njit(forceinline=True)
+def _reach(view, ahead, beside, bent, determinant, solid, log_solid):
+    """Twice the logarithm of 255 times the opacity, 0 of what is not seen."""
+    reach = where_above(solid, np.float32(1 / 255), (log_solid + np.float32(LOG_FULL)) * 2.0)
+    reach = where_above(ahead, view[NEAR], reach)
+    reach = where_above(view[REACH] - beside, np.float32(0), reach)
+    for side, size in ((bent[0], view[SIZE]), (bent[1], view[SIZE + 1])):
+        reach = where_above(side, -view[MARGIN], reach)
+        reach = where_above(view[MARGIN] + size - side, np.float32(0), reach)
+    reach = where_above(determinant, np.float32(0), reach)
+    return where_above(np.float32(1e30) - determinant, np.float32(0), reach)
+
+
+@njit(parallel=True, cache=True)
 def project(means, log_scales, quaternions, opacity, colors, maps, links, weights, view, tints, fades, out):
-    """Fill ``out`` (N, 12) with splats; see ``project.project``."""
-    total = means.shape[0]
-    chunks = 64
-    for chunk in prange(chunks):
-        warp, turn, basis = room(12), room(9), room(16)
-        jacobian, moved, rows, scales, local = room(6), room(6), room(6), room(3), room(3)
-        plain = colors.shape[1] - len(tints)
-        for row in range(total * chunk // chunks, total * (chunk + 1) // chunks):
-            i = np.uintp(row)
-            out[i, 10] = ZERO
-            x, y, z = _follow(means, maps, links, weights, i, warp)
-            _seen_from(view, x, y, z, local)
-            solid = ONE / (ONE + math.exp(-_logit(opacity, i, fades)))
-            px, py = local[0] / local[2], local[1] / local[2]
-            if not (local[2] > view[NEAR] and solid * FULL > ONE and px * px + py * py < view[REACH]):
-                continue
-            bent = _lens(view, px, py)
-            beside = max(-bent[0], bent[0] - view[SIZE], -bent[1], bent[1] - view[SIZE + 1])
-            if not beside < view[MARGIN]:
-                continue
-            _slopes_of_pixel(view, local, bent, jacobian)
-            _times(jacobian, warp, moved)
-            _turn(quaternions, i, turn)
-            _times(moved, turn, rows)
-            for k in range(3):
-                scales[k] = math.exp(log_scales[i, k])
-            a, b, c, determinant = _covariance(view, rows, scales)
-            if not (determinant > 0 and determinant < 1e30):
-                continue
-            out[i, 0], out[i, 1] = bent[0], bent[1]
-            out[i, 2], out[i, 3], out[i, 4] = c / determinant, -b / determinant, a / determinant
-            out[i, 5] = solid
-            out[i, 9] = math.sqrt(local[0] * local[0] + local[1] * local[1] + local[2] * local[2])
-            reach = TWO * math.log(FULL * solid)
-            out[i, 10], out[i, 11] = math.sqrt(reach * a), math.sqrt(reach * c)
-            _paint(view, x, y, z, out[i, 9], plain, colors, i, tints, basis, out)
+    """Fill ``out`` (N', 16) with splats; see ``project.project``. N' is N or more, a multiple of 16.
 
-
-@njit(inline="always", fastmath={"contract"})
-def _paint(view, x, y, z, distance, plain, colors, i, tints, basis, out):
-    """The colour of a splat: what its direction and the time make of its coefficients."""
-    inverse = ONE / distance
-    dx, dy, dz = (
-        (x - view[CENTER]) * inverse,
-        (y - view[CENTER + 1]) * inverse,
-        (z - view[CENTER + 2]) * inverse,
-    )
-    harmonics(dx, dy, dz, plain, basis)
-    for channel in range(3):
-        value = HALF
-        for k in range(plain):
-            value += basis[k] * colors[i, k, channel]
-        for k in range(len(tints)):
-            value += tints[k] * colors[i, plain + k, channel]
-        out[i, 6 + channel] = max(value, ZERO)
+    A splat: u, v, A, B, C, opacity, colour (3), distance, how far it reaches along both axes (one that is
+    not seen reaches 0), and the logarithm of its opacity. Other numbers of what is not seen mean nothing.
+    """
+    total, blocks = means.shape[0], out.shape[0] // SIDE_BY_SIDE
+    for share in prange(64):
+        place, which = room(ROWS), np.empty(SIDE_BY_SIDE, np.intp)
+        for block in range(blocks * share // 64, blocks * (share + 1) // 64):
+            for lane in range(SIDE_BY_SIDE):
+                which[lane] = min(SIDE_BY_SIDE * block + lane, total - 1)
+            x, y, z = followed(means, maps, links, weights, which, place)
+            local = seen_from(view, x, y, z)
+            inverse = sixteen(1.0) / local[2]
+            px, py = local[0] * inverse, local[1] * inverse
+            bent = through_lens(view, px, py)
+            jacobian = slopes_of_pixel(view, inverse, px, py, bent)
+            gathered(quaternions, which, place, QUATERNION, 4)
+            rows = product(product(jacobian, linear_of(place)), turned(place))
+            scales = scales_of(log_scales, which, place)
+            a, b, c, determinant = covariance(view, rows, scales)
+            solid = _solid(opacity, which, fades, place)
+            least = log(solid)
+            squared = fma(local[0], local[0], fma(local[1], local[1], local[2] * local[2]))
+            distance = root(squared)
+            apart = sixteen(1.0) / distance
+            red, green, blue = _paint(
+                (x - view[CENTER]) * apart,
+                (y - view[CENTER + 1]) * apart,
+                (z - view[CENTER + 2]) * apart,
+                colors,
+                tints,
+                which,
+                place,
+            )
+            reach = _reach(view, local[2], px * px + py * py, bent, determinant, solid, least)
+            inverse = sixteen(1.0) / determinant
+            set_row(place, 0, bent[0])
+            set_row(place, 1, bent[1])
+            set_row(place, 2, c * inverse)
+            set_row(place, 3, b * inverse * -1.0)
+            set_row(place, 4, a * inverse)
+            set_row(place, 5, solid)
+            set_row(place, 6, red)
+            set_row(place, 7, green)
+            set_row(place, 8, blue)
+            set_row(place, 9, distance)
+            set_row(place, 10, where_above(reach, np.float32(0), root(reach * a)))
+            set_row(place, 11, where_above(reach, np.float32(0), root(reach * c)))
+            set_row(place, 12, least)
+            for j in range(13, SPLAT):
+                set_row(place, j, sixteen(0.0))
+            transpose(place)
+            for lane in range(SIDE_BY_SIDE):
+                row = SIDE_BY_SIDE * block + lane
+                put_row(out, row, row_of(place, lane))
+                if row >= total:
+                    out[row, 10] = 0

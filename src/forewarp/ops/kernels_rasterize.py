@@ -43,7 +43,7 @@ def _alpha(records, i, x, y):
 
 @njit(cache=True)
 def _blend(records, entries, first, last, x, y, kept):
-    """Composite a tile's entries from near to far. ``kept`` takes alpha and transmittance of each.
+    """Composite a tile's entries from near to far. ``kept`` takes the alpha of each, and its weight.
 
     Returns what is let through, the colour, and how many entries were looked at.
     """
@@ -53,8 +53,8 @@ def _blend(records, entries, first, last, x, y, kept):
         i = entries[at]
         alpha = _alpha(records, i, x, y)
         put(kept, 2 * count, alpha)
-        put(kept, 2 * count + 1, through)
         weight = alpha * through
+        put(kept, 2 * count + 1, weight)
         red = fma(weight, records[i, 6], red)
         green = fma(weight, records[i, 7], green)
         blue = fma(weight, records[i, 8], blue)
@@ -66,44 +66,43 @@ def _blend(records, entries, first, last, x, y, kept):
 
 
 @njit(cache=True)
-def _walk_back(records, entries, first, count, column, y, kept, slopes, behind, sums):
+def _walk_back(records, entries, first, count, column, y, kept, slopes, far, behind, sums):
     """Add the gradients of a tile to ``sums``, from far to near.
 
-    ``slopes``: of colour (3), of distance and of coverage; ``behind``: what the tile shows behind its last
+    ``slopes``: of colour (3); ``far``: of distance, or None; ``behind``: what the tile shows behind its last
     entry, times the slopes. With T the transmittance before an entry and f its own share of the slopes,
     ``dL/dalpha = T (f - behind)``.
     """
-    red, green, blue, far, cover = slopes
+    red, green, blue = slopes
     beside = narrow_columns()
     for k in range(count - 1, -1, -1):
         i = entries[first + k]
-        alpha, through = get(kept, 2 * k), get(kept, 2 * k + 1)
-        shown = fma(red, records[i, 6], fma(green, records[i, 7], fma(blue, records[i, 8], cover)))
-        shown = fma(far, records[i, 9], shown) - behind
+        alpha, weight = get(kept, 2 * k), get(kept, 2 * k + 1)
+        shown = fma(red, records[i, 6], fma(green, records[i, 7], fma(blue, records[i, 8], behind * -1.0)))
+        if far is not None:
+            shown = fma(far, records[i, 9], shown)
         behind = fma(alpha, shown, behind)
-        weight = alpha * through
         slope = weight * shown
         dy = y - records[i, 1]
         low = slope * dy
         dx = beside + (column - records[i, 0])
         s, sy, syy = fold(slope), fold(low), fold(low * dy)
         sx = s * dx
-        add_sums(
-            sums,
-            i,
-            (
-                s,
-                sx,
-                sy,
-                sx * dx,
-                sy * dx,
-                syy,
-                fold(weight * red),
-                fold(weight * green),
-                fold(weight * blue),
-                fold(weight * far),
-            ),
+        found = (
+            s,
+            sx,
+            sy,
+            sx * dx,
+            sy * dx,
+            syy,
+            fold(weight * red),
+            fold(weight * green),
+            fold(weight * blue),
         )
+        if far is None:
+            add_sums(sums, i, found)
+        else:
+            add_sums(sums, i, (*found, fold(weight * far)))
 
 
 @njit(cache=True)
@@ -159,12 +158,20 @@ def pull(records, entries, ends, shares, slopes, kept, sums):
                 get_tile(slopes[0], row, column),
                 get_tile(slopes[1], row, column),
                 get_tile(slopes[2], row, column),
-                get_tile(slopes[3], row, column),
-                lanes(0.0),
             )
-            behind = get_tile(slopes[4], row, column)
+            far, behind = get_tile(slopes[3], row, column), get_tile(slopes[4], row, column)
             _walk_back(
-                records, entries, first, count, np.float32(column), y, kept[share], of, behind, sums[share]
+                records,
+                entries,
+                first,
+                count,
+                np.float32(column),
+                y,
+                kept[share],
+                of,
+                far,
+                behind,
+                sums[share],
             )
 
 
@@ -231,8 +238,6 @@ def compare(records, entries, ends, shares, pixels, background, width, kept, sum
                 _scored(red, width, score),
                 _scored(green, width, score),
                 _scored(blue, width, score),
-                lanes(0.0),
-                lanes(0.0),
             )
             behind = fma(of[0], background[0], fma(of[1], background[1], of[2] * background[2]))
             _walk_back(
@@ -244,6 +249,7 @@ def compare(records, entries, ends, shares, pixels, background, width, kept, sum
                 y,
                 kept[share],
                 of,
+                None,
                 behind,
                 sums[share],
             )

@@ -1,7 +1,6 @@
 """Numba kernels that order splats by depth and sort them into tiles, by the rules of ``kernels_grid``.
 
-A splat is a row of ``kernels_project``: u, v, A, B, C, opacity, colour (3), distance, and how far it reaches
-along both axes; one that is not seen reaches 0.
+A splat is a row of ``kernels_project``.
 """
 
 from __future__ import annotations
@@ -9,12 +8,14 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+from numba import njit, prange
 
 from forewarp.ops.kernels_rasterize import LEAST_LOG, RECORD, SIDE
 
 _DIGIT = 11  # bits that are sorted by at once
-_ZERO = np.float32(0)
+_ZERO, _SHARE = np.float32(0), np.float32(1 / SIDE)
+_HALF = np.float32(0.5)  # a tile's first pixel's centre
+_SLACK = np.float32(1e-3)  # pixels that rounding may move an edge by
 
 
 @njit(cache=True)
@@ -46,87 +47,101 @@ def by_depth(splats):
     return rows
 
 
-@njit(cache=True)
-def records_of(splats, order):
-    """The records (V, 10) of splats in an order; see ``kernels_rasterize``."""
-    records = np.empty((len(order), RECORD), np.float32)
-    for k in range(len(order)):
-        i = order[k]
-        records[k, 0], records[k, 1] = splats[i, 0], splats[i, 1]
-        records[k, 2], records[k, 3] = np.float32(-0.5) * splats[i, 2], -splats[i, 3]
-        records[k, 4] = np.float32(-0.5) * splats[i, 4]
-        records[k, 5] = math.log(splats[i, 5])
-        for j in range(6, RECORD):
-            records[k, j] = splats[i, j]
-    return records
+@njit(forceinline=True)
+def _record(splats, i, k, records):
+    """Write the record of splat i to the row k of ``records``; see ``kernels_rasterize``."""
+    records[k, 0], records[k, 1] = splats[i, 0], splats[i, 1]
+    records[k, 2], records[k, 3] = np.float32(-0.5) * splats[i, 2], -splats[i, 3]
+    records[k, 4] = np.float32(-0.5) * splats[i, 4]
+    records[k, 5] = splats[i, 12]
+    for j in range(6, RECORD):
+        records[k, j] = splats[i, j]
 
 
 @njit(inline="always")
-def _span(center, reach, count):
-    """The first tile that an interval of pixels touches, and the one after the last."""
-    low = min(max(center - reach, np.float32(0)), np.float32(SIDE * count))
-    high = min(max(center + reach, np.float32(0)), np.float32(SIDE * count))
-    return int(low) // SIDE, min(int(high) // SIDE + 1, count)
+def _span(low, high, count):
+    """The first tile with a pixel's centre in an interval, and the one after the last."""
+    most = np.float32(SIDE * (count + 1))
+    low, high = low + (_HALF - _SLACK), high + (np.float32(SIDE) - _HALF + _SLACK)
+    first = int(min(max(low, _ZERO), most) * _SHARE)
+    return first, min(int(min(max(high, _ZERO), most) * _SHARE), count)
 
 
-@njit(inline="always")
-def _highest(a, b, c, x0, y0):
-    """The largest exponent ``a x^2 + b x y + c y^2`` of a splat in a tile that begins at x0, y0 from it."""
-    x1, y1 = x0 + np.float32(SIDE), y0 + np.float32(SIDE)
-    x, y = min(max(_ZERO, x0), x1), min(max(_ZERO, y0), y1)
-    best = _ZERO if x == 0 and y == 0 else np.float32(-np.inf)
-    if x != 0:  # along the nearer upright edge
-        at = min(max(np.float32(-0.5) * b * x / c, y0), y1)
-        best = a * x * x + at * (b * x + c * at)
-    if y != 0:
-        at = min(max(np.float32(-0.5) * b * y / a, x0), x1)
-        best = max(best, c * y * y + at * (b * y + a * at))
-    return best
+@njit(forceinline=True, fastmath={"contract"})
+def _in_row(records, k, reach, row, across):
+    """The tiles of a row that the part of a splat's ellipse in that row touches, first and after the last.
 
-
-@njit(cache=True)
-def _spans(splats, order, across, down):
-    """The tiles (V, 4) that the box of each splat touches, first and after the last, and how many in all."""
-    spans, most = np.empty((len(order), 4), np.int32), 0
-    for k in range(len(order)):
-        i = np.uintp(order[k])
-        spans[k, 0], spans[k, 1] = _span(splats[i, 0], splats[i, 10], across)
-        spans[k, 2], spans[k, 3] = _span(splats[i, 1], splats[i, 11], down)
-        most += max(0, spans[k, 1] - spans[k, 0]) * max(0, spans[k, 3] - spans[k, 2])
-    return spans, most
-
-
-@njit(cache=True, fastmath={"contract"})
-def sort_into_tiles(splats, order, records, across, down):
-    """Which splats each tile has to look at, from near to far: ``entries``, and where each tile's begin.
-
-    A tile that the ellipse of a splat, at a 255th of a pixel, does not touch is left out.
+    The ellipse is the level of a 255th, ``a x^2 + b x y + c y^2``; its upper and lower end at a height y are
+    at ``(b y -+ sqrt(bend y^2 + rest)) half``, its right end, ``reach`` away, at the height ``tip``.
     """
-    spans, most = _spans(splats, order, across, down)
-    tiles, owners = np.empty(most, np.int32), np.empty(most, np.int32)
-    ends = np.zeros(across * down + 1, np.int64)
-    pairs = 0
-    for k in range(len(order)):
-        first, last, top, bottom = spans[k, 0], spans[k, 1], spans[k, 2], spans[k, 3]
-        small = last - first <= 1 and bottom - top <= 1
-        u, v, a, b, c = records[k, 0], records[k, 1], records[k, 2], records[k, 3], records[k, 4]
-        least = np.float32(LEAST_LOG) - records[k, 5]
-        for row in range(top, bottom):
-            y = np.float32(SIDE * row) - v
-            for column in range(first, last):
-                if small or _highest(a, b, c, np.float32(SIDE * column) - u, y) >= least:
+    u, v, a, b, c = records[k, 0], records[k, 1], records[k, 2], records[k, 3], records[k, 4]
+    half, bend = np.float32(-0.5) / a, b * b - np.float32(4) * a * c
+    rest, slope = np.float32(4) * a * (np.float32(LEAST_LOG) - records[k, 5]), b * half
+    tip = np.float32(-0.5) * b / c * reach
+    top = np.float32(SIDE * row) + _HALF - v
+    bottom = top + np.float32(SIDE - 1)
+    at, to = min(max(-tip, top), bottom), min(max(tip, top), bottom)
+    left = slope * at - half * math.sqrt(max(bend * at * at + rest, _ZERO))
+    right = slope * to + half * math.sqrt(max(bend * to * to + rest, _ZERO))
+    return _span(u + left, u + right, across)
+
+
+@njit(parallel=True, cache=True)
+def sort_into_tiles(splats, order, across, down, shares):
+    """The ``records`` (V, 10) of splats in an order, which of them each tile has to look at, from near to
+    far (``entries``), and where each tile's begin.
+
+    A tile without a pixel's centre in the box of the part of a splat's ellipse that lies in the tile's rows
+    is left out. ``shares`` threads take a part of the splats each; the result does not depend on them.
+    """
+    count, whole = len(order), across * down
+    records, spans = np.empty((count, RECORD), np.float32), np.empty((count, 4), np.int32)
+    begins, used = np.zeros(shares + 1, np.int64), np.zeros(shares, np.int64)
+    for share in prange(shares):
+        most = 0
+        for k in range(count * share // shares, count * (share + 1) // shares):
+            i = np.uintp(order[k])
+            _record(splats, i, k, records)
+            u, v, wide, high = splats[i, 0], splats[i, 1], splats[i, 10], splats[i, 11]
+            spans[k, 0], spans[k, 1] = _span(u - wide, u + wide, across)
+            spans[k, 2], spans[k, 3] = _span(v - high, v + high, down)
+            most += max(0, spans[k, 1] - spans[k, 0]) * max(0, spans[k, 3] - spans[k, 2])
+        begins[share + 1] = most
+    for share in range(shares):
+        begins[share + 1] += begins[share]
+    tiles, owners = np.empty(begins[shares], np.int32), np.empty(begins[shares], np.int32)
+    places, ends = np.zeros((shares, whole), np.int64), np.zeros(whole + 1, np.int64)
+    for share in prange(shares):
+        pairs = begins[share]
+        for k in range(count * share // shares, count * (share + 1) // shares):
+            first, last, top, bottom = spans[k, 0], spans[k, 1], spans[k, 2], spans[k, 3]
+            single = last - first <= 1 or bottom - top <= 1  # then the box is as good
+            reach = splats[np.uintp(order[k]), 10]
+            for row in range(top, bottom):
+                low, high = first, last
+                if not single:
+                    low, high = _in_row(records, k, reach, row, across)
+                    low, high = max(low, first), min(high, last)
+                for column in range(low, high):
                     tile = np.uintp(row * across + column)
                     tiles[pairs], owners[pairs] = tile, k
-                    ends[tile + np.uintp(1)] += 1
+                    places[share, tile] += 1
                     pairs += 1
-    for tile in range(across * down):
-        ends[tile + 1] += ends[tile]
-    entries, place = np.empty(pairs, np.int32), ends[:-1].copy()
-    for pair in range(pairs):
-        tile = np.uintp(tiles[pair])
-        entries[place[tile]] = owners[pair]
-        place[tile] += 1
-    return entries, ends
+        used[share] = pairs
+    total = 0
+    for tile in range(whole):
+        for share in range(shares):
+            many = places[share, tile]
+            places[share, tile] = total
+            total += many
+        ends[tile + 1] = total
+    entries = np.empty(total, np.int32)
+    for share in prange(shares):
+        for pair in range(begins[share], used[share]):
+            tile = np.uintp(tiles[pair])
+            entries[places[share, tile]] = owners[pair]
+            places[share, tile] += 1
+    return records, entries, ends
 
 
 @njit(cache=True)

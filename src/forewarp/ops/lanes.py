@@ -118,6 +118,16 @@ def lanes(typing, value):
 
 
 @intrinsic
+def sixteen(typing, value):
+    """A number on 16 lanes."""
+
+    def code(context, builder, sig, args):
+        return repeated(builder, number(builder, args[0], sig.args[0]), NARROW)
+
+    return SUMS(value), code
+
+
+@intrinsic
 def columns(typing):
     """Column 0 to 7 of each of a tile's pixels, at its centre."""
     return TILE(), lambda context, builder, sig, args: constant(WIDE, ((i % ROW) + 0.5 for i in range(WIDE)))
@@ -176,6 +186,17 @@ def where_above(typing, a, least, value):
         return builder.select(above, args[2], constant(a.width, [0.0] * a.width))
 
     return value(a, least, value), code
+
+
+@intrinsic
+def at_least(typing, a, least):
+    """The larger of ``a`` and ``least``; NaN stays NaN."""
+
+    def code(context, builder, sig, args):
+        mark = repeated(builder, number(builder, args[1], sig.args[1]), a.width)
+        return builder.select(builder.fcmp_ordered("<", args[0], mark), mark, args[0])
+
+    return a(a, least), code
 
 
 @intrinsic

@@ -7,7 +7,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from forewarp.ops.lanes import FLAGS, FLOAT, INT, NARROW, ROW, TILE, WIDE, constant, repeated, shuffled
+from forewarp.ops.lanes import FLAGS, FLOAT, INT, NARROW, ROW, SUMS, TILE, WIDE, constant, shuffled
 
 
 def _combined(builder, a, b, size: int):
@@ -61,48 +61,93 @@ def put(typing, array, row, value):
     return types.none(array, types.intp, value), code
 
 
-@intrinsic
+@intrinsic(prefer_literal=True)
 def room(typing, count):
-    """Place for 16 float32 of a function's own: a pointer to index, which becomes registers where it can.
-
-    ``count`` says how many are used, for a reader.
-    """
+    """Place for ``count`` (a literal) rows of 16 float32 of a function's own: a pointer to index."""
+    if not isinstance(count, types.IntegerLiteral):
+        return None
 
     def code(context, builder, sig, args):
-        place = cgutils.alloca_once(builder, ir.VectorType(FLOAT, NARROW))
+        place = cgutils.alloca_once(builder, ir.ArrayType(ir.VectorType(FLOAT, NARROW), count.literal_value))
         return builder.bitcast(place, FLOAT.as_pointer())
 
     return types.CPointer(types.float32)(count), code
 
 
-@intrinsic
-def add_row(typing, array, row, factor, numbers):
-    """``array[row, :16] += factor numbers``, 16 numbers of a ``room``."""
-
-    def code(context, builder, sig, args):
-        at, kind = [args[1], context.get_constant(types.intp, 0)], ir.VectorType(FLOAT, NARROW).as_pointer()
-        pointer = builder.bitcast(_address(context, builder, sig.args[0], args[0], at), kind)
-        factor = repeated(builder, args[2], NARROW)
-        value = builder.fmul(factor, builder.load(builder.bitcast(args[3], kind), align=4), flags=FLAGS)
-        builder.store(builder.fadd(builder.load(pointer, align=4), value, flags=FLAGS), pointer, align=4)
-        return context.get_dummy_value()
-
-    return types.none(array, types.intp, types.float32, numbers), code
+def _row(builder, place, index):
+    """Pointer to a row of a ``room``, as a vector."""
+    kind = ir.VectorType(FLOAT, NARROW).as_pointer()
+    return builder.gep(builder.bitcast(place, kind), [index])
 
 
 @intrinsic
-def take_row(typing, array, row, factor, numbers):
-    """``numbers += factor array[row, :16]``, 16 numbers of a ``room``."""
+def row_of(typing, place, index):
+    """Read row ``index`` of a ``room``."""
 
     def code(context, builder, sig, args):
-        at, kind = [args[1], context.get_constant(types.intp, 0)], ir.VectorType(FLOAT, NARROW).as_pointer()
-        pointer = builder.bitcast(_address(context, builder, sig.args[0], args[0], at), kind)
-        own, factor = builder.bitcast(args[3], kind), repeated(builder, args[2], NARROW)
-        value = builder.fmul(factor, builder.load(pointer, align=4), flags=FLAGS)
-        builder.store(builder.fadd(builder.load(own, align=4), value, flags=FLAGS), own, align=4)
+        return builder.load(_row(builder, *args), align=4)
+
+    return SUMS(place, types.intp), code
+
+
+@intrinsic
+def set_row(typing, place, index, value):
+    """Write row ``index`` of a ``room``."""
+
+    def code(context, builder, sig, args):
+        builder.store(args[2], _row(builder, *args[:2]), align=4)
         return context.get_dummy_value()
 
-    return types.none(array, types.intp, types.float32, numbers), code
+    return types.none(place, types.intp, value), code
+
+
+@intrinsic
+def get_row(typing, array, row):
+    """Read ``array[row, :16]``, or ``array[row : row + 16]``."""
+
+    def code(context, builder, sig, args):
+        return builder.load(_array_row(context, builder, sig.args[0], *args), align=4)
+
+    return SUMS(array, types.intp), code
+
+
+@intrinsic
+def put_row(typing, array, row, value):
+    """Write 16 numbers to ``array[row, :16]``, or ``array[row : row + 16]``."""
+
+    def code(context, builder, sig, args):
+        builder.store(args[2], _array_row(context, builder, sig.args[0], *args[:2]), align=4)
+        return context.get_dummy_value()
+
+    return types.none(array, types.intp, value), code
+
+
+def _array_row(context, builder, kind, array, row):
+    zeros = [context.get_constant(types.intp, 0)] * (kind.ndim - 1)
+    pointer = _address(context, builder, kind, array, [row, *zeros])
+    return builder.bitcast(pointer, ir.VectorType(FLOAT, NARROW).as_pointer())
+
+
+@intrinsic
+def transpose(typing, place):
+    """Exchange rows and columns of the first 16 rows of a ``room``."""
+
+    def code(context, builder, sig, args):
+        index = [_row(builder, args[0], ir.Constant(ir.IntType(64), i)) for i in range(NARROW)]
+        rows = [builder.load(pointer, align=4) for pointer in index]
+        size = 1
+        while size < NARROW:
+            low = [i if not i & size else NARROW + i - size for i in range(NARROW)]
+            high = [i + size if not i & size else NARROW + i for i in range(NARROW)]
+            for i in (i for i in range(NARROW) if not i & size):
+                a, b = rows[i], rows[i + size]
+                rows[i], rows[i + size] = shuffled(builder, a, b, low), shuffled(builder, a, b, high)
+            size *= 2
+        for pointer, row in zip(index, rows):
+            builder.store(row, pointer, align=4)
+        return context.get_dummy_value()
+
+    return types.none(place), code
 
 
 @intrinsic

@@ -118,3 +118,48 @@ def pull_nodes(
         strain = stiffness(own, places, edges, weights)
         ((node_maps(own, places) * by_maps).sum() + factor * strain).backward()
     return own.grad, float(strain.detach())
+
+
+def spread_nodes(
+    shift: Tensor, turn: Tensor | None, slope: Tensor, basis: Tensor, bend: Tensor, factor: float, unit: float
+) -> tuple[Tensor, Tensor | None, float]:
+    """Carry gradients by ``motion`` at a time to the coefficients of the curves, and keep curves smooth.
+
+    The bend of a node is ``b = sum_k c_k bend_k``, of ``shift`` in shares of ``unit``; what is added to the
+    loss is ``factor mean b^2``, once for ``shift`` and once for ``turn``.
+
+    Args:
+        shift, turn: (M, K, 3) coefficients; None where nothing turns.
+        slope: (M, 6) gradients by ``motion``.
+        basis, bend: (K,) of the time; of its second difference.
+        factor: of the squared bend.
+        unit: a length, world units.
+
+    Returns:
+        gradients by ``shift`` and by ``turn`` (M, K, 3), and the mean of b^2, both kinds together.
+
+    Cost: about 20 operations a coefficient.
+    """
+    check_shape("slope", slope, (len(shift), 6))
+    check_shape("basis", basis, (shift.shape[1],))
+    check_shape("bend", bend, (shift.shape[1],))
+    parts = ((shift, slope[:, :3], unit), (turn, slope[:, 3:], 1.0))
+    found, total = [], 0.0
+    for value, own, scale in parts:
+        if value is None:
+            found.append(None)
+            continue
+        value = value.detach()
+        if use_numba(value) and value.dtype == torch.float32:
+            from forewarp.ops import kernels_nodes
+
+            gradient = torch.empty_like(value)
+            arrays = (value, own, basis, bend, gradient)
+            total += kernels_nodes.spread(*(a.numpy() for a in arrays), float(factor), float(scale))
+        else:
+            bent = torch.einsum("mkc,k->mc", value, bend) / scale
+            total += float(bent.square().mean())
+            pulled = 2 * factor / (bent.numel() * scale) * bent
+            gradient = own[:, None] * basis[:, None] + pulled[:, None] * bend[:, None]
+        found.append(gradient)
+    return *found, total

@@ -240,6 +240,11 @@ def _through_lens(pinhole: Pinhole, plane: Tensor) -> tuple[Tensor, Tensor]:
     return torch.stack([u, v], -1) @ outer.T + plane.new_tensor(pinhole.middle), outer @ inner
 
 
+def whole(count: int) -> int:
+    """Round up to the sixteens that kernels treat side by side."""
+    return -(-count // 16) * 16
+
+
 def arrays(*tensors: Tensor) -> tuple:
     """Numpy views for kernels, contiguous."""
     return tuple(t.detach().contiguous().numpy() for t in tensors)
@@ -255,10 +260,11 @@ class _Project(torch.autograd.Function):
         match_threads()
         maps = torch.nn.functional.pad(maps, (0, 4))
         inputs = (means, log_scales, quaternions, opacity, colors, maps, links, weights, view, tints, fades)
-        out = means.new_zeros(len(means), kernels.SPLAT)
+        out = means.new_empty(whole(len(means)), kernels.SPLAT)
         kernels.project(*arrays(*inputs), out.numpy())
         ctx.save_for_backward(*inputs, out)
-        numbers, reach = torch.where(out[:, 10:11] > 0, out[:, :10], 0.0), out[:, 10:]
+        out = out[: len(means)]
+        numbers, reach = torch.where(out[:, 10:11] > 0, out[:, :10], 0.0), out[:, 10:12]
         ctx.mark_non_differentiable(reach)
         return numbers, reach
 
@@ -272,6 +278,8 @@ class _Project(torch.autograd.Function):
         found = [torch.zeros_like(t) for t in inputs[:5]]
         maps = inputs[5].new_zeros(shares, *inputs[5].shape)
         weights = torch.zeros_like(inputs[7])
-        ranks = torch.where(out[:, 10] > 0, torch.arange(len(out), dtype=torch.int32), -1)
-        kernels_chain.chain(*arrays(*inputs, out, ranks, slopes, *found, maps, weights))
+        order = (out[:, 10] > 0).nonzero()[:, 0].int()
+        rows = slopes.new_zeros(whole(len(order)), kernels_chain.SLOPES)
+        rows[: len(order), : slopes.shape[1]] = slopes[order.long()]
+        kernels_chain.chain(*arrays(*inputs, out, order, rows, *found, maps, weights))
         return *found, maps.sum(0)[:, :12], None, weights, None, None, None

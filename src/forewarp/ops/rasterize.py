@@ -11,7 +11,7 @@ from torch.autograd.function import once_differentiable
 
 from forewarp.ops.backend import match_threads, use_numba
 from forewarp.ops.checks import check_shape
-from forewarp.ops.project import Splats
+from forewarp.ops.project import Splats, whole
 
 SIDE = 8  # pixels of a tile along both axes
 _LEAST = -math.log(255.0)
@@ -96,12 +96,11 @@ class Tiles(NamedTuple):
 
 
 def sorted_tiles(splats, across: int, down: int, threads: int) -> Tiles:
-    """Sort splats (N, 12), a numpy array, into ``across`` x ``down`` tiles; needs Numba."""
+    """Sort splats (N, 16), a numpy array of ``kernels_project``, into ``across`` x ``down`` tiles."""
     from forewarp.ops import kernels_tiles as kernels
 
     order = kernels.by_depth(splats)
-    records = kernels.records_of(splats, order)
-    entries, ends = kernels.sort_into_tiles(splats, order, records, across, down)
+    records, entries, ends = kernels.sort_into_tiles(splats, order, across, down, threads)
     shares, longest = kernels.shared_out(ends, threads)
     return Tiles(order, records, entries, ends, shares, int(longest))
 
@@ -119,7 +118,8 @@ class _Rasterize(torch.autograd.Function):
         from forewarp.ops import kernels_rasterize as kernels
 
         threads = match_threads()
-        splats = torch.cat([numbers.detach(), reach], -1).contiguous()
+        log = numbers.detach()[:, 5:6].log()
+        splats = torch.nn.functional.pad(torch.cat([numbers.detach(), reach, log], -1), (0, 3))
         tiles = sorted_tiles(splats.numpy(), across, down, threads)
         out = torch.empty(5, SIDE * down, SIDE * across)
         kernels.draw(tiles.records, tiles.entries, tiles.ends, tiles.shares, out.numpy())
@@ -144,10 +144,10 @@ class _Rasterize(torch.autograd.Function):
             kept.numpy(),
             sums.numpy(),
         )
-        by_splat, pull = torch.empty(len(tiles.order), kernels_chain.SLOPES), torch.empty(len(ctx.splats))
-        kernels_chain.slopes_of(
-            ctx.splats.numpy(), tiles.order, sums.numpy(), 1.0, by_splat.numpy(), pull.numpy()
-        )
-        found = slopes.new_zeros(len(ctx.splats), kernels_chain.SLOPES)
-        found[torch.from_numpy(tiles.order).long()] = by_splat
+        seen, ranks = kernels_chain.ranked(tiles.order, len(ctx.splats))
+        by_splat, pull = torch.empty(whole(len(seen)), kernels_chain.SLOPES), torch.empty(len(ctx.splats))
+        inputs = ctx.splats.numpy(), seen, ranks, sums.numpy()
+        kernels_chain.slopes_of(*inputs, 1.0, by_splat.numpy(), pull.numpy())
+        found = slopes.new_zeros(len(ctx.splats), 10)
+        found[torch.from_numpy(seen).long()] = by_splat[: len(seen), :10]
         return found, None, None, None

@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 
 from forewarp.evaluation.pictures import psnr_by_view
 from forewarp.files import read_json, write_json
-from forewarp.report.gain import Gain, Numbers
+from forewarp.metrics.gain import Gain, Numbers
 from forewarp.runs.build import build_run
 from forewarp.runs.config import claim
 from forewarp.runs.data_check import check_data

@@ -7,9 +7,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from forewarp.files import replace_file
+from forewarp.metrics.gain import Estimate
 from forewarp.report.collect import Result, by_scene, collect, grouped, left_out, machine
 from forewarp.report.curve import Published, draw_scene, seconds_to
-from forewarp.report.tables import Column, Estimate, Table
+from forewarp.report.tables import Column, Table
 
 Groups = Mapping[tuple[str, float | None], Sequence[Result]]
 

@@ -8,9 +8,10 @@ from pathlib import Path
 import yaml
 
 from forewarp.files import MOST_CONFIG, read_text, replace_file
+from forewarp.metrics.gain import Estimate
 from forewarp.report.collect import Result, by_scene, collect, left_out, machine
 from forewarp.report.curve import seconds_to
-from forewarp.report.tables import Column, Estimate, Table
+from forewarp.report.tables import Column, Table
 
 CHOICES = {"auto": "planned", "all_effects": "every effect", "full": "the paper's set", "base": "the preset"}
 WITHIN = 0.3  # a planned run should come within this many dB of every effect at once, in less time

@@ -12,8 +12,8 @@ from forewarp.files import replace_file
 from forewarp.report import page, paper_figures
 from forewarp.report.collect import Result, collect, machine
 from forewarp.report.page import Section
+from forewarp.report.paper_printed import PAPER, PaperTable, read_paper
 from forewarp.report.paper_tables import comparison, counterpart, measured, row_of, with_means
-from forewarp.report.published import PAPER, PaperTable, read_paper
 
 TITLE = "The paper's tables, measured"
 INTRODUCTION = (

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from forewarp.files import read_json
+from forewarp.metrics.gain import Estimate
 from forewarp.report import curve
 from forewarp.report.collect import Result
 from forewarp.report.paper_tables import row_of
-from forewarp.report.tables import Estimate
 
 RESOLUTION = re.compile(r"resolution |voxels_\d")  # variants of sweeps=resolution, now and before 0.3
 GAP = 4  # pixels between the parts of a sheet

@@ -7,9 +7,10 @@ from dataclasses import dataclass, replace
 from statistics import fmean
 from typing import NamedTuple
 
+from forewarp.metrics.gain import Estimate
 from forewarp.report.collect import Result
-from forewarp.report.published import Group, PaperTable
-from forewarp.report.tables import Cell, Column, Difference, Estimate, Table
+from forewarp.report.paper_printed import Group, PaperTable
+from forewarp.report.tables import Cell, Column, Difference, Table
 
 # Title, digits, whether more is better, and the factor to the printed unit.
 METRICS = {

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from forewarp.files import replace_file
+from forewarp.metrics.gain import DIFFERENCES, Estimate, measure_effect
 from forewarp.report.collect import Result, by_scene, collect, grouped, left_out, machine
-from forewarp.report.gain import DIFFERENCES, measure_effect
-from forewarp.report.tables import Column, Estimate, Table
+from forewarp.report.tables import Column, Table
 
 # The columns of a run's numbers.
 MEASURES = {

@@ -4,30 +4,12 @@ from __future__ import annotations
 
 import csv
 import io
-import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from tabulate import tabulate
 
-
-@dataclass(frozen=True)
-class Estimate:
-    """A mean over repetitions, and the sample's standard deviation; None for a single repetition."""
-
-    mean: float
-    deviation: float | None = None
-
-    @classmethod
-    def of(cls, values: Sequence[float]) -> Estimate | None:
-        """Estimate from values; None if there are none.
-
-        >>> Estimate.of([1.0, 3.0])
-        Estimate(mean=2.0, deviation=1.4142135623730951)
-        """
-        if not values:
-            return None
-        return cls(statistics.fmean(values), statistics.stdev(values) if len(values) > 1 else None)
+from forewarp.metrics.gain import Estimate
 
 
 class Difference(float):

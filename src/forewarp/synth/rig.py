@@ -29,20 +29,10 @@ POINTS, STILL_POINTS = 4000, 20000
 # The arc, in the vehicle's units and degrees from x towards y.
 RADIUS, ARC, FOCUS, BASELINE = 3.0, (-118.0, -62.0), (0.0, 0.0, -0.08), 0.26
 VIEW_ANGLE = 52.0  # horizontal field of view, degrees
-# Two phones of one make: pixel aspect, focal length and principal point differ a little, as do the lenses.
+# Two phones of one make differ a little: pixel aspect, focal length, principal point and lens.
 PHONES = (
-    {
-        "aspect": 1.013,
-        "focal": 1.0,
-        "off": (0.012, -0.008),
-        "lens": Lens((0.11, -0.08, 0.02), (0.004, -0.006)),
-    },
-    {
-        "aspect": 0.991,
-        "focal": 1.02,
-        "off": (-0.009, 0.011),
-        "lens": Lens((0.08, -0.05, 0.0), (-0.003, 0.004)),
-    },
+    (1.013, 1.0, (0.012, -0.008), Lens((0.11, -0.08, 0.02), (0.004, -0.006))),
+    (0.991, 1.02, (-0.009, 0.011), Lens((0.08, -0.05, 0.0), (-0.003, 0.004))),
 )
 # The capture's own world: neither centred nor of known scale, as a reconstruction leaves it.
 WORLD_SCALE, WORLD_AT = 2.4, (3.1, -1.7, 0.9)
@@ -129,11 +119,11 @@ def rig_cameras(size: int, times: np.ndarray, seed: int) -> list[tuple[Camera, C
 
 
 def _phone(size: int, k: int, center: np.ndarray, target: np.ndarray) -> Camera:
-    phone, width, height = PHONES[k], size, size * 3 // 4
-    fx = phone["focal"] * 0.5 * width / math.tan(0.5 * math.radians(VIEW_ANGLE))
-    cx, cy = width * (0.5 + phone["off"][0]), height * (0.5 + phone["off"][1])
+    (aspect, focal, off, lens), width, height = PHONES[k], size, size * 3 // 4
+    fx = focal * 0.5 * width / math.tan(0.5 * math.radians(VIEW_ANGLE))
+    cx, cy = width * (0.5 + off[0]), height * (0.5 + off[1])
     pose = look_at(torch.from_numpy(center), torch.from_numpy(target), torch.tensor([0.0, 0.0, 1.0]))
-    return Camera(width, height, fx, fx * phone["aspect"], cx, cy, pose, 0.1, 10.0, lens=phone["lens"])
+    return Camera(width, height, fx, fx * aspect, cx, cy, pose, 0.1, 10.0, lens=lens)
 
 
 def _name(t: int, k: int) -> str:

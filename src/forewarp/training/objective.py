@@ -103,6 +103,7 @@ class _Given(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, slope: Tensor) -> tuple:
-        if slope.device.type == "cpu" and float(slope) == 1:  # not scaled: no copies
-            return None, None, *ctx.gradients
-        return None, None, *(slope * gradient for gradient in ctx.gradients)
+        gradients, ctx.gradients = ctx.gradients, None  # what nobody else holds becomes .grad without a copy
+        if slope.device.type == "cpu" and float(slope) == 1:  # not scaled
+            return None, None, *gradients
+        return None, None, *(slope * gradient for gradient in gradients)

@@ -82,7 +82,7 @@ def test_slopes_over_time_are_those_of_autograd(turns):
     motion, _ = nodes.carried(basis)
     slope = torch.randn(motion.shape)
     (motion * slope).sum().backward()
-    found = nodes.spread_over_time(basis, slope)
+    found = nodes.spread_over_time(0.6, basis, slope, 0.0, 1.0)[1]
     torch.testing.assert_close(found["nodes.shift"], nodes.shift.grad)
     assert ("nodes.turn" in found) == turns
     if turns:
@@ -92,7 +92,7 @@ def test_slopes_over_time_are_those_of_autograd(turns):
 def test_slopes_of_bending_are_those_of_autograd():
     nodes = nodes_of()
     nodes.seen.copy_(torch.tensor([0.0, 1.0]))
-    value, found = nodes.bent(0.5, 3.0, unit=2.0)
+    value, found = nodes.spread_over_time(0.5, nodes.curve(0.5), torch.zeros(12, 6), 3.0, 2.0)
     step = 1 / 5
     before, now, after = (nodes.curve(t) for t in (0.5 - step, 0.5, 0.5 + step))
     basis = after - 2 * now + before
@@ -110,7 +110,9 @@ def test_straight_motion_does_not_bend():
     line = torch.arange(8.0)[:, None].expand(8, 3)
     nodes.shift.data = line.expand(12, 8, 3).clone()
     nodes.turn.data.zero_()
-    assert nodes.bent(0.4, 1.0, 1.0)[0] == pytest.approx(0.0, abs=1e-9)
+    assert nodes.spread_over_time(0.4, nodes.curve(0.4), torch.zeros(12, 6), 1.0, 1.0)[0] == pytest.approx(
+        0.0, abs=1e-9
+    )
 
 
 def test_a_curve_is_continued_to_times_not_yet_seen():

@@ -3,18 +3,14 @@ from functools import partial
 import pytest
 import torch
 
-from forewarp.fields.radiance import FeatureRadiance
-from forewarp.methods.voxel.effects.inpaint import UNet3d
 from forewarp.methods.voxel.effects.upsample import LearnedUpsampler, TrilinearUpsampler
-from forewarp.methods.voxel.forward_warp import ForwardWarp
 from forewarp.methods.voxel.stage import EFFECTS
 from forewarp.renderer import Renderer
 from forewarp.scene.box import Lattice
 from forewarp.scene.view import Moment
-from tests.support.tiny_scene import BOX, built, camera_at, forward_model
+from tests.support.tiny_scene import BOX, INPAINTER, built, camera_at, forward_model
 
 LATTICE = Lattice(BOX, (7, 6, 5))
-INPAINTER = partial(UNet3d, width=16, levels=2)
 
 
 def build(effects=EFFECTS, frames=5, seed=0, **choices):
@@ -53,12 +49,6 @@ def test_effects_that_are_off_own_no_parameters_and_no_buffers():
     assert heads(build(effects=(), upsampler=TrilinearUpsampler, inpainter=INPAINTER)) == {"radiance"}
 
 
-def test_one_time_builds_no_motion():
-    method = build(frames=1)
-    assert method.motion is None
-    assert torch.equal(picture(method, 0.0), picture(method, 0.9))
-
-
 @pytest.mark.parametrize("choices", [{}, {"upsampler": TrilinearUpsampler}, {"inpainter": INPAINTER}])
 def test_at_the_canonical_time_the_picture_is_the_unwarped_one(choices):
     moving, still = build(**choices), build(motion=None, trajectory=None, **choices)
@@ -68,14 +58,6 @@ def test_at_the_canonical_time_the_picture_is_the_unwarped_one(choices):
     state = moving.at(Moment(0.3))
     assert state.flow is None
     assert state.dropped == 0
-
-
-def test_a_state_holds_what_was_computed():
-    state = build().at(Moment(0.9))
-    assert list(state.fields) == ["warped"]
-    assert state.flow.shape == (4 * 4 * 3, 3)
-    assert len(state.coverage) == len(state.fields["warped"].values)
-    assert state.inpaint_difference is None
 
 
 UPSAMPLERS = {"none": None, "trilinear": TrilinearUpsampler, "learned": partial(LearnedUpsampler, width=8)}
@@ -97,15 +79,6 @@ def test_the_inpainter_starts_as_the_identity_to_the_bit(time, upsampler, covera
     assert torch.equal(picture(method, time, 0), picture(method, time, 1))
 
 
-@pytest.mark.parametrize("upsampler", UPSAMPLERS)
-def test_without_an_inpainter_it_is_the_same_picture(upsampler):
-    plain = build(upsampler=UPSAMPLERS[upsampler])
-    inpainted = build(upsampler=UPSAMPLERS[upsampler], inpainter=INPAINTER)
-    shared = {k: v for k, v in plain.state_dict().items() if not k.startswith("upsampler.")}
-    inpainted.load_state_dict(shared, strict=False)
-    torch.testing.assert_close(picture(plain, 0.9), picture(inpainted, 0.9), atol=1e-5, rtol=0)
-
-
 def test_every_part_learns():
     method = build(upsampler=UPSAMPLERS["learned"], inpainter=INPAINTER)
     torch.nn.init.normal_(method.upsampler.head.weight)
@@ -119,12 +92,6 @@ def test_every_part_learns():
     assert all(p.grad.isfinite().all() for p in method.parameters())
 
 
-def test_features_through_a_network_serve_as_well():
-    radiance = partial(FeatureRadiance, alpha_init=1e-2, alpha_threshold=0.0, grid_features=3, width=8)
-    state = build(radiance=radiance).at(Moment(0.9))
-    assert state.fields["warped"].values.shape[1] == 13
-
-
 def test_everything_outside_the_box_leaves_an_empty_field():
     method = build()
     torch.nn.init.constant_(method.motion.trajectory.network[-1].bias, 100.0)
@@ -132,27 +99,3 @@ def test_everything_outside_the_box_leaves_an_empty_field():
     assert state.dropped == 48
     assert len(state.fields["warped"].values) == 0
     assert torch.equal(picture(method, 0.9), torch.ones(24 * 24, 3))
-
-
-def test_paths():
-    points = torch.rand(4, 3)
-    times = torch.tensor([0.3, 0.9])
-    assert torch.equal(build(motion=None).trajectories(points, times), points[:, None].expand(4, 2, 3))
-    moving = build().trajectories(points, times)
-    assert torch.equal(moving[:, 0], points)
-    assert not torch.equal(moving[:, 1], points)
-
-
-@pytest.mark.parametrize("name", ["motion", "upsampler", "inpainter", "view_dependence"])
-def test_refuses_a_ghost_of_the_configuration(name):
-    with pytest.raises(
-        ValueError, match=f"model.{name}: expected a module or null, but got dict; choose model/{name}=none"
-    ):
-        ForwardWarp(build().radiance, canonical_time=0.0, **{name: {"width": 16}})
-
-
-def test_refuses_a_broken_scale_beside_an_inpainter():
-    with pytest.raises(
-        ValueError, match="model.upsampler.scale: expected a whole number beside an inpainter, but got 1.5"
-    ):
-        build(upsampler=partial(TrilinearUpsampler, scale=1.5), inpainter=INPAINTER)

@@ -6,23 +6,21 @@ from functools import partial
 import pytest
 import torch
 
-from forewarp.fields.radiance import FeatureRadiance
 from forewarp.fields.trajectory import TrajectoryField
-from forewarp.methods.method import Start, parameter_count
-from forewarp.methods.voxel.backward_warp import Deformation
-from forewarp.methods.voxel.effects.background import StaticBackground
-from forewarp.methods.voxel.effects.inpaint import UNet3d
-from forewarp.methods.voxel.effects.upsample import LearnedUpsampler, TrilinearUpsampler
-from forewarp.methods.voxel.effects.view_dependence import ViewNetwork
+from forewarp.methods.method import Start
+from forewarp.methods.voxel.effects.upsample import TrilinearUpsampler
 from forewarp.methods.voxel.stage import EFFECTS
 from forewarp.scene.box import Lattice
 from forewarp.scene.cloud import Handover
 from forewarp.training.handover import make_handover
 from tests.support.tiny_scene import (
     BOX,
+    EVERYTHING,
+    FEATURES,
+    RADIANCE,
     RADIUS,
-    backward_model,
     ball_center,
+    ball_method,
     ball_scene,
     built,
     forward_model,
@@ -36,30 +34,7 @@ def build(model, effects=EFFECTS, **numbers):
     return built(model, LATTICE, static=static, effects=effects, **numbers)
 
 
-FULL = forward_model(
-    radiance=partial(FeatureRadiance, alpha_init=1e-2, alpha_threshold=0.0, width=8),
-    trajectory=partial(TrajectoryField, bases=3, nodes=8, features=2),
-    view_dependence=ViewNetwork,
-    upsampler=LearnedUpsampler,
-    inpainter=partial(UNet3d, levels=2),
-    background=partial(StaticBackground, features=3, alpha_init=1e-2, alpha_threshold=0.0),
-)
-
-
-def test_every_parameter_has_one_kind():
-    kinds = build(FULL).param_groups()
-    assert set(kinds) == {"density", "color", "grid", "flow", "network"}
-    listed = [id(p) for parameters in kinds.values() for p in parameters]
-    assert len(listed) == len(set(listed)) == len(list(build(FULL).parameters()))
-    direct = build(forward_model()).param_groups()
-    assert set(direct) == {"density", "color", "shading", "flow"}
-    backward = backward_model(deformation=Deformation, view_dependence=None)
-    assert set(build(backward).param_groups()) == {"density", "color", "flow"}
-
-
-def test_parameter_count():
-    method = build(forward_model(motion=None, trajectory=None, view_dependence=None))
-    assert parameter_count(method) == 5 * 4 * 6 * (1 + 3)
+FULL = forward_model(**EVERYTHING, trajectory=partial(TrajectoryField, bases=3, nodes=8, features=2))
 
 
 @pytest.mark.parametrize("effect", EFFECTS)
@@ -73,58 +48,6 @@ def test_a_stage_may_interpolate_instead():
     method = build(FULL, ["motion"], upsample=1.5)
     assert type(method.upsampler) is TrilinearUpsampler
     assert method.upsampler.scale == 1.5
-
-
-def test_the_up_layer_refines_what_it_is_given():
-    alone, after = build(FULL, ["upsampler"]), build(FULL, ["upsampler", "inpainter"])
-    assert alone.upsampler.project.in_channels == 4
-    assert after.upsampler.project.in_channels == after.inpainter.width == 16
-
-
-def test_one_layer_makes_the_residual_the_inpainters_or_the_up_layers():
-    assert build(FULL).inpainter.head is None
-    assert build(FULL, ["inpainter"]).inpainter.head is not None
-    assert build(FULL, upsample=2.0).inpainter.head is not None
-
-
-def test_density_is_measured_in_the_unit():
-    assert build(forward_model()).radiance.activation.density_scale == 0.3
-
-
-def test_backward_takes_none_of_the_forward_effects():
-    with pytest.raises(TypeError, match="unexpected keyword argument 'inpainter'"):
-        backward_model(deformation=Deformation, inpainter=partial(UNet3d, levels=2))
-    method = build(backward_model(deformation=Deformation))
-    assert not any(hasattr(method, name) for name in ("motion", "upsampler", "inpainter"))
-
-
-MODELS = {
-    forward_model: (
-        "radiance",
-        "motion",
-        "trajectory",
-        "upsampler",
-        "inpainter",
-        "view_dependence",
-        "background",
-    ),
-    backward_model: ("radiance", "view_dependence", "background", "deformation"),
-}
-
-
-@pytest.mark.parametrize(("make", "name"), [(make, name) for make in MODELS for name in MODELS[make]])
-def test_refuses_a_ghost_of_the_configuration(make, name):
-    with pytest.raises(
-        ValueError, match=f"model.{name}: expected a factory or null, but got .*choose model/{name}=none"
-    ):
-        make(**{name: {"width": 3}})
-
-
-def test_refuses_half_a_choice():
-    with pytest.raises(ValueError, match="model.deformation: expected a factory, but got null"):
-        backward_model()
-    with pytest.raises(ValueError, match="model.trajectory: expected a factory, but got null"):
-        forward_model(trajectory=None)
 
 
 SCENE = ball_scene(frames=6, size=16)
@@ -148,32 +71,13 @@ def left(method):
     return Handover(BOX, True, 6, notes=method.notes())
 
 
-def known(raw=8.0):
-    """A method whose canonical grid is the ball, with some motion."""
-    torch.manual_seed(0)
-    method = fresh()
-    points = method.radiance.lattice.to_world(method.radiance.voxels)
-    inside = (points - ball_center(0.0)).norm(dim=-1) < RADIUS
-    method.radiance.density.data = torch.where(inside, raw, -9.0)[:, None]
-    torch.nn.init.normal_(method.radiance.color)
-    torch.nn.init.normal_(method.motion.trajectory.network[-1].weight, std=1e-3)
-    return method
-
-
-def test_a_fresh_method_starts_faint_everywhere():
-    method = fresh(start_alpha=0.03)
-    lattice = method.radiance.lattice
+@pytest.mark.parametrize("radiance", [RADIANCE, FEATURES], ids=["voxels", "network"])
+def test_a_fresh_method_starts_faint_everywhere(radiance):
+    method = fresh(forward_model(radiance=radiance), start_alpha=0.03)
+    lattice, grid = method.radiance.lattice, method.radiance()
     assert method.notes() == {"density_scale": lattice.voxel_size}
-    grid = method.radiance()
     alpha = grid.activation.alpha(grid.raw_density, lattice.voxel_size)
     torch.testing.assert_close(alpha, torch.full((lattice.count,), 0.03), rtol=1e-3, atol=0)
-
-
-def test_a_network_starts_faint_as_well():
-    radiance = partial(FeatureRadiance, alpha_init=1e-2, alpha_threshold=0.0, width=4)
-    grid = fresh(forward_model(radiance=radiance), start_alpha=0.03).radiance()
-    alpha = grid.activation.alpha(grid.raw_density, grid.lattice.voxel_size)
-    torch.testing.assert_close(alpha, torch.full_like(alpha, 0.03), rtol=1e-3, atol=0)
 
 
 def test_the_hull_is_where_matter_may_be():
@@ -183,14 +87,6 @@ def test_the_hull_is_where_matter_may_be():
     ball_now = (everywhere - ball_center(0.0)).norm(dim=-1) < 0.8 * RADIUS
     assert (method.radiance.index.flatten()[ball_now] >= 0).all()
     assert len(points) < 0.5 * len(everywhere)
-
-
-def test_the_hull_needs_alpha():
-    scene = replace(SCENE, has_alpha=False)
-    with pytest.raises(
-        ValueError, match="stage.coarse.start: expected box, since the images of 'ball' have no alpha"
-    ):
-        fresh(scene=scene, frames=[0], start="hull")
 
 
 def test_left_to_itself_it_starts_in_the_hull_where_there_is_alpha_and_in_the_box_elsewhere():
@@ -221,7 +117,7 @@ def test_what_only_waits_for_a_checkpoint_looks_at_no_picture():
 
 
 def test_carrying_keeps_matter_motion_and_unit():
-    before = known()
+    before = ball_method(SCENE)
     unit, path = before.radiance.activation.density_scale, before.motion.trajectory.state_dict()
     handover = make_handover(before, SCENE, None, 6)
     sigma, at = before.radiance().density, before.radiance.lattice.to_lattice
@@ -246,7 +142,7 @@ def test_carrying_into_a_stage_with_more_effects():
 
 
 def test_carrying_a_network():
-    model = forward_model(radiance=partial(FeatureRadiance, alpha_init=1e-2, alpha_threshold=0.0, width=4))
+    model = forward_model(radiance=FEATURES)
     before = fresh(model)
     torch.nn.init.normal_(before.radiance.network[-1].weight)
     after = carried(before, left(before), model)
@@ -255,7 +151,7 @@ def test_carrying_a_network():
 
 
 def test_where_nothing_is_carried_the_box_and_the_unit_are_kept():
-    before = known()
+    before = ball_method(SCENE)
     handover = make_handover(before, SCENE, None, 6)
     after = carried(before, handover, carry=False)
     assert after.radiance.lattice.box == handover.box

@@ -8,7 +8,7 @@ from forewarp.methods.effect import Asked, Begin, Rival
 from forewarp.methods.voxel import planning as decisions
 from forewarp.methods.voxel.evidence import Movement, Residual
 from forewarp.methods.voxel.planning import VoxelEvidence, VoxelPlanning
-from forewarp.report.gain import Gain
+from forewarp.metrics.gain import Gain
 from forewarp.scene.pictures import Pictures
 
 MOVING = VoxelEvidence(

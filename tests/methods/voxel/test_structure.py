@@ -3,16 +3,9 @@ from functools import partial
 import pytest
 import torch
 
-from forewarp.fields.radiance import DirectRadiance, FeatureRadiance
+from forewarp.fields.radiance import DirectRadiance
 from forewarp.methods.voxel.backward_warp import Deformation
-from forewarp.methods.voxel.structure import (
-    box_of_all_times,
-    occupied,
-    refresh,
-    renew_parameters,
-    resample,
-    seen_rows,
-)
+from forewarp.methods.voxel.structure import box_of_all_times, occupied, refresh, resample, seen_rows
 from forewarp.scene.box import Box, Lattice
 from tests.support.tiny_scene import BOX, backward_model, built, forward_model
 
@@ -86,49 +79,21 @@ def test_refresh_gives_births_to_new_voxels_and_no_moments():
     refresh(made, optimizer, keep_alpha=1e-2, birth_alpha=5e-3)
     old = made.index >= 0
     made.density.data[made.index[3, 3, 4].long()] = SOLID  # matter has reached a corner of the active set
-    rows_before = made.index.clone()
     assert refresh(made, optimizer, keep_alpha=1e-2, birth_alpha=5e-3)
     assert torch.equal(made.index >= 0, around((2, 2, 3)) | around((3, 3, 4)))
     new = torch.tensor([not bool(old[tuple(v)]) for v in made.voxels.tolist()])
     alpha = made.activation.alpha(made.density[new, 0], LATTICE.voxel_size)
     torch.testing.assert_close(alpha, torch.full_like(alpha, 5e-3), rtol=1e-3, atol=0)
-    x, y, z = (3, 3, 5)
-    neighbours = rows_before[x - 1 : x + 2, y - 1 : y + 2, z - 1 : z + 2].flatten()
-    colours = [made.color[made.index[tuple(v)], 0].item() for v in made.voxels.tolist() if old[tuple(v)]]
-    near = torch.tensor(colours)[neighbours[neighbours >= 0].long()]
-    assert made.color[made.index[x, y, z], 0].item() == pytest.approx(near.mean().item())
     for parameter in made.parameters():
         moments = optimizer.state[parameter]["exp_avg"]
         assert (moments[new] == 0).all()
         assert (moments[~new] != 0).all()
 
 
-def test_training_goes_on_after_a_refresh():
-    made = radiance()
-    optimizer = adam(made)
-    refresh(made, optimizer, keep_alpha=1e-2, birth_alpha=5e-3)
-    for group in optimizer.param_groups:
-        group["lr"] = 0.1
-    before = made.density.detach().clone()
-    made().values.sum().backward()
-    optimizer.step()
-    assert (made.density != before).all()
-    assert set(optimizer.state) == set(made.parameters())
-
-
 def test_an_empty_grid_is_left_as_it_is():
     made = radiance([])
     before = made.density
     assert not refresh(made, adam(made), keep_alpha=1e-2, birth_alpha=5e-3)
-    assert made.density is before
-
-
-def test_an_active_set_that_stays_keeps_its_parameters():
-    made = radiance()
-    optimizer = adam(made)
-    refresh(made, optimizer, keep_alpha=1e-2, birth_alpha=5e-3)
-    before = made.density
-    assert not refresh(made, optimizer, keep_alpha=1e-2, birth_alpha=5e-3)
     assert made.density is before
 
 
@@ -149,17 +114,6 @@ def test_voxels_are_born_only_where_allowed():
     expected = around((2, 2, 3)) & allowed
     expected[2, 2, 3] = True  # matter itself stays
     assert torch.equal(made.index >= 0, expected)
-
-
-def test_moments_start_afresh_where_rows_mean_nothing():
-    made = radiance()
-    optimizer = adam(made)
-    before = list(made.parameters())
-    made.activate(around((1, 1, 1)), {})
-    renew_parameters(optimizer, before, list(made.parameters()), None)
-    for parameter in made.parameters():
-        assert optimizer.state[parameter]["exp_avg"].shape == parameter.shape
-        assert (optimizer.state[parameter]["exp_avg"] == 0).all()
 
 
 def test_resample_follows_what_is_occupied():
@@ -193,23 +147,6 @@ def test_resample_of_an_empty_field_keeps_all_voxels():
     made = radiance([])
     resample(made, LATTICE.box, 400, keep_alpha=1e-2)
     assert (made.index >= 0).all()
-
-
-@pytest.mark.parametrize("kind", ["direct", "features"])
-def test_resample_of_a_constant_is_constant(kind):
-    everywhere = torch.ones(SHAPE, dtype=torch.bool)
-    if kind == "direct":
-        made = radiance()
-        made.density.data[:], made.color.data[:] = SOLID, 0.25
-    else:
-        made = FeatureRadiance(LATTICE, everywhere, width=4, grid_features=2, **COMMON)
-        made.features.data[:] = 0.25
-        torch.nn.init.constant_(made.network[-1].bias, SOLID)
-    resample(made, Box((1, 1, 1), (4, 3.5, 5)), 300, keep_alpha=1e-2)
-    values = made().values
-    assert len(values) == made.lattice.count
-    torch.testing.assert_close(values, values[:1].expand_as(values))
-    assert values[0, 0].item() == pytest.approx(SOLID, abs=1e-5)
 
 
 def moving(kind, shift):

@@ -1,7 +1,6 @@
 """Each loss term of the voxel methods applies the right function, and only terms that count are computed."""
 
 from dataclasses import replace
-from functools import partial
 
 import pytest
 import torch
@@ -9,7 +8,6 @@ import torch
 from forewarp import losses
 from forewarp.fields.radiance_grid import Activation, RadianceGrid
 from forewarp.methods.method import Step
-from forewarp.methods.voxel.effects.inpaint import UNet3d
 from forewarp.methods.voxel.snapshot import VoxelSnapshot
 from forewarp.methods.voxel.terms import TERMS, Seen, voxel_terms
 from forewarp.ops.grid import neighbour_pairs
@@ -90,22 +88,6 @@ def test_every_term_is_the_pure_function_of_its_parts():
         torch.testing.assert_close(raw[name], value.detach())
 
 
-def forbid(*_):
-    raise AssertionError("a term of weight 0 was called")
-
-
-@pytest.mark.parametrize("off", TERMS)
-def test_a_term_of_weight_zero_is_never_called(off, monkeypatch):
-    function = {"photo": "photometric"}.get(off, off)
-    monkeypatch.setattr(losses, function, forbid)
-    seen = looked()
-    if off == "tv_depth":
-        seen = replace(seen, render_patches=forbid)
-    for weights in ({n: 1.0 for n in TERMS if n != off}, {n: float(n != off) for n in TERMS}):
-        _, raw = loss_of(Objective(weights), seen, terms=voxel_terms() | {off: forbid})
-        assert set(raw) == set(TERMS) - {off}
-
-
 def test_terms_of_effects_that_are_off_are_left_out():
     nothing = looked(inpainted=False, moving=False, background=False)
     _, raw = loss_of(Objective(dict.fromkeys(TERMS, 1.0)), nothing)
@@ -152,24 +134,3 @@ def test_the_weights_of_all_samples_are_kept_only_for_a_printed_form(literal, ne
     data = ball_data(rays=4, frames=2, size=8)
     method.look(data.batches.draw(), {"photo": 1.0}, torch.Generator().manual_seed(0))
     assert asked == [needed]
-
-
-def test_the_rays_terms_may_look_at_some_renderings_only():
-    inpainter = {"inpainter": partial(UNet3d, width=16, levels=2)}
-    moment = Moment(0.5)
-
-    def wanted(objective, **choices):
-        method = method_for(objective, **choices)
-        return method._wanted(method.at(moment))
-
-    assert wanted(Objective({}), **inpainter) == ["warped", "inpainted"]
-    chosen = Objective({}, photo_on=["inpainted"])
-    assert wanted(chosen, **inpainter) == ["inpainted"]
-    assert wanted(chosen) == ["warped"]  # what is not there cannot be looked at
-    for first in ("warped", "upsampled"):  # with an up-sampler or without
-        assert wanted(Objective({}, photo_on=[first]), **inpainter) == ["warped"]
-
-
-def test_refuses_a_printed_form_that_is_none():
-    with pytest.raises(ValueError, match=r"objective.literal: .* but got \['ssim'\]"):
-        voxel_terms(["ssim"])

@@ -242,9 +242,9 @@ class Particles(Method):
                 motion, nodes.places, found.maps, nodes.edges, nodes.edge_weights, rigid
             )
             own["rigid"] = strain
-            _add(total, nodes.spread_over_time(basis, slope))
-            own["smooth"], bent = nodes.bent(time, factors.get("smooth", 0.0), float(self.extent))
-            _add(total, bent)
+            smooth = factors.get("smooth", 0.0)
+            own["smooth"], over_time = nodes.spread_over_time(time, basis, slope, smooth, float(self.extent))
+            _add(total, over_time)
         return found, own
 
     def _loose(self) -> float:

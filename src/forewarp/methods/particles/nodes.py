@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from forewarp.fields.curves import Curve
-from forewarp.ops.nodes import carry_nodes
+from forewarp.ops.nodes import carry_nodes, spread_nodes
 
 LINKS = 4  # nodes that a particle follows
 _DAMP = 0.5  # of a curve's last stride, where it is continued to times not yet seen
@@ -125,12 +125,13 @@ class Nodes(nn.Module):
         """Continue curves beyond the times [low, high] that have been seen: a knot beyond them starts as a
         damped continuation of the two before it.
         """
+        first, last = self.seen.tolist()
+        if low >= first and high <= last:
+            return
         reach = self.curve.reach()
         if reach is None:
             return
-        if low >= float(self.seen[0]) and high <= float(self.seen[1]):
-            return
-        self.seen[0], self.seen[1] = min(low, float(self.seen[0])), max(high, float(self.seen[1]))
+        self.seen[0], self.seen[1] = min(low, first), max(high, last)
         middle = reach.mean(-1)
         slack = _FULL * float(reach[0, 1] - reach[0, 0])
         after = (reach[:, 0] > float(self.seen[1]) - slack).nonzero()[:, 0].tolist()
@@ -174,34 +175,27 @@ class Nodes(nn.Module):
                 own.data = own.data.new_empty(state[prefix + name].shape)
         super()._load_from_state_dict(state, prefix, *args, **kwargs)
 
-    def spread_over_time(self, basis: Tensor, slope: Tensor) -> dict[str, Tensor]:
-        """From slopes (M, 6) by ``motion`` to those by coefficients, by name."""
-        found = {"nodes.shift": slope[:, None, :3] * basis[:, None]}
-        if self.turn is not None:
-            found["nodes.turn"] = slope[:, None, 3:] * basis[:, None]
-        return found
+    def spread_over_time(
+        self, time: float, basis: Tensor, slope: Tensor, factor: float, unit: float
+    ) -> tuple[float, dict[str, Tensor]]:
+        """From slopes (M, 6) by ``motion`` to those by coefficients, by name; curves are kept smooth.
 
-    @torch.no_grad()
-    def bent(self, time: float, factor: float, unit: float) -> tuple[float, dict[str, Tensor]]:
-        """How much curves bend at a time, over a knot's reach, in shares of ``unit``; and ``factor`` times
-        the slopes of that.
-
-        ``mean |x(t + h) - 2 x(t) + x(t - h)|^2 / unit^2``, h a knot's distance to the next: only where and as
-        often as a curve is seen is it kept smooth.
+        What is kept small is ``mean |x(t + h) - 2 x(t) + x(t - h)|^2 / unit^2``, h a knot's distance to the
+        next: only where and as often as a curve is seen. Its value comes first.
         """
-        step = 1 / max(self.curve.count - 3, 2)
-        low, high = float(self.seen[0]) + step, float(self.seen[1]) - step
-        if factor == 0 or low > high:
-            return 0.0, {}
+        bend = self._bend(time) if factor else torch.zeros_like(basis)
+        *found, bent = spread_nodes(self.shift, self.turn, slope, basis, bend, factor, unit)
+        names = ("nodes.shift", "nodes.turn")
+        return bent, {name: part for name, part in zip(names, found) if part is not None}
+
+    def _bend(self, time: float) -> Tensor:
+        """The second difference (K,) of the basis around a time, within the times that have been seen."""
+        step, (low, high) = 1 / max(self.curve.count - 3, 2), self.seen.tolist()
+        low, high = low + step, high - step
+        if low > high:
+            return self.places.new_zeros(self.curve.count)
         middle = min(max(time, low), high)
-        times = torch.tensor([middle - step, middle, middle + step], dtype=torch.float64).clamp(0, 1)
-        before, now, after = self.curve(times).to(self.places)
-        basis, found, total = after - 2 * now + before, {}, 0.0
-        for name, scale in (("shift", unit), ("turn", 1.0)):
-            value = getattr(self, name)
-            if value is not None:
-                bend = torch.einsum("mkc,k->mc", value, basis) / scale
-                total += float(bend.square().mean())
-                slope = 2 * factor / (bend.numel() * scale) * bend
-                found[f"nodes.{name}"] = slope[:, None] * basis[:, None]
-        return total, found
+        before, now, after = (
+            self.curve(min(max(t, 0.0), 1.0)).to(self.places) for t in (middle - step, middle, middle + step)
+        )
+        return after - 2 * now + before

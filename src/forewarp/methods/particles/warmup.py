@@ -6,7 +6,7 @@ import torch
 
 from forewarp.ops.adam import adam_rows
 from forewarp.ops.compare import compare
-from forewarp.ops.nodes import carry_nodes, pull_nodes
+from forewarp.ops.nodes import carry_nodes, pull_nodes, spread_nodes
 from forewarp.ops.project import Gaussians, Pinhole, Warp, project
 from forewarp.ops.rasterize import rasterize
 
@@ -24,6 +24,7 @@ def compile_kernels(method: torch.nn.Module) -> None:
     rasterize(project(particles, warp, pinhole, none, first), 9, 8)
     edges = torch.zeros(1, 1, dtype=torch.int64)
     carry_nodes(zero[:, None], zero[:, None], first, zero)
+    spread_nodes(zero[:, None], zero[:, None], torch.zeros(1, 6), first, first, 1.0, 1.0)
     pull_nodes(torch.zeros(1, 6), zero, torch.zeros(1, 12), edges, one, 1.0)
     adam_rows(
         torch.zeros(1, 3),

@@ -11,7 +11,7 @@ from forewarp.fields.mlp import mlp
 from forewarp.fields.radiance import DirectRadiance
 from forewarp.fields.radiance_grid import RadianceGrid, Shade
 from forewarp.methods.voxel.effects.background import StaticBackground, Together
-from forewarp.methods.voxel.method import VoxelMethod, check_effect
+from forewarp.methods.voxel.method import VoxelMethod
 from forewarp.methods.voxel.planning import EFFECTS
 from forewarp.methods.voxel.snapshot import VoxelSnapshot
 from forewarp.ops.encode import positional_encoding
@@ -19,6 +19,8 @@ from forewarp.ops.grid import dilate
 from forewarp.renderer import Renderer
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.view import Moment
+
+_NODES = 32  # side of the lattice on which the occupied cells at a time are found
 
 
 class Deformation(nn.Module):
@@ -106,7 +108,6 @@ class BackwardWarp(VoxelMethod):
     Args:
         radiance, canonical_time, view_dependence, background, renderer: as for ``ForwardWarp``.
         deformation: displaces samples to the canonical time; None: the scene is static.
-        mask_nodes: side of the lattice on which the occupied cells at a time are found.
     """
 
     effects = tuple(effect for effect in EFFECTS if effect.name in ("view_dependence", "background"))
@@ -119,7 +120,6 @@ class BackwardWarp(VoxelMethod):
         deformation: Deformation | None,
         view_dependence: nn.Module | None = None,
         background: StaticBackground | None = None,
-        mask_nodes: int = 32,
         renderer: Renderer | None = None,
     ) -> None:
         super().__init__(
@@ -129,8 +129,7 @@ class BackwardWarp(VoxelMethod):
             view_dependence=view_dependence,
             background=background,
         )
-        check_effect("deformation", deformation, "model=backward or another model")
-        self.deformation, self.mask_nodes = deformation, mask_nodes
+        self.deformation = deformation
 
     def at(self, moment: Moment) -> VoxelSnapshot:
         """Return the field ``backward``: the displaced one, or the canonical one at the canonical time."""
@@ -151,7 +150,7 @@ class BackwardWarp(VoxelMethod):
         """Find the cells at ``time`` that the displacement carries near an occupied canonical cell."""
         source = canonical.cells
         lattice = canonical.lattice
-        coarse = Lattice(lattice.box, tuple(min(n, self.mask_nodes) for n in lattice.shape))
+        coarse = Lattice(lattice.box, tuple(min(n, _NODES) for n in lattice.shape))
         nodes = coarse.to_world(coarse.all_voxels(source.device))
         moved = lattice.to_lattice(nodes + self.deformation(nodes, time))
         reach = max(-(-n // m) for n, m in zip(lattice.shape, coarse.shape)) + 1

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from forewarp.fields.radiance_grid import FieldAtTime
 from forewarp.methods.voxel.effects.background import Together
+from forewarp.methods.voxel.method import SOLID
 from forewarp.metrics.limits import low_passed
 from forewarp.ops.grid import index_of, neighbour_pairs
 from forewarp.scene.batch import Target
@@ -21,7 +22,6 @@ from forewarp.scene.view import View
 if TYPE_CHECKING:
     from forewarp.methods.voxel.forward_warp import ForwardWarp
 
-SOLID = 0.1  # opacity over one voxel above which it counts as matter
 TORN = 2.0  # distance of neighbours in voxels; a splat reaches one voxel to either side
 _TIMES = 40  # at most this many times are examined
 

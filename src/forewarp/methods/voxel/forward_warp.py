@@ -17,7 +17,7 @@ from forewarp.methods.voxel.effects.upsample import (
     interpolate_dense,
     refined,
 )
-from forewarp.methods.voxel.method import VoxelMethod, check_effect
+from forewarp.methods.voxel.method import VoxelMethod
 from forewarp.methods.voxel.planning import EFFECTS
 from forewarp.methods.voxel.snapshot import VoxelSnapshot
 from forewarp.renderer import Renderer
@@ -40,8 +40,7 @@ class ForwardWarp(VoxelMethod):
         renderer: marches the rays.
 
     Raises:
-        ValueError: for an effect that is neither a module nor None, or for an up-sampler whose scale is not
-            a whole number beside an inpainter.
+        ValueError: for an up-sampler whose scale is not a whole number beside an inpainter.
     """
 
     effects = EFFECTS
@@ -65,9 +64,7 @@ class ForwardWarp(VoxelMethod):
             view_dependence=view_dependence,
             background=background,
         )
-        for name, effect in {"motion": motion, "upsampler": upsampler, "inpainter": inpainter}.items():
-            check_effect(name, effect, f"model/{name}=none")
-            setattr(self, name, effect)
+        self.motion, self.upsampler, self.inpainter = motion, upsampler, inpainter
         scale = getattr(upsampler, "scale", 1)
         if inpainter is not None and scale != int(scale):
             raise ValueError(

@@ -53,8 +53,6 @@ class VoxelMethod(Method):
         background: StaticBackground | None = None,
     ) -> None:
         super().__init__()
-        check_effect("view_dependence", view_dependence, "model/view_dependence=none")
-        check_effect("background", background, "model/background=none")
         self.radiance, self.view_dependence, self.background = radiance, view_dependence, background
         self.canonical_time, self.renderer = canonical_time, renderer or Renderer()
         self.lattices: Lattices | None = None
@@ -142,7 +140,7 @@ class VoxelMethod(Method):
         self._pairs = [
             *self._pairs[-1:],
             (index, pairs),
-        ]  # of two grids at most; a changed grid replaces the older
+        ]  # of two grids at most
         return pairs
 
     def param_groups(self) -> dict[str, list[nn.Parameter]]:
@@ -226,17 +224,3 @@ class VoxelMethod(Method):
                 grid.activation = Activation(grid.activation.shift, float(state["density_scale"]))
         if self.lattices is not None and state["lattices"]:
             self.lattices.load_state_dict(state["lattices"])
-
-
-def check_effect(name: str, effect: object, choose: str) -> None:
-    """Raise ValueError unless ``effect`` is a module or None: keys of an option that is off leave a dict.
-
-    Args:
-        name: key of the effect in ``model``.
-        effect: what was given.
-        choose: override to suggest.
-    """
-    if effect is not None and not isinstance(effect, nn.Module):
-        raise ValueError(
-            f"model.{name}: expected a module or null, but got {type(effect).__name__}; choose {choose}"
-        )

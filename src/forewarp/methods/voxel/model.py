@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -178,16 +178,12 @@ class Ground:
     static: tuple[Lattice, Tensor] | None = None
 
 
-class _HasBackground(Protocol):
-    background: object
-
-
 def is_carried(start: Start, stage: VoxelStage) -> bool:
     """Return whether a stage continues with the grids of the stage before."""
     return stage.carry and not start.blank and isinstance(getattr(start.before, "radiance", None), VoxelGrid)
 
 
-def ground_of(model: _HasBackground, start: Start, stage: VoxelStage) -> Ground:
+def ground_of(model: VoxelModel, start: Start, stage: VoxelStage) -> Ground:
     """Find the lattices and active voxels of a stage. Cost: a hull reads each of its images once."""
     scene, before = start.scene, start.before if is_carried(start, stage) else None
     box = scene.box if start.handover is None else start.handover.box

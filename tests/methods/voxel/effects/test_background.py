@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from forewarp.fields.radiance_grid import Activation, RadianceGrid
-from forewarp.methods.voxel.effects.background import StaticBackground, Together, overlapped
+from forewarp.methods.voxel.effects.background import Together, overlapped
 from forewarp.ops.grid import index_of
 from forewarp.renderer import Renderer
 from forewarp.scene.box import Box, Lattice
@@ -124,24 +124,3 @@ def test_extreme_densities_stay_finite_in_values_and_gradients(raw):
     (together.colors(points, points, None).sum() + together.density(points).sum()).backward()
     for grid in (moving, still):
         assert grid.values.grad.isfinite().all()
-
-
-def test_gradients_agree_with_finite_differences():
-    moving, still = grid_on(SMALL, 0.0, (0, 1, 2), seed=7), grid_on(WIDE, 0.0, (1, 0, -1), seed=8)
-    points = random_points(12)
-
-    def both(a, b):
-        together = Together(moving.with_values(a), still.with_values(b))
-        return together.colors(points, points, None), together.density(points)
-
-    assert torch.autograd.gradcheck(
-        both, (moving.values.requires_grad_(), still.values.requires_grad_()), fast_mode=True
-    )
-
-
-def test_it_is_a_grid_of_four_channels():
-    active = torch.ones(WIDE.shape, dtype=torch.bool)
-    background = StaticBackground(
-        WIDE, active, features=3, alpha_init=1e-2, density_scale=0.3, alpha_threshold=0.0
-    )
-    assert sum(p.numel() for p in background.parameters()) == 4 * WIDE.count

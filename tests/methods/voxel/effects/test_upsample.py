@@ -10,13 +10,14 @@ from forewarp.methods.voxel.effects.upsample import (
     refined,
 )
 from forewarp.scene.box import Box, Lattice
+from tests.support.hard_cases import index_with
 
 LATTICE = Lattice(Box((0, 0, 0), (2, 3, 4)), (3, 4, 5))
 
 
 def grid(present=None):
     present = torch.ones(LATTICE.shape, dtype=torch.bool) if present is None else present
-    index = torch.where(present.flatten(), present.flatten().cumsum(0) - 1, -1).reshape(LATTICE.shape).int()
+    index = index_with(present)
     values = torch.randn(int(present.sum()), 4, generator=torch.Generator().manual_seed(0))
     return RadianceGrid(LATTICE, index, values, Activation(-4.6, 0.5))
 
@@ -94,27 +95,3 @@ def test_recomputing_holds_less_and_changes_nothing():
     assert all(torch.equal(ours, theirs) for ours, theirs in zip(gradients, plain_gradients))
     assert all(gradient.abs().sum() > 0 for gradient in gradients[:-2])
     assert held < 0.5 * plain_held
-
-
-def test_gradients_reach_the_coarse_values():
-    values = grid().values.requires_grad_()
-    TrilinearUpsampler(scale=1.5)(grid().with_values(values)).values.sum().backward()
-    assert (values.grad > 0).all()
-
-
-def test_an_empty_grid_stays_empty():
-    empty = grid(torch.zeros(LATTICE.shape, dtype=torch.bool))
-    fine = TrilinearUpsampler(scale=2)(empty)
-    assert fine.values.shape == (0, 4)
-    assert (fine.index == -1).all()
-
-
-@pytest.mark.parametrize("scale", [1, 0.5, float("nan")])
-def test_refuses_what_does_not_refine(scale):
-    with pytest.raises(ValueError, match=r"model.upsampler.scale: expected a number > 1, but got"):
-        TrilinearUpsampler(scale=scale)
-
-
-def test_the_learned_layer_takes_whole_scales_only():
-    with pytest.raises(ValueError, match="expects a whole number, but got 1.5"):
-        LearnedUpsampler(scale=1.5, channels=4)

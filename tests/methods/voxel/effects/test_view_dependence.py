@@ -14,13 +14,6 @@ def test_harmonics_hand_worked():
     torch.testing.assert_close(color, torch.sigmoid(torch.tensor([[0.1 + 0.8, 0.2 - 0.5, 0.3 + 0.6]])))
 
 
-def test_harmonics_own_no_parameters_and_without_shading_see_no_direction():
-    view = SphericalHarmonics()
-    assert not list(view.parameters())
-    features = torch.cat([torch.randn(5, 3), torch.zeros(5, 9)], -1)
-    assert torch.equal(view(features, torch.randn(5, 3)), torch.sigmoid(features[:, :3]))
-
-
 @pytest.mark.parametrize("view", [SphericalHarmonics(), ViewNetwork(features=12, width=8)])
 def test_colours_lie_in_the_unit_cube_for_any_number_of_samples(view):
     for samples in (0, 1, 7):

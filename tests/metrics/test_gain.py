@@ -1,7 +1,6 @@
 import pytest
 
-from forewarp.report.gain import Gain, measure_effect
-from forewarp.report.tables import Estimate
+from forewarp.metrics.gain import Estimate, Gain, measure_effect
 
 PAIRS = [({"psnr": 31.0, "step": 0.2}, {"psnr": 30.0, "step": 0.1}), ({"psnr": 30.0}, {"psnr": 30.0})]
 
