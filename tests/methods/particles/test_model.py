@@ -1,3 +1,4 @@
+from dataclasses import replace
 from functools import partial
 
 import pytest
@@ -5,9 +6,10 @@ import torch
 
 from forewarp.methods.particles.model import Particles
 from forewarp.methods.particles.settings import Numbers
+from forewarp.methods.particles.start import widths
 from forewarp.scene.view import Moment, View
 from tests.contract.fitting import module_of
-from tests.contract.scenes import data_of, write_dnerf
+from tests.contract.scenes import data_of, write_dnerf, write_hypernerf
 from tests.contract.table import METHODS
 
 ENTRY = METHODS["particles"]
@@ -57,6 +59,17 @@ def test_gradients_are_those_of_autograd(data, options):
     for name, p in method.named_parameters():
         error = float((p.grad - step.gradients[name]).norm() / p.grad.norm().clamp(min=1e-9))
         assert error < 2e-3, name
+
+
+def test_particles_of_opaque_pictures_begin_no_larger_than_they_are_apart_there(data, tmp_path):
+    write_hypernerf(tmp_path / "hypernerf")
+    opaque = data_of("hypernerf", tmp_path)
+    for scene, limited in ((opaque.scene, True), (replace(opaque.scene, has_alpha=True), False)):
+        opaque.scene = scene
+        method = module_with(opaque).method
+        widest = widths(scene, method.means.data, float(method.covered))
+        larger = method.log_scales.data.exp()[:, 0] > 1.001 * widest
+        assert bool(larger.any()) != limited
 
 
 def test_what_is_off_is_absent(data):
@@ -132,7 +145,8 @@ def test_refused(data, changes, text):
 
 def test_numbers_follow_the_pictures():
     numbers = Numbers()
-    assert numbers.most(4.0) == 180
+    assert numbers.most(4.0, 100) == numbers.most(4.0, 200) == 180
+    assert numbers.most(4.0, 25) == 90  # fewer pictures tell less
     assert numbers.share_at(0.0) == 0.5
     assert numbers.share_at(1.0) == 1.0
     assert numbers.motion(100, 2)[1] == 4

@@ -94,12 +94,13 @@ class Particles(Method):
     def _measured(self, start: Start) -> dict[str, Tensor]:
         """The first values of every parameter; notes what follows from the pictures, too."""
         covered = covered_pixels(start.scene, list(start.frames))
-        most = self.numbers_of.most(covered)
+        most = self.numbers_of.most(covered, len(start.scene.train))
         cloud = first_points(start, round(self.numbers_of.first * most))
         away = (cloud.points - cloud.points.median(0).values).norm(dim=-1).median()
         extent = float(away) or start.scene.box.diagonal
         self._scalars(covered, extent, most)
-        return first_values(cloud, widths(start.scene, cloud.points, covered))
+        opaque = not start.scene.has_alpha  # else points lie on a surface, and are apart as they should be
+        return first_values(cloud, widths(start.scene, cloud.points, covered) if opaque else None)
 
     def _scalars(self, covered: float, extent: float, most: int) -> None:
         """Pixels that show anything; median distance from the middle; most particles."""
