@@ -118,7 +118,8 @@ def test_rates_fall_each_by_itself(data):
 
 
 def test_particles_grow_to_what_the_pictures_call_for(data):
-    module = module_with(data, numbers={"every": 0.1, "first": 0.5, "settled": 1.0})
+    numbers = {"every": 0.1, "first": 0.5, "settled": 1.0, "density": 400.0}  # some hundreds, of 6 pictures
+    module = module_with(data, numbers=numbers)
     method, optimizer = module.method, module.configure_optimizers()
     assert len(method.means) == round(0.5 * float(method.most))
     for number in range(1, 10):
