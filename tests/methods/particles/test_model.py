@@ -1,3 +1,4 @@
+from dataclasses import replace
 from functools import partial
 
 import pytest
@@ -5,9 +6,10 @@ import torch
 
 from forewarp.methods.particles.model import Particles
 from forewarp.methods.particles.settings import Numbers
+from forewarp.methods.particles.start import widths
 from forewarp.scene.view import Moment, View
 from tests.contract.fitting import module_of
-from tests.contract.scenes import data_of, write_dnerf
+from tests.contract.scenes import data_of, write_dnerf, write_hypernerf
 from tests.contract.table import METHODS
 
 ENTRY = METHODS["particles"]
@@ -59,6 +61,17 @@ def test_gradients_are_those_of_autograd(data, options):
         assert error < 2e-3, name
 
 
+def test_particles_of_opaque_pictures_begin_no_larger_than_they_are_apart_there(data, tmp_path):
+    write_hypernerf(tmp_path / "hypernerf")
+    opaque = data_of("hypernerf", tmp_path)
+    for scene, limited in ((opaque.scene, True), (replace(opaque.scene, has_alpha=True), False)):
+        opaque.scene = scene
+        method = module_with(opaque).method
+        widest = widths(scene, method.means.data, float(method.covered))
+        larger = method.log_scales.data.exp()[:, 0] > 1.001 * widest
+        assert bool(larger.any()) != limited
+
+
 def test_what_is_off_is_absent(data):
     method = module_with(data, motion="none", view=0).method
     assert method.nodes is None
@@ -105,7 +118,8 @@ def test_rates_fall_each_by_itself(data):
 
 
 def test_particles_grow_to_what_the_pictures_call_for(data):
-    module = module_with(data, numbers={"every": 0.1, "first": 0.5, "settled": 1.0})
+    numbers = {"every": 0.1, "first": 0.5, "settled": 1.0, "density": 400.0}  # some hundreds, of 6 pictures
+    module = module_with(data, numbers=numbers)
     method, optimizer = module.method, module.configure_optimizers()
     assert len(method.means) == round(0.5 * float(method.most))
     for number in range(1, 10):
@@ -132,7 +146,8 @@ def test_refused(data, changes, text):
 
 def test_numbers_follow_the_pictures():
     numbers = Numbers()
-    assert numbers.most(4.0) == 180
+    assert numbers.most(4.0, 100) == numbers.most(4.0, 200) == 180
+    assert numbers.most(4.0, 25) == 90  # fewer pictures tell less
     assert numbers.share_at(0.0) == 0.5
     assert numbers.share_at(1.0) == 1.0
     assert numbers.motion(100, 2)[1] == 4

@@ -16,7 +16,7 @@ from forewarp.methods.particles.nodes import Nodes
 from forewarp.methods.particles.rows_adam import RowsAdam
 from forewarp.methods.particles.settings import Numbers
 from forewarp.methods.particles.snapshot import ParticlesSnapshot
-from forewarp.methods.particles.start import covered_pixels, first_points, first_values
+from forewarp.methods.particles.start import covered_pixels, first_points, first_values, widths
 from forewarp.ops.compare import compare
 from forewarp.ops.nodes import pull_nodes
 from forewarp.ops.project import Gaussians, Warp, moved
@@ -91,14 +91,16 @@ class Particles(Method):
         self.register_buffer("round", torch.zeros((), dtype=torch.int64))
         self.grows = self._grows()
 
-    def _measured(self, start: Start) -> Cloud:
+    def _measured(self, start: Start) -> dict[str, Tensor]:
+        """The first values of every parameter; notes what follows from the pictures, too."""
         covered = covered_pixels(start.scene, list(start.frames))
-        most = self.numbers_of.most(covered)
+        most = self.numbers_of.most(covered, len(start.scene.train))
         cloud = first_points(start, round(self.numbers_of.first * most))
         away = (cloud.points - cloud.points.median(0).values).norm(dim=-1).median()
         extent = float(away) or start.scene.box.diagonal
         self._scalars(covered, extent, most)
-        return cloud
+        opaque = not start.scene.has_alpha  # else points lie on a surface, and are apart as they should be
+        return first_values(cloud, widths(start.scene, cloud.points, covered) if opaque else None)
 
     def _scalars(self, covered: float, extent: float, most: int) -> None:
         """Pixels that show anything; median distance from the middle; most particles."""
@@ -107,14 +109,14 @@ class Particles(Method):
         self.register_buffer("most", torch.tensor(float(most)))
 
     def _make(
-        self, before: Particles | None, cloud: Cloud | None, plain: int, tints: int, fades: int
+        self, before: Particles | None, fresh: dict[str, Tensor] | None, plain: int, tints: int, fades: int
     ) -> None:
-        """Give every parameter its first value: of the stage before, of points, or none at all."""
+        """Give every parameter its first value: of the stage before, fresh ones, or none at all."""
         if before is not None:
             self._scalars(float(before.covered), float(before.extent), int(before.most))
             first = {name: p.data.clone() for name, p in before.named_parameters(recurse=False)}
-        elif cloud is not None:
-            first = first_values(cloud)
+        elif fresh is not None:
+            first = fresh
         else:
             self._scalars(1.0, 1.0, 1)
             first = first_values(Cloud(torch.zeros(1, 3), torch.zeros(1, 3), torch.zeros(1), 1.0))

@@ -6,6 +6,8 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+_VIEWS = 100  # pictures from which on more of them call for no more particles
+
 
 @dataclass(frozen=True)
 class Numbers:
@@ -13,7 +15,8 @@ class Numbers:
 
     Args:
         moves: whether particles move; a stage that only shapes them has no nodes.
-        density: particles there are in the end, times the square root of the pixels that show anything.
+        density: particles there are in the end, times the square root of the pixels that show anything; of
+            less than a hundred pictures, of their share of these pixels.
         first: share of them to begin with.
         full: share of them that this stage ends with.
         nodes: how many there are, times the square root of the particles at the beginning.
@@ -59,13 +62,13 @@ class Numbers:
                 f"{self.density}, {self.relink}, {self.jitter}, {self.calm}"
             )
 
-    def most(self, covered: float) -> int:
-        """How many particles there are in the end.
+    def most(self, covered: float, views: int) -> int:
+        """How many particles there are in the end, by the pixels that show anything and the pictures.
 
-        >>> Numbers().most(20_000.0)
-        12728
+        >>> Numbers().most(20_000.0, 100), Numbers().most(20_000.0, 25)
+        (12728, 6364)
         """
-        return max(32, round(self.density * math.sqrt(covered)))
+        return max(32, round(self.density * math.sqrt(covered * min(1.0, views / _VIEWS))))
 
     def share_at(self, progress: float) -> float:
         """The share of them that there should be: on a line from ``first``; soon before ``settled``, all."""
