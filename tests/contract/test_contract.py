@@ -4,6 +4,7 @@ import multiprocessing
 import os
 import signal
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -175,9 +176,14 @@ def test_a_term_of_weight_zero_is_never_called(name, scenes):
         assert off not in raw
 
 
+def with_options(model, options):
+    """Return a model with other options."""
+    return partial(model, **options) if isinstance(model, partial) else replace(model, **options)
+
+
 def full_model(entry):
     """Return the model with all its effects."""
-    return replace(entry.model, **{k: v for e in entry.effects.values() for k, v in e.on.items()})
+    return with_options(entry.model, {k: v for e in entry.effects.values() for k, v in e.on.items()})
 
 
 def refuse(monkeypatch, effect):
@@ -190,11 +196,11 @@ def test_an_effect_that_is_off_is_absent(name, effect, scenes, monkeypatch):
     entry, data = METHODS[name], data_of("dnerf", scenes)
     part = entry.effects[effect]
     refuse(monkeypatch, part)
-    without = replace(full_model(entry), **dict.fromkeys(part.on))
+    without = with_options(full_model(entry), dict.fromkeys(part.on))
     module = module_of(entry, data, model=without)
     data.picker = lambda: TIMES - 1  # a time at which things have moved
     backward(module, batch_of(data))
-    assert not [key for key in module.method.state_dict() if key.startswith(effect)]
+    assert not [key for key in module.method.state_dict() if key.startswith(part.owns or effect)]
 
 
 @each_effect

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+
+from forewarp.methods.particles.effects import NAMES
 
 
 @dataclass(frozen=True)
@@ -12,7 +14,7 @@ class Numbers:
     """The numbers of a stage that are the method's own. Shares are of the stage.
 
     Args:
-        moves: whether particles move; a stage that only shapes them has no nodes.
+        effects: those of the model's effects that the stage uses; one that only shapes particles uses none.
         density: particles there are in the end, times the square root of the pixels that show anything.
         first: share of them to begin with.
         full: share of them that this stage ends with.
@@ -27,7 +29,7 @@ class Numbers:
         hold_rates: share up to which such a rate stays.
     """
 
-    moves: bool = True
+    effects: Sequence[str] = NAMES
     density: float = 90.0
     first: float = 0.5
     full: float = 1.0
@@ -44,6 +46,10 @@ class Numbers:
     hold_rates: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        if not set(self.effects) <= set(NAMES):
+            raise ValueError(
+                f"stage.effects: expected some of {', '.join(NAMES)}, but got {list(self.effects)}"
+            )
         shares = ("first", "every", "loose", "full")
         for name in shares:
             if not 0 < getattr(self, name) <= 1:
