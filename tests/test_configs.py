@@ -35,7 +35,7 @@ DEFAULTS = {
     ("trainer", "auto"),
     ("model/renderer", "march"),
 }
-VOXELS = {"model/motion", "model/view_dependence"}  # also groups of voxel methods
+VOXELS = {"model/motion", "model/view_dependence", "model/background"}  # also groups of voxel methods
 OF_PARTICLES = [
     ("model/motion", "spline"),
     ("model/motion", "cosines"),
@@ -43,6 +43,7 @@ OF_PARTICLES = [
     ("model/view_dependence", "harmonics"),
     ("model/color_over_time", "cosines"),
     ("model/opacity_over_time", "cosines"),
+    ("model/background", "still"),
 ]
 CHOICES = {(group, option) for group in groups() if group not in ELSEWHERE for option in options(group)}
 CHOICES = sorted(CHOICES - DEFAULTS)

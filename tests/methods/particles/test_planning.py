@@ -44,15 +44,17 @@ def test_every_effect_is_on_at_first_and_then_left_out():
     begin, drops = walk(PICTURES, asked(), dict.fromkeys(NAMES, True))
     assert begin == Begin("coarse", tuple(f"model/{effect.name}={effect.on}" for effect in EFFECTS))
     assert [drop.effect for drop in drops] == NAMES
-    assert drops[0] == Drop("motion", ("model/motion=none", "model/rotation=none"))
+    off = ("model/motion=none", "model/rotation=none", "model/background=none")
+    assert drops[0] == Drop("motion", off)
     assert drops[-1].overrides == ("model/view_dependence=none",)
 
 
 def test_what_does_not_move_does_not_turn():
     _, drops = walk(PICTURES, asked(), dict.fromkeys(NAMES, False))
-    assert "rotation" not in [drop.effect for drop in drops]
+    assert not {"rotation", "background"} & {drop.effect for drop in drops}
     found = decided(PICTURES, asked(), motion=NO)
-    assert (found["rotation"].choice, found["rotation"].because[:8]) == ("none", "0 nodes:")
+    for name in ("rotation", "background"):
+        assert (found[name].choice, found[name].because[:8]) == ("none", "0 nodes:")
 
 
 @pytest.mark.parametrize(

@@ -18,6 +18,8 @@ class Effects:
         rotation: True: nodes turn, and do not only shift.
         view_dependence: degree 1 to 3 of the harmonics by which colour depends on direction.
         color_over_time, opacity_over_time: cosines over time of each particle's colour, and of its opacity.
+        background: share of the scene's extent; nodes that move by less come to rest, and particles that
+            follow no others need no nodes any more.
 
     Raises:
         ValueError: naming the key of a choice that there is not.
@@ -28,6 +30,7 @@ class Effects:
     view_dependence: int | None = None
     color_over_time: int | None = None
     opacity_over_time: int | None = None
+    background: float | None = None
 
     def __post_init__(self) -> None:
         for name, known, good in (
@@ -36,6 +39,7 @@ class Effects:
             ("view_dependence", "a degree of 1 to 3", lambda choice: _is_whole(choice) and choice <= 3),
             ("color_over_time", "a number of cosines >= 1", _is_whole),
             ("opacity_over_time", "a number of cosines >= 1", _is_whole),
+            ("background", "a number > 0", lambda choice: isinstance(choice, float) and choice > 0),
         ):
             choice = getattr(self, name)
             if choice is not None and not good(choice):
@@ -47,7 +51,7 @@ class Effects:
     def only(self, names: Sequence[str], times: int) -> Effects:
         """Switch off all effects but those named, and, in a scene of one time, those that need several."""
         kept = {name for name in names if times > 1 or name == "view_dependence"}
-        kept -= set() if self.motion is not None and "motion" in kept else {"rotation"}
+        kept -= set() if self.motion is not None and "motion" in kept else {"rotation", "background"}
         return replace(self, **{name: None for name in NAMES if name not in kept})
 
 

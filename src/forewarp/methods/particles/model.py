@@ -15,6 +15,7 @@ from forewarp.methods.particles.density import renew
 from forewarp.methods.particles.effects import Effects, cosines
 from forewarp.methods.particles.nodes import Nodes
 from forewarp.methods.particles.planning import EFFECTS, ParticlesPlanning
+from forewarp.methods.particles.rest import come_to_rest
 from forewarp.methods.particles.rows_adam import RowsAdam
 from forewarp.methods.particles.settings import Numbers
 from forewarp.methods.particles.snapshot import ParticlesSnapshot
@@ -72,6 +73,9 @@ class Particles(Method):
             links, shares = self.nodes.links(self.means.data)
             self.register_buffer("links", links)
             self.register_buffer("shares", shares)
+        resting = None if on.background is None else torch.zeros(len(self.means), dtype=torch.bool)
+        self.register_buffer("resting", resting)
+        self.least_motion = on.background
         for name in ("pulled", "shown", "idle"):
             self.register_buffer(name, torch.zeros(len(self.means)))
         self.register_buffer("round", torch.zeros((), dtype=torch.int64))
@@ -115,6 +119,7 @@ class Particles(Method):
     def _grows(self) -> tuple[str, ...]:
         names = ["means", "log_scales", "turns", "opacity", "color", "shade", "tint", "fade"]
         names += ["pulled", "shown", "idle", *(["links", "shares"] if self.nodes is not None else [])]
+        names += ["resting"]
         return tuple(name for name in names if getattr(self, name) is not None)
 
     @property
@@ -235,6 +240,10 @@ class Particles(Method):
             _add(total, nodes.spread_over_time(basis, slope))
             own["smooth"], bent = nodes.bent(time, factors.get("smooth", 0.0), float(self.extent))
             _add(total, bent)
+            if self.resting is not None:
+                for name in ("nodes.shift", "nodes.turn"):
+                    if name in total:
+                        total[name][nodes.still] = 0.0
         return found, own
 
     def _loose(self) -> float:
@@ -278,6 +287,10 @@ class Particles(Method):
         renew(self, optimizer, target, unseen=whole and self.nodes is not None, extent=float(self.extent))
         if self.nodes is not None and int(self.round) % self.numbers_of.relink == 0:
             self.links, self.shares = self.nodes.links(self.means.data)
+            if self.resting is not None:
+                self.shares[self.resting] = 0.0
+                if progress >= self.numbers_of.rest:
+                    come_to_rest(self, self.least_motion * float(self.extent))
 
     def warm_up(self) -> None:
         """Compile the operators' kernels."""

@@ -15,10 +15,12 @@ DISAGREEMENT = 0.01  # share of the foreground that no static shape explains, ab
 NARROW = 15.0  # degrees between the most different cameras below which direction cannot be observed
 MEANS = 8e-3  # learning rate of the places of particles in a trial
 
+OF_NODES = ("rotation", "background")  # nothing without motion
 # In the order in which they are left out.
 EFFECTS = (
     Effect("motion", "spline", attribute="nodes"),
     Effect("rotation", "nodes", attribute="nodes.turn"),
+    Effect("background", "still", attribute="resting"),
     Effect("opacity_over_time", "cosines", attribute="fade"),
     Effect("color_over_time", "cosines", attribute="tint"),
     Effect("view_dependence", "harmonics", attribute="shade"),
@@ -49,10 +51,10 @@ class ParticlesPlanning:
         yield Begin("coarse", _choices(on))
         moves = asked.typed.get("model/motion") != "none"
         for name in [name for name in on if seen[name] and asked.trials]:
-            if f"model/{name}" in asked.typed or (name == "rotation" and not moves):
+            if f"model/{name}" in asked.typed or (name in OF_NODES and not moves):
                 continue
-            off = {"motion": "none", "rotation": "none"} if name == "motion" else {name: "none"}
-            pays = yield Drop(name, _choices(off))
+            off = (name, *OF_NODES) if name == "motion" else (name,)
+            pays = yield Drop(name, _choices(dict.fromkeys(off, "none")))
             moves = pays if name == "motion" else moves
 
     def look(
@@ -65,8 +67,8 @@ class ParticlesPlanning:
         found: dict[str, Decision] = {}
         for effect in EFFECTS:
             name, why = effect.name, unseen(effect.name, evidence.pictures)
-            if name == "rotation" and not found["motion"].on:
-                why = "0 nodes: what does not move does not turn"
+            if name in OF_NODES and not found["motion"].on:
+                why = "0 nodes: nothing moves"
             pays = why is None and self._called(name, evidence)
             typed = asked.typed.get(effect.group)
             choice = typed or (asked.choose(name) if pays else effect.off)

@@ -23,6 +23,7 @@ class Numbers:
         edges: neighbours that a node is kept rigid with.
         every: share between two rounds of density control, up to ``settled``.
         relink: rounds after which particles look again for the nodes beside them.
+        rest: share from which nodes that do not move come to rest, where the model has a background.
         jitter, calm: spread of the random shift of a picture's time, which falls to 0 at the share ``calm``.
         loose: what is left of the weight of ``rigid`` at the end.
         finals: what is left at the end of a learning rate, by its name; the others stay.
@@ -39,6 +40,7 @@ class Numbers:
     every: float = 0.01
     settled: float = 0.6
     relink: int = 5
+    rest: float = 0.45
     jitter: float = 0.01
     calm: float = 0.4
     loose: float = 0.17
