@@ -175,11 +175,13 @@ class Rival:
 class Drop:
     """Continue the coarse stage with and, by ``overrides``, without an effect, at equal steps, seed by seed.
 
-    If the effect is not missed, all later trials do without it. The answer is whether it pays.
+    If the effect is not missed, all later trials do without it. The answer is whether it pays. ``longer``:
+    how many times the usual steps.
     """
 
     effect: str
     overrides: Sequence[str]
+    longer: int = 1
 
 
 class Planning(Protocol):

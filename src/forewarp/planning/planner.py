@@ -107,7 +107,8 @@ class Planner:
         self._price_of_steps()
         with_it = self.name_of_trial, self.base
         without = f"{self.name_of_trial}-no-{wanted.effect}", merged(self.base, wanted.overrides)
-        self._try(wanted.effect, with_it, without)
+        longer = None if wanted.longer == 1 else wanted.longer * self.trials.fine_steps
+        self._try(wanted.effect, with_it, without, longer)
         pays = self.evidence.pays(wanted.effect)
         if not pays:
             self.name_of_trial, self.base = without
@@ -122,14 +123,22 @@ class Planner:
         half = self._tried("fine-half", self.base, 0, max(1, plain.steps // 2))
         evidence.slope, evidence.steps, evidence.step = gain([plain], [half]).psnr, plain.steps, plain.step
 
-    def _try(self, effect: str, with_it: tuple[str, list[str]], without: tuple[str, list[str]]) -> None:
+    def _try(
+        self,
+        effect: str,
+        with_it: tuple[str, list[str]],
+        without: tuple[str, list[str]],
+        steps: int | None = None,
+    ) -> None:
         """Compare two trials, each a name and overrides, seed by seed; stop once the gain is clearly below
-        ``plan.least``.
+        ``plan.least``. ``steps``: of both; None: the usual number.
         """
+        if steps is not None:
+            with_it, without = ((f"{name}-{steps}", overrides) for name, overrides in (with_it, without))
         on, off = [], []
         for seed in range(self.settings.seeds):
-            on.append(self._tried(*with_it, seed, on[0].steps if on else None))
-            off.append(self._tried(*without, seed))
+            on.append(self._tried(*with_it, seed, on[0].steps if on else steps))
+            off.append(self._tried(*without, seed, steps))
             if off[-1].steps != on[-1].steps:  # the trial with the effect ran out of time
                 name, overrides = without
                 off[-1] = self._tried(f"{name}-{on[-1].steps}", overrides, seed, on[-1].steps)

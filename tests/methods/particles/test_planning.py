@@ -46,7 +46,7 @@ def test_every_effect_is_on_at_first_and_then_left_out():
     assert [drop.effect for drop in drops] == NAMES
     off = ("model/motion=none", "model/rotation=none", "model/background=none")
     assert drops[0] == Drop("motion", off)
-    assert drops[-1].overrides == ("model/view_dependence=none",)
+    assert drops[-1] == Drop("view_dependence", ("model/view_dependence=none",), 2)
 
 
 def test_what_does_not_move_does_not_turn():
