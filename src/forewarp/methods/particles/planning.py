@@ -38,9 +38,10 @@ class ParticlesPlanning:
         return Evidence(pictures, **bounds)
 
     def always(self, asked: Asked) -> tuple[Sequence[str], Sequence[str]]:
-        """Shape particles without any effect, so that all trials continue from the same; let them learn faster
-        than usual, as trials have few steps. (At the usual rate a still scene had 2.3 dB more with motion than
-        without after 1,000 steps, as nodes go faster than particles; after 3,000 it had 0.7 dB less.)
+        """Shape particles without any effect, so that all trials continue from the same; let them learn
+        faster than usual, as trials have few steps. (At the usual rate a still scene had 2.3 dB more with
+        motion than without after 1,000 steps, as nodes go faster than particles; after 3,000 it had 0.7 dB
+        less.)
         """
         rates = [f"stage.{asked.last}.lr.{name}={rate:g}" for name, rate in RATES.items()]
         return [f"stage.{asked.coarse}.effects=[]"], rates
