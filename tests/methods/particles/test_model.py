@@ -23,7 +23,7 @@ def data(tmp_path_factory):
 
 
 MOVING = {"motion": "spline", "rotation": True, "view_dependence": 1}
-EVERY = MOVING | {"color_over_time": 2, "opacity_over_time": 2}
+EVERY = MOVING | {"color_over_time": 2, "opacity_over_time": 2, "background": 0.03}
 
 
 def module_with(data, **changes):
@@ -80,7 +80,7 @@ def test_with_all_effects_off_there_are_bare_particles(data):
 @pytest.mark.parametrize("effect", EVERY)
 def test_an_effect_that_is_off_is_absent_and_the_others_are_there(data, effect):
     method = module_with(data, **EVERY | {effect: None}).method
-    gone = {effect} | ({"rotation"} if effect == "motion" else set())
+    gone = {effect} | ({"rotation", "background"} if effect == "motion" else set())
     assert {name for name, on in switched(method).items() if not on} == gone
 
 

@@ -14,7 +14,9 @@ TIMES = [0.0, 0.25, 0.5, 0.75, 1.0]
 @pytest.fixture
 def half(data):  # noqa: F811
     """Particles whose nodes on one side of the scene move, while all others stand aside, turned."""
-    module = module_with(data, **EVERY, background=0.01, numbers={"rest": 0.1, "relink": 1, "every": 0.1})
+    module = module_with(
+        data, **EVERY | {"background": 0.01}, numbers={"rest": 0.1, "relink": 1, "every": 0.1}
+    )
     method = module.method
     nodes = method.nodes
     nodes.seen.copy_(torch.tensor([0.0, 1.0]))
@@ -78,7 +80,7 @@ def test_nothing_comes_to_rest_where_the_effect_is_off(data, monkeypatch):  # no
 
 @pytest.mark.parametrize("motion", ["spline", "dct"])
 def test_a_node_that_stops_stays(data, motion):  # noqa: F811
-    nodes = module_with(data, motion=motion).method.nodes
+    nodes = module_with(data, motion=motion, background=0.01).method.nodes
     nodes.shift.data.normal_()
     which = torch.zeros(len(nodes), dtype=torch.bool)
     which[:2] = True

@@ -69,7 +69,8 @@ class Particles(Method):
             count, knots = self.numbers_of.motion(len(self.means), len(times))
             curve = Curve(on.motion, knots, len(times), self.canonical_time)
             points, edges = None if start.blank else self.means.data, self.numbers_of.edges
-            self.nodes = Nodes(points, count, curve, turns=on.rotation is not None, edges=edges)
+            turns, rests = on.rotation is not None, on.background is not None
+            self.nodes = Nodes(points, count, curve, turns=turns, rests=rests, edges=edges)
             links, shares = self.nodes.links(self.means.data)
             self.register_buffer("links", links)
             self.register_buffer("shares", shares)
@@ -118,8 +119,13 @@ class Particles(Method):
 
     def _grows(self) -> tuple[str, ...]:
         names = ["means", "log_scales", "turns", "opacity", "color", "shade", "tint", "fade"]
-        names += ["pulled", "shown", "idle", *(["links", "shares"] if self.nodes is not None else [])]
-        names += ["resting"]
+        names += [
+            "pulled",
+            "shown",
+            "idle",
+            "resting",
+            *(["links", "shares"] if self.nodes is not None else []),
+        ]
         return tuple(name for name in names if getattr(self, name) is not None)
 
     @property
@@ -161,11 +167,8 @@ class Particles(Method):
 
     def warp(self, time: float) -> Warp:
         """How everything moves until a time."""
-        if self.nodes is None:
-            return self._still()
-        return Warp(self.nodes.maps(time), self.links, self.shares)
-
-    def _still(self) -> Warp:
+        if self.nodes is not None:
+            return Warp(self.nodes.maps(time), self.links, self.shares)
         none = self.means.new_zeros(len(self.means), 1)
         return Warp(self.means.new_zeros(1, 12), none.int(), none)
 
@@ -176,11 +179,11 @@ class Particles(Method):
         return self.means.new_tensor(tints), self.means.new_tensor([1.0, *fades])
 
     def tints(self, time: float) -> list[float]:
-        """What a time makes of the coefficients of colour over time."""
+        """See ``over_time``."""
         return cosines(self.tint.shape[1], time, self.canonical_time)
 
     def fades(self, time: float) -> list[float]:
-        """What a time makes of the coefficients of opacity over time."""
+        """See ``over_time``."""
         return cosines(self.fade.shape[1], time, self.canonical_time)
 
     def most_opaque(self) -> Tensor:
@@ -218,14 +221,16 @@ class Particles(Method):
     def _compared(self, seen, time: float, weight: float, factors, total: dict) -> tuple:
         """Compare one picture; adds gradients to ``total``, and gives what the nodes' terms are."""
         tints, fades = self.over_time(time)
-        own, basis, warp = {}, None, None
-        if self.nodes is not None:
+        own, basis = {}, None
+        if self.nodes is None:
+            warp = self.warp(time)
+        else:
             self.nodes.look_ahead(time, time)
             basis = self.nodes.curve(time)
             motion, maps = self.nodes.carried(basis)
             warp = Warp(maps, self.links, self.shares)
         found = compare(
-            self.gaussians(), warp or self._still(), self.pinholes(seen.view.camera), tints, fades,
+            self.gaussians(), warp, self.pinholes(seen.view.camera), tints, fades,
             seen.rgb, seen.background, width=self.width, factor=weight,
         )  # fmt: skip
         self.pulled += found.pull
@@ -240,10 +245,6 @@ class Particles(Method):
             _add(total, nodes.spread_over_time(basis, slope))
             own["smooth"], bent = nodes.bent(time, factors.get("smooth", 0.0), float(self.extent))
             _add(total, bent)
-            if self.resting is not None:
-                for name in ("nodes.shift", "nodes.turn"):
-                    if name in total:
-                        total[name][nodes.still] = 0.0
         return found, own
 
     def _loose(self) -> float:

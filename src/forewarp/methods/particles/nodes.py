@@ -51,13 +51,21 @@ class Nodes(nn.Module):
         count: of nodes.
         curve: of every node.
         turns: whether nodes turn.
+        rests: whether nodes may ``stop``; ``still`` (M,) bool says which have.
         edges: neighbours that a node is kept rigid with.
     """
 
     ROWS = ("places", "edges", "edge_weights", "spread", "still", "shift", "turn")
 
     def __init__(
-        self, points: Tensor | None, count: int, curve: Curve, *, turns: bool = True, edges: int = 6
+        self,
+        points: Tensor | None,
+        count: int,
+        curve: Curve,
+        *,
+        turns: bool = True,
+        rests: bool = False,
+        edges: int = 6,
     ) -> None:
         super().__init__()
         self.curve = curve
@@ -73,7 +81,7 @@ class Nodes(nn.Module):
         self.shift = nn.Parameter(torch.zeros(len(places), curve.count, 3))
         self.turn = nn.Parameter(torch.zeros(len(places), curve.count, 3)) if turns else None
         self.register_buffer("seen", torch.tensor([curve.canonical_time] * 2))
-        self.register_buffer("still", torch.zeros(len(places), dtype=torch.bool))
+        self.register_buffer("still", torch.zeros(len(places), dtype=torch.bool) if rests else None)
 
     def __len__(self) -> int:
         return len(self.places)
@@ -204,6 +212,8 @@ class Nodes(nn.Module):
 
     def spread_over_time(self, basis: Tensor, slope: Tensor) -> dict[str, Tensor]:
         """From slopes (M, 6) by ``motion`` to those by coefficients, by name."""
+        if self.still is not None:
+            slope[self.still] = 0.0
         found = {"nodes.shift": slope[:, None, :3] * basis[:, None]}
         if self.turn is not None:
             found["nodes.turn"] = slope[:, None, 3:] * basis[:, None]
@@ -231,5 +241,7 @@ class Nodes(nn.Module):
                 bend = torch.einsum("mkc,k->mc", value, basis) / scale
                 total += float(bend.square().mean())
                 slope = 2 * factor / (bend.numel() * scale) * bend
+                if self.still is not None:
+                    slope[self.still] = 0.0  # rounding errors would be steps, as Adam takes them
                 found[f"nodes.{name}"] = slope[:, None] * basis[:, None]
         return total, found
