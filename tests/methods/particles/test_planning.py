@@ -11,7 +11,7 @@ from forewarp.scene.pictures import Pictures
 
 PICTURES = Pictures(frames=50, times=50, cut_out=0.8, spread=160.0, disagreement=0.2)
 NAMES = [effect.name for effect in EFFECTS]
-YES, NO, UNSURE = Gain(1.0, 0.2, 1.2, 1000), Gain(-0.1, 0.2, 1.2, 1000), Gain(0.3, 0.4, 1.2, 1000)
+YES, NO, UNSURE = Gain(1.0, 0.2, 1.2, 1000), Gain(-0.1, 0.2, 1.2, 1000), Gain(0.8, 0.9, 1.2, 1000)
 
 
 def asked(trials=True, **typed):
@@ -34,7 +34,7 @@ def walk(pictures, asked, answers):
 
 
 def decided(pictures, asked, **gains):
-    made = ParticlesPlanning().decide(Evidence(pictures, gains=gains), asked)
+    made = ParticlesPlanning().decide(Evidence(pictures, gains=gains, least=0.6), asked)
     assert [decision.effect for decision in made] == NAMES
     assert all(any(c.isdigit() for c in decision.because) for decision in made)
     return {decision.effect: decision for decision in made}

@@ -221,16 +221,14 @@ class Particles(Method):
     def _compared(self, seen, time: float, weight: float, factors, total: dict) -> tuple:
         """Compare one picture; adds gradients to ``total``, and gives what the nodes' terms are."""
         tints, fades = self.over_time(time)
-        own, basis = {}, None
-        if self.nodes is None:
-            warp = self.warp(time)
-        else:
+        own, warp = {}, None
+        if self.nodes is not None:
             self.nodes.look_ahead(time, time)
             basis = self.nodes.curve(time)
             motion, maps = self.nodes.carried(basis)
             warp = Warp(maps, self.links, self.shares)
         found = compare(
-            self.gaussians(), warp, self.pinholes(seen.view.camera), tints, fades,
+            self.gaussians(), warp or self.warp(time), self.pinholes(seen.view.camera), tints, fades,
             seen.rgb, seen.background, width=self.width, factor=weight,
         )  # fmt: skip
         self.pulled += found.pull
