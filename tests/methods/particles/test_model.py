@@ -4,6 +4,8 @@ from functools import partial
 import pytest
 import torch
 
+from forewarp.methods.effect import switched
+from forewarp.methods.particles import model
 from forewarp.methods.particles.model import Particles
 from forewarp.methods.particles.settings import Numbers
 from forewarp.methods.particles.start import widths
@@ -22,8 +24,13 @@ def data(tmp_path_factory):
     return data_of("dnerf", root)
 
 
+MOVING = {"motion": "spline", "rotation": True, "view_dependence": 1}
+EVERY = MOVING | {"color_over_time": 2, "opacity_over_time": 2, "background": 0.03}
+
+
 def module_with(data, **changes):
-    """A module whose method has these options; ``numbers`` and ``weights`` are its stage's."""
+    """A module of moving particles with these options; ``numbers`` and ``weights`` are its stage's."""
+    changes = MOVING | changes
     of_entry = {key: changes.pop(key) for key in ("numbers", "weights") if key in changes}
     return module_of(ENTRY, data, model=partial(Particles, **changes), **of_entry)
 
@@ -36,7 +43,9 @@ def look(module, data, index=None, factors=None):
     return module.method.look(batch, factors, module.generator)
 
 
-@pytest.mark.parametrize("options", [{}, {"tints": 2, "fades": 2, "view": 2}, {"turns": False}, {"view": 0}])
+@pytest.mark.parametrize(
+    "options", [{}, EVERY | {"view_dependence": 2}, {"rotation": None}, {"view_dependence": None}]
+)
 def test_gradients_are_those_of_autograd(data, options):
     """What a step gives by itself, against the picture's graph; without jitter both see the same time."""
     module = module_with(data, numbers={"jitter": 0.0}, **options)
@@ -72,17 +81,63 @@ def test_particles_of_opaque_pictures_begin_no_larger_than_they_are_apart_there(
         assert bool(larger.any()) != limited
 
 
-def test_what_is_off_is_absent(data):
-    method = module_with(data, motion="none", view=0).method
-    assert method.nodes is None
+def test_with_all_effects_off_there_are_bare_particles(data):
+    method = module_with(data, **dict.fromkeys(MOVING)).method
     assert not method.moves
-    names = {name for name, _ in method.named_parameters()}
-    assert names == {"means", "log_scales", "turns", "opacity", "color"}
-    assert not {name for name, _ in method.named_buffers()} & {"links", "shares"}
+    assert set(dict(method.named_parameters())) == {"means", "log_scales", "turns", "opacity", "color"}
+    assert not set(dict(method.named_buffers())) & {"links", "shares"}
+    assert set(method.param_groups()) == set(dict(method.named_parameters()))
+    assert set(switched(method).values()) == {False}
+
+
+@pytest.mark.parametrize("effect", EVERY)
+def test_an_effect_that_is_off_is_absent_and_the_others_are_there(data, effect):
+    method = module_with(data, **EVERY | {effect: None}).method
+    gone = {effect} | ({"rotation", "background"} if effect == "motion" else set())
+    assert {name for name, on in switched(method).items() if not on} == gone
+
+
+def test_operators_get_nothing_of_what_is_off(data, monkeypatch):
+    seen = {}
+
+    def spied(name):
+        kept = getattr(model, name)
+
+        def spy(*given, **named):
+            seen[name] = given
+            return kept(*given, **named)
+
+        monkeypatch.setattr(model, name, spy)
+
+    spied("compare")
+    look(module_with(data, **dict.fromkeys(MOVING)), data)
+    particles, warp, _, tints, fades, *_ = seen["compare"]
+    assert particles.colors.shape[1] == particles.opacity.shape[1] == warp.links.shape[1] == 1
+    assert (len(tints), fades.tolist(), int(warp.weights.count_nonzero())) == (0, [1.0], 0)
+    look(module_with(data, **EVERY), data)
+    particles, warp, _, tints, fades, *_ = seen["compare"]
+    assert (particles.colors.shape[1], particles.opacity.shape[1], warp.links.shape[1]) == (6, 3, 4)
+    assert (len(tints), len(fades)) == (2, 3)
+
+
+def test_a_stage_uses_the_effects_that_it_names(data):
+    module = module_with(data, **EVERY, numbers={"effects": ["rotation", "color_over_time"]})
+    on = {name for name, is_on in switched(module.method).items() if is_on}
+    assert on == {"color_over_time"}  # nothing turns that does not move
+
+
+def test_what_appears_later_is_not_thrown_away(data):
+    module = module_with(data, **EVERY, numbers={"every": 0.1})
+    method, optimizer = module.method, module.configure_optimizers()
+    method.opacity.data.fill_(-20.0)
+    method.fade.data[:3, 0] = -15.0  # the first cosine falls from 0 to -2
+    assert (method.most_opaque() > 0).nonzero()[:, 0].tolist() == [0, 1, 2]
+    method.advance(0.15, 1, optimizer)
+    assert len(method.means) == 3
 
 
 def test_without_motion_its_terms_are_none(data):
-    step = look(module_with(data, motion="none"), data)
+    step = look(module_with(data, motion=None), data)
     assert step.terms["rigid"]() is None
     assert step.terms["smooth"]() is None
 
@@ -132,9 +187,20 @@ def test_particles_grow_to_what_the_pictures_call_for(data):
 @pytest.mark.parametrize(
     ("changes", "text"),
     [
-        ({"view": 4}, "view of 0 to 3"),
-        ({"tints": -1}, "tints >= 0"),
-        ({"motion": "wobble"}, "model.motion: expected spline, dct or none, but got 'wobble'"),
+        ({"view_dependence": 4}, "model.view_dependence: expected a degree of 1 to 3, or null, but got 4"),
+        (
+            {"color_over_time": 0},
+            "model.color_over_time: expected a number of cosines >= 1, or null, but got 0",
+        ),
+        (
+            {"rotation": False},
+            "model.rotation: expected true, or null, but got False; choose model/rotation=none",
+        ),
+        ({"motion": "wobble"}, "model.motion: expected spline or dct, or null, but got 'wobble'"),
+        (
+            {"numbers": {"effects": ["glow"]}},
+            r"stage.effects: expected some of motion, .*, but got \['glow'\]",
+        ),
         ({"numbers": {"first": 0.0}}, r"stage.first: expected a number in \(0, 1\], but got 0.0"),
         ({"numbers": {"density": -1.0}}, "expected density > 0"),
     ],
