@@ -21,7 +21,8 @@ def come_to_rest(method: Method, least: float) -> None:
     be kept rigid with it.
 
     Args:
-        method: has ``ends``, the first and the last time, ``nodes``, ``means``, ``turns``, ``links``, ``shares`` and ``resting`` (N,) bool.
+        method: has ``ends`` (the first and the last time), ``nodes``, ``means``, ``turns``, ``links``,
+            ``shares`` and ``resting`` (N,) bool.
         least: the distance.
     """
     nodes = method.nodes
