@@ -79,6 +79,15 @@ def test_nothing_comes_to_rest_where_the_effect_is_off(data, monkeypatch):  # no
 
 
 @pytest.mark.parametrize("motion", ["spline", "dct"])
+def test_what_moves_does_not_come_to_rest(data, motion):  # noqa: F811
+    method = module_with(data, motion=motion, background=0.01).method
+    method.nodes.shift.data.normal_()
+    come_to_rest(method, 0.01)
+    assert not bool(method.nodes.still.any())
+    assert not bool(method.resting.any())
+
+
+@pytest.mark.parametrize("motion", ["spline", "dct"])
 def test_a_node_that_stops_stays(data, motion):  # noqa: F811
     nodes = module_with(data, motion=motion, background=0.01).method.nodes
     nodes.shift.data.normal_()

@@ -121,13 +121,8 @@ class Particles(Method):
 
     def _grows(self) -> tuple[str, ...]:
         names = ["means", "log_scales", "turns", "opacity", "color", "shade", "tint", "fade"]
-        names += [
-            "pulled",
-            "shown",
-            "idle",
-            "resting",
-            *(["links", "shares"] if self.nodes is not None else []),
-        ]
+        names += ["pulled", "shown", "idle", "resting"]
+        names += [] if self.nodes is None else ["links", "shares"]
         return tuple(name for name in names if getattr(self, name) is not None)
 
     @property

@@ -21,11 +21,12 @@ def come_to_rest(method: Method, least: float) -> None:
     be kept rigid with it.
 
     Args:
-        method: has ``nodes``, ``means``, ``turns``, ``links``, ``shares`` and ``resting`` (N,) bool.
+        method: has ``ends`` (the first and the last time), ``nodes``, ``means``, ``turns``, ``links``,
+            ``shares`` and ``resting`` (N,) bool.
         least: the distance.
     """
     nodes = method.nodes
-    times = torch.linspace(*nodes.seen.tolist(), _TIMES).tolist()
+    times = torch.linspace(*method.ends, _TIMES).tolist()
     nodes.stop(nodes.reach_of(times) < least, times)
     free = nodes.still[method.links.long()].all(-1) & ~method.resting
     if not bool(free.any()):
