@@ -3,10 +3,10 @@
 from dataclasses import replace
 
 import pytest
-from forewarp.metrics.gain import Gain
 
 from forewarp.methods.effect import Asked, Begin, Drop, Evidence
 from forewarp.methods.particles.planning import EFFECTS, ParticlesPlanning
+from forewarp.metrics.gain import Gain
 from forewarp.scene.pictures import Pictures
 
 PICTURES = Pictures(frames=50, times=50, cut_out=0.8, spread=160.0, disagreement=0.2)
