@@ -1,3 +1,4 @@
+import importlib
 from dataclasses import replace
 from functools import partial
 
@@ -228,3 +229,33 @@ def test_two_views_of_a_time_count_as_one_step(data):
     one, two = (module.method.look(b, {"photo": 1.0}, module.generator) for b in (batch, twice))
     assert float(one.terms["photo"]()) == pytest.approx(float(two.terms["photo"]()), rel=1e-5)
     torch.testing.assert_close(one.gradients["means"], two.gradients["means"], rtol=1e-3, atol=1e-6)
+
+
+def test_the_first_steps_meet_warm_kernels_only(data, monkeypatch):
+    numba = pytest.importorskip("numba")
+    met = set()
+
+    def watched(name, kernel):
+        def call(*arguments):
+            met.add((name, *(str(numba.typeof(a)) for a in arguments)))
+            return kernel(*arguments)
+
+        return call
+
+    for part in ("project", "tiles", "rasterize", "chain", "nodes", "adam"):
+        home = importlib.import_module(f"forewarp.ops.kernels_{part}")
+        for name, kernel in list(vars(home).items()):
+            if hasattr(kernel, "py_func") and kernel.py_func.__module__ == home.__name__ and name[0] != "_":
+                monkeypatch.setattr(home, name, watched(name, kernel))
+    module = module_with(data, **EVERY)
+    module.method.warm_up()
+    warm = met.copy()
+    met.clear()
+    optimizer = module.configure_optimizers()
+    look(module, data)
+    for group in optimizer.param_groups:
+        for p in group["params"]:
+            p.grad = torch.ones_like(p)
+    optimizer.step()
+    assert len(met) > 5
+    assert met <= warm
