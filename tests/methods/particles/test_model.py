@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from forewarp.methods.effect import switched
+from forewarp.methods.method import Start
 from forewarp.methods.particles import model
 from forewarp.methods.particles.model import Particles
 from forewarp.methods.particles.settings import Numbers
@@ -259,3 +260,9 @@ def test_the_first_steps_meet_warm_kernels_only(data, monkeypatch):
     optimizer.step()
     assert len(met) > 5
     assert met <= warm
+
+
+def test_a_stage_has_as_many_particles_as_its_own_density_says(data):
+    first = module_with(data).method
+    start = Start(data.scene, "fine", {"density": 2 * first.numbers_of.density}, range(3), before=first)
+    assert int(Particles(start).most) == pytest.approx(2 * int(first.most), abs=1)

@@ -57,7 +57,7 @@ class Particles(Method):
         self.numbers_of = Numbers(**start.numbers)
         self.canonical_time, self.width = start.scene.canonical_time, width
         self.pinholes = Pinholes(blur)
-        times = start.scene.times
+        self.views, times = len(start.scene.train), start.scene.times
         on = Effects(**choices).only(self.numbers_of.effects, len(times))
         self.ends = min(times), max(times)
         self.progress, self._optimizer = 0.0, None
@@ -85,7 +85,7 @@ class Particles(Method):
     def _measured(self, start: Start) -> dict[str, Tensor]:
         """The first values of every parameter; notes what follows from the pictures, too."""
         covered = covered_pixels(start.scene, list(start.frames))
-        most = self.numbers_of.most(covered, len(start.scene.train))
+        most = self.numbers_of.most(covered, self.views)
         cloud = first_points(start, round(self.numbers_of.first * most))
         away = (cloud.points - cloud.points.median(0).values).norm(dim=-1).median()
         extent = float(away) or start.scene.box.diagonal
@@ -102,7 +102,9 @@ class Particles(Method):
     def _make(self, before: Particles | None, fresh: dict[str, Tensor] | None, on: Effects) -> None:
         """Give every parameter its first value: of the stage before, fresh ones, or none at all."""
         if before is not None:
-            self._scalars(float(before.covered), float(before.extent), int(before.most))
+            covered = float(before.covered)
+            most = self.numbers_of.most(covered, self.views)  # by this stage's own density
+            self._scalars(covered, float(before.extent), most)
             first = {name: p.data.clone() for name, p in before.named_parameters(recurse=False)}
         elif fresh is not None:
             first = fresh
