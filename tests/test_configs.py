@@ -11,6 +11,7 @@ from omegaconf import OmegaConf
 
 from forewarp.data import dnerf, hypernerf, nhr, posed_video
 from forewarp.data.module import SceneDataModule
+from forewarp.methods.particles.effects import Effects
 from forewarp.methods.voxel.effects.inpaint import UNet3d
 from forewarp.methods.voxel.effects.upsample import LearnedUpsampler
 from forewarp.methods.voxel.effects.view_dependence import SphericalHarmonics, ViewNetwork
@@ -30,6 +31,16 @@ ELSEWHERE = {"preset", "model", "experiment", "stage", "objective", "data", "sce
 ELSEWHERE |= {"callbacks", "hydra", "paths"}
 DEFAULTS = {("capture", "cut_out"), ("logger", "tensorboard"), ("trainer", "auto")}
 DEFAULTS |= {("model/renderer", "march")}
+VOXELS = {"model/motion", "model/view_dependence", "model/background"}  # also groups of voxel methods
+OF_PARTICLES = [
+    ("model/motion", "spline"),
+    ("model/motion", "cosines"),
+    ("model/rotation", "nodes"),
+    ("model/view_dependence", "harmonics"),
+    ("model/color_over_time", "cosines"),
+    ("model/opacity_over_time", "cosines"),
+    ("model/background", "still"),
+]
 CHOICES = {(group, option) for group in groups() if group not in ELSEWHERE for option in options(group)}
 CHOICES = sorted(CHOICES - DEFAULTS)
 OFF = [("inpainter", "unet3d"), ("upsampler", "learned"), ("view_dependence", "mlp"), ("motion", "dct")]
@@ -51,10 +62,28 @@ def method_of(model, frames=4):
 
 @pytest.mark.parametrize(("group", "option"), CHOICES)
 def test_every_option_composes_and_instantiates(group, option):
-    run = run_of(f"{group}={option}")
+    of_particles = (group, option) in OF_PARTICLES or group in {of for of, choice in OF_PARTICLES} - VOXELS
+    run = run_of(f"{group}={option}", *(["model=particles"] if of_particles else []))
     assert [stage.settings.name for stage in run.stages] == ["coarse", "fine"]
-    if group.startswith("model/"):
+    if group.startswith("model/") and not of_particles:
         assert isinstance(method_of(run.model), torch.nn.Module)
+
+
+def test_effects_of_particles_are_switched_one_by_one():
+    off = [f"{group}=none" for group, _ in OF_PARTICLES]
+    assert set(run_of("model=particles", *off).model.keywords.values()) == {None}
+    for group, option in OF_PARTICLES:
+        given = run_of("model=particles", *off, f"{group}={option}").model.keywords
+        on = {name: choice for name, choice in given.items() if choice is not None}
+        assert on.keys() == {group.removeprefix("model/")}
+        assert Effects(**given)
+    assert run_of("model=particles", "capture=video").model.keywords["view_dependence"] is None
+
+
+def test_an_effect_of_voxels_is_refused_by_particles():
+    given = run_of("model=particles", "model/view_dependence=mlp").model.keywords
+    with pytest.raises(ValueError, match="model.view_dependence: expected a degree of 1 to 3, or null, but"):
+        Effects(**given)
 
 
 @pytest.mark.parametrize("name", [path.stem for path in CONF.glob("*.yaml")])

@@ -110,8 +110,9 @@ def test_renamed_keys_of_ones_own_files_are_named(refused, in_tmp, name):
         assert refused(name, "--config-dir", ".", "experiment=mine") == f"{line} renamed in 0.3"
 
 
-def test_a_method_of_today_may_have_a_key_that_another_had(refused, in_tmp):
-    assert refused("train", "model=particles", "model.view=1", "seeds=2").startswith("seeds: ")
+def test_a_renamed_key_is_named_whatever_the_method(refused, in_tmp):
+    said = refused("train", "model=particles", "model.view=1")
+    assert said == "model.view=1: expected model.view_dependence=1; renamed in 0.3"
 
 
 @pytest.mark.parametrize(("name", "key"), [("evaluate", "run"), ("render", "run"), ("train", "resume")])

@@ -8,6 +8,7 @@ from forewarp.fields.radiance import DirectRadiance
 from forewarp.fields.trajectory import TrajectoryField
 from forewarp.methods.method import Method, Start
 from forewarp.methods.particles.model import Particles
+from forewarp.methods.particles.nodes import Nodes
 from forewarp.methods.tnerf import TNeRF
 from forewarp.methods.voxel.backward_warp import Deformation
 from forewarp.methods.voxel.effects.background import StaticBackground, Together
@@ -23,11 +24,13 @@ class Effect:
     """An optional part of a method.
 
     ``on`` are the model's fields that switch it on (None is off). ``parts`` are pairs of a class and a
-    function name: none is called with the effect off, at least one with it on.
+    function name: none is called with the effect off, at least one with it on. The names of its parameters
+    begin with ``owns``; None: with its own name.
     """
 
     on: Mapping[str, object]
     parts: tuple[tuple[type, str], ...]
+    owns: str | None = None
 
 
 @dataclass(frozen=True)
@@ -82,6 +85,11 @@ WARP = {
     ),
     "background": BACKGROUND,
 }
+OF_PARTICLES = {
+    "motion": Effect({"motion": "spline"}, ((Nodes, "carried"), (Nodes, "spread_over_time")), "nodes"),
+    "color_over_time": Effect({"color_over_time": 1}, ((Particles, "tints"),), "tint"),
+    "opacity_over_time": Effect({"opacity_over_time": 1}, ((Particles, "fades"),), "fade"),
+}
 SMALL_NETWORK = {"width": 32, "layers": 3, "skip": None, "position_frequencies": 4}
 SMALL_NETWORK |= {"time_frequencies": 2, "samples": 16, "fine_samples": 16}
 
@@ -98,11 +106,19 @@ METHODS = {
         steps=150,
     ),
     "particles": Entry(
-        partial(Particles, tints=1, fades=1),
+        partial(
+            Particles,
+            motion="spline",
+            rotation=True,
+            view_dependence=1,
+            color_over_time=1,
+            opacity_over_time=1,
+        ),
         {"means": 1.5e-3, "log_scales": 5e-3, "turns": 3e-3, "opacity": 5e-2, "color": 3e-2, "shade": 1e-3}
         | {"tint": 1e-3, "fade": 3e-3, "shifts": 7e-3, "node_turns": 8e-3},
         {"photo": 1.0, "rigid": 3.0, "smooth": 0.1},
         {"every": 0.05, "settled": 0.9, "finals": {"means": 0.1}},
         steps=150,
+        effects=OF_PARTICLES,
     ),
 }

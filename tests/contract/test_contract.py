@@ -4,7 +4,7 @@ import multiprocessing
 import os
 import signal
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import pytest
@@ -162,9 +162,14 @@ def test_a_term_of_weight_zero_is_never_called(name, scenes):
         assert off not in raw
 
 
+def with_options(model, options):
+    """Return a model with other options."""
+    return partial(model, **options) if isinstance(model, partial) else replace(model, **options)
+
+
 def full_model(entry):
     """Return the model with all its effects."""
-    return replace(entry.model, **{k: v for e in entry.effects.values() for k, v in e.on.items()})
+    return with_options(entry.model, {k: v for e in entry.effects.values() for k, v in e.on.items()})
 
 
 @each_effect
@@ -173,10 +178,10 @@ def test_an_effect_that_is_off_is_absent_and_one_that_is_on_is_called(name, effe
     part = entry.effects[effect]
     for of, function in part.parts:
         monkeypatch.setattr(of, function, lambda *a, at=f"{of.__name__}.{function}", **k: pytest.fail(at))
-    module = module_of(entry, data, model=replace(full_model(entry), **dict.fromkeys(part.on)))
+    module = module_of(entry, data, model=with_options(full_model(entry), dict.fromkeys(part.on)))
     data.picker = lambda: TIMES - 1  # a time at which things have moved
     backward(module, batch_of(data))
-    assert not [key for key in module.method.state_dict() if key.startswith(effect)]
+    assert not [key for key in module.method.state_dict() if key.startswith(part.owns or effect)]
     module = module_of(entry, data, model=full_model(entry))
     with pytest.raises(pytest.fail.Exception):
         backward(module, batch_of(data))

@@ -161,6 +161,7 @@ BAD = {
         (FRAMES, {"frames.1.file_path": "./images/frame_1.png"}, "expected each image once, but got imag"),
         (FRAMES, {"frames.1.mask_path": "images/frame_1.png"}, "mask_path: expected one in all .*1 of"),
         (FRAMES, lambda c: [e.update(mask_path="m.png") for e in c["frames"]], "m.png: expected 30 x 20 "),
+        (FRAMES, lambda c: [e.update(mask_path="../x.png") for e in c["frames"]], f"mask_path: {OUT}"),
         (FRAMES, {"frames.1.time": 0.5}, "frames: time: expected one in all .*1 of 10"),
         (FRAMES, {"frames.1.time": 3}, r"frames\[1\].time: expected a number in \[0, 1\], but got 3"),
         (FRAMES, {"fl_x": GONE}, r"frames\[0\].fl_x: expected a number in .*got None"),

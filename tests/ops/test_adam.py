@@ -31,13 +31,14 @@ def test_it_is_adam_where_every_row_has_a_gradient(backend, shape):
 @pytest.mark.parametrize("rows", [6, 32])
 def test_rows_without_a_gradient_stay_as_they_are(backend, rows):
     parts, gradient = state((rows, 3)), torch.ones(rows, 3)
+    step(parts, gradient)
     gradient[2] = 0
     gradient[4, :2] = 0  # a part of it has one
     before = [part.clone() for part in parts]
     step(parts, gradient)
     for now, then in zip(parts, before):
         assert torch.equal(now[2], then[2])
-    assert parts[3].tolist() == [1, 1, 0, 1, 1, 1] + [1] * (rows - 6)
+    assert parts[3].tolist() == [2, 2, 1, 2, 2, 2] + [2] * (rows - 6)
     torch.testing.assert_close(parts[0][0], before[0][0] - 0.1)
 
 
@@ -73,3 +74,19 @@ def test_not_a_number_is_kept(backend):
     gradient[3, 1] = float("nan")
     step(parts, gradient)
     assert bool(parts[0][3, 1].isnan())
+
+
+def test_moments_of_another_shape_are_refused(backend):
+    value, mean, square, steps = state((200, 3))
+    with pytest.raises(ValueError, match="exp_avg: expected shape"):
+        step((value, mean[:1], square[:1], steps), torch.ones(200, 3))
+    with pytest.raises(ValueError, match="steps: expected shape"):
+        step((value, mean, square, steps[:5]), torch.ones(200, 3))
+
+
+@pytest.mark.parametrize("count", [-1e9, -5000.0, float("nan"), 1e30])
+def test_any_count_of_steps_stays_within_the_table(count):
+    parts = state((32, 3))
+    parts[3].fill_(count)
+    step(parts, torch.ones(32, 3))
+    assert bool(parts[0].isfinite().all())

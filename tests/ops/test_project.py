@@ -80,6 +80,18 @@ def test_gradients_of_kernel_equal_those_of_the_reference(lens):
         assert float((exact - fast).norm() / exact.norm()) < 1e-5
 
 
+def test_gradients_do_not_depend_on_how_particles_lie_in_memory():
+    particles, warp, tints, fades = crowd(dtype=torch.float32)
+    found = []
+    for means in (particles.means, particles.means.T.contiguous().T):
+        leaf = means.detach().requires_grad_()
+        splats = project(particles._replace(means=leaf), warp, pinhole(), tints.float(), fades.float())
+        splats.numbers.sum().backward()
+        found.append(leaf.grad)
+    assert float(found[0].norm()) > 0
+    torch.testing.assert_close(found[0], found[1])
+
+
 def test_gradcheck():
     particles, warp, tints, fades = crowd(count=4, degree=0)
 

@@ -69,6 +69,40 @@ def test_a_plan_is_made_once_told_and_fitted(forewarp, ok, words, monkeypatch, i
     assert (fit / "plan.yaml").read_text() == file.read_text()
 
 
+def test_particles_are_planned_by_leaving_effects_out(forewarp, scenes, in_tmp, monkeypatch):
+    """One after the other; what is not missed stays out of all later trials."""
+    missed = {"motion": True, "rotation": False, "opacity_over_time": True}
+    monkeypatch.setattr(
+        "forewarp.methods.effect.Evidence.pays", lambda self, effect: missed.get(effect, False)
+    )
+    typed = [*TINY, "model=particles", f"data.root={scenes}", "data.scene=vehicle"]
+    short = ["plan.steps=4", "plan.trial_steps=8", "plan.seeds=1", "plan.held_out=3"]
+    done = forewarp("plan", *typed, *short, "model/background=none")
+    assert done.status == 0, done.err
+    (file,) = in_tmp.glob("runs/vehicle/plan-*/plan.yaml")
+    made = yaml.safe_load(file.read_text())
+    assert {name for name, decision in made["effects"].items() if decision["on"]} == {
+        "motion",
+        "opacity_over_time",
+    }
+    assert made["effects"]["background"]["because"].startswith("as typed; ")
+    no = ["fine-no-motion", "fine-no-rotation", "fine-no-rotation-no-opacity_over_time"]
+    no += ["fine-no-rotation-no-color_over_time", "fine-no-rotation-no-color_over_time-16"]
+    no += ["fine-no-rotation-no-color_over_time-no-view_dependence-16"]
+    trials = {path.name.removesuffix("-seed0") for path in file.parent.glob("fine*")}
+    assert trials == {"fine", *no}
+    last = yaml.safe_load((file.parent / f"{no[-1]}-seed0" / "config.yaml").read_text())["model"]
+    assert (last["motion"], last["rotation"], last["opacity_over_time"]) == ("spline", None, 4)
+    assert (last["color_over_time"], last["view_dependence"]) == (None, None)
+
+    fitted = forewarp("train", f"plan={file}", "budget.iterations=6", "run=fit", "evaluate=false")
+    assert fitted.status == 0, fitted.err
+    config = yaml.safe_load((in_tmp / "fit" / "config.yaml").read_text())["model"]
+    assert [name for name, choice in config.items() if choice is None] == [
+        *("rotation", "view_dependence", "color_over_time", "background")
+    ]
+
+
 @pytest.mark.slow
 def test_every_question_is_asked_where_all_is_open(ok, words, in_tmp, monkeypatch):
     """No alpha, and evidence that rules nothing out: each effect is tried, with its price."""

@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 import yaml
 
-from forewarp.synth.cameras import random_cameras, stream
+from forewarp.synth.cameras import centers_of, random_cameras, stream
+from forewarp.synth.motions import GROUND
+from forewarp.synth.points import surface_points
 from forewarp.synth.raycast import Posed, camera_rays, light_points, render
-from forewarp.synth.specimens import SPECIMENS
+from forewarp.synth.specimens import _STAY, SPECIMENS
 from forewarp.synth.world import World
 from tests.support.configs import CONF
 
@@ -65,6 +67,46 @@ def test_light_is_thrown_back_in_one_direction():
     assert (seen >= matte - 1e-12).all()
     assert (seen - matte).max() > 0.2
     assert np.median(seen - matte) < 0.1
+
+
+def test_by_daylight_shades_change_and_nothing_else():
+    camera = random_cameras(1, 40, stream(0, 2))[0]
+    (first, near), (last, far) = (render(World("daylight"), time, camera, 1) for time in (0.0, 0.7))
+    np.testing.assert_array_equal(near, far)
+    np.testing.assert_array_equal(first[..., 3], last[..., 3])
+    seen = first[..., 3] > 0
+    assert np.abs(first[seen].astype(int) - last[seen])[:, :3].max(-1).mean() > 10
+
+
+def test_the_light_of_a_day_stands_on_one_side_of_the_globe_and_then_on_the_other():
+    world = World("daylight")
+    for time, side in ((0.0, -1), (1.0, 1)):
+        posed = Posed(world, time)
+        start = np.array([[3.0 * s, 0.0, GROUND + 0.7] for s in (-1, 1)])
+        hits = posed.first_hits(start, np.array([[1.0, 0, 0], [-1.0, 0, 0]]))
+        shade = posed.color(hits, light_points(24, posed.light)) / posed._albedo(hits)
+        bright, dark = (shade[0], shade[1]) if side < 0 else (shade[1], shade[0])
+        assert (bright > dark + 0.1).all()
+
+
+@pytest.mark.parametrize("time", [0.0, 0.4, 0.5, 0.65, 1.0])
+def test_blocks_are_where_they_are_and_nowhere_else(time):
+    there = {n: begin <= time <= end for n, (begin, end) in _STAY.items()}
+    posed = Posed(World("blocks"), time)
+    above = np.array([[0, 0.45, 2.0], [-0.45, 0, 2.0], [0, -0.45, 2.0], [0.45, 0, 2.0]])
+    hits = posed.first_hits(above, np.tile([0.0, 0, -1], (4, 1)))
+    named = [posed.world.parts[posed.world.part_of_face[face]].name for face in hits.face]
+    assert named == [n if there[n] else "plate" for n in ("north", "west", "south", "east")]
+    beside, along = np.array([[-0.6, 0.45, GROUND + 0.2]]), np.array([[1.0, 0, 0]])
+    assert bool(posed.is_free(beside, along)[0]) is not there["north"]
+
+
+def test_points_are_drawn_on_what_is_there_at_first():
+    world = World("blocks")
+    centers = centers_of(random_cameras(6, 8, stream(0, 1)))
+    faces, _ = surface_points(world, 300, centers, stream(0, 2))
+    named = {world.parts[part].name for part in np.unique(world.part_of_face[faces])}
+    assert named == {"plate", "pillar", "north", "west"}
 
 
 def test_the_room_fills_every_picture():

@@ -117,6 +117,13 @@ def test_a_step_meets_warm_kernels_only(monkeypatch):
     assert met <= warm
 
 
+def test_a_missing_rate_is_named():
+    made = module()
+    made.settings = replace(made.settings, lr={k: v for k, v in made.settings.lr.items() if k != "flow"})
+    with pytest.raises(ValueError, match=r"stage.coarse.lr: expected a rate for 'flow', but got \['col"):
+        made.configure_optimizers()
+
+
 def test_random_views_are_rendered_only_for_their_term():
     renderer = CountingRenderer()
     module(weights={"photo": 1.0, "tv_depth": 0.0}, renderer=renderer).training_step(batch(), 0)

@@ -7,7 +7,7 @@ import torch
 
 from forewarp.scene.lens import Lens
 from forewarp.training.bundle import read_bundle
-from forewarp.training.sentinel import BrokenStep, Sentinel, diagnose
+from forewarp.training.sentinel import BrokenStep, Sentinel, diagnose, first_bad
 from tests.support.tiny_scene import INPAINTER, ball_data, forward_model, make_run, stage
 
 NAN = float("nan")
@@ -219,3 +219,9 @@ def test_a_bundle_with_a_wrong_part_is_refused_in_one_line(stopped, tmp_path, na
 def test_a_skip_below_zero_is_refused():
     with pytest.raises(ValueError, match="sentinel.skip: expected a whole number of steps >= 0, but got -1"):
         Sentinel(".", skip=-1)
+
+
+def test_a_gradient_whose_square_overflows_is_bad():
+    large = [("a", torch.ones(3)), ("b", torch.tensor([1e20]))]
+    assert first_bad(large) is None
+    assert first_bad(large, squared=True) == "b"

@@ -33,8 +33,10 @@ def refused(path: Path, what: str) -> Iterator[None]:
         yield
     except OSError as error:
         raise SceneError(f"{path}: expected {what}, but got {error.strerror or error}") from error
+    except SceneError:
+        raise
     except ValueError as error:
-        raise error if isinstance(error, SceneError) else SceneError(str(error)) from error
+        raise SceneError(str(error)) from error
 
 
 @contextmanager

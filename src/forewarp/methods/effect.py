@@ -21,9 +21,10 @@ class Effect:
     Attributes:
         name: name of the config group ``model/<name>``.
         on, off: the usual options that switch it on and off.
-        attribute: the method's attribute that is None while the effect is off; by default ``name``.
+        attribute: the method's attribute, perhaps a dotted name, that is None while the effect is off; by
+            default ``name``.
         later: True: decide it after the coarse stage, by a trial with and without it. False: decide it by
-            comparing coarse stages.
+            what ``Planning.coarse`` asks for.
         rules_out: returns True if the evidence makes a trial of a ``later`` effect pointless.
         with_it: returns further overrides, for the final run to be as its trial was.
     """
@@ -43,7 +44,10 @@ class Effect:
 
     def is_on(self, method: Method) -> bool:
         """Return whether the effect is on in a method."""
-        return getattr(method, self.attribute or self.name, None) is not None
+        found = method
+        for name in (self.attribute or self.name).split("."):
+            found = getattr(found, name, None)
+        return found is not None
 
 
 def switched(method: Method) -> dict[str, bool]:
@@ -167,10 +171,30 @@ class Rival:
     adds: bool = False
 
 
+@dataclass(frozen=True)
+class Drop:
+    """Continue the coarse stage with and, by ``overrides``, without an effect, at equal steps, seed by seed.
+
+    If the effect is not missed, all later trials do without it. The answer is whether it pays. ``longer``:
+    how many times the usual steps.
+    """
+
+    effect: str
+    overrides: Sequence[str]
+    longer: int = 1
+
+
 class Planning(Protocol):
-    """How a method's effects are decided: the attribute ``planning`` of its model."""
+    """How a method's effects are decided: the attribute ``planning`` of its model.
+
+    ``steps`` and ``trial_steps`` are the steps of a coarse stage and of a trial, and ``least`` the gain (dB)
+    below which an effect does not count, unless the user says.
+    """
 
     effects: Sequence[Effect]
+    steps: int
+    trial_steps: int
+    least: float
 
     def evidence(self, pictures: Pictures, **bounds) -> Evidence:
         """Begin the evidence with what the images say."""
@@ -178,8 +202,8 @@ class Planning(Protocol):
     def always(self, asked: Asked) -> tuple[Sequence[str], Sequence[str]]:
         """Return the overrides of every trial, and the additional ones of fine trials."""
 
-    def coarse(self, evidence: Evidence, asked: Asked) -> Generator[Begin | Rival, bool | None, None]:
-        """Yield the coarse stages to fit, one by one; receive for each rival whether its effect pays."""
+    def coarse(self, evidence: Evidence, asked: Asked) -> Generator[Begin | Rival | Drop, bool | None, None]:
+        """Yield what to fit, one by one; receive for each rival and each drop whether its effect pays."""
 
     def look(
         self, evidence: Evidence, method: Method, scene: Scene, targets: Sequence[Target], asked: Asked

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from forewarp.ops.backend import match_threads, use_numba
+from forewarp.ops.checks import check_shape
 
 
 def adam_rows(
@@ -22,8 +23,14 @@ def adam_rows(
         steps: (...,) float32, how many steps each row has made.
         rate, betas, eps: as of Adam.
 
-    Cost: one look at the gradients, five numbers moved for each that is not passed over.
+    Raises:
+        ValueError: for shapes that do not go together, as an altered checkpoint may have.
+
+    Cost: one look at the gradients; five numbers moved for each of sixteen rows of which one has a gradient.
     """
+    for name, part in (("gradient", gradient), ("exp_avg", mean), ("exp_avg_sq", square)):
+        check_shape(name, part, tuple(value.shape))
+    check_shape("steps", steps, tuple(value.shape[:-1]))
     fast = use_numba(value) and value.dtype == torch.float32 and value.is_contiguous()
     if fast:
         from forewarp.ops import kernels_adam

@@ -134,9 +134,9 @@ def _compare_numba(
     by_splat = torch.empty(whole(len(seen)), kernels_chain.SLOPES)
     pull = torch.zeros(len(particles.means))
     kernels_chain.slopes_of(splats.numpy(), seen, ranks, sums.numpy(), factor, by_splat.numpy(), pull.numpy())
-    gradients = [torch.zeros_like(t) for t in particles]
+    gradients = [torch.zeros(t.shape) for t in particles]
     maps = torch.zeros(threads, *padded.shape)
-    weights = torch.zeros_like(warp.weights) if by_weights else warp.weights.new_zeros(0, 0)
+    weights = torch.zeros(warp.weights.shape) if by_weights else warp.weights.new_zeros(0, 0)
     kernels_chain.chain(*inputs, splats.numpy(), seen, by_splat.numpy(), *arrays(*gradients, maps, weights))
     loss, squared = found.sum(0).tolist()
     return Compared(

@@ -53,7 +53,7 @@ def adam(value, gradient, mean, square, steps, rate, first, second, eps, bias):
                 if _seen(gradient, row, width):
                     any_seen = True
                     steps[row] += np.float32(1)
-                    n = min(int(steps[row]), KNOWN)
+                    n = max(0, min(int(steps[row]), KNOWN))
                     pace, scale = whole * bias[n, 0], bias[n, 1]
                 for c in range(width):
                     paces[width * lane + c], scales[width * lane + c] = pace, scale
@@ -72,7 +72,7 @@ def adam(value, gradient, mean, square, steps, rate, first, second, eps, bias):
         if not _seen(gradient, row, width):
             continue
         steps[row] += np.float32(1)
-        n = min(int(steps[row]), KNOWN)
+        n = max(0, min(int(steps[row]), KNOWN))
         for i in range(row * width, (row + 1) * width):
             g = gradient[i]
             mean[i], square[i] = b1 * mean[i] + c1 * g, b2 * square[i] + c2 * g * g

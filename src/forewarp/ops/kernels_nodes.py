@@ -81,7 +81,7 @@ def carry(shift, turn, basis, places, motion, maps):
             maps[m, 9 + r] = rest
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def spread(value, slope, basis, bend, gradient, factor, scale):
     """Fill ``gradient`` (M, K, 3); returns the mean of the squared bend. See ``nodes.spread_nodes``."""
     total, many = 0.0, 3 * value.shape[0]

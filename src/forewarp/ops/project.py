@@ -275,9 +275,9 @@ class _Project(torch.autograd.Function):
 
         shares = match_threads()
         *inputs, out = ctx.saved_tensors
-        found = [torch.zeros_like(t) for t in inputs[:5]]
+        found = [torch.zeros(t.shape) for t in inputs[:5]]
         maps = inputs[5].new_zeros(shares, *inputs[5].shape)
-        weights = torch.zeros_like(inputs[7])
+        weights = torch.zeros(inputs[7].shape)
         order = (out[:, 10] > 0).nonzero()[:, 0].int()
         rows = slopes.new_zeros(whole(len(order)), kernels_chain.SLOPES)
         rows[: len(order), : slopes.shape[1]] = slopes[order.long()]

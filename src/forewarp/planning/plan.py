@@ -22,6 +22,7 @@ from forewarp.scene.frame import Scene
 # Keys that do not change what a run computes.
 NOT_OF_IT = ("effects", "plan", "run", "evaluate", "sheets", "planned", "trust", "score")
 LEAST = {"steps": 1, "trial_steps": 1, "seeds": 1, "held_out": 2}  # whole numbers
+OF_METHOD = ("steps", "trial_steps", "least")  # null: as the method has it
 AMOUNTS = ("seconds", "trial_seconds", "minutes", "least")
 
 
@@ -61,9 +62,9 @@ def make_plan(config: DictConfig, overrides: Sequence[str]) -> dict:
     trials = Trials(
         typed,
         folder,
-        steps=config.plan.steps,
+        steps=config.plan.steps or planning.steps,
         seconds=config.plan.seconds,
-        fine_steps=config.plan.trial_steps,
+        fine_steps=config.plan.trial_steps or planning.trial_steps,
         fine_seconds=config.plan.trial_seconds,
         held_out=spared(run.datamodule.scene, config.plan.held_out),
         tell=lambda name: print(f"{folder / name}", flush=True),
@@ -116,9 +117,11 @@ def refuse(config: DictConfig, typed: Sequence[str]) -> None:
     if any(one.startswith("~") for one in typed) or len(config.stage) < 2:
         raise ValueError("stage: expected a coarse stage and another, but got one; leave out ~stage.<name>")
     for key, least in LEAST.items():
-        if not (isinstance(config.plan[key], int) and config.plan[key] >= least):
-            raise ValueError(f"plan.{key}: expected a whole number >= {least}, but got {config.plan[key]}")
+        value = config.plan[key]
+        if not (isinstance(value, int) and value >= least) and not (value is None and key in OF_METHOD):
+            raise ValueError(f"plan.{key}: expected a whole number >= {least}, but got {value}")
     for key in AMOUNTS:
         value = config.plan[key]
-        if not (isinstance(value, int | float) and value > 0) and not (key == "minutes" and value is None):
+        free = value is None and key in ("minutes", *OF_METHOD)
+        if not (isinstance(value, int | float) and value > 0) and not free:
             raise ValueError(f"plan.{key}: expected a number > 0, but got {value}")

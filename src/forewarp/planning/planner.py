@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict, fields, is_dataclass, replace
-from functools import partial
 
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from forewarp.methods.effect import Asked, Begin, Decision, Effect, Planning, Rival
+from forewarp.methods.effect import Asked, Begin, Decision, Drop, Effect, Planning, Rival
 from forewarp.planning.trials import Trial, Trials, gain
 from forewarp.runs.overrides import key_of, merged
 from forewarp.scene.frame import Scene
@@ -39,7 +38,8 @@ class Planner:
         # An effect of the last stage costs time of the last stage only.
         shares = [stage.share for stage in stages.values()]
         minutes = self.settings.minutes and self.settings.minutes * shares[-1] / sum(shares)
-        self.evidence = planning.evidence(survey(scene), least=self.settings.least, minutes=minutes)
+        least = self.settings.least or planning.least
+        self.evidence = planning.evidence(survey(scene), least=least, minutes=minutes)
 
     def plan(self) -> dict:
         """Return the plan, without seconds: overrides, effects with reasons, evidence."""
@@ -67,12 +67,14 @@ class Planner:
             if isinstance(wanted, Begin):
                 overrides = list(wanted.overrides)
                 answer = self._use(wanted.name, merged(self.base, overrides) if wanted.change else overrides)
+            elif isinstance(wanted, Drop):
+                answer = self._drop(wanted)
             else:
                 answer = self._rival(wanted)
 
     def _use(self, name: str, overrides: list[str]) -> None:
         """Fit the coarse stage that evidence is taken from and fine trials begin from."""
-        self.name, self.base = name, overrides
+        self.name, self.base, self.name_of_trial = name, overrides, "fine"
         self.reached, self.run, self.module = self.trials.coarse(name, overrides)
 
     def _rival(self, wanted: Rival) -> bool:
@@ -88,31 +90,60 @@ class Planner:
 
     def _try_fine(self) -> None:
         """Try each undecided effect in the fine stage: with and without the effect, at equal steps."""
-        evidence, tried = self.evidence, partial(self._tried, "fine", self.base, 0)
+        evidence = self.evidence
         asked = [
             effect
             for effect in self.effects.values()
             if effect.later and effect.group not in self.asked.typed and not effect.rules_out(evidence)
         ]
-        if asked and evidence.minutes is not None:
-            plain = tried()
-            half = self._tried("fine-half", self.base, 0, max(1, plain.steps // 2))
-            evidence.slope, evidence.steps = gain([plain], [half]).psnr, plain.steps
-            evidence.step = plain.step
+        if asked:
+            self._price_of_steps()
         for effect in asked:
             choice = f"{effect.group}={self._choose(effect.name)}"
-            self._try(effect.name, merged(self.base, [choice]))
+            self._try(effect.name, (f"fine-{effect.name}", merged(self.base, [choice])), ("fine", self.base))
 
-    def _try(self, effect: str, overrides: list[str]) -> None:
-        """Try an effect seed by seed; stop once the gain is clearly below ``plan.least``."""
+    def _drop(self, wanted: Drop) -> bool:
+        """Try to do without an effect; go on without it unless it is missed."""
+        self._price_of_steps()
+        with_it = self.name_of_trial, self.base
+        without = f"{self.name_of_trial}-no-{wanted.effect}", merged(self.base, wanted.overrides)
+        longer = None if wanted.longer == 1 else wanted.longer * self.trials.fine_steps
+        self._try(wanted.effect, with_it, without, longer)
+        pays = self.evidence.pays(wanted.effect)
+        if not pays:
+            self.name_of_trial, self.base = without
+        return pays
+
+    def _price_of_steps(self) -> None:
+        """Measure once what steps are worth, if the planned run has given minutes."""
+        evidence = self.evidence
+        if evidence.minutes is None or evidence.step is not None:
+            return
+        plain = self._tried("fine", self.base, 0)
+        half = self._tried("fine-half", self.base, 0, max(1, plain.steps // 2))
+        evidence.slope, evidence.steps, evidence.step = gain([plain], [half]).psnr, plain.steps, plain.step
+
+    def _try(
+        self,
+        effect: str,
+        with_it: tuple[str, list[str]],
+        without: tuple[str, list[str]],
+        steps: int | None = None,
+    ) -> None:
+        """Compare two trials, each a name and overrides, seed by seed; stop once the gain is clearly below
+        ``plan.least``. ``steps``: of both; None: the usual number.
+        """
+        if steps is not None:
+            with_it, without = ((f"{name}-{steps}", overrides) for name, overrides in (with_it, without))
         on, off = [], []
         for seed in range(self.settings.seeds):
-            on.append(self._tried(f"fine-{effect}", overrides, seed, on[0].steps if on else None))
-            off.append(self._tried("fine", self.base, seed))
+            on.append(self._tried(*with_it, seed, on[0].steps if on else steps))
+            off.append(self._tried(*without, seed, steps))
             if off[-1].steps != on[-1].steps:  # the trial with the effect ran out of time
-                off[-1] = self._tried(f"fine-{on[-1].steps}", self.base, seed, on[-1].steps)
+                name, overrides = without
+                off[-1] = self._tried(f"{name}-{on[-1].steps}", overrides, seed, on[-1].steps)
             found = self.evidence.gains[effect] = gain(on, off)
-            if found.psnr + found.noise < self.settings.least:
+            if found.psnr + found.noise < self.evidence.least:
                 return
 
     def _tried(self, name: str, overrides: list[str], seed: int, steps: int | None = None) -> Trial:

@@ -29,14 +29,14 @@ def surface_points(
         centers: camera centres (C, 3); a point is visible if at least one camera sees it.
         rng: the same state gives the same points.
         time: time at which points must be visible.
-        among: (F,) bool, faces to draw from; None: all.
+        among: (F,) bool, faces to draw from; None: all that are there.
 
     Returns:
         faces (N,) and barycentric coordinates (N, 3), which ``World.points`` places at any time.
     """
     posed = Posed(world, time)
     drawn = _SPARE * count
-    cumulative = np.cumsum(posed.area if among is None else posed.area * among)
+    cumulative = np.cumsum(posed.area * (posed.there if among is None else posed.there & among))
     face = np.searchsorted(cumulative, rng.random(drawn) * cumulative[-1], side="right")
     # The square root makes the density even over the triangle.
     a, b = np.sqrt(rng.random(drawn)), rng.random(drawn)

@@ -41,14 +41,17 @@ class Posed:
 
     def __init__(self, world: World, time: float):
         self.world, self.time = world, time
+        light = world.light(time)
+        self.light, self.there = LIGHT_AT if light is None else light, world.there(time)
         self.corners = world.place(time)[world.faces]  # (F, 3, 3)
         cross = np.cross(self.corners[:, 1] - self.corners[:, 0], self.corners[:, 2] - self.corners[:, 0])
         self.area = 0.5 * np.linalg.norm(cross, axis=-1)
         self.normal = cross / (2 * self.area[:, None])
         self.corner_normal = _corner_normals(world, cross, self.normal)
         self.finish = np.array([(p.material.gloss, p.material.shine) for p in world.parts])
-        self._first = _intersector(self.corners)
-        self._first_blocker = self._first if world.casts.all() else _intersector(self.corners[world.casts])
+        self._first = _intersector(self.corners, self.there)
+        every = bool(world.casts.all())
+        self._first_blocker = self._first if every else _intersector(self.corners, self.there & world.casts)
 
     def first_hits(self, origins: np.ndarray, directions: np.ndarray) -> Hits:
         """Find the first hits of rays from ``origins`` (n, 3) along unit ``directions`` (n, 3)."""
@@ -105,7 +108,7 @@ class Posed:
         """
         gloss, shine = (self.finish[self.world.part_of_face[hits.face], i] for i in (0, 1))
         mirrored = directions - 2 * np.einsum("nd,nd->n", directions, normal)[:, None] * normal
-        cosine = mirrored @ (LIGHT_AT / np.linalg.norm(LIGHT_AT))
+        cosine = mirrored @ (self.light / np.linalg.norm(self.light))
         return gloss * np.clip(cosine, 0, 1) ** shine
 
     def _albedo(self, hits: Hits) -> np.ndarray:
@@ -143,7 +146,7 @@ def render(
     posed = _posed(world, time)
     count = camera.height * camera.width
     total, hit = np.zeros((count, 3)), np.zeros(count)
-    lights = light_points(samples_per_pixel * shadow_rays)
+    lights = light_points(samples_per_pixel * shadow_rays, posed.light)
     for i in range(samples_per_pixel):
         # The R1 sequence covers the pixel evenly with any number of samples; a single sample is the centre.
         offset = ((i + 0.5) / samples_per_pixel, (0.5 + i * 0.6180339887498949) % 1.0)
@@ -175,18 +178,18 @@ def camera_rays(camera: Camera, offset: tuple[float, float] = (0.5, 0.5)) -> tup
     return np.broadcast_to(camera.center.double().numpy(), directions.shape), directions
 
 
-def light_points(count: int) -> np.ndarray:
-    """Place points (count, 3) evenly on the light's disc, which faces the origin.
+def light_points(count: int, at: np.ndarray = LIGHT_AT) -> np.ndarray:
+    """Place points (count, 3) evenly on the disc of a light at a place (3,), which faces the origin.
 
     The points are the same for every pixel, so that shadows look alike from all cameras.
     """
     i = np.arange(count)
     radius, angle = LIGHT_RADIUS * np.sqrt((i + 0.5) / count), 2.399963229728653 * i  # golden angle
-    axis = LIGHT_AT / np.linalg.norm(LIGHT_AT)
+    axis = at / np.linalg.norm(at)
     across = np.cross(axis, (0, 0, 1.0))
     across /= np.linalg.norm(across)
     disc = np.cos(angle)[:, None] * across + np.sin(angle)[:, None] * np.cross(axis, across)
-    return LIGHT_AT + radius[:, None] * disc
+    return at + radius[:, None] * disc
 
 
 def _corner_normals(world: World, cross: np.ndarray, flat: np.ndarray) -> np.ndarray:
@@ -200,8 +203,10 @@ def _corner_normals(world: World, cross: np.ndarray, flat: np.ndarray) -> np.nda
     return normals
 
 
-def _intersector(corners: np.ndarray):
-    """Make a function (origins, directions) -> index (n,) of the first face hit, -1 for none."""
+def _intersector(corners: np.ndarray, some: np.ndarray):
+    """Make a function (origins, directions) -> index (n,) of the first face hit, of those that the mask
+    ``some`` (F,) has; -1 for none.
+    """
     try:
         import trimesh
         from trimesh.ray.ray_pyembree import RayMeshIntersector
@@ -210,12 +215,13 @@ def _intersector(corners: np.ndarray):
             "making a scene: expected the packages trimesh and embreex, but they are missing; "
             "install forewarp[synth]"
         ) from error
-    faces = np.arange(3 * len(corners)).reshape(-1, 3)
-    caster = RayMeshIntersector(trimesh.Trimesh(corners.reshape(-1, 3), faces, process=False))
+    rows = np.append(np.flatnonzero(some), -1)  # the last is what a ray without a hit gets
+    faces = np.arange(3 * (len(rows) - 1)).reshape(-1, 3)
+    caster = RayMeshIntersector(trimesh.Trimesh(corners[some].reshape(-1, 3), faces, process=False))
 
     def first(origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
         if len(origins) == 0:
             return np.zeros(0, dtype=np.int64)
-        return caster.intersects_first(origins, directions)
+        return rows[caster.intersects_first(origins, directions)]
 
     return first

@@ -1,4 +1,4 @@
-"""Six small subjects that each call for one effect beside motion, or for none.
+"""Small subjects that each call for one effect, or for one beside motion, or for none.
 
 A plan made from a specimen's pictures should switch on only the effects that
 ``conf/scene/specimen_<name>.yaml`` lists.
@@ -6,7 +6,7 @@ A plan made from a specimen's pictures should switch on only the effects that
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -30,12 +30,16 @@ class Specimen:
         joints: time in [0, 1] -> each joint's map (4, 4).
         parts: meshes; None: the vehicle's.
         extra: parts beside the vehicle's.
+        light: time -> place of the light (3,); None: it stands still.
+        absent: time -> names of the parts that are not there.
         azimuth, rise: range of camera positions; see ``random_cameras``.
     """
 
     joints: Callable[[float], dict[str, np.ndarray]]
     parts: Callable[[], list[Part]] | None = None
     extra: Callable[[], list[Part]] = list
+    light: Callable[[float], np.ndarray] | None = None
+    absent: Callable[[float], Collection[str]] = lambda time: ()
     azimuth: tuple[float, float] = (0.0, 360.0)
     rise: tuple[float, float] = ELEVATION
 
@@ -109,6 +113,41 @@ def _in_room(time: float) -> dict[str, np.ndarray]:
     return _rigid(time) | {"room": np.eye(4)}
 
 
+def _matte_globe() -> list[Part]:
+    globe, plate = _globe()
+    matte = Material("mosaic", STONES, 0.16)
+    return [replace(globe, material=matte), replace(plate, material=replace(matte, colors=TILES))]
+
+
+def _sun(time: float) -> np.ndarray:
+    """Let the light go halfway round the scene, low above the ground in the middle of its way."""
+    angle = np.radians(-140 + 180 * time)
+    return 5.5 * np.array([0.8 * np.cos(angle), 0.8 * np.sin(angle), 0.6])
+
+
+# From when to when a block is there.
+_STAY = {"north": (0.0, 0.34), "west": (0.0, 0.62), "south": (0.42, 1.0), "east": (0.7, 1.0)}
+
+
+def _blocks() -> list[Part]:
+    """Put four blocks around a pillar on a plate, which each come or go."""
+    plate, pillar = rounded_slab(0.7, 0.2, -0.07, 0.0), box((-0.14, -0.14, 0.0), (0.14, 0.14, 0.7))
+    parts = [
+        Part("plate", "ground", *plate, Material("mosaic", TILES, 0.2)),
+        Part("pillar", "ground", *pillar, Material("mosaic", STONES, 0.14)),
+    ]
+    paint = {"north": LACQUER, "west": STONES, "south": TILES, "east": LACQUER}
+    for name, (x, y) in {"north": (0, 1), "west": (-1, 0), "south": (0, -1), "east": (1, 0)}.items():
+        middle = 0.35 * np.array([x, y, 0.0])
+        solid = box(middle - (0.2, 0.2, 0.0), middle + (0.2, 0.2, 0.42))
+        parts.append(Part(name, "ground", *solid, Material("mosaic", paint[name], 0.13)))
+    return parts
+
+
+def _gone(time: float) -> list[str]:
+    return [name for name, (come, go) in _STAY.items() if not come <= time <= go]
+
+
 SPECIMENS = {
     "still": Specimen(_still),
     "rigid": Specimen(_rigid),
@@ -116,4 +155,6 @@ SPECIMENS = {
     "glossy": Specimen(_globe_joints, _globe),
     "room": Specimen(_in_room, extra=_corner, azimuth=(28.0, 62.0), rise=(0.28, 0.5)),
     "quick": Specimen(_quick),
+    "daylight": Specimen(_globe_joints, _matte_globe, light=_sun),
+    "blocks": Specimen(_globe_joints, _blocks, absent=_gone),
 }

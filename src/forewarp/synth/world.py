@@ -26,7 +26,7 @@ class World:
 
     def __init__(self, motion: str = "lift_tilt", has_room: bool = False):
         self.motion, self.has_room = motion, has_room
-        specimen = SPECIMENS.get(motion)
+        self.specimen = specimen = SPECIMENS.get(motion)
         self.joints = partial(joints, motion) if specimen is None else specimen.joints
         self.parts = vehicle() if specimen is None or specimen.parts is None else specimen.parts()
         self.parts += [] if specimen is None else specimen.extra()
@@ -40,6 +40,15 @@ class World:
         """Place every vertex at any ``time`` in [0, 1]: world positions (V, 3) float64."""
         at = self.joints(time)
         return np.concatenate([p.vertices @ at[p.joint][:3, :3].T + at[p.joint][:3, 3] for p in self.parts])
+
+    def light(self, time: float) -> np.ndarray | None:
+        """Return where the light is (3,); None where it stands still."""
+        return None if self.specimen is None or self.specimen.light is None else self.specimen.light(time)
+
+    def there(self, time: float) -> np.ndarray:
+        """Tell which faces (F,) are there at ``time``."""
+        absent = () if self.specimen is None else self.specimen.absent(time)
+        return np.array([part.name not in absent for part in self.parts])[self.part_of_face]
 
     def points(self, faces: np.ndarray, barycentric: np.ndarray, time: float) -> np.ndarray:
         """Place surface points, given as faces (N,) and barycentric (N, 3), at ``time``: (N, 3)."""

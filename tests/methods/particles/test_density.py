@@ -21,6 +21,9 @@ class Few(nn.Module):
             self.register_buffer(name, torch.zeros(count))
         self.register_buffer("shown", torch.ones(count))
 
+    def most_opaque(self):
+        return self.opacity[:, 0]
+
 
 def optimizer_of(method):
     groups = [{"params": [p], "lr": 1e-3, "name": n} for n, p in method.named_parameters()]

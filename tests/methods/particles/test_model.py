@@ -1,13 +1,19 @@
+import importlib
+from dataclasses import replace
 from functools import partial
 
 import pytest
 import torch
 
+from forewarp.methods.effect import switched
+from forewarp.methods.method import Start
+from forewarp.methods.particles import model
 from forewarp.methods.particles.model import Particles
 from forewarp.methods.particles.settings import Numbers
+from forewarp.methods.particles.start import widths
 from forewarp.scene.view import Moment, View
 from tests.contract.fitting import module_of
-from tests.contract.scenes import data_of, write_dnerf
+from tests.contract.scenes import data_of, write_dnerf, write_hypernerf
 from tests.contract.table import METHODS
 
 ENTRY = METHODS["particles"]
@@ -20,8 +26,13 @@ def data(tmp_path_factory):
     return data_of("dnerf", root)
 
 
+MOVING = {"motion": "spline", "rotation": True, "view_dependence": 1}
+EVERY = MOVING | {"color_over_time": 2, "opacity_over_time": 2, "background": 0.03}
+
+
 def module_with(data, **changes):
-    """A module whose method has these options; ``numbers`` and ``weights`` are its stage's."""
+    """A module of moving particles with these options; ``numbers`` and ``weights`` are its stage's."""
+    changes = MOVING | changes
     of_entry = {key: changes.pop(key) for key in ("numbers", "weights") if key in changes}
     return module_of(ENTRY, data, model=partial(Particles, **changes), **of_entry)
 
@@ -34,7 +45,9 @@ def look(module, data, index=None, factors=None):
     return module.method.look(batch, factors, module.generator)
 
 
-@pytest.mark.parametrize("options", [{}, {"tints": 2, "fades": 2, "view": 2}, {"turns": False}, {"view": 0}])
+@pytest.mark.parametrize(
+    "options", [{}, EVERY | {"view_dependence": 2}, {"rotation": None}, {"view_dependence": None}]
+)
 def test_gradients_are_those_of_autograd(data, options):
     """What a step gives by itself, against the picture's graph; without jitter both see the same time."""
     module = module_with(data, numbers={"jitter": 0.0}, **options)
@@ -59,17 +72,74 @@ def test_gradients_are_those_of_autograd(data, options):
         assert error < 2e-3, name
 
 
-def test_what_is_off_is_absent(data):
-    method = module_with(data, motion="none", view=0).method
-    assert method.nodes is None
+def test_particles_of_opaque_pictures_begin_no_larger_than_they_are_apart_there(data, tmp_path):
+    write_hypernerf(tmp_path / "hypernerf")
+    opaque = data_of("hypernerf", tmp_path)
+    for scene, limited in ((opaque.scene, True), (replace(opaque.scene, has_alpha=True), False)):
+        opaque.scene = scene
+        method = module_with(opaque).method
+        widest = widths(scene, method.means.data, float(method.covered))
+        larger = method.log_scales.data.exp()[:, 0] > 1.001 * widest
+        assert bool(larger.any()) != limited
+
+
+def test_with_all_effects_off_there_are_bare_particles(data):
+    method = module_with(data, **dict.fromkeys(MOVING)).method
     assert not method.moves
-    names = {name for name, _ in method.named_parameters()}
-    assert names == {"means", "log_scales", "turns", "opacity", "color"}
-    assert not {name for name, _ in method.named_buffers()} & {"links", "shares"}
+    assert set(dict(method.named_parameters())) == {"means", "log_scales", "turns", "opacity", "color"}
+    assert not set(dict(method.named_buffers())) & {"links", "shares"}
+    assert set(method.param_groups()) == set(dict(method.named_parameters()))
+    assert set(switched(method).values()) == {False}
+
+
+@pytest.mark.parametrize("effect", EVERY)
+def test_an_effect_that_is_off_is_absent_and_the_others_are_there(data, effect):
+    method = module_with(data, **EVERY | {effect: None}).method
+    gone = {effect} | ({"rotation", "background"} if effect == "motion" else set())
+    assert {name for name, on in switched(method).items() if not on} == gone
+
+
+def test_operators_get_nothing_of_what_is_off(data, monkeypatch):
+    seen = {}
+
+    def spied(name):
+        kept = getattr(model, name)
+
+        def spy(*given, **named):
+            seen[name] = given
+            return kept(*given, **named)
+
+        monkeypatch.setattr(model, name, spy)
+
+    spied("compare")
+    look(module_with(data, **dict.fromkeys(MOVING)), data)
+    particles, warp, _, tints, fades, *_ = seen["compare"]
+    assert particles.colors.shape[1] == particles.opacity.shape[1] == warp.links.shape[1] == 1
+    assert (len(tints), fades.tolist(), int(warp.weights.count_nonzero())) == (0, [1.0], 0)
+    look(module_with(data, **EVERY), data)
+    particles, warp, _, tints, fades, *_ = seen["compare"]
+    assert (particles.colors.shape[1], particles.opacity.shape[1], warp.links.shape[1]) == (6, 3, 4)
+    assert (len(tints), len(fades)) == (2, 3)
+
+
+def test_a_stage_uses_the_effects_that_it_names(data):
+    module = module_with(data, **EVERY, numbers={"effects": ["rotation", "color_over_time"]})
+    on = {name for name, is_on in switched(module.method).items() if is_on}
+    assert on == {"color_over_time"}  # nothing turns that does not move
+
+
+def test_what_appears_later_is_not_thrown_away(data):
+    module = module_with(data, **EVERY, numbers={"every": 0.1})
+    method, optimizer = module.method, module.configure_optimizers()
+    method.opacity.data.fill_(-20.0)
+    method.fade.data[:3, 0] = -15.0  # the first cosine falls from 0 to -2
+    assert (method.most_opaque() > 0).nonzero()[:, 0].tolist() == [0, 1, 2]
+    method.advance(0.15, 1, optimizer)
+    assert len(method.means) == 3
 
 
 def test_without_motion_its_terms_are_none(data):
-    step = look(module_with(data, motion="none"), data)
+    step = look(module_with(data, motion=None), data)
     assert step.terms["rigid"]() is None
     assert step.terms["smooth"]() is None
 
@@ -105,7 +175,8 @@ def test_rates_fall_each_by_itself(data):
 
 
 def test_particles_grow_to_what_the_pictures_call_for(data):
-    module = module_with(data, numbers={"every": 0.1, "first": 0.5, "settled": 1.0})
+    numbers = {"every": 0.1, "first": 0.5, "settled": 1.0, "density": 400.0}  # some hundreds, of 6 pictures
+    module = module_with(data, numbers=numbers)
     method, optimizer = module.method, module.configure_optimizers()
     assert len(method.means) == round(0.5 * float(method.most))
     for number in range(1, 10):
@@ -118,9 +189,20 @@ def test_particles_grow_to_what_the_pictures_call_for(data):
 @pytest.mark.parametrize(
     ("changes", "text"),
     [
-        ({"view": 4}, "view of 0 to 3"),
-        ({"tints": -1}, "tints >= 0"),
-        ({"motion": "wobble"}, "model.motion: expected spline, dct or none, but got 'wobble'"),
+        ({"view_dependence": 4}, "model.view_dependence: expected a degree of 1 to 3, or null, but got 4"),
+        (
+            {"color_over_time": 0},
+            "model.color_over_time: expected a number of cosines >= 1, or null, but got 0",
+        ),
+        (
+            {"rotation": False},
+            "model.rotation: expected true, or null, but got False; choose model/rotation=none",
+        ),
+        ({"motion": "wobble"}, "model.motion: expected spline or dct, or null, but got 'wobble'"),
+        (
+            {"numbers": {"effects": ["glow"]}},
+            r"stage.effects: expected some of motion, .*, but got \['glow'\]",
+        ),
         ({"numbers": {"first": 0.0}}, r"stage.first: expected a number in \(0, 1\], but got 0.0"),
         ({"numbers": {"density": -1.0}}, "expected density > 0"),
     ],
@@ -132,7 +214,8 @@ def test_refused(data, changes, text):
 
 def test_numbers_follow_the_pictures():
     numbers = Numbers()
-    assert numbers.most(4.0) == 180
+    assert numbers.most(4.0, 100) == numbers.most(4.0, 200) == 180
+    assert numbers.most(4.0, 25) == 90  # fewer pictures tell less
     assert numbers.share_at(0.0) == 0.5
     assert numbers.share_at(1.0) == 1.0
     assert numbers.motion(100, 2)[1] == 4
@@ -147,3 +230,39 @@ def test_two_views_of_a_time_count_as_one_step(data):
     one, two = (module.method.look(b, {"photo": 1.0}, module.generator) for b in (batch, twice))
     assert float(one.terms["photo"]()) == pytest.approx(float(two.terms["photo"]()), rel=1e-5)
     torch.testing.assert_close(one.gradients["means"], two.gradients["means"], rtol=1e-3, atol=1e-6)
+
+
+def test_the_first_steps_meet_warm_kernels_only(data, monkeypatch):
+    numba = pytest.importorskip("numba")
+    met = set()
+
+    def watched(name, kernel):
+        def call(*arguments):
+            met.add((name, *(str(numba.typeof(a)) for a in arguments)))
+            return kernel(*arguments)
+
+        return call
+
+    for part in ("project", "tiles", "rasterize", "chain", "nodes", "adam"):
+        home = importlib.import_module(f"forewarp.ops.kernels_{part}")
+        for name, kernel in list(vars(home).items()):
+            if hasattr(kernel, "py_func") and kernel.py_func.__module__ == home.__name__ and name[0] != "_":
+                monkeypatch.setattr(home, name, watched(name, kernel))
+    module = module_with(data, **EVERY)
+    module.method.warm_up()
+    warm = met.copy()
+    met.clear()
+    optimizer = module.configure_optimizers()
+    look(module, data)
+    for group in optimizer.param_groups:
+        for p in group["params"]:
+            p.grad = torch.ones_like(p)
+    optimizer.step()
+    assert len(met) > 5
+    assert met <= warm
+
+
+def test_a_stage_has_as_many_particles_as_its_own_density_says(data):
+    first = module_with(data).method
+    start = Start(data.scene, "fine", {"density": 2 * first.numbers_of.density}, range(3), before=first)
+    assert int(Particles(start).most) == pytest.approx(2 * int(first.most), abs=1)

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -8,8 +10,9 @@ from forewarp.methods.particles.start import (
     first_points,
     first_values,
     hull_surface,
+    widths,
 )
-from forewarp.methods.particles.sweep import swept
+from forewarp.methods.particles.sweep import _in_holes, seen_colors, swept
 from forewarp.scene.cloud import Cloud, Handover
 from tests.contract.scenes import DATASETS, RADIUS, ball_center, data_of
 
@@ -47,6 +50,27 @@ def test_points_are_where_neighbouring_views_agree(scene_of):
     assert bool(cloud.points.isfinite().all())
 
 
+def test_a_picture_of_a_sweep_fills_only_its_holes(scene_of):
+    camera = scene_of("hypernerf").train[0].camera  # 20 x 16 pixels; cells of 4 x 4
+    rays = camera.rays()
+    column = torch.arange(320) % 20
+    there = (rays.origins + 3.0 * rays.directions)[column < 12]
+    for depth in (1.0, 5.0):  # before what is there, and behind it
+        fresh = _in_holes(there, rays.origins + depth * rays.directions, camera, 5)
+        assert torch.equal(fresh, column >= 12)
+    assert bool(_in_holes(torch.zeros(0, 3), there, camera, 5).all())
+
+
+def test_known_points_have_the_colour_that_pictures_show(scene_of):
+    scene = scene_of("hypernerf")
+    known = swept(scene, [], 400).points[:50]
+    cloud = swept(replace(scene, still=known), [], 400)
+    cameras, pictures = [f.camera for f in scene.train], [f.load() for f in scene.train]
+    assert torch.equal(cloud.points[:50], known)
+    torch.testing.assert_close(cloud.colors[:50], seen_colors(known, cameras, pictures))
+    assert float((cloud.colors[:50] - 0.5).abs().max()) > 0.05
+
+
 def test_what_a_stage_left_comes_first(scene_of):
     left = Cloud(torch.rand(100, 3), torch.rand(100, 3), torch.ones(100), 0.1)
     handover = Handover(scene_of("dnerf").box, True, 6, left)
@@ -74,6 +98,21 @@ def test_first_values_are_round_and_as_large_as_points_are_apart():
     first = first_values(Cloud(points, torch.full_like(points, 0.75), torch.ones(64), 1.0))
     torch.testing.assert_close(first["log_scales"], torch.zeros(64, 3), atol=1e-3, rtol=0)
     torch.testing.assert_close(0.5 + 0.28209479 * first["color"], torch.full((64, 1, 3), 0.75))
+
+
+def test_particles_begin_no_larger_than_they_are_apart_in_a_picture(scene_of):
+    scene = scene_of("hypernerf")
+    camera = scene.train[0].camera
+    ahead = camera.center.float() - 2.0 * camera.camera_to_world[:3, 2].float()
+    points = ahead + 0.1 * torch.rand(50, 3)
+    away = torch.stack([(points - f.camera.center.float()).norm(dim=-1) for f in scene.train]).amin(0)
+    widest = widths(scene, points, 200.0)
+    torch.testing.assert_close(widest, away / camera.fx * 2.0)  # 200 pixels for 50 points: 2 pixels apart
+    cloud = Cloud(points * 100, torch.rand(50, 3), torch.ones(50), 1.0)
+    first = first_values(cloud, widest)
+    torch.testing.assert_close(first["log_scales"].exp(), widest[:, None].expand(-1, 3))
+    near = first_values(Cloud(points * 1e-3, cloud.colors, cloud.opacity, 1.0), widest)
+    assert bool((near["log_scales"].exp() < widest[:, None]).all())
 
 
 def test_points_that_coincide_and_a_single_one_are_finite():

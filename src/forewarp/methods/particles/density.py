@@ -26,7 +26,7 @@ def renew(
     of its mean pull over the pictures that showed it, until there are ``target``.
 
     Args:
-        method: has ``means``, ``log_scales``, ``turns``, ``opacity``, and the counters ``pulled``,
+        method: has ``means``, ``log_scales``, ``turns``, ``most_opaque``, and the counters ``pulled``,
             ``shown`` and ``idle``, (N,) each.
         optimizer: whose moments follow.
         target: how many there should be.
@@ -34,7 +34,7 @@ def renew(
         extent: of the scene, world units.
     """
     method.idle.copy_(torch.where(method.shown > 0, 0.0, method.idle + 1))
-    gone = method.opacity[:, 0] < _FADED
+    gone = method.most_opaque() < _FADED
     gone |= method.log_scales.amax(-1).exp() > _LARGE * extent
     if unseen:
         gone |= method.idle >= _IDLE

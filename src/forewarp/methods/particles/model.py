@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -12,11 +12,14 @@ from forewarp.fields.curves import Curve
 from forewarp.methods.method import Method, Snapshot, Start, Step
 from forewarp.methods.particles.camera import Pinholes
 from forewarp.methods.particles.density import renew
+from forewarp.methods.particles.effects import Effects, cosines
 from forewarp.methods.particles.nodes import Nodes
+from forewarp.methods.particles.planning import EFFECTS, ParticlesPlanning
+from forewarp.methods.particles.rest import come_to_rest
 from forewarp.methods.particles.rows_adam import RowsAdam
 from forewarp.methods.particles.settings import Numbers
 from forewarp.methods.particles.snapshot import ParticlesSnapshot
-from forewarp.methods.particles.start import covered_pixels, first_points, first_values
+from forewarp.methods.particles.start import covered_pixels, first_points, first_values, widths
 from forewarp.ops.compare import compare
 from forewarp.ops.nodes import pull_nodes
 from forewarp.ops.project import Gaussians, Warp, moved
@@ -27,6 +30,7 @@ from forewarp.scene.view import Moment
 
 _FLAT = 0.28209479177387814  # of the harmonics: what a colour's first coefficient is multiplied by
 _SOLID, _SEEN = 0.1, 0.02  # opacity from which matter bounds the scene; from which there is any
+_TIMES = 16  # at which opacity over time is looked at
 
 
 class Particles(Method):
@@ -37,68 +41,57 @@ class Particles(Method):
 
     Args:
         start: what it is built from.
-        motion: ``spline``, ``dct`` or ``none``: the curves of the nodes.
-        turns: whether nodes turn, or only shift.
-        view: degree 0 to 3 of the harmonics by which colour depends on direction.
-        tints, fades: cosines over time of each particle's colour, and of its opacity; 0: none.
         width: of the loss, where it turns from a square to a line.
         blur: square pixels that every particle is blurred by.
+        choices: see ``effects.Effects``.
     """
 
     terms = ("photo", "rigid", "smooth")
     numbers = tuple(Numbers.__dataclass_fields__)
     asks = Asks(kind="pictures", straight=True)
+    effects = EFFECTS
+    planning: ClassVar[ParticlesPlanning] = ParticlesPlanning()
 
-    def __init__(
-        self,
-        start: Start,
-        *,
-        motion: str = "spline",
-        turns: bool = True,
-        view: int = 1,
-        tints: int = 0,
-        fades: int = 0,
-        width: float = 0.05,
-        blur: float = 0.3,
-    ) -> None:
+    def __init__(self, start: Start, *, width: float = 0.05, blur: float = 0.3, **choices) -> None:
         super().__init__()
-        if view not in (0, 1, 2, 3) or min(tints, fades) < 0:
-            raise ValueError(
-                "model: expected view of 0 to 3, tints >= 0 and fades >= 0, "
-                f"but got {view=}, {tints=}, {fades=}"
-            )
         self.numbers_of = Numbers(**start.numbers)
         self.canonical_time, self.width = start.scene.canonical_time, width
         self.pinholes = Pinholes(blur)
-        self.bases = {"tints": tints, "fades": fades}
-        times = start.scene.times
+        self.views, times = len(start.scene.train), start.scene.times
+        on = Effects(**choices).only(self.numbers_of.effects, len(times))
         self.ends = min(times), max(times)
         self.progress, self._optimizer = 0.0, None
         before = start.before if isinstance(start.before, Particles) else None
         fresh = None if start.blank or before is not None else self._measured(start)
-        self._make(before, fresh, (view + 1) ** 2, tints, fades)
+        self._make(before, fresh, on)
         self.nodes = None
-        if motion != "none" and self.numbers_of.moves and len(times) > 1:
+        if on.motion is not None:
             count, knots = self.numbers_of.motion(len(self.means), len(times))
-            curve = Curve(motion, knots, len(times), self.canonical_time)
+            curve = Curve(on.motion, knots, len(times), self.canonical_time)
             points, edges = None if start.blank else self.means.data, self.numbers_of.edges
-            self.nodes = Nodes(points, count, curve, turns=turns, edges=edges)
+            turns, rests = on.rotation is not None, on.background is not None
+            self.nodes = Nodes(points, count, curve, turns=turns, rests=rests, edges=edges)
             links, shares = self.nodes.links(self.means.data)
             self.register_buffer("links", links)
             self.register_buffer("shares", shares)
+        resting = None if on.background is None else torch.zeros(len(self.means), dtype=torch.bool)
+        self.register_buffer("resting", resting)
+        self.least_motion = on.background
         for name in ("pulled", "shown", "idle"):
             self.register_buffer(name, torch.zeros(len(self.means)))
         self.register_buffer("round", torch.zeros((), dtype=torch.int64))
         self.grows = self._grows()
 
-    def _measured(self, start: Start) -> Cloud:
+    def _measured(self, start: Start) -> dict[str, Tensor]:
+        """The first values of every parameter; notes what follows from the pictures, too."""
         covered = covered_pixels(start.scene, list(start.frames))
-        most = self.numbers_of.most(covered)
+        most = self.numbers_of.most(covered, self.views)
         cloud = first_points(start, round(self.numbers_of.first * most))
         away = (cloud.points - cloud.points.median(0).values).norm(dim=-1).median()
         extent = float(away) or start.scene.box.diagonal
         self._scalars(covered, extent, most)
-        return cloud
+        opaque = not start.scene.has_alpha  # else points lie on a surface, and are apart as they should be
+        return first_values(cloud, widths(start.scene, cloud.points, covered) if opaque else None)
 
     def _scalars(self, covered: float, extent: float, most: int) -> None:
         """Pixels that show anything; median distance from the middle; most particles."""
@@ -106,35 +99,32 @@ class Particles(Method):
         self.register_buffer("extent", torch.tensor(float(extent)))
         self.register_buffer("most", torch.tensor(float(most)))
 
-    def _make(
-        self, before: Particles | None, cloud: Cloud | None, plain: int, tints: int, fades: int
-    ) -> None:
-        """Give every parameter its first value: of the stage before, of points, or none at all."""
+    def _make(self, before: Particles | None, fresh: dict[str, Tensor] | None, on: Effects) -> None:
+        """Give every parameter its first value: of the stage before, fresh ones, or none at all."""
         if before is not None:
-            self._scalars(float(before.covered), float(before.extent), int(before.most))
+            covered = float(before.covered)
+            most = self.numbers_of.most(covered, self.views)  # by this stage's own density
+            self._scalars(covered, float(before.extent), most)
             first = {name: p.data.clone() for name, p in before.named_parameters(recurse=False)}
-        elif cloud is not None:
-            first = first_values(cloud)
+        elif fresh is not None:
+            first = fresh
         else:
             self._scalars(1.0, 1.0, 1)
             first = first_values(Cloud(torch.zeros(1, 3), torch.zeros(1, 3), torch.zeros(1), 1.0))
         count = len(first["means"])
         for name in ("means", "log_scales", "turns", "opacity", "color"):
             setattr(self, name, nn.Parameter(first[name]))
-        for name, many in (("shade", plain - 1), ("tint", tints)):
+        degree, tints, fades = on.view_dependence or 0, on.color_over_time or 0, on.opacity_over_time or 0
+        for name, shape in (("shade", (degree * (degree + 2), 3)), ("tint", (tints, 3)), ("fade", (fades,))):
             value = first.get(name)
-            if value is None or value.shape[1] != many:
-                value = torch.zeros(count, many, 3)
-            setattr(self, name, nn.Parameter(value) if many else None)
-        value = first.get("fade")
-        self.fade = None
-        if fades:
-            fits = value is not None and value.shape[1] == fades
-            self.fade = nn.Parameter(value if fits else torch.zeros(count, fades))
+            if value is None or value.shape[1:] != shape:
+                value = torch.zeros(count, *shape)
+            setattr(self, name, nn.Parameter(value) if shape[0] else None)
 
     def _grows(self) -> tuple[str, ...]:
         names = ["means", "log_scales", "turns", "opacity", "color", "shade", "tint", "fade"]
-        names += ["pulled", "shown", "idle", *(["links", "shares"] if self.nodes is not None else [])]
+        names += ["pulled", "shown", "idle", "resting"]
+        names += [] if self.nodes is None else ["links", "shares"]
         return tuple(name for name in names if getattr(self, name) is not None)
 
     @property
@@ -176,24 +166,31 @@ class Particles(Method):
 
     def warp(self, time: float) -> Warp:
         """How everything moves until a time."""
-        if self.nodes is None:
-            return self._still()
-        return Warp(self.nodes.maps(time), self.links, self.shares)
-
-    def _still(self) -> Warp:
+        if self.nodes is not None:
+            return Warp(self.nodes.maps(time), self.links, self.shares)
         none = self.means.new_zeros(len(self.means), 1)
         return Warp(self.means.new_zeros(1, 12), none.int(), none)
 
     def over_time(self, time: float) -> tuple[Tensor, Tensor]:
-        """What a time makes of colours (T,) and of opacity (1 + F,): cosines, 0 at the canonical time."""
-        tints, fades = (
-            [
-                math.cos(math.pi * k * time) - math.cos(math.pi * k * self.canonical_time)
-                for k in range(1, n + 1)
-            ]
-            for n in self.bases.values()
-        )
+        """What a time makes of colours (T,) and of opacity (1 + F,)."""
+        tints = [] if self.tint is None else self.tints(time)
+        fades = [] if self.fade is None else self.fades(time)
         return self.means.new_tensor(tints), self.means.new_tensor([1.0, *fades])
+
+    def tints(self, time: float) -> list[float]:
+        """See ``over_time``."""
+        return cosines(self.tint.shape[1], time, self.canonical_time)
+
+    def fades(self, time: float) -> list[float]:
+        """See ``over_time``."""
+        return cosines(self.fade.shape[1], time, self.canonical_time)
+
+    def most_opaque(self) -> Tensor:
+        """The logit of each particle's opacity (N,) when it is largest."""
+        if self.fade is None:
+            return self.opacity.data[:, 0]
+        fades = self.means.new_tensor([self.fades(i / _TIMES) for i in range(_TIMES + 1)])  # (T, F)
+        return self.opacity.data[:, 0] + (self.fade.data @ fades.T).amax(-1)
 
     @torch.no_grad()
     def look(self, batch: Batch, factors: Mapping[str, float], generator: torch.Generator) -> Step:
@@ -223,14 +220,14 @@ class Particles(Method):
     def _compared(self, seen, time: float, weight: float, factors, total: dict) -> tuple:
         """Compare one picture; adds gradients to ``total``, and gives what the nodes' terms are."""
         tints, fades = self.over_time(time)
-        own, basis, warp = {}, None, None
+        own, warp = {}, None
         if self.nodes is not None:
             self.nodes.look_ahead(time, time)
             basis = self.nodes.curve(time)
             motion, maps = self.nodes.carried(basis)
             warp = Warp(maps, self.links, self.shares)
         found = compare(
-            self.gaussians(), warp or self._still(), self.pinholes(seen.view.camera), tints, fades,
+            self.gaussians(), warp or self.warp(time), self.pinholes(seen.view.camera), tints, fades,
             seen.rgb, seen.background, width=self.width, factor=weight,
         )  # fmt: skip
         self.pulled += found.pull
@@ -288,6 +285,10 @@ class Particles(Method):
         renew(self, optimizer, target, unseen=whole and self.nodes is not None, extent=float(self.extent))
         if self.nodes is not None and int(self.round) % self.numbers_of.relink == 0:
             self.links, self.shares = self.nodes.links(self.means.data)
+            if self.resting is not None:
+                self.shares[self.resting] = 0.0
+                if progress >= self.numbers_of.rest:
+                    come_to_rest(self, self.least_motion * float(self.extent))
 
     def warm_up(self) -> None:
         """Compile the operators' kernels."""
@@ -317,7 +318,7 @@ class Particles(Method):
     @torch.no_grad()
     def bounds(self, times: list[float]) -> Box | None:
         """See ``HasBounds``."""
-        solid = torch.sigmoid(self.opacity[:, 0]) > _SOLID
+        solid = torch.sigmoid(self.most_opaque()) > _SOLID
         if not bool(solid.any()):
             return None
         points = self.trajectories(self._canonical()[solid], torch.tensor(times)).flatten(0, 1)

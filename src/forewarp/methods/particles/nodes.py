@@ -51,13 +51,21 @@ class Nodes(nn.Module):
         count: of nodes.
         curve: of every node.
         turns: whether nodes turn.
+        rests: whether nodes may ``stop``; ``still`` (M,) bool says which have.
         edges: neighbours that a node is kept rigid with.
     """
 
-    ROWS = ("places", "edges", "edge_weights", "spread", "shift", "turn")
+    ROWS = ("places", "edges", "edge_weights", "spread", "still", "shift", "turn")
 
     def __init__(
-        self, points: Tensor | None, count: int, curve: Curve, *, turns: bool = True, edges: int = 6
+        self,
+        points: Tensor | None,
+        count: int,
+        curve: Curve,
+        *,
+        turns: bool = True,
+        rests: bool = False,
+        edges: int = 6,
     ) -> None:
         super().__init__()
         self.curve = curve
@@ -73,6 +81,7 @@ class Nodes(nn.Module):
         self.shift = nn.Parameter(torch.zeros(len(places), curve.count, 3))
         self.turn = nn.Parameter(torch.zeros(len(places), curve.count, 3)) if turns else None
         self.register_buffer("seen", torch.tensor([curve.canonical_time] * 2))
+        self.register_buffer("still", torch.zeros(len(places), dtype=torch.bool) if rests else None)
 
     def __len__(self) -> int:
         return len(self.places)
@@ -145,6 +154,33 @@ class Nodes(nn.Module):
                     if 0 <= far < len(middle):
                         value[:, j] = value[:, near] + _DAMP * (value[:, near] - value[:, far])
 
+    @torch.no_grad()
+    def reach_of(self, times: list[float]) -> Tensor:
+        """How far each node takes what is beside it (M,) from its mean place over some times, world units."""
+        far = torch.zeros(len(self.places)).to(self.places)
+        for value, arm in ((self.shift, 1.0), (self.turn, 2 * self.spread)):  # |r| is half the angle
+            if value is not None:
+                went = torch.einsum("mkc,tk->tmc", value, self._bases(times))
+                far += arm * (went - went.mean(0)).norm(dim=-1).amax(0)
+        return far
+
+    @torch.no_grad()
+    def stop(self, which: Tensor, times: list[float]) -> None:
+        """Let nodes (M,) bool stay where they were, and as they were turned, on average over some times.
+
+        Cosines are 0 at the canonical time, so that with these nodes stay where they are then.
+        """
+        which = which & ~self.still
+        self.still |= which
+        mean = self._bases(times).mean(0)
+        for value in (self.shift, self.turn):
+            if value is not None:
+                stays = torch.einsum("mkc,k->mc", value[which], mean)
+                value[which] = stays[:, None] if self.curve.kind == "spline" else 0.0
+
+    def _bases(self, times: list[float]) -> Tensor:
+        return torch.stack([self.curve(time) for time in times]).to(self.places)
+
     def rows(self) -> list[str]:
         """What has a row a node."""
         return [name for name in self.ROWS if getattr(self, name) is not None]
@@ -185,6 +221,10 @@ class Nodes(nn.Module):
         """
         bend = self._bend(time) if factor else torch.zeros_like(basis)
         *found, bent = spread_nodes(self.shift, self.turn, slope, basis, bend, factor, unit)
+        if self.still is not None:
+            for part in found:
+                if part is not None:
+                    part[self.still] = 0.0  # rounding errors would be steps, as Adam takes them
         names = ("nodes.shift", "nodes.turn")
         return bent, {name: part for name, part in zip(names, found) if part is not None}
 

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+
+from forewarp.methods.particles.effects import NAMES
+
+_VIEWS = 100  # pictures from which on more of them call for no more particles
 
 
 @dataclass(frozen=True)
@@ -12,8 +16,9 @@ class Numbers:
     """The numbers of a stage that are the method's own. Shares are of the stage.
 
     Args:
-        moves: whether particles move; a stage that only shapes them has no nodes.
-        density: particles there are in the end, times the square root of the pixels that show anything.
+        effects: those of the model's effects that the stage uses; one that only shapes particles uses none.
+        density: particles there are in the end, times the square root of the pixels that show anything; of
+            less than a hundred pictures, of their share of these pixels.
         first: share of them to begin with.
         full: share of them that this stage ends with.
         nodes: how many there are, times the square root of the particles at the beginning.
@@ -21,13 +26,14 @@ class Numbers:
         edges: neighbours that a node is kept rigid with.
         every: share between two rounds of density control, up to ``settled``.
         relink: rounds after which particles look again for the nodes beside them.
+        rest: share from which nodes that do not move come to rest, where the model has a background.
         jitter, calm: spread of the random shift of a picture's time, which falls to 0 at the share ``calm``.
         loose: what is left of the weight of ``rigid`` at the end.
         finals: what is left at the end of a learning rate, by its name; the others stay.
         hold_rates: share up to which such a rate stays.
     """
 
-    moves: bool = True
+    effects: Sequence[str] = NAMES
     density: float = 90.0
     first: float = 0.5
     full: float = 1.0
@@ -37,6 +43,7 @@ class Numbers:
     every: float = 0.01
     settled: float = 0.6
     relink: int = 5
+    rest: float = 0.45
     jitter: float = 0.01
     calm: float = 0.4
     loose: float = 0.17
@@ -44,6 +51,10 @@ class Numbers:
     hold_rates: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        if not set(self.effects) <= set(NAMES):
+            raise ValueError(
+                f"stage.effects: expected some of {', '.join(NAMES)}, but got {list(self.effects)}"
+            )
         shares = ("first", "every", "loose", "full")
         for name in shares:
             if not 0 < getattr(self, name) <= 1:
@@ -59,13 +70,13 @@ class Numbers:
                 f"{self.density}, {self.relink}, {self.jitter}, {self.calm}"
             )
 
-    def most(self, covered: float) -> int:
-        """How many particles there are in the end.
+    def most(self, covered: float, views: int) -> int:
+        """How many particles there are in the end, by the pixels that show anything and the pictures.
 
-        >>> Numbers().most(20_000.0)
-        12728
+        >>> Numbers().most(20_000.0, 100), Numbers().most(20_000.0, 25)
+        (12728, 6364)
         """
-        return max(32, round(self.density * math.sqrt(covered)))
+        return max(32, round(self.density * math.sqrt(covered * min(1.0, views / _VIEWS))))
 
     def share_at(self, progress: float) -> float:
         """The share of them that there should be: on a line from ``first``; soon before ``settled``, all."""

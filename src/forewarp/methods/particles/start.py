@@ -7,17 +7,18 @@ from torch import Tensor
 
 from forewarp.methods.method import Start
 from forewarp.methods.particles.nodes import nearest
-from forewarp.methods.particles.sweep import swept
+from forewarp.methods.particles.sweep import seen_colors, swept
 from forewarp.ops.grid import dilate
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.cloud import Cloud
-from forewarp.scene.frame import Scene
+from forewarp.scene.frame import Scene, spread
 from forewarp.scene.hull import visual_hull
 
 _FRAMES = 12  # whose silhouettes are looked at
 _DRIFT = 0.2  # share of a picture's width by which a silhouette is taken to move in all the time there is
 _ROUGH, _FINE = 48, 112  # voxels along the mean side of the box, and of what is left of it
 _FEW = 16  # points that are too few to begin with
+_CAMERAS = 64  # whose distance from a point is looked at
 _FLAT = 0.28209479177387814  # of the harmonics: what a colour's first coefficient is multiplied by
 
 
@@ -104,36 +105,42 @@ def _grown(mask: Tensor) -> Tensor:
     return torch.nn.functional.max_pool3d(mask[None, None].float(), 3, 1, 1)[0, 0] > 0
 
 
-def seen_colors(points: Tensor, cameras: list, pictures: list[Tensor]) -> Tensor:
-    """The mean colour (N, 3) of what pictures (H, W, 4) uint8 show at points (N, 3), by their alpha."""
-    total, weight = torch.zeros(len(points), 3), torch.full((len(points), 1), 1e-6)
-    for camera, rgba in zip(cameras, pictures):
-        pixel, z = camera.project(points)
-        column, row = pixel.floor().long().unbind(-1)
-        inside = (z > 0) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
-        shown = rgba[row.clamp(0, camera.height - 1), column.clamp(0, camera.width - 1)].float() / 255
-        share = shown[:, 3:] * inside[:, None]
-        total, weight = total + shown[:, :3] * share, weight + share
-    return torch.where(weight > 1e-3, total / weight, 0.5)
-
-
 def covered_pixels(scene: Scene, frames: list[int]) -> float:
     """How many pixels of a picture show anything, the mean over some frames."""
     shown = [float((scene.train[i].load()[..., 3] > 127).sum()) for i in frames[:_FRAMES]]
     return max(sum(shown) / len(shown), 1.0)
 
 
-def first_values(cloud: Cloud) -> dict[str, Tensor]:
-    """Round particles at points, as large as the points are apart."""
+def widths(scene: Scene, points: Tensor, covered: float) -> Tensor:
+    """How far apart (N,) particles at points (N, 3) may be, world units: evenly spread over the pixels that
+    show anything (``covered``), and seen by the camera that shows them largest.
+    """
+    smallest = torch.full((len(points),), float("inf"))
+    for i in spread(len(scene.train), _CAMERAS):
+        camera = scene.train[i].camera
+        away = (points - camera.center.to(points)).norm(dim=-1)
+        smallest = torch.minimum(smallest, away / max(camera.fx, camera.fy))
+    return smallest * (covered / max(len(points), 1)) ** 0.5
+
+
+def first_values(cloud: Cloud, widest: Tensor | None = None) -> dict[str, Tensor]:
+    """Round particles at points, as large as the points are apart, but not larger than ``widest`` (N,).
+
+    Points of a sweep lie at uncertain depths, so that they are farther apart in space than in the pictures:
+    as large as that, particles would blur what they show, and many steps would go into making them smaller.
+    """
     points = cloud.points.float()
     away, _ = nearest(points, points, 4)
     apart = away[:, 1:].sqrt().mean(-1) if away.shape[1] > 1 else torch.full((len(points),), cloud.size)
     middle = float(apart.median()) or cloud.size
+    size = apart.clamp(0.1 * middle, 4 * middle)
+    if widest is not None:
+        size = torch.minimum(size, widest.clamp(min=1e-3 * middle))
     turns = torch.zeros(len(points), 4)
     turns[:, 0] = 1
     return {
         "means": points.clone(),
-        "log_scales": apart.clamp(0.1 * middle, 4 * middle).log()[:, None].repeat(1, 3),
+        "log_scales": size.log()[:, None].repeat(1, 3),
         "turns": turns,
         "opacity": torch.zeros(len(points), 1),
         "color": ((cloud.colors.float() - 0.5) / _FLAT)[:, None].clone(),

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
 from forewarp.scene.box import Box
+from forewarp.scene.camera import Camera
 from forewarp.scene.cloud import Cloud
 from forewarp.scene.frame import Scene, spread
 
@@ -13,15 +16,15 @@ _DEPTHS = 48  # planes, evenly in inverse depth
 _SIDE = 64  # lattice points along the longer side of a picture
 _VIEWS, _OTHERS = 10, 8  # pictures that are swept; neighbours in time of each
 _LEAST = 0.02  # share of the far plane at which planes begin at the earliest
-_NEW = 0.05  # share by which a point must lie nearer or farther than what is there to be a new one
 
 
 def swept(scene: Scene, frames: list[int], count: int) -> Cloud | None:
     """Points (about ``count``) that neighbouring views agree on; None where there is a single view.
 
     Of each lattice point of a picture that depth is taken at which its colour is most like what its
-    neighbours in time show there, the best half of them counted. Pictures come one after the other, and only
-    what is not there yet is added. Points known to stand still are kept.
+    neighbours in time show there, the best half of them counted. Pictures come one after the other, and each
+    adds only what fills its holes: what stands before points that are there already is mostly a wrong depth,
+    or what has moved meanwhile. Points known to stand still are kept.
     """
     if len(scene.train) < 2:
         return None
@@ -29,10 +32,11 @@ def swept(scene: Scene, frames: list[int], count: int) -> Cloud | None:
     chosen = [order[i] for i in spread(len(order), _VIEWS)]
     side = max(8, min(_SIDE, round((2 * count) ** 0.5)))
     known = scene.still if scene.still is not None else torch.zeros(0, 3)
-    points, colors, sizes = [known.float()], [torch.full((len(known), 3), 0.5)], []
+    cameras, pictures = zip(*((scene.train[i].camera, scene.train[i].load()) for i in chosen))
+    points, colors, sizes = [known.float()], [seen_colors(known.float(), cameras, pictures)], []
     for i in chosen:
         found, color, size = _sweep(scene, i, side)
-        fresh = _is_new(torch.cat(points), found, scene.train[i].camera, side)
+        fresh = _in_holes(torch.cat(points), found, scene.train[i].camera, side)
         inside = _within(scene.box, found)
         points.append(found[fresh & inside])
         colors.append(color[fresh & inside])
@@ -48,7 +52,7 @@ def _within(box: Box, points: Tensor) -> Tensor:
     return ((points >= low) & (points <= high)).all(-1)
 
 
-def _small(scene: Scene, i: int, side: int) -> tuple[Tensor, object]:
+def _small(scene: Scene, i: int, side: int) -> tuple[Tensor, Camera]:
     """A picture (h, w, 3) whose longer side is about four times the lattice's, and its camera."""
     camera, rgba = scene.train[i].camera, scene.train[i].load()
     scale = min(1.0, 4 * side / max(camera.width, camera.height))
@@ -84,7 +88,7 @@ def _sweep(scene: Scene, i: int, side: int) -> tuple[Tensor, Tensor, Tensor]:
     return points, color, depth.median() * step / camera.fx
 
 
-def _nearest_plane(camera, others: list) -> float:
+def _nearest_plane(camera: Camera, others: Sequence[Camera]) -> float:
     """Where planes begin: not before the camera's near, nor where what the neighbours see has shifted by half
     a picture, which nothing could tell.
     """
@@ -103,21 +107,30 @@ def _difference(scene: Scene, j: int, side: int, places: Tensor, color: Tensor) 
     return torch.where(inside, (shown - color[:, None]).abs().mean(-1), 1.0)
 
 
-def _is_new(points: Tensor, found: Tensor, camera, side: int) -> Tensor:
-    """Which of a picture's points (P, 3) no earlier point is near to, along the same line of sight."""
-    if not len(points):
-        return torch.ones(len(found), dtype=torch.bool)
+def _in_holes(points: Tensor, found: Tensor, camera: Camera, side: int) -> Tensor:
+    """Which of a picture's points (P, 3) lie in cells of its lattice that no earlier point falls into."""
     step = max(camera.width, camera.height) / side
 
-    def cells(of: Tensor) -> tuple[Tensor, Tensor]:
+    def cells(of: Tensor) -> Tensor:
         pixel, z = camera.project(of)
         column, row = (pixel / step).floor().long().unbind(-1)
         good = (z > 0) & (column >= 0) & (column < side) & (row >= 0) & (row < side)
-        return torch.where(good, row * side + column, side * side), z
+        return torch.where(good, row * side + column, side * side)
 
-    held = torch.full((side * side + 1,), float("inf"))
-    cell, z = cells(points)
-    held.scatter_reduce_(0, cell, z.float(), "amin")
-    cell, z = cells(found)
-    # What lies behind an earlier point cannot be told from it; what lies before it is new.
-    return (z < (1 - _NEW) * held[cell]) | held[cell].isinf()
+    filled = torch.zeros(side * side + 1, dtype=torch.bool)
+    filled[cells(points)] = True
+    filled[-1] = False  # beside the picture nothing is filled
+    return ~filled[cells(found)]
+
+
+def seen_colors(points: Tensor, cameras: Sequence[Camera], pictures: Sequence[Tensor]) -> Tensor:
+    """The mean colour (N, 3) of what pictures (H, W, 4) uint8 show at points (N, 3), by their alpha."""
+    total, weight = torch.zeros(len(points), 3), torch.full((len(points), 1), 1e-6)
+    for camera, rgba in zip(cameras, pictures):
+        pixel, z = camera.project(points)
+        column, row = pixel.floor().long().unbind(-1)
+        inside = (z > 0) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
+        shown = rgba[row.clamp(0, camera.height - 1), column.clamp(0, camera.width - 1)].float() / 255
+        share = shown[:, 3:] * inside[:, None]
+        total, weight = total + shown[:, :3] * share, weight + share
+    return torch.where(weight > 1e-3, total / weight, 0.5)

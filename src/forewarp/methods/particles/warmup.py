@@ -24,7 +24,8 @@ def compile_kernels(method: torch.nn.Module) -> None:
     rasterize(project(particles, warp, pinhole, none, first), 9, 8)
     edges = torch.zeros(1, 1, dtype=torch.int64)
     carry_nodes(zero[:, None], zero[:, None], first, zero)
-    spread_nodes(zero[:, None], zero[:, None], torch.zeros(1, 6), first, first, 1.0, 1.0)
+    two = torch.zeros(2, 1, 3)  # of a single node, half of its gradients would pass for contiguous
+    spread_nodes(two, two, torch.zeros(2, 6), first, first, 1.0, 1.0)
     pull_nodes(torch.zeros(1, 6), zero, torch.zeros(1, 12), edges, one, 1.0)
     adam_rows(
         torch.zeros(1, 3),

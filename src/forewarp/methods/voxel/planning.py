@@ -158,6 +158,7 @@ class VoxelPlanning:
     """Decide the effects of the paper's method (see ``methods.effect.Planning``)."""
 
     effects = EFFECTS
+    steps, trial_steps, least = 3000, 250, 0.1
 
     def evidence(self, pictures: Pictures, **bounds) -> VoxelEvidence:
         """Begin the evidence with what the images say."""

@@ -1,0 +1,62 @@
+"""Bring to rest what does not move: nodes that stand still, and particles that follow none but these."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from forewarp.methods.method import Method
+from forewarp.ops.project import moved
+
+_TIMES = 16  # at which motion is looked at
+
+
+@torch.no_grad()
+def come_to_rest(method: Method, least: float) -> None:
+    """Stop the nodes that move by less than ``least`` (world units), and let go of them the particles that
+    follow no others.
+
+    Such a particle is put where it was on average, turned as it was on average, and its shares of nodes
+    become 0: it costs no motion any more. A stopped node stays where it was on average, too, as others may
+    be kept rigid with it.
+
+    Args:
+        method: has ``ends`` (the first and the last time), ``nodes``, ``means``, ``turns``, ``links``,
+            ``shares`` and ``resting`` (N,) bool.
+        least: the distance.
+    """
+    nodes = method.nodes
+    times = torch.linspace(*method.ends, _TIMES).tolist()
+    nodes.stop(nodes.reach_of(times) < least, times)
+    free = nodes.still[method.links.long()].all(-1) & ~method.resting
+    if not bool(free.any()):
+        return
+    places, linear = (sum(parts) / len(times) for parts in zip(*(_moved(method, t) for t in times)))
+    method.means[free] = places[free]
+    left, _, right = torch.linalg.svd(linear[free])
+    method.turns[free] = _product(_quaternions(left @ right), method.turns[free])
+    method.resting[free] = True
+    method.shares[free] = 0.0
+
+
+def _moved(method: Method, time: float) -> tuple[Tensor, Tensor]:
+    return moved(method.means.data, method.warp(time))
+
+
+def _quaternions(matrices: Tensor) -> Tensor:
+    """Quaternions (N, 4) of rotation matrices (N, 3, 3) by less than half a turn.
+
+    >>> from forewarp.ops.project import rotations
+    >>> _quaternions(rotations(torch.tensor([[0.8, 0.0, 0.6, 0.0]])))
+    tensor([[0.8000, 0.0000, 0.6000, 0.0000]])
+    """
+    w = 0.5 * (1 + matrices.diagonal(dim1=-2, dim2=-1).sum(-1)).clamp(min=1e-6).sqrt()
+    skew = matrices - matrices.mT
+    return torch.stack([w, *(skew[:, i, j] / (4 * w) for i, j in ((2, 1), (0, 2), (1, 0)))], -1)
+
+
+def _product(a: Tensor, b: Tensor) -> Tensor:
+    """The quaternions (N, 4) of first b's rotation, then a's."""
+    w, v, x, u = a[:, :1], a[:, 1:], b[:, :1], b[:, 1:]
+    scalar = w * x - (v * u).sum(-1, keepdim=True)
+    return torch.cat([scalar, w * u + x * v + torch.linalg.cross(v, u)], -1)
