@@ -1,4 +1,3 @@
-import importlib
 from dataclasses import replace
 from functools import partial
 
@@ -15,6 +14,7 @@ from forewarp.scene.box import Lattice
 from forewarp.training.module import DynamicSceneModule
 from forewarp.training.objective import total
 from forewarp.training.schedule import Curriculum
+from tests.support.kernels import watch
 from tests.support.tiny_scene import (
     BOX,
     INPAINTER,
@@ -87,23 +87,9 @@ def test_the_clock_starts_when_the_kernels_are_warm(monkeypatch):
 
 
 def test_a_step_meets_warm_kernels_only(monkeypatch):
-    numba = pytest.importorskip("numba")
     if not numba_installed():
         pytest.skip("Numba is switched off")
-    met = set()
-
-    def watched(name, kernel):
-        def call(*arguments):
-            met.add((name, *(str(numba.typeof(a)) for a in arguments)))
-            return kernel(*arguments)
-
-        return call
-
-    for part in ("grid", "splat", "march"):
-        home = importlib.import_module(f"forewarp.ops.kernels_{part}")
-        for name, kernel in list(vars(home).items()):
-            if hasattr(kernel, "py_func") and not name.startswith("_"):
-                monkeypatch.setattr(home, name, watched(name, kernel))
+    met = watch(monkeypatch, "grid", "splat", "march")
     before = torch.get_rng_state()
     warm_up()
     assert torch.equal(torch.get_rng_state(), before)

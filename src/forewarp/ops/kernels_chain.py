@@ -11,12 +11,12 @@ from numba import njit, prange
 from forewarp.ops.kernels_project import (
     ANY,
     BASIS,
-    CENTER,
     MEAN,
     QUATERNION,
     ROWS,
     SIDE_BY_SIDE,
     covariance,
+    directed,
     followed,
     gathered,
     harmonics,
@@ -152,7 +152,7 @@ def _of_turn(place, d):
 
 
 @njit(forceinline=True)
-def _of_place(view, local, inverse, px, py, bent, place, by_jacobian):
+def _of_place(view, local, distance, inverse, px, py, bent, place, by_jacobian):
     """Slopes (3) by the world point, of the pixel, of its own slopes (2, 3) and of the distance.
 
     How the lens bends is taken to be the same around the point.
@@ -169,8 +169,7 @@ def _of_place(view, local, inverse, px, py, bent, place, by_jacobian):
     ahead_x = first0 * view[6] + first1 * view[7] + first2 * view[8]
     ahead_y = second0 * view[6] + second1 * view[7] + second2 * view[8]
     square = inverse * inverse
-    squared = fma(local[0], local[0], fma(local[1], local[1], local[2] * local[2]))
-    far = by_far / root(squared)
+    far = by_far / distance
     lx = gx * inverse - ahead_x * square + far * local[0]
     ly = gy * inverse - ahead_y * square + far * local[1]
     turn = (px * ahead_x + py * ahead_y) * 2.0 - across - upright
@@ -221,6 +220,43 @@ def _of_maps(maps, links, weights, which, valid, place, to_maps, to_weights):
                 to_weights[i, n] = value
 
 
+@njit(forceinline=True)
+def _of_shape(view, moved, log_scales, quaternions, which, valid, place, to_scales, to_quaternions):
+    """Slopes by scales and quaternions; returns those by ``moved`` (2, 3), what maps a particle's axes,
+    before they are turned, to the picture.
+    """
+    gathered(quaternions, which, place, QUATERNION, 4)
+    turn, scales = turned(place), scales_of(log_scales, which, place)
+    rows = product(moved, turn)
+    by_root = _of_covariance(
+        view,
+        rows,
+        scales,
+        row_of(place, _SLOPE + 2),
+        row_of(place, _SLOPE + 3),
+        row_of(place, _SLOPE + 4),
+    )
+    r0, r1, r2 = by_root[0] * scales[0], by_root[1] * scales[1], by_root[2] * scales[2]
+    r3, r4, r5 = by_root[3] * scales[0], by_root[4] * scales[1], by_root[5] * scales[2]
+    set_row(place, ANY, r0 * rows[0] + r3 * rows[3])
+    set_row(place, ANY + 1, r1 * rows[1] + r4 * rows[4])
+    set_row(place, ANY + 2, r2 * rows[2] + r5 * rows[5])
+    _scattered(place, ANY, 3, to_scales, which, valid)
+    by_turn = (
+        moved[0] * r0 + moved[3] * r3, moved[0] * r1 + moved[3] * r4, moved[0] * r2 + moved[3] * r5,
+        moved[1] * r0 + moved[4] * r3, moved[1] * r1 + moved[4] * r4, moved[1] * r2 + moved[4] * r5,
+        moved[2] * r0 + moved[5] * r3, moved[2] * r1 + moved[5] * r4, moved[2] * r2 + moved[5] * r5,
+    )  # fmt: skip
+    by_four = _of_turn(place, by_turn)
+    set_row(place, QUATERNION, by_four[0])
+    set_row(place, QUATERNION + 1, by_four[1])
+    set_row(place, QUATERNION + 2, by_four[2])
+    set_row(place, QUATERNION + 3, by_four[3])
+    _scattered(place, QUATERNION, 4, to_quaternions, which, valid)
+    back = (r0, r1, r2, r3, r4, r5)
+    return product(back, _transposed(turn))
+
+
 @njit(parallel=True, cache=True)
 def chain(  # long: sixteen particles' way back, step by step
     means, log_scales, quaternions, opacity, colors, maps, links, weights, view, tints, fades,
@@ -246,60 +282,23 @@ def chain(  # long: sixteen particles' way back, step by step
                 set_row(place, _SLOPE + j, row_of(place, j))
             x, y, z = followed(means, maps, links, weights, which, place)
             local = seen_from(view, x, y, z)
+            distance, dx, dy, dz = directed(view, x, y, z, local)
             inverse = sixteen(1.0) / local[2]
             px, py = local[0] * inverse, local[1] * inverse
             bent = through_lens(view, px, py)
             jacobian, warp = slopes_of_pixel(view, inverse, px, py, bent), linear_of(place)
-            gathered(quaternions, which, place, QUATERNION, 4)
-            moved, turn, scales = product(jacobian, warp), turned(place), scales_of(log_scales, which, place)
-            rows = product(moved, turn)
-            by_root = _of_covariance(
-                view,
-                rows,
-                scales,
-                row_of(place, _SLOPE + 2),
-                row_of(place, _SLOPE + 3),
-                row_of(place, _SLOPE + 4),
+            moved = product(jacobian, warp)
+            by_moved = _of_shape(
+                view, moved, log_scales, quaternions, which, valid, place, to_scales, to_quaternions
             )
-            r0, r1, r2 = by_root[0] * scales[0], by_root[1] * scales[1], by_root[2] * scales[2]
-            r3, r4, r5 = by_root[3] * scales[0], by_root[4] * scales[1], by_root[5] * scales[2]
-            set_row(place, ANY, r0 * rows[0] + r3 * rows[3])
-            set_row(place, ANY + 1, r1 * rows[1] + r4 * rows[4])
-            set_row(place, ANY + 2, r2 * rows[2] + r5 * rows[5])
-            _scattered(place, ANY, 3, to_scales, which, valid)
-            by_turn = (
-                moved[0] * r0 + moved[3] * r3, moved[0] * r1 + moved[3] * r4, moved[0] * r2 + moved[3] * r5,
-                moved[1] * r0 + moved[4] * r3, moved[1] * r1 + moved[4] * r4, moved[1] * r2 + moved[4] * r5,
-                moved[2] * r0 + moved[5] * r3, moved[2] * r1 + moved[5] * r4, moved[2] * r2 + moved[5] * r5,
-            )  # fmt: skip
-            by_four = _of_turn(place, by_turn)
-            set_row(place, QUATERNION, by_four[0])
-            set_row(place, QUATERNION + 1, by_four[1])
-            set_row(place, QUATERNION + 2, by_four[2])
-            set_row(place, QUATERNION + 3, by_four[3])
-            _scattered(place, QUATERNION, 4, to_quaternions, which, valid)
-            back = (r0, r1, r2, r3, r4, r5)
-            by_moved = product(back, _transposed(turn))
             by_point = _of_place(
-                view, local, inverse, px, py, bent, place, product(by_moved, _transposed(warp))
+                view, local, distance, inverse, px, py, bent, place, product(by_moved, _transposed(warp))
             )
             set_row(place, ANY, warp[0] * by_point[0] + warp[3] * by_point[1] + warp[6] * by_point[2])
             set_row(place, ANY + 1, warp[1] * by_point[0] + warp[4] * by_point[1] + warp[7] * by_point[2])
             set_row(place, ANY + 2, warp[2] * by_point[0] + warp[5] * by_point[1] + warp[8] * by_point[2])
             _scattered(place, ANY, 3, to_means, which, valid)
-            squared = fma(local[0], local[0], fma(local[1], local[1], local[2] * local[2]))
-            apart = sixteen(1.0) / root(squared)
-            _of_colors(
-                (x - view[CENTER]) * apart,
-                (y - view[CENTER + 1]) * apart,
-                (z - view[CENTER + 2]) * apart,
-                splats,
-                tints,
-                which,
-                valid,
-                place,
-                to_colors,
-            )
+            _of_colors(dx, dy, dz, splats, tints, which, valid, place, to_colors)
             for lane in range(valid):
                 i = np.uintp(which[lane])
                 slope = (

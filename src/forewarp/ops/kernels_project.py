@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
+from forewarp.ops.kernels_rasterize import LEAST_LOG
 from forewarp.ops.lanes import at_least, fma, root, sixteen, where_above
 from forewarp.ops.lanes_arrays import get_row, put_row, room, row_of, set_row, transpose
 from forewarp.ops.lanes_math import exp, log
@@ -20,7 +21,6 @@ ROTATION, CENTER, FOCAL, SKEW, MIDDLE, SIZE, NEAR, BLUR, MARGIN, RADIAL, TANGENT
 )  # fmt: skip
 # Rows of a room: the blended map, then what is gathered of the particles, then harmonics.
 MEAN, SCALE, QUATERNION, ANY, BASIS, ROWS = 16, 19, 22, 26, 29, 45
-LOG_FULL = 5.541263545158426  # log(255): what adds less than a 255th to a pixel is not seen
 C0, C1 = np.float32(0.28209479177387814), np.float32(0.4886025119029199)
 C20, C21, C22 = (np.float32(c) for c in (1.0925484305920792, 0.31539156525252005, 0.5462742152960396))
 C30, C31, C32 = (np.float32(c) for c in (0.5900435899266435, 2.890611442640554, 0.4570457994644658))
@@ -230,7 +230,7 @@ def _paint(dx, dy, dz, colors, tints, which, place):
 @njit(forceinline=True)
 def _reach(view, ahead, beside, bent, determinant, solid, log_solid):
     """Twice the logarithm of 255 times the opacity, 0 of what is not seen."""
-    reach = where_above(solid, np.float32(1 / 255), (log_solid + np.float32(LOG_FULL)) * 2.0)
+    reach = where_above(solid, np.float32(1 / 255), (log_solid - np.float32(LEAST_LOG)) * 2.0)
     reach = where_above(ahead, view[NEAR], reach)
     reach = where_above(view[REACH] - beside, np.float32(0), reach)
     for side, size in ((bent[0], view[SIZE]), (bent[1], view[SIZE + 1])):
@@ -238,6 +238,19 @@ def _reach(view, ahead, beside, bent, determinant, solid, log_solid):
         reach = where_above(view[MARGIN] + size - side, np.float32(0), reach)
     reach = where_above(determinant, np.float32(0), reach)
     return where_above(np.float32(1e30) - determinant, np.float32(0), reach)
+
+
+@njit(forceinline=True)
+def directed(view, x, y, z, local):
+    """The distances of world points from the camera, and the unit directions (3) towards them."""
+    distance = root(fma(local[0], local[0], fma(local[1], local[1], local[2] * local[2])))
+    apart = sixteen(1.0) / distance
+    return (
+        distance,
+        (x - view[CENTER]) * apart,
+        (y - view[CENTER + 1]) * apart,
+        (z - view[CENTER + 2]) * apart,
+    )
 
 
 @njit(parallel=True, cache=True)
@@ -265,18 +278,8 @@ def project(means, log_scales, quaternions, opacity, colors, maps, links, weight
             a, b, c, determinant = covariance(view, rows, scales)
             solid = _solid(opacity, which, fades, place)
             least = log(solid)
-            squared = fma(local[0], local[0], fma(local[1], local[1], local[2] * local[2]))
-            distance = root(squared)
-            apart = sixteen(1.0) / distance
-            red, green, blue = _paint(
-                (x - view[CENTER]) * apart,
-                (y - view[CENTER + 1]) * apart,
-                (z - view[CENTER + 2]) * apart,
-                colors,
-                tints,
-                which,
-                place,
-            )
+            distance, dx, dy, dz = directed(view, x, y, z, local)
+            red, green, blue = _paint(dx, dy, dz, colors, tints, which, place)
             reach = _reach(view, local[2], px * px + py * py, bent, determinant, solid, least)
             inverse = sixteen(1.0) / determinant
             set_row(place, 0, bent[0])

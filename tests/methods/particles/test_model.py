@@ -1,4 +1,3 @@
-import importlib
 from dataclasses import replace
 from functools import partial
 
@@ -15,6 +14,7 @@ from forewarp.scene.view import Moment, View
 from tests.contract.fitting import module_of
 from tests.contract.scenes import data_of, write_dnerf, write_hypernerf
 from tests.contract.table import METHODS
+from tests.support.kernels import watch
 
 ENTRY = METHODS["particles"]
 
@@ -233,21 +233,7 @@ def test_two_views_of_a_time_count_as_one_step(data):
 
 
 def test_the_first_steps_meet_warm_kernels_only(data, monkeypatch):
-    numba = pytest.importorskip("numba")
-    met = set()
-
-    def watched(name, kernel):
-        def call(*arguments):
-            met.add((name, *(str(numba.typeof(a)) for a in arguments)))
-            return kernel(*arguments)
-
-        return call
-
-    for part in ("project", "tiles", "rasterize", "chain", "nodes", "adam"):
-        home = importlib.import_module(f"forewarp.ops.kernels_{part}")
-        for name, kernel in list(vars(home).items()):
-            if hasattr(kernel, "py_func") and kernel.py_func.__module__ == home.__name__ and name[0] != "_":
-                monkeypatch.setattr(home, name, watched(name, kernel))
+    met = watch(monkeypatch, "project", "tiles", "rasterize", "chain", "nodes", "adam")
     module = module_with(data, **EVERY)
     module.method.warm_up()
     warm = met.copy()

@@ -19,7 +19,7 @@ from forewarp.methods.particles.rest import come_to_rest
 from forewarp.methods.particles.rows_adam import RowsAdam
 from forewarp.methods.particles.settings import Numbers
 from forewarp.methods.particles.snapshot import ParticlesSnapshot
-from forewarp.methods.particles.start import covered_pixels, first_points, first_values, widths
+from forewarp.methods.particles.start import FLAT, covered_pixels, first_points, first_values, widths
 from forewarp.ops.compare import compare
 from forewarp.ops.nodes import pull_nodes
 from forewarp.ops.project import Gaussians, Warp, moved
@@ -28,7 +28,6 @@ from forewarp.scene.box import Box
 from forewarp.scene.cloud import Cloud
 from forewarp.scene.view import Moment
 
-_FLAT = 0.28209479177387814  # of the harmonics: what a colour's first coefficient is multiplied by
 _SOLID, _SEEN = 0.1, 0.02  # opacity from which matter bounds the scene; from which there is any
 _TIMES = 16  # at which opacity over time is looked at
 
@@ -60,7 +59,7 @@ class Particles(Method):
         self.views, times = len(start.scene.train), start.scene.times
         on = Effects(**choices).only(self.numbers_of.effects, len(times))
         self.ends = min(times), max(times)
-        self.progress, self._optimizer = 0.0, None
+        self.progress = 0.0
         before = start.before if isinstance(start.before, Particles) else None
         fresh = None if start.blank or before is not None else self._measured(start)
         self._make(before, fresh, on)
@@ -335,7 +334,7 @@ class Particles(Method):
         """See ``HasMatter``."""
         solid = torch.sigmoid(self.opacity[:, 0])
         keep = solid > _SEEN if bool((solid > _SEEN).any()) else solid >= 0
-        colors = (0.5 + _FLAT * self.color[keep, 0]).clamp(0, 1)
+        colors = (0.5 + FLAT * self.color[keep, 0]).clamp(0, 1)
         size = 2 * float(self.log_scales.exp().mean())
         return Cloud(self._canonical()[keep], colors, solid[keep], max(size, 1e-9))
 

@@ -19,7 +19,7 @@ _DRIFT = 0.2  # share of a picture's width by which a silhouette is taken to mov
 _ROUGH, _FINE = 48, 112  # voxels along the mean side of the box, and of what is left of it
 _FEW = 16  # points that are too few to begin with
 _CAMERAS = 64  # whose distance from a point is looked at
-_FLAT = 0.28209479177387814  # of the harmonics: what a colour's first coefficient is multiplied by
+FLAT = 0.28209479177387814  # of the harmonics: what a colour's first coefficient is multiplied by
 
 
 def first_points(start: Start, count: int) -> Cloud:
@@ -143,5 +143,5 @@ def first_values(cloud: Cloud, widest: Tensor | None = None) -> dict[str, Tensor
         "log_scales": size.log()[:, None].repeat(1, 3),
         "turns": turns,
         "opacity": torch.zeros(len(points), 1),
-        "color": ((cloud.colors.float() - 0.5) / _FLAT)[:, None].clone(),
+        "color": ((cloud.colors.float() - 0.5) / FLAT)[:, None].clone(),
     }
