@@ -3,10 +3,17 @@
 import gc
 
 import pytest
+import torch
 
 from tests.support.commands import call, fitted_run
 
 collect_ignore = ["foreign"]  # the package that tests/cli/test_foreign.py imports as somebody else's
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _one_thread():
+    """Compute alike on every machine: sums over several threads differ in their last bits."""
+    torch.set_num_threads(1)
 
 
 @pytest.fixture
