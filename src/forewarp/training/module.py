@@ -50,6 +50,13 @@ class DynamicSceneModule(lightning.LightningModule):
         self._noted: Mapping[str, float] = {}
         self._torch_state: Tensor | None = None
 
+    def __setattr__(self, name: str, value: object) -> None:
+        """Set an attribute; the name of the hook, which Lightning notes dozens of times a step, at once."""
+        if name == "_current_fx_name":
+            self.__dict__[name] = value
+        else:
+            super().__setattr__(name, value)
+
     @property
     def fraction(self) -> float:
         """Fraction of the stage that is done, in [0, 1]."""
