@@ -90,6 +90,8 @@ OF_PARTICLES = {
     "color_over_time": Effect({"color_over_time": 1}, ((Particles, "tints"),), "tint"),
     "opacity_over_time": Effect({"opacity_over_time": 1}, ((Particles, "fades"),), "fade"),
 }
+RATES = {"means": 1.5e-3, "log_scales": 5e-3, "turns": 3e-3, "opacity": 5e-2, "color": 3e-2, "shade": 1e-3}
+RATES |= {"tint": 1e-3, "fade": 3e-3, "shifts": 7e-3, "node_turns": 8e-3}
 SMALL_NETWORK = {"width": 32, "layers": 3, "skip": None, "position_frequencies": 4}
 SMALL_NETWORK |= {"time_frequencies": 2, "samples": 16, "fine_samples": 16}
 
@@ -114,10 +116,9 @@ METHODS = {
             color_over_time=1,
             opacity_over_time=1,
         ),
-        {"means": 1.5e-3, "log_scales": 5e-3, "turns": 3e-3, "opacity": 5e-2, "color": 3e-2, "shade": 1e-3}
-        | {"tint": 1e-3, "fade": 3e-3, "shifts": 7e-3, "node_turns": 8e-3},
+        RATES,
         {"photo": 1.0, "rigid": 3.0, "smooth": 0.1},
-        {"every": 0.05, "settled": 0.9, "finals": {"means": 0.1}},
+        {"every": 0.05, "settled": 0.9, "lr_final_factor": dict.fromkeys(RATES, 0.1) | {"means": 0.01}},
         steps=150,
         effects=OF_PARTICLES,
     ),

@@ -114,9 +114,8 @@ class DynamicSceneModule(lightning.LightningModule):
             return -1
         self.curriculum.fraction = fraction
         optimizer = self.optimizers().optimizer
-        factor = self.settings.lr_factor(fraction)
         for group in optimizer.param_groups:
-            group["lr"] = group["base_lr"] * factor
+            group["lr"] = group["base_lr"] * self.settings.lr_factor(fraction, group["name"])
         self._noted = self.method.advance(fraction, self.global_step, optimizer)
         return None
 

@@ -262,13 +262,9 @@ class Particles(Method):
         return found
 
     def advance(self, progress: float, step: int, optimizer: torch.optim.Optimizer) -> dict[str, float]:
-        """Let rates fall, each as far as its kind should; renew particles where it is time."""
+        """Rates of lengths are of the scene's extent; renew particles where it is time."""
         self.progress, numbers = progress, self.numbers_of
         for group in optimizer.param_groups:
-            last = numbers.finals.get(group["name"], 1.0)
-            held = max(0.0, progress - numbers.hold_rates.get(group["name"], 0.0))
-            left = 1 - numbers.hold_rates.get(group["name"], 0.0)
-            group["lr"] *= last ** (held / left)
             if group["name"] in ("means", "shifts"):
                 group["lr"] *= float(self.extent)
         number = int(progress / numbers.every)

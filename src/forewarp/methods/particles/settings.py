@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 from forewarp.methods.particles.effects import NAMES
 
@@ -29,8 +29,6 @@ class Numbers:
         rest: share from which nodes that do not move come to rest, where the model has a background.
         jitter, calm: spread of the random shift of a picture's time, which falls to 0 at the share ``calm``.
         loose: what is left of the weight of ``rigid`` at the end.
-        finals: what is left at the end of a learning rate, by its name; the others stay.
-        hold_rates: share up to which such a rate stays.
     """
 
     effects: Sequence[str] = NAMES
@@ -47,8 +45,6 @@ class Numbers:
     jitter: float = 0.01
     calm: float = 0.4
     loose: float = 0.17
-    finals: Mapping[str, float] = field(default_factory=dict)
-    hold_rates: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not set(self.effects) <= set(NAMES):
