@@ -199,6 +199,7 @@ class Curriculum:
         error_share: share of the draws that picks a frame with a probability proportional to its latest
             error (see ``report``): the few frames at the ends of a sequence are hard.
         seed: seed of the draws.
+        where: key that errors name.
     """
 
     def __init__(
@@ -213,11 +214,12 @@ class Curriculum:
         newest_part: float = 0.125,
         error_share: float = 0.0,
         seed: int = 0,
+        where: str = "stage.curriculum",
     ) -> None:
         shares = all(0 <= share <= 1 for share in (all_in, newest_share, error_share))
         if not (start >= 1 and shares and 0 < newest_part <= 1):
             raise ValueError(
-                "stage.curriculum: expected start >= 1, all_in, newest_share and error_share in [0, 1] and "
+                f"{where}: expected start >= 1, all_in, newest_share and error_share in [0, 1] and "
                 f"newest_part in (0, 1], but got {start=}, {all_in=}, {newest_share=}, {error_share=}, "
                 f"{newest_part=}"
             )
@@ -227,7 +229,7 @@ class Curriculum:
         self._ends = [place + 1 for place in last_of_time.values()]  # frames in play, by number of times
         if most is not None:
             if most < 1:
-                raise ValueError(f"stage.curriculum.most: expected at least 1 or null, but got {most}")
+                raise ValueError(f"{where}.most: expected at least 1 or null, but got {most}")
             self._ends = self._ends[:most]
         self.start, self.all_in = min(start, len(self._ends)), all_in
         self.newest_share, self.newest_part = newest_share, newest_part

@@ -144,7 +144,7 @@ def test_without_motion_its_terms_are_none(data):
     assert step.terms["smooth"]() is None
 
 
-@pytest.mark.parametrize("motion", ["spline", "dct"])
+@pytest.mark.parametrize("motion", ["spline", "cosines"])
 def test_the_canonical_state_is_the_particles_themselves(data, motion):
     method = module_with(data, motion=motion).method
     for p in (method.nodes.shift, method.nodes.turn):
@@ -195,13 +195,15 @@ def test_particles_grow_to_what_the_pictures_call_for(data):
             {"rotation": False},
             "model.rotation: expected true, or null, but got False; choose model/rotation=none",
         ),
-        ({"motion": "wobble"}, "model.motion: expected spline or dct, or null, but got 'wobble'"),
+        ({"motion": "wobble"}, "model.motion: expected spline or cosines, or null, but got 'wobble'"),
         (
             {"numbers": {"effects": ["glow"]}},
-            r"stage.effects: expected some of motion, .*, but got \['glow'\]",
+            r"stage.fine.effects: expected some of motion, .*, but got \['glow'\]",
         ),
-        ({"numbers": {"first": 0.0}}, r"stage.first: expected a number in \(0, 1\], but got 0.0"),
-        ({"numbers": {"density": -1.0}}, "expected density > 0"),
+        ({"numbers": {"first": 0.0}}, r"stage.fine.first: expected a number in \(0, 1\], but got 0.0"),
+        ({"numbers": {"density": -1.0}}, "stage.fine.density: expected a number > 0, but got -1.0"),
+        ({"numbers": {"edges": 0}}, "stage.fine.edges: expected a number >= 1, but got 0"),
+        ({"numbers": {"jitter": "some"}}, "stage.fine.jitter: expected a number >= 0, but got 'some'"),
     ],
 )
 def test_refused(data, changes, text):

@@ -46,14 +46,14 @@ class Particles(Method):
     """
 
     terms = ("photo", "rigid", "smooth")
-    numbers = tuple(Numbers.__dataclass_fields__)
+    numbers = tuple(key for key in Numbers.__dataclass_fields__ if key != "name")
     asks = Asks(kind="pictures", straight=True)
     effects = EFFECTS
     planning: ClassVar[ParticlesPlanning] = ParticlesPlanning()
 
     def __init__(self, start: Start, *, width: float = 0.05, blur: float = 0.3, **choices) -> None:
         super().__init__()
-        self.numbers_of = Numbers(**start.numbers)
+        self.numbers_of = Numbers(name=start.stage, **start.numbers)
         self.canonical_time, self.width = start.scene.canonical_time, width
         self.pinholes = Pinholes(blur)
         self.views, times = len(start.scene.train), start.scene.times
