@@ -91,7 +91,7 @@ def test_options_of_ones_own_stand_beside_ours(ok, way, in_tmp):
         ),
         (
             ["model=particles", "+stage.fine.lr_final_factor.meens=0.5"],
-            "stage.fine.lr_final_factor: expected groups of means, log_scales, turns, opacity, color, shade, ti",
+            "stage.fine.lr_final_factor: expected groups of means, log_scales, turns, opacity, color,",
         ),
         (
             ["--multirun", "hydra/sweeper=one_at_a_time", "hydra.sweeper.changes=[]"],
