@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from forewarp.methods.method import Method, Snapshot, Step
+from forewarp.progress import told_if_slow
 from forewarp.scene.batch import Batch, Target
 from forewarp.scene.camera import Camera
 from forewarp.scene.view import Moment, Rendering, View
@@ -96,7 +97,8 @@ class DynamicSceneModule(lightning.LightningModule):
 
     def on_train_start(self) -> None:
         """Compile the kernels, then start the training clock."""
-        self.method.warm_up()
+        with told_if_slow(self.settings.name, "compiling kernels, once on a machine: up to a minute"):
+            self.method.warm_up()
         if self._torch_state is not None:  # restored last: callbacks may have drawn random numbers
             torch.set_rng_state(self._torch_state)
             self._torch_state = None
