@@ -82,6 +82,18 @@ def test_options_of_ones_own_stand_beside_ours(ok, way, in_tmp):
         (["budget=fast"], "budget=fast: expected preset=fast; the choice is called preset since 0.2"),
         (["--multirun", "hydra.sweeper.params.preset.skip_alpha=1"], "expected hydra.sweeper.params.preset."),
         (
+            ["model=particles", "stage.fine.lr.means=fast"],
+            "stage.fine.lr.means: expected a number >= 0, but got",
+        ),
+        (
+            ["model=forward", "stage.coarse.lr.flow=-1"],
+            "stage.coarse.lr.flow: expected a number >= 0, but got",
+        ),
+        (
+            ["model=particles", "+stage.fine.lr_final_factor.meens=0.5"],
+            "stage.fine.lr_final_factor: expected groups of means, log_scales, turns, opacity, color,",
+        ),
+        (
             ["--multirun", "hydra/sweeper=one_at_a_time", "hydra.sweeper.changes=[]"],
             "hydra.sweeper.changes: expected at least one change, but got []",
         ),

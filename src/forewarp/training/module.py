@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from forewarp.methods.method import Method, Snapshot, Step
+from forewarp.progress import told_if_slow
 from forewarp.scene.batch import Batch, Target
 from forewarp.scene.camera import Camera
 from forewarp.scene.view import Moment, Rendering, View
@@ -103,7 +104,8 @@ class DynamicSceneModule(lightning.LightningModule):
 
     def on_train_start(self) -> None:
         """Compile the kernels, then start the training clock."""
-        self.method.warm_up()
+        with told_if_slow(self.settings.name, "compiling kernels, once on a machine: up to a minute"):
+            self.method.warm_up()
         if self._torch_state is not None:  # restored last: callbacks may have drawn random numbers
             torch.set_rng_state(self._torch_state)
             self._torch_state = None
@@ -121,9 +123,8 @@ class DynamicSceneModule(lightning.LightningModule):
             return -1
         self.curriculum.fraction = fraction
         optimizer = self.optimizers().optimizer
-        factor = self.settings.lr_factor(fraction)
         for group in optimizer.param_groups:
-            group["lr"] = group["base_lr"] * factor
+            group["lr"] = group["base_lr"] * self.settings.lr_factor(fraction, group["name"])
         self._noted = self.method.advance(fraction, self.global_step, optimizer)
         return None
 

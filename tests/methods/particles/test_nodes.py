@@ -54,7 +54,7 @@ def test_shares_sum_to_one_and_prefer_the_nearest():
     assert bool((shares[:, 0] >= shares[:, 1:].amax(-1)).all())
 
 
-@pytest.mark.parametrize("kind", ["spline", "dct"])
+@pytest.mark.parametrize("kind", ["spline", "cosines"])
 @pytest.mark.parametrize("canonical", [0.0, 0.4])
 def test_nothing_has_moved_at_the_canonical_time(kind, canonical):
     nodes, points = nodes_of(kind=kind, canonical=canonical), torch.randn(7, 3)
@@ -64,7 +64,7 @@ def test_nothing_has_moved_at_the_canonical_time(kind, canonical):
 
 
 def test_paths_are_where_the_maps_lead():
-    nodes, points = nodes_of(kind="dct"), torch.randn(7, 3)
+    nodes, points = nodes_of(kind="cosines"), torch.randn(7, 3)
     rows, shares = nodes.links(points)
     maps = nodes.maps(0.7)
     expected = points.clone()
@@ -141,7 +141,7 @@ def test_what_was_seen_is_not_continued_anew():
 
 
 def test_another_kind_of_curve_is_refused():
-    with pytest.raises(ValueError, match="model.motion: expected spline, dct or none, but got 'fourier'"):
+    with pytest.raises(ValueError, match="model.motion: expected spline, cosines or none, but got 'fourier'"):
         Curve("fourier", 8, 20, 0.0)
     with pytest.raises(ValueError, match="at least 2 distinct training times, but got 1"):
         Curve("spline", 8, 1, 0.0)

@@ -78,7 +78,7 @@ def test_nothing_comes_to_rest_where_the_effect_is_off(data, monkeypatch):  # no
     module.method.advance(0.35, 1, module.configure_optimizers())
 
 
-@pytest.mark.parametrize("motion", ["spline", "dct"])
+@pytest.mark.parametrize("motion", ["spline", "cosines"])
 def test_what_moves_does_not_come_to_rest(data, motion):  # noqa: F811
     method = module_with(data, motion=motion, background=0.01).method
     method.nodes.shift.data.normal_()
@@ -87,7 +87,7 @@ def test_what_moves_does_not_come_to_rest(data, motion):  # noqa: F811
     assert not bool(method.resting.any())
 
 
-@pytest.mark.parametrize("motion", ["spline", "dct"])
+@pytest.mark.parametrize("motion", ["spline", "cosines"])
 def test_a_node_that_stops_stays(data, motion):  # noqa: F811
     nodes = module_with(data, motion=motion, background=0.01).method.nodes
     nodes.shift.data.normal_()

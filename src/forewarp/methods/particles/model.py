@@ -46,14 +46,14 @@ class Particles(Method):
     """
 
     terms = ("photo", "rigid", "smooth")
-    numbers = tuple(Numbers.__dataclass_fields__)
+    numbers = tuple(key for key in Numbers.__dataclass_fields__ if key != "name")
     asks = Asks(kind="pictures", straight=True)
     effects = EFFECTS
     planning: ClassVar[ParticlesPlanning] = ParticlesPlanning()
 
     def __init__(self, start: Start, *, width: float = 0.05, blur: float = 0.3, **choices) -> None:
         super().__init__()
-        self.numbers_of = Numbers(**start.numbers)
+        self.numbers_of = Numbers(name=start.stage, **start.numbers)
         self.canonical_time, self.width = start.scene.canonical_time, width
         self.pinholes = Pinholes(blur)
         self.views, times = len(start.scene.train), start.scene.times
@@ -262,13 +262,9 @@ class Particles(Method):
         return found
 
     def advance(self, progress: float, step: int, optimizer: torch.optim.Optimizer) -> dict[str, float]:
-        """Let rates fall, each as far as its kind should; renew particles where it is time."""
+        """Rates of lengths are of the scene's extent; renew particles where it is time."""
         self.progress, numbers = progress, self.numbers_of
         for group in optimizer.param_groups:
-            last = numbers.finals.get(group["name"], 1.0)
-            held = max(0.0, progress - numbers.hold_rates.get(group["name"], 0.0))
-            left = 1 - numbers.hold_rates.get(group["name"], 0.0)
-            group["lr"] *= last ** (held / left)
             if group["name"] in ("means", "shifts"):
                 group["lr"] *= float(self.extent)
         number = int(progress / numbers.every)
