@@ -87,7 +87,7 @@ def test_with_all_effects_off_there_are_bare_particles(data):
     method = module_with(data, **dict.fromkeys(MOVING)).method
     assert not method.moves
     assert set(dict(method.named_parameters())) == {"means", "log_scales", "turns", "opacity", "color"}
-    assert not set(dict(method.named_buffers())) & {"links", "shares"}
+    assert not set(dict(method.named_buffers())) & {"skin.links", "skin.shares"}
     assert set(method.param_groups()) == set(dict(method.named_parameters()))
     assert set(switched(method).values()) == {False}
 
@@ -180,7 +180,7 @@ def test_particles_grow_to_what_the_pictures_call_for(data):
         look(module, data)
         method.advance(number / 10, number, optimizer)
     assert len(method.means) == pytest.approx(float(method.most), rel=0.05)
-    assert len(method.links) == len(method.pulled) == len(method.means)
+    assert len(method.skin.links) == len(method.pulled) == len(method.means)
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ import torch
 
 from forewarp.fields.curves import Curve
 from forewarp.methods.particles.nodes import Nodes, nearest, spread_out
+from forewarp.methods.particles.skin import Skin
 
 
 def grid(side=4):
@@ -145,3 +146,21 @@ def test_another_kind_of_curve_is_refused():
         Curve("fourier", 8, 20, 0.0)
     with pytest.raises(ValueError, match="at least 2 distinct training times, but got 1"):
         Curve("spline", 8, 1, 0.0)
+
+
+def test_particles_learn_whom_they_follow_and_keep_what_they_learned():
+    nodes = nodes_of()
+    skin = Skin(nodes, nodes.places[:5] + 0.01)
+    torch.testing.assert_close(skin.weights().detach(), skin.shares)
+    skin.learned.data = torch.randn(5, 4)
+    skin.let_go(torch.arange(5) == 2)
+    weights = skin.weights()
+    torch.testing.assert_close(weights.sum(-1), torch.tensor([1.0, 1.0, 0.0, 1.0, 1.0]))
+    by_weights = torch.randn(5, 4)
+    (weights * by_weights).sum().backward()
+    torch.testing.assert_close(skin.slope(weights.detach(), by_weights), skin.learned.grad)
+    before = {(i, int(n)): float(v) for i in range(5) for n, v in zip(skin.links[i], skin.learned[i])}
+    skin.relink(nodes, nodes.places[:5] + 0.4)
+    after = {(i, int(n)): float(v) for i in range(5) for n, v in zip(skin.links[i], skin.learned[i])}
+    assert after == pytest.approx({key: before.get(key, 0.0) for key in after})
+    assert 0 < len(before.keys() & after.keys()) < len(after)

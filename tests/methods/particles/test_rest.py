@@ -41,13 +41,13 @@ def test_it_rests_where_it_was_and_as_it_was_turned(half):
     assert torch.equal(method.nodes.still, ~moves)
     rests = method.resting
     assert 0 < int(rests.sum()) < len(rests)
-    assert torch.equal(rests, method.nodes.still[method.links.long()].all(-1))
+    assert torch.equal(rests, method.nodes.still[method.skin.links.long()].all(-1))
     after, linear = placed(method, 0.5)
     torch.testing.assert_close(after[rests], before[rests], atol=1e-4, rtol=0)
     torch.testing.assert_close(
         (linear @ rotations(method.turns.data))[rests], turned[rests], atol=1e-3, rtol=0
     )
-    assert int(method.shares[rests].count_nonzero()) == 0
+    assert int(method.skin.shares[rests].count_nonzero()) == 0
     ends = [placed(method, time)[0] for time in (0.0, 1.0)]
     assert torch.equal(ends[0][rests], ends[1][rests])
     assert float((ends[1] - ends[0]).detach()[~rests].norm(dim=-1).max()) > 0.3
@@ -66,7 +66,7 @@ def test_what_rests_keeps_resting_through_steps_and_density_control(half, data):
         method.advance(0.1 * number + 0.05, number, optimizer)
     assert torch.equal(method.nodes.shift.data[~moves], kept)
     assert len(method.resting) == len(method.means)
-    assert int(method.shares[method.resting].count_nonzero()) == 0
+    assert int(method.skin.shares[method.resting].count_nonzero()) == 0
     assert bool(method.resting.any())
 
 

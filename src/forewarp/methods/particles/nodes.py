@@ -199,7 +199,7 @@ class Nodes(nn.Module):
                 return prefix + name
         if state[prefix + "edges"].shape != state[prefix + "edge_weights"].shape:
             return prefix + "edges"
-        for name, rows in ((prefix + "edges", state[prefix + "edges"]), ("links", links)):
+        for name, rows in ((prefix + "edges", state[prefix + "edges"]), ("skin.links", links)):
             if rows.numel() and not 0 <= int(rows.min()) <= int(rows.max()) < many:
                 return name
         return None
