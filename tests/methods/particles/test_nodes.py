@@ -159,8 +159,8 @@ def test_particles_learn_whom_they_follow_and_keep_what_they_learned():
     by_weights = torch.randn(5, 4)
     (weights * by_weights).sum().backward()
     torch.testing.assert_close(skin.slope(weights.detach(), by_weights), skin.learned.grad)
-    before = {(i, int(n)): float(v) for i in range(5) for n, v in zip(skin.links[i], skin.learned[i])}
+    before = {(i, int(n)): float(v) for i in range(5) for n, v in zip(skin.links[i], skin.learned.data[i])}
     skin.relink(nodes, nodes.places[:5] + 0.4)
-    after = {(i, int(n)): float(v) for i in range(5) for n, v in zip(skin.links[i], skin.learned[i])}
+    after = {(i, int(n)): float(v) for i in range(5) for n, v in zip(skin.links[i], skin.learned.data[i])}
     assert after == pytest.approx({key: before.get(key, 0.0) for key in after})
     assert 0 < len(before.keys() & after.keys()) < len(after)
