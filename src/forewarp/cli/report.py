@@ -11,6 +11,7 @@ KINDS = {
     "accuracy_time": "accuracy against training time, and the cheapest way to each dB",
     "price_list": "what each choice costs and brings, with the spread over seeds",
     "paper": "the paper's tables and figures: Markdown, LaTeX, CSV, HTML",
+    "minutes": "what a method reaches on each scene in so many minutes, by seed and view",
     "effects": "planned runs against every effect at once and the paper's fixed set",
     "compare": "a few runs side by side, printed",
     "limits": "what keeps a few runs from the truth, printed: time, views, voxel size, regions",
@@ -26,7 +27,7 @@ forewarp-report makes tables and curves of runs that are already there. Only kin
   forewarp-report kind=limits 'runs=runs/paper/*/plain-forward-fast-*'
 
 What one types most:
-  runs=FOLDER            searched for runs (runs/accuracy_time, runs/paper or runs/effects)
+  runs=FOLDER            searched for runs (runs/accuracy_time, paper, minutes or effects)
   runs=[FOLDER,FOLDER]   compare, limits: the runs themselves; patterns with * are expanded
   out=FOLDER             where the page goes (results/ below the runs)
   target=DB              accuracy_time: PSNR that every variant's seconds are listed for
@@ -51,7 +52,7 @@ def report(config) -> None:
         return
     if not isinstance(config.runs, str | None):
         raise ValueError(f"runs: expected one folder for kind={config.kind}, but got a list; name one folder")
-    default = config.kind if config.kind in ("paper", "effects") else "accuracy_time"
+    default = config.kind if config.kind in ("paper", "effects", "minutes") else "accuracy_time"
     runs = Path(config.runs or f"{config.paths.runs}/{default}")
     for file in _written(config, runs, Path(config.out or runs / "results")):
         print(f"written: {file}")
@@ -99,6 +100,7 @@ def _written(config, runs: Path, out: Path) -> list[Path]:
     from forewarp.report.accuracy_time import write_accuracy_time
     from forewarp.report.curve import OTHERS, read_published
     from forewarp.report.effects import write_effects
+    from forewarp.report.minutes import write_minutes
     from forewarp.report.paper import write_paper
     from forewarp.report.paper_printed import PAPER
     from forewarp.report.price_list import write_price_list
@@ -107,6 +109,8 @@ def _written(config, runs: Path, out: Path) -> list[Path]:
         return write_price_list(runs, out)
     if config.kind == "effects":
         return write_effects(runs, out)
+    if config.kind == "minutes":
+        return write_minutes(runs, out)
     if config.kind == "paper":
         curves = Path(config.curves or f"{config.paths.runs}/accuracy_time/results")
         return write_paper(runs, out, Path(config.published or PAPER), curves)

@@ -34,7 +34,7 @@ def draw_resolution(path: Path, results: Sequence[Result]) -> Path | None:
     scenes = {scene: sides for scene, sides in scenes.items() if len(sides) > 1}
     if not scenes:
         return None
-    figure, axes = _figure(1, 1, (7, 4.5))
+    figure, axes = figure_of(1, 1, (7, 4.5))
     for scene, sides in sorted(scenes.items()):
         estimates = [Estimate.of(sides[side]) for side in sorted(sides)]
         spread = [estimate.deviation or 0 for estimate in estimates]
@@ -63,7 +63,7 @@ def draw_canonical(path: Path, forward: Result, backward: Result) -> Path | None
     _, theirs, their_error = thirds(_read(_sheets(backward)[name]))
     pictures = {"truth": truth, "forward": ours, "backward": theirs}
     pictures |= {"error, forward": error, "error, backward": their_error}
-    figure, axes = _figure(1, len(pictures), (3 * len(pictures), 3.4))
+    figure, axes = figure_of(1, len(pictures), (3 * len(pictures), 3.4))
     _show(axes[0], pictures)
     figure.suptitle(f"{forward.scene}, {name}: near the canonical time; errors up to 0.25 (white)")
     return curve._save(figure, path)
@@ -75,7 +75,7 @@ def draw_sheet(path: Path, results: Sequence[Result], columns: int = 3) -> Path 
     found = {scene: sheets for scene, sheets in found.items() if sheets}
     if not found:
         return None
-    figure, axes = _figure(len(found), columns, (3 * columns, 3.2 * len(found)))
+    figure, axes = figure_of(len(found), columns, (3 * columns, 3.2 * len(found)))
     for row, (scene, sheets) in zip(axes, found.items()):
         name = sorted(sheets)[len(sheets) // 2]
         parts = thirds(_read(sheets[name]))
@@ -111,7 +111,8 @@ def _show(axes, pictures: Mapping[str, np.ndarray]) -> None:
         axis.set_axis_off()
 
 
-def _figure(rows: int, columns: int, size: tuple[float, float]):
+def figure_of(rows: int, columns: int, size: tuple[float, float]):
+    """Make a figure and its axes (rows, columns); ``size`` in inches."""
     try:
         from matplotlib.figure import Figure
     except ImportError:
