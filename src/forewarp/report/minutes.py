@@ -24,10 +24,10 @@ _MOST = 1 << 24  # bytes of a table that is read back
 INTRODUCTION = """# What {method} reaches in so many minutes
 
 Written by `forewarp-report kind=minutes` from runs of `sweeps=minutes`. Minutes are of training, by the
-platform's clock: it counts all that a method does to begin with (a visual hull, a plane sweep), and leaves out
-reading pictures and compiling. PSNR (dB), SSIM and LPIPS are means over test views; ± is the standard
-deviation over the seeds. *Ends*: by how much the mean PSNR of views in the first and last tenth of the time is
-below the median of the others.
+platform's clock: it counts all that a method does to begin with (a visual hull, a plane sweep), and leaves
+out reading pictures and compiling. PSNR (dB), SSIM and LPIPS are means over test views; ± is the standard
+deviation over the seeds. *Ends*: by how much the mean PSNR of views in the first and last tenth of the time
+is below the median of the others.
 """
 
 
