@@ -106,10 +106,10 @@ def scene_of(count: int, side: int) -> Scene:
 
 
 def run_of(size: Size, steps: int, folder: Path) -> Run:
-    """A run of the figure by the project's own numbers, in which the particles stay as many as they are."""
+    """A run of the figure by the project's own numbers, but particles stay as many and nothing is drawn."""
     nodes = size.nodes / math.sqrt(size.particles)
     config = composed(
-        "model=particles", "trainer=cpu", "~stage.coarse", f"run={folder}",
+        "model=particles", "trainer=cpu", "~stage.coarse", "callbacks.pictures=null", f"run={folder}",
         "budget.minutes=null", f"budget.iterations={steps}", f"stage.fine.nodes={nodes}",
         "stage.fine.first=1.0", "stage.fine.every=1.0", "stage.fine.density=1000",
     )  # fmt: skip
