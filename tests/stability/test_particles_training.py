@@ -115,7 +115,7 @@ def test_nodes_that_coincide(turns, count):
         assert all(value.isfinite().all() for value in found)
 
 
-@pytest.mark.parametrize("kind", ["spline", "dct"])
+@pytest.mark.parametrize("kind", ["spline", "cosines"])
 @pytest.mark.parametrize("time", [0.0, 1e-12, 1e-7, 1 - 1e-7, 1.0])
 def test_at_and_beside_the_canonical_time_and_the_ends(kind, time):
     for canonical in (0.0, 1.0):
