@@ -119,7 +119,7 @@ def test_a_run_with_views_set_aside_leaves_its_curve(ok, scenes, tmp_path):
     assert len((run / "accuracy_time.csv").read_text().splitlines()) > 1
     assert (run / "accuracy_time.png").stat().st_size > 1000
     command = yaml.safe_load((run / "config.yaml").read_text())["command"]
-    assert command.startswith("forewarp-train data=dnerf ")
+    assert command.startswith("forewarp-train model=forward data=dnerf ")
     assert "data.held_out=2" in command
 
 
