@@ -22,7 +22,7 @@ types most:
   plan.steps=N plan.seconds=N              bounds of a coarse stage; the first that is reached ends it
   plan.trial_steps=N plan.trial_seconds=N  bounds of a trial
   plan.folder=FOLDER     where plan.yaml and the trials go; an interrupted plan goes on there
-Overrule a plan by an override: forewarp-train plan=FILE model/inpainter=unet3d
+Overrule a plan by an override: forewarp-train plan=FILE model/view_dependence=none
 """
 
 
