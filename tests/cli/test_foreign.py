@@ -21,7 +21,7 @@ SMALL = [
     *("hydra.searchpath=[pkg://theirs.conf]", "trainer=cpu", "data.rays=64", "threads=1"),
     *("budget.minutes=null", "budget.iterations=6", "checkpoint_seconds=0", "sheets=0"),
 ]
-DISC = [*SMALL, "experiment=disc", "model/view_dependence=tint", "~stage.fine"]
+DISC = [*SMALL, "experiment=disc", "model=forward", "model/view_dependence=tint", "~stage.fine"]
 MIST = [*SMALL, "experiment=disc", "model=mist"]
 TRUST = "trust=[theirs]"
 ADVICE = "; if you trust the package theirs, add trust=[theirs] (or set FOREWARP_TRUST=theirs)"

@@ -12,7 +12,7 @@ from forewarp.files import read_json, read_text, replace_file
 from forewarp.metrics.gain import Estimate
 from forewarp.report import curve
 from forewarp.report.collect import Result, collect, left_out, machine
-from forewarp.report.paper_figures import figure_of
+from forewarp.report.sheets import figure_of
 from forewarp.report.tables import Column, Table
 
 KEY = ("method", "scene", "minutes", "seed")  # what tells rows apart
