@@ -17,7 +17,7 @@ from forewarp.methods.particles.nodes import Nodes
 from forewarp.methods.particles.planning import EFFECTS, ParticlesPlanning
 from forewarp.methods.particles.rest import come_to_rest
 from forewarp.methods.particles.rows_adam import RowsAdam
-from forewarp.methods.particles.settings import Numbers
+from forewarp.methods.particles.settings import Numbers, told_by
 from forewarp.methods.particles.skin import Skin
 from forewarp.methods.particles.snapshot import ParticlesSnapshot
 from forewarp.methods.particles.start import FLAT, covered_pixels, first_points, first_values, widths
@@ -265,11 +265,15 @@ class Particles(Method):
         return found
 
     def advance(self, progress: float, step: int, optimizer: torch.optim.Optimizer) -> dict[str, float]:
-        """Rates of lengths are of the scene's extent; renew particles where it is time."""
+        """Rates of lengths are of the scene's extent, that of weights follows what the pictures tell; renew
+        particles where it is time.
+        """
         self.progress, numbers = progress, self.numbers_of
         for group in optimizer.param_groups:
             if group["name"] in ("means", "shifts"):
                 group["lr"] *= float(self.extent)
+            elif group["name"] == "skin":
+                group["lr"] *= told_by(self.views)
         number = int(progress / numbers.every)
         if number > int(self.round) and progress < numbers.settled:
             self.round.fill_(number)

@@ -11,6 +11,11 @@ from forewarp.methods.particles.effects import NAMES
 _VIEWS = 100  # pictures from which on more of them call for no more particles
 
 
+def told_by(views: int) -> float:
+    """How much so many pictures tell of who follows whom and of details: all of it in [0, 1], or a share."""
+    return min(1.0, views / _VIEWS)
+
+
 @dataclass(frozen=True)
 class Numbers:
     """The numbers of a stage that are the method's own. Shares are of the stage.
@@ -74,7 +79,7 @@ class Numbers:
         >>> Numbers().most(20_000.0, 100), Numbers().most(20_000.0, 25)
         (12728, 6364)
         """
-        return max(32, round(self.density * math.sqrt(covered * min(1.0, views / _VIEWS))))
+        return max(32, round(self.density * math.sqrt(covered * told_by(views))))
 
     def share_at(self, progress: float) -> float:
         """The share of them that there should be: on a line from ``first``; soon before ``settled``, all."""
