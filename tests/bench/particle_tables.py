@@ -46,7 +46,7 @@ LEAST_SHARE, LEAST_GAIN, STEP_MS, PICTURE_MS = 0.8, 1.6, 7.0, 5.0  # the goals
 
 @contextmanager
 def kernels_timed() -> Iterator[dict[tuple[str, str], float]]:
-    """Add up the seconds of processor time in each kernel by module and name."""
+    """Add up the seconds of processor time in each kernel by module and name; all must be compiled before."""
     spent: dict[tuple[str, str], float] = {}
     before = []
 

@@ -152,6 +152,7 @@ class Loop:
         torch.manual_seed(0)
         self.module = run._module(run.stages[0], None, None, 0)
         self.method, self.fraction = self.module.method, fraction
+        self.method.warm_up()
         run.datamodule.picker, run.datamodule.asks = self.module.curriculum, self.method.asks
         self.module.curriculum.fraction = fraction
         self.optimizer = self.module.configure_optimizers()
