@@ -10,6 +10,7 @@ from forewarp.methods.particles import model
 from forewarp.methods.particles.model import Particles
 from forewarp.methods.particles.settings import Numbers
 from forewarp.methods.particles.start import widths
+from forewarp.ops.project import moved
 from forewarp.scene.view import Moment, View
 from tests.contract.fitting import module_of
 from tests.contract.scenes import data_of, write_dnerf, write_hypernerf
@@ -118,7 +119,7 @@ def test_operators_get_nothing_of_what_is_off(data, monkeypatch):
     assert (len(tints), fades.tolist(), int(warp.weights.count_nonzero())) == (0, [1.0], 0)
     look(module_with(data, **EVERY), data)
     particles, warp, _, tints, fades, *_ = seen["compare"]
-    assert (particles.colors.shape[1], particles.opacity.shape[1], warp.links.shape[1]) == (6, 3, 4)
+    assert (particles.colors.shape[1], particles.opacity.shape[1], warp.links.shape[1]) == (6, 3, 6)
     assert (len(tints), len(fades)) == (2, 3)
 
 
@@ -145,13 +146,20 @@ def test_without_motion_its_terms_are_none(data):
 
 
 @pytest.mark.parametrize("motion", ["spline", "cosines"])
-def test_the_canonical_state_is_the_particles_themselves(data, motion):
+def test_points_go_with_the_particles_beside_them(data, motion):
     method = module_with(data, motion=motion).method
-    for p in (method.nodes.shift, method.nodes.turn):
-        p.data.normal_()
-    paths = method.trajectories(method.means.data[:5], torch.tensor([method.canonical_time, 1.0]))
-    torch.testing.assert_close(paths[:, 0], method.means.data[:5])
+    generator = torch.Generator().manual_seed(0)
+    for p in method.nodes.parameters():
+        p.data += 0.05 * torch.randn(p.shape, generator=generator)
+    method.skin.learned.data += torch.randn(method.skin.learned.shape, generator=generator)
+    times = torch.tensor([method.canonical_time, 0.7])
+    place, later = (moved(method.means.data, method.warp(float(time)))[0] for time in times)
+    paths = method.trajectories(place[:20], times)
+    torch.testing.assert_close(paths[:, 0], place[:20])
+    torch.testing.assert_close(paths[:, 1], later[:20], atol=2e-3, rtol=0)  # others are near, too
     assert float((paths[:, 1] - paths[:, 0]).norm(dim=-1).amin()) > 0.01
+    beside = place[:20] + 0.1 * torch.randn(20, 3, generator=generator)
+    torch.testing.assert_close(method.trajectories(beside, times[:1])[:, 0], beside)
 
 
 def test_a_snapshot_holds_its_time(data):
@@ -167,7 +175,7 @@ def test_rates_of_lengths_are_of_the_scenes_extent(data):
     module.method.advance(0.5, 0, optimizer)
     changed = {g["name"]: g["lr"] / before[g["name"]] for g in optimizer.param_groups}
     assert {name: factor for name, factor in changed.items() if factor != 1} == pytest.approx(
-        {"means": extent, "shifts": extent}
+        {"means": extent, "shifts": extent, "skin": len(data.scene.train) / 100}
     )
 
 

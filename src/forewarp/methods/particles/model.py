@@ -13,6 +13,7 @@ from forewarp.methods.method import Method, Snapshot, Start, Step
 from forewarp.methods.particles.camera import Pinholes
 from forewarp.methods.particles.density import renew
 from forewarp.methods.particles.effects import Effects, cosines
+from forewarp.methods.particles.matter import bounds_of, matter_of, paths_of
 from forewarp.methods.particles.nodes import Nodes
 from forewarp.methods.particles.planning import EFFECTS, ParticlesPlanning
 from forewarp.methods.particles.rest import come_to_rest
@@ -20,16 +21,15 @@ from forewarp.methods.particles.rows_adam import RowsAdam
 from forewarp.methods.particles.settings import Numbers, told_by
 from forewarp.methods.particles.skin import Skin
 from forewarp.methods.particles.snapshot import ParticlesSnapshot
-from forewarp.methods.particles.start import FLAT, covered_pixels, first_points, first_values, widths
+from forewarp.methods.particles.start import covered_pixels, first_points, first_values, widths
 from forewarp.ops.compare import compare
 from forewarp.ops.nodes import pull_nodes
-from forewarp.ops.project import Gaussians, Warp, moved
+from forewarp.ops.project import Gaussians, Warp
 from forewarp.scene.batch import Asks, Batch
 from forewarp.scene.box import Box
 from forewarp.scene.cloud import Cloud
 from forewarp.scene.view import Moment
 
-_SOLID, _SEEN = 0.1, 0.02  # opacity from which matter bounds the scene; from which there is any
 _TIMES = 16  # at which opacity over time is looked at
 
 
@@ -310,36 +310,17 @@ class Particles(Method):
         """Adam by rows."""
         return RowsAdam(groups)
 
-    @torch.no_grad()
     def trajectories(self, points: Tensor, times: Tensor) -> Tensor:
-        """See ``HasTrajectories``: points follow the nodes beside them."""
-        if self.nodes is None:
-            return points[:, None].expand(-1, len(times), -1).clone()
-        return self.nodes.paths(points.float(), times)
+        """See ``HasTrajectories``: points go with the particles beside them."""
+        return paths_of(self, points, times)
 
-    @torch.no_grad()
     def bounds(self, times: list[float]) -> Box | None:
         """See ``HasBounds``."""
-        solid = torch.sigmoid(self.most_opaque()) > _SOLID
-        if not bool(solid.any()):
-            return None
-        points = self.trajectories(self._canonical()[solid], torch.tensor(times)).flatten(0, 1)
-        pad = 2 * float(self.log_scales[solid].exp().median()) + 1e-3 * float(self.extent)
-        low, high = points.amin(0) - pad, points.amax(0) + pad
-        return Box(tuple(low.tolist()), tuple(high.tolist()))
+        return bounds_of(self, times)
 
-    def _canonical(self) -> Tensor:
-        """Where particles are at the canonical time (N, 3)."""
-        return moved(self.means.data, self.warp(self.canonical_time))[0]
-
-    @torch.no_grad()
     def matter(self) -> Cloud:
         """See ``HasMatter``."""
-        solid = torch.sigmoid(self.opacity[:, 0])
-        keep = solid > _SEEN if bool((solid > _SEEN).any()) else solid >= 0
-        colors = (0.5 + FLAT * self.color[keep, 0]).clamp(0, 1)
-        size = 2 * float(self.log_scales.exp().mean())
-        return Cloud(self._canonical()[keep], colors, solid[keep], max(size, 1e-9))
+        return matter_of(self)
 
     def protocol(self) -> dict[str, str]:
         """See ``Method``."""
