@@ -1,15 +1,17 @@
 .DEFAULT_GOAL := help
-.PHONY: help install install-launchers demo demo-forward demo-backward tables-vehicle tables-captures demo-lego-complete demo-hypernerf demo-nhr test conformance test-slow test-stability bench bench-gpu effects accuracy-time price-list reproduce-tables lint format clean
+.PHONY: help install install-launchers demo demo-particles demo-forward demo-backward tables-vehicle tables-captures demo-lego-complete demo-hypernerf demo-nhr test conformance test-slow test-stability bench bench-gpu effects accuracy-time price-list reproduce-tables lint format clean
 
 PYTHON ?= python3
 BIN := .venv/bin
 DEMO := runs/demo
 # For accuracy-time and price-list: a folder of D-NeRF scenes (none: the procedural vehicle), a scene of it, minutes of
-# training a run, how many seeds, and, to compare less than sweeps/price_list.yaml does, CHANGES="preset.rays=1024,2048".
+# training a run, how many seeds, MODEL=forward for the paper's method instead of particles, and, to compare less than
+# sweeps/price_list_<model>.yaml does, CHANGES="stage.fine.density=45,180".
 DATA ?=
 SCENE ?= jumpingjacks
 SCENES ?= jumpingjacks hook
 MINUTES ?= 3
+MODEL ?=
 DEVICE ?= gpu
 SHELL := bash
 .SHELLFLAGS := -o pipefail -c
@@ -21,9 +23,10 @@ comma := ,
 SEED = $(if $(SEEDS),$(if $(findstring $(comma),$(SEEDS)),seed,seeds)=$(SEEDS))
 # Begin each line of jobs that run side by side with the job's name; leave Ctrl-C to the job itself.
 SAYS = 2>&1 | { trap '' INT; sed -u 's/^/$@ | /'; }
-# All changes of the price list; with CHANGES the reference, then these.
+# All changes of the method's price list; with CHANGES the reference, then these.
+OF_MODEL = $(if $(MODEL),model=$(MODEL))
 SWEEP = sweep() { $(BIN)/forewarp-train --multirun "$$@" $(MORE); }; \
-	compare() { $(if $(CHANGES),sweep sweeps=accuracy_time "$$@" $(GO_ON); sweep sweeps=accuracy_time "$$@" $(CHANGES),sweep sweeps=price_list "$$@"); }
+	compare() { $(if $(CHANGES),sweep sweeps=accuracy_time $(OF_MODEL) "$$@" $(GO_ON); sweep sweeps=accuracy_time $(OF_MODEL) "$$@" $(CHANGES),sweep sweeps=price_list_$(or $(MODEL),particles) "$$@"); }
 space := $(subst ,, )
 # A failed job has printed its error and stops no other job; make ends with its status. Only Ctrl-C ends everything.
 GO_ON = || { status=$$?; [ $$status -lt 128 ] || exit $$status; }
@@ -43,13 +46,16 @@ install-launchers: ## add joblib, Ray and submitit for sweeps (launcher=...), an
 	if [ -n "$$links" ]; then export UV_FIND_LINKS="$$links"; fi; \
 	VIRTUAL_ENV="$$PWD/.venv" $(BIN)/uv pip install --compile-bytecode -c constraints.txt -e '.[sweeps]'
 
-demo: ## fit the procedural vehicle forward and backward, one core each, compare, make a video (three minutes)
-	@$(MAKE) --no-print-directory -j2 demo-forward demo-backward
-	$(BIN)/forewarp-report kind=compare runs=[$(DEMO)/forward,$(DEMO)/backward]
-	$(BIN)/forewarp-render run=$(DEMO)/forward path=both
+demo: ## fit the procedural vehicle by three methods, two at once, compare, make a video (three minutes)
+	@$(MAKE) --no-print-directory -j2 demo-particles demo-forward demo-backward
+	$(BIN)/forewarp-report kind=compare runs=[$(DEMO)/particles,$(DEMO)/forward,$(DEMO)/backward] out=$(DEMO)
+	$(BIN)/forewarp-render run=$(DEMO)/particles path=both
 
-demo-forward demo-backward: demo-%:
-	$(BIN)/forewarp-train experiment=demo model=$* threads=1 budget.minutes=1.25 run=$(DEMO)/$* $(SAYS)
+# Kernels of particles compile for half a minute the first time, beside the others' training.
+demo-particles: DEMO_MINUTES := 0.5
+demo-forward demo-backward: DEMO_MINUTES := 0.8
+demo-particles demo-forward demo-backward: demo-%:
+	$(BIN)/forewarp-train experiment=demo model=$* threads=1 budget.minutes=$(DEMO_MINUTES) run=$(DEMO)/$* $(SAYS)
 
 demo-lego-complete: ## build a small counterpart of Lego Complete, fit a scene, evaluate, make a video
 demo-hypernerf: ## the same for a two-phone rig in a textured room, with a static background
@@ -77,9 +83,9 @@ TINY = data.scene=tiny paths.data=runs/bench-gpu data.synthesis.size=32 data.syn
 	data.synthesis.test_views=[1,1,1] preset.rays=64 preset.inpainter_width=16 data.held_out=2 budget.iterations=12 \
 	stage.coarse.num_voxels=[[0,1000]] stage.fine.num_voxels=[[0,1500]]
 bench-gpu: MINUTES := $(if $(filter command line,$(origin MINUTES)),$(MINUTES),10)
-bench-gpu: ## seconds of steps and frames, and PSNR against seconds, on a GPU [DATA= SCENES="a b" MINUTES= DEVICE=cpu SMALL=1]
+bench-gpu: ## seconds of steps and frames, and PSNR against seconds, of model=forward on a GPU [DATA= SCENES="a b" MINUTES= DEVICE=cpu SMALL=1]
 	status=0; for scene in $(if $(DATA),$(SCENES),vehicle); do \
-		bench() { $(BIN)/forewarp-train trainer=$(DEVICE) $(if $(DATA),experiment=dnerf data.root=$(DATA)) data.scene=$$scene \
+		bench() { $(BIN)/forewarp-train model=forward trainer=$(DEVICE) $(if $(DATA),experiment=dnerf data.root=$(DATA)) data.scene=$$scene \
 			+variant.name=base "$$@" $(if $(SMALL),$(TINY)) $(GO_ON); }; \
 		bench preset=fast data.held_out=8 budget.minutes=$(MINUTES) run=runs/bench-gpu/$$scene-fast; \
 		bench preset=faithful budget.minutes=null budget.iterations=240 run=runs/bench-gpu/$$scene-faithful; \
@@ -88,14 +94,14 @@ bench-gpu: ## seconds of steps and frames, and PSNR against seconds, on a GPU [D
 		$(BIN)/forewarp-report kind=$$kind runs=runs/bench-gpu out=runs/bench-gpu/results $(GO_ON); \
 	done; exit $$status
 
-RENAMED = $(if $(VARIANTS),$(error VARIANTS: expected CHANGES="preset.rays=1024$(comma)2048"; variants are gone since 0.3))
-accuracy-time: ## accuracy of each choice against training time [DATA= SCENE= MINUTES= CHANGES= SEEDS=3]
+RENAMED = $(if $(VARIANTS),$(error VARIANTS: expected MODEL=forward CHANGES="preset.rays=1024$(comma)2048"; variants are gone since 0.3))
+accuracy-time: ## accuracy of each choice against training time [MODEL=forward DATA= SCENE= MINUTES= CHANGES= SEEDS=3]
 	@$(RENAMED)
 	status=0; $(SWEEP); compare $(if $(DATA),experiment=dnerf data.root=$(DATA) data.scene=$(SCENE)) $(GO_ON); \
 	$(BIN)/forewarp-report kind=accuracy_time out=docs/results && exit $$status
 
 price-list: SEEDS ?= 2
-price-list: ## what each choice costs and brings, on the vehicle and real scenes [DATA= SCENES="a b" MINUTES= CHANGES=]
+price-list: ## what each choice costs and brings, on the vehicle and real scenes [MODEL=forward DATA= SCENES="a b" MINUTES= CHANGES=]
 	@$(RENAMED)
 	@test -n "$(DATA)" || { echo "price-list: expected DATA=<folder of D-NeRF scenes>"; exit 2; }
 	status=0; $(SWEEP); compare $(GO_ON); \
@@ -107,7 +113,7 @@ price-list: ## what each choice costs and brings, on the vehicle and real scenes
 COMPARE = $(BIN)/forewarp-train --multirun sweeps=effects $(if $(THREADS),threads=$(THREADS))
 effects: MINUTES := $(if $(filter command line,$(origin MINUTES)),$(MINUTES),2)
 effects: SEEDS ?= 2
-effects: ## planned effects against all effects, on procedural or real scenes [DATA= SCENES="a b" MINUTES= SEEDS=]
+effects: ## planned effects of model=forward against all effects, on procedural or real scenes [DATA= SCENES="a b" MINUTES= SEEDS=]
 ifeq ($(DATA),)
 	@status=0; $(COMPARE) $(SEED) ablation=auto $(GO_ON); \
 	$(COMPARE) $(SEED) ablation=all_effects budget.minutes=$(MINUTES) $(GO_ON); \
@@ -121,16 +127,16 @@ else
 	$(BIN)/forewarp-report kind=effects && exit $$status
 endif
 
-REPRODUCE = $(BIN)/forewarp-train --multirun preset=$(PRESET) budget.minutes=$(MINUTES) $(SEED) $(if $(THREADS),threads=$(THREADS)) $(if $(LAUNCHER),launcher=$(LAUNCHER))
-# Without DATA: a counterpart of each dataset, 27 runs of 12 s, half of them on each of two cores.
+REPRODUCE = $(BIN)/forewarp-train --multirun preset=$(PRESET) $(if $(filter-out null,$(MINUTES)),budget.minutes=$(MINUTES)) $(SEED) $(if $(THREADS),threads=$(THREADS)) $(if $(LAUNCHER),launcher=$(LAUNCHER))
+# Without DATA: a counterpart of each dataset, 12 runs of 12 s (SWEEPS=all: 29), half of them on each of two cores.
 reproduce-tables: PRESET ?= $(if $(DATA),fast,demo)
 reproduce-tables: MINUTES := $(if $(filter command line,$(origin MINUTES)),$(MINUTES),$(if $(filter faithful,$(PRESET)),null,$(if $(DATA),5,0.2)))
 reproduce-tables: SWEEPS ?= $(if $(SCENES_TYPED),dnerf,dnerf hypernerf nhr lego_complete)
-reproduce-tables: override SWEEPS := $(if $(filter all,$(SWEEPS)),dnerf hypernerf nhr lego_complete ablation_modules ablation_losses resolution methods,$(SWEEPS))
+reproduce-tables: override SWEEPS := $(if $(filter all,$(SWEEPS)),dnerf hypernerf nhr lego_complete ablation_modules ablation_losses resolution,$(SWEEPS))
 reproduce-tables: SCENES_TYPED := $(if $(filter command line,$(origin SCENES)),$(SCENES))
 reproduce-tables: SEEDS ?= 1
 reproduce-tables: OUT ?= runs/paper/results
-reproduce-tables: ## the paper's tables and figures, measured beside published [DATA= PRESET= SCENES="hook lego" MINUTES= SEEDS=3 SWEEPS=all OUT=]
+reproduce-tables: ## the paper's tables and figures by three methods, beside published [DATA= PRESET= SCENES="hook lego" MINUTES= SEEDS=3 SWEEPS=all OUT=]
 ifeq ($(DATA),)
 	@status=0; $(MAKE) --no-print-directory -j2 tables-vehicle tables-captures \
 		PRESET=$(PRESET) MINUTES=$(MINUTES) SEEDS=$(SEEDS) $(GO_ON); \
@@ -143,8 +149,8 @@ else
 	$(BIN)/forewarp-report kind=paper out=$(OUT) curves=docs/results && exit $$status
 endif
 
-tables-vehicle: PAIRS := methods:dnerf ablation_losses:dnerf ablation_modules:dnerf nhr:nhr lego_complete:lego_complete ablation_modules:lego_complete
-tables-captures: PAIRS := hypernerf:hypernerf ablation_modules:hypernerf resolution:hypernerf
+tables-vehicle: PAIRS := dnerf:dnerf nhr:nhr $(if $(filter all,$(SWEEPS)),ablation_losses:dnerf ablation_modules:dnerf ablation_modules:lego_complete)
+tables-captures: PAIRS := lego_complete:lego_complete hypernerf:hypernerf $(if $(filter all,$(SWEEPS)),ablation_modules:hypernerf resolution:hypernerf)
 tables-vehicle tables-captures: THREADS ?= 1
 tables-vehicle tables-captures:
 	@{ status=0; for pair in $(PAIRS); do \

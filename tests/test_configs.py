@@ -63,9 +63,10 @@ def method_of(model, frames=4):
 @pytest.mark.parametrize(("group", "option"), CHOICES)
 def test_every_option_composes_and_instantiates(group, option):
     of_particles = (group, option) in OF_PARTICLES or group in {of for of, choice in OF_PARTICLES} - VOXELS
-    run = run_of(f"{group}={option}", *(["model=particles"] if of_particles else []))
+    of_voxels = group.startswith("model/") and not of_particles
+    run = run_of(f"{group}={option}", f"model={'forward' if of_voxels else 'particles'}")
     assert [stage.settings.name for stage in run.stages] == ["coarse", "fine"]
-    if group.startswith("model/") and not of_particles:
+    if of_voxels:
         assert isinstance(method_of(run.model), torch.nn.Module)
 
 
@@ -77,7 +78,14 @@ def test_effects_of_particles_are_switched_one_by_one():
         on = {name: choice for name, choice in given.items() if choice is not None}
         assert on.keys() == {group.removeprefix("model/")}
         assert Effects(**given)
-    assert run_of("model=particles", "capture=video").model.keywords["view_dependence"] is None
+    assert run_of("capture=video").model.keywords["view_dependence"] is None
+
+
+@pytest.mark.parametrize("experiment", EXPERIMENTS)
+def test_particles_are_the_default(experiment):
+    config = composed(f"experiment={experiment}", "data.scene=x")
+    assert (config.model.name, composed().model.name) == ("particles", "particles")
+    assert composed(f"experiment={experiment}", "data.scene=x", "model=forward").model.name == "forward"
 
 
 def test_an_effect_of_voxels_is_refused_by_particles():
@@ -93,7 +101,7 @@ def test_every_command_has_a_config(name):
 
 
 def test_faithful_is_the_papers_model():
-    method = method_of(run_of("preset=faithful").model, frames=40)
+    method = method_of(run_of("model=forward", "preset=faithful").model, frames=40)
     assert isinstance(method.inpainter, UNet3d)
     assert method.inpainter.width == 64
     assert isinstance(method.upsampler, LearnedUpsampler)
@@ -103,7 +111,7 @@ def test_faithful_is_the_papers_model():
 
 
 def test_faithful_stages_are_the_papers():
-    coarse, fine = run_of("preset=faithful").stages
+    coarse, fine = run_of("model=forward", "preset=faithful").stages
     assert (coarse.settings.iterations, fine.settings.iterations) == (20_000, 100_000)
     first, last = coarse.settings.numbers, fine.settings.numbers
     assert (first["start_alpha"], last["start_alpha"]) == (1e-6, 1e-2)
@@ -116,8 +124,10 @@ def test_faithful_stages_are_the_papers():
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_off_is_none_whatever_the_preset(preset):
-    off = run_of(f"preset={preset}", *(f"model/{effect}=none" for effect, _ in OFF)).model
-    on = run_of(f"preset={preset}", *(f"model/{effect}={choice}" for effect, choice in OFF)).model
+    off = run_of("model=forward", f"preset={preset}", *(f"model/{effect}=none" for effect, _ in OFF)).model
+    on = run_of(
+        "model=forward", f"preset={preset}", *(f"model/{effect}={choice}" for effect, choice in OFF)
+    ).model
     for effect, _ in OFF:
         assert getattr(off, effect) is None
         assert getattr(on, effect) is not None
@@ -128,15 +138,15 @@ def test_every_number_of_the_renderer_is_a_key_and_equals_its_default():
     defaults = {
         name: p.default for name, p in signature(Renderer.__init__).parameters.items() if name != "self"
     }
-    config = OmegaConf.to_container(composed("data.scene=x").model.renderer)
+    config = OmegaConf.to_container(composed("data.scene=x", "model=forward").model.renderer)
     assert config == {"_target_": "forewarp.renderer.Renderer"} | defaults
-    assert run_of("model.renderer.early_stop_eps=0").model.renderer.early_stop_eps == 0
+    assert run_of("model=forward", "model.renderer.early_stop_eps=0").model.renderer.early_stop_eps == 0
 
 
 @pytest.mark.parametrize("order", [1, -1])
 def test_the_command_line_wins_over_the_preset_and_the_experiment(order):
-    overrides = ["preset=fast", "model/view_dependence=mlp"][::order]
-    assert type(method_of(run_of("preset=fast").model).view_dependence) is SphericalHarmonics
+    overrides = ["model=forward", "preset=fast", "model/view_dependence=mlp"][::order]
+    assert type(method_of(run_of("model=forward", "preset=fast").model).view_dependence) is SphericalHarmonics
     assert type(method_of(run_of(*overrides).model).view_dependence) is ViewNetwork
     words = ["experiment=dnerf", "data.scene=x", "preset=faithful", "data.box=null", "data.rays=7"][::order]
     config = composed(*words)
@@ -144,7 +154,7 @@ def test_the_command_line_wins_over_the_preset_and_the_experiment(order):
 
 
 def test_budget_is_shared_out():
-    run = run_of("preset=fast", "budget.minutes=20", "budget.iterations=1000")
+    run = run_of("model=forward", "budget.minutes=20", "budget.iterations=1000")
     assert [stage.settings.minutes for stage in run.stages] == pytest.approx([8, 12])
     assert [stage.settings.iterations for stage in run.stages] == [400, 600]
     (only,) = run_of("preset=fast", "budget.minutes=20", "~stage.fine").stages
@@ -166,7 +176,8 @@ def test_every_stage_key_may_be_typed_and_starts_from_the_same():
 
 
 def test_every_weight_may_be_typed():
-    config = composed("objective.coarse.weights.tv_depth=0.5", "objective.fine.weights.flow_l1=0.25")
+    weights = ["objective.coarse.weights.tv_depth=0.5", "objective.fine.weights.flow_l1=0.25"]
+    config = composed("model=forward", *weights)
     coarse, fine = build_run(config).stages
     assert (coarse.objective.weights["tv_depth"], fine.objective.weights["tv_depth"]) == (0.5, 0.0)
     assert set(coarse.objective.weights) == set(TERMS)
@@ -213,7 +224,7 @@ def test_each_number_of_a_method_is_taken_where_it_is_keyed(model):
 
 def test_effects_follow_the_pictures_and_the_command_line_wins():
     def chosen(*words):
-        return composed("data.scene=x", *words, hydra=True).hydra.runtime.choices
+        return composed("data.scene=x", "model=forward", *words, hydra=True).hydra.runtime.choices
 
     assert chosen("experiment=hypernerf")["model/view_dependence"] == "none"
     assert chosen("experiment=hypernerf")["model/background"] == "grid"

@@ -15,10 +15,14 @@ from forewarp.runs.config import hashed
 from hydra_plugins.forewarp_one_at_a_time import changed
 from tests.support.configs import CONF, ROOT, composed, groups, options
 
-PAPER = {"dnerf": 8, "hypernerf": 4, "nhr": 4, "lego_complete": 3, "ablation_modules": 60}
-PAPER |= {"ablation_losses": 32, "resolution": 16, "methods": 32}
-OTHERS = {"accuracy_time", "effects", "price_list", "search"}
-CHANGES = yaml.safe_load((ROOT / "sweeps" / "price_list.yaml").read_text())["hydra"]["sweeper"]["changes"]
+PAPER = {"dnerf": 24, "hypernerf": 12, "nhr": 12, "lego_complete": 9, "ablation_modules": 60}
+PAPER |= {"ablation_losses": 32, "resolution": 16}
+OTHERS = {"accuracy_time", "effects", "price_list_forward", "price_list_particles", "search", "minutes"}
+LISTS = {
+    name: yaml.safe_load((ROOT / "sweeps" / f"price_list_{name}.yaml").read_text())["hydra"]["sweeper"]
+    for name in ("forward", "particles")
+}
+CHANGES = {name: sweeper["changes"] for name, sweeper in LISTS.items()}
 
 
 def jobs_of(sweep, *words):
@@ -79,15 +83,18 @@ def test_every_job_composes_and_has_a_folder_of_its_own(sweep):
     assert len(set(folders)) == len(folders)
 
 
-every_change = pytest.param(CHANGES, marks=pytest.mark.slow)
-
-
-@pytest.mark.parametrize("changes", [CHANGES[::40], every_change], ids=["some", "all"])
-def test_every_change_composes_and_has_a_folder_of_its_own(changes):
-    common = ["experiment=dnerf", "data.scene=x", "budget.minutes=3"]
-    jobs = [job_of("price_list", *common, *shlex.split(change)) for change in changes]
+@pytest.mark.parametrize("every", [40, pytest.param(1, marks=pytest.mark.slow)], ids=["some", "all"])
+@pytest.mark.parametrize("method", CHANGES)
+def test_every_change_composes_and_has_a_folder_of_its_own(method, every):
+    common, changes = ["experiment=dnerf", "data.scene=x"], CHANGES[method][::every]
+    found = changed(jobs_of(f"price_list_{method}"), changes)
+    jobs = [
+        job_of(f"price_list_{method}", *common, *(word for part in job for word in shlex.split(part)))
+        for job in found
+    ]
     assert len({hashed(job).run for job in jobs}) == len(changes)
     assert {(job.budget.minutes, job.data.held_out) for job in jobs} == {(3, 8)}
+    assert jobs[0].model.name == method
 
 
 @pytest.mark.parametrize("dataset", ["dnerf", "hypernerf", "nhr", "lego_complete"])
@@ -98,12 +105,15 @@ def test_a_counterpart_stands_in_for_each_dataset(dataset):
     assert config.stage.fine.num_voxels == [[0, 13824]]
 
 
-def test_the_price_list_changes_one_thing_at_a_time():
-    assert CHANGES[0] == ""
-    assert len({frozenset(change.split()) for change in CHANGES}) == len(CHANGES) == 46
-    jobs = changed(jobs_of("price_list", "seeds=2"), CHANGES)
-    assert len(jobs) == 92
-    assert jobs[2:4] == [[f"seed={seed}", "budget.minutes=3", CHANGES[1]] for seed in (0, 1)]
+@pytest.mark.parametrize(("method", "count"), [("forward", 45), ("particles", 40)])
+def test_the_price_list_changes_one_thing_at_a_time(method, count):
+    changes = CHANGES[method]
+    assert changes[0] == ""
+    assert len({frozenset(change.split()) for change in changes}) == len(changes) == count
+    jobs = changed(jobs_of(f"price_list_{method}", "seeds=2"), changes)
+    assert len(jobs) == 2 * count
+    assert [job[-1] for job in jobs[2:4]] == [changes[1], changes[1]]
+    assert [job[:2] for job in jobs[2:4]] == [[f"seed={seed}", "budget.minutes=3"] for seed in (0, 1)]
 
 
 def test_a_job_is_named_by_what_was_typed_but_not_by_how_it_runs(forewarp, in_tmp):
@@ -111,8 +121,10 @@ def test_a_job_is_named_by_what_was_typed_but_not_by_how_it_runs(forewarp, in_tm
     how = ["checkpoint_seconds=9", "score=ssim", "evaluate=false", "sentinel.skip=1", "trust=[x]"]
     how += [f"callbacks{word}" for word in ("=default", ".pictures=null", ".accuracy=null")]
     how += ["absent=skip", "data_changed=accept"]
-    for typed in ([], ["model/motion=dct_features", "preset.bases=5"]):
-        shown = forewarp("train", "sweeps=price_list", *scene, *how, *typed, "--cfg", "job", "--resolve")
+    for typed in ([], ["model/motion=cosines", "stage.fine.density=45"]):
+        shown = forewarp(
+            "train", "sweeps=price_list_particles", *scene, *how, *typed, "--cfg", "job", "--resolve"
+        )
         assert yaml.safe_load(shown.out)["variant"] == {"name": " ".join(typed)}
 
 
@@ -120,8 +132,8 @@ def test_a_job_is_named_by_what_was_typed_but_not_by_how_it_runs(forewarp, in_tm
 def test_what_reproduces_a_table_names_its_method(folder):
     for path in folder.glob("*.yaml"):
         text = path.read_text()
-        inherited = re.search(r"^  - (full|accuracy_time)$", text, re.MULTILINE)
-        assert inherited or "\n  - override /model: forward\n" in text or path.stem == "methods", path
+        named = r"^  - (full|override /model: (forward|particles))$|^      model: (forward|particles)\b"
+        assert re.search(named, text, re.MULTILINE) or path.stem == "accuracy_time", path
 
 
 def test_an_ablation_takes_one_thing_from_all():
@@ -162,7 +174,7 @@ def test_a_job_is_known_by_what_it_computes():
     steps = {"budget__minutes": None, "budget__iterations": 5}  # without minutes the machine does not count
     folders = [folder_of(job, **steps, trainer__precision=p) for p in (None, "32-true", "bf16-mixed")]
     assert folders[0] == folders[1] != folders[2]
-    assert folder_of(composed("data.scene=x", "data=dnerf")) == "runs/x/forward-fast-seed0"
+    assert folder_of(composed("data.scene=x", "data=dnerf")) == "runs/x/particles-fast-seed0"
 
 
 def test_what_stands_alone_begins_as_the_coarse_stage_would():

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import sys
+import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TextIO
 
 from rich.console import Console
@@ -20,6 +23,29 @@ def time_text(seconds: float) -> str:
     minutes, seconds = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02d}:{seconds:02d}" if hours else f"{minutes}:{seconds:02d}"
+
+
+@contextmanager
+def told_if_slow(
+    title: str, text: str, *, after: float = 3.0, stream: TextIO | None = None
+) -> Iterator[None]:
+    """Print a line, ``title``, 0 % and ``text``, once what is within has taken ``after`` seconds.
+
+    Args:
+        title: what runs.
+        text: what takes the time.
+        after: seconds.
+        stream: None: stderr.
+    """
+    line = f"{title} {0:4.0%} | {text}"
+    timer = threading.Timer(after, print, [line], {"file": stream or sys.stderr, "flush": True})
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+        timer.join()
 
 
 class ProgressLine:

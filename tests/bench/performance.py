@@ -19,6 +19,7 @@ from forewarp.ops.splat import average_splat
 from forewarp.ops.warmup import warm_up
 from forewarp.runs.config_files import project_root
 from forewarp.training.device import peak_memory_bytes, reset_peak_memory
+from tests.bench import particle_tables, start_up
 from tests.bench.timed_cases import (
     ALONE,
     CASES,
@@ -51,7 +52,7 @@ WORDS = (
     ("threshold_backward", "rectifiers"),
     ("adam", "optimiser"),
 )
-_VERDICTS = {True: "reached", False: "**missed**", None: ""}
+VERDICTS = {True: "reached", False: "**missed**", None: ""}
 
 
 def slope(amounts: Sequence[float], seconds: Sequence[float]) -> float:
@@ -161,7 +162,7 @@ def goals_table(side: int = 80, rays: int = 8192, picture: int = 400, frame_side
         ["another view of that time", "< 0.5 s", f"{again:.2f} s", again < 0.5],
         [f"first picture with the U-Net, {side}^3 to {2 * side}^3", "< 1.5 s", f"{full:.2f} s", full < 1.5],
     ]
-    return table(["what", "wanted", "measured", ""], [[*r[:3], _VERDICTS[r[3]]] for r in rows])
+    return table(["what", "wanted", "measured", ""], [[*r[:3], VERDICTS[r[3]]] for r in rows])
 
 
 def free_table(side: int = 48, rays: int = 2048) -> str:
@@ -189,23 +190,29 @@ def by_itself(side: int, rays: int) -> float:
     return float(subprocess.run(call, env=plain, check=True, capture_output=True, text=True).stdout)
 
 
+SECTIONS = {
+    "growth": growth_tables,
+    "profile": profile_table,
+    "box": box_table,
+    "goals": goals_table,
+    "free": free_table,
+    "particles": particle_tables.parts_table,
+    "particles, growth": particle_tables.growth_table,
+    "particles, goals": particle_tables.goals_table,
+    "start": start_up.start_table,
+}
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure, and write the tables."""
     parser = argparse.ArgumentParser(prog="python -m tests.bench.performance", description=__doc__)
     parser.add_argument("--document", type=Path, default=None, help="instead of docs/performance.md")
-    parser.add_argument("--only", nargs="*", default=("growth", "profile", "box", "goals", "free"))
+    parser.add_argument("--only", nargs="*", default=tuple(SECTIONS))
     given = parser.parse_args(arguments)
     quiet()
     document = given.document or project_root() / "docs" / "performance.md"
-    sections = {
-        "growth": growth_tables,
-        "profile": profile_table,
-        "box": box_table,
-        "goals": goals_table,
-        "free": free_table,
-    }
     for name in given.only:
-        text = sections[name]()
+        text = SECTIONS[name]()
         print(f"{name}\n{text}\n", flush=True)
         replace_section(document, name, text)
     print(document)

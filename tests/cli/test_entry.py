@@ -70,31 +70,80 @@ def test_options_of_ones_own_stand_beside_ours(ok, way, in_tmp):
         (["budget.minuts=1"], "got none of this name; did you mean budget.minutes?"),
         (["modle/view_dependence=sh"], "modle/view_dependence: expected a key of the configuration, but got"),
         (["--multirun", "seed=0,1", "model=forward,backward", "budgt=fast"], "did you mean budget?"),
-        (["model/upsampler=learned", "model.upsampler.recomputes=true"], "mean model.upsampler.recompute?"),
+        (
+            ["model=forward", "model/upsampler=learned", "model.upsampler.recomputes=true"],
+            "mean model.upsampler.recompute?",
+        ),
         (["data=[1"], "data=[1: no viable alternative at input '[1'"),
         (["budget.minutes=-1"], "budget.minutes: expected a number > 0 or null, but got -1"),
         (["budget.minutes=null"], "stage.coarse: expected iterations or minutes, but got neither"),
         (["threads=0"], "threads: expected a whole number > 0 or null, but got 0"),
         (["~stage.coarse", "~stage.fine"], "stage: expected at least one stage, but got none"),
-        (["stage.coarse.start=middle"], "stage.coarse.start: expected auto, box or hull, but got 'middle'"),
-        (["+stage.coarse.bogus=1"], "got an unexpected keyword argument 'bogus'; leave that key out"),
-        (["+model.renderer.bogus=1"], "model.renderer: "),
+        (
+            ["model=forward", "stage.coarse.start=middle"],
+            "stage.coarse.start: expected auto, box or hull, but got 'middle'",
+        ),
+        (
+            ["model=forward", "+stage.coarse.bogus=1"],
+            "got an unexpected keyword argument 'bogus'; leave that key out",
+        ),
+        (["model=forward", "+model.renderer.bogus=1"], "model.renderer: "),
         (["budget=fast"], "budget=fast: expected preset=fast; the choice is called preset since 0.2"),
         (["--multirun", "hydra.sweeper.params.preset.skip_alpha=1"], "expected hydra.sweeper.params.preset."),
+        (
+            ["model=particles", "stage.fine.lr.means=fast"],
+            "stage.fine.lr.means: expected a number >= 0, but got",
+        ),
+        (
+            ["model=forward", "stage.coarse.lr.flow=-1"],
+            "stage.coarse.lr.flow: expected a number >= 0, but got",
+        ),
+        (
+            ["model=particles", "+stage.fine.lr_final_factor.meens=0.5"],
+            "stage.fine.lr_final_factor: expected groups of means, log_scales, turns, opacity, color,",
+        ),
         (
             ["--multirun", "hydra/sweeper=one_at_a_time", "hydra.sweeper.changes=[]"],
             "hydra.sweeper.changes: expected at least one change, but got []",
         ),
-        (["objective.coarse.literal=[foto]"], "objective.literal: expected some of photo"),
-        (["+objective.coarse.weights.foto=1"], "objective: expected a term of photo, point_color"),
+        (["model=forward", "objective.coarse.literal=[foto]"], "objective.literal: expected some of photo"),
+        (
+            ["model=forward", "+objective.coarse.weights.foto=1"],
+            "objective: expected a term of photo, point_color",
+        ),
         (["model=tnerf", "+stage.fine.hodl=0.3"], "stage.fine: expected a key of none, but got 'hodl'"),
         (["model=tnerf", "ablation=base"], "model: expected forward or backward, which base is"),
         (["model=tnerf", "+stage.coarse.share=1"], "stage.coarse: expected a stage of the method, but got"),
-        (["+model.inpainter.width=16"], "model.inpainter: expected a factory or null, but got {'width': 16}"),
+        (
+            ["model=forward", "+model.inpainter.width=16"],
+            "model.inpainter: expected a factory or null, but got {'width': 16}",
+        ),
     ],
 )
 def test_a_mistyped_command_ends_in_one_line(refused, in_tmp, arguments, line):
     assert line in refused("train", *arguments, "paths.data=data")
+    assert list(in_tmp.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "option", "model", "owner"),
+    [
+        (["preset.rays=1024"], "preset.rays=1024", "particles", "forward"),
+        (["preset.nodes=0"], "preset.nodes", "particles", "forward"),
+        (["model/inpainter=unet3d"], "model/inpainter", "particles", "forward"),
+        (["model/view_dependence=sh"], "model/view_dependence=sh", "particles", "forward"),
+        (["stage.fine.lr.flow=1e-3"], "stage.fine.lr.flow", "particles", "forward"),
+        (["objective.fine.weights.tv_flow=0"], "objective.fine.weights.tv_flow", "particles", "forward"),
+        (["model=forward", "model/motion=spline"], "model/motion=spline", "forward", "particles"),
+        (["model=backward", "stage.fine.density=60"], "stage.fine.density", "backward", "particles"),
+        (["preset.width=4"], "preset.width", "particles", "tnerf"),
+    ],
+)
+def test_an_option_of_another_method_names_it(refused, in_tmp, arguments, option, model, owner):
+    assert refused("train", *arguments, "paths.data=data") == (
+        f"{option}: expected an option of model={model}, but got one of model={owner}; add model={owner}, or "
+        "leave it out"
+    )
     assert list(in_tmp.iterdir()) == []
 
 

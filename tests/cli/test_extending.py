@@ -73,7 +73,7 @@ def test_the_method_trains_on_the_data_of_the_page(forewarp, ok, refused, work):
 
 
 def test_the_effect_is_switched_by_a_word(ok, work):
-    words = ["--config-dir", "mine/conf", "experiment=mine", *SMALL, *VOXELS, "evaluate=false"]
+    words = ["--config-dir", "mine/conf", "experiment=mine", "model=forward", *SMALL, *VOXELS]
     for choice, name in (("sheen", "Sheen"), ("none", "NoneType")):
-        ok("train", *words, f"model/view_dependence={choice}", f"run={choice}")
+        ok("train", *words, f"model/view_dependence={choice}", "evaluate=false", f"run={choice}")
         assert type(load(choice, trust=["mine"]).method.view_dependence).__name__ == name

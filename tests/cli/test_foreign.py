@@ -21,7 +21,7 @@ SMALL = [
     *("hydra.searchpath=[pkg://theirs.conf]", "trainer=cpu", "data.rays=64", "threads=1"),
     *("budget.minutes=null", "budget.iterations=6", "checkpoint_seconds=0", "sheets=0"),
 ]
-DISC = [*SMALL, "experiment=disc", "model/view_dependence=tint", "~stage.fine"]
+DISC = [*SMALL, "experiment=disc", "model=forward", "model/view_dependence=tint", "~stage.fine"]
 MIST = [*SMALL, "experiment=disc", "model=mist"]
 TRUST = "trust=[theirs]"
 ADVICE = "; if you trust the package theirs, add trust=[theirs] (or set FOREWARP_TRUST=theirs)"
@@ -121,6 +121,19 @@ def test_a_stored_run_is_measured_by_who_trusts_it(ok, refused, fitted, monkeypa
         ok("evaluate", "run=run", override)
     monkeypatch.setenv("FOREWARP_TRUST", "other, theirs")
     ok("evaluate", "run=run")
+
+
+def test_no_job_of_a_sweep_measures_a_run_that_is_not_trusted(forewarp, ok, fitted):
+    shutil.copytree(fitted, "again")
+    sweep = ["evaluate", "--multirun", "run=run,again"]
+    written = [Path(run, "metrics.json").stat().st_mtime_ns for run in ("run", "again")]
+    done = forewarp(*sweep)
+    assert done.status == 2
+    assert done.err.count(f"{ADVICE}\n") == 2
+    assert "2 of 2 jobs failed" in done.err
+    assert "theirs" not in sys.modules
+    assert written == [Path(run, "metrics.json").stat().st_mtime_ns for run in ("run", "again")]
+    ok(*sweep, TRUST)
 
 
 def test_the_limits_take_trust(forewarp, refused, fitted):

@@ -13,7 +13,8 @@ from forewarp.synth.scenes import synthesize
 
 LAUNCHERS = {"local": [], "joblib": [], "ray": ["+hydra.launcher.ray.init.num_cpus=2"], "submitit": []}
 JOB = [
-    *("--multirun", "sweeps=dnerf", "paths.scenes=.", "preset=demo", "budget.minutes=null", "seeds=2"),
+    *("--multirun", "sweeps=dnerf", "model=forward", "paths.scenes=.", "preset=demo", "seeds=2"),
+    "budget.minutes=null",
     *("trainer=cpu", "threads=1", "data.rays=64", "logger=none", "callbacks.pictures=null", "~stage.fine"),
     *("stage.coarse.num_voxels=[[0,800]]", "checkpoint_seconds=0", "sheets=0"),
 ]

@@ -14,13 +14,20 @@ from forewarp.synth.world import World
 
 COMMON = [
     *("trainer=cpu", "logger=none", "callbacks.pictures=null", "seed=0", "budget.minutes=null"),
-    *("budget.iterations=150", "preset.rays=512"),
-    *("stage.coarse.num_voxels=[[0,15625]]", "stage.fine.num_voxels=[[0,27000]]"),
+]
+PARTICLES = ["model=particles", "budget.iterations=1000"]  # each of one picture
+VOXELS = [
+    "model=forward",
+    "budget.iterations=150",
+    "preset.rays=512",
+    "stage.coarse.num_voxels=[[0,15625]]",
+    "stage.fine.num_voxels=[[0,27000]]",
 ]
 
 
 @pytest.mark.slow
-def test_a_users_own_capture_is_fitted(ok, tmp_path):
+@pytest.mark.parametrize("model", [PARTICLES, VOXELS], ids=["particles", "forward"])
+def test_a_users_own_capture_is_fitted(ok, tmp_path, model):
     world = World("lift")
     cameras = [replace(c, near=0.0, far=1.0) for c in random_cameras(24, 32, np.random.default_rng(3))]
     times = [i / 23 for i in range(24)]
@@ -30,6 +37,6 @@ def test_a_users_own_capture_is_fitted(ok, tmp_path):
     )
     write_scene(tmp_path / "data" / "mine", shots, near=2.0, far=6.0, aabb=Box((-1, -1, -1), (1, 1, 1)))
     run, data = tmp_path / "run", [f"data.root={tmp_path}/data", "data.scene=mine"]
-    ok("train", "data=video_with_poses", *data, *COMMON, f"run={run}")
+    ok("train", "data=video_with_poses", *data, *COMMON, *model, f"run={run}")
     scores = json.loads((run / "metrics.json").read_text())["test"].values()
-    assert min(one["psnr"] for one in scores) > 18.0  # 20 after 150 steps; a picture of one colour: 11 to 15
+    assert min(one["psnr"] for one in scores) > 18.0  # voxels have 20; a picture of one colour: 11 to 15

@@ -17,7 +17,8 @@ from forewarp.synth.scenes import synthesize
 from tests.support.commands import call
 
 SMALL = [
-    *("data=dnerf", "data.scene=vehicle", "preset=demo", "trainer=cpu", "data.rays=64", "logger=none"),
+    *("model=forward", "data=dnerf", "data.scene=vehicle", "preset=demo", "trainer=cpu", "data.rays=64"),
+    "logger=none",
     *("budget.minutes=null", "budget.iterations=6", "stage.coarse.num_voxels=[[0,800]]", "~stage.fine"),
     *("callbacks.pictures=null", "callbacks.accuracy=null", "evaluate=false", "checkpoint_seconds=0"),
 ]
@@ -52,7 +53,7 @@ def test_a_run_is_resumed_by_its_folder_alone(ok, begun):
     ok("train", f"resume={begun}")
     assert json.loads((begun / "coarse" / "done.json").read_text())["steps"] == 6
     assert config(begun) == before
-    assert "forewarp-train data=dnerf" in before["command"]
+    assert "forewarp-train model=forward data=dnerf" in before["command"]
 
 
 def test_beside_it_stands_only_what_may_change(ok, refused, begun):

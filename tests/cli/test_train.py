@@ -119,7 +119,7 @@ def test_a_run_with_views_set_aside_leaves_its_curve(ok, scenes, tmp_path):
     assert len((run / "accuracy_time.csv").read_text().splitlines()) > 1
     assert (run / "accuracy_time.png").stat().st_size > 1000
     command = yaml.safe_load((run / "config.yaml").read_text())["command"]
-    assert command.startswith("forewarp-train data=dnerf ")
+    assert command.startswith("forewarp-train model=forward data=dnerf ")
     assert "data.held_out=2" in command
 
 
@@ -135,6 +135,7 @@ def test_another_configuration_is_refused(refused, fitted, scenes):
     assert line.endswith("seed: expected 0, as the run that this folder holds, but got 1 (and 1 more keys)")
     assert advice == "use run=<another folder>, or delete this one"
     assert "budget.minutes: expected 0.9, as" in refused(*arguments(scenes, fitted, "budget.minutes=9"))
+    assert "model.name: expected forward, as" in refused(*arguments(scenes, fitted, "model=backward"))
 
 
 def test_a_config_that_lacks_its_data_is_refused(refused, in_tmp):

@@ -12,7 +12,7 @@ import pytest
 from tests.support.configs import CONF, ROOT
 
 SMALL = [
-    *("experiment=demo", "trainer=cpu", "threads=1", "sheets=1", "data.rays=256"),
+    *("experiment=demo", "trainer=cpu", "threads=1", "sheets=1"),
     *("data.synthesis.size=32", "data.synthesis.frames=5", "data.synthesis.test_views=[1,1,1]"),
     *("data.synthesis.val_views=1", "data.synthesis.samples_per_pixel=1"),
 ]
@@ -82,20 +82,24 @@ def test_commands_work_in_an_empty_folder_and_write_nowhere_else(installed):
     code = "import forewarp; print(forewarp.__file__)"
     where = call(sys.executable, "-c", code, cwd=folder, PYTHONPATH=str(site))
     assert where.strip() == str(site / "forewarp" / "__init__.py")
-    assert "methods (with --multirun)" in run("train", "--help")
+    assert "price_list_particles (with --multirun)" in run("train", "--help")
     assert list(folder.iterdir()) == []
     run("train", *SMALL, "budget.minutes=0.05", "run=runs/demo")
     assert "test views" in run("evaluate", "run=runs/demo", "trainer=cpu")
     run("render", "run=runs/demo", "format=png", "frames=2", "size=32", "trainer=cpu")
     assert len(list((folder / "runs" / "demo" / "videos" / "fixed").glob("*.png"))) == 2
-    words = ["sweeps=methods", "scene=counterpart_dnerf", *SMALL[1:], "evaluate=false", "seeds=1"]
+    words = ["sweeps=dnerf", "scene=counterpart_dnerf", *SMALL[1:], "evaluate=false", "seeds=1"]
     run("train", "--multirun", *words, "preset=demo", "budget.minutes=null", "budget.iterations=2")
     fitted = sorted(path.parents[0].name for path in (folder / "runs" / "paper").rglob("config.yaml"))
-    assert [name.split("-")[1] for name in fitted] == ["backward", "forward"]
-    changes = ["hydra/sweeper=one_at_a_time", 'hydra.sweeper.changes=["preset.rays=64"]', "run=runs/one"]
+    assert [name.split("-")[1] for name in fitted] == ["backward", "forward", "particles"]
+    changes = [
+        "hydra/sweeper=one_at_a_time",
+        'hydra.sweeper.changes=["stage.fine.density=45"]',
+        "run=runs/one",
+    ]
     steps = ["evaluate=false", "budget.minutes=null", "budget.iterations=2"]
     run("train", "--multirun", *changes, *SMALL, *steps)  # our own sweeper, from the wheel
-    assert "rays: 64" in (folder / "runs" / "one" / "config.yaml").read_text()
+    assert "density: 45" in (folder / "runs" / "one" / "config.yaml").read_text()
     run("report", "kind=paper", "runs=runs")
     assert (folder / "runs" / "results" / "paper.md").is_file()
     assert {path.name for path in folder.iterdir()} == {"data", "runs"}

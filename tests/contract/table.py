@@ -24,13 +24,14 @@ class Effect:
     """An optional part of a method.
 
     ``on`` are the model's fields that switch it on (None is off). ``parts`` are pairs of a class and a
-    function name: none is called with the effect off, at least one with it on. The names of its parameters
-    begin with ``owns``; None: with its own name.
+    function name: none is called with the effect off, at least one with it on; empty for an effect that only
+    gives the same functions more numbers. The names of its parameters and buffers begin with one of ``owns``;
+    None: with its own name.
     """
 
     on: Mapping[str, object]
     parts: tuple[tuple[type, str], ...]
-    owns: str | None = None
+    owns: tuple[str, ...] | None = None
 
 
 @dataclass(frozen=True)
@@ -86,10 +87,15 @@ WARP = {
     "background": BACKGROUND,
 }
 OF_PARTICLES = {
-    "motion": Effect({"motion": "spline"}, ((Nodes, "carried"), (Nodes, "spread_over_time")), "nodes"),
-    "color_over_time": Effect({"color_over_time": 1}, ((Particles, "tints"),), "tint"),
-    "opacity_over_time": Effect({"opacity_over_time": 1}, ((Particles, "fades"),), "fade"),
+    "motion": Effect({"motion": "spline"}, ((Nodes, "carried"), (Nodes, "spread_over_time")), ("nodes",)),
+    "rotation": Effect({"rotation": True}, (), ("nodes.turn",)),
+    "view_dependence": Effect({"view_dependence": 1}, (), ("shade",)),
+    "color_over_time": Effect({"color_over_time": 1}, ((Particles, "tints"),), ("tint",)),
+    "opacity_over_time": Effect({"opacity_over_time": 1}, ((Particles, "fades"),), ("fade",)),
+    "background": Effect({"background": 0.03}, (), ("resting", "nodes.still")),
 }
+RATES = {"means": 1.5e-3, "log_scales": 5e-3, "turns": 3e-3, "opacity": 5e-2, "color": 3e-2, "shade": 1e-3}
+RATES |= {"tint": 1e-3, "fade": 3e-3, "shifts": 7e-3, "node_turns": 8e-3, "skin": 1e-2}
 SMALL_NETWORK = {"width": 32, "layers": 3, "skip": None, "position_frequencies": 4}
 SMALL_NETWORK |= {"time_frequencies": 2, "samples": 16, "fine_samples": 16}
 
@@ -113,11 +119,11 @@ METHODS = {
             view_dependence=1,
             color_over_time=1,
             opacity_over_time=1,
+            background=0.03,
         ),
-        {"means": 1.5e-3, "log_scales": 5e-3, "turns": 3e-3, "opacity": 5e-2, "color": 3e-2, "shade": 1e-3}
-        | {"tint": 1e-3, "fade": 3e-3, "shifts": 7e-3, "node_turns": 8e-3},
+        RATES,
         {"photo": 1.0, "rigid": 3.0, "smooth": 0.1},
-        {"every": 0.05, "settled": 0.9, "finals": {"means": 0.1}},
+        {"every": 0.05, "settled": 0.9, "lr_final_factor": dict.fromkeys(RATES, 0.1) | {"means": 0.01}},
         steps=150,
         effects=OF_PARTICLES,
     ),

@@ -94,6 +94,9 @@ BAD = [
 def test_bad_settings(scene, options, match):
     with pytest.raises(SceneError, match=match):
         Sampler(scene, **options)
+    with pytest.raises(SceneError, match="data.rays: expected a number, as the method is trained on single"):
+        Sampler(scene, rays=None).draw()
+    assert len(Sampler(scene, rays=None, views_per_step=8, asks=Asks("pictures")).draw().observations) == 1
     with pytest.raises(SceneError, match="data.eval_background: expected white or black, but got 'random'"):
         color_of("random")
     with pytest.raises(ValueError, match="asks: expected a kind of pixels, crops, pictures, side >= 1,"):

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from forewarp.evaluation.measure import without
+from forewarp.evaluation.measure import show, without
 from forewarp.metrics.suite import LPIPS_METRICS
 from forewarp.runs.build import build_run
 from forewarp.training.device import device_of
@@ -17,6 +17,12 @@ def machine(monkeypatch):
         monkeypatch.setattr(torch.backends.mps, "is_available", lambda: apple)
 
     return pretend
+
+
+def test_seconds_of_a_picture_have_three_digits(capsys, tmp_path):
+    seconds = {"train": 61.0, "fine": 61.0, "render_per_frame": 0.00277, "render_again_per_frame": 12.345}
+    show({"protocol": {"scene": "x"}, "seconds": seconds}, tmp_path, {})
+    assert "trained 1:01 (fine 1:01), 0.00277 s a frame, 12.3 s another at" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

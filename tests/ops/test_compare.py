@@ -47,18 +47,19 @@ def test_the_loss_of_nothing(backend):
 def test_finite_differences():
     """In float64, of every parameter: the reference, to which kernels are held."""
     particles, warp, tints, fades = crowd(count=6, degree=0, tints=1)
-    arguments = (warp, pinhole(), tints, fades, pixels(), BEHIND.double())
-    found = compare(particles, *arguments)
+    rest = (pinhole(), tints, fades, pixels(), BEHIND.double())
+    found = compare(particles, warp, *rest, by_weights=True)
     step = 1e-6
-    for name in ("means", "log_scales", "quaternions", "opacity", "colors"):
-        slope = torch.randn(getattr(particles, name).shape, dtype=torch.float64)
-        sides = [
-            compare(
-                particles._replace(**{name: getattr(particles, name) + sign * step * slope}), *arguments
-            ).loss
-            for sign in (1, -1)
-        ]
-        along = float((getattr(found.particles, name) * slope).sum())
+    for name in (*particles._fields, "maps", "weights"):
+        part = warp if name in warp._fields else particles
+        slope = torch.randn(getattr(part, name).shape, dtype=torch.float64)
+        sides = []
+        for sign in (1, -1):
+            near = part._replace(**{name: getattr(part, name) + sign * step * slope})
+            both = (particles, near) if part is warp else (near, warp)
+            sides.append(compare(*both, *rest).loss)
+        gradient = getattr(found if part is warp else found.particles, name)
+        along = float((gradient * slope).sum())
         assert (sides[0] - sides[1]) / (2 * step) == pytest.approx(along, rel=1e-4, abs=1e-4), name
 
 

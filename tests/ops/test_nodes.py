@@ -1,7 +1,9 @@
 import math
+from functools import partial
 
 import pytest
 import torch
+from torch import zeros
 from torch.autograd import gradcheck
 
 from forewarp.ops.nodes import carry_nodes, node_maps, pull_nodes, spread_nodes, stiffness
@@ -80,16 +82,42 @@ def test_nodes_that_coincide(backend):
     assert math.isfinite(strain)
 
 
-def test_shapes_that_do_not_go_together_are_refused():
-    motion, places, edges, weights = some()
-    with pytest.raises(ValueError, match=r"motion: expected shape \(M, 6\)"):
-        node_maps(motion[:, :5], places)
-    with pytest.raises(ValueError, match=r"places: expected shape \(7, 3\)"):
-        node_maps(motion, places[:3])
-    with pytest.raises(ValueError, match=r"by_maps: expected shape \(7, 12\)"):
-        pull_nodes(motion, places, torch.zeros(7, 9), edges, weights, 1.0)
-    with pytest.raises(ValueError, match=r"shift: expected shape \(7, 2, 3\)"):
-        carry_nodes(torch.zeros(7, 3, 3), None, torch.zeros(2), places)
+def pull(motion=zeros(7, 6), places=zeros(7, 3), edges=zeros(7, 2).long(), weights=zeros(7, 2), by=12):  # noqa: B008
+    pull_nodes(motion, places, zeros(7, by), edges, weights, 1.0)
+
+
+def carry(shift=zeros(7, 2, 3), turn=None, basis=zeros(2), places=zeros(7, 3)):  # noqa: B008
+    carry_nodes(shift, turn, basis, places)
+
+
+def spread(shift=zeros(7, 2, 3), turn=None, slope=zeros(7, 6), basis=zeros(2), bend=zeros(2)):  # noqa: B008
+    spread_nodes(shift, turn, slope, basis, bend, 1.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("call", "text"),
+    [
+        (partial(node_maps, zeros(7, 5), zeros(7, 3)), r"motion: expected shape \(M, 6\)"),
+        (partial(node_maps, zeros(7, 6), zeros(3, 3)), r"places: expected shape \(7, 3\)"),
+        (partial(stiffness, zeros(7, 6), zeros(3, 3), zeros(7, 2).long(), zeros(7, 2)), "places"),
+        (partial(pull, motion=zeros(7, 5)), r"motion: expected shape \(M, 6\)"),
+        (partial(pull, places=zeros(3, 3)), r"places: expected shape \(7, 3\)"),
+        (partial(pull, edges=zeros(2, 2).long()), r"edges: expected shape \(7, E\)"),
+        (partial(pull, weights=zeros(7, 1)), r"weights: expected shape \(7, 2\)"),
+        (partial(pull, by=9), r"by_maps: expected shape \(7, 12\)"),
+        (partial(carry, shift=zeros(7, 3, 3)), r"shift: expected shape \(7, 2, 3\)"),
+        (partial(carry, turn=zeros(3, 2, 3)), r"turn: expected shape \(7, 2, 3\)"),
+        (partial(carry, places=zeros(7, 2)), r"places: expected shape \(M, 3\)"),
+        (partial(spread, shift=zeros(7, 2, 2)), r"shift: expected shape \(M, K, 3\)"),
+        (partial(spread, turn=zeros(3, 2, 3)), r"turn: expected shape \(7, 2, 3\)"),
+        (partial(spread, slope=zeros(3, 6)), r"slope: expected shape \(7, 6\)"),
+        (partial(spread, basis=zeros(3)), r"basis: expected shape \(2\)"),
+        (partial(spread, bend=zeros(3)), r"bend: expected shape \(2\)"),
+    ],
+)
+def test_shapes_that_do_not_go_together_are_refused(backend, call, text):
+    with pytest.raises(ValueError, match=text):
+        call()
 
 
 @pytest.mark.parametrize("turns", [True, False])

@@ -35,12 +35,18 @@ def test_smooth_between_spans():
 
 
 @pytest.mark.parametrize(
-    ("time", "knots", "text"),
-    [(0.5, 3, "at least 4 knots, but got 3"), (1.01, 5, r"times in \[0, 1\]"), (float("nan"), 5, "times in")],
+    ("time", "knots", "canonical", "text"),
+    [
+        (0.5, 3, 0.0, "at least 4 knots, but got 3"),
+        (1.01, 5, 0.0, r"times in \[0, 1\]"),
+        (float("nan"), 5, 0.0, "times in"),
+        (0.5, 5, 1.5, "times in"),
+        (0.5, 5, float("nan"), "times in"),
+    ],
 )
-def test_refused(time, knots, text):
+def test_refused(time, knots, canonical, text):
     with pytest.raises(ValueError, match=text):
-        spline_basis(time, knots, 0.0)
+        spline_basis(time, knots, canonical)
 
 
 @pytest.mark.parametrize("time", [0.3, torch.tensor([0.0, 0.3, 1.0])])

@@ -11,9 +11,14 @@ from forewarp.planning.plan_file import read_plan, with_plan, write_plan
 from forewarp.planning.trials import Trials
 from forewarp.synth.scenes import synthesize
 
-TINY = ["data=dnerf", "preset=demo", "trainer=cpu", "data.rays=64", "logger=none", "callbacks=default"]
+TINY = ["data=dnerf", "preset=demo", "trainer=cpu", "logger=none", "callbacks=default"]
 TINY += ["callbacks.pictures=null", "callbacks.accuracy=null", "callbacks.scalars=null", "threads=1"]
-LATTICES = ["stage.coarse.num_voxels=[[0,800]]", "stage.fine.num_voxels=[[0,1000]]"]
+VOXELS = [
+    "model=forward",
+    "data.rays=64",
+    "stage.coarse.num_voxels=[[0,800]]",
+    "stage.fine.num_voxels=[[0,1000]]",
+]
 SHORT = ["plan.steps=8", "plan.trial_steps=3", "plan.seeds=1", "plan.held_out=3"]
 EFFECTS = ["motion", "bases", "background", "view_dependence", "inpainter", "upsampler"]
 
@@ -29,7 +34,7 @@ def scenes(tmp_path_factory):
 @pytest.fixture
 def words(scenes, in_tmp):
     """What one types of the tiny scene."""
-    return [*TINY, *LATTICES, f"data.root={scenes}", "data.scene=vehicle"]
+    return [*VOXELS, *TINY, f"data.root={scenes}", "data.scene=vehicle"]
 
 
 def test_a_plan_is_made_once_told_and_fitted(forewarp, ok, words, monkeypatch, in_tmp):
@@ -75,7 +80,7 @@ def test_particles_are_planned_by_leaving_effects_out(forewarp, scenes, in_tmp, 
     monkeypatch.setattr(
         "forewarp.methods.effect.Evidence.pays", lambda self, effect: missed.get(effect, False)
     )
-    typed = [*TINY, "model=particles", f"data.root={scenes}", "data.scene=vehicle"]
+    typed = [*TINY, f"data.root={scenes}", "data.scene=vehicle"]
     short = ["plan.steps=4", "plan.trial_steps=8", "plan.seeds=1", "plan.held_out=3"]
     done = forewarp("plan", *typed, *short, "model/background=none")
     assert done.status == 0, done.err
@@ -154,7 +159,7 @@ def test_auto_plans_and_fits_in_one_go_a_scene_of_one_time_without_motion(
 
 
 def test_mistakes_are_one_line(refused, words, in_tmp):
-    assert "use model=forward" in refused("plan", *words, "model=backward")
+    assert "use model=particles or model=forward" in refused("plan", *words, "model=backward")
     assert refused("plan", *words, "~stage.fine").startswith("stage: expected a coarse stage and another")
     assert refused("plan", *words, "plan.seeds=0") == "plan.seeds: expected a whole number >= 1, but got 0"
     assert refused("train", *words, "effects=some") == "effects: expected given or auto, but got some"

@@ -1,5 +1,8 @@
 import json
+import shutil
 
+import imageio.v3 as iio
+import numpy as np
 import pytest
 
 from forewarp.report.compare import compare, names_of
@@ -39,6 +42,19 @@ def test_two_runs_side_by_side_with_their_difference(ok, runs):
         ["steps", "1300", "1300"],
         ["seconds", "of", "training", "60", "60"],
     ]
+
+
+def test_a_view_is_drawn_by_every_run_that_has_it(ok, runs, in_tmp):
+    for run in runs(one=metrics("particles"), two=metrics("forward"), three=metrics("backward")):
+        for name in ("a", "b") if run != "three" else "b":
+            sheet = in_tmp / run / "images" / "sheets" / "test" / f"{name}.png"
+            sheet.parent.mkdir(parents=True, exist_ok=True)
+            iio.imwrite(sheet, np.zeros((3, 4 * 3 + 8, 3), np.uint8))
+    done = ok("report", "kind=compare", "runs=[one,two,three]", "out=out")
+    assert done.out.splitlines()[-1] == "written: out/compare.png"
+    assert iio.imread("out/compare.png").shape[2] == 4
+    shutil.rmtree("three/images")
+    assert "written" not in ok("report", "kind=compare", "runs=[one,two,three]", "out=other").out
 
 
 def test_a_measure_that_a_run_lacks_has_no_row(runs):

@@ -12,9 +12,9 @@ import pytest
 from forewarp.report.collect import collect
 from forewarp.report.page import latex_text
 from forewarp.report.paper import write_paper
-from forewarp.report.paper_figures import thirds
 from forewarp.report.paper_printed import PAPER, read_paper
 from forewarp.report.paper_tables import comparison, counterpart, measured, with_means
+from forewarp.report.sheets import thirds
 from tests.support.runs_on_disk import write_run
 
 ALL = ["hellwarrior", "mutant", "hook", "bouncingballs", "lego", "trex", "standup", "jumpingjacks"]
@@ -51,15 +51,15 @@ def cells(table, name, kind="measured"):
 def test_a_mean_is_of_all_scenes_or_empty(tmp_path):
     for number, scene in enumerate(ALL[:7]):
         paper_run(tmp_path, scene, psnr=20.0 + number)
-    assert cells(table_of(tmp_path), "forewarp: forward, fast, 1 min") == ["", "", ""]
+    assert cells(table_of(tmp_path), "forewarp: forward (the paper's method), fast, 1 min") == ["", "", ""]
     scenes = table_of(tmp_path, "dnerf_scenes")
     names = [column.name for column in scenes.columns]
-    values = dict(zip(names[2:], cells(scenes, "forewarp: forward, fast, 1 min")))
+    values = dict(zip(names[2:], cells(scenes, "forewarp: forward (the paper's method), fast, 1 min")))
     assert values["Hook PSNR↑"] == "22.00"
     assert values["Hook LPIPS↓"] == values["Mean of 8 PSNR↑"] == values["Jumping Jacks PSNR↑"] == ""
     assert values["Mean of the 7 measured PSNR↑"] == "23.00"
     paper_run(tmp_path, ALL[7], psnr=27.0)
-    row = cells(table_of(tmp_path), "forewarp: forward, fast, 1 min")
+    row = cells(table_of(tmp_path), "forewarp: forward (the paper's method), fast, 1 min")
     assert row == ["23.50", "0.900", ""]
     assert cells(table_of(tmp_path), "", "difference to the paper") == ["-9.18", "-0.070", ""]
 
@@ -69,7 +69,10 @@ def test_seeds_give_a_deviation_where_all_scenes_have_them(tmp_path):
         for scene in ALL:
             paper_run(tmp_path, scene, seed=seed, psnr=psnr)
     paper_run(tmp_path, "hook", seed=2, psnr=99.0)
-    assert cells(table_of(tmp_path), "forewarp: forward, fast, 1 min, 3 seeds")[0] == "21.00 ± 1.41"
+    assert (
+        cells(table_of(tmp_path), "forewarp: forward (the paper's method), fast, 1 min, 3 seeds")[0]
+        == "21.00 ± 1.41"
+    )
 
 
 def test_ranks_are_among_measured_rows_alone(tmp_path):
@@ -94,7 +97,7 @@ def test_abilities_and_depth_have_columns_of_their_own(tmp_path):
     }
     for scene in ("lift", "lift_tilt", "drive"):
         paper_run(tmp_path, scene, dataset="lego_complete", **by_ability)
-    row = cells(table_of(tmp_path, "lego_complete"), "forewarp: forward, fast, 1 min")
+    row = cells(table_of(tmp_path, "lego_complete"), "forewarp: forward (the paper's method), fast, 1 min")
     assert row == ["20.00", "", "50.000", "", "21.00", "", "", "", "22.00", "", "", "25.000"]
 
 
@@ -102,7 +105,7 @@ def test_abilities_and_depth_have_columns_of_their_own(tmp_path):
 def whole(tmp_path):
     """A folder with every output, of a few runs with pictures."""
     runs = tmp_path / "runs"
-    for warp in ("forward", "backward"):
+    for warp in ("particles", "forward", "backward"):
         folder = paper_run(runs, "hook", warp=warp)
         sheet = np.full((3, 4 * 3 + 8, 3), 255, np.uint8)
         (folder / "images" / "sheets" / "test").mkdir(parents=True)
@@ -129,16 +132,18 @@ def test_pages_tell_how_numbers_came_about(whole):
         "* ball/failed-1.0-seed0: no metrics.json; run its command again",
     ):
         assert line in text
-    assert re.search(r"\* date: \d{4}-\d\d-\d\d\n\* command, one of 2 runs: forewarp-train variant=", text)
+    assert re.search(r"\* date: \d{4}-\d\d-\d\d\n\* command, one of 3 runs: forewarp-train variant=", text)
     lines = re.sub(" +", " ", text)
-    assert "| forewarp: backward, fast, 1 min | measured |" in lines
+    for method in ("particles", "forward (the paper's method)", "backward"):
+        assert f"| forewarp: {method}, fast, 1 min | measured |" in lines
     assert "| Ours (80^3) | published | 32.68 | 0.97 | 0.04 |" in lines
     names = {path.name for path in whole.iterdir()}
-    assert {"paper-resolution.png", "paper-canonical-hook.png", "paper-views-dnerf.png"} <= names
+    assert {"paper-resolution.png", "paper-canonical-hook.png"} <= names
+    assert {"paper-views-dnerf-forward.png", "paper-views-dnerf-particles.png"} <= names
     assert "# machine: a cpu, 2 threads" in (whole / "paper-table-1-d-nerf.csv").read_text()
     page = (whole / "paper.html").read_text()  # needs nothing else
     sources = [source.split(",") for source in re.findall(r'src="([^"]*)"', page)]
-    assert [kind for kind, _ in sources] == ["data:image/png;base64"] * 3
+    assert [kind for kind, _ in sources] == ["data:image/png;base64"] * 4
     assert all(base64.b64decode(content).startswith(b"\x89PNG") for _, content in sources)
     assert not re.search(r"https?://|<script|<link", page)
     latex = (whole / "paper.tex").read_text()
@@ -154,7 +159,7 @@ def test_a_scene_with_one_kind_of_view_is_measured_by_it(tmp_path):
         sizes = [[512, 384], [1024, 768]] if number == 3 else [4, 3]
         space = {"psnr": 20.0 + number}
         paper_run(tmp_path, scene, dataset="nhr", protocol={"resolution": sizes}, space=space)
-    row = cells(table_of(tmp_path, "nhr"), "forewarp: forward, fast, 1 min")
+    row = cells(table_of(tmp_path, "nhr"), "forewarp: forward (the paper's method), fast, 1 min")
     assert row == ["20.00", "", "", "21.00", "", "", "22.00", "", "", "23.00", "", "", "21.50", "", ""]
     write_paper(tmp_path, tmp_path / "out")
     text = (tmp_path / "out" / "paper.md").read_text()
@@ -192,9 +197,14 @@ def test_of_runs_alike_the_newest_counts(tmp_path):
 def test_no_mean_is_taken_over_unlike_images(tmp_path):
     for scene in ALL:
         paper_run(tmp_path, scene, protocol={"half_resolution": scene == "hook"})
-    assert cells(table_of(tmp_path), "forewarp: forward, fast, 1 min") == ["", "", ""]
+    assert cells(table_of(tmp_path), "forewarp: forward (the paper's method), fast, 1 min") == ["", "", ""]
     names = [column.name for column in table_of(tmp_path, "dnerf_scenes").columns]
-    row = dict(zip(names[2:], cells(table_of(tmp_path, "dnerf_scenes"), "forewarp: forward, fast, 1 min")))
+    row = dict(
+        zip(
+            names[2:],
+            cells(table_of(tmp_path, "dnerf_scenes"), "forewarp: forward (the paper's method), fast, 1 min"),
+        )
+    )
     assert row["Hook PSNR↑"] == "30.00"
 
 

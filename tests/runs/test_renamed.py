@@ -29,7 +29,8 @@ from tests.support.configs import composed
         ("budget.skip_alpha=0", "preset.alpha_threshold=0; the method's numbers are called preset since 0.2"),
         ("hydra.sweeper.params.stage.fine.rates.flow=1", "hydra.sweeper.params.stage.fine.lr.flow=1;"),
         ("+variant=mine", "+ablation=mine; move your file from variant/ to ablation/"),
-        ("variant=base,unet_16", "no such override; type what a variant changed, as preset.rays=1024;"),
+        ("variant=base,unet_16", "no such override; type model=forward and the change, as preset.rays=1024;"),
+        ("sweeps=methods", "sweeps=dnerf; each dataset's sweep has all methods since 0.3"),
         ("ablation=voxels_20,voxels_40", "no such override; sweeps=resolution has these sizes"),
     ],
 )
@@ -55,7 +56,7 @@ def test_words_of_today_are_not():
     ],
 )
 def test_keys_of_a_composed_config_are_refused_unless_the_method_is_anothers(typed, line):
-    config = composed(typed)
+    config = composed("model=forward", typed)
     with pytest.raises(ValueError, match=re.escape(line)):
         refuse_renamed_keys(config)
     config.model._target_ = "theirs.methods.Mist"

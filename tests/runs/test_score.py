@@ -9,7 +9,8 @@ from forewarp.runs.score import named
 from forewarp.synth.scenes import synthesize
 
 SMALL = [
-    *("data=dnerf", "data.root=.", "data.scene=vehicle", "preset=demo", "trainer=cpu", "data.rays=64"),
+    *("model=forward", "data=dnerf", "data.root=.", "data.scene=vehicle", "preset=demo", "trainer=cpu"),
+    "data.rays=64",
     *("logger=none", "budget.minutes=null", "budget.iterations=4", "stage.coarse.num_voxels=[[0,800]]"),
     *("callbacks.pictures=null", "callbacks.accuracy=null", "callbacks.scalars=null", "threads=1"),
     *("~stage.fine", "evaluate=false"),

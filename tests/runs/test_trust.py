@@ -87,8 +87,8 @@ def test_what_is_no_plain_config_is_refused_in_one_line(text, said):
     "words",
     [
         ["experiment=demo_hypernerf"],
-        ["experiment=lego_complete", "data.scene=x", "preset=faithful", "trainer=gpu"],
-        ["experiment=video_with_poses", "data.scene=x", "model/motion=dct_features", "logger=none"],
+        ["experiment=lego_complete", "data.scene=x", "preset=faithful", "trainer=gpu", "logger=none"],
+        ["experiment=video_with_poses", "data.scene=x", "model=forward", "model/motion=dct_features"],
     ],
 )
 def test_what_we_write_ourselves_is_trusted(words):

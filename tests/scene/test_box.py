@@ -15,6 +15,9 @@ def test_hand_worked():
     assert BOX.scaled(2) == Box((-2, -1.5, 0), (2, 4.5, 8))
     assert BOX.padded(1) == Box((-2, -1, 1), (2, 4, 7))
     assert BOX.intersection(Box((0, -9, 3), (9, 9, 4))) == Box((0, 0, 3), (1, 3, 4))
+    assert BOX.meets(Box((0, -9, 3), (9, 9, 4)))
+    for low in (1.0, 5.0):  # a face is shared; nothing is
+        assert not BOX.meets(Box((low, 0, 2), (low + 1, 3, 6)))
 
 
 def test_the_outermost_points_lie_on_the_faces():

@@ -9,7 +9,8 @@ from pathlib import Path
 
 from forewarp.cli.entry import quiet
 from forewarp.runs.config_files import project_root
-from tests.stability.twin import BACKENDS, rows
+from tests.stability import hard_particles
+from tests.stability.twin import BACKENDS, CASES, rows
 
 COLUMNS = [f"{what}, {backend}" for backend in BACKENDS for what in ("values", "gradients")]
 
@@ -34,7 +35,7 @@ def table(header: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
 def operator_table() -> str:
     """Measure every operator's errors, and print each."""
     lines = []
-    for row in rows():
+    for row in rows((*CASES, hard_particles.cases)):
         lines.append([row["operator"], row["input"], *(error_text(row[c]) for c in COLUMNS)])
         print("  ".join(lines[-1]), flush=True)
     return table(["operator", "input", *COLUMNS], lines)

@@ -89,7 +89,13 @@ def check_whole(scene):
 
 def of_run(root):
     """A run's config and its checkpoint, each with what reads it."""
-    small = ("experiment=demo", "stage.coarse.num_voxels=[[0,64]]", "data.root=data", "logger=none")
+    small = (
+        "model=forward",
+        "experiment=demo",
+        "stage.coarse.num_voxels=[[0,64]]",
+        "data.root=data",
+        "logger=none",
+    )
     config = OmegaConf.to_container(composed(*small, "trainer=cpu"), resolve=True)
     GlobalHydra.instance().clear()
     config, nothing = OmegaConf.create(config), OmegaConf.create({})

@@ -18,7 +18,7 @@ pytestmark = pytest.mark.stability
 KILLS = 24
 SMALL = [
     *("data=dnerf", "data.scene=vehicle", "data.rays=64", "data.half_resolution=false", "data.held_out=1"),
-    *("preset=demo", "preset.nodes=6", "budget.minutes=null", "budget.iterations=36"),
+    *("model=forward", "preset=demo", "preset.nodes=6", "budget.minutes=null", "budget.iterations=36"),
     *("stage.coarse.num_voxels=[[0,800],[0.5,1500]]", "stage.fine.num_voxels=[[0,1500],[0.5,2500]]"),
     *("stage.coarse.share=0.5", "stage.fine.share=0.5", "stage.fine.see_steps=2"),
     *("stage.coarse.refresh_every=4", "stage.fine.refresh_every=4"),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 
 import torch
@@ -168,9 +168,12 @@ def relative_error(ours: list[Tensor], exact: list[Tensor]) -> float | None:
     return worst
 
 
-def rows() -> Iterator[dict[str, float | str | None]]:
+CASES = (compositing_cases, splat_cases, lattice_cases, encoding_cases)
+
+
+def rows(groups: Iterable[Callable[[], Iterator[Case]]]) -> Iterator[dict[str, float | str | None]]:
     """Yield a row for each case: operator, input, errors of values and gradients by implementation."""
-    for cases in (compositing_cases, splat_cases, lattice_cases, encoding_cases):
+    for cases in groups:
         for operator, name, function, inputs in cases():
             with implementation("reference"):
                 exact = answers(function, inputs, torch.float64)

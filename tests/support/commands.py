@@ -19,7 +19,8 @@ from hydra.core.global_hydra import GlobalHydra
 # A scene of 32 x 32 pixels, with test views of all three kinds.
 SCENE = {"size": 32, "frames": 6, "test_views": (2, 1, 2), "val_views": 1, "samples_per_pixel": 1}
 TINY = [
-    *("data=dnerf", "data.scene=vehicle", "preset=demo", "trainer=cpu", "data.rays=128", "threads=1"),
+    *("model=forward", "data=dnerf", "data.scene=vehicle", "preset=demo", "trainer=cpu", "data.rays=128"),
+    "threads=1",
     *("budget.iterations=60", "stage.fine.num_voxels=[[0,8000]]", "stage.coarse.num_voxels=[[0,4000]]"),
 ]
 

@@ -117,6 +117,14 @@ def test_a_stage_that_found_nothing_keeps_its_box_and_says_so(box):
     assert len(handover.cloud) == 0
 
 
+def test_matter_that_has_left_the_scene_is_none():
+    class Astray(Method):
+        def bounds(self, times):
+            return Box((9.0, 9.0, 9.0), (10.0, 10.0, 10.0))
+
+    assert make_handover(Astray(), SCENE, None, 4) == Handover(BOX, False, 4)
+
+
 def test_of_a_method_that_can_tell_nothing_the_box_is_left(tmp_path):
     class Least(Method):
         pass

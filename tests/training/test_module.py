@@ -1,3 +1,4 @@
+import time
 from dataclasses import replace
 from functools import partial
 
@@ -9,6 +10,7 @@ from forewarp.methods.voxel.backward_warp import Deformation
 from forewarp.methods.voxel.structure import resample
 from forewarp.ops.backend import numba_installed
 from forewarp.ops.warmup import warm_up
+from forewarp.progress import told_if_slow
 from forewarp.renderer import Renderer
 from forewarp.scene.box import Lattice
 from forewarp.training.module import DynamicSceneModule
@@ -84,6 +86,17 @@ def test_the_clock_starts_when_the_kernels_are_warm(monkeypatch):
     made.on_train_start()
     assert seen == [(made.device, 0)]
     assert made.clock.seconds > 0
+
+
+@pytest.mark.parametrize(
+    ("seconds", "said"),
+    [(0.6, "coarse   0% | compiling kernels, once on a machine: up to a minute\n"), (0, "")],
+)
+def test_kernels_that_take_long_to_compile_are_told(monkeypatch, capsys, seconds, said):
+    monkeypatch.setattr("forewarp.training.module.told_if_slow", partial(told_if_slow, after=0.2))
+    monkeypatch.setattr("forewarp.methods.voxel.method.warm_up", lambda device: time.sleep(seconds))
+    module().on_train_start()
+    assert capsys.readouterr().err == said
 
 
 def test_a_step_meets_warm_kernels_only(monkeypatch):

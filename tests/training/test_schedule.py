@@ -1,5 +1,6 @@
 """Budget, learning rates and curriculum of a stage."""
 
+import re
 from collections import Counter
 from functools import partial
 
@@ -21,10 +22,45 @@ def test_keys_that_the_platform_does_not_know_are_the_methods_own():
 
 def test_rates_hold_and_then_fall_exponentially():
     made = settings(lr_hold=0.5, lr_final_factor=0.01)
-    assert [made.lr_factor(f) for f in (0, 0.5)] == [1, 1]
-    assert made.lr_factor(0.75) == pytest.approx(0.1)
-    assert made.lr_factor(1.0) == made.lr_factor(1.5) == pytest.approx(0.01)
-    assert settings(lr_hold=1.0).lr_factor(1.0) == 1
+    assert [made.lr_factor(f, "any") for f in (0, 0.5)] == [1, 1]
+    assert made.lr_factor(0.75, "any") == pytest.approx(0.1)
+    assert made.lr_factor(1.0, "any") == made.lr_factor(1.5, "any") == pytest.approx(0.01)
+    assert settings(lr_hold=1.0).lr_factor(1.0, "any") == 1
+
+
+def test_groups_may_fall_each_by_itself():
+    made = settings(
+        lr={"means": 1e-3, "shifts": 1e-3, "color": 1e-3},
+        lr_hold={"shifts": 0.5},
+        lr_final_factor={"means": 0.01, "shifts": 0.25},
+    )
+    for fraction, expected in ((0.0, (1, 1, 1)), (0.5, (0.1, 1, 1)), (0.75, (0.01**0.75, 0.5, 1))):
+        assert [made.lr_factor(fraction, group) for group in made.lr] == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"lr": None}, "stage.coarse.lr: expected a rate for each group, but got None"),
+        ({"lr": {"grid": "fast"}}, "stage.coarse.lr.grid: expected a number >= 0, but got 'fast'"),
+        ({"lr": {"grid": -1e-3}}, "stage.coarse.lr.grid: expected a number >= 0, but got -0.001"),
+        ({"lr": {"grid": float("nan")}}, "stage.coarse.lr.grid: expected a number >= 0, but got nan"),
+        ({"lr": {"grid": True}}, "stage.coarse.lr.grid: expected a number >= 0, but got True"),
+        ({"lr_hold": 1.5}, "stage.coarse.lr_hold: expected a number in [0, 1], but got 1.5"),
+        ({"lr_final_factor": 0}, "stage.coarse.lr_final_factor: expected a number > 0, but got 0"),
+        (
+            {"lr": {"means": 1e-3, "color": 1e-3}, "lr_final_factor": {"meens": 0.1}},
+            "stage.coarse.lr_final_factor: expected groups of means, color, but got 'meens'",
+        ),
+        (
+            {"lr": {"means": 1e-3}, "lr_hold": {"means": "late"}},
+            "stage.coarse.lr_hold.means: expected a number in [0, 1], but got 'late'",
+        ),
+    ],
+)
+def test_rates_that_cannot_be_are_refused(changes, message):
+    with pytest.raises(ValueError, match=f"^{re.escape(message)}$"):
+        settings(**changes)
 
 
 @pytest.mark.parametrize(

@@ -8,9 +8,9 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from forewarp.cli.misspelt import every_key
+from forewarp.cli.misspelt import every_key, of_another
 from forewarp.data.files import MARKERS, scene_folder
-from forewarp.runs.overrides import refuse_renamed
+from forewarp.runs.overrides import key_of, refuse_renamed, typed_overrides
 
 # Data modules that are not listed, such as those that make their scene, check for themselves.
 READERS = {
@@ -21,6 +21,16 @@ READERS = {
     "forewarp.data.module.PosedVideoDataModule": "posed_video",
 }
 
+VOXELS, PARTICLES = "forewarp.methods.voxel.", "forewarp.methods.particles."
+
+
+def refuse_all(config: DictConfig) -> None:
+    """Refuse what is wrong with a config by itself, whatever the data."""
+    refuse_renamed_keys(config)
+    refuse_seeds(config)
+    refuse_two_models(config)
+    refuse_other_methods(config)
+
 
 def refuse_renamed_keys(config: DictConfig) -> None:
     """Refuse keys of earlier versions, such as those of a user's own files.
@@ -28,7 +38,7 @@ def refuse_renamed_keys(config: DictConfig) -> None:
     A method of another package may have keys of these names.
     """
     target = str(config.model.get("_target_"))
-    voxel = target.startswith("forewarp.methods.voxel.")  # only these methods' options were renamed
+    voxel = target.startswith(VOXELS)  # only these methods' options were renamed
     if target.startswith("forewarp."):
         refuse_renamed([key for key in every_key(config) if voxel or not key.startswith("model.")])
 
@@ -68,3 +78,28 @@ def refuse_two_models(config: DictConfig) -> None:
             f"model: expected {' or '.join(known.of)}, which {known.name} is a change of, but got "
             f"{config.model.name}; leave one of them out"
         )
+
+
+def refuse_other_methods(config: DictConfig) -> None:
+    """Refuse options of another method: of voxels for particles, and the other way round.
+
+    Effects of voxels are classes, those of particles numbers and words; particles see no single rays.
+    """
+    target, choices = str(config.model.get("_target_")), {}
+    if HydraConfig.initialized():
+        choices = HydraConfig.get().runtime.choices
+    if not target.startswith((VOXELS, PARTICLES)):
+        return
+    voxels = target.startswith(VOXELS)
+    for group, option in choices.items():
+        part = config.model._get_node(group[6:]) if group.startswith("model/") else None
+        if part is None or part._is_none() or isinstance(part, DictConfig) == voxels:
+            continue
+        raise ValueError(
+            of_another(f"{group}={option}", config.model.name, "particles" if voxels else "forward")
+        )
+    stages = [stage for stage in config.get("stage", {}).values() if stage is not None]
+    if not voxels and HydraConfig.initialized() and not any("model" in stage for stage in stages):
+        for one in typed_overrides():
+            if key_of(one) in ("preset.rays", "data.rays") and not one.endswith("=null"):
+                raise ValueError(of_another(one, config.model.name, "forward"))

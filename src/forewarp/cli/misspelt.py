@@ -11,6 +11,7 @@ from pathlib import Path
 from forewarp.runs.config_files import configurations
 from forewarp.runs.overrides import key_of, refuse_renamed
 
+OF_METHODS = ("model", "modules", "objective", "preset", "stage")  # what methods have keys of their own in
 FOLDERS = {"evaluate": "run", "render": "run", "train": "resume"}
 
 
@@ -69,13 +70,37 @@ def unknown_key(error: Exception, name: str, arguments: list[str]) -> str | None
     if found is None or not isinstance(error, HydraException):
         return None
     key, conf = found[1], configurations()
-    known = [
-        *every_key(_composed(conf, name, [a for a in arguments if a.split("=")[0] != key])),
-        *_groups(conf),
-    ]
+    others = [argument for argument in arguments if key_of(argument) != key]
+    config = _composed(conf, name, others)
+    if (owner := _owner(key, conf, name, others)) is not None:
+        return of_another(key, config.model.name, owner)
+    known = [*every_key(config), *_groups(conf)]
     near = difflib.get_close_matches(key, known, 1, cutoff=0.8)
     advice = f"did you mean {near[0]}?" if near else f"forewarp-{name} --cfg job prints all keys"
     return f"{key}: expected a key of the configuration, but got none of this name; {advice}"
+
+
+def of_another(option: str, model: str, owner: str) -> str:
+    """Return the line for an option that the chosen method has not, but ``owner`` has."""
+    return (
+        f"{option}: expected an option of model={model}, but got one of model={owner}; add model={owner}, or "
+        "leave it out"
+    )
+
+
+def _owner(key: str, conf: Path, name: str, arguments: list[str]) -> str | None:
+    """Return the first of our methods that has a key or group of options; the paper's comes first."""
+    if not (conf / name).with_suffix(".yaml").is_file() or not key.startswith(OF_METHODS):
+        return None
+    kept = [argument for argument in arguments if key_of(argument) != "model"]
+    models = sorted(
+        (path.stem for path in (conf / "model").glob("*.yaml")), key=lambda m: (m != "forward", m)
+    )
+    for model in models:
+        config = _composed(conf, name, [*kept, f"model={model}"])
+        if config.get("model", {}).get("name") == model and key.replace("/", ".") in every_key(config):
+            return model
+    return None
 
 
 def _composed(conf: Path, name: str, arguments: list[str]):

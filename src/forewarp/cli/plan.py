@@ -22,13 +22,13 @@ types most:
   plan.steps=N plan.seconds=N              bounds of a coarse stage; the first that is reached ends it
   plan.trial_steps=N plan.trial_seconds=N  bounds of a trial
   plan.folder=FOLDER     where plan.yaml and the trials go; an interrupted plan goes on there
-Overrule a plan by an override: forewarp-train plan=FILE model/inpainter=unet3d
+Overrule a plan by an override: forewarp-train plan=FILE model/view_dependence=none
 """
 
 
 def plan(config) -> None:
     """Make a plan and print it."""
-    from forewarp.cli.checks import refuse_missing_scene, refuse_renamed_keys, refuse_seeds, refuse_two_models
+    from forewarp.cli.checks import refuse_all, refuse_missing_scene
     from forewarp.planning.plan_file import show_plan
     from forewarp.runs.overrides import typed_overrides
 
@@ -36,9 +36,7 @@ def plan(config) -> None:
         raise ValueError(
             f"plan: expected keys as plan.minutes=10, but got {config.plan}; forewarp-train takes a file"
         )
-    refuse_renamed_keys(config)
-    refuse_seeds(config)
-    refuse_two_models(config)
+    refuse_all(config)
     refuse_missing_scene(config)
     from forewarp.planning.plan import make_plan  # loads torch; mistakes have been answered before
 

@@ -11,8 +11,9 @@ KINDS = {
     "accuracy_time": "accuracy against training time, and the cheapest way to each dB",
     "price_list": "what each choice costs and brings, with the spread over seeds",
     "paper": "the paper's tables and figures: Markdown, LaTeX, CSV, HTML",
+    "minutes": "what a method reaches on each scene in so many minutes, by seed and view",
     "effects": "planned runs against every effect at once and the paper's fixed set",
-    "compare": "a few runs side by side, printed",
+    "compare": "a few runs side by side, printed, and with out=FOLDER drawn",
     "limits": "what keeps a few runs from the truth, printed: time, views, voxel size, regions",
 }
 
@@ -22,13 +23,13 @@ forewarp-report makes tables and curves of runs that are already there. Only kin
 {chr(10).join(f"  kind={kind:<14} {about}" for kind, about in KINDS.items())}
 
   forewarp-report kind=price_list runs=FOLDER out=FOLDER
-  forewarp-report kind=compare runs=[runs/demo/forward,runs/demo/backward]
+  forewarp-report kind=compare runs=[runs/demo/particles,runs/demo/forward] out=runs/demo
   forewarp-report kind=limits 'runs=runs/paper/*/plain-forward-fast-*'
 
 What one types most:
-  runs=FOLDER            searched for runs (runs/accuracy_time, runs/paper or runs/effects)
+  runs=FOLDER            searched for runs (runs/accuracy_time, paper, minutes or effects)
   runs=[FOLDER,FOLDER]   compare, limits: the runs themselves; patterns with * are expanded
-  out=FOLDER             where the page goes (results/ below the runs)
+  out=FOLDER             where the page goes (results/ below the runs); compare: where the picture goes
   target=DB              accuracy_time: PSNR that every variant's seconds are listed for
   published=FILE         accuracy_time: results of others to show; paper: the printed numbers
   curves=FOLDER          paper: where accuracy_time put its pictures (runs/accuracy_time/results)
@@ -51,7 +52,7 @@ def report(config) -> None:
         return
     if not isinstance(config.runs, str | None):
         raise ValueError(f"runs: expected one folder for kind={config.kind}, but got a list; name one folder")
-    default = config.kind if config.kind in ("paper", "effects") else "accuracy_time"
+    default = config.kind if config.kind in ("paper", "effects", "minutes") else "accuracy_time"
     runs = Path(config.runs or f"{config.paths.runs}/{default}")
     for file in _written(config, runs, Path(config.out or runs / "results")):
         print(f"written: {file}")
@@ -68,9 +69,10 @@ def _folders(runs) -> list[str]:
 def _table(config, folders: list[str]) -> str:
     """Return the table of ``kind=compare`` or ``kind=limits``."""
     if config.kind == "compare":
-        from forewarp.report.compare import compare
+        from forewarp.report.compare import compare, draw_compared
 
-        return compare(folders).plain()
+        drawn = draw_compared(folders, Path(config.out)) if config.out else None
+        return compare(folders).plain() + (f"\nwritten: {drawn}" if drawn else "")
     if type(config.views) is not int or config.views < 1:
         raise ValueError(f"views: expected a whole number > 0, but got {config.views}")
     from forewarp.runs.config import saved_config
@@ -99,6 +101,7 @@ def _written(config, runs: Path, out: Path) -> list[Path]:
     from forewarp.report.accuracy_time import write_accuracy_time
     from forewarp.report.curve import OTHERS, read_published
     from forewarp.report.effects import write_effects
+    from forewarp.report.minutes import write_minutes
     from forewarp.report.paper import write_paper
     from forewarp.report.paper_printed import PAPER
     from forewarp.report.price_list import write_price_list
@@ -107,6 +110,8 @@ def _written(config, runs: Path, out: Path) -> list[Path]:
         return write_price_list(runs, out)
     if config.kind == "effects":
         return write_effects(runs, out)
+    if config.kind == "minutes":
+        return write_minutes(runs, out)
     if config.kind == "paper":
         curves = Path(config.curves or f"{config.paths.runs}/accuracy_time/results")
         return write_paper(runs, out, Path(config.published or PAPER), curves)

@@ -17,9 +17,9 @@ What one types most (options such as --multirun or --config-dir=FOLDER come firs
   preset=demo|fast|faithful           the method's numbers: small, cheap (the default), as in the paper
   budget.minutes=N                    of training, all stages together
   budget.iterations=N                 the same in steps; the first that is reached ends training
-  model=forward|backward|tnerf|particles   the paper's method (default), its opponent, a network, Gaussians
-  model/view_dependence=none|sh|mlp   switch an effect; all others work alike
-  stage.NAME.lr.GROUP=RATE            a learning rate; groups: density, color, shading, grid, flow, network
+  model=particles|forward|backward|tnerf   Gaussians (default), the paper's method, its opponent, a network
+  model/view_dependence=none|harmonics     switch an effect; all others work alike (of forward: none|sh|mlp)
+  stage.NAME.lr.GROUP=RATE            a learning rate; groups: means, color, shifts, ... (see --cfg job)
   seed=N                              of all random numbers
   trainer=cpu|gpu|auto                the device
   resume=FOLDER                       go on with the run in a folder; no other override is needed
@@ -35,9 +35,9 @@ What one types most (options such as --multirun or --config-dir=FOLDER come firs
   ablation=NAME                       an ablation of the paper; ablation=full is its whole method
   launcher=local|joblib|ray|slurm|submitit   where the jobs of --multirun run
   ~stage.fine                         drop a stage
-  --multirun seeds=3                  one run after another; --multirun sweeps=methods: a prepared sweep
-  --multirun sweeps=accuracy_time preset.rays=1024,2048    what choices cost; see forewarp-report
-  --multirun sweeps=price_list seeds=2                     the same for every choice, one at a time
+  --multirun seeds=3                  one run after another; --multirun sweeps=dnerf: a prepared sweep
+  --multirun sweeps=accuracy_time stage.fine.density=45,180  what choices cost; see forewarp-report
+  --multirun sweeps=price_list_particles seeds=2  the same for every choice, one at a time; also _forward
 
 A run's folder holds config.yaml, a folder for each stage (checkpoint, handover.json, TensorBoard events,
 images), images/ of the test views, per_image.json and metrics.json. With data.held_out or validation views it
@@ -48,13 +48,11 @@ Watch: tensorboard --logdir runs
 
 def train(config) -> float | None:
     """Fit the stages that are not finished and measure the run; return its score if one is asked for."""
-    from forewarp.cli.checks import refuse_missing_scene, refuse_renamed_keys, refuse_seeds, refuse_two_models
+    from forewarp.cli.checks import refuse_all, refuse_missing_scene
     from forewarp.runs.config import claim, hashed, resumed
     from forewarp.runs.trust import check_planned, trust_of
 
-    refuse_renamed_keys(config)
-    refuse_seeds(config)
-    refuse_two_models(config)
+    refuse_all(config)
     trust = trust_of(config.get("trust"))
     if config.get("planned") is not None:
         check_planned(config, trust)

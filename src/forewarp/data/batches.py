@@ -42,11 +42,12 @@ class Sampler(IterableDataset):
     """An endless stream of training batches, of what a method ``asks`` for.
 
     ``picker()`` chooses the next frame, an index into ``scene.train``; None picks uniformly. A batch of
-    single pixels has ``rays`` of them. If ``views_per_step`` is above 1, the rays are divided among up to
-    that many random frames of the picked frame's time, so one snapshot serves them all. ``background`` is
-    white, black or random: a colour per pixel, or one for a whole picture or crop, drawn at each step. An
-    image without alpha hides the colour, so a random one penalises transparency in the rendering. A second
-    ``iter`` goes on where the first stopped; ``state_dict`` holds what an exact continuation needs.
+    single pixels has ``rays`` of them (None: the method asks for no such batch). If ``views_per_step`` is
+    above 1, the rays are divided among up to that many random frames of the picked frame's time, so one
+    snapshot serves them all. ``background`` is white, black or random: a colour per pixel, or one for a whole
+    picture or crop, drawn at each step. An image without alpha hides the colour, so a random one penalises
+    transparency in the rendering. A second ``iter`` goes on where the first stopped; ``state_dict`` holds
+    what an exact continuation needs.
 
     Cost: linear in the pixels, below 2 ms for 8192; a frame is decoded when it is first picked, and kept
     while there is room.
@@ -56,21 +57,22 @@ class Sampler(IterableDataset):
         self,
         scene: Scene,
         *,
-        rays: int = 8192,
+        rays: int | None = 8192,
         background: str = "white",
         seed: int = 0,
         picker: Callable[[], int] | None = None,
         views_per_step: int = 1,
         asks: Asks | None = None,
     ) -> None:
-        if int(rays) < 1:
+        if rays is not None and int(rays) < 1:
             raise SceneError(f"data.rays: expected at least 1, but got {rays}")
         if background not in (*COLORS, "random"):
             raise SceneError(f"data.background: expected white, black or random, but got {background!r}")
         if int(views_per_step) < 1:
             raise SceneError(f"data.views_per_step: expected at least 1, but got {views_per_step}")
-        self.frames, self.rays, self.background, self.picker = scene.train, int(rays), background, picker
-        self.views_per_step, self.asks = min(int(views_per_step), self.rays), asks or Asks()
+        self.frames, self.background, self.picker, self.asks = scene.train, background, picker, asks or Asks()
+        self.rays = None if rays is None else int(rays)
+        self.views_per_step = min(int(views_per_step), self.rays or 1)
         self._of_time: dict[float, list[int]] = {}
         for index, frame in enumerate(scene.train):
             self._of_time.setdefault(frame.time, []).append(index)
@@ -91,6 +93,11 @@ class Sampler(IterableDataset):
         if not 0 <= index < len(self.frames):
             raise ValueError(f"picker: expected a training frame in [0, {len(self.frames)}), but got {index}")
         frames = [*self._views(index), *self._neighbours(self.frames[index].time)]
+        if self.asks.kind == "pixels" and self.rays is None:
+            raise SceneError(
+                "data.rays: expected a number, as the method is trained on single rays, but got null; set "
+                "preset.rays=2048"
+            )
         if self.asks.kind == "pixels":
             frames = frames[: self.rays]  # none without a pixel
         drawn = self._pixels(frames) if self.asks.kind == "pixels" else self._areas(frames)

@@ -29,7 +29,7 @@ class SceneDataModule(LightningDataModule):
 
     Args:
         read: gives the scene; called once, at the first use.
-        rays: pixels of a batch.
+        rays: pixels of a batch; None where the method asks for whole pictures.
         background: behind training pixels: white, black or random (a colour each).
         eval_background: behind whole images: white or black.
         seed: seed of the pixels, the background colours and the default choice of frames.
@@ -46,7 +46,7 @@ class SceneDataModule(LightningDataModule):
         self,
         read: Callable[[], Scene],
         *,
-        rays: int = 8192,
+        rays: int | None = 8192,
         background: str = "white",
         eval_background: str = "white",
         seed: int = 0,

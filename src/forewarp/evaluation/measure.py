@@ -66,8 +66,8 @@ def show(metrics: dict, folder: Path, absent: dict[str, str]) -> None:
     others = ("train", "render_per_frame", "render_again_per_frame")
     stages = ", ".join(f"{name} {time_text(s)}" for name, s in seconds.items() if name not in others)
     lines = [
-        f"trained {time_text(seconds['train'])} ({stages}), {seconds['render_per_frame']:.2f} s a frame, "
-        f"{seconds['render_again_per_frame']:.2f} s another at the same time"
+        f"trained {time_text(seconds['train'])} ({stages}), {seconds['render_per_frame']:.3g} s a frame, "
+        f"{seconds['render_again_per_frame']:.3g} s another at the same time"
     ]
     if flow and flow["epe_moving"] is not None:
         error, motion = flow["epe_moving"], flow["motion_mean"]

@@ -8,7 +8,7 @@ from torch import Tensor
 from forewarp.ops.dct import dct_basis
 from forewarp.ops.spline import spline_basis
 
-KINDS = ("spline", "dct")
+KINDS = ("spline", "cosines")
 _PADDING = 0.2  # of the sequence, imagined before and after it: a cosine stands still at both ends
 
 
@@ -17,8 +17,8 @@ class Curve:
     time bend their own knots, and not what all others share.
 
     Args:
-        kind: ``spline``, whose knots bend their neighbourhood in time alone, or ``dct``, the paper's cosines.
-        count: of coefficients; a spline has at least 4, a DCT at most one less than there are times.
+        kind: ``spline``, whose knots bend their neighbourhood in time alone, or ``cosines``, the paper's DCT.
+        count: of coefficients; a spline has at least 4, cosines at most one less than there are times.
         times: how many distinct training times there are.
         canonical_time: in [0, 1].
 
@@ -45,7 +45,7 @@ class Curve:
 
     def reach(self) -> Tensor | None:
         """From when to when (K, 2) each coefficient bends the curve; None where all do so at all times."""
-        if self.kind == "dct":
+        if self.kind == "cosines":
             return None
         knots = torch.arange(self.count, dtype=torch.float32)
         return torch.stack([knots - 3, knots + 1], -1) / (self.count - 3)

@@ -57,7 +57,8 @@ def carry_nodes(shift: Tensor, turn: Tensor | None, basis: Tensor, places: Tenso
 
     Cost: 6 numbers a node and coefficient that is not 0.
     """
-    check_shape("shift", shift, (len(places), len(basis), 3))
+    check_shape("places", places, ("M", 3))
+    _check_curves(shift, turn, (len(places), len(basis), 3))
     asks = torch.is_grad_enabled() and (shift.requires_grad or (turn is not None and turn.requires_grad))
     if use_numba(shift) and shift.dtype == torch.float32 and not asks:
         from forewarp.ops import kernels_nodes
@@ -83,12 +84,29 @@ def stiffness(motion: Tensor, places: Tensor, edges: Tensor, weights: Tensor) ->
     Returns:
         (), differentiable in ``motion``.
 
+    Raises:
+        ValueError: for shapes that do not go together.
+
     Cost: about 40 operations an edge.
     """
+    _check_edges(motion, places, edges, weights)
     linear = node_maps(motion, places)[:, :9].reshape(-1, 3, 3)
     apart = places[edges] - places[:, None]
     strain = motion[edges, :3] - motion[:, None, :3] - (linear[:, None] @ apart[..., None])[..., 0]
     return (weights[..., None] * strain.square()).sum()
+
+
+def _check_edges(motion: Tensor, places: Tensor, edges: Tensor, weights: Tensor) -> None:
+    check_shape("motion", motion, ("M", 6))
+    check_shape("places", places, (len(motion), 3))
+    check_shape("edges", edges, (len(motion), "E"))
+    check_shape("weights", weights, tuple(edges.shape))
+
+
+def _check_curves(shift: Tensor, turn: Tensor | None, shape: tuple[int | str, ...]) -> None:
+    check_shape("shift", shift, shape)
+    if turn is not None:
+        check_shape("turn", turn, tuple(shift.shape))
 
 
 def pull_nodes(
@@ -106,6 +124,7 @@ def pull_nodes(
 
     Cost: about 60 operations an edge.
     """
+    _check_edges(motion, places, edges, weights)
     check_shape("by_maps", by_maps, (len(motion), 12))
     if use_numba(motion) and motion.dtype == torch.float32:
         from forewarp.ops import kernels_nodes
@@ -140,6 +159,7 @@ def spread_nodes(
 
     Cost: about 20 operations a coefficient.
     """
+    _check_curves(shift, turn, ("M", "K", 3))
     check_shape("slope", slope, (len(shift), 6))
     check_shape("basis", basis, (shift.shape[1],))
     check_shape("bend", bend, (shift.shape[1],))

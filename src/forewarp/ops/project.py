@@ -197,10 +197,11 @@ def project_reference(
         [torch.stack([1 / z, zero, -x / z**2], -1), torch.stack([zero, 1 / z, -y / z**2], -1)], -2
     )
     rows = slopes.detach() @ flat @ rotation @ linear @ rotations(quaternions)  # (N, 2, 3)
-    root = rows * log_scales.exp()[:, None]
-    determinant = _covariance(root.detach(), pinhole.blur)[3]
+    determinant = _covariance(rows.detach() * log_scales.detach().exp()[:, None], pinhole.blur)[3]
     seen = seen & (determinant > 0) & (determinant < 1e30)
-    a, b, c, determinant = _covariance(torch.where(seen[:, None, None], root, 0.0), pinhole.blur)
+    scales = torch.where(seen[:, None], log_scales, 0.0).exp()  # an infinite one's slope would be NaN
+    root = torch.where(seen[:, None, None], rows * scales[:, None], 0.0)
+    a, b, c, determinant = _covariance(root, pinhole.blur)
     distance = away.square().sum(-1).clamp(min=1e-30).sqrt()
     directions = (away / distance[:, None]).detach()
     plain = colors.shape[1] - len(tints)

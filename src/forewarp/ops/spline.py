@@ -31,13 +31,14 @@ def spline_basis(time: Tensor | float, knots: int, canonical_time: float | None 
     """
     if knots < 4:
         raise ValueError(f"spline: expected at least 4 knots, but got {knots}")
-    if isinstance(time, float) and 0 <= time <= 1:  # as in every step: plain numbers are faster
+    origin = 0.0 if canonical_time is None else canonical_time
+    if isinstance(time, float) and 0 <= time <= 1 and 0 <= origin <= 1:  # plain numbers are faster
         now = _shares(time, knots)
-        then = [0.0] * knots if canonical_time is None else _shares(canonical_time, knots)
+        then = [0.0] * knots if canonical_time is None else _shares(origin, knots)
         return torch.tensor([a - b for a, b in zip(now, then)])
     t = torch.as_tensor(time)
     t = t if t.is_floating_point() else t.float()
-    both = torch.stack([t, torch.full_like(t, canonical_time or 0.0)]).double()
+    both = torch.stack([t, torch.full_like(t, origin)]).double()
     if not bool(((both >= 0) & (both <= 1)).all()):
         low, high = float(both.min()), float(both.max())
         raise ValueError(

@@ -85,8 +85,8 @@ def planning_of(model: Callable, name: str) -> Planning:
     planning = getattr(model, "planning", getattr(getattr(model, "func", None), "planning", None))
     if planning is None:
         raise ValueError(
-            f"model: expected a method whose effects can be planned, but {name} has none; use model=forward, "
-            "or leave out effects=auto"
+            f"model: expected a method whose effects can be planned, but {name} has none; use "
+            "model=particles or model=forward, or leave out effects=auto"
         )
     return planning
 

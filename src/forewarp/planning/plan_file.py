@@ -88,7 +88,7 @@ def with_plan(name: str, arguments: list[str]) -> list[str]:
     made = read_plan(Path(files[-1]).expanduser(), without_trust(arguments)[1])
     typed = [argument for argument in arguments if not argument.startswith("plan=")]
     planned = merged(made["overrides"], made["typed"])
-    model = ([one for one in planned if one.startswith("model=")] or ["model=forward"])[-1]
+    model = next((one for one in planned if one.startswith("model=")), None)
     for one in typed:
         if one.startswith("resume=") or (one.startswith("model=") and one != model):
             raise ValueError(

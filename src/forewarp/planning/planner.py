@@ -49,9 +49,10 @@ class Planner:
         if self.settings.trials:
             self._try_fine()
         every = [self._as_tried(decision) for decision in self.planning.decide(self.evidence, self.asked)]
+        model = f"model={HydraConfig.get().runtime.choices['model']}"  # its effects; defaults may change
         return {
             "typed": list(self.typed),
-            "overrides": list(dict.fromkeys(one for decision in every for one in decision.overrides)),
+            "overrides": [model, *dict.fromkeys(one for decision in every for one in decision.overrides)],
             "effects": {d.effect: {"choice": d.choice, "on": d.on, "because": d.because} for d in every},
             "evidence": self._numbers(),
         }

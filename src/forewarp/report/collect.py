@@ -65,7 +65,7 @@ class Result:
     def variant(self) -> str:
         """Name what tells this run from others of its scene.
 
-        The name of an ablation; for runs of ``sweeps=accuracy_time`` and ``price_list`` the typed overrides
+        The name of an ablation; for runs of ``sweeps=accuracy_time`` and its price lists the typed overrides
         (``base`` without any); for all other runs the method and the preset.
         """
         known = self.config.get("variant") or {}

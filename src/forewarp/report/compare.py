@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from forewarp.files import read_json
+from forewarp.report.sheets import draw_beside
 from forewarp.report.tables import Column, Difference, Table
 
 _ABILITIES = {
@@ -48,6 +49,16 @@ def compare(folders: Sequence[Path]) -> Table:
     columns = ["PSNR (dB) of test views", *names_of(folders, metrics)]
     columns += ["difference"] if len(folders) == 2 else []
     return Table([Column(name) for name in columns], rows)
+
+
+def draw_compared(folders: Sequence[Path], out: Path) -> Path | None:
+    """Draw a test view in the middle of the time by every run into ``compare.png``.
+
+    Return None if the runs share no test view with a picture.
+    """
+    names = names_of(folders, [read_metrics(Path(folder)) for folder in folders])
+    runs = {name: Path(folder) for name, folder in zip(names, folders)}
+    return draw_beside(out / "compare.png", runs, 0.5, "test view")
 
 
 def _add(rows: list, name: str, values: list, digits: int, *, with_difference: bool = True) -> None:

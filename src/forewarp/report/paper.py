@@ -6,6 +6,7 @@ import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import datetime, timezone
+from itertools import product
 from pathlib import Path
 
 from forewarp.files import replace_file
@@ -19,7 +20,8 @@ TITLE = "The paper's tables, measured"
 INTRODUCTION = (
     "Written by `forewarp-report kind=paper`. Rows marked measured are runs of this project, those marked "
     "published are what the paper prints; the best and the second are marked among measured rows "
-    "alone. Over several seeds: mean ± standard deviation. A cell without a run is empty. Synthetic "
+    "alone. `forward` is the paper's method, `backward` its opponent, `particles` this project's own. "
+    "Over several seeds: mean ± standard deviation. A cell without a run is empty. Synthetic "
     "counterparts are procedural scenes in a dataset's format: their numbers are not "
     "comparable with printed ones."
 )
@@ -27,6 +29,7 @@ COUNTERPART = ": synthetic counterpart"
 # Entries of a run's protocol that the page shows.
 TOLD = ("half_resolution", "scale", "split", "frames", "views", "train_frames", "test_views", "test_frames")
 TOLD += ("held_out", "canonical_time", "mask_box")
+METHODS = ("particles", "forward", "backward")  # that are compared in pictures
 DATASETS = ("dnerf", "hypernerf", "nhr", "lego_complete")
 
 
@@ -121,25 +124,25 @@ def _draw(results: Sequence[Result], out: Path) -> list[tuple[str, Path | None, 
     sides = [run for run in results if paper_figures.RESOLUTION.match(run.variant)]
     found = [("Resolution", paper_figures.draw_resolution(out / "paper-resolution.png", sides), sides)]
     plain = [run for run in results if row_of(run).variant == "plain"]
-    for scene, both in _pairs(plain).items():
-        path = paper_figures.draw_canonical(out / f"paper-canonical-{scene}.png", *both)
-        found.append((f"Canonical comparison: {scene}", path, both))
-    for dataset in DATASETS:
-        runs = [r for r in plain if r.dataset == dataset and r.config["model"]["name"] == "forward"]
+    for scene, rivals in _rivals(plain).items():
+        path = paper_figures.draw_canonical(out / f"paper-canonical-{scene}.png", rivals)
+        found.append((f"Canonical comparison: {scene}", path, list(rivals.values())))
+    for dataset, method in product(DATASETS, METHODS[:2]):
+        runs = [r for r in plain if r.dataset == dataset and r.config["model"]["name"] == method]
         runs = list({run.scene: run for run in runs}.values())
-        path = paper_figures.draw_sheet(out / f"paper-views-{dataset}.png", runs)
-        found.append((f"Views: {dataset}", path, runs))
+        path = paper_figures.draw_sheet(out / f"paper-views-{dataset}-{method}.png", runs)
+        found.append((f"Views: {dataset}, {method}", path, runs))
     return found
 
 
-def _pairs(runs: Sequence[Result]) -> dict[str, list[Result]]:
-    """Return for each scene a forward and a backward run, equal in preset, budget and seed."""
+def _rivals(runs: Sequence[Result]) -> dict[str, dict[str, Result]]:
+    """Return for each scene runs of several methods by their names, equal in preset, budget and seed."""
     equal: dict[tuple, dict[str, Result]] = {}
     for run in runs:
         row = row_of(run)
         equal.setdefault((run.scene, run.seed, row._replace(model="")), {})[row.model] = run
-    both = {key[0]: pair for key, pair in equal.items() if {"forward", "backward"} <= pair.keys()}
-    return {scene: [pair["forward"], pair["backward"]] for scene, pair in sorted(both.items())}
+    several = {key[0]: rivals for key, rivals in equal.items() if len(rivals.keys() & set(METHODS)) > 1}
+    return {scene: {m: found[m] for m in METHODS if m in found} for scene, found in sorted(several.items())}
 
 
 def _write_csv(sections: Sequence[Section], out: Path) -> list[Path]:

@@ -6,16 +6,13 @@ import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import numpy as np
-
-from forewarp.files import read_json
 from forewarp.metrics.gain import Estimate
 from forewarp.report import curve
 from forewarp.report.collect import Result
 from forewarp.report.paper_tables import row_of
+from forewarp.report.sheets import draw_beside, figure_of, read_picture, sheets_of, show, thirds
 
 RESOLUTION = re.compile(r"resolution |voxels_\d")  # variants of sweeps=resolution, now and before 0.3
-GAP = 4  # pixels between the parts of a sheet
 
 
 def draw_resolution(path: Path, results: Sequence[Result]) -> Path | None:
@@ -34,7 +31,7 @@ def draw_resolution(path: Path, results: Sequence[Result]) -> Path | None:
     scenes = {scene: sides for scene, sides in scenes.items() if len(sides) > 1}
     if not scenes:
         return None
-    figure, axes = _figure(1, 1, (7, 4.5))
+    figure, axes = figure_of(1, 1, (7, 4.5))
     for scene, sides in sorted(scenes.items()):
         estimates = [Estimate.of(sides[side]) for side in sorted(sides)]
         spread = [estimate.deviation or 0 for estimate in estimates]
@@ -47,74 +44,26 @@ def draw_resolution(path: Path, results: Sequence[Result]) -> Path | None:
     return curve._save(figure, path)
 
 
-def draw_canonical(path: Path, forward: Result, backward: Result) -> Path | None:
-    """Draw the view nearest to the canonical time: truth, forward, backward, and both errors.
+def draw_canonical(path: Path, rivals: Mapping[str, Result]) -> Path | None:
+    """Draw the view nearest to the canonical time: truth, then each method's rendering and error.
 
-    Return None if the two runs share no view with a sheet.
+    Return None if the runs, by their methods, share no view with a sheet.
     """
-    both = sorted(set(_sheets(forward)) & set(_sheets(backward)))
-    if not both:
-        return None
-    about = {image["name"]: image for image in _images(forward)}
-    at = forward.metrics["protocol"].get("canonical_time", 0.5 if forward.dataset == "hypernerf" else 0.0)
-    known = [name for name in both if name in about]
-    name = min(known or both, key=lambda name: abs(about.get(name, {"time": at})["time"] - at))
-    truth, ours, error = thirds(_read(_sheets(forward)[name]))
-    _, theirs, their_error = thirds(_read(_sheets(backward)[name]))
-    pictures = {"truth": truth, "forward": ours, "backward": theirs}
-    pictures |= {"error, forward": error, "error, backward": their_error}
-    figure, axes = _figure(1, len(pictures), (3 * len(pictures), 3.4))
-    _show(axes[0], pictures)
-    figure.suptitle(f"{forward.scene}, {name}: near the canonical time; errors up to 0.25 (white)")
-    return curve._save(figure, path)
+    first = next(iter(rivals.values()))
+    at = first.metrics["protocol"].get("canonical_time", 0.5 if first.dataset == "hypernerf" else 0.0)
+    folders = {name: run.folder for name, run in rivals.items()}
+    return draw_beside(path, folders, at, f"{first.scene}, near the canonical time")
 
 
 def draw_sheet(path: Path, results: Sequence[Result], columns: int = 3) -> Path | None:
     """Draw a row for each scene: truth, result and error of a view; None if no run has a sheet."""
-    found = {run.scene: _sheets(run) for run in sorted(results, key=lambda run: run.scene)}
+    found = {run.scene: sheets_of(run.folder) for run in sorted(results, key=lambda run: run.scene)}
     found = {scene: sheets for scene, sheets in found.items() if sheets}
     if not found:
         return None
-    figure, axes = _figure(len(found), columns, (3 * columns, 3.2 * len(found)))
+    figure, axes = figure_of(len(found), columns, (3 * columns, 3.2 * len(found)))
     for row, (scene, sheets) in zip(axes, found.items()):
         name = sorted(sheets)[len(sheets) // 2]
-        parts = thirds(_read(sheets[name]))
-        _show(row, dict(zip((f"{scene}, {name}", "rendered", "error"), parts)))
+        parts = thirds(read_picture(sheets[name]))
+        show(row, dict(zip((f"{scene}, {name}", "rendered", "error"), parts)))
     return curve._save(figure, path)
-
-
-def thirds(sheet: np.ndarray) -> list[np.ndarray]:
-    """Split a sheet (H, 3 W + 2 GAP, C) into its three pictures (H, W, C)."""
-    width = (sheet.shape[1] - 2 * GAP) // 3
-    return [sheet[:, i * (width + GAP) : i * (width + GAP) + width] for i in range(3)]
-
-
-def _sheets(run: Result) -> dict[str, Path]:
-    folder = run.folder / "images" / "sheets"
-    return {path.relative_to(folder).with_suffix("").as_posix(): path for path in folder.rglob("[!.]*.png")}
-
-
-def _images(run: Result) -> list[dict]:
-    return (read_json(run.folder / "per_image.json") or {}).get("images", [])
-
-
-def _read(path: Path) -> np.ndarray:
-    from matplotlib.image import imread
-
-    return imread(path)
-
-
-def _show(axes, pictures: Mapping[str, np.ndarray]) -> None:
-    for axis, (title, picture) in zip(axes, pictures.items()):
-        axis.imshow(picture)
-        axis.set_title(title, fontsize="small")
-        axis.set_axis_off()
-
-
-def _figure(rows: int, columns: int, size: tuple[float, float]):
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise ImportError("expected matplotlib for plots; install forewarp[plots]") from None
-    figure = Figure(figsize=size, layout="constrained")
-    return figure, figure.subplots(rows, columns, squeeze=False)

@@ -154,6 +154,7 @@ def _name(row: Row, runs: Sequence[Result], tell_device: bool) -> str:
     minutes, steps = f"{row.minutes or 0:g} min", f"{row.iterations} steps"
     bounds = [minutes if row.minutes else "", steps if row.iterations else ""]
     about = row.model if row.variant == "plain" else (runs[0].about or row.variant)
+    about += " (the paper's method)" * (about == "forward")
     seeds = len({run.seed for run in runs})
     parts = [f"forewarp: {about}", row.preset, *bounds, f"{seeds} seeds" if seeds > 1 else ""]
     parts.append(f"{row.held_out} views held out" if row.held_out else "")

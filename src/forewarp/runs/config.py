@@ -20,7 +20,7 @@ from forewarp.runs.trust import trust_of, trusted_config
 # Two runs differ if these keys differ; device, folder and what is shown do not count.
 IDENTITY = ("data", "model", "objective", "stage", "preset", "budget", "seed")
 # Named first in a refusal, as other differences follow from these.
-TYPED = ("data.scene", "data.root", "seed", "preset", "budget")
+TYPED = ("model.name", "data.scene", "data.root", "seed", "preset", "budget")
 HASH = "{hash}"
 # May be set beside resume=<run>.
 MAY_CHANGE = (

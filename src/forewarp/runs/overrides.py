@@ -45,9 +45,10 @@ RENAMED = (
     (
         rf"variant=(.*,)?({_VARIANTS})(,.*)?",
         None,
-        "type what a variant changed, as preset.rays=1024; sweeps/price_list.yaml lists all that there were",
+        "type model=forward and the change, as preset.rays=1024; sweeps/price_list_forward.yaml has all",
     ),
     (r"variant=base", "ablation=base", SINCE_3),
+    (r"sweeps=methods", "sweeps=dnerf", "each dataset's sweep has all methods since 0.3"),
     (
         r"variant=([^{]*)",
         r"ablation=\1",

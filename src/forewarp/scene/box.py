@@ -59,8 +59,12 @@ class Box:
         """Add ``by`` world units on every side."""
         return Box(tuple(v - by for v in self.low), tuple(v + by for v in self.high))
 
+    def meets(self, other: Box) -> bool:
+        """Return whether two boxes share more than a face."""
+        return all(max(a, b) < min(c, d) for a, b, c, d in zip(self.low, other.low, self.high, other.high))
+
     def intersection(self, other: Box) -> Box:
-        """Intersect two boxes."""
+        """Intersect two boxes that meet."""
         return Box(
             tuple(max(a, b) for a, b in zip(self.low, other.low)),
             tuple(min(a, b) for a, b in zip(self.high, other.high)),

@@ -31,8 +31,9 @@ def make_handover(method: Method, scene: Scene, before: Handover | None, frames_
     """
     times = list(scene.times)
     box = method.bounds(times) if isinstance(method, HasBounds) else None
-    if tight := box is not None:
-        box = box.intersection(scene.box.scaled(1.05))
+    room = scene.box.scaled(1.05)
+    if tight := box is not None and box.meets(room):  # what drew nothing may have strayed from it
+        box = box.intersection(room)
     else:
         box = scene.box if before is None else before.box
     some = paths = cloud = None

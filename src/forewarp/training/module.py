@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from forewarp.methods.method import Method, Snapshot, Step
+from forewarp.progress import told_if_slow
 from forewarp.scene.batch import Batch, Target
 from forewarp.scene.camera import Camera
 from forewarp.scene.view import Moment, Rendering, View
@@ -49,6 +50,13 @@ class DynamicSceneModule(lightning.LightningModule):
         self.last: dict[str, float] = {}
         self._noted: Mapping[str, float] = {}
         self._torch_state: Tensor | None = None
+
+    def __setattr__(self, name: str, value: object) -> None:
+        """Set an attribute; the name of the hook, which Lightning notes dozens of times a step, at once."""
+        if name == "_current_fx_name":
+            self.__dict__[name] = value
+        else:
+            super().__setattr__(name, value)
 
     @property
     def fraction(self) -> float:
@@ -96,7 +104,8 @@ class DynamicSceneModule(lightning.LightningModule):
 
     def on_train_start(self) -> None:
         """Compile the kernels, then start the training clock."""
-        self.method.warm_up()
+        with told_if_slow(self.settings.name, "compiling kernels, once on a machine: up to a minute"):
+            self.method.warm_up()
         if self._torch_state is not None:  # restored last: callbacks may have drawn random numbers
             torch.set_rng_state(self._torch_state)
             self._torch_state = None
@@ -114,9 +123,8 @@ class DynamicSceneModule(lightning.LightningModule):
             return -1
         self.curriculum.fraction = fraction
         optimizer = self.optimizers().optimizer
-        factor = self.settings.lr_factor(fraction)
         for group in optimizer.param_groups:
-            group["lr"] = group["base_lr"] * factor
+            group["lr"] = group["base_lr"] * self.settings.lr_factor(fraction, group["name"])
         self._noted = self.method.advance(fraction, self.global_step, optimizer)
         return None
 

@@ -23,22 +23,25 @@ class StageSettings:
         lr: learning rate of each of the method's ``param_groups``.
         iterations: steps; None if only minutes bound the stage.
         minutes: training minutes; None if only iterations bound it. With both, the stage ends at the first.
-        lr_hold: keep the learning rates constant up to this fraction, then let them fall exponentially.
-        lr_final_factor: the learning rates end at this multiple of their initial values.
+        lr_hold: keep the learning rates constant up to this fraction, then let them fall exponentially; one
+            number, or one by group, where a group left out is not held.
+        lr_final_factor: the learning rates end at this multiple of their initial values; one number, or one
+            by group, where a group left out stays as it is.
         curriculum: arguments of ``Curriculum``.
         max_gradient: clip the gradients' norm to this; 0 does not clip.
         numbers: all other keys of the stage, which belong to the method.
 
     Raises:
-        ValueError: for a name that is no folder name, or a stage without a bound.
+        ValueError: for a name that is no folder name, a stage without a bound, a rate or its schedule that is
+            not a number in range, or a schedule for a group that has no rate.
     """
 
     name: str
     lr: Mapping[str, float]
     iterations: int | None = None
     minutes: float | None = None
-    lr_hold: float = 0.0
-    lr_final_factor: float = 0.1
+    lr_hold: float | Mapping[str, float] = 0.0
+    lr_final_factor: float | Mapping[str, float] = 0.1
     curriculum: Mapping[str, float] = field(default_factory=dict)
     max_gradient: float = 0.0
     numbers: Mapping[str, Any] = field(default_factory=dict)
@@ -58,6 +61,26 @@ class StageSettings:
             value = getattr(self, key)
             if value is not None and not value > 0:
                 raise ValueError(f"{where}.{key}: expected a number > 0, but got {value}")
+        self._check_rates(where)
+
+    def _check_rates(self, where: str) -> None:
+        if not isinstance(self.lr, Mapping):
+            raise ValueError(f"{where}.lr: expected a rate for each group, but got {self.lr!r}")
+        for key, low, high, what in (
+            ("lr", 0.0, math.inf, "a number >= 0"),
+            ("lr_hold", 0.0, 1.0, "a number in [0, 1]"),
+            ("lr_final_factor", 1e-30, math.inf, "a number > 0"),
+        ):
+            given = getattr(self, key)
+            for group, value in given.items() if isinstance(given, Mapping) else [(None, given)]:
+                if group is not None and group not in self.lr:
+                    raise ValueError(
+                        f"{where}.{key}: expected groups of {', '.join(self.lr)}, but got '{group}'"
+                    )
+                number = isinstance(value, int | float) and not isinstance(value, bool)
+                if not (number and math.isfinite(value) and low <= value <= high):
+                    at = key if group is None else f"{key}.{group}"
+                    raise ValueError(f"{where}.{at}: expected {what}, but got {value!r}")
 
     @classmethod
     def of(cls, name: str, **keys: Any) -> StageSettings:
@@ -65,11 +88,12 @@ class StageSettings:
         own = {key: keys.pop(key) for key in list(keys) if key in cls.__dataclass_fields__}
         return cls(name, **own, numbers=keys)
 
-    def lr_factor(self, fraction: float) -> float:
-        """Return what the learning rates are multiplied by at ``fraction`` of the stage."""
-        if fraction <= self.lr_hold:
+    def lr_factor(self, fraction: float, group: str) -> float:
+        """Return what the learning rate of a group is multiplied by at ``fraction`` of the stage."""
+        hold, last = _of(self.lr_hold, group, 0.0), _of(self.lr_final_factor, group, 1.0)
+        if fraction <= hold:
             return 1.0
-        return self.lr_final_factor ** ((min(1.0, fraction) - self.lr_hold) / (1 - self.lr_hold))
+        return last ** ((min(1.0, fraction) - hold) / (1 - hold))
 
     def fraction(self, steps: int, seconds: float) -> float:
         """Return the fraction done, in [0, 1]: of the iterations or of the minutes, whichever is larger."""
@@ -79,6 +103,11 @@ class StageSettings:
         if self.minutes is not None:
             done = max(done, seconds / (60 * self.minutes))
         return min(1.0, done)
+
+
+def _of(given: float | Mapping[str, float], group: str, otherwise: float) -> float:
+    """Return a group's number, where one is given for all groups or one each."""
+    return given.get(group, otherwise) if isinstance(given, Mapping) else given
 
 
 @dataclass(frozen=True)
@@ -170,6 +199,7 @@ class Curriculum:
         error_share: share of the draws that picks a frame with a probability proportional to its latest
             error (see ``report``): the few frames at the ends of a sequence are hard.
         seed: seed of the draws.
+        where: key that errors name.
     """
 
     def __init__(
@@ -184,11 +214,12 @@ class Curriculum:
         newest_part: float = 0.125,
         error_share: float = 0.0,
         seed: int = 0,
+        where: str = "stage.curriculum",
     ) -> None:
         shares = all(0 <= share <= 1 for share in (all_in, newest_share, error_share))
         if not (start >= 1 and shares and 0 < newest_part <= 1):
             raise ValueError(
-                "stage.curriculum: expected start >= 1, all_in, newest_share and error_share in [0, 1] and "
+                f"{where}: expected start >= 1, all_in, newest_share and error_share in [0, 1] and "
                 f"newest_part in (0, 1], but got {start=}, {all_in=}, {newest_share=}, {error_share=}, "
                 f"{newest_part=}"
             )
@@ -198,7 +229,7 @@ class Curriculum:
         self._ends = [place + 1 for place in last_of_time.values()]  # frames in play, by number of times
         if most is not None:
             if most < 1:
-                raise ValueError(f"stage.curriculum.most: expected at least 1 or null, but got {most}")
+                raise ValueError(f"{where}.most: expected at least 1 or null, but got {most}")
             self._ends = self._ends[:most]
         self.start, self.all_in = min(start, len(self._ends)), all_in
         self.newest_share, self.newest_part = newest_share, newest_part

@@ -156,7 +156,9 @@ class Run:
         scene: Scene = self.datamodule.scene
         settings, objective = stage.settings, stage.objective
         times = [frame.time for frame in scene.train]
-        curriculum = Curriculum(times, scene.canonical_time, seed=self.seed + number, **settings.curriculum)
+        where = f"stage.{settings.name}.curriculum"
+        draws = {"seed": self.seed + number, "where": where, **settings.curriculum}
+        curriculum = Curriculum(times, scene.canonical_time, **draws)
         start = Start(
             scene,
             settings.name,

@@ -10,6 +10,7 @@ from forewarp.methods.particles import model
 from forewarp.methods.particles.model import Particles
 from forewarp.methods.particles.settings import Numbers
 from forewarp.methods.particles.start import widths
+from forewarp.ops.project import moved
 from forewarp.scene.view import Moment, View
 from tests.contract.fitting import module_of
 from tests.contract.scenes import data_of, write_dnerf, write_hypernerf
@@ -87,7 +88,7 @@ def test_with_all_effects_off_there_are_bare_particles(data):
     method = module_with(data, **dict.fromkeys(MOVING)).method
     assert not method.moves
     assert set(dict(method.named_parameters())) == {"means", "log_scales", "turns", "opacity", "color"}
-    assert not set(dict(method.named_buffers())) & {"links", "shares"}
+    assert not set(dict(method.named_buffers())) & {"skin.links", "skin.shares"}
     assert set(method.param_groups()) == set(dict(method.named_parameters()))
     assert set(switched(method).values()) == {False}
 
@@ -118,7 +119,7 @@ def test_operators_get_nothing_of_what_is_off(data, monkeypatch):
     assert (len(tints), fades.tolist(), int(warp.weights.count_nonzero())) == (0, [1.0], 0)
     look(module_with(data, **EVERY), data)
     particles, warp, _, tints, fades, *_ = seen["compare"]
-    assert (particles.colors.shape[1], particles.opacity.shape[1], warp.links.shape[1]) == (6, 3, 4)
+    assert (particles.colors.shape[1], particles.opacity.shape[1], warp.links.shape[1]) == (6, 3, 6)
     assert (len(tints), len(fades)) == (2, 3)
 
 
@@ -144,14 +145,21 @@ def test_without_motion_its_terms_are_none(data):
     assert step.terms["smooth"]() is None
 
 
-@pytest.mark.parametrize("motion", ["spline", "dct"])
-def test_the_canonical_state_is_the_particles_themselves(data, motion):
+@pytest.mark.parametrize("motion", ["spline", "cosines"])
+def test_points_go_with_the_particles_beside_them(data, motion):
     method = module_with(data, motion=motion).method
-    for p in (method.nodes.shift, method.nodes.turn):
-        p.data.normal_()
-    paths = method.trajectories(method.means.data[:5], torch.tensor([method.canonical_time, 1.0]))
-    torch.testing.assert_close(paths[:, 0], method.means.data[:5])
+    generator = torch.Generator().manual_seed(0)
+    for p in method.nodes.parameters():
+        p.data += 0.05 * torch.randn(p.shape, generator=generator)
+    method.skin.learned.data += torch.randn(method.skin.learned.shape, generator=generator)
+    times = torch.tensor([method.canonical_time, 0.7])
+    place, later = (moved(method.means.data, method.warp(float(time)))[0] for time in times)
+    paths = method.trajectories(place[:20], times)
+    torch.testing.assert_close(paths[:, 0], place[:20])
+    torch.testing.assert_close(paths[:, 1], later[:20], atol=2e-3, rtol=0)  # others are near, too
     assert float((paths[:, 1] - paths[:, 0]).norm(dim=-1).amin()) > 0.01
+    beside = place[:20] + 0.1 * torch.randn(20, 3, generator=generator)
+    torch.testing.assert_close(method.trajectories(beside, times[:1])[:, 0], beside)
 
 
 def test_a_snapshot_holds_its_time(data):
@@ -160,18 +168,15 @@ def test_a_snapshot_holds_its_time(data):
     assert not snapshot.holds(Moment(0.51))
 
 
-def test_rates_fall_each_by_itself(data):
-    numbers = {"finals": {"means": 0.01, "shifts": 0.25}, "hold_rates": {"shifts": 0.5}}
-    module = module_with(data, numbers=numbers)
+def test_rates_of_lengths_are_of_the_scenes_extent(data):
+    module = module_with(data)
     optimizer = module.configure_optimizers()
-    for progress, expected in ((0.0, (1, 1, 1)), (0.5, (0.1, 1, 1)), (0.75, (0.01**0.75, 0.5, 1))):
-        for group in optimizer.param_groups:
-            group["lr"] = group["base_lr"]
-        module.method.advance(progress, 0, optimizer)
-        rates = {g["name"]: g["lr"] / g["base_lr"] for g in optimizer.param_groups}
-        extent = float(module.method.extent)
-        found = (rates["means"] / extent, rates["shifts"] / extent, rates["opacity"])
-        assert found == pytest.approx(expected, rel=1e-5)
+    extent, before = float(module.method.extent), {g["name"]: g["lr"] for g in optimizer.param_groups}
+    module.method.advance(0.5, 0, optimizer)
+    changed = {g["name"]: g["lr"] / before[g["name"]] for g in optimizer.param_groups}
+    assert {name: factor for name, factor in changed.items() if factor != 1} == pytest.approx(
+        {"means": extent, "shifts": extent, "skin": len(data.scene.train) / 100}
+    )
 
 
 def test_particles_grow_to_what_the_pictures_call_for(data):
@@ -183,7 +188,7 @@ def test_particles_grow_to_what_the_pictures_call_for(data):
         look(module, data)
         method.advance(number / 10, number, optimizer)
     assert len(method.means) == pytest.approx(float(method.most), rel=0.05)
-    assert len(method.links) == len(method.pulled) == len(method.means)
+    assert len(method.skin.links) == len(method.pulled) == len(method.means)
 
 
 @pytest.mark.parametrize(
@@ -198,13 +203,15 @@ def test_particles_grow_to_what_the_pictures_call_for(data):
             {"rotation": False},
             "model.rotation: expected true, or null, but got False; choose model/rotation=none",
         ),
-        ({"motion": "wobble"}, "model.motion: expected spline or dct, or null, but got 'wobble'"),
+        ({"motion": "wobble"}, "model.motion: expected spline or cosines, or null, but got 'wobble'"),
         (
             {"numbers": {"effects": ["glow"]}},
-            r"stage.effects: expected some of motion, .*, but got \['glow'\]",
+            r"stage.fine.effects: expected some of motion, .*, but got \['glow'\]",
         ),
-        ({"numbers": {"first": 0.0}}, r"stage.first: expected a number in \(0, 1\], but got 0.0"),
-        ({"numbers": {"density": -1.0}}, "expected density > 0"),
+        ({"numbers": {"first": 0.0}}, r"stage.fine.first: expected a number in \(0, 1\], but got 0.0"),
+        ({"numbers": {"density": -1.0}}, "stage.fine.density: expected a number > 0, but got -1.0"),
+        ({"numbers": {"edges": 0}}, "stage.fine.edges: expected a number >= 1, but got 0"),
+        ({"numbers": {"jitter": "some"}}, "stage.fine.jitter: expected a number >= 0, but got 'some'"),
     ],
 )
 def test_refused(data, changes, text):

@@ -5,6 +5,7 @@ import torch
 
 from forewarp.fields.curves import Curve
 from forewarp.methods.particles.nodes import Nodes, nearest, spread_out
+from forewarp.methods.particles.skin import Skin
 
 
 def grid(side=4):
@@ -44,6 +45,8 @@ def test_nearest_is_nearest():
     exact = torch.cdist(points, places).square().sort(-1)
     torch.testing.assert_close(away, exact.values[:, :4], atol=1e-4, rtol=1e-4)
     assert (rows == exact.indices[:, :4]).float().mean() > 0.999
+    assert [part.shape for part in nearest(points[:0], places, 4)] == [(0, 4)] * 2
+    assert [part.shape for part in nearest(points, places[:2], 4)] == [(5000, 2)] * 2
 
 
 def test_shares_sum_to_one_and_prefer_the_nearest():
@@ -52,27 +55,6 @@ def test_shares_sum_to_one_and_prefer_the_nearest():
     torch.testing.assert_close(shares.sum(-1), torch.ones(12))
     assert torch.equal(rows[:, 0].long(), torch.arange(12))
     assert bool((shares[:, 0] >= shares[:, 1:].amax(-1)).all())
-
-
-@pytest.mark.parametrize("kind", ["spline", "dct"])
-@pytest.mark.parametrize("canonical", [0.0, 0.4])
-def test_nothing_has_moved_at_the_canonical_time(kind, canonical):
-    nodes, points = nodes_of(kind=kind, canonical=canonical), torch.randn(7, 3)
-    paths = nodes.paths(points, torch.tensor([canonical, 1.0], dtype=torch.float64))
-    torch.testing.assert_close(paths[:, 0], points)
-    assert float((paths[:, 1] - points).detach().norm(dim=-1).amin()) > 1e-3
-
-
-def test_paths_are_where_the_maps_lead():
-    nodes, points = nodes_of(kind="dct"), torch.randn(7, 3)
-    rows, shares = nodes.links(points)
-    maps = nodes.maps(0.7)
-    expected = points.clone()
-    for i in range(7):
-        for row, share in zip(rows[i].tolist(), shares[i]):
-            linear, shift = maps[row, :9].reshape(3, 3), maps[row, 9:]
-            expected[i] += share * (linear @ points[i] + shift)
-    torch.testing.assert_close(nodes.paths(points, torch.tensor([0.7]))[:, 0], expected)
 
 
 @pytest.mark.parametrize("turns", [True, False])
@@ -141,7 +123,25 @@ def test_what_was_seen_is_not_continued_anew():
 
 
 def test_another_kind_of_curve_is_refused():
-    with pytest.raises(ValueError, match="model.motion: expected spline, dct or none, but got 'fourier'"):
+    with pytest.raises(ValueError, match="model.motion: expected spline, cosines or none, but got 'fourier'"):
         Curve("fourier", 8, 20, 0.0)
     with pytest.raises(ValueError, match="at least 2 distinct training times, but got 1"):
         Curve("spline", 8, 1, 0.0)
+
+
+def test_particles_learn_whom_they_follow_and_keep_what_they_learned():
+    nodes = nodes_of()
+    skin = Skin(nodes, nodes.places[:5] + 0.01)
+    torch.testing.assert_close(skin.weights().detach(), skin.shares)
+    skin.learned.data = torch.randn(skin.learned.shape)
+    skin.let_go(torch.arange(5) == 2)
+    weights = skin.weights()
+    torch.testing.assert_close(weights.sum(-1), torch.tensor([1.0, 1.0, 0.0, 1.0, 1.0]))
+    by_weights = torch.randn(weights.shape)
+    (weights * by_weights).sum().backward()
+    torch.testing.assert_close(skin.slope(weights.detach(), by_weights), skin.learned.grad)
+    before = {(i, int(n)): float(v) for i in range(5) for n, v in zip(skin.links[i], skin.learned.data[i])}
+    skin.relink(nodes, nodes.places[:5] + 0.4)
+    after = {(i, int(n)): float(v) for i in range(5) for n, v in zip(skin.links[i], skin.learned.data[i])}
+    assert after == pytest.approx({key: before.get(key, 0.0) for key in after})
+    assert 0 < len(before.keys() & after.keys()) < len(after)

@@ -41,13 +41,13 @@ def test_it_rests_where_it_was_and_as_it_was_turned(half):
     assert torch.equal(method.nodes.still, ~moves)
     rests = method.resting
     assert 0 < int(rests.sum()) < len(rests)
-    assert torch.equal(rests, method.nodes.still[method.links.long()].all(-1))
+    assert torch.equal(rests, method.nodes.still[method.skin.links.long()].all(-1))
     after, linear = placed(method, 0.5)
     torch.testing.assert_close(after[rests], before[rests], atol=1e-4, rtol=0)
     torch.testing.assert_close(
         (linear @ rotations(method.turns.data))[rests], turned[rests], atol=1e-3, rtol=0
     )
-    assert int(method.shares[rests].count_nonzero()) == 0
+    assert int(method.skin.shares[rests].count_nonzero()) == 0
     ends = [placed(method, time)[0] for time in (0.0, 1.0)]
     assert torch.equal(ends[0][rests], ends[1][rests])
     assert float((ends[1] - ends[0]).detach()[~rests].norm(dim=-1).max()) > 0.3
@@ -66,7 +66,7 @@ def test_what_rests_keeps_resting_through_steps_and_density_control(half, data):
         method.advance(0.1 * number + 0.05, number, optimizer)
     assert torch.equal(method.nodes.shift.data[~moves], kept)
     assert len(method.resting) == len(method.means)
-    assert int(method.shares[method.resting].count_nonzero()) == 0
+    assert int(method.skin.shares[method.resting].count_nonzero()) == 0
     assert bool(method.resting.any())
 
 
@@ -78,7 +78,7 @@ def test_nothing_comes_to_rest_where_the_effect_is_off(data, monkeypatch):  # no
     module.method.advance(0.35, 1, module.configure_optimizers())
 
 
-@pytest.mark.parametrize("motion", ["spline", "dct"])
+@pytest.mark.parametrize("motion", ["spline", "cosines"])
 def test_what_moves_does_not_come_to_rest(data, motion):  # noqa: F811
     method = module_with(data, motion=motion, background=0.01).method
     method.nodes.shift.data.normal_()
@@ -87,7 +87,7 @@ def test_what_moves_does_not_come_to_rest(data, motion):  # noqa: F811
     assert not bool(method.resting.any())
 
 
-@pytest.mark.parametrize("motion", ["spline", "dct"])
+@pytest.mark.parametrize("motion", ["spline", "cosines"])
 def test_a_node_that_stops_stays(data, motion):  # noqa: F811
     nodes = module_with(data, motion=motion, background=0.01).method.nodes
     nodes.shift.data.normal_()

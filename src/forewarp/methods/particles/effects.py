@@ -14,7 +14,7 @@ class Effects:
     """The choice of each effect; None: off.
 
     Args:
-        motion: ``spline`` or ``dct``: the curves of the nodes.
+        motion: ``spline`` or ``cosines``: the curves of the nodes.
         rotation: True: nodes turn, and do not only shift.
         view_dependence: degree 1 to 3 of the harmonics by which colour depends on direction.
         color_over_time, opacity_over_time: cosines over time of each particle's colour, and of its opacity.

@@ -13,22 +13,23 @@ from forewarp.methods.method import Method, Snapshot, Start, Step
 from forewarp.methods.particles.camera import Pinholes
 from forewarp.methods.particles.density import renew
 from forewarp.methods.particles.effects import Effects, cosines
+from forewarp.methods.particles.matter import bounds_of, matter_of, paths_of
 from forewarp.methods.particles.nodes import Nodes
 from forewarp.methods.particles.planning import EFFECTS, ParticlesPlanning
 from forewarp.methods.particles.rest import come_to_rest
 from forewarp.methods.particles.rows_adam import RowsAdam
-from forewarp.methods.particles.settings import Numbers
+from forewarp.methods.particles.settings import Numbers, told_by
+from forewarp.methods.particles.skin import Skin
 from forewarp.methods.particles.snapshot import ParticlesSnapshot
-from forewarp.methods.particles.start import FLAT, covered_pixels, first_points, first_values, widths
+from forewarp.methods.particles.start import covered_pixels, first_points, first_values, widths
 from forewarp.ops.compare import compare
 from forewarp.ops.nodes import pull_nodes
-from forewarp.ops.project import Gaussians, Warp, moved
+from forewarp.ops.project import Gaussians, Warp
 from forewarp.scene.batch import Asks, Batch
 from forewarp.scene.box import Box
 from forewarp.scene.cloud import Cloud
 from forewarp.scene.view import Moment
 
-_SOLID, _SEEN = 0.1, 0.02  # opacity from which matter bounds the scene; from which there is any
 _TIMES = 16  # at which opacity over time is looked at
 
 
@@ -46,14 +47,14 @@ class Particles(Method):
     """
 
     terms = ("photo", "rigid", "smooth")
-    numbers = tuple(Numbers.__dataclass_fields__)
+    numbers = tuple(key for key in Numbers.__dataclass_fields__ if key != "name")
     asks = Asks(kind="pictures", straight=True)
     effects = EFFECTS
     planning: ClassVar[ParticlesPlanning] = ParticlesPlanning()
 
-    def __init__(self, start: Start, *, width: float = 0.05, blur: float = 0.3, **choices) -> None:
+    def __init__(self, start: Start, *, width: float = 0.05, blur: float = 0.1, **choices) -> None:
         super().__init__()
-        self.numbers_of = Numbers(**start.numbers)
+        self.numbers_of = Numbers(name=start.stage, **start.numbers)
         self.canonical_time, self.width = start.scene.canonical_time, width
         self.pinholes = Pinholes(blur)
         self.views, times = len(start.scene.train), start.scene.times
@@ -63,16 +64,14 @@ class Particles(Method):
         before = start.before if isinstance(start.before, Particles) else None
         fresh = None if start.blank or before is not None else self._measured(start)
         self._make(before, fresh, on)
-        self.nodes = None
+        self.nodes = self.skin = None
         if on.motion is not None:
             count, knots = self.numbers_of.motion(len(self.means), len(times))
             curve = Curve(on.motion, knots, len(times), self.canonical_time)
             points, edges = None if start.blank else self.means.data, self.numbers_of.edges
             turns, rests = on.rotation is not None, on.background is not None
             self.nodes = Nodes(points, count, curve, turns=turns, rests=rests, edges=edges)
-            links, shares = self.nodes.links(self.means.data)
-            self.register_buffer("links", links)
-            self.register_buffer("shares", shares)
+            self.skin = Skin(self.nodes, self.means.data)
         resting = None if on.background is None else torch.zeros(len(self.means), dtype=torch.bool)
         self.register_buffer("resting", resting)
         self.least_motion = on.background
@@ -123,8 +122,8 @@ class Particles(Method):
     def _grows(self) -> tuple[str, ...]:
         names = ["means", "log_scales", "turns", "opacity", "color", "shade", "tint", "fade"]
         names += ["pulled", "shown", "idle", "resting"]
-        names += [] if self.nodes is None else ["links", "shares"]
-        return tuple(name for name in names if getattr(self, name) is not None)
+        rows = [] if self.skin is None else [f"skin.{name}" for name in Skin.ROWS]
+        return (*(name for name in names if getattr(self, name) is not None), *rows)
 
     @property
     def moves(self) -> bool:
@@ -145,9 +144,12 @@ class Particles(Method):
         """See ``Method``; what is stored of nodes must go together, too."""
         if self.nodes is None:
             return super().misfit(state)
-        own, wide = self.nodes, self.links.shape[1]
-        links = {n: state[n][:, :1].expand(-1, wide) for n in ("links", "shares") if state[n].dim() == 2}
-        return own.misfit(state, "nodes.", state["links"]) or super().misfit({**state, **links})
+        own, wide = self.nodes, self.skin.links.shape[1]  # few nodes are fewer to follow
+        rows = [f"skin.{name}" for name in Skin.ROWS]
+        links = {n: state[n][:, :1].expand(-1, wide) for n in rows if state[n].dim() == 2}
+        if len({state[n].shape for n in rows}) > 1:
+            return rows[0]
+        return own.misfit(state, "nodes.", state["skin.links"]) or super().misfit({**state, **links})
 
     def at(self, moment: Moment) -> Snapshot:
         """Move every particle; nothing is drawn yet."""
@@ -166,7 +168,7 @@ class Particles(Method):
     def warp(self, time: float) -> Warp:
         """How everything moves until a time."""
         if self.nodes is not None:
-            return Warp(self.nodes.maps(time), self.links, self.shares)
+            return Warp(self.nodes.maps(time), self.skin.links, self.skin.weights())
         none = self.means.new_zeros(len(self.means), 1)
         return Warp(self.means.new_zeros(1, 12), none.int(), none)
 
@@ -224,15 +226,16 @@ class Particles(Method):
             self.nodes.look_ahead(time, time)
             basis = self.nodes.curve(time)
             motion, maps = self.nodes.carried(basis)
-            warp = Warp(maps, self.links, self.shares)
+            warp = Warp(maps, self.skin.links, self.skin.weights())
         found = compare(
             self.gaussians(), warp or self.warp(time), self.pinholes(seen.view.camera), tints, fades,
-            seen.rgb, seen.background, width=self.width, factor=weight,
+            seen.rgb, seen.background, width=self.width, factor=weight, by_weights=warp is not None,
         )  # fmt: skip
         self.pulled += found.pull
         self.shown += found.pull > 0
         _add(total, self._by_name(found.particles))
         if self.nodes is not None:
+            _add(total, {"skin.learned": self.skin.slope(warp.weights, found.weights)})
             nodes, rigid = self.nodes, factors.get("rigid", 0.0) * self._loose()
             slope, strain = pull_nodes(
                 motion, nodes.places, found.maps, nodes.edges, nodes.edge_weights, rigid
@@ -262,15 +265,15 @@ class Particles(Method):
         return found
 
     def advance(self, progress: float, step: int, optimizer: torch.optim.Optimizer) -> dict[str, float]:
-        """Let rates fall, each as far as its kind should; renew particles where it is time."""
+        """Rates of lengths are of the scene's extent, that of weights follows what the pictures tell; renew
+        particles where it is time.
+        """
         self.progress, numbers = progress, self.numbers_of
         for group in optimizer.param_groups:
-            last = numbers.finals.get(group["name"], 1.0)
-            held = max(0.0, progress - numbers.hold_rates.get(group["name"], 0.0))
-            left = 1 - numbers.hold_rates.get(group["name"], 0.0)
-            group["lr"] *= last ** (held / left)
             if group["name"] in ("means", "shifts"):
                 group["lr"] *= float(self.extent)
+            elif group["name"] == "skin":
+                group["lr"] *= told_by(self.views)
         number = int(progress / numbers.every)
         if number > int(self.round) and progress < numbers.settled:
             self.round.fill_(number)
@@ -283,9 +286,9 @@ class Particles(Method):
         whole = low <= self.ends[0] + 0.02 and high >= self.ends[1] - 0.02
         renew(self, optimizer, target, unseen=whole and self.nodes is not None, extent=float(self.extent))
         if self.nodes is not None and int(self.round) % self.numbers_of.relink == 0:
-            self.links, self.shares = self.nodes.links(self.means.data)
+            self.skin.relink(self.nodes, self.means.data)
             if self.resting is not None:
-                self.shares[self.resting] = 0.0
+                self.skin.let_go(self.resting)
                 if progress >= self.numbers_of.rest:
                     come_to_rest(self, self.least_motion * float(self.extent))
 
@@ -299,7 +302,7 @@ class Particles(Method):
         """See ``Method``."""
         groups = {name: [p] for name, p in self.named_parameters(recurse=False)}
         if self.nodes is not None:
-            groups["shifts"] = [self.nodes.shift]
+            groups |= {"shifts": [self.nodes.shift], "skin": [self.skin.learned]}
             groups |= {} if self.nodes.turn is None else {"node_turns": [self.nodes.turn]}
         return groups
 
@@ -307,36 +310,17 @@ class Particles(Method):
         """Adam by rows."""
         return RowsAdam(groups)
 
-    @torch.no_grad()
     def trajectories(self, points: Tensor, times: Tensor) -> Tensor:
-        """See ``HasTrajectories``: points follow the nodes beside them."""
-        if self.nodes is None:
-            return points[:, None].expand(-1, len(times), -1).clone()
-        return self.nodes.paths(points.float(), times)
+        """See ``HasTrajectories``: points go with the particles beside them."""
+        return paths_of(self, points, times)
 
-    @torch.no_grad()
     def bounds(self, times: list[float]) -> Box | None:
         """See ``HasBounds``."""
-        solid = torch.sigmoid(self.most_opaque()) > _SOLID
-        if not bool(solid.any()):
-            return None
-        points = self.trajectories(self._canonical()[solid], torch.tensor(times)).flatten(0, 1)
-        pad = 2 * float(self.log_scales[solid].exp().median()) + 1e-3 * float(self.extent)
-        low, high = points.amin(0) - pad, points.amax(0) + pad
-        return Box(tuple(low.tolist()), tuple(high.tolist()))
+        return bounds_of(self, times)
 
-    def _canonical(self) -> Tensor:
-        """Where particles are at the canonical time (N, 3)."""
-        return moved(self.means.data, self.warp(self.canonical_time))[0]
-
-    @torch.no_grad()
     def matter(self) -> Cloud:
         """See ``HasMatter``."""
-        solid = torch.sigmoid(self.opacity[:, 0])
-        keep = solid > _SEEN if bool((solid > _SEEN).any()) else solid >= 0
-        colors = (0.5 + FLAT * self.color[keep, 0]).clamp(0, 1)
-        size = 2 * float(self.log_scales.exp().mean())
-        return Cloud(self._canonical()[keep], colors, solid[keep], max(size, 1e-9))
+        return matter_of(self)
 
     def protocol(self) -> dict[str, str]:
         """See ``Method``."""

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from forewarp.fields.curves import Curve
 from forewarp.ops.nodes import carry_nodes, spread_nodes
 
-LINKS = 4  # nodes that a particle follows
+LINKS = 6  # nodes that a particle follows
 _DAMP = 0.5  # of a curve's last stride, where it is continued to times not yet seen
 _FULL = 0.05  # share of a spline's basis at a time, from which on its knot counts as seen
 
@@ -30,16 +30,16 @@ def spread_out(points: Tensor, count: int) -> Tensor:
 
 def nearest(points: Tensor, places: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """Squared distances and rows (N, count) of the places (M, 3) nearest to points (N, 3); less, where there
-    are fewer. Points in pieces of 4,096.
+    are fewer.
     """
-    found = []
-    for part in points.split(4096):
-        away = (part.square().sum(-1)[:, None] + places.square().sum(-1) - 2 * part @ places.T).clamp(min=0)
-        found.append(away.topk(min(count, len(places)), dim=-1, largest=False))
-    if not found:
-        empty = points.new_zeros(0, min(count, len(places)))
-        return empty, empty.long()
-    return torch.cat([f.values for f in found]), torch.cat([f.indices for f in found])
+    from scipy.spatial import KDTree  # late, as its import takes time
+
+    known = range(1, min(count, len(places)) + 1)
+    if not len(points):
+        return points.new_zeros(0, len(known)), torch.zeros(0, len(known), dtype=torch.int64)
+    tree = KDTree(places.detach().double().cpu().numpy())
+    away, rows = tree.query(points.detach().double().cpu().numpy(), list(known))
+    return torch.from_numpy(away).square().to(points), torch.from_numpy(rows).to(points.device)
 
 
 class Nodes(nn.Module):
@@ -91,10 +91,7 @@ class Nodes(nn.Module):
 
         ``exp(-(d^2 - d_min^2) / (2 s^2))``, normalised, s the mean distance of a node to its nearest three.
         """
-        return self._links(points, self.places)
-
-    def _links(self, points: Tensor, places: Tensor) -> tuple[Tensor, Tensor]:
-        away, rows = nearest(points, places, LINKS)
+        away, rows = nearest(points, self.places, LINKS)
         shares = torch.exp(-(away - away[:, :1]) / (2 * self.spread[rows] ** 2))
         return rows.int(), (shares / shares.sum(-1, keepdim=True)).contiguous()
 
@@ -105,29 +102,6 @@ class Nodes(nn.Module):
     def maps(self, time: float) -> Tensor:
         """``ops.nodes.node_maps`` (M, 12) at a time."""
         return self.carried(self.curve(time).to(self.places))[1]
-
-    def paths(self, points: Tensor, times: Tensor) -> Tensor:
-        """Where points (N, 3) of the canonical time are at times (T,): (N, T, 3).
-
-        A node takes a point from where it was then: ``R_t R_c^t (y - p - v_c) + p + v_t``; those of the nodes
-        that were nearest then are blended. At the canonical time that is y itself.
-        """
-        motion = self.carried(self.curve(self.curve.canonical_time).to(self.places))
-        then, turned = self._frames(motion)
-        rows, shares = self._links(points, then)
-        rows = rows.long()
-        local = (turned.mT[rows] @ (points[:, None] - then[rows])[..., None])[..., 0]
-        found = []
-        for time in times.tolist():
-            at, turn = self._frames(self.carried(self.curve(time).to(self.places)))
-            went = (turn[rows] @ local[..., None])[..., 0] + at[rows]
-            found.append((shares[..., None] * went).sum(1))
-        return torch.stack(found, 1) if found else points.new_zeros(len(points), 0, 3)
-
-    def _frames(self, carried: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-        """Where nodes are (M, 3) and their rotations (M, 3, 3)."""
-        motion, maps = carried
-        return self.places + motion[:, :3], maps[:, :9].reshape(-1, 3, 3) + torch.eye(3).to(maps)
 
     @torch.no_grad()
     def look_ahead(self, low: float, high: float) -> None:
@@ -199,7 +173,7 @@ class Nodes(nn.Module):
                 return prefix + name
         if state[prefix + "edges"].shape != state[prefix + "edge_weights"].shape:
             return prefix + "edges"
-        for name, rows in ((prefix + "edges", state[prefix + "edges"]), ("links", links)):
+        for name, rows in ((prefix + "edges", state[prefix + "edges"]), ("skin.links", links)):
             if rows.numel() and not 0 <= int(rows.min()) <= int(rows.max()) < many:
                 return name
         return None

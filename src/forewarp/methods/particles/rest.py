@@ -21,14 +21,14 @@ def come_to_rest(method: Method, least: float) -> None:
     be kept rigid with it.
 
     Args:
-        method: has ``ends`` (the first and the last time), ``nodes``, ``means``, ``turns``, ``links``,
-            ``shares`` and ``resting`` (N,) bool.
+        method: has ``ends`` (the first and the last time), ``nodes``, ``means``, ``turns``, ``skin``
+            and ``resting`` (N,) bool.
         least: the distance.
     """
     nodes = method.nodes
     times = torch.linspace(*method.ends, _TIMES).tolist()
     nodes.stop(nodes.reach_of(times) < least, times)
-    free = nodes.still[method.links.long()].all(-1) & ~method.resting
+    free = nodes.still[method.skin.links.long()].all(-1) & ~method.resting
     if not bool(free.any()):
         return
     places, linear = (sum(parts) / len(times) for parts in zip(*(_moved(method, t) for t in times)))
@@ -36,7 +36,7 @@ def come_to_rest(method: Method, least: float) -> None:
     left, _, right = torch.linalg.svd(linear[free])
     method.turns[free] = _product(_quaternions(left @ right), method.turns[free])
     method.resting[free] = True
-    method.shares[free] = 0.0
+    method.skin.let_go(free)
 
 
 def _moved(method: Method, time: float) -> tuple[Tensor, Tensor]:

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 from forewarp.methods.particles.effects import NAMES
 
 _VIEWS = 100  # pictures from which on more of them call for no more particles
+
+
+def told_by(views: int) -> float:
+    """How much so many pictures tell of who follows whom and of details: all of it in [0, 1], or a share."""
+    return min(1.0, views / _VIEWS)
 
 
 @dataclass(frozen=True)
@@ -29,8 +34,10 @@ class Numbers:
         rest: share from which nodes that do not move come to rest, where the model has a background.
         jitter, calm: spread of the random shift of a picture's time, which falls to 0 at the share ``calm``.
         loose: what is left of the weight of ``rigid`` at the end.
-        finals: what is left at the end of a learning rate, by its name; the others stay.
-        hold_rates: share up to which such a rate stays.
+        name: name of the stage.
+
+    Raises:
+        ValueError: naming the stage's wrong key.
     """
 
     effects: Sequence[str] = NAMES
@@ -47,28 +54,24 @@ class Numbers:
     jitter: float = 0.01
     calm: float = 0.4
     loose: float = 0.17
-    finals: Mapping[str, float] = field(default_factory=dict)
-    hold_rates: Mapping[str, float] = field(default_factory=dict)
+    name: str = "fine"
 
     def __post_init__(self) -> None:
+        where = f"stage.{self.name}"
         if not set(self.effects) <= set(NAMES):
             raise ValueError(
-                f"stage.effects: expected some of {', '.join(NAMES)}, but got {list(self.effects)}"
+                f"{where}.effects: expected some of {', '.join(NAMES)}, but got {list(self.effects)}"
             )
-        shares = ("first", "every", "loose", "full")
-        for name in shares:
-            if not 0 < getattr(self, name) <= 1:
-                raise ValueError(f"stage.{name}: expected a number in (0, 1], but got {getattr(self, name)}")
-        if not (self.nodes > 0 and self.knots > 0 and self.edges >= 1):
-            raise ValueError(
-                "stage: expected nodes > 0, knots > 0 and edges >= 1, "
-                f"but got {self.nodes}, {self.knots}, {self.edges}"
-            )
-        if not (self.density > 0 and self.relink >= 1 and self.jitter >= 0 and self.calm > 0):
-            raise ValueError(
-                "stage: expected density > 0, relink >= 1, jitter >= 0 and calm > 0, but got "
-                f"{self.density}, {self.relink}, {self.jitter}, {self.calm}"
-            )
+        for keys, what, good in (
+            (("first", "every", "loose", "full"), "a number in (0, 1]", lambda value: 0 < value <= 1),
+            (("density", "nodes", "knots", "calm"), "a number > 0", lambda value: value > 0),
+            (("edges", "relink"), "a number >= 1", lambda value: value >= 1),
+            (("jitter",), "a number >= 0", lambda value: value >= 0),
+        ):
+            for key in keys:
+                value = getattr(self, key)
+                if not (isinstance(value, int | float) and good(value)):
+                    raise ValueError(f"{where}.{key}: expected {what}, but got {value!r}")
 
     def most(self, covered: float, views: int) -> int:
         """How many particles there are in the end, by the pixels that show anything and the pictures.
@@ -76,7 +79,7 @@ class Numbers:
         >>> Numbers().most(20_000.0, 100), Numbers().most(20_000.0, 25)
         (12728, 6364)
         """
-        return max(32, round(self.density * math.sqrt(covered * min(1.0, views / _VIEWS))))
+        return max(32, round(self.density * math.sqrt(covered * told_by(views))))
 
     def share_at(self, progress: float) -> float:
         """The share of them that there should be: on a line from ``first``; soon before ``settled``, all."""

@@ -1,0 +1,76 @@
+"""What others ask of particles: where matter is, how far it reaches, and where points go."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from forewarp.methods.method import Method
+from forewarp.methods.particles.nodes import nearest
+from forewarp.methods.particles.start import FLAT
+from forewarp.ops.project import Warp, moved
+from forewarp.scene.box import Box
+from forewarp.scene.cloud import Cloud
+
+_SOLID, _SEEN = 0.1, 0.02  # opacity from which matter bounds the scene; from which there is any
+_BESIDE = 4  # particles that a point goes with
+_COLLAPSED = 0.05  # of the longest axis: what a blend of maps has pressed flatter is not stretched again
+
+
+@torch.no_grad()
+def matter_of(method: Method) -> Cloud:
+    """See ``HasMatter``: the particles of which there is anything to see, at the canonical time."""
+    keep = _seen(method)
+    points = moved(method.means.data, method.warp(method.canonical_time))[0]
+    colors = (0.5 + FLAT * method.color.data[keep, 0]).clamp(0, 1)
+    size = 2 * float(method.log_scales.exp().mean())
+    return Cloud(points[keep], colors, torch.sigmoid(method.opacity.data[keep, 0]), max(size, 1e-9))
+
+
+@torch.no_grad()
+def bounds_of(method: Method, times: list[float]) -> Box | None:
+    """See ``HasBounds``."""
+    solid = torch.sigmoid(method.most_opaque()) > _SOLID
+    if not bool(solid.any()):
+        return None
+    points = torch.cat([moved(method.means.data, method.warp(time))[0][solid] for time in times])
+    pad = 2 * float(method.log_scales[solid].exp().median()) + 1e-3 * float(method.extent)
+    low, high = points.amin(0) - pad, points.amax(0) + pad
+    return Box(tuple(low.tolist()), tuple(high.tolist()))
+
+
+@torch.no_grad()
+def paths_of(method: Method, points: Tensor, times: Tensor) -> Tensor:
+    """Where points (P, 3) of the canonical time are at times (T,): (P, T, 3).
+
+    A particle takes a point from where it was beside it then, ``F_t F_c^-1 (y - x_c) + x_t``; those that were
+    nearest then are blended by ``1 / d^2``. At the canonical time that is y itself.
+
+    Cost: a search among the particles, and all of them moved once for each time.
+    """
+    if method.nodes is None:
+        return points[:, None].expand(-1, len(times), -1).clone()
+    keep, skin = _seen(method), method.skin
+    means, links, weights = method.means.data[keep], skin.links[keep], skin.weights()[keep]
+
+    def at(time: float) -> tuple[Tensor, Tensor]:
+        return moved(means, Warp(method.nodes.maps(time), links, weights))
+
+    then, turned = at(method.canonical_time)
+    points = points.to(then)
+    away, rows = nearest(points, then, _BESIDE)
+    shares = 1 / (away + 1e-6 * away.mean() + 1e-30)
+    shares = (shares / shares.sum(-1, keepdim=True))[..., None]
+    back = torch.linalg.pinv(turned, rtol=_COLLAPSED)
+    local = (back[rows] @ (points[:, None] - then[rows])[..., None])[..., 0]
+    found = []
+    for time in times.tolist():
+        now, turn = at(time)
+        found.append((shares * ((turn[rows] @ local[..., None])[..., 0] + now[rows])).sum(1))
+    return torch.stack(found, 1) if found else points.new_zeros(len(points), 0, 3)
+
+
+def _seen(method: Method) -> Tensor:
+    """Which particles (N,) there is anything to see of; all, if there is of none."""
+    seen = torch.sigmoid(method.opacity.data[:, 0]) > _SEEN
+    return seen if bool(seen.any()) else torch.ones_like(seen)

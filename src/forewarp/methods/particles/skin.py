@@ -1,0 +1,50 @@
+"""Who follows whom: the nodes beside each particle, and how much of each one's motion it takes."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from forewarp.methods.particles.nodes import Nodes
+
+_LEAST = 1e-20
+
+
+class Skin(nn.Module):
+    """N particles follow up to L nodes each: ``links`` (N, L) int32, by ``weights`` that sum to 1.
+
+    A weight is that of the distance, ``shares`` (N, L), times ``exp(learned)``: what lies beside two parts
+    that move apart learns which of them it belongs to. A particle at rest has the shares 0, and follows none.
+    """
+
+    ROWS = ("links", "shares", "learned")
+
+    def __init__(self, nodes: Nodes, points: Tensor) -> None:
+        super().__init__()
+        links, shares = nodes.links(points)
+        self.register_buffer("links", links)
+        self.register_buffer("shares", shares)
+        self.learned = nn.Parameter(torch.zeros_like(shares))
+
+    def weights(self) -> Tensor:
+        """The weights (N, L), differentiable in ``learned``."""
+        own = self.shares * self.learned.exp()
+        return own / own.sum(-1, keepdim=True).clamp(min=_LEAST)
+
+    @staticmethod
+    def slope(weights: Tensor, by_weights: Tensor) -> Tensor:
+        """The gradient (N, L) by ``learned`` of a loss that has the gradient ``by_weights``."""
+        pulled = weights * by_weights
+        return pulled - weights * pulled.sum(-1, keepdim=True)
+
+    @torch.no_grad()
+    def relink(self, nodes: Nodes, points: Tensor) -> None:
+        """Look for the nodes beside points (N, 3) again; what was learned of those that stay is kept."""
+        before = self.links
+        self.links, self.shares = nodes.links(points)
+        stays = self.links[:, :, None] == before[:, None]
+        self.learned.copy_((stays * self.learned[:, None]).sum(-1))
+
+    def let_go(self, which: Tensor) -> None:
+        """Let particles (N,) bool follow no node."""
+        self.shares[which] = 0.0

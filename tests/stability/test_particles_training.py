@@ -1,0 +1,144 @@
+"""Particles trained under bad conditions: odd scenes, rates far too high, other units of length."""
+
+from dataclasses import replace
+from functools import partial
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from forewarp.data.module import SceneDataModule
+from forewarp.fields.curves import Curve
+from forewarp.methods.particles.matter import paths_of
+from forewarp.methods.particles.model import Particles
+from forewarp.methods.particles.nodes import Nodes
+from forewarp.methods.particles.skin import Skin
+from forewarp.ops.nodes import pull_nodes
+from forewarp.scene.box import Box
+from forewarp.scene.view import Moment
+from tests.contract.fitting import stage_of
+from tests.contract.table import METHODS
+from tests.stability.test_training import FEW, SCENE, Diary, in_other_units, pictured
+from tests.support.tiny_scene import ball_scene, make_run
+
+pytestmark = pytest.mark.stability
+
+ENTRY = METHODS["particles"]
+OPTIONS = {"motion": "spline", "rotation": True, "view_dependence": 1, "color_over_time": 1}
+OPTIONS |= {"opacity_over_time": 1, "background": 0.03}
+
+
+def fit(folder, scene, steps, rates=1.0, **changes):
+    """A fitted module of particles with all effects, and the losses of its steps."""
+    diary = Diary()
+    numbers = ENTRY.numbers | changes.pop("numbers", {})
+    lr = {kind: rates * rate for kind, rate in ENTRY.lr.items()}
+    model = partial(Particles, **OPTIONS | changes)
+    stage = stage_of(ENTRY, steps=steps, lr=lr, numbers=numbers, model=model)
+    run = make_run(folder, [stage], data=SceneDataModule(lambda: scene, rays=1), callbacks=[diary])
+    return run.fit(), diary.losses
+
+
+def psnr(module, scene):
+    """The mean PSNR of the test views, dB."""
+    data = SceneDataModule(lambda: scene, rays=1)
+    data.setup("test")
+    return sum(float(module.psnr_of(target)) for target in data.test_dataloader()) / len(scene.test)
+
+
+HARD = {
+    **{f"times {times}": (ball_scene(size=16, times=times, canonical_time=times[0]), {}) for times in FEW},
+    "white on white": (pictured(SCENE, 255), {}),
+    "without matter": (pictured(SCENE, 0), {}),
+    "opaque": (replace(pictured(SCENE, 255), has_alpha=False), {}),
+    "one opaque picture": (replace(SCENE, train=SCENE.train[:1], has_alpha=False), {}),
+    "a camera inside the box": (replace(SCENE, box=Box((-5, -5, -5), (5, 5, 5))), {}),
+    "a scene 1e-6 thin": (replace(SCENE, box=Box((-1, -0.8, -1e-6), (1.2, 0.8, 1e-6))), {}),
+    **{f"rates {rates} too high": (SCENE, {"steps": 25, "rates": rates}) for rates in (10.0, 300.0)},
+    "jitter of all time there is": (SCENE, {"numbers": {"jitter": 3.0}}),
+}
+
+
+@pytest.mark.parametrize("name", HARD)
+def test_hard_scenes_train(tmp_path, name):
+    scene, options = HARD[name]
+    options = {"steps": 8} | options
+    module, losses = fit(tmp_path, scene, **options)
+    assert len(losses) == options["steps"]
+    assert all(0 <= loss < 1e4 for loss in losses)
+    for part, value in module.method.state_dict().items():
+        assert not value.is_floating_point() or value.isfinite().all(), part
+    assert len(module.method.means) >= 1
+    drawn = module.render(scene.test[0].camera, Moment(0.5), torch.ones(3))
+    assert all(plane.isfinite().all() for plane in (drawn.rgb, drawn.depth, drawn.opacity))
+
+
+@pytest.mark.parametrize(("factor", "has_alpha"), [(1e-3, True), (2.0**20, False)])
+def test_no_number_depends_on_the_unit_of_length(tmp_path, factor, has_alpha):
+    """With all effects and terms on, the first steps are equal except for rounding."""
+    still = torch.tensor([[0.9, 0.1, 0.2], [-0.8, 0.3, -0.2]])
+    scene = replace(ball_scene(frames=6, size=16), still=still, has_alpha=has_alpha)
+    _, plain = fit(tmp_path / "plain", scene, 7)
+    _, other = fit(tmp_path / "other", in_other_units(scene, factor), 7)
+    assert other == pytest.approx(plain, rel=2e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("factor", [1e-3, 1e3])
+def test_other_units_train_to_the_same_accuracy(tmp_path, factor):
+    scene = ball_scene(frames=24, size=48)
+    numbers = {"density": 20.0, "every": 0.01}
+    found = []
+    for folder, own in (("plain", scene), ("other", in_other_units(scene, factor))):
+        module, _ = fit(tmp_path / folder, own, 1500, numbers=numbers)
+        found.append(psnr(module, own))
+    assert found[0] > 28
+    assert found[1] == pytest.approx(found[0], abs=0.3)
+
+
+def paths(nodes, points, times):
+    """Where points go that are particles themselves."""
+    canonical, skin = nodes.curve.canonical_time, Skin(nodes, points)
+    parts = {
+        "means": torch.nn.Parameter(points.clone()),
+        "opacity": torch.nn.Parameter(torch.zeros(len(points), 1)),
+    }
+    method = SimpleNamespace(nodes=nodes, skin=skin, canonical_time=canonical, **parts)
+    return paths_of(method, points, torch.tensor(times, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("turns", [True, False])
+@pytest.mark.parametrize("count", [1, 2, 9])
+def test_nodes_that_coincide(turns, count):
+    """Points that all lie at one place, or at two: nodes, shares, strain and paths are finite."""
+    for apart in (0.0, 1e-6, 1.0):
+        points = torch.full((count, 3), 0.3)
+        points[count // 2 :, 0] += apart
+        nodes = Nodes(points, 6, Curve("spline", 5, 9, 0.25), turns=turns, rests=True)
+        for value in filter(lambda v: v is not None, (nodes.shift, nodes.turn)):
+            value.data = torch.randn(value.shape, generator=torch.Generator().manual_seed(0))
+        links, shares = nodes.links(points + 0.1)
+        torch.testing.assert_close(shares.sum(-1), torch.ones(count))
+        assert int(links.max()) < len(nodes)
+        motion, maps = nodes.carried(nodes.curve(0.7))
+        pulled, strain = pull_nodes(
+            motion.detach(), nodes.places, torch.ones_like(maps), nodes.edges, nodes.edge_weights, 1.0
+        )
+        found = [pulled, torch.tensor(strain), paths(nodes, points, [0.0, 0.25, 1.0])]
+        found += [nodes.edge_weights, nodes.spread, nodes.reach_of([0.0, 1.0])]
+        assert all(value.isfinite().all() for value in found)
+
+
+@pytest.mark.parametrize("kind", ["spline", "cosines"])
+@pytest.mark.parametrize("time", [0.0, 1e-12, 1e-7, 1 - 1e-7, 1.0])
+def test_at_and_beside_the_canonical_time_and_the_ends(kind, time):
+    for canonical in (0.0, 1.0):
+        nodes = Nodes(torch.eye(3), 3, Curve(kind, 6, 9, canonical))
+        for value in (nodes.shift, nodes.turn):
+            value.data = torch.randn(value.shape, generator=torch.Generator().manual_seed(0))
+        went = paths(nodes, torch.eye(3), [time])[:, 0] - torch.eye(3)
+        assert went.isfinite().all()
+        assert float(went.norm()) <= 100 * abs(time - canonical) + 1e-6  # no jump
+        nodes.look_ahead(time, time)
+        bent, slopes = nodes.spread_over_time(time, nodes.curve(time), torch.ones(3, 6), 1.0, 1.0)
+        assert all(value.isfinite().all() for value in (torch.tensor(bent), *slopes.values()))
