@@ -44,7 +44,7 @@ class Numbers:
     density: float = 90.0
     first: float = 0.5
     full: float = 1.0
-    nodes: float = 4.95
+    nodes: float = 2.5
     knots: float = 2.2
     edges: int = 6
     every: float = 0.01
@@ -90,7 +90,7 @@ class Numbers:
         """How many nodes, and how many coefficients each has.
 
         >>> Numbers().motion(6364, 100)
-        (395, 22)
+        (199, 22)
         """
         knots = min(times + 2, round(self.knots * math.sqrt(times)))
         return max(4, round(self.nodes * math.sqrt(particles))), max(4, knots)
