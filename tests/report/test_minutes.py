@@ -13,7 +13,7 @@ TIMES = (0.0, 0.05, 0.5, 0.6, 1.0)
 
 def write_views(folder, values):
     images = [
-        {"time": time, "rendering": "rendered", "scores": {"psnr": psnr}} for time, psnr in zip(TIMES, values)
+        {"time": time, "rendering": "warped", "scores": {"psnr": psnr}} for time, psnr in zip(TIMES, values)
     ]
     (folder / "per_image.json").write_text(json.dumps({"images": images}))
 
@@ -52,5 +52,8 @@ def test_it_is_a_kind_of_report(tmp_path, ok):
     write_run(tmp_path / "runs")
     done = ok("report", "kind=minutes", f"runs={tmp_path / 'runs'}", f"out={tmp_path / 'out'}")
     assert done.out.count("written: ") == 3
+    write_run(tmp_path / "runs", scene="endless", minutes=None)
+    page = write_minutes(tmp_path / "runs", tmp_path / "out")[0].read_text()
+    assert "* endless/base-None-seed0: no budget.minutes" in page
     with pytest.raises(ValueError, match="expected folders of runs"):
         write_minutes(tmp_path / "none", tmp_path / "out")

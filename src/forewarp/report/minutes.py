@@ -11,13 +11,14 @@ from pathlib import Path
 from forewarp.files import read_json, read_text, replace_file
 from forewarp.metrics.gain import Estimate
 from forewarp.report import curve
-from forewarp.report.collect import Result, collect, left_out, machine
+from forewarp.report.collect import Result, collect, left_out
 from forewarp.report.sheets import figure_of
 from forewarp.report.tables import Column, Table
 
-KEY = ("method", "scene", "minutes", "seed")  # what tells rows apart
+KEY = ("method", "preset", "scene", "minutes", "seed")  # what tells rows apart
 NUMBERS = ("psnr", "ssim", "lpips", "steps", "parameters", "memory", "ends", "threads")
 FIELDS = (*KEY, *NUMBERS, "device", "views", "command")
+NETS = ("vgg", "alex", "squeeze")  # LPIPS is of the first whose weights were there
 _ENDS = 0.1  # share of the time that counts as its first and last part
 _MOST = 1 << 24  # bytes of a table that is read back
 
@@ -27,7 +28,7 @@ Written by `forewarp-report kind=minutes` from runs of `sweeps=minutes`. Minutes
 platform's clock: it counts all that a method does to begin with (a visual hull, a plane sweep), and leaves
 out reading pictures and compiling. PSNR (dB), SSIM and LPIPS are means over test views; ± is the standard
 deviation over the seeds. *Ends*: by how much the mean PSNR of views in the first and last tenth of the time
-is below the median of the others.
+is below the median of the others. LPIPS is of the first of {nets} whose weights were there.
 """
 
 
@@ -45,13 +46,16 @@ def write_minutes(runs: Path, out: Path) -> list[Path]:
         the files written.
     """
     results, without = collect(runs, ["metrics.json"])
+    endless = [result for result in results if result.minutes is None]
+    without += [f"{result.folder.relative_to(runs)}: no budget.minutes" for result in endless]
+    results = [result for result in results if result.minutes is not None]
     written = []
     for method in sorted({result.config["model"]["name"] for result in results}):
         own = [result for result in results if result.config["model"]["name"] == method]
         rows = _merged(out / f"{method}.csv", [row_of(result) for result in own])
         page, table, picture = (out / f"{method}.{kind}" for kind in ("md", "csv", "png"))
         replace_file(table, _csv(rows))
-        parts = [INTRODUCTION.format(method=method), f"Machine: {machine(own)}.\n"]
+        parts = [INTRODUCTION.format(method=method, nets=", ".join(NETS)), f"Machine: {_machine(rows)}.\n"]
         parts += [_by_minutes(rows).markdown(), "## Each\n", _details(rows).markdown()]
         parts += ["## By view\n", f"![PSNR of each test view over time]({picture.name})\n"]
         parts += ["## Commands\n", "```bash", *sorted({row["command"] for row in rows}), "```\n"]
@@ -65,16 +69,17 @@ def write_minutes(runs: Path, out: Path) -> list[Path]:
 def row_of(result: Result) -> dict:
     """A run's row: ``FIELDS``; what is not known is None."""
     images = (read_json(result.folder / "per_image.json") or {}).get("images", [])
-    views = sorted((one["time"], one["scores"]["psnr"]) for one in images if one["rendering"] == "rendered")
+    views = sorted((one["time"], one["scores"]["psnr"]) for one in images)
     numbers, scores = result.numbers, result.metrics["test"][result.ability]
     protocol = result.metrics["protocol"]
     return {
         "method": result.config["model"]["name"],
+        "preset": result.config["preset"]["name"],
         "scene": result.scene,
         "minutes": result.minutes,
         "seed": result.seed,
         **{name: numbers.get(name) for name in ("psnr", "ssim", "steps", "memory", "parameters")},
-        "lpips": scores.get("lpips_vgg", scores.get("lpips_alex")),
+        "lpips": next((scores[f"lpips_{net}"] for net in NETS if f"lpips_{net}" in scores), None),
         "ends": ends_below(views),
         "threads": protocol.get("threads"),
         "device": protocol.get("device"),
@@ -92,6 +97,12 @@ def ends_below(views: Sequence[tuple[float, float]]) -> float | None:
     ends = [psnr for time, psnr in views if not _ENDS < time < 1 - _ENDS]
     others = [psnr for time, psnr in views if _ENDS < time < 1 - _ENDS]
     return statistics.median(others) - statistics.fmean(ends) if ends and others else None
+
+
+def _machine(rows: list[dict]) -> str:
+    return "; ".join(
+        sorted({f"{row['device']}, threads: {row['threads']:g}" for row in rows if row["device"]})
+    )
 
 
 def _merged(file: Path, rows: list[dict]) -> list[dict]:
