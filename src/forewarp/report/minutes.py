@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 import statistics
 from collections.abc import Sequence
 from pathlib import Path
@@ -58,7 +59,13 @@ def write_minutes(runs: Path, out: Path) -> list[Path]:
         parts = [INTRODUCTION.format(method=method, nets=", ".join(NETS)), f"Machine: {_machine(rows)}.\n"]
         parts += [_by_minutes(rows).markdown(), "## Each\n", _details(rows).markdown()]
         parts += ["## By view\n", f"![PSNR of each test view over time]({picture.name})\n"]
-        parts += ["## Commands\n", "```bash", *sorted({row["command"] for row in rows}), "```\n"]
+        parts += [
+            "## Commands\n",
+            "Each with its `seed=`.\n",
+            "```bash",
+            *sorted({re.sub(r"\bseed=\d+ ", "", row["command"]) for row in rows}),
+            "```\n",
+        ]
         parts += left_out("Without numbers", without)
         replace_file(page, "\n".join(parts))
         _draw(rows, picture)
@@ -154,7 +161,7 @@ def _details(rows: list[dict]) -> Table:
             Column("LPIPS", 4),
             Column("ends (dB)", 1),
             Column("steps", 0),
-            Column("size", 0),
+            Column("parameters (M)", 2),
             Column("GiB", 2),
         ),
     ]
