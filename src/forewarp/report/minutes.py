@@ -18,12 +18,12 @@ from forewarp.report.tables import Column, Table
 
 KEY = ("method", "preset", "scene", "minutes", "seed")  # what tells rows apart
 NUMBERS = ("psnr", "ssim", "lpips", "steps", "parameters", "memory", "ends", "threads")
-FIELDS = (*KEY, *NUMBERS, "device", "views", "command")
+FIELDS = (*KEY, *NUMBERS, "dataset", "device", "views", "command")
 NETS = ("vgg", "alex", "squeeze")  # LPIPS is of the first whose weights were there
 _ENDS = 0.1  # share of the time that counts as its first and last part
 _MOST = 1 << 24  # bytes of a table that is read back
 
-INTRODUCTION = """# What {method} reaches in so many minutes
+INTRODUCTION = """# What `model={method}` reaches in so many minutes
 
 Written by `forewarp-report kind=minutes` from runs of `sweeps=minutes`. Minutes are of training, by the
 platform's clock: it counts all that a method does to begin with (a visual hull, a plane sweep), and leaves
@@ -63,7 +63,7 @@ def write_minutes(runs: Path, out: Path) -> list[Path]:
             "## Commands\n",
             "Each with its `seed=`.\n",
             "```bash",
-            *sorted({re.sub(r"\bseed=\d+ ", "", row["command"]) for row in rows}),
+            *sorted({re.sub(r"\bseed=\d+ | run=\S+$", "", row["command"]) for row in rows}),
             "```\n",
         ]
         parts += left_out("Without numbers", without)
@@ -89,6 +89,7 @@ def row_of(result: Result) -> dict:
         "lpips": next((scores[f"lpips_{net}"] for net in NETS if f"lpips_{net}" in scores), None),
         "ends": ends_below(views),
         "threads": protocol.get("threads"),
+        "dataset": result.dataset,
         "device": protocol.get("device"),
         "views": " ".join(f"{time:.4f}:{psnr:.2f}" for time, psnr in views),
         "command": result.command,
@@ -139,7 +140,7 @@ def _estimate(rows: Sequence[dict], name: str) -> Estimate | None:
 
 
 def _by_minutes(rows: list[dict]) -> Table:
-    """PSNR by scene and minutes, and the mean over scenes where all are there."""
+    """PSNR by scene and minutes, and its mean over a dataset's scenes where all are there."""
     scenes, minutes = (sorted({row[name] for row in rows}) for name in ("scene", "minutes"))
     cells = {
         (scene, m): _estimate([r for r in rows if (r["scene"], r["minutes"]) == (scene, m)], "psnr")
@@ -147,8 +148,11 @@ def _by_minutes(rows: list[dict]) -> Table:
         for m in minutes
     }
     lines = [[scene, *(cells[scene, m] for m in minutes)] for scene in scenes]
-    means = [[cells[scene, m] for scene in scenes] for m in minutes]
-    lines.append(["mean", *(None if None in of else statistics.fmean(c.mean for c in of) for of in means)])
+    for dataset in sorted({row["dataset"] for row in rows}):
+        own = sorted({row["scene"] for row in rows if row["dataset"] == dataset})
+        found = [[cells[scene, m] for scene in own] for m in minutes]
+        means = [None if None in of else statistics.fmean(cell.mean for cell in of) for of in found]
+        lines += [[f"mean of {dataset}", *means]] if len(own) > 1 else []
     columns = [Column("scene"), *(Column(f"{m:g} min") for m in minutes)]
     return Table(columns, lines, caption="PSNR (dB) of test views.")
 
