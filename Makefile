@@ -25,8 +25,9 @@ SEED = $(if $(SEEDS),$(if $(findstring $(comma),$(SEEDS)),seed,seeds)=$(SEEDS))
 SAYS = 2>&1 | { trap '' INT; sed -u 's/^/$@ | /'; }
 # All changes of the method's price list; with CHANGES the reference, then these.
 OF_MODEL = $(if $(MODEL),model=$(MODEL))
+KNOWN_LIST = $(if $(filter-out particles forward,$(MODEL)),$(error MODEL: expected particles or forward, but got $(MODEL)))
 SWEEP = sweep() { $(BIN)/forewarp-train --multirun "$$@" $(MORE); }; \
-	compare() { $(if $(CHANGES),sweep sweeps=accuracy_time $(OF_MODEL) "$$@" $(GO_ON); sweep sweeps=accuracy_time $(OF_MODEL) "$$@" $(CHANGES),sweep sweeps=price_list_$(or $(MODEL),particles) "$$@"); }
+	compare() { $(if $(CHANGES),sweep sweeps=accuracy_time $(OF_MODEL) "$$@" $(GO_ON); sweep sweeps=accuracy_time $(OF_MODEL) "$$@" $(CHANGES),$(KNOWN_LIST)sweep sweeps=price_list_$(or $(MODEL),particles) "$$@"); }
 space := $(subst ,, )
 # A failed job has printed its error and stops no other job; make ends with its status. Only Ctrl-C ends everything.
 GO_ON = || { status=$$?; [ $$status -lt 128 ] || exit $$status; }

@@ -31,7 +31,7 @@ def row_of(folder: Path) -> dict:
 def about(run: Path, method: str) -> str:
     """Say how good a run is, and after how long."""
     metrics = read_metrics(run)
-    psnr = [kind["psnr"] for kind in metrics["test"].values()]
+    psnr = [image["scores"]["psnr"] for image in read_json(run / "per_image.json")["images"]]
     return f"{method}: {sum(psnr) / len(psnr):.1f} dB, {metrics['seconds']['train']:.0f} s"
 
 

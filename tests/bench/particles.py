@@ -1,7 +1,7 @@
 """The particles that are timed: a figure like D-NeRF's hook, its run, its steps and its pictures.
 
-After 2,500 steps hook had 12,616 particles and 431 nodes of 22 coefficients; its pictures of 400 x 400 showed
-something at 19,650 pixels, and tiles had 60,000 particles to look at. The figure: 12,000, 400 of 22, 17,000
+After 2,500 steps hook had 12,616 particles and 200 nodes of 22 coefficients; its pictures of 400 x 400 showed
+something at 19,650 pixels, and tiles had 60,000 particles to look at. The figure: 12,000, 200 of 22, 17,000
 and 56,000.
 """
 
@@ -32,7 +32,7 @@ from forewarp.scene.view import Moment, View
 from forewarp.training.stages import Run
 from tests.support.configs import composed
 
-COUNT, SIDE, NODES = 12_000, 400, 400
+COUNT, SIDE, NODES = 12_000, 400, 200
 TIMES, VIEWS = 100, 8  # training times; different pictures of them
 WHITE, MIDDLE = torch.ones(3), 0.5
 # From, to and radius of the capsules that the figure consists of: body, head, arms, legs.

@@ -1,9 +1,12 @@
 import errno
+import platform
 import shutil
+from types import SimpleNamespace
 
 import pytest
 from omegaconf import OmegaConf
 
+from forewarp.cli import entry
 from forewarp.cli.errors import one_line
 from forewarp.cli.misspelt import with_run_key
 from forewarp.scene.errors import SceneError
@@ -247,3 +250,15 @@ def test_a_failed_job_of_several_does_not_stop_the_others(forewarp, monkeypatch,
         "forewarp-train: 1 of 2 jobs failed:",
         "  seed=0",
     ]
+
+
+def test_freed_memory_stays_where_the_c_library_can_be_told(monkeypatch):
+    asked = []
+    library = SimpleNamespace(mallopt=lambda *given: asked.append(given))
+    for found in (library, SimpleNamespace()):  # another library has no such call
+        monkeypatch.setattr(entry.ctypes, "CDLL", lambda name, found=found: found)
+        entry._keep_memory()
+    monkeypatch.undo()
+    assert len(asked) == 2
+    if platform.libc_ver()[0] == "glibc":
+        assert [entry.ctypes.CDLL(None).mallopt(*given) for given in asked] == [1, 1]

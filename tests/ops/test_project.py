@@ -21,11 +21,11 @@ def float32(values):
 
 
 def test_hand_worked(backend):
-    # 4 units away a unit is 10 pixels, a deviation of 0.2 two pixels, its variance 4 + 0.3.
+    # 4 units away a unit is 10 pixels, a deviation of 0.2 two pixels, its variance 4 + 0.1.
     splats = seen(one((0.1, -0.2, 0.0), scale=0.2, opacity=math.log(3), color=(0.1, 0.2, -0.6)))
     u, v, a, b, c, solid, *color, distance = splats.numbers[0].tolist()
     # Beside the axis the slopes of depth add a little to the variance.
-    wide, high = 4.3 + (2 * 0.1 / 4) ** 2, 4.3 + (2 * 0.2 / 4) ** 2
+    wide, high = 4.1 + (2 * 0.1 / 4) ** 2, 4.1 + (2 * 0.2 / 4) ** 2
     beside = -(2 * 0.1 / 4) * (2 * 0.2 / 4)
     determinant = wide * high - beside**2
     assert (u, v) == pytest.approx((9.0, 6.0))

@@ -39,8 +39,9 @@ def one_line(error: BaseException) -> str | None:
     ):
         wanted = re.search(r"allocate (\d+ bytes|[\d.]+ .iB)", str(error))
         return (
-            f"memory: expected room for {wanted[1] if wanted else 'more'}, but got none; lower data.rays or "
-            "stage.*.num_voxels, and run the same command again"
+            f"memory: expected room for {wanted[1] if wanted else 'more'}, but got none; lower "
+            "stage.*.density, or with model=forward data.rays or stage.*.num_voxels, and run the same "
+            "command again"
         )
     if isinstance(error, TypeError) and "unexpected keyword argument" in str(error):
         return f"config: {error}; leave that key out"

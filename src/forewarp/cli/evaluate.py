@@ -8,7 +8,7 @@ HELP = """
 forewarp-evaluate measures a finished run on its test views and prints the table. Everything is rebuilt from
 the run's own config.yaml; images/, per_image.json and metrics.json are written again.
 
-  forewarp-evaluate run=runs/vehicle/forward-demo-seed0
+  forewarp-evaluate run=runs/vehicle/particles-demo-seed0
   forewarp-evaluate run=FOLDER data.root=../elsewhere/dnerf
 
 What one types most:

@@ -9,7 +9,7 @@ LEAST_SIZE = 400  # pixels of the longer side, unless size= asks for another
 HELP = """
 forewarp-render makes a video of a finished run, into its videos/.
 
-  forewarp-render run=runs/vehicle/forward-demo-seed0 path=both
+  forewarp-render run=runs/vehicle/particles-demo-seed0 path=both
   forewarp-render run=FOLDER path=trajectories format=gif size=300
 
 What one types most:

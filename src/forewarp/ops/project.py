@@ -13,6 +13,7 @@ from torch.autograd.function import once_differentiable
 from forewarp.ops.backend import match_threads, use_numba
 from forewarp.ops.checks import check_shape
 
+BLUR = 0.1  # square pixels; a pixel alone has a variance of 1/12
 _LEAST = 1e-12  # length of a quaternion below which it turns nothing
 
 
@@ -34,7 +35,7 @@ class Pinhole:
     size: tuple[int, int]
     near: float
     skew: float = 0.0
-    blur: float = 0.3
+    blur: float = BLUR
     margin: float = 50.0
     radial: tuple[float, float, float] = (0.0, 0.0, 0.0)
     tangential: tuple[float, float] = (0.0, 0.0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 import statistics
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,23 +12,24 @@ from pathlib import Path
 from forewarp.files import read_json, read_text, replace_file
 from forewarp.metrics.gain import Estimate
 from forewarp.report import curve
-from forewarp.report.collect import Result, collect, left_out, machine
+from forewarp.report.collect import Result, collect, left_out
 from forewarp.report.sheets import figure_of
 from forewarp.report.tables import Column, Table
 
-KEY = ("method", "scene", "minutes", "seed")  # what tells rows apart
+KEY = ("method", "preset", "scene", "minutes", "seed")  # what tells rows apart
 NUMBERS = ("psnr", "ssim", "lpips", "steps", "parameters", "memory", "ends", "threads")
-FIELDS = (*KEY, *NUMBERS, "device", "views", "command")
+FIELDS = (*KEY, *NUMBERS, "dataset", "device", "views", "command")
+NETS = ("vgg", "alex", "squeeze")  # LPIPS is of the first whose weights were there
 _ENDS = 0.1  # share of the time that counts as its first and last part
 _MOST = 1 << 24  # bytes of a table that is read back
 
-INTRODUCTION = """# What {method} reaches in so many minutes
+INTRODUCTION = """# What `model={method}` reaches in so many minutes
 
 Written by `forewarp-report kind=minutes` from runs of `sweeps=minutes`. Minutes are of training, by the
 platform's clock: it counts all that a method does to begin with (a visual hull, a plane sweep), and leaves
 out reading pictures and compiling. PSNR (dB), SSIM and LPIPS are means over test views; ± is the standard
 deviation over the seeds. *Ends*: by how much the mean PSNR of views in the first and last tenth of the time
-is below the median of the others.
+is below the median of the others. LPIPS is of the first of {nets} whose weights were there.
 """
 
 
@@ -45,16 +47,25 @@ def write_minutes(runs: Path, out: Path) -> list[Path]:
         the files written.
     """
     results, without = collect(runs, ["metrics.json"])
+    endless = [result for result in results if result.minutes is None]
+    without += [f"{result.folder.relative_to(runs)}: no budget.minutes" for result in endless]
+    results = [result for result in results if result.minutes is not None]
     written = []
     for method in sorted({result.config["model"]["name"] for result in results}):
         own = [result for result in results if result.config["model"]["name"] == method]
         rows = _merged(out / f"{method}.csv", [row_of(result) for result in own])
         page, table, picture = (out / f"{method}.{kind}" for kind in ("md", "csv", "png"))
         replace_file(table, _csv(rows))
-        parts = [INTRODUCTION.format(method=method), f"Machine: {machine(own)}.\n"]
+        parts = [INTRODUCTION.format(method=method, nets=", ".join(NETS)), f"Machine: {_machine(rows)}.\n"]
         parts += [_by_minutes(rows).markdown(), "## Each\n", _details(rows).markdown()]
         parts += ["## By view\n", f"![PSNR of each test view over time]({picture.name})\n"]
-        parts += ["## Commands\n", "```bash", *sorted({row["command"] for row in rows}), "```\n"]
+        parts += [
+            "## Commands\n",
+            "Each with its `seed=`.\n",
+            "```bash",
+            *sorted({re.sub(r"\bseed=\d+ | run=\S+$", "", row["command"]) for row in rows}),
+            "```\n",
+        ]
         parts += left_out("Without numbers", without)
         replace_file(page, "\n".join(parts))
         _draw(rows, picture)
@@ -65,18 +76,20 @@ def write_minutes(runs: Path, out: Path) -> list[Path]:
 def row_of(result: Result) -> dict:
     """A run's row: ``FIELDS``; what is not known is None."""
     images = (read_json(result.folder / "per_image.json") or {}).get("images", [])
-    views = sorted((one["time"], one["scores"]["psnr"]) for one in images if one["rendering"] == "rendered")
+    views = sorted((one["time"], one["scores"]["psnr"]) for one in images)
     numbers, scores = result.numbers, result.metrics["test"][result.ability]
     protocol = result.metrics["protocol"]
     return {
         "method": result.config["model"]["name"],
+        "preset": result.config["preset"]["name"],
         "scene": result.scene,
         "minutes": result.minutes,
         "seed": result.seed,
         **{name: numbers.get(name) for name in ("psnr", "ssim", "steps", "memory", "parameters")},
-        "lpips": scores.get("lpips_vgg", scores.get("lpips_alex")),
+        "lpips": next((scores[f"lpips_{net}"] for net in NETS if f"lpips_{net}" in scores), None),
         "ends": ends_below(views),
         "threads": protocol.get("threads"),
+        "dataset": result.dataset,
         "device": protocol.get("device"),
         "views": " ".join(f"{time:.4f}:{psnr:.2f}" for time, psnr in views),
         "command": result.command,
@@ -92,6 +105,12 @@ def ends_below(views: Sequence[tuple[float, float]]) -> float | None:
     ends = [psnr for time, psnr in views if not _ENDS < time < 1 - _ENDS]
     others = [psnr for time, psnr in views if _ENDS < time < 1 - _ENDS]
     return statistics.median(others) - statistics.fmean(ends) if ends and others else None
+
+
+def _machine(rows: list[dict]) -> str:
+    return "; ".join(
+        sorted({f"{row['device']}, threads: {row['threads']:g}" for row in rows if row["device"]})
+    )
 
 
 def _merged(file: Path, rows: list[dict]) -> list[dict]:
@@ -121,7 +140,7 @@ def _estimate(rows: Sequence[dict], name: str) -> Estimate | None:
 
 
 def _by_minutes(rows: list[dict]) -> Table:
-    """PSNR by scene and minutes, and the mean over scenes where all are there."""
+    """PSNR by scene and minutes, and its mean over a dataset's scenes where all are there."""
     scenes, minutes = (sorted({row[name] for row in rows}) for name in ("scene", "minutes"))
     cells = {
         (scene, m): _estimate([r for r in rows if (r["scene"], r["minutes"]) == (scene, m)], "psnr")
@@ -129,8 +148,11 @@ def _by_minutes(rows: list[dict]) -> Table:
         for m in minutes
     }
     lines = [[scene, *(cells[scene, m] for m in minutes)] for scene in scenes]
-    means = [[cells[scene, m] for scene in scenes] for m in minutes]
-    lines.append(["mean", *(None if None in of else statistics.fmean(c.mean for c in of) for of in means)])
+    for dataset in sorted({row["dataset"] for row in rows}):
+        own = sorted({row["scene"] for row in rows if row["dataset"] == dataset})
+        found = [[cells[scene, m] for scene in own] for m in minutes]
+        means = [None if None in of else statistics.fmean(cell.mean for cell in of) for of in found]
+        lines += [[f"mean of {dataset}", *means]] if len(own) > 1 else []
     columns = [Column("scene"), *(Column(f"{m:g} min") for m in minutes)]
     return Table(columns, lines, caption="PSNR (dB) of test views.")
 
@@ -143,7 +165,7 @@ def _details(rows: list[dict]) -> Table:
             Column("LPIPS", 4),
             Column("ends (dB)", 1),
             Column("steps", 0),
-            Column("size", 0),
+            Column("parameters (M)", 2),
             Column("GiB", 2),
         ),
     ]

@@ -210,7 +210,7 @@ def test_particles_grow_to_what_the_pictures_call_for(data):
         ),
         ({"numbers": {"first": 0.0}}, r"stage.fine.first: expected a number in \(0, 1\], but got 0.0"),
         ({"numbers": {"density": -1.0}}, "stage.fine.density: expected a number > 0, but got -1.0"),
-        ({"numbers": {"edges": 0}}, "stage.fine.edges: expected a number >= 1, but got 0"),
+        ({"numbers": {"edges": 0}}, "stage.fine.edges: expected a whole number >= 1, but got 0"),
         ({"numbers": {"jitter": "some"}}, "stage.fine.jitter: expected a number >= 0, but got 'some'"),
     ],
 )

@@ -5,6 +5,7 @@ import torch
 
 from forewarp.fields.curves import Curve
 from forewarp.methods.particles.nodes import Nodes, nearest, spread_out
+from forewarp.methods.particles.rows_adam import RowsAdam
 from forewarp.methods.particles.skin import Skin
 
 
@@ -129,19 +130,43 @@ def test_another_kind_of_curve_is_refused():
         Curve("spline", 8, 1, 0.0)
 
 
-def test_particles_learn_whom_they_follow_and_keep_what_they_learned():
-    nodes = nodes_of()
-    skin = Skin(nodes, nodes.places[:5] + 0.01)
-    torch.testing.assert_close(skin.weights().detach(), skin.shares)
-    skin.learned.data = torch.randn(skin.learned.shape)
+def skin_of(nodes, count=5):
+    skin = Skin(nodes, nodes.places[:count] + 0.01)
+    skin.learned.data = torch.randn(skin.learned.shape, generator=torch.Generator().manual_seed(0))
+    return skin
+
+
+def test_particles_learn_whom_they_follow():
+    skin = skin_of(nodes_of())
     skin.let_go(torch.arange(5) == 2)
     weights = skin.weights()
     torch.testing.assert_close(weights.sum(-1), torch.tensor([1.0, 1.0, 0.0, 1.0, 1.0]))
     by_weights = torch.randn(weights.shape)
     (weights * by_weights).sum().backward()
     torch.testing.assert_close(skin.slope(weights.detach(), by_weights), skin.learned.grad)
-    before = {(i, int(n)): float(v) for i in range(5) for n, v in zip(skin.links[i], skin.learned.data[i])}
-    skin.relink(nodes, nodes.places[:5] + 0.4)
-    after = {(i, int(n)): float(v) for i in range(5) for n, v in zip(skin.links[i], skin.learned.data[i])}
-    assert after == pytest.approx({key: before.get(key, 0.0) for key in after})
-    assert 0 < len(before.keys() & after.keys()) < len(after)
+    skin.learned.data += torch.tensor([[-300.0], [0.0], [5.0], [300.0], [1e6]])  # of a row it means nothing
+    torch.testing.assert_close(skin.weights()[[0, 1, 3]], weights[[0, 1, 3]], atol=1e-4, rtol=0)
+    assert bool(skin.weights().isfinite().all())
+
+
+def test_what_was_learned_of_nodes_that_stay_is_kept():
+    nodes = nodes_of()
+    skin, drifted = skin_of(nodes), skin_of(nodes)
+    drifted.learned.data += 5.0
+    optimizer = RowsAdam([{"params": [skin.learned]}])
+    moments = torch.arange(float(skin.learned.numel())).reshape(skin.learned.shape)
+    optimizer.state[skin.learned] = {"exp_avg": moments, "exp_avg_sq": moments + 1, "steps": torch.ones(5)}
+    known = {
+        (i, int(n)): v
+        for i in range(5)
+        for n, v in zip(skin.links[i], skin.weights().data[i] / skin.shares[i])
+    }
+    places = {(i, int(n)): float(moments[i, k]) for i in range(5) for k, n in enumerate(skin.links[i])}
+    skin.relink(nodes, nodes.places[:5] + 0.4, optimizer)
+    drifted.relink(nodes, nodes.places[:5] + 0.4, RowsAdam([{"params": [drifted.learned]}]))
+    torch.testing.assert_close(drifted.learned, skin.learned, atol=1e-4, rtol=0)
+    after = {(i, int(n)): (i, k) for i in range(5) for k, n in enumerate(skin.links[i])}
+    assert 0 < len(known.keys() & after.keys()) < len(after)
+    for key, at in after.items():  # what comes anew begins with its share
+        assert float(skin.learned.data[at].exp()) == pytest.approx(float(known.get(key, 1.0)), rel=1e-4)
+        assert float(optimizer.state[skin.learned]["exp_avg"][at]) == places.get(key, 0.0)

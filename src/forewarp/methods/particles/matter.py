@@ -44,7 +44,8 @@ def paths_of(method: Method, points: Tensor, times: Tensor) -> Tensor:
     """Where points (P, 3) of the canonical time are at times (T,): (P, T, 3).
 
     A particle takes a point from where it was beside it then, ``F_t F_c^-1 (y - x_c) + x_t``; those that were
-    nearest then are blended by ``1 / d^2``. At the canonical time that is y itself.
+    nearest then are blended by ``1 / d^2``. At the canonical time that is y itself, unless a blend has
+    pressed a particle flat.
 
     Cost: a search among the particles, and all of them moved once for each time.
     """

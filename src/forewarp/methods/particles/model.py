@@ -24,7 +24,7 @@ from forewarp.methods.particles.snapshot import ParticlesSnapshot
 from forewarp.methods.particles.start import covered_pixels, first_points, first_values, widths
 from forewarp.ops.compare import compare
 from forewarp.ops.nodes import pull_nodes
-from forewarp.ops.project import Gaussians, Warp
+from forewarp.ops.project import BLUR, Gaussians, Warp
 from forewarp.scene.batch import Asks, Batch
 from forewarp.scene.box import Box
 from forewarp.scene.cloud import Cloud
@@ -52,7 +52,7 @@ class Particles(Method):
     effects = EFFECTS
     planning: ClassVar[ParticlesPlanning] = ParticlesPlanning()
 
-    def __init__(self, start: Start, *, width: float = 0.05, blur: float = 0.1, **choices) -> None:
+    def __init__(self, start: Start, *, width: float = 0.05, blur: float = BLUR, **choices) -> None:
         super().__init__()
         self.numbers_of = Numbers(name=start.stage, **start.numbers)
         self.canonical_time, self.width = start.scene.canonical_time, width
@@ -286,7 +286,7 @@ class Particles(Method):
         whole = low <= self.ends[0] + 0.02 and high >= self.ends[1] - 0.02
         renew(self, optimizer, target, unseen=whole and self.nodes is not None, extent=float(self.extent))
         if self.nodes is not None and int(self.round) % self.numbers_of.relink == 0:
-            self.skin.relink(self.nodes, self.means.data)
+            self.skin.relink(self.nodes, self.means.data, optimizer)
             if self.resting is not None:
                 self.skin.let_go(self.resting)
                 if progress >= self.numbers_of.rest:

@@ -31,12 +31,19 @@ def spread_out(points: Tensor, count: int) -> Tensor:
 def nearest(points: Tensor, places: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """Squared distances and rows (N, count) of the places (M, 3) nearest to points (N, 3); less, where there
     are fewer.
+
+    Raises:
+        ValueError: for points or places that are not finite.
+
+    Cost: a tree of the places, on the CPU, and a walk down it for each point.
     """
     from scipy.spatial import KDTree  # late, as its import takes time
 
     known = range(1, min(count, len(places)) + 1)
     if not len(points):
-        return points.new_zeros(0, len(known)), torch.zeros(0, len(known), dtype=torch.int64)
+        return points.new_zeros(0, len(known)), torch.zeros(
+            0, len(known), dtype=torch.int64, device=points.device
+        )
     tree = KDTree(places.detach().double().cpu().numpy())
     away, rows = tree.query(points.detach().double().cpu().numpy(), list(known))
     return torch.from_numpy(away).square().to(points), torch.from_numpy(rows).to(points.device)

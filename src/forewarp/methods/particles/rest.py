@@ -8,6 +8,7 @@ from torch import Tensor
 from forewarp.methods.method import Method
 from forewarp.ops.project import moved
 
+_FOLLOWS = 1e-3  # weight of a node below which its motion shows nowhere
 _TIMES = 16  # at which motion is looked at
 
 
@@ -28,7 +29,8 @@ def come_to_rest(method: Method, least: float) -> None:
     nodes = method.nodes
     times = torch.linspace(*method.ends, _TIMES).tolist()
     nodes.stop(nodes.reach_of(times) < least, times)
-    free = nodes.still[method.skin.links.long()].all(-1) & ~method.resting
+    follows = method.skin.weights() > _FOLLOWS
+    free = ~(follows & ~nodes.still[method.skin.links.long()]).any(-1) & ~method.resting
     if not bool(free.any()):
         return
     places, linear = (sum(parts) / len(times) for parts in zip(*(_moved(method, t) for t in times)))

@@ -65,12 +65,15 @@ class Numbers:
         for keys, what, good in (
             (("first", "every", "loose", "full"), "a number in (0, 1]", lambda value: 0 < value <= 1),
             (("density", "nodes", "knots", "calm"), "a number > 0", lambda value: value > 0),
-            (("edges", "relink"), "a number >= 1", lambda value: value >= 1),
-            (("jitter",), "a number >= 0", lambda value: value >= 0),
+            (("edges", "relink"), "a whole number >= 1", lambda value: value >= 1 and value == int(value)),
+            (("jitter", "settled", "rest"), "a number >= 0", lambda value: value >= 0),
         ):
             for key in keys:
                 value = getattr(self, key)
-                if not (isinstance(value, int | float) and good(value)):
+                known = (
+                    isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+                )
+                if not (known and good(value)):
                     raise ValueError(f"{where}.{key}: expected {what}, but got {value!r}")
 
     def most(self, covered: float, views: int) -> int:

@@ -28,8 +28,12 @@ class Skin(nn.Module):
 
     def weights(self) -> Tensor:
         """The weights (N, L), differentiable in ``learned``."""
-        own = self.shares * self.learned.exp()
+        own = self.shares * (self.learned - self._top()).exp()
         return own / own.sum(-1, keepdim=True).clamp(min=_LEAST)
+
+    def _top(self) -> Tensor:
+        """The largest number that each particle learned (N, 1). A row less it means the same, and is safe."""
+        return self.learned.detach().amax(-1, keepdim=True)
 
     @staticmethod
     def slope(weights: Tensor, by_weights: Tensor) -> Tensor:
@@ -38,12 +42,21 @@ class Skin(nn.Module):
         return pulled - weights * pulled.sum(-1, keepdim=True)
 
     @torch.no_grad()
-    def relink(self, nodes: Nodes, points: Tensor) -> None:
-        """Look for the nodes beside points (N, 3) again; what was learned of those that stay is kept."""
-        before = self.links
+    def relink(self, nodes: Nodes, points: Tensor, optimizer: torch.optim.Optimizer) -> None:
+        """Look for the nodes beside points (N, 3) again.
+
+        What was learned of those that stay is kept, with its moments: as factors of the shares, so that one
+        that comes anew begins with its share.
+        """
+        own = (self.shares * (self.learned - self._top()).exp()).sum(-1, keepdim=True)
+        level = torch.where(own > 0, own.clamp(min=_LEAST).log() + self._top(), 0.0)
+        before, known = self.links, self.learned - level
         self.links, self.shares = nodes.links(points)
         stays = self.links[:, :, None] == before[:, None]
-        self.learned.copy_((stays * self.learned[:, None]).sum(-1))
+        self.learned.copy_((stays * known[:, None]).sum(-1))
+        moments = optimizer.state.get(self.learned, {})
+        for name in {"exp_avg", "exp_avg_sq"} & moments.keys():
+            moments[name] = (stays * moments[name][:, None]).sum(-1)
 
     def let_go(self, which: Tensor) -> None:
         """Let particles (N,) bool follow no node."""
