@@ -238,6 +238,7 @@ def test_what_is_typed_beside_a_plan_wins(tmp_path):
     write_plan(file, {"typed": typed, "overrides": planned, "of": "0"})
     found = with_plan("train", [f"plan={file}", "model/inpainter=unet3d", "seed=4"])
     assert found == [
+        "model=forward",  # a plan that names no method is of a time when this was the default
         *("model/view_dependence=sh", "model/motion=none", "data.scene=x", "stage.coarse.bases=[[0,4]]"),
         *(f"planned='{file}'", "effects=given", "run='${paths.runs}/${data.scene}/planned-{hash}'"),
         *("model/inpainter=unet3d", "seed=4"),
@@ -246,4 +247,5 @@ def test_what_is_typed_beside_a_plan_wins(tmp_path):
     for word in ("model=backward", "resume=runs/x"):
         with pytest.raises(ValueError, match=f"{word}: expected no such override beside plan="):
             with_plan("train", [f"plan={file}", word])
+    assert with_plan("train", [f"plan={file}", "model=forward"])[-1] == "model=forward"
     assert with_plan("plan", ["plan.seeds=1"]) == ["plan.seeds=1"]

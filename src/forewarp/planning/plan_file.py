@@ -88,7 +88,9 @@ def with_plan(name: str, arguments: list[str]) -> list[str]:
     made = read_plan(Path(files[-1]).expanduser(), without_trust(arguments)[1])
     typed = [argument for argument in arguments if not argument.startswith("plan=")]
     planned = merged(made["overrides"], made["typed"])
-    model = next((one for one in planned if one.startswith("model=")), None)
+    if not any(one.startswith("model=") for one in planned):
+        planned = ["model=forward", *planned]  # of a version in which this was the default
+    model = next(one for one in planned if one.startswith("model="))
     for one in typed:
         if one.startswith("resume=") or (one.startswith("model=") and one != model):
             raise ValueError(
