@@ -249,7 +249,7 @@ def test_starved_halfway_a_run_keeps_its_checkpoint_and_goes_on(begin, tmp_path)
     last = run / "coarse" / "last.ckpt"
     assert begin(run, *more, die=die)[0] == -signal.SIGKILL
     before, step = last.read_bytes(), step_of(last)
-    refused(*begin(run, *more, memory=250 * 2**20), "memory: expected room for", "lower data.rays")
+    refused(*begin(run, *more, memory=400 * 2**20), "memory: expected room for", "data.rays")
     assert last.read_bytes() == before
     assert begin(run, *more, die=die)[0] == -signal.SIGKILL
     assert step_of(last) > step
