@@ -47,7 +47,7 @@ install-launchers: ## add joblib, Ray and submitit for sweeps (launcher=...), an
 	if [ -n "$$links" ]; then export UV_FIND_LINKS="$$links"; fi; \
 	VIRTUAL_ENV="$$PWD/.venv" $(BIN)/uv pip install --compile-bytecode -c constraints.txt -e '.[sweeps]'
 
-demo: ## fit the procedural vehicle by three methods, two at once, compare, make a video (three minutes)
+demo: ## fit the procedural vehicle by three methods, two at once, compare, make a video (three to four minutes)
 	@$(MAKE) --no-print-directory -j2 demo-particles demo-forward demo-backward
 	$(BIN)/forewarp-report kind=compare runs=[$(DEMO)/particles,$(DEMO)/forward,$(DEMO)/backward] out=$(DEMO)
 	$(BIN)/forewarp-render run=$(DEMO)/particles path=both

@@ -36,8 +36,8 @@ is below the median of the others. LPIPS is of the first of {nets} whose weights
 def write_minutes(runs: Path, out: Path) -> list[Path]:
     """Write ``<method>.md``, ``.csv`` (a row a run) and ``.png`` (PSNR by view) of each method in the runs.
 
-    Rows of a table that is there already stay, unless a run of the same scene, minutes and seed replaces
-    them: runs may be made one day after the other.
+    Rows of a table that is there already stay, unless a run of the same preset, scene, minutes and seed
+    replaces them: runs may be made one day after the other.
 
     Args:
         runs: folder to search for measured runs.

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from forewarp.methods.particles.nodes import Nodes
 
-_LEAST = 1e-20
+_LEAST = 1e-20  # sum of weights that is divided by: that of a particle at rest is 0
 
 
 class Skin(nn.Module):
@@ -48,8 +48,7 @@ class Skin(nn.Module):
         What was learned of those that stay is kept, with its moments: as factors of the shares, so that one
         that comes anew begins with its share.
         """
-        own = (self.shares * (self.learned - self._top()).exp()).sum(-1, keepdim=True)
-        level = torch.where(own > 0, own.clamp(min=_LEAST).log() + self._top(), 0.0)
+        level = (self.learned + self.shares.log()).logsumexp(-1, keepdim=True).nan_to_num(neginf=0.0)
         before, known = self.links, self.learned - level
         self.links, self.shares = nodes.links(points)
         stays = self.links[:, :, None] == before[:, None]
