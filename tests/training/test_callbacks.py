@@ -8,11 +8,11 @@ import pytest
 from lightning.pytorch.loggers import TensorBoardLogger
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from forewarp.clock import Clock
 from forewarp.data.module import SceneDataModule
 from forewarp.evaluation.pictures import TensorBoardPictures
 from forewarp.progress import ProgressLine
 from forewarp.training.callbacks import StageProgress, TensorBoardScalars
-from forewarp.training.clock import Clock
 from tests.support.tiny_scene import Interrupt, ball_data, ball_scene, make_run, same, stage, trainer
 
 STEPS = 12

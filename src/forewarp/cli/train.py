@@ -16,6 +16,7 @@ What one types most (options such as --multirun or --config-dir=FOLDER come firs
   data.root=FOLDER data.scene=NAME    where the scenes are, and which one
   preset=demo|fast|faithful           the method's numbers: small, cheap (the default), as in the paper
   budget.minutes=N                    of training, all stages together
+  budget.clock=wall|processor         what minutes are of; processor time does not depend on other work
   budget.iterations=N                 the same in steps; the first that is reached ends training
   model=particles|forward|backward|tnerf   Gaussians (default), the paper's method, its opponent, a network
   model/view_dependence=none|harmonics     switch an effect; all others work alike (of forward: none|sh|mlp)

@@ -8,6 +8,7 @@ from collections.abc import Callable
 
 from torch import Tensor
 
+from forewarp.clock import left_out
 from forewarp.scene.errors import SceneError
 
 
@@ -35,7 +36,8 @@ class ImageCache:
         if key in self._kept:
             self._kept.move_to_end(key)
             return self._kept[key][1]
-        made = make()
+        with left_out():  # reading pictures is no training
+            made = make()
         if made.nbytes <= self.limit:
             # Freed as soon as the owner dies; until then no other object can have its id.
             self._kept[key] = (weakref.ref(owner, lambda _: self._drop(key)), made)

@@ -9,6 +9,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from forewarp.clock import now
 from forewarp.drawing.colors import at_least, error_colors, in_a_row
 from forewarp.drawing.files import write_png
 from forewarp.files import write_json
@@ -20,7 +21,6 @@ from forewarp.metrics.suite import ImageSuite, summarise
 from forewarp.scene.batch import Target
 from forewarp.scene.frame import Scene, spread
 from forewarp.scene.view import Rendering
-from forewarp.training.clock import now
 from forewarp.training.device import device_name, versions
 from forewarp.training.module import DynamicSceneModule
 

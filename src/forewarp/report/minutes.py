@@ -18,7 +18,7 @@ from forewarp.report.tables import Column, Table
 
 KEY = ("method", "preset", "scene", "minutes", "seed")  # what tells rows apart
 NUMBERS = ("psnr", "ssim", "lpips", "steps", "parameters", "memory", "ends", "threads")
-FIELDS = (*KEY, *NUMBERS, "dataset", "device", "views", "command")
+FIELDS = (*KEY, *NUMBERS, "clock", "dataset", "device", "views", "command")
 NETS = ("vgg", "alex", "squeeze")  # LPIPS is of the first whose weights were there
 _ENDS = 0.1  # share of the time that counts as its first and last part
 _MOST = 1 << 24  # bytes of a table that is read back
@@ -27,9 +27,11 @@ INTRODUCTION = """# What `model={method}` reaches in so many minutes
 
 Written by `forewarp-report kind=minutes` from runs of `sweeps=minutes`. Minutes are of training, by the
 platform's clock: it counts all that a method does to begin with (a visual hull, a plane sweep), and leaves
-out reading pictures and compiling. PSNR (dB), SSIM and LPIPS are means over test views; ± is the standard
-deviation over the seeds. *Ends*: by how much the mean PSNR of views in the first and last tenth of the time
-is below the median of the others. LPIPS is of the first of {nets} whose weights were there.
+out reading pictures and compiling. The processor clock counts processor time of the process, which is the
+same beside other work on the machine and, with one thread, equals the wall clock on an idle one. PSNR (dB),
+SSIM and LPIPS are means over test views; ± is the standard deviation over the seeds. *Ends*: by how much the
+mean PSNR of views in the first and last tenth of the time is below the median of the others. LPIPS is of the
+first of {nets} whose weights were there.
 """
 
 
@@ -89,6 +91,7 @@ def row_of(result: Result) -> dict:
         "lpips": next((scores[f"lpips_{net}"] for net in NETS if f"lpips_{net}" in scores), None),
         "ends": ends_below(views),
         "threads": protocol.get("threads"),
+        "clock": protocol.get("clock", "wall"),
         "dataset": result.dataset,
         "device": protocol.get("device"),
         "views": " ".join(f"{time:.4f}:{psnr:.2f}" for time, psnr in views),
@@ -109,7 +112,13 @@ def ends_below(views: Sequence[tuple[float, float]]) -> float | None:
 
 def _machine(rows: list[dict]) -> str:
     return "; ".join(
-        sorted({f"{row['device']}, threads: {row['threads']:g}" for row in rows if row["device"]})
+        sorted(
+            {
+                f"{row['device']}, threads: {row['threads']:g}, minutes by the {row['clock']} clock"
+                for row in rows
+                if row["device"]
+            }
+        )
     )
 
 
@@ -124,7 +133,7 @@ def _merged(file: Path, rows: list[dict]) -> list[dict]:
 
 def _read(row: dict) -> dict:
     numbers = {name: float(row[name]) if row[name] else None for name in ("minutes", *NUMBERS)}
-    return row | numbers | {"seed": int(row["seed"])}
+    return {"clock": "wall"} | row | numbers | {"seed": int(row["seed"])}
 
 
 def _csv(rows: list[dict]) -> str:

@@ -10,6 +10,7 @@ import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
+from forewarp.clock import Clock
 from forewarp.evaluation.measure import measure
 from forewarp.files import read_json
 from forewarp.training.callbacks import StageProgress
@@ -30,6 +31,12 @@ def build_run(config: DictConfig) -> Run:
             raise ValueError(f"threads: expected a whole number > 0 or null, but got {config.threads}")
         torch.set_num_threads(config.threads)
     check_precision(config.trainer.get("precision"))
+    clock = Clock(config.budget.clock).kind
+    if clock != "wall" and device_of(config.trainer.accelerator).type != "cpu":
+        raise ValueError(
+            f"budget.clock: expected wall, as processor time leaves out the GPU's, but got {clock!r}; "
+            "leave budget.clock out, or set trainer=cpu"
+        )
     data = instantiate(config.data, _convert_="all")
     plans = {name: stage_of(name, stage) for name, stage in config.stage.items()}
     watchers = [w for w in instantiate(config.callbacks, _convert_="all").values() if w is not None]
@@ -62,6 +69,7 @@ def build_run(config: DictConfig) -> Run:
         checkpoint_seconds=config.checkpoint_seconds,
         skip=config.get("sentinel", {"skip": 0})["skip"],
         tell=partial(print, flush=True),
+        clock=clock,
     )
     run.check()
     return run
@@ -108,7 +116,8 @@ def _callbacks(run: Run, watchers: list[Callable], name: str) -> list:
 def measure_run(run: Run, module: DynamicSceneModule, config: DictConfig) -> dict:
     """Evaluate a fitted run by its config; print and return the numbers."""
     protocol = {"method": method_name(config), "preset": config.preset.name, "seed": config.seed}
-    protocol |= {"minutes": config.budget.minutes, "iterations": config.budget.iterations}
+    budget = config.budget
+    protocol |= {"minutes": budget.minutes, "iterations": budget.iterations, "clock": budget.clock}
     extra = config.lpips_weights
     return measure(
         run,

@@ -8,12 +8,12 @@ import lightning
 import torch
 from torch import Tensor
 
+from forewarp.clock import Clock
 from forewarp.methods.method import Method, Snapshot, Step
 from forewarp.progress import told_if_slow
 from forewarp.scene.batch import Batch, Target
 from forewarp.scene.camera import Camera
 from forewarp.scene.view import Moment, Rendering, View
-from forewarp.training.clock import Clock
 from forewarp.training.objective import Objective, total
 from forewarp.training.schedule import Curriculum, StageSettings
 

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import lightning
 
+from forewarp.clock import Clock
 from forewarp.files import read_json, write_json
 from forewarp.methods.method import Model, Start, parameter_count
 from forewarp.scene.cloud import Handover
@@ -40,6 +41,7 @@ class Run:
         checkpoint_seconds: training seconds between two checkpoints.
         skip: steps per stage that may be skipped because of numbers that are not finite (see ``Sentinel``).
         tell: called with a line for each stage that is loaded or continued.
+        clock: what minutes are of: see ``Clock``.
     """
 
     datamodule: lightning.LightningDataModule
@@ -52,6 +54,7 @@ class Run:
     checkpoint_seconds: float = 60.0
     skip: int = 0
     tell: Callable[[str], None] = lambda line: None
+    clock: str = "wall"
 
     def check(self) -> None:
         """Refuse keys and terms that a stage's method does not know, before anything is read.
@@ -79,7 +82,10 @@ class Run:
             self.datamodule.restart(number)
             finished = self.is_finished(stage)
             blank = finished or (folder / "last.ckpt").is_file()
-            module = self._module(stage, module, handover, number, blank=blank)
+            clock = Clock(self.clock)
+            with clock.running():  # a hull, a plane sweep
+                module = self._module(stage, module, handover, number, blank=blank)
+            module.clock = Clock(self.clock) if blank else clock
             if finished:
                 load_weights(module, folder / "last.ckpt")
                 self.tell(f"{stage.settings.name}: finished before")

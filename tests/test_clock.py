@@ -2,8 +2,8 @@ from contextlib import suppress
 
 import pytest
 
-from forewarp.training import clock as module
-from forewarp.training.clock import Clock
+from forewarp import clock as module
+from forewarp.clock import Clock, left_out
 
 
 @pytest.fixture
@@ -39,6 +39,34 @@ def test_pauses_leave_out_what_runs_inside_also_if_it_fails(clock):
         raise RuntimeError
     clock.now = 62.0
     assert clock.seconds == 3
+
+
+def test_reading_pictures_is_left_out(clock):
+    clock.start()
+    clock.now = 1.0
+    with left_out():
+        clock.now = 4.0
+    clock.now = 6.0
+    assert clock.seconds == 3
+    clock.stop()
+    with left_out():
+        clock.now = 50.0
+    with clock.running():
+        clock.now = 51.0
+    assert clock.seconds == 4
+
+
+def test_a_kind_that_there_is_not():
+    with pytest.raises(ValueError, match="budget.clock: expected wall or processor, but got 'sun'"):
+        Clock("sun")
+
+
+def test_processor_time_leaves_out_waiting(monkeypatch):
+    clock = Clock("processor")
+    monkeypatch.setattr(module.time, "process_time", lambda: 7.0)
+    with clock.running():
+        module.time.sleep(0.002)
+    assert clock.seconds == 0
 
 
 def test_goes_on_from_a_saved_state(clock):
