@@ -24,7 +24,7 @@ _POINTS = 1 << 17  # evaluated at once for an image
 
 @dataclass(frozen=True)
 class Sampled(Rendering):
-    """A rendering, with ``depths``, ``density`` and ``weights`` (K, S) and ``points`` (K, S, 3) along the K rays
+    """A rendering, with ``depths``, ``density``, ``weights`` (K, S) and ``points`` (K, S, 3) along the K rays
     that meet the box, and what the first pass saw, where it has a gradient too (``coarse``).
     """
 
@@ -134,12 +134,19 @@ class Quadrature:
         )
 
     @torch.no_grad()
-    def picture(self, density: Density, radiance: Radiance, rays: Rays, background: Tensor) -> Rendering:
+    def picture(
+        self,
+        density: Density,
+        radiance: Radiance,
+        rays: Rays,
+        background: Tensor,
+        generator: torch.Generator | None = None,
+    ) -> Rendering:
         """Render an image's rays without gradient. Cost: time linear in the rays, memory bounded."""
         chunk = max(1, _POINTS // (self.samples + self.fine_samples))
         behind = background.expand(len(rays), 3)
         parts = [
-            self(density, radiance, rays[begin : begin + chunk], behind[begin : begin + chunk])
+            self(density, radiance, rays[begin : begin + chunk], behind[begin : begin + chunk], generator)
             for begin in range(0, len(rays), chunk)
         ]
         return Rendering(

@@ -37,7 +37,7 @@ class Field:
         return self.activation(self.template.density(self.encoded(points)))
 
     def radiance(self, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-        """World points (..., 3), unit directions that broadcast to them -> density (...,), colour (..., 3)."""
+        """Points (..., 3), unit directions that broadcast to them -> density (...,) and colour (..., 3)."""
         towards = self.condition(directions)
         raw, color = self.template(self.encoded(points), towards.expand(*points.shape[:-1], -1))
         return self.activation(raw), color
@@ -53,6 +53,7 @@ class Sampling:
         density: ``relu`` as NeRF has it, with which some seeds start dead, or ``softplus``.
         occupancy: cells along a side of the lattice that notes where matter is (see ``Occupancy``), so that
             samples elsewhere are not evaluated; 0: evaluate all, as published.
+        jitter_in_pictures: draw the samples of pictures at random too, as HyperNeRF's code does.
     """
 
     samples: int = 64
@@ -61,6 +62,7 @@ class Sampling:
     inside_box: bool = False
     density: str = "relu"
     occupancy: int = 0
+    jitter_in_pictures: bool = False
 
     def departures(self, published: str) -> list[str]:
         """Name what differs from a publication with this density."""
@@ -143,8 +145,8 @@ class SampledMethod(Method):
         self._blank_steps = self._blank_steps + 1 if blank else 0
         if self._blank_steps >= _PATIENCE:
             raise ValueError(
-                f"model.sampling.density: expected matter somewhere, but got a density of 0 at every sample of "
-                f"{_PATIENCE} steps, which {self.sampling.density} never leaves: a dead start; "
+                "model.sampling.density: expected matter somewhere, but got a density of 0 at every sample "
+                f"of {_PATIENCE} steps, which {self.sampling.density} never leaves: a dead start; "
                 "set another seed=N, or model.sampling.density=softplus"
             )
 
@@ -194,7 +196,8 @@ class SampledSnapshot(Snapshot):
             return self.sampled(rays, background)
         first, second = self.method.fields(self.moment)
         places = (first or second).density
-        return self.method.quadrature.picture(places, second.radiance, rays, background)
+        jitter = torch.Generator().manual_seed(0) if self.method.sampling.jitter_in_pictures else None
+        return self.method.quadrature.picture(places, second.radiance, rays, background, jitter)
 
     def holds(self, moment: Moment) -> bool:
         """Return whether it is the same time; the camera does not matter."""
