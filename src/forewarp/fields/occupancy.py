@@ -10,7 +10,8 @@ from torch import Tensor, nn
 from forewarp.scene.box import Box
 
 _FADE = 0.95  # of what was found, at each look
-_OPAQUE = 0.01  # a cell counts as occupied if a step of one cell through it is at least so opaque
+_OPAQUE = 0.01  # a cell counts as occupied if a step of one cell through it is at least so opaque,
+_LEAST = 1e-4  # or more opaque than the mean of all cells and this, while a field is young
 
 
 class Occupancy(nn.Module):
@@ -57,7 +58,7 @@ class Occupancy(nn.Module):
         self.looks += 1
         if int(self.looks) >= self.patience:
             opaque = -torch.expm1(-self.density * float(self.cell.min()))
-            self.occupied.copy_(self._grown(opaque > min(_OPAQUE, float(opaque.mean()))))
+            self.occupied.copy_(self._grown(opaque > min(_OPAQUE, max(_LEAST, float(opaque.mean())))))
 
     def _grown(self, occupied: Tensor) -> Tensor:
         """Add the cells beside occupied ones: what moves, moves into them."""
