@@ -45,7 +45,7 @@ class Entry:
 
     ``model`` makes it; ``lr`` and ``numbers`` are of its stage, ``weights`` of its objective. After ``steps``
     its loss must be below ``falls`` times the first. ``effects`` are its optional parts by name, with which
-    the names of their parameters begin.
+    the names of their parameters begin. ``slow``: another entry has its parts, so its tests are slow ones.
     """
 
     model: Callable[[Start], Method]
@@ -55,6 +55,7 @@ class Entry:
     falls: float = 0.5
     steps: int = 60
     effects: Mapping[str, Effect] = field(default_factory=dict)
+    slow: bool = False
 
 
 GRID = partial(DirectRadiance, alpha_init=1e-2, alpha_threshold=1e-4)
@@ -122,12 +123,14 @@ METHODS = {
         {"network": 2e-3},
         {"photo": 1.0, "coarse_photo": 1.0},
         steps=150,
+        slow=True,
     ),
     "dnerf": Entry(
         partial(DNeRF, **SMALL_NETWORK, time_frequencies=2),
         {"network": 2e-3},
         {"photo": 1.0, "second_time": 1e-4},
         steps=150,
+        slow=True,
     ),
     "nerfies": Entry(
         partial(Nerfies, **SMALL_NETWORK, **SMALL_WARP, elastic_samples=64, still_points=64),
@@ -142,6 +145,7 @@ METHODS = {
         {"photo": 1.0, "coarse_photo": 1.0, "still": 1.0},
         {"warp_in": 0.3, "slice_from": 0.01, "slice_in": 0.2},
         steps=150,
+        slow=True,
     ),
     "particles": Entry(
         partial(
