@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Protocol, runtime_checkable
 
 from torch import Tensor
@@ -43,3 +44,9 @@ class HasEllipsoids(Protocol):
 
     def ellipsoids(self, time: float) -> Ellipsoids:
         """Return all of them as they are at a time in [0, 1], without gradients; a row is always the same."""
+
+    def template(self) -> Ellipsoids:
+        """Return them before any motion, with opacity and colours of the canonical time."""
+
+    def movement(self, times: Sequence[float]) -> dict[str, Tensor]:
+        """Return, by name, what makes ``ellipsoids`` at T times of the ``template``, and its coefficients."""
