@@ -4,6 +4,10 @@ from __future__ import annotations
 
 from forewarp.cli.entry import command
 
+WHOLE = {"degree": (0, 3), "resolution": (8, 512), "points": (1, 10**6), "views": (1, 100)}
+REAL = {"level": (0.01, 0.99)}
+CHOICES = {"files": ("ply", "obj")}
+
 HELP = """
 forewarp-export writes a finished run for other programs, into its exports/<format>/ (docs/exports.md).
 
@@ -13,10 +17,13 @@ forewarp-export writes a finished run for other programs, into its exports/<form
 What one types most:
   run=FOLDER                    the run (needed)
   format=ply                    particles for viewers of Gaussian splats, a file a time; voxels as points
+  format=mesh                   the surface with colours, by marching cubes, a file a time
   format=npz                    trajectories of points with what is visible of them, and the method's arrays
   times=N times=[0,0.5]         how many, evenly spaced, or which
   out=FOLDER                    another folder
   degree=0|1|2|3                ply: how finely colours depend on direction
+  resolution=N level=SHARE      mesh: points of the lattice along the longest side; opacity of the surface
+  files=ply|obj                 mesh: the files
   points=N                      npz: most points
   views=N                       npz: cameras that tell which points are visible
   trust=[PACKAGE]               code of other packages that the run's config may name
@@ -74,7 +81,7 @@ def check(config) -> list[float]:
     """Refuse settings of which nothing can be written, before anything is loaded; return the times."""
     from omegaconf import ListConfig
 
-    from forewarp.export.formats import FORMATS
+    from forewarp.export.formats import FORMATS, require
     from forewarp.runs.overrides import key_of, typed_overrides
 
     if config.format not in FORMATS:
@@ -84,6 +91,7 @@ def check(config) -> list[float]:
         if key in every - set(options):
             known = ", ".join(options)
             raise ValueError(f"{key}: expected an option of format={config.format} ({known}); leave it out")
+    require(config.format)
     for key in options:
         check_option(key, config[key])
     times = config.times
@@ -99,11 +107,13 @@ def check(config) -> list[float]:
 
 def check_option(key: str, value: object) -> None:
     """Refuse a value that an option cannot have."""
-    whole = {"degree": (0, 3), "points": (1, None), "views": (1, None)}
-    low, high = whole[key]
-    if type(value) is not int or value < low or (high is not None and value > high):
-        known = f"from {low} to {high}" if high is not None else f"of at least {low}"
-        raise ValueError(f"{key}: expected a whole number {known}, but got {value}")
+    known = CHOICES.get(key)
+    if known is not None and value not in known:
+        raise ValueError(f"{key}: expected {' or '.join(known)}, but got {value}")
+    for numbers, types, what in ((WHOLE, (int,), "a whole number"), (REAL, (int, float), "a number")):
+        low, high = numbers.get(key, (value, value))
+        if key in numbers and (type(value) not in types or not low <= value <= high):
+            raise ValueError(f"{key}: expected {what} from {low} to {high}, but got {value}")
 
 
 def main() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -17,17 +18,35 @@ _AXES = "the data's own world: right-handed, in its own unit of length"
 
 
 class Format(NamedTuple):
-    """A ``function`` of a ``module`` of this package, and the ``options`` that it takes."""
+    """A ``function`` of a ``module`` of this package, the ``options`` that it takes, and the ``package`` of
+    an ``extra`` that it needs.
+    """
 
     module: str
     function: str
     options: tuple[str, ...]
+    package: str | None = None
+    extra: str | None = None
 
 
 FORMATS = {
     "ply": Format("ply", "export_ply", ("degree",)),
+    "mesh": Format("mesh", "export_mesh", ("resolution", "level", "files"), "skimage", "export"),
     "npz": Format("arrays", "export_npz", ("points", "views")),
 }
+
+
+def require(kind: str) -> None:
+    """Refuse a format whose package is not installed.
+
+    Raises:
+        ImportError: naming the extra to install.
+    """
+    package, extra = FORMATS[kind].package, FORMATS[kind].extra
+    if package is not None and find_spec(package) is None:
+        raise ImportError(
+            f"format={kind}: expected the package {package}, but got none; install forewarp[{extra}]"
+        )
 
 
 def write(
@@ -48,8 +67,9 @@ def write(
 
     Raises:
         ValueError: for a method that the format cannot be made of, or a folder of other files.
-        ImportError: naming the extra to install.
+        ImportError: see ``require``.
     """
+    require(kind)
     made = FORMATS[kind]
     fill = getattr(import_module(f"forewarp.export.{made.module}"), made.function)
     with folder_written_whole(folder, ABOUT) as part:

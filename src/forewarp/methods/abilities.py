@@ -7,7 +7,7 @@ from typing import Protocol, runtime_checkable
 
 from torch import Tensor
 
-from forewarp.scene.box import Box
+from forewarp.scene.box import Box, Lattice
 from forewarp.scene.cloud import Cloud
 from forewarp.scene.ellipsoids import Ellipsoids
 
@@ -50,3 +50,13 @@ class HasEllipsoids(Protocol):
 
     def movement(self, times: Sequence[float]) -> dict[str, Tensor]:
         """Return, by name, what makes ``ellipsoids`` at T times of the ``template``, and its coefficients."""
+
+
+@runtime_checkable
+class HasSolid(Protocol):
+    """Of a snapshot: tell how opaque every place is, for meshes."""
+
+    def solid(self, lattice: Lattice) -> tuple[Tensor, Tensor]:
+        """Return the opacity (X, Y, Z) of a small cube around each point of a lattice, and its mean colour
+        over all directions (X, Y, Z, 3); 0 where there is nothing.
+        """
