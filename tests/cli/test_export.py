@@ -46,9 +46,10 @@ def test_trajectories_are_those_of_the_run(ok, run, tmp_path):
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        (["format=stl"], "format: expected one of ply, mesh, npz, but got 'stl'"),
+        (["format=stl"], "format: expected one of ply, mesh, gltf, npz, but got 'stl'"),
         (["times=0"], "times: expected a whole number of at least 1, or a list, but got 0"),
         (["times=[0,2]"], "times: expected numbers in [0, 1], but got [0, 2]"),
+        (["times=[1,0]"], "times: expected each later than the one before, but got [1, 0]"),
         (["times=[]"], "times: expected numbers in [0, 1], but got []"),
         (["points=9"], "points: expected an option of format=ply (degree); leave it out"),
         (["degree=4"], "degree: expected a whole number from 0 to 3, but got 4"),

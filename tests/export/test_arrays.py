@@ -1,5 +1,6 @@
 import numpy as np
 import torch
+from scipy.spatial import KDTree
 
 from forewarp.export.formats import write
 from tests.export.conftest import TIMES
@@ -38,7 +39,9 @@ def test_voxels_go_where_the_method_says_and_are_seen_from_their_side(ball, tmp_
 def test_particles_go_as_their_centers_with_colours_and_opacity_of_each_time(particles, tmp_path):
     _, found, own = load(particles, tmp_path, points=10**6, views=1)
     clouds = [particles.method.ellipsoids(time) for time in TIMES]
-    assert len(found["points"]) == len(clouds[0])
+    chosen = KDTree(clouds[0].centers).query(found["positions"][:, 0])[1]
+    assert len(set(chosen)) == len(chosen) > 50
+    clouds = [cloud[chosen] for cloud in clouds]
     for row, cloud in enumerate(clouds):
         np.testing.assert_allclose(found["positions"][:, row], cloud.centers, atol=1e-6)
         np.testing.assert_allclose(found["colors"][:, row], cloud.colors, atol=1e-6)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from forewarp.cli.entry import command
 
 WHOLE = {"degree": (0, 3), "resolution": (8, 512), "points": (1, 10**6), "views": (1, 100)}
-REAL = {"level": (0.01, 0.99)}
+REAL = {"level": (0.01, 0.99), "seconds": (0.1, 3600)}
 CHOICES = {"files": ("ply", "obj")}
 
 HELP = """
@@ -18,13 +18,15 @@ What one types most:
   run=FOLDER                    the run (needed)
   format=ply                    particles for viewers of Gaussian splats, a file a time; voxels as points
   format=mesh                   the surface with colours, by marching cubes, a file a time
+  format=gltf                   moving points as an animation, one file
   format=npz                    trajectories of points with what is visible of them, and the method's arrays
   times=N times=[0,0.5]         how many, evenly spaced, or which
   out=FOLDER                    another folder
   degree=0|1|2|3                ply: how finely colours depend on direction
   resolution=N level=SHARE      mesh: points of the lattice along the longest side; opacity of the surface
   files=ply|obj                 mesh: the files
-  points=N                      npz: most points
+  points=N                      gltf, npz: most points
+  seconds=N                     gltf: how long the animation lasts
   views=N                       npz: cameras that tell which points are visible
   trust=[PACKAGE]               code of other packages that the run's config may name
   data.root=FOLDER              where the data are now, if they moved
@@ -99,6 +101,8 @@ def check(config) -> list[float]:
         good = [type(time) in (int, float) and 0 <= time <= 1 for time in times]
         if not (good and all(good)):
             raise ValueError(f"times: expected numbers in [0, 1], but got {list(times)}")
+        if sorted(set(times)) != list(times):
+            raise ValueError(f"times: expected each later than the one before, but got {list(times)}")
         return [float(time) for time in times]
     if type(times) is not int or times < 1:
         raise ValueError(f"times: expected a whole number of at least 1, or a list, but got {times}")

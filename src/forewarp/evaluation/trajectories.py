@@ -81,6 +81,15 @@ class Trajectories:
 @torch.no_grad()
 def surface(module: DynamicSceneModule, cameras: Sequence[Camera]) -> Cloud:
     """Return the matter seen by a few cameras at the canonical time."""
+    matter = module.method.matter()
+    return matter[seen_by(module, cameras, matter.points, matter.size)]
+
+
+@torch.no_grad()
+def seen_by(module: DynamicSceneModule, cameras: Sequence[Camera], points: Tensor, size: float) -> Tensor:
+    """Tell which canonical points (N, 3) lie in a cube, ``size`` world units wide, in which a few cameras see
+    the surface: (N,) bool.
+    """
     canonical = module.method.at(Moment(module.curriculum.canonical_time))
     black, found = torch.zeros(3, device=module.device), []
     for camera in cameras[:: max(1, len(cameras) // _VIEWS)][:_VIEWS]:
@@ -89,9 +98,7 @@ def surface(module: DynamicSceneModule, cameras: Sequence[Camera]) -> Cloud:
         hit = drawn.opacity > 0.5
         found.append(rays.origins[hit] + drawn.depth[hit, None] * rays.directions[hit])
     # At a silhouette the mean depth lies in empty space; points of matter do not.
-    matter = module.method.matter()
-    cells, seen = _cells(matter.points, matter.size), _cells(torch.cat(found), matter.size)
-    return matter[torch.isin(cells, seen)]
+    return torch.isin(_cells(points, size), _cells(torch.cat(found), size))
 
 
 def _cells(points: Tensor, size: float) -> Tensor:

@@ -32,6 +32,7 @@ class Format(NamedTuple):
 FORMATS = {
     "ply": Format("ply", "export_ply", ("degree",)),
     "mesh": Format("mesh", "export_mesh", ("resolution", "level", "files"), "skimage", "export"),
+    "gltf": Format("gltf", "export_gltf", ("points", "seconds")),
     "npz": Format("arrays", "export_npz", ("points", "views")),
 }
 

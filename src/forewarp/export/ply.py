@@ -13,6 +13,7 @@ from forewarp.export.source import Progress, Source, tracks_of
 from forewarp.scene.ellipsoids import Ellipsoids
 
 _TYPES = {"float32": "float", "uint8": "uchar"}
+_EVERY = 1 << 31  # points
 _SURE = 1e-6  # opacities this near to 0 and 1 are written as this, as their logits are
 
 
@@ -115,7 +116,7 @@ def export_ply(source: Source, folder: Path, progress: Progress, *, degree: int)
 
 
 def _export_points(source: Source, folder: Path, progress: Progress) -> dict:
-    tracks = tracks_of(source, None, progress)
+    tracks = tracks_of(source, _EVERY, progress)
     for number, places in enumerate(tracks.positions):
         write_ply(_frame(folder, number), point_columns(places, tracks.colors[0]))
     return {

@@ -9,7 +9,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from forewarp.evaluation.trajectories import spread, surface
+from forewarp.evaluation.trajectories import seen_by, spread, surface
 from forewarp.methods.abilities import HasEllipsoids, HasMatter, HasTrajectories
 from forewarp.methods.method import Method
 from forewarp.scene.camera import Camera
@@ -18,7 +18,7 @@ from forewarp.training.module import DynamicSceneModule
 
 Progress = Callable[[int, int], None]  # how many are done, of how many
 
-_SEEN = 1 / 255  # opacity below which nothing is drawn
+_SOLID = 0.1  # opacity at some time of a particle that is a point of the surface
 
 
 @dataclass(frozen=True)
@@ -93,12 +93,12 @@ class Tracks:
 
 
 @torch.no_grad()
-def tracks_of(source: Source, count: int | None, progress: Progress = lambda done, of: None) -> Tracks:
+def tracks_of(source: Source, count: int, progress: Progress = lambda done, of: None) -> Tracks:
     """Follow points of the surface: of particles their centers, of voxels their middles.
 
     Args:
         source: the scene and its times.
-        count: most points, spread evenly over the surface; None: all.
+        count: most points, spread evenly over the surface.
         progress: told after each time.
     """
     times = torch.tensor(source.times, dtype=torch.float32)
@@ -113,15 +113,17 @@ def tracks_of(source: Source, count: int | None, progress: Progress = lambda don
     return Tracks(points.float().cpu(), times, positions, colors, opacity, size)
 
 
-def _particles(source: Source, count: int | None):
+def _particles(source: Source, count: int):
     method = source.method
     clouds = (method.ellipsoids(float(time)) for time in source.times)
-    seen = torch.stack([cloud.opacity for cloud in clouds]).amax(0) > _SEEN
+    opacity = torch.stack([cloud.opacity for cloud in clouds]).amax(0)
     cloud = method.ellipsoids(source.module.curriculum.canonical_time)
+    size = method.matter().size
+    seen = (opacity > _SOLID) & seen_by(source.module, source.cameras, cloud.centers, size)
     rows = seen.nonzero()[:, 0]
-    if count is not None:
-        rows = rows[spread(cloud.centers[rows], count)]
-    size = 2 * float(cloud.axes[0].median()) if len(cloud) else 1.0
+    if not len(rows):
+        raise ValueError("run: expected particles that a camera sees, but got none; train it longer")
+    rows = rows[spread(cloud.centers[rows], count)]
 
     def at(time: float):
         now = method.ellipsoids(time)[rows]
@@ -130,9 +132,9 @@ def _particles(source: Source, count: int | None):
     return cloud.centers[rows], size, at
 
 
-def _matter(source: Source, count: int | None):
+def _matter(source: Source, count: int):
     cloud = source.surface
-    cloud = cloud if count is None else cloud[spread(cloud.points, count)]
+    cloud = cloud[spread(cloud.points, count)]
 
     def at(time: float):
         moved = source.method.trajectories(cloud.points, cloud.points.new_tensor([time]))[:, 0]
