@@ -32,7 +32,7 @@ ONLY_IN = {
     "lightning": {"data", "training", "evaluation", "runs", "planning", "cli"},
     **{"torchmetrics": {"metrics"}, "numba": {"ops"}, "PIL": {"data"}, "matplotlib": {"report"}},
     **{"trimesh": {"synth"}, "embreex": {"synth"}, "torchvision": set()},
-    "skimage": {"export"},
+    **{"skimage": {"export"}, "viser": {"export", "viewer"}},
     **{"imageio": {"drawing", "evaluation", "cli"}, "imageio_ffmpeg": {"drawing", "cli"}},
     "rich": {"progress", "training", "evaluation", "planning", "cli"},
 }

@@ -46,7 +46,7 @@ def test_trajectories_are_those_of_the_run(ok, run, tmp_path):
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        (["format=stl"], "format: expected one of ply, mesh, gltf, npz, but got 'stl'"),
+        (["format=stl"], "format: expected one of ply, mesh, gltf, html, npz, but got 'stl'"),
         (["times=0"], "times: expected a whole number of at least 1, or a list, but got 0"),
         (["times=[0,2]"], "times: expected numbers in [0, 1], but got [0, 2]"),
         (["times=[1,0]"], "times: expected each later than the one before, but got [1, 0]"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from forewarp.cli.entry import command
 
 WHOLE = {"degree": (0, 3), "resolution": (8, 512), "points": (1, 10**6), "views": (1, 100)}
-REAL = {"level": (0.01, 0.99), "seconds": (0.1, 3600)}
+REAL = {"level": (0.01, 0.99), "seconds": (0.1, 3600), "megabytes": (1, 1000)}
 CHOICES = {"files": ("ply", "obj")}
 
 HELP = """
@@ -19,14 +19,16 @@ What one types most:
   format=ply                    particles for viewers of Gaussian splats, a file a time; voxels as points
   format=mesh                   the surface with colours, by marching cubes, a file a time
   format=gltf                   moving points as an animation, one file
+  format=html                   one page for a browser, without a server, with a time slider
   format=npz                    trajectories of points with what is visible of them, and the method's arrays
   times=N times=[0,0.5]         how many, evenly spaced, or which
   out=FOLDER                    another folder
   degree=0|1|2|3                ply: how finely colours depend on direction
   resolution=N level=SHARE      mesh: points of the lattice along the longest side; opacity of the surface
   files=ply|obj                 mesh: the files
-  points=N                      gltf, npz: most points
-  seconds=N                     gltf: how long the animation lasts
+  points=N                      gltf, npz, html of voxels: most points
+  seconds=N                     gltf, html: how long the animation lasts
+  megabytes=N                   html: most of the page; what does not fit is left out, and said
   views=N                       npz: cameras that tell which points are visible
   trust=[PACKAGE]               code of other packages that the run's config may name
   data.root=FOLDER              where the data are now, if they moved

@@ -33,6 +33,7 @@ FORMATS = {
     "ply": Format("ply", "export_ply", ("degree",)),
     "mesh": Format("mesh", "export_mesh", ("resolution", "level", "files"), "skimage", "export"),
     "gltf": Format("gltf", "export_gltf", ("points", "seconds")),
+    "html": Format("page", "export_html", ("points", "seconds", "megabytes"), "viser", "viewer"),
     "npz": Format("arrays", "export_npz", ("points", "views")),
 }
 
