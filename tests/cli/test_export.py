@@ -51,7 +51,7 @@ def test_trajectories_are_those_of_the_run(ok, run, tmp_path):
         (["times=[0,2]"], "times: expected numbers in [0, 1], but got [0, 2]"),
         (["times=[1,0]"], "times: expected each later than the one before, but got [1, 0]"),
         (["times=[]"], "times: expected numbers in [0, 1], but got []"),
-        (["points=9"], "points: expected an option of format=ply (degree); leave it out"),
+        (["points=9"], "points: expected an option of format=ply (degree, up); leave it out"),
         (["degree=4"], "degree: expected a whole number from 0 to 3, but got 4"),
         (["format=npz", "points=0"], "points: expected a whole number from 1 to 1000000, but got 0"),
         (["format=mesh", "files=stl"], "files: expected ply or obj, but got stl"),
@@ -63,3 +63,10 @@ def test_mistakes_end_in_one_line(refused, run, words, says, in_tmp):
     (in_tmp / "a file").touch()
     assert says in refused("export", f"run={run}", *words)
     assert [file.name for file in in_tmp.iterdir()] == ["a file"]
+
+
+def test_a_run_that_is_not_finished_is_refused(refused, run, tmp_path):
+    half = shutil.copytree(run, tmp_path / "half")
+    (half / "fine" / "done.json").unlink()
+    said = refused("export", f"run={half}")
+    assert said == f"{half}/fine: expected a finished stage, but got none; continue with forewarp-train"

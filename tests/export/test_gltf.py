@@ -1,12 +1,10 @@
 import numpy as np
-import pytest
 import torch
 from pygltflib import GLTF2
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from forewarp.export.formats import write
-from forewarp.export.gltf import upright
 from tests.export.conftest import TIMES
 
 TYPES = {5126: np.float32, 5125: np.uint32}
@@ -96,9 +94,3 @@ def test_one_time_is_a_still(ball, tmp_path):
     _, file = export(ball, tmp_path / "gltf", points=5)
     assert not file.gltf.animations
     assert not file.primitive.targets
-
-
-@pytest.mark.parametrize("up", [(0.0, 1, 0), (0.0, -1, 0), (1.0, 0, 0), (0.6, 0, -0.8)])
-def test_up_becomes_y(up):
-    turn = Rotation.from_quat(upright(torch.tensor(up)))
-    np.testing.assert_allclose(turn.apply(up), [0, 1, 0], atol=1e-6)

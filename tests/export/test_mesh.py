@@ -12,7 +12,7 @@ from forewarp.scene.ellipsoids import Ellipsoids
 from tests.export.conftest import TIMES
 from tests.support.tiny_scene import BOX, RADIUS, ball_center
 
-OPTIONS = {"resolution": 60, "level": 0.5, "files": "ply"}
+OPTIONS = {"resolution": 60, "level": 0.5, "files": "ply", "up": "world"}
 
 
 def export(source, folder, **options):
@@ -34,6 +34,19 @@ def test_the_ball_is_where_it_is_at_each_time(ball, tmp_path, files):
         shown = np.asarray(mesh.visual.vertex_colors)[:, :3] / 255
         painted = torch.sigmoid(2 * torch.from_numpy(np.asarray(mesh.vertices)))
         assert abs(shown - painted.numpy()).max() < 0.03
+
+
+def test_it_can_be_turned_upright(ball, tmp_path):
+    ball.method.bounds = lambda times: BOX
+    for up in ("world", "-y"):
+        export(ball, tmp_path / up, resolution=30, up=up)
+    for number in range(len(TIMES)):
+        meshes = [
+            trimesh.load(tmp_path / up / f"mesh_{number:04d}.ply", process=False) for up in ("world", "-y")
+        ]
+        wanted = np.asarray(meshes[0].vertices) @ ball.turn_to("-y").T.numpy()
+        np.testing.assert_allclose(meshes[1].vertices, wanted, atol=1e-5)
+        assert meshes[1].volume > 0
 
 
 def dense(cloud, points, blur):

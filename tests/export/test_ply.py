@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -9,6 +11,7 @@ from forewarp.export.formats import write
 from forewarp.export.ply import splat_columns, write_ply
 from forewarp.ops.project import FLAT, Gaussians
 from forewarp.scene.ellipsoids import Ellipsoids
+from forewarp.scene.paths import mean_up
 from forewarp.scene.view import Moment, View
 from tests.export.conftest import TIMES
 from tests.support.gaussians import NO_TINTS, still
@@ -42,7 +45,9 @@ def gaussians(table):
 @pytest.fixture
 def written(particles, tmp_path):
     told = []
-    about = write("ply", particles, tmp_path / "ply", {"scene": "x"}, lambda *n: told.append(n), degree=3)
+    about = write(
+        "ply", particles, tmp_path / "ply", {"scene": "x"}, lambda *n: told.append(n), degree=3, up="world"
+    )
     assert told == [(1, 3), (2, 3), (3, 3)]
     return particles, tmp_path / "ply", about
 
@@ -109,7 +114,7 @@ def test_extremes_are_finite(tmp_path):
 
 
 def test_voxels_are_points_of_the_surface_that_move(ball, tmp_path):
-    about = write("ply", ball, tmp_path / "ply", {}, lambda *n: None, degree=3)
+    about = write("ply", ball, tmp_path / "ply", {}, lambda *n: None, degree=3, up="world")
     frames = [trimesh.load(tmp_path / "ply" / "frames" / f"frame_{i:04d}.ply") for i in range(len(TIMES))]
     first = torch.from_numpy(np.asarray(frames[0].vertices)).float()
     assert len(first) == about["points"] > 100
@@ -121,3 +126,20 @@ def test_voxels_are_points_of_the_surface_that_move(ball, tmp_path):
         torch.testing.assert_close(shown, wanted, atol=0.003, rtol=0)
     moved = (paths[:, 2] - paths[:, 0]).norm(dim=-1)
     assert {round(float(m), 3) for m in moved} == {0.0, 0.8}
+
+
+@pytest.mark.parametrize("up", ["y", "-y", "z"])
+def test_turned_files_are_seen_by_turned_cameras_as_before(particles, tmp_path, up):
+    write("ply", particles, tmp_path / "ply", {}, lambda *n: None, degree=2, up=up)
+    turn = particles.turn_to(up)
+    sign, axis = -1.0 if up[0] == "-" else 1.0, "xyz".index(up[-1])
+    assert float((turn @ mean_up(list(particles.cameras)))[axis]) == pytest.approx(sign)
+    assert float(torch.linalg.det(turn)) == pytest.approx(1)
+    snapshot, camera = particles.method.at(Moment(TIMES[1])), particles.cameras[3]
+    bare = gaussians(read(tmp_path / "ply" / "frames" / "frame_0001.ply"))
+    own = type(snapshot)(snapshot.moment, bare, still(bare), NO_TINTS, torch.ones(1), snapshot.pinholes)
+    pose = camera.camera_to_world.clone()
+    pose[:3] = turn @ pose[:3]
+    found = own.render(View(replace(camera, camera_to_world=pose)), torch.ones(3)).rgb
+    wanted = snapshot.render(View(camera), torch.ones(3)).rgb.detach()
+    torch.testing.assert_close(found, wanted, atol=2e-3, rtol=0)

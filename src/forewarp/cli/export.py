@@ -6,7 +6,7 @@ from forewarp.cli.entry import command
 
 WHOLE = {"degree": (0, 3), "resolution": (8, 512), "points": (1, 10**6), "views": (1, 100)}
 REAL = {"level": (0.01, 0.99), "seconds": (0.1, 3600), "megabytes": (1, 1000)}
-CHOICES = {"files": ("ply", "obj")}
+CHOICES = {"files": ("ply", "obj"), "up": ("world", "y", "-y", "z")}
 
 HELP = """
 forewarp-export writes a finished run for other programs, into its exports/<format>/ (docs/exports.md).
@@ -24,6 +24,7 @@ What one types most:
   times=N times=[0,0.5]         how many, evenly spaced, or which
   out=FOLDER                    another folder
   degree=0|1|2|3                ply: how finely colours depend on direction
+  up=world|y|-y|z               ply, mesh: which axis points upwards; -y for SuperSplat
   resolution=N level=SHARE      mesh: points of the lattice along the longest side; opacity of the surface
   files=ply|obj                 mesh: the files
   points=N                      gltf, npz, html of voxels: most points

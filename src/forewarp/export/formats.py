@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from forewarp.export.source import Progress, Source
 
 ABOUT = "about.json"  # in every folder of an export, which may then be replaced
-_AXES = "the data's own world: right-handed, in its own unit of length"
+_AXES = "the data's own world, right-handed, in its own unit of length; turned about its origin if up says so"
 
 
 class Format(NamedTuple):
@@ -30,8 +30,8 @@ class Format(NamedTuple):
 
 
 FORMATS = {
-    "ply": Format("ply", "export_ply", ("degree",)),
-    "mesh": Format("mesh", "export_mesh", ("resolution", "level", "files"), "skimage", "export"),
+    "ply": Format("ply", "export_ply", ("degree", "up")),
+    "mesh": Format("mesh", "export_mesh", ("resolution", "level", "files", "up"), "skimage", "export"),
     "gltf": Format("gltf", "export_gltf", ("points", "seconds")),
     "html": Format("page", "export_html", ("points", "seconds", "megabytes"), "viser", "viewer"),
     "npz": Format("arrays", "export_npz", ("points", "views")),

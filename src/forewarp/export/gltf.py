@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from forewarp.export.source import Progress, Source, Tracks, tracks_of
-from forewarp.scene.paths import mean_up
 
 # A tetrahedron about the origin, 1 from its middle to its corners; triangles counter-clockwise from outside.
 _CORNERS = torch.tensor([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / 3**0.5
@@ -65,7 +64,7 @@ def export_gltf(source: Source, folder: Path, progress: Progress, *, points: int
     source.refuse_without_tracks("gltf")
     tracks = tracks_of(source, points, progress)
     radius = _ACROSS * apart(tracks.points, tracks.size)
-    (folder / "points.glb").write_bytes(glb(tracks, radius, mean_up(list(source.cameras)), seconds))
+    (folder / "points.glb").write_bytes(glb(tracks, radius, source.turn_to("y"), seconds))
     return {
         "points": len(tracks),
         "radius": radius,
@@ -90,25 +89,15 @@ def linear(colors: Tensor) -> Tensor:
     return torch.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)
 
 
-def upright(up: Tensor) -> list[float]:
-    """Return the quaternion x, y, z, w of the shortest turn from a unit vector (3,) to y.
-
-    >>> [round(v, 3) + 0.0 for v in upright(torch.tensor([0.0, 0.0, 1.0]))]
-    [-0.707, 0.0, 0.0, 0.707]
-    """
-    x, y, z = up.double().tolist()
-    turn = torch.tensor([-z, 0.0, x, 1 + y], dtype=torch.float64)  # up cross y, 1 + up dot y
-    length = float(turn.norm())
-    return (turn / length).tolist() if length > 1e-6 else [1.0, 0.0, 0.0, 0.0]
-
-
-def glb(tracks: Tracks, radius: float, up: Tensor, seconds: float) -> bytes:
+def glb(tracks: Tracks, radius: float, turn: Tensor, seconds: float) -> bytes:
     """Make a binary glTF: each point is a small tetrahedron, as mere points are drawn by few programs.
 
     Its corners at the first time are the mesh; every later time is a morph target. The animation lets weights
     rise and fall so that corners go straight from each time to the next. While a point is less
     opaque than at other times its tetrahedron is smaller; colours that change are in the targets too.
     """
+    from scipy.spatial.transform import Rotation
+
     count, total = len(tracks), len(tracks.times)
     opacity = tracks.opacity / tracks.opacity.amax(0).clamp(min=1e-6)
     scale = radius * opacity.expand(total, -1)[..., None, None]
@@ -134,13 +123,14 @@ def glb(tracks: Tracks, radius: float, up: Tensor, seconds: float) -> bytes:
         sampler = {"input": clock, "output": weights, "interpolation": "LINEAR"}
         channel = {"sampler": 0, "target": {"node": 0, "path": "weights"}}
         animations = [{"name": "time", "samplers": [sampler], "channels": [channel]}]
+    rotation = Rotation.from_matrix(turn.numpy()).as_quat().tolist()  # x, y, z, w
     unlit = {"extensions": {"KHR_materials_unlit": {}}, "pbrMetallicRoughness": {"metallicFactor": 0}}
     content = {
         "asset": {"version": "2.0", "generator": "forewarp"},
         "extensionsUsed": ["KHR_materials_unlit"],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "rotation": upright(up), "name": "points"}],
+        "nodes": [{"mesh": 0, "rotation": rotation, "name": "points"}],
         "meshes": [mesh],
         "materials": [unlit],
         "accessors": buffer.accessors,

@@ -111,8 +111,24 @@ def write_obj(path: Path, mesh: Mesh) -> None:
         np.savetxt(file, mesh.faces + 1, "f %d %d %d")
 
 
+def _bounds(source: Source) -> Box:
+    """See ``export_mesh``: the box of all matter at all times."""
+    method = source.method
+    if not isinstance(method, HasBounds) or not (
+        source.has_ellipsoids or isinstance(method.at(Moment(source.times[0])), HasSolid)
+    ):
+        raise ValueError(
+            "format=mesh: expected a method that knows where matter is, as particles, forward or backward, "
+            f"but got {source.model}"
+        )
+    box = method.bounds(list(source.times))
+    if box is None:
+        raise ValueError("run: expected matter to make a mesh of, but got none; train it longer")
+    return box
+
+
 def export_mesh(
-    source: Source, folder: Path, progress: Progress, *, resolution: int, level: float, files: str
+    source: Source, folder: Path, progress: Progress, *, resolution: int, level: float, files: str, up: str
 ) -> dict:
     """Write ``mesh_0000.ply`` (or ``.obj``) and so on.
 
@@ -123,6 +139,7 @@ def export_mesh(
         resolution: points of the lattice along the longest side of all matter.
         level: opacity at which the surface is.
         files: ``ply`` or ``obj``.
+        up: see ``Source.turn_to``.
 
     Returns:
         what ``about.json`` says of it.
@@ -130,17 +147,8 @@ def export_mesh(
     Raises:
         ValueError: for a method that cannot tell where matter is, or where nothing is as opaque.
     """
-    first = source.method.at(Moment(source.times[0]))
-    if not isinstance(source.method, HasBounds) or not (source.has_ellipsoids or isinstance(first, HasSolid)):
-        raise ValueError(
-            "format=mesh: expected a method that knows where matter is, as particles, forward or backward, "
-            f"but got {source.model}"
-        )
-    box = source.method.bounds(list(source.times))
-    if box is None:
-        raise ValueError("run: expected matter to make a mesh of, but got none; train it longer")
-    lattice = lattice_in(box, resolution)
-    vertices, faces = [], []
+    lattice = lattice_in(_bounds(source), resolution)
+    vertices, faces, turn = [], [], source.turn_to(up).float()
     for number, time in enumerate(source.times):
         if source.has_ellipsoids:
             opacity, colors = solid_of(source.method.ellipsoids(time), lattice)
@@ -152,6 +160,7 @@ def export_mesh(
                 f"level: expected less than the highest opacity at time {time:.4g}, "
                 f"{float(opacity.max()):.3g}, but got {level}"
             )
+        mesh = mesh._replace(vertices=mesh.vertices @ turn.T)
         path = folder / f"mesh_{number:04d}.{files}"
         if files == "obj":
             write_obj(path, mesh)
@@ -164,6 +173,7 @@ def export_mesh(
         "vertices": vertices,
         "faces": faces,
         "level": level,
+        "up": up,
         "spacing": lattice.spacing[0],
         "colors": "sRGB, as in the pictures, the mean over directions",
     }

@@ -107,7 +107,7 @@ def page(
         packed = []
         for done, time in enumerate(times, 1):
             handle = show.add(server.scene, time, rows)
-            packed.append(getattr(handle, show.part))
+            packed.append(getattr(handle, show.part).copy())  # viser writes later values into its own
             progress(done, len(times))
         if packed:
             setattr(handle, show.part, packed[0])

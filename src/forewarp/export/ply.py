@@ -77,7 +77,7 @@ def _named(values: Tensor, names) -> dict[str, np.ndarray]:
     return dict(zip(names, values.detach().float().cpu().numpy().T))
 
 
-def export_ply(source: Source, folder: Path, progress: Progress, *, degree: int) -> dict:
+def export_ply(source: Source, folder: Path, progress: Progress, *, degree: int, up: str) -> dict:
     """Write ``frames/frame_0000.ply`` and so on; of particles also ``canonical.ply``, which is what
     ``motion.npz`` moves.
 
@@ -86,6 +86,7 @@ def export_ply(source: Source, folder: Path, progress: Progress, *, degree: int)
         folder: to write into.
         progress: told after each file.
         degree: of the harmonics in a file, 0 to 3.
+        up: see ``Source.turn_to``; what ``motion.npz`` moves is not turned.
 
     Returns:
         what ``about.json`` says of it.
@@ -95,11 +96,14 @@ def export_ply(source: Source, folder: Path, progress: Progress, *, degree: int)
     """
     source.refuse_without_tracks("ply")
     (folder / "frames").mkdir()
+    turn = source.turn_to(up)
     if not source.has_ellipsoids:
-        return _export_points(source, folder, progress)
+        return _export_points(source, folder, progress, turn) | {"up": up}
     total = len(source.times)
     for number, time in enumerate(source.times):
-        write_ply(_frame(folder, number), splat_columns(source.method.ellipsoids(time), degree))
+        cloud = source.method.ellipsoids(time)
+        cloud = cloud if up == "world" else cloud.turned(turn)
+        write_ply(_frame(folder, number), splat_columns(cloud, degree))
         progress(number + 1, total)
     template = source.method.template()
     write_ply(folder / "canonical.ply", splat_columns(template, degree))
@@ -109,15 +113,16 @@ def export_ply(source: Source, folder: Path, progress: Progress, *, degree: int)
     return {
         "particles": len(template),
         "kind": "Gaussian splats",
+        "up": up,
         "degree": degree,
         "degree of the run": own,
         "colors": "sRGB, as in the pictures: 1/2 + 0.28209479177387814 f_dc is the mean over directions",
     }
 
 
-def _export_points(source: Source, folder: Path, progress: Progress) -> dict:
+def _export_points(source: Source, folder: Path, progress: Progress, turn: Tensor) -> dict:
     tracks = tracks_of(source, _EVERY, progress)
-    for number, places in enumerate(tracks.positions):
+    for number, places in enumerate(tracks.positions @ turn.T.float()):
         write_ply(_frame(folder, number), point_columns(places, tracks.colors[0]))
     return {
         "points": len(tracks),

@@ -14,10 +14,12 @@ from forewarp.methods.abilities import HasEllipsoids, HasMatter, HasTrajectories
 from forewarp.methods.method import Method
 from forewarp.scene.camera import Camera
 from forewarp.scene.cloud import Cloud
+from forewarp.scene.paths import mean_up
 from forewarp.training.module import DynamicSceneModule
 
 Progress = Callable[[int, int], None]  # how many are done, of how many
 
+UP = {"y": (0.0, 1.0, 0.0), "-y": (0.0, -1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 _SOLID = 0.1  # opacity at some time of a particle that is a point of the surface
 
 
@@ -41,6 +43,19 @@ class Source:
     def has_ellipsoids(self) -> bool:
         """Whether the scene is a cloud of soft ellipsoids."""
         return isinstance(self.method, HasEllipsoids)
+
+    def turn_to(self, up: str) -> Tensor:
+        """Return the rotation (3, 3) float64 that takes the upward direction of the pictures to an axis.
+
+        Args:
+            up: ``y``, ``-y`` or ``z``; ``world``: nothing is turned.
+        """
+        from scipy.spatial.transform import Rotation
+
+        if up == "world":
+            return torch.eye(3, dtype=torch.float64)
+        before = mean_up(list(self.cameras)).numpy()
+        return torch.from_numpy(Rotation.align_vectors([UP[up]], [before])[0].as_matrix())
 
     @cached_property
     def surface(self) -> Cloud:

@@ -9,7 +9,7 @@ from itertools import permutations
 import torch
 from torch import Tensor
 
-from forewarp.ops.project import FLAT
+from forewarp.ops.project import FLAT, harmonics
 
 _THINNEST = 1e-6  # of an ellipsoid's longest axis: a map may have pressed it flat, and logarithms are taken
 
@@ -46,6 +46,17 @@ class Ellipsoids:
     def colors(self) -> Tensor:
         """Mean colours over all directions (N, 3), in [0, 1]."""
         return (0.5 + FLAT * self.harmonics[:, 0]).clamp(0, 1)
+
+    def turned(self, rotation: Tensor) -> Ellipsoids:
+        """Turn all of them by a rotation (3, 3) about the origin; their colours turn with them."""
+        rotation, count = rotation.double(), self.harmonics.shape[1]
+        generator = torch.Generator().manual_seed(0)
+        some = torch.nn.functional.normalize(torch.randn(64, 3, generator=generator, dtype=torch.float64))
+        # A colour seen from a direction is seen from the turned direction afterwards.
+        after = torch.linalg.lstsq(harmonics(some @ rotation.T, count), harmonics(some, count)).solution
+        colors = torch.einsum("ab,nbc->nac", after.to(self.harmonics), self.harmonics)
+        rotation = rotation.to(self.centers)
+        return Ellipsoids(self.centers @ rotation.T, rotation @ self.roots, self.opacity, colors)
 
     @cached_property
     def axes(self) -> tuple[Tensor, Tensor]:
