@@ -75,7 +75,7 @@ def crowd(count=40):
 def test_ellipsoids_on_a_lattice_are_those_one_by_one(monkeypatch):
     cloud, lattice = crowd(), lattice_in(Box((-1, -0.8, -0.9), (0.6, 1, 1)), 20)
     wanted = dense(cloud, lattice.to_world(lattice.all_voxels()).numpy(), (0.5 * lattice.spacing[0]) ** 2)
-    for pairs in (1 << 21, 500):
+    for pairs in (1 << 19, 500):
         monkeypatch.setattr("forewarp.export.mesh._PAIRS", pairs)
         opacity, colors = solid_of(cloud, lattice)
         # Boxes hold a little more than the ellipsoids that end where nothing is drawn.

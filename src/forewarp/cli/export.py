@@ -60,9 +60,10 @@ def export(config) -> None:
     run = build_run(saved)
     module = run.load().to(device_of(saved.trainer.accelerator)).eval()
     warn_if_changed(run)
-    cameras = [frame.camera for frame in run.datamodule.scene.train]
-    source = Source(module, method_name(saved), cameras, times)
-    about = {"run": str(config.run), "scene": run.datamodule.scene.name, "method": source.model}
+    scene = run.datamodule.scene
+    cameras = [frame.camera for frame in scene.train]
+    source = Source(module, method_name(saved), cameras, times, opaque=not scene.has_alpha)
+    about = {"run": str(config.run), "scene": scene.name, "method": source.model}
     options = {name: config[name] for name in FORMATS[config.format].options}
     with Counted(config.format) as progress:
         found = write(config.format, source, folder, about, progress, **options)

@@ -20,7 +20,7 @@ from forewarp.scene.view import Moment
 _BLUR = 0.5  # spacings of the lattice that ellipsoids are blurred by, so that none falls between its points
 _REACH = 1 / 255  # opacity below which an ellipsoid ends, as in pictures
 _SURE = 1 - 1e-6  # most opacity of a place, so that its optical depth is finite
-_PAIRS = 1 << 21  # of an ellipsoid and a point, at a time
+_PAIRS = 1 << 19  # of an ellipsoid and a point, at a time
 
 
 class Mesh(NamedTuple):

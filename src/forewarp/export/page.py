@@ -9,6 +9,7 @@ from io import StringIO
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -20,6 +21,7 @@ from forewarp.scene.paths import focus_point, mean_up
 _ACROSS = 100.0  # units of the page across the cameras: squares of small lengths vanish in half precision
 _TIMES = 12  # times that are kept while particles can be left out instead
 _SPARE = 0.97  # share of the room that is planned for, as a page's size is only estimated
+_FULL, _TRIES = 0.9, 4  # share of the room from which on a page will do; pages that are tried
 
 
 class Show(NamedTuple):
@@ -59,23 +61,29 @@ def export_html(
     some = [source.times[i] for i in spread(total, 2)]
     empty = len(page(source, show, [], show.order, seconds))
     each = (len(page(source, show, some, show.order, seconds)) - empty) / (len(some) * count)
-    rows, times = thinned(count, total, (_SPARE * room - empty) / each)
-    while True:
+    best = None
+    for _ in range(_TRIES):
+        rows, times = thinned(count, total, (_SPARE * room - empty) / each)
         if rows < 1:
-            raise ValueError(f"megabytes: expected room for the page, but got {megabytes}; raise it")
+            break
         kept = [source.times[i] for i in spread(total, times)]
         text = page(source, show, kept, show.order[:rows], seconds, progress)
-        if len(text) <= room:
-            break
-        rows = min(rows - 1, int(0.95 * rows * room / len(text)))
-    (folder / "scene.html").write_bytes(text)
-    left_out = {"thinned": f"{rows} of {count} {show.name}, {times} of {total} times"}
+        if len(text) <= room and (best is None or rows * times > best[0] * len(best[1])):
+            best = rows, kept
+            (folder / "scene.html").write_bytes(text)
+            if (rows, times) == (count, total) or len(text) > _FULL * room:
+                break
+        each = (len(text) - empty) / (rows * times)  # times near each other take less room
+    if best is None:
+        raise ValueError(f"megabytes: expected room for the page, but got {megabytes}; raise it")
+    rows, kept = best
+    left_out = {"thinned": f"{rows} of {count} {show.name}, {len(kept)} of {total} times"}
     return {
         show.name: rows,
         "times on the page": kept,
         "seconds": seconds,
         "colors": "sRGB, as in the pictures, the mean over directions",
-    } | (left_out if (rows, times) != (count, total) else {})
+    } | (left_out if (rows, len(kept)) != (count, total) else {})
 
 
 def thinned(count: int, times: int, room: float) -> tuple[int, int]:
@@ -104,6 +112,8 @@ def page(
         server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
     try:
         _look(server, list(source.cameras))
+        if source.opaque:
+            server.scene.set_background_image(np.zeros((1, 1, 3), np.uint8))
         packed = []
         for done, time in enumerate(times, 1):
             handle = show.add(server.scene, time, rows)

@@ -25,14 +25,15 @@ _SOLID = 0.1  # opacity at some time of a particle that is a point of the surfac
 
 @dataclass(frozen=True)
 class Source:
-    """A fitted ``module`` named ``model`` in its config, the ``cameras`` it was trained with, and ``times``
-    in [0, 1].
+    """A fitted ``module`` named ``model`` in its config, the ``cameras`` it was trained with, ``times`` in
+    [0, 1], and whether its pictures were ``opaque``, so that it is seen before black.
     """
 
     module: DynamicSceneModule
     model: str
     cameras: Sequence[Camera]
     times: Sequence[float]
+    opaque: bool = False
 
     @property
     def method(self) -> Method:
