@@ -1,6 +1,8 @@
 import base64
+import io
 import re
 
+import imageio.v3 as iio
 import msgspec
 import numpy as np
 import pytest
@@ -68,6 +70,17 @@ def test_particles_are_splats_of_each_time(particles, tmp_path):
         bytes_of = buffer.view("u1").reshape(-1, 32)[:, 28:] / 255
         np.testing.assert_allclose(bytes_of[:, :3], cloud.colors[chosen], atol=0.005)
         np.testing.assert_allclose(bytes_of[:, 3], cloud.opacity[chosen], atol=0.005)
+
+
+@pytest.mark.parametrize("opaque", [False, True])
+def test_opaque_pictures_are_seen_before_black(ball, tmp_path, opaque):
+    object.__setattr__(ball, "opaque", opaque)
+    export(ball, tmp_path / "html", points=20)
+    _, messages = read(tmp_path / "html")
+    behind = [message["rgb_data"] for _, message in messages if message["type"] == "BackgroundImageMessage"]
+    assert (behind[-1] is not None) is opaque
+    if opaque:
+        assert not iio.imread(io.BytesIO(bytes(behind[-1]))).any()
 
 
 def test_voxels_are_points_of_each_time(ball, tmp_path):
