@@ -41,7 +41,7 @@ def export(config) -> None:
     """Load a run and write it."""
     from pathlib import Path
 
-    from forewarp.export.formats import ABOUT, FORMATS
+    from forewarp.export.formats import ABOUT, FORMATS, write
     from forewarp.files import check_replaceable
     from forewarp.runs.config import saved_config
 
@@ -50,7 +50,6 @@ def export(config) -> None:
     folder = Path(config.out or Path(config.run) / "exports" / config.format)
     check_replaceable(folder, ABOUT)
     # These load torch; mistakes have been answered before.
-    from forewarp.export.formats import write
     from forewarp.export.source import Source
     from forewarp.progress import Counted
     from forewarp.runs.build import build_run, method_name

@@ -93,8 +93,8 @@ def glb(tracks: Tracks, radius: float, turn: Tensor, seconds: float) -> bytes:
     """Make a binary glTF: each point is a small tetrahedron, as mere points are drawn by few programs.
 
     Its corners at the first time are the mesh; every later time is a morph target. The animation lets weights
-    rise and fall so that corners go straight from each time to the next. While a point is less
-    opaque than at other times its tetrahedron is smaller; colours that change are in the targets too.
+    rise and fall so that corners go straight from each time to the next. While a point is less opaque than at
+    other times its tetrahedron is smaller; colours that change are in the targets too.
     """
     from scipy.spatial.transform import Rotation
 

@@ -127,6 +127,7 @@ def _bounds(source: Source) -> Box:
     return box
 
 
+@torch.no_grad()
 def export_mesh(
     source: Source, folder: Path, progress: Progress, *, resolution: int, level: float, files: str, up: str
 ) -> dict:

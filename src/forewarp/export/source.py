@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -13,7 +12,6 @@ from forewarp.evaluation.trajectories import seen_by, spread, surface
 from forewarp.methods.abilities import HasEllipsoids, HasMatter, HasTrajectories
 from forewarp.methods.method import Method
 from forewarp.scene.camera import Camera
-from forewarp.scene.cloud import Cloud
 from forewarp.scene.paths import mean_up
 from forewarp.training.module import DynamicSceneModule
 
@@ -57,18 +55,6 @@ class Source:
             return torch.eye(3, dtype=torch.float64)
         before = mean_up(list(self.cameras)).numpy()
         return torch.from_numpy(Rotation.align_vectors([UP[up]], [before])[0].as_matrix())
-
-    @cached_property
-    def surface(self) -> Cloud:
-        """The canonical matter that some cameras see.
-
-        Raises:
-            ValueError: if there is none.
-        """
-        found = surface(self.module, self.cameras)
-        if not len(found):
-            raise ValueError("run: expected matter that a camera sees, but got none; train it longer")
-        return found
 
     def refuse_without_tracks(self, kind: str) -> None:
         """Refuse a method of which ``tracks_of`` knows nothing.
@@ -116,6 +102,9 @@ def tracks_of(source: Source, count: int, progress: Progress = lambda done, of: 
         source: the scene and its times.
         count: most points, spread evenly over the surface.
         progress: told after each time.
+
+    Raises:
+        ValueError: if no camera sees any.
     """
     times = torch.tensor(source.times, dtype=torch.float32)
     follow = _particles if source.has_ellipsoids else _matter
@@ -149,7 +138,9 @@ def _particles(source: Source, count: int):
 
 
 def _matter(source: Source, count: int):
-    cloud = source.surface
+    cloud = surface(source.module, source.cameras)
+    if not len(cloud):
+        raise ValueError("run: expected matter that a camera sees, but got none; train it longer")
     cloud = cloud[spread(cloud.points, count)]
 
     def at(time: float):
