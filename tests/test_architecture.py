@@ -21,8 +21,10 @@ MAY_IMPORT = {
     "evaluation": LOWER | {"methods", "training"},
     "runs": LOWER | {"methods", "training", "evaluation", "data"},
     "planning": LOWER | {"methods", "training", "evaluation", "data", "report", "runs"},
+    "export": LOWER | {"methods", "training", "evaluation"},
     "replay": {"cli", "runs", "training"},
-    "cli": LOWER | {"methods", "training", "evaluation", "data", "synth", "report", "runs", "planning"},
+    "cli": LOWER
+    | {"methods", "training", "evaluation", "data", "synth", "report", "runs", "planning", "export"},
 }
 CONFIG = {"runs", "planning", "cli"}
 ONLY_IN = {
@@ -30,13 +32,14 @@ ONLY_IN = {
     "lightning": {"data", "training", "evaluation", "runs", "planning", "cli"},
     **{"torchmetrics": {"metrics"}, "numba": {"ops"}, "PIL": {"data"}, "matplotlib": {"report"}},
     **{"trimesh": {"synth"}, "embreex": {"synth"}, "torchvision": set()},
+    **{"skimage": {"export"}, "viser": {"export", "viewer"}},
     **{"imageio": {"drawing", "evaluation", "cli"}, "imageio_ffmpeg": {"drawing", "cli"}},
     "rich": {"progress", "training", "evaluation", "planning", "cli"},
 }
 CONTRACT = {"method", "abilities", "effect", "rows"}  # files of methods/ that packages above may import
 # Attributes of one method only.
 OWN_PARTS = {"radiance", "lattice", "lattices", "motion", "deformation", "inpainter"}
-ABOVE = {"training", "data", "report", "evaluation", "runs", "planning", "cli"}
+ABOVE = {"training", "data", "report", "evaluation", "runs", "planning", "export", "cli"}
 FUNCTION_LINES, FILE_LINES = 60, 350
 REASON = "# long: "
 

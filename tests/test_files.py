@@ -5,7 +5,16 @@ import os
 
 import pytest
 
-from forewarp.files import load_json, read_json, read_text, replace_file, write_json, written_whole
+from forewarp.files import (
+    check_replaceable,
+    folder_written_whole,
+    load_json,
+    read_json,
+    read_text,
+    replace_file,
+    write_json,
+    written_whole,
+)
 
 
 def test_a_file_appears_whole_with_its_folder(tmp_path):
@@ -66,3 +75,23 @@ def test_nothing_is_read_of_a_file_that_is_too_large_or_no_file(tmp_path):
         read_text(tmp_path / "pipe")
     with pytest.raises(IsADirectoryError):
         read_text(tmp_path)
+
+
+def test_a_folder_appears_whole_and_only_ours_is_replaced(tmp_path):
+    path = tmp_path / "made" / "here"
+    for content in ("one", "two"):
+        with folder_written_whole(path, "mark") as part:
+            assert not (path / content).exists()
+            (part / "mark").touch()
+            (part / content).mkdir()
+        assert sorted(file.name for file in path.iterdir()) == ["mark", content]
+    with pytest.raises(ZeroDivisionError), folder_written_whole(path, "mark") as part:
+        (part / "half").write_text("half") // 0
+    assert sorted(file.name for file in path.iterdir()) == ["mark", "two"]
+    assert [p.name for p in path.parent.iterdir()] == ["here"]
+    (tmp_path / "theirs").mkdir()
+    (tmp_path / "theirs" / "a").touch()
+    (tmp_path / "link").symlink_to(path)
+    for other in ("theirs", "link", "theirs/a"):
+        with pytest.raises(ValueError, match="expected no folder, an empty one, or one written before"):
+            check_replaceable(tmp_path / other, "mark")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import shutil
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -47,6 +48,47 @@ def written_whole(path: Path, *, synced: bool = False) -> Iterator[Path]:
     finally:
         with suppress(OSError):
             beside.unlink()
+
+
+@contextmanager
+def folder_written_whole(path: Path, mark: str) -> Iterator[Path]:
+    """Fill the folder that this gives, which takes the place of ``path`` at the end.
+
+    Args:
+        path: appears whole or not at all. See ``check_replaceable`` for what it may hold.
+        mark: name of a file that is in every such folder.
+
+    Raises:
+        ValueError: see ``check_replaceable``.
+        OSError: where it cannot be written; nothing is then left behind.
+    """
+    check_replaceable(path, mark)
+    beside, before = (path.with_name(f".{path.name}.{end}") for end in ("part", "before"))
+    try:
+        for old in (beside, before):  # of a call that was killed
+            shutil.rmtree(old, ignore_errors=True)
+        beside.mkdir(parents=True)
+        yield beside
+        if path.exists():
+            os.replace(path, before)
+        os.replace(beside, path)
+    finally:
+        for old in (beside, before):
+            shutil.rmtree(old, ignore_errors=True)
+
+
+def check_replaceable(path: Path, mark: str) -> None:
+    """Refuse a path at which lies what is not ours: a file, a link, or a folder of files without ``mark``.
+
+    Raises:
+        ValueError: naming ``path``.
+    """
+    ours = path.is_dir() and not path.is_symlink() and ((path / mark).is_file() or not any(path.iterdir()))
+    if os.path.lexists(path) and not ours:
+        raise ValueError(
+            f"{path}: expected no folder, an empty one, or one written before (with {mark}), "
+            "but got other files; choose another"
+        )
 
 
 def replace_file(path: Path, content: bytes | str) -> None:

@@ -12,6 +12,7 @@ from forewarp.drawing.lines import draw_discs, hidden, sample_lines
 from forewarp.evaluation.pictures import within
 from forewarp.methods.abilities import HasMatter, HasTrajectories
 from forewarp.scene.camera import Camera
+from forewarp.scene.cloud import Cloud
 from forewarp.scene.view import Moment, Rendering, View
 from forewarp.training.module import DynamicSceneModule
 
@@ -78,8 +79,17 @@ class Trajectories:
 
 
 @torch.no_grad()
-def surface_points(module: DynamicSceneModule, cameras: Sequence[Camera]) -> Tensor:
-    """Return the points of matter (N, 3), world units, seen by a few cameras at the canonical time."""
+def surface(module: DynamicSceneModule, cameras: Sequence[Camera]) -> Cloud:
+    """Return the matter seen by a few cameras at the canonical time."""
+    matter = module.method.matter()
+    return matter[seen_by(module, cameras, matter.points, matter.size)]
+
+
+@torch.no_grad()
+def seen_by(module: DynamicSceneModule, cameras: Sequence[Camera], points: Tensor, size: float) -> Tensor:
+    """Tell which canonical points (N, 3) lie in a cube, ``size`` world units wide, in which a few cameras see
+    the surface: (N,) bool.
+    """
     canonical = module.method.at(Moment(module.curriculum.canonical_time))
     black, found = torch.zeros(3, device=module.device), []
     for camera in cameras[:: max(1, len(cameras) // _VIEWS)][:_VIEWS]:
@@ -88,9 +98,7 @@ def surface_points(module: DynamicSceneModule, cameras: Sequence[Camera]) -> Ten
         hit = drawn.opacity > 0.5
         found.append(rays.origins[hit] + drawn.depth[hit, None] * rays.directions[hit])
     # At a silhouette the mean depth lies in empty space; points of matter do not.
-    matter = module.method.matter()
-    cells, seen = _cells(matter.points, matter.size), _cells(torch.cat(found), matter.size)
-    return matter.points[torch.isin(cells, seen)]
+    return torch.isin(_cells(points, size), _cells(torch.cat(found), size))
 
 
 def _cells(points: Tensor, size: float) -> Tensor:
@@ -102,28 +110,30 @@ def _cells(points: Tensor, size: float) -> Tensor:
 @torch.no_grad()
 def moving_points(module: DynamicSceneModule, cameras: Sequence[Camera], count: int) -> Tensor:
     """Choose at most ``count`` canonical points (N, 3), spread evenly over the moving surface."""
-    points = surface_points(module, cameras)
+    points = surface(module, cameras).points
     if not len(points):
         return points
     paths = module.method.trajectories(points, torch.linspace(0, 1, 33, device=points.device))
     reach = (paths - points[:, None]).norm(dim=-1).amax(1)
     least = max(_STILL * float(reach.max()), module.method.matter().size)
-    return spread(points[reach > least], count)
+    points = points[reach > least]
+    return points[spread(points, count)]
 
 
 def spread(points: Tensor, count: int) -> Tensor:
-    """Choose ``count`` of the points (N, 3): the first, then repeatedly the one farthest from those chosen.
+    """Choose rows (count,) of points (N, 3): the first, then repeatedly that of the one farthest from those
+    chosen; all rows, if there are no more.
 
     Cost: N * count distances.
     """
     if len(points) <= count:
-        return points
+        return torch.arange(len(points), device=points.device)
     chosen = [0]
     nearest = (points - points[0]).square().sum(-1)
     for _ in range(count - 1):
         chosen.append(int(nearest.argmax()))
         nearest = torch.minimum(nearest, (points - points[chosen[-1]]).square().sum(-1))
-    return points[torch.tensor(chosen, device=points.device)]
+    return torch.tensor(chosen, device=points.device)
 
 
 def order_of(points: Tensor) -> Tensor:

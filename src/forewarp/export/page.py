@@ -1,0 +1,178 @@
+"""``format=html``: one page that shows the scene through time, without a server."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from contextlib import redirect_stdout
+from io import StringIO
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from forewarp.export.source import Progress, Source, tracks_of
+from forewarp.scene.camera import Camera
+from forewarp.scene.frame import spread
+from forewarp.scene.paths import focus_point, mean_up
+
+_ACROSS = 100.0  # units of the page across the cameras: squares of small lengths vanish in half precision
+_TIMES = 12  # times that are kept while particles can be left out instead
+_SPARE = 0.97  # share of the room that is planned for, as a page's size is only estimated
+_FULL, _TRIES = 0.9, 4  # share of the room from which on a page will do; pages that are tried
+
+
+class Show(NamedTuple):
+    """N things that move. ``add(scene, time, rows)`` puts some of them (n,) into viser's scene, by the same
+    name each time; ``part`` is what changes of them later; ``order`` (N,) are their rows, least needed last.
+    """
+
+    name: str
+    add: Callable
+    part: str
+    order: Tensor
+
+
+def export_html(
+    source: Source, folder: Path, progress: Progress, *, points: int, seconds: float, megabytes: float
+) -> dict:
+    """Write ``scene.html``: viser's own page with a recording; particles are splats of one colour from all
+    sides, voxels are points.
+
+    Args:
+        source: the scene and its times.
+        folder: to write into.
+        progress: told after each time.
+        points: most points of a method without particles.
+        seconds: that the recording lasts from time 0 to time 1.
+        megabytes: most of the page; times, then particles are left out so that it fits.
+
+    Returns:
+        what ``about.json`` says of it; ``thinned`` if anything was left out.
+
+    Raises:
+        ValueError: for a method whose points cannot be followed, or if nothing fits.
+    """
+    source.refuse_without_tracks("html")
+    show = _splats(source) if source.has_ellipsoids else _points(source, points)
+    count, total, room = len(show.order), len(source.times), megabytes * 1e6
+    some = [source.times[i] for i in spread(total, 2)]
+    empty = len(page(source, show, [], show.order, seconds))
+    each = (len(page(source, show, some, show.order, seconds)) - empty) / (len(some) * count)
+    best = None
+    for _ in range(_TRIES):
+        rows, times = thinned(count, total, (_SPARE * room - empty) / each)
+        if rows < 1:
+            break
+        kept = [source.times[i] for i in spread(total, times)]
+        text = page(source, show, kept, show.order[:rows], seconds, progress)
+        if len(text) <= room and (best is None or rows * times > best[0] * len(best[1])):
+            best = rows, kept
+            (folder / "scene.html").write_bytes(text)
+            if (rows, times) == (count, total) or len(text) > _FULL * room:
+                break
+        each = (len(text) - empty) / (rows * times)  # times near each other take less room
+    if best is None:
+        raise ValueError(f"megabytes: expected room for the page, but got {megabytes}; raise it")
+    rows, kept = best
+    left_out = {"thinned": f"{rows} of {count} {show.name}, {len(kept)} of {total} times"}
+    return {
+        show.name: rows,
+        "times on the page": kept,
+        "seconds": seconds,
+        "colors": "sRGB, as in the pictures, the mean over directions",
+    } | (left_out if (rows, len(kept)) != (count, total) else {})
+
+
+def thinned(count: int, times: int, room: float) -> tuple[int, int]:
+    """Say how many of ``count`` things at how many ``times`` fit where there is room for ``room`` of one at
+    one time: times are left out first, but not more than to 12.
+
+    >>> thinned(100, 50, 5000), thinned(100, 50, 2000), thinned(100, 50, 600)
+    ((100, 50), (100, 20), (50, 12))
+    """
+    kept = max(min(times, _TIMES), min(times, int(room / count)))
+    return min(count, int(room / kept)), kept
+
+
+def page(
+    source: Source,
+    show: Show,
+    times: Sequence[float],
+    rows: Tensor,
+    seconds: float,
+    progress: Progress = lambda done, of: None,
+) -> bytes:
+    """Record what ``show`` shows at some times; return the page."""
+    import viser
+
+    with redirect_stdout(StringIO()):  # it tells of its server, which viser records nothing without
+        server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    try:
+        _look(server, list(source.cameras))
+        if source.opaque:
+            server.scene.set_background_image(np.zeros((1, 1, 3), np.uint8))
+        packed = []
+        for done, time in enumerate(times, 1):
+            handle = show.add(server.scene, time, rows)
+            packed.append(getattr(handle, show.part).copy())  # viser writes later values into its own
+            progress(done, len(times))
+        if packed:
+            setattr(handle, show.part, packed[0])
+        recording = server.get_scene_serializer()
+        for k in range(1, len(times)):
+            recording.insert_sleep((times[k] - times[k - 1]) * seconds)
+            setattr(handle, show.part, packed[k])
+        if len(times) > 1:
+            recording.insert_sleep((times[-1] - times[0]) * seconds / (len(times) - 1))
+        return recording.as_html().encode()
+    finally:
+        with redirect_stdout(StringIO()):
+            server.stop()
+
+
+def _look(server, cameras: list[Camera]) -> None:
+    """Begin where the first camera stood, with the scene upright."""
+    camera, focus = cameras[0], focus_point(cameras)
+    server.scene.set_up_direction(tuple(mean_up(cameras).tolist()))
+    server.initial_camera.position = tuple(camera.center.tolist())
+    server.initial_camera.look_at = tuple(focus.tolist())
+    server.initial_camera.fov = 2 * math.atan(0.5 * camera.height / camera.fy)
+    server.initial_camera.near, server.initial_camera.far = 0.01 * camera.far, 10 * camera.far
+
+
+def _splats(source: Source) -> Show:
+    """Particles as splats; those that cover little are needed least."""
+    clouds = [source.method.ellipsoids(source.times[i]) for i in spread(len(source.times), _TIMES)]
+    long = clouds[0].covariances.diagonal(dim1=-2, dim2=-1).sum(-1)
+    cover = long * torch.stack([cloud.opacity for cloud in clouds]).amax(0)
+    unit = _unit(source.cameras)
+
+    def add(scene, time: float, rows: Tensor):
+        cloud = source.method.ellipsoids(time)[rows]
+        parts = cloud.centers / unit, cloud.covariances / unit**2, cloud.colors, cloud.opacity[:, None]
+        return scene.add_gaussian_splats("/scene", *(part.cpu().numpy() for part in parts), scale=unit)
+
+    return Show("particles", add, "buffer", cover.argsort(descending=True))
+
+
+def _points(source: Source, count: int) -> Show:
+    """Points of the surface; evenly spread ones come first."""
+    tracks = tracks_of(source, count)
+    colors = tracks.colors[0].numpy()
+
+    def add(scene, time: float, rows: Tensor):
+        places = tracks.positions[list(source.times).index(time)][rows].numpy()
+        options = {"point_size": tracks.size, "point_shape": "circle", "precision": "float32"}
+        return scene.add_point_cloud("/scene", places, colors[rows.numpy()], **options)
+
+    return Show("points", add, "points", torch.arange(len(tracks)))
+
+
+def _unit(cameras: Sequence[Camera]) -> float:
+    """World units that are one unit of the page."""
+    centers = torch.stack([camera.center for camera in cameras])
+    across = float((centers.amax(0) - centers.amin(0)).norm())
+    return max(across, cameras[0].far) / _ACROSS
