@@ -1,4 +1,4 @@
-"""Optional abilities of a method, beside the contract: trajectories, bounds, points."""
+"""Optional abilities of a method, beside the contract: trajectories, bounds, points, ellipsoids."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from torch import Tensor
 
 from forewarp.scene.box import Box
 from forewarp.scene.cloud import Cloud
+from forewarp.scene.ellipsoids import Ellipsoids
 
 
 @runtime_checkable
@@ -34,3 +35,11 @@ class HasMatter(Protocol):
 
     def matter(self) -> Cloud:
         """Return all canonical matter as points."""
+
+
+@runtime_checkable
+class HasEllipsoids(Protocol):
+    """Be a cloud of soft ellipsoids, for programs that draw such."""
+
+    def ellipsoids(self, time: float) -> Ellipsoids:
+        """Return all of them as they are at a time in [0, 1], without gradients; a row is always the same."""

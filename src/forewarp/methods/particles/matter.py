@@ -7,10 +7,10 @@ from torch import Tensor
 
 from forewarp.methods.method import Method
 from forewarp.methods.particles.nodes import nearest
-from forewarp.methods.particles.start import FLAT
-from forewarp.ops.project import Warp, moved
+from forewarp.ops.project import FLAT, Warp, moved, rotations
 from forewarp.scene.box import Box
 from forewarp.scene.cloud import Cloud
+from forewarp.scene.ellipsoids import Ellipsoids
 
 _SOLID, _SEEN = 0.1, 0.02  # opacity from which matter bounds the scene; from which there is any
 _BESIDE = 4  # particles that a point goes with
@@ -25,6 +25,19 @@ def matter_of(method: Method) -> Cloud:
     colors = (0.5 + FLAT * method.color.data[keep, 0]).clamp(0, 1)
     size = 2 * float(method.log_scales.exp().mean())
     return Cloud(points[keep], colors, torch.sigmoid(method.opacity.data[keep, 0]), max(size, 1e-9))
+
+
+@torch.no_grad()
+def ellipsoids_of(method: Method, time: float) -> Ellipsoids:
+    """See ``HasEllipsoids``: all particles, also those at rest and those that have faded."""
+    means, log_scales, turns, opacity, colors = method.gaussians()
+    tints, fades = method.over_time(time)
+    centers, linear = moved(means, method.warp(time))
+    roots = linear @ rotations(turns) * log_scales.exp()[:, None]
+    plain = colors.shape[1] - len(tints)
+    harmonics = colors[:, :plain].clone()
+    harmonics[:, 0] += torch.einsum("t,ntc->nc", tints, colors[:, plain:]) / FLAT
+    return Ellipsoids(centers, roots, torch.sigmoid(opacity @ fades), harmonics)
 
 
 @torch.no_grad()

@@ -13,7 +13,7 @@ from forewarp.methods.method import Method, Snapshot, Start, Step
 from forewarp.methods.particles.camera import Pinholes
 from forewarp.methods.particles.density import renew
 from forewarp.methods.particles.effects import Effects, cosines
-from forewarp.methods.particles.matter import bounds_of, matter_of, paths_of
+from forewarp.methods.particles.matter import bounds_of, ellipsoids_of, matter_of, paths_of
 from forewarp.methods.particles.nodes import Nodes
 from forewarp.methods.particles.planning import EFFECTS, ParticlesPlanning
 from forewarp.methods.particles.rest import come_to_rest
@@ -28,6 +28,7 @@ from forewarp.ops.project import BLUR, Gaussians, Warp
 from forewarp.scene.batch import Asks, Batch
 from forewarp.scene.box import Box
 from forewarp.scene.cloud import Cloud
+from forewarp.scene.ellipsoids import Ellipsoids
 from forewarp.scene.view import Moment
 
 _TIMES = 16  # at which opacity over time is looked at
@@ -321,6 +322,10 @@ class Particles(Method):
     def matter(self) -> Cloud:
         """See ``HasMatter``."""
         return matter_of(self)
+
+    def ellipsoids(self, time: float) -> Ellipsoids:
+        """See ``HasEllipsoids``."""
+        return ellipsoids_of(self, time)
 
     def protocol(self) -> dict[str, str]:
         """See ``Method``."""
