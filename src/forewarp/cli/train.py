@@ -29,6 +29,7 @@ What one types most (options such as --multirun or --config-dir=FOLDER come firs
   run=FOLDER                          the run's folder (runs/<scene>/<model>-<preset>-seed<seed>)
   effects=auto                        find out what the scene calls for, then fit that: see forewarp-plan
   plan=FILE                           fit what a plan says; an override typed beside it wins
+  viewer=true                         show the run on a page while it trains: see forewarp-view
   evaluate=false                      do not measure at the end
   data.held_out=N                     hold N training views out and record their PSNR against training time
   scene=DATASET_NAME                  a scene of the paper below paths.scenes=FOLDER, such as scene=dnerf_hook
@@ -61,6 +62,7 @@ def train(config) -> float | None:
 
         named(config.score)
     config = resumed(config)
+    viewer = is_viewed(config)
     refuse_missing_scene(config)
     # These load torch; mistakes have been answered before.
     from forewarp.report.curve import draw_own
@@ -87,7 +89,8 @@ def train(config) -> float | None:
         check_data(run, changed)
         keep_plan(config)
         print(beginning(run, config), flush=True)
-        module = run.fit()
+        with watched(run, config, viewer):
+            module = run.fit()
         if config.evaluate:
             measure_run(run, module, config)
         else:
@@ -98,6 +101,29 @@ def train(config) -> float | None:
         if steps := noted.get("skipped_steps"):
             print(f"{name}: {steps} broken steps skipped; each lies in {run.folder / name / 'broken'}")
     return value
+
+
+def is_viewed(config) -> bool:
+    """Tell whether a page is asked for; refuse one that cannot be made."""
+    from forewarp.cli.view import require_viewer
+
+    viewer = config.get("viewer", False)
+    if type(viewer) is not bool:
+        raise ValueError(f"viewer: expected true or false, but got {viewer}")
+    if viewer:
+        require_viewer()
+    return viewer
+
+
+def watched(run, config, viewer: bool):
+    """Return a context in which a page shows the run while it trains, if one is asked for."""
+    from contextlib import nullcontext
+
+    if not viewer:
+        return nullcontext()
+    from forewarp.viewer.live import live
+
+    return live(run, host=config.host, port=config.port)
 
 
 def planned(config):

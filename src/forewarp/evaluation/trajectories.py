@@ -28,6 +28,7 @@ class Trajectories:
         count: most points to draw.
         tail: duration of a tail, as a share of the whole time.
         width: line width, as a share of the picture's longer side.
+        points: canonical points (N, 3) to draw; None: chosen by ``moving_points``.
     """
 
     def __init__(
@@ -38,6 +39,7 @@ class Trajectories:
         count: int = 300,
         tail: float = 0.5,
         width: float = 0.004,
+        points: Tensor | None = None,
     ) -> None:
         for ability in (HasTrajectories, HasMatter):
             if not isinstance(module.method, ability):
@@ -48,7 +50,7 @@ class Trajectories:
         self.method, self.tail, self.width = module.method, tail, width
         # The depth of a rendered surface is uncertain by about the size of its matter.
         self.slack = 1.5 * module.method.matter().size
-        self.points = moving_points(module, cameras, count)
+        self.points = moving_points(module, cameras, count) if points is None else points
         self.colors = hues(0.85 * order_of(self.points))
 
     @torch.no_grad()
