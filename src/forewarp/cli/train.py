@@ -84,13 +84,12 @@ def train(config) -> float | None:
             return Score(run, config).of()
     run.datamodule.setup("fit")  # before the folder is made: a mistyped scene leaves nothing behind
     score = Score(run, config)
-    with locked(run.folder):
+    with watched(run, config, viewer), locked(run.folder):
         claim(config)
         check_data(run, changed)
         keep_plan(config)
         print(beginning(run, config), flush=True)
-        with watched(run, config, viewer):
-            module = run.fit()
+        module = run.fit()
         if config.evaluate:
             measure_run(run, module, config)
         else:

@@ -58,7 +58,7 @@ class LiveView(lightning.Callback):
 
     def on_train_end(self, trainer, module) -> None:
         """Say that there is nothing new to see."""
-        self.studio.note = f"{module.settings.name} has ended"
+        self.studio.note = f"{module.settings.name} has ended; what follows is not shown"
         for page in self.studio.pages:
             page.tell(self.studio.note)
 
@@ -78,7 +78,5 @@ def live(run: Run, *, host: str, port: int) -> Iterator[None]:
     with served(studio, host=host, port=port, title=title, folder=folder / "videos") as address:
         run.tell(f"see it: {address}")
         run.callbacks = lambda name, where: [*before(name, where), LiveView(studio, folder.name)]
-        try:
-            yield
-        finally:
-            run.callbacks = before
+        yield
+    run.tell(f"see it again: forewarp-view run={folder}")

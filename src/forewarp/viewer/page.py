@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,8 @@ from forewarp.viewer.visit import Visit
 _MOST_FRUSTA = 200
 _SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "4")
 _MOVED = 1e-3  # of the distance to the pivot: a camera that went farther has left where it stood
+_UPRIGHT = 0.02  # largest sine of the angle by which an upright picture is rolled
+_ARRIVES = 0.5  # seconds in which a camera that was sent somewhere may still tell where it was
 _QUALITY = {True: 92, False: 80}  # of JPEG, at rest and while moving
 
 
@@ -40,7 +43,7 @@ class Page:
         self.studio, self.client, self.folder = studio, client, folder
         self.visit = Visit(studio, self)
         self.focus, self.up = pivot(studio.scene)
-        self.keys, self._splats = [], None
+        self.keys, self._splats, self._stood = [], None, float("-inf")
         self._built = False
         self.status = client.gui.add_markdown("...")
         self.build()
@@ -82,14 +85,14 @@ class Page:
 
     def splats(self, ellipsoids: Ellipsoids) -> None:
         """See ``Surface``."""
-        arrays = [
-            array.cpu().numpy() for array in (ellipsoids.centers, ellipsoids.covariances, ellipsoids.colors)
-        ]
-        opacity = ellipsoids.opacity.cpu().numpy()[:, None]
+        # In half precision squares of small lengths vanish: the box is drawn 100 units large, and scaled.
+        unit = self.studio.scene.box.diagonal / 100
+        parts = ellipsoids.centers / unit, ellipsoids.covariances / unit**2, ellipsoids.colors
+        arrays = [part.cpu().numpy() for part in (*parts, ellipsoids.opacity[:, None])]
         if self._splats is None:
             self.client.scene.set_background_image(np.full((1, 1, 3), 255, np.uint8))
         # The same name takes the place of the one before.
-        self._splats = self.client.scene.add_gaussian_splats("/splats", *arrays, opacity)
+        self._splats = self.client.scene.add_gaussian_splats("/splats", *arrays, scale=unit)
 
     def tell(self, text: str) -> None:
         """See ``Surface``."""
@@ -117,10 +120,12 @@ class Page:
         async def _(event: viser.GuiEvent) -> None:
             if event.client is not None:  # not our own, while time plays
                 visit.change(time=float(self.time.value))
+                self._stands()
 
         @self.play.on_click
         async def _(_: viser.GuiEvent) -> None:
             visit.play(not visit.player.playing)
+            self._stands()
             self.playing_is(visit.player.playing)
 
         @speed.on_update
@@ -145,6 +150,7 @@ class Page:
         @show.on_update
         async def _(_: viser.GuiEvent) -> None:
             visit.change(show=show.value)
+            self._stands()
 
         if self.studio.follows:
 
@@ -177,17 +183,23 @@ class Page:
             visit.change(followed=())
 
     def _add_cameras(self) -> None:
-        gui = self.client.gui
-        with gui.add_folder("Training cameras"):
-            shown = gui.add_checkbox("show them", False)
-            gui.add_markdown("Click one to stand there and see truth | prediction | error.")
+        gui, last = self.client.gui, len(self.studio.scene.train) - 1
+        with gui.add_folder("Training images"):
+            gui.add_markdown("Choose one, or click its camera, for truth | prediction | error.")
+            self.image = gui.add_slider("image", 0, max(last, 1), 1, 0)
+            # Over two pictures beside each other there is no one place for a camera.
+            self.shown = gui.add_checkbox("show cameras", False, visible=len(self.studio.subjects) == 1)
             self.leave = gui.add_button("leave it", visible=False)
-        frusta = self._add_frusta()
+        self._frusta = self._add_frusta()
 
-        @shown.on_update
+        @self.shown.on_update
         async def _(_: viser.GuiEvent) -> None:
-            for frustum in frusta:
-                frustum.visible = shown.value
+            self._show_frusta()
+
+        @self.image.on_update
+        async def _(event: viser.GuiEvent) -> None:
+            if event.client is not None:
+                self.stand(min(self.image.value, last))
 
         @self.leave.on_click
         async def _(_: viser.GuiEvent) -> None:
@@ -202,7 +214,7 @@ class Page:
                 f"/cameras/{index}",
                 fov=vertical_fov(camera),
                 aspect=camera.width / camera.height,
-                scale=0.06 * float((camera.center - self.focus).norm()),
+                scale=0.05 * float((camera.center - self.focus).norm()),
                 thickness=1.5,
                 thickness_units="screen",
                 color=tuple(color),
@@ -251,33 +263,50 @@ class Page:
 
     def stand(self, index: int | None) -> None:
         """Stand where a training image was taken, or leave."""
-        self.leave.visible = index is not None
+        self.visit.stand(index)
+        self._stands()
         if index is not None:
+            self._stood = time.monotonic()
+            self.image.value = index
             frame = self.studio.scene.train[index]
             pose = frame.camera.camera_to_world
             center, ahead = pose[:3, 3], pose[:3, 2]
             away = max(float((self.focus - center) @ ahead), 1e-3 * self.studio.scene.box.diagonal)
             camera = self.client.camera
             with self.client.atomic():
-                camera.up_direction = (-pose[:3, 1]).numpy()
+                # Upright cameras keep turning about the scene's own axis.
+                upright = abs(float(pose[:3, 0] @ self.up)) < _UPRIGHT
+                camera.up_direction = (self.up if upright else -pose[:3, 1]).numpy()
                 camera.position = center.numpy()
                 camera.look_at = (center + away * ahead).numpy()
                 camera.fov = vertical_fov(frame.camera)
             self.time.value = round(frame.time, 3)
             self.playing_is(False)
-            self.tell(f"training image {frame.name}: truth, prediction, error")
-        self.visit.stand(index)
+
+    def _stands(self) -> None:
+        """Show the controls that go with where the page stands."""
+        stands = self.visit.look.stand is not None
+        if self.leave.visible != stands:
+            self.leave.visible = stands
+            self._show_frusta()
+
+    def _show_frusta(self) -> None:
+        visible = self.shown.value and self.visit.look.stand is None
+        with self.client.atomic():
+            for frustum in self._frusta:
+                frustum.visible = visible
 
     def _camera_moved(self, camera: viser.CameraHandle) -> None:
         pose = torch.eye(4, dtype=torch.float64)
         pose[:3, :3] = torch.from_numpy(viser.transforms.SO3(camera.wxyz).as_matrix())
         pose[:3, 3] = torch.from_numpy(np.array(camera.position))
         look = self.visit.look
-        if look.stand is not None and self._is_near(pose, look.pose):
+        arriving = time.monotonic() - self._stood < _ARRIVES
+        if look.stand is not None and (arriving or self._is_near(pose, look.pose)):
             self.visit.refresh()  # the canvas may have another size
             return
-        self.leave.visible = False
         self.visit.change(pose=pose, fov=float(camera.fov))
+        self._stands()
 
     def _is_near(self, pose: Tensor, other: Tensor) -> bool:
         far = float((other[:3, 3] - self.focus).norm())

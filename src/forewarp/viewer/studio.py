@@ -51,19 +51,19 @@ class Studio:
             subject.prepare(look)
 
     def picture(self, look: Look, width: int, height: int, stale: Stale, parts: int = 1) -> Tensor:
-        """Draw a look, (height, width, 3) in [0, 1]: all subjects beside each other; of a training view, truth
-        and then prediction and error of each.
+        """Draw a look, (height, width, 3) in [0, 1]: all subjects beside each other; of a training view,
+        truth, prediction and error, a row for each subject.
 
         Raises:
             Superseded: if ``stale`` says that it is no longer wanted.
         """
-        if look.stand is not None:
-            count = 1 + 2 * len(self.subjects)
-            cell = (width - (count - 1) * _GAP) // count
-            found = [subject.compared(look.stand, cell, height) for subject in self.subjects]
-            row = [found[0][0], *(picture for one in found for picture in one[1:])]
-            return on_white(in_a_row(row, _GAP), width, height)
         count = len(self.subjects)
+        if look.stand is not None:
+            room = (width - 2 * _GAP) // 3, (height - (count - 1) * _GAP) // count
+            rows = [in_a_row(subject.compared(look.stand, *room), _GAP) for subject in self.subjects]
+            gap = rows[0].new_ones(_GAP, rows[0].shape[1], 3)
+            stacked = torch.cat([part for row in rows for part in (gap, row)][1:])
+            return on_white(stacked, width, height)
         wide = self.part_width(width)
         camera = camera_of(look, wide, height, self.scene)
         found = [subject.picture(look, camera, stale, parts) for subject in self.subjects]

@@ -215,6 +215,9 @@ class Visit:
             full = rows == self._full()[1]
             self.surface.show(picture, rest=full)
             size = f"{width} x {rows}, exact" + ("" if full else ", small while moving")
+            if look.stand is not None:
+                name = studio.scene.train[look.stand].name
+                size += f" | training image {name}: truth, prediction, error"
         self.drawn += 1
         rate = self._rate.drew(self._clock())
         note = f"{studio.note} | " if studio.note else ""
