@@ -94,6 +94,10 @@ class Desk:
             pass
         except Exception as error:
             traceback.print_exception(error)
+        finally:
+            with self._changed:
+                if self._newest.get(who) == wish.number:
+                    del self._newest[who]
         return True
 
     def serve_forever(self) -> None:

@@ -80,7 +80,7 @@ def write_film(
     def pictures() -> Iterator[Tensor]:
         for number, look in enumerate(looks):
             tell(number, len(looks))
-            yield visit.request(look, "film")
+            yield visit.request(look)
 
     number = next(n for n in range(1, 10_000) if not (folder / f"path-{n}.mp4").exists())
     return write_video(folder / f"path-{number}.mp4", pictures(), fps=FPS)

@@ -321,7 +321,7 @@ class Page:
             drawn = torch.from_numpy(seen[..., :3] / 255.0)
         else:
             try:
-                drawn = self.visit.request(look, "screenshot", urgency=1)
+                drawn = self.visit.request(look, urgency=1)
             except Superseded:
                 return
         names = "-".join(subject.name for subject in self.studio.subjects)

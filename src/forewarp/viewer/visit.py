@@ -123,12 +123,11 @@ class Visit:
         self.gone = True
         self.studio.desk.leave(self)
 
-    def request(self, look: Look, name: str, urgency: int = 2) -> Tensor:
+    def request(self, look: Look, urgency: int = 2) -> Tensor:
         """Wait for the full picture (H, W, 3) of a look; not for the thread that serves the desk.
 
         Args:
             look: what is drawn; what a browser would draw is rendered.
-            name: a newer request of the same name takes its place.
             urgency: see ``Desk.ask``.
 
         Raises:
@@ -144,11 +143,10 @@ class Visit:
             finally:
                 done.set()
 
-        self.studio.desk.ask((self, name), draw, urgency=urgency)
-        while not done.wait(0.2):
-            if self.gone or self.studio.desk.closed:
-                raise Superseded
-        if not found:
+        self.studio.desk.ask((self, draw), draw, urgency=urgency)
+        while not done.wait(0.2) and not self.gone and not self.studio.desk.closed:
+            pass
+        if self.gone or not found:
             raise Superseded
         return found[0]
 
