@@ -13,9 +13,11 @@ import numpy as np
 import pytest
 
 NEEDED = "FOREWARP_NEED_BROWSER"  # set to 1: a missing browser is a failure
-# Without a graphics card; --no-sandbox as root may not make a sandbox.
+# Without a graphics card; --no-sandbox, as root may make none.
 FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-dev-shm-usage"]
-_PATIENCE = 20.0  # seconds for anything to appear
+# What viser itself logs as an error when it is given splats of any kind.
+_OF_VISER = "computeBoundingSphere(): Computed radius is NaN"
+_PATIENCE = 30.0  # seconds for anything to appear
 
 
 def missing(what: str):
@@ -41,13 +43,15 @@ def chromium():
 
 
 class Tab:
-    """A page of the viewer; ``errors`` is what its console complains of."""
+    """A page of the viewer in a context of its own; ``errors`` is what its console complains of."""
 
-    def __init__(self, browser, address: str, width: int = 900, height: int = 500) -> None:
+    def __init__(self, browser, address: str, width: int = 900, height: int = 640) -> None:
         self.page = browser.new_page(viewport={"width": width, "height": height})
         self.errors = []
         self.page.on("pageerror", lambda error: self.errors.append(str(error)))
-        self.page.on("console", lambda m: m.type == "error" and self.errors.append(m.text))
+        self.page.on(
+            "console", lambda m: m.type == "error" and _OF_VISER not in m.text and self.errors.append(m.text)
+        )
         self.page.goto(address)
         self.page.get_by_text("pictures/s").wait_for(timeout=1000 * _PATIENCE)
         for close in self.page.locator(".mantine-Notification-closeButton").all():
@@ -57,14 +61,16 @@ class Tab:
         """The line that says how fast pictures come."""
         return self.page.get_by_text("pictures/s").inner_text()
 
+    def canvas(self) -> dict[str, float]:
+        """Where the picture is on the page."""
+        return self.page.locator("canvas").first.bounding_box()
+
     def picture(self) -> np.ndarray:
         """What the canvas shows, (H, W, 3) uint8."""
-        box = self.page.locator("canvas").first.bounding_box()
-        box["width"] = min(box["width"], self.page.locator(".mantine-Paper-root").last.bounding_box()["x"])
-        return iio.imread(io.BytesIO(self.page.screenshot(clip=box)))[..., :3]
+        return iio.imread(io.BytesIO(self.page.screenshot(clip=self.canvas())))[..., :3]
 
     def settled(self, text: str = "exact") -> np.ndarray:
-        """The picture once its size is the full one and it stays the same."""
+        """The picture once the full one is there and stays the same."""
         return until(self._still, text)
 
     def _still(self, text: str):
@@ -72,40 +78,57 @@ class Tab:
         if text not in said or "while moving" in said:
             return None
         before = self.picture()
-        self.page.wait_for_timeout(250)
+        self.page.wait_for_timeout(300)
         after = self.picture()
-        return after if (before == after).all() else None
+        return after if (before == after).all() and self.status() == said else None
 
-    def set_time(self, time: float) -> None:
-        """Type a time beside the slider."""
-        field = self.page.locator("input[type=text]").first
-        field.fill(str(time))
+    def type(self, label: str, value: float) -> None:
+        """Type a number into the field of a label."""
+        field = self._row(label).locator("input:not([type=hidden])").last
+        field.fill(str(value))
         field.press("Enter")
+
+    def check(self, label: str, on: bool = True) -> None:
+        """Set a checkbox."""
+        self._row(label).locator("input[type=checkbox]").first.set_checked(on)
+
+    def _row(self, label: str):
+        """The innermost part of the page that holds a label and an input."""
+        return self.page.locator(f'xpath=//label[text()="{label}"]/ancestor::*[.//input][1]').first
 
     def press(self, label: str) -> None:
         """Press a button."""
         self.page.get_by_role("button", name=label, exact=True).click()
 
-    def choose(self, now: str, then: str) -> None:
-        """Choose from a list that shows ``now``."""
-        self.page.locator(f'input[value="{now}"]').first.click()
-        self.page.get_by_role("option", name=then, exact=True).click()
+    def has(self, label: str) -> bool:
+        """Whether a button is there."""
+        return self.page.get_by_role("button", name=label, exact=True).is_visible()
+
+    def choose(self, label: str, option: str) -> None:
+        """Choose from a list."""
+        self._row(label).locator("input:not([type=hidden])").first.click()
+        self.page.get_by_role("option", name=option, exact=True).click()
 
     def turn(self, right: int = 120, down: int = 0) -> None:
         """Drag the camera around."""
         mouse = self.page.mouse
-        mouse.move(250, 300)
+        mouse.move(200, 300)
         mouse.down()
-        mouse.move(250 + right, 300 + down, steps=6)
+        mouse.move(200 + right, 300 + down, steps=6)
         mouse.up()
+
+    def click(self, x: float, y: float) -> None:
+        """Click into the picture; fractions of it."""
+        box = self.canvas()
+        self.page.mouse.click(box["x"] + x * box["width"], box["y"] + y * box["height"])
 
 
 def until(found, *arguments, seconds: float = _PATIENCE):
-    """Wait for a truthy answer."""
+    """Wait for an answer other than None and False."""
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         answer = found(*arguments)
         if answer is not None and answer is not False:
             return answer
         time.sleep(0.1)
-    raise AssertionError(f"waited {seconds} s in vain for {found.__name__}{arguments}")
+    raise AssertionError(f"waited {seconds} s in vain for {getattr(found, '__name__', found)}{arguments}")

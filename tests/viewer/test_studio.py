@@ -3,9 +3,10 @@ from dataclasses import replace
 import pytest
 import torch
 
+from forewarp.scene.camera import look_at
 from forewarp.scene.view import Moment, View
 from forewarp.viewer.desk import Superseded
-from forewarp.viewer.look import Look, camera_of, first_look, reach, vertical_fov
+from forewarp.viewer.look import Look, axis_of, camera_of, first_look, reach, vertical_fov
 from forewarp.viewer.studio import Studio, refuse_other_scene
 from forewarp.viewer.subject import Subject
 from tests.support.known_ball import known_ball
@@ -56,6 +57,18 @@ def test_the_first_look_is_the_first_test_image(data):
 def test_a_camera_anywhere_sees_the_whole_box(center, near, far):
     found = reach(torch.tensor(center, dtype=torch.float64), BOX, [camera_at(0.0)])
     assert found == pytest.approx((near, far))
+
+
+@pytest.mark.parametrize("roll", [0.0, 0.06, -1.0, 3.0])
+@pytest.mark.parametrize("up", [(0, 0, 1), (0, 1, 0)])
+def test_a_page_turns_upright_but_for_the_roll_of_where_it_stands(roll, up):
+    pose, up = camera_at(0.3).camera_to_world.clone(), torch.tensor(up, dtype=torch.float64)
+    c, s = torch.cos(torch.tensor(roll)), torch.sin(torch.tensor(roll))
+    pose[:3, :2] = pose[:3, :2] @ torch.tensor([[c, -s], [s, c]], dtype=torch.float64)
+    axis = axis_of(pose, up)
+    torch.testing.assert_close(look_at(pose[:3, 3], pose[:3, 3] + pose[:3, 2], axis), pose)
+    if roll == 0.0 and up[2] == 1:
+        torch.testing.assert_close(axis, up)
 
 
 def test_colour_depth_and_opacity_are_those_of_the_method_whole_or_in_parts(studio, look):

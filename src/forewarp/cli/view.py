@@ -31,10 +31,10 @@ def require_viewer() -> None:
     Raises:
         ImportError: naming what to install.
     """
-    try:
-        import viser  # noqa: F401
-    except ImportError as error:
-        raise ImportError("viewer: expected viser, but got none; install forewarp[viewer]") from error
+    from importlib.util import find_spec
+
+    if find_spec("viser") is None:
+        raise ImportError("viewer: expected viser, but got none; install forewarp[viewer]")
 
 
 def view(config) -> None:

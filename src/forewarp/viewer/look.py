@@ -75,3 +75,13 @@ def pivot(scene: Scene) -> tuple[Tensor, Tensor]:
     """Return the point that the page's camera turns about, and the upward direction, both (3,)."""
     cameras = [frame.camera for frame in scene.train]
     return focus_point(cameras), mean_up(cameras)
+
+
+def axis_of(pose: Tensor, up: Tensor) -> Tensor:
+    """Return the axis (3,) about which a page turns that stands at ``pose`` (4, 4): the upward direction
+    ``up``, bent just so much that the picture has the pose's roll.
+    """
+    right, above = pose[:3, 0], -pose[:3, 1]
+    axis = up - (up @ right) * right
+    axis = axis if float(axis @ above) > 0 else -axis
+    return axis / axis.norm() if float(axis @ above) > 0.05 else above

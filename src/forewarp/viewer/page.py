@@ -17,7 +17,7 @@ from forewarp.scene.ellipsoids import Ellipsoids
 from forewarp.scene.frame import spread
 from forewarp.viewer.desk import Superseded
 from forewarp.viewer.film import write_film
-from forewarp.viewer.look import pivot, vertical_fov
+from forewarp.viewer.look import axis_of, pivot, vertical_fov
 from forewarp.viewer.studio import Studio
 from forewarp.viewer.subject import SPLATS
 from forewarp.viewer.visit import Visit
@@ -25,7 +25,6 @@ from forewarp.viewer.visit import Visit
 _MOST_FRUSTA = 200
 _SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "4")
 _MOVED = 1e-3  # of the distance to the pivot: a camera that went farther has left where it stood
-_UPRIGHT = 0.02  # largest sine of the angle by which an upright picture is rolled
 _ARRIVES = 0.5  # seconds in which a camera that was sent somewhere may still tell where it was
 _QUALITY = {True: 92, False: 80}  # of JPEG, at rest and while moving
 
@@ -221,6 +220,7 @@ class Page:
                 wxyz=viser.transforms.SO3.from_matrix(camera.camera_to_world[:3, :3].numpy()).wxyz,
                 position=camera.center.numpy(),
                 visible=False,
+                variant="filled",  # a line alone is hard to hit
             )
 
             @frustum.on_click
@@ -274,9 +274,7 @@ class Page:
             away = max(float((self.focus - center) @ ahead), 1e-3 * self.studio.scene.box.diagonal)
             camera = self.client.camera
             with self.client.atomic():
-                # Upright cameras keep turning about the scene's own axis.
-                upright = abs(float(pose[:3, 0] @ self.up)) < _UPRIGHT
-                camera.up_direction = (self.up if upright else -pose[:3, 1]).numpy()
+                camera.up_direction = axis_of(pose, self.up).numpy()
                 camera.position = center.numpy()
                 camera.look_at = (center + away * ahead).numpy()
                 camera.fov = vertical_fov(frame.camera)

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 import viser
 
-from forewarp.viewer.look import first_look, pivot
+from forewarp.viewer.look import axis_of, first_look, pivot
 from forewarp.viewer.page import Page
 from forewarp.viewer.studio import Studio
 
@@ -109,6 +109,7 @@ def _prepare(server: _Server, studio: Studio, title: str) -> None:
     target = center + look.pose[:3, 2] * (ahead if ahead > 0 else studio.scene.box.diagonal)
     server.initial_camera.position = tuple(center.tolist())
     server.initial_camera.look_at = tuple(target.tolist())
+    server.initial_camera.up = tuple(axis_of(look.pose, up).tolist())
     server.initial_camera.fov = look.fov
     server.gui.set_panel_label(title)
     server.gui.configure_theme(show_logo=False, show_share_button=False)
