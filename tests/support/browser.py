@@ -45,17 +45,24 @@ def chromium():
 class Tab:
     """A page of the viewer in a context of its own; ``errors`` is what its console complains of."""
 
-    def __init__(self, browser, address: str, width: int = 900, height: int = 640) -> None:
+    def __init__(self, browser, address: str | None, width: int = 900, height: int = 640) -> None:
         self.page = browser.new_page(viewport={"width": width, "height": height})
         self.errors = []
         self.page.on("pageerror", lambda error: self.errors.append(str(error)))
-        self.page.on(
-            "console", lambda m: m.type == "error" and _OF_VISER not in m.text and self.errors.append(m.text)
-        )
+        self.page.on("console", self._said)
+        if address is not None:
+            self.open(address)
+
+    def open(self, address: str) -> None:
+        """Go to the page and wait for its first picture."""
         self.page.goto(address)
         self.page.get_by_text("pictures/s").wait_for(timeout=1000 * _PATIENCE)
         for close in self.page.locator(".mantine-Notification-closeButton").all():
             close.click()  # "WebGL is running in software mode"
+
+    def _said(self, message) -> None:
+        if message.type == "error" and _OF_VISER not in message.text:
+            self.errors.append(message.text)
 
     def status(self) -> str:
         """The line that says how fast pictures come."""

@@ -101,6 +101,7 @@ def test_a_run_that_is_watched_ends_with_the_same_numbers(tmp_path, monkeypatch)
         yield "http://nowhere"
 
     monkeypatch.setattr(live_view, "served", without_a_server)
+    monkeypatch.setattr("forewarp.viewer.visit.FASTEST", 0.0)
     said = []
     run.tell = said.append
     with live_view.live(run, host="127.0.0.1", port=0):

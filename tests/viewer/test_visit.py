@@ -6,11 +6,12 @@ from time import monotonic
 import pytest
 import torch
 
+from forewarp.viewer import visit as visit_module
 from forewarp.viewer.desk import Desk, Superseded
 from forewarp.viewer.film import FPS, between, write_film
 from forewarp.viewer.pace import GOAL
 from forewarp.viewer.player import WHOLE
-from forewarp.viewer.visit import REST, Visit
+from forewarp.viewer.visit import FASTEST, REST, Visit
 from tests.support.films import read_film
 from tests.support.tiny_scene import ball_scene, camera_at
 
@@ -99,6 +100,23 @@ def serve(studio, jobs=100):
     while done < jobs and studio.desk.serve():
         done += 1
     return done
+
+
+@pytest.fixture(autouse=True)
+def as_fast_as_it_can(monkeypatch):
+    monkeypatch.setattr(visit_module, "FASTEST", 0.0)
+
+
+def test_thirty_pictures_a_second_are_enough(watch, monkeypatch):
+    monkeypatch.setattr(visit_module, "FASTEST", FASTEST)
+    studio = FakeStudio(watch, cost=1e-9)
+    visit, page = visit_of(studio)
+    visit.play(True)
+    begun = watch.now
+    while watch.now < begun + 1:
+        studio.desk.serve()
+        watch.now += 0.001
+    assert 27 <= len(page.pictures) <= 31
 
 
 def test_small_while_moving_and_whole_at_rest(studio, watch):
