@@ -1,7 +1,7 @@
 """``python -m tests.bench.viewer RUN [RUN ...]``: what the viewer shows a second, into docs/viewer.md.
 
-Takes finished runs, of one method each. The page is measured in a headless browser without a graphics card, of
-the first run whose particles a browser can draw. ``--print`` leaves the document as it is.
+Takes finished runs, of one method each. The page is measured in a headless browser without a graphics
+card, with the first run whose particles it can draw. ``--print`` leaves the document as it is.
 """
 
 from __future__ import annotations

@@ -90,13 +90,23 @@ class Watcher:
         pass
 
 
-def test_a_run_that_is_watched_ends_with_the_same_numbers(tmp_path, monkeypatch):
+class Broken(Watcher):
+    """A page whose browser is gone in the worst moments."""
+
+    def build(self):
+        raise ConnectionError("gone while it was built")
+
+    def tell(self, text):
+        raise ConnectionError("gone while it was told")
+
+
+def test_a_run_that_is_watched_ends_with_the_same_numbers(tmp_path, monkeypatch, capsys):
     plain = make_run(tmp_path / "plain", [stage(), stage("fine")]).fit()
     run, pages = make_run(tmp_path / "seen", [stage(), stage("fine")]), []
 
     @contextlib.contextmanager
     def without_a_server(studio, **where):
-        pages.append(Watcher(studio))
+        pages.extend([Watcher(studio), Broken(studio)])
         studio.pages = tuple(pages)
         yield "http://nowhere"
 
@@ -113,6 +123,7 @@ def test_a_run_that_is_watched_ends_with_the_same_numbers(tmp_path, monkeypatch)
     assert pages[0].said[-1] == "fine has ended; what follows is not shown"
     assert said == ["see it: http://nowhere", f"see it again: forewarp-view run={tmp_path / 'seen'}"]
     assert seen.clock.seconds < 5
+    assert "gone while it was built" in capsys.readouterr().err
 
 
 def test_nobody_watching_costs_no_picture(tmp_path, monkeypatch):

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Iterator
+import traceback
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import lightning
 import torch
@@ -33,14 +35,13 @@ class LiveView(lightning.Callback):
 
     def __init__(self, studio: Studio, name: str) -> None:
         self.studio, self.name = studio, name
-        self._last = 0.0
+        self._last = float("-inf")
 
     def on_train_start(self, trainer, module) -> None:
         """Show the method of this stage from now on."""
         self.studio.subjects = [Subject(self.name, module, trainer.datamodule, fresh=_FRESH)]
-        for page in self.studio.pages:
-            page.build()
-        self._last = 0.0
+        self._each_page(lambda page: page.build())
+        self._last = float("-inf")
 
     def on_train_batch_end(self, trainer, module, outputs, batch, batch_idx) -> None:
         """Draw one picture, if one is asked for."""
@@ -48,9 +49,7 @@ class LiveView(lightning.Callback):
         if now - self._last > _EVERY:
             self._last = now
             studio.note = f"{module.settings.name} {module.fraction:.0%}, step {module.global_step}"
-            for page in studio.pages:
-                page.build()
-                page.visit.refresh()
+            self._each_page(lambda page: (page.build(), page.visit.refresh()))
         if studio.desk.is_due():
             with module.clock.paused(), torch.random.fork_rng(devices=[]):
                 studio.subjects[0].forget()
@@ -59,8 +58,15 @@ class LiveView(lightning.Callback):
     def on_train_end(self, trainer, module) -> None:
         """Say that there is nothing new to see."""
         self.studio.note = f"{module.settings.name} has ended; what follows is not shown"
+        self._each_page(lambda page: page.tell(self.studio.note))
+
+    def _each_page(self, do: Callable[[Any], object]) -> None:
+        """Do something with every page; what goes wrong with one is told on stderr and ends no training."""
         for page in self.studio.pages:
-            page.tell(self.studio.note)
+            try:
+                do(page)
+            except Exception as error:
+                traceback.print_exception(error)
 
 
 @contextlib.contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from pathlib import Path
 
@@ -43,16 +44,19 @@ class Page:
         self.visit = Visit(studio, self)
         self.focus, self.up = pivot(studio.scene)
         self.keys, self._splats, self._stood = [], None, float("-inf")
-        self._built = False
+        self._building, self._built = threading.Lock(), False
         self.status = client.gui.add_markdown("...")
         self.build()
 
     def build(self) -> None:
         """Make the controls, once there is a method that says what can be shown."""
-        if self._built or not self.studio.subjects:
-            self.status.content = self.studio.note or "..."
+        with self._building:  # threads of the server and of a run in training may come at once
+            if self._built:
+                return
+            self._built = bool(self.studio.subjects)
+        if not self._built:
+            self.tell(self.studio.note)
             return
-        self._built = True
         if len(self.studio.subjects) == 2:
             left, right = (subject.name for subject in self.studio.subjects)
             self.client.gui.add_markdown(f"left: **{left}**, right: **{right}**")
