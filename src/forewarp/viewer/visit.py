@@ -63,7 +63,7 @@ class Visit:
         self.look = first_look(studio.scene)
         self.player, self._pace, self._rate = Player(), Pace(), Rate()
         self._lock = threading.RLock()
-        self.drawn = 0  # pictures so far
+        self.drawn, self._told = 0, 0.0  # pictures so far; pictures a second
         self.gone = False
 
     def change(self, **what) -> None:
@@ -152,9 +152,12 @@ class Visit:
         return found[0]
 
     def _full(self) -> tuple[int, int]:
-        """Width and height of a picture at rest: the canvas's shape, with at most ``studio.size`` rows."""
+        """Width and height of a picture at rest: the canvas's shape, with at most ``studio.size`` rows.
+
+        On a slow machine the browser tells a canvas of half the pixels that it has.
+        """
         width, height = self.surface.canvas()
-        rows = max(1, min(height, self.studio.size))
+        rows = max(1, min(2 * height, self.studio.size))
         return max(1, round(width * rows / height)), rows
 
     def _draw_moving(self, stale: Stale) -> None:
@@ -164,7 +167,7 @@ class Visit:
         self._pass_time()
         width, full = self._full()
         rows = self._pace.rows(self._kind, full)
-        self._draw(max(1, round(width * rows / full)), rows, stale, 1)
+        self._draw(max(1, round(width * rows / full)), rows, stale)
         if stale():
             return
         if self.player.playing:
@@ -176,7 +179,7 @@ class Visit:
     def _draw_at_rest(self, stale: Stale) -> None:
         width, rows = self._full()
         parts = 1 if self.look.show == "motion" else self._pace.parts(self._kind, width * rows)
-        self._draw(width, rows, stale, parts)
+        self._draw(width, rows, stale, parts, moving=False)
 
     def _pass_time(self) -> None:
         """Let the look follow the time that plays."""
@@ -195,8 +198,11 @@ class Visit:
         look = self.look
         return look.show, look.tails, look.stand is not None
 
-    def _draw(self, width: int, rows: int, stale: Stale, parts: int) -> None:
-        """Draw and show one picture; what the time alone needs does not count for the size of the next."""
+    def _draw(self, width: int, rows: int, stale: Stale, parts: int = 1, *, moving: bool = True) -> None:
+        """Draw and show one picture; what the time alone needs does not count for the size of the next.
+
+        The rate told is that of pictures while something moves; of a single one, what it took.
+        """
         studio, look = self.studio, self.look
         if not studio.subjects:
             self.surface.tell(studio.note)
@@ -220,6 +226,7 @@ class Visit:
                 name = studio.scene.train[look.stand].name
                 size += f" | training image {name}: truth, prediction, error"
         self.drawn += 1
-        rate = self._rate.drew(self._clock())
+        if moving:
+            self._told = self._rate.drew(self._clock()) or 1 / max(seconds, 1e-3)
         note = f"{studio.note} | " if studio.note else ""
-        self.surface.tell(f"{note}{rate:.1f} pictures/s | {1000 * seconds:.0f} ms | {size}")
+        self.surface.tell(f"{note}{self._told:.1f} pictures/s | {1000 * seconds:.0f} ms | {size}")
