@@ -54,6 +54,7 @@ class Subject:
         self._snapshots: OrderedDict[Moment, Snapshot] = OrderedDict()
         self._trajectories: tuple[float, Trajectories] | None = None
         self._canonical: dict[tuple[Point, float], Tensor] = {}
+        self._followed: dict[tuple, Trajectories] = {}
 
     @property
     def follows(self) -> bool:
@@ -75,6 +76,9 @@ class Subject:
         """Forget what was computed from the method's parameters, which have changed."""
         self._snapshots.clear()
         self._canonical.clear()
+        self._followed.clear()
+        if self._trajectories is not None:
+            self._trajectories[1].forget()
 
     @torch.no_grad()
     def freeze(self, moment: Moment) -> Snapshot:
@@ -185,8 +189,10 @@ class Subject:
             return []
         found = [self._all_over()] if look.tails else []
         if look.followed:
-            points = torch.stack([self.canonical(*one) for one in look.followed])
-            found.append(Trajectories(self.module, (), points=points, **_FOLLOWED))
+            if look.followed not in self._followed:
+                points = torch.stack([self.canonical(*one) for one in look.followed])
+                self._followed[look.followed] = Trajectories(self.module, (), points=points, **_FOLLOWED)
+            found.append(self._followed[look.followed])
         return found
 
     def _all_over(self) -> Trajectories:
