@@ -61,8 +61,8 @@ def train(config) -> float | None:
         from forewarp.runs.score import named
 
         named(config.score)
+    viewer = viewer_of(config)  # as typed: a saved config has none
     config = resumed(config)
-    viewer = is_viewed(config)
     refuse_missing_scene(config)
     # These load torch; mistakes have been answered before.
     from forewarp.report.curve import draw_own
@@ -84,7 +84,7 @@ def train(config) -> float | None:
             return Score(run, config).of()
     run.datamodule.setup("fit")  # before the folder is made: a mistyped scene leaves nothing behind
     score = Score(run, config)
-    with watched(run, config, viewer), locked(run.folder):
+    with watched(run, viewer), locked(run.folder):
         claim(config)
         check_data(run, changed)
         keep_plan(config)
@@ -102,27 +102,28 @@ def train(config) -> float | None:
     return value
 
 
-def is_viewed(config) -> bool:
-    """Tell whether a page is asked for; refuse one that cannot be made."""
+def viewer_of(config) -> dict | None:
+    """Return where a page should listen, None if none is asked for; refuse one that cannot be made."""
     from forewarp.cli.view import require_viewer
 
     viewer = config.get("viewer", False)
     if type(viewer) is not bool:
         raise ValueError(f"viewer: expected true or false, but got {viewer}")
-    if viewer:
-        require_viewer()
-    return viewer
+    if not viewer:
+        return None
+    require_viewer()
+    return {"host": config.host, "port": config.port}
 
 
-def watched(run, config, viewer: bool):
+def watched(run, viewer: dict | None):
     """Return a context in which a page shows the run while it trains, if one is asked for."""
     from contextlib import nullcontext
 
-    if not viewer:
+    if viewer is None:
         return nullcontext()
     from forewarp.viewer.live import live
 
-    return live(run, host=config.host, port=config.port)
+    return live(run, **viewer)
 
 
 def planned(config):
