@@ -29,8 +29,10 @@ def test_a_slow_whole_picture_does_not_shrink_those_while_moving():
     before = pace.rows("colour", 800)
     pace.drew("colour", 800, 800 * 800, 25 * GOAL)
     assert pace.rows("colour", 800) == before
-    assert pace.parts("colour", 800 * 800) == 9  # of 0.3 s
-    assert Pace().parts("colour", 800 * 800) == 1
+    assert pace.parts("colour", 800, 800) == 9  # of 0.3 s
+    assert Pace().parts("colour", 800, 800) == 1
+    pace.drew("colour", 72, 72 * 72, 1e4)
+    assert pace.parts("colour", 800, 100) == 100  # a row each
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,6 @@ from collections.abc import Hashable
 GOAL = 0.1  # seconds a picture may take while the camera moves
 _FIRST, _LEAST = 160, 72  # rows of the first picture while moving, and of the smallest
 _PART = 0.3  # seconds that a part of a large picture may take
-_MOST_PARTS = 32
 
 
 class Pace:
@@ -38,10 +37,10 @@ class Pace:
             factor = math.sqrt(GOAL / max(seconds, 1e-4))
             self._rows[kind] = max(_LEAST, rows * min(1.5, max(0.5, factor)))
 
-    def parts(self, kind: Hashable, pixels: int) -> int:
+    def parts(self, kind: Hashable, width: int, rows: int) -> int:
         """Return in how many parts to draw a picture, so that one that is no longer wanted soon ends."""
-        seconds = self._second.get(kind, 0.0) * pixels
-        return max(1, min(_MOST_PARTS, math.ceil(seconds / _PART)))
+        seconds = self._second.get(kind, 0.0) * width * rows
+        return max(1, min(rows, math.ceil(seconds / _PART)))
 
 
 class Rate:

@@ -178,7 +178,9 @@ class Visit:
 
     def _draw_at_rest(self, stale: Stale) -> None:
         width, rows = self._full()
-        parts = 1 if self.look.show == "motion" else self._pace.parts(self._kind, width * rows)
+        parts = 1 if self.look.show == "motion" else self._pace.parts(self._kind, width, rows)
+        if parts > 1:
+            self.surface.tell(f"{self._told:.1f} pictures/s | drawing {width} x {rows}")
         self._draw(width, rows, stale, parts, moving=False)
 
     def _pass_time(self) -> None:
