@@ -72,7 +72,8 @@ def exact_table(studios: list[Studio]) -> str:
         kind, count = subject.module.method.size
         row = [subject.name, f"{count:,} {kind}"]
         for size in SIZES:
-            row += [f"{pictures_a_second(studio, size, moving=moving):.2g}" for moving in ("camera", "time")]
+            rates = [pictures_a_second(studio, size, moving=moving) for moving in ("camera", "time")]
+            row += [f"{rate:.0f}" if rate >= 10 else f"{rate:.2g}" for rate in rates]
         rows.append(row)
         print("  ".join(row), flush=True)
     heads = [f"{size} x {size}, {what} moves" for size in SIZES for what in ("camera", "time")]
