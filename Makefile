@@ -1,5 +1,5 @@
 .DEFAULT_GOAL := help
-.PHONY: help install install-launchers demo demo-particles demo-forward demo-backward tables-vehicle tables-captures demo-lego-complete demo-hypernerf demo-nhr test conformance test-slow test-stability bench bench-gpu effects accuracy-time price-list reproduce-tables lint format clean
+.PHONY: help install install-launchers install-browser demo demo-particles demo-forward demo-backward tables-vehicle tables-captures demo-lego-complete demo-hypernerf demo-nhr test conformance test-slow test-stability bench bench-gpu effects accuracy-time price-list reproduce-tables lint format clean
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -47,6 +47,13 @@ install-launchers: ## add joblib, Ray and submitit for sweeps (launcher=...), an
 	if [ -n "$$links" ]; then export UV_FIND_LINKS="$$links"; fi; \
 	VIRTUAL_ENV="$$PWD/.venv" $(BIN)/uv pip install --compile-bytecode -c constraints.txt -e '.[sweeps]'
 
+install-browser: ## add a headless Chromium and playwright, which test the viewer's page; as root, on Debian
+	command -v chromium >/dev/null || { apt-get update -qq && \
+		apt-get install -y -qq --no-install-recommends chromium fonts-dejavu-core >/dev/null; }
+	links="$$($(BIN)/pip config get global.find-links 2>/dev/null || echo "$$PIP_FIND_LINKS")"; \
+	if [ -n "$$links" ]; then export UV_FIND_LINKS="$$links"; fi; \
+	VIRTUAL_ENV="$$PWD/.venv" $(BIN)/uv pip install --compile-bytecode -c constraints.txt -e '.[browser]'
+
 demo: ## fit the procedural vehicle by three methods, two at once, compare, make a video (three to four minutes)
 	@$(MAKE) --no-print-directory -j2 demo-particles demo-forward demo-backward
 	$(BIN)/forewarp-report kind=compare runs=[$(DEMO)/particles,$(DEMO)/forward,$(DEMO)/backward] out=$(DEMO)
@@ -68,7 +75,7 @@ demo-lego-complete demo-hypernerf demo-nhr:
 test: ## run the tests except the slow ones
 	$(BIN)/pytest --no-cov -m "not slow"
 
-test-slow: ## run the slow tests: killed runs, every method on every dataset, every sweep's jobs, the wheel
+test-slow: ## run the slow tests: the page in a browser, killed runs, every method on every dataset, every sweep's jobs, the wheel
 	$(BIN)/pytest --no-cov -m slow
 
 conformance: ## test every method against the contract, slow cases too, and write docs/conformance.md

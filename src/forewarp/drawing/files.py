@@ -29,6 +29,11 @@ def write_png(path: Path, picture: Tensor) -> Path:
     return path
 
 
+def png_bytes(picture: Tensor) -> bytes:
+    """Encode (H, W, 3) in [0, 1]."""
+    return iio.imwrite("<bytes>", to_bytes(picture), extension=".png")
+
+
 def write_video(path: Path, pictures: Iterable[Tensor], *, fps: float) -> Path:
     """Write pictures (H, W, 3) in [0, 1], taken one by one, in the format that the suffix names.
 

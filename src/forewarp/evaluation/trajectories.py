@@ -17,6 +17,7 @@ from forewarp.scene.view import Moment, Rendering, View
 from forewarp.training.module import DynamicSceneModule
 
 _VIEWS, _VIEW_SIZE = 24, 80  # number and pixels of the views that find the surface
+_STEPS = 60  # vertices of a path through all time
 _STILL = 0.15  # a moving point travels at least this share of the farthest travel
 
 
@@ -29,6 +30,7 @@ class Trajectories:
         count: most points to draw.
         tail: duration of a tail, as a share of the whole time.
         width: line width, as a share of the picture's longer side.
+        points: canonical points (N, 3) to draw; None: chosen by ``moving_points``.
     """
 
     def __init__(
@@ -39,6 +41,7 @@ class Trajectories:
         count: int = 300,
         tail: float = 0.5,
         width: float = 0.004,
+        points: Tensor | None = None,
     ) -> None:
         for ability in (HasTrajectories, HasMatter):
             if not isinstance(module.method, ability):
@@ -49,7 +52,8 @@ class Trajectories:
         self.method, self.tail, self.width = module.method, tail, width
         # The depth of a rendered surface is uncertain by about the size of its matter.
         self.slack = 1.5 * module.method.matter().size
-        self.points = moving_points(module, cameras, count)
+        self.points = moving_points(module, cameras, count) if points is None else points
+        self._paths: Tensor | None = None
         self.colors = hues(0.85 * order_of(self.points))
 
     @torch.no_grad()
@@ -57,9 +61,7 @@ class Trajectories:
         """Draw the tails over ``picture`` (H, W, 3) of ``camera`` at ``time``; ``drawn`` is its rendering."""
         if not len(self.points):
             return picture
-        begin = max(0.0, time - self.tail)
-        times = torch.linspace(begin, time, 2 + int(60 * (time - begin)), device=self.points.device)
-        paths = self.method.trajectories(self.points, times)
+        paths, times = self._tails(time)
         pixels, z = camera.project(paths)
         distance = (paths - camera.center.to(paths)).norm(dim=-1)
         strength = (1 - (time - times) / self.tail).clamp(0, 1).expand_as(distance)
@@ -71,6 +73,25 @@ class Trajectories:
         radius = max(0.35, 0.5 * self.width * max(picture.shape[:2]))
         picture = self._draw(picture, marks, colors[line], surface, radius)
         return self._draw(picture, vertices[:, -1], colors, surface, 1.8 * radius)
+
+    def forget(self) -> None:
+        """Forget where the points were, as the method has changed."""
+        self._paths = None
+
+    def _tails(self, time: float) -> tuple[Tensor, Tensor]:
+        """Return the points' tails (N, T, 3) at a time, and when they were there (T,), the time itself last.
+
+        Cost: at the first call the method follows the points through all time; then linear interpolation.
+        """
+        every = torch.linspace(0, 1, _STEPS + 1, device=self.points.device)
+        if self._paths is None:
+            self._paths = self.method.trajectories(self.points, every)
+        begin = max(0.0, time - self.tail)
+        between = every[(every > begin) & (every < time)]
+        times = torch.cat([between.new_tensor([begin]), between, between.new_tensor([time])])
+        at = times * _STEPS
+        low = at.floor().long().clamp(max=_STEPS - 1)
+        return torch.lerp(self._paths[:, low], self._paths[:, low + 1], (at - low)[:, None]), times
 
     def _draw(self, picture: Tensor, marks: Tensor, colors: Tensor, surface: Tensor, radius: float) -> Tensor:
         at, distance, strength = marks[:, :2], marks[:, 2], marks[:, 3]

@@ -1,0 +1,86 @@
+"""A video along a path through key views."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from forewarp.drawing.files import write_video
+from forewarp.viewer.look import Look
+from forewarp.viewer.visit import Visit
+
+FPS = 25.0  # pictures a second of a video
+
+
+def between(keys: Sequence[Look], count: int) -> list[Look]:
+    """Make ``count`` looks along a smooth path through key views, evenly spaced from the first to the last.
+
+    Places follow a cubic spline, turns a spline of rotations, both through every key; times and angles of
+    view go monotonically from key to key. What else is shown is as in the key before.
+
+    Raises:
+        ValueError: for fewer than 2 keys or pictures.
+    """
+    from scipy.interpolate import CubicSpline, PchipInterpolator  # late, as their import takes time
+    from scipy.spatial.transform import Rotation, RotationSpline
+
+    if len(keys) < 2 or count < 2:
+        raise ValueError(
+            f"key views: expected at least 2 and 2 pictures, but got {len(keys)} and {count}; "
+            "go to another view or time and add it"
+        )
+    poses = np.stack([key.pose.double().numpy() for key in keys])
+    at, along = np.arange(len(keys)), np.linspace(0, len(keys) - 1, count)
+    kind = CubicSpline if len(keys) > 2 else PchipInterpolator
+    places = kind(at, poses[:, :3, 3])(along)
+    turns = RotationSpline(at, Rotation.from_matrix(poses[:, :3, :3]))(along).as_matrix()
+    times, angles = (
+        PchipInterpolator(at, [getattr(key, name) for key in keys])(along) for name in ("time", "fov")
+    )
+    looks = []
+    for i, place in enumerate(places):
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = turns[i], place
+        before = keys[min(int(along[i] + 1e-9), len(keys) - 1)]
+        time = min(1.0, max(0.0, float(times[i])))
+        looks.append(
+            replace(before, pose=torch.from_numpy(pose), time=time, fov=float(angles[i]), stand=None)
+        )
+    return looks
+
+
+def write_film(
+    folder: Path, visit: Visit, keys: Sequence[Look], seconds: float, tell: Callable[[int, int], None]
+) -> Path:
+    """Write a video through key views into ``folder``, as ``path-<number>.mp4`` that is not there yet.
+
+    Its pictures are drawn at the desk, after what pages wait for; not for the thread that serves it.
+
+    Args:
+        folder: is made if need be.
+        visit: draws the pictures, as large as at rest.
+        keys: see ``between``.
+        seconds: how long it plays.
+        tell: called with the pictures done, and of how many.
+
+    Returns:
+        the file.
+
+    Raises:
+        ValueError: for fewer than 2 keys.
+        Superseded: if the page leaves; nothing is written then.
+    """
+    looks = between(keys, max(2, round(seconds * FPS)))
+
+    def pictures() -> Iterator[Tensor]:
+        for number, look in enumerate(looks):
+            tell(number, len(looks))
+            yield visit.request(look)
+
+    number = next(n for n in range(1, 10_000) if not (folder / f"path-{n}.mp4").exists())
+    return write_video(folder / f"path-{number}.mp4", pictures(), fps=FPS)
