@@ -22,6 +22,19 @@ _ACROSS = 100.0  # units of the page across the cameras: squares of small length
 _TIMES = 12  # times that are kept while particles can be left out instead
 _SPARE = 0.97  # share of the room that is planned for, as a page's size is only estimated
 _FULL, _TRIES = 0.9, 4  # share of the room from which on a page will do; pages that are tried
+# Splats are sorted by a worker, whose code lies at a "blob:" address; browsers refuse that to a page that was
+# opened as a file, and take it from a "data:" address.
+WORKERS = """<script>if (location.protocol === "file:") {
+  const Plain = Worker;
+  window.Worker = class extends Plain {
+    constructor(place, options) {
+      const code = new XMLHttpRequest();
+      code.open("GET", place, false);
+      code.send();
+      super("data:text/javascript;charset=utf-8," + encodeURIComponent(code.responseText), options);
+    }
+  };
+}</script>"""
 
 
 class Show(NamedTuple):
@@ -127,7 +140,7 @@ def page(
             setattr(handle, show.part, packed[k])
         if len(times) > 1:
             recording.insert_sleep((times[-1] - times[0]) * seconds / (len(times) - 1))
-        return recording.as_html().encode()
+        return recording.as_html().replace("<head>", f"<head>{WORKERS}", 1).encode()
     finally:
         with redirect_stdout(StringIO()):
             server.stop()
