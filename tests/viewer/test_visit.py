@@ -175,7 +175,7 @@ def test_two_pages_keep_their_own(studio, watch):
     one.change(time=0.25)
     two.change(time=0.75, show="depth")
     serve(studio)
-    assert page.pictures[-1][2], other.pictures[-1][2] == (0.25, 0.75)
+    assert (page.pictures[-1][2], other.pictures[-1][2]) == (0.25, 0.75)
     assert (one.look.show, two.look.show) == ("colour", "depth")
     one.play(True)
     watch.now += 0.1 * WHOLE
@@ -272,6 +272,16 @@ def test_a_browser_draws_splats_by_itself(studio, watch):
     serve(studio)
     assert page.pictures == ["splats at 0.5"]
     assert "one colour from all sides" in page.said[-1]
+
+
+def test_a_training_view_becomes_whole_at_rest_also_where_splats_are_chosen(studio, watch):
+    visit, page = visit_of(studio)
+    visit.change(show="splats")
+    visit.stand(2)
+    serve(studio)
+    watch.now += REST
+    serve(studio)
+    assert page.pictures[-1][:2] == ((400, 533), True)
 
 
 def test_without_a_method_it_says_why(studio):

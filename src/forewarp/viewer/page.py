@@ -18,9 +18,8 @@ from forewarp.scene.ellipsoids import Ellipsoids
 from forewarp.scene.frame import spread
 from forewarp.viewer.desk import Superseded
 from forewarp.viewer.film import write_film
-from forewarp.viewer.look import axis_of, pivot, vertical_fov
+from forewarp.viewer.look import SPLATS, axis_of, pivot, vertical_fov
 from forewarp.viewer.studio import Studio
-from forewarp.viewer.subject import SPLATS
 from forewarp.viewer.visit import Visit
 
 _MOST_FRUSTA = 200
@@ -317,7 +316,7 @@ class Page:
 
     def _screenshot(self) -> None:
         look = self.visit.look
-        if look.show == SPLATS:
+        if look.by_browser:
             width, height = self.canvas()
             seen = self.client.get_render(height, width, transport_format="png", timeout=30)
             drawn = torch.from_numpy(seen[..., :3] / 255.0)

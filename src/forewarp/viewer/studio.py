@@ -10,8 +10,8 @@ from torch import Tensor
 from forewarp.drawing.colors import in_a_row
 from forewarp.scene.frame import Scene
 from forewarp.viewer.desk import Desk, Stale
-from forewarp.viewer.look import Look, Point, camera_of
-from forewarp.viewer.subject import SPLATS, Subject
+from forewarp.viewer.look import SPLATS, Look, Point, camera_of
+from forewarp.viewer.subject import Subject
 
 LEAST_SIZE = 400  # rows of a picture at rest, if the images have fewer
 _GAP = 4  # white pixels between two pictures

@@ -18,9 +18,8 @@ from forewarp.scene.ellipsoids import Ellipsoids
 from forewarp.scene.view import Moment, Rendering, View
 from forewarp.training.module import DynamicSceneModule
 from forewarp.viewer.desk import Stale, Superseded
-from forewarp.viewer.look import Look, Point
+from forewarp.viewer.look import SPLATS, Look, Point
 
-SPLATS = "splats"  # drawn by the browser; all other names are pictures that the method renders
 _KEPT = 2  # snapshots: of the time shown, and of the canonical time
 _FOLLOWED = {"tail": 1.0, "width": 0.008}
 _SOLID = 0.5  # opacity from which a pixel shows something that can be followed

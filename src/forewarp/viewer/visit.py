@@ -16,7 +16,6 @@ from forewarp.viewer.look import Look, first_look, vertical_fov
 from forewarp.viewer.pace import Pace, Rate
 from forewarp.viewer.player import Player
 from forewarp.viewer.studio import Studio
-from forewarp.viewer.subject import SPLATS
 
 FASTEST = 1 / 30  # seconds between two pictures while time plays
 REST = 0.15  # seconds without a change after which the camera is at rest
@@ -135,7 +134,7 @@ class Visit:
             Superseded: if the page has left, or everything ends.
         """
         done, found = threading.Event(), []
-        look = replace(look, show="colour") if look.show == SPLATS else look
+        look = replace(look, show="colour") if look.by_browser else look
 
         def draw(stale: Stale) -> None:
             try:
@@ -173,7 +172,7 @@ class Visit:
         if self.player.playing:
             wait = max(0.0, FASTEST - (self._clock() - begun))
             self.studio.desk.ask((self, "picture"), self._draw_moving, after=wait)
-        elif rows < full and self.look.show != SPLATS:
+        elif rows < full and not self.look.by_browser:
             self.studio.desk.ask((self, "picture"), self._draw_at_rest, urgency=1, after=REST)
 
     def _draw_at_rest(self, stale: Stale) -> None:
@@ -210,7 +209,7 @@ class Visit:
             self.surface.tell(studio.note)
             return
         begun = self._clock()
-        if look.show == SPLATS and look.stand is None:
+        if look.by_browser:
             self.surface.splats(studio.subjects[0].ellipsoids(look.time))
             seconds, size = self._clock() - begun, "drawn by the browser, one colour from all sides"
         else:
