@@ -210,6 +210,22 @@ def test_it_plays_and_follows_the_time(studio, watch, loop):
     assert page.pictures[-1][1] is True
 
 
+def test_it_plays_also_if_begun_just_before_the_picture_at_rest_is_asked_for(studio, watch):
+    visit, page = visit_of(studio)
+    ask = studio.desk.ask
+
+    def late(who, job, **when):
+        if job == visit._draw_at_rest and not visit.player.playing:
+            visit.play(True)
+        ask(who, job, **when)
+
+    studio.desk.ask = late
+    serve(studio, 1)
+    watch.now += REST
+    serve(studio, 3)
+    assert len(page.times) > 1
+
+
 def test_the_slider_while_it_plays_moves_the_time(studio, watch):
     visit, page = visit_of(studio)
     visit.play(True)
@@ -322,6 +338,10 @@ def test_a_single_key_makes_no_video():
         between(keys_of(0.5), 50)
 
 
+def out_of_memory():
+    raise RuntimeError("no memory")
+
+
 def test_a_film_through_its_keys(tmp_path):
     studio = FakeStudio(Watch())
     studio.desk = Desk(monotonic)
@@ -336,6 +356,20 @@ def test_a_film_through_its_keys(tmp_path):
         brightness = film.mean((1, 2, 3))
         assert (brightness[1:] > brightness[:-1]).all()
     assert told[:10] == [(i, 10) for i in range(10)]
+    page = visit.surface
+
+    def meanwhile(number, of):
+        if number == 3:
+            page.canvas = lambda: (300, 100)  # the window is resized, and another page makes a film
+            write_film(tmp_path, Visit(studio, FakePage()), keys_of(0.0, 1.0), 0.4, lambda *_: None)
+
+    assert write_film(tmp_path, visit, keys_of(0.0, 1.0), 0.4, meanwhile).name == "path-3.mp4"
+    assert [len(read_film(tmp_path / f"path-{n}.mp4", 64, 84)) for n in (3, 4)] == [10, 10]
+    for number in (3, 4):
+        (tmp_path / f"path-{number}.mp4").unlink()
+    studio.interrupt = out_of_memory
+    with pytest.raises(RuntimeError, match="no memory"):
+        write_film(tmp_path, visit, keys_of(0.0, 1.0), 0.4, lambda *_: None)
     studio.interrupt = lambda: told.append("left") or visit.leave()
     with pytest.raises(Superseded):
         write_film(tmp_path, visit, keys_of(0.0, 1.0), 0.4, lambda *_: None)

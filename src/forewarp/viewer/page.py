@@ -162,7 +162,12 @@ class Page:
 
         @picture.on_click
         def _(_: viser.GuiEvent) -> None:  # in a thread of its own, as it waits
-            self._screenshot()
+            try:
+                self._screenshot()
+            except Superseded:
+                pass
+            except Exception as error:
+                self.tell(f"no screenshot: {told(error)}")
 
     def _add_following(self) -> None:
         gui, visit, scene = self.client.gui, self.visit, self.client.scene
@@ -321,10 +326,7 @@ class Page:
             seen = self.client.get_render(height, width, transport_format="png", timeout=30)
             drawn = torch.from_numpy(seen[..., :3] / 255.0)
         else:
-            try:
-                drawn = self.visit.request(look, urgency=1)
-            except Superseded:
-                return
+            drawn = self.visit.request(look, urgency=1)
         names = "-".join(subject.name for subject in self.studio.subjects)
         name = f"{self.studio.scene.name}-{names}-{look.show}-{look.time:.3f}.png"
         self.client.send_file_download(name, png_bytes(drawn), save_immediately=True)
@@ -340,8 +342,14 @@ class Page:
             )
         except Superseded:
             return
-        except (ValueError, OSError) as error:
-            say(str(error))
+        except Exception as error:  # also what went wrong while a picture was drawn
+            say(f"no video: {told(error)}")
             return
         say(f"written: {file}")
         self.client.send_file_download(file.name, file.read_bytes(), save_immediately=True)
+
+
+def told(error: Exception) -> str:
+    """Say what went wrong; its kind too, where its words are none of ours."""
+    ours = isinstance(error, ValueError) or getattr(error, "errno", None) is not None
+    return str(error) if ours else f"{type(error).__name__}: {error}"

@@ -103,7 +103,7 @@ class Visit:
         """Draw the trajectory of the point seen at ``x y``, fractions of the canvas, besides others."""
 
         def find(stale: Stale) -> None:
-            look, (width, height) = self.look, self._full()
+            look, (width, height) = self.look, self.full_size()
             if look.stand is not None:
                 return
             point = self.studio.point_at(look, x, y, width, height)
@@ -123,34 +123,41 @@ class Visit:
         self.gone = True
         self.studio.desk.leave(self)
 
-    def request(self, look: Look, urgency: int = 2) -> Tensor:
+    def request(self, look: Look, urgency: int = 2, size: tuple[int, int] | None = None) -> Tensor:
         """Wait for the full picture (H, W, 3) of a look; not for the thread that serves the desk.
 
         Args:
             look: what is drawn; what a browser would draw is rendered.
             urgency: see ``Desk.ask``.
+            size: width and height; None: those of the page at rest, ``full_size()``.
 
         Raises:
             Superseded: if the page has left, or everything ends.
+            Exception: what went wrong while it was drawn.
         """
-        done, found = threading.Event(), []
+        done, found, failed = threading.Event(), [], []
         look = replace(look, show="colour") if look.by_browser else look
 
         def draw(stale: Stale) -> None:
             try:
                 self.studio.prepare(look)
-                found.append(self.studio.picture(look, *self._full(), stale))
+                found.append(self.studio.picture(look, *(size or self.full_size()), stale))
+            except Exception as error:
+                failed.append(error)
+                raise
             finally:
                 done.set()
 
         self.studio.desk.ask((self, draw), draw, urgency=urgency)
         while not done.wait(0.2) and not self.gone and not self.studio.desk.closed:
             pass
+        if failed and not self.gone:
+            raise failed[0]
         if self.gone or not found:
             raise Superseded
         return found[0]
 
-    def _full(self) -> tuple[int, int]:
+    def full_size(self) -> tuple[int, int]:
         """Width and height of a picture at rest: the canvas's shape, with at most ``studio.size`` rows.
 
         On a slow machine the browser tells a canvas of half the pixels that it has.
@@ -164,7 +171,7 @@ class Visit:
             return
         begun = self._clock()
         self._pass_time()
-        width, full = self._full()
+        width, full = self.full_size()
         rows = self._pace.rows(self._kind, full)
         self._draw(max(1, round(width * rows / full)), rows, stale)
         if stale():
@@ -176,7 +183,12 @@ class Visit:
             self.studio.desk.ask((self, "picture"), self._draw_at_rest, urgency=1, after=REST)
 
     def _draw_at_rest(self, stale: Stale) -> None:
-        width, rows = self._full()
+        if self.gone:
+            return
+        if self.player.playing:  # begun after this was asked for
+            self._draw_moving(stale)
+            return
+        width, rows = self.full_size()
         parts = 1 if self.look.show == "motion" else self._pace.parts(self._kind, width, rows)
         if parts > 1:
             self.surface.tell(f"{self._told:.1f} pictures/s | drawing {width} x {rows}")
@@ -220,7 +232,7 @@ class Visit:
             self._pace.drew(self._kind, rows, width * rows, self._clock() - prepared)
             if stale() and parts > 1:
                 raise Superseded
-            full = rows == self._full()[1]
+            full = rows == self.full_size()[1]
             self.surface.show(picture, rest=full)
             size = f"{width} x {rows}, exact" + ("" if full else ", small while moving")
             if look.stand is not None:
