@@ -36,6 +36,9 @@ class FakeStudio:
         self.desk, self.subjects = Desk(watch), [self]
         self.looks, self.interrupt = [], None
 
+    def known(self, look):
+        return look
+
     def prepare(self, look):
         self.watch.now += 0.001
 
@@ -270,6 +273,16 @@ def test_a_training_view_is_left_by_a_new_camera_time_or_choice(studio, watch):
     assert visit.look.stand is None
 
 
+def test_a_training_view_or_a_time_that_is_none_becomes_the_nearest(studio):
+    visit, _ = visit_of(studio)
+    for asked, found in ((-1, 0), (3, 3), (4, 3), (10**9, 3)):
+        assert (visit.stand(asked), visit.look.stand) == (found, found)
+    assert (visit.stand(None), visit.look.stand) == (None, None)
+    for asked, found in ((-0.5, 0.0), (7.0, 1.0), (float("nan"), 0.0)):
+        visit.change(time=asked)
+        assert visit.look.time == found
+
+
 def test_a_clicked_point_is_added_to_those_followed(studio):
     visit, page = visit_of(studio)
     visit.change(time=0.25)
@@ -336,6 +349,16 @@ def test_a_path_goes_through_its_keys_smoothly(times):
 def test_a_single_key_makes_no_video():
     with pytest.raises(ValueError, match="key views: expected at least 2 and 2 pictures, but got 1 and 50"):
         between(keys_of(0.5), 50)
+
+
+@pytest.mark.parametrize(("seconds", "pictures"), [(1e9, 15_000), (-1.0, 2), (float("nan"), 2)])
+def test_a_film_is_as_long_as_it_may_be(tmp_path, seconds, pictures):
+    visit, told = Visit(FakeStudio(Watch()), FakePage()), []
+    visit.leave()
+    with pytest.raises(Superseded):
+        write_film(tmp_path, visit, keys_of(0.0, 1.0), seconds, lambda *count: told.append(count))
+    assert told == [(0, pictures)]
+    assert list(tmp_path.iterdir()) == []
 
 
 def out_of_memory():

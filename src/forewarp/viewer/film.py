@@ -16,6 +16,7 @@ from forewarp.viewer.look import Look
 from forewarp.viewer.visit import Visit
 
 FPS = 25.0  # pictures a second of a video
+SHORTEST, LONGEST = 0.1, 600.0  # seconds of a video
 
 
 def between(keys: Sequence[Look], pictures: int) -> list[Look]:
@@ -66,7 +67,7 @@ def write_film(
         folder: is made if need be.
         visit: draws the pictures, all as large as it shows them at rest now.
         keys: see ``between``.
-        seconds: how long it plays.
+        seconds: how long it plays; ``SHORTEST`` to ``LONGEST``, others become the nearest of these.
         tell: called with the pictures done, and of how many.
 
     Returns:
@@ -77,6 +78,7 @@ def write_film(
         Superseded: if the page leaves.
         Exception: what went wrong while a picture was drawn. In all cases nothing is left behind.
     """
+    seconds = min(LONGEST, max(SHORTEST, seconds))
     looks = between(keys, max(2, round(seconds * FPS)))
 
     size = visit.full_size()  # of all pictures, also where the window gets another size meanwhile

@@ -67,6 +67,8 @@ class Visit:
 
     def change(self, **what) -> None:
         """Change parts of the look. A new camera, time or choice leaves the training view it stood in."""
+        if "time" in what:
+            what["time"] = min(1.0, max(0.0, what["time"]))
         with self._lock:
             leaves = "stand" not in what and set(what) & {"pose", "time", "show"}
             self.look = replace(self.look, **({"stand": None} if leaves else {}), **what)
@@ -74,15 +76,21 @@ class Visit:
                 self.player.play(self.look.time, self._clock())
         self.refresh()
 
-    def stand(self, index: int | None) -> None:
-        """Stand where a training image was taken, at its time, and compare; None: leave."""
+    def stand(self, index: int | None) -> int | None:
+        """Stand where a training image was taken, at its time, and compare; None: leave.
+
+        Returns:
+            the index, or the nearest that there is.
+        """
         if index is None:
             self.change(stand=None)
-            return
+            return None
+        index = min(max(index, 0), len(self.studio.scene.train) - 1)
         frame = self.studio.scene.train[index]
         self.play(False)
         pose, fov = frame.camera.camera_to_world, vertical_fov(frame.camera)
         self.change(stand=index, pose=pose, fov=fov, time=frame.time)
+        return index
 
     def play(self, playing: bool) -> None:
         """Let time pass, or stop it."""
@@ -104,7 +112,7 @@ class Visit:
 
         def find(stale: Stale) -> None:
             look, (width, height) = self.look, self.full_size()
-            if look.stand is not None:
+            if look.stand is not None or not self.studio.follows:
                 return
             point = self.studio.point_at(look, x, y, width, height)
             if point is None:
@@ -140,8 +148,9 @@ class Visit:
 
         def draw(stale: Stale) -> None:
             try:
-                self.studio.prepare(look)
-                found.append(self.studio.picture(look, *(size or self.full_size()), stale))
+                shown = self.studio.known(look)
+                self.studio.prepare(shown)
+                found.append(self.studio.picture(shown, *(size or self.full_size()), stale))
             except Exception as error:
                 failed.append(error)
                 raise
@@ -171,6 +180,7 @@ class Visit:
             return
         begun = self._clock()
         self._pass_time()
+        self._keep_known()
         width, full = self.full_size()
         rows = self._pace.rows(self._kind, full)
         self._draw(max(1, round(width * rows / full)), rows, stale)
@@ -188,6 +198,7 @@ class Visit:
         if self.player.playing:  # begun after this was asked for
             self._draw_moving(stale)
             return
+        self._keep_known()
         width, rows = self.full_size()
         parts = 1 if self.look.show == "motion" else self._pace.parts(self._kind, width, rows)
         if parts > 1:
@@ -205,6 +216,12 @@ class Visit:
         self.surface.time_is(time)
         if ended:
             self.surface.playing_is(False)
+
+    def _keep_known(self) -> None:
+        """Drop what the method of this stage cannot show."""
+        if self.studio.subjects:
+            with self._lock:
+                self.look = self.studio.known(self.look)
 
     @property
     def _kind(self) -> tuple:
