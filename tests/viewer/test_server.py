@@ -21,6 +21,8 @@ from forewarp.viewer.server import served
 from forewarp.viewer.studio import Studio
 from forewarp.viewer.subject import Subject
 from forewarp.viewer.visit import Visit
+from tests.contract.fitting import stage_of
+from tests.contract.table import METHODS
 from tests.support.known_ball import known_ball
 from tests.support.tiny_scene import ball_data, ball_scene, make_run, same, stage
 
@@ -161,9 +163,16 @@ class Broken(Watcher):
         raise ConnectionError("gone while it was told")
 
 
-def test_a_run_that_is_watched_ends_with_the_same_numbers(tmp_path, monkeypatch, capsys):
-    plain = make_run(tmp_path / "plain", [stage(), stage("fine")]).fit()
-    run, pages = make_run(tmp_path / "seen", [stage(), stage("fine")]), []
+def stages_of(method, steps=12):
+    if method == "forward":
+        return [stage(iterations=steps), stage("fine", iterations=steps)]
+    return [stage_of(METHODS[method], name, steps=steps) for name in ("coarse", "fine")]
+
+
+@pytest.mark.parametrize("method", ["forward", pytest.param("particles", marks=pytest.mark.slow)])
+def test_a_run_that_is_watched_ends_with_the_same_numbers(tmp_path, monkeypatch, capsys, method):
+    plain = make_run(tmp_path / "plain", stages_of(method)).fit()
+    run, pages = make_run(tmp_path / "seen", stages_of(method)), []
 
     @contextlib.contextmanager
     def without_a_server(studio, **where):
@@ -180,7 +189,7 @@ def test_a_run_that_is_watched_ends_with_the_same_numbers(tmp_path, monkeypatch,
     assert same(plain, seen)
     assert [type(one) for one in run.callbacks("coarse", None)] == []  # as before
     assert len(pages[0].shown) == 24  # one picture a step, in both stages
-    assert float((pages[0].shown[1] - pages[0].shown[-1]).abs().max()) > 0.05
+    assert float((pages[0].shown[1] - pages[0].shown[-1]).abs().max()) > 0.05  # it plays
     assert pages[0].said[0].startswith("coarse ")
     assert pages[0].said[-1] == "fine has ended; what follows is not shown"
     assert said == ["see it: http://nowhere", f"see it again: forewarp-view run={tmp_path / 'seen'}"]
