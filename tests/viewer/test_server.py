@@ -6,6 +6,7 @@ import os
 import socket
 import threading
 import urllib.request
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -17,6 +18,9 @@ import viser
 from forewarp.viewer import live as live_view
 from forewarp.viewer.address import check_address
 from forewarp.viewer.controls import Controls
+from forewarp.viewer.desk import Superseded
+from forewarp.viewer.look import first_look
+from forewarp.viewer.page import Page
 from forewarp.viewer.server import served
 from forewarp.viewer.studio import Studio
 from forewarp.viewer.subject import Subject
@@ -237,6 +241,41 @@ def test_a_stage_of_another_method_shows_what_it_can(capsys):
     assert capsys.readouterr().err == ""
 
 
+def test_what_pages_cost_is_no_training_time():
+    data, module, running = ball_data(), known_ball(), []
+    studio = Studio(data.scene)
+    view, page = live_view.LiveView(studio, "run"), Watcher(studio)
+    page.build = lambda: running.append(module.clock._since is not None)
+    page.visit = SimpleNamespace(refresh=page.build)
+    studio.pages = (page,)
+    module.trainer = trainer = SimpleNamespace(datamodule=data, global_step=1)
+    with module.clock.running():
+        view.on_train_start(trainer, module)
+        view.on_train_batch_end(trainer, module, None, None, 0)
+    assert running == [False] * 3
+
+
+@pytest.mark.parametrize(
+    ("show", "error", "says"),
+    [
+        ("colour", RuntimeError("no memory"), ["no screenshot: RuntimeError: no memory"]),
+        ("splats", TimeoutError("30 s"), ["no screenshot: TimeoutError: 30 s"]),
+        ("colour", Superseded(), []),
+    ],
+)
+def test_why_there_is_no_screenshot_is_told(studio, show, error, says):
+    def fail(*how, **more):
+        raise error
+
+    page, said = object.__new__(Page), []
+    look = replace(first_look(studio.scene), show=show)
+    page.visit = SimpleNamespace(look=look, request=fail)
+    page.client = SimpleNamespace(get_render=fail, camera=SimpleNamespace(image_width=4, image_height=3))
+    page.tell = said.append
+    page.save_screenshot()
+    assert said == says
+
+
 def test_controls_offer_what_the_method_of_a_stage_can_show():
     data = ball_data()
     subjects = [Subject("run", module, data) for module in modules_of_two_methods()]
@@ -247,6 +286,13 @@ def test_controls_offer_what_the_method_of_a_stage_can_show():
         parts = controls.splats, controls.tails, controls.choose, controls.forget
         controls.what.value, controls.tails.value = "splats", True
         assert [part.visible for part in parts] == [True] * 4
+        assert controls._frusta._made == []  # nothing is made before it is asked for
+        controls.shown.value = True
+        controls._show_frusta()
+        assert [one.visible for one in controls._frusta._made] == [True] * len(data.scene.train)
+        visit.stand(0)
+        controls.stands()
+        assert not any(one.visible for one in controls._frusta._made)
         studio.subjects = subjects[1:]
         controls.adapt()
         assert [part.visible for part in parts] == [False] * 4

@@ -229,6 +229,16 @@ def test_it_plays_also_if_begun_just_before_the_picture_at_rest_is_asked_for(stu
     assert len(page.times) > 1
 
 
+def test_a_page_that_leaves_just_before_it_gets_no_picture_at_rest(studio, watch):
+    visit, page = visit_of(studio)
+    serve(studio, 1)
+    seen = len(page.pictures)
+    visit.gone = True  # and what it asks for at the same moment comes after all else was dropped
+    watch.now += REST
+    assert serve(studio) == 1
+    assert len(page.pictures) == seen
+
+
 def test_the_slider_while_it_plays_moves_the_time(studio, watch):
     visit, page = visit_of(studio)
     visit.play(True)
