@@ -1,11 +1,17 @@
 import shutil
 import socket
 import sys
+from contextlib import nullcontext
+from types import SimpleNamespace
 
 import pytest
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
+from omegaconf import OmegaConf
 
 pytest.importorskip("viser", reason="no viser: pip install forewarp[viewer]")
 
+from forewarp.cli.train import refuse_one_port
 from forewarp.viewer.desk import Desk
 
 
@@ -67,6 +73,27 @@ def test_without_the_extra_it_says_what_to_install(refused, fitted, monkeypatch,
     monkeypatch.setitem(sys.modules, "viser", None)
     said = refused(command, *(word.format(run=fitted) for word in words))
     assert said == "viewer: expected viser, but got none; install forewarp[viewer]"
+
+
+def test_training_with_a_page_asks_for_its_port_before_anything_else(refused, in_tmp):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        says = refused("train", "viewer=true", f"port={port}", "effects=auto")
+        assert says.startswith(f"port: expected a free port, but got {port}")
+
+
+@pytest.mark.parametrize(
+    ("launcher", "port", "fails"), [("joblib", 8080, True), ("joblib", 0, False), ("local", 8080, False)]
+)
+def test_jobs_that_run_at_once_take_ports_of_their_own(monkeypatch, launcher, port, fails):
+    target = {"joblib": "hydra_plugins.hydra_joblib_launcher.joblib_launcher.JoblibLauncher"}.get(
+        launcher, "hydra._internal.core_plugins.basic_launcher.BasicLauncher"
+    )
+    seen = OmegaConf.create({"launcher": {"_target_": target}})
+    monkeypatch.setattr(HydraConfig, "initialized", lambda: True)
+    monkeypatch.setattr(HydraConfig, "get", lambda: SimpleNamespace(mode=RunMode.MULTIRUN, **seen))
+    with pytest.raises(ValueError, match="port: expected 0 where") if fails else nullcontext():
+        refuse_one_port(OmegaConf.create({"port": port}))
 
 
 def test_training_with_a_page_of_no_meaning_is_refused(refused, in_tmp):

@@ -264,7 +264,7 @@ def test_screenshots_and_videos_are_saved(one, tab):
     assert re.fullmatch(r"vehicle-particles-colour-0\.\d{3}\.png", got.value.suggested_filename)
     shot = iio.imread(got.value.path().read_bytes())
     look, page = studio.pages[0].visit.look, studio.pages[0]
-    width, rows = page.visit._full()
+    width, rows = page.visit.full_size()
     assert far(shot, 255 * studio.picture(look, width, rows, bool).numpy()) < 1
     tab.page.get_by_text("Video", exact=True).click()
     tab.press("make the video")

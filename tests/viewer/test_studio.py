@@ -202,3 +202,16 @@ def test_two_runs_of_different_scenes_are_refused(data, other, says):
 @pytest.mark.parametrize(("size", "rows"), [(None, 400), (64, 64)])
 def test_the_size_at_rest_is_that_of_the_images_but_not_too_small(data, size, rows):
     assert Studio(data.scene, size=size).size == rows
+
+
+def test_paths_of_points_that_nobody_follows_any_more_are_forgotten(studio, look):
+    subject = studio.subjects[0]
+    kept = []
+    for count in range(1, 9):
+        points = tuple(((-0.3, 0.1, 0.01 * i), 0.0) for i in range(count))
+        drawn(studio, replace(look, followed=points))
+        kept.append(len(subject._followed))
+    assert kept == [1, 2, 3, 4, 4, 4, 4, 4]
+    made = [*subject._followed.values()][-1]
+    drawn(studio, replace(look, time=0.5, followed=points))
+    assert [*subject._followed.values()][-1] is made

@@ -1,81 +1,10 @@
-from dataclasses import replace
-from pathlib import Path
-from threading import Thread
-from time import monotonic
-
 import pytest
-import torch
 
 from forewarp.viewer import visit as visit_module
-from forewarp.viewer.desk import Desk, Superseded
-from forewarp.viewer.film import FPS, between, write_film
 from forewarp.viewer.pace import GOAL
 from forewarp.viewer.player import WHOLE
 from forewarp.viewer.visit import FASTEST, REST, Visit
-from tests.support.films import read_film
-from tests.support.tiny_scene import ball_scene, camera_at
-
-CANVAS = 640, 480
-
-
-class Watch:
-    def __init__(self):
-        self.now = 0.0
-
-    def __call__(self):
-        return self.now
-
-
-class FakeStudio:
-    """Draws grey pictures; each takes ``cost`` seconds a pixel, of a clock that stands otherwise."""
-
-    size, note, follows = 400, "", True
-
-    def __init__(self, watch, cost=0.0):
-        self.watch, self.cost, self.scene = watch, cost, ball_scene(frames=4)
-        self.desk, self.subjects = Desk(watch), [self]
-        self.looks, self.interrupt = [], None
-
-    def prepare(self, look):
-        self.watch.now += 0.001
-
-    def picture(self, look, width, height, stale, parts=1):
-        self.looks.append(look)
-        self.watch.now += self.cost * width * height
-        if self.interrupt:
-            self.interrupt()
-            if stale():
-                raise Superseded
-        return torch.full((height, width, 3), look.time)
-
-    def ellipsoids(self, time):
-        return f"splats at {time}"
-
-    def point_at(self, look, x, y, width, height):
-        return None if x > 0.9 else (x, y, 0.0)
-
-
-class FakePage:
-    def __init__(self):
-        self.pictures, self.said, self.times, self.plays = [], [], [], []
-
-    def canvas(self):
-        return CANVAS
-
-    def show(self, picture, *, rest):
-        self.pictures.append((tuple(picture.shape[:2]), rest, round(float(picture[0, 0, 0]), 3)))
-
-    def splats(self, ellipsoids):
-        self.pictures.append(ellipsoids)
-
-    def tell(self, text):
-        self.said.append(text)
-
-    def time_is(self, time):
-        self.times.append(time)
-
-    def playing_is(self, playing):
-        self.plays.append(playing)
+from tests.support.fake_studio import FakePage, FakeStudio, Watch
 
 
 @pytest.fixture
@@ -175,7 +104,7 @@ def test_two_pages_keep_their_own(studio, watch):
     one.change(time=0.25)
     two.change(time=0.75, show="depth")
     serve(studio)
-    assert page.pictures[-1][2], other.pictures[-1][2] == (0.25, 0.75)
+    assert (page.pictures[-1][2], other.pictures[-1][2]) == (0.25, 0.75)
     assert (one.look.show, two.look.show) == ("colour", "depth")
     one.play(True)
     watch.now += 0.1 * WHOLE
@@ -208,6 +137,32 @@ def test_it_plays_and_follows_the_time(studio, watch, loop):
     serve(studio)
     assert visit.look.time == before
     assert page.pictures[-1][1] is True
+
+
+def test_it_plays_also_if_begun_just_before_the_picture_at_rest_is_asked_for(studio, watch):
+    visit, page = visit_of(studio)
+    ask = studio.desk.ask
+
+    def late(who, job, **when):
+        if job == visit._draw_at_rest and not visit.player.playing:
+            visit.play(True)
+        ask(who, job, **when)
+
+    studio.desk.ask = late
+    serve(studio, 1)
+    watch.now += REST
+    serve(studio, 3)
+    assert len(page.times) > 1
+
+
+def test_a_page_that_leaves_just_before_it_gets_no_picture_at_rest(studio, watch):
+    visit, page = visit_of(studio)
+    serve(studio, 1)
+    seen = len(page.pictures)
+    visit.gone = True  # and what it asks for at the same moment comes after all else was dropped
+    watch.now += REST
+    assert serve(studio) == 1
+    assert len(page.pictures) == seen
 
 
 def test_the_slider_while_it_plays_moves_the_time(studio, watch):
@@ -254,6 +209,16 @@ def test_a_training_view_is_left_by_a_new_camera_time_or_choice(studio, watch):
     assert visit.look.stand is None
 
 
+def test_a_training_view_or_a_time_that_is_none_becomes_the_nearest(studio):
+    visit, _ = visit_of(studio)
+    for asked, found in ((-1, 0), (3, 3), (4, 3), (10**9, 3)):
+        assert (visit.stand(asked), visit.look.stand) == (found, found)
+    assert (visit.stand(None), visit.look.stand) == (None, None)
+    for asked, found in ((-0.5, 0.0), (7.0, 1.0), (float("nan"), 0.0)):
+        visit.change(time=asked)
+        assert visit.look.time == found
+
+
 def test_a_clicked_point_is_added_to_those_followed(studio):
     visit, page = visit_of(studio)
     visit.change(time=0.25)
@@ -274,61 +239,19 @@ def test_a_browser_draws_splats_by_itself(studio, watch):
     assert "one colour from all sides" in page.said[-1]
 
 
+def test_a_training_view_becomes_whole_at_rest_also_where_splats_are_chosen(studio, watch):
+    visit, page = visit_of(studio)
+    visit.change(show="splats")
+    visit.stand(2)
+    serve(studio)
+    watch.now += REST
+    serve(studio)
+    assert page.pictures[-1][:2] == ((400, 533), True)
+
+
 def test_without_a_method_it_says_why(studio):
     studio.subjects, studio.note = [], "waiting for the first step"
     visit, page = visit_of(studio)
     serve(studio)
     assert page.said == ["waiting for the first step"]
     assert page.pictures == []
-
-
-def keys_of(*times):
-    visit = Visit(FakeStudio(Watch()), FakePage())
-    return [
-        replace(visit.look, pose=camera_at(0.2 * i).camera_to_world, time=time, fov=0.5 + 0.1 * i)
-        for i, time in enumerate(times)
-    ]
-
-
-@pytest.mark.parametrize("times", [(0.2, 0.9), (0.0, 1.0, 0.3), (0.0, 0.0, 1.0, 1.0)])
-def test_a_path_goes_through_its_keys_smoothly(times):
-    keys = keys_of(*times)
-    looks = between(keys, 20 * (len(keys) - 1) + 1)
-    for key, look in zip(keys, looks[::20]):
-        torch.testing.assert_close(look.pose, key.pose, atol=1e-6, rtol=0)
-        assert (look.time, look.fov) == (pytest.approx(key.time), pytest.approx(key.fov))
-    poses = torch.stack([look.pose for look in looks])
-    rotations = poses[:, :3, :3]
-    torch.testing.assert_close(rotations @ rotations.mT, torch.eye(3).double().expand_as(rotations))
-    steps = (poses[1:] - poses[:-1]).abs().amax((1, 2))
-    assert float(steps.max()) < 3 * float(steps.median())
-    for first, then, part in zip(times, times[1:], range(len(times))):
-        within = [look.time for look in looks[20 * part : 20 * part + 21]]
-        assert sorted(within, reverse=then < first) == within
-
-
-def test_a_single_key_makes_no_video():
-    with pytest.raises(ValueError, match="key views: expected at least 2 and 2 pictures, but got 1 and 50"):
-        between(keys_of(0.5), 50)
-
-
-def test_a_film_through_its_keys(tmp_path):
-    studio = FakeStudio(Watch())
-    studio.desk = Desk(monotonic)
-    studio.size = 63  # odd sizes are made even
-    Thread(target=studio.desk.serve_forever, daemon=True).start()
-    visit, told = Visit(studio, FakePage()), []
-    for number in (1, 2):
-        file = write_film(tmp_path, visit, keys_of(0.0, 1.0), 0.4, lambda *count: told.append(count))
-        assert file == tmp_path / f"path-{number}.mp4"
-        film = read_film(file, 64, 84)
-        assert len(film) == 0.4 * FPS
-        brightness = film.mean((1, 2, 3))
-        assert (brightness[1:] > brightness[:-1]).all()
-    assert told[:10] == [(i, 10) for i in range(10)]
-    studio.interrupt = lambda: told.append("left") or visit.leave()
-    with pytest.raises(Superseded):
-        write_film(tmp_path, visit, keys_of(0.0, 1.0), 0.4, lambda *_: None)
-    assert told[-1] == "left"
-    assert sorted(path.name for path in Path(tmp_path).iterdir()) == ["path-1.mp4", "path-2.mp4"]
-    studio.desk.close()

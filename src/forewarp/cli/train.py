@@ -106,6 +106,7 @@ def train(config) -> float | None:
 def viewer_of(config) -> dict | None:
     """Return where a page should listen, None if none is asked for; refuse one that cannot be made."""
     from forewarp.cli.view import require_viewer
+    from forewarp.viewer.address import check_address
 
     viewer = config.get("viewer", False)
     if type(viewer) is not bool:
@@ -113,7 +114,23 @@ def viewer_of(config) -> dict | None:
     if not viewer:
         return None
     require_viewer()
+    refuse_one_port(config)
+    check_address(config.host, config.port)
     return {"host": config.host, "port": config.port}
+
+
+def refuse_one_port(config) -> None:
+    """Refuse one port for jobs that may run at once."""
+    from hydra.core.hydra_config import HydraConfig
+    from hydra.types import RunMode
+
+    if not (HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN) or config.port == 0:
+        return
+    if "BasicLauncher" not in str(HydraConfig.get().launcher.get("_target_")):
+        raise ValueError(
+            f"port: expected 0 where jobs may run at once, so that each takes one that is free, but got "
+            f"{config.port}; set port=0, or launcher=local"
+        )
 
 
 def watched(run, viewer: dict | None):

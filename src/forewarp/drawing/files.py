@@ -66,6 +66,10 @@ def _write_mp4(path: Path, frames: Iterable[np.ndarray], fps: float) -> None:
     writer.send(None)
     try:
         for frame in chain([first], frames):
+            if frame.shape != first.shape:  # ffmpeg would take it, and shear all that follow
+                raise ValueError(
+                    f"video: expected pictures of {first.shape}, as the first, but got {frame.shape}"
+                )
             writer.send(frame)
     except OSError as error:  # its message has many lines and does not name the file
         raise OSError(errno.EIO, "ffmpeg could not go on (is the disk full?)", str(path)) from error

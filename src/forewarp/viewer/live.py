@@ -40,7 +40,7 @@ class LiveView(lightning.Callback):
     def on_train_start(self, trainer, module) -> None:
         """Show the method of this stage from now on."""
         self.studio.subjects = [Subject(self.name, module, trainer.datamodule, fresh=_FRESH)]
-        self._each_page(lambda page: page.build())
+        self._each_page(module, lambda page: page.build())
         self._last = float("-inf")
 
     def on_train_batch_end(self, trainer, module, outputs, batch, batch_idx) -> None:
@@ -49,7 +49,7 @@ class LiveView(lightning.Callback):
         if now - self._last > _EVERY:
             self._last = now
             studio.note = f"{module.settings.name} {module.fraction:.0%}, step {module.global_step}"
-            self._each_page(lambda page: (page.build(), page.visit.refresh()))
+            self._each_page(module, lambda page: (page.build(), page.visit.refresh()))
         if studio.desk.is_due():
             with module.clock.paused(), torch.random.fork_rng(devices=[]):
                 studio.subjects[0].forget()
@@ -58,15 +58,19 @@ class LiveView(lightning.Callback):
     def on_train_end(self, trainer, module) -> None:
         """Say that there is nothing new to see."""
         self.studio.note = f"{module.settings.name} has ended; what follows is not shown"
-        self._each_page(lambda page: page.tell(self.studio.note))
+        self._each_page(module, lambda page: page.tell(self.studio.note))
 
-    def _each_page(self, do: Callable[[Any], object]) -> None:
-        """Do something with every page; what goes wrong with one is told on stderr and ends no training."""
-        for page in self.studio.pages:
-            try:
-                do(page)
-            except Exception as error:
-                traceback.print_exception(error)
+    def _each_page(self, module, do: Callable[[Any], object]) -> None:
+        """Do something with every page while the training clock is stopped; what goes wrong with one is told
+        on stderr and ends no training.
+        """
+        pages = self.studio.pages
+        with module.clock.paused() if pages else contextlib.nullcontext():
+            for page in pages:
+                try:
+                    do(page)
+                except Exception as error:
+                    traceback.print_exception(error)
 
 
 @contextlib.contextmanager
@@ -84,5 +88,8 @@ def live(run: Run, *, host: str, port: int) -> Iterator[None]:
     with served(studio, host=host, port=port, title=title, folder=folder / "videos") as address:
         run.tell(f"see it: {address}")
         run.callbacks = lambda name, where: [*before(name, where), LiveView(studio, folder.name)]
-        yield
+        try:
+            yield
+        finally:
+            run.callbacks = before
     run.tell(f"see it again: forewarp-view run={folder}")

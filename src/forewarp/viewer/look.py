@@ -14,6 +14,7 @@ from forewarp.scene.camera import Camera
 from forewarp.scene.frame import Scene
 from forewarp.scene.paths import focus_point, mean_up
 
+SPLATS = "splats"  # drawn by the browser; all other names are pictures that the method renders
 _CLOSEST = 0.01  # of the box's diagonal: nothing nearer to the camera is drawn
 
 Point = tuple[float, float, float]
@@ -40,6 +41,11 @@ class Look:
     tails: bool = False
     followed: tuple[tuple[Point, float], ...] = ()
     stand: int | None = None
+
+    @property
+    def by_browser(self) -> bool:
+        """Whether the browser draws it by itself; a training view is always compared in a picture."""
+        return self.show == SPLATS and self.stand is None
 
 
 def first_look(scene: Scene) -> Look:

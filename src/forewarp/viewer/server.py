@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import io
-import socket
 import warnings
 from collections.abc import Iterator
 
 import viser
 
+from forewarp.viewer.address import check_address, is_our_page, taken, url
 from forewarp.viewer.look import axis_of, first_look, pivot
 from forewarp.viewer.page import Page
 from forewarp.viewer.studio import Studio
@@ -54,7 +54,7 @@ def served(studio: Studio, *, host: str, port: int, title: str, folder) -> Itera
             if page is not None:
                 page.visit.leave()
 
-        yield f"http://{host}:{server.get_port()}"
+        yield url(host, server.get_port())
     finally:
         studio.desk.close()
         with _silent():
@@ -63,34 +63,28 @@ def served(studio: Studio, *, host: str, port: int, title: str, folder) -> Itera
 
 def _listening(host: str, port: int) -> _Server:
     """Start a server on this port and no other; viser by itself takes the next free one and says nothing."""
-    if not (type(port) is int and 0 <= port < 65536):
-        raise ValueError(f"port: expected a whole number from 0 to 65535, but got {port}")
-    _refuse_taken(host, port)
+    check_address(host, port)
     # What a page is sent in the moment in which it leaves is lost, as it should be.
     warnings.filterwarnings("ignore", message="Queued a .* on a closed connection", category=UserWarning)
     with _silent():
         server = _Server(host=host, port=port, verbose=False)
         if port and server.get_port() != port:  # taken since
             server.stop()
-            raise ValueError(_taken(port))
+            raise ValueError(taken(port))
+    _refuse_foreign(server, host)
     return server
 
 
-def _refuse_taken(host: str, port: int) -> None:
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    try:
-        socket.create_server((host, port), family=family).close()
-    except OSError as error:
-        if error.errno is not None and "in use" in str(error):
-            raise ValueError(_taken(port)) from None
-        raise ValueError(
-            f"host: expected an address of this machine that port {port} may be opened on, but got {host} "
-            f"({error.strerror or error}); use host=127.0.0.1"
-        ) from None
+def _refuse_foreign(server: _Server, host: str) -> None:
+    """Close what pages of foreign sites open, before anything is sent; viser itself asks nobody."""
+    sockets = server._websock_server  # viser has no public way to a request's headers
 
-
-def _taken(port: int) -> str:
-    return f"port: expected a free port, but got {port}, which is in use; use port={port + 1}"
+    @sockets.on_client_connect
+    async def _(client) -> None:
+        connection = sockets._live_connections[client.client_id]
+        headers = connection.request.headers
+        if not is_our_page(host, headers.get("Host"), headers.get("Origin")):
+            await connection.close(1008, "not a page of this server")
 
 
 @contextlib.contextmanager

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -10,8 +11,8 @@ from torch import Tensor
 from forewarp.drawing.colors import in_a_row
 from forewarp.scene.frame import Scene
 from forewarp.viewer.desk import Desk, Stale
-from forewarp.viewer.look import Look, Point, camera_of
-from forewarp.viewer.subject import SPLATS, Subject
+from forewarp.viewer.look import SPLATS, Look, Point, camera_of, pivot
+from forewarp.viewer.subject import Subject
 
 LEAST_SIZE = 400  # rows of a picture at rest, if the images have fewer
 _GAP = 4  # white pixels between two pictures
@@ -30,6 +31,7 @@ class Studio:
     def __init__(self, scene: Scene, subjects: Sequence[Subject] = (), *, size: int | None = None) -> None:
         self.scene, self.subjects = scene, list(subjects)
         self.size = size or max(LEAST_SIZE, *(frame.camera.height for frame in scene.train))
+        self.focus, self.up = pivot(scene)  # of all pages' cameras
         self.desk = Desk()
         self.note = ""  # what a run in training is doing
         self.pages: tuple = ()  # that are open now
@@ -44,6 +46,11 @@ class Studio:
     def follows(self) -> bool:
         """Whether points can be followed in all subjects."""
         return all(subject.follows for subject in self.subjects)
+
+    def known(self, look: Look) -> Look:
+        """Return a look without what the present methods cannot show, as those of an earlier stage could."""
+        look = look if look.show in self.shows else replace(look, show=self.shows[0])
+        return look if self.follows else replace(look, tails=False, followed=())
 
     def prepare(self, look: Look) -> None:
         """Compute what a picture needs besides its pixels."""

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import time as clock
 from collections import OrderedDict
+from collections.abc import Callable, Hashable
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -18,11 +20,13 @@ from forewarp.scene.ellipsoids import Ellipsoids
 from forewarp.scene.view import Moment, Rendering, View
 from forewarp.training.module import DynamicSceneModule
 from forewarp.viewer.desk import Stale, Superseded
-from forewarp.viewer.look import Look, Point
+from forewarp.viewer.look import SPLATS, Look, Point
 
-SPLATS = "splats"  # drawn by the browser; all other names are pictures that the method renders
 _KEPT = 2  # snapshots: of the time shown, and of the canonical time
+_KEPT_PATHS = 4  # of followed points, which pages share
+_KEPT_POINTS = 64
 _FOLLOWED = {"tail": 1.0, "width": 0.008}
+Value = TypeVar("Value")
 _SOLID = 0.5  # opacity from which a pixel shows something that can be followed
 
 
@@ -53,8 +57,8 @@ class Subject:
         self.count, self.tail, self.fresh = count, tail, fresh
         self._snapshots: OrderedDict[Moment, Snapshot] = OrderedDict()
         self._trajectories: tuple[float, Trajectories] | None = None
-        self._canonical: dict[tuple[Point, float], Tensor] = {}
-        self._followed: dict[tuple, Trajectories] = {}
+        self._canonical: OrderedDict[tuple[Point, float], Tensor] = OrderedDict()
+        self._followed: OrderedDict[tuple, Trajectories] = OrderedDict()
 
     @property
     def follows(self) -> bool:
@@ -87,10 +91,7 @@ class Subject:
             if snapshot.holds(moment):
                 self._snapshots.move_to_end(known)
                 return snapshot
-        self._snapshots[moment] = self.module.method.at(moment)
-        while len(self._snapshots) > _KEPT:
-            self._snapshots.popitem(last=False)
-        return self._snapshots[moment]
+        return kept(self._snapshots, moment, lambda: self.module.method.at(moment), _KEPT)
 
     def prepare(self, look: Look) -> None:
         """Compute what a picture needs besides its pixels."""
@@ -172,12 +173,14 @@ class Subject:
     @torch.no_grad()
     def canonical(self, point: Point, time: float) -> Tensor:
         """Return the canonical point (3,) of the matter that is nearest to a point at a time."""
-        if (point, time) not in self._canonical:
+
+        def nearest() -> Tensor:
             method = self.module.method
             matter = method.matter().points
             now = method.trajectories(matter, matter.new_tensor([time]))[:, 0]
-            self._canonical[point, time] = matter[(now - now.new_tensor(point)).norm(dim=-1).argmin()]
-        return self._canonical[point, time]
+            return matter[(now - now.new_tensor(point)).norm(dim=-1).argmin()]
+
+        return kept(self._canonical, (point, time), nearest, _KEPT_POINTS)
 
     def ellipsoids(self, time: float) -> Ellipsoids:
         """Return what a browser draws."""
@@ -189,11 +192,12 @@ class Subject:
             return []
         found = [self._all_over()] if look.tails else []
         if look.followed:
-            if look.followed not in self._followed:
-                points = torch.stack([self.canonical(*one) for one in look.followed])
-                self._followed[look.followed] = Trajectories(self.module, (), points=points, **_FOLLOWED)
-            found.append(self._followed[look.followed])
+            found.append(kept(self._followed, look.followed, lambda: self._paths(look), _KEPT_PATHS))
         return found
+
+    def _paths(self, look: Look) -> Trajectories:
+        points = torch.stack([self.canonical(*one) for one in look.followed])
+        return Trajectories(self.module, (), points=points, **_FOLLOWED)
 
     def _all_over(self) -> Trajectories:
         now = clock.monotonic()
@@ -202,3 +206,18 @@ class Subject:
             made = Trajectories(self.module, cameras, count=self.count, tail=self.tail)
             self._trajectories = now, made
         return self._trajectories[1]
+
+
+def kept(known: OrderedDict[Hashable, Value], key: Hashable, make: Callable[[], Value], most: int) -> Value:
+    """Return what is known of a key, or make it; the ``most`` that were used last are kept.
+
+    >>> known = OrderedDict()
+    >>> [kept(known, key, lambda: 10 * key, 2) for key in (1, 2, 1, 3)], list(known)
+    ([10, 20, 10, 30], [1, 3])
+    """
+    if key not in known:
+        known[key] = make()
+    known.move_to_end(key)
+    while len(known) > most:
+        known.popitem(last=False)
+    return known[key]

@@ -16,7 +16,6 @@ from forewarp.viewer.look import Look, first_look, vertical_fov
 from forewarp.viewer.pace import Pace, Rate
 from forewarp.viewer.player import Player
 from forewarp.viewer.studio import Studio
-from forewarp.viewer.subject import SPLATS
 
 FASTEST = 1 / 30  # seconds between two pictures while time plays
 REST = 0.15  # seconds without a change after which the camera is at rest
@@ -68,6 +67,8 @@ class Visit:
 
     def change(self, **what) -> None:
         """Change parts of the look. A new camera, time or choice leaves the training view it stood in."""
+        if "time" in what:
+            what["time"] = min(1.0, max(0.0, what["time"]))
         with self._lock:
             leaves = "stand" not in what and set(what) & {"pose", "time", "show"}
             self.look = replace(self.look, **({"stand": None} if leaves else {}), **what)
@@ -75,15 +76,21 @@ class Visit:
                 self.player.play(self.look.time, self._clock())
         self.refresh()
 
-    def stand(self, index: int | None) -> None:
-        """Stand where a training image was taken, at its time, and compare; None: leave."""
+    def stand(self, index: int | None) -> int | None:
+        """Stand where a training image was taken, at its time, and compare; None: leave.
+
+        Returns:
+            the index, or the nearest that there is.
+        """
         if index is None:
             self.change(stand=None)
-            return
+            return None
+        index = min(max(index, 0), len(self.studio.scene.train) - 1)
         frame = self.studio.scene.train[index]
         self.play(False)
         pose, fov = frame.camera.camera_to_world, vertical_fov(frame.camera)
         self.change(stand=index, pose=pose, fov=fov, time=frame.time)
+        return index
 
     def play(self, playing: bool) -> None:
         """Let time pass, or stop it."""
@@ -104,8 +111,8 @@ class Visit:
         """Draw the trajectory of the point seen at ``x y``, fractions of the canvas, besides others."""
 
         def find(stale: Stale) -> None:
-            look, (width, height) = self.look, self._full()
-            if look.stand is not None:
+            look, (width, height) = self.look, self.full_size()
+            if look.stand is not None or not self.studio.follows:
                 return
             point = self.studio.point_at(look, x, y, width, height)
             if point is None:
@@ -124,34 +131,42 @@ class Visit:
         self.gone = True
         self.studio.desk.leave(self)
 
-    def request(self, look: Look, urgency: int = 2) -> Tensor:
+    def request(self, look: Look, urgency: int = 2, size: tuple[int, int] | None = None) -> Tensor:
         """Wait for the full picture (H, W, 3) of a look; not for the thread that serves the desk.
 
         Args:
             look: what is drawn; what a browser would draw is rendered.
             urgency: see ``Desk.ask``.
+            size: width and height; None: those of the page at rest, ``full_size()``.
 
         Raises:
             Superseded: if the page has left, or everything ends.
+            Exception: what went wrong while it was drawn.
         """
-        done, found = threading.Event(), []
-        look = replace(look, show="colour") if look.show == SPLATS else look
+        done, found, failed = threading.Event(), [], []
+        look = replace(look, show="colour") if look.by_browser else look
 
         def draw(stale: Stale) -> None:
             try:
-                self.studio.prepare(look)
-                found.append(self.studio.picture(look, *self._full(), stale))
+                shown = self.studio.known(look)
+                self.studio.prepare(shown)
+                found.append(self.studio.picture(shown, *(size or self.full_size()), stale))
+            except Exception as error:
+                failed.append(error)
+                raise
             finally:
                 done.set()
 
         self.studio.desk.ask((self, draw), draw, urgency=urgency)
         while not done.wait(0.2) and not self.gone and not self.studio.desk.closed:
             pass
+        if failed and not self.gone:
+            raise failed[0]
         if self.gone or not found:
             raise Superseded
         return found[0]
 
-    def _full(self) -> tuple[int, int]:
+    def full_size(self) -> tuple[int, int]:
         """Width and height of a picture at rest: the canvas's shape, with at most ``studio.size`` rows.
 
         On a slow machine the browser tells a canvas of half the pixels that it has.
@@ -165,7 +180,8 @@ class Visit:
             return
         begun = self._clock()
         self._pass_time()
-        width, full = self._full()
+        self._keep_known()
+        width, full = self.full_size()
         rows = self._pace.rows(self._kind, full)
         self._draw(max(1, round(width * rows / full)), rows, stale)
         if stale():
@@ -173,11 +189,17 @@ class Visit:
         if self.player.playing:
             wait = max(0.0, FASTEST - (self._clock() - begun))
             self.studio.desk.ask((self, "picture"), self._draw_moving, after=wait)
-        elif rows < full and self.look.show != SPLATS:
+        elif rows < full and not self.look.by_browser:
             self.studio.desk.ask((self, "picture"), self._draw_at_rest, urgency=1, after=REST)
 
     def _draw_at_rest(self, stale: Stale) -> None:
-        width, rows = self._full()
+        if self.gone:
+            return
+        if self.player.playing:  # begun after this was asked for
+            self._draw_moving(stale)
+            return
+        self._keep_known()
+        width, rows = self.full_size()
         parts = 1 if self.look.show == "motion" else self._pace.parts(self._kind, width, rows)
         if parts > 1:
             self.surface.tell(f"{self._told:.1f} pictures/s | drawing {width} x {rows}")
@@ -195,6 +217,12 @@ class Visit:
         if ended:
             self.surface.playing_is(False)
 
+    def _keep_known(self) -> None:
+        """Drop what the method of this stage cannot show."""
+        if self.studio.subjects:
+            with self._lock:
+                self.look = self.studio.known(self.look)
+
     @property
     def _kind(self) -> tuple:
         look = self.look
@@ -210,7 +238,7 @@ class Visit:
             self.surface.tell(studio.note)
             return
         begun = self._clock()
-        if look.show == SPLATS and look.stand is None:
+        if look.by_browser:
             self.surface.splats(studio.subjects[0].ellipsoids(look.time))
             seconds, size = self._clock() - begun, "drawn by the browser, one colour from all sides"
         else:
@@ -221,7 +249,7 @@ class Visit:
             self._pace.drew(self._kind, rows, width * rows, self._clock() - prepared)
             if stale() and parts > 1:
                 raise Superseded
-            full = rows == self._full()[1]
+            full = rows == self.full_size()[1]
             self.surface.show(picture, rest=full)
             size = f"{width} x {rows}, exact" + ("" if full else ", small while moving")
             if look.stand is not None:
