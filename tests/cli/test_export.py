@@ -56,7 +56,7 @@ def test_trajectories_are_those_of_the_run(ok, run, tmp_path):
         (["format=npz", "points=0"], "points: expected a whole number from 1 to 1000000, but got 0"),
         (["format=mesh", "files=stl"], "files: expected ply or obj, but got stl"),
         (["format=mesh", "level=1"], "level: expected a number from 0.01 to 0.99, but got 1"),
-        (["out=."], "other files; choose another"),
+        (["out=."], "but got a file in it; move it, or choose another"),
     ],
 )
 def test_mistakes_end_in_one_line(refused, run, words, says, in_tmp):
