@@ -61,7 +61,8 @@ def export(config) -> None:
     warn_if_changed(run)
     scene = run.datamodule.scene
     cameras = [frame.camera for frame in scene.train]
-    source = Source(module, method_name(saved), cameras, times, opaque=not scene.has_alpha)
+    background = tuple(run.datamodule.targets("train").background.tolist())
+    source = Source(module, method_name(saved), cameras, times, background)
     about = {"run": str(config.run), "scene": scene.name, "method": source.model}
     options = {name: config[name] for name in FORMATS[config.format].options}
     with Counted(config.format) as progress:

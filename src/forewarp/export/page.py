@@ -9,10 +9,10 @@ from io import StringIO
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
+from forewarp.drawing.files import to_bytes
 from forewarp.export.source import Progress, Source, tracks_of
 from forewarp.scene.camera import Camera
 from forewarp.scene.frame import spread
@@ -125,8 +125,8 @@ def page(
         server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
     try:
         _look(server, list(source.cameras))
-        if source.opaque:
-            server.scene.set_background_image(np.zeros((1, 1, 3), np.uint8))
+        behind = to_bytes(torch.tensor(source.background)[None, None])
+        server.scene.set_background_image(behind, format="png")
         packed = []
         for done, time in enumerate(times, 1):
             handle = show.add(server.scene, time, rows)

@@ -24,14 +24,14 @@ _SOLID = 0.1  # opacity at some time of a particle that is a point of the surfac
 @dataclass(frozen=True)
 class Source:
     """A fitted ``module`` named ``model`` in its config, the ``cameras`` it was trained with, ``times`` in
-    [0, 1], and whether its pictures were ``opaque``, so that it is seen before black.
+    [0, 1], and the ``background`` (3,) in [0, 1] of its exact pictures.
     """
 
     module: DynamicSceneModule
     model: str
     cameras: Sequence[Camera]
     times: Sequence[float]
-    opaque: bool = False
+    background: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
     @property
     def method(self) -> Method:
