@@ -8,10 +8,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from forewarp.evaluation.trajectories import seen_by, spread, surface
+from forewarp.evaluation.trajectories import seen_by, surface
 from forewarp.methods.abilities import HasEllipsoids, HasMatter, HasTrajectories
 from forewarp.methods.method import Method
 from forewarp.scene.camera import Camera
+from forewarp.scene.cloud import far_apart
 from forewarp.scene.paths import mean_up
 from forewarp.training.module import DynamicSceneModule
 
@@ -128,7 +129,7 @@ def _particles(source: Source, count: int):
     rows = seen.nonzero()[:, 0]
     if not len(rows):
         raise ValueError("run: expected particles that a camera sees, but got none; train it longer")
-    rows = rows[spread(cloud.centers[rows], count)]
+    rows = rows[far_apart(cloud.centers[rows], count)]
 
     def at(time: float):
         now = method.ellipsoids(time)[rows]
@@ -141,7 +142,7 @@ def _matter(source: Source, count: int):
     cloud = surface(source.module, source.cameras)
     if not len(cloud):
         raise ValueError("run: expected matter that a camera sees, but got none; train it longer")
-    cloud = cloud[spread(cloud.points, count)]
+    cloud = cloud[far_apart(cloud.points, count)]
 
     def at(time: float):
         moved = source.method.trajectories(cloud.points, cloud.points.new_tensor([time]))[:, 0]
