@@ -52,13 +52,10 @@ def export(config) -> None:
     # These load torch; mistakes have been answered before.
     from forewarp.export.source import Source
     from forewarp.progress import Counted
-    from forewarp.runs.build import build_run, method_name
-    from forewarp.runs.data_check import warn_if_changed
-    from forewarp.training.device import device_of
+    from forewarp.runs.build import method_name
+    from forewarp.runs.fitted import opened
 
-    run = build_run(saved)
-    module = run.load().to(device_of(saved.trainer.accelerator)).eval()
-    warn_if_changed(run)
+    run, module = opened(saved)
     scene = run.datamodule.scene
     cameras = [frame.camera for frame in scene.train]
     background = tuple(run.datamodule.targets("train").background.tolist())
