@@ -15,14 +15,15 @@ MAY_IMPORT = {
     **dict.fromkeys(["metrics", "drawing", "fields", "data", "quadrature"], {"ops", "scene"}),
     "report": {"drawing", "metrics"},
     "synth": {"ops", "scene", "data"},
+    "browser": {"ops", "scene"},
     "renderer": {"ops", "scene", "fields"},
     "methods": LOWER,
     "training": LOWER | {"methods"},
     "evaluation": LOWER | {"methods", "training"},
     "runs": LOWER | {"methods", "training", "evaluation", "data"},
     "planning": LOWER | {"methods", "training", "evaluation", "data", "report", "runs"},
-    "viewer": LOWER | {"methods", "training", "evaluation"},
-    "export": LOWER | {"methods", "training", "evaluation"},
+    "viewer": LOWER | {"browser", "methods", "training", "evaluation"},
+    "export": LOWER | {"browser", "methods", "training", "evaluation"},
     "replay": {"cli", "runs", "training"},
     "cli": LOWER
     | {

@@ -43,6 +43,23 @@ def test_trajectories_are_those_of_the_run(ok, run, tmp_path):
     np.testing.assert_allclose(found["positions"], wanted, atol=1e-5)
 
 
+def test_the_background_is_that_of_the_runs_pictures(ok, run, tmp_path, monkeypatch):
+    dark = shutil.copytree(run, tmp_path / "dark")
+    text = (dark / "config.yaml").read_text()
+    assert "eval_background: white" in text
+    (dark / "config.yaml").write_text(text.replace("eval_background: white", "eval_background: black"))
+    found = []
+
+    def write(kind, source, *rest, **options):
+        found.append(source.background)
+        return {"bytes": {}}
+
+    monkeypatch.setattr("forewarp.export.formats.write", write)
+    for folder in (run, dark):
+        ok("export", f"run={folder}", "times=1")
+    assert found == [(1, 1, 1), (0, 0, 0)]
+
+
 @pytest.mark.parametrize(
     ("words", "says"),
     [
@@ -56,7 +73,7 @@ def test_trajectories_are_those_of_the_run(ok, run, tmp_path):
         (["format=npz", "points=0"], "points: expected a whole number from 1 to 1000000, but got 0"),
         (["format=mesh", "files=stl"], "files: expected ply or obj, but got stl"),
         (["format=mesh", "level=1"], "level: expected a number from 0.01 to 0.99, but got 1"),
-        (["out=."], "other files; choose another"),
+        (["out=."], "but got a file in it; move it, or choose another"),
     ],
 )
 def test_mistakes_end_in_one_line(refused, run, words, says, in_tmp):

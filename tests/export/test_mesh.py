@@ -99,8 +99,13 @@ def test_particles_have_their_opacity_at_the_vertices(particles, tmp_path):
         assert abs(shown - color).mean() < 0.06
 
 
-def test_nothing_found_is_one_line(particles, tmp_path):
+def test_nothing_found_is_one_line(particles, tmp_path, monkeypatch):
     particles.method.opacity.data -= 2
-    with pytest.raises(ValueError, match=r"level: expected less than the highest opacity at time 0, 0\.\d+"):
+    between = "level: expected a number between the lowest and the highest opacity at time 0, "
+    with pytest.raises(ValueError, match=between + r"0 and 0\.\d+, but got 0.9"):
         export(particles, tmp_path / "mesh", level=0.9)
+    full = torch.linspace(0.6, 1, 8).reshape(2, 2, 2), torch.ones(2, 2, 2, 3)
+    monkeypatch.setattr("forewarp.export.mesh.solid_of", lambda *_: full)
+    with pytest.raises(ValueError, match=between + "0.6 and 1, but got 0.5"):
+        export(particles, tmp_path / "mesh")
     assert list(tmp_path.iterdir()) == []

@@ -72,15 +72,13 @@ def test_particles_are_splats_of_each_time(particles, tmp_path):
         np.testing.assert_allclose(bytes_of[:, 3], cloud.opacity[chosen], atol=0.005)
 
 
-@pytest.mark.parametrize("opaque", [False, True])
-def test_opaque_pictures_are_seen_before_black(ball, tmp_path, opaque):
-    object.__setattr__(ball, "opaque", opaque)
+@pytest.mark.parametrize("color", [(0.0, 0.0, 0.0), (1.0, 1.0, 1.0)])
+def test_it_is_seen_before_the_background_of_exact_pictures(ball, tmp_path, color):
+    object.__setattr__(ball, "background", color)
     export(ball, tmp_path / "html", points=20)
     _, messages = read(tmp_path / "html")
     behind = [message["rgb_data"] for _, message in messages if message["type"] == "BackgroundImageMessage"]
-    assert (behind[-1] is not None) is opaque
-    if opaque:
-        assert not iio.imread(io.BytesIO(bytes(behind[-1]))).any()
+    assert (iio.imread(io.BytesIO(bytes(behind[-1])))[..., :3] == 255 * np.array(color)).all()
 
 
 def test_voxels_are_points_of_each_time(ball, tmp_path):

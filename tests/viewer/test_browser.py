@@ -33,19 +33,18 @@ def browser():
         yield found
 
 
+def words(fitted, iterations):
+    """What ``forewarp-train`` is told for a short run of the scene of ``fitted``, without an evaluation."""
+    data = [f"data.root={fitted.parent}/scenes", "data=dnerf", "data.scene=vehicle"]
+    budget = ["budget.minutes=null", f"budget.iterations={iterations}"]
+    return [*data, *budget, "preset=demo", "trainer=cpu", "threads=1", "evaluate=false"]
+
+
 @pytest.fixture(scope="module")
 def particles(fitted, tmp_path_factory):
     """A run of particles, of the scene of ``fitted``."""
     run = tmp_path_factory.mktemp("runs") / "particles"
-    words = [
-        f"data.root={fitted.parent}/scenes",
-        "data=dnerf",
-        "data.scene=vehicle",
-        "preset=demo",
-        "trainer=cpu",
-    ]
-    budget = ["threads=1", "budget.minutes=null", "budget.iterations=400", "evaluate=false"]
-    done = call("train", "model=particles", *words, *budget, f"run={run}")
+    done = call("train", "model=particles", *words(fitted, 400), f"run={run}")
     assert done.status == 0, done
     return run
 
@@ -299,24 +298,8 @@ def test_two_runs_beside_each_other(browser, fitted, particles, tmp_path):
 
 
 def test_a_run_is_seen_while_it_trains(browser, fitted, tmp_path):
-    words = [
-        f"data.root={fitted.parent}/scenes",
-        "data=dnerf",
-        "data.scene=vehicle",
-        "preset=demo",
-        "trainer=cpu",
-    ]
-    words += ["threads=1", "budget.minutes=null", "budget.iterations=1200", f"run={tmp_path}/run"]
-    command = [
-        sys.executable,
-        "-u",
-        "-m",
-        "forewarp.cli.train",
-        *words,
-        "evaluate=false",
-        "viewer=true",
-        "port=0",
-    ]
+    command = [sys.executable, "-u", "-m", "forewarp.cli.train", *words(fitted, 1200)]
+    command += [f"run={tmp_path}/run", "viewer=true", "port=0"]
     with open(tmp_path / "said", "w") as log:
         process = subprocess.Popen(command, stdout=log, stderr=log, cwd=tmp_path)
     try:

@@ -40,7 +40,7 @@ def test_a_path_goes_through_its_keys_smoothly(times):
 
 
 def test_a_single_key_makes_no_video():
-    with pytest.raises(ValueError, match="key views: expected at least 2 and 2 pictures, but got 1 and 50"):
+    with pytest.raises(ValueError, match="and 2 pictures of them, but got 1 key views and 50 pictures"):
         between(keys_of(0.5), 50)
 
 

@@ -52,16 +52,14 @@ def export(config) -> None:
     # These load torch; mistakes have been answered before.
     from forewarp.export.source import Source
     from forewarp.progress import Counted
-    from forewarp.runs.build import build_run, method_name
-    from forewarp.runs.data_check import warn_if_changed
-    from forewarp.training.device import device_of
+    from forewarp.runs.build import method_name
+    from forewarp.runs.fitted import opened
 
-    run = build_run(saved)
-    module = run.load().to(device_of(saved.trainer.accelerator)).eval()
-    warn_if_changed(run)
+    run, module = opened(saved)
     scene = run.datamodule.scene
     cameras = [frame.camera for frame in scene.train]
-    source = Source(module, method_name(saved), cameras, times, opaque=not scene.has_alpha)
+    background = tuple(run.datamodule.targets("train").background.tolist())
+    source = Source(module, method_name(saved), cameras, times, background)
     about = {"run": str(config.run), "scene": scene.name, "method": source.model}
     options = {name: config[name] for name in FORMATS[config.format].options}
     with Counted(config.format) as progress:

@@ -39,13 +39,14 @@ def require_viewer() -> None:
 
 def view(config) -> None:
     """Load one or two runs and serve their page until Ctrl-C."""
+    from forewarp.cli.checks import refuse_numbers
     from forewarp.runs.config import saved_config
 
     require_viewer()
     runs = {"run": saved_config(config.run, config)}
     if config.run2 is not None:
         runs["run2"] = saved_config(config.run2, config, "run2")
-    check(config)
+    refuse_numbers(config, "size", "points", "tail")
     # These load torch; mistakes have been answered before.
     from pathlib import Path
 
@@ -70,28 +71,12 @@ def subject_of(saved, config):
     """Load a run's method."""
     from pathlib import Path
 
-    from forewarp.runs.build import build_run
-    from forewarp.runs.data_check import warn_if_changed
-    from forewarp.training.device import device_of
+    from forewarp.runs.fitted import opened
     from forewarp.viewer.subject import Subject
 
-    run = build_run(saved)
-    module = run.load().to(device_of(saved.trainer.accelerator))
-    module.eval()
-    warn_if_changed(run)
+    run, module = opened(saved)
     name = Path(saved.run).resolve().name
     return Subject(name, module, run.datamodule, count=config.points, tail=float(config.tail))
-
-
-def check(config) -> None:
-    """Refuse settings that make no page, before anything is loaded."""
-    for key, least in (("size", 16), ("points", 1)):
-        if (key, config[key]) == ("size", None):
-            continue
-        if type(config[key]) is not int or config[key] < least:
-            raise ValueError(f"{key}: expected a whole number of at least {least}, but got {config[key]}")
-    if type(config.tail) not in (int, float) or not 0.01 <= config.tail <= 1:
-        raise ValueError(f"tail: expected a number in [0.01, 1], but got {config.tail}")
 
 
 def main() -> None:

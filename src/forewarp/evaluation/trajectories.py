@@ -12,7 +12,7 @@ from forewarp.drawing.lines import draw_discs, hidden, sample_lines
 from forewarp.evaluation.pictures import within
 from forewarp.methods.abilities import HasMatter, HasTrajectories
 from forewarp.scene.camera import Camera
-from forewarp.scene.cloud import Cloud
+from forewarp.scene.cloud import Cloud, far_apart
 from forewarp.scene.view import Moment, Rendering, View
 from forewarp.training.module import DynamicSceneModule
 
@@ -138,23 +138,7 @@ def moving_points(module: DynamicSceneModule, cameras: Sequence[Camera], count: 
     reach = (paths - points[:, None]).norm(dim=-1).amax(1)
     least = max(_STILL * float(reach.max()), module.method.matter().size)
     points = points[reach > least]
-    return points[spread(points, count)]
-
-
-def spread(points: Tensor, count: int) -> Tensor:
-    """Choose rows (count,) of points (N, 3): the first, then repeatedly that of the one farthest from those
-    chosen; all rows, if there are no more.
-
-    Cost: N * count distances.
-    """
-    if len(points) <= count:
-        return torch.arange(len(points), device=points.device)
-    chosen = [0]
-    nearest = (points - points[0]).square().sum(-1)
-    for _ in range(count - 1):
-        chosen.append(int(nearest.argmax()))
-        nearest = torch.minimum(nearest, (points - points[chosen[-1]]).square().sum(-1))
-    return torch.tensor(chosen, device=points.device)
+    return points[far_apart(points, count)]
 
 
 def order_of(points: Tensor) -> Tensor:

@@ -146,7 +146,7 @@ def export_mesh(
         what ``about.json`` says of it.
 
     Raises:
-        ValueError: for a method that cannot tell where matter is, or where nothing is as opaque.
+        ValueError: for a method that cannot tell where matter is, or where nothing or all is as opaque.
     """
     lattice = lattice_in(_bounds(source), resolution)
     vertices, faces, turn = [], [], source.turn_to(up).float()
@@ -158,8 +158,8 @@ def export_mesh(
         mesh = mesh_of(opacity, colors, lattice, level)
         if mesh is None:
             raise ValueError(
-                f"level: expected less than the highest opacity at time {time:.4g}, "
-                f"{float(opacity.max()):.3g}, but got {level}"
+                f"level: expected a number between the lowest and the highest opacity at time {time:.4g}, "
+                f"{float(opacity.min()):.3g} and {float(opacity.max()):.3g}, but got {level}"
             )
         mesh = mesh._replace(vertices=mesh.vertices @ turn.T)
         path = folder / f"mesh_{number:04d}.{files}"

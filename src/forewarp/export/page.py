@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
-from contextlib import redirect_stdout
-from io import StringIO
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
+from forewarp.browser import begin_at, silent, splat_arrays, vertical_fov
+from forewarp.drawing.files import to_bytes
 from forewarp.export.source import Progress, Source, tracks_of
 from forewarp.scene.camera import Camera
 from forewarp.scene.frame import spread
@@ -121,12 +119,12 @@ def page(
     """Record what ``show`` shows at some times; return the page."""
     import viser
 
-    with redirect_stdout(StringIO()):  # it tells of its server, which viser records nothing without
+    with silent():  # viser records nothing without a server
         server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
     try:
         _look(server, list(source.cameras))
-        if source.opaque:
-            server.scene.set_background_image(np.zeros((1, 1, 3), np.uint8))
+        behind = to_bytes(torch.tensor(source.background)[None, None])
+        server.scene.set_background_image(behind, format="png")
         packed = []
         for done, time in enumerate(times, 1):
             handle = show.add(server.scene, time, rows)
@@ -142,17 +140,14 @@ def page(
             recording.insert_sleep((times[-1] - times[0]) * seconds / (len(times) - 1))
         return recording.as_html().replace("<head>", f"<head>{WORKERS}", 1).encode()
     finally:
-        with redirect_stdout(StringIO()):
+        with silent():
             server.stop()
 
 
 def _look(server, cameras: list[Camera]) -> None:
     """Begin where the first camera stood, with the scene upright."""
-    camera, focus = cameras[0], focus_point(cameras)
-    server.scene.set_up_direction(tuple(mean_up(cameras).tolist()))
-    server.initial_camera.position = tuple(camera.center.tolist())
-    server.initial_camera.look_at = tuple(focus.tolist())
-    server.initial_camera.fov = 2 * math.atan(0.5 * camera.height / camera.fy)
+    camera, pose = cameras[0], cameras[0].camera_to_world
+    begin_at(server, pose, vertical_fov(camera), focus_point(cameras), mean_up(cameras), camera.far)
     server.initial_camera.near, server.initial_camera.far = 0.01 * camera.far, 10 * camera.far
 
 
@@ -164,9 +159,8 @@ def _splats(source: Source) -> Show:
     unit = _unit(source.cameras)
 
     def add(scene, time: float, rows: Tensor):
-        cloud = source.method.ellipsoids(time)[rows]
-        parts = cloud.centers / unit, cloud.covariances / unit**2, cloud.colors, cloud.opacity[:, None]
-        return scene.add_gaussian_splats("/scene", *(part.cpu().numpy() for part in parts), scale=unit)
+        arrays = splat_arrays(source.method.ellipsoids(time)[rows], unit)
+        return scene.add_gaussian_splats("/scene", *arrays, scale=unit)
 
     return Show("particles", add, "buffer", cover.argsort(descending=True))
 

@@ -8,10 +8,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from forewarp.evaluation.trajectories import seen_by, spread, surface
+from forewarp.evaluation.trajectories import seen_by, surface
 from forewarp.methods.abilities import HasEllipsoids, HasMatter, HasTrajectories
 from forewarp.methods.method import Method
 from forewarp.scene.camera import Camera
+from forewarp.scene.cloud import far_apart
 from forewarp.scene.paths import mean_up
 from forewarp.training.module import DynamicSceneModule
 
@@ -24,14 +25,14 @@ _SOLID = 0.1  # opacity at some time of a particle that is a point of the surfac
 @dataclass(frozen=True)
 class Source:
     """A fitted ``module`` named ``model`` in its config, the ``cameras`` it was trained with, ``times`` in
-    [0, 1], and whether its pictures were ``opaque``, so that it is seen before black.
+    [0, 1], and the ``background`` (3,) in [0, 1] of its exact pictures.
     """
 
     module: DynamicSceneModule
     model: str
     cameras: Sequence[Camera]
     times: Sequence[float]
-    opaque: bool = False
+    background: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
     @property
     def method(self) -> Method:
@@ -128,7 +129,7 @@ def _particles(source: Source, count: int):
     rows = seen.nonzero()[:, 0]
     if not len(rows):
         raise ValueError("run: expected particles that a camera sees, but got none; train it longer")
-    rows = rows[spread(cloud.centers[rows], count)]
+    rows = rows[far_apart(cloud.centers[rows], count)]
 
     def at(time: float):
         now = method.ellipsoids(time)[rows]
@@ -141,7 +142,7 @@ def _matter(source: Source, count: int):
     cloud = surface(source.module, source.cameras)
     if not len(cloud):
         raise ValueError("run: expected matter that a camera sees, but got none; train it longer")
-    cloud = cloud[spread(cloud.points, count)]
+    cloud = cloud[far_apart(cloud.points, count)]
 
     def at(time: float):
         moved = source.method.trajectories(cloud.points, cloud.points.new_tensor([time]))[:, 0]

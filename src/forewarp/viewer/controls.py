@@ -93,7 +93,9 @@ class Controls:
         gui, visit = self.client.gui, self.visit
         with gui.add_folder("Show"):
             self.what = gui.add_dropdown("show", self.studio.shows, initial_value=visit.look.show)
-            self.splats = gui.add_markdown("*splats*: drawn by the browser, with one colour from all sides")
+            self.splats = gui.add_markdown(
+                "*splats*: drawn by the browser, with one colour from all sides and no trajectories"
+            )
             self.tails = gui.add_checkbox("trajectories", False)
             self._add_following()
             picture = gui.add_button("screenshot")
@@ -140,6 +142,7 @@ class Controls:
             self.image = gui.add_slider("image", 0, max(last, 1), 1, 0)
             # Over two pictures beside each other there is no one place for a camera.
             self.shown = gui.add_checkbox("show cameras", False, visible=len(self.studio.subjects) == 1)
+            there = gui.add_button("go there")
             self.leave = gui.add_button("leave it", visible=False)
 
         @self.shown.on_update
@@ -150,6 +153,10 @@ class Controls:
         async def _(event: viser.GuiEvent) -> None:
             if event.client is not None:
                 self.page.stand(int(self.image.value))
+
+        @there.on_click
+        async def _(_: viser.GuiEvent) -> None:
+            self.page.stand(int(self.image.value))
 
         @self.leave.on_click
         async def _(_: viser.GuiEvent) -> None:

@@ -33,8 +33,8 @@ def between(keys: Sequence[Look], pictures: int) -> list[Look]:
 
     if len(keys) < 2 or pictures < 2:
         raise ValueError(
-            f"key views: expected at least 2 and 2 pictures, but got {len(keys)} and {pictures}; "
-            "go to another view or time and add it"
+            f"key views: expected at least 2, and 2 pictures of them, but got {len(keys)} key views and "
+            f"{pictures} pictures; go to another view or time and add it"
         )
     poses = np.stack([key.pose.double().numpy() for key in keys])
     at, along = np.arange(len(keys)), np.linspace(0, len(keys) - 1, pictures)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from forewarp.browser import vertical_fov
 from forewarp.scene.box import Box
 from forewarp.scene.camera import Camera
 from forewarp.scene.frame import Scene
@@ -52,11 +53,6 @@ def first_look(scene: Scene) -> Look:
     """Stand where the first test image was taken, at its time; without one, the first training image."""
     frame = (scene.test or scene.train)[0]
     return Look(frame.camera.camera_to_world, vertical_fov(frame.camera), frame.time)
-
-
-def vertical_fov(camera: Camera) -> float:
-    """Return the angle that a camera's picture spans from top to bottom, radians."""
-    return 2 * math.atan(0.5 * camera.height / camera.fy)
 
 
 def camera_of(look: Look, width: int, height: int, scene: Scene) -> Camera:

@@ -43,21 +43,24 @@ class Pace:
         return max(1, min(rows, math.ceil(seconds / _PART)))
 
 
+_LEAST_SPAN = 0.5  # seconds of pictures before there is a rate
+
+
 class Rate:
-    """Count pictures a second over the last ``span`` seconds."""
+    """Count pictures a second over the last ``span`` seconds, once they took half a second."""
 
     def __init__(self, span: float = 2.0) -> None:
         self._span, self._drawn = span, deque()
 
     def drew(self, now: float) -> float:
-        """Note a picture; return the rate, 0 for the first.
+        """Note a picture; return the rate, 0 for the first ones.
 
         >>> rate = Rate()
-        >>> [rate.drew(now) for now in (0.0, 0.5, 1.0)]
-        [0.0, 2.0, 2.0]
+        >>> [rate.drew(now) for now in (0.0, 0.1, 0.5, 1.0)]
+        [0.0, 0.0, 4.0, 3.0]
         """
         self._drawn.append(now)
         while now - self._drawn[0] > self._span:
             self._drawn.popleft()
         passed = now - self._drawn[0]
-        return (len(self._drawn) - 1) / passed if passed > 0 else 0.0
+        return (len(self._drawn) - 1) / passed if passed >= _LEAST_SPAN else 0.0

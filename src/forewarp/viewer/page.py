@@ -13,6 +13,7 @@ import viser
 import viser.transforms
 from torch import Tensor
 
+from forewarp.browser import splat_arrays
 from forewarp.drawing.files import png_bytes, to_bytes
 from forewarp.scene.ellipsoids import Ellipsoids
 from forewarp.viewer.controls import Controls
@@ -78,12 +79,11 @@ class Page:
 
     def splats(self, ellipsoids: Ellipsoids) -> None:
         """See ``Surface``."""
-        # In half precision squares of small lengths vanish: the box is drawn 100 units large, and scaled.
         unit = self.studio.scene.box.diagonal / 100
-        parts = ellipsoids.centers / unit, ellipsoids.covariances / unit**2, ellipsoids.colors
-        arrays = [part.cpu().numpy() for part in (*parts, ellipsoids.opacity[:, None])]
+        arrays = splat_arrays(ellipsoids, unit)
         if self._splats is None:
-            self.client.scene.set_background_image(np.full((1, 1, 3), 255, np.uint8))
+            behind = to_bytes(self.studio.subjects[0].background[None, None])  # as in exact pictures
+            self.client.scene.set_background_image(behind, format="png")
         # The same name takes the place of the one before.
         self._splats = self.client.scene.add_gaussian_splats("/splats", *arrays, scale=unit)
 

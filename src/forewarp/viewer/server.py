@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-import io
 import warnings
 from collections.abc import Iterator
 
 import viser
 
+from forewarp.browser import begin_at, silent
 from forewarp.viewer.address import check_address, is_our_page, taken, url
 from forewarp.viewer.look import axis_of, first_look, pivot
 from forewarp.viewer.page import Page
@@ -57,7 +57,7 @@ def served(studio: Studio, *, host: str, port: int, title: str, folder) -> Itera
         yield url(host, server.get_port())
     finally:
         studio.desk.close()
-        with _silent():
+        with silent():
             server.stop()
 
 
@@ -66,7 +66,7 @@ def _listening(host: str, port: int) -> _Server:
     check_address(host, port)
     # What a page is sent in the moment in which it leaves is lost, as it should be.
     warnings.filterwarnings("ignore", message="Queued a .* on a closed connection", category=UserWarning)
-    with _silent():
+    with silent():
         server = _Server(host=host, port=port, verbose=False)
         if port and server.get_port() != port:  # taken since
             server.stop()
@@ -87,24 +87,11 @@ def _refuse_foreign(server: _Server, host: str) -> None:
             await connection.close(1008, "not a page of this server")
 
 
-@contextlib.contextmanager
-def _silent() -> Iterator[None]:
-    """Drop what viser prints: the command says where the page is in its own words."""
-    with contextlib.redirect_stdout(io.StringIO()):
-        yield
-
-
 def _prepare(server: _Server, studio: Studio, title: str) -> None:
     """Set what all pages begin with."""
     look, (focus, up) = first_look(studio.scene), pivot(studio.scene)
-    center = look.pose[:3, 3]
-    server.scene.set_up_direction(tuple(up.tolist()))
-    ahead = float((focus - center) @ look.pose[:3, 2])
-    target = center + look.pose[:3, 2] * (ahead if ahead > 0 else studio.scene.box.diagonal)
-    server.initial_camera.position = tuple(center.tolist())
-    server.initial_camera.look_at = tuple(target.tolist())
+    begin_at(server, look.pose, look.fov, focus, up, studio.scene.box.diagonal)
     server.initial_camera.up = tuple(axis_of(look.pose, up).tolist())
-    server.initial_camera.fov = look.fov
     server.gui.set_panel_label(title)
     server.gui.configure_theme(show_logo=False, show_share_button=False)
     server.gui.main_panel.dock_right()

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from forewarp.drawing.colors import in_a_row
+from forewarp.scene.camera import Camera
 from forewarp.scene.frame import Scene
 from forewarp.viewer.desk import Desk, Stale
 from forewarp.viewer.look import SPLATS, Look, Point, camera_of, pivot
@@ -72,7 +73,7 @@ class Studio:
             stacked = torch.cat([part for row in rows for part in (gap, row)][1:])
             return on_white(stacked, width, height)
         wide = self.part_width(width)
-        camera = camera_of(look, wide, height, self.scene)
+        camera = self._camera(look, wide, height)
         found = [subject.picture(look, camera, stale, parts) for subject in self.subjects]
         return found[0] if count == 1 else on_white(in_a_row(found, _GAP), width, height)
 
@@ -81,12 +82,19 @@ class Studio:
         count = len(self.subjects)
         return max(1, (width - (count - 1) * _GAP) // count)
 
+    def _camera(self, look: Look, wide: int, height: int) -> Camera:
+        """Make the camera of one subject's picture; beside another it sees as much as a square picture would."""
+        camera = camera_of(look, wide, height, self.scene)
+        if len(self.subjects) == 1 or wide >= height:
+            return camera
+        return replace(camera, fx=camera.fx * wide / height, fy=camera.fy * wide / height)
+
     def point_at(self, look: Look, x: float, y: float, width: int, height: int) -> Point | None:
         """Return the world point seen at ``x y``, fractions of the whole picture; None: nothing solid."""
         wide = self.part_width(width)
         number = min(int(x * len(self.subjects)), len(self.subjects) - 1)
         column = int(x * width) - number * (wide + _GAP)
-        camera = camera_of(look, wide, height, self.scene)
+        camera = self._camera(look, wide, height)
         return self.subjects[number].point_at(camera, (column, int(y * height)), look.time)
 
 

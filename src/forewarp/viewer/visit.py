@@ -116,7 +116,7 @@ class Visit:
                 return
             point = self.studio.point_at(look, x, y, width, height)
             if point is None:
-                self.surface.tell("nothing solid there to follow")
+                self.surface.tell("nothing solid there to follow; press the button again")
             else:
                 self.change(followed=(*look.followed, (point, look.time)))
 

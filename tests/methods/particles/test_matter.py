@@ -4,26 +4,20 @@ import torch
 from forewarp.methods.abilities import HasEllipsoids
 from forewarp.ops.project import Gaussians, project, project_reference
 from forewarp.scene.view import Moment
-from tests.methods.particles.test_model import EVERY, data, module_with  # noqa: F401
 from tests.support.gaussians import NO_TINTS, still
+from tests.support.particles import EVERY, module_with, shaken
 
 
 @pytest.fixture(params=["every effect", "nothing moves"])
-def method(request, data):  # noqa: F811
+def method(request, data):
     """Particles whose parameters are all random; some of them rest."""
     options = EVERY | {"view_dependence": 2} if request.param == "every effect" else {"motion": None}
-    method = module_with(data, **options).method
-    generator = torch.Generator().manual_seed(0)
-    for p in method.parameters():
-        p.data += 0.1 * torch.randn(p.shape, generator=generator)
-    if method.skin is not None:
-        method.skin.let_go(torch.arange(len(method.means)) % 3 == 0)
-    return method
+    return shaken(module_with(data, **options)).method
 
 
 @pytest.mark.parametrize("time", [0.0, 0.6])
 @pytest.mark.parametrize("by", [project, project_reference])
-def test_ellipsoids_are_seen_as_the_particles_are(method, data, time, by):  # noqa: F811
+def test_ellipsoids_are_seen_as_the_particles_are(method, data, time, by):
     assert isinstance(method, HasEllipsoids)
     snapshot = method.at(Moment(time))
     pinhole = snapshot.pinholes(data.scene.train[0].camera)
