@@ -226,7 +226,7 @@ def test_a_clicked_point_is_added_to_those_followed(studio):
         visit.follow(x, 0.5)
         serve(studio)
     assert visit.look.followed == (((0.5, 0.5, 0.0), 0.25), ((0.25, 0.5, 0.0), 0.25))
-    assert "nothing solid there to follow" in page.said
+    assert "nothing solid there to follow; press the button again" in page.said
 
 
 def test_a_browser_draws_splats_by_itself(studio, watch):

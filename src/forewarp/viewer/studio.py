@@ -83,7 +83,7 @@ class Studio:
         return max(1, (width - (count - 1) * _GAP) // count)
 
     def _camera(self, look: Look, wide: int, height: int) -> Camera:
-        """Make the camera of one subject's picture; beside another it sees as much as a square picture would."""
+        """Make the camera of one subject's picture; beside another it sees what a square one would."""
         camera = camera_of(look, wide, height, self.scene)
         if len(self.subjects) == 1 or wide >= height:
             return camera
