@@ -1,5 +1,5 @@
 .DEFAULT_GOAL := help
-.PHONY: help install install-launchers demo demo-particles demo-forward demo-backward tables-vehicle tables-captures demo-lego-complete demo-hypernerf demo-nhr test conformance test-slow test-stability bench bench-gpu effects accuracy-time price-list reproduce-tables lint format clean
+.PHONY: help install install-launchers install-browser demo demo-particles demo-forward demo-backward tables-vehicle tables-captures demo-lego-complete demo-hypernerf demo-nhr test conformance test-slow test-stability bench bench-gpu effects accuracy-time price-list reproduce-tables lint format clean
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -40,12 +40,19 @@ install: ## create .venv with forewarp and all extras except the launchers of sw
 	$(BIN)/pip install --quiet uv
 	links="$$($(BIN)/pip config get global.find-links 2>/dev/null || echo "$$PIP_FIND_LINKS")"; \
 	if [ -n "$$links" ]; then export UV_FIND_LINKS="$$links"; fi; \
-	VIRTUAL_ENV="$$PWD/.venv" $(BIN)/uv pip install --compile-bytecode -c constraints.txt -e '.[cpu,synth,plots,dev]'
+	VIRTUAL_ENV="$$PWD/.venv" $(BIN)/uv pip install --compile-bytecode -c constraints.txt -e '.[cpu,synth,plots,viewer,export,dev]'
 
 install-launchers: ## add joblib, Ray and submitit for sweeps (launcher=...), and Optuna (sweeps=search)
 	links="$$($(BIN)/pip config get global.find-links 2>/dev/null || echo "$$PIP_FIND_LINKS")"; \
 	if [ -n "$$links" ]; then export UV_FIND_LINKS="$$links"; fi; \
 	VIRTUAL_ENV="$$PWD/.venv" $(BIN)/uv pip install --compile-bytecode -c constraints.txt -e '.[sweeps]'
+
+install-browser: ## add a headless Chromium and playwright, which test the viewer's page; as root, on Debian
+	command -v chromium >/dev/null || { apt-get update -qq && \
+		apt-get install -y -qq --no-install-recommends chromium fonts-dejavu-core >/dev/null; }
+	links="$$($(BIN)/pip config get global.find-links 2>/dev/null || echo "$$PIP_FIND_LINKS")"; \
+	if [ -n "$$links" ]; then export UV_FIND_LINKS="$$links"; fi; \
+	VIRTUAL_ENV="$$PWD/.venv" $(BIN)/uv pip install --compile-bytecode -c constraints.txt -e '.[browser]'
 
 demo: ## fit the procedural vehicle by three methods, two at once, compare, make a video (three to four minutes)
 	@$(MAKE) --no-print-directory -j2 demo-particles demo-forward demo-backward
@@ -68,7 +75,7 @@ demo-lego-complete demo-hypernerf demo-nhr:
 test: ## run the tests except the slow ones
 	$(BIN)/pytest --no-cov -m "not slow"
 
-test-slow: ## run the slow tests: killed runs, every method on every dataset, every sweep's jobs, the wheel
+test-slow: ## run the slow tests: the page in a browser, killed runs, every method on every dataset, every sweep's jobs, the wheel
 	$(BIN)/pytest --no-cov -m slow
 
 conformance: ## test every method against the contract, slow cases too, and write docs/conformance.md

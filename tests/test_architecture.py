@@ -15,21 +15,37 @@ MAY_IMPORT = {
     **dict.fromkeys(["metrics", "drawing", "fields", "data", "quadrature"], {"ops", "scene"}),
     "report": {"drawing", "metrics"},
     "synth": {"ops", "scene", "data"},
+    "browser": {"ops", "scene"},
     "renderer": {"ops", "scene", "fields"},
     "methods": LOWER,
     "training": LOWER | {"methods"},
     "evaluation": LOWER | {"methods", "training"},
     "runs": LOWER | {"methods", "training", "evaluation", "data"},
     "planning": LOWER | {"methods", "training", "evaluation", "data", "report", "runs"},
+    "viewer": LOWER | {"browser", "methods", "training", "evaluation"},
+    "export": LOWER | {"browser", "methods", "training", "evaluation"},
     "replay": {"cli", "runs", "training"},
-    "cli": LOWER | {"methods", "training", "evaluation", "data", "synth", "report", "runs", "planning"},
+    "cli": LOWER
+    | {
+        "methods",
+        "training",
+        "evaluation",
+        "data",
+        "synth",
+        "report",
+        "runs",
+        "planning",
+        "viewer",
+        "export",
+    },
 }
 CONFIG = {"runs", "planning", "cli"}
 ONLY_IN = {
     **dict.fromkeys(["hydra", "omegaconf"], CONFIG),
-    "lightning": {"data", "training", "evaluation", "runs", "planning", "cli"},
+    "lightning": {"data", "training", "evaluation", "runs", "planning", "viewer", "cli"},
     **{"torchmetrics": {"metrics"}, "numba": {"ops"}, "PIL": {"data"}, "matplotlib": {"report"}},
     **{"trimesh": {"synth"}, "embreex": {"synth"}, "torchvision": set()},
+    **{"skimage": {"export"}, "viser": {"export", "viewer", "cli"}},
     **{"imageio": {"drawing", "evaluation", "cli"}, "imageio_ffmpeg": {"drawing", "cli"}},
     "rich": {"progress", "training", "evaluation", "planning", "cli"},
 }
@@ -42,7 +58,7 @@ CONTRACT = {
 }  # files of methods/ that packages above may import
 # Attributes of one method only.
 OWN_PARTS = {"radiance", "lattice", "lattices", "motion", "deformation", "inpainter"}
-ABOVE = {"training", "data", "report", "evaluation", "runs", "planning", "cli"}
+ABOVE = {"training", "data", "report", "evaluation", "runs", "planning", "viewer", "export", "cli"}
 FUNCTION_LINES, FILE_LINES = 60, 350
 REASON = "# long: "
 

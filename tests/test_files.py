@@ -5,7 +5,16 @@ import os
 
 import pytest
 
-from forewarp.files import load_json, read_json, read_text, replace_file, write_json, written_whole
+from forewarp.files import (
+    check_replaceable,
+    folder_written_whole,
+    load_json,
+    read_json,
+    read_text,
+    replace_file,
+    write_json,
+    written_whole,
+)
 
 
 def test_a_file_appears_whole_with_its_folder(tmp_path):
@@ -66,3 +75,86 @@ def test_nothing_is_read_of_a_file_that_is_too_large_or_no_file(tmp_path):
         read_text(tmp_path / "pipe")
     with pytest.raises(IsADirectoryError):
         read_text(tmp_path)
+
+
+def fill(part, content):
+    (part / "in").mkdir()
+    (part / "in" / content).touch()
+    write_json(part / "mark", {"bytes": {f"in/{content}": 0}})
+
+
+def files_in(path):
+    return sorted(file.relative_to(path).as_posix() for file in path.rglob("*") if file.is_file())
+
+
+def test_a_folder_appears_whole_and_nothing_stays_beside(tmp_path):
+    path = tmp_path / "made" / "here"
+    with pytest.raises(ZeroDivisionError), folder_written_whole(path, "mark") as part:
+        (part / "half").write_text("half") // 0
+    assert list(tmp_path.iterdir()) == []
+    for content in ("one", "two"):
+        with folder_written_whole(path, "mark") as part:
+            fill(part, content)
+            assert not (path / "in" / content).exists()
+        assert files_in(path.parent) == [f"here/in/{content}", "here/mark"]
+    with pytest.raises(ZeroDivisionError), folder_written_whole(path, "mark") as part:
+        (part / "half").write_text("half") // 0
+    assert files_in(path.parent) == ["here/in/two", "here/mark"]
+    assert path.stat().st_mode == path.parent.stat().st_mode
+
+
+def test_two_calls_for_one_folder_do_not_disturb_each_other(tmp_path):
+    path = tmp_path / "here"
+    with folder_written_whole(path, "mark") as part:
+        with folder_written_whole(path, "mark") as other:
+            fill(other, "other")
+        fill(part, "this")
+    assert files_in(tmp_path) == ["here/in/this", "here/mark"]  # the last to end
+
+
+def test_the_old_folder_stays_if_the_new_one_cannot_take_its_place(tmp_path, monkeypatch):
+    path, replace = tmp_path / "here", os.replace
+    with folder_written_whole(path, "mark") as part:
+        fill(part, "old")
+
+    def fails(source, target):
+        if source.is_dir() and target == path and source.suffix == ".part":
+            raise OSError(errno.EIO, "Input/output error")
+        replace(source, target)
+
+    monkeypatch.setattr(os, "replace", fails)
+    with pytest.raises(OSError, match="Input/output"), folder_written_whole(path, "mark") as part:
+        fill(part, "new")
+    assert files_in(tmp_path) == ["here/in/old", "here/mark"]
+
+
+def test_what_a_killed_call_left_is_put_back_or_cleared(tmp_path):
+    path, left = tmp_path / "here", tmp_path / ".here.0.part"
+    with folder_written_whole(tmp_path / ".here.before", "mark") as part:
+        fill(part, "old")
+    left.mkdir()
+    os.utime(left, (0, 0))
+    with pytest.raises(ZeroDivisionError), folder_written_whole(path, "mark") as part:
+        part.write_text("half") if left.exists() else 1 // 0
+    assert files_in(tmp_path) == ["here/in/old", "here/mark"]
+
+
+def test_only_a_folder_of_ours_is_replaced(tmp_path):
+    path = tmp_path / "here"
+    with folder_written_whole(path, "mark") as part:
+        fill(part, "one")
+    check_replaceable(path, "mark")
+    (tmp_path / "theirs").mkdir()
+    (tmp_path / "theirs" / "a").touch()
+    (tmp_path / "link").symlink_to(path)
+    (path / "in" / "notes").touch()
+    for other, got in (
+        ("theirs", "a in it"),
+        ("link", "a file or"),
+        ("theirs/a", "a file or"),
+        ("here", "in/notes"),
+    ):
+        with pytest.raises(
+            ValueError, match=f"expected no folder, an empty one, or one written before.*{got}"
+        ):
+            check_replaceable(tmp_path / other, "mark")

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import errno
+import glob
 import json
 import os
+import secrets
+import shutil
 import stat
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -17,6 +21,8 @@ MOST_BYTES = 1 << 26  # of a text that is parsed, which takes up to thirty times
 MOST_POINTS = 1 << 28  # of a cloud of points as text
 MOST_IMAGE = 1 << 29
 MOST_ARRAYS = 1 << 30  # of NumPy's files, also when unpacked
+
+_LEFT = 24 * 3600  # seconds after which nobody fills a folder any more
 
 
 @contextmanager
@@ -47,6 +53,80 @@ def written_whole(path: Path, *, synced: bool = False) -> Iterator[Path]:
     finally:
         with suppress(OSError):
             beside.unlink()
+
+
+@contextmanager
+def folder_written_whole(path: Path, mark: str) -> Iterator[Path]:
+    """Fill the folder that this gives, which takes the place of ``path`` at the end.
+
+    Args:
+        path: appears whole or not at all; stays as it was if anything fails. What a killed call left of it
+            is put back first. See ``check_replaceable`` for what it may hold.
+        mark: see ``check_replaceable``.
+
+    Raises:
+        ValueError: see ``check_replaceable``.
+        OSError: where it cannot be written; nothing is then left behind.
+    """
+    check_replaceable(path, mark)
+    path = Path(os.path.abspath(path))
+    before = path.with_name(f".{path.name}.before")
+    if before.exists() and not path.exists():  # killed between the two renames below
+        os.replace(before, path)
+        check_replaceable(path, mark)
+    # A name of its own, as another call may be filling one for the same folder.
+    beside = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
+    made = [folder for folder in path.parents if not folder.exists()]
+    try:
+        for old in [before, *filter(_is_left, path.parent.glob(f".{glob.escape(path.name)}.*.part"))]:
+            shutil.rmtree(old, ignore_errors=True)
+        beside.mkdir(parents=True)
+        yield beside
+        if path.exists():
+            os.replace(path, before)
+        try:
+            os.replace(beside, path)
+        except BaseException:
+            with suppress(OSError):
+                os.replace(before, path)
+            raise
+        shutil.rmtree(before, ignore_errors=True)
+        made = []
+    finally:
+        shutil.rmtree(beside, ignore_errors=True)
+        for folder in made:
+            with suppress(OSError):  # not empty: someone else's by now
+                folder.rmdir()
+
+
+def _is_left(part: Path) -> bool:
+    """Whether a half-filled folder is so old that the call that filled it was killed."""
+    with suppress(OSError):
+        return time.time() - part.stat().st_mtime > _LEFT
+    return False
+
+
+def check_replaceable(path: Path, mark: str) -> None:
+    """Refuse a path at which lies what is not ours: a file, a link, or a folder with files of others.
+
+    Args:
+        path: of the folder.
+        mark: name of a JSON file in every folder of ours; its ``bytes`` has the other files as keys.
+
+    Raises:
+        ValueError: naming ``path`` and a file that is not ours.
+    """
+    if not os.path.lexists(path):
+        return
+    expected = f"{path}: expected no folder, an empty one, or one written before (with {mark})"
+    if path.is_symlink() or not path.is_dir():
+        raise ValueError(f"{expected}, but got a file or a link; choose another")
+    content = read_json(path / mark) or {}
+    ours = {mark, *content["bytes"]} if isinstance(content.get("bytes"), dict) else set()
+    found = sorted(file.relative_to(path).as_posix() for file in path.rglob("*") if not file.is_dir())
+    others = [name for name in found if name not in ours]
+    if others:
+        raise ValueError(f"{expected}, but got {others[0]} in it; move it, or choose another")
 
 
 def replace_file(path: Path, content: bytes | str) -> None:

@@ -12,7 +12,7 @@ from forewarp.cli.misspelt import with_run_key
 from forewarp.scene.errors import SceneError
 from tests.support.configs import CONF, ROOT, options
 
-COMMANDS = ("train", "evaluate", "render", "synthesize", "report")
+COMMANDS = ("train", "evaluate", "render", "export", "synthesize", "report")
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -167,7 +167,9 @@ def test_a_renamed_key_is_named_whatever_the_method(refused, in_tmp):
     assert said == "model.view=1: expected model.view_dependence=1; renamed in 0.3"
 
 
-@pytest.mark.parametrize(("name", "key"), [("evaluate", "run"), ("render", "run"), ("train", "resume")])
+@pytest.mark.parametrize(
+    ("name", "key"), [("evaluate", "run"), ("render", "run"), ("export", "run"), ("train", "resume")]
+)
 def test_a_bare_folder_is_a_run(refused, in_tmp, name, key):
     (in_tmp / "demo").mkdir()
     line = "demo/config.yaml: expected the configuration of a run, but got none; set "

@@ -21,7 +21,7 @@ for name, *words in json.load(sys.stdin):
     GlobalHydra.instance().clear()
     print(json.dumps([status, err.getvalue(), sorted(sys.modules)]), flush=True)
 """
-COMMANDS = ("train", "plan", "evaluate", "render", "report", "synthesize")
+COMMANDS = ("train", "plan", "evaluate", "render", "view", "export", "report", "synthesize")
 NOWHERE = ["data=dnerf", "data.root=nowhere", "data.scene=x"]
 REFUSED = [
     (["train", "data.scence=x"], "did you mean data.scene?"),
@@ -37,6 +37,11 @@ REFUSED = [
     (["evaluate"], "run: expected the folder of a run, but got nothing"),
     (["evaluate", "run=."], "config.yaml: expected the configuration of a run, but got none"),
     (["render", "run=."], "config.yaml: expected the configuration of a run, but got none"),
+    (["view"], "run: expected the folder of a run, but got nothing"),
+    (["view", "run=."], "config.yaml: expected the configuration of a run, but got none"),
+    (["train", "viewer=8080"], "viewer: expected true or false, but got 8080"),
+    (["export"], "run: expected the folder of a run, but got nothing"),
+    (["export", "run=."], "config.yaml: expected the configuration of a run, but got none"),
     (["report", "kind=limits", "runs=[a]"], "config.yaml: expected the configuration of a run, but got none"),
     (["report"], "runs/accuracy_time: expected folders of runs, but got none"),
     (["synthesize", "folder=."], "expected a new or empty folder, but got one with files"),

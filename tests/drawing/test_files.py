@@ -40,3 +40,10 @@ def test_nothing_half_written_stays(tmp_path, suffix):
     with pytest.raises(KeyboardInterrupt):
         write_video(tmp_path / f"a.{suffix}", broken(), fps=5)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_video_of_pictures_of_two_sizes_is_refused(tmp_path):
+    pictures = [torch.zeros(20, 30, 3), torch.zeros(20, 30, 3), torch.zeros(20, 32, 3)]
+    with pytest.raises(ValueError, match=r"expected pictures of \(20, 30, 3\), .* but got \(20, 32, 3\)"):
+        write_video(tmp_path / "film.mp4", pictures, fps=10)
+    assert list(tmp_path.iterdir()) == []

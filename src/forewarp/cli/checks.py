@@ -23,6 +23,10 @@ READERS = {
 
 VOXELS, PARTICLES = "forewarp.methods.voxel.", "forewarp.methods.particles."
 
+# Of videos and pages: the least whole number, and the range of a number.
+LEAST = {"frames": 2, "view": 0, "points": 1, "size": 16}
+RANGES = {"fps": (0.1, 1000), "time": (0, 1), "tail": (0.01, 1)}
+
 
 def refuse_all(config: DictConfig) -> None:
     """Refuse what is wrong with a config by itself, whatever the data."""
@@ -103,3 +107,14 @@ def refuse_other_methods(config: DictConfig) -> None:
         for one in typed_overrides():
             if key_of(one) in ("preset.rays", "data.rays") and not one.endswith("=null"):
                 raise ValueError(of_another(one, config.model.name, "forward"))
+
+
+def refuse_numbers(config: DictConfig, *keys: str) -> None:
+    """Refuse values that keys of ``LEAST`` and ``RANGES`` cannot have; size may be null."""
+    for key in keys:
+        value = config[key]
+        if key in LEAST and (key, value) != ("size", None) and (type(value) is not int or value < LEAST[key]):
+            raise ValueError(f"{key}: expected a whole number of at least {LEAST[key]}, but got {value}")
+        low, high = RANGES.get(key, (value, value))
+        if key in RANGES and (type(value) not in (int, float) or not low <= value <= high):
+            raise ValueError(f"{key}: expected a number in [{low}, {high}], but got {value}")

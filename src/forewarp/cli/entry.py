@@ -163,7 +163,7 @@ def choices(conf: Path, name: str) -> str:
         text = (conf / f"{name}.yaml").read_text()
         groups = [group for group in ("dataset", "trainer") if f"- {group}:" in text]
     else:
-        silent = {"hydra", "paths", "callbacks", "dataset"}
+        silent = {"hydra", "paths", "callbacks", "dataset", "listen"}
         folders = [path for path in sorted(conf.rglob("*")) if path.is_dir() and path.name != "one"]
         groups = [p.relative_to(conf).as_posix() for p in folders]
         # model_preset and its like follow from what is chosen.

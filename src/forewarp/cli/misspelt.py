@@ -12,7 +12,7 @@ from forewarp.runs.config_files import configurations
 from forewarp.runs.overrides import key_of, refuse_renamed
 
 OF_METHODS = ("model", "modules", "objective", "preset", "stage")  # what methods have keys of their own in
-FOLDERS = {"evaluate": "run", "render": "run", "train": "resume"}
+FOLDERS = {"evaluate": "run", "render": "run", "view": "run", "export": "run", "train": "resume"}
 
 
 def with_run_key(name: str, arguments: list[str]) -> list[str]:

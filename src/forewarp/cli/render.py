@@ -39,13 +39,9 @@ def render(config) -> None:
     # These load torch; mistakes have been answered before.
     from forewarp.drawing.files import write_video
     from forewarp.progress import Counted
-    from forewarp.runs.build import build_run
-    from forewarp.runs.data_check import warn_if_changed
-    from forewarp.training.device import device_of
+    from forewarp.runs.fitted import opened
 
-    run = build_run(saved)
-    module = run.load().to(device_of(saved.trainer.accelerator))
-    warn_if_changed(run)
+    run, module = opened(saved)
     pictures = pictures_of(config, module, run.datamodule)
     file = Path(run.folder) / "videos" / f"{config.path}.{config.format}"
     with Counted(config.path) as progress:
@@ -81,20 +77,14 @@ def counted(pictures, total: int, progress):
 
 def check(config) -> None:
     """Refuse settings of which no video can be made, before anything is loaded."""
+    from forewarp.cli.checks import LEAST, RANGES, refuse_numbers
     from forewarp.drawing.files import FORMATS
     from forewarp.evaluation.videos import PATHS
 
     for key, known in (("path", PATHS), ("format", FORMATS)):
         if config[key] not in known:
             raise ValueError(f"{key}: expected one of {', '.join(known)}, but got '{config[key]}'")
-    for key, least in (("frames", 2), ("view", 0), ("points", 1), ("size", 16)):
-        if type(config[key]) is not int or config[key] < least:
-            if key == "size" and config.size is None:
-                continue
-            raise ValueError(f"{key}: expected a whole number of at least {least}, but got {config[key]}")
-    for key, low, high in (("fps", 0.1, 1000), ("time", 0, 1), ("tail", 0.01, 1)):
-        if type(config[key]) not in (int, float) or not low <= config[key] <= high:
-            raise ValueError(f"{key}: expected a number in [{low}, {high}], but got {config[key]}")
+    refuse_numbers(config, *LEAST, *RANGES)
 
 
 def main() -> None:

@@ -31,6 +31,7 @@ What one types most (options such as --multirun or --config-dir=FOLDER come firs
   run=FOLDER                          the run's folder (runs/<scene>/<model>-<preset>-seed<seed>)
   effects=auto                        find out what the scene calls for, then fit that: see forewarp-plan
   plan=FILE                           fit what a plan says; an override typed beside it wins
+  viewer=true                         show the run on a page while it trains: see forewarp-view
   evaluate=false                      do not measure at the end
   data.held_out=N                     hold N training views out and record their PSNR against training time
   scene=DATASET_NAME                  a scene of the paper below paths.scenes=FOLDER, such as scene=dnerf_hook
@@ -62,6 +63,7 @@ def train(config) -> float | None:
         from forewarp.runs.score import named
 
         named(config.score)
+    viewer = viewer_of(config)  # as typed: a saved config has none
     config = resumed(config)
     refuse_missing_scene(config)
     # These load torch; mistakes have been answered before.
@@ -84,7 +86,7 @@ def train(config) -> float | None:
             return Score(run, config).of()
     run.datamodule.setup("fit")  # before the folder is made: a mistyped scene leaves nothing behind
     score = Score(run, config)
-    with locked(run.folder):
+    with watched(run, viewer), locked(run.folder):
         claim(config)
         check_data(run, changed)
         keep_plan(config)
@@ -100,6 +102,47 @@ def train(config) -> float | None:
         if steps := noted.get("skipped_steps"):
             print(f"{name}: {steps} broken steps skipped; each lies in {run.folder / name / 'broken'}")
     return value
+
+
+def viewer_of(config) -> dict | None:
+    """Return where a page should listen, None if none is asked for; refuse one that cannot be made."""
+    from forewarp.cli.view import require_viewer
+    from forewarp.viewer.address import check_address
+
+    viewer = config.get("viewer", False)
+    if type(viewer) is not bool:
+        raise ValueError(f"viewer: expected true or false, but got {viewer}")
+    if not viewer:
+        return None
+    require_viewer()
+    refuse_one_port(config)
+    check_address(config.host, config.port)
+    return {"host": config.host, "port": config.port}
+
+
+def refuse_one_port(config) -> None:
+    """Refuse one port for jobs that may run at once."""
+    from hydra.core.hydra_config import HydraConfig
+    from hydra.types import RunMode
+
+    if not (HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN) or config.port == 0:
+        return
+    if "BasicLauncher" not in str(HydraConfig.get().launcher.get("_target_")):
+        raise ValueError(
+            f"port: expected 0 where jobs may run at once, so that each takes one that is free, but got "
+            f"{config.port}; set port=0, or launcher=local"
+        )
+
+
+def watched(run, viewer: dict | None):
+    """Return a context in which a page shows the run while it trains, if one is asked for."""
+    from contextlib import nullcontext
+
+    if viewer is None:
+        return nullcontext()
+    from forewarp.viewer.live import live
+
+    return live(run, **viewer)
 
 
 def planned(config):

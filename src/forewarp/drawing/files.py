@@ -29,6 +29,11 @@ def write_png(path: Path, picture: Tensor) -> Path:
     return path
 
 
+def png_bytes(picture: Tensor) -> bytes:
+    """Encode (H, W, 3) in [0, 1]."""
+    return iio.imwrite("<bytes>", to_bytes(picture), extension=".png")
+
+
 def write_video(path: Path, pictures: Iterable[Tensor], *, fps: float) -> Path:
     """Write pictures (H, W, 3) in [0, 1], taken one by one, in the format that the suffix names.
 
@@ -61,6 +66,10 @@ def _write_mp4(path: Path, frames: Iterable[np.ndarray], fps: float) -> None:
     writer.send(None)
     try:
         for frame in chain([first], frames):
+            if frame.shape != first.shape:  # ffmpeg would take it, and shear all that follow
+                raise ValueError(
+                    f"video: expected pictures of {first.shape}, as the first, but got {frame.shape}"
+                )
             writer.send(frame)
     except OSError as error:  # its message has many lines and does not name the file
         raise OSError(errno.EIO, "ffmpeg could not go on (is the disk full?)", str(path)) from error

@@ -13,9 +13,10 @@ from torch import Tensor
 from forewarp.drawing.colors import depth_colors, error_colors, flow_colors, in_a_row, with_wheel
 from forewarp.drawing.files import write_png
 from forewarp.methods.abilities import HasTrajectories
+from forewarp.methods.method import Snapshot
 from forewarp.scene.batch import Target
 from forewarp.scene.camera import Camera
-from forewarp.scene.view import Moment, View
+from forewarp.scene.view import Moment, Rendering, View
 from forewarp.training.module import DynamicSceneModule
 
 _SEEN = 0.02  # show the motion of pixels at least this opaque
@@ -41,14 +42,9 @@ def pictures_of(module: DynamicSceneModule, target: Target, size: int | None = N
     """
     camera = within(target.frame.camera, size)
     shape = (camera.height, camera.width)
-    drawn = module.render(camera, target.moment, target.background)
-    predicted = drawn.rgb.reshape(*shape, 3).clamp(0, 1)
-    truth = target.rgb.to(predicted)
-    if truth.shape != predicted.shape:
-        channels_first = truth.permute(2, 0, 1)[None]
-        truth = torch.nn.functional.interpolate(channels_first, shape, mode="area")[0].permute(1, 2, 0)
+    compared, drawn = compare(module, target, camera)
     pictures = {
-        "compare": in_a_row([truth, predicted, error_colors(truth, predicted)]),
+        "compare": in_a_row(compared),
         "depth": depth_colors(drawn.depth.reshape(shape), drawn.opacity.reshape(shape)),
     }
     if isinstance(module.method, HasTrajectories):
@@ -56,16 +52,41 @@ def pictures_of(module: DynamicSceneModule, target: Target, size: int | None = N
     return pictures
 
 
+def compare(
+    module: DynamicSceneModule, target: Target, camera: Camera, snapshot: Snapshot | None = None
+) -> tuple[list[Tensor], Rendering]:
+    """Draw truth, prediction and error, each (h, w, 3) in [0, 1], of an image; return the rendering too.
+
+    Args:
+        module: the fitted scene.
+        target: the image.
+        camera: its camera, resized to (h, w).
+        snapshot: of the image's moment, if already made.
+    """
+    shape = (camera.height, camera.width)
+    drawn = module.render(camera, target.moment, target.background, snapshot)
+    predicted = drawn.rgb.reshape(*shape, 3).clamp(0, 1)
+    truth = target.rgb.to(predicted)
+    if truth.shape != predicted.shape:
+        channels_first = truth.permute(2, 0, 1)[None]
+        truth = torch.nn.functional.interpolate(channels_first, shape, mode="area")[0].permute(1, 2, 0)
+    return [truth, predicted, error_colors(truth, predicted)], drawn
+
+
 @torch.no_grad()
-def image_flow(module: DynamicSceneModule, camera: Camera, time: float) -> tuple[Tensor, Tensor]:
+def image_flow(
+    module: DynamicSceneModule, camera: Camera, time: float, snapshot: Snapshot | None = None
+) -> tuple[Tensor, Tensor]:
     """Render the canonical scene and follow the visible points to ``time``.
+
+    ``snapshot``: of the canonical time, if already made.
 
     Returns:
         flow (H, W, 2) in pixels, opacity (H, W).
     """
     view = View(camera)
     canonical = Moment(module.curriculum.canonical_time)
-    drawn = module.render(view, canonical, torch.zeros(3))
+    drawn = module.render(view, canonical, torch.zeros(3), snapshot)
     rays = view.rays().to(module.device)
     seen = drawn.opacity > _SEEN
     at = rays.origins[seen] + drawn.depth[seen, None] * rays.directions[seen]

@@ -12,10 +12,12 @@ from forewarp.drawing.lines import draw_discs, hidden, sample_lines
 from forewarp.evaluation.pictures import within
 from forewarp.methods.abilities import HasMatter, HasTrajectories
 from forewarp.scene.camera import Camera
+from forewarp.scene.cloud import Cloud, far_apart
 from forewarp.scene.view import Moment, Rendering, View
 from forewarp.training.module import DynamicSceneModule
 
 _VIEWS, _VIEW_SIZE = 24, 80  # number and pixels of the views that find the surface
+_STEPS = 60  # vertices of a path through all time
 _STILL = 0.15  # a moving point travels at least this share of the farthest travel
 
 
@@ -28,6 +30,7 @@ class Trajectories:
         count: most points to draw.
         tail: duration of a tail, as a share of the whole time.
         width: line width, as a share of the picture's longer side.
+        points: canonical points (N, 3) to draw; None: chosen by ``moving_points``.
     """
 
     def __init__(
@@ -38,6 +41,7 @@ class Trajectories:
         count: int = 300,
         tail: float = 0.5,
         width: float = 0.004,
+        points: Tensor | None = None,
     ) -> None:
         for ability in (HasTrajectories, HasMatter):
             if not isinstance(module.method, ability):
@@ -48,7 +52,8 @@ class Trajectories:
         self.method, self.tail, self.width = module.method, tail, width
         # The depth of a rendered surface is uncertain by about the size of its matter.
         self.slack = 1.5 * module.method.matter().size
-        self.points = moving_points(module, cameras, count)
+        self.points = moving_points(module, cameras, count) if points is None else points
+        self._paths: Tensor | None = None
         self.colors = hues(0.85 * order_of(self.points))
 
     @torch.no_grad()
@@ -56,9 +61,7 @@ class Trajectories:
         """Draw the tails over ``picture`` (H, W, 3) of ``camera`` at ``time``; ``drawn`` is its rendering."""
         if not len(self.points):
             return picture
-        begin = max(0.0, time - self.tail)
-        times = torch.linspace(begin, time, 2 + int(60 * (time - begin)), device=self.points.device)
-        paths = self.method.trajectories(self.points, times)
+        paths, times = self._tails(time)
         pixels, z = camera.project(paths)
         distance = (paths - camera.center.to(paths)).norm(dim=-1)
         strength = (1 - (time - times) / self.tail).clamp(0, 1).expand_as(distance)
@@ -71,6 +74,25 @@ class Trajectories:
         picture = self._draw(picture, marks, colors[line], surface, radius)
         return self._draw(picture, vertices[:, -1], colors, surface, 1.8 * radius)
 
+    def forget(self) -> None:
+        """Forget where the points were, as the method has changed."""
+        self._paths = None
+
+    def _tails(self, time: float) -> tuple[Tensor, Tensor]:
+        """Return the points' tails (N, T, 3) at a time, and when they were there (T,), the time itself last.
+
+        Cost: at the first call the method follows the points through all time; then linear interpolation.
+        """
+        every = torch.linspace(0, 1, _STEPS + 1, device=self.points.device)
+        if self._paths is None:
+            self._paths = self.method.trajectories(self.points, every)
+        begin = max(0.0, time - self.tail)
+        between = every[(every > begin) & (every < time)]
+        times = torch.cat([between.new_tensor([begin]), between, between.new_tensor([time])])
+        at = times * _STEPS
+        low = at.floor().long().clamp(max=_STEPS - 1)
+        return torch.lerp(self._paths[:, low], self._paths[:, low + 1], (at - low)[:, None]), times
+
     def _draw(self, picture: Tensor, marks: Tensor, colors: Tensor, surface: Tensor, radius: float) -> Tensor:
         at, distance, strength = marks[:, :2], marks[:, 2], marks[:, 3]
         seen = strength * ~hidden(at, distance, surface, self.slack)
@@ -78,8 +100,17 @@ class Trajectories:
 
 
 @torch.no_grad()
-def surface_points(module: DynamicSceneModule, cameras: Sequence[Camera]) -> Tensor:
-    """Return the points of matter (N, 3), world units, seen by a few cameras at the canonical time."""
+def surface(module: DynamicSceneModule, cameras: Sequence[Camera]) -> Cloud:
+    """Return the matter seen by a few cameras at the canonical time."""
+    matter = module.method.matter()
+    return matter[seen_by(module, cameras, matter.points, matter.size)]
+
+
+@torch.no_grad()
+def seen_by(module: DynamicSceneModule, cameras: Sequence[Camera], points: Tensor, size: float) -> Tensor:
+    """Tell which canonical points (N, 3) lie in a cube, ``size`` world units wide, in which a few cameras see
+    the surface: (N,) bool.
+    """
     canonical = module.method.at(Moment(module.curriculum.canonical_time))
     black, found = torch.zeros(3, device=module.device), []
     for camera in cameras[:: max(1, len(cameras) // _VIEWS)][:_VIEWS]:
@@ -88,9 +119,7 @@ def surface_points(module: DynamicSceneModule, cameras: Sequence[Camera]) -> Ten
         hit = drawn.opacity > 0.5
         found.append(rays.origins[hit] + drawn.depth[hit, None] * rays.directions[hit])
     # At a silhouette the mean depth lies in empty space; points of matter do not.
-    matter = module.method.matter()
-    cells, seen = _cells(matter.points, matter.size), _cells(torch.cat(found), matter.size)
-    return matter.points[torch.isin(cells, seen)]
+    return torch.isin(_cells(points, size), _cells(torch.cat(found), size))
 
 
 def _cells(points: Tensor, size: float) -> Tensor:
@@ -102,28 +131,14 @@ def _cells(points: Tensor, size: float) -> Tensor:
 @torch.no_grad()
 def moving_points(module: DynamicSceneModule, cameras: Sequence[Camera], count: int) -> Tensor:
     """Choose at most ``count`` canonical points (N, 3), spread evenly over the moving surface."""
-    points = surface_points(module, cameras)
+    points = surface(module, cameras).points
     if not len(points):
         return points
     paths = module.method.trajectories(points, torch.linspace(0, 1, 33, device=points.device))
     reach = (paths - points[:, None]).norm(dim=-1).amax(1)
     least = max(_STILL * float(reach.max()), module.method.matter().size)
-    return spread(points[reach > least], count)
-
-
-def spread(points: Tensor, count: int) -> Tensor:
-    """Choose ``count`` of the points (N, 3): the first, then repeatedly the one farthest from those chosen.
-
-    Cost: N * count distances.
-    """
-    if len(points) <= count:
-        return points
-    chosen = [0]
-    nearest = (points - points[0]).square().sum(-1)
-    for _ in range(count - 1):
-        chosen.append(int(nearest.argmax()))
-        nearest = torch.minimum(nearest, (points - points[chosen[-1]]).square().sum(-1))
-    return points[torch.tensor(chosen, device=points.device)]
+    points = points[reach > least]
+    return points[far_apart(points, count)]
 
 
 def order_of(points: Tensor) -> Tensor:

@@ -47,6 +47,12 @@ def shaded(features: Tensor, directions: Tensor, shade: Shade | None) -> Tensor:
     return torch.sigmoid(features[:, :3]) if shade is None else shade(features, directions)
 
 
+def mean_color(color_of: Callable[[Tensor], Tensor], points: Tensor) -> Tensor:
+    """Colours (P, 3) of points (P, 3): the mean of what ``color_of`` gives along the six axes' directions."""
+    towards = torch.cat([torch.eye(3), -torch.eye(3)]).to(points)
+    return sum(color_of(d.expand(len(points), 3)) for d in towards) / len(towards)
+
+
 @dataclass(frozen=True)
 class Activation:
     """The density activation ``sigma = softplus(raw + shift) / density_scale`` (DirectVoxGO's).

@@ -1,13 +1,15 @@
-"""Optional abilities of a method, beside the contract: trajectories, bounds, points."""
+"""Optional abilities of a method, beside the contract: trajectories, bounds, points, ellipsoids."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Protocol, runtime_checkable
 
 from torch import Tensor
 
-from forewarp.scene.box import Box
+from forewarp.scene.box import Box, Lattice
 from forewarp.scene.cloud import Cloud
+from forewarp.scene.ellipsoids import Ellipsoids
 
 
 @runtime_checkable
@@ -34,3 +36,27 @@ class HasMatter(Protocol):
 
     def matter(self) -> Cloud:
         """Return all canonical matter as points."""
+
+
+@runtime_checkable
+class HasEllipsoids(Protocol):
+    """Be a cloud of soft ellipsoids, for programs that draw such."""
+
+    def ellipsoids(self, time: float) -> Ellipsoids:
+        """Return all of them as they are at a time in [0, 1], without gradients; a row is always the same."""
+
+    def template(self) -> Ellipsoids:
+        """Return them before any motion, with opacity and colours of the canonical time."""
+
+    def movement(self, times: Sequence[float]) -> dict[str, Tensor]:
+        """Return, by name, what makes ``ellipsoids`` at T times of the ``template``, and its coefficients."""
+
+
+@runtime_checkable
+class HasSolid(Protocol):
+    """Of a snapshot: tell how opaque every place is, for meshes."""
+
+    def solid(self, lattice: Lattice) -> tuple[Tensor, Tensor]:
+        """Return the opacity (X, Y, Z) of a small cube around each point of a lattice, and its mean colour
+        over all directions (X, Y, Z, 3); 0 where there is nothing.
+        """

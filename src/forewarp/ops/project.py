@@ -14,6 +14,7 @@ from forewarp.ops.backend import match_threads, use_numba
 from forewarp.ops.checks import check_shape
 
 BLUR = 0.1  # square pixels; a pixel alone has a variance of 1/12
+FLAT = 0.28209479177387814  # the first harmonic, 1 / sqrt(4 pi), which no direction changes
 _LEAST = 1e-12  # length of a quaternion below which it turns nothing
 
 
@@ -138,10 +139,9 @@ def harmonics(directions: Tensor, count: int) -> Tensor:
     >>> harmonics(torch.tensor([[0.0, 0.0, 1.0]]), 4)[0, ::2]
     tensor([0.2821, 0.4886])
     """
-    from_one = math.sqrt(1 / (4 * math.pi))
     x, y, z = directions.unbind(-1)
     one = math.sqrt(3 / (4 * math.pi))
-    found = [torch.full_like(x, from_one), -one * y, one * z, -one * x]
+    found = [torch.full_like(x, FLAT), -one * y, one * z, -one * x]
     two = [math.sqrt(f / math.pi) for f in (15 / 4, 5 / 16, 15 / 16)]
     found += [two[0] * x * y, -two[0] * y * z, two[1] * (2 * z * z - x * x - y * y), -two[0] * x * z]
     found += [two[2] * (x * x - y * y)]

@@ -25,7 +25,7 @@ HASH = "{hash}"
 # May be set beside resume=<run>.
 MAY_CHANGE = (
     *("trainer", "threads", "lpips_weights", "sheets", "evaluate", "checkpoint_seconds"),
-    *("sentinel", "data_changed", "score"),
+    *("sentinel", "data_changed", "score", "viewer", "host", "port"),
 )
 
 
@@ -77,6 +77,8 @@ def claim(config: DictConfig, *, finished: bool = False) -> None:
     config.resume = None
     if "trust" in config:  # only who runs the command may trust, never a folder
         config.trust = None
+    if "viewer" in config:  # a run that goes on opens no page by itself
+        config.viewer = False
     resolved = OmegaConf.create(OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
     begun = folder.is_dir() and any(folder.glob("*/last.ckpt"))
     if begun and not path.is_file():

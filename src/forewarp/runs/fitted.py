@@ -16,12 +16,15 @@ from forewarp.methods.abilities import HasMatter, HasTrajectories
 from forewarp.methods.method import Method, Snapshot
 from forewarp.runs.build import build_run
 from forewarp.runs.config import saved_config
+from forewarp.runs.data_check import warn_if_changed
 from forewarp.runs.trust import trust_of
 from forewarp.scene.camera import Camera
 from forewarp.scene.cloud import Cloud
 from forewarp.scene.frame import Frame, Scene
 from forewarp.scene.view import Moment, View
+from forewarp.training.device import device_of
 from forewarp.training.module import DynamicSceneModule
+from forewarp.training.stages import Run
 
 SPLITS = ("train", "val", "test", "held")
 
@@ -109,11 +112,28 @@ class Fitted:
         return self.method
 
 
+def opened(config: DictConfig, device: str | torch.device | None = None) -> tuple[Run, DynamicSceneModule]:
+    """Open a finished run to look at it; warn if its data have changed since.
+
+    Args:
+        config: of ``saved_config``.
+        device: None: the one that the config's trainer names.
+
+    Returns:
+        the run, and its fitted module.
+
+    Raises:
+        ValueError: naming the wrong key of the config, or a stage that is not finished.
+    """
+    run = build_run(config)
+    module = run.load().to(device or device_of(config.trainer.accelerator))
+    warn_if_changed(run)
+    return run, module.eval()
+
+
 def open_run(run: str | Path, *, trust: Sequence[str] | str = (), device: str = "cpu") -> Fitted:
     """Load a finished run from its folder; see ``forewarp.load``."""
     changes = OmegaConf.create({"trust": list(trust_of(trust))})
     config = saved_config(str(run), changes)
-    made = build_run(config)
-    module = made.load().to(device)
-    module.eval()
+    made, module = opened(config, device)
     return Fitted(Path(run), config, module, made.datamodule.scene)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+import torch
 from torch import Tensor
 
 from forewarp.scene.box import Box
@@ -26,6 +27,22 @@ class Cloud:
 
     def __getitem__(self, rows) -> Cloud:
         return Cloud(self.points[rows], self.colors[rows], self.opacity[rows], self.size)
+
+
+def far_apart(points: Tensor, count: int) -> Tensor:
+    """Choose rows (count,) of points (N, 3) that are spread evenly: the farthest from their mean, then
+    repeatedly the farthest from those chosen; all rows, if there are no more.
+
+    Cost: N * count distances.
+    """
+    if len(points) <= count:
+        return torch.arange(len(points), device=points.device)
+    chosen = [int((points - points.mean(0)).square().sum(-1).argmax())]
+    away = (points - points[chosen[0]]).square().sum(-1)
+    for _ in range(count - 1):
+        chosen.append(int(away.argmax()))
+        away = torch.minimum(away, (points - points[chosen[-1]]).square().sum(-1))
+    return torch.tensor(chosen, device=points.device)
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,4 @@
 from dataclasses import replace
-from functools import partial
 
 import pytest
 import torch
@@ -12,38 +11,9 @@ from forewarp.methods.particles.settings import Numbers
 from forewarp.methods.particles.start import widths
 from forewarp.ops.project import moved
 from forewarp.scene.view import Moment, View
-from tests.contract.fitting import module_of
-from tests.contract.scenes import data_of, write_dnerf, write_hypernerf
-from tests.contract.table import METHODS
+from tests.contract.scenes import data_of, write_hypernerf
 from tests.support.kernels import watch
-
-ENTRY = METHODS["particles"]
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    root = tmp_path_factory.mktemp("scenes")
-    write_dnerf(root / "dnerf")
-    return data_of("dnerf", root)
-
-
-MOVING = {"motion": "spline", "rotation": True, "view_dependence": 1}
-EVERY = MOVING | {"color_over_time": 2, "opacity_over_time": 2, "background": 0.03}
-
-
-def module_with(data, **changes):
-    """A module of moving particles with these options; ``numbers`` and ``weights`` are its stage's."""
-    changes = MOVING | changes
-    of_entry = {key: changes.pop(key) for key in ("numbers", "weights") if key in changes}
-    return module_of(ENTRY, data, model=partial(Particles, **changes), **of_entry)
-
-
-def look(module, data, index=None, factors=None):
-    if index is not None:
-        data.picker = lambda: index
-    batch = next(iter(data.train_dataloader()))
-    factors = {"photo": 1.0, "rigid": 3.0, "smooth": 0.1} if factors is None else factors
-    return module.method.look(batch, factors, module.generator)
+from tests.support.particles import EVERY, MOVING, look, module_with
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from forewarp.fields.curves import Curve
-from forewarp.methods.particles.nodes import Nodes, nearest, spread_out
+from forewarp.methods.particles.nodes import Nodes, nearest
 from forewarp.methods.particles.rows_adam import RowsAdam
 from forewarp.methods.particles.skin import Skin
 
@@ -21,15 +21,6 @@ def nodes_of(count=12, kind="spline", knots=8, canonical=0.0, turns=True):
         if value is not None:
             value.data = 0.1 * torch.randn(value.shape, generator=generator)
     return nodes
-
-
-def test_places_are_far_from_one_another():
-    points = torch.randn(500, 3)
-    chosen = spread_out(points, 20)
-    places = points[chosen]
-    apart = torch.cdist(places, places) + 1e9 * torch.eye(20)
-    # No point is farther from the places than they are from one another.
-    assert float(torch.cdist(points, places).amin(-1).max()) <= float(apart.min()) + 1e-5
 
 
 def test_fewer_points_than_nodes():

@@ -6,13 +6,13 @@ import torch
 from forewarp.methods.particles import model
 from forewarp.methods.particles.rest import _product, _quaternions, come_to_rest
 from forewarp.ops.project import moved, rotations
-from tests.methods.particles.test_model import EVERY, data, look, module_with  # noqa: F401
+from tests.support.particles import EVERY, look, module_with
 
 TIMES = [0.0, 0.25, 0.5, 0.75, 1.0]
 
 
 @pytest.fixture
-def half(data):  # noqa: F811
+def half(data):
     """Particles whose nodes on one side of the scene move, while all others stand aside, turned."""
     module = module_with(
         data, **EVERY | {"background": 0.01}, numbers={"rest": 0.1, "relink": 1, "every": 0.1}
@@ -54,7 +54,7 @@ def test_it_rests_where_it_was_and_as_it_was_turned(half):
     assert float((ends[1] - ends[0]).detach()[~rests].norm(dim=-1).max()) > 0.3
 
 
-def test_what_rests_keeps_resting_through_steps_and_density_control(half, data):  # noqa: F811
+def test_what_rests_keeps_resting_through_steps_and_density_control(half, data):
     module, moves = half
     method, optimizer = module.method, module.configure_optimizers()
     come_to_rest(method, 0.01)
@@ -71,7 +71,7 @@ def test_what_rests_keeps_resting_through_steps_and_density_control(half, data):
     assert bool(method.resting.any())
 
 
-def test_nothing_comes_to_rest_where_the_effect_is_off(data, monkeypatch):  # noqa: F811
+def test_nothing_comes_to_rest_where_the_effect_is_off(data, monkeypatch):
     monkeypatch.setattr(model, "come_to_rest", lambda *_: pytest.fail("called"))
     module = module_with(data, numbers={"rest": 0.0, "relink": 1, "every": 0.1})
     assert module.method.resting is None
@@ -80,7 +80,7 @@ def test_nothing_comes_to_rest_where_the_effect_is_off(data, monkeypatch):  # no
 
 
 @pytest.mark.parametrize("motion", ["spline", "cosines"])
-def test_what_moves_does_not_come_to_rest(data, motion):  # noqa: F811
+def test_what_moves_does_not_come_to_rest(data, motion):
     method = module_with(data, motion=motion, background=0.01).method
     method.nodes.shift.data.normal_()
     come_to_rest(method, 0.01)
@@ -89,7 +89,7 @@ def test_what_moves_does_not_come_to_rest(data, motion):  # noqa: F811
 
 
 @pytest.mark.parametrize("motion", ["spline", "cosines"])
-def test_a_node_that_stops_stays(data, motion):  # noqa: F811
+def test_a_node_that_stops_stays(data, motion):
     nodes = module_with(data, motion=motion, background=0.01).method.nodes
     nodes.shift.data.normal_()
     which = torch.zeros(len(nodes), dtype=torch.bool)

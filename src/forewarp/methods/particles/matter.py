@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
 from forewarp.methods.method import Method
 from forewarp.methods.particles.nodes import nearest
-from forewarp.methods.particles.start import FLAT
-from forewarp.ops.project import Warp, moved
+from forewarp.ops.project import FLAT, Warp, moved, rotations
 from forewarp.scene.box import Box
 from forewarp.scene.cloud import Cloud
+from forewarp.scene.ellipsoids import Ellipsoids
 
 _SOLID, _SEEN = 0.1, 0.02  # opacity from which matter bounds the scene; from which there is any
 _BESIDE = 4  # particles that a point goes with
@@ -25,6 +27,56 @@ def matter_of(method: Method) -> Cloud:
     colors = (0.5 + FLAT * method.color.data[keep, 0]).clamp(0, 1)
     size = 2 * float(method.log_scales.exp().mean())
     return Cloud(points[keep], colors, torch.sigmoid(method.opacity.data[keep, 0]), max(size, 1e-9))
+
+
+@torch.no_grad()
+def ellipsoids_of(method: Method, time: float) -> Ellipsoids:
+    """See ``HasEllipsoids``: all particles, also those at rest and those that have faded."""
+    template = template_of(method)
+    centers, linear = moved(template.centers, method.warp(time))
+    tints, fades = method.over_time(time)
+    harmonics, opacity = template.harmonics, method.opacity[:, 0]
+    if method.tint is not None:
+        harmonics = harmonics.clone()
+        harmonics[:, 0] += torch.einsum("t,ntc->nc", tints, method.tint) / FLAT
+    if method.fade is not None:
+        opacity = opacity + method.fade @ fades[1:]
+    return Ellipsoids(centers, linear @ template.roots, torch.sigmoid(opacity), harmonics)
+
+
+@torch.no_grad()
+def template_of(method: Method) -> Ellipsoids:
+    """See ``HasEllipsoids``: what nodes move, at the canonical time a little, too."""
+    roots = rotations(method.turns) * method.log_scales.exp()[:, None]
+    harmonics = method.color if method.shade is None else torch.cat([method.color, method.shade], 1)
+    return Ellipsoids(method.means.data, roots, torch.sigmoid(method.opacity[:, 0]), harmonics.data)
+
+
+@torch.no_grad()
+def movement_of(method: Method, times: Sequence[float]) -> dict[str, Tensor]:
+    """See ``HasEllipsoids``. A center goes to ``x + sum_l w_l (D x + d)``, a root to ``(I + sum_l w_l D)
+    root``, where l are the nodes in ``links`` (N, L), w ``weights`` (N, L) and ``D | d`` the nodes' ``maps``
+    (T, M, 3, 4). ``color_over_time`` (N, K, 3), by ``color_basis`` (T, K), is added to the colour, and
+    ``opacity_over_time`` (N, F), by ``opacity_basis`` (T, F), to the opacity's logit. The maps come of
+    ``node_shift`` and ``node_turn`` (M, B, 3), by ``node_basis`` (T, B), about ``node_places`` (M, 3).
+    What is off is absent.
+    """
+    found = {}
+    if method.nodes is not None:
+        warps = [method.warp(time) for time in times]
+        maps = [torch.cat([w.maps[:, :9].reshape(-1, 3, 3), w.maps[:, 9:, None]], -1) for w in warps]
+        nodes, basis = method.nodes, [method.nodes.curve(time) for time in times]
+        found = {"links": warps[0].links, "weights": warps[0].weights, "maps": torch.stack(maps)}
+        found |= {"node_places": nodes.places, "node_basis": torch.stack(basis), "node_shift": nodes.shift}
+        found |= {} if nodes.turn is None else {"node_turn": nodes.turn}
+    for name, over_time, basis in (
+        ("color", method.tint, method.tints),
+        ("opacity", method.fade, method.fades),
+    ):
+        if over_time is not None:
+            found[f"{name}_over_time"] = over_time
+            found[f"{name}_basis"] = over_time.new_tensor([basis(time) for time in times])
+    return {name: value.detach() for name, value in found.items()}
 
 
 @torch.no_grad()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import ClassVar
 
 import torch
@@ -10,10 +10,10 @@ from torch import Tensor, nn
 
 from forewarp.fields.curves import Curve
 from forewarp.methods.method import Method, Snapshot, Start, Step
+from forewarp.methods.particles import matter
 from forewarp.methods.particles.camera import Pinholes
 from forewarp.methods.particles.density import renew
 from forewarp.methods.particles.effects import Effects, cosines
-from forewarp.methods.particles.matter import bounds_of, matter_of, paths_of
 from forewarp.methods.particles.nodes import Nodes
 from forewarp.methods.particles.planning import EFFECTS, ParticlesPlanning
 from forewarp.methods.particles.rest import come_to_rest
@@ -28,6 +28,7 @@ from forewarp.ops.project import BLUR, Gaussians, Warp
 from forewarp.scene.batch import Asks, Batch
 from forewarp.scene.box import Box
 from forewarp.scene.cloud import Cloud
+from forewarp.scene.ellipsoids import Ellipsoids
 from forewarp.scene.view import Moment
 
 _TIMES = 16  # at which opacity over time is looked at
@@ -312,15 +313,27 @@ class Particles(Method):
 
     def trajectories(self, points: Tensor, times: Tensor) -> Tensor:
         """See ``HasTrajectories``: points go with the particles beside them."""
-        return paths_of(self, points, times)
+        return matter.paths_of(self, points, times)
 
     def bounds(self, times: list[float]) -> Box | None:
         """See ``HasBounds``."""
-        return bounds_of(self, times)
+        return matter.bounds_of(self, times)
 
     def matter(self) -> Cloud:
         """See ``HasMatter``."""
-        return matter_of(self)
+        return matter.matter_of(self)
+
+    def ellipsoids(self, time: float) -> Ellipsoids:
+        """See ``HasEllipsoids``."""
+        return matter.ellipsoids_of(self, time)
+
+    def template(self) -> Ellipsoids:
+        """See ``HasEllipsoids``."""
+        return matter.template_of(self)
+
+    def movement(self, times: Sequence[float]) -> dict[str, Tensor]:
+        """See ``HasEllipsoids``."""
+        return matter.movement_of(self, times)
 
     def protocol(self) -> dict[str, str]:
         """See ``Method``."""

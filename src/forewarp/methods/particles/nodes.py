@@ -9,23 +9,11 @@ from torch import Tensor, nn
 
 from forewarp.fields.curves import Curve
 from forewarp.ops.nodes import carry_nodes, spread_nodes
+from forewarp.scene.cloud import far_apart
 
 LINKS = 6  # nodes that a particle follows
 _DAMP = 0.5  # of a curve's last stride, where it is continued to times not yet seen
 _FULL = 0.05  # share of a spline's basis at a time, from which on its knot counts as seen
-
-
-def spread_out(points: Tensor, count: int) -> Tensor:
-    """Rows (count,) of points (N, 3) that are far from one another: each the farthest from those before.
-
-    Cost: ``count`` looks at all points.
-    """
-    chosen = [int((points - points.mean(0)).square().sum(-1).argmax())]
-    away = (points - points[chosen[0]]).square().sum(-1)
-    for _ in range(min(count, len(points)) - 1):
-        chosen.append(int(away.argmax()))
-        away = torch.minimum(away, (points - points[chosen[-1]]).square().sum(-1))
-    return torch.tensor(chosen, dtype=torch.int64, device=points.device)
 
 
 def nearest(points: Tensor, places: Tensor, count: int) -> tuple[Tensor, Tensor]:
@@ -76,7 +64,7 @@ class Nodes(nn.Module):
     ) -> None:
         super().__init__()
         self.curve = curve
-        places = torch.zeros(1, 3) if points is None else points[spread_out(points, count)].clone()
+        places = torch.zeros(1, 3) if points is None else points[far_apart(points, count)].clone()
         self.register_buffer("places", places)
         away, beside = nearest(places, places, edges + 1)
         away, beside = away[:, 1:], beside[:, 1:]  # the nearest is the node itself

@@ -9,6 +9,7 @@ from forewarp.methods.method import Start
 from forewarp.methods.particles.nodes import nearest
 from forewarp.methods.particles.sweep import seen_colors, swept
 from forewarp.ops.grid import dilate
+from forewarp.ops.project import FLAT
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.cloud import Cloud
 from forewarp.scene.frame import Scene, spread
@@ -19,7 +20,6 @@ _DRIFT = 0.2  # share of a picture's width by which a silhouette is taken to mov
 _ROUGH, _FINE = 48, 112  # voxels along the mean side of the box, and of what is left of it
 _FEW = 16  # points that are too few to begin with
 _CAMERAS = 64  # whose distance from a point is looked at
-FLAT = 0.28209479177387814  # of the harmonics: what a colour's first coefficient is multiplied by
 
 
 def first_points(start: Start, count: int) -> Cloud:

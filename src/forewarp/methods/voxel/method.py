@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from forewarp.fields.radiance import DirectRadiance, FeatureRadiance
-from forewarp.fields.radiance_grid import Activation, shaded
+from forewarp.fields.radiance_grid import Activation, mean_color, shaded
 from forewarp.fields.voxel_grid import VoxelGrid
 from forewarp.methods.method import Method, Start, Step
 from forewarp.methods.voxel.effects.background import StaticBackground
@@ -181,11 +181,7 @@ class VoxelMethod(Method):
         alpha = grid.activation.alpha(grid.raw_density, grid.lattice.voxel_size)
         solid = alpha > SOLID
         points = grid.lattice.to_world(self.radiance.voxels[solid])
-        towards = torch.cat([torch.eye(3), -torch.eye(3)]).to(grid.values)
-        colors = (
-            sum(shaded(grid.color[solid], d.expand(len(points), 3), self.view_dependence) for d in towards)
-            / 6
-        )
+        colors = mean_color(lambda d: shaded(grid.color[solid], d, self.view_dependence), points)
         return Cloud(points, colors, alpha[solid], grid.lattice.voxel_size)
 
     def notes(self) -> dict[str, float]:

@@ -8,11 +8,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from forewarp.fields.radiance_grid import FieldAtTime, RadianceGrid, Shade
+from forewarp.fields.radiance_grid import FieldAtTime, RadianceGrid, Shade, mean_color
 from forewarp.methods.method import Snapshot
 from forewarp.renderer import Renderer
+from forewarp.scene.box import Lattice
 from forewarp.scene.rays import Rays
 from forewarp.scene.view import Moment, Rendering, View
+
+_NOTHING = 1e-3  # opacity over a voxel below which no colour is computed
 
 
 @dataclass(frozen=True)
@@ -61,6 +64,24 @@ class VoxelSnapshot(Snapshot):
     def march(self, name: str, rays: Rays, background: Tensor, **options):
         """Render one field along any rays; also return the samples."""
         return self.renderer(self.fields[name], rays, background, self.shade, **options)
+
+    @torch.no_grad()
+    def solid(self, lattice: Lattice, chunk: int = 1 << 18) -> tuple[Tensor, Tensor]:
+        """See ``HasSolid``: the opacity over one voxel, of the best rendering's field."""
+        field = self.fields[self.renderings[-1]]
+        voxels, last = lattice.all_voxels(), torch.tensor(field.lattice.shape) - 1
+        opacity, colors = torch.zeros(len(voxels)), torch.zeros(len(voxels), 3)
+        for begin in range(0, len(voxels), chunk):
+            points = field.lattice.to_lattice(lattice.to_world(voxels[begin : begin + chunk]))
+            inside = ((points >= 0) & (points <= last)).all(-1).nonzero()[:, 0]
+            points = points[inside].to(self.canonical.values)
+            alpha = -torch.expm1(-field.density(points) * field.voxel_size)
+            some = (alpha > _NOTHING).nonzero()[:, 0]
+            rows = begin + inside[some.cpu()]
+            seen = points[some]
+            opacity[rows] = alpha[some].cpu()
+            colors[rows] = mean_color(lambda d, p=seen: field.colors(p, d, self.shade), seen).cpu()
+        return opacity.reshape(lattice.shape), colors.reshape(*lattice.shape, 3)
 
     def holds(self, moment: Moment) -> bool:
         """Return whether it is the same time; the camera does not matter."""

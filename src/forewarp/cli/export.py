@@ -1,0 +1,130 @@
+"""``forewarp-export``: a finished run in formats of other programs."""
+
+from __future__ import annotations
+
+from forewarp.cli.entry import command
+
+WHOLE = {"degree": (0, 3), "resolution": (8, 512), "points": (1, 10**6), "views": (1, 100)}
+REAL = {"level": (0.01, 0.99), "seconds": (0.1, 3600), "megabytes": (1, 1000)}
+CHOICES = {"files": ("ply", "obj"), "up": ("world", "y", "-y", "z")}
+
+HELP = """
+forewarp-export writes a finished run for other programs, into its exports/<format>/ (docs/exports.md).
+
+  forewarp-export run=runs/vehicle/particles-demo-seed0 format=ply
+  forewarp-export run=FOLDER format=npz times=[0,0.5,1] points=500
+
+What one types most:
+  run=FOLDER                    the run (needed)
+  format=ply                    particles for viewers of Gaussian splats, a file a time; voxels as points
+  format=mesh                   the surface with colours, by marching cubes, a file a time
+  format=gltf                   moving points as an animation, one file
+  format=html                   one page for a browser, without a server, with a time slider
+  format=npz                    trajectories of points with what is visible of them, and the method's arrays
+  times=N times=[0,0.5]         how many, evenly spaced, or which
+  out=FOLDER                    another folder
+  degree=0|1|2|3                ply: how finely colours depend on direction
+  up=world|y|-y|z               ply, mesh: which axis points upwards; -y for SuperSplat
+  resolution=N level=SHARE      mesh: points of the lattice along the longest side; opacity of the surface
+  files=ply|obj                 mesh: the files
+  points=N                      gltf, npz, html of voxels: most points
+  seconds=N                     gltf, html: how long the animation lasts
+  megabytes=N                   html: most of the page; what does not fit is left out, and said
+  views=N                       npz: cameras that tell which points are visible
+  trust=[PACKAGE]               code of other packages that the run's config may name
+  data.root=FOLDER              where the data are now, if they moved
+  threads=N trainer=cpu         threads and device to compute with
+"""
+
+
+def export(config) -> None:
+    """Load a run and write it."""
+    from pathlib import Path
+
+    from forewarp.export.formats import ABOUT, FORMATS, write
+    from forewarp.files import check_replaceable
+    from forewarp.runs.config import saved_config
+
+    saved = saved_config(config.run, config)
+    times = check(config)
+    folder = Path(config.out or Path(config.run) / "exports" / config.format)
+    check_replaceable(folder, ABOUT)
+    # These load torch; mistakes have been answered before.
+    from forewarp.export.source import Source
+    from forewarp.progress import Counted
+    from forewarp.runs.build import method_name
+    from forewarp.runs.fitted import opened
+
+    run, module = opened(saved)
+    scene = run.datamodule.scene
+    cameras = [frame.camera for frame in scene.train]
+    background = tuple(run.datamodule.targets("train").background.tolist())
+    source = Source(module, method_name(saved), cameras, times, background)
+    about = {"run": str(config.run), "scene": scene.name, "method": source.model}
+    options = {name: config[name] for name in FORMATS[config.format].options}
+    with Counted(config.format) as progress:
+        found = write(config.format, source, folder, about, progress, **options)
+    print(f"written: {folder}: {told(found)}")
+
+
+def told(about: dict) -> str:
+    """Say in a few words what was written.
+
+    >>> told({"bytes": {"a": 2_000_000, "b": 500_000}, "points": 7})
+    '2 files, 2.5 MB'
+    >>> told({"bytes": {"a": 1000}, "thinned": "7 of 9 points"})
+    '1 file, 0.0 MB; thinned to 7 of 9 points'
+    """
+    count, total = len(about["bytes"]), sum(about["bytes"].values())
+    text = f"{count} file{'s' * (count != 1)}, {total / 1e6:.1f} MB"
+    return text + (f"; thinned to {about['thinned']}" if "thinned" in about else "")
+
+
+def check(config) -> list[float]:
+    """Refuse settings of which nothing can be written, before anything is loaded; return the times."""
+    from omegaconf import ListConfig
+
+    from forewarp.export.formats import FORMATS, require
+    from forewarp.runs.overrides import key_of, typed_overrides
+
+    if config.format not in FORMATS:
+        raise ValueError(f"format: expected one of {', '.join(FORMATS)}, but got '{config.format}'")
+    options, every = FORMATS[config.format].options, {n for f in FORMATS.values() for n in f.options}
+    for key in map(key_of, typed_overrides()):
+        if key in every - set(options):
+            known = ", ".join(options)
+            raise ValueError(f"{key}: expected an option of format={config.format} ({known}); leave it out")
+    require(config.format)
+    for key in options:
+        check_option(key, config[key])
+    times = config.times
+    if isinstance(times, ListConfig):
+        good = [type(time) in (int, float) and 0 <= time <= 1 for time in times]
+        if not (good and all(good)):
+            raise ValueError(f"times: expected numbers in [0, 1], but got {list(times)}")
+        if sorted(set(times)) != list(times):
+            raise ValueError(f"times: expected each later than the one before, but got {list(times)}")
+        return [float(time) for time in times]
+    if type(times) is not int or times < 1:
+        raise ValueError(f"times: expected a whole number of at least 1, or a list, but got {times}")
+    return [i / max(times - 1, 1) for i in range(times)]
+
+
+def check_option(key: str, value: object) -> None:
+    """Refuse a value that an option cannot have."""
+    known = CHOICES.get(key)
+    if known is not None and value not in known:
+        raise ValueError(f"{key}: expected {' or '.join(known)}, but got {value}")
+    for numbers, types, what in ((WHOLE, (int,), "a whole number"), (REAL, (int, float), "a number")):
+        low, high = numbers.get(key, (value, value))
+        if key in numbers and (type(value) not in types or not low <= value <= high):
+            raise ValueError(f"{key}: expected {what} from {low} to {high}, but got {value}")
+
+
+def main() -> None:
+    """Run the console script."""
+    command("export", export, HELP)
+
+
+if __name__ == "__main__":
+    main()

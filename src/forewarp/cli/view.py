@@ -1,0 +1,88 @@
+"""``forewarp-view``: see a finished run in the browser, or two beside each other."""
+
+from __future__ import annotations
+
+from forewarp.cli.entry import command
+
+HELP = """
+forewarp-view opens a page on which one flies around a finished run and through its time. It prints the page's
+address, and runs until Ctrl-C.
+
+  forewarp-view run=runs/vehicle/particles-demo-seed0
+  forewarp-view run=FOLDER run2=ANOTHER        two runs of one scene, beside each other under one camera
+
+What one types most:
+  run=FOLDER                    the run (needed)
+  run2=FOLDER                   another run of the same scene
+  host=ADDRESS port=N           where to listen: 127.0.0.1, for this machine alone, and 8080
+  size=N                        rows of a picture at rest (as the images, at least 400)
+  points=N tail=SHARE           how many trajectories, and for what share of the time they stay visible
+  trust=[PACKAGE]               code of other packages that the runs' configs may name
+  data.root=FOLDER              where the data are now, if they moved
+  threads=N trainer=cpu         threads and device to compute with
+
+A run in training: forewarp-train ... viewer=true
+"""
+
+
+def require_viewer() -> None:
+    """Refuse to go on without the package that makes the page.
+
+    Raises:
+        ImportError: naming what to install.
+    """
+    from importlib.util import find_spec
+
+    if find_spec("viser") is None:
+        raise ImportError("viewer: expected viser, but got none; install forewarp[viewer]")
+
+
+def view(config) -> None:
+    """Load one or two runs and serve their page until Ctrl-C."""
+    from forewarp.cli.checks import refuse_numbers
+    from forewarp.runs.config import saved_config
+
+    require_viewer()
+    runs = {"run": saved_config(config.run, config)}
+    if config.run2 is not None:
+        runs["run2"] = saved_config(config.run2, config, "run2")
+    refuse_numbers(config, "size", "points", "tail")
+    # These load torch; mistakes have been answered before.
+    from pathlib import Path
+
+    from forewarp.viewer.server import served
+    from forewarp.viewer.studio import Studio, refuse_other_scene
+
+    subjects = [subject_of(saved, config) for saved in runs.values()]
+    if len(subjects) == 2:
+        refuse_other_scene(subjects[0].scene, subjects[1].scene)
+    studio = Studio(subjects[0].scene, subjects, size=config.size)
+    title = " | ".join([studio.scene.name, *(subject.name for subject in subjects)])
+    folder = Path(config.run) / "videos"
+    with served(studio, host=config.host, port=config.port, title=title, folder=folder) as address:
+        print(f"see it: {address} (Ctrl-C ends)", flush=True)
+        try:
+            studio.desk.serve_forever()
+        except KeyboardInterrupt:
+            print()
+
+
+def subject_of(saved, config):
+    """Load a run's method."""
+    from pathlib import Path
+
+    from forewarp.runs.fitted import opened
+    from forewarp.viewer.subject import Subject
+
+    run, module = opened(saved)
+    name = Path(saved.run).resolve().name
+    return Subject(name, module, run.datamodule, count=config.points, tail=float(config.tail))
+
+
+def main() -> None:
+    """Run the console script."""
+    command("view", view, HELP)
+
+
+if __name__ == "__main__":
+    main()

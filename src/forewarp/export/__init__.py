@@ -1,0 +1,1 @@
+"""A fitted scene as files that other programs read."""

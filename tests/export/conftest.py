@@ -1,0 +1,33 @@
+"""Scenes whose every point is known, as exports begin with them."""
+
+import pytest
+
+from forewarp.export.source import Source
+from tests.support.known_ball import known_ball
+from tests.support.particles import EVERY, module_with, shaken, small_data
+from tests.support.tiny_scene import ball_scene
+
+TIMES = (0.0, 0.4, 1.0)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    """Of the scene that the particles are in."""
+    return small_data(tmp_path_factory.mktemp("scenes"))
+
+
+@pytest.fixture
+def particles(data):
+    """Particles with every effect whose parameters are random; a third of them rests."""
+    module = shaken(module_with(data, **EVERY | {"view_dependence": 2}))
+    module.method.opacity.data += 1
+    return Source(module, "particles", [frame.camera for frame in data.scene.train], TIMES)
+
+
+@pytest.fixture
+def ball():
+    """A ball of voxels that slides along x beside a block at rest; colours follow the canonical place."""
+    module = known_ball()
+    radiance = module.method.radiance
+    radiance.color.data = 2 * module.method.points.clone()
+    return Source(module, "forward", [frame.camera for frame in ball_scene().train], TIMES)
