@@ -49,7 +49,13 @@ ONLY_IN = {
     **{"imageio": {"drawing", "evaluation", "cli"}, "imageio_ffmpeg": {"drawing", "cli"}},
     "rich": {"progress", "training", "evaluation", "planning", "cli"},
 }
-CONTRACT = {"method", "abilities", "effect", "rows"}  # files of methods/ that packages above may import
+CONTRACT = {
+    "method",
+    "abilities",
+    "effect",
+    "rows",
+    "sampled",
+}  # files of methods/ that packages above may import
 # Attributes of one method only.
 OWN_PARTS = {"radiance", "lattice", "lattices", "motion", "deformation", "inpainter"}
 ABOVE = {"training", "data", "report", "evaluation", "runs", "planning", "viewer", "export", "cli"}

@@ -25,7 +25,7 @@ def slab(strength, low=-0.5, high=0.5):
         return strength * ((points[..., 0] > low) & (points[..., 0] < high)).to(points)
 
     def radiance(points, directions):
-        assert directions.shape == (len(points), 3)
+        assert directions.shape == (len(points), 1, 3)
         return density(points), RED.expand(*points.shape[:2], 3)
 
     return density, radiance

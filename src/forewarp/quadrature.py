@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -14,9 +14,9 @@ from forewarp.scene.box import Box
 from forewarp.scene.rays import Rays
 from forewarp.scene.view import Rendering
 
-# Points (R, S, 3) -> density (R, S) >= 0 per world unit.
+# Points (..., 3) -> density (...,) >= 0 per world unit.
 Density = Callable[[Tensor], Tensor]
-# Points (R, S, 3) and unit directions (R, 3) -> density (R, S) and colour (R, S, 3).
+# Points (..., 3) and unit directions that broadcast to them -> density (...,) and colour (..., 3).
 Radiance = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 _FAR = 1e10  # the published length of the last interval
 _POINTS = 1 << 17  # evaluated at once for an image
@@ -24,11 +24,15 @@ _POINTS = 1 << 17  # evaluated at once for an image
 
 @dataclass(frozen=True)
 class Sampled(Rendering):
-    """A rendering, with ``depths``, ``density`` and ``weights`` (K, S) along the K rays that meet the box."""
+    """A rendering, with ``depths``, ``density``, ``weights`` (K, S) and ``points`` (K, S, 3) along the K rays
+    that meet the box, and what the first pass saw, where it has a gradient too (``coarse``).
+    """
 
     depths: Tensor
+    points: Tensor
     density: Tensor
     weights: Tensor
+    coarse: Sampled | None = None
 
 
 @dataclass(frozen=True)
@@ -41,12 +45,14 @@ class Quadrature:
         open_end: give the last sample an endless interval, as published. A density that is never 0 (softplus)
             then hides the background. False: end the interval with the ray.
         box: treat space outside as empty, without evaluating it; None: evaluate all from near to far.
+        kept: points (..., 3) -> bool (...,): treat all other points as empty, without evaluating them.
     """
 
     samples: int = 64
     fine_samples: int = 128
     open_end: bool = True
     box: Box | None = None
+    kept: Callable[[Tensor], Tensor] | None = None
 
     def __post_init__(self) -> None:
         if self.samples < 3 or self.fine_samples < 0:
@@ -62,6 +68,8 @@ class Quadrature:
         rays: Rays,
         background: Tensor,
         generator: torch.Generator | None = None,
+        *,
+        coarse: Radiance | None = None,
     ) -> Sampled:
         """Render R rays.
 
@@ -71,54 +79,74 @@ class Quadrature:
             rays: origins, unit directions, near and far.
             background: colour (3,) or (R, 3) behind everything.
             generator: jitters the samples; None: place them evenly.
+            coarse: evaluated by the first pass in place of ``density``, and rendered with a gradient.
         """
         near, far = self._stretch(rays)
         met = (far > near).nonzero()[:, 0]
         inner, far = rays[met], far[met]
         depths = stratified(near[met], far, self.samples, generator)
-        if self.fine_samples:
-            depths = self.refined(density, inner, depths, far, generator)
         behind = background.to(rays.origins).expand(len(rays), 3)
+        first = None if coarse is None else self.composite(coarse, inner, depths, far, behind[met])
+        if self.fine_samples:
+            found = self._found(density, inner, depths, far) if first is None else first.weights.detach()
+            more = by_importance(midpoints(depths), found[:, 1:-1], self.fine_samples, generator)
+            depths = union(depths, more)
         seen = self.composite(radiance, inner, depths, far, behind[met])
-        if len(met) == len(rays):
-            return seen
-        nothing = behind.new_zeros(len(rays))
-        return Sampled(
-            behind.index_copy(0, met, seen.rgb),
-            nothing.index_copy(0, met, seen.depth),
-            nothing.index_copy(0, met, seen.opacity),
-            seen.depths,
-            seen.density,
-            seen.weights,
-        )
+        whole = [one and self._whole(one, met, behind) for one in (first, seen)]
+        return replace(whole[1], coarse=whole[0])
 
     @torch.no_grad()
-    def refined(
-        self, density: Density, rays: Rays, depths: Tensor, far: Tensor, generator: torch.Generator | None
-    ) -> Tensor:
-        """Add F samples to ``depths`` (R, S) where density is found, (R, S + F); no gradient passes."""
-        weights, _ = dense_weights(density(_points(rays, depths)) * self._intervals(depths, far))
-        more = by_importance(midpoints(depths), weights[:, 1:-1], self.fine_samples, generator)
-        return union(depths, more)
+    def _found(self, density: Density, rays: Rays, depths: Tensor, far: Tensor) -> Tensor:
+        """Return the weights (R, S) of the samples of the first pass."""
+        points = _points(rays, depths)
+        kept = None if self.kept is None else self.kept(points)
+        found = density(points) if kept is None else _placed(kept, density(points[kept]))
+        return dense_weights(found * self._intervals(depths, far))[0]
 
     def composite(
         self, radiance: Radiance, rays: Rays, depths: Tensor, far: Tensor, background: Tensor
     ) -> Sampled:
         """Composite the samples at ``depths`` (R, S) of rays that end at ``far`` (R,)."""
-        density, color = radiance(_points(rays, depths), rays.directions)
+        points, towards = _points(rays, depths), rays.directions[:, None]
+        kept = None if self.kept is None else self.kept(points)
+        if kept is None:
+            density, color = radiance(points, towards)
+        else:
+            only = radiance(points[kept], towards.expand_as(points)[kept])
+            density, color = (_placed(kept, part) for part in only)
         weights, through = dense_weights(density * self._intervals(depths, far))
         rgb = (weights[..., None] * color).sum(1) + through[:, None] * background
         opacity = weights.sum(1).clamp(max=1)
         depth = (weights * depths).sum(1) / opacity.clamp(min=1e-6)
-        return Sampled(rgb, depth, opacity, depths, density, weights)
+        return Sampled(rgb, depth, opacity, depths, points, density, weights)
+
+    @staticmethod
+    def _whole(seen: Sampled, met: Tensor, behind: Tensor) -> Sampled:
+        """Add the rays that miss the box: they see what is behind (R, 3)."""
+        if len(met) == len(behind):
+            return seen
+        nothing = behind.new_zeros(len(behind))
+        return replace(
+            seen,
+            rgb=behind.index_copy(0, met, seen.rgb),
+            depth=nothing.index_copy(0, met, seen.depth),
+            opacity=nothing.index_copy(0, met, seen.opacity),
+        )
 
     @torch.no_grad()
-    def picture(self, density: Density, radiance: Radiance, rays: Rays, background: Tensor) -> Rendering:
+    def picture(
+        self,
+        density: Density,
+        radiance: Radiance,
+        rays: Rays,
+        background: Tensor,
+        generator: torch.Generator | None = None,
+    ) -> Rendering:
         """Render an image's rays without gradient. Cost: time linear in the rays, memory bounded."""
         chunk = max(1, _POINTS // (self.samples + self.fine_samples))
         behind = background.expand(len(rays), 3)
         parts = [
-            self(density, radiance, rays[begin : begin + chunk], behind[begin : begin + chunk])
+            self(density, radiance, rays[begin : begin + chunk], behind[begin : begin + chunk], generator)
             for begin in range(0, len(rays), chunk)
         ]
         return Rendering(
@@ -136,6 +164,13 @@ class Quadrature:
         """Return the length (R, S) of each sample's interval: up to the next sample."""
         last = torch.full_like(far, _FAR) if self.open_end else (far - depths[:, -1]).clamp(min=0)
         return torch.cat([depths[:, 1:] - depths[:, :-1], last[:, None]], 1)
+
+
+def _placed(kept: Tensor, values: Tensor) -> Tensor:
+    """Put values (P, ...) of the kept samples where they are in (R, S, ...), 0 elsewhere."""
+    return values.new_zeros(*kept.shape, *values.shape[1:]).masked_scatter(
+        kept.reshape(*kept.shape, *[1] * (values.dim() - 1)), values
+    )
 
 
 def _points(rays: Rays, depths: Tensor) -> Tensor:

@@ -139,7 +139,7 @@ def test_a_mistyped_command_ends_in_one_line(refused, in_tmp, arguments, line):
         (["objective.fine.weights.tv_flow=0"], "objective.fine.weights.tv_flow", "particles", "forward"),
         (["model=forward", "model/motion=spline"], "model/motion=spline", "forward", "particles"),
         (["model=backward", "stage.fine.density=60"], "stage.fine.density", "backward", "particles"),
-        (["preset.width=4"], "preset.width", "particles", "tnerf"),
+        (["preset.width=4"], "preset.width", "particles", "dnerf"),
     ],
 )
 def test_an_option_of_another_method_names_it(refused, in_tmp, arguments, option, model, owner):

@@ -6,9 +6,14 @@ from functools import partial
 
 from forewarp.fields.radiance import DirectRadiance
 from forewarp.fields.trajectory import TrajectoryField
+from forewarp.methods.dnerf import DNeRF
+from forewarp.methods.hypernerf import HyperNeRF
 from forewarp.methods.method import Method, Start
+from forewarp.methods.nerf import NeRF
+from forewarp.methods.nerfies import Nerfies
 from forewarp.methods.particles.model import Particles
 from forewarp.methods.particles.nodes import Nodes
+from forewarp.methods.sampled import Sampling
 from forewarp.methods.tnerf import TNeRF
 from forewarp.methods.voxel.backward_warp import Deformation
 from forewarp.methods.voxel.effects.background import StaticBackground, Together
@@ -40,7 +45,7 @@ class Entry:
 
     ``model`` makes it; ``lr`` and ``numbers`` are of its stage, ``weights`` of its objective. After ``steps``
     its loss must be below ``falls`` times the first. ``effects`` are its optional parts by name, with which
-    the names of their parameters begin.
+    the names of their parameters begin. ``slow``: another entry has its parts, so its tests are slow ones.
     """
 
     model: Callable[[Start], Method]
@@ -50,6 +55,7 @@ class Entry:
     falls: float = 0.5
     steps: int = 60
     effects: Mapping[str, Effect] = field(default_factory=dict)
+    slow: bool = False
 
 
 GRID = partial(DirectRadiance, alpha_init=1e-2, alpha_threshold=1e-4)
@@ -97,7 +103,8 @@ OF_PARTICLES = {
 RATES = {"means": 1.5e-3, "log_scales": 5e-3, "turns": 3e-3, "opacity": 5e-2, "color": 3e-2, "shade": 1e-3}
 RATES |= {"tint": 1e-3, "fade": 3e-3, "shifts": 7e-3, "node_turns": 8e-3, "skin": 1e-2}
 SMALL_NETWORK = {"width": 32, "layers": 3, "skip": None, "position_frequencies": 4}
-SMALL_NETWORK |= {"time_frequencies": 2, "samples": 16, "fine_samples": 16}
+SMALL_NETWORK |= {"sampling": Sampling(16, 16, density="softplus", open_end=False, inside_box=True)}
+SMALL_WARP = {"warp_width": 24, "warp_layers": 3, "warp_skip": None}
 
 METHODS = {
     "forward": Entry(ForwardModel(GRID, motion=Motion, trajectory=TRAJECTORY), **VOXELS, effects=WARP),
@@ -107,9 +114,38 @@ METHODS = {
         effects={"view_dependence": VIEW, "background": BACKGROUND},
     ),
     "tnerf": Entry(
-        partial(TNeRF, **SMALL_NETWORK, density="softplus", open_end=False, inside_box=True),
+        partial(TNeRF, **SMALL_NETWORK, time_frequencies=2),
         {"network": 2e-3},
         steps=150,
+    ),
+    "nerf": Entry(
+        partial(NeRF, **SMALL_NETWORK),
+        {"network": 2e-3},
+        {"photo": 1.0, "coarse_photo": 1.0},
+        steps=150,
+        slow=True,
+    ),
+    "dnerf": Entry(
+        partial(DNeRF, **SMALL_NETWORK, time_frequencies=2),
+        {"network": 2e-3},
+        {"photo": 1.0, "second_time": 1e-4},
+        steps=150,
+        slow=True,
+    ),
+    "nerfies": Entry(
+        partial(Nerfies, **SMALL_NETWORK, **SMALL_WARP, elastic_samples=64, still_points=64),
+        {"network": 2e-3},
+        {"photo": 1.0, "coarse_photo": 1.0, "elastic": 1e-3, "still": 1.0},
+        {"warp_in": 0.3},
+        steps=150,
+    ),
+    "hypernerf": Entry(
+        partial(HyperNeRF, **SMALL_NETWORK, **SMALL_WARP, slice_width=16, still_points=64),
+        {"network": 2e-3},
+        {"photo": 1.0, "coarse_photo": 1.0, "still": 1.0},
+        {"warp_in": 0.3, "slice_from": 0.01, "slice_in": 0.2},
+        steps=150,
+        slow=True,
     ),
     "particles": Entry(
         partial(

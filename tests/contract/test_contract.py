@@ -22,7 +22,14 @@ from tests.contract.scenes import DATASETS, TIMES, data_of
 from tests.contract.table import METHODS
 
 WHITE = torch.ones(3)
-each = pytest.mark.parametrize("name", METHODS)
+
+
+def cost(name):
+    """Methods whose parts another one has are tested by the slow tests alone."""
+    return pytest.mark.slow if METHODS[name].slow else ()
+
+
+each = pytest.mark.parametrize("name", [pytest.param(name, marks=cost(name)) for name in METHODS])
 each_effect = pytest.mark.parametrize(
     ("name", "effect"), [(n, e) for n in METHODS for e in METHODS[n].effects]
 )
@@ -33,7 +40,7 @@ def on(datasets, first="dnerf"):
     return pytest.mark.parametrize(
         ("name", "dataset"),
         [
-            pytest.param(n, d, marks=() if d == first else pytest.mark.slow, id=f"{n}-{d}")
+            pytest.param(n, d, marks=cost(n) if d == first else pytest.mark.slow, id=f"{n}-{d}")
             for n in METHODS
             for d in datasets
         ],

@@ -18,7 +18,8 @@ What one types most (options such as --multirun or --config-dir=FOLDER come firs
   budget.minutes=N                    of training, all stages together
   budget.clock=wall|processor         what minutes are of; processor time does not depend on other work
   budget.iterations=N                 the same in steps; the first that is reached ends training
-  model=particles|forward|backward|tnerf   Gaussians (default), the paper's method, its opponent, a network
+  model=particles|forward|backward    Gaussians (default), the paper's method, its like-for-like opponent
+  model=nerf|tnerf|dnerf|nerfies|hypernerf   networks along rays, as in their papers with preset=faithful
   model/view_dependence=none|harmonics     switch an effect; all others work alike (of forward: none|sh|mlp)
   stage.NAME.lr.GROUP=RATE            a learning rate; groups: means, color, shifts, ... (see --cfg job)
   seed=N                              of all random numbers

@@ -19,12 +19,23 @@ class Trunk(nn.Module):
         layers: number of layers, at least 1.
         skip: number of the layer, from 1, that also reads the input: 6 in PyTorch versions of NeRF, 5 in JAX
             versions; None: no layer.
+        besides: channels that only the first layer reads, not the skip.
+        glorot: start from Glorot's uniform weights and biases of 0, as JAX versions do; False: PyTorch's.
 
     >>> sum(p.numel() for p in Trunk(72).parameters())
     497664
     """
 
-    def __init__(self, inputs: int, *, width: int = 256, layers: int = 8, skip: int | None = 6) -> None:
+    def __init__(
+        self,
+        inputs: int,
+        *,
+        width: int = 256,
+        layers: int = 8,
+        skip: int | None = 6,
+        besides: int = 0,
+        glorot: bool = False,
+    ) -> None:
         super().__init__()
         if min(inputs, width, layers) < 1 or not (skip is None or 2 <= skip <= layers):
             raise ValueError(
@@ -32,14 +43,17 @@ class Trunk(nn.Module):
                 f"but got {inputs=}, {width=}, {layers=}, {skip=}"
             )
         self.skip = skip
-        sizes = [inputs, *[width] * (layers - 1)]
+        sizes = [inputs + besides, *[width] * (layers - 1)]
         self.layers = nn.ModuleList(
             nn.Linear(size + (inputs if number == skip else 0), width) for number, size in enumerate(sizes, 1)
         )
 
-    def forward(self, x: Tensor) -> Tensor:
-        """(..., I) -> (..., width)."""
-        hidden = x
+        if glorot:
+            self.apply(start_as_glorot)
+
+    def forward(self, x: Tensor, beside: Tensor | None = None) -> Tensor:
+        """(..., I), and what the first layer reads beside it (..., B) -> (..., width)."""
+        hidden = x if beside is None else torch.cat([x, beside], -1)
         for number, layer in enumerate(self.layers, 1):
             if number == self.skip:
                 hidden = torch.cat([x, hidden], -1)
@@ -56,14 +70,21 @@ class Template(nn.Module):
     Args:
         inputs: channels of the encoded point.
         condition: channels that only colour depends on.
-        width, layers, skip: see ``Trunk``.
+        width, layers, skip, glorot: see ``Trunk``.
 
     >>> sum(p.numel() for p in Template(63, 27).parameters())
     595844
     """
 
     def __init__(
-        self, inputs: int, condition: int, *, width: int = 256, layers: int = 8, skip: int | None = 6
+        self,
+        inputs: int,
+        condition: int,
+        *,
+        width: int = 256,
+        layers: int = 8,
+        skip: int | None = 6,
+        glorot: bool = False,
     ) -> None:
         super().__init__()
         if condition < 1 or width < 2:
@@ -75,6 +96,8 @@ class Template(nn.Module):
         self.bottleneck = nn.Linear(width, width)
         self.shading = nn.Linear(width + condition, width // 2)
         self.color_head = nn.Linear(width // 2, 3)
+        if glorot:
+            self.apply(start_as_glorot)
 
     def density(self, x: Tensor) -> Tensor:
         """Encoded points (..., I) -> raw density (...,)."""
@@ -85,6 +108,13 @@ class Template(nn.Module):
         hidden = self.trunk(x)
         color = torch.relu(self.shading(torch.cat([self.bottleneck(hidden), condition], -1)))
         return self.density_head(hidden)[..., 0], torch.sigmoid(self.color_head(color))
+
+
+def start_as_glorot(layer: nn.Module) -> None:
+    """Give a linear layer Glorot's uniform weights and a bias of 0; leave others as they are."""
+    if isinstance(layer, nn.Linear):
+        nn.init.xavier_uniform_(layer.weight)
+        nn.init.zeros_(layer.bias)
 
 
 def density_of(name: str) -> Callable[[Tensor], Tensor]:

@@ -1,0 +1,73 @@
+"""Where a field has matter at any time, so that samples elsewhere need not be evaluated."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor, nn
+
+from forewarp.scene.box import Box
+
+_FADE = 0.95  # of what was found, at each look
+_OPAQUE = 0.01  # a cell counts as occupied if a step of one cell through it is at least so opaque,
+_LEAST = 1e-4  # or more opaque than the mean of all cells and this, while a field is young
+
+
+class Occupancy(nn.Module):
+    """A lattice of side^3 cells over a box: the largest density found in each of them of late, at any time.
+
+    Until it has looked ``patience`` times every cell counts as occupied. A look evaluates every n-th
+    cell, at a random point of each and at a random time.
+
+    Args:
+        box: of the scene; what lies outside is empty.
+        side: cells along each axis.
+        part: share of the cells that a look evaluates.
+        patience: looks before any cell may count as empty.
+    """
+
+    def __init__(self, box: Box, *, side: int = 64, part: float = 0.125, patience: int = 16) -> None:
+        super().__init__()
+        self.side, self.part, self.patience = side, part, patience
+        self.register_buffer("low", torch.tensor(box.low))
+        self.register_buffer("cell", torch.tensor(box.size) / side)
+        self.register_buffer("density", torch.zeros(side**3))
+        self.register_buffer("occupied", torch.ones(side**3, dtype=torch.bool))
+        self.register_buffer("looks", torch.zeros((), dtype=torch.int64))
+
+    @torch.no_grad()
+    def look(
+        self, density: Callable[[Tensor, float], Tensor], times: Sequence[float], generator: torch.Generator
+    ) -> None:
+        """Look at some cells.
+
+        Args:
+            density: world points (P, 3) and a time -> density (P,), per world unit.
+            times: one is drawn.
+            generator: draws cells, points and time.
+        """
+        step = max(1, round(1 / self.part))
+        first = int(torch.randint(step, (), generator=generator))
+        cells = torch.arange(first, len(self.density), step, device=self.low.device)
+        inside = torch.rand(len(cells), 3, generator=generator).to(self.low)
+        time = times[int(torch.randint(len(times), (), generator=generator))]
+        rows = torch.stack([cells // self.side**2, cells // self.side % self.side, cells % self.side], -1)
+        found = density(self.low + (rows + inside) * self.cell, time)
+        self.density[cells] = torch.maximum(_FADE * self.density[cells], found)
+        self.looks += 1
+        if int(self.looks) >= self.patience:
+            opaque = -torch.expm1(-self.density * float(self.cell.min()))
+            self.occupied.copy_(self._grown(opaque > min(_OPAQUE, max(_LEAST, float(opaque.mean())))))
+
+    def _grown(self, occupied: Tensor) -> Tensor:
+        """Add the cells beside occupied ones: what moves, moves into them."""
+        volume = occupied.reshape(1, 1, *[self.side] * 3).to(torch.float32)
+        return nn.functional.max_pool3d(volume, 3, 1, 1).flatten() > 0
+
+    def forward(self, points: Tensor) -> Tensor:
+        """Tell which of the world points (..., 3) lie in an occupied cell: bool (...,)."""
+        rows = ((points - self.low) / self.cell).floor().long()
+        inside = ((rows >= 0) & (rows < self.side)).all(-1)
+        x, y, z = rows.clamp(0, self.side - 1).unbind(-1)
+        return inside & self.occupied[(x * self.side + y) * self.side + z]

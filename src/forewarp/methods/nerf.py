@@ -1,0 +1,52 @@
+"""NeRF: one field for all times."""
+
+from __future__ import annotations
+
+from forewarp.fields.template import Template
+from forewarp.methods.method import Start
+from forewarp.methods.sampled import Field, SampledMethod, Sampling, encoder
+from forewarp.ops.encode import encoded_size
+from forewarp.scene.view import Moment
+
+
+class NeRF(SampledMethod):
+    """``(x, d) -> (density, colour)``: ``N(PE(x), PE(d))``, whatever the time.
+
+    A network of its own places the samples; both are trained (NeRF, equations 2, 5 and 6). It shows what a
+    scene looks like if nothing may move: what moves is blurred to its mean over time.
+
+    Args:
+        start: scene, stage and numbers.
+        sampling: see ``Sampling``.
+        width, layers, skip: see ``fields.template.Trunk``.
+        position_frequencies, direction_frequencies: octaves of the encodings.
+        glorot: first values of the JAX versions (Glorot, biases 0) in place of PyTorch's.
+    """
+
+    terms = ("photo", "coarse_photo")
+    moves = False
+
+    def __init__(
+        self,
+        start: Start,
+        *,
+        sampling: Sampling | None = None,
+        width: int = 256,
+        layers: int = 8,
+        skip: int | None = 6,
+        position_frequencies: int = 10,
+        direction_frequencies: int = 4,
+        glorot: bool = False,
+    ) -> None:
+        super().__init__(start, sampling or Sampling())
+        self.position, self.direction = encoder(position_frequencies), encoder(direction_frequencies)
+        sizes = encoded_size(3, position_frequencies), encoded_size(3, direction_frequencies)
+        shape = {"width": width, "layers": layers, "skip": skip, "glorot": glorot}
+        self.coarse, self.fine = Template(*sizes, **shape), Template(*sizes, **shape)
+
+    def fields(self, moment: Moment) -> tuple[Field, Field]:
+        """See ``SampledMethod``."""
+        return tuple(
+            Field(network, self.activation, self.position, self.direction)
+            for network in (self.coarse, self.fine)
+        )

@@ -1,0 +1,211 @@
+"""What methods share whose density and colour a network gives at samples along rays."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from forewarp.fields.occupancy import Occupancy
+from forewarp.fields.template import Template, density_of
+from forewarp.methods.method import Method, Snapshot, Start, Step
+from forewarp.ops.encode import positional_encoding
+from forewarp.quadrature import Quadrature, Sampled
+from forewarp.scene.batch import Batch
+from forewarp.scene.rays import Rays
+from forewarp.scene.view import Moment, Rendering, View
+
+_PATIENCE = 20  # steps in a row without any density, after which the network is dead
+_LOOK_EVERY = 8  # steps between two looks for where matter is
+
+
+@dataclass(frozen=True)
+class Field:
+    """A template at one moment: ``encoded`` maps world points (..., 3) to its inputs (..., I), ``condition``
+    unit directions (..., 3) to what colour also reads (..., D), ``activation`` raw density to density.
+    """
+
+    template: Template
+    activation: Callable[[Tensor], Tensor]
+    encoded: Callable[[Tensor], Tensor]
+    condition: Callable[[Tensor], Tensor]
+
+    def density(self, points: Tensor) -> Tensor:
+        """World points (..., 3) -> density (...,), per world unit."""
+        return self.activation(self.template.density(self.encoded(points)))
+
+    def radiance(self, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+        """Points (..., 3), unit directions that broadcast to them -> density (...,) and colour (..., 3)."""
+        towards = self.condition(directions)
+        raw, color = self.template(self.encoded(points), towards.expand(*points.shape[:-1], -1))
+        return self.activation(raw), color
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """How a method looks along rays, and what it takes for matter; one for all such methods.
+
+    Args:
+        samples, fine_samples, open_end: see ``Quadrature``.
+        inside_box: treat space outside the scene's box as empty, to save samples; not as published.
+        density: ``relu`` as NeRF has it, with which some seeds start dead, or ``softplus``.
+        occupancy: cells along a side of the lattice that notes where matter is (see ``Occupancy``), so that
+            samples elsewhere are not evaluated; 0: evaluate all, as published.
+        jitter_in_pictures: draw the samples of pictures at random too, as HyperNeRF's code does.
+    """
+
+    samples: int = 64
+    fine_samples: int = 128
+    open_end: bool = True
+    inside_box: bool = False
+    density: str = "relu"
+    occupancy: int = 0
+    jitter_in_pictures: bool = False
+
+    def departures(self, published: str) -> list[str]:
+        """Name what differs from a publication with this density."""
+        notes = ["pixel centres at +0.5", "near and far along unit rays"]
+        if self.density != published:
+            notes.append(f"{self.density} density")
+        if not self.open_end:
+            notes.append("the last interval ends with the ray")
+        if self.inside_box:
+            notes.append("empty outside the scene's box")
+        if self.occupancy:
+            notes.append("empty space is not sampled")
+        return notes
+
+
+class SampledMethod(Method):
+    """A network evaluated at samples along rays and composited: one of ``fields`` for each of two passes.
+
+    Args:
+        start: scene, stage and numbers.
+        sampling: see ``Sampling``.
+    """
+
+    published = "relu"  # density in the publication
+
+    def __init__(self, start: Start, sampling: Sampling) -> None:
+        super().__init__()
+        box, self.sampling, self.times = start.scene.box, sampling, start.scene.times
+        self.activation = density_of(sampling.density)
+        self.occupancy = Occupancy(box, side=sampling.occupancy) if sampling.occupancy else None
+        self.quadrature = Quadrature(
+            sampling.samples,
+            sampling.fine_samples,
+            sampling.open_end,
+            box if sampling.inside_box or sampling.occupancy else None,
+            self.occupancy,
+        )
+        self._blank_steps = 0
+
+    def fields(self, moment: Moment) -> tuple[Field | None, Field]:
+        """Return the field of each pass at a moment.
+
+        Where the first is None, one network serves both: its first pass places samples, and has no gradient.
+        """
+        raise NotImplementedError
+
+    def extra_terms(
+        self, seen: Sampled, batch: Batch, factors: Mapping[str, float], generator: torch.Generator
+    ) -> dict[str, Callable[[], Tensor | None]]:
+        """Return the loss terms beside the errors of the passes."""
+        return {}
+
+    def at(self, moment: Moment) -> SampledSnapshot:
+        """Fix the time; compute nothing yet."""
+        return SampledSnapshot(moment, self)
+
+    def look(self, batch: Batch, factors: Mapping[str, float], generator: torch.Generator) -> Step:
+        """See ``Method.look``; a batch holds one moment, as no neighbours are asked for.
+
+        Raises:
+            ValueError: if the density is 0 everywhere for many steps, as it then has no gradient.
+        """
+        rays, rgb, background = batch.joined()
+        moment = batch.observations[0].moment
+        seen = self.at(moment).sampled(rays.to(self.device), background.to(self.device), generator)
+        self._refuse_a_dead_start(seen.density)
+        error = (seen.rgb - rgb).square().mean()
+        terms = {"photo": lambda: error}
+        if seen.coarse is not None:
+            terms["coarse_photo"] = lambda: (seen.coarse.rgb - rgb).square().mean()
+        return Step(
+            terms | self.extra_terms(seen, batch, factors, generator),
+            error.detach(),
+            {"samples": seen.depths.numel(), "opacity": float(seen.opacity.detach().mean())},
+            tensors=lambda: ((name, getattr(seen, name)) for name in ("density", "weights", "rgb")),
+        )
+
+    def _refuse_a_dead_start(self, density: Tensor) -> None:
+        blank = density.numel() > 0 and not bool((density > 0).any())
+        self._blank_steps = self._blank_steps + 1 if blank else 0
+        if self._blank_steps >= _PATIENCE:
+            raise ValueError(
+                "model.sampling.density: expected matter somewhere, but got a density of 0 at every sample "
+                f"of {_PATIENCE} steps, which {self.sampling.density} never leaves: a dead start; "
+                "set another seed=N, or model.sampling.density=softplus"
+            )
+
+    def advance(self, progress: float, step: int, optimizer: torch.optim.Optimizer) -> dict[str, float]:
+        """See ``Method``; look now and then for where matter is."""
+        if self.occupancy is None or step % _LOOK_EVERY:
+            return {}
+        self.occupancy.look(self._density_at, self.times, torch.default_generator)
+        return {"occupied": float(self.occupancy.occupied.float().mean())}
+
+    def _density_at(self, points: Tensor, time: float) -> Tensor:
+        return self.fields(Moment(time))[1].density(points)
+
+    def optimizer(self, groups: list[dict]) -> torch.optim.Optimizer:
+        """Make Adam with the published betas."""
+        return torch.optim.Adam(groups, betas=(0.9, 0.999), eps=1e-8, fused=True)
+
+    def departures(self) -> Sequence[str]:
+        """List what differs from the publication beside the sampling."""
+        return ()
+
+    def protocol(self) -> dict[str, str]:
+        """List the departures from the publication."""
+        return {"departures": "; ".join([*self.sampling.departures(self.published), *self.departures()])}
+
+
+@dataclass(frozen=True)
+class SampledSnapshot(Snapshot):
+    """Such a method at one moment. An image costs the same at every time: all its samples."""
+
+    moment: Moment
+    method: SampledMethod
+
+    def sampled(self, rays: Rays, background: Tensor, generator: torch.Generator | None = None) -> Sampled:
+        """Render rays; also return what lies along them."""
+        first, second = self.method.fields(self.moment)
+        coarse = None if first is None else first.radiance
+        return self.method.quadrature(
+            second.density, second.radiance, rays, background, generator, coarse=coarse
+        )
+
+    def render(self, view: View, background: Tensor, rendering: str | None = None) -> Rendering:
+        """See ``Snapshot.render``; without gradients in chunks of rays, for images of any size."""
+        rays = view.rays().to(self.method.device)
+        background = background.to(rays.origins)
+        if torch.is_grad_enabled():
+            return self.sampled(rays, background)
+        first, second = self.method.fields(self.moment)
+        places = (first or second).density
+        jitter = torch.Generator().manual_seed(0) if self.method.sampling.jitter_in_pictures else None
+        return self.method.quadrature.picture(places, second.radiance, rays, background, jitter)
+
+    def holds(self, moment: Moment) -> bool:
+        """Return whether it is the same time; the camera does not matter."""
+        return moment.time == self.moment.time
+
+
+def encoder(frequencies: int) -> Callable[[Tensor], Tensor]:
+    """Return ``positional_encoding`` with so many octaves; ValueError for fewer than 0."""
+    if frequencies < 0:
+        raise ValueError(f"model: expected frequencies >= 0, but got {frequencies}")
+    return lambda x: positional_encoding(x, frequencies)

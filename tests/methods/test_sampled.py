@@ -1,0 +1,322 @@
+"""NeRF, T-NeRF, D-NeRF, Nerfies and HyperNeRF: sizes, identities, what they can learn."""
+
+from functools import partial
+
+import pytest
+import torch
+
+from forewarp.data.module import SceneDataModule
+from forewarp.methods.dnerf import DNeRF
+from forewarp.methods.hypernerf import HyperNeRF
+from forewarp.methods.method import Start, parameter_count
+from forewarp.methods.nerf import NeRF
+from forewarp.methods.nerfies import Nerfies
+from forewarp.methods.sampled import Sampling
+from forewarp.methods.tnerf import TNeRF
+from forewarp.ops.encode import positional_encoding
+from forewarp.scene.batch import Batch, Observation
+from forewarp.scene.box import Box
+from forewarp.scene.camera import Camera, look_at
+from forewarp.scene.frame import Frame, Scene
+from forewarp.scene.view import Moment, View
+from forewarp.training.objective import Objective
+from forewarp.training.schedule import StageSettings
+from forewarp.training.stages import Stage
+from tests.support.tiny_scene import make_run
+
+TIMES = (0.0, 0.5, 1.0)
+SMALL = {"width": 32, "layers": 3, "skip": None, "position_frequencies": 3, "direction_frequencies": 1}
+WARP = {"warp_width": 24, "warp_layers": 3, "warp_skip": None}
+GENTLE = {"density": "softplus", "open_end": False}
+KINDS = {
+    "nerf": partial(NeRF, **SMALL),
+    "tnerf": partial(TNeRF, **SMALL, time_frequencies=2),
+    "dnerf": partial(DNeRF, **SMALL, time_frequencies=2),
+    "nerfies": partial(Nerfies, **SMALL, **WARP, elastic_samples=64),
+    "hypernerf": partial(HyperNeRF, **SMALL, **WARP, slice_width=16),
+}
+
+
+def camera(size=12):
+    pose = look_at(torch.tensor([0.0, -3.0, 0.4]), torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
+    return Camera(size, size, 1.5 * size, 1.5 * size, size / 2, size / 2, pose, 2.0, 4.0)
+
+
+def picture(time, size=12):
+    """A dark square that slides to the right before white."""
+    image = torch.zeros(size, size, 4, dtype=torch.uint8)
+    begin = round(1 + time * (size - 6))
+    image[4:8, begin : begin + 4] = torch.tensor([40, 80, 160, 255], dtype=torch.uint8)
+    return image
+
+
+def frame(name, time):
+    return Frame(name, time, camera(), lambda: picture(time), camera_id=0)
+
+
+def moving_scene(still=None):
+    """A static camera, three times."""
+    train = tuple(frame(f"r_{i}", time) for i, time in enumerate(TIMES))
+    box = Box((-1, -1, -1), (1, 1, 1))
+    return Scene("square", train, (), train[:1], box, 0.0, has_alpha=True, still=still)
+
+
+def method(kind, seed=0, still=None, **sampling):
+    torch.manual_seed(seed)
+    asked = Sampling(**({"samples": 12, "fine_samples": 12} | sampling))
+    return KINDS[kind](Start(moving_scene(still), "fine", {}), sampling=asked)
+
+
+def batch(time=0.5):
+    rgb = torch.rand(144, 3, generator=torch.Generator().manual_seed(0))
+    return Batch((Observation(Moment(time), View(camera()), rgb, torch.ones(3)),), 0)
+
+
+def shown(made, time, points=None):
+    """Density and colour at some points."""
+    points = torch.randn(64, 3, generator=torch.Generator().manual_seed(3)) if points is None else points
+    directions = torch.tensor([0.0, 0.6, 0.8]).expand_as(points)
+    return made.fields(Moment(time, camera=0))[1].radiance(points, directions)
+
+
+def start(scene=None):
+    return Start(scene or moving_scene(), "fine", {})
+
+
+@pytest.mark.parametrize(
+    ("make", "count"),
+    [
+        (NeRF, 1_191_688),
+        (partial(NeRF, position_frequencies=8, skip=5, glorot=True), 1_179_400),
+        (TNeRF, 600_452),
+        (partial(TNeRF, time_frequencies=10), 606_596),
+        (DNeRF, 1_095_047),
+        (Nerfies, 1_275_410 - 2 + 3 * 8),  # one camera, where the rig has two; three times
+        (partial(Nerfies, camera_code_size=0), 2 * 589_700 + 95_494 + 3 * 8),
+        (HyperNeRF, 1_305_616 + 3 * 8),
+    ],
+)
+def test_published_counts(make, count):
+    assert parameter_count(make(start())) == count
+
+
+def test_the_snapshot_asks_the_network_in_world_units():
+    made = method("tnerf", **GENTLE)
+    points, directions = torch.randn(4, 5, 3), torch.nn.functional.normalize(torch.randn(4, 3), dim=1)
+    x, t = positional_encoding(points, 3), positional_encoding(torch.tensor([0.25]), 2)
+    raw, color = made.network(
+        torch.cat([x, t.expand(4, 5, -1)], -1), positional_encoding(directions, 1)[:, None].expand(4, 5, -1)
+    )
+    first, field = made.fields(Moment(0.25))
+    density, seen = field.radiance(points, directions[:, None])
+    assert first is None
+    torch.testing.assert_close(density, torch.nn.functional.softplus(raw))
+    torch.testing.assert_close(seen, color)
+    torch.testing.assert_close(field.density(points), density)
+    assert made.at(Moment(0.25)).holds(Moment(0.25, camera=3))
+    assert not made.at(Moment(0.25)).holds(Moment(0.2))
+
+
+@pytest.mark.parametrize("inside_box", [False, True])
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_step_gives_the_losses_of_its_passes(kind, inside_box):
+    made = method(kind, inside_box=inside_box, **GENTLE)
+    step = made.look(batch(), {"photo": 1.0}, torch.Generator().manual_seed(0))
+    values = {name: term() for name, term in step.terms.items()}
+    assert values["photo"].item() == step.squared_error.item()
+    assert ("coarse_photo" in values) == (kind in ("nerf", "nerfies", "hypernerf"))
+    assert set(values) <= set(type(made).terms)
+    sum(value for value in values.values() if value is not None).backward()
+    assert all(p.grad is None or p.grad.isfinite().all() for p in made.parameters())
+    blind = {name for name, p in made.named_parameters() if p.grad is None or not p.grad.any()}
+    assert all("code" in name or "slice" in name for name in blind), blind
+    assert {"density", "weights", "rgb"} == {name for name, _ in step.tensors()}
+    assert step.noted["samples"] <= 144 * 24
+
+
+def test_a_dead_start_is_named():
+    made = method("tnerf")
+    with torch.no_grad():
+        made.network.density_head.bias.fill_(-100)
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(19):
+        assert made.look(batch(), {"photo": 1.0}, generator).noted["opacity"] == 0
+    with pytest.raises(ValueError, match=r"a dead start; set another seed=N, or model.sampling.density=soft"):
+        made.look(batch(), {"photo": 1.0}, generator)
+
+
+def test_a_start_that_comes_alive_is_none():
+    made, generator = method("tnerf"), torch.Generator().manual_seed(0)
+    for step in range(40):
+        with torch.no_grad():
+            made.network.density_head.bias.fill_(1.0 if step % 15 == 14 else -100)
+        made.look(batch(), {"photo": 1.0}, generator)
+
+
+def test_its_protocol_names_departures():
+    published = method("tnerf").protocol()["departures"]
+    changed = method("tnerf", inside_box=True, occupancy=8, **GENTLE).protocol()["departures"]
+    assert "softplus" not in published
+    assert changed.startswith(published)
+    assert "softplus density; the last interval ends with the ray; empty outside" in changed
+    assert "relu density" in method("nerfies").protocol()["departures"]
+
+
+def test_nerf_shows_the_same_at_all_times():
+    made = method("nerf", **GENTLE)
+    for one, other in zip(shown(made, 0.0), shown(made, 0.7)):
+        assert one.equal(other)
+
+
+def test_tnerf_without_its_time_is_a_nerf():
+    made = method("tnerf", **GENTLE)
+    assert not shown(made, 0.2)[0].equal(shown(made, 0.3)[0])
+    with torch.no_grad():
+        made.network.trunk.layers[0].weight[:, 21:] = 0  # after the position's columns
+    assert shown(made, 0.2)[0].equal(shown(made, 0.3)[0])
+
+
+def test_dnerf_at_the_canonical_time_is_its_nerf():
+    made = method("dnerf", **GENTLE)
+    points = torch.randn(64, 3, generator=torch.Generator().manual_seed(3))
+    expected = torch.nn.functional.softplus(made.template.density(positional_encoding(points, 3)))
+    density = shown(made, 0.0)[0]
+    assert density.equal(expected)
+    density.sum().backward()
+    assert made.offset_head.weight.grad is None
+    assert not shown(made, 0.5)[0].equal(density)
+
+
+def test_the_content_of_dnerf_moves_against_its_offset():
+    made, shift = method("dnerf", **GENTLE), torch.tensor([0.1, -0.2, 0.3])
+    with torch.no_grad():
+        made.offset_head.weight.zero_()
+        made.offset_head.bias.zero_()
+        points = torch.randn(64, 3)
+        rest = shown(made, 0.5, points)
+        assert rest[0].equal(shown(made, 0.0, points)[0])
+        made.offset_head.bias.copy_(shift)
+        torch.testing.assert_close(shown(made, 0.5, points - shift)[0], rest[0])
+        torch.testing.assert_close(shown(made, 0.0, points)[0], rest[0])
+
+
+def test_continuous_offsets_go_to_zero_at_the_canonical_time():
+    jumps, glides = (
+        KINDS["dnerf"](start(), sampling=Sampling(**GENTLE), continuous=continuous)
+        for continuous in (False, True)
+    )
+    points = torch.randn(64, 3)
+    assert float(glides.offset(points, 1e-5).detach().abs().max()) < 1e-4
+    assert float(jumps.offset(points, 1e-5).detach().abs().mean()) > 1e-3
+
+
+def test_nerfies_starts_near_the_identity_and_lets_octaves_in():
+    made = Nerfies(start())
+    points = 0.8 * torch.rand(500, 3) - 0.4
+    for window, most in ((0.0, 1e-3), (6.0, 1e-2)):
+        moved = made.warp(points, made.codes(0.5), window).detach()
+        assert 0 < float((moved - points).norm(dim=-1).mean()) < most
+    optimizer = torch.optim.SGD(made.parameters(), 0.0)
+    for progress, octaves in ((0.0, 0.0), (0.16, 3.0), (0.32, 6.0), (1.0, 6.0)):
+        assert made.advance(progress, 1, optimizer)["octaves"] == pytest.approx(octaves)
+        assert float(made.window) == pytest.approx(octaves)
+
+
+def test_waves_that_are_not_let_in_do_not_matter():
+    made = method("nerfies", **GENTLE)
+    before = shown(made, 0.5)[0]
+    with torch.no_grad():
+        made.warp.trunk.layers[0].weight[:, 3 : 3 + 36] += 1.0
+    assert shown(made, 0.5)[0].equal(before)
+
+
+def test_equal_codes_look_equal():
+    for kind in ("nerfies", "hypernerf"):
+        made = method(kind, **GENTLE)
+        made.advance(1.0, 1, torch.optim.SGD(made.parameters(), 0.0))
+        with torch.no_grad():
+            made.codes.table[1] = made.codes.table[0]
+        assert shown(made, 0.0)[0].equal(shown(made, 0.5)[0])
+        assert not shown(made, 0.0)[0].equal(shown(made, 1.0)[0])
+
+
+def test_a_rigid_warp_is_not_elastic_and_one_that_doubles_is():
+    made = Nerfies(start())
+    points = torch.randn(20, 3)
+    with torch.no_grad():
+        for head in (made.warp.turn, made.warp.shift):
+            head.weight.zero_()
+        made.warp.turn.bias.copy_(torch.tensor([0.3, -0.2, 0.5]))
+        made.warp.shift.bias.fill_(0.4)
+    rigid = made.warp.elastic(points, made.codes(0.5), 6.0)
+    torch.testing.assert_close(rigid, torch.zeros(20), atol=1e-5, rtol=0)
+    other = Nerfies(start())
+    with torch.no_grad():
+        for head in (other.warp.turn, other.warp.shift):
+            head.weight.mul_(1e3)
+    bent = other.warp.elastic(points, other.codes(0.5), 6.0)
+    assert float(bent.detach().mean()) > 0.5
+    bent.sum().backward()
+    assert other.warp.shift.weight.grad.isfinite().all()
+
+
+def test_points_that_never_move_are_pulled_to_stay():
+    still = torch.randn(50, 3)
+    for kind in ("nerfies", "hypernerf"):
+        made = method(kind, still=still, **GENTLE)
+        draw = torch.Generator().manual_seed(0)
+        seen = made.at(Moment(0.5)).sampled(View(camera()).rays(), torch.ones(3), draw)
+        (term,) = (t for n, t in made.extra_terms(seen, batch(), {}, draw).items() if n == "still")
+        low = float(term().detach())
+        with torch.no_grad():
+            made.warp.shift.bias.fill_(0.1)
+        assert low < 1 < 1.9 < float(term().detach()) <= 2
+        bare = method(kind, **GENTLE)
+        assert bare.extra_terms(seen, batch(), {}, draw)["still"]() is None
+
+
+def test_hypernerf_without_its_slice_ignores_it():
+    made = method("hypernerf", **GENTLE)
+    optimizer = torch.optim.SGD(made.parameters(), 0.0)
+    for progress, matters in ((0.0, False), (1.0, True)):
+        made.advance(progress, 1, optimizer)
+        before = shown(made, 0.5)[0]
+        with torch.no_grad():
+            made.slice.head.bias += 0.3
+        assert shown(made, 0.5)[0].equal(before) != matters
+    assert made.windows.tolist() == [6.0, 1.0]
+
+
+def test_pictures_of_a_jittered_method_are_drawn_alike():
+    plain, jittered = (method("tnerf", jitter_in_pictures=jitter, **GENTLE) for jitter in (False, True))
+    with torch.no_grad():
+        one, two, other = (
+            made.at(Moment(0.5)).render(View(camera()), torch.ones(3)).rgb
+            for made in (jittered, jittered, plain)
+        )
+    assert one.equal(two)
+    assert not one.equal(other)
+
+
+def static_ceiling():
+    """The train PSNR that no static model exceeds with a fixed camera."""
+    images = torch.stack([picture(time).double() / 255 for time in TIMES])
+    rgb = images[..., :3] * images[..., 3:] + 1 - images[..., 3:]
+    return float(-10 * torch.log10(rgb.var(0, unbiased=False).mean()))
+
+
+@pytest.mark.parametrize(
+    "kind", [*KINDS][:3] + [pytest.param(kind, marks=pytest.mark.slow) for kind in [*KINDS][3:]]
+)
+def test_it_learns_what_moves(kind, tmp_path):
+    settings = StageSettings.of("fine", lr={"network": 5e-3}, iterations=260, curriculum={"all_in": 0.0})
+    weights = dict.fromkeys({"photo", "coarse_photo"} & set(KINDS[kind].func.terms), 1.0)
+    data = SceneDataModule(moving_scene, rays=96)
+    model = partial(KINDS[kind], sampling=Sampling(12, 12, **GENTLE))
+    module = make_run(tmp_path, [Stage(settings, Objective(weights))], data=data, model=model).fit()
+    psnr = [float(module.psnr_of(target)) for target in data.targets("train")]
+    mean = sum(psnr) / len(psnr)
+    if kind == "nerf":
+        assert static_ceiling() - 3 < mean <= static_ceiling()
+    else:
+        assert mean > static_ceiling() + 3
