@@ -20,6 +20,7 @@ from forewarp.ops.lens import distort
 from forewarp.ops.nodes import carry_nodes, node_maps, stiffness
 from forewarp.ops.project import Gaussians, Splats, Warp, moved, project, project_reference, rotations
 from forewarp.ops.rasterize import rasterize, rasterize_reference
+from forewarp.ops.rigid import geman_mcclure, move_by_screw, stretch
 from forewarp.ops.samples import midpoints, union
 from forewarp.ops.splat import average_splat, scatter_reference, with_copies
 from forewarp.ops.variation import patch_variation, total_variation
@@ -37,7 +38,7 @@ WITHOUT = {
     " whole",
     "places samples, which no loss pulls at": "march march_reference stratified by_importance clip_to_box",
     "whole numbers, or yes and no": "map_cells unfolded index_of dilate occupied_cells neighbour_pairs"
-    " occupied_cells_reference sorted_tiles",
+    " occupied_cells_reference sorted_tiles encoded_size",
     "says that it has none": "trace undistort adam_rows arrays",
     "of times or directions, which are not learned": "spline_basis harmonics",
     "gives its own, which test_compare and test_nodes compare": "compare compare_reference pull_nodes"
@@ -152,6 +153,9 @@ CHECKS = {
     "rasterize_reference": partial(of_rasterizing, draw=rasterize_reference),
     "stiffness": of_stiffness,
     "moved": of_moved,
+    "move_by_screw": lambda s: (move_by_screw, draw(s, 3, 3), draw(s + 1, 3, 3), draw(s + 2, 3, 3)),
+    "stretch": lambda s: (stretch, torch.eye(3, dtype=torch.float64) + 0.2 * draw(s, 2, 3, 3)),
+    "geman_mcclure": lambda s: (geman_mcclure, draw(s, 5).square()),
     "rotations": lambda s: (rotations, draw(s, 3, 4)),
     "node_maps": lambda s: (lambda m: node_maps(m, draw(s, 3, 3)), draw(s + 1, 3, 6)),
     "carry_nodes": lambda s: (

@@ -70,13 +70,17 @@ def export(config) -> None:
 def told(about: dict) -> str:
     """Say in a few words what was written.
 
-    >>> told({"bytes": {"a": 2_000_000, "b": 500_000}, "points": 7})
-    '2 files, 2.5 MB'
-    >>> told({"bytes": {"a": 1000}, "thinned": "7 of 9 points"})
-    '1 file, 0.0 MB; thinned to 7 of 9 points'
+    >>> told({"bytes": {"a": 2_000_000, "b": 500_000}, "vertices": [7200, 72]})
+    '2 files, 2.5 MB, at least 72 vertices each'
+    >>> told({"bytes": {"a": 1000}, "points": 7, "thinned": "7 of 9 points"})
+    '1 file, 0.0 MB, 7 points; thinned to 7 of 9 points'
     """
     count, total = len(about["bytes"]), sum(about["bytes"].values())
     text = f"{count} file{'s' * (count != 1)}, {total / 1e6:.1f} MB"
+    for what in {"particles", "points", "vertices"} & about.keys():
+        number = about[what]
+        of_each = isinstance(number, list)
+        text += f", at least {min(number):,} {what} each" if of_each else f", {number:,} {what}"
     return text + (f"; thinned to {about['thinned']}" if "thinned" in about else "")
 
 
