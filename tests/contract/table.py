@@ -138,6 +138,7 @@ METHODS = {
         {"photo": 1.0, "coarse_photo": 1.0, "elastic": 1e-3, "still": 1.0},
         {"warp_in": 0.3},
         steps=150,
+        slow=True,
     ),
     "hypernerf": Entry(
         partial(HyperNeRF, **SMALL_NETWORK, **SMALL_WARP, slice_width=16, still_points=64),
