@@ -122,6 +122,7 @@ METHODS = {
         partial(NeRF, **SMALL_NETWORK),
         {"network": 2e-3},
         {"photo": 1.0, "coarse_photo": 1.0},
+        falls=0.6,  # it cannot show what moves
         steps=150,
         slow=True,
     ),
@@ -135,7 +136,7 @@ METHODS = {
     "nerfies": Entry(
         partial(Nerfies, **SMALL_NETWORK, **SMALL_WARP, elastic_samples=64, still_points=64),
         {"network": 2e-3},
-        {"photo": 1.0, "coarse_photo": 1.0, "elastic": 1e-3, "still": 1.0},
+        {"photo": 1.0, "coarse_photo": 1.0, "elastic": 1e-3, "still": 1e-3},
         {"warp_in": 0.3},
         steps=150,
         slow=True,
@@ -143,7 +144,7 @@ METHODS = {
     "hypernerf": Entry(
         partial(HyperNeRF, **SMALL_NETWORK, **SMALL_WARP, slice_width=16, still_points=64),
         {"network": 2e-3},
-        {"photo": 1.0, "coarse_photo": 1.0, "still": 1.0},
+        {"photo": 1.0, "coarse_photo": 1.0, "still": 1e-3},
         {"warp_in": 0.3, "slice_from": 0.01, "slice_in": 0.2},
         steps=150,
         slow=True,
