@@ -169,7 +169,12 @@ KERNELS = ("trilinear", "average_splat")
 
 
 @pytest.mark.parametrize(
-    ("operator", "numba"), [*((name, False) for name in CHECKS), *((name, True) for name in KERNELS)]
+    ("operator", "numba"),
+    [
+        # Without Numba ``project`` is ``project_reference``.
+        *(pytest.param(n, False, marks=pytest.mark.slow if n == "project" else ()) for n in CHECKS),
+        *((name, True) for name in KERNELS),
+    ],
 )
 def test_gradients_equal_finite_differences(operator, numba, monkeypatch):
     if numba:

@@ -107,6 +107,7 @@ def goes_on(begin, folder, whole):
     assert differences(folder, whole) == []
 
 
+@pytest.mark.slow
 def test_killed_while_a_checkpoint_takes_its_place(begin, whole, tmp_path):
     # The first two files are config.yaml and data.json, the fourth is the second checkpoint.
     assert begin(tmp_path / "run", die=[4, "half"])[0] == -signal.SIGKILL

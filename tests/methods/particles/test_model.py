@@ -43,6 +43,7 @@ def test_gradients_are_those_of_autograd(data, options):
         assert error < 2e-3, name
 
 
+@pytest.mark.slow
 def test_particles_of_opaque_pictures_begin_no_larger_than_they_are_apart_there(data, tmp_path):
     write_hypernerf(tmp_path / "hypernerf")
     opaque = data_of("hypernerf", tmp_path)
