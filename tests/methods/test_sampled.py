@@ -150,7 +150,8 @@ def test_a_start_that_comes_alive_is_none():
     for step in range(40):
         with torch.no_grad():
             made.network.density_head.bias.fill_(1.0 if step % 15 == 14 else -100)
-        made.look(batch(), {"photo": 1.0}, generator)
+        opacity = made.look(batch(), {"photo": 1.0}, generator).noted["opacity"]
+        assert (opacity > 0) == (step % 15 == 14)
 
 
 def test_its_protocol_names_departures():

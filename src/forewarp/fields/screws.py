@@ -59,8 +59,17 @@ class ScrewWarp(nn.Module):
         jacobian = torch.stack(rows, 1)
         return geman_mcclure(stretch(jacobian) / _ELASTIC**2)
 
-    def stray(self, points: Tensor, codes: Tensor, window: float, generator: torch.Generator) -> Tensor:
-        """How far the warp moves points that should stay (P, 3), by a code each (P, D): mean in [0, 2]."""
+    def stray(
+        self, still: Tensor | None, table: Tensor, window: float, most: int | None, generator: torch.Generator
+    ) -> Tensor | None:
+        """How far the warp moves points that should stay (P, 3): mean in [0, 2]; None without such points.
+
+        ``most`` of them are drawn (None: all), and for each one of the codes in ``table`` (T, D).
+        """
+        if still is None or not len(still):
+            return None
+        points = drawn(still.to(table), most, generator)
+        codes = table[torch.randint(len(table), (len(points),), generator=generator).to(table.device)]
         noise = torch.randn(points.shape, generator=generator).to(points)
         near = points + _JITTER * noise
         return geman_mcclure((self(near, codes, window) - near).square().sum(-1) / _STILL**2).mean()

@@ -83,7 +83,7 @@ class DNeRF(SampledMethod):
 
         def second_time() -> Tensor:
             time = batch.time
-            beside = [other for other in _neighbours(self.times, time)]
+            beside = _neighbours(self.times, time)
             drawn = torch.rand(2, generator=generator).tolist()
             other = beside[int(drawn[0] * len(beside))] if beside else time
             between = time + drawn[1] * (other - time)

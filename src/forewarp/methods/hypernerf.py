@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from forewarp.fields.codes import TimeCodes
-from forewarp.fields.screws import ScrewWarp, drawn
+from forewarp.fields.screws import ScrewWarp
 from forewarp.fields.template import Template, Trunk
 from forewarp.methods.method import Start
 from forewarp.methods.sampled import Field, SampledMethod, Sampling, encoder
@@ -135,11 +135,7 @@ class HyperNeRF(SampledMethod):
         """Offer ``still``, at points that never move."""
 
         def still() -> Tensor | None:
-            if self.still is None or not len(self.still):
-                return None
-            points = drawn(self.still.to(self.device), self.still_points, generator)
-            rows = torch.randint(len(self.times), (len(points),), generator=generator)
-            codes = self.codes.table[rows.to(self.device)]
-            return self.warp.stray(points, codes, float(self.windows[0]), generator)
+            window = float(self.windows[0])
+            return self.warp.stray(self.still, self.codes.table, window, self.still_points, generator)
 
         return {"still": still}

@@ -115,10 +115,6 @@ class Nerfies(SampledMethod):
             return (some[:, 3] * strain).sum() * (len(both) / max(len(some), 1) / max(len(batch), 1))
 
         def still() -> Tensor | None:
-            if self.still is None or not len(self.still):
-                return None
-            points = drawn(self.still.to(self.device), self.still_points, generator)
-            rows = torch.randint(len(self.times), (len(points),), generator=generator)
-            return self.warp.stray(points, self.codes.table[rows.to(self.device)], window, generator)
+            return self.warp.stray(self.still, self.codes.table, window, self.still_points, generator)
 
         return {"elastic": elastic, "still": still}
