@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from forewarp.data.module import SceneDataModule
-from forewarp.data.options import hold_out, with_canonical
+from forewarp.data.options import hold_out, outline, with_canonical
 from forewarp.scene.errors import SceneError
 from forewarp.scene.frame import Truth
 from tests.support.tiny_scene import ball_scene
@@ -61,5 +61,47 @@ def test_the_middle_training_time_becomes_canonical_and_leads_the_trajectories()
     assert torch.equal(moved.truth.points, scene.truth.points[:, [2, 0, 1, 3]])
     assert with_canonical(moving(0.0, 1.0), "middle").truth is None
     assert with_canonical(scene, None) is scene
-    with pytest.raises(SceneError, match="data.canonical: expected middle or null, but got last"):
-        with_canonical(scene, "last")
+
+
+@pytest.mark.parametrize(
+    ("choice", "time"), [(0.0, 0.0), (0.3, 0.25), (0.45, 0.5), (1, 1.0), ("middle", 0.5)]
+)
+def test_the_training_time_nearest_to_a_typed_one_becomes_canonical(choice, time):
+    scene = moving(0.0, 0.25, 0.5, 1.0)
+    assert with_canonical(scene, choice).canonical_time == time
+
+
+@pytest.mark.parametrize("word", ["last", 1.5, -0.1, True, float("nan")])
+def test_another_canonical_time_is_refused(word):
+    with pytest.raises(SceneError, match="data.canonical: expected middle, spread, a time in .0, 1. or null"):
+        with_canonical(moving(0.0), word)
+
+
+def posing(*apart, alpha=True):
+    """A scene of two bars that are so many pixels apart in each frame; 0: they touch."""
+    pictures = []
+    for gap in apart:
+        rgba = torch.zeros(24, 24, 4, dtype=torch.uint8)
+        rgba[4:20, 8:12, 3] = rgba[4:20, 12 + gap : 16 + gap, 3] = 255
+        pictures.append(rgba)
+    scene = ball_scene(frames=len(apart), size=24)
+    train = tuple(replace(f, load=lambda p=p: p) for f, p in zip(scene.train, pictures, strict=True))
+    return replace(scene, train=train, has_alpha=alpha)
+
+
+@pytest.mark.parametrize(
+    ("apart", "time"),
+    [
+        ((4, 4, 0, 0, 0), 0.25),  # two parts that touch later on
+        ((0, 0, 0, 0, 4), 1.0),
+        ((4, 4, 4, 4, 0), 0.5),  # of much the same, the middle
+        ((0, 0, 0, 0, 0), 0.5),
+    ],
+)
+def test_the_canonical_time_is_one_at_which_parts_do_not_touch(apart, time):
+    assert with_canonical(posing(*apart), "spread").canonical_time == time
+    assert with_canonical(posing(*apart, alpha=False), "spread").canonical_time == 0.5
+
+
+def test_an_empty_silhouette_has_no_outline():
+    assert outline(torch.zeros(4, 4, dtype=torch.bool)) == 0

@@ -36,7 +36,7 @@ class SceneDataModule(LightningDataModule):
         views_per_step: training frames of one time that share a batch's rays.
         cache_bytes: most bytes of decoded images kept in the process; the last module's number counts.
         held_out: training frames that are never trained on (``hold_out``).
-        canonical: ``middle``: the training time in the middle is canonical; None: the format's own choice.
+        canonical: another canonical time than the format's own (None): see ``with_canonical``.
         place: the scene's folder, where it has one.
 
     ``picker`` may be set at any time: a callable that chooses the training frame of the next batch.
@@ -53,7 +53,7 @@ class SceneDataModule(LightningDataModule):
         views_per_step: int = 1,
         cache_bytes: int = 1_500_000_000,
         held_out: int = 0,
-        canonical: str | None = None,
+        canonical: str | float | None = None,
         place: str | Path | None = None,
     ) -> None:
         super().__init__()
