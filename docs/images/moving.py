@@ -1,6 +1,6 @@
 """Draw the README's moving picture: test views, what a run makes of them, and a flight around while time passes.
 
-    python docs/images/moving.py runs/hook/particles-fast-seed0 docs/images/hook.gif
+python docs/images/moving.py runs/hook/particles-fast-seed0 docs/images/hook.gif
 """
 
 import sys
