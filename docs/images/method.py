@@ -41,7 +41,7 @@ def grid(side: int) -> np.ndarray:
 def covered(points: np.ndarray, side: int) -> np.ndarray:
     """Return which cells (side, side) a dense cloud of points fills: 1 or 0."""
     counts, *_ = np.histogram2d(*points.T, bins=side, range=[[0, 1], [0, 1]])
-    return (counts.T > 0.25 * np.median(counts[counts > 0])).astype(float)
+    return np.where(counts > 0.25 * np.median(counts[counts > 0]), 1.0, 0.0).T
 
 
 def splat(points: np.ndarray, side: int = SIDE) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Draw the README's moving picture: test views, what a run makes of them, and a flight around while time passes.
+"""Draw the README's moving picture: test views, what a run makes of them, and a flight around the scene.
 
 python docs/images/moving.py runs/hook/particles-fast-seed0 docs/images/hook.gif
 """

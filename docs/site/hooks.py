@@ -11,8 +11,18 @@ SOURCE = ROOT / "src" / "forewarp"
 TITLE = "Reference"
 COMMANDS, KERNELS = "cli", "kernels_"  # told by --help; each tested against its reference
 
+INTRODUCTION = f"""# {TITLE}
+
+One page a package, from the docstrings. `forewarp.load` opens a run as a
+[`Fitted`](runs.md#forewarp.runs.fitted.Fitted) ([notebooks and scripts](../scripts.md)). What a method must
+do is in [`methods.method`](methods.md#forewarp.methods.method), who may import whom in
+[architecture](../architecture.md).
+"""
+
 # A link or picture of Markdown: what stands before the address, the address.
 LINK = re.compile(r"(\]\()([^)\s#]+)")
+# A piece of code in a row of a table, where only GitHub's Markdown wants its bars escaped.
+ROW, CODE = re.compile(r"^\|.*$", re.MULTILINE), re.compile(r"`[^`]*`")
 
 
 def packages() -> dict[str, list[str]]:
@@ -41,12 +51,7 @@ def page_of(package: str) -> str:
 def reference() -> dict[str, str]:
     """Write the pages of the reference: name -> Markdown."""
     rows = [f"| [`{name}`]({PurePosixPath(page_of(name)).name}) | {about(name)} |" for name in packages()]
-    pages = {
-        "reference/index.md": f"# {TITLE}\n\nOne page a package, from the docstrings. `forewarp.load` opens a "
-        "run ([notebooks and scripts](../scripts.md)); what a method must do is in [`methods`](methods.md); "
-        "who may import whom: [architecture](../architecture.md).\n\n| package | holds |\n|---|---|\n"
-        + "\n".join(rows)
-    }
+    pages = {"reference/index.md": "\n".join([INTRODUCTION, "| package | holds |", "|---|---|", *rows])}
     for name, modules in packages().items():
         own = [f"::: {name}\n    options: {{show_root_toc_entry: false, show_submodules: false}}"]
         parts = [f"# {name}"] + (own if name == "forewarp" else [about(name)])
@@ -70,7 +75,7 @@ def on_files(files, config):
 
 
 def on_page_markdown(markdown, page, config, files):
-    """Let links to a source file lead to where the reference has it."""
+    """Let links to a source file lead to where the reference has it, and show bars of code in tables."""
     here = PurePosixPath("docs", page.file.src_uri).parent
 
     def lead(found: re.Match) -> str:
@@ -81,7 +86,8 @@ def on_page_markdown(markdown, page, config, files):
         up = "../" * len(PurePosixPath(page.file.src_uri).parent.parts)
         return f"{found[1]}{up}{page_of(name.rpartition('.')[0])}#{name}"
 
-    return LINK.sub(lead, markdown)
+    bars = ROW.sub(lambda row: CODE.sub(lambda code: code[0].replace("\\|", "|"), row[0]), markdown)
+    return LINK.sub(lead, bars)
 
 
 def _plain(path: PurePosixPath) -> PurePosixPath:
