@@ -59,9 +59,9 @@ def lattice(axis, filled: np.ndarray, **style) -> None:
     """Show cells (N, N), and the lattice's lines."""
     shown = {"cmap": "Blues", "vmin": 0, "vmax": 1.6} | style
     axis.imshow(filled, origin="lower", extent=(0, 1, 0, 1), interpolation="nearest", **shown)
-    for line in np.linspace(0, 1, len(filled) + 1):
-        axis.plot([line, line], [0, 1], color=GREY, lw=0.3)
-        axis.plot([0, 1], [line, line], color=GREY, lw=0.3)
+    lines = np.repeat(np.linspace(0, 1, len(filled) + 1), 3)
+    ends = np.tile([0, 1, np.nan], len(filled) + 1)
+    axis.plot(np.concatenate([lines, ends]), np.concatenate([ends, lines]), color=GREY, lw=0.3)
 
 
 def ellipses(axis, points: np.ndarray, *, moved: bool, radii=(0.055, 0.034)) -> None:
