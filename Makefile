@@ -164,7 +164,8 @@ tables-vehicle tables-captures:
 		$(REPRODUCE) sweeps=$${pair%:*} scene=counterpart_$${pair#*:} $(GO_ON); \
 	done; exit $$status; } $(SAYS)
 
-MKDOCS = { test -x $(BIN)/mkdocs || { $(ADD) '.[docs]'; }; } && NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs
+MKDOCS = { $(BIN)/python -c 'import material, mkdocstrings_handlers.python' 2>/dev/null || { $(ADD) '.[docs]'; }; } && \
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs
 docs: ## build the docs site into site/, from which it opens without a network; warnings are errors
 	@$(MKDOCS) build --strict --quiet
 	@echo "written: site/index.html"
