@@ -97,14 +97,24 @@ def test_the_moving_picture_is_small():
     assert (DOCS / "images" / "hook.gif").stat().st_size < 3e6
 
 
-def test_links_to_source_lead_to_the_reference(monkeypatch):
-    pytest.importorskip("mkdocs", reason="no mkdocs: make docs adds it")
+@pytest.fixture
+def part(monkeypatch):
+    """``part("hooks")`` is a module of ``docs/site``."""
+    pytest.importorskip("mkdocstrings_handlers", reason="no mkdocstrings: make docs adds it")
     monkeypatch.syspath_prepend(str(DOCS / "site"))
-    hooks = importlib.import_module("hooks")
+    return importlib.import_module
+
+
+def test_links_to_source_lead_to_the_reference_and_bars_need_no_escape(part):
     page = SimpleNamespace(file=SimpleNamespace(src_uri="results/a.md"))
-    text = "[a](../../src/forewarp/ops/splat.py) [b](../b.md#c)"
-    led = hooks.on_page_markdown(text, page, None, None)
-    assert led == "[a](../reference/ops.md#forewarp.ops.splat) [b](../b.md#c)"
+    text = "[a](../../src/forewarp/ops/splat.py) [b](../b.md#c)\n| `x\\|y` | z \\| |"
+    led = part("hooks").on_page_markdown(text, page, None, None)
+    assert led == "[a](../reference/ops.md#forewarp.ops.splat) [b](../b.md#c)\n| `x|y` | z \\| |"
+
+
+def test_doctests_are_fenced(part):
+    fenced = part("doctests").fenced
+    assert fenced("Add.\n\n>>> 1 + 1\n2\n\nSo.") == "Add.\n\n```pycon\n>>> 1 + 1\n2\n```\n\nSo."
 
 
 @pytest.mark.slow
@@ -122,7 +132,7 @@ def test_commands_of_the_pages_are_understood(line, in_tmp):
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
     """The folder of the built site."""
-    pytest.importorskip("mkdocs", reason="no mkdocs: make docs adds it")
+    pytest.importorskip("mkdocstrings_handlers", reason="no mkdocstrings: make docs adds it")
     folder = tmp_path_factory.mktemp("site")
     words = (sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(folder))
     quiet = os.environ | {"NO_MKDOCS_2_WARNING": "1"}
@@ -139,6 +149,15 @@ def test_the_site_fetches_nothing_from_elsewhere(site):
     pages = list(site.rglob("*.html"))
     assert len(pages) > 40
     assert {found for page in pages for found in fetched.findall(page.read_text())} == set()
+
+
+@pytest.mark.slow
+def test_the_reference_shows_functions_and_their_doctests_as_code(site):
+    pages = {page.stem: page.read_text() for page in (site / "reference").glob("*.html")}
+    assert 'id="forewarp.ops.splat.average_splat"' in pages["ops"]
+    assert 'id="forewarp.load"' in pages["forewarp"]
+    assert "language-pycon" in pages["ops"]
+    assert [name for name, text in pages.items() if "<blockquote>" in text] == []
 
 
 @pytest.mark.slow

@@ -18,9 +18,5 @@ class Doctests(griffe.Extension):
 
 
 def fenced(text: str) -> str:
-    """Put a fence around each doctest.
-
-    >>> fenced("Add.\\n\\n>>> 1 + 1\\n2")
-    'Add.\\n\\n```pycon\\n>>> 1 + 1\\n2\\n```'
-    """
+    """Put a fence around each doctest of a docstring."""
     return DOCTEST.sub(lambda found: f"```pycon\n{found[0].rstrip()}\n```", text)
