@@ -166,11 +166,11 @@ def test_pages_open_from_disk_fit_a_phone_and_are_searched(site):
     with chromium() as browser:
         tab = Tab(browser, None, width=390, height=800)
         for file in ("index.html", "method.html", "results/price-list.html", "reference/ops.html"):
-            tab.page.goto((site / file).as_uri())
-            tab.page.locator("h1").first.wait_for()
+            tab.page.goto((site / file).as_uri(), wait_until="networkidle")
             assert tab.page.evaluate("document.documentElement.scrollWidth") <= 390, file
         wide = Tab(browser, None, width=1280, height=800)
         wide.page.goto((site / "index.html").as_uri())
+        wide.page.get_by_text("Type to start searching").wait_for(state="attached")  # the index is read
         wide.page.get_by_role("textbox", name="Search").click()
         wide.page.keyboard.type("average splat")
         results = wide.page.locator(".md-search-result__item")
