@@ -170,9 +170,14 @@ def test_pages_open_from_disk_fit_a_phone_and_are_searched(site):
             assert tab.page.evaluate("document.documentElement.scrollWidth") <= 390, file
         wide = Tab(browser, None, width=1280, height=800)
         wide.page.goto((site / "index.html").as_uri())
-        wide.page.get_by_text("Type to start searching").wait_for(state="attached")  # the index is read
-        wide.page.get_by_role("textbox", name="Search").click()
-        wide.page.keyboard.type("average splat")
-        results = wide.page.locator(".md-search-result__item")
-        assert until(results.count) > 0
+        box, results = wide.page.get_by_role("textbox", name="Search"), ".md-search-result__item"
+
+        def searched():
+            box.fill("")
+            box.press_sequentially("average splat")  # again, if the index was not read yet
+            wide.page.wait_for_timeout(1000)
+            return wide.page.locator(results).count()
+
+        box.click()
+        assert until(searched) > 0
         assert (tab.errors, wide.errors) == ([], [])
