@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import tempfile
 from collections.abc import Iterable
 from itertools import chain
 from pathlib import Path
@@ -10,11 +11,13 @@ from pathlib import Path
 import imageio.v3 as iio
 import imageio_ffmpeg
 import numpy as np
+import torch
 from torch import Tensor
 
 from forewarp.files import written_whole
 
 FORMATS = ("mp4", "gif", "png")
+_SMALLER = ((1, 6), (1, 5), (1, 4), (2, 5), (2, 3), (4, 3))  # pixels that become one, ffmpeg's quality
 
 
 def to_bytes(picture: Tensor) -> np.ndarray:
@@ -32,6 +35,36 @@ def write_png(path: Path, picture: Tensor) -> Path:
 def png_bytes(picture: Tensor) -> bytes:
     """Encode (H, W, 3) in [0, 1]."""
     return iio.imwrite("<bytes>", to_bytes(picture), extension=".png")
+
+
+def jpeg_bytes(picture: Tensor, quality: int) -> bytes:
+    """Encode (H, W, 3) in [0, 1] with loss; ``quality`` in [1, 95]."""
+    return iio.imwrite("<bytes>", to_bytes(picture), extension=".jpg", quality=quality, subsampling=0)
+
+
+def read_picture(path: Path) -> Tensor:
+    """Read a picture as (H, W, 3) in [0, 1]; alpha is dropped."""
+    return torch.from_numpy(iio.imread(path)[..., :3].copy()).float() / 255
+
+
+def smaller_video(path: Path, most: int) -> tuple[bytes, str]:
+    """Encode an ``.mp4`` with more loss, and at last smaller, until it has at most ``most`` bytes.
+
+    Returns:
+        the file's bytes, and in words what was changed; no bytes if nothing fits.
+    """
+    with tempfile.TemporaryDirectory(prefix="forewarp-") as folder:
+        file = Path(folder) / "video.mp4"
+        for shrink, quality in _SMALLER:
+            frames = imageio_ffmpeg.read_frames(str(path))
+            about = next(frames)
+            width, height = about["size"]
+            pictures = (np.frombuffer(frame, np.uint8).reshape(height, width, 3) for frame in frames)
+            _write_mp4(file, (_shrunk(one, shrink) for one in pictures), about["fps"], quality)
+            if file.stat().st_size <= most:
+                size = f", {width // shrink} x {height // shrink} pixels" if shrink > 1 else ""
+                return file.read_bytes(), f"encoded again with more loss{size}"
+    return b"", "left out"
 
 
 def write_video(path: Path, pictures: Iterable[Tensor], *, fps: float) -> Path:
@@ -56,12 +89,12 @@ def write_video(path: Path, pictures: Iterable[Tensor], *, fps: float) -> Path:
     return path
 
 
-def _write_mp4(path: Path, frames: Iterable[np.ndarray], fps: float) -> None:
+def _write_mp4(path: Path, frames: Iterable[np.ndarray], fps: float, quality: float = 8) -> None:
     frames = map(_even, frames)
     first = next(frames)
     size = first.shape[1], first.shape[0]
     # The default block of 16 would stretch the picture; 2 is the smallest that the codec allows.
-    options = {"fps": fps, "quality": 8, "macro_block_size": 2, "ffmpeg_log_level": "error"}
+    options = {"fps": fps, "quality": quality, "macro_block_size": 2, "ffmpeg_log_level": "error"}
     writer = imageio_ffmpeg.write_frames(str(path), size, **options)
     writer.send(None)
     try:
@@ -75,6 +108,13 @@ def _write_mp4(path: Path, frames: Iterable[np.ndarray], fps: float) -> None:
         raise OSError(errno.EIO, "ffmpeg could not go on (is the disk full?)", str(path)) from error
     finally:
         writer.close()
+
+
+def _shrunk(frame: np.ndarray, times: int) -> np.ndarray:
+    """Average squares of ``times`` x ``times`` pixels of (H, W, 3) uint8."""
+    height, width = frame.shape[0] // times, frame.shape[1] // times
+    squares = frame[: height * times, : width * times].reshape(height, times, width, times, 3)
+    return squares.mean((1, 3)).round().astype(np.uint8)
 
 
 def _even(frame: np.ndarray) -> np.ndarray:

@@ -14,6 +14,10 @@ import yaml
 from forewarp.files import MOST_CONFIG, read_text
 
 
+# What reading a broken run may raise.
+UNREADABLE = OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError, yaml.YAMLError
+
+
 @dataclass(frozen=True)
 class Point:
     """A row of ``accuracy_time.csv``: PSNR (dB) of the held-out views after ``seconds`` of training.
@@ -161,11 +165,8 @@ def collect(root: Path, needed: Sequence[str] = ()) -> tuple[list[Result], list[
         absent = [name for name in needed if not (folder / name).is_file()]
         try:
             result = read_run(folder)
-        except (
-            *(OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError, yaml.YAMLError),
-        ) as error:
-            reason = f"no key {error}" if isinstance(error, KeyError) else str(error).split("\n")[0]
-            without.append(f"{folder.relative_to(root)}: cannot be read ({reason})")
+        except UNREADABLE as error:
+            without.append(f"{folder.relative_to(root)}: cannot be read ({unreadable(error)})")
             continue
         if absent:
             again = "run its command again"
@@ -180,6 +181,11 @@ def collect(root: Path, needed: Sequence[str] = ()) -> tuple[list[Result], list[
             f"{root}: expected folders of runs, but got none; make some with forewarp-train, or set runs=..."
         )
     return results, without
+
+
+def unreadable(error: Exception) -> str:
+    """Say in a few words why a run cannot be read."""
+    return f"no key {error}" if isinstance(error, KeyError) else str(error).split("\n")[0]
 
 
 def _shorten(results: Sequence[Result]) -> None:
