@@ -19,8 +19,8 @@ KINDS = {
 }
 
 HELP = f"""
-forewarp-report makes tables, curves and pages of runs that are already there. Only kind=limits and kind=run render
-anything.
+forewarp-report makes tables, curves and pages of runs that are already there. Only kind=limits and kind=run
+render anything.
 
 {chr(10).join(f"  kind={kind:<14} {about}" for kind, about in KINDS.items())}
 
@@ -38,9 +38,9 @@ What one types most:
   curves=FOLDER          paper: where accuracy_time put its pictures (runs/accuracy_time/results)
   views=N                limits: training views to render
   run=FOLDER             run: the run; its page is <run>/page.html, or out=FILE.html
-  megabytes=N            run: most of the page; pictures and the video are made smaller to fit, and the page says so
+  megabytes=N            run: most of the page; pictures and the video are made smaller to fit
   render=false           run: show only what the folder has; load no method and no data
-  path=both|fixed|orbit|trajectories   run: which video (docs/run-page.md)
+  path=both|trajectories|fixed|orbit   run: which video, as in forewarp-render
   data.root=FOLDER       run: where the data are now, if they moved
   trust=[PACKAGE]        limits, run: code of other packages that a run's config may name
 

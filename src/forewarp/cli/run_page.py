@@ -96,8 +96,10 @@ def rendered(config: DictConfig, story: Story, media):
         if name in places
     ]
     media = replace(media, views=views or media.views)
-    if media.video is not None or not len(targets):
+    if media.video is not None:
         return media
+    if not len(targets):
+        return replace(media, missing=("No video: the scene has no test view to begin it from.",))
     film = OmegaConf.load(project_root() / "conf" / "render.yaml")
     film.path = config.path or ("both" if story.result.config.get("capture") == "cut_out" else "fixed")
     check(film)
@@ -105,7 +107,7 @@ def rendered(config: DictConfig, story: Story, media):
 
 
 def newest_film(config: DictConfig, story: Story) -> tuple[Path | None, str]:
-    """Return the video that the run's folder has, made after training, and what it shows; None without one."""
+    """Return a video in the folder that was made after training, and what it shows; None without one."""
     done = [path.stat().st_mtime_ns for path in story.result.folder.glob("*/done.json")]
     for name in [config.path] if config.path else FILMS:
         file = story.result.folder / "videos" / f"{name}.mp4"
@@ -132,7 +134,7 @@ def told_views(story: Story) -> list:
     drawn = sorted(folder.glob("*/images/*_compare.png"), key=lambda path: path.stat().st_mtime_ns)[-1:]
     return [
         Shown(
-            "during training",
+            "in training",
             f"stage {path.parts[-3]}, {int(path.stem.split('_')[0])} % of it",
             dict(zip(names, thirds(read_picture(path)))),
         )

@@ -54,13 +54,12 @@ def chart(
     ys = [y.at(py) for one in series for _, py in one.points] + ([y.at(level[0])] if level else [])
     spans = _span(xs, 0.02), _span(ys, _MARGIN)
     frame = _Frame(x, y, *spans)
-    parts = [_grid(frame)]
+    parts, named_level = [_grid(frame)], []
     if level is not None:
         at = frame.down(level[0])
         parts.append(el("line", x1=_LEFT, x2=WIDTH - _RIGHT, y1=at, y2=at, class_="level"))
-        text = {"x": WIDTH - _RIGHT - 2, "y": round(at - 4, 1), "class_": "level", "text_anchor": "end"}
-        parts.append(el("text", level[1], **text))
-    parts += [_drawn(frame, one, number) for number, one in enumerate(series)]
+        named_level = [_level_name(frame, series, at, level[1])]
+    parts += [_drawn(frame, one, number) for number, one in enumerate(series)] + named_level
     named = [(number, one.name) for number, one in enumerate(series) if one.name]
     legend = [el("span", el("i", class_=f"c{number}"), name) for number, name in named]
     picture = el("svg", *parts, viewBox=f"0 0 {WIDTH} {HEIGHT}", role="img", aria_label=label)
@@ -131,6 +130,14 @@ def _grid(frame: _Frame) -> Html:
     turned = f"rotate(-90) translate({-(_TOP + bottom) / 2:g} 12)"
     parts.append(el("text", frame.y.title, transform=turned, text_anchor="middle", class_="axis"))
     return joined(*parts)
+
+
+def _level_name(frame: _Frame, series: Sequence[Series], at: float, name: str) -> Html:
+    """Write a level's name above it, at the end where fewer points lie."""
+    near = [frame.right(px) for one in series for px, py in one.points if -4 < at - frame.down(py) < 20]
+    left = sum(place < _LEFT + 70 for place in near) <= sum(place > WIDTH - _RIGHT - 70 for place in near)
+    x, anchor = (_LEFT + 3, "start") if left else (WIDTH - _RIGHT - 3, "end")
+    return el("text", name, x=x, y=round(at - 5, 1), text_anchor=anchor, class_="level")
 
 
 def _drawn(frame: _Frame, one: Series, number: int) -> Html:

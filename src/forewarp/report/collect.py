@@ -13,7 +13,6 @@ import yaml
 
 from forewarp.files import MOST_CONFIG, read_text
 
-
 # What reading a broken run may raise.
 UNREADABLE = OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError, yaml.YAMLError
 

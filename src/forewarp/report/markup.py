@@ -16,8 +16,8 @@ class Html(str):
 def el(name: str, /, *inside: object, **attributes: object) -> Html:
     """Make an element. What is inside is escaped unless it is ``Html``; None is left out.
 
-    Attributes: ``class_`` is ``class``, ``aria_label`` is ``aria-label``; True is an attribute without a value;
-    None and False leave it out.
+    Attributes: ``class_`` is ``class``, ``aria_label`` is ``aria-label``. True is an attribute without a
+    value; None and False leave it out.
 
     >>> el("p", "a < b", el("b", "c"), class_="x", hidden=True, title='"')
     '<p class="x" hidden title="&quot;">a &lt; b<b>c</b></p>'

@@ -109,6 +109,7 @@ def _aligned(table: Table) -> str:
 
 
 def html_table(table: Table) -> str:
+    """Return a table, its caption above it, as HTML."""
     marks = {"best": "<b>{}</b>", "second": "<u>{}</u>"}
     head = "".join(f"<th>{escape(column.name)}" for column in table.columns)
     lines = [f"<p>{escape(table.caption)}</p>" if table.caption else "", f"<table><tr>{head}"]

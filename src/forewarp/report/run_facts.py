@@ -13,9 +13,9 @@ KINDS = {
     "space": "at training times",
     "time": "between training times",
     "canonical": "at the canonical time",
-    "all": "of all kinds",
+    "all": "all",
 }
-_NAMES = {"psnr": "PSNR (dB)", "ssim": "SSIM", "ms_ssim": "MS-SSIM"}
+_NAMES = {"psnr": "PSNR (dB)", "ssim": "SSIM", "ms_ssim": "MS-SSIM", "ms_ssim_legacy": "MS-SSIM (legacy)"}
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,10 @@ def tiles_of(story: Story) -> list[tuple[str, str]]:
     protocol, numbers = result.metrics.get("protocol", {}), result.numbers if result.metrics else {}
     if story.result.stages:
         spent = sum(float(done["seconds"]) for done in result.stages.values())
-        found.append(("trained, min:s", time_text(spent)))
+        clock = " (processor)" if result.config["budget"].get("clock") == "processor" else ""
+        found.append(
+            (f"training{clock}", f"{time_text(spent)} min" if spent < 3600 else f"{time_text(spent)} h")
+        )
     if "ssim" in numbers:
         found.append(("SSIM", f"{numbers['ssim']:.4f}"))
     scores = result.metrics["test"].get(result.ability, {}) if result.metrics else {}
@@ -127,7 +130,7 @@ def protocol_of(story: Story) -> list[tuple[str, str]]:
         ("seed", str(result.seed)),
         ("test views", _kinds(story)),
         ("background", str(protocol.get("background", ""))),
-        ("what is scored", str(protocol.get("scored", ""))),
+        ("rendering scored", str(protocol.get("scored", ""))),
         ("departures", str(protocol.get("departures", ""))),
         ("parameters", f"{result.metrics['parameters']:,}" if "parameters" in result.metrics else ""),
         ("device", str(protocol.get("device", ""))),
@@ -141,7 +144,9 @@ def _kinds(story: Story) -> str:
     found = {}
     for view in story.views:
         found[view.ability] = found.get(view.ability, 0) + 1
-    return ", ".join(f"{count} {KINDS.get(kind, kind)}" for kind, count in found.items())
+    return ", ".join(
+        f"{count}" + ("" if kind == "all" else f" {KINDS.get(kind, kind)}") for kind, count in found.items()
+    )
 
 
 def scores_of(story: Story) -> Table | None:

@@ -1,4 +1,4 @@
-"""The figures of a run's page: PSNR through the scene's time and by view, PSNR and loss against training time."""
+"""The figures of a run's page: PSNR through the scene's time and by view; PSNR and loss while it trained."""
 
 from __future__ import annotations
 
@@ -55,8 +55,8 @@ def _by_view(views: Sequence[View]) -> Figure:
     stems = Series("", points, "stems", [_about(view) for view in ranked], base=mean)
     below = sum(view.psnr < mean - 1 for view in ranked)
     says = (
-        f"From the worst view ({ranked[0].psnr:.1f} dB) to the best ({ranked[-1].psnr:.1f} dB), from their mean; "
-        f"{below} of {len(ranked)} {'is' if below == 1 else 'are'} more than 1 dB below it."
+        f"From the worst view ({ranked[0].psnr:.1f} dB) to the best ({ranked[-1].psnr:.1f} dB), from their "
+        f"mean; {below} of {len(ranked)} {'is' if below == 1 else 'are'} more than 1 dB below it."
     )
     level = mean, f"mean {mean:.1f}"
     drawn = chart([stems], Axis("view, from worst to best"), Axis("PSNR (dB)"), says, level=level)
@@ -89,6 +89,6 @@ def _losses(story: Story) -> Figure | None:
     if not series:
         return None
     ends = ", ".join(f"{one.name} ends at {one.points[-1][1]:.3g}" for one in series)
-    says = f"The loss that is minimised, a mean over neighbouring steps; stages may weigh terms differently: {ends}."
+    says = f"What is minimised, averaged over steps; stages may weigh terms differently: {ends}."
     axes = Axis("seconds of training", log=True), Axis("loss", log=True)
     return "Loss", chart(series, *axes, f"Loss against training time. {says}"), says

@@ -97,10 +97,12 @@ def refuse_other(folder: Path) -> None:
     if runs:
         some = ", ".join(str(run) for run in runs[:3]) + (", ..." if len(runs) > 3 else "")
         raise ValueError(
-            f"run: expected the folder of one run, but got {folder}, which holds {len(runs)}; choose one: {some}"
+            f"run: expected the folder of one run, but got {folder}, which holds {len(runs)}; choose one: "
+            f"{some}"
         )
     raise ValueError(
-        f"{folder / 'config.yaml'}: expected the configuration of a run, but got none; set run=<a run's folder>"
+        f"{folder / 'config.yaml'}: expected the configuration of a run, but got none; "
+        "set run=<a run's folder>"
     )
 
 
@@ -146,7 +148,7 @@ def _scalars(folder: Path) -> dict[str, list[tuple[int, float]]]:
 
 
 def _clock(result: Result, stage: str, before: float) -> list[tuple[int, float]]:
-    """Return the moments of a stage that are known: (step of the stage, seconds of training over all stages)."""
+    """Return the known moments of a stage: (step of the stage, seconds of training over all stages)."""
     known = {0: before}
     path = result.folder / "accuracy_time.csv"
     if path.is_file():
@@ -179,8 +181,8 @@ def thinned(points: Sequence[tuple[float, float]], most: int) -> list[tuple[floa
 def telling(views: Sequence[View]) -> dict[str, str]:
     """Choose the views to look at: the best, the middle one and the worst by PSNR, then the ends of the time.
 
-    >>> some = [View(name, t, "time", p, {}) for name, t, p in [("a", 0.0, 30.0), ("b", 0.5, 20.0), ("c", 1.0, 40.0)]]
-    >>> telling(some)
+    >>> seen = ("a", 0.0, 30.0), ("b", 0.5, 20.0), ("c", 1.0, 40.0)
+    >>> telling([View(name, time, "all", psnr, {}) for name, time, psnr in seen])
     {'c': 'best', 'a': 'median', 'b': 'worst'}
     """
     if not views:

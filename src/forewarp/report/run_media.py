@@ -30,7 +30,7 @@ class Shown:
 
 @dataclass(frozen=True)
 class Media:
-    """What a page shows: views, the file of a video, what is to be seen in it, and what is missing and why."""
+    """What a page shows: views, the file of a video and what is to be seen in it; what is missing and why."""
 
     views: Sequence[Shown] = ()
     video: Path | None = None

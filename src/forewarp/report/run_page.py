@@ -1,10 +1,9 @@
-"""Write the page of one run: what it shows, how good it is, how it came about. One file that fetches nothing."""
+"""Write the page of one run: what it shows, how good it is, how it came about. It fetches nothing."""
 
 from __future__ import annotations
 
 import base64
 import hashlib
-from collections.abc import Sequence
 from pathlib import Path
 
 from forewarp.files import read_text, replace_file
@@ -21,7 +20,7 @@ from forewarp.report.run_facts import (
 )
 from forewarp.report.run_figures import figures_of
 from forewarp.report.run_files import Story
-from forewarp.report.run_media import Held, Media, held
+from forewarp.report.run_media import Held, Media, Shown, held
 from forewarp.report.tables import Table
 
 STYLE, SCRIPT = (Path(__file__).with_name(f"run_page.{kind}") for kind in ("css", "js"))
@@ -36,7 +35,7 @@ def write_run_page(file: Path, story: Story, media: Media, *, megabytes: float) 
         file: of the page.
         story: what the run's folder tells.
         media: what to show of it.
-        megabytes: most of the page, in 10^6 bytes; pictures and the video are made smaller, or left out, to fit.
+        megabytes: most of the page, in 10^6 bytes; pictures and the video are made smaller, or left out.
 
     Returns:
         bytes written.
@@ -48,8 +47,8 @@ def write_run_page(file: Path, story: Story, media: Media, *, megabytes: float) 
     room = 1e6 * megabytes - bare - _SPARE
     if room < 0:
         raise ValueError(
-            f"megabytes: expected room for the page's text, {(bare + _SPARE) / 1e6:.2f}, but got {megabytes}; "
-            "raise it"
+            f"megabytes: expected room for the page's text, {(bare + _SPARE) / 1e6:.2f}, but got "
+            f"{megabytes}; raise it"
         )
     text = page(story, media, held(media, room)).encode()
     replace_file(file, text)
@@ -97,10 +96,10 @@ def _hero(story: Story, media: Media, inside: Held) -> Html:
     result = story.result
     big = el("p", "Not measured", class_="big")
     if result.metrics and (psnr := result.numbers.get("psnr")) is not None:
-        kind = KINDS.get(result.ability, result.ability)
+        kind = "" if result.ability == "all" else f" {KINDS.get(result.ability, result.ability)}"
         count = sum(result.ability in ("all", view.ability) for view in story.views)
         of = f"{count} test views" if count else "test views"
-        small = el("small", "PSNR", el("br"), f"mean of {of} {kind}")
+        small = el("small", el("span", "PSNR"), el("span", f"mean of {of}{kind}"))
         big = el("p", el("b", f"{psnr:.2f}"), " dB ", small, class_="big")
     tiles = [el("div", el("dt", name), el("dd", value)) for name, value in tiles_of(story)]
     facts = el(
@@ -128,11 +127,14 @@ def _views(media: Media, inside: Held) -> Html | None:
         panels.append(_panel(number, shown, pictures))
     about = (
         "Drag the line, or focus it and use the arrow keys: the truth is on its left, what the run renders "
-        "on its right. Error is black where both agree and white where they differ by a quarter of the range or "
-        "more; in depth, near is bright."
+        "on its right. Error is black where both agree and white where they differ by a quarter of the range "
+        "or more; in depth, near is bright."
     )
     return _section(
-        "Truth against prediction", el("p", about), el("div", *choices, *panels, class_="views"), id_="views"
+        "Truth against prediction",
+        el("p", about),
+        el("div", *choices, *panels, class_="views"),
+        el("p", f"Pictures are {inside.pictures_note}.", class_="note"),
     )
 
 
@@ -180,7 +182,7 @@ def _effects(story: Story) -> Html | None:
             "li",
             el("span", "on" if one.on else "off", class_="badge on" if one.on else "badge"),
             el("b", one.name.replace("_", " ")),
-            el("code", one.choice) if one.choice else None,
+            el("code", one.choice) if one.choice and (one.on or one.choice != "none") else None,
             el("p", one.because),
         )
         for one in effects
@@ -235,20 +237,22 @@ def _missing(story: Story, media: Media, inside: Held) -> Html | None:
         notes.append(f"The run is not measured. Measure it: forewarp-evaluate run={story.result.folder}")
     if not story.result.curve:
         notes.append(
-            "No PSNR against training time: the run held no views out (data.held_out=N) and the scene has no "
-            "validation views."
+            "No PSNR against training time: it needs validation views, or data.held_out=N, and some seconds "
+            "of training."
         )
     notes += media.missing
-    notes += [f"Pictures: {inside.pictures_note}."] if inside.pictures_note else []
-    notes += [f"Video: {inside.video_note}."] if inside.video_note else []
+    if media.views and not inside.views:
+        notes.append(f"Pictures are {inside.pictures_note}.")
+    if media.video and not inside.video:
+        notes.append(f"The video is {inside.video_note}, as the page has no room for it; raise megabytes.")
     version = story.result.metrics.get("protocol", {}).get("versions", {}).get("forewarp", "")
     made = f"Written by forewarp-report kind=run. Measured on {story.measured}" if story.measured else ""
     foot = el("p", f"{made}{', forewarp ' + version if version else ''}.", class_="note") if made else None
     listed = el("ul", *(el("li", note) for note in notes)) if notes else None
     if not notes:
         return el("footer", foot)
-    return joined(_section("What this page lacks or shows smaller", listed), el("footer", foot))
+    return joined(_section("What this page lacks", listed), el("footer", foot))
 
 
-def _section(title: str, *parts: object, id_: str | None = None) -> Html:
-    return el("section", el("h2", title), *parts, id=id_)
+def _section(title: str, *parts: object) -> Html:
+    return el("section", el("h2", title), *parts)
