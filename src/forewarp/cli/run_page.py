@@ -69,7 +69,7 @@ def gathered(config: DictConfig, story: Story):
     from forewarp.report.run_media import Media
 
     media = Media(told_views(story), *newest_film(config, story))
-    if not config.render:
+    if not config.render or story.unfinished:
         return media
     try:
         return rendered(config, story, media)
@@ -131,14 +131,18 @@ def told_views(story: Story) -> list:
     ]
     if shown:
         return shown
-    drawn = sorted(folder.glob("*/images/*_compare.png"), key=lambda path: path.stat().st_mtime_ns)[-1:]
+    stages = [*story.result.config.get("stage", {})]
+    drawn = sorted(
+        (path for path in folder.glob("*/images/*_compare.png") if path.parts[-3] in stages),
+        key=lambda path: (stages.index(path.parts[-3]), path.name),
+    )
     return [
         Shown(
             "in training",
-            f"stage {path.parts[-3]}, {int(path.stem.split('_')[0])} % of it",
+            f"stage {path.parts[-3]}, {path.stem.split('_')[0].lstrip('0')} % of it",
             dict(zip(names, thirds(read_picture(path)))),
         )
-        for path in drawn
+        for path in drawn[-1:]
     ]
 
 

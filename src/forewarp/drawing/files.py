@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import subprocess
 import tempfile
 from collections.abc import Iterable
 from itertools import chain
@@ -17,7 +18,7 @@ from torch import Tensor
 from forewarp.files import written_whole
 
 FORMATS = ("mp4", "gif", "png")
-_SMALLER = ((1, 6), (1, 5), (1, 4), (2, 5), (2, 3), (4, 3))  # pixels that become one, ffmpeg's quality
+_SMALLER = ((1, 20), (1, 26), (1, 32), (2, 26), (2, 32), (4, 32))  # size to divide by, loss (ffmpeg's crf)
 
 
 def to_bytes(picture: Tensor) -> np.ndarray:
@@ -52,17 +53,20 @@ def smaller_video(path: Path, most: int) -> tuple[bytes, str]:
 
     Returns:
         the file's bytes, and in words what was changed; no bytes if nothing fits.
+
+    Raises:
+        OSError: naming ``path``, if ffmpeg cannot read it.
     """
     with tempfile.TemporaryDirectory(prefix="forewarp-") as folder:
         file = Path(folder) / "video.mp4"
-        for shrink, quality in _SMALLER:
-            frames = imageio_ffmpeg.read_frames(str(path))
-            about = next(frames)
-            width, height = about["size"]
-            pictures = (np.frombuffer(frame, np.uint8).reshape(height, width, 3) for frame in frames)
-            _write_mp4(file, (_shrunk(one, shrink) for one in pictures), about["fps"], quality)
+        for shrink, loss in _SMALLER:
+            even = f"scale=trunc(iw/{2 * shrink})*2:trunc(ih/{2 * shrink})*2:flags=area"
+            call = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-v", "error", "-i", str(path), "-vf", even]
+            call += ["-crf", str(loss), "-pix_fmt", "yuv420p", "-movflags", "+faststart", "-an", str(file)]
+            if subprocess.run(call, capture_output=True).returncode:
+                raise OSError(errno.EIO, "ffmpeg could not read it", str(path))
             if file.stat().st_size <= most:
-                size = f", {width // shrink} x {height // shrink} pixels" if shrink > 1 else ""
+                size = f", at 1/{shrink} of its width and height" if shrink > 1 else ""
                 return file.read_bytes(), f"encoded again with more loss{size}"
     return b"", "left out"
 
@@ -89,12 +93,12 @@ def write_video(path: Path, pictures: Iterable[Tensor], *, fps: float) -> Path:
     return path
 
 
-def _write_mp4(path: Path, frames: Iterable[np.ndarray], fps: float, quality: float = 8) -> None:
+def _write_mp4(path: Path, frames: Iterable[np.ndarray], fps: float) -> None:
     frames = map(_even, frames)
     first = next(frames)
     size = first.shape[1], first.shape[0]
     # The default block of 16 would stretch the picture; 2 is the smallest that the codec allows.
-    options = {"fps": fps, "quality": quality, "macro_block_size": 2, "ffmpeg_log_level": "error"}
+    options = {"fps": fps, "quality": 8, "macro_block_size": 2, "ffmpeg_log_level": "error"}
     writer = imageio_ffmpeg.write_frames(str(path), size, **options)
     writer.send(None)
     try:
@@ -108,13 +112,6 @@ def _write_mp4(path: Path, frames: Iterable[np.ndarray], fps: float, quality: fl
         raise OSError(errno.EIO, "ffmpeg could not go on (is the disk full?)", str(path)) from error
     finally:
         writer.close()
-
-
-def _shrunk(frame: np.ndarray, times: int) -> np.ndarray:
-    """Average squares of ``times`` x ``times`` pixels of (H, W, 3) uint8."""
-    height, width = frame.shape[0] // times, frame.shape[1] // times
-    squares = frame[: height * times, : width * times].reshape(height, times, width, times, 3)
-    return squares.mean((1, 3)).round().astype(np.uint8)
 
 
 def _even(frame: np.ndarray) -> np.ndarray:

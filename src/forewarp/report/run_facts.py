@@ -39,8 +39,9 @@ def tiles_of(story: Story) -> list[tuple[str, str]]:
     """List what one wants to know first: (name, value)."""
     result, found = story.result, []
     protocol, numbers = result.metrics.get("protocol", {}), result.numbers if result.metrics else {}
-    if story.result.stages:
+    if result.stages or result.curve:
         spent = sum(float(done["seconds"]) for done in result.stages.values())
+        spent = max([spent, *(point.seconds for point in result.curve)])
         clock = " (processor)" if result.config["budget"].get("clock") == "processor" else ""
         found.append(
             (f"training{clock}", f"{time_text(spent)} min" if spent < 3600 else f"{time_text(spent)} h")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import math
 from bisect import bisect_left
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -16,7 +16,7 @@ from forewarp.report.collect import UNREADABLE, Result, read_run, unreadable
 from forewarp.report.effects import plan_of
 
 _POINTS = 150  # of a stage's loss that are kept
-_OTHER = ("loss", "psnr", "frames_in_play")  # what is noted of every method; the others say its size
+_KINDS = ("particles", "voxels")  # that a scene may consist of
 
 
 @dataclass(frozen=True)
@@ -117,18 +117,36 @@ def _day(path: Path) -> str:
 
 def read_curves(result: Result, stages: Sequence[str]) -> Curves:
     """Read each stage's loss from TensorBoard's events, against seconds of training."""
-    losses, size, before = {}, None, 0.0
+    losses, noted, before, rows = {}, {}, 0.0, _rows(result.folder / "accuracy_time.csv")
     for stage in stages:
         scalars = _scalars(result.folder / stage / "tensorboard")
-        known = _clock(result, stage, before)
-        if (loss := scalars.pop("train/loss", None)) and len(known) > 1:
+        known = _clock(result, stage, before, rows)
+        if (loss := scalars.get("train/loss")) and len(known) > 1:
             losses[stage] = thinned([(_between(known, step), value) for step, value in loss], _POINTS)
-        kinds = [tag.removeprefix("train/") for tag in scalars if tag.startswith("train/")]
-        for kind in kinds:
-            if kind not in _OTHER and "/" not in kind:
-                size = kind, round(scalars[f"train/{kind}"][-1][1])
+        noted |= {tag.split("/")[1]: values[-1][1] for tag, values in scalars.items() if values}
         before += float(result.stages.get(stage, {}).get("seconds", 0))
-    return Curves(losses, size)
+    return Curves(losses, _size(noted, rows))
+
+
+def _size(noted: Mapping[str, float], rows: Sequence[Mapping[str, str]]) -> tuple[str, int] | None:
+    """Name what the last ``size`` of the curve counts, by the noted number that is about as large.
+
+    >>> _size({"samples": 801.0, "occupied_voxels": 812.5}, [{"size": "700"}, {"size": "800"}])
+    ('voxels', 800)
+    """
+    count = int(rows[-1].get("size") or 0) if rows else 0
+    for name, value in noted.items():
+        kind = name.split("_")[-1]
+        if kind in _KINDS and abs(value - count) < 0.1 * count:
+            return kind, count
+    return None
+
+
+def _rows(path: Path) -> list[dict[str, str]]:
+    if not path.is_file():
+        return []
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
 
 
 def _scalars(folder: Path) -> dict[str, list[tuple[int, float]]]:
@@ -147,14 +165,12 @@ def _scalars(folder: Path) -> dict[str, list[tuple[int, float]]]:
     }
 
 
-def _clock(result: Result, stage: str, before: float) -> list[tuple[int, float]]:
+def _clock(
+    result: Result, stage: str, before: float, rows: Sequence[Mapping[str, str]]
+) -> list[tuple[int, float]]:
     """Return the known moments of a stage: (step of the stage, seconds of training over all stages)."""
     known = {0: before}
-    path = result.folder / "accuracy_time.csv"
-    if path.is_file():
-        with path.open(newline="") as file:
-            rows = [row for row in csv.DictReader(file) if row.get("stage") == stage]
-        known |= {int(row["step"]): float(row["seconds"]) for row in rows}
+    known |= {int(row["step"]): float(row["seconds"]) for row in rows if row.get("stage") == stage}
     if (done := result.stages.get(stage)) is not None:
         known[int(done["steps"])] = before + float(done["seconds"])
     return sorted(known.items())

@@ -132,7 +132,7 @@ def _views(media: Media, inside: Held) -> Html | None:
     )
     return _section(
         "Truth against prediction",
-        el("p", about),
+        el("p", about, el("noscript", " Without scripts the two stand beside each other.")),
         el("div", *choices, *panels, class_="views"),
         el("p", f"Pictures are {inside.pictures_note}.", class_="note"),
     )
