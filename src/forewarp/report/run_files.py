@@ -129,14 +129,19 @@ def read_curves(result: Result, stages: Sequence[str]) -> Curves:
 
 
 def _size(noted: Mapping[str, float], rows: Sequence[Mapping[str, str]]) -> tuple[str, int] | None:
-    """Name what the last ``size`` of the curve counts, by the noted number that is about as large.
+    """Say how many particles or voxels there were: the last ``size`` of the curve, without one as noted.
+
+    The noted number tells what was counted: it is a mean over the last steps, so about as large.
 
     >>> _size({"samples": 801.0, "occupied_voxels": 812.5}, [{"size": "700"}, {"size": "800"}])
     ('voxels', 800)
+    >>> _size({"samples": 801.0, "particles": 812.0}, [])
+    ('particles', 812)
     """
-    count = int(rows[-1].get("size") or 0) if rows else 0
     for name, value in noted.items():
-        kind = name.split("_")[-1]
+        kind, count = name.split("_")[-1], round(value)
+        if rows:
+            count = int(rows[-1].get("size") or 0)
         if kind in _KINDS and abs(value - count) < 0.1 * count:
             return kind, count
     return None

@@ -152,12 +152,13 @@ def _panel(number: int, shown: Shown, pictures: dict[str, str]) -> Html:
         cut = {"type": "range", "min": 0, "max": 100, "value": 50, "aria_label": label, "hidden": True}
         both += [el("input", **cut), el("span", class_="seam", aria_hidden="true")]
     others = [figure(name) for name in ("error", "depth") if name in shown.pictures]
+    height, width = next(iter(shown.pictures.values())).shape[:2]
     return el(
         "div",
-        el("div", *both, class_="pair"),
+        el("div", *both, class_="pair", style=f"--shape: {width / height:.4f}"),
         el("div", *others, class_="side") if others else None,
         el("p", shown.about, class_="note"),
-        class_="panel",
+        class_="panel tall" if height > 1.2 * width else "panel",
         id=f"p{number}",
     )
 
