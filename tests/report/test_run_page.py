@@ -231,7 +231,7 @@ def test_a_run_without_its_data_or_its_end_still_has_a_page(ok, run, tmp_path):
     folder = shutil.copytree(run, tmp_path / "run")
     done = ok("report", "kind=run", f"run={folder}", f"data.root={tmp_path}/moved")
     line = done.out.splitlines()[0]
-    assert line.startswith("Nothing was rendered for this page: data.root: expected an existing folder")
+    assert line.startswith("Rendering for this page stopped: data.root: expected an existing folder")
     assert line in Page((folder / "page.html").read_text()).text
     for name in ("metrics.json", "per_image.json", "images", "fine/done.json"):
         path = folder / name
@@ -254,6 +254,18 @@ def test_a_missing_video_is_made_as_forewarp_render_does(ok, run, tmp_path, monk
         ok("report", "kind=run", f"run={run}", f"out={tmp_path}", *more)
     assert asked == [("orbit", "mp4", 60)]
     assert "Once around the scene at one time." in Page((tmp_path / "page.html").read_text()).text
+
+
+def test_what_was_rendered_before_an_error_is_shown(ok, run, tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device", "film.mp4")
+
+    monkeypatch.setattr("forewarp.cli.run_page.write_film", full)
+    done = ok("report", "kind=run", f"run={run}", f"out={tmp_path}", "path=fixed")
+    assert done.out.startswith("Rendering for this page stopped: film.mp4: expected room to write")
+    page = Page((tmp_path / "page.html").read_text())
+    assert "depth of the best view" in " ".join(page.of("alt"))
+    assert "video" not in page.tags
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -68,20 +69,22 @@ def gathered(config: DictConfig, story: Story):
     """Find or make the page's pictures and its video; what cannot be made is told, and left out."""
     from forewarp.report.run_media import Media
 
-    media = Media(told_views(story), *newest_film(config, story))
+    found = Media(told_views(story), *newest_film(config, story))
     if not config.render or story.unfinished:
-        return media
+        return found
     try:
-        return rendered(config, story, media)
+        for more in rendered(config, story, found):
+            found = more
     except Exception as error:
         reason = one_line(error)
         if reason is None:
             raise
-        return replace(media, missing=(f"Nothing was rendered for this page: {reason}.",))
+        return replace(found, missing=(f"Rendering for this page stopped: {reason}.",))
+    return found
 
 
-def rendered(config: DictConfig, story: Story, media):
-    """Render the telling views, and the video if the run has none, as the run's method does."""
+def rendered(config: DictConfig, story: Story, media) -> Iterator:
+    """Render the telling views, and the video if the run has none; yield what there is after each."""
     from forewarp.evaluation.pictures import parts_of
     from forewarp.report.run_media import Shown
     from forewarp.runs.config import saved_config
@@ -96,14 +99,16 @@ def rendered(config: DictConfig, story: Story, media):
         if name in places
     ]
     media = replace(media, views=views or media.views)
+    yield media
     if media.video is not None:
-        return media
+        return
     if not len(targets):
-        return replace(media, missing=("No video: the scene has no test view to begin it from.",))
+        yield replace(media, missing=("No video: the scene has no test view to begin it from.",))
+        return
     film = OmegaConf.load(project_root() / "conf" / "render.yaml")
     film.path = config.path or ("both" if story.result.config.get("capture") == "cut_out" else "fixed")
     check(film)
-    return replace(media, video=write_film(film, run, module), about=FILMS[film.path])
+    yield replace(media, video=write_film(film, run, module), about=FILMS[film.path])
 
 
 def newest_film(config: DictConfig, story: Story) -> tuple[Path | None, str]:

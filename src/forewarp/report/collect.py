@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import re
 from collections.abc import Iterable, Sequence
@@ -11,7 +10,7 @@ from pathlib import Path
 
 import yaml
 
-from forewarp.files import MOST_CONFIG, read_text
+from forewarp.files import MOST_CONFIG, read_rows, read_text
 
 # What reading a broken run may raise.
 UNREADABLE = OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError, yaml.YAMLError
@@ -222,19 +221,15 @@ def read_run(folder: Path) -> Result:
 
 def read_curve(folder: Path) -> tuple[Point, ...]:
     """Read the rows of a run's ``accuracy_time.csv``; a missing file has none."""
-    path = folder / "accuracy_time.csv"
-    if not path.is_file():
-        return ()
-    with path.open(newline="") as file:
-        return tuple(
-            Point(
-                float(row["seconds"]),
-                float(row["psnr"]),
-                int(row["step"]),
-                float(row["epe_moving"]) if row["epe_moving"] else None,
-            )
-            for row in csv.DictReader(file)
+    return tuple(
+        Point(
+            float(row["seconds"]),
+            float(row["psnr"]),
+            int(row["step"]),
+            float(row["epe_moving"]) if row["epe_moving"] else None,
         )
+        for row in read_rows(folder / "accuracy_time.csv")
+    )
 
 
 def grouped(results: Sequence[Result]) -> dict[tuple[str, float | None], list[Result]]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
@@ -11,7 +10,7 @@ from datetime import datetime
 from pathlib import Path
 from statistics import fmean
 
-from forewarp.files import read_json
+from forewarp.files import read_json, read_rows
 from forewarp.report.collect import UNREADABLE, Result, read_run, unreadable
 from forewarp.report.effects import plan_of
 
@@ -117,7 +116,7 @@ def _day(path: Path) -> str:
 
 def read_curves(result: Result, stages: Sequence[str]) -> Curves:
     """Read each stage's loss from TensorBoard's events, against seconds of training."""
-    losses, noted, before, rows = {}, {}, 0.0, _rows(result.folder / "accuracy_time.csv")
+    losses, noted, before, rows = {}, {}, 0.0, read_rows(result.folder / "accuracy_time.csv")
     for stage in stages:
         scalars = _scalars(result.folder / stage / "tensorboard")
         known = _clock(result, stage, before, rows)
@@ -145,13 +144,6 @@ def _size(noted: Mapping[str, float], rows: Sequence[Mapping[str, str]]) -> tupl
         if kind in _KINDS and abs(value - count) < 0.1 * count:
             return kind, count
     return None
-
-
-def _rows(path: Path) -> list[dict[str, str]]:
-    if not path.is_file():
-        return []
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
 
 
 def _scalars(folder: Path) -> dict[str, list[tuple[int, float]]]:

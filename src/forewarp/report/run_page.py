@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import shlex
 from pathlib import Path
 
 from forewarp.files import read_text, replace_file
@@ -210,16 +211,18 @@ def _scrolled(table: Table, label: str) -> Html:
 
 def _protocol(story: Story) -> Html:
     rows = [joined(el("dt", name), el("dd", value)) for name, value in protocol_of(story)]
-    folder = story.result.folder
+    folder = shlex.quote(str(story.result.folder))
     again = el("pre", el("code", story.result.command))
-    closer = f"forewarp-view run={folder}\nforewarp-export run={folder} format=html"
+    closer = f"forewarp-view run={folder}"
+    if story.curves.size is not None:
+        closer += f"\nforewarp-export run={folder} format=html"
     return joined(
         _section("How it was made and measured", el("dl", *rows, class_="rows")),
         _section(
             "Do it again",
             el("p", "The command that made this run; into another folder with run=..."),
             again,
-            None if story.unfinished else el("p", "Fly through it, or make a page on which others can:"),
+            None if story.unfinished else el("p", "Fly through it:"),
             None if story.unfinished else el("pre", el("code", closer)),
         ),
     )
