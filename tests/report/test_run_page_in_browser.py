@@ -103,11 +103,12 @@ def test_a_view_is_chosen_by_a_click_and_by_keys(tab):
 
 
 def test_nothing_is_wider_than_the_page_and_the_video_plays(tab):
+    video = tab.page.locator("video")
+    until(lambda: video.evaluate("video => video.currentTime > 0.2 && video.videoWidth == 32"))
+    # Last, as a browser pauses what it has scrolled away.
     tab.page.locator("summary").click()
     wide, own = tab.page.evaluate("[document.documentElement.scrollWidth, innerWidth]")
     assert wide <= own
-    video = tab.page.locator("video")
-    until(lambda: video.evaluate("video => video.currentTime > 0.2 && video.videoWidth == 32"))
     assert tab.page.locator("svg").count() == 3
     assert min(box["height"] for box in (one.bounding_box() for one in tab.page.locator("svg").all())) > 100
 
