@@ -1,0 +1,157 @@
+"""``forewarp-report kind=run``: gather what the page of a run shows, and write it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+from omegaconf import DictConfig, ListConfig, OmegaConf
+
+from forewarp.cli.errors import one_line
+from forewarp.cli.render import check, write_film
+from forewarp.report.run_files import Story, read_story, telling
+from forewarp.runs.config_files import project_root
+
+PAGE = "page.html"
+MEGABYTES = 0.3, 1000  # least and most that may be asked for
+MOST_SIDE = 800  # pixels of a picture's longer side
+# Videos in the order in which one of a folder is taken.
+FILMS = {
+    "both": "once around the scene while its time passes",
+    "trajectories": "one camera, with the paths of points on the moving surface",
+    "fixed": "one camera, through the scene's time",
+    "orbit": "once around the scene at one time",
+}
+
+
+def run_page(config: DictConfig) -> str:
+    """Write the page of the run that ``config.run`` names; return what to print.
+
+    Raises:
+        ValueError: in one line, if ``config.run`` is not one run's folder, or a setting is wrong.
+    """
+    folder = named(config)
+    story = read_story(folder)
+    file = Path(config.out or folder)
+    file = file if file.suffix in (".html", ".htm") else file / PAGE
+    # These load torch; mistakes have been answered before.
+    from forewarp.report.run_page import write_run_page
+
+    media = gathered(config, story)
+    size = write_run_page(file, story, media, megabytes=float(config.megabytes))
+    told = [*media.missing, f"written: {file}: {size / 1e6:.1f} of at most {config.megabytes:g} MB"]
+    return "\n".join(told)
+
+
+def named(config: DictConfig) -> Path:
+    """Return the run's folder; refuse settings of which no page can be made."""
+    low, high = MEGABYTES
+    if type(config.megabytes) not in (int, float) or not low <= config.megabytes <= high:
+        raise ValueError(f"megabytes: expected a number from {low} to {high}, but got {config.megabytes}")
+    if type(config.render) is not bool:
+        raise ValueError(f"render: expected true or false, but got {config.render}")
+    if config.path not in (None, *FILMS):
+        raise ValueError(f"path: expected one of {', '.join(FILMS)} or null, but got '{config.path}'")
+    if config.run is None and config.runs is not None:
+        raise ValueError("run: expected the folder of a run, but got runs=; set run=<a run's folder>")
+    if config.run is None:
+        raise ValueError("run: expected the folder of a run, but got nothing; set run=runs/...")
+    if isinstance(config.run, ListConfig):
+        raise ValueError(
+            f"run: expected the folder of one run, but got {len(config.run)}; a page shows one run, and "
+            "kind=compare several"
+        )
+    return Path(str(config.run))
+
+
+def gathered(config: DictConfig, story: Story):
+    """Find or make the page's pictures and its video; what cannot be made is told, and left out."""
+    from forewarp.report.run_media import Media
+
+    found = Media(told_views(story), *newest_film(config, story))
+    if not config.render or story.unfinished:
+        return found
+    try:
+        for more in rendered(config, story, found):
+            found = more
+    except Exception as error:
+        reason = one_line(error)
+        if reason is None:
+            raise
+        return replace(found, missing=(f"Rendering for this page stopped: {reason}.",))
+    return found
+
+
+def rendered(config: DictConfig, story: Story, media) -> Iterator:
+    """Render the telling views, and the video if the run has none; yield what there is after each."""
+    from forewarp.evaluation.pictures import parts_of
+    from forewarp.report.run_media import Shown
+    from forewarp.runs.config import saved_config
+    from forewarp.runs.fitted import opened
+
+    run, module = opened(saved_config(str(story.result.folder), config))
+    targets = run.datamodule.targets("test")
+    places = {frame.name: number for number, frame in enumerate(targets.frames)}
+    views = [
+        Shown(why, about(story, name), parts_of(module, targets[places[name]], MOST_SIDE))
+        for name, why in telling(story.views).items()
+        if name in places
+    ]
+    media = replace(media, views=views or media.views)
+    yield media
+    if media.video is not None:
+        return
+    if not len(targets):
+        yield replace(media, missing=("No video: the scene has no test view to begin it from.",))
+        return
+    film = OmegaConf.load(project_root() / "conf" / "render.yaml")
+    film.path = config.path or ("both" if story.result.config.get("capture") == "cut_out" else "fixed")
+    check(film)
+    yield replace(media, video=write_film(film, run, module), about=FILMS[film.path])
+
+
+def newest_film(config: DictConfig, story: Story) -> tuple[Path | None, str]:
+    """Return a video in the folder that was made after training, and what it shows; None without one."""
+    done = [path.stat().st_mtime_ns for path in story.result.folder.glob("*/done.json")]
+    for name in [config.path] if config.path else FILMS:
+        file = story.result.folder / "videos" / f"{name}.mp4"
+        if file.is_file() and file.stat().st_mtime_ns >= max(done, default=0):
+            return file, FILMS[name]
+    return None, ""
+
+
+def told_views(story: Story) -> list:
+    """Return what the folder has of truth, prediction and error: of test views, or as training drew them."""
+    from forewarp.drawing.files import read_picture
+    from forewarp.report.run_media import Shown
+    from forewarp.report.sheets import sheets_of, thirds
+
+    folder, names = story.result.folder, ("truth", "prediction", "error")
+    sheets = sheets_of(folder)
+    chosen = telling([view for view in story.views if view.name in sheets])
+    shown = [
+        Shown(why, about(story, name), dict(zip(names, thirds(read_picture(sheets[name])))))
+        for name, why in chosen.items()
+    ]
+    if shown:
+        return shown
+    stages = [*story.result.config.get("stage", {})]
+    drawn = sorted(
+        (path for path in folder.glob("*/images/*_compare.png") if path.parts[-3] in stages),
+        key=lambda path: (stages.index(path.parts[-3]), path.name),
+    )
+    return [
+        Shown(
+            "in training",
+            f"stage {path.parts[-3]}, {path.stem.split('_')[0].lstrip('0')} % of it",
+            dict(zip(names, thirds(read_picture(path)))),
+        )
+        for path in drawn[-1:]
+    ]
+
+
+def about(story: Story, name: str) -> str:
+    """Say which view it is: name, time and PSNR."""
+    view = next(view for view in story.views if view.name == name)
+    return f"{view.name}, time {view.time:.2f}, {view.psnr:.1f} dB"
