@@ -1,0 +1,84 @@
+"""Turn, scale and centre what was found, and propose near, far and a box."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from forewarp.capture.sparse import Sparse
+from forewarp.scene.box import Box
+from forewarp.scene.paths import mean_up
+
+# Points beyond these quantiles are taken for outliers, unless they lie close to the rest.
+_QUANTILES, _SLACK, _MARGIN = (0.02, 0.98), 0.25, 0.05
+_NEAR, _FAR = 0.5, 1.25  # of the nearest and the farthest points, as what moves may be nearer
+_MIDWAY = 0.5  # share of its points' median distance from which on a camera's view belongs to the box
+
+
+@dataclass(frozen=True)
+class Limits:
+    """``near`` and ``far`` along the unit ray, and a ``box`` around all that is seen."""
+
+    near: float
+    far: float
+    box: Box
+
+
+def placed(sparse: Sparse) -> Sparse:
+    """Turn the pictures' mean upward direction to z, put the points' median into the origin, and scale the
+    median distance between a camera and a point that it sees to 1.
+    """
+    up = mean_up(list(sparse.cameras.values())).numpy()
+    return sparse.moved(
+        _upright(up), np.median(sparse.points, axis=0), 1 / float(np.median(sparse.distances()))
+    )
+
+
+def _upright(up: np.ndarray) -> np.ndarray:
+    """The smallest rotation (3, 3) that turns a unit vector to z."""
+    axis = np.cross(up, [0.0, 0.0, 1.0])
+    if up[2] < -1 + 1e-9:
+        return np.diag([1.0, -1.0, -1.0])
+    cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    return np.eye(3) + cross + cross @ cross / (1 + up[2])
+
+
+def limits_of(sparse: Sparse) -> Limits:
+    """Propose limits from the points, whose outliers do not count, and from where the cameras look.
+
+    What moves has hardly a point. It is before what stands still, so the box also holds the middle of every
+    camera's view from half the distance of its points on.
+    """
+    distances = sparse.distances()
+    low, high = np.quantile(distances, _QUANTILES)
+    cameras = list(sparse.cameras.values())
+    midway = []
+    for row, camera in enumerate(cameras):
+        own = distances[sparse.seen[:, 0] == row]
+        if len(own):
+            middle = torch.tensor([camera.width / 2, camera.height / 2])
+            ahead = np.asarray(camera.directions(middle[0], middle[1]))
+            midway.append(np.asarray(camera.center) + _MIDWAY * float(np.median(own)) * ahead)
+    bounds = bounds_of(sparse.points)
+    ends = np.concatenate([np.array(bounds), np.array(midway).reshape(-1, 3)])
+    pad = _MARGIN * float((bounds[1] - bounds[0]).max())
+    box = Box(tuple(ends.min(0) - pad), tuple(ends.max(0) + pad))
+    return Limits(_NEAR * float(low), _FAR * float(high), box)
+
+
+def bounds_of(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Bound points (N, 3) without their outliers: low (3,) and high (3,).
+
+    The quantiles, and what lies within a quarter of their span beyond them.
+
+    >>> line = np.linspace(0, 1, 101)[:, None].repeat(3, 1)
+    >>> [end.tolist() for end in bounds_of(np.concatenate([line, [[90.0, 0.5, 0.5]]]))]
+    [[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]]
+    """
+    low, high = np.quantile(points, _QUANTILES, axis=0)
+    slack = _SLACK * (high - low)
+    inside = ((points >= low - slack) & (points <= high + slack)).all(1)
+    kept = points[inside] if inside.any() else points
+    return kept.min(0), kept.max(0)
