@@ -40,7 +40,7 @@ install: ## create .venv with forewarp and all extras except the launchers of sw
 	$(BIN)/pip install --quiet uv
 	links="$$($(BIN)/pip config get global.find-links 2>/dev/null || echo "$$PIP_FIND_LINKS")"; \
 	if [ -n "$$links" ]; then export UV_FIND_LINKS="$$links"; fi; \
-	VIRTUAL_ENV="$$PWD/.venv" $(BIN)/uv pip install --compile-bytecode -c constraints.txt -e '.[cpu,synth,plots,viewer,export,dev]'
+	VIRTUAL_ENV="$$PWD/.venv" $(BIN)/uv pip install --compile-bytecode -c constraints.txt -e '.[cpu,synth,plots,viewer,export,capture,dev]'
 
 install-launchers: ## add joblib, Ray and submitit for sweeps (launcher=...), and Optuna (sweeps=search)
 	links="$$($(BIN)/pip config get global.find-links 2>/dev/null || echo "$$PIP_FIND_LINKS")"; \

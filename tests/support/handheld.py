@@ -1,4 +1,4 @@
-"""Films a textured scene of ``synth`` as a hand would: an arc with sway and tremor, a lens, some blurred frames."""
+"""Films a textured scene of ``synth`` as a hand would: an arc with sway and tremor, and a lens."""
 
 import math
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from forewarp.synth.world import World
 
 @dataclass(frozen=True)
 class Walk:
-    """An arc from azimuth to azimuth (degrees) at ``radius`` around ``focus``, seen ``angle`` degrees wide."""
+    """An arc from azimuth to azimuth (degrees) at ``radius`` around ``focus``, ``angle`` degrees wide."""
 
     motion: str
     has_room: bool

@@ -8,7 +8,6 @@ import numpy as np
 
 from forewarp.capture.pictures import Pictures
 from forewarp.capture.place import Limits
-from forewarp.capture.scene import still_points
 from forewarp.capture.sparse import Sparse
 
 ABOUT, PICTURE = "capture.json", "capture.png"
@@ -28,7 +27,7 @@ def facts_of(source, pictures: Pictures, sparse: Sparse, limits: Limits, scales:
         "seconds": max(times) - min(times) if source.video is not None else None,
         "reprojection_error": sparse.error,
         "points": len(sparse.points),
-        "still_points": len(still_points(sparse)),
+        "sure_points": len(sparse.sure()),
         "camera": {
             "width": camera.width,
             "height": camera.height,
@@ -61,9 +60,9 @@ def told(facts: dict) -> list[str]:
     lines = [
         f"registered: {facts['registered']} of {facts['pictures']} pictures, {camera['width']} x "
         f"{camera['height']} pixels, reprojection error {facts['reprojection_error']:.2f} pixels",
-        f"camera: {camera['degrees']:.0f} degrees wide; its path is {facts['path']:.2f} long, where what it sees is "
-        "1 away",
-        f"points: {facts['points']:,}, {facts['still_points']:,} of them sure; box {size}, near "
+        f"camera: {camera['degrees']:.0f} degrees wide; its path is {facts['path']:.2f} long, where what it "
+        "sees is 1 away",
+        f"points: {facts['points']:,}, {facts['sure_points']:,} of them sure; box {size}, near "
         f"{facts['near']:.2f}, far {facts['far']:.2f}",
     ]
     if facts["left_out"]:

@@ -133,8 +133,8 @@ def _write_masks(dark: Path, masks: Path, done: dict, folder: Path) -> None:
         chosen = [paths[row] for row in done["rows"]]
     else:
         raise ValueError(
-            f"{masks}: expected {done['found']} masks, one for each frame or picture, or masks with the names of "
-            f"the pictures ({names[0]}), but got {len(paths)}"
+            f"{masks}: expected {done['found']} masks, one for each frame or picture, or masks with the "
+            f"names of the pictures ({names[0]}), but got {len(paths)}"
         )
     for name, path in zip(names, chosen):
         height, width = read_image(folder / name).shape[:2]

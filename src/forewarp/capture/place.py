@@ -9,11 +9,13 @@ import torch
 
 from forewarp.capture.sparse import Sparse
 from forewarp.scene.box import Box
+from forewarp.scene.camera import Camera
 from forewarp.scene.paths import mean_up
 
 # Points beyond these quantiles are taken for outliers, unless they lie close to the rest.
 _QUANTILES, _SLACK, _MARGIN = (0.02, 0.98), 0.25, 0.05
 _NEAR, _FAR = 0.5, 1.25  # of the nearest and the farthest points, as what moves may be nearer
+_ROLL = 0.01  # mean square of the sine by which a hand rolls a camera, and some more
 _MIDWAY = 0.5  # share of its points' median distance from which on a camera's view belongs to the box
 
 
@@ -27,13 +29,25 @@ class Limits:
 
 
 def placed(sparse: Sparse) -> Sparse:
-    """Turn the pictures' mean upward direction to z, put the points' median into the origin, and scale the
-    median distance between a camera and a point that it sees to 1.
+    """Turn upwards to z, put the points' median into the origin, and scale the median distance between a
+    camera and a point that it sees to 1.
     """
-    up = mean_up(list(sparse.cameras.values())).numpy()
+    up = upwards(list(sparse.cameras.values()))
     return sparse.moved(
         _upright(up), np.median(sparse.points, axis=0), 1 / float(np.median(sparse.distances()))
     )
+
+
+def upwards(cameras: list[Camera]) -> np.ndarray:
+    """Estimate the direction away from the ground (3,), unit length.
+
+    A hand tilts a camera up and down, but holds it level: upwards is across all pictures' horizontal axes, as
+    far as they tell, and else the mean of the pictures' upward axes.
+    """
+    mean = mean_up(cameras).numpy()
+    level = np.stack([np.asarray(camera.camera_to_world)[:3, 0] for camera in cameras])
+    up = np.linalg.solve(level.T @ level / len(level) + _ROLL * np.eye(3), _ROLL * mean)
+    return up / np.linalg.norm(up)
 
 
 def _upright(up: np.ndarray) -> np.ndarray:
@@ -61,7 +75,7 @@ def limits_of(sparse: Sparse) -> Limits:
             middle = torch.tensor([camera.width / 2, camera.height / 2])
             ahead = np.asarray(camera.directions(middle[0], middle[1]))
             midway.append(np.asarray(camera.center) + _MIDWAY * float(np.median(own)) * ahead)
-    bounds = bounds_of(sparse.points)
+    bounds = bounds_of(sparse.sure())
     ends = np.concatenate([np.array(bounds), np.array(midway).reshape(-1, 3)])
     pad = _MARGIN * float((bounds[1] - bounds[0]).max())
     box = Box(tuple(ends.min(0) - pad), tuple(ends.max(0) + pad))

@@ -27,7 +27,7 @@ class Search:
     """
 
     matching: str = "auto"
-    lens: str = "OPENCV"
+    lens: str = "RADIAL"
     features: int = 4096
     seed: int = 0
     threads: int | None = None

@@ -48,13 +48,13 @@ def refuse_matches(database: Path, pictures: Pictures) -> None:
         raise ValueError(f"{_sentence(found, pictures)}; {_advice(found, pictures)}")
     if found.shift < STILL:
         raise ValueError(
-            f"camera: expected one that moves, but matches shift by {100 * found.shift:.1f} % of the picture at "
-            "most; walk around the subject while filming"
+            f"camera: expected one that moves, but matches shift by {100 * found.shift:.1f} % of the picture "
+            "at most; walk around the subject while filming"
         )
     if found.unturned < TURNED:
         raise ValueError(
-            f"camera: expected one that moves sideways, but {100 - 100 * found.unturned:.0f} % of all shift is "
-            "explained by turning it; walk, and keep the subject in the middle"
+            f"camera: expected one that moves sideways, but {100 - 100 * found.unturned:.0f} % of all shift "
+            "is explained by turning it; walk, and keep the subject in the middle"
         )
 
 
@@ -72,7 +72,7 @@ def refuse_poses(sparse: Sparse | None, pictures: Pictures, database: Path | Non
     names = set() if sparse is None else sparse.cameras.keys()
     if unknown := sorted(names - pictures.times.keys()):
         raise ValueError(
-            f"images: expected a picture {unknown[0]}, which the model has, but got none; set images="
+            f"images: expected a picture {unknown[0]}, as the model has, but got none; set images="
         )
     registered, total = len(names), len(pictures.times)
     if registered < max(3, LEAST_REGISTERED * total):
@@ -99,13 +99,13 @@ def refuse_poses(sparse: Sparse | None, pictures: Pictures, database: Path | Non
     parallax = extent / float(np.median(sparse.distances()))
     if parallax < LEAST_PARALLAX:
         raise ValueError(
-            f"camera: expected one that moves sideways, but its places are {100 * parallax:.2f} % of the distance "
-            "apart; walk around the subject while filming"
+            f"camera: expected one that moves sideways, but its places are {100 * parallax:.2f} % of the "
+            "distance apart; walk around the subject while filming"
         )
     if sparse.error > WORST_ERROR:
         raise ValueError(
-            f"poses: expected a reprojection error of at most {WORST_ERROR} pixels, but got {sparse.error:.1f}; "
-            "give masks= of what moves"
+            f"poses: expected a reprojection error of at most {WORST_ERROR} pixels, but got "
+            f"{sparse.error:.1f}; give masks= of what moves"
         )
 
 
@@ -154,7 +154,7 @@ def unturned(first: np.ndarray, second: np.ndarray, focal: float) -> float:
         first, second: (M, 2) from the middle of the picture, as shares of its longer side.
         focal: in that unit.
 
-    The best turn of the rays is fitted to the better half of them again and again, as other matches are wrong.
+    The best turn of the rays is fitted to the better half of them again and again, as others may be wrong.
     """
     rays = [np.concatenate([ends, np.full((len(ends), 1), focal)], 1) for ends in (first, second)]
     a, b = (one / np.linalg.norm(one, axis=1, keepdims=True) for one in rays)
@@ -175,14 +175,14 @@ def _advice(found: Evidence, pictures: Pictures) -> str:
     """The advice that the evidence calls for."""
     if pictures.edges > BLURRED:
         return (
-            f"edges are {pictures.edges:.0f} pixels wide (of 640): the pictures are blurred; film slower, and in more "
-            "light"
+            f"edges are {pictures.edges:.0f} pixels wide (of 640): the pictures are blurred; film slower, "
+            "and in more light"
         )
     if found.features < FEW_FEATURES and pictures.masks is not None:
-        return "there is no texture but on what the masks call moving; put things with texture around the subject"
+        return "there is no texture but on what the masks call moving; put textured things around it"
     if found.features < FEW_FEATURES:
-        return "there is hardly any texture; put things with texture around the subject, as newspapers"
+        return "there is hardly any texture; put textured things around the subject, as newspapers"
     return (
-        "film slower and with more of what stands still in the picture, take more frames (frames=), or give masks= of "
-        "what moves"
+        "film slower and with more of what stands still in the picture, take more frames (frames=), or give "
+        "masks= of what moves"
     )

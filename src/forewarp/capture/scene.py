@@ -13,12 +13,6 @@ from forewarp.data.images import read_image, write_jpeg, write_png
 from forewarp.data.posed_video import SCALES, PosedShot, write_scene
 
 _LEAST_SIDE = 96  # pixels: smaller copies are of no use
-_VIEWS, _ERROR = 3, 1.5  # a point that is known to stand still: seen by so many, to so many pixels
-
-
-def still_points(sparse: Sparse) -> np.ndarray:
-    """Choose the points (K, 3) that are sure enough to begin with and to be held still."""
-    return sparse.points[(sparse.views >= _VIEWS) & (sparse.errors <= _ERROR)]
 
 
 def write(
@@ -51,13 +45,13 @@ def write(
             yield PosedShot(name, sparse.cameras[name], pixels, time)
             progress(done + 1, len(names))
 
-    options = {"near": limits.near, "far": limits.far, "aabb": limits.box, "points": still_points(sparse)}
+    options = {"near": limits.near, "far": limits.far, "aabb": limits.box, "points": sparse.sure()}
     write_scene(folder, shots(), **options)
     return scales
 
 
 def _write_smaller(path: Path, pixels: np.ndarray, scale: int) -> None:
-    """Write the mean of each block of ``scale`` x ``scale`` pixels; what is left over at the ends is cut off."""
+    """Write the mean of each block of ``scale`` x ``scale`` pixels; leave out what is left at the ends."""
     height, width = (n // scale for n in pixels.shape[:2])
     blocks = pixels[: height * scale, : width * scale].reshape(height, scale, width, scale, 3)
     small = blocks.mean((1, 3)).round().astype(np.uint8)

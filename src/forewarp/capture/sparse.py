@@ -12,6 +12,7 @@ from forewarp.scene.camera import Camera
 from forewarp.scene.lens import Lens
 
 _KNOWN = {"f", "fx", "fy", "cx", "cy", "k", "k1", "k2", "k3", "p1", "p2"}
+_VIEWS, _ERROR = 3, 1.5  # a point that is sure: seen by so many cameras, to so many pixels
 
 
 @dataclass(frozen=True)
@@ -33,6 +34,11 @@ class Sparse:
         """From each camera to each point that it sees (M,)."""
         centers = np.stack([np.asarray(camera.center) for camera in self.cameras.values()])
         return np.linalg.norm(self.points[self.seen[:, 1]] - centers[self.seen[:, 0]], axis=1)
+
+    def sure(self) -> np.ndarray:
+        """Choose the points (K, 3) that are sure enough to begin with; all, if none is."""
+        sure = (self.views >= _VIEWS) & (self.errors <= _ERROR)
+        return self.points[sure] if sure.any() else self.points
 
     def moved(self, turn: np.ndarray, center: np.ndarray, scale: float) -> Sparse:
         """Map the world by ``X -> scale * turn @ (X - center)``."""
@@ -59,8 +65,8 @@ def read_model(folder: Path) -> Sparse:
     ]
     if not any(kinds):
         raise ValueError(
-            f"colmap: expected a folder with cameras.bin, images.bin and points3D.bin (or .txt), but got {folder}; "
-            "it is often called sparse/0"
+            f"colmap: expected a folder with cameras.bin, images.bin and points3D.bin (or .txt), but got "
+            f"{folder}; it is often called sparse/0"
         )
     try:
         return sparse_of(pycolmap.Reconstruction(folder))
@@ -105,8 +111,8 @@ def _camera(image) -> Camera:
     beyond = [name for name, value in values.items() if name not in _KNOWN and value != 0]
     if beyond or "FISHEYE" in own.model_name or not {"f", "fx"} & values.keys():
         raise ValueError(
-            f"{image.name}: expected a camera model with k1 k2 k3 p1 p2, as OPENCV, but got {own.model_name}; "
-            "undistort the pictures (colmap image_undistorter)"
+            f"{image.name}: expected a camera model with k1 k2 k3 p1 p2, as OPENCV, but got "
+            f"{own.model_name}; undistort the pictures (colmap image_undistorter)"
         )
     fx, fy = (values.get(name, values.get("f", 0.0)) for name in ("fx", "fy"))
     k = (values.get("k1", values.get("k", 0.0)), values.get("k2", 0.0), values.get("k3", 0.0))

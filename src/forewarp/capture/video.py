@@ -143,6 +143,6 @@ def _refuse(video: Path, text: str, count: int, stamps: list[float], duration: f
     step = end / (count - 1)
     if end + step < _WHOLE * duration:
         raise ValueError(
-            f"{video}: expected {duration:.1f} seconds, as its header says, but got {end + step:.1f}; copy it "
-            "again, or cut it: ffmpeg -i in.mp4 -t SECONDS new.mp4"
+            f"{video}: expected {duration:.1f} seconds, as its header says, but got {end + step:.1f}; copy "
+            "it again, or cut it: ffmpeg -i in.mp4 -t SECONDS new.mp4"
         )

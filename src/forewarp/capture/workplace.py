@@ -23,8 +23,8 @@ def workplace(out: Path, about: Mapping[str, object]) -> Iterator[Path]:
         out: of the result.
         about: what the work depends on; work about anything else is removed first.
 
-    It is removed at the end, and where the work is refused (``ValueError``, ``ImportError``), with the folders
-    that were made for it; it stays after Ctrl-C, a kill and errors of the system.
+    It is removed at the end, and where the work is refused (``ValueError``, ``ImportError``), with the
+    folders that were made for it; it stays after Ctrl-C, a kill and errors of the system.
 
     Raises:
         ValueError: where another call is at work.

@@ -15,8 +15,8 @@ What one types most:
   video=FILE                    a video; its rotation flag and its own time stamps are heeded
   images=FOLDER                 or pictures of one size, in the order of their names
   colmap=FOLDER                 poses that are known: a COLMAP model, of the pictures in images=
-  masks=FOLDER                  what moves is bright; poses are not found from it. A mask for each frame of the
-                                video in order, or masks with the pictures' names
+  masks=FOLDER                  what moves is bright; poses are not found from it. A mask for each frame
+                                of the video in order, or masks with the pictures' names
   out=FOLDER                    the scene's folder (captures/<name of the video>)
   frames=N size=N               how many frames; pixels of the longer side, at most
   matching=exhaustive           match every pair of pictures, where the camera comes back to where it was

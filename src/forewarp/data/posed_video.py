@@ -132,7 +132,8 @@ def write_scene(
 
     Args:
         shots: consumed one by one; all or none have a split.
-        near, far, aabb, points: where known, in the units of the cameras' places; ``points`` (N, 3) never move.
+        near, far, aabb, points: where known, in the units of the cameras' places; ``points`` (N, 3) never
+            move.
 
     Raises:
         ValueError: for a shot that ``read_scene`` would refuse.
