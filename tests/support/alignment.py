@@ -18,14 +18,27 @@ class Similarity:
         return self.scale * points @ self.turn.T + self.shift
 
 
-def fitted(source: np.ndarray, target: np.ndarray) -> Similarity:
-    """The similarity that takes points (N, 3) to others, least squares (Umeyama 1991)."""
+def _axes(cameras) -> np.ndarray:
+    return np.stack([np.asarray(camera.camera_to_world)[:3, :3] for camera in cameras])
+
+
+def _centers(cameras) -> np.ndarray:
+    return np.stack([np.asarray(camera.center) for camera in cameras])
+
+
+def fitted(found, true) -> Similarity:
+    """Fit the similarity that takes found cameras to true ones.
+
+    The turn is the mean of what takes found axes to true ones: centres on a path that is nearly a line would
+    leave the turn about that line open. Scale and shift fit the centres, least squares.
+    """
+    total = np.einsum("nij,nkj->ik", _axes(true), _axes(found))
+    u, _, v = np.linalg.svd(total)
+    turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ v)]) @ v
+    source, target = _centers(found) @ turn.T, _centers(true)
     a, b = source - source.mean(0), target - target.mean(0)
-    u, size, v = np.linalg.svd(b.T @ a)
-    sign = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ v))])
-    turn = u @ sign @ v
-    scale = float((size * np.diag(sign)).sum() / (a**2).sum())
-    return Similarity(scale, turn, target.mean(0) - scale * turn @ source.mean(0))
+    scale = float((a * b).sum() / (a * a).sum())
+    return Similarity(scale, turn, target.mean(0) - scale * source.mean(0))
 
 
 def pose_errors(found, true) -> tuple[Similarity, np.ndarray, np.ndarray]:
@@ -35,13 +48,9 @@ def pose_errors(found, true) -> tuple[Similarity, np.ndarray, np.ndarray]:
         the similarity from found to true; degrees (N,) between their axes; distances (N,) between their
         centres, as a share of the length of the true path.
     """
-    centers = [np.stack([np.asarray(c.center) for c in cameras]) for cameras in (found, true)]
-    similarity = fitted(*centers)
-    path = np.linalg.norm(np.diff(centers[1], axis=0), axis=1).sum()
-    away = np.linalg.norm(similarity(centers[0]) - centers[1], axis=1) / path
-    turns = [
-        np.asarray(t.camera_to_world)[:3, :3].T @ similarity.turn @ np.asarray(f.camera_to_world)[:3, :3]
-        for f, t in zip(found, true)
-    ]
-    degrees = [np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1))) for turn in turns]
-    return similarity, np.array(degrees), away
+    similarity, centers = fitted(found, true), _centers(true)
+    path = np.linalg.norm(np.diff(centers, axis=0), axis=1).sum()
+    away = np.linalg.norm(similarity(_centers(found)) - centers, axis=1) / path
+    turns = np.einsum("nji,njk->nik", _axes(true), similarity.turn @ _axes(found))
+    cosine = (np.trace(turns, axis1=1, axis2=2) - 1) / 2
+    return similarity, np.degrees(np.arccos(np.clip(cosine, -1, 1))), away

@@ -16,6 +16,7 @@ from forewarp.scene.paths import mean_up
 _QUANTILES, _SLACK, _MARGIN = (0.02, 0.98), 0.25, 0.05
 _NEAR, _FAR = 0.5, 1.25  # of the nearest and the farthest points, as what moves may be nearer
 _ROLL = 0.01  # mean square of the sine by which a hand rolls a camera, and some more
+_LEVEL = 1e-3  # sine of the angle between up and ahead below which all cameras look up or down
 _MIDWAY = 0.5  # share of its points' median distance from which on a camera's view belongs to the box
 
 
@@ -29,13 +30,13 @@ class Limits:
 
 
 def placed(sparse: Sparse) -> Sparse:
-    """Turn upwards to z, put the points' median into the origin, and scale the median distance between a
-    camera and a point that it sees to 1.
+    """Turn upwards to z and the mean direction of view to y, put the points' median into the origin, and make
+    the median distance between a camera and a point that it sees 1.
     """
-    up = upwards(list(sparse.cameras.values()))
-    return sparse.moved(
-        _upright(up), np.median(sparse.points, axis=0), 1 / float(np.median(sparse.distances()))
-    )
+    cameras = list(sparse.cameras.values())
+    ahead = np.mean([np.asarray(camera.camera_to_world)[:3, 2] for camera in cameras], 0)
+    turn = _turn(upwards(cameras), ahead)
+    return sparse.moved(turn, np.median(sparse.points, axis=0), 1 / float(np.median(sparse.distances())))
 
 
 def upwards(cameras: list[Camera]) -> np.ndarray:
@@ -50,13 +51,14 @@ def upwards(cameras: list[Camera]) -> np.ndarray:
     return up / np.linalg.norm(up)
 
 
-def _upright(up: np.ndarray) -> np.ndarray:
-    """The smallest rotation (3, 3) that turns a unit vector to z."""
-    axis = np.cross(up, [0.0, 0.0, 1.0])
-    if up[2] < -1 + 1e-9:
-        return np.diag([1.0, -1.0, -1.0])
-    cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
-    return np.eye(3) + cross + cross @ cross / (1 + up[2])
+def _turn(up: np.ndarray, ahead: np.ndarray) -> np.ndarray:
+    """Make the rotation (3, 3) that turns ``up`` to z, and ``ahead`` to y as far as it is level."""
+    right = np.cross(ahead, up)
+    if np.linalg.norm(right) < _LEVEL:
+        right = np.eye(3)[np.abs(up).argmin()]
+        right = right - (right @ up) * up
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(up, right), up])
 
 
 def limits_of(sparse: Sparse) -> Limits:

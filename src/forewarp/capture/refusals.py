@@ -14,7 +14,7 @@ from forewarp.scene.errors import SceneError
 
 FEW_FEATURES = 60  # of a picture, in the median
 STILL = 0.01  # share of a picture's longer side: a camera that stands shifts less
-BLURRED = 4.0  # pixels of a picture 640 wide: edges of sharp pictures are 1 to 2 wide
+BLURRED = 3.0  # pixels of a picture 640 wide: edges of sharp pictures are 0.5 to 1.5 wide
 TURNED = 0.06  # share of the shift that no turn of the camera explains
 LEAST_REGISTERED = 0.5
 WIDEST = 130.0  # degrees

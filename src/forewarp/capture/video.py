@@ -128,7 +128,8 @@ def _read(said) -> tuple[float, list[float]]:
 def _refuse(video: Path, text: str, count: int, stamps: list[float], duration: float) -> None:
     """Refuse what gives no frames, one frame, or fewer than the file promises."""
     if not count:
-        missing = "moov atom not found" in text
+        with video.open("rb") as stream:
+            missing = "moov atom not found" in text and stream.read(8).endswith(b"ftyp")
         got = "one that was cut off; copy it again" if missing else "another file; choose a video, or images="
         got = "sound alone; choose a video" if "matches no streams" in text else got
         raise ValueError(f"{video}: expected a video, but got {got}")

@@ -1,0 +1,40 @@
+"""What structure from motion would find of an arc around random points."""
+
+import math
+
+import numpy as np
+import torch
+
+from forewarp.capture.sparse import Sparse
+from forewarp.scene.camera import Camera, look_at
+
+
+def cameras_on_arc(count=12, radius=4.0, degrees=70.0, height=1.2, focal=300.0, roll=0.0, lens=None):
+    """Cameras of 320 x 240 pixels by name, which look at the origin, z upwards."""
+    rng, made = np.random.default_rng(1), {}
+    for i in range(count):
+        angle = math.radians(degrees * (i / (count - 1) - 0.5))
+        center = torch.tensor(
+            [radius * math.sin(angle), -radius * math.cos(angle), height], dtype=torch.float64
+        )
+        up = torch.tensor([roll * rng.normal(), roll * rng.normal(), 1.0])
+        pose = look_at(center, torch.zeros(3), up)
+        made[f"frame_{i + 1:06d}.jpg"] = Camera(320, 240, focal, focal, 160, 120, pose, 0.0, 0.0, lens=lens)
+    return made
+
+
+def sparse_arc(points=400, outliers=0, error=0.5, **options) -> Sparse:
+    """Points in the unit cube about the origin, which all cameras see, then outliers thousands of units away."""
+    rng, cameras = np.random.default_rng(0), cameras_on_arc(**options)
+    places = np.concatenate([rng.uniform(-1, 1, (points, 3)), 3000 * rng.normal(size=(outliers, 3))])
+    grid = np.meshgrid(np.arange(len(cameras)), np.arange(len(places)), indexing="ij")
+    seen = np.stack(grid, -1).reshape(-1, 2)
+    return Sparse(
+        cameras,
+        places,
+        rng.integers(0, 256, places.shape).astype(np.uint8),
+        np.full(len(places), error),
+        np.full(len(places), len(cameras)),
+        seen,
+        error,
+    )
