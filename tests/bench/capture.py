@@ -22,7 +22,7 @@ import torch
 from forewarp.data import hypernerf
 from forewarp.data.images import read_image
 from forewarp.data.posed_video import PosedShot, read_scene, write_scene
-from forewarp.drawing.files import write_png, write_video
+from forewarp.drawing.files import write_video
 from forewarp.progress import Counted
 from forewarp.scene.box import Box
 from tests.support.alignment import pose_errors
