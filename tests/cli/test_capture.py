@@ -67,7 +67,7 @@ def things(in_tmp):
         (["video=one.mp4"], "one.mp4: expected a video of many frames, but got one frame"),
         (
             ["video=few.mp4"],
-            "hundreds of features to match, but got 0 in a picture; there is hardly any texture",
+            "hundreds of features to match, but got 6 in a picture; there is hardly any texture",
         ),
         (["video=few.mp4", "frames=2"], "frames: expected a whole number of at least 3, but got 2"),
         (["video=few.mp4", "size=10"], "size: expected a whole number of at least 64, but got 10"),

@@ -25,7 +25,7 @@ def cameras_on_arc(count=12, radius=4.0, degrees=70.0, height=1.2, focal=300.0, 
 
 
 def sparse_arc(points=400, outliers=0, error=0.5, **options) -> Sparse:
-    """Points in the cube from -1 to 1, which all cameras see, then outliers thousands of units away."""
+    """Points in the cube from -1 to 1, which all cameras see, then outliers thousands away."""
     rng, cameras = np.random.default_rng(0), cameras_on_arc(**options)
     places = np.concatenate([rng.uniform(-1, 1, (points, 3)), 3000 * rng.normal(size=(outliers, 3))])
     grid = np.meshgrid(np.arange(len(cameras)), np.arange(len(places)), indexing="ij")

@@ -69,10 +69,11 @@ def read_model(folder: Path) -> Sparse:
             f"{folder}; it is often called sparse/0"
         )
     try:
-        return sparse_of(pycolmap.Reconstruction(folder))
-    except (RuntimeError, IndexError, OverflowError, MemoryError) as error:
-        text = str(error).strip().splitlines() or ["a file that cannot be read"]
-        raise ValueError(f"{folder}: expected a COLMAP model, but got {text[-1]}; export it again") from error
+        found = pycolmap.Reconstruction(folder)
+    except (RuntimeError, ValueError, IndexError, OverflowError, MemoryError) as error:
+        text = (str(error).strip().splitlines() or ["a file that cannot be read"])[-1]
+        raise ValueError(f"{folder}: expected a COLMAP model, but got {text}; export it again") from error
+    return sparse_of(found)
 
 
 def sparse_of(found) -> Sparse:

@@ -5,6 +5,7 @@ Frames come turned upright, as the file's rotation flag says, none dropped and n
 
 from __future__ import annotations
 
+import math
 import re
 import subprocess
 import tempfile
@@ -53,7 +54,7 @@ def measure(video: Path, progress: Progress) -> Footage:
                 duration, stamps = _read(said)
                 if duration:
                     seconds = stamps[-1] - stamps[0] if stamps else 0.0
-                    progress(round(10 * min(seconds, duration)), round(10 * duration))
+                    progress(round(10 * min(seconds, duration)), math.ceil(10 * duration))
         duration, stamps = _read(said)
         said.seek(0)
         _refuse(video, said.read(), len(sharp), stamps, duration)
