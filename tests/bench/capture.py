@@ -82,24 +82,20 @@ def compared(found: Path, true: list, frame_of) -> tuple[dict, object]:
 
 
 def with_true_poses(found: Path, folder: Path, true: list, frame_of, similarity) -> None:
-    """Write the captured pictures again with the true cameras; points, near, far and box move along."""
+    """Write the captured pictures, half as large, with the true cameras in the found world."""
     content, scene = json.loads((found / "transforms.json").read_text()), read_scene(found.parent, found.name)
-    ends = np.array(content["aabb"])
-    corners = similarity(np.stack(np.meshgrid(*ends.T), -1).reshape(-1, 3))
     shots = []
     for frame in in_time(scene):
         name = Path(frame.name).name + ".jpg"
         pixels = read_image(found / "images_2" / name)[..., :3]
         camera = true[frame_of(name)].resized(pixels.shape[1], pixels.shape[0])
-        shots.append(PosedShot(name, replace(camera, near=0.0, far=1.0), pixels, frame.time))
-    write_scene(
-        folder,
-        shots,
-        near=content["near"] * similarity.scale,
-        far=content["far"] * similarity.scale,
-        aabb=Box(tuple(corners.min(0).tolist()), tuple(corners.max(0).tolist())),
-        points=similarity(np.load(found / "points.npy")),
-    )
+        pose = torch.eye(4, dtype=torch.float64)
+        pose[:3, :3] = torch.from_numpy(similarity.turn.T) @ camera.camera_to_world[:3, :3]
+        place = (np.asarray(camera.center) - similarity.shift) @ similarity.turn / similarity.scale
+        pose[:3, 3] = torch.from_numpy(place)
+        shots.append(PosedShot(name, replace(camera, camera_to_world=pose), pixels, frame.time))
+    limits = {key: content[key] for key in ("near", "far")} | {"aabb": Box(*content["aabb"])}
+    write_scene(folder, shots, **limits, points=np.load(found / "points.npy"))
 
 
 def fitted(root: Path, scene: str, run: Path, steps: int, seed: int, *words) -> dict:

@@ -58,6 +58,7 @@ def find_features(folder: Path, pictures: Path, masks: Path | None, how: Search,
         done = {image.name for image in base.read_all_images() if base.exists_keypoints(image.image_id)}
         known = [camera.camera_id for camera in base.read_all_cameras()]
     left = [name for name in names if name not in done]
+    progress(len(done), len(names))
     for some in _batches(left, _AT_ONCE):
         if known:
             reader.existing_camera_id = known[0]  # else the others would get one of their own
@@ -95,6 +96,7 @@ def match(database: Path, how: Search, progress: Progress) -> None:
     verify = pycolmap.TwoViewGeometryOptions()
     verify.ransac.random_seed = how.seed
     chosen, done = database.with_name("pairs.txt"), len(pairs) - len(left)
+    progress(done, len(pairs))
     for some in _batches(left, _PAIRS_AT_ONCE):
         chosen.write_text("".join(f"{first} {second}\n" for first, second in some))
         pycolmap.match_image_pairs(
