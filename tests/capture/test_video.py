@@ -1,3 +1,6 @@
+import subprocess
+
+import imageio_ffmpeg
 import numpy as np
 import pytest
 
@@ -72,10 +75,17 @@ def noise(count):
     return np.random.default_rng(0).integers(0, 256, (count, 48, 64, 3), np.uint8)
 
 
+def sound(path):
+    tone = ["-f", "lavfi", "-i", "sine=duration=1", "-c:a", "aac", str(path)]
+    subprocess.run([imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", *tone], check=True)
+    return path
+
+
 FAST = ("-movflags", "faststart")
 BROKEN = {
     "text": (lambda p: p.write_text("no video") and p, "expected a video, but got another file"),
     "empty": (lambda p: p.touch() or p, "expected a video, but got another file"),
+    "sound": (sound, "expected a video, but got sound alone"),
     "one frame": (lambda p: write_film(p, numbered(1)), "expected a video of many frames, but got one frame"),
     "no end": (lambda p: cut(write_film(p, noise(9)), 0.5), "expected a video, but got one that was cut off"),
     "no rest": (

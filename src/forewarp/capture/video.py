@@ -6,6 +6,7 @@ Frames come turned upright, as the file's rotation flag says, none dropped and n
 from __future__ import annotations
 
 import math
+import os
 import re
 import subprocess
 import tempfile
@@ -18,7 +19,7 @@ import numpy as np
 from forewarp.capture.sharpness import edge_width, sharpness
 
 _SIDE = 640  # pixels of the longer side at which sharpness is measured
-_STAMP = re.compile(r"Parsed_showinfo.* n: *(\d+) .* pts_time:(\S+)")
+_STAMP = re.compile(r"Parsed_showinfo.* n: *\d+ .* pts_time:(\S+)")
 _DURATION = re.compile(r"Duration: (\d+):(\d+):([\d.]+)")
 _WHOLE = 0.9  # share of its duration after which a video counts as whole: sound may end later
 
@@ -44,22 +45,18 @@ def measure(video: Path, progress: Progress) -> Footage:
 
     **Cost** one decoding, and about 10 ms a frame.
     """
-    duration, stamps, sharp, widths = 0.0, [], [], []
+    sharp, widths = [], []
     small = f"scale=w='min(iw,if(gt(iw,ih),{_SIDE},-1))':h='min(ih,if(gt(iw,ih),-1,{_SIDE}))',format=gray"
-    with tempfile.TemporaryFile("w+") as said:
+    with _Said() as said:
         for picture in _frames(video, f"showinfo=checksum=0,{small}", "pgm", said):
             sharp.append(sharpness(picture))
             widths.append(edge_width(picture))
-            if len(sharp) % 10 == 1:
-                duration, stamps = _read(said)
-                if duration:
-                    seconds = stamps[-1] - stamps[0] if stamps else 0.0
-                    progress(round(10 * min(seconds, duration)), math.ceil(10 * duration))
-        duration, stamps = _read(said)
-        said.seek(0)
-        _refuse(video, said.read(), len(sharp), stamps, duration)
+            if len(sharp) % 10 == 1 and said.read_on().duration and said.stamps:
+                seconds = min(said.stamps[-1] - said.stamps[0], said.duration)
+                progress(round(10 * seconds), math.ceil(10 * said.duration))
+        _refuse(video, said.read_on(), len(sharp))
     progress(len(sharp), len(sharp))
-    order = np.array(stamps[: len(sharp)])
+    order = np.array(said.stamps[: len(sharp)])
     return Footage(order - order[0], np.array(sharp), np.array(widths))
 
 
@@ -75,7 +72,7 @@ def extracted(video: Path, chosen: Sequence[int], size: int | None) -> Iterator[
     if size is not None:
         fit = f"w='if(gt(iw,ih),min(iw,{size}),-1)':h='if(gt(iw,ih),-1,min(ih,{size}))'"
         shape += f",scale={fit}:flags=area"
-    with tempfile.TemporaryFile("w+") as said:
+    with _Said() as said:
         yield from _frames(video, f"{shape},format=rgb24", "ppm", said)
 
 
@@ -87,19 +84,53 @@ def _any_of(chosen: list[int]) -> str:
     return f"({_any_of(chosen[:half])}+{_any_of(chosen[half:])})"
 
 
-def _frames(video: Path, filters: str, codec: str, said) -> Iterator[np.ndarray]:
+class _Said:
+    """What ffmpeg says, while it runs: a file, read on without moving the place that ffmpeg writes at.
+
+    ``duration`` in seconds, 0 where unknown; ``stamps`` of the frames so far; ``rest`` all other lines.
+    """
+
+    def __init__(self) -> None:
+        self.duration, self.stamps, self.rest, self._begun = 0.0, [], [], 0
+
+    def __enter__(self) -> _Said:
+        self.file = tempfile.TemporaryFile()
+        return self
+
+    def __exit__(self, *error) -> None:
+        self.file.close()
+
+    def read_on(self) -> _Said:
+        """Read the lines that are new."""
+        raw = b""
+        while more := os.pread(self.file.fileno(), 1 << 20, self._begun + len(raw)):
+            raw += more
+        raw = raw[: raw.rfind(b"\n") + 1]
+        self._begun += len(raw)
+        for line in raw.decode(errors="replace").splitlines():
+            if found := _STAMP.search(line):
+                self.stamps += [float(found[1])] if found[1] != "NOPTS" else []
+            elif found := _DURATION.search(line):
+                self.duration = sum(float(part) * unit for part, unit in zip(found.groups(), (3600, 60, 1)))
+            else:
+                self.rest.append(line)
+        return self
+
+
+def _frames(video: Path, filters: str, codec: str, said: _Said) -> Iterator[np.ndarray]:
     """Decode the first video stream; write what ffmpeg says to ``said``."""
     import imageio_ffmpeg
 
     begin = [imageio_ffmpeg.get_ffmpeg_exe(), "-hide_banner", "-nostdin", "-nostats", "-i", str(video)]
     shape = ["-map", "0:v:0", "-vf", filters, "-fps_mode", "passthrough"]
     call = [*begin, *shape, "-f", "image2pipe", "-c:v", codec, "-"]
-    with subprocess.Popen(call, stdout=subprocess.PIPE, stderr=said) as process:
+    with subprocess.Popen(call, stdout=subprocess.PIPE, stderr=said.file) as process:
         try:
             while (picture := _read_netpbm(process.stdout)) is not None:
                 yield picture
-        finally:
+        except BaseException:  # also where no more are asked for
             process.kill()
+            raise
 
 
 def _read_netpbm(stream) -> np.ndarray | None:
@@ -116,18 +147,9 @@ def _read_netpbm(stream) -> np.ndarray | None:
     return np.frombuffer(raw, np.uint8).reshape((height, width, 3) if channels == 3 else (height, width))
 
 
-def _read(said) -> tuple[float, list[float]]:
-    """Parse the duration (0: unknown) and the stamps so far, seconds."""
-    said.seek(0)
-    text = said.read()
-    found = _DURATION.search(text)
-    duration = sum(float(part) * unit for part, unit in zip(found.groups(), (3600, 60, 1))) if found else 0.0
-    stamps = [(int(n), float(time)) for n, time in _STAMP.findall(text) if time != "NOPTS"]
-    return duration, [time for _, time in sorted(stamps)]
-
-
-def _refuse(video: Path, text: str, count: int, stamps: list[float], duration: float) -> None:
+def _refuse(video: Path, said: _Said, count: int) -> None:
     """Refuse what gives no frames, one frame, or fewer than the file promises."""
+    stamps, duration, text = said.stamps, said.duration, "\n".join(said.rest)
     if not count:
         with video.open("rb") as stream:
             missing = "moov atom not found" in text and stream.read(8).endswith(b"ftyp")
