@@ -11,6 +11,9 @@ _OVERLAP = 6  # of sequential matching: the next six pictures, and those at 1, 2
 _FEW = 40  # pictures of which every pair is matched
 _SIDE = 1600  # pixels of the longer side in which features are looked for
 _LEAST_MODEL = 3
+# The last adjustment: a point's least views and greatest error in pixels, a camera's least points; the error
+# in pixels from which on a match hardly counts.
+_SURE_VIEWS, _SURE_ERROR, _LEAST_POINTS, _LOSS = 4, 1.5, 30, 0.5
 _AT_ONCE, _PAIRS_AT_ONCE = 8, 48  # between two updates of the progress
 
 
@@ -144,7 +147,37 @@ def reconstruct(database: Path, pictures: Path, folder: Path, how: Search, progr
     found = pycolmap.incremental_mapping(
         database, pictures, folder, options, initial_image_pair_callback=count, next_image_callback=count
     )
-    return max(found.values(), key=lambda one: one.num_reg_images(), default=None)
+    best = max(found.values(), key=lambda one: one.num_reg_images(), default=None)
+    if best is not None:
+        _adjust(best)
+    return best
+
+
+def _adjust(found) -> None:
+    """Adjust all cameras once more to the points that are sure, and so that outliers hardly count.
+
+    What moves leaves points that few pictures agree on, and the mapper's squares of errors let them bend the
+    poses. Where a camera would be left with too few points, all stay.
+    """
+    import pycolmap
+
+    doubtful = {
+        number
+        for number, point in found.points3D.items()
+        if point.track.length() < _SURE_VIEWS or point.error > _SURE_ERROR
+    }
+    kept = (
+        sum(point.has_point3D() and point.point3D_id not in doubtful for point in found.images[i].points2D)
+        for i in found.reg_image_ids()
+    )
+    if min(kept) >= _LEAST_POINTS:
+        for number in doubtful:
+            found.delete_point3D(number)
+    options = pycolmap.BundleAdjustmentOptions(print_summary=False)
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.loss_function_scale = _LOSS
+    pycolmap.bundle_adjustment(found, options)
+    found.update_point_3d_errors()
 
 
 def _batches(things: list, size: int) -> list[list]:
