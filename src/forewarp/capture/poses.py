@@ -149,11 +149,11 @@ def reconstruct(database: Path, pictures: Path, folder: Path, how: Search, progr
     )
     best = max(found.values(), key=lambda one: one.num_reg_images(), default=None)
     if best is not None:
-        _adjust(best)
+        _adjust(best, how.threads or -1)
     return best
 
 
-def _adjust(found) -> None:
+def _adjust(found, threads: int) -> None:
     """Adjust all cameras once more to the points that are sure, and so that outliers hardly count.
 
     What moves leaves points that few pictures agree on, and the mapper's squares of errors let them bend the
@@ -176,6 +176,7 @@ def _adjust(found) -> None:
     options = pycolmap.BundleAdjustmentOptions(print_summary=False)
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.loss_function_scale = _LOSS
+    options.ceres.solver_options.num_threads = threads
     pycolmap.bundle_adjustment(found, options)
     found.update_point_3d_errors()
 
