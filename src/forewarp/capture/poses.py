@@ -177,7 +177,12 @@ def _adjust(found, threads: int) -> None:
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.loss_function_scale = _LOSS
     options.ceres.solver_options.num_threads = threads
-    pycolmap.bundle_adjustment(found, options)
+    what = pycolmap.BundleAdjustmentConfig()
+    for number in found.reg_image_ids():
+        what.add_image(number)
+    what.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    # Not pycolmap.bundle_adjustment, which prints whatever the level of its log.
+    pycolmap.create_default_bundle_adjuster(options, what, found).solve()
     found.update_point_3d_errors()
 
 
