@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from shlex import quote
+
 from forewarp.cli.entry import command
 
 HELP = """
@@ -97,6 +99,9 @@ def train(config) -> float | None:
         else:
             print(f"fitted: {run.folder}; measure it with forewarp-evaluate run={run.folder}")
         draw_own(run.folder)
+        if config.evaluate:
+            at = quote(f"run={run.folder}")
+            print(f"look at  forewarp-view {at}, or a page: forewarp-report kind=run {at}")
         value = score.of(module)
     for name, noted in run.finished().items():
         if steps := noted.get("skipped_steps"):
