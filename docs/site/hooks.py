@@ -9,6 +9,7 @@ from mkdocs.structure.files import File
 ROOT = Path(__file__).parents[2]
 SOURCE = ROOT / "src" / "forewarp"
 TITLE = "Reference"
+WHOLE_WIDTH = "---\nhide: [navigation, toc]\n---\n\n"  # the home page has nothing beside it
 COMMANDS, KERNELS = "cli", "kernels_"  # told by --help; each tested against its reference
 
 INTRODUCTION = f"""# {TITLE}
@@ -69,7 +70,7 @@ def on_config(config):
 def on_files(files, config):
     """Add the home page, which is README.md, and the reference."""
     home = (ROOT / "README.md").read_text().replace("](docs/", "](")
-    for name, text in {"index.md": home, **reference()}.items():
+    for name, text in {"index.md": WHOLE_WIDTH + home, **reference()}.items():
         files.append(File.generated(config, name, content=text))
     return files
 
