@@ -21,9 +21,9 @@ DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
 MADE = {"index.md", "reference/index.md"}  # by docs/site/hooks.py
 FENCE = re.compile(r"^( *)```(\w*)\n(.*?)^ *```", re.MULTILINE | re.DOTALL)
-# Of packages that tests/cli/test_extending.py writes, of plans that must exist, and patterns of commands.
 # What a reader types into the search -> the title of the first page that it lists.
 FOUND = {"average splat": "forewarp.ops", "page of a run": "The page of a run", "the viewer": "The viewer"}
+# Of packages that tests/cli/test_extending.py writes, of plans that must exist, and patterns of commands.
 OTHERS = ("--config-dir", "mine", "model=balls", "plan=", "specimen_<", "...")
 
 
@@ -174,13 +174,13 @@ def test_pages_open_from_disk_fit_a_phone_and_are_searched(site):
         wide.page.goto((site / "index.html").as_uri())
         box, titles = wide.page.get_by_role("textbox", name="Search"), ".md-search-result__item h1"
 
-        def first(words):
+        def lists_first(title, words):
             box.fill("")
             box.press_sequentially(words)  # again, if the index was not read yet
             wide.page.wait_for_timeout(1000)
-            return (wide.page.locator(titles).all_inner_texts() or [""])[0]
+            return wide.page.locator(titles).all_inner_texts()[:1] == [title]
 
         box.click()
         for words, title in FOUND.items():
-            assert until(lambda words=words, title=title: first(words) == title), words
+            assert until(lists_first, title, words)
         assert (tab.errors, wide.errors) == ([], [])
