@@ -21,6 +21,8 @@ DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
 MADE = {"index.md", "reference/index.md"}  # by docs/site/hooks.py
 FENCE = re.compile(r"^( *)```(\w*)\n(.*?)^ *```", re.MULTILINE | re.DOTALL)
+# What a reader types into the search -> the title of the first page that it lists.
+FOUND = {"average splat": "forewarp.ops", "page of a run": "The page of a run", "the viewer": "The viewer"}
 # Of packages that tests/cli/test_extending.py writes, of plans that must exist, and patterns of commands.
 OTHERS = ("--config-dir", "mine", "model=balls", "plan=", "specimen_<", "...")
 
@@ -170,14 +172,15 @@ def test_pages_open_from_disk_fit_a_phone_and_are_searched(site):
             assert tab.page.evaluate("document.documentElement.scrollWidth") <= 390, file
         wide = Tab(browser, None, width=1280, height=800)
         wide.page.goto((site / "index.html").as_uri())
-        box, results = wide.page.get_by_role("textbox", name="Search"), ".md-search-result__item"
+        box, titles = wide.page.get_by_role("textbox", name="Search"), ".md-search-result__item h1"
 
-        def searched():
+        def lists_first(title, words):
             box.fill("")
-            box.press_sequentially("average splat")  # again, if the index was not read yet
+            box.press_sequentially(words)  # again, if the index was not read yet
             wide.page.wait_for_timeout(1000)
-            return wide.page.locator(results).count()
+            return wide.page.locator(titles).all_inner_texts()[:1] == [title]
 
         box.click()
-        assert until(searched) > 0
+        for words, title in FOUND.items():
+            assert until(lists_first, title, words)
         assert (tab.errors, wide.errors) == ([], [])

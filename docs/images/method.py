@@ -55,6 +55,14 @@ def splat(points: np.ndarray, side: int = SIDE) -> np.ndarray:
     return np.clip(cover, 0, 1).T
 
 
+def finer(cover: np.ndarray) -> np.ndarray:
+    """Read a lattice (N, N) linearly at the centres of one twice as fine (2N, 2N)."""
+    side = len(cover)
+    old, new = np.arange(side), (np.arange(2 * side) - 0.5) / 2
+    wide = np.stack([np.interp(new, old, row) for row in cover])
+    return np.stack([np.interp(new, old, column) for column in wide.T]).T
+
+
 def lattice(axis, filled: np.ndarray, **style) -> None:
     """Show cells (N, N), and the lattice's lines."""
     shown = {"cmap": "Blues", "vmin": 0, "vmax": 1.6} | style
@@ -104,17 +112,14 @@ def camera(axis, *, tiles: bool) -> None:
 def voxels(axes) -> None:
     """Draw the six steps of the voxel method."""
     cells, dense = grid(SIDE), grid(8 * SIDE)
-    torn, whole = splat(bend(cells)), covered(bend(dense), SIDE)
-    still = splat(cells)
-    for axis, filled in zip(axes, (still, 0.35 * still, torn, torn)):
+    still, torn = splat(cells), splat(bend(cells))
+    fine, whole = finer(torn), covered(bend(dense), 2 * SIDE)
+    for axis, filled in zip(axes, (still, 0.35 * still, torn, fine, fine, whole)):
         lattice(axis, filled)
     ends = np.isin((cells[:, 0] * SIDE).astype(int), (4, 8, 11, 13)) & (abs(cells[:, 1] - 0.25) < 0.08)
     paths(axes[1], cells[ends], color=BLUE, ms=2)
-    gaps = np.ma.masked_less(0.6 * (whole - torn), 0.2)
-    axes[3].imshow(gaps, origin="lower", extent=(0, 1, 0, 1), cmap="Reds", vmin=0, vmax=1.6)
-    fine = covered(bend(dense), 2 * SIDE)
-    lattice(axes[4], fine)
-    lattice(axes[5], fine)
+    gaps = np.ma.masked_less(0.6 * (whole - fine), 0.2)
+    axes[4].imshow(gaps, origin="lower", extent=(0, 1, 0, 1), cmap="Reds", vmin=0, vmax=1.6)
     camera(axes[5], tiles=False)
 
 
@@ -135,8 +140,8 @@ TEXTS = (
     ("1  canonical voxels", "density and colour"),
     ("2  trajectories", "a curve for each voxel"),
     ("3  splat", "onto a lattice; gaps open"),
-    ("4  inpaint", "a 3D U-Net fills gaps"),
-    ("5  up-sample", "a finer lattice"),
+    ("4  up-sample", "a finer lattice"),
+    ("5  inpaint", "a 3D U-Net fills gaps"),
     ("6  render", "rays march through it"),
     ("1  Gaussians", "places, shapes, colours"),
     ("2  trajectories", "of nodes, turning too"),
@@ -146,7 +151,7 @@ TEXTS = (
 
 def main() -> None:
     """Draw both methods."""
-    matplotlib.rcParams.update({"svg.hashsalt": "forewarp", "font.size": 10})
+    matplotlib.rcParams.update({"svg.hashsalt": "forewarp", "svg.fonttype": "none", "font.size": 10})
     figure = Figure(figsize=(6.6, 7.2), layout="constrained")
     axes = figure.subplots(3, 3).ravel()
     voxels(axes[:6])
@@ -156,9 +161,10 @@ def main() -> None:
         axis.set_title(title, loc="left", fontsize=11, fontweight="bold")
         axis.set_xlabel(below, loc="left")
         axis.spines[:].set_visible(False)
+        axis.set_rasterization_zorder(2.5)  # all but words and arrows: as paths they are thousands of lines
     for axis, name in zip(axes[::3], ("model=forward", "model=forward", "model=particles")):
         axis.set_ylabel(name)
-    figure.savefig(Path(__file__).with_suffix(".svg"), metadata={"Date": None})
+    figure.savefig(Path(__file__).with_suffix(".svg"), dpi=150, metadata={"Date": None})
 
 
 if __name__ == "__main__":

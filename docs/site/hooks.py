@@ -9,6 +9,8 @@ from mkdocs.structure.files import File
 ROOT = Path(__file__).parents[2]
 SOURCE = ROOT / "src" / "forewarp"
 TITLE = "Reference"
+WHOLE_WIDTH = "---\nhide: [navigation, toc]\n---\n\n"  # the home page has nothing beside it
+SEARCH = "site/search-from-disk.js"
 COMMANDS, KERNELS = "cli", "kernels_"  # told by --help; each tested against its reference
 
 INTRODUCTION = f"""# {TITLE}
@@ -60,7 +62,8 @@ def reference() -> dict[str, str]:
 
 
 def on_config(config):
-    """List the pages of the reference in the navigation."""
+    """List the pages of the reference in the navigation, and let pages from disk search by our own script."""
+    config.extra["polyfills"] = [SEARCH]  # in place of one from the network, which the plugin offline adds
     pages = [{"Packages": "reference/index.md"}] + [{name: page_of(name)} for name in packages()]
     config.nav = [{TITLE: pages} if TITLE in item else item for item in config.nav]
     return config
@@ -69,7 +72,7 @@ def on_config(config):
 def on_files(files, config):
     """Add the home page, which is README.md, and the reference."""
     home = (ROOT / "README.md").read_text().replace("](docs/", "](")
-    for name, text in {"index.md": home, **reference()}.items():
+    for name, text in {"index.md": WHOLE_WIDTH + home, **reference()}.items():
         files.append(File.generated(config, name, content=text))
     return files
 
