@@ -39,7 +39,7 @@ def run_page(config: DictConfig) -> str:
     file = file if file.suffix in (".html", ".htm") else file / PAGE
     # These load torch; mistakes have been answered before.
     from forewarp.report.run_media import Media
-    from forewarp.report.run_page import write_run_page
+    from forewarp.report.run_page import room_of, write_run_page
 
     def written() -> str:
         size = write_run_page(file, story, media, megabytes=float(config.megabytes))
@@ -47,6 +47,7 @@ def run_page(config: DictConfig) -> str:
         return "\n".join(told)
 
     media = Media(told_views(story), *newest_film(config, story))
+    room_of(story, media, float(config.megabytes))  # refuses before minutes of rendering
     try:
         for more in gathered(config, story, media):
             media = more

@@ -45,6 +45,17 @@ def write_run_page(file: Path, story: Story, media: Media, *, megabytes: float) 
         bytes written.
 
     Raises:
+        ValueError: see ``room_of``.
+    """
+    text = page(story, media, held(media, room_of(story, media, megabytes))).encode()
+    replace_file(file, text)
+    return len(text)
+
+
+def room_of(story: Story, media: Media, megabytes: float) -> float:
+    """Return the bytes that a page of so many 10^6 bytes has for pictures and the video.
+
+    Raises:
         ValueError: in one line, if the text alone is larger, or the run's files hold what no page can show.
     """
     views = [dict.fromkeys([*one.pictures, "thumb"], "") for one in media.views]
@@ -61,9 +72,7 @@ def write_run_page(file: Path, story: Story, media: Media, *, megabytes: float) 
         raise ValueError(
             f"megabytes: expected room for the page's text, {bare / 1e6:.2f}, but got {megabytes}; raise it"
         )
-    text = page(story, media, held(media, room)).encode()
-    replace_file(file, text)
-    return len(text)
+    return room
 
 
 def page(story: Story, media: Media, inside: Held) -> str:
