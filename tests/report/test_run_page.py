@@ -362,8 +362,8 @@ def test_sheets_are_named_for_what_they_are_among_all_views(tmp_path):
         write_png(folder / "images" / "sheets" / "test" / f"r_{number}.png", torch.rand(8, 32, 3))
     views = told_views(read_story(folder))
     assert [(one.why, one.about.split(",")[0]) for one in views] == [
-        ("median", "test/r_3"),
         ("best of 2 drawn", "test/r_5"),
+        ("median", "test/r_3"),
     ]
 
 

@@ -10,7 +10,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from forewarp.cli.errors import one_line
 from forewarp.cli.render import check, write_film
-from forewarp.report.run_files import Story, read_story, telling
+from forewarp.report.run_files import WHYS, Story, read_story, telling
 from forewarp.runs.config_files import project_root
 
 PAGE = "page.html"
@@ -168,7 +168,7 @@ def told_views(story: Story) -> list:
     }
     shown = [
         Shown(why, about(story, name), dict(zip(names, thirds(read_picture(sheets[name])))))
-        for name, why in chosen.items()
+        for name, why in sorted(chosen.items(), key=lambda one: WHYS.index(one[1].split()[0]))
     ]
     if shown:
         return shown

@@ -14,6 +14,7 @@ from forewarp.report.collect import UNREADABLE, Result, read_run, unreadable
 from forewarp.report.effects import plan_of
 
 _POINTS = 150  # of a stage's loss that are kept
+WHYS = "best", "median", "worst", "earliest", "latest"  # views to look at, as they are shown
 _KINDS = ("particles", "voxels")  # that a scene may consist of
 
 
@@ -205,5 +206,4 @@ def telling(views: Sequence[View]) -> dict[str, str]:
     chosen = {}
     for view, why in zip(telling, ("best", "worst", "median", "earliest", "latest")):
         chosen.setdefault(view.name, why)
-    shown = "best", "median", "worst", "earliest", "latest"
-    return dict(sorted(chosen.items(), key=lambda one: shown.index(one[1])))
+    return dict(sorted(chosen.items(), key=lambda one: WHYS.index(one[1])))
