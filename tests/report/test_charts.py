@@ -29,12 +29,14 @@ def test_points_and_ticks_share_their_axes(log):
     axis = Axis("t", log=log)
     values = [1.0, 10.0, 100.0]
     picture = drawn([Series("", [(v, v) for v in values])], axis, axis)
-    ticked = {text.text: float(text.get("x")) for text in picture.iter("text") if text.get("x")}
     at = dict(zip(values, circles(picture)))
-    shared = [v for v in values if f"{v:g}" in ticked]
-    assert shared
-    for value in shared:
-        assert abs(ticked[f"{value:g}"] - at[value][0]) < 0.2 or ticked[f"{value:g}"] < 60  # of y
+    for side, (anchor, key, off) in enumerate([("middle", "x", 0), ("end", "y", 4)]):
+        marks = [text for text in picture.iter("text") if text.get("text-anchor") == anchor]
+        ticked = {float(text.text): float(text.get(key)) for text in marks if text.text != "t"}
+        shared = [value for value in values if value in ticked]
+        assert shared
+        for value in shared:
+            assert ticked[value] - off == pytest.approx(at[value][side], abs=0.2)
     assert at[1][0] < at[10][0] < at[100][0]
     assert at[1][1] > at[10][1] > at[100][1]  # upwards
     if log:
@@ -45,8 +47,11 @@ def test_points_and_ticks_share_their_axes(log):
 @pytest.mark.parametrize("kind", ["line", "dots", "stems"])
 def test_without_a_range_everything_stays_inside(points, kind):
     text = chart([Series("", points, kind, base=points[0][1])], *PLAIN, "label", level=(points[0][1], "mean"))
-    numbers = [float(n) for n in re.findall(r'(?:cx|cy|x1|y1|x2|y2)="([-\d.]+)"', text)]
-    assert all(0 <= number <= 460 for number in numbers)
+    numbers = re.findall(r'(?:cx|cy|x1|y1|x2|y2)="([-\d.]+)"', text)
+    places = [pair for found in re.findall(r'points="([^"]+)"', text) for pair in found.split()]
+    assert len(places) == (len(points) if kind == "line" else 0)
+    numbers += [number for pair in places for number in pair.split(",")]
+    assert all(0 <= float(number) <= 460 for number in numbers)
 
 
 def test_stems_begin_at_their_base_and_titles_are_escaped():

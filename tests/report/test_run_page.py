@@ -9,7 +9,9 @@ import pytest
 import torch
 import yaml
 
-from forewarp.drawing.files import write_video
+from forewarp.cli.run_page import told_views
+from forewarp.drawing.files import write_png, write_video
+from forewarp.report.run_figures import figures_of
 from forewarp.report.run_files import View, read_story, telling
 from forewarp.report.run_media import Media, Shown
 from forewarp.report.run_page import write_run_page
@@ -87,7 +89,7 @@ def test_the_page_tells_what_the_run_is(tmp_path):
         command="forewarp-train data.scene=ball",
     )
     page = write(folder, Media([shown()]))
-    expected = ["ball", "forward, preset fast", "31.25 dB", "0:50 min", "1.00 GiB", "a cpu", "2,000,000"]
+    expected = ["ball", "forward, preset fast", "31.25 dB", "training 0:50", "1.00 GiB", "a cpu", "2,000,000"]
     expected += ["forewarp-train data.scene=ball", "trial +4.0 dB", "in 1:05", "off view trial +0.1 dB"]
     expected += ["on extra", "22.0 dB", "test/r_2", "25.5 dB after 40 s"]
     assert [one for one in expected if one not in page.text] == []
@@ -121,15 +123,21 @@ def test_what_a_file_says_is_text_and_never_markup(tmp_path):
     ("more", "says", "absent"),
     [
         ({"psnr": None, "views": 0}, "The run is not measured", "dB PSNR"),
+        ({"metrics": {"effects": None}}, "No effects: neither a plan nor metrics.json", "Effects, and why"),
+        ({"metrics": {"test": {"all": {"psnr": 20.0, "lpips_vgg": None}}}}, "LPIPS (vgg)", "None"),
         ({"curve": None}, "No PSNR against training time", "PSNR while it learned"),
-        ({"views": 0}, "PSNR while it learned", "Through the scene's time"),
-        ({"views": 1}, "Through the scene's time", "What this page lacks"),
+        ({"views": 0}, "No PSNR by view and through the scene's time", "view, from worst to best"),
+        ({"views": 1}, "Through the scene's time", "No PSNR by view"),
+        ({}, "No loss: the folders of the stages have no TensorBoard events", "Loss against training time"),
+        ({}, "No pictures: the run's folder has none", "Pictures are"),
+        ({}, "No video: the run's folder has none", "Video:"),
         ({}, "No plan was made", "Truth against prediction"),
         (
             {"config": {"stage": {"coarse": {}, "fine": {}}}},
-            "of its stages fine has not ended",
+            "of its stages fine has not ended (finished: coarse; trained for 0:50). It goes on with",
             "forewarp-view",
         ),
+        ({"config": {"stage": {"a": {}, "b": {}}}}, "of its stages a, b have not ended", "forewarp-view"),
     ],
 )
 def test_what_is_missing_is_said_and_left_out(tmp_path, more, says, absent):
@@ -169,13 +177,21 @@ def test_pictures_and_video_are_made_smaller_until_the_page_fits(tmp_path):
         ("per_image.json", '{"images": [{"name": "a"}]}', "no key 'scores'"),
         ("config.yaml", "a: [", "expected a run whose files can be read"),
         ("plan.yaml", "effects: {motion: {choice: x}}", "no key 'on'"),
+        (
+            "config.yaml",
+            "{data: {scene: a}, model: {name: b}, preset: null, seed: 0, budget: {}}",
+            "not subscriptable",
+        ),
+        ("coarse/done.json", '{"steps": 3}', "no key 'seconds'"),
     ],
 )
 def test_a_broken_file_ends_in_one_line(tmp_path, file, content, says):
     folder = told_run(tmp_path)
     (folder / file).write_text(content)
-    with pytest.raises(ValueError, match="^run: expected a run whose files can be read, but got") as caught:
-        read_story(folder)
+    with pytest.raises(
+        ValueError, match="^run: expected a run whose files can be (read|shown), but"
+    ) as caught:
+        write(folder)
     assert says in str(caught.value)
     assert "\n" not in str(caught.value)
 
@@ -194,6 +210,67 @@ def test_losses_are_against_the_clock_of_training(fitted):
 def test_one_view_is_the_best_of_all():
     assert telling([View("a", 0.5, "all", 30.0, {})]) == {"a": "best"}
     assert telling([]) == {}
+    two = View("a", 0.5, "all", 30.0, {}), View("b", 0.6, "all", 20.0, {})
+    assert telling(two) == {"a": "best", "b": "worst"}
+
+
+@pytest.mark.parametrize(("count", "name"), [(5, "r"), (5, "r" * 120), (1, "r")])
+def test_the_markup_of_the_views_is_within_the_limit(tmp_path, count, name):
+    folder = told_run(tmp_path)
+    media = Media([shown(f"view {i}", about=f"{name}, 20.0 dB") for i in range(count)])
+    write(folder, media)
+    whole = (folder / "page.html").stat().st_size
+    assert write(folder, media, (whole - 1) / 1e6).tags.count("img") == 5 * count  # smaller, none left out
+    write(folder, media, (whole - 1000) / 1e6)
+
+
+def test_pictures_rendered_smaller_than_the_view_are_said_to_be(tmp_path):
+    view = Shown("best", "r_0, 20.0 dB", shown().pictures, side=1600)
+    assert "quality 92, scaled from 1600 to 800 pixels" in write(told_run(tmp_path), Media([view])).text
+
+
+def test_words_are_of_all_views_where_only_some_are_drawn(tmp_path):
+    folder = told_run(tmp_path, views=1500)
+    rows = json.loads((folder / "per_image.json").read_text())
+    rows["images"][1]["scores"]["psnr"] = 3.0
+    (folder / "per_image.json").write_text(json.dumps(rows))
+    (_, (through, ranked)), *_ = figures_of(read_story(folder))
+    for _, drawn, says in (through, ranked):
+        assert re.search(r" (3\d\d|40\d) of the 1500 views are drawn", says)
+        assert "time 0.001: 3.00 dB" in drawn
+    assert "The lowest, 3.0 dB, is test/r_1 at" in through[2]
+    assert "of 1500 are more than 1 dB below it" in ranked[2]
+    page = write(folder)
+    assert "The first 1000 of 1500 views" in page.text
+    assert page.tags.count("tr") < 1010
+
+
+def test_numbers_that_are_none_are_left_out(tmp_path):
+    folder = told_run(tmp_path, curve=((10, 20.0), (20, "nan"), (40, 25.5), (50, "inf")))
+    rows = json.loads((folder / "per_image.json").read_text())
+    rows["images"][0]["scores"] |= {"psnr": float("nan")}
+    rows["images"][1]["scores"] |= {"ssim": None}
+    (folder / "per_image.json").write_text(json.dumps(rows))
+    page = write(folder)
+    assert "25.5 dB after 40 s" in page.text
+    assert "Every test view (2)" in page.text
+    assert "nan" not in page.text
+    assert "inf" not in page.text
+
+
+def test_folders_are_relative_to_the_current_one_and_quoted(in_tmp):
+    folder = told_run(in_tmp / "my runs", command=f"forewarp-train data.root={in_tmp}/data run=a")
+    page = write(folder)
+    assert "forewarp-train data.root=data run=a" in page.text
+    assert "forewarp-view run='my runs/ball/base-1.0-seed0'" in page.text
+    assert str(in_tmp) not in page.text
+
+
+def test_an_option_that_says_nothing_by_itself_is_not_shown(tmp_path):
+    config = {"model": {"name": "forward", "motion": "dct", "codes": 2, "view": True}}
+    effects = dict.fromkeys(("motion", "codes", "view"), True)
+    text = write(told_run(tmp_path, config=config, metrics={"effects": effects})).text
+    assert [f"on {one} As" in text for one in ("motion dct", "codes", "view")] == [True] * 3
 
 
 @pytest.fixture(scope="module")
@@ -208,10 +285,9 @@ def test_the_command_renders_the_telling_views(ok, run, tmp_path):
     done = ok("report", "kind=run", f"run={run}", f"out={tmp_path}/shown.html")
     assert re.fullmatch(rf"written: {tmp_path}/shown.html: 0\.\d of at most 4 MB", done.out.strip())
     page = Page((tmp_path / "shown.html").read_text())
-    labels = [alt.split(" of the ")[1].split(" view")[0] for alt in page.of("alt") if alt]
-    names = [alt.split()[0] for alt in page.of("alt") if alt]
+    names, labels = zip(*(alt.split(":")[0].split(", ") for alt in page.of("alt") if alt))
     assert {"best", "median", "worst"} <= set(labels)
-    assert names[:4] == ["truth", "prediction", "error", "depth"]
+    assert names[:4] == ("truth", "prediction", "error", "depth")
     assert page.tags.count("video") == 1
     assert page.tags.count("svg") == 4
     assert "voxels" in page.text
@@ -222,8 +298,8 @@ def test_without_rendering_the_page_has_what_the_folder_has(ok, run, tmp_path):
     shutil.rmtree(folder / "fine" / "images")
     done = ok("report", "kind=run", f"run={folder}", "render=false")
     page = Page((folder / "page.html").read_text())
-    assert "depth of the best view" not in " ".join(alt for alt in page.of("alt") if alt)
-    assert "prediction of the best view" in " ".join(page.of("alt"))
+    assert "depth, " not in " ".join(page.of("alt"))
+    assert "prediction, best: " in " ".join(page.of("alt"))
     assert done.out.count("\n") == 1
 
 
@@ -239,7 +315,7 @@ def test_a_run_without_its_data_or_its_end_still_has_a_page(ok, run, tmp_path):
     ok("report", "kind=run", f"run={folder}", f"out={tmp_path}/begun")
     page = Page((tmp_path / "begun" / "page.html").read_text())
     assert "forewarp-train resume=" in page.text
-    assert "prediction of the in training view: stage fine, 100 % of it" in page.of("alt")
+    assert "prediction, in training: stage fine at 100 %" in page.of("alt")
 
 
 def test_a_missing_video_is_made_as_forewarp_render_does(ok, run, tmp_path, monkeypatch):
@@ -264,8 +340,55 @@ def test_what_was_rendered_before_an_error_is_shown(ok, run, tmp_path, monkeypat
     done = ok("report", "kind=run", f"run={run}", f"out={tmp_path}", "path=fixed")
     assert done.out.startswith("Rendering for this page stopped: film.mp4: expected room to write")
     page = Page((tmp_path / "page.html").read_text())
-    assert "depth of the best view" in " ".join(page.of("alt"))
+    assert "depth, best: " in " ".join(page.of("alt"))
     assert "video" not in page.tags
+
+
+def test_after_an_interrupt_the_page_has_what_was_rendered(forewarp, run, tmp_path, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("forewarp.cli.run_page.write_film", interrupted)
+    done = forewarp("report", "kind=run", f"run={run}", f"out={tmp_path}", "path=fixed")
+    assert done.status == 130
+    page = Page((tmp_path / "page.html").read_text())
+    assert "depth, best: " in " ".join(page.of("alt"))
+    assert "Rendering for this page was interrupted." in page.text
+
+
+def test_sheets_are_named_for_what_they_are_among_all_views(tmp_path):
+    folder = told_run(tmp_path, views=8)
+    for number in (3, 5):
+        write_png(folder / "images" / "sheets" / "test" / f"r_{number}.png", torch.rand(8, 32, 3))
+    views = told_views(read_story(folder))
+    assert [(one.why, one.about.split(",")[0]) for one in views] == [
+        ("best of 2 drawn", "test/r_5"),
+        ("median", "test/r_3"),
+    ]
+
+
+@pytest.mark.parametrize(("typed", "device"), [([], "cpu"), (["trainer=gpu"], "gpu")])
+def test_a_run_keeps_its_trainer_unless_one_is_named(ok, run, tmp_path, monkeypatch, typed, device):
+    seen = []
+
+    def build(config):
+        seen.append(config.trainer.accelerator)
+        raise ValueError("enough")
+
+    monkeypatch.setattr("forewarp.runs.build.build_run", build)
+    ok("report", "kind=run", f"run={run}", f"out={tmp_path}", *typed)
+    assert seen == [device]
+
+
+def test_a_synthetic_scene_that_is_gone_is_not_made_again(ok, run, tmp_path):
+    folder = shutil.copytree(run, tmp_path / "run")
+    config = yaml.safe_load((folder / "config.yaml").read_text())
+    config["data"] |= {"_target_": "forewarp.synth.module.SyntheticDataModule", "root": f"{tmp_path}/gone"}
+    config["data"]["synthesis"] = {"size": 16, "frames": 2}
+    (folder / "config.yaml").write_text(yaml.safe_dump(config))
+    done = ok("report", "kind=run", f"run={folder}")
+    assert "data.root: expected the scene of the run, but got none in" in done.out
+    assert not (tmp_path / "gone").exists()
 
 
 @pytest.mark.parametrize(

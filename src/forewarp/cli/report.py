@@ -39,9 +39,10 @@ What one types most:
   views=N                limits: training views to render
   run=FOLDER             run: the run; its page is <run>/page.html, or out=FILE.html
   megabytes=N            run: most of the page; pictures and the video are made smaller to fit
-  render=false           run: show only what the folder has; load no method and no data
+  render=false           run: show only what the folder has; load no method and no data; for slow methods
   path=both|trajectories|fixed|orbit   run: which video, as in forewarp-render
-  data.root=FOLDER       run: where the data are now, if they moved
+  data.root=FOLDER       limits, run: where the data are now, if they moved
+  trainer=cpu|gpu|auto   limits, run: device to compute with; without it the one of the run
   trust=[PACKAGE]        limits, run: code of other packages that a run's config may name
 
 The runs: make accuracy-time [DATA=FOLDER SCENE=NAME MINUTES=N], make price-list DATA=FOLDER,

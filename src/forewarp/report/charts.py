@@ -135,7 +135,7 @@ def _grid(frame: _Frame) -> Html:
 def _level_name(frame: _Frame, series: Sequence[Series], at: float, name: str) -> Html:
     """Write a level's name above it, at the end where fewer points lie."""
     near = [frame.right(px) for one in series for px, py in one.points if -4 < at - frame.down(py) < 20]
-    left = sum(place < _LEFT + 70 for place in near) <= sum(place > WIDTH - _RIGHT - 70 for place in near)
+    left = sum(place < _LEFT + 100 for place in near) <= sum(place > WIDTH - _RIGHT - 100 for place in near)
     x, anchor = (_LEFT + 3, "start") if left else (WIDTH - _RIGHT - 3, "end")
     return el("text", name, x=x, y=round(at - 5, 1), text_anchor=anchor, class_="level")
 

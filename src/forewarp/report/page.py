@@ -113,8 +113,9 @@ def html_table(table: Table) -> str:
     marks = {"best": "<b>{}</b>", "second": "<u>{}</u>"}
     head = "".join(f"<th>{escape(column.name)}" for column in table.columns)
     lines = [f"<p>{escape(table.caption)}</p>" if table.caption else "", f"<table><tr>{head}"]
+    numeric = table.numeric  # looks at all rows
     for number, row in enumerate(table.texts(marks, escape)):
-        cells = "".join(f"<td{' class=n' * n}>{text}" for text, n in zip(row, table.numeric))
+        cells = "".join(f"<td{' class=n' * n}>{text}" for text, n in zip(row, numeric))
         lines.append(f"<tr{' class=rule' * (number in table.rules)}>{cells}")
     return "\n".join(lines) + "</table>"
 

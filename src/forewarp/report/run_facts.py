@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 from dataclasses import dataclass
+from pathlib import Path
 
 from forewarp.progress import time_text
 from forewarp.report.run_files import Story
@@ -15,6 +17,7 @@ KINDS = {
     "canonical": "at the canonical time",
     "all": "all",
 }
+_ROWS = 1000  # of the table of views
 _NAMES = {"psnr": "PSNR (dB)", "ssim": "SSIM", "ms_ssim": "MS-SSIM", "ms_ssim_legacy": "MS-SSIM (legacy)"}
 
 
@@ -40,16 +43,13 @@ def tiles_of(story: Story) -> list[tuple[str, str]]:
     result, found = story.result, []
     protocol, numbers = result.metrics.get("protocol", {}), result.numbers if result.metrics else {}
     if result.stages or result.curve:
-        spent = sum(float(done["seconds"]) for done in result.stages.values())
-        spent = max([spent, *(point.seconds for point in result.curve)])
-        clock = " (processor)" if result.config["budget"].get("clock") == "processor" else ""
-        found.append(
-            (f"training{clock}", f"{time_text(spent)} min" if spent < 3600 else f"{time_text(spent)} h")
-        )
+        clock = ", processor time" if result.config["budget"].get("clock") == "processor" else ""
+        found.append((f"training{clock}", time_text(seconds_of(story))))
     if "ssim" in numbers:
         found.append(("SSIM", f"{numbers['ssim']:.4f}"))
     scores = result.metrics["test"].get(result.ability, {}) if result.metrics else {}
-    found += [(name_of(name), f"{value:.4f}") for name, value in scores.items() if name.startswith("lpips")]
+    lpips = {name: value for name, value in scores.items() if name.startswith("lpips") and value is not None}
+    found += [(name_of(name), f"{value:.4f}") for name, value in lpips.items()]
     if "frame" in numbers:
         found.append(("a picture of a new time", f"{1000 * numbers['frame']:.3g} ms"))
     if story.curves.size is not None:
@@ -62,12 +62,23 @@ def tiles_of(story: Story) -> list[tuple[str, str]]:
     return found
 
 
+def seconds_of(story: Story) -> float:
+    """Return the seconds of training: of the finished stages, or as far as the curve goes."""
+    finished = sum(float(done["seconds"]) for done in story.result.stages.values())
+    return max([finished, *(point.seconds for point in story.result.curve)])
+
+
+def near(text: str) -> str:
+    """Write folders below the current one relative to it, as a page may be passed on."""
+    return re.sub(rf"(?<![\w.:/~-]){re.escape(str(Path.cwd()))}/(?=\w)", "", text)
+
+
 def effects_of(story: Story) -> tuple[str, list[Effect]]:
     """Return in words how the effects were chosen, and the effects."""
     result = story.result
-    switched, model = result.metrics.get("effects", {}), result.config["model"]
+    switched, model = result.metrics.get("effects") or {}, result.config["model"]
     typed = _typed(result.command)
-    planned = story.plan.get("effects", {})
+    planned = story.plan.get("effects") or {}
     if planned:
         spent = story.plan.get("seconds")
         took = f" in {time_text(spent)}" if isinstance(spent, int | float) else ""
@@ -80,11 +91,11 @@ def effects_of(story: Story) -> tuple[str, list[Effect]]:
         on = switched.get(name, decision["on"] if decision else False)
         own = [one for one in typed if one.split("=")[0].lstrip("+~") in (f"model/{name}", f"model.{name}")]
         if decision is not None and on == decision["on"]:
-            choice, because = decision["choice"], decision["because"]
+            choice, because = _option(decision["choice"]), decision["because"]
         else:
             choice = _option(model.get(name))
             because = f"Typed: {' '.join(own)}." if own else _unplanned(typed, model["name"])
-        found.append(Effect(name, bool(on), str(choice), str(because)))
+        found.append(Effect(name, bool(on), choice, near(str(because))))
     return about, sorted(found, key=lambda one: not one.on)
 
 
@@ -107,7 +118,8 @@ def _unplanned(typed: list[str], method: str) -> str:
 
 
 def _option(value: object) -> str:
-    return "" if value is None or isinstance(value, dict | list) else str(value).lower()
+    """Return an option's name; "" for numbers, switches and parts, which say nothing without their key."""
+    return value if isinstance(value, str) and value != "none" else ""
 
 
 def protocol_of(story: Story) -> list[tuple[str, str]]:
@@ -170,15 +182,17 @@ def _flow(story: Story) -> str:
 
 
 def views_table(story: Story) -> Table:
-    """List the scores of every test view."""
+    """List the scores of every test view, or of the first 1,000."""
     names = list(dict.fromkeys(name for view in story.views for name in view.scores))
     columns = [Column("view"), Column("kind"), Column("time", 3)]
     columns += [Column(name_of(name), _digits(name)) for name in names]
     rows = [
         [view.name, KINDS.get(view.ability, view.ability), view.time, *map(view.scores.get, names)]
-        for view in story.views
+        for view in story.views[:_ROWS]
     ]
-    return Table(columns, rows)
+    count = len(story.views)
+    cut = f"The first {_ROWS} of {count} views; per_image.json has all." if count > _ROWS else ""
+    return Table(columns, rows, cut)
 
 
 def name_of(score: str) -> str:

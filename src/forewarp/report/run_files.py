@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from datetime import datetime
 from pathlib import Path
 from statistics import fmean
 
@@ -15,6 +14,7 @@ from forewarp.report.collect import UNREADABLE, Result, read_run, unreadable
 from forewarp.report.effects import plan_of
 
 _POINTS = 150  # of a stage's loss that are kept
+WHYS = "best", "median", "worst", "earliest", "latest"  # views to look at, as they are shown
 _KINDS = ("particles", "voxels")  # that a scene may consist of
 
 
@@ -49,7 +49,6 @@ class Story:
         curves: of the losses.
         plan: content of ``plan.yaml``; empty if the run follows none.
         unfinished: the stages that are not finished.
-        measured: the day of the measurement; "" if there was none.
     """
 
     result: Result
@@ -57,7 +56,6 @@ class Story:
     curves: Curves
     plan: dict
     unfinished: tuple[str, ...]
-    measured: str
 
 
 def read_story(folder: Path) -> Story:
@@ -72,16 +70,16 @@ def read_story(folder: Path) -> Story:
         planned = result.config.get("stage") or result.stages
         stages = [name for name, stage in planned.items() if stage is not None]
         rows = (read_json(folder / "per_image.json") or {}).get("images", [])
-        views = sorted((_view(row) for row in rows if "psnr" in row["scores"]), key=lambda view: view.name)
+        views = tuple(sorted(_views(rows), key=lambda view: view.name))
         plan = plan_of(result)
-        _ = [(d["choice"], d["on"], d["because"]) for d in plan.get("effects", {}).values()]
+        _ = [(d["choice"], d["on"], d["because"]) for d in (plan.get("effects") or {}).values()]
         curves = read_curves(result, stages)
     except UNREADABLE as error:
         raise ValueError(
             f"run: expected a run whose files can be read, but got {folder} ({unreadable(error)})"
         ) from error
     unfinished = tuple(name for name in stages if name not in result.stages)
-    return Story(result, tuple(views), curves, plan, unfinished, _day(folder / "metrics.json"))
+    return Story(result, views, curves, plan, unfinished)
 
 
 def refuse_other(folder: Path) -> None:
@@ -105,13 +103,13 @@ def refuse_other(folder: Path) -> None:
     )
 
 
-def _view(row: dict) -> View:
-    scores = {name: float(value) for name, value in row["scores"].items()}
-    return View(str(row["name"]), float(row["time"]), str(row["ability"]), scores["psnr"], scores)
-
-
-def _day(path: Path) -> str:
-    return datetime.fromtimestamp(path.stat().st_mtime).date().isoformat() if path.is_file() else ""
+def _views(rows: Sequence[dict]) -> Iterator[View]:
+    """Give the views that have a PSNR; scores that are no finite number are left out."""
+    for row in rows:
+        known = {name: float(value) for name, value in row["scores"].items() if value is not None}
+        scores = {name: value for name, value in known.items() if math.isfinite(value)}
+        if "psnr" in scores and math.isfinite(time := float(row["time"])):
+            yield View(str(row["name"]), time, str(row["ability"]), scores["psnr"], scores)
 
 
 def read_curves(result: Result, stages: Sequence[str]) -> Curves:
@@ -197,15 +195,15 @@ def telling(views: Sequence[View]) -> dict[str, str]:
     >>> seen = ("a", 0.0, 30.0), ("b", 0.5, 20.0), ("c", 1.0, 40.0)
     >>> telling([View(name, time, "all", psnr, {}) for name, time, psnr in seen])
     {'c': 'best', 'a': 'median', 'b': 'worst'}
+    >>> telling([View(name, time, "all", psnr, {}) for name, time, psnr in seen[:2]])
+    {'a': 'best', 'b': 'worst'}
     """
     if not views:
         return {}
     ranked = sorted(views, key=lambda view: (-view.psnr, view.name))
     by_time = sorted(views, key=lambda view: (view.time, view.name))
-    chosen = {ranked[0].name: "best"}
-    for view, why in (
-        *((ranked[len(ranked) // 2], "median"), (ranked[-1], "worst")),
-        *((by_time[0], "earliest"), (by_time[-1], "latest")),
-    ):
+    telling = ranked[0], ranked[-1], ranked[len(ranked) // 2], by_time[0], by_time[-1]
+    chosen = {}
+    for view, why in zip(telling, ("best", "worst", "median", "earliest", "latest")):
         chosen.setdefault(view.name, why)
-    return chosen
+    return dict(sorted(chosen.items(), key=lambda one: WHYS.index(one[1])))

@@ -20,12 +20,14 @@ _THUMB = 96, 70
 @dataclass(frozen=True)
 class Shown:
     """A view: why it is shown, what it is, and its pictures (H, W, 3) in [0, 1]: ``truth``, ``prediction``,
-    ``error`` and ``depth``, or some of them.
+    ``error`` and ``depth``, or some of them. ``side``: pixels of the longer side of the view that was scored,
+    where the pictures were rendered smaller; 0: as they are.
     """
 
     why: str
     about: str
     pictures: Mapping[str, Tensor]
+    side: int = 0
 
 
 @dataclass(frozen=True)
@@ -61,7 +63,7 @@ def held(media: Media, room: float) -> Held:
 def _pictures(shown: Sequence[Shown], room: float) -> tuple[list[dict[str, str]], str]:
     if not shown:
         return [], ""
-    largest = max(max(p.shape[:2]) for one in shown for p in one.pictures.values())
+    largest = max(max(one.side, *p.shape[:2]) for one in shown for p in one.pictures.values())
     for side, quality in _LADDER:
         views = [_encoded(one, side, quality) for one in shown]
         if sum(len(text) for view in views for text in view.values()) <= room:

@@ -9,13 +9,16 @@ from pathlib import Path
 
 from forewarp.files import read_text, replace_file
 from forewarp.progress import time_text
+from forewarp.report.collect import UNREADABLE, unreadable
 from forewarp.report.markup import Html, el, joined
 from forewarp.report.run_facts import (
     KINDS,
     described,
     effects_of,
+    near,
     protocol_of,
     scores_of,
+    seconds_of,
     tiles_of,
     views_table,
 )
@@ -26,7 +29,7 @@ from forewarp.report.tables import Table
 
 STYLE, SCRIPT = (Path(__file__).with_name(f"run_page.{kind}") for kind in ("css", "js"))
 _SMALL = 300  # pictures with a shorter longer side are shown as squares, not blurred
-_SPARE = 4000  # bytes of the room for pictures that their markup takes
+_NOTES = 1000  # bytes that are kept for what the page says about sizes
 
 
 def write_run_page(file: Path, story: Story, media: Media, *, megabytes: float) -> int:
@@ -42,18 +45,34 @@ def write_run_page(file: Path, story: Story, media: Media, *, megabytes: float) 
         bytes written.
 
     Raises:
-        ValueError: if the text alone is larger.
+        ValueError: see ``room_of``.
     """
-    bare = len(page(story, media, Held()).encode())
-    room = 1e6 * megabytes - bare - _SPARE
-    if room < 0:
-        raise ValueError(
-            f"megabytes: expected room for the page's text, {(bare + _SPARE) / 1e6:.2f}, but got "
-            f"{megabytes}; raise it"
-        )
-    text = page(story, media, held(media, room)).encode()
+    text = page(story, media, held(media, room_of(story, media, megabytes))).encode()
     replace_file(file, text)
     return len(text)
+
+
+def room_of(story: Story, media: Media, megabytes: float) -> float:
+    """Return the bytes that a page of so many 10^6 bytes has for pictures and the video.
+
+    Raises:
+        ValueError: in one line, if the text alone is larger, or the run's files hold what no page can show.
+    """
+    views = [dict.fromkeys([*one.pictures, "thumb"], "") for one in media.views]
+    empty = Held(views, "data:" if media.video else "")
+    try:
+        bare = len(page(story, media, empty).encode()) + _NOTES
+    except UNREADABLE as error:
+        raise ValueError(
+            f"run: expected a run whose files can be shown, but got {story.result.folder} "
+            f"({unreadable(error)})"
+        ) from error
+    room = 1e6 * megabytes - bare
+    if room < 0:
+        raise ValueError(
+            f"megabytes: expected room for the page's text, {bare / 1e6:.2f}, but got {megabytes}; raise it"
+        )
+    return room
 
 
 def page(story: Story, media: Media, inside: Held) -> str:
@@ -142,13 +161,13 @@ def _views(media: Media, inside: Held) -> Html | None:
 def _panel(number: int, shown: Shown, pictures: dict[str, str]) -> Html:
     def figure(name: str) -> Html:
         width, height = shown.pictures[name].shape[1::-1]
-        alt = f"{name} of the {shown.why} view: {shown.about}"
+        alt = f"{name}, {shown.why}: {shown.about}"
         small = "small" if max(width, height) < _SMALL else None
         image = el("img", src=pictures[name], alt=alt, width=width, height=height, class_=small)
         return el("figure", image, el("figcaption", name), class_=name)
 
     both = [figure(name) for name in ("truth", "prediction") if name in shown.pictures]
-    label = f"Truth on the left, prediction on the right, of the {shown.why} view"
+    label = f"Truth on the left, prediction on the right: {shown.why}"
     if len(both) == 2:
         cut = {"type": "range", "min": 0, "max": 100, "value": 50, "aria_label": label, "hidden": True}
         both += [el("input", **cut), el("span", class_="seam", aria_hidden="true")]
@@ -184,7 +203,7 @@ def _effects(story: Story) -> Html | None:
             "li",
             el("span", "on" if one.on else "off", class_="badge on" if one.on else "badge"),
             el("b", one.name.replace("_", " ")),
-            el("code", one.choice) if one.choice and (one.on or one.choice != "none") else None,
+            el("code", one.choice) if one.choice else None,
             el("p", one.because),
         )
         for one in effects
@@ -211,8 +230,8 @@ def _scrolled(table: Table, label: str) -> Html:
 
 def _protocol(story: Story) -> Html:
     rows = [joined(el("dt", name), el("dd", value)) for name, value in protocol_of(story)]
-    folder = shlex.quote(str(story.result.folder))
-    again = el("pre", el("code", story.result.command))
+    folder = _folder(story)
+    again = el("pre", el("code", near(story.result.command)))
     closer = f"forewarp-view run={folder}"
     if story.curves.size is not None:
         closer += f"\nforewarp-export run={folder} format=html"
@@ -228,34 +247,57 @@ def _protocol(story: Story) -> Html:
     )
 
 
-def _missing(story: Story, media: Media, inside: Held) -> Html | None:
-    notes: list[str] = []
+def _folder(story: Story) -> str:
+    """Write the run's folder as a command line takes it."""
+    return shlex.quote(near(str(story.result.folder)))
+
+
+def _missing(story: Story, media: Media, inside: Held) -> Html:
+    notes = [*_not_known(story), *map(near, media.missing)]
+    if not media.views:
+        notes.append("No pictures: the run's folder has none of test views, and none of training.")
+    elif not inside.views:
+        notes.append(f"Pictures are {inside.pictures_note}.")
+    if not media.video and not media.missing:
+        how = "" if story.unfinished else f" forewarp-render run={_folder(story)} makes one."
+        notes.append(f"No video: the run's folder has none that was made after training.{how}")
+    if media.video and not inside.video:
+        notes.append(f"The video is {inside.video_note}, as the page has no room for it; raise megabytes.")
+    version = story.result.metrics.get("protocol", {}).get("versions", {}).get("forewarp", "")
+    measured = f" The run was measured by forewarp {version}." if version else ""
+    foot = el("footer", el("p", f"Written by forewarp-report kind=run.{measured}", class_="note"))
+    listed = el("ul", *(el("li", note) for note in notes))
+    return joined(_section("What this page lacks", listed) if notes else None, foot)
+
+
+def _not_known(story: Story) -> list[str]:
+    """Say what the run's files do not tell, and how it can be had."""
+    result, notes = story.result, []
+    measure = f"forewarp-evaluate run={_folder(story)}"
     if story.unfinished:
-        spent = time_text(sum(done["seconds"] for done in story.result.stages.values()))
-        finished = ", ".join(story.result.stages) or "none"
+        have = "has" if len(story.unfinished) == 1 else "have"
         notes.append(
-            f"The run is not finished: of its stages {', '.join(story.unfinished)} has not ended (finished: "
-            f"{finished}; {spent}). It goes on with: forewarp-train resume={story.result.folder}"
+            f"The run is not finished, so it has no scores: of its stages {', '.join(story.unfinished)} "
+            f"{have} not ended (finished: {', '.join(result.stages) or 'none'}; trained for "
+            f"{time_text(seconds_of(story))}). It goes on with: forewarp-train resume={_folder(story)}"
         )
-    elif not story.result.metrics:
-        notes.append(f"The run is not measured. Measure it: forewarp-evaluate run={story.result.folder}")
-    if not story.result.curve:
+    elif not result.metrics:
+        notes.append(f"The run is not measured, so it has no scores. Measure it: {measure}")
+    elif not story.views:
+        notes.append(
+            "No PSNR by view and through the scene's time: per_image.json is missing, cut off or empty. "
+            f"Write it again: {measure}"
+        )
+    if not effects_of(story)[1]:
+        notes.append("No effects: neither a plan nor metrics.json names any.")
+    if not result.curve:
         notes.append(
             "No PSNR against training time: it needs validation views, or data.held_out=N, and some seconds "
             "of training."
         )
-    notes += media.missing
-    if media.views and not inside.views:
-        notes.append(f"Pictures are {inside.pictures_note}.")
-    if media.video and not inside.video:
-        notes.append(f"The video is {inside.video_note}, as the page has no room for it; raise megabytes.")
-    version = story.result.metrics.get("protocol", {}).get("versions", {}).get("forewarp", "")
-    made = f"Written by forewarp-report kind=run. Measured on {story.measured}" if story.measured else ""
-    foot = el("p", f"{made}{', forewarp ' + version if version else ''}.", class_="note") if made else None
-    listed = el("ul", *(el("li", note) for note in notes)) if notes else None
-    if not notes:
-        return el("footer", foot)
-    return joined(_section("What this page lacks", listed), el("footer", foot))
+    if not story.curves.loss:
+        notes.append("No loss: the folders of the stages have no TensorBoard events of it.")
+    return notes
 
 
 def _section(title: str, *parts: object) -> Html:
