@@ -138,7 +138,9 @@ def real(source: Path, folder: Path, steps: int, seeds: list[int]) -> dict:
         (folder / f"{name}.seconds").write_text(f"{spent}")
     names = sorted(path.stem for path in (source / "camera").iterdir())
     given = [hypernerf.read_camera(source / "camera" / f"{one}.json", 0.0, 1.0) for one in names]
-    facts, _ = compared(found, given, names.index)
+    originals = json.loads((found / "capture.json").read_text())["originals"]
+    stems = {Path(ours).stem: Path(theirs).stem for ours, theirs in originals.items()}
+    facts, _ = compared(found, given, lambda name: names.index(stems[Path(name).stem]))
     facts["seconds"] = float((folder / f"{name}.seconds").read_text())
     return facts
 

@@ -14,9 +14,9 @@ from tests.support.sparse_scene import cameras_on_arc, sparse_arc
 GOOD = Evidence(features=900, shift=0.2, unturned=0.5)
 
 
-def pictures(count=12, edges=1.0, masks=None):
+def pictures(count=12, edges=1.0, masks=None, size=(320, 240), originals=()):
     times = {name: float(i) for i, name in enumerate(cameras_on_arc(count))}
-    return Pictures(Path("pictures"), times, masks, count, edges)
+    return Pictures(Path("pictures"), times, masks, count, edges, size, originals)
 
 
 @pytest.mark.parametrize(
@@ -52,6 +52,13 @@ def test_good_matches_and_poses_pass(monkeypatch):
             "most of 12 pictures registered, but got 5; film slower and with more",
         ),
         (lambda: sparse_arc(count=5), {"edges": 4.0}, "but got 5; edges are 4 pixels wide"),
+        (lambda: None, {}, r"but got 0; .*, take more frames \(frames=\), or give"),
+        (lambda: None, {"originals": {"picture_000001.jpg": "a.jpg"}}, "0; .*, take more pictures, or give"),
+        (
+            sparse_arc,
+            {"size": (640, 480)},
+            "colmap: expected cameras of 640 x 480 pixels, as the pictures, but got 320 x 240; set images=",
+        ),
         (lambda: sparse_arc(focal=60.0), {}, "at most 130 degrees, but got 139; a fisheye"),
         (lambda: sparse_arc(lens=Lens((-2.0, 0.0, 0.0))), {}, "a lens that can be undone .* a fisheye"),
         (
@@ -60,14 +67,24 @@ def test_good_matches_and_poses_pass(monkeypatch):
             "moves sideways, but its places are 0.08 % of the distance",
         ),
         (lambda: sparse_arc(error=3.0), {}, "reprojection error of at most 2.5 pixels, but got 3.0"),
-        (lambda: sparse_arc(points=0), {}, "expected points beside the cameras, but got none"),
-        (lambda: sparse_arc(), {"count": 11}, "a picture frame_000012.jpg, as the model has, but got none"),
+        (lambda: sparse_arc(points=0), {}, "expected points that cameras see, but got none"),
+        (
+            lambda: replace(sparse_arc(), seen=np.zeros((0, 2), np.int64)),
+            {},
+            "points that cameras see, but got none; keep points3D and its tracks",
+        ),
     ],
 )
 def test_bad_poses_are_refused_with_advice(monkeypatch, sparse, given, says):
     monkeypatch.setattr(refusals, "evidence_of", lambda database: GOOD)
     with pytest.raises(ValueError, match=says):
         refuse_poses(sparse(), pictures(**given), Path("database.db"))
+
+
+def test_of_known_poses_three_are_enough():
+    refuse_poses(sparse_arc(count=3), pictures())
+    with pytest.raises(ValueError, match="a model of at least 3 pictures, but got 2"):
+        refuse_poses(sparse_arc(count=2), pictures())
 
 
 @pytest.mark.parametrize(("moves", "least", "most"), [(0.0, 0.0, 1e-6), (0.002, 0, 0.06), (0.3, 0.08, 1.0)])

@@ -36,12 +36,26 @@ def test_a_model_is_read_as_it_was_written(tmp_path, model, lens):
     assert len(found.sure()) == 40
 
 
+def test_cameras_come_in_the_order_of_time_under_our_names(tmp_path):
+    """Of the users' names 1, 2, ... 12 the plain order is 1, 10, 11, 12, 2 ..."""
+    cameras = cameras_on_arc(12)
+    theirs = [f"IMG{n}.jpg" for n in range(1, 13)]
+    write_model(tmp_path / "sparse", dict(zip(theirs, cameras.values())), POINTS)
+    found = read_model(tmp_path / "sparse", dict(zip(cameras, theirs)))
+    assert list(found.cameras) == list(cameras)
+    for name, camera in cameras.items():
+        torch.testing.assert_close(found.cameras[name].camera_to_world, camera.camera_to_world)
+
+
 def test_what_cannot_be_read_is_refused(tmp_path):
     with pytest.raises(ValueError, match="expected a folder with cameras.bin, images.bin and points3D.bin"):
         read_model(tmp_path)
     write_model(tmp_path / "fish", cameras_on_arc(3), POINTS, "OPENCV_FISHEYE", LENS)
     with pytest.raises(ValueError, match="with k1 k2 k3 p1 p2, as OPENCV, but got OPENCV_FISHEYE; undistort"):
         read_model(tmp_path / "fish")
+    write_model(tmp_path / "more", cameras_on_arc(3), POINTS)
+    with pytest.raises(ValueError, match="a picture frame_000002.jpg, as the model has, but got none"):
+        read_model(tmp_path / "more", {"picture_000001.jpg": "frame_000001.jpg"})
     write_model(tmp_path / "torn", cameras_on_arc(3), POINTS)
     (tmp_path / "torn" / "cameras.txt").write_text("1 OPENCV x\n")
     with pytest.raises(ValueError, match="torn: expected a COLMAP model, but got"):

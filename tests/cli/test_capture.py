@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -9,6 +10,7 @@ import time
 
 import numpy as np
 import pytest
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from PIL import Image
 
 from forewarp.data.posed_video import read_scene
@@ -80,6 +82,9 @@ def things(in_tmp):
             ["video=few.mp4", "matching=x"],
             "matching: expected one of auto, sequential, exhaustive, but got 'x'",
         ),
+        (["video=few.mp4", "out=."], "out: expected a folder to be made, but got ., which you are in"),
+        (["images=2024_11"], "images: expected an existing folder, but got none: 2024_11;"),
+        (["video=VID (1),a=b.mp4"], "video: expected an existing file, but got none: VID (1),a=b.mp4;"),
         (
             ["video=few.mp4", "out=pictures"],
             "pictures: expected no folder, an empty one, or one written before",
@@ -138,6 +143,16 @@ def test_cameras_that_do_not_walk_are_refused(refused, in_tmp, frames, says):
 
 
 @needs_pycolmap
+def test_pictures_with_spaces_and_alpha_are_matched(refused, in_tmp):
+    """That they stand is known from their matches alone."""
+    (in_tmp / "p").mkdir()
+    for n, frame in enumerate(stood(3)):
+        Image.fromarray(frame).convert("RGBA").save(in_tmp / "p" / f"IMG {n}.png")
+    said = refused("capture", "images=p", "threads=1", "features=400")
+    assert "camera: expected one that moves, but matches shift by 0." in said
+
+
+@needs_pycolmap
 def test_poses_that_are_known_become_a_scene(ok, refused, in_tmp):
     cameras = cameras_on_arc(8)
     write_pictures(in_tmp / "pictures", cameras)
@@ -161,6 +176,72 @@ def test_poses_that_are_known_become_a_scene(ok, refused, in_tmp):
     assert "expected a new folder, but got a scene; set overwrite=true" in refused("capture", *words)
     ok("capture", *words, "overwrite=true")
     assert not [path for path in (in_tmp / "captures").iterdir() if path.name != "hand"]
+
+
+@needs_pycolmap
+def test_known_poses_keep_cut_outs_as_they_are_stored(ok, refused, in_tmp):
+    cameras = {f"IMG_{n}.png": camera for n, camera in enumerate(cameras_on_arc(8).values())}
+    exif = Image.Exif()
+    exif[0x0112] = 6  # to be turned, but the poses are of the pictures as stored
+    (in_tmp / "p").mkdir()
+    for name in cameras:
+        cut_out = np.zeros((240, 320, 4), np.uint8)
+        cut_out[:120, :160] = (200, 100, 50, 255)
+        Image.fromarray(cut_out).save(in_tmp / "p" / name, exif=exif)
+    write_model(in_tmp / "sparse", cameras, POINTS)
+    ok("capture", "images=p", "colmap=sparse", "out=hand")
+    for scale in (1, 2):
+        scene = read_scene(".", "hand", scale=scale)
+        assert scene.has_alpha
+        pixels = scene.train[0].load()
+        assert pixels.shape[:2] == (240 // scale, 320 // scale)
+        assert pixels[0, 0].tolist() == [200, 100, 50, 255]
+        assert pixels[-1, -1, 3] == 0
+    other = {name: camera.resized(160, 120) for name, camera in cameras.items()}
+    write_model(in_tmp / "small", other, POINTS)
+    said = refused("capture", "images=p", "colmap=small", "out=small_hand")
+    assert "expected cameras of 320 x 240 pixels, as the pictures, but got 160 x 120" in said
+
+
+@needs_pycolmap
+@pytest.mark.parametrize("name", ["20241122_101500", "my hand", "VID (1), it's"])
+def test_the_next_line_can_be_typed_as_it_is_printed(ok, in_tmp, name):
+    """Names as phones give them: of the folder, of the pictures, and of the scene."""
+    cameras = cameras_on_arc(14)
+    theirs = {f"IMG{n}.jpg": camera for n, camera in enumerate(cameras.values(), 1)}
+    write_pictures(in_tmp / name, theirs)
+    write_model(in_tmp / "sparse", dict(list(theirs.items())[:6]), POINTS)  # fewer than half
+    said = ok("capture", f"images={name}", "colmap=sparse").out.splitlines()
+    about = json.loads((in_tmp / "captures" / name / "capture.json").read_text())
+    assert list(about["originals"].values()) == list(theirs)
+    assert about["left_out"] == list(theirs)[6:]
+    words = shlex.split(said[-1].removeprefix("next: "))
+    assert words[:2] == ["forewarp-train", "experiment=video_with_poses"]
+    read = OverridesParser.create().parse_overrides(words[1:])
+    assert [override.value() for override in read[1:]] == ["captures", name]
+    scene = read_scene("captures", name)
+    assert len(scene.train) + len(scene.test) == 6
+
+
+@needs_pycolmap
+def test_masks_that_changed_are_read_again(forewarp, refused, in_tmp, monkeypatch):
+    """Work that was interrupted is gone on with by the same masks alone."""
+    cameras = cameras_on_arc(3)
+    write_pictures(in_tmp / "pictures", cameras)
+    (in_tmp / "masks").mkdir()
+    for name in cameras:
+        Image.new("L", (320, 240), 255).save(in_tmp / "masks" / f"{name[:-4]}.png")
+    words = ["images=pictures", "masks=masks", "out=hand"]
+
+    def stop(*arguments):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr("forewarp.capture.poses.find_features", stop)
+        assert forewarp("capture", *words).status == 130
+    for name in cameras:
+        Image.new("L", (320, 240), 1).save(in_tmp / "masks" / f"{name[:-4]}.png")
+    assert "brighter than 127 of 255, but got at most 1" in refused("capture", *words)
 
 
 def film(folder, count=30):

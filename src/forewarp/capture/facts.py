@@ -18,12 +18,14 @@ def facts_of(source, pictures: Pictures, sparse: Sparse, limits: Limits, scales:
     camera = next(iter(sparse.cameras.values()))
     times = [pictures.times[name] for name in sparse.cameras]
     lens = camera.lens
+    left_out = sorted(pictures.times.keys() - sparse.cameras.keys())
     return {
         "source": str(source.path),
         "found": pictures.found,
         "pictures": len(pictures.times),
         "registered": len(sparse.cameras),
-        "left_out": sorted(pictures.times.keys() - sparse.cameras.keys()),
+        "left_out": [pictures.originals.get(name, name) for name in left_out],
+        "originals": pictures.originals,
         "seconds": max(times) - min(times) if source.video is not None else None,
         "reprojection_error": sparse.error,
         "points": len(sparse.points),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -49,16 +50,15 @@ def capture(
         how: how poses are found.
         told: gives a ``Progress`` for each step.
         frames: to choose from a video.
-        size: most pixels of the longer side; with poses that are known it is left as it is.
+        size: most pixels of the longer side; with poses that are known pictures are left as stored.
 
     Raises:
         ValueError: where nothing good comes of it, with advice; nothing is then left behind.
     """
     about = {**dataclasses.asdict(source), **dataclasses.asdict(how), "frames": frames, "size": size}
     del about["threads"]
-    about["bytes"], about["changed"] = _state(source.path)
-    if source.colmap is not None:
-        size = None
+    about["files"] = [_state(path) for path in (source.path, source.masks) if path is not None]
+    known = source.colmap is not None
     with workplace(out, about) as place:
         pictures = take(
             place,
@@ -66,10 +66,14 @@ def capture(
             video=source.video is not None,
             masks=source.masks,
             count=frames,
-            size=size,
+            size=None if known else size,
             told=told,
+            upright=not known,
         )
-        sparse = _found(place, pictures, how, told) if source.colmap is None else read_model(source.colmap)
+        if known:
+            sparse = read_model(source.colmap, pictures.originals)
+        else:
+            sparse = _found(place, pictures, how, told)
         refuse_poses(sparse, pictures)
         sparse = placed(sparse)
         limits = limits_of(sparse)
@@ -105,8 +109,8 @@ def _found(place: Path, pictures: Pictures, how: poses.Search, told: Told) -> Sp
     return sparse_of(model)
 
 
-def _state(path: Path) -> tuple[int, int]:
-    """Bytes and time of change of a file, or of the files of a folder."""
-    files = [path] if path.is_file() else [file for file in path.iterdir() if file.is_file()]
-    states = [file.stat() for file in files]
-    return sum(s.st_size for s in states), max((s.st_mtime_ns for s in states), default=0)
+def _state(path: Path) -> str:
+    """A digest of the name, bytes and time of change of a file, or of each file of a folder."""
+    files = [path] if path.is_file() else sorted(file for file in path.iterdir() if file.is_file())
+    states = [(file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in files]
+    return hashlib.sha256(repr(states).encode()).hexdigest()

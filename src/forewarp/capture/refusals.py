@@ -16,7 +16,7 @@ FEW_FEATURES = 60  # of a picture, in the median
 STILL = 0.01  # share of a picture's longer side: a camera that stands shifts less
 BLURRED = 3.0  # pixels of a picture 640 wide: edges of sharp pictures are 0.5 to 1.5 wide
 TURNED = 0.06  # share of the shift that no turn of the camera explains
-LEAST_REGISTERED = 0.5
+LEAST_MODEL, LEAST_REGISTERED = 3, 0.5  # pictures; share of them, where poses are searched for
 WIDEST = 130.0  # degrees
 WORST_ERROR = 2.5  # pixels
 LEAST_PARALLAX = 0.01  # the extent of the cameras' places as a share of the distance of what they see
@@ -69,23 +69,27 @@ def refuse_poses(sparse: Sparse | None, pictures: Pictures, database: Path | Non
     Raises:
         ValueError: with what was found, and advice.
     """
-    names = set() if sparse is None else sparse.cameras.keys()
-    if unknown := sorted(names - pictures.times.keys()):
+    registered, total = 0 if sparse is None else len(sparse.cameras), len(pictures.times)
+    if database is None and registered < LEAST_MODEL:
         raise ValueError(
-            f"images: expected a picture {unknown[0]}, as the model has, but got none; set images="
+            f"colmap: expected a model of at least {LEAST_MODEL} pictures, but got {registered}; set another"
         )
-    registered, total = len(names), len(pictures.times)
-    if registered < max(3, LEAST_REGISTERED * total):
-        found = evidence_of(database) if database is not None else None
-        advice = _advice(found, pictures) if found else "choose a model of more of them"
+    if database is not None and registered < max(LEAST_MODEL, LEAST_REGISTERED * total):
+        advice = _advice(evidence_of(database), pictures)
         raise ValueError(
             f"poses: expected most of {total} pictures registered, but got {registered}; {advice}"
         )
-    if not len(sparse.points):
+    if not len(sparse.seen):
         raise ValueError(
-            "poses: expected points beside the cameras, but got none; keep points3D in the model"
+            "poses: expected points that cameras see, but got none; keep points3D and its tracks in it"
         )
-    camera = next(iter(sparse.cameras.values()))
+    for camera in sparse.cameras.values():
+        if (camera.width, camera.height) != pictures.size:
+            expected, got = "{} x {}".format(*pictures.size), f"{camera.width} x {camera.height}"
+            raise ValueError(
+                f"colmap: expected cameras of {expected} pixels, as the pictures, but got {got}; set images= "
+                "to the pictures that the model was made from"
+            )
     degrees = np.degrees(2 * np.arctan(camera.width / (2 * camera.fx)))
     try:
         check_lens(camera, "lens")
@@ -182,7 +186,7 @@ def _advice(found: Evidence, pictures: Pictures) -> str:
         return "there is no texture but on what the masks call moving; put textured things around it"
     if found.features < FEW_FEATURES:
         return "there is hardly any texture; put textured things around the subject, as newspapers"
+    more = "take more pictures" if pictures.originals else "take more frames (frames=)"
     return (
-        "film slower and with more of what stands still in the picture, take more frames (frames=), or give "
-        "masks= of what moves"
+        f"film slower and with more of what stands still in the picture, {more}, or give masks= of what moves"
     )

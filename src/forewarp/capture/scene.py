@@ -7,9 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
+from forewarp.capture.pictures import shrunk
 from forewarp.capture.place import Limits
 from forewarp.capture.sparse import Sparse
-from forewarp.data.images import read_image, write_jpeg, write_png
+from forewarp.data.images import common_header, read_image, write_jpeg, write_png
 from forewarp.data.posed_video import SCALES, PosedShot, write_scene
 
 _LEAST_SIDE = 96  # pixels: smaller copies are of no use
@@ -34,11 +35,13 @@ def write(
     names = sorted(sparse.cameras, key=lambda name: times[name])
     first, last = times[names[0]], times[names[-1]]
     camera = sparse.cameras[names[0]]
+    has_alpha = common_header([pictures / name for name in names]).has_alpha
     scales = [s for s in SCALES[1:] if min(camera.width, camera.height) // s >= _LEAST_SIDE]
 
     def shots() -> Iterator[PosedShot]:
         for done, name in enumerate(names):
-            pixels = read_image(pictures / name)[..., :3].numpy()
+            pixels = read_image(pictures / name).numpy()
+            pixels = pixels if has_alpha else pixels[..., :3]
             for scale in scales:
                 _write_smaller(folder / f"images_{scale}" / name, pixels, scale)
             time = (times[name] - first) / (last - first)
@@ -53,6 +56,5 @@ def write(
 def _write_smaller(path: Path, pixels: np.ndarray, scale: int) -> None:
     """Write the mean of each block of ``scale`` x ``scale`` pixels; leave out what is left at the ends."""
     height, width = (n // scale for n in pixels.shape[:2])
-    blocks = pixels[: height * scale, : width * scale].reshape(height, scale, width, scale, 3)
-    small = blocks.mean((1, 3)).round().astype(np.uint8)
+    small = shrunk(pixels[: height * scale, : width * scale], height, width)
     (write_png if path.suffix.lower() == ".png" else write_jpeg)(path, small)

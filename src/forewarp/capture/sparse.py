@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,7 +18,7 @@ _VIEWS, _ERROR = 3, 1.5  # a point that is sure: seen by so many cameras, to so 
 
 @dataclass(frozen=True)
 class Sparse:
-    """``cameras`` by the picture's name, in order of the names, near and far 0; ``points`` (N, 3) with
+    """``cameras`` by the picture's name, in the order of time, near and far 0; ``points`` (N, 3) with
     ``colors`` (N, 3) uint8, reprojection ``errors`` (N,) in pixels and how many pictures see each, ``views``
     (N,); ``seen`` (M, 2) which camera sees which point; ``error`` the mean over all observations, pixels.
     """
@@ -51,11 +52,15 @@ class Sparse:
         return replace(self, cameras=cameras, points=scale * (self.points - center) @ turn.T)
 
 
-def read_model(folder: Path) -> Sparse:
+def read_model(folder: Path, originals: Mapping[str, str] | None = None) -> Sparse:
     """Read a COLMAP model, binary or text.
 
+    Args:
+        folder: of the model.
+        originals: names of pictures in the model by those that they are to have; None: they stay.
+
     Raises:
-        ValueError: where there is none, or one that cannot be read.
+        ValueError: where there is none, or one that cannot be read, or that has other pictures.
     """
     import pycolmap
 
@@ -73,11 +78,21 @@ def read_model(folder: Path) -> Sparse:
     except (RuntimeError, ValueError, IndexError, OverflowError, MemoryError) as error:
         text = (str(error).strip().splitlines() or ["a file that cannot be read"])[-1]
         raise ValueError(f"{folder}: expected a COLMAP model, but got {text}; export it again") from error
+    if originals is None:
+        return sparse_of(found)
+    ours = {original: name for name, original in originals.items()}
+    unknown = {image.name for image in found.images.values() if image.has_pose} - ours.keys()
+    if unknown:
+        raise ValueError(
+            f"images: expected a picture {min(unknown)}, as the model has, but got none; set images="
+        )
+    for image in found.images.values():
+        image.name = ours.get(image.name, image.name)
     return sparse_of(found)
 
 
 def sparse_of(found) -> Sparse:
-    """Take cameras and points out of a ``pycolmap.Reconstruction``.
+    """Take cameras and points out of a ``pycolmap.Reconstruction``, whose pictures' names sort by time.
 
     Raises:
         ValueError: for a camera model that pinhole cameras with Brown's distortion do not cover.

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import sys
+
 from forewarp.cli.entry import command
+from forewarp.runs.overrides import command_line, key_of, text_override
 
 HELP = """
 forewarp-capture makes a scene from a video: it takes the sharpest frames, finds the cameras' poses from what
@@ -27,6 +30,7 @@ What one types most:
 After Ctrl-C the same command goes on.
 """
 MATCHING = ("auto", "sequential", "exhaustive")
+PATHS = ("video", "images", "colmap", "masks", "out")
 LENSES = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 
 
@@ -46,7 +50,8 @@ def capture(config) -> None:
     for line in told(facts):
         print(line)
     print(f"written: {out}; see {Path(out) / PICTURE}")
-    print(f"next: forewarp-train experiment=video_with_poses data.root={out.parent} data.scene={out.name}")
+    where = [text_override("data.root", str(out.parent)), text_override("data.scene", out.name)]
+    print(f"next: {command_line('train', ['experiment=video_with_poses', *where])}")
 
 
 def check(config) -> tuple[dict, object]:
@@ -57,10 +62,7 @@ def check(config) -> tuple[dict, object]:
     from forewarp.data.files import MARKERS
     from forewarp.files import check_replaceable
 
-    source = {
-        key: None if config[key] is None else Path(config[key])
-        for key in ("video", "images", "colmap", "masks")
-    }
+    source = {key: None if config[key] is None else Path(config[key]) for key in PATHS if key != "out"}
     video, images = source["video"], source["images"]
     if (video is None) == (images is None):
         got = "both" if video else "neither"
@@ -91,14 +93,33 @@ def check(config) -> tuple[dict, object]:
     if find_spec("pycolmap") is None:
         raise ImportError("capture: expected pycolmap, but got none; install forewarp[capture]")
     out = Path(config.out or Path("captures") / (video or images).resolve().stem)
+    if Path.cwd().is_relative_to(out.resolve()):
+        raise ValueError(f"out: expected a folder to be made, but got {out}, which you are in; name another")
     if (out / MARKERS["posed_video"]).exists() and not config.overwrite:
         raise ValueError(f"{out}: expected a new folder, but got a scene; set overwrite=true or out=...")
     check_replaceable(out, "capture.json")
     return source, out
 
 
+def as_text(arguments: list[str]) -> list[str]:
+    """Quote paths so that Hydra keeps them as they were typed: ``2024``, ``VID (1).mp4``.
+
+    >>> as_text(["images=2024", "out=null", "video='a b.mp4'", "seed=1"])
+    ["images='2024'", 'out=null', "video='a b.mp4'", 'seed=1']
+    """
+    if {"-m", "--multirun"} & set(arguments):  # there a comma is between several
+        return arguments
+    found = []
+    for argument in arguments:
+        key, _, value = argument.partition("=")
+        bare = key_of(argument) in PATHS and value not in ("", "null") and value[0] not in "'\"$"
+        found.append(text_override(key, value) if bare else argument)
+    return found
+
+
 def main() -> None:
     """Run the console script."""
+    sys.argv[1:] = as_text(sys.argv[1:])
     command("capture", capture, HELP)
 
 
