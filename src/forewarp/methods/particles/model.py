@@ -17,7 +17,7 @@ from forewarp.methods.particles.effects import Effects, cosines
 from forewarp.methods.particles.nodes import Nodes
 from forewarp.methods.particles.planning import EFFECTS, ParticlesPlanning
 from forewarp.methods.particles.rest import come_to_rest
-from forewarp.methods.particles.rows_adam import RowsAdam
+from forewarp.methods.rows_adam import RowsAdam
 from forewarp.methods.particles.settings import Numbers, told_by
 from forewarp.methods.particles.skin import Skin
 from forewarp.methods.particles.snapshot import ParticlesSnapshot
