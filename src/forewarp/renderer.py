@@ -77,8 +77,8 @@ class Renderer:
         """Render R rays.
 
         Args:
-            field: density and colour at one time; where one network gives both, its ``look_up`` is asked for the
-                density (P,) of points and a function that colours some of them, seen along directions.
+            field: density and colour at one time; ``look_up``, where one network gives both: points (P, 3)
+                -> density (P,), and a function: rows (K,) of them, directions (K, 3) -> colour (K, 3).
             rays: origins, unit directions, near and far.
             background: colour (3,) or (R, 3) behind everything.
             shade: turns features and directions into colour; None: the first 3 features are the colour.
@@ -94,7 +94,8 @@ class Renderer:
             return self._traced(field, rays, background, shade, generator)
         count, step = len(rays), self.step * field.voxel_size
         ray_ids, distances, points = self._samples(field, rays, step, generator)
-        density, color_of = field.look_up(points) if hasattr(field, "look_up") else (field.density(points), None)
+        at_once = hasattr(field, "look_up")
+        density, color_of = field.look_up(points) if at_once else (field.density(points), None)
         weights, transmittance = render_weights(density * step, ray_ids, count)
         kept = slice(None)
         if self.color_threshold > 0:

@@ -76,7 +76,7 @@ class Occupancy(nn.Module):
         self._judge()
 
     def bounds(self, alpha: float) -> Box | None:
-        """Bound the cells more opaque than ``alpha`` across one cell, and those beside them; None: no cell."""
+        """Bound the cells more opaque than ``alpha`` across one cell and those beside them; None: none."""
         rows = self._rows((self._opacity() > alpha).nonzero()[:, 0])
         if not len(rows):
             return None

@@ -19,12 +19,12 @@ def read_strided(grid: VoxelGrid, points: Tensor, strides: Sequence[int], *, pad
         points: (P, 3), world units.
         strides: ascending, the last a multiple of the others. Along each axis a lattice of n voxels needs
             n - 1 to be a multiple of the last.
-        padded: add zeros behind the last voxel until that is so, and stretch all over the box: voxels are then
-            not where the lattice has them.
+        padded: add zeros behind the last voxel until that is so, and stretch all over the box: voxels are
+            then not where the lattice has them.
 
     Returns:
-        (P, C S), the channels of the first stride first; 0 outside the box. Differentiable in the grid's values
-        and in the points.
+        (P, C S), the channels of the first stride first; 0 outside the box. Differentiable in the grid's
+        values and in the points.
 
     Raises:
         ValueError: for a lattice of other sizes, unless ``padded``.
@@ -42,7 +42,7 @@ def read_strided(grid: VoxelGrid, points: Tensor, strides: Sequence[int], *, pad
 
 
 def _indices(grid: VoxelGrid, strides: tuple[int, ...], padded: bool) -> tuple[Tensor, list[Tensor]]:
-    """Return the index, padded where asked for, and every s-th entry of it; kept until the lattice changes."""
+    """Return the index, padded where asked for, and every s-th entry of it; kept until the grid changes."""
     known = getattr(grid, "_strided", None)
     if known is None or known[0] is not grid.index or known[1] != (strides, padded):
         missing = [(1 - n) % strides[-1] for n in grid.index.shape]

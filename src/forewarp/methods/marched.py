@@ -11,8 +11,10 @@ from torch import Tensor
 
 from forewarp import losses
 from forewarp.fields.occupancy import Occupancy
-from forewarp.fields.voxel_grid import adopted_in, misfit_in
+from forewarp.fields.radiance_grid import Activation
+from forewarp.fields.voxel_grid import VoxelGrid, adopted_in, misfit_in
 from forewarp.methods.method import Method, Snapshot, Start, Step
+from forewarp.methods.rows import renew_parameters
 from forewarp.methods.rows_adam import RowsAdam
 from forewarp.ops.warmup import warm_up
 from forewarp.renderer import Marched, Renderer
@@ -74,8 +76,8 @@ class _Placed:
 class MarchedMethod(Method):
     """Rays marched at equal steps through a box, lattices that grow during a stage, Adam by rows.
 
-    A subclass makes its lattices for ``num_voxels``, ends its constructor with ``begin``, and says what it
-    is at a moment (``field``) and how it grows (``grow``).
+    A subclass makes its lattices for ``num_voxels``, sets the ``shift`` of its ``activation``, ends its
+    constructor with ``begin``, and says what it is at a moment (``field``) and how it grows (``grow``).
 
     Args:
         start: scene, stage and numbers.
@@ -95,8 +97,6 @@ class MarchedMethod(Method):
         self.renderer = Renderer(step=marching.step, color_threshold=marching.color_threshold)
         self.renderer = self.renderer.with_threshold(threshold)
         self.occupancy = Occupancy(box, side=marching.occupancy, patience=8) if marching.occupancy else None
-        cells = max(1, marching.occupancy)
-        self.marched = Lattice(box, (cells + 1,) * 3)
 
     def begin(self) -> None:
         """Note where the schedule stands, once all parameters are there."""
@@ -109,9 +109,18 @@ class MarchedMethod(Method):
         return self.schedule[-1][1]
 
     @property
-    def voxel_size(self) -> float:
-        """Size of the voxels that a step is a share of, world units."""
+    def lattice_marched(self) -> Lattice:
+        """The lattice that a step is a share of, as it is now."""
         raise NotImplementedError
+
+    def marching_lattice(self, num_voxels: float) -> Lattice:
+        """Return that lattice with about ``num_voxels`` voxels."""
+        raise NotImplementedError
+
+    @property
+    def activation(self) -> Activation:
+        """Density of raw density; its unit of length is a voxel of the last lattice."""
+        return Activation(self.shift, self.marching_lattice(self.last_voxels).voxel_size)
 
     def field(self, moment: Moment) -> PointField:
         """Return what is to be asked at a moment."""
@@ -160,7 +169,8 @@ class MarchedMethod(Method):
         """Return a field as the renderer asks it."""
         everywhere = torch.ones(1, 1, 1, dtype=torch.bool, device=self.device)
         cells = everywhere if self.occupancy is None else self.occupancy.cells
-        return _Placed(field, self.marched, cells, self.voxel_size)
+        lattice = Lattice(self.box, tuple(n + 1 for n in cells.shape))
+        return _Placed(field, lattice, cells, self.lattice_marched.voxel_size)
 
     def advance(self, progress: float, step: int, optimizer: torch.optim.Optimizer) -> dict[str, float]:
         """See ``Method``; grow, after which optimiser and learning rates start anew; look for matter."""
@@ -199,6 +209,14 @@ class MarchedMethod(Method):
         """Return what in a stored grid contradicts its lattice, as kernels do not check the index."""
         return misfit_in(self, state)
 
+    def get_extra_state(self) -> dict:
+        """Return the box in plain numbers."""
+        return {"low": list(self.box.low), "high": list(self.box.high)}
+
+    def set_extra_state(self, state: dict) -> None:
+        """Adopt a checkpoint's box."""
+        self.box = Box(tuple(state["low"]), tuple(state["high"]))
+
     def departures(self) -> Sequence[str]:
         """List what differs from the publication beside the marching."""
         return ()
@@ -235,6 +253,18 @@ class MarchedSnapshot(Snapshot):
     def holds(self, moment: Moment) -> bool:
         """Return whether it is the same time, seen by the same camera."""
         return (moment.time, moment.camera) == (self.moment.time, self.moment.camera)
+
+
+def whole_grid(lattice: Lattice, channels: dict[str, int]) -> VoxelGrid:
+    """Make a grid of zeros of all voxels of a lattice."""
+    return VoxelGrid(lattice, torch.ones(lattice.shape, dtype=torch.bool), channels)
+
+
+def regrow(grid: VoxelGrid, lattice: Lattice, optimizer: torch.optim.Optimizer) -> None:
+    """Interpolate such a grid to another lattice; its moments start at 0."""
+    before = [grid.parameter(name) for name in grid.names]
+    grid.resample(lattice, torch.ones(lattice.shape, dtype=torch.bool), dict.fromkeys(grid.names, 0.0))
+    renew_parameters(optimizer, before, [grid.parameter(name) for name in grid.names], None)
 
 
 def _checked(start: Start) -> list[tuple[float, float]]:

@@ -1,5 +1,5 @@
-"""TiNeuVox: a small network moves each sample, a voxel grid is read there at three strides, and a network that
-also knows position and time turns what was read into density and colour.
+"""TiNeuVox: a small network moves each sample, a voxel grid is read there at three strides, and a network
+that also knows position and time turns what was read into density and colour.
 """
 
 from __future__ import annotations
@@ -11,17 +11,14 @@ from torch import Tensor, nn
 
 from forewarp.fields.mlp import mlp
 from forewarp.fields.radiance import density_shift
-from forewarp.fields.radiance_grid import Activation
 from forewarp.fields.strided import read_strided
 from forewarp.fields.template import Template
-from forewarp.fields.voxel_grid import VoxelGrid
-from forewarp.methods.marched import MarchedMethod, Marching
+from forewarp.methods.marched import MarchedMethod, Marching, regrow, whole_grid
 from forewarp.methods.method import Start
-from forewarp.methods.rows import renew_parameters
 from forewarp.ops.encode import encoded_size, positional_encoding
 from forewarp.ops.variation import huber_variation
 from forewarp.scene.batch import Batch
-from forewarp.scene.box import Box, Lattice
+from forewarp.scene.box import Lattice
 from forewarp.scene.view import Moment
 
 _STRIDES = (1, 2, 4)
@@ -41,8 +38,8 @@ class TiNeuVox(MarchedMethod):
         width: of the networks.
         alpha_init: opacity at first of a voxel of the last lattice.
         camera: let colour depend on the number of the camera that took a picture (the rig's two).
-        padded: a fault of the released code: reading strides 2 and 4, it adds zeros at the grid's high ends, and so
-            places voxels elsewhere than where they are trained after the next growth. False: sizes of 4 k + 1.
+        padded: a fault of the released code: before it reads, it adds zeros at the grid's high ends, so that
+            voxels lie elsewhere after the grid has grown. False: sizes of 4 k + 1.
         position_frequencies, time_frequencies, feature_frequencies, direction_frequencies: octaves.
     """
 
@@ -68,10 +65,8 @@ class TiNeuVox(MarchedMethod):
         self.padded, self.still = padded, start.scene.still
         self.frozen_from = float(start.numbers.get("frozen_from", 1.0))
         self.octaves = position_frequencies, time_frequencies, feature_frequencies, direction_frequencies
-        scale = self._lattice(self.last_voxels).voxel_size
-        self.activation = Activation(density_shift(alpha_init), scale)
-        lattice = self._lattice(self.schedule[0][1])
-        self.grid = VoxelGrid(lattice, torch.ones(lattice.shape, dtype=torch.bool), {"features": channels})
+        self.shift = density_shift(alpha_init)
+        self.grid = whole_grid(self.marching_lattice(self.schedule[0][1]), {"features": channels})
         place, moment, direction = (
             encoded_size(size, n)
             for size, n in ((3, position_frequencies), (1, time_frequencies), (3, direction_frequencies))
@@ -85,8 +80,8 @@ class TiNeuVox(MarchedMethod):
         self.head = Template(read + place + code, condition, width=width, layers=1, skip=None)
         self.begin()
 
-    def _lattice(self, num_voxels: float) -> Lattice:
-        """Return the lattice of about ``num_voxels``, with sizes of 4 k + 1 unless ``padded``."""
+    def marching_lattice(self, num_voxels: float) -> Lattice:
+        """See ``MarchedMethod``; sizes are 4 k + 1 unless ``padded``."""
         lattice = Lattice.of_count(self.box, num_voxels)
         if self.padded:
             return lattice
@@ -94,9 +89,9 @@ class TiNeuVox(MarchedMethod):
         return Lattice(self.box, tuple(last * max(1, round((n - 1) / last)) + 1 for n in lattice.shape))
 
     @property
-    def voxel_size(self) -> float:
+    def lattice_marched(self) -> Lattice:
         """See ``MarchedMethod``."""
-        return self.grid.lattice.voxel_size
+        return self.grid.lattice
 
     def field(self, moment: Moment) -> TiNeuVoxField:
         """See ``MarchedMethod``."""
@@ -113,9 +108,7 @@ class TiNeuVox(MarchedMethod):
 
     def grow(self, num_voxels: float, optimizer: torch.optim.Optimizer) -> None:
         """See ``MarchedMethod``."""
-        before, lattice = [self.grid.features], self._lattice(num_voxels)
-        self.grid.resample(lattice, torch.ones(lattice.shape, dtype=torch.bool), {"features": 0.0})
-        renew_parameters(optimizer, before, [self.grid.features], None)
+        regrow(self.grid, self.marching_lattice(num_voxels), optimizer)
 
     def advance(self, progress: float, step: int, optimizer: torch.optim.Optimizer) -> dict[str, float]:
         """See ``Method``; at last, where asked for, round the grid to half precision and let it stay."""

@@ -41,7 +41,9 @@ def second_variation(volume: Tensor) -> Tensor:
     """
     check_shape("volume", volume, ("X", "Y", "Z", "C"))
     if min(volume.shape[:3]) < 3:
-        raise ValueError(f"second_variation: expected 3 points an axis or more, but got {tuple(volume.shape)}")
+        raise ValueError(
+            f"second_variation: expected 3 points an axis or more, but got {tuple(volume.shape)}"
+        )
     return sum(volume.diff(n=2, dim=axis).abs().mean() for axis in range(3)) / 3
 
 

@@ -247,7 +247,9 @@ class Curriculum:
     def in_play(self) -> int:
         """Number of frames that may be drawn now."""
         if self.pace is not None:
-            return self._ends[min(max(self.start, int(self.pace * self.fraction + 1e-9)), len(self._ends)) - 1]
+            return self._ends[
+                min(max(self.start, int(self.pace * self.fraction + 1e-9)), len(self._ends)) - 1
+            ]
         done = 1.0 if self.all_in == 0 else min(1.0, self.fraction / self.all_in)
         return self._ends[self.start + int((len(self._ends) - self.start) * done) - 1]
 
