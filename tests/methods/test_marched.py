@@ -151,10 +151,10 @@ def test_the_grid_of_tineuvox_freezes():
         assert {g["name"]: g["lr"] for g in optimizer.param_groups}["grid"] == rate
         assert optimizer.param_groups[-1]["lr"] == 1.0
         assert float(made.grid.features.detach()[0, 0]) == pytest.approx(value)
-    kept = made.protocol()["faults kept"]
+    kept = made.protocol()["faults"]
     assert "padded" in kept
     assert "frozen_from" in kept
-    assert "faults kept" not in method("tineuvox", padded=False).protocol()
+    assert "faults" not in method("tineuvox", padded=False).protocol()
 
 
 @pytest.mark.parametrize(("alpha", "opaque"), [(1e-2, 5.0e-3), (1e-6, 5.0e-7)])
@@ -294,9 +294,9 @@ def test_voxels_before_a_camera_are_empty():
 
 def test_the_released_faults_of_ndvg_are_named():
     made = method("ndvg", still=some_points(5), pool=2.5)
-    assert "the last 1 times (pool)" in made.protocol()["faults kept"]
-    assert "weights.still" in made.protocol()["faults kept"]
-    assert "faults kept" not in method("ndvg").protocol()
+    assert "the last 1 times (pool)" in made.protocol()["faults"]
+    assert "weights.still" in made.protocol()["faults"]
+    assert "faults" not in method("ndvg").protocol()
 
 
 @pytest.mark.parametrize("kind", KINDS)

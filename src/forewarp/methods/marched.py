@@ -24,6 +24,7 @@ from forewarp.scene.rays import Rays
 from forewarp.scene.view import Moment, Rendering, View
 
 _RAYS = 4096  # of a picture, at once
+_YOUNG = 4  # steps between two of the first looks for where matter is
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,7 @@ class Marching:
     color_threshold: float = 1e-4
     jitter: bool = False
     occupancy: int = 0
-    look_every: int = 4
+    look_every: int = 16
 
     def departures(self) -> list[str]:
         """Name what differs from the publications."""
@@ -185,7 +186,8 @@ class MarchedMethod(Method):
             group["lr"] *= factor
         if self.occupancy is None:
             return {}
-        if self.marching.look_every and step % self.marching.look_every == 0:
+        pace, young = self.marching.look_every, int(self.occupancy.looks) < self.occupancy.patience
+        if pace and step % (min(pace, _YOUNG) if young else pace) == 0:
             self.occupancy.look(self.density_at, self.times, torch.default_generator)
         return {"occupied": float(self.occupancy.occupied.float().mean())}
 
@@ -229,7 +231,7 @@ class MarchedMethod(Method):
         """List the departures from the publication, and the faults kept from its code."""
         departures = "; ".join([*self.marching.departures(), *self.departures()])
         kept = "; ".join(self.faults())
-        return {"departures": departures} | ({"faults kept": kept} if kept else {})
+        return {"departures": departures} | ({"faults": kept} if kept else {})
 
 
 @dataclass(frozen=True)
