@@ -168,7 +168,7 @@ METHODS = {
     ),
     "ndvg": Entry(
         partial(NDVG, marching=Marching(jitter=True, occupancy=12), width=(24, 24), continuous=True),
-        {"grid": 0.1, "network": 3e-3},
+        {"density": 0.1, "color": 0.1, "deformation": 0.1, "network": 3e-3},
         {"photo": 1.0, "point_color": 0.01, "background_entropy": 1e-3, "flow_l1": 1e-2}
         | {"tv_deformation": 1.0, "canonical": 1.0, "still": 0.1},
         {"num_voxels": [[0, 9**3], [0.4, 12**3]], "alpha_init": 1e-2},

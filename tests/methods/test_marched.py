@@ -337,7 +337,8 @@ def test_a_stage_without_voxels_is_refused():
 
 def learned(kind, folder, **options):
     """The mean train PSNR on the toy."""
-    rate = {"grid": 8e-2, "deformation": 3e-3, "network": 5e-3}
+    rate = {"grid": 8e-2, "density": 0.1, "color": 0.1, "network": 5e-3}
+    rate["deformation"] = 3e-3 if kind == "tineuvox" else 0.1
     groups = method(kind, **options).param_groups()
     settings = StageSettings.of(
         "fine",

@@ -205,10 +205,14 @@ class NDVG(MarchedMethod):
         }
 
     def param_groups(self) -> dict[str, list[nn.Parameter]]:
-        """Group parameters: ``grid`` and ``network``."""
-        grids = [p for grid in (self.canonical, self.deformation) for p in grid.parameters()]
-        known = {id(p) for p in grids}
-        return {"grid": grids, "network": [p for p in self.parameters() if id(p) not in known]}
+        """Group parameters: ``density``, ``color`` and ``deformation`` (the grids), ``network``."""
+        networks = [self.network, *([] if self.color is None else [self.color])]
+        return {
+            "density": [self.canonical.density],
+            "color": [self.canonical.color],
+            "deformation": [self.deformation.features],
+            "network": [p for network in networks for p in network.parameters()],
+        }
 
     def departures(self) -> list[str]:
         """See ``MarchedMethod``."""
