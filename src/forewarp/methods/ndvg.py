@@ -44,6 +44,7 @@ class NDVGStage:
         alpha_init: opacity at first of a voxel of the last deformation grid.
         sink: how far raw density falls each time the grids grow.
         box_alpha: the next stage's box holds cells more opaque than this.
+        carry: start from the canonical density of the stage before; False: from nothing, as published.
         masked: leave canonical voxels empty for good where the stage before has less than ``box_alpha``.
     """
 
@@ -52,6 +53,7 @@ class NDVGStage:
     alpha_init: float = 1e-2
     sink: float = 1.0
     box_alpha: float = 1e-3
+    carry: bool = False
     masked: bool = False
 
 
@@ -132,14 +134,22 @@ class NDVG(MarchedMethod):
         self.deformation.features.copy_(_read(before.deformation, "features", nodes))
         self.network.load_state_dict(before.network.state_dict())
         if self.occupancy is not None:
-            self.occupancy.settle(before.density_at, _some(self.times))
+            self.occupancy.settle(before.density_found, _some(self.times))
+        voxels = self.canonical.lattice.to_world(self.canonical.voxels)
+        if self.stage.carry:
+            optical = (
+                before.activation.sigma(_read(before.canonical, "density", voxels))
+                * self.activation.density_scale
+            )
+            self.canonical.density.copy_(
+                torch.log(torch.expm1(optical.double()).clamp(min=1e-6)) - self.shift
+            )
         if self.stage.masked:
             old = before.canonical
             size = old.lattice.voxel_size
             solid = before.activation.alpha(old.density[:, 0], size) > before.stage.box_alpha
             near = dilate(solid.reshape(old.lattice.shape)).reshape(-1, 1).to(old.density)
-            at = self.canonical.lattice.to_world(self.canonical.voxels)
-            near = trilinear(near, old.index, old.lattice.to_lattice(at), near.new_zeros(1))
+            near = trilinear(near, old.index, old.lattice.to_lattice(voxels), near.new_zeros(1))
             self.canonical.density[near[:, 0] <= 0] = _HIDDEN
 
     @property
@@ -158,6 +168,13 @@ class NDVG(MarchedMethod):
         moment = positional_encoding(points.new_tensor([time]), self.octaves[0]).expand(len(points), -1)
         found = self.network(torch.cat([read, place, moment], -1))
         return found[:, :3], found[:, 3]
+
+    def density_found(self, points: Tensor, time: float) -> Tensor:
+        """As ``density_at``; 0 without a look in cells that were found to be empty."""
+        if self.occupancy is None:
+            return self.density_at(points, time)
+        known = self.occupancy(points).nonzero()[:, 0]
+        return points.new_zeros(len(points)).index_copy(0, known, self.density_at(points[known], time))
 
     def grow(self, num_voxels: float, optimizer: torch.optim.Optimizer) -> None:
         """See ``MarchedMethod``; raw density falls by ``sink``."""
@@ -216,16 +233,14 @@ class NDVG(MarchedMethod):
 
     def departures(self) -> list[str]:
         """See ``MarchedMethod``."""
-        return ["offsets without a jump at the canonical time"] if self.continuous else []
+        found = ["offsets without a jump at the canonical time"] if self.continuous else []
+        return found + (["the second stage starts from the density of the first"] if self.stage.carry else [])
 
     def faults(self) -> list[str]:
         """See ``MarchedMethod``."""
-        late = self.pool is not None and self.pool < len(self.times)
-        found = (
-            [f"the first stage never sees the last {len(self.times) - int(self.pool)} times (pool)"]
-            if late
-            else []
-        )
+        found = []
+        if self.pool is not None and (unseen := len(self.times) - int(self.pool)) > 0:
+            found.append(f"the first stage never sees the last {unseen} times (pool)")
         if self.still is not None and not self.pulls:
             found.append("points that never move are not looked at (weights.still)")
         return found
