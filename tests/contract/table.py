@@ -8,12 +8,15 @@ from forewarp.fields.radiance import DirectRadiance
 from forewarp.fields.trajectory import TrajectoryField
 from forewarp.methods.dnerf import DNeRF
 from forewarp.methods.hypernerf import HyperNeRF
+from forewarp.methods.marched import Marching
 from forewarp.methods.method import Method, Start
+from forewarp.methods.ndvg import NDVG
 from forewarp.methods.nerf import NeRF
 from forewarp.methods.nerfies import Nerfies
 from forewarp.methods.particles.model import Particles
 from forewarp.methods.particles.nodes import Nodes
 from forewarp.methods.sampled import Sampling
+from forewarp.methods.tineuvox import TiNeuVox
 from forewarp.methods.tnerf import TNeRF
 from forewarp.methods.voxel.backward_warp import Deformation
 from forewarp.methods.voxel.effects.background import StaticBackground, Together
@@ -147,6 +150,29 @@ METHODS = {
         {"photo": 1.0, "coarse_photo": 1.0, "still": 1e-3},
         {"warp_in": 0.3, "slice_from": 0.01, "slice_in": 0.2},
         steps=150,
+        slow=True,
+    ),
+    "tineuvox": Entry(
+        partial(
+            TiNeuVox,
+            marching=Marching(jitter=True, occupancy=12),
+            width=24,
+            position_frequencies=3,
+            camera=True,
+            padded=False,
+        ),
+        {"grid": 8e-2, "deformation": 2e-3, "network": 5e-3},
+        {"photo": 1.0, "point_color": 0.01, "background_entropy": 1e-3, "still": 0.1, "tv_grid": 1e-6},
+        {"num_voxels": [[0, 9**3], [0.4, 13**3]]},
+        steps=100,
+    ),
+    "ndvg": Entry(
+        partial(NDVG, marching=Marching(jitter=True, occupancy=12), width=(24, 24), continuous=True),
+        {"density": 0.1, "color": 0.1, "deformation": 0.1, "network": 3e-3},
+        {"photo": 1.0, "point_color": 0.01, "background_entropy": 1e-3, "flow_l1": 1e-2}
+        | {"tv_deformation": 1.0, "canonical": 1.0, "still": 0.1},
+        {"num_voxels": [[0, 9**3], [0.4, 12**3]], "alpha_init": 1e-2},
+        steps=100,
         slow=True,
     ),
     "particles": Entry(

@@ -47,3 +47,18 @@ def test_it_is_kept_in_a_checkpoint():
     other.load_state_dict(lattice.state_dict())
     points = 2 * torch.rand(100, 3) - 1
     assert other(points).equal(lattice(points))
+
+
+def test_it_settles_by_a_look_at_all_times_and_bounds_what_it_found():
+    lattice = Occupancy(BOX, side=16)
+    assert lattice.bounds(0.1) is None
+    lattice.settle(ball, [0.0, 1.0])
+    points = 2 * torch.rand(4000, 3, generator=torch.Generator().manual_seed(1)) - 1
+    there = torch.stack([ball(points, time) > 0 for time in (0.0, 1.0)]).any(0)
+    assert lattice(points)[there].all()
+    assert lattice(points)[~there].float().mean() < 0.25
+    assert lattice.cells.sum() == lattice.occupied.sum()
+    box = lattice.bounds(0.1)
+    for low, high, ends in zip(box.low, box.high, ((-0.8, 0.8), (-0.3, 0.3), (-0.3, 0.3))):
+        assert ends[0] - 0.26 < low < ends[0]
+        assert ends[1] < high < ends[1] + 0.26

@@ -11,6 +11,7 @@ from forewarp.scene.box import Box
 
 _FADE = 0.95  # of what was found, at each look
 _OPAQUE = 0.01  # a cell counts as occupied if a step of one cell through it is at least so opaque,
+_AT_ONCE = 1 << 16  # cells evaluated at once
 _LEAST = 1e-4  # or more opaque than the mean of all cells and this, while a field is young
 
 
@@ -52,13 +53,52 @@ class Occupancy(nn.Module):
         cells = torch.arange(first, len(self.density), step, device=self.low.device)
         inside = torch.rand(len(cells), 3, generator=generator).to(self.low)
         time = times[int(torch.randint(len(times), (), generator=generator))]
-        rows = torch.stack([cells // self.side**2, cells // self.side % self.side, cells % self.side], -1)
-        found = density(self.low + (rows + inside) * self.cell, time)
+        found = density(self.low + (self._rows(cells) + inside) * self.cell, time)
         self.density[cells] = torch.maximum(_FADE * self.density[cells], found)
         self.looks += 1
         if int(self.looks) >= self.patience:
-            opaque = -torch.expm1(-self.density * float(self.cell.min()))
-            self.occupied.copy_(self._grown(opaque > min(_OPAQUE, max(_LEAST, float(opaque.mean())))))
+            self._judge()
+
+    @torch.no_grad()
+    def settle(self, density: Callable[[Tensor, float], Tensor], times: Sequence[float]) -> None:
+        """Look at the middle of every occupied cell at all of these times, and rely on what is found.
+
+        Args:
+            density, times: as of ``look``.
+        """
+        cells = self.occupied.nonzero()[:, 0]
+        middles = self.low + (self._rows(cells) + 0.5) * self.cell
+        self.density.zero_()
+        for time in times:
+            for some, rows in zip(middles.split(_AT_ONCE), cells.split(_AT_ONCE)):
+                self.density[rows] = torch.maximum(self.density[rows], density(some, time))
+        self.looks.fill_(self.patience)
+        self._judge()
+
+    def bounds(self, alpha: float) -> Box | None:
+        """Bound the cells more opaque than ``alpha`` across one cell and those beside them; None: none."""
+        rows = self._rows((self._opacity() > alpha).nonzero()[:, 0])
+        if not len(rows):
+            return None
+        low, high = rows.amin(0) - 1, rows.amax(0) + 2
+        corners = (self.low + corner.clamp(0, self.side) * self.cell for corner in (low, high))
+        return Box(*(tuple(corner.tolist()) for corner in corners))
+
+    @property
+    def cells(self) -> Tensor:
+        """The cells (side, side, side) bool that may hold matter."""
+        return self.occupied.reshape(self.side, self.side, self.side)
+
+    def _rows(self, cells: Tensor) -> Tensor:
+        """Return the places (P, 3) of cells (P,) along the axes."""
+        return torch.stack([cells // self.side**2, cells // self.side % self.side, cells % self.side], -1)
+
+    def _opacity(self) -> Tensor:
+        return -torch.expm1(-self.density * float(self.cell.min()))
+
+    def _judge(self) -> None:
+        opaque = self._opacity()
+        self.occupied.copy_(self._grown(opaque > min(_OPAQUE, max(_LEAST, float(opaque.mean())))))
 
     def _grown(self, occupied: Tensor) -> Tensor:
         """Add the cells beside occupied ones: what moves, moves into them."""
