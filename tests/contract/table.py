@@ -11,6 +11,7 @@ from forewarp.methods.hypernerf import HyperNeRF
 from forewarp.methods.method import Method, Start
 from forewarp.methods.nerf import NeRF
 from forewarp.methods.nerfies import Nerfies
+from forewarp.methods.neural_volumes import NeuralVolumes
 from forewarp.methods.particles.model import Particles
 from forewarp.methods.particles.nodes import Nodes
 from forewarp.methods.sampled import Sampling
@@ -105,6 +106,9 @@ RATES |= {"tint": 1e-3, "fade": 3e-3, "shifts": 7e-3, "node_turns": 8e-3, "skin"
 SMALL_NETWORK = {"width": 32, "layers": 3, "skip": None, "position_frequencies": 4}
 SMALL_NETWORK |= {"sampling": Sampling(16, 16, density="softplus", open_end=False, inside_box=True)}
 SMALL_WARP = {"warp_width": 24, "warp_layers": 3, "warp_skip": None}
+SMALL_VOLUMES = {"picture_size": (8, 8), "tower": (8, 16), "features": 16, "code": 8}
+SMALL_VOLUMES |= {"decoder": (32, 16, 16, 8), "maps": 4, "warp_side": 6, "warp_width": 16, "weight_width": 8}
+SMALL_VOLUMES |= {"step": 1 / 12, "from_identity": True, "first_opacity": 0.1, "jitter_in_pictures": False}
 
 METHODS = {
     "forward": Entry(ForwardModel(GRID, motion=Motion, trajectory=TRAJECTORY), **VOXELS, effects=WARP),
@@ -147,6 +151,13 @@ METHODS = {
         {"photo": 1.0, "coarse_photo": 1.0, "still": 1e-3},
         {"warp_in": 0.3, "slice_from": 0.01, "slice_in": 0.2},
         steps=150,
+        slow=True,
+    ),
+    "neural_volumes": Entry(
+        partial(NeuralVolumes, **SMALL_VOLUMES),
+        {"network": 2e-3},
+        {"photo": 104.04, "code_prior": 1e-3, "opacity_prior": 1e-2, "opacity_variation": 1e-2},
+        steps=100,
         slow=True,
     ),
     "particles": Entry(
