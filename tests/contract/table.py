@@ -108,7 +108,13 @@ SMALL_NETWORK |= {"sampling": Sampling(16, 16, density="softplus", open_end=Fals
 SMALL_WARP = {"warp_width": 24, "warp_layers": 3, "warp_skip": None}
 SMALL_VOLUMES = {"picture_size": (8, 8), "tower": (8, 16), "features": 16, "code": 8}
 SMALL_VOLUMES |= {"decoder": (32, 16, 16, 8), "maps": 4, "warp_side": 6, "warp_width": 16, "weight_width": 8}
-SMALL_VOLUMES |= {"step": 1 / 12, "from_identity": True, "first_opacity": 0.1, "jitter_in_pictures": False}
+SMALL_VOLUMES |= {
+    "step": 1 / 12,
+    "from_identity": True,
+    "first_opacity": 0.1,
+    "first_deviation": 0.05,
+    "jitter_in_pictures": False,
+}
 
 METHODS = {
     "forward": Entry(ForwardModel(GRID, motion=Motion, trajectory=TRAJECTORY), **VOXELS, effects=WARP),

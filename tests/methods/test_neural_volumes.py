@@ -30,7 +30,14 @@ from tests.support.tiny_scene import make_run
 
 SMALL = {"picture_size": (16, 16), "tower": (8, 16), "features": 32, "code": 12, "decoder": (32, 16, 16, 8)}
 SMALL |= {"maps": 4, "warp_side": 6, "warp_width": 16, "weight_width": 8, "step": 1 / 16}
-KIND = partial(NeuralVolumes, **SMALL, from_identity=True, first_opacity=0.1, jitter_in_pictures=False)
+KIND = partial(
+    NeuralVolumes,
+    **SMALL,
+    from_identity=True,
+    first_opacity=0.1,
+    first_deviation=0.05,
+    jitter_in_pictures=False,
+)
 WEIGHTS = {"photo": 104.04, "code_prior": 1e-3, "opacity_prior": 1e-2, "opacity_variation": 1e-2}
 
 
@@ -167,6 +174,7 @@ def test_a_picture_is_fitted_over_white():
             r"model.picture_size: expected height and width in multiples of 4.*\[18, 16\]",
         ),
         ({"first_opacity": -1.0}, r"model.first_opacity: expected a number > 0 or null, but got -1"),
+        ({"first_deviation": 0.0}, r"model.first_deviation: expected a number > 0 or null, but got 0"),
         ({"step": 0.0}, r"model.step: expected a length in \(0, 1\], but got 0.0"),
     ],
 )
@@ -233,7 +241,7 @@ def test_gradients_against_differences():
 
 
 def fitted(tmp_path, scene, steps):
-    settings = StageSettings.of("fine", lr={"network": 2e-3}, iterations=steps, curriculum={"all_in": 0.0})
+    settings = StageSettings.of("fine", lr={"network": 5e-3}, iterations=steps, curriculum={"all_in": 0.0})
     data = SceneDataModule(scene, rays=144)
     module = make_run(tmp_path, [Stage(settings, Objective(WEIGHTS))], data=data, model=KIND).fit()
     psnr = [float(module.psnr_of(target)) for target in data.targets("train")]

@@ -13,6 +13,7 @@ from torch.nn import functional
 
 from forewarp.ops.project import rotations
 
+DEVIATION_SCALE = 0.01  # of the layer that gives the logarithm of the deviation
 _SLOPE = 0.2  # of leaky ReLUs
 _LEAST = 1e-3  # least total weight of the maps at a point
 
@@ -58,7 +59,7 @@ class PictureEncoder(nn.Module):
         """See the class."""
         seen = [tower(one[None]).flatten() for tower, one in zip(self.towers, pictures, strict=True)]
         hidden = functional.leaky_relu(self.joined(torch.cat(seen)), _SLOPE)
-        return 0.1 * self.mean(hidden), 0.01 * self.deviation(hidden)
+        return 0.1 * self.mean(hidden), DEVIATION_SCALE * self.deviation(hidden)
 
 
 class VolumeDecoder(nn.Module):

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from forewarp.fields.codes import beside
-from forewarp.fields.volumes import AffineMixture, PictureEncoder, VolumeDecoder, read
+from forewarp.fields.volumes import DEVIATION_SCALE, AffineMixture, PictureEncoder, VolumeDecoder, read
 from forewarp.methods.method import Method, Snapshot, Start, Step
 from forewarp.ops.samples import clip_to_box
 from forewarp.scene.batch import Batch
@@ -53,8 +53,9 @@ class NeuralVolumes(Method):
         picture_size, tower, features, code: see ``fields.volumes.PictureEncoder``.
         decoder: see ``fields.volumes.VolumeDecoder``.
         maps, warp_side, warp_width, weight_width, from_identity: see ``fields.volumes.AffineMixture``.
-        first_opacity: of the volume before training, > 0; null: as released, about 0.7, with which most rays are
-            opaque at first, and have no gradient.
+        first_opacity: of the volume before training, > 0; null: as released, about 0.7, with which most rays
+            are opaque at first, and have no gradient.
+        first_deviation: of the code before training, > 0; null: as released, about 1, many times the code.
         step: length of a step along a ray, in half sides of the cube around the scene's box.
         jitter_in_pictures: march from random places in pictures too, as the released code does.
 
@@ -81,21 +82,26 @@ class NeuralVolumes(Method):
         step: float = 4 / 256,
         from_identity: bool = False,
         first_opacity: float | None = None,
+        first_deviation: float | None = None,
         jitter_in_pictures: bool = True,
     ) -> None:
         super().__init__()
-        if first_opacity is not None and not first_opacity > 0:
-            raise ValueError(f"model.first_opacity: expected a number > 0 or null, but got {first_opacity}")
+        for key, first in (("opacity", first_opacity), ("deviation", first_deviation)):
+            if first is not None and not first > 0:
+                raise ValueError(f"model.first_{key}: expected a number > 0 or null, but got {first}")
         if not 0 < step <= 1:
             raise ValueError(f"model.step: expected a length in (0, 1], but got {step}")
         self.step, self.jitter_in_pictures = step, jitter_in_pictures
-        self.from_identity, self.first_opacity = from_identity, first_opacity
+        self.from_identity = from_identity
+        self.first = {"opacity": first_opacity, "deviation of the code": first_deviation}
         scene = start.scene
         self.times = scene.times
         shots = shots_of(scene, pictures)
         size = tuple(picture_size)
         self.encoder = PictureEncoder(len(shots[0]), size, tower=tower, width=features, code=code)
         self.decoder = VolumeDecoder(code, decoder)
+        if first_deviation is not None:
+            nn.init.constant_(self.encoder.deviation.bias, math.log(first_deviation) / DEVIATION_SCALE)
         if first_opacity is not None:
             nn.init.constant_(self.decoder.grow[-1].bias[3], math.log(math.expm1(first_opacity)))
         shape = {"maps": maps, "side": warp_side, "width": warp_width, "weight_width": weight_width}
@@ -206,8 +212,7 @@ class NeuralVolumes(Method):
         ]
         if self.from_identity:
             notes.append("the warp starts as the identity")
-        if self.first_opacity is not None:
-            notes.append(f"the volume starts with an opacity of {self.first_opacity:g}")
+        notes += [f"first {name} {value:g}" for name, value in self.first.items() if value is not None]
         if not self.jitter_in_pictures:
             notes.append("pictures are drawn without random steps")
         return {"departures": "; ".join(notes)}
