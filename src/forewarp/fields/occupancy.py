@@ -77,13 +77,19 @@ class Occupancy(nn.Module):
         self.density[cells] = torch.maximum(_FADE * self.density[cells], found)
         self.looks += 1
         if int(self.looks) >= self.patience:
-            opaque = -torch.expm1(-self.density * float(self.cell.min()))
-            least = min(_OPAQUE, max(_LEAST, float(opaque[self.possible].mean())))
-            self.occupied.copy_(self._grown(opaque > least) & self.possible)
+            self._judge()
 
     def _rows(self, cells: Tensor) -> Tensor:
-        """Return the places (N, 3) of cells (N,) along the axes."""
+        """Return the places (P, 3) of cells (P,) along the axes."""
         return torch.stack([cells // self.side**2, cells // self.side % self.side, cells % self.side], -1)
+
+    def _opacity(self) -> Tensor:
+        return -torch.expm1(-self.density * float(self.cell.min()))
+
+    def _judge(self) -> None:
+        opaque = self._opacity()
+        least = min(_OPAQUE, max(_LEAST, float(opaque[self.possible].mean())))
+        self.occupied.copy_(self._grown(opaque > least) & self.possible)
 
     def _grown(self, occupied: Tensor) -> Tensor:
         """Add the cells beside occupied ones: what moves, moves into them."""
