@@ -1,5 +1,6 @@
 """NeRF, T-NeRF, D-NeRF, Nerfies and HyperNeRF: sizes, identities, what they can learn."""
 
+from dataclasses import replace
 from functools import partial
 
 import pytest
@@ -116,6 +117,38 @@ def test_a_dead_start_is_named():
         assert made.look(batch(), {"photo": 1.0}, generator).noted["opacity"] == 0
     with pytest.raises(ValueError, match=r"a dead start; set another seed=N, or model.sampling.density=soft"):
         made.look(batch(), {"photo": 1.0}, generator)
+
+
+def test_a_field_that_nothing_is_left_of_is_dead():
+    made = method("tnerf", occupancy=8, **GENTLE)
+    made.occupancy.occupied.zero_()
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(19):
+        assert made.look(batch(), {"photo": 1.0}, generator).noted["samples"] == 0
+    with pytest.raises(ValueError, match=r"0 along every ray of 20 .* or model.sampling.occupancy=0"):
+        made.look(batch(), {"photo": 1.0}, generator)
+
+
+def test_pictures_say_where_matter_may_be():
+    confined, free = (method("tnerf", occupancy=8, hull=hull, **GENTLE).occupancy for hull in (0.1, 0.0))
+    assert free.possible.all()
+    assert 0 < int(confined.possible.sum()) < len(confined.possible)
+    assert confined.occupied.equal(confined.possible)
+    blank = TNeRF(replace(start(), blank=True), sampling=Sampling(occupancy=8, hull=0.1))
+    assert blank.occupancy.possible.all()
+    with pytest.raises(ValueError, match=r"model.sampling.hull: expected a share in \[0, 1\], but got 2"):
+        Sampling(hull=2)
+
+
+@pytest.mark.parametrize("kind", ["nerf", "nerfies", "hypernerf"])
+def test_one_pass_has_one_network(kind):
+    made = method(kind, fine_samples=0, **GENTLE)
+    step = made.look(batch(), {"photo": 1.0}, torch.Generator().manual_seed(0))
+    assert made.coarse is None
+    assert made.fields(Moment(0.5))[0] is None
+    assert step.terms["coarse_photo"]() is None
+    assert step.noted["samples"] <= 144 * 12
+    assert "one pass" in made.protocol()["departures"]
 
 
 def test_a_start_that_comes_alive_is_none():
