@@ -91,8 +91,9 @@ class AffineMixture(nn.Module):
         maps: their number.
         side: lattice points along an axis of the weights and of W.
         width, weight_width: hidden channels of the maps and of the weights.
-        from_identity: start from ``s = 1`` and ``R = I``. Published: from small scales and any rotations,
-            with which W at first draws all points to the middle.
+        from_identity: start from ``s = 1`` and ``R = I``, and go on beyond the cube with the weights at its
+            border. As released, scales are small and rotations any at first, so that W draws all points to
+            the middle, and weights are 0 beyond the cube, near which gradients have peaks.
     """
 
     def __init__(
@@ -133,7 +134,9 @@ class AffineMixture(nn.Module):
         """Code (C,) -> W at the lattice's points (3, S, S, S)."""
         places = self.moved(code, self.lattice)
         weights = self.weight(code).exp().reshape(self.maps, 1, *[self.side] * 3)
-        weights = functional.grid_sample(weights, places, align_corners=True)[:, 0, ..., None]
+        beyond = "border" if self.from_identity else "zeros"
+        weights = functional.grid_sample(weights, places, padding_mode=beyond, align_corners=True)
+        weights = weights[:, 0, ..., None]
         whole = (weights * places).sum(0) / weights.sum(0).clamp(min=_LEAST)
         return whole.permute(3, 0, 1, 2)
 
