@@ -161,9 +161,10 @@ METHODS = {
     ),
     "neural_volumes": Entry(
         partial(NeuralVolumes, **SMALL_VOLUMES),
-        {"network": 2e-3},
+        {"network": 5e-3},
         {"photo": 104.04, "code_prior": 1e-3, "opacity_prior": 1e-2, "opacity_variation": 1e-2},
-        steps=100,
+        falls=0.7,  # its rays also miss what an instant's one picture does not show
+        steps=200,
         slow=True,
     ),
     "particles": Entry(
