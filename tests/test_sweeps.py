@@ -16,7 +16,7 @@ from hydra_plugins.forewarp_one_at_a_time import changed
 from tests.support.configs import CONF, ROOT, composed, groups, options
 
 PAPER = {"dnerf": 24, "hypernerf": 12, "nhr": 12, "lego_complete": 9, "ablation_modules": 60}
-PAPER |= {"ablation_losses": 32, "resolution": 16}
+PAPER |= {"ablation_losses": 32, "resolution": 16, "methods": 24}
 OTHERS = {"accuracy_time", "effects", "price_list_forward", "price_list_particles", "search", "minutes"}
 LISTS = {
     name: yaml.safe_load((ROOT / "sweeps" / f"price_list_{name}.yaml").read_text())["hydra"]["sweeper"]
@@ -57,7 +57,7 @@ def test_no_sweep_is_forgotten():
 
 def test_effects_are_compared_on_every_specimen():
     jobs = jobs_of("effects")
-    assert len(jobs) == 18
+    assert len(jobs) == 24
     auto, every, paper = (job_of("effects", *job) for job in jobs if "scene=specimen_room" in job)
     for config in (auto, every, paper):
         assert config.run.startswith("runs/effects/room/")

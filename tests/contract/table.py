@@ -13,6 +13,7 @@ from forewarp.methods.method import Method, Start
 from forewarp.methods.ndvg import NDVG
 from forewarp.methods.nerf import NeRF
 from forewarp.methods.nerfies import Nerfies
+from forewarp.methods.neural_volumes import NeuralVolumes
 from forewarp.methods.particles.model import Particles
 from forewarp.methods.particles.nodes import Nodes
 from forewarp.methods.sampled import Sampling
@@ -108,6 +109,15 @@ RATES |= {"tint": 1e-3, "fade": 3e-3, "shifts": 7e-3, "node_turns": 8e-3, "skin"
 SMALL_NETWORK = {"width": 32, "layers": 3, "skip": None, "position_frequencies": 4}
 SMALL_NETWORK |= {"sampling": Sampling(16, 16, density="softplus", open_end=False, inside_box=True)}
 SMALL_WARP = {"warp_width": 24, "warp_layers": 3, "warp_skip": None}
+SMALL_VOLUMES = {"picture_size": (8, 8), "tower": (8, 16), "features": 16, "code": 8}
+SMALL_VOLUMES |= {"decoder": (32, 16, 16, 8), "maps": 4, "warp_side": 6, "warp_width": 16, "weight_width": 8}
+SMALL_VOLUMES |= {
+    "step": 1 / 12,
+    "from_identity": True,
+    "first_opacity": 0.1,
+    "first_deviation": 0.05,
+    "jitter_in_pictures": False,
+}
 
 METHODS = {
     "forward": Entry(ForwardModel(GRID, motion=Motion, trajectory=TRAJECTORY), **VOXELS, effects=WARP),
@@ -165,6 +175,7 @@ METHODS = {
         {"photo": 1.0, "point_color": 0.01, "background_entropy": 1e-3, "still": 0.1, "tv_grid": 1e-6},
         {"num_voxels": [[0, 9**3], [0.4, 13**3]]},
         steps=100,
+        slow=True,
     ),
     "ndvg": Entry(
         partial(NDVG, marching=Marching(jitter=True, occupancy=12), width=(24, 24), continuous=True),
@@ -173,6 +184,14 @@ METHODS = {
         | {"tv_deformation": 1.0, "canonical": 1.0, "still": 0.1},
         {"num_voxels": [[0, 9**3], [0.4, 12**3]], "alpha_init": 1e-2},
         steps=100,
+        slow=True,
+    ),
+    "neural_volumes": Entry(
+        partial(NeuralVolumes, **SMALL_VOLUMES),
+        {"network": 5e-3},
+        {"photo": 104.04, "code_prior": 1e-3, "opacity_prior": 1e-2, "opacity_variation": 1e-2},
+        falls=0.7,  # its rays also miss what an instant's one picture does not show
+        steps=200,
         slow=True,
     ),
     "particles": Entry(
