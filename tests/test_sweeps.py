@@ -57,7 +57,7 @@ def test_no_sweep_is_forgotten():
 
 def test_effects_are_compared_on_every_specimen():
     jobs = jobs_of("effects")
-    assert len(jobs) == 24
+    assert len(jobs) == 18
     auto, every, paper = (job_of("effects", *job) for job in jobs if "scene=specimen_room" in job)
     for config in (auto, every, paper):
         assert config.run.startswith("runs/effects/room/")
