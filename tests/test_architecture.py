@@ -57,7 +57,9 @@ CONTRACT = {
     "abilities",
     "effect",
     "rows",
+    "rows_adam",
     "sampled",
+    "marched",
 }  # files of methods/ that packages above may import
 # Attributes of one method only.
 OWN_PARTS = {"radiance", "lattice", "lattices", "motion", "deformation", "inpainter"}
