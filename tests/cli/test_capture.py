@@ -127,7 +127,7 @@ def turned(count):
 @pytest.mark.parametrize(
     ("frames", "says"),
     [
-        (stood, "camera: expected one that moves, but matches shift"),
+        (stood, "camera: expected one that moves, but got matches that shift"),
         (turned, "is explained by turning it; walk"),
     ],
 )

@@ -68,6 +68,7 @@ def capture(
             count=frames,
             size=size,
             told=told,
+            threads=how.threads,
         )
         sparse = _found(place, pictures, how, told) if source.colmap is None else read_model(source.colmap)
         refuse_poses(sparse, pictures)

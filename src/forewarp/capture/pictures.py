@@ -36,7 +36,15 @@ class Pictures:
 
 
 def take(
-    place: Path, source: Path, *, video: bool, masks: Path | None, count: int, size: int | None, told: Told
+    place: Path,
+    source: Path,
+    *,
+    video: bool,
+    masks: Path | None,
+    count: int,
+    size: int | None,
+    told: Told,
+    threads: int | None = None,
 ) -> Pictures:
     """Take pictures out of a video or a folder, unless an earlier call has done so.
 
@@ -48,6 +56,7 @@ def take(
         count: of frames to choose from a video; those of a folder are all taken.
         size: most pixels of the longer side; None: as they are.
         told: shows progress.
+        threads: of ffmpeg; None: as many as it likes.
 
     Raises:
         ValueError: where they cannot be read or are too few.
@@ -57,21 +66,26 @@ def take(
     if done is None:
         for left in (folder, dark):
             shutil.rmtree(left, ignore_errors=True)
-        done = (_from_video if video else _from_folder)(folder, source, count, size, told)
+        if video:
+            done = _from_video(folder, source, count, size, told, threads)
+        else:
+            done = _from_folder(folder, source, size, told)
         if masks is not None:
             _write_masks(dark, masks, done, folder)
         write_json(place / _DONE, done)
     return Pictures(folder, done["times"], dark if masks else None, done["found"], done["edges"])
 
 
-def _from_video(folder: Path, video: Path, count: int, size: int | None, told: Told) -> dict:
+def _from_video(
+    folder: Path, video: Path, count: int, size: int | None, told: Told, threads: int | None
+) -> dict:
     """Write the sharpest frames, named after their numbers in the video, from 1."""
     with told("looking at frames") as progress:
-        footage = measure(video, progress)
+        footage = measure(video, progress, threads)
     chosen = sharpest(footage.stamps, footage.sharp, count)
     times = {}
     with told("taking frames") as progress:
-        for index, pixels in zip(chosen, extracted(video, chosen, size)):
+        for index, pixels in zip(chosen, extracted(video, chosen, size, threads)):
             name = f"frame_{index + 1:06d}.jpg"
             write_jpeg(folder / name, pixels)
             times[name] = float(footage.stamps[index])
@@ -82,7 +96,7 @@ def _from_video(folder: Path, video: Path, count: int, size: int | None, told: T
     return {"times": times, "found": len(footage.stamps), "edges": _finite(edges), "rows": chosen}
 
 
-def _from_folder(folder: Path, source: Path, count: int, size: int | None, told: Told) -> dict:
+def _from_folder(folder: Path, source: Path, size: int | None, told: Told) -> dict:
     """Copy pictures of one size; times are even, in the order of the names."""
     paths = in_order(path for path in source.iterdir() if path.suffix in SUFFIXES)
     if len(paths) < 2:
@@ -94,7 +108,7 @@ def _from_folder(folder: Path, source: Path, count: int, size: int | None, told:
         for done, path in enumerate(paths):
             pixels = _fitted(read_image(path)[..., :3].numpy(), size)
             (write_png if path.suffix.lower() == ".png" else write_jpeg)(folder / path.name, pixels)
-            widths.append(edge_width(pixels.mean(-1)) * 640 / max(pixels.shape))
+            widths.append(edge_width(pixels.mean(-1)))
             progress(done + 1, len(paths))
     times = {path.name: float(number) for number, path in enumerate(paths)}
     rows = list(range(len(paths)))
