@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from forewarp.capture import poses
@@ -16,7 +16,9 @@ from forewarp.capture.scene import write
 from forewarp.capture.sparse import Sparse, read_model, sparse_of
 from forewarp.capture.workplace import workplace
 from forewarp.drawing.files import write_png
-from forewarp.files import folder_written_whole, write_json
+from forewarp.files import folder_written_whole, read_json, write_json
+
+_ERROR = "error.json"  # pixels, before points were deleted
 
 
 @dataclass(frozen=True)
@@ -90,7 +92,7 @@ def _found(place: Path, pictures: Pictures, how: poses.Search, told: Told) -> Sp
 
     best = place / "best"
     if best.is_dir():
-        return sparse_of(pycolmap.Reconstruction(best))
+        return replace(sparse_of(pycolmap.Reconstruction(best)), **read_json(best / _ERROR))
     with told("features") as progress:
         database = poses.find_features(place, pictures.folder, pictures.masks, how, progress)
     with told("matches") as progress:
@@ -98,12 +100,18 @@ def _found(place: Path, pictures: Pictures, how: poses.Search, told: Told) -> Sp
     refuse_matches(database, pictures)
     with told("poses") as progress:
         model = poses.reconstruct(database, pictures.folder, place / "models", how, progress)
-    refuse_poses(None if model is None else sparse_of(model), pictures, database)
+    sparse = None
+    if model is not None:
+        with told("adjustment") as progress:
+            error = poses.adjust(model, how, progress)
+        sparse = replace(sparse_of(model), error=error)
+    refuse_poses(sparse, pictures, database)
     part = place / "part"
     part.mkdir(exist_ok=True)
     model.write(part)
+    write_json(part / _ERROR, {"error": error})
     part.rename(best)
-    return sparse_of(model)
+    return sparse
 
 
 def _state(path: Path) -> tuple[int, int]:
