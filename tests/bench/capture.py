@@ -11,6 +11,7 @@ import argparse
 import json
 import os
 import resource
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -18,17 +19,21 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from PIL import Image
 
+from forewarp.capture.facts import PICTURE
 from forewarp.data import hypernerf
 from forewarp.data.images import read_image
 from forewarp.data.posed_video import PosedShot, read_scene, write_scene
-from forewarp.drawing.files import write_video
+from forewarp.drawing.colors import in_a_row
+from forewarp.drawing.files import read_picture, to_bytes, write_video
 from forewarp.progress import Counted
 from forewarp.scene.box import Box
 from tests.support.alignment import pose_errors
 from tests.support.handheld import WALKS, cameras_of, pictures_of, smeared
 
 FRAMES, SECONDS, SHAKEN = 120, 8.0, 4  # every fourth frame is blurred
+GAP = 8  # pixels between pictures
 TRAIN = [
     "data.scale=2",
     "trainer=cpu",
@@ -145,8 +150,28 @@ def real(source: Path, folder: Path, steps: int, seeds: list[int]) -> dict:
     return facts
 
 
+def pictured(folder: Path, scenes: list[str], seed: int) -> None:
+    """Write ``capture-<scene>.png``, cameras and points, and ``capture-fits.png``: for each scene its middle
+    held-out view, true, fitted with the found poses, and with the true ones.
+    """
+    for found in (folder / "captures").iterdir():
+        shutil.copy(found / PICTURE, folder / f"capture-{found.name}.png")
+    rows = []
+    for scene in scenes:
+        runs = [
+            folder / "runs" / f"{scene}-{kind}-{seed}" / "images" / "images" for kind in ("found", "true")
+        ]
+        drawn = sorted(runs[0].iterdir())
+        view = drawn[len(drawn) // 2].name
+        truth = (folder / "exact" / scene / "images" / view).with_suffix(".jpg")
+        rows.append(in_a_row([read_picture(path) for path in (truth, *(run / view for run in runs))], GAP))
+    turned = [row.transpose(0, 1) for row in rows]
+    picture = Image.fromarray(to_bytes(in_a_row(turned, GAP).transpose(0, 1)))
+    picture.quantize(256).save(folder / "capture-fits.png", optimize=True)  # a quarter of the bytes
+
+
 def main() -> None:
-    """Measure, and write ``facts.json`` and the pictures of ``docs/results/capture.md``."""
+    """Measure; write ``facts.json`` and the pictures of ``docs/results/capture.md``."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("runs/capture"))
     parser.add_argument("--scenes", nargs="*", default=list(WALKS))
@@ -159,6 +184,7 @@ def main() -> None:
     if words.real is not None:
         facts[words.real.name] = real(words.real, words.out, words.steps, words.seeds)
     (words.out / "facts.json").write_text(json.dumps(facts, indent=2) + "\n")
+    pictured(words.out, words.scenes, words.seeds[0])
     print(json.dumps(facts, indent=2))
 
 

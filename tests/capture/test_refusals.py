@@ -25,8 +25,16 @@ def pictures(count=12, edges=1.0, masks=None, size=(320, 240), originals=()):
         ({"features": 20}, {"edges": 5.0}, r"20 in a picture; edges are 5 pixels wide .* film slower"),
         ({"features": 20}, {}, "20 in a picture; there is hardly any texture"),
         ({"features": 20}, {"masks": Path("masks")}, "no texture but on what the masks call moving"),
-        ({"shift": 0.002}, {}, "one that moves, but matches shift by 0.2 % .* walk around the subject"),
-        ({"unturned": 0.01}, {}, "one that moves sideways, but 99 % of all shift is explained by turning it"),
+        (
+            {"shift": 0.002},
+            {},
+            "one that moves, but got matches that shift by 0.2 % .* walk around the subject",
+        ),
+        (
+            {"unturned": 0.01},
+            {},
+            "99 % of all shift is explained by turning it; .* before something flat: walk around",
+        ),
     ],
 )
 def test_hopeless_matches_are_refused_with_advice(monkeypatch, evidence, given, says):
@@ -59,12 +67,20 @@ def test_good_matches_and_poses_pass(monkeypatch):
             {"size": (640, 480)},
             "colmap: expected cameras of 640 x 480 pixels, as the pictures, but got 320 x 240; set images=",
         ),
-        (lambda: sparse_arc(focal=60.0), {}, "at most 130 degrees, but got 139; a fisheye"),
-        (lambda: sparse_arc(lens=Lens((-2.0, 0.0, 0.0))), {}, "a lens that can be undone .* a fisheye"),
+        (
+            lambda: sparse_arc(focal=60.0),
+            {},
+            "at most 130 degrees, but got 139; if it is a fisheye, .* before something flat",
+        ),
+        (
+            lambda: sparse_arc(lens=Lens((-2.0, 0.0, 0.0))),
+            {},
+            "a lens that can be undone .* if it is a fisheye",
+        ),
         (
             lambda: sparse_arc(degrees=0.1),
             {},
-            "moves sideways, but its places are 0.08 % of the distance",
+            "but got places that are 0.08 % of the distance apart; .* before something flat",
         ),
         (lambda: sparse_arc(error=3.0), {}, "reprojection error of at most 2.5 pixels, but got 3.0"),
         (lambda: sparse_arc(points=0), {}, "expected points that cameras see, but got none"),

@@ -3,7 +3,9 @@ import subprocess
 import imageio_ffmpeg
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
+from forewarp.capture.refusals import BLURRED
 from forewarp.capture.video import extracted, measure
 from tests.support.films import numbered, write_film
 
@@ -65,6 +67,16 @@ def test_blurred_frames_measure_as_blurred(tmp_path):
     assert found.widths[1] > 1.3 * max(found.widths[0], found.widths[2])
 
 
+@pytest.mark.parametrize(("blur", "seen"), [(0, False), (1, False), (4, True), (8, True)])
+def test_a_films_blur_is_seen_whatever_the_codec_adds(tmp_path, blur, seen):
+    """Coded as strongly as phones and web sites do."""
+    rng = np.random.default_rng(0)
+    sharp = rng.integers(0, 256, (24, 32, 3)).repeat(20, 0).repeat(20, 1).astype(float)
+    film = np.stack([gaussian_filter(np.roll(sharp, 3 * i, 1), (blur, blur, 0)) for i in range(3)])
+    path = write_film(tmp_path / "a.mp4", film.astype(np.uint8), options=("-qp", "28"))
+    assert (np.median(measure(path, quiet).widths) > BLURRED) == seen
+
+
 def cut(path, share):
     content = path.read_bytes()
     path.write_bytes(content[: int(share * len(content))])
@@ -81,6 +93,20 @@ def sound(path):
     return path
 
 
+def with_sound(path, seconds):
+    """The film and a tone of so many seconds."""
+    tone = ["-f", "lavfi", "-i", f"sine=duration={seconds}", "-map", "0:v", "-map", "1:a", "-c:v", "copy"]
+    made = path.with_name(f"with_sound_{path.name}")
+    call = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-i", str(path), *tone, *FAST, str(made)]
+    subprocess.run(call, check=True)
+    return made
+
+
+def test_sound_may_go_on_after_the_last_frame(tmp_path):
+    film = with_sound(write_film(tmp_path / "a.mp4", noise(50)), 3)
+    assert len(measure(film, quiet, threads=1).stamps) == 50
+
+
 FAST = ("-movflags", "faststart")
 BROKEN = {
     "text": (lambda p: p.write_text("no video") and p, "expected a video, but got another file"),
@@ -91,6 +117,10 @@ BROKEN = {
     "no rest": (
         lambda p: cut(write_film(p, noise(50), options=FAST), 0.5),
         "expected 2.0 seconds, as its header says, but got",
+    ),
+    "no rest, with sound": (
+        lambda p: cut(with_sound(write_film(p, noise(50)), 3), 0.5),
+        "expected 3.0 seconds, as its header says, but got",
     ),
 }
 

@@ -1,4 +1,5 @@
 import pytest
+from filelock import FileLock
 
 from forewarp.capture.workplace import workplace
 
@@ -21,14 +22,17 @@ def test_it_is_gone_at_the_end(tmp_path):
     assert [path.name for path in (tmp_path / "new").iterdir()] == ["hand"]
 
 
-@pytest.mark.parametrize("error", [ValueError("no"), ImportError("no")])
+@pytest.mark.parametrize("error", [ValueError("a: expected b, but got c"), ImportError("no")])
 def test_a_refusal_leaves_nothing(tmp_path, error):
     with pytest.raises(type(error)):
         work(tmp_path / "new" / "hand", ABOUT, error)
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError("full"), RuntimeError("a bug")])
+@pytest.mark.parametrize(
+    "error",
+    [KeyboardInterrupt(), OSError("full"), RuntimeError("a bug"), ValueError("shapes (2,) (3,) not aligned")],
+)
 def test_what_was_interrupted_goes_on(tmp_path, error):
     with pytest.raises(type(error)):
         work(tmp_path / "hand", ABOUT, error)
@@ -49,3 +53,13 @@ def test_two_at_once_are_refused(tmp_path):
         ):
             pass
         assert place.is_dir()
+
+
+def test_the_next_call_keeps_what_it_begins(tmp_path, monkeypatch):
+    """It may begin as soon as the lock is free; the folder of the one before is removed by then."""
+    free, there = FileLock.release, []
+    monkeypatch.setattr(
+        FileLock, "release", lambda lock, *a, **k: (there.extend(tmp_path.iterdir()), free(lock, *a, **k))
+    )
+    work(tmp_path / "hand", ABOUT)
+    assert there[:1] == [tmp_path / "hand"]

@@ -132,8 +132,8 @@ def turned(count):
 @pytest.mark.parametrize(
     ("frames", "says"),
     [
-        (stood, "camera: expected one that moves, but matches shift"),
-        (turned, "is explained by turning it; walk"),
+        (stood, "camera: expected one that moves, but got matches that shift"),
+        (turned, "is explained by turning it; it only turns"),
     ],
 )
 def test_cameras_that_do_not_walk_are_refused(refused, in_tmp, frames, says):

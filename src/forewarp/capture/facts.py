@@ -24,6 +24,7 @@ def facts_of(source, pictures: Pictures, sparse: Sparse, limits: Limits, scales:
         "found": pictures.found,
         "pictures": len(pictures.times),
         "registered": len(sparse.cameras),
+        "searched": source.colmap is None,
         "left_out": [pictures.originals.get(name, name) for name in left_out],
         "originals": pictures.originals,
         "seconds": max(times) - min(times) if source.video is not None else None,
@@ -59,15 +60,17 @@ def told(facts: dict) -> list[str]:
     """Say what was found in a few lines."""
     camera, box = facts["camera"], facts["box"]
     size = " x ".join(f"{high - low:.2f}" for low, high in zip(box[:3], box[3:]))
+    all_sure = facts["sure_points"] == facts["points"]
+    sure = "" if all_sure else f", {facts['sure_points']:,} of them sure"
     lines = [
         f"registered: {facts['registered']} of {facts['pictures']} pictures, {camera['width']} x "
         f"{camera['height']} pixels, reprojection error {facts['reprojection_error']:.2f} pixels",
         f"camera: {camera['degrees']:.0f} degrees wide; its path is {facts['path']:.2f} long, where what it "
         "sees is 1 away",
-        f"points: {facts['points']:,}, {facts['sure_points']:,} of them sure; box {size}, near "
-        f"{facts['near']:.2f}, far {facts['far']:.2f}",
+        f"points: {facts['points']:,}{sure}; box {size}, near {facts['near']:.2f}, far {facts['far']:.2f}",
     ]
     if facts["left_out"]:
         few = ", ".join(facts["left_out"][:3])
-        lines.append(f"left out: {len(facts['left_out'])} pictures without a pose ({few})")
+        advice = "; film slower and with more of what stands still" if facts["searched"] else ""
+        lines.append(f"left out: {len(facts['left_out'])} pictures without a pose ({few}){advice}")
     return lines

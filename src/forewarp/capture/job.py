@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from forewarp.capture import poses
@@ -17,7 +17,9 @@ from forewarp.capture.scene import write
 from forewarp.capture.sparse import Sparse, read_model, sparse_of
 from forewarp.capture.workplace import workplace
 from forewarp.drawing.files import write_png
-from forewarp.files import folder_written_whole, write_json
+from forewarp.files import folder_written_whole, read_json, write_json
+
+_ERROR = "error.json"  # pixels, before points were deleted
 
 
 @dataclass(frozen=True)
@@ -69,6 +71,7 @@ def capture(
             size=None if known else size,
             told=told,
             upright=not known,
+            threads=how.threads,
         )
         if known:
             sparse = read_model(source.colmap, pictures.originals)
@@ -93,7 +96,7 @@ def _found(place: Path, pictures: Pictures, how: poses.Search, told: Told) -> Sp
 
     best = place / "best"
     if best.is_dir():
-        return sparse_of(pycolmap.Reconstruction(best))
+        return replace(sparse_of(pycolmap.Reconstruction(best)), **read_json(best / _ERROR))
     with told("features") as progress:
         database = poses.find_features(place, pictures.folder, pictures.masks, how, progress)
     with told("matches") as progress:
@@ -101,12 +104,18 @@ def _found(place: Path, pictures: Pictures, how: poses.Search, told: Told) -> Sp
     refuse_matches(database, pictures)
     with told("poses") as progress:
         model = poses.reconstruct(database, pictures.folder, place / "models", how, progress)
-    refuse_poses(None if model is None else sparse_of(model), pictures, database)
+    sparse = None
+    if model is not None:
+        with told("adjustment") as progress:
+            error = poses.adjust(model, how, progress)
+        sparse = replace(sparse_of(model), error=error)
+    refuse_poses(sparse, pictures, database)
     part = place / "part"
     part.mkdir(exist_ok=True)
     model.write(part)
+    write_json(part / _ERROR, {"error": error})
     part.rename(best)
-    return sparse_of(model)
+    return sparse
 
 
 def _state(path: Path) -> str:

@@ -49,6 +49,7 @@ def take(
     size: int | None,
     told: Told,
     upright: bool = True,
+    threads: int | None = None,
 ) -> Pictures:
     """Take pictures out of a video or a folder, unless an earlier call has done so.
 
@@ -61,6 +62,7 @@ def take(
         size: most pixels of the longer side; None: as they are.
         told: shows progress.
         upright: turn a folder's pictures as their EXIF orientation says.
+        threads: of ffmpeg; None: as many as it likes.
 
     Raises:
         ValueError: where they cannot be read or are too few.
@@ -71,7 +73,7 @@ def take(
         for left in (folder, dark):
             shutil.rmtree(left, ignore_errors=True)
         if video:
-            done = _from_video(folder, source, count, size, told)
+            done = _from_video(folder, source, count, size, told, threads)
         else:
             done = _from_folder(folder, source, size, upright, told)
         if masks is not None:
@@ -81,17 +83,19 @@ def take(
     return Pictures(folder, done["times"], dark if masks else None, *facts)
 
 
-def _from_video(folder: Path, video: Path, count: int, size: int | None, told: Told) -> dict:
+def _from_video(
+    folder: Path, video: Path, count: int, size: int | None, told: Told, threads: int | None
+) -> dict:
     """Write the sharpest frames, named after their numbers in the video, from 1."""
     with told("looking at frames") as progress:
-        footage = measure(video, progress)
+        footage = measure(video, progress, threads)
     if len(footage.stamps) < _LEAST:
         got = f"{len(footage.stamps)} frames"
         raise ValueError(f"{video}: expected a video of many frames, but got {got}; film longer")
     chosen = sharpest(footage.stamps, footage.sharp, count)
     times = {}
     with told("taking frames") as progress:
-        for index, pixels in zip(chosen, extracted(video, chosen, size)):
+        for index, pixels in zip(chosen, extracted(video, chosen, size, threads)):
             name = f"frame_{index + 1:06d}.jpg"
             write_jpeg(folder / name, pixels)
             times[name] = float(footage.stamps[index])
@@ -125,7 +129,7 @@ def _from_folder(folder: Path, source: Path, size: int | None, upright: bool, to
             name = f"picture_{done:06d}{'.png' if is_png or has_alpha else '.jpg'}"
             (write_png if name.endswith(".png") else write_jpeg)(folder / name, pixels)
             originals[name] = path.name
-            widths.append(edge_width(pixels[..., :3].mean(-1)) * 640 / max(pixels.shape))
+            widths.append(edge_width(pixels[..., :3].mean(-1)))
             progress(done, len(paths))
     times = {name: float(number) for number, name in enumerate(originals)}
     rows, edges = list(range(len(paths))), _finite(float(np.median(widths)))

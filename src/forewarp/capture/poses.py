@@ -147,36 +147,38 @@ def reconstruct(database: Path, pictures: Path, folder: Path, how: Search, progr
     found = pycolmap.incremental_mapping(
         database, pictures, folder, options, initial_image_pair_callback=count, next_image_callback=count
     )
-    best = max(found.values(), key=lambda one: one.num_reg_images(), default=None)
-    if best is not None:
-        _adjust(best, how.threads or -1)
-    return best
+    return max(found.values(), key=lambda one: one.num_reg_images(), default=None)
 
 
-def _adjust(found, threads: int) -> None:
+def adjust(found, how: Search, progress: Progress) -> float:
     """Adjust all cameras once more to the points that are sure, and so that outliers hardly count.
 
     What moves leaves points that few pictures agree on, and the mapper's squares of errors let them bend the
-    poses. Where a camera would be left with too few points, all stay.
+    poses. They are deleted, but those of cameras that would be left with too few.
+
+    Returns:
+        the mean reprojection error in pixels before it, of all points, so that nothing flatters it.
     """
     import pycolmap
 
+    progress(0, 1)
+    error = float(found.compute_mean_reprojection_error())
     doubtful = {
         number
         for number, point in found.points3D.items()
         if point.track.length() < _SURE_VIEWS or point.error > _SURE_ERROR
     }
-    kept = (
-        sum(point.has_point3D() and point.point3D_id not in doubtful for point in found.images[i].points2D)
-        for i in found.reg_image_ids()
-    )
-    if min(kept) >= _LEAST_POINTS:
-        for number in doubtful:
-            found.delete_point3D(number)
+    needed = set()
+    for image in found.reg_image_ids():
+        seen = {point.point3D_id for point in found.images[image].points2D if point.has_point3D()}
+        if len(seen - doubtful) < _LEAST_POINTS:
+            needed |= seen
+    for number in doubtful - needed:
+        found.delete_point3D(number)
     options = pycolmap.BundleAdjustmentOptions(print_summary=False)
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.loss_function_scale = _LOSS
-    options.ceres.solver_options.num_threads = threads
+    options.ceres.solver_options.num_threads = how.threads or -1
     what = pycolmap.BundleAdjustmentConfig()
     for number in found.reg_image_ids():
         what.add_image(number)
@@ -184,6 +186,8 @@ def _adjust(found, threads: int) -> None:
     # Not pycolmap.bundle_adjustment, which prints whatever the level of its log.
     pycolmap.create_default_bundle_adjuster(options, what, found).solve()
     found.update_point_3d_errors()
+    progress(1, 1)
+    return error
 
 
 def _batches(things: list, size: int) -> list[list]:

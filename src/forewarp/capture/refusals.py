@@ -14,12 +14,13 @@ from forewarp.scene.errors import SceneError
 
 FEW_FEATURES = 60  # of a picture, in the median
 STILL = 0.01  # share of a picture's longer side: a camera that stands shifts less
-BLURRED = 3.0  # pixels of a picture 640 wide: edges of sharp pictures are 0.5 to 1.5 wide
+BLURRED = 2.5  # pixels of a picture 640 wide, as ``sharpness.edge_width`` has them
 TURNED = 0.06  # share of the shift that no turn of the camera explains
 LEAST_MODEL, LEAST_REGISTERED = 3, 0.5  # pictures; share of them, where poses are searched for
 WIDEST = 130.0  # degrees
 WORST_ERROR = 2.5  # pixels
 LEAST_PARALLAX = 0.01  # the extent of the cameras' places as a share of the distance of what they see
+_AROUND = "it only turns, or moves before something flat: walk around the subject, not along a wall"
 _PAIRS = 60  # of pictures that are looked at
 _SHIFTS = 0.03, 0.4  # of pairs in which a turn and a step can be told apart
 _FOCAL = (0.6, 0.8, 1.0, 1.25, 1.6, 2.0)  # shares of the longer side that are tried
@@ -48,13 +49,13 @@ def refuse_matches(database: Path, pictures: Pictures) -> None:
         raise ValueError(f"{_sentence(found, pictures)}; {_advice(found, pictures)}")
     if found.shift < STILL:
         raise ValueError(
-            f"camera: expected one that moves, but matches shift by {100 * found.shift:.1f} % of the picture "
-            "at most; walk around the subject while filming"
+            f"camera: expected one that moves, but got matches that shift by {100 * found.shift:.1f} % of "
+            "the picture at most; walk around the subject while filming"
         )
     if found.unturned < TURNED:
         raise ValueError(
-            f"camera: expected one that moves sideways, but {100 - 100 * found.unturned:.0f} % of all shift "
-            "is explained by turning it; walk, and keep the subject in the middle"
+            "camera: expected one that moves around things near and far, but got one where "
+            f"{100 - 100 * found.unturned:.0f} % of all shift is explained by turning it; {_AROUND}"
         )
 
 
@@ -97,14 +98,16 @@ def refuse_poses(sparse: Sparse | None, pictures: Pictures, database: Path | Non
             raise SceneError(f"lens: expected at most {WIDEST:.0f} degrees, but got {degrees:.0f}")
     except SceneError as error:
         text = str(error).partition(";")[0]
-        raise ValueError(f"{text}; a fisheye? film without it, or undistort the video first") from error
+        raise ValueError(
+            f"{text}; if it is a fisheye, film without it or undistort first; else {_AROUND}"
+        ) from error
     centers = np.stack([np.asarray(one.center) for one in sparse.cameras.values()])
     extent = float(np.linalg.norm(centers - np.median(centers, axis=0), axis=1).max())
     parallax = extent / float(np.median(sparse.distances()))
     if parallax < LEAST_PARALLAX:
         raise ValueError(
-            f"camera: expected one that moves sideways, but its places are {100 * parallax:.2f} % of the "
-            "distance apart; walk around the subject while filming"
+            f"camera: expected one that moves around things near and far, but got places that are "
+            f"{100 * parallax:.2f} % of the distance apart; {_AROUND}"
         )
     if sparse.error > WORST_ERROR:
         raise ValueError(

@@ -20,7 +20,8 @@ _VIEWS, _ERROR = 3, 1.5  # a point that is sure: seen by so many cameras, to so 
 class Sparse:
     """``cameras`` by the picture's name, in the order of time, near and far 0; ``points`` (N, 3) with
     ``colors`` (N, 3) uint8, reprojection ``errors`` (N,) in pixels and how many pictures see each, ``views``
-    (N,); ``seen`` (M, 2) which camera sees which point; ``error`` the mean over all observations, pixels.
+    (N,); ``seen`` (M, 2) which camera sees which point; ``error`` the mean over all observations, pixels; of
+    a search of ours, before doubtful points were deleted.
     """
 
     cameras: dict[str, Camera]

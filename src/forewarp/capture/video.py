@@ -21,7 +21,8 @@ from forewarp.capture.sharpness import edge_width, sharpness
 _SIDE = 640  # pixels of the longer side at which sharpness is measured
 _STAMP = re.compile(r"Parsed_showinfo.* n: *\d+ .* pts_time:(\S+)")
 _DURATION = re.compile(r"Duration: (\d+):(\d+):([\d.]+)")
-_WHOLE = 0.9  # share of its duration after which a video counts as whole: sound may end later
+_WHOLE = 0.9  # share of its duration after which a video counts as whole
+_DAMAGE = re.compile("partial file|ended prematurely|corrupt")
 
 Progress = Callable[[int, int], None]
 
@@ -37,8 +38,13 @@ class Footage:
     widths: np.ndarray
 
 
-def measure(video: Path, progress: Progress) -> Footage:
+def measure(video: Path, progress: Progress, threads: int | None = None) -> Footage:
     """Decode a video once and measure its frames.
+
+    Args:
+        video: any that ffmpeg reads.
+        progress: called with tenths of seconds done and all.
+        threads: None: as many as ffmpeg likes.
 
     Raises:
         ValueError: where the file is no video, ends too early, or has a single frame.
@@ -48,7 +54,7 @@ def measure(video: Path, progress: Progress) -> Footage:
     sharp, widths = [], []
     small = f"scale=w='min(iw,if(gt(iw,ih),{_SIDE},-1))':h='min(ih,if(gt(iw,ih),-1,{_SIDE}))',format=gray"
     with _Said() as said:
-        for picture in _frames(video, f"showinfo=checksum=0,{small}", "pgm", said):
+        for picture in _frames(video, f"showinfo=checksum=0,{small}", "pgm", said, threads):
             sharp.append(sharpness(picture))
             widths.append(edge_width(picture))
             if len(sharp) % 10 == 1 and said.read_on().duration and said.stamps:
@@ -60,20 +66,23 @@ def measure(video: Path, progress: Progress) -> Footage:
     return Footage(order - order[0], np.array(sharp), np.array(widths))
 
 
-def extracted(video: Path, chosen: Sequence[int], size: int | None) -> Iterator[np.ndarray]:
+def extracted(
+    video: Path, chosen: Sequence[int], size: int | None, threads: int | None = None
+) -> Iterator[np.ndarray]:
     """Yield the frames ``chosen``, ascending indices: uint8 (H, W, 3), square pixels, upright.
 
     Args:
         video: which ``measure`` has accepted.
         chosen: from 0.
         size: most pixels of the longer side; None: as filmed.
+        threads: None: as many as ffmpeg likes.
     """
     shape = f"select='{_any_of(list(chosen))}',scale=w='iw*sar':h=ih"
     if size is not None:
         fit = f"w='if(gt(iw,ih),min(iw,{size}),-1)':h='if(gt(iw,ih),-1,min(ih,{size}))'"
         shape += f",scale={fit}:flags=area"
     with _Said() as said:
-        yield from _frames(video, f"{shape},format=rgb24", "ppm", said)
+        yield from _frames(video, f"{shape},format=rgb24", "ppm", said, threads)
 
 
 def _any_of(chosen: list[int]) -> str:
@@ -117,13 +126,14 @@ class _Said:
         return self
 
 
-def _frames(video: Path, filters: str, codec: str, said: _Said) -> Iterator[np.ndarray]:
+def _frames(video: Path, filters: str, codec: str, said: _Said, threads: int | None) -> Iterator[np.ndarray]:
     """Decode the first video stream; write what ffmpeg says to ``said``."""
     import imageio_ffmpeg
 
-    begin = [imageio_ffmpeg.get_ffmpeg_exe(), "-hide_banner", "-nostdin", "-nostats", "-i", str(video)]
-    shape = ["-map", "0:v:0", "-vf", filters, "-fps_mode", "passthrough"]
-    call = [*begin, *shape, "-f", "image2pipe", "-c:v", codec, "-"]
+    some = ["-threads", str(threads or 0)]  # of decoder and encoder
+    begin = [imageio_ffmpeg.get_ffmpeg_exe(), "-hide_banner", "-nostdin", "-nostats"]
+    shape = ["-map", "0:v:0", "-vf", filters, "-filter_threads", some[1], "-fps_mode", "passthrough"]
+    call = [*begin, *some, "-i", str(video), *shape, *some, "-f", "image2pipe", "-c:v", codec, "-"]
     with subprocess.Popen(call, stdout=subprocess.PIPE, stderr=said.file) as process:
         try:
             while (picture := _read_netpbm(process.stdout)) is not None:
@@ -161,12 +171,14 @@ def _refuse(video: Path, said: _Said, count: int) -> None:
     if len(stamps) < count or not np.all(np.diff(stamps[:count]) > 0):
         raise ValueError(
             f"{video}: expected a time stamp for each frame, each later than the one before, but got "
-            f"{len(stamps)} for {count} frames; convert it: ffmpeg -i {video.name} new.mp4"
+            f"{len(stamps)} for {count} frames; save it anew with a video editor"
         )
     end = stamps[count - 1] - stamps[0]
     step = end / (count - 1)
-    if end + step < _WHOLE * duration:
+    # The header's duration is of all streams: sound that goes on is no damage.
+    cut = _DAMAGE.search(text) or ": Audio:" not in text
+    if cut and end + step < _WHOLE * duration:
         raise ValueError(
             f"{video}: expected {duration:.1f} seconds, as its header says, but got {end + step:.1f}; copy "
-            "it again, or cut it: ffmpeg -i in.mp4 -t SECONDS new.mp4"
+            "it again, or save the part that plays with a video editor"
         )
