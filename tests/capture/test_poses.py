@@ -1,5 +1,9 @@
+from contextlib import nullcontext
+from types import SimpleNamespace
+
 import pytest
 
+from forewarp.capture import job, poses
 from forewarp.capture.poses import Search, adjust
 
 pycolmap = pytest.importorskip("pycolmap", reason="no pycolmap; make install adds it")
@@ -47,3 +51,17 @@ def test_one_poor_camera_does_not_keep_the_points_of_others(found):
     forget(found, images[0], doubtful[1:] + sorted(found.points3D)[35:])
     adjust(found, Search(threads=1), lambda done, total: None)
     assert set(doubtful) & set(found.points3D) == {doubtful[0]}
+
+
+def test_the_error_is_kept_for_the_next_call(found, tmp_path, monkeypatch):
+    """It is that of all points, also where the poses are read again."""
+    error = found.compute_mean_reprojection_error()
+    for name, result in (("find_features", None), ("match", None), ("reconstruct", found)):
+        monkeypatch.setattr(poses, name, lambda *given, result=result: result)
+    for name in ("refuse_matches", "refuse_poses"):
+        monkeypatch.setattr(job, name, lambda *given: None)
+    pictures, quiet = SimpleNamespace(folder=None, masks=None), lambda done, total: None
+    first = job._found(tmp_path, pictures, Search(threads=1), lambda title: nullcontext(quiet))
+    again = job._found(tmp_path, pictures, Search(threads=1), None)
+    assert first.error == again.error == error
+    assert len(first.points) == len(again.points) == 40

@@ -93,6 +93,9 @@ def sound(path):
     return path
 
 
+FAST = ("-movflags", "faststart")
+
+
 def with_sound(path, seconds):
     """The film and a tone of so many seconds."""
     tone = ["-f", "lavfi", "-i", f"sine=duration={seconds}", "-map", "0:v", "-map", "1:a", "-c:v", "copy"]
@@ -107,7 +110,6 @@ def test_sound_may_go_on_after_the_last_frame(tmp_path):
     assert len(measure(film, quiet, threads=1).stamps) == 50
 
 
-FAST = ("-movflags", "faststart")
 BROKEN = {
     "text": (lambda p: p.write_text("no video") and p, "expected a video, but got another file"),
     "empty": (lambda p: p.touch() or p, "expected a video, but got another file"),
@@ -130,3 +132,15 @@ def test_what_is_no_whole_video_is_refused(tmp_path, kind):
     make, says = BROKEN[kind]
     with pytest.raises(ValueError, match=says):
         measure(make(tmp_path / "a.mp4"), quiet)
+
+
+def test_ffmpeg_takes_no_more_threads_than_it_is_given(tmp_path, monkeypatch):
+    film = write_film(tmp_path / "a.mp4", numbered(3))
+    calls, popen = [], subprocess.Popen
+    monkeypatch.setattr(subprocess, "Popen", lambda call, **rest: calls.append(call) or popen(call, **rest))
+    measure(film, quiet, threads=1)
+    list(extracted(film, [1], None, threads=1))
+    for call in calls:
+        given = {call[i + 1] for i, word in enumerate(call) if word in ("-threads", "-filter_threads")}
+        assert given == {"1"}
+    assert len(calls) == 2
