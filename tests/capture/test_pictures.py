@@ -42,6 +42,13 @@ def test_frames_bear_their_numbers_and_stamps(tmp_path):
         )
 
 
+def test_by_default_at_most_every_second_frame_is_taken(tmp_path):
+    film = write_film(tmp_path / "a.mp4", numbered(12))
+    found = taken(tmp_path / "work", film, count=None)
+    assert len(found.times) == 6
+    assert all((int(name[6:12]) - 1) // 2 == window for window, name in enumerate(sorted(found.times)))
+
+
 def test_pictures_of_a_folder_come_in_the_order_of_their_names(tmp_path):
     (tmp_path / "p").mkdir()
     for name in ("img 10.png", "img 2.png", "img 1.png", "img 2.jpg"):

@@ -149,7 +149,7 @@ def test_pictures_with_spaces_and_alpha_are_matched(refused, in_tmp):
     for n, frame in enumerate(stood(3)):
         Image.fromarray(frame).convert("RGBA").save(in_tmp / "p" / f"IMG {n}.png")
     said = refused("capture", "images=p", "threads=1", "features=400")
-    assert "camera: expected one that moves, but matches shift by 0." in said
+    assert "camera: expected one that moves, but got matches that shift by 0." in said
 
 
 @needs_pycolmap

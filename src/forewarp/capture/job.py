@@ -40,7 +40,13 @@ class Source:
 
 
 def capture(
-    source: Source, out: Path, how: poses.Search, told: Told, *, frames: int = 120, size: int | None = 1600
+    source: Source,
+    out: Path,
+    how: poses.Search,
+    told: Told,
+    *,
+    frames: int | None = None,
+    size: int | None = 1600,
 ) -> dict:
     """Make a scene in ``out`` and return what was found, which ``capture.json`` there holds too.
 
@@ -51,7 +57,7 @@ def capture(
         out: the scene's folder; an earlier capture in it is replaced.
         how: how poses are found.
         told: gives a ``Progress`` for each step.
-        frames: to choose from a video.
+        frames: to choose from a video; None: 120, and at most every second one.
         size: most pixels of the longer side; with poses that are known pictures are left as stored.
 
     Raises:

@@ -17,7 +17,7 @@ from forewarp.files import read_json, write_json
 
 _DONE = "pictures.json"  # written last
 _MOVING = 127  # a mask above it is what moves
-_LEAST = 3  # pictures
+_LEAST, _ENOUGH = 3, 120  # pictures
 
 Told = Callable[[str], object]  # title of a step -> a context manager that gives a ``Progress``
 
@@ -45,7 +45,7 @@ def take(
     *,
     video: bool,
     masks: Path | None,
-    count: int,
+    count: int | None,
     size: int | None,
     told: Told,
     upright: bool = True,
@@ -58,7 +58,8 @@ def take(
         source: a video, or a folder of pictures.
         video: which of both.
         masks: a folder; see ``_write_masks``.
-        count: of frames to choose from a video; those of a folder are all taken.
+        count: of frames to choose from a video; None: ``_ENOUGH``, and at most every second one, so that
+            blurred ones can be left out. Pictures of a folder are all taken.
         size: most pixels of the longer side; None: as they are.
         told: shows progress.
         upright: turn a folder's pictures as their EXIF orientation says.
@@ -84,7 +85,7 @@ def take(
 
 
 def _from_video(
-    folder: Path, video: Path, count: int, size: int | None, told: Told, threads: int | None
+    folder: Path, video: Path, count: int | None, size: int | None, told: Told, threads: int | None
 ) -> dict:
     """Write the sharpest frames, named after their numbers in the video, from 1."""
     with told("looking at frames") as progress:
@@ -92,6 +93,8 @@ def _from_video(
     if len(footage.stamps) < _LEAST:
         got = f"{len(footage.stamps)} frames"
         raise ValueError(f"{video}: expected a video of many frames, but got {got}; film longer")
+    if count is None:
+        count = max(_LEAST, min(_ENOUGH, len(footage.stamps) // 2))
     chosen = sharpest(footage.stamps, footage.sharp, count)
     times = {}
     with told("taking frames") as progress:

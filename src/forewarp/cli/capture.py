@@ -21,7 +21,8 @@ What one types most:
   masks=FOLDER                  what moves is bright; poses are not found from it. A mask for each frame
                                 of the video in order, or masks with the pictures' names
   out=FOLDER                    the scene's folder (captures/<name of the video>)
-  frames=N size=N               how many frames; pixels of the longer side, at most
+  frames=N                      how many frames of a video; by default 120, but at most every second one
+  size=1600                     pixels of the longer side, at most; null: as filmed
   matching=exhaustive           match every pair of pictures, where the camera comes back to where it was
   lens=SIMPLE_RADIAL            a simpler camera, where few pictures or points tell of the lens
   threads=N seed=N              processors; random choices
@@ -77,7 +78,7 @@ def check(config) -> tuple[dict, object]:
             got = "another thing" if path.exists() else "none"
             raise ValueError(f"{key}: expected an existing {what}, but got {got}: {path}; set {key}=...")
     for key, least, or_null in (
-        ("frames", 3, False),
+        ("frames", 3, True),
         ("size", 64, True),
         ("features", 100, False),
         ("threads", 1, True),
