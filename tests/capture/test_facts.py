@@ -29,6 +29,6 @@ def test_facts_are_those_of_the_capture():
         "registered: 12 of 14 pictures, 320 x 240 pixels, reprojection error 0.50 pixels",
         f"camera: 56 degrees wide; its path is {11 * chord:.2f} long, where what it sees is 1 away",
         "points: 400; box 2.00 x 3.00 x 4.00, near 0.50, far 2.00",
-        "left out: 2 pictures without a pose (IMG 13.jpg, IMG 14.jpg); film slower and with more of what stands "
-        "still",
+        "left out: 2 pictures without a pose (IMG 13.jpg, IMG 14.jpg); film slower and with more of what "
+        "stands still",
     ]
