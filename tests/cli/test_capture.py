@@ -259,7 +259,9 @@ def test_a_video_becomes_a_scene_that_is_trained_also_when_interrupted(ok, in_tm
     words = [f"video={video}", "out=captures/hand", "frames=20", "threads=1"]
     command = [sys.executable, "-m", "forewarp.cli.capture", *words]
     work = in_tmp / "captures" / ".hand.work"
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=os.environ)
+    signal.signal(signal.SIGINT, before)
     while not (work / "pairs.txt").exists():
         assert process.poll() is None, process.stderr.read()
         time.sleep(0.05)
