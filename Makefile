@@ -1,5 +1,5 @@
 .DEFAULT_GOAL := help
-.PHONY: help install install-launchers install-browser demo demo-particles demo-forward demo-backward tables-vehicle tables-captures demo-lego-complete demo-hypernerf demo-nhr test conformance test-slow test-stability bench bench-gpu effects accuracy-time price-list reproduce-tables lint format clean
+.PHONY: help install install-launchers install-browser demo demo-particles demo-forward demo-backward tables-vehicle tables-captures demo-lego-complete demo-hypernerf demo-nhr test conformance test-slow test-stability bench bench-gpu effects accuracy-time price-list reproduce-tables docs docs-serve lint format clean
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -32,27 +32,26 @@ space := $(subst ,, )
 # A failed job has printed its error and stops no other job; make ends with its status. Only Ctrl-C ends everything.
 GO_ON = || { status=$$?; [ $$status -lt 128 ] || exit $$status; }
 
+# Install forewarp with the extras that follow, from where pip is told to look.
+ADD = links="$$($(BIN)/pip config get global.find-links 2>/dev/null || echo "$$PIP_FIND_LINKS")"; \
+	if [ -n "$$links" ]; then export UV_FIND_LINKS="$$links"; fi; \
+	VIRTUAL_ENV="$$PWD/.venv" $(BIN)/uv pip install --compile-bytecode -c constraints.txt -e
+
 help: ## show this list
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 20
 
 install: ## create .venv with forewarp and all extras except the launchers of sweeps
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
 	$(BIN)/pip install --quiet uv
-	links="$$($(BIN)/pip config get global.find-links 2>/dev/null || echo "$$PIP_FIND_LINKS")"; \
-	if [ -n "$$links" ]; then export UV_FIND_LINKS="$$links"; fi; \
-	VIRTUAL_ENV="$$PWD/.venv" $(BIN)/uv pip install --compile-bytecode -c constraints.txt -e '.[cpu,synth,plots,viewer,export,dev]'
+	$(ADD) '.[cpu,synth,plots,viewer,export,capture,dev]'
 
 install-launchers: ## add joblib, Ray and submitit for sweeps (launcher=...), and Optuna (sweeps=search)
-	links="$$($(BIN)/pip config get global.find-links 2>/dev/null || echo "$$PIP_FIND_LINKS")"; \
-	if [ -n "$$links" ]; then export UV_FIND_LINKS="$$links"; fi; \
-	VIRTUAL_ENV="$$PWD/.venv" $(BIN)/uv pip install --compile-bytecode -c constraints.txt -e '.[sweeps]'
+	$(ADD) '.[sweeps]'
 
 install-browser: ## add a headless Chromium and playwright, which test the viewer's page; as root, on Debian
 	command -v chromium >/dev/null || { apt-get update -qq && \
 		apt-get install -y -qq --no-install-recommends chromium fonts-dejavu-core >/dev/null; }
-	links="$$($(BIN)/pip config get global.find-links 2>/dev/null || echo "$$PIP_FIND_LINKS")"; \
-	if [ -n "$$links" ]; then export UV_FIND_LINKS="$$links"; fi; \
-	VIRTUAL_ENV="$$PWD/.venv" $(BIN)/uv pip install --compile-bytecode -c constraints.txt -e '.[browser]'
+	$(ADD) '.[browser]'
 
 demo: ## fit the procedural vehicle by three methods, two at once, compare, make a video (three to four minutes)
 	@$(MAKE) --no-print-directory -j2 demo-particles demo-forward demo-backward
@@ -165,6 +164,15 @@ tables-vehicle tables-captures:
 		$(REPRODUCE) sweeps=$${pair%:*} scene=counterpart_$${pair#*:} $(GO_ON); \
 	done; exit $$status; } $(SAYS)
 
+MKDOCS = { $(BIN)/python -c 'import material, mkdocstrings_handlers.python' 2>/dev/null || { $(ADD) '.[docs]'; }; } && \
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs
+docs: ## build the docs site into site/, from which it opens without a network; warnings are errors
+	@$(MKDOCS) build --strict --quiet
+	@echo "written: site/index.html"
+
+docs-serve: ## show the docs site on 127.0.0.1:8000, and anew after each change
+	@$(MKDOCS) serve
+
 lint: ## check code and format
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -174,5 +182,5 @@ format: ## fix what can be fixed, and format
 	$(BIN)/ruff format .
 
 clean: ## remove caches and builds; runs/ and data/ stay
-	rm -rf .pytest_cache .ruff_cache .hypothesis .coverage build dist
+	rm -rf .pytest_cache .ruff_cache .hypothesis .coverage build dist site
 	find src tests -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -24,6 +24,7 @@ MAY_IMPORT = {
     "planning": LOWER | {"methods", "training", "evaluation", "data", "report", "runs"},
     "viewer": LOWER | {"browser", "methods", "training", "evaluation"},
     "export": LOWER | {"browser", "methods", "training", "evaluation"},
+    "capture": {"ops", "scene", "drawing", "data"},
     "replay": {"cli", "runs", "training"},
     "cli": LOWER
     | {
@@ -37,6 +38,7 @@ MAY_IMPORT = {
         "planning",
         "viewer",
         "export",
+        "capture",
     },
 }
 CONFIG = {"runs", "planning", "cli"}
@@ -45,8 +47,9 @@ ONLY_IN = {
     "lightning": {"data", "training", "evaluation", "runs", "planning", "viewer", "cli"},
     **{"torchmetrics": {"metrics"}, "numba": {"ops"}, "PIL": {"data"}, "matplotlib": {"report"}},
     **{"trimesh": {"synth"}, "embreex": {"synth"}, "torchvision": set()},
+    "pycolmap": {"capture"},
     **{"skimage": {"export"}, "viser": {"export", "viewer", "cli"}},
-    **{"imageio": {"drawing", "evaluation", "cli"}, "imageio_ffmpeg": {"drawing", "cli"}},
+    **{"imageio": {"drawing", "evaluation", "cli"}, "imageio_ffmpeg": {"drawing", "capture", "cli"}},
     "rich": {"progress", "training", "evaluation", "planning", "cli"},
 }
 CONTRACT = {
@@ -54,11 +57,13 @@ CONTRACT = {
     "abilities",
     "effect",
     "rows",
+    "rows_adam",
     "sampled",
+    "marched",
 }  # files of methods/ that packages above may import
 # Attributes of one method only.
 OWN_PARTS = {"radiance", "lattice", "lattices", "motion", "deformation", "inpainter"}
-ABOVE = {"training", "data", "report", "evaluation", "runs", "planning", "viewer", "export", "cli"}
+ABOVE = {"training", "data", "report", "evaluation", "runs", "planning", "viewer", "export", "capture", "cli"}
 FUNCTION_LINES, FILE_LINES = 60, 350
 REASON = "# long: "
 

@@ -30,7 +30,7 @@ EXPERIMENTS = options("experiment")
 ELSEWHERE = {"preset", "model", "experiment", "stage", "objective", "data", "scene", "ablation"}
 ELSEWHERE |= {"callbacks", "hydra", "paths"}
 DEFAULTS = {("capture", "cut_out"), ("logger", "tensorboard"), ("trainer", "auto")}
-DEFAULTS |= {("model/renderer", "march"), ("model/sampling", "along_rays")}
+DEFAULTS |= {("model/renderer", "march"), ("model/sampling", "along_rays"), ("model/marching", "equal_steps")}
 VOXELS = {"model/motion", "model/view_dependence", "model/background"}  # also groups of voxel methods
 OF_PARTICLES = [
     ("model/motion", "spline"),

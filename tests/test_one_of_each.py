@@ -57,11 +57,12 @@ def test_nothing_is_written_twice():
     [
         (
             "softplus",
-            {"fields/radiance_grid.py", "fields/template.py"},
-        ),  # raw density: of voxels, of networks
+            {"fields/radiance_grid.py", "fields/template.py", "methods/neural_volumes.py"},
+        ),  # raw density: of voxels, of networks, of decoded volumes
         # Compositing is in log space, in ops/composite.py; a splat may be opaque, which has no logarithm.
         ("cumprod", {"ops/rasterize.py"}),
-        ("grid_sample", set()),  # trilinear reads are ops/grid.py's
+        # Trilinear reads are ops/grid.py's; Neural Volumes reads volumes with gradients to places.
+        ("grid_sample", {"fields/volumes.py"}),
         ("scatter_add_", set()),
     ],
 )

@@ -109,6 +109,28 @@ def test_outside_the_box_nothing_is_asked():
     assert len(seen.depths) == 2
 
 
+def test_samples_lie_between_the_first_and_the_last_kept_point():
+    box, asked = Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)), []
+
+    def kept(points):
+        return (points[..., 0] > -0.3) & (points[..., 0] < 0.2) & (points[..., 1] > -0.5)
+
+    def radiance(points, directions):
+        asked.append(points)
+        return 2.0 * torch.ones(len(points)), RED.expand(len(points), 3)
+
+    three = along_x()
+    three.origins[1:, 1] = torch.tensor([-0.6, 1.5])  # past all that is kept, and past the box
+    seen = Quadrature(50, 0, False, box, kept)(None, radiance, three, WHITE)
+    step = 2 / 63  # the probes begin at the box's face
+    assert seen.depths.shape == (1, 50)
+    assert 2.7 - step <= float(seen.depths.min()) < float(seen.depths.max()) <= 3.2 + step
+    assert len(asked[0]) > 44
+    assert kept(asked[0]).all()
+    expected = torch.tensor([1 - math.exp(-2 * 0.5), 0.0, 0.0])
+    torch.testing.assert_close(seen.opacity, expected, atol=0.02, rtol=0)
+
+
 def test_all_rays_may_miss():
     weight = torch.ones((), requires_grad=True)
     box = Box((-1, 7, -1), (1, 8, 1))

@@ -16,7 +16,7 @@ from hydra_plugins.forewarp_one_at_a_time import changed
 from tests.support.configs import CONF, ROOT, composed, groups, options
 
 PAPER = {"dnerf": 24, "hypernerf": 12, "nhr": 12, "lego_complete": 9, "ablation_modules": 60}
-PAPER |= {"ablation_losses": 32, "resolution": 16}
+PAPER |= {"ablation_losses": 32, "resolution": 16, "methods": 24}
 OTHERS = {"accuracy_time", "effects", "price_list_forward", "price_list_particles", "search", "minutes"}
 LISTS = {
     name: yaml.safe_load((ROOT / "sweeps" / f"price_list_{name}.yaml").read_text())["hydra"]["sweeper"]

@@ -120,13 +120,19 @@ class Counted:
     def __init__(self, title: str, stream=None) -> None:
         self.line, self.begin = ProgressLine(title, stream=stream), time.perf_counter()
         self.done, self.total = 0, 1
+        self.first: tuple[int, float] | None = None  # what was done at the first call, and when that was
 
     def __call__(self, done: int, total: int) -> None:
-        """Show that ``done`` of ``total`` are done, where an update is due."""
+        """Show that ``done`` of ``total`` are done, where an update is due.
+
+        The time left is told from what was done since the first call, as an earlier run may have done a part.
+        """
         self.done, self.total = done, total
+        self.first = self.first or (done, time.perf_counter())
         if self.line.due():
-            spent = time.perf_counter() - self.begin
-            self.line.show(done / total, spent / done * (total - done) if done else None, f"{done}/{total}")
+            newly, spent = done - self.first[0], time.perf_counter() - self.first[1]
+            left = spent / newly * (total - done) if newly else None
+            self.line.show(done / total, left, f"{done}/{total}")
 
     def __enter__(self) -> Counted:
         return self

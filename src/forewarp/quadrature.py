@@ -20,6 +20,7 @@ Density = Callable[[Tensor], Tensor]
 Radiance = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 _FAR = 1e10  # the published length of the last interval
 _POINTS = 1 << 17  # evaluated at once for an image
+_PROBES = 64  # points of a ray that tell where kept ones begin and end
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,8 @@ class Quadrature:
         open_end: give the last sample an endless interval, as published. A density that is never 0 (softplus)
             then hides the background. False: end the interval with the ray.
         box: treat space outside as empty, without evaluating it; None: evaluate all from near to far.
-        kept: points (..., 3) -> bool (...,): treat all other points as empty, without evaluating them.
+        kept: points (..., 3) -> bool (...,): treat all other points as empty, without evaluating them, and
+            place samples between the first and the last kept point of a ray; with a box.
     """
 
     samples: int = 64
@@ -158,7 +160,17 @@ class Quadrature:
         if self.box is None:
             return tuple(rays.origins.new_full((len(rays),), end) for end in (rays.near, rays.far))
         corners = (rays.origins.new_tensor(corner) for corner in (self.box.low, self.box.high))
-        return clip_to_box(rays.origins, rays.directions, rays.near, rays.far, *corners)
+        ends = clip_to_box(rays.origins, rays.directions, rays.near, rays.far, *corners)
+        return ends if self.kept is None else self._narrowed(rays, *ends)
+
+    def _narrowed(self, rays: Rays, near: Tensor, far: Tensor) -> tuple[Tensor, Tensor]:
+        """Leave out what lies before the first and behind the last kept point; far <= near: there is none."""
+        step = (far - near).clamp(min=0) / (_PROBES - 1)
+        numbers = torch.arange(_PROBES, device=near.device)
+        kept = self.kept(_points(rays, near[:, None] + step[:, None] * numbers))
+        first = torch.where(kept, numbers, _PROBES).amin(1)
+        last = torch.where(kept, numbers, -1).amax(1)
+        return near + (first - 1).clamp(min=0) * step, near + (last + 1).clamp(max=_PROBES - 1) * step
 
     def _intervals(self, depths: Tensor, far: Tensor) -> Tensor:
         """Return the length (R, S) of each sample's interval: up to the next sample."""

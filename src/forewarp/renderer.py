@@ -77,7 +77,8 @@ class Renderer:
         """Render R rays.
 
         Args:
-            field: density and colour at one time.
+            field: density and colour at one time; ``look_up``, where one network gives both: points (P, 3)
+                -> density (P,), and a function: rows (K,) of them, directions (K, 3) -> colour (K, 3).
             rays: origins, unit directions, near and far.
             background: colour (3,) or (R, 3) behind everything.
             shade: turns features and directions into colour; None: the first 3 features are the colour.
@@ -93,12 +94,15 @@ class Renderer:
             return self._traced(field, rays, background, shade, generator)
         count, step = len(rays), self.step * field.voxel_size
         ray_ids, distances, points = self._samples(field, rays, step, generator)
-        weights, transmittance = render_weights(field.density(points) * step, ray_ids, count)
+        at_once = hasattr(field, "look_up")
+        density, color_of = field.look_up(points) if at_once else (field.density(points), None)
+        weights, transmittance = render_weights(density * step, ray_ids, count)
         kept = slice(None)
         if self.color_threshold > 0:
             kept = (weights.detach() > self.color_threshold).nonzero()[:, 0]
         some_weights, some_rays = weights[kept], ray_ids[kept]
-        colors = field.colors(points[kept], rays.directions[some_rays], shade)
+        towards = rays.directions[some_rays]
+        colors = color_of(kept, towards) if color_of else field.colors(points[kept], towards, shade)
         rgb = accumulate(some_weights, colors, some_rays, count) + transmittance[:, None] * background
         # Not 1 - transmittance: it rounds to 0 for thin matter, and depth would leave [near, far].
         moments = torch.stack([torch.ones_like(distances), distances], -1)

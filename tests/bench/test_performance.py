@@ -1,5 +1,7 @@
 """The tables of the benchmark."""
 
+import pytest
+
 from tests.bench import performance
 from tests.bench.timed_cases import CASES
 from tests.bench.workloads import make_module
@@ -35,6 +37,7 @@ def test_the_work_of_a_step_does_not_ask_how_large_the_box_is():
         assert 0.7 * before < after < 1.3 * before
 
 
+@pytest.mark.slow
 def test_every_table_is_made(monkeypatch):
     monkeypatch.setattr(performance, "by_itself", lambda side, rays: 1e6)
     assert performance.box_table(side=8, rays=16).count("| x") == 4

@@ -12,7 +12,7 @@ from forewarp.cli.misspelt import with_run_key
 from forewarp.scene.errors import SceneError
 from tests.support.configs import CONF, ROOT, options
 
-COMMANDS = ("train", "evaluate", "render", "export", "synthesize", "report")
+COMMANDS = ("train", "evaluate", "render", "export", "synthesize", "report", "capture")
 
 
 @pytest.mark.parametrize("name", COMMANDS)

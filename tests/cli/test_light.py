@@ -21,7 +21,7 @@ for name, *words in json.load(sys.stdin):
     GlobalHydra.instance().clear()
     print(json.dumps([status, err.getvalue(), sorted(sys.modules)]), flush=True)
 """
-COMMANDS = ("train", "plan", "evaluate", "render", "view", "export", "report", "synthesize")
+COMMANDS = ("train", "plan", "evaluate", "render", "view", "export", "report", "synthesize", "capture")
 NOWHERE = ["data=dnerf", "data.root=nowhere", "data.scene=x"]
 REFUSED = [
     (["train", "data.scence=x"], "did you mean data.scene?"),
@@ -44,6 +44,7 @@ REFUSED = [
     (["export", "run=."], "config.yaml: expected the configuration of a run, but got none"),
     (["report", "kind=limits", "runs=[a]"], "config.yaml: expected the configuration of a run, but got none"),
     (["report"], "runs/accuracy_time: expected folders of runs, but got none"),
+    (["capture"], "expected video=FILE or images=FOLDER, but got neither"),
     (["synthesize", "folder=."], "expected a new or empty folder, but got one with files"),
 ]
 

@@ -8,12 +8,16 @@ from forewarp.fields.radiance import DirectRadiance
 from forewarp.fields.trajectory import TrajectoryField
 from forewarp.methods.dnerf import DNeRF
 from forewarp.methods.hypernerf import HyperNeRF
+from forewarp.methods.marched import Marching
 from forewarp.methods.method import Method, Start
+from forewarp.methods.ndvg import NDVG
 from forewarp.methods.nerf import NeRF
 from forewarp.methods.nerfies import Nerfies
+from forewarp.methods.neural_volumes import NeuralVolumes
 from forewarp.methods.particles.model import Particles
 from forewarp.methods.particles.nodes import Nodes
 from forewarp.methods.sampled import Sampling
+from forewarp.methods.tineuvox import TiNeuVox
 from forewarp.methods.tnerf import TNeRF
 from forewarp.methods.voxel.backward_warp import Deformation
 from forewarp.methods.voxel.effects.background import StaticBackground, Together
@@ -105,6 +109,15 @@ RATES |= {"tint": 1e-3, "fade": 3e-3, "shifts": 7e-3, "node_turns": 8e-3, "skin"
 SMALL_NETWORK = {"width": 32, "layers": 3, "skip": None, "position_frequencies": 4}
 SMALL_NETWORK |= {"sampling": Sampling(16, 16, density="softplus", open_end=False, inside_box=True)}
 SMALL_WARP = {"warp_width": 24, "warp_layers": 3, "warp_skip": None}
+SMALL_VOLUMES = {"picture_size": (8, 8), "tower": (8, 16), "features": 16, "code": 8}
+SMALL_VOLUMES |= {"decoder": (32, 16, 16, 8), "maps": 4, "warp_side": 6, "warp_width": 16, "weight_width": 8}
+SMALL_VOLUMES |= {
+    "step": 1 / 12,
+    "from_identity": True,
+    "first_opacity": 0.1,
+    "first_deviation": 0.05,
+    "jitter_in_pictures": False,
+}
 
 METHODS = {
     "forward": Entry(ForwardModel(GRID, motion=Motion, trajectory=TRAJECTORY), **VOXELS, effects=WARP),
@@ -147,6 +160,38 @@ METHODS = {
         {"photo": 1.0, "coarse_photo": 1.0, "still": 1e-3},
         {"warp_in": 0.3, "slice_from": 0.01, "slice_in": 0.2},
         steps=150,
+        slow=True,
+    ),
+    "tineuvox": Entry(
+        partial(
+            TiNeuVox,
+            marching=Marching(jitter=True, occupancy=12),
+            width=24,
+            position_frequencies=3,
+            camera=True,
+            padded=False,
+        ),
+        {"grid": 8e-2, "deformation": 2e-3, "network": 5e-3},
+        {"photo": 1.0, "point_color": 0.01, "background_entropy": 1e-3, "still": 0.1, "tv_grid": 1e-6},
+        {"num_voxels": [[0, 9**3], [0.4, 13**3]]},
+        steps=100,
+        slow=True,
+    ),
+    "ndvg": Entry(
+        partial(NDVG, marching=Marching(jitter=True, occupancy=12), width=(24, 24), continuous=True),
+        {"density": 0.1, "color": 0.1, "deformation": 0.1, "network": 3e-3},
+        {"photo": 1.0, "point_color": 0.01, "background_entropy": 1e-3, "flow_l1": 1e-2}
+        | {"tv_deformation": 1.0, "canonical": 1.0, "still": 0.1},
+        {"num_voxels": [[0, 9**3], [0.4, 12**3]], "alpha_init": 1e-2},
+        steps=100,
+        slow=True,
+    ),
+    "neural_volumes": Entry(
+        partial(NeuralVolumes, **SMALL_VOLUMES),
+        {"network": 5e-3},
+        {"photo": 104.04, "code_prior": 1e-3, "opacity_prior": 1e-2, "opacity_variation": 1e-2},
+        falls=0.7,  # its rays also miss what an instant's one picture does not show
+        steps=200,
         slow=True,
     ),
     "particles": Entry(

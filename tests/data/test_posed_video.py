@@ -76,6 +76,20 @@ def test_known_points_project_by_the_formats_formulas(tmp_path, made):
         torch.testing.assert_close(camera.center + (moved - camera.center).norm() * ray, moved)
 
 
+def test_points_that_never_move_are_in_the_scenes_units(tmp_path):
+    points = np.random.default_rng(0).uniform(-20, 20, (7, 3)) + MIDDLE.numpy()
+    for given in (points, None):  # an old scene's points do not stay
+        write_scene(tmp_path / "toy", shots(), near=20.0, far=120.0, points=given)
+        scene = read_scene(tmp_path, "toy")
+        if given is None:
+            assert scene.still is None
+            return
+        assert scene.still.dtype == torch.float32
+        frame, camera = next(iter(frames_of(scene).values())), cameras(10)[0]
+        before, after = camera.project(torch.from_numpy(points)), frame.camera.project(scene.still.double())
+        torch.testing.assert_close(before[0], after[0], atol=1e-3, rtol=0)
+
+
 def test_each_frame_may_have_its_own_camera(made):
     views = cameras(5) + cameras(5, size=(16, 12), lens=None)
     views[2] = replace(views[2], fx=50.0, cx=11.0)

@@ -7,7 +7,8 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from forewarp.data.module import SceneDataModule
-from forewarp.evaluation.accuracy_time import COLUMNS, AccuracyCurve, read_rows, seconds_before
+from forewarp.evaluation.accuracy_time import COLUMNS, AccuracyCurve, seconds_before
+from forewarp.files import read_rows
 from forewarp.scene.frame import Truth
 from forewarp.training.stages import Run
 from tests.support.tiny_scene import Interrupt, ball_scene, forward_model, stage, trainer

@@ -1,7 +1,11 @@
+import math
+
 import torch
 
 from forewarp.fields.occupancy import Occupancy
 from forewarp.scene.box import Box
+from forewarp.scene.camera import Camera, look_at
+from forewarp.scene.frame import Frame
 
 BOX = Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
 
@@ -36,7 +40,7 @@ def test_all_matter_of_all_times_is_kept_and_most_of_the_rest_is_not():
 
 def test_what_is_gone_is_forgotten():
     lattice, draw = looked([0.0], 40), torch.Generator().manual_seed(2)
-    for _ in range(2400):
+    for _ in range(300):
         lattice.look(lambda points, time: torch.zeros(len(points)), [0.0], draw)
     assert not lattice(torch.tensor([[-0.5, 0.0, 0.0]])).item()
 
@@ -47,3 +51,52 @@ def test_it_is_kept_in_a_checkpoint():
     other.load_state_dict(lattice.state_dict())
     points = 2 * torch.rand(100, 3) - 1
     assert other(points).equal(lattice(points))
+
+
+def test_it_settles_by_a_look_at_all_times_and_bounds_what_it_found():
+    lattice = Occupancy(BOX, side=16)
+    assert lattice.bounds(0.1) is None
+    lattice.settle(ball, [0.0, 1.0])
+    points = 2 * torch.rand(4000, 3, generator=torch.Generator().manual_seed(1)) - 1
+    there = torch.stack([ball(points, time) > 0 for time in (0.0, 1.0)]).any(0)
+    assert lattice(points)[there].all()
+    assert lattice(points)[~there].float().mean() < 0.25
+    assert lattice.cells.sum() == lattice.occupied.sum()
+    box = lattice.bounds(0.1)
+    for low, high, ends in zip(box.low, box.high, ((-0.8, 0.8), (-0.3, 0.3), (-0.3, 0.3))):
+        assert ends[0] - 0.26 < low < ends[0]
+        assert ends[1] < high < ends[1] + 0.26
+
+
+def view(angle, size=32):
+    """A camera on a circle around the ball, and the alpha of its picture."""
+    place = torch.tensor([3 * math.cos(angle), 3 * math.sin(angle), 0.5])
+    pose = look_at(place, torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
+    return Camera(size, size, 1.4 * size, 1.4 * size, size / 2, size / 2, pose, 2.0, 4.0)
+
+
+def shot(number, count):
+    time = number / (count - 1)
+    camera = view(2.4 * number)
+    rays = camera.rays()
+    towards = torch.tensor([-0.5 + time, 0.0, 0.0]) - rays.origins
+    along = (towards * rays.directions).sum(-1, keepdim=True)
+    covered = (towards - along * rays.directions).norm(dim=-1) < 0.3
+    picture = torch.zeros(camera.height, camera.width, 4, dtype=torch.uint8)
+    picture[..., 3] = 255 * covered.reshape(camera.height, camera.width)
+    return Frame(str(number), time, camera, lambda: picture)
+
+
+def test_what_pictures_show_as_uncovered_is_empty_from_the_start():
+    frames = [shot(number, 24) for number in range(24)]
+    lattice = Occupancy(BOX, side=16)
+    lattice.confine(frames, 0.1)
+    points = 2 * torch.rand(4000, 3, generator=torch.Generator().manual_seed(1)) - 1
+    there = torch.stack([ball(points, f.time) > 0 for f in frames]).float().mean(0)
+    assert lattice(points)[there > 0.15].all()
+    assert lattice(points)[there == 0].float().mean() < 0.45
+    seen = []
+    lattice.look(
+        lambda points, time: seen.append(points) or torch.ones(len(points)), [0.0], torch.Generator()
+    )
+    assert lattice(seen[0]).all()  # a look passes over what is empty for good

@@ -1,5 +1,6 @@
 """NeRF, T-NeRF, D-NeRF, Nerfies and HyperNeRF: sizes, identities, what they can learn."""
 
+from dataclasses import replace
 from functools import partial
 
 import pytest
@@ -15,16 +16,13 @@ from forewarp.methods.sampled import Sampling
 from forewarp.methods.tnerf import TNeRF
 from forewarp.ops.encode import positional_encoding
 from forewarp.scene.batch import Batch, Observation
-from forewarp.scene.box import Box
-from forewarp.scene.camera import Camera, look_at
-from forewarp.scene.frame import Frame, Scene
 from forewarp.scene.view import Moment, View
 from forewarp.training.objective import Objective
 from forewarp.training.schedule import StageSettings
 from forewarp.training.stages import Stage
+from tests.support.sliding_square import camera, moving_scene, static_ceiling
 from tests.support.tiny_scene import make_run
 
-TIMES = (0.0, 0.5, 1.0)
 SMALL = {"width": 32, "layers": 3, "skip": None, "position_frequencies": 3, "direction_frequencies": 1}
 WARP = {"warp_width": 24, "warp_layers": 3, "warp_skip": None}
 GENTLE = {"density": "softplus", "open_end": False}
@@ -35,30 +33,6 @@ KINDS = {
     "nerfies": partial(Nerfies, **SMALL, **WARP, elastic_samples=64),
     "hypernerf": partial(HyperNeRF, **SMALL, **WARP, slice_width=16),
 }
-
-
-def camera(size=12):
-    pose = look_at(torch.tensor([0.0, -3.0, 0.4]), torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
-    return Camera(size, size, 1.5 * size, 1.5 * size, size / 2, size / 2, pose, 2.0, 4.0)
-
-
-def picture(time, size=12):
-    """A dark square that slides to the right before white."""
-    image = torch.zeros(size, size, 4, dtype=torch.uint8)
-    begin = round(1 + time * (size - 6))
-    image[4:8, begin : begin + 4] = torch.tensor([40, 80, 160, 255], dtype=torch.uint8)
-    return image
-
-
-def frame(name, time):
-    return Frame(name, time, camera(), lambda: picture(time), camera_id=0)
-
-
-def moving_scene(still=None):
-    """A static camera, three times."""
-    train = tuple(frame(f"r_{i}", time) for i, time in enumerate(TIMES))
-    box = Box((-1, -1, -1), (1, 1, 1))
-    return Scene("square", train, (), train[:1], box, 0.0, has_alpha=True, still=still)
 
 
 def method(kind, seed=0, still=None, **sampling):
@@ -143,6 +117,38 @@ def test_a_dead_start_is_named():
         assert made.look(batch(), {"photo": 1.0}, generator).noted["opacity"] == 0
     with pytest.raises(ValueError, match=r"a dead start; set another seed=N, or model.sampling.density=soft"):
         made.look(batch(), {"photo": 1.0}, generator)
+
+
+def test_a_field_that_nothing_is_left_of_is_dead():
+    made = method("tnerf", occupancy=8, **GENTLE)
+    made.occupancy.occupied.zero_()
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(19):
+        assert made.look(batch(), {"photo": 1.0}, generator).noted["samples"] == 0
+    with pytest.raises(ValueError, match=r"0 along every ray of 20 .* or model.sampling.occupancy=0"):
+        made.look(batch(), {"photo": 1.0}, generator)
+
+
+def test_pictures_say_where_matter_may_be():
+    confined, free = (method("tnerf", occupancy=8, hull=hull, **GENTLE).occupancy for hull in (0.1, 0.0))
+    assert free.possible.all()
+    assert 0 < int(confined.possible.sum()) < len(confined.possible)
+    assert confined.occupied.equal(confined.possible)
+    blank = TNeRF(replace(start(), blank=True), sampling=Sampling(occupancy=8, hull=0.1))
+    assert blank.occupancy.possible.all()
+    with pytest.raises(ValueError, match=r"model.sampling.hull: expected a share in \[0, 1\], but got 2"):
+        Sampling(hull=2)
+
+
+@pytest.mark.parametrize("kind", ["nerf", "nerfies", "hypernerf"])
+def test_one_pass_has_one_network(kind):
+    made = method(kind, fine_samples=0, **GENTLE)
+    step = made.look(batch(), {"photo": 1.0}, torch.Generator().manual_seed(0))
+    assert made.coarse is None
+    assert made.fields(Moment(0.5))[0] is None
+    assert step.terms["coarse_photo"]() is None
+    assert step.noted["samples"] <= 144 * 12
+    assert "one pass" in made.protocol()["departures"]
 
 
 def test_a_start_that_comes_alive_is_none():
@@ -297,13 +303,6 @@ def test_pictures_of_a_jittered_method_are_drawn_alike():
         )
     assert one.equal(two)
     assert not one.equal(other)
-
-
-def static_ceiling():
-    """The train PSNR that no static model exceeds with a fixed camera."""
-    images = torch.stack([picture(time).double() / 255 for time in TIMES])
-    rgb = images[..., :3] * images[..., 3:] + 1 - images[..., 3:]
-    return float(-10 * torch.log10(rgb.var(0, unbiased=False).mean()))
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from forewarp.ops.grid import neighbour_pairs
-from forewarp.ops.variation import patch_variation, total_variation
+from forewarp.ops.variation import huber_variation, patch_variation, second_variation, total_variation
 from tests.support.reference import patch_roughness, variation
 
 
@@ -42,3 +42,29 @@ def test_transparent_patches_do_not_count_and_opacity_is_not_pulled():
     patch_variation(depth, opacity).backward()
     assert opacity.grad is None
     assert depth.grad.abs().sum() > 0
+
+
+def test_second_differences_of_a_ramp_are_none_and_of_a_square_are_two():
+    axes = torch.meshgrid(*map(torch.arange, (3, 4, 5)), indexing="ij")
+    ramp = (axes[0] + 2 * axes[1] - 3 * axes[2]).float()[..., None]
+    assert second_variation(ramp).item() == 0
+    assert second_variation((axes[1] ** 2).float()[..., None]).item() == pytest.approx(2 / 3)
+    with pytest.raises(ValueError, match="expected 3 points an axis or more, but got"):
+        second_variation(torch.zeros(3, 2, 3, 1))
+
+
+def test_the_slope_of_hubers_variation_is_the_difference_up_to_one():
+    volume = torch.zeros(2, 1, 1, 1, dtype=torch.float64)
+    for value, slope, total in ((0.5, 0.5, 0.125), (3.0, 1.0, 2.5)):
+        volume[1] = value
+        leaf = volume.clone().requires_grad_()
+        found = huber_variation(leaf)
+        found.backward()
+        assert found.item() == pytest.approx(total)
+        assert leaf.grad.flatten().tolist() == pytest.approx([-slope, slope])
+
+
+def test_variations_of_volumes_gradcheck():
+    volume = torch.randn(3, 4, 5, 2, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(second_variation, (volume,))
+    assert torch.autograd.gradcheck(huber_variation, (0.2 * volume,))

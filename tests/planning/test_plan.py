@@ -74,6 +74,7 @@ def test_a_plan_is_made_once_told_and_fitted(forewarp, ok, words, monkeypatch, i
     assert (fit / "plan.yaml").read_text() == file.read_text()
 
 
+@pytest.mark.slow
 def test_particles_are_planned_by_leaving_effects_out(forewarp, scenes, in_tmp, monkeypatch):
     """One after the other; what is not missed stays out of all later trials."""
     missed = {"motion": True, "rotation": False, "opacity_over_time": True}

@@ -23,7 +23,7 @@ from forewarp.ops.rasterize import rasterize, rasterize_reference
 from forewarp.ops.rigid import geman_mcclure, move_by_screw, stretch
 from forewarp.ops.samples import midpoints, union
 from forewarp.ops.splat import average_splat, scatter_reference, with_copies
-from forewarp.ops.variation import patch_variation, total_variation
+from forewarp.ops.variation import huber_variation, patch_variation, second_variation, total_variation
 from tests.support.gaussians import crowd, pinhole
 from tests.support.hard_cases import index_with
 
@@ -154,6 +154,8 @@ CHECKS = {
     "stiffness": of_stiffness,
     "moved": of_moved,
     "move_by_screw": lambda s: (move_by_screw, draw(s, 3, 3), draw(s + 1, 3, 3), draw(s + 2, 3, 3)),
+    "second_variation": lambda s: (second_variation, draw(s, 3, 4, 5, 2)),
+    "huber_variation": lambda s: (huber_variation, 2 * draw(s, 3, 4, 5, 2)),
     "stretch": lambda s: (stretch, torch.eye(3, dtype=torch.float64) + 0.2 * draw(s, 2, 3, 3)),
     "geman_mcclure": lambda s: (geman_mcclure, draw(s, 5).square()),
     "rotations": lambda s: (rotations, draw(s, 3, 4)),

@@ -184,7 +184,24 @@ def test_a_saved_state_does_not_change_afterwards():
 
 
 NAMES = ("/tmp/x", "..", "../x", "a/b", "a\\b", "", "-a", "a b", "a\n", 7)
-ODD = ({"start": 0}, {"all_in": 1.5}, {"newest_share": -0.1}, {"newest_part": 0.0}, {"newest_part": 2.0})
+
+
+def test_a_pace_ignores_how_many_times_there_are():
+    for count, expected in ((200, [10, 10, 11, 166]), (100, [10, 10, 11, 100])):
+        curriculum, found = Curriculum([i / count for i in range(count)], 0.0, pace=166.67), []
+        for step in (0, 300, 330, 4999):
+            curriculum.fraction = step / 5000
+            found.append(curriculum.in_play)
+        assert found == expected
+
+
+ODD = (
+    {"start": 0},
+    {"all_in": 1.5},
+    {"newest_share": -0.1},
+    {"newest_part": 0.0},
+    {"newest_part": 2.0},
+)
 REFUSED = [
     (settings, {"iterations": None}, "stage.coarse: expected iterations or minutes, but got neither"),
     (settings, {"iterations": 0}, "stage.coarse.iterations: expected a number > 0, but got 0"),
@@ -195,6 +212,7 @@ REFUSED = [
     (shared, {"minutes": 0}, r"budget\.minutes: expected a number > 0 or null, but got 0"),
     (shared, {"minutes": "soon"}, r"budget\.minutes: expected a number > 0 or null, but got soon"),
     (shared, {"minutes": None}, r"stage\.a: expected iterations or minutes, but got neither"),
+    (partial(Curriculum, TIMES, 0.0), {"pace": -1.0}, "pace: expected a number >= 0 or null, but got -1.0"),
     *(
         (partial(Curriculum, TIMES, 0.0), wrong, r"stage.curriculum: expected start >= 1, .*but got")
         for wrong in (*ODD, {"error_share": 1.5}, {"error_share": float("nan")})

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from forewarp.cli.entry import command
 
 LEAST_SIZE = 400  # pixels of the longer side, unless size= asks for another
@@ -30,23 +32,25 @@ What one types most:
 
 def render(config) -> None:
     """Load a run and write the video."""
-    from pathlib import Path
-
     from forewarp.runs.config import saved_config
 
     saved = saved_config(config.run, config)
     check(config)
     # These load torch; mistakes have been answered before.
-    from forewarp.drawing.files import write_video
-    from forewarp.progress import Counted
     from forewarp.runs.fitted import opened
 
-    run, module = opened(saved)
+    print(f"written: {write_film(config, *opened(saved))}")
+
+
+def write_film(config, run, module) -> Path:
+    """Write the video that the config describes into the run's folder; return its file."""
+    from forewarp.drawing.files import write_video
+    from forewarp.progress import Counted
+
     pictures = pictures_of(config, module, run.datamodule)
     file = Path(run.folder) / "videos" / f"{config.path}.{config.format}"
     with Counted(config.path) as progress:
-        written = write_video(file, counted(pictures, config.frames, progress), fps=float(config.fps))
-    print(f"written: {written}")
+        return write_video(file, counted(pictures, config.frames, progress), fps=float(config.fps))
 
 
 def pictures_of(config, module, datamodule):

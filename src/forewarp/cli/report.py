@@ -14,16 +14,19 @@ KINDS = {
     "minutes": "what a method reaches on each scene in so many minutes, by seed and view",
     "effects": "planned runs against every effect at once and the paper's fixed set",
     "compare": "a few runs side by side, printed, and with out=FOLDER drawn",
+    "run": "the page of one run: its video, truth against prediction, curves, effects and why",
     "limits": "what keeps a few runs from the truth, printed: time, views, voxel size, regions",
 }
 
 HELP = f"""
-forewarp-report makes tables and curves of runs that are already there. Only kind=limits renders anything.
+forewarp-report makes tables, curves and pages of runs that are already there. Only kind=limits and kind=run
+render anything.
 
 {chr(10).join(f"  kind={kind:<14} {about}" for kind, about in KINDS.items())}
 
   forewarp-report kind=price_list runs=FOLDER out=FOLDER
   forewarp-report kind=compare runs=[runs/demo/particles,runs/demo/forward] out=runs/demo
+  forewarp-report kind=run run=runs/vehicle/particles-demo-seed0
   forewarp-report kind=limits 'runs=runs/paper/*/plain-forward-fast-*'
 
 What one types most:
@@ -34,7 +37,13 @@ What one types most:
   published=FILE         accuracy_time: results of others to show; paper: the printed numbers
   curves=FOLDER          paper: where accuracy_time put its pictures (runs/accuracy_time/results)
   views=N                limits: training views to render
-  trust=[PACKAGE]        limits: code of other packages that a run's config may name
+  run=FOLDER             run: the run; its page is <run>/page.html, or out=FILE.html
+  megabytes=N            run: most of the page; pictures and the video are made smaller to fit
+  render=false           run: show only what the folder has; load no method and no data; for slow methods
+  path=both|trajectories|fixed|orbit   run: which video, as in forewarp-render
+  data.root=FOLDER       limits, run: where the data are now, if they moved
+  trainer=cpu|gpu|auto   limits, run: device to compute with; without it the one of the run
+  trust=[PACKAGE]        limits, run: code of other packages that a run's config may name
 
 The runs: make accuracy-time [DATA=FOLDER SCENE=NAME MINUTES=N], make price-list DATA=FOLDER,
 make reproduce-tables [DATA=FOLDER], make effects. Runs without results are listed at the end of the page.
@@ -47,6 +56,11 @@ def report(config) -> None:
         raise ValueError(f"kind: expected one of {', '.join(KINDS)}, but got '{config.kind}'")
     if not isinstance(config.target, int | float | None):
         raise ValueError(f"target: expected a number of dB or null, but got '{config.target}'")
+    if config.kind == "run":
+        from forewarp.cli.run_page import run_page
+
+        print(run_page(config))
+        return
     if config.kind in ("compare", "limits"):
         print(_table(config, _folders(config.runs)))
         return

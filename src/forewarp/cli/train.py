@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from shlex import quote
+
 from forewarp.cli.entry import command
 
 HELP = """
@@ -20,6 +22,8 @@ What one types most (options such as --multirun or --config-dir=FOLDER come firs
   budget.iterations=N                 the same in steps; the first that is reached ends training
   model=particles|forward|backward    Gaussians (default), the paper's method, its like-for-like opponent
   model=nerf|tnerf|dnerf|nerfies|hypernerf   networks along rays, as in their papers with preset=faithful
+  model=ndvg|tineuvox_s|tineuvox_b    voxel grids with networks, as in their papers with preset=faithful
+  model=neural_volumes                a volume decoded from pictures of the instant
   model/view_dependence=none|harmonics     switch an effect; all others work alike (of forward: none|sh|mlp)
   stage.NAME.lr.GROUP=RATE            a learning rate; groups: means, color, shifts, ... (see --cfg job)
   seed=N                              of all random numbers
@@ -97,6 +101,9 @@ def train(config) -> float | None:
         else:
             print(f"fitted: {run.folder}; measure it with forewarp-evaluate run={run.folder}")
         draw_own(run.folder)
+        if config.evaluate:
+            at = quote(f"run={run.folder}")
+            print(f"look at  forewarp-view {at}, or a page: forewarp-report kind=run {at}")
         value = score.of(module)
     for name, noted in run.finished().items():
         if steps := noted.get("skipped_steps"):

@@ -12,7 +12,7 @@ from typing import BinaryIO
 
 import numpy as np
 import torch
-from PIL import Image, UnidentifiedImageError
+from PIL import Image, ImageOps, UnidentifiedImageError
 from torch import Tensor
 
 from forewarp.data.cache import CACHE
@@ -60,13 +60,17 @@ def common_header(paths: Iterable[Path]) -> Header:
     return Header(size, all(h.has_alpha for h in headers.values()))
 
 
-def read_image(path: Path) -> Tensor:
+def read_image(path: Path, *, upright: bool = False) -> Tensor:
     """Decode a PNG or JPEG: uint8 (H, W, 4), straight alpha; without an alpha channel it is 255.
+
+    Args:
+        path: of the image.
+        upright: turn it as its EXIF orientation says; else it is as stored.
 
     Raises:
         SceneError: as ``inspect_image``, and where the pixels cannot be decoded.
     """
-    return torch.from_numpy(_decode(path, "RGBA"))
+    return torch.from_numpy(_decode(path, "RGBA", upright))
 
 
 def read_sized(path: Path, size: tuple[int, int]) -> Tensor:
@@ -206,15 +210,16 @@ class MaskedImage:
         return part.clone()
 
 
-def _decode(path: Path, mode: str) -> np.ndarray:
-    """Decode the first picture of a file in one of Pillow's modes."""
+def _decode(path: Path, mode: str, upright: bool = False) -> np.ndarray:
+    """Decode the first picture of a file in one of Pillow's modes, turned upright if wanted."""
     with opened(path, MOST_IMAGE, "an image") as stream:
         content = io.BytesIO(stream.read())
     _inspect(content, path, mode)
     content.seek(0)
     try:
         # In one expression: while a name keeps the image alive, its memory is not used again.
-        return np.array(Image.open(content, formats=_FORMATS).convert(mode))
+        turn = ImageOps.exif_transpose if upright else (lambda image: image)
+        return np.array(turn(Image.open(content, formats=_FORMATS)).convert(mode))
     except Exception as error:  # decoders raise OSError, SyntaxError, struct.error and more
         raise SceneError(
             f"{path}: expected an image, but got data that cannot be decoded ({error})"

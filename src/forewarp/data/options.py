@@ -110,7 +110,9 @@ def outline(mask: Tensor) -> float:
     """Length of a silhouette's outline (H, W) over the square root of its area; 0 for an empty one.
 
     >>> import torch
-    >>> outline(torch.ones(4, 4, dtype=torch.bool))
+    >>> square = torch.zeros(6, 6, dtype=torch.bool)
+    >>> square[1:5, 1:5] = True
+    >>> outline(square)  # 12 of its 16 pixels
     3.0
     """
     inside = torch.nn.functional.max_pool2d((~mask)[None].float(), 3, 1, 1)[0] == 0

@@ -3,7 +3,7 @@
 A pose on disk is camera-to-world with OpenGL's axes (x right, y up, looking along -z). The camera
 (``w h fl_x fl_y cx cy k1 k2 k3 p1 p2 camera_model``) stands at the top or, where it differs, in a frame. All
 lengths (``near``, ``far``, ``aabb``; ``data.near``, ``data.far``, ``data.box``) are in the file's units,
-which may be any: the scene is normalised.
+which may be any: the scene is normalised. The optional ``points.npy`` (N, 3) holds points that never move.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from reprlib import repr as short
 import numpy as np
 from torch import Tensor
 
+from forewarp.data.arrays import read_cloud, write_array
 from forewarp.data.files import MARKERS, number, read_json, scene_folder, whole
 from forewarp.data.geometry import FLIP, MOST_UNITS, box_of, pose_of
 from forewarp.data.images import CachedImage, MaskedImage, write_jpeg, write_png
@@ -36,7 +37,7 @@ from forewarp.scene.camera import Camera
 from forewarp.scene.errors import SceneError
 from forewarp.scene.frame import Frame, Scene
 
-FILE = MARKERS["posed_video"]
+FILE, POINTS = MARKERS["posed_video"], "points.npy"
 SCALES = (1, 2, 4, 8)
 _OF_CAMERA = {"w", "h", "fl_x", "fl_y", "cx", "cy", "camera_model", "k1", "k2", "k3", "p1", "p2"}
 
@@ -113,7 +114,9 @@ def read_scene(
         "far": region.far,
         "derived": [n for n, v in (("near", near), ("far", far), ("box", bounds)) if v is None],
     }
-    return Scene(scene, train, val, test, region.box, start, has_alpha, protocol=protocol)
+    cloud = file.parent / POINTS
+    still = region.points(read_cloud(cloud, 3)) if cloud.exists() else None
+    return Scene(scene, train, val, test, region.box, start, has_alpha, protocol=protocol, still=still)
 
 
 def write_scene(
@@ -123,18 +126,21 @@ def write_scene(
     near: float | None = None,
     far: float | None = None,
     aabb: Box | None = None,
+    points: np.ndarray | None = None,
 ) -> None:
     """Write a scene that ``read_scene`` reads; ``transforms.json`` is removed first and written last.
 
     Args:
         shots: consumed one by one; all or none have a split.
-        near, far, aabb: where known, in the units of the cameras' places.
+        near, far, aabb, points: where known, in the units of the cameras' places; ``points`` (N, 3) never
+            move.
 
     Raises:
         ValueError: for a shot that ``read_scene`` would refuse.
     """
     folder = Path(folder)
-    (folder / FILE).unlink(missing_ok=True)
+    for name in (FILE, POINTS):
+        (folder / name).unlink(missing_ok=True)
     entries, lists, taken = [], {split: [] for split in SPLITS}, set()
     for shot in shots:
         _check_shot(folder, shot, taken)
@@ -148,6 +154,8 @@ def write_scene(
     content |= {key: value for key, value in (("near", near), ("far", far)) if value is not None}
     content |= {} if aabb is None else {"aabb": [aabb.low, aabb.high]}
     content["frames"] = [{k: v for k, v in entry.items() if k not in common} for entry in entries]
+    if points is not None and len(points):
+        write_array(folder / POINTS, np.asarray(points, dtype=np.float32))
     write_json(folder / FILE, content)
 
 

@@ -6,6 +6,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -43,6 +44,10 @@ class Region:
         pose = camera.camera_to_world.clone()
         pose[:3, 3] = (pose[:3, 3] - torch.tensor(self.center, dtype=torch.float64)) * self.scale
         return replace(camera, camera_to_world=pose, near=self.near, far=self.far)
+
+    def points(self, points: np.ndarray) -> Tensor:
+        """Move points (N, 3) from the file's units to the scene's: float32."""
+        return ((torch.from_numpy(points).double() - torch.tensor(self.center)) * self.scale).float()
 
     def moved(self, box: Box) -> Box:
         """Move a box from the file's units to the scene's."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import re
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from reprlib import repr as short
@@ -97,13 +98,22 @@ def name_of(folder: Path, value: object, where: str) -> str:
 
 
 def with_even_times(entries: list[ImageEntry]) -> list[ImageEntry]:
-    """Sort entries by name, numbers by value, and space their times evenly over [0, 1]."""
-
-    def order(entry: ImageEntry) -> list:
-        return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", entry.name)]
-
-    entries = sorted(entries, key=order)
+    """Sort entries by name, as ``in_order``, and space their times evenly over [0, 1]."""
+    entries = in_order(entries, lambda entry: entry.name)
     return [replace(entry, time=i / max(len(entries) - 1, 1)) for i, entry in enumerate(entries)]
+
+
+def in_order(things: Iterable, name: Callable[..., str] = str) -> list:
+    """Sort things by their names, numbers within them by value.
+
+    >>> in_order(["b2", "b10", "a"])
+    ['a', 'b2', 'b10']
+    """
+
+    def parts(thing) -> list:
+        return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name(thing))]
+
+    return sorted(things, key=parts)
 
 
 def split_entries(file: Path, content: dict, entries: list[ImageEntry], test_every: int) -> tuple[dict, str]:

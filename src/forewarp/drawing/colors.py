@@ -97,3 +97,19 @@ def at_least(picture: Tensor, side: int) -> Tensor:
     """
     times = max(1, math.ceil(side / min(picture.shape[:2])))
     return picture.repeat_interleave(times, 0).repeat_interleave(times, 1)
+
+
+def at_most(picture: Tensor, side: int) -> Tensor:
+    """Shrink a picture (H, W, 3) whose longer side has more than ``side`` pixels; each becomes a mean.
+
+    >>> at_most(torch.zeros(100, 120, 3), 60).shape
+    torch.Size([50, 60, 3])
+    """
+    height, width = picture.shape[:2]
+    scale = side / max(height, width)
+    if scale >= 1:
+        return picture
+    shape = max(1, round(height * scale)), max(1, round(width * scale))
+    return torch.nn.functional.interpolate(picture.permute(2, 0, 1)[None], shape, mode="area")[0].permute(
+        1, 2, 0
+    )

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import errno
+import subprocess
+import tempfile
 from collections.abc import Iterable
 from itertools import chain
 from pathlib import Path
@@ -10,11 +12,13 @@ from pathlib import Path
 import imageio.v3 as iio
 import imageio_ffmpeg
 import numpy as np
+import torch
 from torch import Tensor
 
 from forewarp.files import written_whole
 
 FORMATS = ("mp4", "gif", "png")
+_SMALLER = ((1, 20), (1, 26), (1, 32), (2, 26), (2, 32), (4, 32))  # size to divide by, loss (ffmpeg's crf)
 
 
 def to_bytes(picture: Tensor) -> np.ndarray:
@@ -32,6 +36,39 @@ def write_png(path: Path, picture: Tensor) -> Path:
 def png_bytes(picture: Tensor) -> bytes:
     """Encode (H, W, 3) in [0, 1]."""
     return iio.imwrite("<bytes>", to_bytes(picture), extension=".png")
+
+
+def jpeg_bytes(picture: Tensor, quality: int) -> bytes:
+    """Encode (H, W, 3) in [0, 1] with loss; ``quality`` in [1, 95]."""
+    return iio.imwrite("<bytes>", to_bytes(picture), extension=".jpg", quality=quality, subsampling=0)
+
+
+def read_picture(path: Path) -> Tensor:
+    """Read a picture as (H, W, 3) in [0, 1]; alpha is dropped."""
+    return torch.from_numpy(iio.imread(path)[..., :3].copy()).float() / 255
+
+
+def smaller_video(path: Path, most: int) -> tuple[bytes, str]:
+    """Encode an ``.mp4`` with more loss, and at last smaller, until it has at most ``most`` bytes.
+
+    Returns:
+        the file's bytes, and in words what was changed; no bytes if nothing fits.
+
+    Raises:
+        OSError: naming ``path``, if ffmpeg cannot read it.
+    """
+    with tempfile.TemporaryDirectory(prefix="forewarp-") as folder:
+        file = Path(folder) / "video.mp4"
+        for shrink, loss in _SMALLER:
+            even = f"scale=trunc(iw/{2 * shrink})*2:trunc(ih/{2 * shrink})*2:flags=area"
+            call = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-v", "error", "-i", str(path), "-vf", even]
+            call += ["-crf", str(loss), "-pix_fmt", "yuv420p", "-movflags", "+faststart", "-an", str(file)]
+            if subprocess.run(call, capture_output=True).returncode:
+                raise OSError(errno.EIO, "ffmpeg could not read it", str(path))
+            if file.stat().st_size <= most:
+                size = f", at 1/{shrink} of its width and height" if shrink > 1 else ""
+                return file.read_bytes(), f"encoded again with more loss{size}"
+    return b"", "left out"
 
 
 def write_video(path: Path, pictures: Iterable[Tensor], *, fps: float) -> Path:

@@ -11,7 +11,7 @@ from lightning.pytorch.loggers import TensorBoardLogger
 
 from forewarp.evaluation.evaluate import flow_error
 from forewarp.evaluation.pictures import validation_psnr
-from forewarp.files import read_json, written_whole
+from forewarp.files import read_json, read_rows, written_whole
 
 FILE = "accuracy_time.csv"
 COLUMNS = ("seconds", "stage", "step", "psnr", "epe_moving", "size")
@@ -109,14 +109,6 @@ def seconds_before(folder: Path) -> float:
     """Sum the training seconds of the finished stages beside a stage's folder."""
     done = [path for path in folder.parent.glob("*/done.json") if path.parent != folder]
     return sum(float((read_json(path) or {}).get("seconds", 0.0)) for path in done)
-
-
-def read_rows(path: Path) -> list[dict[str, str]]:
-    """Read the rows of an ``accuracy_time.csv``; a missing file has none."""
-    if not path.is_file():
-        return []
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
 
 
 def write_rows(path: Path, rows: list[dict[str, str]]) -> None:

@@ -74,6 +74,9 @@ def show(metrics: dict, folder: Path, absent: dict[str, str]) -> None:
         lines.append(
             f"flow: moving points off by {error:.4f}, {error / motion:.0%} of their motion {motion:.4f}"
         )
+    lines += [
+        f"{key}: {metrics['protocol'][key]}" for key in ("departures", "faults") if key in metrics["protocol"]
+    ]
     if absent:
         lines.append(without(absent))
     images = Path(folder) / "images"

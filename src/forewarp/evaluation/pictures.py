@@ -40,16 +40,22 @@ def pictures_of(module: DynamicSceneModule, target: Target, size: int | None = N
     with trajectories, is the displacement in the picture from the canonical time to the target's time: hue is
     the direction, saturation the length.
     """
-    camera = within(target.frame.camera, size)
-    shape = (camera.height, camera.width)
-    compared, drawn = compare(module, target, camera)
-    pictures = {
-        "compare": in_a_row(compared),
-        "depth": depth_colors(drawn.depth.reshape(shape), drawn.opacity.reshape(shape)),
-    }
+    parts = parts_of(module, target, size)
+    compared = in_a_row([parts[name] for name in ("truth", "prediction", "error")])
+    pictures = {"compare": compared, "depth": parts["depth"]}
     if isinstance(module.method, HasTrajectories):
+        camera = within(target.frame.camera, size)
         pictures["flow"] = with_wheel(flow_colors(*image_flow(module, camera, target.moment.time)))
     return pictures
+
+
+def parts_of(module: DynamicSceneModule, target: Target, size: int | None = None) -> dict[str, Tensor]:
+    """Draw ``truth``, ``prediction``, ``error`` and ``depth`` of one view, each (h, w, 3) in [0, 1]."""
+    camera = within(target.frame.camera, size)
+    compared, drawn = compare(module, target, camera)
+    shape = (camera.height, camera.width)
+    depth = depth_colors(drawn.depth.reshape(shape), drawn.opacity.reshape(shape))
+    return dict(zip(("truth", "prediction", "error", "depth"), [*compared, depth]))
 
 
 def compare(

@@ -25,11 +25,23 @@ class TimeCodes(nn.Module):
 
     def forward(self, time: float) -> Tensor:
         """Return the code (D,) of a time; before the first and after the last it stays the same."""
-        after = bisect.bisect_left(self.times, time)
-        if after == len(self.times) or after == 0 or self.times[after] == time:
-            return self.table[min(after, len(self.times) - 1)]
-        low, high = self.times[after - 1], self.times[after]
-        return torch.lerp(self.table[after - 1], self.table[after], (time - low) / (high - low))
+        before, after, share = beside(self.times, time)
+        return self.table[before] if before == after else self.table[before].lerp(self.table[after], share)
+
+
+def beside(times: Sequence[float], time: float) -> tuple[int, int, float]:
+    """Return the numbers of the ascending times before and after a time, and how far it is on the way.
+
+    Both are the same at one of the times, before the first and after the last.
+
+    >>> beside((0.0, 0.5, 1.0), 0.625), beside((0.0, 0.5), 0.5)
+    ((1, 2, 0.25), (1, 1, 0.0))
+    """
+    after = bisect.bisect_left(times, time)
+    if after == len(times) or after == 0 or times[after] == time:
+        after = min(after, len(times) - 1)
+        return after, after, 0.0
+    return after - 1, after, (time - times[after - 1]) / (times[after] - times[after - 1])
 
 
 class CameraCodes(nn.Module):

@@ -106,8 +106,12 @@ class Template(nn.Module):
     def forward(self, x: Tensor, condition: Tensor) -> tuple[Tensor, Tensor]:
         """Encoded points (..., I), condition (..., D) -> raw density (...,), colour (..., 3) in [0, 1]."""
         hidden = self.trunk(x)
-        color = torch.relu(self.shading(torch.cat([self.bottleneck(hidden), condition], -1)))
-        return self.density_head(hidden)[..., 0], torch.sigmoid(self.color_head(color))
+        return self.density_head(hidden)[..., 0], self.color(hidden, condition)
+
+    def color(self, hidden: Tensor, condition: Tensor) -> Tensor:
+        """What the trunk gave (..., width), condition (..., D) -> colour (..., 3) in [0, 1]."""
+        shaded = torch.relu(self.shading(torch.cat([self.bottleneck(hidden), condition], -1)))
+        return torch.sigmoid(self.color_head(shaded))
 
 
 def start_as_glorot(layer: nn.Module) -> None:

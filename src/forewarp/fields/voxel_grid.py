@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
 from torch import Tensor, nn
 
@@ -147,6 +149,26 @@ class VoxelGrid(nn.Module):
                 p = self.parameter(name)
                 p.data = p.data.new_empty(state_dict[prefix + name].shape)
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
+
+
+def grids_in(module: nn.Module) -> dict[str, VoxelGrid]:
+    """Return all voxel grids of a module by their names in ``state_dict``."""
+    return {name: part for name, part in module.named_modules() if isinstance(part, VoxelGrid)}
+
+
+def adopted_in(module: nn.Module) -> set[str]:
+    """Return the names in ``state_dict`` by which a module's grids adopt a checkpoint's lattices."""
+    return {
+        f"{place}.{name}"
+        for place, grid in grids_in(module).items()
+        for name in ("voxels", "index", *grid.names)
+    }
+
+
+def misfit_in(module: nn.Module, state: Mapping[str, Tensor]) -> str | None:
+    """Return what in a module's stored grids contradicts their lattices, or None."""
+    found = ((place, grid.misfit(state, f"{place}.")) for place, grid in grids_in(module).items())
+    return next((f"{place}.{name}" for place, name in found if name is not None), None)
 
 
 def _lattice(state: dict) -> Lattice:

@@ -101,7 +101,7 @@ class HyperNeRF(SampledMethod):
         inputs = encoded_size(3, position_frequencies) + 2 * ambient * ambient_frequencies
         shape = {"width": width, "layers": layers, "skip": skip, "glorot": True}
         condition = encoded_size(3, direction_frequencies)
-        self.coarse, self.fine = (Template(inputs, condition, **shape) for _ in range(2))
+        self.coarse, self.fine = self.passes(lambda: Template(inputs, condition, **shape))
         self.numbers_of = {"warp_in": 0.32, "slice_from": 0.004, "slice_in": 0.044} | dict(start.numbers)
         self.register_buffer("windows", torch.zeros(2))  # of the warp and of the ambient coordinates
         self.still, self.still_points = start.scene.still, still_points
@@ -126,7 +126,8 @@ class HyperNeRF(SampledMethod):
             return torch.cat([self.position(self.warp(points, code, octaves)), beside], -1)
 
         return tuple(
-            Field(template, self.activation, encoded, self.direction) for template in (self.coarse, self.fine)
+            template and Field(template, self.activation, encoded, self.direction)
+            for template in (self.coarse, self.fine)
         )
 
     def extra_terms(

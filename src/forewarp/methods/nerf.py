@@ -42,11 +42,11 @@ class NeRF(SampledMethod):
         self.position, self.direction = encoder(position_frequencies), encoder(direction_frequencies)
         sizes = encoded_size(3, position_frequencies), encoded_size(3, direction_frequencies)
         shape = {"width": width, "layers": layers, "skip": skip, "glorot": glorot}
-        self.coarse, self.fine = Template(*sizes, **shape), Template(*sizes, **shape)
+        self.coarse, self.fine = self.passes(lambda: Template(*sizes, **shape))
 
     def fields(self, moment: Moment) -> tuple[Field, Field]:
         """See ``SampledMethod``."""
         return tuple(
-            Field(network, self.activation, self.position, self.direction)
+            network and Field(network, self.activation, self.position, self.direction)
             for network in (self.coarse, self.fine)
         )

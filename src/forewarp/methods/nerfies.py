@@ -71,7 +71,7 @@ class Nerfies(SampledMethod):
             encoded_size(3, direction_frequencies) + camera_code_size,
         )
         shape = {"width": width, "layers": layers, "skip": skip, "glorot": True}
-        self.coarse, self.fine = Template(*sizes, **shape), Template(*sizes, **shape)
+        self.coarse, self.fine = self.passes(lambda: Template(*sizes, **shape))
         self.warp_in = float(start.numbers.get("warp_in", 0.32))
         self.register_buffer("window", torch.tensor(0.0))
         self.still, self.still_points = start.scene.still, still_points
@@ -98,7 +98,8 @@ class Nerfies(SampledMethod):
             return torch.cat([towards, camera.expand(*towards.shape[:-1], -1)], -1)
 
         return tuple(
-            Field(template, self.activation, encoded, condition) for template in (self.coarse, self.fine)
+            template and Field(template, self.activation, encoded, condition)
+            for template in (self.coarse, self.fine)
         )
 
     def extra_terms(

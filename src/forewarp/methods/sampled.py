@@ -14,11 +14,13 @@ from forewarp.methods.method import Method, Snapshot, Start, Step
 from forewarp.ops.encode import positional_encoding
 from forewarp.quadrature import Quadrature, Sampled
 from forewarp.scene.batch import Batch
+from forewarp.scene.frame import spread
 from forewarp.scene.rays import Rays
 from forewarp.scene.view import Moment, Rendering, View
 
 _PATIENCE = 20  # steps in a row without any density, after which the network is dead
 _LOOK_EVERY = 8  # steps between two looks for where matter is
+_PICTURES = 64  # most whose outlines say where matter may be
 
 
 @dataclass(frozen=True)
@@ -48,11 +50,14 @@ class Sampling:
     """How a method looks along rays, and what it takes for matter; one for all such methods.
 
     Args:
-        samples, fine_samples, open_end: see ``Quadrature``.
+        samples, fine_samples, open_end: see ``Quadrature``. Without fine samples a method that has a network
+            for each pass has one.
         inside_box: treat space outside the scene's box as empty, to save samples; not as published.
         density: ``relu`` as NeRF has it, with which some seeds start dead, or ``softplus``.
         occupancy: cells along a side of the lattice that notes where matter is (see ``Occupancy``), so that
             samples elsewhere are not evaluated; 0: evaluate all, as published.
+        hull: where the lattice is and pictures have alpha, space that less than this share of the training
+            pictures shows as covered is empty for good (see ``Occupancy.confine``); 0: no space is.
         jitter_in_pictures: draw the samples of pictures at random too, as HyperNeRF's code does.
     """
 
@@ -62,7 +67,12 @@ class Sampling:
     inside_box: bool = False
     density: str = "relu"
     occupancy: int = 0
+    hull: float = 0.0
     jitter_in_pictures: bool = False
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.hull <= 1:
+            raise ValueError(f"model.sampling.hull: expected a share in [0, 1], but got {self.hull}")
 
     def departures(self, published: str) -> list[str]:
         """Name what differs from a publication with this density."""
@@ -71,6 +81,8 @@ class Sampling:
             notes.append(f"{self.density} density")
         if not self.open_end:
             notes.append("the last interval ends with the ray")
+        if not self.fine_samples:
+            notes.append("one pass")
         if self.inside_box:
             notes.append("empty outside the scene's box")
         if self.occupancy:
@@ -93,6 +105,9 @@ class SampledMethod(Method):
         box, self.sampling, self.times = start.scene.box, sampling, start.scene.times
         self.activation = density_of(sampling.density)
         self.occupancy = Occupancy(box, side=sampling.occupancy) if sampling.occupancy else None
+        if self.occupancy is not None and sampling.hull and start.scene.has_alpha and not start.blank:
+            train = start.scene.train
+            self.occupancy.confine([train[i] for i in spread(len(train), _PICTURES)], sampling.hull)
         self.quadrature = Quadrature(
             sampling.samples,
             sampling.fine_samples,
@@ -101,6 +116,10 @@ class SampledMethod(Method):
             self.occupancy,
         )
         self._blank_steps = 0
+
+    def passes(self, make: Callable[[], Template]) -> tuple[Template | None, Template]:
+        """Make a network for each pass; None in place of the first where there is one pass."""
+        return make() if self.sampling.fine_samples else None, make()
 
     def fields(self, moment: Moment) -> tuple[Field | None, Field]:
         """Return the field of each pass at a moment.
@@ -123,7 +142,8 @@ class SampledMethod(Method):
         """See ``Method.look``; a batch holds one moment, as no neighbours are asked for.
 
         Raises:
-            ValueError: if the density is 0 everywhere for many steps, as it then has no gradient.
+            ValueError: if the density is 0 at every sample, or no sample is left, for many steps: there is
+                then no gradient.
         """
         rays, rgb, background = batch.joined()
         moment = batch.observations[0].moment
@@ -131,8 +151,8 @@ class SampledMethod(Method):
         self._refuse_a_dead_start(seen.density)
         error = (seen.rgb - rgb).square().mean()
         terms = {"photo": lambda: error}
-        if seen.coarse is not None:
-            terms["coarse_photo"] = lambda: (seen.coarse.rgb - rgb).square().mean()
+        if "coarse_photo" in self.terms:
+            terms["coarse_photo"] = lambda: seen.coarse and (seen.coarse.rgb - rgb).square().mean()
         return Step(
             terms | self.extra_terms(seen, batch, factors, generator),
             error.detach(),
@@ -141,13 +161,13 @@ class SampledMethod(Method):
         )
 
     def _refuse_a_dead_start(self, density: Tensor) -> None:
-        blank = density.numel() > 0 and not bool((density > 0).any())
-        self._blank_steps = self._blank_steps + 1 if blank else 0
+        self._blank_steps = 0 if bool((density > 0).any()) else self._blank_steps + 1
         if self._blank_steps >= _PATIENCE:
+            relu = self.sampling.density == "relu"
             raise ValueError(
-                "model.sampling.density: expected matter somewhere, but got a density of 0 at every sample "
-                f"of {_PATIENCE} steps, which {self.sampling.density} never leaves: a dead start; "
-                "set another seed=N, or model.sampling.density=softplus"
+                f"model.sampling: expected matter somewhere, but got a density of 0 along every ray of "
+                f"{_PATIENCE} steps, which has no gradient: a dead start; set another seed=N, or "
+                f"model.sampling.{'density=softplus' if relu else 'occupancy=0'}"
             )
 
     def advance(self, progress: float, step: int, optimizer: torch.optim.Optimizer) -> dict[str, float]:

@@ -13,8 +13,9 @@ def check_shape(name: str, tensor: Tensor, shape: tuple[int | str, ...]) -> None
     >>> import torch
     >>> check_shape("points", torch.zeros(4, 3), ("P", 3))
     """
-    last = shape[1:] if shape[0] == "..." else shape
-    found = tuple(tensor.shape)[-len(last) :] if shape[0] == "..." else tuple(tensor.shape)
+    ends = shape[:1] == ("...",)
+    last = shape[1:] if ends else shape
+    found = tuple(tensor.shape)[-len(last) :] if ends else tuple(tensor.shape)
     fits = len(found) == len(last) and all(isinstance(s, str) or s == n for s, n in zip(last, found))
     if not fits:
         wanted = "(" + ", ".join(str(s) for s in shape) + ")"

@@ -61,7 +61,7 @@ def by_importance(
         weights: (R, B) >= 0 of the bins, not normalised.
         count: S >= 1.
         generator: draws the uniform numbers; None: take them evenly from 0 to 1.
-        floor: > 0, added to every weight, so that every bin can be drawn.
+        floor: above 0, added to every weight, so that every bin can be drawn.
 
     Returns:
         (R, S), ascending without a generator.

@@ -28,6 +28,44 @@ def total_variation(values: Tensor, pairs: list[tuple[Tensor, Tensor]]) -> Tenso
     return total
 
 
+def second_variation(volume: Tensor) -> Tensor:
+    """Return the mean absolute second difference per axis, averaged over axes: 0 of anything linear.
+
+    Args:
+        volume: (X, Y, Z, C), at least 3 points an axis.
+
+    Returns:
+        (). Differentiable.
+
+    Cost: three passes over the volume.
+    """
+    check_shape("volume", volume, ("X", "Y", "Z", "C"))
+    if min(volume.shape[:3]) < 3:
+        raise ValueError(
+            f"second_variation: expected 3 points an axis or more, but got {tuple(volume.shape)}"
+        )
+    return sum(volume.diff(n=2, dim=axis).abs().mean() for axis in range(3)) / 3
+
+
+def huber_variation(volume: Tensor) -> Tensor:
+    """Return Huber's function of the first differences, summed over axes, points and channels.
+
+    Its slope is the difference itself, at most 1.
+
+    Args:
+        volume: (X, Y, Z, C).
+
+    Returns:
+        (). Differentiable.
+
+    Cost: three passes over the volume.
+    """
+    check_shape("volume", volume, ("X", "Y", "Z", "C"))
+    steps = [volume.diff(dim=axis) for axis in range(3)]
+    zero = volume.new_zeros(())
+    return sum(torch.nn.functional.smooth_l1_loss(d, zero.expand_as(d), reduction="sum") for d in steps)
+
+
 def patch_variation(depth: Tensor, opacity: Tensor) -> Tensor:
     """RegNeRF's depth term: squared first differences in patches, weighted by opacity without gradient.
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import re
 from collections.abc import Iterable, Sequence
@@ -11,7 +10,10 @@ from pathlib import Path
 
 import yaml
 
-from forewarp.files import MOST_CONFIG, read_text
+from forewarp.files import MOST_CONFIG, read_rows, read_text
+
+# What reading a broken run may raise.
+UNREADABLE = OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError, yaml.YAMLError
 
 
 @dataclass(frozen=True)
@@ -161,11 +163,8 @@ def collect(root: Path, needed: Sequence[str] = ()) -> tuple[list[Result], list[
         absent = [name for name in needed if not (folder / name).is_file()]
         try:
             result = read_run(folder)
-        except (
-            *(OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError, yaml.YAMLError),
-        ) as error:
-            reason = f"no key {error}" if isinstance(error, KeyError) else str(error).split("\n")[0]
-            without.append(f"{folder.relative_to(root)}: cannot be read ({reason})")
+        except UNREADABLE as error:
+            without.append(f"{folder.relative_to(root)}: cannot be read ({unreadable(error)})")
             continue
         if absent:
             again = "run its command again"
@@ -180,6 +179,11 @@ def collect(root: Path, needed: Sequence[str] = ()) -> tuple[list[Result], list[
             f"{root}: expected folders of runs, but got none; make some with forewarp-train, or set runs=..."
         )
     return results, without
+
+
+def unreadable(error: Exception) -> str:
+    """Say in a few words why a run cannot be read."""
+    return f"no key {error}" if isinstance(error, KeyError) else str(error).split("\n")[0]
 
 
 def _shorten(results: Sequence[Result]) -> None:
@@ -217,19 +221,15 @@ def read_run(folder: Path) -> Result:
 
 def read_curve(folder: Path) -> tuple[Point, ...]:
     """Read the rows of a run's ``accuracy_time.csv``; a missing file has none."""
-    path = folder / "accuracy_time.csv"
-    if not path.is_file():
-        return ()
-    with path.open(newline="") as file:
-        return tuple(
-            Point(
-                float(row["seconds"]),
-                float(row["psnr"]),
-                int(row["step"]),
-                float(row["epe_moving"]) if row["epe_moving"] else None,
-            )
-            for row in csv.DictReader(file)
+    return tuple(
+        Point(
+            float(row["seconds"]),
+            float(row["psnr"]),
+            int(row["step"]),
+            float(row["epe_moving"]) if row["epe_moving"] else None,
         )
+        for row in read_rows(folder / "accuracy_time.csv")
+    )
 
 
 def grouped(results: Sequence[Result]) -> dict[tuple[str, float | None], list[Result]]:

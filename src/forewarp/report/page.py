@@ -65,7 +65,7 @@ def html(title: str, introduction: str, sections: Sequence[Section]) -> str:
     parts += [f"<style>{STYLE}</style>", f"<h1>{escape(title)}</h1><p>{escape(introduction)}</p>"]
     for section in sections:
         parts.append(f"<h2>{escape(section.title)}</h2>")
-        parts += [_html_table(table) for table in section.tables]
+        parts += [html_table(table) for table in section.tables]
         parts += [
             f'<p><img alt="{escape(path.stem)}" src="{_inline(path)}"></p>' for path in section.pictures
         ]
@@ -108,12 +108,14 @@ def _aligned(table: Table) -> str:
     return "".join("r" if numeric else "l" for numeric in table.numeric)
 
 
-def _html_table(table: Table) -> str:
+def html_table(table: Table) -> str:
+    """Return a table, its caption above it, as HTML."""
     marks = {"best": "<b>{}</b>", "second": "<u>{}</u>"}
     head = "".join(f"<th>{escape(column.name)}" for column in table.columns)
     lines = [f"<p>{escape(table.caption)}</p>" if table.caption else "", f"<table><tr>{head}"]
+    numeric = table.numeric  # looks at all rows
     for number, row in enumerate(table.texts(marks, escape)):
-        cells = "".join(f"<td{' class=n' * n}>{text}" for text, n in zip(row, table.numeric))
+        cells = "".join(f"<td{' class=n' * n}>{text}" for text, n in zip(row, numeric))
         lines.append(f"<tr{' class=rule' * (number in table.rules)}>{cells}")
     return "\n".join(lines) + "</table>"
 

@@ -79,6 +79,26 @@ def command_line(name: str, overrides: Sequence[str]) -> str:
     return shlex.join([f"forewarp-{name}", *overrides])
 
 
+def text_override(key: str, text: str) -> str:
+    """Write an override whose value Hydra keeps as text, in quotes only where it needs them.
+
+    >>> text_override("data.scene", "hand"), text_override("data.scene", "2024_11")
+    ('data.scene=hand', "data.scene='2024_11'")
+    """
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from hydra.errors import HydraException
+
+    try:
+        read = OverridesParser.create().parse_override(f"{key}={text}")
+        if not read.is_sweep_override() and read.value() == text:
+            return f"{key}={text}"
+    except HydraException:  # its grammar has no such bare value
+        pass
+    # In Hydra's quotes a backslash is one unless a quote follows.
+    inner = re.sub(r"(\\+)(?='|$)", r"\1\1", text).replace("'", r"\'")
+    return f"{key}='{inner}'"
+
+
 def key_of(override: str) -> str:
     """Return the key that an override sets.
 

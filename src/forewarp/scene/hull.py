@@ -20,13 +20,22 @@ def visual_hull(points: Tensor, cameras: list[Camera], masks: list[Tensor], miss
     Returns:
         (N,) bool. A point that fewer than half of the views see is outside.
     """
-    against = torch.zeros(len(points), dtype=torch.int32)
+    covered, seen = sightings(points, cameras, masks)
+    return (2 * seen >= len(cameras)) & (seen > misses) & (seen - covered <= misses)
+
+
+def sightings(points: Tensor, cameras: list[Camera], masks: list[Tensor]) -> tuple[Tensor, Tensor]:
+    """Count the views inside whose silhouette each point lies, and those that see it, (N,) int32 each.
+
+    Arguments are those of ``visual_hull``.
+    """
+    covered = torch.zeros(len(points), dtype=torch.int32)
     seen = torch.zeros(len(points), dtype=torch.int32)
     for camera, mask in zip(cameras, masks, strict=True):
         pixel, z = camera.project(points)
         column, row = pixel.floor().long().unbind(-1)
         visible = (z > 0) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
         on = mask[row.clamp(0, camera.height - 1), column.clamp(0, camera.width - 1)]
-        against += (visible & ~on).int()
+        covered += (visible & on).int()
         seen += visible.int()
-    return (2 * seen >= len(cameras)) & (seen > misses) & (against <= misses)
+    return covered, seen

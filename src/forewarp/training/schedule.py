@@ -193,6 +193,8 @@ class Curriculum:
         canonical_time: where training starts.
         start: distinct times in play at the beginning.
         all_in: fraction of the stage at which all times are in play; 0: from the start.
+        pace: distinct times that come into play in a whole stage, ``start`` at least, whatever ``all_in``; a
+            longer sequence is never seen whole; null: by ``all_in``.
         most: number of times that ever come into play; null: all.
         newest_share: share of the draws that goes to the newest frames, while frames still come in.
         newest_part: share of the frames in play that counts as the newest.
@@ -209,6 +211,7 @@ class Curriculum:
         *,
         start: int = 10,
         all_in: float = 0.6,
+        pace: float | None = None,
         most: int | None = None,
         newest_share: float = 0.3,
         newest_part: float = 0.125,
@@ -231,7 +234,9 @@ class Curriculum:
             if most < 1:
                 raise ValueError(f"{where}.most: expected at least 1 or null, but got {most}")
             self._ends = self._ends[:most]
-        self.start, self.all_in = min(start, len(self._ends)), all_in
+        if pace is not None and not pace >= 0:
+            raise ValueError(f"{where}.pace: expected a number >= 0 or null, but got {pace}")
+        self.start, self.all_in, self.pace = min(start, len(self._ends)), all_in, pace
         self.newest_share, self.newest_part = newest_share, newest_part
         self.error_share = error_share
         self.errors = torch.full((len(times),), float("nan"))
@@ -241,6 +246,10 @@ class Curriculum:
     @property
     def in_play(self) -> int:
         """Number of frames that may be drawn now."""
+        if self.pace is not None:
+            return self._ends[
+                min(max(self.start, int(self.pace * self.fraction + 1e-9)), len(self._ends)) - 1
+            ]
         done = 1.0 if self.all_in == 0 else min(1.0, self.fraction / self.all_in)
         return self._ends[self.start + int((len(self._ends) - self.start) * done) - 1]
 

@@ -2,7 +2,7 @@ import torch
 from torch import nn
 
 from forewarp.methods.particles.density import renew
-from forewarp.methods.particles.rows_adam import RowsAdam
+from forewarp.methods.rows_adam import RowsAdam
 
 
 class Few(nn.Module):

@@ -5,8 +5,8 @@ import torch
 
 from forewarp.fields.curves import Curve
 from forewarp.methods.particles.nodes import Nodes, nearest
-from forewarp.methods.particles.rows_adam import RowsAdam
 from forewarp.methods.particles.skin import Skin
+from forewarp.methods.rows_adam import RowsAdam
 
 
 def grid(side=4):

@@ -17,11 +17,11 @@ from forewarp.methods.particles.effects import Effects, cosines
 from forewarp.methods.particles.nodes import Nodes
 from forewarp.methods.particles.planning import EFFECTS, ParticlesPlanning
 from forewarp.methods.particles.rest import come_to_rest
-from forewarp.methods.particles.rows_adam import RowsAdam
 from forewarp.methods.particles.settings import Numbers, told_by
 from forewarp.methods.particles.skin import Skin
 from forewarp.methods.particles.snapshot import ParticlesSnapshot
 from forewarp.methods.particles.start import covered_pixels, first_points, first_values, widths
+from forewarp.methods.rows_adam import RowsAdam
 from forewarp.ops.compare import compare
 from forewarp.ops.nodes import pull_nodes
 from forewarp.ops.project import BLUR, Gaussians, Warp

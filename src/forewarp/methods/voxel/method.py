@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from forewarp.fields.radiance import DirectRadiance, FeatureRadiance
 from forewarp.fields.radiance_grid import Activation, mean_color, shaded
-from forewarp.fields.voxel_grid import VoxelGrid
+from forewarp.fields.voxel_grid import adopted_in, misfit_in
 from forewarp.methods.method import Method, Start, Step
 from forewarp.methods.voxel.effects.background import StaticBackground
 from forewarp.methods.voxel.snapshot import VoxelSnapshot
@@ -193,20 +193,13 @@ class VoxelMethod(Method):
         """Number of active voxels."""
         return "voxels", len(self.radiance.voxels)
 
-    def grids(self) -> dict[str, VoxelGrid]:
-        """Return all voxel grids by their names in ``state_dict``."""
-        return {name: part for name, part in self.named_modules() if isinstance(part, VoxelGrid)}
-
     def adopted(self) -> set[str]:
         """Let voxel grids adopt a checkpoint's lattices."""
-        return {
-            f"{place}.{name}" for place, g in self.grids().items() for name in ("voxels", "index", *g.names)
-        }
+        return adopted_in(self)
 
     def misfit(self, state: Mapping[str, Tensor]) -> str | None:
         """Return what in a stored grid contradicts its lattice, as kernels do not check the index."""
-        found = ((place, grid.misfit(state, f"{place}.")) for place, grid in self.grids().items())
-        return next((f"{place}.{name}" for place, name in found if name is not None), None)
+        return misfit_in(self, state)
 
     def get_extra_state(self) -> dict:
         """Return the length that density is measured in, and the state of the lattices' schedule."""

@@ -26,7 +26,7 @@ class TrilinearUpsampler(nn.Module):
     """Interpolate to a lattice ``scale`` times finer, in occupied cells only.
 
     Args:
-        scale: > 1, not necessarily whole.
+        scale: above 1, not necessarily whole.
     """
 
     def __init__(self, *, scale: float = 2.0) -> None:

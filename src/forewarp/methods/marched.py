@@ -1,0 +1,278 @@
+"""What methods share that march rays at equal steps and read learned lattices and networks at the samples."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from forewarp import losses
+from forewarp.fields.occupancy import Occupancy
+from forewarp.fields.radiance_grid import Activation
+from forewarp.fields.voxel_grid import VoxelGrid, adopted_in, misfit_in
+from forewarp.methods.method import Method, Snapshot, Start, Step
+from forewarp.methods.rows import renew_parameters
+from forewarp.methods.rows_adam import RowsAdam
+from forewarp.ops.warmup import warm_up
+from forewarp.renderer import Marched, Renderer
+from forewarp.scene.batch import Batch
+from forewarp.scene.box import Box, Lattice
+from forewarp.scene.rays import Rays
+from forewarp.scene.view import Moment, Rendering, View
+
+_RAYS = 4096  # of a picture, at once
+_YOUNG = 4  # steps between two of the first looks for where matter is
+
+
+@dataclass(frozen=True)
+class Marching:
+    """How a method marches; one for all such methods.
+
+    Args:
+        step: distance between samples, in voxels of the method's finest lattice.
+        color_threshold: compute no colour for samples of less weight; 0: compute all.
+        jitter: in training, shift the samples of each ray by up to one step.
+        occupancy: cells along a side of the lattice that notes where matter is (see ``Occupancy``), so that
+            samples elsewhere are not evaluated; 0: evaluate all in the box.
+        look_every: steps between two looks for where matter is; 0: never look again.
+    """
+
+    step: float = 0.5
+    color_threshold: float = 1e-4
+    jitter: bool = False
+    occupancy: int = 0
+    look_every: int = 16
+
+    def departures(self) -> list[str]:
+        """Name what differs from the publications."""
+        notes = ["pixel centres at +0.5", "near and far along unit rays", "a step's rays from one picture"]
+        return notes + (["empty space is not sampled"] if self.occupancy and self.look_every else [])
+
+
+class PointField(Protocol):
+    """A method at one moment, asked at world points."""
+
+    def look_up(self, points: Tensor) -> tuple[Tensor, Callable[[Tensor | slice, Tensor], Tensor]]:
+        """World points (P, 3) -> density (P,) per world unit, and a function: rows (K,) of these points and
+        unit directions (K, 3) -> colour (K, 3).
+        """
+
+
+@dataclass(frozen=True)
+class _Placed:
+    """A ``PointField`` as the renderer asks it: in coordinates of the ``lattice`` whose cells are marched."""
+
+    field: PointField
+    lattice: Lattice
+    cells: Tensor
+    voxel_size: float
+
+    def look_up(self, points: Tensor) -> tuple[Tensor, Callable[[Tensor | slice, Tensor], Tensor]]:
+        return self.field.look_up(self.lattice.to_world(points))
+
+
+class MarchedMethod(Method):
+    """Rays marched at equal steps through a box, lattices that grow during a stage, Adam by rows.
+
+    A subclass makes its lattices for ``num_voxels``, sets the ``shift`` of its ``activation``, ends its
+    constructor with ``begin``, and says what it is at a moment (``field``) and how it grows (``grow``).
+
+    Args:
+        start: scene, stage and numbers.
+        marching: see ``Marching``.
+        box: outside, everything is empty.
+        num_voxels: ``[[fraction, count], ...]``: about ``count`` voxels from ``fraction`` of the stage on.
+    """
+
+    terms = ("photo", "point_color", "background_entropy")
+    numbers = ("num_voxels", "color_threshold")
+
+    def __init__(self, start: Start, marching: Marching, box: Box) -> None:
+        super().__init__()
+        self.box, self.times, self.marching = box, start.scene.times, marching
+        self.schedule = _checked(start)
+        threshold = start.numbers.get("color_threshold")
+        self.renderer = Renderer(step=marching.step, color_threshold=marching.color_threshold)
+        self.renderer = self.renderer.with_threshold(threshold)
+        self.occupancy = Occupancy(box, side=marching.occupancy, patience=8) if marching.occupancy else None
+
+    def begin(self) -> None:
+        """Note where the schedule stands, once all parameters are there."""
+        self.register_buffer("voxels", torch.tensor(self.schedule[0][1], dtype=torch.float64))
+        self.register_buffer("raised", torch.ones(len(self.param_groups()), dtype=torch.float64))
+
+    @property
+    def last_voxels(self) -> float:
+        """The number of voxels at the end of the stage."""
+        return self.schedule[-1][1]
+
+    @property
+    def lattice_marched(self) -> Lattice:
+        """The lattice that a step is a share of, as it is now."""
+        raise NotImplementedError
+
+    def marching_lattice(self, num_voxels: float) -> Lattice:
+        """Return that lattice with about ``num_voxels`` voxels."""
+        raise NotImplementedError
+
+    @property
+    def activation(self) -> Activation:
+        """Density of raw density; its unit of length is a voxel of the last lattice."""
+        return Activation(self.shift, self.marching_lattice(self.last_voxels).voxel_size)
+
+    def field(self, moment: Moment) -> PointField:
+        """Return what is to be asked at a moment."""
+        raise NotImplementedError
+
+    def grow(self, num_voxels: float, optimizer: torch.optim.Optimizer) -> None:
+        """Resample the lattices to about ``num_voxels`` voxels."""
+        raise NotImplementedError
+
+    def extra_terms(
+        self, field: PointField, batch: Batch, generator: torch.Generator
+    ) -> dict[str, Callable[[], Tensor | None]]:
+        """Return the loss terms beside those of the rays; ``field`` has been asked at the rays' samples."""
+        return {}
+
+    def at(self, moment: Moment) -> MarchedSnapshot:
+        """Fix the time; compute nothing yet."""
+        return MarchedSnapshot(moment, self)
+
+    def look(self, batch: Batch, factors: Mapping[str, float], generator: torch.Generator) -> Step:
+        """See ``Method.look``; a batch holds one moment, as no neighbours are asked for."""
+        rays, rgb, background = batch.joined()
+        field = self.field(batch.observations[0].moment)
+        jitter = generator if self.marching.jitter else None
+        drawn = self.marched_through(field, rays.to(self.device), background.to(self.device), jitter)
+        error = (drawn.rgb - rgb).square().mean()
+        terms = {
+            "photo": lambda: error,
+            "point_color": lambda: losses.point_color(drawn.weights, drawn.colors, drawn.ray_ids, rgb),
+            "background_entropy": lambda: losses.background_entropy(drawn.transmittance),
+        }
+        return Step(
+            terms | self.extra_terms(field, batch, generator),
+            error.detach(),
+            {"samples": drawn.samples, "opacity": float(drawn.opacity.detach().mean())},
+            tensors=lambda: ((name, getattr(drawn, name)) for name in ("weights", "colors", "rgb")),
+        )
+
+    def marched_through(
+        self, field: PointField, rays: Rays, background: Tensor, generator: torch.Generator | None = None
+    ) -> Marched:
+        """March rays through the occupied cells of a field; ``generator`` jitters the samples."""
+        return self.renderer(self.placed(field), rays, background, generator=generator)
+
+    def placed(self, field: PointField) -> _Placed:
+        """Return a field as the renderer asks it."""
+        everywhere = torch.ones(1, 1, 1, dtype=torch.bool, device=self.device)
+        cells = everywhere if self.occupancy is None else self.occupancy.cells
+        lattice = Lattice(self.box, tuple(n + 1 for n in cells.shape))
+        return _Placed(field, lattice, cells, self.lattice_marched.voxel_size)
+
+    def advance(self, progress: float, step: int, optimizer: torch.optim.Optimizer) -> dict[str, float]:
+        """See ``Method``; grow, after which optimiser and learning rates start anew; look for matter."""
+        wanted = next(n for begin, n in reversed(self.schedule) if progress >= begin)
+        if wanted != float(self.voxels):
+            self.grow(wanted, optimizer)
+            optimizer.state.clear()
+            self.voxels.fill_(wanted)
+            pairs = [(group["base_lr"], group["lr"]) for group in optimizer.param_groups]
+            self.raised.copy_(torch.tensor([first / now if now else 1.0 for first, now in pairs]))
+        for group, factor in zip(optimizer.param_groups, self.raised.tolist()):
+            group["lr"] *= factor
+        if self.occupancy is None:
+            return {}
+        pace, young = self.marching.look_every, int(self.occupancy.looks) < self.occupancy.patience
+        if pace and step % (min(pace, _YOUNG) if young else pace) == 0:
+            self.occupancy.look(self.density_at, self.times, torch.default_generator)
+        return {"occupied": float(self.occupancy.occupied.float().mean())}
+
+    def density_at(self, points: Tensor, time: float) -> Tensor:
+        """World points (P, 3) and a time -> density (P,), per world unit."""
+        return self.field(Moment(time)).look_up(points)[0]
+
+    def optimizer(self, groups: list[dict]) -> torch.optim.Optimizer:
+        """Make Adam with the published betas; voxels that no sample touched keep their moments."""
+        return RowsAdam(groups, betas=(0.9, 0.99), eps=1e-8)
+
+    def warm_up(self) -> None:
+        """Compile the kernels."""
+        warm_up(self.device)
+
+    def adopted(self) -> set[str]:
+        """Let voxel grids adopt a checkpoint's lattices."""
+        return adopted_in(self)
+
+    def misfit(self, state: Mapping[str, Tensor]) -> str | None:
+        """Return what in a stored grid contradicts its lattice, as kernels do not check the index."""
+        return misfit_in(self, state)
+
+    def get_extra_state(self) -> dict:
+        """Return the box in plain numbers."""
+        return {"low": list(self.box.low), "high": list(self.box.high)}
+
+    def set_extra_state(self, state: dict) -> None:
+        """Adopt a checkpoint's box."""
+        self.box = Box(tuple(state["low"]), tuple(state["high"]))
+
+    def departures(self) -> Sequence[str]:
+        """List what differs from the publication beside the marching."""
+        return ()
+
+    def faults(self) -> Sequence[str]:
+        """List the faults of the released code that are on."""
+        return ()
+
+    def protocol(self) -> dict[str, str]:
+        """List the departures from the publication, and the faults kept from its code."""
+        departures = "; ".join([*self.marching.departures(), *self.departures()])
+        kept = "; ".join(self.faults())
+        return {"departures": departures} | ({"faults": kept} if kept else {})
+
+
+@dataclass(frozen=True)
+class MarchedSnapshot(Snapshot):
+    """Such a method at one moment."""
+
+    moment: Moment
+    method: MarchedMethod
+
+    def render(self, view: View, background: Tensor, rendering: str | None = None) -> Rendering:
+        """See ``Snapshot.render``; without gradients in chunks of rays, for images of any size."""
+        rays, field = view.rays().to(self.method.device), self.method.field(self.moment)
+        background = background.to(rays.origins)
+        if torch.is_grad_enabled():
+            return self.method.marched_through(field, rays, background)
+        behind = background.expand(len(rays), 3)
+        chunks = [slice(begin, begin + _RAYS) for begin in range(0, len(rays), _RAYS)]
+        parts = [self.method.marched_through(field, rays[some], behind[some]) for some in chunks]
+        return Rendering(*(torch.cat([getattr(p, k) for p in parts]) for k in ("rgb", "depth", "opacity")))
+
+    def holds(self, moment: Moment) -> bool:
+        """Return whether it is the same time, seen by the same camera."""
+        return (moment.time, moment.camera) == (self.moment.time, self.moment.camera)
+
+
+def whole_grid(lattice: Lattice, channels: dict[str, int]) -> VoxelGrid:
+    """Make a grid of zeros of all voxels of a lattice."""
+    return VoxelGrid(lattice, torch.ones(lattice.shape, dtype=torch.bool), channels)
+
+
+def regrow(grid: VoxelGrid, lattice: Lattice, optimizer: torch.optim.Optimizer) -> None:
+    """Interpolate such a grid to another lattice; its moments start at 0."""
+    before = [grid.parameter(name) for name in grid.names]
+    grid.resample(lattice, torch.ones(lattice.shape, dtype=torch.bool), dict.fromkeys(grid.names, 0.0))
+    renew_parameters(optimizer, before, [grid.parameter(name) for name in grid.names], None)
+
+
+def _checked(start: Start) -> list[tuple[float, float]]:
+    """Return the schedule of a stage's voxels as pairs."""
+    where, given = f"stage.{start.stage}.num_voxels", start.numbers.get("num_voxels", ())
+    pairs = [tuple(pair) for pair in given]
+    if not pairs or any(len(p) != 2 or not 0 <= p[0] <= 1 or p[1] < 8 for p in pairs) or pairs[0][0] != 0:
+        raise ValueError(f"{where}: expected [[0, count], [fraction, count], ...], but got {given}")
+    return [(float(begin), float(count)) for begin, count in pairs]

@@ -1,0 +1,297 @@
+"""NDVG: a voxel grid and a small network move each sample back to the canonical time, where a voxel radiance
+field is, and say how much of it is hidden.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from copy import deepcopy
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor, nn
+
+from forewarp import losses
+from forewarp.fields.mlp import mlp
+from forewarp.fields.occupancy import Occupancy
+from forewarp.fields.radiance import density_shift
+from forewarp.fields.voxel_grid import VoxelGrid
+from forewarp.methods.marched import MarchedMethod, Marching, regrow, whole_grid
+from forewarp.methods.method import Start
+from forewarp.ops.encode import encoded_size, positional_encoding
+from forewarp.ops.grid import dilate, trilinear
+from forewarp.ops.variation import second_variation
+from forewarp.scene.batch import Batch
+from forewarp.scene.box import Box, Lattice
+from forewarp.scene.frame import spread
+from forewarp.scene.view import Moment
+
+_HIDDEN = -100.0  # raw density that never comes back
+_OPAQUE = 1 - 1e-6  # most a sample may hide, so that what is behind keeps a gradient
+_SIDE = 96  # cells along a side of the lattice by which a box is found, where there is no other
+_LOOKS = 50  # times at which a finished stage is asked where matter is
+_BOX = 1.05  # a tight box is made so much wider
+_STILL = 1024  # at most this many points that never move, in a step
+
+
+@dataclass(frozen=True)
+class NDVGStage:
+    """The numbers of a stage of NDVG, beside those of ``MarchedMethod``.
+
+    Args:
+        deformation_voxels: voxels of the deformation grid for each canonical voxel.
+        view_dependence: False: three canonical features are the colour, from everywhere.
+        alpha_init: opacity at first of a voxel of the last deformation grid.
+        sink: how far raw density falls each time the grids grow.
+        box_alpha: the next stage's box holds cells more opaque than this.
+        carry: start from the canonical density of the stage before; False: from nothing, as published.
+        masked: leave canonical voxels empty for good where the stage before has less than ``box_alpha``.
+    """
+
+    deformation_voxels: float = (190 / 160) ** 3
+    view_dependence: bool = True
+    alpha_init: float = 1e-2
+    sink: float = 1.0
+    box_alpha: float = 1e-3
+    carry: bool = False
+    masked: bool = False
+
+
+class NDVG(MarchedMethod):
+    """``(d, m) = F(PE(G(x)), PE(x), PE(t))``, ``y = x + d``, ``alpha = m (1 - exp(-sigma(y) step))``,
+    ``colour = m N(K(y), PE(y), PE(dir))``; ``d = 0`` at the canonical time.
+
+    ``G`` (deformation), ``sigma`` and ``K`` (canonical) are voxel grids that start at 0; the mask ``m``
+    starts at one half. A second stage goes on with ``G`` and ``F`` of the first, in a box around its matter.
+
+    Args:
+        start: scene, stage and numbers (see ``NDVGStage``).
+        marching: see ``Marching``; its voxels are those of the deformation grid.
+        width: of the networks of deformation and colour.
+        channels: of the deformation grid, and of the canonical features.
+        frequencies: octaves of the encoded features, places and times.
+        direction_frequencies: octaves of the encoded directions.
+        continuous: ``F(x, t) - F(x, canonical)`` in place of a jump to 0 at the canonical time.
+        pool: as ``curriculum.pace`` of the first stage, to be named among the faults.
+    """
+
+    terms = (*MarchedMethod.terms, "flow_l1", "tv_deformation", "canonical", "still")
+    numbers = (*MarchedMethod.numbers, *(field.name for field in fields(NDVGStage)))
+
+    def __init__(
+        self,
+        start: Start,
+        *,
+        marching: Marching | None = None,
+        width: Sequence[int] = (64, 128),
+        channels: Sequence[int] = (4, 12),
+        frequencies: int = 5,
+        direction_frequencies: int = 4,
+        continuous: bool = False,
+        pool: float | None = None,
+    ) -> None:
+        tight = start.handover is not None and start.handover.tight
+        box = start.handover.box if tight else start.scene.box
+        super().__init__(start, marching or Marching(jitter=True), box)
+        own = {f.name: start.numbers[f.name] for f in fields(NDVGStage) if f.name in start.numbers}
+        self.stage = NDVGStage(**own)
+        self.shift = density_shift(self.stage.alpha_init)
+        self.canonical_time, self.still = start.scene.canonical_time, start.scene.still
+        self.octaves, self.continuous, self.pool = (frequencies, direction_frequencies), continuous, pool
+        self.pulls = bool(start.weights.get("still"))
+        viewed, first = self.stage.view_dependence, self.schedule[0][1]
+        self.canonical = whole_grid(
+            Lattice.of_count(box, first), {"density": 1, "color": channels[1] if viewed else 3}
+        )
+        self.deformation = whole_grid(self.marching_lattice(first), {"features": channels[0]})
+        place, direction = encoded_size(3, frequencies), encoded_size(3, direction_frequencies)
+        inputs = encoded_size(channels[0], frequencies) + place + encoded_size(1, frequencies)
+        self.network = mlp(inputs, 4, width=width[0], layers=4, zero_last=True)
+        self.color = mlp(channels[1] + place + direction, 3, width=width[1], layers=3) if viewed else None
+        if viewed:
+            nn.init.zeros_(self.color[-1].bias)
+        self.begin()
+        if isinstance(start.before, NDVG) and not start.blank:
+            self._go_on(start.before)
+        elif not start.blank:
+            self._clear([frame.camera for frame in start.scene.train])
+
+    def marching_lattice(self, num_voxels: float) -> Lattice:
+        """See ``MarchedMethod``: that of the deformation."""
+        return Lattice.of_count(self.box, self.stage.deformation_voxels * num_voxels)
+
+    def _clear(self, cameras: Sequence) -> None:
+        """Empty the voxels nearer to a camera than it can see."""
+        points = self.canonical.lattice.to_world(self.canonical.voxels)
+        for center, near in {(tuple(camera.center.tolist()), camera.near) for camera in cameras}:
+            close = (points - points.new_tensor(center)).norm(dim=-1) <= near
+            self.canonical.density.data[close] = _HIDDEN
+
+    @torch.no_grad()
+    def _go_on(self, before: NDVG) -> None:
+        """Take over the deformation of the stage before, and do not look where it found nothing."""
+        nodes = self.deformation.lattice.to_world(self.deformation.voxels)
+        self.deformation.features.copy_(_read(before.deformation, "features", nodes))
+        self.network.load_state_dict(before.network.state_dict())
+        if self.occupancy is not None:
+            self.occupancy.settle(before.density_found, _some(self.times))
+        voxels = self.canonical.lattice.to_world(self.canonical.voxels)
+        if self.stage.carry:
+            optical = (
+                before.activation.sigma(_read(before.canonical, "density", voxels))
+                * self.activation.density_scale
+            )
+            self.canonical.density.copy_(
+                torch.log(torch.expm1(optical.double()).clamp(min=1e-6)) - self.shift
+            )
+        if self.stage.masked:
+            old = before.canonical
+            size = old.lattice.voxel_size
+            solid = before.activation.alpha(old.density[:, 0], size) > before.stage.box_alpha
+            near = dilate(solid.reshape(old.lattice.shape)).reshape(-1, 1).to(old.density)
+            near = trilinear(near, old.index, old.lattice.to_lattice(voxels), near.new_zeros(1))
+            self.canonical.density[near[:, 0] <= 0] = _HIDDEN
+
+    @property
+    def lattice_marched(self) -> Lattice:
+        """See ``MarchedMethod``."""
+        return self.deformation.lattice
+
+    def field(self, moment: Moment) -> NDVGField:
+        """See ``MarchedMethod``."""
+        return NDVGField(self, moment.time)
+
+    def carried(self, points: Tensor, time: float) -> tuple[Tensor, Tensor]:
+        """World points (P, 3) -> what ``F`` says of them at a time: offset (P, 3), raw mask (P,)."""
+        read = positional_encoding(_read(self.deformation, "features", points), self.octaves[0])
+        place = positional_encoding(points, self.octaves[0])
+        moment = positional_encoding(points.new_tensor([time]), self.octaves[0]).expand(len(points), -1)
+        found = self.network(torch.cat([read, place, moment], -1))
+        return found[:, :3], found[:, 3]
+
+    def density_found(self, points: Tensor, time: float) -> Tensor:
+        """As ``density_at``; 0 without a look in cells that were found to be empty."""
+        if self.occupancy is None:
+            return self.density_at(points, time)
+        known = self.occupancy(points).nonzero()[:, 0]
+        return points.new_zeros(len(points)).index_copy(0, known, self.density_at(points[known], time))
+
+    def grow(self, num_voxels: float, optimizer: torch.optim.Optimizer) -> None:
+        """See ``MarchedMethod``; raw density falls by ``sink``."""
+        regrow(self.canonical, Lattice.of_count(self.box, num_voxels), optimizer)
+        regrow(self.deformation, self.marching_lattice(num_voxels), optimizer)
+        self.canonical.density.data -= self.stage.sink
+
+    @torch.no_grad()
+    def bounds(self, times: list[float]) -> Box | None:
+        """Bound all matter more opaque than ``box_alpha`` across a cell, and a little more."""
+        looked = deepcopy(self.occupancy) or Occupancy(self.box, side=_SIDE).to(self.device)
+        looked.settle(self.density_at, _some(times))
+        found = looked.bounds(self.stage.box_alpha)
+        return None if found is None else found.scaled(_BOX)
+
+    def extra_terms(
+        self, field: NDVGField, batch: Batch, generator: torch.Generator
+    ) -> dict[str, Callable[[], Tensor | None]]:
+        """Offer ``flow_l1``, the samples' offsets; ``tv_deformation``; ``canonical``, offsets of samples at
+        the canonical time, which ``F`` should give as 0; ``still``, at points that never move.
+        """
+
+        def canonical() -> Tensor | None:
+            if self.continuous or not len(field.points):
+                return None
+            count = max(1, len(field.points) // len(self.times))
+            rows = torch.randint(len(field.points), (count,), generator=generator)
+            return self.carried(field.points[rows.to(self.device)], self.canonical_time)[0].abs().mean()
+
+        def tv_deformation() -> Tensor:
+            shape = self.deformation.lattice.shape
+            return second_variation(self.deformation.features.reshape(*shape, -1))
+
+        def still() -> Tensor | None:
+            if self.still is None or not len(self.still):
+                return None
+            rows = torch.randint(len(self.still), (min(_STILL, len(self.still)),), generator=generator)
+            return field.offset(self.still[rows].to(self.device))[0].square().mean()
+
+        return {
+            "flow_l1": lambda: losses.flow_l1(field.offsets),
+            "tv_deformation": tv_deformation,
+            "canonical": canonical,
+            "still": still,
+        }
+
+    def param_groups(self) -> dict[str, list[nn.Parameter]]:
+        """Group parameters: ``density``, ``color`` and ``deformation`` (the grids), ``network``."""
+        networks = [self.network, *([] if self.color is None else [self.color])]
+        return {
+            "density": [self.canonical.density],
+            "color": [self.canonical.color],
+            "deformation": [self.deformation.features],
+            "network": [p for network in networks for p in network.parameters()],
+        }
+
+    def departures(self) -> list[str]:
+        """See ``MarchedMethod``."""
+        found = ["offsets without a jump at the canonical time"] if self.continuous else []
+        return found + (["the second stage starts from the density of the first"] if self.stage.carry else [])
+
+    def faults(self) -> list[str]:
+        """See ``MarchedMethod``."""
+        found = []
+        if self.pool is not None and (unseen := len(self.times) - int(self.pool)) > 0:
+            found.append(f"the first stage never sees the last {unseen} times (pool)")
+        if self.still is not None and not self.pulls:
+            found.append("points that never move are not looked at (weights.still)")
+        return found
+
+
+class NDVGField:
+    """NDVG at a time (see ``PointField``); keeps the ``points`` (P, 3) asked last, and their ``offsets``."""
+
+    def __init__(self, method: NDVG, time: float) -> None:
+        self.method, self.time = method, time
+
+    def offset(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """World points (P, 3) -> offsets to their canonical places (P, 3), masks (P,) in (0, 1)."""
+        method = self.method
+        offset, hidden = method.carried(points, self.time)
+        if self.time == method.canonical_time:
+            offset = torch.zeros_like(offset)
+        elif method.continuous:
+            offset = offset - method.carried(points, method.canonical_time)[0]
+        return offset, torch.sigmoid(hidden)
+
+    def look_up(self, points: Tensor) -> tuple[Tensor, Callable[[Tensor | slice, Tensor], Tensor]]:
+        """See ``PointField``. The density is the one whose opacity over a step is the masked one."""
+        method, canonical = self.method, self.method.canonical
+        self.points = points
+        self.offsets, mask = self.offset(points)
+        placed = points + self.offsets
+        at = canonical.lattice.to_lattice(placed.detach())
+        inside = ((at >= 0) & (at <= at.new_tensor(canonical.lattice.shape) - 1)).all(-1)
+        step = method.marching.step * method.lattice_marched.voxel_size
+        alpha = inside * mask * method.activation.alpha(_read(canonical, "density", placed)[:, 0], step)
+
+        def color(rows: Tensor | slice, directions: Tensor) -> Tensor:
+            there = placed[rows]
+            features = _read(canonical, "color", there)
+            if method.color is not None:
+                encoded = (
+                    positional_encoding(x, octaves) for x, octaves in zip((there, directions), method.octaves)
+                )
+                features = method.color(torch.cat([features, *encoded], -1))
+            return mask[rows, None] * torch.sigmoid(features)
+
+        return -torch.log1p(-alpha.clamp(max=_OPAQUE)) / step, color
+
+
+def _read(grid: VoxelGrid, name: str, points: Tensor) -> Tensor:
+    """Read a parameter (N, C) of a dense grid at world points (P, 3): (P, C)."""
+    values = grid.parameter(name)
+    return trilinear(values, grid.index, grid.lattice.to_lattice(points), values.new_zeros(values.shape[1]))
+
+
+def _some(times: Sequence[float]) -> list[float]:
+    """At most so many of the times, spread evenly."""
+    return [times[i] for i in spread(len(times), _LOOKS)]

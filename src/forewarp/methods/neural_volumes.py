@@ -1,0 +1,303 @@
+"""Neural Volumes: pictures of an instant give a code, and it a volume, read through a warp."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from forewarp.fields.codes import beside
+from forewarp.fields.volumes import DEVIATION_SCALE, AffineMixture, PictureEncoder, VolumeDecoder, read
+from forewarp.methods.method import Method, Snapshot, Start, Step
+from forewarp.ops.samples import clip_to_box
+from forewarp.scene.batch import Batch
+from forewarp.scene.frame import Frame, Scene, spread
+from forewarp.scene.rays import Rays
+from forewarp.scene.view import Moment, Rendering, View
+
+_MOST = 3  # pictures of an instant, as published
+_POINTS = 1 << 19  # read at once for an image
+_MEAN, _DEVIATION = 100.0, 25.0  # of pictures in [0, 255]
+
+
+@dataclass(frozen=True)
+class Volumes:
+    """The scene at one time: ``template`` (4, S, S, S), colour in about [0, 1] and opacity per half side of
+    the cube, and ``warp`` (3, W, W, W), where in the template each place of the cube is.
+    """
+
+    template: Tensor
+    warp: Tensor
+
+    def at(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Points (N, 3) of the cube -> colour (N, 3) and opacity (N,)."""
+        found = read(self.template, read(self.warp, points, "border"))
+        return found[:, :3], found[:, 3]
+
+
+class NeuralVolumes(Method):
+    """``z = E(pictures(t))``, ``V = D(z)``, seen at x: ``V(W(x; z))`` (Neural Volumes, equations 1 to 12).
+
+    Time enters only through training pictures of the instant, which are kept small in the method itself.
+    Where fixed cameras see every instant, up to three of them are looked at; else the one picture of the
+    instant, wherever it was taken from. Between training times the codes beside it are interpolated.
+
+    Args:
+        start: scene, stage and numbers.
+        pictures: of an instant, taken by as many fixed cameras; null: as many as there are, at most 3.
+        picture_size, tower, features, code: see ``fields.volumes.PictureEncoder``.
+        decoder: see ``fields.volumes.VolumeDecoder``.
+        maps, warp_side, warp_width, weight_width, from_identity: see ``fields.volumes.AffineMixture``.
+        first_opacity: of the volume before training, > 0; null: as released, about 0.7, with which most rays
+            are opaque at first, and have no gradient.
+        first_deviation: of the code before training, > 0; null: as released, about 1, many times the code.
+        step: length of a step along a ray, in half sides of the cube around the scene's box.
+        jitter_in_pictures: march from random places in pictures too, as the released code does.
+
+    Raises:
+        ValueError: where fewer fixed cameras see every instant than ``pictures`` asks for.
+    """
+
+    terms = ("photo", "code_prior", "opacity_prior", "opacity_variation")
+
+    def __init__(
+        self,
+        start: Start,
+        *,
+        pictures: int | None = None,
+        picture_size: Sequence[int] = (512, 384),
+        tower: Sequence[int] = (64, 64, 128, 128, 256, 256, 256),
+        features: int = 512,
+        code: int = 256,
+        decoder: Sequence[int] = (1024, 512, 512, 256, 256, 128, 128),
+        maps: int = 16,
+        warp_side: int = 32,
+        warp_width: int = 128,
+        weight_width: int = 64,
+        step: float = 4 / 256,
+        from_identity: bool = False,
+        first_opacity: float | None = None,
+        first_deviation: float | None = None,
+        jitter_in_pictures: bool = True,
+    ) -> None:
+        super().__init__()
+        for key, first in (("opacity", first_opacity), ("deviation", first_deviation)):
+            if first is not None and not first > 0:
+                raise ValueError(f"model.first_{key}: expected a number > 0 or null, but got {first}")
+        if not 0 < step <= 1:
+            raise ValueError(f"model.step: expected a length in (0, 1], but got {step}")
+        self.step, self.jitter_in_pictures = step, jitter_in_pictures
+        self.from_identity = from_identity
+        self.first = {"opacity": first_opacity, "deviation of the code": first_deviation}
+        scene = start.scene
+        self.times = scene.times
+        shots = shots_of(scene, pictures)
+        size = tuple(picture_size)
+        self.encoder = PictureEncoder(len(shots[0]), size, tower=tower, width=features, code=code)
+        self.decoder = VolumeDecoder(code, decoder)
+        if first_deviation is not None:
+            nn.init.constant_(self.encoder.deviation.bias, math.log(first_deviation) / DEVIATION_SCALE)
+        if first_opacity is not None:
+            nn.init.constant_(self.decoder.grow[-1].bias[3], math.log(math.expm1(first_opacity)))
+        shape = {"maps": maps, "side": warp_side, "width": warp_width, "weight_width": weight_width}
+        self.warp = AffineMixture(code, **shape, from_identity=from_identity)
+        known = {frame.camera_id for frame in scene.train} - {None}
+        self.gain = nn.Parameter(torch.ones(max(known) + 1, 3)) if known else None
+        self.bias = nn.Parameter(torch.zeros(max(known) + 1, 3)) if known else None
+        self.reach = max(scene.box.size) / 2  # half a side of the cube
+        self.register_buffer("center", torch.tensor(scene.box.center))
+        held = torch.zeros(len(shots), len(shots[0]), 3, *size, dtype=torch.uint8)
+        if not start.blank:
+            for row, frames in zip(held, shots):
+                for place, frame in zip(row, frames):
+                    place.copy_(fitted_picture(frame.load(), size))
+        self.register_buffer("pictures", held)
+
+    def encoded(self, row: int) -> tuple[Tensor, Tensor]:
+        """Return a training time's code, by its number: mean, and logarithm of the deviation."""
+        return self.encoder((self.pictures[row].to(self.center) - _MEAN) / _DEVIATION)
+
+    def code_at(self, time: float) -> Tensor:
+        """Return the mean code (C,) of any time."""
+        before, after, share = beside(self.times, time)
+        mean = self.encoded(before)[0]
+        return mean if before == after else torch.lerp(mean, self.encoded(after)[0], share)
+
+    def volumes(self, code: Tensor) -> Volumes:
+        """Decode a code (C,)."""
+        raw = self.decoder(code)
+        color = functional.softplus(_MEAN + _DEVIATION * raw[:3]) / 255
+        return Volumes(torch.cat([color, functional.softplus(raw[3:])]), self.warp(code))
+
+    def march(
+        self,
+        volumes: Volumes,
+        rays: Rays,
+        background: Tensor,
+        camera: int | None,
+        generator: torch.Generator | None = None,
+    ) -> Rendering:
+        """March R rays through the cube. Opacity adds up along a ray, until it is 1.
+
+        ``generator`` draws where a ray begins, and the length of its steps; None: as they are on average.
+        """
+        origins = (rays.origins.to(self.center) - self.center) / self.reach
+        directions, half = rays.directions.to(self.center), self.reach
+        corner = torch.ones_like(self.center)
+        near, far = clip_to_box(origins, directions, rays.near / half, rays.far / half, -corner, corner)
+        met = (far > near).nonzero()[:, 0]
+        origins, directions, near, far = origins[met], directions[met], near[met], far[met]
+        begin, length = near - 0.5 * self.step, torch.full_like(near, self.step)
+        if generator is not None:
+            begin = near - self.step * torch.rand(near.shape, generator=generator).to(near)
+            length = length * (0.01 * torch.randn(near.shape, generator=generator)).exp().to(near)
+        count = int((((far - begin) / length).amax()).ceil()) + 1 if len(met) else 0
+        depths = begin[:, None] + length[:, None] * torch.arange(count, device=near.device)
+        inside = (depths >= near[:, None]) & (depths < far[:, None])
+        row, _ = inside.nonzero(as_tuple=True)
+        color, opacity = volumes.at(origins[row] + depths[inside][:, None] * directions[row])
+        optical = torch.zeros_like(depths).masked_scatter(inside, opacity * length[row])
+        through = optical.cumsum(1).clamp(max=1)
+        weights = through - functional.pad(through, (1, 0))[:, :-1]
+        rgb = near.new_zeros(len(near), 3).index_add(0, row, weights[inside][:, None] * color)
+        total = weights.sum(1)
+        depth = half * (weights * depths).sum(1) / total.clamp(min=1e-6)
+        whole = rgb.new_zeros(len(rays))
+        rgb = rgb.new_zeros(len(rays), 3).index_copy(0, met, rgb)
+        total, depth = whole.index_copy(0, met, total), whole.index_copy(0, met, depth)
+        if self.gain is not None and camera is not None and 0 <= camera < len(self.gain):
+            rgb = rgb * self.gain[camera] + self.bias[camera]
+        return Rendering(rgb + (1 - total)[:, None] * background.to(rgb), depth, total)
+
+    def at(self, moment: Moment) -> VolumesSnapshot:
+        """Fix the time; compute nothing yet."""
+        return VolumesSnapshot(moment, self)
+
+    def look(self, batch: Batch, factors: Mapping[str, float], generator: torch.Generator) -> Step:
+        """See ``Method.look``; a batch holds one moment, as no neighbours are asked for."""
+        rays, rgb, background = batch.joined()
+        moment = batch.observations[0].moment
+        mean, deviation = self.encoded(self.times.index(moment.time))
+        noise = torch.randn(mean.shape, generator=generator).to(mean)
+        volumes = self.volumes(mean + deviation.exp() * noise)
+        seen = self.march(volumes, rays, background, moment.camera, generator)
+        error = (seen.rgb - rgb.to(seen.rgb)).square().mean()
+        terms = {
+            "photo": lambda: error,
+            "code_prior": lambda: code_prior(mean, deviation),
+            "opacity_prior": lambda: opacity_prior(seen.opacity),
+            "opacity_variation": lambda: opacity_variation(volumes.template[3]),
+        }
+        tensors = {"code": mean, "template": volumes.template, "warp": volumes.warp, "rgb": seen.rgb}
+        noted = {"opacity": float(seen.opacity.detach().mean())}
+        return Step(terms, error.detach(), noted, tensors=tensors.items)
+
+    def optimizer(self, groups: list[dict]) -> torch.optim.Optimizer:
+        """Make Adam with the published betas."""
+        return torch.optim.Adam(groups, betas=(0.9, 0.999), eps=1e-8, fused=True)
+
+    def protocol(self) -> dict[str, str]:
+        """List the departures from the publication."""
+        notes = [
+            f"code from {self.pictures.shape[1]} picture(s) of an instant",
+            "pixel centres at +0.5",
+            "rays of one picture a step",
+            "codes interpolated between training times",
+            "no return to earlier weights where the loss jumps",
+        ]
+        if self.from_identity:
+            notes.append("the warp starts as the identity")
+        notes += [f"first {name} {value:g}" for name, value in self.first.items() if value is not None]
+        if not self.jitter_in_pictures:
+            notes.append("pictures are drawn without random steps")
+        return {"departures": "; ".join(notes)}
+
+
+@dataclass(frozen=True)
+class VolumesSnapshot(Snapshot):
+    """Such a method at one moment. An image costs decoding once, and its rays' steps."""
+
+    moment: Moment
+    method: NeuralVolumes
+
+    @cached_property
+    def _still(self) -> Volumes:
+        with torch.no_grad():
+            return self.volumes()
+
+    def volumes(self) -> Volumes:
+        """Decode the volumes of the moment."""
+        return self.method.volumes(self.method.code_at(self.moment.time))
+
+    def render(self, view: View, background: Tensor, rendering: str | None = None) -> Rendering:
+        """See ``Snapshot.render``; without gradients in chunks of rays, for images of any size."""
+        rays, made, camera = view.rays(), self.method, self.moment.camera
+        if torch.is_grad_enabled():
+            return made.march(self.volumes(), rays, background, camera)
+        draw = torch.Generator().manual_seed(0) if made.jitter_in_pictures else None
+        behind, chunk = background.expand(len(rays), 3), max(1, int(_POINTS * made.step / 4))
+        parts = [
+            made.march(self._still, rays[i : i + chunk], behind[i : i + chunk], camera, draw)
+            for i in range(0, len(rays), chunk)
+        ]
+        return Rendering(
+            *(torch.cat([getattr(p, key) for p in parts]) for key in ("rgb", "depth", "opacity"))
+        )
+
+
+def shots_of(scene: Scene, wanted: int | None) -> list[list[Frame]]:
+    """Choose the pictures of each training time: by the same cameras, or one by whichever camera there is."""
+    of_time: dict[float, list[Frame]] = {time: [] for time in scene.times}
+    for frame in scene.train:
+        of_time[frame.time].append(frame)
+    seen_by = [{frame.camera_id for frame in frames} - {None} for frames in of_time.values()]
+    fixed = sorted(set.intersection(*seen_by))
+    there = max(len(fixed), 1)
+    if wanted is not None and not 1 <= wanted <= there:
+        raise ValueError(
+            f"model.pictures: expected at most {there}, as so many cameras took training pictures at every "
+            f"instant, but got {wanted}; set model.pictures=null"
+        )
+    if not fixed:
+        return [frames[:1] for frames in of_time.values()]
+    chosen = [fixed[i] for i in spread(len(fixed), min(wanted or _MOST, there))]
+    return [
+        [next(f for f in frames if f.camera_id == camera) for camera in chosen] for frames in of_time.values()
+    ]
+
+
+def fitted_picture(rgba: Tensor, size: tuple[int, int]) -> Tensor:
+    """Fit a picture (H, W, 4) uint8, over white, into the top left of one of a size: (3, *size) uint8."""
+    alpha = rgba[..., 3:].float() / 255
+    rgb = (alpha * rgba[..., :3].float() + (1 - alpha) * 255).permute(2, 0, 1)
+    factor = min(size[0] / rgb.shape[1], size[1] / rgb.shape[2])
+    fits = [max(1, min(most, round(side * factor))) for side, most in zip(rgb.shape[1:], size)]
+    small = functional.interpolate(rgb[None], fits, mode="bilinear", antialias=True)[0]
+    whole = torch.zeros(3, *size, dtype=torch.uint8)
+    whole[:, : fits[0], : fits[1]] = small.round().clamp(0, 255).to(torch.uint8)
+    return whole
+
+
+def code_prior(mean: Tensor, deviation: Tensor) -> Tensor:
+    """Kullback-Leibler divergence of a code from a standard normal, mean over channels; ``deviation`` is the
+    logarithm.
+    """
+    return (-0.5 - deviation + 0.5 * mean.square() + 0.5 * (2 * deviation).exp()).mean()
+
+
+def opacity_prior(opacity: Tensor) -> Tensor:
+    """Mean of ``log(0.1 + A) + log(1.1 - A) + 2.20727``: 0 for rays (R,) that are clear or opaque."""
+    return ((0.1 + opacity).log() + (1.1 - opacity).log()).mean() + 2.20727
+
+
+def opacity_variation(opacity: Tensor) -> Tensor:
+    """Total variation of the logarithm of a volume's opacity (S, S, S), mean over its inner points."""
+    value = (1e-5 + opacity).log()
+    inner = value[:-1, :-1, :-1]
+    steps = (value[1:, :-1, :-1] - inner, value[:-1, 1:, :-1] - inner, value[:-1, :-1, 1:] - inner)
+    return (1e-5 + sum(step.square() for step in steps)).sqrt().mean()

@@ -1,0 +1,196 @@
+"""TiNeuVox: a small network moves each sample, a voxel grid is read there at three strides, and a network
+that also knows position and time turns what was read into density and colour.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor, nn
+
+from forewarp.fields.mlp import mlp
+from forewarp.fields.radiance import density_shift
+from forewarp.fields.strided import read_strided
+from forewarp.fields.template import Template
+from forewarp.methods.marched import MarchedMethod, Marching, regrow, whole_grid
+from forewarp.methods.method import Start
+from forewarp.ops.encode import encoded_size, positional_encoding
+from forewarp.ops.variation import huber_variation
+from forewarp.scene.batch import Batch
+from forewarp.scene.box import Lattice
+from forewarp.scene.view import Moment
+
+_STRIDES = (1, 2, 4)
+_STILL_SHARE = 3  # as many points that never move as a third of a step's rays
+
+
+class TiNeuVox(MarchedMethod):
+    """``tau = T(PE(t))``, ``y = x + D(PE(x), tau)``, ``v = [V_1(y), V_2(y), V_4(y)]`` (one grid, read at
+    strides 1, 2 and 4), ``(density, colour) = N([PE(v), PE(x), tau], PE(d))``.
+
+    There is no canonical time: ``N`` reads the time and the place before the move as well.
+
+    Args:
+        start: scene, stage and numbers.
+        marching: see ``Marching``.
+        channels: of the grid.
+        width: of the networks.
+        alpha_init: opacity at first of a voxel of the last lattice.
+        camera: let colour depend on the number of the camera that took a picture (the rig's two).
+        padded: a fault of the released code: before it reads, it adds zeros at the grid's high ends, so that
+            voxels lie elsewhere after the grid has grown. False: sizes of 4 k + 1.
+        position_frequencies, time_frequencies, feature_frequencies, direction_frequencies: octaves.
+    """
+
+    terms = (*MarchedMethod.terms, "still", "tv_grid")
+    numbers = (*MarchedMethod.numbers, "frozen_from")
+
+    def __init__(
+        self,
+        start: Start,
+        *,
+        marching: Marching | None = None,
+        channels: int = 4,
+        width: int = 64,
+        alpha_init: float = 1e-2,
+        camera: bool = False,
+        padded: bool = True,
+        position_frequencies: int = 10,
+        time_frequencies: int = 8,
+        feature_frequencies: int = 2,
+        direction_frequencies: int = 4,
+    ) -> None:
+        super().__init__(start, marching or Marching(), start.scene.box)
+        self.padded, self.still = padded, start.scene.still
+        self.frozen_from = float(start.numbers.get("frozen_from", 1.0))
+        self.octaves = position_frequencies, time_frequencies, feature_frequencies, direction_frequencies
+        self.shift = density_shift(alpha_init)
+        self.grid = whole_grid(self.marching_lattice(self.schedule[0][1]), {"features": channels})
+        place, moment, direction = (
+            encoded_size(size, n)
+            for size, n in ((3, position_frequencies), (1, time_frequencies), (3, direction_frequencies))
+        )
+        code = 5 * channels
+        self.time_code = mlp(moment, code, width=width, layers=2)
+        self.camera_code = mlp(moment, code, width=width, layers=2) if camera else None
+        self.offsets = mlp(place + code, 3, width=width, layers=3)
+        read = encoded_size(len(_STRIDES) * channels, feature_frequencies)
+        condition = direction + (code if camera else 0)
+        self.head = Template(read + place + code, condition, width=width, layers=1, skip=None)
+        self.begin()
+
+    def marching_lattice(self, num_voxels: float) -> Lattice:
+        """See ``MarchedMethod``; sizes are 4 k + 1 unless ``padded``."""
+        lattice = Lattice.of_count(self.box, num_voxels)
+        if self.padded:
+            return lattice
+        last = max(_STRIDES)
+        return Lattice(self.box, tuple(last * max(1, round((n - 1) / last)) + 1 for n in lattice.shape))
+
+    @property
+    def lattice_marched(self) -> Lattice:
+        """See ``MarchedMethod``."""
+        return self.grid.lattice
+
+    def field(self, moment: Moment) -> TiNeuVoxField:
+        """See ``MarchedMethod``."""
+        return TiNeuVoxField(self, moment)
+
+    def read(self, points: Tensor) -> Tensor:
+        """World points (P, 3) -> features (P, 3 C) at the three strides; 0 outside the box."""
+        return read_strided(self.grid, points, _STRIDES, padded=self.padded)
+
+    def code(self, network: nn.Module, number: float) -> Tensor:
+        """A time, or a camera's number -> code (5 C,)."""
+        like = self.grid.features
+        return network(positional_encoding(like.new_tensor([number]), self.octaves[1]))
+
+    def grow(self, num_voxels: float, optimizer: torch.optim.Optimizer) -> None:
+        """See ``MarchedMethod``."""
+        regrow(self.grid, self.marching_lattice(num_voxels), optimizer)
+
+    def advance(self, progress: float, step: int, optimizer: torch.optim.Optimizer) -> dict[str, float]:
+        """See ``Method``; at last, where asked for, round the grid to half precision and let it stay."""
+        noted = super().advance(progress, step, optimizer)
+        if progress >= self.frozen_from:
+            self.grid.features.data = self.grid.features.data.half().to(self.grid.features)
+            for group in optimizer.param_groups:
+                group["lr"] *= group["name"] != "grid"
+        return noted
+
+    def extra_terms(
+        self, field: TiNeuVoxField, batch: Batch, generator: torch.Generator
+    ) -> dict[str, Callable[[], Tensor | None]]:
+        """Offer ``still``, at points that never move, and ``tv_grid``, the grid's total variation."""
+
+        def still() -> Tensor | None:
+            if self.still is None or not len(self.still):
+                return None
+            count = max(1, len(batch) // _STILL_SHARE)
+            rows = torch.randint(len(self.still), (count,), generator=generator)
+            return field.offset(self.still[rows].to(self.device)).square().mean()
+
+        def tv_grid() -> Tensor:
+            shape = self.grid.lattice.shape
+            return huber_variation(self.grid.features.reshape(*shape, -1)) * (max(shape) / 128 / 6)
+
+        return {"still": still, "tv_grid": tv_grid}
+
+    def param_groups(self) -> dict[str, list[nn.Parameter]]:
+        """Group parameters: ``grid``, ``deformation``, and ``network`` (all other networks)."""
+        grid, moving = [self.grid.features], list(self.offsets.parameters())
+        known = {id(p) for p in (*grid, *moving)}
+        return {
+            "grid": grid,
+            "deformation": moving,
+            "network": [p for p in self.parameters() if id(p) not in known],
+        }
+
+    def departures(self) -> list[str]:
+        """See ``MarchedMethod``."""
+        return [] if self.padded else ["grid sizes of 4 k + 1"]
+
+    def faults(self) -> list[str]:
+        """See ``MarchedMethod``."""
+        found = ["the grid is padded with zeros (padded)"] if self.padded else []
+        if self.frozen_from < 1:
+            found.append(f"the grid stays as it is from {self.frozen_from:g} of the stage on (frozen_from)")
+        return found
+
+
+class TiNeuVoxField:
+    """TiNeuVox at one moment (see ``PointField``)."""
+
+    def __init__(self, method: TiNeuVox, moment: Moment) -> None:
+        self.method = method
+        self.tau = method.code(method.time_code, moment.time)
+        self.camera = None
+        if method.camera_code is not None:
+            self.camera = method.code(method.camera_code, 0.5 if moment.camera is None else moment.camera)
+
+    def offset(self, points: Tensor) -> Tensor:
+        """World points (P, 3) -> how far they are moved (P, 3), world units."""
+        return self._offset(self._placed(points))
+
+    def _placed(self, points: Tensor) -> Tensor:
+        """``[PE(x), tau]`` (P, I)."""
+        position = positional_encoding(points, self.method.octaves[0])
+        return torch.cat([position, self.tau.expand(len(points), -1)], -1)
+
+    def _offset(self, placed: Tensor) -> Tensor:
+        return self.method.offsets(placed)
+
+    def look_up(self, points: Tensor) -> tuple[Tensor, Callable[[Tensor | slice, Tensor], Tensor]]:
+        """See ``PointField``."""
+        method, placed = self.method, self._placed(points)
+        read = positional_encoding(method.read(points + self._offset(placed)), method.octaves[2])
+        hidden = method.head.trunk(torch.cat([read, placed], -1))
+
+        def color(rows: Tensor | slice, directions: Tensor) -> Tensor:
+            condition = positional_encoding(directions, method.octaves[3])
+            if self.camera is not None:
+                condition = torch.cat([condition, self.camera.expand(len(directions), -1)], -1)
+            return method.head.color(hidden[rows], condition)
+
+        return method.activation.sigma(method.head.density_head(hidden)[:, 0]), color

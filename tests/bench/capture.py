@@ -1,0 +1,192 @@
+"""Measure forewarp-capture where the truth is known: ``python -m tests.bench.capture`` (under an hour).
+
+Films textured scenes of ``synth`` as a hand would, writes real mp4s, captures them, compares poses, and fits
+with the found and with the true poses. ``--real FOLDER`` adds a capture in HyperNeRF's layout, whose cameras
+another program has found.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+
+from forewarp.capture.facts import PICTURE
+from forewarp.data import hypernerf
+from forewarp.data.images import read_image
+from forewarp.data.posed_video import PosedShot, read_scene, write_scene
+from forewarp.drawing.colors import in_a_row
+from forewarp.drawing.files import read_picture, to_bytes, write_video
+from forewarp.progress import Counted
+from forewarp.scene.box import Box
+from tests.support.alignment import pose_errors
+from tests.support.handheld import WALKS, cameras_of, pictures_of, smeared
+
+FRAMES, SECONDS, SHAKEN = 120, 8.0, 4  # every fourth frame is blurred
+GAP = 8  # pixels between pictures
+TRAIN = [
+    "data.scale=2",
+    "trainer=cpu",
+    "logger=none",
+    "callbacks.pictures=null",
+    "budget.minutes=null",
+    "threads=1",
+]
+
+
+def film(name: str, folder: Path) -> tuple[Path, list]:
+    """Write ``<name>.mp4``, unless it is there; return it and the true cameras of its frames."""
+    walk, times = WALKS[name], np.linspace(0, 1, FRAMES)
+    cameras, path = cameras_of(walk, times, SECONDS), folder / f"{name}.mp4"
+    if not path.exists():
+        with Counted(f"filming {name}") as progress:
+            pictures = enumerate(pictures_of(walk, times, cameras, workers=1, progress=progress))
+            shaken = (smeared(p, 9) if i % SHAKEN == 1 else p for i, p in pictures)
+            write_video(path, (torch.from_numpy(p).float() / 255 for p in shaken), fps=FRAMES / SECONDS)
+    return path, cameras
+
+
+def called(name: str, *words) -> float:
+    """Run a command; return its seconds of processor time."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    command = [sys.executable, "-m", f"forewarp.cli.{name}", *map(str, words)]
+    subprocess.run(command, check=True, env=os.environ | {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"})
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
+def in_time(scene) -> list:
+    """All frames of a scene in the order of time."""
+    return sorted((*scene.train, *scene.test), key=lambda frame: frame.time)
+
+
+def compared(found: Path, true: list, frame_of) -> tuple[dict, object]:
+    """Compare a captured scene's cameras with true ones; ``frame_of`` gives the row of a picture's name."""
+    frames = in_time(read_scene(found.parent, found.name, normalise=False))
+    pairs = [true[frame_of(Path(frame.name).name)] for frame in frames]
+    similarity, degrees, away = pose_errors([frame.camera for frame in frames], pairs)
+    about = json.loads((found / "capture.json").read_text())
+    return {
+        "registered": f"{about['registered']} of {about['pictures']}",
+        "error": about["reprojection_error"],
+        "points": about["points"],
+        "degrees": [float(np.mean(degrees)), float(np.max(degrees))],
+        "path": [float(100 * np.mean(away)), float(100 * np.max(away))],
+        "focal": [frames[0].camera.fx, pairs[0].fx],
+    }, similarity
+
+
+def with_true_poses(found: Path, folder: Path, true: list, frame_of, similarity) -> None:
+    """Write the captured pictures, half as large, with the true cameras in the found world."""
+    content, scene = json.loads((found / "transforms.json").read_text()), read_scene(found.parent, found.name)
+    shots = []
+    for frame in in_time(scene):
+        name = Path(frame.name).name + ".jpg"
+        pixels = read_image(found / "images_2" / name)[..., :3]
+        camera = true[frame_of(name)].resized(pixels.shape[1], pixels.shape[0])
+        pose = torch.eye(4, dtype=torch.float64)
+        pose[:3, :3] = torch.from_numpy(similarity.turn.T) @ camera.camera_to_world[:3, :3]
+        place = (np.asarray(camera.center) - similarity.shift) @ similarity.turn / similarity.scale
+        pose[:3, 3] = torch.from_numpy(place)
+        shots.append(PosedShot(name, replace(camera, camera_to_world=pose), pixels, frame.time))
+    limits = {key: content[key] for key in ("near", "far")} | {"aabb": Box(*content["aabb"])}
+    write_scene(folder, shots, **limits, points=np.load(found / "points.npy"))
+
+
+def fitted(root: Path, scene: str, run: Path, steps: int, seed: int, *words) -> dict:
+    """Fit a scene, unless a run of that name has finished; return its scores and processor seconds."""
+    if not (run / "seconds.json").exists():
+        options = [f"data.root={root}", f"data.scene={scene}", f"run={run}", f"seed={seed}", *TRAIN, *words]
+        spent = called("train", "experiment=video_with_poses", f"budget.iterations={steps}", *options)
+        (run / "seconds.json").write_text(json.dumps(spent))
+    scores = json.loads((run / "metrics.json").read_text())["test"]["all"]
+    return {**scores, "seconds": json.loads((run / "seconds.json").read_text())}
+
+
+def number_in(name: str) -> int:
+    """The row of a frame of a video, from its file's name."""
+    return int(Path(name).stem.split("_")[1]) - 1
+
+
+def proof(name: str, folder: Path, steps: int, seeds: list[int]) -> dict:
+    """Film, capture, compare and fit one scene; nothing that is there already is done again."""
+    video, true = film(name, folder)
+    found, exact = folder / "captures" / name, folder / "exact" / name
+    if not (found / "capture.json").exists():
+        spent = called("capture", f"video={video}", f"out={found}", f"frames={FRAMES // 2}", "threads=1")
+        (folder / f"{name}.seconds").write_text(f"{spent}")
+    facts, similarity = compared(found, true, number_in)
+    facts["seconds"] = float((folder / f"{name}.seconds").read_text())
+    if not (exact / "transforms.json").exists():
+        with_true_poses(found, exact, true, number_in, similarity)
+    for kind, root, words in (("found", found.parent, ()), ("true", exact.parent, ("data.scale=1",))):
+        runs = [fitted(root, name, folder / "runs" / f"{name}-{kind}-{s}", steps, s, *words) for s in seeds]
+        facts[kind] = {key: [run[key] for run in runs] for key in ("psnr", "ssim", "seconds")}
+    return facts
+
+
+def real(source: Path, folder: Path, steps: int, seeds: list[int]) -> dict:
+    """Capture the pictures of a HyperNeRF layout, and compare with the cameras that it comes with."""
+    found, name = folder / "captures" / source.name, source.name
+    if not (found / "capture.json").exists():
+        spent = called("capture", f"images={source / 'rgb' / '1x'}", f"out={found}", "threads=1")
+        (folder / f"{name}.seconds").write_text(f"{spent}")
+    names = sorted(path.stem for path in (source / "camera").iterdir())
+    given = [hypernerf.read_camera(source / "camera" / f"{one}.json", 0.0, 1.0) for one in names]
+    originals = json.loads((found / "capture.json").read_text())["originals"]
+    stems = {Path(ours).stem: Path(theirs).stem for ours, theirs in originals.items()}
+    facts, _ = compared(found, given, lambda name: names.index(stems[Path(name).stem]))
+    facts["seconds"] = float((folder / f"{name}.seconds").read_text())
+    return facts
+
+
+def pictured(folder: Path, scenes: list[str], seed: int) -> None:
+    """Write ``capture-<scene>.png``, cameras and points, and ``capture-fits.png``: for each scene its middle
+    held-out view, true, fitted with the found poses, and with the true ones.
+    """
+    for found in (folder / "captures").iterdir():
+        shutil.copy(found / PICTURE, folder / f"capture-{found.name}.png")
+    rows = []
+    for scene in scenes:
+        runs = [
+            folder / "runs" / f"{scene}-{kind}-{seed}" / "images" / "images" for kind in ("found", "true")
+        ]
+        drawn = sorted(runs[0].iterdir())
+        view = drawn[len(drawn) // 2].name
+        truth = (folder / "exact" / scene / "images" / view).with_suffix(".jpg")
+        rows.append(in_a_row([read_picture(path) for path in (truth, *(run / view for run in runs))], GAP))
+    turned = [row.transpose(0, 1) for row in rows]
+    picture = Image.fromarray(to_bytes(in_a_row(turned, GAP).transpose(0, 1)))
+    picture.quantize(256).save(folder / "capture-fits.png", optimize=True)  # a quarter of the bytes
+
+
+def main() -> None:
+    """Measure; write ``facts.json`` and the pictures of ``docs/results/capture.md``."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, default=Path("runs/capture"))
+    parser.add_argument("--scenes", nargs="*", default=list(WALKS))
+    parser.add_argument("--steps", type=int, default=3000)
+    parser.add_argument("--seeds", type=int, nargs="*", default=[0])
+    parser.add_argument("--real", type=Path)
+    words = parser.parse_args()
+    torch.set_num_threads(1)
+    facts = {name: proof(name, words.out, words.steps, words.seeds) for name in words.scenes}
+    if words.real is not None:
+        facts[words.real.name] = real(words.real, words.out, words.steps, words.seeds)
+    (words.out / "facts.json").write_text(json.dumps(facts, indent=2) + "\n")
+    pictured(words.out, words.scenes, words.seeds[0])
+    print(json.dumps(facts, indent=2))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,260 @@
+"""Neural Volumes: sizes, priors, warp and march, and what it can learn."""
+
+from dataclasses import replace
+from functools import partial
+
+import pytest
+import torch
+from torch.autograd import gradcheck
+
+from forewarp.data.module import SceneDataModule
+from forewarp.fields.volumes import AffineMixture, PictureEncoder, VolumeDecoder, read
+from forewarp.methods.method import Start, parameter_count
+from forewarp.methods.neural_volumes import (
+    NeuralVolumes,
+    Volumes,
+    code_prior,
+    fitted_picture,
+    opacity_prior,
+    opacity_variation,
+)
+from forewarp.scene.batch import Batch, Observation
+from forewarp.scene.frame import Frame
+from forewarp.scene.rays import Rays
+from forewarp.scene.view import Moment, View
+from forewarp.training.objective import Objective
+from forewarp.training.schedule import StageSettings
+from forewarp.training.stages import Stage
+from tests.support.sliding_square import TIMES, camera, moving_scene, picture, static_ceiling
+from tests.support.tiny_scene import make_run
+
+SMALL = {"picture_size": (16, 16), "tower": (8, 16), "features": 32, "code": 12, "decoder": (32, 16, 16, 8)}
+SMALL |= {"maps": 4, "warp_side": 6, "warp_width": 16, "weight_width": 8, "step": 1 / 16}
+KIND = partial(
+    NeuralVolumes,
+    **SMALL,
+    from_identity=True,
+    first_opacity=0.1,
+    first_deviation=0.05,
+    jitter_in_pictures=False,
+)
+WEIGHTS = {"photo": 104.04, "code_prior": 1e-3, "opacity_prior": 1e-2, "opacity_variation": 1e-2}
+
+
+def method(scene=None, kind=KIND, **options):
+    torch.manual_seed(0)
+    return kind(Start(scene or moving_scene(), "fine", {}), **options)
+
+
+def rig(cameras=(0, 1, 2, 3), times=TIMES):
+    """Several fixed cameras at every instant."""
+    frames = (
+        Frame(f"{c}_{t}", t, camera(), partial(picture, t), camera_id=c) for t in times for c in cameras
+    )
+    return replace(moving_scene(), train=tuple(frames))
+
+
+def drawn(made, time=0.5, camera_id=0):
+    return made.at(Moment(time, camera=camera_id)).render(View(camera()), torch.ones(3))
+
+
+def solid(opacity, side=4, **options):
+    """A cube of one colour and opacity, without a warp."""
+    template = torch.full((4, side, side, side), 0.25)
+    template[3] = opacity
+    warp = method(**options).warp.lattice.permute(3, 0, 1, 2)
+    return Volumes(template, warp)
+
+
+@pytest.mark.parametrize(
+    ("part", "count"),
+    [
+        (partial(PictureEncoder, 3, (512, 384)), 14_235_008),
+        (partial(PictureEncoder, 1, (512, 384)), 4_920_448),
+        (partial(VolumeDecoder, 256), 66_358_020),
+        (partial(AffineMixture, 256), 34_214_496),
+        (partial(NeuralVolumes, Start(rig(), "fine", {}, blank=True)), 114_807_524 + 4 * 6),
+        (partial(NeuralVolumes, Start(moving_scene(), "fine", {}, blank=True)), 105_492_964 + 6),
+    ],
+)
+def test_published_counts(part, count):
+    with torch.device("meta"):
+        assert parameter_count(part()) == count
+
+
+@pytest.mark.parametrize(("opacity", "reached"), [(0.3, 0.6), (0.2, 0.4), (2.0, 1.0)])
+@pytest.mark.parametrize("seed", [None, 0])
+def test_opacity_adds_up_along_a_ray(opacity, reached, seed):
+    rays = Rays(torch.tensor([[0.1, -3.0, 0.2], [9.0, -3.0, 0.0]]), torch.tensor([[0.0, 1.0, 0.0]] * 2), 1, 9)
+    draw = None if seed is None else torch.Generator().manual_seed(seed)
+    seen = method().march(solid(opacity), rays, torch.tensor([1.0, 0.5, 0.0]), None, draw)
+    torch.testing.assert_close(seen.opacity, torch.tensor([reached, 0.0]), atol=2 * opacity / 16, rtol=0)
+    behind = torch.tensor([1.0, 0.5, 0.0])
+    expected = seen.opacity[:, None] * 0.25 + (1 - seen.opacity[:, None]) * behind
+    torch.testing.assert_close(seen.rgb, expected)
+    assert seen.depth[1] == 0
+    assert 2 < float(seen.depth[0]) < 3.1
+
+
+def test_priors_at_known_values():
+    for opacity, value in ((0.0, 0.0), (1.0, 0.0), (0.5, 1.186)):
+        assert float(opacity_prior(torch.full((5,), opacity))) == pytest.approx(value, abs=1e-3)
+    assert float(code_prior(torch.zeros(4), torch.zeros(4))) == 0
+    assert float(code_prior(torch.ones(4), torch.zeros(4))) == pytest.approx(0.5)
+    assert float(opacity_variation(torch.full((3, 4, 5), 0.3))) == pytest.approx(1e-5**0.5)
+    step = torch.ones(3, 3, 3)
+    step[2] = torch.e
+    assert float(opacity_variation(step)) == pytest.approx((1 + 1e-5**0.5) / 2, rel=1e-4)
+
+
+def maps_of(turns=False, **options):
+    """A warp whose maps do not depend on the code."""
+    warp = AffineMixture(4, maps=3, side=6, width=8, weight_width=8, **options)
+    with torch.no_grad():
+        for head in (warp.scale, warp.turn, warp.shift):
+            head[-1].weight.zero_()
+            head[-1].bias.zero_()
+    return warp
+
+
+def test_maps_that_are_the_identity_leave_all_points():
+    warp = maps_of(from_identity=True)
+    torch.testing.assert_close(warp(torch.randn(4)).permute(1, 2, 3, 0), warp.lattice)
+
+
+def test_released_maps_at_first_draw_all_points_to_the_middle():
+    assert not maps_of(from_identity=False)(torch.randn(4)).any()
+
+
+def test_a_map_scales_turns_and_shifts():
+    warp = maps_of(from_identity=True)
+    with torch.no_grad():
+        warp.scale[-1].bias.copy_(torch.tensor([1.0, 0.0, 0.0]).repeat(3))
+        warp.turn[-1].bias.copy_(
+            torch.tensor([0.0, 0.0, 0.0, 1.0]).repeat(3)
+        )  # (1, 0, 0, 1): a quarter about z
+        warp.shift[-1].bias.copy_(torch.tensor([2.0, 0.0, 0.0]).repeat(3))
+    found = warp.moved(torch.randn(4), torch.tensor([[1.2, 0.5, 0.3]]))
+    torch.testing.assert_close(found, torch.tensor([[[-1.0, 1.0, 0.3]]]).expand(3, 1, 3))
+
+
+def test_a_volume_is_read_with_x_last_and_points_on_its_corners():
+    volume = torch.zeros(1, 3, 4, 5)
+    volume[0, 0, 3, 4] = 1.0
+    points = torch.tensor([[1.0, 1.0, -1.0], [0.75, 1.0, -1.0], [1.5, 1.0, -1.0]])
+    torch.testing.assert_close(read(volume, points)[:, 0], torch.tensor([1.0, 0.5, 0.0]))
+
+
+def test_pictures_are_of_cameras_that_see_every_instant():
+    assert method(rig()).pictures.shape[:2] == (3, 3)
+    assert method(rig(), pictures=2).pictures.shape[:2] == (3, 2)
+    assert method().pictures.shape[:2] == (3, 1)
+    alone = replace(moving_scene(), train=tuple(replace(f, camera_id=None) for f in moving_scene().train))
+    assert method(alone).gain is None
+    with pytest.raises(
+        ValueError, match=r"model.pictures: expected at most 1, .* got 3; set model.pictures=null"
+    ):
+        method(pictures=3)
+
+
+def test_a_picture_is_fitted_over_white():
+    rgba = torch.zeros(4, 8, 4, dtype=torch.uint8)
+    rgba[:, 4:] = torch.tensor([10, 20, 30, 255], dtype=torch.uint8)
+    small = fitted_picture(rgba, (6, 8))
+    assert (small[:, :4, :2] == 255).all()
+    assert small[:, 0, 7].tolist() == [10, 20, 30]
+    assert not small[:, 4:].any()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (
+            {"picture_size": (18, 16)},
+            r"model.picture_size: expected height and width in multiples of 4.*\[18, 16\]",
+        ),
+        ({"first_opacity": -1.0}, r"model.first_opacity: expected a number > 0 or null, but got -1"),
+        ({"first_deviation": 0.0}, r"model.first_deviation: expected a number > 0 or null, but got 0"),
+        ({"step": 0.0}, r"model.step: expected a length in \(0, 1\], but got 0.0"),
+    ],
+)
+def test_wrong_numbers_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        method(**options)
+
+
+def test_codes_between_times_are_interpolated():
+    made = method()
+    first, second = (made.encoded(i)[0] for i in (0, 1))
+    assert made.code_at(0.5).equal(second)
+    torch.testing.assert_close(made.code_at(0.125), 0.75 * first + 0.25 * second)
+    assert not first.equal(second)
+
+
+@pytest.mark.parametrize("jitter", [False, True])
+def test_pictures_are_drawn_alike(jitter):
+    made = method(jitter_in_pictures=jitter)
+    with torch.no_grad():
+        one, two = drawn(made).rgb, drawn(made).rgb
+        made.pictures[1] = 0
+        other = drawn(made).rgb
+    assert one.equal(two)
+    assert not one.equal(other)  # time enters through the pictures alone
+    with torch.no_grad():
+        plain = drawn(method(jitter_in_pictures=not jitter)).rgb
+    assert not one.equal(plain)
+
+
+def test_gains_are_of_known_cameras():
+    made = method()
+    with torch.no_grad():
+        before = drawn(made, camera_id=None).rgb
+        made.gain.mul_(2)
+        made.bias.add_(0.1)
+        assert drawn(made, camera_id=7).rgb.equal(before)
+        assert not drawn(made, camera_id=0).rgb.equal(before)
+
+
+def test_a_step_reaches_every_parameter():
+    made = method()
+    observed = Observation(Moment(0.5, camera=0), View(camera()), torch.rand(144, 3), torch.rand(144, 3))
+    step = made.look(Batch((observed,), 1), WEIGHTS, torch.Generator().manual_seed(0))
+    values = {name: term() for name, term in step.terms.items()}
+    assert values["photo"].item() == step.squared_error.item()
+    assert set(values) == set(NeuralVolumes.terms)
+    sum(WEIGHTS[name] * value for name, value in values.items()).backward()
+    assert all(p.grad is not None and p.grad.isfinite().all() and p.grad.any() for p in made.parameters())
+    assert {"code", "template", "warp", "rgb"} == {name for name, _ in step.tensors()}
+    assert "the warp starts as the identity" in made.protocol()["departures"]
+
+
+def test_gradients_against_differences():
+    made = method(decoder=(8, 4), maps=2, warp_side=3, code=4).double()
+    rays = View(camera(3)).rays()
+
+    def look(code):
+        volumes = made.volumes(code)
+        seen = made.march(volumes, rays, torch.ones(3).double(), 0)
+        return seen.rgb.sum(), seen.opacity.sum(), opacity_variation(volumes.template[3])
+
+    assert gradcheck(look, [torch.randn(4, dtype=torch.float64, requires_grad=True)])
+
+
+def fitted(tmp_path, scene, steps):
+    settings = StageSettings.of("fine", lr={"network": 5e-3}, iterations=steps, curriculum={"all_in": 0.0})
+    data = SceneDataModule(scene, rays=144)
+    module = make_run(tmp_path, [Stage(settings, Objective(WEIGHTS))], data=data, model=KIND).fit()
+    psnr = [float(module.psnr_of(target)) for target in data.targets("train")]
+    return sum(psnr) / len(psnr)
+
+
+def test_one_view_is_learned_beyond_the_background_alone(tmp_path):
+    scene = replace(moving_scene(), train=moving_scene().train[:1])
+    truth = scene.train[0].load().double() / 255
+    bare = -10 * torch.log10((truth[..., 3:] * (1 - truth[..., :3])).square().mean())
+    assert fitted(tmp_path, lambda: scene, 60) > bare + 3
+
+
+@pytest.mark.slow
+def test_it_learns_what_moves(tmp_path):
+    assert fitted(tmp_path, moving_scene, 300) > static_ceiling() + 3
