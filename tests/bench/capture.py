@@ -1,8 +1,8 @@
 """Measure forewarp-capture where the truth is known: ``python -m tests.bench.capture`` (under an hour).
 
 Films textured scenes of ``synth`` as a hand would, writes real mp4s, captures them, compares poses, and fits
-with the found and with the true poses. ``--real FOLDER`` adds a capture in HyperNeRF's layout, whose cameras
-another program has found.
+with the found and with the true poses. ``--real FOLDER`` adds a capture in HyperNeRF's layout, where cameras
+that another program has found stand for the truth.
 """
 
 from __future__ import annotations
@@ -91,8 +91,8 @@ def with_true_poses(found: Path, folder: Path, true: list, frame_of, similarity)
     content, scene = json.loads((found / "transforms.json").read_text()), read_scene(found.parent, found.name)
     shots = []
     for frame in in_time(scene):
-        name = Path(frame.name).name + ".jpg"
-        pixels = read_image(found / "images_2" / name)[..., :3]
+        (path,) = (found / "images_2").glob(f"{Path(frame.name).name}.*")
+        name, pixels = path.name, read_image(path)[..., :3]
         camera = true[frame_of(name)].resized(pixels.shape[1], pixels.shape[0])
         pose = torch.eye(4, dtype=torch.float64)
         pose[:3, :3] = torch.from_numpy(similarity.turn.T) @ camera.camera_to_world[:3, :3]
@@ -121,14 +121,20 @@ def number_in(name: str) -> int:
 def proof(name: str, folder: Path, steps: int, seeds: list[int]) -> dict:
     """Film, capture, compare and fit one scene; nothing that is there already is done again."""
     video, true = film(name, folder)
-    found, exact = folder / "captures" / name, folder / "exact" / name
+    found = folder / "captures" / name
     if not (found / "capture.json").exists():
         spent = called("capture", f"video={video}", f"out={found}", f"frames={FRAMES // 2}", "threads=1")
         (folder / f"{name}.seconds").write_text(f"{spent}")
     facts, similarity = compared(found, true, number_in)
     facts["seconds"] = float((folder / f"{name}.seconds").read_text())
+    return facts | fits(found, folder, true, number_in, similarity, steps, seeds)
+
+
+def fits(found: Path, folder: Path, true: list, frame_of, similarity, steps: int, seeds: list[int]) -> dict:
+    """Fit with the found and with the true poses, each with all seeds."""
+    name, exact, facts = found.name, folder / "exact" / found.name, {}
     if not (exact / "transforms.json").exists():
-        with_true_poses(found, exact, true, number_in, similarity)
+        with_true_poses(found, exact, true, frame_of, similarity)
     for kind, root, words in (("found", found.parent, ()), ("true", exact.parent, ("data.scale=1",))):
         runs = [fitted(root, name, folder / "runs" / f"{name}-{kind}-{s}", steps, s, *words) for s in seeds]
         facts[kind] = {key: [run[key] for run in runs] for key in ("psnr", "ssim", "seconds")}
@@ -136,7 +142,7 @@ def proof(name: str, folder: Path, steps: int, seeds: list[int]) -> dict:
 
 
 def real(source: Path, folder: Path, steps: int, seeds: list[int]) -> dict:
-    """Capture the pictures of a HyperNeRF layout, and compare with the cameras that it comes with."""
+    """Capture the pictures of a HyperNeRF layout; compare with the cameras it comes with, and fit both."""
     found, name = folder / "captures" / source.name, source.name
     if not (found / "capture.json").exists():
         spent = called("capture", f"images={source / 'rgb' / '1x'}", f"out={found}", "threads=1")
@@ -145,17 +151,21 @@ def real(source: Path, folder: Path, steps: int, seeds: list[int]) -> dict:
     given = [hypernerf.read_camera(source / "camera" / f"{one}.json", 0.0, 1.0) for one in names]
     originals = json.loads((found / "capture.json").read_text())["originals"]
     stems = {Path(ours).stem: Path(theirs).stem for ours, theirs in originals.items()}
-    facts, _ = compared(found, given, lambda name: names.index(stems[Path(name).stem]))
+
+    def frame_of(name: str) -> int:
+        return names.index(stems[Path(name).stem])
+
+    facts, similarity = compared(found, given, frame_of)
     facts["seconds"] = float((folder / f"{name}.seconds").read_text())
-    return facts
+    return facts | fits(found, folder, given, frame_of, similarity, steps, seeds)
 
 
-def pictured(folder: Path, scenes: list[str], seed: int) -> None:
-    """Write ``capture-<scene>.png``, cameras and points, and ``capture-fits.png``: for each scene its middle
-    held-out view, true, fitted with the found poses, and with the true ones.
+def pictured(folder: Path, scenes: list[str], seed: int, file: str) -> None:
+    """Write ``capture-<scene>.png``, cameras and points, and ``file``: for each scene its middle held-out
+    view, true, fitted with the found poses, and with the true ones.
     """
-    for found in (folder / "captures").iterdir():
-        shutil.copy(found / PICTURE, folder / f"capture-{found.name}.png")
+    for scene in scenes:
+        shutil.copy(folder / "captures" / scene / PICTURE, folder / f"capture-{scene}.png")
     rows = []
     for scene in scenes:
         runs = [
@@ -163,11 +173,11 @@ def pictured(folder: Path, scenes: list[str], seed: int) -> None:
         ]
         drawn = sorted(runs[0].iterdir())
         view = drawn[len(drawn) // 2].name
-        truth = (folder / "exact" / scene / "images" / view).with_suffix(".jpg")
+        (truth,) = (folder / "exact" / scene / "images").glob(f"{Path(view).stem}.*")
         rows.append(in_a_row([read_picture(path) for path in (truth, *(run / view for run in runs))], GAP))
     turned = [row.transpose(0, 1) for row in rows]
     picture = Image.fromarray(to_bytes(in_a_row(turned, GAP).transpose(0, 1)))
-    picture.quantize(256).save(folder / "capture-fits.png", optimize=True)  # a quarter of the bytes
+    picture.quantize(256).save(folder / file, optimize=True)  # a quarter of the bytes
 
 
 def main() -> None:
@@ -184,7 +194,9 @@ def main() -> None:
     if words.real is not None:
         facts[words.real.name] = real(words.real, words.out, words.steps, words.seeds)
     (words.out / "facts.json").write_text(json.dumps(facts, indent=2) + "\n")
-    pictured(words.out, words.scenes, words.seeds[0])
+    pictured(words.out, words.scenes, words.seeds[0], "capture-fits.png")
+    if words.real is not None:
+        pictured(words.out, [words.real.name], words.seeds[0], f"capture-fits-{words.real.name}.png")
     print(json.dumps(facts, indent=2))
 
 

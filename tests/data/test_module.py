@@ -1,5 +1,7 @@
 """Data modules under a real Trainer: no warnings, one reading, exact continuation."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from lightning import LightningModule, Trainer
@@ -9,6 +11,7 @@ from forewarp.data.module import DNeRFDataModule, SceneDataModule
 from forewarp.scene.batch import Batch, Target
 from forewarp.scene.errors import SceneError
 from tests.support.dnerf_scene import shots, write_tiny
+from tests.support.tiny_scene import ball_scene
 
 
 class Recorder(LightningModule):
@@ -93,6 +96,26 @@ def test_the_scene_is_read_once(tmp_path):
     assert len(calls) == 1
     assert data.scene.protocol["background"] == "black"
     assert data.scene.protocol["dataset"] == "dnerf"
+
+
+OPAQUE = [
+    ({"background": "black"}, 0.0),
+    ({"background": "white"}, 1.0),
+    ({"background": "random"}, 0.0),
+    ({"background": "black", "eval_background": "white"}, 1.0),
+]
+
+
+@pytest.mark.parametrize(("options", "behind"), OPAQUE)
+def test_behind_opaque_pictures_is_what_was_there_in_training(options, behind):
+    data = SceneDataModule(lambda: replace(ball_scene(), has_alpha=False), **options)
+    assert data.targets("test").background.tolist() == [behind] * 3
+
+
+def test_behind_cut_out_pictures_is_white_whatever_training_had():
+    data = SceneDataModule(ball_scene, background="black")
+    assert data.targets("test").background.tolist() == [1.0] * 3
+    assert data.scene.protocol["background"] == "white"
 
 
 def test_targets_by_split(tmp_path):

@@ -31,7 +31,8 @@ class SceneDataModule(LightningDataModule):
         read: gives the scene; called once, at the first use.
         rays: pixels of a batch; None where the method asks for whole pictures.
         background: behind training pixels: white, black or random (a colour each).
-        eval_background: behind whole images: white or black.
+        eval_background: behind whole images: white or black; None: white behind cut-out pictures; as in
+            training behind opaque ones, which do not teach what lies behind (black where that is random).
         seed: seed of the pixels, the background colours and the default choice of frames.
         views_per_step: training frames of one time that share a batch's rays.
         cache_bytes: most bytes of decoded images kept in the process; the last module's number counts.
@@ -48,7 +49,7 @@ class SceneDataModule(LightningDataModule):
         *,
         rays: int | None = 8192,
         background: str = "white",
-        eval_background: str = "white",
+        eval_background: str | None = None,
         seed: int = 0,
         views_per_step: int = 1,
         cache_bytes: int = 1_500_000_000,
@@ -61,17 +62,24 @@ class SceneDataModule(LightningDataModule):
         self._read, self.cache_bytes, self.held_out = read, cache_bytes, held_out
         self._canonical = canonical
         self._draw = {"rays": rays, "background": background, "seed": seed, "views_per_step": views_per_step}
-        self.eval_background = eval_background
+        self._eval_background = eval_background
 
     @cached_property
     def scene(self) -> Scene:
         """The scene; its protocol names the background that it is measured on."""
         scene = hold_out(with_canonical(self._read(), self._canonical), self.held_out)
-        behind = self.eval_background if scene.has_alpha else "none"
+        behind = self._behind(scene) if scene.has_alpha else "none"
         protocol = {**scene.protocol, "background": behind}
         if self.place is not None and any((p / RECORD).is_file() for p in (self.place, self.place.parent)):
             protocol["synthetic"] = True  # however it is read
         return replace(scene, protocol=protocol)
+
+    def _behind(self, scene: Scene) -> str:
+        if self._eval_background is not None:
+            return self._eval_background
+        if scene.has_alpha:
+            return "white"
+        return "black" if self._draw["background"] == "random" else self._draw["background"]
 
     @cached_property
     def batches(self) -> Sampler:
@@ -98,15 +106,15 @@ class SceneDataModule(LightningDataModule):
 
     def setup(self, stage: str | None = None) -> None:
         """Read the scene, once, and refuse bad settings."""
-        color_of(self.eval_background)
         CACHE.resize(self.cache_bytes)
         _ = self.batches
+        color_of(self._behind(self.scene))
 
     def targets(self, split: str) -> Targets:
         """Give the whole images of ``train``, ``val``, ``test`` or ``held``."""
         if split not in ("train", "val", "test", "held"):
             raise SceneError(f"split: expected train, val, test or held, but got {split!r}")
-        behind = color_of(self.eval_background)
+        behind = color_of(self._behind(self.scene))
         return Targets(getattr(self.scene, split), behind, self.scene.has_alpha, trained=split == "train")
 
     def watched(self) -> Targets:
