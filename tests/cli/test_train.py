@@ -176,6 +176,12 @@ def test_a_full_disk_names_the_file_and_leaves_no_half(refused, scenes, in_tmp, 
     assert [path.name for path in Path("run/coarse").iterdir() if "ckpt" in path.name] == []
 
 
+@pytest.mark.parametrize(("word", "least"), [("views=0", 1), ("views=all", 1), ("sheets=-1", 0)])
+def test_numbers_of_views_are_checked_before_training(refused, scenes, in_tmp, word, least):
+    line = refused(*arguments(scenes, "run", word))
+    assert f"expected a whole number of at least {least}, but got {word.split('=')[1]}" in line
+
+
 def test_settings_of_a_failed_start_do_not_bind(refused, ok, scenes, in_tmp):
     assert "model.motion: expected 0 < tau" in refused(*arguments(scenes, "run", "model.motion.tau=7"))
     ok(*arguments(scenes, "run", "budget.iterations=2", "evaluate=false", "~stage.fine"))

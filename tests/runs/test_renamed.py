@@ -1,6 +1,7 @@
 """Words of earlier versions are answered with those that took their place."""
 
 import re
+from pathlib import Path
 
 import pytest
 
@@ -30,7 +31,6 @@ from tests.support.configs import composed
         ("hydra.sweeper.params.stage.fine.rates.flow=1", "hydra.sweeper.params.stage.fine.lr.flow=1;"),
         ("+variant=mine", "+ablation=mine; move your file from variant/ to ablation/"),
         ("variant=base,unet_16", "no such override; type model=forward and the change, as preset.rays=1024;"),
-        ("sweeps=methods", "sweeps=dnerf; each dataset's sweep has all methods since 0.3"),
         ("ablation=voxels_20,voxels_40", "no such override; sweeps=resolution has these sizes"),
     ],
 )
@@ -38,6 +38,15 @@ def test_a_renamed_word_is_refused_with_the_new_one(word, now):
     with pytest.raises(ValueError, match=re.escape(f"{word}: expected {now}")) as refusal:
         refuse_renamed(["data.scene=x", word])
     assert "\n" not in str(refusal.value)
+
+
+def test_no_sweep_of_today_is():
+    assert (
+        refuse_renamed(
+            [f"sweeps={path.stem}" for path in (Path(__file__).parents[2] / "sweeps").glob("*.yaml")]
+        )
+        is None
+    )
 
 
 def test_words_of_today_are_not():

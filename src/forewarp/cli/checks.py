@@ -23,8 +23,9 @@ READERS = {
 
 VOXELS, PARTICLES = "forewarp.methods.voxel.", "forewarp.methods.particles."
 
-# Of videos and pages: the least whole number, and the range of a number.
-LEAST = {"frames": 2, "view": 0, "points": 1, "size": 16}
+# The least whole number, whether null is one too, and the range of a number.
+LEAST = {"frames": 2, "view": 0, "points": 1, "size": 16, "views": 1, "sheets": 0}
+MAY_BE_NULL = ("size", "views")
 RANGES = {"fps": (0.1, 1000), "time": (0, 1), "tail": (0.01, 1)}
 
 
@@ -34,6 +35,7 @@ def refuse_all(config: DictConfig) -> None:
     refuse_seeds(config)
     refuse_two_models(config)
     refuse_other_methods(config)
+    refuse_numbers(config, "views", "sheets")
 
 
 def refuse_renamed_keys(config: DictConfig) -> None:
@@ -110,10 +112,12 @@ def refuse_other_methods(config: DictConfig) -> None:
 
 
 def refuse_numbers(config: DictConfig, *keys: str) -> None:
-    """Refuse values that keys of ``LEAST`` and ``RANGES`` cannot have; size may be null."""
+    """Refuse values that keys of ``LEAST`` and ``RANGES`` cannot have; a config may lack a key."""
     for key in keys:
-        value = config[key]
-        if key in LEAST and (key, value) != ("size", None) and (type(value) is not int or value < LEAST[key]):
+        value = config.get(key)
+        if key not in config or (value is None and key in MAY_BE_NULL):
+            continue
+        if key in LEAST and (type(value) is not int or value < LEAST[key]):
             raise ValueError(f"{key}: expected a whole number of at least {LEAST[key]}, but got {value}")
         low, high = RANGES.get(key, (value, value))
         if key in RANGES and (type(value) not in (int, float) or not low <= value <= high):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from forewarp.cli.checks import refuse_numbers
 from forewarp.cli.entry import command
 
 HELP = """
@@ -16,6 +17,7 @@ What one types most:
   trust=[PACKAGE]          code of other packages that the run's config may name
   data.root=FOLDER         where the data are now, if they moved
   lpips_weights=FILE       a backbone's weights, or a folder of them, for LPIPS
+  views=N                  measure N test views, evenly spread, in place of all
   sheets=N                 how many pictures of truth | prediction | error
   threads=N trainer=cpu    threads and device to compute with
 """
@@ -25,6 +27,7 @@ def evaluate(config) -> None:
     """Load a run and measure it."""
     from forewarp.runs.config import saved_config
 
+    refuse_numbers(config, "views", "sheets")
     saved = saved_config(config.run, config)
     # These load torch; mistakes have been answered before.
     from forewarp.runs.build import build_run, measure_run

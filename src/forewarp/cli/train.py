@@ -37,6 +37,7 @@ What one types most (options such as --multirun or --config-dir=FOLDER come firs
   plan=FILE                           fit what a plan says; an override typed beside it wins
   viewer=true                         show the run on a page while it trains: see forewarp-view
   evaluate=false                      do not measure at the end
+  views=N                             measure N test views, evenly spread, in place of all
   data.held_out=N                     hold N training views out and record their PSNR against training time
   scene=DATASET_NAME                  a scene of the paper below paths.scenes=FOLDER, such as scene=dnerf_hook
   ablation=NAME                       an ablation of the paper; ablation=full is its whole method

@@ -81,6 +81,7 @@ def evaluate(
     protocol: Mapping | None = None,
     finished: Mapping[str, Mapping] | None = None,
     sheets: int = 6,
+    views: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict:
     """Measure a fitted scene on its test views; all numbers but the seconds are reproducible.
@@ -95,21 +96,26 @@ def evaluate(
         suite: computes the metrics of an image.
         protocol: further entries of ``protocol``: how the run was made.
         finished: the ``done.json`` of each stage (``Run.finished``).
-        sheets: number of sheets to write, spread over the split.
+        sheets: number of sheets to write, spread over the views.
+        views: most test views to measure, evenly spread; None: all.
         progress: called with (images done, all images) after each image.
 
     Returns:
         the content of ``metrics.json``.
     """
     scene, targets, finished = datamodule.scene, datamodule.targets("test"), finished or {}
-    on_sheets = set(spread(len(targets), sheets))
+    chosen = spread(len(targets), len(targets) if views is None else views)
+    on_sheets = {chosen[i] for i in spread(len(chosen), sheets)}
     rows: dict[int, dict] = {}
-    for shown in draw(module, targets):
+    for shown in draw(module, targets, chosen):
         rows[shown.number] = _score(shown, suite)
         _save(shown, Path(folder) / "images", shown.number in on_sheets)
         if progress is not None:
-            progress(len(rows), len(targets))
+            progress(len(rows), len(chosen))
     per_image = [rows[number] for number in sorted(rows)]
+    if len(chosen) < len(targets):
+        measured = f"{len(chosen)} of {len(targets)} test views, evenly spread"
+        protocol = {**(protocol or {}), "measured": measured}
     metrics = {
         "protocol": _protocol(module, scene, per_image, protocol or {}),
         "seconds": _seconds(per_image, finished),

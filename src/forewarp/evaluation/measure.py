@@ -27,7 +27,8 @@ def measure(
     device: torch.device,
     protocol: Mapping,
     lpips_weights: Sequence[str] | None = None,
-    sheets: bool | int = True,
+    sheets: int = 6,
+    views: int | None = None,
 ) -> dict:
     """Evaluate a fitted run into its folder and print the table.
 
@@ -37,7 +38,7 @@ def measure(
         device: device to render on.
         protocol: further entries of ``protocol``: how the run was made.
         lpips_weights: files or folders of backbone weights, searched before the usual places.
-        sheets: number of sheets; see ``evaluate``.
+        sheets, views: numbers of sheets and of test views; see ``evaluate``.
     """
     suite = ImageSuite(
         find_lpips(extra=lpips_weights), mask_box=run.datamodule.scene.protocol.get("mask_box", False)
@@ -52,6 +53,7 @@ def measure(
             protocol=protocol,
             finished=run.finished(),
             sheets=sheets,
+            views=views,
             progress=progress,
         )
     show(metrics, run.folder, suite.absent)

@@ -28,7 +28,7 @@ INTRODUCTION = (
 COUNTERPART = ": synthetic counterpart"
 # Entries of a run's protocol that the page shows.
 TOLD = ("half_resolution", "scale", "split", "frames", "views", "train_frames", "test_views", "test_frames")
-TOLD += ("held_out", "canonical_time", "mask_box")
+TOLD += ("measured", "held_out", "canonical_time", "mask_box")
 METHODS = ("particles", "forward", "backward")  # that are compared in pictures
 DATASETS = ("dnerf", "hypernerf", "nhr", "lego_complete")
 

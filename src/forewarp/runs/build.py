@@ -126,6 +126,7 @@ def measure_run(run: Run, module: DynamicSceneModule, config: DictConfig) -> dic
         protocol=protocol,
         lpips_weights=[extra] if isinstance(extra, str) else extra,
         sheets=config.sheets,
+        views=config.get("views"),
     )
 
 

@@ -48,7 +48,6 @@ RENAMED = (
         "type model=forward and the change, as preset.rays=1024; sweeps/price_list_forward.yaml has all",
     ),
     (r"variant=base", "ablation=base", SINCE_3),
-    (r"sweeps=methods", "sweeps=dnerf", "each dataset's sweep has all methods since 0.3"),
     (
         r"variant=([^{]*)",
         r"ablation=\1",
