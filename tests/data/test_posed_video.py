@@ -123,7 +123,16 @@ def test_given_times_are_kept(tmp_path, made):
 
 @pytest.mark.parametrize(
     ("count", "every", "held"),
-    [(10, 2, [2, 4, 6, 8]), (10, 3, [2, 5, 8]), (6, 8, [5]), (13, 8, [5]), (21, 8, [5, 13]), (4, 2, [2])],
+    [
+        (10, 2, [2, 4, 6, 8]),
+        (10, 3, [2, 5, 8]),
+        (6, 8, [5]),
+        (13, 8, [5]),
+        (21, 8, [5, 13]),
+        (4, 2, [2]),
+        (5, 8, [4]),
+        (3, 8, [2]),
+    ],
 )
 def test_every_nth_frame_is_held_out_but_never_the_first_or_the_last(tmp_path, count, every, held):
     write_tiny(tmp_path / "toy", count=count)

@@ -123,7 +123,8 @@ def split_entries(file: Path, content: dict, entries: list[ImageEntry], test_eve
         file, content: where ``<split>_filenames`` may list frames; what no list names trains, or tests where
             the training frames are listed.
         entries: in the order of time.
-        test_every: every n-th is a test frame where nothing is listed, the first and the last never.
+        test_every: every n-th is a test frame where nothing is listed, the first and the last never; of three
+            frames or more at least one.
 
     Raises:
         SceneError: for a list that names no frame or one of another list, and where a split is empty.
@@ -138,7 +139,7 @@ def split_entries(file: Path, content: dict, entries: list[ImageEntry], test_eve
         parts |= {home: free} if home else {}
         how = "as listed in the file"
     else:
-        held = slice(test_every // 2, -1, test_every)
+        held = slice(max(1, min(test_every // 2, len(entries) - 2)), -1, test_every)
         parts = {"train": entries.copy(), "val": [], "test": entries[held]}
         del parts["train"][held]
         how = f"every {test_every}th frame held out"
