@@ -104,7 +104,7 @@ def evaluate(
         the content of ``metrics.json``.
     """
     scene, targets, finished = datamodule.scene, datamodule.targets("test"), finished or {}
-    chosen = spread(len(targets), len(targets) if views is None else views)
+    chosen = middles(len(targets), views)
     on_sheets = {chosen[i] for i in spread(len(chosen), sheets)}
     rows: dict[int, dict] = {}
     for shown in draw(module, targets, chosen):
@@ -130,6 +130,18 @@ def evaluate(
     write_json(Path(folder) / "per_image.json", {"images": per_image})
     write_json(Path(folder) / "metrics.json", metrics)
     return metrics
+
+
+def middles(count: int, wanted: int | None) -> list[int]:
+    """Choose the middles of ``wanted`` equal parts of ``count`` views, so that ends count no more than in all of
+    them; None, or more than there are: all.
+
+    >>> middles(20, 5), middles(3, None)
+    ([2, 6, 10, 14, 18], [0, 1, 2])
+    """
+    if wanted is None or wanted >= count:
+        return list(range(count))
+    return [(2 * i + 1) * count // (2 * wanted) for i in range(wanted)]
 
 
 def mean_scores(module: DynamicSceneModule, targets: Sequence[Target], suite: ImageSuite) -> dict[str, float]:
