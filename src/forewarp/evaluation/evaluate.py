@@ -133,8 +133,8 @@ def evaluate(
 
 
 def middles(count: int, wanted: int | None) -> list[int]:
-    """Choose the middles of ``wanted`` equal parts of ``count`` views, so that ends count no more than in all of
-    them; None, or more than there are: all.
+    """Choose the middles of ``wanted`` equal parts of ``count`` views, so that ends count no more than in all
+    of them; None, or more than there are: all.
 
     >>> middles(20, 5), middles(3, None)
     ([2, 6, 10, 14, 18], [0, 1, 2])
