@@ -35,7 +35,7 @@ reach in such minutes, and says nothing of what they reach in the hours of a GPU
 
 PSNR (dB), SSIM and LPIPS are means over the test views; ± is the standard deviation over seeds. *s a
 step* are all seconds of training by the number of steps, *s a frame* those of the first picture of a
-time. LPIPS is of the first of {nets} whose weights were there.
+time, *GiB* the most memory of the process. LPIPS is of the first of {nets} whose weights were there.
 """
 CURVES = """PSNR of some pixels of validation views while each method learns; the number at a line's end is
 the last of these, and not the table's, which is of whole test views. Schedules follow the share of the

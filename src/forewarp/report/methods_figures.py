@@ -18,7 +18,7 @@ TIMES = (0.25, 0.75)  # near which a view is shown
 LEADER = {"arrowstyle": "-", "linewidth": 0.6, "alpha": 0.6, "relpos": (0, 0.5), "shrinkA": 2, "shrinkB": 1}
 DOTS = 120  # an inch
 TITLE = 26  # pixels
-WIDEST = 1400  # pixels of the picture of views
+WIDEST = 1500  # pixels of the picture of views
 MARGIN = 24  # pixels around the subject
 
 
