@@ -45,7 +45,7 @@ CONFIG = {"runs", "planning", "cli"}
 ONLY_IN = {
     **dict.fromkeys(["hydra", "omegaconf"], CONFIG),
     "lightning": {"data", "training", "evaluation", "runs", "planning", "viewer", "cli"},
-    **{"torchmetrics": {"metrics"}, "numba": {"ops"}, "PIL": {"data"}, "matplotlib": {"report"}},
+    **{"torchmetrics": {"metrics"}, "numba": {"ops"}, "PIL": {"data", "report"}, "matplotlib": {"report"}},
     **{"trimesh": {"synth"}, "embreex": {"synth"}, "torchvision": set()},
     "pycolmap": {"capture"},
     **{"skimage": {"export"}, "viser": {"export", "viewer", "cli"}},

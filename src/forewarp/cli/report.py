@@ -12,6 +12,7 @@ KINDS = {
     "price_list": "what each choice costs and brings, with the spread over seeds",
     "paper": "the paper's tables and figures: Markdown, LaTeX, CSV, HTML",
     "minutes": "what a method reaches on each scene in so many minutes, by seed and view",
+    "methods": "all methods under one clock: what each reaches, PSNR against seconds, views side by side",
     "effects": "planned runs against every effect at once and the paper's fixed set",
     "compare": "a few runs side by side, printed, and with out=FOLDER drawn",
     "run": "the page of one run: its video, truth against prediction, curves, effects and why",
@@ -30,7 +31,7 @@ render anything.
   forewarp-report kind=limits 'runs=runs/paper/*/plain-forward-fast-*'
 
 What one types most:
-  runs=FOLDER            searched for runs (runs/accuracy_time, paper, minutes or effects)
+  runs=FOLDER            searched for runs (runs/accuracy_time, paper, minutes or effects; methods: paper)
   runs=[FOLDER,FOLDER]   compare, limits: the runs themselves; patterns with * are expanded
   out=FOLDER             where the page goes (results/ below the runs); compare: where the picture goes
   target=DB              accuracy_time: PSNR that every variant's seconds are listed for
@@ -67,6 +68,7 @@ def report(config) -> None:
     if not isinstance(config.runs, str | None):
         raise ValueError(f"runs: expected one folder for kind={config.kind}, but got a list; name one folder")
     default = config.kind if config.kind in ("paper", "effects", "minutes") else "accuracy_time"
+    default = "paper" if config.kind == "methods" else default  # where sweeps=methods puts its runs
     runs = Path(config.runs or f"{config.paths.runs}/{default}")
     for file in _written(config, runs, Path(config.out or runs / "results")):
         print(f"written: {file}")
@@ -115,6 +117,7 @@ def _written(config, runs: Path, out: Path) -> list[Path]:
     from forewarp.report.accuracy_time import write_accuracy_time
     from forewarp.report.curve import OTHERS, read_published
     from forewarp.report.effects import write_effects
+    from forewarp.report.methods import write_methods
     from forewarp.report.minutes import write_minutes
     from forewarp.report.paper import write_paper
     from forewarp.report.paper_printed import PAPER
@@ -126,6 +129,8 @@ def _written(config, runs: Path, out: Path) -> list[Path]:
         return write_effects(runs, out)
     if config.kind == "minutes":
         return write_minutes(runs, out)
+    if config.kind == "methods":
+        return write_methods(runs, out)
     if config.kind == "paper":
         curves = Path(config.curves or f"{config.paths.runs}/accuracy_time/results")
         return write_paper(runs, out, Path(config.published or PAPER), curves)

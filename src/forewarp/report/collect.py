@@ -6,6 +6,7 @@ import json
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from datetime import datetime, timezone
 from pathlib import Path
 
 import yaml
@@ -114,6 +115,12 @@ class Result:
     def command(self) -> str:
         """The command that made the run."""
         return self.config.get("command") or f"forewarp-train # as {self.folder / 'config.yaml'}"
+
+    @property
+    def day(self) -> str:
+        """The day on which the run was measured, as 2026-11-22."""
+        seconds = (self.folder / "metrics.json").stat().st_mtime
+        return datetime.fromtimestamp(seconds, timezone.utc).date().isoformat()
 
     @property
     def ability(self) -> str:

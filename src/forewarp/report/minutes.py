@@ -2,33 +2,19 @@
 
 from __future__ import annotations
 
-import csv
-import io
-import re
 import statistics
-from collections.abc import Sequence
 from pathlib import Path
 
-from forewarp.files import read_json, read_text, replace_file
-from forewarp.metrics.gain import Estimate
+from forewarp.files import replace_file
 from forewarp.report import curve
-from forewarp.report.collect import Result, collect, left_out
+from forewarp.report.collect import left_out
+from forewarp.report.run_rows import CLOCKS, NETS, commands, estimate, machine, merged, of_minutes, pairs
 from forewarp.report.sheets import figure_of
 from forewarp.report.tables import Column, Table
 
-KEY = ("method", "preset", "scene", "minutes", "seed")  # what tells rows apart
-NUMBERS = ("psnr", "ssim", "lpips", "steps", "parameters", "memory", "ends", "threads")
-FIELDS = (*KEY, *NUMBERS, "clock", "dataset", "device", "views", "command")
-NETS = ("vgg", "alex", "squeeze")  # LPIPS is of the first whose weights were there
-_ENDS = 0.1  # share of the time that counts as its first and last part
-_MOST = 1 << 24  # bytes of a table that is read back
-
 INTRODUCTION = """# What `model={method}` reaches in so many minutes
 
-Written by `forewarp-report kind=minutes` from runs of `sweeps=minutes`. Minutes are of training, by the
-platform's clock: it counts all that a method does to begin with (a visual hull, a plane sweep), and leaves
-out reading pictures and compiling. The processor clock counts processor time of the process, which is the
-same beside other work on the machine and, with one thread, equals the wall clock on an idle one. PSNR (dB),
+Written by `forewarp-report kind=minutes` from runs of `sweeps=minutes`. {clocks} PSNR (dB),
 SSIM and LPIPS are means over test views; ± is the standard deviation over the seeds. *Ends*: by how much the
 mean PSNR of views in the first and last tenth of the time is below the median of the others. LPIPS is of the
 first of {nets} whose weights were there.
@@ -48,26 +34,17 @@ def write_minutes(runs: Path, out: Path) -> list[Path]:
     Returns:
         the files written.
     """
-    results, without = collect(runs, ["metrics.json"])
-    endless = [result for result in results if result.minutes is None]
-    without += [f"{result.folder.relative_to(runs)}: no budget.minutes" for result in endless]
-    results = [result for result in results if result.minutes is not None]
+    results, without = of_minutes(runs)
     written = []
     for method in sorted({result.config["model"]["name"] for result in results}):
         own = [result for result in results if result.config["model"]["name"] == method]
-        rows = _merged(out / f"{method}.csv", [row_of(result) for result in own])
         page, table, picture = (out / f"{method}.{kind}" for kind in ("md", "csv", "png"))
-        replace_file(table, _csv(rows))
-        parts = [INTRODUCTION.format(method=method, nets=", ".join(NETS)), f"Machine: {_machine(rows)}.\n"]
+        rows = merged(table, own)
+        about = INTRODUCTION.format(method=method, clocks=CLOCKS, nets=", ".join(NETS))
+        parts = [about, f"Machine: {machine(rows)}.\n"]
         parts += [_by_minutes(rows).markdown(), "## Each\n", _details(rows).markdown()]
         parts += ["## By view\n", f"![PSNR of each test view over time]({picture.name})\n"]
-        parts += [
-            "## Commands\n",
-            "Each with its `seed=`.\n",
-            "```bash",
-            *sorted({re.sub(r"\bseed=\d+ | run=\S+$", "", row["command"]) for row in rows}),
-            "```\n",
-        ]
+        parts += [commands(rows)]
         parts += left_out("Without numbers", without)
         replace_file(page, "\n".join(parts))
         _draw(rows, picture)
@@ -75,84 +52,11 @@ def write_minutes(runs: Path, out: Path) -> list[Path]:
     return written
 
 
-def row_of(result: Result) -> dict:
-    """A run's row: ``FIELDS``; what is not known is None."""
-    images = (read_json(result.folder / "per_image.json") or {}).get("images", [])
-    views = sorted((one["time"], one["scores"]["psnr"]) for one in images)
-    numbers, scores = result.numbers, result.metrics["test"][result.ability]
-    protocol = result.metrics["protocol"]
-    return {
-        "method": result.config["model"]["name"],
-        "preset": result.config["preset"]["name"],
-        "scene": result.scene,
-        "minutes": result.minutes,
-        "seed": result.seed,
-        **{name: numbers.get(name) for name in ("psnr", "ssim", "steps", "memory", "parameters")},
-        "lpips": next((scores[f"lpips_{net}"] for net in NETS if f"lpips_{net}" in scores), None),
-        "ends": ends_below(views),
-        "threads": protocol.get("threads"),
-        "clock": protocol.get("clock", "wall"),
-        "dataset": result.dataset,
-        "device": protocol.get("device"),
-        "views": " ".join(f"{time:.4f}:{psnr:.2f}" for time, psnr in views),
-        "command": result.command,
-    }
-
-
-def ends_below(views: Sequence[tuple[float, float]]) -> float | None:
-    """By how many dB the mean of the views (time, PSNR) at both ends is below the median of the others.
-
-    >>> ends_below([(0.0, 30.0), (0.05, 31.0), (0.5, 34.0), (0.6, 33.0), (1.0, 32.0)])
-    2.5
-    """
-    ends = [psnr for time, psnr in views if not _ENDS < time < 1 - _ENDS]
-    others = [psnr for time, psnr in views if _ENDS < time < 1 - _ENDS]
-    return statistics.median(others) - statistics.fmean(ends) if ends and others else None
-
-
-def _machine(rows: list[dict]) -> str:
-    return "; ".join(
-        sorted(
-            {
-                f"{row['device']}, threads: {row['threads']:g}, minutes by the {row['clock']} clock"
-                for row in rows
-                if row["device"]
-            }
-        )
-    )
-
-
-def _merged(file: Path, rows: list[dict]) -> list[dict]:
-    """Add rows to those of a table, as numbers; new ones replace old ones."""
-    known = list(csv.DictReader(io.StringIO(read_text(file, _MOST)))) if file.is_file() else []
-    found = {}
-    for row in (*(_read(row) for row in known), *rows):
-        found[tuple(row[name] for name in KEY)] = row
-    return [found[key] for key in sorted(found, key=str)]
-
-
-def _read(row: dict) -> dict:
-    numbers = {name: float(row[name]) if row[name] else None for name in ("minutes", *NUMBERS)}
-    return {"clock": "wall"} | row | numbers | {"seed": int(row["seed"])}
-
-
-def _csv(rows: list[dict]) -> str:
-    file = io.StringIO()
-    writer = csv.DictWriter(file, FIELDS, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows({name: "" if row[name] is None else row[name] for name in FIELDS} for row in rows)
-    return file.getvalue()
-
-
-def _estimate(rows: Sequence[dict], name: str) -> Estimate | None:
-    return Estimate.of([row[name] for row in rows if row[name] is not None])
-
-
 def _by_minutes(rows: list[dict]) -> Table:
     """PSNR by scene and minutes, and its mean over a dataset's scenes where all are there."""
     scenes, minutes = (sorted({row[name] for row in rows}) for name in ("scene", "minutes"))
     cells = {
-        (scene, m): _estimate([r for r in rows if (r["scene"], r["minutes"]) == (scene, m)], "psnr")
+        (scene, m): estimate([r for r in rows if (r["scene"], r["minutes"]) == (scene, m)], "psnr")
         for scene in scenes
         for m in minutes
     }
@@ -182,7 +86,7 @@ def _details(rows: list[dict]) -> Table:
     lines = []
     for scene, minutes in sorted({(row["scene"], row["minutes"]) for row in rows}):
         own = [row for row in rows if (row["scene"], row["minutes"]) == (scene, minutes)]
-        found = {name: _estimate(own, name) for name in names}
+        found = {name: estimate(own, name) for name in names}
         plain = {n: found[n] and found[n].mean for n in ("ends", "steps", "parameters", "memory")}
         lines.append([scene, minutes, len(own), *(v for v in (found | plain).values())])
     return Table(columns, lines)
@@ -198,8 +102,7 @@ def _draw(rows: list[dict], picture: Path) -> None:
         own = [row for row in rows if row["scene"] == scene]
         for row in own:
             if row["seed"] == min(r["seed"] for r in own) and row["views"]:
-                times, values = zip(*(map(float, one.split(":")) for one in row["views"].split()))
-                axis.plot(times, values, marker=".", label=f"{row['minutes']:g} min")
+                axis.plot(*zip(*pairs(row["views"])), marker=".", label=f"{row['minutes']:g} min")
         axis.set(title=scene, xlabel="time", ylabel="PSNR (dB)")
         if axis.lines:
             axis.legend(fontsize="small")

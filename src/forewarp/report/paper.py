@@ -5,7 +5,6 @@ from __future__ import annotations
 import shutil
 from collections.abc import Sequence
 from dataclasses import replace
-from datetime import datetime, timezone
 from itertools import product
 from pathlib import Path
 
@@ -91,7 +90,7 @@ def facts(runs: Sequence[Result]) -> list[str]:
     """State protocol, machine, budget, date and command of the runs."""
     if not runs:
         return ["measured: nothing yet"]
-    days = sorted({_day(run) for run in runs})
+    days = sorted({run.day for run in runs})
     protocols = list(dict.fromkeys(_protocol(run) for run in runs))
     budgets = sorted({_budget(run) for run in runs})
     return [
@@ -178,8 +177,3 @@ def _budget(run: Result) -> str:
     minutes = f"{budget['minutes']:g} min a run" if budget["minutes"] else ""
     steps = f"{budget['iterations']} steps" if budget.get("iterations") else ""
     return ", ".join(word for word in (run.config["preset"]["name"], minutes, steps) if word)
-
-
-def _day(run: Result) -> str:
-    seconds = (run.folder / "metrics.json").stat().st_mtime
-    return datetime.fromtimestamp(seconds, timezone.utc).date().isoformat()

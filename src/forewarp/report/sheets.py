@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -24,14 +24,9 @@ def draw_beside(path: Path, runs: Mapping[str, Path], near: float, about: str) -
 
     Return None if the runs share no view with a sheet.
     """
-    sheets = {name: sheets_of(folder) for name, folder in runs.items()}
-    shared = set.intersection(*(set(found) for found in sheets.values())) if sheets else set()
-    if not shared:
+    if (view := view_near(runs, near)) is None:
         return None
-    times = {image["name"]: image["time"] for image in _images(next(iter(runs.values())))}
-    known = [name for name in sorted(shared) if name in times]
-    view = min(known or sorted(shared), key=lambda name: abs(times.get(name, near) - near))
-    parts = {name: thirds(read_picture(found[view])) for name, found in sheets.items()}
+    parts = {name: thirds(read_picture(sheets_of(folder)[view])) for name, folder in runs.items()}
     truth = next(iter(parts.values()))[0]
     figure, axes = figure_of(2, 1 + len(parts), (3 * (1 + len(parts)), 6.6))
     show(axes[0], {"truth": truth} | {name: rendered for name, (_, rendered, _) in parts.items()})
@@ -39,6 +34,17 @@ def draw_beside(path: Path, runs: Mapping[str, Path], near: float, about: str) -
     show(axes[1, 1:], {f"error, {name}": error for name, (_, _, error) in parts.items()})
     figure.suptitle(f"{about}, {view}; errors up to 0.25 (white)")
     return curve._save(figure, path)
+
+
+def view_near(runs: Mapping[str, Path], near: float) -> str | None:
+    """Choose, of the views that all runs have a sheet of, the nearest to a time; None if there is none."""
+    sheets = [set(sheets_of(folder)) for folder in runs.values()]
+    shared = sorted(set.intersection(*sheets)) if sheets else []
+    if not shared:
+        return None
+    times = {image["name"]: image["time"] for image in images_of(next(iter(runs.values())))}
+    known = [name for name in shared if name in times]
+    return min(known or shared, key=lambda name: abs(times.get(name, near) - near))
 
 
 def sheets_of(folder: Path) -> dict[str, Path]:
@@ -60,16 +66,16 @@ def read_picture(path: Path) -> np.ndarray:
     return imread(path)
 
 
-def show(axes, pictures: Mapping[str, np.ndarray]) -> None:
-    """Show titled pictures, one on each axis."""
+def show(axes, pictures: Mapping[str, np.ndarray], size: str = "small") -> None:
+    """Show pictures, one on each axis, with titles of a ``size``."""
     for axis, (title, picture) in zip(axes, pictures.items()):
         axis.imshow(picture)
-        axis.set_title(title, fontsize="small")
+        axis.set_title(title, fontsize=size)
         axis.set_axis_off()
 
 
-def figure_of(rows: int, columns: int, size: tuple[float, float]):
-    """Make a figure and its axes (rows, columns); ``size`` in inches.
+def figure_of(rows: int, columns: int, size: tuple[float, float], heights: Sequence[float] | None = None):
+    """Make a figure and its axes (rows, columns); ``size`` in inches, ``heights`` of rows in any unit.
 
     Raises:
         ImportError: if matplotlib is missing.
@@ -79,8 +85,9 @@ def figure_of(rows: int, columns: int, size: tuple[float, float]):
     except ImportError:
         raise ImportError("expected matplotlib for plots; install forewarp[plots]") from None
     figure = Figure(figsize=size, layout="constrained")
-    return figure, figure.subplots(rows, columns, squeeze=False)
+    return figure, figure.subplots(rows, columns, squeeze=False, height_ratios=heights)
 
 
-def _images(folder: Path) -> list[dict]:
+def images_of(folder: Path) -> list[dict]:
+    """Read what a run's ``per_image.json`` holds of each test view; nothing if there is none."""
     return (read_json(Path(folder) / "per_image.json") or {}).get("images", [])

@@ -1,0 +1,89 @@
+"""The page of all methods, of runs that nobody trained."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from forewarp.report.methods import write_methods
+from forewarp.report.methods_figures import MARGIN, subject
+from forewarp.report.sheets import GAP
+from tests.support.runs_on_disk import rows_of, write_run
+
+SIDE = 60
+
+
+def method_run(root, name, psnr, *, seed=0, minutes=5.0, sheets=True, **protocol):
+    """A run of a method, with sheets of two views at 0.2 and 0.8; how red its pictures are tells its PSNR."""
+    config = {"model": {"name": name}, "variant": None}
+    command = f"forewarp-train seed={seed} scene=ball model={name} run=runs/{name}"
+    metrics = {"protocol": {"clock": "processor", **protocol}}
+    named = {"seed": seed, "minutes": minutes, "psnr": psnr, "command": command}
+    curve = ((10, psnr - 5), (100, psnr))
+    folder = write_run(root, name, config=config, metrics=metrics, curve=curve, **named)
+    if sheets:
+        scores = {"scores": {"psnr": psnr}, "rendering": "rendered"}
+        images = [{"name": f"test/{view}", "time": time} | scores for view, time in (("a", 0.2), ("b", 0.8))]
+        (folder / "per_image.json").write_text(json.dumps({"images": images}))
+        (folder / "images" / "sheets" / "test").mkdir(parents=True)
+        parts = np.full((SIDE, 3 * SIDE + 2 * GAP, 3), 255, np.uint8)
+        for i, red in enumerate((0, 7 * psnr, 0)):
+            parts[20:40, 20 + i * (SIDE + GAP) : 40 + i * (SIDE + GAP)] = (red, 0, 0)
+        for view in "ab":
+            Image.fromarray(parts).save(folder / "images" / "sheets" / "test" / f"{view}.png")
+    return folder
+
+
+def test_methods_are_ranked_and_what_they_depart_from_is_listed_once(tmp_path):
+    runs, out = tmp_path / "runs", tmp_path / "out"
+    method_run(runs, "forward", 27.0)
+    for seed, psnr in ((0, 30.0), (1, 32.0)):
+        method_run(runs, "particles", psnr, seed=seed, measured="5 of 20 test views, evenly spread")
+    method_run(runs, "ndvg", 22.0, departures="rays of one picture; no pool", faults="padded")
+    method_run(runs, "tnerf", 21.0, departures="rays of one picture", sheets=False)
+    write_run(runs, "full", config={"variant": {"name": "full"}})
+    page, table, curves, views = write_methods(runs, out)
+    text = page.read_text()
+    first = [line.split("|")[1].strip() for line in text.splitlines() if line.startswith("| `")]
+    assert first == ["`particles`", "`forward` (the paper's)", "`ndvg`", "`tnerf`"]
+    assert rows_of(text, "`particles`")[0][1:6] == ["31.00 ± 1.41", "0.9000 ± 0.0000", "", "100", "0.500"]
+    assert rows_of(text, "rays of one picture") == [["rays of one picture", "`ndvg`, `tnerf`"]]
+    assert rows_of(text, "kept fault: padded") == [["kept fault: padded", "`ndvg`"]]
+    assert "**ball, 5 minutes, 5 of 20 test views, evenly spread**" in text
+    assert "* ball/full-1.0-seed0: an ablation" in text
+    assert "scene=ball model=forward,ndvg,particles,tnerf budget.clock=processor threads=2\n" in text
+    curve = next(csv.DictReader(table.read_text().splitlines()))["curve"]
+    assert curve == "10.0:22.00 100.0:27.00"
+    assert (curves.name, views.name) == ("methods-ball.png", "methods-ball-views.png")
+    with Image.open(views) as picture:
+        assert picture.mode == "P"  # few colours
+        reds = [red for _, (red, green, _) in picture.convert("RGB").getcolors() if green < 8]
+    for psnr, there in ((27, True), (30, True), (22, True), (21, False), (25, False)):
+        assert any(abs(red - 7 * psnr) < 4 for red in reds) == there, psnr  # tnerf has no sheets
+
+
+def test_later_runs_are_added_and_the_longest_are_drawn(tmp_path):
+    method_run(tmp_path / "runs", "forward", 27.0, sheets=False)
+    write_methods(tmp_path / "runs", tmp_path / "out")
+    method_run(tmp_path / "later", "forward", 29.0, minutes=20.0, sheets=False)
+    (tmp_path / "out" / "faithful-step.md").touch()
+    text = write_methods(tmp_path / "later", tmp_path / "out")[0].read_text()
+    assert [row[1] for row in rows_of(text, "`forward` (the paper's)")] == ["27.00", "29.00"]
+    assert "](faithful-step.md)" in text
+
+
+def test_runs_without_curves_and_pictures_have_a_table(tmp_path, ok):
+    write_run(tmp_path / "runs", curve=None)
+    done = ok("report", "kind=methods", f"runs={tmp_path / 'runs'}", f"out={tmp_path / 'out'}")
+    assert done.out.count("written: ") == 2
+    with pytest.raises(ValueError, match="expected folders of runs"):
+        write_methods(tmp_path / "none", tmp_path / "out")
+
+
+def test_a_picture_is_cut_to_its_subject():
+    picture = np.ones((100, 80, 3))
+    assert subject(picture) == (slice(0, 100), slice(0, 80))
+    picture[50:60, 75] = 0
+    assert subject(picture) == (slice(50 - MARGIN, 60 + MARGIN), slice(75 - MARGIN, 80))
