@@ -8,7 +8,7 @@ from statistics import fmean
 from typing import NamedTuple
 
 from forewarp.metrics.gain import Estimate
-from forewarp.report.collect import Result, machine
+from forewarp.report.collect import Result
 from forewarp.report.paper_printed import Group, PaperTable
 from forewarp.report.paper_printed import Row as PrintedRow
 from forewarp.report.protocols import numbered, protocol_of
@@ -23,6 +23,7 @@ METRICS = {
     "depth_delta_1.25": ("δ<1.25", 3, True, 100),
     "depth_delta_1.5625": ("δ<1.25²", 3, True, 100),
 }
+UNPRINTED = ("particles", "backward")  # methods of this project that the paper prints no row of
 # What a measured row says beside its scores.
 COSTS = (
     *(Column("training, s a run", 0), Column("GiB"), Column("parameters (M)", 3), Column("steps", 0)),
@@ -66,7 +67,7 @@ class Measured:
         known = ([run.numbers[name] for run in self.runs if name in run.numbers] for name in names)
         seconds = fmean(run.metrics["seconds"]["train"] for run in self.runs)
         means = [fmean(of) if of else None for of in known]
-        return [seconds, *means, ", ".join(sorted(protocols, key=int)), machine(self.runs)]
+        return [seconds, *means, ", ".join(sorted(protocols, key=int)), self.row.device]
 
 
 class Row(NamedTuple):
@@ -94,17 +95,17 @@ def row_of(run: Result) -> Row:
 
 
 def measured(table: PaperTable, results: Sequence[Result]) -> list[Measured]:
-    """Return the table's measured rows: by its variants, then this project's own method, then as printed."""
+    """Return the table's measured rows: by its variants, then as printed, then ``UNPRINTED``, then others."""
     rows = {}
     datasets = {group.dataset for group in table.groups}
     for run in results:
         key = row_of(run)
         if key.variant in table.variants and run.dataset in datasets:
             rows.setdefault(key, []).append(run)
-    systems = [row.model for row in table.rows]
+    systems = list(dict.fromkeys([*(row.model for row in table.rows), *UNPRINTED]))
 
     def place(key: Row) -> tuple:
-        by_model = systems.index(key.model) if key.model in systems else -1
+        by_model = systems.index(key.model) if key.model in systems else len(systems)
         return table.variants.index(key.variant), by_model, *(str(value or "") for value in key)
 
     return [Measured(_name(key, rows[key]), key, tuple(rows[key])) for key in sorted(rows, key=place)]
@@ -221,8 +222,8 @@ def _conditions(run: Result) -> tuple:
 
 def _name(row: Row, runs: Sequence[Result]) -> str:
     minutes, steps = f"{row.minutes or 0:g} min", f"{row.iterations} steps"
+    minutes += " of processor time" * (row.clock == "processor")
     bounds = [minutes if row.minutes else "", steps if row.iterations else ""]
-    bounds.append("processor time" if row.minutes and row.clock == "processor" else "")
     about = row.model if row.variant == "plain" else (runs[0].about or row.variant)
     about += " (the paper's method)" * (about == "forward")
     seeds = len({run.seed for run in runs})
