@@ -139,7 +139,7 @@ OF_METHODS = $(if $(METHODS),model=$(subst $(space),$(comma),$(strip $(METHODS))
 UNTIL = $(if $(STEPS),budget.minutes=null budget.iterations=$(STEPS),$(if $(filter-out null,$(MINUTES)),budget.minutes=$(MINUTES)))
 REPRODUCE = table() { \
 	case $$1 in sweeps=ablation_*|sweeps=resolution) of=;; *) of=$(OF_METHODS);; esac; \
-	$(BIN)/forewarp-train --multirun preset=$(PRESET) $(UNTIL) $(SEED) $(if $(VIEWS),views=$(VIEWS)) \
+	$(BIN)/forewarp-train --multirun preset=$(PRESET) $(UNTIL) $(SEED) $(if $(VIEWS),views=$(VIEWS)) score=null \
 		$(if $(THREADS),threads=$(THREADS)) $(if $(LAUNCHER),launcher=$(LAUNCHER)) "$$@" $$of; }
 # Without DATA: a counterpart of each dataset; on two of them all methods. Half of the runs on each of two cores.
 JOBS ?= 2
