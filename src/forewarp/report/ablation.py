@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from statistics import fmean
 
@@ -24,12 +25,12 @@ INTRODUCTION = (
     "tables of ablations takes one thing from its whole method (`Ours`). PSNR (dB) is of test views, mean "
     "± standard deviation over the seeds. A difference is to `Ours` with the same seed, scene and budget; "
     "beside it stands the difference of the numbers that the paper prints, for real scenes. *Noise* is "
-    "the pooled standard deviation of the differences over seeds: of all rows of a table with one budget, "
-    "each around its own mean. A mean difference no larger than that is *within noise*; else the paper's "
-    "order *holds* if both differences have the same sign, and is *reversed* if not. With two seeds, "
-    "about one row in six that changes nothing would still exceed the noise. Seconds a step are of "
-    "training, all stages together. At equal minutes a cheaper step means more steps; at equal steps it "
-    "counts for nothing."
+    "the pooled standard deviation of the differences over seeds: of all rows, of all tables, with the "
+    "same scene and budget, each around its own mean. A mean difference no larger than that is *within "
+    "noise*; else the paper's order *holds* if both differences have the same sign, and is *reversed* if "
+    "not. With two seeds, about one row in six that changes nothing would still exceed the noise. Seconds "
+    "a step are of training, all stages together. At equal minutes a cheaper step means more steps; at "
+    "equal steps it counts for nothing."
 )
 
 
@@ -85,18 +86,20 @@ def changes(table: PaperTable, group: Group, results: Sequence[Result]) -> Table
         results: runs of the group's scenes, and others.
     """
     by_budget: dict[Row, dict[str, Measured]] = {}
-    for one in measured(table, results):
+    every = tuple(dict.fromkeys(run.variant for run in results))  # the noise is of other tables' rows, too
+    for one in measured(replace(table, variants=every), results):
         if one.row.model == "forward" and one.by_seed(group, "psnr"):
             by_budget.setdefault(one.row._replace(variant=""), {})[one.row.variant] = one
-    order = sorted(by_budget, key=lambda row: (row.minutes is None, row.minutes or 0, row.iterations or 0))
-    by_budget = {row: by_budget[row] for row in order if "full" in by_budget[row] and len(by_budget[row]) > 1}
-    if not by_budget:
+    own = {row.variant for row in _in_order(table)} - {"full"}
+    budgets = [budget for budget, found in by_budget.items() if "full" in found and own & set(found)]
+    budgets.sort(key=lambda row: (row.minutes is None, row.minutes or 0, row.iterations or 0))
+    if not budgets:
         return None
     printed = _printed(table, group)
     columns, notes = [Column("row of the paper"), Column("paper, dB", signed=True)], []
     rows: list[list[Cell]] = [[row.name, printed.get(row.variant)] for row in _in_order(table)]
-    for budget, found in by_budget.items():
-        label = _label(budget, by_budget)
+    for budget in budgets:
+        found, label = by_budget[budget], _label(budget, budgets)
         noise = pooled_deviation([list(differences(found, v, group).values()) for v in found])
         columns += [Column(f"{label}: PSNR"), Column("difference", signed=True), Column("order")]
         columns += [Column("s a step", 3), Column("of a step of Ours", prefix="×")]
