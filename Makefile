@@ -165,7 +165,7 @@ endif
 
 ablations: PRESET ?= demo
 ablations: MINUTES := $(if $(filter command line,$(origin MINUTES)),$(MINUTES),4)
-ablations: STEPS ?= 800
+ablations: STEPS ?= 500
 ablations: SEEDS ?= 2
 ablations: OUT ?= docs/results
 # The voxel networks come with the fine stage, which the demo's numbers give too little of the training to tell.

@@ -73,7 +73,9 @@ def sections_of(table: PaperTable, results: Sequence[Result]) -> list[Section]:
             if (parts := changes(table, group, of_group)) is not None:
                 scene = f", {group.scenes[0]}" * (is_made and group.name != group.scenes[0])
                 used = [run for run in of_group if run.variant in table.variants]
-                found.append(Section(f"{table.title}: {group.name}{scene}", [parts], facts(used)))
+                found.append(
+                    Section(f"{table.title}: {group.name}{scene}", [parts], facts(used), table.notes)
+                )
     return found
 
 
