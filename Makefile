@@ -1,5 +1,5 @@
 .DEFAULT_GOAL := help
-.PHONY: help install install-launchers install-browser demo demo-particles demo-forward demo-backward tables-vehicle tables-captures demo-lego-complete demo-hypernerf demo-nhr test conformance test-slow test-stability bench bench-gpu effects accuracy-time price-list reproduce-tables docs docs-serve lint format clean
+.PHONY: help install install-launchers install-browser demo demo-particles demo-forward demo-backward tables-vehicle tables-captures demo-lego-complete demo-hypernerf demo-nhr test conformance test-slow test-stability bench bench-gpu effects accuracy-time price-list reproduce-tables ablations docs docs-serve lint format clean
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -134,34 +134,57 @@ else
 	$(BIN)/forewarp-report kind=effects && exit $$status
 endif
 
-REPRODUCE = $(BIN)/forewarp-train --multirun preset=$(PRESET) $(if $(filter-out null,$(MINUTES)),budget.minutes=$(MINUTES)) $(SEED) $(if $(THREADS),threads=$(THREADS)) $(if $(LAUNCHER),launcher=$(LAUNCHER))
-# Without DATA: a counterpart of each dataset, 12 runs of 12 s (SWEEPS=all: 29), half of them on each of two cores.
+# METHODS="dnerf tineuvox_b": these in place of a sweep's own; ablations and the resolution are of model=forward.
+OF_METHODS = $(if $(METHODS),model=$(subst $(space),$(comma),$(strip $(METHODS))))
+UNTIL = $(if $(STEPS),budget.minutes=null budget.iterations=$(STEPS),$(if $(filter-out null,$(MINUTES)),budget.minutes=$(MINUTES)))
+REPRODUCE = table() { \
+	case $$1 in sweeps=ablation_*|sweeps=resolution) of=;; *) of=$(OF_METHODS);; esac; \
+	$(BIN)/forewarp-train --multirun preset=$(PRESET) $(UNTIL) $(SEED) $(if $(VIEWS),views=$(VIEWS)) score=null \
+		$(if $(THREADS),threads=$(THREADS)) $(if $(LAUNCHER),launcher=$(LAUNCHER)) $(ALSO) "$$@" $$of; }
+# Without DATA: a counterpart of each dataset; on two of them all methods. Half of the runs on each of two cores.
+JOBS ?= 2
+LANES = $(MAKE) --no-print-directory -j$(JOBS) tables-vehicle tables-captures PRESET=$(PRESET) SEEDS=$(SEEDS)
 reproduce-tables: PRESET ?= $(if $(DATA),fast,demo)
-reproduce-tables: MINUTES := $(if $(filter command line,$(origin MINUTES)),$(MINUTES),$(if $(filter faithful,$(PRESET)),null,$(if $(DATA),5,0.2)))
+reproduce-tables: MINUTES := $(if $(filter command line,$(origin MINUTES)),$(MINUTES),$(if $(filter faithful,$(PRESET)),null,$(if $(DATA),5,1)))
 reproduce-tables: SWEEPS ?= $(if $(SCENES_TYPED),dnerf,dnerf hypernerf nhr lego_complete)
 reproduce-tables: override SWEEPS := $(if $(filter all,$(SWEEPS)),dnerf hypernerf nhr lego_complete ablation_modules ablation_losses resolution,$(SWEEPS))
 reproduce-tables: SCENES_TYPED := $(if $(filter command line,$(origin SCENES)),$(SCENES))
 reproduce-tables: SEEDS ?= 1
 reproduce-tables: OUT ?= runs/paper/results
-reproduce-tables: ## the paper's tables and figures by three methods, beside published [DATA= PRESET= SCENES="hook lego" MINUTES= SEEDS=3 SWEEPS=all OUT=]
+reproduce-tables: ## the paper's tables and figures by all its systems, beside published [DATA= METHODS="dnerf ndvg" PRESET= SCENES="hook lego" MINUTES= SEEDS=3 VIEWS= SWEEPS=all OUT=]
 ifeq ($(DATA),)
-	@status=0; $(MAKE) --no-print-directory -j2 tables-vehicle tables-captures \
-		PRESET=$(PRESET) MINUTES=$(MINUTES) SEEDS=$(SEEDS) $(GO_ON); \
+	@status=0; $(LANES) MINUTES=$(MINUTES) $(GO_ON); \
 	$(BIN)/forewarp-report kind=paper out=$(OUT) curves=docs/results && exit $$status
 else
-	@status=0; for sweep in $(SWEEPS); do \
-		$(REPRODUCE) sweeps=$$sweep paths.scenes=$(DATA) \
+	@status=0; $(REPRODUCE); for sweep in $(SWEEPS); do \
+		table sweeps=$$sweep paths.scenes=$(DATA) \
 			$(if $(SCENES_TYPED),scene=$(subst $(space),$(comma),$(addprefix dnerf_,$(SCENES_TYPED)))) $(GO_ON); \
 	done; \
 	$(BIN)/forewarp-report kind=paper out=$(OUT) curves=docs/results && exit $$status
 endif
 
-tables-vehicle: PAIRS := dnerf:dnerf nhr:nhr $(if $(filter all,$(SWEEPS)),ablation_losses:dnerf ablation_modules:dnerf ablation_modules:lego_complete)
-tables-captures: PAIRS := lego_complete:lego_complete hypernerf:hypernerf $(if $(filter all,$(SWEEPS)),ablation_modules:hypernerf resolution:hypernerf)
+ablations: PRESET ?= demo
+ablations: MINUTES := $(if $(filter command line,$(origin MINUTES)),$(MINUTES),4)
+ablations: STEPS ?= 500
+ablations: SEEDS ?= 2
+ablations: OUT ?= docs/results
+# The voxel networks come with the fine stage, which the demo's numbers give too little of the training to tell.
+ablations: ALSO ?= stage.fine.share=2
+ablations: ## what each part of the paper's method brings, on three counterparts, at equal minutes and at equal steps [MINUTES= STEPS= SEEDS=3 OUT=]
+	@status=0; \
+	$(LANES) SWEEPS=ablations ALSO="$(ALSO)" MINUTES=$(MINUTES) STEPS= $(GO_ON); \
+	$(LANES) SWEEPS=ablations ALSO="$(ALSO)" STEPS=$(STEPS) $(GO_ON); \
+	$(BIN)/forewarp-report kind=ablation out=$(OUT) && exit $$status
+
+ONLY_ABLATIONS = $(filter ablations,$(SWEEPS))
+WITH_ABLATIONS = $(filter ablations all,$(SWEEPS))
+tables-vehicle: PAIRS := $(if $(ONLY_ABLATIONS),,methods:dnerf nhr:nhr) $(if $(WITH_ABLATIONS),ablation_losses:dnerf ablation_modules:dnerf)
+tables-captures: PAIRS := $(if $(ONLY_ABLATIONS),,methods:hypernerf lego_complete:lego_complete) \
+	$(if $(WITH_ABLATIONS),ablation_modules:hypernerf ablation_modules:lego_complete) $(if $(filter all,$(SWEEPS)),resolution:hypernerf)
 tables-vehicle tables-captures: THREADS ?= 1
 tables-vehicle tables-captures:
-	@{ status=0; for pair in $(PAIRS); do \
-		$(REPRODUCE) sweeps=$${pair%:*} scene=counterpart_$${pair#*:} $(GO_ON); \
+	@{ status=0; $(REPRODUCE); for pair in $(PAIRS); do \
+		table sweeps=$${pair%:*} scene=counterpart_$${pair#*:} budget.clock=processor $(GO_ON); \
 	done; exit $$status; } $(SAYS)
 
 MKDOCS = { $(BIN)/python -c 'import material, mkdocstrings_handlers.python' 2>/dev/null || { $(ADD) '.[docs]'; }; } && \

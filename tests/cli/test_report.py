@@ -2,7 +2,7 @@ import pytest
 
 from tests.support.runs_on_disk import write_run
 
-KINDS = "accuracy_time, price_list, paper, minutes, methods, effects, compare, run, limits"
+KINDS = "accuracy_time, price_list, paper, ablation, minutes, methods, effects, compare, run, limits"
 
 
 def test_pages_are_written_and_named(ok, in_tmp):

@@ -8,13 +8,15 @@ import re
 import imageio.v3 as iio
 import numpy as np
 import pytest
+import yaml
 
 from forewarp.report.collect import collect
 from forewarp.report.page import latex_text
 from forewarp.report.paper import write_paper
 from forewarp.report.paper_printed import PAPER, read_paper
-from forewarp.report.paper_tables import comparison, counterpart, measured, with_means
+from forewarp.report.paper_tables import COSTS, comparison, measured, stand_in, with_means
 from forewarp.report.sheets import thirds
+from tests.support.configs import options
 from tests.support.runs_on_disk import write_run
 
 ALL = ["hellwarrior", "mutant", "hook", "bouncingballs", "lego", "trex", "standup", "jumpingjacks"]
@@ -45,7 +47,7 @@ def cells(table, name, kind="measured"):
     rows = [
         i for i, row in enumerate(table.rows) if row[1] == kind and (kind != "measured" or row[0] == name)
     ]
-    return table.texts({"best": "[{}]", "second": "({})"})[rows[0]][2:-1]
+    return table.texts({"best": "[{}]", "second": "({})"})[rows[0]][2 : -len(COSTS)]
 
 
 def test_a_mean_is_of_all_scenes_or_empty(tmp_path):
@@ -85,8 +87,19 @@ def test_ranks_are_among_measured_rows_alone(tmp_path):
     assert cells(table, "forewarp: the no_tv, fast, 1 min") == ["(24.00)", "[0.900]", "[0.100]"]
     assert cells(table, "forewarp: the no_view, fast, 1 min")[::2] == ["20.00", "0.300"]
     assert cells(table, "", "published") == ["33.75", "0.979", "0.040"]  # as printed, unmarked
-    assert table.rules == [3]
-    assert [row[-1] for row in table.rows[:4]] == [50.0] * 3 + [None]
+    kinds = [(row[0], row[1]) for row in table.rows[:5]]  # each published row has its measured one below it
+    assert kinds[::2] == [
+        ("Ours", "published"),
+        ("w/o total variation", "published"),
+        ("w/o flow L1", "published"),
+    ]
+    assert kinds[1::2] == [
+        ("forewarp: the full, fast, 1 min", "measured"),
+        ("forewarp: the no_tv, fast, 1 min", "measured"),
+    ]
+    assert table.rules == [2, 4, 8, 10]
+    assert table.texts({})[1][-len(COSTS) :] == ["50", "1.00", "2.000", "100", "1", "a cpu"]
+    assert table.rows[0][-len(COSTS) :] == [None] * len(COSTS)
 
 
 def test_abilities_and_depth_have_columns_of_their_own(tmp_path):
@@ -124,7 +137,7 @@ def whole(tmp_path):
 def test_pages_tell_how_numbers_came_about(whole):
     text = (whole / "paper.md").read_text()
     for line in (
-        "* protocol: dnerf, 4x3, background white",
+        "* protocol 1: dnerf, 4x3, background white",
         "* machine: a cpu, 2 threads, torch 2",
         "* budget: fast, 1 min a run",
         "* measured: nothing yet",
@@ -163,25 +176,96 @@ def test_a_scene_with_one_kind_of_view_is_measured_by_it(tmp_path):
     assert row == ["20.00", "", "", "21.00", "", "", "22.00", "", "", "23.00", "", "", "21.50", "", ""]
     write_paper(tmp_path, tmp_path / "out")
     text = (tmp_path / "out" / "paper.md").read_text()
-    assert "* protocol: nhr, 512x384 and 1024x768, background white" in text
+    assert "* protocol 1: nhr, 512x384 and 1024x768, background white" in text
 
 
 def test_counterparts_never_meet_printed_numbers(tmp_path):
     paper_run(tmp_path, "vehicle", made=True, psnr=28.0)
     paper_run(tmp_path, "lift", dataset="lego_complete", protocol={"synthetic": True})  # however it is read
     results, _ = collect(tmp_path, ["metrics.json"])
-    made = comparison(counterpart(read_paper(PAPER)["dnerf"], results), results)
-    assert [column.name for column in made.columns[2:-1]] == [
-        f"vehicle {m}" for m in ("PSNR↑", "SSIM↑", "LPIPS↓")
-    ]
-    assert [row[1] for row in made.rows] == ["measured"]
+    made = stand_in(read_paper(PAPER)["dnerf"], results)
+    names = [column.name for column in made.columns]
+    assert names[1:4] == [f"vehicle {m}" for m in ("PSNR↑", "SSIM↑", "LPIPS↓")]
+    assert names[-2:] == ["published as", "published: Mean of 8 PSNR"]
+    assert made.texts({})[0][1] == "28.00"
+    assert made.rows[0][-2:] == ["Ours (80^3)", "32.68"]
+    assert stand_in(read_paper(PAPER)["dnerf_scenes"], results) is None
     write_paper(tmp_path, tmp_path / "out")
     text = (tmp_path / "out" / "paper.md").read_text()
     first, second = text.split("## Table 1: D-NeRF, mean of eight scenes")[1:3]
     assert "28.00" not in first
-    assert "published" not in second.split("## ")[0]
+    assert "| published |" not in second.split("## ")[0]
     assert "## Table 4: Lego Complete, by ability: synthetic counterpart" in text
-    assert "difference to the paper" not in text
+    assert "| difference to the paper |" not in text
+
+
+SYSTEMS = {
+    "dnerf": {"tnerf", "tineuvox_s", "tineuvox_b", "dnerf", "ndvg", "forward"},
+    "hypernerf": {
+        "nerf",
+        "neural_volumes",
+        "nerfies",
+        "hypernerf",
+        "tineuvox_s",
+        "tineuvox_b",
+        "ndvg",
+        "forward",
+    },
+    "nhr": {"tineuvox_s", "tineuvox_b", "ndvg", "forward"},
+    "lego_complete": {"dnerf", "ndvg", "forward"},
+}
+
+
+@pytest.mark.parametrize("dataset", SYSTEMS)
+def test_every_system_stands_beside_its_published_row(tmp_path, dataset):
+    table = read_paper(PAPER)[dataset]
+    models = set(options("model"))
+    assert {row.model for row in table.rows} == SYSTEMS[dataset] < models
+    real, made = tmp_path / "real", tmp_path / "made"
+    for model in models:
+        kinds = {group.ability for group in table.groups}
+        scores = {kind: {"psnr": 25.0} for kind in kinds if kind} or {"psnr": 25.0}
+        paper_run(real, table.groups[0].scenes[0], dataset=dataset, warp=model, **scores)
+        paper_run(made, "toy", dataset=dataset, warp=model, made=True, **scores)
+    rows = table_of(real, dataset).rows
+    for row in table.rows:
+        if row.variant in (None, "full"):
+            at = next(i for i, cells in enumerate(rows) if cells[:2] == [row.name, "published"])
+            assert rows[at + 1][0].startswith(f"forewarp: {row.model}")
+    at_the_end = [row[0].split(",")[0].split(": ")[1] for row in rows[-len(models - SYSTEMS[dataset]) :]]
+    assert set(at_the_end) == models - SYSTEMS[dataset]
+    shown = stand_in(table, collect(made)[0])
+    first = len(shown.columns) - 1 - len([g for g in table.groups if len(g.scenes) > 1])
+    beside = {
+        row[0].split(",")[0].split(" (")[0].removeprefix("forewarp: "): row[first:] for row in shown.rows
+    }
+    assert {model for model, cells in beside.items() if all(cells)} == SYSTEMS[dataset]
+    assert all(cells == [""] * len(cells) for model, cells in beside.items() if model not in SYSTEMS[dataset])
+
+
+def test_rows_of_other_views_or_another_clock_stand_apart(tmp_path):
+    few = {"measured": "5 of 20 test views, evenly spread"}
+    for seed, protocol in enumerate(({}, few)):
+        for model in ("particles", "forward"):
+            paper_run(tmp_path / str(seed), "toy", warp=model, made=True, protocol=protocol)
+    table = read_paper(PAPER)["dnerf"]
+    both, one = (stand_in(table, collect(folder)[0]) for folder in (tmp_path, tmp_path / "1"))
+    names = [row[0] for row in both.rows]
+    assert names[:2] == [
+        f"forewarp: forward (the paper's method), fast, 1 min{more}" for more in ("", ", 5 test views")
+    ]
+    assert names[2] == "forewarp: particles, fast, 1 min"
+    assert [bool(shown.marks) for shown in (both, one)] == [False, True]
+    folder = paper_run(tmp_path / "2", "toy", made=True)
+    config = yaml.safe_load((folder / "config.yaml").read_text())
+    config["budget"]["clock"] = "processor"
+    (folder / "config.yaml").write_text(yaml.safe_dump(config))
+    write_paper(tmp_path, tmp_path / "out")
+    text = (tmp_path / "out" / "paper.md").read_text()
+    assert "| forewarp: forward (the paper's method), fast, 1 min of processor time |" in re.sub(
+        " +", " ", text
+    )
+    assert "fast, 1 min a run by the processor clock" in text
 
 
 def test_of_runs_alike_the_newest_counts(tmp_path):
@@ -212,7 +296,7 @@ def test_machines_have_rows_of_their_own(tmp_path):
     for number, scene in enumerate(ALL):
         paper_run(tmp_path, scene, protocol={"device": "a gpu" if number < 4 else "a cpu"})
     rows = [row for row in table_of(tmp_path).rows if row[1] == "measured"]
-    assert [row[0][-5:] for row in rows] == ["a cpu", "a gpu"]
+    assert [row[-1] for row in rows] == ["a cpu", "a gpu"]
     assert all(row[2] is None for row in rows)
 
 
@@ -236,7 +320,7 @@ def test_only_runs_of_the_resolution_sweep_are_in_its_figure(tmp_path):
 def test_the_other_method_is_not_held_against_the_papers_own(tmp_path):
     for scene in ALL:
         paper_run(tmp_path, scene, warp="backward")
-    assert [row[1] for row in table_of(tmp_path).rows][:2] == ["measured", "published"]
+    assert [row[1] for row in table_of(tmp_path).rows] == ["published"] * 6 + ["measured"]
 
 
 def test_measured_rows_keep_the_order_of_the_variants(tmp_path):

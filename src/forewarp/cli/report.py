@@ -11,6 +11,7 @@ KINDS = {
     "accuracy_time": "accuracy against training time, and the cheapest way to each dB",
     "price_list": "what each choice costs and brings, with the spread over seeds",
     "paper": "the paper's tables and figures: Markdown, LaTeX, CSV, HTML",
+    "ablation": "what each part of the paper's method brings, and whether the paper's order holds",
     "minutes": "what a method reaches on each scene in so many minutes, by seed and view",
     "methods": "all methods under one clock: what each reaches, PSNR against seconds, views side by side",
     "effects": "planned runs against every effect at once and the paper's fixed set",
@@ -31,11 +32,11 @@ render anything.
   forewarp-report kind=limits 'runs=runs/paper/*/plain-forward-fast-*'
 
 What one types most:
-  runs=FOLDER            searched for runs (runs/accuracy_time, paper, minutes or effects; methods: paper)
+  runs=FOLDER            searched for runs (runs/accuracy_time, minutes, effects; paper of other tables)
   runs=[FOLDER,FOLDER]   compare, limits: the runs themselves; patterns with * are expanded
   out=FOLDER             where the page goes (results/ below the runs); compare: where the picture goes
   target=DB              accuracy_time: PSNR that every variant's seconds are listed for
-  published=FILE         accuracy_time: results of others to show; paper: the printed numbers
+  published=FILE         accuracy_time: results of others to show; paper, ablation: the printed numbers
   curves=FOLDER          paper: where accuracy_time put its pictures (runs/accuracy_time/results)
   views=N                limits: training views to render
   run=FOLDER             run: the run; its page is <run>/page.html, or out=FILE.html
@@ -47,7 +48,7 @@ What one types most:
   trust=[PACKAGE]        limits, run: code of other packages that a run's config may name
 
 The runs: make accuracy-time [DATA=FOLDER SCENE=NAME MINUTES=N], make price-list DATA=FOLDER,
-make reproduce-tables [DATA=FOLDER], make effects. Runs without results are listed at the end of the page.
+make reproduce-tables [DATA=FOLDER], make ablations, make effects. Runs without results are listed at the end.
 """
 
 
@@ -67,8 +68,9 @@ def report(config) -> None:
         return
     if not isinstance(config.runs, str | None):
         raise ValueError(f"runs: expected one folder for kind={config.kind}, but got a list; name one folder")
-    default = config.kind if config.kind in ("paper", "effects", "minutes") else "accuracy_time"
-    default = "paper" if config.kind == "methods" else default  # where sweeps=methods puts its runs
+    folders = {kind: kind for kind in ("paper", "effects", "minutes")}
+    folders |= {"ablation": "paper", "methods": "paper"}
+    default = folders.get(config.kind, "accuracy_time")
     runs = Path(config.runs or f"{config.paths.runs}/{default}")
     for file in _written(config, runs, Path(config.out or runs / "results")):
         print(f"written: {file}")
@@ -114,6 +116,7 @@ def _table(config, folders: list[str]) -> str:
 
 def _written(config, runs: Path, out: Path) -> list[Path]:
     """Write the page of this kind and return its files."""
+    from forewarp.report.ablation import write_ablation
     from forewarp.report.accuracy_time import write_accuracy_time
     from forewarp.report.curve import OTHERS, read_published
     from forewarp.report.effects import write_effects
@@ -131,6 +134,8 @@ def _written(config, runs: Path, out: Path) -> list[Path]:
         return write_minutes(runs, out)
     if config.kind == "methods":
         return write_methods(runs, out)
+    if config.kind == "ablation":
+        return write_ablation(runs, out, Path(config.published or PAPER))
     if config.kind == "paper":
         curves = Path(config.curves or f"{config.paths.runs}/accuracy_time/results")
         return write_paper(runs, out, Path(config.published or PAPER), curves)

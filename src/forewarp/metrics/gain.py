@@ -31,6 +31,17 @@ class Estimate:
         return cls(statistics.fmean(values), statistics.stdev(values) if len(values) > 1 else None)
 
 
+def pooled_deviation(groups: Sequence[Sequence[float]]) -> float | None:
+    """Pool the standard deviation within groups that may have different means; None without repetitions.
+
+    >>> pooled_deviation([[1.0, 3.0], [10.0, 10.0], [5.0]])
+    1.0
+    """
+    within = [value - statistics.fmean(group) for group in groups if group for value in group]
+    free = sum(len(group) - 1 for group in groups if group)
+    return math.sqrt(sum(value**2 for value in within) / free) if free else None
+
+
 def measure_effect(pairs: Sequence[tuple[Numbers, Numbers]], measure: str) -> Estimate | None:
     """Return the change of a measure over pairs of (with, without) that are equal in all else.
 

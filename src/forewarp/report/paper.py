@@ -13,21 +13,25 @@ from forewarp.report import page, paper_figures
 from forewarp.report.collect import Result, collect, machine
 from forewarp.report.page import Section
 from forewarp.report.paper_printed import PAPER, PaperTable, read_paper
-from forewarp.report.paper_tables import comparison, counterpart, measured, row_of, with_means
+from forewarp.report.paper_tables import comparison, measured, row_of, runs_of, stand_in, with_means
+from forewarp.report.protocols import numbered
 
 TITLE = "The paper's tables, measured"
 INTRODUCTION = (
     "Written by `forewarp-report kind=paper`. Rows marked measured are runs of this project, those marked "
-    "published are what the paper prints; the best and the second are marked among measured rows "
-    "alone. `forward` is the paper's method, `backward` its opponent, `particles` this project's own. "
-    "Over several seeds: mean ± standard deviation. A cell without a run is empty. Synthetic "
-    "counterparts are procedural scenes in a dataset's format: their numbers are not "
-    "comparable with printed ones."
+    "published are what the paper prints. `forward` is the paper's method, `backward` its opponent, "
+    "`particles` this project's own; the others are our own versions of the systems they are named after. "
+    "The best and the second are marked among measured rows, if all are of the same test views. Over "
+    "several seeds: mean ± standard deviation. Of a scene with several kinds of test views, columns that "
+    "name no kind show those between the training times. A cell without a run is empty; a method that "
+    "gets nowhere in its minutes stands there with what it reached. Memory, parameters and steps are "
+    "means over a row's runs; the protocol of each row stands below its table. Synthetic counterparts are "
+    "procedural scenes in a dataset's format: their numbers are not comparable with those published for "
+    "real scenes, which stand in the last columns. Runs as short as those of `make reproduce-tables` "
+    "without DATA (a minute of processor time) prove the machinery, not the ranking: only longer runs on "
+    "real scenes tell which method is better."
 )
 COUNTERPART = ": synthetic counterpart"
-# Entries of a run's protocol that the page shows.
-TOLD = ("half_resolution", "scale", "split", "frames", "views", "train_frames", "test_views", "test_frames")
-TOLD += ("measured", "held_out", "canonical_time", "mask_box")
 METHODS = ("particles", "forward", "backward")  # that are compared in pictures
 DATASETS = ("dnerf", "hypernerf", "nhr", "lego_complete")
 
@@ -76,13 +80,10 @@ def sections_of(table: PaperTable, results: Sequence[Result]) -> list[Section]:
     made = [run for run in results if run.is_counterpart]
     printed = with_means(table, real)
     source = f"published rows: the paper, {table.source}"
-    shown = [run for row in measured(table, real) for run in row.runs]
-    found = [Section(table.title, [comparison(printed, real)], [source, *facts(shown)], table.notes)]
-    stand_in = counterpart(table, made)
-    shown = [run for row in measured(table, made) for run in row.runs]
-    if stand_in is not None and shown:
-        title = table.title + COUNTERPART
-        found.append(Section(title, [comparison(stand_in, made)], facts(shown)))
+    lines = [source, *facts(runs_of(measured(table, real)))]
+    found = [Section(table.title, [comparison(printed, real)], lines, table.notes)]
+    if (beside := stand_in(table, made)) is not None:
+        found.append(Section(table.title + COUNTERPART, [beside], facts(runs_of(measured(table, made)))))
     return found
 
 
@@ -91,10 +92,9 @@ def facts(runs: Sequence[Result]) -> list[str]:
     if not runs:
         return ["measured: nothing yet"]
     days = sorted({run.day for run in runs})
-    protocols = list(dict.fromkeys(_protocol(run) for run in runs))
     budgets = sorted({_budget(run) for run in runs})
     return [
-        *(f"protocol: {text}" for text in protocols),
+        *(f"protocol {number}: {text}" for text, number in numbered(runs).items()),
         f"machine: {machine(runs)}",
         f"budget: {'; '.join(budgets)}",
         f"date: {' to '.join(dict.fromkeys((days[0], days[-1])))}",
@@ -156,24 +156,9 @@ def _write_csv(sections: Sequence[Section], out: Path) -> list[Path]:
     return files
 
 
-def _protocol(run: Result) -> str:
-    known = run.metrics.get("protocol", {})
-    sizes = known.get("resolution", [])
-    sizes = sizes if sizes and isinstance(sizes[0], list) else [sizes]
-    size = " and ".join("x".join(map(str, sides)) for sides in sizes)
-    words = [run.dataset, size, f"background {known.get('background', 'unknown')}"]
-    words += [f"{key.replace('_', ' ')} {_text(known[key])}" for key in TOLD if known.get(key)]
-    return ", ".join(word for word in [*words, known.get("note", "")] if word)
-
-
-def _text(value: object) -> str:
-    if isinstance(value, dict):
-        return ", ".join(f"{name} {part}" for name, part in value.items())
-    return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
-
-
 def _budget(run: Result) -> str:
     budget = run.config["budget"]
     minutes = f"{budget['minutes']:g} min a run" if budget["minutes"] else ""
+    minutes += " by the processor clock" if minutes and budget.get("clock") == "processor" else ""
     steps = f"{budget['iterations']} steps" if budget.get("iterations") else ""
     return ", ".join(word for word in (run.config["preset"]["name"], minutes, steps) if word)

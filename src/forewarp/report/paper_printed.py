@@ -31,12 +31,13 @@ class Group:
 class Row:
     """A printed row, numbers as text, "" for a missing number.
 
-    ``variant`` names the measured runs to compare with the row; None for methods of others.
+    ``model`` and ``variant`` name the measured runs to compare with the row; others have no variant.
     """
 
     name: str
     values: tuple[str, ...]
     variant: str | None = None
+    model: str | None = None
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,12 @@ class PaperTable:
     rows: tuple[Row, ...]
     notes: tuple[str, ...] = ()
     means: tuple[tuple[str, tuple[str, ...]], ...] = ()
+
+    def printed(self, model: str, variant: str) -> Row | None:
+        """Return the row of a method and variant, or None; ``plain`` is compared with ``full``."""
+        wanted = "full" if variant == "plain" else variant
+        named = (row for row in self.rows if row.model == model)
+        return next((row for row in named if (row.variant or "full") == wanted), None)
 
     @property
     def columns(self) -> list[tuple[Group, str]]:
@@ -100,10 +107,7 @@ def _table(key: str, entry: dict, datasets: dict) -> PaperTable:
         )
         for g in entry["groups"]
     )
-    rows = tuple(
-        Row(r["name"], tuple("" if v == "null" else v for v in r["values"]), _variant(r))
-        for r in entry["rows"]
-    )
+    rows = tuple(_row(entry) for entry in entry["rows"])
     about = [entry[name] for name in ("title", "source")]
     table = PaperTable(key, *about, tuple(entry["variants"]), groups, rows, tuple(entry["notes"]))
     for row in rows:
@@ -114,8 +118,11 @@ def _table(key: str, entry: dict, datasets: dict) -> PaperTable:
     return replace(table, means=tuple((name, tuple(scenes)) for name, scenes in means))
 
 
-def _variant(row: dict) -> str | None:
-    return row.get("variant", "full" if row["name"].split(" (")[0] == "Ours" else None)
+def _row(entry: dict) -> Row:
+    values = tuple("" if value == "null" else value for value in entry["values"])
+    own = "full" if entry["name"].split(" (")[0] == "Ours" else None
+    variant = entry.get("variant", own)
+    return Row(entry["name"], values, variant, entry.get("model", "forward" if variant else None))
 
 
 def _mean(values: list[str]) -> str:

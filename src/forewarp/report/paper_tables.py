@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from statistics import fmean
 from typing import NamedTuple
@@ -10,6 +10,8 @@ from typing import NamedTuple
 from forewarp.metrics.gain import Estimate
 from forewarp.report.collect import Result
 from forewarp.report.paper_printed import Group, PaperTable
+from forewarp.report.paper_printed import Row as PrintedRow
+from forewarp.report.protocols import numbered, protocol_of
 from forewarp.report.tables import Cell, Column, Difference, Table
 
 # Title, digits, whether more is better, and the factor to the printed unit.
@@ -21,6 +23,12 @@ METRICS = {
     "depth_delta_1.25": ("δ<1.25", 3, True, 100),
     "depth_delta_1.5625": ("δ<1.25²", 3, True, 100),
 }
+UNPRINTED = ("particles", "backward")  # methods of this project that the paper prints no row of
+# What a measured row says beside its scores.
+COSTS = (
+    *(Column("training, s a run", 0), Column("GiB"), Column("parameters (M)", 3), Column("steps", 0)),
+    *(Column("protocol"), Column("device")),
+)
 
 
 @dataclass(frozen=True)
@@ -31,10 +39,10 @@ class Measured:
     row: Row
     runs: tuple[Result, ...]
 
-    def cell(self, group: Group, metric: str) -> Estimate | None:
-        """Estimate a metric's mean over the scenes of a group, over the seeds that all scenes have.
+    def by_seed(self, group: Group, metric: str) -> dict[int, float]:
+        """Average a metric over the scenes of a group, for each seed that all scenes have.
 
-        Return None if there is no such seed, or the scenes' images differ in size or background.
+        Empty if there is no such seed, or the scenes' images differ in size or background.
         """
         found, conditions = {}, set()
         for run in self.runs:
@@ -43,15 +51,23 @@ class Measured:
                 found[run.scene, run.seed] = scores[metric] * METRICS[metric][3]
                 conditions |= {_conditions(run)} if run.scene in group.scenes else set()
         if len(conditions) > 1:
-            return None
+            return {}
         seeds = sorted({seed for _, seed in found})
         whole = [seed for seed in seeds if all((scene, seed) in found for scene in group.scenes)]
-        return Estimate.of([fmean(found[scene, seed] for scene in group.scenes) for seed in whole])
+        return {seed: fmean(found[scene, seed] for scene in group.scenes) for seed in whole}
 
-    @property
-    def seconds(self) -> float:
-        """The mean training seconds of the runs."""
-        return fmean(run.metrics["seconds"]["train"] for run in self.runs)
+    def cell(self, group: Group, metric: str) -> Estimate | None:
+        """Estimate a metric's mean over the seeds of ``by_seed``; None if it is empty."""
+        return Estimate.of(list(self.by_seed(group, metric).values()))
+
+    def costs(self, numbers: Mapping[str, str]) -> list[Cell]:
+        """Return the cells of ``COSTS``: means over the runs, and the numbers of their protocols."""
+        protocols = {numbers[protocol_of(run)] for run in self.runs}
+        names = ("memory", "parameters", "steps")
+        known = ([run.numbers[name] for run in self.runs if name in run.numbers] for name in names)
+        seconds = fmean(run.metrics["seconds"]["train"] for run in self.runs)
+        means = [fmean(of) if of else None for of in known]
+        return [seconds, *means, ", ".join(sorted(protocols, key=int)), self.row.device]
 
 
 class Row(NamedTuple):
@@ -64,6 +80,8 @@ class Row(NamedTuple):
     iterations: int | None
     held_out: int
     device: str | None
+    clock: str = "wall"
+    views: int | None = None  # that were measured; None: all
 
 
 def row_of(run: Result) -> Row:
@@ -71,55 +89,107 @@ def row_of(run: Result) -> Row:
     budget = run.config["budget"]
     known, protocol = (run.config.get("variant") or {}).get("name", "plain"), run.metrics.get("protocol", {})
     bounds = run.config["preset"]["name"], budget["minutes"], budget.get("iterations")
-    conditions = protocol.get("held_out", 0), protocol.get("device")
-    return Row(known, run.config["model"]["name"], *bounds, *conditions)
+    conditions = protocol.get("held_out", 0), protocol.get("device"), budget.get("clock") or "wall"
+    views = str(protocol.get("measured", "")).split(" ")[0]  # "10 of 30 test views, evenly spread"
+    return Row(known, run.config["model"]["name"], *bounds, *conditions, int(views) if views else None)
 
 
 def measured(table: PaperTable, results: Sequence[Result]) -> list[Measured]:
-    """Return the table's measured rows, in the order of its variants."""
+    """Return the table's measured rows: by its variants, then as printed, then ``UNPRINTED``, then others."""
     rows = {}
     datasets = {group.dataset for group in table.groups}
     for run in results:
         key = row_of(run)
         if key.variant in table.variants and run.dataset in datasets:
             rows.setdefault(key, []).append(run)
-    order = sorted(rows, key=lambda k: (table.variants.index(k.variant), *map(str, k)))
-    machines = {key.device for key in rows}
-    return [Measured(_name(key, rows[key], len(machines) > 1), key, tuple(rows[key])) for key in order]
+    systems = list(dict.fromkeys([*(row.model for row in table.rows), *UNPRINTED]))
+
+    def place(key: Row) -> tuple:
+        by_model = systems.index(key.model) if key.model in systems else len(systems)
+        return table.variants.index(key.variant), by_model, *(str(value or "") for value in key)
+
+    return [Measured(_name(key, rows[key]), key, tuple(rows[key])) for key in sorted(rows, key=place)]
+
+
+def runs_of(rows: Sequence[Measured]) -> list[Result]:
+    """Return the runs of all rows."""
+    return [run for row in rows for run in row.runs]
 
 
 def comparison(table: PaperTable, results: Sequence[Result], *, difference: bool = True) -> Table:
-    """Make a table of the measured rows, then the published ones.
+    """Make a table of each published row with the measured ones of its method below it, then the others.
 
-    In each column mark the best and the second best of the measured rows.
+    In each column mark the best and the second best of the measured rows, if all have the same test views.
 
     Args:
         table: the paper's table.
         results: the runs of the table's scenes.
-        difference: after each measured row add the difference from the paper's row.
+        difference: after each measured row add the difference from the published one.
     """
-    rows, ranked, kinds = [], [], ["measured", "difference to the paper", "published"]
-    for row in measured(table, results):
-        cells = [row.cell(group, metric) for group, metric in table.columns]
-        ranked.append(len(rows))
-        rows.append([row.name, kinds[0], *cells, row.seconds])
-        papers_own = row.row.model == "forward"
-        printed = _ours(table, row.row.variant) if papers_own else None
+    found = measured(table, results)
+    numbers = numbered(runs_of(found))
+    rows, ranked, rules, absent = [], {}, [], [None] * len(COSTS)
+
+    def add(one: Measured, printed: PrintedRow | None) -> None:
+        cells = [one.cell(group, metric) for group, metric in table.columns]
+        ranked[len(rows)] = one.row.views
+        rows.append([one.name, "measured", *cells, *one.costs(numbers)])
         if difference and printed is not None and any(cells):
-            rows.append(["", kinds[1], *map(_difference, cells, printed), None])
-    rules = [len(rows)] if rows else []
-    rows += [[row.name, kinds[2], *row.values, None] for row in table.rows]
-    columns = [
-        Column("method"),
-        Column("kind"),
-        *(_column(*pair) for pair in table.columns),
-        Column("training, s a run", 0),
+            rows.append(["", "difference to the paper", *map(_difference, cells, printed.values), *absent])
+
+    own = {one.row: table.printed(one.row.model, one.row.variant) for one in found}
+    for printed in table.rows:
+        below = [one for one in found if own[one.row] is printed]
+        rules += [len(rows)] if below or (rows and rows[-1][1] != "published") else []
+        rows.append([printed.name, "published", *printed.values, *absent])
+        for one in below:
+            add(one, printed)
+    others = [one for one in found if own[one.row] is None]
+    rules += [len(rows)] if others else []
+    for one in others:
+        add(one, None)
+    columns = [Column("method"), Column("kind"), *(_column(*pair) for pair in table.columns), *COSTS]
+    marks = _marks(table, rows, list(ranked)) if len(set(ranked.values())) == 1 else {}
+    return Table(columns, rows, marks=marks, rules=[rule for rule in rules if rule])
+
+
+def stand_in(table: PaperTable, results: Sequence[Result]) -> Table | None:
+    """Make a table of the runs on synthetic counterparts, with what was published for real scenes at its end.
+
+    None if there are no such runs.
+    """
+    made = counterpart(table, results)
+    found = measured(table, results)
+    if made is None or not found:
+        return None
+    numbers, datasets = numbered(runs_of(found)), {run.dataset for run in runs_of(found)}
+    shown = [
+        (number, group)
+        for number, (group, metric) in enumerate(table.columns)
+        if metric == "psnr" and group.dataset in datasets and len(group.scenes) > 1
     ]
-    return Table(columns, rows, marks=_marks(table, rows, ranked), rules=rules)
+    rows = []
+    for one in found:
+        cells = [one.cell(group, metric) for group, metric in made.columns]
+        printed = table.printed(one.row.model, one.row.variant)
+        beside = [printed.values[number] if printed else "" for number, _ in shown]
+        rows.append([one.name, *cells, *one.costs(numbers), printed.name if printed else "", *beside])
+    columns = [Column("measured"), *(_column(*pair) for pair in made.columns), *COSTS]
+    columns += [
+        Column("published as"),
+        *(Column(f"published: {group.name} PSNR") for _, group in shown),
+    ]
+    same = len({one.row.views for one in found}) == 1
+    return Table(columns, rows, marks=_marks(made, rows, range(len(rows)), 1) if same else {})
 
 
 def counterpart(table: PaperTable, results: Sequence[Result]) -> PaperTable | None:
-    """Return the table for the measured synthetic scenes, without printed rows, or None."""
+    """Return the table for the measured synthetic scenes, without printed rows, or None.
+
+    A table scene by scene has none: its scenes are those of another table.
+    """
+    if table.means:
+        return None
     groups = {}
     for group in table.groups:
         for scene in sorted({run.scene for run in results if run.dataset == group.dataset}):
@@ -150,15 +220,16 @@ def _conditions(run: Result) -> tuple:
     return protocol.get("half_resolution"), protocol.get("background")
 
 
-def _name(row: Row, runs: Sequence[Result], tell_device: bool) -> str:
+def _name(row: Row, runs: Sequence[Result]) -> str:
     minutes, steps = f"{row.minutes or 0:g} min", f"{row.iterations} steps"
+    minutes += " of processor time" * (row.clock == "processor")
     bounds = [minutes if row.minutes else "", steps if row.iterations else ""]
     about = row.model if row.variant == "plain" else (runs[0].about or row.variant)
     about += " (the paper's method)" * (about == "forward")
     seeds = len({run.seed for run in runs})
     parts = [f"forewarp: {about}", row.preset, *bounds, f"{seeds} seeds" if seeds > 1 else ""]
     parts.append(f"{row.held_out} views held out" if row.held_out else "")
-    parts.append(str(row.device) if tell_device else "")
+    parts.append(f"{row.views} test views" if row.views else "")
     return ", ".join(part for part in parts if part)
 
 
@@ -167,19 +238,14 @@ def _column(group: Group, metric: str) -> Column:
     return Column(f"{group.name} {title}{'↑' if more else '↓'}", digits)
 
 
-def _ours(table: PaperTable, variant: str) -> tuple[str, ...] | None:
-    wanted = "full" if variant == "plain" else variant
-    return next((row.values for row in table.rows if row.variant == wanted), None)
-
-
 def _difference(cell: Estimate | None, printed: str) -> Difference | None:
     return None if cell is None or not printed else Difference(cell.mean - float(printed))
 
 
-def _marks(table: PaperTable, rows: Sequence[Sequence[Cell]], ranked: Sequence[int]) -> dict:
-    """Mark the best and the second best of each column; numbers that round to the same text tie."""
+def _marks(table: PaperTable, rows: Sequence[Sequence[Cell]], ranked: Sequence[int], first: int = 2) -> dict:
+    """Mark the best and the second best of each column from ``first`` on; equal texts tie."""
     marks = {}
-    for number, (_, metric) in enumerate(table.columns, 2):
+    for number, (_, metric) in enumerate(table.columns, first):
         _, digits, more, _ = METRICS[metric]
         values = {i: round(rows[i][number].mean, digits) for i in ranked if rows[i][number] is not None}
         order = sorted(set(values.values()), reverse=more)

@@ -1,0 +1,95 @@
+"""The commands that make's targets for the paper's tables and ablations would run."""
+
+import shlex
+import subprocess
+
+import pytest
+
+from tests.support.configs import ROOT, options
+
+FAKE = '#!/bin/sh\nprintf "%s" "$(basename $0)" >> "$SAID"\nprintf " %s" "$@" >> "$SAID"\necho >> "$SAID"\n'
+
+
+@pytest.fixture
+def made(tmp_path, monkeypatch):
+    """Run make with commands that only write down how they were called; return their calls."""
+    for name in ("forewarp-train", "forewarp-report"):
+        (tmp_path / name).write_text(FAKE)
+        (tmp_path / name).chmod(0o755)
+    monkeypatch.setenv("SAID", str(tmp_path / "said"))
+    for word in ("MAKEFLAGS", "MAKELEVEL", "MFLAGS"):  # of a make that runs the tests
+        monkeypatch.delenv(word, raising=False)
+
+    def run(line):
+        words = ["make", "-C", str(ROOT), f"BIN={tmp_path}", "JOBS=1", *shlex.split(line)]
+        subprocess.run(words, check=True, capture_output=True, text=True)
+        return [set(call.split()) for call in (tmp_path / "said").read_text().splitlines()]
+
+    return run
+
+
+def called(calls, *words):
+    """The calls that have all these words."""
+    return [call for call in calls if call.issuperset(words)]
+
+
+def test_tables_without_data_fit_all_methods_on_two_counterparts(made):
+    *fits, report = made("reproduce-tables")
+    assert report == {"forewarp-report", "kind=paper", "out=runs/paper/results", "curves=docs/results"}
+    common = {"preset=demo", "budget.minutes=1", "seeds=1", "threads=1", "budget.clock=processor"}
+    pairs = [
+        ("methods", "dnerf"),
+        ("nhr", "nhr"),
+        ("methods", "hypernerf"),
+        ("lego_complete", "lego_complete"),
+    ]
+    assert len(called(fits, *common)) == len(fits) == len(pairs)
+    for sweep, dataset in pairs:
+        assert len(called(fits, f"sweeps={sweep}", f"scene=counterpart_{dataset}")) == 1
+
+
+def test_methods_seeds_minutes_and_views_are_named_by_key(made):
+    *fits, _ = made('reproduce-tables METHODS="dnerf ndvg" MINUTES=3 SEEDS=4,7 VIEWS=9 SWEEPS=all')
+    assert len(called(fits, "budget.minutes=3", "seed=4,7", "views=9")) == len(fits) == 9
+    own = called(fits, "model=dnerf,ndvg")
+    assert [word for call in own for word in call if word.startswith("sweeps=")] == [
+        *("sweeps=methods", "sweeps=nhr", "sweeps=methods", "sweeps=lego_complete")
+    ]
+
+
+def test_real_scenes_are_fitted_by_the_methods_named(made):
+    words = (
+        'reproduce-tables DATA=there METHODS="tnerf dnerf" SCENES="hook lego" SWEEPS="dnerf ablation_losses"'
+    )
+    own, ablations, report = made(words)
+    common = {"preset=fast", "budget.minutes=5", "paths.scenes=there", "scene=dnerf_hook,dnerf_lego"}
+    assert own > common | {"sweeps=dnerf", "model=tnerf,dnerf"}
+    assert ablations > common | {"sweeps=ablation_losses"}
+    assert not [word for word in ablations if word.startswith("model=")]
+    assert "kind=paper" in report
+
+
+def test_ablations_are_run_for_equal_minutes_and_equal_steps(made):
+    *fits, report = made("ablations MINUTES=0.1 STEPS=30")
+    assert report == {"forewarp-report", "kind=ablation", "out=docs/results"}
+    by_time = called(fits, "budget.minutes=0.1", "seeds=2")
+    by_steps = called(fits, "budget.minutes=null", "budget.iterations=30", "seeds=2")
+    assert len(by_time) == len(by_steps) == 4
+    common = {"preset=demo", "threads=1", "budget.clock=processor", "stage.fine.share=2"}
+    assert len(called(fits, *common)) == len(fits) == 8
+    for group in (by_time, by_steps):
+        assert {word for call in group for word in call if word.startswith(("sweeps=", "scene="))} == {
+            *("sweeps=ablation_losses", "sweeps=ablation_modules"),
+            *(f"scene=counterpart_{dataset}" for dataset in ("dnerf", "hypernerf", "lego_complete")),
+        }
+
+
+def test_the_commands_choose_what_there_is(made):
+    calls = made("reproduce-tables SWEEPS=all")
+    words = {word for call in calls for word in call if word.startswith(("sweeps=", "scene="))}
+    known = {f"{group}={name}" for group in ("sweeps", "scene") for name in options_of(group)}
+    assert words <= known
+
+
+def options_of(group):
+    return [path.stem for path in (ROOT / "sweeps").glob("*.yaml")] if group == "sweeps" else options(group)
