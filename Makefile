@@ -136,7 +136,7 @@ endif
 
 # METHODS="dnerf tineuvox_b": these in place of a sweep's own; ablations and the resolution are of model=forward.
 OF_METHODS = $(if $(METHODS),model=$(subst $(space),$(comma),$(strip $(METHODS))))
-UNTIL = $(if $(STEPS),budget.minutes=null budget.iterations=$(STEPS),$(if $(filter-out null,$(MINUTES)),budget.minutes=$(MINUTES)))
+UNTIL = $(if $(STEPS),budget.minutes=null budget.iterations=$(STEPS),$(if $(MINUTES),budget.minutes=$(MINUTES)))
 REPRODUCE = table() { \
 	case $$1 in sweeps=ablation_*|sweeps=resolution) of=;; *) of=$(OF_METHODS);; esac; \
 	$(BIN)/forewarp-train --multirun preset=$(PRESET) $(UNTIL) $(SEED) $(if $(VIEWS),views=$(VIEWS)) score=null \

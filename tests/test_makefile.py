@@ -48,6 +48,12 @@ def test_tables_without_data_fit_all_methods_on_two_counterparts(made):
         assert len(called(fits, f"sweeps={sweep}", f"scene=counterpart_{dataset}")) == 1
 
 
+@pytest.mark.parametrize("more", ["", " DATA=there SWEEPS=methods"])
+def test_the_published_numbers_are_not_cut_short_by_minutes(made, more):
+    *fits, _ = made("reproduce-tables PRESET=faithful" + more)
+    assert len(called(fits, "preset=faithful", "budget.minutes=null")) == len(fits) > 0
+
+
 def test_methods_seeds_minutes_and_views_are_named_by_key(made):
     *fits, _ = made('reproduce-tables METHODS="dnerf ndvg" MINUTES=3 SEEDS=4,7 VIEWS=9 SWEEPS=all')
     assert len(called(fits, "budget.minutes=3", "seed=4,7", "views=9")) == len(fits) == 9

@@ -12,6 +12,7 @@ import csv
 import io
 import json
 import resource
+import signal
 import subprocess
 import sys
 import tempfile
@@ -42,6 +43,7 @@ PAGE = Path("docs/results/faithful-step.md")
 METHODS = ("forward", "backward", "nerf", "tnerf", "dnerf", "nerfies", "hypernerf", "neural_volumes")
 METHODS += ("ndvg", "tineuvox_s", "tineuvox_b")
 FIELDS = ("method", "of", "rays", "flop", "seconds", "bytes", "parameters", "steps", "failed")
+CONDITIONS = ("scene", "day")
 LEAST = 64  # rays
 
 
@@ -125,8 +127,9 @@ def apart(method: str, scene: Path, gib: float) -> dict:
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode == 0:
             return json.loads(done.stdout.splitlines()[-1])
-        why = done.stderr.strip().split("\n")[-1]
-        if "allocate memory" not in done.stderr and "MemoryError" not in done.stderr:
+        why = done.stderr.strip().split("\n")[-1] or f"ended by signal {-done.returncode}"
+        killed = done.returncode == -signal.SIGKILL  # as the system does where memory is short
+        if not killed and "allocate memory" not in done.stderr and "MemoryError" not in done.stderr:
             break
         rays = (rays or configured(method, scene).preset.rays) // 2
         why = f"does not fit into {gib:g} GiB"
@@ -165,20 +168,20 @@ def known_rows(file: Path) -> list[dict]:
     """Read the rows of an earlier call."""
     return [
         {
-            name: row[name] if name in ("method", "failed") else json.loads(row[name] or "null")
-            for name in FIELDS
+            name: row[name] if name in ("method", "failed", *CONDITIONS) else json.loads(row[name] or "null")
+            for name in (*FIELDS, *CONDITIONS)
         }
         for row in read_rows(file)
     ]
 
 
-def write(rows: Sequence[dict], page: Path, scene: str) -> None:
+def write(rows: Sequence[dict], page: Path) -> None:
     """Write the table into the page, and a CSV file beside it."""
-    device, day = device_name(torch.device("cpu")), time.strftime("%Y-%m-%d")
-    about = f"Scene: {scene}. Machine: {device}, one thread, torch {torch.__version__}, {day}."
+    scene, day = (" and ".join(sorted({row[name] for row in rows})) for name in CONDITIONS)
+    about = f"Scene: {scene}. Machine: {device_name(torch.device('cpu'))}, one thread, {day}."
     replace_section(page, "steps", f"{about}\n\n{steps_table(rows)}")
     file = io.StringIO()
-    writer = csv.DictWriter(file, FIELDS, lineterminator="\n")
+    writer = csv.DictWriter(file, (*FIELDS, *CONDITIONS), lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
     replace_file(page.with_suffix(".csv"), file.getvalue())
@@ -203,10 +206,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     rows = {row["method"]: row for row in known_rows(given.page.with_suffix(".csv"))}
     with tempfile.TemporaryDirectory() as folder:
         scene = given.scene.resolve() if given.scene else synthesize(Path(folder) / "vehicle")
+        if others := {row["scene"] for row in rows.values()} - {scene.name}:
+            parser.error(
+                f"--scene: expected {', '.join(others)}, as in the table's rows, but got {scene.name}"
+            )
         for method in given.only:
-            rows[method] = apart(method, scene, given.gib)
+            about = {"scene": scene.name, "day": time.strftime("%Y-%m-%d")}
+            rows[method] = apart(method, scene, given.gib) | about
             print(rows[method], flush=True)
-    write([rows[method] for method in METHODS if method in rows], given.page, scene.name)
+            write([rows[method] for method in METHODS if method in rows], given.page)
     print(given.page)
 
 

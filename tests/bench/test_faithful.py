@@ -20,9 +20,10 @@ def test_a_method_that_failed_says_why_in_its_row(tmp_path):
     page = tmp_path / "page.md"
     page.write_text("# Steps\n<!-- steps -->\n<!-- end of steps -->\n")
     row = {"method": "nerf", "of": 1000, "rays": 1000, "flop": 3 * 10**9, "seconds": 8.64, "bytes": 2**30}
-    row |= {"parameters": 1_500_000, "steps": 20_000, "failed": ""}
+    row |= {"parameters": 1_500_000, "steps": 20_000, "failed": "", "scene": "ball", "day": "today"}
     less = row | {"method": "nerfies", "rays": 500}
-    write([row, less, dict.fromkeys(FIELDS) | {"method": "ndvg", "failed": "killed"}], page, "ball")
+    failed = dict.fromkeys(FIELDS) | {"method": "ndvg", "failed": "killed", "scene": "ball", "day": "today"}
+    write([row, less, failed], page)
     lines = page.read_text().splitlines()
     assert "| `nerf` | 1,000 | 3 | 3.0 | 8.6 | 1.0 | 1.50 | 20,000 | 2.0 |" in lines
     shown = "1,000, measured with 500 | ≈ 6 | 6.0 | ≈ 17.3 | 1.0 with 500 | 1.50 | 20,000 | ≈ 4.0 |"

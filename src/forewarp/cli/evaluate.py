@@ -29,6 +29,7 @@ def evaluate(config) -> None:
 
     refuse_numbers(config, "views", "sheets")
     saved = saved_config(config.run, config)
+    saved.views = config.views  # not those of the run: null is all
     # These load torch; mistakes have been answered before.
     from forewarp.runs.build import build_run, measure_run
     from forewarp.runs.data_check import warn_if_changed

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -105,6 +106,7 @@ def evaluate(
     """
     scene, targets, finished = datamodule.scene, datamodule.targets("test"), finished or {}
     chosen = middles(len(targets), views)
+    shutil.rmtree(Path(folder) / "images", ignore_errors=True)  # views that are not measured now
     on_sheets = {chosen[i] for i in spread(len(chosen), sheets)}
     rows: dict[int, dict] = {}
     for shown in draw(module, targets, chosen):

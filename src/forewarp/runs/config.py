@@ -96,9 +96,9 @@ def saved_config(run: str | None, changes: DictConfig, key: str = "run") -> Dict
 
     Args:
         run: the run's folder.
-        changes: the command's own config; the keys ``trainer``, ``threads``, ``lpips_weights``, ``sheets``,
-            ``views`` and ``data.root`` are applied if they are not null. ``trust`` names packages whose code
-            the run's config may name.
+        changes: the command's own config; the keys ``trainer``, ``threads``, ``lpips_weights``, ``sheets``
+            and ``data.root`` are applied if they are not null. ``trust`` names packages whose code the run's
+            config may name.
         key: name of the key that holds the folder, for errors.
 
     Raises:
@@ -112,7 +112,7 @@ def saved_config(run: str | None, changes: DictConfig, key: str = "run") -> Dict
             f"{path}: expected the configuration of a run, but got none; set {key}=<a run's folder>"
         )
     saved = read_config(path, trust_of(changes.get("trust")))
-    for name in ("trainer", "threads", "lpips_weights", "sheets", "views"):
+    for name in ("trainer", "threads", "lpips_weights", "sheets"):
         if changes.get(name) is not None:
             saved[name] = changes[name]
     if (changes.get("data") or {}).get("root") is not None:
