@@ -94,6 +94,7 @@ def test_the_commands_choose_what_there_is(made):
     calls = made("reproduce-tables SWEEPS=all")
     words = {word for call in calls for word in call if word.startswith(("sweeps=", "scene="))}
     known = {f"{group}={name}" for group in ("sweeps", "scene") for name in options_of(group)}
+    assert words
     assert words <= known
 
 

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import sys
 
 import numpy as np
 import pytest
@@ -19,7 +20,8 @@ def method_run(root, name, psnr, *, seed=0, minutes=5.0, sheets=True, **protocol
     """A run of a method, with sheets of two views at 0.2 and 0.8; how red its pictures are tells its PSNR."""
     config = {"model": {"name": name}, "variant": None}
     command = f"forewarp-train seed={seed} scene=ball model={name} run=runs/{name}"
-    metrics = {"protocol": {"clock": "processor", **protocol}}
+    views = {"measured": "5 of 20 test views, evenly spread"}
+    metrics = {"protocol": {"clock": "processor", **views, **protocol}}
     named = {"seed": seed, "minutes": minutes, "psnr": psnr, "command": command}
     curve = ((10, psnr - 5), (100, psnr))
     folder = write_run(root, name, config=config, metrics=metrics, curve=curve, **named)
@@ -40,7 +42,7 @@ def test_methods_are_ranked_and_what_they_depart_from_is_listed_once(tmp_path):
     runs, out = tmp_path / "runs", tmp_path / "out"
     method_run(runs, "forward", 27.0)
     for seed, psnr in ((0, 30.0), (1, 32.0)):
-        method_run(runs, "particles", psnr, seed=seed, measured="5 of 20 test views, evenly spread")
+        method_run(runs, "particles", psnr, seed=seed)
     method_run(runs, "ndvg", 22.0, departures="rays of one picture; no pool", faults="padded")
     method_run(runs, "tnerf", 21.0, departures="rays of one picture", sheets=False)
     write_run(runs, "full", config={"variant": {"name": "full"}})
@@ -60,7 +62,7 @@ def test_methods_are_ranked_and_what_they_depart_from_is_listed_once(tmp_path):
     with Image.open(views) as picture:
         assert picture.mode == "P"  # few colours
         reds = [red for _, (red, green, _) in picture.convert("RGB").getcolors() if green < 8]
-    for psnr, there in ((27, True), (30, True), (22, True), (21, False), (25, False)):
+    for psnr, there in ((27, True), (30, True), (22, True), (21, False)):
         assert any(abs(red - 7 * psnr) < 4 for red in reds) == there, psnr  # tnerf has no sheets
 
 
@@ -72,6 +74,55 @@ def test_later_runs_are_added_and_the_longest_are_drawn(tmp_path):
     text = write_methods(tmp_path / "later", tmp_path / "out")[0].read_text()
     assert [row[1] for row in rows_of(text, "`forward` (the paper's)")] == ["27.00", "29.00"]
     assert "](faithful-step.md)" in text
+
+
+def test_runs_under_other_conditions_have_a_table_of_their_own(tmp_path):
+    runs, out = tmp_path / "runs", tmp_path / "out"
+    conditions = (
+        {},
+        {"clock": None},
+        {"threads": None},
+        {"device": "other"},
+        {"measured": "9 of 20 test views"},
+    )
+    for number, more in enumerate(conditions):
+        method_run(runs / str(number), "forward", 20.0 + number, sheets=False, **more)
+    for _ in range(2):  # the second time the rows come from the table, too
+        text = write_methods(runs, out)[0].read_text()
+        found = [row[1] for row in rows_of(text, "`forward` (the paper's)")]
+        assert sorted(found) == [f"{20 + number}.00" for number in range(len(conditions))]
+    assert text.count("5 minutes, wall clock") == 1
+    method_run(tmp_path / "again", "forward", 30.0, sheets=False)
+    text = write_methods(tmp_path / "again", out)[0].read_text()
+    found = [row[1] for row in rows_of(text, "`forward` (the paper's)")]
+    assert sorted(found) == ["21.00", "22.00", "23.00", "24.00", "30.00"]  # measured again
+
+
+def test_a_picture_of_more_methods_stays(tmp_path):
+    for name in ("forward", "ndvg"):
+        method_run(tmp_path / "runs", name, 25.0)
+    write_methods(tmp_path / "runs", tmp_path / "out")
+    picture = tmp_path / "out" / "methods-ball-views.png"
+    before = picture.read_bytes()
+    method_run(tmp_path / "later", "ndvg", 20.0)
+    text = write_methods(tmp_path / "later", tmp_path / "out")[0].read_text()
+    assert picture.read_bytes() == before
+    assert "after 5 minutes: forward, ndvg](methods-ball-views.png)" in text
+
+
+def test_without_matplotlib_the_page_says_why_it_has_no_picture(tmp_path, monkeypatch):
+    method_run(tmp_path / "runs", "forward", 25.0)
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    monkeypatch.setitem(sys.modules, "matplotlib.image", None)
+    written = write_methods(tmp_path / "runs", tmp_path / "out")
+    assert [file.name for file in written] == ["methods.md", "methods.csv"]
+    assert "install forewarp[plots]" in written[0].read_text()
+
+
+def test_a_page_without_any_row_is_refused(tmp_path):
+    write_run(tmp_path / "runs", minutes=None)
+    with pytest.raises(ValueError, match="expected measured runs that ended after minutes"):
+        write_methods(tmp_path / "runs", tmp_path / "out")
 
 
 def test_runs_without_curves_and_pictures_have_a_table(tmp_path, ok):

@@ -152,12 +152,15 @@ def _cells(
     change = Estimate.of(list(differences(found, row.variant, group).values()))
     step, whole = (_step(found[variant], group) for variant in (row.variant, "full"))
     order = verdict(change.mean, printed.get(row.variant), noise) if change else None
-    return [found[row.variant].cell(group, "psnr"), change, order, step, step / whole]
+    times = step / whole if step and whole else None
+    return [found[row.variant].cell(group, "psnr"), change, order, step, times]
 
 
-def _step(one: Measured, group: Group) -> float:
-    """The mean seconds of a step of the runs on the group's scenes."""
-    return fmean(run.numbers["step"] for run in runs_of([one]) if run.scene in group.scenes)
+def _step(one: Measured, group: Group) -> float | None:
+    """The mean seconds of a step of the runs on the group's scenes; None if no run tells its steps."""
+    numbers = [run.numbers for run in runs_of([one]) if run.scene in group.scenes]
+    known = [found["step"] for found in numbers if "step" in found]
+    return fmean(known) if known else None
 
 
 def _printed(table: PaperTable, group: Group) -> dict[str, float]:

@@ -112,6 +112,12 @@ class Result:
         return self.config["budget"]["minutes"]
 
     @property
+    def clock(self) -> str:
+        """The clock that its minutes are of: ``wall`` or ``processor``."""
+        protocol, budget = self.metrics.get("protocol", {}), self.config["budget"]
+        return protocol.get("clock") or budget.get("clock") or "wall"
+
+    @property
     def command(self) -> str:
         """The command that made the run."""
         return self.config.get("command") or f"forewarp-train # as {self.folder / 'config.yaml'}"
@@ -119,8 +125,12 @@ class Result:
     @property
     def day(self) -> str:
         """The day on which the run was measured, as 2026-11-22."""
-        seconds = (self.folder / "metrics.json").stat().st_mtime
-        return datetime.fromtimestamp(seconds, timezone.utc).date().isoformat()
+        return datetime.fromtimestamp(self.measured_at / 1e9, timezone.utc).date().isoformat()
+
+    @property
+    def measured_at(self) -> int:
+        """When the run was measured, in nanoseconds: the time of ``metrics.json``."""
+        return (self.folder / "metrics.json").stat().st_mtime_ns
 
     @property
     def ability(self) -> str:
@@ -260,14 +270,25 @@ def left_out(title: str, lines: Sequence[str]) -> list[str]:
 
 def machine(results: Sequence[Result]) -> str:
     """Say in one line what the runs were computed on."""
-    found = []
-    for protocol in (result.metrics.get("protocol", {}) for result in results):
-        torch = protocol.get("versions", {}).get("torch")
-        threads = protocol.get("threads")
-        about = [protocol.get("device"), f"{threads} thread{'s' * (threads != 1)}", f"torch {torch}"]
-        if protocol.get("device") and about not in found:
-            found.append(about)
-    return "; ".join(", ".join(about) for about in found) or "unknown"
+    protocols = [result.metrics.get("protocol", {}) for result in results]
+    versions = [protocol.get("versions", {}).get("torch") for protocol in protocols]
+    return machines(
+        (protocol.get("device"), protocol.get("threads"), torch and f"torch {torch}")
+        for protocol, torch in zip(protocols, versions)
+    )
+
+
+def machines(found: Iterable[tuple[str | None, float | None, str | None]]) -> str:
+    """Say in one line what machines there are: of each the device, the threads and one word more.
+
+    >>> machines([("a cpu", 2.0, "torch 2"), ("a cpu", None, None), (None, 1, ""), ("a cpu", None, None)])
+    'a cpu, 2 threads, torch 2; a cpu'
+    """
+    lines = {}
+    for device, threads, more in found:
+        told = f"{threads:g} thread{'s' * (threads != 1)}" if threads else None
+        lines |= {", ".join(filter(None, (device, told, more))): None} if device else {}
+    return "; ".join(lines) or "unknown"
 
 
 def _json(path: Path) -> dict:

@@ -12,6 +12,7 @@ from forewarp.files import MOST_CONFIG, read_text, written_whole
 from forewarp.report.collect import Point, Result, read_curve
 
 OTHERS = Path(__file__).with_name("published.yaml")  # results of others
+NO_PLOTS = "expected matplotlib for plots; install forewarp[plots]"
 _KEYS = ("name", "seconds", "psnr", "hardware", "source", "dataset")
 
 
@@ -127,7 +128,7 @@ def _axes(with_flow: bool, wide: bool = False):
     try:
         from matplotlib.figure import Figure
     except ImportError:
-        raise ImportError("expected matplotlib for plots; install forewarp[plots]") from None
+        raise ImportError(NO_PLOTS) from None
     # Without pyplot, which keeps global state and looks for a display.
     figure = Figure(figsize=(7, 7.5 if with_flow else 4.5), layout="constrained")
     axes = figure.subplots(2 if with_flow else 1, 1, squeeze=False)[:, 0]

@@ -2,23 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
-from forewarp.files import replace_file
-from forewarp.report.collect import Result, left_out
+from forewarp.files import read_text, replace_file
+from forewarp.report.collect import left_out
 from forewarp.report.methods_figures import draw_curves, draw_views
 from forewarp.report.run_rows import (
     CLOCKS,
-    KEY,
+    CONDITIONS,
     NETS,
+    apart,
     commands,
     estimate,
     key_of,
-    machine,
+    made_on,
     merged,
     of_minutes,
+    row_of,
+    telling,
 )
+from forewarp.report.sheets import sheets_of
 from forewarp.report.tables import Column, Table
 
 OURS = "forward"  # the paper's own method
@@ -34,13 +40,18 @@ reach in such minutes, and says nothing of what they reach in the hours of a GPU
 {clocks}
 
 PSNR (dB), SSIM and LPIPS are means over the test views; ± is the standard deviation over seeds. *s a
-step* are all seconds of training by the number of steps, *s a frame* those of the first picture of a
-time, *GiB* the most memory of the process. LPIPS is of the first of {nets} whose weights were there.
+step* are all seconds of training by the number of steps. *s a frame* are those of the first picture of a
+time, the mean over the test views measured, by the wall clock: other work on the machine makes them more.
+*GiB* is the most memory of the process. LPIPS is of the first of {nets} whose weights were there.
 """
 CURVES = """PSNR of some pixels of validation views while each method learns; the number at a line's end is
 the last of these, and not the table's, which is of whole test views. Schedules follow the share of the
 minutes that is spent, so no method is at its best before the end.
 """
+CURVES_OF, VIEWS_OF = (
+    "PSNR against seconds of training",
+    "Test views, the truth first,",
+)  # and then the methods
 VIEWS = "Test views and their PSNR (dB), cut to the subject: what a method draws elsewhere is not seen.\n"
 NUMBERS = ("psnr", "ssim", "lpips", "steps", "step", "frame", "parameters", "memory")
 COLUMNS = (
@@ -52,8 +63,8 @@ COLUMNS = (
 def write_methods(runs: Path, out: Path) -> list[Path]:
     """Write ``methods.md``, ``methods.csv`` (a row a run), and two pictures of each scene.
 
-    Rows of a table that is there already stay, as in ``write_minutes``; views are drawn of the given runs
-    alone. Ablations among the runs are left out.
+    Rows of a table that is there already stay, as in ``write_minutes``. Views are drawn of the given runs
+    alone; a picture that an earlier page shows stays if it has more methods. Ablations are left out.
 
     Args:
         runs: folder to search for measured runs.
@@ -61,6 +72,9 @@ def write_methods(runs: Path, out: Path) -> list[Path]:
 
     Returns:
         the files written.
+
+    Raises:
+        ValueError: if there is no run of a method, and no table with such runs.
     """
     results, without = of_minutes(runs)
     plain = [run for run in results if (run.config.get("variant") or {}).get("name") in (None, "base")]
@@ -68,12 +82,16 @@ def write_methods(runs: Path, out: Path) -> list[Path]:
     page, table = out / "methods.md", out / "methods.csv"
     rows, written = merged(table, plain), [page, table]
     about = INTRODUCTION.format(ours=OURS, clocks=CLOCKS, nets=", ".join(NETS))
-    parts = [about, f"Machine: {machine(rows)}.\n"]
+    parts = [about, f"Machine: {made_on(rows)}.\n"]
+    earlier = read_text(page) if page.is_file() else ""
+    folders = {key_of(row_of(run)): run.folder for run in sorted(plain, key=lambda run: run.measured_at)}
     for scene in sorted({row["scene"] for row in rows}):
-        text, pictures = _scene(scene, rows, plain, out)
-        parts += text
+        own = [row for row in rows if row["scene"] == scene]
+        text, pictures = _pictures(scene, own, folders, out, earlier)
+        parts += [f"## {scene}\n", *text, *(_reached(group, own).markdown() for group in apart(own))]
         written += pictures
-    parts += [_departures(rows).markdown()]
+    if (departures := _departures(rows)).rows:
+        parts += [departures.markdown()]
     if (out / STEPS).is_file():
         parts += [f"What a step costs with the published numbers: [a step of `faithful`]({STEPS}).\n"]
     parts += [commands(rows), *left_out("Without numbers", without)]
@@ -87,31 +105,43 @@ def names_of(rows: Sequence[dict]) -> dict[int, str]:
     return {id(row): row["method"] + (f" ({row['preset']})" if several else "") for row in rows}
 
 
-def _scene(scene: str, rows: list[dict], results: list[Result], out: Path) -> tuple[list[str], list[Path]]:
-    """The part of the page about a scene, and its pictures, which are of each method's longest runs."""
-    own = [row for row in rows if row["scene"] == scene]
-    names, parts, pictures = names_of(own), [f"## {scene}\n"], []
-    longest: dict[str, dict] = {}
-    for row in sorted(own, key=lambda row: (row["minutes"], -row["seed"])):
-        longest[names[id(row)]] = row
-    if drawn := draw_curves(out / f"methods-{scene}.png", longest, scene):
-        parts += [f"![PSNR against seconds of training, a line a method]({drawn.name})\n", CURVES]
-        pictures.append(drawn)
-    at = {tuple(row[key] for key in KEY): name for name, row in longest.items()}
-    folders = {at[key_of(run)]: run.folder for run in results if key_of(run) in at}
-    ranked = sorted(folders, key=lambda name: -(longest[name]["psnr"] or 0.0))
-    path = out / f"methods-{scene}-views.png"
-    if drawn := draw_views(path, {name: folders[name] for name in ranked}):
-        parts += [f"![Test views, the truth and each method]({drawn.name})\n", VIEWS]
-        pictures.append(drawn)
-    for minutes in sorted({row["minutes"] for row in own}):
-        parts.append(_reached([row for row in own if row["minutes"] == minutes], names).markdown())
-    return parts, pictures
+def _pictures(
+    scene: str, rows: list[dict], folders: Mapping[tuple, Path], out: Path, earlier: str
+) -> tuple[list[str], list[Path]]:
+    """The part of the page with a scene's pictures, and those drawn; of one group of ``apart``.
+
+    That is the group with the most methods and, of equal ones, the most minutes; of a method its first seed.
+    """
+    names, parts, drawn = names_of(rows), [], []
+    chosen = max(apart(rows), key=lambda group: (len({names[id(row)] for row in group}), group[0]["minutes"]))
+    first = {names[id(row)]: row for row in sorted(chosen, key=lambda row: -row["seed"])}
+    about = f"{chosen[0]['minutes']:g} minutes"
+    seen = {name: folders[key_of(row)] for name, row in first.items() if key_of(row) in folders}
+    seen = {name: folder for name, folder in seen.items() if sheets_of(folder)}
+    seen = dict(sorted(seen.items(), key=lambda one: -(first[one[0]]["psnr"] or 0.0)))
+    curves, views = out / f"methods-{scene}.png", out / f"methods-{scene}-views.png"
+    for path, heading, text, shown, draw in (
+        (curves, CURVES_OF, CURVES, first, partial(draw_curves, rows=first, title=f"{scene}, {about}")),
+        (views, VIEWS_OF, VIEWS, seen, partial(draw_views, runs=seen)),
+    ):
+        known = re.search(rf"!\[(.*)\]\({re.escape(path.name)}\)", earlier) if path.is_file() else None
+        if known and len(known[1].rpartition(": ")[2].split(", ")) > len(shown):
+            parts += [f"{known[0]}\n", text]
+            continue
+        try:
+            done = draw(path)
+        except ImportError as error:
+            parts += [f"{known[0]}\n", text] if known else [f"Without a picture: {error}.\n"]
+            continue
+        if done:
+            parts += [f"![{heading} after {about}: {', '.join(shown)}]({path.name})\n", text]
+            drawn.append(path)
+    return parts, drawn
 
 
-def _reached(rows: list[dict], names: dict[int, str]) -> Table:
-    """All numbers of the runs of a scene and some minutes, the best PSNR first."""
-    groups: dict[str, list[dict]] = {}
+def _reached(rows: list[dict], others: list[dict]) -> Table:
+    """All numbers of the runs of a scene that may be compared, the best PSNR first."""
+    names, groups = names_of(others), {}
     for row in rows:
         groups.setdefault(names[id(row)], []).append(row)
     lines = []
@@ -121,9 +151,10 @@ def _reached(rows: list[dict], names: dict[int, str]) -> Table:
         paper = " (the paper's)" if group[0]["method"] == OURS else ""
         lines.append([f"`{name}`{paper}", *(found | plain).values()])
     lines.sort(key=lambda line: -line[1].mean if line[1] else 0.0)
-    measured = "; ".join(sorted({row["measured"] for row in rows if row["measured"]}))
-    about = f"{rows[0]['scene']}, {rows[0]['minutes']:g} minutes" + (f", {measured}" if measured else "")
-    return Table(COLUMNS, lines, caption=f"**{about}**")
+    measured = sorted({row["measured"] for row in rows if row["measured"]})
+    words = telling(rows[0], others, [name for name in CONDITIONS if name != "measured"])
+    about = [rows[0]["scene"], f"{rows[0]['minutes']:g} minutes", *words, *measured]
+    return Table(COLUMNS, lines, caption=f"**{', '.join(about)}**")
 
 
 def _departures(rows: list[dict]) -> Table:

@@ -46,11 +46,9 @@ def draw_curves(path: Path, rows: Mapping[str, dict], title: str) -> Path | None
     ends = {name: points[-1] for name, points in curves.items()}
     low, high = axis.get_ylim()
     places = spread_out([psnr for _, psnr in ends.values()], 0.042 * (high - low))
-    minutes = {rows[name]["minutes"] for name in ends}
     for (name, end), place in zip(ends.items(), places):
-        about = f", {rows[name]['minutes']:g} min" if len(minutes) > 1 else ""
         axis.annotate(
-            f"{end[1]:.1f}  {name}{about}",
+            f"{end[1]:.1f}  {name}",
             end,
             (1.03, place),
             textcoords=axis.get_yaxis_transform(),
@@ -59,8 +57,7 @@ def draw_curves(path: Path, rows: Mapping[str, dict], title: str) -> Path | None
             annotation_clip=False,
             arrowprops={"color": styles[name][0]} | LEADER,
         )
-    one = f", {minutes.pop():g} minutes" if len(minutes) == 1 else ""
-    axis.set_title(title + one)
+    axis.set_title(title)
     return curve._save(figure, path)
 
 

@@ -8,7 +8,18 @@ from pathlib import Path
 from forewarp.files import replace_file
 from forewarp.report import curve
 from forewarp.report.collect import left_out
-from forewarp.report.run_rows import CLOCKS, NETS, commands, estimate, machine, merged, of_minutes, pairs
+from forewarp.report.run_rows import (
+    CLOCKS,
+    CONDITIONS,
+    NETS,
+    commands,
+    estimate,
+    made_on,
+    merged,
+    of_minutes,
+    pairs,
+    telling,
+)
 from forewarp.report.sheets import figure_of
 from forewarp.report.tables import Column, Table
 
@@ -24,7 +35,7 @@ first of {nets} whose weights were there.
 def write_minutes(runs: Path, out: Path) -> list[Path]:
     """Write ``<method>.md``, ``.csv`` (a row a run) and ``.png`` (PSNR by view) of each method in the runs.
 
-    Rows of a table that is there already stay, unless a run of the same preset, scene, minutes and seed
+    Rows of a table that is there already stay, unless a run of the same ``run_rows.KEY``
     replaces them: runs may be made one day after the other.
 
     Args:
@@ -41,15 +52,26 @@ def write_minutes(runs: Path, out: Path) -> list[Path]:
         page, table, picture = (out / f"{method}.{kind}" for kind in ("md", "csv", "png"))
         rows = merged(table, own)
         about = INTRODUCTION.format(method=method, clocks=CLOCKS, nets=", ".join(NETS))
-        parts = [about, f"Machine: {machine(rows)}.\n"]
-        parts += [_by_minutes(rows).markdown(), "## Each\n", _details(rows).markdown()]
+        parts = [about, f"Machine: {made_on(rows)}.\n"]
+        named = _named(rows)
+        parts += [_by_minutes(named).markdown(), "## Each\n", _details(named).markdown()]
         parts += ["## By view\n", f"![PSNR of each test view over time]({picture.name})\n"]
         parts += [commands(rows)]
         parts += left_out("Without numbers", without)
         replace_file(page, "\n".join(parts))
-        _draw(rows, picture)
+        _draw(named, picture)
         written += [page, table, picture]
     return written
+
+
+def _named(rows: list[dict]) -> list[dict]:
+    """The rows; where those of a scene differ in preset or ``CONDITIONS``, its name says in what."""
+    found = []
+    for row in rows:
+        others = [other for other in rows if other["scene"] == row["scene"]]
+        words = telling(row, others, ("preset", *CONDITIONS))
+        found.append(row | {name: ", ".join([row[name] or "", *words]) for name in ("scene", "dataset")})
+    return found
 
 
 def _by_minutes(rows: list[dict]) -> Table:

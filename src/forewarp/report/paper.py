@@ -68,7 +68,7 @@ def write_paper(runs: Path, out: Path, published: Path = PAPER, curves: Path | N
 def newest(results: Sequence[Result]) -> tuple[list[Result], list[Result]]:
     """Of runs with the same table entry select the one measured last; return these runs, and the others."""
     kept: dict[tuple, Result] = {}
-    for run in sorted(results, key=lambda run: (run.folder / "metrics.json").stat().st_mtime_ns):
+    for run in sorted(results, key=lambda run: run.measured_at):
         kept[run.dataset, run.is_counterpart, run.scene, run.seed, row_of(run)] = run
     chosen = {run.folder for run in kept.values()}
     return [r for r in results if r.folder in chosen], [r for r in results if r.folder not in chosen]
@@ -159,6 +159,6 @@ def _write_csv(sections: Sequence[Section], out: Path) -> list[Path]:
 def _budget(run: Result) -> str:
     budget = run.config["budget"]
     minutes = f"{budget['minutes']:g} min a run" if budget["minutes"] else ""
-    minutes += " by the processor clock" if minutes and budget.get("clock") == "processor" else ""
+    minutes += " by the processor clock" if minutes and run.clock == "processor" else ""
     steps = f"{budget['iterations']} steps" if budget.get("iterations") else ""
     return ", ".join(word for word in (run.config["preset"]["name"], minutes, steps) if word)

@@ -89,7 +89,7 @@ def row_of(run: Result) -> Row:
     budget = run.config["budget"]
     known, protocol = (run.config.get("variant") or {}).get("name", "plain"), run.metrics.get("protocol", {})
     bounds = run.config["preset"]["name"], budget["minutes"], budget.get("iterations")
-    conditions = protocol.get("held_out", 0), protocol.get("device"), budget.get("clock") or "wall"
+    conditions = protocol.get("held_out", 0), protocol.get("device"), run.clock
     views = str(protocol.get("measured", "")).split(" ")[0]  # "10 of 30 test views, evenly spread"
     return Row(known, run.config["model"]["name"], *bounds, *conditions, int(views) if views else None)
 

@@ -11,11 +11,13 @@ from pathlib import Path
 
 from forewarp.files import read_json, read_text, replace_file
 from forewarp.metrics.gain import Estimate
-from forewarp.report.collect import Result, collect
+from forewarp.report.collect import Result, collect, machines
 
-KEY = ("method", "preset", "scene", "minutes", "seed")  # what tells rows apart
-NUMBERS = ("psnr", "ssim", "lpips", "steps", "step", "frame", "parameters", "memory", "ends", "threads")
-TEXTS = ("clock", "dataset", "device", "day", "measured", "departures", "faults", "views", "curve", "command")
+CONDITIONS = ("clock", "threads", "device", "measured")  # rows that differ in these are not compared
+FORMS = {"clock": "{} clock", "threads": "threads: {:g}"}
+KEY = ("method", "preset", "scene", "minutes", "seed", *CONDITIONS)  # what tells rows apart
+NUMBERS = ("psnr", "ssim", "lpips", "steps", "step", "frame", "parameters", "memory", "ends")
+TEXTS = ("dataset", "day", "departures", "faults", "views", "curve", "command")
 NETS = ("vgg", "alex", "squeeze")  # LPIPS is of the first whose weights were there
 CLOCKS = """Minutes are of training, by the
 platform's clock: it counts all that a method does to begin with (a visual hull, a plane sweep), and leaves
@@ -37,12 +39,6 @@ def of_minutes(runs: Path) -> tuple[list[Result], list[str]]:
     return [result for result in results if result.minutes is not None], without
 
 
-def key_of(result: Result) -> tuple[str, str, str, float, int]:
-    """What tells a run's row from others: ``KEY``."""
-    config = result.config
-    return config["model"]["name"], config["preset"]["name"], result.scene, result.minutes, result.seed
-
-
 def row_of(result: Result) -> dict:
     """A run's row: ``KEY``, ``NUMBERS`` and ``TEXTS``; what is not known is None.
 
@@ -54,22 +50,51 @@ def row_of(result: Result) -> dict:
     protocol = result.metrics["protocol"]
     frames = protocol.get("test_frames")
     return {
-        **dict(zip(KEY, key_of(result))),
+        "method": result.config["model"]["name"],
+        "preset": result.config["preset"]["name"],
+        "scene": result.scene,
+        "minutes": result.minutes,
+        "seed": result.seed,
+        "clock": result.clock,
+        "threads": protocol.get("threads"),
+        "device": protocol.get("device"),
+        "measured": protocol.get("measured", frames and f"all {frames} test views"),
         **{name: numbers.get(name) for name in NUMBERS},
         "lpips": next((scores[f"lpips_{net}"] for net in NETS if f"lpips_{net}" in scores), None),
         "ends": ends_below(views),
-        "threads": protocol.get("threads"),
-        "clock": protocol.get("clock", "wall"),
         "dataset": result.dataset,
-        "device": protocol.get("device"),
         "day": result.day,
-        "measured": protocol.get("measured", frames and f"all {frames} test views"),
         "departures": protocol.get("departures"),
         "faults": protocol.get("faults"),
         "views": " ".join(f"{time:.4f}:{psnr:.2f}" for time, psnr in views),
         "curve": " ".join(f"{point.seconds:.1f}:{point.psnr:.2f}" for point in result.curve),
         "command": result.command,
     }
+
+
+def key_of(row: dict, names: Sequence[str] = KEY) -> tuple:
+    """What tells a row from others; where all test views were measured, None, as in an older table."""
+    known = row | {"measured": None if (row["measured"] or "").startswith("all ") else row["measured"]}
+    return tuple(known[name] for name in names)
+
+
+def apart(rows: Iterable[dict]) -> list[list[dict]]:
+    """Group rows by minutes and ``CONDITIONS``: only rows of one group may be compared."""
+    groups: dict[tuple, list[dict]] = {}
+    for row in rows:
+        groups.setdefault(key_of(row, ("minutes", *CONDITIONS)), []).append(row)
+    return [groups[key] for key in sorted(groups, key=_order)]
+
+
+def telling(row: dict, others: Iterable[dict], names: Sequence[str] = CONDITIONS) -> list[str]:
+    """Say in a word each which of a row's ``names`` some of the other rows do not share.
+
+    >>> rows = [{"clock": clock, "threads": 1.0, "measured": None} for clock in ("wall", "processor")]
+    >>> telling(rows[0], rows, ("clock", "threads"))
+    ['wall clock']
+    """
+    differs = [name for name in names if len({key_of(one, (name,)) for one in (row, *others)}) > 1]
+    return [FORMS.get(name, "{}").format(row[name]) for name in differs if row[name] is not None]
 
 
 def pairs(text: str | None) -> list[tuple[float, float]]:
@@ -95,21 +120,33 @@ def ends_below(views: Sequence[tuple[float, float]]) -> float | None:
 def merged(file: Path, results: Iterable[Result]) -> list[dict]:
     """Add the rows of runs to those of a table, which is written; return all.
 
-    A run takes the place of a row of the same method, preset, scene, minutes and seed.
+    Of rows with the same ``KEY`` the one measured last stays; a run beats a row of its day.
+
+    Raises:
+        ValueError: if there would be no row.
     """
     known = list(csv.DictReader(io.StringIO(read_text(file, _MOST)))) if file.is_file() else []
-    found = {}
-    for row in (*(_read(row) for row in known), *(row_of(result) for result in results)):
-        found[tuple(row[name] for name in KEY)] = row
-    rows = [found[key] for key in sorted(found, key=str)]
+    rows = [_read(row) for row in known]
+    rows += [row_of(result) for result in sorted(results, key=lambda result: result.measured_at)]
+    if not rows:
+        raise ValueError(
+            "runs: expected measured runs that ended after minutes, but got none; set budget.minutes"
+        )
+    found = {key_of(row): row for row in sorted(rows, key=lambda row: row["day"] or "")}
+    rows = [found[key] for key in sorted(found, key=_order)]
     replace_file(file, _csv(rows))
     return rows
 
 
+def _order(key: tuple) -> list[tuple]:
+    """Sort keys by their parts, what is unknown first."""
+    return [(part is not None, part) for part in key]
+
+
 def _read(row: dict) -> dict:
     """A row as ``row_of`` makes it; of an older table some fields are unknown."""
-    numbers = {name: float(row[name]) if row.get(name) else None for name in ("minutes", *NUMBERS)}
-    texts = {name: row.get(name) or None for name in TEXTS}
+    numbers = {name: float(row[name]) if row.get(name) else None for name in ("minutes", "threads", *NUMBERS)}
+    texts = {name: row.get(name) or None for name in ("clock", "device", "measured", *TEXTS)}
     return row | numbers | texts | {"seed": int(row["seed"]), "clock": texts["clock"] or "wall"}
 
 
@@ -126,15 +163,11 @@ def estimate(rows: Sequence[dict], name: str) -> Estimate | None:
     return Estimate.of([row[name] for row in rows if row[name] is not None])
 
 
-def machine(rows: Sequence[dict]) -> str:
+def made_on(rows: Sequence[dict]) -> str:
     """Say in a line on what the runs were computed, and when."""
-    about = {
-        f"{row['device']}, threads: {row['threads']:g}, minutes by the {row['clock']} clock"
-        for row in rows
-        if row["device"]
-    }
+    line = machines((row["device"], row["threads"], f"minutes by the {row['clock']} clock") for row in rows)
     days = sorted({row["day"] for row in rows if row["day"]})
-    return "; ".join(sorted(about)) + (f"; {' to '.join(dict.fromkeys((days[0], days[-1])))}" if days else "")
+    return line + (f"; {' to '.join(dict.fromkeys((days[0], days[-1])))}" if days else "")
 
 
 def commands(rows: Sequence[dict]) -> str:
@@ -143,10 +176,11 @@ def commands(rows: Sequence[dict]) -> str:
     A job of a sweep does not name what the sweep sets, so the clock and the threads are added.
     """
     models: dict[str, list[str]] = {}
-    for row in rows:
-        command = re.sub(r"\bseed=\d+ | run=\S+$", "", row["command"])
+    for row in (row for row in rows if row["command"]):
+        command = re.sub(r"\s(seed|run|sheets)=\S+", "", row["command"])
         if row["clock"] != "wall" and "budget.clock=" not in command and "#" not in command:
-            command += f" budget.clock={row['clock']} threads={row['threads']:g}"
+            command += f" budget.clock={row['clock']}"
+            command += f" threads={row['threads']:g}" if row["threads"] and " threads=" not in command else ""
         model = re.search(r" model=(\S+)", command)
         command = command.replace(model[0], " model={}", 1) if model else command
         known = models.setdefault(command, [])

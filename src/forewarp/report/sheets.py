@@ -60,9 +60,15 @@ def thirds(sheet: np.ndarray) -> list[np.ndarray]:
 
 
 def read_picture(path: Path) -> np.ndarray:
-    """Read a picture as matplotlib shows it."""
-    from matplotlib.image import imread
+    """Read a picture as matplotlib shows it.
 
+    Raises:
+        ImportError: if matplotlib is missing.
+    """
+    try:
+        from matplotlib.image import imread
+    except ImportError:
+        raise ImportError(curve.NO_PLOTS) from None
     return imread(path)
 
 
@@ -83,7 +89,7 @@ def figure_of(rows: int, columns: int, size: tuple[float, float], heights: Seque
     try:
         from matplotlib.figure import Figure
     except ImportError:
-        raise ImportError("expected matplotlib for plots; install forewarp[plots]") from None
+        raise ImportError(curve.NO_PLOTS) from None
     figure = Figure(figsize=size, layout="constrained")
     return figure, figure.subplots(rows, columns, squeeze=False, height_ratios=heights)
 
