@@ -163,6 +163,8 @@ else
 	$(BIN)/forewarp-report kind=paper out=$(OUT) curves=docs/results && exit $$status
 endif
 
+# Apart from the runs of tables, from which a page could not tell those of another share.
+ABLATIONS := paths.runs=runs/ablations
 ablations: PRESET ?= demo
 ablations: MINUTES := $(if $(filter command line,$(origin MINUTES)),$(MINUTES),4)
 ablations: STEPS ?= 500
@@ -172,9 +174,9 @@ ablations: OUT ?= docs/results
 ablations: ALSO ?= stage.fine.share=2
 ablations: ## what each part of the paper's method brings, on three counterparts, at equal minutes and at equal steps [MINUTES= STEPS= SEEDS=3 OUT=]
 	@status=0; \
-	$(LANES) SWEEPS=ablations ALSO="$(ALSO)" MINUTES=$(MINUTES) STEPS= $(GO_ON); \
-	$(LANES) SWEEPS=ablations ALSO="$(ALSO)" STEPS=$(STEPS) $(GO_ON); \
-	$(BIN)/forewarp-report kind=ablation out=$(OUT) && exit $$status
+	$(LANES) SWEEPS=ablations ALSO="$(ALSO) $(ABLATIONS)" MINUTES=$(MINUTES) STEPS= $(GO_ON); \
+	$(LANES) SWEEPS=ablations ALSO="$(ALSO) $(ABLATIONS)" STEPS=$(STEPS) $(GO_ON); \
+	$(BIN)/forewarp-report kind=ablation $(ABLATIONS) out=$(OUT) && exit $$status
 
 ONLY_ABLATIONS = $(filter ablations,$(SWEEPS))
 WITH_ABLATIONS = $(filter ablations all,$(SWEEPS))

@@ -77,11 +77,17 @@ def test_real_scenes_are_fitted_by_the_methods_named(made):
 
 def test_ablations_are_run_for_equal_minutes_and_equal_steps(made):
     *fits, report = made("ablations MINUTES=0.1 STEPS=30")
-    assert report == {"forewarp-report", "kind=ablation", "out=docs/results"}
+    assert report == {"forewarp-report", "kind=ablation", "paths.runs=runs/ablations", "out=docs/results"}
     by_time = called(fits, "budget.minutes=0.1", "seeds=2")
     by_steps = called(fits, "budget.minutes=null", "budget.iterations=30", "seeds=2")
     assert len(by_time) == len(by_steps) == 4
-    common = {"preset=demo", "threads=1", "budget.clock=processor", "stage.fine.share=2"}
+    common = {
+        "preset=demo",
+        "threads=1",
+        "budget.clock=processor",
+        "stage.fine.share=2",
+        "paths.runs=runs/ablations",
+    }
     assert len(called(fits, *common)) == len(fits) == 8
     for group in (by_time, by_steps):
         assert {word for call in group for word in call if word.startswith(("sweeps=", "scene="))} == {
