@@ -4,6 +4,8 @@ import json
 import subprocess
 import sys
 
+import pytest
+
 from tests.support.configs import ROOT
 
 HEAVY = {"torch", "lightning", "torchmetrics", "numba", "imageio", "matplotlib"}
@@ -69,6 +71,7 @@ def test_help_is_light(tmp_path):
     assert found == [(0, "", set())] * len(COMMANDS)
 
 
+@pytest.mark.slow
 def test_what_is_refused_is_refused_at_once(tmp_path):
     (tmp_path / "a file").touch()
     found = call(tmp_path, [words for words, _ in REFUSED])

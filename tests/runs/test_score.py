@@ -43,6 +43,7 @@ def returned(monkeypatch):
     return values
 
 
+@pytest.mark.slow
 def test_jobs_of_a_sweep_return_it_and_give_it_again(ok, scene, returned):
     folder = scene(2)
     sweep = ["--multirun", *SMALL, "seeds=2", "run=runs/${seed}", "evaluate=true", "sheets=0"]
