@@ -27,11 +27,12 @@ def module(run):
 
 def test_fewer_views_are_evenly_spread_and_named(run, module, tmp_path):
     evaluate(module, run.datamodule, tmp_path, ImageSuite())
+    (tmp_path / "images" / "mine.png").touch()
     metrics = evaluate(module, run.datamodule, tmp_path, ImageSuite(), sheets=6, views=2)
     rows = json.loads((tmp_path / "per_image.json").read_text())["images"]
     assert [row["name"] for row in rows] == ["t_0", "t_2"]
     assert {path.stem for path in (tmp_path / "images" / "sheets").glob("*.png")} == {"t_0", "t_2"}
-    assert {path.stem for path in (tmp_path / "images").glob("*.png")} == {"t_0", "t_2"}
+    assert {path.stem for path in (tmp_path / "images").glob("*.png")} == {"t_0", "t_2", "mine"}
     assert metrics["protocol"]["measured"] == "2 of 3 test views, evenly spread"
     assert metrics["test"]["all"]["psnr"] == pytest.approx(sum(row["scores"]["psnr"] for row in rows) / 2)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -106,7 +105,6 @@ def evaluate(
     """
     scene, targets, finished = datamodule.scene, datamodule.targets("test"), finished or {}
     chosen = middles(len(targets), views)
-    shutil.rmtree(Path(folder) / "images", ignore_errors=True)  # views that are not measured now
     on_sheets = {chosen[i] for i in spread(len(chosen), sheets)}
     rows: dict[int, dict] = {}
     for shown in draw(module, targets, chosen):
@@ -114,6 +112,10 @@ def evaluate(
         _save(shown, Path(folder) / "images", shown.number in on_sheets)
         if progress is not None:
             progress(len(rows), len(chosen))
+    for number, frame in enumerate(targets.frames):  # pictures of an earlier choice of views
+        for written, place in ((number in rows, "images"), (number in on_sheets, "images/sheets")):
+            if not written:
+                (Path(folder) / place / f"{frame.name}.png").unlink(missing_ok=True)
     per_image = [rows[number] for number in sorted(rows)]
     if len(chosen) < len(targets):
         measured = f"{len(chosen)} of {len(targets)} test views, evenly spread"
