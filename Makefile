@@ -146,6 +146,7 @@ JOBS ?= 2
 LANES = $(MAKE) --no-print-directory -j$(JOBS) tables-vehicle tables-captures PRESET=$(PRESET) SEEDS=$(SEEDS)
 reproduce-tables: PRESET ?= $(if $(DATA),fast,demo)
 reproduce-tables: MINUTES := $(if $(filter command line,$(origin MINUTES)),$(MINUTES),$(if $(filter faithful,$(PRESET)),null,$(if $(DATA),5,1)))
+reproduce-tables: SWEEPS_TYPED := $(if $(filter command line,$(origin SWEEPS)),$(SWEEPS))
 reproduce-tables: SWEEPS ?= $(if $(SCENES_TYPED),dnerf,dnerf hypernerf nhr lego_complete)
 reproduce-tables: override SWEEPS := $(if $(filter all,$(SWEEPS)),dnerf hypernerf nhr lego_complete ablation_modules ablation_losses resolution,$(SWEEPS))
 reproduce-tables: SCENES_TYPED := $(if $(filter command line,$(origin SCENES)),$(SCENES))
@@ -153,6 +154,8 @@ reproduce-tables: SEEDS ?= 1
 reproduce-tables: OUT ?= runs/paper/results
 reproduce-tables: ## the paper's tables and figures by all its systems, beside published [DATA= METHODS="dnerf ndvg" PRESET= SCENES="hook lego" MINUTES= SEEDS=3 VIEWS= SWEEPS=all OUT=]
 ifeq ($(DATA),)
+	@$(if $(SCENES_TYPED),$(error SCENES: expected DATA=<folder of D-NeRF scenes> beside it))
+	@$(if $(filter-out all ablations,$(SWEEPS_TYPED)),$(error SWEEPS: expected all or ablations without DATA, but got $(SWEEPS_TYPED)))
 	@status=0; $(LANES) MINUTES=$(MINUTES) $(GO_ON); \
 	$(BIN)/forewarp-report kind=paper out=$(OUT) curves=docs/results && exit $$status
 else
@@ -173,6 +176,8 @@ ablations: OUT ?= docs/results
 # The voxel networks come with the fine stage, which the demo's numbers give too little of the training to tell.
 ablations: ALSO ?= stage.fine.share=2
 ablations: ## what each part of the paper's method brings, on three counterparts, at equal minutes and at equal steps [MINUTES= STEPS= SEEDS=3 OUT=]
+	@$(if $(DATA)$(METHODS),$(error DATA, METHODS: not for ablations; they are of model=forward on counterparts. \
+		Real scenes: make reproduce-tables DATA=$(or $(DATA),<folder>) SWEEPS="ablation_modules ablation_losses"))
 	@status=0; \
 	$(LANES) SWEEPS=ablations ALSO="$(ALSO) $(ABLATIONS)" MINUTES=$(MINUTES) STEPS= $(GO_ON); \
 	$(LANES) SWEEPS=ablations ALSO="$(ALSO) $(ABLATIONS)" STEPS=$(STEPS) $(GO_ON); \

@@ -96,6 +96,21 @@ def test_ablations_are_run_for_equal_minutes_and_equal_steps(made):
         }
 
 
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("reproduce-tables SCENES=hook", "SCENES: expected DATA=<folder of D-NeRF scenes> beside it"),
+        ("reproduce-tables SWEEPS=dnerf", "SWEEPS: expected all or ablations without DATA, but got dnerf"),
+        ("ablations DATA=there", "make reproduce-tables DATA=there SWEEPS="),
+        ("ablations METHODS=ndvg", "DATA, METHODS: not for ablations"),
+    ],
+)
+def test_words_that_would_have_no_effect_are_refused(made, line, expected):
+    with pytest.raises(subprocess.CalledProcessError) as caught:
+        made(line)
+    assert expected in caught.value.stderr
+
+
 def test_the_commands_choose_what_there_is(made):
     calls = made("reproduce-tables SWEEPS=all")
     words = {word for call in calls for word in call if word.startswith(("sweeps=", "scene="))}

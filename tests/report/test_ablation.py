@@ -1,6 +1,7 @@
 """The page of ablations, of runs that nobody trained."""
 
 import json
+import os
 
 import pytest
 import yaml
@@ -109,6 +110,18 @@ def test_scenes_and_kinds_of_views_have_sections_of_their_own(tmp_path):
     assert printed[heads[1]] == ["-0.90", "24.00", "-1.00", "one seed"]
     assert printed[heads[2]] == ["-0.98", "24.00", "-1.00", "one seed"]
     assert "noise unknown" in text
+
+
+def test_some_scenes_of_a_mean_are_beside_its_printed_row(tmp_path):
+    for scene in ("hook", "mutant"):
+        part(tmp_path, "full", 0, 25.0, scene=scene, made=False)
+        part(tmp_path, "no_tv", 0, 24.0, scene=scene, made=False)
+    old = part(tmp_path / "again", "no_tv", 0, 29.0, scene="hook", made=False)
+    os.utime(old / "metrics.json", (0, 0))
+    text, _ = page_of(tmp_path)
+    section = text.split("of which mutant, hook\n")[1].split("## ")[0]
+    assert rows_of(section, "w/o total variation")[0][1:5] == ["-0.45", "24.00", "-1.00", "one seed"]
+    assert f"{old}: another run of the same is newer" in text.split("## Left out")[1]
 
 
 def test_without_ablations_there_is_no_page(tmp_path):

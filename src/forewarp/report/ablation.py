@@ -49,14 +49,14 @@ def write_ablation(runs: Path, out: Path, published: Path = PAPER) -> list[Path]
         ValueError: if no run is of an ablation.
     """
     results, without = collect(runs, ["metrics.json"])
-    results, _ = newest(results)
+    results, older = newest(results)
     tables = [table for table in read_paper(published).values() if _of_parts(table)]
     own = [run for run in results if run.variant in {row.variant for t in tables for row in t.rows} - {None}]
     if not own:
         raise ValueError(f"{runs}: expected runs of ablations, but got none; make some with make ablations")
     sections = [section for table in tables for section in sections_of(table, own)]
-    if without:
-        sections.append(Section("Left out", facts=without))
+    if lines := [*without, *(f"{run.folder}: another run of the same is newer" for run in older)]:
+        sections.append(Section("Left out", facts=lines))
     replace_file(out / "ablation.md", page.markdown(TITLE, INTRODUCTION, sections))
     replace_file(out / "ablation.csv", every_run(own).csv())
     return [out / "ablation.md", out / "ablation.csv"]
@@ -69,7 +69,9 @@ def sections_of(table: PaperTable, results: Sequence[Result]) -> list[Section]:
         runs = [run for run in results if run.is_counterpart == is_made]
         shown = counterpart(table, runs) if is_made else table
         for group in shown.groups if shown else ():
-            of_group = [run for run in runs if run.scene in group.scenes]
+            if not (of_group := [run for run in runs if run.scene in group.scenes]):
+                continue
+            group = _measured_part(group, of_group)
             if (parts := changes(table, group, of_group)) is not None:
                 scene = f", {group.scenes[0]}" * (is_made and group.name != group.scenes[0])
                 used = [run for run in of_group if run.variant in table.variants]
@@ -161,6 +163,15 @@ def _step(one: Measured, group: Group) -> float | None:
     numbers = [run.numbers for run in runs_of([one]) if run.scene in group.scenes]
     known = [found["step"] for found in numbers if "step" in found]
     return fmean(known) if known else None
+
+
+def _measured_part(group: Group, runs: Sequence[Result]) -> Group:
+    """Return the group of those scenes that were measured, named if some of a mean's are absent."""
+    known = {run.scene for run in runs}
+    if known >= set(group.scenes):
+        return group
+    scenes = tuple(scene for scene in group.scenes if scene in known)
+    return replace(group, name=f"{group.name}, of which {', '.join(scenes)}", scenes=scenes)
 
 
 def _printed(table: PaperTable, group: Group) -> dict[str, float]:
