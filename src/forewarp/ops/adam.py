@@ -38,8 +38,8 @@ def adam_rows(
         match_threads()
         betas = tuple(map(float, betas))
         table = kernels_adam.biases(*betas)
-        arrays = [t.detach().view(-1).numpy() for t in (value, gradient.contiguous(), mean, square)]
-        kernels_adam.adam(*arrays, steps.view(-1).numpy(), float(rate), *betas, float(eps), table)
+        parts = (value.detach(), gradient.contiguous(), mean, square, steps)
+        kernels_adam.adam(*(t.view(-1).numpy() for t in parts), float(rate), *betas, float(eps), table)
         return
     seen = (gradient != 0).any(-1)
     counted = steps[seen] + 1

@@ -26,12 +26,18 @@ def use_numba(tensor: Tensor) -> bool:
 
 def match_threads() -> int:
     """Let Numba use as many threads as PyTorch; return their number."""
-    from numba import config, get_num_threads, set_num_threads
-
+    numba = _numba()
     asked = torch.get_num_threads()
-    wanted = max(1, min(asked, config.NUMBA_NUM_THREADS))
-    if get_num_threads() != wanted:
-        set_num_threads(wanted)
+    wanted = max(1, min(asked, numba.config.NUMBA_NUM_THREADS))
+    if numba.get_num_threads() != wanted:
+        numba.set_num_threads(wanted)
     if torch.get_num_threads() != asked:  # Numba's first call starts all threads of the OpenMP they share
         torch.set_num_threads(asked)
     return wanted
+
+
+@cache
+def _numba():
+    import numba
+
+    return numba

@@ -13,6 +13,8 @@ def check_shape(name: str, tensor: Tensor, shape: tuple[int | str, ...]) -> None
     >>> import torch
     >>> check_shape("points", torch.zeros(4, 3), ("P", 3))
     """
+    if tensor.shape == shape:
+        return
     ends = shape[:1] == ("...",)
     last = shape[1:] if ends else shape
     found = tuple(tensor.shape)[-len(last) :] if ends else tuple(tensor.shape)

@@ -232,8 +232,8 @@ class Particles(Method):
             self.gaussians(), warp or self.warp(time), self.pinholes(seen.view.camera), tints, fades,
             seen.rgb, seen.background, width=self.width, factor=weight, by_weights=warp is not None,
         )  # fmt: skip
-        self.pulled += found.pull
-        self.shown += found.pull > 0
+        self.pulled.add_(found.pull)
+        self.shown.add_(found.pull > 0)
         _add(total, self._by_name(found.particles))
         if self.nodes is not None:
             _add(total, {"skin.learned": self.skin.slope(warp.weights, found.weights)})
