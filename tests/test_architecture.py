@@ -57,6 +57,7 @@ CONTRACT = {
     "abilities",
     "effect",
     "rows",
+    "dead_start",
     "rows_adam",
     "sampled",
     "marched",

@@ -222,6 +222,16 @@ def test_each_number_of_a_method_is_taken_where_it_is_keyed(model):
     assert (band.stage.fine.num_voxels, still.stage.coarse.num_voxels) == ([[0, 15625]], [[0, 46656]])
 
 
+def test_systems_of_the_tables_have_their_numbers_of_a_dataset():
+    ndvg = composed("experiment=hypernerf", "data.scene=x", "model=ndvg", "preset=faithful")
+    assert (list(k for k, v in ndvg.stage.items() if v), ndvg.budget.iterations) == (["fine"], 10000)
+    assert ndvg.data.canonical == 0
+    lego = composed("experiment=lego_complete", "data.scene=x", "model=ndvg", "preset=faithful")
+    assert lego.data.box is None
+    volumes = composed("experiment=hypernerf", "data.scene=x", "model=neural_volumes", "preset=faithful")
+    assert volumes.data.background == volumes.data.eval_background == "black"
+
+
 def test_effects_follow_the_pictures_and_the_command_line_wins():
     def chosen(*words):
         return composed("data.scene=x", "model=forward", *words, hydra=True).hydra.runtime.choices

@@ -23,6 +23,7 @@ from tests.support.tiny_scene import make_run
 S, B = {}, {"channels": 6, "width": 256, "alpha_init": 1e-3}
 SMALL = {"tineuvox": {"width": 16, "position_frequencies": 3}, "ndvg": {"width": (16, 16)}}
 KINDS = {"tineuvox": TiNeuVox, "ndvg": NDVG}
+THICK = {"tineuvox": {"alpha_init": 1e-2}, "ndvg": {"numbers": {"alpha_init": 1e-2}}}
 JITTER = Marching(jitter=True, occupancy=8)
 
 
@@ -262,6 +263,36 @@ def test_points_that_never_move_are_pulled_to_stay(kind):
     assert method(kind).extra_terms(field, batch(), draw)["still"]() is None
 
 
+def test_weights_of_offsets_do_not_depend_on_what_is_skipped():
+    made = method("ndvg", marching=Marching(occupancy=8))
+    with torch.no_grad():
+        made.network[-1].bias[:3] = torch.tensor([0.1, -0.2, 0.3])
+    draw, found = torch.Generator().manual_seed(0), []
+    for keep in (None, "front"):
+        if keep:
+            made.occupancy.cells[: len(made.occupancy.cells) // 2] = False
+        terms = made.look(batch(), {}, draw).terms
+        found.append([float(terms[name]().detach()) for name in ("flow_l1", "canonical")])
+        points = made.look(batch(), {}, draw).noted["samples"]
+        ray = 12**0.5 / (0.5 * made.deformation.lattice.voxel_size)  # places along the box's diagonal
+        assert found[-1] == pytest.approx([0.2 * points / (144 * ray)] * 2, rel=1e-4)
+    assert 0 < found[1][0] < 0.9 * found[0][0]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_dead_start_is_named(kind):
+    alive = method(kind, 13**3, marching=Marching(color_threshold=1e-3), **THICK[kind])
+    dead = method(kind, 13**3, marching=Marching(color_threshold=0.9), **THICK[kind])
+    for made in (alive, dead):
+        for _ in range(19):
+            made.look(batch(), {}, torch.Generator())
+    alive.look(batch(), {}, torch.Generator())
+    with pytest.raises(
+        ValueError, match="dead start; set it to 0, or a larger alpha_init, or preset.occupancy=0"
+    ):
+        dead.look(batch(), {}, torch.Generator())
+
+
 def test_the_second_stage_of_ndvg_goes_on_where_the_first_ended():
     first = method("ndvg", 13**3, marching=JITTER, numbers={"view_dependence": False, "box_alpha": 0.05})
     with torch.no_grad():
@@ -313,17 +344,17 @@ def test_gradcheck(kind):
     with torch.no_grad():
         for parameter in made.parameters():
             parameter.add_(0.1 * torch.randn_like(parameter))
-    grid = made.grid if kind == "tineuvox" else made.canonical
-    values = next(grid.parameters())
+    grids = [made.grid] if kind == "tineuvox" else [made.canonical, made.deformation]
+    values = [parameter for grid in grids for parameter in grid.parameters()]
     toward = torch.tensor([[0.0, 0.6, 0.8]], dtype=torch.float64).expand(4, 3)
 
-    def look(points, last, _):
+    def look(points, last, *_):
         density, color = made.field(Moment(0.7)).look_up(points)
         return density, color(torch.arange(4), toward)
 
     points = (0.4 * some_points(4, dtype=torch.float64) + 0.013).requires_grad_()
     last = (made.head.density_head if kind == "tineuvox" else made.network[-1]).bias
-    assert torch.autograd.gradcheck(look, (points, last, values), eps=1e-7, atol=1e-4, nondet_tol=1e-12)
+    assert torch.autograd.gradcheck(look, (points, last, *values), eps=1e-7, atol=1e-4, nondet_tol=1e-12)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -215,6 +215,16 @@ def test_gains_are_of_known_cameras():
         assert not drawn(made, camera_id=0).rgb.equal(before)
 
 
+def test_a_dead_start_is_named():
+    made = method(first_opacity=200.0)
+    seen = Batch((Observation(Moment(0.5), View(camera()), torch.rand(144, 3), torch.ones(3)),), 0)
+    draw = torch.Generator().manual_seed(0)
+    for _ in range(19):
+        made.look(seen, {}, draw)
+    with pytest.raises(ValueError, match="all clear or all opaque in each of 20 steps"):
+        made.look(seen, {}, draw)
+
+
 def test_a_step_reaches_every_parameter():
     made = method()
     observed = Observation(Moment(0.5, camera=0), View(camera()), torch.rand(144, 3), torch.rand(144, 3))

@@ -13,6 +13,7 @@ from forewarp import losses
 from forewarp.fields.occupancy import Occupancy
 from forewarp.fields.radiance_grid import Activation
 from forewarp.fields.voxel_grid import VoxelGrid, adopted_in, misfit_in
+from forewarp.methods.dead_start import DeadStart
 from forewarp.methods.method import Method, Snapshot, Start, Step
 from forewarp.methods.rows import renew_parameters
 from forewarp.methods.rows_adam import RowsAdam
@@ -98,6 +99,11 @@ class MarchedMethod(Method):
         self.renderer = Renderer(step=marching.step, color_threshold=marching.color_threshold)
         self.renderer = self.renderer.with_threshold(threshold)
         self.occupancy = Occupancy(box, side=marching.occupancy, patience=8) if marching.occupancy else None
+        self.dead_start = DeadStart(
+            "preset.color_threshold",
+            "no sample of so much weight",
+            "set it to 0, or a larger alpha_init, or preset.occupancy=0",
+        )
 
     def begin(self) -> None:
         """Note where the schedule stands, once all parameters are there."""
@@ -142,11 +148,16 @@ class MarchedMethod(Method):
         return MarchedSnapshot(moment, self)
 
     def look(self, batch: Batch, factors: Mapping[str, float], generator: torch.Generator) -> Step:
-        """See ``Method.look``; a batch holds one moment, as no neighbours are asked for."""
+        """See ``Method.look``; a batch holds one moment, as no neighbours are asked for.
+
+        Raises:
+            ValueError: if no sample has a colour for many steps.
+        """
         rays, rgb, background = batch.joined()
         field = self.field(batch.observations[0].moment)
         jitter = generator if self.marching.jitter else None
         drawn = self.marched_through(field, rays.to(self.device), background.to(self.device), jitter)
+        self.dead_start.look(len(drawn.weights) > 0)
         error = (drawn.rgb - rgb).square().mean()
         terms = {
             "photo": lambda: error,

@@ -27,6 +27,7 @@ from forewarp.scene.frame import spread
 from forewarp.scene.view import Moment
 
 _HIDDEN = -100.0  # raw density that never comes back
+_LEAST = 1e-4  # least density, in the unit of raw density, that a stage hands over: less hardly comes back
 _OPAQUE = 1 - 1e-6  # most a sample may hide, so that what is behind keeps a gradient
 _SIDE = 96  # cells along a side of the lattice by which a box is found, where there is no other
 _LOOKS = 50  # times at which a finished stage is asked where matter is
@@ -142,7 +143,7 @@ class NDVG(MarchedMethod):
                 * self.activation.density_scale
             )
             self.canonical.density.copy_(
-                torch.log(torch.expm1(optical.double()).clamp(min=1e-6)) - self.shift
+                torch.log(torch.expm1(optical.double()).clamp(min=_LEAST)) - self.shift
             )
         if self.stage.masked:
             old = before.canonical
@@ -195,14 +196,22 @@ class NDVG(MarchedMethod):
     ) -> dict[str, Callable[[], Tensor | None]]:
         """Offer ``flow_l1``, the samples' offsets; ``tv_deformation``; ``canonical``, offsets of samples at
         the canonical time, which ``F`` should give as 0; ``still``, at points that never move.
+
+        As published, means over samples are over all places of a ray along the box's diagonal, most of which
+        are in no box or empty and have no offset. So their weights do not depend on what is skipped.
         """
+
+        def of_all(offsets: Tensor) -> Tensor:
+            places = self.box.diagonal / (self.marching.step * self.lattice_marched.voxel_size)
+            return len(field.points) / (places * len(batch)) * losses.flow_l1(offsets)
 
         def canonical() -> Tensor | None:
             if self.continuous or not len(field.points):
                 return None
             count = max(1, len(field.points) // len(self.times))
             rows = torch.randint(len(field.points), (count,), generator=generator)
-            return self.carried(field.points[rows.to(self.device)], self.canonical_time)[0].abs().mean()
+            found, _ = self.carried(field.points[rows.to(self.device)], self.canonical_time)
+            return of_all(found)
 
         def tv_deformation() -> Tensor:
             shape = self.deformation.lattice.shape
@@ -215,7 +224,7 @@ class NDVG(MarchedMethod):
             return field.offset(self.still[rows].to(self.device))[0].square().mean()
 
         return {
-            "flow_l1": lambda: losses.flow_l1(field.offsets),
+            "flow_l1": lambda: of_all(field.offsets),
             "tv_deformation": tv_deformation,
             "canonical": canonical,
             "still": still,

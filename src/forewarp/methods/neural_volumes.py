@@ -13,6 +13,7 @@ from torch.nn import functional
 
 from forewarp.fields.codes import beside
 from forewarp.fields.volumes import DEVIATION_SCALE, AffineMixture, PictureEncoder, VolumeDecoder, read
+from forewarp.methods.dead_start import DeadStart
 from forewarp.methods.method import Method, Snapshot, Start, Step
 from forewarp.ops.samples import clip_to_box
 from forewarp.scene.batch import Batch
@@ -93,6 +94,11 @@ class NeuralVolumes(Method):
             raise ValueError(f"model.step: expected a length in (0, 1], but got {step}")
         self.step, self.jitter_in_pictures = step, jitter_in_pictures
         self.from_identity = from_identity
+        self.dead_start = DeadStart(
+            "preset.first_opacity",
+            "rays that are all clear or all opaque",
+            "set it to 0.1, or another seed=N",
+        )
         self.first = {"opacity": first_opacity, "deviation of the code": first_deviation}
         scene = start.scene
         self.times = scene.times
@@ -179,13 +185,18 @@ class NeuralVolumes(Method):
         return VolumesSnapshot(moment, self)
 
     def look(self, batch: Batch, factors: Mapping[str, float], generator: torch.Generator) -> Step:
-        """See ``Method.look``; a batch holds one moment, as no neighbours are asked for."""
+        """See ``Method.look``; a batch holds one moment, as no neighbours are asked for.
+
+        Raises:
+            ValueError: if every ray is opaque for many steps.
+        """
         rays, rgb, background = batch.joined()
         moment = batch.observations[0].moment
         mean, deviation = self.encoded(self.times.index(moment.time))
         noise = torch.randn(mean.shape, generator=generator).to(mean)
         volumes = self.volumes(mean + deviation.exp() * noise)
         seen = self.march(volumes, rays, background, moment.camera, generator)
+        self.dead_start.look(bool(((seen.opacity > 0) & (seen.opacity < 1)).any()))
         error = (seen.rgb - rgb.to(seen.rgb)).square().mean()
         terms = {
             "photo": lambda: error,
