@@ -17,7 +17,8 @@ from forewarp.scene.view import Moment, View
 from forewarp.training.objective import Objective
 from forewarp.training.schedule import StageSettings
 from forewarp.training.stages import Stage
-from tests.methods.test_sampled import batch, camera, moving_scene, static_ceiling
+from tests.support.sampled_methods import batch
+from tests.support.sliding_square import camera, moving_scene, static_ceiling
 from tests.support.tiny_scene import make_run
 
 S, B = {}, {"channels": 6, "width": 256, "alpha_init": 1e-3}

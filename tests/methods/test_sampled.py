@@ -6,55 +6,17 @@ from functools import partial
 import pytest
 import torch
 
-from forewarp.data.module import SceneDataModule
 from forewarp.methods.dnerf import DNeRF
 from forewarp.methods.hypernerf import HyperNeRF
-from forewarp.methods.method import Start, parameter_count
+from forewarp.methods.method import parameter_count
 from forewarp.methods.nerf import NeRF
 from forewarp.methods.nerfies import Nerfies
 from forewarp.methods.sampled import Sampling
 from forewarp.methods.tnerf import TNeRF
 from forewarp.ops.encode import positional_encoding
-from forewarp.scene.batch import Batch, Observation
 from forewarp.scene.view import Moment, View
-from forewarp.training.objective import Objective
-from forewarp.training.schedule import StageSettings
-from forewarp.training.stages import Stage
-from tests.support.sliding_square import camera, moving_scene, static_ceiling
-from tests.support.tiny_scene import make_run
-
-SMALL = {"width": 32, "layers": 3, "skip": None, "position_frequencies": 3, "direction_frequencies": 1}
-WARP = {"warp_width": 24, "warp_layers": 3, "warp_skip": None}
-GENTLE = {"density": "softplus", "open_end": False}
-KINDS = {
-    "nerf": partial(NeRF, **SMALL),
-    "tnerf": partial(TNeRF, **SMALL, time_frequencies=2),
-    "dnerf": partial(DNeRF, **SMALL, time_frequencies=2),
-    "nerfies": partial(Nerfies, **SMALL, **WARP, elastic_samples=64),
-    "hypernerf": partial(HyperNeRF, **SMALL, **WARP, slice_width=16),
-}
-
-
-def method(kind, seed=0, still=None, **sampling):
-    torch.manual_seed(seed)
-    asked = Sampling(**({"samples": 12, "fine_samples": 12} | sampling))
-    return KINDS[kind](Start(moving_scene(still), "fine", {}), sampling=asked)
-
-
-def batch(time=0.5):
-    rgb = torch.rand(144, 3, generator=torch.Generator().manual_seed(0))
-    return Batch((Observation(Moment(time), View(camera()), rgb, torch.ones(3)),), 0)
-
-
-def shown(made, time, points=None):
-    """Density and colour at some points."""
-    points = torch.randn(64, 3, generator=torch.Generator().manual_seed(3)) if points is None else points
-    directions = torch.tensor([0.0, 0.6, 0.8]).expand_as(points)
-    return made.fields(Moment(time, camera=0))[1].radiance(points, directions)
-
-
-def start(scene=None):
-    return Start(scene or moving_scene(), "fine", {})
+from tests.support.sampled_methods import GENTLE, KINDS, batch, learned, method, shown, start
+from tests.support.sliding_square import camera, static_ceiling
 
 
 @pytest.mark.parametrize(
@@ -309,14 +271,8 @@ def test_pictures_of_a_jittered_method_are_drawn_alike():
     "kind", ["tnerf", *(pytest.param(k, marks=pytest.mark.slow) for k in KINDS if k != "tnerf")]
 )
 def test_it_learns_what_moves(kind, tmp_path):
-    settings = StageSettings.of("fine", lr={"network": 5e-3}, iterations=260, curriculum={"all_in": 0.0})
-    weights = dict.fromkeys({"photo", "coarse_photo"} & set(KINDS[kind].func.terms), 1.0)
-    data = SceneDataModule(moving_scene, rays=96)
-    model = partial(KINDS[kind], sampling=Sampling(12, 12, **GENTLE))
-    module = make_run(tmp_path, [Stage(settings, Objective(weights))], data=data, model=model).fit()
-    psnr = [float(module.psnr_of(target)) for target in data.targets("train")]
-    mean = sum(psnr) / len(psnr)
+    psnr = learned(kind, tmp_path)[1]
     if kind == "nerf":
-        assert static_ceiling() - 3 < mean <= static_ceiling()
+        assert static_ceiling() - 3 < psnr <= static_ceiling()
     else:
-        assert mean > static_ceiling() + 3
+        assert psnr > static_ceiling() + 3

@@ -1,0 +1,71 @@
+"""Small NeRF, T-NeRF, D-NeRF, Nerfies and HyperNeRF of the sliding square."""
+
+from functools import partial
+
+import torch
+
+from forewarp.data.module import SceneDataModule
+from forewarp.methods.dnerf import DNeRF
+from forewarp.methods.hypernerf import HyperNeRF
+from forewarp.methods.method import Start
+from forewarp.methods.nerf import NeRF
+from forewarp.methods.nerfies import Nerfies
+from forewarp.methods.sampled import Sampling
+from forewarp.methods.tnerf import TNeRF
+from forewarp.scene.batch import Batch, Observation
+from forewarp.scene.view import Moment, View
+from forewarp.training.objective import Objective
+from forewarp.training.schedule import StageSettings
+from forewarp.training.stages import Stage
+from tests.support.sliding_square import camera, moving_scene
+from tests.support.tiny_scene import make_run
+
+SMALL = {"width": 32, "layers": 3, "skip": None, "position_frequencies": 3, "direction_frequencies": 1}
+WARP = {"warp_width": 24, "warp_layers": 3, "warp_skip": None}
+GENTLE = {"density": "softplus", "open_end": False}
+KINDS = {
+    "nerf": partial(NeRF, **SMALL),
+    "tnerf": partial(TNeRF, **SMALL, time_frequencies=2),
+    "dnerf": partial(DNeRF, **SMALL, time_frequencies=2),
+    "nerfies": partial(Nerfies, **SMALL, **WARP, elastic_samples=64),
+    "hypernerf": partial(HyperNeRF, **SMALL, **WARP, slice_width=16),
+}
+
+
+def start(scene=None):
+    return Start(scene or moving_scene(), "fine", {})
+
+
+def method(kind, seed=0, still=None, **sampling):
+    torch.manual_seed(seed)
+    asked = Sampling(**({"samples": 12, "fine_samples": 12} | sampling))
+    return KINDS[kind](start(moving_scene(still)), sampling=asked)
+
+
+def batch(time=0.5):
+    rgb = torch.rand(144, 3, generator=torch.Generator().manual_seed(0))
+    return Batch((Observation(Moment(time), View(camera()), rgb, torch.ones(3)),), 0)
+
+
+def shown(made, time, points=None):
+    """Density and colour at some points."""
+    points = torch.randn(64, 3, generator=torch.Generator().manual_seed(3)) if points is None else points
+    directions = torch.tensor([0.0, 0.6, 0.8]).expand_as(points)
+    return made.fields(Moment(time, camera=0))[1].radiance(points, directions)
+
+
+def learned(kind, folder, read=moving_scene, *, iterations=260, rays=96):
+    """Train a method for some steps: the method, and the PSNR of the pixels of all training pictures.
+
+    Squared errors are pooled, as in ``static_ceiling``: a mean of PSNRs has no ceiling, since one picture may
+    be shown exactly.
+    """
+    settings = StageSettings.of(
+        "fine", lr={"network": 5e-3}, iterations=iterations, curriculum={"all_in": 0.0}
+    )
+    weights = dict.fromkeys({"photo", "coarse_photo"} & set(KINDS[kind].func.terms), 1.0)
+    data = SceneDataModule(read, rays=rays)
+    model = partial(KINDS[kind], sampling=Sampling(12, 12, **GENTLE))
+    module = make_run(folder, [Stage(settings, Objective(weights))], data=data, model=model).fit()
+    psnr = torch.stack([module.psnr_of(target).double() for target in data.targets("train")])
+    return module.method, float(-10 * torch.log10((10 ** (-psnr / 10)).mean()))
