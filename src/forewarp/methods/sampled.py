@@ -123,15 +123,10 @@ class SampledMethod(Method):
             box if sampling.inside_box or sampling.occupancy else None,
             self.occupancy,
         )
-        # An open end would hide the background of a density that is never 0.
-        instead = "density=softplus model.sampling.open_end=false"
-        if sampling.density != "relu":
-            instead = "occupancy=0"
-        self.dead_start = DeadStart(
-            "model.sampling",
-            "a density of 0 along every ray",
-            f"set another seed=N, or model.sampling.{instead}",
-        )
+        alive = "density=softplus model.sampling.open_end=false"  # an open end would hide the background
+        alive = alive if sampling.density == "relu" else "occupancy=0"
+        advice = f"set another seed=N, or model.sampling.{alive}"
+        self.dead_start = DeadStart("model.sampling", "a density of 0 along every ray", advice)
 
     def passes(self, make: Callable[[], Template]) -> tuple[Template | None, Template]:
         """Make a network for each pass; None in place of the first where there is one pass."""
