@@ -232,6 +232,36 @@ def test_systems_of_the_tables_have_their_numbers_of_a_dataset():
     assert volumes.data.background == volumes.data.eval_background == "black"
 
 
+def test_the_nerf_of_captures_is_the_one_of_hypernerfs_tables():
+    config = composed("scene=hypernerf_broom", "model=nerf", "preset=faithful")
+    asked = {"skip": 5, "position_frequencies": 8, "glorot": True, "width": 256, "layers": 8}
+    assert config.model.items() >= asked.items()
+    looks = {"density": "softplus", "samples": 128, "fine_samples": 128, "open_end": True}
+    assert config.model.sampling.items() >= looks.items()
+    assert (config.data.rays, config.budget.iterations) == (6144, 250_000)
+    assert (config.stage.fine.lr.network, config.stage.fine.lr_final_factor) == (1e-3, 0.1)
+
+
+def test_networks_train_over_the_background_that_they_are_measured_on():
+    for model in ("nerf", "tnerf", "dnerf", "nerfies", "hypernerf"):
+        data = composed("experiment=hypernerf", "data.scene=x", f"model={model}").data
+        assert (data.background, data.eval_background) == ("black", "black")
+    for words, color in (("scene=hypernerf_broom", "black"), ("scene=dnerf_lego", "white")):
+        data = composed(words, "model=nerfies", "preset=faithful").data
+        assert (data.background, data.eval_background) == (color, color)
+
+
+def test_frames_of_some_scenes_come_in_sooner_with_faithful_alone():
+    faithful = composed("experiment=dnerf", "data.scene=x", "model=dnerf", "preset=faithful")
+    for scene, all_in in (("lego", 0.0125), ("trex", 0.0125), ("bouncingballs", 0.0125), ("hook", 0.125)):
+        faithful.data.scene = scene
+        expected = {"start": 3, "all_in": all_in, "from_zero": True}
+        assert build_run(faithful).stages[0].settings.curriculum.items() >= expected.items()
+    for preset, all_in in (("faithful", 0.0125), ("fast", 0.3), ("demo", 0.0)):
+        config = composed("scene=dnerf_lego", "model=dnerf", f"preset={preset}")
+        assert config.stage.fine.curriculum.all_in == all_in
+
+
 def test_effects_follow_the_pictures_and_the_command_line_wins():
     def chosen(*words):
         return composed("data.scene=x", "model=forward", *words, hydra=True).hydra.runtime.choices

@@ -75,6 +75,16 @@ def test_an_open_end_hides_the_background_of_a_density_that_is_never_0():
     )
 
 
+def test_opacity_and_depth_leave_out_a_sample_without_end():
+    def fog(points, directions):
+        return torch.full(points.shape[:2], 0.1), RED.expand(*points.shape[:2], 3)
+
+    seen, closed = (Quadrature(200, 0, open_end)(None, fog, along_x(1), WHITE) for open_end in (True, False))
+    assert float(seen.weights.sum()) == pytest.approx(1)
+    assert float(seen.opacity) == pytest.approx(1 - math.exp(-0.4), abs=2e-3)
+    torch.testing.assert_close(seen.depth, closed.depth, atol=0.02, rtol=0)
+
+
 def test_the_first_pass_has_no_gradient_and_the_second_has():
     strength = torch.tensor(2.0, requires_grad=True)
     density, radiance = slab(strength)
@@ -165,5 +175,5 @@ def test_a_generator_jitters_and_nothing_else_does():
 
 @pytest.mark.parametrize("wrong", [(2, 8), (8, -1)])
 def test_refuses(wrong):
-    with pytest.raises(ValueError, match="model.samples: expected samples >= 3 and fine_samples >= 0"):
+    with pytest.raises(ValueError, match="model.sampling: expected samples >= 3 and fine_samples >= 0"):
         Quadrature(*wrong)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor
@@ -26,7 +26,8 @@ _PROBES = 64  # points of a ray that tell where kept ones begin and end
 @dataclass(frozen=True)
 class Sampled(Rendering):
     """A rendering, with ``depths``, ``density``, ``weights`` (K, S) and ``points`` (K, S, 3) along the K rays
-    that meet the box, and what the first pass saw, where it has a gradient too (``coarse``).
+    that meet the box, and what the first pass saw, where it has a gradient too (``coarse``). Its depth and
+    opacity leave out a last sample without end.
     """
 
     depths: Tensor
@@ -59,7 +60,7 @@ class Quadrature:
     def __post_init__(self) -> None:
         if self.samples < 3 or self.fine_samples < 0:
             raise ValueError(
-                "model.samples: expected samples >= 3 and fine_samples >= 0, but got "
+                "model.sampling: expected samples >= 3 and fine_samples >= 0, but got "
                 f"samples={self.samples}, fine_samples={self.fine_samples}"
             )
 
@@ -118,8 +119,9 @@ class Quadrature:
             density, color = (_placed(kept, part) for part in only)
         weights, through = dense_weights(density * self._intervals(depths, far))
         rgb = (weights[..., None] * color).sum(1) + through[:, None] * background
-        opacity = weights.sum(1).clamp(max=1)
-        depth = (weights * depths).sum(1) / opacity.clamp(min=1e-6)
+        ended = weights[:, :-1] if self.open_end else weights
+        opacity = ended.sum(1).clamp(max=1)
+        depth = (ended * depths[:, : ended.shape[1]]).sum(1) / opacity.clamp(min=1e-6)
         return Sampled(rgb, depth, opacity, depths, points, density, weights)
 
     @staticmethod
@@ -176,6 +178,15 @@ class Quadrature:
         """Return the length (R, S) of each sample's interval: up to the next sample."""
         last = torch.full_like(far, _FAR) if self.open_end else (far - depths[:, -1]).clamp(min=0)
         return torch.cat([depths[:, 1:] - depths[:, :-1], last[:, None]], 1)
+
+
+def joined(parts: Sequence[Sampled]) -> Sampled:
+    """Put what several groups of rays saw behind one another."""
+    if len(parts) == 1:
+        return parts[0]
+    coarse = None if parts[0].coarse is None else joined([part.coarse for part in parts])
+    names = [field.name for field in fields(Sampled) if field.name != "coarse"]
+    return Sampled(*(torch.cat([getattr(part, name) for part in parts]) for name in names), coarse=coarse)
 
 
 def _placed(kept: Tensor, values: Tensor) -> Tensor:

@@ -26,7 +26,9 @@ def test_first_values_are_small_and_positive():
 
 
 def test_a_camera_that_is_not_known_sees_by_the_mean():
-    codes = CameraCodes(2, 3)
-    assert codes(1).equal(codes.table[1])
-    for unknown in (None, 2, -1):
+    codes = CameraCodes({55, 1, 9}, 3)  # ids are not rows
+    for row, camera in enumerate((1, 9, 55)):
+        assert codes(camera).equal(codes.table[row])
+    for unknown in (None, 0, 2, -1):
         torch.testing.assert_close(codes(unknown), codes.table.mean(0))
+    assert CameraCodes({None, 4}, 3)(None).shape == (3,)

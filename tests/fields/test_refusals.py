@@ -27,7 +27,7 @@ REFUSED = [
         for wrong in ({"skip": 1}, {"skip": 5}, {"layers": 0}, {"width": 0})
     ),
     (partial(Template, 5, 0), "template: expected condition >= 1 and width >= 2, but got"),
-    (partial(density_of, "exp"), "model.density: expected relu or softplus, but got 'exp'"),
+    (partial(density_of, "exp"), "model.sampling.density: expected relu or softplus, but got 'exp'"),
     (
         partial(TrajectoryField, Box((0, 0, 0), (1, 1, 1)), bases=3, frames=1, canonical_time=0.3),
         "expected at least 2 distinct training times, but got 1; use model/motion=none",

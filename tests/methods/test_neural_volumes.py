@@ -238,6 +238,13 @@ def test_a_step_reaches_every_parameter():
     assert "the warp starts as the identity" in made.protocol()["departures"]
 
 
+def test_the_released_faults_are_named():
+    released = {"from_identity": False, "first_opacity": None, "jitter_in_pictures": True}
+    mended = {"from_identity": True, "first_opacity": 0.05, "jitter_in_pictures": False}
+    assert [fault.split()[-1] for fault in method(**released).faults()] == [f"({key})" for key in released]
+    assert "faults" not in method(**mended).protocol()
+
+
 def test_gradients_against_differences():
     made = method(decoder=(8, 4), maps=2, warp_side=3, code=4).double()
     rays = View(camera(3)).rays()

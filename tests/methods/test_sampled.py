@@ -11,12 +11,13 @@ from forewarp.methods.hypernerf import HyperNeRF
 from forewarp.methods.method import parameter_count
 from forewarp.methods.nerf import NeRF
 from forewarp.methods.nerfies import Nerfies
-from forewarp.methods.sampled import Sampling
+from forewarp.methods.sampled import OF_JAX, OF_PYTORCH, Sampling
 from forewarp.methods.tnerf import TNeRF
 from forewarp.ops.encode import positional_encoding
+from forewarp.scene.batch import Batch, Observation
 from forewarp.scene.view import Moment, View
-from tests.support.sampled_methods import GENTLE, KINDS, batch, learned, method, shown, start
-from tests.support.sliding_square import camera, static_ceiling
+from tests.support.sampled_methods import GENTLE, KINDS, SMALL, WARP, batch, learned, method, shown, start
+from tests.support.sliding_square import camera, moving_scene, static_ceiling
 
 
 @pytest.mark.parametrize(
@@ -77,7 +78,19 @@ def test_a_dead_start_is_named():
     generator = torch.Generator().manual_seed(0)
     for _ in range(19):
         assert made.look(batch(), {"photo": 1.0}, generator).noted["opacity"] == 0
-    with pytest.raises(ValueError, match=r"a dead start; set another seed=N, or model.sampling.density=soft"):
+    advice = "set another seed=N, or model.sampling.density=softplus model.sampling.open_end=false"
+    with pytest.raises(ValueError, match=f"a dead start; {advice}"):
+        made.look(batch(), {"photo": 1.0}, generator)
+
+
+def test_a_first_pass_that_is_dead_alone_is_named():
+    made, generator = method("nerf"), torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        made.coarse.density_head.bias.fill_(-100)
+        made.fine.density_head.bias.fill_(1)
+    for _ in range(19):
+        assert made.look(batch(), {"photo": 1.0}, generator).noted["opacity"] > 0
+    with pytest.raises(ValueError, match="a dead start"):
         made.look(batch(), {"photo": 1.0}, generator)
 
 
@@ -87,7 +100,7 @@ def test_a_field_that_nothing_is_left_of_is_dead():
     generator = torch.Generator().manual_seed(0)
     for _ in range(19):
         assert made.look(batch(), {"photo": 1.0}, generator).noted["samples"] == 0
-    with pytest.raises(ValueError, match=r"0 along every ray of 20 .* or model.sampling.occupancy=0"):
+    with pytest.raises(ValueError, match=r"0 along every ray in each of 20 .* or model.sampling.occupancy=0"):
         made.look(batch(), {"photo": 1.0}, generator)
 
 
@@ -120,6 +133,38 @@ def test_a_start_that_comes_alive_is_none():
             made.network.density_head.bias.fill_(1.0 if step % 15 == 14 else -100)
         opacity = made.look(batch(), {"photo": 1.0}, generator).noted["opacity"]
         assert (opacity > 0) == (step % 15 == 14)
+
+
+@pytest.mark.parametrize(
+    ("make", "departures", "faults"),
+    [
+        (NeRF, OF_PYTORCH, []),
+        (TNeRF, OF_PYTORCH, []),
+        (DNeRF, OF_PYTORCH, ["offsets jump at the canonical time (continuous)"]),
+        (partial(DNeRF, continuous=True), (*OF_PYTORCH, "continuous offsets"), []),
+        (Nerfies, OF_JAX, []),
+        (HyperNeRF, (*OF_JAX, "pictures are drawn without random samples"), []),
+        (
+            partial(HyperNeRF, sampling=Sampling(density="softplus", jitter_in_pictures=True)),
+            OF_JAX,
+            ["pictures are drawn with random samples (jitter_in_pictures)"],
+        ),
+        (
+            partial(NeRF, glorot=True, sampling=Sampling(density="softplus")),
+            ("as Nerfies without its warp (the configuration was not published)", OF_JAX[0]),
+            [],
+        ),
+        (
+            partial(TNeRF, sampling=Sampling(jitter_in_pictures=True)),
+            (*OF_PYTORCH, "pictures are drawn with random samples"),
+            [],
+        ),
+    ],
+)
+def test_departures_and_faults_are_those_of_the_publication(make, departures, faults):
+    made = make(start())
+    expected = {"departures": "; ".join(departures), "faults": "; ".join(faults)}
+    assert made.protocol() == {name: text for name, text in expected.items() if text}
 
 
 def test_its_protocol_names_departures():
@@ -227,6 +272,44 @@ def test_a_rigid_warp_is_not_elastic_and_one_that_doubles_is():
     assert float(bent.detach().mean()) > 0.5
     bent.sum().backward()
     assert other.warp.shift.weight.grad.isfinite().all()
+
+
+def by_cameras(*ids):
+    """Nerfies whose training pictures are of cameras with these ids, whose codes differ much."""
+    scene = moving_scene()
+    train = tuple(replace(frame, camera_id=camera) for frame, camera in zip(scene.train, ids))
+    torch.manual_seed(0)
+    options = SMALL | WARP | {"sampling": Sampling(12, 12, **GENTLE)}
+    made = Nerfies(start(replace(scene, train=train)), **options)
+    with torch.no_grad():
+        made.camera_codes.table.copy_(torch.tensor([[9.0, -9.0], [-9.0, 9.0]]))
+    return made
+
+
+def test_a_snapshot_holds_what_it_draws_alike():
+    plain = method("hypernerf", **GENTLE)
+    for made, alike in ((by_cameras(1, 2, 2), False), (plain, True)):
+        one, other = Moment(0.5, camera=1), Moment(0.5, camera=2)
+        assert made.at(one).holds(other) == alike
+        assert made.at(one).holds(replace(one, frame=3))
+        with torch.no_grad():
+            drawn = [made.at(m).render(View(camera()), torch.ones(3)).rgb for m in (one, other)]
+        assert drawn[0].equal(drawn[1]) == alike
+
+
+def test_each_view_of_a_batch_is_seen_by_the_code_of_its_camera():
+    made = by_cameras(1, 2, 2)
+    rgb, white = torch.rand(144, 3), torch.ones(3)
+    both = [Observation(Moment(0.5, camera=i), View(camera()), rgb, white) for i in (1, 2)]
+    step = made.look(Batch(tuple(both), 0), {"photo": 1.0}, torch.Generator().manual_seed(0))
+    assert step.noted["samples"] == 2 * 144 * 24
+    sum(step.terms[name]() for name in ("photo", "coarse_photo")).backward()
+    assert made.camera_codes.table.grad.ne(0).all()
+    generator = torch.Generator().manual_seed(0)
+    alone = [made.look(Batch((one,), 0), {"photo": 1.0}, generator) for one in both]
+    mean = sum(float(one.squared_error) for one in alone) / 2
+    assert float(step.squared_error) == pytest.approx(mean)
+    assert dict(step.tensors())["rgb"].shape == (288, 3)
 
 
 def test_points_that_never_move_are_pulled_to_stay():

@@ -195,6 +195,16 @@ def test_a_pace_ignores_how_many_times_there_are():
         assert found == expected
 
 
+def test_times_come_in_as_if_from_none_on():
+    for count in (50, 100, 200):  # D-NeRF's max(int(i / 100k * count), 3)
+        curriculum = Curriculum([i / count for i in range(count)], 0.0, start=3, all_in=0.125, from_zero=True)
+        found = []
+        for step in (0, 8_000, 50_000, 100_000, 800_000):
+            curriculum.fraction = step / 800_000
+            found.append(curriculum.in_play)
+        assert found == [3, 8 * count // 100, count // 2, count, count]
+
+
 ODD = (
     {"start": 0},
     {"all_in": 1.5},

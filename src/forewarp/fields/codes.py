@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import bisect
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 
 import torch
 from torch import Tensor, nn
@@ -48,16 +48,17 @@ class CameraCodes(nn.Module):
     """A code (D,) for each camera that took training pictures; others see by the mean of them.
 
     Args:
-        count: number of cameras.
+        cameras: their ids; None: pictures whose camera is not known.
         size: D.
         spread: the first values are uniform in [0, spread).
     """
 
-    def __init__(self, count: int, size: int, spread: float = 0.05) -> None:
+    def __init__(self, cameras: Set[int | None], size: int, spread: float = 0.05) -> None:
         super().__init__()
-        self.table = nn.Parameter(spread * torch.rand(count, size))
+        ordered = sorted(cameras, key=lambda camera: (camera is None, camera))
+        self.rows = {camera: row for row, camera in enumerate(ordered)}
+        self.table = nn.Parameter(spread * torch.rand(len(self.rows), size))
 
     def forward(self, camera: int | None) -> Tensor:
-        """Return the code (D,) of a camera's number."""
-        known = camera is not None and 0 <= camera < len(self.table)
-        return self.table[camera] if known else self.table.mean(0)
+        """Return the code (D,) of a camera's id."""
+        return self.table[self.rows[camera]] if camera in self.rows else self.table.mean(0)

@@ -124,5 +124,5 @@ def start_as_glorot(layer: nn.Module) -> None:
 def density_of(name: str) -> Callable[[Tensor], Tensor]:
     """Return the density activation ``relu`` or ``softplus``; ValueError for another name."""
     if name not in DENSITY:
-        raise ValueError(f"model.density: expected {' or '.join(DENSITY)}, but got {name!r}")
+        raise ValueError(f"model.sampling.density: expected {' or '.join(DENSITY)}, but got {name!r}")
     return DENSITY[name]

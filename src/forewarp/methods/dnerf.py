@@ -93,7 +93,12 @@ class DNeRF(SampledMethod):
 
     def departures(self) -> list[str]:
         """See ``SampledMethod``."""
-        return ["no centre crop at first", *(["continuous offsets"] if self.continuous else [])]
+        return super().departures() + (["continuous offsets"] if self.continuous else [])
+
+    def faults(self) -> list[str]:
+        """See ``Method``."""
+        jump = [] if self.continuous else ["offsets jump at the canonical time (continuous)"]
+        return super().faults() + jump
 
 
 def _neighbours(times: tuple[float, ...], time: float) -> list[float]:

@@ -11,7 +11,7 @@ from forewarp.fields.codes import TimeCodes
 from forewarp.fields.screws import ScrewWarp
 from forewarp.fields.template import Template, Trunk
 from forewarp.methods.method import Start
-from forewarp.methods.sampled import Field, SampledMethod, Sampling, encoder
+from forewarp.methods.sampled import OF_JAX, Field, SampledMethod, Sampling, encoder
 from forewarp.ops.encode import encoded_size, positional_encoding
 from forewarp.quadrature import Sampled
 from forewarp.scene.batch import Batch
@@ -70,6 +70,8 @@ class HyperNeRF(SampledMethod):
     terms = ("photo", "coarse_photo", "still")
     numbers = ("warp_in", "slice_from", "slice_in")
     published = "softplus"
+    jitters = True
+    conventions = OF_JAX
 
     def __init__(
         self,

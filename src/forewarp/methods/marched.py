@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -230,19 +230,9 @@ class MarchedMethod(Method):
         """Adopt a checkpoint's box."""
         self.box = Box(tuple(state["low"]), tuple(state["high"]))
 
-    def departures(self) -> Sequence[str]:
-        """List what differs from the publication beside the marching."""
-        return ()
-
-    def faults(self) -> Sequence[str]:
-        """List the faults of the released code that are on."""
-        return ()
-
-    def protocol(self) -> dict[str, str]:
-        """List the departures from the publication, and the faults kept from its code."""
-        departures = "; ".join([*self.marching.departures(), *self.departures()])
-        kept = "; ".join(self.faults())
-        return {"departures": departures} | ({"faults": kept} if kept else {})
+    def departures(self) -> list[str]:
+        """See ``Method``; a subclass adds its own to those of the marching."""
+        return self.marching.departures()
 
 
 @dataclass(frozen=True)

@@ -148,9 +148,18 @@ class Method(nn.Module):
         """Return numbers for the next stage, which only the same method understands."""
         return {}
 
+    def departures(self) -> list[str]:
+        """List what differs from the publication."""
+        return []
+
+    def faults(self) -> list[str]:
+        """List the faults of the released code that are on, each with its key."""
+        return []
+
     def protocol(self) -> dict[str, str]:
-        """Return what readers of the method's results should know, for example departures from the paper."""
-        return {}
+        """Return what readers of the method's results should know: departures and kept faults, if any."""
+        found = {"departures": self.departures(), "faults": self.faults()}
+        return {name: "; ".join(notes) for name, notes in found.items() if notes}
 
     @property
     def size(self) -> tuple[str, int]:

@@ -242,11 +242,15 @@ class NDVG(MarchedMethod):
 
     def departures(self) -> list[str]:
         """See ``MarchedMethod``."""
-        found = ["offsets without a jump at the canonical time"] if self.continuous else []
-        return found + (["the second stage starts from the density of the first"] if self.stage.carry else [])
+        found = super().departures()
+        if self.continuous:
+            found.append("offsets without a jump at the canonical time")
+        if self.stage.carry:
+            found.append("the second stage starts from the density of the first")
+        return found
 
     def faults(self) -> list[str]:
-        """See ``MarchedMethod``."""
+        """See ``Method``."""
         found = []
         if self.pool is not None and (unseen := len(self.times) - int(self.pool)) > 0:
             found.append(f"the first stage never sees the last {unseen} times (pool)")

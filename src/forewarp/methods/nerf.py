@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from forewarp.fields.template import Template
 from forewarp.methods.method import Start
-from forewarp.methods.sampled import Field, SampledMethod, Sampling, encoder
+from forewarp.methods.sampled import OF_JAX, Field, SampledMethod, Sampling, encoder
 from forewarp.ops.encode import encoded_size
 from forewarp.scene.view import Moment
 
@@ -20,7 +20,8 @@ class NeRF(SampledMethod):
         sampling: see ``Sampling``.
         width, layers, skip: see ``fields.template.Trunk``.
         position_frequencies, direction_frequencies: octaves of the encodings.
-        glorot: first values of the JAX versions (Glorot, biases 0) in place of PyTorch's.
+        glorot: the NeRF of HyperNeRF's tables: Nerfies without its warp, whose code is in JAX (first values:
+            Glorot's, biases 0), in place of PyTorch's.
     """
 
     terms = ("photo", "coarse_photo")
@@ -39,6 +40,10 @@ class NeRF(SampledMethod):
         glorot: bool = False,
     ) -> None:
         super().__init__(start, sampling or Sampling())
+        if glorot:
+            self.published = "softplus"
+            note = "as Nerfies without its warp (the configuration was not published)"
+            self.conventions = (note, OF_JAX[0])
         self.position, self.direction = encoder(position_frequencies), encoder(direction_frequencies)
         sizes = encoded_size(3, position_frequencies), encoded_size(3, direction_frequencies)
         shape = {"width": width, "layers": layers, "skip": skip, "glorot": glorot}

@@ -11,7 +11,7 @@ from forewarp.fields.codes import CameraCodes, TimeCodes
 from forewarp.fields.screws import ScrewWarp, drawn
 from forewarp.fields.template import Template
 from forewarp.methods.method import Start
-from forewarp.methods.sampled import Field, SampledMethod, Sampling, encoder
+from forewarp.methods.sampled import OF_JAX, Field, SampledMethod, Sampling, encoder
 from forewarp.ops.encode import encoded_size
 from forewarp.quadrature import Sampled
 from forewarp.scene.batch import Batch
@@ -38,6 +38,7 @@ class Nerfies(SampledMethod):
     terms = ("photo", "coarse_photo", "elastic", "still")
     numbers = ("warp_in",)
     published = "softplus"
+    conventions = OF_JAX
 
     def __init__(
         self,
@@ -64,8 +65,9 @@ class Nerfies(SampledMethod):
         self.warp = ScrewWarp(
             code_size, frequencies=warp_frequencies, width=warp_width, layers=warp_layers, skip=warp_skip
         )
-        cameras = len({frame.camera_id for frame in start.scene.train})
+        cameras = {frame.camera_id for frame in start.scene.train}
         self.camera_codes = CameraCodes(cameras, camera_code_size) if camera_code_size else None
+        self.sees_by_camera = self.camera_codes is not None
         sizes = (
             encoded_size(3, position_frequencies),
             encoded_size(3, direction_frequencies) + camera_code_size,

@@ -212,8 +212,8 @@ class NeuralVolumes(Method):
         """Make Adam with the published betas."""
         return torch.optim.Adam(groups, betas=(0.9, 0.999), eps=1e-8, fused=True)
 
-    def protocol(self) -> dict[str, str]:
-        """List the departures from the publication."""
+    def departures(self) -> list[str]:
+        """See ``Method``."""
         notes = [
             f"code from {self.pictures.shape[1]} picture(s) of an instant",
             "pixel centres at +0.5",
@@ -226,7 +226,16 @@ class NeuralVolumes(Method):
         notes += [f"first {name} {value:g}" for name, value in self.first.items() if value is not None]
         if not self.jitter_in_pictures:
             notes.append("pictures are drawn without random steps")
-        return {"departures": "; ".join(notes)}
+        return notes
+
+    def faults(self) -> list[str]:
+        """See ``Method``."""
+        kept = {
+            "at first the warp draws all points to the middle (from_identity)": not self.from_identity,
+            "at first most rays are opaque (first_opacity)": self.first["opacity"] is None,
+            "pictures are drawn with random steps (jitter_in_pictures)": self.jitter_in_pictures,
+        }
+        return [fault for fault, on in kept.items() if on]
 
 
 @dataclass(frozen=True)

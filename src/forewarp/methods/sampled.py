@@ -2,25 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from forewarp.fields.occupancy import Occupancy
 from forewarp.fields.template import Template, density_of
+from forewarp.methods.dead_start import DeadStart
 from forewarp.methods.method import Method, Snapshot, Start, Step
 from forewarp.ops.encode import positional_encoding
-from forewarp.quadrature import Quadrature, Sampled
+from forewarp.quadrature import Quadrature, Sampled, joined
 from forewarp.scene.batch import Batch
 from forewarp.scene.frame import spread
 from forewarp.scene.rays import Rays
 from forewarp.scene.view import Moment, Rendering, View
 
-_PATIENCE = 20  # steps in a row without any density, after which the network is dead
 _LOOK_EVERY = 8  # steps between two looks for where matter is
 _PICTURES = 64  # most whose outlines say where matter may be
+# What differs from the publications in every preset, of those whose code is in PyTorch, and in JAX.
+OF_PYTORCH = ("pixel centres at +0.5", "near and far along unit rays", "no centre crop at first")
+OF_JAX = ("a step's rays from one picture", "codes interpolated between training times")
 
 
 @dataclass(frozen=True)
@@ -74,11 +77,11 @@ class Sampling:
         if not 0 <= self.hull <= 1:
             raise ValueError(f"model.sampling.hull: expected a share in [0, 1], but got {self.hull}")
 
-    def departures(self, published: str) -> list[str]:
-        """Name what differs from a publication with this density."""
-        notes = ["pixel centres at +0.5", "near and far along unit rays"]
-        if self.density != published:
-            notes.append(f"{self.density} density")
+    def departures(self, density: str, jitters: bool) -> list[str]:
+        """Name what differs from a publication with this density; ``jitters``: with random samples in
+        pictures.
+        """
+        notes = [f"{self.density} density"] if self.density != density else []
         if not self.open_end:
             notes.append("the last interval ends with the ray")
         if not self.fine_samples:
@@ -87,6 +90,8 @@ class Sampling:
             notes.append("empty outside the scene's box")
         if self.occupancy:
             notes.append("empty space is not sampled")
+        if self.jitter_in_pictures != jitters:
+            notes.append(f"pictures are drawn with{'' if self.jitter_in_pictures else 'out'} random samples")
         return notes
 
 
@@ -99,6 +104,9 @@ class SampledMethod(Method):
     """
 
     published = "relu"  # density in the publication
+    jitters = False  # whether the released code draws the samples of pictures at random
+    conventions = OF_PYTORCH
+    sees_by_camera = False  # whether colour depends on the id of the camera that looks
 
     def __init__(self, start: Start, sampling: Sampling) -> None:
         super().__init__()
@@ -115,7 +123,10 @@ class SampledMethod(Method):
             box if sampling.inside_box or sampling.occupancy else None,
             self.occupancy,
         )
-        self._blank_steps = 0
+        alive = "density=softplus model.sampling.open_end=false"  # an open end would hide the background
+        alive = alive if sampling.density == "relu" else "occupancy=0"
+        advice = f"set another seed=N, or model.sampling.{alive}"
+        self.dead_start = DeadStart("model.sampling", "a density of 0 along every ray", advice)
 
     def passes(self, make: Callable[[], Template]) -> tuple[Template | None, Template]:
         """Make a network for each pass; None in place of the first where there is one pass."""
@@ -139,16 +150,19 @@ class SampledMethod(Method):
         return SampledSnapshot(moment, self)
 
     def look(self, batch: Batch, factors: Mapping[str, float], generator: torch.Generator) -> Step:
-        """See ``Method.look``; a batch holds one moment, as no neighbours are asked for.
+        """See ``Method.look``; a batch holds one time, as no neighbours are asked for, seen by one or
+        several cameras.
 
         Raises:
-            ValueError: if the density is 0 at every sample, or no sample is left, for many steps: there is
-                then no gradient.
+            ValueError: if the density of a pass is 0 at every sample, or no sample is left, for many steps:
+                there is then no gradient.
         """
-        rays, rgb, background = batch.joined()
-        moment = batch.observations[0].moment
-        seen = self.at(moment).sampled(rays.to(self.device), background.to(self.device), generator)
-        self._refuse_a_dead_start(seen.density)
+        rgb, parts = batch.joined()[1], [batch]
+        if self.sees_by_camera:
+            parts = [replace(batch, observations=(one,)) for one in batch.observations]
+        seen = joined([self._sampled(part, generator) for part in parts])
+        passes = [seen] if seen.coarse is None else [seen.coarse, seen]
+        self.dead_start.look(all(bool((one.density > 0).any()) for one in passes))
         error = (seen.rgb - rgb).square().mean()
         terms = {"photo": lambda: error}
         if "coarse_photo" in self.terms:
@@ -160,15 +174,10 @@ class SampledMethod(Method):
             tensors=lambda: ((name, getattr(seen, name)) for name in ("density", "weights", "rgb")),
         )
 
-    def _refuse_a_dead_start(self, density: Tensor) -> None:
-        self._blank_steps = 0 if bool((density > 0).any()) else self._blank_steps + 1
-        if self._blank_steps >= _PATIENCE:
-            relu = self.sampling.density == "relu"
-            raise ValueError(
-                f"model.sampling: expected matter somewhere, but got a density of 0 along every ray of "
-                f"{_PATIENCE} steps, which has no gradient: a dead start; set another seed=N, or "
-                f"model.sampling.{'density=softplus' if relu else 'occupancy=0'}"
-            )
+    def _sampled(self, batch: Batch, generator: torch.Generator) -> Sampled:
+        rays, _, background = batch.joined()
+        snapshot = self.at(batch.observations[0].moment)
+        return snapshot.sampled(rays.to(self.device), background.to(self.device), generator)
 
     def advance(self, progress: float, step: int, optimizer: torch.optim.Optimizer) -> dict[str, float]:
         """See ``Method``; look now and then for where matter is."""
@@ -184,13 +193,14 @@ class SampledMethod(Method):
         """Make Adam with the published betas."""
         return torch.optim.Adam(groups, betas=(0.9, 0.999), eps=1e-8, fused=True)
 
-    def departures(self) -> Sequence[str]:
-        """List what differs from the publication beside the sampling."""
-        return ()
+    def departures(self) -> list[str]:
+        """See ``Method``; a subclass adds its own to those of the sampling and of the platform."""
+        return [*self.conventions, *self.sampling.departures(self.published, self.jitters)]
 
-    def protocol(self) -> dict[str, str]:
-        """List the departures from the publication."""
-        return {"departures": "; ".join([*self.sampling.departures(self.published), *self.departures()])}
+    def faults(self) -> list[str]:
+        """See ``Method``."""
+        kept = self.jitters and self.sampling.jitter_in_pictures
+        return ["pictures are drawn with random samples (jitter_in_pictures)"] if kept else []
 
 
 @dataclass(frozen=True)
@@ -220,8 +230,9 @@ class SampledSnapshot(Snapshot):
         return self.method.quadrature.picture(places, second.radiance, rays, background, jitter)
 
     def holds(self, moment: Moment) -> bool:
-        """Return whether it is the same time; the camera does not matter."""
-        return moment.time == self.moment.time
+        """Return whether it is the same time, and the same camera where that matters."""
+        alike = not self.method.sees_by_camera or moment.camera == self.moment.camera
+        return alike and moment.time == self.moment.time
 
 
 def encoder(frequencies: int) -> Callable[[Tensor], Tensor]:

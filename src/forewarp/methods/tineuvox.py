@@ -149,10 +149,10 @@ class TiNeuVox(MarchedMethod):
 
     def departures(self) -> list[str]:
         """See ``MarchedMethod``."""
-        return [] if self.padded else ["grid sizes of 4 k + 1"]
+        return super().departures() + ([] if self.padded else ["grid sizes of 4 k + 1"])
 
     def faults(self) -> list[str]:
-        """See ``MarchedMethod``."""
+        """See ``Method``."""
         found = ["the grid is padded with zeros (padded)"] if self.padded else []
         if self.frozen_from < 1:
             found.append(f"the grid stays as it is from {self.frozen_from:g} of the stage on (frozen_from)")

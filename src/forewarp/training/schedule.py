@@ -193,6 +193,8 @@ class Curriculum:
         canonical_time: where training starts.
         start: distinct times in play at the beginning.
         all_in: fraction of the stage at which all times are in play; 0: from the start.
+        from_zero: times come in as if from none on, of which ``start`` are in play in any case; False: from
+            ``start`` on.
         pace: distinct times that come into play in a whole stage, ``start`` at least, whatever ``all_in``; a
             longer sequence is never seen whole; null: by ``all_in``.
         most: number of times that ever come into play; null: all.
@@ -211,6 +213,7 @@ class Curriculum:
         *,
         start: int = 10,
         all_in: float = 0.6,
+        from_zero: bool = False,
         pace: float | None = None,
         most: int | None = None,
         newest_share: float = 0.3,
@@ -237,6 +240,7 @@ class Curriculum:
         if pace is not None and not pace >= 0:
             raise ValueError(f"{where}.pace: expected a number >= 0 or null, but got {pace}")
         self.start, self.all_in, self.pace = min(start, len(self._ends)), all_in, pace
+        self.from_zero = from_zero
         self.newest_share, self.newest_part = newest_share, newest_part
         self.error_share = error_share
         self.errors = torch.full((len(times),), float("nan"))
@@ -246,12 +250,15 @@ class Curriculum:
     @property
     def in_play(self) -> int:
         """Number of frames that may be drawn now."""
-        if self.pace is not None:
-            return self._ends[
-                min(max(self.start, int(self.pace * self.fraction + 1e-9)), len(self._ends)) - 1
-            ]
+        count = len(self._ends)
         done = 1.0 if self.all_in == 0 else min(1.0, self.fraction / self.all_in)
-        return self._ends[self.start + int((len(self._ends) - self.start) * done) - 1]
+        if self.pace is not None:
+            grown = int(self.pace * self.fraction + 1e-9)
+        elif self.from_zero:
+            grown = int(count * done + 1e-9)
+        else:
+            grown = self.start + int((count - self.start) * done)
+        return self._ends[min(max(self.start, grown), count) - 1]
 
     def frames(self) -> list[int]:
         """Return the frames in play, nearest to the canonical time first."""

@@ -335,9 +335,9 @@ class Particles(Method):
         """See ``HasEllipsoids``."""
         return matter.movement_of(self, times)
 
-    def protocol(self) -> dict[str, str]:
+    def departures(self) -> list[str]:
         """See ``Method``."""
-        return {"departures": "particles, rasterised, in the place of voxels that are marched through"}
+        return ["particles, rasterised, in the place of voxels that are marched through"]
 
 
 def _add(total: dict[str, Tensor], found: Mapping[str, Tensor]) -> None:
