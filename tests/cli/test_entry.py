@@ -73,9 +73,10 @@ def test_options_of_ones_own_stand_beside_ours(ok, way, in_tmp):
         (["budget.minuts=1"], "got none of this name; did you mean budget.minutes?"),
         (["modle/view_dependence=sh"], "modle/view_dependence: expected a key of the configuration, but got"),
         (["--multirun", "seed=0,1", "model=forward,backward", "budgt=fast"], "did you mean budget?"),
-        (
+        pytest.param(
             ["model=forward", "model/upsampler=learned", "model.upsampler.recomputes=true"],
             "mean model.upsampler.recompute?",
+            marks=pytest.mark.slow,
         ),
         (["data=[1"], "data=[1: no viable alternative at input '[1'"),
         (["budget.minutes=-1"], "budget.minutes: expected a number > 0 or null, but got -1"),
