@@ -150,6 +150,16 @@ def test_rates_of_lengths_are_of_the_scenes_extent(data):
     )
 
 
+def test_what_is_opaque_can_still_fade(data):
+    module = module_with(data)
+    method, optimizer = module.method, module.configure_optimizers()
+    method.opacity.data.fill_(20.0)  # 1 in float32, without a slope
+    method.advance(0.5, 0, optimizer)
+    assert method.opacity.sigmoid().min() > 0.997
+    gradient = look(module, data).gradients["opacity"]
+    assert (gradient[method.shown > 0] != 0).float().mean() > 0.9
+
+
 def test_particles_grow_to_what_the_pictures_call_for(data):
     numbers = {"every": 0.1, "first": 0.5, "settled": 1.0, "density": 400.0}  # some hundreds, of 6 pictures
     module = module_with(data, numbers=numbers)

@@ -32,6 +32,7 @@ from forewarp.scene.ellipsoids import Ellipsoids
 from forewarp.scene.view import Moment
 
 _TIMES = 16  # at which opacity over time is looked at
+_SOLID = 6.0  # largest logit of an opacity: of 17 float32 has no slope, and what is there can never fade
 
 
 class Particles(Method):
@@ -270,6 +271,7 @@ class Particles(Method):
         particles where it is time.
         """
         self.progress, numbers = progress, self.numbers_of
+        self.opacity.data.clamp_(max=_SOLID)
         for group in optimizer.param_groups:
             if group["name"] in ("means", "shifts"):
                 group["lr"] *= float(self.extent)
