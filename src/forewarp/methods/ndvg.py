@@ -197,8 +197,8 @@ class NDVG(MarchedMethod):
         """Offer ``flow_l1``, the samples' offsets; ``tv_deformation``; ``canonical``, offsets of samples at
         the canonical time, which ``F`` should give as 0; ``still``, at points that never move.
 
-        As published, means over samples are over all places of a ray along the box's diagonal, most of which
-        are in no box or empty and have no offset. So their weights do not depend on what is skipped.
+        Means of offsets are, as published, over as many places a ray as fit on the box's diagonal; places
+        that are empty or outside count as 0. So their weights do not depend on what is skipped.
         """
 
         def of_all(offsets: Tensor) -> Tensor:

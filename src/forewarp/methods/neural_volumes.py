@@ -188,7 +188,7 @@ class NeuralVolumes(Method):
         """See ``Method.look``; a batch holds one moment, as no neighbours are asked for.
 
         Raises:
-            ValueError: if every ray is opaque for many steps.
+            ValueError: if every ray is clear or opaque for many steps.
         """
         rays, rgb, background = batch.joined()
         moment = batch.observations[0].moment

@@ -48,10 +48,8 @@ CURVES = """PSNR of some pixels of validation views while each method learns; th
 the last of these, and not the table's, which is of whole test views. Schedules follow the share of the
 minutes that is spent, so no method is at its best before the end.
 """
-CURVES_OF, VIEWS_OF = (
-    "PSNR against seconds of training",
-    "Test views, the truth first,",
-)  # and then the methods
+CURVES_OF = "PSNR against seconds of training"  # and then the methods
+VIEWS_OF = "Test views, the truth first,"  # likewise
 VIEWS = "Test views and their PSNR (dB), cut to the subject: what a method draws elsewhere is not seen.\n"
 NUMBERS = ("psnr", "ssim", "lpips", "steps", "step", "frame", "parameters", "memory")
 COLUMNS = (

@@ -32,7 +32,7 @@ from forewarp.scene.ellipsoids import Ellipsoids
 from forewarp.scene.view import Moment
 
 _TIMES = 16  # at which opacity over time is looked at
-_SOLID = 6.0  # largest logit of an opacity: of 17 float32 has no slope, and what is there can never fade
+_MOST_OPAQUE = 6.0  # logit: at 17 float32 has no slope left, and what is opaque there can never fade
 
 
 class Particles(Method):
@@ -271,7 +271,7 @@ class Particles(Method):
         particles where it is time.
         """
         self.progress, numbers = progress, self.numbers_of
-        self.opacity.data.clamp_(max=_SOLID)
+        self.opacity.data.clamp_(max=_MOST_OPAQUE)
         for group in optimizer.param_groups:
             if group["name"] in ("means", "shifts"):
                 group["lr"] *= float(self.extent)
