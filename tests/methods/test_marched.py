@@ -91,6 +91,7 @@ def test_published_counts_of_ndvg():
 
 @pytest.mark.parametrize(("options", "moved", "opaque"), [(S, 0.14, 5.0e-3), (B, 0.12, 5.0e-4)])
 def test_tineuvox_starts_thin_and_moved(options, moved, opaque):
+    torch.manual_seed(0)
     made = TiNeuVox(start(9**3), **options)
     points = 3 * torch.rand(500, 3, generator=torch.Generator().manual_seed(0)) - 1.5
     offset = made.field(Moment(0.5)).offset(points).detach()
