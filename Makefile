@@ -147,21 +147,21 @@ LANES = $(MAKE) --no-print-directory -j$(JOBS) tables-vehicle tables-captures PR
 reproduce-tables: PRESET ?= $(if $(DATA),fast,demo)
 reproduce-tables: MINUTES := $(if $(filter command line,$(origin MINUTES)),$(MINUTES),$(if $(filter faithful,$(PRESET)),null,$(if $(DATA),5,1)))
 reproduce-tables: SWEEPS_TYPED := $(if $(filter command line,$(origin SWEEPS)),$(SWEEPS))
+reproduce-tables: SCENES_TYPED := $(if $(filter command line,$(origin SCENES)),$(SCENES))
 reproduce-tables: SWEEPS ?= $(if $(SCENES_TYPED),dnerf,dnerf hypernerf nhr lego_complete)
 reproduce-tables: override SWEEPS := $(if $(filter all,$(SWEEPS)),dnerf hypernerf nhr lego_complete ablation_modules ablation_losses resolution,$(SWEEPS))
-reproduce-tables: SCENES_TYPED := $(if $(filter command line,$(origin SCENES)),$(SCENES))
 reproduce-tables: SEEDS ?= 1
 reproduce-tables: OUT ?= runs/paper/results
-reproduce-tables: ## the paper's tables and figures by all its systems, beside published [DATA= METHODS="dnerf ndvg" PRESET= SCENES="hook lego" MINUTES= SEEDS=3 VIEWS= SWEEPS=all OUT=]
+reproduce-tables: ## the paper's tables and figures by all its systems, beside published [DATA=<folder that holds dnerf/ ...> METHODS="dnerf ndvg" PRESET= SCENES="hook lego" MINUTES= SEEDS=3 VIEWS= SWEEPS=all OUT=]
 ifeq ($(DATA),)
-	@$(if $(SCENES_TYPED),$(error SCENES: expected DATA=<folder of D-NeRF scenes> beside it))
+	@$(if $(SCENES_TYPED),$(error SCENES: expected DATA=<folder that holds dnerf/> beside it))
 	@$(if $(filter-out all ablations,$(SWEEPS_TYPED)),$(error SWEEPS: expected all or ablations without DATA, but got $(SWEEPS_TYPED)))
 	@status=0; $(LANES) MINUTES=$(MINUTES) $(GO_ON); \
 	$(BIN)/forewarp-report kind=paper out=$(OUT) curves=docs/results && exit $$status
 else
-	@status=0; $(REPRODUCE); for sweep in $(SWEEPS); do \
+	@status=0; $(REPRODUCE); for sweep in $(SWEEPS:ablations=ablation_modules ablation_losses); do \
 		table sweeps=$$sweep paths.scenes=$(DATA) \
-			$(if $(SCENES_TYPED),scene=$(subst $(space),$(comma),$(addprefix dnerf_,$(SCENES_TYPED)))) $(GO_ON); \
+			$(if $(SCENES_TYPED),absent=refuse scene=$(subst $(space),$(comma),$(addprefix dnerf_,$(SCENES_TYPED)))) $(GO_ON); \
 	done; \
 	$(BIN)/forewarp-report kind=paper out=$(OUT) curves=docs/results && exit $$status
 endif
@@ -181,7 +181,7 @@ ablations: ## what each part of the paper's method brings, on three counterparts
 	@status=0; \
 	$(LANES) SWEEPS=ablations ALSO="$(ALSO) $(ABLATIONS)" MINUTES=$(MINUTES) STEPS= $(GO_ON); \
 	$(LANES) SWEEPS=ablations ALSO="$(ALSO) $(ABLATIONS)" STEPS=$(STEPS) $(GO_ON); \
-	$(BIN)/forewarp-report kind=ablation $(ABLATIONS) out=$(OUT) && exit $$status
+	$(BIN)/forewarp-report kind=ablation out=$(OUT) && exit $$status
 
 ONLY_ABLATIONS = $(filter ablations,$(SWEEPS))
 WITH_ABLATIONS = $(filter ablations all,$(SWEEPS))

@@ -70,14 +70,27 @@ def test_real_scenes_are_fitted_by_the_methods_named(made):
     own, ablations, report = made(words)
     common = {"preset=fast", "budget.minutes=5", "paths.scenes=there", "scene=dnerf_hook,dnerf_lego"}
     assert own > common | {"sweeps=dnerf", "model=tnerf,dnerf"}
-    assert ablations > common | {"sweeps=ablation_losses"}
+    assert ablations > common | {"sweeps=ablation_losses", "absent=refuse"}
     assert not [word for word in ablations if word.startswith("model=")]
     assert "kind=paper" in report
 
 
+def test_scenes_alone_are_of_one_sweep(made):
+    fit, _ = made('reproduce-tables DATA=there SCENES="hook lego"')
+    assert fit > {"sweeps=dnerf", "scene=dnerf_hook,dnerf_lego", "absent=refuse"}
+
+
+def test_ablations_of_real_scenes_are_both_sweeps(made):
+    *fits, _ = made("reproduce-tables DATA=there SWEEPS=ablations")
+    assert [fit & {"sweeps=ablation_modules", "sweeps=ablation_losses"} for fit in fits] == [
+        {"sweeps=ablation_modules"},
+        {"sweeps=ablation_losses"},
+    ]
+
+
 def test_ablations_are_run_for_equal_minutes_and_equal_steps(made):
     *fits, report = made("ablations MINUTES=0.1 STEPS=30")
-    assert report == {"forewarp-report", "kind=ablation", "paths.runs=runs/ablations", "out=docs/results"}
+    assert report == {"forewarp-report", "kind=ablation", "out=docs/results"}
     by_time = called(fits, "budget.minutes=0.1", "seeds=2")
     by_steps = called(fits, "budget.minutes=null", "budget.iterations=30", "seeds=2")
     assert len(by_time) == len(by_steps) == 4
@@ -99,7 +112,7 @@ def test_ablations_are_run_for_equal_minutes_and_equal_steps(made):
 @pytest.mark.parametrize(
     ("line", "expected"),
     [
-        ("reproduce-tables SCENES=hook", "SCENES: expected DATA=<folder of D-NeRF scenes> beside it"),
+        ("reproduce-tables SCENES=hook", "SCENES: expected DATA=<folder that holds dnerf/> beside it"),
         ("reproduce-tables SWEEPS=dnerf", "SWEEPS: expected all or ablations without DATA, but got dnerf"),
         ("ablations DATA=there", "make reproduce-tables DATA=there SWEEPS="),
         ("ablations METHODS=ndvg", "DATA, METHODS: not for ablations"),

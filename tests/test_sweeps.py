@@ -168,10 +168,11 @@ def test_a_job_is_known_by_what_it_computes():
     assert same == folder_of(other)
     assert "{hash}" not in same
     others = [{"seed": 1}, {"budget__minutes": 3}, {"data__rays": 7}, {"stage__fine__share": 0.1}]
-    others += [{"trainer__precision": "bf16-mixed"}]
+    others += [{"trainer__precision": "bf16-mixed"}, {"threads": 1}]
     assert len({same, *(folder_of(job, **changes) for changes in others)}) == 1 + len(others)
-    assert folder_of(job, sheets=1, threads=1, trainer__accelerator="cpu") == same
+    assert folder_of(job, sheets=1, trainer__accelerator="cpu") == same
     steps = {"budget__minutes": None, "budget__iterations": 5}  # without minutes the machine does not count
+    assert folder_of(job, **steps, threads=1) == folder_of(job, **steps)
     folders = [folder_of(job, **steps, trainer__precision=p) for p in (None, "32-true", "bf16-mixed")]
     assert folders[0] == folders[1] != folders[2]
     assert folder_of(composed("data.scene=x", "data=dnerf")) == "runs/x/particles-fast-seed0"

@@ -91,12 +91,33 @@ def test_the_page_says_which_of_the_papers_orders_hold(tmp_path):
     assert len(table.splitlines()) == 1 + 2 * 7
 
 
-def test_scenes_and_kinds_of_views_have_sections_of_their_own(tmp_path):
-    for name, dataset, made in (
-        ("rig", "hypernerf", True),
-        ("hook", "dnerf", True),
-        ("lift", "lego_complete", True),
-    ):
+def test_a_row_with_fewer_seeds_says_so(tmp_path):
+    for seed, whole in enumerate((25.0, 26.0)):
+        part(tmp_path, "full", seed, whole)
+        part(tmp_path, "no_flow", seed, whole + 0.1 * seed)
+    part(tmp_path, "no_tv", 1, 24.0)
+    rows = page_of(tmp_path)[0].split("## Table 5")[1]
+    assert rows_of(rows, "w/o total variation")[0][2:5] == ["24.00", "-2.00", "holds (1 of 2 seeds)"]
+    assert rows_of(rows, "w/o flow L1")[0][4] == "within noise"
+
+
+def test_kinds_of_test_views_have_sections_of_their_own(tmp_path):
+    for variant, changes in (("full", (0.0, 0.0, 0.0)), ("no_inpainter", (-1.0, 1.0, 0.5))):
+        folder = part(tmp_path, variant, 0, 25.0, scene="lift", dataset="lego_complete")
+        metrics = json.loads((folder / "metrics.json").read_text())
+        kinds = zip(("space", "time", "canonical"), changes, strict=True)
+        metrics["test"] = {kind: {"psnr": 25.0 + change} for kind, change in kinds}
+        (folder / "metrics.json").write_text(json.dumps(metrics))
+    text, _ = page_of(tmp_path)
+    head, rows = "## Table 4: Lego Complete, by ability: {} interpolation, lift\n", []
+    for kind in ("Space", "Time", "Canonical"):
+        section = text.split(head.format(kind))[1].split("## ")[0]
+        rows += [rows_of(section, "Ours, no inpainter (80^3)")[0][1:4]]
+    assert rows == [["-0.97", "24.00", "-1.00"], ["-0.95", "26.00", "+1.00"], ["-1.72", "25.50", "+0.50"]]
+
+
+def test_scenes_have_sections_of_their_own(tmp_path):
+    for name, dataset, made in (("rig", "hypernerf", True), ("hook", "dnerf", True)):
         for variant, psnr in (("full", 25.0), ("no_inpainter", 24.0)):
             part(tmp_path, variant, 0, psnr, scene=name, dataset=dataset, made=made)
     for number, scene in enumerate(("vrig-3dprinter", "broom2", "vrig-chicken", "vrig-peel-banana")):

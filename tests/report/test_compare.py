@@ -44,6 +44,20 @@ def test_two_runs_side_by_side_with_their_difference(ok, runs):
     ]
 
 
+def test_conditions_in_which_runs_differ_are_told(runs):
+    told = {"clock": "wall", "threads": 2, "device": "a cpu"}
+    runs(
+        **{
+            name: metrics("forward", protocol={"method": "forward", **told} | more)
+            for name, more in (("one", {}), ("two", {"threads": 1, "held_out": 8}))
+        }
+    )
+    rows = {row[0]: row[1:] for row in compare(["one", "two"]).rows}
+    assert rows["threads"] == ["2", "1", None]
+    assert rows["views held out"] == ["none named", "8", None]
+    assert not {"computed on", "clock of the minutes"} & rows.keys()
+
+
 def test_a_view_is_drawn_by_every_run_that_has_it(ok, runs, in_tmp):
     for run in runs(one=metrics("particles"), two=metrics("forward"), three=metrics("backward")):
         for name in ("a", "b") if run != "three" else "b":

@@ -2,10 +2,12 @@
 
 import csv
 import json
+import os
 import sys
 
 import numpy as np
 import pytest
+import yaml
 from PIL import Image
 
 from forewarp.report.methods import write_methods
@@ -50,12 +52,13 @@ def test_methods_are_ranked_and_what_they_depart_from_is_listed_once(tmp_path):
     text = page.read_text()
     first = [line.split("|")[1].strip() for line in text.splitlines() if line.startswith("| `")]
     assert first == ["`particles`", "`forward` (the paper's)", "`ndvg`", "`tnerf`"]
-    assert rows_of(text, "`particles`")[0][1:6] == ["31.00 ± 1.41", "0.9000 ± 0.0000", "", "100", "0.500"]
+    assert rows_of(text, "`particles`")[0][1:6] == ["2", "31.00 ± 1.41", "0.9000 ± 0.0000", "", "100"]
     assert rows_of(text, "rays of one picture") == [["rays of one picture", "`ndvg`, `tnerf`"]]
     assert rows_of(text, "kept fault: padded") == [["kept fault: padded", "`ndvg`"]]
     assert "**ball, 5 minutes, 5 of 20 test views, evenly spread**" in text
     assert "* ball/full-1.0-seed0: an ablation" in text
     assert "scene=ball model=forward,ndvg,particles,tnerf budget.clock=processor threads=2\n" in text
+    assert "minutes: particles 30.00, forward 27.00, ndvg 22.00](methods-ball-views.png)" in text
     curve = next(csv.DictReader(table.read_text().splitlines()))["curve"]
     assert curve == "10.0:22.00 100.0:27.00"
     assert (curves.name, views.name) == ("methods-ball.png", "methods-ball-views.png")
@@ -72,7 +75,7 @@ def test_later_runs_are_added_and_the_longest_are_drawn(tmp_path):
     method_run(tmp_path / "later", "forward", 29.0, minutes=20.0, sheets=False)
     (tmp_path / "out" / "faithful-step.md").touch()
     text = write_methods(tmp_path / "later", tmp_path / "out")[0].read_text()
-    assert [row[1] for row in rows_of(text, "`forward` (the paper's)")] == ["27.00", "29.00"]
+    assert [row[2] for row in rows_of(text, "`forward` (the paper's)")] == ["27.00", "29.00"]
     assert "](faithful-step.md)" in text
 
 
@@ -84,18 +87,27 @@ def test_runs_under_other_conditions_have_a_table_of_their_own(tmp_path):
         {"threads": None},
         {"device": "other"},
         {"measured": "9 of 20 test views"},
+        {"resolution": [[90, 60], [80, 60]], "background": "white"},
+        {"held_out": 8},
+        {"iterations": 300},
     )
     for number, more in enumerate(conditions):
-        method_run(runs / str(number), "forward", 20.0 + number, sheets=False, **more)
+        steps = more.pop("iterations", None)
+        folder = method_run(runs / str(number), "forward", 20.0 + number, sheets=False, **more)
+        if steps:
+            config = yaml.safe_load((folder / "config.yaml").read_text())
+            config["budget"]["iterations"] = steps
+            (folder / "config.yaml").write_text(yaml.safe_dump(config))
     for _ in range(2):  # the second time the rows come from the table, too
         text = write_methods(runs, out)[0].read_text()
-        found = [row[1] for row in rows_of(text, "`forward` (the paper's)")]
+        found = [row[2] for row in rows_of(text, "`forward` (the paper's)")]
         assert sorted(found) == [f"{20 + number}.00" for number in range(len(conditions))]
-    assert text.count("5 minutes, wall clock") == 1
+    for words in ("wall clock", "90x60 and 80x60, background white", "8 views held out", "300 steps at most"):
+        assert sum(f", {words}" in line for line in text.splitlines()) == 1
     method_run(tmp_path / "again", "forward", 30.0, sheets=False)
     text = write_methods(tmp_path / "again", out)[0].read_text()
-    found = [row[1] for row in rows_of(text, "`forward` (the paper's)")]
-    assert sorted(found) == ["21.00", "22.00", "23.00", "24.00", "30.00"]  # measured again
+    found = [row[2] for row in rows_of(text, "`forward` (the paper's)")]
+    assert sorted(found) == [f"{20 + number}.00" for number in (1, 2, 3, 4, 5, 6, 7, 10)]  # again
 
 
 def test_a_picture_of_more_methods_stays(tmp_path):
@@ -107,7 +119,19 @@ def test_a_picture_of_more_methods_stays(tmp_path):
     method_run(tmp_path / "later", "ndvg", 20.0)
     text = write_methods(tmp_path / "later", tmp_path / "out")[0].read_text()
     assert picture.read_bytes() == before
-    assert "after 5 minutes: forward, ndvg](methods-ball-views.png)" in text
+    assert "after 5 minutes: forward 25.00, ndvg 25.00](methods-ball-views.png)" in text
+    assert text.count("The picture is of runs before the table's of `ndvg`.") == 1  # curves are of the table
+    again = write_methods(tmp_path / "later", tmp_path / "out")[0].read_text()
+    assert "The picture is of runs before the table's of `ndvg`." in again
+
+
+def test_of_equal_runs_the_newest_counts_and_the_other_is_named(tmp_path):
+    old = method_run(tmp_path / "runs" / "old", "forward", 25.0, sheets=False)
+    os.utime(old / "metrics.json", (0, 0))
+    method_run(tmp_path / "runs" / "new", "forward", 26.0, sheets=False)
+    text = write_methods(tmp_path / "runs", tmp_path / "out")[0].read_text()
+    assert [row[2] for row in rows_of(text, "`forward` (the paper's)")] == ["26.00"]
+    assert f"* {old.relative_to(tmp_path / 'runs')}: another run of the same is newer" in text
 
 
 def test_without_matplotlib_the_page_says_why_it_has_no_picture(tmp_path, monkeypatch):

@@ -38,9 +38,9 @@ def paper_run(
     return write_run(root, name, seed, scene=scene, curve=None, config=config, metrics=metrics)
 
 
-def table_of(root, key="dnerf", **options):
+def table_of(root, key="dnerf"):
     results, _ = collect(root, ["metrics.json"])
-    return comparison(with_means(read_paper(PAPER)[key], results), results, **options)
+    return comparison(with_means(read_paper(PAPER)[key], results), results)
 
 
 def cells(table, name, kind="measured"):
@@ -82,23 +82,25 @@ def test_ranks_are_among_measured_rows_alone(tmp_path):
     for variant, psnr, lpips in (("full", 25.0, 0.2), ("no_tv", 24.0, 0.1), ("no_view", 20.0, 0.3)):
         for scene in four:
             paper_run(tmp_path, scene, variant, psnr=psnr, lpips_vgg=lpips)
-    table = table_of(tmp_path, "losses", difference=False)
+    table = table_of(tmp_path, "losses")
     assert cells(table, "forewarp: the full, fast, 1 min") == ["[25.00]", "[0.900]", "(0.200)"]
     assert cells(table, "forewarp: the no_tv, fast, 1 min") == ["(24.00)", "[0.900]", "[0.100]"]
     assert cells(table, "forewarp: the no_view, fast, 1 min")[::2] == ["20.00", "0.300"]
     assert cells(table, "", "published") == ["33.75", "0.979", "0.040"]  # as printed, unmarked
-    kinds = [(row[0], row[1]) for row in table.rows[:5]]  # each published row has its measured one below it
+    assert cells(table, "", "difference to the paper") == ["-8.75", "-0.079", "+0.160"]
+    # Each published row has its measured one below it.
+    kinds = [row[:2] for row in table.rows[:7] if "difference" not in row[1]]
     assert kinds[::2] == [
-        ("Ours", "published"),
-        ("w/o total variation", "published"),
-        ("w/o flow L1", "published"),
+        ["Ours", "published"],
+        ["w/o total variation", "published"],
+        ["w/o flow L1", "published"],
     ]
     assert kinds[1::2] == [
-        ("forewarp: the full, fast, 1 min", "measured"),
-        ("forewarp: the no_tv, fast, 1 min", "measured"),
+        ["forewarp: the full, fast, 1 min", "measured"],
+        ["forewarp: the no_tv, fast, 1 min", "measured"],
     ]
-    assert table.rules == [2, 4, 8, 10]
-    assert table.texts({})[1][-len(COSTS) :] == ["50", "1.00", "2.000", "100", "1", "a cpu"]
+    assert table.rules == [3, 6, 10, 13]
+    assert table.texts({})[1][-len(COSTS) :] == ["50", "1.00", "2.000", "100", "1", "a cpu, 2 threads"]
     assert table.rows[0][-len(COSTS) :] == [None] * len(COSTS)
 
 
@@ -293,11 +295,29 @@ def test_no_mean_is_taken_over_unlike_images(tmp_path):
 
 
 def test_machines_have_rows_of_their_own(tmp_path):
+    machines = {"device": "a gpu"}, {"device": "a cpu"}, {"threads": 1}
     for number, scene in enumerate(ALL):
-        paper_run(tmp_path, scene, protocol={"device": "a gpu" if number < 4 else "a cpu"})
+        paper_run(tmp_path, scene, protocol=machines[number // 3])
     rows = [row for row in table_of(tmp_path).rows if row[1] == "measured"]
-    assert [row[-1] for row in rows] == ["a cpu", "a gpu"]
+    assert {row[-1] for row in rows} == {"a cpu, 2 threads", "a gpu, 2 threads", "a cpu, 1 thread"}
     assert all(row[2] is None for row in rows)
+
+
+@pytest.mark.parametrize(
+    ("change", "marked"),
+    [({}, True), ({"protocol": {"threads": 1}}, False), ({"protocol": {"clock": "processor"}}, False)],
+)
+def test_rows_of_other_conditions_are_not_ranked(tmp_path, change, marked):
+    for scene in ALL:
+        paper_run(tmp_path, scene, psnr=31.0)
+        paper_run(tmp_path, scene, warp="backward", psnr=30.0, **change)
+    assert bool(table_of(tmp_path).marks) is marked
+
+
+def test_scenes_at_different_scales_have_no_mean(tmp_path):
+    for number, scene in enumerate(ALL):
+        paper_run(tmp_path, scene, protocol={"scale": 2 if number else 4})
+    assert cells(table_of(tmp_path), "forewarp: forward (the paper's method), fast, 1 min")[0] == ""
 
 
 def test_curves_that_were_drawn_before_are_shown(tmp_path):

@@ -32,7 +32,7 @@ render anything.
   forewarp-report kind=limits 'runs=runs/paper/*/plain-forward-fast-*'
 
 What one types most:
-  runs=FOLDER            searched for runs (runs/accuracy_time, minutes, effects; paper of other tables)
+  runs=FOLDER            searched for runs (runs/accuracy_time, minutes, effects, ablations, else paper)
   runs=[FOLDER,FOLDER]   compare, limits: the runs themselves; patterns with * are expanded
   out=FOLDER             where the page goes (results/ below the runs); compare: where the picture goes
   target=DB              accuracy_time: PSNR that every variant's seconds are listed for
@@ -69,7 +69,7 @@ def report(config) -> None:
     if not isinstance(config.runs, str | None):
         raise ValueError(f"runs: expected one folder for kind={config.kind}, but got a list; name one folder")
     folders = {kind: kind for kind in ("paper", "effects", "minutes")}
-    folders |= {"ablation": "paper", "methods": "paper"}
+    folders |= {"ablation": "ablations", "methods": "paper"}
     default = folders.get(config.kind, "accuracy_time")
     runs = Path(config.runs or f"{config.paths.runs}/{default}")
     for file in _written(config, runs, Path(config.out or runs / "results")):

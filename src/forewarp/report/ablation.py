@@ -24,13 +24,14 @@ INTRODUCTION = (
     "Written by `forewarp-report kind=ablation`; `make ablations` makes its runs. Each row of the paper's "
     "tables of ablations takes one thing from its whole method (`Ours`). PSNR (dB) is of test views, mean "
     "± standard deviation over the seeds. A difference is to `Ours` with the same seed, scene and budget; "
-    "beside it stands the difference of the numbers that the paper prints, for real scenes. *Noise* is "
-    "the pooled standard deviation of the differences over seeds: of all rows, of all tables, with the "
-    "same scene and budget, each around its own mean. A mean difference no larger than that is *within "
-    "noise*; else the paper's order *holds* if both differences have the same sign, and is *reversed* if "
-    "not. With two seeds, about one row in six that changes nothing would still exceed the noise. Seconds "
-    "a step are of training, all stages together. At equal minutes a cheaper step means more steps; at "
-    "equal steps it counts for nothing."
+    "beside it stands the difference of the numbers that the paper prints, for real scenes. *Noise* is the "
+    "pooled standard deviation of the differences over seeds: of all rows, of all tables, with the same "
+    "scene and budget, each around its own mean. A mean difference no larger than that is *within noise*; "
+    "else the paper's order *holds* if both differences have the same sign, and is *reversed* if not. With "
+    "two seeds, one row in four to six that changes nothing would still exceed the noise, and all rows "
+    "share the runs of `Ours`, so they err together. A row with fewer seeds than `Ours` says so. Seconds a "
+    "step are of training, all stages together. At equal minutes a cheaper step means more steps; at equal "
+    "steps it counts for nothing."
 )
 
 
@@ -154,6 +155,9 @@ def _cells(
     change = Estimate.of(list(differences(found, row.variant, group).values()))
     step, whole = (_step(found[variant], group) for variant in (row.variant, "full"))
     order = verdict(change.mean, printed.get(row.variant), noise) if change else None
+    seeds, all_seeds = (len(found[variant].by_seed(group, "psnr")) for variant in (row.variant, "full"))
+    if order and seeds < all_seeds:
+        order += f" ({seeds} of {all_seeds} seeds)"
     times = step / whole if step and whole else None
     return [found[row.variant].cell(group, "psnr"), change, order, step, times]
 
@@ -198,7 +202,7 @@ def _label(budget: Row, others: Sequence[Row]) -> str:
     """Name a budget, with what else tells it from the others."""
     parts = [f"{budget.minutes:g} min" if budget.minutes else ""]
     parts += [f"{budget.iterations} steps" if budget.iterations else ""]
-    for name in ("preset", "device", "clock", "views", "held_out"):
+    for name in ("preset", "device", "threads", "clock", "views", "held_out"):
         several = len({getattr(other, name) for other in others}) > 1
         parts.append(f"{name.replace('_', ' ')} {getattr(budget, name)}" if several else "")
     return ", ".join(part for part in parts if part)

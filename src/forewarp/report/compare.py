@@ -15,13 +15,17 @@ _ABILITIES = {
     "canonical": "canonical time",
     "all": "all",
 }
+# Shown where the runs differ in them, as their numbers then tell little of the methods.
+_CONDITIONS = {"clock": "clock of the minutes", "threads": "threads", "device": "computed on"}
+_CONDITIONS |= {"resolution": "size of pictures", "measured": "test views", "held_out": "views held out"}
 _KEYS = ("protocol", "seconds", "test")
 
 
 def compare(folders: Sequence[Path]) -> Table:
     """Make a table with a row for each measure and a column for each run.
 
-    PSNR is that of the test views, in dB; for two runs a column with the difference is added.
+    PSNR is that of the test views, in dB; for two runs a column with the difference is added. Conditions in
+    which the runs differ come last.
 
     Args:
         folders: folders of measured runs.
@@ -46,6 +50,10 @@ def compare(folders: Sequence[Path]) -> Table:
         0,
         with_difference=False,
     )
+    for key, about in _CONDITIONS.items():
+        told = [str(found["protocol"].get(key) or "none named") for found in metrics]
+        if len(set(told)) > 1:
+            rows.append([about, *told, *[None] * (len(folders) == 2)])
     columns = ["PSNR (dB) of test views", *names_of(folders, metrics)]
     columns += ["difference"] if len(folders) == 2 else []
     return Table([Column(name) for name in columns], rows)

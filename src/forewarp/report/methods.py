@@ -50,11 +50,18 @@ minutes that is spent, so no method is at its best before the end.
 """
 CURVES_OF = "PSNR against seconds of training"  # and then the methods
 VIEWS_OF = "Test views, the truth first,"  # likewise
+KNOWN = re.compile(r"[^\[\]]* after (?P<minutes>\S+) minutes: (?P<methods>[^\[\]]*)$")  # words of a picture
 VIEWS = "Test views and their PSNR (dB), cut to the subject: what a method draws elsewhere is not seen.\n"
 NUMBERS = ("psnr", "ssim", "lpips", "steps", "step", "frame", "parameters", "memory")
 COLUMNS = (
-    *(Column("method"), Column("PSNR"), Column("SSIM", 4), Column("LPIPS", 4), Column("steps", 0)),
-    *(Column("s a step", 3), Column("s a frame", 2), Column("parameters (M)", 2), Column("GiB", 2)),
+    *(Column("method"), Column("seeds", 0), Column("PSNR"), Column("SSIM", 4), Column("LPIPS", 4)),
+    *(
+        Column("steps", 0),
+        Column("s a step", 3),
+        Column("s a frame", 2),
+        Column("parameters (M)", 2),
+        Column("GiB", 2),
+    ),
 )
 
 
@@ -62,7 +69,8 @@ def write_methods(runs: Path, out: Path) -> list[Path]:
     """Write ``methods.md``, ``methods.csv`` (a row a run), and two pictures of each scene.
 
     Rows of a table that is there already stay, as in ``write_minutes``. Views are drawn of the given runs
-    alone; a picture that an earlier page shows stays if it has more methods. Ablations are left out.
+    alone; a picture that an earlier page shows stays if it has more methods, and the page says which of
+    them have other rows by now. Ablations are left out.
 
     Args:
         runs: folder to search for measured runs.
@@ -92,7 +100,7 @@ def write_methods(runs: Path, out: Path) -> list[Path]:
         parts += [departures.markdown()]
     if (out / STEPS).is_file():
         parts += [f"What a step costs with the published numbers: [a step of `faithful`]({STEPS}).\n"]
-    parts += [commands(rows), *left_out("Without numbers", without)]
+    parts += [commands(rows, "methods"), *left_out("Without numbers", without)]
     replace_file(page, "\n".join(parts))
     return written
 
@@ -122,19 +130,37 @@ def _pictures(
         (curves, CURVES_OF, CURVES, first, partial(draw_curves, rows=first, title=f"{scene}, {about}")),
         (views, VIEWS_OF, VIEWS, seen, partial(draw_views, runs=seen)),
     ):
-        known = re.search(rf"!\[(.*)\]\({re.escape(path.name)}\)", earlier) if path.is_file() else None
-        if known and len(known[1].rpartition(": ")[2].split(", ")) > len(shown):
-            parts += [f"{known[0]}\n", text]
+        known = KNOWN.search(earlier.partition(f"]({path.name})")[0]) if path.is_file() else None
+        listed = _listed(known["methods"]) if known else {}
+        kept = (
+            [f"![{known[0]}]({path.name})\n", text, *_older(listed, known["minutes"], rows)] if known else []
+        )
+        if len(listed) > len(shown):
+            parts += kept
             continue
         try:
             done = draw(path)
         except ImportError as error:
-            parts += [f"{known[0]}\n", text] if known else [f"Without a picture: {error}.\n"]
+            parts += kept or [f"Without a picture: {error}.\n"]
             continue
         if done:
-            parts += [f"![{heading} after {about}: {', '.join(shown)}]({path.name})\n", text]
+            told = ", ".join(f"{name} {first[name]['psnr'] or 0.0:.2f}" for name in shown)
+            parts += [f"![{heading} after {about}: {told}]({path.name})\n", text]
             drawn.append(path)
     return parts, drawn
+
+
+def _listed(methods: str) -> dict[str, str]:
+    """Read the methods and their PSNR (dB) that the words of a picture list."""
+    return {name: psnr for name, _, psnr in (one.rpartition(" ") for one in methods.split(", "))}
+
+
+def _older(listed: Mapping[str, str], minutes: str, rows: list[dict]) -> list[str]:
+    """Say which methods of a picture have no row any more with the PSNR that the picture has."""
+    names = names_of(rows)
+    now = {(names[id(row)], f"{row['psnr'] or 0.0:.2f}") for row in rows if f"{row['minutes']:g}" == minutes}
+    changed = [f"`{name}`" for name, psnr in listed.items() if (name, psnr) not in now]
+    return [f"The picture is of runs before the table's of {', '.join(changed)}.\n"] if changed else []
 
 
 def _reached(rows: list[dict], others: list[dict]) -> Table:
@@ -147,8 +173,8 @@ def _reached(rows: list[dict], others: list[dict]) -> Table:
         found = {number: estimate(group, number) for number in NUMBERS}
         plain = {n: found[n] and found[n].mean for n in NUMBERS[3:]}
         paper = " (the paper's)" if group[0]["method"] == OURS else ""
-        lines.append([f"`{name}`{paper}", *(found | plain).values()])
-    lines.sort(key=lambda line: -line[1].mean if line[1] else 0.0)
+        lines.append([f"`{name}`{paper}", len(group), *(found | plain).values()])
+    lines.sort(key=lambda line: -line[2].mean if line[2] else 0.0)
     measured = sorted({row["measured"] for row in rows if row["measured"]})
     words = telling(rows[0], others, [name for name in CONDITIONS if name != "measured"])
     about = [rows[0]["scene"], f"{rows[0]['minutes']:g} minutes", *words, *measured]

@@ -56,7 +56,7 @@ def write_minutes(runs: Path, out: Path) -> list[Path]:
         named = _named(rows)
         parts += [_by_minutes(named).markdown(), "## Each\n", _details(named).markdown()]
         parts += ["## By view\n", f"![PSNR of each test view over time]({picture.name})\n"]
-        parts += [commands(rows)]
+        parts += [commands(rows, "minutes")]
         parts += left_out("Without numbers", without)
         replace_file(page, "\n".join(parts))
         _draw(named, picture)

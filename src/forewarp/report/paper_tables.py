@@ -8,7 +8,7 @@ from statistics import fmean
 from typing import NamedTuple
 
 from forewarp.metrics.gain import Estimate
-from forewarp.report.collect import Result
+from forewarp.report.collect import Result, machines
 from forewarp.report.paper_printed import Group, PaperTable
 from forewarp.report.paper_printed import Row as PrintedRow
 from forewarp.report.protocols import numbered, protocol_of
@@ -67,7 +67,7 @@ class Measured:
         known = ([run.numbers[name] for run in self.runs if name in run.numbers] for name in names)
         seconds = fmean(run.metrics["seconds"]["train"] for run in self.runs)
         means = [fmean(of) if of else None for of in known]
-        return [seconds, *means, ", ".join(sorted(protocols, key=int)), self.row.device]
+        return [seconds, *means, ", ".join(sorted(protocols, key=int)), machines([(*self.row.machine, None)])]
 
 
 class Row(NamedTuple):
@@ -80,8 +80,14 @@ class Row(NamedTuple):
     iterations: int | None
     held_out: int
     device: str | None
+    threads: int | None
     clock: str = "wall"
     views: int | None = None  # that were measured; None: all
+
+    @property
+    def machine(self) -> tuple[str | None, int | None]:
+        """The device and its threads."""
+        return self.device, self.threads
 
 
 def row_of(run: Result) -> Row:
@@ -89,7 +95,8 @@ def row_of(run: Result) -> Row:
     budget = run.config["budget"]
     known, protocol = (run.config.get("variant") or {}).get("name", "plain"), run.metrics.get("protocol", {})
     bounds = run.config["preset"]["name"], budget["minutes"], budget.get("iterations")
-    conditions = protocol.get("held_out", 0), protocol.get("device"), run.clock
+    machine = protocol.get("device"), protocol.get("threads")
+    conditions = protocol.get("held_out", 0), *machine, run.clock
     views = str(protocol.get("measured", "")).split(" ")[0]  # "10 of 30 test views, evenly spread"
     return Row(known, run.config["model"]["name"], *bounds, *conditions, int(views) if views else None)
 
@@ -116,25 +123,25 @@ def runs_of(rows: Sequence[Measured]) -> list[Result]:
     return [run for row in rows for run in row.runs]
 
 
-def comparison(table: PaperTable, results: Sequence[Result], *, difference: bool = True) -> Table:
+def comparison(table: PaperTable, results: Sequence[Result]) -> Table:
     """Make a table of each published row with the measured ones of its method below it, then the others.
 
-    In each column mark the best and the second best of the measured rows, if all have the same test views.
+    After each measured row comes its difference from the published one. In each column the best and the
+    second best of the measured rows are marked, if all may be compared.
 
     Args:
         table: the paper's table.
         results: the runs of the table's scenes.
-        difference: after each measured row add the difference from the published one.
     """
     found = measured(table, results)
     numbers = numbered(runs_of(found))
-    rows, ranked, rules, absent = [], {}, [], [None] * len(COSTS)
+    rows, ranked, rules, absent = [], [], [], [None] * len(COSTS)
 
     def add(one: Measured, printed: PrintedRow | None) -> None:
         cells = [one.cell(group, metric) for group, metric in table.columns]
-        ranked[len(rows)] = one.row.views
+        ranked.append(len(rows))
         rows.append([one.name, "measured", *cells, *one.costs(numbers)])
-        if difference and printed is not None and any(cells):
+        if printed is not None and any(cells):
             rows.append(["", "difference to the paper", *map(_difference, cells, printed.values), *absent])
 
     own = {one.row: table.printed(one.row.model, one.row.variant) for one in found}
@@ -149,7 +156,7 @@ def comparison(table: PaperTable, results: Sequence[Result], *, difference: bool
     for one in others:
         add(one, None)
     columns = [Column("method"), Column("kind"), *(_column(*pair) for pair in table.columns), *COSTS]
-    marks = _marks(table, rows, list(ranked)) if len(set(ranked.values())) == 1 else {}
+    marks = _marks(table, rows, ranked) if _comparable(found) else {}
     return Table(columns, rows, marks=marks, rules=[rule for rule in rules if rule])
 
 
@@ -179,8 +186,8 @@ def stand_in(table: PaperTable, results: Sequence[Result]) -> Table | None:
         Column("published as"),
         *(Column(f"published: {group.name} PSNR") for _, group in shown),
     ]
-    same = len({one.row.views for one in found}) == 1
-    return Table(columns, rows, marks=_marks(made, rows, range(len(rows)), 1) if same else {})
+    marks = _marks(made, rows, range(len(rows)), 1) if _comparable(found) else {}
+    return Table(columns, rows, marks=marks)
 
 
 def counterpart(table: PaperTable, results: Sequence[Result]) -> PaperTable | None:
@@ -215,9 +222,14 @@ def with_means(table: PaperTable, results: Sequence[Result]) -> PaperTable:
     return table
 
 
+def _comparable(rows: Sequence[Measured]) -> bool:
+    """Tell whether rows differ in method and variant alone: same budget, machine and test views."""
+    return len({one.row._replace(variant="", model="") for one in rows}) == 1
+
+
 def _conditions(run: Result) -> tuple:
     protocol = run.metrics.get("protocol", {})
-    return protocol.get("half_resolution"), protocol.get("background")
+    return tuple(protocol.get(key) for key in ("half_resolution", "scale", "background"))
 
 
 def _name(row: Row, runs: Sequence[Result]) -> str:

@@ -14,12 +14,19 @@ TOLD += ("measured", "held_out", "canonical_time", "mask_box")
 def protocol_of(run: Result) -> str:
     """Say in a line what a run was trained and measured on."""
     known = run.metrics.get("protocol", {})
-    sizes = known.get("resolution", [])
-    sizes = sizes if sizes and isinstance(sizes[0], list) else [sizes]
-    size = " and ".join("x".join(map(str, sides)) for sides in sizes)
-    words = [run.dataset, size, f"background {known.get('background', 'unknown')}"]
+    words = [run.dataset, pictures_in_words(run) or "background unknown"]
     words += [f"{key.replace('_', ' ')} {_text(known[key])}" for key in TOLD if known.get(key)]
     return ", ".join(word for word in [*words, known.get("note", "")] if word)
+
+
+def pictures_in_words(run: Result) -> str | None:
+    """Say how large a run's pictures are and over which background; None if the run does not tell."""
+    known = run.metrics.get("protocol", {})
+    sizes = known.get("resolution", [])
+    sizes = sizes if sizes and isinstance(sizes[0], list) else [sizes]
+    words = [" and ".join("x".join(map(str, sides)) for sides in sizes)]
+    words += [f"background {known['background']}"] if "background" in known else []
+    return ", ".join(filter(None, words)) or None
 
 
 def numbered(runs: Sequence[Result]) -> dict[str, str]:

@@ -9,15 +9,24 @@ import statistics
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from forewarp.files import read_json, read_text, replace_file
+from forewarp.files import read_text, replace_file
 from forewarp.metrics.gain import Estimate
 from forewarp.report.collect import Result, collect, machines
+from forewarp.report.protocols import pictures_in_words
+from forewarp.report.sheets import images_of
 
-CONDITIONS = ("clock", "threads", "device", "measured")  # rows that differ in these are not compared
+# Rows that differ in these are not compared.
+CONDITIONS = ("clock", "threads", "device", "measured", "pictures", "iterations", "held_out")
 FORMS = {"clock": "{} clock", "threads": "threads: {:g}"}
+FORMS |= {"iterations": "{:g} steps at most", "held_out": "{:g} views held out"}
 KEY = ("method", "preset", "scene", "minutes", "seed", *CONDITIONS)  # what tells rows apart
 NUMBERS = ("psnr", "ssim", "lpips", "steps", "step", "frame", "parameters", "memory", "ends")
 TEXTS = ("dataset", "day", "departures", "faults", "views", "curve", "command")
+PLACES = {
+    "paths.scenes": "DATASETS",
+    "data.root": "SCENES",
+    "lpips_weights": "WEIGHTS",
+}  # of whoever repeats it
 NETS = ("vgg", "alex", "squeeze")  # LPIPS is of the first whose weights were there
 CLOCKS = """Minutes are of training, by the
 platform's clock: it counts all that a method does to begin with (a visual hull, a plane sweep), and leaves
@@ -30,13 +39,19 @@ _MOST = 1 << 24  # bytes of a table that is read back
 def of_minutes(runs: Path) -> tuple[list[Result], list[str]]:
     """Read the measured runs below a folder that ended after minutes, and a line for each other run.
 
+    Of runs with the same ``KEY`` the one measured last is returned.
+
     Raises:
         ValueError: if there is no run at all.
     """
     results, without = collect(runs, ["metrics.json"])
     endless = [result for result in results if result.minutes is None]
     without += [f"{result.folder.relative_to(runs)}: no budget.minutes" for result in endless]
-    return [result for result in results if result.minutes is not None], without
+    timed = sorted((r for r in results if r.minutes is not None), key=lambda result: result.measured_at)
+    newest = {key_of(row_of(result)): result for result in timed}
+    older = [result for result in timed if newest[key_of(row_of(result))] is not result]
+    without += [f"{result.folder.relative_to(runs)}: another run of the same is newer" for result in older]
+    return list(newest.values()), without
 
 
 def row_of(result: Result) -> dict:
@@ -44,8 +59,7 @@ def row_of(result: Result) -> dict:
 
     ``step`` and ``frame`` are seconds, ``views`` is time:PSNR of each test view, ``curve`` is seconds:PSNR.
     """
-    images = (read_json(result.folder / "per_image.json") or {}).get("images", [])
-    views = sorted((one["time"], one["scores"]["psnr"]) for one in images)
+    views = sorted((one["time"], one["scores"]["psnr"]) for one in images_of(result.folder))
     numbers, scores = result.numbers, result.metrics["test"][result.ability]
     protocol = result.metrics["protocol"]
     frames = protocol.get("test_frames")
@@ -59,6 +73,9 @@ def row_of(result: Result) -> dict:
         "threads": protocol.get("threads"),
         "device": protocol.get("device"),
         "measured": protocol.get("measured", frames and f"all {frames} test views"),
+        "pictures": pictures_in_words(result),
+        "iterations": result.config["budget"].get("iterations"),
+        "held_out": protocol.get("held_out") or None,
         **{name: numbers.get(name) for name in NUMBERS},
         "lpips": next((scores[f"lpips_{net}"] for net in NETS if f"lpips_{net}" in scores), None),
         "ends": ends_below(views),
@@ -145,8 +162,9 @@ def _order(key: tuple) -> list[tuple]:
 
 def _read(row: dict) -> dict:
     """A row as ``row_of`` makes it; of an older table some fields are unknown."""
-    numbers = {name: float(row[name]) if row.get(name) else None for name in ("minutes", "threads", *NUMBERS)}
-    texts = {name: row.get(name) or None for name in ("clock", "device", "measured", *TEXTS)}
+    counted = ("minutes", "threads", "iterations", "held_out", *NUMBERS)
+    numbers = {name: float(row[name]) if row.get(name) else None for name in counted}
+    texts = {name: row.get(name) or None for name in ("clock", "device", "measured", "pictures", *TEXTS)}
     return row | numbers | texts | {"seed": int(row["seed"]), "clock": texts["clock"] or "wall"}
 
 
@@ -170,23 +188,42 @@ def made_on(rows: Sequence[dict]) -> str:
     return line + (f"; {' to '.join(dict.fromkeys((days[0], days[-1])))}" if days else "")
 
 
-def commands(rows: Sequence[dict]) -> str:
+def commands(rows: Sequence[dict], sweep: str) -> str:
     """The section with the commands that made the rows: those that differ only in ``model=`` as one.
 
-    A job of a sweep does not name what the sweep sets, so the clock and the threads are added.
+    Args:
+        rows: as of ``row_of``.
+        sweep: name of the sweep that gives jobs the processor clock, one thread and a folder each.
     """
     models: dict[str, list[str]] = {}
     for row in (row for row in rows if row["command"]):
-        command = re.sub(r"\s(seed|run|sheets)=\S+", "", row["command"])
-        if row["clock"] != "wall" and "budget.clock=" not in command and "#" not in command:
-            command += f" budget.clock={row['clock']}"
-            command += f" threads={row['threads']:g}" if row["threads"] and " threads=" not in command else ""
+        command = _repeated(row, sweep)
         model = re.search(r" model=(\S+)", command)
         command = command.replace(model[0], " model={}", 1) if model else command
         known = models.setdefault(command, [])
         known += [model[1]] if model and model[1] not in known else []
-    lines = []
-    for command, names in models.items():
-        several = command.replace("forewarp-train", "forewarp-train --multirun", 1)
-        lines.append((several if len(names) > 1 else command).replace("model={}", f"model={','.join(names)}"))
-    return "\n".join(["## Commands\n", "Each with its `seed=`.\n", "```bash", *sorted(lines), "```\n"])
+    lines = [command.replace("model={}", f"model={','.join(names)}") for command, names in models.items()]
+    about = "Each with its `seed=`; words in capitals are folders of your own.\n"
+    return "\n".join(["## Commands\n", about, "```bash", *sorted(lines), "```\n"])
+
+
+def _repeated(row: dict, sweep: str) -> str:
+    """A row's command as another would type it: without seed and folder, as a job of the sweep if it may be.
+
+    >>> row = {"command": "forewarp-train seed=1 scene=s run=r", "clock": "processor", "threads": 1.0}
+    >>> _repeated(row, "minutes")
+    'forewarp-train --multirun sweeps=minutes scene=s'
+    >>> _repeated(row | {"threads": 2.0}, "minutes")
+    'forewarp-train scene=s budget.clock=processor threads=2'
+    """
+    command = re.sub(r"\s(seed|run|sheets)=\S+", "", row["command"])
+    for key, word in PLACES.items():
+        command = re.sub(rf"(\s{re.escape(key)}=)\S+", rf"\g<1>{word}", command)
+    if row["clock"] == "wall" or "#" in command:
+        return command
+    command = re.sub(r"\s(budget\.clock|threads)=\S+", "", command)
+    if " scene=" in command and row["clock"] == "processor" and row["threads"] == 1:
+        return command.replace("forewarp-train", f"forewarp-train --multirun sweeps={sweep}", 1)
+    return f"{command} budget.clock={row['clock']}" + (
+        f" threads={row['threads']:g}" if row["threads"] else ""
+    )

@@ -33,7 +33,7 @@ def hashed(config: DictConfig) -> DictConfig:
     """Replace ``{hash}`` in the key ``run`` by ten digits of a hash of the keys that tell runs apart.
 
     So each configuration has a folder of its own, and a finished job is found again. A precision other than
-    32-true counts too, and for a run bounded by minutes the device.
+    32-true counts too, and for a run bounded by minutes the device and the number of threads.
     """
     if HASH in str(config.run):
         config.run = str(config.run).replace(HASH, content_hash(config))
@@ -48,7 +48,7 @@ def content_hash(config: DictConfig, more: Sequence[str] = (), *others: object) 
     if config.budget.minutes is not None:
         from forewarp.training.device import device_of
 
-        content["on"] = [device_of(config.trainer.accelerator).type, precision]
+        content["on"] = [device_of(config.trainer.accelerator).type, precision, config.get("threads")]
     elif precision not in (None, "32-true"):
         content["precision"] = precision
     if others:
