@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import accumulate as accumulated
 
 import torch
 from torch import Tensor
@@ -199,3 +201,16 @@ class Renderer:
         origins, directions, jitter = cls._starts(field, rays, generator)
         ray_ids, distances = march(origins, directions, rays.near, rays.far, step, field.cells, jitter)
         return ray_ids, distances, origins[ray_ids] + distances[:, None] * directions[ray_ids]
+
+
+def joined(parts: Sequence[Marched]) -> Marched:
+    """Put what several groups of rays saw behind one another; without the weights of all samples."""
+    if len(parts) == 1:
+        return parts[0]
+    begins = accumulated((len(part.rgb) for part in parts), initial=0)
+    names = ("rgb", "depth", "opacity", "transmittance", "weights", "colors")
+    return Marched(
+        **{name: torch.cat([getattr(part, name) for part in parts]) for name in names},
+        ray_ids=torch.cat([part.ray_ids + begin for part, begin in zip(parts, begins)]),
+        samples=sum(part.samples for part in parts),
+    )

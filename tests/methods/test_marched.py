@@ -13,6 +13,7 @@ from forewarp.methods.method import Start, parameter_count
 from forewarp.methods.ndvg import NDVG
 from forewarp.methods.tineuvox import TiNeuVox
 from forewarp.renderer import Renderer
+from forewarp.scene.batch import Batch
 from forewarp.scene.view import Moment, View
 from forewarp.training.objective import Objective
 from forewarp.training.schedule import StageSettings
@@ -293,6 +294,25 @@ def test_a_dead_start_is_named(kind):
         ValueError, match="dead start; set it to 0, or a larger alpha_init, or preset.occupancy=0"
     ):
         dead.look(batch(), {}, torch.Generator())
+
+
+def test_each_view_of_a_batch_is_seen_by_the_code_of_its_camera():
+    made = method("tineuvox", 13**3, camera=True, alpha_init=1e-2)
+    one = batch().observations[0]
+    both = [replace(one, moment=Moment(0.5, camera=i), rgb=one.rgb / (1 + i)) for i in (0, 1)]
+    terms = ("photo", "point_color", "background_entropy")
+
+    def look(*seen):
+        step = made.look(Batch(seen, 0), {}, torch.Generator().manual_seed(0))
+        return step, torch.stack([step.terms[name]().detach() for name in terms])
+
+    step, found = look(*both)
+    alone = [look(seen) for seen in both]
+    torch.testing.assert_close(found, sum(values for _, values in alone) / 2)
+    assert step.noted["samples"] == sum(other.noted["samples"] for other, _ in alone)
+    drawn = [dict(step.tensors())["rgb"].detach() for step in (step, *(other for other, _ in alone))]
+    torch.testing.assert_close(drawn[0], torch.cat(drawn[1:]))
+    assert not drawn[1].allclose(drawn[2])
 
 
 def test_the_second_stage_of_ndvg_goes_on_where_the_first_ended():

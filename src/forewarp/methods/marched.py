@@ -18,7 +18,7 @@ from forewarp.methods.method import Method, Snapshot, Start, Step
 from forewarp.methods.rows import renew_parameters
 from forewarp.methods.rows_adam import RowsAdam
 from forewarp.ops.warmup import warm_up
-from forewarp.renderer import Marched, Renderer
+from forewarp.renderer import Marched, Renderer, joined
 from forewarp.scene.batch import Batch
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.rays import Rays
@@ -90,6 +90,7 @@ class MarchedMethod(Method):
 
     terms = ("photo", "point_color", "background_entropy")
     numbers = ("num_voxels", "color_threshold")
+    sees_by_camera = False  # whether colour depends on the id of the camera that looks
 
     def __init__(self, start: Start, marching: Marching, box: Box) -> None:
         super().__init__()
@@ -140,7 +141,10 @@ class MarchedMethod(Method):
     def extra_terms(
         self, field: PointField, batch: Batch, generator: torch.Generator
     ) -> dict[str, Callable[[], Tensor | None]]:
-        """Return the loss terms beside those of the rays; ``field`` has been asked at the rays' samples."""
+        """Return the loss terms beside those of the rays.
+
+        ``field`` has been asked at the rays' samples, or where it sees by camera at those of the first.
+        """
         return {}
 
     def at(self, moment: Moment) -> MarchedSnapshot:
@@ -148,15 +152,15 @@ class MarchedMethod(Method):
         return MarchedSnapshot(moment, self)
 
     def look(self, batch: Batch, factors: Mapping[str, float], generator: torch.Generator) -> Step:
-        """See ``Method.look``; a batch holds one moment, as no neighbours are asked for.
+        """See ``Method.look``; a batch holds one time, as no neighbours are asked for, seen by one or
+        several cameras.
 
         Raises:
             ValueError: if no sample has a colour for many steps.
         """
-        rays, rgb, background = batch.joined()
-        field = self.field(batch.observations[0].moment)
-        jitter = generator if self.marching.jitter else None
-        drawn = self.marched_through(field, rays.to(self.device), background.to(self.device), jitter)
+        rgb, parts = batch.joined()[1], batch.split() if self.sees_by_camera else [batch]
+        fields = [self.field(part.observations[0].moment) for part in parts]
+        drawn = joined([self._drawn(*both, generator) for both in zip(fields, parts)])
         self.dead_start.look(len(drawn.weights) > 0)
         error = (drawn.rgb - rgb).square().mean()
         terms = {
@@ -165,11 +169,16 @@ class MarchedMethod(Method):
             "background_entropy": lambda: losses.background_entropy(drawn.transmittance),
         }
         return Step(
-            terms | self.extra_terms(field, batch, generator),
+            terms | self.extra_terms(fields[0], batch, generator),
             error.detach(),
             {"samples": drawn.samples, "opacity": float(drawn.opacity.detach().mean())},
             tensors=lambda: ((name, getattr(drawn, name)) for name in ("weights", "colors", "rgb")),
         )
+
+    def _drawn(self, field: PointField, batch: Batch, generator: torch.Generator) -> Marched:
+        rays, _, background = batch.joined()
+        jitter = generator if self.marching.jitter else None
+        return self.marched_through(field, rays.to(self.device), background.to(self.device), jitter)
 
     def marched_through(
         self, field: PointField, rays: Rays, background: Tensor, generator: torch.Generator | None = None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -157,9 +157,7 @@ class SampledMethod(Method):
             ValueError: if the density of a pass is 0 at every sample, or no sample is left, for many steps:
                 there is then no gradient.
         """
-        rgb, parts = batch.joined()[1], [batch]
-        if self.sees_by_camera:
-            parts = [replace(batch, observations=(one,)) for one in batch.observations]
+        rgb, parts = batch.joined()[1], batch.split() if self.sees_by_camera else [batch]
         seen = joined([self._sampled(part, generator) for part in parts])
         passes = [seen] if seen.coarse is None else [seen.coarse, seen]
         self.dead_start.look(all(bool((one.density > 0).any()) for one in passes))

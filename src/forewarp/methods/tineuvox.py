@@ -62,7 +62,7 @@ class TiNeuVox(MarchedMethod):
         direction_frequencies: int = 4,
     ) -> None:
         super().__init__(start, marching or Marching(), start.scene.box)
-        self.padded, self.still = padded, start.scene.still
+        self.padded, self.still, self.sees_by_camera = padded, start.scene.still, camera
         self.frozen_from = float(start.numbers.get("frozen_from", 1.0))
         self.octaves = position_frequencies, time_frequencies, feature_frequencies, direction_frequencies
         self.shift = density_shift(alpha_init)
