@@ -18,7 +18,7 @@ from forewarp.methods.method import Method, Snapshot, Start, Step
 from forewarp.methods.rows import renew_parameters
 from forewarp.methods.rows_adam import RowsAdam
 from forewarp.ops.warmup import warm_up
-from forewarp.renderer import Marched, Renderer, joined
+from forewarp.renderer import Marched, Renderer
 from forewarp.scene.batch import Batch
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.rays import Rays
@@ -160,7 +160,7 @@ class MarchedMethod(Method):
         """
         rgb, parts = batch.joined()[1], batch.split() if self.sees_by_camera else [batch]
         fields = [self.field(part.observations[0].moment) for part in parts]
-        drawn = joined([self._drawn(*both, generator) for both in zip(fields, parts)])
+        drawn = Marched.joined([self._drawn(*both, generator) for both in zip(fields, parts)])
         self.dead_start.look(len(drawn.weights) > 0)
         error = (drawn.rgb - rgb).square().mean()
         terms = {
@@ -260,7 +260,7 @@ class MarchedSnapshot(Snapshot):
         behind = background.expand(len(rays), 3)
         chunks = [slice(begin, begin + _RAYS) for begin in range(0, len(rays), _RAYS)]
         parts = [self.method.marched_through(field, rays[some], behind[some]) for some in chunks]
-        return Rendering(*(torch.cat([getattr(p, k) for p in parts]) for k in ("rgb", "depth", "opacity")))
+        return Rendering.joined(parts)
 
     def holds(self, moment: Moment) -> bool:
         """Return whether it is the same time, seen by the same camera."""

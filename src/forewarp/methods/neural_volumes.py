@@ -284,9 +284,7 @@ class VolumesSnapshot(Snapshot):
             made.march(self._still, rays[i : i + chunk], behind[i : i + chunk], tint, draw)
             for i in range(0, len(rays), chunk)
         ]
-        return Rendering(
-            *(torch.cat([getattr(p, key) for p in parts]) for key in ("rgb", "depth", "opacity"))
-        )
+        return Rendering.joined(parts)
 
 
 def shots_of(scene: Scene, wanted: int | None) -> list[list[Frame]]:

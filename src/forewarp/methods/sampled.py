@@ -13,7 +13,7 @@ from forewarp.fields.template import Template, density_of
 from forewarp.methods.dead_start import DeadStart
 from forewarp.methods.method import Method, Snapshot, Start, Step
 from forewarp.ops.encode import positional_encoding
-from forewarp.quadrature import Quadrature, Sampled, joined
+from forewarp.quadrature import Quadrature, Sampled
 from forewarp.scene.batch import Batch
 from forewarp.scene.frame import spread
 from forewarp.scene.rays import Rays
@@ -158,7 +158,7 @@ class SampledMethod(Method):
                 there is then no gradient.
         """
         rgb, parts = batch.joined()[1], batch.split() if self.sees_by_camera else [batch]
-        seen = joined([self._sampled(part, generator) for part in parts])
+        seen = Sampled.joined([self._sampled(part, generator) for part in parts])
         passes = [seen] if seen.coarse is None else [seen.coarse, seen]
         self.dead_start.look(all(bool((one.density > 0).any()) for one in passes))
         error = (seen.rgb - rgb).square().mean()
