@@ -14,6 +14,7 @@ from forewarp.methods.ndvg import NDVG
 from forewarp.methods.tineuvox import TiNeuVox
 from forewarp.renderer import Renderer
 from forewarp.scene.batch import Batch
+from forewarp.scene.cloud import Handover
 from forewarp.scene.view import Moment, View
 from forewarp.training.objective import Objective
 from forewarp.training.schedule import StageSettings
@@ -354,10 +355,15 @@ def test_voxels_before_a_camera_are_empty():
 
 
 def test_the_released_faults_of_ndvg_are_named():
-    made = method("ndvg", still=some_points(5), pool=2.5)
-    assert "the last 1 times (pool)" in made.protocol()["faults"]
-    assert "weights.still" in made.protocol()["faults"]
-    assert "faults" not in method("ndvg").protocol()
+    assert method("ndvg").faults() == ["offsets jump at the canonical time (continuous)"]
+    still = method("ndvg", still=some_points(5), continuous=True)
+    assert still.faults() == ["points that never move are not looked at (weights.still)"]
+    of_some = start(still=some_points(5), weights={"still": 1.0})
+    seen = Handover(of_some.scene.box, False, 2)
+    short = "the first stage never sees the last 1 training pictures (pool)"
+    for frames, faults in ((2, [short]), (3, [])):
+        begun = replace(of_some, handover=replace(seen, frames_in_play=frames), blank=True)
+        assert NDVG(begun, **SMALL["ndvg"], continuous=True).faults() == faults
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -6,6 +6,7 @@ from functools import partial
 import pytest
 import torch
 
+from forewarp.methods.departures import NO_JUMP
 from forewarp.methods.dnerf import DNeRF
 from forewarp.methods.hypernerf import HyperNeRF
 from forewarp.methods.method import parameter_count
@@ -141,7 +142,7 @@ def test_a_start_that_comes_alive_is_none():
         (NeRF, OF_PYTORCH, []),
         (TNeRF, OF_PYTORCH, []),
         (DNeRF, OF_PYTORCH, ["offsets jump at the canonical time (continuous)"]),
-        (partial(DNeRF, continuous=True), (*OF_PYTORCH, "continuous offsets"), []),
+        (partial(DNeRF, continuous=True), (*OF_PYTORCH, NO_JUMP), []),
         (Nerfies, OF_JAX, []),
         (HyperNeRF, (*OF_JAX, "pictures are drawn without random samples"), []),
         (

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from forewarp.fields.template import Template, Trunk
+from forewarp.methods.departures import JUMP, NO_JUMP
 from forewarp.methods.method import Start
 from forewarp.methods.sampled import Field, SampledMethod, Sampling, encoder
 from forewarp.ops.encode import encoded_size
@@ -93,12 +94,11 @@ class DNeRF(SampledMethod):
 
     def departures(self) -> list[str]:
         """See ``SampledMethod``."""
-        return super().departures() + (["continuous offsets"] if self.continuous else [])
+        return super().departures() + ([NO_JUMP] if self.continuous else [])
 
     def faults(self) -> list[str]:
         """See ``Method``."""
-        jump = [] if self.continuous else ["offsets jump at the canonical time (continuous)"]
-        return super().faults() + jump
+        return super().faults() + ([] if self.continuous else [JUMP])
 
 
 def _neighbours(times: tuple[float, ...], time: float) -> list[float]:

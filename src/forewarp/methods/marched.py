@@ -14,6 +14,7 @@ from forewarp.fields.occupancy import Occupancy
 from forewarp.fields.radiance_grid import Activation
 from forewarp.fields.voxel_grid import VoxelGrid, adopted_in, misfit_in
 from forewarp.methods.dead_start import DeadStart
+from forewarp.methods.departures import ALONG_RAYS, CENTRES, ONE_TIME
 from forewarp.methods.method import Method, Snapshot, Start, Step
 from forewarp.methods.rows import renew_parameters
 from forewarp.methods.rows_adam import RowsAdam
@@ -49,7 +50,7 @@ class Marching:
 
     def departures(self) -> list[str]:
         """Name what differs from the publications."""
-        notes = ["pixel centres at +0.5", "near and far along unit rays", "a step's rays from one picture"]
+        notes = [CENTRES, ALONG_RAYS, ONE_TIME]
         return notes + (["empty space is not sampled"] if self.occupancy and self.look_every else [])
 
 

@@ -16,6 +16,7 @@ from forewarp.fields.mlp import mlp
 from forewarp.fields.occupancy import Occupancy
 from forewarp.fields.radiance import density_shift
 from forewarp.fields.voxel_grid import VoxelGrid
+from forewarp.methods.departures import JUMP, NO_JUMP
 from forewarp.methods.marched import MarchedMethod, Marching, regrow, whole_grid
 from forewarp.methods.method import Start
 from forewarp.ops.encode import encoded_size, positional_encoding
@@ -73,7 +74,6 @@ class NDVG(MarchedMethod):
         frequencies: octaves of the encoded features, places and times.
         direction_frequencies: octaves of the encoded directions.
         continuous: ``F(x, t) - F(x, canonical)`` in place of a jump to 0 at the canonical time.
-        pool: as ``curriculum.pace`` of the first stage, to be named among the faults.
     """
 
     terms = (*MarchedMethod.terms, "flow_l1", "tv_deformation", "canonical", "still")
@@ -89,7 +89,6 @@ class NDVG(MarchedMethod):
         frequencies: int = 5,
         direction_frequencies: int = 4,
         continuous: bool = False,
-        pool: float | None = None,
     ) -> None:
         tight = start.handover is not None and start.handover.tight
         box = start.handover.box if tight else start.scene.box
@@ -98,7 +97,9 @@ class NDVG(MarchedMethod):
         self.stage = NDVGStage(**own)
         self.shift = density_shift(self.stage.alpha_init)
         self.canonical_time, self.still = start.scene.canonical_time, start.scene.still
-        self.octaves, self.continuous, self.pool = (frequencies, direction_frequencies), continuous, pool
+        self.octaves, self.continuous = (frequencies, direction_frequencies), continuous
+        seen = start.handover and start.handover.frames_in_play
+        self.never_seen = 0 if seen is None else len(start.scene.train) - seen  # by the first stage
         self.pulls = bool(start.weights.get("still"))
         viewed, first = self.stage.view_dependence, self.schedule[0][1]
         self.canonical = whole_grid(
@@ -244,16 +245,16 @@ class NDVG(MarchedMethod):
         """See ``MarchedMethod``."""
         found = super().departures()
         if self.continuous:
-            found.append("offsets without a jump at the canonical time")
+            found.append(NO_JUMP)
         if self.stage.carry:
             found.append("the second stage starts from the density of the first")
         return found
 
     def faults(self) -> list[str]:
         """See ``Method``."""
-        found = []
-        if self.pool is not None and (unseen := len(self.times) - int(self.pool)) > 0:
-            found.append(f"the first stage never sees the last {unseen} times (pool)")
+        found = [] if self.continuous else [JUMP]
+        if self.never_seen > 0:
+            found.append(f"the first stage never sees the last {self.never_seen} training pictures (pool)")
         if self.still is not None and not self.pulls:
             found.append("points that never move are not looked at (weights.still)")
         return found

@@ -14,6 +14,7 @@ from torch.nn import functional
 from forewarp.fields.codes import beside
 from forewarp.fields.volumes import DEVIATION_SCALE, AffineMixture, PictureEncoder, VolumeDecoder, read
 from forewarp.methods.dead_start import DeadStart
+from forewarp.methods.departures import BETWEEN_TIMES, CENTRES, ONE_TIME
 from forewarp.methods.method import Method, Snapshot, Start, Step
 from forewarp.ops.samples import clip_to_box
 from forewarp.scene.batch import Batch
@@ -234,9 +235,9 @@ class NeuralVolumes(Method):
         """See ``Method``."""
         notes = [
             f"code from {self.pictures.shape[1]} picture(s) of an instant",
-            "pixel centres at +0.5",
-            "rays of one picture a step",
-            "codes interpolated between training times",
+            CENTRES,
+            ONE_TIME,
+            BETWEEN_TIMES,
             "no return to earlier weights where the loss jumps",
         ]
         if self.from_identity:

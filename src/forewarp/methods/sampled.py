@@ -11,6 +11,7 @@ from torch import Tensor
 from forewarp.fields.occupancy import Occupancy
 from forewarp.fields.template import Template, density_of
 from forewarp.methods.dead_start import DeadStart
+from forewarp.methods.departures import ALONG_RAYS, BETWEEN_TIMES, CENTRES, ONE_TIME
 from forewarp.methods.method import Method, Snapshot, Start, Step
 from forewarp.ops.encode import positional_encoding
 from forewarp.quadrature import Quadrature, Sampled
@@ -22,8 +23,8 @@ from forewarp.scene.view import Moment, Rendering, View
 _LOOK_EVERY = 8  # steps between two looks for where matter is
 _PICTURES = 64  # most whose outlines say where matter may be
 # What differs from the publications in every preset, of those whose code is in PyTorch, and in JAX.
-OF_PYTORCH = ("pixel centres at +0.5", "near and far along unit rays", "no centre crop at first")
-OF_JAX = ("a step's rays from one picture", "codes interpolated between training times")
+OF_PYTORCH = (CENTRES, ALONG_RAYS, "no centre crop at first")
+OF_JAX = (ONE_TIME, BETWEEN_TIMES)
 
 
 @dataclass(frozen=True)
