@@ -1,6 +1,5 @@
 """TiNeuVox and NDVG: sizes, starts, identities, what they can learn."""
 
-import math
 from copy import deepcopy
 from dataclasses import replace
 from functools import partial
@@ -16,12 +15,12 @@ from forewarp.methods.ndvg import NDVG
 from forewarp.methods.tineuvox import TiNeuVox
 from forewarp.renderer import Renderer
 from forewarp.scene.batch import Batch
-from forewarp.scene.box import Lattice
 from forewarp.scene.cloud import Handover
 from forewarp.scene.view import Moment, View
 from forewarp.training.objective import Objective
 from forewarp.training.schedule import StageSettings
 from forewarp.training.stages import Stage
+from tests.support.full_size import at_full_size
 from tests.support.sampled_methods import batch
 from tests.support.sliding_square import camera, moving_scene, static_ceiling
 from tests.support.tiny_scene import make_run
@@ -77,18 +76,7 @@ def test_published_counts_of_tineuvox(options, side, parts, total):
     counts = [parameter_count(part) for part in networks if part is not None]
     assert (*counts[:4], color, *counts[4:]) == parts
     assert made.marching_lattice(side**3).shape == (side,) * 3
-    grid = made.grid.features.shape[1] * side**3
-    assert parameter_count(made) - made.grid.features.numel() + grid == total
-
-
-def at_full_size(made, num_voxels):
-    """How many parameters NDVG has with so many canonical voxels."""
-    whole = Lattice.of_count(made.box, num_voxels), made.marching_lattice(num_voxels)
-    grids = (made.canonical, made.deformation)
-    rows = [math.prod(lattice.shape) for lattice in whole]
-    small = sum(map(parameter_count, grids))
-    channels = [sum(p.shape[1] for p in grid.parameters()) for grid in grids]
-    return parameter_count(made) - small + sum(c * n for c, n in zip(channels, rows))
+    assert at_full_size(made, side**3) == total
 
 
 def test_published_counts_of_ndvg():
