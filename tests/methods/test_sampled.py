@@ -112,7 +112,7 @@ def test_pictures_say_where_matter_may_be():
     assert confined.occupied.equal(confined.possible)
     blank = TNeRF(replace(start(), blank=True), sampling=Sampling(occupancy=8, hull=0.1))
     assert blank.occupancy.possible.all()
-    with pytest.raises(ValueError, match=r"model.sampling.hull: expected a share in \[0, 1\], but got 2"):
+    with pytest.raises(ValueError, match=r"model.sampling.hull: expected a fraction in \[0, 1\], but got 2"):
         Sampling(hull=2)
 
 

@@ -47,8 +47,10 @@ class DNeRF(SampledMethod):
         continuous: bool = False,
     ) -> None:
         super().__init__(start, sampling or Sampling())
-        self.position, self.moment = encoder(position_frequencies), encoder(time_frequencies)
-        self.direction, self.continuous = encoder(direction_frequencies), continuous
+        self.position = encoder("position", position_frequencies)
+        self.moment = encoder("time", time_frequencies)
+        self.direction = encoder("direction", direction_frequencies)
+        self.continuous = continuous
         self.canonical_time = start.scene.canonical_time
         point, time = encoded_size(3, position_frequencies), encoded_size(1, time_frequencies)
         shape = {"width": width, "layers": layers, "skip": skip}

@@ -16,6 +16,7 @@ from forewarp.fields.mlp import mlp
 from forewarp.fields.occupancy import Occupancy
 from forewarp.fields.radiance import density_shift
 from forewarp.fields.voxel_grid import VoxelGrid
+from forewarp.methods.checks import check_least, check_number, check_pair
 from forewarp.methods.departures import JUMP, NO_JUMP
 from forewarp.methods.marched import MarchedMethod, Marching, regrow, whole_grid
 from forewarp.methods.method import Start
@@ -58,6 +59,13 @@ class NDVGStage:
     carry: bool = False
     masked: bool = False
 
+    def checked(self, where: str) -> NDVGStage:
+        """Return this; ``ValueError`` for a number out of range, naming its key in ``where``."""
+        check_number(f"{where}.deformation_voxels", self.deformation_voxels, "a number > 0", lambda n: n > 0)
+        check_number(f"{where}.sink", self.sink, "a number >= 0", lambda fall: fall >= 0)
+        check_number(f"{where}.box_alpha", self.box_alpha, "a number in [0, 1)", lambda part: 0 <= part < 1)
+        return self
+
 
 class NDVG(MarchedMethod):
     """``(d, m) = F(PE(G(x)), PE(x), PE(t))``, ``y = x + d``, ``alpha = m (1 - exp(-sigma(y) step))``,
@@ -92,10 +100,14 @@ class NDVG(MarchedMethod):
     ) -> None:
         tight = start.handover is not None and start.handover.tight
         box = start.handover.box if tight else start.scene.box
-        super().__init__(start, marching or Marching(jitter=True), box)
+        where = f"stage.{start.stage}"
+        super().__init__(start, marching or Marching(jitter=True), box, f"{where}.alpha_init")
+        check_pair("model.width", width)
+        check_pair("model.channels", channels)
+        check_least(frequencies=frequencies, direction_frequencies=direction_frequencies)
         own = {f.name: start.numbers[f.name] for f in fields(NDVGStage) if f.name in start.numbers}
-        self.stage = NDVGStage(**own)
-        self.shift = density_shift(self.stage.alpha_init)
+        self.stage = NDVGStage(**own).checked(where)
+        self.shift = density_shift(self.stage.alpha_init, self.alpha_key)
         self.canonical_time, self.still = start.scene.canonical_time, start.scene.still
         self.octaves, self.continuous = (frequencies, direction_frequencies), continuous
         seen = start.handover and start.handover.frames_in_play

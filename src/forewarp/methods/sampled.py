@@ -10,6 +10,7 @@ from torch import Tensor
 
 from forewarp.fields.occupancy import Occupancy
 from forewarp.fields.template import Template, density_of
+from forewarp.methods.checks import FRACTION, check_least, check_number
 from forewarp.methods.dead_start import DeadStart
 from forewarp.methods.departures import ALONG_RAYS, BETWEEN_TIMES, CENTRES, ONE_TIME
 from forewarp.methods.method import Method, Snapshot, Start, Step
@@ -75,8 +76,8 @@ class Sampling:
     jitter_in_pictures: bool = False
 
     def __post_init__(self) -> None:
-        if not 0 <= self.hull <= 1:
-            raise ValueError(f"model.sampling.hull: expected a share in [0, 1], but got {self.hull}")
+        check_number("model.sampling.hull", self.hull, *FRACTION)
+        check_least(of="model.sampling", occupancy=self.occupancy)
 
     def departures(self, density: str, jitters: bool) -> list[str]:
         """Name what differs from a publication with this density; ``jitters``: with random samples in
@@ -234,8 +235,7 @@ class SampledSnapshot(Snapshot):
         return alike and moment.time == self.moment.time
 
 
-def encoder(frequencies: int) -> Callable[[Tensor], Tensor]:
-    """Return ``positional_encoding`` with so many octaves; ValueError for fewer than 0."""
-    if frequencies < 0:
-        raise ValueError(f"model: expected frequencies >= 0, but got {frequencies}")
+def encoder(of: str, frequencies: int) -> Callable[[Tensor], Tensor]:
+    """Return ``positional_encoding`` with so many octaves, ``model.<of>_frequencies``."""
+    check_least(**{f"{of}_frequencies": frequencies})
     return lambda x: positional_encoding(x, frequencies)
