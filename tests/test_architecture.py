@@ -58,6 +58,8 @@ CONTRACT = {
     "effect",
     "rows",
     "dead_start",
+    "checks",
+    "departures",
     "rows_adam",
     "sampled",
     "marched",

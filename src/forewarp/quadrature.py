@@ -36,6 +36,15 @@ class Sampled(Rendering):
     weights: Tensor
     coarse: Sampled | None = None
 
+    @staticmethod
+    def joined(parts: Sequence[Sampled]) -> Sampled:
+        """See ``Rendering``."""
+        if len(parts) == 1:
+            return parts[0]
+        coarse = None if parts[0].coarse is None else Sampled.joined([part.coarse for part in parts])
+        names = [field.name for field in fields(Sampled) if field.name != "coarse"]
+        return Sampled(*(torch.cat([getattr(part, name) for part in parts]) for name in names), coarse=coarse)
+
 
 @dataclass(frozen=True)
 class Quadrature:
@@ -153,9 +162,7 @@ class Quadrature:
             self(density, radiance, rays[begin : begin + chunk], behind[begin : begin + chunk], generator)
             for begin in range(0, len(rays), chunk)
         ]
-        return Rendering(
-            *(torch.cat([getattr(p, key) for p in parts]) for key in ("rgb", "depth", "opacity"))
-        )
+        return Rendering.joined(parts)
 
     def _stretch(self, rays: Rays) -> tuple[Tensor, Tensor]:
         """Return where each ray starts and ends, (R,) each."""
@@ -178,15 +185,6 @@ class Quadrature:
         """Return the length (R, S) of each sample's interval: up to the next sample."""
         last = torch.full_like(far, _FAR) if self.open_end else (far - depths[:, -1]).clamp(min=0)
         return torch.cat([depths[:, 1:] - depths[:, :-1], last[:, None]], 1)
-
-
-def joined(parts: Sequence[Sampled]) -> Sampled:
-    """Put what several groups of rays saw behind one another."""
-    if len(parts) == 1:
-        return parts[0]
-    coarse = None if parts[0].coarse is None else joined([part.coarse for part in parts])
-    names = [field.name for field in fields(Sampled) if field.name != "coarse"]
-    return Sampled(*(torch.cat([getattr(part, name) for part in parts]) for name in names), coarse=coarse)
 
 
 def _placed(kept: Tensor, values: Tensor) -> Tensor:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import accumulate as accumulated
 
 import torch
 from torch import Tensor
@@ -34,6 +36,19 @@ class Marched(Rendering):
     samples: int = 0
     all_weights: Tensor | None = field(default=None, repr=False)
     all_ray_ids: Tensor | None = field(default=None, repr=False)
+
+    @staticmethod
+    def joined(parts: Sequence[Marched]) -> Marched:
+        """See ``Rendering``; without the weights of all samples."""
+        if len(parts) == 1:
+            return parts[0]
+        begins = accumulated((len(part.rgb) for part in parts), initial=0)
+        names = ("rgb", "depth", "opacity", "transmittance", "weights", "colors")
+        return Marched(
+            **{name: torch.cat([getattr(part, name) for part in parts]) for name in names},
+            ray_ids=torch.cat([part.ray_ids + begin for part, begin in zip(parts, begins)]),
+            samples=sum(part.samples for part in parts),
+        )
 
 
 class Renderer:
@@ -178,7 +193,7 @@ class Renderer:
                 self(field, rays[begin : begin + chunk], background, shade)
                 for begin in range(0, len(rays), chunk)
             ]
-        return Rendering(*(torch.cat([getattr(p, k) for p in parts]) for k in ("rgb", "depth", "opacity")))
+        return Rendering.joined(parts)
 
     @staticmethod
     def _starts(

@@ -104,5 +104,7 @@ DATASETS = {
 
 
 def data_of(dataset, root):
-    """A data module over a scene that was written into ``root/dataset``."""
-    return SceneDataModule(partial(DATASETS[dataset][1], root, dataset), rays=192, place=root / dataset)
+    """A data module over a scene that was written into ``root/dataset``; of a dome, of 3 views a step."""
+    views = 3 if dataset == "nhr" else 1
+    read = partial(DATASETS[dataset][1], root, dataset)
+    return SceneDataModule(read, rays=192, views_per_step=views, place=root / dataset)

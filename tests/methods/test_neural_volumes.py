@@ -206,13 +206,39 @@ def test_pictures_are_drawn_alike(jitter):
 
 
 def test_gains_are_of_known_cameras():
-    made = method()
+    made = method(rig((0, 1, 500_000)))
+    assert made.gain.shape == made.bias.shape == (3, 3)
     with torch.no_grad():
-        before = drawn(made, camera_id=None).rgb
-        made.gain.mul_(2)
-        made.bias.add_(0.1)
+        before = drawn(made, camera_id=0).rgb
         assert drawn(made, camera_id=7).rgb.equal(before)
-        assert not drawn(made, camera_id=0).rgb.equal(before)
+        made.gain[2] = 2.5
+        made.bias[2] = 0.3
+        changed = {camera_id: drawn(made, camera_id=camera_id).rgb for camera_id in (0, 500_000, 7)}
+        made.gain.fill_(1.5)
+        made.bias.fill_(0.1)
+        mean = drawn(made, camera_id=0).rgb
+    assert changed[0].equal(before)
+    assert not changed[500_000].equal(before)
+    torch.testing.assert_close(changed[7], mean)  # of a camera that took no training picture
+
+
+def test_each_view_of_a_batch_is_seen_by_the_gains_of_its_camera():
+    made = method(rig((1, 4)))
+    with torch.no_grad():
+        made.gain[1] = 2.0
+    rgb, white = torch.rand(144, 3), torch.ones(3)
+
+    def look(*cameras):
+        seen = tuple(Observation(Moment(0.5, camera=c), View(camera()), rgb, white) for c in cameras)
+        return made.look(Batch(seen, 0), WEIGHTS, torch.Generator().manual_seed(0))
+
+    both = look(1, 4)
+    both.terms["photo"]().backward()
+    assert made.gain.grad.ne(0).all()
+    assert made.bias.grad.ne(0).all()
+    found, one, other = (dict(step.tensors())["rgb"].detach() for step in (both, look(1, 1), look(4, 4)))
+    torch.testing.assert_close(found, torch.cat([one[:144], other[144:]]))
+    assert not one.allclose(other)
 
 
 def test_a_dead_start_is_named():
@@ -251,7 +277,7 @@ def test_gradients_against_differences():
 
     def look(code):
         volumes = made.volumes(code)
-        seen = made.march(volumes, rays, torch.ones(3).double(), 0)
+        seen = made.march(volumes, rays, torch.ones(3).double(), made.tint(0))
         return seen.rgb.sum(), seen.opacity.sum(), opacity_variation(volumes.template[3])
 
     assert gradcheck(look, [torch.randn(4, dtype=torch.float64, requires_grad=True)])

@@ -6,6 +6,7 @@ from functools import partial
 import pytest
 import torch
 
+from forewarp.methods.departures import NO_JUMP
 from forewarp.methods.dnerf import DNeRF
 from forewarp.methods.hypernerf import HyperNeRF
 from forewarp.methods.method import parameter_count
@@ -111,7 +112,7 @@ def test_pictures_say_where_matter_may_be():
     assert confined.occupied.equal(confined.possible)
     blank = TNeRF(replace(start(), blank=True), sampling=Sampling(occupancy=8, hull=0.1))
     assert blank.occupancy.possible.all()
-    with pytest.raises(ValueError, match=r"model.sampling.hull: expected a share in \[0, 1\], but got 2"):
+    with pytest.raises(ValueError, match=r"model.sampling.hull: expected a fraction in \[0, 1\], but got 2"):
         Sampling(hull=2)
 
 
@@ -141,7 +142,7 @@ def test_a_start_that_comes_alive_is_none():
         (NeRF, OF_PYTORCH, []),
         (TNeRF, OF_PYTORCH, []),
         (DNeRF, OF_PYTORCH, ["offsets jump at the canonical time (continuous)"]),
-        (partial(DNeRF, continuous=True), (*OF_PYTORCH, "continuous offsets"), []),
+        (partial(DNeRF, continuous=True), (*OF_PYTORCH, NO_JUMP), []),
         (Nerfies, OF_JAX, []),
         (HyperNeRF, (*OF_JAX, "pictures are drawn without random samples"), []),
         (

@@ -40,5 +40,5 @@ def test_a_window_lets_octaves_in_one_after_the_other():
 
 def test_without_the_identity_zero_has_cosines_of_one():
     assert positional_encoding(torch.zeros(1, 2), 1, identity=False).tolist() == [[0, 0, 1, 1]]
-    with pytest.raises(ValueError, match="frequencies"):
+    with pytest.raises(ValueError, match="expected frequencies >= 1 without the identity, but got 0"):
         positional_encoding(torch.zeros(1, 2), 0, identity=False)

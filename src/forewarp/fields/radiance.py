@@ -14,17 +14,17 @@ from forewarp.ops.encode import positional_encoding
 from forewarp.scene.box import Box, Lattice
 
 
-def density_shift(alpha_init: float) -> float:
+def density_shift(alpha_init: float, key: str = "model.radiance.alpha_init") -> float:
     """Return ``log(1 / (1 - alpha_init) - 1)``, the ``shift`` of ``Activation``.
 
     Raises:
-        ValueError: for an opacity outside (0, 1).
+        ValueError: for an opacity outside (0, 1), naming its ``key``.
 
     >>> round(density_shift(0.5), 6)
     0.0
     """
-    if not 0 < alpha_init < 1:
-        raise ValueError(f"model.radiance.alpha_init: expected a number in (0, 1), but got {alpha_init}")
+    if not isinstance(alpha_init, int | float) or not 0 < alpha_init < 1:
+        raise ValueError(f"{key}: expected a number in (0, 1), but got {alpha_init}")
     return math.log(1 / (1 - alpha_init) - 1)
 
 

@@ -47,6 +47,10 @@ class ScrewWarp(nn.Module):
         hidden = self.trunk(torch.cat([encoded, code.expand(*points.shape[:-1], -1)], -1))
         return move_by_screw(points, self.turn(hidden), self.shift(hidden))
 
+    def octaves(self, progress: float, warp_in: float) -> float:
+        """How many octaves of the encoding count at ``progress`` of a stage: all from ``warp_in`` on."""
+        return self.frequencies * min(1.0, progress / max(warp_in, 1e-6))
+
     def elastic(self, points: Tensor, code: Tensor, window: float) -> Tensor:
         """How far the warp at points (P, 3) is from rigid (P,), in [0, 2]: robust squared logarithms of the
         singular values of its Jacobian.

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from forewarp.fields.template import Template, Trunk
+from forewarp.methods.departures import JUMP, NO_JUMP
 from forewarp.methods.method import Start
 from forewarp.methods.sampled import Field, SampledMethod, Sampling, encoder
 from forewarp.ops.encode import encoded_size
@@ -46,8 +47,10 @@ class DNeRF(SampledMethod):
         continuous: bool = False,
     ) -> None:
         super().__init__(start, sampling or Sampling())
-        self.position, self.moment = encoder(position_frequencies), encoder(time_frequencies)
-        self.direction, self.continuous = encoder(direction_frequencies), continuous
+        self.position = encoder("position", position_frequencies)
+        self.moment = encoder("time", time_frequencies)
+        self.direction = encoder("direction", direction_frequencies)
+        self.continuous = continuous
         self.canonical_time = start.scene.canonical_time
         point, time = encoded_size(3, position_frequencies), encoded_size(1, time_frequencies)
         shape = {"width": width, "layers": layers, "skip": skip}
@@ -93,12 +96,11 @@ class DNeRF(SampledMethod):
 
     def departures(self) -> list[str]:
         """See ``SampledMethod``."""
-        return super().departures() + (["continuous offsets"] if self.continuous else [])
+        return super().departures() + ([NO_JUMP] if self.continuous else [])
 
     def faults(self) -> list[str]:
         """See ``Method``."""
-        jump = [] if self.continuous else ["offsets jump at the canonical time (continuous)"]
-        return super().faults() + jump
+        return super().faults() + ([] if self.continuous else [JUMP])
 
 
 def _neighbours(times: tuple[float, ...], time: float) -> list[float]:

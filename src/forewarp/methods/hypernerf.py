@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from forewarp.fields.codes import TimeCodes
 from forewarp.fields.screws import ScrewWarp
 from forewarp.fields.template import Template, Trunk
+from forewarp.methods.checks import FRACTION, check_least, check_number
 from forewarp.methods.method import Start
 from forewarp.methods.sampled import OF_JAX, Field, SampledMethod, Sampling, encoder
 from forewarp.ops.encode import encoded_size, positional_encoding
@@ -94,7 +95,9 @@ class HyperNeRF(SampledMethod):
         still_points: int | None = 16384,
     ) -> None:
         super().__init__(start, sampling or Sampling(128, 128, density="softplus"))
-        self.position, self.direction = encoder(position_frequencies), encoder(direction_frequencies)
+        self.position = encoder("position", position_frequencies)
+        self.direction = encoder("direction", direction_frequencies)
+        check_least(1, warp_frequencies=warp_frequencies, ambient_frequencies=ambient_frequencies)
         self.ambient_frequencies = ambient_frequencies
         self.codes = TimeCodes(self.times, code_size)
         depth = {"frequencies": warp_frequencies, "layers": warp_layers, "skip": warp_skip}
@@ -105,13 +108,15 @@ class HyperNeRF(SampledMethod):
         condition = encoded_size(3, direction_frequencies)
         self.coarse, self.fine = self.passes(lambda: Template(inputs, condition, **shape))
         self.numbers_of = {"warp_in": 0.32, "slice_from": 0.004, "slice_in": 0.044} | dict(start.numbers)
+        for name in self.numbers:
+            check_number(f"stage.{start.stage}.{name}", self.numbers_of[name], *FRACTION)
         self.register_buffer("windows", torch.zeros(2))  # of the warp and of the ambient coordinates
         self.still, self.still_points = start.scene.still, still_points
 
     def advance(self, progress: float, step: int, optimizer: torch.optim.Optimizer) -> dict[str, float]:
         """See ``Method``; let octaves of the warp's encoding in, then the ambient coordinates."""
         given = self.numbers_of
-        octaves = self.warp.frequencies * min(1.0, progress / max(given["warp_in"], 1e-6))
+        octaves = self.warp.octaves(progress, given["warp_in"])
         begin, end = given["slice_from"], max(given["slice_in"], given["slice_from"] + 1e-6)
         share = min(1.0, max(0.0, (progress - begin) / (end - begin)))
         self.windows.copy_(torch.tensor([octaves, share * self.ambient_frequencies]))

@@ -13,7 +13,9 @@ from forewarp import losses
 from forewarp.fields.occupancy import Occupancy
 from forewarp.fields.radiance_grid import Activation
 from forewarp.fields.voxel_grid import VoxelGrid, adopted_in, misfit_in
+from forewarp.methods.checks import check_least, check_number, steps_of
 from forewarp.methods.dead_start import DeadStart
+from forewarp.methods.departures import ALONG_RAYS, CENTRES, ONE_TIME
 from forewarp.methods.method import Method, Snapshot, Start, Step
 from forewarp.methods.rows import renew_parameters
 from forewarp.methods.rows_adam import RowsAdam
@@ -25,6 +27,7 @@ from forewarp.scene.rays import Rays
 from forewarp.scene.view import Moment, Rendering, View
 
 _RAYS = 4096  # of a picture, at once
+_THRESHOLD = "a weight in [0, 1)", lambda weight: 0 <= weight < 1
 _YOUNG = 4  # steps between two of the first looks for where matter is
 
 
@@ -47,9 +50,14 @@ class Marching:
     occupancy: int = 0
     look_every: int = 16
 
+    def __post_init__(self) -> None:
+        check_number("model.marching.step", self.step, "a number > 0", lambda step: step > 0)
+        check_number("model.marching.color_threshold", self.color_threshold, *_THRESHOLD)
+        check_least(of="model.marching", occupancy=self.occupancy, look_every=self.look_every)
+
     def departures(self) -> list[str]:
         """Name what differs from the publications."""
-        notes = ["pixel centres at +0.5", "near and far along unit rays", "a step's rays from one picture"]
+        notes = [CENTRES, ALONG_RAYS, ONE_TIME]
         return notes + (["empty space is not sampled"] if self.occupancy and self.look_every else [])
 
 
@@ -85,24 +93,34 @@ class MarchedMethod(Method):
         start: scene, stage and numbers.
         marching: see ``Marching``.
         box: outside, everything is empty.
+        alpha_key: of the opacity at first.
         num_voxels: ``[[fraction, count], ...]``: about ``count`` voxels from ``fraction`` of the stage on.
     """
 
     terms = ("photo", "point_color", "background_entropy")
     numbers = ("num_voxels", "color_threshold")
+    sees_by_camera = False  # whether colour depends on the id of the camera that looks
 
-    def __init__(self, start: Start, marching: Marching, box: Box) -> None:
+    def __init__(
+        self, start: Start, marching: Marching, box: Box, alpha_key: str = "model.alpha_init"
+    ) -> None:
         super().__init__()
+        self.alpha_key = alpha_key
         self.box, self.times, self.marching = box, start.scene.times, marching
-        self.schedule = _checked(start)
-        threshold = start.numbers.get("color_threshold")
+        where, numbers = f"stage.{start.stage}", start.numbers
+        self.schedule = steps_of(
+            f"{where}.num_voxels", numbers.get("num_voxels", ()), least=8, from_start=True
+        )
+        threshold = numbers.get("color_threshold")
+        if threshold is not None:
+            check_number(f"{where}.color_threshold", threshold, *_THRESHOLD)
         self.renderer = Renderer(step=marching.step, color_threshold=marching.color_threshold)
         self.renderer = self.renderer.with_threshold(threshold)
         self.occupancy = Occupancy(box, side=marching.occupancy, patience=8) if marching.occupancy else None
         self.dead_start = DeadStart(
             "preset.color_threshold",
             "no sample of so much weight",
-            "set it to 0, or a larger alpha_init, or preset.occupancy=0",
+            f"set it to 0, or a larger {self.alpha_key}, or preset.occupancy=0",
         )
 
     def begin(self) -> None:
@@ -140,7 +158,10 @@ class MarchedMethod(Method):
     def extra_terms(
         self, field: PointField, batch: Batch, generator: torch.Generator
     ) -> dict[str, Callable[[], Tensor | None]]:
-        """Return the loss terms beside those of the rays; ``field`` has been asked at the rays' samples."""
+        """Return the loss terms beside those of the rays.
+
+        ``field`` has been asked at the rays' samples, or where it sees by camera at those of the first.
+        """
         return {}
 
     def at(self, moment: Moment) -> MarchedSnapshot:
@@ -148,15 +169,15 @@ class MarchedMethod(Method):
         return MarchedSnapshot(moment, self)
 
     def look(self, batch: Batch, factors: Mapping[str, float], generator: torch.Generator) -> Step:
-        """See ``Method.look``; a batch holds one moment, as no neighbours are asked for.
+        """See ``Method.look``; a batch holds one time, as no neighbours are asked for, seen by one or
+        several cameras.
 
         Raises:
             ValueError: if no sample has a colour for many steps.
         """
-        rays, rgb, background = batch.joined()
-        field = self.field(batch.observations[0].moment)
-        jitter = generator if self.marching.jitter else None
-        drawn = self.marched_through(field, rays.to(self.device), background.to(self.device), jitter)
+        rgb, parts = batch.joined()[1], batch.split() if self.sees_by_camera else [batch]
+        fields = [self.field(part.observations[0].moment) for part in parts]
+        drawn = Marched.joined([self._drawn(*both, generator) for both in zip(fields, parts)])
         self.dead_start.look(len(drawn.weights) > 0)
         error = (drawn.rgb - rgb).square().mean()
         terms = {
@@ -165,11 +186,16 @@ class MarchedMethod(Method):
             "background_entropy": lambda: losses.background_entropy(drawn.transmittance),
         }
         return Step(
-            terms | self.extra_terms(field, batch, generator),
+            terms | self.extra_terms(fields[0], batch, generator),
             error.detach(),
             {"samples": drawn.samples, "opacity": float(drawn.opacity.detach().mean())},
             tensors=lambda: ((name, getattr(drawn, name)) for name in ("weights", "colors", "rgb")),
         )
+
+    def _drawn(self, field: PointField, batch: Batch, generator: torch.Generator) -> Marched:
+        rays, _, background = batch.joined()
+        jitter = generator if self.marching.jitter else None
+        return self.marched_through(field, rays.to(self.device), background.to(self.device), jitter)
 
     def marched_through(
         self, field: PointField, rays: Rays, background: Tensor, generator: torch.Generator | None = None
@@ -251,7 +277,7 @@ class MarchedSnapshot(Snapshot):
         behind = background.expand(len(rays), 3)
         chunks = [slice(begin, begin + _RAYS) for begin in range(0, len(rays), _RAYS)]
         parts = [self.method.marched_through(field, rays[some], behind[some]) for some in chunks]
-        return Rendering(*(torch.cat([getattr(p, k) for p in parts]) for k in ("rgb", "depth", "opacity")))
+        return Rendering.joined(parts)
 
     def holds(self, moment: Moment) -> bool:
         """Return whether it is the same time, seen by the same camera."""
@@ -268,12 +294,3 @@ def regrow(grid: VoxelGrid, lattice: Lattice, optimizer: torch.optim.Optimizer) 
     before = [grid.parameter(name) for name in grid.names]
     grid.resample(lattice, torch.ones(lattice.shape, dtype=torch.bool), dict.fromkeys(grid.names, 0.0))
     renew_parameters(optimizer, before, [grid.parameter(name) for name in grid.names], None)
-
-
-def _checked(start: Start) -> list[tuple[float, float]]:
-    """Return the schedule of a stage's voxels as pairs."""
-    where, given = f"stage.{start.stage}.num_voxels", start.numbers.get("num_voxels", ())
-    pairs = [tuple(pair) for pair in given]
-    if not pairs or any(len(p) != 2 or not 0 <= p[0] <= 1 or p[1] < 8 for p in pairs) or pairs[0][0] != 0:
-        raise ValueError(f"{where}: expected [[0, count], [fraction, count], ...], but got {given}")
-    return [(float(begin), float(count)) for begin, count in pairs]

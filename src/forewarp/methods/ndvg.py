@@ -16,6 +16,8 @@ from forewarp.fields.mlp import mlp
 from forewarp.fields.occupancy import Occupancy
 from forewarp.fields.radiance import density_shift
 from forewarp.fields.voxel_grid import VoxelGrid
+from forewarp.methods.checks import check_least, check_number, check_pair
+from forewarp.methods.departures import JUMP, NO_JUMP
 from forewarp.methods.marched import MarchedMethod, Marching, regrow, whole_grid
 from forewarp.methods.method import Start
 from forewarp.ops.encode import encoded_size, positional_encoding
@@ -57,6 +59,13 @@ class NDVGStage:
     carry: bool = False
     masked: bool = False
 
+    def checked(self, where: str) -> NDVGStage:
+        """Return this; ``ValueError`` for a number out of range, naming its key in ``where``."""
+        check_number(f"{where}.deformation_voxels", self.deformation_voxels, "a number > 0", lambda n: n > 0)
+        check_number(f"{where}.sink", self.sink, "a number >= 0", lambda fall: fall >= 0)
+        check_number(f"{where}.box_alpha", self.box_alpha, "a number in [0, 1)", lambda part: 0 <= part < 1)
+        return self
+
 
 class NDVG(MarchedMethod):
     """``(d, m) = F(PE(G(x)), PE(x), PE(t))``, ``y = x + d``, ``alpha = m (1 - exp(-sigma(y) step))``,
@@ -73,7 +82,6 @@ class NDVG(MarchedMethod):
         frequencies: octaves of the encoded features, places and times.
         direction_frequencies: octaves of the encoded directions.
         continuous: ``F(x, t) - F(x, canonical)`` in place of a jump to 0 at the canonical time.
-        pool: as ``curriculum.pace`` of the first stage, to be named among the faults.
     """
 
     terms = (*MarchedMethod.terms, "flow_l1", "tv_deformation", "canonical", "still")
@@ -89,16 +97,21 @@ class NDVG(MarchedMethod):
         frequencies: int = 5,
         direction_frequencies: int = 4,
         continuous: bool = False,
-        pool: float | None = None,
     ) -> None:
         tight = start.handover is not None and start.handover.tight
         box = start.handover.box if tight else start.scene.box
-        super().__init__(start, marching or Marching(jitter=True), box)
+        where = f"stage.{start.stage}"
+        super().__init__(start, marching or Marching(jitter=True), box, f"{where}.alpha_init")
+        check_pair("model.width", width)
+        check_pair("model.channels", channels)
+        check_least(frequencies=frequencies, direction_frequencies=direction_frequencies)
         own = {f.name: start.numbers[f.name] for f in fields(NDVGStage) if f.name in start.numbers}
-        self.stage = NDVGStage(**own)
-        self.shift = density_shift(self.stage.alpha_init)
+        self.stage = NDVGStage(**own).checked(where)
+        self.shift = density_shift(self.stage.alpha_init, self.alpha_key)
         self.canonical_time, self.still = start.scene.canonical_time, start.scene.still
-        self.octaves, self.continuous, self.pool = (frequencies, direction_frequencies), continuous, pool
+        self.octaves, self.continuous = (frequencies, direction_frequencies), continuous
+        seen = start.handover and start.handover.frames_in_play
+        self.never_seen = 0 if seen is None else len(start.scene.train) - seen  # by the first stage
         self.pulls = bool(start.weights.get("still"))
         viewed, first = self.stage.view_dependence, self.schedule[0][1]
         self.canonical = whole_grid(
@@ -244,16 +257,16 @@ class NDVG(MarchedMethod):
         """See ``MarchedMethod``."""
         found = super().departures()
         if self.continuous:
-            found.append("offsets without a jump at the canonical time")
+            found.append(NO_JUMP)
         if self.stage.carry:
             found.append("the second stage starts from the density of the first")
         return found
 
     def faults(self) -> list[str]:
         """See ``Method``."""
-        found = []
-        if self.pool is not None and (unseen := len(self.times) - int(self.pool)) > 0:
-            found.append(f"the first stage never sees the last {unseen} times (pool)")
+        found = [] if self.continuous else [JUMP]
+        if self.never_seen > 0:
+            found.append(f"the first stage never sees the last {self.never_seen} training pictures (pool)")
         if self.still is not None and not self.pulls:
             found.append("points that never move are not looked at (weights.still)")
         return found

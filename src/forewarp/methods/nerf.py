@@ -44,7 +44,8 @@ class NeRF(SampledMethod):
             self.published = "softplus"
             note = "as Nerfies without its warp (the configuration was not published)"
             self.conventions = (note, OF_JAX[0])
-        self.position, self.direction = encoder(position_frequencies), encoder(direction_frequencies)
+        self.position = encoder("position", position_frequencies)
+        self.direction = encoder("direction", direction_frequencies)
         sizes = encoded_size(3, position_frequencies), encoded_size(3, direction_frequencies)
         shape = {"width": width, "layers": layers, "skip": skip, "glorot": glorot}
         self.coarse, self.fine = self.passes(lambda: Template(*sizes, **shape))

@@ -10,6 +10,7 @@ from torch import Tensor
 from forewarp.fields.codes import CameraCodes, TimeCodes
 from forewarp.fields.screws import ScrewWarp, drawn
 from forewarp.fields.template import Template
+from forewarp.methods.checks import FRACTION, check_least, check_number
 from forewarp.methods.method import Start
 from forewarp.methods.sampled import OF_JAX, Field, SampledMethod, Sampling, encoder
 from forewarp.ops.encode import encoded_size
@@ -60,7 +61,9 @@ class Nerfies(SampledMethod):
         still_points: int | None = 16384,
     ) -> None:
         super().__init__(start, sampling or Sampling(128, 128, density="softplus"))
-        self.position, self.direction = encoder(position_frequencies), encoder(direction_frequencies)
+        self.position = encoder("position", position_frequencies)
+        self.direction = encoder("direction", direction_frequencies)
+        check_least(warp_frequencies=warp_frequencies)
         self.codes = TimeCodes(self.times, code_size)
         self.warp = ScrewWarp(
             code_size, frequencies=warp_frequencies, width=warp_width, layers=warp_layers, skip=warp_skip
@@ -74,14 +77,15 @@ class Nerfies(SampledMethod):
         )
         shape = {"width": width, "layers": layers, "skip": skip, "glorot": True}
         self.coarse, self.fine = self.passes(lambda: Template(*sizes, **shape))
-        self.warp_in = float(start.numbers.get("warp_in", 0.32))
+        self.warp_in = start.numbers.get("warp_in", 0.32)
+        check_number(f"stage.{start.stage}.warp_in", self.warp_in, *FRACTION)
         self.register_buffer("window", torch.tensor(0.0))
         self.still, self.still_points = start.scene.still, still_points
         self.elastic_samples = elastic_samples
 
     def advance(self, progress: float, step: int, optimizer: torch.optim.Optimizer) -> dict[str, float]:
         """See ``Method``; let octaves of the warp's encoding in."""
-        octaves = self.warp.frequencies * min(1.0, progress / max(self.warp_in, 1e-6))
+        octaves = self.warp.octaves(progress, self.warp_in)
         self.window.fill_(octaves)
         return {"octaves": octaves} | super().advance(progress, step, optimizer)
 

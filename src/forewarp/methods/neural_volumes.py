@@ -14,6 +14,7 @@ from torch.nn import functional
 from forewarp.fields.codes import beside
 from forewarp.fields.volumes import DEVIATION_SCALE, AffineMixture, PictureEncoder, VolumeDecoder, read
 from forewarp.methods.dead_start import DeadStart
+from forewarp.methods.departures import BETWEEN_TIMES, CENTRES, ONE_TIME
 from forewarp.methods.method import Method, Snapshot, Start, Step
 from forewarp.ops.samples import clip_to_box
 from forewarp.scene.batch import Batch
@@ -112,9 +113,10 @@ class NeuralVolumes(Method):
             nn.init.constant_(self.decoder.grow[-1].bias[3], math.log(math.expm1(first_opacity)))
         shape = {"maps": maps, "side": warp_side, "width": warp_width, "weight_width": weight_width}
         self.warp = AffineMixture(code, **shape, from_identity=from_identity)
-        known = {frame.camera_id for frame in scene.train} - {None}
-        self.gain = nn.Parameter(torch.ones(max(known) + 1, 3)) if known else None
-        self.bias = nn.Parameter(torch.zeros(max(known) + 1, 3)) if known else None
+        known = sorted({frame.camera_id for frame in scene.train} - {None})
+        self.rows = {camera: row for row, camera in enumerate(known)}
+        self.gain = nn.Parameter(torch.ones(len(known), 3)) if known else None
+        self.bias = nn.Parameter(torch.zeros(len(known), 3)) if known else None
         self.reach = max(scene.box.size) / 2  # half a side of the cube
         self.register_buffer("center", torch.tensor(scene.box.center))
         held = torch.zeros(len(shots), len(shots[0]), 3, *size, dtype=torch.uint8)
@@ -140,17 +142,28 @@ class NeuralVolumes(Method):
         color = functional.softplus(_MEAN + _DEVIATION * raw[:3]) / 255
         return Volumes(torch.cat([color, functional.softplus(raw[3:])]), self.warp(code))
 
+    def tint(self, camera: int | None) -> Tensor | None:
+        """Return what a camera makes of colour (2, 3): a factor, and what is added then.
+
+        A camera that took no training picture has the mean of the others; None: no camera is known.
+        """
+        if self.gain is None:
+            return None
+        every = torch.stack([self.gain, self.bias])
+        return every[:, self.rows[camera]] if camera in self.rows else every.mean(1)
+
     def march(
         self,
         volumes: Volumes,
         rays: Rays,
         background: Tensor,
-        camera: int | None,
+        tint: Tensor | None,
         generator: torch.Generator | None = None,
     ) -> Rendering:
         """March R rays through the cube. Opacity adds up along a ray, until it is 1.
 
-        ``generator`` draws where a ray begins, and the length of its steps; None: as they are on average.
+        ``tint``: of the camera that looks (2, 3), or of each ray's (2, R, 3); see ``tint``. ``generator``
+        draws where a ray begins, and the length of its steps; None: as they are on average.
         """
         origins = (rays.origins.to(self.center) - self.center) / self.reach
         directions, half = rays.directions.to(self.center), self.reach
@@ -176,8 +189,8 @@ class NeuralVolumes(Method):
         whole = rgb.new_zeros(len(rays))
         rgb = rgb.new_zeros(len(rays), 3).index_copy(0, met, rgb)
         total, depth = whole.index_copy(0, met, total), whole.index_copy(0, met, depth)
-        if self.gain is not None and camera is not None and 0 <= camera < len(self.gain):
-            rgb = rgb * self.gain[camera] + self.bias[camera]
+        if tint is not None:
+            rgb = rgb * tint[0] + tint[1]
         return Rendering(rgb + (1 - total)[:, None] * background.to(rgb), depth, total)
 
     def at(self, moment: Moment) -> VolumesSnapshot:
@@ -185,17 +198,17 @@ class NeuralVolumes(Method):
         return VolumesSnapshot(moment, self)
 
     def look(self, batch: Batch, factors: Mapping[str, float], generator: torch.Generator) -> Step:
-        """See ``Method.look``; a batch holds one moment, as no neighbours are asked for.
+        """See ``Method.look``; a batch holds one time, as no neighbours are asked for, seen by one or
+        several cameras.
 
         Raises:
             ValueError: if every ray is clear or opaque for many steps.
         """
         rays, rgb, background = batch.joined()
-        moment = batch.observations[0].moment
-        mean, deviation = self.encoded(self.times.index(moment.time))
+        mean, deviation = self.encoded(self.times.index(batch.time))
         noise = torch.randn(mean.shape, generator=generator).to(mean)
         volumes = self.volumes(mean + deviation.exp() * noise)
-        seen = self.march(volumes, rays, background, moment.camera, generator)
+        seen = self.march(volumes, rays, background, self._tints(batch), generator)
         self.dead_start.look(bool(((seen.opacity > 0) & (seen.opacity < 1)).any()))
         error = (seen.rgb - rgb.to(seen.rgb)).square().mean()
         terms = {
@@ -208,6 +221,12 @@ class NeuralVolumes(Method):
         noted = {"opacity": float(seen.opacity.detach().mean())}
         return Step(terms, error.detach(), noted, tensors=tensors.items)
 
+    def _tints(self, batch: Batch) -> Tensor | None:
+        if self.gain is None:
+            return None
+        seen_by = ((self.tint(one.moment.camera), len(one.view)) for one in batch.observations)
+        return torch.cat([tint[:, None].expand(2, count, 3) for tint, count in seen_by], 1)
+
     def optimizer(self, groups: list[dict]) -> torch.optim.Optimizer:
         """Make Adam with the published betas."""
         return torch.optim.Adam(groups, betas=(0.9, 0.999), eps=1e-8, fused=True)
@@ -216,9 +235,9 @@ class NeuralVolumes(Method):
         """See ``Method``."""
         notes = [
             f"code from {self.pictures.shape[1]} picture(s) of an instant",
-            "pixel centres at +0.5",
-            "rays of one picture a step",
-            "codes interpolated between training times",
+            CENTRES,
+            ONE_TIME,
+            BETWEEN_TIMES,
             "no return to earlier weights where the loss jumps",
         ]
         if self.from_identity:
@@ -256,18 +275,17 @@ class VolumesSnapshot(Snapshot):
 
     def render(self, view: View, background: Tensor, rendering: str | None = None) -> Rendering:
         """See ``Snapshot.render``; without gradients in chunks of rays, for images of any size."""
-        rays, made, camera = view.rays(), self.method, self.moment.camera
+        rays, made = view.rays(), self.method
+        tint = made.tint(self.moment.camera)
         if torch.is_grad_enabled():
-            return made.march(self.volumes(), rays, background, camera)
+            return made.march(self.volumes(), rays, background, tint)
         draw = torch.Generator().manual_seed(0) if made.jitter_in_pictures else None
         behind, chunk = background.expand(len(rays), 3), max(1, int(_POINTS * made.step / 4))
         parts = [
-            made.march(self._still, rays[i : i + chunk], behind[i : i + chunk], camera, draw)
+            made.march(self._still, rays[i : i + chunk], behind[i : i + chunk], tint, draw)
             for i in range(0, len(rays), chunk)
         ]
-        return Rendering(
-            *(torch.cat([getattr(p, key) for p in parts]) for key in ("rgb", "depth", "opacity"))
-        )
+        return Rendering.joined(parts)
 
 
 def shots_of(scene: Scene, wanted: int | None) -> list[list[Frame]]:

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from forewarp.fields.occupancy import Occupancy
 from forewarp.fields.template import Template, density_of
+from forewarp.methods.checks import FRACTION, check_least, check_number
 from forewarp.methods.dead_start import DeadStart
+from forewarp.methods.departures import ALONG_RAYS, BETWEEN_TIMES, CENTRES, ONE_TIME
 from forewarp.methods.method import Method, Snapshot, Start, Step
 from forewarp.ops.encode import positional_encoding
-from forewarp.quadrature import Quadrature, Sampled, joined
+from forewarp.quadrature import Quadrature, Sampled
 from forewarp.scene.batch import Batch
 from forewarp.scene.frame import spread
 from forewarp.scene.rays import Rays
@@ -22,8 +24,8 @@ from forewarp.scene.view import Moment, Rendering, View
 _LOOK_EVERY = 8  # steps between two looks for where matter is
 _PICTURES = 64  # most whose outlines say where matter may be
 # What differs from the publications in every preset, of those whose code is in PyTorch, and in JAX.
-OF_PYTORCH = ("pixel centres at +0.5", "near and far along unit rays", "no centre crop at first")
-OF_JAX = ("a step's rays from one picture", "codes interpolated between training times")
+OF_PYTORCH = (CENTRES, ALONG_RAYS, "no centre crop at first")
+OF_JAX = (ONE_TIME, BETWEEN_TIMES)
 
 
 @dataclass(frozen=True)
@@ -74,8 +76,8 @@ class Sampling:
     jitter_in_pictures: bool = False
 
     def __post_init__(self) -> None:
-        if not 0 <= self.hull <= 1:
-            raise ValueError(f"model.sampling.hull: expected a share in [0, 1], but got {self.hull}")
+        check_number("model.sampling.hull", self.hull, *FRACTION)
+        check_least(of="model.sampling", occupancy=self.occupancy)
 
     def departures(self, density: str, jitters: bool) -> list[str]:
         """Name what differs from a publication with this density; ``jitters``: with random samples in
@@ -157,10 +159,8 @@ class SampledMethod(Method):
             ValueError: if the density of a pass is 0 at every sample, or no sample is left, for many steps:
                 there is then no gradient.
         """
-        rgb, parts = batch.joined()[1], [batch]
-        if self.sees_by_camera:
-            parts = [replace(batch, observations=(one,)) for one in batch.observations]
-        seen = joined([self._sampled(part, generator) for part in parts])
+        rgb, parts = batch.joined()[1], batch.split() if self.sees_by_camera else [batch]
+        seen = Sampled.joined([self._sampled(part, generator) for part in parts])
         passes = [seen] if seen.coarse is None else [seen.coarse, seen]
         self.dead_start.look(all(bool((one.density > 0).any()) for one in passes))
         error = (seen.rgb - rgb).square().mean()
@@ -235,8 +235,7 @@ class SampledSnapshot(Snapshot):
         return alike and moment.time == self.moment.time
 
 
-def encoder(frequencies: int) -> Callable[[Tensor], Tensor]:
-    """Return ``positional_encoding`` with so many octaves; ValueError for fewer than 0."""
-    if frequencies < 0:
-        raise ValueError(f"model: expected frequencies >= 0, but got {frequencies}")
+def encoder(of: str, frequencies: int) -> Callable[[Tensor], Tensor]:
+    """Return ``positional_encoding`` with so many octaves, ``model.<of>_frequencies``."""
+    check_least(**{f"{of}_frequencies": frequencies})
     return lambda x: positional_encoding(x, frequencies)

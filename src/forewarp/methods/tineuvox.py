@@ -13,6 +13,7 @@ from forewarp.fields.mlp import mlp
 from forewarp.fields.radiance import density_shift
 from forewarp.fields.strided import read_strided
 from forewarp.fields.template import Template
+from forewarp.methods.checks import FRACTION, check_least, check_number
 from forewarp.methods.marched import MarchedMethod, Marching, regrow, whole_grid
 from forewarp.methods.method import Start
 from forewarp.ops.encode import encoded_size, positional_encoding
@@ -62,10 +63,15 @@ class TiNeuVox(MarchedMethod):
         direction_frequencies: int = 4,
     ) -> None:
         super().__init__(start, marching or Marching(), start.scene.box)
-        self.padded, self.still = padded, start.scene.still
-        self.frozen_from = float(start.numbers.get("frozen_from", 1.0))
-        self.octaves = position_frequencies, time_frequencies, feature_frequencies, direction_frequencies
-        self.shift = density_shift(alpha_init)
+        self.padded, self.still, self.sees_by_camera = padded, start.scene.still, camera
+        self.frozen_from = start.numbers.get("frozen_from", 1.0)
+        check_number(f"stage.{start.stage}.frozen_from", self.frozen_from, *FRACTION)
+        octaves = {"position": position_frequencies, "time": time_frequencies}
+        octaves |= {"feature": feature_frequencies, "direction": direction_frequencies}
+        check_least(**{f"{name}_frequencies": count for name, count in octaves.items()})
+        check_least(1, channels=channels, width=width)
+        self.octaves = tuple(octaves.values())
+        self.shift = density_shift(alpha_init, self.alpha_key)
         self.grid = whole_grid(self.marching_lattice(self.schedule[0][1]), {"features": channels})
         place, moment, direction = (
             encoded_size(size, n)

@@ -38,8 +38,9 @@ class TNeRF(SampledMethod):
         direction_frequencies: int = 4,
     ) -> None:
         super().__init__(start, sampling or Sampling())
-        self.position, self.moment = encoder(position_frequencies), encoder(time_frequencies)
-        self.direction = encoder(direction_frequencies)
+        self.position = encoder("position", position_frequencies)
+        self.moment = encoder("time", time_frequencies)
+        self.direction = encoder("direction", direction_frequencies)
         inputs = encoded_size(3, position_frequencies) + encoded_size(1, time_frequencies)
         condition = encoded_size(3, direction_frequencies)
         self.network = Template(inputs, condition, width=width, layers=layers, skip=skip)

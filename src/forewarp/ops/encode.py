@@ -13,7 +13,7 @@ def positional_encoding(
 
     Args:
         x: (..., D); without a factor of pi, so in the units that the network is meant for.
-        frequencies: F >= 0; 0 returns ``x``.
+        frequencies: F >= 0, without the identity >= 1; 0 returns ``x``.
         window: how many octaves count, in [0, F] (Nerfies' coarse-to-fine annealing): octave k is multiplied
             by ``(1 - cos(pi clip(window - k, 0, 1))) / 2``; ``x`` itself is not. None: all of them.
         identity: whether ``x`` itself comes first.
@@ -27,7 +27,8 @@ def positional_encoding(
     tensor([[0.0000, 0.0000, 1.0000, 0.5000]])
     """
     if frequencies < 0 or not (identity or frequencies):
-        raise ValueError(f"positional_encoding: expected frequencies >= 0, but got {frequencies}")
+        least = "frequencies >= 0" if identity else "frequencies >= 1 without the identity"
+        raise ValueError(f"positional_encoding: expected {least}, but got {frequencies}")
     if frequencies == 0:
         return x
     bands = 2.0 ** torch.arange(frequencies, dtype=x.dtype, device=x.device)

@@ -83,6 +83,10 @@ class Batch:
         each = [b.expand(len(one.view), 3) for b, one in zip(behind, self.observations)]
         return rays, torch.cat(rgb), torch.cat(each)
 
+    def split(self) -> list[Batch]:
+        """Return a batch of each observation."""
+        return [replace(self, observations=(one,)) for one in self.observations]
+
     def __len__(self) -> int:
         return sum(len(one.view) for one in self.observations)
 

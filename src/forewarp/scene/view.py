@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -83,3 +84,10 @@ class Rendering:
     rgb: Tensor
     depth: Tensor
     opacity: Tensor
+
+    @staticmethod
+    def joined(parts: Sequence[Rendering]) -> Rendering:
+        """Put what several groups of pixels show behind one another."""
+        return Rendering(
+            *(torch.cat([getattr(p, key) for p in parts]) for key in ("rgb", "depth", "opacity"))
+        )

@@ -145,9 +145,7 @@ class Subject:
             found.append(self.module.render(view, moment, self.background, snapshot))
         if parts == 1:
             return found[0]
-        return Rendering(
-            *(torch.cat([getattr(one, key) for one in found]) for key in ("rgb", "depth", "opacity"))
-        )
+        return Rendering.joined(found)
 
     def compared(self, stand: int, width: int, height: int) -> list[Tensor]:
         """Draw truth, prediction and error of a training view, as large as fits."""

@@ -24,7 +24,9 @@ OPACITIES, OPACITY = (
 )
 GHOST = "model.{0}: expected a factory or null, but got .*choose model/{0}=none"
 STAGES = [
-    ({"num_voxels": []}, r"stage.coarse.num_voxels: expected \[\[fraction, count\], ...\], but got \[\]"),
+    ({"num_voxels": []}, r"stage.coarse.num_voxels: expected \[\[fraction, count\], ...\] .* but got \[\]"),
+    ({"num_voxels": [[0.5, 100], [0, 100]]}, "stage.coarse.num_voxels: expected .* ascending fractions"),
+    ({"num_voxels": 100}, "stage.coarse.num_voxels: expected .* but got 100"),
     ({"num_voxels": [[2, 100]]}, "stage.coarse.num_voxels: expected"),
     ({"num_voxels": [[0, 0]]}, "stage.coarse.num_voxels: expected"),
     ({"bases": [[0, 1, 2]]}, "stage.coarse.bases: expected"),

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from forewarp.methods.checks import steps_of
+
 EFFECTS = ("motion", "view_dependence", "upsampler", "inpainter", "background")
 
 
@@ -69,13 +71,8 @@ class VoxelStage:
     def __post_init__(self) -> None:
         where = f"stage.{self.name}"
         for key in ("num_voxels", "background_num_voxels", "bases"):
-            steps = [tuple(s) for s in getattr(self, key)]
-            if (key != "bases" and not steps) or any(
-                len(s) != 2 or not 0 <= s[0] <= 1 or s[1] < 1 for s in steps
-            ):
-                raise ValueError(
-                    f"{where}.{key}: expected [[fraction, count], ...], but got {getattr(self, key)}"
-                )
+            if key != "bases" or self.bases:
+                steps_of(f"{where}.{key}", getattr(self, key))
         if not set(self.effects) <= set(EFFECTS):
             raise ValueError(
                 f"{where}.effects: expected some of {', '.join(EFFECTS)}, but got {list(self.effects)}"
