@@ -22,7 +22,11 @@ def machine(monkeypatch):
 def test_seconds_of_a_picture_have_three_digits(capsys, tmp_path):
     seconds = {"train": 61.0, "fine": 61.0, "render_per_frame": 0.00277, "render_again_per_frame": 12.345}
     show({"protocol": {"scene": "x"}, "seconds": seconds}, tmp_path, {})
-    assert "trained 1:01 (fine 1:01), 0.00277 s a frame, 12.3 s another at" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "trained 1:01 (fine 1:01), 0.00277 s a frame, 12.3 s another at" in said
+    assert "departures" not in said
+    show({"protocol": {"scene": "x", "faults": "a; b", "departures": "c"}, "seconds": seconds}, tmp_path, {})
+    assert "\ndepartures: c\nfaults: a; b\n" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

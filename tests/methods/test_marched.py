@@ -139,12 +139,15 @@ def test_tineuvox_without_its_code_does_not_know_the_time():
 
 def test_the_camera_changes_colour_only():
     made = method("tineuvox", camera=True)
-    fields = [made.field(Moment(0.5, camera=camera)) for camera in (0, 1, None)]
+    made.cameras = [0, 1]
+    fields = [made.field(Moment(0.5, camera=camera)) for camera in (0, 1, None, 7)]
     points, towards = some_points(), torch.tensor([0.0, 0.6, 0.8]).expand(200, 3)
     seen = [(density, color(slice(None), towards)) for density, color in (f.look_up(points) for f in fields)]
     assert seen[0][0].equal(seen[1][0])
     assert not seen[0][1].equal(seen[1][1])
     assert not seen[0][1].equal(seen[2][1])
+    assert seen[2][1].equal(seen[3][1])  # who took no training picture sees by the mean of the others
+    torch.testing.assert_close(fields[2].camera, (fields[0].camera + fields[1].camera) / 2)
 
 
 def test_the_grid_of_tineuvox_freezes():
@@ -300,6 +303,7 @@ def test_a_dead_start_is_named(kind):
 
 def test_each_view_of_a_batch_is_seen_by_the_code_of_its_camera():
     made = method("tineuvox", 13**3, camera=True, alpha_init=1e-2)
+    made.cameras = [0, 1]
     one = batch().observations[0]
     both = [replace(one, moment=Moment(0.5, camera=i), rgb=one.rgb / (1 + i)) for i in (0, 1)]
     terms = ("photo", "point_color", "background_entropy")

@@ -247,8 +247,16 @@ def test_a_dead_start_is_named():
     draw = torch.Generator().manual_seed(0)
     for _ in range(19):
         made.look(seen, {}, draw)
-    with pytest.raises(ValueError, match="all clear or all opaque in each of 20 steps"):
+    with pytest.raises(ValueError, match="all clear or all opaque in each of 20 steps.*; set it to 0.1, or"):
         made.look(seen, {}, draw)
+    assert "set it to 0.1" not in method().dead_start.advice
+
+
+def test_a_snapshot_holds_its_time_and_camera():
+    snapshot = method().at(Moment(0.5, 1, 0))
+    assert snapshot.holds(Moment(0.5, camera=0))
+    assert not snapshot.holds(Moment(0.5, 1, 3))
+    assert not snapshot.holds(Moment(0.25, 1, 0))
 
 
 def test_a_step_reaches_every_parameter():

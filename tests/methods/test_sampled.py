@@ -108,6 +108,9 @@ def test_a_field_that_nothing_is_left_of_is_dead():
 def test_pictures_say_where_matter_may_be():
     confined, free = (method("tnerf", occupancy=8, hull=hull, **GENTLE).occupancy for hull in (0.1, 0.0))
     assert free.possible.all()
+    clear = "what pictures show as clear is empty from the start"
+    assert clear in method("tnerf", occupancy=8, hull=0.1, **GENTLE).departures()
+    assert clear not in method("tnerf", occupancy=8, **GENTLE).departures()
     assert 0 < int(confined.possible.sum()) < len(confined.possible)
     assert confined.occupied.equal(confined.possible)
     blank = TNeRF(replace(start(), blank=True), sampling=Sampling(occupancy=8, hull=0.1))

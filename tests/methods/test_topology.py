@@ -42,4 +42,4 @@ def psnr_on_the_niche(kind, folder):
 def test_fields_that_know_the_time_show_what_appears_better_than_bent_ones(tmp_path):
     psnr = {kind: psnr_on_the_niche(kind, tmp_path / kind) for kind in KINDS}
     print({kind: round(value, 1) for kind, value in psnr.items()})  # for docs/methods.md
-    assert min(psnr["tnerf"], psnr["hypernerf"]) > max(psnr["nerfies"], psnr["dnerf"]), psnr
+    assert min(psnr["tnerf"], psnr["hypernerf"]) > max(psnr["nerfies"], psnr["dnerf"]) + 1, psnr

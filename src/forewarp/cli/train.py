@@ -72,6 +72,7 @@ def train(config) -> float | None:
     config = resumed(config)
     refuse_missing_scene(config)
     # These load torch; mistakes have been answered before.
+    from forewarp.evaluation.measure import notes_of
     from forewarp.report.curve import draw_own
     from forewarp.runs.build import build_run, is_measured, measure_run
     from forewarp.runs.data_check import check_data
@@ -100,7 +101,8 @@ def train(config) -> float | None:
         if config.evaluate:
             measure_run(run, module, config)
         else:
-            print(f"fitted: {run.folder}; measure it with forewarp-evaluate run={run.folder}")
+            said = f"fitted: {run.folder}; measure it with forewarp-evaluate run={run.folder}"
+            print(said, *notes_of(module.method.protocol()), sep="\n")
         draw_own(run.folder)
         if config.evaluate:
             at = quote(f"run={run.folder}")

@@ -76,9 +76,7 @@ def show(metrics: dict, folder: Path, absent: dict[str, str]) -> None:
         lines.append(
             f"flow: moving points off by {error:.4f}, {error / motion:.0%} of their motion {motion:.4f}"
         )
-    lines += [
-        f"{key}: {metrics['protocol'][key]}" for key in ("departures", "faults") if key in metrics["protocol"]
-    ]
+    lines += notes_of(metrics["protocol"])
     if absent:
         lines.append(without(absent))
     images = Path(folder) / "images"
@@ -86,6 +84,11 @@ def show(metrics: dict, folder: Path, absent: dict[str, str]) -> None:
     if (images / "sheets").is_dir():
         lines.append(f"sheets   {images / 'sheets'}: truth | prediction | error")
     console.print("\n".join(lines), highlight=False, soft_wrap=True)
+
+
+def notes_of(protocol: Mapping) -> list[str]:
+    """Say in a line each what a method does otherwise than published, and which faults it keeps, if any."""
+    return [f"{key}: {protocol[key]}" for key in ("departures", "faults") if key in protocol]
 
 
 def without(absent: dict[str, str]) -> str:

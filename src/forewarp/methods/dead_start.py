@@ -1,4 +1,4 @@
-"""Notice a run that has no gradient from the beginning."""
+"""Notice a run that has no gradient, as it mostly is from the beginning."""
 
 from __future__ import annotations
 
@@ -6,7 +6,10 @@ _PATIENCE = 20  # steps
 
 
 class DeadStart:
-    """Count steps in a row that show nothing to learn from.
+    """Count steps in a row that show nothing to learn from, at any time of a run.
+
+    The count is no part of a checkpoint: a run that goes on counts anew, and so ends a few steps later. A
+    step that is repeated counts twice.
 
     Args:
         key: where the mend is typed.

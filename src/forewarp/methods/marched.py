@@ -107,6 +107,7 @@ class MarchedMethod(Method):
         super().__init__()
         self.alpha_key = alpha_key
         self.box, self.times, self.marching = box, start.scene.times, marching
+        self.still = start.scene.still
         where, numbers = f"stage.{start.stage}", start.numbers
         self.schedule = steps_of(
             f"{where}.num_voxels", numbers.get("num_voxels", ()), least=8, from_start=True
@@ -163,6 +164,13 @@ class MarchedMethod(Method):
         ``field`` has been asked at the rays' samples, or where it sees by camera at those of the first.
         """
         return {}
+
+    def some_still(self, count: int, generator: torch.Generator) -> Tensor | None:
+        """Draw at most so many points that never move (P, 3); None where none is known."""
+        if self.still is None or not len(self.still):
+            return None
+        rows = torch.randint(len(self.still), (min(count, len(self.still)),), generator=generator)
+        return self.still[rows].to(self.device)
 
     def at(self, moment: Moment) -> MarchedSnapshot:
         """Fix the time; compute nothing yet."""

@@ -108,7 +108,7 @@ class NDVG(MarchedMethod):
         own = {f.name: start.numbers[f.name] for f in fields(NDVGStage) if f.name in start.numbers}
         self.stage = NDVGStage(**own).checked(where)
         self.shift = density_shift(self.stage.alpha_init, self.alpha_key)
-        self.canonical_time, self.still = start.scene.canonical_time, start.scene.still
+        self.canonical_time = start.scene.canonical_time
         self.octaves, self.continuous = (frequencies, direction_frequencies), continuous
         seen = start.handover and start.handover.frames_in_play
         self.never_seen = 0 if seen is None else len(start.scene.train) - seen  # by the first stage
@@ -231,10 +231,8 @@ class NDVG(MarchedMethod):
             return second_variation(self.deformation.features.reshape(*shape, -1))
 
         def still() -> Tensor | None:
-            if self.still is None or not len(self.still):
-                return None
-            rows = torch.randint(len(self.still), (min(_STILL, len(self.still)),), generator=generator)
-            return field.offset(self.still[rows].to(self.device))[0].square().mean()
+            points = self.some_still(_STILL, generator)
+            return None if points is None else field.offset(points)[0].square().mean()
 
         return {
             "flow_l1": lambda: of_all(field.offsets),

@@ -25,7 +25,6 @@ class NeRF(SampledMethod):
     """
 
     terms = ("photo", "coarse_photo")
-    moves = False
 
     def __init__(
         self,

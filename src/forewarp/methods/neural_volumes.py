@@ -13,6 +13,7 @@ from torch.nn import functional
 
 from forewarp.fields.codes import beside
 from forewarp.fields.volumes import DEVIATION_SCALE, AffineMixture, PictureEncoder, VolumeDecoder, read
+from forewarp.methods.checks import check_number
 from forewarp.methods.dead_start import DeadStart
 from forewarp.methods.departures import BETWEEN_TIMES, CENTRES, ONE_TIME
 from forewarp.methods.method import Method, Snapshot, Start, Step
@@ -89,16 +90,17 @@ class NeuralVolumes(Method):
     ) -> None:
         super().__init__()
         for key, first in (("opacity", first_opacity), ("deviation", first_deviation)):
-            if first is not None and not first > 0:
-                raise ValueError(f"model.first_{key}: expected a number > 0 or null, but got {first}")
-        if not 0 < step <= 1:
-            raise ValueError(f"model.step: expected a length in (0, 1], but got {step}")
+            if first is not None:
+                check_number(f"model.first_{key}", first, "a number > 0 or null", lambda number: number > 0)
+        check_number("model.step", step, "a length in (0, 1]", lambda length: 0 < length <= 1)
         self.step, self.jitter_in_pictures = step, jitter_in_pictures
         self.from_identity = from_identity
         self.dead_start = DeadStart(
             "preset.first_opacity",
             "rays that are all clear or all opaque",
-            "set it to 0.1, or another seed=N",
+            "set it to 0.1, or another seed=N"
+            if first_opacity != 0.1
+            else f"set another seed=N, or a smaller stage.{start.stage}.lr",
         )
         self.first = {"opacity": first_opacity, "deviation of the code": first_deviation}
         scene = start.scene
@@ -268,6 +270,10 @@ class VolumesSnapshot(Snapshot):
     def _still(self) -> Volumes:
         with torch.no_grad():
             return self.volumes()
+
+    def holds(self, moment: Moment) -> bool:
+        """Return whether it is the same time, seen by the same camera."""
+        return (moment.time, moment.camera) == (self.moment.time, self.moment.camera)
 
     def volumes(self) -> Volumes:
         """Decode the volumes of the moment."""

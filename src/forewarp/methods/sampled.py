@@ -115,7 +115,8 @@ class SampledMethod(Method):
         box, self.sampling, self.times = start.scene.box, sampling, start.scene.times
         self.activation = density_of(sampling.density)
         self.occupancy = Occupancy(box, side=sampling.occupancy) if sampling.occupancy else None
-        if self.occupancy is not None and sampling.hull and start.scene.has_alpha and not start.blank:
+        self.confined = self.occupancy is not None and sampling.hull > 0 and start.scene.has_alpha
+        if self.confined and not start.blank:
             train = start.scene.train
             self.occupancy.confine([train[i] for i in spread(len(train), _PICTURES)], sampling.hull)
         self.quadrature = Quadrature(
@@ -195,7 +196,8 @@ class SampledMethod(Method):
 
     def departures(self) -> list[str]:
         """See ``Method``; a subclass adds its own to those of the sampling and of the platform."""
-        return [*self.conventions, *self.sampling.departures(self.published, self.jitters)]
+        notes = [*self.conventions, *self.sampling.departures(self.published, self.jitters)]
+        return notes + (["what pictures show as clear is empty from the start"] if self.confined else [])
 
     def faults(self) -> list[str]:
         """See ``Method``."""

@@ -38,7 +38,8 @@ class TiNeuVox(MarchedMethod):
         channels: of the grid.
         width: of the networks.
         alpha_init: opacity at first of a voxel of the last lattice.
-        camera: let colour depend on the number of the camera that took a picture (the rig's two).
+        camera: let colour depend on the number of the camera that took a picture (the rig's two); who took no
+            training picture sees by the mean of what the others' numbers give.
         padded: a fault of the released code: before it reads, it adds zeros at the grid's high ends, so that
             voxels lie elsewhere after the grid has grown. False: sizes of 4 k + 1.
         position_frequencies, time_frequencies, feature_frequencies, direction_frequencies: octaves.
@@ -63,7 +64,7 @@ class TiNeuVox(MarchedMethod):
         direction_frequencies: int = 4,
     ) -> None:
         super().__init__(start, marching or Marching(), start.scene.box)
-        self.padded, self.still, self.sees_by_camera = padded, start.scene.still, camera
+        self.padded, self.sees_by_camera = padded, camera
         self.frozen_from = start.numbers.get("frozen_from", 1.0)
         check_number(f"stage.{start.stage}.frozen_from", self.frozen_from, *FRACTION)
         octaves = {"position": position_frequencies, "time": time_frequencies}
@@ -79,6 +80,7 @@ class TiNeuVox(MarchedMethod):
         )
         code = 5 * channels
         self.time_code = mlp(moment, code, width=width, layers=2)
+        self.cameras = sorted({frame.camera_id for frame in start.scene.train} - {None}) or [0.5]
         self.camera_code = mlp(moment, code, width=width, layers=2) if camera else None
         self.offsets = mlp(place + code, 3, width=width, layers=3)
         read = encoded_size(len(_STRIDES) * channels, feature_frequencies)
@@ -131,11 +133,8 @@ class TiNeuVox(MarchedMethod):
         """Offer ``still``, at points that never move, and ``tv_grid``, the grid's total variation."""
 
         def still() -> Tensor | None:
-            if self.still is None or not len(self.still):
-                return None
-            count = max(1, len(batch) // _STILL_SHARE)
-            rows = torch.randint(len(self.still), (count,), generator=generator)
-            return field.offset(self.still[rows].to(self.device)).square().mean()
+            points = self.some_still(max(1, len(batch) // _STILL_SHARE), generator)
+            return None if points is None else field.offset(points).square().mean()
 
         def tv_grid() -> Tensor:
             shape = self.grid.lattice.shape
@@ -173,7 +172,8 @@ class TiNeuVoxField:
         self.tau = method.code(method.time_code, moment.time)
         self.camera = None
         if method.camera_code is not None:
-            self.camera = method.code(method.camera_code, 0.5 if moment.camera is None else moment.camera)
+            known = [moment.camera] if moment.camera in method.cameras else method.cameras
+            self.camera = sum(method.code(method.camera_code, camera) for camera in known) / len(known)
 
     def offset(self, points: Tensor) -> Tensor:
         """World points (P, 3) -> how far they are moved (P, 3), world units."""
