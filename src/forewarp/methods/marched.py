@@ -15,7 +15,7 @@ from forewarp.fields.radiance_grid import Activation
 from forewarp.fields.voxel_grid import VoxelGrid, adopted_in, misfit_in
 from forewarp.methods.checks import check_least, check_number, steps_of
 from forewarp.methods.dead_start import DeadStart
-from forewarp.methods.departures import ALONG_RAYS, CENTRES, ONE_TIME
+from forewarp.methods.departures import ALONG_RAYS, ONE_TIME
 from forewarp.methods.method import Method, Snapshot, Start, Step
 from forewarp.methods.rows import renew_parameters
 from forewarp.methods.rows_adam import RowsAdam
@@ -57,7 +57,7 @@ class Marching:
 
     def departures(self) -> list[str]:
         """Name what differs from the publications."""
-        notes = [CENTRES, ALONG_RAYS, ONE_TIME]
+        notes = [ALONG_RAYS, ONE_TIME]
         return notes + (["empty space is not sampled"] if self.occupancy and self.look_every else [])
 
 
