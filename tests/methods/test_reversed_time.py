@@ -13,10 +13,11 @@ from forewarp.scene.view import Moment, View
 from tests.support.sampled_methods import KINDS, learned
 from tests.support.sliding_square import camera, moving_scene, static_ceiling
 
-ALL = KINDS | {
+GRIDS = {
     "tineuvox": partial(TiNeuVox, width=16, position_frequencies=3),
     "ndvg": partial(NDVG, width=(16, 16)),
 }
+ALL = KINDS | GRIDS
 TIED = {"dnerf", "ndvg"}  # to the canonical time
 
 
@@ -33,14 +34,8 @@ def drawn(kind, canonical_time, time):
     scene = replace(moving_scene(), canonical_time=canonical_time)
     made = ALL[kind](Start(scene, "fine", {"num_voxels": [[0, 9**3]], "alpha_init": 0.1}))
     with torch.no_grad():
-        for name, parameter in made.named_parameters():
-            if (
-                kind in ("tineuvox", "ndvg")
-                and "features" in name
-                or "canonical" in name
-                or "network" in name
-            ):
-                parameter.add_(0.3 * torch.randn_like(parameter))
+        for parameter in made.parameters() if kind in GRIDS else ():  # which start at 0
+            parameter.add_(0.3 * torch.randn_like(parameter))
         return made.at(Moment(time)).render(View(camera()), torch.ones(3)).rgb
 
 
