@@ -33,20 +33,22 @@ INTRODUCTION = """# All methods under one clock
 
 Written by `forewarp-report kind=methods` from runs of `sweeps=methods`: each method learns from the same
 pictures in the same minutes, and is measured on the same test views. `{ours}` is the paper's method,
-`backward` its opponent like for like, `particles` our own; the others are the published systems of the
-paper's tables. With `preset=fast` all are as small as minutes of a processor ask for: this is what they
-reach in such minutes, and says nothing of what they reach in the hours of a GPU that they were made for.
+`backward` its ablation with a backward warp, `particles` our own; the others are the published systems of
+the paper's tables ([what each is](../methods.md)). With `preset=fast` all are as small as minutes of a
+processor ask for: this is what they reach in such minutes, and says nothing of what they reach in the hours
+of a GPU that they were made for.
 
 {clocks}
 
-PSNR (dB), SSIM and LPIPS are means over the test views; ± is the standard deviation over seeds. *s a
-step* are all seconds of training by the number of steps. *s a frame* are those of the first picture of a
-time, the mean over the test views measured, by the wall clock: other work on the machine makes them more.
-*GiB* is the most memory of the process. LPIPS is of the first of {nets} whose weights were there.
+PSNR (dB), SSIM and LPIPS are means over the test views, and over the seeds: ± is the standard deviation
+where there are several. *s a step* is all seconds of training divided by the steps. *s a frame* is for the
+first picture of a time (later ones of that time may be faster), mean over the test views, by the wall
+clock: other work on the machine makes it longer. *GiB* is the most memory of the process. LPIPS is by the
+first of {nets} whose weights were found; a run's `metrics.json` says which.
 """
-CURVES = """PSNR of some pixels of validation views while each method learns; the number at a line's end is
-the last of these, and not the table's, which is of whole test views. Schedules follow the share of the
-minutes that is spent, so no method is at its best before the end.
+CURVES = """PSNR of a few pixels of validation views while each method learns; the number at a line's end
+differs from the table, which is of whole test views. Schedules follow the share of the minutes that is
+spent: the point at one minute is not what a run of one minute reaches.
 """
 CURVES_OF = "PSNR against seconds of training"  # and then the methods
 VIEWS_OF = "Test views, the truth first,"  # likewise
@@ -191,4 +193,5 @@ def _departures(rows: list[dict]) -> Table:
     lines = [[about, ", ".join(sorted(methods))] for about, methods in found.items()]
     lines.sort(key=lambda line: (line[0].startswith("kept"), -line[1].count(","), line[0]))
     columns = [Column("departure"), Column("methods")]
-    return Table(columns, lines, caption="## What differs from the publications")
+    presets = ", ".join(f"`preset={name}`" for name in sorted({row["preset"] for row in rows}))
+    return Table(columns, lines, caption=f"## What differs from the publications with {presets}")

@@ -28,10 +28,9 @@ PLACES = {
     "lpips_weights": "WEIGHTS",
 }  # of whoever repeats it
 NETS = ("vgg", "alex", "squeeze")  # LPIPS is of the first whose weights were there
-CLOCKS = """Minutes are of training, by the
-platform's clock: it counts all that a method does to begin with (a visual hull, a plane sweep), and leaves
-out reading pictures and compiling. The processor clock counts processor time of the process, which is the
-same beside other work on the machine and, with one thread, equals the wall clock on an idle one."""
+CLOCKS = """Minutes are of training: setting up counts (a visual hull, a plane sweep), reading pictures and
+compiling do not. The processor clock counts processor time of the process, which is the same beside other
+work on the machine and, with one thread, equals the wall clock on an idle one."""
 _ENDS = 0.1  # share of the time that counts as its first and last part
 _MOST = 1 << 24  # bytes of a table that is read back
 

@@ -339,7 +339,9 @@ class Particles(Method):
 
     def departures(self) -> list[str]:
         """See ``Method``."""
-        return ["particles, rasterised, in the place of voxels that are marched through"]
+        return [
+            "from the forward-flow paper: particles that are rasterised, not voxels that rays march through"
+        ]
 
 
 def _add(total: dict[str, Tensor], found: Mapping[str, Tensor]) -> None:

@@ -101,6 +101,17 @@ class ForwardWarp(VoxelMethod):
             length=2 / 3 * self.half_extent if self.moves else 1.0,
         )
 
+    def departures(self) -> list[str]:
+        """See ``Method``; docs/method.md has the rest, which every preset shares."""
+        parts = {"no up-sampling": self.upsampler, "no inpainter": self.inpainter}
+        parts["colour without direction"] = self.view_dependence
+        notes = [about for about, part in parts.items() if part is None]
+        if isinstance(self.radiance, DirectRadiance):
+            notes.append("voxels hold density and colour, without the network F1")
+        if self.motion is not None and self.motion.trajectory.at_nodes:
+            notes.append("motion (F2) at the nodes of a coarse lattice")
+        return notes
+
     @property
     def first_rendering(self) -> str:
         """Name of the rendering without inpainting: ``upsampled``, or ``warped`` without an up-sampler."""
