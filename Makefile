@@ -134,8 +134,9 @@ else
 	$(BIN)/forewarp-report kind=effects && exit $$status
 endif
 
-# METHODS="dnerf tineuvox_b": these in place of a sweep's own; ablations and the resolution are of model=forward.
-OF_METHODS = $(if $(METHODS),model=$(subst $(space),$(comma),$(strip $(METHODS))))
+# METHODS="dnerf tineuvox_b", or all: these in place of a sweep's own; ablations and the resolution are of model=forward.
+EVERY := particles forward backward nerf tnerf dnerf nerfies hypernerf neural_volumes ndvg tineuvox_s tineuvox_b
+OF_METHODS = $(if $(METHODS),model=$(subst $(space),$(comma),$(strip $(METHODS:all=$(EVERY)))))
 UNTIL = $(if $(STEPS),budget.minutes=null budget.iterations=$(STEPS),$(if $(MINUTES),budget.minutes=$(MINUTES)))
 REPRODUCE = table() { \
 	case $$1 in sweeps=ablation_*|sweeps=resolution) of=;; *) of=$(OF_METHODS);; esac; \
@@ -152,13 +153,15 @@ reproduce-tables: SWEEPS ?= $(if $(SCENES_TYPED),dnerf,dnerf hypernerf nhr lego_
 reproduce-tables: override SWEEPS := $(if $(filter all,$(SWEEPS)),dnerf hypernerf nhr lego_complete ablation_modules ablation_losses resolution,$(SWEEPS))
 reproduce-tables: SEEDS ?= 1
 reproduce-tables: OUT ?= runs/paper/results
-reproduce-tables: ## the paper's tables and figures by all its systems, beside published [DATA=<folder that holds dnerf/ ...> METHODS="dnerf ndvg" PRESET= SCENES="hook lego" MINUTES= SEEDS=3 VIEWS= SWEEPS=all OUT=]
+reproduce-tables: ## the paper's tables and figures, measured beside published [DATA=<folder that holds dnerf/ ...> METHODS="dnerf ndvg", or all; PRESET= SCENES="hook lego" MINUTES= SEEDS=3 VIEWS= SWEEPS=all OUT=]
 ifeq ($(DATA),)
 	@$(if $(SCENES_TYPED),$(error SCENES: expected DATA=<folder that holds dnerf/> beside it))
 	@$(if $(filter-out all ablations,$(SWEEPS_TYPED)),$(error SWEEPS: expected all or ablations without DATA, but got $(SWEEPS_TYPED)))
 	@status=0; $(LANES) MINUTES=$(MINUTES) $(GO_ON); \
 	$(BIN)/forewarp-report kind=paper out=$(OUT) curves=docs/results && exit $$status
 else
+	@$(if $(filter methods,$(SWEEPS)),$(if $(SCENES_TYPED),,$(error SCENES: expected SCENES="hook ..." beside SWEEPS=methods with DATA; \
+		all scenes by all methods: METHODS=all)))
 	@status=0; $(REPRODUCE); for sweep in $(SWEEPS:ablations=ablation_modules ablation_losses); do \
 		table sweeps=$$sweep paths.scenes=$(DATA) \
 			$(if $(SCENES_TYPED),absent=refuse scene=$(subst $(space),$(comma),$(addprefix dnerf_,$(SCENES_TYPED)))) $(GO_ON); \

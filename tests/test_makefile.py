@@ -4,6 +4,7 @@ import shlex
 import subprocess
 
 import pytest
+import yaml
 
 from tests.support.configs import ROOT, options
 
@@ -48,7 +49,7 @@ def test_tables_without_data_fit_all_methods_on_two_counterparts(made):
         assert len(called(fits, f"sweeps={sweep}", f"scene=counterpart_{dataset}")) == 1
 
 
-@pytest.mark.parametrize("more", ["", " DATA=there SWEEPS=methods"])
+@pytest.mark.parametrize("more", ["", " DATA=there SWEEPS=methods SCENES=hook"])
 def test_the_published_numbers_are_not_cut_short_by_minutes(made, more):
     *fits, _ = made("reproduce-tables PRESET=faithful" + more)
     assert len(called(fits, "preset=faithful", "budget.minutes=null")) == len(fits) > 0
@@ -73,6 +74,12 @@ def test_real_scenes_are_fitted_by_the_methods_named(made):
     assert ablations > common | {"sweeps=ablation_losses", "absent=refuse"}
     assert not [word for word in ablations if word.startswith("model=")]
     assert "kind=paper" in report
+
+
+def test_all_methods_are_those_of_their_sweep(made):
+    own, _ = made("reproduce-tables DATA=there METHODS=all SWEEPS=dnerf")
+    sweep = yaml.safe_load((ROOT / "sweeps" / "methods.yaml").read_text())
+    assert f"model={sweep['hydra']['sweeper']['params']['model']}" in own
 
 
 def test_scenes_alone_are_of_one_sweep(made):
@@ -114,6 +121,7 @@ def test_ablations_are_run_for_equal_minutes_and_equal_steps(made):
     [
         ("reproduce-tables SCENES=hook", "SCENES: expected DATA=<folder that holds dnerf/> beside it"),
         ("reproduce-tables SWEEPS=dnerf", "SWEEPS: expected all or ablations without DATA, but got dnerf"),
+        ("reproduce-tables DATA=there SWEEPS=methods", 'SCENES: expected SCENES="hook ..." beside'),
         ("ablations DATA=there", "make reproduce-tables DATA=there SWEEPS="),
         ("ablations METHODS=ndvg", "DATA, METHODS: not for ablations"),
     ],

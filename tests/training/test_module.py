@@ -98,7 +98,7 @@ def test_the_name_of_a_hook_is_noted_at_once(monkeypatch):
 
 @pytest.mark.parametrize(
     ("seconds", "said"),
-    [(0.6, "coarse   0% | compiling kernels, once on a machine: up to a minute\n"), (0, "")],
+    [(0.6, "coarse   0% | compiling what this method runs, once on a machine: up to a minute\n"), (0, "")],
 )
 def test_kernels_that_take_long_to_compile_are_told(monkeypatch, capsys, seconds, said):
     monkeypatch.setattr("forewarp.training.module.told_if_slow", partial(told_if_slow, after=0.2))
