@@ -32,6 +32,7 @@ def runs(in_tmp):
 
 def test_two_runs_side_by_side_with_their_difference(ok, runs):
     more = {"flow": {"epe_moving": 0.1, "motion_mean": 0.4}, "steps": {"coarse": 400, "fine": 900}}
+    more["seconds"] = {"train": 60.0, "render_per_frame": 0.0123}
     runs(one=metrics("forward", 31.5, **more), two=metrics("backward", 30.0, **more))
     done = ok("report", "kind=compare", "runs=[one,two]")
     head, _, *rows = (line.split() for line in done.out.splitlines())
@@ -41,6 +42,7 @@ def test_two_runs_side_by_side_with_their_difference(ok, runs):
         ["moving", "points'", "error,", "%", "of", "motion", "25", "25", "+0"],
         ["steps", "1300", "1300"],
         ["seconds", "of", "training", "60", "60"],
+        ["seconds", "a", "picture", "0.012", "0.012"],
     ]
 
 

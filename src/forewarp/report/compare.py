@@ -43,13 +43,11 @@ def compare(folders: Sequence[Path]) -> Table:
     _add(rows, "moving points' error, % of motion", [share and 100 * share for share in shares], 0)
     steps = [sum((found.get("steps") or {}).values()) or None for found in metrics]
     _add(rows, "steps", steps, 0, with_difference=False)
-    _add(
-        rows,
-        "seconds of training",
-        [found["seconds"]["train"] for found in metrics],
-        0,
-        with_difference=False,
-    )
+    for about, key, digits in (
+        ("seconds of training", "train", 0),
+        ("seconds a picture", "render_per_frame", 3),
+    ):
+        _add(rows, about, [found["seconds"].get(key) for found in metrics], digits, with_difference=False)
     for key, about in _CONDITIONS.items():
         told = [str(found["protocol"].get(key) or "none named") for found in metrics]
         if len(set(told)) > 1:

@@ -104,7 +104,9 @@ class DynamicSceneModule(lightning.LightningModule):
 
     def on_train_start(self) -> None:
         """Compile the kernels, then start the training clock."""
-        with told_if_slow(self.settings.name, "compiling what this method runs, once on a machine: up to a minute"):
+        with told_if_slow(
+            self.settings.name, "compiling what this method runs, once on a machine: up to a minute"
+        ):
             self.method.warm_up()
         if self._torch_state is not None:  # restored last: callbacks may have drawn random numbers
             torch.set_rng_state(self._torch_state)
