@@ -335,3 +335,14 @@ def test_faults_of_the_released_code_are_on_in_faithful_and_off_in_fast_and_demo
         assert made_by(config, "fine").faults() == kept
         if model == "ndvg":
             assert made_by(config, "fine", frames=2).faults() == [*kept[:1], UNSEEN, *kept[1:]]
+
+
+def test_the_papers_method_names_what_it_does_otherwise():
+    forward = ["model=forward", "scene=dnerf_hook", "preset=fast"]
+    plain = made_by(composed(*forward), "coarse").departures()
+    assert plain == [
+        *("no up-sampling", "no inpainter", "voxels hold density and colour, without the network F1"),
+        "motion (F2) at the nodes of a coarse lattice",
+    ]
+    assert made_by(composed(*forward, "ablation=full"), "fine").departures() == plain[2:]
+    assert "colour without direction" in made_by(composed(*forward, "ablation=no_view"), "fine").departures()

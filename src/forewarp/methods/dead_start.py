@@ -1,4 +1,4 @@
-"""Notice a run that has no gradient, as it mostly is from the beginning."""
+"""Notice a run without any gradient, most often from its beginning."""
 
 from __future__ import annotations
 
