@@ -129,6 +129,7 @@ METHODS = {
     "tnerf": Entry(
         partial(TNeRF, **SMALL_NETWORK, time_frequencies=2),
         {"network": 2e-3},
+        falls=0.6,
         steps=150,
     ),
     "nerf": Entry(
@@ -143,6 +144,7 @@ METHODS = {
         partial(DNeRF, **SMALL_NETWORK, time_frequencies=2),
         {"network": 2e-3},
         {"photo": 1.0, "second_time": 1e-4},
+        falls=0.6,
         steps=150,
         slow=True,
     ),
@@ -151,6 +153,7 @@ METHODS = {
         {"network": 2e-3},
         {"photo": 1.0, "coarse_photo": 1.0, "elastic": 1e-3, "still": 1e-3},
         {"warp_in": 0.3},
+        falls=0.6,
         steps=150,
         slow=True,
     ),
@@ -159,6 +162,7 @@ METHODS = {
         {"network": 2e-3},
         {"photo": 1.0, "coarse_photo": 1.0, "still": 1e-3},
         {"warp_in": 0.3, "slice_from": 0.01, "slice_in": 0.2},
+        falls=0.6,
         steps=150,
         slow=True,
     ),

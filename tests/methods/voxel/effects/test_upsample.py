@@ -80,9 +80,13 @@ def stepped(recompute):
     torch.nn.init.normal_(learned.head.weight)
     features = torch.randn(1, 6, *LATTICE.shape, requires_grad=True)
     held = {}
-    with torch.autograd.graph.saved_tensors_hooks(
-        lambda t: held.update({t.data_ptr(): t.nbytes}) or t, lambda t: t
-    ):
+
+    def hold(kept):
+        place = id(kept) if kept.is_mkldnn else kept.data_ptr()
+        held[place] = kept.numel() * kept.element_size()
+        return kept
+
+    with torch.autograd.graph.saved_tensors_hooks(hold, lambda kept: kept):
         detail = learned.residual(features, occupied_crop(grid().index, 0))
     detail.square().sum().backward()
     return detail.detach(), [features.grad, *(p.grad for p in learned.parameters())], sum(held.values())
