@@ -135,7 +135,7 @@ else
 endif
 
 # METHODS="dnerf tineuvox_b", or all: these in place of a sweep's own; ablations and the resolution are of model=forward.
-EVERY := particles forward backward nerf tnerf dnerf nerfies hypernerf neural_volumes ndvg tineuvox_s tineuvox_b
+EVERY = $(subst $(comma),$(space),$(shell sed -n 's/^ *model: //p' sweeps/methods.yaml))
 OF_METHODS = $(if $(METHODS),model=$(subst $(space),$(comma),$(strip $(METHODS:all=$(EVERY)))))
 UNTIL = $(if $(STEPS),budget.minutes=null budget.iterations=$(STEPS),$(if $(MINUTES),budget.minutes=$(MINUTES)))
 REPRODUCE = table() { \

@@ -57,7 +57,8 @@ def test_methods_are_ranked_and_what_they_depart_from_is_listed_once(tmp_path):
     assert rows_of(text, "kept fault: padded") == [["kept fault: padded", "`ndvg`"]]
     assert "**ball, 5 minutes, 5 of 20 test views, evenly spread**" in text
     assert "* ball/full-1.0-seed0: an ablation" in text
-    assert "scene=ball model=forward,ndvg,particles,tnerf budget.clock=processor threads=2\n" in text
+    models = "model=forward,ndvg,particles,tnerf"
+    assert f"\nforewarp-train --multirun scene=ball {models} budget.clock=processor threads=2\n" in text
     assert "minutes: particles 30.00, forward 27.00, ndvg 22.00](methods-ball-views.png)" in text
     curve = next(csv.DictReader(table.read_text().splitlines()))["curve"]
     assert curve == "10.0:22.00 100.0:27.00"

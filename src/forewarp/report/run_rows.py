@@ -22,11 +22,8 @@ FORMS |= {"iterations": "{:g} steps at most", "held_out": "{:g} views held out"}
 KEY = ("method", "preset", "scene", "minutes", "seed", *CONDITIONS)  # what tells rows apart
 NUMBERS = ("psnr", "ssim", "lpips", "steps", "step", "frame", "parameters", "memory", "ends")
 TEXTS = ("dataset", "day", "departures", "faults", "views", "curve", "command")
-PLACES = {
-    "paths.scenes": "DATASETS",
-    "data.root": "SCENES",
-    "lpips_weights": "WEIGHTS",
-}  # of whoever repeats it
+# What stands for the folders of whoever types a command again.
+PLACES = {"paths.scenes": "DATASETS", "data.root": "SCENES", "lpips_weights": "WEIGHTS"}
 NETS = ("vgg", "alex", "squeeze")  # LPIPS is of the first whose weights were there
 CLOCKS = """Minutes are of training: setting up counts (a visual hull, a plane sweep), reading pictures and
 compiling do not. The processor clock counts processor time of the process, which is the same beside other
@@ -201,7 +198,11 @@ def commands(rows: Sequence[dict], sweep: str) -> str:
         command = command.replace(model[0], " model={}", 1) if model else command
         known = models.setdefault(command, [])
         known += [model[1]] if model and model[1] not in known else []
-    lines = [command.replace("model={}", f"model={','.join(names)}") for command, names in models.items()]
+    lines = []
+    for command, names in models.items():
+        if len(names) > 1 and "--multirun" not in command:
+            command = command.replace("forewarp-train", "forewarp-train --multirun", 1)
+        lines.append(command.replace("model={}", f"model={','.join(names)}"))
     about = "Each with its `seed=`; words in capitals are folders of your own.\n"
     return "\n".join(["## Commands\n", about, "```bash", *sorted(lines), "```\n"])
 
@@ -223,6 +224,5 @@ def _repeated(row: dict, sweep: str) -> str:
     command = re.sub(r"\s(budget\.clock|threads)=\S+", "", command)
     if " scene=" in command and row["clock"] == "processor" and row["threads"] == 1:
         return command.replace("forewarp-train", f"forewarp-train --multirun sweeps={sweep}", 1)
-    return f"{command} budget.clock={row['clock']}" + (
-        f" threads={row['threads']:g}" if row["threads"] else ""
-    )
+    threads = f" threads={row['threads']:g}" if row["threads"] else ""
+    return f"{command} budget.clock={row['clock']}{threads}"
