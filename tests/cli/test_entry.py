@@ -71,6 +71,7 @@ def test_options_of_ones_own_stand_beside_ours(ok, way, in_tmp):
             "data.nothing_like_it: expected a key of the configuration, but got none",
         ),
         (["budget.minuts=1"], "got none of this name; did you mean budget.minutes?"),
+        (["data={rooot: 1}"], "data.rooot: expected a key of the configuration, but got none"),
         (["modle/view_dependence=sh"], "modle/view_dependence: expected a key of the configuration, but got"),
         (["--multirun", "seed=0,1", "model=forward,backward", "budgt=fast"], "did you mean budget?"),
         pytest.param(

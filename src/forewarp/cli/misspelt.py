@@ -72,9 +72,13 @@ def unknown_key(error: Exception, name: str, arguments: list[str]) -> str | None
     key, conf = found[1], configurations()
     others = [argument for argument in arguments if key_of(argument) != key]
     config = _composed(conf, name, others)
+    known = [*every_key(config), *_groups(conf)]
+    if key in known:  # with a dictionary as its value, one of whose keys is unknown
+        inner = [own for one in arguments if key_of(one) == key for own in _spread(one)[1:]]
+        if (key := next((own for own in inner if own not in known), None)) is None:
+            return None
     if (owner := _owner(key, conf, name, others)) is not None:
         return of_another(key, config.model.name, owner)
-    known = [*every_key(config), *_groups(conf)]
     near = difflib.get_close_matches(key, known, 1, cutoff=0.8)
     advice = f"did you mean {near[0]}?" if near else f"forewarp-{name} --cfg job prints all keys"
     return f"{key}: expected a key of the configuration, but got none of this name; {advice}"
