@@ -75,7 +75,7 @@ def test_lines_where_there_is_no_terminal(tmp_path, capsys):
     assert len(lines) == STEPS + 1
     shape = (
         r"coarse +(\d+)% \| (.*) \| train psnr -?[\d.]+ \| loss [\d.]+ \| frames (\d+)/12 \| "
-        r"voxels [\d,]+ \| [\d.]+ steps/s"
+        r"voxels [\d,]+( \| [\d.]+ steps/s)?"
     )
     found = [re.fullmatch(shape, line) for line in lines]
     assert all(found), lines
@@ -87,6 +87,7 @@ def test_lines_where_there_is_no_terminal(tmp_path, capsys):
     assert percents == sorted(percents)
     assert percents[-2:] == [100, 100]
     assert [found[0][3], found[-1][3]] == ["10", "12"]
+    assert [bool(match[4]) for match in found] == [False] + [True] * STEPS  # none is timed by the first step
 
 
 def test_a_terminal_gets_a_bar_that_is_not_drawn_too_often(monkeypatch):

@@ -37,11 +37,15 @@ class StageProgress(lightning.Callback):
     def on_train_start(self, trainer, module) -> None:
         """Begin the line of this stage."""
         self._line = ProgressLine(module.settings.name, refresh=self.refresh, every=self.every)
-        self._psnr, self._seen, self._speed = 0.0, 0.0, None
-        self._since = time.perf_counter(), module.global_step
+        self._psnr, self._seen = 0.0, 0.0
+        self._speed: float | None = None
+        self._since: tuple[float, int] | None = None
 
     def on_train_batch_end(self, trainer, module, outputs, batch, batch_idx) -> None:
-        """Update the mean PSNR; draw if it is time."""
+        """Update the mean PSNR; draw if it is time. The speed is of the steps after the first, which may wait
+        for what is compiled or read.
+        """
+        self._since = self._since or (time.perf_counter(), module.global_step)
         if math.isfinite(module.last["psnr"]):  # not finite in a skipped step
             self._psnr += _SMOOTHING * (module.last["psnr"] - self._psnr)
             self._seen += _SMOOTHING * (1 - self._seen)
@@ -69,14 +73,17 @@ class StageProgress(lightning.Callback):
 
     def _text(self, module) -> str:
         last, playing, (kind, count) = module.last, module.curriculum, module.method.size
+        speed = self._steps_a_second(module.global_step)
         return (
             f"train psnr {self._psnr / max(self._seen, _SMOOTHING):.1f} | loss {last['loss']:.4f} | "
-            f"frames {playing.in_play}/{len(playing.order)} | {kind} {count:,} | "
-            f"{self._steps_a_second(module.global_step):.1f} steps/s"
+            f"frames {playing.in_play}/{len(playing.order)} | {kind} {count:,}"
+            + ("" if speed is None else f" | {speed:.1f} steps/s")
         )
 
-    def _steps_a_second(self, step: int) -> float:
-        now, (before, step_before) = time.perf_counter(), self._since
+    def _steps_a_second(self, step: int) -> float | None:
+        now, (before, step_before) = time.perf_counter(), self._since or (0.0, step)
+        if step == step_before:
+            return self._speed
         speed = (step - step_before) / max(now - before, 1e-6)
         self._since = now, step
         smooth = 0.3 if self._line.terminal and self._speed is not None else 1.0
