@@ -120,8 +120,14 @@ price-list: ## what each choice costs and brings, on the vehicle and real scenes
 COMPARE = $(BIN)/forewarp-train --multirun sweeps=effects $(if $(THREADS),threads=$(THREADS))
 effects: MINUTES := $(if $(filter command line,$(origin MINUTES)),$(MINUTES),2)
 effects: SEEDS ?= 2
-effects: ## planned effects of model=forward against all effects, on procedural or real scenes [DATA= SCENES="a b" MINUTES= SEEDS=]
-ifeq ($(DATA),)
+# Two specimens are made for effects that particles alone have; they have no fixed set to compare a plan with.
+SPECIMENS := still,rigid,band,glossy,room,quick,daylight,blocks
+effects: ## planned effects of model=forward against all effects, on procedural or real scenes [DATA= SCENES="a b" MINUTES= SEEDS=]; plans of MODEL=particles
+ifeq ($(MODEL),particles)
+	@status=0; $(COMPARE) $(SEED) model=particles ablation=auto $(if $(DATA),paths.scenes=$(DATA)) \
+		scene=$(if $(DATA),$(subst $(space),$(comma),$(addprefix dnerf_,$(SCENES))),specimen_$(subst $(comma),$(comma)specimen_,$(SPECIMENS))) $(GO_ON); \
+	$(BIN)/forewarp-report kind=effects && exit $$status
+else ifeq ($(DATA),)
 	@status=0; $(COMPARE) $(SEED) ablation=auto $(GO_ON); \
 	$(COMPARE) $(SEED) ablation=all_effects budget.minutes=$(MINUTES) $(GO_ON); \
 	$(BIN)/forewarp-report kind=effects && exit $$status

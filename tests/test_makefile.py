@@ -116,6 +116,14 @@ def test_ablations_are_run_for_equal_minutes_and_equal_steps(made):
         }
 
 
+def test_effects_of_particles_are_planned_on_all_specimens(made):
+    fit, report = made("effects MODEL=particles")
+    scenes = {path.stem for path in (ROOT / "conf" / "scene").glob("specimen_*.yaml")}
+    assert {"sweeps=effects", "model=particles", "ablation=auto", "seeds=2"} < fit
+    assert {scene for word in fit if word.startswith("scene=") for scene in word[6:].split(",")} == scenes
+    assert report == {"forewarp-report", "kind=effects"}
+
+
 @pytest.mark.parametrize(
     ("line", "expected"),
     [

@@ -11,16 +11,21 @@ from tests.support.runs_on_disk import write_run
 SLOW, QUICK = ((10, 20.0), (20, 24.0), (40, 25.0)), ((5, 24.0), (10, 24.9), (20, 26.0))
 
 
-def write_choice(root, choice, *, scene="ball", seed=0, calls_for=None, on=(), psnr=30.0, curve=SLOW):
+def write_choice(
+    root, choice, *, scene="ball", seed=0, calls_for=None, on=(), psnr=30.0, curve=SLOW, model="forward"
+):
     """A run of a choice; of ``auto`` with its plan."""
+    own = {"calls_for": calls_for, "model": {"name": model}}
     more = {"scene": scene, "psnr": psnr, "curve": curve, "against": "all_effects"}
-    folder = write_run(root, choice, seed, **more, config={"calls_for": calls_for})
+    folder = write_run(root, choice, seed, **more, config=own)
     if choice == "auto":
         effects = {
             name: {"choice": "x" if name in on else "none", "on": name in on, "because": f"{name}, 3 %"}
             for name in ("motion", "view")
         }
+        trials = {name: {"psnr": 1.25, "noise": 0.5} for name in on}
         plan = {"typed": [], "overrides": [], "effects": effects, "seconds": 12.5}
+        plan["evidence"] = {"trials": trials}
         (folder / "plan.yaml").write_text(yaml.safe_dump(plan))
     return folder
 
@@ -73,3 +78,19 @@ def test_of_two_runs_of_a_kind_the_last_one_counts(tmp_path):
     os.utime(last / "metrics.json", (2e9, 2e9))
     results, _ = collect(tmp_path)
     assert compared(results).rows[0][2].mean == 31.0
+
+
+def test_each_method_has_a_page_with_what_its_trials_gained(tmp_path):
+    write_choice(tmp_path / "a", "auto", calls_for=[], on=["view"])
+    write_choice(tmp_path / "b", "auto", calls_for=["motion"], on=["motion"], model="particles")
+    files = write_effects(tmp_path, tmp_path / "out")
+    assert [file.name for file in files] == [
+        *("effects.md", "effects.csv"),
+        *("effects-particles.md", "effects-particles.csv"),
+    ]
+    text = files[2].read_text()
+    assert text.startswith("# Only the effects a scene calls for: model=particles")
+    assert "1 of 1 plans" in text
+    assert lines_of(text.partition("## What each effect is worth")[2], "ball")[0].split("|")[3].strip() == (
+        "+1.25 ± 0.50"
+    )

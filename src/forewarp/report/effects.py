@@ -16,7 +16,7 @@ from forewarp.report.tables import Column, Table
 CHOICES = {"auto": "planned", "all_effects": "every effect", "full": "the paper's set", "base": "the preset"}
 WITHIN = 0.3  # a planned run should come within this many dB of every effect at once, in less time
 
-INTRODUCTION = """# Only the effects a scene calls for
+INTRODUCTION = """# Only the effects a scene calls for: model={model}
 
 Written by `forewarp-report kind=effects` from runs of `sweeps=effects`. *Planned* is what `effects=auto`
 found the scene to call for, *every effect* has all of them on, *the paper's set* is motion, inpainter,
@@ -28,7 +28,8 @@ validation views, came within {within:g} dB of where every effect ended, "of" so
 
 
 def write_effects(runs: Path, out: Path) -> list[Path]:
-    """Write ``effects.md`` and ``effects.csv`` (every run).
+    """Write ``effects.md`` and ``effects.csv`` (every run) of ``model=forward``, and ``effects-<model>`` of
+    any other method.
 
     Args:
         runs: folder to search for measured runs.
@@ -39,18 +40,27 @@ def write_effects(runs: Path, out: Path) -> list[Path]:
     """
     results, without = collect(runs, ["metrics.json"])
     results = [result for result in results if result.variant in CHOICES]
-    parts = [INTRODUCTION.format(within=WITHIN), f"Machine: {machine(results)}.\n"]
-    for title, own in (("Specimens", True), ("Other scenes", False)):
-        found = [r for r in results if (r.config.get("calls_for") is not None) == own]
+    files = []
+    for model in sorted({_model(result) for result in results}) or ["forward"]:
+        own = [result for result in results if _model(result) == model]
+        name = "effects" if model == "forward" else f"effects-{model}"
+        replace_file(out / f"{name}.md", "\n".join(_parts(model, own) + left_out("Without numbers", without)))
+        replace_file(out / f"{name}.csv", every_run(own).csv())
+        files += [out / f"{name}.md", out / f"{name}.csv"]
+    return files
+
+
+def _parts(model: str, results: Sequence[Result]) -> list[str]:
+    """Make the paragraphs of one method's page."""
+    parts = [INTRODUCTION.format(within=WITHIN, model=model), f"Machine: {machine(results)}.\n"]
+    for title, made in (("Specimens", True), ("Other scenes", False)):
+        found = [r for r in results if (r.config.get("calls_for") is not None) == made]
         if found:
             parts += [f"## {title}\n", compared(found).markdown()]
-            parts += [called(found).markdown()] if own else []
-    parts += ["## Why\n", *reasons(results)]
-    parts += left_out("Without numbers", without)
-    page, file = out / "effects.md", out / "effects.csv"
-    replace_file(page, "\n".join(parts))
-    replace_file(file, every_run(results).csv())
-    return [page, file]
+            parts += [called(found).markdown()] if made else []
+    trials = missed(results)
+    parts += ["## What each effect is worth in trials\n", trials.markdown()] if trials.rows else []
+    return [*parts, "## Why\n", *reasons(results)]
 
 
 def plan_of(result: Result) -> dict:
@@ -100,6 +110,29 @@ def called(results: Sequence[Result]) -> Table:
     right = sum(row[-1] == "as made" for row in rows)
     columns = [Column("scene"), Column("seed", 0), Column("made to call for"), Column("planned"), Column("")]
     return Table(columns, rows, f"{right} of {len(rows)} plans turn on what is called for and nothing else:")
+
+
+def missed(results: Sequence[Result]) -> Table:
+    """List for every plan what its trials gained by each effect, ± two standard errors."""
+    plans = [(run, _trials(run)) for run in _runs(results, "auto")]
+    names = list(dict.fromkeys(name for _, trials in plans for name in trials))
+    rows = []
+    for run, trials in sorted(plans, key=lambda one: (one[0].scene, one[0].seed)):
+        gains = [trials.get(name) for name in names]
+        cells = [gain and f"{gain['psnr']:+.2f} ± {gain['noise']:.2f}" for gain in gains]
+        rows += [[run.scene, run.seed, *cells]] if trials else []
+    columns = [Column("scene"), Column("seed", 0), *(Column(name.replace("_", " ")) for name in names)]
+    caption = "dB on held-out training views that a trial with the effect has more; empty: not tried."
+    return Table(columns, rows, caption)
+
+
+def _model(run: Result) -> str:
+    return run.config["model"]["name"]
+
+
+def _trials(run: Result) -> dict[str, dict]:
+    """What each trial of a run's plan gained, by effect."""
+    return plan_of(run).get("evidence", {}).get("trials", {})
 
 
 def reasons(results: Sequence[Result]) -> list[str]:
