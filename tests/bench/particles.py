@@ -47,11 +47,14 @@ BOX = Box((-1.0, -0.5, -1.2), (1.0, 0.5, 1.1))
 
 @dataclass(frozen=True)
 class Size:
-    """What is timed: so many ``particles`` and ``nodes``, pictures of ``side`` squared pixels."""
+    """What is timed: so many ``particles`` and ``nodes``, pictures of ``side`` squared pixels; ``zoom`` makes
+    the figure larger in them, at 1 it is as large as hook.
+    """
 
     particles: int = COUNT
     side: int = SIDE
     nodes: int = NODES
+    zoom: float = 1.0
 
 
 def figure(count: int) -> tuple[Gaussians, float]:
@@ -71,11 +74,12 @@ def figure(count: int) -> tuple[Gaussians, float]:
     return Gaussians(means, scales, quaternions, opacity, colors), apart
 
 
-def camera(side: int, turn: float) -> Camera:
+def camera(side: int, turn: float, zoom: float = 1.0) -> Camera:
     """A camera about the figure, as D-NeRF's are."""
     at = torch.tensor([3.8 * math.cos(6.283 * turn), 3.8 * math.sin(6.283 * turn), 1.4])
     pose = look_at(at, torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
-    return Camera(side, side, 1.39 * side, 1.39 * side, side / 2, side / 2, pose, 2.0, 6.0)
+    focal = 1.39 * side * zoom
+    return Camera(side, side, focal, focal, side / 2, side / 2, pose, 2.0, 6.0)
 
 
 @torch.no_grad()
@@ -93,10 +97,10 @@ def photograph(particles: Gaussians, view: Camera) -> Tensor:
 
 
 @cache
-def scene_of(count: int, side: int) -> Scene:
+def scene_of(count: int, side: int, zoom: float = 1.0) -> Scene:
     """The figure at many times; pictures repeat."""
     particles, _ = figure(count)
-    cameras = [camera(side, i / VIEWS) for i in range(VIEWS)]
+    cameras = [camera(side, i / VIEWS, zoom) for i in range(VIEWS)]
     pictures = [photograph(particles, view) for view in cameras]
     frames = tuple(
         Frame(f"r_{i}", i / (TIMES - 1), cameras[i % VIEWS], lambda i=i: pictures[i % VIEWS])
@@ -114,7 +118,7 @@ def run_of(size: Size, steps: int, folder: Path) -> Run:
         "stage.fine.first=1.0", "stage.fine.every=1.0", "stage.fine.density=1000",
     )  # fmt: skip
     run = build_run(config)
-    data = SceneDataModule(lambda: scene_of(size.particles, size.side), background="random")
+    data = SceneDataModule(lambda: scene_of(size.particles, size.side, size.zoom), background="random")
     make = run.model
     return replace(run, datamodule=data, model=lambda start: _made(make, start, size), tell=lambda _: None)
 
@@ -159,7 +163,7 @@ class Loop:
         self.batches = iter(run.datamodule.train_dataloader())
         self.parameters = dict(self.method.named_parameters())
         self.factors = self.module.objective.factors(0)
-        self.view = View(camera(size.side, 0.3))
+        self.view = View(camera(size.side, 0.3, size.zoom))
 
     def step(self) -> None:
         """Take a whole step."""
@@ -170,6 +174,10 @@ class Loop:
         for name, p in self.parameters.items():
             p.grad = gradients[name]
         self.optimizer.step()
+
+    def covered(self) -> float:
+        """Pixels that show something, on average over the pictures."""
+        return float(self.method.covered)
 
     @torch.no_grad()
     def picture(self) -> Tensor:

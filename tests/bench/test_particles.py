@@ -62,9 +62,11 @@ def test_tables_are_made(few):
             name in particle_tables.PARTS and name != "sorting into tiles"
         )  # plain PyTorch has no tiles
         assert bool(cells[2]) == compared
-    grown = particle_tables.growth_table(TINY, {"particles": (100, 200), "side": (16, 32), "nodes": (4, 9)})
+    grown = particle_tables.growth_table(TINY, {"particles": (100, 200), "zoom": (0.5, 1.0), "nodes": (4, 9)})
     assert grown.count("to the power") == 3
     assert grown.count("\n| ") == 3 * 4
+    small, large = (int(line.split("|")[1]) for line in grown.split("\n\n")[3].splitlines()[2:])
+    assert 3 * small < large < 5 * small  # covered pixels: half as large, a quarter
 
 
 def test_goals_are_judged(few, monkeypatch):
@@ -73,6 +75,7 @@ def test_goals_are_judged(few, monkeypatch):
     monkeypatch.setattr(particle_tables, "steps_a_second", lambda loop, threads: 100.0 * threads**0.7)
     text = particle_tables.goals_table(TINY)
     assert "| 1.62 times | reached |" in text
+    assert text.count("times a million exponentials") == 2
     assert "| 70%: 10 and 7 ms | **missed** |" in text
 
 
