@@ -186,14 +186,15 @@ ablations: OUT ?= docs/results
 # The voxel networks come with the fine stage, which the demo's numbers give too little of the training to tell; on fewer
 # rays and voxels it makes enough steps within minutes.
 ablations: ALSO ?= stage.fine.share=2 preset.rays=512 modules.num_voxels=[[0,4096]] \
-	stage.coarse.background_num_voxels=[[0,27000]] stage.fine.background_num_voxels=[[0,110592]] \
 	callbacks.accuracy.rays=2000 callbacks.pictures=null logger=none
+# And in HyperNeRF's room.
+ablations: ROOM ?= stage.coarse.background_num_voxels=[[0,27000]] stage.fine.background_num_voxels=[[0,110592]]
 ablations: ## what each part of the paper's method brings, on three counterparts, at equal minutes and at equal steps [MINUTES= STEPS= SEEDS=3 OUT=]
 	@$(if $(DATA)$(METHODS),$(error DATA, METHODS: not for ablations; they are of model=forward on counterparts. \
 		Real scenes: make reproduce-tables DATA=$(or $(DATA),<folder>) SWEEPS="ablation_modules ablation_losses"))
 	@status=0; \
-	$(LANES) SWEEPS=ablations VIEWS=$(VIEWS) ALSO="$(ALSO) $(ABLATIONS)" MINUTES=$(MINUTES) STEPS= $(GO_ON); \
-	$(LANES) SWEEPS=ablations VIEWS=$(VIEWS) ALSO="$(ALSO) $(ABLATIONS)" STEPS=$(STEPS) $(GO_ON); \
+	$(LANES) SWEEPS=ablations VIEWS=$(VIEWS) ALSO="$(ALSO) $(ABLATIONS)" ROOM="$(ROOM)" MINUTES=$(MINUTES) STEPS= $(GO_ON); \
+	$(LANES) SWEEPS=ablations VIEWS=$(VIEWS) ALSO="$(ALSO) $(ABLATIONS)" ROOM="$(ROOM)" STEPS=$(STEPS) $(GO_ON); \
 	$(BIN)/forewarp-report kind=ablation out=$(OUT) && exit $$status
 
 ONLY_ABLATIONS = $(filter ablations,$(SWEEPS))
@@ -204,7 +205,8 @@ tables-captures: PAIRS := $(if $(ONLY_ABLATIONS),,methods:hypernerf lego_complet
 tables-vehicle tables-captures: THREADS ?= 1
 tables-vehicle tables-captures:
 	@{ status=0; $(REPRODUCE); for pair in $(PAIRS); do \
-		table sweeps=$${pair%:*} scene=counterpart_$${pair#*:} budget.clock=processor $(GO_ON); \
+		case $$pair in ablation_*:hypernerf) room="$(ROOM)";; *) room=;; esac; \
+		table sweeps=$${pair%:*} scene=counterpart_$${pair#*:} budget.clock=processor $$room $(GO_ON); \
 	done; exit $$status; } $(SAYS)
 
 MKDOCS = { $(BIN)/python -c 'import material, mkdocstrings_handlers.python' 2>/dev/null || { $(ADD) '.[docs]'; }; } && \

@@ -110,6 +110,10 @@ def test_ablations_are_run_for_equal_minutes_and_equal_steps(made):
     }
     assert len(called(fits, *common)) == len(fits) == 8
     for group in (by_time, by_steps):
+        (in_room,) = called(group, "scene=counterpart_hypernerf")  # no_coarse has no such stage
+        others = [call for call in group if call is not in_room]
+        assert [word for word in in_room if word.startswith("stage.coarse.")]
+        assert not [word for call in others for word in call if word.startswith("stage.coarse.")]
         assert {word for call in group for word in call if word.startswith(("sweeps=", "scene="))} == {
             *("sweeps=ablation_losses", "sweeps=ablation_modules"),
             *(f"scene=counterpart_{dataset}" for dataset in ("dnerf", "hypernerf", "lego_complete")),

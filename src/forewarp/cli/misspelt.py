@@ -73,10 +73,12 @@ def unknown_key(error: Exception, name: str, arguments: list[str]) -> str | None
     others = [argument for argument in arguments if key_of(argument) != key]
     config = _composed(conf, name, others)
     known = [*every_key(config), *_groups(conf)]
-    if key in known:  # with a dictionary as its value, one of whose keys is unknown
+    if key in known:  # but not a key of the dictionary that is its value, or not in each of several jobs
         inner = [own for one in arguments if key_of(one) == key for own in _spread(one)[1:]]
-        if (key := next((own for own in inner if own not in known), None)) is None:
-            return None
+        unknown = next((own for own in inner if own not in known), None)
+        if unknown is None:
+            return f"{key}: expected an option of every job, but got one that not all have; leave it out"
+        key = unknown
     if (owner := _owner(key, conf, name, others)) is not None:
         return of_another(key, config.model.name, owner)
     near = difflib.get_close_matches(key, known, 1, cutoff=0.8)
@@ -108,7 +110,7 @@ def _owner(key: str, conf: Path, name: str, arguments: list[str]) -> str | None:
 
 
 def _composed(conf: Path, name: str, arguments: list[str]):
-    """Compose the config with the other arguments, or without them if they are wrong, too."""
+    """Compose the config with the other arguments, of a sweep the first; or alone, if they are wrong."""
     import hydra
     from hydra.core.global_hydra import GlobalHydra
 
@@ -118,8 +120,18 @@ def _composed(conf: Path, name: str, arguments: list[str]):
     more = [f"hydra.searchpath=[{','.join(f'file://{Path(d).resolve()}' for d in dirs)}]"] if dirs else []
     with hydra.initialize_config_dir(str(conf), version_base="1.3"):
         with suppress(Exception):
-            return hydra.compose(name, [*more, *(one for one in arguments if "=" in one and one[:1] != "-")])
+            typed = [_first(one) for one in arguments if "=" in one and one[:1] != "-"]
+            return hydra.compose(name, [*more, *typed])
         return hydra.compose(name)
+
+
+def _first(override: str) -> str:
+    """Of an override with several choices, take the first: ``a=x,y`` -> ``a=x``."""
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+
+    parsed = OverridesParser.create().parse_override(override)
+    sweeps = parsed.is_sweep_override()
+    return f"{override.partition('=')[0]}={next(parsed.sweep_string_iterator())}" if sweeps else override
 
 
 def every_key(node, prefix: str = "") -> Iterator[str]:
