@@ -46,6 +46,7 @@ def test_the_page_says_which_of_the_papers_orders_hold(tmp_path):
             part(tmp_path, variant, seed, whole + change[seed], seconds=25.0)
         part(tmp_path, "no_tv", seed, whole - 6, steps=600)
     text, table = page_of(tmp_path)
+    assert rows_of(text.split("## Table 5")[0], "4 min") == [["4 min", "5", "2", "1", "2"]]
     section = text.split("## Table 5")[1].split("## ")[0]
     rows = {name: rows_of(section, name)[0][1:] for name in ("Ours", "w/o total variation", "w/o flow L1")}
     assert rows["Ours"] == [
@@ -125,6 +126,7 @@ def test_scenes_have_sections_of_their_own(tmp_path):
             part(tmp_path, variant, 0, psnr, scene=scene, dataset="hypernerf", made=False)
     text, _ = page_of(tmp_path)
     heads = [line.removeprefix("## ") for line in text.splitlines() if line.startswith("## ")]
+    assert heads.pop(0) == "In short"
     assert heads == ["Table 6: modules: HyperNeRF", "Table 6: modules: hook", "Table 6: modules: rig"]
     printed = {head: rows_of(text.split(f"## {head}\n")[1], "Ours, no inpainter")[0][1:5] for head in heads}
     assert printed[heads[0]] == ["-0.98", "26.50", "+1.50", "one seed"]  # a mean of four scenes

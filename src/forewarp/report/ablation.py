@@ -20,6 +20,7 @@ from forewarp.report.price_list import every_run
 from forewarp.report.tables import Cell, Column, Table
 
 TITLE = "What each part of the paper's method brings"
+ORDERS = ("holds", "within noise", "reversed")
 INTRODUCTION = (
     "Written by `forewarp-report kind=ablation`; `make ablations` makes its runs. Each row of the paper's "
     "tables of ablations takes one thing from its whole method (`Ours`). PSNR (dB) is of test views, mean "
@@ -56,6 +57,7 @@ def write_ablation(runs: Path, out: Path, published: Path = PAPER) -> list[Path]
     if not own:
         raise ValueError(f"{runs}: expected runs of ablations, but got none; make some with make ablations")
     sections = [section for table in tables for section in sections_of(table, own)]
+    sections.insert(0, Section("In short", [in_short(sections)]))
     if lines := [*without, *(f"{run.folder}: another run of the same is newer" for run in older)]:
         sections.append(Section("Left out", facts=lines))
     replace_file(out / "ablation.md", page.markdown(TITLE, INTRODUCTION, sections))
@@ -80,6 +82,22 @@ def sections_of(table: PaperTable, results: Sequence[Result]) -> list[Section]:
                     Section(f"{table.title}: {group.name}{scene}", [parts], facts(used), table.notes)
                 )
     return found
+
+
+def in_short(sections: Sequence[Section]) -> Table:
+    """Count for each budget in how many rows of all tables the paper's order holds, and in how many not."""
+    found: dict[str, list[str]] = {}
+    for table in (table for section in sections for table in section.tables):
+        for i, column in enumerate(table.columns):
+            if column.name == "order":
+                label = table.columns[i - 2].name.removesuffix(": PSNR")
+                found.setdefault(label, []).extend(str(row[i]) for row in table.rows if row[i])
+    rows = [
+        [label, len(orders), *(sum(order.startswith(kind) for order in orders) for kind in ORDERS)]
+        for label, orders in found.items()
+    ]
+    columns = [Column("budget of a run"), Column("rows", 0), *(Column(kind, 0) for kind in ORDERS)]
+    return Table(columns, rows, "Rows of all tables below, by what became of the paper's order:")
 
 
 def changes(table: PaperTable, group: Group, results: Sequence[Result]) -> Table | None:
