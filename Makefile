@@ -53,14 +53,14 @@ install-browser: ## add a headless Chromium and playwright, which test the viewe
 		apt-get install -y -qq --no-install-recommends chromium fonts-dejavu-core >/dev/null; }
 	$(ADD) '.[browser]'
 
-demo: ## fit the procedural vehicle by three methods, two at once, compare, make a video (three to four minutes)
+demo: ## fit the procedural vehicle by three methods, two at once, compare, make a video (about three minutes)
 	@$(MAKE) --no-print-directory -j2 demo-particles demo-forward demo-backward
 	$(BIN)/forewarp-report kind=compare runs=[$(DEMO)/particles,$(DEMO)/forward,$(DEMO)/backward] out=$(DEMO)
 	$(BIN)/forewarp-render run=$(DEMO)/particles path=both
 
 # Kernels of particles compile for half a minute the first time, beside the others' training.
 demo-particles: DEMO_MINUTES := 0.5
-demo-forward demo-backward: DEMO_MINUTES := 0.8
+demo-forward demo-backward: DEMO_MINUTES := 0.6
 demo-particles demo-forward demo-backward: demo-%:
 	$(BIN)/forewarp-train experiment=demo model=$* threads=1 budget.minutes=$(DEMO_MINUTES) run=$(DEMO)/$* $(SAYS)
 
