@@ -17,6 +17,15 @@ def _one_thread():
 
 
 @pytest.fixture
+def two_threads():
+    """Two threads, so that sums are made in more than one chunk."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture
 def forewarp():
     """``forewarp("train", "data.scene=x")`` gives ``status``, ``out`` and ``err``; nothing global remains."""
     return call

@@ -19,7 +19,7 @@ from forewarp.scene.view import Moment
 from tests.contract.fitting import stage_of
 from tests.contract.table import METHODS
 from tests.stability.test_training import FEW, SCENE, Diary, in_other_units, pictured
-from tests.support.tiny_scene import ball_scene, make_run
+from tests.support.tiny_scene import ball_scene, make_run, same
 
 pytestmark = pytest.mark.stability
 
@@ -81,6 +81,20 @@ def test_no_number_depends_on_the_unit_of_length(tmp_path, factor, has_alpha):
     _, plain = fit(tmp_path / "plain", scene, 7)
     _, other = fit(tmp_path / "other", in_other_units(scene, factor), 7)
     assert other == pytest.approx(plain, rel=1e-2)  # squares of the smallest gradients underflow
+
+
+def test_two_threads_train_alike(tmp_path, two_threads):
+    """A short run with all effects and density control, twice on two threads: equal to the bit."""
+    scene, found = ball_scene(size=48), []
+    for folder in ("once", "again"):
+        module, losses = fit(tmp_path / folder, scene, 16, numbers={"every": 0.2})
+        assert torch.get_num_threads() == 2
+        found.append((module, losses))
+    (once, losses), (again, same_losses) = found
+    assert int(once.method.round) >= 2  # particles have been renewed
+    assert losses == same_losses
+    assert len(set(losses)) == 16
+    assert same(once, again)
 
 
 @pytest.mark.slow
