@@ -1,6 +1,9 @@
 """What every test may ask for: the commands in this process, a fitted run, an empty folder."""
 
 import gc
+import os
+
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # as the commands do: a thread that waits works no core
 
 import pytest
 import torch

@@ -85,7 +85,7 @@ def test_no_number_depends_on_the_unit_of_length(tmp_path, factor, has_alpha):
 
 def test_two_threads_train_alike(tmp_path, two_threads):
     """A short run with all effects and density control, twice on two threads: equal to the bit."""
-    scene, found = ball_scene(size=48), []
+    scene, found = ball_scene(frames=6, size=40), []
     for folder in ("once", "again"):
         module, losses = fit(tmp_path / folder, scene, 16, numbers={"every": 0.2})
         assert torch.get_num_threads() == 2
