@@ -1,6 +1,9 @@
 """What every test may ask for: the commands in this process, a fitted run, an empty folder."""
 
 import gc
+import os
+
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # as the commands do: a thread that waits works no core
 
 import pytest
 import torch
@@ -14,6 +17,15 @@ collect_ignore = ["foreign"]  # the package that tests/cli/test_foreign.py impor
 def _one_thread():
     """Compute alike on every machine: sums over several threads differ in their last bits."""
     torch.set_num_threads(1)
+
+
+@pytest.fixture
+def two_threads():
+    """Two threads, so that sums are made in more than one chunk."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    yield
+    torch.set_num_threads(before)
 
 
 @pytest.fixture

@@ -27,12 +27,3 @@ def sparse():
     index = torch.where(present, present.cumsum(0) - 1, -1).to(torch.int32).reshape(SHAPE)
     values = torch.randn(int(present.sum()), 2, generator=generator, dtype=torch.float64)
     return values, index, torch.tensor([-7.0, 0.5], dtype=torch.float64)
-
-
-@pytest.fixture
-def two_threads():
-    """Two threads, so that sums are made in more than one chunk."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(2)
-    yield
-    torch.set_num_threads(before)

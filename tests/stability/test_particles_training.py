@@ -9,17 +9,19 @@ import torch
 
 from forewarp.data.module import SceneDataModule
 from forewarp.fields.curves import Curve
+from forewarp.methods.particles import model
 from forewarp.methods.particles.matter import paths_of
 from forewarp.methods.particles.model import Particles
 from forewarp.methods.particles.nodes import Nodes
 from forewarp.methods.particles.skin import Skin
+from forewarp.methods.particles.start import anywhere
 from forewarp.ops.nodes import pull_nodes
 from forewarp.scene.box import Box
 from forewarp.scene.view import Moment
 from tests.contract.fitting import stage_of
 from tests.contract.table import METHODS
 from tests.stability.test_training import FEW, SCENE, Diary, in_other_units, pictured
-from tests.support.tiny_scene import ball_scene, make_run
+from tests.support.tiny_scene import ball_scene, make_run, same
 
 pytestmark = pytest.mark.stability
 
@@ -33,8 +35,8 @@ def fit(folder, scene, steps, rates=1.0, **changes):
     diary = Diary()
     numbers = ENTRY.numbers | changes.pop("numbers", {})
     lr = {kind: rates * rate for kind, rate in ENTRY.lr.items()}
-    model = partial(Particles, **OPTIONS | changes)
-    stage = stage_of(ENTRY, steps=steps, lr=lr, numbers=numbers, model=model)
+    method = partial(Particles, **OPTIONS | changes)
+    stage = stage_of(ENTRY, steps=steps, lr=lr, numbers=numbers, model=method)
     run = make_run(folder, [stage], data=SceneDataModule(lambda: scene, rays=1), callbacks=[diary])
     return run.fit(), diary.losses
 
@@ -59,18 +61,61 @@ HARD = {
 }
 
 
-@pytest.mark.parametrize("name", HARD)
-def test_hard_scenes_train(tmp_path, name):
-    scene, options = HARD[name]
-    options = {"steps": 8} | options
-    module, losses = fit(tmp_path, scene, **options)
-    assert len(losses) == options["steps"]
+def check_sound(module, losses, scene, steps):
+    """It took all its steps, is made of numbers, and so is what it draws."""
+    assert len(losses) == steps
     assert all(0 <= loss < 1e4 for loss in losses)
     for part, value in module.method.state_dict().items():
         assert not value.is_floating_point() or value.isfinite().all(), part
     assert len(module.method.means) >= 1
     drawn = module.render(scene.test[0].camera, Moment(0.5), torch.ones(3))
     assert all(plane.isfinite().all() for plane in (drawn.rgb, drawn.depth, drawn.opacity))
+
+
+@pytest.mark.parametrize("name", HARD)
+def test_hard_scenes_train(tmp_path, name):
+    scene, options = HARD[name]
+    options = {"steps": 8} | options
+    module, losses = fit(tmp_path, scene, **options)
+    check_sound(module, losses, scene, options["steps"])
+
+
+def coincide(method):
+    """Put all particles at one place, and all nodes."""
+    method.means.data[:] = method.means.data[:1]
+    edges = method.nodes.edges.shape[1]
+    method.nodes.__init__(method.means.data, 6, method.nodes.curve, rests=True, edges=edges)
+    method.skin.__init__(method.nodes, method.means.data)
+
+
+BAD = {
+    "all outside the view": lambda m: m.means.data.add_(90.0),
+    "all at a camera": lambda m: m.means.data.copy_(SCENE.train[0].camera.center.expand_as(m.means)),
+    "opacity 0": lambda m: m.opacity.data.fill_(-1e4),
+    "opacity 1": lambda m: m.opacity.data.fill_(1e4),
+    "all faded, so that none would be left": lambda m: m.opacity.data.fill_(-5.0),
+    "all faded but one": lambda m: m.opacity.data[1:].fill_(-5.0),
+    "quaternions of length 0": lambda m: m.turns.data.zero_(),
+    "scales of 0": lambda m: m.log_scales.data.fill_(-1e4),
+    "scales of e^40": lambda m: m.log_scales.data.fill_(40.0),
+    "nodes that coincide": coincide,
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_beginnings_train(tmp_path, monkeypatch, name):
+    """As a step too long may have left it; density control and new links come in between."""
+    made = Particles.__init__
+
+    def spoiled(self, start, **options):
+        made(self, start, **options)
+        BAD[name](self)
+
+    monkeypatch.setattr(Particles, "__init__", spoiled)
+    monkeypatch.setattr(model, "first_points", lambda start, count: anywhere(start.scene.box, count))
+    module, losses = fit(tmp_path, SCENE, 10, numbers={"every": 0.2, "relink": 1})
+    assert int(module.method.round) >= 2
+    check_sound(module, losses, SCENE, 10)
 
 
 @pytest.mark.parametrize(("factor", "has_alpha"), [(1e-3, True), (2.0**20, False)])
@@ -81,6 +126,20 @@ def test_no_number_depends_on_the_unit_of_length(tmp_path, factor, has_alpha):
     _, plain = fit(tmp_path / "plain", scene, 7)
     _, other = fit(tmp_path / "other", in_other_units(scene, factor), 7)
     assert other == pytest.approx(plain, rel=1e-2)  # squares of the smallest gradients underflow
+
+
+def test_two_threads_train_alike(tmp_path, two_threads):
+    """A short run with all effects and density control, twice on two threads: equal to the bit."""
+    scene, found = ball_scene(frames=6, size=40), []
+    for folder in ("once", "again"):
+        module, losses = fit(tmp_path / folder, scene, 16, numbers={"every": 0.2})
+        assert torch.get_num_threads() == 2
+        found.append((module, losses))
+    (once, losses), (again, same_losses) = found
+    assert int(once.method.round) >= 2  # particles have been renewed
+    assert losses == same_losses
+    assert len(set(losses)) == 16
+    assert same(once, again)
 
 
 @pytest.mark.slow
@@ -117,6 +176,7 @@ def test_nodes_that_coincide(turns, count):
         nodes = Nodes(points, 6, Curve("spline", 5, 9, 0.25), turns=turns, rests=True)
         for value in filter(lambda v: v is not None, (nodes.shift, nodes.turn)):
             value.data = torch.randn(value.shape, generator=torch.Generator().manual_seed(0))
+        assert bool(nodes.edge_weights.any()) == (apart > 0 and len(nodes) > 1)
         links, shares = nodes.links(points + 0.1)
         torch.testing.assert_close(shares.sum(-1), torch.ones(count))
         assert int(links.max()) < len(nodes)

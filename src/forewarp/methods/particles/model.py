@@ -226,7 +226,7 @@ class Particles(Method):
         own, warp = {}, None
         if self.nodes is not None:
             self.nodes.look_ahead(time, time)
-            basis = self.nodes.curve(time)
+            basis = self.nodes.curve(time).to(self.means)
             motion, maps = self.nodes.carried(basis)
             warp = Warp(maps, self.skin.links, self.skin.weights())
         found = compare(

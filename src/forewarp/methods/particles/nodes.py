@@ -12,6 +12,7 @@ from forewarp.ops.nodes import carry_nodes, spread_nodes
 from forewarp.scene.cloud import far_apart
 
 LINKS = 6  # nodes that a particle follows
+_LEAST = 1e-20  # squared distance; what is nearer together coincides, and cannot be strained
 _DAMP = 0.5  # of a curve's last stride, where it is continued to times not yet seen
 _FULL = 0.05  # share of a spline's basis at a time, from which on its knot counts as seen
 
@@ -68,11 +69,13 @@ class Nodes(nn.Module):
         self.register_buffer("places", places)
         away, beside = nearest(places, places, edges + 1)
         away, beside = away[:, 1:], beside[:, 1:]  # the nearest is the node itself
-        unit = away.mean().clamp(min=1e-20) if away.numel() else torch.tensor(1.0)
+        unit = away.mean() if away.numel() else torch.tensor(1.0)
+        apart = away + 1e-3 * unit
+        tight = (apart > _LEAST) / apart.clamp(min=_LEAST)
         self.register_buffer("edges", beside.contiguous())
-        self.register_buffer("edge_weights", 1 / (away + 1e-3 * unit) / max(beside.numel(), 1))
+        self.register_buffer("edge_weights", tight / max(beside.numel(), 1))
         near = away[:, :3].sqrt().mean(-1) if away.shape[1] else torch.ones(len(places))
-        self.register_buffer("spread", near.clamp(min=1e-6 * float(unit) ** 0.5))
+        self.register_buffer("spread", near.clamp(min=1e-6 * max(float(unit), _LEAST) ** 0.5))
         self.shift = nn.Parameter(torch.zeros(len(places), curve.count, 3))
         self.turn = nn.Parameter(torch.zeros(len(places), curve.count, 3)) if turns else None
         self.register_buffer("seen", torch.tensor([curve.canonical_time] * 2))
