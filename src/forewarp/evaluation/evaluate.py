@@ -22,7 +22,7 @@ from forewarp.metrics.suite import ImageSuite, summarise
 from forewarp.scene.batch import Target
 from forewarp.scene.frame import Scene, spread
 from forewarp.scene.view import Rendering
-from forewarp.training.device import device_name, versions
+from forewarp.training.device import commit, device_name, versions
 from forewarp.training.module import DynamicSceneModule
 
 _SHEET_SIDE = 300  # least pixels of the shorter side of a picture on a sheet
@@ -246,4 +246,5 @@ def _protocol(module: DynamicSceneModule, scene: Scene, per_image: list[dict], p
         "device": device_name(module.device),
         "threads": torch.get_num_threads(),
         "versions": versions(),
+        **({"commit": code} if (code := commit()) else {}),
     }

@@ -149,14 +149,14 @@ def made_when(rows: Sequence[dict]) -> str | None:
     """Say of which versions of the code the columns of a table are, where these are several."""
     found: dict[float, set[str]] = {}
     for row in rows:
-        day = row["day"] or "a day unknown"
-        found.setdefault(row["minutes"], set()).add(f"{day} ({row['commit']})" if row["commit"] else day)
+        made = f"commit {row['commit']}" if row["commit"] else row["day"] or "a day unknown"
+        found.setdefault(row["minutes"], set()).add(made)
     if len(set.union(set(), *found.values())) < 2:
         return None
     told = [f"{minutes:g} min of {', '.join(sorted(found[minutes]))}" for minutes in sorted(found)]
     return (
-        "Not all runs are of one version of the code: a difference between them may be of the code. By day "
-        f"(and commit, where noted): {'; '.join(told)}.\n"
+        "Not all runs are of one version of the code: a difference between them may be of the code. By "
+        f"commit where it was noted, else by day: {'; '.join(told)}.\n"
     )
 
 
