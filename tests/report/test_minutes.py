@@ -145,6 +145,7 @@ def test_more_minutes_and_more_particles_hold_or_fall(tmp_path):
     assert rows_of(text, "ball")[0] == ["ball", "30.00", "31.00", "30.70"]  # of the preset's density alone
     told = [row[-1] for row in rows_of(section(text, "More minutes"), "ball")]
     assert told == ["", "holds (+1.00 dB)", "falls by 0.30 dB"]
+    assert [row[1] for row in rows_of(section(text, "Each"), "ball")] == ["1", "5", "20"]
     found = rows_of(section(text, "More particles"), "ball")
     assert [(row[3], row[4], row[5]) for row in found] == [
         ("45", "6000", "29.90"),

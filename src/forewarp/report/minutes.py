@@ -137,7 +137,7 @@ def _each(rows: Sequence[dict]) -> Table:
     for group in alike(rows):
         means = [_mean(group, name) for name in ("ends", "size")]
         scores = [estimate(group, name) for name in ("psnr", "ssim", "lpips")]
-        lines.append([group[0]["label"], group[0]["minutes"], len(group), *scores, *means])
+        lines.append([group[0]["label"], f"{group[0]['minutes']:g}", len(group), *scores, *means])
     return Table(columns, lines)
 
 
@@ -153,7 +153,7 @@ def _costs(rows: Sequence[dict]) -> Table:
         step = _mean(group, "step")
         means = [_mean(group, name) for name in ("processor", "wall", "steps")]
         means += [step and 1000 * step, *(_mean(group, name) for name in ("frame", "parameters", "memory"))]
-        lines.append([group[0]["label"], group[0]["minutes"], *means])
+        lines.append([group[0]["label"], f"{group[0]['minutes']:g}", *means])
     return Table([Column("scene"), Column("minutes", 0), *COSTS], lines)
 
 

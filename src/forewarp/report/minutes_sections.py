@@ -113,7 +113,7 @@ def beside(method: str, rows: Sequence[dict], others: Sequence[dict]) -> list[st
                 verdicts = [above(group, rival, name) for name in ("psnr", "ssim", "lpips")]
                 seeds = f"{len(group)} and {len(rival)}"
                 both = [estimate(one, "psnr") for one in (group, rival)]
-                lines.append([group[0]["label"], group[0]["minutes"], seeds, *both, *verdicts])
+                lines.append([group[0]["label"], f"{group[0]['minutes']:g}", seeds, *both, *verdicts])
         columns = [Column("scene"), Column("minutes", 0), Column("seeds"), Column(f"`{method}`")]
         columns += [Column(f"`{other}`"), Column("PSNR"), Column("SSIM"), Column("LPIPS")]
         about = (
@@ -133,7 +133,7 @@ def abilities(rows: Sequence[dict]) -> list[str]:
     for group in alike(known):
         found = [estimate(group, name) for name in names]
         error = found[-1] and Estimate(*(v and 100 * v for v in (found[-1].mean, found[-1].deviation)))
-        about = [group[0]["label"], group[0]["minutes"], f"`{group[0]['method']}`", len(group)]
+        about = [group[0]["label"], f"{group[0]['minutes']:g}", f"`{group[0]['method']}`", len(group)]
         lines.append([*about, *found[:-1], error])
     columns = [Column("scene"), Column("minutes", 0), Column("method"), Column("seeds", 0)]
     columns += [*(Column(one) for one in ABILITIES), Column("moving points (%)", 1)]
@@ -233,7 +233,7 @@ def _begins() -> list[Column]:
 
 
 def _begin(group: Group) -> list[Cell]:
-    return [group[0]["label"], group[0]["minutes"], len(group)]
+    return [group[0]["label"], f"{group[0]['minutes']:g}", len(group)]
 
 
 def _scores(group: Group) -> list[Cell]:
