@@ -70,11 +70,25 @@ def test_processor_time_leaves_out_waiting(monkeypatch):
 
 
 def test_goes_on_from_a_saved_state(clock):
-    clock.load_state_dict({"seconds": 40.0})
+    clock.load_state_dict({"seconds": 40.0})  # of a version that kept one clock
     assert clock.seconds == 40
     clock.start()
     clock.now = 2.0
-    assert clock.state_dict() == {"seconds": 42.0}
+    assert clock.state_dict() == {"seconds": 42.0, "every": {"wall": 42.0}}
+    again = Clock("wall")
+    again.load_state_dict({"seconds": 42.0, "every": {"wall": 42.0, "processor": 30.0}})
+    assert again.every == {"wall": 42.0, "processor": 30.0}
+
+
+def test_the_other_clock_is_read_too(clock, monkeypatch):
+    monkeypatch.setattr(module.time, "process_time", lambda: 0.5 * clock.now)
+    with clock.running():
+        clock.now = 6.0
+        with clock.paused():
+            clock.now = 8.0
+        with left_out():
+            clock.now = 9.0
+    assert clock.every == {"wall": 6.0, "processor": 3.0}
 
 
 def test_waits_for_a_gpu_where_it_starts_and_stops_only(clock, monkeypatch):

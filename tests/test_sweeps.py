@@ -194,3 +194,19 @@ def test_the_voxel_networks_come_with_the_fine_stage(preset):
     networks = {"upsampler", "inpainter"}
     assert networks.isdisjoint(stage.coarse.effects)
     assert networks <= set(stage.fine.effects)
+
+
+def test_jobs_of_minutes_have_folders_of_their_own():
+    scenes = {word for job in jobs_of("minutes") for word in job if word.startswith("scene=")}
+    assert "scene=hypernerf_moving_hand" in scenes
+    assert len(scenes) == len(jobs_of("minutes")) == 7
+    changes = [[], ["seed=1"], ["budget.minutes=5"], ["model=forward"], ["stage.fine.density=45"]]
+    changes += [["data.root=elsewhere"], ["data.half_resolution=false"]]
+    jobs = [job_of("minutes", "scene=dnerf_hook", "budget.minutes=1", *words) for words in changes]
+    folders = [hashed(job).run for job in jobs]
+    assert len(set(folders)) == len(folders)
+    assert folders[0].startswith("runs/minutes/hook/particles-1min-seed0-")
+    for dataset in ("dnerf", "hypernerf", "nhr", "lego_complete"):
+        for model in ("particles", "forward"):
+            job = job_of("minutes", f"scene=counterpart_{dataset}", f"model={model}", "budget.minutes=1")
+            assert (job.budget.clock, job.threads, job.budget.minutes) == ("processor", 1, 1)

@@ -48,24 +48,29 @@ class Clock:
         if kind not in KINDS:
             raise ValueError(f"budget.clock: expected {' or '.join(KINDS)}, but got {kind!r}")
         self.kind = kind
-        self._done = 0.0
-        self._since: float | None = None
+        self._done = dict.fromkeys(KINDS, 0.0)
+        self._since: dict[str, float] | None = None
 
     @property
     def seconds(self) -> float:
         """Training seconds so far; reading it never waits for a GPU."""
-        return self._done if self._since is None else self._done + self._counted() - self._since
+        return self._of(self.kind)
+
+    @property
+    def every(self) -> dict[str, float]:
+        """The same seconds by every kind of clock that was read from the start."""
+        return {kind: self._of(kind) for kind in self._done}
 
     def start(self) -> None:
         """Start counting."""
         now(self.kind)
-        self._since = self._counted()
+        self._since = {kind: _counted(kind) for kind in KINDS}
 
     def stop(self) -> None:
         """Stop counting."""
         if self._since is not None:
             now(self.kind)
-            self._done, self._since = self.seconds, None
+            self._done, self._since = self.every, None
 
     @contextmanager
     def paused(self) -> Iterator[None]:
@@ -89,11 +94,16 @@ class Clock:
 
     def state_dict(self) -> dict:
         """Return the seconds so far."""
-        return {"seconds": self.seconds}
+        return {"seconds": self.seconds, "every": self.every}
 
     def load_state_dict(self, state: dict) -> None:
         """Continue from a ``state_dict``."""
-        self._done, self._since = float(state["seconds"]), None
+        known = {kind: float(seconds) for kind, seconds in state.get("every", {}).items() if kind in KINDS}
+        self._done, self._since = known | {self.kind: float(state["seconds"])}, None
 
-    def _counted(self) -> float:
-        return KINDS[self.kind]() - _left_out[self.kind]
+    def _of(self, kind: str) -> float:
+        return self._done[kind] + (0.0 if self._since is None else _counted(kind) - self._since[kind])
+
+
+def _counted(kind: str) -> float:
+    return KINDS[kind]() - _left_out[kind]

@@ -88,6 +88,9 @@ def test_evaluating_twice_gives_the_same_numbers(ok, fitted, copied, scenes, tmp
     done = ok("evaluate", f"run={copied}", f"data.root={moved}")
     assert "canonical" in done.out
     assert numbers(copied) == numbers(fitted)
+    ok("evaluate", f"run={copied}", f"data.root={moved}", "reduce=2")
+    assert json.loads((copied / "metrics.json").read_text())["protocol"]["reduced"] == 2
+    assert numbers(copied) != numbers(fitted)
 
 
 def test_the_same_command_again_trains_nothing(ok, fitted, scenes, monkeypatch):
@@ -176,10 +179,18 @@ def test_a_full_disk_names_the_file_and_leaves_no_half(refused, scenes, in_tmp, 
     assert [path.name for path in Path("run/coarse").iterdir() if "ckpt" in path.name] == []
 
 
-@pytest.mark.parametrize(("word", "least"), [("views=0", 1), ("views=all", 1), ("sheets=-1", 0)])
+@pytest.mark.parametrize(
+    ("word", "least"), [("views=0", 1), ("views=all", 1), ("sheets=-1", 0), ("reduce=1", 2)]
+)
 def test_numbers_of_views_are_checked_before_training(refused, scenes, in_tmp, word, least):
     line = refused(*arguments(scenes, "run", word))
     assert f"expected a whole number of at least {least}, but got {word.split('=')[1]}" in line
+
+
+def test_pictures_that_cannot_be_reduced_are_refused_before_training(refused, scenes, in_tmp):
+    line = refused(*arguments(scenes, "run", "reduce=7"))
+    assert line.startswith("reduce: expected pictures with sides that 7 divides, but got ")
+    assert not Path("run").exists()
 
 
 def test_settings_of_a_failed_start_do_not_bind(refused, ok, scenes, in_tmp):

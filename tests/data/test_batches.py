@@ -8,13 +8,14 @@ import torch
 
 from forewarp.data.batches import Sampler, Targets, color_of
 from forewarp.data.dnerf import read_scene
-from forewarp.data.images import composited
+from forewarp.data.images import MaskedImage, composited
+from forewarp.data.module import DNeRFDataModule
 from forewarp.scene.batch import Asks
 from forewarp.scene.errors import SceneError
 from forewarp.scene.frame import Frame, Scene
 from forewarp.scene.rays import joined
 from forewarp.scene.view import Moment
-from tests.support.dnerf_scene import write_tiny
+from tests.support.dnerf_scene import real, shots, write_tiny
 
 
 @pytest.fixture
@@ -252,3 +253,33 @@ def test_batches_repeat_and_continue_exactly(scene, options):
     assert not torch.equal(colours(other), first)
     other.load_state_dict(state)
     assert torch.equal(colours(other), expected)
+
+
+@pytest.mark.parametrize("depth", [False, True])
+def test_reduced_truth_is_what_half_resolution_loads(tmp_path, depth):
+    splits = {"test": shots(3, 2, (6, 8), depth=depth)}
+    write_tiny(tmp_path / "toy", **splits)
+    whole, half = (DNeRFDataModule(tmp_path, "toy", half_resolution=halve) for halve in (False, True))
+    pairs = list(zip(whole.targets("test").reduced(2), half.targets("test"), strict=True))
+    for target, loaded in pairs:
+        assert torch.equal(target.rgb, loaded.rgb)
+        assert torch.equal(target.foreground, loaded.foreground)
+        assert target.depth is None if not depth else torch.equal(target.depth, loaded.depth)
+        assert (target.view.shape, loaded.view.shape) == ((6, 8), (3, 4))  # rendered whole
+
+
+def test_the_real_scene_of_800_pixels_reduced_is_that_of_400():
+    wide, small = real("dnerf_800"), real("dnerf")
+    whole = DNeRFDataModule(wide, "hellwarrior", half_resolution=False).targets("test").reduced(2)
+    assert torch.equal(whole[7].rgb, DNeRFDataModule(wide, "hellwarrior").targets("test")[7].rgb)
+    published = DNeRFDataModule(small, "hellwarrior").targets("test")[7].rgb
+    assert float((whole[7].rgb - published).abs().max()) <= 1 / 255
+
+
+def test_what_cannot_be_reduced(tmp_path):
+    targets = DNeRFDataModule(write_tiny(tmp_path / "toy").parent, "toy").targets("test")
+    with pytest.raises(SceneError, match="reduce: expected pictures with sides that 4 divides, but got 8"):
+        targets.reduced(4)
+    frame = replace(targets.frames[0], load=MaskedImage(tmp_path, tmp_path, (8, 6)))
+    with pytest.raises(SceneError, match="reduce: expected whole pictures, but got test/r_0 cut out"):
+        Targets([frame], targets.background, has_alpha=True).reduced(2)

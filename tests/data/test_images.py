@@ -10,12 +10,11 @@ from forewarp.data.images import (
     CachedImage,
     MaskedImage,
     composited,
-    halved,
     halved_cutout,
-    halved_depth,
     inspect_image,
     read_gray16,
     read_image,
+    reduced,
     write_jpeg,
     write_png,
 )
@@ -36,9 +35,9 @@ def test_composition_by_hand():
 def test_halving_is_the_rounded_mean_of_straight_values():
     rgba = torch.randint(0, 256, (6, 10, 4), dtype=torch.uint8)
     mean = rgba.double().reshape(3, 2, 5, 2, 4).mean((1, 3))
-    assert torch.equal(halved(rgba), mean.round().to(torch.uint8))  # half to even, as torch rounds
-    depth = torch.tensor([[2.0, 0.0, 0.0, 0.0], [4.0, 0.0, 0.0, 0.0]])
-    assert torch.equal(halved_depth(depth), torch.tensor([[3.0, 0.0]]))  # of the foreground
+    assert torch.equal(reduced(rgba), mean.round().to(torch.uint8))  # half to even, as torch rounds
+    mean = rgba[:, :9].double().reshape(2, 3, 3, 3, 4).mean((1, 3))
+    assert torch.equal(reduced(rgba[:, :9], 3), mean.round().to(torch.uint8))
     block = torch.tensor([[[10, 20, 30, 255], [0] * 4], [[20, 40, 61, 255], [0] * 4]], dtype=torch.uint8)
     assert halved_cutout(block).tolist() == [[[15, 30, 46, 128]]]
     assert halved_cutout(torch.zeros(3, 5, 4, dtype=torch.uint8)).tolist() == [[[0] * 4] * 2]

@@ -1,6 +1,7 @@
 import gc
 import os
 import platform
+import re
 import resource
 import sys
 from pathlib import Path
@@ -64,3 +65,10 @@ def test_a_machine_is_called_by_its_processor(lines, name, monkeypatch, tmp_path
     if lines is not None:
         (tmp_path / "cpuinfo").write_text(lines)
     assert device.device_name(torch.device("cpu")) == name
+
+
+def test_the_commit_of_the_code_is_known_in_its_checkout_alone(monkeypatch, tmp_path):
+    found = device.commit.__wrapped__()
+    assert found is None or re.fullmatch(r"[0-9a-f]{9,}\+?", found)
+    monkeypatch.setattr(device, "__file__", str(tmp_path / "training" / "device.py"))
+    assert device.commit.__wrapped__() is None

@@ -24,8 +24,8 @@ READERS = {
 VOXELS, PARTICLES = "forewarp.methods.voxel.", "forewarp.methods.particles."
 
 # The least whole number, whether null is one too, and the range of a number.
-LEAST = {"frames": 2, "view": 0, "points": 1, "size": 16, "views": 1, "sheets": 0}
-MAY_BE_NULL = ("size", "views")
+LEAST = {"frames": 2, "view": 0, "points": 1, "size": 16, "views": 1, "sheets": 0, "reduce": 2}
+MAY_BE_NULL = ("size", "views", "reduce")
 RANGES = {"fps": (0.1, 1000), "time": (0, 1), "tail": (0.01, 1)}
 
 
@@ -35,7 +35,7 @@ def refuse_all(config: DictConfig) -> None:
     refuse_seeds(config)
     refuse_two_models(config)
     refuse_other_methods(config)
-    refuse_numbers(config, "views", "sheets")
+    refuse_numbers(config, "views", "sheets", "reduce")
 
 
 def refuse_renamed_keys(config: DictConfig) -> None:

@@ -18,6 +18,7 @@ What one types most:
   data.root=FOLDER         where the data are now, if they moved
   lpips_weights=FILE       a backbone's weights, or a folder of them, for LPIPS
   views=N                  measure N test views, evenly spread, in place of all
+  reduce=2                 average 2 x 2 pixels of each view and of its truth, then score
   sheets=N                 how many pictures of truth | prediction | error
   threads=N trainer=cpu    threads and device to compute with
 """
@@ -27,9 +28,9 @@ def evaluate(config) -> None:
     """Load a run and measure it."""
     from forewarp.runs.config import saved_config
 
-    refuse_numbers(config, "views", "sheets")
+    refuse_numbers(config, "views", "sheets", "reduce")
     saved = saved_config(config.run, config)
-    saved.views = config.views  # not those of the run: null is all
+    saved.views, saved.reduce = config.views, config.reduce  # not those of the run: null is all, and whole
     # These load torch; mistakes have been answered before.
     from forewarp.runs.build import build_run, measure_run
     from forewarp.runs.data_check import warn_if_changed

@@ -38,6 +38,7 @@ What one types most (options such as --multirun or --config-dir=FOLDER come firs
   viewer=true                         show the run on a page while it trains: see forewarp-view
   evaluate=false                      do not measure at the end
   views=N                             measure N test views, evenly spread, in place of all
+  reduce=2                            average 2 x 2 pixels of each test view and of its truth, then score
   data.held_out=N                     hold N training views out and record their PSNR against training time
   scene=DATASET_NAME                  a scene of the paper below paths.scenes=FOLDER, such as scene=dnerf_hook
   ablation=NAME                       an ablation of the paper; ablation=full is its whole method
@@ -91,6 +92,8 @@ def train(config) -> float | None:
             print(f"measured before: {run.folder}; again with forewarp-evaluate run={run.folder}")
             return Score(run, config).of()
     run.datamodule.setup("fit")  # before the folder is made: a mistyped scene leaves nothing behind
+    if config.evaluate and config.get("reduce") is not None:
+        run.datamodule.targets("test").reduced(config.reduce)  # refused now, not when all is trained
     score = Score(run, config)
     with watched(run, viewer), locked(run.folder):
         claim(config)

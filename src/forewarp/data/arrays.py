@@ -14,8 +14,9 @@ from torch import Tensor
 
 from forewarp.data.files import numbers_of, read_bytes
 from forewarp.data.geometry import MOST_UNITS
-from forewarp.data.images import halved_depth, read_gray16
+from forewarp.data.images import read_gray16
 from forewarp.files import MOST_ARRAYS, MOST_POINTS, written_whole
+from forewarp.ops.blocks import reduced_depth
 from forewarp.scene.errors import SceneError
 from forewarp.scene.frame import Truth
 
@@ -50,7 +51,7 @@ class StoredDepth:
         if not np.isfinite(depth).all() or (depth < 0).any():
             raise SceneError(f"{expected}, but got values from {depth.min()} to {depth.max()}")
         tensor = torch.from_numpy(depth)
-        return halved_depth(tensor) if self.halve else tensor
+        return reduced_depth(tensor) if self.halve else tensor
 
 
 def read_truth(path: Path, canonical_time: float) -> Truth | None:

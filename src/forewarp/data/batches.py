@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 from torch.utils.data import IterableDataset
 
-from forewarp.data.images import composited
+from forewarp.data.images import MaskedImage, composited, reduced
+from forewarp.ops.blocks import reduced_depth
 from forewarp.scene.batch import Asks, Batch, Observation, Target
 from forewarp.scene.errors import SceneError
 from forewarp.scene.frame import Frame, Scene
@@ -186,13 +187,44 @@ class Sampler(IterableDataset):
 
 
 class Targets(Sequence[Target]):
-    """The frames as whole images over a constant background; decoded at the first use."""
+    """The frames as whole images over a constant background; decoded at the first use.
+
+    ``by`` above 1 averages blocks of so many pixels a side: see ``reduced``.
+    """
 
     def __init__(
-        self, frames: Sequence[Frame], background: Tensor, has_alpha: bool, *, trained: bool = False
+        self,
+        frames: Sequence[Frame],
+        background: Tensor,
+        has_alpha: bool,
+        *,
+        trained: bool = False,
+        by: int = 1,
     ) -> None:
         self.frames, self.background, self.has_alpha = frames, background, has_alpha
         self.trained = trained  # ``frames`` are all training frames in order: a target's place is its index
+        self.by = by  # pictures are this many times smaller than their frame's camera
+
+    def reduced(self, by: int) -> Targets:
+        """The same views, true pictures averaged over ``by`` x ``by`` pixels as ``data.half_resolution`` of
+        D-NeRF does; a target's view keeps its camera.
+
+        Raises:
+            SceneError: where ``by`` does not divide a picture's sides, or a mask cuts a picture out.
+        """
+        for frame in self.frames:
+            width, height = frame.camera.width, frame.camera.height
+            if width % by or height % by:
+                raise SceneError(
+                    f"reduce: expected pictures with sides that {by} divides, but got {width} x {height} "
+                    f"pixels of {frame.name}; set another number, or leave reduce out"
+                )
+            if isinstance(frame.load, MaskedImage):
+                raise SceneError(
+                    f"reduce: expected whole pictures, but got {frame.name} cut out by a mask, whose outline "
+                    "is averaged in another way; use data.half_resolution, or leave reduce out"
+                )
+        return Targets(self.frames, self.background, self.has_alpha, trained=self.trained, by=by)
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -201,6 +233,8 @@ class Targets(Sequence[Target]):
         frame = self.frames[index]
         rgba = pixels_of(frame)
         depth = frame.load_depth() if frame.load_depth else None
+        if self.by > 1:
+            rgba, depth = reduced(rgba, self.by), None if depth is None else reduced_depth(depth, self.by)
         foreground = None if depth is None else depth > 0
         if self.has_alpha:
             foreground = rgba[..., 3] > 127  # at least half covered

@@ -1,4 +1,4 @@
-"""Read, check and write images; halve them and lay them over a background."""
+"""Read, check and write images; reduce them and lay them over a background."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from torch import Tensor
 from forewarp.data.cache import CACHE
 from forewarp.data.files import opened
 from forewarp.files import MOST_IMAGE, written_whole
+from forewarp.ops.blocks import block_means, block_sums
 from forewarp.scene.errors import SceneError
 
 _FORMATS = ("PNG", "JPEG")
@@ -105,25 +106,16 @@ def write_jpeg(path: Path, pixels: Tensor | np.ndarray, quality: int = 97) -> No
         Image.fromarray(pixels).save(beside, "JPEG", quality=quality, subsampling=0)
 
 
-def halved(rgba: Tensor) -> Tensor:
-    """Average each 2 x 2 block of *straight* RGBA, uint8 (H, W, 4) -> (H/2, W/2, 4), rounded.
+def reduced(rgba: Tensor, by: int = 2) -> Tensor:
+    """Average each block of ``by`` x ``by`` pixels of *straight* RGBA, uint8 (H, W, 4) -> (H/by, W/by, 4).
 
-    Averaging before the alpha is applied darkens silhouettes a little; the published numbers do so.
+    Averaging before the alpha is applied darkens silhouettes a little; the published numbers do so. Rounded
+    half to even: exactly what the released half-size copies hold.
 
-    >>> halved(torch.tensor([[[1], [2]], [[3], [5]]], dtype=torch.uint8)).item()
+    >>> reduced(torch.tensor([[[1], [2]], [[3], [5]]], dtype=torch.uint8)).item()
     3
     """
-    blocks = rgba.to(torch.int16)
-    total = blocks[0::2, 0::2] + blocks[0::2, 1::2] + blocks[1::2, 0::2] + blocks[1::2, 1::2]
-    # total / 4 rounded half to even, in integers: exactly what the released half-size copies hold
-    return ((total + 1 + ((total >> 2) & 1)) >> 2).to(torch.uint8)
-
-
-def halved_depth(depth: Tensor) -> Tensor:
-    """Average the foreground (> 0) of each 2 x 2 block, (H, W) -> (H/2, W/2); 0 where there is none."""
-    h, w = depth.shape
-    blocks = depth.reshape(h // 2, 2, w // 2, 2)
-    return blocks.sum((1, 3)) / (blocks > 0).sum((1, 3)).clamp(min=1)
+    return block_means(rgba.int(), by).round().to(torch.uint8)
 
 
 def halved_cutout(rgba: Tensor) -> Tensor:
@@ -139,10 +131,10 @@ def halved_cutout(rgba: Tensor) -> Tensor:
     """
     height, width = (n // 2 * 2 for n in rgba.shape[:2])
     rgba = rgba[:height, :width]
-    blocks = rgba[..., :3].reshape(height // 2, 2, width // 2, 2, 3).int().sum((1, 3))
-    count = (rgba[..., 3] > 0).reshape(height // 2, 2, width // 2, 2).sum((1, 3))[..., None].clamp(min=1)
-    color = torch.div(blocks + count // 2, count, rounding_mode="floor").to(torch.uint8)
-    return torch.cat([color, halved(rgba[..., 3:])], -1)
+    sums = block_sums(rgba[..., :3].int())
+    count = block_sums((rgba[..., 3] > 0).int())[..., None].clamp(min=1)
+    color = torch.div(sums + count // 2, count, rounding_mode="floor").to(torch.uint8)
+    return torch.cat([color, reduced(rgba[..., 3:])], -1)
 
 
 def composited(rgba: Tensor, background: Tensor) -> Tensor:
@@ -166,7 +158,7 @@ class CachedImage:
 
     def _decode(self) -> Tensor:
         pixels = read_sized(self.path, self.size)
-        return halved(pixels) if self.halve else pixels
+        return reduced(pixels) if self.halve else pixels
 
 
 class MaskedImage:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -12,6 +12,7 @@ from torch import Tensor
 from forewarp.clock import now
 from forewarp.drawing.colors import at_least, error_colors, in_a_row
 from forewarp.drawing.files import write_png
+from forewarp.evaluation.reduce import reduced_rendering
 from forewarp.files import write_json
 from forewarp.methods.abilities import HasTrajectories
 from forewarp.methods.effect import switched
@@ -21,7 +22,7 @@ from forewarp.metrics.suite import ImageSuite, summarise
 from forewarp.scene.batch import Target
 from forewarp.scene.frame import Scene, spread
 from forewarp.scene.view import Rendering
-from forewarp.training.device import device_name, versions
+from forewarp.training.device import commit, device_name, versions
 from forewarp.training.module import DynamicSceneModule
 
 _SHEET_SIDE = 300  # least pixels of the shorter side of a picture on a sheet
@@ -82,6 +83,7 @@ def evaluate(
     finished: Mapping[str, Mapping] | None = None,
     sheets: int = 6,
     views: int | None = None,
+    reduce: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict:
     """Measure a fitted scene on its test views; all numbers but the seconds are reproducible.
@@ -98,16 +100,19 @@ def evaluate(
         finished: the ``done.json`` of each stage (``Run.finished``).
         sheets: number of sheets to write, spread over the views.
         views: most test views to measure, evenly spread; None: all.
+        reduce: average so many pixels a side of each view and of the truth, then score; None: as they are.
         progress: called with (images done, all images) after each image.
 
     Returns:
         the content of ``metrics.json``.
     """
     scene, targets, finished = datamodule.scene, datamodule.targets("test"), finished or {}
+    targets = targets if reduce is None else targets.reduced(reduce)
     chosen = middles(len(targets), views)
     on_sheets = {chosen[i] for i in spread(len(chosen), sheets)}
     rows: dict[int, dict] = {}
     for shown in draw(module, targets, chosen):
+        shown = shown if reduce is None else _reduced(shown, reduce, scene.has_alpha)
         rows[shown.number] = _score(shown, suite)
         _save(shown, Path(folder) / "images", shown.number in on_sheets)
         if progress is not None:
@@ -120,12 +125,16 @@ def evaluate(
     if len(chosen) < len(targets):
         measured = f"{len(chosen)} of {len(targets)} test views, evenly spread"
         protocol = {**(protocol or {}), "measured": measured}
+    if reduce is not None:
+        protocol = {**(protocol or {}), "reduced": reduce}
     metrics = {
         "protocol": _protocol(module, scene, per_image, protocol or {}),
         "seconds": _seconds(per_image, finished),
+        "clocks": _clocks(finished),
         "steps": {name: int(noted["steps"]) for name, noted in finished.items()},
         "peak_memory_bytes": max((int(s["peak_memory_bytes"]) for s in finished.values()), default=None),
         "parameters": parameter_count(module.method),
+        "size": dict([module.method.size]),
         "effects": switched(module.method),
         **_means(per_image),
     }
@@ -162,6 +171,16 @@ def flow_error(module: DynamicSceneModule, scene: Scene) -> dict | None:
         return None
     points, times = truth.points[:, 0].to(module.device), truth.times.float().to(module.device)
     return end_point_error(module.method.trajectories(points, times), truth.points)
+
+
+def _reduced(shown: Shown, by: int, straight: bool) -> Shown:
+    """Average blocks of pixels of all renderings; the target is as small already."""
+    behind, shape = shown.target.background, shown.target.view.shape
+    smaller = {
+        name: reduced_rendering(one, shape, by, behind.to(one.rgb), straight=straight)
+        for name, one in shown.renderings.items()
+    }
+    return replace(shown, renderings=smaller)
 
 
 def _image(rendering: Rendering, target: Target) -> Tensor:
@@ -208,6 +227,13 @@ def _seconds(per_image: list[dict], finished: Mapping[str, Mapping]) -> dict[str
     return {"train": sum(stages.values()), **stages, **frames}
 
 
+def _clocks(finished: Mapping[str, Mapping]) -> dict[str, float]:
+    """Return the seconds of training by each clock that all stages were counted by."""
+    counted = [noted.get("clocks", {}) for noted in finished.values()]
+    shared = set.intersection(*map(set, counted)) if counted else set()
+    return {kind: sum(float(one[kind]) for one in counted) for kind in sorted(shared)}
+
+
 def _protocol(module: DynamicSceneModule, scene: Scene, per_image: list[dict], protocol: Mapping) -> dict:
     first = per_image[0]
     return {
@@ -220,4 +246,5 @@ def _protocol(module: DynamicSceneModule, scene: Scene, per_image: list[dict], p
         "device": device_name(module.device),
         "threads": torch.get_num_threads(),
         "versions": versions(),
+        **({"commit": code} if (code := commit()) else {}),
     }

@@ -29,6 +29,7 @@ def measure(
     lpips_weights: Sequence[str] | None = None,
     sheets: int = 6,
     views: int | None = None,
+    reduce: int | None = None,
 ) -> dict:
     """Evaluate a fitted run into its folder and print the table.
 
@@ -38,7 +39,7 @@ def measure(
         device: device to render on.
         protocol: further entries of ``protocol``: how the run was made.
         lpips_weights: files or folders of backbone weights, searched before the usual places.
-        sheets, views: numbers of sheets and of test views; see ``evaluate``.
+        sheets, views, reduce: numbers of sheets and of test views, and pixels to average; see ``evaluate``.
     """
     suite = ImageSuite(
         find_lpips(extra=lpips_weights), mask_box=run.datamodule.scene.protocol.get("mask_box", False)
@@ -54,6 +55,7 @@ def measure(
             finished=run.finished(),
             sheets=sheets,
             views=views,
+            reduce=reduce,
             progress=progress,
         )
     show(metrics, run.folder, suite.absent)

@@ -20,7 +20,7 @@ from forewarp.runs.trust import trust_of
 from forewarp.scene.frame import Scene
 
 # Keys that do not change what a run computes.
-NOT_OF_IT = ("effects", "plan", "run", "evaluate", "sheets", "views", "planned", "trust", "score")
+NOT_OF_IT = ("effects", "plan", "run", "evaluate", "sheets", "views", "reduce", "planned", "trust", "score")
 LEAST = {"steps": 1, "trial_steps": 1, "seeds": 1, "held_out": 2}  # whole numbers
 OF_METHOD = ("steps", "trial_steps", "least")  # null: as the method has it
 AMOUNTS = ("seconds", "trial_seconds", "minutes", "least")

@@ -25,6 +25,8 @@ def pictures_in_words(run: Result) -> str | None:
     sizes = known.get("resolution", [])
     sizes = sizes if sizes and isinstance(sizes[0], list) else [sizes]
     words = [" and ".join("x".join(map(str, sides)) for sides in sizes)]
+    if by := known.get("reduced"):
+        words[0] = f"{words[0]} reduced {by}x{by}".strip()
     words += [f"background {known['background']}"] if "background" in known else []
     return ", ".join(filter(None, words)) or None
 

@@ -9,25 +9,29 @@ import statistics
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from forewarp.files import read_text, replace_file
+from forewarp.files import read_rows, read_text, replace_file
 from forewarp.metrics.gain import Estimate
 from forewarp.report.collect import Result, collect, machines
 from forewarp.report.protocols import pictures_in_words
 from forewarp.report.sheets import images_of
 
 # Rows that differ in these are not compared.
-CONDITIONS = ("clock", "threads", "device", "measured", "pictures", "iterations", "held_out")
+CONDITIONS = ("clock", "threads", "device", "measured", "pictures", "iterations", "held_out", "density")
 FORMS = {"clock": "{} clock", "threads": "threads: {:g}"}
 FORMS |= {"iterations": "{:g} steps at most", "held_out": "{:g} views held out"}
+FORMS |= {"density": "stage.fine.density={:g}"}
 KEY = ("method", "preset", "scene", "minutes", "seed", *CONDITIONS)  # what tells rows apart
+ABILITIES = ("space", "time", "canonical")
 NUMBERS = ("psnr", "ssim", "lpips", "steps", "step", "frame", "parameters", "memory", "ends")
-TEXTS = ("dataset", "day", "departures", "faults", "views", "curve", "command")
+NUMBERS += ("motion_error", *(f"psnr_{ability}" for ability in ABILITIES), "size", "wall", "processor")
+TEXTS = ("dataset", "day", "commit", "departures", "faults", "views", "curve", "command")
 # What stands for the folders of whoever types a command again.
 PLACES = {"paths.scenes": "DATASETS", "data.root": "SCENES", "lpips_weights": "WEIGHTS"}
 NETS = ("vgg", "alex", "squeeze")  # LPIPS is of the first whose weights were there
 CLOCKS = """Minutes are of training: setting up counts (a visual hull, a plane sweep), reading pictures and
 compiling do not. The processor clock counts processor time of the process, which is the same beside other
 work on the machine and, with one thread, equals the wall clock on an idle one."""
+DENSITY = re.compile(r"\sstage\.fine\.density=([\d.]+)")  # in a command
 _ENDS = 0.1  # share of the time that counts as its first and last part
 _MOST = 1 << 24  # bytes of a table that is read back
 
@@ -53,11 +57,16 @@ def of_minutes(runs: Path) -> tuple[list[Result], list[str]]:
 def row_of(result: Result) -> dict:
     """A run's row: ``KEY``, ``NUMBERS`` and ``TEXTS``; what is not known is None.
 
-    ``step`` and ``frame`` are seconds, ``views`` is time:PSNR of each test view, ``curve`` is seconds:PSNR.
+    ``step`` and ``frame`` are seconds, ``wall`` and ``processor`` those of training by each clock, ``views``
+    is time:PSNR of each test view, ``curve`` is seconds:PSNR; ``motion_error`` is the error of moving points
+    as a share of their motion, ``size`` the number of particles or voxels, ``density`` that of the last stage
+    where it was typed (None: the preset's own).
     """
     views = sorted((one["time"], one["scores"]["psnr"]) for one in images_of(result.folder))
     numbers, scores = result.numbers, result.metrics["test"][result.ability]
-    protocol = result.metrics["protocol"]
+    protocol, flow = result.metrics["protocol"], result.metrics.get("flow") or {}
+    abilities = {f"psnr_{one}": result.metrics["test"].get(one, {}).get("psnr") for one in ABILITIES}
+    typed = DENSITY.search(result.command)
     frames = protocol.get("test_frames")
     return {
         "method": result.config["model"]["name"],
@@ -72,17 +81,31 @@ def row_of(result: Result) -> dict:
         "pictures": pictures_in_words(result),
         "iterations": result.config["budget"].get("iterations"),
         "held_out": protocol.get("held_out") or None,
+        "density": float(typed[1]) if typed else None,
         **{name: numbers.get(name) for name in NUMBERS},
+        **abilities,
+        **{kind: result.metrics.get("clocks", {}).get(kind) for kind in ("wall", "processor")},
+        "motion_error": flow["epe_moving"] / flow["motion_mean"] if flow.get("motion_mean") else None,
+        "size": size_of(result),
         "lpips": next((scores[f"lpips_{net}"] for net in NETS if f"lpips_{net}" in scores), None),
         "ends": ends_below(views),
-        "dataset": result.dataset,
+        "dataset": _of_counterpart(result.dataset) if result.is_counterpart else result.dataset,
         "day": result.day,
+        "commit": protocol.get("commit"),
         "departures": protocol.get("departures"),
         "faults": protocol.get("faults"),
         "views": " ".join(f"{time:.4f}:{psnr:.2f}" for time, psnr in views),
         "curve": " ".join(f"{point.seconds:.1f}:{point.psnr:.2f}" for point in result.curve),
         "command": result.command,
     }
+
+
+def size_of(result: Result) -> float | None:
+    """The number of particles or voxels; of a run that noted it in its curve alone, the last of that."""
+    for count in result.metrics.get("size", {}).values():
+        return float(count)
+    sizes = [row["size"] for row in read_rows(result.folder / "accuracy_time.csv") if row.get("size")]
+    return float(sizes[-1]) if sizes else None
 
 
 def key_of(row: dict, names: Sequence[str] = KEY) -> tuple:
@@ -158,10 +181,17 @@ def _order(key: tuple) -> list[tuple]:
 
 def _read(row: dict) -> dict:
     """A row as ``row_of`` makes it; of an older table some fields are unknown."""
-    counted = ("minutes", "threads", "iterations", "held_out", *NUMBERS)
+    counted = ("minutes", "threads", "iterations", "held_out", "density", *NUMBERS)
     numbers = {name: float(row[name]) if row.get(name) else None for name in counted}
     texts = {name: row.get(name) or None for name in ("clock", "device", "measured", "pictures", *TEXTS)}
+    if " scene=counterpart_" in (texts["command"] or ""):
+        texts["dataset"] = _of_counterpart(texts["dataset"] or "")
     return row | numbers | texts | {"seed": int(row["seed"]), "clock": texts["clock"] or "wall"}
+
+
+def _of_counterpart(dataset: str) -> str:
+    """Name the dataset of a scene that stands in for its scenes, whose means it does not belong to."""
+    return dataset if dataset.startswith("counterpart") else f"counterpart of {dataset}"
 
 
 def _csv(rows: list[dict]) -> str:

@@ -127,6 +127,7 @@ def measure_run(run: Run, module: DynamicSceneModule, config: DictConfig) -> dic
         lpips_weights=[extra] if isinstance(extra, str) else extra,
         sheets=config.sheets,
         views=config.get("views"),
+        reduce=config.get("reduce"),
     )
 
 

@@ -24,7 +24,7 @@ TYPED = ("model.name", "data.scene", "data.root", "seed", "preset", "budget")
 HASH = "{hash}"
 # May be set beside resume=<run>.
 MAY_CHANGE = (
-    *("trainer", "threads", "lpips_weights", "sheets", "views", "evaluate", "checkpoint_seconds"),
+    *("trainer", "threads", "lpips_weights", "sheets", "views", "reduce", "evaluate", "checkpoint_seconds"),
     *("sentinel", "data_changed", "score", "viewer", "host", "port"),
 )
 

@@ -99,7 +99,8 @@ class Batch:
 
 @dataclass(frozen=True)
 class Target:
-    """A whole image to compare with: ``rgb`` (H, W, 3) in [0, 1] over ``background`` (3,).
+    """A whole image to compare with: ``rgb`` (H, W, 3) in [0, 1] over ``background`` (3,), of the size of the
+    frame's camera or, where it was reduced, smaller.
 
     If known: ``foreground`` (H, W) bool, ``depth`` (H, W) exact ray depth in world units (0 on the
     background), ``index`` among the training frames.

@@ -6,8 +6,10 @@ import ctypes
 import gc
 import platform
 import resource
+import subprocess
 import sys
 from contextlib import suppress
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -65,6 +67,24 @@ def versions() -> dict[str, str]:
         except PackageNotFoundError:
             continue
     return found
+
+
+@cache
+def commit() -> str | None:
+    """Return the commit of the checkout that the package lies in, with a + where its files differ; None
+    where there is none.
+    """
+    here = Path(__file__).parents[1]
+
+    def git(*words: str) -> str:
+        line = ["git", "-C", str(here), *words]
+        return subprocess.run(line, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
+
+    try:
+        git("ls-files", "--error-unmatch", "__init__.py")  # else the checkout is another project's
+        return git("rev-parse", "--short=9", "HEAD") + "+" * bool(git("status", "--porcelain", "--", "."))
+    except (OSError, subprocess.SubprocessError):
+        return None
 
 
 def reset_peak_memory() -> None:

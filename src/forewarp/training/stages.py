@@ -211,6 +211,7 @@ class Run:
             folder / "done.json",
             {
                 "seconds": module.clock.seconds,
+                "clocks": module.clock.every,
                 "steps": module.global_step,
                 "parameters": parameter_count(module.method),
                 "frames_in_play": module.curriculum.in_play,
