@@ -14,6 +14,7 @@ from forewarp.methods.particles import matter, opacity
 from forewarp.methods.particles.camera import Pinholes
 from forewarp.methods.particles.density import renew
 from forewarp.methods.particles.effects import Effects, cosines
+from forewarp.methods.particles.feasible import check_feasible
 from forewarp.methods.particles.nodes import Nodes
 from forewarp.methods.particles.planning import EFFECTS, ParticlesPlanning
 from forewarp.methods.particles.rest import come_to_rest
@@ -49,7 +50,9 @@ class Particles(Method):
     numbers = tuple(key for key in Numbers.__dataclass_fields__ if key != "name")
     asks = Asks(kind="pictures", straight=True)
     effects = EFFECTS
+    on_cpu = "its kernels are the CPU's, and without them only small pictures are feasible"
     planning: ClassVar[ParticlesPlanning] = ParticlesPlanning()
+    check_feasible = classmethod(check_feasible)
 
     def __init__(self, start: Start, *, width: float = 0.05, blur: float = BLUR, **choices) -> None:
         super().__init__()
