@@ -191,12 +191,15 @@ def keep_plan(config) -> None:
 
 
 def beginning(run, config) -> str:
-    """Say in two lines what is about to be trained, on what device, and into which folder."""
-    from forewarp.training.device import device_of
+    """Say in two lines what is about to be trained, on what device, and into which folder; in one more why
+    a GPU is left aside, if it is.
+    """
+    from forewarp.runs.device import why_on_cpu
 
-    scene, device = run.datamodule.scene, device_of(config.trainer.accelerator).type.upper()
+    scene, why = run.datamodule.scene, why_on_cpu(config)
     views = f"{_images(scene.train, 'training')} and {_images(scene.test, 'test')}"
-    return f"{scene.name}: {views}, on the {device}\nrun: {run.folder}"
+    lines = [f"{scene.name}: {views}, on the {run.device.type.upper()}", *([] if why is None else [why])]
+    return "\n".join([*lines, f"run: {run.folder}"])
 
 
 def _images(frames, kind: str) -> str:

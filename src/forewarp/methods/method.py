@@ -95,6 +95,7 @@ class Method(nn.Module):
         effects: its optional parts (see ``methods.effect``).
         grows: dotted names of the parameters and buffers whose number of rows may change during training;
             they adopt a checkpoint's.
+        on_cpu: why ``trainer=auto`` should leave a GPU aside, in a few words; None: it should not.
     """
 
     terms: ClassVar[Sequence[str]] = ("photo",)
@@ -103,6 +104,7 @@ class Method(nn.Module):
     asks: Asks = Asks()
     effects: ClassVar[Sequence] = ()
     grows: ClassVar[Sequence[str]] = ()
+    on_cpu: ClassVar[str | None] = None
 
     def at(self, moment: Moment) -> Snapshot:
         """Freeze the scene at a moment."""
@@ -207,6 +209,18 @@ class Method(nn.Module):
                 if name not in known:
                     there = ", ".join(known) or "none"
                     raise ValueError(f"{key}: expected {what} {there}, but got '{name}'")
+
+    @classmethod
+    def check_feasible(
+        cls, scene: Scene, stage: str, numbers: Mapping[str, Any], device: torch.device
+    ) -> None:
+        """Refuse a scene that a stage with these ``numbers`` cannot be trained on, on this device.
+
+        Called before the first stage is begun; a look at some pictures is all that it should cost.
+
+        Raises:
+            ValueError: naming what would be feasible.
+        """
 
     def _load_from_state_dict(self, state_dict, prefix, *args, **kwargs) -> None:
         for name in self.grows:  # including those of submodules, which load later

@@ -19,9 +19,14 @@ def numba_installed() -> bool:
     return os.environ.get("FOREWARP_NUMBA", "1") != "0" and importlib.util.find_spec("numba") is not None
 
 
+def has_kernels(device: torch.device) -> bool:
+    """Return whether there are kernels for tensors on a device."""
+    return device.type == "cpu" and numba_installed()
+
+
 def use_numba(tensor: Tensor) -> bool:
     """Return whether to use the Numba kernel for ``tensor``."""
-    return tensor.device.type == "cpu" and numba_installed()
+    return has_kernels(tensor.device)
 
 
 def match_threads() -> int:

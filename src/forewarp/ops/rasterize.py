@@ -15,7 +15,7 @@ from forewarp.ops.project import Splats, whole
 
 SIDE = 8  # pixels of a tile along both axes
 _LEAST = -math.log(255.0)
-_FEASIBLE = 1 << 28  # numbers that the reference holds several times
+FEASIBLE = 1 << 27  # splats times pixels of the reference: with gradients ten float32 tensors of these, 5 GB
 
 
 class Picture(NamedTuple):
@@ -65,10 +65,13 @@ def rasterize_reference(splats: Splats, width: int, height: int) -> Tensor:
     """``rasterize`` in plain PyTorch: planes (5, H, W) of colour, distance, and what is let through."""
     numbers = splats.numbers
     seen = (splats.reach[:, 0] > 0).nonzero()[:, 0]
-    if len(seen) * width * height > _FEASIBLE:
+    most = FEASIBLE / max(len(seen), 1)
+    if width * height > most:
+        wide, high = smaller(width, height, (most / (width * height)) ** 0.5)
         raise ValueError(
-            f"rasterize: expected at most {_FEASIBLE:,} splats times pixels without the kernels, but got "
-            f"{len(seen):,} x {width} x {height}; install forewarp[cpu] and compute on the CPU, in float32"
+            f"rasterize: expected at most {FEASIBLE:,} splats times pixels without the kernels, but got "
+            f"{len(seen):,} x {width} x {height}; install forewarp[cpu] and compute on the CPU, in float32, "
+            f"or draw at most {wide} x {high} pixels"
         )
     order = seen[numbers.detach()[seen, 9].sort(stable=True).indices]
     u, v, a, b, c, solid = (numbers[order, k, None, None] for k in range(6))
@@ -80,6 +83,15 @@ def rasterize_reference(splats: Splats, width: int, height: int) -> Tensor:
     weights = alpha * passed[:-1]
     shown = torch.einsum("vhw,vk->khw", weights, numbers[order, 6:])
     return torch.cat([shown, passed[-1:]])
+
+
+def smaller(width: int, height: int, share: float) -> tuple[int, int]:
+    """The sides of a picture of the same form, times a share of them.
+
+    >>> smaller(400, 300, 0.3337)
+    (133, 100)
+    """
+    return max(1, int(share * width)), max(1, int(share * height))
 
 
 class Tiles(NamedTuple):

@@ -20,7 +20,6 @@ from forewarp.runs.config import claim
 from forewarp.runs.data_check import check_data
 from forewarp.runs.lock import locked
 from forewarp.runs.overrides import merged, without_switched_off
-from forewarp.training.device import device_of
 from forewarp.training.handover import NUMBERS, POINTS
 from forewarp.training.module import DynamicSceneModule
 from forewarp.training.stages import Run
@@ -154,7 +153,7 @@ class Trials:
             check_data(run, "refuse")
             if begun is not None:
                 _share(begun, run.folder / begun.name)
-            module = run.fit().to(device_of(config.trainer.accelerator))
+            module = run.fit().to(run.device)
             file, stage = run.folder / "trial.json", run.stages[-1]
             known = read_json(file)
             if known is None:

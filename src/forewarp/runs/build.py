@@ -13,8 +13,9 @@ from omegaconf import DictConfig, OmegaConf
 from forewarp.clock import Clock
 from forewarp.evaluation.measure import measure
 from forewarp.files import read_json
+from forewarp.runs.device import device_for
 from forewarp.training.callbacks import StageProgress
-from forewarp.training.device import check_precision, device_of
+from forewarp.training.device import check_precision
 from forewarp.training.module import DynamicSceneModule
 from forewarp.training.schedule import StagePlan, seconds_after, share_out
 from forewarp.training.stages import Run
@@ -31,8 +32,8 @@ def build_run(config: DictConfig) -> Run:
             raise ValueError(f"threads: expected a whole number > 0 or null, but got {config.threads}")
         torch.set_num_threads(config.threads)
     check_precision(config.trainer.get("precision"))
-    clock = Clock(config.budget.clock).kind
-    if clock != "wall" and device_of(config.trainer.accelerator).type != "cpu":
+    clock, device = Clock(config.budget.clock).kind, device_for(config)
+    if clock != "wall" and device.type != "cpu":
         raise ValueError(
             f"budget.clock: expected wall, as processor time leaves out the GPU's, but got {clock!r}; "
             "leave budget.clock out, or set trainer=cpu"
@@ -45,7 +46,7 @@ def build_run(config: DictConfig) -> Run:
     def make_trainer(folder: Path, callbacks: list):
         return trainer(
             # With auto, Lightning would choose a Mac's GPU, which lacks float64.
-            accelerator=device_of(config.trainer.accelerator).type,
+            accelerator=device.type,
             max_epochs=1,
             max_steps=-1,
             callbacks=callbacks,
@@ -70,6 +71,7 @@ def build_run(config: DictConfig) -> Run:
         skip=config.get("sentinel", {"skip": 0})["skip"],
         tell=partial(print, flush=True),
         clock=clock,
+        device=device,
     )
     run.check()
     return run
@@ -122,7 +124,7 @@ def measure_run(run: Run, module: DynamicSceneModule, config: DictConfig) -> dic
     return measure(
         run,
         module,
-        device=device_of(config.trainer.accelerator),
+        device=run.device,
         protocol=protocol,
         lpips_weights=[extra] if isinstance(extra, str) else extra,
         sheets=config.sheets,

@@ -46,9 +46,9 @@ def content_hash(config: DictConfig, more: Sequence[str] = (), *others: object) 
     content = {key: _plain(config.get(key)) for key in (*IDENTITY, *more)}
     precision = config.trainer.get("precision")
     if config.budget.minutes is not None:
-        from forewarp.training.device import device_of
+        from forewarp.runs.device import device_for
 
-        content["on"] = [device_of(config.trainer.accelerator).type, precision, config.get("threads")]
+        content["on"] = [device_for(config).type, precision, config.get("threads")]
     elif precision not in (None, "32-true"):
         content["precision"] = precision
     if others:

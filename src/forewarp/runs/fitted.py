@@ -22,7 +22,6 @@ from forewarp.scene.camera import Camera
 from forewarp.scene.cloud import Cloud
 from forewarp.scene.frame import Frame, Scene
 from forewarp.scene.view import Moment, View
-from forewarp.training.device import device_of
 from forewarp.training.module import DynamicSceneModule
 from forewarp.training.stages import Run
 
@@ -126,7 +125,7 @@ def opened(config: DictConfig, device: str | torch.device | None = None) -> tupl
         ValueError: naming the wrong key of the config, or a stage that is not finished.
     """
     run = build_run(config)
-    module = run.load().to(device or device_of(config.trainer.accelerator))
+    module = run.load().to(device or run.device)
     warn_if_changed(run)
     return run, module.eval()
 

@@ -17,7 +17,6 @@ from forewarp.metrics.lpips import NETS, find_lpips, find_lpips_weights
 from forewarp.metrics.suite import LPIPS_METRICS, METRICS, ImageSuite
 from forewarp.runs.build import is_current
 from forewarp.runs.overrides import key_of, typed_overrides
-from forewarp.training.device import device_of
 from forewarp.training.module import DynamicSceneModule
 from forewarp.training.stages import Run
 
@@ -88,7 +87,7 @@ class Score:
             find_lpips(nets, self.config.get("lpips_weights")),
             mask_box=run.datamodule.scene.protocol.get("mask_box", False),
         )
-        module.to(device_of(self.config.trainer.accelerator))
+        module.to(run.device)
         scores = mean_scores(module, run.datamodule.watched(), suite)
         content = {"views": self._views(), "scores": self._stored() | scores}
         write_json(Path(run.folder) / FILE, content)

@@ -8,6 +8,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import lightning
+import torch
 
 from forewarp.clock import Clock
 from forewarp.files import read_json, write_json
@@ -42,6 +43,7 @@ class Run:
         skip: steps per stage that may be skipped because of numbers that are not finite (see ``Sentinel``).
         tell: called with a line for each stage that is loaded or continued.
         clock: what minutes are of: see ``Clock``.
+        device: that its trainers compute on.
     """
 
     datamodule: lightning.LightningDataModule
@@ -55,6 +57,7 @@ class Run:
     skip: int = 0
     tell: Callable[[str], None] = lambda line: None
     clock: str = "wall"
+    device: torch.device = torch.device("cpu")
 
     def check(self) -> None:
         """Refuse keys and terms that a stage's method does not know, before anything is read.
@@ -63,8 +66,7 @@ class Run:
             ValueError: see ``Method.check``.
         """
         for stage in self.stages:
-            model = stage.model or self.model
-            check = getattr(getattr(model, "func", model), "check", None)
+            check = self._of_method(stage, "check")
             if check is not None:
                 objective = stage.objective
                 check(stage.settings.name, stage.settings.numbers, objective.names, objective.literal)
@@ -72,6 +74,7 @@ class Run:
     def fit(self) -> DynamicSceneModule:
         """Train all stages that are not finished; return the module of the last one."""
         self.datamodule.setup("fit")
+        self._check_feasible()
         self._check_later_stages()
         module, handover = None, None
         for number, stage in enumerate(self.stages):
@@ -143,6 +146,18 @@ class Run:
         return replace(self, datamodule=SimpleNamespace(scene=scene))._module(
             stage, None, None, number, blank=True
         )
+
+    def _of_method(self, stage: Stage, name: str) -> Callable | None:
+        """Return what the method of a stage has by this name before it is built."""
+        model = stage.model or self.model
+        return getattr(getattr(model, "func", model), name, None)
+
+    def _check_feasible(self) -> None:
+        """Refuse what a method cannot do on this device, before anything is computed."""
+        for stage in self.stages:
+            check = self._of_method(stage, "check_feasible")
+            if check is not None and not self.is_finished(stage):
+                check(self.datamodule.scene, stage.settings.name, stage.settings.numbers, self.device)
 
     def _check_later_stages(self) -> None:
         """Build the later stages once, so that errors in their settings are reported before training."""

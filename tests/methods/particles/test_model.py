@@ -160,6 +160,31 @@ def test_what_is_opaque_can_still_fade(data):
     assert (gradient[method.shown > 0] != 0).float().mean() > 0.9
 
 
+def test_what_is_opaque_at_some_time_can_still_fade(data):
+    module = module_with(data, opacity_over_time=3)
+    method, optimizer = module.method, module.configure_optimizers()
+    solid = method.opacity.data
+    solid[:4, 0] = torch.tensor([20.0, 5.0, -8.0, 6.0])
+    before = solid.clone()
+    method.fade.data[1:3, 0] = -9.0  # the first cosine falls from 0 to -2
+    method.fade.data[3:, 0] = 2.0
+    method.advance(0.5, 0, optimizer)
+    assert solid[:4, 0].tolist() == pytest.approx([6.0, -12.0, -12.0, 6.0])
+    assert torch.equal(solid[4:], before[4:])
+    fades = torch.stack([method.over_time(i / 64)[1] for i in range(65)])
+    logits = method.gaussians().opacity.detach() @ fades.T
+    assert float(logits.amax()) == pytest.approx(6.0, abs=1e-4)
+
+
+def test_without_opacity_over_time_only_what_is_too_opaque_changes(data):
+    module = module_with(data)
+    solid, optimizer = module.method.opacity.data, module.configure_optimizers()
+    solid[:, 0] = torch.linspace(-20, 20, len(solid))
+    before = solid.clone()
+    module.method.advance(0.5, 0, optimizer)
+    assert torch.equal(solid, before.clamp(max=6.0))
+
+
 def test_particles_grow_to_what_the_pictures_call_for(data):
     numbers = {"every": 0.1, "first": 0.5, "settled": 1.0, "density": 400.0}  # some hundreds, of 6 pictures
     module = module_with(data, numbers=numbers)

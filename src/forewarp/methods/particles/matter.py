@@ -65,7 +65,7 @@ def movement_of(method: Method, times: Sequence[float]) -> dict[str, Tensor]:
     if method.nodes is not None:
         warps = [method.warp(time) for time in times]
         maps = [torch.cat([w.maps[:, :9].reshape(-1, 3, 3), w.maps[:, 9:, None]], -1) for w in warps]
-        nodes, basis = method.nodes, [method.nodes.curve(time) for time in times]
+        nodes, basis = method.nodes, [method.nodes.basis(time) for time in times]
         found = {"links": warps[0].links, "weights": warps[0].weights, "maps": torch.stack(maps)}
         found |= {"node_places": nodes.places, "node_basis": torch.stack(basis), "node_shift": nodes.shift}
         found |= {} if nodes.turn is None else {"node_turn": nodes.turn}

@@ -10,10 +10,11 @@ from torch import Tensor, nn
 
 from forewarp.fields.curves import Curve
 from forewarp.methods.method import Method, Snapshot, Start, Step
-from forewarp.methods.particles import matter
+from forewarp.methods.particles import matter, opacity
 from forewarp.methods.particles.camera import Pinholes
 from forewarp.methods.particles.density import renew
 from forewarp.methods.particles.effects import Effects, cosines
+from forewarp.methods.particles.feasible import check_feasible
 from forewarp.methods.particles.nodes import Nodes
 from forewarp.methods.particles.planning import EFFECTS, ParticlesPlanning
 from forewarp.methods.particles.rest import come_to_rest
@@ -30,9 +31,6 @@ from forewarp.scene.box import Box
 from forewarp.scene.cloud import Cloud
 from forewarp.scene.ellipsoids import Ellipsoids
 from forewarp.scene.view import Moment
-
-_TIMES = 16  # at which opacity over time is looked at
-_MOST_OPAQUE = 6.0  # logit: at 17 float32 has no slope left, and what is opaque there can never fade
 
 
 class Particles(Method):
@@ -52,7 +50,9 @@ class Particles(Method):
     numbers = tuple(key for key in Numbers.__dataclass_fields__ if key != "name")
     asks = Asks(kind="pictures", straight=True)
     effects = EFFECTS
+    on_cpu = "its kernels are the CPU's, and without them only small pictures are feasible"
     planning: ClassVar[ParticlesPlanning] = ParticlesPlanning()
+    check_feasible = classmethod(check_feasible)
 
     def __init__(self, start: Start, *, width: float = 0.05, blur: float = BLUR, **choices) -> None:
         super().__init__()
@@ -105,7 +105,7 @@ class Particles(Method):
             covered = float(before.covered)
             most = self.numbers_of.most(covered, self.views)  # by this stage's own density
             self._scalars(covered, float(before.extent), most)
-            first = {name: p.data.clone() for name, p in before.named_parameters(recurse=False)}
+            first = {n: p.data.to("cpu", copy=True) for n, p in before.named_parameters(recurse=False)}
         elif fresh is not None:
             first = fresh
         else:
@@ -162,10 +162,10 @@ class Particles(Method):
 
     def gaussians(self) -> Gaussians:
         """The particles as the operators read them."""
-        opacity = self.opacity if self.fade is None else torch.cat([self.opacity, self.fade], -1)
+        solid = self.opacity if self.fade is None else torch.cat([self.opacity, self.fade], -1)
         colors = [part for part in (self.color, self.shade, self.tint) if part is not None]
         colors = colors[0] if len(colors) == 1 else torch.cat(colors, 1)
-        return Gaussians(self.means, self.log_scales, self.turns, opacity, colors)
+        return Gaussians(self.means, self.log_scales, self.turns, solid, colors)
 
     def warp(self, time: float) -> Warp:
         """How everything moves until a time."""
@@ -190,10 +190,7 @@ class Particles(Method):
 
     def most_opaque(self) -> Tensor:
         """The logit of each particle's opacity (N,) when it is largest."""
-        if self.fade is None:
-            return self.opacity.data[:, 0]
-        fades = self.means.new_tensor([self.fades(i / _TIMES) for i in range(_TIMES + 1)])  # (T, F)
-        return self.opacity.data[:, 0] + (self.fade.data @ fades.T).amax(-1)
+        return opacity.most_opaque(self)
 
     @torch.no_grad()
     def look(self, batch: Batch, factors: Mapping[str, float], generator: torch.Generator) -> Step:
@@ -226,7 +223,7 @@ class Particles(Method):
         own, warp = {}, None
         if self.nodes is not None:
             self.nodes.look_ahead(time, time)
-            basis = self.nodes.curve(time).to(self.means)
+            basis = self.nodes.basis(time)
             motion, maps = self.nodes.carried(basis)
             warp = Warp(maps, self.skin.links, self.skin.weights())
         found = compare(
@@ -271,7 +268,7 @@ class Particles(Method):
         particles where it is time.
         """
         self.progress, numbers = progress, self.numbers_of
-        self.opacity.data.clamp_(max=_MOST_OPAQUE)
+        opacity.bound(self)
         for group in optimizer.param_groups:
             if group["name"] in ("means", "shifts"):
                 group["lr"] *= float(self.extent)

@@ -93,13 +93,17 @@ class Nodes(nn.Module):
         shares = torch.exp(-(away - away[:, :1]) / (2 * self.spread[rows] ** 2))
         return rows.int(), (shares / shares.sum(-1, keepdim=True)).contiguous()
 
+    def basis(self, time: float) -> Tensor:
+        """The curve's basis (K,) at a time, as the coefficients are."""
+        return self.curve(time).to(self.places)
+
     def carried(self, basis: Tensor) -> tuple[Tensor, Tensor]:
         """Where nodes went and how they turned (M, 6), by a curve's basis (K,), and their maps (M, 12)."""
         return carry_nodes(self.shift, self.turn, basis, self.places)
 
     def maps(self, time: float) -> Tensor:
         """``ops.nodes.node_maps`` (M, 12) at a time."""
-        return self.carried(self.curve(time).to(self.places))[1]
+        return self.carried(self.basis(time))[1]
 
     @torch.no_grad()
     def look_ahead(self, low: float, high: float) -> None:
@@ -208,6 +212,6 @@ class Nodes(nn.Module):
             return self.places.new_zeros(self.curve.count)
         middle = min(max(time, low), high)
         before, now, after = (
-            self.curve(min(max(t, 0.0), 1.0)).to(self.places) for t in (middle - step, middle, middle + step)
+            self.basis(min(max(t, 0.0), 1.0)) for t in (middle - step, middle, middle + step)
         )
         return after - 2 * now + before

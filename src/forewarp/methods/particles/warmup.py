@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 
 from forewarp.ops.adam import adam_rows
+from forewarp.ops.backend import use_numba
 from forewarp.ops.compare import compare
 from forewarp.ops.nodes import carry_nodes, pull_nodes, spread_nodes
 from forewarp.ops.project import Gaussians, Pinhole, Warp, project
@@ -13,7 +14,12 @@ from forewarp.ops.rasterize import rasterize
 
 @torch.no_grad()
 def compile_kernels(method: torch.nn.Module) -> None:
-    """Run each operator once; nothing is drawn at random, nothing of the method is touched."""
+    """Run each operator once; nothing is drawn at random, nothing of the method is touched.
+
+    A method that uses none of the kernels, as on a GPU, has nothing to compile.
+    """
+    if not use_numba(method.means):
+        return
     zero, one = torch.zeros(1, 3), torch.ones(1, 1)
     particles = Gaussians(zero, zero, torch.ones(1, 4), one, torch.zeros(1, 1, 3))
     warp = Warp(torch.zeros(1, 12), torch.zeros(1, 1, dtype=torch.int32), one)
