@@ -52,7 +52,8 @@ def test_a_run_leaves_what_it_promises(fitted):
 
 def test_metrics_have_the_promised_shape(fitted):
     content = json.loads((fitted / "metrics.json").read_text())
-    whole = {"protocol", "seconds", "steps", "peak_memory_bytes", "parameters", "effects", "test", "flow"}
+    whole = {"protocol", "seconds", "clocks", "steps", "peak_memory_bytes", "parameters", "size", "effects"}
+    whole |= {"test", "flow"}
     assert set(content) == whole
     seconds = content["seconds"]
     assert set(seconds) == {"train", "coarse", "fine", "render_per_frame", "render_again_per_frame"}

@@ -20,6 +20,7 @@ from forewarp.report.price_list import every_run
 from forewarp.report.tables import Cell, Column, Table
 
 TITLE = "What each part of the paper's method brings"
+LEAST = 0.1  # dB; of two seeds both may err alike
 ORDERS = ("holds", "within noise", "reversed")
 INTRODUCTION = (
     "Written by `forewarp-report kind=ablation`; `make ablations` makes its runs. Each row of the paper's "
@@ -27,12 +28,12 @@ INTRODUCTION = (
     "± standard deviation over the seeds. A difference is to `Ours` with the same seed, scene and budget; "
     "beside it stands the difference of the numbers that the paper prints, for real scenes. *Noise* is the "
     "pooled standard deviation of the differences over seeds: of all rows, of all tables, with the same "
-    "scene and budget, each around its own mean. A mean difference no larger than that is *within noise*; "
-    "else the paper's order *holds* if both differences have the same sign, and is *reversed* if not. With "
-    "two seeds, one row in four to six that changes nothing would still exceed the noise, and all rows "
-    "share the runs of `Ours`, so they err together. A row with fewer seeds than `Ours` says so. Seconds a "
-    "step are of training, all stages together. At equal minutes a cheaper step means more steps; at equal "
-    "steps it counts for nothing."
+    "scene and budget, each around its own mean. A mean difference no larger than that, or than "
+    f"{LEAST:g} dB, is *within noise*; else the paper's order *holds* if both differences have the same "
+    "sign, and is *reversed* if not. With two seeds, one row in four to six that changes nothing would "
+    "still exceed the noise, and all rows share the runs of `Ours`, so they err together. A row with fewer "
+    "seeds than `Ours` says so. Seconds a step are of training, all stages together. At equal minutes a "
+    "cheaper step means more steps; at equal steps it counts for nothing."
 )
 
 
@@ -155,7 +156,7 @@ def verdict(change: float, printed: float | None, noise: float | None) -> str:
         return ""
     if noise is None:
         return "one seed"
-    if abs(change) <= noise:
+    if abs(change) <= max(noise, LEAST):
         return "within noise"
     return "holds" if change * printed > 0 else "reversed"
 
