@@ -123,7 +123,9 @@ effects: SEEDS ?= 2
 # Two specimens are made for effects that particles alone have; they have no fixed set to compare a plan with.
 SPECIMENS := still,rigid,band,glossy,room,quick,daylight,blocks
 effects: ## planned effects of model=forward against all effects, on procedural or real scenes [DATA= SCENES="a b" MINUTES= SEEDS=]; plans of MODEL=particles
-ifeq ($(MODEL),particles)
+ifneq ($(filter-out particles forward,$(MODEL)),)
+	$(error MODEL: expected forward or particles, which can be planned, but got $(MODEL))
+else ifeq ($(MODEL),particles)
 	@status=0; $(COMPARE) $(SEED) model=particles ablation=auto $(if $(DATA),paths.scenes=$(DATA)) \
 		scene=$(if $(DATA),$(subst $(space),$(comma),$(addprefix dnerf_,$(SCENES))),specimen_$(subst $(comma),$(comma)specimen_,$(SPECIMENS))) $(GO_ON); \
 	$(BIN)/forewarp-report kind=effects && exit $$status

@@ -46,7 +46,7 @@ def test_the_page_says_which_of_the_papers_orders_hold(tmp_path):
             part(tmp_path, variant, seed, whole + change[seed], seconds=25.0)
         part(tmp_path, "no_tv", seed, whole - 6, steps=600)
     text, table = page_of(tmp_path)
-    assert rows_of(text.split("## Table 5")[0], "4 min") == [["4 min", "5", "2", "1", "2"]]
+    assert rows_of(text.split("## Table 5")[0], "4 min") == [["4 min", "5", "2", "1", "2", "0"]]
     section = text.split("## Table 5")[1].split("## ")[0]
     rows = {name: rows_of(section, name)[0][1:] for name in ("Ours", "w/o total variation", "w/o flow L1")}
     assert rows["Ours"] == [

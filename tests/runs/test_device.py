@@ -48,7 +48,7 @@ def test_it_says_why_and_how_to_choose_the_gpu(gpu, data_run):
     first, second, third = beginning(run, config).splitlines()
     assert first.endswith("on the CPU")
     assert second.startswith("model=particles leaves the GPU aside: its kernels are the CPU's")
-    assert second.endswith("; trainer=gpu takes it all the same")
+    assert second.endswith("; trainer=gpu takes it for small ones")
     assert third == f"run: {run.folder}"
     config.trainer.accelerator = "cpu"
     assert len(beginning(run, config).splitlines()) == 2
@@ -69,6 +69,12 @@ def test_one_stage_that_belongs_on_the_cpu_is_enough(gpu):
     config.stage.fine.model = config_of("model=particles").model
     assert device_for(config) == torch.device("cpu")
     assert why_on_cpu(config).startswith("model=particles")
+
+
+def test_what_was_trained_by_the_processor_clock_is_only_not_trained_on_a_gpu(gpu):
+    run = build_run(config_of("model=forward", "trainer=gpu", "budget.clock=processor"))
+    with pytest.raises(ValueError, match="budget.clock: expected wall, as processor time leaves out the GPU"):
+        run.fit()
 
 
 def test_what_is_no_method_is_not_named_here(gpu):

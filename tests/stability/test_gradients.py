@@ -12,6 +12,7 @@ from torch.autograd import gradcheck
 
 from forewarp import ops
 from forewarp.ops import backend
+from forewarp.ops.blocks import block_means, block_sums, reduced_depth
 from forewarp.ops.composite import accumulate, dense_weights, render_weights
 from forewarp.ops.dct import dct_basis
 from forewarp.ops.encode import positional_encoding, spherical_harmonics_1
@@ -35,7 +36,7 @@ SEEDS = strategies.integers(0, 10_000)
 # Why operators have no gradient, and which.
 WITHOUT = {
     "a guard or a switch": "check_shape check_march numba_installed use_numba match_threads warm_up kept_for"
-    " whole",
+    " whole has_kernels smaller",
     "places samples, which no loss pulls at": "march march_reference stratified by_importance clip_to_box",
     "whole numbers, or yes and no": "map_cells unfolded index_of dilate occupied_cells neighbour_pairs"
     " occupied_cells_reference sorted_tiles encoded_size",
@@ -144,6 +145,9 @@ CHECKS = {
         draw(s + 1, 2, 3, 3),
     ),
     "dct_basis": lambda s: (lambda t: dct_basis(t, 4, 9, 0.3, 0.2), draw(s, 3).sigmoid()),
+    "block_sums": lambda s: (block_sums, draw(s, 4, 6, 2)),
+    "block_means": lambda s: (lambda x: block_means(x, 2), draw(s, 4, 6, 2)),
+    "reduced_depth": lambda s: (reduced_depth, draw(s, 4, 6).abs() + 0.1),
     "positional_encoding": lambda s: (lambda x: positional_encoding(x, 4), draw(s, 3, 2)),
     "distort": lambda s: (lambda p: distort(p, (0.1, -0.05, 0.01), (0.01, -0.02)), draw(s, 4, 2)),
     "spherical_harmonics_1": lambda s: (spherical_harmonics_1, draw(s, 3, 3)),

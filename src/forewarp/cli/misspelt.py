@@ -76,11 +76,16 @@ def unknown_key(error: Exception, name: str, arguments: list[str]) -> str | None
     if key in known:  # but not a key of the dictionary that is its value, or not in each of several jobs
         inner = [own for one in arguments if key_of(one) == key for own in _spread(one)[1:]]
         unknown = next((own for own in inner if own not in known), None)
+        if unknown is None and "--multirun" not in arguments and "-m" not in arguments:
+            return None
         if unknown is None:
             return f"{key}: expected an option of every job, but got one that not all have; leave it out"
         key = unknown
+    model = config.get("model", {}).get("name")
+    if key in every_key(_composed(conf, name, [one for one in others if key_of(one) in ("model", "preset")])):
+        return f"{key}: expected an option, but got one that another choice takes away; leave one of them out"
     if (owner := _owner(key, conf, name, others)) is not None:
-        return of_another(key, config.model.name, owner)
+        return of_another(key, model, owner)
     near = difflib.get_close_matches(key, known, 1, cutoff=0.8)
     advice = f"did you mean {near[0]}?" if near else f"forewarp-{name} --cfg job prints all keys"
     return f"{key}: expected a key of the configuration, but got none of this name; {advice}"
@@ -120,7 +125,7 @@ def _composed(conf: Path, name: str, arguments: list[str]):
     more = [f"hydra.searchpath=[{','.join(f'file://{Path(d).resolve()}' for d in dirs)}]"] if dirs else []
     with hydra.initialize_config_dir(str(conf), version_base="1.3"):
         with suppress(Exception):
-            typed = [_first(one) for one in arguments if "=" in one and one[:1] != "-"]
+            typed = [_first(one) for one in arguments if one[:1] == "~" or ("=" in one and one[:1] != "-")]
             return hydra.compose(name, [*more, *typed])
         return hydra.compose(name)
 

@@ -89,8 +89,12 @@ def train(config) -> float | None:
         with locked(run.folder):
             claim(config, finished=True)
             check_data(run, changed)
-            print(f"measured before: {run.folder}; again with forewarp-evaluate run={run.folder}")
+            again = f"forewarp-evaluate run={run.folder}" + (
+                f" reduce={n}" if (n := config.get("reduce")) else ""
+            )
+            print(f"measured before: {run.folder}; again with {again}")
             return Score(run, config).of()
+    run.check_clock()
     run.datamodule.setup("fit")  # before the folder is made: a mistyped scene leaves nothing behind
     if config.evaluate and config.get("reduce") is not None:
         run.datamodule.targets("test").reduced(config.reduce)  # refused now, not when all is trained

@@ -22,7 +22,7 @@ from forewarp.metrics.suite import ImageSuite, summarise
 from forewarp.scene.batch import Target
 from forewarp.scene.frame import Scene, spread
 from forewarp.scene.view import Rendering
-from forewarp.training.device import commit, device_name, versions
+from forewarp.training.device import device_name, versions
 from forewarp.training.module import DynamicSceneModule
 
 _SHEET_SIDE = 300  # least pixels of the shorter side of a picture on a sheet
@@ -128,7 +128,7 @@ def evaluate(
     if reduce is not None:
         protocol = {**(protocol or {}), "reduced": reduce}
     metrics = {
-        "protocol": _protocol(module, scene, per_image, protocol or {}),
+        "protocol": _protocol(module, scene, per_image, {**_trained_by(finished), **(protocol or {})}),
         "seconds": _seconds(per_image, finished),
         "clocks": _clocks(finished),
         "steps": {name: int(noted["steps"]) for name, noted in finished.items()},
@@ -246,5 +246,10 @@ def _protocol(module: DynamicSceneModule, scene: Scene, per_image: list[dict], p
         "device": device_name(module.device),
         "threads": torch.get_num_threads(),
         "versions": versions(),
-        **({"commit": code} if (code := commit()) else {}),
     }
+
+
+def _trained_by(finished: Mapping[str, Mapping]) -> dict:
+    """The commit that the last stage was trained by, where it was noted."""
+    noted = [stage["commit"] for stage in finished.values() if stage.get("commit")]
+    return {"commit": noted[-1]} if noted else {}

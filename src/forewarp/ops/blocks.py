@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 
@@ -20,7 +21,8 @@ def block_sums(picture: Tensor, by: int = 2) -> Tensor:
     height, width = picture.shape[:2]
     if height % by or width % by:
         raise ValueError(f"picture: expected sides that {by} divides, but got {width} x {height} pixels")
-    return picture.reshape(height // by, by, width // by, by, *picture.shape[2:]).sum((1, 3))
+    blocks = picture.reshape(height // by, by, width // by, by, *picture.shape[2:])
+    return blocks.sum((1, 3), dtype=None if picture.is_floating_point() else torch.int32)
 
 
 def block_means(picture: Tensor, by: int = 2) -> Tensor:

@@ -21,7 +21,7 @@ from forewarp.report.tables import Cell, Column, Table
 
 TITLE = "What each part of the paper's method brings"
 LEAST = 0.1  # dB; of two seeds both may err alike
-ORDERS = ("holds", "within noise", "reversed")
+ORDERS = ("holds", "within noise", "reversed", "one seed")
 INTRODUCTION = (
     "Written by `forewarp-report kind=ablation`; `make ablations` makes its runs. Each row of the paper's "
     "tables of ablations takes one thing from its whole method (`Ours`). PSNR (dB) is of test views, mean "

@@ -58,7 +58,7 @@ def _parts(model: str, results: Sequence[Result]) -> list[str]:
         if found:
             parts += [f"## {title}\n", compared(found).markdown()]
             parts += [called(found).markdown()] if made else []
-    trials = missed(results)
+    trials = gains_of_trials(results)
     parts += ["## What each effect is worth in trials\n", trials.markdown()] if trials.rows else []
     return [*parts, "## Why\n", *reasons(results)]
 
@@ -112,7 +112,7 @@ def called(results: Sequence[Result]) -> Table:
     return Table(columns, rows, f"{right} of {len(rows)} plans turn on what is called for and nothing else:")
 
 
-def missed(results: Sequence[Result]) -> Table:
+def gains_of_trials(results: Sequence[Result]) -> Table:
     """List for every plan what its trials gained by each effect, ± two standard errors."""
     plans = [(run, _trials(run)) for run in _runs(results, "auto")]
     names = list(dict.fromkeys(name for _, trials in plans for name in trials))

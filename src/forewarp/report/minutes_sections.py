@@ -69,7 +69,7 @@ def more_density(rows: Sequence[dict]) -> list[str]:
         "the seeds. More hold if PSNR is at least that of fewer, less 0.2 dB.\n"
     )
     lines = _steps(
-        [row for row in rows if not _REDUCED.search(row["pictures"] or "")],
+        [row for row in rows if row["size"] and not _REDUCED.search(row["pictures"] or "")],
         lambda group: key_of(group[0], ("scene", "preset", "minutes", *_without("density"))),
         size_in,
     )
@@ -155,7 +155,7 @@ def made_when(rows: Sequence[dict]) -> str | None:
         return None
     told = [f"{minutes:g} min of {', '.join(sorted(found[minutes]))}" for minutes in sorted(found)]
     return (
-        "Not all runs are of one version of the code: a difference between them may be of the code. By "
+        "Not all runs may be of one version of the code, to which differences may then be due. By "
         f"commit where it was noted, else by day: {'; '.join(told)}.\n"
     )
 

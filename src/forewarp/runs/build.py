@@ -32,12 +32,7 @@ def build_run(config: DictConfig) -> Run:
             raise ValueError(f"threads: expected a whole number > 0 or null, but got {config.threads}")
         torch.set_num_threads(config.threads)
     check_precision(config.trainer.get("precision"))
-    clock, device = Clock(config.budget.clock).kind, device_for(config)
-    if clock != "wall" and device.type != "cpu":
-        raise ValueError(
-            f"budget.clock: expected wall, as processor time leaves out the GPU's, but got {clock!r}; "
-            "leave budget.clock out, or set trainer=cpu"
-        )
+    clock, place = Clock(config.budget.clock).kind, partial(device_for, config)
     data = instantiate(config.data, _convert_="all")
     plans = {name: stage_of(name, stage) for name, stage in config.stage.items()}
     watchers = [w for w in instantiate(config.callbacks, _convert_="all").values() if w is not None]
@@ -46,7 +41,7 @@ def build_run(config: DictConfig) -> Run:
     def make_trainer(folder: Path, callbacks: list):
         return trainer(
             # With auto, Lightning would choose a Mac's GPU, which lacks float64.
-            accelerator=device.type,
+            accelerator=place().type,
             max_epochs=1,
             max_steps=-1,
             callbacks=callbacks,
@@ -71,7 +66,7 @@ def build_run(config: DictConfig) -> Run:
         skip=config.get("sentinel", {"skip": 0})["skip"],
         tell=partial(print, flush=True),
         clock=clock,
-        device=device,
+        place=place,
     )
     run.check()
     return run

@@ -71,8 +71,8 @@ def versions() -> dict[str, str]:
 
 @cache
 def commit() -> str | None:
-    """Return the commit of the checkout that the package lies in, with a + where its files differ; None
-    where there is none.
+    """Return the commit of the checkout that the package lies in, with a + where its files or its numbers
+    (conf, sweeps) differ; None where there is none. It is looked up once, when a process first asks.
     """
     here = Path(__file__).parents[1]
 
@@ -82,7 +82,9 @@ def commit() -> str | None:
 
     try:
         git("ls-files", "--error-unmatch", "__init__.py")  # else the checkout is another project's
-        return git("rev-parse", "--short=9", "HEAD") + "+" * bool(git("status", "--porcelain", "--", "."))
+        numbers = [str(folder) for name in ("conf", "sweeps") if (folder := here.parents[1] / name).is_dir()]
+        changed = git("--no-optional-locks", "status", "--porcelain", "--", ".", *numbers)
+        return git("rev-parse", "--short=9", "HEAD") + "+" * bool(changed)
     except (OSError, subprocess.SubprocessError):
         return None
 

@@ -16,7 +16,7 @@ from forewarp.methods.method import Model, Start, parameter_count
 from forewarp.scene.cloud import Handover
 from forewarp.scene.frame import Scene
 from forewarp.training.checkpoints import KeepCheckpoint, check_state, load_weights
-from forewarp.training.device import peak_memory_bytes, reset_peak_memory
+from forewarp.training.device import commit, peak_memory_bytes, reset_peak_memory
 from forewarp.training.handover import load_handover, make_handover, save_handover
 from forewarp.training.interruption import Interruption
 from forewarp.training.module import DynamicSceneModule
@@ -43,7 +43,7 @@ class Run:
         skip: steps per stage that may be skipped because of numbers that are not finite (see ``Sentinel``).
         tell: called with a line for each stage that is loaded or continued.
         clock: what minutes are of: see ``Clock``.
-        device: that its trainers compute on.
+        place: gives the device that its trainers compute on.
     """
 
     datamodule: lightning.LightningDataModule
@@ -57,7 +57,16 @@ class Run:
     skip: int = 0
     tell: Callable[[str], None] = lambda line: None
     clock: str = "wall"
-    device: torch.device = torch.device("cpu")
+    place: Callable[[], torch.device] = lambda: torch.device("cpu")
+
+    @property
+    def device(self) -> torch.device:
+        """The device that the run computes on.
+
+        Raises:
+            ValueError: if there is no such device.
+        """
+        return self.place()
 
     def check(self) -> None:
         """Refuse keys and terms that a stage's method does not know, before anything is read.
@@ -71,8 +80,21 @@ class Run:
                 objective = stage.objective
                 check(stage.settings.name, stage.settings.numbers, objective.names, objective.literal)
 
+    def check_clock(self) -> None:
+        """Refuse to train on a GPU by the processor's clock; what is trained may be looked at on any device.
+
+        Raises:
+            ValueError: naming the key.
+        """
+        if Clock(self.clock).kind != "wall" and self.device.type != "cpu":
+            raise ValueError(
+                "budget.clock: expected wall, as processor time leaves out the GPU's, but got "
+                f"{self.clock!r}; set budget.clock=wall, or trainer=cpu"
+            )
+
     def fit(self) -> DynamicSceneModule:
         """Train all stages that are not finished; return the module of the last one."""
+        self.check_clock()
         self.datamodule.setup("fit")
         self._check_feasible()
         self._check_later_stages()
@@ -215,6 +237,7 @@ class Run:
             done = stage.settings.fraction(steps, seconds)
             self.tell(f"{stage.settings.name}: goes on at {done:.0%}, step {steps}")
         reset_peak_memory()
+        code = commit()  # now, as others may be made before the stage ends
         with interruption:
             trainer.fit(module, datamodule=self.datamodule, ckpt_path=checkpoint, weights_only=True)
         if module.fraction < 1:  # fit returned early, as when a callback stops it: the stage is not finished
@@ -232,6 +255,7 @@ class Run:
                 "frames_in_play": module.curriculum.in_play,
                 "peak_memory_bytes": peak_memory_bytes(),
                 "skipped_steps": sentinel.skipped,
+                "commit": code,
             },
         )
         if interruption.asked:  # pressed after the stage's last step
