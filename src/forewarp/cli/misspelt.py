@@ -72,15 +72,13 @@ def unknown_key(error: Exception, name: str, arguments: list[str]) -> str | None
     key, conf = found[1], configurations()
     others = [argument for argument in arguments if key_of(argument) != key]
     config = _composed(conf, name, others)
-    known = [*every_key(config), *_groups(conf)]
-    if key in known:  # but not a key of the dictionary that is its value, or not in each of several jobs
-        inner = [own for one in arguments if key_of(one) == key for own in _spread(one)[1:]]
-        unknown = next((own for own in inner if own not in known), None)
-        if unknown is None and "--multirun" not in arguments and "-m" not in arguments:
-            return None
-        if unknown is None:
-            return f"{key}: expected an option of every job, but got one that not all have; leave it out"
-        key = unknown
+    keys = list(every_key(config))
+    known = [*keys, *_groups(conf)]
+    inner = [own for one in arguments if key_of(one) == key for own in _spread(one)[1:]]
+    if key in keys and inner:  # a key of the dictionary that is its value
+        key = next((own for own in inner if own not in keys), key)
+    elif key in keys and {"--multirun", "-m"} & set(arguments):
+        return f"{key}: expected an option of every job, but got one that not all have; leave it out"
     model = config.get("model", {}).get("name")
     if key in every_key(_composed(conf, name, [one for one in others if key_of(one) in ("model", "preset")])):
         return f"{key}: expected an option, but got one that another choice takes away; leave one of them out"
