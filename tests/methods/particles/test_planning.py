@@ -49,6 +49,11 @@ def test_every_effect_is_on_at_first_and_then_left_out():
     assert drops[-1] == Drop("view_dependence", ("model/view_dependence=none",), 2)
 
 
+def test_motion_is_tried_for_longer_where_nothing_is_cut_out():
+    _, drops = walk(replace(PICTURES, cut_out=0.0), asked(), dict.fromkeys(NAMES, True))
+    assert [drop.longer for drop in drops] == [3, 1, 1, 1, 1, 2]
+
+
 def test_what_does_not_move_does_not_turn():
     _, drops = walk(PICTURES, asked(), dict.fromkeys(NAMES, False))
     assert not {"rotation", "background"} & {drop.effect for drop in drops}
