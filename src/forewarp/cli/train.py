@@ -89,15 +89,10 @@ def train(config) -> float | None:
         with locked(run.folder):
             claim(config, finished=True)
             check_data(run, changed)
-            again = f"forewarp-evaluate run={run.folder}" + (
-                f" reduce={n}" if (n := config.get("reduce")) else ""
-            )
-            print(f"measured before: {run.folder}; again with {again}")
+            other = f" reduce={config.reduce}" if config.get("reduce") else ""
+            print(f"measured before: {run.folder}; again with forewarp-evaluate run={run.folder}{other}")
             return Score(run, config).of()
-    run.check_clock()
-    run.datamodule.setup("fit")  # before the folder is made: a mistyped scene leaves nothing behind
-    if config.evaluate and config.get("reduce") is not None:
-        run.datamodule.targets("test").reduced(config.reduce)  # refused now, not when all is trained
+    refuse_early(run, config)
     score = Score(run, config)
     with watched(run, viewer), locked(run.folder):
         claim(config)
@@ -119,6 +114,14 @@ def train(config) -> float | None:
         if steps := noted.get("skipped_steps"):
             print(f"{name}: {steps} broken steps skipped; each lies in {run.folder / name / 'broken'}")
     return value
+
+
+def refuse_early(run, config) -> None:
+    """Read the scene, and refuse what could not be trained or measured, before the run's folder is made."""
+    run.check_clock()
+    run.datamodule.setup("fit")
+    if config.evaluate and config.get("reduce") is not None:
+        run.datamodule.targets("test").reduced(config.reduce)
 
 
 def viewer_of(config) -> dict | None:
