@@ -15,8 +15,8 @@ def block_sums(picture: Tensor, by: int = 2) -> Tensor:
     Cost: one read of the picture.
 
     >>> import torch
-    >>> block_sums(torch.arange(8).reshape(2, 4))
-    tensor([[10, 18]])
+    >>> block_sums(torch.arange(8).reshape(2, 4)).tolist()
+    [[10, 18]]
     """
     height, width = picture.shape[:2]
     if height % by or width % by:
