@@ -219,4 +219,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
+    if "GOMP_SPINCOUNT" not in os.environ:  # read when torch is imported, which it is already
+        os.environ.setdefault("OMP_NUM_THREADS", "1")
+        quiet()
+        os.execv(sys.executable, [sys.executable, "-m", "tests.bench.performance", *sys.argv[1:]])
     main()

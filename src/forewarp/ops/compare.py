@@ -107,25 +107,38 @@ def compare_reference(
 def _compare_numba(
     particles, warp, pinhole, tints, fades, pixels, background, width, factor, by_weights
 ) -> Compared:
-    from forewarp.ops import kernels_chain, kernels_project, kernels_rasterize
+    from forewarp.ops import kernels_project
 
     threads = match_threads()
-    view = pinhole.row(particles.means)
-    padded = torch.nn.functional.pad(warp.maps, (0, 4))
-    inputs = arrays(*particles, padded, warp.links, warp.weights, view, tints, fades)
+    inputs = inputs_of(particles, warp, pinhole, tints, fades)
     splats = torch.empty(whole(len(particles.means)), kernels_project.SPLAT)
     kernels_project.project(*inputs, splats.numpy())
     size = pinhole.size
     tiles = sorted_tiles(splats.numpy(), -(-size[0] // SIDE), -(-size[1] // SIDE), threads)
+    picture = pixels.contiguous().view(torch.int32).reshape(size[1], size[0])
+    return way_back(particles, inputs, splats, tiles, picture, background, width, factor, by_weights)
+
+
+def inputs_of(particles: Gaussians, warp: Warp, pinhole: Pinhole, tints: Tensor, fades: Tensor) -> tuple:
+    """Return what the kernels of both ways read, as arrays; maps, the sixth, have 16 numbers each."""
+    padded = torch.nn.functional.pad(warp.maps, (0, 4))
+    view = pinhole.row(particles.means)
+    return arrays(*particles, padded, warp.links, warp.weights, view, tints, fades)
+
+
+def way_back(particles, inputs, splats, tiles, picture, background, width, factor, by_weights) -> Compared:
+    """Compare sorted splats with a picture (H, W) int32 of four bytes a pixel; lead the gradients back."""
+    from forewarp.ops import kernels_chain, kernels_rasterize
+
+    threads = len(tiles.shares) - 1
     sums = torch.zeros(threads, len(tiles.order), kernels_rasterize.GRADIENT)
     found, kept = torch.zeros(threads, 2, dtype=torch.float64), kept_for(tiles, threads)
-    picture = pixels.contiguous().view(torch.int32).reshape(size[1], size[0]).numpy().view("uint32")
     kernels_rasterize.compare(
         tiles.records,
         tiles.entries,
         tiles.ends,
         tiles.shares,
-        picture,
+        picture.numpy().view("uint32"),
         *arrays(background.float()),
         kernels_rasterize.np.float32(width),
         *arrays(kept, sums, found),
@@ -135,8 +148,8 @@ def _compare_numba(
     pull = torch.zeros(len(particles.means))
     kernels_chain.slopes_of(splats.numpy(), seen, ranks, sums.numpy(), factor, by_splat.numpy(), pull.numpy())
     gradients = [torch.zeros(t.shape) for t in particles]
-    maps = torch.zeros(threads, *padded.shape)
-    weights = torch.zeros(warp.weights.shape) if by_weights else warp.weights.new_zeros(0, 0)
+    maps = torch.zeros(threads, *inputs[5].shape)
+    weights = torch.zeros(inputs[7].shape if by_weights else (0, 0))
     kernels_chain.chain(*inputs, splats.numpy(), seen, by_splat.numpy(), *arrays(*gradients, maps, weights))
     loss, squared = found.sum(0).tolist()
     return Compared(

@@ -1,45 +1,97 @@
-"""Compiling ahead of time: a step, a picture and an optimiser's step of a single particle."""
+"""Compiling ahead of time: a step, a picture and an optimiser's step of a single particle.
+
+``python -m forewarp.methods.particles.warmup`` compiles the way back alone, which is about half of the work.
+"""
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
 import torch
+from torch import Tensor
 
 from forewarp.ops.adam import adam_rows
 from forewarp.ops.backend import use_numba
-from forewarp.ops.compare import compare
+from forewarp.ops.compare import compare, inputs_of, way_back
 from forewarp.ops.nodes import carry_nodes, pull_nodes, spread_nodes
-from forewarp.ops.project import Gaussians, Pinhole, Warp, project
-from forewarp.ops.rasterize import rasterize
+from forewarp.ops.project import Gaussians, Pinhole, Warp, project, whole
+from forewarp.ops.rasterize import SIDE, Tiles, rasterize
 
 
 @torch.no_grad()
 def compile_kernels(method: torch.nn.Module) -> None:
     """Run each operator once; nothing is drawn at random, nothing of the method is touched.
 
-    A method that uses none of the kernels, as on a GPU, has nothing to compile.
+    What was never compiled on a machine is compiled by two processes, where it has two cores. A method that
+    uses none of the kernels, as on a GPU, has nothing to compile.
     """
     if not use_numba(method.means):
         return
+    from forewarp.ops import kernels_nodes
+
+    zero, one, first = torch.zeros(1, 3), torch.ones(1, 1), torch.ones(1)
+    carry_nodes(zero[:, None], zero[:, None], first, zero)
+    with _way_back_beside(kernels_nodes.carry.stats.cache_misses.total() > 0):
+        given = _single()
+        rasterize(project(*given), 9, 8)
+        two = torch.zeros(2, 1, 3)  # of a single node, half of its gradients would pass for contiguous
+        spread_nodes(two, two, torch.zeros(2, 6), first, first, 1.0, 1.0)
+        edges = torch.zeros(1, 1, dtype=torch.int64)
+        pull_nodes(torch.zeros(1, 6), zero, torch.zeros(1, 12), edges, one, 1.0)
+        moments = zero.clone(), zero.clone(), first.clone()
+        adam_rows(torch.zeros(1, 3), torch.ones(1, 3), *moments, 1e-3, (0.9, 0.99), 1e-15)
+    compare(*given, torch.zeros(72, 4, dtype=torch.uint8), torch.ones(3))
+
+
+def compile_way_back() -> None:
+    """Compile what leads from splats and a picture back to particles, by tiles in which nothing lies."""
+    from forewarp.ops.kernels_project import SPLAT
+    from forewarp.ops.kernels_rasterize import RECORD
+
+    particles, warp, pinhole, tints, fades = _single()
+    width, height = pinhole.size
+    across, down = -(-width // SIDE), -(-height // SIDE)
+    none, ends = np.zeros(0, np.int32), np.zeros(across * down + 1, np.int64)
+    shares = np.array([0, across * down])
+    tiles = Tiles(none, np.zeros((0, RECORD), np.float32), none, ends, shares, 0)
+    picture, splats = torch.zeros(height, width, dtype=torch.int32), torch.zeros(whole(1), SPLAT)
+    inputs = inputs_of(particles, warp, pinhole, tints, fades)
+    way_back(particles, inputs, splats, tiles, picture, torch.ones(3), 1.0, 1.0, False)
+
+
+def _single() -> tuple[Gaussians, Warp, Pinhole, Tensor, Tensor]:
+    """A particle, its warp and a camera."""
     zero, one = torch.zeros(1, 3), torch.ones(1, 1)
     particles = Gaussians(zero, zero, torch.ones(1, 4), one, torch.zeros(1, 1, 3))
     warp = Warp(torch.zeros(1, 12), torch.zeros(1, 1, dtype=torch.int32), one)
     eye = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
     pinhole = Pinhole(eye, (0.0, 0.0, -2.0), (8.0, 8.0), (4.0, 4.0), (9, 8), 0.1)
-    none, first = torch.zeros(0), torch.ones(1)
-    compare(particles, warp, pinhole, none, first, torch.zeros(72, 4, dtype=torch.uint8), torch.ones(3))
-    rasterize(project(particles, warp, pinhole, none, first), 9, 8)
-    edges = torch.zeros(1, 1, dtype=torch.int64)
-    carry_nodes(zero[:, None], zero[:, None], first, zero)
-    two = torch.zeros(2, 1, 3)  # of a single node, half of its gradients would pass for contiguous
-    spread_nodes(two, two, torch.zeros(2, 6), first, first, 1.0, 1.0)
-    pull_nodes(torch.zeros(1, 6), zero, torch.zeros(1, 12), edges, one, 1.0)
-    adam_rows(
-        torch.zeros(1, 3),
-        torch.ones(1, 3),
-        zero.clone(),
-        zero.clone(),
-        first.clone(),
-        1e-3,
-        (0.9, 0.99),
-        1e-15,
-    )
+    return particles, warp, pinhole, torch.zeros(0), torch.ones(1)
+
+
+@contextmanager
+def _way_back_beside(new: bool) -> Iterator[None]:
+    """Let another process compile the way back meanwhile, if kernels are ``new`` and there is a core for it.
+
+    It leaves them in the cache on disk, where this process finds them; what it does not get done, is
+    compiled here.
+    """
+    if not new or len(os.sched_getaffinity(0)) < 2:
+        yield
+        return
+    command = [sys.executable, "-m", __name__]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+        try:
+            yield
+        except BaseException:
+            process.kill()
+            raise
+
+
+if __name__ == "__main__":
+    compile_way_back()

@@ -1,0 +1,64 @@
+"""Kernels that are compiled ahead are those that a step calls."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from forewarp.methods.particles import warmup
+from forewarp.ops.backend import numba_installed
+
+pytestmark = pytest.mark.skipif(not numba_installed(), reason="needs Numba")
+
+
+def _signatures() -> dict[str, list]:
+    from forewarp.ops import kernels_chain, kernels_rasterize
+
+    kernels = (kernels_rasterize.compare, kernels_chain.ranked, kernels_chain.slopes_of, kernels_chain.chain)
+    return {kernel.py_func.__name__: list(kernel.signatures) for kernel in kernels}
+
+
+def test_the_process_beside_compiles_for_the_numbers_that_a_step_has():
+    script = (
+        "import json, types, torch\n"
+        "from forewarp.methods.particles import warmup\n"
+        "from tests.methods.particles.test_warmup import _signatures\n"
+        "warmup.compile_way_back(); before = _signatures()\n"
+        "warmup.compile_kernels(types.SimpleNamespace(means=torch.zeros(1, 3)))\n"
+        "assert all(len(found) == 1 for found in before.values()), before\n"
+        "assert _signatures() == before, (before, _signatures())\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_another_process_is_started_only_for_new_kernels_and_a_second_core(monkeypatch):
+    started = []
+
+    class Process:
+        def __init__(self, command, **_):
+            started.append(command)
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_):
+            return None
+
+        def kill(self):
+            started.append("killed")
+
+    monkeypatch.setattr(subprocess, "Popen", Process)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1})
+    with warmup._way_back_beside(False):
+        assert not started
+    with warmup._way_back_beside(True):
+        assert started == [[sys.executable, "-m", "forewarp.methods.particles.warmup"]]
+    with pytest.raises(KeyboardInterrupt), warmup._way_back_beside(True):
+        raise KeyboardInterrupt
+    assert started[-1] == "killed"
+    started.clear()
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0})
+    with warmup._way_back_beside(True):
+        assert not started
