@@ -16,7 +16,7 @@ DEVICE ?= gpu
 SHELL := bash
 .SHELLFLAGS := -o pipefail -c
 # Large memory pages, as the commands use; one thread, as threads that wait for a busy core spoil the timing.
-MEASURE := OMP_NUM_THREADS=1 OMP_WAIT_POLICY=passive GOMP_SPINCOUNT=3000 THP_MEM_ALLOC_ENABLE=1
+MEASURE := OMP_NUM_THREADS=1 OMP_WAIT_POLICY=passive GOMP_SPINCOUNT=10000 THP_MEM_ALLOC_ENABLE=1
 MORE = budget.minutes=$(MINUTES) $(SEED) $(if $(THREADS),threads=$(THREADS))
 comma := ,
 # SEEDS=3: run each job with seeds 0, 1 and 2; SEEDS=4,7: with these.
