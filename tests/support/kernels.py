@@ -15,6 +15,7 @@ def watch(monkeypatch, *parts):
             met.add((name, *(str(numba.typeof(a)) for a in arguments)))
             return kernel(*arguments)
 
+        call.stats = kernel.stats
         return call
 
     for part in parts:

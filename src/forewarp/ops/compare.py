@@ -110,23 +110,23 @@ def _compare_numba(
     from forewarp.ops import kernels_project
 
     threads = match_threads()
-    inputs = inputs_of(particles, warp, pinhole, tints, fades)
+    inputs = _inputs_of(particles, warp, pinhole, tints, fades)
     splats = torch.empty(whole(len(particles.means)), kernels_project.SPLAT)
     kernels_project.project(*inputs, splats.numpy())
     size = pinhole.size
     tiles = sorted_tiles(splats.numpy(), -(-size[0] // SIDE), -(-size[1] // SIDE), threads)
     picture = pixels.contiguous().view(torch.int32).reshape(size[1], size[0])
-    return way_back(particles, inputs, splats, tiles, picture, background, width, factor, by_weights)
+    return _way_back(particles, inputs, splats, tiles, picture, background, width, factor, by_weights)
 
 
-def inputs_of(particles: Gaussians, warp: Warp, pinhole: Pinhole, tints: Tensor, fades: Tensor) -> tuple:
+def _inputs_of(particles: Gaussians, warp: Warp, pinhole: Pinhole, tints: Tensor, fades: Tensor) -> tuple:
     """Return what the kernels of both ways read, as arrays; maps, the sixth, have 16 numbers each."""
     padded = torch.nn.functional.pad(warp.maps, (0, 4))
     view = pinhole.row(particles.means)
     return arrays(*particles, padded, warp.links, warp.weights, view, tints, fades)
 
 
-def way_back(particles, inputs, splats, tiles, picture, background, width, factor, by_weights) -> Compared:
+def _way_back(particles, inputs, splats, tiles, picture, background, width, factor, by_weights) -> Compared:
     """Compare sorted splats with a picture (H, W) int32 of four bytes a pixel; lead the gradients back."""
     from forewarp.ops import kernels_chain, kernels_rasterize
 

@@ -12,6 +12,7 @@ from forewarp.fields.curves import Curve
 from forewarp.methods.method import Method, Snapshot, Start, Step
 from forewarp.methods.particles import matter, opacity
 from forewarp.methods.particles.camera import Pinholes
+from forewarp.methods.particles.clock import Clock
 from forewarp.methods.particles.density import renew
 from forewarp.methods.particles.effects import Effects, cosines
 from forewarp.methods.particles.feasible import check_feasible
@@ -72,7 +73,8 @@ class Particles(Method):
             curve = Curve(on.motion, knots, len(times), self.canonical_time)
             points, edges = None if start.blank else self.means.data, self.numbers_of.edges
             turns, rests = on.rotation is not None, on.background is not None
-            self.nodes = Nodes(points, count, curve, turns=turns, rests=rests, edges=edges)
+            clock = Clock.of(on.motion, times, self.numbers_of.clock)
+            self.nodes = Nodes(points, count, curve, clock, turns=turns, rests=rests, edges=edges)
             self.skin = Skin(self.nodes, self.means.data)
         resting = None if on.background is None else torch.zeros(len(self.means), dtype=torch.bool)
         self.register_buffer("resting", resting)
@@ -222,7 +224,7 @@ class Particles(Method):
         tints, fades = self.over_time(time)
         own, warp = {}, None
         if self.nodes is not None:
-            self.nodes.look_ahead(time, time)
+            self.nodes.look_at(time)
             basis = self.nodes.basis(time)
             motion, maps = self.nodes.carried(basis)
             warp = Warp(maps, self.skin.links, self.skin.weights())
@@ -272,6 +274,9 @@ class Particles(Method):
         for group in optimizer.param_groups:
             if group["name"] in ("means", "shifts"):
                 group["lr"] *= float(self.extent)
+            elif group["name"] == "clock":
+                group["lr"] *= progress >= numbers.calm
+                self.nodes.clock.settle(group["lr"])
             elif group["name"] == "skin":
                 group["lr"] *= told_by(self.views)
         number = int(progress / numbers.every)
@@ -302,8 +307,7 @@ class Particles(Method):
         """See ``Method``."""
         groups = {name: [p] for name, p in self.named_parameters(recurse=False)}
         if self.nodes is not None:
-            groups |= {"shifts": [self.nodes.shift], "skin": [self.skin.learned]}
-            groups |= {} if self.nodes.turn is None else {"node_turns": [self.nodes.turn]}
+            groups |= {"skin": [self.skin.learned]} | self.nodes.param_groups()
         return groups
 
     def optimizer(self, groups: list[dict]) -> torch.optim.Optimizer:

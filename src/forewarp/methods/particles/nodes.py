@@ -8,12 +8,14 @@ import torch
 from torch import Tensor, nn
 
 from forewarp.fields.curves import Curve
+from forewarp.methods.particles.clock import Clock
 from forewarp.ops.nodes import carry_nodes, spread_nodes
 from forewarp.scene.cloud import far_apart
 
 LINKS = 6  # nodes that a particle follows
 _LEAST = 1e-20  # squared distance; what is nearer together coincides, and cannot be strained
 _DAMP = 0.5  # of a curve's last stride, where it is continued to times not yet seen
+_NEAR = 1e-3  # half of the time over which a slope by time is taken
 _FULL = 0.05  # share of a spline's basis at a time, from which on its knot counts as seen
 
 
@@ -46,6 +48,7 @@ class Nodes(nn.Module):
         points: (N, 3) canonical points that are to move; None: a checkpoint will say.
         count: of nodes.
         curve: of every node.
+        clock: when pictures were taken; None: when they say.
         turns: whether nodes turn.
         rests: whether nodes may ``stop``; ``still`` (M,) bool says which have.
         edges: neighbours that a node is kept rigid with.
@@ -58,13 +61,14 @@ class Nodes(nn.Module):
         points: Tensor | None,
         count: int,
         curve: Curve,
+        clock: Clock | None = None,
         *,
         turns: bool = True,
         rests: bool = False,
         edges: int = 6,
     ) -> None:
         super().__init__()
-        self.curve = curve
+        self.curve, self.clock = curve, clock
         places = torch.zeros(1, 3) if points is None else points[far_apart(points, count)].clone()
         self.register_buffer("places", places)
         away, beside = nearest(places, places, edges + 1)
@@ -94,8 +98,15 @@ class Nodes(nn.Module):
         return rows.int(), (shares / shares.sum(-1, keepdim=True)).contiguous()
 
     def basis(self, time: float) -> Tensor:
-        """The curve's basis (K,) at a time, as the coefficients are."""
-        return self.curve(time).to(self.places)
+        """The curve's basis (K,) at a given time, as the coefficients are."""
+        return self._basis(self.taken(time))
+
+    def taken(self, time: float) -> float:
+        """The time of the motion in a picture of a given time."""
+        return time if self.clock is None else self.clock(time)
+
+    def _basis(self, taken: float) -> Tensor:
+        return self.curve(taken).to(self.places)
 
     def carried(self, basis: Tensor) -> tuple[Tensor, Tensor]:
         """Where nodes went and how they turned (M, 6), by a curve's basis (K,), and their maps (M, 12)."""
@@ -105,10 +116,21 @@ class Nodes(nn.Module):
         """``ops.nodes.node_maps`` (M, 12) at a time."""
         return self.carried(self.basis(time))[1]
 
+    def param_groups(self) -> dict[str, list[nn.Parameter]]:
+        """What is learned, by the name of its rate."""
+        clock = None if self.clock is None else self.clock.off
+        parts = {"shifts": self.shift, "node_turns": self.turn, "clock": clock}
+        return {name: [part] for name, part in parts.items() if part is not None}
+
+    def look_at(self, time: float) -> None:
+        """Note that a picture of a given time is seen, and ``look_ahead``."""
+        taken = min(max(self.taken(time), 0.0), 1.0)
+        self.look_ahead(taken, taken)
+
     @torch.no_grad()
     def look_ahead(self, low: float, high: float) -> None:
-        """Continue curves beyond the times [low, high] that have been seen: a knot beyond them starts as a
-        damped continuation of the two before it.
+        """Continue curves beyond the times of the motion [low, high] that have been seen: a knot beyond them
+        starts as a damped continuation of the two before it.
         """
         first, last = self.seen.tolist()
         if low >= first and high <= last:
@@ -155,7 +177,7 @@ class Nodes(nn.Module):
                 value[which] = stays[:, None] if self.curve.kind == "spline" else 0.0
 
     def _bases(self, times: list[float]) -> Tensor:
-        return torch.stack([self.curve(time) for time in times]).to(self.places)
+        return torch.stack([self.basis(time) for time in times])
 
     def rows(self) -> list[str]:
         """What has a row a node."""
@@ -201,8 +223,17 @@ class Nodes(nn.Module):
             for part in found:
                 if part is not None:
                     part[self.still] = 0.0  # rounding errors would be steps, as Adam takes them
-        names = ("nodes.shift", "nodes.turn")
+        if self.clock is not None:
+            found.append(self.clock.slopes(time, self._by_time(self.taken(time), slope)))
+        names = ("nodes.shift", "nodes.turn", "nodes.clock.off")
         return bent, {name: part for name, part in zip(names, found) if part is not None}
+
+    def _by_time(self, taken: float, slope: Tensor) -> float:
+        """From slopes (M, 6) by ``motion`` to the one by its time."""
+        along = (self._basis(taken + _NEAR) - self._basis(taken - _NEAR)) / (2 * _NEAR)
+        moved = torch.einsum("mkc,k->mc", self.shift, along)
+        turned = torch.zeros_like(moved) if self.turn is None else torch.einsum("mkc,k->mc", self.turn, along)
+        return (torch.cat([moved, turned], -1) * slope).sum().detach().item()
 
     def _bend(self, time: float) -> Tensor:
         """The second difference (K,) of the basis around a time, within the times that have been seen."""
@@ -210,8 +241,8 @@ class Nodes(nn.Module):
         low, high = low + step, high - step
         if low > high:
             return self.places.new_zeros(self.curve.count)
-        middle = min(max(time, low), high)
+        middle = min(max(self.taken(time), low), high)
         before, now, after = (
-            self.basis(min(max(t, 0.0), 1.0)) for t in (middle - step, middle, middle + step)
+            self._basis(min(max(t, 0.0), 1.0)) for t in (middle - step, middle, middle + step)
         )
         return after - 2 * now + before

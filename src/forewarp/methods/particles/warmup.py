@@ -17,7 +17,7 @@ from torch import Tensor
 
 from forewarp.ops.adam import adam_rows
 from forewarp.ops.backend import use_numba
-from forewarp.ops.compare import compare, inputs_of, way_back
+from forewarp.ops.compare import _inputs_of, _way_back, compare
 from forewarp.ops.nodes import carry_nodes, pull_nodes, spread_nodes
 from forewarp.ops.project import Gaussians, Pinhole, Warp, project, whole
 from forewarp.ops.rasterize import SIDE, Tiles, rasterize
@@ -60,8 +60,8 @@ def compile_way_back() -> None:
     shares = np.array([0, across * down])
     tiles = Tiles(none, np.zeros((0, RECORD), np.float32), none, ends, shares, 0)
     picture, splats = torch.zeros(height, width, dtype=torch.int32), torch.zeros(whole(1), SPLAT)
-    inputs = inputs_of(particles, warp, pinhole, tints, fades)
-    way_back(particles, inputs, splats, tiles, picture, torch.ones(3), 1.0, 1.0, False)
+    inputs = _inputs_of(particles, warp, pinhole, tints, fades)
+    _way_back(particles, inputs, splats, tiles, picture, torch.ones(3), 1.0, 1.0, False)
 
 
 def _single() -> tuple[Gaussians, Warp, Pinhole, Tensor, Tensor]:

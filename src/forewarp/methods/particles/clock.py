@@ -1,0 +1,72 @@
+"""When pictures were taken, where the time that is written beside them is not quite it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+_FEWEST = 8  # times: neighbours must tell how things move
+_PULL = 0.1  # of the rate: how much a step draws towards 0
+
+
+class Clock(nn.Module):
+    """The time of the motion at T training times: each is ``off`` (T, 1) from the one that is given, in units
+    of their mean distance; in between, on a line.
+
+    Published sequences hold their first picture twice, leave one out before the last, or round their times. A
+    smooth motion cannot follow, and errs where one picture does not tell: along its line of sight.
+
+    Args:
+        times: distinct, two or more.
+        most: bound of ``off``.
+    """
+
+    def __init__(self, times: Sequence[float], most: float) -> None:
+        super().__init__()
+        self.most = most
+        self.register_buffer("times", torch.tensor(sorted(times), dtype=torch.float64), persistent=False)
+        self.step = (max(times) - min(times)) / (len(times) - 1)
+        self.off = nn.Parameter(torch.zeros(len(times), 1))
+
+    @classmethod
+    def of(cls, motion: str, times: Sequence[float], most: float) -> Clock | None:
+        """Make the clock of a motion; None where it may not be off, of few times, and of cosines, which are
+        exactly 0 at the canonical time.
+        """
+        return cls(times, most) if most and motion == "spline" and len(times) >= _FEWEST else None
+
+    def weights(self, time: float) -> dict[int, float]:
+        """The rows of the one or two training times around a time, and how much each counts.
+
+        >>> Clock([0.0, 0.5, 1.0], 1.5).weights(0.625)
+        {1: 0.75, 2: 0.25}
+        """
+        after = int(torch.searchsorted(self.times, time))
+        if after in (0, len(self.times)):
+            return {min(after, len(self.times) - 1): 1.0}
+        low, high = self.times[after - 1 : after + 1].tolist()
+        share = (time - low) / (high - low)
+        return {row: part for row, part in ((after - 1, 1 - share), (after, share)) if part > 0}
+
+    def __call__(self, time: float) -> float:
+        """The time of the motion, up to ``most`` steps beyond [0, 1]."""
+        off = sum(part * self.off.detach()[row].item() for row, part in self.weights(time).items())
+        return time + self.step * off
+
+    def slopes(self, time: float, by_motion: float) -> Tensor:
+        """From the slope by the time of the motion to those by ``off``."""
+        found = torch.zeros_like(self.off)
+        for row, part in self.weights(time).items():
+            found[row] = part * self.step * by_motion
+        return found
+
+    @torch.no_grad()
+    def settle(self, rate: float) -> None:
+        """Draw towards 0 what pictures do not hold, by a share of the learning rate, and keep to the bound.
+
+        Every picture counts once in T steps, so that a step's share is a T-th.
+        """
+        size = (self.off.abs() - _PULL * rate / len(self.times)).clamp(0.0, self.most)
+        self.off.copy_(size * self.off.sign())

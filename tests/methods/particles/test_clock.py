@@ -1,0 +1,96 @@
+"""The time of the motion, where pictures are off the time that is given."""
+
+import pytest
+import torch
+
+from forewarp.fields.curves import Curve
+from forewarp.methods.particles.clock import Clock
+from forewarp.methods.particles.nodes import Nodes
+
+TIMES = [0.0, 0.25, 0.5, 0.75, 1.0]
+
+
+def test_between_two_training_times_a_clock_is_off_on_a_line():
+    clock = Clock(TIMES, 1.5)
+    clock.off.data[:] = torch.tensor([[0.0], [1.0], [0.0], [0.0], [-1.0]])
+    assert clock(0.0) == 0.0
+    assert clock(0.25) == 0.5
+    assert clock(0.125) == 0.25
+    assert clock(1.0) == 0.75
+
+
+def test_a_clock_beyond_the_training_times_is_that_of_the_last():
+    clock = Clock([0.25, 0.5, 0.75], 1.5)
+    clock.off.data[:] = torch.tensor([[0.5], [0.0], [1.0]])
+    assert clock(0.0) == 0.125
+    assert clock(1.0) == 1.25
+
+
+def test_clocks_are_of_splines_and_can_be_switched_off():
+    many = [0.1 * i for i in range(11)]
+    assert isinstance(Clock.of("spline", many, 1.5), Clock)
+    assert Clock.of("cosines", many, 1.5) is None
+    assert Clock.of("spline", many, 0) is None
+    assert Clock.of("spline", TIMES, 1.5) is None
+
+
+def test_settling_draws_to_the_given_time_and_keeps_to_the_bound():
+    clock = Clock(TIMES, 1.5)
+    clock.off.data[:] = torch.tensor([[2.0], [-2.0], [0.01], [-0.01], [0.5]])
+    clock.settle(1.0)
+    torch.testing.assert_close(clock.off[:, 0], torch.tensor([1.5, -1.5, 0.0, 0.0, 0.48]))
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("turns", [True, False])
+@pytest.mark.parametrize("time", [0.0, 0.3, 1.0])
+def test_slopes_by_the_clock_are_finite_differences(turns, time):
+    draw = torch.Generator().manual_seed(0)
+    points = torch.rand(40, 3, generator=draw)
+    clock = Clock(TIMES, 1.5)
+    clock.off.data[:] = torch.rand(5, 1, generator=draw) - 0.5
+    nodes = Nodes(points, 6, Curve("spline", 8, 5, 0.0), clock, turns=turns)
+    for value in (nodes.shift, nodes.turn):
+        if value is not None:
+            value.data[:] = torch.rand(value.shape, generator=draw) - 0.5
+    nodes.double()
+    slope = torch.rand(6, 6, generator=draw, dtype=torch.float64)
+    if not turns:
+        slope[:, 3:] = 0
+    nodes.look_at(time)
+    found = nodes.spread_over_time(time, nodes.basis(time), slope, 0.0, 1.0)[1]["nodes.clock.off"]
+
+    def loss() -> float:
+        return float((nodes.carried(nodes.basis(time))[0] * slope).sum())
+
+    for row in range(5):
+        sides = []
+        for step in (1e-2, -2e-2):
+            clock.off.data[row] += step
+            sides.append(loss())
+        clock.off.data[row] += 1e-2
+        assert float(found[row]) == pytest.approx((sides[0] - sides[1]) / 2e-2, rel=2e-2, abs=1e-5)
+
+
+@torch.no_grad()
+def test_a_first_picture_that_shows_the_second_time_is_understood():
+    times, speed = [i / 20 for i in range(21)], torch.tensor([2.0, 1.0, 0.5])
+    clock = Clock(times, 1.5)
+    nodes = Nodes(torch.zeros(1, 3), 1, Curve("spline", 8, 21, 0.0), clock, turns=False)
+    nodes.shift.copy_((torch.arange(8.0)[:, None] - 1) / 5 * speed)  # an even motion
+    adam = torch.optim.Adam([clock.off], lr=0.1, betas=(0.9, 0.99))
+    for _ in range(200):
+        clock.off.grad = torch.zeros_like(clock.off)
+        for time in times:
+            slope = nodes.carried(nodes.basis(time))[0]
+            slope[:, :3] -= speed * max(times[1], time)
+            slope[:, 2] = 0  # along the line of sight
+            clock.off.grad += nodes.spread_over_time(time, nodes.basis(time), slope, 0.0, 1.0)[1][
+                "nodes.clock.off"
+            ]
+        adam.step()
+        clock.settle(0.1)
+        adam.param_groups[0]["lr"] *= 0.98
+    assert float(clock.off[0]) == pytest.approx(1.0, abs=0.05)
+    assert float(clock.off[1:].abs().max()) < 0.05
+    assert float(nodes.carried(nodes.basis(0.0))[0][0, 2]) == pytest.approx(0.5 * times[1], abs=2e-3)
