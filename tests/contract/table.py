@@ -210,7 +210,12 @@ METHODS = {
         ),
         RATES,
         {"photo": 1.0, "rigid": 3.0, "smooth": 0.1},
-        {"every": 0.05, "settled": 0.9, "lr_final_factor": dict.fromkeys(RATES, 0.1) | {"means": 0.01}},
+        {
+            "every": 0.05,
+            "settled": 0.9,
+            "clock": 1.5,
+            "lr_final_factor": dict.fromkeys(RATES, 0.1) | {"means": 0.01},
+        },
         steps=150,
         effects=OF_PARTICLES,
     ),

@@ -73,9 +73,9 @@ def _arguments(name: str) -> list[str]:
 def quiet() -> None:
     """Set what must be set before torch is imported, and silence the notices of other packages."""
     # Threads that wait spinning are many times slower on a busy machine; those that sleep at once wake so
-    # late that a second thread brings nothing. Microseconds of spinning cost nothing and bring all of it.
-    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-    os.environ.setdefault("GOMP_SPINCOUNT", "10000")
+    # late that a second thread brings nothing. A fraction of a millisecond costs nothing, and brings it.
+    if os.environ.setdefault("OMP_WAIT_POLICY", "passive") == "passive":
+        os.environ.setdefault("GOMP_SPINCOUNT", "10000")
     # Large pages: first touches of small ones take 20 to 40 % of a U-Net's step on a CPU.
     os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")
     _keep_memory()

@@ -9,7 +9,6 @@ from forewarp.ops.dct import dct_basis
 from forewarp.ops.spline import spline_basis
 
 KINDS = ("spline", "cosines")
-_BEYOND = 0.25  # of all time, by which a spline may be continued
 _PADDING = 0.2  # of the sequence, imagined before and after it: a cosine stands still at both ends
 
 
@@ -38,10 +37,10 @@ class Curve:
         self.kind, self.times, self.canonical_time = kind, times, canonical_time
         self.count = max(4, count) if kind == "spline" else max(1, min(count, times - 1))
 
-    def __call__(self, time: float | Tensor) -> Tensor:
-        """The basis (..., K) at a time in [0, 1]; of a spline, a little beyond, too."""
+    def __call__(self, time: float | Tensor, beyond: float = 0.0) -> Tensor:
+        """The basis (..., K) at a time in [0, 1]; of a spline, by so much ``beyond`` it, too."""
         if self.kind == "spline":
-            return spline_basis(time, self.count, beyond=_BEYOND)
+            return spline_basis(time, self.count, beyond=beyond)
         return dct_basis(time, self.count, self.times, self.canonical_time, _PADDING)
 
     def reach(self) -> Tensor | None:

@@ -12,18 +12,18 @@ TIMES = [0.0, 0.25, 0.5, 0.75, 1.0]
 
 def test_between_two_training_times_a_clock_is_off_on_a_line():
     clock = Clock(TIMES, 1.5)
-    clock.off.data[:] = torch.tensor([[0.0], [1.0], [0.0], [0.0], [-1.0]])
+    clock.off.data[:] = torch.tensor([[0.0], [0.5], [0.0], [0.0], [-0.5]])
     assert clock(0.0) == 0.0
-    assert clock(0.25) == 0.5
-    assert clock(0.125) == 0.25
-    assert clock(1.0) == 0.75
+    assert clock(0.25) == 0.375
+    assert clock(0.125) == 0.1875
+    assert clock(1.0) == 0.875
 
 
 def test_a_clock_beyond_the_training_times_is_that_of_the_last():
     clock = Clock([0.25, 0.5, 0.75], 1.5)
-    clock.off.data[:] = torch.tensor([[0.5], [0.0], [1.0]])
+    clock.off.data[:] = torch.tensor([[0.5], [0.0], [0.75]])
     assert clock(0.0) == 0.125
-    assert clock(1.0) == 1.25
+    assert clock(1.0) == 1.1875
 
 
 def test_clocks_are_of_splines_and_can_be_switched_off():
@@ -35,10 +35,28 @@ def test_clocks_are_of_splines_and_can_be_switched_off():
 
 
 def test_settling_draws_to_the_given_time_and_keeps_to_the_bound():
-    clock = Clock(TIMES, 1.5)
+    clock = Clock(TIMES, 0.75)
     clock.off.data[:] = torch.tensor([[2.0], [-2.0], [0.01], [-0.01], [0.5]])
+    assert clock(0.0) == 0.75 * 0.25  # what a step has just left is bound, too
     clock.settle(1.0)
-    torch.testing.assert_close(clock.off[:, 0], torch.tensor([1.5, -1.5, 0.0, 0.0, 0.48]))
+    torch.testing.assert_close(clock.off[:, 0], torch.tensor([0.75, -0.75, 0.0, 0.0, 0.48]))
+
+
+def test_no_time_is_off_by_more_than_a_fifth_of_all():
+    clock = Clock(TIMES, 1.5)
+    clock.off.data.fill_(9.0)
+    assert clock(1.0) == pytest.approx(1.2)
+
+
+@torch.no_grad()
+def test_a_clock_that_does_not_learn_yet_has_no_slopes():
+    clock = Clock(TIMES, 0.75)
+    nodes = Nodes(torch.zeros(1, 3), 1, Curve("spline", 8, 5, 0.0), clock, turns=False)
+    slope = torch.ones(1, 6)
+    for learns in (False, True):
+        clock.settle(1.0, learns=learns)
+        found = nodes.spread_over_time(0.5, nodes.basis(0.5), slope, 0.0, 1.0)[1]
+        assert ("nodes.clock.off" in found) is learns
 
 
 @torch.no_grad()

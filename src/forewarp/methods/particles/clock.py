@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 _FEWEST = 8  # times: neighbours must tell how things move
+_FARTHEST = 0.2  # of all time
 _PULL = 0.1  # of the rate: how much a step draws towards 0
 
 
@@ -20,14 +21,15 @@ class Clock(nn.Module):
 
     Args:
         times: distinct, two or more.
-        most: bound of ``off``.
+        most: bound of ``off``; of few times less, so that none is off by more than a fifth of all time.
     """
 
     def __init__(self, times: Sequence[float], most: float) -> None:
         super().__init__()
-        self.most = most
         self.register_buffer("times", torch.tensor(sorted(times), dtype=torch.float64), persistent=False)
         self.step = (max(times) - min(times)) / (len(times) - 1)
+        self.most = min(most, _FARTHEST / self.step)
+        self.learns = True
         self.off = nn.Parameter(torch.zeros(len(times), 1))
 
     @classmethod
@@ -53,7 +55,7 @@ class Clock(nn.Module):
     def __call__(self, time: float) -> float:
         """The time of the motion, up to ``most`` steps beyond [0, 1]."""
         off = sum(part * self.off.detach()[row].item() for row, part in self.weights(time).items())
-        return time + self.step * off
+        return time + self.step * min(max(off, -self.most), self.most)
 
     def slopes(self, time: float, by_motion: float) -> Tensor:
         """From the slope by the time of the motion to those by ``off``."""
@@ -63,10 +65,11 @@ class Clock(nn.Module):
         return found
 
     @torch.no_grad()
-    def settle(self, rate: float) -> None:
-        """Draw towards 0 what pictures do not hold, by a share of the learning rate, and keep to the bound.
+    def settle(self, rate: float, *, learns: bool = True) -> None:
+        """Draw towards 0 what pictures do not hold, and keep to the bound; ``learns`` until the next call?
 
-        Every picture counts once in T steps, so that a step's share is a T-th.
+        A time's pictures count once in about T steps, so that a step draws by a T-th of a share of the rate.
         """
+        self.learns = learns
         size = (self.off.abs() - _PULL * rate / len(self.times)).clamp(0.0, self.most)
         self.off.copy_(size * self.off.sign())

@@ -275,8 +275,7 @@ class Particles(Method):
             if group["name"] in ("means", "shifts"):
                 group["lr"] *= float(self.extent)
             elif group["name"] == "clock":
-                group["lr"] *= progress >= numbers.calm
-                self.nodes.clock.settle(group["lr"])
+                self.nodes.clock.settle(group["lr"], learns=progress >= numbers.calm)
             elif group["name"] == "skin":
                 group["lr"] *= told_by(self.views)
         number = int(progress / numbers.every)

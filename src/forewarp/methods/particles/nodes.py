@@ -15,6 +15,7 @@ from forewarp.scene.cloud import far_apart
 LINKS = 6  # nodes that a particle follows
 _LEAST = 1e-20  # squared distance; what is nearer together coincides, and cannot be strained
 _DAMP = 0.5  # of a curve's last stride, where it is continued to times not yet seen
+_BEYOND = 0.25  # of all time, by which a clock may ask for more of a curve
 _NEAR = 1e-3  # half of the time over which a slope by time is taken
 _FULL = 0.05  # share of a spline's basis at a time, from which on its knot counts as seen
 
@@ -106,7 +107,7 @@ class Nodes(nn.Module):
         return time if self.clock is None else self.clock(time)
 
     def _basis(self, taken: float) -> Tensor:
-        return self.curve(taken).to(self.places)
+        return self.curve(taken, 0.0 if self.clock is None else _BEYOND).to(self.places)
 
     def carried(self, basis: Tensor) -> tuple[Tensor, Tensor]:
         """Where nodes went and how they turned (M, 6), by a curve's basis (K,), and their maps (M, 12)."""
@@ -223,7 +224,7 @@ class Nodes(nn.Module):
             for part in found:
                 if part is not None:
                     part[self.still] = 0.0  # rounding errors would be steps, as Adam takes them
-        if self.clock is not None:
+        if self.clock is not None and self.clock.learns:
             found.append(self.clock.slopes(time, self._by_time(self.taken(time), slope)))
         names = ("nodes.shift", "nodes.turn", "nodes.clock.off")
         return bent, {name: part for name, part in zip(names, found) if part is not None}

@@ -34,7 +34,7 @@ class Numbers:
         rest: share from which nodes that do not move come to rest, where the model has a background.
         jitter, calm: spread of the random shift of a picture's time, which falls to 0 at the share ``calm``.
         clock: by how much, times the mean distance of two times, a picture may be off the time that is given;
-            splines alone; 0: no picture is.
+            learned from ``calm`` on, of splines alone; 0: no picture is.
         loose: what is left of the weight of ``rigid`` at the end.
         name: name of the stage.
 

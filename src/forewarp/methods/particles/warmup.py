@@ -9,7 +9,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 import numpy as np
 import torch
@@ -21,6 +21,8 @@ from forewarp.ops.compare import _inputs_of, _way_back, compare
 from forewarp.ops.nodes import carry_nodes, pull_nodes, spread_nodes
 from forewarp.ops.project import Gaussians, Pinhole, Warp, project, whole
 from forewarp.ops.rasterize import SIDE, Tiles, rasterize
+
+_PATIENCE_S = 120.0  # that the other process is waited for
 
 
 @torch.no_grad()
@@ -35,8 +37,9 @@ def compile_kernels(method: torch.nn.Module) -> None:
     from forewarp.ops import kernels_nodes
 
     zero, one, first = torch.zeros(1, 3), torch.ones(1, 1), torch.ones(1)
+    missed = kernels_nodes.carry.stats.cache_misses.total()
     carry_nodes(zero[:, None], zero[:, None], first, zero)
-    with _way_back_beside(kernels_nodes.carry.stats.cache_misses.total() > 0):
+    with _way_back_beside(kernels_nodes.carry.stats.cache_misses.total() > missed):
         given = _single()
         rasterize(project(*given), 9, 8)
         two = torch.zeros(2, 1, 3)  # of a single node, half of its gradients would pass for contiguous
@@ -78,19 +81,24 @@ def _single() -> tuple[Gaussians, Warp, Pinhole, Tensor, Tensor]:
 def _way_back_beside(new: bool) -> Iterator[None]:
     """Let another process compile the way back meanwhile, if kernels are ``new`` and there is a core for it.
 
-    It leaves them in the cache on disk, where this process finds them; what it does not get done, is
-    compiled here.
+    It leaves them in the cache on disk, where this process finds them; what it does not get done is
+    compiled here. It is never killed, as half a file in the cache would be worse than none.
     """
-    if not new or len(os.sched_getaffinity(0)) < 2:
-        yield
-        return
-    command = [sys.executable, "-m", __name__]
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
-        try:
-            yield
-        except BaseException:
-            process.kill()
-            raise
+    process = None
+    if new and _cores() > 1:
+        with suppress(OSError):
+            command = [sys.executable, "-m", "forewarp.methods.particles.warmup"]
+            process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    yield
+    if process is not None:
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(_PATIENCE_S)
+
+
+def _cores() -> int:
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 if __name__ == "__main__":
