@@ -15,8 +15,6 @@ MODEL ?=
 DEVICE ?= gpu
 SHELL := bash
 .SHELLFLAGS := -o pipefail -c
-# Large memory pages, as the commands use; one thread, as threads that wait for a busy core spoil the timing.
-MEASURE := OMP_NUM_THREADS=1 OMP_WAIT_POLICY=passive GOMP_SPINCOUNT=10000 THP_MEM_ALLOC_ENABLE=1
 MORE = budget.minutes=$(MINUTES) $(SEED) $(if $(THREADS),threads=$(THREADS))
 comma := ,
 # SEEDS=3: run each job with seeds 0, 1 and 2; SEEDS=4,7: with these.
@@ -84,7 +82,7 @@ test-stability: ## run the numerical hard cases and killed runs, slow ones too
 	$(BIN)/pytest --no-cov -m stability tests/stability
 
 bench: ## time every operator, a step and a frame, into docs/performance.md (a quarter of an hour)
-	$(MEASURE) $(BIN)/python -m tests.bench.performance
+	$(BIN)/python -m tests.bench.performance
 
 TINY = data.scene=tiny paths.data=runs/bench-gpu data.synthesis.size=32 data.synthesis.frames=8 \
 	data.synthesis.test_views=[1,1,1] preset.rays=64 preset.inpainter_width=16 data.held_out=2 budget.iterations=12 \

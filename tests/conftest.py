@@ -1,10 +1,11 @@
 """What every test may ask for: the commands in this process, a fitted run, an empty folder."""
 
+# ruff: noqa: E402 (torch is imported after it is said how its threads wait)
 import gc
-import os
 
-os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # as the commands do: a thread that waits works no core
-os.environ.setdefault("GOMP_SPINCOUNT", "10000")
+from forewarp.cli.entry import wait_briefly
+
+wait_briefly()  # before torch is imported
 
 import pytest
 import torch

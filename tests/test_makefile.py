@@ -136,6 +136,7 @@ def test_effects_of_particles_are_planned_on_all_specimens(made):
         ("reproduce-tables DATA=there SWEEPS=methods", 'SCENES: expected SCENES="hook ..." beside'),
         ("ablations DATA=there", "make reproduce-tables DATA=there SWEEPS="),
         ("ablations METHODS=ndvg", "DATA, METHODS: not for ablations"),
+        ("effects MODEL=nerf", "MODEL: expected forward or particles, which can be planned, but got nerf"),
     ],
 )
 def test_words_that_would_have_no_effect_are_refused(made, line, expected):

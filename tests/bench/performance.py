@@ -219,8 +219,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    if not {"OMP_NUM_THREADS", "OMP_WAIT_POLICY"} <= os.environ.keys():  # read when torch was imported
-        os.environ.setdefault("OMP_NUM_THREADS", "1")
-        quiet()
+    before = dict(os.environ)
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # threads that wait for a busy core spoil the timing
+    quiet()
+    if os.environ != before:  # all this is read when torch is imported
         os.execv(sys.executable, [sys.executable, "-m", "tests.bench.performance", *sys.argv[1:]])
     main()

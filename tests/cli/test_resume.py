@@ -89,6 +89,7 @@ def test_a_run_begun_inside_its_scene_goes_on(ok, begun, monkeypatch):
     ok("train", *SMALL, "data.root=..", "run=runs/a")
     (scene / "runs" / "a" / "coarse" / "done.json").unlink()
     ok("train", "resume=runs/a")
+    assert (scene / "runs" / "a" / "coarse" / "done.json").is_file()
 
 
 def test_what_is_measured_on_changed_data_says_so(forewarp, ok, begun):
@@ -112,12 +113,15 @@ def test_a_folder_in_work_is_refused(ok, refused, begun):
 
 
 def test_a_file_system_without_locks_is_used_without(begun, monkeypatch):
+    asked = []
+
     def missing(lock):
+        asked.append(lock)
         raise OSError(errno.ENOSYS, "Function not implemented")
 
     monkeypatch.setattr(FileLock, "_acquire", missing)
     with locked(begun), locked(begun):
-        pass
+        assert len(asked) == 2
 
 
 ODD = {

@@ -7,8 +7,10 @@ from pathlib import Path
 
 import lightning
 import pytest
+import torch
 import yaml
 
+from forewarp.training.stages import Run
 from tests.support.commands import TINY
 from tests.support.dnerf_scene import write_tiny
 
@@ -92,6 +94,35 @@ def test_evaluating_twice_gives_the_same_numbers(ok, fitted, copied, scenes, tmp
     ok("evaluate", f"run={copied}", f"data.root={moved}", "reduce=2")
     assert json.loads((copied / "metrics.json").read_text())["protocol"]["reduced"] == 2
     assert numbers(copied) != numbers(fitted)
+
+
+def test_a_device_that_there_is_not_is_refused_before_a_folder_is_made(
+    refused, scenes, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    line = refused(*arguments(scenes, tmp_path / "run", "trainer=gpu"))
+    assert line == "trainer.accelerator: expected a GPU, but found none; use trainer=cpu"
+    assert not (tmp_path / "run").exists()
+
+
+def test_an_option_that_another_one_removes_is_named(refused):
+    line = refused("train", "data=synthetic", "~model/rotation", "model.rotation=true")
+    assert line.startswith(
+        "model.rotation: expected an option, but got one that another one typed here removes"
+    )
+
+
+def test_metrics_tell_by_which_commit_the_run_was_trained_not_measured(ok, copied, scenes):
+    noted = json.loads((copied / "fine" / "done.json").read_text())
+    (copied / "fine" / "done.json").write_text(json.dumps(noted | {"commit": "0123abcde"}))
+    ok("evaluate", f"run={copied}")
+    assert json.loads((copied / "metrics.json").read_text())["protocol"]["commit"] == "0123abcde"
+
+
+def test_a_gpu_that_is_gone_is_refused_before_a_run_is_measured(refused, copied, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(Run, "load", lambda _: pytest.fail("loaded"))
+    assert "trainer.accelerator: expected a GPU" in refused("evaluate", f"run={copied}", "trainer=gpu")
 
 
 def test_the_same_command_again_trains_nothing(ok, fitted, scenes, monkeypatch):

@@ -105,7 +105,7 @@ OF_PARTICLES = {
     "background": Effect({"background": 0.03}, (), ("resting", "nodes.still")),
 }
 RATES = {"means": 1.5e-3, "log_scales": 5e-3, "turns": 3e-3, "opacity": 5e-2, "color": 3e-2, "shade": 1e-3}
-RATES |= {"tint": 1e-3, "fade": 3e-3, "shifts": 7e-3, "node_turns": 8e-3, "skin": 1e-2, "clock": 0.3}
+RATES |= {"tint": 1e-3, "fade": 3e-3, "shifts": 7e-3, "node_turns": 8e-3, "skin": 1e-2, "time_offsets": 0.3}
 SMALL_NETWORK = {"width": 32, "layers": 3, "skip": None, "position_frequencies": 4}
 SMALL_NETWORK |= {"sampling": Sampling(16, 16, density="softplus", open_end=False, inside_box=True)}
 SMALL_WARP = {"warp_width": 24, "warp_layers": 3, "warp_skip": None}
@@ -213,7 +213,7 @@ METHODS = {
         {
             "every": 0.05,
             "settled": 0.9,
-            "clock": 1.5,
+            "time_offsets": 1.5,
             "lr_final_factor": dict.fromkeys(RATES, 0.1) | {"means": 0.01},
         },
         steps=150,

@@ -38,6 +38,9 @@ def test_kernel_equals_reference(options):
     assert fast.squared == pytest.approx(exact.squared, rel=1e-5)
     for one_part, other in zip(gradients_of(exact), gradients_of(fast), strict=True):
         assert float((one_part - other).norm() / one_part.norm()) < 2e-5
+    assert fast.order.tolist() == exact.order.tolist()
+    torch.testing.assert_close(fast.distances.double(), exact.distances, atol=1e-5, rtol=1e-5)
+    assert bool((exact.distances.diff() >= 0).all())
 
 
 def test_the_loss_of_nothing(backend):

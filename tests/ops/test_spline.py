@@ -28,6 +28,18 @@ def test_a_number_and_a_tensor_give_the_same():
         torch.testing.assert_close(spline_basis(time, 7, 0.4), spline_basis(torch.tensor(time), 7, 0.4))
 
 
+def test_beyond_its_times_a_spline_goes_on_as_at_the_end_and_only_so_far():
+    line = (torch.arange(7.0) - 1) / 4
+    for time in (-0.1, 1.1):
+        basis = spline_basis(time, 7, beyond=0.2)
+        torch.testing.assert_close(basis, spline_basis(torch.tensor(time), 7, beyond=0.2))
+        assert float(basis.sum()) == pytest.approx(1.0, abs=1e-6)
+        assert float(basis @ line) == pytest.approx(time, abs=1e-6)
+    for time in (1.3, torch.tensor(1.3)):
+        with pytest.raises(ValueError, match=r"expected times in \[-0.2, 1.2\], but got .*1.3"):
+            spline_basis(time, 7, beyond=0.2)
+
+
 def test_smooth_between_spans():
     times = torch.linspace(0, 1, 2001, dtype=torch.float64)
     bend = spline_basis(times, 9, 0.0).diff(n=2, dim=0) / (times[1] - times[0]) ** 2

@@ -179,6 +179,6 @@ def test_both_clocks_and_versions_of_the_code_are_told(tmp_path, monkeypatch):
     text = write_minutes(runs, tmp_path / "out")[0].read_text()
     (row,) = rows_of(section(text, "What it costs"), "ball")
     assert row[2:6] == ["60", "70", "100", "500.0"]
-    (line,) = [line for line in text.splitlines() if line.startswith("Not all runs may be of one version")]
+    (line,) = [line for line in text.splitlines() if line.startswith("The runs may be of different versions")]
     assert line.endswith("1 min of commit aaa, commit bbb.")
     assert minutes.mean_by_time(drawn["forward"])[:2] == [(0.0, 31.0), (0.05, 31.0)]

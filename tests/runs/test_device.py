@@ -48,7 +48,7 @@ def test_it_says_why_and_how_to_choose_the_gpu(gpu, data_run):
     first, second, third = beginning(run, config).splitlines()
     assert first.endswith("on the CPU")
     assert second.startswith("model=particles leaves the GPU aside: its kernels are the CPU's")
-    assert second.endswith("; trainer=gpu takes it for small ones")
+    assert second.endswith("; trainer=gpu runs it there all the same")
     assert third == f"run: {run.folder}"
     config.trainer.accelerator = "cpu"
     assert len(beginning(run, config).splitlines()) == 2

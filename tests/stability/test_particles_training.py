@@ -199,6 +199,6 @@ def test_at_and_beside_the_canonical_time_and_the_ends(kind, time):
         went = paths(nodes, torch.eye(3), [time])[:, 0] - torch.eye(3)
         assert went.isfinite().all()
         assert float(went.norm()) <= 100 * abs(time - canonical) + 1e-6  # no jump
-        nodes.look_ahead(time, time)
-        bent, slopes = nodes.spread_over_time(time, nodes.curve(time), torch.ones(3, 6), 1.0, 1.0)
+        nodes.look_ahead(time)
+        bent, slopes = nodes.spread_over_time(time, time, nodes.curve(time), torch.ones(3, 6), 1.0, 1.0)
         assert all(value.isfinite().all() for value in (torch.tensor(bent), *slopes.values()))

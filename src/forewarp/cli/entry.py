@@ -72,10 +72,7 @@ def _arguments(name: str) -> list[str]:
 
 def quiet() -> None:
     """Set what must be set before torch is imported, and silence the notices of other packages."""
-    # Threads that wait spinning are many times slower on a busy machine; those that sleep at once wake so
-    # late that a second thread brings nothing. A fraction of a millisecond costs nothing, and brings it.
-    if os.environ.setdefault("OMP_WAIT_POLICY", "passive") == "passive":
-        os.environ.setdefault("GOMP_SPINCOUNT", "10000")
+    wait_briefly()
     # Large pages: first touches of small ones take 20 to 40 % of a U-Net's step on a CPU.
     os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")
     _keep_memory()
@@ -88,6 +85,16 @@ def quiet() -> None:
     if TRACEBACK_VARIABLE not in os.environ:
         warnings.filterwarnings("ignore", module=r"(lightning|torch|tensorboard|numba)(\..*)?$")
         warnings.filterwarnings("ignore", message=".*LeafSpec.*", category=FutureWarning)
+
+
+def wait_briefly() -> None:
+    """Say how threads wait for work, before torch is imported.
+
+    Those that wait spinning are many times slower on a busy machine; those that sleep at once wake so late
+    that a second thread brings nothing. A fraction of a millisecond costs nothing, and brings it.
+    """
+    if os.environ.setdefault("OMP_WAIT_POLICY", "passive").lower() == "passive":
+        os.environ.setdefault("GOMP_SPINCOUNT", "10000")
 
 
 def _keep_memory() -> None:

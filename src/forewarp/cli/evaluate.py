@@ -37,8 +37,9 @@ def evaluate(config) -> None:
     from forewarp.runs.lock import locked
 
     run = build_run(saved)
+    place = run.device  # one that there is not is refused before anything is read
     with locked(run.folder):
-        module = run.load()
+        module = run.load().to(place)
         warn_if_changed(run)
         measure_run(run, module, saved)
 

@@ -81,7 +81,8 @@ def unknown_key(error: Exception, name: str, arguments: list[str]) -> str | None
         return f"{key}: expected an option of every job, but got one that not all have; leave it out"
     model = config.get("model", {}).get("name")
     if key in every_key(_composed(conf, name, [one for one in others if key_of(one) in ("model", "preset")])):
-        return f"{key}: expected an option, but got one that another choice takes away; leave one of them out"
+        removed = "expected an option, but got one that another one typed here removes"
+        return f"{key}: {removed}; leave one of them out"
     if (owner := _owner(key, conf, name, others)) is not None:
         return of_another(key, model, owner)
     near = difflib.get_close_matches(key, known, 1, cutoff=0.8)

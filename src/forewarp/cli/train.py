@@ -118,7 +118,7 @@ def train(config) -> float | None:
 
 def refuse_early(run, config) -> None:
     """Read the scene, and refuse what could not be trained or measured, before the run's folder is made."""
-    run.check_clock()
+    run.check_device()
     run.datamodule.setup("fit")
     if config.evaluate and config.get("reduce") is not None:
         run.datamodule.targets("test").reduced(config.reduce)

@@ -38,7 +38,7 @@ class Curve:
         self.count = max(4, count) if kind == "spline" else max(1, min(count, times - 1))
 
     def __call__(self, time: float | Tensor, beyond: float = 0.0) -> Tensor:
-        """The basis (..., K) at a time in [0, 1]; of a spline, by so much ``beyond`` it, too."""
+        """The basis (..., K) at a time in [0, 1]; a spline also takes times up to ``beyond`` outside."""
         if self.kind == "spline":
             return spline_basis(time, self.count, beyond=beyond)
         return dct_basis(time, self.count, self.times, self.canonical_time, _PADDING)

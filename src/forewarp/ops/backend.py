@@ -29,6 +29,12 @@ def use_numba(tensor: Tensor) -> bool:
     return has_kernels(tensor.device)
 
 
+def cores() -> int:
+    """Return how many cores this process may use."""
+    allowed = getattr(os, "sched_getaffinity", None)
+    return len(allowed(0)) if allowed else os.cpu_count() or 1
+
+
 def match_threads() -> int:
     """Let Numba use as many threads as PyTorch; return their number."""
     numba = _numba()

@@ -4,19 +4,21 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from forewarp.ops.backend import match_threads, use_numba
 from forewarp.ops.checks import check_shape
-from forewarp.ops.project import Gaussians, Pinhole, Warp, _check, arrays, project_reference, whole
-from forewarp.ops.rasterize import SIDE, kept_for, rasterize_reference, sorted_tiles
+from forewarp.ops.project import Gaussians, Pinhole, Warp, _check, arrays, project_reference, projected, whole
+from forewarp.ops.rasterize import SIDE, Tiles, kept_for, rasterize_reference, sorted_tiles
 
 
 class Compared(NamedTuple):
     """``loss`` and ``squared``: sums over pixels and channels; ``particles``, ``maps`` and ``weights``: the
     gradients of ``factor`` times the loss; ``pull`` (N,) how strongly that pulls each over the
-    picture, per pixel; 0 of particles that the picture does not show.
+    picture, per pixel; 0 of particles that the picture does not show. ``order`` (V,): the rows of those that
+    the picture may show, from near to far; ``distances`` (V,): theirs from the camera.
     """
 
     loss: float
@@ -25,6 +27,8 @@ class Compared(NamedTuple):
     maps: Tensor
     weights: Tensor | None
     pull: Tensor
+    order: Tensor
+    distances: Tensor
 
 
 def compare(
@@ -101,38 +105,47 @@ def compare_reference(
     pull = splats.numbers.grad[:, :2].norm(dim=-1)
     squared = float(error.detach().square().sum())
     weights = found[6] if by_weights else None
-    return Compared(float(loss.detach()), squared, Gaussians(*found[:5]), found[5], weights, pull)
+    seen, away = (splats.reach[:, 0] > 0).nonzero()[:, 0], splats.numbers.detach()[:, 9]
+    order = seen[away[seen].argsort(stable=True)]
+    gradients = Gaussians(*found[:5])
+    return Compared(float(loss.detach()), squared, gradients, found[5], weights, pull, order, away[order])
 
 
 def _compare_numba(
     particles, warp, pinhole, tints, fades, pixels, background, width, factor, by_weights
 ) -> Compared:
-    from forewarp.ops import kernels_project
-
     threads = match_threads()
-    inputs = _inputs_of(particles, warp, pinhole, tints, fades)
-    splats = torch.empty(whole(len(particles.means)), kernels_project.SPLAT)
-    kernels_project.project(*inputs, splats.numpy())
-    size = pinhole.size
+    view = pinhole.row(particles.means)
+    inputs, splats = projected(*particles, *warp, view, tints, fades)
+    inputs, size = arrays(*inputs), pinhole.size
     tiles = sorted_tiles(splats.numpy(), -(-size[0] // SIDE), -(-size[1] // SIDE), threads)
     picture = pixels.contiguous().view(torch.int32).reshape(size[1], size[0])
     return _way_back(particles, inputs, splats, tiles, picture, background, width, factor, by_weights)
 
 
-def _inputs_of(particles: Gaussians, warp: Warp, pinhole: Pinhole, tints: Tensor, fades: Tensor) -> tuple:
-    """Return what the kernels of both ways read, as arrays; maps, the sixth, have 16 numbers each."""
-    padded = torch.nn.functional.pad(warp.maps, (0, 4))
-    view = pinhole.row(particles.means)
-    return arrays(*particles, padded, warp.links, warp.weights, view, tints, fades)
+def compile_way_back(
+    particles: Gaussians, warp: Warp, pinhole: Pinhole, tints: Tensor, fades: Tensor
+) -> None:
+    """Compile what leads from splats and a picture back to particles, by tiles in which nothing lies."""
+    from forewarp.ops.kernels_rasterize import RECORD
+
+    inputs, splats = projected(*particles, *warp, pinhole.row(particles.means), tints, fades, draw=False)
+    width, height = pinhole.size
+    many = -(-width // SIDE) * -(-height // SIDE)
+    none, ends = np.zeros(0, np.int32), np.zeros(many + 1, np.int64)
+    tiles = Tiles(none, np.zeros((0, RECORD), np.float32), none, ends, np.array([0, many]), 0)
+    picture = torch.zeros(height, width, dtype=torch.int32)
+    _way_back(particles, arrays(*inputs), splats, tiles, picture, torch.ones(3), 1.0, 1.0, False)
 
 
 def _way_back(particles, inputs, splats, tiles, picture, background, width, factor, by_weights) -> Compared:
     """Compare sorted splats with a picture (H, W) int32 of four bytes a pixel; lead the gradients back."""
     from forewarp.ops import kernels_chain, kernels_rasterize
 
-    threads = len(tiles.shares) - 1
+    kept = kept_for(tiles)
+    threads = len(kept)
     sums = torch.zeros(threads, len(tiles.order), kernels_rasterize.GRADIENT)
-    found, kept = torch.zeros(threads, 2, dtype=torch.float64), kept_for(tiles, threads)
+    found = torch.zeros(threads, 2, dtype=torch.float64)
     kernels_rasterize.compare(
         tiles.records,
         tiles.entries,
@@ -140,7 +153,7 @@ def _way_back(particles, inputs, splats, tiles, picture, background, width, fact
         tiles.shares,
         picture.numpy().view("uint32"),
         *arrays(background.float()),
-        kernels_rasterize.np.float32(width),
+        np.float32(width),
         *arrays(kept, sums, found),
     )
     seen, ranks = kernels_chain.ranked(tiles.order, len(particles.means))
@@ -152,6 +165,7 @@ def _way_back(particles, inputs, splats, tiles, picture, background, width, fact
     weights = torch.zeros(inputs[7].shape if by_weights else (0, 0))
     kernels_chain.chain(*inputs, splats.numpy(), seen, by_splat.numpy(), *arrays(*gradients, maps, weights))
     loss, squared = found.sum(0).tolist()
+    order = torch.from_numpy(tiles.order)
     return Compared(
         loss,
         squared,
@@ -159,4 +173,6 @@ def _way_back(particles, inputs, splats, tiles, picture, background, width, fact
         maps.sum(0)[:, :12],
         weights if by_weights else None,
         pull,
+        order,
+        splats[order, 9],
     )

@@ -252,18 +252,28 @@ def arrays(*tensors: Tensor) -> tuple:
     return tuple(t.detach().contiguous().numpy() for t in tensors)
 
 
+def projected(
+    means, log_scales, quaternions, opacity, colors, maps, links, weights, view, tints, fades, *, draw=True
+) -> tuple[tuple, Tensor]:
+    """What the kernels of both ways read, where maps have 16 numbers each, and the splats (N up to a whole
+    sixteen, 16) of the kernel; without ``draw`` nothing is computed, and they are 0.
+    """
+    from forewarp.ops import kernels_project as kernels
+
+    maps = torch.nn.functional.pad(maps, (0, 4))
+    inputs = (means, log_scales, quaternions, opacity, colors, maps, links, weights, view, tints, fades)
+    out = (means.new_empty if draw else means.new_zeros)(whole(len(means)), kernels.SPLAT)
+    if draw:
+        kernels.project(*arrays(*inputs), out.detach().numpy())
+    return inputs, out
+
+
 class _Project(torch.autograd.Function):
     @staticmethod
-    def forward(
-        ctx, means, log_scales, quaternions, opacity, colors, maps, links, weights, view, tints, fades
-    ):
-        from forewarp.ops import kernels_project as kernels
-
+    def forward(ctx, *tensors):
         match_threads()
-        maps = torch.nn.functional.pad(maps, (0, 4))
-        inputs = (means, log_scales, quaternions, opacity, colors, maps, links, weights, view, tints, fades)
-        out = means.new_empty(whole(len(means)), kernels.SPLAT)
-        kernels.project(*arrays(*inputs), out.numpy())
+        inputs, out = projected(*tensors)
+        means = inputs[0]
         ctx.save_for_backward(*inputs, out)
         out = out[: len(means)]
         numbers, reach = torch.where(out[:, 10:11] > 0, out[:, :10], 0.0), out[:, 10:12]

@@ -117,11 +117,11 @@ def sorted_tiles(splats, across: int, down: int, threads: int) -> Tiles:
     return Tiles(order, records, entries, ends, shares, int(longest))
 
 
-def kept_for(tiles: Tiles, threads: int) -> Tensor:
+def kept_for(tiles: Tiles) -> Tensor:
     """Room for what a tile keeps between its way there and back, for each thread."""
     from forewarp.ops.kernels_rasterize import MOST
 
-    return torch.empty(threads, 2 * max(min(tiles.longest, MOST), 1), SIDE * SIDE)
+    return torch.empty(len(tiles.shares) - 1, 2 * max(min(tiles.longest, MOST), 1), SIDE * SIDE)
 
 
 class _Rasterize(torch.autograd.Function):
@@ -135,7 +135,7 @@ class _Rasterize(torch.autograd.Function):
         tiles = sorted_tiles(splats.numpy(), across, down, threads)
         out = torch.empty(5, SIDE * down, SIDE * across)
         kernels.draw(tiles.records, tiles.entries, tiles.ends, tiles.shares, out.numpy())
-        ctx.tiles, ctx.splats, ctx.threads = tiles, splats, threads
+        ctx.tiles, ctx.splats = tiles, splats
         return out
 
     @staticmethod
@@ -145,8 +145,8 @@ class _Rasterize(torch.autograd.Function):
 
         match_threads()
         tiles = ctx.tiles
-        sums = torch.zeros(ctx.threads, len(tiles.order), kernels_rasterize.GRADIENT)
-        kept = kept_for(tiles, ctx.threads)
+        kept = kept_for(tiles)
+        sums = torch.zeros(len(kept), len(tiles.order), kernels_rasterize.GRADIENT)
         kernels_rasterize.pull(
             tiles.records,
             tiles.entries,

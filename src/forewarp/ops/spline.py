@@ -45,7 +45,8 @@ def spline_basis(
     if not bool(((both >= -beyond) & (both <= 1 + beyond)).all()):
         low, high = float(both.min()), float(both.max())
         raise ValueError(
-            f"spline: expected times in [0, 1], but got {low:.4g} to {high:.4g}; scale the times"
+            f"spline: expected times in [{0.0 - beyond:g}, {1 + beyond:g}], but got {low:.4g} to {high:.4g}; "
+            "scale the times"
         )
     place = both * (knots - 3)
     first = place.floor().clamp(0, knots - 4)

@@ -43,6 +43,7 @@ def make_plan(config: DictConfig, overrides: Sequence[str]) -> dict:
     asked_as = list(overrides)
     typed = [override for override in overrides if key_of(override).split(".")[0] not in NOT_OF_IT]
     run = build_run(config)
+    run.check_device()  # before a folder is made
     planning = planning_of(run.model, config.model.name)
     refuse(config, typed)
     run.datamodule.setup("fit")

@@ -155,7 +155,7 @@ def made_when(rows: Sequence[dict]) -> str | None:
         return None
     told = [f"{minutes:g} min of {', '.join(sorted(found[minutes]))}" for minutes in sorted(found)]
     return (
-        "Not all runs may be of one version of the code, to which differences may then be due. By "
+        "The runs may be of different versions of the code, which may then explain differences. By "
         f"commit where it was noted, else by day: {'; '.join(told)}.\n"
     )
 

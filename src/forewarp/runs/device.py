@@ -31,7 +31,7 @@ def why_on_cpu(config: DictConfig) -> str | None:
             why = getattr(get_object(str(model.get("_target_"))), "on_cpu", None)
             if why is not None:
                 name = model.get("name", config.model.get("name"))
-                return f"model={name} leaves the GPU aside: {why}; trainer=gpu takes it for small ones"
+                return f"model={name} leaves the GPU aside: {why}; trainer=gpu runs it there all the same"
     return None
 
 

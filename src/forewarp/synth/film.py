@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import pickle
 import signal
 from collections import deque
@@ -17,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
+from forewarp.ops.backend import cores
 from forewarp.scene.camera import Camera
 from forewarp.synth.raycast import SHADOW_RAYS, render
 from forewarp.synth.world import World
@@ -104,9 +104,7 @@ class Film:
 
 def _worth(samples: float) -> int:
     """Choose the number of processes by the number of samples."""
-    affinity = getattr(os, "sched_getaffinity", None)
-    processors = len(affinity(0)) if affinity else os.cpu_count() or 1
-    return max(1, min(processors, math.floor(samples / _SAMPLES_A_PROCESS)))
+    return max(1, min(cores(), math.floor(samples / _SAMPLES_A_PROCESS)))
 
 
 def _begin() -> None:

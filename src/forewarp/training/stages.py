@@ -80,13 +80,14 @@ class Run:
                 objective = stage.objective
                 check(stage.settings.name, stage.settings.numbers, objective.names, objective.literal)
 
-    def check_clock(self) -> None:
-        """Refuse to train on a GPU by the processor's clock; what is trained may be looked at on any device.
+    def check_device(self) -> None:
+        """Refuse a device that there is not, and to train on a GPU by the processor's clock.
 
         Raises:
             ValueError: naming the key.
         """
-        if Clock(self.clock).kind != "wall" and self.device.type != "cpu":
+        place = self.device
+        if self.clock != "wall" and place.type != "cpu":
             raise ValueError(
                 "budget.clock: expected wall, as processor time leaves out the GPU's, but got "
                 f"{self.clock!r}; set budget.clock=wall, or trainer=cpu"
@@ -94,7 +95,7 @@ class Run:
 
     def fit(self) -> DynamicSceneModule:
         """Train all stages that are not finished; return the module of the last one."""
-        self.check_clock()
+        self.check_device()
         self.datamodule.setup("fit")
         self._check_feasible()
         self._check_later_stages()

@@ -1,7 +1,9 @@
+import math
+
 import torch
 from torch import nn
 
-from forewarp.methods.particles.density import renew
+from forewarp.methods.particles.density import renew, too_near
 from forewarp.methods.rows_adam import RowsAdam
 
 
@@ -62,6 +64,26 @@ def test_what_has_faded_or_is_too_large_goes():
     kept = few.means[[0, 1, 3, 5, 6, 7, 8, 9]].clone()
     renew(few, optimizer, 8, unseen=False, extent=1.0)
     torch.testing.assert_close(few.means.data, kept)
+
+
+def test_what_stood_too_near_to_a_camera_goes_though_it_was_seen():
+    few = Few()
+    optimizer = optimizer_of(few)
+    few.idle[7] = math.inf
+    kept = few.means[[0, 1, 2, 3, 4, 5, 6, 8, 9]].clone()
+    renew(few, optimizer, 9, unseen=False, extent=1.0)
+    torch.testing.assert_close(few.means.data, kept)
+    assert not bool(few.idle.any())
+
+
+def test_few_that_stand_before_all_others_are_too_near_and_many_are_not():
+    order, far = torch.arange(200).flip(0), torch.linspace(2.0, 3.0, 200)
+    assert not len(too_near(order, far))
+    for few, gone in ((1, 1), (4, 4), (6, 0)):
+        distances = torch.cat([torch.full((few,), 0.5), far[few:]])
+        assert too_near(order, distances).tolist() == order[:gone].tolist()
+    assert not len(too_near(order[:0], far[:0]))
+    assert not len(too_near(order[:1], far[:1]))  # the only one is not before any other
 
 
 def test_what_is_never_seen_goes_after_some_rounds_and_only_where_all_is_in_play():

@@ -150,6 +150,16 @@ def test_rates_of_lengths_are_of_the_scenes_extent(data):
     )
 
 
+def test_what_stands_right_before_a_camera_is_to_go(data):
+    module = module_with(data)
+    method, camera = module.method, data.scene.train[0].camera
+    ahead = camera.rays(torch.tensor([camera.height // 2 * camera.width + camera.width // 2])).directions[0]
+    method.means.data[5] = camera.center + 0.1 * ahead * (method.means.data[5] - camera.center).norm()
+    data.picker = lambda: 0
+    method.look(next(iter(data.train_dataloader())), {"photo": 1.0}, module.generator)
+    assert method.idle.isinf().nonzero().flatten().tolist() == [5]
+
+
 def test_what_is_opaque_can_still_fade(data):
     module = module_with(data)
     method, optimizer = module.method, module.configure_optimizers()

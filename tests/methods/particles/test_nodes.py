@@ -56,7 +56,7 @@ def test_slopes_over_time_are_those_of_autograd(turns):
     motion, _ = nodes.carried(basis)
     slope = torch.randn(motion.shape)
     (motion * slope).sum().backward()
-    found = nodes.spread_over_time(0.6, basis, slope, 0.0, 1.0)[1]
+    found = nodes.spread_over_time(0.6, 0.6, basis, slope, 0.0, 1.0)[1]
     torch.testing.assert_close(found["nodes.shift"], nodes.shift.grad)
     assert ("nodes.turn" in found) == turns
     if turns:
@@ -66,7 +66,7 @@ def test_slopes_over_time_are_those_of_autograd(turns):
 def test_slopes_of_bending_are_those_of_autograd():
     nodes = nodes_of()
     nodes.seen.copy_(torch.tensor([0.0, 1.0]))
-    value, found = nodes.spread_over_time(0.5, nodes.curve(0.5), torch.zeros(12, 6), 3.0, 2.0)
+    value, found = nodes.spread_over_time(0.5, 0.5, nodes.curve(0.5), torch.zeros(12, 6), 3.0, 2.0)
     step = 1 / 5
     before, now, after = (nodes.curve(t) for t in (0.5 - step, 0.5, 0.5 + step))
     basis = after - 2 * now + before
@@ -84,9 +84,8 @@ def test_straight_motion_does_not_bend():
     line = torch.arange(8.0)[:, None].expand(8, 3)
     nodes.shift.data = line.expand(12, 8, 3).clone()
     nodes.turn.data.zero_()
-    assert nodes.spread_over_time(0.4, nodes.curve(0.4), torch.zeros(12, 6), 1.0, 1.0)[0] == pytest.approx(
-        0.0, abs=1e-9
-    )
+    bent = nodes.spread_over_time(0.4, 0.4, nodes.curve(0.4), torch.zeros(12, 6), 1.0, 1.0)[0]
+    assert bent == pytest.approx(0.0, abs=1e-9)
 
 
 def test_a_curve_is_continued_to_times_not_yet_seen():
@@ -94,7 +93,7 @@ def test_a_curve_is_continued_to_times_not_yet_seen():
     for value in (nodes.shift, nodes.turn):
         value.data.zero_()
     nodes.shift.data[:, :5, 0] = torch.arange(5.0)
-    nodes.look_ahead(0.0, 0.29)  # the third span is the last that is seen
+    nodes.look_ahead(0.29)  # the third span is the last that is seen
     assert nodes.shift[0, :5, 0].tolist() == [0, 1, 2, 3, 4]
     expected, stride = 4.0, 1.0
     for j in range(5, 10):
@@ -108,9 +107,9 @@ def test_a_curve_is_continued_to_times_not_yet_seen():
 
 def test_what_was_seen_is_not_continued_anew():
     nodes = nodes_of()
-    nodes.look_ahead(0.0, 1.0)
+    nodes.look_ahead(1.0)
     before = nodes.shift.clone()
-    nodes.look_ahead(0.2, 0.9)
+    nodes.look_ahead(0.9)
     assert torch.equal(nodes.shift, before)
 
 

@@ -24,7 +24,7 @@ def test_the_process_beside_compiles_for_the_numbers_that_a_step_has():
         "import json, types, torch\n"
         "from forewarp.methods.particles import warmup\n"
         "from tests.methods.particles.test_warmup import _signatures\n"
-        "warmup.compile_way_back(); before = _signatures()\n"
+        "warmup.compile_way_back(*warmup._single()); before = _signatures()\n"
         "warmup.compile_kernels(types.SimpleNamespace(means=torch.zeros(1, 3)))\n"
         "assert all(len(found) == 1 for found in before.values()), before\n"
         "assert _signatures() == before, (before, _signatures())\n"
@@ -40,18 +40,21 @@ def test_another_process_is_started_only_for_new_kernels_and_a_second_core(monke
         def __init__(self, command, **_):
             started.append(command)
 
-        def wait(self, timeout):
+        returncode = 0
+
+        def communicate(self, timeout):
             started.append("waited")
+            return "", ""
 
     monkeypatch.setattr(subprocess, "Popen", Process)
-    monkeypatch.setattr(warmup, "_cores", lambda: 2)
+    monkeypatch.setattr(warmup, "cores", lambda: 2)
     with warmup._way_back_beside(False):
         assert not started
     with warmup._way_back_beside(True):
         assert started == [[sys.executable, "-m", "forewarp.methods.particles.warmup"]]
     assert started[-1] == "waited"
     started.clear()
-    monkeypatch.setattr(warmup, "_cores", lambda: 1)
+    monkeypatch.setattr(warmup, "cores", lambda: 1)
     with warmup._way_back_beside(True):
         assert not started
 
@@ -61,11 +64,21 @@ def test_where_no_process_can_be_started_all_is_compiled_here(monkeypatch):
         raise OSError("no more processes")
 
     monkeypatch.setattr(subprocess, "Popen", refuse)
-    monkeypatch.setattr(warmup, "_cores", lambda: 2)
+    monkeypatch.setattr(warmup, "cores", lambda: 2)
     done = []
     with warmup._way_back_beside(True):
         done.append(True)
     assert done
+
+
+def test_why_the_second_process_failed_is_told_and_it_is_waited_for_after_an_error_too(monkeypatch, capsys):
+    command = [sys.executable, "-c", "import sys; sys.exit('no room')"]
+    start = subprocess.Popen
+    monkeypatch.setattr(subprocess, "Popen", lambda _, **how: start(command, **how))
+    monkeypatch.setattr(warmup, "cores", lambda: 2)
+    with pytest.raises(KeyError), warmup._way_back_beside(True):
+        raise KeyError
+    assert capsys.readouterr().out.endswith("as a second one failed: no room\n")
 
 
 @pytest.mark.slow
@@ -76,7 +89,7 @@ def test_what_the_other_process_compiles_is_found_in_the_cache(tmp_path):
     script = (
         "from forewarp.methods.particles import warmup\n"
         "from forewarp.ops import kernels_chain, kernels_rasterize\n"
-        "warmup.compile_way_back()\n"
+        "warmup.compile_way_back(*warmup._single())\n"
         "for kernel in (kernels_chain.chain, kernels_chain.slopes_of, kernels_rasterize.compare):\n"
         "    assert kernel.stats.cache_misses.total() == 0, kernel\n"
     )

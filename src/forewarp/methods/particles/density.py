@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -13,6 +15,25 @@ _IDLE = 5  # rounds without being seen after which it goes
 _MOST_A_ROUND = 0.1  # share of the particles that are split at once
 _HALF, _APART = 0.6, 0.6  # of the longest axis: a half's length, and how far each is moved along it
 _LARGE = 0.45  # of the scene's extent: a longer axis goes
+_NEAREST, _NEARER = 0.02, 0.6  # share of a picture's particles; of the farthest of them, what is too near
+
+
+def too_near(order: Tensor, distances: Tensor) -> Tensor:
+    """Which particles stand much nearer to a camera than nearly all others that it sees: their rows.
+
+    So near, a few of them mend a picture where they stand in no other's way, and hide things from views that
+    lie between pictures. A thing that comes near is more than a few.
+
+    Args:
+        order, distances: (V,), as of ``ops.compare.Compared``.
+
+    >>> too_near(torch.tensor([4, 2, 0, 3]), torch.tensor([0.1, 2.0, 2.5, 3.0]))
+    tensor([4])
+    """
+    if not len(order):
+        return order
+    limit = _NEARER * distances[min(math.ceil(_NEAREST * len(order)), len(order) - 1)]
+    return order[: int(torch.searchsorted(distances, limit))]
 
 
 @torch.no_grad()
@@ -21,20 +42,21 @@ def renew(
 ) -> None:
     """Remove what is not needed, and split what the pictures pull at most.
 
-    A particle goes whose opacity has faded, that is longer than a good part of the scene, or that, where
-    ``unseen``, no picture has shown for some rounds. The rest is split along its longest axis, in the order
-    of its mean pull over the pictures that showed it, until there are ``target``.
+    A particle goes whose opacity has faded, that is longer than a good part of the scene, that stood too near
+    to a camera, or that, where ``unseen``, no picture has shown for some rounds. The rest is split along its
+    longest axis, in the order of its mean pull over the pictures that showed it, until there are ``target``.
 
     Args:
         method: has ``means``, ``log_scales``, ``turns``, ``most_opaque``, and the counters ``pulled``,
-            ``shown`` and ``idle``, (N,) each.
+            ``shown`` and ``idle``, (N,) each; what is infinitely ``idle`` goes.
         optimizer: whose moments follow.
         target: how many there should be.
         unseen: whether all frames are in play.
         extent: of the scene, world units.
     """
+    gone = method.idle.isinf()
     method.idle.copy_(torch.where(method.shown > 0, 0.0, method.idle + 1))
-    gone = method.most_opaque() < _FADED
+    gone |= method.most_opaque() < _FADED
     gone |= method.log_scales.amax(-1).exp() > _LARGE * extent
     if unseen:
         gone |= method.idle >= _IDLE

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import ClassVar
 
@@ -12,17 +13,18 @@ from forewarp.fields.curves import Curve
 from forewarp.methods.method import Method, Snapshot, Start, Step
 from forewarp.methods.particles import matter, opacity
 from forewarp.methods.particles.camera import Pinholes
-from forewarp.methods.particles.clock import Clock
-from forewarp.methods.particles.density import renew
+from forewarp.methods.particles.density import renew, too_near
 from forewarp.methods.particles.effects import Effects, cosines
 from forewarp.methods.particles.feasible import check_feasible
 from forewarp.methods.particles.nodes import Nodes
+from forewarp.methods.particles.packed import add, by_name, packed
 from forewarp.methods.particles.planning import EFFECTS, ParticlesPlanning
 from forewarp.methods.particles.rest import come_to_rest
 from forewarp.methods.particles.settings import Numbers, told_by
 from forewarp.methods.particles.skin import Skin
 from forewarp.methods.particles.snapshot import ParticlesSnapshot
 from forewarp.methods.particles.start import covered_pixels, first_points, first_values, widths
+from forewarp.methods.particles.time_offsets import TimeOffsets
 from forewarp.methods.rows_adam import RowsAdam
 from forewarp.ops.compare import compare
 from forewarp.ops.nodes import pull_nodes
@@ -73,8 +75,8 @@ class Particles(Method):
             curve = Curve(on.motion, knots, len(times), self.canonical_time)
             points, edges = None if start.blank else self.means.data, self.numbers_of.edges
             turns, rests = on.rotation is not None, on.background is not None
-            clock = Clock.of(on.motion, times, self.numbers_of.clock)
-            self.nodes = Nodes(points, count, curve, clock, turns=turns, rests=rests, edges=edges)
+            offsets = TimeOffsets.of(on.motion, times, self.numbers_of.time_offsets)
+            self.nodes = Nodes(points, count, curve, offsets, turns=turns, rests=rests, edges=edges)
             self.skin = Skin(self.nodes, self.means.data)
         resting = None if on.background is None else torch.zeros(len(self.means), dtype=torch.bool)
         self.register_buffer("resting", resting)
@@ -164,10 +166,7 @@ class Particles(Method):
 
     def gaussians(self) -> Gaussians:
         """The particles as the operators read them."""
-        solid = self.opacity if self.fade is None else torch.cat([self.opacity, self.fade], -1)
-        colors = [part for part in (self.color, self.shade, self.tint) if part is not None]
-        colors = colors[0] if len(colors) == 1 else torch.cat(colors, 1)
-        return Gaussians(self.means, self.log_scales, self.turns, solid, colors)
+        return packed(self)
 
     def warp(self, time: float) -> Warp:
         """How everything moves until a time."""
@@ -224,8 +223,9 @@ class Particles(Method):
         tints, fades = self.over_time(time)
         own, warp = {}, None
         if self.nodes is not None:
-            self.nodes.look_at(time)
-            basis = self.nodes.basis(time)
+            taken = self.nodes.taken(time)
+            self.nodes.look_ahead(taken)
+            basis = self.nodes.basis_of_motion(taken)
             motion, maps = self.nodes.carried(basis)
             warp = Warp(maps, self.skin.links, self.skin.weights())
         found = compare(
@@ -234,36 +234,25 @@ class Particles(Method):
         )  # fmt: skip
         self.pulled.add_(found.pull)
         self.shown.add_(found.pull > 0)
-        _add(total, self._by_name(found.particles))
+        self.idle[too_near(found.order, found.distances)] = math.inf
+        add(total, by_name(self, found.particles))
         if self.nodes is not None:
-            _add(total, {"skin.learned": self.skin.slope(warp.weights, found.weights)})
+            add(total, {"skin.learned": self.skin.slope(warp.weights, found.weights)})
             nodes, rigid = self.nodes, factors.get("rigid", 0.0) * self._loose()
             slope, strain = pull_nodes(
                 motion, nodes.places, found.maps, nodes.edges, nodes.edge_weights, rigid
             )
             own["rigid"] = strain
             smooth = factors.get("smooth", 0.0)
-            own["smooth"], over_time = nodes.spread_over_time(time, basis, slope, smooth, float(self.extent))
-            _add(total, over_time)
+            own["smooth"], over_time = nodes.spread_over_time(
+                time, taken, basis, slope, smooth, float(self.extent)
+            )
+            add(total, over_time)
         return found, own
 
     def _loose(self) -> float:
         """What is left of the rigidity, by how much of the stage is done."""
         return self.numbers_of.loose**self.progress
-
-    def _by_name(self, gradients: Gaussians) -> dict[str, Tensor]:
-        found = {"means": gradients.means, "log_scales": gradients.log_scales, "turns": gradients.quaternions}
-        if self.fade is None:
-            found["opacity"] = gradients.opacity
-        else:
-            found["opacity"], found["fade"] = gradients.opacity[:, :1], gradients.opacity[:, 1:]
-        at = 0
-        for name in ("color", "shade", "tint"):
-            part = getattr(self, name)
-            if part is not None:
-                found[name] = gradients.colors[:, at : at + part.shape[1]]
-                at += part.shape[1]
-        return found
 
     def advance(self, progress: float, step: int, optimizer: torch.optim.Optimizer) -> dict[str, float]:
         """Rates of lengths are of the scene's extent, that of weights follows what the pictures tell; renew
@@ -274,8 +263,10 @@ class Particles(Method):
         for group in optimizer.param_groups:
             if group["name"] in ("means", "shifts"):
                 group["lr"] *= float(self.extent)
-            elif group["name"] == "clock":
-                self.nodes.clock.settle(group["lr"], learns=progress >= numbers.calm)
+            elif group["name"] == "time_offsets":
+                self.nodes.offsets.learns = progress >= numbers.calm
+                if self.nodes.offsets.learns:
+                    self.nodes.offsets.settle(group["lr"])
             elif group["name"] == "skin":
                 group["lr"] *= told_by(self.views)
         number = int(progress / numbers.every)
@@ -342,8 +333,3 @@ class Particles(Method):
         return [
             "from the forward-flow paper: particles that are rasterised, not voxels that rays march through"
         ]
-
-
-def _add(total: dict[str, Tensor], found: Mapping[str, Tensor]) -> None:
-    for name, value in found.items():
-        total[name] = value if name not in total else total[name] + value

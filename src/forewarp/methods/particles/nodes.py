@@ -8,15 +8,15 @@ import torch
 from torch import Tensor, nn
 
 from forewarp.fields.curves import Curve
-from forewarp.methods.particles.clock import Clock
+from forewarp.methods.particles.time_offsets import FARTHEST, TimeOffsets
 from forewarp.ops.nodes import carry_nodes, spread_nodes
 from forewarp.scene.cloud import far_apart
 
 LINKS = 6  # nodes that a particle follows
 _LEAST = 1e-20  # squared distance; what is nearer together coincides, and cannot be strained
 _DAMP = 0.5  # of a curve's last stride, where it is continued to times not yet seen
-_BEYOND = 0.25  # of all time, by which a clock may ask for more of a curve
 _NEAR = 1e-3  # half of the time over which a slope by time is taken
+_BEYOND = FARTHEST + 2 * _NEAR  # of all time, by which more of a curve is asked for
 _FULL = 0.05  # share of a spline's basis at a time, from which on its knot counts as seen
 
 
@@ -49,7 +49,7 @@ class Nodes(nn.Module):
         points: (N, 3) canonical points that are to move; None: a checkpoint will say.
         count: of nodes.
         curve: of every node.
-        clock: when pictures were taken; None: when they say.
+        offsets: learned corrections of the pictures' times; None: times are used as they are given.
         turns: whether nodes turn.
         rests: whether nodes may ``stop``; ``still`` (M,) bool says which have.
         edges: neighbours that a node is kept rigid with.
@@ -62,14 +62,14 @@ class Nodes(nn.Module):
         points: Tensor | None,
         count: int,
         curve: Curve,
-        clock: Clock | None = None,
+        offsets: TimeOffsets | None = None,
         *,
         turns: bool = True,
         rests: bool = False,
         edges: int = 6,
     ) -> None:
         super().__init__()
-        self.curve, self.clock = curve, clock
+        self.curve, self.offsets = curve, offsets
         places = torch.zeros(1, 3) if points is None else points[far_apart(points, count)].clone()
         self.register_buffer("places", places)
         away, beside = nearest(places, places, edges + 1)
@@ -100,14 +100,15 @@ class Nodes(nn.Module):
 
     def basis(self, time: float) -> Tensor:
         """The curve's basis (K,) at a given time, as the coefficients are."""
-        return self._basis(self.taken(time))
+        return self.basis_of_motion(self.taken(time))
 
     def taken(self, time: float) -> float:
         """The time of the motion in a picture of a given time."""
-        return time if self.clock is None else self.clock(time)
+        return time if self.offsets is None else self.offsets(time)
 
-    def _basis(self, taken: float) -> Tensor:
-        return self.curve(taken, 0.0 if self.clock is None else _BEYOND).to(self.places)
+    def basis_of_motion(self, taken: float) -> Tensor:
+        """The curve's basis (K,) at a time of the motion."""
+        return self.curve(taken, 0.0 if self.offsets is None else _BEYOND).to(self.places)
 
     def carried(self, basis: Tensor) -> tuple[Tensor, Tensor]:
         """Where nodes went and how they turned (M, 6), by a curve's basis (K,), and their maps (M, 12)."""
@@ -119,27 +120,22 @@ class Nodes(nn.Module):
 
     def param_groups(self) -> dict[str, list[nn.Parameter]]:
         """What is learned, by the name of its rate."""
-        clock = None if self.clock is None else self.clock.off
-        parts = {"shifts": self.shift, "node_turns": self.turn, "clock": clock}
+        off = None if self.offsets is None else self.offsets.off
+        parts = {"shifts": self.shift, "node_turns": self.turn, "time_offsets": off}
         return {name: [part] for name, part in parts.items() if part is not None}
 
-    def look_at(self, time: float) -> None:
-        """Note that a picture of a given time is seen, and ``look_ahead``."""
-        taken = min(max(self.taken(time), 0.0), 1.0)
-        self.look_ahead(taken, taken)
-
     @torch.no_grad()
-    def look_ahead(self, low: float, high: float) -> None:
-        """Continue curves beyond the times of the motion [low, high] that have been seen: a knot beyond them
-        starts as a damped continuation of the two before it.
+    def look_ahead(self, taken: float) -> None:
+        """Note that a time of the motion is seen, and continue curves beyond those seen so far: a knot beyond
+        them starts as a damped continuation of the two before it.
         """
-        first, last = self.seen.tolist()
-        if low >= first and high <= last:
+        taken, (first, last) = min(max(taken, 0.0), 1.0), self.seen.tolist()
+        if first <= taken <= last:
             return
         reach = self.curve.reach()
         if reach is None:
             return
-        self.seen[0], self.seen[1] = min(low, first), max(high, last)
+        self.seen[0], self.seen[1] = min(taken, first), max(taken, last)
         middle = reach.mean(-1)
         slack = _FULL * float(reach[0, 1] - reach[0, 0])
         after = (reach[:, 0] > float(self.seen[1]) - slack).nonzero()[:, 0].tolist()
@@ -211,39 +207,38 @@ class Nodes(nn.Module):
         super()._load_from_state_dict(state, prefix, *args, **kwargs)
 
     def spread_over_time(
-        self, time: float, basis: Tensor, slope: Tensor, factor: float, unit: float
+        self, time: float, taken: float, basis: Tensor, slope: Tensor, factor: float, unit: float
     ) -> tuple[float, dict[str, Tensor]]:
-        """From slopes (M, 6) by ``motion`` to those by coefficients, by name; curves are kept smooth.
+        """From slopes (M, 6) by ``motion`` to those by coefficients, and by the offset of a picture's given
+        ``time`` from that of the motion, ``taken``; by name. Curves are kept smooth.
 
         What is kept small is ``mean |x(t + h) - 2 x(t) + x(t - h)|^2 / unit^2``, h a knot's distance to the
         next: only where and as often as a curve is seen. Its value comes first.
         """
-        bend = self._bend(time) if factor else torch.zeros_like(basis)
+        bend = self._bend(taken) if factor else torch.zeros_like(basis)
         *found, bent = spread_nodes(self.shift, self.turn, slope, basis, bend, factor, unit)
         if self.still is not None:
             for part in found:
                 if part is not None:
                     part[self.still] = 0.0  # rounding errors would be steps, as Adam takes them
-        if self.clock is not None and self.clock.learns:
-            found.append(self.clock.slopes(time, self._by_time(self.taken(time), slope)))
-        names = ("nodes.shift", "nodes.turn", "nodes.clock.off")
+        if self.offsets is not None and self.offsets.learns:
+            found.append(self.offsets.slopes(time, self._by_time(taken, slope)))
+        names = ("nodes.shift", "nodes.turn", "nodes.offsets.off")
         return bent, {name: part for name, part in zip(names, found) if part is not None}
 
     def _by_time(self, taken: float, slope: Tensor) -> float:
         """From slopes (M, 6) by ``motion`` to the one by its time."""
-        along = (self._basis(taken + _NEAR) - self._basis(taken - _NEAR)) / (2 * _NEAR)
-        moved = torch.einsum("mkc,k->mc", self.shift, along)
-        turned = torch.zeros_like(moved) if self.turn is None else torch.einsum("mkc,k->mc", self.turn, along)
-        return (torch.cat([moved, turned], -1) * slope).sum().detach().item()
+        along = (self.basis_of_motion(taken + _NEAR) - self.basis_of_motion(taken - _NEAR)) / (2 * _NEAR)
+        return (self.carried(along)[0].detach() * slope).sum().item()
 
-    def _bend(self, time: float) -> Tensor:
-        """The second difference (K,) of the basis around a time, within the times that have been seen."""
+    def _bend(self, taken: float) -> Tensor:
+        """The second difference (K,) of the basis around a time of the motion, within those seen."""
         step, (low, high) = 1 / max(self.curve.count - 3, 2), self.seen.tolist()
         low, high = low + step, high - step
         if low > high:
             return self.places.new_zeros(self.curve.count)
-        middle = min(max(self.taken(time), low), high)
+        middle = min(max(taken, low), high)
         before, now, after = (
-            self._basis(min(max(t, 0.0), 1.0)) for t in (middle - step, middle, middle + step)
+            self.basis_of_motion(min(max(t, 0.0), 1.0)) for t in (middle - step, middle, middle + step)
         )
         return after - 2 * now + before

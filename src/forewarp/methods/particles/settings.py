@@ -33,8 +33,8 @@ class Numbers:
         relink: rounds after which particles look again for the nodes beside them.
         rest: share from which nodes that do not move come to rest, where the model has a background.
         jitter, calm: spread of the random shift of a picture's time, which falls to 0 at the share ``calm``.
-        clock: by how much, times the mean distance of two times, a picture may be off the time that is given;
-            learned from ``calm`` on, of splines alone; 0: no picture is.
+        time_offsets: largest learned correction of a picture's time, times the mean distance of two training
+            times; learned from ``calm`` on, of splines alone; 0: times are used as they are given.
         loose: what is left of the weight of ``rigid`` at the end.
         name: name of the stage.
 
@@ -55,7 +55,7 @@ class Numbers:
     rest: float = 0.45
     jitter: float = 0.01
     calm: float = 0.4
-    clock: float = 0.0
+    time_offsets: float = 0.0
     loose: float = 0.17
     name: str = "fine"
 
@@ -69,7 +69,7 @@ class Numbers:
             (("first", "every", "loose", "full"), "a number in (0, 1]", lambda value: 0 < value <= 1),
             (("density", "nodes", "knots", "calm"), "a number > 0", lambda value: value > 0),
             (("edges", "relink"), "a whole number >= 1", lambda value: value >= 1 and value == int(value)),
-            (("jitter", "settled", "rest", "clock"), "a number >= 0", lambda value: value >= 0),
+            (("jitter", "settled", "rest", "time_offsets"), "a number >= 0", lambda value: value >= 0),
         ):
             for key in keys:
                 value = getattr(self, key)

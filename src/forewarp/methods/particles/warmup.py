@@ -5,22 +5,20 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from forewarp.ops.adam import adam_rows
-from forewarp.ops.backend import use_numba
-from forewarp.ops.compare import _inputs_of, _way_back, compare
+from forewarp.ops.backend import cores, use_numba
+from forewarp.ops.compare import compare, compile_way_back
 from forewarp.ops.nodes import carry_nodes, pull_nodes, spread_nodes
-from forewarp.ops.project import Gaussians, Pinhole, Warp, project, whole
-from forewarp.ops.rasterize import SIDE, Tiles, rasterize
+from forewarp.ops.project import Gaussians, Pinhole, Warp, project
+from forewarp.ops.rasterize import rasterize
 
 _PATIENCE_S = 120.0  # that the other process is waited for
 
@@ -51,22 +49,6 @@ def compile_kernels(method: torch.nn.Module) -> None:
     compare(*given, torch.zeros(72, 4, dtype=torch.uint8), torch.ones(3))
 
 
-def compile_way_back() -> None:
-    """Compile what leads from splats and a picture back to particles, by tiles in which nothing lies."""
-    from forewarp.ops.kernels_project import SPLAT
-    from forewarp.ops.kernels_rasterize import RECORD
-
-    particles, warp, pinhole, tints, fades = _single()
-    width, height = pinhole.size
-    across, down = -(-width // SIDE), -(-height // SIDE)
-    none, ends = np.zeros(0, np.int32), np.zeros(across * down + 1, np.int64)
-    shares = np.array([0, across * down])
-    tiles = Tiles(none, np.zeros((0, RECORD), np.float32), none, ends, shares, 0)
-    picture, splats = torch.zeros(height, width, dtype=torch.int32), torch.zeros(whole(1), SPLAT)
-    inputs = _inputs_of(particles, warp, pinhole, tints, fades)
-    _way_back(particles, inputs, splats, tiles, picture, torch.ones(3), 1.0, 1.0, False)
-
-
 def _single() -> tuple[Gaussians, Warp, Pinhole, Tensor, Tensor]:
     """A particle, its warp and a camera."""
     zero, one = torch.zeros(1, 3), torch.ones(1, 1)
@@ -82,24 +64,25 @@ def _way_back_beside(new: bool) -> Iterator[None]:
     """Let another process compile the way back meanwhile, if kernels are ``new`` and there is a core for it.
 
     It leaves them in the cache on disk, where this process finds them; what it does not get done is
-    compiled here. It is never killed, as half a file in the cache would be worse than none.
+    compiled here, and why is told. It is never killed, as half a file in the cache would be worse than none.
     """
     process = None
-    if new and _cores() > 1:
+    if new and cores() > 1:
         with suppress(OSError):
             command = [sys.executable, "-m", "forewarp.methods.particles.warmup"]
-            process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    yield
-    if process is not None:
-        with suppress(subprocess.TimeoutExpired):
-            process.wait(_PATIENCE_S)
-
-
-def _cores() -> int:
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+            process = subprocess.Popen(
+                command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, errors="replace"
+            )
+    try:
+        yield
+    finally:
+        if process is not None:
+            with suppress(subprocess.TimeoutExpired):
+                said = process.communicate(timeout=_PATIENCE_S)[1].strip()
+                if process.returncode:
+                    why = said.splitlines()[-1] if said else f"status {process.returncode}"
+                    print(f"kernels are compiled by one process, as a second one failed: {why}")
 
 
 if __name__ == "__main__":
-    compile_way_back()
+    compile_way_back(*_single())

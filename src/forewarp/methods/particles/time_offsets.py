@@ -1,23 +1,25 @@
-"""When pictures were taken, where the time that is written beside them is not quite it."""
+"""Learned corrections of the times that are written beside pictures."""
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
 
+FARTHEST = 0.2  # of all time
 _FEWEST = 8  # times: neighbours must tell how things move
-_FARTHEST = 0.2  # of all time
 _PULL = 0.1  # of the rate: how much a step draws towards 0
 
 
-class Clock(nn.Module):
-    """The time of the motion at T training times: each is ``off`` (T, 1) from the one that is given, in units
-    of their mean distance; in between, on a line.
+class TimeOffsets(nn.Module):
+    """From the time written beside a picture to the time of the motion that it shows: T training times are
+    each ``off`` (T, 1), in units of their mean distance; times in between, on a line.
 
-    Published sequences hold their first picture twice, leave one out before the last, or round their times. A
-    smooth motion cannot follow, and errs where one picture does not tell: along its line of sight.
+    Published sequences hold their first picture twice, leave one out before the last, or round their times.
+    A smooth motion cannot fit such times; the error then shows as a wrong depth, which one picture cannot
+    tell.
 
     Args:
         times: distinct, two or more.
@@ -26,29 +28,29 @@ class Clock(nn.Module):
 
     def __init__(self, times: Sequence[float], most: float) -> None:
         super().__init__()
-        self.register_buffer("times", torch.tensor(sorted(times), dtype=torch.float64), persistent=False)
-        self.step = (max(times) - min(times)) / (len(times) - 1)
-        self.most = min(most, _FARTHEST / self.step)
+        self.times = sorted(times)
+        self.step = (self.times[-1] - self.times[0]) / (len(times) - 1)
+        self.most = min(most, FARTHEST / self.step)
         self.learns = True
         self.off = nn.Parameter(torch.zeros(len(times), 1))
 
     @classmethod
-    def of(cls, motion: str, times: Sequence[float], most: float) -> Clock | None:
-        """Make the clock of a motion; None where it may not be off, of few times, and of cosines, which are
-        exactly 0 at the canonical time.
+    def of(cls, motion: str, times: Sequence[float], most: float) -> TimeOffsets | None:
+        """Make the offsets of a motion; None if ``most`` is 0, of fewer than 8 times, and of cosines, which
+        are exactly 0 at the canonical time.
         """
         return cls(times, most) if most and motion == "spline" and len(times) >= _FEWEST else None
 
     def weights(self, time: float) -> dict[int, float]:
         """The rows of the one or two training times around a time, and how much each counts.
 
-        >>> Clock([0.0, 0.5, 1.0], 1.5).weights(0.625)
+        >>> TimeOffsets([0.0, 0.5, 1.0], 1.5).weights(0.625)
         {1: 0.75, 2: 0.25}
         """
-        after = int(torch.searchsorted(self.times, time))
+        after = bisect_left(self.times, time)
         if after in (0, len(self.times)):
             return {min(after, len(self.times) - 1): 1.0}
-        low, high = self.times[after - 1 : after + 1].tolist()
+        low, high = self.times[after - 1 : after + 1]
         share = (time - low) / (high - low)
         return {row: part for row, part in ((after - 1, 1 - share), (after, share)) if part > 0}
 
@@ -65,11 +67,10 @@ class Clock(nn.Module):
         return found
 
     @torch.no_grad()
-    def settle(self, rate: float, *, learns: bool = True) -> None:
-        """Draw towards 0 what pictures do not hold, and keep to the bound; ``learns`` until the next call?
+    def settle(self, rate: float) -> None:
+        """Draw towards 0 what pictures do not hold, and keep to the bound.
 
         A time's pictures count once in about T steps, so that a step draws by a T-th of a share of the rate.
         """
-        self.learns = learns
         size = (self.off.abs() - _PULL * rate / len(self.times)).clamp(0.0, self.most)
         self.off.copy_(size * self.off.sign())
