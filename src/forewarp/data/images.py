@@ -115,7 +115,7 @@ def reduced(rgba: Tensor, by: int = 2) -> Tensor:
     >>> reduced(torch.tensor([[[1], [2]], [[3], [5]]], dtype=torch.uint8)).item()
     3
     """
-    return block_means(rgba.int(), by).round().to(torch.uint8)
+    return block_means(rgba, by).round().to(torch.uint8)
 
 
 def halved_cutout(rgba: Tensor) -> Tensor:
@@ -131,8 +131,8 @@ def halved_cutout(rgba: Tensor) -> Tensor:
     """
     height, width = (n // 2 * 2 for n in rgba.shape[:2])
     rgba = rgba[:height, :width]
-    sums = block_sums(rgba[..., :3].int())
-    count = block_sums((rgba[..., 3] > 0).int())[..., None].clamp(min=1)
+    sums = block_sums(rgba[..., :3])
+    count = block_sums(rgba[..., 3] > 0)[..., None].clamp(min=1)
     color = torch.div(sums + count // 2, count, rounding_mode="floor").to(torch.uint8)
     return torch.cat([color, reduced(rgba[..., 3:])], -1)
 

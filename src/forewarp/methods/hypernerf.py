@@ -132,10 +132,7 @@ class HyperNeRF(SampledMethod):
             )
             return torch.cat([self.position(self.warp(points, code, octaves)), beside], -1)
 
-        return tuple(
-            template and Field(template, self.activation, encoded, self.direction)
-            for template in (self.coarse, self.fine)
-        )
+        return self.both(encoded, self.direction)
 
     def extra_terms(
         self, seen: Sampled, batch: Batch, factors: Mapping[str, float], generator: torch.Generator

@@ -51,7 +51,4 @@ class NeRF(SampledMethod):
 
     def fields(self, moment: Moment) -> tuple[Field, Field]:
         """See ``SampledMethod``."""
-        return tuple(
-            network and Field(network, self.activation, self.position, self.direction)
-            for network in (self.coarse, self.fine)
-        )
+        return self.both(self.position, self.direction)

@@ -103,10 +103,7 @@ class Nerfies(SampledMethod):
             camera = self.camera_codes(moment.camera)
             return torch.cat([towards, camera.expand(*towards.shape[:-1], -1)], -1)
 
-        return tuple(
-            template and Field(template, self.activation, encoded, condition)
-            for template in (self.coarse, self.fine)
-        )
+        return self.both(encoded, condition)
 
     def extra_terms(
         self, seen: Sampled, batch: Batch, factors: Mapping[str, float], generator: torch.Generator

@@ -135,6 +135,13 @@ class SampledMethod(Method):
         """Make a network for each pass; None in place of the first where there is one pass."""
         return make() if self.sampling.fine_samples else None, make()
 
+    def both(
+        self, encoded: Callable[[Tensor], Tensor], condition: Callable[[Tensor], Tensor]
+    ) -> tuple[Field | None, Field]:
+        """The field of each pass, by the networks ``coarse`` (or None) and ``fine``; see ``Field``."""
+        networks = (self.coarse, self.fine)
+        return tuple(n if n is None else Field(n, self.activation, encoded, condition) for n in networks)
+
     def fields(self, moment: Moment) -> tuple[Field | None, Field]:
         """Return the field of each pass at a moment.
 

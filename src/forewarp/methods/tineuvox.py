@@ -67,6 +67,7 @@ class TiNeuVox(MarchedMethod):
         self.padded, self.sees_by_camera = padded, camera
         self.frozen_from = start.numbers.get("frozen_from", 1.0)
         check_number(f"stage.{start.stage}.frozen_from", self.frozen_from, *FRACTION)
+        self.frozen = False
         octaves = {"position": position_frequencies, "time": time_frequencies}
         octaves |= {"feature": feature_frequencies, "direction": direction_frequencies}
         check_least(**{f"{name}_frequencies": count for name, count in octaves.items()})
@@ -122,7 +123,9 @@ class TiNeuVox(MarchedMethod):
         """See ``Method``; at last, where asked for, round the grid to half precision and let it stay."""
         noted = super().advance(progress, step, optimizer)
         if progress >= self.frozen_from:
-            self.grid.features.data = self.grid.features.data.half().to(self.grid.features)
+            if not self.frozen:  # once; a run that goes on rounds what is round
+                self.frozen, features = True, self.grid.features
+                features.data = features.data.half().to(features)
             for group in optimizer.param_groups:
                 group["lr"] *= group["name"] != "grid"
         return noted
