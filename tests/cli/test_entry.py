@@ -1,4 +1,5 @@
 import errno
+import os
 import platform
 import shutil
 from types import SimpleNamespace
@@ -13,6 +14,17 @@ from forewarp.scene.errors import SceneError
 from tests.support.configs import CONF, ROOT, options
 
 COMMANDS = ("train", "evaluate", "render", "export", "synthesize", "report", "capture")
+
+
+@pytest.mark.parametrize(("policy", "spins"), [(None, "10000"), ("PASSIVE", "10000"), ("active", None)])
+def test_threads_that_wait_passively_spin_a_little_first(monkeypatch, policy, spins):
+    for name, value in (("OMP_WAIT_POLICY", policy), ("GOMP_SPINCOUNT", None)):
+        monkeypatch.delenv(name, raising=False)
+        if value is not None:
+            monkeypatch.setenv(name, value)
+    entry.wait_briefly()
+    assert os.environ.get("GOMP_SPINCOUNT") == spins
+    assert os.environ["OMP_WAIT_POLICY"] == (policy or "passive")
 
 
 @pytest.mark.parametrize("name", COMMANDS)

@@ -160,6 +160,11 @@ def test_the_grid_of_tineuvox_freezes():
         assert {g["name"]: g["lr"] for g in optimizer.param_groups}["grid"] == rate
         assert optimizer.param_groups[-1]["lr"] == 1.0
         assert float(made.grid.features.detach()[0, 0]) == pytest.approx(value)
+    made.grow(2000, optimizer)
+    with torch.no_grad():
+        made.grid.features.fill_(1 / 3)
+    made.advance(0.95, 2, rates(made))
+    assert float(made.grid.features.detach()[0, 0]) == pytest.approx(0.33325195)  # what grew later, too
     kept = made.protocol()["faults"]
     assert "padded" in kept
     assert "frozen_from" in kept

@@ -100,4 +100,4 @@ def test_refuses(room):
 
 def test_a_shape_that_fits_passes():
     for size, shape in (((4, 3), ("P", 3)), ((4, 3), (4, 3)), ((2,), ("...", 2)), ((0, 2), ("...", 2))):
-        assert check_shape("points", zeros(size), shape) is None
+        check_shape("points", zeros(size), shape)

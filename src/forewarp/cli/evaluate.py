@@ -37,7 +37,7 @@ def evaluate(config) -> None:
     from forewarp.runs.lock import locked
 
     run = build_run(saved)
-    place = run.device  # one that there is not is refused before anything is read
+    place = run.device  # one that there is not is refused before pictures and weights are read
     with locked(run.folder):
         module = run.load().to(place)
         warn_if_changed(run)

@@ -118,6 +118,7 @@ class TiNeuVox(MarchedMethod):
     def grow(self, num_voxels: float, optimizer: torch.optim.Optimizer) -> None:
         """See ``MarchedMethod``."""
         regrow(self.grid, self.marching_lattice(num_voxels), optimizer)
+        self.frozen = False
 
     def advance(self, progress: float, step: int, optimizer: torch.optim.Optimizer) -> dict[str, float]:
         """See ``Method``; at last, where asked for, round the grid to half precision and let it stay."""

@@ -42,9 +42,8 @@ def test_another_process_is_started_only_for_new_kernels_and_a_second_core(monke
 
         returncode = 0
 
-        def communicate(self, timeout):
+        def wait(self, timeout):
             started.append("waited")
-            return "", ""
 
     monkeypatch.setattr(subprocess, "Popen", Process)
     monkeypatch.setattr(warmup, "cores", lambda: 2)
@@ -71,13 +70,13 @@ def test_where_no_process_can_be_started_all_is_compiled_here(monkeypatch):
     assert done
 
 
-def test_why_the_second_process_failed_is_told_and_it_is_waited_for_after_an_error_too(monkeypatch, capsys):
+def test_why_the_second_process_failed_is_told(monkeypatch, capsys):
     command = [sys.executable, "-c", "import sys; sys.exit('no room')"]
     start = subprocess.Popen
     monkeypatch.setattr(subprocess, "Popen", lambda _, **how: start(command, **how))
     monkeypatch.setattr(warmup, "cores", lambda: 2)
-    with pytest.raises(KeyError), warmup._way_back_beside(True):
-        raise KeyError
+    with warmup._way_back_beside(True):
+        pass
     assert capsys.readouterr().out.endswith("as a second one failed: no room\n")
 
 

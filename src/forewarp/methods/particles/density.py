@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 
@@ -19,20 +17,20 @@ _NEAREST, _NEARER = 0.02, 0.6  # share of a picture's particles; of the farthest
 
 
 def too_near(order: Tensor, distances: Tensor) -> Tensor:
-    """Which particles stand much nearer to a camera than nearly all others that it sees: their rows.
+    """Which particles stand much nearer to a camera than nearly all others before it: their rows.
 
     So near, a few of them mend a picture where they stand in no other's way, and hide things from views that
-    lie between pictures. A thing that comes near is more than a few.
+    lie between pictures. A thing that comes near is more than a few; of fewer than fifty none is too near.
 
     Args:
         order, distances: (V,), as of ``ops.compare.Compared``.
 
-    >>> too_near(torch.tensor([4, 2, 0, 3]), torch.tensor([0.1, 2.0, 2.5, 3.0]))
-    tensor([4])
+    >>> too_near(torch.arange(50), torch.tensor([0.1] + [2.0] * 49))
+    tensor([0])
     """
     if not len(order):
         return order
-    limit = _NEARER * distances[min(math.ceil(_NEAREST * len(order)), len(order) - 1)]
+    limit = _NEARER * distances[int(_NEAREST * len(order))]
     return order[: int(torch.searchsorted(distances, limit))]
 
 

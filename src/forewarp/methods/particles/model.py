@@ -234,7 +234,8 @@ class Particles(Method):
         )  # fmt: skip
         self.pulled.add_(found.pull)
         self.shown.add_(found.pull > 0)
-        self.idle[too_near(found.order, found.distances)] = math.inf
+        if self.progress < self.numbers_of.settled:
+            self.idle[too_near(found.order, found.distances)] = math.inf
         add(total, by_name(self, found.particles))
         if self.nodes is not None:
             add(total, {"skin.learned": self.skin.slope(warp.weights, found.weights)})

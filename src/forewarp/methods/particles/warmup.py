@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from tempfile import TemporaryFile
 
 import torch
 from torch import Tensor
@@ -66,22 +67,23 @@ def _way_back_beside(new: bool) -> Iterator[None]:
     It leaves them in the cache on disk, where this process finds them; what it does not get done is
     compiled here, and why is told. It is never killed, as half a file in the cache would be worse than none.
     """
-    process = None
-    if new and cores() > 1:
-        with suppress(OSError):
-            command = [sys.executable, "-m", "forewarp.methods.particles.warmup"]
-            process = subprocess.Popen(
-                command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, errors="replace"
-            )
-    try:
+    if not new or cores() < 2:
         yield
-    finally:
-        if process is not None:
-            with suppress(subprocess.TimeoutExpired):
-                said = process.communicate(timeout=_PATIENCE_S)[1].strip()
-                if process.returncode:
-                    why = said.splitlines()[-1] if said else f"status {process.returncode}"
-                    print(f"kernels are compiled by one process, as a second one failed: {why}")
+        return
+    with TemporaryFile() as errors:
+        process, command = None, [sys.executable, "-m", "forewarp.methods.particles.warmup"]
+        with suppress(OSError):
+            process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=errors)
+        yield
+        if process is None:
+            return
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(_PATIENCE_S)
+        if process.returncode:
+            errors.seek(0)
+            said = errors.read().decode(errors="replace").strip().splitlines()
+            why = said[-1] if said else f"status {process.returncode}"
+            print(f"kernels are compiled by one process, as a second one failed: {why}")
 
 
 if __name__ == "__main__":
