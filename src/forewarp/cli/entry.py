@@ -91,7 +91,7 @@ def wait_briefly() -> None:
     """Say how threads wait for work, before torch is imported.
 
     Those that wait spinning are many times slower on a busy machine; those that sleep at once wake so late
-    that a second thread brings nothing. A fraction of a millisecond costs nothing, and brings it.
+    that a second thread brings nothing. Spinning for a fraction of a millisecond first avoids both.
     """
     if os.environ.setdefault("OMP_WAIT_POLICY", "passive").lower() == "passive":
         os.environ.setdefault("GOMP_SPINCOUNT", "10000")

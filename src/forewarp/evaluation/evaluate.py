@@ -250,6 +250,6 @@ def _protocol(module: DynamicSceneModule, scene: Scene, per_image: list[dict], p
 
 
 def _trained_by(finished: Mapping[str, Mapping]) -> dict:
-    """The commit that the last stage was trained, at least to its end, by; where it was noted."""
+    """The commit by which the last stage was finished, where it was noted."""
     noted = [stage["commit"] for stage in finished.values() if stage.get("commit")]
     return {"commit": noted[-1]} if noted else {}

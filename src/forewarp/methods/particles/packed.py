@@ -35,6 +35,6 @@ def by_name(method: Method, gradients: Gaussians) -> dict[str, Tensor]:
 
 
 def add(total: dict[str, Tensor], found: Mapping[str, Tensor]) -> None:
-    """Add gradients to those of the same names, in place."""
+    """Add gradients to those of the same names in ``total``."""
     for name, value in found.items():
         total[name] = value if name not in total else total[name] + value
