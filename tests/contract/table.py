@@ -213,6 +213,7 @@ METHODS = {
         {
             "every": 0.05,
             "settled": 0.9,
+            "straight": True,
             "time_offsets": 1.5,
             "lr_final_factor": dict.fromkeys(RATES, 0.1) | {"means": 0.01},
         },

@@ -40,6 +40,32 @@ def test_beyond_its_times_a_spline_goes_on_as_at_the_end_and_only_so_far():
             spline_basis(time, 7, beyond=0.2)
 
 
+@pytest.mark.parametrize("knots", [2, 3, 8])
+def test_a_natural_spline_passes_through_its_ends_without_acceleration(knots):
+    values = torch.randn(knots, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    step = 1e-3
+    for end, value, inward in ((0.0, values[0], step), (1.0, values[-1], -step)):
+        times = end + inward * torch.arange(4, dtype=torch.float64)
+        curve = spline_basis(times, knots, straight=True) @ values
+        assert float(curve[0]) == pytest.approx(float(value))
+        first, second = (curve.diff(n=2) / step**2).tolist()
+        assert 2 * first - second == pytest.approx(
+            0.0, abs=1e-6
+        )  # the second derivative, continued to the end
+    line = torch.linspace(0, 1, knots, dtype=torch.float64)
+    times = torch.linspace(-0.1, 1.1, 13, dtype=torch.float64)
+    torch.testing.assert_close(spline_basis(times, knots, straight=True, beyond=0.2) @ line, times)
+    for time in (-0.1, 0.3, 1.0):
+        found = spline_basis(time, knots, 0.2, straight=True, beyond=0.2)
+        of_tensor = spline_basis(torch.tensor(time), knots, 0.2, straight=True, beyond=0.2)
+        torch.testing.assert_close(found, of_tensor)
+
+
+def test_a_natural_spline_needs_two_knots():
+    with pytest.raises(ValueError, match="at least 2 knots, but got 1"):
+        spline_basis(0.5, 1, straight=True)
+
+
 def test_smooth_between_spans():
     times = torch.linspace(0, 1, 2001, dtype=torch.float64)
     bend = spline_basis(times, 9, 0.0).diff(n=2, dim=0) / (times[1] - times[0]) ** 2

@@ -18,15 +18,20 @@ class Curve:
 
     Args:
         kind: ``spline``, whose knots bend their neighbourhood in time alone, or ``cosines``, the paper's DCT.
-        count: of coefficients; a spline has at least 4, cosines at most one less than there are times.
+        count: of coefficients; a spline has at least 4, cosines at most one less than there are times. Of a
+            ``straight`` spline two of them follow from the others, so that it has two less.
         times: how many distinct training times there are.
         canonical_time: in [0, 1].
+        straight: whether a spline ends without acceleration: what the first and the last picture leave open
+            is then told by those beside them.
 
     Raises:
         ValueError: for another kind, or a single time, over which nothing moves.
     """
 
-    def __init__(self, kind: str, count: int, times: int, canonical_time: float) -> None:
+    def __init__(
+        self, kind: str, count: int, times: int, canonical_time: float, *, straight: bool = False
+    ) -> None:
         if kind not in KINDS:
             raise ValueError(f"model.motion: expected {', '.join(KINDS)} or none, but got {kind!r}")
         if times < 2:
@@ -35,17 +40,20 @@ class Curve:
                 "use model.motion=none"
             )
         self.kind, self.times, self.canonical_time = kind, times, canonical_time
+        self.straight = straight and kind == "spline"
         self.count = max(4, count) if kind == "spline" else max(1, min(count, times - 1))
+        self.pieces = max(4, count) - 3  # of a spline, each a cubic between two knots
+        self.count -= 2 * self.straight
 
     def __call__(self, time: float | Tensor, beyond: float = 0.0) -> Tensor:
         """The basis (..., K) at a time in [0, 1]; a spline also takes times up to ``beyond`` outside."""
         if self.kind == "spline":
-            return spline_basis(time, self.count, beyond=beyond)
+            return spline_basis(time, self.count, beyond=beyond, straight=self.straight)
         return dct_basis(time, self.count, self.times, self.canonical_time, _PADDING)
 
     def reach(self) -> Tensor | None:
         """From when to when (K, 2) each coefficient bends the curve; None where all do so at all times."""
         if self.kind == "cosines":
             return None
-        knots = torch.arange(self.count, dtype=torch.float32)
-        return torch.stack([knots - 3, knots + 1], -1) / (self.count - 3)
+        knots = torch.arange(self.count, dtype=torch.float32) + self.straight
+        return torch.stack([knots - 3, knots + 1], -1) / self.pieces

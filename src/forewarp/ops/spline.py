@@ -7,19 +7,24 @@ from torch import Tensor
 
 
 def spline_basis(
-    time: Tensor | float, knots: int, canonical_time: float | None = None, *, beyond: float = 0.0
-) -> Tensor:
+    time: Tensor | float, knots: int, canonical_time: float | None = None, *, beyond: float = 0.0,
+    straight: bool = False,
+) -> Tensor:  # fmt: skip
     """Uniform cubic B-splines over [0, 1], less their values at the canonical time, where one is given.
 
     With ``s = t (K - 3)``, ``i`` its whole part and ``u`` the rest, knots i to i + 3 have the shares
     ``(1 - u)^3, 3 u^3 - 6 u^2 + 4, -3 u^3 + 3 u^2 + 3 u + 1, u^3`` over 6, and all others none. A curve is
     ``sum_k c_k B_k(t)``, or ``sum_k c_k (B_k(t) - B_k(canonical))``: exactly zero at the canonical time.
 
+    A natural spline (``straight``) has no acceleration at 0 and 1: of K + 2 such knots the outer two follow
+    from those beside them, ``c_0 = 2 c_1 - c_2``, and it passes through its first and last coefficient.
+
     Args:
         time: in [0, 1], a float or a tensor (...,).
-        knots: K >= 4.
+        knots: K >= 4; if ``straight``, >= 2.
         canonical_time: in [0, 1], or None.
         beyond: how far beyond [0, 1] a time may be; the first and the last piece are continued there.
+        straight: whether the curve ends without acceleration.
 
     Returns:
         (..., K), float32 (or ``time``'s floating dtype). Not differentiable in ``time``.
@@ -31,13 +36,16 @@ def spline_basis(
 
     >>> spline_basis(1.0, 4, canonical_time=1.0)
     tensor([0., 0., 0., 0.])
+    >>> spline_basis(1.0, 3, straight=True)
+    tensor([0., 0., 1.])
     """
-    if knots < 4:
-        raise ValueError(f"spline: expected at least 4 knots, but got {knots}")
+    least = 2 if straight else 4
+    if knots < least:
+        raise ValueError(f"spline: expected at least {least} knots, but got {knots}")
     origin = 0.0 if canonical_time is None else canonical_time
     if isinstance(time, float) and -beyond <= time <= 1 + beyond and 0 <= origin <= 1:
-        now = _shares(time, knots)
-        then = [0.0] * knots if canonical_time is None else _shares(origin, knots)
+        now = _shares(time, knots, straight)
+        then = [0.0] * knots if canonical_time is None else _shares(origin, knots, straight)
         return torch.tensor([a - b for a, b in zip(now, then)])
     t = torch.as_tensor(time)
     t = t if t.is_floating_point() else t.float()
@@ -48,27 +56,39 @@ def spline_basis(
             f"spline: expected times in [{0.0 - beyond:g}, {1 + beyond:g}], but got {low:.4g} to {high:.4g}; "
             "scale the times"
         )
-    place = both * (knots - 3)
-    first = place.floor().clamp(0, knots - 4)
+    every = knots + 2 if straight else knots
+    place = both * (every - 3)
+    first = place.floor().clamp(0, every - 4)
     u = place - first
     shares = [(1 - u) ** 3, 3 * u**3 - 6 * u**2 + 4, -3 * u**3 + 3 * u**2 + 3 * u + 1, u**3]
-    basis = both.new_zeros(*both.shape, knots)
+    basis = both.new_zeros(*both.shape, every)
     basis.scatter_(
         -1, first.long()[..., None] + torch.arange(4, device=t.device), torch.stack(shares, -1) / 6
     )
+    if straight:
+        basis = torch.stack(_folded(list(basis.unbind(-1))), -1)
     return (basis[0] if canonical_time is None else basis[0] - basis[1]).to(t.dtype)
 
 
-def _shares(time: float, knots: int) -> list[float]:
+def _shares(time: float, knots: int, straight: bool) -> list[float]:
     """``B_k`` at a time."""
-    place = time * (knots - 3)
-    first = min(max(int(place), 0), knots - 4)
+    every = knots + 2 if straight else knots
+    place = time * (every - 3)
+    first = min(max(int(place), 0), every - 4)
     u = place - first
-    found = [0.0] * knots
+    found = [0.0] * every
     found[first : first + 4] = (
         (1 - u) ** 3 / 6,
         (3 * u**3 - 6 * u**2 + 4) / 6,
         (-3 * u**3 + 3 * u**2 + 3 * u + 1) / 6,
         u**3 / 6,
     )
-    return found
+    return _folded(found) if straight else found
+
+
+def _folded(shares: list) -> list:
+    """The shares of the inner knots, of which the outer two are continuations."""
+    first, *inner, last = shares
+    inner[0], inner[1] = inner[0] + 2 * first, inner[1] - first
+    inner[-1], inner[-2] = inner[-1] + 2 * last, inner[-2] - last
+    return inner

@@ -1,5 +1,3 @@
-import math
-
 import pytest
 import torch
 
@@ -14,8 +12,8 @@ def grid(side=4):
     return torch.cartesian_prod(axis, axis, axis)
 
 
-def nodes_of(count=12, kind="spline", knots=8, canonical=0.0, turns=True):
-    nodes = Nodes(grid(), count, Curve(kind, knots, 20, canonical), turns=turns)
+def nodes_of(count=12, kind="spline", knots=8, canonical=0.0, turns=True, straight=False):
+    nodes = Nodes(grid(), count, Curve(kind, knots, 20, canonical, straight=straight), turns=turns)
     generator = torch.Generator().manual_seed(0)
     for value in (nodes.shift, nodes.turn):
         if value is not None:
@@ -63,8 +61,9 @@ def test_slopes_over_time_are_those_of_autograd(turns):
         torch.testing.assert_close(found["nodes.turn"], nodes.turn.grad)
 
 
-def test_slopes_of_bending_are_those_of_autograd():
-    nodes = nodes_of()
+@pytest.mark.parametrize("straight", [False, True])
+def test_slopes_of_bending_are_those_of_autograd(straight):
+    nodes = nodes_of(straight=straight)
     nodes.seen.copy_(torch.tensor([0.0, 1.0]))
     value, found = nodes.spread_over_time(0.5, 0.5, nodes.curve(0.5), torch.zeros(12, 6), 3.0, 2.0)
     step = 1 / 5
@@ -88,21 +87,30 @@ def test_straight_motion_does_not_bend():
     assert bent == pytest.approx(0.0, abs=1e-9)
 
 
-def test_a_curve_is_continued_to_times_not_yet_seen():
-    nodes = nodes_of(knots=10)
+@pytest.mark.parametrize(("straight", "known"), [(False, 5), (True, 4)])
+def test_a_curve_is_continued_to_times_not_yet_seen(straight, known):
+    nodes = nodes_of(knots=10, straight=straight)
     for value in (nodes.shift, nodes.turn):
         value.data.zero_()
     nodes.shift.data[:, :5, 0] = torch.arange(5.0)
     nodes.look_ahead(0.29)  # the third span is the last that is seen
-    assert nodes.shift[0, :5, 0].tolist() == [0, 1, 2, 3, 4]
-    expected, stride = 4.0, 1.0
-    for j in range(5, 10):
+    expected, stride = [float(j) for j in range(known)], 1.0
+    while len(expected) < nodes.curve.count:
         stride *= 0.5
-        expected += stride
-        # The sixth knot is seen already, though at 0; what lies beyond follows it.
-        if j > 5:
-            assert math.isfinite(nodes.shift[0, j, 0].item())
+        expected.append(expected[-1] + stride)
+    assert nodes.shift[0, :, 0].tolist() == pytest.approx(expected)
     assert nodes.seen.tolist() == pytest.approx([0.0, 0.29])
+
+
+def test_a_natural_spline_has_two_numbers_less_and_knots_as_far_apart():
+    free, natural = (Curve("spline", 10, 20, 0.0, straight=straight) for straight in (False, True))
+    assert (free.count, natural.count) == (10, 8)
+    torch.testing.assert_close(natural.reach(), free.reach()[1:-1])
+    times = torch.linspace(0, 1, 15)
+    inner = natural(times)[5:10, 2:6]  # far from the ends both are the same
+    torch.testing.assert_close(inner, free(times)[5:10, 3:7])
+    assert Curve("cosines", 10, 20, 0.0, straight=True).count == 10
+    assert Curve("spline", 4, 2, 0.0, straight=True)(0.25).tolist() == pytest.approx([0.75, 0.25])
 
 
 def test_what_was_seen_is_not_continued_anew():

@@ -50,6 +50,22 @@ def test_points_are_where_neighbouring_views_agree(scene_of):
     assert bool(cloud.points.isfinite().all())
 
 
+def test_of_several_cameras_those_of_the_same_time_are_a_sweeps_neighbours(scene_of):
+    scene = scene_of("hypernerf")
+
+    def unread():
+        raise AssertionError("a picture of another time was read")
+
+    around = [scene.train[i % len(scene.train)] for i in range(10)]
+    now = [replace(frame, time=0.5, camera_id=i) for i, frame in enumerate(around)]
+    other = [replace(frame, time=t, camera_id=0, load=unread) for frame in around for t in (0.4, 0.6)]
+    several = replace(scene, train=(*other, *now))
+    cloud = swept(several, list(range(len(other), len(several.train))), 400)
+    assert len(cloud) > 16
+    with pytest.raises(AssertionError, match="another time"):
+        swept(replace(scene, train=(*other, *now[:8])), list(range(len(other), len(other) + 8)), 400)
+
+
 def test_a_picture_of_a_sweep_fills_only_its_holes(scene_of):
     camera = scene_of("hypernerf").train[0].camera  # 20 x 16 pixels; cells of 4 x 4
     rays = camera.rays()

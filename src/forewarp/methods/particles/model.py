@@ -72,7 +72,8 @@ class Particles(Method):
         self.nodes = self.skin = None
         if on.motion is not None:
             count, knots = self.numbers_of.motion(len(self.means), len(times))
-            curve = Curve(on.motion, knots, len(times), self.canonical_time)
+            straight = self.numbers_of.straight
+            curve = Curve(on.motion, knots, len(times), self.canonical_time, straight=straight)
             points, edges = None if start.blank else self.means.data, self.numbers_of.edges
             turns, rests = on.rotation is not None, on.background is not None
             offsets = TimeOffsets.of(on.motion, times, self.numbers_of.time_offsets)

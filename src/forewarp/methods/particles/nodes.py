@@ -233,7 +233,7 @@ class Nodes(nn.Module):
 
     def _bend(self, taken: float) -> Tensor:
         """The second difference (K,) of the basis around a time of the motion, within those seen."""
-        step, (low, high) = 1 / max(self.curve.count - 3, 2), self.seen.tolist()
+        step, (low, high) = 1 / max(self.curve.pieces, 2), self.seen.tolist()
         low, high = low + step, high - step
         if low > high:
             return self.places.new_zeros(self.curve.count)

@@ -28,6 +28,7 @@ class Numbers:
         full: share of them that this stage ends with.
         nodes: how many there are, times the square root of the particles at the beginning.
         knots: coefficients of each node's curve, times the square root of the times.
+        straight: whether the curves, if splines, end without acceleration.
         edges: neighbours that a node is kept rigid with.
         every: share between two rounds of density control, up to ``settled``.
         relink: rounds after which particles look again for the nodes beside them.
@@ -48,6 +49,7 @@ class Numbers:
     full: float = 1.0
     nodes: float = 2.5
     knots: float = 2.2
+    straight: bool = False
     edges: int = 6
     every: float = 0.01
     settled: float = 0.6
@@ -65,6 +67,8 @@ class Numbers:
             raise ValueError(
                 f"{where}.effects: expected some of {', '.join(NAMES)}, but got {list(self.effects)}"
             )
+        if not isinstance(self.straight, bool):
+            raise ValueError(f"{where}.straight: expected true or false, but got {self.straight!r}")
         for keys, what, good in (
             (("first", "every", "loose", "full"), "a number in (0, 1]", lambda value: 0 < value <= 1),
             (("density", "nodes", "knots", "calm"), "a number > 0", lambda value: value > 0),
