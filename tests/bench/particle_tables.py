@@ -47,6 +47,7 @@ AXES = {
     "zoom": "covered pixels of as many",
     "nodes": "nodes",
 }
+THREADS = (1, 2, 4, 8, 16)
 LEAST_SHARE, LEAST_GAIN, STEP_MS, PICTURE_MS = 0.8, 1.6, 7.0, 5.0  # the goals
 
 
@@ -155,7 +156,7 @@ def parts_table(size: Size = Size()) -> str:  # noqa: B008
 
 
 def growth_table(size: Size = Size(), sizes: dict[str, Sequence[int]] | None = None) -> str:  # noqa: B008
-    """Time a step and a picture while particles, pixels or nodes grow."""
+    """Time a step and a picture while particles, pixels or nodes grow, and steps while threads do."""
     from tests.bench.performance import slope
 
     parts = []
@@ -173,7 +174,17 @@ def growth_table(size: Size = Size(), sizes: dict[str, Sequence[int]] | None = N
         said = f"a step grows as {against} to the power {fitted[0]:.2f}, a picture to {fitted[1]:.2f}"
         head = [AXES[name], "a step, ms", "a picture, ms"]
         parts.append(f"**{AXES[name]}**: {said}\n\n{table(head, lines)}")
-    return "\n\n".join(parts)
+    return "\n\n".join([*parts, threads_table(size)])
+
+
+def threads_table(size: Size) -> str:
+    """Time steps by the clock on one thread and on more, as far as there are cores."""
+    loop = Loop(size)
+    known = [count for count in THREADS if count <= _most_threads()]
+    found = {count: steps_a_second(loop, count) for count in known}
+    lines = [[f"{n}", f"{rate:.0f}", f"{rate / found[1]:.2f}"] for n, rate in found.items()]
+    said = "by the clock, so that other work on the machine counts"
+    return f"**threads**: {said}\n\n{table(['threads', 'steps a second', 'times those of one'], lines)}"
 
 
 def steps_a_second(loop: Loop, threads: int, steps: int = STEPS) -> float:
@@ -230,7 +241,7 @@ def goals_table(size: Size = Size(), steps: int = 400) -> str:  # noqa: B008
     loop = Loop(size)
     step, picture = timed(loop.step, STEPS), timed(loop.picture, STEPS)
     unit = yardstick()
-    gain = steps_a_second(loop, 2) / steps_a_second(loop, 1) if _two_threads() else None
+    gain = steps_a_second(loop, 2) / steps_a_second(loop, 1) if _most_threads() >= 2 else None
     within, bare = lightning_shares(size, steps)
     share = bare / within
     rows = [
@@ -249,7 +260,7 @@ def _with_ratio(seconds: float, unit: float) -> str:
     return f"{milliseconds(seconds)} ms, {seconds / unit:.1f} times a million exponentials"
 
 
-def _two_threads() -> bool:
+def _most_threads() -> int:
     from numba import config
 
-    return config.NUMBA_NUM_THREADS >= 2
+    return config.NUMBA_NUM_THREADS

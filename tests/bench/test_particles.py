@@ -65,14 +65,24 @@ def test_tables_are_made(few):
         assert bool(cells[2]) == compared
     grown = particle_tables.growth_table(TINY, {"particles": (100, 200), "zoom": (0.5, 1.0), "nodes": (4, 9)})
     assert grown.count("to the power") == 3
+    grown, _, threads = grown.partition("**threads**")
+    assert "| 1 |" in threads
     assert grown.count("\n| ") == 3 * 4
     small, large = (int(line.split("|")[1]) for line in grown.split("\n\n")[3].splitlines()[2:])
     assert 3 * small < large < 5 * small  # covered pixels: half as large, a quarter
 
 
+def test_steps_grow_with_threads_as_far_as_there_are_cores(few, monkeypatch):
+    monkeypatch.setattr(particle_tables, "_most_threads", lambda: 3)
+    monkeypatch.setattr(particle_tables, "steps_a_second", lambda loop, threads: 100.0 * threads**0.7)
+    text = particle_tables.threads_table(TINY)
+    assert "| 1 | 100 | 1.00 |" in text
+    assert text.endswith("| 2 | 162 | 1.62 |")
+
+
 def test_goals_are_judged(few, monkeypatch):
     monkeypatch.setattr(particle_tables, "lightning_shares", lambda size, steps: (0.010, 0.007))
-    monkeypatch.setattr(particle_tables, "_two_threads", lambda: True)
+    monkeypatch.setattr(particle_tables, "_most_threads", lambda: 2)
     monkeypatch.setattr(particle_tables, "steps_a_second", lambda loop, threads: 100.0 * threads**0.7)
     text = particle_tables.goals_table(TINY)
     assert "| 1.62 times | reached |" in text

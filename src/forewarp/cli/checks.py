@@ -98,7 +98,8 @@ def refuse_other_methods(config: DictConfig) -> None:
         return
     voxels = target.startswith(VOXELS)
     for group, option in choices.items():
-        part = config.model._get_node(group[6:]) if group.startswith("model/") else None
+        own = group.startswith("model/") and "@" not in group  # else of a stage's own model
+        part = config.model._get_node(group[6:]) if own else None
         if part is None or part._is_none() or isinstance(part, DictConfig) == voxels:
             continue
         raise ValueError(
