@@ -188,7 +188,7 @@ def threads_table(size: Size) -> str:
 
 
 def steps_a_second(loop: Loop, threads: int, steps: int = STEPS) -> float:
-    """Steps a second of the clock, as two threads share the work; the median of five rounds."""
+    """Count steps a second of the clock, by so many threads; the median of five rounds."""
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
     try:

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import pytest
 
 from forewarp.ops import kernels_project, kernels_tiles
+from forewarp.training.callbacks import StageProgress
 from forewarp.training.module import DynamicSceneModule
 from tests.bench import particle_tables, start_up
 from tests.bench.particles import Loop, Size, figure
@@ -95,8 +96,10 @@ def test_steps_within_lightning_and_without_are_timed(monkeypatch):
     monkeypatch.setattr(
         DynamicSceneModule, "training_step", clock.taking(3.0, DynamicSceneModule.training_step)
     )
+    shown = clock.taking(0.5, StageProgress.on_train_batch_end)  # a run's callbacks count
+    monkeypatch.setattr(StageProgress, "on_train_batch_end", shown)
     monkeypatch.setattr(particle_tables.Loop, "step", clock.taking(2.0, particle_tables.Loop.step))
-    assert particle_tables.lightning_shares(TINY, 12) == (3.0, 2.0)
+    assert particle_tables.lightning_shares(TINY, 12) == (3.5, 2.0)
 
 
 def test_a_second_counts_once(monkeypatch):

@@ -1,15 +1,17 @@
 """Particles that begin with a stage of voxels, as one types it."""
 
 from forewarp import load
+from forewarp.methods.particles.model import Particles
 from forewarp.synth.scenes import synthesize
 from forewarp.training.handover import load_handover
 
 
 def test_particles_begin_where_voxels_found_matter(ok, refused, in_tmp, monkeypatch):
-    def hull(*_):
-        raise AssertionError("they began on the hull")
+    def elsewhere(*_):
+        raise AssertionError("they began somewhere else")
 
-    monkeypatch.setattr("forewarp.methods.particles.start.hull_surface", hull)
+    for start in ("hull_surface", "swept", "anywhere"):
+        monkeypatch.setattr(f"forewarp.methods.particles.start.{start}", elsewhere)
     synthesize(in_tmp / "x", size=24, frames=8, test_views=(1, 1, 0), val_views=0, samples_per_pixel=1)
     words = ["data=dnerf", "data.root=.", "data.scene=x", "trainer=cpu", "threads=1", "logger=none"]
     words += [
@@ -21,4 +23,6 @@ def test_particles_begin_where_voxels_found_matter(ok, refused, in_tmp, monkeypa
     assert "expected a number, as the method is trained on single rays" in refused("train", *words)
     ok("train", *words, "preset.rays=64")
     assert len(load_handover(in_tmp / "run" / "coarse").cloud) >= 16
-    assert load(in_tmp / "run").config.stage.fine.get("model") is None  # the run's: particles
+    assert isinstance(load(in_tmp / "run").method, Particles)
+    line = refused("train", *words, "preset.rays=64", "model/radiance=mlp")
+    assert "model/radiance: expected an option of model=particles" in line  # of the run as ever

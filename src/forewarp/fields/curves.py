@@ -19,7 +19,8 @@ class Curve:
     Args:
         kind: ``spline``, whose knots bend their neighbourhood in time alone, or ``cosines``, the paper's DCT.
         count: of coefficients; a spline has at least 4, cosines at most one less than there are times. Of a
-            ``straight`` spline two of them follow from the others, so that it has two less.
+            ``straight`` spline two follow from the others, and it has two less, but no fewer than 4 of four
+            times or more, and as many as there are times of fewer.
         times: how many distinct training times there are.
         canonical_time: in [0, 1].
         straight: whether a spline ends without acceleration: what the first and the last picture leave open
@@ -41,9 +42,11 @@ class Curve:
             )
         self.kind, self.times, self.canonical_time = kind, times, canonical_time
         self.straight = straight and kind == "spline"
-        self.count = max(4, count) if kind == "spline" else max(1, min(count, times - 1))
-        self.pieces = max(4, count) - 3  # of a spline, each a cubic between two knots
-        self.count -= 2 * self.straight
+        if kind == "cosines":
+            self.count = max(1, min(count, times - 1))
+        else:
+            self.count = max(min(times, 4), count - 2) if straight else max(4, count)
+        self.pieces = self.count - (1 if self.straight else 3)  # cubics of a spline, each between two knots
 
     def __call__(self, time: float | Tensor, beyond: float = 0.0) -> Tensor:
         """The basis (..., K) at a time in [0, 1]; a spline also takes times up to ``beyond`` outside."""

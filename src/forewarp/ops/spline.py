@@ -56,12 +56,12 @@ def spline_basis(
             f"spline: expected times in [{0.0 - beyond:g}, {1 + beyond:g}], but got {low:.4g} to {high:.4g}; "
             "scale the times"
         )
-    every = knots + 2 if straight else knots
-    place = both * (every - 3)
-    first = place.floor().clamp(0, every - 4)
+    whole = _with_outer(knots, straight)
+    place = both * (whole - 3)
+    first = place.floor().clamp(0, whole - 4)
     u = place - first
     shares = [(1 - u) ** 3, 3 * u**3 - 6 * u**2 + 4, -3 * u**3 + 3 * u**2 + 3 * u + 1, u**3]
-    basis = both.new_zeros(*both.shape, every)
+    basis = both.new_zeros(*both.shape, whole)
     basis.scatter_(
         -1, first.long()[..., None] + torch.arange(4, device=t.device), torch.stack(shares, -1) / 6
     )
@@ -72,11 +72,11 @@ def spline_basis(
 
 def _shares(time: float, knots: int, straight: bool) -> list[float]:
     """``B_k`` at a time."""
-    every = knots + 2 if straight else knots
-    place = time * (every - 3)
-    first = min(max(int(place), 0), every - 4)
+    whole = _with_outer(knots, straight)
+    place = time * (whole - 3)
+    first = min(max(int(place), 0), whole - 4)
     u = place - first
-    found = [0.0] * every
+    found = [0.0] * whole
     found[first : first + 4] = (
         (1 - u) ** 3 / 6,
         (3 * u**3 - 6 * u**2 + 4) / 6,
@@ -86,8 +86,13 @@ def _shares(time: float, knots: int, straight: bool) -> list[float]:
     return _folded(found) if straight else found
 
 
-def _folded(shares: list) -> list:
-    """The shares of the inner knots, of which the outer two are continuations."""
+def _with_outer(knots: int, straight: bool) -> int:
+    """How many knots there are, with those that follow from others."""
+    return knots + 2 if straight else knots
+
+
+def _folded(shares: list[float] | list[Tensor]) -> list:
+    """Give the outer two knots' shares to those inside, of which they are continuations."""
     first, *inner, last = shares
     inner[0], inner[1] = inner[0] + 2 * first, inner[1] - first
     inner[-1], inner[-2] = inner[-1] + 2 * last, inner[-2] - last

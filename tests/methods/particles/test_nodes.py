@@ -61,9 +61,9 @@ def test_slopes_over_time_are_those_of_autograd(turns):
         torch.testing.assert_close(found["nodes.turn"], nodes.turn.grad)
 
 
-@pytest.mark.parametrize("straight", [False, True])
-def test_slopes_of_bending_are_those_of_autograd(straight):
-    nodes = nodes_of(straight=straight)
+@pytest.mark.parametrize(("kind", "straight"), [("spline", False), ("spline", True), ("cosines", False)])
+def test_slopes_of_bending_are_those_of_autograd(kind, straight):
+    nodes = nodes_of(kind=kind, straight=straight)
     nodes.seen.copy_(torch.tensor([0.0, 1.0]))
     value, found = nodes.spread_over_time(0.5, 0.5, nodes.curve(0.5), torch.zeros(12, 6), 3.0, 2.0)
     step = 1 / 5
@@ -111,6 +111,12 @@ def test_a_natural_spline_has_two_numbers_less_and_knots_as_far_apart():
     torch.testing.assert_close(inner, free(times)[5:10, 3:7])
     assert Curve("cosines", 10, 20, 0.0, straight=True).count == 10
     assert Curve("spline", 4, 2, 0.0, straight=True)(0.25).tolist() == pytest.approx([0.75, 0.25])
+
+
+@pytest.mark.parametrize("times", [2, 3, 4])
+def test_few_times_leave_a_natural_spline_as_free_as_they_are(times):
+    curve = Curve("spline", 4, times, 0.0, straight=True)
+    assert torch.linalg.matrix_rank(curve(torch.linspace(0, 1, times))) == times == curve.count
 
 
 def test_what_was_seen_is_not_continued_anew():

@@ -28,7 +28,8 @@ class Numbers:
         full: share of them that this stage ends with.
         nodes: how many there are, times the square root of the particles at the beginning.
         knots: coefficients of each node's curve, times the square root of the times.
-        straight: whether the curves, if splines, end without acceleration.
+        straight: whether the curves, if splines, end without acceleration: two coefficients follow from the
+            others. Runs that do not say have free ends.
         edges: neighbours that a node is kept rigid with.
         every: share between two rounds of density control, up to ``settled``.
         relink: rounds after which particles look again for the nodes beside them.
