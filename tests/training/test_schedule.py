@@ -135,6 +135,18 @@ def test_frames_with_large_errors_come_more_often():
     assert draws(curriculum, 0.0)[4] / 2000 == pytest.approx(0.5 / 1.4, abs=0.04)
 
 
+def test_the_ends_of_time_get_their_share_once_all_frames_are_in():
+    times = [i / 39 for i in range(40)]
+    curriculum = Curriculum(times, 0.5, start=30, all_in=0.5, newest_share=0.0, ends_share=0.5)
+    assert max(draws(curriculum, 0.0).values()) < 150  # of 30 frames, none at an end
+    counts = draws(curriculum, 1.0)
+    ends = [0, 1, 38, 39]
+    for frame in ends:
+        assert counts[frame] / 2000 == pytest.approx(0.5 / 4 + 0.5 / 40, abs=0.03)
+    assert max(count for frame, count in counts.items() if frame not in ends) < 60
+    assert Curriculum([0.3], 0.3, all_in=0.0, ends_share=1.0)() == 0
+
+
 def test_frames_without_an_error_count_as_the_worst():
     curriculum = Curriculum(TIMES, 0.0, all_in=0.0, error_share=1.0)
     assert len(draws(curriculum, 0.0)) == 10
@@ -225,7 +237,7 @@ REFUSED = [
     (partial(Curriculum, TIMES, 0.0), {"pace": -1.0}, "pace: expected a number >= 0 or null, but got -1.0"),
     *(
         (partial(Curriculum, TIMES, 0.0), wrong, r"stage.curriculum: expected start >= 1, .*but got")
-        for wrong in (*ODD, {"error_share": 1.5}, {"error_share": float("nan")})
+        for wrong in (*ODD, {"error_share": 1.5}, {"ends_share": 1.5}, {"error_share": float("nan")})
     ),
 ]
 

@@ -13,6 +13,8 @@ import torch
 from forewarp.methods.method import Model
 from forewarp.training.objective import Objective
 
+_ENDS = 0.05  # of all time, at its beginning and at its end
+
 
 @dataclass(frozen=True)
 class StageSettings:
@@ -202,6 +204,8 @@ class Curriculum:
         newest_part: share of the frames in play that counts as the newest.
         error_share: share of the draws that picks a frame with a probability proportional to its latest
             error (see ``report``): the few frames at the ends of a sequence are hard.
+        ends_share: share of the draws that goes to the first and the last twentieth of all time, once all
+            times are in play: what moves there has frames on one side alone.
         seed: seed of the draws.
         where: key that errors name.
     """
@@ -219,15 +223,16 @@ class Curriculum:
         newest_share: float = 0.3,
         newest_part: float = 0.125,
         error_share: float = 0.0,
+        ends_share: float = 0.0,
         seed: int = 0,
         where: str = "stage.curriculum",
     ) -> None:
-        shares = all(0 <= share <= 1 for share in (all_in, newest_share, error_share))
+        shares = all(0 <= share <= 1 for share in (all_in, newest_share, error_share, ends_share))
         if not (start >= 1 and shares and 0 < newest_part <= 1):
             raise ValueError(
-                f"{where}: expected start >= 1, all_in, newest_share and error_share in [0, 1] and "
-                f"newest_part in (0, 1], but got {start=}, {all_in=}, {newest_share=}, {error_share=}, "
-                f"{newest_part=}"
+                f"{where}: expected start >= 1, all_in, newest_share, error_share and ends_share in [0, 1] "
+                f"and newest_part in (0, 1], but got {start=}, {all_in=}, {newest_share=}, {error_share=}, "
+                f"{ends_share=}, {newest_part=}"
             )
         self.canonical_time = canonical_time
         self.order = sorted(range(len(times)), key=lambda i: (abs(times[i] - canonical_time), times[i], i))
@@ -242,7 +247,10 @@ class Curriculum:
         self.start, self.all_in, self.pace = min(start, len(self._ends)), all_in, pace
         self.from_zero = from_zero
         self.newest_share, self.newest_part = newest_share, newest_part
-        self.error_share = error_share
+        self.error_share, self.ends_share = error_share, ends_share
+        first, last = min(times), max(times)
+        near = _ENDS * (last - first)
+        self.at_ends = [i for i, time in enumerate(times) if time <= first + near or time >= last - near]
         self.errors = torch.full((len(times),), float("nan"))
         self.fraction = 0.0
         self.generator = torch.Generator().manual_seed(seed)
@@ -267,13 +275,19 @@ class Curriculum:
     def __call__(self) -> int:
         """Draw the next training frame."""
         playing = self.in_play
-        if self.error_share > 0 and float(torch.rand((), generator=self.generator)) < self.error_share:
+        if self._falls_to(self.error_share):
             return self._by_error()
-        newest = max(1, int(playing * self.newest_part))
         growing = playing < len(self.order)
+        if not growing and self._falls_to(self.ends_share):
+            return self.at_ends[int(torch.randint(len(self.at_ends), (), generator=self.generator))]
+        newest = max(1, int(playing * self.newest_part))
         favour = growing and float(torch.rand((), generator=self.generator)) < self.newest_share
         low = playing - newest if favour else 0
         return self.order[int(torch.randint(low, playing, (), generator=self.generator))]
+
+    def _falls_to(self, share: float) -> bool:
+        """Whether this draw is of a share; a share of 0 draws nothing."""
+        return share > 0 and float(torch.rand((), generator=self.generator)) < share
 
     def report(self, frame: int, error: float) -> None:
         """Record the squared error of a frame after a step on it; ignore errors that are not finite."""
