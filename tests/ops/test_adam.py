@@ -69,6 +69,23 @@ def test_both_agree_after_many_steps():
     torch.testing.assert_close(fast[0].double(), exact[0], rtol=1e-3, atol=1e-3)
 
 
+@pytest.mark.parametrize("width", [1, 3, 6])
+def test_rows_of_many_steps_have_one_pace_and_those_without_a_gradient_stay(width):
+    fast = state((48, width))
+    fast[3].copy_(torch.arange(48) + 2040.0)  # some blocks below the end of the table, some beyond
+    fast[1].normal_()
+    fast[2].uniform_(0.5, 1.0)
+    gradient = torch.randn(48, width, generator=torch.Generator().manual_seed(1))
+    gradient[[3, 20, 31, 40]] = 0
+    gradient[41, 1:] = 0  # a part of it has one
+    exact, before = [part.double() for part in fast], [part.clone() for part in fast]
+    step(fast, gradient, 1e-3)
+    step(exact, gradient.double(), 1e-3)
+    for part, twin, then in zip(fast, exact, before):
+        torch.testing.assert_close(part.double(), twin, rtol=1e-5, atol=1e-6)
+        assert torch.equal(part[[3, 20, 31, 40]], then[[3, 20, 31, 40]])
+
+
 def test_not_a_number_is_kept(backend):
     parts, gradient = state(), torch.ones(6, 3)
     gradient[3, 1] = float("nan")

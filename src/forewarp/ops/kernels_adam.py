@@ -26,10 +26,41 @@ def biases(first: float, second: float) -> np.ndarray:
 @njit(inline="always")
 def _seen(gradient, row, width):
     """Whether a row has a gradient."""
-    found = False
+    for i in range(row * width, (row + 1) * width):  # noqa: SIM110 (Numba takes no generator here)
+        if gradient[i] != 0:
+            return True
+    return False
+
+
+@njit(inline="always")
+def _step_alike(value, gradient, mean, square, steps, block, width, rooms, numbers):
+    """A step of sixteen rows of one pace; rows without a gradient are put back as they were."""
+    c1, c2, pace, scale, small = numbers
+    means, squares, values = rooms
+    seen = 0
+    for lane in range(16):
+        row = 16 * block + lane
+        if _seen(gradient, row, width):
+            steps[row] += np.float32(1)
+            seen |= 1 << lane
+            continue
+        for c in range(width):
+            at, to = row * width + c, lane * width + c
+            means[to], squares[to], values[to] = mean[at], square[at], value[at]
+    if seen == 0:
+        return
     for c in range(width):
-        found |= gradient[row * width + c] != 0
-    return found
+        at = 16 * (width * block + c)
+        g, m, v = get_row(gradient, at), get_row(mean, at), get_row(square, at)
+        m, v = m + (g - m) * c1, v + (g * g - v) * c2
+        put_row(mean, at, m)
+        put_row(square, at, v)
+        put_row(value, at, get_row(value, at) - pace * m / (scale * root(v) + small))
+    for lane in range(16):
+        if not seen >> lane & 1:
+            for c in range(width):
+                at, to = (16 * block + lane) * width + c, lane * width + c
+                mean[at], square[at], value[at] = means[to], squares[to], values[to]
 
 
 @njit(parallel=True, cache=True)
@@ -37,7 +68,8 @@ def adam(value, gradient, mean, square, steps, rate, first, second, eps, bias):
     """See ``adam.adam_rows``; all are (R C,), steps (R,), ``bias`` as of ``biases``.
 
     Sixteen rows at once, whose numbers lie side by side in C vectors; what is beyond the last sixteen, or
-    wider than a room, number by number.
+    wider than a room, number by number. Rows that have all made so many steps that biases are 1, which soon
+    is the rule, have one pace.
     """
     rows = len(steps)
     width = len(value) // max(rows, 1)
@@ -45,9 +77,17 @@ def adam(value, gradient, mean, square, steps, rate, first, second, eps, bias):
     small, whole = np.float32(eps), np.float32(rate)
     blocks = rows // 16 if width <= _WIDEST else 0
     for chunk in prange(64):
-        paces, scales = room(_WIDEST), room(_WIDEST)
+        paces, scales, values = room(_WIDEST), room(_WIDEST), room(_WIDEST)
         for block in range(blocks * chunk // 64, blocks * (chunk + 1) // 64):
-            any_seen = False
+            any_seen, known = False, True
+            for row in range(16 * block, 16 * block + 16):
+                known &= steps[row] >= KNOWN
+            if known:
+                _step_alike(
+                    value, gradient, mean, square, steps, block, width, (paces, scales, values),
+                    (c1, c2, whole * bias[KNOWN, 0], bias[KNOWN, 1], small),
+                )  # fmt: skip
+                continue
             for lane in range(16):
                 row, pace, scale = 16 * block + lane, np.float32(0), np.float32(0)  # 0: not seen
                 if _seen(gradient, row, width):

@@ -217,7 +217,7 @@ class Nodes(nn.Module):
         """
         bend = self._bend(taken) if factor else torch.zeros_like(basis)
         *found, bent = spread_nodes(self.shift, self.turn, slope, basis, bend, factor, unit)
-        if self.still is not None:
+        if self.still is not None and bool(self.still.any()):
             for part in found:
                 if part is not None:
                     part[self.still] = 0.0  # rounding errors would be steps, as Adam takes them
