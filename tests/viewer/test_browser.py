@@ -102,7 +102,7 @@ def exact(studio, tab, **changes):
 
 
 def changed(seen, other) -> float:
-    """Share of the pixels that differ by more than compression does; a red line on orange differs by some 50 of 255."""
+    """Share of the pixels that differ by more than compression does; red on orange is some 50 of 255."""
     return float((np.abs(seen.astype(int) - other).max(-1) > 30).mean())
 
 

@@ -199,6 +199,28 @@ def at_least(typing, a, least):
     return a(a, least), code
 
 
+def _chosen(a, b, sign: str):
+    """Code that takes ``a`` where it compares so with ``b``, else ``b``; a number is put beside itself."""
+
+    def code(context, builder, sig, args):
+        x, y = (_as_lanes(builder, v, k, sig.return_type.width) for v, k in zip(args, sig.args))
+        return builder.select(builder.fcmp_ordered(sign, x, y), x, y)
+
+    return SUMS(a, b), code
+
+
+@intrinsic
+def maximum(typing, a, b):
+    """The larger of two vectors of 16 numbers, or of one and a number; ``b`` where ``a`` is NaN."""
+    return _chosen(a, b, ">")
+
+
+@intrinsic
+def minimum(typing, a, b):
+    """The smaller of two vectors of 16 numbers, or of one and a number; ``b`` where ``a`` is NaN."""
+    return _chosen(a, b, "<")
+
+
 @intrinsic
 def any_above(typing, a, least):
     """Whether ``a > least`` anywhere."""
