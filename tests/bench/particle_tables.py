@@ -40,12 +40,31 @@ SIZES = {
     "side": (100, 200, 400, 800),
     "zoom": (0.25, 0.5, 1.0, 2.0),
     "nodes": (100, 200, 400, 800),
+    "box": (1.0, 2.0, 4.0, 8.0),
 }
 AXES = {
     "particles": "particles",
     "side": "side of the picture",
     "zoom": "covered pixels of as many",
     "nodes": "nodes",
+    "box": "volume of the box, times one that fits",
+}
+MOVES = (
+    *("model/rotation=none", "model/view_dependence=none", "model/color_over_time=none"),
+    *("model/opacity_over_time=none", "model/background=none"),
+)  # along splines, which are the default
+NONE = ("model/motion=none", *MOVES)
+# Each effect alone, on what it needs: what is typed.
+ALONE = {
+    "nothing: particles at rest, of one colour each": NONE,
+    "view dependence, degree 1": (*NONE, "model/view_dependence=harmonics"),
+    "view dependence, degree 3": (*NONE, "model/view_dependence=harmonics", "model.view_dependence=3"),
+    "colour over time": (*NONE, "model/color_over_time=cosines"),
+    "opacity over time": (*NONE, "model/opacity_over_time=cosines"),
+    "motion, without rotation": MOVES,
+    "motion": (*MOVES, "model/rotation=nodes"),
+    "motion and a background that rests": (*MOVES, "model/rotation=nodes", "model/background=still"),
+    "all that cut-out pictures have by default": (),
 }
 THREADS = (1, 2, 4, 8, 16)
 LEAST_SHARE, LEAST_GAIN, STEP_MS, PICTURE_MS = 0.8, 1.6, 7.0, 5.0  # the goals
@@ -175,6 +194,17 @@ def growth_table(size: Size = Size(), sizes: dict[str, Sequence[int]] | None = N
         head = [AXES[name], "a step, ms", "a picture, ms"]
         parts.append(f"**{AXES[name]}**: {said}\n\n{table(head, lines)}")
     return "\n\n".join([*parts, threads_table(size)])
+
+
+def effects_table(size: Size = Size()) -> str:  # noqa: B008
+    """Time a step and a picture with each effect alone, relative to none."""
+    lines, first = [], None
+    for name, typed in ALONE.items():
+        loop = Loop(size, typed)
+        step, picture = timed(loop.step, STEPS), timed(loop.picture, STEPS)
+        first = first or step
+        lines.append([name, milliseconds(step), f"{step / first:.2f}", milliseconds(picture)])
+    return table(["effect", "a step, ms", "times", "a picture, ms"], lines)
 
 
 def threads_table(size: Size) -> str:

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import torch
@@ -48,13 +48,15 @@ BOX = Box((-1.0, -0.5, -1.2), (1.0, 0.5, 1.1))
 @dataclass(frozen=True)
 class Size:
     """What is timed: so many ``particles`` and ``nodes``, pictures of ``side`` squared pixels; ``zoom`` makes
-    the figure larger in them, at 1 it is as large as hook.
+    the figure larger in them, at 1 it is as large as hook. The scene's box has ``box`` times the volume of
+    one that fits.
     """
 
     particles: int = COUNT
     side: int = SIDE
     nodes: int = NODES
     zoom: float = 1.0
+    box: float = 1.0
 
 
 def figure(count: int) -> tuple[Gaussians, float]:
@@ -97,7 +99,7 @@ def photograph(particles: Gaussians, view: Camera) -> Tensor:
 
 
 @cache
-def scene_of(count: int, side: int, zoom: float = 1.0) -> Scene:
+def scene_of(count: int, side: int, zoom: float = 1.0, box: float = 1.0) -> Scene:
     """The figure at many times; pictures repeat."""
     particles, _ = figure(count)
     cameras = [camera(side, i / VIEWS, zoom) for i in range(VIEWS)]
@@ -106,19 +108,25 @@ def scene_of(count: int, side: int, zoom: float = 1.0) -> Scene:
         Frame(f"r_{i}", i / (TIMES - 1), cameras[i % VIEWS], lambda i=i: pictures[i % VIEWS])
         for i in range(TIMES)
     )
-    return Scene("figure", frames, (), (), BOX, 0.0, has_alpha=True)
+    low, high = (tuple(box ** (1 / 3) * x for x in corner) for corner in (BOX.low, BOX.high))
+    return Scene("figure", frames, (), (), Box(low, high), 0.0, has_alpha=True)
 
 
-def run_of(size: Size, steps: int, folder: Path) -> Run:
-    """A run of the figure by the project's own numbers, but particles stay as many and nothing is drawn."""
+def run_of(size: Size, steps: int, folder: Path, effects: Sequence[str] = ()) -> Run:
+    """A run of the figure by the project's own numbers, but particles stay as many and nothing is drawn.
+
+    ``effects``: overrides that choose other effects than cut-out pictures have by default.
+    """
     nodes = size.nodes / math.sqrt(size.particles)
     config = composed(
         "model=particles", "trainer=cpu", "~stage.coarse", "callbacks.pictures=null", f"run={folder}",
         "budget.minutes=null", f"budget.iterations={steps}", f"stage.fine.nodes={nodes}",
-        "stage.fine.first=1.0", "stage.fine.every=1.0", "stage.fine.density=1000",
+        "stage.fine.first=1.0", "stage.fine.every=1.0", "stage.fine.density=1000", *effects,
     )  # fmt: skip
     run = build_run(config)
-    data = SceneDataModule(lambda: scene_of(size.particles, size.side, size.zoom), background="random")
+    data = SceneDataModule(
+        lambda: scene_of(size.particles, size.side, size.zoom, size.box), background="random"
+    )
     make = run.model
     return replace(run, datamodule=data, model=lambda start: _made(make, start, size), tell=lambda _: None)
 
@@ -134,10 +142,11 @@ def _made(make: Callable[[Start], Particles], start: Start, size: Size) -> Parti
         method.turns.copy_(particles.quaternions)
         method.opacity.copy_(particles.opacity)
         method.color.copy_(particles.colors[:, :1])
-        draw = torch.Generator().manual_seed(1)
-        for curves in (method.nodes.shift, method.nodes.turn):
-            curves.copy_(0.02 * torch.randn(curves.shape, generator=draw))
-        method.nodes.seen.copy_(torch.tensor([0.0, 1.0]))
+        if method.nodes is not None:
+            draw = torch.Generator().manual_seed(1)
+            for curves in filter(lambda part: part is not None, (method.nodes.shift, method.nodes.turn)):
+                curves.copy_(0.02 * torch.randn(curves.shape, generator=draw))
+            method.nodes.seen.copy_(torch.tensor([0.0, 1.0]))
     return method
 
 
@@ -146,12 +155,13 @@ class Loop:
 
     Args:
         size: of the figure.
+        effects: overrides that choose other effects than cut-out pictures have by default.
         fraction: of the stage that is taken to be done.
     """
 
-    def __init__(self, size: Size, fraction: float = 0.7) -> None:
+    def __init__(self, size: Size, effects: Sequence[str] = (), *, fraction: float = 0.7) -> None:
         with tempfile.TemporaryDirectory() as folder:
-            run = run_of(size, 1000, Path(folder) / "run")
+            run = run_of(size, 1000, Path(folder) / "run", effects)
         run.datamodule.setup("fit")
         torch.manual_seed(0)
         self.module = run._module(run.stages[0], None, None, 0)

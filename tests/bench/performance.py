@@ -198,6 +198,7 @@ SECTIONS = {
     "free": free_table,
     "particles": particle_tables.parts_table,
     "particles, growth": particle_tables.growth_table,
+    "particles, effects": particle_tables.effects_table,
     "particles, goals": particle_tables.goals_table,
     "start": start_up.start_table,
 }

@@ -64,13 +64,29 @@ def test_tables_are_made(few):
             name in particle_tables.PARTS and name != "sorting into tiles"
         )  # plain PyTorch has no tiles
         assert bool(cells[2]) == compared
-    grown = particle_tables.growth_table(TINY, {"particles": (100, 200), "zoom": (0.5, 1.0), "nodes": (4, 9)})
-    assert grown.count("to the power") == 3
+    grown = particle_tables.growth_table(
+        TINY, {"particles": (100, 200), "zoom": (0.5, 1.0), "nodes": (4, 9), "box": (1.0, 8.0)}
+    )
+    assert grown.count("to the power") == 4
     grown, _, threads = grown.partition("**threads**")
     assert "| 1 |" in threads
-    assert grown.count("\n| ") == 3 * 4
+    assert grown.count("\n| ") == 4 * 4
     small, large = (int(line.split("|")[1]) for line in grown.split("\n\n")[3].splitlines()[2:])
     assert 3 * small < large < 5 * small  # covered pixels: half as large, a quarter
+
+
+def test_each_effect_is_timed_alone_and_what_is_off_is_absent(few):
+    text = particle_tables.effects_table(TINY)
+    lines = text.splitlines()[2:]
+    assert [line.split("|")[1].strip() for line in lines] == list(particle_tables.ALONE)
+    assert all(float(cell) > 0 for line in lines for cell in line.split("|")[2:-1])
+    bare, shaded, moving, usual = (
+        Loop(TINY, list(particle_tables.ALONE.values())[k]).method for k in (0, 2, 5, 8)
+    )
+    assert (bare.nodes, bare.shade, bare.tint, bare.fade, bare.resting) == (None,) * 5
+    assert shaded.shade.shape == (300, 15, 3)
+    assert moving.nodes.turn is None
+    assert None not in (usual.nodes.turn, usual.shade, usual.tint, usual.resting)
 
 
 def test_steps_grow_with_threads_as_far_as_there_are_cores(few, monkeypatch):
