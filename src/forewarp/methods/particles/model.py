@@ -257,8 +257,8 @@ class Particles(Method):
         return self.numbers_of.loose**self.progress
 
     def advance(self, progress: float, step: int, optimizer: torch.optim.Optimizer) -> dict[str, float]:
-        """Rates of lengths are of the scene's extent, that of weights follows what the pictures tell; renew
-        particles where it is time.
+        """Rates of lengths are of the scene's extent, that of weights follows what the pictures tell; let
+        opacities decay; renew particles where it is time.
         """
         self.progress, numbers = progress, self.numbers_of
         opacity.bound(self)
@@ -269,6 +269,8 @@ class Particles(Method):
                 self.nodes.offsets.learns = progress >= numbers.calm
                 if self.nodes.offsets.learns:
                     self.nodes.offsets.settle(group["lr"])
+            elif group["name"] == "opacity":
+                opacity.decay(self, numbers.opacity_decay * group["lr"] / (group["base_lr"] or 1.0))
             elif group["name"] == "skin":
                 group["lr"] *= told_by(self.views)
         number = int(progress / numbers.every)

@@ -1,6 +1,8 @@
-"""Opacity over time: how large it becomes, and where it ends."""
+"""Opacity: how large it becomes over time, where it ends, and how it decays."""
 
 from __future__ import annotations
+
+import math
 
 import torch
 from torch import Tensor
@@ -30,3 +32,19 @@ def bound(method: Method) -> None:
     if method.fade is not None:
         base[:, 0] -= (most_opaque(method) - _MOST).clamp(min=0)
     base.clamp_(max=_MOST)
+
+
+@torch.no_grad()
+def decay(method: Method, share: float) -> None:
+    """Take a share in [0, 1) of each particle's opacity, where time adds to it, of that without.
+
+    Few pictures leave open what stands where; what none of them asks for fades, and goes.
+
+    Cost: four operations a particle; none where the share is 0.
+
+    Source: as of "Binocular-Guided 3D Gaussian Splatting with View Consistency for Sparse View Synthesis"
+    (NeurIPS 2024), there by the same share throughout.
+    """
+    if share > 0:
+        base = method.opacity.data
+        base.sub_(torch.log1p(share * base.exp())).add_(math.log1p(-share))

@@ -37,6 +37,8 @@ class Numbers:
         jitter, calm: spread of the random shift of a picture's time, which falls to 0 at the share ``calm``.
         time_offsets: largest learned correction of a picture's time, times the mean distance of two training
             times; learned from ``calm`` on, of splines alone; 0: times are used as they are given.
+        opacity_decay: share of its opacity that each particle loses a step, while the rate of opacity is its
+            first; as that falls, so does the share. What no picture asks for fades.
         loose: what is left of the weight of ``rigid`` at the end.
         name: name of the stage.
 
@@ -59,6 +61,7 @@ class Numbers:
     jitter: float = 0.01
     calm: float = 0.4
     time_offsets: float = 0.0
+    opacity_decay: float = 0.0
     loose: float = 0.17
     name: str = "fine"
 
@@ -74,6 +77,7 @@ class Numbers:
             (("first", "every", "loose", "full"), "a number in (0, 1]", lambda value: 0 < value <= 1),
             (("density", "nodes", "knots", "calm"), "a number > 0", lambda value: value > 0),
             (("edges", "relink"), "a whole number >= 1", lambda value: value >= 1 and value == int(value)),
+            (("opacity_decay",), "a number in [0, 1)", lambda value: 0 <= value < 1),
             (("jitter", "settled", "rest", "time_offsets"), "a number >= 0", lambda value: value >= 0),
         ):
             for key in keys:
