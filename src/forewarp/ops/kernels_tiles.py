@@ -119,9 +119,9 @@ def _by_row(outline, spans, start, end, across, most, lows, highs):
         get_row(outline[3], 0),
     )
     bend, rest, tip = get_row(outline[4], 0), get_row(outline[5], 0), get_row(outline[6], 0)
-    first = row_of(tops, 0) * SIDE + _HALF - v
+    first = row_of(tops, 0)
     for row in range(most):
-        top = first + SIDE * row
+        top = (first + row) * SIDE + _HALF - v
         bottom = top + (SIDE - 1)
         at, to = minimum(maximum(tip * -1.0, top), bottom), minimum(maximum(tip, top), bottom)
         left = u + (slope * at - half * root(maximum(bend * at * at + rest, _ZERO)))

@@ -211,13 +211,13 @@ def _chosen(a, b, sign: str):
 
 @intrinsic
 def maximum(typing, a, b):
-    """The larger of two vectors of 16 numbers, or of one and a number; ``b`` where ``a`` is NaN."""
+    """The larger of two vectors of 16 numbers, or of one and a number; ``b`` where either is NaN."""
     return _chosen(a, b, ">")
 
 
 @intrinsic
 def minimum(typing, a, b):
-    """The smaller of two vectors of 16 numbers, or of one and a number; ``b`` where ``a`` is NaN."""
+    """The smaller of two vectors of 16 numbers, or of one and a number; ``b`` where either is NaN."""
     return _chosen(a, b, "<")
 
 

@@ -196,20 +196,26 @@ def test_without_opacity_over_time_only_what_is_too_opaque_changes(data):
 
 
 @pytest.mark.parametrize("share", [0.0, 1e-3, 0.2])
-def test_opacity_decays_as_its_rate_falls(data, share):
+def test_a_picture_takes_opacity_of_what_it_shows_as_the_rate_falls(data, share):
     module = module_with(data, numbers={"opacity_decay": share, "settled": 0.0})
     method, optimizer = module.method, module.configure_optimizers()
     (group,) = (group for group in optimizer.param_groups if group["name"] == "opacity")
+    method.means.data[:3] = 90.0  # beside every picture
     method.opacity.data[:, 0] = torch.linspace(-8, 6, len(method.opacity))
     for factor in (1.0, 0.25, 0.0):
         group["lr"] = factor * group["base_lr"]
         before = method.opacity.data.clone()
         method.advance(0.5, 0, optimizer)
+        method.shown.zero_()
+        look(module, data)
+        wanted = torch.where(method.shown[:, None] > 0, 1 - factor * share, 1.0).double()
+        assert 0 < int(method.shown.sum()) < len(wanted) - 3
         left = method.opacity.data.double().sigmoid() / before.double().sigmoid()
-        torch.testing.assert_close(left, torch.full_like(left, 1 - factor * share), rtol=1e-5, atol=0)
+        torch.testing.assert_close(left, wanted, rtol=1e-5, atol=0)
         assert torch.equal(method.opacity.data, before) == (factor * share == 0)
     group["base_lr"] = group["lr"] = 0.0  # what does not learn does not decay
     method.advance(0.5, 0, optimizer)
+    look(module, data)
     assert torch.equal(method.opacity.data, before)
 
 

@@ -65,7 +65,7 @@ class Particles(Method):
         self.views, times = len(start.scene.train), start.scene.times
         on = Effects(**choices).only(self.numbers_of.effects, len(times))
         self.ends = min(times), max(times)
-        self.progress = 0.0
+        self.progress = self.decay = 0.0
         before = start.before if isinstance(start.before, Particles) else None
         fresh = None if start.blank or before is not None else self._measured(start)
         self._make(before, fresh, on)
@@ -234,7 +234,9 @@ class Particles(Method):
             seen.rgb, seen.background, width=self.width, factor=weight, by_weights=warp is not None,
         )  # fmt: skip
         self.pulled.add_(found.pull)
-        self.shown.add_(found.pull > 0)
+        shown = found.pull > 0
+        self.shown.add_(shown)
+        opacity.decay(self, shown, self.decay)
         if self.progress < self.numbers_of.settled:
             self.idle[too_near(found.order, found.distances)] = math.inf
         add(total, by_name(self, found.particles))
@@ -257,8 +259,8 @@ class Particles(Method):
         return self.numbers_of.loose**self.progress
 
     def advance(self, progress: float, step: int, optimizer: torch.optim.Optimizer) -> dict[str, float]:
-        """Rates of lengths are of the scene's extent, that of weights follows what the pictures tell; let
-        opacities decay; renew particles where it is time.
+        """Rates of lengths are of the scene's extent, that of weights follows what the pictures tell, and the
+        decay of opacity its rate; renew particles where it is time.
         """
         self.progress, numbers = progress, self.numbers_of
         opacity.bound(self)
@@ -270,7 +272,7 @@ class Particles(Method):
                 if self.nodes.offsets.learns:
                     self.nodes.offsets.settle(group["lr"])
             elif group["name"] == "opacity":
-                opacity.decay(self, numbers.opacity_decay * group["lr"] / (group["base_lr"] or 1.0))
+                self.decay = numbers.opacity_decay * group["lr"] / (group["base_lr"] or 1.0)
             elif group["name"] == "skin":
                 group["lr"] *= told_by(self.views)
         number = int(progress / numbers.every)

@@ -37,8 +37,8 @@ class Numbers:
         jitter, calm: spread of the random shift of a picture's time, which falls to 0 at the share ``calm``.
         time_offsets: largest learned correction of a picture's time, times the mean distance of two training
             times; learned from ``calm`` on, of splines alone; 0: times are used as they are given.
-        opacity_decay: share of its opacity that each particle loses a step, while the rate of opacity is its
-            first; as that falls, so does the share. What no picture asks for fades.
+        opacity_decay: share of their opacity that a picture takes from the particles that it shows, while the
+            rate of opacity is its first; as that falls, so does the share.
         loose: what is left of the weight of ``rigid`` at the end.
         name: name of the stage.
 
