@@ -65,7 +65,7 @@ def more_minutes(rows: Sequence[dict]) -> list[str]:
 def more_density(rows: Sequence[dict]) -> list[str]:
     """The section of runs that differ in density; none without such runs."""
     about = (
-        "Runs that differ in the density of particles alone (empty: the preset's own), fewest first; means over "
+        "Runs that differ in density alone (empty: the preset's own), fewest first; means over "
         "the seeds. More hold if PSNR is at least that of fewer, less 0.2 dB.\n"
     )
     lines = _steps(
