@@ -126,10 +126,9 @@ def _by_row(outline, spans, start, end, across, most, lows, highs):
         at, to = minimum(maximum(tip * -1.0, top), bottom), minimum(maximum(tip, top), bottom)
         left = u + (slope * at - half * root(maximum(bend * at * at + rest, _ZERO)))
         right = u + (slope * to + half * root(maximum(bend * to * to + rest, _ZERO)))
-        low, high = left + (_HALF - _SLACK), right + (np.float32(SIDE) - _HALF + _SLACK)
-        end_of_all = np.float32(SIDE * (across + 1))
-        put_row(lows, row, minimum(maximum(low, _ZERO), end_of_all) * _SHARE)
-        put_row(highs, row, minimum(maximum(high, _ZERO), end_of_all) * _SHARE)
+        low, high = _span(left, right, across)
+        put_row(lows, row, low)
+        put_row(highs, row, high)
 
 
 @njit(inline="always")
@@ -148,8 +147,8 @@ def sort_into_tiles(splats, order, across, down, shares):
     """
     count, whole = len(order), across * down
     records, spans = np.empty((count, RECORD), np.float32), np.empty((count, 4), np.int32)
-    room_of = count // shares // SIDE_BY_SIDE + 2  # blocks of a thread
-    outlines = np.empty((shares, room_of, 7, SIDE_BY_SIDE), np.float32)
+    blocks = count // shares // SIDE_BY_SIDE + 2  # of a thread, at most
+    outlines = np.empty((shares, blocks, 7, SIDE_BY_SIDE), np.float32)
     begins, used = np.zeros(shares + 1, np.int64), np.zeros(shares, np.int64)
     for share in prange(shares):
         most, begin, end = 0, count * share // shares, count * (share + 1) // shares
