@@ -118,8 +118,8 @@ price-list: ## what each choice costs and brings, on the vehicle and real scenes
 COMPARE = $(BIN)/forewarp-train --multirun sweeps=effects $(if $(THREADS),threads=$(THREADS))
 effects: MINUTES := $(if $(filter command line,$(origin MINUTES)),$(MINUTES),2)
 effects: SEEDS ?= 2
-# Two specimens are made for effects that particles alone have; they have no fixed set to compare a plan with.
-SPECIMENS := still,rigid,band,glossy,room,quick,daylight,blocks
+# Three specimens are made for effects that particles alone have; they have no fixed set to compare a plan with.
+SPECIMENS := still,rigid,band,glossy,room,quick,daylight,blocks,spin
 effects: ## planned effects of model=forward against all effects, on procedural or real scenes [DATA= SCENES="a b" MINUTES= SEEDS=]; plans of MODEL=particles
 ifneq ($(filter-out particles forward,$(MODEL)),)
 	$(error MODEL: expected forward or particles, which can be planned, but got $(MODEL))

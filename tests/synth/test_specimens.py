@@ -29,7 +29,7 @@ def test_it_moves_exactly_where_motion_is_called_for(name):
     assert (moved > 0.1) if "motion" in called_for else (moved == 0)
 
 
-@pytest.mark.parametrize("name", ["rigid", "quick", "room"])
+@pytest.mark.parametrize("name", ["rigid", "quick", "room", "spin"])
 def test_parts_keep_their_shape(name):
     world, places = World(name), paths(name)
     for part in np.unique(world.part_of_face):
@@ -42,6 +42,12 @@ def test_parts_keep_their_shape(name):
 def test_the_band_is_drawn_out_beyond_what_a_splat_holds_together():
     joints = SPECIMENS["band"].joints
     assert max(np.linalg.norm(joints(time)["sheet"][:3, 0]) for time in TIMES) == pytest.approx(5.0)
+
+
+def test_the_wings_turn_by_a_sixth_of_a_turn_and_stay_where_they_are():
+    (start, end) = (SPECIMENS["spin"].joints(time)["wings"] for time in (0.0, 1.0))
+    assert np.degrees(np.arccos(end[0, 0])) == pytest.approx(60.0)
+    np.testing.assert_allclose((end - start)[:, 2:], 0, atol=1e-12)
 
 
 def test_the_quick_one_needs_more_cosines_than_the_slow_one():

@@ -1,4 +1,4 @@
-"""Optional abilities of a method, beside the contract: trajectories, bounds, points, ellipsoids."""
+"""Optional abilities of a method, beside the contract: trajectories, bounds, rest, points, ellipsoids."""
 
 from __future__ import annotations
 
@@ -28,6 +28,14 @@ class HasBounds(Protocol):
 
     def bounds(self, times: list[float]) -> Box | None:
         """Return the box that holds all matter at all ``times``, in world units; None if there is none."""
+
+
+@runtime_checkable
+class HasRest(Protocol):
+    """Find out while training what does not move, and spare it the motion."""
+
+    def at_rest(self) -> float:
+        """Return the share of the matter that has come to rest, in [0, 1]."""
 
 
 @runtime_checkable

@@ -76,6 +76,7 @@ class Evidence:
     Attributes:
         pictures: what the images alone say.
         gains: result of each trial, by effect.
+        at_rest: share of the matter that came to rest in the trial with an effect, by effect.
         least: dB; a smaller gain counts as none.
         minutes: planned for the last stage; None: choose the cheapest option within noise of the best.
         slope: dB that the fine trial without effects gained in the second half of its ``steps``.
@@ -85,6 +86,7 @@ class Evidence:
 
     pictures: Pictures
     gains: dict[str, Gain] = field(default_factory=dict)
+    at_rest: dict[str, float] = field(default_factory=dict)
     least: float = 0.1
     minutes: float | None = None
     slope: float = 0.0
@@ -107,6 +109,11 @@ class Evidence:
         """Return whether an effect's gain exceeds its noise and its price; None without a trial."""
         gain = self.gains.get(effect)
         return None if gain is None else gain.psnr > max(gain.noise, self.least) + self.price(gain)
+
+    def hopeless(self, effect: str) -> bool:
+        """Return whether an effect's gain is so clearly too small that no other seed need be tried."""
+        gain = self.gains[effect]
+        return gain.psnr + gain.noise < self.least
 
     def of_trial(self, effect: str) -> str:
         """Describe an effect's trial; an empty string without one."""

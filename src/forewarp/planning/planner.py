@@ -131,8 +131,8 @@ class Planner:
         without: tuple[str, list[str]],
         steps: int | None = None,
     ) -> None:
-        """Compare two trials, each a name and overrides, seed by seed; stop once the gain is clearly below
-        ``plan.least``. ``steps``: of both; None: the usual number.
+        """Compare two trials, each a name and overrides, seed by seed; stop once the gain is clearly too
+        small. ``steps``: of both; None: the usual number.
         """
         if steps is not None:
             with_it, without = ((f"{name}-{steps}", overrides) for name, overrides in (with_it, without))
@@ -143,8 +143,9 @@ class Planner:
             if off[-1].steps != on[-1].steps:  # the trial with the effect ran out of time
                 name, overrides = without
                 off[-1] = self._tried(f"{name}-{on[-1].steps}", overrides, seed, on[-1].steps)
-            found = self.evidence.gains[effect] = gain(on, off)
-            if found.psnr + found.noise < self.evidence.least:
+            self.evidence.gains[effect] = gain(on, off)
+            self.evidence.at_rest[effect] = on[-1].at_rest
+            if self.evidence.hopeless(effect):
                 return
 
     def _tried(self, name: str, overrides: list[str], seed: int, steps: int | None = None) -> Trial:

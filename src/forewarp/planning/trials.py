@@ -14,6 +14,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 
 from forewarp.evaluation.pictures import psnr_by_view
 from forewarp.files import read_json, write_json
+from forewarp.methods.abilities import HasRest
 from forewarp.metrics.gain import Gain, Numbers
 from forewarp.runs.build import build_run
 from forewarp.runs.config import claim
@@ -36,12 +37,14 @@ class Trial:
         step: training seconds per step.
         steps: number of steps done.
         took: seconds in all, with loading and scoring.
+        at_rest: share of the matter that came to rest; 0 for a method that does not tell.
     """
 
     psnr: tuple[float, ...]
     step: float
     steps: int
     took: float
+    at_rest: float = 0.0
 
     @property
     def numbers(self) -> list[Numbers]:
@@ -160,7 +163,8 @@ class Trials:
                 noted = read_json(run.stage_folder(stage) / "done.json")
                 psnr = psnr_by_view(module, run.datamodule.watched(), RAYS)
                 step, took = noted["seconds"] / noted["steps"], time.perf_counter() - begin
-                known = asdict(Trial(psnr, step, noted["steps"], took))
+                rest = module.method.at_rest() if isinstance(module.method, HasRest) else 0.0
+                known = asdict(Trial(psnr, step, noted["steps"], took, rest))
                 write_json(file, known)
             else:
                 self.seconds_before += known["took"]

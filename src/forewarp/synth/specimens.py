@@ -144,6 +144,25 @@ def _blocks() -> list[Part]:
     return parts
 
 
+def _spin(time: float) -> dict[str, np.ndarray]:
+    """Turn three wings about their common edge by a sixth of a turn."""
+    angle = np.radians(60) * (0.5 - 0.5 * np.cos(np.pi * time))
+    place = np.eye(4)
+    place[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    return {"wings": place}
+
+
+def _wings() -> list[Part]:
+    """Set up three wings, as of a revolving door."""
+    parts = []
+    for name, turn, colors in (("first", 0, LACQUER), ("second", 120, TILES), ("third", 240, STONES)):
+        vertices, faces = box((0.02, -0.05, -0.45), (0.62, 0.05, 0.35))
+        c, s = np.cos(np.radians(turn)), np.sin(np.radians(turn))
+        vertices = vertices @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+        parts.append(Part(name, "wings", vertices, faces, Material("mosaic", colors, 0.13)))
+    return parts
+
+
 def _gone(time: float) -> list[str]:
     return [name for name, (come, go) in _STAY.items() if not come <= time <= go]
 
@@ -155,6 +174,7 @@ SPECIMENS = {
     "glossy": Specimen(_globe_joints, _globe),
     "room": Specimen(_in_room, extra=_corner, azimuth=(28.0, 62.0), rise=(0.28, 0.5)),
     "quick": Specimen(_quick),
+    "spin": Specimen(_spin, _wings),
     "daylight": Specimen(_globe_joints, _matte_globe, light=_sun),
     "blocks": Specimen(_globe_joints, _blocks, absent=_gone),
 }

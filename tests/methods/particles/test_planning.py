@@ -33,8 +33,10 @@ def walk(pictures, asked, answers):
         answer = answers[drops[-1].effect]
 
 
-def decided(pictures, asked, **gains):
-    made = ParticlesPlanning().decide(Evidence(pictures, gains=gains, least=0.6), asked)
+def decided(pictures, asked, at_rest=0.3, **gains):
+    evidence = ParticlesPlanning().evidence(pictures, gains=gains, least=0.6)
+    evidence.at_rest = dict.fromkeys(gains, at_rest)
+    made = ParticlesPlanning().decide(evidence, asked)
     assert [decision.effect for decision in made] == NAMES
     assert all(any(c.isdigit() for c in decision.because) for decision in made)
     return {decision.effect: decision for decision in made}
@@ -93,6 +95,30 @@ def test_an_effect_stays_if_it_is_missed_beyond_noise(gain, on):
     assert (found.on, found.choice) == (on, "cosines" if on else "none")
     assert found.overrides == (f"model/color_over_time={found.choice}",)
     assert found.because == str(gain)
+
+
+@pytest.mark.parametrize(
+    ("gain", "at_rest", "on"),
+    [(0.0, 0.3, True), (-0.05, 0.3, True), (-0.3, 0.3, False), (0.0, 0.02, False), (1.0, 0.02, False)],
+)
+def test_the_background_is_found_by_what_rests_and_left_out_where_it_costs_accuracy(gain, at_rest, on):
+    gain = Gain(gain, 0.1, 1.0, 1000)
+    found = decided(PICTURES, asked(), at_rest, motion=YES, background=gain)["background"]
+    assert (found.on, found.choice) == (on, "still" if on else "none")
+    assert found.because == f"{at_rest:.0%} at rest; {gain}"
+
+
+def test_another_seed_is_tried_where_it_may_decide():
+    evidence = ParticlesPlanning().evidence(PICTURES, least=0.6)
+    for effect, gain, at_rest, hopeless in (
+        ("rotation", Gain(0.1, 0.2, 1.0, 9), 0.0, True),
+        ("rotation", Gain(0.5, 0.2, 1.0, 9), 0.0, False),
+        ("background", Gain(0.1, 0.2, 1.0, 9), 0.3, False),
+        ("background", Gain(0.1, 0.2, 1.0, 9), 0.0, True),
+        ("background", Gain(-0.3, 0.2, 1.0, 9), 0.3, True),
+    ):
+        evidence.gains[effect], evidence.at_rest[effect] = gain, at_rest
+        assert evidence.hopeless(effect) is hopeless
 
 
 def test_without_trials_silhouettes_decide_on_motion_alone():

@@ -71,6 +71,25 @@ def test_what_rests_keeps_resting_through_steps_and_density_control(half, data):
     assert bool(method.resting.any())
 
 
+def test_the_share_that_rests_is_told(half):
+    module, _ = half
+    assert module.method.at_rest() == 0
+    come_to_rest(module.method, 0.01)
+    assert module.method.at_rest() == pytest.approx(float(module.method.resting.float().mean()))
+    assert 0 < module.method.at_rest() < 1
+
+
+@pytest.mark.parametrize(("covered", "least"), [(1e6, 0.01), (100.0, 0.2507)])
+def test_less_than_a_pixel_is_no_motion(half, monkeypatch, covered, least):
+    asked = []
+    monkeypatch.setattr(model, "come_to_rest", lambda _, least: asked.append(least))
+    method, optimizer = half[0].method, half[0].configure_optimizers()
+    method.covered.fill_(covered)
+    method.extent.fill_(1.0)
+    method.advance(0.5, 1, optimizer)
+    assert asked == [pytest.approx(least, abs=1e-4)]
+
+
 def test_nothing_comes_to_rest_where_the_effect_is_off(data, monkeypatch):
     monkeypatch.setattr(model, "come_to_rest", lambda *_: pytest.fail("called"))
     module = module_with(data, numbers={"rest": 0.0, "relink": 1, "every": 0.1})

@@ -19,7 +19,7 @@ from forewarp.methods.particles.feasible import check_feasible
 from forewarp.methods.particles.nodes import Nodes
 from forewarp.methods.particles.packed import add, by_name, packed
 from forewarp.methods.particles.planning import EFFECTS, ParticlesPlanning
-from forewarp.methods.particles.rest import come_to_rest
+from forewarp.methods.particles.rest import come_to_rest, pixel_width
 from forewarp.methods.particles.settings import Numbers, told_by
 from forewarp.methods.particles.skin import Skin
 from forewarp.methods.particles.snapshot import ParticlesSnapshot
@@ -291,7 +291,8 @@ class Particles(Method):
             if self.resting is not None:
                 self.skin.let_go(self.resting)
                 if progress >= self.numbers_of.rest:
-                    come_to_rest(self, self.least_motion * float(self.extent))
+                    least = max(self.least_motion, pixel_width(float(self.covered)))
+                    come_to_rest(self, least * float(self.extent))
 
     def warm_up(self) -> None:
         """Compile the operators' kernels."""
@@ -317,6 +318,10 @@ class Particles(Method):
     def bounds(self, times: list[float]) -> Box | None:
         """See ``HasBounds``."""
         return matter.bounds_of(self, times)
+
+    def at_rest(self) -> float:
+        """See ``HasRest``."""
+        return 0.0 if self.resting is None else float(self.resting.float().mean())
 
     def matter(self) -> Cloud:
         """See ``HasMatter``."""

@@ -13,6 +13,7 @@ from forewarp.scene.pictures import Pictures
 CUT_OUT = 0.001  # share of transparent pixels below which silhouettes say nothing
 DISAGREEMENT = 0.01  # share of the foreground that no static shape explains, above which something moves
 NARROW = 15.0  # degrees between the most different cameras below which direction cannot be observed
+AT_REST = 0.1  # share of the particles that come to rest, from which sparing them the motion counts
 RATES = {"means": 8e-3, "shade": 1e-3}  # learning rates of a trial
 
 OF_NODES = ("rotation", "background")  # nothing without motion
@@ -27,6 +28,28 @@ EFFECTS = (
 )
 
 
+class ParticlesEvidence(Evidence):
+    """Evidence that takes the background for what it is: it makes steps cheaper, and pictures no better."""
+
+    def pays(self, effect: str) -> bool | None:
+        """Return whether an effect is missed; the background: whether much rests, and no picture suffers."""
+        if effect == "background" and effect in self.gains:
+            return not self.hopeless(effect)
+        return super().pays(effect)
+
+    def hopeless(self, effect: str) -> bool:
+        """See ``Evidence``; the background: little rests, or it clearly costs accuracy."""
+        if effect != "background":
+            return super().hopeless(effect)
+        gain = self.gains[effect]
+        return self.at_rest[effect] < AT_REST or gain.psnr + gain.noise < 0
+
+    def of_trial(self, effect: str) -> str:
+        """Describe an effect's trial; the background: how much came to rest, too."""
+        told = super().of_trial(effect)
+        return f"; {self.at_rest[effect]:.0%} at rest{told}" if told and effect == "background" else told
+
+
 class ParticlesPlanning:
     """Decide the effects of particles (see ``methods.effect.Planning``)."""
 
@@ -36,7 +59,7 @@ class ParticlesPlanning:
 
     def evidence(self, pictures: Pictures, **bounds) -> Evidence:
         """Begin the evidence with what the images say."""
-        return Evidence(pictures, **bounds)
+        return ParticlesEvidence(pictures, **bounds)
 
     def always(self, asked: Asked) -> tuple[Sequence[str], Sequence[str]]:
         """Shape particles without any effect, so that all trials continue from the same; let them learn

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -10,6 +12,17 @@ from forewarp.ops.project import moved
 
 _FOLLOWS = 1e-3  # weight of a node below which its motion shows nowhere
 _TIMES = 16  # at which motion is looked at
+
+
+def pixel_width(covered: float) -> float:
+    """Return the width of a pixel as a share of the scene's extent, by the pixels that show anything.
+
+    The extent is the median distance from the middle; of a disc that is its radius over the root of 2.
+
+    >>> round(pixel_width(20_000.0), 4)
+    0.0177
+    """
+    return math.sqrt(2 * math.pi / max(covered, 1.0))
 
 
 @torch.no_grad()
