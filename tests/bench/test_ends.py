@@ -12,7 +12,7 @@ from tests.support.tiny_scene import ball_scene
 
 def test_the_motion_alone_is_trained_on(tmp_path):
     scene = ball_scene(frames=8, size=24)
-    module, _ = fit(tmp_path, scene, 60)
+    module, _ = fit(tmp_path, scene, 60, background=None)
     view = ends.sorted_from(scene.test, last=True)[0]
     before = {name: p.detach().clone() for name, p in module.method.named_parameters()}
     had = ends.psnr(module.method, view)

@@ -76,6 +76,22 @@ def test_the_fraction_is_of_what_comes_first(bounds, fraction):
     assert settings(**bounds).fraction(25, 30.0) == fraction
 
 
+@pytest.mark.parametrize(
+    ("bounds", "iterations"),
+    [
+        ({"passes": None, "iterations": None}, None),
+        ({"passes": 1.5, "iterations": None}, 15),
+        ({"passes": 2, "iterations": 30}, 20),
+        ({"passes": 2, "iterations": 8}, 8),
+        ({"passes": 0.01, "iterations": None}, 1),
+    ],
+)
+def test_passes_are_steps_for_each_picture(bounds, iterations):
+    own = settings(minutes=1.0, **bounds)
+    assert own.over(10).iterations == iterations
+    assert own.over(10).minutes == 1.0
+
+
 def plan(share=1.0, **changes):
     """Make a stage without its share of the budget."""
     numbers = {"num_voxels": [[0, 64]], "lr": {}}

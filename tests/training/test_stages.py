@@ -62,6 +62,20 @@ def test_a_continued_run_equals_an_uninterrupted_one_to_the_bit(tmp_path, whole,
     assert same(run(tmp_path).fit(), whole[1])
 
 
+def test_a_stage_ends_after_its_passes_and_says_so(tmp_path):
+    only = stage("only", num_voxels=[[0, 10**3]], iterations=1000, passes=0.5)
+    bounded, told = make_run(tmp_path, [only], data=ball_data(rays=64, size=16)), []
+    bounded.tell = told.append
+    bounded.fit()
+    pictures = len(bounded.datamodule.scene.train)
+    steps = round(0.5 * pictures)
+    assert bounded.finished()["only"]["steps"] == steps
+    assert told == [
+        f"only: ended after {steps} steps, 0.5 for each of {pictures} training pictures; "
+        "for as many as the budget has: stage.only.passes=null"
+    ]
+
+
 def test_another_seed_gives_another_run(tmp_path, whole):
     other = make_run(tmp_path, stages(), data=ball_data(rays=64, size=16, seed=1), seed=1).fit()
     assert not same(other, whole[1])

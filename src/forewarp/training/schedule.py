@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -25,6 +25,7 @@ class StageSettings:
         lr: learning rate of each of the method's ``param_groups``.
         iterations: steps; None if only minutes bound the stage.
         minutes: training minutes; None if only iterations bound it. With both, the stage ends at the first.
+        passes: most steps for each training picture, at which the stage ends too; None: no such end.
         lr_hold: keep the learning rates constant up to this fraction, then let them fall exponentially; one
             number, or one by group, where a group left out is not held.
         lr_final_factor: the learning rates end at this multiple of their initial values; one number, or one
@@ -42,6 +43,7 @@ class StageSettings:
     lr: Mapping[str, float]
     iterations: int | None = None
     minutes: float | None = None
+    passes: float | None = None
     lr_hold: float | Mapping[str, float] = 0.0
     lr_final_factor: float | Mapping[str, float] = 0.1
     curriculum: Mapping[str, float] = field(default_factory=dict)
@@ -59,7 +61,7 @@ class StageSettings:
             raise ValueError(
                 f"{where}: expected iterations or minutes, but got neither; set budget.minutes=10"
             )
-        for key in ("iterations", "minutes"):
+        for key in ("iterations", "minutes", "passes"):
             value = getattr(self, key)
             if value is not None and not value > 0:
                 raise ValueError(f"{where}.{key}: expected a number > 0, but got {value}")
@@ -89,6 +91,13 @@ class StageSettings:
         """Make settings from a stage's keys; keys that are not fields go to ``numbers``."""
         own = {key: keys.pop(key) for key in list(keys) if key in cls.__dataclass_fields__}
         return cls(name, **own, numbers=keys)
+
+    def over(self, pictures: int) -> StageSettings:
+        """Return the settings whose ``iterations`` also keep ``passes`` over so many training pictures."""
+        if self.passes is None:
+            return self
+        most = max(1, round(self.passes * pictures))
+        return replace(self, iterations=most if self.iterations is None else min(most, self.iterations))
 
     def lr_factor(self, fraction: float, group: str) -> float:
         """Return what the learning rate of a group is multiplied by at ``fraction`` of the stage."""

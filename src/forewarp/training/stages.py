@@ -198,7 +198,7 @@ class Run:
         blank: bool = False,
     ) -> DynamicSceneModule:
         scene: Scene = self.datamodule.scene
-        settings, objective = stage.settings, stage.objective
+        settings, objective = stage.settings.over(len(scene.train)), stage.objective
         times = [frame.time for frame in scene.train]
         where = f"stage.{settings.name}.curriculum"
         draws = {"seed": self.seed + number, "where": where, **settings.curriculum}
@@ -235,7 +235,7 @@ class Run:
         checkpoint = last if last.is_file() else None
         if checkpoint is not None:
             steps, seconds = check_state(checkpoint, module)
-            done = stage.settings.fraction(steps, seconds)
+            done = module.settings.fraction(steps, seconds)
             self.tell(f"{stage.settings.name}: goes on at {done:.0%}, step {steps}")
         reset_peak_memory()
         code = commit()  # now, as others may be made before the stage ends
@@ -243,6 +243,7 @@ class Run:
             trainer.fit(module, datamodule=self.datamodule, ckpt_path=checkpoint, weights_only=True)
         if module.fraction < 1:  # fit returned early, as when a callback stops it: the stage is not finished
             raise KeyboardInterrupt
+        self._tell_of_passes(stage, module)
         keeper.save(trainer)
         in_play = module.curriculum.in_play
         save_handover(make_handover(module.method, self.datamodule.scene, before, in_play), folder)
@@ -261,6 +262,16 @@ class Run:
         )
         if interruption.asked:  # pressed after the stage's last step
             raise KeyboardInterrupt
+
+    def _tell_of_passes(self, stage: Stage, module: DynamicSceneModule) -> None:
+        """Say so where a stage ended by its passes, before its budget."""
+        own, most = stage.settings, module.settings.iterations
+        if most != own.iterations and module.global_step >= most:
+            pictures = f"{own.passes:g} for each of {len(self.datamodule.scene.train)} training pictures"
+            self.tell(
+                f"{own.name}: ended after {most:,} steps, {pictures}; "
+                f"for as many as the budget has: stage.{own.name}.passes=null"
+            )
 
 
 def _noted(folder: Path) -> dict | None:
