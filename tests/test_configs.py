@@ -72,6 +72,7 @@ def test_every_option_composes_and_instantiates(group, option):
         assert isinstance(method_of(run.model), torch.nn.Module)
 
 
+@pytest.mark.slow
 def test_effects_of_particles_are_switched_one_by_one():
     off = [f"{group}=none" for group, _ in OF_PARTICLES]
     assert set(run_of("model=particles", *off).model.keywords.values()) == {None}
@@ -211,6 +212,7 @@ def test_every_method_fits_every_experiment_in_every_preset(experiment, model, p
     build_run(config)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", ["forward", "backward"])
 def test_each_number_of_a_method_is_taken_where_it_is_keyed(model):
     hypernerf = ["experiment=hypernerf", "data.scene=x", f"model={model}"]
@@ -244,6 +246,7 @@ def test_the_nerf_of_captures_is_the_one_of_hypernerfs_tables():
     assert (config.stage.fine.lr.network, config.stage.fine.lr_final_factor) == (1e-3, 0.1)
 
 
+@pytest.mark.slow
 def test_published_systems_train_over_the_background_that_they_are_measured_on():
     for model, experiment in product(OF_THE_TABLES, ("hypernerf", "demo_hypernerf")):
         config = composed(f"experiment={experiment}", "data.scene=x", f"model={model}")
@@ -257,6 +260,7 @@ def test_published_systems_train_over_the_background_that_they_are_measured_on()
         assert (data.background, data.eval_background) == (color, color)
 
 
+@pytest.mark.slow
 def test_frames_of_some_scenes_come_in_sooner_with_faithful_alone():
     faithful = composed("experiment=dnerf", "data.scene=x", "model=dnerf", "preset=faithful")
     for scene, all_in in (("lego", 0.0125), ("trex", 0.0125), ("bouncingballs", 0.0125), ("hook", 0.125)):
@@ -268,6 +272,7 @@ def test_frames_of_some_scenes_come_in_sooner_with_faithful_alone():
         assert config.stage.fine.curriculum.all_in == all_in
 
 
+@pytest.mark.slow
 def test_effects_follow_the_pictures_and_the_command_line_wins():
     def chosen(*words):
         return composed("data.scene=x", "model=forward", *words, hydra=True).hydra.runtime.choices
@@ -291,6 +296,7 @@ FOREIGN = {
 }
 
 
+@pytest.mark.slow
 def test_a_package_brings_a_method_and_its_numbers(tmp_path):
     for name, text in FOREIGN.items():
         (tmp_path / name).parent.mkdir(exist_ok=True)

@@ -55,6 +55,7 @@ def test_no_sweep_is_forgotten():
     assert {path.stem for path in (ROOT / "sweeps").glob("*.yaml")} == PAPER.keys() | OTHERS
 
 
+@pytest.mark.slow
 def test_effects_are_compared_on_every_specimen():
     jobs = jobs_of("effects")
     assert len(jobs) == 18
@@ -136,6 +137,7 @@ def test_what_reproduces_a_table_names_its_method(folder):
         assert re.search(named, text, re.MULTILINE) or path.stem == "accuracy_time", path
 
 
+@pytest.mark.slow
 def test_an_ablation_takes_one_thing_from_all():
     common = ["scene=dnerf_hook", "preset=fast"]
     full = composed(*common, "ablation=full")
@@ -196,6 +198,7 @@ def test_the_voxel_networks_come_with_the_fine_stage(preset):
     assert networks <= set(stage.fine.effects)
 
 
+@pytest.mark.slow
 def test_jobs_of_minutes_have_folders_of_their_own():
     scenes = {word for job in jobs_of("minutes") for word in job if word.startswith("scene=")}
     assert "scene=hypernerf_moving_hand" in scenes

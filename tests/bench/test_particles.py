@@ -54,6 +54,7 @@ def test_every_kernel_of_a_step_belongs_to_a_part(loop):
     assert hasattr(kernels_tiles.by_depth, "py_func")
 
 
+@pytest.mark.slow
 def test_tables_are_made(few):
     text = particle_tables.parts_table(TINY)
     for name in (*particle_tables.PARTS, "**a whole step**", "**a picture**"):
@@ -75,6 +76,7 @@ def test_tables_are_made(few):
     assert 3 * small < large < 5 * small  # covered pixels: half as large, a quarter
 
 
+@pytest.mark.slow
 def test_each_effect_is_timed_alone_and_what_is_off_is_absent(few):
     text = particle_tables.effects_table(TINY)
     lines = text.splitlines()[2:]

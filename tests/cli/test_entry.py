@@ -142,12 +142,14 @@ def test_a_mistyped_command_ends_in_one_line(refused, in_tmp, arguments, line):
     assert list(in_tmp.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_an_option_that_not_every_job_has_is_named(refused, in_tmp):
     jobs = ["--multirun", "model=forward", "ablation=full,no_coarse", "stage.coarse.hull_frames=3"]
     expected = "stage.coarse.hull_frames: expected an option of every job, but got one that not all have"
     assert expected in refused("train", *jobs, "paths.data=data")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "option", "model", "owner"),
     [

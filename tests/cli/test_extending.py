@@ -72,6 +72,7 @@ def test_the_method_trains_on_the_data_of_the_page(forewarp, ok, refused, work):
     assert scene.trajectories(scene.matter().points, [0.0, 1.0]).shape == (64, 2, 3)
 
 
+@pytest.mark.slow
 def test_the_effect_is_switched_by_a_word(ok, work):
     words = ["--config-dir", "mine/conf", "experiment=mine", "model=forward", *SMALL, *VOXELS]
     for choice, name in (("sheen", "Sheen"), ("none", "NoneType")):

@@ -93,6 +93,7 @@ def test_what_is_typed_trains_and_trains_again_without_trust(forewarp, ok, fitte
     assert "coarse: finished before" in again.out
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_goes_on(forewarp, ok, refused, in_tmp, ctrl_c):
     stopped = forewarp("train", *DISC, "run=run", "callbacks.count.stop_at=3", "evaluate=false", TRUST)
     assert stopped.status == 130, stopped
@@ -123,6 +124,7 @@ def test_a_stored_run_is_measured_by_who_trusts_it(ok, refused, fitted, monkeypa
     ok("evaluate", "run=run")
 
 
+@pytest.mark.slow
 def test_no_job_of_a_sweep_measures_a_run_that_is_not_trusted(forewarp, ok, fitted):
     shutil.copytree(fitted, "again")
     sweep = ["evaluate", "--multirun", "run=run,again"]
@@ -188,6 +190,7 @@ def test_a_method_of_theirs_is_measured_and_rendered_with_trust(ok, refused, mis
     assert len(list((mist / "videos").rglob("*.png"))) == 2
 
 
+@pytest.mark.slow
 def test_a_method_of_theirs_is_swept_beside_ours_and_reported(ok, in_tmp):
     run = "run=runs/disc/${model.name}-seed${seed}"
     done = ok("train", "--multirun", *SMALL, "experiment=disc", "model=forward,mist", run)

@@ -67,6 +67,7 @@ def test_beside_it_stands_only_what_may_change(ok, refused, begun):
     assert line.endswith("expected the configuration of a run, but got none; set resume=<a run's folder>")
 
 
+@pytest.mark.slow
 def test_changed_data_are_refused_unless_accepted(ok, refused, begun):
     path = begun.parent / "vehicle" / "transforms_train.json"
     path.write_text(path.read_text() + " ")
@@ -102,6 +103,7 @@ def test_what_is_measured_on_changed_data_says_so(forewarp, ok, begun):
     assert f"{said}transforms_test_time.json" in done.err
 
 
+@pytest.mark.slow
 def test_a_folder_in_work_is_refused(ok, refused, begun):
     with locked(begun):
         line = refused("train", f"resume={begun}")

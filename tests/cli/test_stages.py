@@ -1,11 +1,14 @@
 """Particles that begin with a stage of voxels, as one types it."""
 
+import pytest
+
 from forewarp import load
 from forewarp.methods.particles.model import Particles
 from forewarp.synth.scenes import synthesize
 from forewarp.training.handover import load_handover
 
 
+@pytest.mark.slow
 def test_particles_begin_where_voxels_found_matter(ok, refused, in_tmp, monkeypatch):
     def elsewhere(*_):
         raise AssertionError("they began somewhere else")

@@ -17,6 +17,7 @@ def test_absent_scenes_of_a_sweep_are_named_and_do_not_count_as_failed(ok, in_tm
     assert not list(in_tmp.rglob("config.yaml"))
 
 
+@pytest.mark.slow
 def test_seeds_repeat_a_job_and_nothing_else(ok, refused, in_tmp):
     scene = ["data=dnerf", "data.root=nowhere", "data.scene=x", "absent=skip"]
     done = ok("train", "--multirun", *scene, "seeds=3")

@@ -93,6 +93,7 @@ def test_bad_arguments_leave_nothing(refused, in_tmp):
     assert list(in_tmp.iterdir()) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("dataset", "keys", "marker"),
     [

@@ -138,6 +138,7 @@ def test_every_question_is_asked_where_all_is_open(ok, words, in_tmp, monkeypatc
     assert None not in [config["model"][e] for e in EFFECTS if e != "bases"]
 
 
+@pytest.mark.slow
 def test_auto_plans_and_fits_in_one_go_a_scene_of_one_time_without_motion(
     forewarp, ok, words, scenes, in_tmp
 ):

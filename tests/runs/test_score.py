@@ -66,6 +66,7 @@ def test_jobs_of_a_sweep_return_it_and_give_it_again(ok, scene, returned):
     assert files[0].stat().st_mtime_ns > times[0]
 
 
+@pytest.mark.slow
 def test_alone_it_is_computed_for_whoever_asks(forewarp, ok, scene, returned):
     folder = scene(1)
     ok("train", *SMALL, "run=run")
@@ -78,6 +79,7 @@ def test_alone_it_is_computed_for_whoever_asks(forewarp, ok, scene, returned):
     assert "of 2 held out views" in done.out, done.err
 
 
+@pytest.mark.slow
 def test_without_views_there_is_none(forewarp, ok, scene, returned):
     scene(0)
     done = ok("train", *SMALL, "run=run", "score=psnr")

@@ -136,6 +136,7 @@ def test_no_number_depends_on_the_unit_of_length(tmp_path, factor, has_alpha):
     assert other == pytest.approx(plain, rel=2e-3)
 
 
+@pytest.mark.slow
 def test_two_threads_train_alike(tmp_path, two_threads):
     """A short run with all effects and density control, twice on two threads: equal to the bit."""
     scene, found = ball_scene(frames=6, size=40), []

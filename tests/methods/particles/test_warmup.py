@@ -19,6 +19,7 @@ def _signatures() -> dict[str, list]:
     return {kernel.py_func.__name__: list(kernel.signatures) for kernel in kernels}
 
 
+@pytest.mark.slow
 def test_the_process_beside_compiles_for_the_numbers_that_a_step_has():
     script = (
         "import json, types, torch\n"
