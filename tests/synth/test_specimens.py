@@ -47,7 +47,18 @@ def test_the_band_is_drawn_out_beyond_what_a_splat_holds_together():
 def test_the_wings_turn_by_a_sixth_of_a_turn_and_stay_where_they_are():
     (start, end) = (SPECIMENS["spin"].joints(time)["wings"] for time in (0.0, 1.0))
     assert np.degrees(np.arccos(end[0, 0])) == pytest.approx(60.0)
-    np.testing.assert_allclose((end - start)[:, 2:], 0, atol=1e-12)
+    np.testing.assert_allclose(start, np.eye(4), atol=1e-12)
+    np.testing.assert_allclose(end[:, 2:], np.eye(4)[:, 2:], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("name", "rests"), [("rigid", True), ("quick", True), ("band", True), ("spin", False)]
+)
+def test_something_rests_where_the_background_is_called_for(name, rests):
+    own = yaml.safe_load((CONF / "model_scene" / f"particles_specimen_{name}.yaml").read_text())["calls_for"]
+    assert ("background" in own) is rests
+    stays = np.ptp(paths(name), axis=0).max(-1) == 0
+    assert (stays.mean() > 0.05) if rests else not stays.any()
 
 
 def test_the_quick_one_needs_more_cosines_than_the_slow_one():

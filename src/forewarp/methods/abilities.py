@@ -32,7 +32,7 @@ class HasBounds(Protocol):
 
 @runtime_checkable
 class HasRest(Protocol):
-    """Find out while training what does not move, and spare it the motion."""
+    """Find out while training what does not move, and compute no motion for it."""
 
     def at_rest(self) -> float:
         """Return the share of the matter that has come to rest, in [0, 1]."""

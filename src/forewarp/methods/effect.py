@@ -76,22 +76,22 @@ class Evidence:
     Attributes:
         pictures: what the images alone say.
         gains: result of each trial, by effect.
-        at_rest: share of the matter that came to rest in the trial with an effect, by effect.
         least: dB; a smaller gain counts as none.
         minutes: planned for the last stage; None: choose the cheapest option within noise of the best.
         slope: dB that the fine trial without effects gained in the second half of its ``steps``.
         steps: steps of that trial.
         step: seconds per step of that trial; None if unknown.
+        at_rest: share of the matter that came to rest in trials with an effect, by effect; mean over seeds.
     """
 
     pictures: Pictures
     gains: dict[str, Gain] = field(default_factory=dict)
-    at_rest: dict[str, float] = field(default_factory=dict)
     least: float = 0.1
     minutes: float | None = None
     slope: float = 0.0
     steps: int = 1
     step: float | None = None
+    at_rest: dict[str, float] = field(default_factory=dict)
 
     def price(self, gain: Gain) -> float:
         """Return the PSNR (dB) lost to the steps that an effect's extra time displaces.
@@ -111,7 +111,7 @@ class Evidence:
         return None if gain is None else gain.psnr > max(gain.noise, self.least) + self.price(gain)
 
     def hopeless(self, effect: str) -> bool:
-        """Return whether an effect's gain is so clearly too small that no other seed need be tried."""
+        """Return whether the trials so far rule an effect out, so that no other seed need be tried."""
         gain = self.gains[effect]
         return gain.psnr + gain.noise < self.least
 

@@ -85,7 +85,7 @@ class Snapshot:
 class Method(nn.Module):
     """A scene that can be learned: implement ``at`` and ``look``, everything else has a default.
 
-    Optional abilities (trajectories, bounds, points) are protocols in ``methods.abilities``.
+    Optional abilities (trajectories, bounds, rest, points) are protocols in ``methods.abilities``.
 
     Attributes:
         terms: names of its loss terms.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict, fields, is_dataclass, replace
+from statistics import fmean
 
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
@@ -144,7 +145,7 @@ class Planner:
                 name, overrides = without
                 off[-1] = self._tried(f"{name}-{on[-1].steps}", overrides, seed, on[-1].steps)
             self.evidence.gains[effect] = gain(on, off)
-            self.evidence.at_rest[effect] = on[-1].at_rest
+            self.evidence.at_rest[effect] = fmean(trial.at_rest for trial in on)
             if self.evidence.hopeless(effect):
                 return
 
@@ -167,4 +168,5 @@ class Planner:
         values = {f.name: getattr(self.evidence, f.name) for f in fields(self.evidence)}
         found = {name: asdict(value) for name, value in values.items() if is_dataclass(value)}
         found["trials"] = {effect: asdict(one) for effect, one in self.evidence.gains.items()}
+        found["at_rest"] = {effect: share for effect, share in self.evidence.at_rest.items() if share > 0}
         return json.loads(json.dumps(found))  # lists for tuples, as YAML has them

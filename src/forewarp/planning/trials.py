@@ -159,7 +159,7 @@ class Trials:
             module = run.fit().to(run.device)
             file, stage = run.folder / "trial.json", run.stages[-1]
             known = read_json(file)
-            if known is None:
+            if known is None or "at_rest" not in known:  # as of earlier versions
                 noted = read_json(run.stage_folder(stage) / "done.json")
                 psnr = psnr_by_view(module, run.datamodule.watched(), RAYS)
                 step, took = noted["seconds"] / noted["steps"], time.perf_counter() - begin

@@ -1,7 +1,8 @@
-"""Small subjects that each call for one effect, or for one beside motion, or for none.
+"""Small subjects that each call for a few known effects, or for none.
 
 A plan made from a specimen's pictures should switch on only the effects that
-``conf/scene/specimen_<name>.yaml`` lists.
+``conf/scene/specimen_<name>.yaml`` lists or, for a method with a list of its own,
+``conf/model_scene/<method>_specimen_<name>.yaml``.
 """
 
 from __future__ import annotations
@@ -145,7 +146,7 @@ def _blocks() -> list[Part]:
 
 
 def _spin(time: float) -> dict[str, np.ndarray]:
-    """Turn three wings about their common edge by a sixth of a turn."""
+    """Turn three wings about the axis where they meet by a sixth of a turn."""
     angle = np.radians(60) * (0.5 - 0.5 * np.cos(np.pi * time))
     place = np.eye(4)
     place[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]

@@ -51,7 +51,7 @@ def moved_module(data, **options):
     "options",
     [
         EVERY | {"background": 10.0},
-        EVERY | {"motion": "cosines", "rotation": None, "background": None},
+        EVERY | {"motion": "cosines", "rotation": None, "background": 10.0},
         dict.fromkeys(MOVING),
     ],
     ids=["all", "cosines", "bare"],

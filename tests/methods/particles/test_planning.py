@@ -53,7 +53,7 @@ def test_every_effect_is_on_at_first_and_then_left_out():
 
 def test_motion_is_tried_for_longer_where_nothing_is_cut_out():
     _, drops = walk(replace(PICTURES, cut_out=0.0), asked(), dict.fromkeys(NAMES, True))
-    assert [drop.longer for drop in drops] == [3, 1, 1, 1, 1, 2]
+    assert [drop.longer for drop in drops] == [3, 1, 3, 1, 1, 2]
 
 
 def test_what_does_not_move_does_not_turn():
@@ -99,13 +99,21 @@ def test_an_effect_stays_if_it_is_missed_beyond_noise(gain, on):
 
 @pytest.mark.parametrize(
     ("gain", "at_rest", "on"),
-    [(0.0, 0.3, True), (-0.05, 0.3, True), (-0.3, 0.3, False), (0.0, 0.02, False), (1.0, 0.02, False)],
+    [
+        *((0.0, 0.3, True), (-0.05, 0.3, True), (-0.15, 0.3, False), (0.0, 0.02, False), (1.0, 0.02, False)),
+        *((0.0, 0.1, True), (0.0, 0.0999, False)),
+    ],
 )
 def test_the_background_is_found_by_what_rests_and_left_out_where_it_costs_accuracy(gain, at_rest, on):
     gain = Gain(gain, 0.1, 1.0, 1000)
     found = decided(PICTURES, asked(), at_rest, motion=YES, background=gain)["background"]
     assert (found.on, found.choice) == (on, "still" if on else "none")
-    assert found.because == f"{at_rest:.0%} at rest; {gain}"
+    assert found.because == f"{at_rest:.1%} at rest; {gain}"
+
+
+def test_noise_excuses_no_great_loss_by_the_background():
+    loss = Gain(-0.9, 1.0, 1.0, 1000)
+    assert not decided(PICTURES, asked(), motion=YES, background=loss)["background"].on
 
 
 def test_another_seed_is_tried_where_it_may_decide():

@@ -18,8 +18,8 @@ class Effects:
         rotation: True: nodes turn, and do not only shift.
         view_dependence: degree 1 to 3 of the harmonics by which colour depends on direction.
         color_over_time, opacity_over_time: cosines over time of each particle's colour, and of its opacity.
-        background: share of the scene's extent; nodes that move by less, or by less than a pixel, come to
-            rest, and particles that follow no others need no nodes any more.
+        background: share of the scene's extent; nodes that stay as near to their mean place, or
+            within a pixel of it, come to rest, and particles that follow no others need no nodes any more.
 
     Raises:
         ValueError: naming the key of a choice that there is not.

@@ -15,9 +15,10 @@ _TIMES = 16  # at which motion is looked at
 
 
 def pixel_width(covered: float) -> float:
-    """Return the width of a pixel as a share of the scene's extent, by the pixels that show anything.
+    """Return the width of a pixel as a share of the scene's extent, from the number of covered pixels.
 
-    The extent is the median distance from the middle; of a disc that is its radius over the root of 2.
+    Roughly: as of a disc that fills the covered pixels, whose extent (the median distance from its middle) is
+    its radius over the root of 2.
 
     >>> round(pixel_width(20_000.0), 4)
     0.0177
