@@ -108,12 +108,16 @@ class Evidence:
     def pays(self, effect: str) -> bool | None:
         """Return whether an effect's gain exceeds its noise and its price; None without a trial."""
         gain = self.gains.get(effect)
-        return None if gain is None else gain.psnr > max(gain.noise, self.least) + self.price(gain)
+        return None if gain is None else gain.psnr > max(gain.noise, self.bound(effect)) + self.price(gain)
 
     def hopeless(self, effect: str) -> bool:
         """Return whether the trials so far rule an effect out, so that no other seed need be tried."""
         gain = self.gains[effect]
-        return gain.psnr + gain.noise < self.least
+        return gain.psnr + gain.noise < self.bound(effect)
+
+    def bound(self, effect: str) -> float:
+        """Return the gain (dB) below which an effect does not count."""
+        return self.least
 
     def of_trial(self, effect: str) -> str:
         """Describe an effect's trial; an empty string without one."""

@@ -116,6 +116,13 @@ def test_noise_excuses_no_great_loss_by_the_background():
     assert not decided(PICTURES, asked(), motion=YES, background=loss)["background"].on
 
 
+@pytest.mark.parametrize(("gain", "on"), [(0.5, True), (0.4, False)])
+def test_the_bound_is_less_in_longer_trials(gain, on):
+    gain = Gain(gain, 0.1, 1.0, 1000)
+    found = decided(PICTURES, asked(), motion=YES, view_dependence=gain, color_over_time=gain)
+    assert (found["view_dependence"].on, found["color_over_time"].on) == (on, False)
+
+
 def test_another_seed_is_tried_where_it_may_decide():
     evidence = ParticlesPlanning().evidence(PICTURES, least=0.6)
     for effect, gain, at_rest, hopeless in (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Generator, Sequence
 
 from forewarp.methods.effect import Asked, Begin, Decision, Drop, Effect, Evidence
@@ -47,6 +48,10 @@ class ParticlesEvidence(Evidence):
         gain = self.gains[effect]
         return self.at_rest.get(effect, 0.0) < AT_REST or gain.psnr < -min(gain.noise, HARM)
 
+    def bound(self, effect: str) -> float:
+        """See ``Evidence``; less in longer trials, as what is rough falls with the root of the steps."""
+        return self.least / math.sqrt(longer(effect, self.pictures))
+
     def of_trial(self, effect: str) -> str:
         """Describe an effect's trial; the background: how much came to rest, too."""
         told = super().of_trial(effect)
@@ -78,14 +83,7 @@ class ParticlesPlanning:
         return [f"stage.{asked.coarse}.effects=[]"], rates
 
     def coarse(self, evidence: Evidence, asked: Asked) -> Generator[Begin | Drop, bool | None, None]:
-        """Begin with every effect that the pictures can show, and leave out one after the other.
-
-        Trials of view dependence are longer: after few steps it makes up for a shape that is still rough. (A
-        matte scene that stands still gains 0.4 dB by it after 700 steps, and 0.2 dB after 1,500, a glossy one
-        0.7 and 0.6.) So are those of motion and background where nothing is cut out, as the start is so
-        rough that all learn as fast at first. (The room gains 0.5 dB by motion after 700 steps, 2.2 dB after
-        2,100.)
-        """
+        """Begin with every effect that the pictures can show, and leave out one after the other."""
         seen = {e.name: unseen(e.name, evidence.pictures) is None for e in EFFECTS}
         on = {name: asked.choose(name) if seen[name] else "none" for name in seen}
         yield Begin("coarse", _choices(on))
@@ -94,10 +92,8 @@ class ParticlesPlanning:
             if f"model/{name}" in asked.typed or (name in OF_NODES and not moves):
                 continue
             off = (name, *OF_NODES) if name == "motion" else (name,)
-            longer = 2 if name == "view_dependence" else 1
-            if name in ("motion", "background") and evidence.pictures.cut_out < CUT_OUT:
-                longer = 3
-            pays = yield Drop(name, _choices(dict.fromkeys(off, "none")), longer)
+            steps = longer(name, evidence.pictures)
+            pays = yield Drop(name, _choices(dict.fromkeys(off, "none")), steps)
             moves = pays if name == "motion" else moves
 
     def look(
@@ -129,6 +125,19 @@ class ParticlesPlanning:
         pictures = evidence.pictures
         moves = pictures.cut_out < CUT_OUT or pictures.disagreement > DISAGREEMENT
         return moves and name in ("motion", "rotation")
+
+
+def longer(name: str, pictures: Pictures) -> int:
+    """Return how many times the usual steps trials of an effect have.
+
+    Those of view dependence are longer: after few steps it makes up for a shape that is still rough. (A matte
+    scene that stands still gains 0.4 dB by it after 700 steps, and 0.2 dB after 1,500, a glossy one 0.7 and
+    0.6.) So are those of motion and background where nothing is cut out, as the start is so rough that all
+    learn as fast at first. (The room gains 0.5 dB by motion after 700 steps, and 2.2 dB after 2,100.)
+    """
+    if name in ("motion", "background") and pictures.cut_out < CUT_OUT:
+        return 3
+    return 2 if name == "view_dependence" else 1
 
 
 def unseen(name: str, pictures: Pictures) -> str | None:
