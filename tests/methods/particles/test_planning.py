@@ -51,9 +51,12 @@ def test_every_effect_is_on_at_first_and_then_left_out():
     assert drops[-1] == Drop("view_dependence", ("model/view_dependence=none",), 2)
 
 
-def test_motion_is_tried_for_longer_where_nothing_is_cut_out():
+def test_where_nothing_is_cut_out_motion_is_tried_for_longer_and_without_what_could_stand_in():
     _, drops = walk(replace(PICTURES, cut_out=0.0), asked(), dict.fromkeys(NAMES, True))
-    assert [drop.longer for drop in drops] == [3, 1, 3, 1, 1, 2]
+    assert [(drop.effect, drop.longer) for drop in drops] == [
+        *(("opacity_over_time", 1), ("color_over_time", 1)),
+        *(("motion", 3), ("rotation", 1), ("background", 3), ("view_dependence", 2)),
+    ]
 
 
 def test_what_does_not_move_does_not_turn():

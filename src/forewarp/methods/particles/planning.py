@@ -19,7 +19,8 @@ HARM = 0.2  # dB that leaving it out may bring in any case, whatever the noise
 RATES = {"means": 8e-3, "shade": 1e-3}  # learning rates of a trial
 
 OF_NODES = ("rotation", "background")  # nothing without motion
-# In the order in which they are left out.
+STAND_INS = ("opacity_over_time", "color_over_time")  # for motion
+# In the order in which they are left out; but see ``order``.
 EFFECTS = (
     Effect("motion", "spline", attribute="nodes"),
     Effect("rotation", "nodes", attribute="nodes.turn"),
@@ -88,7 +89,7 @@ class ParticlesPlanning:
         on = {name: asked.choose(name) if seen[name] else "none" for name in seen}
         yield Begin("coarse", _choices(on))
         moves = asked.typed.get("model/motion") != "none"
-        for name in [name for name in on if seen[name] and asked.trials]:
+        for name in [name for name in order(evidence.pictures) if seen[name] and asked.trials]:
             if f"model/{name}" in asked.typed or (name in OF_NODES and not moves):
                 continue
             off = (name, *OF_NODES) if name == "motion" else (name,)
@@ -125,6 +126,18 @@ class ParticlesPlanning:
         pictures = evidence.pictures
         moves = pictures.cut_out < CUT_OUT or pictures.disagreement > DISAGREEMENT
         return moves and name in ("motion", "rotation")
+
+
+def order(pictures: Pictures) -> list[str]:
+    """Return the names of the effects in the order in which they are left out.
+
+    Where nothing is cut out, those that could stand in for motion go first: everything is visible all the
+    time, and fading in and out mimics it. (In the room motion gains 0.8 dB with them, 4.8 dB without.)
+    """
+    names = [effect.name for effect in EFFECTS]
+    if pictures.cut_out >= CUT_OUT:
+        return names
+    return [*STAND_INS, *(name for name in names if name not in STAND_INS)]
 
 
 def longer(name: str, pictures: Pictures) -> int:
