@@ -15,7 +15,7 @@ CUT_OUT = 0.001  # share of transparent pixels below which silhouettes say nothi
 DISAGREEMENT = 0.01  # share of the foreground that no static shape explains, above which something moves
 NARROW = 15.0  # degrees between the most different cameras below which direction cannot be observed
 AT_REST = 0.1  # least share of particles at rest for the background to be worth having
-HARM = 0.2  # dB that leaving it out may bring in any case, whatever the noise
+HARM = 0.2  # dB from which on the background costs too much
 RATES = {"means": 8e-3, "shade": 1e-3}  # learning rates of a trial
 
 OF_NODES = ("rotation", "background")  # nothing without motion
@@ -47,7 +47,7 @@ class ParticlesEvidence(Evidence):
         if effect != "background":
             return super().hopeless(effect)
         gain = self.gains[effect]
-        return self.at_rest.get(effect, 0.0) < AT_REST or gain.psnr < -min(gain.noise, HARM)
+        return self.at_rest.get(effect, 0.0) < AT_REST or gain.psnr < -HARM
 
     def bound(self, effect: str) -> float:
         """See ``Evidence``; less in longer trials, as what is rough falls with the root of the steps."""
@@ -132,7 +132,7 @@ def order(pictures: Pictures) -> list[str]:
     """Return the names of the effects in the order in which they are left out.
 
     Where nothing is cut out, those that could stand in for motion go first: everything is visible all the
-    time, and fading in and out mimics it. (In the room motion gains 0.8 dB with them, 4.8 dB without.)
+    time, and fading in and out mimics it. (In the room motion gains 0.8 dB with them, 4 dB without.)
     """
     names = [effect.name for effect in EFFECTS]
     if pictures.cut_out >= CUT_OUT:
