@@ -18,6 +18,7 @@ from forewarp.ops.compare import compare
 from forewarp.ops.nodes import pull_nodes
 from forewarp.ops.project import Gaussians, Splats, project
 from forewarp.ops.rasterize import rasterize
+from forewarp.ops.skin import skin_weights
 from tests.bench.particles import MIDDLE, WHITE, Loop, Size, camera, run_of
 from tests.bench.timed_cases import milliseconds, timed
 from tests.stability.report import table
@@ -32,6 +33,7 @@ PARTS = {
     "forward, loss and backward": (("rasterize", ("compare",)),),
     "chain, back to particles and nodes": (("chain", ()),),
     "nodes": (("nodes", ()),),
+    "weights of nodes": (("skin", ()),),
     "optimiser": (("adam", ()),),
 }
 SMALLER = 16  # times as small along a side as the picture that plain PyTorch draws
@@ -145,6 +147,8 @@ def plain_times(loop: Loop, size: Size) -> dict[str, float]:
         leaves = Gaussians(*(part.clone().requires_grad_() for part in particles))
         numbers = project(leaves, *seen[1:]).numbers.sum()
         found["chain, back to particles and nodes"] = timed(lambda: numbers.backward(retain_graph=True), FEW)
+        skin = method.skin
+        found["weights of nodes"] = timed(lambda: skin_weights(skin.shares, skin.learned.detach()), FEW)
         motion, maps = nodes.carried(nodes.curve(MIDDLE))
         pulled = (motion.detach(), nodes.places, maps.detach(), nodes.edges, nodes.edge_weights, 1.0)
         found["nodes"] = timed(lambda: pull_nodes(*pulled), FEW)

@@ -107,7 +107,7 @@ def compared(hard: Hard, kind: torch.dtype, place: torch.device | str = "cpu") -
     particles, warp = _as(hard[:2], kind, place)
     tints, fades, behind = (t.to(place, kind) for t in (*hard[3:], BEHIND))
     truth = pixels(hard.camera.size).to(place)
-    return compare(particles, warp, hard.camera, tints, fades, truth, behind, by_weights=True)
+    return compare(particles, warp, hard.camera, tints, fades, truth, behind, by_skin=True)
 
 
 def drawn(hard: Hard) -> tuple:

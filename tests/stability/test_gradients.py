@@ -23,6 +23,7 @@ from forewarp.ops.project import Gaussians, Splats, Warp, moved, project, projec
 from forewarp.ops.rasterize import rasterize, rasterize_reference
 from forewarp.ops.rigid import geman_mcclure, move_by_screw, stretch
 from forewarp.ops.samples import midpoints, union
+from forewarp.ops.skin import skin_weights, skin_weights_reference
 from forewarp.ops.splat import average_splat, scatter_reference, with_copies
 from forewarp.ops.variation import huber_variation, patch_variation, second_variation, total_variation
 from tests.support.gaussians import crowd, pinhole
@@ -157,6 +158,11 @@ CHECKS = {
     "rasterize": of_rasterizing,
     "rasterize_reference": partial(of_rasterizing, draw=rasterize_reference),
     "stiffness": of_stiffness,
+    "skin_weights": lambda s: (partial(skin_weights, draw(s, 5, 3).exp()), draw(s + 1, 5, 3)),
+    "skin_weights_reference": lambda s: (
+        partial(skin_weights_reference, draw(s, 5, 3).exp()),
+        draw(s + 1, 5, 3),
+    ),
     "moved": of_moved,
     "move_by_screw": lambda s: (move_by_screw, draw(s, 3, 3), draw(s + 1, 3, 3), draw(s + 2, 3, 3)),
     "second_variation": lambda s: (second_variation, draw(s, 3, 4, 5, 2)),

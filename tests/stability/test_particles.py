@@ -24,11 +24,11 @@ pytestmark = pytest.mark.stability
 # Relative to the largest entry. Where all of a picture is covered many times over, what is let through ends a
 # tile at a thousandth. Of a needle a tenth of a square pixel is the smaller side, and a few digits go.
 COVERED = {"as large as the scene": 5e-3, "larger than all": 2e-2, "needles, 1 to 60,000": 4e-5}
-NAMES = ("loss", *Gaussians._fields, "maps", "weights", "pull")
+NAMES = ("loss", *Gaussians._fields, "maps", "skin", "pull")
 
 
 def parts(found):
-    return (torch.tensor([found.loss]), *found.particles, found.maps, found.weights, found.pull)
+    return (torch.tensor([found.loss]), *found.particles, found.maps, found.skin, found.pull)
 
 
 def check_close(ours, exact, most):

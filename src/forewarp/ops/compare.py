@@ -15,17 +15,17 @@ from forewarp.ops.rasterize import SIDE, Tiles, kept_for, rasterize_reference, s
 
 
 class Compared(NamedTuple):
-    """``loss`` and ``squared``: sums over pixels and channels; ``particles``, ``maps`` and ``weights``: the
+    """``loss`` and ``squared``: sums over pixels and channels; ``particles``, ``maps`` and ``skin``: the
     gradients of ``factor`` times the loss; ``pull`` (N,) how strongly that pulls each over the
     picture, per pixel; 0 of particles that the picture does not show. ``order`` (V,): the rows of those that
-    the picture may show, from near to far; ``distances`` (V,): theirs from the camera.
+    the picture may show, from near to far; ``distances`` (N,): from the camera, known of these alone.
     """
 
     loss: float
     squared: float
     particles: Gaussians
     maps: Tensor
-    weights: Tensor | None
+    skin: Tensor | None
     pull: Tensor
     order: Tensor
     distances: Tensor
@@ -42,7 +42,7 @@ def compare(
     *,
     width: float = 0.05,
     factor: float = 1.0,
-    by_weights: bool = False,
+    by_skin: bool = False,
 ) -> Compared:
     """The loss ``sum sqrt(e^2 + width^2) - width`` over pixels and channels, and its gradients.
 
@@ -55,7 +55,7 @@ def compare(
         background: (3,).
         width: where the loss turns from a square to a line, > 0.
         factor: of the gradients.
-        by_weights: whether gradients by the shares of nodes are wanted.
+        by_skin: whether gradients (N, L) by the numbers are wanted whose softmax the warp's weights are.
 
     Returns:
         ``Compared``; nothing in it has a graph.
@@ -72,7 +72,7 @@ def compare(
         raise ValueError(f"compare: expected uint8 pixels and width > 0, but got {pixels.dtype}, {width=}")
     fast = use_numba(particles.means) and particles.means.dtype == torch.float32
     run = _compare_numba if fast else compare_reference
-    return run(particles, warp, pinhole, tints, fades, pixels, background, width, factor, by_weights)
+    return run(particles, warp, pinhole, tints, fades, pixels, background, width, factor, by_skin)
 
 
 def compare_reference(
@@ -85,7 +85,7 @@ def compare_reference(
     background: Tensor,
     width: float,
     factor: float,
-    by_weights: bool,
+    by_skin: bool,
 ) -> Compared:
     """``compare`` in plain PyTorch, on any device and in any precision."""
     leaves = [t.detach().clone().requires_grad_() for t in (*particles, warp.maps, warp.weights)]
@@ -104,15 +104,21 @@ def compare_reference(
     found = [torch.zeros_like(leaf) if leaf.grad is None else leaf.grad for leaf in leaves]
     pull = splats.numbers.grad[:, :2].norm(dim=-1)
     squared = float(error.detach().square().sum())
-    weights = found[6] if by_weights else None
+    skin = _by_softmax(warp.weights.detach(), found[6]) if by_skin else None
     seen, away = (splats.reach[:, 0] > 0).nonzero()[:, 0], splats.numbers.detach()[:, 9]
     order = seen[away[seen].argsort(stable=True)]
     gradients = Gaussians(*found[:5])
-    return Compared(float(loss.detach()), squared, gradients, found[5], weights, pull, order, away[order])
+    return Compared(float(loss.detach()), squared, gradients, found[5], skin, pull, order, away)
+
+
+def _by_softmax(weights: Tensor, slopes: Tensor) -> Tensor:
+    """From the gradients (N, L) by weights that are a softmax to those by the numbers it is of."""
+    pulled = weights * slopes
+    return pulled - weights * pulled.sum(-1, keepdim=True)
 
 
 def _compare_numba(
-    particles, warp, pinhole, tints, fades, pixels, background, width, factor, by_weights
+    particles, warp, pinhole, tints, fades, pixels, background, width, factor, by_skin
 ) -> Compared:
     threads = match_threads()
     view = pinhole.row(particles.means)
@@ -120,7 +126,7 @@ def _compare_numba(
     inputs, size = arrays(*inputs), pinhole.size
     tiles = sorted_tiles(splats.numpy(), -(-size[0] // SIDE), -(-size[1] // SIDE), threads)
     picture = pixels.contiguous().view(torch.int32).reshape(size[1], size[0])
-    return _way_back(particles, inputs, splats, tiles, picture, background, width, factor, by_weights)
+    return _way_back(particles, inputs, splats, tiles, picture, background, width, factor, by_skin)
 
 
 def compile_way_back(
@@ -138,7 +144,7 @@ def compile_way_back(
     _way_back(particles, arrays(*inputs), splats, tiles, picture, torch.ones(3), 1.0, 1.0, False)
 
 
-def _way_back(particles, inputs, splats, tiles, picture, background, width, factor, by_weights) -> Compared:
+def _way_back(particles, inputs, splats, tiles, picture, background, width, factor, by_skin) -> Compared:
     """Compare sorted splats with a picture (H, W) int32 of four bytes a pixel; lead the gradients back."""
     from forewarp.ops import kernels_chain, kernels_rasterize
 
@@ -162,17 +168,17 @@ def _way_back(particles, inputs, splats, tiles, picture, background, width, fact
     kernels_chain.slopes_of(splats.numpy(), seen, ranks, sums.numpy(), factor, by_splat.numpy(), pull.numpy())
     gradients = [torch.zeros(t.shape) for t in particles]
     maps = torch.zeros(threads, *inputs[5].shape)
-    weights = torch.zeros(inputs[7].shape if by_weights else (0, 0))
-    kernels_chain.chain(*inputs, splats.numpy(), seen, by_splat.numpy(), *arrays(*gradients, maps, weights))
+    skin = torch.zeros(inputs[7].shape if by_skin else (0, 0))
+    found_by = arrays(by_splat, *gradients, maps, skin)
+    kernels_chain.chain(*inputs, splats.numpy(), seen, *found_by, True)
     loss, squared = found.sum(0).tolist()
-    order = torch.from_numpy(tiles.order)
     return Compared(
         loss,
         squared,
         Gaussians(*gradients),
         maps.sum(0)[:, :12],
-        weights if by_weights else None,
+        skin if by_skin else None,
         pull,
-        order,
-        splats[order, 9],
+        torch.from_numpy(tiles.order),
+        splats[:, 9],
     )

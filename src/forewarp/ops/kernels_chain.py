@@ -206,10 +206,12 @@ def _of_colors(dx, dy, dz, splats, tints, which, valid, place, to_colors):
 
 
 @njit(forceinline=True)
-def _of_maps(maps, links, weights, which, valid, place, to_maps, to_weights):
-    """Add the slopes of blended maps, a particle's in a row of ``place``, to those by maps and shares."""
+def _of_maps(maps, links, weights, which, valid, place, to_maps, to_weights, softmax):
+    """Add the slopes of blended maps, a particle's in a row of ``place``, to those by maps; fill those by
+    weights, or by the numbers whose ``softmax`` they are.
+    """
     for lane in range(valid):
-        i, own = np.uintp(which[lane]), row_of(place, lane)
+        i, own, mean = np.uintp(which[lane]), row_of(place, lane), np.float32(0)
         for n in range(links.shape[1]):
             node = links[i, n]
             put_row(to_maps, node, fma(own, weights[i, n], get_row(to_maps, node)))
@@ -218,6 +220,10 @@ def _of_maps(maps, links, weights, which, valid, place, to_maps, to_weights):
                 for j in range(12):
                     value += place[SIDE_BY_SIDE * lane + j] * maps[node, j]
                 to_weights[i, n] = value
+                mean += weights[i, n] * value
+        if softmax and len(to_weights):
+            for n in range(links.shape[1]):
+                to_weights[i, n] = weights[i, n] * (to_weights[i, n] - mean)
 
 
 @njit(forceinline=True)
@@ -261,11 +267,12 @@ def _of_shape(view, moved, log_scales, quaternions, which, valid, place, to_scal
 def chain(  # long: sixteen particles' way back, step by step
     means, log_scales, quaternions, opacity, colors, maps, links, weights, view, tints, fades,
     splats, seen, slopes,
-    to_means, to_scales, to_quaternions, to_opacity, to_colors, to_maps, to_weights,
+    to_means, to_scales, to_quaternions, to_opacity, to_colors, to_maps, to_weights, softmax,
 ):  # fmt: skip
     """From slopes (V', 16) of the particles ``seen`` (V,) to those by all particles, and by maps.
 
-    ``to_maps`` (S, M, 16): each thread has its own.
+    ``to_maps`` (S, M, 16): each thread has its own. ``to_weights`` (N, L), or empty: by weights, or by the
+    numbers whose ``softmax`` they are.
     """
     count, shares = len(seen), to_maps.shape[0]
     blocks = (count + SIDE_BY_SIDE - 1) // SIDE_BY_SIDE
@@ -315,7 +322,7 @@ def chain(  # long: sixteen particles' way back, step by step
             for j in range(12, SIDE_BY_SIDE):
                 set_row(place, j, sixteen(0.0))
             transpose(place)
-            _of_maps(maps, links, weights, which, valid, place, to_maps[share], to_weights)
+            _of_maps(maps, links, weights, which, valid, place, to_maps[share], to_weights, softmax)
 
 
 @njit(forceinline=True)

@@ -293,5 +293,5 @@ class _Project(torch.autograd.Function):
         order = (out[:, 10] > 0).nonzero()[:, 0].int()
         rows = slopes.new_zeros(whole(len(order)), kernels_chain.SLOPES)
         rows[: len(order), : slopes.shape[1]] = slopes[order.long()]
-        kernels_chain.chain(*arrays(*inputs, out, order, rows, *found, maps, weights))
+        kernels_chain.chain(*arrays(*inputs, out, order, rows, *found, maps, weights), False)
         return *found, maps.sum(0)[:, :12], None, weights, None, None, None

@@ -82,11 +82,11 @@ def test_few_that_stand_before_all_others_are_too_near_and_many_are_not():
     order, far = torch.arange(200).flip(0), torch.linspace(2.0, 3.0, 200)
     assert not len(too_near(order, far))
     for few, gone in ((1, 1), (4, 4), (6, 0)):
-        distances = torch.cat([torch.full((few,), 0.5), far[few:]])
+        distances = torch.cat([torch.full((few,), 0.5), far[few:]]).flip(0)  # of each row, not in that order
         assert too_near(order, distances).tolist() == order[:gone].tolist()
     assert not len(too_near(order[:0], far[:0]))
     lone = torch.tensor([0.1, 2.0, 2.5])
-    assert not len(too_near(order[:3], lone))  # of so few it may be the scene itself
+    assert not len(too_near(torch.arange(3), lone))  # of so few it may be the scene itself
 
 
 def test_what_is_never_seen_goes_after_some_rounds_and_only_where_all_is_in_play():

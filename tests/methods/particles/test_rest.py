@@ -81,7 +81,7 @@ def test_the_share_that_rests_is_told(half):
 
 
 @pytest.mark.parametrize(("covered", "least"), [(1e6, 0.02), (100.0, 0.5013)])
-def test_less_than_a_pixel_is_no_motion(half, monkeypatch, covered, least):
+def test_what_moves_no_farther_than_a_pixel_from_its_mean_place_may_rest(half, monkeypatch, covered, least):
     asked = []
     monkeypatch.setattr(model, "come_to_rest", lambda _, least: asked.append(least))
     method, optimizer = half[0].method, half[0].configure_optimizers()

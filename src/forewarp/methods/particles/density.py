@@ -23,15 +23,15 @@ def too_near(order: Tensor, distances: Tensor) -> Tensor:
     lie between pictures. A thing that comes near is more than a few; of fewer than fifty none is too near.
 
     Args:
-        order, distances: (V,), as of ``ops.compare.Compared``.
+        order, distances: (V,) and (N,), as of ``ops.compare.Compared``.
 
     >>> too_near(torch.arange(50), torch.tensor([0.1] + [2.0] * 49))
     tensor([0])
     """
     if not len(order):
         return order
-    limit = _NEARER * distances[int(_NEAREST * len(order))]
-    return order[: int(torch.searchsorted(distances, limit))]
+    nearest = distances[order[: int(_NEAREST * len(order)) + 1]]
+    return order[: int(torch.searchsorted(nearest, _NEARER * nearest[-1]))]
 
 
 @torch.no_grad()

@@ -231,7 +231,7 @@ class Particles(Method):
             warp = Warp(maps, self.skin.links, self.skin.weights())
         found = compare(
             self.gaussians(), warp or self.warp(time), self.pinholes(seen.view.camera), tints, fades,
-            seen.rgb, seen.background, width=self.width, factor=weight, by_weights=warp is not None,
+            seen.rgb, seen.background, width=self.width, factor=weight, by_skin=warp is not None,
         )  # fmt: skip
         self.pulled.add_(found.pull)
         shown = found.pull > 0
@@ -241,7 +241,7 @@ class Particles(Method):
             self.idle[too_near(found.order, found.distances)] = math.inf
         add(total, by_name(self, found.particles))
         if self.nodes is not None:
-            add(total, {"skin.learned": self.skin.slope(warp.weights, found.weights)})
+            add(total, {"skin.learned": found.skin})
             nodes, rigid = self.nodes, factors.get("rigid", 0.0) * self._loose()
             slope, strain = pull_nodes(
                 motion, nodes.places, found.maps, nodes.edges, nodes.edge_weights, rigid

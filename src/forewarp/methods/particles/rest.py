@@ -18,7 +18,7 @@ def pixel_width(covered: float) -> float:
     """Return the width of a pixel as a share of the scene's extent, from the number of covered pixels.
 
     Roughly: as of a disc that fills the covered pixels, whose extent (the median distance from its middle) is
-    its radius over the root of 2.
+    its radius over the root of 2. Of pictures that show a part of the scene each it is too large.
 
     >>> round(pixel_width(20_000.0), 4)
     0.0177
@@ -28,8 +28,8 @@ def pixel_width(covered: float) -> float:
 
 @torch.no_grad()
 def come_to_rest(method: Method, least: float) -> None:
-    """Stop the nodes that move by less than ``least`` (world units), and let go of them the particles that
-    follow no others.
+    """Stop the nodes that stay within ``least`` (world units) of their mean place, and take with them by
+    turning nothing farther; let go of them the particles that follow no others.
 
     Such a particle is put where it was on average, turned as it was on average, and its shares of nodes
     become 0: it costs no motion any more. A stopped node stays where it was on average, too, as others may

@@ -6,8 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from forewarp.methods.particles.nodes import Nodes
-
-_LEAST = 1e-20  # sum of weights that is divided by: that of a particle at rest is 0
+from forewarp.ops.skin import skin_weights
 
 
 class Skin(nn.Module):
@@ -28,18 +27,7 @@ class Skin(nn.Module):
 
     def weights(self) -> Tensor:
         """The weights (N, L), differentiable in ``learned``."""
-        own = self.shares * (self.learned - self._top()).exp()
-        return own / own.sum(-1, keepdim=True).clamp(min=_LEAST)
-
-    def _top(self) -> Tensor:
-        """The largest number that each particle learned (N, 1). A row less it means the same, and is safe."""
-        return self.learned.detach().amax(-1, keepdim=True)
-
-    @staticmethod
-    def slope(weights: Tensor, by_weights: Tensor) -> Tensor:
-        """The gradient (N, L) by ``learned`` of a loss that has the gradient ``by_weights``."""
-        pulled = weights * by_weights
-        return pulled - weights * pulled.sum(-1, keepdim=True)
+        return skin_weights(self.shares, self.learned)
 
     @torch.no_grad()
     def relink(self, nodes: Nodes, points: Tensor, optimizer: torch.optim.Optimizer) -> None:

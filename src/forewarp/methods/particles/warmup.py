@@ -20,6 +20,7 @@ from forewarp.ops.compare import compare, compile_way_back
 from forewarp.ops.nodes import carry_nodes, pull_nodes, spread_nodes
 from forewarp.ops.project import Gaussians, Pinhole, Warp, project
 from forewarp.ops.rasterize import rasterize
+from forewarp.ops.skin import skin_weights
 
 _PATIENCE_S = 120.0  # that the other process is waited for
 
@@ -45,6 +46,7 @@ def compile_kernels(method: torch.nn.Module) -> None:
         spread_nodes(two, two, torch.zeros(2, 6), first, first, 1.0, 1.0)
         edges = torch.zeros(1, 1, dtype=torch.int64)
         pull_nodes(torch.zeros(1, 6), zero, torch.zeros(1, 12), edges, one, 1.0)
+        skin_weights(one, one)
         moments = zero.clone(), zero.clone(), first.clone()
         adam_rows(torch.zeros(1, 3), torch.ones(1, 3), *moments, 1e-3, (0.9, 0.99), 1e-15)
     compare(*given, torch.zeros(72, 4, dtype=torch.uint8), torch.ones(3))
