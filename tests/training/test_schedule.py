@@ -79,17 +79,25 @@ def test_the_fraction_is_of_what_comes_first(bounds, fraction):
 @pytest.mark.parametrize(
     ("bounds", "iterations"),
     [
-        ({"passes": None, "iterations": None}, None),
-        ({"passes": 1.5, "iterations": None}, 15),
-        ({"passes": 2, "iterations": 30}, 20),
-        ({"passes": 2, "iterations": 8}, 8),
-        ({"passes": 0.01, "iterations": None}, 1),
+        ({"steps_per_picture": None, "iterations": None}, None),
+        ({"steps_per_picture": 1.5, "iterations": None}, 15),
+        ({"steps_per_picture": 2, "iterations": 30}, 20),
+        ({"steps_per_picture": 2, "iterations": 8}, 8),
+        ({"steps_per_picture": 0.01, "iterations": None}, 1),
     ],
 )
-def test_passes_are_steps_for_each_picture(bounds, iterations):
+def test_steps_for_each_picture_bound_a_stage(bounds, iterations):
     own = settings(minutes=1.0, **bounds)
     assert own.over(10).iterations == iterations
     assert own.over(10).minutes == 1.0
+
+
+@pytest.mark.parametrize("key", ["iterations", "minutes", "steps_per_picture"])
+@pytest.mark.parametrize("value", [0, -1.0, float("inf"), float("nan"), True, "many"])
+def test_a_bound_that_is_no_number_is_refused(key, value):
+    message = f"stage.coarse.{key}: expected a number > 0, or null, but got {value!r}"
+    with pytest.raises(ValueError, match=f"^{re.escape(message)}$"):
+        settings(**{"minutes": 1.0, key: value})
 
 
 def plan(share=1.0, **changes):
@@ -113,6 +121,8 @@ def test_what_the_stages_after_one_may_take():
     assert [seconds_after(stages, name) for name in "abc"] == [90, 30, 0]
     steps = share_out({"a": plan(1), "b": plan(999), "c": None}, minutes=None, iterations=10)
     assert [seconds_after(steps, name) for name in "ab"] == [None, 0]
+    bounded = {"a": plan(1), "b": plan(1, steps_per_picture=9)}
+    assert seconds_after(share_out(bounded, minutes=2.0, iterations=None), "a") is None
     assert [(s.settings.minutes, s.settings.iterations) for s in steps] == [(None, 1), (None, 10)]
 
 
@@ -242,8 +252,8 @@ ODD = (
 )
 REFUSED = [
     (settings, {"iterations": None}, "stage.coarse: expected iterations or minutes, but got neither"),
-    (settings, {"iterations": 0}, "stage.coarse.iterations: expected a number > 0, but got 0"),
-    (settings, {"minutes": -1.0}, "stage.coarse.minutes: expected a number > 0, but got -1.0"),
+    (settings, {"iterations": 0}, "stage.coarse.iterations: expected a number > 0, or null, but got 0"),
+    (settings, {"minutes": -1.0}, "stage.coarse.minutes: expected a number > 0, or null, but got -1.0"),
     *((settings, {"name": name}, "stage: expected names of letters, digits, _ and -") for name in NAMES),
     (shared, {"plans": {}}, "stage: expected at least one stage, but got none"),
     (shared, {"plans": {"a": plan(0)}}, r"stage\.a\.share: expected a number > 0, but got 0"),

@@ -62,8 +62,8 @@ def test_a_continued_run_equals_an_uninterrupted_one_to_the_bit(tmp_path, whole,
     assert same(run(tmp_path).fit(), whole[1])
 
 
-def test_a_stage_ends_after_its_passes_and_says_so(tmp_path):
-    only = stage("only", num_voxels=[[0, 10**3]], iterations=1000, passes=0.5)
+def test_a_stage_ends_after_its_steps_for_each_picture_and_says_so(tmp_path):
+    only = stage("only", num_voxels=[[0, 10**3]], iterations=1000, steps_per_picture=0.5)
     bounded, told = make_run(tmp_path, [only], data=ball_data(rays=64, size=16)), []
     bounded.tell = told.append
     bounded.fit()
@@ -72,8 +72,17 @@ def test_a_stage_ends_after_its_passes_and_says_so(tmp_path):
     assert bounded.finished()["only"]["steps"] == steps
     assert told == [
         f"only: ended after {steps} steps, 0.5 for each of {pictures} training pictures; "
-        "for as many as the budget has: stage.only.passes=null"
+        "for as many as the budget has: stage.only.steps_per_picture=null"
     ]
+
+
+def test_a_stage_that_steps_per_picture_bound_goes_on_to_the_bit(tmp_path):
+    """Rates and curriculum follow the steps there will be, also after an interruption."""
+    bounded = {"iterations": 1000, "steps_per_picture": 0.5}
+    fitted = run(tmp_path / "whole", **bounded).fit()
+    with pytest.raises(SystemExit):
+        run(tmp_path / "cut", [Interrupt("fine", 3)], **bounded).fit()
+    assert same(run(tmp_path / "cut", **bounded).fit(), fitted)
 
 
 def test_another_seed_gives_another_run(tmp_path, whole):

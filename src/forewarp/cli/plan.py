@@ -6,8 +6,9 @@ from forewarp.cli.entry import command
 
 HELP = """
 forewarp-plan finds out which effects a scene calls for, and says for each the number that decides. It reads
-the pictures, fits short coarse stages, measures what they leave unexplained, and tries the effects that are
-still open in short fine stages. It scores on training views that it sets aside, never on test views.
+the pictures and fits short runs. Of particles it leaves out one effect after the other, and keeps those that
+are missed; of voxels (model=forward) it measures what coarse stages leave unexplained, and tries the effects
+that are still open. It scores on training views that it sets aside, never on test views.
 
   forewarp-plan scene=specimen_glossy                           a synthetic scene that calls for one effect
   forewarp-plan experiment=dnerf data.root=../data/dnerf data.scene=hook
@@ -16,11 +17,12 @@ still open in short fine stages. It scores on training views that it sets aside,
 
 All overrides of forewarp-train work here too; what is typed is fixed, and not decided by the plan. What one
 types most:
-  plan.minutes=N         plan for a run of N minutes; left out: the cheapest choice within noise of the best
+  plan.minutes=N         plan for a run of N minutes: an effect must be worth the steps it costs
+  plan.least=DB          gain below which an effect does not count; particles 0.6 dB, voxels 0.1
   plan.trials=false      only coarse stages, no trials: less sure, in a third of the time
   plan.seeds=N           seeds of every trial
   plan.steps=N plan.seconds=N              bounds of a coarse stage; the first that is reached ends it
-  plan.trial_steps=N plan.trial_seconds=N  bounds of a trial
+  plan.trial_steps=N plan.trial_seconds=N  bounds of a trial; a few have two or three times as much
   plan.folder=FOLDER     where plan.yaml and the trials go; an interrupted plan goes on there
 Overrule a plan by an override: forewarp-train plan=FILE model/view_dependence=none
 """

@@ -17,7 +17,7 @@ test views. The same command run again skips what is finished and goes on with w
 What one types most (options such as --multirun or --config-dir=FOLDER come first):
   data.root=FOLDER data.scene=NAME    where the scenes are, and which one
   preset=demo|fast|faithful           the method's numbers: small, cheap (the default), as in the paper
-  budget.minutes=N                    of training, all stages together
+  budget.minutes=N                    of training, all stages together; 10 with preset=fast
   budget.clock=wall|processor         what minutes are of; processor time does not depend on other work
   budget.iterations=N                 the same in steps; the first that is reached ends training
   model=particles|forward|backward    Gaussians (default), the paper's method, its like-for-like opponent

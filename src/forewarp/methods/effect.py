@@ -27,6 +27,7 @@ class Effect:
             what ``Planning.coarse`` asks for.
         rules_out: returns True if the evidence makes a trial of a ``later`` effect pointless.
         with_it: returns further overrides, for the final run to be as its trial was.
+        rests: True for what brings matter to rest: how much of it is evidence.
     """
 
     name: str
@@ -36,6 +37,7 @@ class Effect:
     later: bool = False
     rules_out: Callable[[Evidence], bool] = lambda evidence: False
     with_it: Callable[[Asked], Sequence[str]] = lambda asked: ()
+    rests: bool = False
 
     @property
     def group(self) -> str:
@@ -81,7 +83,9 @@ class Evidence:
         slope: dB that the fine trial without effects gained in the second half of its ``steps``.
         steps: steps of that trial.
         step: seconds per step of that trial; None if unknown.
-        at_rest: share of the matter that came to rest in trials with an effect, by effect; mean over seeds.
+        at_rest: share of the matter that came to rest in trials with an effect that ``rests``, by effect;
+            mean over seeds.
+        most_steps: of the planned run's last stage, whatever its minutes; None: only they end it.
     """
 
     pictures: Pictures
@@ -92,6 +96,7 @@ class Evidence:
     steps: int = 1
     step: float | None = None
     at_rest: dict[str, float] = field(default_factory=dict)
+    most_steps: int | None = None
 
     def price(self, gain: Gain) -> float:
         """Return the PSNR (dB) lost to the steps that an effect's extra time displaces.
@@ -101,9 +106,10 @@ class Evidence:
         """
         if None in (self.minutes, self.step, gain.steps) or gain.times <= 1:
             return 0.0
-        steps = max(60 * self.minutes / self.step, 1.0)
+        most = math.inf if self.most_steps is None else self.most_steps
+        without, with_it = (min(max(60 * self.minutes / (self.step * k), 1.0), most) for k in (1, gain.times))
         scale = max(self.slope, 0.0) / (math.sqrt(2) - 1) * math.sqrt(self.steps)
-        return scale / math.sqrt(steps) * (math.sqrt(gain.times) - 1)
+        return scale * (1 / math.sqrt(with_it) - 1 / math.sqrt(without))
 
     def pays(self, effect: str) -> bool | None:
         """Return whether an effect's gain exceeds its noise and its price; None without a trial."""

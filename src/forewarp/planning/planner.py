@@ -40,7 +40,9 @@ class Planner:
         shares = [stage.share for stage in stages.values()]
         minutes = self.settings.minutes and self.settings.minutes * shares[-1] / sum(shares)
         least = self.settings.least or planning.least
-        self.evidence = planning.evidence(survey(scene), least=least, minutes=minutes)
+        each = list(stages.values())[-1].get("steps_per_picture")
+        most = None if each is None else round(each * len(scene.train))
+        self.evidence = planning.evidence(survey(scene), least=least, minutes=minutes, most_steps=most)
 
     def plan(self) -> dict:
         """Return the plan, without seconds: overrides, effects with reasons, evidence."""
@@ -109,8 +111,7 @@ class Planner:
         self._price_of_steps()
         with_it = self.name_of_trial, self.base
         without = f"{self.name_of_trial}-no-{wanted.effect}", merged(self.base, wanted.overrides)
-        longer = None if wanted.longer == 1 else wanted.longer * self.trials.fine_steps
-        self._try(wanted.effect, with_it, without, longer)
+        self._try(wanted.effect, with_it, without, wanted.longer)
         pays = self.evidence.pays(wanted.effect)
         if not pays:
             self.name_of_trial, self.base = without
@@ -130,27 +131,31 @@ class Planner:
         effect: str,
         with_it: tuple[str, list[str]],
         without: tuple[str, list[str]],
-        steps: int | None = None,
+        longer: int = 1,
     ) -> None:
         """Compare two trials, each a name and overrides, seed by seed; stop once the gain is clearly too
-        small. ``steps``: of both; None: the usual number.
+        small. ``longer``: how many times the usual steps and seconds both have.
         """
-        if steps is not None:
-            with_it, without = ((f"{name}-{steps}", overrides) for name, overrides in (with_it, without))
+        if longer != 1:
+            many = longer * self.trials.fine_steps
+            with_it, without = ((f"{name}-{many}", overrides) for name, overrides in (with_it, without))
         on, off = [], []
         for seed in range(self.settings.seeds):
-            on.append(self._tried(*with_it, seed, on[0].steps if on else steps))
-            off.append(self._tried(*without, seed, steps))
+            on.append(self._tried(*with_it, seed, on[0].steps if on else None, longer))
+            off.append(self._tried(*without, seed, None, longer))
             if off[-1].steps != on[-1].steps:  # the trial with the effect ran out of time
                 name, overrides = without
                 off[-1] = self._tried(f"{name}-{on[-1].steps}", overrides, seed, on[-1].steps)
             self.evidence.gains[effect] = gain(on, off)
-            self.evidence.at_rest[effect] = fmean(trial.at_rest for trial in on)
+            if self.effects[effect].rests:
+                self.evidence.at_rest[effect] = fmean(trial.at_rest for trial in on)
             if self.evidence.hopeless(effect):
                 return
 
-    def _tried(self, name: str, overrides: list[str], seed: int, steps: int | None = None) -> Trial:
-        return self.trials.fine(name, overrides, self.name, seed, steps)
+    def _tried(
+        self, name: str, overrides: list[str], seed: int, steps: int | None = None, longer: int = 1
+    ) -> Trial:
+        return self.trials.fine(name, overrides, self.name, seed, steps, longer)
 
     def _choose(self, effect: str) -> str:
         """Return the option that switches an effect on: the configured one, else ``Effect.on``."""
@@ -168,5 +173,5 @@ class Planner:
         values = {f.name: getattr(self.evidence, f.name) for f in fields(self.evidence)}
         found = {name: asdict(value) for name, value in values.items() if is_dataclass(value)}
         found["trials"] = {effect: asdict(one) for effect, one in self.evidence.gains.items()}
-        found["at_rest"] = {effect: share for effect, share in self.evidence.at_rest.items() if share > 0}
+        found["at_rest"] = dict(self.evidence.at_rest)
         return json.loads(json.dumps(found))  # lists for tuples, as YAML has them

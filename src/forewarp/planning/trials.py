@@ -104,7 +104,13 @@ class Trials:
         return self._fitted(config)
 
     def fine(
-        self, name: str, changes: Sequence[str], after: str, seed: int, steps: int | None = None
+        self,
+        name: str,
+        changes: Sequence[str],
+        after: str,
+        seed: int,
+        steps: int | None = None,
+        longer: int = 1,
     ) -> Trial:
         """Fit a short fine stage that begins where the coarse stage of the trial ``after`` ended.
 
@@ -114,12 +120,13 @@ class Trials:
             after: name of the trial whose coarse stage to continue.
             seed: added to the run's seed.
             steps: steps of the stage; None: ``fine_steps``, or fewer if ``fine_seconds`` end first.
+            longer: without ``steps``, how many times as many of both.
         """
         if (known := self.made.get(f"{name}-seed{seed}")) is not None:
             return known
-        seconds = self.fine_seconds if steps is None else None
-        always = [*self.always, *self.always_fine]
-        config = self._config(f"{name}-seed{seed}", changes, always, seed, steps or self.fine_steps, seconds)
+        seconds = longer * self.fine_seconds if steps is None else None
+        steps, always = steps or longer * self.fine_steps, [*self.always, *self.always_fine]
+        config = self._config(f"{name}-seed{seed}", changes, always, seed, steps, seconds)
         first, last = list(config.stage)[0], list(config.stage)[-1]
         config.stage[first].share, config.stage[last].share = 1e-6, 1.0
         self.made[f"{name}-seed{seed}"] = self._fitted(config, self.folder / after / first)[0]
@@ -159,7 +166,7 @@ class Trials:
             module = run.fit().to(run.device)
             file, stage = run.folder / "trial.json", run.stages[-1]
             known = read_json(file)
-            if known is None or "at_rest" not in known:  # as of earlier versions
+            if known is None:
                 noted = read_json(run.stage_folder(stage) / "done.json")
                 psnr = psnr_by_view(module, run.datamodule.watched(), RAYS)
                 step, took = noted["seconds"] / noted["steps"], time.perf_counter() - begin

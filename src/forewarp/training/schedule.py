@@ -25,7 +25,7 @@ class StageSettings:
         lr: learning rate of each of the method's ``param_groups``.
         iterations: steps; None if only minutes bound the stage.
         minutes: training minutes; None if only iterations bound it. With both, the stage ends at the first.
-        passes: most steps for each training picture, at which the stage ends too; None: no such end.
+        steps_per_picture: times the training pictures, the most steps of the stage; None: no such end.
         lr_hold: keep the learning rates constant up to this fraction, then let them fall exponentially; one
             number, or one by group, where a group left out is not held.
         lr_final_factor: the learning rates end at this multiple of their initial values; one number, or one
@@ -43,7 +43,7 @@ class StageSettings:
     lr: Mapping[str, float]
     iterations: int | None = None
     minutes: float | None = None
-    passes: float | None = None
+    steps_per_picture: float | None = None
     lr_hold: float | Mapping[str, float] = 0.0
     lr_final_factor: float | Mapping[str, float] = 0.1
     curriculum: Mapping[str, float] = field(default_factory=dict)
@@ -61,10 +61,10 @@ class StageSettings:
             raise ValueError(
                 f"{where}: expected iterations or minutes, but got neither; set budget.minutes=10"
             )
-        for key in ("iterations", "minutes", "passes"):
+        for key in ("iterations", "minutes", "steps_per_picture"):
             value = getattr(self, key)
-            if value is not None and not value > 0:
-                raise ValueError(f"{where}.{key}: expected a number > 0, but got {value}")
+            if value is not None and not (_is_number(value) and value > 0):
+                raise ValueError(f"{where}.{key}: expected a number > 0, or null, but got {value!r}")
         self._check_rates(where)
 
     def _check_rates(self, where: str) -> None:
@@ -81,8 +81,7 @@ class StageSettings:
                     raise ValueError(
                         f"{where}.{key}: expected groups of {', '.join(self.lr)}, but got '{group}'"
                     )
-                number = isinstance(value, int | float) and not isinstance(value, bool)
-                if not (number and math.isfinite(value) and low <= value <= high):
+                if not (_is_number(value) and low <= value <= high):
                     at = key if group is None else f"{key}.{group}"
                     raise ValueError(f"{where}.{at}: expected {what}, but got {value!r}")
 
@@ -93,10 +92,10 @@ class StageSettings:
         return cls(name, **own, numbers=keys)
 
     def over(self, pictures: int) -> StageSettings:
-        """Return the settings whose ``iterations`` also keep ``passes`` over so many training pictures."""
-        if self.passes is None:
+        """Return the settings whose ``iterations`` also keep ``steps_per_picture``."""
+        if self.steps_per_picture is None:
             return self
-        most = max(1, round(self.passes * pictures))
+        most = max(1, round(self.steps_per_picture * pictures))
         return replace(self, iterations=most if self.iterations is None else min(most, self.iterations))
 
     def lr_factor(self, fraction: float, group: str) -> float:
@@ -114,6 +113,10 @@ class StageSettings:
         if self.minutes is not None:
             done = max(done, seconds / (60 * self.minutes))
         return min(1.0, done)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def _of(given: float | Mapping[str, float], group: str, otherwise: float) -> float:
@@ -186,10 +189,12 @@ def share_out(
 
 
 def seconds_after(stages: Sequence[Stage], name: str) -> float | None:
-    """Return the most seconds that the stages after ``name`` may take; None if minutes do not bound them."""
+    """Return how many seconds the stages after ``name`` will take; None if more than minutes bounds them."""
     names = [stage.settings.name for stage in stages]
-    minutes = [stage.settings.minutes for stage in stages[names.index(name) + 1 :]]
-    return None if None in minutes else 60 * sum(minutes)
+    later = [stage.settings for stage in stages[names.index(name) + 1 :]]
+    if any(one.minutes is None or one.steps_per_picture is not None for one in later):
+        return None
+    return 60 * sum(one.minutes for one in later)
 
 
 class Curriculum:

@@ -243,7 +243,7 @@ class Run:
             trainer.fit(module, datamodule=self.datamodule, ckpt_path=checkpoint, weights_only=True)
         if module.fraction < 1:  # fit returned early, as when a callback stops it: the stage is not finished
             raise KeyboardInterrupt
-        self._tell_of_passes(stage, module)
+        self._tell_of_end(stage, module)
         keeper.save(trainer)
         in_play = module.curriculum.in_play
         save_handover(make_handover(module.method, self.datamodule.scene, before, in_play), folder)
@@ -263,14 +263,15 @@ class Run:
         if interruption.asked:  # pressed after the stage's last step
             raise KeyboardInterrupt
 
-    def _tell_of_passes(self, stage: Stage, module: DynamicSceneModule) -> None:
-        """Say so where a stage ended by its passes, before its budget."""
+    def _tell_of_end(self, stage: Stage, module: DynamicSceneModule) -> None:
+        """Say so where a stage ended by its steps per picture, before its budget."""
         own, most = stage.settings, module.settings.iterations
         if most != own.iterations and module.global_step >= most:
-            pictures = f"{own.passes:g} for each of {len(self.datamodule.scene.train)} training pictures"
+            many = len(self.datamodule.scene.train)
+            pictures = f"{own.steps_per_picture:g} for each of {many} training pictures"
             self.tell(
                 f"{own.name}: ended after {most:,} steps, {pictures}; "
-                f"for as many as the budget has: stage.{own.name}.passes=null"
+                f"for as many as the budget has: stage.{own.name}.steps_per_picture=null"
             )
 
 

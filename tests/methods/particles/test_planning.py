@@ -128,16 +128,19 @@ def test_another_seed_is_tried_where_it_may_decide():
         ("rotation", Gain(0.5, 0.2, 1.0, 9), 0.0, False),
         ("background", Gain(0.1, 0.2, 1.0, 9), 0.3, False),
         ("background", Gain(0.1, 0.2, 1.0, 9), 0.0, True),
-        ("background", Gain(-0.3, 0.2, 1.0, 9), 0.3, True),
+        ("background", Gain(0.1, 0.2, 1.0, 9), 0.09, False),  # another seed may have more at rest
+        ("background", Gain(-0.3, 0.2, 1.0, 9), 0.3, False),
+        ("background", Gain(-0.5, 0.2, 1.0, 9), 0.3, True),
     ):
         evidence.gains[effect], evidence.at_rest[effect] = gain, at_rest
         assert evidence.hopeless(effect) is hopeless
 
 
-def test_without_trials_silhouettes_decide_on_motion_alone():
+def test_without_trials_silhouettes_decide_on_motion_and_all_that_nodes_do():
     for disagreement, cut_out, moves in ((0.2, 0.8, True), (0.0, 0.8, False), (0.0, 0.0, True)):
         pictures = replace(PICTURES, disagreement=disagreement, cut_out=cut_out)
         begin, drops = walk(pictures, asked(trials=False), {})
         assert drops == []
         found = decided(pictures, asked(trials=False))
-        assert [name for name in NAMES if found[name].on] == (["motion", "rotation"] if moves else [])
+        nodes = ["motion", "rotation", "background"] if moves else []
+        assert [name for name in NAMES if found[name].on] == nodes

@@ -127,6 +127,10 @@ def test_the_price_is_what_fewer_steps_cost_on_the_curve_that_was_seen():
     assert found.price(Gain(0, 0, 4.0, 20)) == pytest.approx(c * (150**-0.5 - 600**-0.5))
     assert found.price(Gain(0, 0, 0.5, 100)) == 0
     assert found.price(Gain(0, 0, 4.0, None)) == 0  # the trial itself was of equal time
+    bounded = {most: replace(found, most_steps=most).price(Gain(0, 0, 4.0, 20)) for most in (100, 300, 900)}
+    assert bounded[100] == 0  # with and without it the minutes are enough for all steps there are
+    assert bounded[300] == pytest.approx(c * (150**-0.5 - 300**-0.5))
+    assert bounded[900] == found.price(Gain(0, 0, 4.0, 20))
 
 
 def asked(trials=True, **typed):

@@ -18,8 +18,9 @@ class Effects:
         rotation: True: nodes turn, and do not only shift.
         view_dependence: degree 1 to 3 of the harmonics by which colour depends on direction.
         color_over_time, opacity_over_time: cosines over time of each particle's colour, and of its opacity.
-        background: share of the scene's extent; nodes that stay as near to their mean place, or
-            within a pixel of it, come to rest, and particles that follow no others need no nodes any more.
+        background: share of the scene's extent. Nodes that move (and, by turning, move what is beside them)
+            no farther than that from their mean place, or than a pixel, come to rest; particles that follow
+            no others need no nodes any more.
 
     Raises:
         ValueError: naming the key of a choice that there is not.
@@ -39,7 +40,7 @@ class Effects:
             ("view_dependence", "a degree of 1 to 3", lambda choice: _is_whole(choice) and choice <= 3),
             ("color_over_time", "a number of cosines >= 1", _is_whole),
             ("opacity_over_time", "a number of cosines >= 1", _is_whole),
-            ("background", "a number > 0", lambda choice: isinstance(choice, float) and choice > 0),
+            ("background", "a number > 0", lambda choice: _is_number(choice) and choice > 0),
         ):
             choice = getattr(self, name)
             if choice is not None and not good(choice):
@@ -56,6 +57,10 @@ class Effects:
 
 
 NAMES = tuple(field.name for field in fields(Effects))
+
+
+def _is_number(choice) -> bool:
+    return isinstance(choice, int | float) and not isinstance(choice, bool) and math.isfinite(choice)
 
 
 def _is_whole(choice) -> bool:

@@ -16,6 +16,7 @@ DISAGREEMENT = 0.01  # share of the foreground that no static shape explains, ab
 NARROW = 15.0  # degrees between the most different cameras below which direction cannot be observed
 AT_REST = 0.1  # least share of particles at rest for the background to be worth having
 HARM = 0.2  # dB from which on the background costs too much
+HOPELESS = 0.5  # of ``AT_REST``: so little at rest with one seed is little with all
 RATES = {"means": 8e-3, "shade": 1e-3}  # learning rates of a trial
 
 OF_NODES = ("rotation", "background")  # nothing without motion
@@ -24,7 +25,7 @@ STAND_INS = ("opacity_over_time", "color_over_time")  # for motion
 EFFECTS = (
     Effect("motion", "spline", attribute="nodes"),
     Effect("rotation", "nodes", attribute="nodes.turn"),
-    Effect("background", "still", attribute="resting"),
+    Effect("background", "still", attribute="resting", rests=True),
     Effect("opacity_over_time", "cosines", attribute="fade"),
     Effect("color_over_time", "cosines", attribute="tint"),
     Effect("view_dependence", "harmonics", attribute="shade"),
@@ -32,22 +33,20 @@ EFFECTS = (
 
 
 class ParticlesEvidence(Evidence):
-    """Evidence that decides the background by what rests, as it makes steps cheaper, and pictures hardly
-    better.
-    """
+    """Evidence that decides the background by what rests, as it makes steps cheaper, not pictures better."""
 
     def pays(self, effect: str) -> bool | None:
         """Return whether an effect is missed; the background: whether much rests, at hardly any loss."""
         if effect == "background" and effect in self.gains:
-            return not self.hopeless(effect)
+            return self.at_rest.get(effect, 0.0) >= AT_REST and self.gains[effect].psnr >= -HARM
         return super().pays(effect)
 
     def hopeless(self, effect: str) -> bool:
-        """See ``Evidence``; the background: little rests, or it costs accuracy."""
+        """See ``Evidence``; the background: very little rests, or it costs accuracy beyond noise."""
         if effect != "background":
             return super().hopeless(effect)
         gain = self.gains[effect]
-        return self.at_rest.get(effect, 0.0) < AT_REST or gain.psnr < -HARM
+        return self.at_rest.get(effect, 0.0) < HOPELESS * AT_REST or gain.psnr + gain.noise < -HARM
 
     def bound(self, effect: str) -> float:
         """See ``Evidence``; less in longer trials, as what is rough falls with the root of the steps."""
@@ -93,8 +92,8 @@ class ParticlesPlanning:
             if f"model/{name}" in asked.typed or (name in OF_NODES and not moves):
                 continue
             off = (name, *OF_NODES) if name == "motion" else (name,)
-            steps = longer(name, evidence.pictures)
-            pays = yield Drop(name, _choices(dict.fromkeys(off, "none")), steps)
+            times_longer = longer(name, evidence.pictures)
+            pays = yield Drop(name, _choices(dict.fromkeys(off, "none")), times_longer)
             moves = pays if name == "motion" else moves
 
     def look(
@@ -119,13 +118,13 @@ class ParticlesPlanning:
         return list(found.values())
 
     def _called(self, name: str, evidence: Evidence) -> bool:
-        """Return what the trials say; without trials, motion alone is on, where silhouettes allow it."""
+        """Return what the trials say; without trials, nodes with all they do, where silhouettes allow it."""
         pays = evidence.pays(name)
         if pays is not None:
             return pays
         pictures = evidence.pictures
         moves = pictures.cut_out < CUT_OUT or pictures.disagreement > DISAGREEMENT
-        return moves and name in ("motion", "rotation")
+        return moves and name in ("motion", *OF_NODES)
 
 
 def order(pictures: Pictures) -> list[str]:
