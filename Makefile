@@ -4,7 +4,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 DEMO := runs/demo
-# For accuracy-time and price-list: a folder of D-NeRF scenes (none: the procedural vehicle), a scene of it, minutes of
+# For accuracy-time and price-list: a folder that holds dnerf/ (none: the procedural vehicle), a scene of it, minutes of
 # training a run, how many seeds, MODEL=forward for the paper's method instead of particles, and, to compare less than
 # sweeps/price_list_<model>.yaml does, CHANGES="stage.fine.density=45,180".
 DATA ?=
@@ -90,7 +90,7 @@ TINY = data.scene=tiny paths.data=runs/bench-gpu data.synthesis.size=32 data.syn
 bench-gpu: MINUTES := $(if $(filter command line,$(origin MINUTES)),$(MINUTES),10)
 bench-gpu: ## seconds of steps and frames, and PSNR against seconds, of model=forward on a GPU [DATA= SCENES="a b" MINUTES= DEVICE=cpu SMALL=1]
 	status=0; for scene in $(if $(DATA),$(SCENES),vehicle); do \
-		bench() { $(BIN)/forewarp-train model=forward trainer=$(DEVICE) $(if $(DATA),experiment=dnerf data.root=$(DATA)) data.scene=$$scene \
+		bench() { $(BIN)/forewarp-train model=forward trainer=$(DEVICE) $(if $(DATA),paths.scenes=$(DATA) scene=dnerf_$$scene,data.scene=$$scene) \
 			+variant.name=base "$$@" $(if $(SMALL),$(TINY)) $(GO_ON); }; \
 		bench preset=fast data.held_out=8 budget.minutes=$(MINUTES) run=runs/bench-gpu/$$scene-fast; \
 		bench preset=faithful budget.minutes=null budget.iterations=240 run=runs/bench-gpu/$$scene-faithful; \
@@ -102,21 +102,21 @@ bench-gpu: ## seconds of steps and frames, and PSNR against seconds, of model=fo
 RENAMED = $(if $(VARIANTS),$(error VARIANTS: expected MODEL=forward CHANGES="preset.rays=1024$(comma)2048"; variants are gone since 0.3))
 accuracy-time: ## accuracy of each choice against training time [MODEL=forward DATA= SCENE= MINUTES= CHANGES= SEEDS=3]
 	@$(RENAMED)
-	status=0; $(SWEEP); compare $(if $(DATA),experiment=dnerf data.root=$(DATA) data.scene=$(SCENE)) $(GO_ON); \
+	status=0; $(SWEEP); compare $(if $(DATA),paths.scenes=$(DATA) scene=dnerf_$(SCENE)) $(GO_ON); \
 	$(BIN)/forewarp-report kind=accuracy_time out=docs/results && exit $$status
 
 price-list: SEEDS ?= 2
 price-list: ## what each choice costs and brings, on the vehicle and real scenes [MODEL=forward DATA= SCENES="a b" MINUTES= CHANGES=]
 	@$(RENAMED)
-	@test -n "$(DATA)" || { echo "price-list: expected DATA=<folder of D-NeRF scenes>"; exit 2; }
+	@test -n "$(DATA)" || { echo "price-list: expected DATA=<folder that holds dnerf/>"; exit 2; }
 	status=0; $(SWEEP); compare $(GO_ON); \
 	for scene in $(SCENES); do \
-		compare experiment=dnerf data.root=$(DATA) data.scene=$$scene $(GO_ON); \
+		compare paths.scenes=$(DATA) scene=dnerf_$$scene $(GO_ON); \
 	done; \
 	$(BIN)/forewarp-report kind=price_list out=docs/results && exit $$status
 
 COMPARE = $(BIN)/forewarp-train --multirun sweeps=effects $(if $(THREADS),threads=$(THREADS))
-effects: MINUTES := $(if $(filter command line,$(origin MINUTES)),$(MINUTES),2)
+effects: MINUTES := $(if $(filter command line,$(origin MINUTES)),$(MINUTES),$(if $(filter particles,$(MODEL)),0.5,2))
 effects: SEEDS ?= 2
 # Three specimens are made for effects that particles alone have; they have no fixed set to compare a plan with.
 SPECIMENS := still,rigid,band,glossy,room,quick,daylight,blocks,spin
@@ -124,7 +124,7 @@ effects: ## planned effects of model=forward against all effects, on procedural 
 ifneq ($(filter-out particles forward,$(MODEL)),)
 	$(error MODEL: expected forward or particles, which can be planned, but got $(MODEL))
 else ifeq ($(MODEL),particles)
-	@status=0; $(COMPARE) $(SEED) model=particles ablation=auto $(if $(DATA),paths.scenes=$(DATA)) \
+	@status=0; $(COMPARE) $(SEED) model=particles ablation=auto budget.minutes=$(MINUTES) $(if $(DATA),paths.scenes=$(DATA)) \
 		scene=$(if $(DATA),$(subst $(space),$(comma),$(addprefix dnerf_,$(SCENES))),specimen_$(subst $(comma),$(comma)specimen_,$(SPECIMENS))) $(GO_ON); \
 	$(BIN)/forewarp-report kind=effects && exit $$status
 else ifeq ($(DATA),)

@@ -10,6 +10,7 @@ from forewarp.files import replace_file
 from forewarp.metrics.gain import Estimate
 from forewarp.report.collect import Result, by_scene, collect, grouped, left_out, machine
 from forewarp.report.curve import Published, draw_scene, seconds_to
+from forewarp.report.run_rows import portable
 from forewarp.report.tables import Column, Table
 
 Groups = Mapping[tuple[str, float | None], Sequence[Result]]
@@ -21,7 +22,8 @@ checkpoints are left out. PSNR is of training views held out (`data.held_out`; w
 views), each estimated from the same random pixels of the whole image; a value counts as reached once two
 evaluations in a row reach it. Over several seeds: mean ± standard deviation, and only where every seed gets
 there. A schedule follows the share of its minutes that is spent, so a run of ten minutes is not at its best
-after one.
+after one. Where runs differ in length, the thick line of a picture joins where they end (a point each); the
+thin ones are what they had on the way.
 """
 
 
@@ -77,7 +79,7 @@ def cheapest(groups: Groups) -> Table:
         found = [(seconds, result) for seconds, result in found if seconds is not None]
         if found:
             seconds, result = min(found, key=lambda pair: pair[0].mean)
-            rows.append([str(psnr), seconds, result.variant, f"`{result.command}`"])
+            rows.append([str(psnr), seconds, result.variant, f"`{portable(result.command)}`"])
     columns = [Column("for dB"), Column("seconds", 1), Column("variant"), Column("command")]
     return Table(columns, rows, "The cheapest way to each PSNR:")
 

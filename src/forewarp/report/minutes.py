@@ -18,6 +18,7 @@ from forewarp.report.minutes_sections import (
     labelled,
     larger_pictures,
     made_when,
+    minutes_of,
     more_density,
     more_minutes,
 )
@@ -25,6 +26,7 @@ from forewarp.report.run_rows import (
     CLOCKS,
     NETS,
     commands,
+    ended_early,
     estimate,
     made_on,
     merged,
@@ -37,7 +39,7 @@ from forewarp.report.tables import Column, Table
 INTRODUCTION = """# What `model={method}` reaches in so many minutes
 
 Written by `forewarp-report kind=minutes` from runs of `sweeps=minutes`. {clocks} PSNR (dB),
-SSIM and LPIPS are means over test views, where a scene tells kinds apart over those between training times;
+SSIM and LPIPS are means over test views; of scenes with several test sets, over views between training times;
 ± is the standard deviation over the seeds. *Ends*: by how much the mean PSNR of views in the first and last
 tenth of the time is below the median of the others. LPIPS is of the first of {nets} whose weights were
 there.
@@ -126,7 +128,9 @@ def _by_minutes(rows: Sequence[dict]) -> Table:
         means = [None if None in of else statistics.fmean(cell.mean for cell in of) for of in found]
         lines += [[f"mean of {dataset}", *means]] if len(own) > 1 else []
     columns = [Column("scene"), *(Column(f"{m:g} min") for m in minutes)]
-    return Table(columns, lines, caption="PSNR (dB) of test views.")
+    early = any(ended_early(group) is not None for group in alike(rows))
+    about = " Some runs ended before their minutes, by their steps for each picture: see *Each*." * early
+    return Table(columns, lines, caption="PSNR (dB) of test views." + about)
 
 
 def _each(rows: Sequence[dict]) -> Table:
@@ -137,7 +141,7 @@ def _each(rows: Sequence[dict]) -> Table:
     for group in alike(rows):
         means = [_mean(group, name) for name in ("ends", "size")]
         scores = [estimate(group, name) for name in ("psnr", "ssim", "lpips")]
-        lines.append([group[0]["label"], f"{group[0]['minutes']:g}", len(group), *scores, *means])
+        lines.append([group[0]["label"], minutes_of(group), len(group), *scores, *means])
     return Table(columns, lines)
 
 
@@ -153,7 +157,7 @@ def _costs(rows: Sequence[dict]) -> Table:
         step = _mean(group, "step")
         means = [_mean(group, name) for name in ("processor", "wall", "steps")]
         means += [step and 1000 * step, *(_mean(group, name) for name in ("frame", "parameters", "memory"))]
-        lines.append([group[0]["label"], f"{group[0]['minutes']:g}", *means])
+        lines.append([group[0]["label"], minutes_of(group), *means])
     return Table([Column("scene"), Column("minutes", 0), *COSTS], lines)
 
 

@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable, Iterable, Sequence
 
 from forewarp.metrics.gain import Estimate
-from forewarp.report.run_rows import ABILITIES, CONDITIONS, estimate, key_of, telling
+from forewarp.report.run_rows import ABILITIES, CONDITIONS, ended_early, estimate, key_of, telling
 from forewarp.report.tables import Cell, Column, Table
 
 NOISE = 0.2  # dB that chance may take: with more of something PSNR may be this much lower
@@ -23,6 +23,16 @@ def alike(rows: Iterable[dict]) -> list[Group]:
     for row in rows:
         groups.setdefault(key_of(row, ("method", "preset", "scene", "minutes", *CONDITIONS)), []).append(row)
     return sorted(groups.values(), key=lambda group: (group[0]["label"], group[0]["minutes"], size_in(group)))
+
+
+def minutes_of(group: Group) -> str:
+    """The minutes of a group's runs; where they ended earlier, after how many.
+
+    >>> minutes_of([{"clock": "wall", "wall": 301.0, "minutes": 20.0}])
+    '20 (ended after 5.0)'
+    """
+    early = ended_early(group)
+    return f"{group[0]['minutes']:g}" + ("" if early is None else f" (ended after {early:.1f})")
 
 
 def size_in(group: Group) -> float:
@@ -51,7 +61,10 @@ def labelled(rows: Sequence[dict]) -> list[dict]:
 
 def more_minutes(rows: Sequence[dict]) -> list[str]:
     """The section on whether more minutes make it worse; none where each scene has one number of minutes."""
-    about = "Means over the seeds. More minutes hold if PSNR is at least that of fewer, less 0.2 dB.\n"
+    about = (
+        "Means over the seeds. More minutes hold if PSNR is at most 0.2 dB below that of fewer. Captures of "
+        "few pictures end after so many steps for each of them; more minutes then change nothing.\n"
+    )
     lines = _steps(
         [row for row in rows if is_plain(row)],
         lambda group: key_of(group[0], ("scene", "preset", *_without("density"))),
@@ -66,7 +79,7 @@ def more_density(rows: Sequence[dict]) -> list[str]:
     """The section of runs that differ in density; none without such runs."""
     about = (
         "Runs that differ in density alone (empty: the preset's own), fewest first; means over "
-        "the seeds. More hold if PSNR is at least that of fewer, less 0.2 dB.\n"
+        "the seeds. More hold if PSNR is at most 0.2 dB below that of fewer.\n"
     )
     lines = _steps(
         [row for row in rows if row["size"] and not _REDUCED.search(row["pictures"] or "")],
@@ -113,7 +126,7 @@ def beside(method: str, rows: Sequence[dict], others: Sequence[dict]) -> list[st
                 verdicts = [above(group, rival, name) for name in ("psnr", "ssim", "lpips")]
                 seeds = f"{len(group)} and {len(rival)}"
                 both = [estimate(one, "psnr") for one in (group, rival)]
-                lines.append([group[0]["label"], f"{group[0]['minutes']:g}", seeds, *both, *verdicts])
+                lines.append([group[0]["label"], minutes_of(group), seeds, *both, *verdicts])
         columns = [Column("scene"), Column("minutes", 0), Column("seeds"), Column(f"`{method}`")]
         columns += [Column(f"`{other}`"), Column("PSNR"), Column("SSIM"), Column("LPIPS")]
         about = (
@@ -133,7 +146,7 @@ def abilities(rows: Sequence[dict]) -> list[str]:
     for group in alike(known):
         found = [estimate(group, name) for name in names]
         error = found[-1] and Estimate(*(v and 100 * v for v in (found[-1].mean, found[-1].deviation)))
-        about = [group[0]["label"], f"{group[0]['minutes']:g}", f"`{group[0]['method']}`", len(group)]
+        about = [group[0]["label"], minutes_of(group), f"`{group[0]['method']}`", len(group)]
         lines.append([*about, *found[:-1], error])
     columns = [Column("scene"), Column("minutes", 0), Column("method"), Column("seeds", 0)]
     columns += [*(Column(one) for one in ABILITIES), Column("moving points (%)", 1)]
@@ -233,7 +246,7 @@ def _begins() -> list[Column]:
 
 
 def _begin(group: Group) -> list[Cell]:
-    return [group[0]["label"], f"{group[0]['minutes']:g}", len(group)]
+    return [group[0]["label"], minutes_of(group), len(group)]
 
 
 def _scores(group: Group) -> list[Cell]:

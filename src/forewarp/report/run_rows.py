@@ -17,9 +17,10 @@ from forewarp.report.sheets import images_of
 
 # Rows that differ in these are not compared.
 CONDITIONS = ("clock", "threads", "device", "measured", "pictures", "iterations", "held_out", "density")
+CONDITIONS += ("steps_per_picture",)
 FORMS = {"clock": "{} clock", "threads": "threads: {:g}"}
 FORMS |= {"iterations": "{:g} steps at most", "held_out": "{:g} views held out"}
-FORMS |= {"density": "stage.fine.density={:g}"}
+FORMS |= {"density": "stage.fine.density={:g}", "steps_per_picture": "stage.fine.steps_per_picture={}"}
 KEY = ("method", "preset", "scene", "minutes", "seed", *CONDITIONS)  # what tells rows apart
 ABILITIES = ("space", "time", "canonical")
 NUMBERS = ("psnr", "ssim", "lpips", "steps", "step", "frame", "parameters", "memory", "ends")
@@ -27,11 +28,14 @@ NUMBERS += ("motion_error", *(f"psnr_{ability}" for ability in ABILITIES), "size
 TEXTS = ("dataset", "day", "commit", "departures", "faults", "views", "curve", "command")
 # What stands for the folders of whoever types a command again.
 PLACES = {"paths.scenes": "DATASETS", "data.root": "SCENES", "lpips_weights": "WEIGHTS"}
+OWN = ("run", "sheets", "paths.runs", "paths.data")  # keys that say where a run's files are, not what it is
 NETS = ("vgg", "alex", "squeeze")  # LPIPS is of the first whose weights were there
 CLOCKS = """Minutes are of training: setting up counts (a visual hull, a plane sweep), reading pictures and
 compiling do not. The processor clock counts processor time of the process, which is the same beside other
 work on the machine and, with one thread, equals the wall clock on an idle one."""
 DENSITY = re.compile(r"\sstage\.fine\.density=([\d.]+)")  # in a command
+STEPS_PER_PICTURE = re.compile(r"\sstage\.fine\.steps_per_picture=(\S+)")
+EARLY = 0.95  # of its minutes: a run that took less ended by its steps
 _ENDS = 0.1  # share of the time that counts as its first and last part
 _MOST = 1 << 24  # bytes of a table that is read back
 
@@ -59,14 +63,14 @@ def row_of(result: Result) -> dict:
 
     ``step`` and ``frame`` are seconds, ``wall`` and ``processor`` those of training by each clock, ``views``
     is time:PSNR of each test view, ``curve`` is seconds:PSNR; ``motion_error`` is the error of moving points
-    as a share of their motion, ``size`` the number of particles or voxels, ``density`` that of the last stage
-    where it was typed (None: the preset's own).
+    as a share of their motion, ``size`` the number of particles or voxels, ``density`` and
+    ``steps_per_picture`` those of the last stage where they were typed (None: the preset's own).
     """
     views = sorted((one["time"], one["scores"]["psnr"]) for one in images_of(result.folder))
     numbers, scores = result.numbers, result.metrics["test"][result.ability]
     protocol, flow = result.metrics["protocol"], result.metrics.get("flow") or {}
     abilities = {f"psnr_{one}": result.metrics["test"].get(one, {}).get("psnr") for one in ABILITIES}
-    typed = DENSITY.search(result.command)
+    typed, steps = DENSITY.search(result.command), STEPS_PER_PICTURE.search(result.command)
     frames = protocol.get("test_frames")
     return {
         "method": result.config["model"]["name"],
@@ -82,6 +86,7 @@ def row_of(result: Result) -> dict:
         "iterations": result.config["budget"].get("iterations"),
         "held_out": protocol.get("held_out") or None,
         "density": float(typed[1]) if typed else None,
+        "steps_per_picture": steps and steps[1],
         **{name: numbers.get(name) for name in NUMBERS},
         **abilities,
         **{kind: result.metrics.get("clocks", {}).get(kind) for kind in ("wall", "processor")},
@@ -183,7 +188,8 @@ def _read(row: dict) -> dict:
     """A row as ``row_of`` makes it; of an older table some fields are unknown."""
     counted = ("minutes", "threads", "iterations", "held_out", "density", *NUMBERS)
     numbers = {name: float(row[name]) if row.get(name) else None for name in counted}
-    texts = {name: row.get(name) or None for name in ("clock", "device", "measured", "pictures", *TEXTS)}
+    named = ("clock", "device", "measured", "pictures", "steps_per_picture", *TEXTS)
+    texts = {name: row.get(name) or None for name in named}
     if " scene=counterpart_" in (texts["command"] or ""):
         texts["dataset"] = _of_counterpart(texts["dataset"] or "")
     return row | numbers | texts | {"seed": int(row["seed"]), "clock": texts["clock"] or "wall"}
@@ -192,6 +198,17 @@ def _read(row: dict) -> dict:
 def _of_counterpart(dataset: str) -> str:
     """Name the dataset of a scene that stands in for its scenes, whose means it does not belong to."""
     return dataset if dataset.startswith("counterpart") else f"counterpart of {dataset}"
+
+
+def ended_early(rows: Sequence[dict]) -> float | None:
+    """The mean minutes that runs took which ended before theirs; None if they took what they had.
+
+    >>> ended_early([{"clock": "processor", "processor": 300.0, "minutes": 20.0}])
+    5.0
+    """
+    taken = [row[row["clock"]] for row in rows if row[row["clock"]] is not None]
+    minutes = statistics.fmean(taken) / 60 if taken else None
+    return minutes if minutes is not None and minutes < EARLY * rows[0]["minutes"] else None
 
 
 def _csv(rows: list[dict]) -> str:
@@ -237,6 +254,18 @@ def commands(rows: Sequence[dict], sweep: str) -> str:
     return "\n".join(["## Commands\n", about, "```bash", *sorted(lines), "```\n"])
 
 
+def portable(command: str) -> str:
+    """A command without the folders of whoever typed it.
+
+    >>> portable("forewarp-train seed=1 paths.scenes=/data paths.runs=r model=forward")
+    'forewarp-train seed=1 paths.scenes=DATASETS model=forward'
+    """
+    command = re.sub(rf"\s({'|'.join(map(re.escape, OWN))})=\S+", "", command)
+    for key, word in PLACES.items():
+        command = re.sub(rf"(\s{re.escape(key)}=)\S+", rf"\g<1>{word}", command)
+    return command
+
+
 def _repeated(row: dict, sweep: str) -> str:
     """A row's command as another would type it: without seed and folder, as a job of the sweep if it may be.
 
@@ -246,9 +275,7 @@ def _repeated(row: dict, sweep: str) -> str:
     >>> _repeated(row | {"threads": 2.0}, "minutes")
     'forewarp-train scene=s budget.clock=processor threads=2'
     """
-    command = re.sub(r"\s(seed|run|sheets)=\S+", "", row["command"])
-    for key, word in PLACES.items():
-        command = re.sub(rf"(\s{re.escape(key)}=)\S+", rf"\g<1>{word}", command)
+    command = re.sub(r"\sseed=\S+", "", portable(row["command"]))
     if row["clock"] == "wall" or "#" in command:
         return command
     command = re.sub(r"\s(budget\.clock|threads)=\S+", "", command)
