@@ -42,7 +42,7 @@ WITHOUT = {
     "whole numbers, or yes and no": "map_cells unfolded index_of dilate occupied_cells neighbour_pairs"
     " occupied_cells_reference sorted_tiles encoded_size",
     "says that it has none": "trace undistort adam_rows arrays",
-    "of times or directions, which are not learned": "spline_basis harmonics",
+    "of times or directions, which are not learned": "spline_basis spline_shares harmonics",
     "gives its own, which test_compare and test_nodes compare": "compare compare_reference pull_nodes"
     " spread_nodes",
     "the kernel of project, without its gradient": "projected",

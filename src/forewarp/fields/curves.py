@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from operator import mul
+
 import torch
 from torch import Tensor
 
 from forewarp.ops.dct import dct_basis
-from forewarp.ops.spline import spline_basis
+from forewarp.ops.spline import spline_basis, spline_shares
 
 KINDS = ("spline", "cosines")
 _PADDING = 0.2  # of the sequence, imagined before and after it: a cosine stands still at both ends
@@ -53,6 +56,14 @@ class Curve:
         if self.kind == "spline":
             return spline_basis(time, self.count, beyond=beyond, straight=self.straight)
         return dct_basis(time, self.count, self.times, self.canonical_time, _PADDING)
+
+    def summed(self, parts: Sequence[tuple[float, float]], beyond: float = 0.0) -> Tensor:
+        """``sum_i f_i b(t_i)`` (K,) of times and factors: a difference of bases, say, at one go."""
+        if self.kind == "spline":
+            shares = [spline_shares(t, self.count, beyond=beyond, straight=self.straight) for t, _ in parts]
+            factors = [factor for _, factor in parts]
+            return torch.tensor([sum(map(mul, factors, of_one)) for of_one in zip(*shares)])
+        return sum(factor * self(time) for time, factor in parts)
 
     def reach(self) -> Tensor | None:
         """From when to when (K, 2) each coefficient bends the curve; None where all do so at all times."""

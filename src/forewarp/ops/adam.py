@@ -31,15 +31,16 @@ def adam_rows(
     for name, part in (("gradient", gradient), ("exp_avg", mean), ("exp_avg_sq", square)):
         check_shape(name, part, tuple(value.shape))
     check_shape("steps", steps, tuple(value.shape[:-1]))
-    fast = use_numba(value) and value.dtype == torch.float32 and value.is_contiguous()
-    if fast:
+    fast = use_numba(value) and value.dtype == torch.float32
+    if fast and all(t.is_contiguous() for t in (value, mean, square, steps)):
         from forewarp.ops import kernels_adam
 
         match_threads()
         betas = tuple(map(float, betas))
         table = kernels_adam.biases(*betas)
         parts = (value.detach(), gradient.contiguous(), mean, square, steps)
-        kernels_adam.adam(*(t.view(-1).numpy() for t in parts), float(rate), *betas, float(eps), table)
+        flat = (t.numpy().reshape(-1) for t in parts)  # a view, quicker than PyTorch's
+        kernels_adam.adam(*flat, float(rate), *betas, float(eps), table)
         return
     seen = (gradient != 0).any(-1)
     counted = steps[seen] + 1

@@ -7,10 +7,13 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import threading
 from functools import cache
 
 import torch
 from torch import Tensor
+
+_MATCHED = threading.local()  # Numba, too, counts the threads of each thread
 
 
 @cache
@@ -36,14 +39,20 @@ def cores() -> int:
 
 
 def match_threads() -> int:
-    """Let Numba use as many threads as PyTorch; return their number."""
-    numba = _numba()
+    """Let Numba use as many threads as PyTorch; return their number.
+
+    Cost: next to nothing where PyTorch has as many as at the last call of the same thread.
+    """
     asked = torch.get_num_threads()
+    if getattr(_MATCHED, "asked", None) == asked:
+        return _MATCHED.wanted
+    numba = _numba()
     wanted = max(1, min(asked, numba.config.NUMBA_NUM_THREADS))
     if numba.get_num_threads() != wanted:
         numba.set_num_threads(wanted)
     if torch.get_num_threads() != asked:  # Numba's first call starts all threads of the OpenMP they share
         torch.set_num_threads(asked)
+    _MATCHED.asked, _MATCHED.wanted = asked, wanted
     return wanted
 
 

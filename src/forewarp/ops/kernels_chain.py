@@ -28,7 +28,7 @@ from forewarp.ops.kernels_project import (
     through_lens,
     turned,
 )
-from forewarp.ops.lanes import fma, root, sixteen, where_above
+from forewarp.ops.lanes import fma, root, sixteen, total, where_above
 from forewarp.ops.lanes_arrays import get_row, put_row, room, row_of, set_row, transpose
 
 SLOPES = 16  # by u, v, A, B, C, opacity, colour (3) and distance; the last six are 0
@@ -211,17 +211,18 @@ def _of_maps(maps, links, weights, which, valid, place, to_maps, to_weights, sof
     weights, or by the numbers whose ``softmax`` they are.
     """
     for lane in range(valid):
-        i, own, mean = np.uintp(which[lane]), row_of(place, lane), np.float32(0)
+        i, own = np.uintp(which[lane]), row_of(place, lane)
         for n in range(links.shape[1]):
             node = links[i, n]
             put_row(to_maps, node, fma(own, weights[i, n], get_row(to_maps, node)))
-            if len(to_weights):
-                value = np.float32(0)
-                for j in range(12):
-                    value += place[SIDE_BY_SIDE * lane + j] * maps[node, j]
-                to_weights[i, n] = value
-                mean += weights[i, n] * value
-        if softmax and len(to_weights):
+        if not len(to_weights):
+            continue
+        mean = np.float32(0)
+        for n in range(links.shape[1]):
+            value = total(own * get_row(maps, links[i, n]))
+            to_weights[i, n] = value
+            mean += weights[i, n] * value
+        if softmax:
             for n in range(links.shape[1]):
                 to_weights[i, n] = weights[i, n] * (to_weights[i, n] - mean)
 

@@ -11,7 +11,6 @@ from numba import njit, prange
 
 from forewarp.ops.lanes import (
     any_above,
-    columns,
     exp_down,
     fma,
     fold,
@@ -19,8 +18,10 @@ from forewarp.ops.lanes import (
     narrow_columns,
     root,
     rows,
+    sixteen,
     total,
     where_above,
+    widened,
 )
 from forewarp.ops.lanes_arrays import add_sums, get, get_channel, get_tile, put, put_tile
 
@@ -32,17 +33,17 @@ MOST = 1 << 15  # entries of a tile that count, the nearest ones
 
 
 @njit(inline="always")
-def _alpha(records, i, x, y):
-    """What a splat covers of each pixel of a tile, whose pixels lie at ``x y`` in its own coordinates."""
-    dx = x - records[i, 0]
+def _alpha(records, i, column, y):
+    """What a splat covers of each pixel of a tile, from a column on and in rows ``y``."""
+    dx = narrow_columns() + (column - records[i, 0])
     dy = y - records[i, 1]
-    along = fma(dx * dx, records[i, 2], lanes(records[i, 5]))
-    power = fma(dy, fma(dy, records[i, 4], dx * records[i, 3]), along)
+    along, across = widened(fma(dx * dx, records[i, 2], sixteen(records[i, 5]))), widened(dx * records[i, 3])
+    power = fma(dy, fma(dy, records[i, 4], across), along)
     return where_above(power, np.float32(LEAST_LOG), exp_down(power))
 
 
 @njit(cache=True)
-def _blend(records, entries, first, last, x, y, kept):
+def _blend(records, entries, first, last, column, y, kept):
     """Composite a tile's entries from near to far. ``kept`` takes the alpha of each, and its weight.
 
     Returns what is let through, the colour, and how many entries were looked at.
@@ -51,7 +52,7 @@ def _blend(records, entries, first, last, x, y, kept):
     count = 0
     for at in range(first, min(last, first + MOST)):
         i = entries[at]
-        alpha = _alpha(records, i, x, y)
+        alpha = _alpha(records, i, column, y)
         put(kept, 2 * count, alpha)
         weight = alpha * through
         put(kept, 2 * count + 1, weight)
@@ -106,12 +107,12 @@ def _walk_back(records, entries, first, count, column, y, kept, slopes, far, beh
 
 
 @njit(cache=True)
-def _draw_tile(records, entries, first, last, x, y):
+def _draw_tile(records, entries, first, last, column, y):
     """Composite a tile: what is let through, colour, and distance times coverage."""
     through, red, green, blue, far = lanes(1.0), lanes(0.0), lanes(0.0), lanes(0.0), lanes(0.0)
     for at in range(first, min(last, first + MOST)):
         i = entries[at]
-        weight = _alpha(records, i, x, y) * through
+        weight = _alpha(records, i, column, y) * through
         red = fma(weight, records[i, 6], red)
         green = fma(weight, records[i, 7], green)
         blue = fma(weight, records[i, 8], blue)
@@ -132,8 +133,8 @@ def draw(records, entries, ends, shares, out):
     for share in prange(len(shares) - 1):
         for tile in range(shares[share], shares[share + 1]):
             row, column = SIDE * (tile // across), SIDE * (tile % across)
-            x, y = columns() + column, rows() + row
-            through, red, green, blue, far = _draw_tile(records, entries, ends[tile], ends[tile + 1], x, y)
+            left, y = np.float32(column), rows() + row
+            through, red, green, blue, far = _draw_tile(records, entries, ends[tile], ends[tile + 1], left, y)
             put_tile(out[0], row, column, red)
             put_tile(out[1], row, column, green)
             put_tile(out[2], row, column, blue)
@@ -151,8 +152,8 @@ def pull(records, entries, ends, shares, slopes, kept, sums):
             if first == last:
                 continue
             row, column = SIDE * (tile // across), SIDE * (tile % across)
-            x, y = columns() + column, rows() + row
-            count = _blend(records, entries, first, last, x, y, kept[share])[4]
+            left, y = np.float32(column), rows() + row
+            count = _blend(records, entries, first, last, left, y, kept[share])[4]
             # The last plane is what is let through: its slope stands behind everything, times 1.
             of = (
                 get_tile(slopes[0], row, column),
@@ -165,7 +166,7 @@ def pull(records, entries, ends, shares, slopes, kept, sums):
                 entries,
                 first,
                 count,
-                np.float32(column),
+                left,
                 y,
                 kept[share],
                 of,
@@ -216,9 +217,9 @@ def compare(records, entries, ends, shares, pixels, background, width, kept, sum
         edge, score = np.zeros((SIDE, SIDE), np.float32), np.zeros(2, np.float64)
         for tile in range(shares[share], shares[share + 1]):
             row, column = SIDE * (tile // across), SIDE * (tile % across)
-            x, y = columns() + column, rows() + row
+            left, y = np.float32(column), rows() + row
             through, red, green, blue, count = _blend(
-                records, entries, ends[tile], ends[tile + 1], x, y, kept[share]
+                records, entries, ends[tile], ends[tile + 1], left, y, kept[share]
             )
             whole = row + SIDE <= pixels.shape[0] and column + SIDE <= pixels.shape[1]
             truth, at, to, inside = pixels, row, column, full
@@ -245,7 +246,7 @@ def compare(records, entries, ends, shares, pixels, background, width, kept, sum
                 entries,
                 ends[tile],
                 count,
-                np.float32(column),
+                left,
                 y,
                 kept[share],
                 of,

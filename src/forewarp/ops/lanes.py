@@ -128,12 +128,6 @@ def sixteen(typing, value):
 
 
 @intrinsic
-def columns(typing):
-    """Column 0 to 7 of each of a tile's pixels, at its centre."""
-    return TILE(), lambda context, builder, sig, args: constant(WIDE, ((i % ROW) + 0.5 for i in range(WIDE)))
-
-
-@intrinsic
 def rows(typing):
     """Row 0 to 7 of each of a tile's pixels, at its centre."""
     return TILE(), lambda context, builder, sig, args: constant(WIDE, ((i // ROW) + 0.5 for i in range(WIDE)))
@@ -145,6 +139,16 @@ def narrow_columns(typing):
     return SUMS(), lambda context, builder, sig, args: constant(
         NARROW, ((i % ROW) + 0.5 for i in range(NARROW))
     )
+
+
+@intrinsic
+def widened(typing, a):
+    """The 64 pixels of a tile whose rows come in four pairs alike: ``a`` is one pair, 2 rows of 8."""
+
+    def code(context, builder, sig, args):
+        return shuffled(builder, args[0], args[0], [*range(NARROW)] * (WIDE // NARROW))
+
+    return TILE(a), code
 
 
 @intrinsic
@@ -235,15 +239,13 @@ def any_above(typing, a, least):
 
 @intrinsic
 def exp_down(typing, a):
-    """``exp(a)`` of ``-6 <= a <= 0`` to 1e-6; of less it is ``exp(-6)``.
+    """``exp(a)`` of ``-6 <= a <= 0`` to 1e-6; of other numbers it is anything.
 
     The polynomial is of ``exp(a / 8)``, whose eighth power is taken by squaring thrice.
     """
 
     def code(context, builder, sig, args):
-        width, kind = a.width, args[0].type
-        least = constant(width, [-6.0] * width)
-        x = builder.select(builder.fcmp_ordered(">", args[0], least), args[0], least)
+        width, kind, x = a.width, args[0].type, args[0]
         function = cgutils.get_or_insert_function(
             builder.module, ir.FunctionType(kind, [kind] * 3), f"llvm.fmuladd.v{width}f32"
         )
@@ -271,10 +273,10 @@ def fold(typing, a):
 
 @intrinsic
 def total(typing, a):
-    """The sum of all 64, float32."""
+    """The sum of all, float32."""
 
     def code(context, builder, sig, args):
-        value, width = args[0], WIDE
+        value, width = args[0], a.width
         while width > 1:
             width //= 2
             low, high = (shuffled(builder, value, value, range(i, i + width)) for i in (0, width))

@@ -39,23 +39,13 @@ def spline_basis(
     >>> spline_basis(1.0, 3, straight=True)
     tensor([0., 0., 1.])
     """
-    least = 2 if straight else 4
-    if knots < least:
-        raise ValueError(f"spline: expected at least {least} knots, but got {knots}")
+    if isinstance(time, float) and canonical_time is None:
+        return torch.tensor(spline_shares(time, knots, beyond=beyond, straight=straight))
     origin = 0.0 if canonical_time is None else canonical_time
-    if isinstance(time, float) and -beyond <= time <= 1 + beyond and 0 <= origin <= 1:
-        now = _shares(time, knots, straight)
-        then = [0.0] * knots if canonical_time is None else _shares(origin, knots, straight)
-        return torch.tensor([a - b for a, b in zip(now, then)])
     t = torch.as_tensor(time)
     t = t if t.is_floating_point() else t.float()
     both = torch.stack([t, torch.full_like(t, origin)]).double()
-    if not bool(((both >= -beyond) & (both <= 1 + beyond)).all()):
-        low, high = float(both.min()), float(both.max())
-        raise ValueError(
-            f"spline: expected times in [{0.0 - beyond:g}, {1 + beyond:g}], but got {low:.4g} to {high:.4g}; "
-            "scale the times"
-        )
+    _check(float(both.min()), float(both.max()), knots, beyond, straight)
     whole = _with_outer(knots, straight)
     place = both * (whole - 3)
     first = place.floor().clamp(0, whole - 4)
@@ -70,8 +60,9 @@ def spline_basis(
     return (basis[0] if canonical_time is None else basis[0] - basis[1]).to(t.dtype)
 
 
-def _shares(time: float, knots: int, straight: bool) -> list[float]:
-    """``B_k`` at a time."""
+def spline_shares(time: float, knots: int, *, beyond: float = 0.0, straight: bool = False) -> list[float]:
+    """``B_k`` at a time as numbers, without what it takes to make a tensor; see ``spline_basis``."""
+    _check(time, time, knots, beyond, straight)
     whole = _with_outer(knots, straight)
     place = time * (whole - 3)
     first = min(max(int(place), 0), whole - 4)
@@ -84,6 +75,17 @@ def _shares(time: float, knots: int, straight: bool) -> list[float]:
         u**3 / 6,
     )
     return _folded(found) if straight else found
+
+
+def _check(low: float, high: float, knots: int, beyond: float, straight: bool) -> None:
+    least = 2 if straight else 4
+    if knots < least:
+        raise ValueError(f"spline: expected at least {least} knots, but got {knots}")
+    if not -beyond <= low <= high <= 1 + beyond:
+        raise ValueError(
+            f"spline: expected times in [{0.0 - beyond:g}, {1 + beyond:g}], but got {low:.4g} to {high:.4g}; "
+            "scale the times"
+        )
 
 
 def _with_outer(knots: int, straight: bool) -> int:

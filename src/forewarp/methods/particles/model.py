@@ -226,7 +226,7 @@ class Particles(Method):
         if self.nodes is not None:
             taken = self.nodes.taken(time)
             self.nodes.look_ahead(taken)
-            basis = self.nodes.basis_of_motion(taken)
+            basis = self.nodes.basis_of_motion((taken, 1.0))
             motion, maps = self.nodes.carried(basis)
             warp = Warp(maps, self.skin.links, self.skin.weights())
         found = compare(

@@ -100,15 +100,15 @@ class Nodes(nn.Module):
 
     def basis(self, time: float) -> Tensor:
         """The curve's basis (K,) at a given time, as the coefficients are."""
-        return self.basis_of_motion(self.taken(time))
+        return self.basis_of_motion((self.taken(time), 1.0))
 
     def taken(self, time: float) -> float:
         """The time of the motion in a picture of a given time."""
         return time if self.offsets is None else self.offsets(time)
 
-    def basis_of_motion(self, taken: float) -> Tensor:
-        """The curve's basis (K,) at a time of the motion."""
-        return self.curve(taken, 0.0 if self.offsets is None else _BEYOND).to(self.places)
+    def basis_of_motion(self, *parts: tuple[float, float]) -> Tensor:
+        """The sum of the curve's bases (K,) at times of the motion, each with its factor."""
+        return self.curve.summed(parts, 0.0 if self.offsets is None else _BEYOND).to(self.places)
 
     def carried(self, basis: Tensor) -> tuple[Tensor, Tensor]:
         """Where nodes went and how they turned (M, 6), by a curve's basis (K,), and their maps (M, 12)."""
@@ -228,7 +228,7 @@ class Nodes(nn.Module):
 
     def _by_time(self, taken: float, slope: Tensor) -> float:
         """From slopes (M, 6) by ``motion`` to the one by its time."""
-        along = (self.basis_of_motion(taken + _NEAR) - self.basis_of_motion(taken - _NEAR)) / (2 * _NEAR)
+        along = self.basis_of_motion((taken + _NEAR, 0.5 / _NEAR), (taken - _NEAR, -0.5 / _NEAR))
         return (self.carried(along)[0].detach() * slope).sum().item()
 
     def _bend(self, taken: float) -> Tensor:
@@ -238,7 +238,5 @@ class Nodes(nn.Module):
         if low > high:
             return self.places.new_zeros(self.curve.count)
         middle = min(max(taken, low), high)
-        before, now, after = (
-            self.basis_of_motion(min(max(t, 0.0), 1.0)) for t in (middle - step, middle, middle + step)
-        )
-        return after - 2 * now + before
+        before, after = max(middle - step, 0.0), min(middle + step, 1.0)
+        return self.basis_of_motion((after, 1.0), (middle, -2.0), (before, 1.0))
