@@ -40,3 +40,11 @@ def test_scenes_and_minutes_stand_apart(tmp_path):
     heads = [line for line in text.splitlines() if line.startswith("## ")]
     assert heads == ["## ball, 1 minutes", "## ball, 3 minutes", "## cube, 1 minutes"]
     assert "Of test views between the training times:" in text
+
+
+def test_a_page_is_named_after_the_method_that_most_runs_are_of(tmp_path):
+    for variant, model in (("base", "particles"), ("nodes=5", "particles"), ("model=forward", "forward")):
+        write_run(tmp_path, variant, config={"model": {"name": model}})
+    written = write_price_list(tmp_path, tmp_path / "out")
+    assert [path.name for path in written] == ["price-list-particles.md", "price-list-particles.csv"]
+    assert len(rows_of(written[0].read_text(), "model=forward")) == 1

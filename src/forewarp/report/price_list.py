@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from statistics import mode
 
 from forewarp.files import replace_file
 from forewarp.metrics.gain import DIFFERENCES, Estimate, measure_effect
@@ -32,7 +33,9 @@ standard deviation over the seeds. A change smaller than its spread says nothing
 
 
 def write_price_list(runs: Path, out: Path) -> list[Path]:
-    """Write ``price-list.md`` and ``price-list.csv`` (every run's own numbers).
+    """Write ``price-list-<model>.md`` and ``.csv`` (every run's own numbers), of ``forward`` ``price-list``.
+
+    The model is that of most runs: what is changed one at a time, beside which whole methods may stand.
 
     Args:
         runs: folder to search for measured runs.
@@ -49,7 +52,9 @@ def write_price_list(runs: Path, out: Path) -> list[Path]:
             bound = f"{minutes:g} minutes" if minutes else "bounded by steps"
             parts += [f"## {scene}, {bound}\n", references(equal).markdown(), changes(equal).markdown()]
     parts += left_out("Without numbers", without)
-    page, file = out / "price-list.md", out / "price-list.csv"
+    models = [result.config["model"]["name"] for result in results] or ["forward"]
+    name = "price-list" if (most := mode(models)) == "forward" else f"price-list-{most}"
+    page, file = out / f"{name}.md", out / f"{name}.csv"
     replace_file(page, "\n".join(parts))
     replace_file(file, every_run(results).csv())
     return [page, file]
