@@ -103,7 +103,7 @@ RENAMED = $(if $(VARIANTS),$(error VARIANTS: expected MODEL=forward CHANGES="pre
 accuracy-time: ## accuracy of each choice against training time [MODEL=forward DATA= SCENE= MINUTES= CHANGES= SEEDS=3]
 	@$(RENAMED)
 	status=0; $(SWEEP); compare $(if $(DATA),paths.scenes=$(DATA) scene=dnerf_$(SCENE)) $(GO_ON); \
-	$(BIN)/forewarp-report kind=accuracy_time out=docs/results && exit $$status
+	$(BIN)/forewarp-report kind=accuracy_time && exit $$status
 
 price-list: SEEDS ?= 2
 price-list: ## what each choice costs and brings, on the vehicle and real scenes [MODEL=forward DATA= SCENES="a b" MINUTES= CHANGES=]

@@ -4,15 +4,7 @@ import imageio.v3 as iio
 import pytest
 
 from forewarp.report.collect import Point, collect, grouped
-from forewarp.report.curve import (
-    Published,
-    draw_run,
-    draw_scene,
-    of_several_lengths,
-    pareto_front,
-    read_published,
-    seconds_to,
-)
+from forewarp.report.curve import Published, draw_run, draw_scene, pareto_front, read_published, seconds_to
 from tests.support.runs_on_disk import write_run
 
 
@@ -68,24 +60,6 @@ def test_a_scene_names_those_on_the_front_and_the_hardware_of_others(tmp_path, m
     other = Published("other", 100.0, 32.0, "a GPU", "its paper", "dnerf")
     legend = legend_of(monkeypatch, tmp_path / "scene.png", groups, "ball", [other])
     assert legend == ["base, 1 min", "good, 1 min", "Pareto front", "other (published, a GPU)"]
-
-
-def test_variants_of_several_lengths_are_joined_by_where_they_end(tmp_path, monkeypatch):
-    drawn = []
-    monkeypatch.setattr(
-        "forewarp.report.curve._line",
-        lambda axes, points, **style: drawn.append(([(p.seconds, p.psnr) for p in points], style)),
-    )
-    for minutes, ends in ((1.0, (25.0, 27.0)), (5.0, (30.0,))):
-        for seed, psnr in enumerate(ends):
-            write_run(tmp_path, seed=seed, minutes=minutes, curve=((30, 20.0), (int(60 * minutes), psnr)))
-    groups = grouped(collect(tmp_path)[0])
-    assert legend_of(monkeypatch, tmp_path / "scene.png", groups, "ball") == ["base: ends of runs"]
-    thick = [points for points, style in drawn if style.get("linewidth") == 2]
-    assert thick == [[(60.0, 26.0), (300.0, 30.0)]]
-    assert sum(style.get("marker") == "o" for _, style in drawn) == 3
-    write_run(tmp_path, "good")  # of one length alone: then curves compare, not ends
-    assert of_several_lengths(grouped(collect(tmp_path)[0])) == []
 
 
 def test_published_points_are_read_and_checked(tmp_path):

@@ -12,7 +12,7 @@ KINDS = {
     "price_list": "what each choice costs and brings, with the spread over seeds",
     "paper": "the paper's tables and figures: Markdown, LaTeX, CSV, HTML",
     "ablation": "what each part of the paper's method brings, and whether the paper's order holds",
-    "minutes": "what a method reaches on each scene in so many minutes, by seed and view",
+    "minutes": "what each method reaches on each scene in so many minutes, by seed and view",
     "methods": "all methods under one clock: what each reaches, PSNR against seconds, views side by side",
     "effects": "planned runs against every effect at once and the paper's fixed set",
     "compare": "a few runs side by side, printed, and with out=FOLDER drawn",
@@ -36,7 +36,7 @@ What one types most:
   runs=[FOLDER,FOLDER]   compare, limits: the runs themselves; patterns with * are expanded
   out=FOLDER             where the page goes (results/ below the runs); compare: where the picture goes
   target=DB              accuracy_time: PSNR that every variant's seconds are listed for
-  published=FILE         accuracy_time: results of others to show; paper, ablation: the printed numbers
+  published=FILE         accuracy_time, minutes: results of others; paper, ablation: the printed numbers
   curves=FOLDER          paper: where accuracy_time put its pictures (runs/accuracy_time/results)
   views=N                limits: training views to render
   run=FOLDER             run: the run; its page is <run>/page.html, or out=FILE.html
@@ -131,7 +131,7 @@ def _written(config, runs: Path, out: Path) -> list[Path]:
     if config.kind == "effects":
         return write_effects(runs, out)
     if config.kind == "minutes":
-        return write_minutes(runs, out)
+        return write_minutes(runs, out, read_published(Path(config.published or OTHERS)))
     if config.kind == "methods":
         return write_methods(runs, out)
     if config.kind == "ablation":

@@ -22,8 +22,7 @@ checkpoints are left out. PSNR is of training views held out (`data.held_out`; w
 views), each estimated from the same random pixels of the whole image; a value counts as reached once two
 evaluations in a row reach it. Over several seeds: mean ± standard deviation, and only where every seed gets
 there. A schedule follows the share of its minutes that is spent, so a run of ten minutes is not at its best
-after one. Where runs differ in length, the thick line of a picture joins where they end (a point each); the
-thin ones are what they had on the way.
+after one.
 """
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from statistics import fmean
 
 import yaml
 
@@ -97,9 +96,6 @@ def draw_scene(
 ) -> Path:
     """Draw all runs of a scene; color and name the groups on the Pareto front, and mark the front.
 
-    Where each variant ran for several lengths, a line joins the means of their ends, each run has a point
-    there, and curves are thin: in so many seconds a variant reaches what a run of that length ends with.
-
     Args:
         path: file of the picture.
         groups: runs as grouped by ``collect.grouped``; a line for each run, a color for each group.
@@ -108,62 +104,24 @@ def draw_scene(
     """
     runs = [(key, run) for key, group in groups.items() for run in group]
     every = [(key, point) for key, run in runs for point in run.curve]
-    seconds = [point.seconds for _, point in every] + [other.seconds for other in published]
-    wide = max(seconds) > 1000 * min(seconds)
-    figure, axes = _axes(any(point.epe is not None for _, point in every), wide)
-    if lengths := of_several_lengths(groups):
-        _draw_lengths(axes, groups, lengths)
-    else:
-        _draw_front(axes, runs, every)
-    for number, other in enumerate(published):
-        label = f"{other.name} (published, {other.hardware})"
-        axes[0].plot(other.seconds, other.psnr, "*", color=f"C{number % 10}", fillstyle="none", label=label)
-    axes[0].legend(fontsize="x-small", loc="lower right")
-    axes[0].set_title(title)
-    return _save(figure, path)
-
-
-def of_several_lengths(groups: Mapping[tuple[str, float | None], Sequence[Result]]) -> list[str]:
-    """Return the variants that ran for several numbers of minutes; none unless all did."""
-    known: dict[str, set] = {}
-    for variant, minutes in groups:
-        known.setdefault(variant, set()).add(minutes)
-    return list(known) if all(len(minutes) > 1 for minutes in known.values()) else []
-
-
-def _draw_lengths(axes, groups: Mapping[tuple[str, float | None], Sequence[Result]], variants) -> None:
-    """Draw each run's curve thinly, and a line through the means of where runs of one length end."""
-    for number, variant in enumerate(variants):
-        color, ends = f"C{number % 10}", []
-        for (own, _), group in groups.items():
-            last = [run.curve[-1] for run in group if run.curve] if own == variant else []
-            for run in group if last else ():
-                _line(axes, run.curve, color=color, linewidth=0.5, alpha=0.5)
-            ends += [last] if last else []
-        _line(axes, [_mean(last) for last in ends], color=color, linewidth=2)
-        for point in (point for last in ends for point in last):
-            _line(axes, [point], color=color, marker="o", markersize=3.5)
-        axes[0].plot([], [], color=color, linewidth=2, marker="o", label=f"{variant}: ends of runs")
-
-
-def _mean(points: Sequence[Point]) -> Point:
-    """The mean of points of several seeds."""
-    known = [point.epe for point in points if point.epe is not None]
-    epe = fmean(known) if len(known) == len(points) else None
-    return Point(fmean(p.seconds for p in points), fmean(p.psnr for p in points), points[0].step, epe)
-
-
-def _draw_front(axes, runs: Sequence[tuple], every: Sequence[tuple]) -> None:
-    """Draw each run's curve, those of groups on the Pareto front in a color, and mark the front."""
     front = [every[i] for i in pareto_front([(point.seconds, point.psnr) for _, point in every])]
     known = enumerate(dict.fromkeys(key for key, _ in front))
     styles = {key: {"color": f"C{i % 10}", "linestyle": "--" if i >= 10 else "-"} for i, key in known}
+    seconds = [point.seconds for _, point in every] + [other.seconds for other in published]
+    wide = max(seconds) > 1000 * min(seconds)
+    figure, axes = _axes(any(point.epe is not None for _, point in every), wide)
     for key, run in runs:
         _line(axes, run.curve, **styles.get(key, {"color": "0.8", "zorder": 1}))
     for key, style in styles.items():
         axes[0].plot([], [], label=f"{key[0]}, {key[1]:g} min" if key[1] else key[0], **style)
     marks = [point.seconds for _, point in front], [point.psnr for _, point in front]
     axes[0].plot(*marks, "ko", markersize=4, label="Pareto front")
+    for number, other in enumerate(published):
+        label = f"{other.name} (published, {other.hardware})"
+        axes[0].plot(other.seconds, other.psnr, "*", color=f"C{number % 10}", fillstyle="none", label=label)
+    axes[0].legend(fontsize="x-small", loc="lower right")
+    axes[0].set_title(title)
+    return _save(figure, path)
 
 
 def _axes(with_flow: bool, wide: bool = False):

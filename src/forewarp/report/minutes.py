@@ -8,7 +8,9 @@ from pathlib import Path
 
 from forewarp.files import read_rows, replace_file
 from forewarp.report import curve
+from forewarp.report.by_method import write_by_method
 from forewarp.report.collect import left_out
+from forewarp.report.curve import Published
 from forewarp.report.minutes_sections import (
     SCORES,
     abilities,
@@ -28,6 +30,7 @@ from forewarp.report.run_rows import (
     commands,
     ended_early,
     estimate,
+    length,
     made_on,
     merged,
     of_minutes,
@@ -54,8 +57,9 @@ COSTS = (
 )
 
 
-def write_minutes(runs: Path, out: Path) -> list[Path]:
-    """Write ``<method>.md``, ``.csv`` (a row a run) and ``.png`` (PSNR by view) of each method in the runs.
+def write_minutes(runs: Path, out: Path, published: Sequence[Published] = ()) -> list[Path]:
+    """Write ``<method>.md``, ``.csv`` (a row a run) and ``.png`` (PSNR by view) of each method in the runs,
+    and the page of them all: see ``by_method``.
 
     Rows of a table that is there already stay, unless a run of the same ``run_rows.KEY``
     replaces them: runs may be made one day after the other. Each page compares its method with the others,
@@ -64,6 +68,7 @@ def write_minutes(runs: Path, out: Path) -> list[Path]:
     Args:
         runs: folder to search for measured runs.
         out: folder to write to.
+        published: results of others, drawn beside.
 
     Returns:
         the files written.
@@ -81,7 +86,7 @@ def write_minutes(runs: Path, out: Path) -> list[Path]:
         replace_file(page, "\n".join([*_page(method, rows, others), *left_out("Without numbers", without)]))
         _draw([row for row in labelled(rows) if is_plain(row)], picture)
         written += [page, out / f"{method}.csv", picture]
-    return written
+    return written + write_by_method(tables, out, published)
 
 
 def _known(out: Path) -> set[str]:
@@ -127,7 +132,7 @@ def _by_minutes(rows: Sequence[dict]) -> Table:
         found = [[cells[scene, m] for scene in own] for m in minutes]
         means = [None if None in of else statistics.fmean(cell.mean for cell in of) for of in found]
         lines += [[f"mean of {dataset}", *means]] if len(own) > 1 else []
-    columns = [Column("scene"), *(Column(f"{m:g} min") for m in minutes)]
+    columns = [Column("scene"), *(Column(length(m)) for m in minutes)]
     early = any(ended_early(group) is not None for group in alike(rows))
     about = " Some runs ended before their minutes, by their steps for each picture: see *Each*." * early
     return Table(columns, lines, caption="PSNR (dB) of test views." + about)
@@ -177,7 +182,7 @@ def _draw(rows: Sequence[dict], picture: Path) -> None:
     for axis, scene in zip(axes.flat, scenes):
         for group in alike(row for row in rows if row["label"] == scene):
             if line := mean_by_time(group):
-                about = f"{group[0]['minutes']:g} min, {len(group)} seed{'s' * (len(group) > 1)}"
+                about = f"{length(group[0]['minutes'])}, {len(group)} seed{'s' * (len(group) > 1)}"
                 axis.plot(*zip(*line), marker=".", label=about)
         axis.set(title=scene, xlabel="time", ylabel="PSNR (dB)")
         if axis.lines:

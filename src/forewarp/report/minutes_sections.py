@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable, Iterable, Sequence
 
 from forewarp.metrics.gain import Estimate
-from forewarp.report.run_rows import ABILITIES, CONDITIONS, ended_early, estimate, key_of, telling
+from forewarp.report.run_rows import ABILITIES, CONDITIONS, ended_early, estimate, key_of, length, telling
 from forewarp.report.tables import Cell, Column, Table
 
 NOISE = 0.2  # dB that chance may take: with more of something PSNR may be this much lower
@@ -32,7 +32,9 @@ def minutes_of(group: Group) -> str:
     '20 (ended after 5.0)'
     """
     early = ended_early(group)
-    return f"{group[0]['minutes']:g}" + ("" if early is None else f" (ended after {early:.1f})")
+    return length(group[0]["minutes"]).removesuffix(" min") + (
+        "" if early is None else f" (ended after {early:.1f})"
+    )
 
 
 def size_in(group: Group) -> float:

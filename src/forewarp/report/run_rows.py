@@ -219,6 +219,15 @@ def _csv(rows: list[dict]) -> str:
     return file.getvalue()
 
 
+def length(minutes: float) -> str:
+    """Spell a length of training.
+
+    >>> length(1 / 30), length(1.0), length(2.5)
+    ('2 s', '1 min', '2.5 min')
+    """
+    return f"{60 * minutes:.0f} s" if minutes < 1 else f"{minutes:g} min"
+
+
 def estimate(rows: Sequence[dict], name: str) -> Estimate | None:
     """Estimate a number over the rows that have it; None if none has."""
     return Estimate.of([row[name] for row in rows if row[name] is not None])
