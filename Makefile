@@ -106,14 +106,15 @@ accuracy-time: ## accuracy of each choice against training time [MODEL=forward D
 	$(BIN)/forewarp-report kind=accuracy_time && exit $$status
 
 price-list: SEEDS ?= 2
+price-list: LISTED := runs/price-list/$(or $(MODEL),particles)
 price-list: ## what each choice costs and brings, on the vehicle and real scenes [MODEL=forward DATA= SCENES="a b" MINUTES= CHANGES=]
 	@$(RENAMED)
 	@test -n "$(DATA)" || { echo "price-list: expected DATA=<folder that holds dnerf/>"; exit 2; }
-	status=0; $(SWEEP); compare $(GO_ON); \
+	status=0; $(SWEEP); compare paths.runs=$(LISTED) $(GO_ON); \
 	for scene in $(SCENES); do \
-		compare paths.scenes=$(DATA) scene=dnerf_$$scene $(GO_ON); \
+		compare paths.runs=$(LISTED) paths.scenes=$(DATA) scene=dnerf_$$scene $(GO_ON); \
 	done; \
-	$(BIN)/forewarp-report kind=price_list out=docs/results && exit $$status
+	$(BIN)/forewarp-report kind=price_list runs=$(LISTED) out=docs/results && exit $$status
 
 COMPARE = $(BIN)/forewarp-train --multirun sweeps=effects $(if $(THREADS),threads=$(THREADS))
 effects: MINUTES := $(if $(filter command line,$(origin MINUTES)),$(MINUTES),$(if $(filter particles,$(MODEL)),0.5,2))

@@ -35,7 +35,7 @@ def test_every_choice_of_particles_is_fitted_and_listed(ok, in_tmp):
     tiny += ["budget.minutes=null", "budget.iterations=8", "data.held_out=2", "logger=none", "sheets=0"]
     ok("train", "--multirun", "sweeps=price_list_particles", *tiny, "callbacks.accuracy.first=1e-3")
     sweep = yaml.safe_load((ROOT / "sweeps" / "price_list_particles.yaml").read_text())
-    for kind, page in (("price_list", "price-list.md"), ("accuracy_time", "accuracy-time.md")):
+    for kind, page in (("price_list", "price-list-particles.md"), ("accuracy_time", "accuracy-time.md")):
         ok("report", f"kind={kind}", "out=out")
         text = (in_tmp / "out" / page).read_text()
         named = {frozenset(line.split("|")[1].split()) for line in text.splitlines() if line.startswith("|")}

@@ -107,3 +107,16 @@ def test_any_count_of_steps_stays_within_the_table(count):
     parts[3].fill_(count)
     step(parts, torch.ones(32, 3))
     assert bool(parts[0].isfinite().all())
+
+
+def test_what_is_not_contiguous_is_changed_in_place_too():
+    plain, spread = state((32, 3)), [torch.zeros(*t.shape, 2)[..., 0] for t in state((32, 3))]
+    for part, own in zip(plain, spread):
+        own.copy_(part)
+    assert not any(part.is_contiguous() for part in spread)
+    for _ in range(2):
+        step(plain, torch.ones(32, 3))
+        step(spread, torch.ones(32, 3))
+    for part, own in zip(plain, spread):
+        torch.testing.assert_close(own, part)
+    assert float(spread[3][0]) == 2

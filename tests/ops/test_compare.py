@@ -37,6 +37,7 @@ def test_kernel_equals_reference(options):
     for one_part, other in zip(gradients_of(exact), gradients_of(fast), strict=True):
         assert float((one_part - other).norm() / one_part.norm()) < 2e-5
     assert fast.order.tolist() == exact.order.tolist()
+    assert fast.distances.shape == exact.distances.shape == fast.pull.shape
     near, away = (found.distances[found.order] for found in (fast, exact))
     torch.testing.assert_close(near.double(), away, atol=1e-5, rtol=1e-5)
     assert bool((away.diff() >= 0).all())

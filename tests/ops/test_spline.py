@@ -91,3 +91,8 @@ def test_refused(time, knots, canonical, text):
 def test_without_a_canonical_time_shares_sum_to_one(time):
     total = spline_basis(time, 6).sum(-1)
     torch.testing.assert_close(total, torch.ones_like(total))
+
+
+@pytest.mark.parametrize("canonical", [None, 0.5])
+def test_no_times_have_no_shares(canonical):
+    assert spline_basis(torch.zeros(0), 7, canonical).shape == (0, 7)

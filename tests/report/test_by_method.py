@@ -1,6 +1,7 @@
 import imageio.v3 as iio
 import pytest
 
+from forewarp.report.by_method import _seconds
 from forewarp.report.curve import Published
 from forewarp.report.minutes import write_minutes
 from tests.support.runs_on_disk import rows_of, write_run
@@ -9,11 +10,13 @@ DNERF = {"protocol": {"dataset": "dnerf"}}
 OTHER = Published("Other", 600.0, 31.0, "RTX 1", "its paper", "dnerf")
 
 
-def measured(runs, method, minutes, *found, scene="ball"):
+def measured(runs, method, minutes, *found, scene="ball", clock="wall", took=None):
     for seed, psnr in enumerate(found):
+        clocks = {} if took is None else {"clocks": {clock: took}}
+        protocol = {**DNERF["protocol"], "clock": clock}
         write_run(
-            runs / method, seed=seed, psnr=psnr, minutes=minutes, scene=scene, metrics=DNERF,
-            config={"model": {"name": method}},
+            runs / method, seed=seed, psnr=psnr, minutes=minutes, scene=scene,
+            metrics={"protocol": protocol, **clocks}, config={"model": {"name": method}},
         )  # fmt: skip
 
 
@@ -35,7 +38,7 @@ def test_methods_are_compared_over_lengths(tmp_path):
     assert head == ["method", "2 s", "1 min", "5 min", "seeds", "passed by `particles` after"]
     assert own == ["`particles`", "21.00 ± 1.41", "30.00", "33.00", "2, 1, 1", ""]
     assert rows_of(text, "`forward`")[0] == ["`forward`", "", "24.00", "29.50", "1, 1", "1 min"]
-    assert "* Other: 31 dB after 600 s of an RTX 1 (its paper)" in text
+    assert "* Other: 31 dB after 600 s of an RTX 1 (dnerf; its paper)" in text
     assert iio.imread(files["accuracy-time-ball.png"]).ndim == 3
     assert "accuracy-time-ball.png" in text
 
@@ -76,3 +79,39 @@ def test_others_stand_beside_scenes_of_their_dataset_alone(tmp_path, monkeypatch
     toy = Published("Toy", 60.0, 20.0, "a CPU", "a page", "toy")
     page_of(tmp_path, published=[OTHER, toy])
     assert drawn == {"ball": ["Other"], "cube": ["Other"]}
+
+
+def test_what_was_measured_otherwise_is_not_compared(tmp_path):
+    for method, clock in (("particles", "processor"), ("forward", "wall")):
+        for minutes in (1.0, 5.0):
+            measured(tmp_path / clock / "runs", method, minutes, 30.0, clock=clock)
+    for clock in ("processor", "wall"):
+        written = write_minutes(tmp_path / clock / "runs", tmp_path / "out")
+        assert "accuracy-time.md" not in [path.name for path in written]
+    for minutes in (1.0, 5.0):  # now there are two of one clock
+        measured(tmp_path / "more", "backward", minutes, 20.0, clock="wall")
+    files = {path.name: path for path in write_minutes(tmp_path / "more", tmp_path / "out", [OTHER])}
+    text = files["accuracy-time.md"].read_text()
+    assert "## ball, wall clock\n" in text
+    assert "](accuracy-time-ball-wall-clock.png)" in text
+    assert not rows_of(text, "`particles`")
+    assert "* Other: " in text
+
+
+def test_runs_that_ended_early_stand_where_they_ended(tmp_path, monkeypatch):
+    drawn = {}
+    monkeypatch.setattr("forewarp.report.by_method._draw", lambda groups, *rest: drawn.update(groups))
+    for method in ("particles", "forward"):
+        measured(tmp_path / "runs", method, 1.0, 30.0, took=60.0)
+        measured(tmp_path / "runs", method, 20.0, 31.0, took=300.0 if method == "particles" else 1200.0)
+    text = page_of(tmp_path, published=[Published("Toy", 60.0, 20.0, "a CPU", "a page", "toy")])[
+        0
+    ].read_text()
+    assert rows_of(text, "`particles`")[0][1:3] == ["30.00", "31.00 (ended after 5 min)"]
+    assert rows_of(text, "`forward`")[0][1:3] == ["30.00", "31.00"]
+    assert [_seconds(group) for group in drawn["particles"]] == [60.0, 300.0]
+    assert "Toy" not in text  # of no scene of the page
+    pages = {path.name: path.read_text() for path in (tmp_path / "out").glob("*.md")}
+    assert "Some runs ended by their steps" in pages["particles.md"]
+    assert "20 (ended after 5 min)" in pages["particles.md"]
+    assert "Some runs ended" not in pages["forward.md"]

@@ -37,7 +37,7 @@ SEEDS = strategies.integers(0, 10_000)
 # Why operators have no gradient, and which.
 WITHOUT = {
     "a guard or a switch": "check_shape check_march numba_installed use_numba match_threads warm_up kept_for"
-    " whole has_kernels smaller cores compile_way_back",
+    " whole has_kernels smaller cores compile_way_back is_number",
     "places samples, which no loss pulls at": "march march_reference stratified by_importance clip_to_box",
     "whole numbers, or yes and no": "map_cells unfolded index_of dilate occupied_cells neighbour_pairs"
     " occupied_cells_reference sorted_tiles encoded_size",

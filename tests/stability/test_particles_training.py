@@ -154,7 +154,9 @@ def test_two_threads_train_alike(tmp_path, two_threads):
 @pytest.mark.slow
 @pytest.mark.parametrize("factor", [1e-3, 1e3])
 def test_other_units_train_to_the_same_accuracy(tmp_path, factor):
-    """Runs that differ by rounding alone end up to half a dB apart, as what is split and goes differs."""
+    """Runs that differ by rounding alone end up to half a dB apart, as what is split and goes differs; the
+    first steps are compared tightly above.
+    """
     scene, found = ball_scene(frames=24, size=48), []
     for folder, own in (("plain", scene), ("other", in_other_units(scene, factor))):
         module, _ = fit(tmp_path / folder, own, 1500, numbers=NUMBERS)

@@ -47,8 +47,8 @@ What one types most:
   trainer=cpu|gpu|auto   limits, run: device to compute with; without it the one of the run
   trust=[PACKAGE]        limits, run: code of other packages that a run's config may name
 
-The runs: make accuracy-time [DATA=FOLDER SCENE=NAME MINUTES=N], make price-list DATA=FOLDER,
-make reproduce-tables [DATA=FOLDER], make ablations, make effects. Runs without results are listed at the end.
+The runs: make accuracy-time [DATA=DATASETS SCENE=NAME MINUTES=N], make price-list DATA=DATASETS,
+make reproduce-tables [DATA=DATASETS], make ablations, make effects. Runs without results are listed.
 """
 
 

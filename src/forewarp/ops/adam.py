@@ -19,7 +19,7 @@ def adam_rows(
     made ``value -= rate m / (1 - b1^n) / (sqrt(v / (1 - b2^n)) + eps)``.
 
     Args:
-        value, gradient, mean, square: (..., C), contiguous; a row is of the last axis.
+        value, gradient, mean, square: (..., C); a row is of the last axis. The kernel takes contiguous ones.
         steps: (...,) float32, how many steps each row has made.
         rate, betas, eps: as of Adam.
 

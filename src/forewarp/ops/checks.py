@@ -2,7 +2,15 @@
 
 from __future__ import annotations
 
+import math
+from typing import Any
+
 from torch import Tensor
+
+
+def is_number(value: Any) -> bool:
+    """Return whether a value, as a config may hold any, is a finite number; true and false are none."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def check_shape(name: str, tensor: Tensor, shape: tuple[int | str, ...]) -> None:

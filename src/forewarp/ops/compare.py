@@ -180,5 +180,5 @@ def _way_back(particles, inputs, splats, tiles, picture, background, width, fact
         skin if by_skin else None,
         pull,
         torch.from_numpy(tiles.order),
-        splats[:, 9],
+        splats[: len(particles.means), 9],
     )

@@ -14,6 +14,7 @@ from forewarp.planning.trials import Trial, Trials, gain
 from forewarp.runs.overrides import key_of, merged
 from forewarp.scene.frame import Scene
 from forewarp.scene.pictures import survey
+from forewarp.training.schedule import most_steps
 
 
 class Planner:
@@ -40,8 +41,8 @@ class Planner:
         shares = [stage.share for stage in stages.values()]
         minutes = self.settings.minutes and self.settings.minutes * shares[-1] / sum(shares)
         least = self.settings.least or planning.least
-        each = list(stages.values())[-1].get("steps_per_picture")
-        most = None if each is None else round(each * len(scene.train))
+        steps = config.budget.iterations and config.budget.iterations * shares[-1] / sum(shares)
+        most = most_steps(steps, list(stages.values())[-1].get("steps_per_picture"), len(scene.train))
         self.evidence = planning.evidence(survey(scene), least=least, minutes=minutes, most_steps=most)
 
     def plan(self) -> dict:

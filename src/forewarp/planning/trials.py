@@ -120,7 +120,7 @@ class Trials:
             after: name of the trial whose coarse stage to continue.
             seed: added to the run's seed.
             steps: steps of the stage; None: ``fine_steps``, or fewer if ``fine_seconds`` end first.
-            longer: without ``steps``, how many times as many of both.
+            longer: times ``fine_steps`` and ``fine_seconds``; of no effect where ``steps`` is given.
         """
         if (known := self.made.get(f"{name}-seed{seed}")) is not None:
             return known

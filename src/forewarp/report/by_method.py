@@ -2,14 +2,27 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from statistics import fmean
 
 from forewarp.files import replace_file
+from forewarp.metrics.gain import Estimate
 from forewarp.report import curve
 from forewarp.report.curve import Published, over_seconds
-from forewarp.report.minutes_sections import Group, alike, is_plain, labelled
-from forewarp.report.run_rows import CLOCKS, commands, estimate, length, made_on
+from forewarp.report.minutes_sections import Group, alike, is_plain
+from forewarp.report.run_rows import (
+    CLOCKS,
+    CONDITIONS,
+    commands,
+    ended_early,
+    estimate,
+    key_of,
+    length,
+    made_on,
+    telling,
+)
 from forewarp.report.sheets import figure_of
 from forewarp.report.tables import Column, Table
 
@@ -37,23 +50,22 @@ def write_by_method(
     Returns:
         the files written; none where no scene has that much.
     """
-    plain = [row for rows in tables.values() for row in labelled(rows) if is_plain(row)]
-    written, parts, used = [], [], []
-    for scene in sorted({row["label"] for row in plain}):
-        groups = _comparable([row for row in plain if row["label"] == scene])
-        if not groups:
-            continue
-        used += [row for found in groups.values() for group in found for row in group]
-        beside = [other for other in published if other.dataset == used[-1]["dataset"]]
-        picture = out / f"accuracy-time-{scene}.png"
+    plain = [row | {"label": row["scene"]} for rows in tables.values() for row in rows if is_plain(row)]
+    written, parts, used, shown = [], [], [], []
+    for scene, groups in _compared(plain).items():
+        rows = [row for found in groups.values() for group in found for row in group]
+        beside = [other for other in published if other.dataset == rows[0]["dataset"]]
+        picture = out / f"accuracy-time-{re.sub(r'[^a-zA-Z0-9]+', '-', scene).strip('-')}.png"
         _draw(groups, beside, scene, picture)
         parts += [f"## {scene}\n", f"![PSNR of {scene} against seconds of training]({picture.name})\n"]
         parts += [_table(groups).markdown()]
         written.append(picture)
+        used, shown = used + rows, [*shown, *(other for other in beside if other not in shown)]
     if not written:
         return []
     lines = [
-        f"* {p.name}: {p.psnr:g} dB after {p.seconds:g} s of an {p.hardware} ({p.source})" for p in published
+        f"* {p.name}: {p.psnr:g} dB after {p.seconds:g} s of an {p.hardware} ({p.dataset}; {p.source})"
+        for p in shown
     ]
     parts += ["## Others\n", PUBLISHED, "\n".join(lines) + "\n"] if lines else []
     page = out / "accuracy-time.md"
@@ -62,13 +74,24 @@ def write_by_method(
     return [page, *written]
 
 
-def _comparable(rows: Sequence[dict]) -> dict[str, list[Group]]:
-    """Groups of seeds, shortest first, of the methods that ran for several lengths; none if only one did."""
-    found: dict[str, list[Group]] = {}
-    for group in alike(rows):
-        found.setdefault(group[0]["method"], []).append(group)
-    found = {method: groups for method, groups in found.items() if len(groups) > 1}
-    return found if len(found) > 1 else {}
+def _compared(rows: Sequence[dict]) -> dict[str, dict[str, list[Group]]]:
+    """Groups of seeds, shortest first, by scene and method: of two methods or more that ran for several
+    lengths under the same ``CONDITIONS``. A scene is named with these where its rows differ in them.
+    """
+    tasks: dict[tuple, list[dict]] = {}
+    for row in rows:
+        tasks.setdefault(key_of(row, ("scene", "preset", *CONDITIONS)), []).append(row)
+    found = {}
+    for own in tasks.values():
+        lengths: dict[str, list[Group]] = {}
+        for group in alike(own):
+            lengths.setdefault(group[0]["method"], []).append(group)
+        lengths = {method: groups for method, groups in lengths.items() if len(groups) > 1}
+        if len(lengths) > 1:
+            others = [row for row in rows if row["scene"] == own[0]["scene"]]
+            name = ", ".join([own[0]["scene"], *telling(own[0], others, ("preset", *CONDITIONS))])
+            found[name] = lengths
+    return dict(sorted(found.items()))
 
 
 def _table(groups: Mapping[str, Sequence[Group]]) -> Table:
@@ -77,8 +100,8 @@ def _table(groups: Mapping[str, Sequence[Group]]) -> Table:
     best = max(groups, key=lambda method: max(estimate(group, "psnr").mean for group in groups[method]))
     lines = []
     for method, found in groups.items():
-        cells = {group[0]["minutes"]: estimate(group, "psnr") for group in found}
-        most = max(cell.mean for cell in cells.values())
+        cells = {group[0]["minutes"]: _cell(group) for group in found}
+        most = max(estimate(group, "psnr").mean for group in found)
         passed = [g[0]["minutes"] for g in groups[best] if estimate(g, "psnr").mean > most]
         seeds = ", ".join(str(len(group)) for group in found)
         lines.append([f"`{method}`", *map(cells.get, lengths), seeds, length(passed[0]) if passed else None])
@@ -86,16 +109,27 @@ def _table(groups: Mapping[str, Sequence[Group]]) -> Table:
     return Table([*columns, Column("seeds"), Column(f"passed by `{best}` after")], lines)
 
 
+def _cell(group: Group) -> Estimate | str:
+    """A group's PSNR, with a word where its runs ended before their minutes."""
+    found, early = estimate(group, "psnr"), ended_early(group)
+    return found if early is None else f"{Column('').text(found)} (ended after {length(early)})"
+
+
+def _seconds(rows: Group) -> float:
+    """The mean seconds that runs took, by the clock that their minutes are of."""
+    return fmean(row[row["clock"]] or 60 * row["minutes"] for row in rows)
+
+
 def _draw(groups: Mapping[str, Sequence[Group]], beside: Sequence[Published], title: str, path: Path) -> None:
     """Draw a point a run and a line a method over seconds of training."""
     figure, ((axis,),) = figure_of(1, 1, (7, 4.5))
-    seconds = [60 * group[0]["minutes"] for found in groups.values() for group in found]
+    seconds = [_seconds(group) for found in groups.values() for group in found]
     seconds += [other.seconds for other in beside]
     over_seconds(axis, "PSNR of test views (dB)", wide=max(seconds) > 1000 * min(seconds))
     for number, (method, found) in enumerate(groups.items()):
-        means = [(60 * group[0]["minutes"], estimate(group, "psnr").mean) for group in found]
+        means = [(_seconds(group), estimate(group, "psnr").mean) for group in found]
         axis.plot(*zip(*means), color=f"C{number}", linewidth=2, label=method)
-        runs = [(60 * row["minutes"], row["psnr"]) for group in found for row in group]
+        runs = [(_seconds([row]), row["psnr"]) for group in found for row in group]
         axis.plot(*zip(*runs), "o", color=f"C{number}", markersize=3.5)
     for number, other in enumerate(beside, len(groups)):
         label = f"{other.name} (published, {other.hardware})"

@@ -134,7 +134,7 @@ def _by_minutes(rows: Sequence[dict]) -> Table:
         lines += [[f"mean of {dataset}", *means]] if len(own) > 1 else []
     columns = [Column("scene"), *(Column(length(m)) for m in minutes)]
     early = any(ended_early(group) is not None for group in alike(rows))
-    about = " Some runs ended before their minutes, by their steps for each picture: see *Each*." * early
+    about = " Some runs ended by their steps, before their minutes: see *Each*." * early
     return Table(columns, lines, caption="PSNR (dB) of test views." + about)
 
 

@@ -29,11 +29,11 @@ def minutes_of(group: Group) -> str:
     """The minutes of a group's runs; where they ended earlier, after how many.
 
     >>> minutes_of([{"clock": "wall", "wall": 301.0, "minutes": 20.0}])
-    '20 (ended after 5.0)'
+    '20 (ended after 5 min)'
     """
     early = ended_early(group)
     return length(group[0]["minutes"]).removesuffix(" min") + (
-        "" if early is None else f" (ended after {early:.1f})"
+        "" if early is None else f" (ended after {length(early)})"
     )
 
 
@@ -64,8 +64,8 @@ def labelled(rows: Sequence[dict]) -> list[dict]:
 def more_minutes(rows: Sequence[dict]) -> list[str]:
     """The section on whether more minutes make it worse; none where each scene has one number of minutes."""
     about = (
-        "Means over the seeds. More minutes hold if PSNR is at most 0.2 dB below that of fewer. Captures of "
-        "few pictures end after so many steps for each of them; more minutes then change nothing.\n"
+        f"Means over the seeds. More minutes hold if PSNR is at most {NOISE} dB below that of fewer. Where "
+        "runs ended by their steps (in brackets), more minutes change nothing.\n"
     )
     lines = _steps(
         [row for row in rows if is_plain(row)],
@@ -81,7 +81,7 @@ def more_density(rows: Sequence[dict]) -> list[str]:
     """The section of runs that differ in density; none without such runs."""
     about = (
         "Runs that differ in density alone (empty: the preset's own), fewest first; means over "
-        "the seeds. More hold if PSNR is at most 0.2 dB below that of fewer.\n"
+        f"the seeds. More hold if PSNR is at most {NOISE} dB below that of fewer.\n"
     )
     lines = _steps(
         [row for row in rows if row["size"] and not _REDUCED.search(row["pictures"] or "")],

@@ -225,7 +225,7 @@ def length(minutes: float) -> str:
     >>> length(1 / 30), length(1.0), length(2.5)
     ('2 s', '1 min', '2.5 min')
     """
-    return f"{60 * minutes:.0f} s" if minutes < 1 else f"{minutes:g} min"
+    return f"{60 * minutes:.0f} s" if minutes < 1 else f"{round(minutes, 1):g} min"
 
 
 def estimate(rows: Sequence[dict], name: str) -> Estimate | None:

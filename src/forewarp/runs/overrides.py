@@ -40,6 +40,7 @@ RENAMED = (
     (r"(preset|model\.radiance|model\.background)\.skip_alpha(=.*)?", r"\1.alpha_threshold\2", SINCE_3),
     (r"model\.renderer\.opaque(=.*)?", r"model.renderer.early_stop_eps\1", SINCE_3),
     (r"(objective(?:\.\w+)?\.weights)\.still_points(=.*)?", r"\1.static_points\2", SINCE_3),
+    (r"(stage\.[\w-]+)\.passes(=.*)?", r"\1.steps_per_picture\2", SINCE_3),
     (r"model/view(=.*)?", r"model/view_dependence\1", SINCE_3),
     (r"model\.view([.=].*)?", r"model.view_dependence\1", SINCE_3),
     (

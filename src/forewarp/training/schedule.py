@@ -11,6 +11,7 @@ from typing import Any
 import torch
 
 from forewarp.methods.method import Model
+from forewarp.ops.checks import is_number
 from forewarp.training.objective import Objective
 
 _ENDS = 0.05  # of all time, at its beginning and at its end
@@ -25,7 +26,7 @@ class StageSettings:
         lr: learning rate of each of the method's ``param_groups``.
         iterations: steps; None if only minutes bound the stage.
         minutes: training minutes; None if only iterations bound it. With both, the stage ends at the first.
-        steps_per_picture: times the training pictures, the most steps of the stage; None: no such end.
+        steps_per_picture: the stage ends after so many steps for each training picture; None: no such end.
         lr_hold: keep the learning rates constant up to this fraction, then let them fall exponentially; one
             number, or one by group, where a group left out is not held.
         lr_final_factor: the learning rates end at this multiple of their initial values; one number, or one
@@ -63,7 +64,7 @@ class StageSettings:
             )
         for key in ("iterations", "minutes", "steps_per_picture"):
             value = getattr(self, key)
-            if value is not None and not (_is_number(value) and value > 0):
+            if value is not None and not (is_number(value) and value > 0):
                 raise ValueError(f"{where}.{key}: expected a number > 0, or null, but got {value!r}")
         self._check_rates(where)
 
@@ -81,7 +82,7 @@ class StageSettings:
                     raise ValueError(
                         f"{where}.{key}: expected groups of {', '.join(self.lr)}, but got '{group}'"
                     )
-                if not (_is_number(value) and low <= value <= high):
+                if not (is_number(value) and low <= value <= high):
                     at = key if group is None else f"{key}.{group}"
                     raise ValueError(f"{where}.{at}: expected {what}, but got {value!r}")
 
@@ -93,10 +94,7 @@ class StageSettings:
 
     def over(self, pictures: int) -> StageSettings:
         """Return the settings whose ``iterations`` also keep ``steps_per_picture``."""
-        if self.steps_per_picture is None:
-            return self
-        most = max(1, round(self.steps_per_picture * pictures))
-        return replace(self, iterations=most if self.iterations is None else min(most, self.iterations))
+        return replace(self, iterations=most_steps(self.iterations, self.steps_per_picture, pictures))
 
     def lr_factor(self, fraction: float, group: str) -> float:
         """Return what the learning rate of a group is multiplied by at ``fraction`` of the stage."""
@@ -115,8 +113,15 @@ class StageSettings:
         return min(1.0, done)
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+def most_steps(iterations: float | None, steps_per_picture: float | None, pictures: int) -> int | None:
+    """Return the steps after which a stage ends, whatever its minutes; None if they alone end it.
+
+    >>> most_steps(None, 1.5, 10), most_steps(12, 1.5, 10), most_steps(None, None, 10)
+    (15, 12, None)
+    """
+    per_picture = None if steps_per_picture is None else steps_per_picture * pictures
+    known = [max(1, round(bound)) for bound in (iterations, per_picture) if bound is not None]
+    return min(known, default=None)
 
 
 def _of(given: float | Mapping[str, float], group: str, otherwise: float) -> float:
@@ -189,7 +194,9 @@ def share_out(
 
 
 def seconds_after(stages: Sequence[Stage], name: str) -> float | None:
-    """Return how many seconds the stages after ``name`` will take; None if more than minutes bounds them."""
+    """Return how many seconds the stages after ``name`` take at most; None if minutes do not bound them, or
+    steps for each picture may end them much earlier.
+    """
     names = [stage.settings.name for stage in stages]
     later = [stage.settings for stage in stages[names.index(name) + 1 :]]
     if any(one.minutes is None or one.steps_per_picture is not None for one in later):

@@ -136,11 +136,11 @@ def test_another_seed_is_tried_where_it_may_decide():
         assert evidence.hopeless(effect) is hopeless
 
 
-def test_without_trials_silhouettes_decide_on_motion_and_all_that_nodes_do():
-    for disagreement, cut_out, moves in ((0.2, 0.8, True), (0.0, 0.8, False), (0.0, 0.0, True)):
+def test_without_trials_silhouettes_decide_on_motion_and_what_nodes_do():
+    every, none = ["motion", "rotation", "background"], []
+    for disagreement, cut_out, nodes in ((0.2, 0.8, every), (0.0, 0.8, none), (0.0, 0.0, every[:2])):
         pictures = replace(PICTURES, disagreement=disagreement, cut_out=cut_out)
         begin, drops = walk(pictures, asked(trials=False), {})
         assert drops == []
         found = decided(pictures, asked(trials=False))
-        nodes = ["motion", "rotation", "background"] if moves else []
         assert [name for name in NAMES if found[name].on] == nodes

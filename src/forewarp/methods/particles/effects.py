@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 from forewarp.fields.curves import KINDS
+from forewarp.ops.checks import is_number
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,7 @@ class Effects:
             ("view_dependence", "a degree of 1 to 3", lambda choice: _is_whole(choice) and choice <= 3),
             ("color_over_time", "a number of cosines >= 1", _is_whole),
             ("opacity_over_time", "a number of cosines >= 1", _is_whole),
-            ("background", "a number > 0", lambda choice: _is_number(choice) and choice > 0),
+            ("background", "a number > 0", lambda choice: is_number(choice) and choice > 0),
         ):
             choice = getattr(self, name)
             if choice is not None and not good(choice):
@@ -57,10 +58,6 @@ class Effects:
 
 
 NAMES = tuple(field.name for field in fields(Effects))
-
-
-def _is_number(choice) -> bool:
-    return isinstance(choice, int | float) and not isinstance(choice, bool) and math.isfinite(choice)
 
 
 def _is_whole(choice) -> bool:

@@ -118,13 +118,15 @@ class ParticlesPlanning:
         return list(found.values())
 
     def _called(self, name: str, evidence: Evidence) -> bool:
-        """Return what the trials say; without trials, nodes with all they do, where silhouettes allow it."""
+        """Return what the trials say. Without trials nodes move and turn unless silhouettes deny it, and come
+        to rest where pictures are cut out.
+        """
         pays = evidence.pays(name)
         if pays is not None:
             return pays
-        pictures = evidence.pictures
-        moves = pictures.cut_out < CUT_OUT or pictures.disagreement > DISAGREEMENT
-        return moves and name in ("motion", *OF_NODES)
+        cut_out = evidence.pictures.cut_out >= CUT_OUT
+        moves = not cut_out or evidence.pictures.disagreement > DISAGREEMENT
+        return moves and (name in ("motion", "rotation") or (name == "background" and cut_out))
 
 
 def order(pictures: Pictures) -> list[str]:

@@ -28,8 +28,8 @@ def pixel_width(covered: float) -> float:
 
 @torch.no_grad()
 def come_to_rest(method: Method, least: float) -> None:
-    """Stop the nodes that stay within ``least`` (world units) of their mean place, and take with them by
-    turning nothing farther; let go of them the particles that follow no others.
+    """Stop each node that stays within ``least`` (world units) of its mean place, with what its turning moves
+    beside it counted in; particles that follow only stopped nodes stop, too.
 
     Such a particle is put where it was on average, turned as it was on average, and its shares of nodes
     become 0: it costs no motion any more. A stopped node stays where it was on average, too, as others may

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from forewarp.methods.particles.effects import NAMES
+from forewarp.ops.checks import is_number
 
 _VIEWS = 100  # pictures from which on more of them call for no more particles
 
@@ -82,10 +83,7 @@ class Numbers:
         ):
             for key in keys:
                 value = getattr(self, key)
-                known = (
-                    isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-                )
-                if not (known and good(value)):
+                if not (is_number(value) and good(value)):
                     raise ValueError(f"{where}.{key}: expected {what}, but got {value!r}")
 
     def most(self, covered: float, views: int) -> int:
