@@ -27,7 +27,8 @@ COMMANDS = ("train", "plan", "evaluate", "render", "view", "export", "report", "
 NOWHERE = ["data=dnerf", "data.root=nowhere", "data.scene=x"]
 REFUSED = [
     (["train", "data.scence=x"], "did you mean data.scene?"),
-    (["train", "--unknown"], "unrecognized arguments: --unknown"),
+    (["train", "--unknown"], "--unknown: expected options without dashes; type unknown=VALUE"),
+    (["train", "--experiment", "dnerf"], "without dashes; type experiment=dnerf"),
     (["train", "sweeps=nothing"], "Could not find 'sweeps/nothing'"),
     (["train", "data=dnerf"], "data.scene: expected a value, but got none"),
     (["train", *NOWHERE], "data.root: expected an existing folder"),

@@ -31,10 +31,19 @@ def test_a_turn_starts_at_the_view_and_stops_before_it_comes_again(cameras, path
     assert float((centers - middle).norm(dim=-1).min()) > 1
 
 
+def test_a_swing_stays_between_the_cameras_while_time_passes(cameras):
+    shots = make_shots("swing", 5, 0.5, cameras[3], cameras[:7])
+    assert [time for _, time in shots] == [0, 0.25, 0.5, 0.75, 1]
+    torch.testing.assert_close(shots[0][0].center, cameras[3].center)
+
+
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
-        (("spiral", 4, 0.5), "path: expected one of fixed, orbit, both, trajectories, but got 'spiral'"),
+        (
+            ("spiral", 4, 0.5),
+            "path: expected one of fixed, swing, orbit, both, trajectories, but got 'spiral'",
+        ),
         (("fixed", 1, 0.5), "frames: expected at least 2, but got 1"),
         (("orbit", 4, 1.5), r"time: expected a number in \[0, 1\], but got 1.5"),
     ],

@@ -401,7 +401,10 @@ def test_a_synthetic_scene_that_is_gone_is_not_made_again(ok, run, tmp_path):
         (["run=several"], "but got several, which holds 2; choose one: several/ball/base-1.0-seed0, "),
         (["run=a", "megabytes=0.1"], "megabytes: expected a number from 0.3 to 1000, but got 0.1"),
         (["run=a", "render=some"], "render: expected true or false, but got some"),
-        (["run=a", "path=spiral"], "path: expected one of both, trajectories, fixed, orbit or null, but got"),
+        (
+            ["run=a", "path=spiral"],
+            "path: expected one of both, trajectories, swing, fixed, orbit or null, but got",
+        ),
     ],
 )
 def test_mistakes_end_in_one_line(refused, in_tmp, arguments, line):

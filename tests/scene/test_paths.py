@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from forewarp.scene.camera import Camera, look_at
-from forewarp.scene.paths import RandomPatches, focus_point, mean_up, orbit
+from forewarp.scene.paths import RandomPatches, focus_point, mean_up, orbit, swing
 from tests.support.tiny_scene import camera_at
 
 Z = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
@@ -98,3 +98,21 @@ def test_orbit_circles_at_the_same_height_and_distance():
         assert pixel[0].tolist() == pytest.approx([12, 12])
         assert depth > 0
     torch.testing.assert_close(views[2].center[:2], -start.center[:2])
+
+
+def test_a_swing_goes_as_far_as_cameras_stand_to_both_sides_and_comes_back():
+    focus = torch.tensor([0.5, 0.0, 0.0], dtype=torch.float64)
+
+    def around(degrees):
+        angle = torch.deg2rad(torch.tensor(float(degrees)))
+        return at([0.5 + 4 * angle.cos().item(), 4 * angle.sin().item(), 1.0], focus.tolist())
+
+    cameras = [around(degrees) for degrees in range(-20, 61)]
+    path = swing(around(10), cameras, focus, Z, torch.arange(400, dtype=torch.float64) / 400)
+    places = torch.stack([camera.center.double() for camera in path]) - focus
+    angles = torch.rad2deg(torch.atan2(places[:, 1], places[:, 0]))
+    assert [angles[i].item() for i in (0, 200)] == pytest.approx([10, 10], abs=1e-3)
+    assert [angles.min().item(), angles.max().item()] == pytest.approx([-16, 56], abs=0.01)  # of 95 %
+    torch.testing.assert_close(places[:, 2], torch.ones(400).double())
+    alone = swing(around(10), [around(10)], focus, Z, torch.linspace(0, 1, 5).double())
+    assert all(torch.allclose(camera.center, around(10).center) for camera in alone)

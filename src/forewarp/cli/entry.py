@@ -14,7 +14,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from forewarp.cli.errors import flat, one_line
-from forewarp.cli.misspelt import renamed_key, unknown_key, with_run_key
+from forewarp.cli.misspelt import refuse_dashes, renamed_key, unknown_key, with_run_key
 from forewarp.runs.config_files import configurations, project_root
 from forewarp.runs.overrides import key_of, refuse_renamed
 
@@ -63,6 +63,7 @@ def command(name: str, task: Callable, text: str, *, config: str | None = None) 
 def _arguments(name: str) -> list[str]:
     """Return the command line as Hydra takes it: a bare folder has its key, a plan is its overrides."""
     arguments = with_run_key(name, sys.argv[1:])
+    refuse_dashes(arguments)
     if any(argument.startswith("plan=") for argument in arguments):
         from forewarp.planning.plan_file import with_plan
 

@@ -12,6 +12,9 @@ from forewarp.runs.config_files import configurations
 from forewarp.runs.overrides import key_of, refuse_renamed
 
 OF_METHODS = ("model", "modules", "objective", "preset", "stage")  # what methods have keys of their own in
+# Hydra's own, which begin with dashes.
+OPTIONS = "help hydra-help version cfg resolve package run multirun shell-completion config-path config-name"
+OPTIONS = (*OPTIONS.split(), "config-dir", "experimental-rerun", "info")
 FOLDERS = {"evaluate": "run", "render": "run", "view": "run", "export": "run", "train": "resume"}
 
 
@@ -28,6 +31,20 @@ def with_run_key(name: str, arguments: list[str]) -> list[str]:
         for i, one in enumerate(arguments)
     ]
     return [f"{key}={one}" if is_bare else one for is_bare, one in zip(bare, arguments)]
+
+
+def refuse_dashes(arguments: list[str]) -> None:
+    """Refuse what is typed as other programs have it, ``--experiment dnerf``; Hydra's own options pass.
+
+    Raises:
+        ValueError: with the way to type it.
+    """
+    for at, argument in enumerate(arguments):
+        key, _, value = argument.removeprefix("--").partition("=")
+        if argument.startswith("--") and key not in OPTIONS:
+            follows = arguments[at + 1] if not value and at + 1 < len(arguments) else ""
+            typed = f"{key}={value or ('' if '=' in follows or follows[:1] == '-' else follows) or 'VALUE'}"
+            raise ValueError(f"{argument}: expected options without dashes; type {typed}")
 
 
 def renamed_key(error: Exception) -> str | None:

@@ -12,11 +12,13 @@ HELP = """
 forewarp-render makes a video of a finished run, into its videos/.
 
   forewarp-render run=runs/vehicle/particles-demo-seed0 path=both
+  forewarp-render run=runs/hand/particles-fast-seed0 path=swing      a capture, filmed from one side
   forewarp-render run=FOLDER path=trajectories format=gif size=300
 
 What one types most:
   run=FOLDER                    the run (needed)
-  path=fixed                    one camera, through time
+  path=fixed                    one camera, through time; what you get without path=
+  path=swing                    to and fro while time passes, as far as the training cameras stand
   path=orbit time=0.5           once around, at one time
   path=both                     once around while time passes
   path=trajectories             as fixed, with the trajectories of points on the moving surface drawn over it
@@ -39,6 +41,11 @@ def render(config) -> None:
     # These load torch; mistakes have been answered before.
     from forewarp.runs.fitted import opened
 
+    if config.path in ("orbit", "both") and saved.get("capture") != "cut_out":
+        print(
+            f"path={config.path} goes all around, also to where no camera of a capture from one side has "
+            "looked; path=swing stays between the training cameras"
+        )
     print(f"written: {write_film(config, *opened(saved))}")
 
 

@@ -42,7 +42,7 @@ What one types most:
   run=FOLDER             run: the run; its page is <run>/page.html, or out=FILE.html
   megabytes=N            run: most of the page; pictures and the video are made smaller to fit
   render=false           run: show only what the folder has; load no method and no data; for slow methods
-  path=both|trajectories|fixed|orbit   run: which video, as in forewarp-render
+  path=both|trajectories|swing|fixed|orbit   run: which video, as in forewarp-render
   data.root=FOLDER       limits, run: where the data are now, if they moved
   trainer=cpu|gpu|auto   limits, run: device to compute with; without it the one of the run
   trust=[PACKAGE]        limits, run: code of other packages that a run's config may name
@@ -90,7 +90,9 @@ def _table(config, folders: list[str]) -> str:
         from forewarp.report.compare import compare, draw_compared
 
         drawn = draw_compared(folders, Path(config.out)) if config.out else None
-        return compare(folders).plain() + (f"\nwritten: {drawn}" if drawn else "")
+        none = "no picture: the runs share no test view with a sheet; type views= and sheets= alike"
+        about = f"written: {drawn}" if drawn else none
+        return compare(folders).plain() + (f"\n{about}" if config.out else "")
     if type(config.views) is not int or config.views < 1:
         raise ValueError(f"views: expected a whole number > 0, but got {config.views}")
     from forewarp.runs.config import saved_config

@@ -20,6 +20,7 @@ MOST_SIDE = 800  # pixels of a picture's longer side
 FILMS = {
     "both": "once around the scene while its time passes",
     "trajectories": "one camera, with the paths of points on the moving surface",
+    "swing": "to and fro between the training cameras while the scene's time passes",
     "fixed": "one camera, through the scene's time",
     "orbit": "once around the scene at one time",
 }
@@ -119,7 +120,7 @@ def rendered(config: DictConfig, story: Story, media) -> Iterator:
         yield replace(media, missing=("No video: the scene has no test view to begin it from.",))
         return
     film = OmegaConf.load(project_root() / "conf" / "render.yaml")
-    film.path = config.path or ("both" if story.result.config.get("capture") == "cut_out" else "fixed")
+    film.path = config.path or ("both" if story.result.config.get("capture") == "cut_out" else "swing")
     check(film)
     yield replace(media, video=write_film(film, run, module), about=FILMS[film.path])
 

@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 
 from forewarp.scene.camera import Camera
-from forewarp.scene.paths import focus_point, mean_up, orbit
+from forewarp.scene.paths import focus_point, mean_up, orbit, swing
 from forewarp.scene.view import Moment, Rendering, View
 from forewarp.training.module import DynamicSceneModule
 
-PATHS = ("fixed", "orbit", "both", "trajectories")
+PATHS = ("fixed", "swing", "orbit", "both", "trajectories")
 
 Shot = tuple[Camera, float]  # camera and time
 Paint = Callable[[Tensor, Rendering, Camera, float], Tensor]
@@ -22,7 +22,8 @@ def make_shots(path: str, frames: int, time: float, camera: Camera, cameras: Seq
     """Return camera and time of each frame of a video.
 
     Args:
-        path: ``fixed`` and ``trajectories`` go through time, ``orbit`` once around at ``time``; ``both``.
+        path: ``fixed`` and ``trajectories`` go through time, ``orbit`` once around at ``time``, ``both`` once
+            around while time passes, ``swing`` to and fro meanwhile, as far as the training cameras stand.
         frames: number of frames.
         time: the time of ``orbit``, in [0, 1].
         camera: camera of the first frame.
@@ -38,10 +39,11 @@ def make_shots(path: str, frames: int, time: float, camera: Camera, cameras: Seq
     if not 0 <= time <= 1:
         raise ValueError(f"time: expected a number in [0, 1], but got {time}")
     views, times = [camera] * frames, torch.linspace(0, 1, frames).tolist()
-    if path in ("orbit", "both"):
+    if path in ("orbit", "both", "swing"):
         # Leave out the full turn, which repeats the first frame, so that the video loops smoothly.
-        turns = torch.arange(frames, dtype=torch.float64) / frames
-        views = orbit(camera, focus_point(list(cameras)), mean_up(list(cameras)), turns)
+        turns, known = torch.arange(frames, dtype=torch.float64) / frames, list(cameras)
+        about = focus_point(known), mean_up(known)
+        views = swing(camera, known, *about, turns) if path == "swing" else orbit(camera, *about, turns)
     return list(zip(views, [time] * frames if path == "orbit" else times))
 
 

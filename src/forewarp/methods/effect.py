@@ -131,7 +131,13 @@ class Evidence:
         if gain is None:
             return ""
         price = self.price(gain)
-        return f"; {gain}" + (f", whose steps are worth {price:.2f} dB" if price >= 0.005 else "")
+        return f"; {gain}, {self.asked_of(effect)}" + (
+            f", whose steps are worth {price:.2f} dB" if price >= 0.005 else ""
+        )
+
+    def asked_of(self, effect: str) -> str:
+        """Say what an effect's gain must exceed beside its price."""
+        return f"more than {max(self.gains[effect].noise, self.bound(effect)):.2f} asked"
 
 
 @dataclass(frozen=True)

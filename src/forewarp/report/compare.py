@@ -24,8 +24,8 @@ _KEYS = ("protocol", "seconds", "test")
 def compare(folders: Sequence[Path]) -> Table:
     """Make a table with a row for each measure and a column for each run.
 
-    PSNR is that of the test views, in dB; for two runs a column with the difference is added. Conditions in
-    which the runs differ come last.
+    PSNR is that of the test views, in dB; for two runs a column with the difference is added, which is empty
+    where they are of different views. Conditions in which the runs differ come last.
 
     Args:
         folders: folders of measured runs.
@@ -38,7 +38,8 @@ def compare(folders: Sequence[Path]) -> Table:
     metrics = [read_metrics(Path(folder)) for folder in folders]
     rows = []
     for ability, name in _ABILITIES.items():
-        _add(rows, name, [found["test"].get(ability, {}).get("psnr") for found in metrics], 2)
+        values = [found["test"].get(ability, {}).get("psnr") for found in metrics]
+        _add(rows, name, values, 2, with_difference=len(set(_told(metrics, "measured"))) == 1)
     shares = [_flow_share(found) for found in metrics]
     _add(rows, "moving points' error, % of motion", [share and 100 * share for share in shares], 0)
     steps = [sum((found.get("steps") or {}).values()) or None for found in metrics]
@@ -49,7 +50,7 @@ def compare(folders: Sequence[Path]) -> Table:
     ):
         _add(rows, about, [found["seconds"].get(key) for found in metrics], digits, with_difference=False)
     for key, about in _CONDITIONS.items():
-        told = [str(found["protocol"].get(key) or "none named") for found in metrics]
+        told = _told(metrics, key)
         if len(set(told)) > 1:
             rows.append([about, *told, *[None] * (len(folders) == 2)])
     columns = ["PSNR (dB) of test views", *names_of(folders, metrics)]
@@ -65,6 +66,13 @@ def draw_compared(folders: Sequence[Path], out: Path) -> Path | None:
     names = names_of(folders, [read_metrics(Path(folder)) for folder in folders])
     runs = {name: Path(folder) for name, folder in zip(names, folders)}
     return draw_beside(out / "compare.png", runs, 0.5, "test view")
+
+
+def _told(metrics: Sequence[dict], key: str) -> list[str]:
+    """A condition of each run, in words; runs that name no test views were measured on all."""
+    unnamed = "all" if key == "measured" else "none named"
+    told = [str(found["protocol"].get(key) or unnamed) for found in metrics]
+    return ["all" if key == "measured" and one.startswith("all ") else one for one in told]
 
 
 def _add(rows: list, name: str, values: list, digits: int, *, with_difference: bool = True) -> None:

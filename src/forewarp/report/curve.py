@@ -132,7 +132,7 @@ def _axes(with_flow: bool, wide: bool = False):
     # Without pyplot, which keeps global state and looks for a display.
     figure = Figure(figsize=(7, 7.5 if with_flow else 4.5), layout="constrained")
     axes = figure.subplots(2 if with_flow else 1, 1, squeeze=False)[:, 0]
-    labels = ("PSNR of held-out views (dB)", "error of moving points (world units)")
+    labels = ("PSNR of views not trained on (dB)", "error of moving points (world units)")
     for axis, label in zip(axes, labels):
         over_seconds(axis, label, wide)
     return figure, axes

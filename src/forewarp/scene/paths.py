@@ -91,3 +91,23 @@ def orbit(camera: Camera, focus: Tensor, up: Tensor, turns: Tensor) -> list[Came
         angle = 2 * math.pi * turn
         views.append(_moved(camera, focus + height + math.cos(angle) * a + math.sin(angle) * b, focus, up))
     return views
+
+
+def swing(camera: Camera, cameras: list[Camera], focus: Tensor, up: Tensor, shares: Tensor) -> list[Camera]:
+    """Make cameras that go to and fro about ``up``, as far as ``cameras`` stand to both sides of ``camera``.
+
+    The outermost twentieth of them on either side does not count.
+
+    Args:
+        camera: gives the first pose and the lens.
+        cameras: that have seen the scene.
+        focus, up: (3,).
+        shares: (N,) of the way in [0, 1]: to one side, to the other, and back.
+    """
+    first = camera.center.double() - focus
+    across = torch.linalg.cross(up, first)
+    places = torch.stack([one.center.double() - focus for one in cameras])
+    turns = torch.atan2(places @ across, places @ first - (places @ up) * (first @ up)) / (2 * math.pi)
+    low, high = torch.quantile(turns, torch.tensor([0.05, 0.95], dtype=turns.dtype)).tolist()
+    wave = torch.sin(2 * math.pi * shares)
+    return orbit(camera, focus, up, torch.where(wave > 0, max(high, 0.0) * wave, max(-low, 0.0) * wave))

@@ -97,7 +97,7 @@ def test_an_effect_stays_if_it_is_missed_beyond_noise(gain, on):
     found = decided(PICTURES, asked(), motion=YES, color_over_time=gain)["color_over_time"]
     assert (found.on, found.choice) == (on, "cosines" if on else "none")
     assert found.overrides == (f"model/color_over_time={found.choice}",)
-    assert found.because == str(gain)
+    assert found.because == f"{gain}, more than {max(gain.noise, 0.6):.2f} asked"
 
 
 @pytest.mark.parametrize(
@@ -111,7 +111,7 @@ def test_the_background_is_found_by_what_rests_and_left_out_where_it_costs_accur
     gain = Gain(gain, 0.1, 1.0, 1000)
     found = decided(PICTURES, asked(), at_rest, motion=YES, background=gain)["background"]
     assert (found.on, found.choice) == (on, "still" if on else "none")
-    assert found.because == f"{at_rest:.1%} at rest; {gain}"
+    assert found.because == f"{at_rest:.1%} at rest, 10% asked; {gain}, -0.2 or more asked"
 
 
 @pytest.mark.parametrize(("gain", "on"), [(0.5, True), (0.4, False)])

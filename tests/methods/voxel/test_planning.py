@@ -38,7 +38,7 @@ def test_one_time_needs_no_trial_to_stand_still():
 def test_a_trial_decides_and_is_named(gain, choice):
     found = decisions.of_motion(with_gains(motion=gain), "dct")
     assert found.choice == choice
-    assert found.because.endswith(f"; {gain}")
+    assert found.because.endswith(f"; {gain}, more than {max(gain.noise, 0.1):.2f} asked")
     assert "20.0% of the foreground" in found.because
     assert "40% of the solid voxels move, by 0.3" in found.because
 
@@ -86,7 +86,8 @@ def test_bases_follow_the_spectrum_or_the_trial():
     assert decisions.of_bases(evidence(), 4, 8).choice == "4"
     tried = decisions.of_bases(with_gains(bases=NO), 4, 8)
     assert (tried.choice, tried.on) == ("4", False)
-    assert tried.because == f"2 of 4 cosines leave out no more than 0.5 voxels; 8 of them against 4: {NO}"
+    why = "2 of 4 cosines leave out no more than 0.5 voxels; 8 of them against 4: "
+    assert tried.because == f"{why}{NO}, more than 0.20 asked"
     assert decisions.of_bases(with_gains(bases=YES), 4, 8).choice == "8"
 
 

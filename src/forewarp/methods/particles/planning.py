@@ -55,11 +55,13 @@ class ParticlesEvidence(Evidence):
     def of_trial(self, effect: str) -> str:
         """Describe an effect's trial; the background: how much came to rest, too."""
         told = super().of_trial(effect)
-        return (
-            f"; {self.at_rest.get(effect, 0.0):.1%} at rest{told}"
-            if told and effect == "background"
-            else told
-        )
+        if not told or effect != "background":
+            return told
+        return f"; {self.at_rest.get(effect, 0.0):.1%} at rest, {AT_REST:.0%} asked{told}"
+
+    def asked_of(self, effect: str) -> str:
+        """See ``Evidence``; the background may cost a little."""
+        return f"{-HARM} or more asked" if effect == "background" else super().asked_of(effect)
 
 
 class ParticlesPlanning:
@@ -168,7 +170,7 @@ def _because(name: str, evidence: Evidence) -> str:
         return evidence.of_trial(name)[2:] or f"{pictures.times} times, and no trial"
     why = f"{pictures.times} times"
     if pictures.cut_out >= CUT_OUT:
-        why += f"; silhouettes: no static shape explains {pictures.disagreement:.1%} of the foreground"
+        why += f"; silhouettes: a static shape explains all but {pictures.disagreement:.1%} of the foreground"
     return why + evidence.of_trial(name)
 
 

@@ -43,7 +43,7 @@ def of_motion(evidence: VoxelEvidence, on: str) -> Decision:
     if times < 2:
         return Decision("motion", "none", ("model/motion=none",), "1 time: nothing can be seen to move")
     share = moved.moving if moved is not None else 0.0
-    why = f"{times} times; silhouettes: no static shape explains {seen:.1%} of the foreground"
+    why = f"{times} times; silhouettes: a static shape explains all but {seen:.1%} of the foreground"
     why = why if evidence.pictures.cut_out >= CUT_OUT else f"{times} times"
     why += f"; {share:.0%} of the solid voxels move" + (f", by {moved.distance:.2g}" if share else "")
     pays = evidence.pays("motion")
