@@ -30,6 +30,7 @@ def test_methods_are_compared_over_lengths(tmp_path):
     measured(runs, "particles", 1 / 30, 20.0, 22.0)
     measured(runs, "particles", 1.0, 30.0)
     measured(runs, "particles", 5.0, 33.0)
+    measured(runs, "forward", 1 / 30, 19.0)
     measured(runs, "forward", 1.0, 24.0)
     measured(runs, "forward", 5.0, 29.5)
     page, files = page_of(tmp_path, published=[OTHER])
@@ -37,16 +38,16 @@ def test_methods_are_compared_over_lengths(tmp_path):
     head, own = rows_of(text, "method")[0], rows_of(text, "`particles`")[0]
     assert head == ["method", "2 s", "1 min", "5 min", "seeds", "passed by `particles` after"]
     assert own == ["`particles`", "21.00 ± 1.41", "30.00", "33.00", "2, 1, 1", ""]
-    assert rows_of(text, "`forward`")[0] == ["`forward`", "", "24.00", "29.50", "1, 1", "1 min"]
+    assert rows_of(text, "`forward`")[0] == ["`forward`", "19.00", "24.00", "29.50", "1, 1, 1", "1 min"]
     assert "* Other: 31 dB after 600 s of an RTX 1 (dnerf; its paper)" in text
     assert iio.imread(files["accuracy-time-ball.png"]).ndim == 3
     assert "accuracy-time-ball.png" in text
 
 
 @pytest.mark.parametrize(
-    "lengths", [{"particles": (1.0, 5.0)}, {"particles": (1.0, 5.0), "forward": (5.0,)}, {"forward": (1.0,)}]
+    "lengths", [{"particles": (1.0, 5.0, 9.0)}, {"particles": (1.0, 5.0, 9.0), "forward": (1.0, 5.0)}]
 )
-def test_one_method_or_one_length_is_no_comparison(tmp_path, lengths):
+def test_one_method_or_two_lengths_are_no_curves(tmp_path, lengths):
     for method, minutes in lengths.items():
         for one in minutes:
             measured(tmp_path / "runs", method, one, 30.0)
@@ -58,8 +59,8 @@ def test_what_was_measured_before_counts(tmp_path):
     measured(tmp_path / "runs", "particles", 5.0, 31.0)
     assert page_of(tmp_path)[0] is None
     measured(tmp_path / "later", "particles", 20.0, 32.0)
-    measured(tmp_path / "later", "forward", 1.0, 25.0)
-    measured(tmp_path / "later", "forward", 5.0, 32.5)
+    for minutes, psnr in ((1.0, 25.0), (5.0, 32.5), (20.0, 32.2)):
+        measured(tmp_path / "later", "forward", minutes, psnr)
     written = write_minutes(tmp_path / "later", tmp_path / "out")
     text = next(path for path in written if path.name == "accuracy-time.md").read_text()
     assert rows_of(text, "`particles`")[0][1:4] == ["30.00", "31.00", "32.00"]
@@ -74,8 +75,8 @@ def test_others_stand_beside_scenes_of_their_dataset_alone(tmp_path, monkeypatch
     )
     for scene in ("ball", "cube"):
         for method in ("particles", "forward"):
-            measured(tmp_path / "runs", method, 1.0, 30.0, scene=scene)
-            measured(tmp_path / "runs", method, 5.0, 30.0, scene=scene)
+            for minutes in (1.0, 5.0, 20.0):
+                measured(tmp_path / "runs", method, minutes, 30.0, scene=scene)
     toy = Published("Toy", 60.0, 20.0, "a CPU", "a page", "toy")
     page_of(tmp_path, published=[OTHER, toy])
     assert drawn == {"ball": ["Other"], "cube": ["Other"]}
@@ -83,12 +84,12 @@ def test_others_stand_beside_scenes_of_their_dataset_alone(tmp_path, monkeypatch
 
 def test_what_was_measured_otherwise_is_not_compared(tmp_path):
     for method, clock in (("particles", "processor"), ("forward", "wall")):
-        for minutes in (1.0, 5.0):
+        for minutes in (0.5, 1.0, 5.0):
             measured(tmp_path / clock / "runs", method, minutes, 30.0, clock=clock)
     for clock in ("processor", "wall"):
         written = write_minutes(tmp_path / clock / "runs", tmp_path / "out")
         assert "accuracy-time.md" not in [path.name for path in written]
-    for minutes in (1.0, 5.0):  # now there are two of one clock
+    for minutes in (0.5, 1.0, 5.0):  # now there are two of one clock
         measured(tmp_path / "more", "backward", minutes, 20.0, clock="wall")
     files = {path.name: path for path in write_minutes(tmp_path / "more", tmp_path / "out", [OTHER])}
     text = files["accuracy-time.md"].read_text()
@@ -102,14 +103,15 @@ def test_runs_that_ended_early_stand_where_they_ended(tmp_path, monkeypatch):
     drawn = {}
     monkeypatch.setattr("forewarp.report.by_method._draw", lambda groups, *rest: drawn.update(groups))
     for method in ("particles", "forward"):
+        measured(tmp_path / "runs", method, 0.5, 29.0, took=30.0)
         measured(tmp_path / "runs", method, 1.0, 30.0, took=60.0)
         measured(tmp_path / "runs", method, 20.0, 31.0, took=300.0 if method == "particles" else 1200.0)
     text = page_of(tmp_path, published=[Published("Toy", 60.0, 20.0, "a CPU", "a page", "toy")])[
         0
     ].read_text()
-    assert rows_of(text, "`particles`")[0][1:3] == ["30.00", "31.00 (ended after 5 min)"]
-    assert rows_of(text, "`forward`")[0][1:3] == ["30.00", "31.00"]
-    assert [_seconds(group) for group in drawn["particles"]] == [60.0, 300.0]
+    assert rows_of(text, "`particles`")[0][2:4] == ["30.00", "31.00 (ended after 5 min)"]
+    assert rows_of(text, "`forward`")[0][2:4] == ["30.00", "31.00"]
+    assert [_seconds(group) for group in drawn["particles"]] == [30.0, 60.0, 300.0]
     assert "Toy" not in text  # of no scene of the page
     pages = {path.name: path.read_text() for path in (tmp_path / "out").glob("*.md")}
     assert "Some runs ended by their steps" in pages["particles.md"]

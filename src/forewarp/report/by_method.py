@@ -32,6 +32,7 @@ Written by `forewarp-report kind=minutes` from runs of `sweeps=minutes` with sev
 Each point is a run of its own, trained from the start for so long, since rates and curricula follow the time
 that a run has; lines join the means of the seeds. PSNR (dB) is of test views. {CLOCKS}
 """
+_LENGTHS = 3  # of training, at least: two points make no curve
 PUBLISHED = (
     "Published by others for all of D-NeRF's scenes, by protocols of their own, for orientation (stars):\n"
 )
@@ -40,7 +41,7 @@ PUBLISHED = (
 def write_by_method(
     tables: Mapping[str, Sequence[dict]], out: Path, published: Sequence[Published]
 ) -> list[Path]:
-    """Write ``accuracy-time.md`` and a picture for each scene that two methods or more have in two lengths.
+    """Write ``accuracy-time.md`` and a picture for each scene that two methods or more have in three lengths.
 
     Args:
         tables: rows as of ``run_rows.row_of``, by method.
@@ -86,7 +87,7 @@ def _compared(rows: Sequence[dict]) -> dict[str, dict[str, list[Group]]]:
         lengths: dict[str, list[Group]] = {}
         for group in alike(own):
             lengths.setdefault(group[0]["method"], []).append(group)
-        lengths = {method: groups for method, groups in lengths.items() if len(groups) > 1}
+        lengths = {method: groups for method, groups in lengths.items() if len(groups) >= _LENGTHS}
         if len(lengths) > 1:
             others = [row for row in rows if row["scene"] == own[0]["scene"]]
             name = ", ".join([own[0]["scene"], *telling(own[0], others, ("preset", *CONDITIONS))])
