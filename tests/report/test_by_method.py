@@ -71,7 +71,7 @@ def test_others_stand_beside_scenes_of_their_dataset_alone(tmp_path, monkeypatch
     drawn = {}
     monkeypatch.setattr(
         "forewarp.report.by_method._draw",
-        lambda groups, beside, title, path: drawn.update({title: [other.name for other in beside]}),
+        lambda groups, beside, title, *rest: drawn.update({title: [other.name for other in beside]}),
     )
     for scene in ("ball", "cube"):
         for method in ("particles", "forward"):

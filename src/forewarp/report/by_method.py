@@ -52,12 +52,13 @@ def write_by_method(
         the files written; none where no scene has that much.
     """
     plain = [row | {"label": row["scene"]} for rows in tables.values() for row in rows if is_plain(row)]
+    colors = {method: f"C{number}" for number, method in enumerate(sorted(tables))}
     written, parts, used, shown = [], [], [], []
     for scene, groups in _compared(plain).items():
         rows = [row for found in groups.values() for group in found for row in group]
         beside = [other for other in published if other.dataset == rows[0]["dataset"]]
         picture = out / f"accuracy-time-{re.sub(r'[^a-zA-Z0-9]+', '-', scene).strip('-')}.png"
-        _draw(groups, beside, scene, picture)
+        _draw(groups, beside, scene, picture, colors)
         parts += [f"## {scene}\n", f"![PSNR of {scene} against seconds of training]({picture.name})\n"]
         parts += [_table(groups).markdown()]
         written.append(picture)
@@ -121,18 +122,24 @@ def _seconds(rows: Group) -> float:
     return fmean(row[row["clock"]] or 60 * row["minutes"] for row in rows)
 
 
-def _draw(groups: Mapping[str, Sequence[Group]], beside: Sequence[Published], title: str, path: Path) -> None:
-    """Draw a point a run and a line a method over seconds of training."""
+def _draw(
+    groups: Mapping[str, Sequence[Group]],
+    beside: Sequence[Published],
+    title: str,
+    path: Path,
+    colors: Mapping[str, str],
+) -> None:
+    """Draw a point a run and a line a method over seconds of training; a method keeps its color."""
     figure, ((axis,),) = figure_of(1, 1, (7, 4.5))
     seconds = [_seconds(group) for found in groups.values() for group in found]
     seconds += [other.seconds for other in beside]
     over_seconds(axis, "PSNR of test views (dB)", wide=max(seconds) > 1000 * min(seconds))
-    for number, (method, found) in enumerate(groups.items()):
+    for method, found in groups.items():
         means = [(_seconds(group), estimate(group, "psnr").mean) for group in found]
-        axis.plot(*zip(*means), color=f"C{number}", linewidth=2, label=method)
+        axis.plot(*zip(*means), color=colors[method], linewidth=2, label=method)
         runs = [(_seconds([row]), row["psnr"]) for group in found for row in group]
-        axis.plot(*zip(*runs), "o", color=f"C{number}", markersize=3.5)
-    for number, other in enumerate(beside, len(groups)):
+        axis.plot(*zip(*runs), "o", color=colors[method], markersize=3.5)
+    for number, other in enumerate(beside, len(colors)):
         label = f"{other.name} (published, {other.hardware})"
         axis.plot(other.seconds, other.psnr, "*", color=f"C{number % 10}", fillstyle="none", label=label)
     axis.legend(fontsize="x-small", loc="lower right")
