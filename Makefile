@@ -58,7 +58,7 @@ demo: ## fit the procedural vehicle by three methods, two at once, compare, make
 
 # Kernels of particles compile for half a minute the first time, beside the others' training.
 demo-particles: DEMO_MINUTES := 0.5
-demo-forward demo-backward: DEMO_MINUTES := 0.6
+demo-forward demo-backward: DEMO_MINUTES := 0.5
 demo-particles demo-forward demo-backward: demo-%:
 	$(BIN)/forewarp-train experiment=demo model=$* threads=1 budget.minutes=$(DEMO_MINUTES) run=$(DEMO)/$* $(SAYS)
 
