@@ -182,3 +182,12 @@ def test_both_clocks_and_versions_of_the_code_are_told(tmp_path, monkeypatch):
     (line,) = [line for line in text.splitlines() if line.startswith("The runs may be of different versions")]
     assert line.endswith("1 min of commit aaa, commit bbb.")
     assert minutes.mean_by_time(drawn["forward"])[:2] == [(0.0, 31.0), (0.05, 31.0)]
+
+
+def test_tables_hold_no_folder_of_whoever_typed(tmp_path):
+    typed = "forewarp-train model=forward paths.scenes=/home/me/data run=/home/me/run lpips_weights=/home/me/w"
+    write_run(tmp_path / "runs", command=typed)
+    for file in write_minutes(tmp_path / "runs", tmp_path / "out"):
+        if file.suffix in (".md", ".csv"):
+            assert "/home/me" not in file.read_text()
+            assert "paths.scenes=DATASETS" in file.read_text()

@@ -9,6 +9,7 @@ from statistics import mode
 from forewarp.files import replace_file
 from forewarp.metrics.gain import DIFFERENCES, Estimate, measure_effect
 from forewarp.report.collect import Result, by_scene, collect, grouped, left_out, machine
+from forewarp.report.run_rows import portable
 from forewarp.report.tables import Column, Table
 
 # The columns of a run's numbers.
@@ -100,7 +101,7 @@ def every_run(results: Sequence[Result]) -> Table:
     for result in results:
         numbers = result.numbers
         about = [result.scene, result.variant, result.minutes, result.seed, result.ability]
-        end = [result.effects, result.command]
+        end = [result.effects, portable(result.command)]
         rows.append([*about, *(numbers.get(measure) for measure in MEASURES), *end])
     columns = [Column(name) for name in ("scene", "variant", "minutes", "seed", "views")]
     return Table([*columns, *MEASURES.values(), Column("effects"), Column("command")], rows)

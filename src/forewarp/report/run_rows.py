@@ -101,7 +101,7 @@ def row_of(result: Result) -> dict:
         "faults": protocol.get("faults"),
         "views": " ".join(f"{time:.4f}:{psnr:.2f}" for time, psnr in views),
         "curve": " ".join(f"{point.seconds:.1f}:{point.psnr:.2f}" for point in result.curve),
-        "command": result.command,
+        "command": portable(result.command),
     }
 
 
