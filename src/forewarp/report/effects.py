@@ -11,6 +11,7 @@ from forewarp.files import MOST_CONFIG, read_text, replace_file
 from forewarp.metrics.gain import Estimate
 from forewarp.report.collect import Result, by_scene, collect, left_out, machine
 from forewarp.report.curve import seconds_to
+from forewarp.report.run_rows import portable
 from forewarp.report.tables import Column, Table
 
 CHOICES = {"auto": "planned", "all_effects": "every effect", "full": "the paper's set", "base": "the preset"}
@@ -158,7 +159,7 @@ def every_run(results: Sequence[Result]) -> Table:
             run.numbers["psnr"],
             run.numbers["steps"],
             plan_of(run).get("seconds"),
-            run.command,
+            portable(run.command),
         ]
         for run in sorted(results, key=lambda run: (run.scene, run.variant, run.seed))
     ]
