@@ -185,7 +185,7 @@ def test_both_clocks_and_versions_of_the_code_are_told(tmp_path, monkeypatch):
 
 
 def test_tables_hold_no_folder_of_whoever_typed(tmp_path):
-    typed = "forewarp-train model=forward paths.scenes=/home/me/data run=/home/me/run lpips_weights=/home/me/w"
+    typed = "forewarp-train seed=0 paths.scenes=/home/me/data run=/home/me/run lpips_weights=/home/me"
     write_run(tmp_path / "runs", command=typed)
     for file in write_minutes(tmp_path / "runs", tmp_path / "out"):
         if file.suffix in (".md", ".csv"):
