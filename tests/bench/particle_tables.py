@@ -259,7 +259,7 @@ def lightning_shares(size: Size, steps: int) -> tuple[float, float]:
         own = run.callbacks
         replace(run, callbacks=lambda *given: [*own(*given), marks]).fit()
     within = (marks.seconds[-1] - marks.seconds[warm - 1]) / (len(marks.seconds) - warm)
-    loop = Loop(size)
+    loop = Loop(size, learned=0)  # as the run
     for _ in range(warm):
         loop.step()
     begin = time.process_time()

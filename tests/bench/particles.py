@@ -33,6 +33,7 @@ from forewarp.training.stages import Run
 from tests.support.configs import composed
 
 COUNT, SIDE, NODES = 12_000, 400, 200
+LEARNED = 2_000  # steps that most particles had learned from by then
 TIMES, VIEWS = 100, 8  # training times; different pictures of them
 WHITE, MIDDLE = torch.ones(3), 0.5
 # From, to and radius of the capsules that the figure consists of: body, head, arms, legs.
@@ -157,9 +158,12 @@ class Loop:
         size: of the figure.
         effects: overrides that choose other effects than cut-out pictures have by default.
         fraction: of the stage that is taken to be done.
+        learned: steps that all parameters are taken to have learned from, which the optimiser counts.
     """
 
-    def __init__(self, size: Size, effects: Sequence[str] = (), *, fraction: float = 0.7) -> None:
+    def __init__(
+        self, size: Size, effects: Sequence[str] = (), *, fraction: float = 0.7, learned: int = LEARNED
+    ) -> None:
         with tempfile.TemporaryDirectory() as folder:
             run = run_of(size, 1000, Path(folder) / "run", effects)
         run.datamodule.setup("fit")
@@ -174,6 +178,9 @@ class Loop:
         self.parameters = dict(self.method.named_parameters())
         self.factors = self.module.objective.factors(0)
         self.view = View(camera(size.side, 0.3, size.zoom))
+        self.step()
+        for state in self.optimizer.state.values():
+            state["steps"].fill_(learned)
 
     def step(self) -> None:
         """Take a whole step."""

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from forewarp.ops.adam import adam_rows
+from forewarp.ops.adam import Learned, adam_rows
 
 
 def state(shape=(6, 3), seed=0):
@@ -12,7 +12,7 @@ def state(shape=(6, 3), seed=0):
 
 def step(parts, gradient, rate=0.1):
     value, mean, square, steps = parts
-    adam_rows(value, gradient, mean, square, steps, rate, (0.9, 0.99), 1e-15)
+    adam_rows([Learned(value, gradient, mean, square, steps, rate)], (0.9, 0.99), 1e-15)
 
 
 @pytest.mark.parametrize("shape", [(6, 3), (37, 4), (40, 1), (33, 17)])
@@ -72,7 +72,7 @@ def test_both_agree_after_many_steps():
 @pytest.mark.parametrize("width", [1, 3, 6])
 def test_rows_of_many_steps_have_one_pace_and_those_without_a_gradient_stay(width):
     fast = state((48, width))
-    fast[3].copy_(torch.arange(48) + 2040.0)  # some blocks below the end of the table, some beyond
+    fast[3].copy_(torch.arange(48) + 1700.0)  # some blocks below the end of the table, some beyond
     fast[1].normal_()
     fast[2].uniform_(0.5, 1.0)
     gradient = torch.randn(48, width, generator=torch.Generator().manual_seed(1))
@@ -120,3 +120,37 @@ def test_what_is_not_contiguous_is_changed_in_place_too():
     for part, own in zip(plain, spread):
         torch.testing.assert_close(own, part)
     assert float(spread[3][0]) == 2
+
+
+@pytest.mark.parametrize("rows", [5, 70])
+def test_gradients_may_be_columns_of_a_larger_tensor(backend, rows):
+    together = torch.randn(rows, 6, 3, generator=torch.Generator().manual_seed(2))
+    together[rows // 2] = 0
+    for first, last in ((0, 1), (1, 4), (4, 6)):
+        shape = (rows, last - first, 3)
+        part, whole = state(shape), state(shape)
+        for _ in range(2):
+            step(part, together[:, first:last])
+            step(whole, together[:, first:last].contiguous())
+        for own, other in zip(part, whole):
+            assert torch.equal(own, other)
+
+
+def test_gradients_may_lie_in_any_order(backend):
+    part, whole, turned = state((32, 3)), state((32, 3)), torch.randn(3, 32).T
+    step(part, turned)
+    step(whole, turned.contiguous())
+    assert torch.equal(part[0], whole[0])
+
+
+def test_many_parameters_take_a_step_at_one_go(backend):
+    shapes = [(40, 3), (7, 2, 3), (33, 5), (20, 17), (16, 1), (4, 6)]
+    alone, together = ([state(shape) for shape in shapes] for _ in range(2))
+    gradients = [torch.randn(shape) for shape in shapes]
+    for parts, gradient in zip(alone, gradients):
+        step(parts, gradient, 0.1)
+    learned = [Learned(v, g, m, s, n, 0.1) for (v, m, s, n), g in zip(together, gradients)]
+    adam_rows(learned, (0.9, 0.99), 1e-15)
+    for one, other in zip(alone, together):
+        for part, twin in zip(one, other):
+            assert torch.equal(part, twin)

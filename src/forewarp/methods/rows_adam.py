@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import torch
 
-from forewarp.ops.adam import adam_rows
+from forewarp.ops.adam import Learned, adam_rows
 
 
 class RowsAdam(torch.optim.Optimizer):
@@ -20,14 +22,19 @@ class RowsAdam(torch.optim.Optimizer):
         if closure is not None:
             with torch.enable_grad():
                 loss = closure()
+        alike: dict[tuple, list[Learned]] = {}
         for group in self.param_groups:
-            for p in group["params"]:
-                if p.grad is None or not p.numel():
-                    continue
-                state = self.state[p]
-                if not state:
-                    state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(p), torch.zeros_like(p)
-                    state["steps"] = torch.zeros_like(p[..., 0])
-                moments = state["exp_avg"], state["exp_avg_sq"], state["steps"]
-                adam_rows(p, p.grad, *moments, group["lr"], group["betas"], group["eps"])
+            alike.setdefault((*group["betas"], group["eps"]), []).extend(self._learned(group))
+        for (first, second, eps), learned in alike.items():
+            adam_rows(learned, (first, second), eps)
         return loss
+
+    def _learned(self, group: dict) -> Iterator[Learned]:
+        for p in group["params"]:
+            if p.grad is None or not p.numel():
+                continue
+            state = self.state[p]
+            if not state:
+                state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(p), torch.zeros_like(p)
+                state["steps"] = torch.zeros_like(p[..., 0])
+            yield Learned(p, p.grad, state["exp_avg"], state["exp_avg_sq"], state["steps"], group["lr"])

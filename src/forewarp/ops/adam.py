@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -9,39 +13,78 @@ from forewarp.ops.backend import match_threads, use_numba
 from forewarp.ops.checks import check_shape
 
 
-def adam_rows(
-    value: Tensor, gradient: Tensor, mean: Tensor, square: Tensor, steps: Tensor, rate: float,
-    betas: tuple[float, float], eps: float,
-) -> None:  # fmt: skip
+class Learned(NamedTuple):
+    """What a step changes of one parameter, and by what.
+
+    Attributes:
+        value, gradient, mean, square: (..., C); a row is of the last axis.
+        steps: (...,) float32, how many steps each row has made.
+        rate: as of Adam.
+    """
+
+    value: Tensor
+    gradient: Tensor
+    mean: Tensor
+    square: Tensor
+    steps: Tensor
+    rate: float
+
+
+def adam_rows(learned: Sequence[Learned], betas: tuple[float, float], eps: float) -> None:
     """One step of Adam, in place, of the rows whose gradient is not 0 throughout.
 
     ``m = b1 m + (1 - b1) g``, ``v = b2 v + (1 - b2) g^2``, and with n the steps that the row itself has
     made ``value -= rate m / (1 - b1^n) / (sqrt(v / (1 - b2^n)) + eps)``.
 
     Args:
-        value, gradient, mean, square: (..., C); a row is of the last axis. The kernel takes contiguous ones.
-        steps: (...,) float32, how many steps each row has made.
-        rate, betas, eps: as of Adam.
+        learned: parameters. The kernel takes all that are contiguous, at one go.
+        betas, eps: as of Adam.
 
     Raises:
         ValueError: for shapes that do not go together, as an altered checkpoint may have.
 
-    Cost: one look at the gradients; five numbers moved for each of sixteen rows of which one has a gradient.
+    Cost: one look at the gradients; five numbers moved for each of the rows side by side, up to sixteen, of
+    which one has a gradient.
     """
-    for name, part in (("gradient", gradient), ("exp_avg", mean), ("exp_avg_sq", square)):
-        check_shape(name, part, tuple(value.shape))
-    check_shape("steps", steps, tuple(value.shape[:-1]))
-    fast = use_numba(value) and value.dtype == torch.float32
-    if fast and all(t.is_contiguous() for t in (value, mean, square, steps)):
-        from forewarp.ops import kernels_adam
+    for one in learned:
+        shape = one.value.shape
+        for name, part in (("gradient", one.gradient), ("exp_avg", one.mean), ("exp_avg_sq", one.square)):
+            if part.shape != shape:
+                check_shape(name, part, tuple(shape))
+        check_shape("steps", one.steps, tuple(shape[:-1]))
+    quick = [_quick(one) for one in learned]
+    if any(quick):
+        _by_kernel([one for one, fast in zip(learned, quick) if fast], betas, eps)
+    for one, fast in zip(learned, quick):
+        if not fast:
+            _adam_reference(one, betas, eps)
 
-        match_threads()
-        betas = tuple(map(float, betas))
-        table = kernels_adam.biases(*betas)
-        parts = (value.detach(), gradient.contiguous(), mean, square, steps)
-        flat = (t.numpy().reshape(-1) for t in parts)  # a view, quicker than PyTorch's
-        kernels_adam.adam(*flat, float(rate), *betas, float(eps), table)
-        return
+
+def _quick(one: Learned) -> bool:
+    """Whether the kernel takes it: it reads and writes float32 at addresses."""
+    kept = (one.value, one.mean, one.square, one.steps)
+    fits = all(t.is_contiguous() and t.dtype == torch.float32 for t in kept)
+    return fits and one.gradient.dtype == torch.float32 and use_numba(one.value) and one.value.numel() > 0
+
+
+def _by_kernel(learned: list[Learned], betas: tuple[float, float], eps: float) -> None:
+    from forewarp.ops import kernels_adam
+
+    match_threads()
+    table, alive = [], []  # gradients must outlive the call
+    for value, gradient, mean, square, steps, _ in learned:
+        alive.append(gradient.contiguous())
+        width, parts = value.shape[-1], (value, alive[-1], mean, square, steps)
+        table.append([*(t.data_ptr() for t in parts), value.numel() // width, width])
+    rates = np.array([one.rate for one in learned], np.float32)
+    first, second = map(float, betas)
+    bias = kernels_adam.biases(first, second)
+    kernels_adam.adam(np.array(table, np.int64), rates, first, second, float(eps), bias)
+
+
+def _adam_reference(learned: Learned, betas: tuple[float, float], eps: float) -> None:
+    """``adam_rows`` of one parameter in plain PyTorch."""
+    value, gradient, mean, square, steps, rate = learned
     seen = (gradient != 0).any(-1)
     counted = steps[seen] + 1
     g = gradient[seen]

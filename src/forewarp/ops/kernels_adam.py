@@ -8,112 +8,108 @@ from functools import cache
 import numpy as np
 from numba import njit, prange
 
-from forewarp.ops.lanes import root, where_above
-from forewarp.ops.lanes_arrays import get_row, put_row, room, row_of
+from forewarp.ops.lanes import not_zero, root, where_bits
+from forewarp.ops.lanes_arrays import floats_at, get_from, put_to, room, row_of
 
-_WIDEST = 16  # numbers of a row that are treated so
-KNOWN = 2048  # steps after which a beta's power is taken for 0
+_WORD = 64  # numbers that are treated together: a bit each says which
 
 
 @cache
 def biases(first: float, second: float) -> np.ndarray:
-    """What moments and roots of squares are multiplied by after n steps (n, 2); the last is of all later."""
-    left, right = (beta ** np.arange(1, KNOWN + 1, dtype=np.float64) for beta in (first, second))
+    """What moments and roots of squares are multiplied by after n steps (n, 2), float32; the last is 1, and
+    of all later.
+    """
+    many = 1 + max(math.ceil(math.log(2.0**-25) / math.log(max(beta, 0.5))) for beta in (first, second))
+    left, right = (beta ** np.arange(1, many + 1, dtype=np.float64) for beta in (first, second))
     found = np.stack([1 / (1 - left), np.sqrt(1 / (1 - right))], -1).astype(np.float32)
     return np.ascontiguousarray(np.concatenate([np.ones((1, 2), np.float32), found]))
 
 
 @njit(inline="always")
-def _seen(gradient, row, width):
-    """Whether a row has a gradient."""
-    for i in range(row * width, (row + 1) * width):  # noqa: SIM110 (Numba takes no generator here)
-        if gradient[i] != 0:
-            return True
-    return False
+def _side_by_side(width):
+    """How many rows of so many numbers fill 16-number vectors, a word's bits at most; 0 where none do."""
+    for rows in (16, 8, 4):
+        if rows * width <= _WORD and rows * width % 16 == 0:
+            return rows
+    return 0
 
 
 @njit(inline="always")
-def _step_alike(value, gradient, mean, square, steps, block, width, rooms, numbers):
-    """A step of sixteen rows of one pace; rows without a gradient are put back as they were."""
-    c1, c2, pace, scale, small = numbers
-    means, squares, values = rooms
-    seen = 0
-    for lane in range(16):
-        row = 16 * block + lane
-        if _seen(gradient, row, width):
-            steps[row] += np.float32(1)
-            seen |= 1 << lane
-            continue
-        for c in range(width):
-            at, to = row * width + c, lane * width + c
-            means[to], squares[to], values[to] = mean[at], square[at], value[at]
-    if seen == 0:
-        return
-    for c in range(width):
-        at = 16 * (width * block + c)
-        g, m, v = get_row(gradient, at), get_row(mean, at), get_row(square, at)
-        m, v = m + (g - m) * c1, v + (g * g - v) * c2
-        put_row(mean, at, m)
-        put_row(square, at, v)
-        put_row(value, at, get_row(value, at) - pace * m / (scale * root(v) + small))
-    for lane in range(16):
-        if not seen >> lane & 1:
-            for c in range(width):
-                at, to = (16 * block + lane) * width + c, lane * width + c
-                mean[at], square[at], value[at] = means[to], squares[to], values[to]
+def _seen(gradient, start, count, width):
+    """A bit for the first of each ``width`` of so many numbers, where any of these is not 0."""
+    bits = np.uint64(0)
+    for c in range(count // 16):
+        bits |= not_zero(get_from(gradient, start + 16 * c)) << np.uint64(16 * c)
+    seen, first = bits, np.uint64(0)
+    for c in range(1, width):
+        seen |= bits >> np.uint64(c)
+    for c in range(0, count, width):
+        first |= np.uint64(1) << np.uint64(c)
+    return seen & first
 
 
 @njit(parallel=True, cache=True)
-def adam(value, gradient, mean, square, steps, rate, first, second, eps, bias):
-    """See ``adam.adam_rows``; all are (R C,), steps (R,), ``bias`` as of ``biases``.
+def adam(table, rates, first, second, eps, bias):
+    """A step of P parameters; see ``adam.adam_rows``.
 
-    Sixteen rows at once, whose numbers lie side by side in C vectors; what is beyond the last sixteen, or
-    wider than a room, number by number. Rows that have all made so many steps that biases are 1, which soon
-    is the rule, have one pace.
+    Args:
+        table: (P, 7) int64, of each the addresses of its values, gradients, both moments and steps, how many
+            rows it has, and how many numbers a row.
+        rates: (P,) float32.
+        first, second, eps: as of Adam.
+        bias: as of ``biases``.
+
+    Rows that fill vectors are treated together: all are computed, and those without a gradient kept as they
+    were. Where all have made so many steps that biases are 1, which soon is the rule, there is one pace. What
+    is beyond the last vectors, or of a width that fills none, goes number by number.
     """
-    rows = len(steps)
-    width = len(value) // max(rows, 1)
     b1, b2, c1, c2 = np.float32(first), np.float32(second), np.float32(1 - first), np.float32(1 - second)
-    small, whole = np.float32(eps), np.float32(rate)
-    blocks = rows // 16 if width <= _WIDEST else 0
+    small, last = np.float32(eps), len(bias) - 1
     for chunk in prange(64):
-        paces, scales, values = room(_WIDEST), room(_WIDEST), room(_WIDEST)
-        for block in range(blocks * chunk // 64, blocks * (chunk + 1) // 64):
-            any_seen, known = False, True
-            for row in range(16 * block, 16 * block + 16):
-                known &= steps[row] >= KNOWN
-            if known:
-                _step_alike(
-                    value, gradient, mean, square, steps, block, width, (paces, scales, values),
-                    (c1, c2, whole * bias[KNOWN, 0], bias[KNOWN, 1], small),
-                )  # fmt: skip
-                continue
-            for lane in range(16):
-                row, pace, scale = 16 * block + lane, np.float32(0), np.float32(0)  # 0: not seen
-                if _seen(gradient, row, width):
-                    any_seen = True
-                    steps[row] += np.float32(1)
-                    n = max(0, min(int(steps[row]), KNOWN))
-                    pace, scale = whole * bias[n, 0], bias[n, 1]
-                for c in range(width):
-                    paces[width * lane + c], scales[width * lane + c] = pace, scale
-            if not any_seen:
-                continue
-            for c in range(width):
-                at = 16 * (width * block + c)
-                pace, scale, g = row_of(paces, c), row_of(scales, c), get_row(gradient, at)
-                m, v = get_row(mean, at), get_row(square, at)
-                put_row(mean, at, m + where_above(scale, np.float32(0), (g - m) * c1))
-                put_row(square, at, v + where_above(scale, np.float32(0), (g * g - v) * c2))
-                m, v = get_row(mean, at), get_row(square, at)
-                step = where_above(scale, np.float32(0), pace * m / (scale * root(v) + small))
-                put_row(value, at, get_row(value, at) - step)
-    for row in range(16 * blocks, rows):
-        if not _seen(gradient, row, width):
-            continue
-        steps[row] += np.float32(1)
-        n = max(0, min(int(steps[row]), KNOWN))
-        for i in range(row * width, (row + 1) * width):
-            g = gradient[i]
-            mean[i], square[i] = b1 * mean[i] + c1 * g, b2 * square[i] + c2 * g * g
-            value[i] -= whole * bias[n, 0] * mean[i] / (bias[n, 1] * math.sqrt(square[i]) + small)
+        paces, scales = room(4), room(4)
+        for p in range(len(table)):
+            value, gradient, mean = floats_at(table[p, 0]), floats_at(table[p, 1]), floats_at(table[p, 2])
+            square, steps, rate = floats_at(table[p, 3]), floats_at(table[p, 4]), rates[p]
+            rows, width = table[p, 5], table[p, 6]
+            together = _side_by_side(width)
+            many, blocks = together * width, rows // together if together else 0
+            for block in range(blocks * chunk // 64, blocks * (chunk + 1) // 64):
+                start, row = many * block, together * block
+                seen, known = _seen(gradient, start, many, width), True
+                if seen == 0:
+                    continue
+                for i in range(together):
+                    made = steps[row + i] + np.float32(seen >> np.uint64(i * width) & np.uint64(1))
+                    steps[row + i] = made
+                    known &= made >= last
+                if not known:
+                    for i in range(together):
+                        n = max(0, min(int(steps[row + i]), last))
+                        for c in range(i * width, (i + 1) * width):
+                            paces[c], scales[c] = rate * bias[n, 0], bias[n, 1]
+                each = seen * np.uint64((1 << width) - 1)  # all of a row's bits
+                for c in range(many // 16):
+                    at, here = start + 16 * c, each >> np.uint64(16 * c)
+                    g, m = get_from(gradient, at), get_from(mean, at)
+                    v, x = get_from(square, at), get_from(value, at)
+                    m, v = where_bits(here, m + (g - m) * c1, m), where_bits(here, v + (g * g - v) * c2, v)
+                    put_to(mean, at, m)
+                    put_to(square, at, v)
+                    if known:
+                        moved = x - rate * m / (root(v) + small)
+                    else:
+                        moved = x - row_of(paces, c) * m / (row_of(scales, c) * root(v) + small)
+                    put_to(value, at, where_bits(here, moved, x))
+            done = together * blocks
+            for row in range(done + (rows - done) * chunk // 64, done + (rows - done) * (chunk + 1) // 64):
+                any_seen = False
+                for i in range(row * width, (row + 1) * width):
+                    any_seen |= gradient[i] != 0
+                if not any_seen:
+                    continue
+                steps[row] += np.float32(1)
+                n = max(0, min(int(steps[row]), last))
+                for i in range(row * width, (row + 1) * width):
+                    g = gradient[i]
+                    mean[i], square[i] = b1 * mean[i] + c1 * g, b2 * square[i] + c2 * g * g
+                    value[i] -= rate * bias[n, 0] * mean[i] / (bias[n, 1] * math.sqrt(square[i]) + small)

@@ -182,9 +182,9 @@ def _of_place(view, local, distance, inverse, px, py, bent, place, by_jacobian):
 
 
 @njit(forceinline=True)
-def _of_colors(dx, dy, dz, splats, tints, which, valid, place, to_colors):
+def _of_colors(dx, dy, dz, splats, tints, which, valid, place, to_colors, spots):
     """Slopes by the coefficients of colour; direction has none."""
-    plain = to_colors.shape[1] - len(tints)
+    plain = len(spots) - len(tints)
     harmonics(dx, dy, dz, plain, place)
     for lane in range(SIDE_BY_SIDE):
         i = np.uintp(which[lane])
@@ -194,15 +194,16 @@ def _of_colors(dx, dy, dz, splats, tints, which, valid, place, to_colors):
     red = where_above(row_of(place, ANY), zero, row_of(place, _SLOPE + 6))
     green = where_above(row_of(place, ANY + 1), zero, row_of(place, _SLOPE + 7))
     blue = where_above(row_of(place, ANY + 2), zero, row_of(place, _SLOPE + 8))
-    for k in range(to_colors.shape[1]):
+    for k in range(len(spots)):
         factor = row_of(place, BASIS + k) if k < plain else sixteen(tints[k - plain])
         set_row(place, ANY, factor * red)
         set_row(place, ANY + 1, factor * green)
         set_row(place, ANY + 2, factor * blue)
         for lane in range(valid):
             i = np.uintp(which[lane])
+            at = spots[k, 0] + i * spots[k, 1]
             for c in range(3):
-                to_colors[i, k, c] = place[SIDE_BY_SIDE * (ANY + c) + lane]
+                to_colors[at + c] = place[SIDE_BY_SIDE * (ANY + c) + lane]
 
 
 @njit(forceinline=True)
@@ -268,10 +269,11 @@ def _of_shape(view, moved, log_scales, quaternions, which, valid, place, to_scal
 def chain(  # long: sixteen particles' way back, step by step
     means, log_scales, quaternions, opacity, colors, maps, links, weights, view, tints, fades,
     splats, seen, slopes,
-    to_means, to_scales, to_quaternions, to_opacity, to_colors, to_maps, to_weights, softmax,
+    to_means, to_scales, to_quaternions, to_opacity, to_colors, spots, to_maps, to_weights, softmax,
 ):  # fmt: skip
     """From slopes (V', 16) of the particles ``seen`` (V,) to those by all particles, and by maps.
 
+    ``to_colors``: those by coefficient k of particle i begin at ``spots[k, 0] + i spots[k, 1]``.
     ``to_maps`` (S, M, 16): each thread has its own. ``to_weights`` (N, L), or empty: by weights, or by the
     numbers whose ``softmax`` they are.
     """
@@ -306,7 +308,7 @@ def chain(  # long: sixteen particles' way back, step by step
             set_row(place, ANY + 1, warp[1] * by_point[0] + warp[4] * by_point[1] + warp[7] * by_point[2])
             set_row(place, ANY + 2, warp[2] * by_point[0] + warp[5] * by_point[1] + warp[8] * by_point[2])
             _scattered(place, ANY, 3, to_means, which, valid)
-            _of_colors(dx, dy, dz, splats, tints, which, valid, place, to_colors)
+            _of_colors(dx, dy, dz, splats, tints, which, valid, place, to_colors, spots)
             for lane in range(valid):
                 i = np.uintp(which[lane])
                 slope = (

@@ -238,6 +238,30 @@ def any_above(typing, a, least):
 
 
 @intrinsic
+def not_zero(typing, a):
+    """Which of 16 numbers are not 0, NaN among them: as bits of a uint64, the first the lowest."""
+
+    def code(context, builder, sig, args):
+        marks = builder.fcmp_unordered("!=", args[0], constant(NARROW, [0.0] * NARROW))
+        return builder.zext(builder.bitcast(marks, ir.IntType(NARROW)), ir.IntType(64))
+
+    return types.uint64(SUMS), code
+
+
+@intrinsic
+def where_bits(typing, bits, a, b):
+    """``a`` where a bit of the lowest 16 of ``bits`` is set, else ``b``; see ``not_zero``."""
+
+    def code(context, builder, sig, args):
+        marks = builder.bitcast(
+            builder.trunc(args[0], ir.IntType(NARROW)), ir.VectorType(ir.IntType(1), NARROW)
+        )
+        return builder.select(marks, args[1], args[2])
+
+    return SUMS(types.uint64, SUMS, SUMS), code
+
+
+@intrinsic
 def exp_down(typing, a):
     """``exp(a)`` of ``-6 <= a <= 0`` to 1e-6; of other numbers it is anything.
 

@@ -74,6 +74,42 @@ def room(typing, count):
     return types.CPointer(types.float32)(count), code
 
 
+@intrinsic
+def floats_at(typing, address):
+    """The float32 at an address, an int64: a pointer to index, as of ``room``."""
+
+    def code(context, builder, sig, args):
+        return builder.inttoptr(args[0], FLOAT.as_pointer())
+
+    return types.CPointer(types.float32)(types.int64), code
+
+
+def _vector(builder, place, index):
+    """Pointer to 16 numbers from ``place[index]`` on."""
+    return builder.bitcast(builder.gep(place, [index]), ir.VectorType(FLOAT, NARROW).as_pointer())
+
+
+@intrinsic
+def get_from(typing, place, index):
+    """Read ``place[index : index + 16]`` of a ``room`` or of ``floats_at``."""
+
+    def code(context, builder, sig, args):
+        return builder.load(_vector(builder, *args), align=4)
+
+    return SUMS(place, types.intp), code
+
+
+@intrinsic
+def put_to(typing, place, index, value):
+    """Write ``place[index : index + 16]``, as ``get_from`` reads it."""
+
+    def code(context, builder, sig, args):
+        builder.store(args[2], _vector(builder, *args[:2]), align=4)
+        return context.get_dummy_value()
+
+    return types.none(place, types.intp, value), code
+
+
 def _row(builder, place, index):
     """Pointer to a row of a ``room``, as a vector."""
     kind = ir.VectorType(FLOAT, NARROW).as_pointer()

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import NamedTuple
 
 import torch
@@ -252,6 +254,19 @@ def arrays(*tensors: Tensor) -> tuple:
     return tuple(t.detach().contiguous().numpy() for t in tensors)
 
 
+def room_for_colors(count: int, kinds: Sequence[int]) -> tuple[Tensor, tuple[Tensor, ...], Tensor]:
+    """Room, 0 throughout, for gradients by the colours of so many particles, ``kinds`` coefficients each in a
+    tensor of its own: the room, these tensors (N, k, 3), and where the kernel finds them in it.
+    """
+    room = torch.zeros(3 * count * sum(kinds))
+    parts = tuple(
+        part.view(count, k, 3) for part, k in zip(room.split([3 * count * k for k in kinds]), kinds)
+    )
+    starts = accumulate(kinds, initial=0)
+    spots = [(3 * (count * start + j), 3 * k) for start, k in zip(starts, kinds) for j in range(k)]
+    return room, parts, torch.tensor(spots)
+
+
 def projected(
     means, log_scales, quaternions, opacity, colors, maps, links, weights, view, tints, fades, *, draw=True
 ) -> tuple[tuple, Tensor]:
@@ -293,5 +308,7 @@ class _Project(torch.autograd.Function):
         order = (out[:, 10] > 0).nonzero()[:, 0].int()
         rows = slopes.new_zeros(whole(len(order)), kernels_chain.SLOPES)
         rows[: len(order), : slopes.shape[1]] = slopes[order.long()]
-        kernels_chain.chain(*arrays(*inputs, out, order, rows, *found, maps, weights), False)
+        colors, (found[4],), spots = room_for_colors(len(inputs[0]), (inputs[4].shape[1],))
+        given = arrays(*inputs, out, order, rows, *found[:4], colors, spots, maps, weights)
+        kernels_chain.chain(*given, False)
         return *found, maps.sum(0)[:, :12], None, weights, None, None, None

@@ -88,22 +88,20 @@ def total(step: Step, factors: Mapping[str, float], parameters: Mapping[str, Ten
                 f"model: expected gradients of some of {', '.join(parameters)}, but got "
                 f"{', '.join(step.gradients) or 'none'}"
             )
-        names, gradients = zip(*step.gradients.items())
-        loss = _Given.apply(loss.detach(), gradients, *(parameters[name] for name in names))
+        loss = _handing_over(loss, dict(step.gradients), parameters)
     return loss, raw
 
 
-class _Given(torch.autograd.Function):
-    """Attach gradients that the method computed itself to the loss."""
+def _handing_over(loss: Tensor, gradients: dict[str, Tensor], parameters: Mapping[str, Tensor]) -> Tensor:
+    """A loss without a graph; ``backward`` hands over, once, gradients that the method computed itself."""
+    loss = loss.detach().requires_grad_()
 
-    @staticmethod
-    def forward(ctx, loss: Tensor, gradients: tuple[Tensor, ...], *parameters: Tensor) -> Tensor:
-        ctx.gradients = gradients
-        return loss.clone()
+    def hand_over(slope: Tensor) -> None:
+        scaled = slope.device.type != "cpu" or float(slope) != 1
+        while gradients:
+            name, value = gradients.popitem()
+            parameter, value = parameters[name], slope * value if scaled else value
+            parameter.grad = value if parameter.grad is None else parameter.grad + value
 
-    @staticmethod
-    def backward(ctx, slope: Tensor) -> tuple:
-        gradients, ctx.gradients = ctx.gradients, None  # what nobody else holds becomes .grad without a copy
-        if slope.device.type == "cpu" and float(slope) == 1:  # not scaled
-            return None, None, *gradients
-        return None, None, *(slope * gradient for gradient in gradients)
+    loss.register_hook(hand_over)
+    return loss

@@ -17,7 +17,7 @@ from forewarp.methods.particles.density import renew, too_near
 from forewarp.methods.particles.effects import Effects, cosines
 from forewarp.methods.particles.feasible import check_feasible
 from forewarp.methods.particles.nodes import Nodes
-from forewarp.methods.particles.packed import add, by_name, packed
+from forewarp.methods.particles.packed import add, by_name, kinds_of, packed
 from forewarp.methods.particles.planning import EFFECTS, ParticlesPlanning
 from forewarp.methods.particles.rest import come_to_rest, pixel_width
 from forewarp.methods.particles.settings import Numbers, told_by
@@ -232,6 +232,7 @@ class Particles(Method):
         found = compare(
             self.gaussians(), warp or self.warp(time), self.pinholes(seen.view.camera), tints, fades,
             seen.rgb, seen.background, width=self.width, factor=weight, by_skin=warp is not None,
+            kinds=kinds_of(self),
         )  # fmt: skip
         self.pulled.add_(found.pull)
         shown = found.pull > 0

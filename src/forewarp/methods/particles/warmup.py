@@ -14,7 +14,7 @@ from tempfile import TemporaryFile
 import torch
 from torch import Tensor
 
-from forewarp.ops.adam import adam_rows
+from forewarp.ops.adam import Learned, adam_rows
 from forewarp.ops.backend import cores, use_numba
 from forewarp.ops.compare import compare, compile_way_back
 from forewarp.ops.nodes import carry_nodes, pull_nodes, spread_nodes
@@ -48,7 +48,7 @@ def compile_kernels(method: torch.nn.Module) -> None:
         pull_nodes(torch.zeros(1, 6), zero, torch.zeros(1, 12), edges, one, 1.0)
         skin_weights(one, one)
         moments = zero.clone(), zero.clone(), first.clone()
-        adam_rows(torch.zeros(1, 3), torch.ones(1, 3), *moments, 1e-3, (0.9, 0.99), 1e-15)
+        adam_rows([Learned(torch.zeros(1, 3), torch.ones(1, 3), *moments, 1e-3)], (0.9, 0.99), 1e-15)
     compare(*given, torch.zeros(72, 4, dtype=torch.uint8), torch.ones(3))
 
 
