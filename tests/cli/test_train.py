@@ -200,6 +200,11 @@ def test_a_scene_for_the_folder_of_scenes_is_put_right(refused, scenes, in_tmp):
     assert line.endswith(f"but got none; did you mean data.root={scenes} data.scene=vehicle?")
 
 
+def test_the_folder_of_all_datasets_is_put_right(refused, scenes, in_tmp):
+    line = refused(*arguments(scenes.parent, "run"))
+    assert line.endswith(f"but got none; did you mean data.root={scenes}?")
+
+
 def test_a_full_disk_names_the_file_and_leaves_no_half(refused, scenes, in_tmp, monkeypatch):
     def full(self, path, *_, **__):
         Path(path).write_bytes(b"half")

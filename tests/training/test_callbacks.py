@@ -80,7 +80,7 @@ def test_lines_where_there_is_no_terminal(tmp_path, capsys):
     found = [re.fullmatch(shape, line) for line in lines]
     assert all(found), lines
     assert all(
-        re.fullmatch(r"\d+:\d\d left \| 2:\d\d:\d\d with what follows", match[2]) for match in found[:-1]
+        re.fullmatch(r"\d+:\d\d left \| 2:\d\d:\d\d to the end of the run", match[2]) for match in found[:-1]
     )
     assert re.fullmatch(r"\d+:\d\d trained", found[-1][2])
     percents = [int(match[1]) for match in found]

@@ -162,6 +162,9 @@ def scene_folder(root: str | Path, scene: str, marker: str) -> Path:
     if not scene or not (root / scene / marker).is_file():
         there = ", ".join(sorted(p.name for p in root.iterdir() if (p / marker).is_file())) or "none"
         advice = f"scenes in {root}: {there}"
+        deeper = sorted(root.glob(f"*/{scene}/{marker}")) if scene and "*" not in scene else []
+        if deeper:
+            advice = f"did you mean data.root={deeper[0].parents[len(Path(scene).parts)]}?"
         if (root / marker).is_file():
             folder = root.resolve()
             advice = f"did you mean data.root={folder.parent} data.scene={folder.name}?"

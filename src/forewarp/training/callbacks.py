@@ -53,7 +53,7 @@ class StageProgress(lightning.Callback):
             fraction, seconds = module.fraction, module.clock.seconds
             left = seconds * (1 - fraction) / fraction if fraction > 0 else None
             known = left is not None and self.later
-            whole = f"{time_text(left + self.later)} with what follows | " if known else ""
+            whole = f"{time_text(left + self.later)} to the end of the run | " if known else ""
             with module.clock.paused():
                 self._line.show(fraction, left, whole + self._text(module))
 
