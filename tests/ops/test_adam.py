@@ -1,6 +1,7 @@
 import pytest
 import torch
 
+from forewarp.methods.rows_adam import RowsAdam
 from forewarp.ops.adam import Learned, adam_rows
 
 
@@ -69,28 +70,30 @@ def test_both_agree_after_many_steps():
     torch.testing.assert_close(fast[0].double(), exact[0], rtol=1e-3, atol=1e-3)
 
 
-@pytest.mark.parametrize("width", [1, 3, 6])
+@pytest.mark.parametrize("width", range(1, 18))
 def test_rows_of_many_steps_have_one_pace_and_those_without_a_gradient_stay(width):
-    fast = state((48, width))
-    fast[3].copy_(torch.arange(48) + 1700.0)  # some blocks below the end of the table, some beyond
+    fast = state((53, width))
+    fast[3].copy_(torch.arange(53) + 1700.0)  # some blocks below the end of the table, some beyond
     fast[1].normal_()
     fast[2].uniform_(0.5, 1.0)
-    gradient = torch.randn(48, width, generator=torch.Generator().manual_seed(1))
-    gradient[[3, 20, 31, 40]] = 0
-    gradient[41, 1:] = 0  # a part of it has one
+    gradient = torch.randn(53, width, generator=torch.Generator().manual_seed(1))
+    rest = [3, 20, 31, 40, 51]
+    gradient[rest] = 0
+    gradient[41, 1:], gradient[42, :-1] = 0, 0  # a part of it has one
     exact, before = [part.double() for part in fast], [part.clone() for part in fast]
     step(fast, gradient, 1e-3)
     step(exact, gradient.double(), 1e-3)
     for part, twin, then in zip(fast, exact, before):
         torch.testing.assert_close(part.double(), twin, rtol=1e-5, atol=1e-6)
-        assert torch.equal(part[[3, 20, 31, 40]], then[[3, 20, 31, 40]])
+        assert torch.equal(part[rest], then[rest])
 
 
 def test_not_a_number_is_kept(backend):
-    parts, gradient = state(), torch.ones(6, 3)
-    gradient[3, 1] = float("nan")
+    parts, gradient = state((37, 3)), torch.ones(37, 3)
+    for row in (3, 35):  # among those side by side, and beyond
+        gradient[row] = torch.tensor([float("nan"), 0.0, 0.0])
     step(parts, gradient)
-    assert bool(parts[0][3, 1].isnan())
+    assert parts[0].isnan().nonzero().tolist() == [[3, 0], [35, 0]]
 
 
 def test_moments_of_another_shape_are_refused(backend):
@@ -101,11 +104,17 @@ def test_moments_of_another_shape_are_refused(backend):
         step((value, mean, square, steps[:5]), torch.ones(200, 3))
 
 
+def test_moments_on_another_device_are_refused():
+    value, mean, square, steps = state((32, 3))
+    with pytest.raises((RuntimeError, NotImplementedError)):
+        step((value, mean.to("meta"), square, steps), torch.ones(32, 3))
+
+
 @pytest.mark.parametrize("count", [-1e9, -5000.0, float("nan"), 1e30])
 def test_any_count_of_steps_stays_within_the_table(count):
-    parts = state((32, 3))
-    parts[3].fill_(count)
-    step(parts, torch.ones(32, 3))
+    parts = state((40, 3))
+    parts[3][::3] = count
+    step(parts, torch.ones(40, 3))
     assert bool(parts[0].isfinite().all())
 
 
@@ -146,11 +155,38 @@ def test_gradients_may_lie_in_any_order(backend):
 def test_many_parameters_take_a_step_at_one_go(backend):
     shapes = [(40, 3), (7, 2, 3), (33, 5), (20, 17), (16, 1), (4, 6)]
     alone, together = ([state(shape) for shape in shapes] for _ in range(2))
+    alone[1], together[1] = ([part.double() for part in parts[1]] for parts in (alone, together))
     gradients = [torch.randn(shape) for shape in shapes]
-    for parts, gradient in zip(alone, gradients):
-        step(parts, gradient, 0.1)
-    learned = [Learned(v, g, m, s, n, 0.1) for (v, m, s, n), g in zip(together, gradients)]
+    gradients[0][5] = 0
+    gradients[1] = gradients[1].double()
+    rates = [0.1 * (1 + number) for number in range(len(shapes))]
+    for parts, gradient, rate in zip(alone, gradients, rates):
+        step(parts, gradient, rate)
+    learned = [Learned(v, g, m, s, n, r) for (v, m, s, n), g, r in zip(together, gradients, rates)]
     adam_rows(learned, (0.9, 0.99), 1e-15)
     for one, other in zip(alone, together):
         for part, twin in zip(one, other):
             assert torch.equal(part, twin)
+    adam_rows([], (0.9, 0.99), 1e-15)
+
+
+def test_groups_have_rates_and_betas_of_their_own(backend):
+    values = [torch.nn.Parameter(torch.zeros(20, 3)) for _ in range(3)]
+    groups = [
+        {"params": values[:1], "lr": 0.1},
+        {"params": values[1:2], "lr": 0.2},
+        {"params": values[2:], "lr": 0.1, "betas": (0.5, 0.5)},
+    ]
+    optimizer = RowsAdam(groups)
+    for sign in (1.0, -2.0):
+        for value in values:
+            value.grad = torch.full((20, 3), sign)
+        optimizer.step()
+    first, second, third = (float(value.detach()[0, 0]) for value in values)
+    assert second == pytest.approx(2 * first)
+    assert third != pytest.approx(first, abs=1e-3)
+
+
+def test_betas_of_one_are_refused():
+    with pytest.raises(ValueError, match=r"betas: expected numbers from 0 to below 1, but got \(0.9, 1.0\)"):
+        RowsAdam([{"params": [torch.nn.Parameter(torch.zeros(2))]}], betas=(0.9, 1.0))

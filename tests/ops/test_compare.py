@@ -43,6 +43,17 @@ def test_kernel_equals_reference(options):
     assert bool((away.diff() >= 0).all())
 
 
+@pytest.mark.parametrize("kind", [torch.float32, torch.float64])  # by the kernel, by the reference
+def test_gradients_of_colours_come_apart(kind):
+    whole, count = run(kind).particles.colors, crowd(dtype=kind)[0].colors.shape[1]
+    parts = run(kind, kinds=(1, count - 3, 2)).particles.colors
+    assert [part.shape[1] for part in parts] == [1, count - 3, 2]
+    assert all(part.is_contiguous() for part in parts) or kind == torch.float64
+    assert torch.equal(torch.cat(parts, 1), whole)
+    with pytest.raises(ValueError, match=f"kinds: expected {count} coefficients in all, but got"):
+        run(kind, kinds=(1, count))
+
+
 def test_the_loss_of_nothing(backend):
     nothing = Gaussians(*(t[:0] for t in one()))
     truth = torch.tensor([[255, 0, 0, 255], [0, 0, 0, 0]], dtype=torch.uint8)

@@ -41,7 +41,7 @@ WITHOUT = {
     "places samples, which no loss pulls at": "march march_reference stratified by_importance clip_to_box",
     "whole numbers, or yes and no": "map_cells unfolded index_of dilate occupied_cells neighbour_pairs"
     " occupied_cells_reference sorted_tiles encoded_size",
-    "says that it has none": "trace undistort adam_rows arrays",
+    "says that it has none": "trace undistort adam_rows arrays room_for_colors",
     "of times or directions, which are not learned": "spline_basis spline_shares harmonics",
     "gives its own, which test_compare and test_nodes compare": "compare compare_reference pull_nodes"
     " spread_nodes",

@@ -53,6 +53,25 @@ def test_a_method_may_bring_gradients_of_its_own():
     (2 * loss).backward()
     assert first.grad is None
     assert second.grad.tolist() == [2.0, -4.0]
+    with pytest.raises(RuntimeError, match="expected to be led back once"):
+        loss.backward()
+
+
+def test_gradients_of_a_method_are_added_to_those_that_there_are():
+    value, frozen = (torch.nn.Parameter(torch.zeros(2)) for _ in range(2))
+    frozen.requires_grad_(False)
+    value.grad = torch.ones(2)
+    step, _ = step_of({"value": torch.tensor([1.0, -2.0]), "frozen": torch.ones(2)}, photo=torch.tensor(3.0))
+    total(step, {"photo": 1.0}, {"value": value, "frozen": frozen})[0].backward()
+    assert value.grad.tolist() == [2.0, -1.0]
+    assert frozen.grad is None
+
+
+@pytest.mark.parametrize("given", [torch.ones(1), torch.ones(2, dtype=torch.float64)])
+def test_a_gradient_that_is_not_as_its_parameter_is_refused(given):
+    step, _ = step_of({"value": given}, photo=torch.tensor(3.0))
+    with pytest.raises(ValueError, match=r"a gradient of value as it is, \(2,\) torch.float32 on cpu"):
+        total(step, {"photo": 1.0}, {"value": torch.nn.Parameter(torch.zeros(2))})
 
 
 @pytest.mark.parametrize("every", [0, 1.5])

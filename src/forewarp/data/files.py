@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import math
 import operator
 import os
@@ -162,7 +163,7 @@ def scene_folder(root: str | Path, scene: str, marker: str) -> Path:
     if not scene or not (root / scene / marker).is_file():
         there = ", ".join(sorted(p.name for p in root.iterdir() if (p / marker).is_file())) or "none"
         advice = f"scenes in {root}: {there}"
-        deeper = sorted(root.glob(f"*/{scene}/{marker}")) if scene and "*" not in scene else []
+        deeper = sorted(root.glob(f"*/{glob.escape(scene)}/{marker}")) if scene else []
         if deeper:
             advice = f"did you mean data.root={deeper[0].parents[len(Path(scene).parts)]}?"
         if (root / marker).is_file():

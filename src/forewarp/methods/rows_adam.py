@@ -10,9 +10,15 @@ from forewarp.ops.adam import Learned, adam_rows
 
 
 class RowsAdam(torch.optim.Optimizer):
-    """See ``ops.adam``; a row is of a parameter's last axis. Its state follows ``methods.rows``."""
+    """See ``ops.adam``; a row is of a parameter's last axis. Its state follows ``methods.rows``.
+
+    Raises:
+        ValueError: for betas that are not in [0, 1).
+    """
 
     def __init__(self, groups: list[dict], *, betas=(0.9, 0.99), eps: float = 1e-15) -> None:
+        if not all(0 <= beta < 1 for beta in betas):
+            raise ValueError(f"betas: expected numbers from 0 to below 1, but got {betas}")
         super().__init__(groups, {"lr": 1e-3, "betas": betas, "eps": eps})
 
     @torch.no_grad()

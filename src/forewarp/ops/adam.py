@@ -37,7 +37,7 @@ def adam_rows(learned: Sequence[Learned], betas: tuple[float, float], eps: float
     made ``value -= rate m / (1 - b1^n) / (sqrt(v / (1 - b2^n)) + eps)``.
 
     Args:
-        learned: parameters. The kernel takes all that are contiguous, at one go.
+        learned: parameters. The kernel takes all that are contiguous, float32 and on the CPU, at one go.
         betas, eps: as of Adam.
 
     Raises:
@@ -62,9 +62,10 @@ def adam_rows(learned: Sequence[Learned], betas: tuple[float, float], eps: float
 
 def _quick(one: Learned) -> bool:
     """Whether the kernel takes it: it reads and writes float32 at addresses."""
-    kept = (one.value, one.mean, one.square, one.steps)
-    fits = all(t.is_contiguous() and t.dtype == torch.float32 for t in kept)
-    return fits and one.gradient.dtype == torch.float32 and use_numba(one.value) and one.value.numel() > 0
+    parts = one[:5]
+    fits = all(t.dtype == torch.float32 and t.device == one.value.device for t in parts)
+    kept = all(t.is_contiguous() for t in (one.value, *parts[2:]))  # a gradient may be copied
+    return fits and kept and use_numba(one.value) and one.value.numel() > 0
 
 
 def _by_kernel(learned: list[Learned], betas: tuple[float, float], eps: float) -> None:

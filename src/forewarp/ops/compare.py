@@ -191,7 +191,7 @@ def _way_back(
     kernels_chain.slopes_of(splats.numpy(), seen, ranks, sums.numpy(), factor, by_splat.numpy(), pull.numpy())
     gradients = [torch.zeros(t.shape) for t in particles[:4]]
     count, many = particles.colors.shape[:2]
-    room, colors, spots = room_for_colors(count, kinds or (many,))
+    room, colors, spots = room_for_colors(count, (many,) if kinds is None else kinds)
     maps = torch.zeros(threads, *inputs[5].shape)
     skin = torch.zeros(inputs[7].shape if by_skin else (0, 0))
     found_by = arrays(by_splat, *gradients, room, spots, maps, skin)

@@ -1,4 +1,4 @@
-"""Numba kernel behind ``adam``, by the rules of ``kernels_grid``."""
+"""Numba kernel behind ``adam``, by the rules of ``kernels_grid``, but that it takes addresses."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ def biases(first: float, second: float) -> np.ndarray:
     """What moments and roots of squares are multiplied by after n steps (n, 2), float32; the last is 1, and
     of all later.
     """
-    many = 1 + max(math.ceil(math.log(2.0**-25) / math.log(max(beta, 0.5))) for beta in (first, second))
+    least = 2.0**-25  # half of what 1 grows by to the next float32
+    many = 1 + max(math.ceil(math.log(least) / math.log(max(beta, 0.5))) for beta in (first, second))
     left, right = (beta ** np.arange(1, many + 1, dtype=np.float64) for beta in (first, second))
     found = np.stack([1 / (1 - left), np.sqrt(1 / (1 - right))], -1).astype(np.float32)
     return np.ascontiguousarray(np.concatenate([np.ones((1, 2), np.float32), found]))

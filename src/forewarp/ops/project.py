@@ -264,7 +264,7 @@ def room_for_colors(count: int, kinds: Sequence[int]) -> tuple[Tensor, tuple[Ten
     )
     starts = accumulate(kinds, initial=0)
     spots = [(3 * (count * start + j), 3 * k) for start, k in zip(starts, kinds) for j in range(k)]
-    return room, parts, torch.tensor(spots)
+    return room, parts, torch.tensor(spots, dtype=torch.int64).reshape(-1, 2)
 
 
 def projected(
@@ -302,13 +302,13 @@ class _Project(torch.autograd.Function):
 
         shares = match_threads()
         *inputs, out = ctx.saved_tensors
-        found = [torch.zeros(t.shape) for t in inputs[:5]]
+        found = [torch.zeros(t.shape) for t in inputs[:4]]
         maps = inputs[5].new_zeros(shares, *inputs[5].shape)
         weights = torch.zeros(inputs[7].shape)
         order = (out[:, 10] > 0).nonzero()[:, 0].int()
         rows = slopes.new_zeros(whole(len(order)), kernels_chain.SLOPES)
         rows[: len(order), : slopes.shape[1]] = slopes[order.long()]
-        colors, (found[4],), spots = room_for_colors(len(inputs[0]), (inputs[4].shape[1],))
-        given = arrays(*inputs, out, order, rows, *found[:4], colors, spots, maps, weights)
+        room, colors, spots = room_for_colors(len(inputs[0]), (inputs[4].shape[1],))
+        given = arrays(*inputs, out, order, rows, *found, room, spots, maps, weights)
         kernels_chain.chain(*given, False)
-        return *found, maps.sum(0)[:, :12], None, weights, None, None, None
+        return *found, *colors, maps.sum(0)[:, :12], None, weights, None, None, None

@@ -88,20 +88,34 @@ def total(step: Step, factors: Mapping[str, float], parameters: Mapping[str, Ten
                 f"model: expected gradients of some of {', '.join(parameters)}, but got "
                 f"{', '.join(step.gradients) or 'none'}"
             )
+        for name, value in step.gradients.items():
+            own = parameters[name]
+            if (value.shape, value.dtype, value.device) != (own.shape, own.dtype, own.device):
+                raise ValueError(
+                    f"model: expected a gradient of {name} as it is, {tuple(own.shape)} {own.dtype} on "
+                    f"{own.device}, but got {tuple(value.shape)} {value.dtype} on {value.device}"
+                )
         loss = _handing_over(loss, dict(step.gradients), parameters)
     return loss, raw
 
 
 def _handing_over(loss: Tensor, gradients: dict[str, Tensor], parameters: Mapping[str, Tensor]) -> Tensor:
-    """A loss without a graph; ``backward`` hands over, once, gradients that the method computed itself."""
+    """A loss without a graph; ``backward`` hands over, once, gradients that the method computed itself.
+
+    They are not copied: what is done to ``.grad`` in place is done to them.
+    """
     loss = loss.detach().requires_grad_()
 
     def hand_over(slope: Tensor) -> None:
+        if not gradients:
+            raise RuntimeError("loss: expected to be led back once, but it was twice")
         scaled = slope.device.type != "cpu" or float(slope) != 1
         while gradients:
             name, value = gradients.popitem()
-            parameter, value = parameters[name], slope * value if scaled else value
-            parameter.grad = value if parameter.grad is None else parameter.grad + value
+            parameter = parameters[name]
+            if parameter.requires_grad:
+                value = slope * value if scaled else value
+                parameter.grad = value if parameter.grad is None else parameter.grad + value
 
     loss.register_hook(hand_over)
     return loss

@@ -36,7 +36,7 @@ def by_name(method: Method, gradients: Gaussians) -> dict[str, Tensor]:
     found["opacity"] = gradients.opacity[:, :1]
     if method.fade is not None:
         found["fade"] = gradients.opacity[:, 1:]
-    return found | dict(zip(_kinds(method), gradients.colors))
+    return found | dict(zip(_kinds(method), gradients.colors, strict=True))
 
 
 def add(total: dict[str, Tensor], found: Mapping[str, Tensor]) -> None:
