@@ -99,18 +99,18 @@ def test_what_was_measured_otherwise_is_not_compared(tmp_path):
     assert "* Other: " in text
 
 
-def test_runs_that_ended_early_stand_where_they_ended(tmp_path, monkeypatch):
+def test_runs_that_ended_early_or_late_stand_where_they_ended(tmp_path, monkeypatch):
     drawn = {}
     monkeypatch.setattr("forewarp.report.by_method._draw", lambda groups, *rest: drawn.update(groups))
     for method in ("particles", "forward"):
-        measured(tmp_path / "runs", method, 0.5, 29.0, took=30.0)
+        measured(tmp_path / "runs", method, 0.5, 29.0, took=50.0 if method == "forward" else 30.0)
         measured(tmp_path / "runs", method, 1.0, 30.0, took=60.0)
         measured(tmp_path / "runs", method, 20.0, 31.0, took=300.0 if method == "particles" else 1200.0)
     text = page_of(tmp_path, published=[Published("Toy", 60.0, 20.0, "a CPU", "a page", "toy")])[
         0
     ].read_text()
     assert rows_of(text, "`particles`")[0][2:4] == ["30.00", "31.00 (ended after 5 min)"]
-    assert rows_of(text, "`forward`")[0][2:4] == ["30.00", "31.00"]
+    assert rows_of(text, "`forward`")[0][1:4] == ["29.00 (took 50 s)", "30.00", "31.00"]
     assert [_seconds(group) for group in drawn["particles"]] == [30.0, 60.0, 300.0]
     assert "Toy" not in text  # of no scene of the page
     pages = {path.name: path.read_text() for path in (tmp_path / "out").glob("*.md")}

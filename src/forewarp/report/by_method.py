@@ -15,8 +15,8 @@ from forewarp.report.minutes_sections import Group, alike, is_plain
 from forewarp.report.run_rows import (
     CLOCKS,
     CONDITIONS,
+    another_length,
     commands,
-    ended_early,
     estimate,
     key_of,
     length,
@@ -112,9 +112,9 @@ def _table(groups: Mapping[str, Sequence[Group]]) -> Table:
 
 
 def _cell(group: Group) -> Estimate | str:
-    """A group's PSNR, with a word where its runs ended before their minutes."""
-    found, early = estimate(group, "psnr"), ended_early(group)
-    return found if early is None else f"{Column('').text(found)} (ended after {length(early)})"
+    """A group's PSNR, with a word where its runs took other minutes than theirs."""
+    found, words = estimate(group, "psnr"), another_length(group)
+    return f"{Column('').text(found)}{words}" if words else found
 
 
 def _seconds(rows: Group) -> float:

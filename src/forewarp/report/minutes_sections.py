@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable, Iterable, Sequence
 
 from forewarp.metrics.gain import Estimate
-from forewarp.report.run_rows import ABILITIES, CONDITIONS, ended_early, estimate, key_of, length, telling
+from forewarp.report.run_rows import ABILITIES, CONDITIONS, another_length, estimate, key_of, length, telling
 from forewarp.report.tables import Cell, Column, Table
 
 NOISE = 0.2  # dB that chance may take: with more of something PSNR may be this much lower
@@ -26,15 +26,12 @@ def alike(rows: Iterable[dict]) -> list[Group]:
 
 
 def minutes_of(group: Group) -> str:
-    """The minutes of a group's runs; where they ended earlier, after how many.
+    """The minutes of a group's runs; where they took others, how many.
 
     >>> minutes_of([{"clock": "wall", "wall": 301.0, "minutes": 20.0}])
     '20 (ended after 5 min)'
     """
-    early = ended_early(group)
-    return length(group[0]["minutes"]).removesuffix(" min") + (
-        "" if early is None else f" (ended after {length(early)})"
-    )
+    return length(group[0]["minutes"]).removesuffix(" min") + another_length(group)
 
 
 def size_in(group: Group) -> float:

@@ -36,6 +36,7 @@ work on the machine and, with one thread, equals the wall clock on an idle one."
 DENSITY = re.compile(r"\sstage\.fine\.density=([\d.]+)")  # in a command
 STEPS_PER_PICTURE = re.compile(r"\sstage\.fine\.steps_per_picture=(\S+)")
 EARLY = 0.95  # of its minutes: a run that took less ended by its steps
+LATE = 1.5  # of its minutes: a run that took more had a last step that took long
 _ENDS = 0.1  # share of the time that counts as its first and last part
 _MOST = 1 << 24  # bytes of a table that is read back
 
@@ -206,9 +207,29 @@ def ended_early(rows: Sequence[dict]) -> float | None:
     >>> ended_early([{"clock": "processor", "processor": 300.0, "minutes": 20.0}])
     5.0
     """
-    taken = [row[row["clock"]] for row in rows if row[row["clock"]] is not None]
-    minutes = statistics.fmean(taken) / 60 if taken else None
+    minutes = _taken(rows)
     return minutes if minutes is not None and minutes < EARLY * rows[0]["minutes"] else None
+
+
+def another_length(rows: Sequence[dict]) -> str:
+    """Words for runs that took other minutes than theirs: less by their steps, or more by a long last step.
+
+    >>> another_length([{"clock": "wall", "wall": 301.0, "minutes": 20.0}])
+    ' (ended after 5 min)'
+    >>> another_length([{"clock": "wall", "wall": 36.2, "minutes": 1 / 6}])
+    ' (took 36 s)'
+    """
+    early, taken = ended_early(rows), _taken(rows)
+    if early is not None:
+        return f" (ended after {length(early)})"
+    late = taken is not None and taken > LATE * rows[0]["minutes"]
+    return f" (took {length(taken)})" if late else ""
+
+
+def _taken(rows: Sequence[dict]) -> float | None:
+    """The mean minutes that runs took, by the clock that theirs are of; None where none is known."""
+    taken = [row[row["clock"]] for row in rows if row[row["clock"]] is not None]
+    return statistics.fmean(taken) / 60 if taken else None
 
 
 def _csv(rows: list[dict]) -> str:
