@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Iterable, Mapping
 
 import lightning
 import torch
@@ -67,11 +68,16 @@ class DynamicSceneModule(lightning.LightningModule):
         """Return the loss of one batch: the weighted sum of the method's terms."""
         factors = self.objective.factors(self.global_step)
         step = self.look(batch, factors)
-        loss, raw = total(
-            step, factors, dict(self.method.named_parameters()) if step.gradients is not None else {}
-        )
+        loss, raw = total(step, factors, self._named(step.gradients or ()))
         self._remember(batch, step, loss, raw)
         return loss
+
+    def _named(self, names: Iterable[str]) -> dict[str, Tensor]:
+        """The method's parameters of these names; all of them, where one of the names is of none."""
+        try:
+            return {name: self.method.get_parameter(name) for name in names}
+        except AttributeError:
+            return dict(self.method.named_parameters())
 
     def look(self, batch: Batch, factors: Mapping[str, float]) -> Step:
         """Let the method compare itself with a batch."""
@@ -91,7 +97,7 @@ class DynamicSceneModule(lightning.LightningModule):
         self.curriculum.report(batch.frame, error)
         self.last = {
             "loss": float(loss.detach()),
-            "psnr": -10 * torch.log10(torch.tensor(max(error, 1e-10))).item(),
+            "psnr": -10 * math.log10(max(error, 1e-10)),
             "frames_in_play": self.curriculum.in_play,
             **self._noted,
             **step.noted,
@@ -142,6 +148,12 @@ class DynamicSceneModule(lightning.LightningModule):
             lr = float(self.settings.lr[kind])
             groups.append({"params": parameters, "lr": lr, "base_lr": lr, "name": kind})
         return self.method.optimizer(groups)
+
+    def optimizer_zero_grad(self, epoch, batch_idx, optimizer) -> None:
+        """Forget the gradients of the step before, at less cost than PyTorch's own way."""
+        for group in optimizer.param_groups:
+            for parameter in group["params"]:
+                parameter.grad = None
 
     def configure_gradient_clipping(
         self, optimizer, gradient_clip_val=None, gradient_clip_algorithm=None

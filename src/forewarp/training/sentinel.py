@@ -139,10 +139,11 @@ class Sentinel(lightning.Callback):
     def on_before_optimizer_step(self, trainer, module, optimizer) -> None:
         """Check the gradients; drop those of a step to skip, so that Adam does nothing."""
         if not self._drop and not _rescales(trainer):
-            named = [(n, p.grad) for n, p in module.method.named_parameters() if p.grad is not None]
-            # A norm may overflow where no entry's square does.
-            if not all_finite(g for _, g in named) and (name := first_bad(named, squared=True)):
-                self._stop(trainer, module, Found("gradient", name), may_skip=True)
+            learned = (p for group in optimizer.param_groups for p in group["params"])
+            if not all_finite(p.grad for p in learned if p.grad is not None):
+                named = [(name, p.grad) for name, p in module.method.named_parameters()]
+                if name := first_bad(named, squared=True):  # a norm may overflow where no entry's square does
+                    self._stop(trainer, module, Found("gradient", name), may_skip=True)
         if self._drop:
             for parameter in module.method.parameters():
                 parameter.grad = None
