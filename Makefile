@@ -57,8 +57,7 @@ demo: ## fit the procedural vehicle by three methods, two at once, compare, make
 	$(BIN)/forewarp-render run=$(DEMO)/particles path=both
 
 # Kernels of particles compile for half a minute the first time, beside the others' training.
-demo-particles: DEMO_MINUTES := 0.5
-demo-forward demo-backward: DEMO_MINUTES := 0.5
+DEMO_MINUTES := 0.3
 demo-particles demo-forward demo-backward: demo-%:
 	$(BIN)/forewarp-train experiment=demo model=$* threads=1 budget.minutes=$(DEMO_MINUTES) run=$(DEMO)/$* $(SAYS)
 
