@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit, prange
 
 from forewarp.ops.lanes import not_zero, root, where_bits
-from forewarp.ops.lanes_arrays import floats_at, get_from, put_to, room, row_of
+from forewarp.ops.lanes_arrays import floats_at, get_row, put_row, room, row_of
 
 _WORD = 64  # numbers that are treated together: a bit each says which
 
@@ -40,7 +40,7 @@ def _seen(gradient, start, count, width):
     """A bit for the first of each ``width`` of so many numbers, where any of these is not 0."""
     bits = np.uint64(0)
     for c in range(count // 16):
-        bits |= not_zero(get_from(gradient, start + 16 * c)) << np.uint64(16 * c)
+        bits |= not_zero(get_row(gradient, start + 16 * c)) << np.uint64(16 * c)
     seen, first = bits, np.uint64(0)
     for c in range(1, width):
         seen |= bits >> np.uint64(c)
@@ -91,16 +91,16 @@ def adam(table, rates, first, second, eps, bias):
                 each = seen * np.uint64((1 << width) - 1)  # all of a row's bits
                 for c in range(many // 16):
                     at, here = start + 16 * c, each >> np.uint64(16 * c)
-                    g, m = get_from(gradient, at), get_from(mean, at)
-                    v, x = get_from(square, at), get_from(value, at)
+                    g, m = get_row(gradient, at), get_row(mean, at)
+                    v, x = get_row(square, at), get_row(value, at)
                     m, v = where_bits(here, m + (g - m) * c1, m), where_bits(here, v + (g * g - v) * c2, v)
-                    put_to(mean, at, m)
-                    put_to(square, at, v)
+                    put_row(mean, at, m)
+                    put_row(square, at, v)
                     if known:
                         moved = x - rate * m / (root(v) + small)
                     else:
                         moved = x - row_of(paces, c) * m / (row_of(scales, c) * root(v) + small)
-                    put_to(value, at, where_bits(here, moved, x))
+                    put_row(value, at, where_bits(here, moved, x))
             done = together * blocks
             for row in range(done + (rows - done) * chunk // 64, done + (rows - done) * (chunk + 1) // 64):
                 any_seen = False

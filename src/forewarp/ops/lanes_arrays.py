@@ -84,32 +84,6 @@ def floats_at(typing, address):
     return types.CPointer(types.float32)(types.int64), code
 
 
-def _vector(builder, place, index):
-    """Pointer to 16 numbers from ``place[index]`` on."""
-    return builder.bitcast(builder.gep(place, [index]), ir.VectorType(FLOAT, NARROW).as_pointer())
-
-
-@intrinsic
-def get_from(typing, place, index):
-    """Read ``place[index : index + 16]`` of a ``room`` or of ``floats_at``."""
-
-    def code(context, builder, sig, args):
-        return builder.load(_vector(builder, *args), align=4)
-
-    return SUMS(place, types.intp), code
-
-
-@intrinsic
-def put_to(typing, place, index, value):
-    """Write ``place[index : index + 16]``, as ``get_from`` reads it."""
-
-    def code(context, builder, sig, args):
-        builder.store(args[2], _vector(builder, *args[:2]), align=4)
-        return context.get_dummy_value()
-
-    return types.none(place, types.intp, value), code
-
-
 def _row(builder, place, index):
     """Pointer to a row of a ``room``, as a vector."""
     kind = ir.VectorType(FLOAT, NARROW).as_pointer()
@@ -139,7 +113,7 @@ def set_row(typing, place, index, value):
 
 @intrinsic
 def get_row(typing, array, row):
-    """Read ``array[row, :16]``, or ``array[row : row + 16]``."""
+    """Read ``array[row, :16]``, or ``array[row : row + 16]``, also of ``floats_at``."""
 
     def code(context, builder, sig, args):
         return builder.load(_array_row(context, builder, sig.args[0], *args), align=4)
@@ -149,7 +123,7 @@ def get_row(typing, array, row):
 
 @intrinsic
 def put_row(typing, array, row, value):
-    """Write 16 numbers to ``array[row, :16]``, or ``array[row : row + 16]``."""
+    """Write 16 numbers to ``array[row, :16]``, or ``array[row : row + 16]``, also of ``floats_at``."""
 
     def code(context, builder, sig, args):
         builder.store(args[2], _array_row(context, builder, sig.args[0], *args[:2]), align=4)
@@ -159,6 +133,8 @@ def put_row(typing, array, row, value):
 
 
 def _array_row(context, builder, kind, array, row):
+    if isinstance(kind, types.CPointer):
+        return builder.bitcast(builder.gep(array, [row]), ir.VectorType(FLOAT, NARROW).as_pointer())
     zeros = [context.get_constant(types.intp, 0)] * (kind.ndim - 1)
     pointer = _address(context, builder, kind, array, [row, *zeros])
     return builder.bitcast(pointer, ir.VectorType(FLOAT, NARROW).as_pointer())
