@@ -169,11 +169,11 @@ def parts_table(size: Size = Size()) -> str:  # noqa: B008
     for name, seconds in own.items():
         slow = plain.get(name)
         beside = ["", ""] if slow is None else [milliseconds(slow), f"{slow / seconds:.0f}"]
-        lines.append([name, milliseconds(seconds), f"{seconds / unit:.2f}", *beside])
+        lines.append([name, milliseconds(seconds), f"{seconds / unit:.3g}", *beside])
     inside = sum(s for name, s in own.items() if name != "forward: a picture's")
     rest = ["all else of a step: drawing the batch, PyTorch, Python", step - inside]
     for name, seconds in (rest, ["**a whole step**", step], ["**a picture**", picture]):
-        lines.append([name, milliseconds(seconds), f"{seconds / unit:.2f}", "", ""])
+        lines.append([name, milliseconds(seconds), f"{seconds / unit:.3g}", "", ""])
     lines.append(["a million exponentials by PyTorch", milliseconds(unit), "1.00", "", ""])
     return table(["part", "ms", "against exponentials", "plain PyTorch, ms", "times faster"], lines)
 
