@@ -219,6 +219,17 @@ def test_a_picture_takes_opacity_of_what_it_shows_as_the_rate_falls(data, share)
     assert torch.equal(method.opacity.data, before)
 
 
+def test_what_is_crowded_decays(data):
+    module = module_with(data, numbers={"opacity_decay": 0.1, "crowd_decay": 0.5, "density": 400.0})
+    method, optimizer = module.method, module.configure_optimizers()
+    most = float(method.most)
+    assert most > 2 * float(method.covered)
+    for covered, wanted in ((most / 4, 1 - 0.9 * (1 - 0.375)), (most, 0.1), (2 * most, 0.1), (0.0, 0.55)):
+        method.covered.fill_(covered)
+        method.advance(0.5, 0, optimizer)
+        assert method.decay == pytest.approx(wanted)
+
+
 def test_particles_grow_to_what_the_pictures_call_for(data):
     numbers = {"every": 0.1, "first": 0.5, "settled": 1.0, "density": 400.0}  # some hundreds, of 6 pictures
     module = module_with(data, numbers=numbers)

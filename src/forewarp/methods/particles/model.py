@@ -273,7 +273,8 @@ class Particles(Method):
                 if self.nodes.offsets.learns:
                     self.nodes.offsets.settle(group["lr"])
             elif group["name"] == "opacity":
-                self.decay = numbers.opacity_decay * group["lr"] / (group["base_lr"] or 1.0)
+                share = numbers.decay(float(self.most), float(self.covered))
+                self.decay = share * group["lr"] / (group["base_lr"] or 1.0)
             elif group["name"] == "skin":
                 group["lr"] *= told_by(self.views)
         number = int(progress / numbers.every)

@@ -40,6 +40,8 @@ class Numbers:
             times; learned from ``calm`` on, of splines alone; 0: times are used as they are given.
         opacity_decay: share of their opacity that a picture takes from the particles that it shows, while the
             rate of opacity is its first; as that falls, so does the share.
+        crowd_decay: what a picture takes besides, times the share of the particles that is more than one a
+            covered pixel, of which a picture cannot tell where each is.
         loose: what is left of the weight of ``rigid`` at the end.
         name: name of the stage.
 
@@ -63,6 +65,7 @@ class Numbers:
     calm: float = 0.4
     time_offsets: float = 0.0
     opacity_decay: float = 0.0
+    crowd_decay: float = 0.0
     loose: float = 0.17
     name: str = "fine"
 
@@ -78,7 +81,7 @@ class Numbers:
             (("first", "every", "loose", "full"), "a number in (0, 1]", lambda value: 0 < value <= 1),
             (("density", "nodes", "knots", "calm"), "a number > 0", lambda value: value > 0),
             (("edges", "relink"), "a whole number >= 1", lambda value: value >= 1 and value == int(value)),
-            (("opacity_decay",), "a number in [0, 1)", lambda value: 0 <= value < 1),
+            (("opacity_decay", "crowd_decay"), "a number in [0, 1)", lambda value: 0 <= value < 1),
             (("jitter", "settled", "rest", "time_offsets"), "a number >= 0", lambda value: value >= 0),
         ):
             for key in keys:
@@ -93,6 +96,16 @@ class Numbers:
         (12728, 6364)
         """
         return max(32, round(self.density * math.sqrt(covered * told_by(views))))
+
+    def decay(self, most: float, covered: float) -> float:
+        """The share of their opacity that a picture takes from particles, by how crowded its pixels are.
+
+        >>> numbers = Numbers(crowd_decay=2.5e-3)
+        >>> numbers.decay(10_000.0, 20_000.0), numbers.decay(10_000.0, 2000.0)
+        (0.0, 0.002)
+        """
+        crowd = max(0.0, 1 - covered / most)
+        return self.opacity_decay + self.crowd_decay * crowd * (1 - self.opacity_decay)
 
     def share_at(self, progress: float) -> float:
         """The share of them that there should be: on a line from ``first``; soon before ``settled``, all."""
