@@ -122,7 +122,8 @@ def run_of(size: Size, steps: int, folder: Path, effects: Sequence[str] = ()) ->
     config = composed(
         "model=particles", "trainer=cpu", "~stage.coarse", "callbacks.pictures=null", f"run={folder}",
         "budget.minutes=null", f"budget.iterations={steps}", f"stage.fine.nodes={nodes}",
-        "stage.fine.first=1.0", "stage.fine.every=1.0", "stage.fine.density=1000", *effects,
+        "stage.fine.first=1.0", "stage.fine.every=1.0", "stage.fine.density=1000",
+        "stage.fine.crowd_decay=0.0", *effects,  # as hook, which has fewer particles than pixels
     )  # fmt: skip
     run = build_run(config)
     data = SceneDataModule(

@@ -173,7 +173,7 @@ def _way_back(
 
     kept = kept_for(tiles)
     threads = len(kept)
-    sums = torch.zeros(threads, len(tiles.order), kernels_rasterize.GRADIENT)
+    sums = torch.empty(threads, len(tiles.order), kernels_rasterize.GRADIENT)
     found = torch.zeros(threads, 2, dtype=torch.float64)
     kernels_rasterize.compare(
         tiles.records,
@@ -189,11 +189,11 @@ def _way_back(
     by_splat = torch.empty(whole(len(seen)), kernels_chain.SLOPES)
     pull = torch.zeros(len(particles.means))
     kernels_chain.slopes_of(splats.numpy(), seen, ranks, sums.numpy(), factor, by_splat.numpy(), pull.numpy())
-    gradients = [torch.zeros(t.shape) for t in particles[:4]]
+    gradients = [torch.empty(t.shape) for t in particles[:4]]
     count, many = particles.colors.shape[:2]
     room, colors, spots = room_for_colors(count, (many,) if kinds is None else kinds)
     maps = torch.zeros(threads, *inputs[5].shape)
-    skin = torch.zeros(inputs[7].shape if by_skin else (0, 0))
+    skin = torch.empty(inputs[7].shape if by_skin else (0, 0))
     found_by = arrays(by_splat, *gradients, room, spots, maps, skin)
     kernels_chain.chain(*inputs, splats.numpy(), seen, *found_by, True)
     loss, squared = found.sum(0).tolist()

@@ -265,22 +265,48 @@ def _of_shape(view, moved, log_scales, quaternions, which, valid, place, to_scal
     return product(back, _transposed(turn))
 
 
+@njit(inline="always")
+def _own_rows(seen, share, shares, total):
+    """A thread's rows of ``total``: from the first that its blocks of ``seen`` write to, to that of the next
+    thread; the first one's begin at 0.
+    """
+    blocks, first, end = (len(seen) + SIDE_BY_SIDE - 1) // SIDE_BY_SIDE, 0, total
+    if share > 0:
+        k = SIDE_BY_SIDE * (blocks * share // shares)
+        first = seen[k] if k < len(seen) else total
+    if share + 1 < shares:
+        k = SIDE_BY_SIDE * (blocks * (share + 1) // shares)
+        end = seen[k] if k < len(seen) else total
+    return first, end
+
+
 @njit(parallel=True, cache=True)
 def chain(  # long: sixteen particles' way back, step by step
     means, log_scales, quaternions, opacity, colors, maps, links, weights, view, tints, fades,
     splats, seen, slopes,
     to_means, to_scales, to_quaternions, to_opacity, to_colors, spots, to_maps, to_weights, softmax,
 ):  # fmt: skip
-    """From slopes (V', 16) of the particles ``seen`` (V,) to those by all particles, and by maps.
+    """From slopes (V', 16) of the particles ``seen`` (V,), the lowest first, to those by all particles, and
+    by maps; those of what is not seen are 0.
 
     ``to_colors``: those by coefficient k of particle i begin at ``spots[k, 0] + i spots[k, 1]``.
-    ``to_maps`` (S, M, 16): each thread has its own. ``to_weights`` (N, L), or empty: by weights, or by the
-    numbers whose ``softmax`` they are.
+    ``to_maps`` (S, M, 16): each thread adds to its own. ``to_weights`` (N, L), or empty: by weights, or by
+    the numbers whose ``softmax`` they are.
     """
     count, shares = len(seen), to_maps.shape[0]
     blocks = (count + SIDE_BY_SIDE - 1) // SIDE_BY_SIDE
     for share in prange(shares):
         place, which = room(_ROWS), np.empty(SIDE_BY_SIDE, np.intp)
+        first, end = _own_rows(seen, share, shares, len(means))
+        to_means[first:end] = 0
+        to_scales[first:end] = 0
+        to_quaternions[first:end] = 0
+        to_opacity[first:end] = 0
+        to_weights[first:end] = 0
+        for k in range(len(spots)):
+            for i in range(first, end):
+                at = np.uintp(spots[k, 0] + i * spots[k, 1])
+                to_colors[at], to_colors[at + 1], to_colors[at + 2] = 0, 0, 0
         for block in range(blocks * share // shares, blocks * (share + 1) // shares):
             start = SIDE_BY_SIDE * block
             valid = min(SIDE_BY_SIDE, count - start)

@@ -209,12 +209,13 @@ def compare(records, entries, ends, shares, pixels, background, width, kept, sum
 
     The loss is the sum over pixels and channels of ``sqrt(e^2 + width^2) - width``; a tile is not looked at
     again. ``pixels`` (H, W) uint32 are straight RGBA. Into ``found`` (S, 2) go loss and squared error,
-    into ``sums`` (S, V, 16) the gradients.
+    into ``sums`` (S, V, 16) the gradients; whatever was there before is gone.
     """
     across = (pixels.shape[1] + SIDE - 1) // SIDE
     for share in prange(len(shares) - 1):
         patch, full = np.zeros((SIDE, SIDE), np.uint32), np.ones((SIDE, SIDE), np.float32)
         edge, score = np.zeros((SIDE, SIDE), np.float32), np.zeros(2, np.float64)
+        sums[share] = 0
         for tile in range(shares[share], shares[share + 1]):
             row, column = SIDE * (tile // across), SIDE * (tile % across)
             left, y = np.float32(column), rows() + row

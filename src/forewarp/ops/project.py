@@ -255,10 +255,10 @@ def arrays(*tensors: Tensor) -> tuple:
 
 
 def room_for_colors(count: int, kinds: Sequence[int]) -> tuple[Tensor, tuple[Tensor, ...], Tensor]:
-    """Room, 0 throughout, for gradients by the colours of so many particles, ``kinds`` coefficients each in a
-    tensor of its own: the room, these tensors (N, k, 3), and where the kernel finds them in it.
+    """Room for gradients by the colours of so many particles, ``kinds`` coefficients each in a tensor of its
+    own: the room, which the kernel fills, these tensors (N, k, 3), and where the kernel finds them in it.
     """
-    room = torch.zeros(3 * count * sum(kinds))
+    room = torch.empty(3 * count * sum(kinds))
     parts = tuple(
         part.view(count, k, 3) for part, k in zip(room.split([3 * count * k for k in kinds]), kinds)
     )
@@ -302,9 +302,9 @@ class _Project(torch.autograd.Function):
 
         shares = match_threads()
         *inputs, out = ctx.saved_tensors
-        found = [torch.zeros(t.shape) for t in inputs[:4]]
+        found = [torch.empty(t.shape) for t in inputs[:4]]
         maps = inputs[5].new_zeros(shares, *inputs[5].shape)
-        weights = torch.zeros(inputs[7].shape)
+        weights = torch.empty(inputs[7].shape)
         order = (out[:, 10] > 0).nonzero()[:, 0].int()
         rows = slopes.new_zeros(whole(len(order)), kernels_chain.SLOPES)
         rows[: len(order), : slopes.shape[1]] = slopes[order.long()]
