@@ -3,8 +3,10 @@ import math
 import pytest
 import torch
 
+from forewarp.ops import compare as compare_module
+from forewarp.ops import project as project_module
 from forewarp.ops.compare import compare
-from forewarp.ops.project import Gaussians
+from forewarp.ops.project import Gaussians, project
 from tests.support.gaussians import NO_FADES, NO_TINTS, SIZE, crowd, one, pinhole, still, straight
 
 
@@ -116,6 +118,42 @@ def test_not_a_number_is_told(backend):
     truth = torch.zeros(256, 4, dtype=torch.uint8)
     found = compare(broken, still(broken), straight(), NO_TINTS, NO_FADES, truth, torch.ones(3))
     assert not math.isfinite(found.loss)
+
+
+@pytest.fixture
+def uncleared():
+    """New memory holds NaN, as what a kernel forgets to write may hold anything."""
+    before = torch.are_deterministic_algorithms_enabled()
+    torch.use_deterministic_algorithms(True)
+    assert bool(torch.empty(1).isnan())
+    yield
+    torch.use_deterministic_algorithms(before)
+
+
+@pytest.mark.parametrize("threads", [1, 2, 3])
+@pytest.mark.parametrize("seen", [slice(0, 0), slice(0, 1), slice(20, 45), slice(59, 60), slice(0, 60)])
+def test_what_is_not_seen_has_a_gradient_of_zero(uncleared, two_threads, monkeypatch, threads, seen):
+    monkeypatch.setattr(compare_module, "match_threads", lambda: threads)
+    monkeypatch.setattr(project_module, "match_threads", lambda: threads)
+    particles, warp, tints, fades = crowd(count=60, dtype=torch.float32)
+    hidden = torch.ones(60, dtype=torch.bool)
+    hidden[seen] = False
+    particles.opacity[hidden] = -100 * fades.sign()
+    rest = (pinhole(), tints, fades, pixels(), BEHIND)
+    kinds = (1, particles.colors.shape[1] - 3, 2)
+    found = compare(particles, warp, *rest, by_skin=True, kinds=kinds)
+    for part in (*found.particles[:4], *found.particles.colors, found.skin, found.pull):
+        assert bool(part.isfinite().all())
+        assert not bool(part[hidden].any())
+    assert bool(found.maps.isfinite().all())
+    assert bool(found.pull.any()) == (not bool(hidden.all()))
+
+    leaves = [part.clone().requires_grad_() for part in (*particles, warp.weights)]
+    own = warp._replace(weights=leaves[5])
+    project(Gaussians(*leaves[:5]), own, pinhole(), tints, fades).numbers.sum().backward()
+    for leaf in leaves:
+        assert bool(leaf.grad.isfinite().all())
+        assert not bool(leaf.grad[hidden].any())
 
 
 def test_two_threads_give_the_same(two_threads):
