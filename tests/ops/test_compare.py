@@ -1,10 +1,14 @@
 import math
 
+import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
 from forewarp.ops import compare as compare_module
 from forewarp.ops import project as project_module
+from forewarp.ops.backend import numba_installed
 from forewarp.ops.compare import compare
 from forewarp.ops.project import Gaussians, project
 from tests.support.gaussians import NO_FADES, NO_TINTS, SIZE, crowd, one, pinhole, still, straight
@@ -125,9 +129,11 @@ def uncleared():
     """New memory holds NaN, as what a kernel forgets to write may hold anything."""
     before = torch.are_deterministic_algorithms_enabled()
     torch.use_deterministic_algorithms(True)
-    assert bool(torch.empty(1).isnan())
-    yield
-    torch.use_deterministic_algorithms(before)
+    try:
+        assert bool(torch.empty(1).isnan())
+        yield
+    finally:
+        torch.use_deterministic_algorithms(before)
 
 
 @pytest.mark.parametrize("threads", [1, 2, 3])
@@ -141,6 +147,7 @@ def test_what_is_not_seen_has_a_gradient_of_zero(uncleared, two_threads, monkeyp
     particles.opacity[hidden] = -100 * fades.sign()
     rest = (pinhole(), tints, fades, pixels(), BEHIND)
     kinds = (1, particles.colors.shape[1] - 3, 2)
+    assert compare(particles, warp, *rest).skin is None
     found = compare(particles, warp, *rest, by_skin=True, kinds=kinds)
     for part in (*found.particles[:4], *found.particles.colors, found.skin, found.pull):
         assert bool(part.isfinite().all())
@@ -154,6 +161,27 @@ def test_what_is_not_seen_has_a_gradient_of_zero(uncleared, two_threads, monkeyp
     for leaf in leaves:
         assert bool(leaf.grad.isfinite().all())
         assert not bool(leaf.grad[hidden].any())
+
+
+@pytest.mark.skipif(not numba_installed(), reason="needs Numba")
+@given(
+    rows=st.integers(0, 60).flatmap(
+        lambda total: st.tuples(st.just(total), st.lists(st.booleans(), min_size=total, max_size=total))
+    ),
+    shares=st.integers(1, 7),
+)
+def test_threads_clear_the_rows_that_they_write(rows, shares):
+    from forewarp.ops.kernels_chain import SIDE_BY_SIDE, _own_rows
+
+    total, shown = rows[0], np.flatnonzero(rows[1]).astype(np.int32)
+    blocks, end = -(-len(shown) // SIDE_BY_SIDE), 0
+    for share in range(shares):
+        first, after = _own_rows.py_func(shown, share, shares, total)
+        assert first == end <= after
+        low, high = (SIDE_BY_SIDE * (blocks * k // shares) for k in (share, share + 1))
+        assert all(first <= row < after for row in shown[low:high])
+        end = after
+    assert end == total
 
 
 def test_two_threads_give_the_same(two_threads):

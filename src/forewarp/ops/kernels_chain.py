@@ -267,8 +267,8 @@ def _of_shape(view, moved, log_scales, quaternions, which, valid, place, to_scal
 
 @njit(inline="always")
 def _own_rows(seen, share, shares, total):
-    """A thread's rows of ``total``: from the first that its blocks of ``seen`` write to, to that of the next
-    thread; the first one's begin at 0.
+    """Return a thread's rows of ``total``: from the first that its blocks of ``seen`` write to, to that of
+    the next thread; the first one's begin at 0.
     """
     blocks, first, end = (len(seen) + SIDE_BY_SIDE - 1) // SIDE_BY_SIDE, 0, total
     if share > 0:

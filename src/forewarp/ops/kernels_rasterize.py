@@ -144,9 +144,12 @@ def draw(records, entries, ends, shares, out):
 
 @njit(parallel=True, cache=True)
 def pull(records, entries, ends, shares, slopes, kept, sums):
-    """Gradients of ``draw``: ``slopes`` (5, H', W') of its five planes, into ``sums`` (S, V, 16)."""
+    """Gradients of ``draw``: ``slopes`` (5, H', W') of its five planes, into ``sums`` (S, V, 16); whatever
+    was there before is gone.
+    """
     across = slopes.shape[2] // SIDE
     for share in prange(len(shares) - 1):
+        sums[share] = 0
         for tile in range(shares[share], shares[share + 1]):
             first, last = ends[tile], ends[tile + 1]
             if first == last:

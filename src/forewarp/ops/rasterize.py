@@ -146,7 +146,7 @@ class _Rasterize(torch.autograd.Function):
         match_threads()
         tiles = ctx.tiles
         kept = kept_for(tiles)
-        sums = torch.zeros(len(kept), len(tiles.order), kernels_rasterize.GRADIENT)
+        sums = torch.empty(len(kept), len(tiles.order), kernels_rasterize.GRADIENT)
         kernels_rasterize.pull(
             tiles.records,
             tiles.entries,

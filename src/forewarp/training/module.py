@@ -19,6 +19,12 @@ from forewarp.training.objective import Objective, total
 from forewarp.training.schedule import Curriculum, StageSettings
 
 
+def _processes() -> int:
+    """How many processes train together."""
+    together = torch.distributed.is_available() and torch.distributed.is_initialized()
+    return torch.distributed.get_world_size() if together else 1
+
+
 class DynamicSceneModule(lightning.LightningModule):
     """Train a method for one stage of one scene.
 
@@ -68,16 +74,22 @@ class DynamicSceneModule(lightning.LightningModule):
         """Return the loss of one batch: the weighted sum of the method's terms."""
         factors = self.objective.factors(self.global_step)
         step = self.look(batch, factors)
-        loss, raw = total(step, factors, self._named(step.gradients or ()))
+        if step.gradients is not None and _processes() > 1:
+            raise ValueError(
+                f"trainer.devices: expected 1, as the method computes its gradients itself and processes "
+                f"would not share them, but got {_processes()} processes"
+            )
+        loss, raw = total(step, factors, self._named(step.gradients))
         self._remember(batch, step, loss, raw)
         return loss
 
-    def _named(self, names: Iterable[str]) -> dict[str, Tensor]:
-        """The method's parameters of these names; all of them, where one of the names is of none."""
+    def _named(self, names: Iterable[str] | None) -> dict[str, Tensor]:
+        """The method's parameters of these names; all of them, where there is no name or one of none."""
         try:
-            return {name: self.method.get_parameter(name) for name in names}
+            found = {name: self.method.get_parameter(name) for name in names or ()}
         except AttributeError:
-            return dict(self.method.named_parameters())
+            found = {}
+        return found if found or names is None else dict(self.method.named_parameters())
 
     def look(self, batch: Batch, factors: Mapping[str, float]) -> Step:
         """Let the method compare itself with a batch."""
@@ -160,7 +172,8 @@ class DynamicSceneModule(lightning.LightningModule):
     ) -> None:
         """Clip the gradients' norm to the stage's ``max_gradient``."""
         if self.settings.max_gradient > 0:
-            torch.nn.utils.clip_grad_norm_(self.method.parameters(), self.settings.max_gradient)
+            learned = [p for group in optimizer.param_groups for p in group["params"]]
+            torch.nn.utils.clip_grad_norm_(learned, self.settings.max_gradient)
 
     def on_save_checkpoint(self, checkpoint: dict) -> None:
         """Add all that a continued run needs to equal an uninterrupted one to the bit."""

@@ -208,6 +208,9 @@ def test_a_picture_takes_opacity_of_what_it_shows_as_the_rate_falls(data, share)
         method.advance(0.5, 0, optimizer)
         method.shown.zero_()
         look(module, data)
+        assert torch.equal(method.opacity.data, before)  # a step that is dropped changes nothing
+        method.opacity.grad = torch.zeros_like(method.opacity)
+        optimizer.step()
         wanted = torch.where(method.shown[:, None] > 0, 1 - factor * share, 1.0).double()
         assert 0 < int(method.shown.sum()) < len(wanted) - 3
         left = method.opacity.data.double().sigmoid() / before.double().sigmoid()
@@ -216,6 +219,19 @@ def test_a_picture_takes_opacity_of_what_it_shows_as_the_rate_falls(data, share)
     group["base_lr"] = group["lr"] = 0.0  # what does not learn does not decay
     method.advance(0.5, 0, optimizer)
     look(module, data)
+    optimizer.step()
+    assert torch.equal(method.opacity.data, before)
+
+
+def test_a_dropped_step_takes_no_opacity(data):
+    module = module_with(data, numbers={"opacity_decay": 0.1})
+    method, optimizer = module.method, module.configure_optimizers()
+    method.advance(0.5, 0, optimizer)
+    before = method.opacity.data.clone()
+    look(module, data)
+    optimizer.step()  # no gradients
+    method.opacity.grad = torch.zeros_like(method.opacity)
+    optimizer.step()  # nor is it made up for
     assert torch.equal(method.opacity.data, before)
 
 

@@ -66,6 +66,7 @@ class Particles(Method):
         on = Effects(**choices).only(self.numbers_of.effects, len(times))
         self.ends = min(times), max(times)
         self.progress = self.decay = 0.0
+        self.fading: list[Tensor] = []  # what each picture of this step showed
         before = start.before if isinstance(start.before, Particles) else None
         fresh = None if start.blank or before is not None else self._measured(start)
         self._make(before, fresh, on)
@@ -237,7 +238,8 @@ class Particles(Method):
         self.pulled.add_(found.pull)
         shown = found.pull > 0
         self.shown.add_(shown)
-        opacity.decay(self, shown, self.decay)
+        if self.decay > 0:
+            self.fading.append(shown)
         if self.progress < self.numbers_of.settled:
             self.idle[too_near(found.order, found.distances)] = math.inf
         add(total, by_name(self, found.particles))
@@ -274,7 +276,7 @@ class Particles(Method):
                     self.nodes.offsets.settle(group["lr"])
             elif group["name"] == "opacity":
                 share = numbers.decay(float(self.most), float(self.covered))
-                self.decay = share * group["lr"] / (group["base_lr"] or 1.0)
+                self.decay = min(0.99, share * group["lr"] / (group["base_lr"] or 1.0))
             elif group["name"] == "skin":
                 group["lr"] *= told_by(self.views)
         number = int(progress / numbers.every)
@@ -310,8 +312,17 @@ class Particles(Method):
         return groups
 
     def optimizer(self, groups: list[dict]) -> torch.optim.Optimizer:
-        """Adam by rows."""
-        return RowsAdam(groups)
+        """Adam by rows, whose steps take of opacity what pictures take."""
+        made = RowsAdam(groups)
+        made.register_step_post_hook(lambda *_: self._fade())
+        return made
+
+    def _fade(self) -> None:
+        """Take of opacity what the pictures of a step take; nothing, if that step was dropped."""
+        if self.opacity.grad is not None:
+            for shown in self.fading:
+                opacity.decay(self, shown, self.decay)
+        self.fading.clear()
 
     def trajectories(self, points: Tensor, times: Tensor) -> Tensor:
         """See ``HasTrajectories``: points go with the particles beside them."""

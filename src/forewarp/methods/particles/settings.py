@@ -40,8 +40,8 @@ class Numbers:
             times; learned from ``calm`` on, of splines alone; 0: times are used as they are given.
         opacity_decay: share of their opacity that a picture takes from the particles that it shows, while the
             rate of opacity is its first; as that falls, so does the share.
-        crowd_decay: what a picture takes besides, times the share of the particles that is more than one a
-            covered pixel, of which a picture cannot tell where each is.
+        crowd_decay: share of their opacity that a picture takes besides, times ``1 - covered pixels /
+            particles``, with as many particles as there are in the end; 0 where these are fewer than pixels.
         loose: what is left of the weight of ``rigid`` at the end.
         name: name of the stage.
 
@@ -98,7 +98,7 @@ class Numbers:
         return max(32, round(self.density * math.sqrt(covered * told_by(views))))
 
     def decay(self, most: float, covered: float) -> float:
-        """The share of their opacity that a picture takes from particles, by how crowded its pixels are.
+        """Return the share of their opacity that a picture takes from particles, by how crowded pixels are.
 
         >>> numbers = Numbers(crowd_decay=2.5e-3)
         >>> numbers.decay(10_000.0, 20_000.0), numbers.decay(10_000.0, 2000.0)
