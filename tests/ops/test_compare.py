@@ -171,12 +171,12 @@ def test_what_is_not_seen_has_a_gradient_of_zero(uncleared, two_threads, monkeyp
     shares=st.integers(1, 7),
 )
 def test_threads_clear_the_rows_that_they_write(rows, shares):
-    from forewarp.ops.kernels_chain import SIDE_BY_SIDE, _own_rows
+    from forewarp.ops.kernels_project import SIDE_BY_SIDE, own_rows
 
     total, shown = rows[0], np.flatnonzero(rows[1]).astype(np.int32)
     blocks, end = -(-len(shown) // SIDE_BY_SIDE), 0
     for share in range(shares):
-        first, after = _own_rows.py_func(shown, share, shares, total)
+        first, after = own_rows.py_func(shown, share, shares, total)
         assert first == end <= after
         low, high = (SIDE_BY_SIDE * (blocks * k // shares) for k in (share, share + 1))
         assert all(first <= row < after for row in shown[low:high])

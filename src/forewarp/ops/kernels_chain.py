@@ -21,6 +21,7 @@ from forewarp.ops.kernels_project import (
     gathered,
     harmonics,
     linear_of,
+    own_rows,
     product,
     scales_of,
     seen_from,
@@ -265,21 +266,6 @@ def _of_shape(view, moved, log_scales, quaternions, which, valid, place, to_scal
     return product(back, _transposed(turn))
 
 
-@njit(inline="always")
-def _own_rows(seen, share, shares, total):
-    """Return a thread's rows of ``total``: from the first that its blocks of ``seen`` write to, to that of
-    the next thread; the first one's begin at 0.
-    """
-    blocks, first, end = (len(seen) + SIDE_BY_SIDE - 1) // SIDE_BY_SIDE, 0, total
-    if share > 0:
-        k = SIDE_BY_SIDE * (blocks * share // shares)
-        first = seen[k] if k < len(seen) else total
-    if share + 1 < shares:
-        k = SIDE_BY_SIDE * (blocks * (share + 1) // shares)
-        end = seen[k] if k < len(seen) else total
-    return first, end
-
-
 @njit(parallel=True, cache=True)
 def chain(  # long: sixteen particles' way back, step by step
     means, log_scales, quaternions, opacity, colors, maps, links, weights, view, tints, fades,
@@ -297,7 +283,7 @@ def chain(  # long: sixteen particles' way back, step by step
     blocks = (count + SIDE_BY_SIDE - 1) // SIDE_BY_SIDE
     for share in prange(shares):
         place, which = room(_ROWS), np.empty(SIDE_BY_SIDE, np.intp)
-        first, end = _own_rows(seen, share, shares, len(means))
+        first, end = own_rows(seen, share, shares, len(means))
         to_means[first:end] = 0
         to_scales[first:end] = 0
         to_quaternions[first:end] = 0

@@ -52,6 +52,21 @@ def harmonics(x, y, z, count, place):
             set_row(place, BASIS + 15, x * (xx - yy * 3.0) * -C30)
 
 
+@njit(inline="always")
+def own_rows(seen, share, shares, total):
+    """Return a thread's rows of ``total``: from the first that its blocks of ``seen`` write to, to that of
+    the next thread; the first one's begin at 0.
+    """
+    blocks, first, end = (len(seen) + SIDE_BY_SIDE - 1) // SIDE_BY_SIDE, 0, total
+    if share > 0:
+        k = SIDE_BY_SIDE * (blocks * share // shares)
+        first = seen[k] if k < len(seen) else total
+    if share + 1 < shares:
+        k = SIDE_BY_SIDE * (blocks * (share + 1) // shares)
+        end = seen[k] if k < len(seen) else total
+    return first, end
+
+
 @njit(forceinline=True)
 def gathered(array, which, place, first, count):
     """Copy the columns (N, count) of 16 particles to the rows from ``first`` on."""

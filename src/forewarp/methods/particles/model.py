@@ -161,10 +161,8 @@ class Particles(Method):
 
     def at(self, moment: Moment) -> Snapshot:
         """Move every particle; nothing is drawn yet."""
-        tints, fades = self.over_time(moment.time)
-        return ParticlesSnapshot(
-            moment, self.gaussians(), self.warp(moment.time), tints, fades, self.pinholes
-        )
+        particles, warp, (tints, fades) = self.gaussians(), self.warp(moment.time), self.over_time(moment.time)
+        return ParticlesSnapshot(moment, particles, warp, tints, fades, self.pinholes)
 
     def gaussians(self) -> Gaussians:
         """The particles as the operators read them."""
@@ -238,8 +236,7 @@ class Particles(Method):
         self.pulled.add_(found.pull)
         shown = found.pull > 0
         self.shown.add_(shown)
-        if self.decay > 0:
-            self.fading.append(shown)
+        self.fading.append(shown)
         if self.progress < self.numbers_of.settled:
             self.idle[too_near(found.order, found.distances)] = math.inf
         add(total, by_name(self, found.particles))
@@ -314,15 +311,8 @@ class Particles(Method):
     def optimizer(self, groups: list[dict]) -> torch.optim.Optimizer:
         """Adam by rows, whose steps take of opacity what pictures take."""
         made = RowsAdam(groups)
-        made.register_step_post_hook(lambda *_: self._fade())
+        made.register_step_post_hook(lambda *_: opacity.fade(self))
         return made
-
-    def _fade(self) -> None:
-        """Take of opacity what the pictures of a step take; nothing, if that step was dropped."""
-        if self.opacity.grad is not None:
-            for shown in self.fading:
-                opacity.decay(self, shown, self.decay)
-        self.fading.clear()
 
     def trajectories(self, points: Tensor, times: Tensor) -> Tensor:
         """See ``HasTrajectories``: points go with the particles beside them."""

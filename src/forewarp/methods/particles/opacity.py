@@ -49,3 +49,16 @@ def decay(method: Method, shown: Tensor, share: float) -> None:
         base = method.opacity.data
         taken = torch.log1p(share * base.exp()) - math.log1p(-share)  # of the logit
         base.sub_(torch.where(shown[:, None], taken, 0.0))
+
+
+def fade(method: Method) -> None:
+    """Take of opacity what the pictures of a step take (``decay``); nothing, if the step was dropped.
+
+    Args:
+        method: has ``opacity``, whose gradient a dropped step lacks, the share ``decay``, and in ``fading``
+            what each picture showed, which is forgotten.
+    """
+    if method.opacity.grad is not None:
+        for shown in method.fading:
+            decay(method, shown, method.decay)
+    method.fading.clear()
