@@ -161,8 +161,8 @@ class Particles(Method):
 
     def at(self, moment: Moment) -> Snapshot:
         """Move every particle; nothing is drawn yet."""
-        particles, warp, (tints, fades) = self.gaussians(), self.warp(moment.time), self.over_time(moment.time)
-        return ParticlesSnapshot(moment, particles, warp, tints, fades, self.pinholes)
+        particles, warp = self.gaussians(), self.warp(moment.time)
+        return ParticlesSnapshot(moment, particles, warp, *self.over_time(moment.time), self.pinholes)
 
     def gaussians(self) -> Gaussians:
         """The particles as the operators read them."""
