@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from forewarp.training import device
-from forewarp.training.device import peak_memory_bytes, reset_peak_memory
+from forewarp.training.device import check_processes, peak_memory_bytes, reset_peak_memory
 
 CLEARED = Path("/proc/self/clear_refs")
 
@@ -72,3 +72,17 @@ def test_the_commit_of_the_code_is_known_in_its_checkout_alone(monkeypatch, tmp_
     assert found is None or re.fullmatch(r"[0-9a-f]{9,}\+?", found)
     monkeypatch.setattr(device, "__file__", str(tmp_path / "training" / "device.py"))
     assert device.commit.__wrapped__() is None
+
+
+@pytest.mark.parametrize("devices", [1, "1", [0], [3]])
+def test_one_process_trains_a_run(devices):
+    check_processes(devices)
+
+
+@pytest.mark.parametrize(
+    ("devices", "nodes", "got"),
+    [(2, 1, "2"), ("auto", 1, "auto"), (-1, 1, "-1"), ([0, 1], 1, r"\[0, 1\]"), (1, 2, "1 on 2 nodes")],
+)
+def test_more_processes_for_a_run_are_refused(devices, nodes, got):
+    with pytest.raises(ValueError, match=f"trainer.devices: expected 1, .* but got {got}; one process trains"):
+        check_processes(devices, nodes)

@@ -15,7 +15,7 @@ from forewarp.evaluation.measure import measure
 from forewarp.files import read_json
 from forewarp.runs.device import device_for
 from forewarp.training.callbacks import StageProgress
-from forewarp.training.device import check_precision
+from forewarp.training.device import check_precision, check_processes
 from forewarp.training.module import DynamicSceneModule
 from forewarp.training.schedule import StagePlan, seconds_after, share_out
 from forewarp.training.stages import Run
@@ -32,6 +32,7 @@ def build_run(config: DictConfig) -> Run:
             raise ValueError(f"threads: expected a whole number > 0 or null, but got {config.threads}")
         torch.set_num_threads(config.threads)
     check_precision(config.trainer.get("precision"))
+    check_processes(config.trainer.get("devices", 1), config.trainer.get("num_nodes", 1))
     clock, place = Clock(config.budget.clock).kind, partial(device_for, config)
     data = instantiate(config.data, _convert_="all")
     plans = {name: stage_of(name, stage) for name, stage in config.stage.items()}

@@ -8,6 +8,7 @@ import platform
 import resource
 import subprocess
 import sys
+from collections.abc import Sequence
 from contextlib import suppress
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
@@ -43,6 +44,23 @@ def check_precision(precision: object) -> None:
         raise ValueError(
             f"trainer.precision: expected 32-true or bf16-mixed, but got {precision}; "
             "float16 does not hold the gradients, use trainer.precision=bf16-mixed"
+        )
+
+
+def check_processes(devices: object, nodes: object = 1) -> None:
+    """Raise ValueError unless one process trains: a run's folder, and its clock, are those of one process.
+
+    Args:
+        devices: ``trainer.devices``: 1, or a list of one GPU's number.
+        nodes: ``trainer.num_nodes``.
+    """
+    listed = isinstance(devices, Sequence) and not isinstance(devices, str)
+    one = len(devices) == 1 if listed else str(devices) == "1"
+    if not (one and str(nodes) == "1"):
+        got = f"{devices}" if str(nodes) == "1" else f"{devices} on {nodes} nodes"
+        raise ValueError(
+            f"trainer.devices: expected 1, or the number of one GPU as [0], but got {got}; one process trains a "
+            "run, and --multirun with launcher=joblib trains several runs at once"
         )
 
 
