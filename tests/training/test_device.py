@@ -84,5 +84,5 @@ def test_one_process_trains_a_run(devices):
     [(2, 1, "2"), ("auto", 1, "auto"), (-1, 1, "-1"), ([0, 1], 1, r"\[0, 1\]"), (1, 2, "1 on 2 nodes")],
 )
 def test_more_processes_for_a_run_are_refused(devices, nodes, got):
-    with pytest.raises(ValueError, match=f"trainer.devices: expected 1, .* but got {got}; one process trains"):
+    with pytest.raises(ValueError, match=f"trainer.devices: expected 1, .* but got {got}; one process"):
         check_processes(devices, nodes)
