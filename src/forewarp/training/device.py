@@ -59,8 +59,8 @@ def check_processes(devices: object, nodes: object = 1) -> None:
     if not (one and str(nodes) == "1"):
         got = f"{devices}" if str(nodes) == "1" else f"{devices} on {nodes} nodes"
         raise ValueError(
-            f"trainer.devices: expected 1, or the number of one GPU as [0], but got {got}; one process trains "
-            "a run, and --multirun with launcher=joblib trains several runs at once"
+            f"trainer.devices: expected 1, or the number of one GPU as [0], but got {got}; one process "
+            "trains a run, and --multirun with launcher=joblib trains several runs at once"
         )
 
 
