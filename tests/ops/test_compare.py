@@ -11,6 +11,7 @@ from forewarp.ops import project as project_module
 from forewarp.ops.backend import numba_installed
 from forewarp.ops.compare import compare
 from forewarp.ops.project import Gaussians, project
+from forewarp.ops.rasterize import rasterize
 from tests.support.gaussians import NO_FADES, NO_TINTS, SIZE, crowd, one, pinhole, still, straight
 
 
@@ -157,7 +158,8 @@ def test_what_is_not_seen_has_a_gradient_of_zero(uncleared, two_threads, monkeyp
 
     leaves = [part.clone().requires_grad_() for part in (*particles, warp.weights)]
     own = warp._replace(weights=leaves[5])
-    project(Gaussians(*leaves[:5]), own, pinhole(), tints, fades).numbers.sum().backward()
+    splats = project(Gaussians(*leaves[:5]), own, pinhole(), tints, fades)
+    (splats.numbers.sum() + rasterize(splats, *SIZE).color.sum()).backward()
     for leaf in leaves:
         assert bool(leaf.grad.isfinite().all())
         assert not bool(leaf.grad[hidden].any())

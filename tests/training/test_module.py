@@ -205,31 +205,13 @@ def test_gradients_and_terms_of_a_method_are_checked():
         total(Step({"photo": lambda: one}, one), {"slow": 1.0}, {})
 
 
-def _bringing(monkeypatch, gradients):
-    made = module()
-    one = torch.ones(())
-    step = Step({"photo": lambda: one}, one, gradients=gradients(made.method))
+def test_a_method_that_brings_no_gradients_is_told_which_it_has(monkeypatch):
+    made, one = module(), torch.ones(())
+    step = Step({"photo": lambda: one}, one, gradients={})
     monkeypatch.setattr(DynamicSceneModule, "look", lambda *_: step)
     monkeypatch.setattr(made.objective, "factors", lambda number: {"photo": 1.0})
-    return made
-
-
-def test_a_method_that_brings_no_gradients_is_told_which_it_has(monkeypatch):
-    made = _bringing(monkeypatch, lambda method: {})
     first = next(name for name, _ in made.method.named_parameters())
     with pytest.raises(ValueError, match=f"expected gradients of some of {first}, .*, but got none"):
-        made.training_step(batch(), 0)
-
-
-def test_a_method_that_brings_its_gradients_trains_in_one_process(monkeypatch):
-    def zeros(method):
-        return {name: torch.zeros_like(p) for name, p in method.named_parameters()}
-
-    made = _bringing(monkeypatch, zeros)
-    made.training_step(batch(), 0)
-    monkeypatch.setattr(torch.distributed, "is_initialized", lambda: True)
-    monkeypatch.setattr(torch.distributed, "get_world_size", lambda: 2)
-    with pytest.raises(ValueError, match="trainer.devices: expected 1, .* but got 2 processes"):
         made.training_step(batch(), 0)
 
 

@@ -19,12 +19,6 @@ from forewarp.training.objective import Objective, total
 from forewarp.training.schedule import Curriculum, StageSettings
 
 
-def _processes() -> int:
-    """How many processes train together."""
-    together = torch.distributed.is_available() and torch.distributed.is_initialized()
-    return torch.distributed.get_world_size() if together else 1
-
-
 class DynamicSceneModule(lightning.LightningModule):
     """Train a method for one stage of one scene.
 
@@ -74,11 +68,6 @@ class DynamicSceneModule(lightning.LightningModule):
         """Return the loss of one batch: the weighted sum of the method's terms."""
         factors = self.objective.factors(self.global_step)
         step = self.look(batch, factors)
-        if step.gradients is not None and _processes() > 1:
-            raise ValueError(
-                f"trainer.devices: expected 1, as the method computes its gradients itself and processes "
-                f"would not share them, but got {_processes()} processes"
-            )
         loss, raw = total(step, factors, self._named(step.gradients))
         self._remember(batch, step, loss, raw)
         return loss

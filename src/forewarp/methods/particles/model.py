@@ -273,7 +273,7 @@ class Particles(Method):
                     self.nodes.offsets.settle(group["lr"])
             elif group["name"] == "opacity":
                 share = numbers.decay(float(self.most), float(self.covered))
-                self.decay = min(0.99, share * group["lr"] / (group["base_lr"] or 1.0))
+                self.decay = min(0.99, share * group["lr"] / (group["base_lr"] or 1.0))  # rates may rise
             elif group["name"] == "skin":
                 group["lr"] *= told_by(self.views)
         number = int(progress / numbers.every)
