@@ -267,7 +267,7 @@ def _of_shape(view, moved, log_scales, quaternions, which, valid, place, to_scal
 
 
 @njit(parallel=True, cache=True)
-def chain(  # long: sixteen particles' way back, step by step
+def chain(
     means, log_scales, quaternions, opacity, colors, maps, links, weights, view, tints, fades,
     splats, seen, slopes,
     to_means, to_scales, to_quaternions, to_opacity, to_colors, spots, to_maps, to_weights, softmax,
