@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from forewarp.browser import begin_at, silent, splat_arrays, vertical_fov
-from forewarp.scene.ellipsoids import Ellipsoids
+from forewarp.scene.cloud import Ellipsoids
 from tests.support.tiny_scene import ball_scene
 
 

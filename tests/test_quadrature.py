@@ -5,7 +5,7 @@ import torch
 
 from forewarp.quadrature import Quadrature
 from forewarp.scene.box import Box
-from forewarp.scene.rays import Rays
+from forewarp.scene.camera import Rays
 
 RED, WHITE = torch.tensor([1.0, 0.0, 0.0]), torch.ones(3)
 

@@ -11,7 +11,7 @@ from forewarp.ops.grid import index_of
 from forewarp.ops.trace import trace
 from forewarp.renderer import Renderer
 from forewarp.scene.box import Box, Lattice
-from forewarp.scene.rays import Rays
+from forewarp.scene.camera import Rays
 from tests.support.reference import composite, march_samples
 
 LATTICE = Lattice(Box((0, 0, 0), (1, 3, 8)), (3, 4, 5))  # spacings 1/2, 1, 2; voxel_size 1

@@ -11,7 +11,7 @@ import numpy as np
 from torch import Tensor
 
 from forewarp.scene.camera import Camera
-from forewarp.scene.ellipsoids import Ellipsoids
+from forewarp.scene.cloud import Ellipsoids
 
 
 @contextlib.contextmanager

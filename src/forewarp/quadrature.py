@@ -11,7 +11,7 @@ from torch import Tensor
 from forewarp.ops.composite import dense_weights
 from forewarp.ops.samples import by_importance, clip_to_box, midpoints, stratified, union
 from forewarp.scene.box import Box
-from forewarp.scene.rays import Rays
+from forewarp.scene.camera import Rays
 from forewarp.scene.view import Rendering
 
 # Points (..., 3) -> density (...,) >= 0 per world unit.

@@ -14,7 +14,7 @@ from forewarp.ops.backend import use_numba
 from forewarp.ops.composite import accumulate, render_weights
 from forewarp.ops.march import march
 from forewarp.ops.trace import trace
-from forewarp.scene.rays import Rays
+from forewarp.scene.camera import Rays
 from forewarp.scene.view import Rendering
 
 

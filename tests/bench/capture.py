@@ -25,8 +25,8 @@ from forewarp.capture.facts import PICTURE
 from forewarp.data import hypernerf
 from forewarp.data.images import read_image
 from forewarp.data.posed_video import PosedShot, read_scene, write_scene
-from forewarp.drawing.colors import in_a_row
 from forewarp.drawing.files import read_picture, to_bytes, write_video
+from forewarp.drawing.images import in_a_row
 from forewarp.progress import Counted
 from forewarp.scene.box import Box
 from tests.support.alignment import pose_errors

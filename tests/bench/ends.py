@@ -15,9 +15,8 @@ import torch
 
 from forewarp import load
 from forewarp.methods.particles.model import Particles
-from forewarp.scene.batch import Batch, Observation
 from forewarp.scene.frame import Frame, Scene
-from forewarp.scene.view import Moment, View
+from forewarp.scene.view import Batch, Moment, Observation, View
 from forewarp.training.module import DynamicSceneModule
 from tests.stability.report import table
 

@@ -22,12 +22,10 @@ from forewarp.methods.voxel.method import VoxelMethod
 from forewarp.methods.voxel.model import ForwardModel, Ground
 from forewarp.methods.voxel.stage import VoxelStage
 from forewarp.renderer import Renderer
-from forewarp.scene.batch import Batch, Observation
 from forewarp.scene.box import Box, Lattice
-from forewarp.scene.camera import Camera, look_at
+from forewarp.scene.camera import Camera, Rays, look_at
 from forewarp.scene.frame import Frame, Scene
-from forewarp.scene.rays import Rays
-from forewarp.scene.view import Moment, View
+from forewarp.scene.view import Batch, Moment, Observation, View
 from forewarp.training.module import DynamicSceneModule
 from forewarp.training.objective import Objective
 from forewarp.training.schedule import Curriculum, StageSettings

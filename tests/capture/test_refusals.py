@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from forewarp.capture import refusals
 from forewarp.capture.pictures import Pictures
 from forewarp.capture.refusals import Evidence, refuse_matches, refuse_poses, unturned
-from forewarp.scene.lens import Lens
+from forewarp.scene.camera import Lens
 from tests.support.sparse_scene import cameras_on_arc, sparse_arc
 
 GOOD = Evidence(features=900, shift=0.2, unturned=0.5)

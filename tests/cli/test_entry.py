@@ -10,7 +10,7 @@ from omegaconf import OmegaConf
 from forewarp.cli import entry
 from forewarp.cli.errors import one_line
 from forewarp.cli.misspelt import with_run_key
-from forewarp.scene.errors import SceneError
+from forewarp.data.files import SceneError
 from tests.support.configs import CONF, ROOT, options
 
 COMMANDS = ("train", "evaluate", "render", "export", "synthesize", "report", "capture")

@@ -8,8 +8,8 @@ import pytest
 
 from forewarp.data.posed_video import PosedShot, write_scene
 from forewarp.scene.box import Box
-from forewarp.synth.cameras import random_cameras
 from forewarp.synth.raycast import render
+from forewarp.synth.scenes import random_cameras
 from forewarp.synth.world import World
 
 COMMON = [

@@ -7,7 +7,7 @@ import pytest
 from hydra.utils import instantiate
 
 from forewarp.data.dnerf import read_scene
-from forewarp.scene.errors import SceneError
+from forewarp.data.files import SceneError
 from forewarp.synth.module import (
     WRITERS,
     SyntheticDataModule,

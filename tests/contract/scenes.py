@@ -6,10 +6,9 @@ from functools import partial
 import numpy as np
 import torch
 
-from forewarp.data import dnerf, hypernerf, lego_complete, nhr
+from forewarp.data import dnerf, hypernerf, nhr
 from forewarp.data.module import SceneDataModule
-from forewarp.scene.camera import Camera, look_at
-from forewarp.scene.lens import Lens
+from forewarp.scene.camera import Camera, Lens, look_at
 
 RADIUS, SIZE, TIMES, FOCAL = 0.5, 20, 6, 24.0
 BOX = (-1.4, -1.2, -1.1, 1.4, 1.2, 1.1)
@@ -92,14 +91,14 @@ def write_nhr(folder):
     nhr.write_scene(folder, cameras, moments())
 
 
-write_lego_complete = partial(write_dnerf, write=lego_complete.write_scene, ability="time")
+write_lego_complete = partial(write_dnerf, ability="time")
 
 # name -> what writes a scene into a folder, and what reads it again from root and name.
 DATASETS = {
     "dnerf": (write_dnerf, dnerf.read_scene),
     "hypernerf": (write_hypernerf, partial(hypernerf.read_scene, scale=1, box=BOX)),
     "nhr": (write_nhr, partial(nhr.read_scene, half_resolution=False, test_views=[0])),
-    "lego_complete": (write_lego_complete, lego_complete.read_scene),
+    "lego_complete": (write_lego_complete, dnerf.read_lego_complete),
 }
 
 

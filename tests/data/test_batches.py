@@ -8,13 +8,12 @@ import torch
 
 from forewarp.data.batches import Sampler, Targets, color_of
 from forewarp.data.dnerf import read_scene
+from forewarp.data.files import SceneError
 from forewarp.data.images import MaskedImage, composited
 from forewarp.data.module import DNeRFDataModule
-from forewarp.scene.batch import Asks
-from forewarp.scene.errors import SceneError
+from forewarp.scene.camera import joined
 from forewarp.scene.frame import Frame, Scene
-from forewarp.scene.rays import joined
-from forewarp.scene.view import Moment
+from forewarp.scene.view import Asks, Moment
 from tests.support.dnerf_scene import real, shots, write_tiny
 
 

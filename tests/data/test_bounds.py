@@ -13,9 +13,8 @@ import pytest
 
 from forewarp.data import hypernerf
 from forewarp.data.arrays import load_numpy
-from forewarp.data.files import MOST_FRAMES, frames_of, inside, read_bytes, read_json
+from forewarp.data.files import MOST_FRAMES, SceneError, frames_of, inside, read_bytes, read_json
 from forewarp.data.images import inspect_image, read_gray16, read_image
-from forewarp.scene.errors import SceneError
 from tests.support.rig_scene import write_rig
 
 BIG = 60_000

@@ -5,9 +5,8 @@ import gc
 import pytest
 import torch
 
-from forewarp.data.cache import CACHE, ImageCache
-from forewarp.data.images import CachedImage, write_png
-from forewarp.scene.errors import SceneError
+from forewarp.data.files import SceneError
+from forewarp.data.images import CACHE, CachedImage, ImageCache, write_png
 
 
 class Owner:

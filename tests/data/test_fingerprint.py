@@ -2,8 +2,7 @@ import os
 
 import pytest
 
-from forewarp.data.files import MOST_BYTES
-from forewarp.data.fingerprint import difference, fingerprint
+from forewarp.data.files import MOST_BYTES, difference, fingerprint
 from forewarp.data.module import DNeRFDataModule, SceneDataModule
 from tests.support.dnerf_scene import write_tiny
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from forewarp.data import dnerf, hypernerf, nhr, posed_video
-from forewarp.scene.errors import SceneError
+from forewarp.data.files import SceneError
 from tests.support import dnerf_scene, nhr_scene, posed_scene, rig_scene
 
 DOME, SPLITS = nhr_scene.dome(2), ["train"] * 5 + ["test"] * 5

@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from forewarp.data.files import number, numbers_of, whole
-from forewarp.data.geometry import box_of, pose_of
-from forewarp.scene.errors import SceneError
+from forewarp.data.cameras import box_of, pose_of
+from forewarp.data.files import SceneError, number, numbers_of, whole
 
 EYE, NAN = np.eye(4), float("nan")
 BAD_POSES = {

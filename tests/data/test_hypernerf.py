@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
+from forewarp.data.files import SceneError
 from forewarp.data.hypernerf import read_camera, read_scene, reduced, write_camera
 from forewarp.data.images import write_png
-from forewarp.scene.errors import SceneError
 from tests.support import reference
 from tests.support.dnerf_scene import real
 from tests.support.edits import GONE, edit

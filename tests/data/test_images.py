@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 import torch
 
-from forewarp.data.cache import CACHE
+from forewarp.data.files import SceneError
 from forewarp.data.images import (
+    CACHE,
     CachedImage,
     MaskedImage,
     composited,
@@ -18,7 +19,6 @@ from forewarp.data.images import (
     write_jpeg,
     write_png,
 )
-from forewarp.scene.errors import SceneError
 
 NOISE = np.random.default_rng(0).integers(0, 256, (37, 53, 3), dtype=np.uint8)
 STUDIO, SKIN = (20, 160, 40), (200, 120, 100)

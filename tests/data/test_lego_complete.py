@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 import torch
 
-from forewarp.data import lego_complete
-from forewarp.data.lego_complete import read_scene
+from forewarp.data import dnerf
+from forewarp.data.dnerf import read_lego_complete as read_scene
 from tests.support.dnerf_scene import FEW, edit, shots, truth, views, write_kinds
 
 
@@ -28,9 +28,9 @@ def test_round_trip(tmp_path):
 
 def test_the_published_counts_need_no_note(tmp_path, monkeypatch):
     published = {"space": 200, "time": 197, "canonical": 50}
-    assert (50, published) == (lego_complete.TRAINING_TIMES, lego_complete.TEST_VIEWS)
-    monkeypatch.setattr(lego_complete, "TRAINING_TIMES", 3)
-    monkeypatch.setattr(lego_complete, "TEST_VIEWS", FEW)
+    assert (50, published) == (dnerf.TRAINING_TIMES, dnerf.TEST_VIEWS)
+    monkeypatch.setattr(dnerf, "TRAINING_TIMES", 3)
+    monkeypatch.setattr(dnerf, "TEST_VIEWS", FEW)
     write_kinds(tmp_path / "lift")
     protocol = read_scene(tmp_path, "lift").protocol
     assert "note" not in protocol

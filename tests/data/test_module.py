@@ -7,9 +7,9 @@ import torch
 from lightning import LightningModule, Trainer
 
 from forewarp.data.dnerf import read_scene
+from forewarp.data.files import SceneError
 from forewarp.data.module import DNeRFDataModule, SceneDataModule
-from forewarp.scene.batch import Batch, Target
-from forewarp.scene.errors import SceneError
+from forewarp.scene.view import Batch, Target
 from tests.support.dnerf_scene import shots, write_tiny
 from tests.support.tiny_scene import ball_scene
 

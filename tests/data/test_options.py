@@ -5,9 +5,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from forewarp.data.module import SceneDataModule
-from forewarp.data.options import hold_out, outline, with_canonical
-from forewarp.scene.errors import SceneError
+from forewarp.data.files import SceneError
+from forewarp.data.module import SceneDataModule, hold_out, outline, with_canonical
 from forewarp.scene.frame import Truth
 from tests.support.tiny_scene import ball_scene
 

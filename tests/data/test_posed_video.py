@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 
+from forewarp.data.files import SceneError
 from forewarp.data.images import write_png
 from forewarp.data.posed_video import FILE, read_scene, write_scene
 from forewarp.scene.box import Box
 from forewarp.scene.camera import look_at
-from forewarp.scene.errors import SceneError
 from tests.support import reference
 from tests.support.edits import GONE, edit
 from tests.support.posed_scene import LENS, MIDDLE, UP, cameras, placed, shots, write_tiny

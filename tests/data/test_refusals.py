@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 import torch
 
-from forewarp.data import dnerf, hypernerf, lego_complete, nhr, posed_video
+from forewarp.data import dnerf, hypernerf, nhr, posed_video
 from forewarp.data.dnerf import Shot
+from forewarp.data.files import SceneError
 from forewarp.data.nhr import DomeFrame
 from forewarp.data.posed_video import PosedShot
-from forewarp.scene.errors import SceneError
 from tests.support import dnerf_scene, nhr_scene, posed_scene, rig_scene
 from tests.support.edits import GONE, edit
 
 READ = {
     "dnerf": dnerf.read_scene,
-    "lego": lego_complete.read_scene,
+    "lego": dnerf.read_lego_complete,
     "rig": hypernerf.read_scene,
     "dome": nhr.read_scene,
     "video": posed_video.read_scene,
@@ -315,10 +315,6 @@ def write_dnerf(folder, splits):
     dnerf.write_scene(folder, splits, camera_angle_x=1)
 
 
-def write_lego(folder, shot):
-    lego_complete.write_scene(folder, {"test": shot}, camera_angle_x=1)
-
-
 def write_dome(folder, frame):
     nhr.write_scene(folder, nhr_scene.dome(), [frame])
 
@@ -340,10 +336,6 @@ UNWRITABLE = {
         ({"train": [shot(pose=2 * np.eye(4))]}, "train/a: pose: expected a rotation"),
         ({"train": [shot(ability="time")]}, "in test only"),
         ({"test": [shot(), shot("b", ability="time")]}, "both kinds"),
-    ],
-    write_lego: [
-        (dnerf_scene.shots(1, depth=True), "r_0: expected .* an ability and a depth, but got no ability"),
-        (dnerf_scene.shots(1, ability="time"), "r_0: expected a test shot with .* but got no depth"),
     ],
     rig_scene.write_rig: [
         ([RIG, RIG], "shots: expected different names"),

@@ -1,6 +1,6 @@
 import torch
 
-from forewarp.drawing import colors as draw
+from forewarp.drawing import images as draw
 
 
 def test_depth_is_bright_near_and_white_where_nothing_is():

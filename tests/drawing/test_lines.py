@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from forewarp.drawing.lines import draw_discs, hidden, sample_lines
+from forewarp.drawing.images import draw_discs, hidden, sample_lines
 
 RED = torch.tensor([[1.0, 0.0, 0.0]])
 

@@ -7,7 +7,7 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from forewarp.data.module import SceneDataModule
-from forewarp.evaluation.accuracy_time import COLUMNS, AccuracyCurve, seconds_before
+from forewarp.evaluation.curves import COLUMNS, AccuracyCurve, seconds_before
 from forewarp.files import read_rows
 from forewarp.scene.frame import Truth
 from forewarp.training.stages import Run
@@ -120,7 +120,7 @@ def test_it_changes_no_weight_and_its_seconds_do_not_count(watched, tmp_path, mo
         seen.append(module.clock.seconds - before)
         return 20.0
 
-    monkeypatch.setattr("forewarp.evaluation.accuracy_time.validation_psnr", psnr)
+    monkeypatch.setattr("forewarp.evaluation.curves.validation_psnr", psnr)
     assert_same(run(tmp_path).fit(), watched[1])
     assert seen == [0.0] * 4
     assert_same(run(tmp_path / "without", curve=False).fit(), watched[1])

@@ -8,7 +8,7 @@ import torch
 from forewarp.data.module import SceneDataModule
 from forewarp.evaluation.evaluate import evaluate
 from forewarp.metrics.suite import ImageSuite
-from forewarp.scene.rays import joined
+from forewarp.scene.camera import joined
 from tests.support.tiny_scene import ball_scene, frame_at, make_run, stage
 
 TIMES = (0.0, 0.5, 1.0)

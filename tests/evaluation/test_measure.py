@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from forewarp.evaluation.measure import show, without
+from forewarp.evaluation.evaluate import show, without
 from forewarp.metrics.suite import LPIPS_METRICS
 from forewarp.runs.build import build_run
 from forewarp.training.device import device_of

@@ -1,9 +1,9 @@
 import pytest
 import torch
 
-from forewarp.drawing.colors import error_colors
-from forewarp.evaluation.pictures import image_flow, pictures_of, sized, validation_psnr, within
-from forewarp.scene.batch import Target
+from forewarp.drawing.images import error_colors
+from forewarp.evaluation.images import image_flow, pictures_of, sized, validation_psnr, within
+from forewarp.scene.view import Target
 from tests.support.known_ball import known_ball
 from tests.support.tiny_scene import RADIUS, TRAVEL, ball_center, ball_data, ball_scene, camera_at
 

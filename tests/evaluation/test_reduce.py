@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from forewarp.data.batches import Targets, color_of
-from forewarp.evaluation.evaluate import evaluate
-from forewarp.evaluation.reduce import reduced_rendering
+from forewarp.evaluation.evaluate import evaluate, reduced_rendering
 from forewarp.metrics.suite import ImageSuite
 from forewarp.scene.view import Rendering
 from tests.support.tiny_scene import ball_scene, make_run, stage

@@ -8,7 +8,7 @@ import trimesh
 from forewarp.export.formats import write
 from forewarp.export.mesh import lattice_in, solid_of
 from forewarp.scene.box import Box
-from forewarp.scene.ellipsoids import Ellipsoids
+from forewarp.scene.cloud import Ellipsoids
 from tests.export.conftest import TIMES
 from tests.support.tiny_scene import BOX, RADIUS, ball_center
 

@@ -10,7 +10,7 @@ from scipy.special import expit
 from forewarp.export.formats import write
 from forewarp.export.ply import splat_columns, write_ply
 from forewarp.ops.project import FLAT, Gaussians
-from forewarp.scene.ellipsoids import Ellipsoids
+from forewarp.scene.cloud import Ellipsoids
 from forewarp.scene.paths import mean_up
 from forewarp.scene.view import Moment, View
 from tests.export.conftest import TIMES

@@ -14,9 +14,8 @@ from forewarp.methods.method import Start, parameter_count
 from forewarp.methods.ndvg import NDVG
 from forewarp.methods.tineuvox import TiNeuVox
 from forewarp.renderer import Renderer
-from forewarp.scene.batch import Batch
 from forewarp.scene.cloud import Handover
-from forewarp.scene.view import Moment, View
+from forewarp.scene.view import Batch, Moment, View
 from forewarp.training.objective import Objective
 from forewarp.training.schedule import StageSettings
 from forewarp.training.stages import Stage

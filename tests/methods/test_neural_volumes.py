@@ -18,10 +18,9 @@ from forewarp.methods.neural_volumes import (
     opacity_prior,
     opacity_variation,
 )
-from forewarp.scene.batch import Batch, Observation
+from forewarp.scene.camera import Rays
 from forewarp.scene.frame import Frame
-from forewarp.scene.rays import Rays
-from forewarp.scene.view import Moment, View
+from forewarp.scene.view import Batch, Moment, Observation, View
 from forewarp.training.objective import Objective
 from forewarp.training.schedule import StageSettings
 from forewarp.training.stages import Stage

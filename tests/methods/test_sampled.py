@@ -15,8 +15,7 @@ from forewarp.methods.nerfies import Nerfies
 from forewarp.methods.sampled import OF_JAX, OF_PYTORCH, Sampling
 from forewarp.methods.tnerf import TNeRF
 from forewarp.ops.encode import positional_encoding
-from forewarp.scene.batch import Batch, Observation
-from forewarp.scene.view import Moment, View
+from forewarp.scene.view import Batch, Moment, Observation, View
 from tests.support.sampled_methods import GENTLE, KINDS, SMALL, WARP, batch, learned, method, shown, start
 from tests.support.sliding_square import camera, moving_scene, static_ceiling
 

@@ -7,9 +7,9 @@ import torch
 from forewarp.metrics import image, lpips
 from forewarp.metrics.lpips import LPIPS
 from forewarp.metrics.suite import DEPTH_METRICS, METRICS, ImageSuite, summarise
-from forewarp.scene.batch import Target
 from forewarp.scene.camera import Camera
 from forewarp.scene.frame import Frame
+from forewarp.scene.view import Target
 
 
 def target(height=34, width=40, depth=None, foreground=None, seed=0):

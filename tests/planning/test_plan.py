@@ -13,7 +13,7 @@ from forewarp.methods.particles.planning import ParticlesPlanning
 from forewarp.planning.plan_file import read_plan, with_plan, write_plan
 from forewarp.planning.planner import Planner
 from forewarp.planning.trials import Trial, Trials
-from forewarp.scene.pictures import Pictures
+from forewarp.scene.silhouettes import Pictures
 from forewarp.synth.scenes import synthesize
 
 TINY = ["data=dnerf", "preset=demo", "trainer=cpu", "logger=none", "callbacks=default"]

@@ -4,7 +4,7 @@ import os
 
 import pytest
 
-from forewarp.data.fingerprint import LOCK
+from forewarp.data.files import LOCK
 from forewarp.runs.lock import locked
 
 

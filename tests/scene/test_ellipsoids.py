@@ -3,7 +3,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from forewarp.ops.project import FLAT, rotations
-from forewarp.scene.ellipsoids import Ellipsoids, axes_of
+from forewarp.scene.cloud import Ellipsoids, axes_of
 
 
 def random(*shape, seed=0):

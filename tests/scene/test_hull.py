@@ -1,7 +1,7 @@
 import torch
 
 from forewarp.scene.box import Box, Lattice
-from forewarp.scene.hull import visual_hull
+from forewarp.scene.silhouettes import visual_hull
 from tests.support.tiny_scene import RADIUS, ball_center, camera_at, photograph
 
 

@@ -5,8 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from forewarp.scene.camera import Camera, look_at
-from forewarp.scene.lens import Lens
+from forewarp.scene.camera import Camera, Lens, look_at
 from tests.support import reference
 
 PHONE = Lens((0.105, -0.088, 0.01), (-0.0537, 0.0037))

@@ -17,10 +17,10 @@ from hypothesis import given, settings
 from omegaconf import OmegaConf
 
 from forewarp.cli.entry import one_line
-from forewarp.data import dnerf, hypernerf, lego_complete, nhr, posed_video
+from forewarp.data import dnerf, hypernerf, nhr, posed_video
+from forewarp.data.files import SceneError
 from forewarp.runs.build import build_run
 from forewarp.runs.config import saved_config
-from forewarp.scene.errors import SceneError
 from forewarp.scene.frame import Scene
 from forewarp.scene.view import Moment, View
 from forewarp.training.checkpoints import check_state, load_weights
@@ -38,7 +38,7 @@ QUICK = settings(FUZZ, max_examples=30, derandomize=True, deadline=60_000)  # ot
 def three_kinds(folder):
     test = [s for i, a in enumerate(dnerf.ABILITIES) for s in dnerf_scene.shots(2, i, ability=a, depth=True)]
     splits, truth = {"train": dnerf_scene.shots(3), "test": test}, dnerf_scene.truth()
-    lego_complete.write_scene(folder, splits, camera_angle_x=0.7, trajectories=truth)
+    dnerf.write_scene(folder, splits, camera_angle_x=0.7, trajectories=truth)
 
 
 def two_phones(folder):
@@ -57,7 +57,7 @@ def video(folder):
 
 FORMATS = {
     "dnerf": (dnerf_scene.write_tiny, dnerf.read_scene),
-    "lego_complete": (three_kinds, lego_complete.read_scene),
+    "lego_complete": (three_kinds, dnerf.read_lego_complete),
     "hypernerf": (two_phones, hypernerf.read_scene),
     "nhr": (dome, nhr.read_scene),
     "video_with_poses": (video, posed_video.read_scene),

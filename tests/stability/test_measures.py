@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from forewarp import losses
-from forewarp.drawing.colors import depth_colors
+from forewarp.drawing.images import depth_colors
 from forewarp.scene.camera import Camera, look_at
 from forewarp.scene.paths import RandomPatches, focus_point, mean_up, orbit
 from tests.support.hard_cases import check_finite

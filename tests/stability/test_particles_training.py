@@ -17,7 +17,7 @@ from forewarp.methods.particles.skin import Skin
 from forewarp.methods.particles.start import anywhere
 from forewarp.ops.nodes import pull_nodes
 from forewarp.scene.box import Box
-from forewarp.scene.lens import Lens
+from forewarp.scene.camera import Lens
 from forewarp.scene.view import Moment
 from tests.contract.fitting import stage_of
 from tests.contract.table import METHODS

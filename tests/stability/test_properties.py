@@ -10,7 +10,7 @@ from forewarp.ops.composite import accumulate, render_weights
 from forewarp.ops.splat import average_splat
 from forewarp.renderer import Renderer
 from forewarp.scene.box import Box, Lattice
-from forewarp.scene.rays import Rays
+from forewarp.scene.camera import Rays
 from tests.support.hard_cases import SHAPE, index_with, voxels
 
 pytestmark = pytest.mark.stability

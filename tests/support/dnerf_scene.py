@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 
-from forewarp.data import lego_complete
 from forewarp.data.dnerf import Shot, write_scene
 from forewarp.scene.camera import look_at
 from forewarp.scene.frame import Truth
@@ -49,7 +48,7 @@ def write_tiny(folder: Path, size=(6, 8), **changes) -> Path:
 def write_kinds(folder: Path, **changes) -> Path:
     """A Lego Complete scene: 3 training images, 9 test views of three kinds with depth, trajectories."""
     splits = {"train": shots(3), "test": views()} | changes
-    lego_complete.write_scene(folder, splits, camera_angle_x=ANGLE, trajectories=truth())
+    write_scene(folder, splits, camera_angle_x=ANGLE, trajectories=truth())
     return folder
 
 

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from forewarp.scene.camera import Camera, look_at
-from forewarp.scene.lens import Lens
+from forewarp.scene.camera import Camera, Lens, look_at
 from forewarp.synth.film import Exposure, Film, ImageSpec
 from forewarp.synth.world import World
 

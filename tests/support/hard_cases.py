@@ -6,7 +6,7 @@ import torch
 
 from forewarp.fields.radiance_grid import Activation, RadianceGrid
 from forewarp.scene.box import Box, Lattice
-from forewarp.scene.rays import Rays
+from forewarp.scene.camera import Rays
 
 SHAPE = (3, 4, 5)
 LATTICE = Lattice(Box((-1.0, -1.0, -1.0), (1.0, 2.0, 3.0)), SHAPE)

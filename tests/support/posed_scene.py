@@ -7,8 +7,7 @@ import numpy as np
 import torch
 
 from forewarp.data.posed_video import PosedShot, write_scene
-from forewarp.scene.camera import Camera, look_at
-from forewarp.scene.lens import Lens
+from forewarp.scene.camera import Camera, Lens, look_at
 
 # Of a world whose unit and origin mean nothing.
 MIDDLE = torch.tensor([30.0, -20.0, 5.0], dtype=torch.float64)

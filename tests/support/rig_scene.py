@@ -6,9 +6,8 @@ import numpy as np
 import torch
 
 from forewarp.data.hypernerf import RigShot, write_scene
-from forewarp.scene.camera import Camera, look_at
+from forewarp.scene.camera import Camera, Lens, look_at
 from forewarp.scene.frame import Truth
-from forewarp.scene.lens import Lens
 
 CENTER, SCALE, NEAR, FAR = (2.5, -1.0, 0.75), 0.2, 0.3, 1.4
 LENS = Lens((0.105, -0.088, 0.01), (-0.0537, 0.0037))

@@ -12,8 +12,7 @@ from forewarp.methods.nerf import NeRF
 from forewarp.methods.nerfies import Nerfies
 from forewarp.methods.sampled import Sampling
 from forewarp.methods.tnerf import TNeRF
-from forewarp.scene.batch import Batch, Observation
-from forewarp.scene.view import Moment, View
+from forewarp.scene.view import Batch, Moment, Observation, View
 from forewarp.training.objective import Objective
 from forewarp.training.schedule import StageSettings
 from forewarp.training.stages import Stage

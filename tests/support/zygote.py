@@ -101,7 +101,7 @@ def serve():
     import torch
 
     import forewarp.data.module
-    import forewarp.evaluation.measure
+    import forewarp.evaluation.evaluate
     import forewarp.runs.build
     import forewarp.training.stages  # noqa: F401
 

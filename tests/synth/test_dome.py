@@ -3,11 +3,11 @@ import pytest
 import torch
 
 from forewarp.data.nhr import read_scene
-from forewarp.synth import dome
-from forewarp.synth.cameras import centers_of, stream
-from forewarp.synth.dome import dome_cameras, synthesize
-from forewarp.synth.motions import MOTIONS
-from forewarp.synth.points import surface_points
+from forewarp.synth import rigs
+from forewarp.synth.raycast import surface_points
+from forewarp.synth.rigs import dome_cameras, synthesize_nhr
+from forewarp.synth.scenes import centers_of, stream
+from forewarp.synth.vehicle import MOTIONS
 from forewarp.synth.world import World
 from tests.support.lit_points import color_errors, lit_points
 
@@ -16,7 +16,7 @@ SMALL = {"size": 120, "frames": 2, "points": 300, "samples_per_pixel": 1}
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    return synthesize(tmp_path_factory.mktemp("synth") / "scene", **SMALL)
+    return synthesize_nhr(tmp_path_factory.mktemp("synth") / "scene", **SMALL)
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +45,7 @@ def test_no_picture_cuts_anything_off(motion):
 
 def test_true_points_have_the_colour_of_their_pixels_and_lie_in_the_masks(scene):
     world, centers = World("lift_tilt"), centers_of(dome_cameras(120, 0))
-    faces, barycentric = surface_points(world, dome.POINTS, centers, stream(0, dome._POINTS))
+    faces, barycentric = surface_points(world, rigs.POINTS, centers, stream(0, rigs._POINTS))
     assert scene.truth.times.tolist() == [0, 1]
     for frame in (scene.train + scene.test)[::3]:
         points, rgba = scene.truth.points[:, int(frame.time)], frame.load()

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from forewarp.synth import film as of_film
-from forewarp.synth.cameras import random_cameras
 from forewarp.synth.film import Exposure, Film, ImageSpec
+from forewarp.synth.scenes import random_cameras
 from forewarp.synth.world import World
 
 CAMERAS = random_cameras(9, 12, np.random.default_rng(0))

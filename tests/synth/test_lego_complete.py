@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 import torch
 
-from forewarp.data.lego_complete import read_scene
-from forewarp.synth.lego_complete import _views, synthesize
+from forewarp.data.dnerf import read_lego_complete as read_scene
+from forewarp.synth.scenes import _views, synthesize_lego_complete
 
 SMALL = {"size": 64, "frames": 3, "motions": ["lift", "drive"], "test_views": (2, 4, 3), "val_views": 1}
 SMALL["samples_per_pixel"] = 1
@@ -11,7 +11,7 @@ SMALL["samples_per_pixel"] = 1
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    return synthesize(tmp_path_factory.mktemp("synth") / "scenes", **SMALL)
+    return synthesize_lego_complete(tmp_path_factory.mktemp("synth") / "scenes", **SMALL)
 
 
 def test_every_motion_is_a_scene_with_three_kinds_of_view(folder):

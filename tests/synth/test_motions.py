@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from forewarp.synth.motions import MOTIONS, joints
+from forewarp.synth.vehicle import MOTIONS, joints
 
 MANY = np.linspace(0, 1, 41)
 

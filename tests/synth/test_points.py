@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from forewarp.synth.cameras import centers_of, random_cameras
-from forewarp.synth.motions import MOTIONS
-from forewarp.synth.points import surface_points, trajectories
+from forewarp.synth.raycast import surface_points, trajectories
+from forewarp.synth.scenes import centers_of, random_cameras
+from forewarp.synth.vehicle import MOTIONS
 from forewarp.synth.world import World
 
 TIMES = np.linspace(0, 1, 41)

@@ -3,9 +3,9 @@ import builtins
 import numpy as np
 import pytest
 
-from forewarp.synth.cameras import orbit_camera
-from forewarp.synth.motions import GROUND, joints
 from forewarp.synth.raycast import LIGHT_AT, Posed, camera_rays, render
+from forewarp.synth.scenes import orbit_camera
+from forewarp.synth.vehicle import GROUND, joints
 from forewarp.synth.world import World
 
 

@@ -3,11 +3,10 @@ import pytest
 import torch
 
 from forewarp.data.hypernerf import read_scene
-from forewarp.synth import rig
-from forewarp.synth.cameras import centers_of, stream
-from forewarp.synth.points import surface_points
-from forewarp.synth.raycast import Posed, camera_rays
-from forewarp.synth.rig import rig_cameras, synthesize
+from forewarp.synth import rigs
+from forewarp.synth.raycast import Posed, camera_rays, surface_points
+from forewarp.synth.rigs import rig_cameras, synthesize_hypernerf
+from forewarp.synth.scenes import centers_of, stream
 from forewarp.synth.world import World
 from tests.support.lit_points import color_errors, lit_points
 
@@ -16,7 +15,7 @@ SMALL = {"size": 192, "frames": 5, "samples_per_pixel": 1}
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    return synthesize(tmp_path_factory.mktemp("synth") / "scene", **SMALL)
+    return synthesize_hypernerf(tmp_path_factory.mktemp("synth") / "scene", **SMALL)
 
 
 @pytest.fixture(scope="module")
@@ -26,8 +25,8 @@ def scene(folder):
 
 def in_vehicle_units(points):
     """Normalised points (..., 3) in the vehicle's units."""
-    unscaled = np.asarray(points, np.float64) / rig.SCENE_SCALE + np.array(rig.SCENE_CENTER)
-    return (unscaled - np.array(rig.WORLD_AT)) / rig.WORLD_SCALE
+    unscaled = np.asarray(points, np.float64) / rigs.SCENE_SCALE + np.array(rigs.SCENE_CENTER)
+    return (unscaled - np.array(rigs.WORLD_AT)) / rigs.WORLD_SCALE
 
 
 def test_the_phones_take_turns(scene, folder):
@@ -47,7 +46,7 @@ def test_the_phones_take_turns(scene, folder):
 
 def test_all_that_is_seen_lies_between_near_and_far(scene):
     world, pairs = World("lift_tilt", has_room=True), rig_cameras(192, np.linspace(0, 1, 5), 0)
-    unit = rig.WORLD_SCALE * rig.SCENE_SCALE
+    unit = rigs.WORLD_SCALE * rigs.SCENE_SCALE
     for pair, frame in zip(pairs, scene.train):
         for camera in pair:
             distance = unit * Posed(world, frame.time).first_hits(*camera_rays(camera)).distance
@@ -60,7 +59,9 @@ def test_true_points_have_the_colour_of_their_pixels(scene):
     times, world = np.linspace(0, 1, 5), World("lift_tilt", has_room=True)
     assert scene.truth.times.tolist() == pytest.approx([0.5, 0, 0.25, 0.75, 1])
     centers = centers_of([c for pair in rig_cameras(192, times, 0) for c in pair])
-    faces, barycentric = surface_points(world, rig.POINTS, centers, stream(0, rig._POINTS), 0.5, world.casts)
+    faces, barycentric = surface_points(
+        world, rigs.POINTS, centers, stream(0, rigs._POINTS), 0.5, world.casts
+    )
     for frame in scene.train + scene.test:
         points = scene.truth.points[:, int((scene.truth.times - frame.time).abs().argmin())]
         place = in_vehicle_units(frame.camera.center)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from forewarp.synth.raycast import LIGHT_AT, Posed
-from forewarp.synth.room import HIGH, LOW
+from forewarp.synth.vehicle import HIGH, LOW
 from forewarp.synth.world import World
 
 

@@ -4,12 +4,10 @@ import numpy as np
 import pytest
 import yaml
 
-from forewarp.synth.cameras import centers_of, random_cameras, stream
-from forewarp.synth.motions import GROUND
-from forewarp.synth.points import surface_points
-from forewarp.synth.raycast import Posed, camera_rays, light_points, render
-from forewarp.synth.specimens import _STAY, SPECIMENS
-from forewarp.synth.world import World
+from forewarp.synth.raycast import Posed, camera_rays, light_points, render, surface_points
+from forewarp.synth.scenes import centers_of, random_cameras, stream
+from forewarp.synth.vehicle import GROUND
+from forewarp.synth.world import _STAY, SPECIMENS, World
 from tests.support.configs import CONF
 
 TIMES = np.linspace(0, 1, 41)

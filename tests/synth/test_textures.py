@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from forewarp.synth.textures import PATTERNS, Material, Surface, color_of
+from forewarp.synth.shapes import PATTERNS, Material, Surface, color_of
 
 
 def surface(*positions, normal=(0.0, 0.0, 1.0)):

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from forewarp.synth.motions import GROUND, MOTIONS
+from forewarp.synth.vehicle import GROUND, MOTIONS
 from forewarp.synth.world import World
 
 

@@ -10,7 +10,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from forewarp.clock import Clock
 from forewarp.data.module import SceneDataModule
-from forewarp.evaluation.pictures import TensorBoardPictures
+from forewarp.evaluation.images import TensorBoardImages
 from forewarp.progress import ProgressLine
 from forewarp.training.callbacks import StageProgress, TensorBoardScalars
 from tests.support.tiny_scene import Interrupt, ball_data, ball_scene, make_run, same, stage, trainer
@@ -29,7 +29,7 @@ def watched_run(folder, *callbacks, steps=STEPS):
 
 
 def all_watchers():
-    return StageProgress(every=0), TensorBoardScalars(every=5), TensorBoardPictures(moments=(0.25, 0.5, 1.0))
+    return StageProgress(every=0), TensorBoardScalars(every=5), TensorBoardImages(moments=(0.25, 0.5, 1.0))
 
 
 class Record(lightning.Callback):
@@ -124,7 +124,7 @@ def test_the_validation_curve_is_the_psnr_of_the_moments(watched, events):
 
 def test_without_validation_views_there_is_no_validation_curve(tmp_path):
     scene = replace(ball_scene(), val=())
-    ours = watched_run(tmp_path, TensorBoardPictures(moments=(1.0,)), steps=2)
+    ours = watched_run(tmp_path, TensorBoardImages(moments=(1.0,)), steps=2)
     ours.datamodule = SceneDataModule(lambda: scene, rays=64)
     ours.fit()
     tags = events_of(tmp_path).Tags()
@@ -192,6 +192,6 @@ def test_the_clock_stands_still_while_something_is_shown(tmp_path, monkeypatch):
     ],
 )
 def test_bad_settings_are_named(tmp_path, wrong, text):
-    made = TensorBoardScalars if "every" in wrong else partial(TensorBoardPictures, moments=(0.1,))
+    made = TensorBoardScalars if "every" in wrong else partial(TensorBoardImages, moments=(0.1,))
     with pytest.raises(ValueError, match=text):
         watched_run(tmp_path, made(**wrong)).fit()

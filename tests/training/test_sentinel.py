@@ -5,7 +5,7 @@ import lightning
 import pytest
 import torch
 
-from forewarp.scene.lens import Lens
+from forewarp.scene.camera import Lens
 from forewarp.training.bundle import read_bundle
 from forewarp.training.sentinel import BrokenStep, Sentinel, diagnose, first_bad
 from tests.support.tiny_scene import INPAINTER, ball_data, forward_model, make_run, stage

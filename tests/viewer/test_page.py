@@ -8,7 +8,7 @@ import torch
 
 pytest.importorskip("viser", reason="no viser: pip install forewarp[viewer]")
 
-from forewarp.scene.ellipsoids import Ellipsoids
+from forewarp.scene.cloud import Ellipsoids
 from forewarp.viewer.page import Page
 
 

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from forewarp.capture.place import Limits
 from forewarp.capture.sparse import Sparse
-from forewarp.drawing.lines import draw_discs, sample_lines
+from forewarp.drawing.images import draw_discs, sample_lines
 
 _SIDE, _GAP = 640, 0.06  # pixels of each drawing; share of it that stays free at its ends
 _FIRST, _LAST, _BOX = (0.10, 0.25, 0.75), (0.85, 0.20, 0.15), (0.55, 0.55, 0.55)

@@ -11,8 +11,8 @@ import numpy as np
 
 from forewarp.capture.sharpness import edge_width, sharpest
 from forewarp.capture.video import extracted, measure
+from forewarp.data.cameras import SUFFIXES, in_order
 from forewarp.data.images import common_header, read_image, write_jpeg, write_png
-from forewarp.data.transforms import SUFFIXES, in_order
 from forewarp.files import read_json, write_json
 
 _DONE = "pictures.json"  # written last

@@ -9,8 +9,8 @@ import numpy as np
 
 from forewarp.capture.pictures import Pictures
 from forewarp.capture.sparse import Sparse
-from forewarp.data.geometry import check_lens
-from forewarp.scene.errors import SceneError
+from forewarp.data.cameras import check_lens
+from forewarp.data.files import SceneError
 
 FEW_FEATURES = 60  # of a picture, in the median
 STILL = 0.01  # share of a picture's longer side: a camera that stands shifts less

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from forewarp.drawing.colors import at_most
+from forewarp.drawing.images import at_most
 
 _FLAT = 1e-9
 _COARSE = 160  # pixels of the longer side at which blur is told from what a codec adds

@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from forewarp.scene.camera import Camera
-from forewarp.scene.lens import Lens
+from forewarp.scene.camera import Camera, Lens
 
 _KNOWN = {"f", "fx", "fy", "cx", "cy", "k", "k1", "k2", "k3", "p1", "p2"}
 _VIEWS, _ERROR = 3, 1.5  # a point that is sure: seen by so many cameras, to so many pixels

@@ -62,7 +62,7 @@ def write_film(config, run, module) -> Path:
 
 def pictures_of(config, module, datamodule):
     """Render the pictures of the video that the config describes."""
-    from forewarp.evaluation.pictures import sized
+    from forewarp.evaluation.images import sized
     from forewarp.evaluation.trajectories import Trajectories
     from forewarp.evaluation.videos import make_shots, video
 

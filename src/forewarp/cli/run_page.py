@@ -96,7 +96,7 @@ def gathered(config: DictConfig, story: Story, media) -> Iterator:
 
 def rendered(config: DictConfig, story: Story, media) -> Iterator:
     """Render the telling views, and the video if the run has none; give what there is after each."""
-    from forewarp.evaluation.pictures import parts_of
+    from forewarp.evaluation.images import parts_of
     from forewarp.report.run_media import Shown
     from forewarp.runs.config import saved_config
     from forewarp.runs.fitted import opened

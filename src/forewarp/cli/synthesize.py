@@ -38,7 +38,7 @@ def synthesize(config) -> None:
 
     from omegaconf import OmegaConf
 
-    from forewarp.data.fingerprint import RECORD
+    from forewarp.data.files import RECORD
 
     arguments = OmegaConf.to_container(config, resolve=True)
     folder, overwrite = Path(arguments.pop("folder")), arguments.pop("overwrite")

@@ -73,7 +73,7 @@ def train(config) -> float | None:
     config = resumed(config)
     refuse_missing_scene(config)
     # These load torch; mistakes have been answered before.
-    from forewarp.evaluation.measure import notes_of
+    from forewarp.evaluation.evaluate import notes_of
     from forewarp.report.curve import draw_own
     from forewarp.runs.build import build_run, is_measured, measure_run
     from forewarp.runs.data_check import check_data

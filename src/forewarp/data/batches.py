@@ -9,12 +9,11 @@ import torch
 from torch import Tensor
 from torch.utils.data import IterableDataset
 
+from forewarp.data.files import SceneError
 from forewarp.data.images import MaskedImage, composited, reduced
 from forewarp.ops.blocks import reduced_depth
-from forewarp.scene.batch import Asks, Batch, Observation, Target
-from forewarp.scene.errors import SceneError
 from forewarp.scene.frame import Frame, Scene
-from forewarp.scene.view import Moment, View
+from forewarp.scene.view import Asks, Batch, Moment, Observation, Target, View
 
 COLORS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 

@@ -11,8 +11,9 @@ from __future__ import annotations
 
 import math
 import os
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from reprlib import repr as short
 
@@ -21,12 +22,11 @@ import torch
 from torch import Tensor
 
 from forewarp.data.arrays import StoredDepth, read_truth, write_array, write_truth
-from forewarp.data.files import MARKERS, frames_of, inside, number, read_json, scene_folder
-from forewarp.data.geometry import FLIP, box_of, check_range, frustum_box, pose_of
+from forewarp.data.cameras import FLIP, box_of, check_range, frustum_box, pose_of
+from forewarp.data.files import MARKERS, SceneError, frames_of, inside, number, read_json, scene_folder
 from forewarp.data.images import CachedImage, common_header, write_png
 from forewarp.files import write_json
 from forewarp.scene.camera import Camera
-from forewarp.scene.errors import SceneError
 from forewarp.scene.frame import Frame, Scene, Truth
 
 ABILITIES = ("space", "time", "canonical")
@@ -245,3 +245,56 @@ def _write_shot(folder: Path, split: str, shot: Shot, files: dict, size: tuple[i
         write_array(folder / f"{path}_depth.npy", shot.depth)
         entry["depth_file_path"] = f"{path}_depth.npy"
     files[part][path] = entry
+
+
+TRAINING_TIMES = 50
+TEST_VIEWS = {"space": 200, "time": 197, "canonical": 50}
+_SAME_TIME = 1e-4  # times are stored with four digits or more; neighbours are 1/196 apart
+
+
+def read_lego_complete(root: str | Path, scene: str, **options) -> Scene:
+    """Read the Lego Complete scene ``root/scene``; ``options`` as in ``read_scene``.
+
+    A scene with other numbers of images or other times is read too; ``protocol["note"]`` says what differs.
+
+    Raises:
+        SceneError: as ``read_scene``, and for a test view without an ability.
+    """
+    found = read_scene(root, scene, **options)
+    for frame in found.test:
+        if frame.ability == "all":
+            raise SceneError(
+                f"{Path(root) / scene}: expected transforms_test_<ability>.json for {', '.join(ABILITIES)}, "
+                f"but got {frame.name} without an ability; use data=dnerf"
+            )
+    counts = Counter(frame.ability for frame in found.test)
+    protocol = {
+        **found.protocol,
+        "dataset": "lego_complete",
+        "training_times": len(found.times),
+        "test_views": {ability: counts[ability] for ability in ABILITIES},
+        "depth": "along the ray, foreground pixels",
+    }
+    if differences := _differences(found, protocol):
+        protocol["note"] = f"not the published protocol: {'; '.join(differences)}"
+    return replace(found, protocol=protocol)
+
+
+def _differences(scene: Scene, protocol: dict) -> list[str]:
+    """Say how a scene differs from the published protocol."""
+    said = []
+    if protocol["training_times"] != TRAINING_TIMES:
+        said.append(f"{protocol['training_times']} training times instead of {TRAINING_TIMES}")
+    if len(scene.train) != protocol["training_times"]:
+        said.append(f"{len(scene.train)} training images at {protocol['training_times']} times")
+    for ability, expected in TEST_VIEWS.items():
+        if (count := protocol["test_views"][ability]) != expected:
+            said.append(f"{count} {ability} views instead of {expected}")
+    for ability, allowed in (("space", scene.times), ("canonical", (scene.canonical_time,))):
+        views = [frame for frame in scene.test if frame.ability == ability]
+        if away := sum(min(abs(frame.time - time) for time in allowed) > _SAME_TIME for frame in views):
+            place = "a training time" if ability == "space" else "the canonical time"
+            said.append(f"{away} {ability} views not at {place}")
+    if bare := sum(frame.load_depth is None for frame in scene.test):
+        said.append(f"{bare} of {len(scene.test)} test views without a depth")
+    return said

@@ -22,15 +22,22 @@ import torch
 from torch import Tensor
 
 from forewarp.data.arrays import read_cloud, read_truth, write_array, write_truth
-from forewarp.data.files import MARKERS, MOST_FRAMES, inside, number, numbers, read_json, scene_folder, whole
-from forewarp.data.geometry import MOST_UNITS, box_of, check_lens, frustum_box, pose_of
+from forewarp.data.cameras import MOST_UNITS, box_of, check_lens, frustum_box, pose_of
+from forewarp.data.files import (
+    MARKERS,
+    MOST_FRAMES,
+    SceneError,
+    inside,
+    number,
+    numbers,
+    read_json,
+    scene_folder,
+    whole,
+)
 from forewarp.data.images import CachedImage, inspect_image, write_png
-from forewarp.data.options import middle_of
 from forewarp.files import write_json
-from forewarp.scene.camera import Camera
-from forewarp.scene.errors import SceneError
-from forewarp.scene.frame import Frame, Scene, Truth
-from forewarp.scene.lens import Lens
+from forewarp.scene.camera import Camera, Lens
+from forewarp.scene.frame import Frame, Scene, Truth, middle_of
 
 _SCALES, _ASPECTS = (1e-6, 1e6), (1e-2, 1e2)
 _MOST_PIXELS, _MOST_PIXELS_OFF, _MOST_BENT = 1e5, 1e7, 1e3  # beyond them a camera file is wrong

@@ -17,13 +17,12 @@ import numpy as np
 import torch
 
 from forewarp.data.arrays import read_cloud, read_truth, shortened, write_array, write_truth
-from forewarp.data.files import MARKERS, number, numbers_of, read_bytes, scene_folder, whole
-from forewarp.data.geometry import box_of, pose_of
+from forewarp.data.cameras import box_of, pose_of
+from forewarp.data.files import MARKERS, SceneError, number, numbers_of, read_bytes, scene_folder, whole
 from forewarp.data.images import MaskedImage, inspect_image, write_jpeg
 from forewarp.files import replace_file
 from forewarp.scene.box import Box
 from forewarp.scene.camera import Camera
-from forewarp.scene.errors import SceneError
 from forewarp.scene.frame import Frame, Scene, Truth
 
 _PADDING = 0.1  # of the points' extent, on every side

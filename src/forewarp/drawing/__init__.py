@@ -1,1 +1,1 @@
-"""Pixels: colours for depth, error and flow, lines over pictures, files."""
+"""Draw and write images and videos."""

@@ -7,9 +7,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from forewarp.drawing.colors import hues
-from forewarp.drawing.lines import draw_discs, hidden, sample_lines
-from forewarp.evaluation.pictures import within
+from forewarp.drawing.images import draw_discs, hidden, hues, sample_lines
+from forewarp.evaluation.images import within
 from forewarp.methods.abilities import HasMatter, HasTrajectories
 from forewarp.scene.camera import Camera
 from forewarp.scene.cloud import Cloud, far_apart

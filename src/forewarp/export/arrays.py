@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from forewarp.drawing.lines import hidden
-from forewarp.evaluation.pictures import within
+from forewarp.drawing.images import hidden
+from forewarp.evaluation.images import within
 from forewarp.export.source import Progress, Source, Tracks, tracks_of
 from forewarp.scene.camera import Camera
 from forewarp.scene.frame import spread

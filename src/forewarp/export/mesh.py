@@ -14,7 +14,7 @@ from forewarp.export.ply import point_columns, write_ply
 from forewarp.export.source import Progress, Source
 from forewarp.methods.abilities import HasBounds, HasSolid
 from forewarp.scene.box import Box, Lattice
-from forewarp.scene.ellipsoids import Ellipsoids
+from forewarp.scene.cloud import Ellipsoids
 from forewarp.scene.view import Moment
 
 _BLUR = 0.5  # spacings of the lattice that ellipsoids are blurred by, so that none falls between its points

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from forewarp.export.source import Progress, Source, tracks_of
-from forewarp.scene.ellipsoids import Ellipsoids
+from forewarp.scene.cloud import Ellipsoids
 
 _TYPES = {"float32": "float", "uint8": "uchar"}
 _EVERY = 1 << 31  # points

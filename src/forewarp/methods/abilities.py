@@ -8,8 +8,7 @@ from typing import Protocol, runtime_checkable
 from torch import Tensor
 
 from forewarp.scene.box import Box, Lattice
-from forewarp.scene.cloud import Cloud
-from forewarp.scene.ellipsoids import Ellipsoids
+from forewarp.scene.cloud import Cloud, Ellipsoids
 
 
 @runtime_checkable

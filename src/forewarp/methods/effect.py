@@ -9,9 +9,9 @@ from typing import Protocol
 
 from forewarp.methods.method import Method
 from forewarp.metrics.gain import Gain
-from forewarp.scene.batch import Target
 from forewarp.scene.frame import Scene
-from forewarp.scene.pictures import Pictures
+from forewarp.scene.silhouettes import Pictures
+from forewarp.scene.view import Target
 
 
 @dataclass(frozen=True)

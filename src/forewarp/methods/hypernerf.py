@@ -15,8 +15,7 @@ from forewarp.methods.method import Start
 from forewarp.methods.sampled import OF_JAX, Field, SampledMethod, Sampling, encoder
 from forewarp.ops.encode import encoded_size, positional_encoding
 from forewarp.quadrature import Sampled
-from forewarp.scene.batch import Batch
-from forewarp.scene.view import Moment
+from forewarp.scene.view import Batch, Moment
 
 _FIRST = 1e-5  # standard deviation of the slice's first weights
 

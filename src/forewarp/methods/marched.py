@@ -21,10 +21,9 @@ from forewarp.methods.rows import renew_parameters
 from forewarp.methods.rows_adam import RowsAdam
 from forewarp.ops.warmup import warm_up
 from forewarp.renderer import Marched, Renderer
-from forewarp.scene.batch import Batch
 from forewarp.scene.box import Box, Lattice
-from forewarp.scene.rays import Rays
-from forewarp.scene.view import Moment, Rendering, View
+from forewarp.scene.camera import Rays
+from forewarp.scene.view import Batch, Moment, Rendering, View
 
 _RAYS = 4096  # of a picture, at once
 _THRESHOLD = "a weight in [0, 1)", lambda weight: 0 <= weight < 1

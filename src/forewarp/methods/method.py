@@ -9,10 +9,9 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
-from forewarp.scene.batch import Asks, Batch
 from forewarp.scene.cloud import Handover
 from forewarp.scene.frame import Scene
-from forewarp.scene.view import Moment, Rendering, View
+from forewarp.scene.view import Asks, Batch, Moment, Rendering, View
 
 
 @dataclass(frozen=True)

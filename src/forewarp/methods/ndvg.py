@@ -23,10 +23,9 @@ from forewarp.methods.method import Start
 from forewarp.ops.encode import encoded_size, positional_encoding
 from forewarp.ops.grid import dilate, trilinear
 from forewarp.ops.variation import second_variation
-from forewarp.scene.batch import Batch
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.frame import spread
-from forewarp.scene.view import Moment
+from forewarp.scene.view import Batch, Moment
 
 _HIDDEN = -100.0  # raw density that never comes back
 _LEAST = 1e-4  # least density, in the unit of raw density, that a stage hands over: less hardly comes back

@@ -15,8 +15,7 @@ from forewarp.methods.method import Start
 from forewarp.methods.sampled import OF_JAX, Field, SampledMethod, Sampling, encoder
 from forewarp.ops.encode import encoded_size
 from forewarp.quadrature import Sampled
-from forewarp.scene.batch import Batch
-from forewarp.scene.view import Moment
+from forewarp.scene.view import Batch, Moment
 
 
 class Nerfies(SampledMethod):

@@ -18,10 +18,9 @@ from forewarp.methods.dead_start import DeadStart
 from forewarp.methods.departures import BETWEEN_TIMES, CENTRES, ONE_TIME
 from forewarp.methods.method import Method, Snapshot, Start, Step
 from forewarp.ops.samples import clip_to_box
-from forewarp.scene.batch import Batch
+from forewarp.scene.camera import Rays
 from forewarp.scene.frame import Frame, Scene, spread
-from forewarp.scene.rays import Rays
-from forewarp.scene.view import Moment, Rendering, View
+from forewarp.scene.view import Batch, Moment, Rendering, View
 
 _MOST = 3  # pictures of an instant, as published
 _POINTS = 1 << 19  # read at once for an image

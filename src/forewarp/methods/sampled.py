@@ -16,10 +16,9 @@ from forewarp.methods.departures import ALONG_RAYS, BETWEEN_TIMES, CENTRES, ONE_
 from forewarp.methods.method import Method, Snapshot, Start, Step
 from forewarp.ops.encode import positional_encoding
 from forewarp.quadrature import Quadrature, Sampled
-from forewarp.scene.batch import Batch
+from forewarp.scene.camera import Rays
 from forewarp.scene.frame import spread
-from forewarp.scene.rays import Rays
-from forewarp.scene.view import Moment, Rendering, View
+from forewarp.scene.view import Batch, Moment, Rendering, View
 
 _LOOK_EVERY = 8  # steps between two looks for where matter is
 _PICTURES = 64  # most whose outlines say where matter may be

@@ -18,9 +18,8 @@ from forewarp.methods.marched import MarchedMethod, Marching, regrow, whole_grid
 from forewarp.methods.method import Start
 from forewarp.ops.encode import encoded_size, positional_encoding
 from forewarp.ops.variation import huber_variation
-from forewarp.scene.batch import Batch
 from forewarp.scene.box import Lattice
-from forewarp.scene.view import Moment
+from forewarp.scene.view import Batch, Moment
 
 _STRIDES = (1, 2, 4)
 _STILL_SHARE = 3  # as many points that never move as a third of a step's rays

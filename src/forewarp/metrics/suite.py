@@ -10,7 +10,7 @@ from torch import Tensor
 
 from forewarp.metrics import depth, image, lpips
 from forewarp.metrics.lpips import LPIPS
-from forewarp.scene.batch import Target
+from forewarp.scene.view import Target
 
 ABILITIES = ("space", "time", "canonical", "all")
 DEPTH_METRICS = tuple(f"depth_delta_{threshold:g}" for threshold in depth.THRESHOLDS)

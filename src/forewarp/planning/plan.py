@@ -8,7 +8,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from forewarp.data.options import most_held_out
+from forewarp.data.module import most_held_out
 from forewarp.methods.effect import Planning
 from forewarp.planning.plan_file import read_plan, write_plan
 from forewarp.planning.planner import Planner

@@ -13,7 +13,7 @@ from forewarp.methods.effect import Asked, Begin, Decision, Drop, Effect, Planni
 from forewarp.planning.trials import Trial, Trials, gain
 from forewarp.runs.overrides import key_of, merged
 from forewarp.scene.frame import Scene
-from forewarp.scene.pictures import survey
+from forewarp.scene.silhouettes import survey
 from forewarp.training.schedule import most_steps
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from hydra import compose
 from omegaconf import DictConfig, OmegaConf, open_dict
 
-from forewarp.evaluation.pictures import psnr_by_view
+from forewarp.evaluation.images import psnr_by_view
 from forewarp.files import read_json, write_json
 from forewarp.methods.abilities import HasRest
 from forewarp.metrics.gain import Gain, Numbers

@@ -9,8 +9,8 @@ from pathlib import Path
 
 from torch import Tensor
 
-from forewarp.drawing.colors import at_most
 from forewarp.drawing.files import jpeg_bytes, smaller_video
+from forewarp.drawing.images import at_most
 
 _PICTURES = 0.6  # share of the room that pictures may take; the video has the rest
 _LADDER = ((800, 92), (640, 90), (480, 88), (320, 80), (200, 70), (120, 60))  # most pixels of a side, quality

@@ -11,7 +11,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from forewarp.clock import Clock
-from forewarp.evaluation.measure import measure
+from forewarp.evaluation.evaluate import measure
 from forewarp.files import read_json
 from forewarp.runs.device import device_for
 from forewarp.training.callbacks import StageProgress

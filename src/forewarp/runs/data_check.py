@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from forewarp.data.fingerprint import difference
+from forewarp.data.files import difference
 from forewarp.files import read_json, write_json
 from forewarp.training.stages import Run
 

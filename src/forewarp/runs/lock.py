@@ -11,7 +11,7 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from forewarp.data.fingerprint import LOCK
+from forewarp.data.files import LOCK
 from forewarp.files import read_text, replace_file
 
 

@@ -5,13 +5,85 @@ Axes are OpenCV's: x right, y down, z forward. Pixel centres lie at +0.5. Distan
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from forewarp.scene.lens import Lens
-from forewarp.scene.rays import Rays
+from forewarp.ops.lens import distort, undistort, unfolded
+
+# In the plane at distance 1: outside every picture, but small enough for 64-bit integers in pixels.
+_OUTSIDE, _ON_AXIS = 1e9, 1e-9
+
+
+@dataclass(frozen=True)
+class Lens:
+    """Radial distortion ``k`` (k1, k2, k3) and tangential distortion ``p`` (p1, p2), as in ``ops.lens``.
+
+    Independent of the image size.
+
+    Raises:
+        ValueError: for other numbers of coefficients, or coefficients that are not finite.
+    """
+
+    k: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    p: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        for name, count in (("k", 3), ("p", 2)):
+            values = tuple(float(v) for v in getattr(self, name))
+            if len(values) != count or not all(math.isfinite(v) for v in values):
+                raise ValueError(f"lens.{name}: expected {count} finite numbers, but got {values}")
+            object.__setattr__(self, name, values)
+
+    def bend(self, points: Tensor) -> Tensor:
+        """Distort points (..., 2) of the plane at distance 1; keeps the dtype.
+
+        Beyond the lens's fold points are invisible, though the polynomial would map them back into the
+        picture; such points, and points mapped still farther, are put far outside in their own direction.
+        """
+        # Float64, as the sixth power of points beside the camera exceeds the range of float32.
+        plane = points.double()
+        bent = distort(plane, self.k, self.p)
+        seen = unfolded(plane, self.k, self.p) & (bent.detach().norm(dim=-1) < _OUTSIDE)
+        away = plane * (_OUTSIDE / plane.detach().norm(dim=-1, keepdim=True).clamp(min=_ON_AXIS))
+        return torch.where(seen[..., None], bent, away).to(points.dtype)
+
+    def straighten(self, points: Tensor) -> Tensor:
+        """Invert ``bend`` for points (..., 2) inside a picture, float64."""
+        return undistort(points, self.k, self.p)
+
+
+@dataclass(frozen=True)
+class Rays:
+    """R rays: ``origins`` (R, 3) and unit ``directions`` (R, 3) in world units; ``near`` and ``far``
+    are distances along the unit direction, shared by all.
+    """
+
+    origins: Tensor
+    directions: Tensor
+    near: float
+    far: float
+
+    def __len__(self) -> int:
+        return len(self.origins)
+
+    def __getitem__(self, rows) -> Rays:
+        return Rays(self.origins[rows], self.directions[rows], self.near, self.far)
+
+    def to(self, device) -> Rays:
+        """Move the rays to another device."""
+        return Rays(self.origins.to(device), self.directions.to(device), self.near, self.far)
+
+
+def joined(parts: Sequence[Rays]) -> Rays:
+    """Concatenate rays; take the least near and the greatest far."""
+    if len(parts) == 1:
+        return parts[0]
+    origins, directions = (torch.cat([getattr(p, name) for p in parts]) for name in ("origins", "directions"))
+    return Rays(origins, directions, min(p.near for p in parts), max(p.far for p in parts))
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
 from torch import Tensor
@@ -77,3 +77,15 @@ def spread(count: int, wanted: int) -> list[int]:
     """
     wanted = min(count, wanted)
     return [round(i * (count - 1) / max(wanted - 1, 1)) for i in range(wanted)]
+
+
+def middle_of(times: Iterable[float]) -> float:
+    """Choose the time nearest to the middle between first and last, the earlier of two as near.
+
+    >>> middle_of([0.0, 0.1, 0.2, 0.8, 1.0])
+    0.2
+    >>> middle_of([0.0, 0.25, 0.75, 1.0])
+    0.25
+    """
+    times = sorted(set(times))
+    return min(times, key=lambda time: round(abs(time - 0.5 * (times[0] + times[-1])), 9))

@@ -8,8 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from forewarp.scene.camera import Camera, look_at
-from forewarp.scene.rays import Rays
+from forewarp.scene.camera import Camera, Rays, look_at
 
 
 def focus_point(cameras: list[Camera]) -> Tensor:

@@ -11,19 +11,17 @@ from pathlib import Path
 
 from filelock import FileLock
 
-from forewarp.data.files import read_json
-from forewarp.data.fingerprint import LOCK, RECORD
+from forewarp.data.files import LOCK, RECORD, SceneError, read_json
 from forewarp.data.module import DNeRFDataModule, HyperNeRFDataModule, LegoCompleteDataModule, NHRDataModule
 from forewarp.progress import Counted
-from forewarp.scene.errors import SceneError
 from forewarp.scene.frame import Scene
-from forewarp.synth import dome, lego_complete, rig, scenes
+from forewarp.synth import rigs, scenes
 
 WRITERS = {
     "dnerf": scenes.synthesize,
-    "lego_complete": lego_complete.synthesize,
-    "hypernerf": rig.synthesize,
-    "nhr": dome.synthesize,
+    "lego_complete": scenes.synthesize_lego_complete,
+    "hypernerf": rigs.synthesize_hypernerf,
+    "nhr": rigs.synthesize_nhr,
 }
 
 

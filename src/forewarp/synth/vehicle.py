@@ -1,22 +1,175 @@
-"""A toy excavator of bricks, a ball and the slab under both: meshes and colours."""
+"""A toy excavator of bricks, a ball and the slab under both, a room around them, and how they move."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
-from forewarp.synth.motions import (
-    BALL_RADIUS,
-    BAND_ALONG_STICK,
-    BAND_FROM,
-    BAND_SIDE,
-    BOOM,
-    PIVOT,
-    STICK,
-    WHEEL_RADIUS,
-    WHEELS,
+from forewarp.synth.shapes import (
+    Material,
+    Mesh,
+    Part,
+    box,
+    cylinder,
+    joined,
+    prism,
+    rounded_slab,
+    sphere,
+    studs,
 )
-from forewarp.synth.shapes import Mesh, Part, box, cylinder, joined, prism, rounded_slab, sphere, studs
-from forewarp.synth.textures import Material
+
+GROUND = -0.5
+WHEELS = {
+    f"wheel{i}": (x, y, 0.162) for i, (x, y) in enumerate([(-0.36, 1), (-0.36, -1), (0.2, 1), (0.2, -1)])
+}
+WHEEL_RADIUS, WHEEL_SIDE = 0.16, 0.285
+PIVOT, BOOM, STICK = (0.10, 0.0, 0.44), 0.62, 0.46
+BALL_RADIUS, BALL_AT = 0.17, (0.34, -0.48)
+BAND_FROM, BAND_ALONG_STICK, BAND_SIDE, BAND_RADIUS = (-0.05, 0.52), 0.36, 0.125, 0.022
+
+
+@dataclass(frozen=True)
+class Controls:
+    """Angles in degrees, each relative to the link before it; ``travel`` and ``height`` in world units;
+    ``turn`` in degrees; ``squash`` the ball's height over its diameter.
+    """
+
+    boom: float = 40.0
+    stick: float = -132.0
+    bucket: float = 14.0
+    travel: float = 0.0
+    turn: float = 0.0
+    height: float = 0.0
+    drift: float = 0.0
+    squash: float = 1.0
+
+
+def _ease(time: float) -> float:
+    return 0.5 - 0.5 * np.cos(np.pi * time)
+
+
+def _lift(time: float) -> Controls:
+    return Controls(boom=39 + 42 * _ease(time), stick=-112)
+
+
+def _lift_tilt(time: float) -> Controls:
+    up = _ease(time)
+    contact = 0.5 - 0.5 * np.cos(2 * np.pi * time)
+    return Controls(
+        boom=46 + 14 * up,
+        stick=-116 + 26 * up,
+        bucket=10 + 16 * up + 8 * np.sin(np.pi * time) ** 2,
+        height=0.3 * (1 - contact),
+        drift=0.12 * up,
+        squash=1.06 - 0.3 * contact,
+    )
+
+
+def _drive(time: float) -> Controls:
+    go = _ease(time)
+    return Controls(
+        boom=40 + 14 * go, stick=-132 + 30 * go, bucket=14 + 20 * go, travel=0.42 * go, turn=32 * go
+    )
+
+
+MOTIONS = {"lift": _lift, "lift_tilt": _lift_tilt, "drive": _drive}
+START = {"lift": (-0.22, 0.08, 18.0), "lift_tilt": (-0.22, 0.08, 18.0), "drive": (-0.32, -0.02, 4.0)}
+
+
+def joints(motion: str, time: float) -> dict[str, np.ndarray]:
+    """Compute each joint's affine map (4, 4) from its rest frame to the world at ``time``.
+
+    Args:
+        motion: a name in MOTIONS.
+        time: in [0, 1].
+    """
+    return placed(MOTIONS[motion](time), START[motion])
+
+
+def placed(now: Controls, start: tuple[float, float, float]) -> dict[str, np.ndarray]:
+    """Compute each joint's affine map (4, 4) from its rest frame to the world.
+
+    Args:
+        now: angles and lengths.
+        start: the chassis's x, y and heading in degrees.
+    """
+    chassis = _along_arc(start, now.travel, now.turn)
+    boom = chassis @ _shift(PIVOT) @ _raise(now.boom)
+    stick = boom @ _shift((BOOM, 0, 0)) @ _raise(now.stick)
+    bucket = stick @ _shift((STICK, 0, 0)) @ _raise(now.bucket)
+    roll = -np.degrees(now.travel / WHEEL_RADIUS)
+    maps = {
+        "ground": _shift((0, 0, GROUND)),
+        "chassis": chassis,
+        "boom": boom,
+        "stick": stick,
+        "bucket": bucket,
+    }
+    for name, (x, side, z) in WHEELS.items():
+        maps[name] = chassis @ _shift((x, side * WHEEL_SIDE, z)) @ _raise(roll)
+    maps["ball"] = _ball_map(now)
+    maps["band"] = chassis @ _band_map(now)
+    return maps
+
+
+def _ball_map(now: Controls) -> np.ndarray:
+    """Squash the ball along z and widen it across, keeping its volume."""
+    wide = now.squash**-0.5
+    x, y = BALL_AT
+    return _shift((x - now.drift, y, GROUND + 0.002 + BALL_RADIUS * now.squash + now.height)) @ np.diag(
+        [wide, wide, now.squash, 1.0]
+    )
+
+
+def _band_map(now: Controls) -> np.ndarray:
+    """Map a cylinder of length and radius 1 along x to the span between two pins, in the chassis frame;
+    it gets thinner as it stretches, keeping its volume.
+    """
+    angle = np.radians([now.boom, now.boom + now.stick])
+    pin = np.array([PIVOT[0], PIVOT[2]]) + BOOM * _point(angle[0]) + BAND_ALONG_STICK * _point(angle[1])
+    span = pin - np.array(BAND_FROM)
+    length = np.hypot(*span)
+    forward = np.array([span[0], 0, span[1]]) / length
+    radius = BAND_RADIUS * (0.6 / length) ** 0.5
+    place = np.eye(4)
+    place[:3, 0] = length * forward
+    place[:3, 1] = (0, radius, 0)
+    place[:3, 2] = radius * np.cross(forward, (0, 1.0, 0))
+    place[:3, 3] = (BAND_FROM[0], BAND_SIDE, BAND_FROM[1])
+    return place
+
+
+def _along_arc(start: tuple[float, float, float], travel: float, turn: float) -> np.ndarray:
+    """Move the chassis by ``travel`` along a circular arc that turns it by ``turn`` degrees."""
+    x, y, heading = start
+    half = np.radians(turn / 2)
+    chord = travel * np.sinc(half / np.pi)
+    course = np.radians(heading) + half
+    place = _shift((x + chord * np.cos(course), y + chord * np.sin(course), GROUND))
+    c, s = _point(np.radians(heading + turn))
+    place[:2, :2] = [[c, -s], [s, c]]
+    return place
+
+
+def _point(angle: float) -> np.ndarray:
+    return np.array([np.cos(angle), np.sin(angle)])
+
+
+def _shift(by) -> np.ndarray:
+    place = np.eye(4)
+    place[:3, 3] = by
+    return place
+
+
+def _raise(degrees: float) -> np.ndarray:
+    """Rotate about y, lifting the x axis towards z."""
+    c, s = _point(np.radians(degrees))
+    place = np.eye(4)
+    place[0, [0, 2]] = c, -s
+    place[2, [0, 2]] = s, c
+    return place
+
 
 YELLOW, AMBER, CHARCOAL, STEEL = (
     (0.96, 0.76, 0.20),
@@ -154,3 +307,39 @@ def _bucket() -> Mesh:
 def _ball() -> list[Part]:
     gores = Material("beach", (RED, CREAM, BLUE, YELLOW), BALL_RADIUS)
     return [Part("ball", "ball", *sphere(BALL_RADIUS), gores, smooth=True)]
+
+
+# World units about the ground joint, whose z = 0 is the top of the slab; the slab stands on the floor.
+LOW, HIGH = (-2.3, -3.7, -0.0702), (2.3, 1.75, 2.7)
+_THICK = 0.1
+
+INK, CHALK = (0.20, 0.21, 0.26), (0.93, 0.92, 0.88)
+FLOOR = Material(
+    "mosaic", ((0.72, 0.52, 0.34), (0.52, 0.34, 0.21), (0.86, 0.70, 0.50), (0.38, 0.25, 0.17), INK), 0.30
+)
+BACK = Material(
+    "mosaic", ((0.26, 0.42, 0.62), (0.80, 0.72, 0.52), (0.55, 0.70, 0.80), (0.68, 0.36, 0.34), CHALK), 0.34
+)
+LEFT = Material(
+    "mosaic", ((0.46, 0.62, 0.42), (0.84, 0.80, 0.62), (0.28, 0.44, 0.34), (0.70, 0.56, 0.36), CHALK), 0.38
+)
+RIGHT = Material(
+    "mosaic", ((0.62, 0.44, 0.60), (0.88, 0.78, 0.72), (0.42, 0.32, 0.50), (0.78, 0.58, 0.52), CHALK), 0.38
+)
+CEILING = Material("mosaic", (CHALK, (0.80, 0.82, 0.84), (0.86, 0.84, 0.78), (0.74, 0.78, 0.82), INK), 0.50)
+
+
+def room() -> list[Part]:
+    """Make six thin closed boxes, which cast no shadow, as the light is outside."""
+    (x0, y0, z0), (x1, y1, z1), t = LOW, HIGH, _THICK
+    walls = [
+        ("floor", (x0 - t, y0 - t, z0 - t), (x1 + t, y1 + t, z0), FLOOR),
+        ("ceiling", (x0 - t, y0 - t, z1), (x1 + t, y1 + t, z1 + t), CEILING),
+        ("left", (x0 - t, y0, z0), (x0, y1, z1), LEFT),
+        ("right", (x1, y0, z0), (x1 + t, y1, z1), RIGHT),
+        ("front", (x0 - t, y0 - t, z0), (x1 + t, y0, z1), BACK),
+        ("back", (x0 - t, y1, z0), (x1 + t, y1 + t, z1), BACK),
+    ]
+    return [
+        Part(name, "ground", *box(low, high), material, casts=False) for name, low, high, material in walls
+    ]

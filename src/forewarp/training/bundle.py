@@ -7,12 +7,10 @@ from pathlib import Path
 
 import torch
 
-from forewarp.scene.batch import Batch, Observation
 from forewarp.scene.box import Box
-from forewarp.scene.camera import Camera
+from forewarp.scene.camera import Camera, Lens
 from forewarp.scene.frame import Frame, Scene
-from forewarp.scene.lens import Lens
-from forewarp.scene.view import Moment, View
+from forewarp.scene.view import Batch, Moment, Observation, View
 from forewarp.training.checkpoints import read_archive, write_archive
 from forewarp.training.module import DynamicSceneModule
 

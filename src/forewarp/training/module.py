@@ -12,9 +12,8 @@ from torch import Tensor
 from forewarp.clock import Clock
 from forewarp.methods.method import Method, Snapshot, Step
 from forewarp.progress import told_if_slow
-from forewarp.scene.batch import Batch, Target
 from forewarp.scene.camera import Camera
-from forewarp.scene.view import Moment, Rendering, View
+from forewarp.scene.view import Batch, Moment, Rendering, Target, View
 from forewarp.training.objective import Objective, total
 from forewarp.training.schedule import Curriculum, StageSettings
 
@@ -87,7 +86,7 @@ class DynamicSceneModule(lightning.LightningModule):
     def validation_step(self, target: Target, batch_idx: int) -> Tensor:
         """Log the PSNR of one whole image as ``val/psnr``, for ``trainer.validate``.
 
-        A run does not pause to validate: its curve ``val/psnr`` comes from ``TensorBoardPictures``.
+        A run does not pause to validate: its curve ``val/psnr`` comes from ``TensorBoardImages``.
         """
         psnr = self.psnr_of(target)
         self.log("val/psnr", psnr, batch_size=1, prog_bar=True)

@@ -11,7 +11,7 @@ import lightning
 import torch
 from torch import Tensor
 
-from forewarp.scene.batch import Batch
+from forewarp.scene.view import Batch
 from forewarp.training.bundle import write_bundle
 from forewarp.training.module import DynamicSceneModule
 from forewarp.training.objective import parts

@@ -8,7 +8,7 @@ import torch
 import viser
 import viser.transforms
 
-from forewarp.drawing.colors import hues
+from forewarp.drawing.images import hues
 from forewarp.scene.frame import spread
 from forewarp.viewer.look import vertical_fov
 from forewarp.viewer.studio import Studio

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from forewarp.browser import splat_arrays
 from forewarp.drawing.files import png_bytes, to_bytes
-from forewarp.scene.ellipsoids import Ellipsoids
+from forewarp.scene.cloud import Ellipsoids
 from forewarp.viewer.controls import Controls
 from forewarp.viewer.desk import Superseded
 from forewarp.viewer.film import write_film

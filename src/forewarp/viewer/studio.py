@@ -8,7 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from forewarp.drawing.colors import in_a_row
+from forewarp.drawing.images import in_a_row
 from forewarp.scene.camera import Camera
 from forewarp.scene.frame import Scene
 from forewarp.viewer.desk import Desk, Stale

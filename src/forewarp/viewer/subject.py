@@ -10,13 +10,13 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from forewarp.drawing.colors import depth_colors, flow_colors, with_wheel
-from forewarp.evaluation.pictures import compare, image_flow
+from forewarp.drawing.images import depth_colors, flow_colors, with_wheel
+from forewarp.evaluation.images import compare, image_flow
 from forewarp.evaluation.trajectories import Trajectories
 from forewarp.methods.abilities import HasEllipsoids, HasMatter, HasTrajectories
 from forewarp.methods.method import Snapshot
 from forewarp.scene.camera import Camera
-from forewarp.scene.ellipsoids import Ellipsoids
+from forewarp.scene.cloud import Ellipsoids
 from forewarp.scene.view import Moment, Rendering, View
 from forewarp.training.module import DynamicSceneModule
 from forewarp.viewer.desk import Stale, Superseded

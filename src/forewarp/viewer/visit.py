@@ -10,7 +10,7 @@ from typing import Protocol
 
 from torch import Tensor
 
-from forewarp.scene.ellipsoids import Ellipsoids
+from forewarp.scene.cloud import Ellipsoids
 from forewarp.viewer.desk import Stale, Superseded
 from forewarp.viewer.look import Look, first_look, vertical_fov
 from forewarp.viewer.pace import Pace, Rate

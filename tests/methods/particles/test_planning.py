@@ -7,7 +7,7 @@ import pytest
 from forewarp.methods.effect import Asked, Begin, Drop, Evidence
 from forewarp.methods.particles.planning import EFFECTS, ParticlesPlanning
 from forewarp.metrics.gain import Gain
-from forewarp.scene.pictures import Pictures
+from forewarp.scene.silhouettes import Pictures
 
 PICTURES = Pictures(frames=50, times=50, cut_out=0.8, spread=160.0, disagreement=0.2)
 NAMES = [effect.name for effect in EFFECTS]

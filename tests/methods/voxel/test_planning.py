@@ -9,7 +9,7 @@ from forewarp.methods.voxel import planning as decisions
 from forewarp.methods.voxel.evidence import Movement, Residual
 from forewarp.methods.voxel.planning import VoxelEvidence, VoxelPlanning
 from forewarp.metrics.gain import Gain
-from forewarp.scene.pictures import Pictures
+from forewarp.scene.silhouettes import Pictures
 
 MOVING = VoxelEvidence(
     Pictures(frames=50, times=50, cut_out=0.8, spread=160.0, disagreement=0.2),

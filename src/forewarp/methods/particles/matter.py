@@ -11,8 +11,7 @@ from forewarp.methods.method import Method
 from forewarp.methods.particles.nodes import nearest
 from forewarp.ops.project import FLAT, Warp, moved, rotations
 from forewarp.scene.box import Box
-from forewarp.scene.cloud import Cloud
-from forewarp.scene.ellipsoids import Ellipsoids
+from forewarp.scene.cloud import Cloud, Ellipsoids
 
 _SOLID, _SEEN = 0.1, 0.02  # opacity from which matter bounds the scene; from which there is any
 _BESIDE = 4  # particles that a point goes with

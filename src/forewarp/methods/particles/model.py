@@ -29,11 +29,9 @@ from forewarp.methods.rows_adam import RowsAdam
 from forewarp.ops.compare import compare
 from forewarp.ops.nodes import pull_nodes
 from forewarp.ops.project import BLUR, Gaussians, Warp
-from forewarp.scene.batch import Asks, Batch
 from forewarp.scene.box import Box
-from forewarp.scene.cloud import Cloud
-from forewarp.scene.ellipsoids import Ellipsoids
-from forewarp.scene.view import Moment
+from forewarp.scene.cloud import Cloud, Ellipsoids
+from forewarp.scene.view import Asks, Batch, Moment
 
 
 class Particles(Method):

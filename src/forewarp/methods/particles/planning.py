@@ -7,9 +7,9 @@ from collections.abc import Generator, Sequence
 
 from forewarp.methods.effect import Asked, Begin, Decision, Drop, Effect, Evidence
 from forewarp.methods.method import Method
-from forewarp.scene.batch import Target
 from forewarp.scene.frame import Scene
-from forewarp.scene.pictures import Pictures
+from forewarp.scene.silhouettes import Pictures
+from forewarp.scene.view import Target
 
 CUT_OUT = 0.001  # share of transparent pixels below which silhouettes say nothing
 DISAGREEMENT = 0.01  # share of the foreground that no static shape explains, above which something moves

@@ -13,7 +13,7 @@ from forewarp.ops.project import FLAT
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.cloud import Cloud
 from forewarp.scene.frame import Scene, spread
-from forewarp.scene.hull import visual_hull
+from forewarp.scene.silhouettes import visual_hull
 
 _FRAMES = 12  # whose silhouettes are looked at
 _DRIFT = 0.2  # share of a picture's width by which a silhouette is taken to move in all the time there is

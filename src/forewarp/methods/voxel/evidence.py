@@ -15,9 +15,8 @@ from forewarp.methods.voxel.effects.background import Together
 from forewarp.methods.voxel.method import SOLID
 from forewarp.metrics.limits import low_passed
 from forewarp.ops.grid import index_of, neighbour_pairs
-from forewarp.scene.batch import Target
 from forewarp.scene.frame import spread
-from forewarp.scene.view import View
+from forewarp.scene.view import Target, View
 
 if TYPE_CHECKING:
     from forewarp.methods.voxel.forward_warp import ForwardWarp

@@ -20,10 +20,10 @@ from forewarp.methods.voxel.terms import LITERAL, TERMS, Seen, voxel_terms
 from forewarp.ops.grid import neighbour_pairs
 from forewarp.ops.warmup import warm_up
 from forewarp.renderer import Renderer
-from forewarp.scene.batch import Batch
 from forewarp.scene.box import Box
 from forewarp.scene.cloud import Cloud
 from forewarp.scene.paths import RandomPatches
+from forewarp.scene.view import Batch
 
 SOLID = 0.1  # opacity over one voxel above which it counts as matter
 _STATIC_POINTS = 1024  # at most this many points known to be static in a step

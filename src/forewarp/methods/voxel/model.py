@@ -25,7 +25,7 @@ from forewarp.ops.grid import dilate
 from forewarp.renderer import Renderer
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.frame import Scene
-from forewarp.scene.hull import visual_hull
+from forewarp.scene.silhouettes import visual_hull
 
 
 @dataclass(frozen=True)

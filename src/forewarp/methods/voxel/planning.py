@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 
 from forewarp.methods.effect import Asked, Begin, Decision, Effect, Evidence, Rival
 from forewarp.methods.voxel.evidence import Movement, Residual, movement, residual
-from forewarp.scene.batch import Target
 from forewarp.scene.box import Lattice
 from forewarp.scene.frame import Scene, spread
-from forewarp.scene.pictures import Pictures
+from forewarp.scene.silhouettes import Pictures
+from forewarp.scene.view import Target
 
 if TYPE_CHECKING:
     from forewarp.methods.voxel.forward_warp import ForwardWarp

@@ -12,7 +12,7 @@ from forewarp.fields.radiance_grid import FieldAtTime, RadianceGrid, Shade, mean
 from forewarp.methods.method import Snapshot
 from forewarp.renderer import Renderer
 from forewarp.scene.box import Lattice
-from forewarp.scene.rays import Rays
+from forewarp.scene.camera import Rays
 from forewarp.scene.view import Moment, Rendering, View
 
 _NOTHING = 1e-3  # opacity over a voxel below which no colour is computed

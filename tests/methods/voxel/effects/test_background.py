@@ -6,7 +6,7 @@ from forewarp.methods.voxel.effects.background import Together, overlapped
 from forewarp.ops.grid import index_of
 from forewarp.renderer import Renderer
 from forewarp.scene.box import Box, Lattice
-from forewarp.scene.rays import Rays
+from forewarp.scene.camera import Rays
 
 WIDE = Lattice(Box((-2, -2, -2), (2, 3, 2)), (9, 11, 7))
 SMALL = Lattice(Box((-1, -0.5, -1), (1, 1, 0.7)), (5, 4, 6))

@@ -10,7 +10,7 @@ import lightning
 from lightning.pytorch.loggers import TensorBoardLogger
 
 from forewarp.evaluation.evaluate import flow_error
-from forewarp.evaluation.pictures import validation_psnr
+from forewarp.evaluation.images import validation_psnr
 from forewarp.files import read_json, read_rows, written_whole
 
 FILE = "accuracy_time.csv"

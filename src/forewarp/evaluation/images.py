@@ -10,13 +10,12 @@ import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 from torch import Tensor
 
-from forewarp.drawing.colors import depth_colors, error_colors, flow_colors, in_a_row, with_wheel
 from forewarp.drawing.files import write_png
+from forewarp.drawing.images import depth_colors, error_colors, flow_colors, in_a_row, with_wheel
 from forewarp.methods.abilities import HasTrajectories
 from forewarp.methods.method import Snapshot
-from forewarp.scene.batch import Target
 from forewarp.scene.camera import Camera
-from forewarp.scene.view import Moment, Rendering, View
+from forewarp.scene.view import Moment, Rendering, Target, View
 from forewarp.training.module import DynamicSceneModule
 
 _SEEN = 0.02  # show the motion of pixels at least this opaque
@@ -119,7 +118,7 @@ def validation_psnr(module: DynamicSceneModule, targets: Sequence[Target], rays:
     return sum(found) / len(found)
 
 
-class TensorBoardPictures(lightning.Callback):
+class TensorBoardImages(lightning.Callback):
     """Draw one view at a few moments of a stage, and log ``val/psnr`` of a few validation views.
 
     Pictures go to TensorBoard and into the stage's ``images/``. Training is not changed: the clock is paused
