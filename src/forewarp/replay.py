@@ -10,7 +10,7 @@ from pathlib import Path
 
 from forewarp.cli.entry import MISTAKE, quiet
 from forewarp.cli.errors import one_line
-from forewarp.runs.trust import without_trust
+from forewarp.runs.config import without_trust
 
 
 def replay(path: Path, trust: Sequence[str] = ()) -> str:

@@ -26,15 +26,15 @@ from omegaconf import DictConfig
 from torch.utils.flop_counter import FlopCounterMode
 
 from forewarp.cli.entry import quiet
+from forewarp.evaluation.evaluate import device_name
 from forewarp.files import read_rows, replace_file
 from forewarp.methods.method import parameter_count
 from forewarp.runs.build import build_run
 from forewarp.runs.config_files import project_root
 from forewarp.synth.scenes import synthesize
-from forewarp.training.device import device_name, peak_memory_bytes, reset_peak_memory
 from forewarp.training.module import DynamicSceneModule
 from forewarp.training.objective import total
-from forewarp.training.stages import Run
+from forewarp.training.stages import Run, peak_memory_bytes, reset_peak_memory
 from tests.stability.report import replace_section, table
 from tests.support.configs import composed
 

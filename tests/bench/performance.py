@@ -18,7 +18,7 @@ from forewarp.methods.voxel.terms import TERMS
 from forewarp.ops.splat import average_splat
 from forewarp.ops.warmup import warm_up
 from forewarp.runs.config_files import project_root
-from forewarp.training.device import peak_memory_bytes, reset_peak_memory
+from forewarp.training.stages import peak_memory_bytes, reset_peak_memory
 from tests.bench import particle_tables, start_up
 from tests.bench.timed_cases import (
     ALONE,

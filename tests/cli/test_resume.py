@@ -12,7 +12,7 @@ import yaml
 from filelock import FileLock
 
 from forewarp.replay import main as replay
-from forewarp.runs.lock import locked
+from forewarp.runs.session import locked
 from forewarp.synth.scenes import synthesize
 from tests.support.commands import call
 

@@ -1,22 +1,11 @@
+import platform
+
 import pytest
 import torch
 
+from forewarp.evaluation import evaluate
 from forewarp.evaluation.evaluate import show, without
 from forewarp.metrics.suite import LPIPS_METRICS
-from forewarp.runs.build import build_run
-from forewarp.training.device import device_of
-from tests.support.configs import composed
-
-
-@pytest.fixture
-def machine(monkeypatch):
-    """Pretends to a machine with or without GPUs of NVIDIA's and Apple's."""
-
-    def pretend(cuda=False, apple=False):
-        monkeypatch.setattr(torch.cuda, "is_available", lambda: cuda)
-        monkeypatch.setattr(torch.backends.mps, "is_available", lambda: apple)
-
-    return pretend
 
 
 def test_seconds_of_a_picture_have_three_digits(capsys, tmp_path):
@@ -29,32 +18,6 @@ def test_seconds_of_a_picture_have_three_digits(capsys, tmp_path):
     assert "\ndepartures: c\nfaults: a; b\n" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(
-    ("accelerator", "cuda", "device"),
-    [("auto", False, "cpu"), ("auto", True, "cuda"), ("gpu", True, "cuda"), ("cpu", True, "cpu")],
-)
-def test_device_of_an_accelerator(machine, accelerator, cuda, device):
-    machine(cuda=cuda, apple=True)
-    assert device_of(accelerator) == torch.device(device)
-
-
-@pytest.mark.parametrize(
-    ("accelerator", "text"),
-    [("gpu", "expected a GPU, but found none; use trainer=cpu"), ("mps", "cpu, gpu or cuda, but got mps")],
-)
-def test_refuses_what_is_not_there(machine, accelerator, text):
-    machine(apple=True)
-    with pytest.raises(ValueError, match=text):
-        device_of(accelerator)
-
-
-def test_training_and_evaluation_use_the_same_device(machine, tmp_path):
-    machine(apple=True)  # which Lightning would take
-    run = build_run(composed("data.scene=x", "trainer=auto", "logger=none"))
-    trainer = run.make_trainer(tmp_path, [])
-    assert trainer.strategy.root_device == device_of("auto") == torch.device("cpu")
-
-
 def test_what_is_left_out_fits_one_line():
     lpips = dict.fromkeys(LPIPS_METRICS, "no weights")
     small = dict.fromkeys(("ms_ssim", "ms_ssim_legacy"), "too small")
@@ -63,8 +26,13 @@ def test_what_is_left_out_fits_one_line():
     assert without(lpips) == f"without {list(lpips)[0]} (no weights), {list(lpips)[1]} (no weights)"
 
 
-@pytest.mark.parametrize("precision", ["16-mixed", 16, "transformer-engine-float16"])
-def test_float16_is_refused(precision):
-    text = f"trainer.precision: expected 32-true or bf16-mixed, but got {precision}; "
-    with pytest.raises(ValueError, match=text):
-        build_run(composed(f"trainer.precision={precision}"))
+@pytest.mark.parametrize(
+    ("lines", "name"),
+    [("processor : 0\nmodel name\t: A Thing 9\n", "A Thing 9"), (None, "arm"), ("model name :\n", "arm")],
+)
+def test_a_machine_is_called_by_its_processor(lines, name, monkeypatch, tmp_path):
+    monkeypatch.setattr(platform, "processor", lambda: "arm")
+    monkeypatch.setattr(evaluate, "_PROCESSOR", tmp_path / "cpuinfo")
+    if lines is not None:
+        (tmp_path / "cpuinfo").write_text(lines)
+    assert evaluate.device_name(torch.device("cpu")) == name

@@ -1,11 +1,16 @@
+"""A fitted run is opened to look at it, and scored for whoever swept it."""
+
 import json
+import os
 import shutil
 
+import pytest
 from omegaconf import OmegaConf
 
 from forewarp import load
 from forewarp.runs.config import saved_config
-from forewarp.runs.fitted import opened
+from forewarp.runs.fitted import named, opened
+from forewarp.synth.scenes import synthesize
 
 
 def test_a_run_is_opened_to_look_at_and_other_data_are_told(fitted, tmp_path, capsys):
@@ -23,3 +28,99 @@ def test_a_run_is_opened_to_look_at_and_other_data_are_told(fitted, tmp_path, ca
             f"warning: {run}/data.json: expected the data that the run was begun with"
             in capsys.readouterr().err
         )
+
+
+SMALL = [
+    *("model=forward", "data=dnerf", "data.root=.", "data.scene=vehicle", "preset=demo", "trainer=cpu"),
+    "data.rays=64",
+    *("logger=none", "budget.minutes=null", "budget.iterations=4", "stage.coarse.num_voxels=[[0,800]]"),
+    *("callbacks.pictures=null", "callbacks.accuracy=null", "callbacks.scalars=null", "threads=1"),
+    *("~stage.fine", "evaluate=false"),
+]
+ABSENT = "no score: the scene has no validation views and none are held out; set data.held_out=8"
+
+
+@pytest.fixture
+def scene(in_tmp):
+    """Makes the scene in the current folder, with so many validation views."""
+
+    def make(val_views):
+        views = {"test_views": (1, 0, 0), "val_views": val_views, "samples_per_pixel": 1}
+        synthesize(in_tmp / "vehicle", size=16, frames=6, **views)
+        return in_tmp
+
+    return make
+
+
+@pytest.fixture
+def returned(monkeypatch):
+    """What the jobs gave to Hydra, in order."""
+    from hydra.core import utils
+
+    values, setter = [], utils.JobReturn.return_value.fset
+    kept = property(
+        utils.JobReturn.return_value.fget, lambda job, value: (values.append(value), setter(job, value))
+    )
+    monkeypatch.setattr(utils.JobReturn, "return_value", kept)
+    return values
+
+
+@pytest.mark.slow
+def test_jobs_of_a_sweep_return_it_and_give_it_again(ok, scene, returned):
+    folder = scene(2)
+    sweep = ["--multirun", *SMALL, "seeds=2", "run=runs/${seed}", "evaluate=true", "sheets=0"]
+    done = ok("train", *sweep)
+    assert done.out.count("of 2 validation views") == 2
+    files = [folder / "runs" / seed / "score.json" for seed in "01"]
+    scores = [json.loads(file.read_text())["scores"] for file in files]
+    assert returned == [one["psnr"] for one in scores]
+    assert len(set(returned)) == 2
+    times = [file.stat().st_mtime_ns for file in files]
+    returned.clear()
+    ok("train", *sweep, "score=ssim")  # measured with the other
+    assert returned == [one["ssim"] for one in scores]
+    assert [file.stat().st_mtime_ns for file in files] == times
+    os.utime(folder / "runs" / "0" / "coarse" / "done.json")  # fitted anew since
+    files[1].unlink()  # measured before: loaded for its score alone
+    returned.clear()
+    ok("train", *sweep)
+    assert returned == [one["psnr"] for one in scores]
+    assert files[0].stat().st_mtime_ns > times[0]
+
+
+@pytest.mark.slow
+def test_alone_it_is_computed_for_whoever_asks(forewarp, ok, scene, returned):
+    folder = scene(1)
+    ok("train", *SMALL, "run=run")
+    assert not (folder / "run" / "score.json").exists()
+    assert "score    ssim 0." in forewarp("train", *SMALL, "run=run", "score=ssim").out
+    assert "score    psnr " in forewarp("train", "resume=run", "score=psnr").out
+    assert returned[0] is None
+    assert all(returned[1:])
+    done = forewarp("train", *SMALL, "run=other", "score=psnr", "data.held_out=2")
+    assert "of 2 held out views" in done.out, done.err
+
+
+@pytest.mark.slow
+def test_without_views_there_is_none(forewarp, ok, scene, returned):
+    scene(0)
+    done = ok("train", *SMALL, "run=run", "score=psnr")
+    assert ABSENT in done.out
+    done = forewarp("train", *SMALL, "run=other", "score=ms_ssim", "data.held_out=2")
+    assert "no score: frame train/r_00" in done.out
+    assert "a side must have" in done.out
+    assert returned == [None, None]
+    sweep = ["--multirun", "hydra/sweeper=one_at_a_time", "hydra.sweeper.changes=['seed=3']"]  # needs none
+    ok("train", *sweep, *SMALL, "run=swept")
+
+
+@pytest.mark.parametrize("word", ["test/psnr", "3", "[psnr]"])
+def test_another_metric_is_refused_with_a_list(refused, in_tmp, word):
+    line = refused("train", *SMALL, f"score={word}")
+    assert line.startswith("score: expected a metric of validation views (psnr, psnr_box, ssim, ms_ssim, ")
+    assert "lpips_squeeze" in line
+    assert not list(in_tmp.iterdir())
+
+
+def test_null_is_no_metric():
+    assert named(None) is None

@@ -6,7 +6,6 @@ from pathlib import Path
 import pytest
 
 from forewarp.cli.checks import refuse_renamed_keys
-from forewarp.runs.config import read_config
 from forewarp.runs.overrides import refuse_renamed
 from tests.support.configs import composed
 
@@ -75,21 +74,3 @@ def test_keys_of_a_composed_config_are_refused_unless_the_method_is_anothers(typ
 @pytest.mark.parametrize("model", ["forward", "backward", "tnerf", "particles"])
 def test_no_key_of_today_is_refused(model):
     assert refuse_renamed_keys(composed(f"model={model}")) is None
-
-
-@pytest.mark.parametrize(
-    ("text", "version"),
-    [
-        ("model: {_target_: forewarp.methods.spec.MethodSpec, warp: forward}\nseed: 0\n", "0.1"),
-        ("model: {name: forward}\nstage: {coarse: null, fine: {rates: {density: 0.3}}}\n", "0.2"),
-    ],
-)
-def test_a_run_of_an_earlier_version_is_refused_with_the_version_that_reads_it(text, version, tmp_path):
-    path = tmp_path / "config.yaml"
-    path.write_text(text)
-    expected = (
-        f"{path}: expected a run of forewarp 0.3, but got one of {version}, which version {version}.0 reads"
-    )
-    with pytest.raises(ValueError, match=re.escape(expected)) as refusal:
-        read_config(path)
-    assert "\n" not in str(refusal.value)

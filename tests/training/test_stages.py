@@ -1,12 +1,19 @@
+import gc
 import json
+import os
+import re
+import resource
 import shutil
 import signal
+import sys
+from pathlib import Path
 
 import lightning
 import pytest
 import torch
 
-from forewarp.training.interruption import Interruption
+from forewarp.training import stages as stages_module
+from forewarp.training.checkpoints import Interruption
 from tests.support.tiny_scene import (
     EVERYTHING,
     RATES,
@@ -171,6 +178,44 @@ def test_rates_bases_lattice_and_frames_follow_the_fraction(tmp_path):
 def test_an_unfinished_run_cannot_be_loaded(tmp_path):
     with pytest.raises(ValueError, match="coarse: expected a finished stage, but got none; continue with"):
         run(tmp_path).load()
+
+
+CLEARED = Path("/proc/self/clear_refs")
+
+
+@pytest.mark.skipif(not os.access(CLEARED, os.W_OK), reason=f"{CLEARED} cannot be written: not Linux")
+def test_the_peak_counts_from_the_reset_without_what_earlier_runs_left(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    gc.collect()
+    gc.disable()
+    try:
+        before = stages_module.peak_memory_bytes()
+        circle = [torch.ones(50_000_000)]  # 200 MB, touched
+        circle.append(circle)  # freed by the garbage collector alone
+        during = stages_module.peak_memory_bytes()
+        del circle
+        assert during > before + 190e6
+        assert stages_module.peak_memory_bytes() > during - 10e6  # the kernel counts in batches of pages
+        stages_module.reset_peak_memory()
+        assert stages_module.peak_memory_bytes() < during - 150e6
+    finally:
+        gc.enable()
+
+
+def test_elsewhere_the_peak_is_that_of_the_process(monkeypatch, tmp_path):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(stages_module, "_PROCESS", tmp_path / "nowhere")
+    stages_module.reset_peak_memory()  # does nothing, and says nothing
+    unit = 1 if sys.platform == "darwin" else 1024
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
+    assert stages_module.peak_memory_bytes() == peak
+
+
+def test_the_commit_of_the_code_is_known_in_its_checkout_alone(monkeypatch, tmp_path):
+    commit = stages_module.commit.__wrapped__()
+    assert commit is None or re.fullmatch(r"[0-9a-f]{9,}\+?", commit)
+    monkeypatch.setattr(stages_module, "__file__", str(tmp_path / "training" / "stages.py"))
+    assert stages_module.commit.__wrapped__() is None
 
 
 def test_every_stage_counts_its_own_memory(tmp_path, monkeypatch):

@@ -115,7 +115,7 @@ def _run(name: str, task: Callable, conf: Path, config_name: str) -> list[int]:
     import hydra
     from hydra.core.hydra_config import HydraConfig
 
-    from forewarp.runs.trust import TRUST_VARIABLE
+    from forewarp.runs.config import TRUST_VARIABLE
 
     # Travels with the job, as a launcher may not pass the environment on.
     trust = {TRUST_VARIABLE: os.environ[TRUST_VARIABLE]} if TRUST_VARIABLE in os.environ else {}

@@ -32,9 +32,9 @@ def evaluate(config) -> None:
     saved = saved_config(config.run, config)
     saved.views, saved.reduce = config.views, config.reduce  # not those of the run: null is all, and whole
     # These load torch; mistakes have been answered before.
-    from forewarp.runs.build import build_run, measure_run
-    from forewarp.runs.data_check import warn_if_changed
-    from forewarp.runs.lock import locked
+    from forewarp.runs.build import build_run
+    from forewarp.runs.fitted import measure_run
+    from forewarp.runs.session import locked, warn_if_changed
 
     run = build_run(saved)
     place = run.device  # one that there is not is refused before pictures and weights are read

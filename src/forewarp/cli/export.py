@@ -52,8 +52,7 @@ def export(config) -> None:
     # These load torch; mistakes have been answered before.
     from forewarp.export.source import Source
     from forewarp.progress import Counted
-    from forewarp.runs.build import method_name
-    from forewarp.runs.fitted import opened
+    from forewarp.runs.fitted import method_name, opened
 
     run, module = opened(saved)
     scene = run.datamodule.scene

@@ -58,15 +58,14 @@ Watch: tensorboard --logdir runs
 def train(config) -> float | None:
     """Fit the stages that are not finished and measure the run; return its score if one is asked for."""
     from forewarp.cli.checks import refuse_all, refuse_missing_scene
-    from forewarp.runs.config import claim, hashed, resumed
-    from forewarp.runs.trust import check_planned, trust_of
+    from forewarp.runs.config import check_planned, hashed, resumed, trust_of
 
     refuse_all(config)
     trust = trust_of(config.get("trust"))
     if config.get("planned") is not None:
         check_planned(config, trust)
     if config.get("score") not in (None, "psnr"):
-        from forewarp.runs.score import named
+        from forewarp.runs.fitted import named
 
         named(config.score)
     viewer = viewer_of(config)  # as typed: a saved config has none
@@ -75,28 +74,23 @@ def train(config) -> float | None:
     # These load torch; mistakes have been answered before.
     from forewarp.evaluation.evaluate import notes_of
     from forewarp.report.curve import draw_own
-    from forewarp.runs.build import build_run, is_measured, measure_run
-    from forewarp.runs.data_check import check_data
-    from forewarp.runs.lock import locked
-    from forewarp.runs.score import Score
+    from forewarp.runs.build import build_run
+    from forewarp.runs.fitted import Score, is_measured, measure_run
+    from forewarp.runs.session import session
 
     config = hashed(planned(config))
-    run, changed = build_run(config), config.get("data_changed", "refuse")
+    run = build_run(config)
     if is_skipped(run, config.get("absent", "refuse")):
         print(f"skipped: {run.datamodule.place}: no such scene")
         return None
     if config.evaluate and is_measured(run):
-        with locked(run.folder):
-            claim(config, finished=True)
-            check_data(run, changed)
+        with session(run, config, finished=True):
             other = f" reduce={config.reduce}" if config.get("reduce") else ""
             print(f"measured before: {run.folder}; again with forewarp-evaluate run={run.folder}{other}")
             return Score(run, config).of()
     refuse_early(run, config)
     score = Score(run, config)
-    with watched(run, viewer), locked(run.folder):
-        claim(config)
-        check_data(run, changed)
+    with watched(run, viewer), session(run, config):
         keep_plan(config)
         print(beginning(run, config), flush=True)
         module = run.fit()
@@ -201,7 +195,7 @@ def beginning(run, config) -> str:
     """Say in two lines what is about to be trained, on what device, and into which folder; in one more why
     a GPU is left aside, if it is.
     """
-    from forewarp.runs.device import why_on_cpu
+    from forewarp.runs.build import why_on_cpu
 
     scene, why = run.datamodule.scene, why_on_cpu(config)
     views = f"{_images(scene.train, 'training')} and {_images(scene.test, 'test')}"

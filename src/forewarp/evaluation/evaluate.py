@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import platform
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import torch
@@ -26,7 +29,6 @@ from forewarp.ops.blocks import block_means, reduced_depth
 from forewarp.progress import Counted, time_text
 from forewarp.scene.frame import Scene, spread
 from forewarp.scene.view import Rendering, Target
-from forewarp.training.device import device_name, versions
 from forewarp.training.module import DynamicSceneModule
 from forewarp.training.stages import Run
 
@@ -62,6 +64,8 @@ def reduced_rendering(
 
 
 _SHEET_SIDE = 300  # least pixels of the shorter side of a picture on a sheet
+_PACKAGES = ("forewarp", "torch", "lightning", "torchmetrics", "numba")  # what results depend on
+_PROCESSOR = Path("/proc/cpuinfo")  # Linux only
 
 
 @dataclass(frozen=True)
@@ -398,3 +402,24 @@ def table_of(metrics: dict) -> Table:
             ]
             table.add_row(ability + suffix, *cells)
     return table
+
+
+def device_name(device: torch.device) -> str:
+    """Return the model name of the GPU or of the processor."""
+    if device.type == "cuda":
+        return torch.cuda.get_device_name(device)
+    try:
+        lines = _PROCESSOR.read_text().splitlines()
+    except OSError:
+        lines = []
+    named = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return next(filter(None, named), None) or platform.processor() or platform.machine()
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of Python and of the installed packages that results depend on."""
+    installed = {"python": platform.python_version()}
+    for package in _PACKAGES:
+        with suppress(PackageNotFoundError):
+            installed[package] = version(package)
+    return installed

@@ -14,9 +14,8 @@ from forewarp.planning.plan_file import read_plan, write_plan
 from forewarp.planning.planner import Planner
 from forewarp.planning.trials import Trials
 from forewarp.runs.build import build_run
-from forewarp.runs.config import HASH, content_hash
+from forewarp.runs.config import HASH, content_hash, trust_of
 from forewarp.runs.overrides import key_of
-from forewarp.runs.trust import trust_of
 from forewarp.scene.frame import Scene
 
 # Keys that do not change what a run computes.

@@ -9,8 +9,8 @@ from pathlib import Path
 import yaml
 
 from forewarp.files import MOST_CONFIG, read_text, replace_file
+from forewarp.runs.config import check_target, without_trust
 from forewarp.runs.overrides import command_line, key_of, merged, without_switched_off
-from forewarp.runs.trust import check_target, without_trust
 
 PATHS = ("lpips_weights",)  # top-level keys that hold paths
 

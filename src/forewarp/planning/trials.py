@@ -17,10 +17,8 @@ from forewarp.files import read_json, write_json
 from forewarp.methods.abilities import HasRest
 from forewarp.metrics.gain import Gain, Numbers
 from forewarp.runs.build import build_run
-from forewarp.runs.config import claim
-from forewarp.runs.data_check import check_data
-from forewarp.runs.lock import locked
 from forewarp.runs.overrides import merged, without_switched_off
+from forewarp.runs.session import session
 from forewarp.training.handover import NUMBERS, POINTS
 from forewarp.training.module import DynamicSceneModule
 from forewarp.training.stages import Run
@@ -158,9 +156,7 @@ class Trials:
         run = build_run(config)
         run.tell = lambda line: None
         run.datamodule.setup("fit")
-        with locked(run.folder):
-            claim(config)
-            check_data(run, "refuse")
+        with session(run, config):
             if begun is not None:
                 _share(begun, run.folder / begun.name)
             module = run.fit().to(run.device)

@@ -1,22 +1,19 @@
-"""Build a run from its config, or from its folder, and measure it as the config says."""
+"""Build a run from its config, on the device that the config names."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
 import torch
-from hydra.utils import instantiate
+from hydra.errors import HydraException
+from hydra.utils import get_object, instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from forewarp.clock import Clock
-from forewarp.evaluation.evaluate import measure
-from forewarp.files import read_json
-from forewarp.runs.device import device_for
 from forewarp.training.callbacks import StageProgress
-from forewarp.training.device import check_precision, check_processes
-from forewarp.training.module import DynamicSceneModule
 from forewarp.training.schedule import StagePlan, seconds_after, share_out
 from forewarp.training.stages import Run
 
@@ -31,18 +28,17 @@ def build_run(config: DictConfig) -> Run:
         if not (isinstance(config.threads, int) and config.threads >= 1):
             raise ValueError(f"threads: expected a whole number > 0 or null, but got {config.threads}")
         torch.set_num_threads(config.threads)
-    check_precision(config.trainer.get("precision"))
-    check_processes(config.trainer.get("devices", 1), config.trainer.get("num_nodes", 1))
-    clock, place = Clock(config.budget.clock).kind, partial(device_for, config)
+    check_trainer(config.trainer)
+    device = partial(device_for, config)
     data = instantiate(config.data, _convert_="all")
     plans = {name: stage_of(name, stage) for name, stage in config.stage.items()}
-    watchers = [w for w in instantiate(config.callbacks, _convert_="all").values() if w is not None]
+    factories = [make for make in instantiate(config.callbacks, _convert_="all").values() if make is not None]
     trainer, logger = (instantiate(config[key], _convert_="all") for key in ("trainer", "logger"))
 
     def make_trainer(folder: Path, callbacks: list):
         return trainer(
             # With auto, Lightning would choose a Mac's GPU, which lacks float64.
-            accelerator=place().type,
+            accelerator=device().type,
             max_epochs=1,
             max_steps=-1,
             callbacks=callbacks,
@@ -55,19 +51,26 @@ def build_run(config: DictConfig) -> Run:
             num_sanity_val_steps=0,
         )
 
+    def make_callbacks(name: str, folder: Path) -> list:
+        callbacks = [make() for make in factories]
+        for callback in callbacks:
+            if isinstance(callback, StageProgress):
+                callback.later = seconds_after(run.stages, name)
+        return callbacks
+
     run = Run(
         datamodule=data,
         model=model_of(config.model),
         stages=share_out(plans, minutes=config.budget.minutes, iterations=config.budget.iterations),
         folder=Path(config.run),
         make_trainer=make_trainer,
-        callbacks=lambda name, folder: _callbacks(run, watchers, name),
+        callbacks=make_callbacks,
         seed=config.seed,
         checkpoint_seconds=config.checkpoint_seconds,
         skip=config.get("sentinel", {"skip": 0})["skip"],
         tell=partial(print, flush=True),
-        clock=clock,
-        place=place,
+        clock=Clock(config.budget.clock).kind,
+        place=device,
     )
     run.check()
     return run
@@ -102,48 +105,62 @@ def stage_of(name: str, config: DictConfig | None) -> StagePlan | None:
     return plan
 
 
-def _callbacks(run: Run, watchers: list[Callable], name: str) -> list:
-    """Make the callbacks of a stage; tell the progress line how long the later stages may take."""
-    made = [watcher() for watcher in watchers]
-    for line in made:
-        if isinstance(line, StageProgress):
-            line.later = seconds_after(run.stages, name)
-    return made
+def check_trainer(trainer: DictConfig) -> None:
+    """Refuse a precision and a number of processes with which no run can be trained.
+
+    Float16 does not hold an inpainter's gradients over constant volumes. One process trains a run, as the
+    run's folder and its clock are those of one process.
+
+    Raises:
+        ValueError: naming the key.
+    """
+    precision = trainer.get("precision")
+    if "16" in str(precision) and "bf16" not in str(precision):
+        raise ValueError(
+            f"trainer.precision: expected 32-true or bf16-mixed, but got {precision}; "
+            "float16 does not hold the gradients, use trainer.precision=bf16-mixed"
+        )
+    devices, nodes = trainer.get("devices", 1), str(trainer.get("num_nodes", 1))
+    listed = isinstance(devices, Sequence) and not isinstance(devices, str)
+    if (len(devices) != 1 if listed else str(devices) != "1") or nodes != "1":
+        got = f"{devices}" if nodes == "1" else f"{devices} on {nodes} nodes"
+        raise ValueError(
+            f"trainer.devices: expected 1, or the number of one GPU as [0], but got {got}; one process "
+            "trains a run, and --multirun with launcher=joblib trains several runs at once"
+        )
 
 
-def measure_run(run: Run, module: DynamicSceneModule, config: DictConfig) -> dict:
-    """Evaluate a fitted run by its config; print and return the numbers."""
-    protocol = {"method": method_name(config), "preset": config.preset.name, "seed": config.seed}
-    budget = config.budget
-    protocol |= {"minutes": budget.minutes, "iterations": budget.iterations, "clock": budget.clock}
-    extra = config.lpips_weights
-    return measure(
-        run,
-        module,
-        device=run.device,
-        protocol=protocol,
-        lpips_weights=[extra] if isinstance(extra, str) else extra,
-        sheets=config.sheets,
-        views=config.get("views"),
-        reduce=config.get("reduce"),
-    )
+def device_for(config: DictConfig) -> torch.device:
+    """Return the device of a run: with ``trainer=auto`` a CUDA GPU, unless there is none or ``why_on_cpu``.
+
+    Other accelerators (Apple's, for example) lack float64, which cameras and the cosine basis need.
+
+    Raises:
+        ValueError: for another accelerator, or for a GPU where there is none.
+    """
+    accelerator = config.trainer.accelerator
+    if accelerator not in ("auto", "cpu", "gpu", "cuda"):
+        raise ValueError(
+            f"trainer.accelerator: expected auto, cpu, gpu or cuda, but got {accelerator}; use trainer=auto"
+        )
+    if accelerator in ("gpu", "cuda") and not torch.cuda.is_available():
+        raise ValueError("trainer.accelerator: expected a GPU, but found none; use trainer=cpu")
+    if accelerator == "auto":
+        accelerator = "cuda" if torch.cuda.is_available() and why_on_cpu(config) is None else "cpu"
+    return torch.device("cpu" if accelerator == "cpu" else "cuda")
 
 
-def method_name(config: DictConfig) -> str:
-    """Name the measured method: the last stage's own method, else the run's."""
-    own = [stage.get("model") for stage in config.stage.values() if stage is not None][-1]
-    return (own or config.model).get("name", config.model.name)
-
-
-def is_measured(run: Run) -> bool:
-    """Tell whether a run is finished and was measured after that."""
-    metrics = Path(run.folder) / "metrics.json"
-    return read_json(metrics) is not None and is_current(metrics, run)
-
-
-def is_current(file: Path, run: Run) -> bool:
-    """Tell whether a run is finished and a file was written after that."""
-    if not all(run.is_finished(stage) for stage in run.stages):
-        return False
-    done = [run.stage_folder(stage) / "done.json" for stage in run.stages]
-    return file.stat().st_mtime_ns >= max(path.stat().st_mtime_ns for path in done)
+def why_on_cpu(config: DictConfig) -> str | None:
+    """Say in a line why ``trainer=auto`` leaves a GPU aside; None where it does not, or there is none."""
+    if config.trainer.accelerator != "auto" or not torch.cuda.is_available():
+        return None
+    for stage in config.stage.values():
+        model = None if stage is None else OmegaConf.select(stage, "model", default=None) or config.model
+        if not isinstance(model, DictConfig):
+            continue
+        with suppress(HydraException, ImportError, ValueError):  # building the method names such a mistake
+            why = getattr(get_object(str(model.get("_target_"))), "on_cpu", None)
+            if why is not None:
+                name = model.get("name", config.model.get("name"))
+                return f"model={name} leaves the GPU aside: {why}; trainer=gpu runs it there all the same"
+    return None

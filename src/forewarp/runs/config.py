@@ -1,32 +1,53 @@
-"""Keep a run's config in its folder, read it back, and tell runs apart by their configs.
+"""Keep a run's config in its folder, read it back safely, and tell runs apart by their configs.
 
-Nothing here loads torch, so that a mistyped command is answered at once.
+A run's folder may come from anyone: its config is data, which may name classes of forewarp and of packages
+that the user trusts, and nothing else. Nothing here loads torch, so a mistyped command is answered at once.
 """
 
 from __future__ import annotations
 
 import hashlib
+import importlib
+import inspect
 import json
-from collections.abc import Sequence
+import os
+import re
+import sys
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+import yaml
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
-from forewarp.files import MOST_CONFIG, read_text, replace_file
-from forewarp.runs.overrides import command_line, key_of, typed_overrides
-from forewarp.runs.trust import trust_of, trusted_config
+from forewarp.files import MOST_CONFIG, read_text
+from forewarp.runs.overrides import key_of, typed_overrides
 
 # Two runs differ if these keys differ; device, folder and what is shown do not count.
 IDENTITY = ("data", "model", "objective", "stage", "preset", "budget", "seed")
-# Named first in a refusal, as other differences follow from these.
-TYPED = ("model.name", "data.scene", "data.root", "seed", "preset", "budget")
 HASH = "{hash}"
 # May be set beside resume=<run>.
 MAY_CHANGE = (
     *("trainer", "threads", "lpips_weights", "sheets", "views", "reduce", "evaluate", "checkpoint_seconds"),
     *("sentinel", "data_changed", "score", "viewer", "host", "port"),
 )
+MOST_LEVELS = 40
+TRUST_VARIABLE = "FOREWARP_TRUST"
+# Allowed beside the classes of forewarp. Listed by full name, as a prefix would allow all of torch.
+ELSEWHERE = {
+    "lightning.Trainer",
+    "lightning.pytorch.Trainer",
+    "lightning.pytorch.loggers.CSVLogger",
+    "lightning.pytorch.loggers.TensorBoardLogger",
+}
+_RESERVED = {"_target_", "_partial_", "_recursive_", "_convert_"}
+# What OmegaConf and PyYAML raise for a text that is no config.
+_UNREADABLE = (
+    *(yaml.YAMLError, OmegaConfBaseException, ValueError, TypeError, AssertionError),
+    *(RecursionError, OverflowError),
+)
+_PARTS = {"name", "version", "sub_dir"}  # keys that make up the path a logger writes to
 
 
 def hashed(config: DictConfig) -> DictConfig:
@@ -42,11 +63,14 @@ def hashed(config: DictConfig) -> DictConfig:
 
 def content_hash(config: DictConfig, more: Sequence[str] = (), *others: object) -> str:
     """Return ten digits of a SHA-256 of ``IDENTITY`` and ``more`` keys of a config, and of ``others``."""
-    _make_absolute(config)
-    content = {key: _plain(config.get(key)) for key in (*IDENTITY, *more)}
+    make_absolute(config)
+    content = {key: config.get(key) for key in (*IDENTITY, *more)}
+    for key, part in content.items():
+        if OmegaConf.is_config(part):
+            content[key] = OmegaConf.to_container(part, resolve=True)
     precision = config.trainer.get("precision")
     if config.budget.minutes is not None:
-        from forewarp.runs.device import device_for
+        from forewarp.runs.build import device_for  # loads torch
 
         content["on"] = [device_for(config).type, precision, config.get("threads")]
     elif precision not in (None, "32-true"):
@@ -54,41 +78,6 @@ def content_hash(config: DictConfig, more: Sequence[str] = (), *others: object) 
     if others:
         content["others"] = others
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:10]
-
-
-def _plain(value: object) -> object:
-    return OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value
-
-
-def claim(config: DictConfig, *, finished: bool = False) -> None:
-    """Write the resolved config into the run's folder, unless the folder holds another run.
-
-    Args:
-        config: the run's config; the key ``run`` names the folder.
-        finished: if true, check but write nothing: a finished run keeps the config it was measured with.
-
-    Raises:
-        ValueError: if the folder holds a run of another config, or checkpoints without a config.
-    """
-    folder, path = Path(config.run), Path(config.run) / "config.yaml"
-    _make_absolute(config)
-    if config.get("resume") is None:
-        config.command = command_line("train", typed_overrides()) if HydraConfig.initialized() else None
-    config.resume = None
-    if "trust" in config:  # only who runs the command may trust, never a folder
-        config.trust = None
-    if "viewer" in config:  # a run that goes on opens no page by itself
-        config.viewer = False
-    resolved = OmegaConf.create(OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
-    begun = folder.is_dir() and any(folder.glob("*/last.ckpt"))
-    if begun and not path.is_file():
-        raise ValueError(
-            f"{path}: expected the configuration of the run, but got none; use run=... or delete the folder"
-        )
-    if begun:
-        _refuse_another(path, read_config(path, None), resolved)
-    if not finished:
-        replace_file(path, OmegaConf.to_yaml(resolved))
 
 
 def saved_config(run: str | None, changes: DictConfig, key: str = "run") -> DictConfig:
@@ -150,14 +139,13 @@ def read_config(path: Path, trust: Sequence[str] | None = ()) -> DictConfig:
     """Read the config in a run's folder; ``trust`` as in ``trusted_config``.
 
     Raises:
-        ValueError: if the file is no config of a run, is of an earlier version, or names untrusted code.
+        ValueError: if the file is no config of a run, or names untrusted code.
     """
     return parsed(read_text(path, MOST_CONFIG), path, trust)
 
 
 def parsed(text: str, path: Path, trust: Sequence[str] | None = ()) -> DictConfig:
     """Parse the text of a config like ``read_config``; ``path`` is named in errors."""
-    _refuse_earlier_version(trusted_config(text, path, None), path)
     config = trusted_config(text, path, trust)
     for key in (*IDENTITY, "trainer", "logger", "callbacks"):
         if key not in config and key != "objective":  # a method may have no objective
@@ -165,43 +153,192 @@ def parsed(text: str, path: Path, trust: Sequence[str] | None = ()) -> DictConfi
     return config
 
 
-def _refuse_earlier_version(config: DictConfig, path: Path) -> None:
-    def has(part: object, key: str) -> bool:
-        return isinstance(part, DictConfig) and key in part
-
-    stages = config.get("stage")
-    stages = stages.values() if isinstance(stages, DictConfig) else ()
-    old = "0.1" if has(config.get("model"), "warp") else None
-    old = old or ("0.2" if any(has(stage, "rates") for stage in stages) else None)
-    if old is not None:
-        raise ValueError(
-            f"{path}: expected a run of forewarp 0.3, but got one of {old}, which version {old}.0 reads; "
-            f"run its command again into another folder, or install forewarp {old}.0"
-        )
-
-
-def _make_absolute(config: DictConfig) -> None:
+def make_absolute(config: DictConfig) -> None:
     """Make ``data.root`` absolute, as a run may be evaluated from another folder."""
     if not OmegaConf.is_missing(config.data, "root") and config.data.get("root") is not None:
         config.data.root = str(Path(config.data.root).expanduser().resolve())
 
 
-def _refuse_another(path: Path, before: DictConfig, now: DictConfig) -> None:
-    old, new = ({k: OmegaConf.to_container(c).get(k) for k in IDENTITY} for c in (before, now))
-    found = list(_differences(old, new))
-    if found:
-        key, was, got = min(found, key=lambda row: [not row[0].startswith(first) for first in TYPED])
-        more = f" (and {len(found) - 1} more keys)" if len(found) > 1 else ""
-        raise ValueError(
-            f"{path}: {key}: expected {was}, as the run that this folder holds, but got {got}{more}; "
-            "use run=<another folder>, or delete this one"
-        )
+def trusted_config(text: str, where: Path, trust: Sequence[str] | None = ()) -> DictConfig:
+    """Parse a resolved config; refuse a config that is not safe to instantiate.
+
+    Args:
+        text: the YAML.
+        where: the file, named in errors.
+        trust: packages whose code the config may name; no other package is imported.
+            None: do not check targets, for a config that is only compared and never instantiated.
+
+    Raises:
+        ValueError: if the text is no YAML mapping, has aliases or interpolations, or is nested too deep; if a
+            ``_target_`` is neither a class of forewarp (named by the module that defines it), nor in
+            ``ELSEWHERE``, nor defined in a trusted package; or if a logger would write outside its stage's
+            folder.
+    """
+    try:
+        _check_events(text, where)
+        config = OmegaConf.create(text)
+        content = OmegaConf.to_container(config) if isinstance(config, DictConfig) else None
+    except _UNREADABLE as error:
+        if str(error).startswith(f"{where}: "):
+            raise
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise ValueError(f"{where}: expected YAML, but got {reason}; delete the run's folder") from None
+    if content is None:
+        raise ValueError(f"{where}: expected a mapping, but got another kind; delete the run's folder")
+    _check(content, where, "", trust)
+    return config
 
 
-def _differences(old, new, key: str = ""):
-    if isinstance(old, dict) and isinstance(new, dict):
-        for name in [*old, *(n for n in new if n not in old)]:
-            inner = f"{key}.{name}" if key else name
-            yield from _differences(old.get(name, "nothing"), new.get(name, "nothing"), inner)
-    elif old != new:
-        yield key, old, new
+def trust_of(named: str | Iterable[str] | None = None) -> tuple[str, ...]:
+    """List the trusted packages: those named, then those in ``FOREWARP_TRUST``.
+
+    Args:
+        named: a name, several separated by commas, or a list; None: none.
+
+    Raises:
+        ValueError: for a name that is no package name, such as an empty one or a wildcard.
+
+    >>> trust_of("theirs"), trust_of(["theirs", "other.part", "theirs"])
+    (('theirs',), ('theirs', 'other.part'))
+    """
+    found: dict[str, None] = {}
+    for source, given in (("trust", named), (TRUST_VARIABLE, os.environ.get(TRUST_VARIABLE) or None)):
+        names = given.split(",") if isinstance(given, str) else [] if given is None else given
+        for name in list(names) if isinstance(names, Iterable) else [names]:
+            name = name.strip() if isinstance(name, str) else name
+            if not isinstance(name, str) or not all(part.isidentifier() for part in name.split(".")):
+                example = "trust=[theirs]" if source == "trust" else f"{TRUST_VARIABLE}=theirs"
+                raise ValueError(
+                    f"{source}: expected names of packages, as {example}, but got {name!r:.80}; name each"
+                )
+            found[name] = None
+    return tuple(found)
+
+
+def without_trust(arguments: Sequence[str]) -> tuple[list[str], tuple[str, ...]]:
+    """Split a command line into the arguments other than ``trust=...`` and the packages to trust.
+
+    >>> without_trust(["run", "trust=[theirs,other]"])
+    (['run'], ('theirs', 'other'))
+    """
+    named = [argument.partition("=")[2] for argument in arguments if argument.startswith("trust=")]
+    lists = [re.sub(r"^\[(.*)\]$", r"\1", text) for text in named]
+    rest = [argument for argument in arguments if not argument.startswith("trust=")]
+    return rest, trust_of([name for text in lists for name in text.split(",")])
+
+
+def check_planned(config: DictConfig, trust: Sequence[str]) -> None:
+    """Check a config composed with overrides from a plan file, like a stored config."""
+    where = f"plan={config.planned}"
+    _check(OmegaConf.to_container(config, resolve=True), where, "", trust)
+
+
+def _check_events(text: str, where: Path) -> None:
+    """Refuse long texts, aliases and deep nesting, which can exhaust memory or the stack."""
+    if len(text) > MOST_CONFIG:
+        raise ValueError(f"{where}: expected at most {MOST_CONFIG} characters, but got {len(text)}")
+    level = 0
+    for event in yaml.parse(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader)):
+        if isinstance(event, yaml.AliasEvent):
+            raise ValueError(f"{where}: expected no aliases, but got *{event.anchor}; write it out")
+        level += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        if level > MOST_LEVELS:
+            raise ValueError(f"{where}: expected at most {MOST_LEVELS} levels, but got more")
+
+
+def _check(node: object, where: Path, key: str, trust: Sequence[str] | None) -> None:
+    if isinstance(node, dict):
+        for name, value in node.items():
+            inner = f"{key}.{name}" if key else str(name)
+            if name == "_target_" and trust is not None:
+                check_target(value, where, inner, trust)
+                _check_logger(node, where, key)
+            elif str(name).startswith("_") and name not in _RESERVED:
+                raise ValueError(f"{where}: {inner}: expected no key of this name; delete it")
+            _check(value, where, inner, trust)
+    elif isinstance(node, list):
+        for i, value in enumerate(node):
+            _check(value, where, f"{key}[{i}]", trust)
+    elif isinstance(node, str) and "${" in node:
+        raise ValueError(f"{where}: {key}: expected a plain value, but got {node[:80]}; write the value")
+
+
+def check_target(name: object, where: Path | str, key: str, trust: Sequence[str]) -> None:
+    """Refuse a ``_target_`` unless it is a class of forewarp, in ``ELSEWHERE``, or of a trusted package.
+
+    Raises:
+        ValueError: naming file and key, and how to trust the package.
+    """
+    if isinstance(name, str) and name in ELSEWHERE:
+        return
+    refusal = f"{where}: {key}: expected a class of forewarp, but got {name!r:.80}"
+    parts = name.split(".") if isinstance(name, str) else []
+    if len(parts) < 2 or not all(part.isidentifier() for part in parts):
+        raise ValueError(refusal)
+    if parts[0] != "forewarp":
+        _check_foreign(name, refusal, trust)
+        return
+    home, _, last = name.rpartition(".")
+    try:
+        found = getattr(importlib.import_module(home), last)
+    except Exception as error:  # an import may raise anything
+        raise ValueError(f"{refusal} ({type(error).__name__})") from None
+    # A module's own imports do not count: ``forewarp.cli.entry.Path`` is not a class of forewarp.
+    if not inspect.isclass(found) or found.__module__ != home:
+        raise ValueError(refusal)
+
+
+def _check_foreign(name: str, refusal: str, trust: Sequence[str]) -> None:
+    """Refuse a target that no trusted package defines; import nothing of packages that are not trusted."""
+    if not _is_below(name, trust):
+        raise ValueError(refusal + advice(name, trust))
+    parts = name.split(".")
+    if any(part.startswith("__") for part in parts):
+        raise ValueError(refusal)
+    try:
+        found = _located(parts)
+    except Exception as error:  # an import may raise anything
+        reason = str(error).partition("\n")[0] or type(error).__name__
+        raise ValueError(f"{refusal}, which cannot be imported ({reason:.120})") from None
+    # A module's own imports do not count, or ``theirs.module.subprocess.run`` would be allowed.
+    home = getattr(found, "__module__", None)
+    if not callable(found) or not isinstance(home, str):
+        raise ValueError(f"{refusal}, which is nothing to call that {parts[0]} defines")
+    if not _is_below(home, trust) and not (inspect.isclass(found) and _is_below(home, ["forewarp"])):
+        raise ValueError(f"{refusal}, which {home} defines{advice(home, trust)}")
+
+
+def _located(parts: Sequence[str]) -> object:
+    """Import a dotted name: first modules, then attributes."""
+    found = importlib.import_module(parts[0])
+    for i, part in enumerate(parts[1:], 2):
+        if not hasattr(found, part) and inspect.ismodule(found):
+            importlib.import_module(".".join(parts[:i]))
+        found = getattr(found, part)
+    return found
+
+
+def _is_below(name: str, trust: Sequence[str]) -> bool:
+    return any(f"{name}.".startswith(f"{package}.") for package in trust)
+
+
+def advice(name: str, trust: Sequence[str] = ()) -> str:
+    """Say how to trust the package of a name; return "" for Python's own modules.
+
+    >>> advice("theirs.Class", ["other"])
+    '; if you trust the package theirs, add trust=[other,theirs] (or set FOREWARP_TRUST=other,theirs)'
+    """
+    package = name.partition(".")[0]
+    if package in sys.stdlib_module_names:
+        return ""
+    names = ",".join([*trust, package])
+    return f"; if you trust the package {package}, add trust=[{names}] (or set {TRUST_VARIABLE}={names})"
+
+
+def _check_logger(node: dict, where: Path, key: str) -> None:
+    """Refuse a logger whose name, appended to the stage's folder, would lead out of it."""
+    for name in _PARTS & node.keys() if node["_target_"].endswith("Logger") else ():
+        if not re.fullmatch(r"(\w[\w.-]*)?", str(node[name])):
+            raise ValueError(
+                f"{where}: {key}.{name}: expected the name of a folder, but got {node[name]!r:.80}"
+            )

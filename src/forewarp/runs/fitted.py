@@ -1,23 +1,31 @@
-"""Open a fitted run as an object, for notebooks and scripts."""
+"""A fitted run: open it as an object, measure it, and score it for a sweep."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
+from hydra.core.hydra_config import HydraConfig
+from hydra.experimental.callback import Callback
+from hydra.types import RunMode
+from hydra.utils import get_class
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from forewarp.data.batches import color_of
-from forewarp.files import read_json
+from forewarp.evaluation.evaluate import mean_scores, measure
+from forewarp.files import read_json, write_json
 from forewarp.methods.abilities import HasMatter, HasTrajectories
 from forewarp.methods.method import Method, Snapshot
+from forewarp.metrics.lpips import NETS, find_lpips, find_lpips_weights
+from forewarp.metrics.suite import LPIPS_METRICS, METRICS, ImageSuite
 from forewarp.runs.build import build_run
-from forewarp.runs.config import saved_config
-from forewarp.runs.data_check import warn_if_changed
-from forewarp.runs.trust import trust_of
+from forewarp.runs.config import saved_config, trust_of
+from forewarp.runs.overrides import key_of, typed_overrides
+from forewarp.runs.session import warn_if_changed
 from forewarp.scene.camera import Camera
 from forewarp.scene.cloud import Cloud
 from forewarp.scene.frame import Frame, Scene
@@ -132,7 +140,159 @@ def opened(config: DictConfig, device: str | torch.device | None = None) -> tupl
 
 def open_run(run: str | Path, *, trust: Sequence[str] | str = (), device: str = "cpu") -> Fitted:
     """Load a finished run from its folder; see ``forewarp.load``."""
-    changes = OmegaConf.create({"trust": list(trust_of(trust))})
-    config = saved_config(str(run), changes)
+    config = saved_config(str(run), OmegaConf.create({"trust": list(trust_of(trust))}))
     made, module = opened(config, device)
     return Fitted(Path(run), config, module, made.datamodule.scene)
+
+
+def measure_run(run: Run, module: DynamicSceneModule, config: DictConfig) -> dict:
+    """Evaluate a fitted run by its config; print and return the numbers."""
+    protocol = {"method": method_name(config), "preset": config.preset.name, "seed": config.seed}
+    budget = config.budget
+    protocol |= {"minutes": budget.minutes, "iterations": budget.iterations, "clock": budget.clock}
+    extra = config.lpips_weights
+    return measure(
+        run,
+        module,
+        device=run.device,
+        protocol=protocol,
+        lpips_weights=[extra] if isinstance(extra, str) else extra,
+        sheets=config.sheets,
+        views=config.get("views"),
+        reduce=config.get("reduce"),
+    )
+
+
+def method_name(config: DictConfig) -> str:
+    """Name the measured method: the last stage's own method, else the run's."""
+    own = [stage.get("model") for stage in config.stage.values() if stage is not None][-1]
+    return (own or config.model).get("name", config.model.name)
+
+
+def is_measured(run: Run) -> bool:
+    """Tell whether a run is finished and was measured after that."""
+    metrics = Path(run.folder) / "metrics.json"
+    return read_json(metrics) is not None and is_current(metrics, run)
+
+
+def is_current(file: Path, run: Run) -> bool:
+    """Tell whether a run is finished and a file was written after that."""
+    if not all(run.is_finished(stage) for stage in run.stages):
+        return False
+    done = [run.stage_folder(stage) / "done.json" for stage in run.stages]
+    return file.stat().st_mtime_ns >= max(path.stat().st_mtime_ns for path in done)
+
+
+class Score:
+    """The number that a job returns in ``--multirun``, or if ``score`` was typed.
+
+    The mean of a metric over whole images: of the held-out views (``data.held_out``), or else of up to 8
+    validation views, never of test views. Stored in the run's ``score.json``.
+
+    Args:
+        run: the run, its scene already read.
+        config: ``score`` (the metric) and ``lpips_weights``.
+
+    Attributes:
+        name: the metric; None if nobody asked for a score, or there can be none.
+
+    Raises:
+        ValueError: if the metric is no validation metric, or the sweeper needs a score and there can be none.
+    """
+
+    def __init__(self, run: Run, config: DictConfig) -> None:
+        self.run, self.file, self.weights = run, Path(run.folder) / "score.json", config.get("lpips_weights")
+        self.typed = HydraConfig.initialized() and any(key_of(o) == "score" for o in typed_overrides())
+        self.name = named(config.get("score")) if self.typed or _sweeper() else None
+        self.nets = [net for net in NETS if f"lpips_{net}" == self.name]
+        if self.name is None:
+            return
+        if not len(run.datamodule.watched()):
+            self._leave_out("the scene has no validation views and none are held out; set data.held_out=8")
+        elif self.nets and find_lpips_weights(self.nets[0], self.weights) is None:
+            self._leave_out("no backbone weights were found; set lpips_weights=<file or folder>")
+
+    def of(self, module: DynamicSceneModule | None = None) -> float | None:
+        """Return the score, measured now or read from ``score.json``; None if there is none.
+
+        Args:
+            module: the fitted module; None: load the module if needed.
+        """
+        if self.name is None:
+            return None
+        value = self._stored().get(self.name)
+        if not isinstance(value, int | float) or not math.isfinite(value):
+            value = self._measured(module or self.run.load())
+        if value is not None:
+            print(f"score    {self.name} {value:.4f} of {self._views()}", flush=True)
+        return value
+
+    def _stored(self) -> dict:
+        """Read the scores in ``score.json``, unless the run was trained after they were written."""
+        scores = (read_json(self.file) or {}).get("scores")
+        return scores if isinstance(scores, dict) and is_current(self.file, self.run) else {}
+
+    def _views(self) -> str:
+        count, held = len(self.run.datamodule.watched()), bool(self.run.datamodule.scene.held)
+        return f"{count} {'held out' if held else 'validation'} view{'s' * (count != 1)}"
+
+    def _measured(self, module: DynamicSceneModule) -> float | None:
+        """Score all views by every metric, and store what they give beside the scores known before."""
+        data = self.run.datamodule
+        mask_box = data.scene.protocol.get("mask_box", False)
+        suite = ImageSuite(find_lpips(self.nets, self.weights), mask_box=mask_box)
+        scores = mean_scores(module.to(self.run.device), data.watched(), suite)
+        write_json(self.file, {"views": self._views(), "scores": self._stored() | scores})
+        if self.name not in scores:
+            self._leave_out(suite.absent.get(self.name, "the views have no such score"))
+        return scores.get(self.name)
+
+    def _leave_out(self, why: str) -> None:
+        """Go on without a score, unless a sweeper chooses jobs by it, as all but Hydra's own do."""
+        # Imported here, as Hydra defines its sweepers anew when it looks for plugins.
+        from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+
+        sweeper = _sweeper().get("_target_")
+        if sweeper is not None and not issubclass(get_class(sweeper), BasicSweeper):
+            raise ValueError(f"score: expected {self.name}, which the sweeper needs, but got none: {why}")
+        if self.typed:
+            print(f"no score: {why}", flush=True)
+        self.name = None
+
+
+def named(score: object) -> str | None:
+    """Return the metric, or None if ``score`` is null.
+
+    Raises:
+        ValueError: if ``score`` is no validation metric, or the sweeper maximises a distance (LPIPS).
+    """
+    if score is None:
+        return None
+    if score not in METRICS:
+        known = ", ".join(METRICS)
+        raise ValueError(f"score: expected a metric of validation views ({known}) or null, but got {score!r}")
+    if score in LPIPS_METRICS and "maximize" in str(_sweeper().get("direction")).lower():
+        raise ValueError(
+            f"hydra.sweeper.direction: expected minimize for {score}, which is less where it is better, "
+            "but got maximize; add hydra.sweeper.direction=minimize"
+        )
+    return str(score)
+
+
+def _sweeper() -> DictConfig:
+    """Return the config of the sweeper that began this job; empty if none did."""
+    swept = HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
+    return HydraConfig.get().sweeper if swept else OmegaConf.create({})
+
+
+class TellBest(Callback):
+    """Print the best job at the end of a search."""
+
+    def on_multirun_end(self, config: DictConfig, **_) -> None:
+        """Print the best job from the sweeper's ``optimization_results.yaml``."""
+        file = Path(config.hydra.sweep.dir) / "optimization_results.yaml"
+        results = OmegaConf.load(file) if file.is_file() else {}
+        if "best_params" in results:
+            overrides = " ".join(f"{key}={value}" for key, value in results.best_params.items())
+            print(f"best     {config.get('score')} {results.best_value:.4f}: {overrides}")
+            print(f"written: {file}", flush=True)

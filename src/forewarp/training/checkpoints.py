@@ -7,8 +7,11 @@ moves the file from the temporary folder, perhaps another disk, without syncing 
 from __future__ import annotations
 
 import io
+import signal
+import sys
 import zipfile
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import lightning
@@ -16,8 +19,36 @@ import torch
 from torch import Tensor
 
 from forewarp.files import replace_file, written_whole
-from forewarp.training.interruption import Interruption
 from forewarp.training.module import DynamicSceneModule
+
+
+class Interruption:
+    """A context in which the first Ctrl-C only sets ``asked``; a second one stops the process at once.
+
+    Do nothing if the program handles or ignores Ctrl-C itself, or in a thread other than the main one,
+    which receives no signals.
+    """
+
+    def __init__(self) -> None:
+        self.asked = False
+
+    def __enter__(self) -> Interruption:
+        self._installed = False
+        if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+            with suppress(ValueError):  # raised in another thread
+                signal.signal(signal.SIGINT, self._ask)
+                self._installed = True
+        return self
+
+    def __exit__(self, *error) -> None:
+        if self._installed:  # Lightning may have replaced it
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    def _ask(self, number, frame) -> None:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        self.asked = True
+        with suppress(OSError, RuntimeError):  # it may interrupt another print
+            print("\nends this step and saves it; Ctrl-C again stops at once", file=sys.stderr, flush=True)
 
 
 class KeepCheckpoint(lightning.Callback):

@@ -2,8 +2,15 @@
 
 from __future__ import annotations
 
+import ctypes
+import gc
+import resource
+import subprocess
+import sys
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -15,13 +22,13 @@ from forewarp.files import read_json, write_json
 from forewarp.methods.method import Model, Start, parameter_count
 from forewarp.scene.cloud import Handover
 from forewarp.scene.frame import Scene
-from forewarp.training.checkpoints import KeepCheckpoint, check_state, load_weights
-from forewarp.training.device import commit, peak_memory_bytes, reset_peak_memory
+from forewarp.training.checkpoints import Interruption, KeepCheckpoint, check_state, load_weights
 from forewarp.training.handover import load_handover, make_handover, save_handover
-from forewarp.training.interruption import Interruption
 from forewarp.training.module import DynamicSceneModule
 from forewarp.training.schedule import Curriculum, Stage
 from forewarp.training.sentinel import Sentinel
+
+_PROCESS = Path("/proc/self")  # Linux only
 
 
 @dataclass
@@ -279,3 +286,55 @@ def _noted(folder: Path) -> dict | None:
     """Read a stage's ``done.json``; None if the stage has not ended."""
     noted = read_json(folder / "done.json")
     return noted if noted is not None and {"seconds", "steps"} <= noted.keys() else None
+
+
+@cache
+def commit() -> str | None:
+    """Return the commit of the checkout that the package lies in, with a + where its files or its numbers
+    (conf, sweeps) differ; None where there is none. It is looked up once, when a process first asks.
+    """
+    here = Path(__file__).parents[1]
+
+    def git(*words: str) -> str:
+        line = ["git", "-C", str(here), *words]
+        return subprocess.run(line, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
+
+    try:
+        git("ls-files", "--error-unmatch", "__init__.py")  # else the checkout is another project's
+        numbers = [str(folder) for name in ("conf", "sweeps") if (folder := here.parents[1] / name).is_dir()]
+        changed = git("--no-optional-locks", "status", "--porcelain", "--", ".", *numbers)
+        return git("rev-parse", "--short=9", "HEAD") + "+" * bool(changed)
+    except (OSError, subprocess.SubprocessError):
+        return None
+
+
+def reset_peak_memory() -> None:
+    """Start a new measurement of ``peak_memory_bytes``, on Linux and on CUDA; elsewhere do nothing.
+
+    Return unused memory to the system first, so that a run does not count what earlier runs left behind.
+    """
+    gc.collect()
+    with suppress(AttributeError, OSError, TypeError):
+        ctypes.CDLL(None).malloc_trim(0)  # glibc's
+    if torch.cuda.is_available():
+        torch.cuda.reset_peak_memory_stats()
+    with suppress(OSError):
+        (_PROCESS / "clear_refs").write_text("5")
+
+
+def peak_memory_bytes() -> int:
+    """Return the peak memory in bytes, of the GPU if one was used, else of the process.
+
+    Measured since ``reset_peak_memory``, or since the process began if the system cannot reset the peak.
+    """
+    if torch.cuda.is_available() and torch.cuda.max_memory_allocated() > 0:
+        return torch.cuda.max_memory_allocated()
+    try:
+        lines = (_PROCESS / "status").read_text().splitlines()
+    except OSError:
+        lines = []
+    for line in lines:
+        if line.startswith("VmHWM:"):
+            return int(line.split()[1]) * 1024  # in KiB
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024  # elsewhere in KiB

@@ -8,8 +8,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from forewarp.files import MOST_CONFIG
-from forewarp.runs.config import read_config, saved_config
-from forewarp.runs.trust import trust_of, trusted_config, without_trust
+from forewarp.runs.config import read_config, saved_config, trust_of, trusted_config, without_trust
 from tests.support.configs import CONF, composed
 
 

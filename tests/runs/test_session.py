@@ -5,7 +5,7 @@ import os
 import pytest
 
 from forewarp.data.files import LOCK
-from forewarp.runs.lock import locked
+from forewarp.runs.session import locked
 
 
 @pytest.mark.parametrize("holder", [None, b"", b"\xff\xfe\x00", b"x" * 5000])

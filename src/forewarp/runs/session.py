@@ -1,0 +1,170 @@
+"""A run's folder while a process works on it: locked, held for one config, its data as they were."""
+
+from __future__ import annotations
+
+import errno
+import os
+import socket
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from filelock import FileLock, Timeout
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
+
+from forewarp.data.files import LOCK, difference
+from forewarp.files import read_json, read_text, replace_file, write_json
+from forewarp.runs.config import IDENTITY, make_absolute, read_config
+from forewarp.runs.overrides import command_line, typed_overrides
+from forewarp.training.stages import Run
+
+# Named first in a refusal, as other differences follow from these.
+_TYPED = ("model.name", "data.scene", "data.root", "seed", "preset", "budget")
+
+
+@contextmanager
+def session(run: Run, config: DictConfig, *, finished: bool = False) -> Iterator[None]:
+    """Hold the folder of a run whose scene is read: lock it, claim it for ``config``, check its data.
+
+    Args:
+        run: the run that ``config`` describes.
+        config: the run's config; ``data_changed`` says what to do if the scene's files have changed.
+        finished: if true, the stored config stays as it is; see ``claim``.
+
+    Raises:
+        ValueError: if another process works on the folder, it holds another run, or its data have changed.
+        OSError: if the folder cannot be written.
+    """
+    with locked(run.folder):
+        claim(config, finished=finished)
+        check_data(run, config.get("data_changed", "refuse"))
+        yield
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Lock a run's folder for the duration of the block; make the folder if it is missing.
+
+    The system holds the lock, so it ends with the process, even if killed. On a file system that does
+    not support locks, go on unlocked. ``.lock`` names the process and stays behind.
+
+    Raises:
+        ValueError: if another process holds the lock; names it.
+        OSError: if the folder cannot be made or written; names the key ``run``.
+    """
+    folder = Path(folder)
+    holder, lock = folder / LOCK, FileLock(folder / f"{LOCK}.held", timeout=0, fallback_to_soft=False)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            lock.acquire()
+        except OSError as error:
+            if isinstance(error, Timeout) or error.errno != errno.ENOSYS:  # ENOSYS: no locks here
+                raise
+        replace_file(holder, f"process {os.getpid()} on {socket.gethostname()}\n")
+    except Timeout:
+        try:
+            process = read_text(holder, 1000)[:200].strip()
+        except (OSError, ValueError):
+            process = ""
+        raise ValueError(
+            f"{folder}: expected a run that nobody works on, but got one of {process or 'another process'}; "
+            "wait for it, or use run=..."
+        ) from None
+    except OSError as error:
+        lock.release()
+        raise OSError(error.errno, error.strerror, f"run: {error.filename or folder}") from None
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+def claim(config: DictConfig, *, finished: bool = False) -> None:
+    """Write the resolved config into the run's folder, unless the folder holds another run.
+
+    Args:
+        config: the run's config; the key ``run`` names the folder.
+        finished: if true, check but write nothing: a finished run keeps the config it was measured with.
+
+    Raises:
+        ValueError: if the folder holds a run of another config, or checkpoints without a config.
+    """
+    path = Path(config.run) / "config.yaml"
+    make_absolute(config)
+    if config.get("resume") is None:
+        config.command = command_line("train", typed_overrides()) if HydraConfig.initialized() else None
+    config.resume = None
+    if "trust" in config:  # only who runs the command may trust, never a folder
+        config.trust = None
+    if "viewer" in config:  # a run that goes on opens no page by itself
+        config.viewer = False
+    resolved = OmegaConf.create(OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
+    if any(path.parent.glob("*/last.ckpt")):
+        if not path.is_file():
+            raise ValueError(
+                f"{path}: expected the configuration of the run, but got none; use run=... or delete the "
+                "folder"
+            )
+        _refuse_another(path, read_config(path, None), resolved)
+    if not finished:
+        replace_file(path, OmegaConf.to_yaml(resolved))
+
+
+def _refuse_another(path: Path, stored: DictConfig, config: DictConfig) -> None:
+    """Refuse a config that describes another run than the one stored at ``path``; name a differing key."""
+    before, now = ({k: OmegaConf.to_container(c).get(k) for k in IDENTITY} for c in (stored, config))
+    if differ := list(_differences(before, now)):
+        key, was, got = min(differ, key=lambda row: [not row[0].startswith(first) for first in _TYPED])
+        more = f" (and {len(differ) - 1} more keys)" if len(differ) > 1 else ""
+        raise ValueError(
+            f"{path}: {key}: expected {was}, as the run that this folder holds, but got {got}{more}; "
+            "use run=<another folder>, or delete this one"
+        )
+
+
+def _differences(old: object, new: object, key: str = "") -> Iterator[tuple[str, object, object]]:
+    """Yield the dotted key, the old and the new value wherever two configs differ."""
+    if isinstance(old, dict) and isinstance(new, dict):
+        for name in [*old, *(name for name in new if name not in old)]:
+            inner = f"{key}.{name}" if key else name
+            yield from _differences(old.get(name, "nothing"), new.get(name, "nothing"), inner)
+    elif old != new:
+        yield key, old, new
+
+
+def check_data(run: Run, changed: str) -> None:
+    """Compare the scene's files with those recorded in the run's ``data.json``; record them at first.
+
+    Args:
+        run: the run whose data are compared.
+        changed: what to do if files differ: ``refuse``, or ``accept`` and record them anew.
+
+    Raises:
+        ValueError: naming what changed.
+    """
+    if changed not in ("refuse", "accept"):
+        raise ValueError(f"data_changed: expected one of refuse, accept, but got {changed}")
+    path, recorded, now, differs = _compared(run)
+    if differs and changed == "refuse":
+        raise ValueError(f"{differs}; use run=..., or go on with data_changed=accept")
+    if now is not None and now != recorded:
+        write_json(path, now)
+
+
+def warn_if_changed(run: Run) -> None:
+    """Warn on stderr if the scene's files differ from those in ``data.json``."""
+    if differs := _compared(run)[-1]:
+        print(f"warning: {differs}", file=sys.stderr)
+
+
+def _compared(run: Run) -> tuple[Path, dict | None, dict | None, str | None]:
+    """Return ``data.json``, the fingerprints in it and of now, and a line if a begun run's differ."""
+    path, now = Path(run.folder) / "data.json", run.datamodule.fingerprint()
+    recorded = None if now is None else read_json(path)
+    begun = recorded is not None and any(path.parent.glob("*/last.ckpt"))
+    differs = difference(recorded, now) if begun else None
+    line = f"{path}: expected the data that the run was begun with, but got others: {differs}"
+    return path, recorded, now, line if differs else None

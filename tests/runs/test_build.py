@@ -1,0 +1,121 @@
+"""A run is built on the device that its config names, or its methods belong on."""
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from forewarp.cli.train import beginning
+from forewarp.runs.build import build_run, check_trainer, device_for, why_on_cpu
+from forewarp.runs.config import content_hash
+from tests.support.configs import composed
+
+
+@pytest.fixture
+def machine(monkeypatch):
+    """Pretends to a machine with or without GPUs of NVIDIA's and Apple's."""
+
+    def pretend(cuda=False, apple=False):
+        monkeypatch.setattr(torch.cuda, "is_available", lambda: cuda)
+        monkeypatch.setattr(torch.backends.mps, "is_available", lambda: apple)
+
+    return pretend
+
+
+def config_of(*more):
+    return composed("data=synthetic", "data.scene=x", "logger=none", *more)
+
+
+def on(accelerator, *targets):
+    """A config of one stage for each model's ``_target_``."""
+    stage = {str(i): {"model": {"_target_": target, "name": "x"}} for i, target in enumerate(targets)}
+    model = {"_target_": "forewarp.methods.nerf.NeRF", "name": "nerf"}
+    return OmegaConf.create({"trainer": {"accelerator": accelerator}, "stage": stage, "model": model})
+
+
+PARTICLES, NERF = "forewarp.methods.particles.model.Particles", "forewarp.methods.nerf.NeRF"
+
+
+@pytest.mark.parametrize(
+    ("accelerator", "targets", "cuda", "device"),
+    [
+        ("auto", [NERF], False, "cpu"),
+        ("auto", [NERF], True, "cuda"),
+        ("auto", [NERF, PARTICLES], True, "cpu"),
+        ("auto", [PARTICLES], False, "cpu"),
+        ("gpu", [PARTICLES], True, "cuda"),
+        ("cpu", [NERF], True, "cpu"),
+        *(("auto", [target], True, "cuda") for target in ("no.such.package", "forewarp.nothing", None)),
+    ],
+)
+def test_auto_takes_what_the_methods_belong_on(machine, accelerator, targets, cuda, device):
+    machine(cuda=cuda, apple=True)
+    config = on(accelerator, *targets)
+    assert device_for(config) == torch.device(device)
+    assert (why_on_cpu(config) is None) == (not (cuda and accelerator == "auto" and PARTICLES in targets))
+
+
+@pytest.mark.parametrize(
+    ("accelerator", "text"),
+    [("gpu", "expected a GPU, but found none; use trainer=cpu"), ("mps", "cpu, gpu or cuda, but got mps")],
+)
+def test_a_device_that_is_not_there_is_refused(machine, accelerator, text):
+    machine(apple=True)
+    with pytest.raises(ValueError, match=text):
+        device_for(on(accelerator))
+
+
+def test_training_and_evaluation_use_the_same_device(machine, tmp_path):
+    machine(apple=True)  # which Lightning would take
+    run = build_run(config_of("trainer=auto"))
+    trainer = run.make_trainer(tmp_path, [])
+    assert trainer.strategy.root_device == run.device == torch.device("cpu")
+
+
+def test_it_says_why_and_how_to_choose_the_gpu(machine):
+    machine(cuda=True)
+    config = config_of("model=particles", "trainer=auto")
+    run = build_run(config)
+    run.datamodule.scene = SimpleNamespace(name="x", train=(), test=())
+    first, second, third = beginning(run, config).splitlines()
+    assert first.endswith("on the CPU")
+    assert second.startswith("model=particles leaves the GPU aside: its kernels are the CPU's")
+    assert second.endswith("; trainer=gpu runs it there all the same")
+    assert third == f"run: {run.folder}"
+    config.trainer.accelerator = "cpu"
+    assert len(beginning(run, config).splitlines()) == 2
+    by_minutes = []
+    for config.trainer.accelerator in ("auto", "cpu", "gpu"):
+        by_minutes.append(content_hash(config))
+    assert by_minutes[0] == by_minutes[1] != by_minutes[2]
+
+
+def test_what_was_trained_by_the_processor_clock_is_only_not_trained_on_a_gpu(machine):
+    machine(cuda=True)
+    run = build_run(config_of("model=forward", "trainer=gpu", "budget.clock=processor"))
+    with pytest.raises(ValueError, match="budget.clock: expected wall, as processor time leaves out the GPU"):
+        run.fit()
+
+
+@pytest.mark.parametrize("precision", ["16-mixed", 16, "transformer-engine-float16"])
+def test_float16_is_refused(precision):
+    text = f"trainer.precision: expected 32-true or bf16-mixed, but got {precision}; "
+    with pytest.raises(ValueError, match=text):
+        build_run(config_of(f"trainer.precision={precision}"))
+
+
+@pytest.mark.parametrize(
+    ("devices", "nodes", "got"),
+    [
+        *((devices, 1, None) for devices in (1, "1", [0], [3])),
+        *((2, 1, "2"), ("auto", 1, "auto"), (-1, 1, "-1"), ([0, 1], 1, r"\[0, 1\]"), (1, 2, "1 on 2 nodes")),
+    ],
+)
+def test_one_process_trains_a_run(devices, nodes, got):
+    trainer = OmegaConf.create({"devices": devices, "num_nodes": nodes})
+    if got is None:
+        check_trainer(trainer)
+    else:
+        with pytest.raises(ValueError, match=f"trainer.devices: expected 1, .* but got {got}; one process"):
+            check_trainer(trainer)
