@@ -42,7 +42,7 @@ def test_no_public_name_of_the_core_is_defined_twice():
     found = homes(public_definitions)
     # A kernel bears the name of the operator that it serves.
     twice = {
-        name: [f for f in files if f.startswith(core) and not f.startswith("ops/kernels_")]
+        name: [f for f in files if f.startswith(core) and not f.startswith("ops/kernels/")]
         for name, files in found.items()
     }
     assert {name: files for name, files in twice.items() if len(files) > 1} == {}
@@ -59,8 +59,8 @@ def test_nothing_is_written_twice():
             "softplus",
             {"fields/radiance_grid.py", "fields/template.py", "methods/neural_volumes.py"},
         ),  # raw density: of voxels, of networks, of decoded volumes
-        # Compositing is in log space, in ops/composite.py; a splat may be opaque, which has no logarithm.
-        ("cumprod", {"ops/rasterize.py"}),
+        # Compositing is in log space, in ops/march.py; a splat may be opaque, which has no logarithm.
+        ("cumprod", {"ops/gaussians.py"}),
         # Trilinear reads are ops/grid.py's; Neural Volumes reads volumes with gradients to places.
         ("grid_sample", {"fields/volumes.py"}),
         ("scatter_add_", set()),

@@ -8,7 +8,7 @@ from forewarp.fields.radiance_grid import Activation, RadianceGrid, shaded
 from forewarp.methods.voxel.effects.view_dependence import SphericalHarmonics
 from forewarp.ops import backend
 from forewarp.ops.grid import index_of
-from forewarp.ops.trace import trace
+from forewarp.ops.march import trace
 from forewarp.renderer import Renderer
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.camera import Rays

@@ -11,7 +11,7 @@ SOURCE = ROOT / "src" / "forewarp"
 TITLE = "Reference"
 WHOLE_WIDTH = "---\nhide: [navigation, toc]\n---\n\n"  # the home page has nothing beside it
 SEARCH = "site/search-from-disk.js"
-COMMANDS, KERNELS = "cli", "kernels_"  # told by --help; each tested against its reference
+UNLISTED = {"cli", "kernels"}  # told by --help; each tested against its reference
 
 INTRODUCTION = f"""# {TITLE}
 
@@ -32,9 +32,8 @@ def packages() -> dict[str, list[str]]:
     found = {}
     for init in sorted(SOURCE.rglob("__init__.py"), key=lambda file: file.parent.parts):
         parts = init.parent.relative_to(SOURCE.parent).parts
-        if COMMANDS not in parts:
+        if not UNLISTED & set(parts):
             files = sorted(file.stem for file in init.parent.glob("[!_]*.py"))
-            files = [name for name in files if not name.startswith(KERNELS)]
             found[".".join(parts)] = [".".join([*parts, name]) for name in files]
     return found
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from forewarp.ops.variation import patch_variation, total_variation
+from forewarp.ops.grid import patch_variation, total_variation
 
 
 def photometric(rgb: Tensor, truth: Tensor, *, literal: bool = False) -> Tensor:

@@ -8,8 +8,7 @@ from dataclasses import dataclass, fields, replace
 import torch
 from torch import Tensor
 
-from forewarp.ops.composite import dense_weights
-from forewarp.ops.samples import by_importance, clip_to_box, midpoints, stratified, union
+from forewarp.ops.march import by_importance, clip_to_box, dense_weights, midpoints, stratified, union
 from forewarp.scene.box import Box
 from forewarp.scene.camera import Rays
 from forewarp.scene.view import Rendering

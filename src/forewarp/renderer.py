@@ -11,9 +11,7 @@ from torch import Tensor
 
 from forewarp.fields.radiance_grid import EMPTY, FieldAtTime, RadianceGrid, Shade
 from forewarp.ops.backend import use_numba
-from forewarp.ops.composite import accumulate, render_weights
-from forewarp.ops.march import march
-from forewarp.ops.trace import trace
+from forewarp.ops.march import accumulate, march, render_weights, trace
 from forewarp.scene.camera import Rays
 from forewarp.scene.view import Rendering
 

@@ -14,26 +14,23 @@ from pathlib import Path
 import lightning
 import torch
 
-from forewarp.ops.compare import compare
-from forewarp.ops.nodes import pull_nodes
-from forewarp.ops.project import Gaussians, Splats, project
-from forewarp.ops.rasterize import rasterize
-from forewarp.ops.skin import skin_weights
+from forewarp.ops.gaussians import Gaussians, Splats, compare, project, rasterize
+from forewarp.ops.nodes import pull_nodes, skin_weights
 from tests.bench.particles import MIDDLE, WHITE, Loop, Size, camera, run_of
 from tests.bench.timed_cases import milliseconds, timed
 from tests.stability.report import table
 from tests.stability.twin import implementation
 
 STEPS, FEW = 40, 5  # repetitions: of what takes milliseconds, of what takes long
-# Of which kernels a part consists: the module's name after ``kernels_``, and its functions; none named: all.
+# Of which kernels a part consists: the module's name in ``ops.kernels``, and its functions; none named: all.
 PARTS = {
     "projection": (("project", ()),),
-    "sorting into tiles": (("tiles", ()),),
+    "sorting into tiles": (("rasterize", ("by_depth", "sort_into_tiles", "shared_out")),),
     "forward: a picture's": (("rasterize", ("draw",)),),
     "forward, loss and backward": (("rasterize", ("compare",)),),
-    "chain, back to particles and nodes": (("chain", ()),),
-    "nodes": (("nodes", ()),),
-    "weights of nodes": (("skin", ()),),
+    "chain, back to particles and nodes": (("backward", ()),),
+    "nodes": (("nodes", ("carry", "pull", "spread")),),
+    "weights of nodes": (("nodes", ("weigh",)),),
     "optimiser": (("adam", ()),),
 }
 SMALLER = 16  # times as small along a side as the picture that plain PyTorch draws
@@ -89,7 +86,7 @@ def kernels_timed() -> Iterator[dict[tuple[str, str], float]]:
         return call
 
     for part in {part for kernels in PARTS.values() for part, _ in kernels}:
-        home = importlib.import_module(f"forewarp.ops.kernels_{part}")
+        home = importlib.import_module(f"forewarp.ops.kernels.{part}")
         for name, kernel in list(vars(home).items()):
             own = hasattr(kernel, "py_func") and kernel.py_func.__module__ == home.__name__
             if own and not name.startswith("_"):

@@ -21,8 +21,7 @@ from forewarp.data.module import SceneDataModule
 from forewarp.methods.method import Start
 from forewarp.methods.particles.camera import pinhole_of
 from forewarp.methods.particles.model import Particles
-from forewarp.ops.project import Gaussians, Warp, project
-from forewarp.ops.rasterize import rasterize
+from forewarp.ops.gaussians import Gaussians, Warp, project, rasterize
 from forewarp.runs.build import build_run
 from forewarp.scene.box import Box
 from forewarp.scene.camera import Camera, look_at

@@ -15,8 +15,8 @@ import torch
 
 from forewarp.cli.entry import quiet
 from forewarp.methods.voxel.terms import TERMS
+from forewarp.ops.march import warm_up
 from forewarp.ops.splat import average_splat
-from forewarp.ops.warmup import warm_up
 from forewarp.runs.config_files import project_root
 from forewarp.training.stages import peak_memory_bytes, reset_peak_memory
 from tests.bench import particle_tables, start_up

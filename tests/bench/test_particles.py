@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from forewarp.ops import kernels_project, kernels_tiles
+from forewarp.ops.kernels import project, rasterize
 from forewarp.training.callbacks import StageProgress
 from forewarp.training.module import DynamicSceneModule
 from tests.bench import particle_tables, start_up
@@ -50,8 +50,8 @@ def test_every_kernel_of_a_step_belongs_to_a_part(loop):
         if key[0] == part and (not names or key[1] in names)
     }
     assert counted == spent.keys()
-    assert hasattr(kernels_project.project, "py_func")  # put back
-    assert hasattr(kernels_tiles.by_depth, "py_func")
+    assert hasattr(project.project, "py_func")  # put back
+    assert hasattr(rasterize.by_depth, "py_func")
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ from scipy.special import expit
 
 from forewarp.export.formats import write
 from forewarp.export.ply import splat_columns, write_ply
-from forewarp.ops.project import FLAT, Gaussians
+from forewarp.ops.gaussians import FLAT, Gaussians
 from forewarp.scene.cloud import Ellipsoids
 from forewarp.scene.paths import mean_up
 from forewarp.scene.view import Moment, View

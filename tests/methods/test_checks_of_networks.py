@@ -17,7 +17,7 @@ from forewarp.fields.codes import TimeCodes
 from forewarp.fields.screws import ScrewWarp
 from forewarp.methods.sampled import Sampling
 from forewarp.ops.encode import positional_encoding
-from forewarp.ops.rigid import geman_mcclure
+from forewarp.ops.nodes import geman_mcclure
 from forewarp.scene.camera import Camera, look_at
 from forewarp.scene.frame import Frame, Scene
 from forewarp.scene.view import Moment, View

@@ -7,14 +7,12 @@ import pytest
 import torch
 from torch import zeros
 
-from forewarp.ops.checks import check_shape
-from forewarp.ops.dct import dct_basis
+from forewarp.ops.backend import check_shape
+from forewarp.ops.curves import dct_basis
 from forewarp.ops.encode import positional_encoding
 from forewarp.ops.grid import index_of, trilinear
-from forewarp.ops.march import march
-from forewarp.ops.samples import by_importance, stratified
+from forewarp.ops.march import by_importance, march, stratified, trace
 from forewarp.ops.splat import average_splat, with_copies
-from forewarp.ops.trace import trace
 
 SHAPE = (3, 4, 5)
 INDEX = zeros(SHAPE, dtype=torch.int32)

@@ -6,12 +6,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from forewarp.ops import compare as compare_module
-from forewarp.ops import project as project_module
+from forewarp.ops import gaussians
 from forewarp.ops.backend import numba_installed
-from forewarp.ops.compare import compare
-from forewarp.ops.project import Gaussians, project
-from forewarp.ops.rasterize import rasterize
+from forewarp.ops.gaussians import Gaussians, compare, project, rasterize
 from tests.support.gaussians import NO_FADES, NO_TINTS, SIZE, crowd, one, pinhole, still, straight
 
 
@@ -140,8 +137,7 @@ def uncleared():
 @pytest.mark.parametrize("threads", [1, 2, 3])
 @pytest.mark.parametrize("seen", [slice(0, 0), slice(0, 1), slice(20, 45), slice(59, 60), slice(0, 60)])
 def test_what_is_not_seen_has_a_gradient_of_zero(uncleared, two_threads, monkeypatch, threads, seen):
-    monkeypatch.setattr(compare_module, "match_threads", lambda: threads)
-    monkeypatch.setattr(project_module, "match_threads", lambda: threads)
+    monkeypatch.setattr(gaussians, "match_threads", lambda: threads)
     particles, warp, tints, fades = crowd(count=60, dtype=torch.float32)
     hidden = torch.ones(60, dtype=torch.bool)
     hidden[seen] = False
@@ -173,7 +169,7 @@ def test_what_is_not_seen_has_a_gradient_of_zero(uncleared, two_threads, monkeyp
     shares=st.integers(1, 7),
 )
 def test_threads_clear_the_rows_that_they_write(rows, shares):
-    from forewarp.ops.kernels_project import SIDE_BY_SIDE, own_rows
+    from forewarp.ops.kernels.project import SIDE_BY_SIDE, own_rows
 
     total, shown = rows[0], np.flatnonzero(rows[1]).astype(np.int32)
     blocks, end = -(-len(shown) // SIDE_BY_SIDE), 0

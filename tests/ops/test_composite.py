@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from forewarp.ops.composite import accumulate, dense_weights, render_weights
+from forewarp.ops.march import accumulate, dense_weights, render_weights
 from tests.support.reference import composite
 
 IDS = torch.tensor([0, 0, 0, 2, 2, 4])  # rays 1, 3 and 5 have no sample

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from forewarp.ops.dct import dct_basis
+from forewarp.ops.curves import dct_basis
 from tests.support.reference import dct_difference
 
 

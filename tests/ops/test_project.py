@@ -4,8 +4,8 @@ import pytest
 import torch
 from torch.autograd import gradcheck
 
+from forewarp.ops.gaussians import Gaussians, Warp, harmonics, moved, project, rotations
 from forewarp.ops.lens import distort
-from forewarp.ops.project import Gaussians, Warp, harmonics, moved, project, rotations
 from tests.support.gaussians import NO_FADES, NO_TINTS, SIZE, crowd, one, pinhole, still, straight, together
 
 LENS = {"radial": (0.1, -0.05, 0.01), "tangential": (0.01, -0.02), "reach": 4.0}

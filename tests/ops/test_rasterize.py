@@ -4,8 +4,7 @@ import pytest
 import torch
 from torch.autograd import gradcheck
 
-from forewarp.ops.project import Splats, project
-from forewarp.ops.rasterize import rasterize
+from forewarp.ops.gaussians import Splats, project, rasterize
 from tests.support.gaussians import NO_FADES, NO_TINTS, SIZE, crowd, one, pinhole, still, straight, together
 
 

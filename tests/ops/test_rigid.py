@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.autograd import gradcheck
 
-from forewarp.ops.rigid import geman_mcclure, move_by_screw, stretch
+from forewarp.ops.nodes import geman_mcclure, move_by_screw, stretch
 
 
 def matrix(turn, shift):

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from forewarp.ops.samples import by_importance, clip_to_box, midpoints, stratified, union
+from forewarp.ops.march import by_importance, clip_to_box, midpoints, stratified, union
 
 
 def generator(seed=0):

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from forewarp.ops.skin import skin_weights, skin_weights_reference
+from forewarp.ops.nodes import skin_weights, skin_weights_reference
 
 
 def numbers(count, width, spread=1.0):

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from forewarp.ops.spline import spline_basis
+from forewarp.ops.curves import spline_basis
 
 
 def test_hand_worked():

@@ -5,7 +5,7 @@ import pytest
 
 pytest.importorskip("numba", reason="no numba: pip install forewarp[cpu]")
 
-from forewarp.ops import kernels_tiles
+from forewarp.ops.kernels import rasterize as kernels
 
 ACROSS, DOWN, SIDE = 5, 4, 8
 
@@ -35,8 +35,8 @@ def touched(splat):
 
 def sorted_by(splats, shares):
     """The splats that each tile looks at, in its order, and the records."""
-    order = kernels_tiles.by_depth(splats)
-    records, entries, ends = kernels_tiles.sort_into_tiles(splats, order, ACROSS, DOWN, shares)
+    order = kernels.by_depth(splats)
+    records, entries, ends = kernels.sort_into_tiles(splats, order, ACROSS, DOWN, shares)
     assert len(ends) == ACROSS * DOWN + 1
     assert ends[-1] == len(entries)
     return [order[entries[a:b]].tolist() for a, b in zip(ends, ends[1:])], records, order

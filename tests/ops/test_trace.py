@@ -5,10 +5,8 @@ import importlib.util
 import pytest
 import torch
 
-from forewarp.ops.composite import accumulate, render_weights
 from forewarp.ops.grid import index_of, occupied_cells, trilinear_reference
-from forewarp.ops.march import march_reference
-from forewarp.ops.trace import trace
+from forewarp.ops.march import accumulate, march_reference, render_weights, trace
 
 pytestmark = pytest.mark.skipif(importlib.util.find_spec("numba") is None, reason="Numba is not installed")
 SHAPE, STEP, SHIFT, SCALE, FILL = (12, 15, 9), 0.31, -0.7, 0.6, -10.0

@@ -2,8 +2,13 @@ import numpy as np
 import pytest
 import torch
 
-from forewarp.ops.grid import neighbour_pairs
-from forewarp.ops.variation import huber_variation, patch_variation, second_variation, total_variation
+from forewarp.ops.grid import (
+    huber_variation,
+    neighbour_pairs,
+    patch_variation,
+    second_variation,
+    total_variation,
+)
 from tests.support.reference import patch_roughness, variation
 
 

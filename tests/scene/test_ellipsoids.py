@@ -2,7 +2,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from forewarp.ops.project import FLAT, rotations
+from forewarp.ops.gaussians import FLAT, rotations
 from forewarp.scene.cloud import Ellipsoids, axes_of
 
 

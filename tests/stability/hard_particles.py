@@ -9,11 +9,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from forewarp.ops.compare import Compared, compare
+from forewarp.ops.curves import spline_basis
+from forewarp.ops.gaussians import Compared, Gaussians, Pinhole, Warp, compare, project, rasterize
 from forewarp.ops.nodes import node_maps, pull_nodes, spread_nodes, stiffness
-from forewarp.ops.project import Gaussians, Pinhole, Warp, project
-from forewarp.ops.rasterize import rasterize
-from forewarp.ops.spline import spline_basis
 from tests.stability.twin import Case, uniform
 from tests.support.gaussians import SIZE, crowd, pinhole, still
 

@@ -13,8 +13,7 @@ import torch
 from torch.autograd import gradcheck
 
 from forewarp.methods.particles.camera import pinhole_of
-from forewarp.ops.compare import compare
-from forewarp.ops.project import BLUR, Warp, project
+from forewarp.ops.gaussians import BLUR, Warp, compare, project
 from tests.stability.hard_particles import BEHIND, pixels
 from tests.support.gaussians import crowd, pinhole
 from tests.support.particles import EVERY, module_with, shaken, small_data

@@ -9,7 +9,7 @@ import torch
 
 from forewarp.data.module import SceneDataModule
 from forewarp.methods.particles.model import Particles
-from forewarp.ops.project import BLUR
+from forewarp.ops.gaussians import BLUR
 from tests.contract.fitting import module_of
 from tests.contract.table import METHODS
 from tests.support.particles import EVERY, look, shaken

@@ -6,7 +6,7 @@ from hypothesis import HealthCheck, given, settings, strategies
 
 from forewarp.fields.radiance_grid import Activation, RadianceGrid
 from forewarp.methods.voxel.effects.dense import Crop, densify
-from forewarp.ops.composite import accumulate, render_weights
+from forewarp.ops.march import accumulate, render_weights
 from forewarp.ops.splat import average_splat
 from forewarp.renderer import Renderer
 from forewarp.scene.box import Box, Lattice

@@ -7,7 +7,7 @@ import torch
 
 from forewarp import losses
 from forewarp.fields.radiance_grid import Activation
-from forewarp.ops.composite import render_weights
+from forewarp.ops.march import render_weights
 from forewarp.renderer import Renderer
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.camera import Camera, look_at

@@ -11,13 +11,11 @@ from torch import Tensor
 
 from forewarp.fields.radiance_grid import Activation
 from forewarp.ops.backend import numba_installed
-from forewarp.ops.composite import accumulate, render_weights
-from forewarp.ops.dct import dct_basis
+from forewarp.ops.curves import dct_basis
 from forewarp.ops.encode import positional_encoding
-from forewarp.ops.grid import neighbour_pairs, trilinear
-from forewarp.ops.march import march
+from forewarp.ops.grid import neighbour_pairs, patch_variation, total_variation, trilinear
+from forewarp.ops.march import accumulate, march, render_weights
 from forewarp.ops.splat import average_splat
-from forewarp.ops.variation import patch_variation, total_variation
 
 Case = tuple[str, str, Callable[..., Tensor | tuple[Tensor, ...]], list[Tensor]]
 BACKENDS = ("reference", "Numba")

@@ -2,7 +2,7 @@
 
 import torch
 
-from forewarp.ops.project import Gaussians, Pinhole, Warp
+from forewarp.ops.gaussians import Gaussians, Pinhole, Warp
 
 SIZE = (29, 21)  # no multiple of a tile
 

@@ -6,7 +6,7 @@ import pytest
 
 
 def watch(monkeypatch, *parts):
-    """Return a set that takes each call of a public kernel of ``forewarp.ops.kernels_<part>``."""
+    """Return a set that takes each call of a public kernel of ``forewarp.ops.kernels.<part>``."""
     numba = pytest.importorskip("numba")
     met = set()
 
@@ -19,7 +19,7 @@ def watch(monkeypatch, *parts):
         return call
 
     for part in parts:
-        home = importlib.import_module(f"forewarp.ops.kernels_{part}")
+        home = importlib.import_module(f"forewarp.ops.kernels.{part}")
         for name, kernel in list(vars(home).items()):
             own = hasattr(kernel, "py_func") and kernel.py_func.__module__ == home.__name__
             if own and not name.startswith("_"):

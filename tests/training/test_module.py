@@ -9,7 +9,7 @@ from forewarp.methods.method import Step
 from forewarp.methods.voxel.backward_warp import Deformation
 from forewarp.methods.voxel.structure import resample
 from forewarp.ops.backend import numba_installed
-from forewarp.ops.warmup import warm_up
+from forewarp.ops.march import warm_up
 from forewarp.progress import told_if_slow
 from forewarp.renderer import Renderer
 from forewarp.scene.box import Lattice
@@ -110,7 +110,7 @@ def test_kernels_that_take_long_to_compile_are_told(monkeypatch, capsys, seconds
 def test_a_step_meets_warm_kernels_only(monkeypatch):
     if not numba_installed():
         pytest.skip("Numba is switched off")
-    met = watch(monkeypatch, "grid", "splat", "march")
+    met = watch(monkeypatch, "voxels")
     before = torch.get_rng_state()
     warm_up()
     assert torch.equal(torch.get_rng_state(), before)

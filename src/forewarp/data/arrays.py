@@ -16,7 +16,7 @@ from forewarp.data.cameras import MOST_UNITS
 from forewarp.data.files import SceneError, numbers_of, read_bytes
 from forewarp.data.images import read_gray16
 from forewarp.files import MOST_ARRAYS, MOST_POINTS, written_whole
-from forewarp.ops.blocks import reduced_depth
+from forewarp.ops.grid import reduced_depth
 from forewarp.scene.frame import Truth
 
 _SAME_TIME = 1e-6

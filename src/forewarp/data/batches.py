@@ -11,7 +11,7 @@ from torch.utils.data import IterableDataset
 
 from forewarp.data.files import SceneError
 from forewarp.data.images import MaskedImage, composited, reduced
-from forewarp.ops.blocks import reduced_depth
+from forewarp.ops.grid import reduced_depth
 from forewarp.scene.frame import Frame, Scene
 from forewarp.scene.view import Asks, Batch, Moment, Observation, Target, View
 

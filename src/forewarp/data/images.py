@@ -20,7 +20,7 @@ from torch import Tensor
 from forewarp.clock import left_out
 from forewarp.data.files import SceneError, opened
 from forewarp.files import MOST_IMAGE, written_whole
-from forewarp.ops.blocks import block_means, block_sums
+from forewarp.ops.grid import block_means, block_sums
 
 
 class ImageCache:

@@ -25,7 +25,7 @@ from forewarp.methods.method import parameter_count
 from forewarp.metrics.flow import end_point_error
 from forewarp.metrics.lpips import find_lpips
 from forewarp.metrics.suite import METRICS, ImageSuite, summarise
-from forewarp.ops.blocks import block_means, reduced_depth
+from forewarp.ops.grid import block_means, reduced_depth
 from forewarp.progress import Counted, time_text
 from forewarp.scene.frame import Scene, spread
 from forewarp.scene.view import Rendering, Target

@@ -8,8 +8,7 @@ from operator import mul
 import torch
 from torch import Tensor
 
-from forewarp.ops.dct import dct_basis
-from forewarp.ops.spline import spline_basis, spline_shares
+from forewarp.ops.curves import dct_basis, spline_basis, spline_shares
 
 KINDS = ("spline", "cosines")
 _PADDING = 0.2  # of the sequence, imagined before and after it: a cosine stands still at both ends

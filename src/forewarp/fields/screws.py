@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from forewarp.fields.template import Trunk
 from forewarp.ops.encode import encoded_size, positional_encoding
-from forewarp.ops.rigid import geman_mcclure, move_by_screw, stretch
+from forewarp.ops.nodes import geman_mcclure, move_by_screw, stretch
 
 _ELASTIC, _STILL = 0.03, 1e-3  # scales of the two robust terms: of log stretches, and in world units
 _JITTER = 1e-3  # world units

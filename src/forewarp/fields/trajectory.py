@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from forewarp.fields.mlp import mlp
 from forewarp.fields.voxel_grid import VoxelGrid
-from forewarp.ops.dct import dct_basis
+from forewarp.ops.curves import dct_basis
 from forewarp.ops.encode import positional_encoding
 from forewarp.ops.grid import corner_weights, index_of, trilinear
 from forewarp.scene.box import Box, Lattice

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from forewarp.ops.project import rotations
+from forewarp.ops.gaussians import rotations
 
 DEVIATION_SCALE = 0.01  # of the layer that gives the logarithm of the deviation
 _SLOPE = 0.2  # of leaky ReLUs

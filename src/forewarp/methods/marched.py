@@ -19,7 +19,7 @@ from forewarp.methods.departures import ALONG_RAYS, ONE_TIME
 from forewarp.methods.method import Method, Snapshot, Start, Step
 from forewarp.methods.rows import renew_parameters
 from forewarp.methods.rows_adam import RowsAdam
-from forewarp.ops.warmup import warm_up
+from forewarp.ops.march import warm_up
 from forewarp.renderer import Marched, Renderer
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.camera import Rays

@@ -21,8 +21,7 @@ from forewarp.methods.departures import JUMP, NO_JUMP
 from forewarp.methods.marched import MarchedMethod, Marching, regrow, whole_grid
 from forewarp.methods.method import Start
 from forewarp.ops.encode import encoded_size, positional_encoding
-from forewarp.ops.grid import dilate, trilinear
-from forewarp.ops.variation import second_variation
+from forewarp.ops.grid import dilate, second_variation, trilinear
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.frame import spread
 from forewarp.scene.view import Batch, Moment

@@ -17,7 +17,7 @@ from forewarp.methods.checks import check_number
 from forewarp.methods.dead_start import DeadStart
 from forewarp.methods.departures import BETWEEN_TIMES, CENTRES, ONE_TIME
 from forewarp.methods.method import Method, Snapshot, Start, Step
-from forewarp.ops.samples import clip_to_box
+from forewarp.ops.march import clip_to_box
 from forewarp.scene.camera import Rays
 from forewarp.scene.frame import Frame, Scene, spread
 from forewarp.scene.view import Batch, Moment, Rendering, View

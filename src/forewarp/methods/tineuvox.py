@@ -17,7 +17,7 @@ from forewarp.methods.checks import FRACTION, check_least, check_number
 from forewarp.methods.marched import MarchedMethod, Marching, regrow, whole_grid
 from forewarp.methods.method import Start
 from forewarp.ops.encode import encoded_size, positional_encoding
-from forewarp.ops.variation import huber_variation
+from forewarp.ops.grid import huber_variation
 from forewarp.scene.box import Lattice
 from forewarp.scene.view import Batch, Moment
 

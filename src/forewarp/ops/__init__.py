@@ -1,1 +1,1 @@
-"""Pure functions on tensors; ``kernels_*`` are their Numba versions for the CPU."""
+"""Pure functions on tensors; ``kernels`` has their Numba versions for the CPU."""

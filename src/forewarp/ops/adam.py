@@ -9,8 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from forewarp.ops.backend import match_threads, use_numba
-from forewarp.ops.checks import check_shape
+from forewarp.ops.backend import check_shape, match_threads, use_numba
 
 
 class Learned(NamedTuple):
@@ -69,7 +68,7 @@ def _quick(one: Learned) -> bool:
 
 
 def _by_kernel(learned: list[Learned], betas: tuple[float, float], eps: float) -> None:
-    from forewarp.ops import kernels_adam
+    from forewarp.ops.kernels import adam as kernels
 
     match_threads()
     table, alive = [], []  # gradients must outlive the call
@@ -79,8 +78,8 @@ def _by_kernel(learned: list[Learned], betas: tuple[float, float], eps: float) -
         table.append([*(t.data_ptr() for t in parts), value.numel() // width, width])
     rates = np.array([one.rate for one in learned], np.float32)
     first, second = map(float, betas)
-    bias = kernels_adam.biases(first, second)
-    kernels_adam.adam(np.array(table, np.int64), rates, first, second, float(eps), bias)
+    bias = kernels.biases(first, second)
+    kernels.adam(np.array(table, np.int64), rates, first, second, float(eps), bias)
 
 
 def _adam_reference(learned: Learned, betas: tuple[float, float], eps: float) -> None:

@@ -1,14 +1,17 @@
-"""Choose the implementation of an operator: Numba's on the CPU if it is installed, PyTorch's otherwise.
+"""Choose the implementation of an operator, and check its arguments.
 
-``FOREWARP_NUMBA=0`` switches Numba off. Tests hold both to the same values and gradients.
+Numba's kernels run on the CPU if Numba is installed, PyTorch otherwise. ``FOREWARP_NUMBA=0`` switches Numba
+off. Tests hold both to the same values and gradients.
 """
 
 from __future__ import annotations
 
 import importlib.util
+import math
 import os
 import threading
 from functools import cache
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -61,3 +64,27 @@ def _numba():
     import numba
 
     return numba
+
+
+def is_number(value: Any) -> bool:
+    """Return whether a value, as a config may hold any, is a finite number; true and false are none."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def check_shape(name: str, tensor: Tensor, shape: tuple[int | str, ...]) -> None:
+    """Raise ValueError unless ``tensor`` has ``shape``.
+
+    A letter stands for any size, "..." in front for any number of sizes.
+
+    >>> import torch
+    >>> check_shape("points", torch.zeros(4, 3), ("P", 3))
+    """
+    if tensor.shape == shape:
+        return
+    ends = shape[:1] == ("...",)
+    last = shape[1:] if ends else shape
+    found = tuple(tensor.shape)[-len(last) :] if ends else tuple(tensor.shape)
+    fits = len(found) == len(last) and all(isinstance(s, str) or s == n for s, n in zip(last, found))
+    if not fits:
+        wanted = "(" + ", ".join(str(s) for s in shape) + ")"
+        raise ValueError(f"{name}: expected shape {wanted}, but got {tuple(tensor.shape)}")

@@ -1,4 +1,4 @@
-"""Sparse lattices: trilinear reads, neighbours, occupied cells.
+"""Lattices of voxels and pixels: trilinear reads, neighbours, occupied cells, block means, total variation.
 
 A sparse lattice is ``values`` (M, C) and ``index`` (X, Y, Z) int32, which holds the row of each voxel, or -1
 if it is absent; a dense grid has no -1. Points are in lattice coordinates.
@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from forewarp.ops.backend import match_threads, use_numba
-from forewarp.ops.checks import check_shape
+from forewarp.ops.backend import check_shape, match_threads, use_numba
 
 _CORNERS = [(a, b, c) for a in (0, 1) for b in (0, 1) for c in (0, 1)]
 
@@ -82,7 +81,7 @@ def trilinear_reference(values: Tensor, index: Tensor, points: Tensor, fill: Ten
 class _NumbaTrilinear(torch.autograd.Function):
     @staticmethod
     def forward(ctx, values, index, points, fill):
-        from forewarp.ops import kernels_grid as kernels
+        from forewarp.ops.kernels import voxels as kernels
 
         match_threads()
         # Keep the large values only if the points need a gradient.
@@ -95,7 +94,7 @@ class _NumbaTrilinear(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx, grad):
-        from forewarp.ops import kernels_grid as kernels
+        from forewarp.ops.kernels import voxels as kernels
 
         values, index, points, fill = ctx.saved_tensors
         chunks = min(4, match_threads())
@@ -146,7 +145,7 @@ def occupied_cells(index: Tensor, keep: Tensor | None = None) -> Tensor:
         keep: (M,) bool over the rows; None: keep all.
     """
     if use_numba(index):
-        from forewarp.ops import kernels_grid as kernels
+        from forewarp.ops.kernels import voxels as kernels
 
         rows = int(index.max()) + 1 if keep is None else len(keep)
         cells = torch.zeros([n - 1 for n in index.shape], dtype=torch.uint8)
@@ -176,3 +175,119 @@ def neighbour_pairs(index: Tensor) -> list[tuple[Tensor, Tensor]]:
         both = ((first >= 0) & (second >= 0)).nonzero()[:, 0]
         pairs.append((first[both].long(), second[both].long()))
     return pairs
+
+
+def block_sums(picture: Tensor, by: int = 2) -> Tensor:
+    """Sum each block of ``by`` x ``by`` pixels: (H, W, ...) -> (H / by, W / by, ...). Differentiable.
+
+    Raises:
+        ValueError: where ``by`` does not divide both sides.
+
+    Cost: one read of the picture.
+
+    >>> import torch
+    >>> block_sums(torch.arange(8).reshape(2, 4)).tolist()
+    [[10, 18]]
+    """
+    height, width = picture.shape[:2]
+    if height % by or width % by:
+        raise ValueError(f"picture: expected sides that {by} divides, but got {width} x {height} pixels")
+    blocks = picture.reshape(height // by, by, width // by, by, *picture.shape[2:])
+    return blocks.sum((1, 3), dtype=None if picture.is_floating_point() else torch.int32)
+
+
+def block_means(picture: Tensor, by: int = 2) -> Tensor:
+    """Average each block of ``by`` x ``by`` pixels; otherwise as ``block_sums``.
+
+    >>> import torch
+    >>> block_means(torch.tensor([[1.0, 2.0], [3.0, 5.0]])).item()
+    2.75
+    """
+    return block_sums(picture, by) / by**2
+
+
+def reduced_depth(depth: Tensor, by: int = 2) -> Tensor:
+    """Average the foreground (> 0) of each block, (H, W) -> (H / by, W / by); 0 where there is none.
+
+    >>> import torch
+    >>> reduced_depth(torch.tensor([[2.0, 0.0], [4.0, 0.0]])).item()
+    3.0
+    """
+    return block_sums(depth, by) / block_sums((depth > 0).to(depth.dtype), by).clamp(min=1)
+
+
+def total_variation(values: Tensor, pairs: list[tuple[Tensor, Tensor]]) -> Tensor:
+    """Return the mean absolute first difference per axis, summed over axes.
+
+    Args:
+        values: (M, C) on a sparse lattice.
+        pairs: rows of neighbours per axis (see ``grid.neighbour_pairs``).
+
+    Returns:
+        (), 0 without neighbours. Differentiable.
+
+    Cost: two reads of C channels per pair.
+    """
+    check_shape("values", values, ("M", "C"))
+    total = values.new_zeros(())
+    for first, second in pairs:
+        if len(first):
+            total = total + (values.index_select(0, first) - values.index_select(0, second)).abs().mean()
+    return total
+
+
+def second_variation(volume: Tensor) -> Tensor:
+    """Return the mean absolute second difference per axis, averaged over axes: 0 of anything linear.
+
+    Args:
+        volume: (X, Y, Z, C), at least 3 points an axis.
+
+    Returns:
+        (). Differentiable.
+
+    Cost: three passes over the volume.
+    """
+    check_shape("volume", volume, ("X", "Y", "Z", "C"))
+    if min(volume.shape[:3]) < 3:
+        raise ValueError(
+            f"second_variation: expected 3 points an axis or more, but got {tuple(volume.shape)}"
+        )
+    return sum(volume.diff(n=2, dim=axis).abs().mean() for axis in range(3)) / 3
+
+
+def huber_variation(volume: Tensor) -> Tensor:
+    """Return Huber's function of the first differences, summed over axes, points and channels.
+
+    Its slope is the difference itself, at most 1.
+
+    Args:
+        volume: (X, Y, Z, C).
+
+    Returns:
+        (). Differentiable.
+
+    Cost: three passes over the volume.
+    """
+    check_shape("volume", volume, ("X", "Y", "Z", "C"))
+    steps = [volume.diff(dim=axis) for axis in range(3)]
+    zero = volume.new_zeros(())
+    return sum(torch.nn.functional.smooth_l1_loss(d, zero.expand_as(d), reduction="sum") for d in steps)
+
+
+def patch_variation(depth: Tensor, opacity: Tensor) -> Tensor:
+    """RegNeRF's depth term: squared first differences in patches, weighted by opacity without gradient.
+
+    Args:
+        depth: (B, S, S), in fractions of far - near.
+        opacity: (B, S, S) in [0, 1].
+
+    Returns:
+        (), the mean over horizontal pairs plus the mean over vertical pairs of weight times squared
+        difference; the weight of a pair is its lower opacity. 0 for single pixels. Differentiable in
+        ``depth``.
+    """
+    check_shape("depth", depth, ("B", "S", "S"))
+    mask = opacity.detach()
+    across = (depth[:, :, 1:] - depth[:, :, :-1]).square() * torch.minimum(mask[:, :, 1:], mask[:, :, :-1])
+    down = (depth[:, 1:] - depth[:, :-1]).square() * torch.minimum(mask[:, 1:], mask[:, :-1])
+    return across.sum() / max(across.numel(), 1) + down.sum() / max(down.numel(), 1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from forewarp.ops.checks import check_shape
+from forewarp.ops.backend import check_shape
 
 Radial = tuple[float, float, float]
 Tangential = tuple[float, float]

@@ -1,15 +1,133 @@
-"""Ray marching: sample rays in occupied cells only."""
+"""Volume rendering: sample rays, in occupied cells or by importance, and composite what they meet."""
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from forewarp.ops.backend import match_threads, use_numba
-from forewarp.ops.checks import check_shape
-from forewarp.ops.grid import _array
+from forewarp.ops.backend import check_shape, match_threads, use_numba
+from forewarp.ops.grid import _array, index_of, occupied_cells, trilinear
+from forewarp.ops.splat import average_splat
+
+
+def stratified(near: Tensor, far: Tensor, count: int, generator: torch.Generator | None = None) -> Tensor:
+    """Stratified sampling (NeRF): one distance in each of ``count`` bins between ``near`` and ``far``.
+
+    The bins meet midway between the points of ``linspace(near, far, count)``, so the first and the last are
+    half as wide as the others.
+
+    Args:
+        near, far: (R,) of each ray.
+        count: S >= 2.
+        generator: draws each distance uniformly in its bin; None: return the linspace.
+
+    Returns:
+        (R, S), ascending.
+
+    >>> stratified(torch.tensor([2.0]), torch.tensor([6.0]), 3)
+    tensor([[2., 4., 6.]])
+    """
+    check_shape("near", near, ("R",))
+    check_shape("far", far, tuple(near.shape))
+    if count < 2:
+        raise ValueError(f"stratified: expected count >= 2, but got {count}")
+    steps = torch.linspace(0, 1, count, dtype=near.dtype, device=near.device)
+    even = near[:, None] + (far - near)[:, None] * steps
+    if generator is None:
+        return even
+    middle = midpoints(even)
+    low, high = torch.cat([even[:, :1], middle], 1), torch.cat([middle, even[:, -1:]], 1)
+    return low + (high - low) * _uniform(even, generator)
+
+
+def midpoints(depths: Tensor) -> Tensor:
+    """Return the midpoints (R, S - 1) of neighbouring distances (R, S)."""
+    return 0.5 * (depths[:, 1:] + depths[:, :-1])
+
+
+@torch.no_grad()
+def by_importance(
+    edges: Tensor,
+    weights: Tensor,
+    count: int,
+    generator: torch.Generator | None = None,
+    floor: float = 1e-5,
+) -> Tensor:
+    """Importance sampling (NeRF): draw ``count`` distances from a piecewise constant density.
+
+    Evaluate the inverse of its distribution function, linear within a bin, at uniform numbers. No gradient
+    passes.
+
+    Args:
+        edges: (R, B + 1) of the bins, ascending.
+        weights: (R, B) >= 0 of the bins, not normalised.
+        count: S >= 1.
+        generator: draws the uniform numbers; None: take them evenly from 0 to 1.
+        floor: above 0, added to every weight, so that every bin can be drawn.
+
+    Returns:
+        (R, S), ascending without a generator.
+
+    Cost: R (B + S log B).
+
+    >>> by_importance(torch.tensor([[0.0, 1.0, 3.0]]), torch.tensor([[0.5, 0.5]]), 5)
+    tensor([[0.0000, 0.5000, 1.0000, 2.0000, 3.0000]])
+    """
+    check_shape("edges", edges, ("R", "E"))
+    check_shape("weights", weights, (len(edges), edges.shape[1] - 1))
+    if weights.shape[1] < 1 or count < 1 or not floor > 0:
+        raise ValueError(
+            f"by_importance: expected a bin, count >= 1 and floor > 0, but got {weights.shape[1]} bins, "
+            f"{count=}, {floor=}"
+        )
+    ends = (weights + floor).cumsum(1)
+    ends = torch.cat([torch.zeros_like(ends[:, :1]), ends / ends[:, -1:]], 1)
+    if generator is None:
+        at = torch.linspace(0, 1, count, dtype=ends.dtype, device=ends.device).repeat(len(ends), 1)
+    else:
+        at = _uniform(ends.new_empty(len(ends), count), generator)
+    right = torch.searchsorted(ends, at, right=True).clamp(1, weights.shape[1])
+    (begin, end), (low, high) = ([t.gather(1, right - 1), t.gather(1, right)] for t in (ends, edges))
+    return low + (high - low) * ((at - begin) / (end - begin)).clamp(0, 1)
+
+
+def union(*depths: Tensor) -> Tensor:
+    """Merge sets of distances (R, S_i) of the same rays into one, ascending (R, sum of S_i)."""
+    return torch.cat(depths, 1).sort(1).values
+
+
+def clip_to_box(
+    origins: Tensor, directions: Tensor, near: float, far: float, low: Tensor, high: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Clip the interval ``[near, far]`` of each ray to an axis-aligned box.
+
+    Args:
+        origins, directions: (R, 3).
+        near, far: range of all rays, in multiples of a direction's length.
+        low, high: (3,) corners of the box.
+
+    Returns:
+        near (R,) and far (R,); far <= near for a ray that misses the box.
+    """
+    check_shape("origins", origins, ("R", 3))
+    check_shape("directions", directions, tuple(origins.shape))
+    to_low, to_high = low - origins, high - origins
+    inside = (to_low <= 0) & (to_high >= 0)
+    level = directions == 0
+    safe = torch.where(level, torch.ones_like(directions), directions)
+    never = torch.where(inside, -torch.inf, torch.inf).to(origins)  # for rays parallel to a face
+    enter = torch.where(level, never, torch.minimum(to_low / safe, to_high / safe))
+    leave = torch.where(level, -never, torch.maximum(to_low / safe, to_high / safe))
+    return enter.amax(1).clamp(near, far), leave.amin(1).clamp(near, far)
+
+
+def _uniform(like: Tensor, generator: torch.Generator) -> Tensor:
+    """Draw numbers in [0, 1) on the generator's device, with shape, dtype and device of a tensor."""
+    return torch.rand(like.shape, generator=generator, device=generator.device, dtype=like.dtype).to(like)
+
 
 _BLOCK = 4  # side, in cells, of the blocks of a coarse occupancy map, by which rays skip empty space
 _MARGIN = 1e-3  # cells
@@ -85,7 +203,7 @@ def march_reference(origins, directions, near, far, step, cells, jitter) -> tupl
 
 
 def _numba_march(origins, directions, near, far, step, cells, jitter) -> tuple[Tensor, Tensor]:
-    from forewarp.ops import kernels_march as kernels
+    from forewarp.ops.kernels import voxels as kernels
 
     match_threads()
     counts, firsts = torch.zeros(2, len(origins), dtype=torch.int64).unbind()
@@ -107,7 +225,7 @@ def map_cells(cells: Tensor) -> tuple:
         the cells, the distance from each block to the next occupied block, the bounds of all occupied cells,
         and the side of a block.
     """
-    from forewarp.ops import kernels_march as kernels
+    from forewarp.ops.kernels import voxels as kernels
 
     array = _array(cells.contiguous().view(torch.uint8))
     reach = torch.empty([-(-n // _BLOCK) for n in cells.shape], dtype=torch.uint8).numpy()
@@ -117,3 +235,176 @@ def map_cells(cells: Tensor) -> tuple:
     bounds[0] = (bounds[0] - _MARGIN).clip(min=0)
     bounds[1] = (bounds[1] + _MARGIN).clip(max=cells.shape)
     return array, reach, bounds, _BLOCK
+
+
+class Traced(NamedTuple):
+    """What ``trace`` finds along R rays.
+
+    Attributes:
+        opacity, distance, transmittance: (R,); ``distance`` is the sum of weight times distance.
+        ray_ids, distances, weights: (P,), of the samples above the threshold.
+        samples: number of samples read.
+    """
+
+    opacity: Tensor
+    distance: Tensor
+    transmittance: Tensor
+    ray_ids: Tensor
+    distances: Tensor
+    weights: Tensor
+    samples: int
+
+
+def trace(
+    origins: Tensor,
+    directions: Tensor,
+    near: float,
+    far: float,
+    step: float,
+    cells: Tensor,
+    jitter: Tensor,
+    *,
+    raw: Tensor,
+    index: Tensor,
+    fill: float,
+    shift: float,
+    scale: float,
+    early_stop_eps: float = 0.0,
+    threshold: float = 0.0,
+) -> Traced:
+    """Do ``march``, ``trilinear`` and ``render_weights`` of ``softplus(raw + shift) * scale`` in one kernel.
+
+    Numba only, without gradient; elsewhere the three operators are called one by one.
+
+    Args:
+        origins, directions, near, far, step, cells, jitter: as for ``march``.
+        raw: (M,), one channel of a sparse lattice.
+        index: (X, Y, Z) int32, its rows or -1.
+        fill: value of an absent voxel.
+        shift, scale: shift and scale of a step's optical depth.
+        early_stop_eps: end a ray once its transmittance is below this; 0: never.
+        threshold: return samples of more weight than this; below 0: all.
+
+    Raises:
+        ValueError: for other shapes, or rays that cannot be marched.
+
+    Cost: one read of 8 voxels per sample up to a ray's end, twice for returned samples; memory P.
+    """
+    check_march(origins, directions, near, far, step, jitter)
+    check_shape("raw", raw, ("M",))
+    check_shape("index", index, tuple(n + 1 for n in cells.shape))
+    from forewarp.ops.kernels import voxels as kernels
+
+    match_threads()
+    sums = torch.zeros(len(origins), 4, dtype=torch.float64)
+    read, counts, firsts = torch.zeros(3, len(origins), dtype=torch.int64).unbind()
+    common = (*(_array(v) for v in (origins, directions)), *map(float, (near, far, step)), _array(jitter))
+    common = (*common, *map_cells(cells), _array(raw), _array(index))
+    common = (*common, *map(float, (fill, shift, scale, early_stop_eps, threshold)))
+    common = (*common, *(v.numpy() for v in (sums, read, counts, firsts)))
+    ids, none = torch.zeros(0, dtype=torch.int64), origins.new_zeros(0)
+    kernels.trace(*common, *(v.numpy() for v in (ids, ids, none, none)))
+    starts, total = counts.cumsum(0) - counts, int(counts.sum())
+    ids, distances, weights = torch.empty(total, dtype=torch.int64), *origins.new_empty(2, total).unbind()
+    kernels.trace(*common, *(v.numpy() for v in (starts, ids, distances, weights)))
+    opacity, distance, transmittance, _ = sums.to(origins.dtype).unbind(-1)
+    return Traced(opacity, distance, transmittance, ids, distances, weights, int(read.sum()))
+
+
+def render_weights(optical: Tensor, ray_ids: Tensor, rays: int) -> tuple[Tensor, Tensor]:
+    """``w_k = T_k (1 - exp(-x_k))``, ``T_k = exp(-sum_{j<k} x_j)`` (the paper's rendering equations).
+
+    One cumulative sum in float64 runs over all rays and each ray's start is subtracted, so that rays do not
+    affect each other. In log space the gradient is exact even for opaque samples.
+
+    Args:
+        optical: x = sigma * delta (P,) >= 0, the samples of a ray adjacent and in order.
+        ray_ids: (P,) int64, ascending.
+        rays: R, number of rays.
+
+    Returns:
+        weights (P,) and the final transmittance (R,), 1 for a ray without samples. Differentiable in
+        ``optical``.
+
+    Cost: one pass over P.
+
+    >>> w, t = render_weights(torch.tensor([0.0, 1e30]), torch.tensor([0, 0]), 2)
+    >>> w.tolist(), t.round(decimals=6).tolist()
+    ([0.0, 1.0], [0.0, 1.0])
+    """
+    check_shape("optical", optical, ("P",))
+    check_shape("ray_ids", ray_ids, (len(optical),))
+    # An optical depth of 80 is opaque in float32; the cap keeps the global sum exact.
+    x = optical.double().clamp(max=80.0)
+    through = x.cumsum(0) - x
+    counts = torch.zeros(rays, dtype=torch.int64, device=x.device).index_add_(
+        0, ray_ids, torch.ones_like(ray_ids)
+    )
+    starts = counts.cumsum(0) - counts
+    offset = torch.cat([through, through.new_zeros(1)])[
+        starts
+    ]  # a last ray without samples starts at the end
+    before = (through - offset[ray_ids]).clamp(min=0)
+    weights = torch.exp(-before) * -torch.expm1(-x)
+    total = torch.zeros(rays, dtype=x.dtype, device=x.device).index_add(0, ray_ids, x)
+    return weights.to(optical.dtype), torch.exp(-total).to(optical.dtype)
+
+
+def accumulate(weights: Tensor, values: Tensor, ray_ids: Tensor, rays: int) -> Tensor:
+    """Sum ``w_k v_k`` over the samples of each ray.
+
+    Args:
+        weights: (P,).
+        values: (P, C).
+        ray_ids: (P,) int64.
+        rays: R, number of rays.
+
+    Returns:
+        (R, C), 0 for a ray without samples. Differentiable in both.
+    """
+    check_shape("values", values, (len(weights), "C"))
+    return values.new_zeros(rays, values.shape[1]).index_add(0, ray_ids, weights[:, None] * values)
+
+
+def dense_weights(optical: Tensor) -> tuple[Tensor, Tensor]:
+    """``render_weights`` for rays with equal numbers of samples.
+
+    Args:
+        optical: x = sigma * delta (R, S) >= 0, in order along each ray; may be infinite.
+
+    Returns:
+        weights (R, S) and the final transmittance (R,). Differentiable in ``optical``.
+
+    Cost: one pass over R S, in the dtype of ``optical``.
+
+    >>> w, t = dense_weights(torch.tensor([[0.0, 1e30, 1.0]]))
+    >>> w.round(decimals=6).tolist(), t.round(decimals=6).tolist()
+    ([[0.0, 1.0, 0.0]], [0.0])
+    """
+    check_shape("optical", optical, ("R", "S"))
+    x = optical.clamp(max=80.0)
+    # Shift instead of subtracting, which would lose digits behind an opaque sample.
+    before = torch.cat([torch.zeros_like(x[:, :1]), x.cumsum(1)], 1)
+    through = torch.exp(-before)
+    return through[:, :-1] * -torch.expm1(-x), through[:, -1]
+
+
+def warm_up(device: torch.device | str = "cpu") -> None:
+    """Run each operator forwards and backwards once, on two voxels per axis, without random numbers.
+
+    Numba compiles a kernel, or reads it from its cache, at the first call, which takes seconds.
+    """
+    voxels = torch.cartesian_prod(*[torch.arange(2, device=device)] * 3)
+    positions = voxels.float().requires_grad_()
+    with torch.enable_grad():
+        splat = average_splat(torch.ones_like(positions).requires_grad_(), positions, (2, 2, 2))
+        read = trilinear(splat.values, splat.index, positions, positions.new_zeros(3))
+        read.sum().backward()
+    index = index_of(voxels, (2, 2, 2))
+    cells = occupied_cells(index)
+    start, along = positions.new_zeros(1, 3), positions.new_ones(1, 3)
+    rays = (start.detach(), along, 0.0, 1.0, 0.5, cells, positions.new_zeros(1))
+    march(*rays)
+    if use_numba(positions):
+        raw = positions.new_zeros(len(voxels))
+        trace(*rays, raw=raw, index=index, fill=0.0, shift=0.0, scale=1.0)

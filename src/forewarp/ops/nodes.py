@@ -1,12 +1,11 @@
-"""Nodes that carry particles: each a rest position, a way it went, and how far it turned."""
+"""Rigid motion: nodes that carry particles, the weights of these nodes, and screws."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-from forewarp.ops.backend import use_numba
-from forewarp.ops.checks import check_shape
+from forewarp.ops.backend import check_shape, match_threads, use_numba
 
 
 def node_maps(motion: Tensor, places: Tensor) -> Tensor:
@@ -61,11 +60,11 @@ def carry_nodes(shift: Tensor, turn: Tensor | None, basis: Tensor, places: Tenso
     _check_curves(shift, turn, (len(places), len(basis), 3))
     asks = torch.is_grad_enabled() and (shift.requires_grad or (turn is not None and turn.requires_grad))
     if use_numba(shift) and shift.dtype == torch.float32 and not asks:
-        from forewarp.ops import kernels_nodes
+        from forewarp.ops.kernels import nodes as kernels
 
         motion, maps = shift.new_empty(len(places), 6), shift.new_empty(len(places), 12)
         arrays = (shift, shift[:0] if turn is None else turn, basis, places, motion, maps)
-        kernels_nodes.carry(*(a.detach().numpy() for a in arrays))
+        kernels.carry(*(a.detach().numpy() for a in arrays))
         return motion, maps
     went = torch.einsum("mkc,k->mc", shift, basis)
     turned = torch.zeros_like(went) if turn is None else torch.einsum("mkc,k->mc", turn, basis)
@@ -127,11 +126,11 @@ def pull_nodes(
     _check_edges(motion, places, edges, weights)
     check_shape("by_maps", by_maps, (len(motion), 12))
     if use_numba(motion) and motion.dtype == torch.float32:
-        from forewarp.ops import kernels_nodes
+        from forewarp.ops.kernels import nodes as kernels
 
         found = torch.zeros_like(motion)
         arrays = (motion, places, by_maps.contiguous(), edges, weights, found)
-        return found, kernels_nodes.pull(*(a.detach().numpy() for a in arrays), float(factor))
+        return found, kernels.pull(*(a.detach().numpy() for a in arrays), float(factor))
     own = motion.detach().clone().requires_grad_()
     with torch.enable_grad():
         strain = stiffness(own, places, edges, weights)
@@ -171,11 +170,11 @@ def spread_nodes(
             continue
         value = value.detach()
         if use_numba(value) and value.dtype == torch.float32:
-            from forewarp.ops import kernels_nodes
+            from forewarp.ops.kernels import nodes as kernels
 
             gradient = torch.empty_like(value)
             arrays = (value, own, basis, bend, gradient)
-            total += kernels_nodes.spread(*(a.numpy() for a in arrays), float(factor), float(scale))
+            total += kernels.spread(*(a.numpy() for a in arrays), float(factor), float(scale))
         else:
             bent = torch.einsum("mkc,k->mc", value, bend) / scale
             total += float(bent.square().mean())
@@ -183,3 +182,121 @@ def spread_nodes(
             gradient = own[:, None] * basis[:, None] + pulled[:, None] * bend[:, None]
         found.append(gradient)
     return *found, total
+
+
+LEAST = 1e-20  # sum that is divided by: that of a particle at rest is 0
+_WIDEST = 16  # nodes of a particle that the kernel knows
+
+
+def skin_weights(shares: Tensor, learned: Tensor) -> Tensor:
+    """The weights ``s_j exp(l_j) / sum_k s_k exp(l_k)`` of the nodes that particles follow.
+
+    Args:
+        shares: (N, L), >= 0; a row of zeros gives zeros.
+        learned: (N, L), of any size: what counts is how far apart the numbers of a row are.
+
+    Returns:
+        (N, L). Differentiable in ``learned``, where a gradient is asked for.
+
+    Raises:
+        ValueError: for shapes that do not go together.
+
+    Cost: an exponential a weight.
+
+    >>> skin_weights(torch.tensor([[0.5, 0.5]]), torch.tensor([[1000.0, 1000.0]]))
+    tensor([[0.5000, 0.5000]])
+    """
+    check_shape("shares", shares, ("N", "L"))
+    check_shape("learned", learned, tuple(shares.shape))
+    asks = torch.is_grad_enabled() and learned.requires_grad
+    fast = use_numba(learned) and learned.dtype == torch.float32 and shares.dtype == torch.float32
+    if not fast or asks or not 0 < shares.shape[1] <= _WIDEST:
+        return skin_weights_reference(shares, learned)
+    from forewarp.ops.kernels import nodes as kernels
+
+    match_threads()
+    found = torch.empty(shares.shape)
+    parts = (t.detach().contiguous().view(-1).numpy() for t in (shares, learned, found))
+    kernels.weigh(*parts, shares.shape[1])
+    return found
+
+
+def skin_weights_reference(shares: Tensor, learned: Tensor) -> Tensor:
+    """``skin_weights`` in plain PyTorch, on any device and in any precision."""
+    top = learned.detach().amax(-1, keepdim=True)  # a row less it means the same, and is safe
+    own = shares * (learned - top).exp()
+    return own / own.sum(-1, keepdim=True).clamp(min=LEAST)
+
+
+_SMALL = 0.05  # radian; below, series in the squared angle are exact to single precision
+
+
+def move_by_screw(points: Tensor, turn: Tensor, shift: Tensor) -> Tensor:
+    """Move points by the exponential of a screw (se(3)): ``x' = R x + V v``.
+
+    With ``theta = |w|`` and ``W`` the matrix of ``w x``: ``R = I + a W + b W^2`` and ``V = I + b W + c W^2``,
+    where ``a = sin(theta) / theta``, ``b = (1 - cos(theta)) / theta^2``, ``c = (1 - a) / theta^2``. Small
+    angles take the series, so that value and gradient are finite at 0, where ``x' = x + v`` (Nerfies, with
+    its axis ``(w, v) / theta`` written out).
+
+    Args:
+        points: x (..., 3).
+        turn: w (..., 3), radian about the origin.
+        shift: v (..., 3), in the unit of the points.
+
+    Returns:
+        (..., 3). Differentiable in all three.
+
+    >>> move_by_screw(torch.tensor([1.0, 0.0, 0.0]), torch.zeros(3), torch.tensor([0.0, 2.0, 0.0]))
+    tensor([1., 2., 0.])
+    """
+    check_shape("points", points, (*points.shape[:-1], 3))
+    check_shape("turn", turn, tuple(points.shape))
+    check_shape("shift", shift, tuple(points.shape))
+    a, b, c = _coefficients(turn.square().sum(-1, keepdim=True))
+    about = torch.linalg.cross(turn, points)
+    along = torch.linalg.cross(turn, shift)
+    turned = points + a * about + b * torch.linalg.cross(turn, about)
+    return turned + shift + b * along + c * torch.linalg.cross(turn, along)
+
+
+def _coefficients(squared: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return ``sin(t)/t``, ``(1 - cos t)/t^2`` and ``(t - sin t)/t^3`` of squared angles."""
+    small = squared < _SMALL**2
+    q = torch.where(small, squared, 0.0)
+    series = (
+        1 - q / 6 * (1 - q / 20 * (1 - q / 42)),
+        (1 - q / 12 * (1 - q / 30 * (1 - q / 56))) / 2,
+        (1 - q / 20 * (1 - q / 42 * (1 - q / 72))) / 6,
+    )
+    safe = torch.where(small, 1.0, squared)
+    angle = safe.sqrt()
+    exact = angle.sin() / angle, (1 - angle.cos()) / safe, (angle - angle.sin()) / (angle * safe)
+    return tuple(torch.where(small, near, far) for near, far in zip(series, exact))
+
+
+def stretch(jacobian: Tensor, floor: float = 1e-6) -> Tensor:
+    """Sum the squared logarithms of a map's singular values: 0 where it is locally rigid (Nerfies' elastic
+    energy).
+
+    Args:
+        jacobian: (..., 3, 3).
+        floor: of a singular value.
+
+    Returns:
+        (...,) >= 0. Differentiable also where singular values are equal, as at the identity.
+
+    >>> float(stretch(2 * torch.eye(3)) / torch.tensor(2.0).log() ** 2)
+    3.0
+    """
+    check_shape("jacobian", jacobian, (*jacobian.shape[:-2], 3, 3))
+    return torch.linalg.svdvals(jacobian).clamp(min=floor).log().square().sum(-1)
+
+
+def geman_mcclure(squared: Tensor) -> Tensor:
+    """``rho = 2 q / (q + 4)`` of squared residuals q over squared scales: half of q near 0, at most 2.
+
+    >>> geman_mcclure(torch.tensor([0.0, 4.0, torch.inf]))
+    tensor([0., 1., 2.])
+    """
+    return 2 / (1 + 4 / squared.clamp(min=torch.finfo(squared.dtype).tiny))

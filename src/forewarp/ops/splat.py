@@ -8,8 +8,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from forewarp.ops.backend import match_threads, use_numba
-from forewarp.ops.checks import check_shape
+from forewarp.ops.backend import check_shape, match_threads, use_numba
 from forewarp.ops.grid import _CORNERS, _array
 
 
@@ -123,7 +122,7 @@ def scatter_reference(
 
 
 def _numba_scatter(source: Tensor, positions: Tensor, shape: tuple[int, int, int]) -> tuple[Tensor, Tensor]:
-    from forewarp.ops import kernels_splat as kernels
+    from forewarp.ops.kernels import voxels as kernels
 
     index = torch.full(shape, -1, dtype=torch.int32)
     rows = kernels.number_touched(_array(positions), index.numpy())
@@ -133,7 +132,7 @@ def _numba_scatter(source: Tensor, positions: Tensor, shape: tuple[int, int, int
 class _NumbaScatter(torch.autograd.Function):
     @staticmethod
     def forward(ctx, source, positions, index, rows):
-        from forewarp.ops import kernels_splat as kernels
+        from forewarp.ops.kernels import voxels as kernels
 
         chunks = min(4, match_threads())
         ctx.save_for_backward(source, positions, index)
@@ -144,7 +143,7 @@ class _NumbaScatter(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx, grad):
-        from forewarp.ops import kernels_splat as kernels
+        from forewarp.ops.kernels import voxels as kernels
 
         match_threads()
         source, positions, index = ctx.saved_tensors

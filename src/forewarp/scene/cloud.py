@@ -10,7 +10,7 @@ from itertools import permutations
 import torch
 from torch import Tensor
 
-from forewarp.ops.project import FLAT, harmonics
+from forewarp.ops.gaussians import FLAT, harmonics
 from forewarp.scene.box import Box
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from forewarp.methods.method import Model
-from forewarp.ops.checks import is_number
+from forewarp.ops.backend import is_number
 from forewarp.training.objective import Objective
 
 _ENDS = 0.05  # of all time, at its beginning and at its end

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from forewarp.methods.abilities import HasEllipsoids
-from forewarp.ops.project import Gaussians, project, project_reference
+from forewarp.ops.gaussians import Gaussians, project, project_reference
 from forewarp.scene.view import Moment
 from tests.support.gaussians import NO_TINTS, still
 from tests.support.particles import EVERY, module_with, shaken

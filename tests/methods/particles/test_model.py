@@ -9,7 +9,7 @@ from forewarp.methods.particles import model
 from forewarp.methods.particles.model import Particles
 from forewarp.methods.particles.settings import Numbers
 from forewarp.methods.particles.start import widths
-from forewarp.ops.project import moved
+from forewarp.ops.gaussians import moved
 from forewarp.scene.view import Moment, View
 from tests.contract.scenes import data_of, write_hypernerf
 from tests.support.kernels import watch
@@ -307,7 +307,7 @@ def test_two_views_of_a_time_count_as_one_step(data):
 
 
 def test_the_first_steps_meet_warm_kernels_only(data, monkeypatch):
-    met = watch(monkeypatch, "project", "tiles", "rasterize", "chain", "nodes", "adam")
+    met = watch(monkeypatch, "project", "rasterize", "backward", "nodes", "adam")
     module = module_with(data, **EVERY)
     module.method.warm_up()
     warm = met.copy()

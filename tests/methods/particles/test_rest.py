@@ -5,7 +5,7 @@ import torch
 
 from forewarp.methods.particles import model
 from forewarp.methods.particles.rest import _product, _quaternions, come_to_rest
-from forewarp.ops.project import moved, rotations
+from forewarp.ops.gaussians import moved, rotations
 from tests.support.particles import EVERY, look, module_with
 
 TIMES = [0.0, 0.25, 0.5, 0.75, 1.0]

@@ -13,9 +13,9 @@ pytestmark = pytest.mark.skipif(not numba_installed(), reason="needs Numba")
 
 
 def _signatures() -> dict[str, list]:
-    from forewarp.ops import kernels_chain, kernels_rasterize
+    from forewarp.ops.kernels import backward, rasterize
 
-    kernels = (kernels_rasterize.compare, kernels_chain.ranked, kernels_chain.slopes_of, kernels_chain.chain)
+    kernels = (rasterize.compare, backward.ranked, backward.slopes_of, backward.chain)
     return {kernel.py_func.__name__: list(kernel.signatures) for kernel in kernels}
 
 
@@ -88,9 +88,9 @@ def test_what_the_other_process_compiles_is_found_in_the_cache(tmp_path):
     subprocess.run(command, env=environment, check=True)
     script = (
         "from forewarp.methods.particles import warmup\n"
-        "from forewarp.ops import kernels_chain, kernels_rasterize\n"
+        "from forewarp.ops.kernels import backward, rasterize\n"
         "warmup.compile_way_back(*warmup._single())\n"
-        "for kernel in (kernels_chain.chain, kernels_chain.slopes_of, kernels_rasterize.compare):\n"
+        "for kernel in (backward.chain, backward.slopes_of, rasterize.compare):\n"
         "    assert kernel.stats.cache_misses.total() == 0, kernel\n"
     )
     subprocess.run([sys.executable, "-c", script], env=environment, check=True)

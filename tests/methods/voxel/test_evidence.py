@@ -8,7 +8,7 @@ import torch
 
 from forewarp.fields.trajectory import TrajectoryField
 from forewarp.methods.voxel.evidence import Movement, _explained, movement, residual
-from forewarp.ops.dct import dct_basis
+from forewarp.ops.curves import dct_basis
 from forewarp.scene.box import Lattice
 from forewarp.scene.silhouettes import survey
 from tests.support.tiny_scene import BOX, ball_data, ball_scene, built, forward_model, make_run, stage

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from forewarp.ops.project import Pinhole
+from forewarp.ops.gaussians import Pinhole
 from forewarp.scene.camera import Camera
 
 _NEAR, _LEAST = 0.1, 0.02  # of the camera's near, and at least of its far: closer particles fill the picture

@@ -89,7 +89,7 @@ def _split(method: Method, first: Tensor, second: Tensor) -> None:
 
 def _axes(quaternions: Tensor, which: Tensor) -> Tensor:
     """The direction (N, 3) of each particle's axis ``which`` (N,)."""
-    from forewarp.ops.project import rotations
+    from forewarp.ops.gaussians import rotations
 
     turned = rotations(quaternions)
     return turned.gather(-1, which[:, None, None].expand(-1, 3, 1))[..., 0]

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 from forewarp.fields.curves import KINDS
-from forewarp.ops.checks import is_number
+from forewarp.ops.backend import is_number
 
 
 @dataclass(frozen=True)

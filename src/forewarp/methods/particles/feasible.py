@@ -10,7 +10,7 @@ import torch
 from forewarp.methods.particles.settings import Numbers
 from forewarp.methods.particles.start import covered_pixels
 from forewarp.ops.backend import has_kernels
-from forewarp.ops.rasterize import FEASIBLE, smaller
+from forewarp.ops.gaussians import FEASIBLE, smaller
 from forewarp.scene.frame import Scene, spread
 
 _PICTURES = 12  # that are looked at

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from forewarp.methods.method import Method
 from forewarp.methods.particles.nodes import nearest
-from forewarp.ops.project import FLAT, Warp, moved, rotations
+from forewarp.ops.gaussians import FLAT, Warp, moved, rotations
 from forewarp.scene.box import Box
 from forewarp.scene.cloud import Cloud, Ellipsoids
 

@@ -26,9 +26,8 @@ from forewarp.methods.particles.snapshot import ParticlesSnapshot
 from forewarp.methods.particles.start import covered_pixels, first_points, first_values, widths
 from forewarp.methods.particles.time_offsets import TimeOffsets
 from forewarp.methods.rows_adam import RowsAdam
-from forewarp.ops.compare import compare
+from forewarp.ops.gaussians import BLUR, Gaussians, Warp, compare
 from forewarp.ops.nodes import pull_nodes
-from forewarp.ops.project import BLUR, Gaussians, Warp
 from forewarp.scene.box import Box
 from forewarp.scene.cloud import Cloud, Ellipsoids
 from forewarp.scene.view import Asks, Batch, Moment

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from forewarp.methods.method import Method
-from forewarp.ops.project import Gaussians
+from forewarp.ops.gaussians import Gaussians
 
 _KINDS = ("color", "shade", "tint")  # of colour: plain, by direction, by time
 

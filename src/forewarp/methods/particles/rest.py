@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from forewarp.methods.method import Method
-from forewarp.ops.project import moved
+from forewarp.ops.gaussians import moved
 
 _FOLLOWS = 1e-3  # weight of a node below which its motion shows nowhere
 _TIMES = 16  # at which motion is looked at
@@ -62,7 +62,7 @@ def _moved(method: Method, time: float) -> tuple[Tensor, Tensor]:
 def _quaternions(matrices: Tensor) -> Tensor:
     """Quaternions (N, 4) of rotation matrices (N, 3, 3) by less than half a turn.
 
-    >>> from forewarp.ops.project import rotations
+    >>> from forewarp.ops.gaussians import rotations
     >>> _quaternions(rotations(torch.tensor([[0.8, 0.0, 0.6, 0.0]])))
     tensor([[0.8000, 0.0000, 0.6000, 0.0000]])
     """

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from forewarp.methods.particles.effects import NAMES
-from forewarp.ops.checks import is_number
+from forewarp.ops.backend import is_number
 
 _VIEWS = 100  # pictures from which on more of them call for no more particles
 

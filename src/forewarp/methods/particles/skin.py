@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from forewarp.methods.particles.nodes import Nodes
-from forewarp.ops.skin import skin_weights
+from forewarp.ops.nodes import skin_weights
 
 
 class Skin(nn.Module):

@@ -7,8 +7,7 @@ from torch import Tensor
 
 from forewarp.methods.method import Snapshot
 from forewarp.methods.particles.camera import Pinholes
-from forewarp.ops.project import Gaussians, Warp, project
-from forewarp.ops.rasterize import rasterize
+from forewarp.ops.gaussians import Gaussians, Warp, project, rasterize
 from forewarp.scene.view import Moment, Rendering, View
 
 _NOTHING = 1e-6  # opacity below which a pixel has no depth

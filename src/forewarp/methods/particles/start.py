@@ -8,8 +8,8 @@ from torch import Tensor
 from forewarp.methods.method import Start
 from forewarp.methods.particles.nodes import nearest
 from forewarp.methods.particles.sweep import seen_colors, swept
+from forewarp.ops.gaussians import FLAT
 from forewarp.ops.grid import dilate
-from forewarp.ops.project import FLAT
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.cloud import Cloud
 from forewarp.scene.frame import Scene, spread

@@ -16,11 +16,8 @@ from torch import Tensor
 
 from forewarp.ops.adam import Learned, adam_rows
 from forewarp.ops.backend import cores, use_numba
-from forewarp.ops.compare import compare, compile_way_back
-from forewarp.ops.nodes import carry_nodes, pull_nodes, spread_nodes
-from forewarp.ops.project import Gaussians, Pinhole, Warp, project
-from forewarp.ops.rasterize import rasterize
-from forewarp.ops.skin import skin_weights
+from forewarp.ops.gaussians import Gaussians, Pinhole, Warp, compare, compile_way_back, project, rasterize
+from forewarp.ops.nodes import carry_nodes, pull_nodes, skin_weights, spread_nodes
 
 _PATIENCE_S = 120.0  # that the other process is waited for
 
@@ -34,12 +31,12 @@ def compile_kernels(method: torch.nn.Module) -> None:
     """
     if not use_numba(method.means):
         return
-    from forewarp.ops import kernels_nodes
+    from forewarp.ops.kernels import nodes as kernels
 
     zero, one, first = torch.zeros(1, 3), torch.ones(1, 1), torch.ones(1)
-    missed = kernels_nodes.carry.stats.cache_misses.total()
+    missed = kernels.carry.stats.cache_misses.total()
     carry_nodes(zero[:, None], zero[:, None], first, zero)
-    with _way_back_beside(kernels_nodes.carry.stats.cache_misses.total() > missed):
+    with _way_back_beside(kernels.carry.stats.cache_misses.total() > missed):
         given = _single()
         rasterize(project(*given), 9, 8)
         two = torch.zeros(2, 1, 3)  # of a single node, half of its gradients would pass for contiguous

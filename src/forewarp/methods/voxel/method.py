@@ -18,7 +18,7 @@ from forewarp.methods.voxel.stage import VoxelStage
 from forewarp.methods.voxel.structure import Lattices, box_of_all_times
 from forewarp.methods.voxel.terms import LITERAL, TERMS, Seen, voxel_terms
 from forewarp.ops.grid import neighbour_pairs
-from forewarp.ops.warmup import warm_up
+from forewarp.ops.march import warm_up
 from forewarp.renderer import Renderer
 from forewarp.scene.box import Box
 from forewarp.scene.cloud import Cloud

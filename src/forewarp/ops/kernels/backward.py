@@ -1,6 +1,6 @@
-"""Numba kernels that carry gradients from splats to particles and nodes, by the rules of ``kernels_grid``.
+"""Numba kernels that carry gradients from splats to particles and nodes, by the rules of ``voxels``.
 
-As in ``kernels_project``, sixteen particles are treated side by side.
+As in ``project``, sixteen particles are treated side by side.
 """
 
 from __future__ import annotations
@@ -8,7 +8,20 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
-from forewarp.ops.kernels_project import (
+from forewarp.ops.kernels.lanes import (
+    fma,
+    get_row,
+    put_row,
+    room,
+    root,
+    row_of,
+    set_row,
+    sixteen,
+    total,
+    transpose,
+    where_above,
+)
+from forewarp.ops.kernels.project import (
     ANY,
     BASIS,
     MEAN,
@@ -29,8 +42,6 @@ from forewarp.ops.kernels_project import (
     through_lens,
     turned,
 )
-from forewarp.ops.lanes import fma, root, sixteen, total, where_above
-from forewarp.ops.lanes_arrays import get_row, put_row, room, row_of, set_row, transpose
 
 SLOPES = 16  # by u, v, A, B, C, opacity, colour (3) and distance; the last six are 0
 _SLOPE, _ROWS = ROWS, ROWS + SLOPES  # where they begin in a room, and how many rows it has

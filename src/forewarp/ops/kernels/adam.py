@@ -1,4 +1,4 @@
-"""Numba kernel behind ``adam``, by the rules of ``kernels_grid``, but that it takes addresses."""
+"""Numba kernel behind ``adam``, by the rules of ``voxels``, but that it takes addresses."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ from functools import cache
 import numpy as np
 from numba import njit, prange
 
-from forewarp.ops.lanes import not_zero, root, where_bits
-from forewarp.ops.lanes_arrays import floats_at, get_row, put_row, room, row_of
+from forewarp.ops.kernels.lanes import floats_at, get_row, not_zero, put_row, room, root, row_of, where_bits
 
 _WORD = 64  # numbers that are treated together: a bit each says which
 

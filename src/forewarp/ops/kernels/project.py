@@ -1,4 +1,4 @@
-"""Numba kernels behind ``project``, by the rules of ``kernels_grid``. The equations stand there.
+"""Numba kernels behind ``project``, by the rules of ``voxels``. The equations stand there.
 
 Sixteen particles are treated side by side: a *row* of a ``room`` has one number of each of them.
 """
@@ -8,13 +8,25 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
-from forewarp.ops.kernels_rasterize import LEAST_LOG
-from forewarp.ops.lanes import at_least, fma, root, sixteen, where_above
-from forewarp.ops.lanes_arrays import get_row, put_row, room, row_of, set_row, transpose
-from forewarp.ops.lanes_math import exp, log
+from forewarp.ops.kernels.lanes import (
+    at_least,
+    exp,
+    fma,
+    get_row,
+    log,
+    put_row,
+    room,
+    root,
+    row_of,
+    set_row,
+    sixteen,
+    transpose,
+    where_above,
+)
 
 SIDE_BY_SIDE = 16
 SPLAT = 16  # numbers of a splat; the last three are 0
+LEAST_LOG = -5.541263545158426  # log(1 / 255): what adds less to a pixel is not seen
 # Where the numbers of a view lie in its row; see ``project.View.row``.
 ROTATION, CENTER, FOCAL, SKEW, MIDDLE, SIZE, NEAR, BLUR, MARGIN, RADIAL, TANGENTIAL, REACH = (
     0, 9, 12, 14, 15, 17, 19, 20, 21, 22, 25, 27,

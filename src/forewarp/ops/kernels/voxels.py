@@ -1,0 +1,385 @@
+"""Numba kernels behind ``grid``, ``splat`` and ``march``. Imported only where Numba is installed.
+
+Arrays are NumPy views of contiguous CPU tensors. Loops that write one entry per point run in parallel. Sums
+into shared voxels run in a fixed number of chunks, each into its own copy, so that results do not depend on
+scheduling.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, prange
+
+
+@njit(inline="always")
+def _corner(x, n):
+    base = int(min(max(np.floor(x), 0.0), n - 2.0))
+    base = min(max(base, 0), n - 2)  # NaN converts to any integer
+    return base, min(max(x - base, 0.0), 1.0)
+
+
+@njit(parallel=True, cache=True, fastmath=False)
+def gather(values, index, points, fill, out):
+    """out[p] = trilinear read of a sparse lattice; absent voxels read ``fill``."""
+    channels = values.shape[1]
+    nx, ny, nz = index.shape
+    for p in prange(points.shape[0]):
+        x0, fx = _corner(points[p, 0], nx)
+        y0, fy = _corner(points[p, 1], ny)
+        z0, fz = _corner(points[p, 2], nz)
+        for c in range(channels):
+            out[p, c] = 0.0
+        for i in range(8):
+            a, b, d = i >> 2, (i >> 1) & 1, i & 1
+            w = (fx if a else 1 - fx) * (fy if b else 1 - fy) * (fz if d else 1 - fz)
+            row = index[x0 + a, y0 + b, z0 + d]
+            if row >= 0:
+                for c in range(channels):
+                    out[p, c] += w * values[row, c]
+            else:
+                for c in range(channels):
+                    out[p, c] += w * fill[c]
+
+
+@njit(parallel=True, cache=True)
+def gather_backward_values(index, points, grad, out):
+    """out[chunk, row] += weight * grad[p]; ``out`` holds one copy a chunk."""
+    chunks = out.shape[0]
+    channels = grad.shape[1]
+    total = points.shape[0]
+    nx, ny, nz = index.shape
+    for chunk in prange(chunks):
+        for p in range(total * chunk // chunks, total * (chunk + 1) // chunks):
+            x0, fx = _corner(points[p, 0], nx)
+            y0, fy = _corner(points[p, 1], ny)
+            z0, fz = _corner(points[p, 2], nz)
+            for i in range(8):
+                a, b, d = i >> 2, (i >> 1) & 1, i & 1
+                row = index[x0 + a, y0 + b, z0 + d]
+                if row >= 0:
+                    w = (fx if a else 1 - fx) * (fy if b else 1 - fy) * (fz if d else 1 - fz)
+                    for c in range(channels):
+                        out[chunk, row, c] += w * grad[p, c]
+
+
+@njit(parallel=True, cache=True)
+def gather_backward_points(values, index, points, fill, grad, out):
+    """out[p] = gradient with respect to the point's lattice coordinate; 0 where clamped."""
+    channels = values.shape[1]
+    nx, ny, nz = index.shape
+    for p in prange(points.shape[0]):
+        x0, fx = _corner(points[p, 0], nx)
+        y0, fy = _corner(points[p, 1], ny)
+        z0, fz = _corner(points[p, 2], nz)
+        gx, gy, gz = 0.0, 0.0, 0.0
+        for i in range(8):
+            a, b, d = i >> 2, (i >> 1) & 1, i & 1
+            wx, wy, wz = (fx if a else 1 - fx), (fy if b else 1 - fy), (fz if d else 1 - fz)
+            row = index[x0 + a, y0 + b, z0 + d]
+            dot = 0.0
+            for c in range(channels):
+                dot += grad[p, c] * (values[row, c] if row >= 0 else fill[c])
+            gx += dot * (1.0 if a else -1.0) * wy * wz
+            gy += dot * (1.0 if b else -1.0) * wx * wz
+            gz += dot * (1.0 if d else -1.0) * wx * wy
+        out[p, 0] = gx if 0 <= points[p, 0] <= nx - 1 else 0.0
+        out[p, 1] = gy if 0 <= points[p, 1] <= ny - 1 else 0.0
+        out[p, 2] = gz if 0 <= points[p, 2] <= nz - 1 else 0.0
+
+
+@njit(cache=True)
+def mark_cells(index, keep, cells):
+    """cells[x, y, z] = 1 where a corner of the cell is present and kept."""
+    nx, ny, nz = index.shape
+    for x in range(nx):
+        for y in range(ny):
+            for z in range(nz):
+                row = index[x, y, z]
+                if row >= 0 and keep[row]:
+                    for a in range(max(x - 1, 0), min(x + 1, nx - 1)):
+                        for b in range(max(y - 1, 0), min(y + 1, ny - 1)):
+                            for d in range(max(z - 1, 0), min(z + 1, nz - 1)):
+                                cells[a, b, d] = 1
+
+
+@njit(inline="always")
+def _floor(position):
+    return int(np.floor(position[0])), int(np.floor(position[1])), int(np.floor(position[2]))
+
+
+@njit(cache=True)
+def number_touched(positions, index):
+    """Number the voxels that a kernel touches, in lattice order, in ``index`` (-1 at first); return how many.
+
+    Voxels whose positions are NaN contribute nothing.
+    """
+    nx, ny, nz = index.shape
+    for q in range(positions.shape[0]):
+        if np.isnan(positions[q, 0]):
+            continue
+        x0, y0, z0 = _floor(positions[q])
+        for a in range(2):
+            for b in range(2):
+                for d in range(2):
+                    x, y, z = x0 + a, y0 + b, z0 + d
+                    if 0 <= x < nx and 0 <= y < ny and 0 <= z < nz:
+                        index[x, y, z] = 0
+    rows = 0
+    flat = index.reshape(-1)
+    for i in range(flat.shape[0]):
+        if flat[i] == 0:
+            flat[i] = rows
+            rows += 1
+    return rows
+
+
+@njit(parallel=True, cache=True)
+def scatter(source, positions, index, out):
+    """out[chunk, row] += b(u) (source[q], 1): the sums of the average splat, coverage in the last channel."""
+    chunks = out.shape[0]
+    channels = source.shape[1]
+    total = positions.shape[0]
+    nx, ny, nz = index.shape
+    for chunk in prange(chunks):
+        for q in range(total * chunk // chunks, total * (chunk + 1) // chunks):
+            if np.isnan(positions[q, 0]):
+                continue
+            x0, y0, z0 = _floor(positions[q])
+            fx, fy, fz = positions[q, 0] - x0, positions[q, 1] - y0, positions[q, 2] - z0
+            for i in range(8):
+                a, b, d = i >> 2, (i >> 1) & 1, i & 1
+                x, y, z = x0 + a, y0 + b, z0 + d
+                if 0 <= x < nx and 0 <= y < ny and 0 <= z < nz:
+                    w = (fx if a else 1 - fx) * (fy if b else 1 - fy) * (fz if d else 1 - fz)
+                    row = index[x, y, z]
+                    for c in range(channels):
+                        out[chunk, row, c] += w * source[q, c]
+                    out[chunk, row, channels] += w
+
+
+@njit(parallel=True, cache=True)
+def scatter_backward(source, positions, index, grad, grad_source, grad_positions):
+    """Compute the gradients of ``scatter`` with respect to values and positions."""
+    channels = source.shape[1]
+    nx, ny, nz = index.shape
+    for q in prange(positions.shape[0]):
+        if np.isnan(positions[q, 0]):
+            continue
+        x0, y0, z0 = _floor(positions[q])
+        fx, fy, fz = positions[q, 0] - x0, positions[q, 1] - y0, positions[q, 2] - z0
+        gx, gy, gz = 0.0, 0.0, 0.0
+        for i in range(8):
+            a, b, d = i >> 2, (i >> 1) & 1, i & 1
+            x, y, z = x0 + a, y0 + b, z0 + d
+            if 0 <= x < nx and 0 <= y < ny and 0 <= z < nz:
+                wx, wy, wz = (fx if a else 1 - fx), (fy if b else 1 - fy), (fz if d else 1 - fz)
+                w = wx * wy * wz
+                row = index[x, y, z]
+                dot = grad[row, channels]
+                for c in range(channels):
+                    grad_source[q, c] += w * grad[row, c]
+                    dot += source[q, c] * grad[row, c]
+                gx += dot * (1.0 if a else -1.0) * wy * wz
+                gy += dot * (1.0 if b else -1.0) * wx * wz
+                gz += dot * (1.0 if d else -1.0) * wx * wy
+        grad_positions[q, 0], grad_positions[q, 1], grad_positions[q, 2] = gx, gy, gz
+
+
+@njit(cache=True)
+def _span(o, d, near, far, bounds):
+    """Return the interval of a ray within ``bounds`` (2, 3); its end precedes its start if it misses."""
+    t0, t1 = near, far
+    for axis in range(3):
+        low, high = bounds[0, axis], bounds[1, axis]
+        if d[axis] == 0.0:
+            if o[axis] < low or o[axis] > high:
+                return 1.0, 0.0
+        else:
+            a, b = (low - o[axis]) / d[axis], (high - o[axis]) / d[axis]
+            t0, t1 = max(t0, min(a, b)), min(t1, max(a, b))
+    return t0, t1
+
+
+@njit(cache=True)
+def _first(t, near, step, jitter):
+    """Return the first step at or after distance ``t``."""
+    return max(int(np.ceil((t - near) / step - jitter)), 0)
+
+
+@njit(cache=True)
+def _leap(o, d, x, y, z, reach, block, end):
+    """Return the distance at which a ray leaves the empty blocks around it, ``reach`` in all directions."""
+    for axis in range(3):
+        if d[axis] != 0.0:
+            at = (x, y, z)[axis] // block
+            corner = at + reach if d[axis] > 0 else at - reach + 1
+            leaves = (corner * block - o[axis]) / d[axis]
+            if leaves < end:
+                end = leaves
+    return end
+
+
+@njit(cache=True)
+def _seek(o, d, k, near, step, jitter, end, cells, reach, block):
+    """Return the next step from ``k`` on in an occupied cell, and its distance; beyond ``end`` if none."""
+    nx, ny, nz = cells.shape
+    t = near + (k + jitter) * step
+    while t <= end:
+        x = min(max(int(o[0] + t * d[0]), 0), nx - 1)
+        y = min(max(int(o[1] + t * d[1]), 0), ny - 1)
+        z = min(max(int(o[2] + t * d[2]), 0), nz - 1)
+        blocks = reach[x // block, y // block, z // block]
+        if blocks == 0:
+            if cells[x, y, z]:
+                break
+            k += 1
+        else:
+            to = _leap(o, d, x, y, z, blocks, block, end + 2 * step)
+            k = max(k + 1, _first(to - 1e-6 * step, near, step, jitter))  # not too far, in spite of rounding
+        t = near + (k + jitter) * step
+    return k, t
+
+
+@njit(parallel=True, cache=True)
+def march(
+    origins, directions, near, far, step, jitter, cells, reach, bounds, block, counts, firsts, starts,
+    ray_ids, distances,
+):  # fmt: skip
+    """Count each ray's samples and note its first step if ``starts`` is empty; else write the samples from
+    ``starts[r]`` on.
+    """
+    counting = starts.shape[0] == 0
+    for r in prange(origins.shape[0]):
+        o, d = origins[r], directions[r]
+        t0, t1 = _span(o, d, near, far, bounds)
+        if t0 > t1 or (not counting and counts[r] == 0):
+            continue
+        k = _first(t0, near, step, jitter[r]) if counting else firsts[r]
+        found, t = 0, near
+        while True:
+            k, t = _seek(o, d, k, near, step, jitter[r], t1, cells, reach, block)
+            if not t <= t1:
+                break
+            if not counting:
+                ray_ids[starts[r] + found] = r
+                distances[starts[r] + found] = t
+            elif found == 0:
+                firsts[r] = k
+            found += 1
+            if not counting and found == counts[r]:
+                break
+            k += 1
+        if counting:
+            counts[r] = found
+
+
+@njit(cache=True)
+def pool_blocks(cells, reach, block, bounds):
+    """Fill ``reach``, the chessboard distance of each block (``block`` cells a side) to the nearest occupied
+    block, and ``bounds`` (2, 3) of the occupied cells, low > high if there are none.
+    """
+    nx, ny, nz = cells.shape
+    far = 255
+    reach[:] = far
+    bounds[0] = np.inf
+    bounds[1] = -np.inf
+    for x in range(nx):
+        for y in range(ny):
+            for z in range(nz):
+                if cells[x, y, z]:
+                    reach[x // block, y // block, z // block] = 0
+                    bounds[0, 0], bounds[1, 0] = min(bounds[0, 0], x), max(bounds[1, 0], x + 1)
+                    bounds[0, 1], bounds[1, 1] = min(bounds[0, 1], y), max(bounds[1, 1], y + 1)
+                    bounds[0, 2], bounds[1, 2] = min(bounds[0, 2], z), max(bounds[1, 2], z + 1)
+    _sweep(reach, 1)
+    _sweep(reach, -1)
+
+
+@njit(cache=True)
+def _sweep(reach, sign):
+    """Sweep the chessboard distance transform, forwards or backwards."""
+    nx, ny, nz = reach.shape
+    for i in range(nx):
+        x = i if sign > 0 else nx - 1 - i
+        for j in range(ny):
+            y = j if sign > 0 else ny - 1 - j
+            for k in range(nz):
+                z = k if sign > 0 else nz - 1 - k
+                least = int(reach[x, y, z])
+                if least == 0:
+                    continue
+                for n in range(13):  # of the 27 around it, those already swept
+                    a, b, c = x + sign * (n // 9 - 1), y + sign * (n // 3 % 3 - 1), z + sign * (n % 3 - 1)
+                    if 0 <= a < nx and 0 <= b < ny and 0 <= c < nz:
+                        least = min(least, reach[a, b, c] + 1)
+                reach[x, y, z] = least
+
+
+@njit(cache=True)
+def _raw(raw, index, fill, x, y, z):
+    """Interpolate one channel of a sparse lattice."""
+    nx, ny, nz = index.shape
+    x0, fx = _corner(x, nx)
+    y0, fy = _corner(y, ny)
+    z0, fz = _corner(z, nz)
+    total = 0.0
+    for i in range(8):
+        a, b, c = i >> 2, (i >> 1) & 1, i & 1
+        w = (fx if a else 1 - fx) * (fy if b else 1 - fy) * (fz if c else 1 - fz)
+        row = index[x0 + a, y0 + b, z0 + c]
+        total += w * (raw[row] if row >= 0 else fill)
+    return total
+
+
+@njit(cache=True)
+def _optical(raw, shift, scale):
+    """Return the optical depth of a step, ``softplus(raw + shift) * scale``, at most 80."""
+    v = raw + shift
+    return min((v if v > 20 else np.log1p(np.exp(v))) * scale, 80.0)
+
+
+@njit(parallel=True, cache=True)
+def trace(
+    origins, directions, near, far, step, jitter, cells, reach, bounds, block, raw, index, fill,
+    shift, scale, early_stop_eps, threshold, sums, read, counts, firsts, starts, ray_ids, distances, weights,
+):  # fmt: skip
+    """If ``starts`` is empty, compute each ray's ``sums`` (opacity, distance, transmittance), the number of
+    samples read, and of those above the threshold the number, the first step and the transmittance before it
+    (last column of ``sums``). Else write the samples above the threshold from ``starts[r]`` on.
+    """
+    counting = starts.shape[0] == 0
+    for r in prange(origins.shape[0]):
+        o, d = origins[r], directions[r]
+        t0, t1 = _span(o, d, near, far, bounds)
+        if t0 > t1 or (not counting and counts[r] == 0):
+            if counting:
+                sums[r, 2] = 1.0
+            continue
+        k = _first(t0, near, step, jitter[r]) if counting else firsts[r]
+        through = 1.0 if counting else sums[r, 3]
+        opacity, distance, found, t = 0.0, 0.0, 0, near
+        while through >= early_stop_eps and (counting or found < counts[r]):
+            k, t = _seek(o, d, k, near, step, jitter[r], t1, cells, reach, block)
+            if not t <= t1:
+                break
+            value = _raw(raw, index, fill, o[0] + t * d[0], o[1] + t * d[1], o[2] + t * d[2])
+            x = _optical(value, shift, scale)
+            weight = through * -np.expm1(-x)
+            if weight > threshold:
+                if not counting:
+                    ray_ids[starts[r] + found] = r
+                    distances[starts[r] + found] = t
+                    weights[starts[r] + found] = weight
+                elif found == 0:
+                    firsts[r] = k
+                    sums[r, 3] = through
+                found += 1
+            if counting:
+                opacity += weight
+                distance += weight * t
+                read[r] += 1
+            through *= np.exp(-x)
+            k += 1
+        if counting:
+            sums[r, 0], sums[r, 1], sums[r, 2] = opacity, distance, through
+            counts[r] = found
