@@ -138,10 +138,11 @@ def test_no_job_of_a_sweep_measures_a_run_that_is_not_trusted(forewarp, ok, fitt
     ok(*sweep, TRUST)
 
 
-def test_the_limits_take_trust(forewarp, refused, fitted):
-    limits = ["report", "kind=limits", "runs=run", "views=1"]
-    assert refused(*limits).endswith(ADVICE)
-    assert "| disc " in forewarp(*limits, TRUST).out
+def test_the_page_of_a_run_takes_trust(ok, fitted, monkeypatch):
+    monkeypatch.setattr("forewarp.cli.run_page.write_film", lambda *_: None)
+    page = ["report", "kind=run", "run=run"]
+    assert ADVICE in ok(*page).out
+    assert "Rendering" not in ok(*page, TRUST).out
 
 
 def test_a_broken_step_is_taken_again_with_trust(refused, in_tmp, capsys):

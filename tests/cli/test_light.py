@@ -45,7 +45,7 @@ REFUSED = [
     (["train", "viewer=8080"], "viewer: expected true or false, but got 8080"),
     (["export"], "run: expected the folder of a run, but got nothing"),
     (["export", "run=."], "config.yaml: expected the configuration of a run, but got none"),
-    (["report", "kind=limits", "runs=[a]"], "config.yaml: expected the configuration of a run, but got none"),
+    (["report", "kind=run", "run=a"], "config.yaml: expected the configuration of a run, but got none"),
     (["report"], "runs/accuracy_time: expected folders of runs, but got none"),
     (["capture"], "expected video=FILE or images=FOLDER, but got neither"),
     (["synthesize", "folder=."], "expected a new or empty folder, but got one with files"),

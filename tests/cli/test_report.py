@@ -2,7 +2,7 @@ import pytest
 
 from tests.support.runs_on_disk import write_run
 
-KINDS = "accuracy_time, price_list, paper, ablation, minutes, methods, effects, compare, run, limits"
+KINDS = "accuracy_time, price_list, paper, ablation, minutes, methods, effects, compare, run"
 
 
 def test_pages_are_written_and_named(ok, in_tmp):
@@ -19,12 +19,6 @@ def test_the_help_has_a_line_for_each_kind(forewarp):
         assert len([line for line in text.splitlines() if line.split()[:1] == [f"kind={kind}"]]) == 1
 
 
-def test_limits_of_a_pattern_of_runs(ok, fitted):
-    done = ok("report", "kind=limits", f"runs={fitted.parent}/r*", "views=1")
-    head, _, row = ([cell.strip() for cell in line.split("|")[1:-1]] for line in done.out.splitlines())
-    assert (head[0], row[0], len(row)) == ("scene", "vehicle", len(head))
-
-
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
@@ -34,8 +28,6 @@ def test_limits_of_a_pattern_of_runs(ok, fitted):
         (["published=none.yaml"], "none.yaml: expected a usable file or folder, but got No such file"),
         (["kind=paper", "runs=[a,b]"], "runs: expected one folder for kind=paper, but got a list"),
         (["kind=compare"], "runs: expected folders of runs, but got none; set runs="),
-        (["kind=limits", "runs=none"], "expected the configuration of a run, but got none; set runs"),
-        (["kind=limits", "runs=none", "views=0"], "views: expected a whole number > 0, but got 0"),
     ],
 )
 def test_mistakes_end_in_one_line(refused, in_tmp, arguments, line):

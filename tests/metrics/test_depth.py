@@ -3,7 +3,8 @@ import math
 import pytest
 import torch
 
-from forewarp.metrics.depth import THRESHOLDS, depth_delta
+from forewarp.metrics.depth import depth_delta
+from forewarp.metrics.registry import THRESHOLDS
 from tests.support import reference
 
 

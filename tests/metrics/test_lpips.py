@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from forewarp.metrics import lpips
-from forewarp.metrics.lpips import LPIPS, NETS, find_lpips, find_lpips_weights
+from forewarp.metrics.lpips import LPIPS, find_lpips, find_lpips_weights
+from forewarp.metrics.registry import NETS
 from tests.support import reference
 
 

@@ -4,12 +4,16 @@ import math
 import pytest
 import torch
 
+from forewarp.evaluation.evaluate import table_of
 from forewarp.metrics import image, lpips
 from forewarp.metrics.lpips import LPIPS
-from forewarp.metrics.suite import DEPTH_METRICS, METRICS, ImageSuite, summarise
+from forewarp.metrics.registry import METRICS, Metric
+from forewarp.metrics.suite import ImageSuite, summarise
 from forewarp.scene.camera import Camera
 from forewarp.scene.frame import Frame
 from forewarp.scene.view import Target
+
+DEPTH_METRICS = [name for name, metric in METRICS.items() if metric.needs_depth]
 
 
 def target(height=34, width=40, depth=None, foreground=None, seed=0):
@@ -113,3 +117,15 @@ BAD_ROWS = [
 def test_summary_refuses(row, message):
     with pytest.raises(ValueError, match=message):
         summarise([row])
+
+
+def test_a_registered_metric_is_scored_averaged_and_printed(monkeypatch):
+    error = Metric("mean_error", "Mean error", 3, False, score=lambda image, target, depth: 0.25)
+    monkeypatch.setitem(METRICS, "mean_error", error)
+    scores = ImageSuite().score(target().rgb, target())
+    assert list(scores) == ["psnr", "ssim", "mean_error"]
+    test = summarise([("all", scores)])
+    assert test["all"]["mean_error"] == 0.25
+    table = table_of({"protocol": {"scene": "x"}, "test": test})
+    assert [column.header for column in table.columns][-1] == "mean_error"
+    assert [*table.columns[-1].cells] == ["0.250"]

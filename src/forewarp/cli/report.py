@@ -17,35 +17,31 @@ KINDS = {
     "effects": "planned runs against every effect at once and the paper's fixed set",
     "compare": "a few runs side by side, printed, and with out=FOLDER drawn",
     "run": "the page of one run: its video, truth against prediction, curves, effects and why",
-    "limits": "what keeps a few runs from the truth, printed: time, views, voxel size, regions",
 }
 
 HELP = f"""
-forewarp-report makes tables, curves and pages of runs that are already there. Only kind=limits and kind=run
-render anything.
+forewarp-report makes tables, curves and pages of runs that are already there. Only kind=run renders anything.
 
 {chr(10).join(f"  kind={kind:<14} {about}" for kind, about in KINDS.items())}
 
   forewarp-report kind=price_list runs=FOLDER out=FOLDER
   forewarp-report kind=compare runs=[runs/demo/particles,runs/demo/forward] out=runs/demo
   forewarp-report kind=run run=runs/vehicle/particles-demo-seed0
-  forewarp-report kind=limits 'runs=runs/paper/*/plain-forward-fast-*'
 
 What one types most:
   runs=FOLDER            searched for runs (runs/accuracy_time, minutes, effects, ablations, else paper)
-  runs=[FOLDER,FOLDER]   compare, limits: the runs themselves; patterns with * are expanded
+  runs=[FOLDER,FOLDER]   compare: the runs themselves; patterns with * are expanded
   out=FOLDER             where the page goes (results/ below the runs); compare: where the picture goes
   target=DB              accuracy_time: PSNR that every variant's seconds are listed for
   published=FILE         accuracy_time, minutes: results of others; paper, ablation: the printed numbers
   curves=FOLDER          paper: where accuracy_time put its pictures (runs/accuracy_time/results)
-  views=N                limits: training views to render
   run=FOLDER             run: the run; its page is <run>/page.html, or out=FILE.html
   megabytes=N            run: most of the page; pictures and the video are made smaller to fit
   render=false           run: show only what the folder has; load no method and no data; for slow methods
   path=both|trajectories|swing|fixed|orbit   run: which video, as in forewarp-render
-  data.root=FOLDER       limits, run: where the data are now, if they moved
-  trainer=cpu|gpu|auto   limits, run: device to compute with; without it the one of the run
-  trust=[PACKAGE]        limits, run: code of other packages that a run's config may name
+  data.root=FOLDER       run: where the data are now, if they moved
+  trainer=cpu|gpu|auto   run: device to compute with; without it the one of the run
+  trust=[PACKAGE]        run: code of other packages that a run's config may name
 
 The runs: make accuracy-time [DATA=DATASETS SCENE=NAME MINUTES=N], make price-list DATA=DATASETS,
 make reproduce-tables [DATA=DATASETS], make ablations, make effects. Runs without results are listed.
@@ -63,8 +59,8 @@ def report(config) -> None:
 
         print(run_page(config))
         return
-    if config.kind in ("compare", "limits"):
-        print(_table(config, _folders(config.runs)))
+    if config.kind == "compare":
+        print(_compared(config, _folders(config.runs)))
         return
     if not isinstance(config.runs, str | None):
         raise ValueError(f"runs: expected one folder for kind={config.kind}, but got a list; name one folder")
@@ -84,36 +80,14 @@ def _folders(runs) -> list[str]:
     return [folder for one in named for folder in sorted(glob(str(one))) or [str(one)]]
 
 
-def _table(config, folders: list[str]) -> str:
-    """Return the table of ``kind=compare`` or ``kind=limits``."""
-    if config.kind == "compare":
-        from forewarp.report.compare import compare, draw_compared
+def _compared(config, folders: list[str]) -> str:
+    """Return the table of ``kind=compare``, and draw a view by each run where ``out`` is set."""
+    from forewarp.report.compare import compare, draw_compared
 
-        drawn = draw_compared(folders, Path(config.out)) if config.out else None
-        none = "no picture: the runs share no test view with a sheet; type views= and sheets= alike"
-        about = f"written: {drawn}" if drawn else none
-        return compare(folders).plain() + (f"\n{about}" if config.out else "")
-    if type(config.views) is not int or config.views < 1:
-        raise ValueError(f"views: expected a whole number > 0, but got {config.views}")
-    from forewarp.runs.config import saved_config
-
-    saved = [saved_config(folder, config, "runs") for folder in folders]
-    # These load torch; mistakes have been answered before.
-    from forewarp.evaluation.limits import limits_of, limits_table
-    from forewarp.progress import Counted
-    from forewarp.runs.build import build_run
-
-    rows = []
-    with Counted("runs") as progress:
-        try:
-            for one in saved:
-                rows.append(limits_of(build_run(one), config.views))
-                progress(len(rows), len(saved))
-        except Exception:  # each row takes minutes: those that there are must not be lost
-            if rows:
-                print(limits_table(rows))
-            raise
-    return limits_table(rows)
+    drawn = draw_compared(folders, Path(config.out)) if config.out else None
+    none = "no picture: the runs share no test view with a sheet; type views= and sheets= alike"
+    about = f"written: {drawn}" if drawn else none
+    return compare(folders).plain() + (f"\n{about}" if config.out else "")
 
 
 def _written(config, runs: Path, out: Path) -> list[Path]:

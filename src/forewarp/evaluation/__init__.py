@@ -1,1 +1,1 @@
-"""Measure and draw fitted scenes: test views, videos, trajectories, accuracy against time, limits."""
+"""Measure and draw fitted scenes: test views, videos, trajectories, accuracy against time."""

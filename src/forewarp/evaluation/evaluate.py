@@ -24,7 +24,8 @@ from forewarp.methods.effect import switched
 from forewarp.methods.method import parameter_count
 from forewarp.metrics.flow import end_point_error
 from forewarp.metrics.lpips import find_lpips
-from forewarp.metrics.suite import METRICS, ImageSuite, summarise
+from forewarp.metrics.registry import METRICS
+from forewarp.metrics.suite import ImageSuite, summarise
 from forewarp.ops.grid import block_means, reduced_depth
 from forewarp.progress import Counted, time_text
 from forewarp.scene.frame import Scene, spread
@@ -396,10 +397,7 @@ def table_of(metrics: dict) -> Table:
     for key, block in blocks.items():
         suffix = key.removeprefix("test").replace("_", " ")
         for ability, scores in block.items():
-            cells = [
-                f"{scores[n]:.2f}" if n.startswith("psnr") else f"{scores[n]:.4f}" if n in scores else ""
-                for n in names
-            ]
+            cells = [f"{scores[name]:.{METRICS[name].digits}f}" if name in scores else "" for name in names]
             table.add_row(ability + suffix, *cells)
     return table
 

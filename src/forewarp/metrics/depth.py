@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-THRESHOLDS = (1.02, 1.25, 1.25**2)
+from forewarp.metrics.registry import THRESHOLDS
 
 
 def depth_delta(

@@ -7,7 +7,7 @@ import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-DIFFERENCES = ("psnr", "ssim", "epe")  # other measures change by a factor
+FACTORS = ("step", "frame", "memory", "parameters", "steps")  # measures that change by a factor
 
 Numbers = Mapping[str, float]
 
@@ -47,16 +47,16 @@ def measure_effect(pairs: Sequence[tuple[Numbers, Numbers]], measure: str) -> Es
 
     Args:
         pairs: pairs of numbers by name; pairs without the measure are left out.
-        measure: name; if in ``DIFFERENCES`` the change is a difference, else a quotient.
+        measure: name; if in ``FACTORS`` the change is a quotient, else a difference.
 
     >>> measure_effect([({"psnr": 31.0, "step": 0.2}, {"psnr": 30.0, "step": 0.1})], "step")
     Estimate(mean=2.0, deviation=None)
     """
     both = [(now.get(measure), before.get(measure)) for now, before in pairs]
     both = [(now, before) for now, before in both if None not in (now, before)]
-    if measure in DIFFERENCES:
-        return Estimate.of([now - before for now, before in both])
-    return Estimate.of([now / before for now, before in both if before])
+    if measure in FACTORS:
+        return Estimate.of([now / before for now, before in both if before])
+    return Estimate.of([now - before for now, before in both])
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from forewarp.metrics.registry import MS_SSIM_LEAST_SIDE, SSIM_LEAST_SIDE
+
 PSNR_CAP = 100.0
-SSIM_LEAST_SIDE = 11
-MS_SSIM_LEAST_SIDE = 161
 _C1, _C2 = 0.01**2, 0.03**2
 _SCALE_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 
@@ -152,3 +152,29 @@ def _blur(images: Tensor) -> Tensor:
         )
         images = sum(shifted)
     return images
+
+
+def low_passed(image: Tensor, pixels: float) -> Tensor:
+    """Fit an image that is linear between points ``pixels`` apart, like a slice of a trilinear grid.
+
+    Not a strict bound for a grid: grid points lie elsewhere in every view, and density makes edges.
+
+    Args:
+        image: (H, W, 3) in [0, 1].
+        pixels: distance of the points; at most 1 returns the image itself.
+
+    Returns:
+        (H, W, 3), the least-squares fit.
+    """
+    if pixels <= 1:
+        return image
+    rows, columns = (_projection(length, pixels) for length in image.shape[:2])
+    return torch.einsum("ab,bcd,ec->aed", rows, image.double(), columns).to(image.dtype)
+
+
+def _projection(length: int, pixels: float) -> Tensor:
+    """Return the projection (length, length) onto functions linear between the points, float64."""
+    places = (torch.arange(length).double() + 0.5) / pixels
+    points = torch.arange(math.ceil(length / pixels) + 1).double()
+    hats = (1 - (places[:, None] - points).abs()).clamp(min=0)
+    return hats @ torch.linalg.pinv(hats)

@@ -18,10 +18,9 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from forewarp.metrics.image import image_pair
+from forewarp.metrics.registry import LPIPS_LEAST_SIDE, NETS
 
-NETS = ("squeeze", "vgg", "alex")
 WEIGHTS_VARIABLE = "FOREWARP_LPIPS_WEIGHTS"
-LPIPS_LEAST_SIDE = 32
 _FILE_PATTERNS = {
     "squeeze": ("squeezenet1_1*.pth", "squeeze.backbone.pth"),
     "vgg": ("vgg16-*.pth", "vgg16.pth", "vgg.backbone.pth"),

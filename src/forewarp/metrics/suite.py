@@ -8,14 +8,12 @@ from collections.abc import Iterable, Mapping
 
 from torch import Tensor
 
-from forewarp.metrics import depth, image, lpips
 from forewarp.metrics.lpips import LPIPS
+from forewarp.metrics.registry import METRICS, NETS
 from forewarp.scene.view import Target
 
 ABILITIES = ("space", "time", "canonical", "all")
-DEPTH_METRICS = tuple(f"depth_delta_{threshold:g}" for threshold in depth.THRESHOLDS)
-LPIPS_METRICS = tuple(f"lpips_{net}" for net in lpips.NETS)
-METRICS = ("psnr", "psnr_box", "ssim", "ms_ssim", "ms_ssim_legacy", *LPIPS_METRICS, *DEPTH_METRICS)
+LPIPS_METRICS = tuple(f"lpips_{net}" for net in NETS)
 
 log = logging.getLogger(__name__)
 
@@ -59,24 +57,23 @@ class ImageSuite:
         Raises:
             ValueError: naming the frame, for a shape that differs or a colour that is not finite.
         """
+        scores = {}
         try:
-            values = {
-                "psnr": image.psnr(prediction, target.rgb),
-                "ssim": image.ssim(prediction, target.rgb),
-                "ms_ssim": image.ms_ssim(prediction, target.rgb),
-                "ms_ssim_legacy": image.ms_ssim_legacy(prediction, target.rgb),
-            }
-            if self.mask_box:
-                values["psnr_box"] = _box_score(prediction, target)
-            values |= {name: net(prediction, target.rgb) for name, net in self.lpips.items()}
-            if predicted_depth is not None and target.depth is not None:
-                values |= _depth_scores(predicted_depth, target)
+            for name, metric in METRICS.items():
+                lacks_depth = metric.needs_depth and (predicted_depth is None or target.depth is None)
+                if name in self.lpips:
+                    value = self.lpips[name](prediction, target.rgb)
+                elif metric.score is None or lacks_depth or (name == "psnr_box" and not self.mask_box):
+                    continue
+                else:
+                    value = metric.score(prediction, target, predicted_depth)
+                if value is None:
+                    self._leave_out(name, _reason(name, target))
+                else:
+                    scores[name] = value
         except ValueError as error:
             raise ValueError(f"frame {target.frame.name}: {error}") from error
-        for name, value in values.items():
-            if value is None:
-                self._leave_out(name, _reason(name, target))
-        return {name: values[name] for name in METRICS if values.get(name) is not None}
+        return scores
 
     def _leave_out(self, name: str, reason: str) -> None:
         if name not in self.absent:
@@ -117,27 +114,11 @@ def summarise(rows: Iterable[tuple[str, Mapping[str, float]]]) -> dict[str, dict
     }
 
 
-def _depth_scores(predicted: Tensor, target: Target) -> dict[str, float | None]:
-    fractions = depth.depth_delta(predicted, target.depth, target.foreground)
-    return dict(zip(DEPTH_METRICS, fractions or [None] * len(DEPTH_METRICS)))
-
-
-def _box_score(prediction: Tensor, target: Target) -> float | None:
-    """PSNR in the bounding rectangle of the foreground, or None without foreground."""
-    if target.foreground is None or not bool(target.foreground.any()):
-        return None
-    rows, columns = (target.foreground.any(axis).nonzero()[:, 0] for axis in (1, 0))
-    box = slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
-    return image.psnr(prediction[box], target.rgb[box])
-
-
 def _reason(name: str, target: Target) -> str:
     """Say why an image lacks a metric."""
-    if name in (*DEPTH_METRICS, "psnr_box"):
+    metric, (height, width) = METRICS[name], target.rgb.shape[:2]
+    if metric.needs_foreground:
         return f"frame {target.frame.name} has no foreground"
-    if name in LPIPS_METRICS:
-        least = lpips.LPIPS_LEAST_SIDE
-    else:
-        least = image.SSIM_LEAST_SIDE if name == "ssim" else image.MS_SSIM_LEAST_SIDE
-    height, width = target.rgb.shape[:2]
-    return f"frame {target.frame.name} is {width}x{height} pixels, a side must have {least}"
+    if min(height, width) < metric.least_side:
+        return f"frame {target.frame.name} is {width}x{height} pixels, a side must have {metric.least_side}"
+    return f"frame {target.frame.name} does not allow it"

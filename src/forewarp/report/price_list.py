@@ -7,7 +7,7 @@ from pathlib import Path
 from statistics import mode
 
 from forewarp.files import replace_file
-from forewarp.metrics.gain import DIFFERENCES, Estimate, measure_effect
+from forewarp.metrics.gain import FACTORS, Estimate, measure_effect
 from forewarp.report.collect import Result, by_scene, collect, grouped, left_out, machine
 from forewarp.report.run_rows import portable
 from forewarp.report.tables import Column, Table
@@ -91,7 +91,7 @@ def changes(results: Sequence[Result]) -> Table:
     columns = [Column("variant"), Column("against"), Column("seeds", 0)]
     for measure, column in MEASURES.items():
         signed = Column(column.name, column.digits, signed=True)
-        columns.append(signed if measure in DIFFERENCES else Column(column.name, prefix="×"))
+        columns.append(Column(column.name, prefix="×") if measure in FACTORS else signed)
     return Table(columns, rows, "Changes:")
 
 

@@ -20,8 +20,9 @@ from forewarp.evaluation.evaluate import mean_scores, measure
 from forewarp.files import read_json, write_json
 from forewarp.methods.abilities import HasMatter, HasTrajectories
 from forewarp.methods.method import Method, Snapshot
-from forewarp.metrics.lpips import NETS, find_lpips, find_lpips_weights
-from forewarp.metrics.suite import LPIPS_METRICS, METRICS, ImageSuite
+from forewarp.metrics.lpips import find_lpips, find_lpips_weights
+from forewarp.metrics.registry import METRICS, NETS
+from forewarp.metrics.suite import ImageSuite
 from forewarp.runs.build import build_run
 from forewarp.runs.config import saved_config, trust_of
 from forewarp.runs.overrides import key_of, typed_overrides
@@ -271,7 +272,7 @@ def named(score: object) -> str | None:
     if score not in METRICS:
         known = ", ".join(METRICS)
         raise ValueError(f"score: expected a metric of validation views ({known}) or null, but got {score!r}")
-    if score in LPIPS_METRICS and "maximize" in str(_sweeper().get("direction")).lower():
+    if not METRICS[score].higher_is_better and "maximize" in str(_sweeper().get("direction")).lower():
         raise ValueError(
             f"hydra.sweeper.direction: expected minimize for {score}, which is less where it is better, "
             "but got maximize; add hydra.sweeper.direction=minimize"

@@ -13,7 +13,7 @@ from torch import Tensor
 from forewarp.fields.radiance_grid import FieldAtTime
 from forewarp.methods.voxel.effects.background import Together
 from forewarp.methods.voxel.method import SOLID
-from forewarp.metrics.limits import low_passed
+from forewarp.metrics.image import low_passed
 from forewarp.ops.grid import index_of, neighbour_pairs
 from forewarp.scene.frame import spread
 from forewarp.scene.view import Target, View

@@ -1,0 +1,128 @@
+"""``python -m tests.bench.limits RUN ...``: what limits the accuracy of fitted runs.
+
+Time, views, the size of voxels, or regions of the image: each run renders its test views and some training
+views, which are compared with the truth, and the truth with itself as blurred as the voxels.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from statistics import fmean
+
+import torch
+from omegaconf import OmegaConf
+from tabulate import tabulate
+from torch import Tensor
+
+from forewarp.evaluation.evaluate import Shown, draw
+from forewarp.methods.abilities import HasMatter
+from forewarp.metrics.image import low_passed, psnr
+from forewarp.ops.grid import dilate
+from forewarp.runs.build import build_run
+from forewarp.runs.config import saved_config
+from forewarp.scene.frame import spread
+from forewarp.training.handover import load_handover
+from forewarp.training.stages import Run
+
+REGIONS = ("outside", "outline", "inside")
+PARTS = {
+    "first fifth": lambda time: time < 0.2,
+    "between": lambda time: 0.2 <= time <= 0.8,
+    "last fifth": lambda time: time > 0.8,
+}
+
+
+def limits_of(run: Run, views: int = 20) -> dict[str, float | str]:
+    """Return what limits a finished run, by name.
+
+    PSNR (dB, mean over images) of all test views; of those in the first fifth of the sequence, in the last
+    fifth, and between; of some training views; and of the true images low-passed to the voxel size, about
+    what the lattice allows. The last entries split the squared error of the test views: outside the true
+    silhouettes, within two pixels of them, inside.
+
+    Args:
+        run: a finished run.
+        views: number of training views to render.
+
+    Raises:
+        ValueError: if the images have no alpha, or the method has no ``matter``.
+    """
+    module, scene = run.load(), run.datamodule.scene
+    if not scene.has_alpha:
+        raise ValueError(
+            f"{run.folder}: expected a scene whose images have alpha, but got one without silhouettes"
+        )
+    if not isinstance(module.method, HasMatter):
+        raise ValueError(f"{run.folder}: expected a method that tells where matter is, but got none")
+    with torch.no_grad():
+        voxel_size = module.method.matter().size
+    before = [load_handover(run.stage_folder(stage)) for stage in run.stages[:-1]]
+    center = torch.tensor((before[-1].box if before else scene.box).center).double()
+    test, train = run.datamodule.targets("test"), run.datamodule.targets("train")
+    tested = [compared(shown, center, voxel_size) for shown in draw(module, test)]
+    trained = [
+        compared(shown, center, voxel_size) for shown in draw(module, train, spread(len(train), views))
+    ]
+    errors = {region: sum(float(view["errors"][region]) for view in tested) for region in REGIONS}
+    return {
+        "scene": scene.name,
+        "seconds": sum(done["seconds"] for done in run.finished().values()),
+        **by_time([(view["time"], view["psnr"]) for view in tested]),
+        "training views": fmean(view["psnr"] for view in trained),
+        "voxel, pixels": fmean(view["voxel"] for view in tested),
+        "low-passed truth": fmean(view["bound"] for view in tested),
+        **{region: error / sum(errors.values()) for region, error in errors.items()},
+    }
+
+
+def compared(shown: Shown, center: Tensor, voxel_size: float) -> dict:
+    """Compare a rendered view with its truth; ``voxel`` is the voxel size in pixels at the center (3,)."""
+    target, camera = shown.target, shown.target.frame.camera
+    truth = target.rgb.cpu()
+    image = list(shown.renderings.values())[-1].rgb.clamp(0, 1).reshape(truth.shape).cpu()
+    voxel = voxel_size * camera.fx / float((center - camera.center).norm())
+    return {
+        "time": target.frame.time,
+        "psnr": psnr(image, truth),
+        "voxel": voxel,
+        "bound": psnr(low_passed(truth, voxel), truth),
+        "errors": error_shares(truth, image, target.foreground.cpu()),
+    }
+
+
+def by_time(views: list[tuple[float, float]]) -> dict[str, float]:
+    """Return the mean PSNR of all views (time, PSNR), and of those in each of ``PARTS``; NaN without any."""
+    found = {"test views": [psnr for _, psnr in views]}
+    found |= {name: [psnr for time, psnr in views if holds(time)] for name, holds in PARTS.items()}
+    return {name: fmean(values) if values else math.nan for name, values in found.items()}
+
+
+def regions(foreground: Tensor, band: int = 2) -> dict[str, Tensor]:
+    """Divide an image into the outside, the outline and the inside of its foreground.
+
+    Args:
+        foreground: (H, W) bool.
+        band: half the width of the outline, in pixels.
+
+    Returns:
+        disjoint masks (H, W) bool by the names in ``REGIONS``.
+    """
+    outline = dilate(foreground, band) & dilate(~foreground, band)
+    return {"outside": ~foreground & ~outline, "outline": outline, "inside": foreground & ~outline}
+
+
+def error_shares(truth: Tensor, image: Tensor, foreground: Tensor) -> dict[str, Tensor]:
+    """Sum the squared error of an image (H, W, 3) in each region of its foreground (H, W)."""
+    error = (truth - image).square().mean(-1)
+    return {name: torch.where(mask, error, 0.0).sum() for name, mask in regions(foreground).items()}
+
+
+def main(folders: list[str]) -> None:
+    """Print a row for each run."""
+    rows = [limits_of(build_run(saved_config(folder, OmegaConf.create(), "runs"))) for folder in folders]
+    print(tabulate(rows, "keys", tablefmt="github", floatfmt=".2f"))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
