@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from forewarp.cli.entry import MISTAKE, quiet
-from forewarp.cli.errors import one_line
+from forewarp.cli.mistakes import one_line
 from forewarp.runs.config import without_trust
 
 

@@ -8,8 +8,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from forewarp.cli import entry
-from forewarp.cli.errors import one_line
-from forewarp.cli.misspelt import with_run_key
+from forewarp.cli.mistakes import one_line, with_run_key
 from forewarp.data.files import SceneError
 from tests.support.configs import CONF, ROOT, options
 

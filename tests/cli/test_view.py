@@ -11,7 +11,7 @@ from omegaconf import OmegaConf
 
 pytest.importorskip("viser", reason="no viser: pip install forewarp[viewer]")
 
-from forewarp.cli.train import refuse_one_port
+from forewarp.cli.prepare import viewer_of
 from forewarp.viewer.desk import Desk
 
 
@@ -92,8 +92,9 @@ def test_jobs_that_run_at_once_take_ports_of_their_own(monkeypatch, launcher, po
     seen = OmegaConf.create({"launcher": {"_target_": target}})
     monkeypatch.setattr(HydraConfig, "initialized", lambda: True)
     monkeypatch.setattr(HydraConfig, "get", lambda: SimpleNamespace(mode=RunMode.MULTIRUN, **seen))
+    config = OmegaConf.create({"viewer": True, "host": "127.0.0.1", "port": port})
     with pytest.raises(ValueError, match="port: expected 0 where") if fails else nullcontext():
-        refuse_one_port(OmegaConf.create({"port": port}))
+        assert viewer_of(config) == {"host": "127.0.0.1", "port": port}
 
 
 def test_training_with_a_page_of_no_meaning_is_refused(refused, in_tmp):

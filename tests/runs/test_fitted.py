@@ -115,8 +115,8 @@ def test_without_views_there_is_none(forewarp, ok, scene, returned):
 
 
 @pytest.mark.parametrize("word", ["test/psnr", "3", "[psnr]"])
-def test_another_metric_is_refused_with_a_list(refused, in_tmp, word):
-    line = refused("train", *SMALL, f"score={word}")
+def test_another_metric_is_refused_with_a_list(refused, fitted, in_tmp, word):
+    line = refused("train", *SMALL, f"data.root={fitted.parent / 'scenes'}", f"score={word}")
     assert line.startswith("score: expected a metric of validation views (psnr, psnr_box, ssim, ms_ssim, ")
     assert "lpips_squeeze" in line
     assert not list(in_tmp.iterdir())

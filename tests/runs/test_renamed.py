@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from forewarp.cli.checks import refuse_renamed_keys
+from forewarp.cli.prepare import refuse_renamed_keys
 from forewarp.runs.overrides import refuse_renamed
 from tests.support.configs import composed
 

@@ -13,8 +13,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
-from forewarp.cli.errors import flat, one_line
-from forewarp.cli.misspelt import refuse_dashes, renamed_key, unknown_key, with_run_key
+from forewarp.cli.mistakes import flat, one_line, refuse_dashes, renamed_key, unknown_key, with_run_key
 from forewarp.runs.config_files import configurations, project_root
 from forewarp.runs.overrides import key_of, refuse_renamed
 

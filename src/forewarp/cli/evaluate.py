@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from forewarp.cli.checks import refuse_numbers
 from forewarp.cli.entry import command
+from forewarp.cli.prepare import refuse_numbers
 
 HELP = """
 forewarp-evaluate measures a finished run on its test views and prints the table. Everything is rebuilt from

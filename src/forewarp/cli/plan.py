@@ -30,7 +30,7 @@ Overrule a plan by an override: forewarp-train plan=FILE model/view_dependence=n
 
 def plan(config) -> None:
     """Make a plan and print it."""
-    from forewarp.cli.checks import refuse_all, refuse_missing_scene
+    from forewarp.cli.prepare import refuse_all, refuse_missing_scene
     from forewarp.planning.plan_file import show_plan
     from forewarp.runs.overrides import typed_overrides
 
@@ -43,6 +43,21 @@ def plan(config) -> None:
     from forewarp.planning.plan import make_plan  # loads torch; mistakes have been answered before
 
     show_plan(make_plan(config, typed_overrides()))
+
+
+def planned():
+    """Make or read a plan of what was typed; return the config of the run that the plan says."""
+    from forewarp.planning.plan import make_plan
+    from forewarp.planning.plan_file import own_folder, show_plan
+    from forewarp.planning.trials import composed
+    from forewarp.runs.overrides import merged, typed_overrides, without_switched_off
+
+    typed = typed_overrides(of_sweep=True)
+    made = make_plan(composed(typed), typed_overrides())
+    show_plan(made, to_fit=False)
+    config = composed(without_switched_off(merged([*made["overrides"], *own_folder(typed)], typed)))
+    config.planned = made["file"]
+    return config
 
 
 def main() -> None:

@@ -88,7 +88,7 @@ def counted(pictures, total: int, progress):
 
 def check(config) -> None:
     """Refuse settings of which no video can be made, before anything is loaded."""
-    from forewarp.cli.checks import LEAST, RANGES, refuse_numbers
+    from forewarp.cli.prepare import LEAST, RANGES, refuse_numbers
     from forewarp.drawing.files import FORMATS
     from forewarp.evaluation.videos import PATHS
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
-from forewarp.cli.errors import one_line
+from forewarp.cli.mistakes import one_line
 from forewarp.cli.render import check, write_film
 from forewarp.report.run_files import WHYS, Story, read_story, telling
 from forewarp.runs.config_files import project_root

@@ -56,139 +56,53 @@ Watch: tensorboard --logdir runs
 
 
 def train(config) -> float | None:
-    """Fit the stages that are not finished and measure the run; return its score if one is asked for."""
-    from forewarp.cli.checks import refuse_all, refuse_missing_scene
-    from forewarp.runs.config import check_planned, hashed, resumed, trust_of
+    """Prepare a run, fit the stages that are not finished, and measure it.
 
-    refuse_all(config)
-    trust = trust_of(config.get("trust"))
-    if config.get("planned") is not None:
-        check_planned(config, trust)
-    if config.get("score") not in (None, "psnr"):
-        from forewarp.runs.fitted import named
+    Returns:
+        the run's score, if one is asked for.
+    """
+    from forewarp.cli.prepare import prepare
 
-        named(config.score)
-    viewer = viewer_of(config)  # as typed: a saved config has none
-    config = resumed(config)
-    refuse_missing_scene(config)
-    # These load torch; mistakes have been answered before.
+    prepared = prepare(config)
+    if prepared is None:  # a sweep goes on without this scene
+        return None
+    with prepared.session():
+        if prepared.measured:
+            return measured_before(prepared)
+        print(beginning(prepared.run, prepared.config), flush=True)
+        module = prepared.run.fit()
+        return measure(prepared, module)
+
+
+def measured_before(prepared) -> float | None:
+    """Say that there is nothing to do, and how to measure anew; return the score."""
+    folder, reduce = prepared.run.folder, prepared.config.get("reduce")
+    words = f"run={folder}" + (f" reduce={reduce}" if reduce else "")
+    print(f"measured before: {folder}; again with forewarp-evaluate {words}")
+    return prepared.score.of()
+
+
+def measure(prepared, module) -> float | None:
+    """Measure a fitted run, or say how to; draw its curve; return the score."""
     from forewarp.evaluation.evaluate import notes_of
     from forewarp.report.curve import draw_own
-    from forewarp.runs.build import build_run
-    from forewarp.runs.fitted import Score, is_measured, measure_run
-    from forewarp.runs.session import session
+    from forewarp.runs.fitted import measure_run
 
-    config = hashed(planned(config))
-    run = build_run(config)
-    if is_skipped(run, config.get("absent", "refuse")):
-        print(f"skipped: {run.datamodule.place}: no such scene")
-        return None
-    if config.evaluate and is_measured(run):
-        with session(run, config, finished=True):
-            other = f" reduce={config.reduce}" if config.get("reduce") else ""
-            print(f"measured before: {run.folder}; again with forewarp-evaluate run={run.folder}{other}")
-            return Score(run, config).of()
-    refuse_early(run, config)
-    score = Score(run, config)
-    with watched(run, viewer), session(run, config):
-        keep_plan(config)
-        print(beginning(run, config), flush=True)
-        module = run.fit()
-        if config.evaluate:
-            measure_run(run, module, config)
-        else:
-            said = f"fitted: {run.folder}; measure it with forewarp-evaluate run={run.folder}"
-            print(said, *notes_of(module.method.protocol()), sep="\n")
-        draw_own(run.folder)
-        if config.evaluate:
-            at = quote(f"run={run.folder}")
-            print(f"look at  forewarp-view {at}, or a page: forewarp-report kind=run {at}")
-        value = score.of(module)
+    run, config = prepared.run, prepared.config
+    if config.evaluate:
+        measure_run(run, module, config)
+    else:
+        fitted = f"fitted: {run.folder}; measure it with forewarp-evaluate run={run.folder}"
+        print(fitted, *notes_of(module.method.protocol()), sep="\n")
+    draw_own(run.folder)
+    if config.evaluate:
+        at = quote(f"run={run.folder}")
+        print(f"look at  forewarp-view {at}, or a page: forewarp-report kind=run {at}")
+    score = prepared.score.of(module)
     for name, noted in run.finished().items():
         if steps := noted.get("skipped_steps"):
             print(f"{name}: {steps} broken steps skipped; each lies in {run.folder / name / 'broken'}")
-    return value
-
-
-def refuse_early(run, config) -> None:
-    """Read the scene, and refuse what could not be trained or measured, before the run's folder is made."""
-    run.check_device()
-    run.datamodule.setup("fit")
-    if config.evaluate and config.get("reduce") is not None:
-        run.datamodule.targets("test").reduced(config.reduce)
-
-
-def viewer_of(config) -> dict | None:
-    """Return where a page should listen, None if none is asked for; refuse one that cannot be made."""
-    from forewarp.cli.view import require_viewer
-    from forewarp.viewer.address import check_address
-
-    viewer = config.get("viewer", False)
-    if type(viewer) is not bool:
-        raise ValueError(f"viewer: expected true or false, but got {viewer}")
-    if not viewer:
-        return None
-    require_viewer()
-    refuse_one_port(config)
-    check_address(config.host, config.port)
-    return {"host": config.host, "port": config.port}
-
-
-def refuse_one_port(config) -> None:
-    """Refuse one port for jobs that may run at once."""
-    from hydra.core.hydra_config import HydraConfig
-    from hydra.types import RunMode
-
-    if not (HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN) or config.port == 0:
-        return
-    if "BasicLauncher" not in str(HydraConfig.get().launcher.get("_target_")):
-        raise ValueError(
-            f"port: expected 0 where jobs may run at once, so that each takes one that is free, but got "
-            f"{config.port}; set port=0, or launcher=local"
-        )
-
-
-def watched(run, viewer: dict | None):
-    """Return a context in which a page shows the run while it trains, if one is asked for."""
-    from contextlib import nullcontext
-
-    if viewer is None:
-        return nullcontext()
-    from forewarp.viewer.live import live
-
-    return live(run, **viewer)
-
-
-def planned(config):
-    """With ``effects=auto``: make or read the plan, and return the config of the run that it says."""
-    choice = config.get("effects", "given")
-    if choice not in ("given", "auto"):
-        raise ValueError(f"effects: expected given or auto, but got {choice}")
-    if choice == "given" or config.get("resume") is not None:
-        return config
-    from forewarp.planning.plan import make_plan
-    from forewarp.planning.plan_file import own_folder, show_plan
-    from forewarp.planning.trials import composed
-    from forewarp.runs.build import build_run
-    from forewarp.runs.overrides import merged, typed_overrides, without_switched_off
-
-    if is_skipped(build_run(config), config.get("absent", "refuse")):
-        return config
-    made = make_plan(config, typed_overrides())
-    show_plan(made, to_fit=False)
-    typed = typed_overrides(of_sweep=True)
-    config = composed(without_switched_off(merged([*made["overrides"], *own_folder(typed)], typed)))
-    config.planned = made["file"]
-    return config
-
-
-def keep_plan(config) -> None:
-    """Copy the plan that a run follows into its folder."""
-    from pathlib import Path
-    from shutil import copyfile
-
-    if config.get("planned") is not None and Path(config.planned).is_file():
-        copyfile(config.planned, Path(config.run) / "plan.yaml")
+    return score
 
 
 def beginning(run, config) -> str:
@@ -198,25 +112,17 @@ def beginning(run, config) -> str:
     from forewarp.runs.build import why_on_cpu
 
     scene, why = run.datamodule.scene, why_on_cpu(config)
-    views = f"{_images(scene.train, 'training')} and {_images(scene.test, 'test')}"
-    lines = [f"{scene.name}: {views}, on the {run.device.type.upper()}", *([] if why is None else [why])]
-    return "\n".join([*lines, f"run: {run.folder}"])
+    images = f"{images_of(scene.train, 'training')} and {images_of(scene.test, 'test')}"
+    lines = [f"{scene.name}: {images}, on the {run.device.type.upper()}", why, f"run: {run.folder}"]
+    return "\n".join(line for line in lines if line is not None)
 
 
-def _images(frames, kind: str) -> str:
+def images_of(frames, kind: str) -> str:
+    """Count images and say their sizes, the smallest and the largest."""
     sizes = sorted({(frame.camera.width, frame.camera.height) for frame in frames})
     ends = dict.fromkeys([*sizes[:1], *sizes[-1:]])
     size = " to ".join(f"{width} x {height}" for width, height in ends)
     return f"{len(frames)} {kind} images" + (f" ({size})" if size else "")
-
-
-def is_skipped(run, absent: str) -> bool:
-    """Skip this sweep job if its scene is missing; synthetic scenes are never skipped."""
-    if absent not in ("refuse", "skip"):
-        raise ValueError(f"absent: expected refuse or skip, but got {absent}")
-    if absent == "refuse" or hasattr(run.datamodule, "prepare"):
-        return False
-    return run.datamodule.place is not None and not run.datamodule.place.is_dir()
 
 
 def main() -> None:

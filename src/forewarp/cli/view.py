@@ -39,7 +39,7 @@ def require_viewer() -> None:
 
 def view(config) -> None:
     """Load one or two runs and serve their page until Ctrl-C."""
-    from forewarp.cli.checks import refuse_numbers
+    from forewarp.cli.prepare import refuse_numbers
     from forewarp.runs.config import saved_config
 
     require_viewer()

@@ -1,0 +1,255 @@
+"""Prepare a run: refuse a config that cannot work, and put together what is trained.
+
+What is wrong with a command by itself is refused before torch is loaded, so a mistake is answered at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from shutil import copyfile
+from typing import TYPE_CHECKING
+
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
+from omegaconf import DictConfig
+
+from forewarp.cli.mistakes import every_key
+from forewarp.cli.view import require_viewer
+from forewarp.data.files import MARKERS, scene_folder
+from forewarp.runs.config import check_planned, hashed, resumed, trust_of
+from forewarp.runs.overrides import key_of, refuse_renamed, typed_overrides
+
+if TYPE_CHECKING:  # loads torch
+    from forewarp.runs.fitted import Score
+    from forewarp.training.stages import Run
+
+# Data modules that are not listed, such as those that make their scene, check for themselves.
+READERS = {
+    "forewarp.data.module.DNeRFDataModule": "dnerf",
+    "forewarp.data.module.LegoCompleteDataModule": "lego_complete",
+    "forewarp.data.module.HyperNeRFDataModule": "hypernerf",
+    "forewarp.data.module.NHRDataModule": "nhr",
+    "forewarp.data.module.PosedVideoDataModule": "posed_video",
+}
+
+VOXELS, PARTICLES = "forewarp.methods.voxel.", "forewarp.methods.particles."
+
+CHOICES = {"effects": ("given", "auto"), "absent": ("refuse", "skip")}
+# The least whole number, whether null is one too, and the range of a number.
+LEAST = {"frames": 2, "view": 0, "points": 1, "size": 16, "views": 1, "sheets": 0, "reduce": 2}
+MAY_BE_NULL = ("size", "views", "reduce")
+RANGES = {"fps": (0.1, 1000), "time": (0, 1), "tail": (0.01, 1)}
+
+
+@dataclass
+class Prepared:
+    """A run that nothing is known to be wrong with, its scene read.
+
+    Attributes:
+        run: the run.
+        config: its config.
+        score: what the job returns.
+        measured: whether the run was finished and measured before.
+        viewer: ``host`` and ``port`` of a page that shows the run while it trains; None: no page.
+    """
+
+    run: Run
+    config: DictConfig
+    score: Score
+    measured: bool
+    viewer: dict | None
+
+    @contextmanager
+    def session(self) -> Iterator[None]:
+        """Hold the run's folder, with a copy of the plan that is followed; show a page, if one is asked for.
+
+        Raises:
+            ValueError, OSError: see ``forewarp.runs.session.session``.
+        """
+        from forewarp.runs.session import session
+
+        with ExitStack() as stack:
+            if self.viewer is not None and not self.measured:
+                from forewarp.viewer.live import live
+
+                stack.enter_context(live(self.run, **self.viewer))
+            stack.enter_context(session(self.run, self.config, finished=self.measured))
+            plan = self.config.get("planned")
+            if plan is not None and not self.measured and Path(plan).is_file():
+                copyfile(plan, Path(self.run.folder) / "plan.yaml")
+            yield
+
+
+def prepare(config: DictConfig) -> Prepared | None:
+    """Refuse a command that cannot work, else put its run together; None where a sweep skips the scene.
+
+    Args:
+        config: composed for ``forewarp-train``; with ``resume`` that run's stored config takes its place.
+
+    Raises:
+        ValueError, OSError, ImportError: naming what to change. No folder of a run has been made then.
+    """
+    refuse_all(config)
+    trust = trust_of(config.get("trust"))
+    if config.get("planned") is not None:
+        check_planned(config, trust)
+    viewer = viewer_of(config)  # as typed: a stored config has none
+    config = resumed(config)
+    refuse_missing_scene(config)
+    # What follows loads torch; mistakes in the command have been answered before.
+    from forewarp.runs.build import build_run
+    from forewarp.runs.fitted import Score, is_measured, named
+
+    named(config.get("score"))
+    run = build_run(hashed(config))
+    place = run.datamodule.place
+    synthetic = hasattr(run.datamodule, "prepare")  # it makes a scene that is not there
+    if config.get("absent") == "skip" and not synthetic and place is not None and not place.is_dir():
+        print(f"skipped: {place}: no such scene")
+        return None
+    if config.get("effects") == "auto" and config.get("resume") is None:
+        from forewarp.cli.plan import planned
+
+        config = hashed(planned())
+        run = build_run(config)
+    measured = bool(config.evaluate) and is_measured(run)
+    if not measured:
+        run.check_device()
+        run.datamodule.setup("fit")
+        if config.evaluate and config.get("reduce") is not None:
+            run.datamodule.targets("test").reduced(config.reduce)
+    return Prepared(run, config, Score(run, config), measured, viewer)
+
+
+def refuse_all(config: DictConfig) -> None:
+    """Refuse what is wrong with a config by itself, whatever the data."""
+    for key, choices in CHOICES.items():
+        if config.get(key, choices[0]) not in choices:
+            raise ValueError(f"{key}: expected {' or '.join(choices)}, but got {config[key]}")
+    refuse_renamed_keys(config)
+    refuse_seeds(config)
+    refuse_two_models(config)
+    refuse_other_methods(config)
+    refuse_numbers(config, "views", "sheets", "reduce")
+
+
+def refuse_renamed_keys(config: DictConfig) -> None:
+    """Refuse keys of earlier versions, such as those of a user's own files.
+
+    A method of another package may have keys of these names.
+    """
+    target = str(config.model.get("_target_"))
+    voxel = target.startswith(VOXELS)  # only these methods' options were renamed
+    if target.startswith("forewarp."):
+        refuse_renamed([key for key in every_key(config) if voxel or not key.startswith("model.")])
+
+
+def refuse_missing_scene(config: DictConfig) -> None:
+    """Refuse a scene whose folder is missing, unless ``absent`` says to skip it.
+
+    Raises:
+        SceneError: listing the scenes that are there.
+    """
+    reader = READERS.get(config.data.get("_target_"))
+    if reader is not None and config.get("absent", "refuse") == "refuse":
+        scene_folder(Path(config.data.root).expanduser(), str(config.data.scene), MARKERS[reader])
+
+
+def refuse_seeds(config: DictConfig) -> None:
+    """Refuse ``seeds=`` without ``--multirun``, which repeats the run, and in a search by a sweeper."""
+    swept = _is_swept()
+    if not swept and config.get("seeds", 1) != 1:
+        raise ValueError(f"seeds: expected --multirun beside seeds={config.seeds}; add it, or use seed=N")
+    if swept and "_optuna_" in str(HydraConfig.get().sweeper.get("_target_")):
+        seeds = str((HydraConfig.get().sweeper.get("params") or {}).get("seed", ""))
+        if config.get("seeds", 1) != 1:
+            raise ValueError(f"seeds: expected 1 in a search, but got {config.seeds}; use seed=N")
+        if seeds.startswith("range"):
+            raise ValueError(
+                "hydra.sweeper.params.seed: expected one seed, as this sweeper would search among several, "
+                f"but got {seeds}; add hydra.sweeper.params.seed=0"
+            )
+
+
+def refuse_two_models(config: DictConfig) -> None:
+    """Refuse an ablation of another method than ``model``."""
+    ablation = config.get("variant") or {}
+    if config.model.name not in ablation.get("of", [config.model.name]):
+        raise ValueError(
+            f"model: expected {' or '.join(ablation.of)}, which {ablation.name} is a change of, but got "
+            f"{config.model.name}; leave one of them out"
+        )
+
+
+def refuse_other_methods(config: DictConfig) -> None:
+    """Refuse options of another method: of voxels for particles, and the other way round.
+
+    Effects of voxels are classes, those of particles numbers and words; particles see no single rays.
+    """
+    target, choices = str(config.model.get("_target_")), {}
+    if HydraConfig.initialized():
+        choices = HydraConfig.get().runtime.choices
+    if not target.startswith((VOXELS, PARTICLES)):
+        return
+    voxels = target.startswith(VOXELS)
+    for group, option in choices.items():
+        own = group.startswith("model/") and "@" not in group  # else of a stage's own model
+        part = config.model._get_node(group[6:]) if own else None
+        if part is None or part._is_none() or isinstance(part, DictConfig) == voxels:
+            continue
+        raise ValueError(
+            _of_another(f"{group}={option}", config.model.name, "particles" if voxels else "forward")
+        )
+    stages = [stage for stage in config.get("stage", {}).values() if stage is not None]
+    if not voxels and HydraConfig.initialized() and not any("model" in stage for stage in stages):
+        for one in typed_overrides():
+            if key_of(one) in ("preset.rays", "data.rays") and not one.endswith("=null"):
+                raise ValueError(_of_another(one, config.model.name, "forward"))
+
+
+def _of_another(option: str, model: str, owner: str) -> str:
+    """Return the line for an option that the chosen method has not, but ``owner`` has."""
+    return (
+        f"{option}: expected an option of model={model}, but got one of model={owner}; add model={owner}, or "
+        "leave it out"
+    )
+
+
+def refuse_numbers(config: DictConfig, *keys: str) -> None:
+    """Refuse values that keys of ``LEAST`` and ``RANGES`` cannot have; a config may lack a key."""
+    for key in keys:
+        value = config.get(key)
+        if key not in config or (value is None and key in MAY_BE_NULL):
+            continue
+        if key in LEAST and (type(value) is not int or value < LEAST[key]):
+            raise ValueError(f"{key}: expected a whole number of at least {LEAST[key]}, but got {value}")
+        low, high = RANGES.get(key, (value, value))
+        if key in RANGES and (type(value) not in (int, float) or not low <= value <= high):
+            raise ValueError(f"{key}: expected a number in [{low}, {high}], but got {value}")
+
+
+def viewer_of(config: DictConfig) -> dict | None:
+    """Return where a page should listen, None if none is asked for; refuse one that cannot be made."""
+    from forewarp.viewer.address import check_address
+
+    viewer, port = config.get("viewer", False), config.get("port")
+    if type(viewer) is not bool:
+        raise ValueError(f"viewer: expected true or false, but got {viewer}")
+    if not viewer:
+        return None
+    require_viewer()
+    if _is_swept() and port != 0 and "BasicLauncher" not in str(HydraConfig.get().launcher.get("_target_")):
+        raise ValueError(
+            f"port: expected 0 where jobs may run at once, so that each takes one that is free, but got "
+            f"{port}; set port=0, or launcher=local"
+        )
+    check_address(config.host, port)
+    return {"host": config.host, "port": port}
+
+
+def _is_swept() -> bool:
+    """Tell whether this is a job of ``--multirun``."""
+    return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
