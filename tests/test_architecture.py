@@ -54,15 +54,10 @@ ONLY_IN = {
 }
 CONTRACT = {
     "method",
-    "abilities",
     "effect",
     "rows",
-    "dead_start",
-    "checks",
-    "departures",
     "rows_adam",
-    "sampled",
-    "marched",
+    "rays",
 }  # files of methods/ that packages above may import
 # Attributes of one method only.
 OWN_PARTS = {"radiance", "lattice", "lattices", "motion", "deformation", "inpainter"}
@@ -144,15 +139,15 @@ def of(part):
     ("check", "line", "allowed"),
     [
         (above, "from forewarp.methods.method import Method", True),
-        (above, "from forewarp.methods.voxel.terms import TERMS", False),
+        (above, "from forewarp.methods.voxel.losses import TERMS", False),
         (above, "from forewarp.methods import voxel", False),
-        (above, "def f():\n    import forewarp.methods.voxel.method", False),
+        (above, "def f():\n    import forewarp.methods.voxel.model", False),
         (above, "module.method.radiance.shape", False),
         (above, "module.method.size", True),
-        (within("voxel/start.py"), "from forewarp.methods.voxel.stage import VoxelStage", True),
-        (within("voxel/start.py"), "from forewarp.methods.method import Start", True),
-        (within("voxel/start.py"), "from forewarp.methods.particles.model import Particles", False),
-        (within("method.py"), "from forewarp.methods.voxel.method import VoxelMethod", False),
+        (within("voxel/forward.py"), "from forewarp.methods.voxel.structure import VoxelStage", True),
+        (within("voxel/forward.py"), "from forewarp.methods.method import Start", True),
+        (within("voxel/forward.py"), "from forewarp.methods.particles.model import Particles", False),
+        (within("method.py"), "from forewarp.methods.voxel.model import VoxelMethod", False),
         (of("ops"), "from forewarp.scene.box import Box", False),
         (of("training"), "from forewarp.data.module import SceneDataModule", False),
         (of("training"), "def f():\n    import hydra", False),

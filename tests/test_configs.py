@@ -13,12 +13,10 @@ from omegaconf import OmegaConf
 from forewarp.data import dnerf, hypernerf, nhr, posed_video
 from forewarp.data.module import SceneDataModule
 from forewarp.methods.particles.effects import Effects
-from forewarp.methods.voxel.effects.inpaint import UNet3d
-from forewarp.methods.voxel.effects.upsample import LearnedUpsampler
-from forewarp.methods.voxel.effects.view_dependence import SphericalHarmonics, ViewNetwork
+from forewarp.methods.voxel.effects import LearnedUpsampler, SphericalHarmonics, UNet3d, ViewNetwork
+from forewarp.methods.voxel.losses import TERMS
 from forewarp.methods.voxel.model import Ground
-from forewarp.methods.voxel.stage import EFFECTS, VoxelStage
-from forewarp.methods.voxel.terms import TERMS
+from forewarp.methods.voxel.structure import EFFECTS, VoxelStage
 from forewarp.renderer import Renderer
 from forewarp.runs.build import build_run
 from forewarp.scene.box import Box, Lattice

@@ -57,12 +57,12 @@ def test_nothing_is_written_twice():
     [
         (
             "softplus",
-            {"fields/radiance_grid.py", "fields/template.py", "methods/neural_volumes.py"},
+            {"fields/grids.py", "fields/networks.py", "methods/neural_volumes.py"},
         ),  # raw density: of voxels, of networks, of decoded volumes
         # Compositing is in log space, in ops/march.py; a splat may be opaque, which has no logarithm.
         ("cumprod", {"ops/gaussians.py"}),
         # Trilinear reads are ops/grid.py's; Neural Volumes reads volumes with gradients to places.
-        ("grid_sample", {"fields/volumes.py"}),
+        ("grid_sample", {"fields/networks.py"}),
         ("scatter_add_", set()),
     ],
 )
@@ -89,4 +89,4 @@ def test_effects_are_asked_for_in_the_methods_only():
 
     found = homes(questions)
     for effect in ("upsampler", "inpainter"):
-        assert found[effect] == {"methods/voxel/forward_warp.py", "methods/voxel/model.py"}
+        assert found[effect] == {"methods/voxel/forward.py"}

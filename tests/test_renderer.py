@@ -4,8 +4,8 @@ import math
 import pytest
 import torch
 
-from forewarp.fields.radiance_grid import Activation, RadianceGrid, shaded
-from forewarp.methods.voxel.effects.view_dependence import SphericalHarmonics
+from forewarp.fields.grids import Activation, RadianceGrid, shaded
+from forewarp.methods.voxel.effects import SphericalHarmonics
 from forewarp.ops import backend
 from forewarp.ops.grid import index_of
 from forewarp.ops.march import trace

@@ -9,7 +9,7 @@ from itertools import accumulate as accumulated
 import torch
 from torch import Tensor
 
-from forewarp.fields.radiance_grid import EMPTY, FieldAtTime, RadianceGrid, Shade
+from forewarp.fields.grids import EMPTY, FieldAtTime, RadianceGrid, Shade
 from forewarp.ops.backend import use_numba
 from forewarp.ops.march import accumulate, march, render_weights, trace
 from forewarp.scene.camera import Rays

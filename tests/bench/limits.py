@@ -16,7 +16,7 @@ from tabulate import tabulate
 from torch import Tensor
 
 from forewarp.evaluation.evaluate import Shown, draw
-from forewarp.methods.abilities import HasMatter
+from forewarp.methods.method import HasMatter
 from forewarp.metrics.image import low_passed, psnr
 from forewarp.ops.grid import dilate
 from forewarp.runs.build import build_run

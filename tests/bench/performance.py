@@ -14,7 +14,7 @@ from pathlib import Path
 import torch
 
 from forewarp.cli.entry import quiet
-from forewarp.methods.voxel.terms import TERMS
+from forewarp.methods.voxel.losses import TERMS
 from forewarp.ops.march import warm_up
 from forewarp.ops.splat import average_splat
 from forewarp.runs.config_files import project_root

@@ -12,16 +12,18 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from forewarp.fields.radiance import DirectRadiance
-from forewarp.fields.trajectory import TrajectoryField
-from forewarp.methods.voxel.effects.background import StaticBackground
-from forewarp.methods.voxel.effects.inpaint import UNet3d
-from forewarp.methods.voxel.effects.motion import Motion
-from forewarp.methods.voxel.effects.upsample import LearnedUpsampler
-from forewarp.methods.voxel.effects.view_dependence import SphericalHarmonics
-from forewarp.methods.voxel.forward_warp import ForwardWarp
-from forewarp.methods.voxel.model import ForwardModel, Ground
-from forewarp.methods.voxel.stage import VoxelStage
+from forewarp.fields.curves import TrajectoryField
+from forewarp.fields.grids import DirectRadiance
+from forewarp.methods.voxel.effects import (
+    LearnedUpsampler,
+    Motion,
+    SphericalHarmonics,
+    StaticBackground,
+    UNet3d,
+)
+from forewarp.methods.voxel.forward import ForwardModel, ForwardWarp
+from forewarp.methods.voxel.model import Ground
+from forewarp.methods.voxel.structure import VoxelStage
 from forewarp.ops.splat import average_splat
 from forewarp.renderer import Renderer
 from forewarp.scene.view import Moment, View

@@ -9,18 +9,13 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from forewarp.fields.radiance import FeatureRadiance
-from forewarp.fields.radiance_grid import EMPTY
-from forewarp.fields.trajectory import TrajectoryField
+from forewarp.fields.curves import TrajectoryField
+from forewarp.fields.grids import EMPTY, FeatureRadiance
 from forewarp.methods.method import Start
-from forewarp.methods.voxel.effects.inpaint import UNet3d
-from forewarp.methods.voxel.effects.motion import Motion
-from forewarp.methods.voxel.effects.upsample import LearnedUpsampler
-from forewarp.methods.voxel.effects.view_dependence import ViewNetwork
-from forewarp.methods.voxel.forward_warp import ForwardWarp
-from forewarp.methods.voxel.method import VoxelMethod
-from forewarp.methods.voxel.model import ForwardModel, Ground
-from forewarp.methods.voxel.stage import VoxelStage
+from forewarp.methods.voxel.effects import LearnedUpsampler, Motion, UNet3d, ViewNetwork
+from forewarp.methods.voxel.forward import ForwardModel, ForwardWarp
+from forewarp.methods.voxel.model import Ground, VoxelMethod
+from forewarp.methods.voxel.structure import VoxelStage
 from forewarp.renderer import Renderer
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.camera import Camera, Rays, look_at

@@ -82,7 +82,7 @@ KINDS = ("size in", "asks for", "loss terms", "effects", "abilities", "loss fall
 
 def kinds_of(method, entry, losses):
     """Return what a method says of itself, as cells of the table."""
-    from forewarp.methods.abilities import HasBounds, HasMatter, HasTrajectories
+    from forewarp.methods.method import HasBounds, HasMatter, HasTrajectories
 
     can = {"trajectories": HasTrajectories, "bounds": HasBounds, "matter": HasMatter}
     asks = method.asks

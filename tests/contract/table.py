@@ -4,11 +4,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 
-from forewarp.fields.radiance import DirectRadiance
-from forewarp.fields.trajectory import TrajectoryField
+from forewarp.fields.curves import TrajectoryField
+from forewarp.fields.grids import DirectRadiance
 from forewarp.methods.dnerf import DNeRF
 from forewarp.methods.hypernerf import HyperNeRF
-from forewarp.methods.marched import Marching
 from forewarp.methods.method import Method, Start
 from forewarp.methods.ndvg import NDVG
 from forewarp.methods.nerf import NeRF
@@ -16,16 +15,21 @@ from forewarp.methods.nerfies import Nerfies
 from forewarp.methods.neural_volumes import NeuralVolumes
 from forewarp.methods.particles.model import Particles
 from forewarp.methods.particles.nodes import Nodes
-from forewarp.methods.sampled import Sampling
+from forewarp.methods.rays import Marching, Sampling
 from forewarp.methods.tineuvox import TiNeuVox
 from forewarp.methods.tnerf import TNeRF
-from forewarp.methods.voxel.backward_warp import Deformation
-from forewarp.methods.voxel.effects.background import StaticBackground, Together
-from forewarp.methods.voxel.effects.inpaint import UNet3d
-from forewarp.methods.voxel.effects.motion import Motion
-from forewarp.methods.voxel.effects.upsample import LearnedUpsampler, TrilinearUpsampler
-from forewarp.methods.voxel.effects.view_dependence import SphericalHarmonics, ViewNetwork
-from forewarp.methods.voxel.model import BackwardModel, ForwardModel
+from forewarp.methods.voxel.backward import BackwardModel, Deformation
+from forewarp.methods.voxel.effects import (
+    LearnedUpsampler,
+    Motion,
+    SphericalHarmonics,
+    StaticBackground,
+    Together,
+    TrilinearUpsampler,
+    UNet3d,
+    ViewNetwork,
+)
+from forewarp.methods.voxel.forward import ForwardModel
 
 
 @dataclass(frozen=True)

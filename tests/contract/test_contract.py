@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from forewarp.methods.abilities import HasBounds, HasMatter, HasTrajectories
+from forewarp.methods.method import HasBounds, HasMatter, HasTrajectories
 from forewarp.scene.view import Moment, View
 from forewarp.training.checkpoints import load_weights
 from forewarp.training.handover import load_handover

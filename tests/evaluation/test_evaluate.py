@@ -7,7 +7,7 @@ import torch
 
 from forewarp.data.batches import Targets
 from forewarp.evaluation.evaluate import draw, evaluate, flow_error
-from forewarp.methods.voxel.snapshot import VoxelSnapshot
+from forewarp.methods.voxel.model import VoxelSnapshot
 from forewarp.metrics.suite import ImageSuite
 from forewarp.scene.frame import Truth
 from tests.support.tiny_scene import ball_data, make_run, stage

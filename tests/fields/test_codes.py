@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from forewarp.fields.codes import CameraCodes, TimeCodes
+from forewarp.fields.networks import CameraCodes, TimeCodes
 
 
 @pytest.mark.parametrize(

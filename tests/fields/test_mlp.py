@@ -1,6 +1,6 @@
 import torch
 
-from forewarp.fields.mlp import mlp
+from forewarp.fields.networks import mlp
 
 
 def test_zero_last_starts_from_zero_and_learns():

@@ -1,8 +1,7 @@
 import pytest
 import torch
 
-from forewarp.fields.radiance import DirectRadiance, FeatureRadiance
-from forewarp.fields.radiance_grid import EMPTY
+from forewarp.fields.grids import EMPTY, DirectRadiance, FeatureRadiance
 from forewarp.scene.box import Box, Lattice
 
 LATTICE = Lattice(Box((0, 0, 0), (2, 3, 4)), (3, 4, 5))

@@ -3,8 +3,7 @@ import math
 import pytest
 import torch
 
-from forewarp.fields.radiance import density_shift
-from forewarp.fields.radiance_grid import EMPTY, Activation, RadianceGrid
+from forewarp.fields.grids import EMPTY, Activation, RadianceGrid, density_shift
 from forewarp.ops.grid import occupied_cells
 from forewarp.scene.box import Box, Lattice
 from tests.support.hard_cases import index_with

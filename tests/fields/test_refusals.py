@@ -4,10 +4,9 @@ from functools import partial
 
 import pytest
 
-from forewarp.fields.mlp import mlp
-from forewarp.fields.radiance import density_shift
-from forewarp.fields.template import Template, Trunk, density_of
-from forewarp.fields.trajectory import TrajectoryField
+from forewarp.fields.curves import TrajectoryField
+from forewarp.fields.grids import density_shift
+from forewarp.fields.networks import Template, Trunk, density_of, mlp
 from forewarp.scene.box import Box
 
 CODES, LAYERS = (

@@ -3,8 +3,7 @@
 import pytest
 import torch
 
-from forewarp.fields.strided import read_strided
-from forewarp.fields.voxel_grid import VoxelGrid
+from forewarp.fields.grids import VoxelGrid, read_strided
 from forewarp.ops.grid import trilinear_reference
 from forewarp.scene.box import Box, Lattice
 

@@ -1,7 +1,7 @@
 import torch
 from torch.autograd import gradcheck
 
-from forewarp.fields.template import Template, Trunk
+from forewarp.fields.networks import Template, Trunk
 
 
 def small(**changes):

@@ -1,8 +1,8 @@
 import pytest
 import torch
 
-from forewarp.fields.trajectory import TrajectoryField
-from forewarp.fields.voxel_grid import VoxelGrid
+from forewarp.fields.curves import TrajectoryField
+from forewarp.fields.grids import VoxelGrid
 from forewarp.scene.box import Box, Lattice
 
 BOX = Box((-1, -1.5, -2), (1, 1.5, 2))

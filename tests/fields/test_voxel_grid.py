@@ -1,6 +1,6 @@
 import torch
 
-from forewarp.fields.voxel_grid import VoxelGrid
+from forewarp.fields.grids import VoxelGrid
 from forewarp.scene.box import Box, Lattice
 
 SHAPE = (3, 4, 5)

@@ -13,9 +13,8 @@ import torch
 from torch.autograd import gradcheck
 from torch.testing import assert_close
 
-from forewarp.fields.codes import TimeCodes
-from forewarp.fields.screws import ScrewWarp
-from forewarp.methods.sampled import Sampling
+from forewarp.fields.networks import ScrewWarp, TimeCodes
+from forewarp.methods.rays import Sampling
 from forewarp.ops.encode import positional_encoding
 from forewarp.ops.nodes import geman_mcclure
 from forewarp.scene.camera import Camera, look_at

@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from forewarp.data.module import SceneDataModule
-from forewarp.fields.radiance_grid import RadianceGrid
-from forewarp.methods.marched import Marching
+from forewarp.fields.grids import RadianceGrid
 from forewarp.methods.method import Start, parameter_count
 from forewarp.methods.ndvg import NDVG
+from forewarp.methods.rays import Marching
 from forewarp.methods.tineuvox import TiNeuVox
 from forewarp.renderer import Renderer
 from forewarp.scene.cloud import Handover

@@ -8,7 +8,7 @@ import torch
 from torch.autograd import gradcheck
 
 from forewarp.data.module import SceneDataModule
-from forewarp.fields.volumes import AffineMixture, PictureEncoder, VolumeDecoder, read
+from forewarp.fields.networks import AffineMixture, PictureEncoder, VolumeDecoder, read
 from forewarp.methods.method import Start, parameter_count
 from forewarp.methods.neural_volumes import (
     NeuralVolumes,

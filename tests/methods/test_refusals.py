@@ -6,12 +6,11 @@ import pytest
 
 from forewarp.methods.dnerf import DNeRF
 from forewarp.methods.hypernerf import HyperNeRF
-from forewarp.methods.marched import Marching
 from forewarp.methods.method import Start
 from forewarp.methods.ndvg import NDVG
 from forewarp.methods.nerf import NeRF
 from forewarp.methods.nerfies import Nerfies
-from forewarp.methods.sampled import Sampling
+from forewarp.methods.rays import Marching, Sampling
 from forewarp.methods.tineuvox import TiNeuVox
 from forewarp.methods.tnerf import TNeRF
 from tests.support.sliding_square import moving_scene

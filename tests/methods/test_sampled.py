@@ -6,13 +6,12 @@ from functools import partial
 import pytest
 import torch
 
-from forewarp.methods.departures import NO_JUMP
 from forewarp.methods.dnerf import DNeRF
 from forewarp.methods.hypernerf import HyperNeRF
 from forewarp.methods.method import parameter_count
 from forewarp.methods.nerf import NeRF
 from forewarp.methods.nerfies import Nerfies
-from forewarp.methods.sampled import OF_JAX, OF_PYTORCH, Sampling
+from forewarp.methods.rays import NO_JUMP, OF_JAX, OF_PYTORCH, Sampling
 from forewarp.methods.tnerf import TNeRF
 from forewarp.ops.encode import positional_encoding
 from forewarp.scene.view import Batch, Moment, Observation, View

@@ -8,7 +8,7 @@ from forewarp.data.module import SceneDataModule
 from forewarp.methods.dnerf import DNeRF
 from forewarp.methods.hypernerf import HyperNeRF
 from forewarp.methods.nerfies import Nerfies
-from forewarp.methods.sampled import Sampling
+from forewarp.methods.rays import Sampling
 from forewarp.methods.tnerf import TNeRF
 from forewarp.training.objective import Objective
 from forewarp.training.schedule import StageSettings

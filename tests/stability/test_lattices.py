@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from forewarp.losses import tv_density, tv_flow
-from forewarp.methods.voxel.effects.inpaint import UNet3d
-from forewarp.methods.voxel.effects.upsample import LearnedUpsampler, TrilinearUpsampler
+from forewarp.methods.voxel.effects import LearnedUpsampler, TrilinearUpsampler, UNet3d
 from forewarp.ops.grid import neighbour_pairs, trilinear
 from forewarp.scene.box import Box, Lattice
 from tests.support.hard_cases import LATTICE, check_finite, grid, index_with

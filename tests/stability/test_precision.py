@@ -5,8 +5,8 @@ from functools import partial
 import pytest
 import torch
 
-from forewarp.fields.mlp import mlp
-from forewarp.methods.voxel.backward_warp import Deformation
+from forewarp.fields.networks import mlp
+from forewarp.methods.voxel.backward import Deformation
 from forewarp.renderer import Renderer
 from forewarp.scene.box import Lattice
 from forewarp.scene.view import Moment

@@ -4,8 +4,8 @@ import pytest
 import torch
 from hypothesis import HealthCheck, given, settings, strategies
 
-from forewarp.fields.radiance_grid import Activation, RadianceGrid
-from forewarp.methods.voxel.effects.dense import Crop, densify
+from forewarp.fields.grids import Activation, RadianceGrid
+from forewarp.methods.voxel.effects import Crop, densify
 from forewarp.ops.march import accumulate, render_weights
 from forewarp.ops.splat import average_splat
 from forewarp.renderer import Renderer

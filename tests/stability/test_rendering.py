@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from forewarp import losses
-from forewarp.fields.radiance_grid import Activation
+from forewarp.fields.grids import Activation
 from forewarp.ops.march import render_weights
 from forewarp.renderer import Renderer
 from forewarp.scene.box import Box, Lattice

@@ -5,9 +5,9 @@ import math
 import pytest
 import torch
 
-from forewarp.fields.radiance_grid import EMPTY
-from forewarp.fields.trajectory import TrajectoryField
-from forewarp.methods.voxel.effects.motion import Motion
+from forewarp.fields.curves import TrajectoryField
+from forewarp.fields.grids import EMPTY
+from forewarp.methods.voxel.effects import Motion
 from forewarp.ops.splat import average_splat
 from tests.support.hard_cases import LATTICE, SHAPE, check_finite, grid, voxels
 

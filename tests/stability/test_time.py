@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from forewarp.fields.trajectory import TrajectoryField
-from forewarp.fields.voxel_grid import VoxelGrid
-from forewarp.methods.voxel.backward_warp import Deformation
+from forewarp.fields.curves import TrajectoryField
+from forewarp.fields.grids import VoxelGrid
+from forewarp.methods.voxel.backward import Deformation
 from forewarp.training.schedule import Curriculum
 from tests.support.hard_cases import LATTICE, check_finite, voxels
 

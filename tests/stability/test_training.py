@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from forewarp.data.module import SceneDataModule
-from forewarp.fields.trajectory import TrajectoryField
-from forewarp.methods.voxel.method import VoxelMethod
+from forewarp.fields.curves import TrajectoryField
+from forewarp.methods.voxel.model import VoxelMethod
 from forewarp.scene.box import Box
 from tests.support.hard_cases import check_finite
 from tests.support.tiny_scene import EVERYTHING, RATES, ball_scene, forward_model, make_run, stage

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 import torch
 from torch import Tensor
 
-from forewarp.fields.radiance_grid import Activation
+from forewarp.fields.grids import Activation
 from forewarp.ops.backend import numba_installed
 from forewarp.ops.curves import dct_basis
 from forewarp.ops.encode import positional_encoding

@@ -4,7 +4,7 @@ import math
 
 import torch
 
-from forewarp.fields.radiance_grid import Activation, RadianceGrid
+from forewarp.fields.grids import Activation, RadianceGrid
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.camera import Rays
 

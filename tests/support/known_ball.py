@@ -2,9 +2,8 @@
 
 import torch
 
-from forewarp.fields.radiance import DirectRadiance
-from forewarp.methods.voxel.method import VoxelMethod
-from forewarp.methods.voxel.snapshot import VoxelSnapshot
+from forewarp.fields.grids import DirectRadiance
+from forewarp.methods.voxel.model import VoxelMethod, VoxelSnapshot
 from forewarp.scene.box import Lattice
 from forewarp.training.module import DynamicSceneModule
 from forewarp.training.objective import Objective

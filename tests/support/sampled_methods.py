@@ -10,7 +10,7 @@ from forewarp.methods.hypernerf import HyperNeRF
 from forewarp.methods.method import Start
 from forewarp.methods.nerf import NeRF
 from forewarp.methods.nerfies import Nerfies
-from forewarp.methods.sampled import Sampling
+from forewarp.methods.rays import Sampling
 from forewarp.methods.tnerf import TNeRF
 from forewarp.scene.view import Batch, Moment, Observation, View
 from forewarp.training.objective import Objective

@@ -8,16 +8,21 @@ import lightning
 import torch
 
 from forewarp.data.module import SceneDataModule
-from forewarp.fields.radiance import DirectRadiance, FeatureRadiance
-from forewarp.fields.trajectory import TrajectoryField
+from forewarp.fields.curves import TrajectoryField
+from forewarp.fields.grids import DirectRadiance, FeatureRadiance
 from forewarp.methods.method import Start
-from forewarp.methods.voxel.effects.background import StaticBackground
-from forewarp.methods.voxel.effects.inpaint import UNet3d
-from forewarp.methods.voxel.effects.motion import Motion
-from forewarp.methods.voxel.effects.upsample import LearnedUpsampler
-from forewarp.methods.voxel.effects.view_dependence import SphericalHarmonics, ViewNetwork
-from forewarp.methods.voxel.model import BackwardModel, ForwardModel, Ground
-from forewarp.methods.voxel.stage import VoxelStage
+from forewarp.methods.voxel.backward import BackwardModel
+from forewarp.methods.voxel.effects import (
+    LearnedUpsampler,
+    Motion,
+    SphericalHarmonics,
+    StaticBackground,
+    UNet3d,
+    ViewNetwork,
+)
+from forewarp.methods.voxel.forward import ForwardModel
+from forewarp.methods.voxel.model import Ground
+from forewarp.methods.voxel.structure import VoxelStage
 from forewarp.scene.box import Box
 from forewarp.scene.camera import Camera, look_at
 from forewarp.scene.frame import Frame, Scene

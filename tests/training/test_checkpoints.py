@@ -7,7 +7,7 @@ from functools import partial
 import pytest
 import torch
 
-from forewarp.fields.trajectory import TrajectoryField
+from forewarp.fields.curves import TrajectoryField
 from forewarp.training.checkpoints import (
     KeepCheckpoint,
     check_checkpoint,

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from forewarp.methods.method import Step
-from forewarp.methods.voxel.backward_warp import Deformation
+from forewarp.methods.voxel.backward import Deformation
 from forewarp.methods.voxel.structure import resample
 from forewarp.ops.backend import numba_installed
 from forewarp.ops.march import warm_up
@@ -81,7 +81,7 @@ def test_only_what_a_term_looks_at_is_rendered(inpainter, photo_on, calls):
 def test_the_clock_starts_when_the_kernels_are_warm(monkeypatch):
     made, seen = module(), []
     monkeypatch.setattr(
-        "forewarp.methods.voxel.method.warm_up", lambda device: seen.append((device, made.clock.seconds))
+        "forewarp.methods.voxel.model.warm_up", lambda device: seen.append((device, made.clock.seconds))
     )
     made.on_train_start()
     assert seen == [(made.device, 0)]
@@ -102,7 +102,7 @@ def test_the_name_of_a_hook_is_noted_at_once(monkeypatch):
 )
 def test_kernels_that_take_long_to_compile_are_told(monkeypatch, capsys, seconds, said):
     monkeypatch.setattr("forewarp.training.module.told_if_slow", partial(told_if_slow, after=0.2))
-    monkeypatch.setattr("forewarp.methods.voxel.method.warm_up", lambda device: time.sleep(seconds))
+    monkeypatch.setattr("forewarp.methods.voxel.model.warm_up", lambda device: time.sleep(seconds))
     module().on_train_start()
     assert capsys.readouterr().err == said
 

@@ -19,9 +19,8 @@ from forewarp.clock import now
 from forewarp.drawing.files import write_png
 from forewarp.drawing.images import at_least, error_colors, in_a_row
 from forewarp.files import write_json
-from forewarp.methods.abilities import HasTrajectories
 from forewarp.methods.effect import switched
-from forewarp.methods.method import parameter_count
+from forewarp.methods.method import HasTrajectories, parameter_count
 from forewarp.metrics.flow import end_point_error
 from forewarp.metrics.lpips import find_lpips
 from forewarp.metrics.registry import METRICS

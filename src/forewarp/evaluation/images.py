@@ -12,8 +12,7 @@ from torch import Tensor
 
 from forewarp.drawing.files import write_png
 from forewarp.drawing.images import depth_colors, error_colors, flow_colors, in_a_row, with_wheel
-from forewarp.methods.abilities import HasTrajectories
-from forewarp.methods.method import Snapshot
+from forewarp.methods.method import HasTrajectories, Snapshot
 from forewarp.scene.camera import Camera
 from forewarp.scene.view import Moment, Rendering, Target, View
 from forewarp.training.module import DynamicSceneModule

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from forewarp.drawing.images import draw_discs, hidden, hues, sample_lines
 from forewarp.evaluation.images import within
-from forewarp.methods.abilities import HasMatter, HasTrajectories
+from forewarp.methods.method import HasMatter, HasTrajectories
 from forewarp.scene.camera import Camera
 from forewarp.scene.cloud import Cloud, far_apart
 from forewarp.scene.view import Moment, Rendering, View

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from forewarp.export.ply import point_columns, write_ply
 from forewarp.export.source import Progress, Source
-from forewarp.methods.abilities import HasBounds, HasSolid
+from forewarp.methods.method import HasBounds, HasSolid
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.cloud import Ellipsoids
 from forewarp.scene.view import Moment

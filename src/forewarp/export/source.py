@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from forewarp.evaluation.trajectories import seen_by, surface
-from forewarp.methods.abilities import HasEllipsoids, HasMatter, HasTrajectories
-from forewarp.methods.method import Method
+from forewarp.methods.method import HasEllipsoids, HasMatter, HasTrajectories, Method
 from forewarp.scene.camera import Camera
 from forewarp.scene.cloud import far_apart
 from forewarp.scene.paths import mean_up

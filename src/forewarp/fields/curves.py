@@ -1,4 +1,4 @@
-"""Smooth curves over time by a few coefficients: which basis, and how many."""
+"""Smooth curves over time, by a few coefficients of a basis; the field of every voxel's curve."""
 
 from __future__ import annotations
 
@@ -6,9 +6,14 @@ from collections.abc import Sequence
 from operator import mul
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
+from forewarp.fields.grids import VoxelGrid
+from forewarp.fields.networks import mlp
 from forewarp.ops.curves import dct_basis, spline_basis, spline_shares
+from forewarp.ops.encode import positional_encoding
+from forewarp.ops.grid import corner_weights, index_of, trilinear
+from forewarp.scene.box import Box, Lattice
 
 KINDS = ("spline", "cosines")
 _PADDING = 0.2  # of the sequence, imagined before and after it: a cosine stands still at both ends
@@ -70,3 +75,125 @@ class Curve:
             return None
         knots = torch.arange(self.count, dtype=torch.float32) + self.straight
         return torch.stack([knots - 3, knots + 1], -1) / self.pieces
+
+
+class TrajectoryField(nn.Module):
+    """The paper's F2: encoded position (and grid features) -> DCT coefficients (N, 3, K) of the flow.
+
+    Coefficients are evaluated at the nodes of a coarse lattice and interpolated to the voxels, which also
+    smooths the motion. With ``nodes=0`` they are evaluated at every voxel, as in the paper. Bases beyond
+    ``bases_in_play`` are 0.
+
+    Args:
+        box: normalises positions to [-1, 1]; the same in all stages, so that the network carries over.
+        bases: K, reduced to ``frames - 1`` if larger.
+        frames: T, the number of distinct training times.
+        canonical_time: time at which flow is exactly 0.
+        nodes: number of nodes along the box's mean side, at least 8; 0: no nodes.
+        features: channels of the deformation feature grid; 0: none.
+        width, layers, frequencies: size of F2, octaves of the positional encoding.
+        padding: lets objects move at the first and last frame (see ``dct_basis``).
+
+    Raises:
+        ValueError: with a single training time.
+    """
+
+    def __init__(
+        self,
+        box: Box,
+        *,
+        bases: int,
+        frames: int,
+        canonical_time: float,
+        nodes: int = 25,
+        features: int = 0,
+        width: int = 64,
+        layers: int = 4,
+        frequencies: int = 5,
+        padding: float = 0.0,
+    ) -> None:
+        super().__init__()
+        if frames < 2:
+            raise ValueError(
+                f"model.motion: expected at least 2 distinct training times, but got {frames}; "
+                "use model/motion=none"
+            )
+        self.box, self.frames, self.canonical_time = box, frames, canonical_time
+        self.bases = min(bases, frames - 1)
+        self.scale = 0.5 * max(box.size)
+        self.lattice = Lattice.of_count(box, max(nodes, 8) ** 3)
+        self.at_nodes = nodes > 0
+        self.features = None
+        if features:
+            self.features = VoxelGrid(
+                self.lattice, torch.ones(self.lattice.shape, dtype=torch.bool), {"grid": features}
+            )
+        self.frequencies, self.padding = frequencies, padding
+        inputs = 3 * (1 + 2 * frequencies) + features
+        self.network = mlp(inputs, 3 * self.bases, width=width, layers=layers, zero_last=True, leaky=True)
+        self.register_buffer("bases_in_play", torch.tensor(self.bases))
+        self._nodes: tuple[Tensor, tuple[Tensor, Tensor, Tensor]] | None = None
+
+    def play(self, bases: float | None) -> int:
+        """Use the first ``bases`` bases, all for None; return their number."""
+        playing = self.bases if bases is None else min(int(bases), self.bases)
+        self.bases_in_play.fill_(playing)
+        return playing
+
+    def coefficients(self, points: Tensor) -> Tensor:
+        """Return the DCT coefficients (N, 3, K) at points (N, 3), in world units."""
+        coordinates = self.lattice.to_lattice(points)
+        inputs = positional_encoding(self.lattice.normalised(coordinates), self.frequencies)
+        if self.features is not None:
+            grid = self.features.parameter("grid")
+            read = trilinear(grid, self.features.index, coordinates, grid.new_zeros(grid.shape[1]))
+            inputs = torch.cat([inputs, read], -1)
+        return self.scale * self.network(inputs).reshape(-1, 3, self.bases)
+
+    def basis(self, time: float | Tensor) -> Tensor:
+        """Return ``dct_basis`` at ``time`` (...,) as (..., K), 0 for bases not in play."""
+        basis = dct_basis(time, self.bases, self.frames, self.canonical_time, self.padding)
+        basis = basis.to(self.bases_in_play.device)
+        return basis * (torch.arange(self.bases, device=basis.device) < self.bases_in_play)
+
+    def flow(self, grid: VoxelGrid, time: float) -> Tensor:
+        """Return the flow (N, 3) of a grid's active voxels from the canonical time, in world units.
+
+        Cost: F2 on the nodes around the active voxels, then one trilinear read per voxel.
+        """
+        points, (nodes, index, coordinates) = self._around(grid)
+        at_nodes = _matmul(self.coefficients(nodes if self.at_nodes else points), self.basis(time))
+        if not self.at_nodes:
+            return at_nodes
+        return trilinear(at_nodes, index, coordinates, at_nodes.new_zeros(3))
+
+    def _around(self, grid: VoxelGrid):
+        if self._nodes is None or self._nodes[0] is not grid.voxels:
+            points = grid.lattice.to_world(grid.voxels)
+            self._nodes = (grid.voxels, (points, self._nodes_around(points)))
+        return self._nodes[1]
+
+    def _nodes_around(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        coordinates = self.lattice.to_lattice(points)
+        corners = corner_weights(coordinates, self.lattice.shape)[0].reshape(-1, 3)
+        mask = torch.zeros(self.lattice.shape, dtype=torch.bool, device=points.device)
+        mask[corners[:, 0], corners[:, 1], corners[:, 2]] = True
+        nodes = mask.nonzero()
+        return self.lattice.to_world(nodes), index_of(nodes, self.lattice.shape), coordinates
+
+    def trajectories(self, points: Tensor, times: Tensor) -> Tensor:
+        """Return the paths (N, T, 3) of canonical points (N, 3) at ``times`` (T,), in world units."""
+        if not self.at_nodes:
+            flow = _matmul(self.coefficients(points), self.basis(times).T)  # (N, 3, T)
+            return points[:, None] + flow.transpose(1, 2)
+        nodes, index, coordinates = self._nodes_around(points)
+        at_nodes = self.coefficients(nodes).flatten(1)
+        read = trilinear(at_nodes, index, coordinates, at_nodes.new_zeros(at_nodes.shape[1]))
+        flow = _matmul(read.reshape(-1, 3, self.bases), self.basis(times).T)
+        return points[:, None] + flow.transpose(1, 2)
+
+
+def _matmul(coefficients: Tensor, basis: Tensor) -> Tensor:
+    """Return ``coefficients @ basis``, in full precision under autocast as in ``Network``."""
+    with torch.autocast(coefficients.device.type, enabled=False):
+        return coefficients @ basis

@@ -7,10 +7,9 @@ from collections.abc import Callable, Mapping
 import torch
 from torch import Tensor, nn
 
-from forewarp.fields.template import Template, Trunk
-from forewarp.methods.departures import JUMP, NO_JUMP
+from forewarp.fields.networks import Template, Trunk
 from forewarp.methods.method import Start
-from forewarp.methods.sampled import Field, SampledMethod, Sampling, encoder
+from forewarp.methods.rays import JUMP, NO_JUMP, Field, SampledMethod, Sampling, encoder
 from forewarp.ops.encode import encoded_size
 from forewarp.quadrature import Sampled
 from forewarp.scene.view import Batch, Moment
@@ -25,7 +24,7 @@ class DNeRF(SampledMethod):
     Args:
         start: scene, stage and numbers.
         sampling: see ``Sampling``.
-        width, layers, skip: see ``fields.template.Trunk``; of the offsets' network and of the field's.
+        width, layers, skip: see ``fields.networks.Trunk``; of the offsets' network and of the field's.
         position_frequencies, time_frequencies, direction_frequencies: octaves of the encodings.
         continuous: ``F(x, t) - F(x, canonical)`` in place of a jump to 0 at the canonical time.
     """

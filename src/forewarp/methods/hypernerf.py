@@ -7,12 +7,9 @@ from collections.abc import Callable, Mapping
 import torch
 from torch import Tensor, nn
 
-from forewarp.fields.codes import TimeCodes
-from forewarp.fields.screws import ScrewWarp
-from forewarp.fields.template import Template, Trunk
-from forewarp.methods.checks import FRACTION, check_least, check_number
-from forewarp.methods.method import Start
-from forewarp.methods.sampled import OF_JAX, Field, SampledMethod, Sampling, encoder
+from forewarp.fields.networks import ScrewWarp, Template, TimeCodes, Trunk
+from forewarp.methods.method import FRACTION, Start, check_least, check_number
+from forewarp.methods.rays import OF_JAX, Field, SampledMethod, Sampling, encoder
 from forewarp.ops.encode import encoded_size, positional_encoding
 from forewarp.quadrature import Sampled
 from forewarp.scene.view import Batch, Moment
@@ -59,7 +56,7 @@ class HyperNeRF(SampledMethod):
     Args:
         start: scene, stage and numbers.
         sampling: see ``Sampling``.
-        width, layers, skip: of the templates, see ``fields.template.Trunk``.
+        width, layers, skip: of the templates, see ``fields.networks.Trunk``.
         warp_width, warp_layers, warp_skip, slice_width: of the warp, and of the slice, as deep.
         position_frequencies, warp_frequencies, ambient_frequencies, direction_frequencies: octaves.
         code_size: channels of an instant's code.

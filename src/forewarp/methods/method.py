@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from itertools import pairwise
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor, nn
 
-from forewarp.scene.cloud import Handover
+from forewarp.scene.box import Box, Lattice
+from forewarp.scene.cloud import Cloud, Ellipsoids, Handover
 from forewarp.scene.frame import Scene
 from forewarp.scene.view import Asks, Batch, Moment, Rendering, View
 
@@ -85,7 +87,7 @@ class Snapshot:
 class Method(nn.Module):
     """A scene that can be learned: implement ``at`` and ``look``, everything else has a default.
 
-    Optional abilities (trajectories, bounds, rest, points) are protocols in ``methods.abilities``.
+    Optional abilities (trajectories, bounds, rest, points) are the protocols below.
 
     Attributes:
         terms: names of its loss terms.
@@ -242,3 +244,124 @@ def parameter_count(method: nn.Module) -> int:
 
 
 Model = Callable[[Start], Method]  # makes the method of a stage
+
+
+@runtime_checkable
+class HasTrajectories(Protocol):
+    """Follow points through time."""
+
+    moves: bool  # False if the scene is static
+
+    def trajectories(self, points: Tensor, times: Tensor) -> Tensor:
+        """Return the paths (N, T, 3) of canonical points (N, 3) at ``times`` (T,), in world units."""
+
+
+@runtime_checkable
+class HasBounds(Protocol):
+    """Bound all matter."""
+
+    def bounds(self, times: list[float]) -> Box | None:
+        """Return the box that holds all matter at all ``times``, in world units; None if there is none."""
+
+
+@runtime_checkable
+class HasRest(Protocol):
+    """Find out while training what does not move, and compute no motion for it."""
+
+    def at_rest(self) -> float:
+        """Return the share of the matter that has come to rest, in [0, 1]."""
+
+
+@runtime_checkable
+class HasMatter(Protocol):
+    """Give the matter as points, for drawing, export and the next stage."""
+
+    def matter(self) -> Cloud:
+        """Return all canonical matter as points."""
+
+
+@runtime_checkable
+class HasEllipsoids(Protocol):
+    """Be a cloud of soft ellipsoids, for programs that draw such."""
+
+    def ellipsoids(self, time: float) -> Ellipsoids:
+        """Return all of them as they are at a time in [0, 1], without gradients; a row is always the same."""
+
+    def template(self) -> Ellipsoids:
+        """Return them before any motion, with opacity and colours of the canonical time."""
+
+    def movement(self, times: Sequence[float]) -> dict[str, Tensor]:
+        """Return, by name, what makes ``ellipsoids`` at T times of the ``template``, and its coefficients."""
+
+
+@runtime_checkable
+class HasSolid(Protocol):
+    """Of a snapshot: tell how opaque every place is, for meshes."""
+
+    def solid(self, lattice: Lattice) -> tuple[Tensor, Tensor]:
+        """Return the opacity (X, Y, Z) of a small cube around each point of a lattice, and its mean colour
+        over all directions (X, Y, Z, 3); 0 where there is nothing.
+        """
+
+
+FRACTION = "a fraction in [0, 1]", lambda part: 0 <= part <= 1
+
+
+def check_number(key: str, given: Any, wanted: str, good: Callable[[float], bool]) -> None:
+    """Refuse what is no number, or no good one.
+
+    Raises:
+        ValueError: naming the key, and in words what it takes.
+    """
+    if isinstance(given, bool) or not isinstance(given, int | float) or not good(given):
+        raise ValueError(f"{key}: expected {wanted}, but got {given}")
+
+
+def check_least(least: int = 0, *, of: str = "model", **given: Any) -> None:
+    """Refuse what is no whole number of at least ``least``; ``given`` by their keys in ``of``.
+
+    Raises:
+        ValueError: naming the key.
+    """
+    for name, count in given.items():
+        if isinstance(count, bool) or not isinstance(count, int) or count < least:
+            raise ValueError(f"{of}.{name}: expected a whole number >= {least}, but got {count}")
+
+
+def check_pair(key: str, given: Any) -> None:
+    """Refuse what is not two whole numbers >= 1.
+
+    Raises:
+        ValueError: naming the key.
+    """
+    whole = isinstance(given, list | tuple) and [n for n in given if type(n) is int and n >= 1]
+    if not whole or len(given) != 2 or len(whole) != 2:
+        raise ValueError(f"{key}: expected two whole numbers >= 1, but got {given}")
+
+
+def steps_of(
+    key: str, given: Any, least: float = 1.0, *, from_start: bool = False
+) -> list[tuple[float, float]]:
+    """Return a schedule ``[[fraction, count], ...]`` as pairs: ``count`` from ``fraction`` of a stage on.
+
+    Args:
+        key: of the schedule.
+        given: what is set there.
+        least: the least count.
+        from_start: whether the first fraction must be 0.
+
+    Raises:
+        ValueError: for something else, for nothing, or for fractions that do not ascend.
+    """
+    try:
+        pairs = [(float(begin), float(count)) for begin, count in given]
+    except (TypeError, ValueError):
+        pairs = []
+    good = pairs and all(0 <= begin <= 1 and count >= least for begin, count in pairs)
+    good = good and all(one[0] <= other[0] for one, other in pairwise(pairs))
+    if not good or (from_start and pairs[0][0] != 0):
+        form = "[[0, count], [fraction, count], ...]" if from_start else "[[fraction, count], ...]"
+        raise ValueError(
+            f"{key}: expected {form} with ascending fractions and counts >= {least:g}, but got {given}"
+        )
+    return pairs

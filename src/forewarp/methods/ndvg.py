@@ -12,14 +12,11 @@ import torch
 from torch import Tensor, nn
 
 from forewarp import losses
-from forewarp.fields.mlp import mlp
+from forewarp.fields.grids import VoxelGrid, density_shift
+from forewarp.fields.networks import mlp
 from forewarp.fields.occupancy import Occupancy
-from forewarp.fields.radiance import density_shift
-from forewarp.fields.voxel_grid import VoxelGrid
-from forewarp.methods.checks import check_least, check_number, check_pair
-from forewarp.methods.departures import JUMP, NO_JUMP
-from forewarp.methods.marched import MarchedMethod, Marching, regrow, whole_grid
-from forewarp.methods.method import Start
+from forewarp.methods.method import Start, check_least, check_number, check_pair
+from forewarp.methods.rays import JUMP, NO_JUMP, MarchedMethod, Marching, regrow, whole_grid
 from forewarp.ops.encode import encoded_size, positional_encoding
 from forewarp.ops.grid import dilate, second_variation, trilinear
 from forewarp.scene.box import Box, Lattice

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from forewarp.fields.template import Template
+from forewarp.fields.networks import Template
 from forewarp.methods.method import Start
-from forewarp.methods.sampled import OF_JAX, Field, SampledMethod, Sampling, encoder
+from forewarp.methods.rays import OF_JAX, Field, SampledMethod, Sampling, encoder
 from forewarp.ops.encode import encoded_size
 from forewarp.scene.view import Moment
 
@@ -18,7 +18,7 @@ class NeRF(SampledMethod):
     Args:
         start: scene, stage and numbers.
         sampling: see ``Sampling``.
-        width, layers, skip: see ``fields.template.Trunk``.
+        width, layers, skip: see ``fields.networks.Trunk``.
         position_frequencies, direction_frequencies: octaves of the encodings.
         glorot: the NeRF of HyperNeRF's tables: Nerfies without its warp, whose code is in JAX (first values:
             Glorot's, biases 0), in place of PyTorch's.

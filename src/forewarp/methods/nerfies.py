@@ -7,12 +7,9 @@ from collections.abc import Callable, Mapping
 import torch
 from torch import Tensor
 
-from forewarp.fields.codes import CameraCodes, TimeCodes
-from forewarp.fields.screws import ScrewWarp, drawn
-from forewarp.fields.template import Template
-from forewarp.methods.checks import FRACTION, check_least, check_number
-from forewarp.methods.method import Start
-from forewarp.methods.sampled import OF_JAX, Field, SampledMethod, Sampling, encoder
+from forewarp.fields.networks import CameraCodes, ScrewWarp, Template, TimeCodes, drawn
+from forewarp.methods.method import FRACTION, Start, check_least, check_number
+from forewarp.methods.rays import OF_JAX, Field, SampledMethod, Sampling, encoder
 from forewarp.ops.encode import encoded_size
 from forewarp.quadrature import Sampled
 from forewarp.scene.view import Batch, Moment
@@ -28,7 +25,7 @@ class Nerfies(SampledMethod):
     Args:
         start: scene, stage and numbers.
         sampling: see ``Sampling``.
-        width, layers, skip: of the templates, see ``fields.template.Trunk``.
+        width, layers, skip: of the templates, see ``fields.networks.Trunk``.
         warp_width, warp_layers, warp_skip: of the warp.
         position_frequencies, warp_frequencies, direction_frequencies: octaves of the encodings.
         code_size, camera_code_size: channels of the codes; 0: no code of the camera.

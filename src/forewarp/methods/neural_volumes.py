@@ -11,12 +11,16 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from forewarp.fields.codes import beside
-from forewarp.fields.volumes import DEVIATION_SCALE, AffineMixture, PictureEncoder, VolumeDecoder, read
-from forewarp.methods.checks import check_number
-from forewarp.methods.dead_start import DeadStart
-from forewarp.methods.departures import BETWEEN_TIMES, CENTRES, ONE_TIME
-from forewarp.methods.method import Method, Snapshot, Start, Step
+from forewarp.fields.networks import (
+    DEVIATION_SCALE,
+    AffineMixture,
+    PictureEncoder,
+    VolumeDecoder,
+    beside,
+    read,
+)
+from forewarp.methods.method import Method, Snapshot, Start, Step, check_number
+from forewarp.methods.rays import BETWEEN_TIMES, CENTRES, ONE_TIME, DeadStart
 from forewarp.ops.march import clip_to_box
 from forewarp.scene.camera import Rays
 from forewarp.scene.frame import Frame, Scene, spread
@@ -52,9 +56,9 @@ class NeuralVolumes(Method):
     Args:
         start: scene, stage and numbers.
         pictures: of an instant, taken by as many fixed cameras; null: as many as there are, at most 3.
-        picture_size, tower, features, code: see ``fields.volumes.PictureEncoder``.
-        decoder: see ``fields.volumes.VolumeDecoder``.
-        maps, warp_side, warp_width, weight_width, from_identity: see ``fields.volumes.AffineMixture``.
+        picture_size, tower, features, code: see ``fields.networks.PictureEncoder``.
+        decoder: see ``fields.networks.VolumeDecoder``.
+        maps, warp_side, warp_width, weight_width, from_identity: see ``fields.networks.AffineMixture``.
         first_opacity: of the volume before training, > 0; null: as released, about 0.7, with which most rays
             are opaque at first, and have no gradient.
         first_deviation: of the code before training, > 0; null: as released, about 1, many times the code.

@@ -9,13 +9,10 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
-from forewarp.fields.mlp import mlp
-from forewarp.fields.radiance import density_shift
-from forewarp.fields.strided import read_strided
-from forewarp.fields.template import Template
-from forewarp.methods.checks import FRACTION, check_least, check_number
-from forewarp.methods.marched import MarchedMethod, Marching, regrow, whole_grid
-from forewarp.methods.method import Start
+from forewarp.fields.grids import density_shift, read_strided
+from forewarp.fields.networks import Template, mlp
+from forewarp.methods.method import FRACTION, Start, check_least, check_number
+from forewarp.methods.rays import MarchedMethod, Marching, regrow, whole_grid
 from forewarp.ops.encode import encoded_size, positional_encoding
 from forewarp.ops.grid import huber_variation
 from forewarp.scene.box import Lattice

@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from forewarp.fields.template import Template
+from forewarp.fields.networks import Template
 from forewarp.methods.method import Start
-from forewarp.methods.sampled import Field, SampledMethod, Sampling, encoder
+from forewarp.methods.rays import Field, SampledMethod, Sampling, encoder
 from forewarp.ops.encode import encoded_size
 from forewarp.scene.view import Moment
 
@@ -21,7 +21,7 @@ class TNeRF(SampledMethod):
     Args:
         start: scene, stage and numbers.
         sampling: see ``Sampling``.
-        width, layers, skip: see ``fields.template.Trunk``.
+        width, layers, skip: see ``fields.networks.Trunk``.
         position_frequencies, time_frequencies, direction_frequencies: octaves of the encodings.
     """
 

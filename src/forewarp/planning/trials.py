@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 
 from forewarp.evaluation.images import psnr_by_view
 from forewarp.files import read_json, write_json
-from forewarp.methods.abilities import HasRest
+from forewarp.methods.method import HasRest
 from forewarp.metrics.gain import Gain, Numbers
 from forewarp.runs.build import build_run
 from forewarp.runs.overrides import merged, without_switched_off

@@ -18,8 +18,7 @@ from torch import Tensor
 from forewarp.data.batches import color_of
 from forewarp.evaluation.evaluate import mean_scores, measure
 from forewarp.files import read_json, write_json
-from forewarp.methods.abilities import HasMatter, HasTrajectories
-from forewarp.methods.method import Method, Snapshot
+from forewarp.methods.method import HasMatter, HasTrajectories, Method, Snapshot
 from forewarp.metrics.lpips import find_lpips, find_lpips_weights
 from forewarp.metrics.registry import METRICS, NETS
 from forewarp.metrics.suite import ImageSuite

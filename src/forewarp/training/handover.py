@@ -8,8 +8,7 @@ from pathlib import Path
 import torch
 
 from forewarp.files import read_json, write_json
-from forewarp.methods.abilities import HasBounds, HasMatter, HasTrajectories
-from forewarp.methods.method import Method
+from forewarp.methods.method import HasBounds, HasMatter, HasTrajectories, Method
 from forewarp.scene.box import Box
 from forewarp.scene.cloud import Cloud, Handover
 from forewarp.scene.frame import Scene, spread

@@ -13,8 +13,7 @@ from torch import Tensor
 from forewarp.drawing.images import depth_colors, flow_colors, with_wheel
 from forewarp.evaluation.images import compare, image_flow
 from forewarp.evaluation.trajectories import Trajectories
-from forewarp.methods.abilities import HasEllipsoids, HasMatter, HasTrajectories
-from forewarp.methods.method import Snapshot
+from forewarp.methods.method import HasEllipsoids, HasMatter, HasTrajectories, Snapshot
 from forewarp.scene.camera import Camera
 from forewarp.scene.cloud import Ellipsoids
 from forewarp.scene.view import Moment, Rendering, View

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from forewarp.methods.abilities import HasEllipsoids
+from forewarp.methods.method import HasEllipsoids
 from forewarp.ops.gaussians import Gaussians, project, project_reference
 from forewarp.scene.view import Moment
 from tests.support.gaussians import NO_TINTS, still

@@ -3,7 +3,7 @@ from functools import partial
 import pytest
 import torch
 
-from forewarp.methods.voxel.backward_warp import Deformation
+from forewarp.methods.voxel.backward import Deformation
 from forewarp.renderer import Renderer
 from forewarp.scene.box import Lattice
 from forewarp.scene.view import Moment

@@ -6,8 +6,8 @@ from functools import partial
 import pytest
 import torch
 
-from forewarp.fields.trajectory import TrajectoryField
-from forewarp.methods.voxel.evidence import Movement, _explained, movement, residual
+from forewarp.fields.curves import TrajectoryField
+from forewarp.methods.voxel.planning import Movement, _explained, movement, residual
 from forewarp.ops.curves import dct_basis
 from forewarp.scene.box import Lattice
 from forewarp.scene.silhouettes import survey

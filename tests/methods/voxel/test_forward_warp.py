@@ -3,8 +3,8 @@ from functools import partial
 import pytest
 import torch
 
-from forewarp.methods.voxel.effects.upsample import LearnedUpsampler, TrilinearUpsampler
-from forewarp.methods.voxel.stage import EFFECTS
+from forewarp.methods.voxel.effects import LearnedUpsampler, TrilinearUpsampler
+from forewarp.methods.voxel.structure import EFFECTS
 from forewarp.renderer import Renderer
 from forewarp.scene.box import Lattice
 from forewarp.scene.view import Moment

@@ -6,10 +6,10 @@ from functools import partial
 import pytest
 import torch
 
-from forewarp.fields.trajectory import TrajectoryField
+from forewarp.fields.curves import TrajectoryField
 from forewarp.methods.method import Start
-from forewarp.methods.voxel.effects.upsample import TrilinearUpsampler
-from forewarp.methods.voxel.stage import EFFECTS
+from forewarp.methods.voxel.effects import TrilinearUpsampler
+from forewarp.methods.voxel.structure import EFFECTS
 from forewarp.scene.box import Lattice
 from forewarp.scene.cloud import Handover
 from forewarp.training.handover import make_handover

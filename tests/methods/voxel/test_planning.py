@@ -6,8 +6,7 @@ import pytest
 
 from forewarp.methods.effect import Asked, Begin, Rival
 from forewarp.methods.voxel import planning as decisions
-from forewarp.methods.voxel.evidence import Movement, Residual
-from forewarp.methods.voxel.planning import VoxelEvidence, VoxelPlanning
+from forewarp.methods.voxel.planning import Movement, Residual, VoxelEvidence, VoxelPlanning
 from forewarp.metrics.gain import Gain
 from forewarp.scene.silhouettes import Pictures
 

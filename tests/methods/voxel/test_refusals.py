@@ -5,13 +5,11 @@ from functools import partial
 
 import pytest
 
-from forewarp.fields.trajectory import TrajectoryField
+from forewarp.fields.curves import TrajectoryField
 from forewarp.methods.method import Start
-from forewarp.methods.voxel.effects.inpaint import UNet3d
-from forewarp.methods.voxel.effects.motion import Motion
-from forewarp.methods.voxel.effects.upsample import LearnedUpsampler, TrilinearUpsampler
-from forewarp.methods.voxel.stage import VoxelStage
-from forewarp.methods.voxel.terms import voxel_terms
+from forewarp.methods.voxel.effects import LearnedUpsampler, Motion, TrilinearUpsampler, UNet3d
+from forewarp.methods.voxel.losses import voxel_terms
+from forewarp.methods.voxel.structure import VoxelStage
 from forewarp.scene.box import Lattice
 from tests.support.tiny_scene import BOX, INPAINTER, backward_model, ball_scene, built, forward_model
 

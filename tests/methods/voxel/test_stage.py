@@ -1,6 +1,6 @@
 """The numbers of a voxel method's stage: schedules, and what is refused by the name of its key."""
 
-from forewarp.methods.voxel.stage import VoxelStage
+from forewarp.methods.voxel.structure import VoxelStage
 
 
 def numbers(**changes):

@@ -3,8 +3,8 @@ from functools import partial
 import pytest
 import torch
 
-from forewarp.fields.radiance import DirectRadiance
-from forewarp.methods.voxel.backward_warp import Deformation
+from forewarp.fields.grids import DirectRadiance
+from forewarp.methods.voxel.backward import Deformation
 from forewarp.methods.voxel.structure import box_of_all_times, occupied, refresh, resample, seen_rows
 from forewarp.scene.box import Box, Lattice
 from tests.support.tiny_scene import BOX, backward_model, built, forward_model

@@ -6,10 +6,10 @@ import pytest
 import torch
 
 from forewarp import losses
-from forewarp.fields.radiance_grid import Activation, RadianceGrid
+from forewarp.fields.grids import Activation, RadianceGrid
 from forewarp.methods.method import Step
-from forewarp.methods.voxel.snapshot import VoxelSnapshot
-from forewarp.methods.voxel.terms import TERMS, Seen, voxel_terms
+from forewarp.methods.voxel.losses import TERMS, Seen, voxel_terms
+from forewarp.methods.voxel.model import VoxelSnapshot
 from forewarp.ops.grid import neighbour_pairs
 from forewarp.renderer import Marched, Renderer
 from forewarp.scene.box import Box, Lattice

@@ -1,8 +1,8 @@
 import pytest
 import torch
 
-from forewarp.fields.radiance_grid import Activation, RadianceGrid
-from forewarp.methods.voxel.effects.background import Together, overlapped
+from forewarp.fields.grids import Activation, RadianceGrid
+from forewarp.methods.voxel.effects import Together, overlapped
 from forewarp.ops.grid import index_of
 from forewarp.renderer import Renderer
 from forewarp.scene.box import Box, Lattice

@@ -1,8 +1,8 @@
 import pytest
 import torch
 
-from forewarp.fields.radiance_grid import EMPTY, Activation, RadianceGrid
-from forewarp.methods.voxel.effects.dense import Crop, densify, occupied_crop, sparsify
+from forewarp.fields.grids import EMPTY, Activation, RadianceGrid
+from forewarp.methods.voxel.effects import Crop, densify, occupied_crop, sparsify
 from forewarp.scene.box import Box, Lattice
 
 SHAPE = (5, 6, 7)

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from forewarp.methods.voxel.effects.inpaint import ConvBlock, UNet3d, convolve
+from forewarp.methods.voxel.effects import ConvBlock, UNet3d, convolve
 
 
 def test_the_first_step_is_the_identity_and_it_can_learn():

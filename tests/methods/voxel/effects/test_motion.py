@@ -3,9 +3,9 @@ import math
 import pytest
 import torch
 
-from forewarp.fields.radiance_grid import EMPTY, Activation, RadianceGrid
-from forewarp.fields.trajectory import TrajectoryField
-from forewarp.methods.voxel.effects.motion import Motion
+from forewarp.fields.curves import TrajectoryField
+from forewarp.fields.grids import EMPTY, Activation, RadianceGrid
+from forewarp.methods.voxel.effects import Motion
 from forewarp.ops.splat import average_splat
 from forewarp.scene.box import Box, Lattice
 
@@ -58,7 +58,7 @@ def test_what_rests_is_copied_and_what_moves_is_splatted(monkeypatch):
         splatted.append(len(values))
         return average_splat(values, *others)
 
-    monkeypatch.setattr("forewarp.methods.voxel.effects.motion.average_splat", noted)
+    monkeypatch.setattr("forewarp.methods.voxel.effects.average_splat", noted)
     with torch.no_grad():
         warped, coverage, _ = motion(rest=0.05).warp(canonical, LATTICE.all_voxels(), flow)
         every, _, _ = motion(rest=0.0).warp(canonical, LATTICE.all_voxels(), flow)

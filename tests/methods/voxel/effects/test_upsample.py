@@ -1,13 +1,15 @@
 import pytest
 import torch
 
-from forewarp.fields.radiance_grid import Activation, RadianceGrid
-from forewarp.methods.voxel.effects.dense import densify, occupied_crop, sparsify
-from forewarp.methods.voxel.effects.upsample import (
+from forewarp.fields.grids import Activation, RadianceGrid
+from forewarp.methods.voxel.effects import (
     LearnedUpsampler,
     TrilinearUpsampler,
+    densify,
     interpolate_dense,
+    occupied_crop,
     refined,
+    sparsify,
 )
 from forewarp.scene.box import Box, Lattice
 from tests.support.hard_cases import index_with

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from forewarp.methods.voxel.effects.view_dependence import SphericalHarmonics, ViewNetwork
+from forewarp.methods.voxel.effects import SphericalHarmonics, ViewNetwork
 
 
 def test_harmonics_hand_worked():

@@ -2,24 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import ClassVar
+
 import torch
 from torch import Tensor, nn
 
-from forewarp.fields.radiance import DirectRadiance, FeatureRadiance
-from forewarp.fields.radiance_grid import RadianceGrid
-from forewarp.methods.voxel.effects.background import StaticBackground, Together
-from forewarp.methods.voxel.effects.dense import densify, occupied_crop, sparsify
-from forewarp.methods.voxel.effects.inpaint import UNet3d
-from forewarp.methods.voxel.effects.motion import Motion
-from forewarp.methods.voxel.effects.upsample import (
+from forewarp.fields.curves import TrajectoryField
+from forewarp.fields.grids import DirectRadiance, FeatureRadiance, RadianceGrid
+from forewarp.methods.voxel.effects import (
     LearnedUpsampler,
+    Motion,
+    StaticBackground,
+    Together,
     TrilinearUpsampler,
+    UNet3d,
+    densify,
     interpolate_dense,
+    occupied_crop,
     refined,
+    sparsify,
 )
-from forewarp.methods.voxel.method import VoxelMethod
-from forewarp.methods.voxel.planning import EFFECTS
-from forewarp.methods.voxel.snapshot import VoxelSnapshot
+from forewarp.methods.voxel.model import Ground, VoxelMethod, VoxelModel, VoxelSnapshot
+from forewarp.methods.voxel.planning import EFFECTS, VoxelPlanning
+from forewarp.methods.voxel.structure import VoxelStage
 from forewarp.renderer import Renderer
 from forewarp.scene.view import Moment
 
@@ -181,3 +188,47 @@ class ForwardWarp(VoxelMethod):
     def half_extent(self) -> float:
         """Half the scene's longest side, in world units."""
         return self.motion.trajectory.scale
+
+
+@dataclass(frozen=True)
+class ForwardModel(VoxelModel):
+    """The options of the paper's method, ``ForwardWarp``."""
+
+    planning: ClassVar[VoxelPlanning] = VoxelPlanning()
+
+    motion: Callable[..., Motion] | None = None
+    trajectory: Callable[..., TrajectoryField] | None = None
+    upsampler: Callable[..., nn.Module] | None = None
+    inpainter: Callable[..., nn.Module] | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.motion is not None and self.trajectory is None:
+            raise ValueError(
+                "model.trajectory: expected a factory, but got null; choose another model/motion or model"
+            )
+
+    def _warp(self, radiance, ground: Ground, stage: VoxelStage, features: int, common: dict) -> ForwardWarp:
+        effects, motion, inpainter = stage.effects, None, None
+        if self.motion is not None and ground.frames > 1 and "motion" in effects:
+            time = ground.canonical_time
+            motion = self.motion(self.trajectory(ground.box, frames=ground.frames, canonical_time=time))
+        if self.inpainter is not None and "inpainter" in effects:
+            learned = stage.upsample is None and "upsampler" in effects and self._learns_to_upsample
+            inpainter = self.inpainter(channels=1 + features, head=not learned)
+        upsampler = self._upsampler(features, inpainter, stage)
+        return ForwardWarp(radiance, motion=motion, upsampler=upsampler, inpainter=inpainter, **common)
+
+    @property
+    def _learns_to_upsample(self) -> bool:
+        made = getattr(self.upsampler, "func", self.upsampler)
+        return isinstance(made, type) and issubclass(made, LearnedUpsampler)
+
+    def _upsampler(self, features: int, inpainter: nn.Module | None, stage: VoxelStage) -> nn.Module | None:
+        if stage.upsample is not None:
+            return TrilinearUpsampler(scale=stage.upsample)
+        if self.upsampler is None or "upsampler" not in stage.effects:
+            return None
+        if self._learns_to_upsample:
+            return self.upsampler(channels=1 + features, features=0 if inpainter is None else inpainter.width)
+        return self.upsampler()

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from torch import Tensor
 
 from forewarp import losses
-from forewarp.fields.radiance_grid import RadianceGrid
-from forewarp.methods.voxel.snapshot import VoxelSnapshot
+from forewarp.fields.grids import RadianceGrid
 from forewarp.renderer import Marched
+
+if TYPE_CHECKING:
+    from forewarp.methods.voxel.model import VoxelSnapshot
 
 Pairs = list[tuple[Tensor, Tensor]]
 LITERAL = ("photo", "point_color", "background_entropy")  # terms whose printed form differs

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
-from forewarp.fields.mlp import mlp
-from forewarp.fields.radiance import DirectRadiance
-from forewarp.fields.radiance_grid import RadianceGrid, Shade
-from forewarp.methods.voxel.effects.background import StaticBackground, Together
-from forewarp.methods.voxel.method import VoxelMethod
+from forewarp.fields.grids import DirectRadiance, RadianceGrid, Shade
+from forewarp.fields.networks import mlp
+from forewarp.methods.voxel.effects import StaticBackground, Together
+from forewarp.methods.voxel.model import Ground, VoxelMethod, VoxelModel, VoxelSnapshot
 from forewarp.methods.voxel.planning import EFFECTS
-from forewarp.methods.voxel.snapshot import VoxelSnapshot
+from forewarp.methods.voxel.structure import VoxelStage
 from forewarp.ops.encode import positional_encoding
 from forewarp.ops.grid import dilate
 from forewarp.renderer import Renderer
@@ -196,3 +196,20 @@ class BackwardWarp(VoxelMethod):
     def half_extent(self) -> float:
         """Half the scene's longest side, in world units."""
         return self.deformation.scale
+
+
+@dataclass(frozen=True)
+class BackwardModel(VoxelModel):
+    """The options of the baseline, ``BackwardWarp``: the same grid with a deformation network."""
+
+    deformation: Callable[..., Deformation] | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.deformation is None:
+            raise ValueError("model.deformation: expected a factory, but got null; choose another model")
+
+    def _warp(self, radiance, ground: Ground, stage: VoxelStage, features: int, common: dict) -> BackwardWarp:
+        time = ground.canonical_time
+        deformation = self.deformation(ground.box, canonical_time=time) if ground.frames > 1 else None
+        return BackwardWarp(radiance, deformation=deformation, **common)
