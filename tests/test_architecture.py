@@ -56,7 +56,6 @@ CONTRACT = {
     "method",
     "effect",
     "rows",
-    "rows_adam",
     "rays",
 }  # files of methods/ that packages above may import
 # Attributes of one method only.

@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 
 from forewarp.data import dnerf, hypernerf, nhr, posed_video
 from forewarp.data.module import SceneDataModule
-from forewarp.methods.particles.effects import Effects
+from forewarp.methods.particles.options import Effects
 from forewarp.methods.voxel.effects import LearnedUpsampler, SphericalHarmonics, UNet3d, ViewNetwork
 from forewarp.methods.voxel.losses import TERMS
 from forewarp.methods.voxel.model import Ground

@@ -14,6 +14,7 @@ from pathlib import Path
 import lightning
 import torch
 
+from forewarp.methods.particles.model import pinhole_of
 from forewarp.ops.gaussians import Gaussians, Splats, compare, project, rasterize
 from forewarp.ops.nodes import pull_nodes, skin_weights
 from tests.bench.particles import MIDDLE, WHITE, Loop, Size, camera, run_of
@@ -132,8 +133,8 @@ def plain_times(loop: Loop, size: Size) -> dict[str, float]:
     view, times = camera(size.side, 0.3), (size.side / smaller) ** 2
     tints, fades = method.over_time(MIDDLE)
     particles, warp = (type(p)(*(t.detach() for t in p)) for p in (method.gaussians(), method.warp(MIDDLE)))
-    seen = (particles, warp, method.pinholes(view), tints, fades)
-    little = (*seen[:2], method.pinholes(camera(smaller, 0.3)), *seen[3:])
+    seen = (particles, warp, pinhole_of(view, method.blur), tints, fades)
+    little = (*seen[:2], pinhole_of(camera(smaller, 0.3), method.blur), *seen[3:])
     truth = torch.zeros(smaller**2, 4, dtype=torch.uint8)
     nodes, found = method.nodes, {}
     with implementation("reference"):

@@ -19,8 +19,7 @@ from torch import Tensor
 
 from forewarp.data.module import SceneDataModule
 from forewarp.methods.method import Start
-from forewarp.methods.particles.camera import pinhole_of
-from forewarp.methods.particles.model import Particles
+from forewarp.methods.particles.model import Particles, pinhole_of
 from forewarp.ops.gaussians import Gaussians, Warp, project, rasterize
 from forewarp.runs.build import build_run
 from forewarp.scene.box import Box

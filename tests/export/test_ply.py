@@ -60,7 +60,7 @@ def test_a_viewer_draws_the_pictures_of_the_run(written):
         assert list(table) == LAYOUT
         assert len(table["x"]) == about["particles"] == len(source.method.means)
         bare = gaussians(table)
-        own = type(snapshot)(snapshot.moment, bare, still(bare), NO_TINTS, torch.ones(1), snapshot.pinholes)
+        own = type(snapshot)(snapshot.moment, bare, still(bare), NO_TINTS, torch.ones(1), snapshot.blur)
         found, wanted = (s.render(View(camera), torch.ones(3)).rgb.detach() for s in (own, snapshot))
         assert float(wanted.std()) > 0.05
         torch.testing.assert_close(found, wanted, atol=2e-3, rtol=0)
@@ -137,7 +137,7 @@ def test_turned_files_are_seen_by_turned_cameras_as_before(particles, tmp_path, 
     assert float(torch.linalg.det(turn)) == pytest.approx(1)
     snapshot, camera = particles.method.at(Moment(TIMES[1])), particles.cameras[3]
     bare = gaussians(read(tmp_path / "ply" / "frames" / "frame_0001.ply"))
-    own = type(snapshot)(snapshot.moment, bare, still(bare), NO_TINTS, torch.ones(1), snapshot.pinholes)
+    own = type(snapshot)(snapshot.moment, bare, still(bare), NO_TINTS, torch.ones(1), snapshot.blur)
     pose = camera.camera_to_world.clone()
     pose[:3] = turn @ pose[:3]
     found = own.render(View(replace(camera, camera_to_world=pose)), torch.ones(3)).rgb

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from forewarp.methods.rows_adam import RowsAdam
+from forewarp.methods.rows import RowsAdam
 from forewarp.ops.adam import Learned, adam_rows
 
 

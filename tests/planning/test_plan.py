@@ -8,8 +8,8 @@ import pytest
 import yaml
 
 from forewarp.data.module import SceneDataModule
-from forewarp.methods.particles.planning import EFFECTS as PARTICLES
-from forewarp.methods.particles.planning import ParticlesPlanning
+from forewarp.methods.particles.options import EFFECTS as PARTICLES
+from forewarp.methods.particles.options import ParticlesPlanning
 from forewarp.planning.plan_file import read_plan, with_plan, write_plan
 from forewarp.planning.planner import Planner
 from forewarp.planning.trials import Trial, Trials

@@ -1,6 +1,6 @@
 """What a step of particles gives, in float64, against finite differences of its own loss.
 
-Two things are left out of gradients by design (``ops.project``): that a direction turns when a particle
+Two things are left out of gradients by design (``ops.gaussians``): that a direction turns when a particle
 moves, which harmonics of degree 1 and more would see, and that a lens's slopes change then, which the shape
 of a splat would see. So where either is on, only what moves nothing is held to finite differences; and with a
 lens that which moves, in the numbers of a splat that have nothing to do with the slopes.
@@ -12,8 +12,9 @@ import pytest
 import torch
 from torch.autograd import gradcheck
 
-from forewarp.methods.particles.camera import pinhole_of
-from forewarp.ops.gaussians import BLUR, Warp, compare, project
+from forewarp.methods.particles import model
+from forewarp.methods.particles.model import pinhole_of
+from forewarp.ops.gaussians import Warp, compare, project
 from tests.stability.hard_particles import BEHIND, pixels
 from tests.support.gaussians import crowd, pinhole
 from tests.support.particles import EVERY, module_with, shaken, small_data
@@ -101,18 +102,18 @@ METHODS = {
 }
 
 
-def exactly(data, options, lens):
+def exactly(data, options, lens, monkeypatch):
     """A shaken method in float64, whose camera has a lens or none, and a batch."""
     module = module_with(data, numbers={"jitter": 0.0, "density": 1.0, "first": 1.0}, **EVERY | options)
     method = shaken(module).method.double()
     method.nodes.seen.copy_(torch.tensor([0.0, 1.0]))  # else the first look continues curves
-    method.pinholes = lambda camera: replace(pinhole_of(camera, BLUR), **lens)
+    monkeypatch.setattr(model, "pinhole_of", lambda camera, blur: replace(pinhole_of(camera, blur), **lens))
     data.picker = lambda: 3
     return method, next(iter(data.train_dataloader())), module.generator
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_a_step_of_the_method(data, name):
+def test_a_step_of_the_method(data, name, monkeypatch):
     """The loss is that of the step itself, all terms weighted; everything is the plain reference.
 
     Photo, rigid and smooth reach ``nodes.shift`` and ``nodes.turn``, and the photo term alone the others.
@@ -121,7 +122,7 @@ def test_a_step_of_the_method(data, name):
     their gradients.
     """
     options, lens, names = METHODS[name]
-    method, batch, generator = exactly(data, options, lens)
+    method, batch, generator = exactly(data, options, lens, monkeypatch)
 
     def loss():
         terms = method.look(batch, FACTORS, generator).terms

@@ -10,10 +10,9 @@ import torch
 from forewarp.data.module import SceneDataModule
 from forewarp.fields.curves import Curve
 from forewarp.methods.particles import model
-from forewarp.methods.particles.matter import paths_of
 from forewarp.methods.particles.model import Particles
-from forewarp.methods.particles.nodes import Nodes
-from forewarp.methods.particles.skin import Skin
+from forewarp.methods.particles.nodes import Nodes, Skin
+from forewarp.methods.particles.queries import trajectories
 from forewarp.methods.particles.start import anywhere
 from forewarp.ops.nodes import pull_nodes
 from forewarp.scene.box import Box
@@ -230,7 +229,7 @@ def paths(nodes, points, times):
         "opacity": torch.nn.Parameter(torch.zeros(len(points), 1)),
     }
     method = SimpleNamespace(nodes=nodes, skin=skin, canonical_time=canonical, **parts)
-    return paths_of(method, points, torch.tensor(times, dtype=torch.float64))
+    return trajectories(method, points, torch.tensor(times, dtype=torch.float64))
 
 
 @pytest.mark.parametrize("turns", [True, False])

@@ -23,8 +23,7 @@ from forewarp.methods.method import (
     check_number,
     steps_of,
 )
-from forewarp.methods.rows import renew_parameters
-from forewarp.methods.rows_adam import RowsAdam
+from forewarp.methods.rows import RowsAdam, renew_parameters
 from forewarp.ops.encode import positional_encoding
 from forewarp.ops.march import warm_up
 from forewarp.quadrature import Quadrature, Sampled

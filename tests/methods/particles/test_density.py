@@ -4,7 +4,7 @@ import torch
 from torch import nn
 
 from forewarp.methods.particles.density import renew, too_near
-from forewarp.methods.rows_adam import RowsAdam
+from forewarp.methods.rows import RowsAdam
 
 
 class Few(nn.Module):
@@ -23,8 +23,7 @@ class Few(nn.Module):
             self.register_buffer(name, torch.zeros(count))
         self.register_buffer("shown", torch.ones(count))
 
-    def most_opaque(self):
-        return self.opacity[:, 0]
+    fade = None
 
 
 def optimizer_of(method):

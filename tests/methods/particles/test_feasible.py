@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from forewarp.methods.particles import feasible, model
+from forewarp.methods.particles import model
 from forewarp.methods.particles.model import Particles
 from forewarp.ops import backend
 from tests.contract.fitting import Losses, run_of, stage_of
@@ -74,7 +74,7 @@ def test_larger_pictures_of_the_test_count_too(data):
 
 def test_with_kernels_nothing_is_looked_at(data, monkeypatch):
     monkeypatch.setattr(backend, "numba_installed", lambda: True)
-    monkeypatch.setattr(feasible, "covered_pixels", None)
+    monkeypatch.setattr(model, "covered_pixels", None)
     Particles.check_feasible(sized(data.scene, 4000, 4000), "fine", {}, CPU)
 
 
@@ -106,5 +106,5 @@ def test_without_numba_particles_learn_the_same(data, tmp_path):
 
 def test_particles_of_a_module_are_no_more_than_were_counted(data):
     method = module_with(data).method
-    most = float(method.most) * max(method.numbers_of.first, method.numbers_of.full)
+    most = float(method.most) * max(method.stage.first, method.stage.full)
     assert len(method.means) <= most

@@ -2,6 +2,7 @@ import pytest
 import torch
 
 from forewarp.methods.method import HasEllipsoids
+from forewarp.methods.particles.model import pinhole_of
 from forewarp.ops.gaussians import Gaussians, project, project_reference
 from forewarp.scene.view import Moment
 from tests.support.gaussians import NO_TINTS, still
@@ -20,13 +21,13 @@ def method(request, data):
 def test_ellipsoids_are_seen_as_the_particles_are(method, data, time, by):
     assert isinstance(method, HasEllipsoids)
     snapshot = method.at(Moment(time))
-    pinhole = snapshot.pinholes(data.scene.train[0].camera)
+    pinhole = pinhole_of(data.scene.train[0].camera, snapshot.blur)
     cloud = method.ellipsoids(time)
     scales, quaternions = cloud.axes
     bare = Gaussians(
         cloud.centers, scales.log(), quaternions, cloud.opacity.logit()[:, None], cloud.harmonics
     )
     found = by(bare, still(bare), pinhole, NO_TINTS, torch.ones(1))
-    wanted = by(snapshot.gaussians, snapshot.warp, pinhole, snapshot.tints, snapshot.fades)
+    wanted = by(snapshot.gaussians, snapshot.warp, pinhole, snapshot.color_basis, snapshot.opacity_basis)
     torch.testing.assert_close(found.numbers, wanted.numbers.detach(), rtol=1e-3, atol=1e-3)
     assert int((wanted.numbers[:, 5] > 0).sum()) > 50

@@ -5,9 +5,9 @@ import torch
 
 from forewarp.methods.effect import switched
 from forewarp.methods.method import Start
-from forewarp.methods.particles import model
+from forewarp.methods.particles import density, model
 from forewarp.methods.particles.model import Particles
-from forewarp.methods.particles.settings import Numbers
+from forewarp.methods.particles.options import Numbers
 from forewarp.methods.particles.start import widths
 from forewarp.ops.gaussians import moved
 from forewarp.scene.view import Moment, View
@@ -105,7 +105,7 @@ def test_what_appears_later_is_not_thrown_away(data):
     method, optimizer = module.method, module.configure_optimizers()
     method.opacity.data.fill_(-20.0)
     method.fade.data[:3, 0] = -15.0  # the first cosine falls from 0 to -2
-    assert (method.most_opaque() > 0).nonzero()[:, 0].tolist() == [0, 1, 2]
+    assert (density.most_opaque(method) > 0).nonzero()[:, 0].tolist() == [0, 1, 2]
     method.advance(0.15, 1, optimizer)
     assert len(method.means) == 3
 
@@ -324,5 +324,5 @@ def test_the_first_steps_meet_warm_kernels_only(data, monkeypatch):
 
 def test_a_stage_has_as_many_particles_as_its_own_density_says(data):
     first = module_with(data).method
-    start = Start(data.scene, "fine", {"density": 2 * first.numbers_of.density}, range(3), before=first)
+    start = Start(data.scene, "fine", {"density": 2 * first.stage.density}, range(3), before=first)
     assert int(Particles(start).most) == pytest.approx(2 * int(first.most), abs=1)

@@ -2,9 +2,8 @@ import pytest
 import torch
 
 from forewarp.fields.curves import Curve
-from forewarp.methods.particles.nodes import Nodes, nearest
-from forewarp.methods.particles.skin import Skin
-from forewarp.methods.rows_adam import RowsAdam
+from forewarp.methods.particles.nodes import Nodes, Skin, nearest
+from forewarp.methods.rows import RowsAdam
 
 
 def grid(side=4):

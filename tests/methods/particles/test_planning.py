@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from forewarp.methods.effect import Asked, Begin, Drop, Evidence
-from forewarp.methods.particles.planning import EFFECTS, ParticlesPlanning
+from forewarp.methods.particles.options import EFFECTS, ParticlesPlanning
 from forewarp.metrics.gain import Gain
 from forewarp.scene.silhouettes import Pictures
 

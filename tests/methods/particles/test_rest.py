@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from forewarp.methods.particles import model
-from forewarp.methods.particles.rest import _product, _quaternions, come_to_rest
+from forewarp.methods.particles import density
+from forewarp.methods.particles.density import _product, _quaternions, come_to_rest
 from forewarp.ops.gaussians import moved, rotations
 from tests.support.particles import EVERY, look, module_with
 
@@ -83,7 +83,7 @@ def test_the_share_that_rests_is_told(half):
 @pytest.mark.parametrize(("covered", "least"), [(1e6, 0.02), (100.0, 0.5013)])
 def test_what_moves_no_farther_than_a_pixel_from_its_mean_place_may_rest(half, monkeypatch, covered, least):
     asked = []
-    monkeypatch.setattr(model, "come_to_rest", lambda _, least: asked.append(least))
+    monkeypatch.setattr(density, "come_to_rest", lambda _, least: asked.append(least))
     method, optimizer = half[0].method, half[0].configure_optimizers()
     method.covered.fill_(covered)
     method.extent.fill_(2.0)
@@ -92,7 +92,7 @@ def test_what_moves_no_farther_than_a_pixel_from_its_mean_place_may_rest(half, m
 
 
 def test_nothing_comes_to_rest_where_the_effect_is_off(data, monkeypatch):
-    monkeypatch.setattr(model, "come_to_rest", lambda *_: pytest.fail("called"))
+    monkeypatch.setattr(density, "come_to_rest", lambda *_: pytest.fail("called"))
     module = module_with(data, numbers={"rest": 0.0, "relink": 1, "every": 0.1})
     assert module.method.resting is None
     look(module, data)

@@ -5,14 +5,16 @@ import torch
 
 from forewarp.methods.method import Start
 from forewarp.methods.particles.start import (
+    _in_holes,
     anywhere,
     covered_pixels,
     first_points,
     first_values,
     hull_surface,
+    seen_colors,
+    swept,
     widths,
 )
-from forewarp.methods.particles.sweep import _in_holes, seen_colors, swept
 from forewarp.scene.cloud import Cloud, Handover
 from tests.contract.scenes import DATASETS, RADIUS, ball_center, data_of
 

@@ -4,9 +4,8 @@ import pytest
 import torch
 
 from forewarp.fields.curves import Curve
-from forewarp.methods.particles.nodes import Nodes
-from forewarp.methods.particles.time_offsets import TimeOffsets
-from forewarp.methods.rows_adam import RowsAdam
+from forewarp.methods.particles.nodes import Nodes, TimeOffsets
+from forewarp.methods.rows import RowsAdam
 
 TIMES = [0.0, 0.25, 0.5, 0.75, 1.0]
 

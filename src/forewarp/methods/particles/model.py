@@ -1,49 +1,146 @@
-"""The method: canonical particles, moved forward by nodes and rasterised."""
+"""Particles: canonical Gaussians, moved forward by nodes and rasterised."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import ClassVar
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
 from forewarp.fields.curves import Curve
 from forewarp.methods.method import Method, Snapshot, Start, Step
-from forewarp.methods.particles import matter, opacity
-from forewarp.methods.particles.camera import Pinholes
-from forewarp.methods.particles.density import renew, too_near
-from forewarp.methods.particles.effects import Effects, cosines
-from forewarp.methods.particles.feasible import check_feasible
-from forewarp.methods.particles.nodes import Nodes
-from forewarp.methods.particles.packed import add, by_name, kinds_of, packed
-from forewarp.methods.particles.planning import EFFECTS, ParticlesPlanning
-from forewarp.methods.particles.rest import come_to_rest, pixel_width
-from forewarp.methods.particles.settings import Numbers, told_by
-from forewarp.methods.particles.skin import Skin
-from forewarp.methods.particles.snapshot import ParticlesSnapshot
-from forewarp.methods.particles.start import covered_pixels, first_points, first_values, widths
-from forewarp.methods.particles.time_offsets import TimeOffsets
-from forewarp.methods.rows_adam import RowsAdam
-from forewarp.ops.gaussians import BLUR, Gaussians, Warp, compare
+from forewarp.methods.particles import density, queries
+from forewarp.methods.particles.nodes import Nodes, Skin, TimeOffsets
+from forewarp.methods.particles.options import EFFECTS, Effects, Numbers, ParticlesPlanning, view_share
+from forewarp.methods.particles.start import (
+    compile_kernels,
+    covered_pixels,
+    first_points,
+    first_values,
+    widths,
+)
+from forewarp.methods.rows import RowsAdam
+from forewarp.ops.backend import has_kernels
+from forewarp.ops.gaussians import (
+    BLUR,
+    FEASIBLE,
+    Compared,
+    Gaussians,
+    Pinhole,
+    Warp,
+    compare,
+    project,
+    rasterize,
+    smaller,
+)
 from forewarp.ops.nodes import pull_nodes
-from forewarp.scene.box import Box
-from forewarp.scene.cloud import Cloud, Ellipsoids
-from forewarp.scene.view import Asks, Batch, Moment
+from forewarp.scene.camera import Camera
+from forewarp.scene.cloud import Cloud
+from forewarp.scene.frame import Scene, spread
+from forewarp.scene.view import Asks, Batch, Moment, Observation, Rendering, View
+
+# Of the camera's near plane, and at least of its far plane: closer particles would fill the image.
+_NEAR, _LEAST_NEAR = 0.1, 0.02
+_MARGIN = 0.125  # share of the longer side; what projects farther outside the image is left out
+_LENS_MARGIN = 1.3  # of the squared distance from the axis that the image's border reaches
+_BORDER = 16  # points along each side of an image
+_TRANSPARENT = 1e-6  # opacity below which a pixel has no depth
+_COUNTED_IMAGES = 12  # whose covered pixels are counted before a run
+_SLACK = 0.98  # of a side, as smaller images are not covered to exactly the same share
+
+
+@lru_cache(maxsize=4096)
+def pinhole_of(camera: Camera, blur: float) -> Pinhole:
+    """Convert a scene's camera to what the operators read; each camera once, as it takes 0.3 ms.
+
+    Args:
+        camera: a camera, with or without a lens.
+        blur: square pixels added to the variance of every splat.
+    """
+    pose, lens = camera.camera_to_world.double(), camera.lens
+    return Pinhole(
+        tuple(pose[:3, :3].T.flatten().tolist()),
+        tuple(pose[:3, 3].tolist()),
+        (camera.fx, camera.fy),
+        (camera.cx, camera.cy),
+        (camera.width, camera.height),
+        max(_NEAR * camera.near, _LEAST_NEAR * camera.far),
+        skew=camera.skew,
+        blur=blur,
+        margin=_MARGIN * max(camera.width, camera.height),
+        radial=(0.0, 0.0, 0.0) if lens is None else lens.k,
+        tangential=(0.0, 0.0) if lens is None else lens.p,
+        reach=1e8 if lens is None else _squared_reach(camera),
+    )
+
+
+def _squared_reach(camera: Camera) -> float:
+    """Return the squared distance from the axis, at depth 1, up to which a lens may show points.
+
+    Beyond it the lens's polynomial may fold points back into the image.
+    """
+    along = torch.linspace(0, 1, _BORDER, dtype=torch.float64)
+    across, down = along * camera.width, along * camera.height
+    zero = torch.zeros_like(along)
+    u = torch.cat([across, across, zero, zero + camera.width])
+    v = torch.cat([zero, zero + camera.height, down, down])
+    y = (v - camera.cy) / camera.fy
+    x = (u - camera.cx - camera.skew * y) / camera.fx
+    return _LENS_MARGIN * float(camera.lens.straighten(torch.stack([x, y], -1)).square().sum(-1).max())
+
+
+@dataclass(eq=False)
+class ParticlesSnapshot(Snapshot):
+    """Particles at a moment.
+
+    Attributes:
+        moment: the moment.
+        gaussians: the canonical particles.
+        warp: how they move until then.
+        color_basis, opacity_basis: what the time makes of colours (T,) and of opacity (F,).
+        blur: square pixels added to the variance of every splat.
+    """
+
+    moment: Moment
+    gaussians: Gaussians
+    warp: Warp
+    color_basis: Tensor
+    opacity_basis: Tensor
+    blur: float
+
+    def render(self, view: View, background: Tensor, rendering: str | None = None) -> Rendering:
+        """See ``Snapshot``. Pixels and crops are taken from the whole image, which costs little."""
+        pinhole = pinhole_of(view.camera, self.blur)
+        splats = project(self.gaussians, self.warp, pinhole, self.color_basis, self.opacity_basis)
+        color, distance, through = rasterize(splats, *pinhole.size)
+        color, distance, through = color.reshape(3, -1).T, distance.reshape(-1), through.reshape(-1)
+        if view.indices is not None:
+            rows = view.indices.to(color.device)
+            color, distance, through = color[rows], distance[rows], through[rows]
+        opacity = 1 - through
+        depth = torch.where(opacity > _TRANSPARENT, distance / opacity.clamp(min=_TRANSPARENT), 0.0)
+        return Rendering(color + through[:, None] * background.to(color), depth, opacity)
+
+    def holds(self, moment: Moment) -> bool:
+        """Return whether it is the same time; which camera looks does not matter."""
+        return moment.time == self.moment.time
 
 
 class Particles(Method):
-    """N Gaussians of a template near the canonical state, and M nodes that carry them through time.
+    """N canonical Gaussians, and M nodes that carry them through time.
 
-    A step draws one whole picture, compares it, and has its gradients in one pass of ``ops.compare``; the
-    optimiser passes over what the picture did not show. Stage numbers: see ``settings.Numbers``.
+    A step renders a whole image, compares it, and has its gradients in one pass of ``ops.compare``; the
+    optimiser passes over particles that the image does not show.
 
     Args:
-        start: what it is built from.
-        width: of the loss, where it turns from a square to a line.
-        blur: square pixels that every particle is blurred by.
-        choices: see ``effects.Effects``.
+        start: what it is built from; for the stage's numbers see ``options.Numbers``.
+        width: error at which the photometric loss turns from a square to a line.
+        blur: square pixels added to the variance of every splat.
+        choices: see ``options.Effects``.
     """
 
     terms = ("photo", "rigid", "smooth")
@@ -52,83 +149,125 @@ class Particles(Method):
     effects = EFFECTS
     on_cpu = "its kernels are the CPU's, and without them only small pictures are feasible"
     planning: ClassVar[ParticlesPlanning] = ParticlesPlanning()
-    check_feasible = classmethod(check_feasible)
+
+    # Scene queries: see ``methods.method``.
+    matter, bounds, trajectories = queries.matter, queries.bounds, queries.trajectories
+    ellipsoids, template, movement = queries.ellipsoids, queries.template, queries.movement
 
     def __init__(self, start: Start, *, width: float = 0.05, blur: float = BLUR, **choices) -> None:
         super().__init__()
-        self.numbers_of = Numbers(name=start.stage, **start.numbers)
-        self.canonical_time, self.width = start.scene.canonical_time, width
-        self.pinholes = Pinholes(blur)
+        self.stage = Numbers(name=start.stage, **start.numbers)
+        self.canonical_time, self.width, self.blur = start.scene.canonical_time, width, blur
         self.views, times = len(start.scene.train), start.scene.times
-        on = Effects(**choices).only(self.numbers_of.effects, len(times))
+        effects = Effects(**choices).only(self.stage.effects, len(times))
         self.ends = min(times), max(times)
         self.progress = self.decay = 0.0
-        self.fading: list[Tensor] = []  # what each picture of this step showed
-        before = start.before if isinstance(start.before, Particles) else None
-        fresh = None if start.blank or before is not None else self._measured(start)
-        self._make(before, fresh, on)
+        self.shown_now: list[Tensor] = []  # which particles each image of this step showed
+
+        values = self._first_values(start)
+        count = len(values["means"])
+        self.means = nn.Parameter(values["means"])
+        self.log_scales = nn.Parameter(values["log_scales"])
+        self.turns = nn.Parameter(values["turns"])
+        self.opacity = nn.Parameter(values["opacity"])  # logits
+        self.color = nn.Parameter(values["color"])  # coefficient of the constant harmonic
+        degree = effects.view_dependence or 0
+        self.shade = _coefficients(values.get("shade"), count, degree * (degree + 2), 3)
+        self.tint = _coefficients(values.get("tint"), count, effects.color_over_time or 0, 3)
+        self.fade = _coefficients(values.get("fade"), count, effects.opacity_over_time or 0)
+
         self.nodes = self.skin = None
-        if on.motion is not None:
-            count, knots = self.numbers_of.motion(len(self.means), len(times))
-            straight = self.numbers_of.straight
-            curve = Curve(on.motion, knots, len(times), self.canonical_time, straight=straight)
-            points, edges = None if start.blank else self.means.data, self.numbers_of.edges
-            turns, rests = on.rotation is not None, on.background is not None
-            offsets = TimeOffsets.of(on.motion, times, self.numbers_of.time_offsets)
-            self.nodes = Nodes(points, count, curve, offsets, turns=turns, rests=rests, edges=edges)
+        if effects.motion is not None:
+            node_count, knots = self.stage.motion(count, len(times))
+            curve = Curve(
+                effects.motion, knots, len(times), self.canonical_time, straight=self.stage.straight
+            )
+            self.nodes = Nodes(
+                None if start.blank else self.means.data,
+                node_count,
+                curve,
+                TimeOffsets.of(effects.motion, times, self.stage.time_offsets),
+                turns=effects.rotation is not None,
+                rests=effects.background is not None,
+                edges=self.stage.edges,
+            )
             self.skin = Skin(self.nodes, self.means.data)
-        resting = None if on.background is None else torch.zeros(len(self.means), dtype=torch.bool)
+        self.least_motion = effects.background
+        resting = None if effects.background is None else torch.zeros(count, dtype=torch.bool)
         self.register_buffer("resting", resting)
-        self.least_motion = on.background
-        for name in ("pulled", "shown", "idle"):
-            self.register_buffer(name, torch.zeros(len(self.means)))
+        # Since the last round of density control: sums of gradients, images that showed a particle; and for
+        # how many rounds none did.
+        self.register_buffer("pulled", torch.zeros(count))
+        self.register_buffer("shown", torch.zeros(count))
+        self.register_buffer("idle", torch.zeros(count))
         self.register_buffer("round", torch.zeros((), dtype=torch.int64))
-        self.grows = self._grows()
+        rows = ["means", "log_scales", "turns", "opacity", "color", "shade", "tint", "fade"]
+        rows += ["pulled", "shown", "idle", "resting"]
+        self.grows = tuple(name for name in rows if getattr(self, name) is not None)
+        if self.skin is not None:
+            self.grows += Skin.ROWS
 
-    def _measured(self, start: Start) -> dict[str, Tensor]:
-        """The first values of every parameter; notes what follows from the pictures, too."""
-        covered = covered_pixels(start.scene, list(start.frames))
-        most = self.numbers_of.most(covered, self.views)
-        cloud = first_points(start, round(self.numbers_of.first * most))
-        away = (cloud.points - cloud.points.median(0).values).norm(dim=-1).median()
-        extent = float(away) or start.scene.box.diagonal
-        self._scalars(covered, extent, most)
-        opaque = not start.scene.has_alpha  # else points lie on a surface, and are apart as they should be
-        return first_values(cloud, widths(start.scene, cloud.points, covered) if opaque else None)
+    def _first_values(self, start: Start) -> dict[str, Tensor]:
+        """Return the first value of every parameter: fresh, or of the stage before.
 
-    def _scalars(self, covered: float, extent: float, most: int) -> None:
-        """Pixels that show anything; median distance from the middle; most particles."""
-        self.register_buffer("covered", torch.tensor(float(covered)))
-        self.register_buffer("extent", torch.tensor(float(extent)))
-        self.register_buffer("most", torch.tensor(float(most)))
-
-    def _make(self, before: Particles | None, fresh: dict[str, Tensor] | None, on: Effects) -> None:
-        """Give every parameter its first value: of the stage before, fresh ones, or none at all."""
-        if before is not None:
-            covered = float(before.covered)
-            most = self.numbers_of.most(covered, self.views)  # by this stage's own density
-            self._scalars(covered, float(before.extent), most)
-            first = {n: p.data.to("cpu", copy=True) for n, p in before.named_parameters(recurse=False)}
-        elif fresh is not None:
-            first = fresh
+        Also register ``covered``: mean number of pixels of an image that show anything; ``extent``: median
+        distance of points from the middle; and ``most``: how many particles there will be.
+        """
+        if isinstance(start.before, Particles):
+            before = start.before
+            covered, extent = float(before.covered), float(before.extent)
+            values = {n: p.data.to("cpu", copy=True) for n, p in before.named_parameters(recurse=False)}
+        elif start.blank:
+            covered = extent = 1.0
+            values = first_values(Cloud(torch.zeros(1, 3), torch.zeros(1, 3), torch.zeros(1), 1.0))
         else:
-            self._scalars(1.0, 1.0, 1)
-            first = first_values(Cloud(torch.zeros(1, 3), torch.zeros(1, 3), torch.zeros(1), 1.0))
-        count = len(first["means"])
-        for name in ("means", "log_scales", "turns", "opacity", "color"):
-            setattr(self, name, nn.Parameter(first[name]))
-        degree, tints, fades = on.view_dependence or 0, on.color_over_time or 0, on.opacity_over_time or 0
-        for name, shape in (("shade", (degree * (degree + 2), 3)), ("tint", (tints, 3)), ("fade", (fades,))):
-            value = first.get(name)
-            if value is None or value.shape[1:] != shape:
-                value = torch.zeros(count, *shape)
-            setattr(self, name, nn.Parameter(value) if shape[0] else None)
+            covered = covered_pixels(start.scene, list(start.frames))
+            cloud = first_points(start, round(self.stage.first * self.stage.most(covered, self.views)))
+            distances = (cloud.points - cloud.points.median(0).values).norm(dim=-1)
+            extent = float(distances.median()) or start.scene.box.diagonal
+            # Points of a hull lie on its surface, and are as far apart as particles should be large.
+            widest = None if start.scene.has_alpha else widths(start.scene, cloud.points, covered)
+            values = first_values(cloud, widest)
+        self.register_buffer("covered", torch.tensor(covered))
+        self.register_buffer("extent", torch.tensor(extent))
+        self.register_buffer("most", torch.tensor(float(self.stage.most(covered, self.views))))
+        return values
 
-    def _grows(self) -> tuple[str, ...]:
-        names = ["means", "log_scales", "turns", "opacity", "color", "shade", "tint", "fade"]
-        names += ["pulled", "shown", "idle", "resting"]
-        rows = [] if self.skin is None else [f"skin.{name}" for name in Skin.ROWS]
-        return (*(name for name in names if getattr(self, name) is not None), *rows)
+    @classmethod
+    def check_feasible(
+        cls, scene: Scene, stage: str, numbers: Mapping[str, Any], device: torch.device
+    ) -> None:
+        """See ``Method``: without kernels, refuse images too large for the particles that they call for.
+
+        The number of particles grows as the root of the covered pixels, so that splats times pixels grow as
+        the third power of an image's side.
+
+        Raises:
+            ValueError: naming a size that is feasible.
+
+        Cost: with kernels nothing, else a look at twelve images.
+        """
+        if has_kernels(device):
+            return
+        cameras = [frame.camera for frame in (*scene.train, *scene.held, *scene.val, *scene.test)]
+        width, height = max(((c.width, c.height) for c in cameras), key=lambda size: size[0] * size[1])
+        settings, views = Numbers(name=stage, **numbers), len(scene.train)
+        covered = covered_pixels(scene, spread(views, _COUNTED_IMAGES))
+        count = settings.most(covered, views) * max(settings.first, settings.full)
+        scale = (FEASIBLE / (count * width * height)) ** (1 / 3)
+        if scale >= 1:
+            return
+        smaller_width, smaller_height = smaller(width, height, _SLACK * scale)
+        if device.type == "cpu":
+            key, why = "model", "have no kernels without Numba"
+            instead = "install forewarp[cpu] and leave FOREWARP_NUMBA unset"
+        else:
+            key, why, instead = "trainer", "have no kernels on a GPU", "use trainer=cpu"
+        raise ValueError(
+            f"{key}: expected pictures of at most {smaller_width} x {smaller_height} pixels, as particles "
+            f"{why}, but got {width} x {height} and {count:,.0f} particles; {instead}, "
+            "or use smaller pictures"
+        )
 
     @property
     def moves(self) -> bool:
@@ -140,6 +279,10 @@ class Particles(Method):
         """See ``Method``."""
         return "particles", len(self.means)
 
+    def at_rest(self) -> float:
+        """See ``HasRest``."""
+        return 0.0 if self.resting is None else float(self.resting.float().mean())
+
     def adopted(self) -> set[str]:
         """See ``Method``: nodes too are as many as a checkpoint says."""
         nodes = () if self.nodes is None else self.nodes.rows()
@@ -149,153 +292,168 @@ class Particles(Method):
         """See ``Method``; what is stored of nodes must go together, too."""
         if self.nodes is None:
             return super().misfit(state)
-        own, wide = self.nodes, self.skin.links.shape[1]  # few nodes are fewer to follow
-        rows = [f"skin.{name}" for name in Skin.ROWS]
-        links = {n: state[n][:, :1].expand(-1, wide) for n in rows if state[n].dim() == 2}
-        if len({state[n].shape for n in rows}) > 1:
-            return rows[0]
-        return own.misfit(state, "nodes.", state["skin.links"]) or super().misfit({**state, **links})
+        followed = self.skin.links.shape[1]  # a particle follows fewer nodes where there are few
+        links = {n: state[n][:, :1].expand(-1, followed) for n in Skin.ROWS if state[n].dim() == 2}
+        if len({state[name].shape for name in Skin.ROWS}) > 1:
+            return Skin.ROWS[0]
+        inconsistent = self.nodes.misfit(state, "nodes.", state["skin.links"])
+        return inconsistent or super().misfit({**state, **links})
 
     def at(self, moment: Moment) -> Snapshot:
-        """Move every particle; nothing is drawn yet."""
-        particles, warp = self.gaussians(), self.warp(moment.time)
-        return ParticlesSnapshot(moment, particles, warp, *self.over_time(moment.time), self.pinholes)
+        """Move every particle; nothing is rendered yet."""
+        bases = self.over_time(moment.time)
+        return ParticlesSnapshot(moment, self.gaussians(), self.warp(moment.time), *bases, self.blur)
 
     def gaussians(self) -> Gaussians:
-        """The particles as the operators read them."""
-        return packed(self)
+        """Return the particles as the operators read them: coefficients of one kind in one tensor."""
+        opacity = self.opacity if self.fade is None else torch.cat([self.opacity, self.fade], -1)
+        colors = [getattr(self, name) for name in self._color_parameters()]
+        colors = colors[0] if len(colors) == 1 else torch.cat(colors, 1)
+        return Gaussians(self.means, self.log_scales, self.turns, opacity, colors)
+
+    def _color_parameters(self) -> list[str]:
+        """Return the parameters of colour that there are, in the operators' order."""
+        return [name for name in ("color", "shade", "tint") if getattr(self, name) is not None]
 
     def warp(self, time: float) -> Warp:
-        """How everything moves until a time."""
+        """Return how all particles move from the canonical state to a time."""
         if self.nodes is not None:
             return Warp(self.nodes.maps(time), self.skin.links, self.skin.weights())
-        none = self.means.new_zeros(len(self.means), 1)
-        return Warp(self.means.new_zeros(1, 12), none.int(), none)
+        zero = self.means.new_zeros(len(self.means), 1)
+        return Warp(self.means.new_zeros(1, 12), zero.int(), zero)
 
     def over_time(self, time: float) -> tuple[Tensor, Tensor]:
-        """What a time makes of colours (T,) and of opacity (1 + F,)."""
-        tints = [] if self.tint is None else self.tints(time)
-        fades = [] if self.fade is None else self.fades(time)
+        """Return what a time makes of the coefficients of colour (T,) and of opacity (1 + F,)."""
+        tints = [] if self.tint is None else self.cosines(self.tint, time)
+        fades = [] if self.fade is None else self.cosines(self.fade, time)
         return self.means.new_tensor(tints), self.means.new_tensor([1.0, *fades])
 
-    def tints(self, time: float) -> list[float]:
-        """See ``over_time``."""
-        return cosines(self.tint.shape[1], time, self.canonical_time)
-
-    def fades(self, time: float) -> list[float]:
-        """See ``over_time``."""
-        return cosines(self.fade.shape[1], time, self.canonical_time)
-
-    def most_opaque(self) -> Tensor:
-        """The logit of each particle's opacity (N,) when it is largest."""
-        return opacity.most_opaque(self)
+    def cosines(self, coefficients: Tensor, time: float) -> list[float]:
+        """Return ``cos(pi k t) - cos(pi k t_c)``, k = 1 .. K, of coefficients (N, K, ...): 0 canonically."""
+        return [
+            math.cos(math.pi * k * time) - math.cos(math.pi * k * self.canonical_time)
+            for k in range(1, coefficients.shape[1] + 1)
+        ]
 
     @torch.no_grad()
     def look(self, batch: Batch, factors: Mapping[str, float], generator: torch.Generator) -> Step:
-        """See ``Method``. Pictures are drawn one after the other; each is whole."""
-        total, squared, pixels = {}, 0.0, 0
+        """See ``Method``. Images are rendered one after the other, each as a whole."""
+        gradients: dict[str, Tensor] = {}
         terms = dict.fromkeys(self.terms, 0.0)
-        weight = factors.get("photo", 0.0) / (float(self.covered) * len(batch.observations))
+        squared, numbers, views = 0.0, 0, len(batch.observations)
+        unit = float(self.covered) * views  # the loss is a mean over pixels that show anything
         for seen in batch.observations:
-            time = self._jittered(seen.moment.time, generator)
-            found, own = self._compared(seen, time, weight, factors, total)
-            squared, pixels = squared + found.squared, pixels + 3 * len(seen.view)
-            terms["photo"] += found.loss / (float(self.covered) * len(batch.observations))
-            for name, value in own.items():
-                terms[name] += value / len(batch.observations)
+            compared, of_nodes = self._compare(seen, factors, unit, generator, gradients)
+            squared, numbers = squared + compared.squared, numbers + 3 * len(seen.view)
+            terms["photo"] += compared.loss / unit
+            for name, value in of_nodes.items():
+                terms[name] += value / views
         values = {name: (lambda v=v: self.means.new_tensor(v)) for name, v in terms.items()}
         if self.nodes is None:
             values["rigid"] = values["smooth"] = lambda: None
-        error = torch.tensor(squared / pixels, dtype=torch.float64)
-        return Step(values, error, {"particles": len(self.means)}, total)
+        error = torch.tensor(squared / numbers, dtype=torch.float64)
+        return Step(values, error, {"particles": len(self.means)}, gradients)
 
-    def _jittered(self, time: float, generator: torch.Generator) -> float:
-        spread = self.numbers_of.jitter * max(0.0, 1 - self.progress / self.numbers_of.calm)
-        if self.nodes is None or spread == 0:
-            return time
-        return min(1.0, max(0.0, time + spread * float(torch.randn((), generator=generator))))
-
-    def _compared(self, seen, time: float, weight: float, factors, total: dict) -> tuple:
-        """Compare one picture; adds gradients to ``total``, and gives what the nodes' terms are."""
+    def _compare(
+        self,
+        seen: Observation,
+        factors: Mapping[str, float],
+        unit: float,
+        generator: torch.Generator,
+        gradients: dict[str, Tensor],
+    ) -> tuple[Compared, dict[str, float]]:
+        """Compare with one image, add to ``gradients``, and return the terms of the nodes, too."""
+        time = self._jittered(seen.moment.time, generator)
         tints, fades = self.over_time(time)
-        own, warp = {}, None
-        if self.nodes is not None:
-            taken = self.nodes.taken(time)
-            self.nodes.look_ahead(taken)
-            basis = self.nodes.basis_of_motion((taken, 1.0))
+        if self.nodes is None:
+            warp = self.warp(time)
+        else:
+            motion_time = self.nodes.taken(time)
+            self.nodes.look_ahead(motion_time)
+            basis = self.nodes.basis_of_motion((motion_time, 1.0))
             motion, maps = self.nodes.carried(basis)
             warp = Warp(maps, self.skin.links, self.skin.weights())
-        found = compare(
-            self.gaussians(), warp or self.warp(time), self.pinholes(seen.view.camera), tints, fades,
-            seen.rgb, seen.background, width=self.width, factor=weight, by_skin=warp is not None,
-            kinds=kinds_of(self),
+        colors = self._color_parameters()
+        compared = compare(
+            self.gaussians(), warp, pinhole_of(seen.view.camera, self.blur), tints, fades, seen.rgb,
+            seen.background, width=self.width, factor=factors.get("photo", 0.0) / unit,
+            by_skin=self.moves, kinds=[getattr(self, name).shape[1] for name in colors],
         )  # fmt: skip
-        self.pulled.add_(found.pull)
-        shown = found.pull > 0
+        shown = compared.pull > 0
+        self.pulled.add_(compared.pull)
         self.shown.add_(shown)
-        self.fading.append(shown)
-        if self.progress < self.numbers_of.settled:
-            self.idle[too_near(found.order, found.distances)] = math.inf
-        add(total, by_name(self, found.particles))
+        self.shown_now.append(shown)
+        if self.progress < self.stage.settled:
+            self.idle[density.too_near(compared.order, compared.distances)] = math.inf
+        found = compared.particles
+        new = {"means": found.means, "log_scales": found.log_scales, "turns": found.quaternions}
+        new |= {"opacity": found.opacity[:, :1], **dict(zip(colors, found.colors, strict=True))}
+        if self.fade is not None:
+            new["fade"] = found.opacity[:, 1:]
+        terms = {}
         if self.nodes is not None:
-            add(total, {"skin.learned": found.skin})
-            nodes, rigid = self.nodes, factors.get("rigid", 0.0) * self._loose()
-            slope, strain = pull_nodes(
-                motion, nodes.places, found.maps, nodes.edges, nodes.edge_weights, rigid
+            nodes, rigid = self.nodes, factors.get("rigid", 0.0) * self.stage.loose**self.progress
+            by_motion, terms["rigid"] = pull_nodes(
+                motion, nodes.places, compared.maps, nodes.edges, nodes.edge_weights, rigid
             )
-            own["rigid"] = strain
-            smooth = factors.get("smooth", 0.0)
-            own["smooth"], over_time = nodes.spread_over_time(
-                time, taken, basis, slope, smooth, float(self.extent)
+            smooth, extent = factors.get("smooth", 0.0), float(self.extent)
+            terms["smooth"], of_nodes = nodes.spread_over_time(
+                time, motion_time, basis, by_motion, smooth, extent
             )
-            add(total, over_time)
-        return found, own
+            new |= {"skin.learned": compared.skin, **of_nodes}
+        for name, value in new.items():
+            gradients[name] = value if name not in gradients else gradients[name] + value
+        return compared, terms
 
-    def _loose(self) -> float:
-        """What is left of the rigidity, by how much of the stage is done."""
-        return self.numbers_of.loose**self.progress
+    def _jittered(self, time: float, generator: torch.Generator) -> float:
+        """Shift an image's time at random, less and less, so that curves do not follow single images."""
+        deviation = self.stage.jitter * max(0.0, 1 - self.progress / self.stage.calm)
+        if self.nodes is None or deviation == 0:
+            return time
+        return min(1.0, max(0.0, time + deviation * float(torch.randn((), generator=generator))))
 
     def advance(self, progress: float, step: int, optimizer: torch.optim.Optimizer) -> dict[str, float]:
-        """Rates of lengths are of the scene's extent, that of weights follows what the pictures tell, and the
-        decay of opacity its rate; renew particles where it is time.
+        """See ``Method``: scale learning rates by the scene, and renew particles where it is time.
+
+        Rates of lengths are of the scene's extent; that of the skin follows the number of images, and the
+        decay of opacity the rate of opacity.
         """
-        self.progress, numbers = progress, self.numbers_of
-        opacity.bound(self)
+        self.progress, stage = progress, self.stage
+        density.bound_opacity(self)
         for group in optimizer.param_groups:
             if group["name"] in ("means", "shifts"):
                 group["lr"] *= float(self.extent)
             elif group["name"] == "time_offsets":
-                self.nodes.offsets.learns = progress >= numbers.calm
+                self.nodes.offsets.learns = progress >= stage.calm
                 if self.nodes.offsets.learns:
                     self.nodes.offsets.settle(group["lr"])
             elif group["name"] == "opacity":
-                share = numbers.decay(float(self.most), float(self.covered))
-                self.decay = min(0.99, share * group["lr"] / (group["base_lr"] or 1.0))  # rates may rise
+                decay = stage.decay(float(self.most), float(self.covered))
+                self.decay = min(0.99, decay * group["lr"] / (group["base_lr"] or 1.0))  # rates may rise
             elif group["name"] == "skin":
-                group["lr"] *= told_by(self.views)
-        number = int(progress / numbers.every)
-        if number > int(self.round) and progress < numbers.settled:
+                group["lr"] *= view_share(self.views)
+        number = int(progress / stage.every)
+        if number > int(self.round) and progress < stage.settled:
             self.round.fill_(number)
             self._renew(progress, optimizer)
         return {}
 
     def _renew(self, progress: float, optimizer: torch.optim.Optimizer) -> None:
-        target = round(float(self.most) * self.numbers_of.share_at(progress))
+        """Run a round of density control; every few rounds, link particles to nodes anew, and let rest."""
+        target = round(float(self.most) * self.stage.share_at(progress))
         low, high = self.ends if self.nodes is None else self.nodes.seen.tolist()
-        whole = low <= self.ends[0] + 0.02 and high >= self.ends[1] - 0.02
-        renew(self, optimizer, target, unseen=whole and self.nodes is not None, extent=float(self.extent))
-        if self.nodes is not None and int(self.round) % self.numbers_of.relink == 0:
+        all_seen = self.moves and low <= self.ends[0] + 0.02 and high >= self.ends[1] - 0.02
+        density.renew(self, optimizer, target, unseen=all_seen, extent=float(self.extent))
+        if self.moves and int(self.round) % self.stage.relink == 0:
             self.skin.relink(self.nodes, self.means.data, optimizer)
             if self.resting is not None:
                 self.skin.let_go(self.resting)
-                if progress >= self.numbers_of.rest:
-                    least = max(self.least_motion, pixel_width(float(self.covered)))
-                    come_to_rest(self, least * float(self.extent))
+                if progress >= self.stage.rest:
+                    least = max(self.least_motion, density.pixel_width(float(self.covered)))
+                    density.come_to_rest(self, least * float(self.extent))
 
     def warm_up(self) -> None:
         """Compile the operators' kernels."""
-        from forewarp.methods.particles.warmup import compile_kernels
-
         compile_kernels(self)
 
     def param_groups(self) -> dict[str, list[nn.Parameter]]:
@@ -306,41 +464,23 @@ class Particles(Method):
         return groups
 
     def optimizer(self, groups: list[dict]) -> torch.optim.Optimizer:
-        """Adam by rows, whose steps take of opacity what pictures take."""
-        made = RowsAdam(groups)
-        made.register_step_post_hook(lambda *_: opacity.fade(self))
-        return made
-
-    def trajectories(self, points: Tensor, times: Tensor) -> Tensor:
-        """See ``HasTrajectories``: points go with the particles beside them."""
-        return matter.paths_of(self, points, times)
-
-    def bounds(self, times: list[float]) -> Box | None:
-        """See ``HasBounds``."""
-        return matter.bounds_of(self, times)
-
-    def at_rest(self) -> float:
-        """See ``HasRest``."""
-        return 0.0 if self.resting is None else float(self.resting.float().mean())
-
-    def matter(self) -> Cloud:
-        """See ``HasMatter``."""
-        return matter.matter_of(self)
-
-    def ellipsoids(self, time: float) -> Ellipsoids:
-        """See ``HasEllipsoids``."""
-        return matter.ellipsoids_of(self, time)
-
-    def template(self) -> Ellipsoids:
-        """See ``HasEllipsoids``."""
-        return matter.template_of(self)
-
-    def movement(self, times: Sequence[float]) -> dict[str, Tensor]:
-        """See ``HasEllipsoids``."""
-        return matter.movement_of(self, times)
+        """Make an Adam that passes over unseen rows; after a step, let the opacity of what was seen decay."""
+        optimizer = RowsAdam(groups)
+        optimizer.register_step_post_hook(lambda *_: density.decay_opacity(self))
+        return optimizer
 
     def departures(self) -> list[str]:
         """See ``Method``."""
         return [
             "from the forward-flow paper: particles that are rasterised, not voxels that rays march through"
         ]
+
+
+def _coefficients(before: Tensor | None, *shape: int) -> nn.Parameter | None:
+    """Make an effect's coefficients (N, K, ...): those of the stage before, if it has as many, else 0.
+
+    None where the effect is off (K = 0).
+    """
+    if shape[1] == 0:
+        return None
+    return nn.Parameter(before if before is not None and before.shape == shape else torch.zeros(shape))

@@ -1,28 +1,33 @@
-"""How particles move: nodes with smooth curves of place and turn, and who follows which of them."""
+"""How particles move: nodes with smooth curves, which of them a particle follows, and the images' times."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from bisect import bisect_left
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor, nn
 
 from forewarp.fields.curves import Curve
-from forewarp.methods.particles.time_offsets import FARTHEST, TimeOffsets
-from forewarp.ops.nodes import carry_nodes, spread_nodes
+from forewarp.ops.nodes import carry_nodes, skin_weights, spread_nodes
 from forewarp.scene.cloud import far_apart
 
 LINKS = 6  # nodes that a particle follows
 _LEAST = 1e-20  # squared distance; what is nearer together coincides, and cannot be strained
-_DAMP = 0.5  # of a curve's last stride, where it is continued to times not yet seen
-_NEAR = 1e-3  # half of the time over which a slope by time is taken
-_BEYOND = FARTHEST + 2 * _NEAR  # of all time, by which more of a curve is asked for
+_DAMP = 0.5  # of a curve's last step, where it is continued to times not yet seen
+_HALF_STEP = 1e-3  # of all time: for central differences by time
 _FULL = 0.05  # share of a spline's basis at a time, from which on its knot counts as seen
+_FARTHEST = 0.2  # of all time: no offset of a time is larger
+_BEYOND = _FARTHEST + 2 * _HALF_STEP  # of all time, by which a curve must reach beyond [0, 1]
+_FEWEST_TIMES = 8  # below which neighbours do not tell how things move
+_PULL = 0.1  # of the learning rate: by how much a step draws an offset towards 0
 
 
 def nearest(points: Tensor, places: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Squared distances and rows (N, count) of the places (M, 3) nearest to points (N, 3); less, where there
-    are fewer.
+    """Find the places (M, 3) nearest to points (N, 3).
+
+    Returns:
+        squared distances and rows (N, count), nearest first; fewer where there are fewer places.
 
     Raises:
         ValueError: for points or places that are not finite.
@@ -31,14 +36,77 @@ def nearest(points: Tensor, places: Tensor, count: int) -> tuple[Tensor, Tensor]
     """
     from scipy.spatial import KDTree  # late, as its import takes time
 
-    known = range(1, min(count, len(places)) + 1)
+    ranks = range(1, min(count, len(places)) + 1)
     if not len(points):
-        return points.new_zeros(0, len(known)), torch.zeros(
-            0, len(known), dtype=torch.int64, device=points.device
+        return points.new_zeros(0, len(ranks)), torch.zeros(
+            0, len(ranks), dtype=torch.int64, device=points.device
         )
     tree = KDTree(places.detach().double().cpu().numpy())
-    away, rows = tree.query(points.detach().double().cpu().numpy(), list(known))
-    return torch.from_numpy(away).square().to(points), torch.from_numpy(rows).to(points.device)
+    distances, rows = tree.query(points.detach().double().cpu().numpy(), list(ranks))
+    return torch.from_numpy(distances).square().to(points), torch.from_numpy(rows).to(points.device)
+
+
+class TimeOffsets(nn.Module):
+    """Learned corrections of the times that are written beside images: from these to times of the motion.
+
+    T training times are each off by ``off`` (T, 1), in units of their mean distance; times in between are
+    interpolated linearly. Published sequences hold their first image twice, leave one out before the last,
+    or round their times. A smooth motion cannot fit such times; the error then shows as a wrong depth, which
+    one image cannot tell.
+
+    Args:
+        times: distinct, two or more.
+        most: bound of ``off``; of few times less, so that none is off by more than a fifth of all time.
+    """
+
+    def __init__(self, times: Sequence[float], most: float) -> None:
+        super().__init__()
+        self.times = sorted(times)
+        self.step = (self.times[-1] - self.times[0]) / (len(times) - 1)
+        self.most = min(most, _FARTHEST / self.step)
+        self.learns = True
+        self.off = nn.Parameter(torch.zeros(len(times), 1))
+
+    @classmethod
+    def of(cls, motion: str, times: Sequence[float], most: float) -> TimeOffsets | None:
+        """Make the offsets of a motion; None if ``most`` is 0, of fewer than 8 times, and of cosines, which
+        are exactly 0 at the canonical time.
+        """
+        return cls(times, most) if most and motion == "spline" and len(times) >= _FEWEST_TIMES else None
+
+    def weights(self, time: float) -> dict[int, float]:
+        """Return the rows of the one or two training times around a time, each with its weight.
+
+        >>> TimeOffsets([0.0, 0.5, 1.0], 1.5).weights(0.625)
+        {1: 0.75, 2: 0.25}
+        """
+        after = bisect_left(self.times, time)
+        if after in (0, len(self.times)):
+            return {min(after, len(self.times) - 1): 1.0}
+        low, high = self.times[after - 1 : after + 1]
+        share = (time - low) / (high - low)
+        return {row: weight for row, weight in ((after - 1, 1 - share), (after, share)) if weight > 0}
+
+    def __call__(self, time: float) -> float:
+        """Return the time of the motion, up to ``most`` steps beyond [0, 1]."""
+        off = sum(weight * self.off.detach()[row].item() for row, weight in self.weights(time).items())
+        return time + self.step * min(max(off, -self.most), self.most)
+
+    def gradients(self, time: float, by_motion_time: float) -> Tensor:
+        """Return the gradients by ``off``, given the one by the time of the motion."""
+        gradients = torch.zeros_like(self.off)
+        for row, weight in self.weights(time).items():
+            gradients[row] = weight * self.step * by_motion_time
+        return gradients
+
+    @torch.no_grad()
+    def settle(self, rate: float) -> None:
+        """Draw offsets that no image holds towards 0, and keep all to the bound.
+
+        A time's images count once in about T steps, so that a step draws by a T-th of a share of the rate.
+        """
+        size = (self.off.abs() - _PULL * rate / len(self.times)).clamp(0.0, self.most)
+        self.off.copy_(size * self.off.sign())
 
 
 class Nodes(nn.Module):
@@ -47,9 +115,9 @@ class Nodes(nn.Module):
 
     Args:
         points: (N, 3) canonical points that are to move; None: a checkpoint will say.
-        count: of nodes.
-        curve: of every node.
-        offsets: learned corrections of the pictures' times; None: times are used as they are given.
+        count: number of nodes.
+        curve: the curve of every node.
+        offsets: learned corrections of the images' times; None: times are used as they are given.
         turns: whether nodes turn.
         rests: whether nodes may ``stop``; ``still`` (M,) bool says which have.
         edges: neighbours that a node is kept rigid with.
@@ -72,15 +140,15 @@ class Nodes(nn.Module):
         self.curve, self.offsets = curve, offsets
         places = torch.zeros(1, 3) if points is None else points[far_apart(points, count)].clone()
         self.register_buffer("places", places)
-        away, beside = nearest(places, places, edges + 1)
-        away, beside = away[:, 1:], beside[:, 1:]  # the nearest is the node itself
-        unit = away.mean() if away.numel() else torch.tensor(1.0)
-        apart = away + 1e-3 * unit
-        tight = (apart > _LEAST) / apart.clamp(min=_LEAST)
-        self.register_buffer("edges", beside.contiguous())
-        self.register_buffer("edge_weights", tight / max(beside.numel(), 1))
-        near = away[:, :3].sqrt().mean(-1) if away.shape[1] else torch.ones(len(places))
-        self.register_buffer("spread", near.clamp(min=1e-6 * max(float(unit), _LEAST) ** 0.5))
+        squared, neighbours = nearest(places, places, edges + 1)
+        squared, neighbours = squared[:, 1:], neighbours[:, 1:]  # the nearest is the node itself
+        unit = squared.mean() if squared.numel() else torch.tensor(1.0)
+        padded = squared + 1e-3 * unit
+        stiffness = (padded > _LEAST) / padded.clamp(min=_LEAST)
+        self.register_buffer("edges", neighbours.contiguous())
+        self.register_buffer("edge_weights", stiffness / max(neighbours.numel(), 1))
+        spread = squared[:, :3].sqrt().mean(-1) if squared.shape[1] else torch.ones(len(places))
+        self.register_buffer("spread", spread.clamp(min=1e-6 * max(float(unit), _LEAST) ** 0.5))
         self.shift = nn.Parameter(torch.zeros(len(places), curve.count, 3))
         self.turn = nn.Parameter(torch.zeros(len(places), curve.count, 3)) if turns else None
         self.register_buffer("seen", torch.tensor([curve.canonical_time] * 2))
@@ -90,74 +158,78 @@ class Nodes(nn.Module):
         return len(self.places)
 
     def links(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Who points (N, 3) follow: rows (N, L) int32 of nodes, and their shares (N, L).
+        """Return the nodes that points (N, 3) follow: rows (N, L) int32, and their shares (N, L).
 
         ``exp(-(d^2 - d_min^2) / (2 s^2))``, normalised, s the mean distance of a node to its nearest three.
         """
-        away, rows = nearest(points, self.places, LINKS)
-        shares = torch.exp(-(away - away[:, :1]) / (2 * self.spread[rows] ** 2))
+        squared, rows = nearest(points, self.places, LINKS)
+        shares = torch.exp(-(squared - squared[:, :1]) / (2 * self.spread[rows] ** 2))
         return rows.int(), (shares / shares.sum(-1, keepdim=True)).contiguous()
 
-    def basis(self, time: float) -> Tensor:
-        """The curve's basis (K,) at a given time, as the coefficients are."""
-        return self.basis_of_motion((self.taken(time), 1.0))
-
     def taken(self, time: float) -> float:
-        """The time of the motion in a picture of a given time."""
+        """Return the time of the motion that an image of a given time shows."""
         return time if self.offsets is None else self.offsets(time)
 
+    def basis(self, time: float) -> Tensor:
+        """Return the curve's basis (K,) at a given time."""
+        return self.basis_of_motion((self.taken(time), 1.0))
+
     def basis_of_motion(self, *parts: tuple[float, float]) -> Tensor:
-        """The sum of the curve's bases (K,) at times of the motion, each with its factor."""
+        """Return the sum of the curve's bases (K,) at times of the motion, each with its factor."""
         return self.curve.summed(parts, 0.0 if self.offsets is None else _BEYOND).to(self.places)
 
     def carried(self, basis: Tensor) -> tuple[Tensor, Tensor]:
-        """Where nodes went and how they turned (M, 6), by a curve's basis (K,), and their maps (M, 12)."""
+        """Return the motion of nodes (M, 6) for a curve's basis (K,), and their maps (M, 12)."""
         return carry_nodes(self.shift, self.turn, basis, self.places)
 
     def maps(self, time: float) -> Tensor:
-        """``ops.nodes.node_maps`` (M, 12) at a time."""
+        """Return ``ops.nodes.node_maps`` (M, 12) at a time."""
         return self.carried(self.basis(time))[1]
 
     def param_groups(self) -> dict[str, list[nn.Parameter]]:
-        """What is learned, by the name of its rate."""
+        """Return what is learned, by the name of its learning rate."""
         off = None if self.offsets is None else self.offsets.off
-        parts = {"shifts": self.shift, "node_turns": self.turn, "time_offsets": off}
-        return {name: [part] for name, part in parts.items() if part is not None}
+        groups = {"shifts": self.shift, "node_turns": self.turn, "time_offsets": off}
+        return {name: [parameter] for name, parameter in groups.items() if parameter is not None}
+
+    def _coefficients(self) -> list[nn.Parameter]:
+        return [self.shift] if self.turn is None else [self.shift, self.turn]
 
     @torch.no_grad()
-    def look_ahead(self, taken: float) -> None:
+    def look_ahead(self, motion_time: float) -> None:
         """Note that a time of the motion is seen, and continue curves beyond those seen so far: a knot beyond
         them starts as a damped continuation of the two before it.
         """
-        taken, (first, last) = min(max(taken, 0.0), 1.0), self.seen.tolist()
-        if first <= taken <= last:
+        motion_time, (first, last) = min(max(motion_time, 0.0), 1.0), self.seen.tolist()
+        if first <= motion_time <= last:
             return
         reach = self.curve.reach()
         if reach is None:
             return
-        self.seen[0], self.seen[1] = min(taken, first), max(taken, last)
-        middle = reach.mean(-1)
+        self.seen[0], self.seen[1] = min(motion_time, first), max(motion_time, last)
+        count = len(reach)
         slack = _FULL * float(reach[0, 1] - reach[0, 0])
         after = (reach[:, 0] > float(self.seen[1]) - slack).nonzero()[:, 0].tolist()
         before = (reach[:, 1] < float(self.seen[0]) + slack).nonzero()[:, 0].tolist()
-        for value in (self.shift, self.turn):
-            if value is None:
-                continue
+        for value in self._coefficients():
             for knots, step in ((after, -1), (before[::-1], 1)):
                 for j in knots:
                     near, far = j + step, j + 2 * step
-                    if 0 <= far < len(middle):
+                    if 0 <= far < count:
                         value[:, j] = value[:, near] + _DAMP * (value[:, near] - value[:, far])
+
+    def _bases(self, times: list[float]) -> Tensor:
+        return torch.stack([self.basis(time) for time in times])
 
     @torch.no_grad()
     def reach_of(self, times: list[float]) -> Tensor:
-        """How far each node takes what is beside it (M,) from its mean place over some times, world units."""
-        far = torch.zeros(len(self.places)).to(self.places)
-        for value, arm in ((self.shift, 1.0), (self.turn, 2 * self.spread)):  # |r| is half the angle
-            if value is not None:
-                went = torch.einsum("mkc,tk->tmc", value, self._bases(times))
-                far += arm * (went - went.mean(0)).norm(dim=-1).amax(0)
-        return far
+        """Return how far each node takes what is beside it (M,) from its mean place, world units."""
+        distance = torch.zeros(len(self.places)).to(self.places)
+        # A Gibbs vector is half the angle, and what turns lies about ``spread`` from the node.
+        for value, arm in zip(self._coefficients(), (1.0, 2 * self.spread)):
+            went = torch.einsum("mkc,tk->tmc", value, self._bases(times))
+            distance += arm * (went - went.mean(0)).norm(dim=-1).amax(0)
+        return distance
 
     @torch.no_grad()
     def stop(self, which: Tensor, times: list[float]) -> None:
@@ -168,16 +240,12 @@ class Nodes(nn.Module):
         which = which & ~self.still
         self.still |= which
         mean = self._bases(times).mean(0)
-        for value in (self.shift, self.turn):
-            if value is not None:
-                stays = torch.einsum("mkc,k->mc", value[which], mean)
-                value[which] = stays[:, None] if self.curve.kind == "spline" else 0.0
-
-    def _bases(self, times: list[float]) -> Tensor:
-        return torch.stack([self.basis(time) for time in times])
+        for value in self._coefficients():
+            stays = torch.einsum("mkc,k->mc", value[which], mean)
+            value[which] = stays[:, None] if self.curve.kind == "spline" else 0.0
 
     def rows(self) -> list[str]:
-        """What has a row a node."""
+        """Return the names of what has a row for each node."""
         return [name for name in self.ROWS if getattr(self, name) is not None]
 
     def misfit(self, state: Mapping[str, Tensor], prefix: str, links: Tensor) -> str | None:
@@ -185,58 +253,106 @@ class Nodes(nn.Module):
 
         All have as many rows as there are places, and nothing points at a node that there is not.
         """
-        many = len(state[prefix + "places"])
+        count = len(state[prefix + "places"])
         for name in self.rows():
-            own, theirs = getattr(self, name), state[prefix + name]
+            here, stored = getattr(self, name), state[prefix + name]
             free = 2 if name in ("edges", "edge_weights") else 1  # few nodes have few neighbours
-            fits = theirs.dtype == own.dtype and theirs.dim() == own.dim() and len(theirs) == many
-            if not fits or theirs.shape[free:] != own.shape[free:]:
+            fits = stored.dtype == here.dtype and stored.dim() == here.dim() and len(stored) == count
+            if not fits or stored.shape[free:] != here.shape[free:]:
                 return prefix + name
         if state[prefix + "edges"].shape != state[prefix + "edge_weights"].shape:
             return prefix + "edges"
         for name, rows in ((prefix + "edges", state[prefix + "edges"]), ("skin.links", links)):
-            if rows.numel() and not 0 <= int(rows.min()) <= int(rows.max()) < many:
+            if rows.numel() and not 0 <= int(rows.min()) <= int(rows.max()) < count:
                 return name
         return None
 
     def _load_from_state_dict(self, state, prefix, *args, **kwargs) -> None:
-        for name in self.ROWS:  # a checkpoint says how many nodes there are
-            own = getattr(self, name)
-            if own is not None and prefix + name in state:
-                own.data = own.data.new_empty(state[prefix + name].shape)
+        for name in self.rows():  # a checkpoint says how many nodes there are
+            if prefix + name in state:
+                here = getattr(self, name)
+                here.data = here.data.new_empty(state[prefix + name].shape)
         super()._load_from_state_dict(state, prefix, *args, **kwargs)
 
     def spread_over_time(
-        self, time: float, taken: float, basis: Tensor, slope: Tensor, factor: float, unit: float
+        self, time: float, motion_time: float, basis: Tensor, by_motion: Tensor, factor: float, unit: float
     ) -> tuple[float, dict[str, Tensor]]:
-        """From slopes (M, 6) by ``motion`` to those by coefficients, and by the offset of a picture's given
-        ``time`` from that of the motion, ``taken``; by name. Curves are kept smooth.
+        """Carry gradients by the motion at a time to the coefficients and time offsets; keep curves smooth.
 
-        What is kept small is ``mean |x(t + h) - 2 x(t) + x(t - h)|^2 / unit^2``, h a knot's distance to the
-        next: only where and as often as a curve is seen. Its value comes first.
+        Added to the loss is ``factor mean |x(t + h) - 2 x(t) + x(t - h)|^2 / unit^2``, h the distance of
+        two knots: only where and as often as a curve is seen.
+
+        Args:
+            time, motion_time: given time of an image, and the time of the motion that it shows.
+            basis: the curve's (K,) at ``motion_time``.
+            by_motion: gradients (M, 6) by the motion of nodes.
+            factor: weight of the second differences.
+            unit: a length, world units.
+
+        Returns:
+            the mean of the squared second differences, and gradients by name.
         """
-        bend = self._bend(taken) if factor else torch.zeros_like(basis)
-        *found, bent = spread_nodes(self.shift, self.turn, slope, basis, bend, factor, unit)
+        bend = self._second_difference(motion_time) if factor else torch.zeros_like(basis)
+        *gradients, bent = spread_nodes(self.shift, self.turn, by_motion, basis, bend, factor, unit)
         if self.still is not None and bool(self.still.any()):
-            for part in found:
-                if part is not None:
-                    part[self.still] = 0.0  # rounding errors would be steps, as Adam takes them
+            for gradient in gradients:
+                if gradient is not None:
+                    gradient[self.still] = 0.0  # rounding errors would be steps, as Adam takes them
         if self.offsets is not None and self.offsets.learns:
-            found.append(self.offsets.slopes(time, self._by_time(taken, slope)))
+            late, early = motion_time + _HALF_STEP, motion_time - _HALF_STEP
+            along = self.basis_of_motion((late, 0.5 / _HALF_STEP), (early, -0.5 / _HALF_STEP))
+            by_time = (self.carried(along)[0].detach() * by_motion).sum().item()
+            gradients.append(self.offsets.gradients(time, by_time))
         names = ("nodes.shift", "nodes.turn", "nodes.offsets.off")
-        return bent, {name: part for name, part in zip(names, found) if part is not None}
+        return bent, {name: value for name, value in zip(names, gradients) if value is not None}
 
-    def _by_time(self, taken: float, slope: Tensor) -> float:
-        """From slopes (M, 6) by ``motion`` to the one by its time."""
-        along = self.basis_of_motion((taken + _NEAR, 0.5 / _NEAR), (taken - _NEAR, -0.5 / _NEAR))
-        return (self.carried(along)[0].detach() * slope).sum().item()
-
-    def _bend(self, taken: float) -> Tensor:
-        """The second difference (K,) of the basis around a time of the motion, within those seen."""
+    def _second_difference(self, motion_time: float) -> Tensor:
+        """Return the second difference (K,) of the basis around a time of the motion, within those seen."""
         step, (low, high) = 1 / max(self.curve.pieces, 2), self.seen.tolist()
         low, high = low + step, high - step
         if low > high:
             return self.places.new_zeros(self.curve.count)
-        middle = min(max(taken, low), high)
+        middle = min(max(motion_time, low), high)
         before, after = max(middle - step, 0.0), min(middle + step, 1.0)
         return self.basis_of_motion((after, 1.0), (middle, -2.0), (before, 1.0))
+
+
+class Skin(nn.Module):
+    """N particles follow up to L nodes each: ``links`` (N, L) int32, by ``weights`` that sum to 1.
+
+    A weight is that of the distance, ``shares`` (N, L), times ``exp(learned)``: what lies beside two parts
+    that move apart learns which of them it belongs to. A particle at rest has the shares 0, and follows none.
+    """
+
+    ROWS = ("skin.links", "skin.shares", "skin.learned")
+
+    def __init__(self, nodes: Nodes, points: Tensor) -> None:
+        super().__init__()
+        links, shares = nodes.links(points)
+        self.register_buffer("links", links)
+        self.register_buffer("shares", shares)
+        self.learned = nn.Parameter(torch.zeros_like(shares))
+
+    def weights(self) -> Tensor:
+        """Return the weights (N, L), differentiable in ``learned``."""
+        return skin_weights(self.shares, self.learned)
+
+    @torch.no_grad()
+    def relink(self, nodes: Nodes, points: Tensor, optimizer: torch.optim.Optimizer) -> None:
+        """Look for the nodes beside points (N, 3) again.
+
+        What was learned of those that stay is kept, with its moments: as factors of the shares, so that one
+        that comes anew begins with its share.
+        """
+        level = (self.learned + self.shares.log()).logsumexp(-1, keepdim=True).nan_to_num(neginf=0.0)
+        old_links, old_factors = self.links, self.learned - level
+        self.links, self.shares = nodes.links(points)
+        stays = self.links[:, :, None] == old_links[:, None]
+        self.learned.copy_((stays * old_factors[:, None]).sum(-1))
+        moments = optimizer.state.get(self.learned, {})
+        for name in {"exp_avg", "exp_avg_sq"} & moments.keys():
+            moments[name] = (stays * moments[name][:, None]).sum(-1)
+
+    def let_go(self, which: Tensor) -> None:
+        """Let particles (N,) bool follow no node."""
+        self.shares[which] = 0.0

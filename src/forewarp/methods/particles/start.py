@@ -1,76 +1,96 @@
-"""Where particles begin: on the visual hull, at known points, or where neighbouring views agree."""
+"""Where particles begin: on the visual hull, at known points, or where neighbouring views agree; and their
+kernels compiled ahead.
+"""
 
 from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from tempfile import TemporaryFile
 
 import torch
 from torch import Tensor
 
 from forewarp.methods.method import Start
 from forewarp.methods.particles.nodes import nearest
-from forewarp.methods.particles.sweep import seen_colors, swept
-from forewarp.ops.gaussians import FLAT
+from forewarp.ops.adam import Learned, adam_rows
+from forewarp.ops.backend import cores, use_numba
+from forewarp.ops.gaussians import (
+    FLAT,
+    Gaussians,
+    Pinhole,
+    Warp,
+    compare,
+    compile_way_back,
+    project,
+    rasterize,
+)
 from forewarp.ops.grid import dilate
+from forewarp.ops.nodes import carry_nodes, pull_nodes, skin_weights, spread_nodes
 from forewarp.scene.box import Box, Lattice
+from forewarp.scene.camera import Camera
 from forewarp.scene.cloud import Cloud
 from forewarp.scene.frame import Scene, spread
 from forewarp.scene.silhouettes import visual_hull
 
-_FRAMES = 12  # whose silhouettes are looked at
-_DRIFT = 0.2  # share of a picture's width by which a silhouette is taken to move in all the time there is
+_FRAMES = 12  # whose silhouettes carve the hull
+_DRIFT = 0.2  # share of an image's width by which a silhouette is taken to move in all the time there is
 _ROUGH, _FINE = 48, 112  # voxels along the mean side of the box, and of what is left of it
 _FEW = 16  # points that are too few to begin with
 _CAMERAS = 64  # whose distance from a point is looked at
 
+_DEPTHS = 48  # planes of a sweep, evenly in inverse depth
+_SIDE = 64  # lattice points along the longer side of an image
+_SWEPT, _NEIGHBOURS = 10, 8  # images that are swept; neighbours in time of each
+_NEAREST_PLANE = 0.02  # share of the far plane at which planes begin at the earliest
+
+_PATIENCE_S = 120.0  # that the other compiling process is waited for
+
 
 def first_points(start: Start, count: int) -> Cloud:
-    """About ``count`` points to begin with, and their colours.
+    """Find at most about ``count`` points to begin with, and their colours.
 
-    What a stage before left comes first; then the visual hull, where pictures have alpha; then points that
-    are known to stand still, and what neighbouring views agree on; in the end random points of the box.
+    Of the first that there is: what the stage before left; the visual hull, where images have alpha; points
+    that are known to stand still with what neighbouring views agree on; random points of the box.
 
     Cost: of the hull, about a second; of neighbouring views, a few.
     """
-    handed, scene = None if start.handover is None else start.handover.cloud, start.scene
+    left, scene = None if start.handover is None else start.handover.cloud, start.scene
     cloud = None
-    if handed is not None and len(handed) >= _FEW:
-        keep = handed.opacity > 0.05
-        cloud = handed[keep] if int(keep.sum()) >= _FEW else handed
+    if left is not None and len(left) >= _FEW:
+        visible = left.opacity > 0.05
+        cloud = left[visible] if int(visible.sum()) >= _FEW else left
     elif scene.has_alpha:
         cloud = hull_surface(scene, list(start.frames), count)
     if cloud is None:
         cloud = swept(scene, list(start.frames), count)
     if cloud is None or len(cloud) < _FEW:
         cloud = anywhere(scene.box, count)
-    return thinned(cloud, count)
-
-
-def thinned(cloud: Cloud, count: int) -> Cloud:
-    """At most ``count`` of a cloud's points, at random."""
-    if len(cloud) <= count:
-        return cloud
-    return cloud[torch.randperm(len(cloud))[:count].sort().values]
+    return cloud if len(cloud) <= count else cloud[torch.randperm(len(cloud))[:count].sort().values]
 
 
 def anywhere(box: Box, count: int) -> Cloud:
-    """Grey points all over a box."""
+    """Draw grey points all over a box."""
     low, size = torch.tensor(box.low), torch.tensor(box.size)
     points = low + size * torch.rand(count, 3)
-    side = (float(size.prod()) / max(count, 1)) ** (1 / 3)
-    return Cloud(points, torch.full_like(points, 0.5), torch.full((count,), 0.1), side)
+    spacing = (float(size.prod()) / max(count, 1)) ** (1 / 3)
+    return Cloud(points, torch.full_like(points, 0.5), torch.full((count,), 0.1), spacing)
 
 
 def hull_surface(scene: Scene, frames: list[int], count: int) -> Cloud | None:
-    """Points on the surface of the visual hull of the first frames; None where nothing is left.
+    """Draw points on the surface of the visual hull of the first frames; None where nothing is left of it.
 
     Silhouettes are grown by how far later frames may have moved. Colours are means over the frames.
     """
     frames = frames[:_FRAMES]
-    pictures = [scene.train[i].load() for i in frames]
+    images = [scene.train[i].load() for i in frames]
     cameras = [scene.train[i].camera for i in frames]
     masks = []
-    for i, rgba in zip(frames, pictures):
-        late = abs(scene.train[i].time - scene.canonical_time)
-        masks.append(dilate(rgba[..., 3] > 127, max(1, round(_DRIFT * late * rgba.shape[1]))))
+    for i, rgba in zip(frames, images):
+        delay = abs(scene.train[i].time - scene.canonical_time)
+        masks.append(dilate(rgba[..., 3] > 127, max(1, round(_DRIFT * delay * rgba.shape[1]))))
     rough = Lattice.of_count(scene.box, _ROUGH**3)
     points = rough.to_world(rough.all_voxels())
     inside = visual_hull(points, cameras, masks)
@@ -82,60 +102,58 @@ def hull_surface(scene: Scene, frames: list[int], count: int) -> Cloud | None:
     fine = Lattice.of_count(box, _FINE**3)
     voxels = fine.all_voxels()
     # Only what the rough hull, a voxel wider, allows is looked at again.
-    wide = _grown(inside.reshape(rough.shape))
+    allowed = _grown(inside.reshape(rough.shape))
     at = rough.to_lattice(fine.to_world(voxels)).round().long()
     at = torch.minimum(at.clamp(min=0), torch.tensor(rough.shape) - 1)
-    maybe = wide[at.unbind(-1)]
+    maybe = allowed[at.unbind(-1)]
     solid = torch.zeros(len(voxels), dtype=torch.bool)
     solid[maybe] = visual_hull(fine.to_world(voxels[maybe]), cameras, masks)
     solid = solid.reshape(fine.shape)
-    shell = solid & _grown(~solid)
-    found = shell.nonzero()
-    if not len(found):
+    shell = (solid & _grown(~solid)).nonzero()
+    if not len(shell):
         return None
-    found = found[torch.randint(len(found), (count,))] + torch.rand(count, 3) - 0.5
-    points = fine.to_world(found)
-    colors = seen_colors(points, cameras, pictures)
-    area = int(shell.sum()) * fine.voxel_size**2
+    area = len(shell) * fine.voxel_size**2
+    points = fine.to_world(shell[torch.randint(len(shell), (count,))] + torch.rand(count, 3) - 0.5)
+    colors = seen_colors(points, cameras, images)
     return Cloud(points, colors, torch.full((count,), 0.5), (area / count) ** 0.5)
 
 
 def _grown(mask: Tensor) -> Tensor:
-    """A mask (X, Y, Z) one voxel wider on all sides; beyond its faces is nothing."""
+    """Make a mask (X, Y, Z) one voxel wider on all sides; beyond its faces is nothing."""
     return torch.nn.functional.max_pool3d(mask[None, None].float(), 3, 1, 1)[0, 0] > 0
 
 
 def covered_pixels(scene: Scene, frames: list[int]) -> float:
-    """How many pixels of a picture show anything, the mean over some frames."""
-    shown = [float((scene.train[i].load()[..., 3] > 127).sum()) for i in frames[:_FRAMES]]
-    return max(sum(shown) / len(shown), 1.0)
+    """Return how many pixels of an image show anything, the mean over the first frames."""
+    counts = [float((scene.train[i].load()[..., 3] > 127).sum()) for i in frames[:_FRAMES]]
+    return max(sum(counts) / len(counts), 1.0)
 
 
 def widths(scene: Scene, points: Tensor, covered: float) -> Tensor:
-    """How far apart (N,) particles at points (N, 3) may be, world units: evenly spread over the pixels that
-    show anything (``covered``), and seen by the camera that shows them largest.
+    """Return how far apart (N,) particles at points (N, 3) may be, world units: evenly spread over the
+    ``covered`` pixels, and seen by the camera that shows them largest.
     """
-    smallest = torch.full((len(points),), float("inf"))
+    pixel = torch.full((len(points),), float("inf"))
     for i in spread(len(scene.train), _CAMERAS):
         camera = scene.train[i].camera
-        away = (points - camera.center.to(points)).norm(dim=-1)
-        smallest = torch.minimum(smallest, away / max(camera.fx, camera.fy))
-    return smallest * (covered / max(len(points), 1)) ** 0.5
+        distances = (points - camera.center.to(points)).norm(dim=-1)
+        pixel = torch.minimum(pixel, distances / max(camera.fx, camera.fy))
+    return pixel * (covered / max(len(points), 1)) ** 0.5
 
 
 def first_values(cloud: Cloud, widest: Tensor | None = None) -> dict[str, Tensor]:
-    """Round particles at points, as large as the points are apart, but not larger than ``widest`` (N,).
+    """Make round particles at points, as large as the points are apart, but no larger than ``widest`` (N,).
 
-    Points of a sweep lie at uncertain depths, so that they are farther apart in space than in the pictures:
-    as large as that, particles would blur what they show, and many steps would go into making them smaller.
+    Points of a sweep lie at uncertain depths, so that they are farther apart in space than in the images: as
+    large as that, particles would blur what they show, and many steps would go into making them smaller.
     """
     points = cloud.points.float()
-    away, _ = nearest(points, points, 4)
-    apart = away[:, 1:].sqrt().mean(-1) if away.shape[1] > 1 else torch.full((len(points),), cloud.size)
-    middle = float(apart.median()) or cloud.size
-    size = apart.clamp(0.1 * middle, 4 * middle)
+    squared, _ = nearest(points, points, 4)
+    apart = squared[:, 1:].sqrt().mean(-1) if squared.shape[1] > 1 else torch.full((len(points),), cloud.size)
+    median = float(apart.median()) or cloud.size
+    size = apart.clamp(0.1 * median, 4 * median)
     if widest is not None:
-        size = torch.minimum(size, widest.clamp(min=1e-3 * middle))
+        size = torch.minimum(size, widest.clamp(min=1e-3 * median))
     turns = torch.zeros(len(points), 4)
     turns[:, 0] = 1
     return {
@@ -145,3 +163,189 @@ def first_values(cloud: Cloud, widest: Tensor | None = None) -> dict[str, Tensor
         "opacity": torch.zeros(len(points), 1),
         "color": ((cloud.colors.float() - 0.5) / FLAT)[:, None].clone(),
     }
+
+
+def swept(scene: Scene, frames: list[int], count: int) -> Cloud | None:
+    """Find points (about ``count``) that neighbouring views agree on; None where there is a single view.
+
+    Each lattice point of an image takes the depth at which its colour is most like what its neighbours in
+    time show there, the best half of them counted. Images come one after the other, and each adds only what
+    fills its holes: what stands before points that are there already is mostly a wrong depth, or what has
+    moved meanwhile. Points known to stand still are kept.
+    """
+    if len(scene.train) < 2:
+        return None
+    order = frames if len(frames) >= _SWEPT else list(range(len(scene.train)))
+    chosen = [order[i] for i in spread(len(order), _SWEPT)]
+    side = max(8, min(_SIDE, round((2 * count) ** 0.5)))
+    still = scene.still.float() if scene.still is not None else torch.zeros(0, 3)
+    cameras, images = zip(*((scene.train[i].camera, scene.train[i].load()) for i in chosen))
+    points, colors, sizes = [still], [seen_colors(still, cameras, images)], []
+    low, high = torch.tensor(scene.box.low), torch.tensor(scene.box.high)
+    for i in chosen:
+        new, color, size = _sweep(scene, i, side)
+        fills = _in_holes(torch.cat(points), new, scene.train[i].camera, side)
+        fills &= ((new >= low) & (new <= high)).all(-1)
+        points.append(new[fills])
+        colors.append(color[fills])
+        sizes.append(size)
+    points, colors = torch.cat(points), torch.cat(colors)
+    if not len(points):
+        return None
+    return Cloud(points, colors, torch.full((len(points),), 0.5), float(torch.stack(sizes).median()))
+
+
+def _small(scene: Scene, i: int, side: int) -> tuple[Tensor, Camera]:
+    """Return an image (h, w, 3) whose longer side is about four times the lattice's, and its camera."""
+    camera, rgba = scene.train[i].camera, scene.train[i].load()
+    scale = min(1.0, 4 * side / max(camera.width, camera.height))
+    size = max(1, round(camera.height * scale)), max(1, round(camera.width * scale))
+    rgb = rgba[..., :3].permute(2, 0, 1)[None].float() / 255
+    rgb = torch.nn.functional.interpolate(rgb, size, mode="area")[0].permute(1, 2, 0)
+    return rgb, camera.resized(size[1], size[0])
+
+
+def _sweep(scene: Scene, i: int, side: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Return points (P, 3) of an image's lattice at their best depths, their colours, and their size ()."""
+    rgb, camera = _small(scene, i, side)
+    step = max(1, round(max(camera.width, camera.height) / side))
+    rows, columns = torch.meshgrid(
+        torch.arange(step // 2, camera.height, step),
+        torch.arange(step // 2, camera.width, step),
+        indexing="ij",
+    )
+    rays = camera.rays((rows * camera.width + columns).flatten())
+    color = rgb[rows, columns].reshape(-1, 3)
+    time = scene.train[i].time
+    neighbours = sorted(
+        (j for j in range(len(scene.train)) if j != i),
+        key=lambda j: (abs(scene.train[j].time - time), abs(j - i)),
+    )[:_NEIGHBOURS]
+    near = _nearest_plane(camera, [scene.train[j].camera for j in neighbours])
+    depths = 1 / torch.linspace(1 / near, 1 / camera.far, _DEPTHS)
+    points = rays.origins[:, None] + depths[:, None] * rays.directions[:, None]  # (P, D, 3)
+    costs = torch.stack([_difference(scene, j, side, points, color) for j in neighbours])
+    best_half = costs.sort(0).values[: max(1, len(neighbours) // 2)].mean(0)
+    depth = depths[best_half.argmin(-1)]
+    points = rays.origins + depth[:, None] * rays.directions
+    return points, color, depth.median() * step / camera.fx
+
+
+def _nearest_plane(camera: Camera, neighbours: Sequence[Camera]) -> float:
+    """Return where planes begin: not before the camera's near plane, nor where what the neighbours see has
+    shifted by half an image, which nothing could tell.
+    """
+    baselines = [float((neighbour.center - camera.center).norm()) for neighbour in neighbours]
+    median = sorted(baselines)[len(baselines) // 2]
+    half_an_image = 2 * camera.fx * median / max(camera.width, camera.height)
+    return min(max(camera.near, half_an_image, _NEAREST_PLANE * camera.far), 0.5 * camera.far)
+
+
+def _difference(scene: Scene, j: int, side: int, points: Tensor, color: Tensor) -> Tensor:
+    """Return how unlike another image is (P, D) at points (P, D, 3); 1 where it does not show them."""
+    rgb, camera = _small(scene, j, side)
+    inside, row, column = _pixels(camera, points)
+    return torch.where(inside, (rgb[row, column] - color[:, None]).abs().mean(-1), 1.0)
+
+
+def _pixels(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return whether a camera sees points (..., 3), and the row and column (...) of the nearest pixel."""
+    pixel, z = camera.project(points)
+    column, row = pixel.floor().long().unbind(-1)
+    inside = (z > 0) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
+    return inside, row.clamp(0, camera.height - 1), column.clamp(0, camera.width - 1)
+
+
+def _in_holes(points: Tensor, new: Tensor, camera: Camera, side: int) -> Tensor:
+    """Return which ``new`` points (P, 3) of an image lie in lattice cells without earlier ``points``."""
+    step = max(camera.width, camera.height) / side
+
+    def cells(of: Tensor) -> Tensor:
+        pixel, z = camera.project(of)
+        column, row = (pixel / step).floor().long().unbind(-1)
+        inside = (z > 0) & (column >= 0) & (column < side) & (row >= 0) & (row < side)
+        return torch.where(inside, row * side + column, side * side)
+
+    filled = torch.zeros(side * side + 1, dtype=torch.bool)
+    filled[cells(points)] = True
+    filled[-1] = False  # outside the image nothing is filled
+    return ~filled[cells(new)]
+
+
+def seen_colors(points: Tensor, cameras: Sequence[Camera], images: Sequence[Tensor]) -> Tensor:
+    """Return the mean colour (N, 3) that images (H, W, 4) uint8 show at points (N, 3), by their alpha."""
+    total, weight = torch.zeros(len(points), 3), torch.full((len(points), 1), 1e-6)
+    for camera, rgba in zip(cameras, images):
+        inside, row, column = _pixels(camera, points)
+        shown = rgba[row, column].float() / 255
+        alpha = shown[:, 3:] * inside[:, None]
+        total, weight = total + shown[:, :3] * alpha, weight + alpha
+    return torch.where(weight > 1e-3, total / weight, 0.5)
+
+
+@torch.no_grad()
+def compile_kernels(method: torch.nn.Module) -> None:
+    """Run each operator once on a single particle; nothing random is drawn, the method is not touched.
+
+    What was never compiled on a machine is compiled by two processes, where it has two cores. A method that
+    uses none of the kernels, as on a GPU, has nothing to compile.
+    """
+    if not use_numba(method.means):
+        return
+    from forewarp.ops.kernels import nodes as kernels
+
+    zero, one, first = torch.zeros(1, 3), torch.ones(1, 1), torch.ones(1)
+    missed = kernels.carry.stats.cache_misses.total()
+    carry_nodes(zero[:, None], zero[:, None], first, zero)
+    with _backward_compiled_beside(kernels.carry.stats.cache_misses.total() > missed):
+        given = _single()
+        rasterize(project(*given), 9, 8)
+        two = torch.zeros(2, 1, 3)  # of a single node, half of its gradients would pass for contiguous
+        spread_nodes(two, two, torch.zeros(2, 6), first, first, 1.0, 1.0)
+        edges = torch.zeros(1, 1, dtype=torch.int64)
+        pull_nodes(torch.zeros(1, 6), zero, torch.zeros(1, 12), edges, one, 1.0)
+        skin_weights(one, one)
+        moments = zero.clone(), zero.clone(), first.clone()
+        adam_rows([Learned(torch.zeros(1, 3), torch.ones(1, 3), *moments, 1e-3)], (0.9, 0.99), 1e-15)
+    compare(*given, torch.zeros(72, 4, dtype=torch.uint8), torch.ones(3))
+
+
+def compile_backward() -> None:
+    """Compile what leads from splats and an image back to particles: about half of all compiling."""
+    compile_way_back(*_single())
+
+
+def _single() -> tuple[Gaussians, Warp, Pinhole, Tensor, Tensor]:
+    """Return a particle, its warp, a camera, and what time makes of colours and opacity."""
+    zero, one = torch.zeros(1, 3), torch.ones(1, 1)
+    particles = Gaussians(zero, zero, torch.ones(1, 4), one, torch.zeros(1, 1, 3))
+    warp = Warp(torch.zeros(1, 12), torch.zeros(1, 1, dtype=torch.int32), one)
+    identity = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+    pinhole = Pinhole(identity, (0.0, 0.0, -2.0), (8.0, 8.0), (4.0, 4.0), (9, 8), 0.1)
+    return particles, warp, pinhole, torch.zeros(0), torch.ones(1)
+
+
+@contextmanager
+def _backward_compiled_beside(new: bool) -> Iterator[None]:
+    """Let another process ``compile_backward`` meanwhile, if kernels are ``new`` and there is a core for it.
+
+    It leaves them in the cache on disk, where this process finds them; what it does not get done is
+    compiled here, and why is told. It is never killed, as half a file in the cache would be worse than none.
+    """
+    if not new or cores() < 2:
+        yield
+        return
+    with TemporaryFile() as errors:
+        process, code = None, f"from {__name__} import compile_backward; compile_backward()"
+        with suppress(OSError):
+            process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.DEVNULL, stderr=errors)
+        yield
+        if process is None:
+            return
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(_PATIENCE_S)
+        if process.returncode:
+            errors.seek(0)
+            lines = errors.read().decode(errors="replace").strip().splitlines()
+            why = lines[-1] if lines else f"status {process.returncode}"
+            print(f"kernels are compiled by one process, as a second one failed: {why}")

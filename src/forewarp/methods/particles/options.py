@@ -1,16 +1,20 @@
-"""Decide which effects of particles a scene needs: those that are missed while all others are on."""
+"""The options of particles: effects, the numbers of a stage, and how a plan decides on effects."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Generator, Sequence
+from dataclasses import dataclass, fields, replace
 
+from forewarp.fields.curves import KINDS
 from forewarp.methods.effect import Asked, Begin, Decision, Drop, Effect, Evidence
 from forewarp.methods.method import Method
+from forewarp.ops.backend import is_number
 from forewarp.scene.frame import Scene
 from forewarp.scene.silhouettes import Pictures
 from forewarp.scene.view import Target
 
+_VIEWS = 100  # training images from which on more of them call for no more particles
 CUT_OUT = 0.001  # share of transparent pixels below which silhouettes say nothing
 DISAGREEMENT = 0.01  # share of the foreground that no static shape explains, above which something moves
 NARROW = 15.0  # degrees between the most different cameras below which direction cannot be observed
@@ -18,6 +22,180 @@ AT_REST = 0.1  # least share of particles at rest for the background to be worth
 HARM = 0.2  # dB from which on the background costs too much
 HOPELESS = 0.5  # of ``AT_REST``: so little at rest with one seed is little with all
 RATES = {"means": 8e-3, "shade": 1e-3}  # learning rates of a trial
+
+
+@dataclass(frozen=True)
+class Effects:
+    """The choice of each effect; None: off.
+
+    Args:
+        motion: the curves of the nodes, ``spline`` or ``cosines``.
+        rotation: True: nodes also rotate what is beside them.
+        view_dependence: degree 1 to 3 of the spherical harmonics by which colour depends on direction.
+        color_over_time, opacity_over_time: number of cosines over time of each particle's colour and opacity.
+        background: share of the scene's extent. Nodes that move (and, by rotating, move what is beside them)
+            no farther than that from their mean position, or than a pixel, come to rest; particles that
+            follow no others need no nodes any more.
+
+    Raises:
+        ValueError: naming the key of a choice that there is not.
+    """
+
+    motion: str | None = None
+    rotation: bool | None = None
+    view_dependence: int | None = None
+    color_over_time: int | None = None
+    opacity_over_time: int | None = None
+    background: float | None = None
+
+    def __post_init__(self) -> None:
+        for name, expected, valid in (
+            ("motion", " or ".join(KINDS), lambda choice: choice in KINDS),
+            ("rotation", "true", lambda choice: choice is True),
+            (
+                "view_dependence",
+                "a degree of 1 to 3",
+                lambda choice: type(choice) is int and 1 <= choice <= 3,
+            ),
+            (
+                "color_over_time",
+                "a number of cosines >= 1",
+                lambda choice: type(choice) is int and choice >= 1,
+            ),
+            (
+                "opacity_over_time",
+                "a number of cosines >= 1",
+                lambda choice: type(choice) is int and choice >= 1,
+            ),
+            ("background", "a number > 0", lambda choice: is_number(choice) and choice > 0),
+        ):
+            choice = getattr(self, name)
+            if choice is not None and not valid(choice):
+                raise ValueError(
+                    f"model.{name}: expected {expected}, or null, but got {choice!r}; "
+                    f"choose model/{name}=none to switch it off"
+                )
+
+    def only(self, names: Sequence[str], times: int) -> Effects:
+        """Switch off all effects but those named, and, in a scene of one time, those that need several."""
+        kept = {name for name in names if times > 1 or name == "view_dependence"}
+        if self.motion is None or "motion" not in kept:
+            kept -= {"rotation", "background"}
+        return replace(self, **{name: None for name in NAMES if name not in kept})
+
+
+NAMES = tuple(field.name for field in fields(Effects))
+
+
+def view_share(views: int) -> float:
+    """Return how much so many training images tell of details, as a share in [0, 1] of a hundred's."""
+    return min(1.0, views / _VIEWS)
+
+
+@dataclass(frozen=True)
+class Numbers:
+    """The numbers of a stage that are the method's own. Shares are of the stage.
+
+    Args:
+        effects: those of the model's effects that the stage uses; one that only shapes particles uses none.
+        density: particles there are in the end, times the square root of the pixels that show anything; of
+            less than a hundred images, of their share of these pixels.
+        first: share of them to begin with.
+        full: share of them that this stage ends with.
+        nodes: how many there are, times the square root of the particles at the beginning.
+        knots: coefficients of each node's curve, times the square root of the times.
+        straight: whether splines end without acceleration: two coefficients follow from the others.
+        edges: neighbours that a node is kept rigid with.
+        every: share between two rounds of density control, up to ``settled``.
+        relink: rounds after which particles look again for the nodes beside them.
+        rest: share from which nodes that do not move come to rest, where the model has a background.
+        jitter, calm: deviation of the random shift of an image's time, which falls to 0 at the share
+            ``calm``.
+        time_offsets: largest learned correction of an image's time, times the mean distance of two training
+            times; learned from ``calm`` on, of splines alone; 0: times are used as they are given.
+        opacity_decay: share of their opacity that a step takes from the particles that its image shows, while
+            the learning rate of opacity is its first; as that falls, so does the share.
+        crowd_decay: extra opacity decay per step, scaled by ``max(0, 1 - covered_pixels /
+            final_particle_count)``.
+        loose: what is left of the weight of ``rigid`` at the end.
+        name: name of the stage.
+
+    Raises:
+        ValueError: naming the stage's wrong key.
+    """
+
+    effects: Sequence[str] = NAMES
+    density: float = 90.0
+    first: float = 0.5
+    full: float = 1.0
+    nodes: float = 2.5
+    knots: float = 2.2
+    straight: bool = False
+    edges: int = 6
+    every: float = 0.01
+    settled: float = 0.6
+    relink: int = 5
+    rest: float = 0.45
+    jitter: float = 0.01
+    calm: float = 0.4
+    time_offsets: float = 0.0
+    opacity_decay: float = 0.0
+    crowd_decay: float = 0.0
+    loose: float = 0.17
+    name: str = "fine"
+
+    def __post_init__(self) -> None:
+        where = f"stage.{self.name}"
+        if not set(self.effects) <= set(NAMES):
+            raise ValueError(
+                f"{where}.effects: expected some of {', '.join(NAMES)}, but got {list(self.effects)}"
+            )
+        if not isinstance(self.straight, bool):
+            raise ValueError(f"{where}.straight: expected true or false, but got {self.straight!r}")
+        for keys, expected, valid in (
+            (("first", "every", "loose", "full"), "a number in (0, 1]", lambda value: 0 < value <= 1),
+            (("density", "nodes", "knots", "calm"), "a number > 0", lambda value: value > 0),
+            (("edges", "relink"), "a whole number >= 1", lambda value: value >= 1 and value == int(value)),
+            (("opacity_decay", "crowd_decay"), "a number in [0, 1)", lambda value: 0 <= value < 1),
+            (("jitter", "settled", "rest", "time_offsets"), "a number >= 0", lambda value: value >= 0),
+        ):
+            for key in keys:
+                value = getattr(self, key)
+                if not (is_number(value) and valid(value)):
+                    raise ValueError(f"{where}.{key}: expected {expected}, but got {value!r}")
+
+    def most(self, covered: float, views: int) -> int:
+        """Return how many particles there are in the end, by covered pixels and training images.
+
+        >>> Numbers().most(20_000.0, 100), Numbers().most(20_000.0, 25)
+        (12728, 6364)
+        """
+        return max(32, round(self.density * math.sqrt(covered * view_share(views))))
+
+    def decay(self, most: float, covered: float) -> float:
+        """Return the share of their opacity that a step takes from particles, by how crowded pixels are.
+
+        >>> numbers = Numbers(crowd_decay=2.5e-3)
+        >>> numbers.decay(10_000.0, 20_000.0), numbers.decay(10_000.0, 2000.0)
+        (0.0, 0.002)
+        """
+        crowd = max(0.0, 1 - covered / most)
+        return self.opacity_decay + self.crowd_decay * crowd * (1 - self.opacity_decay)
+
+    def share_at(self, progress: float) -> float:
+        """Return the share of all particles that there should be: it grows to ``full`` before ``settled``."""
+        done = min(1.0, progress / max(0.8 * self.settled, 1e-6))
+        return self.full * (self.first + (1 - self.first) * done)
+
+    def motion(self, particles: int, times: int) -> tuple[int, int]:
+        """Return how many nodes there are, and how many coefficients each has.
+
+        >>> Numbers().motion(6364, 100)
+        (199, 22)
+        """
+        knots = min(times + 2, round(self.knots * math.sqrt(times)))
+        return max(4, round(self.nodes * math.sqrt(particles))), max(4, knots)
+
 
 OF_NODES = ("rotation", "background")  # nothing without motion
 STAND_INS = ("opacity_over_time", "color_over_time")  # for motion
