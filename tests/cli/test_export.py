@@ -1,63 +1,38 @@
 import json
+import re
 import shutil
 
 import numpy as np
 import pytest
+from omegaconf import OmegaConf
 from plyfile import PlyData
 
 from forewarp import load
+from forewarp.cli.export import check
+from forewarp.export import formats
+from tests.support.configs import CONF
 
 
-@pytest.fixture(scope="module")
-def run(fitted, tmp_path_factory):
-    """A copy of the shared run."""
-    return shutil.copytree(fitted, tmp_path_factory.mktemp("runs") / "vehicle")
-
-
-def test_it_fills_the_runs_folder_and_says_so(forewarp, run):
-    for times, count in (("times=2", 2), ("times=[0.25]", 1)):
-        done = forewarp("export", str(run), times)
-        folder = run / "exports" / "ply"
-        assert done.out.startswith(f"written: {folder}: {count} file"), done
-        assert f"ply 100% | {count}/{count}" in done.err
-        assert len(list(folder.glob("frames/*.ply"))) == count  # nothing of a call before stays
-    about = json.loads((folder / "about.json").read_text())
-    assert about["times"] == [0.25]
-    assert about["method"] == "forward"
-    assert len(PlyData.read(folder / "frames" / "frame_0000.ply")["vertex"]) == about["points"]
-
-
-def test_trajectories_are_those_of_the_run(ok, run, tmp_path):
-    ok(
-        "export",
-        f"run={run}",
-        "format=npz",
-        "times=[0,1]",
-        "points=20",
-        "views=1",
-        f"out={tmp_path / 'here'}",
-    )
-    found = np.load(tmp_path / "here" / "trajectories.npz")
-    scene = load(run)
-    wanted = scene.trajectories(scene.matter().points.new_tensor(found["points"]), [0.0, 1.0])
-    np.testing.assert_allclose(found["positions"], wanted, atol=1e-5)
-
-
-def test_the_background_is_that_of_the_runs_pictures(ok, run, tmp_path, monkeypatch):
-    dark = shutil.copytree(run, tmp_path / "dark")
-    text = (dark / "config.yaml").read_text()
+def test_it_writes_what_the_run_has_into_its_folder_and_says_so(forewarp, ok, fitted, tmp_path, monkeypatch):
+    run, sources, write = shutil.copytree(fitted, tmp_path / "vehicle"), [], formats.write
+    text = (run / "config.yaml").read_text()
     assert "eval_background: white" in text
-    (dark / "config.yaml").write_text(text.replace("eval_background: white", "eval_background: black"))
-    found = []
-
-    def write(kind, source, *rest, **options):
-        found.append(source.background)
-        return {"bytes": {}}
-
-    monkeypatch.setattr("forewarp.export.formats.write", write)
-    for folder in (run, dark):
-        ok("export", f"run={folder}", "times=1")
-    assert found == [(1, 1, 1), (0, 0, 0)]
+    (run / "config.yaml").write_text(text.replace("eval_background: white", "eval_background: black"))
+    monkeypatch.setattr(
+        formats, "write", lambda kind, source, *a, **k: sources.append(source) or write(kind, source, *a, **k)
+    )
+    done, folder = forewarp("export", str(run), "times=[0.25]"), run / "exports" / "ply"
+    assert done.out.startswith(f"written: {folder}: 1 file"), done
+    assert "ply 100% | 1/1" in done.err
+    assert sources[0].background == (0, 0, 0)
+    about = json.loads((folder / "about.json").read_text())
+    assert (about["times"], about["method"]) == ([0.25], "forward")
+    assert len(PlyData.read(folder / "frames" / "frame_0000.ply")["vertex"]) == about["points"]
+    words = ["format=npz", "times=2", "points=20", "views=1", f"out={tmp_path / 'here'}"]
+    ok("export", f"run={run}", *words)
+    tracks, scene = np.load(tmp_path / "here" / "trajectories.npz"), load(run)
+    wanted = scene.trajectories(scene.matter().points.new_tensor(tracks["points"]), [0.0, 1.0])
+    np.testing.assert_allclose(tracks["positions"], wanted, atol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -73,17 +48,17 @@ def test_the_background_is_that_of_the_runs_pictures(ok, run, tmp_path, monkeypa
         (["format=npz", "points=0"], "points: expected a whole number from 1 to 1000000, but got 0"),
         (["format=mesh", "files=stl"], "files: expected ply or obj, but got stl"),
         (["format=mesh", "level=1"], "level: expected a number from 0.01 to 0.99, but got 1"),
-        (["out=."], "but got a file in it; move it, or choose another"),
     ],
 )
-def test_mistakes_end_in_one_line(refused, run, words, says, in_tmp):
+def test_mistakes_end_before_anything_is_loaded(monkeypatch, words, says):
+    monkeypatch.setattr("forewarp.runs.overrides.typed_overrides", lambda: words)
+    config = OmegaConf.merge(OmegaConf.load(CONF / "export.yaml"), OmegaConf.from_dotlist(words))
+    with pytest.raises(ValueError, match=re.escape(says)):
+        check(config)
+
+
+def test_a_folder_of_others_is_left_alone(refused, fitted, in_tmp):
     (in_tmp / "a file").touch()
-    assert says in refused("export", f"run={run}", *words)
+    said = refused("export", f"run={fitted}", "out=.")
+    assert "but got a file in it; move it, or choose another" in said
     assert [file.name for file in in_tmp.iterdir()] == ["a file"]
-
-
-def test_a_run_that_is_not_finished_is_refused(refused, run, tmp_path):
-    half = shutil.copytree(run, tmp_path / "half")
-    (half / "fine" / "done.json").unlink()
-    said = refused("export", f"run={half}")
-    assert said == f"{half}/fine: expected a finished stage, but got none; continue with forewarp-train"

@@ -1,8 +1,12 @@
 """Scenes whose every point is known, as exports begin with them."""
 
+import copy
+from dataclasses import replace
+
 import pytest
 
-from forewarp.export.source import Source
+from forewarp.export import formats
+from forewarp.export.tracks import Source
 from tests.support.known_ball import known_ball
 from tests.support.particles import EVERY, module_with, shaken, small_data
 from tests.support.tiny_scene import ball_scene
@@ -10,18 +14,27 @@ from tests.support.tiny_scene import ball_scene
 TIMES = (0.0, 0.4, 1.0)
 
 
-@pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    """Of the scene that the particles are in."""
-    return small_data(tmp_path_factory.mktemp("scenes"))
+def exporter(kind, **defaults):
+    """Return ``export(source, folder, **options)``, which writes a format and returns ``about.json``."""
+
+    def export(source, folder, **options):
+        return formats.write(kind, source, folder, {}, lambda *done: None, **defaults | options)
+
+    return export
 
 
-@pytest.fixture
-def particles(data):
-    """Particles with every effect whose parameters are random; a third of them rests."""
+@pytest.fixture(scope="session")
+def _particles(tmp_path_factory):
+    data = small_data(tmp_path_factory.mktemp("scenes"))
     module = shaken(module_with(data, **EVERY | {"view_dependence": 2}))
     module.method.opacity.data += 1
     return Source(module, "particles", [frame.camera for frame in data.scene.train], TIMES)
+
+
+@pytest.fixture
+def particles(_particles):
+    """Particles with every effect whose parameters are random; a third of them rests."""
+    return replace(_particles, module=copy.deepcopy(_particles.module))
 
 
 @pytest.fixture

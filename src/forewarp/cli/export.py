@@ -4,10 +4,6 @@ from __future__ import annotations
 
 from forewarp.cli.entry import command
 
-WHOLE = {"degree": (0, 3), "resolution": (8, 512), "points": (1, 10**6), "views": (1, 100)}
-REAL = {"level": (0.01, 0.99), "seconds": (0.1, 3600), "megabytes": (1, 1000)}
-CHOICES = {"files": ("ply", "obj"), "up": ("world", "y", "-y", "z")}
-
 HELP = """
 forewarp-export writes a finished run for other programs, into its exports/<format>/ (docs/exports.md).
 
@@ -50,7 +46,7 @@ def export(config) -> None:
     folder = Path(config.out or Path(config.run) / "exports" / config.format)
     check_replaceable(folder, ABOUT)
     # These load torch; mistakes have been answered before.
-    from forewarp.export.source import Source
+    from forewarp.export.tracks import Source
     from forewarp.progress import Counted
     from forewarp.runs.fitted import method_name, opened
 
@@ -62,24 +58,24 @@ def export(config) -> None:
     about = {"run": str(config.run), "scene": scene.name, "method": source.model}
     options = {name: config[name] for name in FORMATS[config.format].options}
     with Counted(config.format) as progress:
-        found = write(config.format, source, folder, about, progress, **options)
-    print(f"written: {folder}: {told(found)}")
+        written = write(config.format, source, folder, about, progress, **options)
+    print(f"written: {folder}: {summary(written)}")
 
 
-def told(about: dict) -> str:
+def summary(about: dict) -> str:
     """Say in a few words what was written.
 
-    >>> told({"bytes": {"a": 2_000_000, "b": 500_000}, "vertices": [7200, 72]})
+    >>> summary({"bytes": {"a": 2_000_000, "b": 500_000}, "vertices": [7200, 72]})
     '2 files, 2.5 MB, at least 72 vertices each'
-    >>> told({"bytes": {"a": 1000}, "points": 7, "thinned": "7 of 9 points"})
+    >>> summary({"bytes": {"a": 1000}, "points": 7, "thinned": "7 of 9 points"})
     '1 file, 0.0 MB, 7 points; thinned to 7 of 9 points'
     """
-    count, total = len(about["bytes"]), sum(about["bytes"].values())
-    text = f"{count} file{'s' * (count != 1)}, {total / 1e6:.1f} MB"
+    count, size = len(about["bytes"]), sum(about["bytes"].values())
+    text = f"{count} file{'s' * (count != 1)}, {size / 1e6:.1f} MB"
     for what in {"particles", "points", "vertices"} & about.keys():
         number = about[what]
-        of_each = isinstance(number, list)
-        text += f", at least {min(number):,} {what} each" if of_each else f", {number:,} {what}"
+        in_each_file = isinstance(number, list)
+        text += f", at least {min(number):,} {what} each" if in_each_file else f", {number:,} {what}"
     return text + (f"; thinned to {about['thinned']}" if "thinned" in about else "")
 
 
@@ -87,23 +83,24 @@ def check(config) -> list[float]:
     """Refuse settings of which nothing can be written, before anything is loaded; return the times."""
     from omegaconf import ListConfig
 
-    from forewarp.export.formats import FORMATS, require
+    from forewarp.export.formats import FORMATS, check_option, require
     from forewarp.runs.overrides import key_of, typed_overrides
 
     if config.format not in FORMATS:
         raise ValueError(f"format: expected one of {', '.join(FORMATS)}, but got '{config.format}'")
-    options, every = FORMATS[config.format].options, {n for f in FORMATS.values() for n in f.options}
+    options = FORMATS[config.format].options
+    foreign = {option for form in FORMATS.values() for option in form.options} - set(options)
     for key in map(key_of, typed_overrides()):
-        if key in every - set(options):
-            known = ", ".join(options)
-            raise ValueError(f"{key}: expected an option of format={config.format} ({known}); leave it out")
+        if key in foreign:
+            raise ValueError(
+                f"{key}: expected an option of format={config.format} ({', '.join(options)}); leave it out"
+            )
     require(config.format)
     for key in options:
         check_option(key, config[key])
     times = config.times
     if isinstance(times, ListConfig):
-        good = [type(time) in (int, float) and 0 <= time <= 1 for time in times]
-        if not (good and all(good)):
+        if not times or not all(type(time) in (int, float) and 0 <= time <= 1 for time in times):
             raise ValueError(f"times: expected numbers in [0, 1], but got {list(times)}")
         if sorted(set(times)) != list(times):
             raise ValueError(f"times: expected each later than the one before, but got {list(times)}")
@@ -111,17 +108,6 @@ def check(config) -> list[float]:
     if type(times) is not int or times < 1:
         raise ValueError(f"times: expected a whole number of at least 1, or a list, but got {times}")
     return [i / max(times - 1, 1) for i in range(times)]
-
-
-def check_option(key: str, value: object) -> None:
-    """Refuse a value that an option cannot have."""
-    known = CHOICES.get(key)
-    if known is not None and value not in known:
-        raise ValueError(f"{key}: expected {' or '.join(known)}, but got {value}")
-    for numbers, types, what in ((WHOLE, (int,), "a whole number"), (REAL, (int, float), "a number")):
-        low, high = numbers.get(key, (value, value))
-        if key in numbers and (type(value) not in types or not low <= value <= high):
-            raise ValueError(f"{key}: expected {what} from {low} to {high}, but got {value}")
 
 
 def main() -> None:

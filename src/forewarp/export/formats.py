@@ -1,4 +1,4 @@
-"""The formats of ``forewarp-export``, and the folder that each of them fills. Nothing here loads torch."""
+"""The registry of ``forewarp-export``'s formats, and the folder that an export fills; loads no torch."""
 
 from __future__ import annotations
 
@@ -11,31 +11,34 @@ from typing import TYPE_CHECKING, NamedTuple
 from forewarp.files import folder_written_whole, write_json
 
 if TYPE_CHECKING:
-    from forewarp.export.source import Progress, Source
+    from forewarp.export.tracks import Progress, Source
 
 ABOUT = "about.json"  # in every folder of an export, which may then be replaced
 _AXES = "the data's own world, right-handed, in its own unit of length; turned about its origin if up says so"
 
 
 class Format(NamedTuple):
-    """A ``function`` of a ``module`` of this package, the ``options`` that it takes, and the ``package`` of
-    an ``extra`` that it needs.
+    """A format ``x``, written by ``export_x`` of a ``module`` of this package with some ``options``; it may
+    need a ``package`` of an ``extra``.
     """
 
     module: str
-    function: str
     options: tuple[str, ...]
     package: str | None = None
     extra: str | None = None
 
 
 FORMATS = {
-    "ply": Format("ply", "export_ply", ("degree", "up")),
-    "mesh": Format("mesh", "export_mesh", ("resolution", "level", "files", "up"), "skimage", "export"),
-    "gltf": Format("gltf", "export_gltf", ("points", "seconds")),
-    "html": Format("page", "export_html", ("points", "seconds", "megabytes"), "viser", "viewer"),
-    "npz": Format("arrays", "export_npz", ("points", "views")),
+    "ply": Format("ply", ("degree", "up")),
+    "mesh": Format("mesh", ("resolution", "level", "files", "up"), "skimage", "export"),
+    "gltf": Format("gltf", ("points", "seconds")),
+    "html": Format("html", ("points", "seconds", "megabytes"), "viser", "viewer"),
+    "npz": Format("tracks", ("points", "views")),
 }
+# The values that an option may have: words, or numbers from a least to a most.
+CHOICES = {"files": ("ply", "obj"), "up": ("world", "y", "-y", "z")}
+WHOLE_NUMBERS = {"degree": (0, 3), "resolution": (8, 512), "points": (1, 10**6), "views": (1, 100)}
+NUMBERS = {"level": (0.01, 0.99), "seconds": (0.1, 3600), "megabytes": (1, 1000)}
 
 
 def require(kind: str) -> None:
@@ -51,6 +54,23 @@ def require(kind: str) -> None:
         )
 
 
+def check_option(key: str, value: object) -> None:
+    """Refuse a value that an option cannot have.
+
+    Raises:
+        ValueError: naming the values that it can have.
+    """
+    if key in CHOICES:
+        if value not in CHOICES[key]:
+            raise ValueError(f"{key}: expected {' or '.join(CHOICES[key])}, but got {value}")
+        return
+    whole = key in WHOLE_NUMBERS
+    least, most = WHOLE_NUMBERS[key] if whole else NUMBERS[key]
+    if type(value) not in ((int,) if whole else (int, float)) or not least <= value <= most:
+        kind = "a whole number" if whole else "a number"
+        raise ValueError(f"{key}: expected {kind} from {least} to {most}, but got {value}")
+
+
 def write(
     kind: str, source: Source, folder: Path, about: Mapping[str, object], progress: Progress, **options
 ) -> dict:
@@ -59,9 +79,9 @@ def write(
     Args:
         kind: a key of ``FORMATS``.
         source: the scene and its times.
-        folder: takes the files; one written before is replaced.
+        folder: takes the files; an earlier export in it is replaced.
         about: what ``about.json`` says first.
-        progress: told after each time.
+        progress: called after each time with the number done and the total.
         options: those of the format.
 
     Returns:
@@ -72,19 +92,12 @@ def write(
         ImportError: see ``require``.
     """
     require(kind)
-    made = FORMATS[kind]
-    fill = getattr(import_module(f"forewarp.export.{made.module}"), made.function)
+    export = getattr(import_module(f"forewarp.export.{FORMATS[kind].module}"), f"export_{kind}")
     with folder_written_whole(folder, ABOUT) as part:
-        noted = fill(source, part, progress, **options)
+        facts = export(source, part, progress, **options)
         files = sorted(file for file in part.rglob("*") if file.is_file())
         sizes = {file.relative_to(part).as_posix(): file.stat().st_size for file in files}
-        content = {
-            "format": kind,
-            **about,
-            "times": list(source.times),
-            "axes": _AXES,
-            **noted,
-            "bytes": sizes,
-        }
+        head = {"format": kind, **about, "times": list(source.times), "axes": _AXES}
+        content = head | facts | {"bytes": sizes}
         write_json(part / ABOUT, content)
     return content

@@ -4,33 +4,22 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from forewarp.export.ply import point_columns, write_ply
-from forewarp.export.source import Progress, Source
+from forewarp.export.tracks import Progress, Source
 from forewarp.methods.method import HasBounds, HasSolid
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.cloud import Ellipsoids
 from forewarp.scene.view import Moment
 
-_BLUR = 0.5  # spacings of the lattice that ellipsoids are blurred by, so that none falls between its points
-_REACH = 1 / 255  # opacity below which an ellipsoid ends, as in pictures
-_SURE = 1 - 1e-6  # most opacity of a place, so that its optical depth is finite
-_PAIRS = 1 << 19  # of an ellipsoid and a point, at a time
-
-
-class Mesh(NamedTuple):
-    """``vertices`` (V, 3) in world units, their ``colors`` (V, 3) in [0, 1], and ``faces`` (F, 3) rows of
-    vertices, counter-clockwise seen from outside.
-    """
-
-    vertices: Tensor
-    colors: Tensor
-    faces: np.ndarray
+_BLUR = 0.5  # spacings of the lattice that Gaussians are blurred by, so that none falls between its points
+_CUTOFF = 1 / 255  # opacity below which a Gaussian ends, as in rendered images
+_MAX_OPACITY = 1 - 1e-6  # of a Gaussian, so that its optical depth is finite
+_CHUNK = 1 << 19  # pairs of a Gaussian and a lattice point that are evaluated at once
 
 
 def lattice_in(box: Box, resolution: int) -> Lattice:
@@ -46,85 +35,68 @@ def lattice_in(box: Box, resolution: int) -> Lattice:
     return Lattice(Box(tuple(low), tuple(high)), tuple(counts))
 
 
-def solid_of(cloud: Ellipsoids, lattice: Lattice) -> tuple[Tensor, Tensor]:
-    """Opacity (X, Y, Z) and colour (X, Y, Z, 3) of ellipsoids on a lattice: ``1 - prod_i (1 - o_i g_i)``,
-    with ``g_i`` the Gaussian, 1 in its middle, blurred by half a spacing; the mean colour by optical depth.
+def voxelize(cloud: Ellipsoids, lattice: Lattice) -> tuple[Tensor, Tensor]:
+    """Evaluate Gaussians on a lattice: opacity (X, Y, Z) and colour (X, Y, Z, 3).
 
-    Cost: linear in the points inside every ellipsoid; memory in a chunk of them.
+    The opacity is ``1 - prod_i (1 - o_i g_i)``, where ``g_i`` is the Gaussian, 1 in its centre, blurred by
+    half a lattice spacing; the colour is the mean weighted by optical depth ``-log(1 - o_i g_i)``.
+
+    Cost: linear in the pairs of a Gaussian and a lattice point inside it; memory in a chunk of them.
     """
     step = lattice.spacing[0]
     blurred = cloud.covariances.double() + (_BLUR * step) ** 2 * torch.eye(3).to(cloud.covariances).double()
-    opacity = cloud.opacity.double().clamp(max=_SURE)
-    reach = (2 * (opacity / _REACH).clamp(min=1).log())[:, None] * blurred.diagonal(dim1=-2, dim2=-1)
-    middle, half = lattice.to_lattice(cloud.centers.double()), reach.sqrt() / step
-    last = torch.tensor(lattice.shape, device=middle.device) - 1
-    low = torch.minimum((middle - half).ceil().clamp(min=0), last + 1.0).long()
-    high = torch.minimum((middle + half).floor(), last.double()).clamp(min=-1).long()
-    counts = (high - low + 1).clamp(min=0) * (opacity > _REACH)[:, None]
-    total = counts.prod(-1)
-    inverse, colors = torch.linalg.inv(blurred) * step**2, cloud.colors.double()
-    depth = torch.zeros(lattice.count, 4, dtype=torch.float64, device=middle.device)
-    strides = torch.tensor([lattice.shape[1] * lattice.shape[2], lattice.shape[2], 1], device=middle.device)
-    ends = total.cumsum(0)
+    opacity, colors = cloud.opacity.double().clamp(max=_MAX_OPACITY), cloud.colors.double()
+    # The box of lattice points in which a Gaussian's opacity is above the cutoff.
+    radius_squared = (2 * (opacity / _CUTOFF).clamp(min=1).log())[:, None]
+    half = (radius_squared * blurred.diagonal(dim1=-2, dim2=-1)).sqrt() / step
+    center = lattice.to_lattice(cloud.centers.double())
+    last = torch.tensor(lattice.shape, device=center.device) - 1
+    low = (center - half).ceil().clamp(min=0).minimum(last + 1.0).long()
+    high = (center + half).floor().clamp(min=-1).minimum(last.double()).long()
+    counts = (high - low + 1).clamp(min=0) * (opacity > _CUTOFF)[:, None]
+    sizes = counts.prod(-1)
+    ends = sizes.cumsum(0)
+    inverse = torch.linalg.inv(blurred) * step**2
+    sums = torch.zeros(lattice.count, 4, dtype=torch.float64, device=center.device)  # optical depth, r, g, b
+    strides = torch.tensor([lattice.shape[1] * lattice.shape[2], lattice.shape[2], 1], device=center.device)
     begin = 0
     while begin < len(cloud):
         done = int(ends[begin - 1]) if begin else 0
-        end = max(begin + 1, int(torch.searchsorted(ends, done + _PAIRS, right=True)))
-        rows = torch.arange(begin, end, device=middle.device)
-        owner = rows.repeat_interleave(total[rows])
-        rank = torch.arange(len(owner), device=middle.device) + done - (ends - total)[owner]
+        end = max(begin + 1, int(torch.searchsorted(ends, done + _CHUNK, right=True)))
+        rows = torch.arange(begin, end, device=center.device)
+        owner = rows.repeat_interleave(sizes[rows])  # (P,), the Gaussian of each pair
+        rank = torch.arange(len(owner), device=center.device) + done - (ends - sizes)[owner]
         wide, deep = counts[owner, 1], counts[owner, 2]
-        offset = torch.stack([rank // (wide * deep), rank // deep % wide, rank % deep], -1)
-        point = low[owner] + offset
-        away = point - middle[owner]
-        fall = torch.exp(-0.5 * torch.einsum("pi,pij,pj->p", away, inverse[owner], away))
-        added = -torch.log1p(-opacity[owner] * fall)[:, None]
-        depth.index_add_(0, (point * strides).sum(-1), torch.cat([added, added * colors[owner]], -1))
+        point = low[owner] + torch.stack([rank // (wide * deep), rank // deep % wide, rank % deep], -1)
+        offset = point - center[owner]
+        gaussian = torch.exp(-0.5 * torch.einsum("pi,pij,pj->p", offset, inverse[owner], offset))
+        depth = -torch.log1p(-opacity[owner] * gaussian)[:, None]
+        sums.index_add_(0, (point * strides).sum(-1), torch.cat([depth, depth * colors[owner]], -1))
         begin = end
-    mean = depth[:, 1:] / depth[:, :1].clamp(min=1e-12)
-    found = -torch.expm1(-depth[:, 0])
-    return found.float().cpu().reshape(lattice.shape), mean.float().cpu().reshape(*lattice.shape, 3)
+    mean = sums[:, 1:] / sums[:, :1].clamp(min=1e-12)
+    total = -torch.expm1(-sums[:, 0])
+    return total.float().cpu().reshape(lattice.shape), mean.float().cpu().reshape(*lattice.shape, 3)
 
 
-def mesh_of(opacity: Tensor, colors: Tensor, lattice: Lattice, level: float) -> Mesh | None:
-    """Find the surface where an opacity (X, Y, Z) is ``level``, with colours (X, Y, Z, 3), by marching cubes;
-    None if it is nowhere.
+def isosurface(
+    opacity: Tensor, colors: Tensor, lattice: Lattice, level: float
+) -> tuple[Tensor, Tensor, np.ndarray]:
+    """Find the surface where an opacity (X, Y, Z) is ``level``, with colours (X, Y, Z, 3), by marching cubes.
+
+    Returns:
+        vertices (V, 3) in world units, their colours (V, 3) in [0, 1], and faces (F, 3), rows of vertices,
+        counter-clockwise seen from outside.
     """
     from scipy.ndimage import map_coordinates
     from skimage.measure import marching_cubes
 
-    if not float(opacity.min()) < level < float(opacity.max()):
-        return None
     places, faces, _, _ = marching_cubes(opacity.numpy(), level, gradient_direction="ascent")
-    weighed = torch.cat([opacity[..., None] * colors, opacity[..., None]], -1).numpy()
-    read = [map_coordinates(weighed[..., i], places.T, order=1) for i in range(4)]
-    shown = np.stack(read[:3], -1) / np.maximum(read[3], 1e-12)[:, None]
+    # Colours of lattice points count by their opacity, as empty ones have none.
+    weighted = torch.cat([opacity[..., None] * colors, opacity[..., None]], -1).numpy()
+    read = [map_coordinates(weighted[..., i], places.T, order=1) for i in range(4)]
+    rgb = np.stack(read[:3], -1) / np.maximum(read[3], 1e-12)[:, None]
     vertices = lattice.to_world(torch.from_numpy(places.astype(np.float32)))
-    return Mesh(vertices, torch.from_numpy(shown).clamp(0, 1), faces)
-
-
-def write_obj(path: Path, mesh: Mesh) -> None:
-    """Write an OBJ whose vertices have colours behind their places."""
-    rows = np.concatenate([mesh.vertices.numpy(), mesh.colors.numpy()], -1)
-    with path.open("w") as file:
-        np.savetxt(file, rows, "v %.7g %.7g %.7g %.4f %.4f %.4f")
-        np.savetxt(file, mesh.faces + 1, "f %d %d %d")
-
-
-def _bounds(source: Source) -> Box:
-    """See ``export_mesh``: the box of all matter at all times."""
-    method = source.method
-    if not isinstance(method, HasBounds) or not (
-        source.has_ellipsoids or isinstance(method.at(Moment(source.times[0])), HasSolid)
-    ):
-        raise ValueError(
-            "format=mesh: expected a method that knows where matter is, as particles, forward or backward, "
-            f"but got {source.model}"
-        )
-    box = method.bounds(list(source.times))
-    if box is None:
-        raise ValueError("run: expected matter to make a mesh of, but got none; train it longer")
-    return box
+    return vertices, torch.from_numpy(rgb).clamp(0, 1), faces
 
 
 @torch.no_grad()
@@ -136,43 +108,57 @@ def export_mesh(
     Args:
         source: the scene and its times.
         folder: to write into.
-        progress: told after each file.
-        resolution: points of the lattice along the longest side of all matter.
-        level: opacity at which the surface is.
+        progress: called after each file.
+        resolution: points of the lattice along the longest side of the box of all matter at all times.
+        level: opacity of the surface.
         files: ``ply`` or ``obj``.
-        up: see ``Source.turn_to``.
+        up: see ``Source.rotation_to``.
 
     Returns:
-        what ``about.json`` says of it.
+        the facts for ``about.json``.
 
     Raises:
         ValueError: for a method that cannot tell where matter is, or where nothing or all is as opaque.
     """
-    lattice = lattice_in(_bounds(source), resolution)
-    vertices, faces, turn = [], [], source.turn_to(up).float()
+    method = source.method
+    if not isinstance(method, HasBounds) or not (
+        source.has_ellipsoids or isinstance(method.at(Moment(source.times[0])), HasSolid)
+    ):
+        raise ValueError(
+            "format=mesh: expected a method that knows where matter is, as particles, forward or backward, "
+            f"but got {source.model}"
+        )
+    box = method.bounds(list(source.times))
+    if box is None:
+        raise ValueError("run: expected matter to make a mesh of, but got none; train it longer")
+    lattice, rotation = lattice_in(box, resolution), source.rotation_to(up).float()
+    vertex_counts, face_counts = [], []
     for number, time in enumerate(source.times):
         if source.has_ellipsoids:
-            opacity, colors = solid_of(source.method.ellipsoids(time), lattice)
+            opacity, colors = voxelize(method.ellipsoids(time), lattice)
         else:
-            opacity, colors = source.method.at(Moment(time)).solid(lattice)
-        mesh = mesh_of(opacity, colors, lattice, level)
-        if mesh is None:
+            opacity, colors = method.at(Moment(time)).solid(lattice)
+        lowest, highest = float(opacity.min()), float(opacity.max())
+        if not lowest < level < highest:
             raise ValueError(
                 f"level: expected a number between the lowest and the highest opacity at time {time:.4g}, "
-                f"{float(opacity.min()):.3g} and {float(opacity.max()):.3g}, but got {level}"
+                f"{lowest:.3g} and {highest:.3g}, but got {level}"
             )
-        mesh = mesh._replace(vertices=mesh.vertices @ turn.T)
-        path = folder / f"mesh_{number:04d}.{files}"
-        if files == "obj":
-            write_obj(path, mesh)
+        vertices, rgb, faces = isosurface(opacity, colors, lattice, level)
+        vertices, path = vertices @ rotation.T, folder / f"mesh_{number:04d}.{files}"
+        if files == "ply":
+            write_ply(path, point_columns(vertices, rgb), faces)
         else:
-            write_ply(path, point_columns(mesh.vertices, mesh.colors), mesh.faces)
-        vertices.append(len(mesh.vertices))
-        faces.append(len(mesh.faces))
+            with path.open("w") as file:  # colours behind the places, a common extension of OBJ
+                rows = np.concatenate([vertices.numpy(), rgb.numpy()], -1)
+                np.savetxt(file, rows, "v %.7g %.7g %.7g %.4f %.4f %.4f")
+                np.savetxt(file, faces + 1, "f %d %d %d")
+        vertex_counts.append(len(vertices))
+        face_counts.append(len(faces))
         progress(number + 1, len(source.times))
     return {
-        "vertices": vertices,
-        "faces": faces,
+        "vertices": vertex_counts,
+        "faces": face_counts,
         "level": level,
         "up": up,
         "spacing": lattice.spacing[0],

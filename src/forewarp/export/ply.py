@@ -1,4 +1,4 @@
-"""``format=ply``: particles in the layout of Gaussian-splat viewers, voxels as coloured points."""
+"""``format=ply``: Gaussians in the layout of splat viewers, voxels as coloured points; and the PLY writer."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from forewarp.export.source import Progress, Source, tracks_of
+from forewarp.export.tracks import Progress, Source, tracks_of
 from forewarp.scene.cloud import Ellipsoids
 
 _TYPES = {"float32": "float", "uint8": "uchar"}
-_EVERY = 1 << 31  # points
-_SURE = 1e-6  # opacities this near to 0 and 1 are written as this, as their logits are
+_ALL = 1 << 31  # more points than there are
+_LOGIT_EPS = 1e-6  # opacities are clamped to [eps, 1 - eps], as their logits are written
 
 
 def write_ply(path: Path, columns: Mapping[str, np.ndarray], faces: np.ndarray | None = None) -> None:
@@ -42,94 +42,78 @@ def write_ply(path: Path, columns: Mapping[str, np.ndarray], faces: np.ndarray |
 
 
 def point_columns(points: Tensor, colors: Tensor) -> dict[str, np.ndarray]:
-    """Columns of points (N, 3) with colours (N, 3) in [0, 1]: ``x y z red green blue``."""
-    places = _named(points, "xyz")
-    shown = (colors.detach().clamp(0, 1) * 255).round().byte().cpu().numpy()
-    return places | dict(zip(("red", "green", "blue"), shown.T))
+    """Return the columns ``x y z red green blue`` of points (N, 3) with colours (N, 3) in [0, 1]."""
+    xyz = points.detach().float().cpu().numpy()
+    rgb = (colors.detach().clamp(0, 1) * 255).round().byte().cpu().numpy()
+    return dict(zip(("x", "y", "z", "red", "green", "blue"), (*xyz.T, *rgb.T)))
 
 
 def splat_columns(cloud: Ellipsoids, degree: int = 3) -> dict[str, np.ndarray]:
-    """Columns of ellipsoids as Gaussian-splat viewers read them.
+    """Return the columns of Gaussians as splat viewers read them.
 
     ``x y z nx ny nz f_dc_* f_rest_* opacity scale_* rot_*``: normals are 0; ``f_rest`` has all coefficients
     of red, then green, then blue, ``(degree + 1)^2 - 1`` each, 0 above the cloud's own degree; opacity is a
-    logit, scales are natural logarithms of standard deviations, ``rot`` is w, x, y, z.
+    logit, scales are natural logarithms of standard deviations, ``rot`` is a quaternion w, x, y, z.
     """
-    count, scales_and_turns = len(cloud), cloud.axes
-    own, wanted = cloud.harmonics.shape[1], (degree + 1) ** 2
-    harmonics = cloud.harmonics.new_zeros(count, wanted, 3)
-    harmonics[:, : min(own, wanted)] = cloud.harmonics[:, :wanted]
+    count, (scales, quaternions) = len(cloud), cloud.axes
+    harmonics = cloud.harmonics.new_zeros(count, (degree + 1) ** 2, 3)
+    stored = min(cloud.harmonics.shape[1], harmonics.shape[1])
+    harmonics[:, :stored] = cloud.harmonics[:, :stored]
     rest = harmonics[:, 1:].transpose(1, 2).reshape(count, -1)
-    columns = _named(cloud.centers, "xyz")
-    columns |= _named(torch.zeros(count, 3), ("nx", "ny", "nz"))
-    columns |= _numbered("f_dc", harmonics[:, 0])
-    columns |= _numbered("f_rest", rest)
-    columns |= _named(torch.logit(cloud.opacity.double(), eps=_SURE)[:, None], ["opacity"])
-    columns |= _numbered("scale", scales_and_turns[0].log())
-    return columns | _numbered("rot", scales_and_turns[1])
-
-
-def _numbered(name: str, values: Tensor) -> dict[str, np.ndarray]:
-    return _named(values, [f"{name}_{i}" for i in range(values.shape[1])])
-
-
-def _named(values: Tensor, names) -> dict[str, np.ndarray]:
-    return dict(zip(names, values.detach().float().cpu().numpy().T))
+    logit = torch.logit(cloud.opacity.double(), eps=_LOGIT_EPS)[:, None]
+    normals = torch.zeros_like(cloud.centers)
+    blocks = [cloud.centers, normals, harmonics[:, 0], rest, logit, scales.log(), quaternions]
+    table = torch.cat([block.detach().float() for block in blocks], 1).cpu().numpy()
+    names = ["x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3))]
+    names += [*(f"f_rest_{i}" for i in range(rest.shape[1])), "opacity"]
+    names += [*(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
+    return dict(zip(names, table.T))
 
 
 def export_ply(source: Source, folder: Path, progress: Progress, *, degree: int, up: str) -> dict:
-    """Write ``frames/frame_0000.ply`` and so on; of particles also ``canonical.ply``, which is what
-    ``motion.npz`` moves.
+    """Write ``frames/frame_0000.ply`` and so on; of particles also ``canonical.ply`` and ``motion.npz``,
+    which moves it.
 
     Args:
         source: the scene and its times.
         folder: to write into.
-        progress: told after each file.
-        degree: of the harmonics in a file, 0 to 3.
-        up: see ``Source.turn_to``; what ``motion.npz`` moves is not turned.
+        progress: called after each file.
+        degree: of the spherical harmonics in a file, 0 to 3.
+        up: see ``Source.rotation_to``; ``canonical.ply`` and ``motion.npz`` are not rotated.
 
     Returns:
-        what ``about.json`` says of it.
+        the facts for ``about.json``.
 
     Raises:
         ValueError: for a method that is neither particles nor can be followed.
     """
     source.refuse_without_tracks("ply")
     (folder / "frames").mkdir()
-    turn = source.turn_to(up)
+    rotation, total = source.rotation_to(up), len(source.times)
+    files = [folder / "frames" / f"frame_{number:04d}.ply" for number in range(total)]
     if not source.has_ellipsoids:
-        return _export_points(source, folder, progress, turn) | {"up": up}
-    total = len(source.times)
-    for number, time in enumerate(source.times):
+        tracks = tracks_of(source, _ALL, progress)
+        for file, places in zip(files, tracks.positions @ rotation.T.float()):
+            write_ply(file, point_columns(places, tracks.colors[0]))
+        return {
+            "points": len(tracks),
+            "kind": "points of the surface",
+            "colors": "sRGB, 8 bits, as in the pictures",
+            "up": up,
+        }
+    for number, (file, time) in enumerate(zip(files, source.times)):
         cloud = source.method.ellipsoids(time)
-        cloud = cloud if up == "world" else cloud.turned(turn)
-        write_ply(_frame(folder, number), splat_columns(cloud, degree))
+        write_ply(file, splat_columns(cloud if up == "world" else cloud.turned(rotation), degree))
         progress(number + 1, total)
     template = source.method.template()
     write_ply(folder / "canonical.ply", splat_columns(template, degree))
     motion = {name: value.cpu().numpy() for name, value in source.method.movement(source.times).items()}
     np.savez(folder / "motion.npz", times=np.array(source.times, np.float32), **motion)
-    own = int(template.harmonics.shape[1] ** 0.5) - 1
     return {
         "particles": len(template),
         "kind": "Gaussian splats",
         "up": up,
         "degree": degree,
-        "degree of the run": own,
+        "degree of the run": int(template.harmonics.shape[1] ** 0.5) - 1,
         "colors": "sRGB, as in the pictures: 1/2 + 0.28209479177387814 f_dc is the mean over directions",
     }
-
-
-def _export_points(source: Source, folder: Path, progress: Progress, turn: Tensor) -> dict:
-    tracks = tracks_of(source, _EVERY, progress)
-    for number, places in enumerate(tracks.positions @ turn.T.float()):
-        write_ply(_frame(folder, number), point_columns(places, tracks.colors[0]))
-    return {
-        "points": len(tracks),
-        "kind": "points of the surface",
-        "colors": "sRGB, 8 bits, as in the pictures",
-    }
-
-
-def _frame(folder: Path, number: int) -> Path:
-    return folder / "frames" / f"frame_{number:04d}.ply"

@@ -1,0 +1,222 @@
+"""What every export begins with: a fitted scene, and the tracks of its points.
+
+``format=npz`` stores these tracks, what cameras see of them, and the method's own arrays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from forewarp.drawing.images import hidden
+from forewarp.evaluation.images import within
+from forewarp.evaluation.trajectories import seen_by, surface
+from forewarp.methods.method import HasEllipsoids, HasMatter, HasTrajectories, Method
+from forewarp.scene.camera import Camera
+from forewarp.scene.cloud import far_apart
+from forewarp.scene.frame import spread
+from forewarp.scene.paths import mean_up
+from forewarp.scene.view import Moment, View
+from forewarp.training.module import DynamicSceneModule
+
+Progress = Callable[[int, int], None]  # the number of times done, and of how many
+
+_UP = {"y": (0.0, 1.0, 0.0), "-y": (0.0, -1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+_MIN_OPACITY = 0.1  # a particle that never gets as opaque is no point of the surface
+_VIEW_SIZE = 200  # most pixels per side of the images that decide what is hidden
+_SLACK = 1.5  # sizes of a point that it may lie behind the surface and still count as visible
+
+
+def no_progress(done: int, total: int) -> None:
+    """Show nothing."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """A fitted ``module``, named ``model`` in its config, the ``cameras`` it was trained with, ``times`` in
+    [0, 1], and the ``background`` (3,) in [0, 1] of its images.
+    """
+
+    module: DynamicSceneModule
+    model: str
+    cameras: Sequence[Camera]
+    times: Sequence[float]
+    background: tuple[float, float, float] = (1.0, 1.0, 1.0)
+
+    @property
+    def method(self) -> Method:
+        """The fitted method."""
+        return self.module.method
+
+    @property
+    def has_ellipsoids(self) -> bool:
+        """Whether the scene is a cloud of Gaussians."""
+        return isinstance(self.method, HasEllipsoids)
+
+    def rotation_to(self, up: str) -> Tensor:
+        """Return the rotation (3, 3) float64 that takes the mean upward direction of the images to an axis.
+
+        Args:
+            up: ``y``, ``-y`` or ``z``; ``world``: the identity.
+        """
+        from scipy.spatial.transform import Rotation
+
+        if up == "world":
+            return torch.eye(3, dtype=torch.float64)
+        before = mean_up(list(self.cameras)).numpy()
+        return torch.from_numpy(Rotation.align_vectors([_UP[up]], [before])[0].as_matrix())
+
+    def refuse_without_tracks(self, kind: str) -> None:
+        """Refuse a method that ``tracks_of`` cannot follow.
+
+        Raises:
+            ValueError: naming the format ``kind``.
+        """
+        follows = isinstance(self.method, HasTrajectories) and isinstance(self.method, HasMatter)
+        if not self.has_ellipsoids and not follows:
+            raise ValueError(
+                f"format={kind}: expected a method whose points can be followed, as particles, forward or "
+                f"backward, but got {self.model}"
+            )
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """N points that move, on the CPU.
+
+    Attributes:
+        points: (N, 3), at the canonical time, world units.
+        times: (T,).
+        positions: (T, N, 3), world units.
+        colors: (T, N, 3), in [0, 1], sRGB; one row if they do not change.
+        opacity: (T, N), in [0, 1]; one row if it does not change.
+        size: approximate width of a point, world units.
+    """
+
+    points: Tensor
+    times: Tensor
+    positions: Tensor
+    colors: Tensor
+    opacity: Tensor
+    size: float
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+@torch.no_grad()
+def tracks_of(source: Source, count: int, progress: Progress = no_progress) -> Tracks:
+    """Follow points of the surface: the centers of Gaussians, or of voxels.
+
+    Args:
+        source: the scene and its times.
+        count: most points, spread evenly over the surface.
+        progress: called after each time.
+
+    Raises:
+        ValueError: if no camera sees any.
+    """
+    module, method = source.module, source.method
+    if source.has_ellipsoids:
+        opacity = torch.stack([method.ellipsoids(time).opacity for time in source.times]).amax(0)
+        cloud, size = method.ellipsoids(module.curriculum.canonical_time), method.matter().size
+        seen = (opacity > _MIN_OPACITY) & seen_by(module, source.cameras, cloud.centers, size)
+        rows = seen.nonzero()[:, 0]
+        points, what = cloud.centers[rows], "particles"
+    else:
+        cloud = surface(module, source.cameras)
+        points, size, what = cloud.points, cloud.size, "matter"
+    if not len(points):
+        raise ValueError(f"run: expected {what} that a camera sees, but got none; train it longer")
+    chosen = far_apart(points, count)
+    points = points[chosen]
+    frames = []
+    for done, time in enumerate(source.times, 1):
+        if source.has_ellipsoids:
+            now = method.ellipsoids(time)[rows[chosen]]
+            frame = now.centers, now.colors, now.opacity
+        else:
+            moved = method.trajectories(points, points.new_tensor([time]))[:, 0]
+            frame = moved, cloud.colors[chosen], cloud.opacity[chosen]
+        frames.append([part.float().cpu() for part in frame])
+        progress(done, len(source.times))
+    positions, *parts = (torch.stack(values) for values in zip(*frames))
+    colors, opacity = (part[:1] if bool((part == part[:1]).all()) else part for part in parts)
+    times = torch.tensor(source.times, dtype=torch.float32)
+    return Tracks(points.float().cpu(), times, positions, colors, opacity, size)
+
+
+def export_npz(source: Source, folder: Path, progress: Progress, *, points: int, views: int) -> dict:
+    """Write ``trajectories.npz`` and ``method.npz``; ``docs/exports.md`` lists their arrays.
+
+    Args:
+        source: the scene and its times.
+        folder: to write into.
+        progress: called after each time.
+        points: most points.
+        views: number of training cameras whose visibility is stored.
+
+    Returns:
+        the facts for ``about.json``.
+
+    Raises:
+        ValueError: for a method whose points cannot be followed.
+    """
+    source.refuse_without_tracks("npz")
+    tracks = tracks_of(source, points)
+    numbers = spread(len(source.cameras), views)
+    cameras = [source.cameras[i] for i in numbers]
+    visible = visibility(source, tracks, cameras, progress)
+    np.savez_compressed(
+        folder / "trajectories.npz",
+        canonical_time=np.float32(source.module.curriculum.canonical_time),
+        points=tracks.points.numpy(),
+        times=tracks.times.numpy(),
+        positions=tracks.positions.transpose(0, 1).numpy(),
+        colors=tracks.colors.expand(len(tracks.times), -1, -1).transpose(0, 1).numpy(),
+        opacity=tracks.opacity.expand(len(tracks.times), -1).T.numpy(),
+        visible=visible.numpy(),
+        cameras=np.array(numbers),
+        camera_to_world=torch.stack([c.camera_to_world.double() for c in cameras]).numpy(),
+        intrinsics=np.array([[[c.fx, c.skew, c.cx], [0, c.fy, c.cy], [0, 0, 1]] for c in cameras]),
+        image_size=np.array([[c.width, c.height] for c in cameras]),
+        lens=np.array([(0.0,) * 5 if c.lens is None else (*c.lens.k, *c.lens.p) for c in cameras]),
+    )
+    state = source.method.state_dict().items()
+    arrays = {name: value.cpu().numpy() for name, value in state if isinstance(value, Tensor)}
+    np.savez_compressed(folder / "method.npz", **arrays)
+    return {
+        "points": len(tracks),
+        "views": len(cameras),
+        "visible": float(visible.float().mean()),
+        "colors": "sRGB, as in the pictures",
+    }
+
+
+@torch.no_grad()
+def visibility(source: Source, tracks: Tracks, cameras: list[Camera], progress: Progress) -> Tensor:
+    """Tell which points are visible at which time from which camera, (N, T, V) bool: in front of it, inside
+    its image, and at most 1.5 point sizes behind the surface in an image of 200 pixels.
+
+    Cost: a small image for each time and camera.
+    """
+    visible = torch.zeros(len(tracks), len(tracks.times), len(cameras), dtype=torch.bool)
+    black = torch.zeros(3, device=source.module.device)
+    for row, time in enumerate(source.times):
+        snapshot, places = source.method.at(Moment(time)), tracks.positions[row]
+        for column, camera in enumerate(within(camera, _VIEW_SIZE) for camera in cameras):
+            image = snapshot.render(View(camera), black)
+            depth = torch.where(image.opacity > 0.5, image.depth, float("inf")).cpu()
+            pixels, z = camera.project(places)
+            inside = (pixels >= 0) & (pixels < pixels.new_tensor([camera.width, camera.height]))
+            distance = (places - camera.center.to(places)).norm(dim=-1)
+            surface_depth = depth.reshape(camera.height, camera.width)
+            behind = hidden(pixels, distance, surface_depth, _SLACK * tracks.size)
+            visible[:, row, column] = (z > 0) & inside.all(-1) & ~behind
+        progress(row + 1, len(source.times))
+    return visible
