@@ -79,7 +79,7 @@ def measured(method: str, scene: Path, rays: int | None = None) -> dict:
     torch.manual_seed(0)
     reset_peak_memory()
     before = peak_memory_bytes()
-    module = run._module(run.stages[-1], None, None, len(run.stages) - 1)
+    module = run._module(run.stages[-1])
     module.method.warm_up()
     optimizer = module.configure_optimizers()
     counter = FlopCounterMode(display=False)

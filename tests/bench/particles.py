@@ -167,7 +167,7 @@ class Loop:
             run = run_of(size, 1000, Path(folder) / "run", effects)
         run.datamodule.setup("fit")
         torch.manual_seed(0)
-        self.module = run._module(run.stages[0], None, None, 0)
+        self.module = run._module(run.stages[0])
         self.method, self.fraction = self.module.method, fraction
         self.method.warm_up()
         run.datamodule.picker, run.datamodule.asks = self.module.curriculum, self.method.asks

@@ -31,7 +31,8 @@ def module_of(entry, data, **changes):
     """Make a module as it is at the beginning of its stage."""
     data.setup("fit")
     torch.manual_seed(0)
-    module = run_of([], data, ".")._module(stage_of(entry, **changes), None, None, 0)
+    stage = stage_of(entry, **changes)
+    module = run_of([stage], data, ".")._module(stage)
     data.picker, data.asks = module.curriculum, module.method.asks
     return module
 

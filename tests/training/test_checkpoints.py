@@ -31,7 +31,7 @@ def module(folder, **changes):
     """Make the module that such a run begins with."""
     ours = run(folder, **changes)
     ours.datamodule.setup()
-    return ours._module(ours.stages[0], None, None, 0)
+    return ours._module(ours.stages[0])
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from forewarp.training import stages as stages_module
-from forewarp.training.checkpoints import Interruption
+from forewarp.training.checkpoints import KeepCheckpoint
 from tests.support.tiny_scene import (
     EVERYTHING,
     RATES,
@@ -325,16 +325,17 @@ def test_ctrl_c_that_no_step_follows_stops_before_the_next_stage(tmp_path, whole
     assert same(run(tmp_path).fit(), whole[1])
 
 
-def test_whoever_sees_to_signals_himself_is_left_alone():
-    def own(number, frame):
+def test_whoever_sees_to_signals_himself_is_left_alone(tmp_path):
+    def handler(number, frame):
         pass
 
-    before = signal.signal(signal.SIGINT, own)
+    keeper = KeepCheckpoint(tmp_path / "last.ckpt", 60)
+    before = signal.signal(signal.SIGINT, handler)
     try:
-        with Interruption() as interruption:
+        with keeper.listening():
             signal.raise_signal(signal.SIGINT)
-            assert signal.getsignal(signal.SIGINT) is own
-        assert signal.getsignal(signal.SIGINT) is own
+            assert signal.getsignal(signal.SIGINT) is handler
+        assert signal.getsignal(signal.SIGINT) is handler
     finally:
         signal.signal(signal.SIGINT, before)
-    assert not interruption.asked
+    assert not keeper.asked

@@ -52,10 +52,11 @@ class StageProgress(lightning.Callback):
         if self._line.due():
             fraction, seconds = module.fraction, module.clock.seconds
             left = seconds * (1 - fraction) / fraction if fraction > 0 else None
-            known = left is not None and self.later
-            whole = f"{time_text(left + self.later)} to the end of the run | " if known else ""
+            text = self._text(module)
+            if left is not None and self.later:
+                text = f"{time_text(left + self.later)} to the end of the run | {text}"
             with module.clock.paused():
-                self._line.show(fraction, left, whole + self._text(module))
+                self._line.show(fraction, left, text)
 
     def on_train_end(self, trainer, module) -> None:
         """Leave a last line with the final values."""
@@ -72,11 +73,11 @@ class StageProgress(lightning.Callback):
             self._line = None
 
     def _text(self, module) -> str:
-        last, playing, (kind, count) = module.last, module.curriculum, module.method.size
-        speed = self._steps_a_second(module.global_step)
+        curriculum, (kind, count) = module.curriculum, module.method.size
+        psnr, speed = self._psnr / max(self._seen, _SMOOTHING), self._steps_a_second(module.global_step)
         return (
-            f"train psnr {self._psnr / max(self._seen, _SMOOTHING):.1f} | loss {last['loss']:.4f} | "
-            f"frames {playing.in_play}/{len(playing.order)} | {kind} {count:,}"
+            f"train psnr {psnr:.1f} | loss {module.last['loss']:.4f} | "
+            f"frames {curriculum.in_play}/{len(curriculum.order)} | {kind} {count:,}"
             + ("" if speed is None else f" | {speed:.1f} steps/s")
         )
 

@@ -11,44 +11,14 @@ import signal
 import sys
 import zipfile
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import lightning
 import torch
-from torch import Tensor
 
 from forewarp.files import replace_file, written_whole
 from forewarp.training.module import DynamicSceneModule
-
-
-class Interruption:
-    """A context in which the first Ctrl-C only sets ``asked``; a second one stops the process at once.
-
-    Do nothing if the program handles or ignores Ctrl-C itself, or in a thread other than the main one,
-    which receives no signals.
-    """
-
-    def __init__(self) -> None:
-        self.asked = False
-
-    def __enter__(self) -> Interruption:
-        self._installed = False
-        if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-            with suppress(ValueError):  # raised in another thread
-                signal.signal(signal.SIGINT, self._ask)
-                self._installed = True
-        return self
-
-    def __exit__(self, *error) -> None:
-        if self._installed:  # Lightning may have replaced it
-            signal.signal(signal.SIGINT, signal.default_int_handler)
-
-    def _ask(self, number, frame) -> None:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        self.asked = True
-        with suppress(OSError, RuntimeError):  # it may interrupt another print
-            print("\nends this step and saves it; Ctrl-C again stops at once", file=sys.stderr, flush=True)
 
 
 class KeepCheckpoint(lightning.Callback):
@@ -58,19 +28,16 @@ class KeepCheckpoint(lightning.Callback):
         path: file of the checkpoint, replaced each time.
         seconds: training seconds between two checkpoints.
         check: called before saving; raises if the state is broken, so that the last checkpoint stays.
-        interruption: once it is ``asked`` for, save after this step and stop.
+
+    Attributes:
+        asked: whether Ctrl-C was pressed inside ``listening()``.
     """
 
     def __init__(
-        self,
-        path: Path,
-        seconds: float,
-        check: Callable[[lightning.Trainer], None] = lambda trainer: None,
-        interruption: Interruption | None = None,
+        self, path: Path, seconds: float, check: Callable[[lightning.Trainer], None] = lambda trainer: None
     ) -> None:
         self.path, self.every, self.check = Path(path), seconds, check
-        self.interruption = interruption or Interruption()
-        self._next = seconds
+        self.asked, self._next = False, seconds
 
     def on_train_start(self, trainer, module) -> None:
         """Count from where a continued run stands."""
@@ -78,11 +45,11 @@ class KeepCheckpoint(lightning.Callback):
 
     def on_train_batch_end(self, trainer, module, outputs, batch, batch_idx) -> None:
         """Save if it is time or if Ctrl-C was pressed; then stop if it was."""
-        if self.interruption.asked or module.clock.seconds >= self._next:
+        if self.asked or module.clock.seconds >= self._next:
             self._next = module.clock.seconds + self.every
             with module.clock.paused():
                 self.save(trainer)
-        if self.interruption.asked:
+        if self.asked:
             raise KeyboardInterrupt
 
     def save(self, trainer: lightning.Trainer) -> None:
@@ -90,6 +57,33 @@ class KeepCheckpoint(lightning.Callback):
         self.check(trainer)
         with written_whole(self.path, synced=True) as beside:
             trainer.save_checkpoint(beside)
+
+    @contextmanager
+    def listening(self) -> Iterator[None]:
+        """Let the first Ctrl-C only ask to save this step and stop; a second one stops the process at once.
+
+        Do nothing if the program handles or ignores Ctrl-C itself, or in a thread other than the main one,
+        which receives no signals.
+        """
+
+        def ask(number, frame) -> None:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+            self.asked = True
+            with suppress(OSError, RuntimeError):  # it may interrupt another print
+                print(
+                    "\nends this step and saves it; Ctrl-C again stops at once", file=sys.stderr, flush=True
+                )
+
+        installed = False
+        if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+            with suppress(ValueError):  # raised in another thread
+                signal.signal(signal.SIGINT, ask)
+                installed = True
+        try:
+            yield
+        finally:
+            if installed:  # Lightning may have replaced it
+                signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def load_weights(module: DynamicSceneModule, path: Path) -> None:
@@ -103,7 +97,14 @@ def check_checkpoint(path: Path, module: DynamicSceneModule) -> dict:
     Raises:
         ValueError: naming the entries that differ, or saying that the file cannot be read.
     """
-    content = _read(path)
+    try:
+        content = read_archive(path)
+    except ValueError as error:
+        raise ValueError(
+            f"{path}: expected a checkpoint, but it cannot be read ({error}); delete it"
+        ) from None
+    if not isinstance(content.get("state_dict"), dict):
+        raise ValueError(f"{path}: expected a checkpoint, but it holds no weights; delete it")
     if differ := misfits(module, content["state_dict"]):
         raise ValueError(
             f"{path}: expected a checkpoint of this configuration, but got one that differs in "
@@ -122,59 +123,36 @@ def check_state(path: Path, module: DynamicSceneModule) -> tuple[int, float]:
         ValueError: naming what is missing, for example in a checkpoint of an older version.
     """
     content, needed = check_checkpoint(path, module), {}
-    found = content.get("forewarp")
     module.on_save_checkpoint(needed)
-    missing = sorted(needed["forewarp"].keys() - (found.keys() if isinstance(found, dict) else ()))
-    if missing:
-        raise ValueError(
-            f"{path}: expected a checkpoint of this version, but got one without {', '.join(missing)}; "
-            "delete it to begin the stage anew"
-        )
-    clock = found["clock"]
-    steps, seconds = content.get("global_step"), clock.get("seconds") if isinstance(clock, dict) else None
-    if type(steps) is not int or type(seconds) not in (int, float):
-        raise ValueError(
-            f"{path}: expected a checkpoint with its step and seconds, but got {steps} and {seconds}; "
-            "delete it to begin the stage anew"
-        )
-    return steps, seconds
+    state = content.get("forewarp")
+    state = state if isinstance(state, dict) else {}
+    lacking = sorted(needed["forewarp"].keys() - state.keys())
+    steps, clock = content.get("global_step"), state.get("clock")
+    seconds = clock.get("seconds") if isinstance(clock, dict) else None
+    if lacking:
+        wrong = f"of this version, but got one without {', '.join(lacking)}"
+    elif type(steps) is not int or type(seconds) not in (int, float):
+        wrong = f"with its step and seconds, but got {steps} and {seconds}"
+    else:
+        return steps, seconds
+    raise ValueError(f"{path}: expected a checkpoint {wrong}; delete it to begin the stage anew")
 
 
 def misfits(module: DynamicSceneModule, weights: dict) -> list[str]:
     """Return the names of stored entries that are missing, unknown, of another shape, or inconsistent."""
-    own, theirs = _shapes(module.state_dict(), module), _shapes(weights, module)
-    differ = sorted(str(k) for k in own | theirs if k not in own or k not in theirs or own[k] != theirs[k])
-    if not differ:
-        own = {str(k).removeprefix("method."): v for k, v in weights.items()}
-        name = module.method.misfit(own)
-        differ = [] if name is None else [f"method.{name}"]
-    return differ
-
-
-def _shapes(weights: dict, module: DynamicSceneModule) -> dict[str, tuple | None]:
-    """Return shapes (for dicts their keys) by name; None for entries that adopt a checkpoint's shape."""
-    adopted = {f"method.{name}" for name in module.method.adopted()}
+    adopted = {f"method.{name}" for name in module.method.adopted()}  # take a checkpoint's shape
 
     def shape(name: str, value: object) -> tuple | None:
         if isinstance(value, dict):  # plain numbers by name
             return tuple(sorted(map(str, value)))
         return tuple(value.shape) if torch.is_tensor(value) and name not in adopted else None
 
-    return {name: shape(name, value) for name, value in weights.items()}
-
-
-def _read(path: Path) -> dict:
-    try:
-        content = read_archive(path)
-    except OSError:
-        raise
-    except ValueError as error:
-        raise ValueError(
-            f"{path}: expected a checkpoint, but it cannot be read ({error}); delete it"
-        ) from None
-    if not isinstance(content.get("state_dict"), dict):
-        raise ValueError(f"{path}: expected a checkpoint, but it holds no weights; delete it")
-    return content
+    built, stored = ({k: shape(k, v) for k, v in w.items()} for w in (module.state_dict(), weights))
+    differ = sorted(str(k) for k in built | stored if built.get(k, "none") != stored.get(k, "none"))
+    if not differ:
+        name = module.method.misfit({str(k).removeprefix("method."): v for k, v in weights.items()})
+        differ = [] if name is None else [f"method.{name}"]
+    return differ
 
 
 def write_archive(path: Path, content: dict) -> None:
@@ -202,13 +180,13 @@ def read_archive(path: Path) -> dict:
             members = archive.infolist()
             # A stored member is no longer than the file; a compressed one may be, a thousand times.
             packed = any(member.compress_type != zipfile.ZIP_STORED for member in members)
-            if packed or sum(member.file_size for member in members) > path.stat().st_size:
-                raise zipfile.BadZipFile
-            if archive.testzip() is not None:
+            larger = sum(member.file_size for member in members) > path.stat().st_size
+            if packed or larger or archive.testzip() is not None:
                 raise zipfile.BadZipFile
         content = torch.load(path, map_location="cpu", weights_only=True)
-        if not isinstance(content, dict) or not all(map(_is_whole, _tensors(content))):
+        if not isinstance(content, dict):
             raise TypeError
+        _check_stored(content)
         return content
     except OSError:
         raise
@@ -216,19 +194,15 @@ def read_archive(path: Path) -> dict:
         raise ValueError(type(error).__name__) from None
 
 
-def _is_whole(tensor: Tensor) -> bool:
-    """Check that every entry is stored in the file, so that a copy of the tensor is no larger."""
-    if tensor.layout != torch.strided or tensor.device.type != "cpu":
-        return False
-    return tensor.numel() * tensor.element_size() <= tensor.untyped_storage().nbytes()
-
-
-def _tensors(content: object) -> Iterator[Tensor]:
+def _check_stored(content: dict) -> None:
+    """Refuse tensors of which the file does not store every entry: a copy would be larger than the file."""
     left, seen = [content], set()
     while left:
         node = left.pop()
         if torch.is_tensor(node):
-            yield node
+            plain = node.layout == torch.strided and node.device.type == "cpu"
+            if not plain or node.numel() * node.element_size() > node.untyped_storage().nbytes():
+                raise TypeError
         elif isinstance(node, dict | list | tuple | set) and id(node) not in seen:
             seen.add(id(node))  # a container may hold itself
             left += [*node, *node.values()] if isinstance(node, dict) else node

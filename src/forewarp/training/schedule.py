@@ -66,9 +66,6 @@ class StageSettings:
             value = getattr(self, key)
             if value is not None and not (is_number(value) and value > 0):
                 raise ValueError(f"{where}.{key}: expected a number > 0, or null, but got {value!r}")
-        self._check_rates(where)
-
-    def _check_rates(self, where: str) -> None:
         if not isinstance(self.lr, Mapping):
             raise ValueError(f"{where}.lr: expected a rate for each group, but got {self.lr!r}")
         for key, low, high, what in (
@@ -89,8 +86,8 @@ class StageSettings:
     @classmethod
     def of(cls, name: str, **keys: Any) -> StageSettings:
         """Make settings from a stage's keys; keys that are not fields go to ``numbers``."""
-        own = {key: keys.pop(key) for key in list(keys) if key in cls.__dataclass_fields__}
-        return cls(name, **own, numbers=keys)
+        fields = {key: keys.pop(key) for key in list(keys) if key in cls.__dataclass_fields__}
+        return cls(name, **fields, numbers=keys)
 
     def over(self, pictures: int) -> StageSettings:
         """Return the settings whose ``iterations`` also keep ``steps_per_picture``."""
@@ -98,19 +95,18 @@ class StageSettings:
 
     def lr_factor(self, fraction: float, group: str) -> float:
         """Return what the learning rate of a group is multiplied by at ``fraction`` of the stage."""
-        hold, last = _of(self.lr_hold, group, 0.0), _of(self.lr_final_factor, group, 1.0)
+        hold, last = self.lr_hold, self.lr_final_factor
+        hold = hold.get(group, 0.0) if isinstance(hold, Mapping) else hold
+        last = last.get(group, 1.0) if isinstance(last, Mapping) else last
         if fraction <= hold:
             return 1.0
         return last ** ((min(1.0, fraction) - hold) / (1 - hold))
 
     def fraction(self, steps: int, seconds: float) -> float:
         """Return the fraction done, in [0, 1]: of the iterations or of the minutes, whichever is larger."""
-        done = 0.0
-        if self.iterations is not None:
-            done = steps / self.iterations
-        if self.minutes is not None:
-            done = max(done, seconds / (60 * self.minutes))
-        return min(1.0, done)
+        by_steps = 0.0 if self.iterations is None else steps / self.iterations
+        by_time = 0.0 if self.minutes is None else seconds / (60 * self.minutes)
+        return min(1.0, max(by_steps, by_time))
 
 
 def most_steps(iterations: float | None, steps_per_picture: float | None, pictures: int) -> int | None:
@@ -120,13 +116,8 @@ def most_steps(iterations: float | None, steps_per_picture: float | None, pictur
     (15, 12, None)
     """
     per_picture = None if steps_per_picture is None else steps_per_picture * pictures
-    known = [max(1, round(bound)) for bound in (iterations, per_picture) if bound is not None]
-    return min(known, default=None)
-
-
-def _of(given: float | Mapping[str, float], group: str, otherwise: float) -> float:
-    """Return a group's number, where one is given for all groups or one each."""
-    return given.get(group, otherwise) if isinstance(given, Mapping) else given
+    bounds = [max(1, round(bound)) for bound in (iterations, per_picture) if bound is not None]
+    return min(bounds, default=None)
 
 
 @dataclass(frozen=True)
@@ -153,11 +144,6 @@ class StagePlan:
     ) -> None:
         self.share, self.objective, self.model, self.settings = share, objective, model, settings
 
-    def stage(self, name: str, minutes: float | None, iterations: int | None) -> Stage:
-        """Make the stage with these bounds."""
-        settings = StageSettings.of(name, minutes=minutes, iterations=iterations, **self.settings)
-        return Stage(settings, self.objective, self.model)
-
 
 def share_out(
     plans: Mapping[str, StagePlan | None], *, minutes: float | None, iterations: int | None
@@ -182,15 +168,14 @@ def share_out(
     for key, value in (("minutes", minutes), ("iterations", iterations)):
         if value is not None and not (isinstance(value, int | float) and value > 0):
             raise ValueError(f"budget.{key}: expected a number > 0 or null, but got {value}")
-    whole = sum(plan.share for plan in kept.values())
-    return [
-        plan.stage(
-            name,
-            None if minutes is None else minutes * plan.share / whole,
-            None if iterations is None else max(1, round(iterations * plan.share / whole)),
-        )
-        for name, plan in kept.items()
-    ]
+    whole, stages = sum(plan.share for plan in kept.values()), []
+    for name, plan in kept.items():
+        bounds = {
+            "minutes": None if minutes is None else minutes * plan.share / whole,
+            "iterations": None if iterations is None else max(1, round(iterations * plan.share / whole)),
+        }
+        stages.append(Stage(StageSettings.of(name, **bounds, **plan.settings), plan.objective, plan.model))
+    return stages
 
 
 def seconds_after(stages: Sequence[Stage], name: str) -> float | None:
@@ -199,9 +184,9 @@ def seconds_after(stages: Sequence[Stage], name: str) -> float | None:
     """
     names = [stage.settings.name for stage in stages]
     later = [stage.settings for stage in stages[names.index(name) + 1 :]]
-    if any(one.minutes is None or one.steps_per_picture is not None for one in later):
+    if any(settings.minutes is None or settings.steps_per_picture is not None for settings in later):
         return None
-    return 60 * sum(one.minutes for one in later)
+    return 60 * sum(settings.minutes for settings in later)
 
 
 class Curriculum:
@@ -259,12 +244,11 @@ class Curriculum:
         self.order = sorted(range(len(times)), key=lambda i: (abs(times[i] - canonical_time), times[i], i))
         last_of_time = {times[i]: place for place, i in enumerate(self.order)}
         self._ends = [place + 1 for place in last_of_time.values()]  # frames in play, by number of times
-        if most is not None:
-            if most < 1:
-                raise ValueError(f"{where}.most: expected at least 1 or null, but got {most}")
-            self._ends = self._ends[:most]
+        if most is not None and most < 1:
+            raise ValueError(f"{where}.most: expected at least 1 or null, but got {most}")
         if pace is not None and not pace >= 0:
             raise ValueError(f"{where}.pace: expected a number >= 0 or null, but got {pace}")
+        self._ends = self._ends[:most]
         self.start, self.all_in, self.pace = min(start, len(self._ends)), all_in, pace
         self.from_zero = from_zero
         self.newest_share, self.newest_part = newest_share, newest_part
@@ -297,7 +281,11 @@ class Curriculum:
         """Draw the next training frame."""
         playing = self.in_play
         if self._falls_to(self.error_share):
-            return self._by_error()
+            errors = self.errors[self.order[:playing]]
+            seen = errors[~errors.isnan()]
+            # A frame not yet seen counts as the worst one.
+            weights = torch.nan_to_num(errors, nan=float(seen.max()) if len(seen) else 1.0) + 1e-8
+            return self.order[int(torch.multinomial(weights, 1, generator=self.generator))]
         growing = playing < len(self.order)
         if not growing and self._falls_to(self.ends_share):
             return self.at_ends[int(torch.randint(len(self.at_ends), (), generator=self.generator))]
@@ -315,15 +303,7 @@ class Curriculum:
         if not math.isfinite(error):
             return
         before = float(self.errors[frame])
-        self.errors[frame] = error if before != before else 0.5 * (before + error)
-
-    def _by_error(self) -> int:
-        frames = self.order[: self.in_play]
-        errors = self.errors[frames]
-        known = errors[~errors.isnan()]
-        # A frame not yet seen counts as the worst one.
-        chance = torch.nan_to_num(errors, nan=float(known.max()) if len(known) else 1.0) + 1e-8
-        return frames[int(torch.multinomial(chance, 1, generator=self.generator))]
+        self.errors[frame] = error if math.isnan(before) else 0.5 * (before + error)
 
     def state_dict(self) -> dict:
         """Return the generator's state, the fraction done and the frames' errors."""

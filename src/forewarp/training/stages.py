@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import gc
+import re
 import resource
 import subprocess
 import sys
@@ -22,7 +23,7 @@ from forewarp.files import read_json, write_json
 from forewarp.methods.method import Model, Start, parameter_count
 from forewarp.scene.cloud import Handover
 from forewarp.scene.frame import Scene
-from forewarp.training.checkpoints import Interruption, KeepCheckpoint, check_state, load_weights
+from forewarp.training.checkpoints import KeepCheckpoint, check_state, load_weights
 from forewarp.training.handover import load_handover, make_handover, save_handover
 from forewarp.training.module import DynamicSceneModule
 from forewarp.training.schedule import Curriculum, Stage
@@ -104,28 +105,36 @@ class Run:
         """Train all stages that are not finished; return the module of the last one."""
         self.check_device()
         self.datamodule.setup("fit")
-        self._check_feasible()
-        self._check_later_stages()
+        finished = [self.is_finished(stage) for stage in self.stages]
+        self._check_ahead([stage for stage, done in zip(self.stages, finished) if not done])
         module, handover = None, None
-        for number, stage in enumerate(self.stages):
+        for number, (stage, done) in enumerate(zip(self.stages, finished)):
             folder = self.stage_folder(stage)
             folder.mkdir(parents=True, exist_ok=True)
             # Every stage seeds anew, so that loading a finished one changes nothing that follows.
             lightning.seed_everything(self.seed + number, verbose=False)
             self.datamodule.restart(number)
-            finished = self.is_finished(stage)
-            blank = finished or (folder / "last.ckpt").is_file()
+            blank = done or (folder / "last.ckpt").is_file()
             clock = Clock(self.clock)
             with clock.running():  # a hull, a plane sweep
-                module = self._module(stage, module, handover, number, blank=blank)
+                module = self._module(stage, module, handover, blank=blank)
             module.clock = Clock(self.clock) if blank else clock
-            if finished:
+            if done:
                 load_weights(module, folder / "last.ckpt")
                 self.tell(f"{stage.settings.name}: finished before")
             else:
-                self._fit_stage(stage, module, folder, handover)
+                self._fit_stage(stage, module, handover)
             handover = load_handover(folder)
         return module
+
+    def _check_ahead(self, stages: Sequence[Stage]) -> None:
+        """Refuse, before training, what a method cannot do on this device, and mistakes in later stages."""
+        for stage in stages:
+            settings, check = stage.settings, self._of_method(stage, "check_feasible")
+            if check is not None:
+                check(self.datamodule.scene, settings.name, settings.numbers, self.device)
+            if stage is not self.stages[0]:
+                self._module(stage, blank=True)
 
     def load(self) -> DynamicSceneModule:
         """Load the last stage of a finished run.
@@ -140,11 +149,10 @@ class Run:
                     f"{self.stage_folder(stage)}: expected a finished stage, but got none; "
                     "continue with forewarp-train"
                 )
-        stage = self.stages[-1]
-        before = [load_handover(self.stage_folder(s)) for s in self.stages[:-1]]
-        handover = before[-1] if before else None
-        module = self._module(stage, None, handover, len(self.stages) - 1, blank=True)
-        load_weights(module, self.stage_folder(stage) / "last.ckpt")
+        *before, last = self.stages
+        handover = load_handover(self.stage_folder(before[-1])) if before else None
+        module = self._module(last, handover=handover, blank=True)
+        load_weights(module, self.stage_folder(last) / "last.ckpt")
         return module
 
     def stage_folder(self, stage: Stage) -> Path:
@@ -158,12 +166,12 @@ class Run:
             load_handover(folder)
         except ValueError:
             return False
-        return _noted(folder) is not None and (folder / "last.ckpt").is_file()
+        return _done(folder) is not None and (folder / "last.ckpt").is_file()
 
     def finished(self) -> dict[str, dict]:
         """Return the contents of ``done.json`` by stage: seconds, steps, peak memory and so on."""
-        found = {stage.settings.name: _noted(self.stage_folder(stage)) for stage in self.stages}
-        return {name: noted for name, noted in found.items() if noted is not None}
+        done = {stage.settings.name: _done(self.stage_folder(stage)) for stage in self.stages}
+        return {name: content for name, content in done.items() if content is not None}
 
     def rebuilt(self, name: str, scene: Scene) -> DynamicSceneModule:
         """Build the module of a stage for a ``state_dict``, without images and without earlier stages.
@@ -172,44 +180,38 @@ class Run:
             name: name of the stage.
             scene: cameras, times and box; its frames need no images.
         """
-        number, stage = next((i, s) for i, s in enumerate(self.stages) if s.settings.name == name)
-        return replace(self, datamodule=SimpleNamespace(scene=scene))._module(
-            stage, None, None, number, blank=True
-        )
+        stage = next(stage for stage in self.stages if stage.settings.name == name)
+        return replace(self, datamodule=SimpleNamespace(scene=scene))._module(stage, blank=True)
 
     def _of_method(self, stage: Stage, name: str) -> Callable | None:
         """Return what the method of a stage has by this name before it is built."""
         model = stage.model or self.model
         return getattr(getattr(model, "func", model), name, None)
 
-    def _check_feasible(self) -> None:
-        """Refuse what a method cannot do on this device, before anything is computed."""
-        for stage in self.stages:
-            check = self._of_method(stage, "check_feasible")
-            if check is not None and not self.is_finished(stage):
-                check(self.datamodule.scene, stage.settings.name, stage.settings.numbers, self.device)
-
-    def _check_later_stages(self) -> None:
-        """Build the later stages once, so that errors in their settings are reported before training."""
-        for number, stage in enumerate(self.stages):
-            if number and not self.is_finished(stage):
-                self._module(stage, None, None, number, blank=True)
-
     def _module(
         self,
         stage: Stage,
-        before: DynamicSceneModule | None,
-        handover: Handover | None,
-        number: int,
+        before: DynamicSceneModule | None = None,
+        handover: Handover | None = None,
         *,
         blank: bool = False,
     ) -> DynamicSceneModule:
+        """Build the module of a stage.
+
+        Args:
+            stage: one of ``stages``.
+            before: the module of the stage before; None where it is not at hand.
+            handover: what that stage left; None for the first.
+            blank: whether a checkpoint will replace what the method begins with.
+        """
         scene: Scene = self.datamodule.scene
+        seed = self.seed + self.stages.index(stage)
         settings, objective = stage.settings.over(len(scene.train)), stage.objective
-        times = [frame.time for frame in scene.train]
-        where = f"stage.{settings.name}.curriculum"
-        draws = {"seed": self.seed + number, "where": where, **settings.curriculum}
-        curriculum = Curriculum(times, scene.canonical_time, **draws)
+        curriculum = Curriculum(
+            [frame.time for frame in scene.train],
+            scene.canonical_time,
+            **{"seed": seed, "where": f"stage.{settings.name}.curriculum", **settings.curriculum},
+        )
         start = Start(
             scene,
             settings.name,
@@ -222,70 +224,59 @@ class Run:
             objective.literal,
             objective.photo_on,
         )
+        method = (stage.model or self.model)(start)
         return DynamicSceneModule(
-            (stage.model or self.model)(start),
-            objective=objective,
-            settings=settings,
-            curriculum=curriculum,
-            seed=self.seed + number,
+            method, objective=objective, settings=settings, curriculum=curriculum, seed=seed
         )
 
-    def _fit_stage(
-        self, stage: Stage, module: DynamicSceneModule, folder: Path, before: Handover | None
-    ) -> None:
+    def _fit_stage(self, stage: Stage, module: DynamicSceneModule, before: Handover | None) -> None:
+        """Train a stage to its end, from its checkpoint if it has one, and write what it leaves."""
+        settings, folder = stage.settings, self.stage_folder(stage)
         last = folder / "last.ckpt"
         sentinel = Sentinel(folder, skip=self.skip)
-        interruption = Interruption()
-        keeper = KeepCheckpoint(last, self.checkpoint_seconds, sentinel.check, interruption)
-        watchers = [sentinel, *self.callbacks(stage.settings.name, folder), keeper]
-        trainer = self.make_trainer(folder, watchers)
+        keeper = KeepCheckpoint(last, self.checkpoint_seconds, sentinel.check)
+        trainer = self.make_trainer(folder, [sentinel, *self.callbacks(settings.name, folder), keeper])
         checkpoint = last if last.is_file() else None
         if checkpoint is not None:
             steps, seconds = check_state(checkpoint, module)
-            done = module.settings.fraction(steps, seconds)
-            self.tell(f"{stage.settings.name}: goes on at {done:.0%}, step {steps}")
+            fraction = module.settings.fraction(steps, seconds)
+            self.tell(f"{settings.name}: goes on at {fraction:.0%}, step {steps}")
         reset_peak_memory()
         code = commit()  # now, as others may be made before the stage ends
-        with interruption:
+        with keeper.listening():
             trainer.fit(module, datamodule=self.datamodule, ckpt_path=checkpoint, weights_only=True)
         if module.fraction < 1:  # fit returned early, as when a callback stops it: the stage is not finished
             raise KeyboardInterrupt
-        self._tell_of_end(stage, module)
+        most = module.settings.iterations
+        if most != settings.iterations and module.global_step >= most:
+            count = len(self.datamodule.scene.train)
+            self.tell(
+                f"{settings.name}: ended after {most:,} steps, {settings.steps_per_picture:g} for each of "
+                f"{count} training pictures; for as many as the budget has: "
+                f"stage.{settings.name}.steps_per_picture=null"
+            )
         keeper.save(trainer)
         in_play = module.curriculum.in_play
         save_handover(make_handover(module.method, self.datamodule.scene, before, in_play), folder)
-        write_json(
-            folder / "done.json",
-            {
-                "seconds": module.clock.seconds,
-                "clocks": module.clock.every,
-                "steps": module.global_step,
-                "parameters": parameter_count(module.method),
-                "frames_in_play": module.curriculum.in_play,
-                "peak_memory_bytes": peak_memory_bytes(),
-                "skipped_steps": sentinel.skipped,
-                "commit": code,
-            },
-        )
-        if interruption.asked:  # pressed after the stage's last step
+        done = {
+            "seconds": module.clock.seconds,
+            "clocks": module.clock.every,
+            "steps": module.global_step,
+            "parameters": parameter_count(module.method),
+            "frames_in_play": in_play,
+            "peak_memory_bytes": peak_memory_bytes(),
+            "skipped_steps": sentinel.skipped,
+            "commit": code,
+        }
+        write_json(folder / "done.json", done)
+        if keeper.asked:  # pressed after the stage's last step
             raise KeyboardInterrupt
 
-    def _tell_of_end(self, stage: Stage, module: DynamicSceneModule) -> None:
-        """Say so where a stage ended by its steps per picture, before its budget."""
-        own, most = stage.settings, module.settings.iterations
-        if most != own.iterations and module.global_step >= most:
-            many = len(self.datamodule.scene.train)
-            pictures = f"{own.steps_per_picture:g} for each of {many} training pictures"
-            self.tell(
-                f"{own.name}: ended after {most:,} steps, {pictures}; "
-                f"for as many as the budget has: stage.{own.name}.steps_per_picture=null"
-            )
 
-
-def _noted(folder: Path) -> dict | None:
+def _done(folder: Path) -> dict | None:
     """Read a stage's ``done.json``; None if the stage has not ended."""
-    noted = read_json(folder / "done.json")
-    return noted if noted is not None and {"seconds", "steps"} <= noted.keys() else None
+    done = read_json(folder / "done.json")
+    return done if done is not None and {"seconds", "steps"} <= done.keys() else None
 
 
 @cache
@@ -329,12 +320,8 @@ def peak_memory_bytes() -> int:
     """
     if torch.cuda.is_available() and torch.cuda.max_memory_allocated() > 0:
         return torch.cuda.max_memory_allocated()
-    try:
-        lines = (_PROCESS / "status").read_text().splitlines()
-    except OSError:
-        lines = []
-    for line in lines:
-        if line.startswith("VmHWM:"):
-            return int(line.split()[1]) * 1024  # in KiB
+    with suppress(OSError):
+        if peak := re.search(r"^VmHWM:\s*(\d+)", (_PROCESS / "status").read_text(), re.MULTILINE):
+            return int(peak[1]) * 1024  # in KiB
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else peak * 1024  # elsewhere in KiB
