@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from forewarp.scene.camera import Camera, Lens, look_at
-from forewarp.synth.film import Exposure, Film, ImageSpec
+from forewarp.synth.raycast import render_all
 from forewarp.synth.world import World
 
 
@@ -70,10 +70,9 @@ def cameras_of(walk: Walk, times, seconds: float, size=(640, 480), seed: int = 0
 def pictures_of(walk: Walk, times, cameras, *, samples: int = 2, workers=None, progress=None):
     """Yield uint8 pictures (H, W, 3), one for each camera; what is behind everything is white."""
     world = World(walk.motion, has_room=walk.has_room)
-    views = [ImageSpec(f"{i}", float(t), camera) for i, (t, camera) in enumerate(zip(times, cameras))]
-    with Film(Exposure(samples, 1), cameras, workers, progress) as film:
-        for rgba, _ in film.pictures(world, views):
-            yield rgba[..., :3]
+    views = [(world, float(time), camera) for time, camera in zip(times, cameras)]
+    for rgba, _ in render_all(views, samples, workers, progress, shadow_rays=1):
+        yield rgba[..., :3]
 
 
 def smeared(picture: np.ndarray, length: int) -> np.ndarray:

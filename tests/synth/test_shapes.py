@@ -1,7 +1,17 @@
 import numpy as np
 import pytest
 
-from forewarp.synth.shapes import box, cylinder, joined, prism, rounded_slab, sphere, studs
+from forewarp.synth.shapes import (
+    PATTERNS,
+    Material,
+    Surface,
+    box,
+    color_of,
+    cylinder,
+    prism,
+    rounded_slab,
+    sphere,
+)
 
 
 def volume(mesh):
@@ -26,14 +36,18 @@ def test_volumes_by_hand():
     assert volume(slab) == pytest.approx((4 - 0.64 + 0.16 * np.pi) / 2, rel=1e-3)
 
 
-def test_joined_meshes_keep_their_own_vertices():
-    first, second = box((0, 0, 0), (1, 1, 1)), box((2, 0, 0), (3, 2, 1))
-    vertices, faces = joined([first, second])
-    np.testing.assert_array_equal(vertices[faces[len(first[1]) :]], second[0][second[1]])
-    assert volume((vertices, faces)) == pytest.approx(3)
+def test_checker_by_hand():
+    position = np.array([(0.5, 0.5, 0), (1.5, 0.5, 0), (1.5, 1.5, 0), (1.0, 0.5, 0)])
+    upwards = np.broadcast_to((0.0, 0.0, 1.0), position.shape)
+    material = Material("checker", ((1, 1, 1), (0, 0, 0), (0.5, 0.5, 0.5)), 1.0)
+    color = color_of(material, Surface(position, position / 2, upwards))
+    assert color[:, 0].tolist() == [1, 0, 1, 0.5]
 
 
-def test_a_stud_for_every_place():
-    one, six = studs([0], [0], 1.0), studs([0, 1, 2], [0, 5], 1.0)
-    assert volume(six) == pytest.approx(6 * volume(one))
-    assert six[0][:, 2].min() < 1.0 < six[0][:, 2].max()
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_every_pattern_colours_any_point(pattern):
+    points, normals = np.random.default_rng(0).uniform(-1, 1, (2, 200, 3))
+    colors = tuple((i / 4, 0.2, 0.3) for i in range(5))
+    found = color_of(Material(pattern, colors, 0.3), Surface(points, 0.5 + 0.5 * points, normals))
+    assert found.shape == (200, 3)
+    assert len(np.unique(found[:, 0])) >= (1 if pattern == "plain" else 2)

@@ -6,7 +6,6 @@ import json
 import os
 import shutil
 from collections.abc import Callable, Mapping
-from functools import partial
 from pathlib import Path
 
 from filelock import FileLock
@@ -39,7 +38,10 @@ def write_whole(
         folder: folder of the scene; an existing one is replaced.
         dataset: a key of ``WRITERS``.
         arguments: arguments of the writer; recorded in the scene's ``synthesis.json``.
-        workers, progress: see ``film.Film``; the files do not depend on them.
+        workers, progress: see ``raycast.RenderPool``; the files do not depend on them.
+
+    Raises:
+        SceneError: for a bad argument, or a folder that cannot be written to.
     """
     beside = folder.with_name(f".{folder.name}.part-{os.getpid()}")
     try:
@@ -48,6 +50,9 @@ def write_whole(
         if folder.exists():
             shutil.rmtree(folder)
         os.replace(beside, folder)
+    except OSError as error:
+        got = error.strerror or error
+        raise SceneError(f"{folder}: expected a folder to write to, but got {got}; set folder") from error
     finally:
         shutil.rmtree(beside, ignore_errors=True)
     return folder
@@ -71,8 +76,13 @@ class Synthetic:
 
     def __init__(self, root: str | Path, scene: str, *, synthesis: Mapping, **arguments) -> None:
         super().__init__(root, scene, **arguments)
-        self.folder, self.synthesis = self._folder(Path(root), scene), dict(synthesis)
-        self._read = partial(self._prepared, self._read)
+        # One call of the Lego Complete writer makes several scenes.
+        self.folder = Path(root) if self.dataset == "lego_complete" else Path(root) / scene
+        self.synthesis, self._read_files, self._read = dict(synthesis), self._read, self._read_prepared
+
+    def _read_prepared(self) -> Scene:
+        self.prepare()
+        return self._read_files()
 
     def prepare(self) -> None:
         """Write the scene if it is missing; if several runs need the scene at once, one writes.
@@ -83,16 +93,16 @@ class Synthetic:
         if not is_scene(self.folder):
             self.folder.parent.mkdir(parents=True, exist_ok=True)
             with FileLock(self.folder.with_name(f".{self.folder.name}{LOCK}")):
-                self._write()
-        self._check()
-
-    def _prepared(self, read: Callable[[], Scene]) -> Scene:
-        self.prepare()
-        return read()
+                if not is_scene(self.folder):  # else written while this run waited for the lock
+                    self._write()
+        record = self.folder / RECORD
+        before = {"dataset": "dnerf", **read_json(record)}
+        for key, value in {"dataset": self.dataset, **self.synthesis}.items():
+            if key in before and before[key] != value:
+                got = f"{before[key]}; use another data.scene or delete the scene"
+                raise SceneError(f"{record}: {key}: expected {value}, but got {got}")
 
     def _write(self) -> None:
-        if is_scene(self.folder):  # written while this run waited for the lock
-            return
         if self.folder.exists() and (not self.folder.is_dir() or any(self.folder.iterdir())):
             raise SceneError(
                 f"{self.folder}: expected a synthesised scene or nothing, but got something else; "
@@ -100,19 +110,6 @@ class Synthetic:
             )
         with Counted(f"writing {self.folder.name}") as progress:
             write_whole(self.folder, self.dataset, self.synthesis, progress=progress)
-
-    def _folder(self, root: Path, scene: str) -> Path:
-        """Return the folder that one call of the writer fills."""
-        return root / scene
-
-    def _check(self) -> None:
-        """Refuse a scene that was made with other arguments."""
-        record = self.folder / RECORD
-        before = {"dataset": "dnerf", **read_json(record)}
-        for key, value in {"dataset": self.dataset, **self.synthesis}.items():
-            if key in before and before[key] != value:
-                got = f"{before[key]}; use another data.scene or delete the scene"
-                raise SceneError(f"{record}: {key}: expected {value}, but got {got}")
 
 
 class SyntheticDataModule(Synthetic, DNeRFDataModule):
@@ -123,9 +120,6 @@ class SyntheticLegoCompleteDataModule(Synthetic, LegoCompleteDataModule):
     """The procedural scene ``root/scene``, one of several that are synthesised together into ``root``."""
 
     dataset = "lego_complete"
-
-    def _folder(self, root: Path, scene: str) -> Path:
-        return root
 
 
 class SyntheticHyperNeRFDataModule(Synthetic, HyperNeRFDataModule):

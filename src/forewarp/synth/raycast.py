@@ -1,24 +1,39 @@
-"""Cast rays exactly into a posed world: lit pictures, depth, surface points and their trajectories."""
+"""Cast rays exactly into a posed world: lit images, depth, surface points and their trajectories.
+
+Many images are rendered in several processes if that is faster.
+"""
 
 from __future__ import annotations
 
+import pickle
+import signal
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
+from multiprocessing import get_context
 
 import numpy as np
 import torch
 
+from forewarp.ops.backend import cores
 from forewarp.scene.camera import Camera
-from forewarp.scene.frame import Truth
 from forewarp.synth.shapes import Surface, color_of
-from forewarp.synth.world import World
+from forewarp.synth.world import LIGHT_AT, World
 
-LIGHT_AT, LIGHT_RADIUS = np.array([2.2, -2.6, 4.6]), 0.45
+LIGHT_RADIUS = 0.45
 AMBIENT, SKY, DIFFUSE = 0.60, 0.10, 0.40
 # Per sample; four samples per pixel see two dozen points of the light, so shadows show no steps.
 SHADOW_RAYS = 6
 # Far above the error of float32, which embree computes in, and far below anything visible.
 LIFT_OFF = 2e-4
+# Candidates per wanted surface point: about half of the surface is never visible.
+_SPARE = 4
+# A process takes seconds to start and casts about two million samples a second.
+_SAMPLES_A_PROCESS = 4e7
+# Images per process waiting to be written: enough that no process idles, few enough for the memory.
+_AHEAD = 3
 
 
 @dataclass(frozen=True)
@@ -41,96 +56,83 @@ class Posed:
     """
 
     def __init__(self, world: World, time: float):
-        self.world, self.time = world, time
-        light = world.light(time)
-        self.light, self.there = LIGHT_AT if light is None else light, world.there(time)
+        self.world, self.light, self.is_there = world, world.subject.light(time), world.is_there(time)
         self.corners = world.place(time)[world.faces]  # (F, 3, 3)
-        cross = np.cross(self.corners[:, 1] - self.corners[:, 0], self.corners[:, 2] - self.corners[:, 0])
+        cross = _cross(self.corners)
         self.area = 0.5 * np.linalg.norm(cross, axis=-1)
         self.normal = cross / (2 * self.area[:, None])
-        self.corner_normal = _corner_normals(world, cross, self.normal)
+        # Normals (F, 3, 3) at the corners: averaged in smooth parts, else those of the faces.
+        self.corner_normal = np.repeat(self.normal[:, None], 3, axis=1)
+        faces, summed = world.faces[world.smooth], np.zeros((len(world.rest), 3))
+        np.add.at(summed, faces, cross[world.smooth][:, None])
+        self.corner_normal[world.smooth] = _unit(summed[faces])
         self.finish = np.array([(p.material.gloss, p.material.shine) for p in world.parts])
-        self._first = _intersector(self.corners, self.there)
-        every = bool(world.casts.all())
-        self._first_blocker = self._first if every else _intersector(self.corners, self.there & world.casts)
+        self._first = _intersector(self.corners, self.is_there)
+        casts = self.is_there & world.casts
+        self._first_blocker = self._first if world.casts.all() else _intersector(self.corners, casts)
 
     def first_hits(self, origins: np.ndarray, directions: np.ndarray) -> Hits:
         """Find the first hits of rays from ``origins`` (n, 3) along unit ``directions`` (n, 3)."""
         face = self._first(origins, directions)
         ray = np.flatnonzero(face >= 0)
-        face = face[ray]
-        barycentric = self._barycentric(face, origins[ray], directions[ray])
-        point = np.einsum("nc,ncd->nd", barycentric, self.corners[face])
-        distance = np.einsum("nd,nd->n", point - origins[ray], directions[ray])
-        return Hits(ray, face, barycentric, distance)
+        face, origins, directions = face[ray], origins[ray], directions[ray]
+        # In float64, as embree gives only the face; grazing rays are clamped to their face.
+        a, b, c = (self.corners[face, i] for i in range(3))
+        normal = 2 * self.area[face, None] * self.normal[face]
+        across = np.cross(directions, origins - a)
+        scale = _dot(directions, normal)
+        scale = np.where(np.abs(scale) < 1e-15, 1e-15, scale)
+        v, w = _dot(c - a, across) / scale, -_dot(b - a, across) / scale
+        weights = np.clip(np.stack([1 - v - w, v, w], -1), 0, 1)
+        barycentric = weights / weights.sum(-1, keepdims=True)
+        point = _blended(barycentric, self.corners[face])
+        return Hits(ray, face, barycentric, _dot(point - origins, directions))
 
     def is_free(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Tell which rays (n, 3), (n, 3) leave the world (n,); parts that cast no shadow are ignored."""
         return self._first_blocker(origins, directions) < 0
-
-    def _barycentric(self, face: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Compute the hits in float64, as embree gives only the face; clamp grazing rays to their face."""
-        a, b, c = (self.corners[face, i] for i in range(3))
-        normal = 2 * self.area[face, None] * self.normal[face]
-        across = np.cross(directions, origins - a)
-        scale = np.einsum("nd,nd->n", directions, normal)
-        scale = np.where(np.abs(scale) < 1e-15, 1e-15, scale)
-        v = np.einsum("nd,nd->n", c - a, across) / scale
-        w = -np.einsum("nd,nd->n", b - a, across) / scale
-        weights = np.clip(np.stack([1 - v - w, v, w], -1), 0, 1)
-        return weights / weights.sum(-1, keepdims=True)
 
     def color(self, hits: Hits, lights: np.ndarray, directions: np.ndarray | None = None) -> np.ndarray:
         """Light hits: colours (n, 3) in [0, 1]; ``lights`` (L, 3) are points of the area light.
 
         ``directions`` (R, 3): the rays' directions; without them nothing is glossy.
         """
-        normal = np.einsum("nc,ncd->nd", hits.barycentric, self.corner_normal[hits.face])
-        normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
-        point = np.einsum("nc,ncd->nd", hits.barycentric, self.corners[hits.face])
-        flat = self.normal[hits.face]
+        normal = _unit(_blended(hits.barycentric, self.corner_normal[hits.face]))
+        point, flat = _blended(hits.barycentric, self.corners[hits.face]), self.normal[hits.face]
         diffuse = np.zeros(len(point))
         for light in lights:
-            towards = light - point
-            towards /= np.linalg.norm(towards, axis=-1, keepdims=True)
-            cosine = np.einsum("nd,nd->n", normal, towards)
-            lit = np.flatnonzero((cosine > 0) & (np.einsum("nd,nd->n", flat, towards) > 0))
-            free = self.is_free(point[lit] + LIFT_OFF * flat[lit], towards[lit])
-            diffuse[lit] += cosine[lit] * free
+            towards = _unit(light - point)
+            cosine = _dot(normal, towards)
+            lit = np.flatnonzero((cosine > 0) & (_dot(flat, towards) > 0))
+            diffuse[lit] += cosine[lit] * self.is_free(point[lit] + LIFT_OFF * flat[lit], towards[lit])
         shade = AMBIENT + SKY * normal[:, 2] + DIFFUSE * diffuse / len(lights)
-        color = self._albedo(hits) * shade[:, None]
+        color = self.albedo(hits) * shade[:, None]
         if directions is not None:
-            color += self._glint(hits, normal, directions[hits.ray])[:, None]
+            # Phong's gloss * cos^shine of the angle between the mirrored ray and the light's middle.
+            gloss, shine = self.finish[self.world.part_of_face[hits.face]].T
+            incoming = directions[hits.ray]
+            mirrored = incoming - 2 * _dot(incoming, normal)[:, None] * normal
+            cosine = mirrored @ (self.light / np.linalg.norm(self.light))
+            color += (gloss * np.clip(cosine, 0, 1) ** shine)[:, None]
         return np.clip(color, 0, 1)
 
-    def _glint(self, hits: Hits, normal: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Compute the highlights of glossy parts (n,): Phong's ``gloss * cos^shine`` of the angle between the
-        mirrored ray and the light's middle; shadows are ignored.
-        """
-        gloss, shine = (self.finish[self.world.part_of_face[hits.face], i] for i in (0, 1))
-        mirrored = directions - 2 * np.einsum("nd,nd->n", directions, normal)[:, None] * normal
-        cosine = mirrored @ (self.light / np.linalg.norm(self.light))
-        return gloss * np.clip(cosine, 0, 1) ** shine
-
-    def _albedo(self, hits: Hits) -> np.ndarray:
-        world = self.world
-        albedo = np.empty((len(hits.face), 3))
-        part_of_hit = world.part_of_face[hits.face]
+    def albedo(self, hits: Hits) -> np.ndarray:
+        """Return the colours (n, 3) of hits before they are lit."""
+        albedo, part_of_hit = np.empty((len(hits.face), 3)), self.world.part_of_face[hits.face]
         for index in np.unique(part_of_hit):
-            part, rows = world.parts[index], np.flatnonzero(part_of_hit == index)
-            corners = world.rest[world.faces[hits.face[rows]]]
-            position = np.einsum("nc,ncd->nd", hits.barycentric[rows], corners)
-            normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-            normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+            part, rows = self.world.parts[index], np.flatnonzero(part_of_hit == index)
+            corners = self.world.rest[self.world.faces[hits.face[rows]]]
+            position = _blended(hits.barycentric[rows], corners)
             low, high = part.vertices.min(0), part.vertices.max(0)
-            albedo[rows] = color_of(part.material, Surface(position, (position - low) / (high - low), normal))
+            surface = Surface(position, (position - low) / (high - low), _unit(_cross(corners)))
+            albedo[rows] = color_of(part.material, surface)
         return albedo
 
 
 def render(
     world: World, time: float, camera: Camera, samples_per_pixel: int = 4, shadow_rays: int = SHADOW_RAYS
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Render one picture of the world at any time from any camera.
+    """Render one image of the world at any time from any camera.
 
     Args:
         world: the world to render.
@@ -144,30 +146,25 @@ def render(
 
     **Cost** H * W * samples_per_pixel * (1 + shadow_rays) rays at most.
     """
-    posed = _posed(world, time)
+    posed, shape = _posed(world, time), (camera.height, camera.width)
     count = camera.height * camera.width
-    total, hit = np.zeros((count, 3)), np.zeros(count)
+    total, hit, depth = np.zeros((count, 3)), np.zeros(count), np.zeros(count, dtype=np.float32)
     lights = light_points(samples_per_pixel * shadow_rays, posed.light)
     for i in range(samples_per_pixel):
         # The R1 sequence covers the pixel evenly with any number of samples; a single sample is the centre.
         offset = ((i + 0.5) / samples_per_pixel, (0.5 + i * 0.6180339887498949) % 1.0)
-        rays = camera_rays(camera, offset)
-        hits = posed.first_hits(*rays)
-        total[hits.ray] += posed.color(hits, lights[i::samples_per_pixel], rays[1])
+        origins, directions = camera_rays(camera, offset)
+        hits = posed.first_hits(origins, directions)
+        total[hits.ray] += posed.color(hits, lights[i::samples_per_pixel], directions)
         hit[hits.ray] += 1
     rgb = total / np.maximum(hit, 1)[:, None]
-    rgba = np.concatenate([rgb, hit[:, None] / samples_per_pixel], -1)
-    centre = posed.first_hits(*camera_rays(camera))
-    depth = np.zeros(count, dtype=np.float32)
-    depth[centre.ray] = centre.distance
-    shape = camera.height, camera.width
-    return np.rint(255 * rgba).astype(np.uint8).reshape(*shape, 4), depth.reshape(shape)
+    rgba = np.rint(255 * np.concatenate([rgb, hit[:, None] / samples_per_pixel], -1)).astype(np.uint8)
+    center = posed.first_hits(*camera_rays(camera))
+    depth[center.ray] = center.distance
+    return rgba.reshape(*shape, 4), depth.reshape(shape)
 
 
-@lru_cache(1)
-def _posed(world: World, time: float) -> Posed:
-    """Pose a world once for all cameras of one time."""
-    return Posed(world, time)
+_posed = lru_cache(1)(Posed)  # once for all cameras of one time
 
 
 def camera_rays(camera: Camera, offset: tuple[float, float] = (0.5, 0.5)) -> tuple[np.ndarray, np.ndarray]:
@@ -193,15 +190,120 @@ def light_points(count: int, at: np.ndarray = LIGHT_AT) -> np.ndarray:
     return at + radius[:, None] * disc
 
 
-def _corner_normals(world: World, cross: np.ndarray, flat: np.ndarray) -> np.ndarray:
-    """Compute normals (F, 3, 3) at the corners of faces: averaged in smooth parts, else flat."""
-    normals = np.repeat(flat[:, None], 3, axis=1)
-    faces = world.faces[world.smooth]
-    summed = np.zeros((len(world.rest), 3))
-    np.add.at(summed, faces, cross[world.smooth][:, None])
-    chosen = summed[faces]
-    normals[world.smooth] = chosen / np.linalg.norm(chosen, axis=-1, keepdims=True)
-    return normals
+def surface_points(
+    world: World,
+    count: int,
+    cameras: list[Camera],
+    rng: np.random.Generator,
+    time: float = 0.0,
+    among: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Draw points uniformly by area on the surface that is visible at one time.
+
+    Args:
+        world: the world.
+        count: number of points; fewer are drawn only if hardly anything is visible.
+        cameras: a point is visible if nothing hides it from at least one of them, whatever way they look.
+        rng: the same state gives the same points.
+        time: time at which points must be visible.
+        among: (F,) bool, faces to draw from; None: all that are there.
+
+    Returns:
+        faces (N,) and barycentric coordinates (N, 3), which ``World.points`` places at any time.
+    """
+    posed, drawn = Posed(world, time), _SPARE * count
+    cumulative = np.cumsum(posed.area * (posed.is_there if among is None else posed.is_there & among))
+    face = np.searchsorted(cumulative, rng.random(drawn) * cumulative[-1], side="right")
+    # The square root makes the density even over the triangle.
+    a, b = np.sqrt(rng.random(drawn)), rng.random(drawn)
+    barycentric = np.stack([1 - a, a * (1 - b), a * b], -1)
+    point, normal, seen = (
+        _blended(barycentric, posed.corners[face]),
+        posed.normal[face],
+        np.zeros(drawn, bool),
+    )
+    for camera in cameras:
+        towards = _unit(np.asarray(camera.center) - point)
+        rows = np.flatnonzero(~seen & (_dot(normal, towards) > 0))
+        seen[rows] = posed.is_free(point[rows] + LIFT_OFF * normal[rows], towards[rows])
+    rows = np.flatnonzero(seen)[:count]
+    return face[rows], barycentric[rows]
+
+
+def render_all(
+    views: Sequence[tuple[World, float, Camera]],
+    samples: int = 4,
+    workers: int | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    shadow_rays: int = SHADOW_RAYS,
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Render many views as ``render`` does, in order; the images do not depend on the number of processes.
+
+    With more than one process, a calling script needs the guard ``if __name__ == "__main__"``, as always with
+    Python's processes; they end with this generator.
+
+    Args:
+        views: world, time in [0, 1] and camera of each.
+        samples: rays averaged into a pixel.
+        workers: processes; None: one per processor, fewer for little work; 1: this process.
+        progress: called with (images done, all images) after each.
+        shadow_rays: shadow rays of each ray.
+    """
+    pixels = sum(camera.width * camera.height for _, _, camera in views)
+    workers = workers or max(1, min(cores(), int(pixels * samples / _SAMPLES_A_PROCESS)))
+    if workers == 1:
+        images = (render(*view, samples, shadow_rays) for view in views)
+    else:
+        images = _rendered_by_processes(views, samples, shadow_rays, workers)
+    for done, image in enumerate(images, 1):
+        if progress is not None:
+            progress(done, len(views))
+        yield image
+
+
+def _rendered_by_processes(views, samples: int, shadow_rays: int, workers: int):
+    pool, waiting = ProcessPoolExecutor(workers, get_context("spawn"), _begin), deque()
+    try:
+        for world, time, camera in views:
+            # Pickled here: an executor would send each tensor through a file in shared memory.
+            job = pickle.dumps((time, camera, samples, shadow_rays))
+            waiting.append(pool.submit(_render, world.motion, world.has_room, job))
+            if len(waiting) > _AHEAD * workers:
+                yield waiting.popleft().result()
+        yield from (future.result() for future in waiting)
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _begin() -> None:
+    """Set up a new process: leave Ctrl-C to the parent, and use one thread."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    torch.set_num_threads(1)
+
+
+_world = lru_cache(4)(World)  # of a process
+
+
+def _render(motion: str, has_room: bool, job: bytes) -> tuple[np.ndarray, np.ndarray]:
+    return render(_world(motion, has_room), *pickle.loads(job))
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.einsum("nd,nd->n", a, b)
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
+def _blended(barycentric: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """Blend values (n, 3, 3) at the corners of faces by barycentric coordinates (n, 3): (n, 3)."""
+    return np.einsum("nc,ncd->nd", barycentric, corners)
+
+
+def _cross(corners: np.ndarray) -> np.ndarray:
+    """Return the normals (F, 3) of faces (F, 3, 3), twice as long as their areas."""
+    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
 
 def _intersector(corners: np.ndarray, some: np.ndarray):
@@ -221,62 +323,7 @@ def _intersector(corners: np.ndarray, some: np.ndarray):
     caster = RayMeshIntersector(trimesh.Trimesh(corners[some].reshape(-1, 3), faces, process=False))
 
     def first(origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        if len(origins) == 0:
-            return np.zeros(0, dtype=np.int64)
-        return rows[caster.intersects_first(origins, directions)]
+        # Embree refuses an empty list of rays.
+        return rows[caster.intersects_first(origins, directions)] if len(origins) else rows[:0]
 
     return first
-
-
-# Candidates per wanted point: about half of the surface is never visible.
-_SPARE = 4
-
-
-def surface_points(
-    world: World,
-    count: int,
-    centers: np.ndarray,
-    rng: np.random.Generator,
-    time: float = 0.0,
-    among: np.ndarray | None = None,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Draw points uniformly by area on the surface that is visible at one time.
-
-    Args:
-        world: the world.
-        count: number of points; fewer are drawn only if hardly anything is visible.
-        centers: camera centres (C, 3); a point is visible if at least one camera sees it.
-        rng: the same state gives the same points.
-        time: time at which points must be visible.
-        among: (F,) bool, faces to draw from; None: all that are there.
-
-    Returns:
-        faces (N,) and barycentric coordinates (N, 3), which ``World.points`` places at any time.
-    """
-    posed = Posed(world, time)
-    drawn = _SPARE * count
-    cumulative = np.cumsum(posed.area * (posed.there if among is None else posed.there & among))
-    face = np.searchsorted(cumulative, rng.random(drawn) * cumulative[-1], side="right")
-    # The square root makes the density even over the triangle.
-    a, b = np.sqrt(rng.random(drawn)), rng.random(drawn)
-    barycentric = np.stack([1 - a, a * (1 - b), a * b], -1)
-    seen = np.flatnonzero(_is_seen(posed, face, barycentric, centers))[:count]
-    return face[seen], barycentric[seen]
-
-
-def trajectories(world: World, faces: np.ndarray, barycentric: np.ndarray, times: np.ndarray) -> Truth:
-    """Follow surface points (N) over ``times`` (T,), the canonical time first; float32 world units."""
-    points = np.stack([world.points(faces, barycentric, t) for t in times], 1)
-    return Truth(torch.from_numpy(points.astype(np.float32)), torch.from_numpy(np.asarray(times, np.float64)))
-
-
-def _is_seen(posed: Posed, face: np.ndarray, barycentric: np.ndarray, centers: np.ndarray) -> np.ndarray:
-    point = np.einsum("nc,ncd->nd", barycentric, posed.corners[face])
-    normal = posed.normal[face]
-    seen = np.zeros(len(face), dtype=bool)
-    for center in centers:
-        towards = center - point
-        towards /= np.linalg.norm(towards, axis=-1, keepdims=True)
-        rows = np.flatnonzero(~seen & (np.einsum("nd,nd->n", normal, towards) > 0))
-        seen[rows] = posed.is_free(point[rows] + LIFT_OFF * normal[rows], towards[rows])
-    return seen

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+Mesh = tuple[np.ndarray, np.ndarray]  # vertices and faces
+
 
 @dataclass(frozen=True)
 class Material:
@@ -82,12 +84,11 @@ def wheel(at: Surface, scale: float) -> np.ndarray:
     """A treaded tyre about the y axis with a hub of six spokes; ``scale`` is the hub's radius."""
     radius = np.hypot(at.position[:, 0], at.position[:, 2])
     angle = np.arctan2(at.position[:, 2], at.position[:, 0]) / (2 * np.pi)
-    side = np.abs(at.normal[:, 1]) > 0.5
-    spoke = (
-        (np.floor(angle * 12).astype(np.int64) % 2 == 0) | (radius < 0.4 * scale) | (radius > 0.85 * scale)
-    )
+    between = np.floor(angle * 12).astype(np.int64) % 2 == 0
+    spoke = between | (radius < 0.4 * scale) | (radius > 0.85 * scale)
+    side = np.where(radius < scale, np.where(spoke, 2, 3), 0)
     tread = np.floor(angle * 24).astype(np.int64) % 2
-    return np.where(side, np.where(radius < scale, np.where(spoke, 2, 3), 0), tread)
+    return np.where(np.abs(at.normal[:, 1]) > 0.5, side, tread)
 
 
 def beach(at: Surface, scale: float) -> np.ndarray:
@@ -108,25 +109,18 @@ def mosaic(at: Surface, scale: float) -> np.ndarray:
     return np.where(joint, 4, (mixed ^ (mixed >> 16)) % 4)
 
 
-PATTERNS = {
-    "plain": lambda at, scale: np.zeros(len(at.position), dtype=np.int64),
-    "checker": checker,
-    "bricks": bricks,
-    "cabin": cabin,
-    "slanted": slanted,
-    "rings": rings,
-    "wheel": wheel,
-    "beach": beach,
-    "mosaic": mosaic,
-}
+def plain(at: Surface, scale: float) -> np.ndarray:
+    """One colour."""
+    return np.zeros(len(at.position), dtype=np.int64)
+
+
+_ALL = (plain, checker, bricks, cabin, slanted, rings, wheel, beach, mosaic)
+PATTERNS = {pattern.__name__: pattern for pattern in _ALL}
 
 
 def color_of(material: Material, at: Surface) -> np.ndarray:
     """RGB (n, 3) in [0, 1] of surface points."""
     return np.asarray(material.colors, dtype=np.float64)[PATTERNS[material.pattern](at, material.scale)]
-
-
-Mesh = tuple[np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -165,15 +159,8 @@ def prism(outline, low: float, high: float, axis: int = 2) -> Mesh:
     j = (i + 1) % count
     top = count + 1
     middle = np.full(count, count)
-    faces = np.concatenate(
-        [
-            np.stack([i, j, j + top], -1),
-            np.stack([i, j + top, i + top], -1),
-            np.stack([j, i, middle], -1),
-            np.stack([i + top, j + top, middle + top], -1),
-        ]
-    )
-    return vertices, faces
+    faces = [(i, j, j + top), (i, j + top, i + top), (j, i, middle), (i + top, j + top, middle + top)]
+    return vertices, np.concatenate([np.stack(corners, -1) for corners in faces])
 
 
 def box(low, high) -> Mesh:
@@ -185,9 +172,8 @@ def box(low, high) -> Mesh:
 def cylinder(center, radius: float, length: float, axis: int = 2, segments: int = 24) -> Mesh:
     """Make a cylinder about ``center`` (3,) along ``axis``."""
     angle = 2 * np.pi * np.arange(segments) / segments
-    vertices, faces = prism(
-        radius * np.stack([np.cos(angle), np.sin(angle)], -1), -length / 2, length / 2, axis
-    )
+    circle = radius * np.stack([np.cos(angle), np.sin(angle)], -1)
+    vertices, faces = prism(circle, -length / 2, length / 2, axis)
     return vertices + np.asarray(center, dtype=np.float64), faces
 
 
@@ -206,12 +192,9 @@ def sphere(radius: float, rings: int = 24, segments: int = 40) -> Mesh:
     """Make a sphere about the origin with ``rings`` of latitude."""
     latitude = np.linspace(-np.pi / 2, np.pi / 2, rings + 1)[1:-1, None]
     longitude = (2 * np.pi * np.arange(segments) / segments)[None]
-    grid = np.stack(
-        np.broadcast_arrays(
-            np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)
-        ),
-        -1,
-    )
+    level = np.cos(latitude)
+    axes = np.broadcast_arrays(level * np.cos(longitude), level * np.sin(longitude), np.sin(latitude))
+    grid = np.stack(axes, -1)
     vertices = np.concatenate([grid.reshape(-1, 3), [[0, 0, -1.0], [0, 0, 1.0]]])
     i = np.arange(segments)
     j = (i + 1) % segments
@@ -227,20 +210,6 @@ def sphere(radius: float, rings: int = 24, segments: int = 40) -> Mesh:
 
 def joined(meshes: list[Mesh]) -> Mesh:
     """Join several meshes into one."""
-    offsets = np.cumsum([0] + [len(v) for v, _ in meshes])
-    return (
-        np.concatenate([v for v, _ in meshes]),
-        np.concatenate([f + offset for (_, f), offset in zip(meshes, offsets)]),
-    )
-
-
-def studs(xs, ys, z: float, radius: float = 0.032, height: float = 0.026) -> Mesh:
-    """Put brick studs at every (x, y) of two lists, at height ``z``."""
-    # Sunk a little, so that the foot does not lie in the plane below.
-    return joined(
-        [
-            cylinder((x, y, z + height / 2 - 0.002), radius, height + 0.004, segments=16)
-            for x in xs
-            for y in ys
-        ]
-    )
+    offsets = np.cumsum([0] + [len(vertices) for vertices, _ in meshes])
+    faces = [faces + offset for (_, faces), offset in zip(meshes, offsets)]
+    return np.concatenate([vertices for vertices, _ in meshes]), np.concatenate(faces)

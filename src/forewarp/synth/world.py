@@ -1,24 +1,38 @@
-"""A subject, perhaps in a room, as one moving mesh; and specimens that each call for a few known effects."""
+"""A subject, perhaps in a room, as one moving mesh; and specimens that each call for a few known effects.
+
+A plan made from a specimen's images should switch on only the effects that
+``conf/scene/specimen_<name>.yaml`` lists or, for a method with a list of its own,
+``conf/model_scene/<method>_specimen_<name>.yaml``.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
+import torch
 
+from forewarp.scene.frame import Truth
 from forewarp.synth.shapes import Material, Part, box, joined, rounded_slab, sphere
-from forewarp.synth.vehicle import GROUND, Controls, joints, placed, room, vehicle
+from forewarp.synth.vehicle import GROUND, MOTIONS, ease, quick, rigid, rotation, shift, still, vehicle
 
 INK, CHALK = (0.20, 0.21, 0.26), (0.93, 0.92, 0.88)
 STONES = ((0.72, 0.52, 0.34), (0.26, 0.42, 0.62), (0.86, 0.70, 0.50), (0.46, 0.62, 0.42), INK)
 TILES = ((0.62, 0.44, 0.60), (0.88, 0.78, 0.72), (0.42, 0.32, 0.50), (0.84, 0.80, 0.62), CHALK)
 LACQUER = ((0.58, 0.16, 0.18), (0.20, 0.30, 0.52), (0.30, 0.46, 0.26), (0.62, 0.48, 0.14), INK)
-
-
-# Least and greatest sine of the elevation: neither along the slab nor straight from above.
+GLOSSY, MATTE = Material("mosaic", LACQUER, 0.16, gloss=0.75, shine=5.0), Material("mosaic", STONES, 0.16)
+LIGHT_AT = np.array([2.2, -2.6, 4.6])
+# Least and greatest sine of a camera's elevation: neither along the slab nor straight from above.
 ELEVATION = (0.06, 0.96)
+
+# World units about the ground joint, whose z = 0 is the top of the slab; the slab stands on the floor.
+ROOM_LOW, ROOM_HIGH = (-2.3, -3.7, -0.0702), (2.3, 1.75, 2.7)
+FLOOR = (0.72, 0.52, 0.34), (0.52, 0.34, 0.21), (0.86, 0.70, 0.50), (0.38, 0.25, 0.17), INK
+BACK = (0.26, 0.42, 0.62), (0.80, 0.72, 0.52), (0.55, 0.70, 0.80), (0.68, 0.36, 0.34), CHALK
+LEFT = (0.46, 0.62, 0.42), (0.84, 0.80, 0.62), (0.28, 0.44, 0.34), (0.70, 0.56, 0.36), CHALK
+RIGHT = (0.62, 0.44, 0.60), (0.88, 0.78, 0.72), (0.42, 0.32, 0.50), (0.78, 0.58, 0.52), CHALK
+CEILING = CHALK, (0.80, 0.82, 0.84), (0.86, 0.84, 0.78), (0.74, 0.78, 0.82), INK
 
 
 @dataclass(frozen=True)
@@ -27,47 +41,26 @@ class Specimen:
 
     Args:
         joints: time in [0, 1] -> each joint's map (4, 4).
-        parts: meshes; None: the vehicle's.
-        extra: parts beside the vehicle's.
-        light: time -> place of the light (3,); None: it stands still.
+        parts: meshes.
+        extra: parts beside them.
+        light: time -> place of the light (3,).
         absent: time -> names of the parts that are not there.
         azimuth, rise: range of camera positions; see ``random_cameras``.
     """
 
     joints: Callable[[float], dict[str, np.ndarray]]
-    parts: Callable[[], list[Part]] | None = None
+    parts: Callable[[], list[Part]] = vehicle
     extra: Callable[[], list[Part]] = list
-    light: Callable[[float], np.ndarray] | None = None
+    light: Callable[[float], np.ndarray] = lambda time: LIGHT_AT
     absent: Callable[[float], Collection[str]] = lambda time: ()
     azimuth: tuple[float, float] = (0.0, 360.0)
     rise: tuple[float, float] = ELEVATION
 
 
-def _still(time: float) -> dict[str, np.ndarray]:
-    return placed(Controls(), (-0.22, 0.08, 18.0))
-
-
-def _rigid(time: float) -> dict[str, np.ndarray]:
-    """Drive along an arc with the arm fixed."""
-    go = 0.5 - 0.5 * np.cos(np.pi * time)
-    return placed(Controls(travel=0.42 * go, turn=32 * go), (-0.32, -0.02, 4.0))
-
-
-def _quick(time: float) -> dict[str, np.ndarray]:
-    """Drive forth and back three times: more than a few cosines can represent."""
-    return placed(Controls(travel=0.3 * (0.5 - 0.5 * np.cos(6 * np.pi * time))), (-0.32, -0.02, 4.0))
-
-
-def _map(scale: tuple[float, float, float], shift: tuple[float, float, float]) -> np.ndarray:
-    place = np.diag([*scale, 1.0])
-    place[:3, 3] = shift
-    return place
-
-
 def _band(time: float) -> dict[str, np.ndarray]:
     """Let a sheet on a pillar rest at first, then stretch it to five times its width."""
-    wide = 1 + 4 * (0.5 - 0.5 * np.cos(np.pi * max(0.0, (time - 0.2) / 0.8)))
-    return {"pillar": np.eye(4), "sheet": _map((wide, wide, 1), (0, 0, 0))}
+    wide = 1 + 4 * ease(max(0.0, (time - 0.2) / 0.8))
+    return {"pillar": np.eye(4), "sheet": np.diag([wide, wide, 1, 1.0])}
 
 
 def _sheet() -> list[Part]:
@@ -79,43 +72,34 @@ def _sheet() -> list[Part]:
     ]
 
 
-def _globe() -> list[Part]:
-    lacquer = replace(Material("mosaic", LACQUER, 0.16), gloss=0.75, shine=5.0)
-    vertices, faces = sphere(0.52, rings=40, segments=64)
-    plate = rounded_slab(0.7, 0.2, -0.07, 0.0)
-    return [
-        Part("globe", "globe", vertices, faces, lacquer, smooth=True),
-        Part("plate", "ground", *plate, replace(lacquer, colors=TILES, gloss=0.6)),
-    ]
+def _plate(material: Material) -> Part:
+    return Part("plate", "ground", *rounded_slab(0.7, 0.2, -0.07, 0.0), material)
+
+
+def _globe(globe: Material, plate: Material) -> list[Part]:
+    return [Part("globe", "globe", *sphere(0.52, rings=40, segments=64), globe, smooth=True), _plate(plate)]
 
 
 def _globe_joints(time: float) -> dict[str, np.ndarray]:
-    return {"ground": _map((1, 1, 1), (0, 0, GROUND)), "globe": _map((1, 1, 1), (0, 0, GROUND + 0.5))}
+    return {"ground": shift((0, 0, GROUND)), "globe": shift((0, 0, GROUND + 0.5))}
 
 
 def _corner() -> list[Part]:
-    """Make a floor and two walls behind the subject; they fill every picture."""
-    low, high, thick = 1.1, 5.0, 0.1
-    floor = GROUND - 0.0702
+    """Make a floor and two walls behind the subject; they fill every image."""
+    near, far, outside, floor = -1.1, 5.0, -1.1 - 0.1, GROUND - 0.0702
     walls = [
-        ("floor", (-low - thick, -low - thick, floor - thick), (high, high, floor), STONES),
-        ("wall_x", (-low - thick, -low - thick, floor), (-low, high, high), TILES),
-        ("wall_y", (-low, -low - thick, floor), (high, -low, high), LACQUER),
+        ("floor", (outside, outside, floor - 0.1), (far, far, floor), STONES),
+        ("wall_x", (outside, outside, floor), (near, far, far), TILES),
+        ("wall_y", (near, outside, floor), (far, near, far), LACQUER),
     ]
     return [
-        Part(name, "room", *box(start, end), Material("mosaic", colors, 0.22), casts=False)
-        for name, start, end, colors in walls
+        Part(name, "room", *box(low, high), Material("mosaic", colors, 0.22), casts=False)
+        for name, low, high, colors in walls
     ]
 
 
 def _in_room(time: float) -> dict[str, np.ndarray]:
-    return _rigid(time) | {"room": np.eye(4)}
-
-
-def _matte_globe() -> list[Part]:
-    globe, plate = _globe()
-    matte = Material("mosaic", STONES, 0.16)
-    return [replace(globe, material=matte), replace(plate, material=replace(matte, colors=TILES))]
+    return rigid(time) | {"room": np.eye(4)}
 
 
 def _sun(time: float) -> np.ndarray:
@@ -124,59 +108,75 @@ def _sun(time: float) -> np.ndarray:
     return 5.5 * np.array([0.8 * np.cos(angle), 0.8 * np.sin(angle), 0.6])
 
 
-# From when to when a block is there.
-_STAY = {"north": (0.0, 0.34), "west": (0.0, 0.62), "south": (0.42, 1.0), "east": (0.7, 1.0)}
+# From when to when a block is there, where it stands on the plate, and its colours.
+BLOCKS = {
+    "north": ((0.0, 0.34), (0, 1), LACQUER),
+    "west": ((0.0, 0.62), (-1, 0), STONES),
+    "south": ((0.42, 1.0), (0, -1), TILES),
+    "east": ((0.7, 1.0), (1, 0), LACQUER),
+}
 
 
 def _blocks() -> list[Part]:
     """Put four blocks around a pillar on a plate, which each come or go."""
-    plate, pillar = rounded_slab(0.7, 0.2, -0.07, 0.0), box((-0.14, -0.14, 0.0), (0.14, 0.14, 0.7))
-    parts = [
-        Part("plate", "ground", *plate, Material("mosaic", TILES, 0.2)),
-        Part("pillar", "ground", *pillar, Material("mosaic", STONES, 0.14)),
-    ]
-    paint = {"north": LACQUER, "west": STONES, "south": TILES, "east": LACQUER}
-    for name, (x, y) in {"north": (0, 1), "west": (-1, 0), "south": (0, -1), "east": (1, 0)}.items():
+    pillar = Part(
+        "pillar", "ground", *box((-0.14, -0.14, 0.0), (0.14, 0.14, 0.7)), Material("mosaic", STONES, 0.14)
+    )
+    parts = [_plate(Material("mosaic", TILES, 0.2)), pillar]
+    for name, (_, (x, y), colors) in BLOCKS.items():
         middle = 0.35 * np.array([x, y, 0.0])
-        solid = box(middle - (0.2, 0.2, 0.0), middle + (0.2, 0.2, 0.42))
-        parts.append(Part(name, "ground", *solid, Material("mosaic", paint[name], 0.13)))
+        block = box(middle - (0.2, 0.2, 0.0), middle + (0.2, 0.2, 0.42))
+        parts.append(Part(name, "ground", *block, Material("mosaic", colors, 0.13)))
     return parts
+
+
+def _absent_blocks(time: float) -> list[str]:
+    return [name for name, ((begin, end), *_) in BLOCKS.items() if not begin <= time <= end]
 
 
 def _spin(time: float) -> dict[str, np.ndarray]:
     """Turn three wings about the axis where they meet by a sixth of a turn."""
-    angle = np.radians(60) * (0.5 - 0.5 * np.cos(np.pi * time))
-    place = np.eye(4)
-    place[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
-    return {"wings": place}
+    return {"wings": rotation(np.radians(60) * ease(time), 0, 1)}
 
 
 def _wings() -> list[Part]:
     """Set up three wings, as of a revolving door."""
-    parts = []
+    parts, (vertices, faces) = [], box((0.02, -0.05, -0.45), (0.62, 0.05, 0.35))
     for name, turn, colors in (("first", 0, LACQUER), ("second", 120, TILES), ("third", 240, STONES)):
-        vertices, faces = box((0.02, -0.05, -0.45), (0.62, 0.05, 0.35))
-        c, s = np.cos(np.radians(turn)), np.sin(np.radians(turn))
-        vertices = vertices @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
-        parts.append(Part(name, "wings", vertices, faces, Material("mosaic", colors, 0.13)))
+        turned = vertices @ rotation(np.radians(turn), 0, 1)[:3, :3].T
+        parts.append(Part(name, "wings", turned, faces, Material("mosaic", colors, 0.13)))
     return parts
 
 
-def _gone(time: float) -> list[str]:
-    return [name for name, (come, go) in _STAY.items() if not come <= time <= go]
+def room() -> list[Part]:
+    """Make six thin closed boxes, which cast no shadow, as the light is outside."""
+    (x0, y0, z0), (x1, y1, z1), t = ROOM_LOW, ROOM_HIGH, 0.1
+    walls = [
+        ("floor", (x0 - t, y0 - t, z0 - t), (x1 + t, y1 + t, z0), FLOOR, 0.30),
+        ("ceiling", (x0 - t, y0 - t, z1), (x1 + t, y1 + t, z1 + t), CEILING, 0.50),
+        ("left", (x0 - t, y0, z0), (x0, y1, z1), LEFT, 0.38),
+        ("right", (x1, y0, z0), (x1 + t, y1, z1), RIGHT, 0.38),
+        ("front", (x0 - t, y0 - t, z0), (x1 + t, y0, z1), BACK, 0.34),
+        ("back", (x0 - t, y1, z0), (x1 + t, y1 + t, z1), BACK, 0.34),
+    ]
+    return [
+        Part(name, "ground", *box(low, high), Material("mosaic", colors, scale), casts=False)
+        for name, low, high, colors, scale in walls
+    ]
 
 
 SPECIMENS = {
-    "still": Specimen(_still),
-    "rigid": Specimen(_rigid),
+    "still": Specimen(still),
+    "rigid": Specimen(rigid),
     "band": Specimen(_band, _sheet),
-    "glossy": Specimen(_globe_joints, _globe),
+    "glossy": Specimen(_globe_joints, lambda: _globe(GLOSSY, replace(GLOSSY, colors=TILES, gloss=0.6))),
     "room": Specimen(_in_room, extra=_corner, azimuth=(28.0, 62.0), rise=(0.28, 0.5)),
-    "quick": Specimen(_quick),
+    "quick": Specimen(quick),
     "spin": Specimen(_spin, _wings),
-    "daylight": Specimen(_globe_joints, _matte_globe, light=_sun),
-    "blocks": Specimen(_globe_joints, _blocks, absent=_gone),
+    "daylight": Specimen(_globe_joints, lambda: _globe(MATTE, replace(MATTE, colors=TILES)), light=_sun),
+    "blocks": Specimen(_globe_joints, _blocks, absent=_absent_blocks),
 }
+SUBJECTS = {name: Specimen(joints) for name, joints in MOTIONS.items()} | SPECIMENS
 
 
 class World:
@@ -186,17 +186,13 @@ class World:
     (V, 3) are coordinates in each part's rest frame, from which colours are computed.
 
     Args:
-        motion: a name in ``motions.MOTIONS`` (the vehicle) or in ``specimens.SPECIMENS``.
+        motion: a name in ``SUBJECTS``.
         has_room: put a static room around the subject.
     """
 
     def __init__(self, motion: str = "lift_tilt", has_room: bool = False):
-        self.motion, self.has_room = motion, has_room
-        self.specimen = specimen = SPECIMENS.get(motion)
-        self.joints = partial(joints, motion) if specimen is None else specimen.joints
-        self.parts = vehicle() if specimen is None or specimen.parts is None else specimen.parts()
-        self.parts += [] if specimen is None else specimen.extra()
-        self.parts += room() if has_room else []
+        self.motion, self.has_room, self.subject = motion, has_room, SUBJECTS[motion]
+        self.parts = self.subject.parts() + self.subject.extra() + (room() if has_room else [])
         self.rest, self.faces = joined([(p.vertices, p.faces) for p in self.parts])
         self.part_of_face = np.repeat(np.arange(len(self.parts)), [len(p.faces) for p in self.parts])
         self.smooth = np.array([p.smooth for p in self.parts])[self.part_of_face]
@@ -204,19 +200,22 @@ class World:
 
     def place(self, time: float) -> np.ndarray:
         """Place every vertex at any ``time`` in [0, 1]: world positions (V, 3) float64."""
-        at = self.joints(time)
-        return np.concatenate([p.vertices @ at[p.joint][:3, :3].T + at[p.joint][:3, 3] for p in self.parts])
+        maps = self.subject.joints(time)
+        return np.concatenate(
+            [p.vertices @ maps[p.joint][:3, :3].T + maps[p.joint][:3, 3] for p in self.parts]
+        )
 
-    def light(self, time: float) -> np.ndarray | None:
-        """Return where the light is (3,); None where it stands still."""
-        return None if self.specimen is None or self.specimen.light is None else self.specimen.light(time)
-
-    def there(self, time: float) -> np.ndarray:
+    def is_there(self, time: float) -> np.ndarray:
         """Tell which faces (F,) are there at ``time``."""
-        absent = () if self.specimen is None else self.specimen.absent(time)
+        absent = self.subject.absent(time)
         return np.array([part.name not in absent for part in self.parts])[self.part_of_face]
 
     def points(self, faces: np.ndarray, barycentric: np.ndarray, time: float) -> np.ndarray:
         """Place surface points, given as faces (N,) and barycentric (N, 3), at ``time``: (N, 3)."""
         corners = self.place(time)[self.faces[faces]]  # (N, 3, 3)
         return np.einsum("nc,ncd->nd", barycentric, corners)
+
+    def trajectories(self, faces: np.ndarray, barycentric: np.ndarray, times: np.ndarray) -> Truth:
+        """Follow surface points (N) over ``times`` (T,), the canonical time first; float32 world units."""
+        points = np.stack([self.points(faces, barycentric, time) for time in times], 1).astype(np.float32)
+        return Truth(torch.from_numpy(points), torch.from_numpy(np.asarray(times, np.float64)))

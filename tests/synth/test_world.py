@@ -1,0 +1,112 @@
+"""Each specimen is what it is said to call for: measured on its meshes and its images."""
+
+import numpy as np
+import pytest
+import yaml
+
+from forewarp.synth.raycast import Posed, camera_rays, light_points, render
+from forewarp.synth.scenes import random_cameras
+from forewarp.synth.vehicle import GROUND
+from forewarp.synth.world import BLOCKS, LIGHT_AT, ROOM_HIGH, ROOM_LOW, SPECIMENS, World
+from tests.support.configs import CONF
+
+TIMES = np.linspace(0, 1, 41)
+
+
+def cameras(count, size, *where):
+    return random_cameras(count, size, np.random.default_rng([0, 2]), *where)
+
+
+def paths(name):
+    """Places (6, V, 3) of every vertex."""
+    world = World(name)
+    return np.stack([world.place(time) for time in TIMES[::8]])
+
+
+@pytest.mark.parametrize("name", SPECIMENS)
+def test_it_moves_exactly_where_motion_is_called_for(name):
+    places = paths(name)
+    moved = np.abs(places - places[0]).max()
+    called_for = yaml.safe_load((CONF / "scene" / f"specimen_{name}.yaml").read_text())["calls_for"]
+    assert (moved > 0.1) if "motion" in called_for else (moved == 0)
+
+
+@pytest.mark.parametrize("name", ["rigid", "quick", "room", "spin"])
+def test_parts_keep_their_shape(name):
+    world, places = World(name), paths(name)
+    a, b = world.faces[:, :2].T
+    lengths = [np.linalg.norm(at[a] - at[b], axis=-1) for at in places]
+    np.testing.assert_allclose(np.ptp(lengths, axis=0), 0, atol=1e-9)
+
+
+def test_the_band_is_drawn_out_and_the_wings_turn_by_a_sixth_of_a_turn():
+    assert [SPECIMENS["band"].joints(time)["sheet"][0, 0] for time in (0, 1)] == pytest.approx([1, 5])
+    c, s = np.cos(np.pi / 3), np.sin(np.pi / 3)
+    turned = [[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+    np.testing.assert_allclose(SPECIMENS["spin"].joints(1)["wings"], turned, atol=1e-12)
+
+
+def test_the_quick_one_needs_more_cosines_than_the_slow_one():
+    basis = np.cos(np.pi * (np.arange(len(TIMES)) + 0.5)[:, None] / len(TIMES) * np.arange(7))
+    left = {}
+    for name in ("rigid", "quick"):
+        places = np.stack([SPECIMENS[name].joints(time)["chassis"].ravel() for time in TIMES])
+        left[name] = np.abs(basis @ np.linalg.lstsq(basis, places, rcond=None)[0] - places).max()
+    assert left["rigid"] < 5e-3 < 0.015 < left["quick"]
+
+
+def test_only_the_glossy_one_throws_light_back_in_one_direction():
+    gloss = {name: max(part.material.gloss for part in World(name).parts) for name in SPECIMENS}
+    assert [name for name in gloss if gloss[name] > 0] == ["glossy"]
+    posed = Posed(World("glossy"), 0.0)
+    origins, directions = camera_rays(cameras(1, 60)[0])
+    hits = posed.first_hits(origins, directions)
+    matte, seen = posed.color(hits, light_points(6)), posed.color(hits, light_points(6), directions)
+    assert (seen >= matte - 1e-12).all()
+    assert (seen - matte).max() > 0.2
+    assert np.median(seen - matte) < 0.1
+
+
+def test_by_daylight_shades_change_and_nothing_else():
+    camera = cameras(1, 40)[0]
+    (first, near), (last, far) = (render(World("daylight"), time, camera, 1) for time in (0.0, 0.7))
+    np.testing.assert_array_equal(near, far)
+    np.testing.assert_array_equal(first[..., 3], last[..., 3])
+    seen = first[..., 3] > 0
+    assert np.abs(first[seen].astype(int) - last[seen])[:, :3].max(-1).mean() > 10
+
+
+@pytest.mark.parametrize("time", [0.0, 0.4, 0.5, 0.65, 1.0])
+def test_blocks_are_where_they_are_and_nowhere_else(time):
+    there = {name: begin <= time <= end for name, ((begin, end), *_) in BLOCKS.items()}
+    posed = Posed(World("blocks"), time)
+    above = np.array([[0.45 * x, 0.45 * y, 2.0] for _, (x, y), _ in BLOCKS.values()])
+    hits = posed.first_hits(above, np.tile([0.0, 0, -1], (4, 1)))
+    named = [posed.world.parts[posed.world.part_of_face[face]].name for face in hits.face]
+    assert named == [name if there[name] else "plate" for name in BLOCKS]
+    beside, along = np.array([[-0.6, 0.45, GROUND + 0.2]]), np.array([[1.0, 0, 0]])
+    assert bool(posed.is_free(beside, along)[0]) is not there["north"]
+
+
+def test_the_corner_fills_every_image():
+    room = SPECIMENS["room"]
+    for camera in cameras(6, 24, room.azimuth, room.rise):
+        rgba, depth = render(World("room"), 0.5, camera, 1, 1)
+        assert (rgba[..., 3] == 255).all()
+        assert (depth > 0).all()
+
+
+def test_walls_of_a_room_end_every_ray_cast_no_shadow_and_never_move():
+    world = World("drive", has_room=True)
+    posed = Posed(world, 0.3)
+    directions = np.random.default_rng(0).normal(size=(3000, 3))
+    hits = posed.first_hits(np.tile([0.0, -2.5, 0.8], (3000, 1)), directions)
+    assert len(hits.ray) == 3000
+    names = {world.parts[i].name for i in world.part_of_face[hits.face]}
+    assert {"floor", "ceiling", "left", "right", "front", "back"} <= names
+    above = np.array([[0.0, 0.0, 1.5]])
+    assert posed.is_free(above, LIGHT_AT - above).all()
+    assert len(posed.first_hits(above, LIGHT_AT - above).ray) == 1  # though the ceiling is in the way
+    walls = np.unique(world.faces[~world.casts])
+    np.testing.assert_array_equal(world.place(0.0)[walls], world.place(0.9)[walls])
+    assert min(*ROOM_HIGH, -ROOM_LOW[0], -ROOM_LOW[1]) > 1.365  # all that moves stays within this
