@@ -89,7 +89,7 @@ TINY = data.scene=tiny paths.data=runs/bench-gpu data.synthesis.size=32 data.syn
 bench-gpu: MINUTES := $(if $(filter command line,$(origin MINUTES)),$(MINUTES),10)
 bench-gpu: ## seconds of steps and frames, and PSNR against seconds, of model=forward on a GPU [DATA= SCENES="a b" MINUTES= DEVICE=cpu SMALL=1]
 	status=0; for scene in $(if $(DATA),$(SCENES),vehicle); do \
-		bench() { $(BIN)/forewarp-train model=forward trainer=$(DEVICE) $(if $(DATA),paths.scenes=$(DATA) scene=dnerf_$$scene,data.scene=$$scene) \
+		bench() { $(BIN)/forewarp-train model=forward trainer=$(DEVICE) $(if $(DATA),paths.scenes=$(DATA) dataset=dnerf data.scene=$$scene,data.scene=$$scene) \
 			+variant.name=base "$$@" $(if $(SMALL),$(TINY)) $(GO_ON); }; \
 		bench preset=fast data.held_out=8 budget.minutes=$(MINUTES) run=runs/bench-gpu/$$scene-fast; \
 		bench preset=faithful budget.minutes=null budget.iterations=240 run=runs/bench-gpu/$$scene-faithful; \
@@ -101,7 +101,7 @@ bench-gpu: ## seconds of steps and frames, and PSNR against seconds, of model=fo
 RENAMED = $(if $(VARIANTS),$(error VARIANTS: expected MODEL=forward CHANGES="preset.rays=1024$(comma)2048"; variants are gone since 0.3))
 accuracy-time: ## accuracy of each choice against training time [MODEL=forward DATA= SCENE= MINUTES= CHANGES= SEEDS=3]
 	@$(RENAMED)
-	status=0; $(SWEEP); compare $(if $(DATA),paths.scenes=$(DATA) scene=dnerf_$(SCENE)) $(GO_ON); \
+	status=0; $(SWEEP); compare $(if $(DATA),paths.scenes=$(DATA) dataset=dnerf data.scene=$(SCENE)) $(GO_ON); \
 	$(BIN)/forewarp-report kind=accuracy_time && exit $$status
 
 price-list: SEEDS ?= 2
@@ -111,7 +111,7 @@ price-list: ## what each choice costs and brings, on the vehicle and real scenes
 	@test -n "$(DATA)" || { echo "price-list: expected DATA=<folder that holds dnerf/>"; exit 2; }
 	status=0; $(SWEEP); compare paths.runs=$(LISTED) $(GO_ON); \
 	for scene in $(SCENES); do \
-		compare paths.runs=$(LISTED) paths.scenes=$(DATA) scene=dnerf_$$scene $(GO_ON); \
+		compare paths.runs=$(LISTED) paths.scenes=$(DATA) dataset=dnerf data.scene=$$scene $(GO_ON); \
 	done; \
 	$(BIN)/forewarp-report kind=price_list runs=$(LISTED) out=docs/results && exit $$status
 
@@ -125,7 +125,7 @@ ifneq ($(filter-out particles forward,$(MODEL)),)
 	$(error MODEL: expected forward or particles, which can be planned, but got $(MODEL))
 else ifeq ($(MODEL),particles)
 	@status=0; $(COMPARE) $(SEED) model=particles ablation=auto budget.minutes=$(MINUTES) $(if $(DATA),paths.scenes=$(DATA)) \
-		scene=$(if $(DATA),$(subst $(space),$(comma),$(addprefix dnerf_,$(SCENES))),specimen_$(subst $(comma),$(comma)specimen_,$(SPECIMENS))) $(GO_ON); \
+		$(if $(DATA),dataset=dnerf data.scene=$(subst $(space),$(comma),$(SCENES)),scene=specimen_$(subst $(comma),$(comma)specimen_,$(SPECIMENS))) $(GO_ON); \
 	$(BIN)/forewarp-report kind=effects && exit $$status
 else ifeq ($(DATA),)
 	@status=0; $(COMPARE) $(SEED) ablation=auto $(GO_ON); \
@@ -134,7 +134,7 @@ else ifeq ($(DATA),)
 else
 	@status=0; \
 	for choice in ablation=auto ablation=all_effects ablation=full ablation=base; do \
-		$(COMPARE) $(SEED) $$choice paths.scenes=$(DATA) scene=$(subst $(space),$(comma),$(addprefix dnerf_,$(SCENES))) \
+		$(COMPARE) $(SEED) $$choice paths.scenes=$(DATA) dataset=dnerf data.scene=$(subst $(space),$(comma),$(SCENES)) \
 			budget.minutes=$(MINUTES) plan.minutes=$(MINUTES) plan.seconds=40 plan.trial_seconds=40 $(GO_ON); \
 	done; \
 	$(BIN)/forewarp-report kind=effects && exit $$status
@@ -170,7 +170,7 @@ else
 		all scenes by all methods: METHODS=all)))
 	@status=0; $(REPRODUCE); for sweep in $(SWEEPS:ablations=ablation_modules ablation_losses); do \
 		table sweeps=$$sweep paths.scenes=$(DATA) \
-			$(if $(SCENES_TYPED),absent=refuse scene=$(subst $(space),$(comma),$(addprefix dnerf_,$(SCENES_TYPED)))) $(GO_ON); \
+			$(if $(SCENES_TYPED),absent=refuse dataset=dnerf data.scene=$(subst $(space),$(comma),$(SCENES_TYPED))) $(GO_ON); \
 	done; \
 	$(BIN)/forewarp-report kind=paper out=$(OUT) curves=docs/results && exit $$status
 endif

@@ -28,7 +28,6 @@ EXPERIMENTS = options("experiment")
 OF_THE_TABLES = [model for model in MODELS if model not in ("forward", "backward", "particles")]
 # Crossed with each other below, jobs of tests/test_sweeps.py (scene, ablation), or always on.
 ELSEWHERE = {"preset", "model", "experiment", "stage", "objective", "data", "scene", "ablation"}
-ELSEWHERE |= {"callbacks", "hydra", "paths"}
 DEFAULTS = {("capture", "cut_out"), ("logger", "tensorboard"), ("trainer", "auto")}
 DEFAULTS |= {("model/renderer", "march"), ("model/sampling", "along_rays"), ("model/marching", "equal_steps")}
 VOXELS = {"model/motion", "model/view_dependence", "model/background"}  # also groups of voxel methods
@@ -95,7 +94,7 @@ def test_an_effect_of_voxels_is_refused_by_particles():
         Effects(**given)
 
 
-@pytest.mark.parametrize("name", [path.stem for path in CONF.glob("*.yaml")])
+@pytest.mark.parametrize("name", [path.stem for path in CONF.glob("*.yaml") if path.stem != "options"])
 def test_every_command_has_a_config(name):
     config = composed("data.scene=x", name=name) if name == "train" else composed(name=name)
     assert OmegaConf.to_container(config, resolve=True, throw_on_missing=True)["paths"]
@@ -218,7 +217,7 @@ def test_each_number_of_a_method_is_taken_where_it_is_keyed(model):
     assert [c.preset.bases for c in (fast, faithful)] == [8, 25]  # model x preset x experiment
     assert fast.objective.fine.weights.static_points == 1e-2  # model x experiment
     assert (fast.preset.rays, faithful.budget.iterations) == (4096, 120000)  # model x preset
-    broom = composed("scene=hypernerf_broom", f"model={model}")  # scene
+    broom = composed("experiment=hypernerf", "data.scene=broom2", f"model={model}")  # scene
     assert (broom.data.scene, broom.stage.fine.num_voxels[-1][1]) == ("broom2", 343000)
     band, still = (composed(f"scene=specimen_{name}", f"model={model}") for name in ("band", "still"))
     assert (band.stage.fine.num_voxels, still.stage.coarse.num_voxels) == ([[0, 15625]], [[0, 46656]])
@@ -235,7 +234,7 @@ def test_systems_of_the_tables_have_their_numbers_of_a_dataset():
 
 
 def test_the_nerf_of_captures_is_the_one_of_hypernerfs_tables():
-    config = composed("scene=hypernerf_broom", "model=nerf", "preset=faithful")
+    config = composed("experiment=hypernerf", "data.scene=broom2", "model=nerf", "preset=faithful")
     asked = {"skip": 5, "position_frequencies": 8, "glorot": True, "width": 256, "layers": 8}
     assert config.model.items() >= asked.items()
     looks = {"density": "softplus", "samples": 128, "fine_samples": 128, "open_end": True}
@@ -253,7 +252,10 @@ def test_published_systems_train_over_the_background_that_they_are_measured_on()
             experiment,
         )
         assert config.model.get("camera") == (True if "tineuvox" in model else None)
-    for words, color in (("scene=hypernerf_broom", "black"), ("scene=dnerf_lego", "white")):
+    for words, color in (
+        ("experiment=hypernerf", "data.scene=broom2", "black"),
+        ("experiment=dnerf", "data.scene=lego", "white"),
+    ):
         data = composed(words, "model=nerfies", "preset=faithful").data
         assert (data.background, data.eval_background) == (color, color)
 
@@ -266,7 +268,7 @@ def test_frames_of_some_scenes_come_in_sooner_with_faithful_alone():
         expected = {"start": 3, "all_in": all_in, "from_zero": True}
         assert build_run(faithful).stages[0].settings.curriculum.items() >= expected.items()
     for preset, all_in in (("faithful", 0.0125), ("fast", 0.3), ("demo", 0.0)):
-        config = composed("scene=dnerf_lego", "model=dnerf", f"preset={preset}")
+        config = composed("experiment=dnerf", "data.scene=lego", "model=dnerf", f"preset={preset}")
         assert config.stage.fine.curriculum.all_in == all_in
 
 
@@ -286,11 +288,17 @@ def test_effects_follow_the_pictures_and_the_command_line_wins():
 
 FOREIGN = {
     "model/mine.yaml": "defaults:\n  - _self_\n\nname: mine\n_target_: mine.Method\nwidth: ${preset.width}\n",
-    "stage/mine_fast.yaml": "only: {share: 1.0}\n",
-    "model_preset/mine_fast.yaml": "# @package _global_\npreset: {rays: 7, background: white, width: 32}\n",
-    "model_experiment/mine_dnerf.yaml": "# @package _global_\npreset: {width: 48}\n",
-    "model_preset_experiment/mine_fast_nhr.yaml": "# @package _global_\npreset: {rays: 9}\n",
-    "model_scene/mine_dnerf_hook.yaml": "# @package _global_\npreset: {width: 64}\n",
+    "numbers/mine_fast.yaml": """
+stage: {only: {share: 1.0}}
+preset: {rays: 7, background: white, width: 32}
+exceptions:
+  dnerf: {preset: {width: 48}}
+  nhr: {preset: {rays: 9}}
+scenes:
+  specimen_still: {preset: {width: 64}}
+""",
+    "numbers/particles.yaml": "exceptions: {dnerf: {preset: {background: white}}, theirs: {seed: 7}}",
+    "options.yaml": "# @package _global_\nexperiment: {theirs: {defaults: [override /data: nhr]}}",
 }
 
 
@@ -308,7 +316,10 @@ def test_a_package_brings_a_method_and_its_numbers(tmp_path):
     assert (list(plain.stage), "objective" in plain, "renderer" in plain.model) == (["only"], False, False)
     assert [c.model.width for c in (plain, dnerf, nhr)] == [32, 48, 32]
     assert [c.data.rays for c in (plain, dnerf, nhr)] == [7, 7, 9]
-    assert mine("scene=dnerf_hook").model.width == 64
+    assert mine("scene=specimen_still").model.width == 64
+    theirs = mine("model=particles", "experiment=theirs")
+    assert (theirs.seed, theirs.data.frames, theirs.preset.background) == (7, 100, "random")
+    assert mine("model=particles", "experiment=dnerf").preset.background == "random"  # ours comes first
     with pytest.raises(ConfigCompositionException, match="Could not find 'stage/mine_demo'"):
         mine("preset=demo")
 

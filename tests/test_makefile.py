@@ -69,7 +69,13 @@ def test_real_scenes_are_fitted_by_the_methods_named(made):
         'reproduce-tables DATA=there METHODS="tnerf dnerf" SCENES="hook lego" SWEEPS="dnerf ablation_losses"'
     )
     own, ablations, report = made(words)
-    common = {"preset=fast", "budget.minutes=5", "paths.scenes=there", "scene=dnerf_hook,dnerf_lego"}
+    common = {
+        "preset=fast",
+        "budget.minutes=5",
+        "paths.scenes=there",
+        "dataset=dnerf",
+        "data.scene=hook,lego",
+    }
     assert own > common | {"sweeps=dnerf", "model=tnerf,dnerf"}
     assert ablations > common | {"sweeps=ablation_losses", "absent=refuse"}
     assert not [word for word in ablations if word.startswith("model=")]
@@ -84,7 +90,7 @@ def test_all_methods_are_those_of_their_sweep(made):
 
 def test_scenes_alone_are_of_one_sweep(made):
     fit, _ = made('reproduce-tables DATA=there SCENES="hook lego"')
-    assert fit > {"sweeps=dnerf", "scene=dnerf_hook,dnerf_lego", "absent=refuse"}
+    assert fit > {"sweeps=dnerf", "dataset=dnerf", "data.scene=hook,lego", "absent=refuse"}
 
 
 def test_ablations_of_real_scenes_are_both_sweeps(made):
@@ -122,7 +128,7 @@ def test_ablations_are_run_for_equal_minutes_and_equal_steps(made):
 
 def test_effects_of_particles_are_planned_on_all_specimens(made):
     fit, report = made("effects MODEL=particles")
-    scenes = {path.stem for path in (ROOT / "conf" / "scene").glob("specimen_*.yaml")}
+    scenes = {name for name in options("scene") if name.startswith("specimen_")}
     assert {"sweeps=effects", "model=particles", "ablation=auto", "seeds=2"} < fit
     assert {scene for word in fit if word.startswith("scene=") for scene in word[6:].split(",")} == scenes
     assert report == {"forewarp-report", "kind=effects"}

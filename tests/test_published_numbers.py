@@ -70,12 +70,12 @@ HYPERNERF = RIG | {
     "parameters": 1_305_616 + 3 * 8,
 }
 PUBLISHED = [
-    ("nerf", "dnerf_hook", NERF),
-    ("tnerf", "dnerf_hook", TNERF),
-    ("dnerf", "dnerf_hook", DNERF | {"frames in": 100_000}),
-    ("dnerf", "dnerf_lego", DNERF | {"frames in": 10_000}),
-    ("nerfies", "hypernerf_broom", NERFIES),
-    ("hypernerf", "hypernerf_broom", HYPERNERF),
+    ("nerf", "dnerf", "hook", NERF),
+    ("tnerf", "dnerf", "hook", TNERF),
+    ("dnerf", "dnerf", "hook", DNERF | {"frames in": 100_000}),
+    ("dnerf", "dnerf", "lego", DNERF | {"frames in": 10_000}),
+    ("nerfies", "hypernerf", "broom2", NERFIES),
+    ("hypernerf", "hypernerf", "broom2", HYPERNERF),
 ]
 
 
@@ -111,9 +111,9 @@ def numbers(config):
     }
 
 
-@pytest.mark.parametrize(("model", "scene", "published"), PUBLISHED)
-def test_faithful_has_the_published_numbers(model, scene, published):
-    config = composed(f"model={model}", f"scene={scene}", "preset=faithful")
+@pytest.mark.parametrize(("model", "dataset", "scene", "published"), PUBLISHED)
+def test_faithful_has_the_published_numbers(model, dataset, scene, published):
+    config = composed(f"model={model}", f"experiment={dataset}", f"data.scene={scene}", "preset=faithful")
     found, sampling = numbers(config), config.model.sampling
     assert {name: found[name] for name in published} == published
     assert (sampling.open_end, sampling.inside_box, sampling.occupancy) == (True, False, 0)
@@ -198,30 +198,34 @@ def growing(last, times):
 
 
 OF_GRIDS = [
-    ("ndvg", "dnerf_hook", "coarse", NDVG_COARSE),
-    ("ndvg", "dnerf_hook", "fine", NDVG_FINE),
-    ("ndvg", "hypernerf_broom", "fine", NDVG_FINE | {"background": "black"}),
+    ("ndvg", "dnerf", "hook", "coarse", NDVG_COARSE),
+    ("ndvg", "dnerf", "hook", "fine", NDVG_FINE),
+    ("ndvg", "hypernerf", "broom2", "fine", NDVG_FINE | {"background": "black"}),
     (
         "tineuvox_s",
-        "dnerf_hook",
+        "dnerf",
+        "hook",
         "fine",
         TINEUVOX | TINEUVOX_S | {"voxels": growing(100**3, 3), "parameters": 4_028_667},
     ),
     (
         "tineuvox_b",
-        "dnerf_hook",
+        "dnerf",
+        "hook",
         "fine",
         TINEUVOX | TINEUVOX_B | {"voxels": growing(160**3, 3), "parameters": 24_828_837},
     ),
     (
         "tineuvox_s",
-        "hypernerf_broom",
+        "hypernerf",
+        "broom2",
         "fine",
         TINEUVOX_RIG | TINEUVOX_S | {"voxels": growing(100**3, 4), "parameters": 4_031_759},
     ),
     (
         "tineuvox_b",
-        "hypernerf_broom",
+        "hypernerf",
+        "broom2",
         "fine",
         TINEUVOX_RIG | TINEUVOX_B | {"voxels": growing(160**3, 4), "parameters": 24_844_995},
     ),
@@ -278,15 +282,15 @@ def numbers_of_grids(config, name):
     } | {key: stage.get(key) for key in ("sink", "box_alpha", "view_dependence", "carry", "masked")}
 
 
-@pytest.mark.parametrize(("model", "scene", "stage", "published"), OF_GRIDS)
-def test_faithful_grids_have_the_published_numbers(model, scene, stage, published):
-    config = composed(f"model={model}", f"scene={scene}", "preset=faithful")
+@pytest.mark.parametrize(("model", "dataset", "scene", "stage", "published"), OF_GRIDS)
+def test_faithful_grids_have_the_published_numbers(model, dataset, scene, stage, published):
+    config = composed(f"model={model}", f"experiment={dataset}", f"data.scene={scene}", "preset=faithful")
     found = numbers_of_grids(config, stage)
     assert {name: found[name] for name in published} == published
 
 
 def test_faithful_neural_volumes_has_the_published_numbers():
-    config = composed("model=neural_volumes", "scene=dnerf_hook", "preset=faithful")
+    config = composed("model=neural_volumes", "experiment=dnerf", "data.scene=hook", "preset=faithful")
     asked = {
         "picture_size": [512, 384],
         "tower": [64, 64, 128, 128, 256, 256, 256],
@@ -330,7 +334,7 @@ FAULTS = {
 @pytest.mark.parametrize("model", FAULTS)
 def test_faults_of_the_released_code_are_on_in_faithful_and_off_in_fast_and_demo(model):
     for preset in ("faithful", "fast", "demo"):
-        config = composed(f"model={model}", "scene=dnerf_hook", f"preset={preset}")
+        config = composed(f"model={model}", "experiment=dnerf", "data.scene=hook", f"preset={preset}")
         kept = FAULTS[model] if preset == "faithful" else []
         assert made_by(config, "fine").faults() == kept
         if model == "ndvg":
@@ -338,7 +342,7 @@ def test_faults_of_the_released_code_are_on_in_faithful_and_off_in_fast_and_demo
 
 
 def test_the_papers_method_names_what_it_does_otherwise():
-    forward = ["model=forward", "scene=dnerf_hook", "preset=fast"]
+    forward = ["model=forward", "experiment=dnerf", "data.scene=hook", "preset=fast"]
     plain = made_by(composed(*forward), "coarse").departures()
     assert plain == [
         *("no up-sampling", "no inpainter", "voxels hold density and colour, without the network F1"),

@@ -1,7 +1,7 @@
-"""``hydra/sweeper=one_at_a_time``: run a job for each change of a list; Hydra's own sweeper crosses all."""
+"""``hydra/sweeper=one_at_a_time``: a job for each scene and change of a list; Hydra's own crosses all."""
 
 import shlex
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper, BasicSweeperConf
@@ -9,31 +9,39 @@ from hydra.core.config_store import ConfigStore
 
 
 class OneAtATime(BasicSweeper):
-    """Hydra's sweeper, each of whose jobs is repeated for every one of ``changes``.
+    """Hydra's sweeper, each of whose jobs is repeated for every one of ``scenes`` and of ``changes``.
 
     Args:
         max_batch_size: jobs launched together; None: all.
         params: as of Hydra's sweeper: key -> comma-separated values, all crossed with one another.
         changes: a string for each change, holding its overrides as one types them ("" for none).
+        scenes: likewise for each scene; of no effect where the command line chooses one.
 
     Raises:
         ValueError: if there is no change, and so no job.
     """
 
     def __init__(
-        self, max_batch_size: int | None, params: dict[str, str] | None = None, changes: Sequence[str] = ("",)
+        self,
+        max_batch_size: int | None,
+        params: dict[str, str] | None = None,
+        changes: Sequence[str] = ("",),
+        scenes: Sequence[str] = ("",),
     ) -> None:
         super().__init__(max_batch_size, params)
         if not changes:
             raise ValueError(
                 "hydra.sweeper.changes: expected at least one change, but got []; use [''] for the plain job"
             )
-        self.changes = changes
+        self.changes, self.scenes = changes, scenes
 
     def split_arguments(self, overrides, max_batch_size):
         """Return the batches of jobs, each job a list of overrides; the base class asks for them."""
         (jobs,) = BasicSweeper.split_arguments(overrides, None)
-        return list(self.split_overrides_to_chunks(changed(jobs, self.changes), max_batch_size))
+        scenes = scenes_left(self.scenes, {override.get_key_element() for override in overrides})
+        return list(
+            self.split_overrides_to_chunks(changed(changed(jobs, scenes), self.changes), max_batch_size)
+        )
 
 
 def changed(jobs: Sequence[Sequence[str]], changes: Sequence[str]) -> list[list[str]]:
@@ -47,12 +55,27 @@ def changed(jobs: Sequence[Sequence[str]], changes: Sequence[str]) -> list[list[
     return [merged(job, shlex.split(change)) for change in changes for job in jobs]
 
 
+def scenes_left(scenes: Sequence[str], typed: Iterable[str]) -> list[str]:
+    """Return the scenes of a sweep, less what the keys that are typed choose.
+
+    >>> scenes_left(["experiment=dnerf data.scene=hook", "experiment=dnerf data.scene=lego"], ["data.scene"])
+    ['experiment=dnerf']
+    """
+    from forewarp.runs.overrides import key_of
+
+    if {"experiment", "scene"} & {*typed}:
+        return [""]
+    kept = [" ".join(word for word in scene.split() if key_of(word) not in typed) for scene in scenes]
+    return list(dict.fromkeys(kept))
+
+
 @dataclass  # Hydra runs this file outside sys.modules, where a dataclass cannot read postponed annotations
 class OneAtATimeConf(BasicSweeperConf):
     """The keys of ``hydra.sweeper``."""
 
     _target_: str = "hydra_plugins.forewarp_one_at_a_time.OneAtATime"
     changes: list[str] = field(default_factory=lambda: [""])
+    scenes: list[str] = field(default_factory=lambda: [""])
 
 
 ConfigStore.instance().store(

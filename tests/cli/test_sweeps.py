@@ -10,7 +10,13 @@ from tests.support.configs import ROOT
 
 
 def test_absent_scenes_of_a_sweep_are_named_and_do_not_count_as_failed(ok, in_tmp):
-    words = ["sweeps=dnerf", "model=particles", "scene=dnerf_hook,dnerf_lego", "paths.scenes=nowhere"]
+    words = [
+        "sweeps=dnerf",
+        "model=particles",
+        "dataset=dnerf",
+        "data.scene=hook,lego",
+        "paths.scenes=nowhere",
+    ]
     done = ok("train", "--multirun", *words)
     lines = [line for line in done.out.splitlines() if line.startswith("skipped: ")]
     assert [line.rsplit("/", 1)[1] for line in lines] == ["hook: no such scene", "lego: no such scene"]

@@ -8,6 +8,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
 from forewarp.runs.config_files import configurations
+from forewarp.runs.sections import option_groups
 
 ROOT = Path(__file__).parents[2]
 CONF = ROOT / "conf"
@@ -25,17 +26,14 @@ def _composed(overrides: tuple[str, ...], name: str, hydra: bool) -> DictConfig:
 
 
 def options(group: str) -> list[str]:
-    """Return the names of a group's option files."""
-    return sorted(path.stem for path in (CONF / group).glob("*.yaml"))
+    """Return the names of a group's options."""
+    return option_groups(CONF)[group]
 
 
 def groups() -> list[str]:
     """Return every group that one chooses from to train.
 
-    Left out: ``dataset`` (it makes scenes), ``launcher`` (it needs packages), and a method's own numbers
-    (``model_...``), which follow from the choices.
+    Left out: ``dataset`` (it makes scenes), ``launcher`` (it needs packages), and what no one chooses.
     """
-    folders = [path.relative_to(CONF).as_posix() for path in CONF.rglob("*") if path.is_dir()]
-    others = ("/one", "dataset", "launcher")
-    chosen = [group for group in folders if options(group) and not group.startswith("model_")]
-    return sorted(group for group in chosen if not group.endswith(others))
+    others = {"dataset", "launcher", "numbers", "paths", "hydra", "stage/one"}
+    return [group for group, names in option_groups(CONF).items() if names and group not in others]

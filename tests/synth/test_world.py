@@ -2,13 +2,12 @@
 
 import numpy as np
 import pytest
-import yaml
 
 from forewarp.synth.raycast import Posed, camera_rays, light_points, render
 from forewarp.synth.scenes import random_cameras
 from forewarp.synth.vehicle import GROUND
 from forewarp.synth.world import BLOCKS, LIGHT_AT, ROOM_HIGH, ROOM_LOW, SPECIMENS, World
-from tests.support.configs import CONF
+from tests.support.configs import composed
 
 TIMES = np.linspace(0, 1, 41)
 
@@ -27,7 +26,7 @@ def paths(name):
 def test_it_moves_exactly_where_motion_is_called_for(name):
     places = paths(name)
     moved = np.abs(places - places[0]).max()
-    called_for = yaml.safe_load((CONF / "scene" / f"specimen_{name}.yaml").read_text())["calls_for"]
+    called_for = composed(f"scene=specimen_{name}", "model=forward").calls_for
     assert (moved > 0.1) if "motion" in called_for else (moved == 0)
 
 

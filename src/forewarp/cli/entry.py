@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import logging
 import os
+import re
 import sys
 import tempfile
 import traceback
@@ -60,8 +61,13 @@ def command(name: str, task: Callable, text: str, *, config: str | None = None) 
 
 
 def _arguments(name: str) -> list[str]:
-    """Return the command line as Hydra takes it: a bare folder has its key, a plan is its overrides."""
+    """Return the command line as Hydra takes it: a bare folder has its key, a plan is its overrides.
+
+    ``dataset=NAME`` is ``experiment=NAME`` where scenes are trained on, and a group where they are written.
+    """
     arguments = with_run_key(name, sys.argv[1:])
+    if name in ("train", "plan"):
+        arguments = [re.sub(r"^dataset=", "experiment=", argument) for argument in arguments]
     refuse_dashes(arguments)
     if any(argument.startswith("plan=") for argument in arguments):
         from forewarp.planning.plan_file import with_plan
@@ -168,21 +174,18 @@ def _bug(error: Exception) -> str:
 
 def choices(conf: Path, name: str) -> str:
     """List the options of every group that ``<name>.yaml`` uses, for the help."""
-    if name != "train":
-        text = (conf / f"{name}.yaml").read_text()
-        groups = [group for group in ("dataset", "trainer") if f"- {group}:" in text]
-    else:
-        silent = {"hydra", "paths", "callbacks", "dataset", "listen"}
-        folders = [path for path in sorted(conf.rglob("*")) if path.is_dir() and path.name != "one"]
-        groups = [p.relative_to(conf).as_posix() for p in folders]
-        # model_preset and its like follow from what is chosen.
-        groups = [g for g in groups if g.split("/")[0] not in silent and not g.startswith("model_")]
-    found = {group: sorted(path.stem for path in (conf / group).glob("*.yaml")) for group in groups}
+    from forewarp.runs.sections import option_groups
+
+    groups = option_groups(conf)
     if name == "train":
-        found["sweeps"] = [
-            f"{path.stem} (with --multirun)" for path in sorted((conf.parent / "sweeps").glob("*.yaml"))
-        ]
-    lines = [f"  {group:<17} {' | '.join(options)}" for group, options in found.items() if options]
+        # Chosen by other choices, or by nobody.
+        groups = {g: groups[g] for g in groups.keys() - {"dataset", "hydra", "numbers", "paths", "stage/one"}}
+        sweeps = sorted((conf.parent / "sweeps").glob("*.yaml"))
+        groups["sweeps"] = [f"{path.stem} (with --multirun)" for path in sweeps]
+    else:
+        text = (conf / f"{name}.yaml").read_text()
+        groups = {group: groups[group] for group in ("dataset", "trainer") if f"- {group}:" in text}
+    lines = [f"  {group:<17} {' | '.join(groups[group])}" for group in sorted(groups) if groups[group]]
     more = [
         "Every other key: --cfg job prints them all; key=value sets one.",
         "Hydra's own options: --hydra-help.",

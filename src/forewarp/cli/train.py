@@ -40,7 +40,7 @@ What one types most (options such as --multirun or --config-dir=FOLDER come firs
   views=N                             measure N test views, evenly spread, in place of all
   reduce=2                            average 2 x 2 pixels of each test view and of its truth, then score
   data.held_out=N                     hold N training views out and record their PSNR against training time
-  scene=DATASET_NAME                  a scene of the paper below paths.scenes=FOLDER, such as scene=dnerf_hook
+  dataset=dnerf data.scene=hook       a scene of a dataset below paths.scenes=FOLDER, here FOLDER/dnerf/hook
   ablation=NAME                       an ablation of the paper; ablation=full is its whole method
   launcher=local|joblib|ray|slurm|submitit   where the jobs of --multirun run
   ~stage.fine                         drop a stage

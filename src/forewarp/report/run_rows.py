@@ -309,7 +309,7 @@ def _repeated(row: dict, sweep: str) -> str:
     if row["clock"] == "wall" or "#" in command:
         return command
     command = re.sub(r"\s(budget\.clock|threads)=\S+", "", command)
-    if " scene=" in command and row["clock"] == "processor" and row["threads"] == 1:
+    if re.search(r" (data\.)?scene=", command) and row["clock"] == "processor" and row["threads"] == 1:
         return command.replace("forewarp-train", f"forewarp-train --multirun sweeps={sweep}", 1)
     threads = f" threads={row['threads']:g}" if row["threads"] else ""
     return f"{command} budget.clock={row['clock']}{threads}"

@@ -29,13 +29,16 @@ def project_root() -> Path:
 
 
 def configurations() -> Path:
-    """Return ``conf/``, ready for Hydra: ``sweeps=NAME`` is registered, and ``paths.root`` is set.
+    """Return ``conf/``, ready for Hydra: ``sweeps=NAME`` and sections are options, and ``paths.root`` is set.
 
     ``paths.root`` is the checkout, or the current folder for an installed package.
     """
     root = project_root()
     if root != PACKAGE:
         os.environ[ROOT_VARIABLE] = str(root)
+    from forewarp.runs.sections import serve_sections
+
+    serve_sections()
     _register(root / "sweeps")
     return root / "conf"
 
