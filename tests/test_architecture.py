@@ -25,7 +25,6 @@ MAY_IMPORT = {
     "viewer": LOWER | {"browser", "methods", "training", "evaluation"},
     "export": LOWER | {"browser", "methods", "training", "evaluation"},
     "capture": {"ops", "scene", "drawing", "data"},
-    "replay": {"cli", "runs", "training"},
     "cli": LOWER
     | {
         "methods",

@@ -33,7 +33,7 @@ from forewarp.runs.build import build_run
 from forewarp.runs.config_files import project_root
 from forewarp.synth.scenes import synthesize
 from forewarp.training.module import DynamicSceneModule
-from forewarp.training.objective import total
+from forewarp.training.objective import set_gradients, total
 from forewarp.training.stages import Run, peak_memory_bytes, reset_peak_memory
 from tests.stability.report import replace_section, table
 from tests.support.configs import composed
@@ -112,8 +112,10 @@ def stepped(run: Run, module: DynamicSceneModule, optimizer: torch.optim.Optimiz
     optimizer.zero_grad()
     factors = module.objective.factors(0)  # every term, also those that count in every tenth step alone
     step = module.look(batch, factors)
-    own = dict(module.method.named_parameters()) if step.gradients is not None else {}
-    total(step, factors, own)[0].backward()
+    if step.gradients is None:
+        total(step, factors)[0].backward()
+    else:
+        set_gradients(module.method, step.gradients)
     optimizer.step()
     return sum(len(seen.view) for seen in batch.observations)
 

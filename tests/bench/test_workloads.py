@@ -20,7 +20,7 @@ def taken(dense, threshold=0.0):
     with implementation("reference" if dense else "Numba"):
         factors = module.objective.factors(0)
         step = module.look(batch, factors)
-        total(step, factors, {})[0].backward()
+        total(step, factors)[0].backward()
     radiance = module.method.radiance
     gradient = torch.zeros(*radiance.lattice.shape, 12)
     x, y, z = radiance.voxels.unbind(-1)

@@ -149,7 +149,7 @@ def step_work(side: float, dense: bool, rays: int = 2048, box: float = 1.0) -> W
     def step() -> None:
         with implementation("reference") if dense else nullcontext():
             optimizer.zero_grad()
-            total(module.look(batch, factors), factors, {})[0].backward()
+            total(module.look(batch, factors), factors)[0].backward()
             optimizer.step()
 
     return step
@@ -244,7 +244,7 @@ def step_with(choices: Mapping, side: int, rays: int, weights: Mapping[str, floa
     def step() -> None:
         optimizer.zero_grad()
         factors = module.objective.factors(0)
-        total(module.look(batch, factors), factors, {})[0].backward()
+        total(module.look(batch, factors), factors)[0].backward()
         optimizer.step()
 
     return step

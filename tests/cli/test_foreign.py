@@ -145,20 +145,6 @@ def test_the_page_of_a_run_takes_trust(ok, fitted, monkeypatch):
     assert "Rendering" not in ok(*page, TRUST).out
 
 
-def test_a_broken_step_is_taken_again_with_trust(refused, in_tmp, capsys):
-    from forewarp.replay import main as replay
-
-    refused("train", *DISC, "run=run", "stage.coarse.lr.color=1e39", "evaluate=false")
-    bundle = str(next((in_tmp / "run").rglob("step_*.pt")))
-    forget("theirs")
-    with pytest.raises(SystemExit):
-        replay([bundle])
-    assert capsys.readouterr().err.strip().endswith(ADVICE)
-    assert "theirs" not in sys.modules
-    replay([bundle, "trust=theirs"])
-    assert "parameter: radiance.color" in capsys.readouterr().out
-
-
 def test_the_environment_goes_along_whatever_a_launcher_hands_on(ok, fitted, monkeypatch):
     """A job of another process or machine: its environment is its own."""
     import hydra

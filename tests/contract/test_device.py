@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from forewarp.scene.view import Moment, View
-from forewarp.training.objective import total
+from forewarp.training.objective import set_gradients, total
 from tests.contract.fitting import module_of
 from tests.contract.scenes import data_of, write_dnerf
 from tests.contract.table import METHODS
@@ -30,10 +30,12 @@ def test_steps_and_a_picture_stay_on_their_device(data, name):
             batch = next(iter(data.train_dataloader())).to("cuda")
             factors = module.objective.factors(number)
             step = method.look(batch, factors, module.generator)
-            own = dict(method.named_parameters()) if step.gradients is not None else {}
-            loss, _ = total(step, factors, own)
+            loss, _ = total(step, factors)
             assert loss.device == GPU
-            loss.backward()
+            if step.gradients is None:
+                loss.backward()
+            else:
+                set_gradients(method, step.gradients)
             optimizer.step()
             optimizer.zero_grad()
         assert {p.device for p in method.parameters()} == {GPU}

@@ -6,6 +6,7 @@
 import resource
 import shutil
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -104,7 +105,8 @@ def of_run(root):
     (root / "config" / "config.yaml").write_text(OmegaConf.to_yaml(config))
     dnerf_scene.write_tiny(root / "toy")
     scene = dnerf.read_scene(root, "toy")
-    module = build_run(config).rebuilt("coarse", scene)
+    run = replace(build_run(config), datamodule=SimpleNamespace(scene=scene))
+    module = run._module(run.stages[0], blank=True)
     content = {"state_dict": module.state_dict(), "global_step": 7}
     module.on_save_checkpoint(content)
     file = root / "checkpoint" / "last.ckpt"

@@ -37,8 +37,8 @@ class Diary(lightning.Callback):
     def __init__(self):
         self.losses = []
 
-    def on_before_backward(self, trainer, module, loss):
-        self.losses.append(float(loss.detach()))
+    def on_before_optimizer_step(self, trainer, module, optimizer):
+        self.losses.append(module.last["loss"])
 
 
 def fit(folder, scene, iterations, weights=None, model=None, **changes):

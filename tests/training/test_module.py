@@ -5,7 +5,7 @@ from functools import partial
 import pytest
 import torch
 
-from forewarp.methods.method import Step
+from forewarp.methods.method import Method, Step
 from forewarp.methods.voxel.backward import Deformation
 from forewarp.methods.voxel.structure import resample
 from forewarp.ops.backend import numba_installed
@@ -14,23 +14,12 @@ from forewarp.progress import told_if_slow
 from forewarp.renderer import Renderer
 from forewarp.scene.box import Lattice
 from forewarp.training.module import DynamicSceneModule
-from forewarp.training.objective import total
 from forewarp.training.schedule import Curriculum
+from tests.support import tiny_scene as tiny
 from tests.support.kernels import watch
-from tests.support.tiny_scene import (
-    BOX,
-    INPAINTER,
-    backward_model,
-    ball_data,
-    begun,
-    built,
-    forward_model,
-    stage,
-    trainer,
-)
 
-BACKWARD = backward_model(deformation=partial(Deformation, width=8, layers=2))
-DATA = ball_data(rays=64, frames=5, size=16)
+BACKWARD = tiny.backward_model(deformation=partial(Deformation, width=8, layers=2))
+DATA = tiny.ball_data(rays=64, frames=5, size=16)
 
 
 class CountingRenderer(Renderer):
@@ -41,19 +30,23 @@ class CountingRenderer(Renderer):
         return super().__call__(*arguments, **named)
 
 
-def module(model=None, weights=None, renderer=None, **changes):
-    torch.manual_seed(0)
-    method = built(model or forward_model(), Lattice(BOX, (9, 7, 6)), density_scale=0.2)
-    for name in method.radiance.names:
-        torch.nn.init.normal_(method.radiance.parameter(name))
-    method.renderer = renderer or method.renderer
-    made = stage(weights=weights, **changes)
+def of_method(method, made):
     return DynamicSceneModule(
-        begun(method, DATA.scene, made),
+        method,
         objective=made.objective,
         settings=made.settings,
         curriculum=Curriculum([f.time for f in DATA.scene.train], 0.0),
     )
+
+
+def module(model=None, weights=None, renderer=None, **changes):
+    torch.manual_seed(0)
+    method = tiny.built(model or tiny.forward_model(), Lattice(tiny.BOX, (9, 7, 6)), density_scale=0.2)
+    for name in method.radiance.names:
+        torch.nn.init.normal_(method.radiance.parameter(name))
+    method.renderer = renderer or method.renderer
+    made = tiny.stage(weights=weights, **changes)
+    return of_method(tiny.begun(method, DATA.scene, made), made)
 
 
 def batch(frame=3):
@@ -62,49 +55,36 @@ def batch(frame=3):
 
 
 @pytest.mark.parametrize(
-    ("inpainter", "photo_on", "calls"),
+    ("model", "options", "calls"),
     [
-        (None, None, 1),
-        (None, ["inpainted"], 1),  # what is not there cannot be looked at
-        (INPAINTER, None, 2),
-        (INPAINTER, ["inpainted"], 1),
-        (INPAINTER, ["upsampled"], 1),  # the first rendering, with an up-sampler or without
+        ({}, {}, 1),
+        ({}, {"photo_on": ["inpainted"]}, 1),  # what is not there cannot be looked at
+        ({"inpainter": tiny.INPAINTER}, {}, 2),
+        ({"inpainter": tiny.INPAINTER}, {"photo_on": ["inpainted"]}, 1),
+        ({"inpainter": tiny.INPAINTER}, {"photo_on": ["upsampled"]}, 1),  # the first, up-sampled or not
+        ({}, {"weights": {"photo": 1.0, "tv_depth": 0.1}, "patches": 2}, 2),  # random views beside it
     ],
 )
-def test_only_what_a_term_looks_at_is_rendered(inpainter, photo_on, calls):
+def test_only_what_a_term_looks_at_is_rendered(model, options, calls):
     renderer = CountingRenderer()
-    made = module(forward_model(inpainter=inpainter), renderer=renderer, photo_on=photo_on)
-    made.training_step(batch(), 0)
+    module(tiny.forward_model(**model), renderer=renderer, **options).loss_of(batch())
     assert renderer.calls == calls
 
 
-def test_the_clock_starts_when_the_kernels_are_warm(monkeypatch):
+@pytest.mark.parametrize("seconds", [0.0, 0.3])
+def test_the_clock_starts_when_the_kernels_are_warm_and_long_compiling_is_told(monkeypatch, capsys, seconds):
     made, seen = module(), []
-    monkeypatch.setattr(
-        "forewarp.methods.voxel.model.warm_up", lambda device: seen.append((device, made.clock.seconds))
-    )
+
+    def compiling(device):
+        seen.append((device, made.clock.seconds))
+        time.sleep(seconds)
+
+    monkeypatch.setattr("forewarp.training.module.told_if_slow", partial(told_if_slow, after=0.1))
+    monkeypatch.setattr("forewarp.methods.voxel.model.warm_up", compiling)
     made.on_train_start()
     assert seen == [(made.device, 0)]
-    assert made.clock.seconds > 0
-
-
-def test_the_name_of_a_hook_is_noted_at_once(monkeypatch):
-    """Lightning sets it dozens of times a step; a module's own way takes ten times as long."""
-    made, slow = module(), []
-    monkeypatch.setattr(torch.nn.Module, "__setattr__", lambda self, name, value: slow.append(name))
-    made._current_fx_name = "hook"
-    assert (made._current_fx_name, slow) == ("hook", [])
-
-
-@pytest.mark.parametrize(
-    ("seconds", "said"),
-    [(0.6, "coarse   0% | compiling what this method runs, once on a machine: up to a minute\n"), (0, "")],
-)
-def test_kernels_that_take_long_to_compile_are_told(monkeypatch, capsys, seconds, said):
-    monkeypatch.setattr("forewarp.training.module.told_if_slow", partial(told_if_slow, after=0.2))
-    monkeypatch.setattr("forewarp.methods.voxel.model.warm_up", lambda device: time.sleep(seconds))
-    module().on_train_start()
-    assert capsys.readouterr().err == said
+    assert 0 < made.clock.seconds < 0.2
+    assert ("compiling what this method runs" in capsys.readouterr().err) == (seconds > 0)
 
 
 def test_a_step_meets_warm_kernels_only(monkeypatch):
@@ -116,10 +96,10 @@ def test_a_step_meets_warm_kernels_only(monkeypatch):
     assert torch.equal(torch.get_rng_state(), before)
     warm = met.copy()
     met.clear()
-    for model in (forward_model(), BACKWARD):
+    for model in (tiny.forward_model(), BACKWARD):
         made = module(model)
-        made.training_step(batch(), 0).backward()
-        resample(made.method.radiance, BOX, 500, keep_alpha=1e-2)
+        made.loss_of(batch())[0].backward()
+        resample(made.method.radiance, tiny.BOX, 500, keep_alpha=1e-2)
     assert len({name for name, *_ in met}) == 9
     assert met <= warm
 
@@ -131,40 +111,22 @@ def test_a_missing_rate_is_named():
         made.configure_optimizers()
 
 
-def test_random_views_are_rendered_only_for_their_term():
-    renderer = CountingRenderer()
-    module(weights={"photo": 1.0, "tv_depth": 0.0}, renderer=renderer).training_step(batch(), 0)
-    assert renderer.calls == 1
-    module(weights={"photo": 1.0, "tv_depth": 0.1}, renderer=renderer, patches=2).training_step(batch(), 0)
-    assert renderer.calls == 3
-
-
-@pytest.mark.parametrize("model", [forward_model(), BACKWARD], ids=["forward", "backward"])
+@pytest.mark.parametrize("model", [tiny.forward_model(), BACKWARD], ids=["forward", "backward"])
 def test_points_known_to_be_static_hold_the_motion(model):
     made = module(model, {"static_points": 1.0})
     method = made.method
     head = (method.motion.trajectory if hasattr(method, "motion") else method.deformation).network[-1]
     torch.nn.init.constant_(head.bias, 0.1)
-    assert made.training_step(batch(), 0) == 0  # none is known
+    assert made.loss_of(batch())[0] == 0  # none is known
     method.static_points = torch.tensor([[0.9, 0.1, 0.2], [-0.8, 0.3, -0.2]])
-    loss = made.training_step(batch(), 0)
+    loss, _ = made.loss_of(batch())
     loss.backward()
     assert loss > 0
     assert head.bias.grad.abs().sum() > 0
 
 
-def test_gradients_are_clipped_where_asked():
-    for limit in (0.0, 1e-3):
-        made = module(max_gradient=limit)
-        (1e3 * made.training_step(batch(), 0)).backward()
-        made.configure_gradient_clipping(made.configure_optimizers())
-        norm = sum(p.grad.square().sum() for p in made.method.parameters() if p.grad is not None) ** 0.5
-        assert (norm <= 1.001e-3) == (limit > 0)
-
-
 def test_an_image_in_chunks_is_the_image():
-    made = module()
-    target = DATA.targets("test")[1]
+    made, target = module(), DATA.targets("test")[1]
     whole = made.render(target.frame.camera, target.moment, target.background)
     field = made.method.at(target.moment).fields["warped"]
     parts = made.method.renderer.picture(
@@ -175,9 +137,7 @@ def test_an_image_in_chunks_is_the_image():
 
 
 def test_validation_logs_the_psnr_of_whole_images():
-    made = module()
-    ours = trainer([])
-    ours.limit_val_batches = 1.0
+    made, ours = module(), tiny.trainer([], limit_val_batches=1.0)
     (logged,) = ours.validate(made, datamodule=DATA, verbose=False)
     target = DATA.targets("val")[0]
     drawn = made.render(target.frame.camera, target.moment, target.background).rgb
@@ -186,33 +146,8 @@ def test_validation_logs_the_psnr_of_whole_images():
 
 
 def test_without_cameras_there_are_no_random_views():
-    made = module()
-    method = begun(made.method, replace(DATA.scene, train=()), stage())
+    method = tiny.begun(module().method, replace(DATA.scene, train=()), tiny.stage())
     assert method.patches is None
-    none = DynamicSceneModule(
-        method, objective=made.objective, settings=made.settings, curriculum=made.curriculum
-    )
-    assert none.training_step(batch(), 0).isfinite()
-
-
-def test_gradients_and_terms_of_a_method_are_checked():
-    one = torch.ones(())
-    with pytest.raises(ValueError, match="expected gradients of some of a, but got none"):
-        total(Step({"photo": lambda: one}, one, gradients={}), {"photo": 1.0}, {"a": one})
-    with pytest.raises(ValueError, match="expected gradients of some of a, but got b"):
-        total(Step({"photo": lambda: one}, one, gradients={"b": one}), {"photo": 1.0}, {"a": one})
-    with pytest.raises(ValueError, match="expected look to give the term 'slow'"):
-        total(Step({"photo": lambda: one}, one), {"slow": 1.0}, {})
-
-
-def test_a_method_that_brings_no_gradients_is_told_which_it_has(monkeypatch):
-    made, one = module(), torch.ones(())
-    step = Step({"photo": lambda: one}, one, gradients={})
-    monkeypatch.setattr(DynamicSceneModule, "look", lambda *_: step)
-    monkeypatch.setattr(made.objective, "factors", lambda number: {"photo": 1.0})
-    first = next(name for name, _ in made.method.named_parameters())
-    with pytest.raises(ValueError, match=f"expected gradients of some of {first}, .*, but got none"):
-        made.training_step(batch(), 0)
 
 
 def test_what_is_drawn_when_training_begins_changes_nothing_after_it():
@@ -223,4 +158,44 @@ def test_what_is_drawn_when_training_begins_changes_nothing_after_it():
     torch.rand(3)  # by callbacks, whose hooks come before the module's
     made.on_train_start()
     made.on_train_end()
-    assert torch.equal(torch.get_rng_state(), checkpoint["forewarp"]["torch"])
+    assert torch.equal(torch.get_rng_state(), checkpoint["forewarp"]["torch_rng"])
+
+
+class Plane(Method):
+    """One colour for all pixels; its gradients come from autograd, or are computed by itself."""
+
+    def __init__(self, start, own):
+        super().__init__()
+        self.color, self.own, self.autocast = torch.nn.Parameter(torch.zeros(3)), own, []
+
+    def look(self, batch, factors, generator):
+        self.autocast.append(torch.is_autocast_enabled("cpu"))
+        error = self.color - batch.observations[0].rgb
+        loss, gradients = error.square().mean(), None
+        if self.own:
+            gradients, loss = {"color": 2 * error.detach().sum(0) / error.numel()}, loss.detach()
+        else:
+            self.color.register_hook(lambda _: self.autocast.append(torch.is_autocast_enabled("cpu")))
+        return Step({"photo": lambda: loss}, loss.detach(), gradients=gradients)
+
+
+def fitted(folder, own, limit=0.0, steps=5, **changes):
+    made = tiny.stage(weights={"photo": 1.0}, iterations=steps, lr={"network": 0.1}, max_gradient=limit)
+    made.settings.numbers.clear()
+    run = tiny.make_run(folder, [made], data=DATA, model=partial(Plane, own=own))
+    run.make_trainer = lambda where, callbacks: tiny.trainer(callbacks, **changes)
+    return run.fit()
+
+
+@pytest.mark.parametrize("limit", [0.0, 1e-3])
+def test_gradients_of_a_method_reach_the_optimiser_as_those_of_autograd_do(tmp_path, limit):
+    ours, theirs = (fitted(tmp_path / str(own), own, limit) for own in (True, False))
+    assert ours.global_step == theirs.global_step == 5
+    torch.testing.assert_close(ours.method.color, theirs.method.color)
+    assert (float(ours.method.color.grad.norm()) <= 1.001e-3) == (limit > 0)
+    assert float(ours.method.color.detach().abs().min()) > 0.1
+
+
+def test_mixed_precision_is_of_the_forward_pass_alone(tmp_path):
+    method = fitted(tmp_path, own=False, steps=1, precision="bf16-mixed").method
+    assert method.autocast == [True, False]

@@ -54,8 +54,8 @@ class Step:
         squared_error: error of the best rendering, mean over pixels and channels.
         noted: numbers to log.
         gradients: of the weighted sum, by parameter name, if the method computes them itself; its terms then
-            need no graph. They become ``.grad`` as they are, without hooks of the parameters, when the loss
-            is led back. None: autograd computes them.
+            need no graph. They become ``.grad`` as they are, without a copy and without hooks of the
+            parameters. None: autograd computes them.
         tensors: yields intermediate results by name, to find the first that is not finite.
     """
 

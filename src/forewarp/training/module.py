@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 
 import lightning
 import torch
@@ -14,7 +14,7 @@ from forewarp.methods.method import Method, Snapshot, Step
 from forewarp.progress import told_if_slow
 from forewarp.scene.camera import Camera
 from forewarp.scene.view import Batch, Moment, Rendering, Target, View
-from forewarp.training.objective import Objective, total
+from forewarp.training.objective import Objective, set_gradients, total
 from forewarp.training.schedule import Curriculum, StageSettings
 
 
@@ -41,6 +41,7 @@ class DynamicSceneModule(lightning.LightningModule):
         seed: int = 0,
     ) -> None:
         super().__init__()
+        self.automatic_optimization = False
         method.check(settings.name, (), objective.names)
         self.method = method
         self.objective, self.settings = objective, settings
@@ -64,20 +65,33 @@ class DynamicSceneModule(lightning.LightningModule):
         return self.settings.fraction(self.global_step, self.clock.seconds)
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        """Return the loss of one batch: the weighted sum of the method's terms."""
+        """Take one step of the optimiser, and return the loss.
+
+        Optimisation is manual, as a method may compute its gradients itself.
+        """
+        optimizer = self.optimizers()
+        for group in optimizer.param_groups:
+            for parameter in group["params"]:
+                parameter.grad = None
+        loss, gradients = self.loss_of(batch)
+        with torch.autocast(self.device.type, enabled=False):  # mixed precision is of the forward pass alone
+            if gradients is None:
+                self.manual_backward(loss)
+            else:
+                set_gradients(self.method, gradients)
+            optimizer.step()
+        return loss.detach()
+
+    def loss_of(self, batch: Batch) -> tuple[Tensor, Mapping[str, Tensor] | None]:
+        """Return the loss of a batch, the weighted sum of the method's terms, and the method's own gradients.
+
+        The gradients are None where autograd computes them.
+        """
         factors = self.objective.factors(self.global_step)
         step = self.look(batch, factors)
-        loss, raw = total(step, factors, self._named(step.gradients))
+        loss, raw = total(step, factors)
         self._remember(batch, step, loss, raw)
-        return loss
-
-    def _named(self, names: Iterable[str] | None) -> dict[str, Tensor]:
-        """The method's parameters of these names; all of them, where there is no name or one of none."""
-        try:
-            found = {name: self.method.get_parameter(name) for name in names or ()}
-        except AttributeError:
-            found = {}
-        return found if found or names is None else dict(self.method.named_parameters())
+        return loss, step.gradients
 
     def look(self, batch: Batch, factors: Mapping[str, float]) -> Step:
         """Let the method compare itself with a batch."""
@@ -149,16 +163,8 @@ class DynamicSceneModule(lightning.LightningModule):
             groups.append({"params": parameters, "lr": lr, "base_lr": lr, "name": kind})
         return self.method.optimizer(groups)
 
-    def optimizer_zero_grad(self, epoch, batch_idx, optimizer) -> None:
-        """Forget the gradients of the step before, at less cost than PyTorch's own way."""
-        for group in optimizer.param_groups:
-            for parameter in group["params"]:
-                parameter.grad = None
-
-    def configure_gradient_clipping(
-        self, optimizer, gradient_clip_val=None, gradient_clip_algorithm=None
-    ) -> None:
-        """Clip the gradients' norm to the stage's ``max_gradient``."""
+    def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
+        """Clip the gradients' norm to the stage's ``max_gradient``; callbacks have seen them before."""
         if self.settings.max_gradient > 0:
             learned = [p for group in optimizer.param_groups for p in group["params"]]
             torch.nn.utils.clip_grad_norm_(learned, self.settings.max_gradient)
@@ -167,7 +173,7 @@ class DynamicSceneModule(lightning.LightningModule):
         """Add all that a continued run needs to equal an uninterrupted one to the bit."""
         checkpoint["forewarp"] = {
             "generator": self.generator.get_state(),
-            "torch": torch.get_rng_state(),
+            "torch_rng": torch.get_rng_state(),
             "curriculum": self.curriculum.state_dict(),
             "clock": self.clock.state_dict(),
         }
@@ -176,7 +182,7 @@ class DynamicSceneModule(lightning.LightningModule):
         """Restore what ``on_save_checkpoint`` added."""
         state = checkpoint["forewarp"]
         self.generator.set_state(state["generator"])
-        self._torch_state = state["torch"]
+        self._torch_state = state["torch_rng"]
         torch.set_rng_state(self._torch_state)
         self.curriculum.load_state_dict(state["curriculum"])
         self.clock.load_state_dict(state["clock"])

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
-from forewarp.methods.method import Step
+from forewarp.methods.method import Method, Step
 
 
 class Objective:
@@ -67,55 +67,42 @@ def parts(step: Step, factors: Mapping[str, float]) -> dict[str, tuple[Tensor, f
     return found
 
 
-def total(step: Step, factors: Mapping[str, float], parameters: Mapping[str, Tensor]) -> tuple[Tensor, dict]:
+def total(step: Step, factors: Mapping[str, float]) -> tuple[Tensor, dict[str, Tensor]]:
     """Return the loss of a step, and its unweighted terms by name.
 
     Args:
         step: the method's answer to a batch.
         factors: factors of the step's terms (see ``Objective.factors``).
-        parameters: by name; needed if the method computed its gradients itself.
 
     Raises:
-        ValueError: for a term or a gradient that the step should have given.
+        ValueError: for a term that the step should have given.
     """
     loss, raw = torch.zeros(()), {}
     for name, (value, factor) in parts(step, factors).items():
         raw[name] = value.detach()
         loss = loss.to(value) + factor * value
-    if step.gradients is not None:
-        if not step.gradients or not step.gradients.keys() <= parameters.keys():
-            raise ValueError(
-                f"model: expected gradients of some of {', '.join(parameters)}, but got "
-                f"{', '.join(step.gradients) or 'none'}"
-            )
-        for name, value in step.gradients.items():
-            own = parameters[name]
-            if (value.shape, value.dtype, value.device) != (own.shape, own.dtype, own.device):
-                raise ValueError(
-                    f"model: expected a gradient of {name} as it is, {tuple(own.shape)} {own.dtype} on "
-                    f"{own.device}, but got {tuple(value.shape)} {value.dtype} on {value.device}"
-                )
-        loss = _handing_over(loss, dict(step.gradients), parameters)
     return loss, raw
 
 
-def _handing_over(loss: Tensor, gradients: dict[str, Tensor], parameters: Mapping[str, Tensor]) -> Tensor:
-    """A loss without a graph; ``backward`` hands over, once, gradients that the method computed itself.
+def set_gradients(method: Method, gradients: Mapping[str, Tensor]) -> None:
+    """Make gradients that a method computed itself those of its parameters; they are not copied.
 
-    They are not copied: what is done to ``.grad`` in place is done to them.
+    Raises:
+        ValueError: for none, one of no parameter, or one of another shape, dtype or device.
     """
-    loss = loss.detach().requires_grad_()
-
-    def hand_over(slope: Tensor) -> None:
-        if not gradients:
-            raise RuntimeError("loss: expected to be led back once, but it was twice")
-        scaled = slope.device.type != "cpu" or float(slope) != 1
-        while gradients:
-            name, value = gradients.popitem()
-            parameter = parameters[name]
-            if parameter.requires_grad:
-                value = slope * value if scaled else value
-                parameter.grad = value if parameter.grad is None else parameter.grad + value
-
-    loss.register_hook(hand_over)
-    return loss
+    parameters = dict(method.named_parameters())
+    if not gradients or not gradients.keys() <= parameters.keys():
+        raise ValueError(
+            f"model: expected gradients of some of {', '.join(parameters)}, but got "
+            f"{', '.join(gradients) or 'none'}"
+        )
+    for name, value in gradients.items():
+        parameter = parameters[name]
+        expected = parameter.shape, parameter.dtype, parameter.device
+        if (value.shape, value.dtype, value.device) != expected:
+            raise ValueError(
+                f"model: expected a gradient of {name} as it is, {tuple(parameter.shape)} {parameter.dtype} "
+                f"on {parameter.device}, but got {tuple(value.shape)} {value.dtype} on {value.device}"
+            )
+        if parameter.requires_grad:
+            parameter.grad = value

@@ -1,10 +1,9 @@
-"""The sentinel: stop a stage at the first number that is not finite, and store that step."""
+"""The sentinel: stop a stage at the first number that is not finite, and store that step to look at."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import Path
 
 import lightning
@@ -12,31 +11,13 @@ import torch
 from torch import Tensor
 
 from forewarp.scene.view import Batch
-from forewarp.training.bundle import write_bundle
+from forewarp.training.checkpoints import write_archive
 from forewarp.training.module import DynamicSceneModule
 from forewarp.training.objective import parts
 
 
 class BrokenStep(ValueError):
     """A step produced a number that is not finite."""
-
-
-@dataclass(frozen=True)
-class Found:
-    """The first number found that is not finite in a step.
-
-    Attributes:
-        kind: the check that failed: ``parameter``, ``loss``, ``gradient`` or ``optimizer``.
-        tensor: name of the first tensor that is not finite.
-        terms: loss terms whose value or gradient is not finite.
-    """
-
-    kind: str
-    tensor: str
-    terms: tuple[str, ...] = ()
-
-    def __str__(self) -> str:
-        return f"{self.kind}: {self.tensor}" + (f" (terms {', '.join(self.terms)})" if self.terms else "")
 
 
 def all_finite(tensors: Iterable[Tensor]) -> bool:
@@ -58,55 +39,56 @@ def first_bad(named: Iterable[tuple[str, Tensor | None]], squared: bool = False)
     return None
 
 
-def diagnose(module: DynamicSceneModule, batch: Batch, number: int) -> Found | None:
-    """Repeat step ``number`` up to its gradients and find what is not finite; None if nothing is.
+def diagnose(module: DynamicSceneModule, batch: Batch, number: int) -> str | None:
+    """Repeat step ``number`` up to its gradients and name what is not finite; None if nothing is.
 
     A gradient counts as broken once its square overflows, as Adam stores squares. Reset the module's
     generator to its state before the step; weights and gradients do not change.
     """
     parameters = dict(module.method.named_parameters())
     if name := first_bad(parameters.items()):
-        return Found("parameter", name)
+        return f"parameter: {name}"
     factors = module.objective.factors(number)
     step = module.look(batch, factors)
-    found = parts(step, factors)
-    bad = tuple(name for name, (value, _) in found.items() if not bool(value.isfinite().all()))
+    terms = parts(step, factors)
+    bad = [name for name, (value, _) in terms.items() if not bool(value.isfinite().all())]
     if bad:
-        return Found("loss", first_bad([*_tensors(batch), *step.tensors()]) or f"the term {bad[0]}", bad)
+        name = first_bad([*_inputs(batch), *step.tensors()]) or f"the term {bad[0]}"
+        return f"loss: {name} (terms {', '.join(bad)})"
     if step.gradients is not None:  # the method's own, of all terms together
         name = first_bad(step.gradients.items(), squared=True)
-        return None if name is None else Found("gradient", name)
-    slopes = {name: _slopes(value * factor, parameters) for name, (value, factor) in found.items()}
-    total = {p: sum(s[p] for s in slopes.values() if s[p] is not None) for p in parameters}
-    name = first_bad(((p, g) for p, g in total.items() if torch.is_tensor(g)), squared=True)
+        return name and f"gradient: {name}"
+    gradients = {name: _gradients(value * factor, parameters) for name, (value, factor) in terms.items()}
+    sums = {p: sum(g[p] for g in gradients.values() if g[p] is not None) for p in parameters}
+    name = first_bad(((p, g) for p, g in sums.items() if torch.is_tensor(g)), squared=True)
     if name is None:
         return None
-    guilty = [term for term, s in slopes.items() if first_bad([("", s[name])], squared=True) is not None]
-    return Found("gradient", name, tuple(guilty))
+    guilty = [term for term, g in gradients.items() if first_bad([("", g[name])], squared=True) is not None]
+    return f"gradient: {name}" + (f" (terms {', '.join(guilty)})" if guilty else "")
 
 
-def _slopes(value: Tensor, parameters: dict[str, Tensor]) -> dict[str, Tensor | None]:
+def _gradients(value: Tensor, parameters: dict[str, Tensor]) -> dict[str, Tensor | None]:
     if not value.requires_grad:
         return dict.fromkeys(parameters)
-    found = torch.autograd.grad(value, list(parameters.values()), retain_graph=True, allow_unused=True)
-    return dict(zip(parameters, found))
+    by_parameter = torch.autograd.grad(value, list(parameters.values()), retain_graph=True, allow_unused=True)
+    return dict(zip(parameters, by_parameter))
 
 
-def _tensors(batch: Batch) -> Iterable[tuple[str, Tensor | None]]:
+def _inputs(batch: Batch) -> Iterable[tuple[str, Tensor | None]]:
     """Yield the colours and rays of a batch by name."""
-    for number, one in enumerate(batch.observations):
-        yield from ((f"batch[{number}].{part}", getattr(one, part)) for part in ("rgb", "background"))
-        rays = one.view.rays()
-        yield from (
-            (f"batch[{number}].rays.{part}", getattr(rays, part)) for part in ("origins", "directions")
-        )
+    for number, seen in enumerate(batch.observations):
+        rays = seen.view.rays()
+        yield f"batch[{number}].rgb", seen.rgb
+        yield f"batch[{number}].background", seen.background
+        yield f"batch[{number}].rays.origins", rays.origins
+        yield f"batch[{number}].rays.directions", rays.directions
 
 
 class Sentinel(lightning.Callback):
     """Check the loss and gradients of every step, the parameters now and then, and all before a checkpoint.
 
-    A number that is not finite ends the stage. The step is stored as ``broken/step_<n>.pt`` (repeat it with
-    ``forewarp.replay``), and the last checkpoint stays as it is.
+    A number that is not finite ends the stage. The step's batch and weights are stored as
+    ``broken/step_<n>.pt``, for ``torch.load``, and the last checkpoint stays as it is.
 
     Args:
         folder: the stage's folder.
@@ -123,28 +105,25 @@ class Sentinel(lightning.Callback):
         self.folder, self.skip, self.every, self.skipped = Path(folder), skip, every, 0
 
     def on_train_batch_start(self, trainer, module, batch, batch_idx) -> None:
-        """Note the states of the random generators; check the parameters if it is time."""
-        self._batch, self._number, self._drop = batch, module.global_step, False
-        self._random = {"samples": module.generator.get_state(), "torch": torch.get_rng_state()}
+        """Note what the step begins with; check the parameters if it is time."""
+        self._batch, self._number = batch, module.global_step
+        self._generator = module.generator.get_state()
         if self._number % self.every == 0:
             self._check_parameters(trainer, module)
 
-    def on_before_backward(self, trainer, module, loss) -> None:
-        """Check the loss."""
-        if not bool(loss.detach().isfinite()):
-            raw = {name: v for name, v in module.last.items() if name.startswith("loss/")}
-            terms = (name.removeprefix("loss/") for name, value in raw.items() if not math.isfinite(value))
-            self._stop(trainer, module, Found("loss", "the loss", tuple(terms)), may_skip=True)
-
     def on_before_optimizer_step(self, trainer, module, optimizer) -> None:
-        """Check the gradients; drop those of a step to skip, so that Adam does nothing."""
-        if not self._drop and not _rescales(trainer):
-            learned = (p for group in optimizer.param_groups for p in group["params"])
-            if not all_finite(p.grad for p in learned if p.grad is not None):
-                named = [(name, p.grad) for name, p in module.method.named_parameters()]
-                if name := first_bad(named, squared=True):  # a norm may overflow where no entry's square does
-                    self._stop(trainer, module, Found("gradient", name), may_skip=True)
-        if self._drop:
+        """Check loss and gradients; drop the gradients of a step to skip: nothing is learned of it."""
+        found = None
+        if not math.isfinite(module.last["loss"]):
+            terms = [name for name, value in module.last.items() if not math.isfinite(value)]
+            terms = [name.removeprefix("loss/") for name in terms if name.startswith("loss/")]
+            found = "loss: the loss" + (f" (terms {', '.join(terms)})" if terms else "")
+        elif not all_finite(p.grad for p in module.method.parameters() if p.grad is not None):
+            named = ((name, p.grad) for name, p in module.method.named_parameters())
+            if name := first_bad(named, squared=True):  # a norm may overflow where no entry's square does
+                found = f"gradient: {name}"
+        if found:
+            self._stop(trainer, module, found, may_skip=True)
             for parameter in module.method.parameters():
                 parameter.grad = None
 
@@ -161,7 +140,7 @@ class Sentinel(lightning.Callback):
             if torch.is_tensor(value)
         )
         if name := first_bad(moments):
-            self._stop(trainer, module, Found("optimizer", name))
+            self._stop(trainer, module, f"optimizer: {name}")
 
     def state_dict(self) -> dict:
         """Return the number of skipped steps."""
@@ -174,48 +153,50 @@ class Sentinel(lightning.Callback):
     def _check_parameters(self, trainer, module) -> None:
         named = list(module.method.named_parameters())
         if not all_finite(p for _, p in named) and (name := first_bad(named)):
-            self._stop(trainer, module, Found("parameter", name))
+            self._stop(trainer, module, f"parameter: {name}")
 
-    def _stop(self, trainer, module, seen: Found, may_skip: bool = False) -> None:
-        found, path, refusal = self._keep(trainer, module, seen)
-        if may_skip and self.skipped < self.skip and refusal is None:
-            self.skipped, self._drop = self.skipped + 1, True
-            return
-        batch, stage = self._batch, f"stage.{module.settings.name}"
-        frame = trainer.datamodule.scene.train[batch.frame].name
-        again = f"python -m forewarp.replay {path} shows it again"
-        if refusal is not None:
-            again = f"{path} could not be written ({refusal})"
-        raise BrokenStep(
-            f"{stage}: expected finite numbers, but got {found} at step {self._number}, frame {frame} "
-            f"(time {batch.time:.4g}); {again}; begin anew with "
-            f"lower {stage}.lr, or go on with resume={self.folder.parent} sentinel.skip=1"
-        )
-
-    def _keep(self, trainer, module, seen: Found) -> tuple[str, Path, str | None]:
-        """Repeat the step to find the first broken tensor, and store it.
-
-        Returns:
-            what was found, the file, and why it could not be written (None if it was).
-        """
+    def _stop(self, trainer, module, found: str, may_skip: bool = False) -> None:
+        """Repeat the step to name its first broken tensor, store it, and raise unless it may be skipped."""
         after = module.generator.get_state()
-        module.generator.set_state(self._random["samples"])
+        module.generator.set_state(self._generator)
         counted = {name: value.clone() for name, value in module.method.named_buffers()}
         with trainer.precision_plugin.forward_context(), torch.enable_grad():
             again = diagnose(module, self._batch, self._number)
         module.generator.set_state(after)
         for name, value in module.method.named_buffers():
             value.copy_(counted[name])
-        found = str(again or f"{seen}, though not when the step was repeated,")
+        found = again or f"{found}, though not when the step was repeated,"
+        frame = trainer.datamodule.scene.train[self._batch.frame].name
         path = self.folder / "broken" / f"step_{self._number}.pt"
-        noted = {"found": found, "stage": module.settings.name, "step": self._number, "random": self._random}
+        content = {"found": found, "step": self._number, "frame": frame}
+        content |= {"batch": _plain(self._batch), "state_dict": module.state_dict()}
+        stored = f"its batch and weights are in {path}"
         try:
-            write_bundle(path, module, self._batch, trainer.datamodule.scene, noted)
-        except OSError as error:  # report what was found all the same
-            return found, path, error.strerror or str(error)
-        return found, path, None
+            write_archive(path, content)
+            if may_skip and self.skipped < self.skip:
+                self.skipped += 1
+                return
+        except OSError as error:  # say what was found all the same
+            stored = f"{path} could not be written ({error.strerror or error})"
+        stage = f"stage.{module.settings.name}"
+        raise BrokenStep(
+            f"{stage}: expected finite numbers, but got {found} at step {self._number}, frame {frame} "
+            f"(time {self._batch.time:.4g}); {stored}; begin anew with "
+            f"lower {stage}.lr, or go on with resume={self.folder.parent} sentinel.skip=1"
+        )
 
 
-def _rescales(trainer: lightning.Trainer) -> bool:
-    """Return whether a float16 gradient scaler is active, which skips overflowing steps by design."""
-    return getattr(trainer.precision_plugin, "scaler", None) is not None
+def _plain(batch: Batch) -> list[dict]:
+    """Return the observations of a batch as tensors and plain numbers."""
+    return [
+        {
+            "time": seen.moment.time,
+            "frame": seen.moment.frame,
+            "camera": seen.moment.camera,
+            "camera_to_world": seen.view.camera.camera_to_world,
+            "pixels": seen.view.indices,
+            "rgb": seen.rgb.cpu(),
+            "background": seen.background.cpu(),
+        }
+        for seen in (*batch.observations, *batch.instant)
+    ]

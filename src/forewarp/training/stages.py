@@ -10,10 +10,9 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from types import SimpleNamespace
 
 import lightning
 import torch
@@ -172,16 +171,6 @@ class Run:
         """Return the contents of ``done.json`` by stage: seconds, steps, peak memory and so on."""
         done = {stage.settings.name: _done(self.stage_folder(stage)) for stage in self.stages}
         return {name: content for name, content in done.items() if content is not None}
-
-    def rebuilt(self, name: str, scene: Scene) -> DynamicSceneModule:
-        """Build the module of a stage for a ``state_dict``, without images and without earlier stages.
-
-        Args:
-            name: name of the stage.
-            scene: cameras, times and box; its frames need no images.
-        """
-        stage = next(stage for stage in self.stages if stage.settings.name == name)
-        return replace(self, datamodule=SimpleNamespace(scene=scene))._module(stage, blank=True)
 
     def _of_method(self, stage: Stage, name: str) -> Callable | None:
         """Return what the method of a stage has by this name before it is built."""

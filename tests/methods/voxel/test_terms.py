@@ -63,7 +63,7 @@ def loss_of(objective, seen, number=0, terms=None):
     """Return the loss and the unweighted terms."""
     terms = voxel_terms(objective.literal) if terms is None else terms
     step = Step({name: lambda term=term: term(seen) for name, term in terms.items()}, torch.zeros(()))
-    return total(step, objective.factors(number), {})
+    return total(step, objective.factors(number))
 
 
 def test_every_term_is_the_pure_function_of_its_parts():
