@@ -104,8 +104,8 @@ OF_PARTICLES = {
     "motion": Effect({"motion": "spline"}, ((Nodes, "carried"), (Nodes, "spread_over_time")), ("nodes",)),
     "rotation": Effect({"rotation": True}, (), ("nodes.turn",)),
     "view_dependence": Effect({"view_dependence": 1}, (), ("shade",)),
-    "color_over_time": Effect({"color_over_time": 1}, ((Particles, "tints"),), ("tint",)),
-    "opacity_over_time": Effect({"opacity_over_time": 1}, ((Particles, "fades"),), ("fade",)),
+    "color_over_time": Effect({"color_over_time": 1}, ((Particles, "color_basis"),), ("tint",)),
+    "opacity_over_time": Effect({"opacity_over_time": 1}, ((Particles, "opacity_basis"),), ("fade",)),
     "background": Effect({"background": 0.03}, (), ("resting", "nodes.still")),
 }
 RATES = {"means": 1.5e-3, "log_scales": 5e-3, "turns": 3e-3, "opacity": 5e-2, "color": 3e-2, "shade": 1e-3}

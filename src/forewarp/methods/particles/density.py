@@ -102,7 +102,7 @@ def most_opaque(particles: Particles) -> Tensor:
     if particles.fade is None:
         return base
     times = [i / _TIMES for i in range(_TIMES + 1)]
-    bases = base.new_tensor([particles.cosines(particles.fade, time) for time in times])  # (T, F)
+    bases = base.new_tensor([particles.opacity_basis(time) for time in times])  # (T, F)
     return base + (bases @ particles.fade.data.T).amax(0)
 
 

@@ -324,15 +324,23 @@ class Particles(Method):
 
     def over_time(self, time: float) -> tuple[Tensor, Tensor]:
         """Return what a time makes of the coefficients of colour (T,) and of opacity (1 + F,)."""
-        tints = [] if self.tint is None else self.cosines(self.tint, time)
-        fades = [] if self.fade is None else self.cosines(self.fade, time)
-        return self.means.new_tensor(tints), self.means.new_tensor([1.0, *fades])
+        color = [] if self.tint is None else self.color_basis(time)
+        opacity = [] if self.fade is None else self.opacity_basis(time)
+        return self.means.new_tensor(color), self.means.new_tensor([1.0, *opacity])
 
-    def cosines(self, coefficients: Tensor, time: float) -> list[float]:
-        """Return ``cos(pi k t) - cos(pi k t_c)``, k = 1 .. K, of coefficients (N, K, ...): 0 canonically."""
+    def color_basis(self, time: float) -> list[float]:
+        """Return the cosines of colour over time."""
+        return self._cosines(self.tint.shape[1], time)
+
+    def opacity_basis(self, time: float) -> list[float]:
+        """Return the cosines of opacity over time."""
+        return self._cosines(self.fade.shape[1], time)
+
+    def _cosines(self, count: int, time: float) -> list[float]:
+        """Return ``cos(pi k t) - cos(pi k t_c)`` for k = 1 .. count: 0 at the canonical time."""
         return [
             math.cos(math.pi * k * time) - math.cos(math.pi * k * self.canonical_time)
-            for k in range(1, coefficients.shape[1] + 1)
+            for k in range(1, count + 1)
         ]
 
     @torch.no_grad()

@@ -82,11 +82,12 @@ def movement(self: Particles, times: Sequence[float]) -> dict[str, Tensor]:
         parts["node_basis"] = torch.stack([nodes.basis(time) for time in times])
         if nodes.turn is not None:
             parts["node_turn"] = nodes.turn
-    for name, coefficients in (("color", self.tint), ("opacity", self.fade)):
-        if coefficients is not None:
-            bases = [self.cosines(coefficients, time) for time in times]
-            parts[f"{name}_over_time"] = coefficients
-            parts[f"{name}_basis"] = coefficients.new_tensor(bases)
+    if self.tint is not None:
+        parts["color_over_time"] = self.tint
+        parts["color_basis"] = self.tint.new_tensor([self.color_basis(time) for time in times])
+    if self.fade is not None:
+        parts["opacity_over_time"] = self.fade
+        parts["opacity_basis"] = self.fade.new_tensor([self.opacity_basis(time) for time in times])
     return {name: value.detach() for name, value in parts.items()}
 
 
