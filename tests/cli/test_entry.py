@@ -104,8 +104,6 @@ def test_options_of_ones_own_stand_beside_ours(ok, way, in_tmp):
             "got an unexpected keyword argument 'bogus'; leave that key out",
         ),
         (["model=forward", "+model.renderer.bogus=1"], "model.renderer: "),
-        (["budget=fast"], "budget=fast: expected preset=fast; the choice is called preset since 0.2"),
-        (["--multirun", "hydra.sweeper.params.preset.skip_alpha=1"], "expected hydra.sweeper.params.preset."),
         (
             ["model=particles", "stage.fine.lr.means=fast"],
             "stage.fine.lr.means: expected a number >= 0, but got",
@@ -160,7 +158,6 @@ def test_an_option_that_not_every_job_has_is_named(refused, in_tmp):
         (["objective.fine.weights.tv_flow=0"], "objective.fine.weights.tv_flow", "particles", "forward"),
         (["model=forward", "model/motion=spline"], "model/motion=spline", "forward", "particles"),
         (["model=backward", "stage.fine.density=60"], "stage.fine.density", "backward", "particles"),
-        (["preset.width=4"], "preset.width", "particles", "dnerf"),
     ],
 )
 def test_an_option_of_another_method_names_it(refused, in_tmp, arguments, option, model, owner):
@@ -169,23 +166,6 @@ def test_an_option_of_another_method_names_it(refused, in_tmp, arguments, option
         "leave it out"
     )
     assert list(in_tmp.iterdir()) == []
-
-
-@pytest.mark.parametrize("name", ["train", "plan"])
-def test_renamed_keys_of_ones_own_files_are_named(refused, in_tmp, name):
-    mine = in_tmp / "experiment" / "mine.yaml"
-    mine.parent.mkdir()
-    for text, line in (
-        ("stage: {fine: {voxels: []}}", "stage.fine.voxels: expected stage.fine.num_voxels;"),
-        ("defaults:\n  - override /model/view: mlp", "model/view: expected model/view_dependence;"),
-    ):
-        mine.write_text(f"# @package _global_\n{text}\n")
-        assert refused(name, "--config-dir", ".", "experiment=mine") == f"{line} renamed in 0.3"
-
-
-def test_a_renamed_key_is_named_whatever_the_method(refused, in_tmp):
-    said = refused("train", "model=particles", "model.view=1")
-    assert said == "model.view=1: expected model.view_dependence=1; renamed in 0.3"
 
 
 @pytest.mark.parametrize(

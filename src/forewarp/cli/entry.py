@@ -14,9 +14,8 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
-from forewarp.cli.mistakes import flat, one_line, refuse_dashes, renamed_key, unknown_key, with_run_key
+from forewarp.cli.mistakes import flat, one_line, refuse_dashes, unknown_key, with_run_key
 from forewarp.runs.config_files import configurations, project_root
-from forewarp.runs.overrides import key_of, refuse_renamed
 
 TRACEBACK_VARIABLE = "FOREWARP_TRACEBACK"
 MISTAKE, INTERRUPTED = 2, 130
@@ -41,9 +40,6 @@ def command(name: str, task: Callable, text: str, *, config: str | None = None) 
             print(text.strip() + "\n\n" + choices(project_root() / "conf", config or name), flush=True)
             sys.exit(0)
         sys.argv[1:] = _arguments(name)
-        if (config or name) == "train":
-            # Choices; whether another package's method has a key is known once the config is composed.
-            refuse_renamed([argument for argument in sys.argv[1:] if "." not in key_of(argument)])
         failures = _run(name, task, configurations(), config or name)
     except KeyboardInterrupt:
         _interrupted(name)
@@ -155,7 +151,7 @@ def _run(name: str, task: Callable, conf: Path, config_name: str) -> list[int]:
 
 def _tell(name: str, error: Exception, config_name: str) -> int:
     """Print what went wrong and return the exit status."""
-    line = renamed_key(error) or unknown_key(error, config_name, sys.argv[1:]) or one_line(error)
+    line = unknown_key(error, config_name, sys.argv[1:]) or one_line(error)
     if line is None or os.environ.get(TRACEBACK_VARIABLE) == "1":
         traceback.print_exception(error)
     print(f"forewarp-{name}: error: {line or _bug(error)}", file=sys.stderr)

@@ -10,7 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from forewarp.runs.config_files import configurations
-from forewarp.runs.overrides import key_of, refuse_renamed
+from forewarp.runs.overrides import key_of
 
 OF_METHODS = ("model", "modules", "objective", "preset", "stage")  # what methods have keys of their own in
 # Hydra's own, which begin with dashes.
@@ -48,32 +48,6 @@ def refuse_dashes(arguments: list[str]) -> None:
             raise ValueError(f"{argument}: expected options without dashes; type {typed}")
 
 
-def renamed_key(error: Exception) -> str | None:
-    """Return the line for a key of an earlier version that Hydra did not find; None for any other error."""
-    from hydra.errors import HydraException
-
-    found = re.search(r"Could not (?:override|delete(?: from config\.)?) '([^'@]+)'", str(error))
-    if found is None or not isinstance(error, HydraException):
-        return None
-    # Hydra quotes the override, unless the name is in a file.
-    quoted = re.search(r"To append to your config use \+(.*)", str(error), re.DOTALL)
-    try:
-        refuse_renamed(_spread(quoted[1]) if quoted else [found[1]])
-    except ValueError as refusal:
-        return str(refusal)
-    return None
-
-
-def _spread(override: str) -> list[str]:
-    """Return an override and, if its value is a dictionary, the dotted keys of that."""
-    from hydra.core.override_parser.overrides_parser import OverridesParser
-    from omegaconf import OmegaConf
-
-    value = OverridesParser.create().parse_override(override).value()
-    inner = every_key(OmegaConf.create(value), f"{key_of(override)}.") if isinstance(value, dict) else ()
-    return [override, *inner]
-
-
 def unknown_key(error: Exception, name: str, arguments: list[str]) -> str | None:
     """Return the line for an unknown key, with the nearest known one; None for any other error.
 
@@ -84,74 +58,55 @@ def unknown_key(error: Exception, name: str, arguments: list[str]) -> str | None
     """
     from hydra.errors import HydraException
 
-    found = re.match(r"Could not override '([^'@]+)'", str(error))
-    if found is None or not isinstance(error, HydraException):
+    from forewarp.runs.sections import option_groups
+
+    unknown = re.match(r"Could not override '([^'@]+)'", str(error))
+    if unknown is None or not isinstance(error, HydraException):
         return None
-    key, conf = found[1], configurations()
-    others = [argument for argument in arguments if key_of(argument) != key]
-    config = _composed(conf, name, others)
-    keys = list(every_key(config))
-    known = [*keys, *_groups(conf)]
-    inner = [own for one in arguments if key_of(one) == key for own in _spread(one)[1:]]
-    if key in keys and inner:  # a key of the dictionary that is its value
-        key = next((own for own in inner if own not in keys), key)
-    elif key in keys and {"--multirun", "-m"} & set(arguments):
+    typed = unknown[1]
+    inner = re.search(r"full_key: (\S+)", str(error.__cause__))  # where the value is a dictionary, its key
+    key = inner[1] if inner else typed
+    others = [argument for argument in arguments if key_of(argument) != typed]
+    config = _composed(name, others)
+    keys = list(_every_key(config))
+    if key in keys and {"--multirun", "-m"} & set(arguments):
         return f"{key}: expected an option of every job, but got one that not all have; leave it out"
-    model = config.get("model", {}).get("name")
-    if key in every_key(_composed(conf, name, [one for one in others if key_of(one) in ("model", "preset")])):
+    if key in _every_key(_composed(name, [one for one in others if key_of(one) in ("model", "preset")])):
         removed = "expected an option, but got one that another one typed here removes"
         return f"{key}: {removed}; leave one of them out"
-    if (owner := _owner(key, conf, name, others)) is not None:
-        return (
-            f"{key}: expected an option of model={model}, but got one of model={owner}; add model={owner}, "
-            "or leave it out"
-        )
-    near = difflib.get_close_matches(key, known, 1, cutoff=0.8)
+    if name == "train" and key.startswith(OF_METHODS):
+        for model in ("forward", "particles"):
+            of_model = [*(one for one in others if key_of(one) != "model"), f"model={model}"]
+            if key.replace("/", ".") in _every_key(_composed(name, of_model)):
+                return (
+                    f"{key}: expected an option of model={config.model.name}, but got one of model={model}; "
+                    f"add model={model}, or leave it out"
+                )
+    near = difflib.get_close_matches(key, [*keys, *option_groups(configurations())], 1, cutoff=0.8)
     advice = f"did you mean {near[0]}?" if near else f"forewarp-{name} --cfg job prints all keys"
     return f"{key}: expected a key of the configuration, but got none of this name; {advice}"
 
 
-def _owner(key: str, conf: Path, name: str, arguments: list[str]) -> str | None:
-    """Return the first of our methods that has a key or group of options; the paper's comes first."""
-    if not (conf / name).with_suffix(".yaml").is_file() or not key.startswith(OF_METHODS):
-        return None
-    kept = [argument for argument in arguments if key_of(argument) != "model"]
-    models = sorted(
-        (path.stem for path in (conf / "model").glob("*.yaml")), key=lambda m: (m != "forward", m)
-    )
-    for model in models:
-        config = _composed(conf, name, [*kept, f"model={model}"])
-        if config.get("model", {}).get("name") == model and key.replace("/", ".") in every_key(config):
-            return model
-    return None
-
-
-def _composed(conf: Path, name: str, arguments: list[str]):
-    """Compose the config with the other arguments, of a sweep the first; or alone, if they are wrong."""
+def _composed(name: str, arguments: list[str]):
+    """Compose the config with the other arguments, less those of a sweep; alone, if they are wrong."""
     import hydra
     from hydra.core.global_hydra import GlobalHydra
+    from hydra.core.override_parser.overrides_parser import OverridesParser
 
     GlobalHydra.instance().clear()
     dirs = [one.partition("=")[2] for one in arguments if one.startswith("--config-dir=")]
     dirs += [after for before, after in zip(arguments, arguments[1:]) if before == "--config-dir"]
     more = [f"hydra.searchpath=[{','.join(f'file://{Path(d).resolve()}' for d in dirs)}]"] if dirs else []
-    with hydra.initialize_config_dir(str(conf), version_base="1.3"):
+    with hydra.initialize_config_dir(str(configurations()), version_base="1.3"):
         with suppress(Exception):
-            typed = [_first(one) for one in arguments if one[:1] == "~" or ("=" in one and one[:1] != "-")]
-            return hydra.compose(name, [*more, *typed])
+            typed = [one for one in arguments if one[:1] == "~" or ("=" in one and one[:1] != "-")]
+            parsed = OverridesParser.create().parse_overrides(typed)
+            one_job = [override.input_line for override in parsed if not override.is_sweep_override()]
+            return hydra.compose(name, [*more, *one_job])
         return hydra.compose(name)
 
 
-def _first(override: str) -> str:
-    """Of an override with several choices, take the first: ``a=x,y`` -> ``a=x``."""
-    from hydra.core.override_parser.overrides_parser import OverridesParser
-
-    parsed = OverridesParser.create().parse_override(override)
-    sweeps = parsed.is_sweep_override()
-    return f"{override.partition('=')[0]}={next(parsed.sweep_string_iterator())}" if sweeps else override
-
-
-def every_key(node, prefix: str = "") -> Iterator[str]:
+def _every_key(node, prefix: str = "") -> Iterator[str]:
     """Yield the dotted keys of a config, each before those within it."""
     from omegaconf import DictConfig
 
@@ -159,11 +114,7 @@ def every_key(node, prefix: str = "") -> Iterator[str]:
         yield f"{prefix}{key}"
         inner = node._get_node(key)
         if isinstance(inner, DictConfig) and not (inner._is_none() or inner._is_missing()):
-            yield from every_key(inner, f"{prefix}{key}.")
-
-
-def _groups(conf: Path) -> Iterator[str]:
-    yield from (path.relative_to(conf).as_posix() for path in conf.rglob("*") if path.is_dir())
+            yield from _every_key(inner, f"{prefix}{key}.")
 
 
 def one_line(error: BaseException) -> str | None:

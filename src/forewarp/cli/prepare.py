@@ -16,11 +16,10 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from forewarp.cli.mistakes import every_key
 from forewarp.cli.view import require_viewer
 from forewarp.data.files import MARKERS, scene_folder
 from forewarp.runs.config import check_planned, hashed, resumed, trust_of
-from forewarp.runs.overrides import key_of, refuse_renamed, typed_overrides
+from forewarp.runs.overrides import key_of, typed_overrides
 
 if TYPE_CHECKING:  # loads torch
     from forewarp.runs.fitted import Score
@@ -129,22 +128,10 @@ def refuse_all(config: DictConfig) -> None:
     for key, choices in CHOICES.items():
         if config.get(key, choices[0]) not in choices:
             raise ValueError(f"{key}: expected {' or '.join(choices)}, but got {config[key]}")
-    refuse_renamed_keys(config)
     refuse_seeds(config)
     refuse_two_models(config)
     refuse_other_methods(config)
     refuse_numbers(config, "views", "sheets", "reduce")
-
-
-def refuse_renamed_keys(config: DictConfig) -> None:
-    """Refuse keys of earlier versions, such as those of a user's own files.
-
-    A method of another package may have keys of these names.
-    """
-    target = str(config.model.get("_target_"))
-    voxel = target.startswith(VOXELS)  # only these methods' options were renamed
-    if target.startswith("forewarp."):
-        refuse_renamed([key for key in every_key(config) if voxel or not key.startswith("model.")])
 
 
 def refuse_missing_scene(config: DictConfig) -> None:

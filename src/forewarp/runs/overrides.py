@@ -1,4 +1,4 @@
-"""The overrides of a command line: list and merge them, and refuse names of earlier versions."""
+"""List, quote and merge the overrides of a command line."""
 
 from __future__ import annotations
 
@@ -7,59 +7,6 @@ import shlex
 from collections.abc import Sequence
 
 OF_A_SWEEP = ("sweeps=", "seeds=", "launcher=")  # these say how jobs are run, not what a job computes
-
-_OF_PRESET = "rays|background|bases|nodes|padding|alpha_threshold|skip_alpha|inpainter_width"
-SINCE_3 = "renamed in 0.3"
-_VARIANTS = (  # that forewarp had
-    r"background_grid|backward|bases_(5|15|20)|carry_off|coarse_[268]0|color_all|confine|frames_all|grid_(64|96|160)|"
-    r"loss_(no_entropy|no_point_color|no_tv_flow|tv_density|tv_depth)|motion_(features|none)|nodes_0|padding_0|"
-    r"preset_(demo|faithful)|radiance_mlp|rays_(1024|2048|8192|whole)|recompute_off|see_off|skip_off|start_box|"
-    r"tv_depth_every_4|unet_(16|16_half|32|64)|upsampler_(learned|trilinear)|view_(mlp|none)|voxels_all"
-)
-# Pattern of a whole override, its replacement (None: there is none), and the reason. Oldest version first,
-# as a later one may rename again what an earlier one renamed.
-RENAMED = (
-    (
-        r"budget=(.*)",
-        r"preset=\1",
-        "the choice is called preset since 0.2; what may be spent is budget.minutes",
-    ),
-    (r"budget\.name=(.*)", r"preset=\1", "the choice is called preset since 0.2"),
-    (rf"budget\.({_OF_PRESET})(=.*)?", r"preset.\1\2", "the method's numbers are called preset since 0.2"),
-    (r"experiment=hypernerf_faithful", "experiment=hypernerf preset=faithful", "one experiment since 0.2"),
-    (r"renderer([.=].*)?", r"model.renderer\1", "it is a part of the model since 0.2"),
-    (r"model\.warp=(.*)", r"model=\1", "the method's name is model.name since 0.2"),
-    (r"stage=(demo|fast|faithful)", r"stage=forward_\1", "each method has its own since 0.2"),
-    (r"objective=(fast|faithful)", r"objective=forward_\1", "each method has its own since 0.2"),
-    (r"suits([.=].*)?", None, "every experiment takes every preset since 0.2"),
-    (r"(stage\.[\w-]+|modules\.alone)\.rates(\..*)?(=.*)?", r"\1.lr\2\3", SINCE_3),
-    (r"(stage\.[\w-]+)\.final_rate(=.*)?", r"\1.lr_final_factor\2", SINCE_3),
-    (r"(stage\.[\w-]+|modules\.alone)\.hold(=.*)?", r"\1.lr_hold\2", SINCE_3),
-    (r"(stage\.[\w-]+|modules)\.voxels(=.*)?", r"\1.num_voxels\2", SINCE_3),
-    (r"(stage\.[\w-]+)\.background_voxels(=.*)?", r"\1.background_num_voxels\2", SINCE_3),
-    (r"(preset|model\.radiance|model\.background)\.skip_alpha(=.*)?", r"\1.alpha_threshold\2", SINCE_3),
-    (r"model\.renderer\.opaque(=.*)?", r"model.renderer.early_stop_eps\1", SINCE_3),
-    (r"(objective(?:\.\w+)?\.weights)\.still_points(=.*)?", r"\1.static_points\2", SINCE_3),
-    (r"(stage\.[\w-]+)\.passes(=.*)?", r"\1.steps_per_picture\2", SINCE_3),
-    (r"model/view(=.*)?", r"model/view_dependence\1", SINCE_3),
-    (r"model\.view([.=].*)?", r"model.view_dependence\1", SINCE_3),
-    (
-        rf"variant=(.*,)?({_VARIANTS})(,.*)?",
-        None,
-        "type model=forward and the change, as preset.rays=1024; sweeps/price_list_forward.yaml has all",
-    ),
-    (r"variant=base", "ablation=base", SINCE_3),
-    (
-        r"variant=([^{]*)",
-        r"ablation=\1",
-        "move your file from variant/ to ablation/, as the group is called since 0.3",
-    ),
-    (
-        r"ablation=(.*,)?voxels_(20|40|60|80)(,.*)?",
-        None,
-        "sweeps=resolution has these sizes since 0.3; one of them is stage.fine.num_voxels=[[0,512000]]",
-    ),
-)
 
 
 def typed_overrides(*, of_sweep: bool = False) -> list[str]:
@@ -128,26 +75,3 @@ def without_switched_off(overrides: Sequence[str]) -> list[str]:
     off = [group.removeprefix("model/") for group, _, choice in groups if choice == "none"]
     off = [f"model.{effect}" for effect in [*off, *(["trajectory"] if "motion" in off else [])]]
     return [override for override in overrides if ".".join(key_of(override).split(".")[:2]) not in off]
-
-
-def refuse_renamed(overrides: Sequence[str]) -> None:
-    """Refuse overrides of earlier versions and name their replacement.
-
-    Raises:
-        ValueError: naming the override, its replacement and the version that renamed it.
-
-    >>> refuse_renamed(["preset=fast", "budget.minutes=3"])
-    >>> refuse_renamed(["budget.bases=12"])
-    Traceback (most recent call last):
-    ValueError: budget.bases=12: expected preset.bases=12; the method's numbers are called preset since 0.2
-    """
-    for override in overrides:
-        before, now = re.fullmatch(r"([+~]*(?:hydra\.sweeper\.params\.)?)(.*)", override, re.DOTALL).groups()
-        reason = None
-        for old, new, why in RENAMED:
-            if found := re.fullmatch(old, now, re.DOTALL):
-                if new is None:
-                    raise ValueError(f"{override}: expected no such override; {why}")
-                now, reason = found.expand(new), reason or why
-        if reason:
-            raise ValueError(f"{override}: expected {before}{now}; {reason}")
