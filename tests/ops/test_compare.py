@@ -169,7 +169,7 @@ def test_what_is_not_seen_has_a_gradient_of_zero(uncleared, two_threads, monkeyp
     shares=st.integers(1, 7),
 )
 def test_threads_clear_the_rows_that_they_write(rows, shares):
-    from forewarp.ops.kernels.project import SIDE_BY_SIDE, own_rows
+    from forewarp.ops.kernels.backward import SIDE_BY_SIDE, own_rows
 
     total, shown = rows[0], np.flatnonzero(rows[1]).astype(np.int32)
     blocks, end = -(-len(shown) // SIDE_BY_SIDE), 0

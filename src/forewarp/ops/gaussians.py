@@ -15,9 +15,15 @@ from torch.autograd.function import once_differentiable
 
 from forewarp.ops.backend import check_shape, match_threads, use_numba
 
+# Columns of a splat; the last three are not part of ``Splats.values``. Kernels pad them with zeros to SPLAT.
+X, Y, CONIC_A, CONIC_B, CONIC_C, OPACITY, RED, GREEN, BLUE, DEPTH, REACH_X, REACH_Y, LOG_OPACITY = range(13)
+SPLAT = 16
+SIDE = 8  # pixels of a tile along both axes
+MOST = 1 << 15  # splats of a tile that count, the nearest ones
+LEAST_LOG = -math.log(255.0)  # what adds less than a 255th to a pixel is not seen
 BLUR = 0.1  # square pixels; a pixel alone has a variance of 1/12
 FLAT = 0.28209479177387814  # the first harmonic, 1 / sqrt(4 pi), which no direction changes
-_LEAST = 1e-12  # length of a quaternion below which it turns nothing
+_LEAST = 1e-12  # length of a quaternion below which it rotates nothing
 
 
 @dataclass(frozen=True)
@@ -277,7 +283,7 @@ def projected(
 
     maps = torch.nn.functional.pad(maps, (0, 4))
     inputs = (means, log_scales, quaternions, opacity, colors, maps, links, weights, view, tints, fades)
-    out = (means.new_empty if draw else means.new_zeros)(whole(len(means)), kernels.SPLAT)
+    out = (means.new_empty if draw else means.new_zeros)(whole(len(means)), SPLAT)
     if draw:
         kernels.project(*arrays(*inputs), out.detach().numpy())
     return inputs, out
@@ -306,7 +312,7 @@ class _Project(torch.autograd.Function):
         maps = inputs[5].new_zeros(shares, *inputs[5].shape)
         weights = torch.empty(inputs[7].shape)
         order = (out[:, 10] > 0).nonzero()[:, 0].int()
-        rows = slopes.new_zeros(whole(len(order)), backward.SLOPES)
+        rows = slopes.new_zeros(whole(len(order)), SPLAT)
         rows[: len(order), : slopes.shape[1]] = slopes[order.long()]
         room, colors, spots = room_for_colors(len(inputs[0]), (inputs[4].shape[1],))
         given = arrays(*inputs, out, order, rows, *found, room, spots, maps, weights)
@@ -314,8 +320,6 @@ class _Project(torch.autograd.Function):
         return *found, *colors, maps.sum(0)[:, :12], None, weights, None, None, None
 
 
-SIDE = 8  # pixels of a tile along both axes
-_LEAST_LOG = -math.log(255.0)
 FEASIBLE = 1 << 27  # splats times pixels of the reference: with gradients ten float32 tensors of these, 5 GB
 
 
@@ -379,7 +383,7 @@ def rasterize_reference(splats: Splats, width: int, height: int) -> Tensor:
     dx = torch.arange(width).to(numbers) + 0.5 - u  # (V, 1, W)
     dy = (torch.arange(height).to(numbers) + 0.5)[:, None] - v  # (V, H, 1)
     power = -0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy + solid.log()
-    alpha = torch.where(power > _LEAST_LOG, power.exp(), 0.0)
+    alpha = torch.where(power > LEAST_LOG, power.exp(), 0.0)
     passed = torch.cumprod(torch.cat([alpha.new_ones(1, height, width), 1 - alpha]), 0)
     weights = alpha * passed[:-1]
     shown = torch.einsum("vhw,vk->khw", weights, numbers[order, 6:])
@@ -414,14 +418,12 @@ def sorted_tiles(splats, across: int, down: int, threads: int) -> Tiles:
 
     order = kernels.by_depth(splats)
     records, entries, ends = kernels.sort_into_tiles(splats, order, across, down, threads)
-    shares, longest = kernels.shared_out(ends, threads)
+    shares, longest = kernels.share_out(ends, threads)
     return Tiles(order, records, entries, ends, shares, int(longest))
 
 
 def kept_for(tiles: Tiles) -> Tensor:
     """Room for what a tile keeps between its way there and back, for each thread."""
-    from forewarp.ops.kernels.rasterize import MOST
-
     return torch.empty(len(tiles.shares) - 1, 2 * max(min(tiles.longest, MOST), 1), SIDE * SIDE)
 
 
@@ -448,7 +450,7 @@ class _Rasterize(torch.autograd.Function):
         match_threads()
         tiles = ctx.tiles
         kept = kept_for(tiles)
-        sums = torch.empty(len(kept), len(tiles.order), drawing.GRADIENT)
+        sums = torch.empty(len(kept), len(tiles.order), SPLAT)
         drawing.pull(
             tiles.records,
             tiles.entries,
@@ -458,10 +460,10 @@ class _Rasterize(torch.autograd.Function):
             kept.numpy(),
             sums.numpy(),
         )
-        seen, ranks = backward.ranked(tiles.order, len(ctx.splats))
-        by_splat, pull = torch.empty(whole(len(seen)), backward.SLOPES), torch.empty(len(ctx.splats))
+        seen, ranks = backward.rank_rows(tiles.order, len(ctx.splats))
+        by_splat, pull = torch.empty(whole(len(seen)), SPLAT), torch.empty(len(ctx.splats))
         inputs = ctx.splats.numpy(), seen, ranks, sums.numpy()
-        backward.slopes_of(*inputs, 1.0, by_splat.numpy(), pull.numpy())
+        backward.splat_gradients(*inputs, 1.0, by_splat.numpy(), pull.numpy())
         found = slopes.new_zeros(len(ctx.splats), 10)
         found[torch.from_numpy(seen).long()] = by_splat[: len(seen), :10]
         return found, None, None, None
@@ -596,13 +598,11 @@ def compile_way_back(
     particles: Gaussians, warp: Warp, pinhole: Pinhole, tints: Tensor, fades: Tensor
 ) -> None:
     """Compile what leads from splats and a picture back to particles, by tiles in which nothing lies."""
-    from forewarp.ops.kernels.rasterize import RECORD
-
     inputs, splats = projected(*particles, *warp, pinhole.row(particles.means), tints, fades, draw=False)
     width, height = pinhole.size
     many = -(-width // SIDE) * -(-height // SIDE)
     none, ends = np.zeros(0, np.int32), np.zeros(many + 1, np.int64)
-    tiles = Tiles(none, np.zeros((0, RECORD), np.float32), none, ends, np.array([0, many]), 0)
+    tiles = Tiles(none, np.zeros((0, DEPTH + 1), np.float32), none, ends, np.array([0, many]), 0)
     picture = torch.zeros(height, width, dtype=torch.int32)
     _way_back(particles, arrays(*inputs), splats, tiles, picture, torch.ones(3), 1.0, 1.0, False, None)
 
@@ -616,7 +616,7 @@ def _way_back(
 
     kept = kept_for(tiles)
     threads = len(kept)
-    sums = torch.empty(threads, len(tiles.order), drawing.GRADIENT)
+    sums = torch.empty(threads, len(tiles.order), SPLAT)
     found = torch.zeros(threads, 2, dtype=torch.float64)
     drawing.compare(
         tiles.records,
@@ -628,10 +628,12 @@ def _way_back(
         np.float32(width),
         *arrays(kept, sums, found),
     )
-    seen, ranks = backward.ranked(tiles.order, len(particles.means))
-    by_splat = torch.empty(whole(len(seen)), backward.SLOPES)
+    seen, ranks = backward.rank_rows(tiles.order, len(particles.means))
+    by_splat = torch.empty(whole(len(seen)), SPLAT)
     pull = torch.zeros(len(particles.means))
-    backward.slopes_of(splats.numpy(), seen, ranks, sums.numpy(), factor, by_splat.numpy(), pull.numpy())
+    backward.splat_gradients(
+        splats.numpy(), seen, ranks, sums.numpy(), factor, by_splat.numpy(), pull.numpy()
+    )
     gradients = [torch.empty(t.shape) for t in particles[:4]]
     count, many = particles.colors.shape[:2]
     room, colors, spots = room_for_colors(count, (many,) if kinds is None else kinds)

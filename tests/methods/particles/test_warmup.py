@@ -20,7 +20,7 @@ pytestmark = pytest.mark.skipif(not numba_installed(), reason="needs Numba")
 def _signatures() -> dict[str, list]:
     from forewarp.ops.kernels import backward, rasterize
 
-    kernels = (rasterize.compare, backward.ranked, backward.slopes_of, backward.chain)
+    kernels = (rasterize.compare, backward.rank_rows, backward.splat_gradients, backward.chain)
     return {kernel.py_func.__name__: list(kernel.signatures) for kernel in kernels}
 
 
@@ -95,7 +95,7 @@ def test_what_the_other_process_compiles_is_found_in_the_cache(tmp_path):
         "from forewarp.methods.particles import start as warmup\n"
         "from forewarp.ops.kernels import backward, rasterize\n"
         "warmup.compile_backward()\n"
-        "for kernel in (backward.chain, backward.slopes_of, rasterize.compare):\n"
+        "for kernel in (backward.chain, backward.splat_gradients, rasterize.compare):\n"
         "    assert kernel.stats.cache_misses.total() == 0, kernel\n"
     )
     subprocess.run([sys.executable, "-c", script], env=environment, check=True)

@@ -19,10 +19,10 @@ def biases(first: float, second: float) -> np.ndarray:
     of all later.
     """
     least = 2.0**-25  # half of what 1 grows by to the next float32
-    many = 1 + max(math.ceil(math.log(least) / math.log(max(beta, 0.5))) for beta in (first, second))
-    left, right = (beta ** np.arange(1, many + 1, dtype=np.float64) for beta in (first, second))
-    found = np.stack([1 / (1 - left), np.sqrt(1 / (1 - right))], -1).astype(np.float32)
-    return np.ascontiguousarray(np.concatenate([np.ones((1, 2), np.float32), found]))
+    count = 1 + max(math.ceil(math.log(least) / math.log(max(beta, 0.5))) for beta in (first, second))
+    left, right = (beta ** np.arange(1, count + 1, dtype=np.float64) for beta in (first, second))
+    later = np.stack([1 / (1 - left), np.sqrt(1 / (1 - right))], -1).astype(np.float32)
+    return np.ascontiguousarray(np.concatenate([np.ones((1, 2), np.float32), later]))
 
 
 @njit(inline="always")
@@ -72,40 +72,40 @@ def adam(table, rates, first, second, eps, bias):
             square, steps, rate = floats_at(table[p, 3]), floats_at(table[p, 4]), rates[p]
             rows, width = table[p, 5], table[p, 6]
             together = _side_by_side(width)
-            many, blocks = together * width, rows // together if together else 0
+            count, blocks = together * width, rows // together if together else 0
             for block in range(blocks * chunk // 64, blocks * (chunk + 1) // 64):
-                start, row = many * block, together * block
-                seen, known = _seen(gradient, start, many, width), True
+                start, row = count * block, together * block
+                seen, settled = _seen(gradient, start, count, width), True
                 if seen == 0:
                     continue
                 for i in range(together):
                     made = steps[row + i] + np.float32(seen >> np.uint64(i * width) & np.uint64(1))
                     steps[row + i] = made
-                    known &= made >= last
-                if not known:
+                    settled &= made >= last
+                if not settled:
                     for i in range(together):
                         n = max(0, min(int(steps[row + i]), last))
                         for c in range(i * width, (i + 1) * width):
                             paces[c], scales[c] = rate * bias[n, 0], bias[n, 1]
                 each = seen * np.uint64((1 << width) - 1)  # all of a row's bits
-                for c in range(many // 16):
+                for c in range(count // 16):
                     at, here = start + 16 * c, each >> np.uint64(16 * c)
                     g, m = get_row(gradient, at), get_row(mean, at)
                     v, x = get_row(square, at), get_row(value, at)
                     m, v = where_bits(here, m + (g - m) * c1, m), where_bits(here, v + (g * g - v) * c2, v)
                     put_row(mean, at, m)
                     put_row(square, at, v)
-                    if known:
+                    if settled:
                         moved = x - rate * m / (root(v) + small)
                     else:
                         moved = x - row_of(paces, c) * m / (row_of(scales, c) * root(v) + small)
                     put_row(value, at, where_bits(here, moved, x))
             done = together * blocks
             for row in range(done + (rows - done) * chunk // 64, done + (rows - done) * (chunk + 1) // 64):
-                any_seen = False
+                seen_row = False
                 for i in range(row * width, (row + 1) * width):
-                    any_seen |= gradient[i] != 0
-                if not any_seen:
+                    seen_row |= gradient[i] != 0
+                if not seen_row:
                     continue
                 steps[row] += np.float32(1)
                 n = max(0, min(int(steps[row]), last))

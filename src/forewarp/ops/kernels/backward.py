@@ -1,6 +1,6 @@
-"""Numba kernels that carry gradients from splats to particles and nodes, by the rules of ``voxels``.
+"""Numba kernels that carry gradients from splats to Gaussians and nodes, by the rules of ``voxels``.
 
-As in ``project``, sixteen particles are treated side by side.
+As in ``project``, sixteen Gaussians are treated side by side.
 """
 
 from __future__ import annotations
@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
+from forewarp.ops.gaussians import CONIC_A, DEPTH, OPACITY, RED, SPLAT
 from forewarp.ops.kernels.lanes import (
     fma,
     get_row,
@@ -15,7 +16,9 @@ from forewarp.ops.kernels.lanes import (
     room,
     root,
     row_of,
+    rows_of,
     set_row,
+    set_rows,
     sixteen,
     total,
     transpose,
@@ -29,26 +32,23 @@ from forewarp.ops.kernels.project import (
     ROWS,
     SIDE_BY_SIDE,
     covariance,
-    directed,
-    followed,
-    gathered,
+    gather,
     harmonics,
-    linear_of,
-    own_rows,
+    pixel_jacobian,
     product,
+    rotated_back,
+    rotations,
     scales_of,
-    seen_from,
-    slopes_of_pixel,
     through_lens,
-    turned,
+    to_camera,
+    warp_points,
 )
 
-SLOPES = 16  # by u, v, A, B, C, opacity, colour (3) and distance; the last six are 0
-_SLOPE, _ROWS = ROWS, ROWS + SLOPES  # where they begin in a room, and how many rows it has
+_GRADIENT, _ROWS = ROWS, ROWS + SPLAT  # where gradients by the splats' columns begin in a room, and its rows
 
 
 @njit(cache=True)
-def ranked(order, count):
+def rank_rows(order, count):
     """Rows (V,) int32 of ``count`` that are in an order, the lowest first, and their places (V,) in it.
 
     What is read row by row should lie side by side: in the order of depth half of the time would be waiting.
@@ -66,61 +66,57 @@ def ranked(order, count):
 
 
 @njit(parallel=True, cache=True)
-def slopes_of(splats, rows, ranks, sums, factor, slopes, pull):
-    """From the sums over pixels (S, V, 16) of splats in the order of depth to ``factor`` times the slopes
-    by the numbers (V', 16) of ``rows``, whose places in that order are ``ranks``; V' is V or more, a
-    multiple of 16.
+def splat_gradients(splats, rows, ranks, sums, factor, gradients, pull):
+    """Turn sums over pixels (S, V, 16) of splats in the order of depth into ``factor`` times the gradients by
+    the columns (V', 16) of ``rows``, whose places in that order are ``ranks``; V' is V or more, a multiple
+    of 16.
 
-    The sums are of q, q dx, q dy, q dx^2, q dx dy, q dy^2, with q the slope by the exponent and dx, dy from
-    the splat to the pixel, then those by colour and distance. ``pull`` (N,) takes the lengths of those by
-    u, v.
+    The sums are of q, q dx, q dy, q dx^2, q dx dy, q dy^2, with q the gradient by the exponent and dx, dy
+    from the splat to the pixel, then those by colour and depth. ``pull`` (N,) takes the lengths of those by
+    x, y.
     """
     count = len(rows)
-    for block in prange(slopes.shape[0] // SIDE_BY_SIDE):
+    for block in prange(gradients.shape[0] // SIDE_BY_SIDE):
         first, place, conics = SIDE_BY_SIDE * block, room(16), room(16)
         for lane in range(SIDE_BY_SIDE):
             k = min(first + lane, count - 1)
             set_row(conics, lane, get_row(splats, rows[k]))
-            found = get_row(sums[0], ranks[k])
+            added = get_row(sums[0], ranks[k])
             for share in range(1, sums.shape[0]):
-                found = found + get_row(sums[share], ranks[k])
-            set_row(place, lane, found * factor)
+                added = added + get_row(sums[share], ranks[k])
+            set_row(place, lane, added * factor)
         transpose(place)
         transpose(conics)
-        a, b, c = row_of(conics, 2), row_of(conics, 3), row_of(conics, 4)
-        s, sx, sy = row_of(place, 0), row_of(place, 1), row_of(place, 2)
-        sxx, sxy, syy = row_of(place, 3), row_of(place, 4), row_of(place, 5)
+        a, b, c, opacity = rows_of(conics, CONIC_A, 4)
+        s, sx, sy, sxx, sxy, syy = rows_of(place, 0, 6)
         along, upright = a * sx + b * sy, b * sx + c * sy
-        set_row(place, 0, along)
-        set_row(place, 1, upright)
-        set_row(place, 2, sxx * -0.5)
-        set_row(place, 3, sxy * -1.0)
-        set_row(place, 4, syy * -0.5)
-        set_row(place, 5, s / row_of(conics, 5))
+        set_rows(place, 0, (along, upright, sxx * -0.5, sxy * -1.0, syy * -0.5, s / opacity))
         set_row(conics, 0, root(along * along + upright * upright))
         transpose(place)
         for lane in range(SIDE_BY_SIDE):
-            put_row(slopes, first + lane, row_of(place, lane))
+            put_row(gradients, first + lane, row_of(place, lane))
             if first + lane < count:
                 pull[rows[first + lane]] = conics[lane]
 
 
 @njit(forceinline=True)
-def _scattered(place, first, count, array, which, valid):
-    """Copy rows from ``first`` on to the columns (N, count) of the particles they belong to."""
+def _scatter(place, values, array, which, valid):
+    """Write a tuple of vectors to the columns of the Gaussians that they belong to."""
+    set_rows(place, ANY, values)
     for lane in range(valid):
         i = np.uintp(which[lane])
-        for c in range(count):
-            array[i, c] = place[SIDE_BY_SIDE * (first + c) + lane]
+        for c in range(len(values)):
+            array[i, c] = place[SIDE_BY_SIDE * (ANY + c) + lane]
 
 
 @njit(forceinline=True)
-def _of_covariance(view, rows, scales, by_a, by_b, by_c):
-    """From slopes by the conic A, B, C to those by rows (2, 3) times scales.
+def _by_covariance(camera, rows, scales, by_conic):
+    """From gradients by the conic A, B, C to those by rows (2, 3) times scales.
 
-    Of the inverse X of a covariance: dL/dcov = -X G X, with G the slopes by X, half of B's on each side.
+    Of the inverse X of a covariance: dL/dcov = -X G X, with G the gradients by X, half of B's on each side.
     """
-    a, b, c, determinant = covariance(view, rows, scales)
+    by_a, by_b, by_c = by_conic
+    a, b, c, determinant = covariance(camera, rows, scales)
     inverse = sixteen(1.0) / determinant
     x, y, z = c * inverse, b * inverse * -1.0, a * inverse
     h = by_b * 0.5
@@ -129,24 +125,15 @@ def _of_covariance(view, rows, scales, by_a, by_b, by_c):
     u0, u1, u2 = rows[0] * scales[0], rows[1] * scales[1], rows[2] * scales[2]
     v0, v1, v2 = rows[3] * scales[0], rows[4] * scales[1], rows[5] * scales[2]
     return (
-        first * u0 + beside * v0,
-        first * u1 + beside * v1,
-        first * u2 + beside * v2,
-        beside * u0 + second * v0,
-        beside * u1 + second * v1,
-        beside * u2 + second * v2,
-    )
+        first * u0 + beside * v0, first * u1 + beside * v1, first * u2 + beside * v2,
+        beside * u0 + second * v0, beside * u1 + second * v1, beside * u2 + second * v2,
+    )  # fmt: skip
 
 
 @njit(forceinline=True)
-def _of_turn(place, d):
-    """From slopes (9) by rotations to those by gathered quaternions (4), whatever their length."""
-    w, x, y, z = (
-        row_of(place, QUATERNION),
-        row_of(place, QUATERNION + 1),
-        row_of(place, QUATERNION + 2),
-        row_of(place, QUATERNION + 3),
-    )
+def _by_quaternion(place, d):
+    """From gradients (9) by rotations to those by gathered quaternions (4), whatever their length."""
+    w, x, y, z = rows_of(place, QUATERNION, 4)
     square = w * w + x * x + y * y + z * z
     length = where_above(square, np.float32(1e-24), sixteen(1.0) / root(square))
     w, x, y, z = w * length, x * length, y * length, z * length
@@ -164,75 +151,69 @@ def _of_turn(place, d):
 
 
 @njit(forceinline=True)
-def _of_place(view, local, distance, inverse, px, py, bent, place, by_jacobian):
-    """Slopes (3) by the world point, of the pixel, of its own slopes (2, 3) and of the distance.
+def _by_point(camera, local, depth, inverse, px, py, lens, place, by_jacobian):
+    """Gradients (3) by the world point, from those by the pixel, its Jacobian (2, 3) and the depth.
 
-    How the lens bends is taken to be the same around the point.
+    The lens's own Jacobian is taken to be the same around the point.
     """
-    a, b, c, d = bent[2], bent[3], bent[4], bent[5]
-    by_u, by_v, by_far = row_of(place, _SLOPE), row_of(place, _SLOPE + 1), row_of(place, _SLOPE + 9)
-    gx, gy = a * by_u + c * by_v, b * by_u + d * by_v
-    # By the slopes of the plane's point: (1/z, 0, -x/z^2) and (0, 1/z, -y/z^2).
-    first0, first1 = a * by_jacobian[0] + c * by_jacobian[3], a * by_jacobian[1] + c * by_jacobian[4]
-    first2, second0 = a * by_jacobian[2] + c * by_jacobian[5], b * by_jacobian[0] + d * by_jacobian[3]
-    second1, second2 = b * by_jacobian[1] + d * by_jacobian[4], b * by_jacobian[2] + d * by_jacobian[5]
-    across = first0 * view[0] + first1 * view[1] + first2 * view[2]
-    upright = second0 * view[3] + second1 * view[4] + second2 * view[5]
-    ahead_x = first0 * view[6] + first1 * view[7] + first2 * view[8]
-    ahead_y = second0 * view[6] + second1 * view[7] + second2 * view[8]
+    a, b, c, d = lens[2], lens[3], lens[4], lens[5]
+    by_x, by_y = rows_of(place, _GRADIENT, 2)
+    gx, gy = a * by_x + c * by_y, b * by_x + d * by_y
+    # By the Jacobian of the plane's point: (1/z, 0, -x/z^2) and (0, 1/z, -y/z^2).
+    j = by_jacobian
+    first0, first1, first2 = a * j[0] + c * j[3], a * j[1] + c * j[4], a * j[2] + c * j[5]
+    second0, second1, second2 = b * j[0] + d * j[3], b * j[1] + d * j[4], b * j[2] + d * j[5]
+    across = first0 * camera[0] + first1 * camera[1] + first2 * camera[2]
+    upright = second0 * camera[3] + second1 * camera[4] + second2 * camera[5]
+    ahead_x = first0 * camera[6] + first1 * camera[7] + first2 * camera[8]
+    ahead_y = second0 * camera[6] + second1 * camera[7] + second2 * camera[8]
     square = inverse * inverse
-    far = by_far / distance
+    far = row_of(place, _GRADIENT + DEPTH) / depth
     lx = gx * inverse - ahead_x * square + far * local[0]
     ly = gy * inverse - ahead_y * square + far * local[1]
     turn = (px * ahead_x + py * ahead_y) * 2.0 - across - upright
     lz = turn * square - (gx * px + gy * py) * inverse + far * local[2]
-    return (
-        lx * view[0] + ly * view[3] + lz * view[6],
-        lx * view[1] + ly * view[4] + lz * view[7],
-        lx * view[2] + ly * view[5] + lz * view[8],
-    )
+    return rotated_back(camera, lx, ly, lz)
 
 
 @njit(forceinline=True)
-def _of_colors(dx, dy, dz, splats, tints, which, valid, place, to_colors, spots):
-    """Slopes by the coefficients of colour; direction has none."""
+def _color_gradients(direction, splats, tints, which, valid, place, to_colors, spots):
+    """Fill the gradients by the coefficients of colour; direction has none."""
     plain = len(spots) - len(tints)
-    harmonics(dx, dy, dz, plain, place)
+    x, y, z = direction
+    harmonics(x, y, z, plain, place)
     for lane in range(SIDE_BY_SIDE):
         i = np.uintp(which[lane])
         for c in range(3):
-            place[SIDE_BY_SIDE * (ANY + c) + lane] = splats[i, 6 + c]
-    zero = np.float32(0)
-    red = where_above(row_of(place, ANY), zero, row_of(place, _SLOPE + 6))
-    green = where_above(row_of(place, ANY + 1), zero, row_of(place, _SLOPE + 7))
-    blue = where_above(row_of(place, ANY + 2), zero, row_of(place, _SLOPE + 8))
+            place[SIDE_BY_SIDE * (ANY + c) + lane] = splats[i, RED + c]
+    zero, shown, by_color = np.float32(0), rows_of(place, ANY, 3), rows_of(place, _GRADIENT + RED, 3)
+    red = where_above(shown[0], zero, by_color[0])
+    green = where_above(shown[1], zero, by_color[1])
+    blue = where_above(shown[2], zero, by_color[2])
     for k in range(len(spots)):
         factor = row_of(place, BASIS + k) if k < plain else sixteen(tints[k - plain])
-        set_row(place, ANY, factor * red)
-        set_row(place, ANY + 1, factor * green)
-        set_row(place, ANY + 2, factor * blue)
+        set_rows(place, ANY, (factor * red, factor * green, factor * blue))
         for lane in range(valid):
-            i = np.uintp(which[lane])
-            at = spots[k, 0] + i * spots[k, 1]
+            at = spots[k, 0] + np.uintp(which[lane]) * spots[k, 1]
             for c in range(3):
                 to_colors[at + c] = place[SIDE_BY_SIDE * (ANY + c) + lane]
 
 
 @njit(forceinline=True)
-def _of_maps(maps, links, weights, which, valid, place, to_maps, to_weights, softmax):
-    """Add the slopes of blended maps, a particle's in a row of ``place``, to those by maps; fill those by
+def _map_gradients(maps, links, weights, which, valid, place, to_maps, to_weights, softmax):
+    """Add the gradients by blended maps, a Gaussian's in a row of ``place``, to those by maps; fill those by
     weights, or by the numbers whose ``softmax`` they are.
     """
     for lane in range(valid):
-        i, own = np.uintp(which[lane]), row_of(place, lane)
+        i, blended = np.uintp(which[lane]), row_of(place, lane)
         for n in range(links.shape[1]):
             node = links[i, n]
-            put_row(to_maps, node, fma(own, weights[i, n], get_row(to_maps, node)))
+            put_row(to_maps, node, fma(blended, weights[i, n], get_row(to_maps, node)))
         if not len(to_weights):
             continue
         mean = np.float32(0)
         for n in range(links.shape[1]):
-            value = total(own * get_row(maps, links[i, n]))
+            value = total(blended * get_row(maps, links[i, n]))
             to_weights[i, n] = value
             mean += weights[i, n] * value
         if softmax:
@@ -241,52 +222,58 @@ def _of_maps(maps, links, weights, which, valid, place, to_maps, to_weights, sof
 
 
 @njit(forceinline=True)
-def _of_shape(view, moved, log_scales, quaternions, which, valid, place, to_scales, to_quaternions):
-    """Slopes by scales and quaternions; returns those by ``moved`` (2, 3), what maps a particle's axes,
-    before they are turned, to the picture.
+def _shape_gradients(camera, moved, log_scales, quaternions, which, valid, place, to_scales, to_quaternions):
+    """Fill the gradients by scales and quaternions; returns those by ``moved`` (2, 3), what maps a Gaussian's
+    axes, before they are rotated, to the image.
     """
-    gathered(quaternions, which, place, QUATERNION, 4)
-    turn, scales = turned(place), scales_of(log_scales, which, place)
-    rows = product(moved, turn)
-    by_root = _of_covariance(
-        view,
-        rows,
-        scales,
-        row_of(place, _SLOPE + 2),
-        row_of(place, _SLOPE + 3),
-        row_of(place, _SLOPE + 4),
-    )
+    gather(quaternions, which, place, QUATERNION, 4)
+    rotation, scales = rotations(place), scales_of(log_scales, which, place)
+    rows = product(moved, rotation)
+    by_root = _by_covariance(camera, rows, scales, rows_of(place, _GRADIENT + CONIC_A, 3))
     r0, r1, r2 = by_root[0] * scales[0], by_root[1] * scales[1], by_root[2] * scales[2]
     r3, r4, r5 = by_root[3] * scales[0], by_root[4] * scales[1], by_root[5] * scales[2]
-    set_row(place, ANY, r0 * rows[0] + r3 * rows[3])
-    set_row(place, ANY + 1, r1 * rows[1] + r4 * rows[4])
-    set_row(place, ANY + 2, r2 * rows[2] + r5 * rows[5])
-    _scattered(place, ANY, 3, to_scales, which, valid)
-    by_turn = (
+    by_scale = (r0 * rows[0] + r3 * rows[3], r1 * rows[1] + r4 * rows[4], r2 * rows[2] + r5 * rows[5])
+    _scatter(place, by_scale, to_scales, which, valid)
+    by_rotation = (
         moved[0] * r0 + moved[3] * r3, moved[0] * r1 + moved[3] * r4, moved[0] * r2 + moved[3] * r5,
         moved[1] * r0 + moved[4] * r3, moved[1] * r1 + moved[4] * r4, moved[1] * r2 + moved[4] * r5,
         moved[2] * r0 + moved[5] * r3, moved[2] * r1 + moved[5] * r4, moved[2] * r2 + moved[5] * r5,
     )  # fmt: skip
-    by_four = _of_turn(place, by_turn)
-    set_row(place, QUATERNION, by_four[0])
-    set_row(place, QUATERNION + 1, by_four[1])
-    set_row(place, QUATERNION + 2, by_four[2])
-    set_row(place, QUATERNION + 3, by_four[3])
-    _scattered(place, QUATERNION, 4, to_quaternions, which, valid)
-    back = (r0, r1, r2, r3, r4, r5)
-    return product(back, _transposed(turn))
+    _scatter(place, _by_quaternion(place, by_rotation), to_quaternions, which, valid)
+    return product((r0, r1, r2, r3, r4, r5), _transposed(rotation))
+
+
+@njit(forceinline=True)
+def _transposed(m):
+    """The transpose of (3, 3) in 9 numbers."""
+    return m[0], m[3], m[6], m[1], m[4], m[7], m[2], m[5], m[8]
+
+
+@njit(inline="always")
+def own_rows(seen, share, shares, count):
+    """Return a thread's rows of ``count``: from the first that its blocks of ``seen`` write to, to that of
+    the next thread; the first one's begin at 0.
+    """
+    blocks, first, end = (len(seen) + SIDE_BY_SIDE - 1) // SIDE_BY_SIDE, 0, count
+    if share > 0:
+        k = SIDE_BY_SIDE * (blocks * share // shares)
+        first = seen[k] if k < len(seen) else count
+    if share + 1 < shares:
+        k = SIDE_BY_SIDE * (blocks * (share + 1) // shares)
+        end = seen[k] if k < len(seen) else count
+    return first, end
 
 
 @njit(parallel=True, cache=True)
 def chain(
-    means, log_scales, quaternions, opacity, colors, maps, links, weights, view, tints, fades,
-    splats, seen, slopes,
+    means, log_scales, quaternions, opacity, colors, maps, links, weights, camera, tints, fades,
+    splats, seen, gradients,
     to_means, to_scales, to_quaternions, to_opacity, to_colors, spots, to_maps, to_weights, softmax,
 ):  # fmt: skip
-    """From slopes (V', 16) of the particles ``seen`` (V,), the lowest first, to those by all particles, and
-    by maps; those of what is not seen are 0.
+    """Apply the chain rule: from gradients (V', 16) by the splats ``seen`` (V,), the lowest first, to those
+    by all Gaussians, and by maps; those of what is not seen are 0.
 
-    ``to_colors``: those by coefficient k of particle i begin at ``spots[k, 0] + i spots[k, 1]``.
+    ``to_colors``: those by coefficient k of Gaussian i begin at ``spots[k, 0] + i spots[k, 1]``.
     ``to_maps`` (S, M, 16): each thread adds to its own. ``to_weights`` (N, L), or empty: by weights, or by
     the numbers whose ``softmax`` they are.
     """
@@ -309,49 +296,36 @@ def chain(
             valid = min(SIDE_BY_SIDE, count - start)
             for lane in range(SIDE_BY_SIDE):
                 which[lane] = seen[min(start + lane, count - 1)]
-                set_row(place, lane, get_row(slopes, start + lane))
+                set_row(place, lane, get_row(gradients, start + lane))
             transpose(place)
-            for j in range(SIDE_BY_SIDE):
-                set_row(place, _SLOPE + j, row_of(place, j))
-            x, y, z = followed(means, maps, links, weights, which, place)
-            local = seen_from(view, x, y, z)
-            distance, dx, dy, dz = directed(view, x, y, z, local)
+            set_rows(place, _GRADIENT, rows_of(place, 0, SPLAT))
+            x, y, z = warp_points(means, maps, links, weights, which, place)
+            local, depth, direction = to_camera(camera, x, y, z)
             inverse = sixteen(1.0) / local[2]
             px, py = local[0] * inverse, local[1] * inverse
-            bent = through_lens(view, px, py)
-            jacobian, warp = slopes_of_pixel(view, inverse, px, py, bent), linear_of(place)
-            moved = product(jacobian, warp)
-            by_moved = _of_shape(
-                view, moved, log_scales, quaternions, which, valid, place, to_scales, to_quaternions
-            )
-            by_point = _of_place(
-                view, local, distance, inverse, px, py, bent, place, product(by_moved, _transposed(warp))
-            )
-            set_row(place, ANY, warp[0] * by_point[0] + warp[3] * by_point[1] + warp[6] * by_point[2])
-            set_row(place, ANY + 1, warp[1] * by_point[0] + warp[4] * by_point[1] + warp[7] * by_point[2])
-            set_row(place, ANY + 2, warp[2] * by_point[0] + warp[5] * by_point[1] + warp[8] * by_point[2])
-            _scattered(place, ANY, 3, to_means, which, valid)
-            _of_colors(dx, dy, dz, splats, tints, which, valid, place, to_colors, spots)
+            lens = through_lens(camera, px, py)
+            jacobian, warp = pixel_jacobian(camera, inverse, px, py, lens), rows_of(place, 0, 9)
+            by_moved = _shape_gradients(
+                camera, product(jacobian, warp), log_scales, quaternions, which, valid, place, to_scales,
+                to_quaternions,
+            )  # fmt: skip
+            by_jacobian = product(by_moved, _transposed(warp))
+            by_point = _by_point(camera, local, depth, inverse, px, py, lens, place, by_jacobian)
+            x, y, z = by_point
+            _scatter(place, rotated_back(warp, x, y, z), to_means, which, valid)
+            _color_gradients(direction, splats, tints, which, valid, place, to_colors, spots)
             for lane in range(valid):
                 i = np.uintp(which[lane])
-                slope = (
-                    place[SIDE_BY_SIDE * (_SLOPE + 5) + lane] * splats[i, 5] * (np.float32(1) - splats[i, 5])
-                )
+                by_opacity, covers = place[SIDE_BY_SIDE * (_GRADIENT + OPACITY) + lane], splats[i, OPACITY]
                 for j in range(len(fades)):
-                    to_opacity[i, j] = slope * fades[j]
+                    to_opacity[i, j] = by_opacity * covers * (np.float32(1) - covers) * fades[j]
             for r in range(3):
                 for c in range(3):
                     value = by_point[r] * row_of(place, MEAN + c)
                     value = fma(jacobian[r], by_moved[c], fma(jacobian[3 + r], by_moved[3 + c], value))
                     set_row(place, 3 * r + c, value)
                 set_row(place, 9 + r, by_point[r])
-            for j in range(12, SIDE_BY_SIDE):
-                set_row(place, j, sixteen(0.0))
+            none = sixteen(0.0)
+            set_rows(place, 12, (none, none, none, none))
             transpose(place)
-            _of_maps(maps, links, weights, which, valid, place, to_maps[share], to_weights, softmax)
-
-
-@njit(forceinline=True)
-def _transposed(m):
-    """The transpose of (3, 3) in 9 numbers."""
-    return m[0], m[3], m[6], m[1], m[4], m[7], m[2], m[5], m[8]
+            _map_gradients(maps, links, weights, which, valid, place, to_maps[share], to_weights, softmax)

@@ -10,28 +10,38 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
+# Grid ------------------------------------------------------------------------------------------------------
+
 
 @njit(inline="always")
-def _corner(x, n):
+def _base(x, n):
+    """The lower of the two voxels of an axis around ``x``, and the fraction beyond it; clamped."""
     base = int(min(max(np.floor(x), 0.0), n - 2.0))
     base = min(max(base, 0), n - 2)  # NaN converts to any integer
     return base, min(max(x - base, 0.0), 1.0)
 
 
-@njit(parallel=True, cache=True, fastmath=False)
+@njit(inline="always")
+def _corner(i, fx, fy, fz):
+    """Corner i of 8: its offsets along the axes, and its weights by them."""
+    a, b, c = i >> 2, (i >> 1) & 1, i & 1
+    return a, b, c, (fx if a else 1 - fx), (fy if b else 1 - fy), (fz if c else 1 - fz)
+
+
+@njit(parallel=True, cache=True)
 def gather(values, index, points, fill, out):
     """out[p] = trilinear read of a sparse lattice; absent voxels read ``fill``."""
     channels = values.shape[1]
     nx, ny, nz = index.shape
     for p in prange(points.shape[0]):
-        x0, fx = _corner(points[p, 0], nx)
-        y0, fy = _corner(points[p, 1], ny)
-        z0, fz = _corner(points[p, 2], nz)
+        x0, fx = _base(points[p, 0], nx)
+        y0, fy = _base(points[p, 1], ny)
+        z0, fz = _base(points[p, 2], nz)
         for c in range(channels):
             out[p, c] = 0.0
         for i in range(8):
-            a, b, d = i >> 2, (i >> 1) & 1, i & 1
-            w = (fx if a else 1 - fx) * (fy if b else 1 - fy) * (fz if d else 1 - fz)
+            a, b, d, wx, wy, wz = _corner(i, fx, fy, fz)
+            w = wx * wy * wz
             row = index[x0 + a, y0 + b, z0 + d]
             if row >= 0:
                 for c in range(channels):
@@ -42,43 +52,40 @@ def gather(values, index, points, fill, out):
 
 
 @njit(parallel=True, cache=True)
-def gather_backward_values(index, points, grad, out):
-    """out[chunk, row] += weight * grad[p]; ``out`` holds one copy a chunk."""
-    chunks = out.shape[0]
-    channels = grad.shape[1]
-    total = points.shape[0]
+def gather_backward_values(index, points, gradient, out):
+    """out[chunk, row] += weight * gradient[p]; ``out`` holds one copy a chunk."""
+    chunks, channels, total = out.shape[0], gradient.shape[1], points.shape[0]
     nx, ny, nz = index.shape
     for chunk in prange(chunks):
         for p in range(total * chunk // chunks, total * (chunk + 1) // chunks):
-            x0, fx = _corner(points[p, 0], nx)
-            y0, fy = _corner(points[p, 1], ny)
-            z0, fz = _corner(points[p, 2], nz)
+            x0, fx = _base(points[p, 0], nx)
+            y0, fy = _base(points[p, 1], ny)
+            z0, fz = _base(points[p, 2], nz)
             for i in range(8):
-                a, b, d = i >> 2, (i >> 1) & 1, i & 1
+                a, b, d, wx, wy, wz = _corner(i, fx, fy, fz)
                 row = index[x0 + a, y0 + b, z0 + d]
                 if row >= 0:
-                    w = (fx if a else 1 - fx) * (fy if b else 1 - fy) * (fz if d else 1 - fz)
+                    w = wx * wy * wz
                     for c in range(channels):
-                        out[chunk, row, c] += w * grad[p, c]
+                        out[chunk, row, c] += w * gradient[p, c]
 
 
 @njit(parallel=True, cache=True)
-def gather_backward_points(values, index, points, fill, grad, out):
+def gather_backward_points(values, index, points, fill, gradient, out):
     """out[p] = gradient with respect to the point's lattice coordinate; 0 where clamped."""
     channels = values.shape[1]
     nx, ny, nz = index.shape
     for p in prange(points.shape[0]):
-        x0, fx = _corner(points[p, 0], nx)
-        y0, fy = _corner(points[p, 1], ny)
-        z0, fz = _corner(points[p, 2], nz)
+        x0, fx = _base(points[p, 0], nx)
+        y0, fy = _base(points[p, 1], ny)
+        z0, fz = _base(points[p, 2], nz)
         gx, gy, gz = 0.0, 0.0, 0.0
         for i in range(8):
-            a, b, d = i >> 2, (i >> 1) & 1, i & 1
-            wx, wy, wz = (fx if a else 1 - fx), (fy if b else 1 - fy), (fz if d else 1 - fz)
+            a, b, d, wx, wy, wz = _corner(i, fx, fy, fz)
             row = index[x0 + a, y0 + b, z0 + d]
             dot = 0.0
             for c in range(channels):
-                dot += grad[p, c] * (values[row, c] if row >= 0 else fill[c])
+                dot += gradient[p, c] * (values[row, c] if row >= 0 else fill[c])
             gx += dot * (1.0 if a else -1.0) * wy * wz
             gy += dot * (1.0 if b else -1.0) * wx * wz
             gz += dot * (1.0 if d else -1.0) * wx * wy
@@ -102,6 +109,9 @@ def mark_cells(index, keep, cells):
                                 cells[a, b, d] = 1
 
 
+# Splat -----------------------------------------------------------------------------------------------------
+
+
 @njit(inline="always")
 def _floor(position):
     return int(np.floor(position[0])), int(np.floor(position[1])), int(np.floor(position[2]))
@@ -118,12 +128,10 @@ def number_touched(positions, index):
         if np.isnan(positions[q, 0]):
             continue
         x0, y0, z0 = _floor(positions[q])
-        for a in range(2):
-            for b in range(2):
-                for d in range(2):
-                    x, y, z = x0 + a, y0 + b, z0 + d
-                    if 0 <= x < nx and 0 <= y < ny and 0 <= z < nz:
-                        index[x, y, z] = 0
+        for x in range(max(x0, 0), min(x0 + 2, nx)):
+            for y in range(max(y0, 0), min(y0 + 2, ny)):
+                for z in range(max(z0, 0), min(z0 + 2, nz)):
+                    index[x, y, z] = 0
     rows = 0
     flat = index.reshape(-1)
     for i in range(flat.shape[0]):
@@ -136,9 +144,7 @@ def number_touched(positions, index):
 @njit(parallel=True, cache=True)
 def scatter(source, positions, index, out):
     """out[chunk, row] += b(u) (source[q], 1): the sums of the average splat, coverage in the last channel."""
-    chunks = out.shape[0]
-    channels = source.shape[1]
-    total = positions.shape[0]
+    chunks, channels, total = out.shape[0], source.shape[1], positions.shape[0]
     nx, ny, nz = index.shape
     for chunk in prange(chunks):
         for q in range(total * chunk // chunks, total * (chunk + 1) // chunks):
@@ -147,10 +153,10 @@ def scatter(source, positions, index, out):
             x0, y0, z0 = _floor(positions[q])
             fx, fy, fz = positions[q, 0] - x0, positions[q, 1] - y0, positions[q, 2] - z0
             for i in range(8):
-                a, b, d = i >> 2, (i >> 1) & 1, i & 1
+                a, b, d, wx, wy, wz = _corner(i, fx, fy, fz)
                 x, y, z = x0 + a, y0 + b, z0 + d
                 if 0 <= x < nx and 0 <= y < ny and 0 <= z < nz:
-                    w = (fx if a else 1 - fx) * (fy if b else 1 - fy) * (fz if d else 1 - fz)
+                    w = wx * wy * wz
                     row = index[x, y, z]
                     for c in range(channels):
                         out[chunk, row, c] += w * source[q, c]
@@ -158,7 +164,7 @@ def scatter(source, positions, index, out):
 
 
 @njit(parallel=True, cache=True)
-def scatter_backward(source, positions, index, grad, grad_source, grad_positions):
+def scatter_backward(source, positions, index, gradient, to_source, to_positions):
     """Compute the gradients of ``scatter`` with respect to values and positions."""
     channels = source.shape[1]
     nx, ny, nz = index.shape
@@ -169,20 +175,22 @@ def scatter_backward(source, positions, index, grad, grad_source, grad_positions
         fx, fy, fz = positions[q, 0] - x0, positions[q, 1] - y0, positions[q, 2] - z0
         gx, gy, gz = 0.0, 0.0, 0.0
         for i in range(8):
-            a, b, d = i >> 2, (i >> 1) & 1, i & 1
+            a, b, d, wx, wy, wz = _corner(i, fx, fy, fz)
             x, y, z = x0 + a, y0 + b, z0 + d
             if 0 <= x < nx and 0 <= y < ny and 0 <= z < nz:
-                wx, wy, wz = (fx if a else 1 - fx), (fy if b else 1 - fy), (fz if d else 1 - fz)
                 w = wx * wy * wz
                 row = index[x, y, z]
-                dot = grad[row, channels]
+                dot = gradient[row, channels]
                 for c in range(channels):
-                    grad_source[q, c] += w * grad[row, c]
-                    dot += source[q, c] * grad[row, c]
+                    to_source[q, c] += w * gradient[row, c]
+                    dot += source[q, c] * gradient[row, c]
                 gx += dot * (1.0 if a else -1.0) * wy * wz
                 gy += dot * (1.0 if b else -1.0) * wx * wz
                 gz += dot * (1.0 if d else -1.0) * wx * wy
-        grad_positions[q, 0], grad_positions[q, 1], grad_positions[q, 2] = gx, gy, gz
+        to_positions[q, 0], to_positions[q, 1], to_positions[q, 2] = gx, gy, gz
+
+
+# March -----------------------------------------------------------------------------------------------------
 
 
 @njit(cache=True)
@@ -256,7 +264,7 @@ def march(
             continue
         k = _first(t0, near, step, jitter[r]) if counting else firsts[r]
         found, t = 0, near
-        while True:
+        while counting or found < counts[r]:
             k, t = _seek(o, d, k, near, step, jitter[r], t1, cells, reach, block)
             if not t <= t1:
                 break
@@ -266,8 +274,6 @@ def march(
             elif found == 0:
                 firsts[r] = k
             found += 1
-            if not counting and found == counts[r]:
-                break
             k += 1
         if counting:
             counts[r] = found
@@ -278,11 +284,9 @@ def pool_blocks(cells, reach, block, bounds):
     """Fill ``reach``, the chessboard distance of each block (``block`` cells a side) to the nearest occupied
     block, and ``bounds`` (2, 3) of the occupied cells, low > high if there are none.
     """
+    reach[:] = 255
+    bounds[0], bounds[1] = np.inf, -np.inf
     nx, ny, nz = cells.shape
-    far = 255
-    reach[:] = far
-    bounds[0] = np.inf
-    bounds[1] = -np.inf
     for x in range(nx):
         for y in range(ny):
             for z in range(nz):
@@ -299,43 +303,31 @@ def pool_blocks(cells, reach, block, bounds):
 def _sweep(reach, sign):
     """Sweep the chessboard distance transform, forwards or backwards."""
     nx, ny, nz = reach.shape
-    for i in range(nx):
-        x = i if sign > 0 else nx - 1 - i
-        for j in range(ny):
-            y = j if sign > 0 else ny - 1 - j
-            for k in range(nz):
-                z = k if sign > 0 else nz - 1 - k
-                least = int(reach[x, y, z])
-                if least == 0:
-                    continue
-                for n in range(13):  # of the 27 around it, those already swept
-                    a, b, c = x + sign * (n // 9 - 1), y + sign * (n // 3 % 3 - 1), z + sign * (n % 3 - 1)
-                    if 0 <= a < nx and 0 <= b < ny and 0 <= c < nz:
-                        least = min(least, reach[a, b, c] + 1)
-                reach[x, y, z] = least
+    for i, j, k in np.ndindex(reach.shape):
+        x, y, z = (i, j, k) if sign > 0 else (nx - 1 - i, ny - 1 - j, nz - 1 - k)
+        least = int(reach[x, y, z])
+        if least == 0:
+            continue
+        for n in range(13):  # of the 27 around it, those already swept
+            a, b, c = x + sign * (n // 9 - 1), y + sign * (n // 3 % 3 - 1), z + sign * (n % 3 - 1)
+            if 0 <= a < nx and 0 <= b < ny and 0 <= c < nz:
+                least = min(least, reach[a, b, c] + 1)
+        reach[x, y, z] = least
 
 
 @njit(cache=True)
 def _raw(raw, index, fill, x, y, z):
     """Interpolate one channel of a sparse lattice."""
     nx, ny, nz = index.shape
-    x0, fx = _corner(x, nx)
-    y0, fy = _corner(y, ny)
-    z0, fz = _corner(z, nz)
+    x0, fx = _base(x, nx)
+    y0, fy = _base(y, ny)
+    z0, fz = _base(z, nz)
     total = 0.0
     for i in range(8):
-        a, b, c = i >> 2, (i >> 1) & 1, i & 1
-        w = (fx if a else 1 - fx) * (fy if b else 1 - fy) * (fz if c else 1 - fz)
+        a, b, c, wx, wy, wz = _corner(i, fx, fy, fz)
         row = index[x0 + a, y0 + b, z0 + c]
-        total += w * (raw[row] if row >= 0 else fill)
+        total += wx * wy * wz * (raw[row] if row >= 0 else fill)
     return total
-
-
-@njit(cache=True)
-def _optical(raw, shift, scale):
-    """Return the optical depth of a step, ``softplus(raw + shift) * scale``, at most 80."""
-    v = raw + shift
-    return min((v if v > 20 else np.log1p(np.exp(v))) * scale, 80.0)
 
 
 @njit(parallel=True, cache=True)
@@ -362,8 +354,9 @@ def trace(
             k, t = _seek(o, d, k, near, step, jitter[r], t1, cells, reach, block)
             if not t <= t1:
                 break
-            value = _raw(raw, index, fill, o[0] + t * d[0], o[1] + t * d[1], o[2] + t * d[2])
-            x = _optical(value, shift, scale)
+            v = _raw(raw, index, fill, o[0] + t * d[0], o[1] + t * d[1], o[2] + t * d[2]) + shift
+            # The optical depth of a step: softplus(raw + shift) * scale.
+            x = min((v if v > 20 else np.log1p(np.exp(v))) * scale, 80.0)
             weight = through * -np.expm1(-x)
             if weight > threshold:
                 if not counting:
