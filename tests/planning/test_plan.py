@@ -13,7 +13,7 @@ from forewarp.methods.particles.options import ParticlesPlanning
 from forewarp.planning.plan_file import read_plan, with_plan, write_plan
 from forewarp.planning.planner import Planner
 from forewarp.planning.trials import Trial, Trials
-from forewarp.scene.silhouettes import Pictures
+from forewarp.scene.silhouettes import Survey
 from forewarp.synth.scenes import synthesize
 
 TINY = ["data=dnerf", "preset=demo", "trainer=cpu", "logger=none", "callbacks=default"]
@@ -88,7 +88,7 @@ def test_what_rests_is_the_mean_of_the_seeds_that_are_tried():
         return Trial((30.0, 31.0), 0.01, 10, 1.0, at_rest=0.2 * (1 + seed) if name == "with" else 0.0)
 
     planner._tried = tried
-    pictures = Pictures(frames=9, times=9, cut_out=0.8, spread=160.0, disagreement=0.2)
+    pictures = Survey(frames=9, times=9, cut_out=0.8, spread=160.0, disagreement=0.2)
     for names, rests in ((("with", "without"), 0.4), (("without", "with"), 0.0)):
         planner.evidence = ParticlesPlanning().evidence(pictures, least=0.6)
         planner._try("background", *((name, []) for name in names))

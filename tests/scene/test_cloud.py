@@ -1,19 +1,69 @@
 import pytest
 import torch
 
-from forewarp.scene.cloud import far_apart
+from forewarp.ops.gaussians import FLAT, harmonics, rotations
+from forewarp.scene.cloud import Ellipsoids, far_apart
+
+
+def random(*shape, seed=0):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
 def test_chosen_points_are_far_from_one_another():
-    points = torch.randn(500, 3, generator=torch.Generator().manual_seed(0))
+    points = random(500, 3)
     chosen = far_apart(points, 20)
     places = points[chosen]
     apart = torch.cdist(places, places) + 1e9 * torch.eye(20)
     # No point is farther from the places than they are from one another.
     assert float(torch.cdist(points, places).amin(-1).max()) <= float(apart.min()) + 1e-5
     assert int(chosen[0]) == int((points - points.mean(0)).norm(dim=-1).argmax())
+    assert far_apart(points[:3], 3).tolist() == [0, 1, 2]
 
 
-@pytest.mark.parametrize("count", [0, 1, 3])
-def test_of_few_points_all_are_chosen(count):
-    assert far_apart(torch.randn(count, 3), 3).tolist() == list(range(count))
+def gaussians(roots, colors=None):
+    """Gaussians of roots (N, 3, 3), whose colours have B = 4 harmonics."""
+    colors = random(len(roots), 4, 3) if colors is None else colors
+    return Ellipsoids(random(len(roots), 3), roots, torch.ones(len(roots)), colors)
+
+
+def test_axes_give_the_covariances_again_with_proper_rotations():
+    roots = random(500, 3, 3)
+    scales, quaternions = gaussians(roots).axes
+    again = rotations(quaternions) * scales[:, None]
+    torch.testing.assert_close(again @ again.mT, gaussians(roots).covariances)
+    torch.testing.assert_close(quaternions.norm(dim=-1), torch.ones(500).double())
+    assert float(scales.min()) > 0
+    torch.testing.assert_close(torch.linalg.det(rotations(quaternions)), torch.ones(500).double())
+
+
+def test_a_turned_diagonal_keeps_its_axes():
+    given, turns = random(200, 3).exp(), torch.nn.functional.normalize(random(200, 4, seed=1), dim=-1)
+    roots = rotations(turns) * given[:, None]
+    scales, quaternions = gaussians(roots).axes
+    torch.testing.assert_close(scales, given)
+    torch.testing.assert_close(rotations(quaternions), rotations(turns))
+
+
+@pytest.mark.parametrize(
+    "diagonal", [(0.0, 0.0, 0.0), (1.0, 0.0, 2.0), (1.0, -1.0, 1.0), (1e-20, 1.0, 1.0), (1e-30, 1e-30, 1e-30)]
+)
+def test_what_is_flat_or_mirrored_has_finite_logarithms(diagonal):
+    roots = torch.diag(torch.tensor(diagonal))[None]
+    scales, quaternions = gaussians(roots).axes
+    assert bool(scales.log().isfinite().all())
+    again = rotations(quaternions) * scales[:, None]
+    torch.testing.assert_close(again @ again.mT, roots @ roots.mT, atol=max(diagonal) ** 2 * 1e-6, rtol=0)
+
+
+def test_colours_are_the_mean_stay_in_range_and_turn_along():
+    flat = torch.tensor([[[0.0, 0.25, 9.0]], [[-9.0, -0.5, 0.5]]]) / FLAT
+    cloud = gaussians(torch.eye(3).expand(2, 3, 3), flat)
+    torch.testing.assert_close(cloud.colors, torch.tensor([[0.5, 0.75, 1.0], [0.0, 0.0, 1.0]]))
+    assert torch.equal(cloud[[1]].colors, cloud.colors[1:])
+    cloud, rotation = gaussians(random(5, 3, 3)), rotations(random(1, 4, seed=3))[0]
+    direction = torch.nn.functional.normalize(random(1, 3, seed=4), dim=-1)
+    before = torch.einsum("rb,nbc->nrc", harmonics(direction, 4), cloud.harmonics)
+    after = torch.einsum(
+        "rb,nbc->nrc", harmonics(direction @ rotation.T, 4), cloud.turned(rotation).harmonics
+    )
+    torch.testing.assert_close(after, before)

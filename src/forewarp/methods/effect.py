@@ -10,7 +10,7 @@ from typing import Protocol
 from forewarp.methods.method import Method
 from forewarp.metrics.gain import Gain
 from forewarp.scene.frame import Scene
-from forewarp.scene.silhouettes import Pictures
+from forewarp.scene.silhouettes import Survey
 from forewarp.scene.view import Target
 
 
@@ -88,7 +88,7 @@ class Evidence:
         most_steps: of the planned run's last stage, whatever its minutes; None: only they end it.
     """
 
-    pictures: Pictures
+    pictures: Survey
     gains: dict[str, Gain] = field(default_factory=dict)
     least: float = 0.1
     minutes: float | None = None
@@ -219,7 +219,7 @@ class Planning(Protocol):
     trial_steps: int
     least: float
 
-    def evidence(self, pictures: Pictures, **bounds) -> Evidence:
+    def evidence(self, pictures: Survey, **bounds) -> Evidence:
         """Begin the evidence with what the images say."""
 
     def always(self, asked: Asked) -> tuple[Sequence[str], Sequence[str]]:

@@ -24,14 +24,12 @@ class Box:
     high: tuple[float, float, float]
 
     def __post_init__(self) -> None:
-        low, high = (tuple(float(v) for v in corner) for corner in (self.low, self.high))
-        object.__setattr__(self, "low", low)
-        object.__setattr__(self, "high", high)
-        good = len(low) == 3 and len(high) == 3 and all(math.isfinite(v) for v in low + high)
-        if not good or any(h <= l for l, h in zip(low, high)):
-            raise ValueError(
-                f"a box: expected finite low < high on three axes, but got low={low}, high={high}"
-            )
+        for name in ("low", "high"):
+            object.__setattr__(self, name, tuple(float(v) for v in getattr(self, name)))
+        is_complete = len(self.low) == len(self.high) == 3 and all(map(math.isfinite, self.low + self.high))
+        if not is_complete or any(h <= l for l, h in zip(self.low, self.high)):
+            got = f"low={self.low}, high={self.high}"
+            raise ValueError(f"a box: expected finite low < high on three axes, but got {got}")
 
     @property
     def size(self) -> tuple[float, float, float]:
@@ -50,10 +48,8 @@ class Box:
 
     def scaled(self, factor: float) -> Box:
         """Scale the box about its centre."""
-        half = [0.5 * factor * s for s in self.size]
-        return Box(
-            tuple(c - h for c, h in zip(self.center, half)), tuple(c + h for c, h in zip(self.center, half))
-        )
+        center, half = self.center, [0.5 * factor * s for s in self.size]
+        return Box(tuple(c - h for c, h in zip(center, half)), tuple(c + h for c, h in zip(center, half)))
 
     def padded(self, by: float) -> Box:
         """Add ``by`` world units on every side."""
@@ -65,10 +61,7 @@ class Box:
 
     def intersection(self, other: Box) -> Box:
         """Intersect two boxes that meet."""
-        return Box(
-            tuple(max(a, b) for a, b in zip(self.low, other.low)),
-            tuple(min(a, b) for a, b in zip(self.high, other.high)),
-        )
+        return Box(tuple(map(max, self.low, other.low)), tuple(map(min, self.high, other.high)))
 
 
 @dataclass(frozen=True)
@@ -84,9 +77,8 @@ class Lattice:
     def __post_init__(self) -> None:
         object.__setattr__(self, "shape", tuple(int(n) for n in self.shape))
         if len(self.shape) != 3 or min(self.shape) < 2:
-            raise ValueError(
-                f"a lattice: expected three axes of at least 2 points, but got shape={self.shape}"
-            )
+            got = f"shape={self.shape}"
+            raise ValueError(f"a lattice: expected three axes of at least 2 points, but got {got}")
 
     @classmethod
     def of_count(cls, box: Box, count: float, least: int = 4) -> Lattice:
@@ -124,8 +116,7 @@ class Lattice:
 
     def to_lattice(self, points: Tensor) -> Tensor:
         """Convert world (..., 3) to lattice coordinates (..., 3)."""
-        low = points.new_tensor(self.box.low)
-        return (points - low) / points.new_tensor(self.spacing)
+        return (points - points.new_tensor(self.box.low)) / points.new_tensor(self.spacing)
 
     def to_world(self, coordinates: Tensor) -> Tensor:
         """Convert lattice coordinates (..., 3) to world (..., 3)."""

@@ -1,4 +1,4 @@
-"""A pinhole camera, optionally with a distorting lens.
+"""A pinhole camera, optionally with a distorting lens, and its rays.
 
 Axes are OpenCV's: x right, y down, z forward. Pixel centres lie at +0.5. Distances are along the unit ray.
 """
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from forewarp.ops.lens import distort, undistort, unfolded
 
-# In the plane at distance 1: outside every picture, but small enough for 64-bit integers in pixels.
+# In the plane at distance 1: outside every image, but small enough for 64-bit integers in pixels.
 _OUTSIDE, _ON_AXIS = 1e9, 1e-9
 
 
@@ -42,7 +42,7 @@ class Lens:
         """Distort points (..., 2) of the plane at distance 1; keeps the dtype.
 
         Beyond the lens's fold points are invisible, though the polynomial would map them back into the
-        picture; such points, and points mapped still farther, are put far outside in their own direction.
+        image; such points, and points mapped still farther, are put far outside in their own direction.
         """
         # Float64, as the sixth power of points beside the camera exceeds the range of float32.
         plane = points.double()
@@ -52,7 +52,7 @@ class Lens:
         return torch.where(seen[..., None], bent, away).to(points.dtype)
 
     def straighten(self, points: Tensor) -> Tensor:
-        """Invert ``bend`` for points (..., 2) inside a picture, float64."""
+        """Invert ``bend`` for points (..., 2) inside a image, float64."""
         return undistort(points, self.k, self.p)
 
 
@@ -80,9 +80,7 @@ class Rays:
 
 def joined(parts: Sequence[Rays]) -> Rays:
     """Concatenate rays; take the least near and the greatest far."""
-    if len(parts) == 1:
-        return parts[0]
-    origins, directions = (torch.cat([getattr(p, name) for p in parts]) for name in ("origins", "directions"))
+    origins, directions = torch.cat([p.origins for p in parts]), torch.cat([p.directions for p in parts])
     return Rays(origins, directions, min(p.near for p in parts), max(p.far for p in parts))
 
 
@@ -127,7 +125,7 @@ class Camera:
 
     def directions(self, u: Tensor, v: Tensor) -> Tensor:
         """Make unit world directions (..., 3) float64 through pixel coordinates ``u v`` (...,), measured from
-        the picture's top-left corner; lens and skew are undone.
+        the image's top-left corner; lens and skew are undone.
         """
         y = (v.double() - self.cy) / self.fy
         x = (u.double() - self.cx - self.skew * y) / self.fx
@@ -157,16 +155,8 @@ class Camera:
     def resized(self, width: int, height: int) -> Camera:
         """Change the image size, keeping the view."""
         sx, sy = width / self.width, height / self.height
-        return replace(
-            self,
-            width=width,
-            height=height,
-            fx=self.fx * sx,
-            fy=self.fy * sy,
-            cx=self.cx * sx,
-            cy=self.cy * sy,
-            skew=self.skew * sx,
-        )
+        pixels = {"fx": self.fx * sx, "fy": self.fy * sy, "cx": self.cx * sx, "cy": self.cy * sy}
+        return replace(self, width=width, height=height, **pixels, skew=self.skew * sx)
 
 
 def look_at(center: Tensor, target: Tensor, up: Tensor) -> Tensor:
@@ -177,8 +167,7 @@ def look_at(center: Tensor, target: Tensor, up: Tensor) -> Tensor:
     forward = torch.nn.functional.normalize(target.double() - center.double(), dim=0)
     right = torch.linalg.cross(forward, up.double())
     if right.norm() < 1e-6:
-        other = torch.eye(3, dtype=torch.float64)[int(forward.abs().argmin())]
-        right = torch.linalg.cross(forward, other)
+        right = torch.linalg.cross(forward, torch.eye(3, dtype=torch.float64)[int(forward.abs().argmin())])
     right = torch.nn.functional.normalize(right, dim=0)
     pose = torch.eye(4, dtype=torch.float64)
     pose[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward], -1)

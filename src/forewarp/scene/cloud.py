@@ -13,6 +13,8 @@ from torch import Tensor
 from forewarp.ops.gaussians import FLAT, harmonics
 from forewarp.scene.box import Box
 
+_THINNEST = 1e-6  # of a Gaussian's longest axis: a map may have pressed it flat, and logarithms are taken
+
 
 @dataclass(frozen=True)
 class Cloud:
@@ -71,12 +73,9 @@ class Handover:
     notes: Mapping[str, float] = field(default_factory=dict)
 
 
-_THINNEST = 1e-6  # of an ellipsoid's longest axis: a map may have pressed it flat, and logarithms are taken
-
-
 @dataclass(frozen=True)
 class Ellipsoids:
-    """N Gaussians, each row the same one at all times.
+    """N Gaussians as other programs draw them, each row the same one at all times.
 
     Attributes:
         centers: (N, 3), world units.
@@ -109,44 +108,36 @@ class Ellipsoids:
 
     def turned(self, rotation: Tensor) -> Ellipsoids:
         """Turn all of them by a rotation (3, 3) about the origin; their colours turn with them."""
-        rotation, count = rotation.double(), self.harmonics.shape[1]
-        generator = torch.Generator().manual_seed(0)
-        some = torch.nn.functional.normalize(torch.randn(64, 3, generator=generator, dtype=torch.float64))
+        rotation, generator = rotation.double(), torch.Generator().manual_seed(0)
+        directions = torch.randn(64, 3, generator=generator, dtype=torch.float64)
+        directions = directions / directions.norm(dim=-1, keepdim=True)
         # A colour seen from a direction is seen from the turned direction afterwards.
-        after = torch.linalg.lstsq(harmonics(some @ rotation.T, count), harmonics(some, count)).solution
-        colors = torch.einsum("ab,nbc->nac", after.to(self.harmonics), self.harmonics)
-        rotation = rotation.to(self.centers)
+        before, after = (harmonics(d, self.harmonics.shape[1]) for d in (directions, directions @ rotation.T))
+        mixed = torch.linalg.lstsq(after, before).solution.to(self.harmonics)
+        colors, rotation = torch.einsum("ab,nbc->nac", mixed, self.harmonics), rotation.to(self.centers)
         return Ellipsoids(self.centers @ rotation.T, rotation @ self.roots, self.opacity, colors)
 
     @cached_property
     def axes(self) -> tuple[Tensor, Tensor]:
-        """See ``axes_of``."""
-        return axes_of(self.roots)
+        """Standard deviations (N, 3) > 0 along the principal axes of the covariances, and how these axes are
+        turned: unit quaternions (N, 4) w, x, y, z.
 
+        Axes have the order and the signs that are nearest to the columns of the roots (N, 3, 3): those of a
+        rotated diagonal matrix stay as they are, and small changes turn them little, unless two are equally
+        long. Rotations are proper. What is thinner than a millionth of the longest axis counts as that.
 
-def axes_of(roots: Tensor) -> tuple[Tensor, Tensor]:
-    """Standard deviations (N, 3) > 0 along the principal axes of covariances ``root root^t``, and how these
-    axes are turned: unit quaternions (N, 4) w, x, y, z.
+        Cost: a singular value decomposition in float64 each, about 10 microseconds.
+        """
+        from scipy.spatial.transform import Rotation  # late, as its import takes time
 
-    Axes have the order and the signs that are nearest to the columns of the roots (N, 3, 3): those of a
-    rotated diagonal matrix stay as they are, and small changes turn them little, unless two are equally long.
-    Rotations are proper. What is thinner than a millionth of the longest axis counts as that.
-
-    Cost: a singular value decomposition in float64 each, about 10 microseconds.
-
-    >>> axes_of(torch.diag(torch.tensor([1.0, 3.0, 2.0]))[None])
-    (tensor([[1., 3., 2.]]), tensor([[1., 0., 0., 0.]]))
-    """
-    from scipy.spatial.transform import Rotation  # late, as its import takes time
-
-    left, scales, right = torch.linalg.svd(roots.double())  # rows of right: axes among the columns
-    orders = torch.tensor(list(permutations(range(3))), device=roots.device)  # (6, 3)
-    columns = torch.arange(3, device=roots.device)
-    order = orders[right.abs()[:, orders, columns].sum(-1).argmax(-1)]  # (N, 3), the axis of each column
-    signs = torch.where(right.gather(1, order[:, None])[:, 0] < 0, -1.0, 1.0)
-    axes = left.gather(2, order[:, None].expand(-1, 3, -1)) * signs[:, None]
-    axes[:, :, 2] *= torch.linalg.det(axes).sign()[:, None]
-    longest = scales[:, :1].clamp(min=torch.finfo(torch.float32).tiny / _THINNEST)
-    scales = torch.maximum(scales.gather(1, order), _THINNEST * longest)
-    turns = Rotation.from_matrix(axes.cpu().numpy()).as_quat()  # x, y, z, w
-    return scales.to(roots), torch.from_numpy(turns).roll(1, -1).to(roots)
+        left, scales, right = torch.linalg.svd(self.roots.double())  # rows of right: axes among the columns
+        orders = torch.tensor(list(permutations(range(3))), device=self.roots.device)  # (6, 3)
+        columns = torch.arange(3, device=self.roots.device)
+        order = orders[right.abs()[:, orders, columns].sum(-1).argmax(-1)]  # (N, 3), the axis of each column
+        signs = torch.where(right.gather(1, order[:, None])[:, 0] < 0, -1.0, 1.0)
+        axes = left.gather(2, order[:, None].expand(-1, 3, -1)) * signs[:, None]
+        axes[:, :, 2] *= torch.linalg.det(axes).sign()[:, None]
+        longest = scales[:, :1].clamp(min=torch.finfo(torch.float32).tiny / _THINNEST)
+        scales = torch.maximum(scales.gather(1, order), _THINNEST * longest)
+        quaternions = Rotation.from_matrix(axes.cpu().numpy()).as_quat()  # x, y, z, w
+        return scales.to(self.roots), torch.from_numpy(quaternions).roll(1, -1).to(self.roots)

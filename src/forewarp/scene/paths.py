@@ -26,16 +26,15 @@ def focus_point(cameras: list[Camera]) -> Tensor:
 
 
 def mean_up(cameras: list[Camera]) -> Tensor:
-    """Average the upward directions of the pictures (3,), float64, unit length; z if they cancel."""
+    """Average the upward directions of the images (3,), float64, unit length; z if they cancel."""
     up = -torch.stack([c.camera_to_world[:3, 1].double() for c in cameras]).mean(0)
     return up / up.norm() if up.norm() > 0.1 else torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 
 
 def _moved(camera: Camera, center: Tensor, focus: Tensor, up: Tensor) -> Camera:
     """Move a camera to ``center``, facing ``focus``; keep the camera if the two coincide."""
-    if float((center - focus).norm()) < 1e-6 * camera.far:
-        return camera
-    return replace(camera, camera_to_world=look_at(center, focus, up))
+    is_apart = float((center - focus).norm()) >= 1e-6 * camera.far
+    return replace(camera, camera_to_world=look_at(center, focus, up)) if is_apart else camera
 
 
 class RandomPatches:
@@ -64,10 +63,8 @@ class RandomPatches:
         camera = _moved(self.cameras[i], self.focus + mixed * radius, self.focus, self.up)
         span = torch.tensor([camera.height - self.size + 1, camera.width - self.size + 1])
         corner = (torch.rand(self.patches, 2, generator=generator) * span).long()
-        inner = torch.stack(
-            torch.meshgrid(torch.arange(self.size), torch.arange(self.size), indexing="ij"), -1
-        )
-        at = corner[:, None, None] + inner
+        side = torch.arange(self.size)
+        at = corner[:, None, None] + torch.stack(torch.meshgrid(side, side, indexing="ij"), -1)
         return camera.rays((at[..., 0] * camera.width + at[..., 1]).reshape(-1))
 
 
@@ -83,13 +80,10 @@ def orbit(camera: Camera, focus: Tensor, up: Tensor, turns: Tensor) -> list[Came
     """
     offset = camera.center.double() - focus
     height = (offset @ up) * up
-    a = offset - height
-    b = torch.linalg.cross(up, a)
-    views = []
-    for turn in turns.tolist():
-        angle = 2 * math.pi * turn
-        views.append(_moved(camera, focus + height + math.cos(angle) * a + math.sin(angle) * b, focus, up))
-    return views
+    a, b = offset - height, torch.linalg.cross(up, offset - height)
+    angles = [2 * math.pi * turn for turn in turns.tolist()]
+    centers = [focus + height + math.cos(angle) * a + math.sin(angle) * b for angle in angles]
+    return [_moved(camera, center, focus, up) for center in centers]
 
 
 def swing(camera: Camera, cameras: list[Camera], focus: Tensor, up: Tensor, shares: Tensor) -> list[Camera]:
@@ -105,7 +99,7 @@ def swing(camera: Camera, cameras: list[Camera], focus: Tensor, up: Tensor, shar
     """
     first = camera.center.double() - focus
     across = torch.linalg.cross(up, first)
-    places = torch.stack([one.center.double() - focus for one in cameras])
+    places = torch.stack([c.center.double() - focus for c in cameras])
     turns = torch.atan2(places @ across, places @ first - (places @ up) * (first @ up)) / (2 * math.pi)
     low, high = torch.quantile(turns, torch.tensor([0.05, 0.95], dtype=turns.dtype)).tolist()
     wave = torch.sin(2 * math.pi * shares)

@@ -8,12 +8,13 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from forewarp.ops.grid import dilate
 from forewarp.scene.box import Lattice
 from forewarp.scene.camera import Camera
 from forewarp.scene.frame import Frame, Scene, spread
+
+_VIEWS, _SIDE = 40, 40
 
 
 def visual_hull(points: Tensor, cameras: list[Camera], masks: list[Tensor], misses: int = 0) -> Tensor:
@@ -37,24 +38,25 @@ def sightings(points: Tensor, cameras: list[Camera], masks: list[Tensor]) -> tup
 
     Arguments are those of ``visual_hull``.
     """
-    covered = torch.zeros(len(points), dtype=torch.int32)
-    seen = torch.zeros(len(points), dtype=torch.int32)
+    covered, seen = torch.zeros(2, len(points), dtype=torch.int32)
     for camera, mask in zip(cameras, masks, strict=True):
-        pixel, z = camera.project(points)
-        column, row = pixel.floor().long().unbind(-1)
-        visible = (z > 0) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
+        row, column, visible = _pixels(camera, points)
         on = mask[row.clamp(0, camera.height - 1), column.clamp(0, camera.width - 1)]
         covered += (visible & on).int()
         seen += visible.int()
     return covered, seen
 
 
-_VIEWS, _SIDE = 40, 40
+def _pixels(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return row and column (N,) of the pixel that shows each point, and whether the image has it."""
+    pixel, z = camera.project(points)
+    column, row = pixel.floor().long().unbind(-1)
+    return row, column, (z > 0) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
 
 
 @dataclass(frozen=True)
-class Pictures:
-    """Properties of the training pictures.
+class Survey:
+    """Properties of the training images.
 
     ``times``: distinct times of the ``frames``. ``cut_out``: share of transparent pixels, 0 without alpha.
     ``spread``: largest angle between two cameras, seen from the scene's middle, degrees. ``disagreement``:
@@ -69,39 +71,32 @@ class Pictures:
     disagreement: float
 
 
-def survey(scene: Scene) -> Pictures:
+def survey(scene: Scene) -> Survey:
     """Measure the training frames. Cost: ``_VIEWS`` images, ``_SIDE``^3 points in each."""
     frames = [scene.train[i] for i in spread(len(scene.train), _VIEWS)]
     cut_out = 0.0
     if scene.has_alpha:
         cut_out = sum(float((f.load()[..., 3] < 128).float().mean()) for f in frames) / len(frames)
-    disagreement = _disagreement(scene, frames) if cut_out > 0 and len(frames) > 1 else 0.0
-    return Pictures(len(scene.train), len(scene.times), cut_out, _spread(scene), disagreement)
-
-
-def _spread(scene: Scene) -> float:
-    middle = torch.tensor([(low + high) / 2 for low, high in zip(scene.box.low, scene.box.high)]).double()
+    middle = torch.tensor(scene.box.center).double()
     towards = torch.stack([frame.camera.center.double() - middle for frame in scene.train])
-    towards = functional.normalize(towards, dim=-1)
-    return math.degrees(math.acos(float((towards @ towards.T).min().clamp(-1, 1))))
+    towards = torch.nn.functional.normalize(towards, dim=-1)
+    angle = math.degrees(math.acos(float((towards @ towards.T).min().clamp(-1, 1))))
+    disagreement = _disagreement(scene, frames) if cut_out > 0 and len(frames) > 1 else 0.0
+    return Survey(len(scene.train), len(scene.times), cut_out, angle, disagreement)
 
 
 def _disagreement(scene: Scene, frames: Sequence[Frame]) -> float:
     lattice = Lattice.of_count(scene.box, _SIDE**3)
-    points, masks, reach = lattice.to_world(lattice.all_voxels()), [], []
-    for frame in frames:
+    points, reach = lattice.to_world(lattice.all_voxels()), []
+    for frame in frames:  # how many pixels a voxel is wide
         depth = float(frame.camera.project(points.mean(0, keepdim=True))[1])
         reach.append(max(1, math.ceil(lattice.voxel_size * frame.camera.fx / max(depth, 1e-6))))
-        masks.append(dilate(frame.load()[..., 3] > 127, reach[-1]))
-    points = points[visual_hull(points, [frame.camera for frame in frames], masks)]
-    missed = total = 0
-    for frame, pixels in zip(frames, reach):
-        camera, foreground = frame.camera, frame.load()[..., 3] > 127
-        pixel, depth = camera.project(points)
-        column, row = pixel.floor().long().unbind(-1)
-        inside = (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height) & (depth > 0)
+    foregrounds = [frame.load()[..., 3] > 127 for frame in frames]
+    masks = [dilate(foreground, pixels) for foreground, pixels in zip(foregrounds, reach)]
+    points, missed = points[visual_hull(points, [frame.camera for frame in frames], masks)], 0
+    for frame, foreground, pixels in zip(frames, foregrounds, reach):
+        row, column, inside = _pixels(frame.camera, points)
         covered = torch.zeros_like(foreground)
         covered[row[inside], column[inside]] = True
         missed += int((foreground & ~dilate(covered, pixels)).sum())
-        total += int(foreground.sum())
-    return missed / max(total, 1)
+    return missed / max(sum(int(foreground.sum()) for foreground in foregrounds), 1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -34,32 +35,19 @@ class View:
     pixels: Tensor | None = None
     crop: tuple[int, int, int, int] | None = None
 
-    def __post_init__(self) -> None:
-        if self.pixels is not None and self.crop is not None:
-            raise ValueError("view: expected pixels or a crop, but got both")
-        if self.crop is not None:
-            top, left, height, width = self.crop
-            inside = top + height <= self.camera.height and left + width <= self.camera.width
-            if not (inside and min(top, left) >= 0 and min(height, width) >= 1):
-                size = f"{self.camera.width} x {self.camera.height}"
-                raise ValueError(f"view: expected a crop inside {size} pixels, but got {self.crop}")
-
     def __len__(self) -> int:
-        if self.pixels is not None:
-            return len(self.pixels)
-        height, width = self.shape
-        return height * width
+        return math.prod(self.shape)
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Shape of the picture: (R,) of single pixels, else (height, width)."""
+        """Shape of the image: (R,) of single pixels, else (height, width)."""
         if self.pixels is not None:
             return (len(self.pixels),)
         return (self.camera.height, self.camera.width) if self.crop is None else self.crop[2:]
 
     @cached_property
     def indices(self) -> Tensor | None:
-        """Flat indices (R,) of the pixels in the whole picture; None for all pixels."""
+        """Flat indices (R,) of the pixels in the whole image; None for all pixels."""
         if self.crop is None:
             return self.pixels
         top, left, height, width = self.crop
@@ -88,18 +76,20 @@ class Rendering:
     @staticmethod
     def joined(parts: Sequence[Rendering]) -> Rendering:
         """Put what several groups of pixels show behind one another."""
-        return Rendering(
-            *(torch.cat([getattr(p, key) for p in parts]) for key in ("rgb", "depth", "opacity"))
-        )
+        columns = zip(*((part.rgb, part.depth, part.opacity) for part in parts))
+        return Rendering(*map(torch.cat, columns))
+
+
+KINDS = ("pixels", "crops", "pictures")
 
 
 @dataclass(frozen=True)
 class Asks:
     """What a method asks for in a batch.
 
-    ``kind``: single ``pixels``, square ``crops`` of ``side`` pixels, or whole ``pictures``. ``neighbours``:
-    how many of the nearest other training times to observe too. ``instant``: up to how many whole training
-    pictures of the picked time to add. ``straight``: give pixels as stored, not composited.
+    ``kind``: single ``pixels``, square ``crops`` of ``side`` pixels, or ``pictures``, whole images.
+    ``neighbours``: how many of the nearest other training times to observe too. ``instant``: up to how many
+    whole training images of the picked time to add. ``straight``: give pixels as stored, not composited.
     """
 
     kind: str = "pixels"
@@ -109,17 +99,14 @@ class Asks:
     straight: bool = False
 
     def __post_init__(self) -> None:
-        kinds = ("pixels", "crops", "pictures")
-        if self.kind not in kinds or min(self.side - 1, self.neighbours, self.instant) < 0:
-            raise ValueError(
-                f"asks: expected a kind of {', '.join(kinds)}, side >= 1, neighbours >= 0 and instant >= 0, "
-                f"but got {self}"
-            )
+        if self.kind not in KINDS or min(self.side - 1, self.neighbours, self.instant) < 0:
+            expected = f"a kind of {', '.join(KINDS)}, side >= 1, neighbours >= 0 and instant >= 0"
+            raise ValueError(f"asks: expected {expected}, but got {self}")
 
 
 @dataclass(frozen=True)
 class Observation:
-    """Pixels of one picture: the true ``rgb`` (R, 3) in [0, 1] over ``background`` (3,) or (R, 3), the colour
+    """Pixels of one image: the true ``rgb`` (R, 3) in [0, 1] over ``background`` (3,) or (R, 3), the colour
     of rays that hit nothing. If the method asks for ``straight`` pixels, ``rgb`` is (R, 4) uint8: colour
     and alpha as stored.
     """
@@ -139,7 +126,7 @@ class Batch:
     """What one training step uses, as the method asked for it.
 
     ``observations``: first of the picked frame's time, then of neighbouring times. ``frame``: the index of
-    the picked training frame. ``instant``: whole training pictures of that time over white, for methods
+    the picked training frame. ``instant``: whole training images of that time over white, for methods
     that encode them; empty unless asked for.
     """
 
@@ -156,25 +143,23 @@ class Batch:
         """Concatenate the rays of all observations, on the CPU, with their true colours (R, 3) and
         backgrounds (R, 3), or (3,) of a single observation. For methods that ask for one time.
         """
-        rays = joined([one.view.rays() for one in self.observations])
-        rgb = [one.rgb for one in self.observations]
-        behind = [one.background for one in self.observations]
-        if len(rgb) == 1:
-            return rays, rgb[0], behind[0]
-        each = [b.expand(len(one.view), 3) for b, one in zip(behind, self.observations)]
-        return rays, torch.cat(rgb), torch.cat(each)
+        first, *others = self.observations
+        if not others:
+            return first.view.rays(), first.rgb, first.background
+        rays = joined([o.view.rays() for o in self.observations])
+        backgrounds = [o.background.expand(len(o.view), 3) for o in self.observations]
+        return rays, torch.cat([o.rgb for o in self.observations]), torch.cat(backgrounds)
 
     def split(self) -> list[Batch]:
         """Return a batch of each observation."""
-        return [replace(self, observations=(one,)) for one in self.observations]
+        return [replace(self, observations=(observation,)) for observation in self.observations]
 
     def __len__(self) -> int:
-        return sum(len(one.view) for one in self.observations)
+        return sum(len(observation.view) for observation in self.observations)
 
     def to(self, device) -> Batch:
         """Move all colours to another device."""
-        moved = (tuple(one.to(device) for one in part) for part in (self.observations, self.instant))
-        observations, instant = moved
+        observations, instant = (tuple(o.to(device) for o in p) for p in (self.observations, self.instant))
         return Batch(observations, self.frame, instant)
 
 
@@ -206,6 +191,6 @@ class Target:
 
     def to(self, device) -> Target:
         """Move the tensors to another device."""
-        foreground, depth = (None if t is None else t.to(device) for t in (self.foreground, self.depth))
-        moved = self.rgb.to(device), self.background.to(device)
-        return Target(self.frame, *moved, foreground, depth, self.index)
+        names = ("rgb", "background", "foreground", "depth")
+        known = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+        return replace(self, **{name: tensor.to(device) for name, tensor in known.items()})

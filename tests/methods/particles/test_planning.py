@@ -7,9 +7,9 @@ import pytest
 from forewarp.methods.effect import Asked, Begin, Drop, Evidence
 from forewarp.methods.particles.options import EFFECTS, ParticlesPlanning
 from forewarp.metrics.gain import Gain
-from forewarp.scene.silhouettes import Pictures
+from forewarp.scene.silhouettes import Survey
 
-PICTURES = Pictures(frames=50, times=50, cut_out=0.8, spread=160.0, disagreement=0.2)
+PICTURES = Survey(frames=50, times=50, cut_out=0.8, spread=160.0, disagreement=0.2)
 NAMES = [effect.name for effect in EFFECTS]
 YES, NO, UNSURE = Gain(1.0, 0.2, 1.2, 1000), Gain(-0.1, 0.2, 1.2, 1000), Gain(0.8, 0.9, 1.2, 1000)
 

@@ -8,10 +8,10 @@ from forewarp.methods.effect import Asked, Begin, Rival
 from forewarp.methods.voxel import planning as decisions
 from forewarp.methods.voxel.planning import Movement, Residual, VoxelEvidence, VoxelPlanning
 from forewarp.metrics.gain import Gain
-from forewarp.scene.silhouettes import Pictures
+from forewarp.scene.silhouettes import Survey
 
 MOVING = VoxelEvidence(
-    Pictures(frames=50, times=50, cut_out=0.8, spread=160.0, disagreement=0.2),
+    Survey(frames=50, times=50, cut_out=0.8, spread=160.0, disagreement=0.2),
     movement=Movement(moving=0.4, distance=0.3, torn=0.2, at=0.9, left_out=(4.0, 2.0, 0.4, 0.1, 0.0)),
     residual=Residual(psnr=28.0, by_direction=0.02, allowed=38.0),
 )

@@ -11,7 +11,7 @@ from forewarp.methods.effect import Asked, Begin, Decision, Drop, Effect, Eviden
 from forewarp.methods.method import Method
 from forewarp.ops.backend import is_number
 from forewarp.scene.frame import Scene
-from forewarp.scene.silhouettes import Pictures
+from forewarp.scene.silhouettes import Survey
 from forewarp.scene.view import Target
 
 _VIEWS = 100  # training images from which on more of them call for no more particles
@@ -249,7 +249,7 @@ class ParticlesPlanning:
     # In a short trial effects make up for what is still rough: by up to 0.5 dB where they are not called for.
     steps, trial_steps, least = 150, 700, 0.6
 
-    def evidence(self, pictures: Pictures, **bounds) -> Evidence:
+    def evidence(self, pictures: Survey, **bounds) -> Evidence:
         """Begin the evidence with what the images say."""
         return ParticlesEvidence(pictures, **bounds)
 
@@ -309,7 +309,7 @@ class ParticlesPlanning:
         return moves and (name in ("motion", "rotation") or (name == "background" and cut_out))
 
 
-def order(pictures: Pictures) -> list[str]:
+def order(pictures: Survey) -> list[str]:
     """Return the names of the effects in the order in which they are left out.
 
     Where nothing is cut out, those that could stand in for motion go first: everything is visible all the
@@ -321,7 +321,7 @@ def order(pictures: Pictures) -> list[str]:
     return [*STAND_INS, *(name for name in names if name not in STAND_INS)]
 
 
-def longer(name: str, pictures: Pictures) -> int:
+def longer(name: str, pictures: Survey) -> int:
     """Return how many times the usual steps trials of an effect have.
 
     Those of view dependence are longer: after few steps it makes up for a shape that is still rough. (A matte
@@ -334,7 +334,7 @@ def longer(name: str, pictures: Pictures) -> int:
     return 2 if name == "view_dependence" else 1
 
 
-def unseen(name: str, pictures: Pictures) -> str | None:
+def unseen(name: str, pictures: Survey) -> str | None:
     """Say why pictures cannot show an effect; None if they can."""
     if name == "view_dependence":
         why = f"all cameras lie within {pictures.spread:.0f} degrees: direction is not seen"

@@ -18,7 +18,7 @@ from forewarp.metrics.image import low_passed
 from forewarp.ops.grid import index_of, neighbour_pairs
 from forewarp.scene.box import Lattice
 from forewarp.scene.frame import Scene, spread
-from forewarp.scene.silhouettes import Pictures
+from forewarp.scene.silhouettes import Survey
 from forewarp.scene.view import Target, View
 
 if TYPE_CHECKING:
@@ -381,7 +381,7 @@ class VoxelPlanning:
     effects = EFFECTS
     steps, trial_steps, least = 3000, 250, 0.1
 
-    def evidence(self, pictures: Pictures, **bounds) -> VoxelEvidence:
+    def evidence(self, pictures: Survey, **bounds) -> VoxelEvidence:
         """Begin the evidence with what the images say."""
         return VoxelEvidence(pictures, **bounds)
 
