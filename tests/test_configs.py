@@ -15,13 +15,13 @@ from forewarp.data.module import SceneDataModule
 from forewarp.methods.particles.options import Effects
 from forewarp.methods.voxel.effects import LearnedUpsampler, SphericalHarmonics, UNet3d, ViewNetwork
 from forewarp.methods.voxel.losses import TERMS
-from forewarp.methods.voxel.model import Ground
-from forewarp.methods.voxel.structure import EFFECTS, VoxelStage
+from forewarp.methods.voxel.structure import VoxelStage
 from forewarp.renderer import Renderer
 from forewarp.runs.build import build_run
-from forewarp.scene.box import Box, Lattice
+from forewarp.scene.box import Lattice
 from forewarp.training.schedule import StageSettings
 from tests.support.configs import CONF, composed, groups, options
+from tests.support.tiny_scene import BOX, built
 
 PRESETS, MODELS = options("preset"), options("model")
 EXPERIMENTS = options("experiment")
@@ -53,10 +53,7 @@ def run_of(*overrides):
 
 def method_of(model, frames=4):
     """A voxel method on a tiny lattice."""
-    lattice = Lattice(Box((-1, -1, -1), (1, 1, 1)), (3, 4, 5))
-    every = torch.ones(lattice.shape, dtype=torch.bool)
-    ground = Ground(lattice, every, 0.5, lattice.box, frames, 0.0, (lattice, every))
-    return model.build(ground, VoxelStage(num_voxels=[[0, 60]], effects=EFFECTS))
+    return built(model, Lattice(BOX, (3, 4, 5)), frames=frames, num_voxels=[[0, 60]])
 
 
 @pytest.mark.parametrize(("group", "option"), CHOICES)
@@ -129,8 +126,8 @@ def test_off_is_none_whatever_the_preset(preset):
         "model=forward", f"preset={preset}", *(f"model/{effect}={choice}" for effect, choice in OFF)
     ).model
     for effect, _ in OFF:
-        assert getattr(off, effect) is None
-        assert getattr(on, effect) is not None
+        assert off.keywords[effect] is None
+        assert on.keywords[effect] is not None
     assert {name.split(".")[0] for name, _ in method_of(off).named_parameters()} == {"radiance"}
 
 
@@ -140,7 +137,10 @@ def test_every_number_of_the_renderer_is_a_key_and_equals_its_default():
     }
     config = OmegaConf.to_container(composed("data.scene=x", "model=forward").model.renderer)
     assert config == {"_target_": "forewarp.renderer.Renderer"} | defaults
-    assert run_of("model=forward", "model.renderer.early_stop_eps=0").model.renderer.early_stop_eps == 0
+    assert (
+        run_of("model=forward", "model.renderer.early_stop_eps=0").model.keywords["renderer"].early_stop_eps
+        == 0
+    )
 
 
 @pytest.mark.parametrize("order", [1, -1])

@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 
 from forewarp.fields.curves import TrajectoryField
-from forewarp.fields.grids import DirectRadiance
 from forewarp.methods.voxel.effects import (
     LearnedUpsampler,
     Motion,
@@ -21,9 +20,7 @@ from forewarp.methods.voxel.effects import (
     StaticBackground,
     UNet3d,
 )
-from forewarp.methods.voxel.forward import ForwardModel, ForwardWarp
-from forewarp.methods.voxel.model import Ground
-from forewarp.methods.voxel.structure import VoxelStage
+from forewarp.methods.voxel.forward import ForwardWarp
 from forewarp.ops.splat import average_splat
 from forewarp.renderer import Renderer
 from forewarp.scene.view import Moment, View
@@ -43,6 +40,7 @@ from tests.bench.workloads import (
     some_rays,
 )
 from tests.stability.twin import implementation
+from tests.support.tiny_scene import built, forward_model
 
 Work = Callable[[], object]
 REPEATS = 5
@@ -225,10 +223,8 @@ def method_with(choices: Mapping, side: int) -> ForwardWarp:
     torch.manual_seed(0)
     lattice = lattice_of(side)
     active = body(lattice, 0.55)
-    model = ForwardModel(radiance=partial(DirectRadiance, alpha_init=1e-2, alpha_threshold=1e-4), **choices)
-    still = (lattice, torch.ones_like(active))
-    ground = Ground(lattice, active, 2 / (side - 1), lattice.box, 50, 0.0, still)
-    method = model.build(ground, VoxelStage(num_voxels=[[0, side**3]]))
+    model = forward_model(**{"motion": None, "view_dependence": None} | choices)
+    method = built(model, lattice, active, density_scale=2 / (side - 1), frames=50, box=lattice.box)
     with torch.no_grad():
         method.radiance.parameter("density").fill_(6.0)
         if method.background is not None:

@@ -11,11 +11,9 @@ from torch import Tensor
 
 from forewarp.fields.curves import TrajectoryField
 from forewarp.fields.grids import EMPTY, FeatureRadiance
-from forewarp.methods.method import Start
 from forewarp.methods.voxel.effects import LearnedUpsampler, Motion, UNet3d, ViewNetwork
-from forewarp.methods.voxel.forward import ForwardModel, ForwardWarp
-from forewarp.methods.voxel.model import Ground, VoxelMethod
-from forewarp.methods.voxel.structure import VoxelStage
+from forewarp.methods.voxel.forward import ForwardWarp
+from forewarp.methods.voxel.model import VoxelMethod
 from forewarp.renderer import Renderer
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.camera import Camera, Rays, look_at
@@ -23,7 +21,8 @@ from forewarp.scene.frame import Frame, Scene
 from forewarp.scene.view import Batch, Moment, Observation, View
 from forewarp.training.module import DynamicSceneModule
 from forewarp.training.objective import Objective
-from forewarp.training.schedule import Curriculum, StageSettings
+from forewarp.training.schedule import Curriculum, Stage, StageSettings
+from tests.support.tiny_scene import begun, built
 
 OCCUPANCY, TIME, SOLID = 0.1, 0.5, 6.0
 RADIUS = (6 * OCCUPANCY / math.pi) ** (1 / 3)
@@ -84,9 +83,8 @@ def module_of(method: VoxelMethod, weights: Mapping[str, float], side: int) -> D
     frame = Frame("0", 0.0, camera(), _no_picture)
     scene = Scene("ball", (frame,), (), (), method.radiance.lattice.box, 0.0, has_alpha=True)
     objective = Objective(weights)
-    start = Start(scene, settings.name, settings.numbers, weights=objective.weights)
     return DynamicSceneModule(
-        method.begin(start, VoxelStage(name=settings.name, **settings.numbers)),
+        begun(method, scene, Stage(settings, objective)),
         objective=objective,
         settings=settings,
         curriculum=Curriculum([i / 49 for i in range(50)], 0.0),
@@ -116,7 +114,8 @@ def make_method(
     """
     ball = body(lattice, RADIUS)
     margin = max(lattice.shape) if dense else 4
-    model = ForwardModel(
+    model = partial(
+        ForwardWarp,
         radiance=partial(FeatureRadiance, alpha_init=1e-2, alpha_threshold=0.0 if dense else 1e-4),
         motion=Motion,
         trajectory=partial(TrajectoryField, bases=15, nodes=0),
@@ -125,8 +124,8 @@ def make_method(
         view_dependence=ViewNetwork,
     )
     active = torch.ones_like(ball) if dense else ball
-    ground = Ground(lattice, active, 2 / (side - 1), lattice.box, frames=50, canonical_time=0.0)
-    method = model.build(ground, VoxelStage(num_voxels=[[0, side**3]], effects=effects))
+    options = {"density_scale": 2 / (side - 1), "frames": 50, "box": lattice.box, "effects": effects}
+    method = built(model, lattice, active, **options)
     _paint(method, ball, shift)
     return method
 

@@ -18,7 +18,7 @@ from forewarp.methods.particles.nodes import Nodes
 from forewarp.methods.rays import Marching, Sampling
 from forewarp.methods.tineuvox import TiNeuVox
 from forewarp.methods.tnerf import TNeRF
-from forewarp.methods.voxel.backward import BackwardModel, Deformation
+from forewarp.methods.voxel.backward import BackwardWarp, Deformation
 from forewarp.methods.voxel.effects import (
     LearnedUpsampler,
     Motion,
@@ -29,7 +29,7 @@ from forewarp.methods.voxel.effects import (
     UNet3d,
     ViewNetwork,
 )
-from forewarp.methods.voxel.forward import ForwardModel
+from forewarp.methods.voxel.forward import ForwardWarp
 
 
 @dataclass(frozen=True)
@@ -124,9 +124,11 @@ SMALL_VOLUMES |= {
 }
 
 METHODS = {
-    "forward": Entry(ForwardModel(GRID, motion=Motion, trajectory=TRAJECTORY), **VOXELS, effects=WARP),
+    "forward": Entry(
+        partial(ForwardWarp, radiance=GRID, motion=Motion, trajectory=TRAJECTORY), **VOXELS, effects=WARP
+    ),
     "backward": Entry(
-        BackwardModel(GRID, deformation=partial(Deformation, width=24, layers=3)),
+        partial(BackwardWarp, radiance=GRID, deformation=partial(Deformation, width=24, layers=3)),
         **VOXELS,
         effects={"view_dependence": VIEW, "background": BACKGROUND},
     ),

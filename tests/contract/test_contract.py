@@ -173,14 +173,9 @@ def test_a_term_of_weight_zero_is_never_called(name, scenes):
         assert off not in raw
 
 
-def with_options(model, options):
-    """Return a model with other options."""
-    return partial(model, **options) if isinstance(model, partial) else replace(model, **options)
-
-
 def full_model(entry):
     """Return the model with all its effects."""
-    return with_options(entry.model, {k: v for e in entry.effects.values() for k, v in e.on.items()})
+    return partial(entry.model, **{k: v for e in entry.effects.values() for k, v in e.on.items()})
 
 
 @each_effect
@@ -189,7 +184,7 @@ def test_an_effect_that_is_off_is_absent_and_one_that_is_on_is_called(name, effe
     part = entry.effects[effect]
     for of, function in part.parts:
         monkeypatch.setattr(of, function, lambda *a, at=f"{of.__name__}.{function}", **k: pytest.fail(at))
-    module = module_of(entry, data, model=with_options(full_model(entry), dict.fromkeys(part.on)))
+    module = module_of(entry, data, model=partial(full_model(entry), **dict.fromkeys(part.on)))
     data.picker = lambda: TIMES - 1  # a time at which things have moved
     backward(module, batch_of(data))
     assert not owned(module, part.owns or (effect,))

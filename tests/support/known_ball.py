@@ -2,13 +2,12 @@
 
 import torch
 
-from forewarp.fields.grids import DirectRadiance
+from forewarp.methods.method import Start
 from forewarp.methods.voxel.model import VoxelMethod, VoxelSnapshot
-from forewarp.scene.box import Lattice
 from forewarp.training.module import DynamicSceneModule
 from forewarp.training.objective import Objective
 from forewarp.training.schedule import Curriculum
-from tests.support.tiny_scene import BOX, RADIUS, TRAVEL, ball_center, stage
+from tests.support.tiny_scene import RADIANCE, RADIUS, TRAVEL, ball_center, ball_scene, stage
 
 
 class KnownBall(VoxelMethod):
@@ -17,10 +16,9 @@ class KnownBall(VoxelMethod):
     moves = True
 
     def __init__(self, count=30**3):
-        lattice = Lattice.of_count(BOX, count)
-        everywhere = torch.ones(lattice.shape, dtype=torch.bool)
-        numbers = {"alpha_init": 1e-2, "density_scale": lattice.voxel_size, "alpha_threshold": 1e-4}
-        super().__init__(DirectRadiance(lattice, everywhere, features=3, **numbers), canonical_time=0.0)
+        start = Start(ball_scene(size=8), "fine", {"num_voxels": [[0, count]]}, blank=True)
+        super().__init__(start, radiance=RADIANCE)
+        lattice = self.radiance.lattice
         self.points = lattice.to_world(self.radiance.voxels)
         self.asked = []
 

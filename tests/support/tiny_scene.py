@@ -11,7 +11,7 @@ from forewarp.data.module import SceneDataModule
 from forewarp.fields.curves import TrajectoryField
 from forewarp.fields.grids import DirectRadiance, FeatureRadiance
 from forewarp.methods.method import Start
-from forewarp.methods.voxel.backward import BackwardModel
+from forewarp.methods.voxel.backward import BackwardWarp
 from forewarp.methods.voxel.effects import (
     LearnedUpsampler,
     Motion,
@@ -20,11 +20,11 @@ from forewarp.methods.voxel.effects import (
     UNet3d,
     ViewNetwork,
 )
-from forewarp.methods.voxel.forward import ForwardModel
-from forewarp.methods.voxel.model import Ground
+from forewarp.methods.voxel.forward import ForwardWarp
 from forewarp.methods.voxel.structure import VoxelStage
 from forewarp.scene.box import Box
 from forewarp.scene.camera import Camera, look_at
+from forewarp.scene.cloud import Handover
 from forewarp.scene.frame import Frame, Scene
 from forewarp.training.objective import Objective
 from forewarp.training.schedule import StageSettings
@@ -105,21 +105,31 @@ def forward_model(**changes):
         "trajectory": partial(TrajectoryField, bases=4, nodes=8, width=32, layers=3),
         "view_dependence": SphericalHarmonics,
     }
-    return ForwardModel(**(choices | changes))
+    return partial(ForwardWarp, **(choices | changes))
 
 
 def backward_model(**changes):
     """Make a cheap backward model; name its ``deformation``."""
-    return BackwardModel(**({"radiance": RADIANCE, "view_dependence": SphericalHarmonics} | changes))
+    return partial(BackwardWarp, **({"radiance": RADIANCE, "view_dependence": SphericalHarmonics} | changes))
 
 
 def built(
-    model, lattice, active=None, *, density_scale=0.3, frames=5, canonical_time=0.0, static=None, **numbers
+    model, lattice, active=None, *, density_scale=0.3, frames=5, canonical_time=0.0, box=BOX, **numbers
 ):
-    """Build a model's method on a lattice, by default fully active; ``numbers`` are of its stage."""
-    active = torch.ones(lattice.shape, dtype=torch.bool) if active is None else active
-    ground = Ground(lattice, active, density_scale, BOX, frames, canonical_time, static)
-    return model.build(ground, VoxelStage(**({"num_voxels": [[0, 500]]} | numbers)))
+    """Make a model's method on a lattice, by default fully active; ``numbers`` are of its stage."""
+    everywhere = torch.ones(lattice.shape, dtype=torch.bool)
+    train = tuple(Frame(str(i), i / max(frames - 1, 1), camera_at(0.0), None) for i in range(frames))
+    scene = Scene("ball", train, (), (), box, canonical_time, has_alpha=True)
+    handover = Handover(box, True, frames, notes={"density_scale": density_scale})
+    start = Start(scene, "fine", {"num_voxels": [[0, 500]]} | numbers, (), handover, blank=True)
+    background = on(model.keywords.get("background"), lattice, everywhere)
+    radiance = on(model.keywords["radiance"], lattice, everywhere if active is None else active)
+    return model(start, radiance=radiance, background=background)
+
+
+def on(factory, lattice, active):
+    """Let a factory use a lattice of the test's own; None for None."""
+    return factory and (lambda *_, **options: factory(lattice, active, **options))
 
 
 def ball_method(scene, raw=8.0, **numbers):
@@ -136,17 +146,12 @@ def ball_method(scene, raw=8.0, **numbers):
 
 
 def begun(method, scene, made):
-    """Prepare a method for the stage ``made`` of a scene."""
+    """Prepare a method for the stage ``made`` of a scene, and keep its contents."""
     settings, objective = made.settings, made.objective
-    start = Start(
-        scene,
-        settings.name,
-        settings.numbers,
-        weights=objective.weights,
-        literal=objective.literal,
-        photo_on=objective.photo_on,
-    )
-    return method.begin(start, VoxelStage(name=settings.name, **settings.numbers))
+    options = {"weights": objective.weights, "literal": objective.literal, "photo_on": objective.photo_on}
+    method.stage = VoxelStage(name=settings.name, **settings.numbers)
+    method.begin(Start(scene, settings.name, settings.numbers, blank=True, **options))
+    return method
 
 
 def stage(name="coarse", weights=None, photo_on=None, **changes):

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from forewarp.fields.networks import mlp
-from forewarp.ops.encode import positional_encoding
+from forewarp.ops.encode import encoded_size, positional_encoding
 from forewarp.ops.grid import index_of, occupied_cells, trilinear
 from forewarp.scene.box import Box, Lattice
 
@@ -179,6 +179,10 @@ class VoxelGrid(nn.Module):
         """Return a parameter (N, C) by name."""
         return getattr(self, name)
 
+    def rows(self) -> list[nn.Parameter]:
+        """Return the parameters (N, C), a row for each active voxel, in the order of ``names``."""
+        return [getattr(self, name) for name in self.names]
+
     @torch.no_grad()
     def activate(self, active: Tensor, births: dict[str, float]) -> Tensor:
         """Make the voxels in ``active`` (X, Y, Z) the active ones.
@@ -331,62 +335,98 @@ def density_shift(alpha_init: float, key: str = "model.radiance.alpha_init") -> 
     return math.log(1 / (1 - alpha_init) - 1)
 
 
-class DirectRadiance(VoxelGrid):
-    """Density and colour stored in the voxels, without a network: the cheap choice.
+class CanonicalRadiance(VoxelGrid):
+    """Density and colour at the canonical time, on the active voxels of a lattice.
 
     Args:
         lattice: possible voxel positions.
         active: (X, Y, Z) bool, the active voxels.
-        features: colour channels: 3 for colour, the rest for shading by direction.
+        channels: number of channels by parameter name.
         alpha_init: opacity over ``density_scale`` at raw density 0.
         density_scale: unit of length of densities, in world units.
         alpha_threshold: skip cells whose eight voxels all have at most this opacity over one voxel.
-        box: unused, as there is no network.
     """
 
     def __init__(
         self,
         lattice: Lattice,
         active: Tensor,
+        channels: dict[str, int],
         *,
-        features: int,
         alpha_init: float,
         density_scale: float,
         alpha_threshold: float,
-        box: Box | None = None,
     ) -> None:
-        super().__init__(lattice, active, self._channels(features))
+        super().__init__(lattice, active, channels)
         self.activation = Activation(density_shift(alpha_init), density_scale)
         self.alpha_threshold = alpha_threshold
 
-    @staticmethod
-    def _channels(features: int) -> dict[str, int]:
-        channels = {"density": 1, "color": 3}
-        return channels | {"shading": features - 3} if features > 3 else channels
-
     def forward(self) -> RadianceGrid:
         """Return the canonical radiance grid, values (N, 1 + C)."""
-        values = torch.cat([self.parameter(name) for name in self.names], -1)
-        return RadianceGrid(self.lattice, self.index, values, self.activation, self.alpha_threshold)
+        return RadianceGrid(self.lattice, self.index, self.values(), self.activation, self.alpha_threshold)
+
+    def values(self) -> Tensor:
+        """Return raw density and colour features (N, 1 + C)."""
+        raise NotImplementedError
+
+    def fill(self, alpha: float) -> None:
+        """Give all active voxels the opacity ``alpha`` over one voxel."""
+        raise NotImplementedError
 
     def births(self, alpha: float) -> dict[str, float]:
-        """Return the values of new voxels by name: the density of opacity ``alpha``; colour is averaged."""
+        """Return the values of new voxels of an opacity by parameter; others get their neighbours' mean."""
+        return {}
+
+    def empties(self) -> dict[str, float]:
+        """Return the values of absent voxels by parameter, for resampling; others do not count them."""
+        return {}
+
+
+class DirectRadiance(CanonicalRadiance):
+    """Density and colour stored in the voxels, without a network: the cheap choice.
+
+    Args:
+        lattice, active: see ``CanonicalRadiance``.
+        features: colour channels: 3 for colour, the rest for shading by direction.
+        box: unused, as there is no network.
+        numbers: alpha_init, density_scale and alpha_threshold: see ``CanonicalRadiance``.
+    """
+
+    def __init__(
+        self, lattice: Lattice, active: Tensor, *, features: int, box: Box | None = None, **numbers: float
+    ) -> None:
+        channels = {"density": 1, "color": 3} | ({"shading": features - 3} if features > 3 else {})
+        super().__init__(lattice, active, channels, **numbers)
+
+    def values(self) -> Tensor:
+        """See ``CanonicalRadiance``."""
+        return torch.cat(self.rows(), -1)
+
+    @torch.no_grad()
+    def fill(self, alpha: float) -> None:
+        """See ``CanonicalRadiance``."""
+        self.density.fill_(self.activation.raw(alpha, self.lattice.voxel_size))
+
+    def births(self, alpha: float) -> dict[str, float]:
+        """Return the density of an opacity; colour is averaged."""
         return {"density": self.activation.raw(alpha, self.lattice.voxel_size)}
 
     def empties(self) -> dict[str, float]:
-        """Return the values of absent voxels by name, for resampling."""
+        """Return the density of absent voxels; colour is averaged."""
         return {"density": EMPTY}
 
 
-class FeatureRadiance(VoxelGrid):
+class FeatureRadiance(CanonicalRadiance):
     """The paper's F1: density and colour from a feature grid and the encoded position by a small MLP.
 
     Args:
-        lattice, active, features, alpha_init, density_scale, alpha_threshold: see ``DirectRadiance``.
+        lattice, active: see ``CanonicalRadiance``.
+        features: colour channels.
         grid_features: channels of the feature grid.
         width, layers: size of F1.
         frequencies: octaves of the positional encoding.
         box: normalises positions to [-1, 1] on all lattices; None: the first lattice's box.
+        numbers: alpha_init, density_scale and alpha_threshold: see ``CanonicalRadiance``.
     """
 
     def __init__(
@@ -395,50 +435,33 @@ class FeatureRadiance(VoxelGrid):
         active: Tensor,
         *,
         features: int,
-        alpha_init: float,
-        density_scale: float,
-        alpha_threshold: float,
         grid_features: int = 12,
         width: int = 128,
         layers: int = 3,
         frequencies: int = 5,
         box: Box | None = None,
+        **numbers: float,
     ) -> None:
-        super().__init__(lattice, active, {"features": grid_features})
-        self.reference = Lattice(box or lattice.box, (2, 2, 2))
+        super().__init__(lattice, active, {"features": grid_features}, **numbers)
+        self.reference, self.frequencies = Lattice(box or lattice.box, (2, 2, 2)), frequencies
         nn.init.normal_(self.features, std=0.1)
-        self.network = mlp(
-            grid_features + 3 * (1 + 2 * frequencies),
-            1 + features,
-            width=width,
-            layers=layers,
-            zero_last=True,
-        )
-        self.frequencies = frequencies
-        self.activation = Activation(density_shift(alpha_init), density_scale)
-        self.alpha_threshold = alpha_threshold
+        inputs = grid_features + encoded_size(3, frequencies)
+        self.network = mlp(inputs, 1 + features, width=width, layers=layers, zero_last=True)
         self._encoded: tuple[Tensor, Tensor] | None = None
 
-    def forward(self) -> RadianceGrid:
-        """Return the canonical radiance grid, values (N, 1 + C)."""
-        values = self.network(torch.cat([self._positions(), self.features], -1))
-        return RadianceGrid(self.lattice, self.index, values, self.activation, self.alpha_threshold)
-
-    def _positions(self) -> Tensor:
+    def values(self) -> Tensor:
+        """See ``CanonicalRadiance``."""
         # Compare the tensor itself, as an id may be reused.
         if self._encoded is None or self._encoded[0] is not self.voxels:
             points = self.reference.to_lattice(self.lattice.to_world(self.voxels))
             encoded = positional_encoding(self.reference.normalised(points), self.frequencies)
             self._encoded = (self.voxels, encoded)
-        return self._encoded[1]
+        return self.network(torch.cat([self._encoded[1], self.features], -1))
 
-    def births(self, alpha: float) -> dict[str, float]:
-        """Return nothing: new voxels get the mean features of their neighbours."""
-        return {}
-
-    def empties(self) -> dict[str, float]:
-        """Return nothing: resampling averages over the present voxels."""
-        return {}
+    @torch.no_grad()
+    def fill(self, alpha: float) -> None:
+        """See ``CanonicalRadiance``."""
+        self.network[-1].bias[0] = self.activation.raw(alpha, self.lattice.voxel_size)
 
 
 def read_strided(grid: VoxelGrid, points: Tensor, strides: Sequence[int], *, padded: bool = False) -> Tensor:

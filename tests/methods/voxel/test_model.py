@@ -30,8 +30,7 @@ LATTICE = Lattice(BOX, (5, 4, 6))
 
 
 def build(model, effects=EFFECTS, **numbers):
-    static = (LATTICE, torch.ones(LATTICE.shape, dtype=torch.bool))
-    return built(model, LATTICE, static=static, effects=effects, **numbers)
+    return built(model, LATTICE, effects=effects, **numbers)
 
 
 FULL = forward_model(**EVERYTHING, trajectory=partial(TrajectoryField, bases=3, nodes=8, features=2))

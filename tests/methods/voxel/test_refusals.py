@@ -20,6 +20,13 @@ OPACITIES, OPACITY = (
     "stage.coarse: expected 0 < birth_alpha < keep_alpha < 1",
     r"expected a number in \(0, 1\), but",
 )
+
+
+def made(model):
+    """Make the method of a first stage."""
+    return model(Start(SCENE, "coarse", {"num_voxels": [[0, 100]]}, [0]))
+
+
 GHOST = "model.{0}: expected a factory or null, but got .*choose model/{0}=none"
 STAGES = [
     ({"num_voxels": []}, r"stage.coarse.num_voxels: expected \[\[fraction, count\], ...\] .* but got \[\]"),
@@ -41,11 +48,20 @@ REFUSED = [
         for wrong, text in STAGES
     ),
     *(
-        (partial(make, **{name: {"width": 3}}), GHOST.format(name))
-        for make, name in ((forward_model, "inpainter"), (backward_model, "deformation"))
+        (lambda name=name: made(forward_model(**{name: {"width": 3}})), GHOST.format(name))
+        for name in ("inpainter", "background")
     ),
-    (backward_model, "model.deformation: expected a factory, but got null"),
-    (partial(forward_model, trajectory=None), "model.trajectory: expected a factory, but got null"),
+    *(
+        (
+            lambda wrong=wrong: made(backward_model(deformation=wrong)),
+            "model.deformation: expected a factory, but got",
+        )
+        for wrong in (None, {"width": 3})
+    ),
+    (
+        lambda: made(forward_model(trajectory=None)),
+        "model.trajectory: expected a factory, but got null; choose another model/motion",
+    ),
     *(
         (
             lambda wrong=wrong: Motion(PATHS(), **wrong),

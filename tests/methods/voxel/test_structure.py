@@ -5,7 +5,7 @@ import torch
 
 from forewarp.fields.grids import DirectRadiance
 from forewarp.methods.voxel.backward import Deformation
-from forewarp.methods.voxel.structure import box_of_all_times, occupied, refresh, resample, seen_rows
+from forewarp.methods.voxel.structure import refresh, resample, seen_rows
 from forewarp.scene.box import Box, Lattice
 from tests.support.tiny_scene import BOX, backward_model, built, forward_model
 
@@ -47,15 +47,6 @@ def number_of(made):
     """Every active voxel's number in the whole lattice."""
     x, y, z = made.voxels.unbind(-1)
     return (x * SHAPE[1] + y) * SHAPE[2] + z
-
-
-def test_occupied_is_what_is_more_opaque_than_asked():
-    made = radiance([(0, 0, 0), (5, 4, 6)])
-    mask = occupied(made, 1e-2)
-    assert mask.nonzero().tolist() == [[0, 0, 0], [5, 4, 6]]
-    assert occupied(made, 1e-9).all()
-    seen = torch.arange(210) > 0
-    assert occupied(made, 1e-2, seen).nonzero().tolist() == [[5, 4, 6]]
 
 
 def test_refresh_keeps_values_and_moments_in_the_right_rows():
@@ -169,16 +160,16 @@ def test_the_box_of_all_times_of_a_known_translation(kind):
     method = moving(kind, (0.7, -0.3, 0.0))
     home = method.radiance.lattice.to_world(torch.tensor([3.0, 4.0, 4.0]))
     voxel_size = method.radiance.lattice.voxel_size
-    box = box_of_all_times(method, [0.0, 1.0], alpha=1e-2, pad=1.5)
-    low = home + torch.tensor([0.0, -0.3, 0.0]) - 1.5 * voxel_size
-    high = home + torch.tensor([0.7, 0.0, 0.0]) + 1.5 * voxel_size
+    box = method.bounds([0.0, 1.0])
+    low = home + torch.tensor([0.0, -0.3, 0.0]) - 2 * voxel_size
+    high = home + torch.tensor([0.7, 0.0, 0.0]) + 2 * voxel_size
     assert box.low == pytest.approx(low.tolist(), abs=1e-5)
     assert box.high == pytest.approx(high.tolist(), abs=1e-5)
-    still = box_of_all_times(method, [0.0], alpha=1e-2, pad=1.5)
-    assert still.size == pytest.approx([3 * voxel_size] * 3, abs=1e-5)
+    still = method.bounds([0.0])
+    assert still.size == pytest.approx([4 * voxel_size] * 3, abs=1e-5)
 
 
 def test_nothing_has_no_box():
     method = moving("forward", (0.7, 0.0, 0.0))
     method.radiance.density.data[:] = AIR
-    assert box_of_all_times(method, [0.0, 1.0], alpha=1e-2, pad=1.0) is None
+    assert method.bounds([0.0, 1.0]) is None

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
-from forewarp.fields.grids import DirectRadiance, RadianceGrid, Shade
+from forewarp.fields.grids import RadianceGrid, Shade
 from forewarp.fields.networks import mlp
-from forewarp.methods.voxel.effects import StaticBackground, Together
-from forewarp.methods.voxel.model import Ground, VoxelMethod, VoxelModel, VoxelSnapshot
+from forewarp.methods.method import Start
+from forewarp.methods.voxel.effects import Together
+from forewarp.methods.voxel.model import Factory, VoxelMethod, VoxelSnapshot
 from forewarp.methods.voxel.planning import EFFECTS
-from forewarp.methods.voxel.structure import VoxelStage
 from forewarp.ops.encode import positional_encoding
 from forewarp.ops.grid import dilate
-from forewarp.renderer import Renderer
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.view import Moment
 
@@ -106,30 +104,23 @@ class BackwardWarp(VoxelMethod):
     """Backward warping: the canonical grid, read at samples that a deformation network displaces.
 
     Args:
-        radiance, canonical_time, view_dependence, background, renderer: as for ``ForwardWarp``.
-        deformation: displaces samples to the canonical time; None: the scene is static.
+        start: scene, stage and numbers (see ``VoxelStage``).
+        deformation: makes what displaces samples to the canonical time; not used in a static scene.
+        shared: radiance, view_dependence, background and renderer: see ``VoxelMethod``.
     """
 
     effects = tuple(effect for effect in EFFECTS if effect.name in ("view_dependence", "background"))
 
-    def __init__(
-        self,
-        radiance: DirectRadiance,
-        *,
-        canonical_time: float,
-        deformation: Deformation | None,
-        view_dependence: nn.Module | None = None,
-        background: StaticBackground | None = None,
-        renderer: Renderer | None = None,
-    ) -> None:
-        super().__init__(
-            radiance,
-            canonical_time=canonical_time,
-            renderer=renderer,
-            view_dependence=view_dependence,
-            background=background,
-        )
-        self.deformation = deformation
+    def __init__(self, start: Start, *, deformation: Factory, **shared) -> None:
+        if not callable(deformation):
+            raise ValueError(
+                f"model.deformation: expected a factory, but got {deformation!r}; choose another model"
+            )
+        super().__init__(start, **shared)
+        scene = start.scene
+        self.moves = len(scene.times) > 1
+        self.deformation = deformation(scene.box, canonical_time=scene.canonical_time) if self.moves else None
+        self.begin(start)
 
     def at(self, moment: Moment) -> VoxelSnapshot:
         """Return the field ``backward``: the displaced one, or the canonical one at the canonical time."""
@@ -183,33 +174,6 @@ class BackwardWarp(VoxelMethod):
         """Move the canonical voxels ``rows`` (N,) bool, at ``points`` (M, 3), to ``time`` (M, 3)."""
         return self.trajectories(points, torch.tensor([time]))[:, 0]
 
-    @property
-    def moves(self) -> bool:
-        """False if the scene is static."""
-        return self.deformation is not None
-
     def displacement(self, points: Tensor, time: float) -> Tensor:
         """Return the displacement (N, 3) of points at ``time`` to the canonical time; differentiable."""
         return self.deformation(points, time)
-
-    @property
-    def half_extent(self) -> float:
-        """Half the scene's longest side, in world units."""
-        return self.deformation.scale
-
-
-@dataclass(frozen=True)
-class BackwardModel(VoxelModel):
-    """The options of the baseline, ``BackwardWarp``: the same grid with a deformation network."""
-
-    deformation: Callable[..., Deformation] | None = None
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.deformation is None:
-            raise ValueError("model.deformation: expected a factory, but got null; choose another model")
-
-    def _warp(self, radiance, ground: Ground, stage: VoxelStage, features: int, common: dict) -> BackwardWarp:
-        time = ground.canonical_time
-        deformation = self.deformation(ground.box, canonical_time=time) if ground.frames > 1 else None
-        return BackwardWarp(radiance, deformation=deformation, **common)

@@ -2,32 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import ClassVar
+from functools import partial
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from forewarp.fields.curves import TrajectoryField
-from forewarp.fields.grids import DirectRadiance, FeatureRadiance, RadianceGrid
+from forewarp.fields.grids import DirectRadiance, RadianceGrid
+from forewarp.methods.method import Start
 from forewarp.methods.voxel.effects import (
     LearnedUpsampler,
-    Motion,
-    StaticBackground,
     Together,
     TrilinearUpsampler,
-    UNet3d,
     densify,
     interpolate_dense,
     occupied_crop,
     refined,
     sparsify,
 )
-from forewarp.methods.voxel.model import Ground, VoxelMethod, VoxelModel, VoxelSnapshot
+from forewarp.methods.voxel.model import Factory, VoxelMethod, VoxelSnapshot
 from forewarp.methods.voxel.planning import EFFECTS, VoxelPlanning
-from forewarp.methods.voxel.structure import VoxelStage
-from forewarp.renderer import Renderer
 from forewarp.scene.view import Moment
 
 
@@ -37,47 +30,62 @@ class ForwardWarp(VoxelMethod):
     ``at`` is the whole pipeline. Every effect may be None, and is then absent.
 
     Args:
-        radiance: the canonical radiance field.
-        canonical_time: time of the canonical field, at which nothing is warped.
-        motion: trajectories and the forward splat; None: the scene is static.
-        upsampler: refines the warped grid; None: render at the resolution of the warp.
-        inpainter: fills holes; None: one rendering instead of two.
-        view_dependence: turns features and directions into colour; None: the features are the colour.
-        background: everything static, on a grid of its own; None: a constant background colour.
-        renderer: marches the rays.
+        start: scene, stage and numbers (see ``VoxelStage``).
+        motion: makes the forward splat along trajectories; None: the scene is static.
+        trajectory: makes the field of trajectories that motion follows.
+        upsampler: makes what refines the warped grid; None: render at the resolution of the warp.
+        inpainter: makes what fills holes; None: one rendering instead of two.
+        shared: radiance, view_dependence, background and renderer: see ``VoxelMethod``.
 
     Raises:
-        ValueError: for an up-sampler whose scale is not a whole number beside an inpainter.
+        ValueError: for motion without trajectories, or an up-sampler whose scale is not a whole number beside
+            an inpainter.
     """
 
     effects = EFFECTS
+    planning = VoxelPlanning()
 
     def __init__(
         self,
-        radiance: DirectRadiance | FeatureRadiance,
+        start: Start,
         *,
-        canonical_time: float,
-        motion: Motion | None = None,
-        upsampler: TrilinearUpsampler | None = None,
-        inpainter: UNet3d | None = None,
-        view_dependence: nn.Module | None = None,
-        background: StaticBackground | None = None,
-        renderer: Renderer | None = None,
+        motion: Factory | None = None,
+        trajectory: Factory | None = None,
+        upsampler: Factory | None = None,
+        inpainter: Factory | None = None,
+        **shared,
     ) -> None:
-        super().__init__(
-            radiance,
-            canonical_time=canonical_time,
-            renderer=renderer,
-            view_dependence=view_dependence,
-            background=background,
-        )
-        self.motion, self.upsampler, self.inpainter = motion, upsampler, inpainter
-        scale = getattr(upsampler, "scale", 1)
+        super().__init__(start, **shared)
+        scene, channels = start.scene, self.channels
+        motion, inpainter = self.used("motion", motion), self.used("inpainter", inpainter)
+        upsampler = self.used("upsampler", upsampler)
+        if self.stage.upsample is not None:
+            upsampler = partial(TrilinearUpsampler, scale=self.stage.upsample)
+        made = getattr(upsampler, "func", upsampler)
+        learned = isinstance(made, type) and issubclass(made, LearnedUpsampler)
+        self.motion = self.upsampler = self.inpainter = None
+        self.moves = motion is not None and len(scene.times) > 1
+        if self.moves:
+            if trajectory is None:
+                raise ValueError(
+                    "model.trajectory: expected a factory, but got null; choose another model/motion or model"
+                )
+            field = trajectory(scene.box, frames=len(scene.times), canonical_time=scene.canonical_time)
+            self.motion = motion(field)
+        inpainter = None if inpainter is None else inpainter(channels=channels, head=not learned)
+        if learned:
+            width = 0 if inpainter is None else inpainter.width
+            self.upsampler = upsampler(channels=channels, features=width)
+        elif upsampler is not None:
+            self.upsampler = upsampler()
+        self.inpainter = inpainter
+        scale = getattr(self.upsampler, "scale", 1)
         if inpainter is not None and scale != int(scale):
             raise ValueError(
                 f"model.upsampler.scale: expected a whole number beside an inpainter, but got {scale}; "
                 "set it to 2, or choose model/inpainter=none"
             )
+        self.begin(start)
 
     def at(self, moment: Moment) -> VoxelSnapshot:
         """Warp the canonical radiance to a moment; one field for each rendering, the best last."""
@@ -175,60 +183,6 @@ class ForwardWarp(VoxelMethod):
         """Move the canonical voxels ``rows`` (N,) bool, at ``points`` (M, 3), to ``time`` (M, 3)."""
         return points + self.motion.flow(self.radiance, time)[rows]
 
-    @property
-    def moves(self) -> bool:
-        """False if the scene is static."""
-        return self.motion is not None
-
     def displacement(self, points: Tensor, time: float) -> Tensor:
         """Return the displacement (N, 3) of canonical points at ``time``, in world units; differentiable."""
         return self.trajectories(points, points.new_tensor([time]))[:, 0] - points
-
-    @property
-    def half_extent(self) -> float:
-        """Half the scene's longest side, in world units."""
-        return self.motion.trajectory.scale
-
-
-@dataclass(frozen=True)
-class ForwardModel(VoxelModel):
-    """The options of the paper's method, ``ForwardWarp``."""
-
-    planning: ClassVar[VoxelPlanning] = VoxelPlanning()
-
-    motion: Callable[..., Motion] | None = None
-    trajectory: Callable[..., TrajectoryField] | None = None
-    upsampler: Callable[..., nn.Module] | None = None
-    inpainter: Callable[..., nn.Module] | None = None
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.motion is not None and self.trajectory is None:
-            raise ValueError(
-                "model.trajectory: expected a factory, but got null; choose another model/motion or model"
-            )
-
-    def _warp(self, radiance, ground: Ground, stage: VoxelStage, features: int, common: dict) -> ForwardWarp:
-        effects, motion, inpainter = stage.effects, None, None
-        if self.motion is not None and ground.frames > 1 and "motion" in effects:
-            time = ground.canonical_time
-            motion = self.motion(self.trajectory(ground.box, frames=ground.frames, canonical_time=time))
-        if self.inpainter is not None and "inpainter" in effects:
-            learned = stage.upsample is None and "upsampler" in effects and self._learns_to_upsample
-            inpainter = self.inpainter(channels=1 + features, head=not learned)
-        upsampler = self._upsampler(features, inpainter, stage)
-        return ForwardWarp(radiance, motion=motion, upsampler=upsampler, inpainter=inpainter, **common)
-
-    @property
-    def _learns_to_upsample(self) -> bool:
-        made = getattr(self.upsampler, "func", self.upsampler)
-        return isinstance(made, type) and issubclass(made, LearnedUpsampler)
-
-    def _upsampler(self, features: int, inpainter: nn.Module | None, stage: VoxelStage) -> nn.Module | None:
-        if stage.upsample is not None:
-            return TrilinearUpsampler(scale=stage.upsample)
-        if self.upsampler is None or "upsampler" not in stage.effects:
-            return None
-        if self._learns_to_upsample:
-            return self.upsampler(channels=1 + features, features=0 if inpainter is None else inpainter.width)
-        return self.upsampler()

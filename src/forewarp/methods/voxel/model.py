@@ -1,4 +1,4 @@
-"""What forward and backward warping share: a canonical grid that is warped to any time, and its stages."""
+"""What forward and backward warping share: a canonical grid, how it is made, rendered and compared."""
 
 from __future__ import annotations
 
@@ -12,8 +12,6 @@ from torch import Tensor, nn
 
 from forewarp.fields.grids import (
     Activation,
-    DirectRadiance,
-    FeatureRadiance,
     FieldAtTime,
     RadianceGrid,
     Shade,
@@ -24,21 +22,23 @@ from forewarp.fields.grids import (
     shaded,
 )
 from forewarp.methods.method import Method, Snapshot, Start, Step
-from forewarp.methods.voxel.effects import StaticBackground
 from forewarp.methods.voxel.losses import LITERAL, TERMS, Seen, voxel_terms
-from forewarp.methods.voxel.structure import Lattices, VoxelStage, box_of_all_times, resample
-from forewarp.ops.grid import dilate, neighbour_pairs
+from forewarp.methods.voxel.structure import Lattices, VoxelStage, first_voxels, resample
+from forewarp.ops.grid import neighbour_pairs
 from forewarp.ops.march import warm_up
 from forewarp.renderer import Renderer
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.camera import Rays
 from forewarp.scene.cloud import Cloud
-from forewarp.scene.frame import Scene
 from forewarp.scene.paths import RandomPatches
-from forewarp.scene.silhouettes import visual_hull
 from forewarp.scene.view import Batch, Moment, Rendering, View
 
+SOLID = 0.1  # opacity over one voxel above which it counts as matter
 _NOTHING = 1e-3  # opacity over a voxel below which no colour is computed
+_STATIC_POINTS = 1024  # at most this many points known to be static in a step
+_MARGIN = 2.0  # voxels around all matter that the next stage's box leaves
+
+Factory = Callable[..., nn.Module]  # makes a part once the lattices are known
 
 
 @dataclass(frozen=True)
@@ -111,53 +111,119 @@ class VoxelSnapshot(Snapshot):
         return moment.time == self.moment.time
 
 
-SOLID = 0.1  # opacity over one voxel above which it counts as matter
-_STATIC_POINTS = 1024  # at most this many points known to be static in a step
-
-
 class VoxelMethod(Method):
     """A canonical radiance grid that ``at`` warps to other times. An absent effect is None.
 
+    A subclass makes its own parts, then calls ``begin``, which copies or fills in what is learned.
+
     Args:
-        radiance: the canonical radiance field.
-        canonical_time: at which nothing is warped.
+        start: scene, stage and numbers (see ``VoxelStage``).
+        radiance: makes the canonical radiance field.
+        view_dependence: makes what turns features and directions into colour; None: the features are the
+            colour.
+        background: makes everything static, on a grid of its own; None: a constant background colour.
         renderer: marches the rays.
-        view_dependence: turns features and directions into colour; None: the features are the colour.
-        background: everything static, on a grid of its own; None: a constant background colour.
+
+    Attributes:
+        moves: False if the scene is static.
+        half_extent: half the scene's longest side, in world units.
     """
 
     terms, literal = TERMS, LITERAL
+    numbers = tuple(field.name for field in fields(VoxelStage) if field.name != "name")
     moves: bool
 
     def __init__(
         self,
-        radiance: DirectRadiance | FeatureRadiance,
+        start: Start,
         *,
-        canonical_time: float,
+        radiance: Factory,
+        view_dependence: Factory | None = None,
+        background: Factory | None = None,
         renderer: Renderer | None = None,
-        view_dependence: nn.Module | None = None,
-        background: StaticBackground | None = None,
     ) -> None:
         super().__init__()
-        self.radiance, self.view_dependence, self.background = radiance, view_dependence, background
-        self.canonical_time, self.renderer = canonical_time, renderer or Renderer()
+        self.stage = stage = VoxelStage(name=start.stage, **start.numbers)
+        self.renderer = (renderer or Renderer()).with_threshold(stage.color_threshold)
+        scene, before = start.scene, _carried(start, stage)
+        self.canonical_time, self.half_extent = scene.canonical_time, 0.5 * max(scene.box.size)
         self.lattices: Lattices | None = None
+        box = scene.box if start.handover is None else start.handover.box
+        if before is not None:
+            resample(before.radiance, box, stage.at("num_voxels", 0.0), keep_alpha=stage.keep_alpha)
+            lattice, active = before.radiance.lattice, before.radiance.index >= 0
+            density_scale = before.radiance.activation.density_scale
+        else:
+            lattice = Lattice.of_count(box, stage.at("num_voxels", 0.0))
+            active, density_scale = first_voxels(start, stage, lattice), _density_scale(start, lattice)
+        common = {"density_scale": density_scale}
+        view_dependence = self.used("view_dependence", view_dependence)
+        shade = None if view_dependence is None else view_dependence()
+        features = 3 if shade is None else shade.features
+        self.channels = 1 + features  # of a radiance grid
+        self.radiance = radiance(lattice, active, features=features, box=scene.box, **common)
+        self.view_dependence, self.background = shade, None
+        if (background := self.used("background", background)) is not None:
+            static = _static_lattice(scene.box.scaled(1.05), stage, getattr(before, "background", None))
+            self.background = background(*static, **common)
 
-    def begin(self, start: Start, stage: VoxelStage) -> VoxelMethod:
-        """Prepare for a stage: its schedule, its loss terms, and what these need beside images."""
-        self.stage, self.renderer = stage, self.renderer.with_threshold(stage.color_threshold)
-        self.lattices = Lattices(self.radiance, self.background, stage)
+    def used(self, name: str, option: Factory | None) -> Factory | None:
+        """Return the factory of an effect; None if the effect is off, or is not one of this stage's.
+
+        Raises:
+            ValueError: for what is neither a factory nor None, such as a number set in an option that was
+                then switched off.
+        """
+        if option is not None and not callable(option):
+            raise ValueError(
+                f"model.{name}: expected a factory or null, but got {option!r}; "
+                f"choose model/{name}=none to switch it off"
+            )
+        return option if name in self.stage.effects else None
+
+    def begin(self, start: Start) -> None:
+        """Take over what the stage before has learned, or start with faint matter; prepare the loss terms."""
+        before = _carried(start, self.stage)
+        if before is not None:
+            ours, theirs = self.state_dict(), before.state_dict()
+            alike = {k: v for k, v in theirs.items() if torch.is_tensor(v) and k in ours}
+            self.load_state_dict(ours | {k: v for k, v in alike.items() if v.shape == ours[k].shape})
+        elif not start.blank:
+            for grid in filter(None, (self.radiance, self.background)):
+                grid.fill(self.stage.start_alpha)
+        self.lattices = Lattices(self.radiance, self.background, self.stage)
         self._terms, self._photo_on = voxel_terms(start.literal), start.photo_on
         self._keep_all_weights = bool({"point_color", "background_entropy"} & set(start.literal))
         cameras = [frame.camera for frame in start.scene.train]
-        self.patches = RandomPatches(cameras, patches=stage.patches) if cameras else None
+        self.patches = RandomPatches(cameras, patches=self.stage.patches) if cameras else None
         self.static_points, self._pairs = start.scene.still, []
-        return self
+
+    @classmethod
+    def check(
+        cls, stage: str, numbers: Mapping[str, Any], terms: Iterable[str], literal: Iterable[str] = ()
+    ) -> None:
+        """See ``Method.check``; also refuse numbers out of range."""
+        super().check(stage, numbers, terms, literal)
+        if numbers:
+            VoxelStage(name=stage, **numbers)
 
     def look(self, batch: Batch, factors: Mapping[str, float], generator: torch.Generator) -> Step:
         """See ``Method.look``; all rays of a batch have one time and are marched together."""
-        seen = self._seen(batch, generator)
-        best, state = list(seen.renderings.values())[-1], seen.state
+        state = self.at(batch.observations[0].moment)
+        rays, rgb, background = batch.joined()
+        rays, options = rays.to(self.device), {"keep_all_weights": self._keep_all_weights}
+        seen = Seen(
+            rgb,
+            state,
+            {
+                name: state.march(name, rays, background, generator=generator, **options)
+                for name in self._compared(state)
+            },
+            lambda: self._patches_of(state, generator),
+            lambda: self._stray(batch.time, generator),
+            self._neighbours,
+        )
+        best = list(seen.renderings.values())[-1]
         noted = {
             "occupied_voxels": len(state.canonical.values),
             "samples": best.samples,
@@ -167,32 +233,12 @@ class VoxelMethod(Method):
             noted["coverage"] = float(state.coverage.detach().clamp(max=1).mean())
         return Step(
             {name: partial(term, seen) for name, term in self._terms.items()},
-            (best.rgb.detach() - seen.rgb).square().mean(),
+            (best.rgb.detach() - rgb).square().mean(),
             noted,
             tensors=seen.tensors,
         )
 
-    def _seen(self, batch: Batch, generator: torch.Generator) -> Seen:
-        state = self.at(batch.observations[0].moment)
-        rays, rgb, background = batch.joined()
-        march = partial(
-            state.march,
-            rays=rays.to(self.device),
-            background=background,
-            generator=generator,
-            keep_all_weights=self._keep_all_weights,
-        )
-        renderings = {name: march(name) for name in self._wanted(state)}
-        return Seen(
-            rgb,
-            state,
-            renderings,
-            lambda: self._patches_of(state, generator),
-            lambda: self._stray(batch.time, generator),
-            self._neighbours,
-        )
-
-    def _wanted(self, state: VoxelSnapshot) -> list[str]:
+    def _compared(self, state: VoxelSnapshot) -> list[str]:
         """Names of the renderings that the per-ray terms compare: those in ``photo_on``, or all.
 
         A stage without up-sampler has ``warped`` in the place of ``upsampled``.
@@ -219,14 +265,11 @@ class VoxelMethod(Method):
         return self.displacement(self.static_points[rows].to(self.device), time) / self.half_extent
 
     def _neighbours(self, index: Tensor) -> list[tuple[Tensor, Tensor]]:
-        for known, pairs in self._pairs:
-            if known is index:
-                return pairs
-        pairs = neighbour_pairs(index)
-        self._pairs = [
-            *self._pairs[-1:],
-            (index, pairs),
-        ]  # of two grids at most
+        """Return the pairs of neighbouring voxels, kept for the two grids that were asked for last."""
+        pairs = next((pairs for known, pairs in self._pairs if known is index), None)
+        if pairs is None:
+            pairs = neighbour_pairs(index)
+            self._pairs = [*self._pairs[-1:], (index, pairs)]
         return pairs
 
     def param_groups(self) -> dict[str, list[nn.Parameter]]:
@@ -252,13 +295,32 @@ class VoxelMethod(Method):
         self.lattices.follow(progress, step, optimizer)
         return {}
 
+    def moved(self, points: Tensor, rows: Tensor, time: float) -> Tensor:
+        """Move the canonical voxels ``rows`` (N,) bool, at ``points`` (M, 3), to ``time`` (M, 3)."""
+        raise NotImplementedError
+
+    def displacement(self, points: Tensor, time: float) -> Tensor:
+        """Return how far points (N, 3) are from the canonical time at ``time`` (N, 3); differentiable."""
+        raise NotImplementedError
+
     def warm_up(self) -> None:
         """Compile the kernels."""
         warm_up(self.device)
 
+    @torch.no_grad()
     def bounds(self, times: list[float]) -> Box | None:
-        """Bound all matter more opaque than the stage's ``box_alpha``, with a margin of two voxels."""
-        return box_of_all_times(self, times, alpha=self.stage.box_alpha, pad=2.0)
+        """Bound all voxels more opaque than the stage's ``box_alpha`` at all times, with a margin."""
+        grid = self.radiance()
+        solid = grid.activation.alpha(grid.raw_density, grid.lattice.voxel_size) > self.stage.box_alpha
+        if not bool(solid.any()):
+            return None
+        home = grid.lattice.to_world(self.radiance.voxels)[solid]
+        low, high = home.amin(0), home.amax(0)
+        for time in times if self.moves else ():
+            points = self.moved(home, solid, time)
+            low, high = torch.minimum(low, points.amin(0)), torch.maximum(high, points.amax(0))
+        margin = _MARGIN * grid.lattice.voxel_size  # added first, as a flat object has no box of its own
+        return Box(tuple((low - margin).tolist()), tuple((high + margin).tolist()))
 
     @torch.no_grad()
     def matter(self) -> Cloud:
@@ -301,185 +363,29 @@ class VoxelMethod(Method):
             self.lattices.load_state_dict(state["lattices"])
 
 
-@dataclass(frozen=True)
-class VoxelModel:
-    """The options of both voxel methods: factories that still need the scene, or None for what is off.
-
-    Call it with a ``Start`` to make the method.
-    """
-
-    radiance: Callable[..., nn.Module]
-    view_dependence: Callable[..., nn.Module] | None = None
-    background: Callable[..., StaticBackground] | None = None
-    renderer: Renderer | None = None
-
-    def __post_init__(self) -> None:
-        for field in fields(self):
-            choice = getattr(self, field.name)
-            if choice is not None and not callable(choice):
-                raise ValueError(
-                    f"model.{field.name}: expected a factory or null, but got {choice!r}; "
-                    f"choose model/{field.name}=none to switch it off"
-                )
-
-    def __call__(self, start: Start) -> VoxelMethod:
-        """Make the method of a stage, from the stage before or afresh."""
-        stage = VoxelStage(name=start.stage, **start.numbers)
-        method = self.build(ground_of(self, start, stage), stage)
-        if is_carried(start, stage):
-            carried(method, start.before)
-        elif not start.blank:
-            set_start_density(method, stage.start_alpha)
-        return method.begin(start, stage)
-
-    @staticmethod
-    def check(
-        stage: str, numbers: Mapping[str, Any], terms: Iterable[str], literal: Iterable[str] = ()
-    ) -> None:
-        """Refuse keys and terms that no voxel method knows (see ``Method.check``)."""
-        VoxelStage(name=stage, **numbers)
-        VoxelMethod.check(stage, (), terms, literal)
-
-    def build(self, ground: Ground, stage: VoxelStage) -> VoxelMethod:
-        """Make the method on given lattices."""
-        view_dependence = None
-        if self.view_dependence is not None and "view_dependence" in stage.effects:
-            view_dependence = self.view_dependence()
-        features = 3 if view_dependence is None else view_dependence.features
-        radiance = self.radiance(
-            ground.lattice,
-            ground.active,
-            features=features,
-            density_scale=ground.density_scale,
-            box=ground.box,
-        )
-        background = None
-        if self.background is not None and "background" in stage.effects:
-            background = self.background(*ground.static, density_scale=ground.density_scale)
-        common = {
-            "canonical_time": ground.canonical_time,
-            "view_dependence": view_dependence,
-            "background": background,
-        }
-        return self._warp(radiance, ground, stage, features, common | {"renderer": self.renderer})
-
-    def _warp(self, radiance, ground: Ground, stage: VoxelStage, features: int, common: dict) -> VoxelMethod:
-        raise NotImplementedError
+def _carried(start: Start, stage: VoxelStage) -> VoxelMethod | None:
+    """Return the method of the stage before, if this stage continues with its grids."""
+    before = start.before if stage.carry and not start.blank else None
+    return before if isinstance(before, VoxelMethod) else None
 
 
-@dataclass(frozen=True)
-class Ground:
-    """The lattices that a voxel method is built on.
-
-    Attributes:
-        lattice: lattice of the canonical grid.
-        active: (X, Y, Z) bool, its active voxels.
-        density_scale: length that density is measured in, world units.
-        box: the scene's box; normalises positions in all stages.
-        frames: number of distinct training times; with one there is no motion.
-        canonical_time: in [0, 1].
-        static: lattice and active voxels of the static background, if the model has one.
-    """
-
-    lattice: Lattice
-    active: Tensor
-    density_scale: float
-    box: Box
-    frames: int
-    canonical_time: float
-    static: tuple[Lattice, Tensor] | None = None
-
-
-def is_carried(start: Start, stage: VoxelStage) -> bool:
-    """Return whether a stage continues with the grids of the stage before."""
-    return stage.carry and not start.blank and isinstance(getattr(start.before, "radiance", None), VoxelGrid)
-
-
-def ground_of(model: VoxelModel, start: Start, stage: VoxelStage) -> Ground:
-    """Find the lattices and active voxels of a stage. Cost: a hull reads each of its images once."""
-    scene, before = start.scene, start.before if is_carried(start, stage) else None
-    box = scene.box if start.handover is None else start.handover.box
-    if before is not None:
-        resample(before.radiance, box, stage.at("num_voxels", 0.0), keep_alpha=stage.keep_alpha)
-        lattice, active = before.radiance.lattice, before.radiance.index >= 0
-        density_scale = before.radiance.activation.density_scale
-    else:
-        lattice = Lattice.of_count(box, stage.at("num_voxels", 0.0))
-        known = {} if start.handover is None else start.handover.notes
-        density_scale, active = known.get("density_scale", lattice.voxel_size), _first(start, lattice, stage)
-        if not density_scale > 0:
-            raise ValueError(
-                f"stage.{start.stage}: expected a density_scale > 0 from the stage before, "
-                f"but got {density_scale}; delete the folder of that stage"
-            )
-    static = None
-    if model.background is not None and "background" in stage.effects:
-        static = _static(scene.box.scaled(1.05), stage, getattr(before, "background", None))
-    return Ground(lattice, active, density_scale, scene.box, len(scene.times), scene.canonical_time, static)
-
-
-def carried(method: nn.Module, before: nn.Module) -> None:
-    """Copy the learned values that two methods on the same lattice share."""
-    for name in set(before.radiance.names) & set(method.radiance.names):
-        method.radiance.parameter(name).data.copy_(before.radiance.parameter(name).data)
-    own, theirs = method.state_dict(), before.state_dict()
-    rest = {
-        k: v
-        for k, v in theirs.items()
-        if torch.is_tensor(v)
-        and k in own
-        and own[k].shape == v.shape
-        and (not k.startswith("radiance.") or k.startswith("radiance.network"))
-    }
-    method.load_state_dict(own | rest)
-
-
-def set_start_density(method: nn.Module, alpha: float) -> None:
-    """Give all active voxels the opacity ``alpha`` over one voxel."""
-    for grid in (method.radiance, method.background):
-        if grid is None:
-            continue
-        raw = grid.activation.raw(alpha, grid.lattice.voxel_size)
-        with torch.no_grad():
-            if "density" in grid.names:
-                grid.parameter("density").fill_(raw)
-            else:
-                grid.network[-1].bias[0] = raw
-
-
-def _static(box: Box, stage: VoxelStage, before: VoxelGrid | None) -> tuple[Lattice, Tensor]:
-    """Return lattice and active voxels of the static background: of the stage before, or all of ``box``."""
-    voxels = stage.at("background_num_voxels", 0.0)
-    if before is None:
-        lattice = Lattice.of_count(box, voxels)
-        return lattice, torch.ones(lattice.shape, dtype=torch.bool)
-    resample(before, box, voxels, keep_alpha=stage.keep_alpha)
-    return before.lattice, before.index >= 0
-
-
-def _first(start: Start, lattice: Lattice, stage: VoxelStage) -> Tensor:
-    """Return the voxels (X, Y, Z) bool that are active at first: the visual hull, or all."""
-    scene, every = start.scene, torch.ones(lattice.shape, dtype=torch.bool)
-    hull = stage.start == "hull" or (stage.start == "auto" and scene.has_alpha)
-    if start.blank or not hull:
-        return every
-    if not scene.has_alpha:
+def _density_scale(start: Start, lattice: Lattice) -> float:
+    """Return the length that density is measured in: of the stage before, or a voxel."""
+    notes = {} if start.handover is None else start.handover.notes
+    density_scale = notes.get("density_scale", lattice.voxel_size)
+    if not density_scale > 0:
         raise ValueError(
-            f"stage.{start.stage}.start: expected box, since the images of '{scene.name}' have no alpha, "
-            "but got hull"
+            f"stage.{start.stage}: expected a density_scale > 0 from the stage before, "
+            f"but got {density_scale}; delete the folder of that stage"
         )
-    inside = _hull(scene, lattice, stage, list(start.frames))
-    return inside if bool(inside.any()) else every
+    return density_scale
 
 
-def _hull(scene: Scene, lattice: Lattice, stage: VoxelStage, frames: list[int]) -> Tensor:
-    count, times = stage.hull_frames, [scene.train[i].time for i in frames]
-    while count < len(frames) and times[count] == times[count - 1]:
-        count += 1  # all views of each time: some neighbouring cameras alone bound nothing
-    frames, masks = frames[:count], []
-    for i in frames:
-        pixels = max(1, round(stage.hull_grow * scene.train[i].camera.width))
-        masks.append(dilate(scene.train[i].load()[..., 3] > 127, pixels))
-    points = lattice.to_world(lattice.all_voxels())
-    hull = visual_hull(points, [scene.train[i].camera for i in frames], masks, stage.hull_misses)
-    return hull.reshape(lattice.shape)
+def _static_lattice(box: Box, stage: VoxelStage, before: VoxelGrid | None) -> tuple[Lattice, Tensor]:
+    """Return lattice and active voxels of the static background: of the stage before, or all of ``box``."""
+    num_voxels = stage.at("background_num_voxels", 0.0)
+    if before is None:
+        lattice = Lattice.of_count(box, num_voxels)
+        return lattice, torch.ones(lattice.shape, dtype=torch.bool)
+    resample(before, box, num_voxels, keep_alpha=stage.keep_alpha)
+    return before.lattice, before.index >= 0

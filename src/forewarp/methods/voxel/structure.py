@@ -9,10 +9,11 @@ import torch
 from torch import Tensor
 
 from forewarp.fields.grids import EMPTY, VoxelGrid
-from forewarp.methods.method import steps_of
+from forewarp.methods.method import FRACTION, Start, check_number, steps_of
 from forewarp.methods.rows import renew_parameters
 from forewarp.ops.grid import dilate, trilinear
 from forewarp.scene.box import Box, Lattice
+from forewarp.scene.silhouettes import visual_hull
 
 EFFECTS = ("motion", "view_dependence", "upsampler", "inpainter", "background")
 
@@ -77,20 +78,17 @@ class VoxelStage:
 
     def __post_init__(self) -> None:
         where = f"stage.{self.name}"
-        for key in ("num_voxels", "background_num_voxels", "bases"):
-            if key != "bases" or self.bases:
-                steps_of(f"{where}.{key}", getattr(self, key))
+        for key in ("num_voxels", "background_num_voxels", *(["bases"] if self.bases else [])):
+            steps_of(f"{where}.{key}", getattr(self, key))
         if not set(self.effects) <= set(EFFECTS):
             raise ValueError(
                 f"{where}.effects: expected some of {', '.join(EFFECTS)}, but got {list(self.effects)}"
             )
         if self.start not in ("auto", "box", "hull"):
             raise ValueError(f"{where}.start: expected auto, box or hull, but got '{self.start}'")
-        if not 0 <= self.confine <= 1:
-            raise ValueError(f"{where}.confine: expected a fraction in [0, 1], but got {self.confine}")
+        check_number(f"{where}.confine", self.confine, *FRACTION)
         for key in ("box_alpha", "start_alpha"):
-            if not 0 < getattr(self, key) < 1:
-                raise ValueError(f"{where}.{key}: expected a number in (0, 1), but got {getattr(self, key)}")
+            check_number(f"{where}.{key}", getattr(self, key), "a number in (0, 1)", lambda a: 0 < a < 1)
         if not 0 < self.birth_alpha < self.keep_alpha < 1:
             raise ValueError(
                 f"{where}: expected 0 < birth_alpha < keep_alpha < 1, or fog spreads, "
@@ -106,14 +104,30 @@ class VoxelStage:
         return value
 
 
-@dataclass
-class _Followed:
-    """A grid, the key of its schedule, its present number of voxels and the step at which it got them."""
+def first_voxels(start: Start, stage: VoxelStage, lattice: Lattice) -> Tensor:
+    """Return the voxels (X, Y, Z) bool that are active at first: the visual hull, or all.
 
-    grid: VoxelGrid
-    key: str
-    num_voxels: float
-    step: int = 0
+    Cost: a hull reads each of its images once.
+    """
+    scene, everywhere = start.scene, torch.ones(lattice.shape, dtype=torch.bool)
+    hull = stage.start == "hull" or (stage.start == "auto" and scene.has_alpha)
+    if start.blank or not hull:
+        return everywhere
+    if not scene.has_alpha:
+        raise ValueError(
+            f"stage.{start.stage}.start: expected box, since the images of '{scene.name}' have no alpha, "
+            "but got hull"
+        )
+    frames, count = [scene.train[i] for i in start.frames], stage.hull_frames
+    while count < len(frames) and frames[count].time == frames[count - 1].time:
+        count += 1  # all views of each time: some neighbouring cameras alone bound nothing
+    frames, masks = frames[:count], []
+    for frame in frames:
+        pixels = max(1, round(stage.hull_grow * frame.camera.width))
+        masks.append(dilate(frame.load()[..., 3] > 127, pixels))
+    points = lattice.to_world(lattice.all_voxels())
+    inside = visual_hull(points, [frame.camera for frame in frames], masks, stage.hull_misses)
+    return inside.reshape(lattice.shape) if bool(inside.any()) else everywhere
 
 
 class Lattices:
@@ -122,49 +136,43 @@ class Lattices:
     Args:
         radiance: the canonical grid.
         background: the static grid, or None.
-        settings: the numbers of the stage.
+        stage: the numbers of the stage.
     """
 
-    def __init__(self, radiance: VoxelGrid, background: VoxelGrid | None, settings: VoxelStage) -> None:
-        self.settings = settings
-        grids = {"num_voxels": radiance, "background_num_voxels": background}
-        self.followed = [
-            _Followed(grid, key, settings.at(key, 0.0)) for key, grid in grids.items() if grid is not None
-        ]
+    def __init__(self, radiance: VoxelGrid, background: VoxelGrid | None, stage: VoxelStage) -> None:
+        self.stage, self.grids = stage, {"num_voxels": radiance}
+        if background is not None:
+            self.grids["background_num_voxels"] = background
+        # By the key of a grid's schedule: its present number of voxels, and the step at which it got them.
+        self.followed = {key: [stage.at(key, 0.0), 0] for key in self.grids}
         # Voxels that were active at the start; meaningful on the first lattice only.
         self.home: Tensor = radiance.index >= 0
 
     def follow(self, fraction: float, step: int, optimizer: torch.optim.Optimizer) -> None:
         """Resample or refresh the grids that are due at a fraction of the stage."""
-        for followed in self.followed:
-            self._follow(followed, fraction, step, optimizer)
-
-    def _follow(
-        self, followed: _Followed, fraction: float, step: int, optimizer: torch.optim.Optimizer
-    ) -> None:
-        settings, grid = self.settings, followed.grid
-        only_seen = settings.see_steps > 0 and step - followed.step >= settings.see_steps
-        common = {"keep_alpha": settings.keep_alpha, "optimizer": optimizer, "only_seen": only_seen}
-        num_voxels = settings.at(followed.key, fraction)
-        due = settings.refresh_every and step and step % settings.refresh_every == 0
-        if num_voxels != followed.num_voxels:
-            resample(grid, grid.lattice.box, num_voxels, **common)
-            followed.num_voxels, followed.step = num_voxels, step
-        elif due and fraction >= settings.refresh_from:
-            confined = followed.key == "num_voxels" and fraction < settings.confine
-            confined = confined and self.home.shape == grid.lattice.shape
-            allowed = self.home.to(grid.index.device) if confined else None
-            refresh(grid, birth_alpha=settings.birth_alpha, allowed=allowed, **common)
+        stage = self.stage
+        due = stage.refresh_every and step and step % stage.refresh_every == 0
+        for key, grid in self.grids.items():
+            (present, since), num_voxels = self.followed[key], stage.at(key, fraction)
+            only_seen = stage.see_steps > 0 and step - since >= stage.see_steps
+            common = {"keep_alpha": stage.keep_alpha, "optimizer": optimizer, "only_seen": only_seen}
+            if num_voxels != present:
+                resample(grid, grid.lattice.box, num_voxels, **common)
+                self.followed[key] = [num_voxels, step]
+            elif due and fraction >= stage.refresh_from:
+                confined = key == "num_voxels" and fraction < stage.confine
+                confined = confined and self.home.shape == grid.lattice.shape
+                allowed = self.home.to(grid.index.device) if confined else None
+                refresh(grid, birth_alpha=stage.birth_alpha, allowed=allowed, **common)
 
     def state_dict(self) -> dict:
         """Return all that is needed to continue."""
-        return {"home": self.home, "followed": {f.key: [f.num_voxels, f.step] for f in self.followed}}
+        return {"home": self.home, "followed": self.followed}
 
     def load_state_dict(self, state: dict) -> None:
         """Continue from a ``state_dict``."""
         self.home = state["home"]
-        for followed in self.followed:
-            followed.num_voxels, followed.step = state["followed"][followed.key]
+        self.followed = {key: list(state["followed"][key]) for key in self.grids}
 
 
 def seen_rows(radiance: VoxelGrid, optimizer: torch.optim.Optimizer) -> Tensor:
@@ -174,18 +182,6 @@ def seen_rows(radiance: VoxelGrid, optimizer: torch.optim.Optimizer) -> Tensor:
     if moments is None:
         return torch.ones(len(radiance.voxels), dtype=torch.bool, device=radiance.voxels.device)
     return moments.amax(-1) > 0
-
-
-def occupied(radiance: VoxelGrid, keep_alpha: float, seen: Tensor | None = None) -> Tensor:
-    """Voxels (X, Y, Z) bool with an opacity above ``keep_alpha`` over one voxel that are ``seen`` (N,)."""
-    with torch.no_grad():
-        grid = radiance()
-    solid = grid.activation.alpha(grid.raw_density, grid.lattice.voxel_size) > keep_alpha
-    solid = solid if seen is None else solid & seen
-    mask = torch.zeros(grid.lattice.shape, dtype=torch.bool, device=solid.device)
-    x, y, z = radiance.voxels[solid].unbind(-1)
-    mask[x, y, z] = True
-    return mask
 
 
 @torch.no_grad()
@@ -213,15 +209,20 @@ def refresh(
     Returns:
         whether the active voxels changed.
     """
-    mask = occupied(radiance, keep_alpha, seen_rows(radiance, optimizer) if only_seen else None)
+    grid = radiance()
+    solid = grid.activation.alpha(grid.raw_density, grid.lattice.voxel_size) > keep_alpha
+    if only_seen:
+        solid = solid & seen_rows(radiance, optimizer)
+    mask = torch.zeros(grid.lattice.shape, dtype=torch.bool, device=solid.device)
+    mask[radiance.voxels[solid].unbind(-1)] = True
     if not bool(mask.any()):
         return False
     active = dilate(mask, 1) if allowed is None else (dilate(mask, 1) & allowed) | mask
     if bool((active == (radiance.index >= 0)).all()):
         return False
-    before = [radiance.parameter(n) for n in radiance.names]
+    before = radiance.rows()
     rows = radiance.activate(active, radiance.births(birth_alpha))
-    renew_parameters(optimizer, before, [radiance.parameter(n) for n in radiance.names], rows)
+    renew_parameters(optimizer, before, radiance.rows(), rows)
     return True
 
 
@@ -254,26 +255,7 @@ def resample(
     mask = dilate(solid.reshape(lattice.shape), 1)
     if not bool(mask.any()):
         mask = torch.ones_like(mask)
-    before = [radiance.parameter(n) for n in radiance.names]
+    before = radiance.rows()
     radiance.resample(lattice, mask, radiance.empties())
     if optimizer is not None:
-        renew_parameters(optimizer, before, [radiance.parameter(n) for n in radiance.names], None)
-
-
-@torch.no_grad()
-def box_of_all_times(method, times: list[float], *, alpha: float, pad: float) -> Box | None:
-    """Bound all voxels more opaque than ``alpha`` at all ``times``, with a margin of ``pad`` voxels.
-
-    Return None if no voxel is that opaque.
-    """
-    grid = method.radiance()
-    solid = grid.activation.alpha(grid.raw_density, grid.lattice.voxel_size) > alpha
-    if not bool(solid.any()):
-        return None
-    home = grid.lattice.to_world(method.radiance.voxels)[solid]
-    low, high = home.amin(0), home.amax(0)
-    for time in times if method.moves else ():
-        at = method.moved(home, solid, time)
-        low, high = torch.minimum(low, at.amin(0)), torch.maximum(high, at.amax(0))
-    margin = pad * grid.lattice.voxel_size  # added first, as a flat object has no box of its own
-    return Box(tuple((low - margin).tolist()), tuple((high + margin).tolist()))
+        renew_parameters(optimizer, before, radiance.rows(), None)
