@@ -124,6 +124,11 @@ class Lattice:
         c = coordinates.to(dtype)
         return c * c.new_tensor(self.spacing) + c.new_tensor(self.box.low)
 
+    def holds(self, coordinates: Tensor) -> Tensor:
+        """Return whether lattice coordinates (..., 3) lie within the box: bool (...,)."""
+        last = coordinates.new_tensor(self.shape) - 1
+        return ((coordinates >= 0) & (coordinates <= last)).all(-1)
+
     def normalised(self, coordinates: Tensor) -> Tensor:
         """Scale lattice coordinates (..., 3) to [-1, 1] per axis, for positional encoding."""
         last = torch.tensor([n - 1 for n in self.shape], device=coordinates.device)

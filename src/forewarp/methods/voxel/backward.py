@@ -86,14 +86,10 @@ class MovedField:
         displacement = self.deformation(self.lattice.to_world(points), self.time)
         return points + displacement / points.new_tensor(self.lattice.spacing)
 
-    def _inside(self, points: Tensor) -> Tensor:
-        last = torch.tensor(self.lattice.shape, device=points.device) - 1
-        return ((points >= 0) & (points <= last)).all(-1)
-
     def density(self, points: Tensor) -> Tensor:
         """Density (P,); 0 where the canonical position lies outside the box."""
         moved = self._moved(points)
-        return self.canonical.density(moved) * self._inside(moved.detach())
+        return self.canonical.density(moved) * self.lattice.holds(moved.detach())
 
     def colors(self, points: Tensor, directions: Tensor, shade: Shade | None) -> Tensor:
         """Colour (P, 3); directions are not warped."""

@@ -159,20 +159,15 @@ class ConvBlock(nn.Module):
 class Pointwise(nn.Conv3d):
     """A 1 x 1 x 1 convolution, as a matrix product over the last channels."""
 
-    def __init__(self, inputs: int, outputs: int) -> None:
+    def __init__(self, inputs: int, outputs: int, *, zero: bool = False) -> None:
         super().__init__(inputs, outputs, 1)
+        if zero:  # start as 0
+            nn.init.zeros_(self.weight)
+            nn.init.zeros_(self.bias)
 
     def forward(self, x: Tensor) -> Tensor:
         """(1, I, x, y, z) -> (1, O, x, y, z), channels last."""
         return functional.linear(x.movedim(1, -1), self.weight.flatten(1), self.bias).movedim(-1, 1)
-
-
-def zero_head(inputs: int, outputs: int) -> Pointwise:
-    """Make a pointwise layer that starts as 0."""
-    head = Pointwise(inputs, outputs)
-    nn.init.zeros_(head.weight)
-    nn.init.zeros_(head.bias)
-    return head
 
 
 class UNet3d(nn.Module):
@@ -218,7 +213,7 @@ class UNet3d(nn.Module):
             nn.Sequential(ConvBlock(deep + skip, skip), ConvBlock(skip, skip))
             for deep, skip in zip(widths[:0:-1], widths[-2::-1])
         )
-        self.head = zero_head(width, channels) if head else None
+        self.head = Pointwise(width, channels, zero=True) if head else None
 
     def features(self, dense: Tensor) -> Tensor:
         """(1, I, x, y, z) -> (1, width, x, y, z); any size of at least one voxel."""
@@ -310,26 +305,22 @@ class LearnedUpsampler(TrilinearUpsampler):
         self.scale, self.margin, self.recompute = int(scale), margin, recompute
         self.project = Pointwise(features or channels, width)
         self.layers = nn.Sequential(ConvBlock(width, width), ConvBlock(width, width))
-        self.head = zero_head(width, channels)
+        self.head = Pointwise(width, channels, zero=True)
 
     def residual(self, features: Tensor, crop: Crop) -> Tensor:
         """Coarse features (1, F, x, y, z) of ``crop`` -> detail (1, 1 + C, x', y', z') of the fine crop."""
         first, second = self.layers
 
-        def refine(coarse: Tensor) -> Tensor:
-            return first(interpolate_dense(coarse, crop, self.scale))
-
-        def finish(fine: Tensor) -> Tensor:
-            return self.head(second(fine))
+        def held(part: Callable[[Tensor], Tensor], volume: Tensor) -> Tensor:
+            if not self.recompute:
+                return part(volume)
+            return checkpoint(part, volume, use_reentrant=False, preserve_rng_state=False)
 
         # Project to few channels first, as all the cost is at the fine resolution.
-        detail = self._held(finish, self._held(refine, self.project(features)))
+        coarse = self.project(features)
+        fine = held(lambda volume: first(interpolate_dense(volume, crop, self.scale)), coarse)
+        detail = held(lambda volume: self.head(second(volume)), fine)
         return detail.to(self.head.weight.dtype)  # half precision ends with the convolutions
-
-    def _held(self, part: Callable[[Tensor], Tensor], volume: Tensor) -> Tensor:
-        if not self.recompute:
-            return part(volume)
-        return checkpoint(part, volume, use_reentrant=False, preserve_rng_state=False)
 
     def alone(self, grid: RadianceGrid) -> RadianceGrid:
         """Up-sample a warped grid without an inpainter: interpolation plus learned detail."""
@@ -411,28 +402,24 @@ class Together:
         """Cells in which either field may hold matter."""
         return self.static.cells | overlapped(self.moving.cells, self.moving.lattice, self.lattice)
 
-    def _moved(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the points in coordinates of the moving lattice, and which of them lie inside."""
+    def _in_moving(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Return which rows of the points lie in the moving lattice, and these in its coordinates."""
         own = self.moving.lattice.to_lattice(self.lattice.to_world(points))
-        last = torch.tensor(self.moving.lattice.shape, device=own.device) - 1
-        return own, ((own >= 0) & (own <= last)).all(-1)
-
-    def _moving_density(self, points: Tensor) -> Tensor:
-        own, inside = self._moved(points)
-        rows = inside.nonzero()[:, 0]
-        return points.new_zeros(len(points)).index_copy(0, rows, self.moving.density(own[rows]))
+        rows = self.moving.lattice.holds(own).nonzero()[:, 0]
+        return rows, own[rows]
 
     def density(self, points: Tensor) -> Tensor:
         """Density (P,)."""
-        return self.static.density(points) + self._moving_density(points)
+        rows, own = self._in_moving(points)
+        moving = points.new_zeros(len(points)).index_copy(0, rows, self.moving.density(own))
+        return self.static.density(points) + moving
 
     def colors(self, points: Tensor, directions: Tensor, shade: Callable | None) -> Tensor:
         """Colour (P, 3): the mean of both fields' colours, weighted by density."""
-        own, inside = self._moved(points)
-        rows = inside.nonzero()[:, 0]
+        rows, own = self._in_moving(points)
         static = self.static.colors(points, directions, None)
-        moving = self.moving.colors(own[rows], directions[rows], shade)
-        sigma = self.moving.density(own[rows])
+        moving = self.moving.colors(own, directions[rows], shade)
+        sigma = self.moving.density(own)
         # The floor avoids 0 / 0 where both fields are empty.
         share = sigma / (sigma + self.static.density(points[rows])).clamp(min=torch.finfo(sigma.dtype).tiny)
         mixed = torch.lerp(static[rows], moving, share[:, None])
@@ -448,30 +435,15 @@ def overlapped(cells: Tensor, source: Lattice, target: Lattice) -> Tensor:
     Returns:
         cells of ``target``, (X'-1, Y'-1, Z'-1) bool.
 
-    Cost: eight reads per target cell inside the source's box, and one cumulative sum of the source's cells.
+    Cost: along each axis in turn, a cumulative sum and two reads per target cell.
     """
-    total = torch.nn.functional.pad(cells.int(), (1, 0, 1, 0, 1, 0))
-    for axis in range(3):
-        total = total.cumsum(axis, dtype=torch.int32)
-    bounds, parts = [], []
+    counts = cells.int()
     for axis in range(3):
         edges = torch.arange(target.shape[axis], dtype=torch.float64, device=cells.device)
         edges = edges * target.spacing[axis] + (target.box.low[axis] - source.box.low[axis])
-        edges = edges / source.spacing[axis]
-        last = cells.shape[axis]
+        edges, last = edges / source.spacing[axis], cells.shape[axis]
         low, high = edges[:-1].floor().clamp(0, last).long(), edges[1:].ceil().clamp(0, last).long()
-        inside = (high > low).nonzero()[:, 0]
-        parts.append(inside)
-        bounds.append((low[inside], high[inside]))
-    result = torch.zeros([n - 1 for n in target.shape], dtype=torch.bool, device=cells.device)
-    if all(len(p) for p in parts):
-        count = _box_counts(total, bounds)
-        result[parts[0][:, None, None], parts[1][:, None], parts[2]] = count > 0
-    return result
-
-
-def _box_counts(total: Tensor, bounds: list[tuple[Tensor, Tensor]]) -> Tensor:
-    """Count the True cells in every box of ``bounds``, from their cumulative sum over all axes."""
-    for axis, (low, high) in enumerate(bounds):
-        total = total.index_select(axis, high) - total.index_select(axis, low)
-    return total
+        total = counts.cumsum(axis, dtype=torch.int32)
+        total = torch.cat([torch.zeros_like(total.narrow(axis, 0, 1)), total], axis)
+        counts = total.index_select(axis, high) - total.index_select(axis, low)
+    return counts > 0

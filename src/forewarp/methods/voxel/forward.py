@@ -143,25 +143,20 @@ class ForwardWarp(VoxelMethod):
     ) -> tuple[dict[str, RadianceGrid], Tensor]:
         """Return the grid before and after inpainting, and their difference, on the occupied box."""
         crop = occupied_crop(warped.index, self.inpainter.margin)
-        dense = densify(warped, crop)
-        inputs = dense
+        dense = inputs = densify(warped, crop)
         if self.inpainter.coverage_channel:
             cover = warped.values.new_ones(len(warped.values)) if coverage is None else coverage.clamp(max=1)
-            inputs = torch.cat(
-                [dense, densify(warped.with_values(cover[:, None] * 1.0), crop).clamp(min=0)], 1
-            )
+            cover = densify(warped.with_values(cover[:, None]), crop).clamp(min=0)
+            inputs = torch.cat([dense, cover], 1)
         features = self.inpainter.features(inputs)
+        learned = isinstance(self.upsampler, LearnedUpsampler)
+        residual = self.upsampler.residual(features, crop) if learned else self.inpainter.residual(features)
         lattice, region = warped.lattice, crop
-        if isinstance(self.upsampler, LearnedUpsampler):
-            residual = self.upsampler.residual(features, crop)
-        else:
-            residual = self.inpainter.residual(features)
         if self.upsampler is not None:
             scale = int(self.upsampler.scale)
             lattice, region = refined(lattice, scale), crop.scaled(scale)
             dense = interpolate_dense(dense, crop, scale)
-            if residual.shape[2:] != dense.shape[2:]:
-                residual = interpolate_dense(residual, crop, scale)
+            residual = residual if learned else interpolate_dense(residual, crop, scale)
         upsampled = sparsify(warped, lattice, region, dense)
         inpainted = sparsify(warped, lattice, region, dense + residual)
         return {self.first_rendering: upsampled, "inpainted": inpainted}, residual

@@ -92,11 +92,11 @@ class VoxelSnapshot(Snapshot):
     def solid(self, lattice: Lattice, chunk: int = 1 << 18) -> tuple[Tensor, Tensor]:
         """See ``HasSolid``: the opacity over one voxel, of the best rendering's field."""
         field = self.fields[self.renderings[-1]]
-        voxels, last = lattice.all_voxels(), torch.tensor(field.lattice.shape) - 1
+        voxels = lattice.all_voxels()
         opacity, colors = torch.zeros(len(voxels)), torch.zeros(len(voxels), 3)
         for begin in range(0, len(voxels), chunk):
             points = field.lattice.to_lattice(lattice.to_world(voxels[begin : begin + chunk]))
-            inside = ((points >= 0) & (points <= last)).all(-1).nonzero()[:, 0]
+            inside = field.lattice.holds(points).nonzero()[:, 0]
             points = points[inside].to(self.canonical.values)
             alpha = -torch.expm1(-field.density(points) * field.voxel_size)
             some = (alpha > _NOTHING).nonzero()[:, 0]
