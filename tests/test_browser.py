@@ -1,3 +1,6 @@
+"""What the viewer's pages and the exported page share; where there is no browser to test them in."""
+
+import sys
 from types import SimpleNamespace
 
 import numpy as np
@@ -6,6 +9,7 @@ import torch
 
 from forewarp.browser import begin_at, silent, splat_arrays, vertical_fov
 from forewarp.scene.cloud import Ellipsoids
+from tests.support.browser import NEEDED, chromium
 from tests.support.tiny_scene import ball_scene
 
 
@@ -46,3 +50,18 @@ def test_silence_ends(capsys):
         print("viser listens")
     print("here")
     assert capsys.readouterr().out == "here\n"
+
+
+@pytest.mark.parametrize(
+    ("needed", "outcome"), [("", pytest.skip.Exception), ("1", pytest.fail.Exception)], ids=["skip", "fail"]
+)
+@pytest.mark.parametrize("lacks", ["playwright", "chromium"])
+def test_a_missing_browser_skips_its_tests_or_fails_where_it_is_needed(monkeypatch, lacks, needed, outcome):
+    monkeypatch.setenv(NEEDED, needed)
+    if lacks == "playwright":
+        monkeypatch.setitem(sys.modules, "playwright.sync_api", None)
+    else:
+        pytest.importorskip("playwright.sync_api", reason="no playwright; make install-browser adds it")
+        monkeypatch.setattr("shutil.which", lambda name: "/nowhere/chromium")
+    with pytest.raises(outcome, match=f"no {lacks}.*make install-browser"), chromium():
+        pass

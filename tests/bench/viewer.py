@@ -18,13 +18,12 @@ import torch
 from omegaconf import OmegaConf
 
 from forewarp.cli.entry import quiet
-from forewarp.cli.view import subject_of
+from forewarp.cli.view import renderer_of
 from forewarp.runs.config import saved_config
 from forewarp.runs.config_files import project_root
 from forewarp.scene.paths import orbit
-from forewarp.viewer.look import first_look, pivot
-from forewarp.viewer.server import served
-from forewarp.viewer.studio import Studio
+from forewarp.viewer.rendering import SPLATS, Viewer, ViewState
+from forewarp.viewer.server import serve
 from tests.stability.report import replace_section, table
 from tests.support.browser import Tab, chromium, until
 
@@ -38,41 +37,40 @@ _FRAMES = """seconds => new Promise(done => {
 })"""
 
 
-def studio_of(run: Path) -> Studio:
+def viewer_of(run: Path) -> Viewer:
     """Open a run as the command does."""
     config = OmegaConf.create({"points": 300, "tail": 0.5, "threads": torch.get_num_threads()})
-    subject = subject_of(saved_config(str(run), config), config)
-    return Studio(subject.scene, [subject], size=max(SIZES))
+    renderer = renderer_of(saved_config(str(run), config), config)
+    return Viewer(renderer.scene, [renderer], rows=max(SIZES))
 
 
-def pictures_a_second(studio: Studio, size: int, *, moving: str) -> float:
-    """Draw pictures of ``size`` squared pixels while the ``camera`` or the ``time`` moves; median rate."""
-    first = first_look(studio.scene)
-    focus, up = pivot(studio.scene)
-    start = replace(studio.scene.test[0].camera, camera_to_world=first.pose)
-    poses = [one.camera_to_world for one in orbit(start, focus, up, torch.arange(64) / 64)]
-    studio.picture(first, 16, 16, bool)  # compiles kernels
+def images_a_second(viewer: Viewer, size: int, *, moving: str) -> float:
+    """Render images of ``size`` squared pixels while the ``camera`` or the ``time`` moves; median rate."""
+    first = ViewState.first(viewer.scene)
+    start = replace(viewer.scene.test[0].camera, camera_to_world=first.pose)
+    poses = [one.camera_to_world for one in orbit(start, viewer.focus, viewer.up, torch.arange(64) / 64)]
+    viewer.image(first, 16, 16)  # compiles kernels
     taken, begun, step = [], time.perf_counter(), 0
     while not taken or time.perf_counter() - begun < SECONDS:
         step += 1
         changes = {"time": (0.37 * step) % 1} if moving == "time" else {"pose": poses[step % len(poses)]}
-        look = replace(first, **changes)
+        state = replace(first, **changes)
         before = time.perf_counter()
-        studio.prepare(look)
-        studio.picture(look, size, size, bool)
+        viewer.prepare(state)
+        viewer.image(state, size, size)
         taken.append(time.perf_counter() - before)
     return 1 / statistics.median(taken)
 
 
-def exact_table(studios: list[Studio]) -> str:
+def exact_table(viewers: list[Viewer]) -> str:
     """The rates of every run."""
     rows = []
-    for studio in studios:
-        subject = studio.subjects[0]
-        kind, count = subject.module.method.size
-        row = [subject.name, f"{count:,} {kind}"]
+    for viewer in viewers:
+        renderer = viewer.renderers[0]
+        kind, count = renderer.module.method.size
+        row = [renderer.name, f"{count:,} {kind}"]
         for size in SIZES:
-            rates = [pictures_a_second(studio, size, moving=moving) for moving in ("camera", "time")]
+            rates = [images_a_second(viewer, size, moving=moving) for moving in ("camera", "time")]
             row += [f"{rate:.0f}" if rate >= 10 else f"{rate:.2g}" for rate in rates]
         rows.append(row)
         print("  ".join(row), flush=True)
@@ -80,22 +78,22 @@ def exact_table(studios: list[Studio]) -> str:
     return table(["run", "size", *heads], rows)
 
 
-def page_table(studio: Studio) -> str:
+def page_table(viewer: Viewer) -> str:
     """Bytes and time of splats, and what the page shows a second, in a browser."""
     with tempfile.TemporaryDirectory() as folder, chromium() as browser:
-        address = served(studio, host="127.0.0.1", port=0, title="bench", folder=Path(folder))
+        address = serve(viewer, host="127.0.0.1", port=0, title="bench", folder=Path(folder))
         with address as where:
-            server = threading.Thread(target=studio.desk.serve_forever)
+            server = threading.Thread(target=viewer.queue.run_forever)
             server.start()
             try:
-                rows = measured(studio, browser, where)
+                rows = measured(viewer, browser, where)
             finally:
-                studio.desk.close()
+                viewer.queue.close()
                 server.join()
     return table(["on the page", ""], rows)
 
 
-def measured(studio: Studio, browser, address: str) -> list[list[str]]:
+def measured(viewer: Viewer, browser, address: str) -> list[list[str]]:
     """The lines of ``page_table``."""
     tab, frames = Tab(browser, None), []
     tab.page.on(
@@ -104,20 +102,20 @@ def measured(studio: Studio, browser, address: str) -> list[list[str]]:
     )
     tab.open(address)
     tab.settled()
-    visit = studio.pages[0].visit
+    session = viewer.pages[0].session
     rows = [["frames a second, nothing changes", f"{tab.page.evaluate(_FRAMES, SECONDS):.0f}"]]
-    drawn, begun = visit.drawn, time.perf_counter()
-    visit.play(True)
+    drawn, begun = session.rendered, time.perf_counter()
+    session.play(True)
     shown = tab.page.evaluate(_FRAMES, SECONDS)
-    pictures = (visit.drawn - drawn) / (time.perf_counter() - begun)
-    visit.play(False)
+    pictures = (session.rendered - drawn) / (time.perf_counter() - begun)
+    session.play(False)
     tab.settled()
     rows.append(["frames a second while exact pictures play", f"{shown:.0f}, with {pictures:.1f} pictures"])
     tab.choose("show", "splats")
     until(lambda: "drawn by the browser" in tab.status())
     tab.page.wait_for_timeout(2000)
-    count = len(studio.subjects[0].ellipsoids(0.5))
-    sent = [splats_sent(tab, visit, frames, count, step / 7) for step in range(1, 7)]
+    count = len(viewer.renderers[0].module.method.ellipsoids(0.5))
+    sent = [splats_sent(tab, session, frames, count, step / 7) for step in range(1, 7)]
     size, seconds = (statistics.median(column) for column in zip(*sent))
     rows.append([f"splats of one time, {count:,} of them", f"{size / 1e6:.2f} MB, {1000 * seconds:.0f} ms"])
     rows.append(["frames a second with splats", f"{tab.page.evaluate(_FRAMES, SECONDS):.0f}"])
@@ -126,11 +124,11 @@ def measured(studio: Studio, browser, address: str) -> list[list[str]]:
     return rows
 
 
-def splats_sent(tab: Tab, visit, frames: list, count: int, moment: float) -> tuple[int, float]:
+def splats_sent(tab: Tab, session, frames: list, count: int, moment: float) -> tuple[int, float]:
     """Bytes of the message that brings the splats of a time, and seconds from the change until it came."""
     frames.clear()
     begun = time.perf_counter()
-    visit.change(time=moment)
+    session.change(time=moment)
     while not any(size > 8 * count for size, _ in frames):
         tab.page.wait_for_timeout(5)
     size, came = max(frames)
@@ -144,9 +142,9 @@ def main() -> None:
     reads.add_argument("runs", nargs="+", type=Path)
     reads.add_argument("--print", action="store_true", help="leave docs/viewer.md as it is")
     given = reads.parse_args()
-    studios = [studio_of(run) for run in given.runs]
-    exact = exact_table(studios)
-    drawable = [one for one in studios if one.subjects[0].has_splats]
+    viewers = [viewer_of(run) for run in given.runs]
+    exact = exact_table(viewers)
+    drawable = [viewer for viewer in viewers if SPLATS in viewer.channels]
     tables = {"exact pictures": exact} | ({"the page": page_table(drawable[0])} if drawable else {})
     if not given.print:
         for name, text in tables.items():

@@ -11,20 +11,21 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
+from omegaconf import OmegaConf
 
 pytest.importorskip("viser", reason="no viser: pip install forewarp[viewer]")
 
-from forewarp.cli.view import subject_of
+from forewarp.browser import vertical_fov
+from forewarp.cli.view import renderer_of
 from forewarp.runs.config import saved_config
-from forewarp.viewer.look import Look, camera_of, first_look, vertical_fov
-from forewarp.viewer.server import served
-from forewarp.viewer.studio import Studio
+from forewarp.viewer.rendering import Viewer, ViewState, camera_of
+from forewarp.viewer.server import serve
 from tests.support.browser import Tab, chromium, until
 from tests.support.commands import call
 from tests.support.films import read_film
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
-SIZE = 400
+ROWS = 240
 
 
 @pytest.fixture(scope="module")
@@ -37,67 +38,66 @@ def words(fitted, iterations):
     """What ``forewarp-train`` is told for a short run of the scene of ``fitted``, without an evaluation."""
     data = [f"data.root={fitted.parent}/scenes", "data=dnerf", "data.scene=vehicle"]
     budget = ["budget.minutes=null", f"budget.iterations={iterations}"]
-    return [*data, *budget, "preset=demo", "trainer=cpu", "threads=1", "evaluate=false"]
+    return [*data, *budget, "model=particles", "preset=demo", "trainer=cpu", "threads=1", "evaluate=false"]
 
 
 @pytest.fixture(scope="module")
 def particles(fitted, tmp_path_factory):
     """A run of particles, of the scene of ``fitted``."""
     run = tmp_path_factory.mktemp("runs") / "particles"
-    done = call("train", "model=particles", *words(fitted, 400), f"run={run}")
+    done = call("train", *words(fitted, 200), f"run={run}")
     assert done.status == 0, done
     return run
 
 
-def opened(*runs):
-    """The studio of some runs, as the command opens them."""
-    from omegaconf import OmegaConf
-
-    config = OmegaConf.create({"points": 100, "tail": 0.5})
-    subjects = [subject_of(saved_config(str(run), config), config) for run in runs]
-    return Studio(subjects[0].scene, subjects, size=SIZE)
-
-
 @contextmanager
-def serving(studio, folder):
-    """Serve a studio from a thread; yields the address."""
-    with served(studio, host="127.0.0.1", port=0, title="test", folder=folder) as address:
-        server = threading.Thread(target=studio.desk.serve_forever)
-        server.start()
+def serving(folder, *runs):
+    """Serve runs as the command does, but from a thread; yields the viewer and its address."""
+    config = OmegaConf.create({"points": 100, "tail": 0.5})
+    renderers = [renderer_of(saved_config(str(run), config), config) for run in runs]
+    viewer = Viewer(renderers[0].scene, renderers, rows=ROWS)
+    with serve(viewer, host="127.0.0.1", port=0, title="test", folder=folder) as address:
+        thread = threading.Thread(target=viewer.queue.run_forever)
+        thread.start()
         try:
-            yield address
+            yield viewer, address
         finally:
-            studio.desk.close()
-            server.join(30)
-            assert not server.is_alive()
+            viewer.queue.close()
+            thread.join(30)
+            assert not thread.is_alive()
 
 
 @pytest.fixture(scope="module")
-def one(particles, tmp_path_factory):
-    """The studio of one run, and its address."""
-    studio = opened(particles)
+def served(particles, tmp_path_factory):
+    """The viewer of one run, its address, and the folder of its videos."""
     folder = tmp_path_factory.mktemp("videos")
-    with serving(studio, folder) as address:
-        yield studio, address, folder
+    with serving(folder, particles) as (viewer, address):
+        yield viewer, address, folder
 
 
 @pytest.fixture
-def tab(browser, one):
-    page = Tab(browser, one[1])
-    yield page
-    page.page.close()
-    assert page.errors == []
+def tab(browser, served):
+    with opened(browser, served[1]) as page:
+        page.settled()
+        yield page
 
 
-def exact(studio, tab, **changes):
+@contextmanager
+def opened(browser, address):
+    """A page in the browser, which must complain of nothing."""
+    tab = Tab(browser, address, width=640, height=480)
+    yield tab
+    tab.page.close()
+    assert tab.errors == []
+
+
+def exact(viewer, tab, **changes):
     """What the page should show, at the size of its canvas."""
-    seen = tab.picture()
-    height, width = seen.shape[:2]
-    first = first_look(studio.scene)
-    values = {"pose": first.pose, "fov": first.fov, "time": first.time} | changes
-    wide, rows = round(width * SIZE / height), SIZE
-    picture = studio.picture(Look(**values), wide, rows, bool)[None].permute(0, 3, 1, 2)
-    resized = torch.nn.functional.interpolate(picture, (height, width), mode="bilinear", antialias=True)
+    height, width = tab.picture().shape[:2]
+    first = ViewState.first(viewer.scene)
+    state = ViewState(**{"pose": first.pose, "fov": first.fov, "time": first.time} | changes)
+    image = viewer.image(state, round(width * ROWS / height), ROWS)[None].permute(0, 3, 1, 2)
+    resized = torch.nn.functional.interpolate(image, (height, width), mode="bilinear", antialias=True)
     return 255 * resized[0].permute(1, 2, 0).numpy()
 
 
@@ -107,78 +107,35 @@ def changed(seen, other) -> float:
 
 
 def far(seen, other) -> float:
-    """Mean difference of two pictures, of 255."""
+    """Mean difference of two images, of 255."""
     return float(np.abs(seen.astype(float) - other.astype(float)).mean())
 
 
-def shows(tab, picture, most: float) -> bool:
-    """Wait until the page shows a picture, but for ``most`` of 255 on average."""
-    return until(lambda: far(tab.picture(), picture) < most)
+def shows(tab, image, most: float) -> bool:
+    """Wait until the page shows an image, but for ``most`` of 255 on average."""
+    return until(lambda: far(tab.picture(), image) < most)
 
 
-def test_the_page_shows_what_the_method_renders_and_the_slider_changes_it(one, tab):
-    studio = one[0]
+def test_the_page_shows_what_the_method_renders_and_what_the_browser_draws(served, tab):
+    viewer = served[0]
     first = tab.settled()
-    assert far(first, exact(studio, tab)) < 2
+    assert far(first, exact(viewer, tab)) < 2
     assert first.astype(float).std() > 20
     tab.type("time", 0.5)
     then = tab.settled()
-    assert far(then, exact(studio, tab, time=0.5)) < 2
-    assert far(first, then) > 2 * far(then, exact(studio, tab, time=0.5))
+    assert far(then, exact(viewer, tab, time=0.5)) < 2
+    assert far(first, then) > 2 * far(then, exact(viewer, tab, time=0.5))
     tab.choose("show", "depth")
-    assert shows(tab, exact(studio, tab, time=0.5, show="depth"), 2)
+    assert shows(tab, exact(viewer, tab, time=0.5, channel="depth"), 2)
     assert re.search(r"\d+\.\d pictures/s", tab.status())
-
-
-def test_the_browser_draws_splats_where_the_method_does(one, tab):
-    studio = one[0]
-    tab.settled()
     tab.choose("show", "splats")
     until(lambda: "drawn by the browser" in tab.status())
-    drawn = until(lambda: (seen := tab.picture()).std() > 15 and seen)
-    near, other = exact(studio, tab), exact(studio, tab, time=0.7)
-    assert far(drawn, near) < 5
-    tab.type("time", 0.7)
-    tab.page.wait_for_timeout(1500)
-    assert far(tab.picture(), other) < 5
+    near, other = exact(viewer, tab, time=0.5), exact(viewer, tab, time=0.9)
+    assert shows(tab, near, 5)
+    tab.type("time", 0.9)
+    assert shows(tab, other, 5)
     assert far(tab.picture(), near) > far(tab.picture(), other)
-
-
-def test_two_pages_keep_their_own_camera_and_time(browser, one, tab):
-    other = Tab(browser, one[1])
-    before = other.settled()
-    tab.settled()
-    tab.turn(160)
-    tab.type("time", 0.8)
-    assert far(tab.settled(), before) > 3
-    assert far(other.settled(), before) < 1  # viser adapts the canvas's own pixels to the machine
-    assert other.errors == []
-    other.page.close()
-
-
-def test_a_page_that_leaves_or_is_killed_harms_nothing(browser, one, tab):
-    from playwright.sync_api import Error
-
-    studio = one[0]
-    for how in ("close", "crash"):
-        other = Tab(browser, one[1])
-        other.check("trajectories")
-        other.press("play")
-        other.page.wait_for_timeout(300)
-        if how == "close":
-            other.page.close()
-        else:
-            with contextlib.suppress(Error):  # the page's process ends at once, without a farewell
-                other.page.goto("chrome://crash")
-        until(lambda: len(studio.pages) == 1)
-        tab.type("time", 0.3 if how == "close" else 0.6)
-        tab.settled()
-        assert shows(tab, exact(studio, tab, time=0.3 if how == "close" else 0.6), 2)
-    assert not studio.desk.is_due()
-
-
-def test_it_plays_and_pauses(tab):
-    tab.settled()
+    tab.choose("show", "colour")
     tab.choose("speed", "4")
     tab.press("play")
     seen = [tab.picture() for _ in range(4) if tab.page.wait_for_timeout(300) is None]
@@ -188,32 +145,70 @@ def test_it_plays_and_pauses(tab):
     assert tab.has("play")
 
 
-def test_a_camera_that_is_clicked_shows_its_image(one, tab):
-    studio = one[0]
-    tab.settled()
+def test_pages_keep_their_own_camera_and_time_and_may_leave_or_be_killed(browser, served, tab):
+    from playwright.sync_api import Error
+
+    viewer = served[0]
+    with opened(browser, served[1]) as other:
+        before = other.settled()
+        tab.turn(160)
+        tab.type("time", 0.8)
+        assert far(tab.settled(), before) > 3
+        assert far(other.settled(), before) < 1  # viser adapts the canvas's own pixels to the machine
+        other.check("trajectories")
+        other.press("play")
+        other.page.wait_for_timeout(300)
+    until(lambda: len(viewer.pages) == 1)
+    killed = Tab(browser, served[1], width=640, height=480)
+    killed.press("play")
+    with contextlib.suppress(Error):  # the page's process ends at once, without a farewell
+        killed.page.goto("chrome://crash")
+    until(lambda: len(viewer.pages) == 1)
+    tab.type("time", 0.3)
+    state = viewer.pages[0].session.state
+    assert shows(tab, exact(viewer, tab, time=0.3, pose=state.pose, fov=state.fov), 2)
+    assert not viewer.queue.has_due_job()
+
+
+def test_cameras_and_points_are_clicked(served, tab):
+    viewer = served[0]
+    tab.type("time", 1.0)
+    plain = tab.settled()
+    height, width = plain.shape[:2]
+    rows, columns = np.nonzero(plain.min(-1) < 150)  # something that is not the background
+    tab.press("follow the point that I click")
+    tab.page.wait_for_timeout(500)
+    middle = len(rows) // 2
+    tab.click(float(columns[middle] / width), float(rows[middle] / height))
+    until(lambda: viewer.pages[0].session.state.followed)
+    ink = until(lambda: changed(tab.picture(), plain) or None)
+    assert ink < 0.1
+    tab.press("follow none")
+    until(lambda: changed(tab.picture(), plain) == 0)
+    tab.check("trajectories")
+    until(lambda: changed(tab.picture(), plain) > 1e-3)
+    tab.check("trajectories", False)
     tab.check("show cameras")
-    tab.page.wait_for_timeout(1000)
     tab.page.mouse.move(200, 300)
     for _ in range(4):
         tab.page.mouse.wheel(0, 500)
         tab.page.wait_for_timeout(300)
     tab.page.wait_for_timeout(1200)
-    found = click_a_camera(studio, tab)
+    index = click_a_camera(viewer, tab)
     until(lambda: "truth, prediction, error" in tab.status())
-    name = studio.scene.train[found].name
-    assert f"training image {name}:" in tab.status()
+    frame = viewer.scene.train[index]
+    assert f"training image {frame.name}:" in tab.status()
     seen = tab.settled("truth")
-    frame = studio.scene.train[found]
-    assert far(seen, exact(studio, tab, pose=frame.camera.camera_to_world, stand=found)) < 3
+    pose = frame.camera.camera_to_world
+    assert far(seen, exact(viewer, tab, pose=pose, training_view=index)) < 3
     tab.press("leave it")
     alone = tab.settled()
-    fov = vertical_fov(frame.camera)
-    there = exact(studio, tab, pose=frame.camera.camera_to_world, fov=fov, time=frame.time)
     tab.check("show cameras", False)
+    there = exact(viewer, tab, pose=pose, fov=vertical_fov(frame.camera), time=frame.time)
     assert shows(tab, there, 3)
     assert far(alone, seen) > 5
     tab.type("image", 1)
-    until(lambda: f"training image {studio.scene.train[1].name}:" in tab.status())
+    until(lambda: f"training image {viewer.scene.train[1].name}:" in tab.status())
     until(left_by_turning, tab)
     assert not tab.has("leave it")
 
@@ -225,52 +220,32 @@ def left_by_turning(tab) -> bool:
     return "truth" not in tab.status()
 
 
-def click_a_camera(studio, tab) -> int:
+def click_a_camera(viewer, tab) -> int:
     """Click where a camera stands; returns the training image that is shown."""
-    page = studio.pages[0]
-    look, (width, height) = page.visit.look, page.canvas()
-    camera = camera_of(look, width, height, studio.scene)
-    apexes = torch.stack([frame.camera.center for frame in studio.scene.train])
+    page = viewer.pages[0]
+    width, height = page.canvas()
+    camera = camera_of(page.session.state, width, height, viewer.scene)
+    apexes = torch.stack([frame.camera.center for frame in viewer.scene.train])
     pixels, depth = camera.project(apexes)
-    inside = (pixels > 60).all(-1) & (pixels[:, 0] < width - 60) & (pixels[:, 1] < height - 60) & (depth > 0)
-    for index in inside.nonzero()[:, 0].tolist():
-        tab.click(float(pixels[index, 0] / width), float(pixels[index, 1] / height))
+    share = pixels / torch.tensor([width, height])
+    inside = ((share > 0.1) & (share < 0.9)).all(-1) & (depth > 0)
+    for x, y in share[inside].tolist():
+        tab.click(x, y)
         tab.page.wait_for_timeout(1500)
-        if page.visit.look.stand is not None:
-            return page.visit.look.stand
+        if page.session.state.training_view is not None:
+            return page.session.state.training_view
     raise AssertionError("no camera was hit")
 
 
-def test_a_point_that_is_clicked_is_followed(one, tab):
-    studio = one[0]
-    tab.settled()
-    tab.type("time", 1.0)
-    plain = tab.settled()
-    height, width = plain.shape[:2]
-    rows, columns = np.nonzero(plain.min(-1) < 150)  # something that is not the background
-    tab.press("follow the point that I click")
-    tab.page.wait_for_timeout(500)
-    middle = len(rows) // 2
-    tab.click(float(columns[middle] / width), float(rows[middle] / height))
-    until(lambda: studio.pages[0].visit.look.followed)
-    ink = until(lambda: changed(tab.picture(), plain) or None)
-    assert ink < 0.1
-    tab.press("follow none")
-    until(lambda: changed(tab.picture(), plain) == 0)
-    tab.check("trajectories")
-    until(lambda: changed(tab.picture(), plain) > 1e-3)
-
-
-def test_screenshots_and_videos_are_saved(one, tab):
-    studio, _, folder = one
-    tab.settled()
+def test_screenshots_and_videos_are_saved(served, tab):
+    viewer, _, folder = served
     with tab.page.expect_download() as got:
         tab.press("screenshot")
     assert re.fullmatch(r"vehicle-particles-colour-0\.\d{3}\.png", got.value.suggested_filename)
+    session = viewer.pages[0].session
+    width, rows = session.full_size()
     shot = iio.imread(got.value.path().read_bytes())
-    look, page = studio.pages[0].visit.look, studio.pages[0]
-    width, rows = page.visit.full_size()
-    assert far(shot, 255 * studio.picture(look, width, rows, bool).numpy()) < 1
+    assert far(shot, 255 * viewer.image(session.state, width, rows).numpy()) < 1
     tab.page.get_by_text("Video", exact=True).click()
     tab.press("make the video")
     tab.page.get_by_text("key views: expected at least 2").wait_for()
@@ -289,35 +264,29 @@ def test_screenshots_and_videos_are_saved(one, tab):
     assert got.value.path().read_bytes() == (folder / "path-1.mp4").read_bytes()
 
 
-def test_two_runs_beside_each_other(browser, fitted, particles, tmp_path):
-    studio = opened(particles, fitted)
-    with serving(studio, tmp_path) as address:
-        tab = Tab(browser, address)
-        assert shows(tab, exact(studio, tab), 2)
+def test_two_runs_side_by_side(browser, fitted, particles, tmp_path):
+    with serving(tmp_path, particles, fitted) as (viewer, address), opened(browser, address) as tab:
+        assert shows(tab, exact(viewer, tab), 2)
         assert tab.page.get_by_text("left: particles, right: run").is_visible()
         tab.type("image", 2)
         tab.settled("truth")
-        pose = studio.scene.train[2].camera.camera_to_world
-        assert shows(tab, exact(studio, tab, pose=pose, stand=2), 3)
-        assert tab.errors == []
-        tab.page.close()
+        pose = viewer.scene.train[2].camera.camera_to_world
+        assert shows(tab, exact(viewer, tab, pose=pose, training_view=2), 3)
 
 
 def test_a_run_is_seen_while_it_trains(browser, fitted, tmp_path):
-    command = [sys.executable, "-u", "-m", "forewarp.cli.train", *words(fitted, 1200)]
+    command = [sys.executable, "-u", "-m", "forewarp.cli.train", *words(fitted, 600)]
     command += [f"run={tmp_path}/run", "viewer=true", "port=0"]
     with open(tmp_path / "said", "w") as log:
         process = subprocess.Popen(command, stdout=log, stderr=log, cwd=tmp_path)
     try:
-        found = until(lambda: re.search(r"see it: (\S+)", (tmp_path / "said").read_text()), seconds=60)
-        tab = Tab(browser, found[1])
-        first = until(step_said, tab)
-        before = tab.picture()
-        tab.press("play")
-        until(lambda: (step_said(tab) or 0) > first + 50)
-        assert far(before, tab.picture()) > 1
-        assert tab.errors == []
-        tab.page.close()
+        said = until(lambda: re.search(r"see it: (\S+)", (tmp_path / "said").read_text()), seconds=60)
+        with opened(browser, said[1]) as tab:
+            first = until(step_said, tab)
+            before = tab.picture()
+            tab.press("play")
+            until(lambda: (step_said(tab) or 0) > first + 50)
+            assert far(before, tab.picture()) > 1
         assert process.wait(180) == 0
     finally:
         process.kill()

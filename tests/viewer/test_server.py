@@ -1,4 +1,4 @@
-"""Where the page listens, and that a run in training is the same with it."""
+"""Where pages are served, their controls, and that a run in training is the same with them."""
 
 import contextlib
 import errno
@@ -8,50 +8,67 @@ import threading
 import urllib.request
 from dataclasses import replace
 from types import SimpleNamespace
+from unittest.mock import Mock
 
+import numpy as np
 import pytest
+import torch
 
 pytest.importorskip("viser", reason="no viser: pip install forewarp[viewer]")
 
 import viser
 
-from forewarp.viewer import live as live_view
+from forewarp.scene.cloud import Ellipsoids
+from forewarp.viewer import server as server_module
 from forewarp.viewer.address import check_address
-from forewarp.viewer.controls import Controls
-from forewarp.viewer.desk import Superseded
-from forewarp.viewer.look import first_look
 from forewarp.viewer.page import Page
-from forewarp.viewer.server import served
-from forewarp.viewer.studio import Studio
-from forewarp.viewer.subject import Subject
-from forewarp.viewer.visit import Visit
+from forewarp.viewer.queue import Cancelled
+from forewarp.viewer.rendering import SceneRenderer, Viewer, ViewState
+from forewarp.viewer.session import Session
 from tests.contract.fitting import stage_of
 from tests.contract.table import METHODS
+from tests.support.fake_viewer import FakePage
 from tests.support.known_ball import known_ball
 from tests.support.tiny_scene import ball_data, ball_scene, make_run, same, stage
 
 
 @pytest.fixture(scope="module")
-def studio():
-    return Studio(ball_scene(frames=4))
+def viewer():
+    return Viewer(ball_scene(frames=4))
 
 
-def listening(studio, folder, host="127.0.0.1", port=0):
-    return served(studio, host=host, port=port, title="ball", folder=folder)
+def serving(viewer, folder, host="127.0.0.1", port=0):
+    return server_module.serve(viewer, host=host, port=port, title="ball", folder=folder)
 
 
-def test_the_page_is_where_it_says_and_nowhere_else(studio, tmp_path, capsys):
-    with listening(studio, tmp_path) as address:
+def test_the_page_is_where_it_says_and_nowhere_else(viewer, tmp_path, capsys):
+    with serving(viewer, tmp_path) as address:
         with urllib.request.urlopen(address, timeout=10) as page:
             assert b"<html" in page.read()
         port = int(address.rpartition(":")[2])
         with pytest.raises(ConnectionRefusedError), socket.create_connection(("127.0.0.2", port), timeout=5):
             pass
+        says = f"port: expected a free port, but got {port}, which is in use; use port={port + 1}"
+        before = threading.active_count()
+        with pytest.raises(ValueError, match=says), serving(viewer, tmp_path, port=port):
+            pass
+        assert threading.active_count() == before
     with pytest.raises(ConnectionRefusedError), socket.create_connection(("127.0.0.1", port), timeout=5):
         pass
     assert capsys.readouterr().out == ""  # viser's own words
-    with listening(studio, tmp_path, port=port) as again:  # the port is free again
+    with serving(viewer, tmp_path, port=port) as again:  # the port is free again
         assert again == address
+
+
+def test_a_port_that_is_taken_since_is_refused(viewer, tmp_path, monkeypatch):
+    monkeypatch.setattr(server_module, "check_address", lambda host, port: None)
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with (
+            pytest.raises(ValueError, match=f"got {port}, which is in use"),
+            serving(viewer, tmp_path, port=port),
+        ):
+            pass
 
 
 @pytest.mark.parametrize(
@@ -65,19 +82,9 @@ def test_the_page_is_where_it_says_and_nowhere_else(studio, tmp_path, capsys):
         ({"host": "no such.host"}, "host: expected an address of this machine .* but got no such.host"),
     ],
 )
-def test_an_address_that_cannot_be_is_refused(studio, tmp_path, where, says):
-    with pytest.raises(ValueError, match=says), listening(studio, tmp_path, **where):
-        pass
-
-
-def test_a_taken_port_is_refused_and_no_other_is_taken(studio, tmp_path):
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
-        says = f"port: expected a free port, but got {port}, which is in use; use port={port + 1}"
-        before = threading.active_count()
-        with pytest.raises(ValueError, match=says), listening(studio, tmp_path, port=port):
-            pass
-        assert threading.active_count() == before
+def test_an_address_that_cannot_be_is_refused(where, says):
+    with pytest.raises(ValueError, match=says):
+        check_address(**{"host": "127.0.0.1", "port": 0} | where)
 
 
 @pytest.mark.parametrize(
@@ -85,83 +92,60 @@ def test_a_taken_port_is_refused_and_no_other_is_taken(studio, tmp_path):
     [
         (errno.EADDRINUSE, 65535, "got 65535, which is in use; use port=0"),
         (errno.EACCES, 80, "port: expected one that you may open, but got 80, .* use port=8080"),
-        (
-            errno.EADDRNOTAVAIL,
-            80,
-            "host: expected an address of this machine that port 80 .* but got 127.0.0.1",
-        ),
+        (errno.EADDRNOTAVAIL, 80, "host: expected an address .* that port 80 .* but got 127.0.0.1"),
     ],
 )
 def test_why_a_port_cannot_be_opened_is_told(monkeypatch, failure, port, says):
-    def create_server(*where, **how):
-        raise OSError(failure, os.strerror(failure))
-
-    monkeypatch.setattr("socket.create_server", create_server)
+    monkeypatch.setattr("socket.create_server", Mock(side_effect=OSError(failure, os.strerror(failure))))
     with pytest.raises(ValueError, match=says):
         check_address("127.0.0.1", port)
 
 
-@pytest.mark.parametrize(
-    ("origin", "host", "welcome"),
-    [
-        (None, None, True),
-        ("http://{host}", None, True),
-        ("http://evil.example", None, False),
-        ("http://evil.example", "evil.example", False),
-    ],
-)
-def test_pages_of_foreign_sites_are_sent_nothing(studio, tmp_path, origin, host, welcome):
+def test_pages_of_foreign_sites_are_sent_nothing(viewer, tmp_path):
     from websockets.exceptions import ConnectionClosed
     from websockets.sync.client import connect
 
-    with listening(studio, tmp_path) as address:
+    with serving(viewer, tmp_path) as address:
         there = address.removeprefix("http://")
-        asked = {
-            "uri": f"ws://{host or there}",
-            "sock": socket.create_connection(there.split(":"), timeout=10),
-            "origin": origin and origin.format(host=there),
-            "subprotocols": [f"viser-v{viser.__version__}"],
-        }
-        with connect(**asked, proxy=None) as client:
-            if welcome:
-                assert len(client.recv(timeout=10)) > 100
-            else:
-                with pytest.raises(ConnectionClosed, match="not a page of this server"):
-                    client.recv(timeout=10)
+        for origin, host, welcome in (
+            (None, there, True),
+            (address, there, True),
+            ("http://evil.example", there, False),
+            ("http://evil.example", "evil.example", False),
+        ):
+            asked = {"origin": origin, "subprotocols": [f"viser-v{viser.__version__}"], "proxy": None}
+            sock = socket.create_connection(there.split(":"), timeout=10)
+            with connect(f"ws://{host}", sock=sock, **asked) as client:
+                if welcome:
+                    assert len(client.recv(timeout=10)) > 100
+                else:
+                    with pytest.raises(ConnectionClosed, match="not a page of this server"):
+                        client.recv(timeout=10)
 
 
-class Watcher:
-    """A page without a browser, which asks for a picture whenever it can."""
+class Watcher(FakePage):
+    """A page without a browser, which asks for an image whenever it can."""
 
-    def __init__(self, studio):
-        self.studio, self.shown, self.said, self.visit = studio, [], [], None
+    def __init__(self, viewer):
+        super().__init__()
+        self.viewer, self.session = viewer, Session(viewer, self)
 
-    def build(self):
-        if self.visit is None:
-            self.visit = Visit(self.studio, self)
-            self.visit.play(True)
+    def adapt(self):
+        if not self.images:
+            self.session.play(True)
 
     def canvas(self):
         return 40, 30
 
-    def show(self, picture, *, rest):
-        self.shown.append(picture)
-
-    def tell(self, text):
-        self.said.append(text)
-
-    def time_is(self, time):
-        pass
-
-    def playing_is(self, playing):
-        pass
+    def show_image(self, image, *, rest):
+        self.images.append(image)
 
 
 class Broken(Watcher):
     """A page whose browser is gone in the worst moments."""
 
-    def build(self):
-        raise ConnectionError("gone while it was built")
+    def adapt(self):
+        raise ConnectionError("gone while it was adapted")
 
     def tell(self, text):
         raise ConnectionError("gone while it was told")
@@ -173,44 +157,66 @@ def stages_of(method, steps=12):
     return [stage_of(METHODS[method], name, steps=steps) for name in ("coarse", "fine")]
 
 
+def without_a_server(monkeypatch, make_pages):
+    """Serve no pages but those that are made of a viewer."""
+
+    @contextlib.contextmanager
+    def serve(viewer, **where):
+        viewer.pages = tuple(make_pages(viewer))
+        yield "http://nowhere"
+
+    monkeypatch.setattr(server_module, "serve", serve)
+
+
 @pytest.mark.parametrize("method", ["forward", pytest.param("particles", marks=pytest.mark.slow)])
 def test_a_run_that_is_watched_ends_with_the_same_numbers(tmp_path, monkeypatch, capsys, method):
     plain = make_run(tmp_path / "plain", stages_of(method)).fit()
-    run, pages = make_run(tmp_path / "seen", stages_of(method)), []
-
-    @contextlib.contextmanager
-    def without_a_server(studio, **where):
-        pages.extend([Watcher(studio), Broken(studio)])
-        studio.pages = tuple(pages)
-        yield "http://nowhere"
-
-    monkeypatch.setattr(live_view, "served", without_a_server)
-    monkeypatch.setattr("forewarp.viewer.visit.FASTEST", 0.0)
-    said = []
+    run, pages, said = make_run(tmp_path / "seen", stages_of(method)), [], []
+    without_a_server(monkeypatch, lambda viewer: pages.extend([Watcher(viewer), Broken(viewer)]) or pages)
+    monkeypatch.setattr("forewarp.viewer.session.MIN_INTERVAL", 0.0)
     run.tell = said.append
-    with live_view.live(run, host="127.0.0.1", port=0):
+    with server_module.live(run, host="127.0.0.1", port=0):
         seen = run.fit()
     assert same(plain, seen)
-    assert [type(one) for one in run.callbacks("coarse", None)] == []  # as before
-    assert len(pages[0].shown) == 24  # one picture a step, in both stages
-    assert float((pages[0].shown[1] - pages[0].shown[-1]).abs().max()) > 0.05  # it plays
-    assert pages[0].said[0].startswith("coarse ")
-    assert pages[0].said[-1] == "fine has ended; what follows is not shown"
+    assert run.callbacks("coarse", None) == []  # as before
+    page = pages[0]
+    assert len(page.images) == 24  # one image a step, in both stages
+    assert float((page.images[1] - page.images[-1]).abs().max()) > 0.05  # it plays
+    assert page.said[0].startswith("coarse ")
+    assert page.said[-1] == "fine has ended; what follows is not shown"
     assert said == ["see it: http://nowhere", f"see it again: forewarp-view run={tmp_path / 'seen'}"]
     assert seen.clock.seconds < 5
-    assert "gone while it was built" in capsys.readouterr().err
+    assert "gone while it was adapted" in capsys.readouterr().err
 
 
-@contextlib.contextmanager
-def a_server():
-    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
-    try:
-        yield server
-    finally:
-        server.stop()
+def test_nobody_watching_costs_no_image(tmp_path, monkeypatch):
+    run = make_run(tmp_path / "run", [stage()])
+    without_a_server(monkeypatch, lambda viewer: ())
+    monkeypatch.setattr(
+        "forewarp.viewer.queue.RenderQueue.run_next", lambda queue: pytest.fail("an image was rendered")
+    )
+    with server_module.live(run, host="127.0.0.1", port=0):
+        assert run.fit().global_step == 12
 
 
-def modules_of_two_methods():
+def test_what_pages_cost_is_no_training_time():
+    data, module, running = ball_data(), known_ball(), []
+    viewer = Viewer(data.scene)
+
+    def note():
+        running.append(module.clock._since is not None)
+
+    viewer.pages = (SimpleNamespace(adapt=note, session=SimpleNamespace(refresh=note)),)
+    view = server_module.LiveView(viewer, "run")
+    module.trainer = trainer = SimpleNamespace(datamodule=data, global_step=1)
+    with module.clock.running():
+        view.on_train_start(trainer, module)
+        view.on_train_batch_end(trainer, module, None, None, 0)
+    assert running == [False] * 3
+
+
+@pytest.fixture
+def modules():
     """A method whose points a page follows and that its browser draws, and one without both."""
     first, second = known_ball(), known_ball()
     for ability in ("ellipsoids", "template", "movement"):
@@ -219,99 +225,85 @@ def modules_of_two_methods():
     return first, second
 
 
-def test_a_stage_of_another_method_shows_what_it_can(capsys):
+def test_a_stage_of_another_method_shows_what_it_can(modules):
     data = ball_data()
-    studio, trainer = Studio(data.scene), SimpleNamespace(datamodule=data)
-    view, page = live_view.LiveView(studio, "run"), Watcher(studio)
-    page.splats = page.shown.append
-    studio.pages = (page,)
-    first, second = modules_of_two_methods()
-    view.on_train_start(trainer, first)
-    assert "splats" in studio.shows
-    page.visit.play(False)
-    page.visit.change(show="splats", tails=True, followed=(((0.0, 0.0, 0.0), 0.5),))
-    studio.desk.serve()
-    assert str(page.shown[-1]).startswith("splats at")
-    view.on_train_start(trainer, second)
-    page.visit.refresh()
-    studio.desk.serve()
-    assert page.shown[-1].shape[2] == 3
-    look = page.visit.look
-    assert (look.show, look.tails, look.followed) == ("colour", False, ())
-    assert capsys.readouterr().err == ""
+    viewer, trainer = Viewer(data.scene), SimpleNamespace(datamodule=data)
+    view, page = server_module.LiveView(viewer, "run"), Watcher(viewer)
+    viewer.pages = (page,)
+    view.on_train_start(trainer, modules[0])
+    assert "splats" in viewer.channels
+    page.session.play(False)
+    page.session.change(channel="splats", trajectories=True, followed=(((0.0, 0.0, 0.0), 0.5),))
+    viewer.queue.run_next()
+    assert str(page.images[-1]).startswith("splats at")
+    view.on_train_start(trainer, modules[1])
+    page.session.refresh()
+    viewer.queue.run_next()
+    assert page.images[-1].shape[2] == 3
+    state = page.session.state
+    assert (state.channel, state.trajectories, state.followed) == ("colour", False, ())
 
 
-def test_what_pages_cost_is_no_training_time():
-    data, module, running = ball_data(), known_ball(), []
-    studio = Studio(data.scene)
-    view, page = live_view.LiveView(studio, "run"), Watcher(studio)
-    page.build = lambda: running.append(module.clock._since is not None)
-    page.visit = SimpleNamespace(refresh=page.build)
-    studio.pages = (page,)
-    module.trainer = trainer = SimpleNamespace(datamodule=data, global_step=1)
-    with module.clock.running():
-        view.on_train_start(trainer, module)
-        view.on_train_batch_end(trainer, module, None, None, 0)
-    assert running == [False] * 3
+@pytest.fixture
+def client():
+    """Viser's server as the client of a page whose camera stands at the origin."""
+    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    server.camera = SimpleNamespace(on_update=lambda act: act, wxyz=np.eye(4)[0], position=(0, 0, 0), fov=0.5)
+    yield server
+    server.stop()
+
+
+def test_controls_offer_what_the_method_of_a_stage_can_show(modules, client, tmp_path):
+    data = ball_data()
+    viewer = Viewer(data.scene)
+    page = Page(viewer, client, tmp_path)
+    parts = page.about_splats, page.trajectories, page.follow, page.follow_none
+    assert not any(part.visible for part in parts)  # before the first step of a run in training
+    renderers = [SceneRenderer("run", module, data) for module in modules]
+    viewer.renderers = renderers[:1]
+    page.adapt()
+    page.channel.value, page.trajectories.value = "splats", True
+    assert all(part.visible for part in parts)
+    assert page._cameras == []  # nothing is made before it is asked for
+    page.cameras_shown.value = True
+    page._show_cameras()
+    assert [camera.visible for camera in page._cameras] == [True] * len(data.scene.train)
+    page.show_training_view(0)
+    assert not any(camera.visible for camera in page._cameras)
+    viewer.renderers = renderers[1:]
+    page.adapt()
+    assert not any(part.visible for part in parts)
+    assert page.channel.options == viewer.channels
+    assert (page.channel.value, page.trajectories.value) == ("colour", False)
+
+
+@pytest.mark.parametrize("shade", [0, 255])
+def test_splats_are_seen_before_the_background_of_exact_images(shade):
+    client, renderer = Mock(), SimpleNamespace(background=torch.full((3,), shade / 255))
+    viewer = SimpleNamespace(renderers=[renderer], scene=SimpleNamespace(box=SimpleNamespace(diagonal=2.0)))
+    page = SimpleNamespace(viewer=viewer, client=client, _splats=None)
+    single = Ellipsoids(torch.ones(1, 3), torch.eye(3)[None], torch.ones(1), torch.zeros(1, 1, 3))
+    for _ in range(2):  # the background is sent once
+        Page.show_splats(page, single)
+    (sent,) = client.scene.set_background_image.call_args_list
+    assert sent.args[0].tolist() == [[[shade] * 3]]
+    assert [call.kwargs["scale"] for call in client.scene.add_gaussian_splats.call_args_list] == [0.02] * 2
 
 
 @pytest.mark.parametrize(
-    ("show", "error", "says"),
+    ("channel", "error", "says"),
     [
         ("colour", RuntimeError("no memory"), ["no screenshot: RuntimeError: no memory"]),
         ("splats", TimeoutError("30 s"), ["no screenshot: TimeoutError: 30 s"]),
-        ("colour", Superseded(), []),
+        ("colour", Cancelled(), []),
     ],
 )
-def test_why_there_is_no_screenshot_is_told(studio, show, error, says):
-    def fail(*how, **more):
-        raise error
-
-    page, said = object.__new__(Page), []
-    look = replace(first_look(studio.scene), show=show)
-    page.visit = SimpleNamespace(look=look, request=fail)
+def test_why_there_is_no_screenshot_is_told(viewer, channel, error, says):
+    fail, said = Mock(side_effect=error), []
+    page = object.__new__(Page)
+    state = replace(ViewState.first(viewer.scene), channel=channel)
+    page.session = SimpleNamespace(state=state, image=fail)
     page.client = SimpleNamespace(get_render=fail, camera=SimpleNamespace(image_width=4, image_height=3))
     page.tell = said.append
     page.save_screenshot()
     assert said == says
-
-
-def test_controls_offer_what_the_method_of_a_stage_can_show():
-    data = ball_data()
-    subjects = [Subject("run", module, data) for module in modules_of_two_methods()]
-    studio = Studio(data.scene, subjects[:1])
-    with a_server() as server:
-        visit = Visit(studio, Watcher(studio))
-        controls = Controls(SimpleNamespace(studio=studio, client=server, visit=visit, stand=visit.stand))
-        parts = controls.splats, controls.tails, controls.choose, controls.forget
-        controls.what.value, controls.tails.value = "splats", True
-        assert [part.visible for part in parts] == [True] * 4
-        assert controls._frusta._made == []  # nothing is made before it is asked for
-        controls.shown.value = True
-        controls._show_frusta()
-        assert [one.visible for one in controls._frusta._made] == [True] * len(data.scene.train)
-        visit.stand(0)
-        controls.stands()
-        assert not any(one.visible for one in controls._frusta._made)
-        studio.subjects = subjects[1:]
-        controls.adapt()
-        assert [part.visible for part in parts] == [False] * 4
-        assert controls.what.options == studio.shows
-        assert (controls.what.value, controls.tails.value) == ("colour", False)
-        studio.subjects = subjects[:1]
-        controls.adapt()
-        assert "splats" in controls.what.options
-        assert [part.visible for part in parts] == [True] * 4
-
-
-def test_nobody_watching_costs_no_picture(tmp_path, monkeypatch):
-    run = make_run(tmp_path / "run", [stage()])
-
-    @contextlib.contextmanager
-    def nobody(studio, **where):
-        monkeypatch.setattr(studio.desk, "serve", lambda: pytest.fail("a picture was drawn"))
-        yield "http://nowhere"
-
-    monkeypatch.setattr(live_view, "served", nobody)
-    with live_view.live(run, host="127.0.0.1", port=0):
-        assert run.fit().global_step == 12

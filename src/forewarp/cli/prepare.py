@@ -72,7 +72,7 @@ class Prepared:
 
         with ExitStack() as stack:
             if self.viewer is not None and not self.measured:
-                from forewarp.viewer.live import live
+                from forewarp.viewer.server import live
 
                 stack.enter_context(live(self.run, **self.viewer))
             stack.enter_context(session(self.run, self.config, finished=self.measured))

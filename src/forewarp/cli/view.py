@@ -50,33 +50,34 @@ def view(config) -> None:
     # These load torch; mistakes have been answered before.
     from pathlib import Path
 
-    from forewarp.viewer.server import served
-    from forewarp.viewer.studio import Studio, refuse_other_scene
+    from forewarp.viewer.rendering import Viewer, refuse_other_scene
+    from forewarp.viewer.server import serve
 
-    subjects = [subject_of(saved, config) for saved in runs.values()]
-    if len(subjects) == 2:
-        refuse_other_scene(subjects[0].scene, subjects[1].scene)
-    studio = Studio(subjects[0].scene, subjects, size=config.size)
-    title = " | ".join([studio.scene.name, *(subject.name for subject in subjects)])
+    renderers = [renderer_of(saved, config) for saved in runs.values()]
+    scene = renderers[0].scene
+    for other in renderers[1:]:
+        refuse_other_scene(scene, other.scene)
+    viewer = Viewer(scene, renderers, rows=config.size)
+    title = " | ".join([scene.name, *(renderer.name for renderer in renderers)])
     folder = Path(config.run) / "videos"
-    with served(studio, host=config.host, port=config.port, title=title, folder=folder) as address:
+    with serve(viewer, host=config.host, port=config.port, title=title, folder=folder) as address:
         print(f"see it: {address} (Ctrl-C ends)", flush=True)
         try:
-            studio.desk.serve_forever()
+            viewer.queue.run_forever()
         except KeyboardInterrupt:
             print()
 
 
-def subject_of(saved, config):
+def renderer_of(saved, config):
     """Load a run's method."""
     from pathlib import Path
 
     from forewarp.runs.fitted import opened
-    from forewarp.viewer.subject import Subject
+    from forewarp.viewer.rendering import SceneRenderer
 
     run, module = opened(saved)
     name = Path(saved.run).resolve().name
-    return Subject(name, module, run.datamodule, count=config.points, tail=float(config.tail))
+    return SceneRenderer(name, module, run.datamodule, count=config.points, tail=float(config.tail))
 
 
 def main() -> None:

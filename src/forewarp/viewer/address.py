@@ -24,11 +24,12 @@ def check_address(host: str, port: int) -> None:
         )
     if not (type(port) is int and 0 <= port < 65536):
         raise ValueError(f"port: expected a whole number from 0 to 65535, but got {port}")
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
-        socket.create_server((host, port), family=_family(host)).close()
+        socket.create_server((host, port), family=family).close()
     except OSError as error:
         if error.errno == errno.EADDRINUSE:
-            raise ValueError(taken(port)) from None
+            raise ValueError(port_in_use(port)) from None
         if error.errno == errno.EACCES:
             raise ValueError(
                 f"port: expected one that you may open, but got {port}, which is kept for the system; "
@@ -40,7 +41,7 @@ def check_address(host: str, port: int) -> None:
         ) from None
 
 
-def taken(port: int) -> str:
+def port_in_use(port: int) -> str:
     """Say that a port is in use, and which may be free."""
     other = port + 1 if port < 65535 else 0
     return f"port: expected a free port, but got {port}, which is in use; use port={other}"
@@ -55,26 +56,26 @@ def url(host: str, port: int) -> str:
     return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
 
 
-def is_our_page(host: str, asked: str | None, origin: str | None) -> bool:
-    """Tell whether a browser's request comes from a page of ours, and not from one of a foreign site.
+def is_same_origin(host: str, requested: str | None, origin: str | None) -> bool:
+    """Tell whether a browser's request comes from a page of this server, and not from one of a foreign site.
 
     Args:
         host: where the server listens.
-        asked: the request's ``Host``. Where the server listens for this machine alone it must name this
+        requested: the request's ``Host``. Where the server listens for this machine alone it must name this
             machine: a foreign site may let its own name point here.
         origin: the request's ``Origin``; None: no browser.
 
-    >>> is_our_page("127.0.0.1", "localhost:9000", "http://localhost:9000")
+    >>> is_same_origin("127.0.0.1", "localhost:9000", "http://localhost:9000")
     True
-    >>> is_our_page("127.0.0.1", "127.0.0.1:8080", "http://evil.example")
+    >>> is_same_origin("127.0.0.1", "127.0.0.1:8080", "http://evil.example")
     False
-    >>> is_our_page("127.0.0.1", "evil.example:8080", "http://evil.example:8080")
+    >>> is_same_origin("127.0.0.1", "evil.example:8080", "http://evil.example:8080")
     False
     """
-    asked = (asked or "").lower()
-    if origin is not None and urlsplit(origin.lower()).netloc != asked:
+    requested = (requested or "").lower()
+    if origin is not None and urlsplit(origin.lower()).netloc != requested:
         return False
-    return not _is_loopback(host) or _is_loopback(urlsplit(f"//{asked}").hostname or "")
+    return not _is_loopback(host) or _is_loopback(urlsplit(f"//{requested}").hostname or "")
 
 
 def _is_loopback(host: str) -> bool:
@@ -82,7 +83,3 @@ def _is_loopback(host: str) -> bool:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
         return host == "localhost"
-
-
-def _family(host: str) -> socket.AddressFamily:
-    return socket.AF_INET6 if ":" in host else socket.AF_INET

@@ -1,184 +1,343 @@
-"""A page: what a browser is shown, and what its controls do, by viser."""
+"""A page: what a browser shows, and what its controls do, by viser."""
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import torch
 import viser
-import viser.transforms
 from torch import Tensor
+from viser.transforms import SO3
 
-from forewarp.browser import splat_arrays
+from forewarp.browser import splat_arrays, vertical_fov
 from forewarp.drawing.files import png_bytes, to_bytes
+from forewarp.drawing.images import hues
 from forewarp.scene.cloud import Ellipsoids
-from forewarp.viewer.controls import Controls
-from forewarp.viewer.desk import Superseded
-from forewarp.viewer.film import write_film
-from forewarp.viewer.look import Look, axis_of, vertical_fov
-from forewarp.viewer.studio import Studio
-from forewarp.viewer.visit import Visit
+from forewarp.scene.frame import spread
+from forewarp.viewer.queue import Cancelled
+from forewarp.viewer.rendering import SPLATS, Viewer, turning_axis
+from forewarp.viewer.session import MAX_VIDEO_SECONDS, MIN_VIDEO_SECONDS, Session
 
-_MOVED = 1e-3  # of the distance to the pivot: a camera that went farther has left where it stood
-_ARRIVES = 0.5  # seconds in which a camera that was sent somewhere may still tell where it was
-_QUALITY = {True: 92, False: 80}  # of JPEG, at rest and while moving
+_MOVED = 1e-3  # of the distance to the pivot: a camera that went farther has left the training view
+_ARRIVAL = 0.5  # seconds in which a camera that was sent somewhere may still tell where it was
+_JPEG_QUALITY = {True: 92, False: 80}  # at rest and while moving
+_SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "4")
+_MAX_CAMERAS = 200  # training cameras that are drawn
+_FOLLOW = "follow the point that I click"
+_ABOUT_SPLATS = "*splats*: drawn by the browser, with one colour from all sides and no trajectories"
 
 
 class Page:
-    """One browser; its ``visit`` decides what it is shown.
+    """One browser with its controls; its ``session`` decides which image it is shown.
 
     Args:
-        studio: what is seen.
+        viewer: what is seen.
         client: the browser.
         folder: where videos go.
     """
 
-    def __init__(self, studio: Studio, client: viser.ClientHandle, folder: Path) -> None:
-        self.studio, self.client, self.folder = studio, client, folder
-        self.visit = Visit(studio, self)
-        self.controls: Controls | None = None
-        self._splats, self._stood, self._building = None, float("-inf"), threading.Lock()
+    def __init__(self, viewer: Viewer, client: viser.ClientHandle, folder: Path) -> None:
+        self.viewer, self.client, self.folder = viewer, client, folder
+        self.session = Session(viewer, self)
+        self._splats, self._sent = None, float("-inf")
+        self._cameras: list[viser.CameraFrustumHandle] = []
+        self._showing_cameras = threading.Lock()
         self.status = client.gui.add_markdown("...")
-        self.build()
+        if len(viewer.renderers) == 2:
+            left, right = (renderer.name for renderer in viewer.renderers)
+            client.gui.add_markdown(f"left: **{left}**, right: **{right}**")
+        self._add_time()
+        self._add_channels()
+        self._add_training_images()
+        self._add_video()
+        self.adapt()
 
-    def build(self) -> None:
-        """Make the controls, once there is a method that says what can be shown; adapt them to another."""
-        with self._building:  # threads of the server and of a run in training may come at once
-            if self.controls is not None:
-                self.controls.adapt()
-                return
-            if not self.studio.subjects:
-                self.tell(self.studio.note)
-                return
-            self.controls = Controls(self)
-
-        @self.client.camera.on_update
+        @client.camera.on_update
         async def _(camera: viser.CameraHandle) -> None:
             self._camera_moved(camera)
 
-        self._camera_moved(self.client.camera)
+        self._camera_moved(client.camera)
 
-    # What a visit draws on.
+    def adapt(self) -> None:
+        """Offer what the present methods can show; a later stage of a run may have another one."""
+        channels, can_follow = self.viewer.channels, self.viewer.can_follow
+        if self.channel.options != channels:
+            # viser chooses the first where the chosen one is gone, as ``Viewer.supported`` does
+            self.channel.options = channels
+        self.about_splats.visible = SPLATS in channels
+        for control in (self.trajectories, self.follow, self.follow_none):
+            control.visible = can_follow
+        if not can_follow:
+            self.trajectories.value = False
+
+    # What the session shows.
 
     def canvas(self) -> tuple[int, int]:
-        """See ``Surface``."""
+        """Return width and height of the page's image, in pixels."""
         camera = self.client.camera
         return max(1, camera.image_width), max(1, camera.image_height)
 
-    def show(self, picture: Tensor, *, rest: bool) -> None:
-        """See ``Surface``."""
+    def show_image(self, image: Tensor, *, rest: bool) -> None:
+        """Show an image (H, W, 3) in [0, 1], stretched over the canvas."""
         if self._splats is not None:
             self._splats.remove()
             self._splats = None
-        self.client.scene.set_background_image(to_bytes(picture), format="jpeg", jpeg_quality=_QUALITY[rest])
+        scene, quality = self.client.scene, _JPEG_QUALITY[rest]
+        scene.set_background_image(to_bytes(image), format="jpeg", jpeg_quality=quality)
         self.client.flush()
 
-    def splats(self, ellipsoids: Ellipsoids) -> None:
-        """See ``Surface``."""
-        unit = self.studio.scene.box.diagonal / 100
-        arrays = splat_arrays(ellipsoids, unit)
+    def show_splats(self, ellipsoids: Ellipsoids) -> None:
+        """Let the browser draw Gaussians in the place of an image, before the same background."""
+        unit = self.viewer.scene.box.diagonal / 100
         if self._splats is None:
-            behind = to_bytes(self.studio.subjects[0].background[None, None])  # as in exact pictures
-            self.client.scene.set_background_image(behind, format="png")
+            background = to_bytes(self.viewer.renderers[0].background[None, None])
+            self.client.scene.set_background_image(background, format="png")
         # The same name takes the place of the one before.
+        arrays = splat_arrays(ellipsoids, unit)
         self._splats = self.client.scene.add_gaussian_splats("/splats", *arrays, scale=unit)
 
     def tell(self, text: str) -> None:
-        """See ``Surface``."""
+        """Say how fast images come, or what is going on."""
         self.status.content = text
 
-    def time_is(self, time: float) -> None:
-        """See ``Surface``."""
-        self.controls.time.value = round(time, 3)
+    def show_time(self, time: float) -> None:
+        """Move the slider to the time."""
+        self.time.value = round(time, 3)
 
-    def playing_is(self, playing: bool) -> None:
-        """See ``Surface``."""
-        self.controls.playing_is(playing)
+    def show_playing(self, playing: bool) -> None:
+        """Name what the button does next."""
+        self.play.label = "pause" if playing else "play"
 
-    # What they do.
+    # The camera, and where training images were taken.
 
-    def stand(self, index: int | None) -> None:
+    def show_training_view(self, index: int | None) -> None:
         """Stand where a training image was taken, or leave."""
-        index = self.visit.stand(index)
-        self.controls.stands()
-        if index is not None:
-            self._stood = time.monotonic()
-            self.controls.image.value = index
-            frame = self.studio.scene.train[index]
-            pose = frame.camera.camera_to_world
-            center, ahead = pose[:3, 3], pose[:3, 2]
-            away = max(float((self.studio.focus - center) @ ahead), 1e-3 * self.studio.scene.box.diagonal)
-            camera = self.client.camera
-            with self.client.atomic():
-                camera.up_direction = axis_of(pose, self.studio.up).numpy()
-                camera.position = center.numpy()
-                camera.look_at = (center + away * ahead).numpy()
-                camera.fov = vertical_fov(frame.camera)
-            self.controls.time.value = round(frame.time, 3)
-            self.playing_is(False)
+        index = self.session.show_training_view(index)
+        self._show_whether_compared()
+        if index is None:
+            return
+        self._sent = time.monotonic()
+        self.image.value = index
+        frame = self.viewer.scene.train[index]
+        pose = frame.camera.camera_to_world
+        center, ahead = pose[:3, 3], pose[:3, 2]
+        distance = max(float((self.viewer.focus - center) @ ahead), 1e-3 * self.viewer.scene.box.diagonal)
+        camera = self.client.camera
+        with self.client.atomic():
+            camera.up_direction = turning_axis(pose, self.viewer.up).numpy()
+            camera.position = center.numpy()
+            camera.look_at = (center + distance * ahead).numpy()
+            camera.fov = vertical_fov(frame.camera)
+        self.show_time(frame.time)
+        self.show_playing(False)
 
     def _camera_moved(self, camera: viser.CameraHandle) -> None:
         pose = torch.eye(4, dtype=torch.float64)
-        pose[:3, :3] = torch.from_numpy(viser.transforms.SO3(camera.wxyz).as_matrix())
+        pose[:3, :3] = torch.from_numpy(SO3(camera.wxyz).as_matrix())
         pose[:3, 3] = torch.from_numpy(np.array(camera.position))
-        look = self.visit.look
-        arriving = time.monotonic() - self._stood < _ARRIVES
-        if look.stand is not None and (arriving or self._is_near(pose, look.pose)):
-            self.visit.refresh()  # the canvas may have another size
-            return
-        self.visit.change(pose=pose, fov=float(camera.fov))
-        self.controls.stands()
+        if self.session.state.training_view is not None:
+            before = self.session.state.pose
+            distance = float((before[:3, 3] - self.viewer.focus).norm())
+            shifted = float((pose[:3, 3] - before[:3, 3]).norm()) > _MOVED * distance
+            turned = float(pose[:3, 2] @ before[:3, 2]) <= 1 - _MOVED**2
+            arriving = time.monotonic() - self._sent < _ARRIVAL
+            if arriving or not (shifted or turned):
+                self.session.refresh()  # the canvas may have another size
+                return
+        self._change(pose=pose, fov=float(camera.fov))
 
-    def _is_near(self, pose: Tensor, other: Tensor) -> bool:
-        far = float((other[:3, 3] - self.studio.focus).norm())
-        moved = float((pose[:3, 3] - other[:3, 3]).norm()) > _MOVED * far
-        return not moved and float(pose[:3, 2] @ other[:3, 2]) > 1 - _MOVED**2
+    def _change(self, **changes) -> None:
+        self.session.change(**changes)
+        self._show_whether_compared()
+
+    def _show_whether_compared(self) -> None:
+        """Show the controls that go with whether the page stands in a training view."""
+        compared = self.session.state.training_view is not None
+        if self.leave.visible != compared:
+            self.leave.visible = compared
+            self._show_cameras()
+
+    def _show_cameras(self) -> None:
+        """Show or hide the training cameras; nothing is sent before they are first shown."""
+        with self._showing_cameras:  # threads of the server may come at once
+            visible = self.cameras_shown.value and self.session.state.training_view is None
+            if visible and not self._cameras:
+                indices = spread(len(self.viewer.scene.train), _MAX_CAMERAS)
+                self._cameras = [self._add_camera(index) for index in indices]
+            with self.client.atomic():
+                for camera in self._cameras:
+                    camera.visible = visible
+
+    def _add_camera(self, index: int) -> viser.CameraFrustumHandle:
+        frame = self.viewer.scene.train[index]
+        camera, color = frame.camera, hues(torch.tensor(0.8 * frame.time)).mul(255).int()
+        frustum = self.client.scene.add_camera_frustum(
+            f"/cameras/{index}",
+            fov=vertical_fov(camera),
+            aspect=camera.width / camera.height,
+            scale=0.05 * float((camera.center - self.viewer.focus).norm()),
+            color=tuple(color.tolist()),
+            wxyz=SO3.from_matrix(camera.camera_to_world[:3, :3].numpy()).wxyz,
+            position=camera.center.numpy(),
+            # A line alone is hard to hit.
+            **{"thickness": 1.5, "thickness_units": "screen", "variant": "filled", "visible": False},
+        )
+        on_press(frustum, lambda: self.show_training_view(index))
+        return frustum
+
+    # The controls.
+
+    def _add_time(self) -> None:
+        gui, session = self.client.gui, self.session
+        with gui.add_folder("Time"):
+            self.time = gui.add_slider("time", 0.0, 1.0, 0.001, round(session.state.time, 3))
+            self.play = gui.add_button("play")
+            speed = gui.add_dropdown("speed", _SPEEDS, initial_value="1")
+            loop = gui.add_checkbox("loop", True)
+
+        def toggle() -> None:
+            session.play(not session.playing)
+            self._show_whether_compared()
+            self.show_playing(session.playing)
+
+        on_edit(self.time, lambda time: self._change(time=float(time)))
+        on_press(self.play, toggle)
+        on_edit(speed, lambda speed: session.set_speed(float(speed)))
+        on_edit(loop, lambda loop: setattr(session, "loop", loop))
+
+    def _add_channels(self) -> None:
+        gui, scene, session = self.client.gui, self.client.scene, self.session
+        with gui.add_folder("Show"):
+            chosen = session.state.channel
+            self.channel = gui.add_dropdown("show", self.viewer.channels, initial_value=chosen)
+            self.about_splats = gui.add_markdown(_ABOUT_SPLATS)
+            self.trajectories = gui.add_checkbox("trajectories", False)
+            self.follow = gui.add_button(_FOLLOW)
+            self.follow_none = gui.add_button("follow none")
+            screenshot = gui.add_button("screenshot")
+
+        async def clicked(event: viser.SceneClickEvent) -> None:
+            scene.remove_click_callback(clicked)
+            self.follow.label = _FOLLOW
+            session.follow(*event.screen_pos)
+
+        def wait_for_click() -> None:
+            scene.remove_click_callback("all")
+            scene.on_click()(clicked)
+            self.follow.label = "now click a point"
+
+        on_edit(self.channel, lambda channel: self._change(channel=channel))
+        on_edit(self.trajectories, lambda shown: session.change(trajectories=shown))
+        on_press(self.follow, wait_for_click)
+        on_press(self.follow_none, lambda: session.change(followed=()))
+        screenshot.on_click(lambda _: self.save_screenshot())  # in a thread of its own, as it waits
+
+    def _add_training_images(self) -> None:
+        gui, last = self.client.gui, len(self.viewer.scene.train) - 1
+        with gui.add_folder("Training images"):
+            gui.add_markdown("Choose one, or click its camera, for truth | prediction | error.")
+            self.image = gui.add_slider("image", 0, max(last, 1), 1, 0)
+            # Over two images side by side there is no one place for a camera.
+            is_alone = len(self.viewer.renderers) < 2
+            self.cameras_shown = gui.add_checkbox("show cameras", False, visible=is_alone)
+            go = gui.add_button("go there")
+            self.leave = gui.add_button("leave it", visible=False)
+        on_edit(self.image, lambda index: self.show_training_view(int(index)))
+        on_press(go, lambda: self.show_training_view(int(self.image.value)))
+        on_press(self.leave, lambda: self.show_training_view(None))
+        self.cameras_shown.on_update(lambda _: self._show_cameras())  # in a thread, as they are many
+
+    def _add_video(self) -> None:
+        gui, keys = self.client.gui, []
+        with gui.add_folder("Video", expand_by_default=False):
+            status = gui.add_markdown("0 key views")
+            add, clear = gui.add_button("add this view and time"), gui.add_button("clear")
+            limits = {"min": MIN_VIDEO_SECONDS, "max": MAX_VIDEO_SECONDS}
+            seconds = gui.add_number("seconds", 4.0, step=0.5, **limits)
+            make = gui.add_button("make the video")
+
+        def tell(text: str) -> None:
+            status.content = text
+
+        def add_key() -> None:
+            keys.append(self.session.state)
+            tell(f"{len(keys)} key views")
+
+        def clear_keys() -> None:
+            keys.clear()
+            tell("0 key views")
+
+        def make_video(_: viser.GuiEvent) -> None:
+            make.disabled = True
+            try:
+                self.save_video(list(keys), float(seconds.value), tell)
+            finally:
+                make.disabled = False
+
+        on_press(add, add_key)
+        on_press(clear, clear_keys)
+        make.on_click(make_video)  # in a thread of its own, as it waits
+
+    # What waits for images.
 
     def save_screenshot(self) -> None:
-        """Send the picture as a file, or say why there is none; waits."""
+        """Send the image as a file, or say why there is none."""
+        state = self.session.state
         try:
-            self._screenshot()
-        except Superseded:
-            pass
+            if state.drawn_by_browser:
+                width, height = self.canvas()
+                drawn = self.client.get_render(height, width, transport_format="png", timeout=30)
+                image = torch.from_numpy(drawn[..., :3] / 255.0)
+            else:
+                image = self.session.image(state, priority=1)
+        except Cancelled:
+            return
         except Exception as error:  # what went wrong while it was drawn, or a browser that does not answer
-            self.tell(f"no screenshot: {told(error)}")
+            self.tell(f"no screenshot: {reason(error)}")
+            return
+        names = "-".join(renderer.name for renderer in self.viewer.renderers)
+        name = f"{self.viewer.scene.name}-{names}-{state.channel}-{state.time:.3f}.png"
+        self.client.send_file_download(name, png_bytes(image), save_immediately=True)
 
-    def _screenshot(self) -> None:
-        look = self.visit.look
-        if look.by_browser:
-            width, height = self.canvas()
-            seen = self.client.get_render(height, width, transport_format="png", timeout=30)
-            drawn = torch.from_numpy(seen[..., :3] / 255.0)
-        else:
-            drawn = self.visit.request(look, urgency=1)
-        names = "-".join(subject.name for subject in self.studio.subjects)
-        name = f"{self.studio.scene.name}-{names}-{look.show}-{look.time:.3f}.png"
-        self.client.send_file_download(name, png_bytes(drawn), save_immediately=True)
+    def save_video(self, keys: list, seconds: float, tell: Callable[[str], None]) -> None:
+        """Write and send a video through key views, or say why there is none."""
 
-    def save_film(self, keys: Sequence[Look], seconds: float, say: Callable[[str], None]) -> None:
-        """Write and send a video, or say why there is none; waits. See ``write_film``."""
+        def progress(done: int, total: int) -> None:
+            tell(f"{done} of {total} pictures")
+
         try:
-            file = write_film(
-                self.folder,
-                self.visit,
-                keys,
-                seconds,
-                lambda done, of: say(f"{done} of {of} pictures"),
-            )
-        except Superseded:
+            file = self.session.write_video(self.folder, keys, seconds, progress)
+        except Cancelled:
             return
-        except Exception as error:  # also what went wrong while a picture was drawn
-            say(f"no video: {told(error)}")
+        except Exception as error:  # also what went wrong while an image was rendered
+            tell(f"no video: {reason(error)}")
             return
-        say(f"written: {file}")
+        tell(f"written: {file}")
         self.client.send_file_download(file.name, file.read_bytes(), save_immediately=True)
 
 
-def told(error: Exception) -> str:
+def reason(error: Exception) -> str:
     """Say what went wrong; its kind too, where its words are none of ours."""
-    ours = isinstance(error, ValueError) or getattr(error, "errno", None) is not None
-    return str(error) if ours else f"{type(error).__name__}: {error}"
+    is_ours = isinstance(error, ValueError) or getattr(error, "errno", None) is not None
+    return str(error) if is_ours else f"{type(error).__name__}: {error}"
+
+
+def on_edit(control, act: Callable) -> None:
+    """Call ``act`` with a control's value when the browser has changed it, not when this program has."""
+
+    @control.on_update
+    async def _(event: viser.GuiEvent) -> None:
+        if event.client is not None:
+            act(control.value)
+
+
+def on_press(button, act: Callable[[], object]) -> None:
+    """Call ``act`` when a button or a camera is clicked. It must not wait: others wait for it."""
+
+    @button.on_click
+    async def _(_: viser.GuiEvent) -> None:
+        act()

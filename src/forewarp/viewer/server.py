@@ -1,18 +1,26 @@
-"""The server of the page: where it listens, and who comes and goes."""
+"""The server of pages: of finished runs, and of a run while it trains."""
 
 from __future__ import annotations
 
 import contextlib
+import time
+import traceback
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from pathlib import Path
 
+import lightning
+import torch
 import viser
 
 from forewarp.browser import begin_at, silent
-from forewarp.viewer.address import check_address, is_our_page, taken, url
-from forewarp.viewer.look import axis_of, first_look, pivot
+from forewarp.training.stages import Run
+from forewarp.viewer.address import check_address, is_same_origin, port_in_use, url
 from forewarp.viewer.page import Page
-from forewarp.viewer.studio import Studio
+from forewarp.viewer.rendering import SceneRenderer, Viewer, ViewState, turning_axis
+
+_REFRESH_SECONDS = 2.0  # between two images of a page at rest, of a run in training
+_RENEWAL_SECONDS = 20.0  # after which points of trajectories are chosen anew
 
 
 class _Server(viser.ViserServer):
@@ -24,11 +32,11 @@ class _Server(viser.ViserServer):
 
 
 @contextlib.contextmanager
-def served(studio: Studio, *, host: str, port: int, title: str, folder) -> Iterator[str]:
-    """Serve pages of a studio, each with its own camera, time and picture; yields the address.
+def serve(viewer: Viewer, *, host: str, port: int, title: str, folder: Path) -> Iterator[str]:
+    """Serve pages of a viewer, each with its own camera, time and image; yields the address.
 
     Args:
-        studio: what they see. Its desk is not served here.
+        viewer: what they see. Its queue is not run here.
         host: address to listen on; 127.0.0.1: nobody but this machine.
         port: 0: any that is free.
         title: stands above the page's controls.
@@ -37,61 +45,125 @@ def served(studio: Studio, *, host: str, port: int, title: str, folder) -> Itera
     Raises:
         ValueError: if nothing can listen there.
     """
-    server = _listening(host, port)
+    server, pages = _listen(host, port), {}
     try:
-        pages: dict[int, Page] = {}
-        _prepare(server, studio, title)
+        first = ViewState.first(viewer.scene)
+        begin_at(server, first.pose, first.fov, viewer.focus, viewer.up, viewer.scene.box.diagonal)
+        server.initial_camera.up = tuple(turning_axis(first.pose, viewer.up).tolist())
+        server.gui.set_panel_label(title)
+        server.gui.configure_theme(show_logo=False, show_share_button=False)
+        server.gui.main_panel.dock_right()
 
         @server.on_client_connect
         async def _(client: viser.ClientHandle) -> None:
-            pages[client.client_id] = Page(studio, client, folder)
-            studio.pages = tuple(pages.values())
+            pages[client.client_id] = Page(viewer, client, folder)
+            viewer.pages = tuple(pages.values())
 
         @server.on_client_disconnect
         async def _(client: viser.ClientHandle) -> None:
             page = pages.pop(client.client_id, None)
-            studio.pages = tuple(pages.values())
+            viewer.pages = tuple(pages.values())
             if page is not None:
-                page.visit.leave()
+                page.session.close()
 
         yield url(host, server.get_port())
     finally:
-        studio.desk.close()
+        viewer.queue.close()
         with silent():
             server.stop()
 
 
-def _listening(host: str, port: int) -> _Server:
-    """Start a server on this port and no other; viser by itself takes the next free one and says nothing."""
+def _listen(host: str, port: int) -> _Server:
+    """Start a server on this port and no other, which sends nothing to pages of foreign sites."""
     check_address(host, port)
     # What a page is sent in the moment in which it leaves is lost, as it should be.
     warnings.filterwarnings("ignore", message="Queued a .* on a closed connection", category=UserWarning)
     with silent():
         server = _Server(host=host, port=port, verbose=False)
-        if port and server.get_port() != port:  # taken since
+        if port and server.get_port() != port:  # viser takes the next free one and says nothing
             server.stop()
-            raise ValueError(taken(port))
-    _refuse_foreign(server, host)
-    return server
-
-
-def _refuse_foreign(server: _Server, host: str) -> None:
-    """Close what pages of foreign sites open, before anything is sent; viser itself asks nobody."""
-    sockets = server._websock_server  # viser has no public way to a request's headers
+            raise ValueError(port_in_use(port))
+    sockets = server._websock_server  # viser has no public way to a request's headers, and asks nobody
 
     @sockets.on_client_connect
     async def _(client) -> None:
         connection = sockets._live_connections[client.client_id]
         headers = connection.request.headers
-        if not is_our_page(host, headers.get("Host"), headers.get("Origin")):
+        if not is_same_origin(host, headers.get("Host"), headers.get("Origin")):
             await connection.close(1008, "not a page of this server")
 
+    return server
 
-def _prepare(server: _Server, studio: Studio, title: str) -> None:
-    """Set what all pages begin with."""
-    look, (focus, up) = first_look(studio.scene), pivot(studio.scene)
-    begin_at(server, look.pose, look.fov, focus, up, studio.scene.box.diagonal)
-    server.initial_camera.up = tuple(axis_of(look.pose, up).tolist())
-    server.gui.set_panel_label(title)
-    server.gui.configure_theme(show_logo=False, show_share_button=False)
-    server.gui.main_panel.dock_right()
+
+class LiveView(lightning.Callback):
+    """Render what pages ask for between two steps, one image a step, while the training clock is stopped.
+
+    The run's numbers are the same as without: nothing is changed, and random numbers are put back.
+
+    Args:
+        viewer: what pages see.
+        name: what they call the run.
+
+    Cost: a step reads the clock, and asks whether a page wants something.
+    """
+
+    def __init__(self, viewer: Viewer, name: str) -> None:
+        self.viewer, self.name = viewer, name
+        self._refreshed = float("-inf")
+
+    def on_train_start(self, trainer, module) -> None:
+        """Show the method of this stage from now on."""
+        data = trainer.datamodule
+        self.viewer.renderers = [SceneRenderer(self.name, module, data, renewal=_RENEWAL_SECONDS)]
+        self._each_page(module, lambda page: page.adapt())
+        self._refreshed = float("-inf")
+
+    def on_train_batch_end(self, trainer, module, outputs, batch, batch_idx) -> None:
+        """Render one image, if one is asked for."""
+        viewer, now = self.viewer, time.monotonic()
+        if now - self._refreshed > _REFRESH_SECONDS:
+            self._refreshed = now
+            viewer.note = f"{module.settings.name} {module.fraction:.0%}, step {module.global_step}"
+            self._each_page(module, lambda page: (page.adapt(), page.session.refresh()))
+        if viewer.queue.has_due_job():
+            with module.clock.paused(), torch.random.fork_rng(devices=[]):
+                viewer.renderers[0].invalidate()
+                viewer.queue.run_next()
+
+    def on_train_end(self, trainer, module) -> None:
+        """Say that there is nothing new to see."""
+        self.viewer.note = f"{module.settings.name} has ended; what follows is not shown"
+        self._each_page(module, lambda page: page.tell(self.viewer.note))
+
+    def _each_page(self, module, act: Callable[[Page], object]) -> None:
+        """Do something with every page while the training clock is stopped; what goes wrong with one is
+        reported on stderr and ends no training.
+        """
+        pages = self.viewer.pages
+        with module.clock.paused() if pages else contextlib.nullcontext():
+            for page in pages:
+                try:
+                    act(page)
+                except Exception as error:
+                    traceback.print_exception(error)
+
+
+@contextlib.contextmanager
+def live(run: Run, *, host: str, port: int) -> Iterator[None]:
+    """Serve a page of a run whose stages are trained within; says where it is.
+
+    Raises:
+        ValueError: if nothing can listen there.
+    """
+    folder, before = Path(run.folder), run.callbacks
+    viewer = Viewer(run.datamodule.scene)
+    viewer.note = "waiting for the first step"
+    title = f"{viewer.scene.name} | {folder.name}, in training"
+    with serve(viewer, host=host, port=port, title=title, folder=folder / "videos") as address:
+        run.tell(f"see it: {address}")
+        run.callbacks = lambda name, where: [*before(name, where), LiveView(viewer, folder.name)]
+        try:
+            yield
+        finally:
+            run.callbacks = before
+    run.tell(f"see it again: forewarp-view run={folder}")

@@ -1,0 +1,366 @@
+"""What pages see of a scene, or of two runs of it side by side: images, trajectories, training views."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import torch
+from torch import Tensor
+
+from forewarp.browser import vertical_fov
+from forewarp.drawing.images import depth_colors, flow_colors, in_a_row, with_wheel
+from forewarp.evaluation.images import compare, image_flow
+from forewarp.evaluation.trajectories import Trajectories
+from forewarp.methods.method import HasEllipsoids, HasMatter, HasTrajectories, Snapshot
+from forewarp.scene.box import Box
+from forewarp.scene.camera import Camera
+from forewarp.scene.frame import Scene
+from forewarp.scene.paths import focus_point, mean_up
+from forewarp.scene.view import Moment, Rendering, View
+from forewarp.training.module import DynamicSceneModule
+from forewarp.viewer.queue import Cancelled, RenderQueue
+
+SPLATS = "splats"  # drawn by the browser; all other channels are images that the method renders
+_MIN_NEAR = 0.01  # of the box's diagonal: nothing nearer to the camera is drawn
+_SOLID = 0.5  # opacity from which a pixel shows something that can be followed
+_SNAPSHOTS = 2  # that are kept: of the time shown, and of the canonical time
+_PATHS, _POINTS = 4, 64  # sets of followed points that are kept, which pages share, and single ones
+_FOLLOWED = {"tail": 1.0, "width": 0.008}  # how the trajectory of a followed point is drawn
+_MIN_FULL_ROWS = 400  # rows of an image at rest, if the training images have fewer
+_GAP = 4  # white pixels between two images
+_TOLERANCE = 1e-3  # by which two runs' test cameras may differ, of their distance to the origin
+
+Point = tuple[float, float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class ViewState:
+    """Where a page stands, and what it wants to see from there.
+
+    Attributes:
+        pose: ``camera_to_world`` (4, 4), float64.
+        fov: vertical, radians.
+        time: in [0, 1].
+        channel: one of ``SceneRenderer.channels``.
+        trajectories: draw trajectories of points all over the moving surface.
+        followed: points, each with the time at which it is there, whose trajectories are drawn.
+        training_view: the training view that is compared with its image; None: none.
+    """
+
+    pose: Tensor
+    fov: float
+    time: float = 0.0
+    channel: str = "colour"
+    trajectories: bool = False
+    followed: tuple[tuple[Point, float], ...] = ()
+    training_view: int | None = None
+
+    @property
+    def drawn_by_browser(self) -> bool:
+        """Whether the browser draws it by itself; a training view is always compared in an image."""
+        return self.channel == SPLATS and self.training_view is None
+
+    @classmethod
+    def first(cls, scene: Scene) -> ViewState:
+        """Stand where the first test image was taken, at its time; without one, the first training image."""
+        frame = (scene.test or scene.train)[0]
+        return cls(frame.camera.camera_to_world, vertical_fov(frame.camera), frame.time)
+
+
+def camera_of(state: ViewState, width: int, height: int, scene: Scene) -> Camera:
+    """Make the pinhole camera of a page, ``width`` x ``height`` pixels, which sees all of the scene's box."""
+    focal = 0.5 * height / math.tan(0.5 * state.fov)
+    near, far = near_and_far(state.pose[:3, 3], scene.box, [frame.camera for frame in scene.train])
+    return Camera(width, height, focal, focal, 0.5 * width, 0.5 * height, state.pose, near, far)
+
+
+def near_and_far(center: Tensor, box: Box, cameras: Sequence[Camera]) -> tuple[float, float]:
+    """Return near and far of a camera at ``center`` (3,): those of the training cameras, and wider where the
+    box begins nearer or ends farther.
+    """
+    low, high = (torch.tensor(corner, dtype=torch.float64) for corner in (box.low, box.high))
+    outside = float(torch.maximum(low - center, center - high).clamp(min=0).norm())
+    farthest = float(torch.maximum((center - low).abs(), (center - high).abs()).norm())
+    near = min(*(camera.near for camera in cameras), max(outside, _MIN_NEAR * box.diagonal))
+    return near, max(farthest, *(camera.far for camera in cameras))
+
+
+def turning_axis(pose: Tensor, up: Tensor) -> Tensor:
+    """Return the axis (3,) about which a page turns that stands at ``pose`` (4, 4): the upward direction
+    ``up``, bent just so much that the image has the pose's roll.
+    """
+    right, above = pose[:3, 0], -pose[:3, 1]
+    axis = up - (up @ right) * right
+    axis = axis if float(axis @ above) > 0 else -axis
+    return axis / axis.norm() if float(axis @ above) > 0.05 else above
+
+
+class SceneRenderer:
+    """Render a fitted method, or one in training. Only one thread may call it.
+
+    Args:
+        name: what pages call it.
+        module: the fitted module.
+        datamodule: serves the scene and the training images.
+        count, tail: see ``Trajectories``.
+        renewal: seconds after which points of a method in training are chosen anew.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        module: DynamicSceneModule,
+        datamodule,
+        *,
+        count: int = 300,
+        tail: float = 0.5,
+        renewal: float = float("inf"),
+    ) -> None:
+        self.name, self.module, self.scene = name, module, datamodule.scene
+        self.targets = datamodule.targets("train")
+        self.background = self.targets.background
+        self.count, self.tail, self.renewal = count, tail, renewal
+        self._snapshots: list[Snapshot] = []
+        self._trajectories: tuple[float, Trajectories] | None = None
+        self._canonical = lru_cache(_POINTS)(self.canonical_point)
+        self._followed = lru_cache(_PATHS)(self._follow)
+
+    @property
+    def can_follow(self) -> bool:
+        """Whether the method follows points."""
+        return isinstance(self.module.method, HasTrajectories) and isinstance(self.module.method, HasMatter)
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """What can be shown."""
+        motion = ("motion",) if isinstance(self.module.method, HasTrajectories) else ()
+        splats = (SPLATS,) if isinstance(self.module.method, HasEllipsoids) else ()
+        return ("colour", "depth", "opacity", *motion, *splats)
+
+    def invalidate(self) -> None:
+        """Forget what was computed from the method's parameters, which have changed."""
+        self._snapshots.clear()
+        self._canonical.cache_clear()
+        self._followed.cache_clear()
+        if self._trajectories is not None:
+            self._trajectories[1].forget()
+
+    @torch.no_grad()
+    def snapshot_at(self, moment: Moment) -> Snapshot:
+        """Return the snapshot of a moment; the last two are kept."""
+        snapshot = next((kept for kept in self._snapshots if kept.holds(moment)), None)
+        snapshot = snapshot or self.module.method.at(moment)
+        others = [kept for kept in self._snapshots if kept is not snapshot]
+        self._snapshots = [snapshot, *others][:_SNAPSHOTS]
+        return snapshot
+
+    @property
+    def _canonical_moment(self) -> Moment:
+        return Moment(self.module.curriculum.canonical_time)
+
+    def prepare(self, state: ViewState) -> None:
+        """Compute what an image needs besides its pixels."""
+        if state.training_view is not None:
+            self.snapshot_at(self.targets[state.training_view].moment)
+            return
+        self.snapshot_at(Moment(state.time))
+        if state.channel == "motion":
+            self.snapshot_at(self._canonical_moment)
+
+    @torch.no_grad()
+    def image(
+        self, state: ViewState, camera: Camera, chunks: int = 1, is_stale: Callable[[], bool] = bool
+    ) -> Tensor:
+        """Render what a page shows, (H, W, 3) in [0, 1] on the CPU.
+
+        Args:
+            state: what to show.
+            camera: from where, and how large.
+            chunks: bands of rows that are rendered one by one.
+            is_stale: tells whether the image is no longer wanted; called before each chunk.
+
+        Raises:
+            Cancelled: if it is no longer wanted.
+        """
+        shape = camera.height, camera.width
+        if state.channel == "motion":
+            canonical = self.snapshot_at(self._canonical_moment)
+            return with_wheel(flow_colors(*image_flow(self.module, camera, state.time, canonical))).cpu()
+        rendering = self._render(camera, Moment(state.time), chunks, is_stale)
+        if state.channel == "depth":
+            image = depth_colors(rendering.depth.reshape(shape), rendering.opacity.reshape(shape))
+        elif state.channel == "opacity":
+            image = rendering.opacity.clamp(0, 1).reshape(*shape, 1).expand(*shape, 3)
+        else:
+            image = rendering.rgb.reshape(*shape, 3).clamp(0, 1)
+        for trajectories in self._overlays(state):
+            image = trajectories(image, rendering, camera, state.time)
+        return image.cpu()
+
+    def _render(self, camera: Camera, moment: Moment, chunks: int, is_stale: Callable) -> Rendering:
+        snapshot, parts = self.snapshot_at(moment), []
+        for chunk in range(chunks):
+            if is_stale():
+                raise Cancelled
+            top, end = (camera.height * i // chunks for i in (chunk, chunk + 1))
+            view = View(camera, crop=None if chunks == 1 else (top, 0, end - top, camera.width))
+            parts.append(self.module.render(view, moment, self.background, snapshot))
+        return parts[0] if chunks == 1 else Rendering.joined(parts)
+
+    def comparison(self, training_view: int, width: int, height: int) -> list[Tensor]:
+        """Render truth, prediction and error of a training view, as large as fits."""
+        target = self.targets[training_view]
+        camera = target.frame.camera
+        scale = min(width / camera.width, height / camera.height)
+        camera = camera.resized(*(max(1, int(scale * side)) for side in (camera.width, camera.height)))
+        images, _ = compare(self.module, target, camera, self.snapshot_at(target.moment))
+        return [image.cpu() for image in images]
+
+    @torch.no_grad()
+    def point_at(self, camera: Camera, pixel: tuple[int, int], moment: Moment) -> Point | None:
+        """Return the world point that a pixel (column, row) shows; None if it shows nothing solid."""
+        column, row = (min(max(p, 0), n - 1) for p, n in zip(pixel, (camera.width, camera.height)))
+        view = View(camera, torch.tensor([row * camera.width + column]))
+        rendering = self.module.render(view, moment, self.background, self.snapshot_at(moment))
+        if float(rendering.opacity) < _SOLID:
+            return None
+        rays = view.rays()
+        return tuple((rays.origins[0] + rendering.depth.cpu() * rays.directions[0]).tolist())
+
+    @torch.no_grad()
+    def canonical_point(self, point: Point, time: float) -> Tensor:
+        """Return the canonical point (3,) of the matter that is nearest to a point at a time."""
+        method = self.module.method
+        matter = method.matter().points
+        now = method.trajectories(matter, matter.new_tensor([time]))[:, 0]
+        return matter[(now - now.new_tensor(point)).norm(dim=-1).argmin()]
+
+    def _overlays(self, state: ViewState) -> list[Trajectories]:
+        """Return what is drawn over an image: points all over the moving surface, and those followed."""
+        overlays = []
+        if self.can_follow and state.trajectories:
+            now = time.monotonic()
+            if self._trajectories is None or now - self._trajectories[0] > self.renewal:
+                cameras = [frame.camera for frame in self.scene.train]
+                chosen = Trajectories(self.module, cameras, count=self.count, tail=self.tail)
+                self._trajectories = now, chosen
+            overlays.append(self._trajectories[1])
+        if self.can_follow and state.followed:
+            overlays.append(self._followed(state.followed))
+        return overlays
+
+    def _follow(self, followed: tuple[tuple[Point, float], ...]) -> Trajectories:
+        points = torch.stack([self._canonical(*point_and_time) for point_and_time in followed])
+        return Trajectories(self.module, (), points=points, **_FOLLOWED)
+
+
+class Viewer:
+    """What all pages share: one scene, one or two renderers of it, and the render queue.
+
+    Args:
+        scene: of all renderers.
+        renderers: none while a run in training has not begun, else one or two, side by side.
+        rows: of an image at rest; None: as the training images have, at least 400.
+    """
+
+    def __init__(
+        self, scene: Scene, renderers: Sequence[SceneRenderer] = (), *, rows: int | None = None
+    ) -> None:
+        self.scene, self.renderers = scene, list(renderers)
+        cameras = [frame.camera for frame in scene.train]
+        self.rows = rows or max(_MIN_FULL_ROWS, *(camera.height for camera in cameras))
+        # The point that pages' cameras turn about, and the upward direction, both (3,).
+        self.focus, self.up = focus_point(cameras), mean_up(cameras)
+        self.queue = RenderQueue()
+        self.note = ""  # what a run in training is doing
+        self.pages: tuple = ()  # that are open now
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """What can be shown of all renderers; splats of a single one."""
+        if not self.renderers:
+            return ("colour",)
+        first, *others = (renderer.channels for renderer in self.renderers)
+        common = [channel for channel in first if all(channel in channels for channels in others)]
+        return tuple(channel for channel in common if channel != SPLATS or not others)
+
+    @property
+    def can_follow(self) -> bool:
+        """Whether points can be followed in all renderers."""
+        return bool(self.renderers) and all(renderer.can_follow for renderer in self.renderers)
+
+    def supported(self, state: ViewState) -> ViewState:
+        """Drop what the present methods cannot show, as those of an earlier stage could."""
+        channels = self.channels
+        state = state if state.channel in channels else replace(state, channel=channels[0])
+        return state if self.can_follow else replace(state, trajectories=False, followed=())
+
+    def prepare(self, state: ViewState) -> None:
+        """Compute what an image needs besides its pixels."""
+        for renderer in self.renderers:
+            renderer.prepare(state)
+
+    def image(self, state: ViewState, width: int, height: int, chunks: int = 1) -> Tensor:
+        """Render what a page shows, (height, width, 3) in [0, 1]: all renderers side by side; of a training
+        view truth, prediction and error, a row for each renderer.
+
+        Raises:
+            Cancelled: if the queue's running job, which wants it, is stale.
+        """
+        count = len(self.renderers)
+        if state.training_view is not None:
+            cell = (width - 2 * _GAP) // 3, (height - (count - 1) * _GAP) // count
+            rows = [in_a_row(r.comparison(state.training_view, *cell), _GAP) for r in self.renderers]
+            gap = rows[0].new_ones(_GAP, rows[0].shape[1], 3)
+            stacked = torch.cat([part for row in rows for part in (gap, row)][1:])
+            return on_white(stacked, width, height)
+        camera = self._camera(state, width, height)
+        images = [renderer.image(state, camera, chunks, self.queue.is_stale) for renderer in self.renderers]
+        return images[0] if count == 1 else on_white(in_a_row(images, _GAP), width, height)
+
+    def _camera(self, state: ViewState, width: int, height: int) -> Camera:
+        """Make the camera of one renderer's part of an image; beside another it sees what a square would."""
+        count = len(self.renderers)
+        part = max(1, (width - (count - 1) * _GAP) // count)
+        camera = camera_of(state, part, height, self.scene)
+        if count == 1 or part >= height:
+            return camera
+        return replace(camera, fx=camera.fx * part / height, fy=camera.fy * part / height)
+
+    def point_at(self, state: ViewState, x: float, y: float, width: int, height: int) -> Point | None:
+        """Return the world point seen at ``x y``, fractions of the whole image; None: nothing solid."""
+        camera = self._camera(state, width, height)
+        number = min(int(x * len(self.renderers)), len(self.renderers) - 1)
+        column = int(x * width) - number * (camera.width + _GAP)
+        return self.renderers[number].point_at(camera, (column, int(y * height)), Moment(state.time))
+
+
+def on_white(image: Tensor, width: int, height: int) -> Tensor:
+    """Put an image (h, w, 3) into the middle of a white one (height, width, 3)."""
+    white = image.new_ones(height, width, 3)
+    top, left = (height - image.shape[0]) // 2, (width - image.shape[1]) // 2
+    white[top : top + image.shape[0], left : left + image.shape[1]] = image
+    return white
+
+
+def refuse_other_scene(scene: Scene, other: Scene) -> None:
+    """Refuse two runs of different scenes.
+
+    Raises:
+        ValueError: if the names differ, or what the test images were taken with.
+    """
+    if scene.name != other.name:
+        raise ValueError(f"run2: expected a run of {scene.name}, as run= is, but got one of {other.name}")
+    same = len(scene.test) == len(other.test) and all(
+        abs(a.time - b.time) < _TOLERANCE
+        and torch.allclose(a.camera.center, b.camera.center, rtol=_TOLERANCE, atol=_TOLERANCE)
+        for a, b in zip(scene.test, other.test)
+    )
+    if not same:
+        raise ValueError(
+            f"run2: expected a run of the same {scene.name} as run= is, but got one with other test views"
+        )

@@ -1,0 +1,74 @@
+"""A viewer and a page without a method and without a browser, by a clock that stands."""
+
+from types import SimpleNamespace
+
+import torch
+
+from forewarp.viewer.queue import Cancelled, RenderQueue
+from tests.support.tiny_scene import ball_scene
+
+CANVAS = 640, 480
+
+
+class Watch:
+    """A clock that stands unless it is moved on."""
+
+    def __init__(self):
+        self.now = 0.0
+
+    def __call__(self):
+        return self.now
+
+
+class FakeViewer:
+    """Renders grey images; each takes ``cost`` seconds a pixel, of a clock that stands otherwise."""
+
+    rows, note, can_follow = 400, "", True
+
+    def __init__(self, watch=None, cost=0.0):
+        self.watch, self.cost, self.scene = watch or Watch(), cost, ball_scene(frames=4)
+        self.queue, self.interrupt = RenderQueue(self.watch), None
+        method = SimpleNamespace(ellipsoids=lambda time: f"splats at {time}")
+        self.renderers = [SimpleNamespace(module=SimpleNamespace(method=method))]
+
+    def supported(self, state):
+        return state
+
+    def prepare(self, state):
+        self.watch.now += 0.001
+
+    def image(self, state, width, height, chunks=1):
+        self.watch.now += self.cost * width * height
+        if self.interrupt:
+            self.interrupt()
+            if self.queue.is_stale():
+                raise Cancelled
+        return torch.full((height, width, 3), state.time)
+
+    def point_at(self, state, x, y, width, height):
+        return None if x > 0.9 else (x, y, 0.0)
+
+
+class FakePage:
+    """Keeps what it is shown and told."""
+
+    def __init__(self):
+        self.images, self.said, self.times, self.plays = [], [], [], []
+
+    def canvas(self):
+        return CANVAS
+
+    def show_image(self, image, *, rest):
+        self.images.append((tuple(image.shape[:2]), rest, round(float(image[0, 0, 0]), 3)))
+
+    def show_splats(self, ellipsoids):
+        self.images.append(ellipsoids)
+
+    def tell(self, text):
+        self.said.append(text)
+
+    def show_time(self, time):
+        self.times.append(time)
+
+    def show_playing(self, playing):
+        self.plays.append(playing)
