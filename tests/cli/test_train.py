@@ -1,18 +1,21 @@
-"""From a written scene to its numbers, and everything a user can get wrong on the way."""
+"""From a written scene to its numbers, as one types it: begun, gone on with, and refused."""
 
-import errno
 import json
+import os
 import shutil
-from pathlib import Path
 
 import lightning
 import pytest
 import torch
 import yaml
 
-from forewarp.training.stages import Run
+from forewarp.runs.session import locked
 from tests.support.commands import TINY
 from tests.support.dnerf_scene import write_tiny
+
+# A run of one stage and 6 steps, beside ``data.root`` and ``run``.
+SHORT = ["budget.iterations=6", "stage.coarse.num_voxels=[[0,800]]", "~stage.fine", "logger=none"]
+SHORT += ["callbacks.pictures=null", "evaluate=false"]
 
 
 @pytest.fixture
@@ -27,20 +30,32 @@ def copied(fitted, tmp_path):
     return shutil.copytree(fitted, tmp_path / "copied")
 
 
+@pytest.fixture
+def begun(copied):
+    """A copy of the shared run that was interrupted after its last step."""
+    (copied / "metrics.json").unlink()
+    (copied / "fine" / "done.json").unlink()
+    return copied
+
+
 def arguments(root, run, *more, scene="vehicle"):
-    """The command line of the shared run, with other words."""
+    """The command line of the shared run, with further overrides."""
     return ["train", *TINY, f"data.root={root}", f"data.scene={scene}", f"run={run}", *more]
 
 
+def read(path):
+    return json.loads(path.read_text())
+
+
 def numbers(folder):
-    """What metrics.json holds, but for seconds and the threads, which another test may have set."""
-    content = json.loads((Path(folder) / "metrics.json").read_text())
+    """What metrics.json holds, but for seconds, and the threads, which another test may have set."""
+    content = read(folder / "metrics.json")
     content.pop("seconds")
     content["protocol"].pop("threads")
     return content
 
 
-def test_a_run_leaves_what_it_promises(fitted):
+def test_a_run_leaves_what_it_promises_and_says_so(fitted):
     for name in ("config.yaml", "metrics.json", "per_image.json", "coarse/handover.json", "coarse/last.ckpt"):
         assert (fitted / name).is_file()
     assert (fitted / "fine" / "last.ckpt").is_file()
@@ -50,13 +65,20 @@ def test_a_run_leaves_what_it_promises(fitted):
     for stage in ("coarse", "fine"):
         assert (fitted / stage / "images" / "100_compare.png").is_file()
         assert list((fitted / stage / "tensorboard").glob("events.*"))
+    out, err = (fitted / "said.txt").read_text().split("\n---\n")
+    first, second = out.splitlines()[:2]
+    assert first == "vehicle: 6 training images (32 x 32) and 5 test images (32 x 32), on the CPU"
+    assert second == f"run: {fitted}"
+    assert "canonical" in out
+    assert "metrics.json" in out
+    told = [line.split()[0] for line in err.strip().splitlines()]
+    assert list(dict.fromkeys(told)) == ["coarse", "fine", "test"]  # a slow machine says each more than once
 
 
 def test_metrics_have_the_promised_shape(fitted):
-    content = json.loads((fitted / "metrics.json").read_text())
+    content = read(fitted / "metrics.json")
     whole = {"protocol", "seconds", "clocks", "steps", "peak_memory_bytes", "parameters", "size", "effects"}
-    whole |= {"test", "flow"}
-    assert set(content) == whole
+    assert set(content) == whole | {"test", "flow"}
     seconds = content["seconds"]
     assert set(seconds) == {"train", "coarse", "fine", "render_per_frame", "render_again_per_frame"}
     assert seconds["train"] == pytest.approx(seconds["coarse"] + seconds["fine"])
@@ -71,65 +93,21 @@ def test_metrics_have_the_promised_shape(fitted):
     assert {"device", "threads", "versions", "background", "resolution"} <= set(content["protocol"])
 
 
-def test_it_says_what_it_does_and_nothing_else(fitted):
-    out, err = (fitted / "said.txt").read_text().split("\n---\n")
-    first, second = out.splitlines()[:2]
-    assert first == "vehicle: 6 training images (32 x 32) and 5 test images (32 x 32), on the CPU"
-    assert second == f"run: {fitted}"
-    assert "canonical" in out
-    assert "metrics.json" in out
-    for noise in ("GPU available", "Tip:", "Warning", "weights_only", "Trainer.fit"):
-        assert noise not in out + err
-    told = [line.split()[0] for line in err.strip().splitlines()]
-    # A slow machine says each more than once.
-    assert list(dict.fromkeys(told)) == ["coarse", "fine", "test"]
-
-
-def test_evaluating_twice_gives_the_same_numbers(ok, fitted, copied, scenes, tmp_path):
-    moved = tmp_path / "moved"
-    shutil.copytree(scenes, moved)
+def test_evaluating_again_gives_the_same_numbers_or_others(ok, fitted, copied, scenes, tmp_path):
+    moved = shutil.copytree(scenes, tmp_path / "moved")
     done = ok("evaluate", f"run={copied}", f"data.root={moved}")
     assert "canonical" in done.out
     assert numbers(copied) == numbers(fitted)
+    path = copied / "fine" / "done.json"
+    path.write_text(json.dumps(read(path) | {"commit": "0123abcde"}))  # by which it was trained, not measured
     ok("evaluate", f"run={copied}", f"data.root={moved}", "reduce=2")
-    assert json.loads((copied / "metrics.json").read_text())["protocol"]["reduced"] == 2
-    assert numbers(copied) != numbers(fitted)
-
-
-def test_a_device_that_there_is_not_is_refused_before_a_folder_is_made(
-    refused, scenes, tmp_path, monkeypatch
-):
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    line = refused(*arguments(scenes, tmp_path / "run", "trainer=gpu"))
-    assert line == "trainer.accelerator: expected a GPU, but found none; use trainer=cpu"
-    assert not (tmp_path / "run").exists()
-
-
-def test_an_option_that_another_one_removes_is_named(refused):
-    line = refused("train", "data=synthetic", "~model/rotation", "model.rotation=true")
-    assert line.startswith(
-        "model.rotation: expected an option, but got one that another one typed here removes"
-    )
-
-
-def test_metrics_tell_by_which_commit_the_run_was_trained_not_measured(ok, copied, scenes):
-    noted = json.loads((copied / "fine" / "done.json").read_text())
-    (copied / "fine" / "done.json").write_text(json.dumps(noted | {"commit": "0123abcde"}))
-    ok("evaluate", f"run={copied}")
-    assert json.loads((copied / "metrics.json").read_text())["protocol"]["commit"] == "0123abcde"
-
-
-def test_a_gpu_that_is_gone_is_refused_before_a_run_is_measured(refused, copied, monkeypatch):
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    monkeypatch.setattr(Run, "load", lambda _: pytest.fail("loaded"))
-    assert "trainer.accelerator: expected a GPU" in refused("evaluate", f"run={copied}", "trainer=gpu")
+    protocol = read(copied / "metrics.json")["protocol"]
+    assert (protocol["reduced"], protocol["commit"]) == (2, "0123abcde")
+    assert numbers(copied)["test"] != numbers(fitted)["test"]
 
 
 def test_the_same_command_again_trains_nothing(ok, fitted, scenes, monkeypatch):
-    def never(*_, **__):
-        raise AssertionError("trained again")
-
-    monkeypatch.setattr(lightning.Trainer, "fit", never)
+    monkeypatch.setattr(lightning.Trainer, "fit", lambda *_, **__: pytest.fail("trained again"))
     before, config = numbers(fitted), (fitted / "config.yaml").read_text()
     done = ok(*arguments(scenes, fitted), "threads=2")
     assert numbers(fitted) == before
@@ -137,108 +115,121 @@ def test_the_same_command_again_trains_nothing(ok, fitted, scenes, monkeypatch):
     assert done.out.startswith(f"measured before: {fitted}; again with forewarp-evaluate run={fitted}")
 
 
-def test_what_was_not_measured_since_is_measured_and_where_stages_stand_is_told(ok, fitted, copied, scenes):
-    (copied / "metrics.json").unlink()
-    (copied / "fine" / "done.json").unlink()
-    done = ok(*arguments(scenes, copied))
+def test_a_begun_run_is_finished_and_measured_and_what_does_not_matter_may_change(ok, fitted, begun, scenes):
+    done = ok(*arguments(scenes, begun, "checkpoint_seconds=5"))
     lines = done.out.splitlines()
     assert lines[2] == "coarse: finished before"
     assert lines[3].startswith("fine: goes on at 100%, step ")
-    assert numbers(copied)["test"] == numbers(fitted)["test"]
+    assert numbers(begun)["test"] == numbers(fitted)["test"]
+    assert yaml.safe_load((begun / "config.yaml").read_text())["checkpoint_seconds"] == 5
+
+
+def test_a_run_is_resumed_by_its_folder_with_what_may_change(ok, refused, begun):
+    before = yaml.safe_load((begun / "config.yaml").read_text())
+    ok("train", f"resume={begun}", "threads=2", "sentinel.skip=3", "trainer=cpu", "evaluate=false")
+    after = yaml.safe_load((begun / "config.yaml").read_text())
+    assert after == before | {"threads": 2, "sentinel": {"skip": 3}, "evaluate": False, "run": str(begun)}
+    assert after["command"].startswith("forewarp-train model=forward data=dnerf ")
+    line = refused("train", f"resume={begun}", "seed=3")
+    assert line.startswith(
+        "seed: expected no such key beside resume=, whose config.yaml holds it, but got seed=3"
+    )
+
+
+@pytest.mark.slow
+def test_changed_data_are_refused_unless_accepted(ok, refused, begun, scenes, tmp_path):
+    moved = shutil.copytree(scenes, tmp_path / "moved")
+    path, config = moved / "vehicle" / "transforms_train.json", begun / "config.yaml"
+    path.write_text(path.read_text() + " ")
+    config.write_text(config.read_text().replace(str(scenes), str(moved)))
+    words = ["train", f"resume={begun}", "evaluate=false"]
+    line = refused(*words)
+    assert "data.json: expected the data that the run was begun with, but got others" in line
+    assert "transforms_train.json; use run=..., or go on with data_changed=accept" in line
+    ok(*words, "data_changed=accept")
+    ok(*words)  # it was accepted once for all
+    path.write_text(path.read_text() + " ")
+    assert "expected the data" in refused(*words)  # and not what comes later
+
+
+@pytest.mark.slow
+def test_a_folder_in_work_is_refused(refused, copied):
+    with locked(copied):
+        line = refused("train", f"resume={copied}")  # measured before
+        assert f"expected a run that nobody works on, but got one of process {os.getpid()} on " in line
+        (copied / "metrics.json").unlink()
+        for name in ("train", "evaluate"):
+            assert "nobody works on" in refused(name, str(copied))
 
 
 def test_a_run_with_views_set_aside_leaves_its_curve(ok, scenes, tmp_path):
     run = tmp_path / "run"
-    more = ["data.held_out=2", "callbacks.accuracy.first=0.001", "budget.iterations=4", "evaluate=false"]
-    ok(*arguments(scenes, run, *more, "stage.coarse.num_voxels=[[0,500]]", "~stage.fine"))
+    done = ok(*arguments(scenes, run, *SHORT, "data.held_out=2", "callbacks.accuracy.first=0.001"))
     assert len((run / "accuracy_time.csv").read_text().splitlines()) > 1
     assert (run / "accuracy_time.png").stat().st_size > 1000
-    command = yaml.safe_load((run / "config.yaml").read_text())["command"]
-    assert command.startswith("forewarp-train model=forward data=dnerf ")
-    assert "data.held_out=2" in command
+    assert f"fitted: {run}; measure it with forewarp-evaluate run={run}\n" in done.out
 
 
-def test_what_does_not_matter_may_change(forewarp, copied, scenes):
-    done = forewarp(*arguments(scenes, copied, "evaluate=false", "checkpoint_seconds=5"))
-    assert f"fitted: {copied}; measure it with forewarp-evaluate run={copied}\n" in done.out
-    assert yaml.safe_load((copied / "config.yaml").read_text())["checkpoint_seconds"] == 5
-
-
-def test_another_configuration_is_refused(refused, fitted, scenes):
-    line = refused(*arguments(scenes, fitted, "seed=1"))
-    line, _, advice = line.partition("; ")
-    assert line.endswith("seed: expected 0, as the run that this folder holds, but got 1 (and 1 more keys)")
-    assert advice == "use run=<another folder>, or delete this one"
-    assert "budget.minutes: expected 0.9, as" in refused(*arguments(scenes, fitted, "budget.minutes=9"))
-    assert "model.name: expected forward, as" in refused(*arguments(scenes, fitted, "model=backward"))
-
-
-def test_a_config_that_lacks_its_data_is_refused(refused, in_tmp):
-    Path("config.yaml").write_text("a: 1")
-    assert "expected the key data" in refused("evaluate", "run=.")
-
-
-def test_a_mistaken_scene_ends_in_one_line_and_leaves_nothing(refused, scenes, in_tmp):
-    line = refused(*arguments(scenes, "run", scene="lorry"))
-    assert line.endswith(f"with transforms_train.json, but got none; scenes in {scenes}: vehicle")
-    write_tiny(in_tmp / "tiny")
-    Path("tiny/train/r_1.png").unlink()
-    line = "train/r_1.png: expected an image, but got No such file"
-    assert line in refused(*arguments(in_tmp, "run", scene="tiny"))
-    assert not Path("run").exists()
-
-
-def test_an_unfinished_run_is_not_measured_nor_rendered(refused, copied):
-    (copied / "fine" / "done.json").unlink()
-    for name in ("evaluate", "render"):
-        assert "fine: expected a finished stage, but got none" in refused(name, f"run={copied}")
-    assert not (copied / "videos").exists()
-
-
-def test_a_scene_for_the_folder_of_scenes_is_put_right(refused, scenes, in_tmp):
-    line = refused(*arguments(scenes / "vehicle", "run"))
-    assert line.endswith(f"but got none; did you mean data.root={scenes} data.scene=vehicle?")
-
-
-def test_the_folder_of_all_datasets_is_put_right(refused, scenes, in_tmp):
-    line = refused(*arguments(scenes.parent, "run"))
-    assert line.endswith(f"but got none; did you mean data.root={scenes}?")
-
-
-def test_a_full_disk_names_the_file_and_leaves_no_half(refused, scenes, in_tmp, monkeypatch):
-    def full(self, path, *_, **__):
-        Path(path).write_bytes(b"half")
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(lightning.Trainer, "save_checkpoint", full)
-    line = refused(*arguments(scenes, "run", "budget.iterations=2"))
-    assert line.startswith("run/coarse/last.ckpt: expected room to write, but got No space left on device;")
-    assert [path.name for path in Path("run/coarse").iterdir() if "ckpt" in path.name] == []
-
-
-@pytest.mark.parametrize(
-    ("word", "least"), [("views=0", 1), ("views=all", 1), ("sheets=-1", 0), ("reduce=1", 2)]
-)
-def test_numbers_of_views_are_checked_before_training(refused, scenes, in_tmp, word, least):
-    line = refused(*arguments(scenes, "run", word))
-    assert f"expected a whole number of at least {least}, but got {word.split('=')[1]}" in line
-
-
-def test_pictures_that_cannot_be_reduced_are_refused_before_training(refused, scenes, in_tmp):
-    line = refused(*arguments(scenes, "run", "reduce=7"))
-    assert line.startswith("reduce: expected pictures with sides that 7 divides, but got ")
-    assert not Path("run").exists()
-
-
-def test_settings_of_a_failed_start_do_not_bind(refused, ok, scenes, in_tmp):
-    assert "model.motion: expected 0 < tau" in refused(*arguments(scenes, "run", "model.motion.tau=7"))
-    ok(*arguments(scenes, "run", "budget.iterations=2", "evaluate=false", "~stage.fine"))
-
-
-def test_renderings_of_an_inpainter_are_both_scored(ok, scenes, in_tmp):
-    more = ["model/inpainter=unet3d", "model/upsampler=trilinear", "budget.iterations=2", "sheets=1"]
-    ok(*arguments(scenes, "run", *more, "stage.coarse.num_voxels=[[0,500]]", "~stage.fine"))
-    content = json.loads(Path("run/metrics.json").read_text())
+def test_renderings_of_an_inpainter_are_both_scored(ok, scenes, tmp_path):
+    more = ["model/inpainter=unet3d", "model/upsampler=trilinear", "budget.iterations=2"]
+    ok(*arguments(scenes, tmp_path / "run", *SHORT, *more, "evaluate=true", "sheets=0", "views=2"))
+    content = read(tmp_path / "run" / "metrics.json")
     assert content["protocol"]["renderings"] == ["upsampled", "inpainted"]
     assert list(content["test"]) == list(content["test_upsampled"])
     assert set(content["seconds"]) == {"train", "coarse", "render_per_frame", "render_again_per_frame"}
+
+
+def test_another_configuration_is_refused(refused, fitted, scenes):
+    line, _, advice = refused(*arguments(scenes, fitted, "seed=1")).partition("; ")
+    assert line.endswith("seed: expected 0, as the run that this folder holds, but got 1 (and 1 more keys)")
+    assert advice == "use run=<another folder>, or delete this one"
+
+
+@pytest.mark.parametrize(
+    ("word", "says"),
+    [
+        ("trainer=gpu", "trainer.accelerator: expected a GPU, but found none; use trainer=cpu"),
+        ("reduce=7", "reduce: expected pictures with sides that 7 divides, but got "),
+        ("views=0", "views: expected a whole number of at least 1, but got 0"),
+        ("data.scene=lorry", "but got none; scenes in {root}: vehicle"),
+        ("data.scene=tiny", "train/r_1.png: expected an image, but got No such file"),
+    ],
+)
+def test_what_cannot_be_trained_is_refused_before_a_folder_is_made(
+    refused, scenes, in_tmp, monkeypatch, word, says
+):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    root = scenes
+    if word == "data.scene=tiny":
+        root = in_tmp
+        write_tiny(root / "tiny")
+        (root / "tiny" / "train" / "r_1.png").unlink()
+    assert says.format(root=root) in refused(*arguments(root, "run"), word)
+    assert not (in_tmp / "run").exists()
+
+
+def test_a_broken_step_ends_in_one_line_and_is_stored(refused, scenes, in_tmp):
+    line = refused(*arguments(scenes, "run", *SHORT, "stage.coarse.lr.color=1e39"))
+    assert line.startswith(
+        "stage.coarse: expected finite numbers, but got parameter: radiance.color at step 1"
+    )
+    assert "; its batch and weights are in run/coarse/broken/step_1.pt; begin anew with lower" in line
+    stored = torch.load(in_tmp / "run" / "coarse" / "broken" / "step_1.pt", weights_only=True)
+    assert stored["found"] == "parameter: radiance.color"
+
+
+def test_skipped_steps_are_told(ok, scenes, in_tmp, monkeypatch):
+    from forewarp.data.batches import Sampler
+
+    draw, drawn = Sampler.draw, []
+
+    def spoiled(self):
+        batch = draw(self)
+        drawn.append(batch)
+        if len(drawn) == 2:
+            batch.observations[0].rgb[0] = float("nan")
+        return batch
+
+    monkeypatch.setattr(Sampler, "draw", spoiled)
+    done = ok(*arguments(scenes, "run", *SHORT, "sentinel.skip=1"))
+    assert "coarse: 1 broken steps skipped; each lies in run/coarse/broken" in done.out

@@ -1,11 +1,15 @@
-"""A run's folder has one process at a time; who it is may be unreadable, the refusal is not."""
+"""A run's folder has one process at a time, one config, and the data that it began with."""
 
+import errno
 import os
+from types import SimpleNamespace
 
 import pytest
+from filelock import FileLock
+from omegaconf import OmegaConf
 
 from forewarp.data.files import LOCK
-from forewarp.runs.session import locked
+from forewarp.runs.session import check_data, claim, locked, warn_if_changed
 
 
 @pytest.mark.parametrize("holder", [None, b"", b"\xff\xfe\x00", b"x" * 5000])
@@ -27,3 +31,67 @@ def test_a_folder_that_cannot_be_written_names_the_key(tmp_path):
     assert str(caught.value.filename).startswith("run: ")
     with locked(tmp_path / "run"):
         pass
+
+
+def test_a_file_system_without_locks_is_used_without(tmp_path, monkeypatch):
+    asked = []
+
+    def missing(lock):
+        asked.append(lock)
+        raise OSError(errno.ENOSYS, "Function not implemented")
+
+    monkeypatch.setattr(FileLock, "_acquire", missing)
+    with locked(tmp_path), locked(tmp_path):
+        assert len(asked) == 2
+
+
+def test_a_folder_is_claimed_for_one_config(tmp_path):
+    def claimed(finished=False, **changes):
+        config = {name: {"name": name} for name in ("model", "objective", "stage", "preset")}
+        config |= {"run": str(tmp_path), "data": {"root": str(tmp_path)}, "budget": {"minutes": 1}, "seed": 0}
+        config |= {"resume": None, "trust": ["theirs"], "viewer": True, "logger": None, "callbacks": None}
+        claim(OmegaConf.create(config | {"trainer": None} | changes), finished=finished)
+        return OmegaConf.load(tmp_path / "config.yaml")
+
+    claimed(seed=5)
+    stored = claimed()  # nothing was trained with the first, which does not bind
+    assert (stored.seed, stored.trust, stored.viewer, stored.command) == (0, None, False, None)
+    (tmp_path / "coarse").mkdir()
+    (tmp_path / "coarse" / "last.ckpt").touch()
+    assert claimed(finished=True, trainer="cpu") == stored
+    assert claimed(trainer="cpu").trainer == "cpu"
+    for changes, says in (
+        ({"seed": 1}, "seed: expected 0, as the run that this folder holds, but got 1; use run="),
+        ({"seed": 1, "budget": {"minutes": 9}}, "seed: expected 0, .* but got 1 .and 1 more keys.; use run="),
+        ({"seed": 1, "model": {"name": "nerf"}}, "model.name: expected model, .* but got nerf .and 1 more"),
+        ({"stage": {}}, "stage.name: expected stage, .* but got nothing"),
+    ):
+        with pytest.raises(ValueError, match=f"config.yaml: {says}"):
+            claimed(**changes)
+    (tmp_path / "config.yaml").unlink()
+    with pytest.raises(ValueError, match="expected the configuration of the run, but got none"):
+        claimed()
+
+
+def test_data_that_changed_are_refused_unless_accepted(tmp_path, capsys):
+    data = {"texts": {"a.json": "1"}, "images": {"count": 1}}
+    run = SimpleNamespace(folder=tmp_path, datamodule=SimpleNamespace(fingerprint=lambda: data))
+    with pytest.raises(ValueError, match="data_changed: expected one of refuse, accept, but got x"):
+        check_data(run, "x")
+    check_data(run, "refuse")
+    data = data | {"texts": {"a.json": "2"}}
+    check_data(run, "refuse")  # nothing was trained with the first
+    (tmp_path / "coarse").mkdir()
+    (tmp_path / "coarse" / "last.ckpt").touch()
+    warn_if_changed(run)
+    assert capsys.readouterr().err == ""
+    data = data | {"texts": {"a.json": "3"}}
+    warn_if_changed(run)
+    said = f"{tmp_path}/data.json: expected the data that the run was begun with, but got others: a.json"
+    assert capsys.readouterr().err == f"warning: {said}\n"
+    with pytest.raises(ValueError, match="a.json; use run=..., or go on with data_changed=accept"):
+        check_data(run, "refuse")
+    check_data(run, "accept")
+    check_data(run, "refuse")  # it was accepted once for all
+    data = None  # a scene without files
+    check_data(run, "refuse")

@@ -7,9 +7,6 @@ import importlib
 import io
 import logging
 import os
-import shutil
-import subprocess
-import sys
 from types import SimpleNamespace
 from unittest.mock import patch
 
@@ -60,7 +57,7 @@ def call(name, *arguments):
 
 
 def fitted_run(factory):
-    """The folder of a small finished run, made once a session by ``forewarp-train`` in its own process.
+    """The folder of a small finished run, made once a session.
 
     Its scene is in ``scenes/vehicle`` beside it, and what the command printed in ``said.txt``. It is shared:
     copy it before changing anything in it.
@@ -69,10 +66,8 @@ def fitted_run(factory):
 
     run = factory.getbasetemp() / "fitted" / "run"
     if not run.is_dir():
-        shutil.rmtree(run.parent, ignore_errors=True)
         synthesize(run.parent / "scenes" / "vehicle", **SCENE)
-        command = [sys.executable, "-m", "forewarp.cli.train", *TINY, f"data.root={run.parent}/scenes"]
-        done = subprocess.run([*command, f"run={run}"], capture_output=True, text=True, cwd=run.parent)
-        assert done.returncode == 0, done.stderr
-        (run / "said.txt").write_text(done.stdout + "\n---\n" + done.stderr)
+        done = call("train", *TINY, f"data.root={run.parent}/scenes", f"run={run}")
+        assert done.status == 0, done.err
+        (run / "said.txt").write_text(done.out + "\n---\n" + done.err)
     return run

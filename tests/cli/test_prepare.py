@@ -1,0 +1,48 @@
+"""What a command is refused for before anything heavy is loaded."""
+
+import pytest
+from omegaconf import OmegaConf
+
+from forewarp.cli.prepare import refuse_missing_scene, refuse_numbers
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "says"),
+    [
+        ("views", 0, "a whole number of at least 1, but got 0"),
+        ("views", "all", "a whole number of at least 1, but got all"),
+        ("sheets", -1, "a whole number of at least 0, but got -1"),
+        ("sheets", None, "a whole number of at least 0, but got None"),
+        ("reduce", 1, "a whole number of at least 2, but got 1"),
+        ("fps", 0, "a number in [0.1, 1000], but got 0"),
+        ("time", "soon", "a number in [0, 1], but got soon"),
+        *(("views", value, None) for value in (None, 3)),
+        ("time", 0.5, None),
+        ("absent", 1, None),
+    ],
+)
+def test_numbers_are_in_their_range(key, value, says):
+    config = OmegaConf.create({key: value} if key != "absent" else {})
+    if says is None:
+        refuse_numbers(config, "views", "time")
+    else:
+        with pytest.raises(ValueError) as refusal:  # noqa: PT011
+            refuse_numbers(config, key)
+        assert str(refusal.value) == f"{key}: expected {says}"
+
+
+def test_a_mistyped_scene_is_put_right(tmp_path):
+    (tmp_path / "dnerf" / "hook").mkdir(parents=True)
+    (tmp_path / "dnerf" / "hook" / "transforms_train.json").touch()
+    dnerf = tmp_path / "dnerf"
+    for root, advice in (
+        (dnerf, f"scenes in {dnerf}: hook"),
+        (dnerf / "hook", f"did you mean data.root={dnerf} data.scene=hook?"),
+        (tmp_path, f"did you mean data.root={dnerf}?"),
+    ):
+        scene = "hook" if root == tmp_path else "lorry" if root == dnerf else "vehicle"
+        data = {"_target_": "forewarp.data.module.DNeRFDataModule", "root": str(root), "scene": scene}
+        with pytest.raises(ValueError) as refusal:  # noqa: PT011
+            refuse_missing_scene(OmegaConf.create({"data": data}))
+        assert str(refusal.value).endswith(f"with transforms_train.json, but got none; {advice}")
+        refuse_missing_scene(OmegaConf.create({"data": data, "absent": "skip"}))
