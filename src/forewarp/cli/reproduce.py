@@ -1,0 +1,398 @@
+"""``forewarp-reproduce``: run the sweeps of a table, a price list or a comparison, then write its page."""
+
+from __future__ import annotations
+
+import difflib
+import shlex
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import yaml
+
+from forewarp.cli.entry import INTERRUPTED, MISTAKE, project_root
+from forewarp.runs.overrides import merged
+
+HELP = """
+forewarp-reproduce runs the sweeps of a page, and then writes the page. A failed job is named at the end and
+stops no other; finished jobs are skipped, so the same command continues. `make TARGET KEY=...` calls it.
+
+  forewarp-reproduce tables                          every method on procedural counterparts, no data needed
+  forewarp-reproduce tables data=DATASETS scenes=hook,lego methods=all minutes=5 seeds=3
+  forewarp-reproduce price-list data=DATASETS model=forward
+  forewarp-reproduce ablations small=1                        the same runs, a few steps each: does it work?
+
+What it runs:
+  demo            the procedural vehicle by three methods, two at a time, beside each other, and a video
+  tables          the paper's tables; with data=FOLDER on real scenes (FOLDER/dnerf/hook ...)
+  ablations       what each part of the paper's method brings on counterparts, at equal minutes and steps
+  accuracy-time   accuracy of each choice against training time, on one scene
+  price-list      what each choice costs and brings, on the procedural vehicle and real scenes
+  effects         planned effects against every effect; of model=particles the plans alone
+  gpu             seconds of steps and frames, and PSNR against seconds, of model=forward on device=gpu
+
+Keys (capitals do, too):
+  data=FOLDER       holds dnerf/hook and so on; without it procedural scenes
+  scenes=A,B        of the D-NeRF scenes
+  methods=A,B|all   tables: in place of a sweep's own
+  model=NAME        accuracy-time, price-list, effects: particles or forward
+  preset=NAME       demo, fast or faithful
+  minutes=N         of training a run;  steps=N  optimiser steps a run
+  seeds=3           seeds 0, 1 and 2;  seeds=4,7  these
+  sweeps=A,B|all    tables: in place of the default; ablations: both sweeps of ablations
+  changes="K=1,2"   accuracy-time, price-list: these in place of sweeps/price_list_<model>.yaml
+  views=N           test views to measure;  out=FOLDER  where the page goes
+  jobs=N            sweeps at a time where two are possible (2);  threads=N  CPU threads a run
+  launcher=NAME     where jobs run, as of forewarp-train;  device=cpu|gpu  of gpu
+  more="K=V ..."    overrides added to every sweep
+  small=1           tiny scenes and a few steps, to try the command
+"""
+
+TABLES = ["dnerf", "hypernerf", "nhr", "lego_complete"]
+ABLATIONS = ["ablation_modules", "ablation_losses"]
+# Sweeps and the counterparts they run on without data, in two lanes of about the same length, a core each.
+LANES = (
+    "methods:dnerf nhr:nhr ablation_losses:dnerf ablation_modules:dnerf",
+    "methods:hypernerf lego_complete:lego_complete ablation_modules:hypernerf "
+    "ablation_modules:lego_complete resolution:hypernerf",
+)
+# The voxel networks come with the fine stage, to which the demo's numbers give too little of the training; on
+# fewer rays and voxels it makes enough steps within minutes.
+OF_ABLATIONS = shlex.split(
+    "stage.fine.share=2 preset.rays=512 modules.num_voxels=[[0,4096]] callbacks.accuracy.rays=2000 "
+    "callbacks.pictures=null logger=none paths.runs=runs/ablations"
+)
+ROOM = ["stage.coarse.background_num_voxels=[[0,27000]]", "stage.fine.background_num_voxels=[[0,110592]]"]
+SPECIMENS = ["still", "rigid", "band", "glossy", "room", "quick", "daylight", "blocks", "spin"]
+# With small=1: a hundredth of a minute, or four steps, and one test view a run; gpu has a tiny model, too.
+SMALL = shlex.split("views=1 sheets=0 logger=none callbacks.pictures=null plan.steps=4 plan.trial_steps=4")
+TINY = shlex.split(
+    "data.scene=tiny paths.data=runs/bench-gpu data.synthesis.size=32 data.synthesis.frames=8 "
+    "data.synthesis.test_views=[1,1,1] preset.rays=64 preset.inpainter_width=16 data.held_out=2 "
+    "stage.coarse.num_voxels=[[0,1000]] stage.fine.num_voxels=[[0,1500]]"
+)
+Sweep = list[str]  # the overrides of one `forewarp-train`
+
+
+@dataclass
+class Keys:
+    """What was typed, as text; "" where a key was left out."""
+
+    data: str = ""
+    scenes: str = ""
+    methods: str = ""
+    model: str = ""
+    preset: str = ""
+    minutes: str = ""
+    steps: str = ""
+    seeds: str = ""
+    sweeps: str = ""
+    changes: str = ""
+    views: str = ""
+    out: str = ""
+    jobs: str = "2"
+    threads: str = ""
+    launcher: str = ""
+    device: str = "gpu"
+    more: str = ""
+    small: str = ""
+
+    @classmethod
+    def typed(cls, arguments: list[str]) -> Keys:
+        """Read ``key=value`` words.
+
+        Raises:
+            ValueError: for another word, or a key that there is not.
+        """
+        known, typed = [field.name for field in fields(cls)], {}
+        for argument in arguments:
+            key, equals, value = argument.partition("=")
+            key = key.lower()
+            if not equals or key not in known:
+                near = difflib.get_close_matches(key, known, 1)
+                hint = f"did you mean {near[0]}=?" if near else f"known are {', '.join(known)}"
+                raise ValueError(f"expected key=value with a known key, but got '{argument}'; {hint}")
+            typed |= {key: value} if value else {}
+        return cls(**typed)
+
+    def chosen(self, *scenes: str) -> Sweep:
+        """Return overrides that choose scenes of D-NeRF in ``data``; none without it."""
+        scene = f"data.scene={','.join(scenes)}"
+        return [f"paths.scenes={self.data}", "dataset=dnerf", scene] if self.data else []
+
+    def drawn(self, default: str = "") -> Sweep:
+        """Return the override of seeds: so many, or those listed."""
+        seeds = self.seeds or default
+        return [] if not seeds else [f"seed={seeds}" if "," in seeds else f"seeds={seeds}"]
+
+
+@dataclass
+class Job:
+    """What to run: lanes of sweeps, ``jobs`` lanes at a time, then other commands, one after the other."""
+
+    lanes: list[list[Sweep]]
+    then: list[list[str]]
+    jobs: int = 1
+
+
+def plan_of(kind: str, keys: Keys) -> Job:
+    """Return what ``kind`` runs with these keys.
+
+    Raises:
+        ValueError: for a kind that there is not, or a key that would have no effect.
+    """
+    if kind not in KINDS:
+        raise ValueError(f"expected one of {', '.join(KINDS)}, but got '{kind}'")
+    job = KINDS[kind](keys)
+    more = shlex.split(keys.more)
+    more += [f"{name}={getattr(keys, name)}" for name in ("threads", "launcher") if getattr(keys, name)]
+    job.lanes = [[merged(sweep, more) for sweep in lane] for lane in job.lanes if lane]
+    return _made_small(job) if keys.small else job
+
+
+def _made_small(job: Job) -> Job:
+    """Shorten all runs, and keep them and their pages apart, below runs/small."""
+
+    def shortened(sweep: Sweep) -> Sweep:
+        by_steps = any(word.startswith("budget.iterations=") for word in sweep)
+        until = ["budget.minutes=null", "budget.iterations=4"] if by_steps else ["budget.minutes=0.01"]
+        return apart(merged(sweep, [*SMALL, *until]))
+
+    def apart(command: list[str]) -> list[str]:
+        moved = [word.replace("out=docs/", "out=runs/").replace("runs/", "runs/small/") for word in command]
+        return moved if moved != command else [*moved, "paths.runs=runs/small"]
+
+    lanes = [[shortened(sweep) for sweep in lane] for lane in job.lanes]
+    return Job(lanes, [apart(command) for command in job.then], job.jobs)
+
+
+def words(text: str) -> list[str]:
+    """Split a list at spaces and commas.
+
+    >>> words("hook, lego mutant")
+    ['hook', 'lego', 'mutant']
+    """
+    return text.replace(",", " ").split()
+
+
+def demo(keys: Keys) -> Job:
+    """Fit the procedural vehicle by three methods, and make a video by particles."""
+    # Kernels of particles compile for half a minute the first time, beside the others' training.
+    common = ["experiment=demo", "threads=1", f"budget.minutes={keys.minutes or 0.3}"]
+    fits = {model: f"runs/demo/{model}" for model in ("particles", "forward", "backward")}
+    lanes = [[[*common, f"model={model}", f"run={run}"]] for model, run in fits.items()]
+    compare = ["report", "kind=compare", f"runs=[{','.join(fits.values())}]", "out=runs/demo"]
+    return Job(lanes, [compare, ["render", "run=runs/demo/particles", "path=both"]], int(keys.jobs))
+
+
+def tables(keys: Keys) -> Job:
+    """Make the paper's tables: of counterparts by all methods, or of the scenes in a folder."""
+    scenes = words(keys.scenes)
+    sweeps = words(keys.sweeps) or (["dnerf"] if scenes else TABLES)
+    if scenes and not keys.data:
+        raise ValueError("scenes: expected data=<folder that holds dnerf/> beside it, but got none")
+    if not keys.data and keys.sweeps not in ("", "all", "ablations"):
+        raise ValueError(f"sweeps: expected all or ablations without data=, but got {keys.sweeps}")
+    if "methods" in sweeps and not scenes:
+        raise ValueError(
+            "scenes: expected scenes=hook,... beside sweeps=methods, but got none; "
+            "methods=all fits all scenes by all methods"
+        )
+    preset = keys.preset or ("fast" if keys.data else "demo")
+    minutes = keys.minutes or ("null" if preset == "faithful" else "5" if keys.data else "1")
+    base = [f"preset={preset}", *_until(minutes, keys.steps), *(keys.drawn("1")), "score=null"]
+    base += [f"views={keys.views}"] if keys.views else []
+    out = keys.out or "runs/paper/results"
+    then = [["report", "kind=paper", "runs=runs/paper", f"out={out}", "curves=docs/results"]]
+    if not keys.data:
+        return Job(_counterparts(keys.sweeps, base, keys), then, int(keys.jobs))
+    if sweeps == ["all"]:
+        sweeps = [*TABLES, *ABLATIONS, "resolution"]
+    sweeps = [name for sweep in sweeps for name in (ABLATIONS if sweep == "ablations" else [sweep])]
+    base += [*keys.chosen(*scenes), "absent=refuse"] if scenes else [f"paths.scenes={keys.data}"]
+    return Job([[[*base, f"sweeps={sweep}", *_models(keys.methods, sweep)] for sweep in sweeps]], then)
+
+
+def _until(minutes: str | None = None, steps: str | None = None) -> Sweep:
+    return ["budget.minutes=null", f"budget.iterations={steps}"] if steps else [f"budget.minutes={minutes}"]
+
+
+def _models(methods: str, sweep: str) -> Sweep:
+    """Return the override that names methods in place of a sweep's own, where a sweep is of any method."""
+    if not methods or sweep in (*ABLATIONS, "resolution"):
+        return []
+    if methods == "all":
+        content = yaml.safe_load((project_root() / "sweeps" / "methods.yaml").read_text())
+        methods = content["hydra"]["sweeper"]["params"]["model"]
+    return [f"model={','.join(words(methods))}"]
+
+
+def _counterparts(sweeps: str, base: Sweep, keys: Keys) -> list[list[Sweep]]:
+    """Return the sweeps of counterparts in two lanes: the tables', those of ``ablations``, or ``all``."""
+    left_out = {"": [*ABLATIONS, "resolution"], "ablations": [*TABLES, "methods", "resolution"], "all": []}
+    lanes, base = [], [*base, "budget.clock=processor", "threads=1"]
+    for lane in LANES:
+        pairs = [pair.split(":") for pair in lane.split()]
+        lanes.append(
+            [
+                [*base, f"sweeps={sweep}", f"scene=counterpart_{data}", *_models(keys.methods, sweep)]
+                + (ROOM if sweeps == "ablations" and data == "hypernerf" else [])
+                for sweep, data in pairs
+                if sweep not in left_out[sweeps]
+            ]
+        )
+    return lanes
+
+
+def ablations(keys: Keys) -> Job:
+    """Leave out each part of the paper's method on three counterparts, at equal minutes and equal steps."""
+    if keys.data or keys.methods:
+        raise ValueError(
+            "data, methods: expected none, as ablations are of model=forward on counterparts, but got some; "
+            f"of real scenes: forewarp-reproduce tables data={keys.data or 'FOLDER'} sweeps=ablations"
+        )
+    common = [f"preset={keys.preset or 'demo'}", f"views={keys.views or 9}", "score=null", *keys.drawn("2")]
+    by_minutes, by_steps = (
+        _counterparts("ablations", [*common, *until, *OF_ABLATIONS], keys)
+        for until in (_until(keys.minutes or "2.5"), _until(steps=keys.steps or "600"))
+    )
+    then = [["report", "kind=ablation", "runs=runs/ablations", f"out={keys.out or 'docs/results'}"]]
+    lanes = [first + second for first, second in zip(by_minutes, by_steps, strict=True)]
+    return Job(lanes, then, int(keys.jobs))
+
+
+def _compared(keys: Keys, base: Sweep) -> list[Sweep]:
+    """All changes of the method's price list; with ``changes`` the reference, then these."""
+    if keys.changes:
+        reference = [*base, "sweeps=accuracy_time", *([f"model={keys.model}"] if keys.model else [])]
+        return [reference, [*reference, *shlex.split(keys.changes)]]
+    model = keys.model or "particles"
+    if model not in ("particles", "forward"):
+        raise ValueError(f"model: expected particles or forward, which have a price list, but got {model}")
+    return [[*base, f"sweeps=price_list_{model}"]]
+
+
+def accuracy_time(keys: Keys) -> Job:
+    """Draw the accuracy of each choice against training time, on one scene."""
+    base = [f"budget.minutes={keys.minutes or 3}", *keys.drawn()]
+    base += keys.chosen(*words(keys.scenes or "jumpingjacks"))
+    return Job([_compared(keys, base)], [["report", "kind=accuracy_time", *_out(keys)]])
+
+
+def price_list(keys: Keys) -> Job:
+    """List what each choice costs and brings, on the vehicle and real scenes."""
+    if not keys.data:
+        raise ValueError("data: expected data=<folder that holds dnerf/>, but got none")
+    runs = f"runs/price-list/{keys.model or 'particles'}"
+    base = [f"budget.minutes={keys.minutes or 3}", *keys.drawn("2"), f"paths.runs={runs}"]
+    lane = _compared(keys, base)
+    for scene in words(keys.scenes or "jumpingjacks hook"):
+        lane += _compared(keys, [*base, *keys.chosen(scene)])
+    return Job([lane], [["report", "kind=price_list", f"runs={runs}", f"out={keys.out or 'docs/results'}"]])
+
+
+def effects(keys: Keys) -> Job:
+    """Compare plans with every effect at once and, on real scenes, with the paper's set and the preset."""
+    model = keys.model or "forward"
+    real, minutes = keys.chosen(*words(keys.scenes or "jumpingjacks hook")), keys.minutes
+    base = ["sweeps=effects", *keys.drawn("" if real else "2")]
+    if model == "particles":
+        scene = real or [f"scene={','.join(f'specimen_{name}' for name in SPECIMENS)}"]
+        lane = [[*base, "model=particles", "ablation=auto", f"budget.minutes={minutes or 0.5}", *scene]]
+    elif model != "forward":
+        raise ValueError(f"model: expected forward or particles, which can be planned, but got {model}")
+    elif not real:
+        lane = [[*base, "ablation=auto"]]
+        lane += [[*base, "ablation=all_effects", f"budget.minutes={minutes or 2}"]]
+    else:
+        base += [*real, f"budget.minutes={minutes or 2}", f"plan.minutes={minutes or 2}"]
+        base += ["plan.seconds=40", "plan.trial_seconds=40"]
+        lane = [[*base, f"ablation={name}"] for name in ("auto", "all_effects", "full", "base")]
+    return Job([lane], [["report", "kind=effects", *_out(keys)]])
+
+
+def gpu(keys: Keys) -> Job:
+    """Time steps and frames, and PSNR against seconds, of the paper's method on a GPU."""
+    lane, folder = [], "runs/bench-gpu"
+    for scene in words(keys.scenes or "jumpingjacks hook") if keys.data else ["vehicle"]:
+        base = ["model=forward", f"trainer={keys.device}", *keys.chosen(scene), "+variant.name=base"]
+        fast = ["preset=fast", "data.held_out=8", *_until(keys.minutes or "10"), f"run={folder}/{scene}-fast"]
+        faithful = ["preset=faithful", *_until(steps="240"), f"run={folder}/{scene}-faithful"]
+        lane += [merged([*base, *half], TINY if keys.small else []) for half in (fast, faithful)]
+    pages = ("accuracy_time", "price_list")
+    then = [["report", f"kind={kind}", f"runs={folder}", f"out={folder}/results"] for kind in pages]
+    return Job([lane], then)
+
+
+def _out(keys: Keys) -> list[str]:
+    return [f"out={keys.out}"] if keys.out else []
+
+
+KINDS = {
+    "demo": demo,
+    "tables": tables,
+    "ablations": ablations,
+    "accuracy-time": accuracy_time,
+    "price-list": price_list,
+    "effects": effects,
+    "gpu": gpu,
+}
+
+
+def run(job: Job) -> int:
+    """Run all sweeps, then the other commands; return the worst exit status. Ctrl-C ends everything."""
+
+    def run_lane(lane: list[Sweep], prefix: str) -> int:
+        return max(_call("train", sweep, prefix) for sweep in lane)
+
+    at_once = min(job.jobs, len(job.lanes))
+    prefixes = [f"{number} | " if at_once > 1 else "" for number in range(1, len(job.lanes) + 1)]
+    with ThreadPoolExecutor(at_once) as pool:
+        statuses = list(pool.map(run_lane, job.lanes, prefixes))
+    return max([*statuses, *(_call(name, arguments) for name, *arguments in job.then)])
+
+
+def _call(name: str, arguments: list[str], prefix: str = "") -> int:
+    """Run a command, each line of its output behind ``prefix``; return its exit status.
+
+    Raises:
+        KeyboardInterrupt: if the command was interrupted.
+    """
+    if name == "train" and not any(word.startswith("run=") for word in arguments):
+        arguments = ["--multirun", *arguments]
+    print(f"{prefix}{shlex.join([f'forewarp-{name}', *arguments])}", flush=True)
+    command = [str(Path(sys.executable).with_name(f"forewarp-{name}")), *arguments]
+    if prefix:
+        with subprocess.Popen(command, stdout=-1, stderr=subprocess.STDOUT, text=True) as process:
+            for line in process.stdout:
+                print(f"{prefix}{line}", end="", flush=True)
+        status = process.returncode
+    else:
+        status = subprocess.run(command).returncode
+    if status < 0 or status >= 128:
+        raise KeyboardInterrupt
+    return status
+
+
+def main() -> None:
+    """Run the console script."""
+    kind, *arguments = sys.argv[1:] or ["--help"]
+    if {"-h", "--help"} & {kind, *arguments}:
+        print(HELP.strip())
+        return
+    try:
+        job = plan_of(kind, Keys.typed(arguments))
+    except ValueError as error:
+        print(f"forewarp-reproduce: error: {error}", file=sys.stderr)
+        sys.exit(MISTAKE)
+    try:
+        sys.exit(run(job))
+    except KeyboardInterrupt:
+        print("\nforewarp-reproduce: interrupted; run the same command again to go on", file=sys.stderr)
+        sys.exit(INTERRUPTED)
+
+
+if __name__ == "__main__":
+    main()

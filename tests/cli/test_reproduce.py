@@ -1,0 +1,136 @@
+"""``forewarp-reproduce`` and the targets of the Makefile that call it."""
+
+import shlex
+import subprocess
+
+import pytest
+
+from forewarp.cli import reproduce
+from forewarp.cli.reproduce import Keys, plan_of
+from tests.support.configs import ROOT
+
+
+def planned(line):
+    """Return the sweeps, as sets of overrides, and the commands after them."""
+    kind, *typed = shlex.split(line)
+    job = plan_of(kind, Keys.typed(typed))
+    return [set(sweep) for lane in job.lanes for sweep in lane], job.then
+
+
+def test_tables_without_data_fit_all_methods_on_two_counterparts():
+    sweeps, ((*_, out, curves),) = planned("tables")
+    assert (out, curves) == ("out=runs/paper/results", "curves=docs/results")
+    common = {"preset=demo", "budget.minutes=1", "seeds=1", "threads=1", "budget.clock=processor"}
+    pairs = [
+        ("methods", "dnerf"),
+        ("nhr", "nhr"),
+        ("methods", "hypernerf"),
+        ("lego_complete", "lego_complete"),
+    ]
+    for sweep, (name, data) in zip(sweeps, pairs, strict=True):
+        assert sweep > common | {f"sweeps={name}", f"scene=counterpart_{data}"}
+
+
+@pytest.mark.parametrize("more", ["", " DATA=there SWEEPS=methods SCENES=hook"])
+def test_the_published_numbers_are_not_cut_short_by_minutes(more):
+    sweeps, _ = planned("tables PRESET=faithful" + more)
+    assert all({"preset=faithful", "budget.minutes=null"} < sweep for sweep in sweeps)
+
+
+def test_real_scenes_are_fitted_by_the_methods_named():
+    line = "tables DATA=there METHODS=tnerf,dnerf SCENES=hook,lego SWEEPS=dnerf,ablations SEEDS=4,7 VIEWS=9"
+    (fits, *ablations), _ = planned(line)
+    scenes = {"paths.scenes=there", "dataset=dnerf", "data.scene=hook,lego", "absent=refuse"}
+    common = {"preset=fast", "budget.minutes=5", "seed=4,7", "views=9", *scenes}
+    assert fits == common | {"sweeps=dnerf", "model=tnerf,dnerf", "score=null"}
+    names = ["ablation_modules", "ablation_losses"]
+    assert ablations == [common | {f"sweeps={name}", "score=null"} for name in names]
+
+
+def test_all_methods_are_those_of_their_sweep():
+    (sweep, *_), _ = planned("tables DATA=there METHODS=all SWEEPS=dnerf")
+    (methods,) = [word for word in sweep if word.startswith("model=")]
+    assert len(methods.split(",")) == 12
+
+
+def test_ablations_are_run_for_equal_minutes_and_equal_steps():
+    sweeps, ((*_, out),) = planned("ablations MINUTES=0.1 STEPS=30")
+    assert out == "out=docs/results"
+    for until in ({"budget.minutes=0.1"}, {"budget.minutes=null", "budget.iterations=30"}):
+        alike = [sweep for sweep in sweeps if sweep >= until]
+        assert len(alike) == 4
+        in_room = [sweep for sweep in alike if any(word.startswith("stage.coarse.") for word in sweep)]
+        assert in_room == [sweep for sweep in alike if "scene=counterpart_hypernerf" in sweep]
+
+
+def test_changes_are_compared_with_the_reference():
+    (reference, changed), _ = planned('accuracy-time MODEL=forward CHANGES="preset.rays=1024,2048"')
+    assert changed == reference | {"preset.rays=1024,2048"}
+    assert "model=forward" in reference
+    sweeps, _ = planned("price-list DATA=there SCENES=hook MORE='views=2 sheets=0'")
+    assert [("data.scene=hook" in sweep) for sweep in sweeps] == [False, True]
+    assert all({"sweeps=price_list_particles", "views=2", "sheets=0"} < sweep for sweep in sweeps)
+
+
+def test_small_runs_are_kept_apart():
+    for line in ("ablations SMALL=1", "tables SMALL=1", "effects SMALL=1", "gpu SMALL=1", "demo SMALL=1"):
+        sweeps, commands = planned(line)
+        short = {"budget.minutes=0.01", "budget.iterations=4"}
+        assert all(len(sweep & short) == 1 for sweep in sweeps)
+        assert all("runs/small" in " ".join(words) for words in [*sweeps, *commands])
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("nothing", "expected one of demo, tables, .*, but got 'nothing'"),
+        ("tables SCENE=hook", "a known key, but got 'SCENE=hook'; did you mean scenes="),
+        ("tables hook", "expected key=value"),
+        ("tables SCENES=hook", "scenes: expected data=<folder that holds dnerf/> beside it"),
+        ("tables SWEEPS=dnerf", "sweeps: expected all or ablations without data=, but got dnerf"),
+        ("tables DATA=there SWEEPS=methods", "scenes: expected scenes=hook,... beside sweeps=methods"),
+        ("ablations DATA=there", "forewarp-reproduce tables data=there sweeps=ablations"),
+        ("price-list", "data: expected data=<folder"),
+        ("price-list DATA=there MODEL=nerf", "which have a price list, but got nerf"),
+        ("effects MODEL=nerf", "model: expected forward or particles, which can be planned, but got nerf"),
+    ],
+)
+def test_words_that_would_have_no_effect_are_refused(line, expected):
+    with pytest.raises(ValueError, match=expected):
+        planned(line)
+
+
+def test_a_failed_sweep_stops_no_other_and_its_status_is_kept(monkeypatch):
+    called = []
+
+    def call(name, arguments, prefix=""):
+        called.append((name, prefix))
+        return 2 if arguments == ["b"] else 0
+
+    monkeypatch.setattr(reproduce, "_call", call)
+    assert reproduce.run(reproduce.Job([[["a"], ["b"], ["c"]], [["d"]]], [["report", "kind=paper"]], 2)) == 2
+    assert sorted(called) == sorted([("train", "1 | ")] * 3 + [("train", "2 | "), ("report", "")])
+
+
+def test_make_hands_over_what_was_typed():
+    words = ["make", "-n", "-C", str(ROOT), "reproduce-tables", "DATA=there", "SCENES=hook lego", "SEEDS=3"]
+    said = subprocess.run(words, check=True, capture_output=True, text=True).stdout
+    assert "forewarp-reproduce tables DATA='there' SCENES='hook lego' SEEDS='3'" in " ".join(said.split())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("line", "page"),
+    [
+        ("reproduce-tables METHODS=nerf", "paper/results/paper.md"),
+        ("ablations SEEDS=1", "results/ablation.md"),
+        ("accuracy-time CHANGES=stage.fine.density=45", "accuracy_time/results/accuracy-time.md"),
+        ("bench-gpu DEVICE=cpu", "bench-gpu/results/price-list.md"),
+        ("effects MODEL=particles MORE=scene=specimen_still", "effects/results/effects-particles.md"),
+    ],
+)
+def test_the_small_form_writes_the_page(line, page, tmp_path):
+    words = ["make", "-f", str(ROOT / "Makefile"), f"BIN={ROOT}/.venv/bin", "SMALL=1", *shlex.split(line)]
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
+    assert (tmp_path / "runs" / "small" / page).is_file()
