@@ -40,14 +40,12 @@ SIZES = {
     "side": (100, 200, 400, 800),
     "zoom": (0.25, 0.5, 1.0, 2.0),
     "nodes": (100, 200, 400, 800),
-    "box": (1.0, 2.0, 4.0, 8.0),
 }
 AXES = {
     "particles": "particles",
     "side": "side of the picture",
     "zoom": "covered pixels of as many",
     "nodes": "nodes",
-    "box": "volume of the box, times one that fits",
 }
 MOVES = (
     *("model/rotation=none", "model/view_dependence=none", "model/color_over_time=none"),

@@ -47,15 +47,13 @@ BOX = Box((-1.0, -0.5, -1.2), (1.0, 0.5, 1.1))
 @dataclass(frozen=True)
 class Size:
     """What is timed: so many ``particles`` and ``nodes``, pictures of ``side`` squared pixels; ``zoom`` makes
-    the figure larger in them, at 1 it is as large as hook. The scene's box has ``box`` times the volume of
-    one that fits.
+    the figure larger in them, at 1 it is as large as hook.
     """
 
     particles: int = COUNT
     side: int = SIDE
     nodes: int = NODES
     zoom: float = 1.0
-    box: float = 1.0
 
 
 def figure(count: int) -> tuple[Gaussians, float]:
@@ -98,7 +96,7 @@ def photograph(particles: Gaussians, view: Camera) -> Tensor:
 
 
 @cache
-def scene_of(count: int, side: int, zoom: float = 1.0, box: float = 1.0) -> Scene:
+def scene_of(count: int, side: int, zoom: float = 1.0) -> Scene:
     """The figure at many times; pictures repeat."""
     particles, _ = figure(count)
     cameras = [camera(side, i / VIEWS, zoom) for i in range(VIEWS)]
@@ -107,8 +105,7 @@ def scene_of(count: int, side: int, zoom: float = 1.0, box: float = 1.0) -> Scen
         Frame(f"r_{i}", i / (TIMES - 1), cameras[i % VIEWS], lambda i=i: pictures[i % VIEWS])
         for i in range(TIMES)
     )
-    low, high = (tuple(box ** (1 / 3) * x for x in corner) for corner in (BOX.low, BOX.high))
-    return Scene("figure", frames, (), (), Box(low, high), 0.0, has_alpha=True)
+    return Scene("figure", frames, (), (), BOX, 0.0, has_alpha=True)
 
 
 def run_of(size: Size, steps: int, folder: Path, effects: Sequence[str] = ()) -> Run:
@@ -124,9 +121,7 @@ def run_of(size: Size, steps: int, folder: Path, effects: Sequence[str] = ()) ->
         "stage.fine.crowd_decay=0.0", *effects,  # as hook, which has fewer particles than pixels
     )  # fmt: skip
     run = build_run(config)
-    data = SceneDataModule(
-        lambda: scene_of(size.particles, size.side, size.zoom, size.box), background="random"
-    )
+    data = SceneDataModule(lambda: scene_of(size.particles, size.side, size.zoom), background="random")
     make = run.model
     return replace(run, datamodule=data, model=lambda start: _made(make, start, size), tell=lambda _: None)
 

@@ -37,21 +37,6 @@ from tests.bench.workloads import OCCUPANCY
 from tests.stability.report import replace_section, table
 from tests.stability.twin import implementation
 
-# Part of a profiler entry's name -> what it is called in the table; the first match counts.
-WORDS = (
-    ("convolution_backward", "convolutions, backwards"),
-    ("convolution", "convolutions"),
-    ("conv3d", "convolutions"),
-    ("upsample_trilinear", "interpolation of the up-layer"),
-    ("batch_norm", "norms"),
-    ("Numba", "reads and scatters (Numba)"),
-    ("mm", "F1, F2, F4 and layers of one voxel"),
-    ("copy", "copies"),
-    ("add", "sums, of gradients above all"),
-    ("clamp_min", "rectifiers"),
-    ("threshold_backward", "rectifiers"),
-    ("adam", "optimiser"),
-)
 VERDICTS = {True: "reached", False: "**missed**", None: ""}
 
 
@@ -98,36 +83,6 @@ def growth_tables(cases: Mapping[str, Case] = CASES) -> str:
         title = f"**{name}**: seconds grow as {against} to the power {fitted:.2f}"
         parts.append(f"{title}\n\n{table(head, lines)}")
     return "\n\n".join(parts)
-
-
-def box_table(side: int = 40, rays: int = 2048) -> str:
-    """Time a step on one object while the box around it grows to eight times the volume."""
-    volumes, seconds, lines = (1.0, 2.0, 4.0, 8.0), [], []
-    for volume in volumes:
-        seconds.append(timed(step_work(side, False, rays=rays, box=volume ** (1 / 3))))
-        share = seconds[-1] / seconds[0]
-        lattice = f"{round(side * volume ** (1 / 3))}^3"
-        lines.append([f"x{volume:g}", lattice, milliseconds(seconds[-1]), f"{share:.2f}"])
-    head = table(["volume of the box", "lattice", "ms a step", "against the first"], lines)
-    return f"{head}\n\nA step grows as the box's volume to the power {slope(volumes, seconds):.2f}."
-
-
-def profile_table(side: int = 80, rays: int = 8192) -> str:
-    """Say where the time of a fine step goes."""
-    from torch.profiler import ProfilerActivity, profile
-
-    step = step_work(side, False, rays=rays)
-    step()
-    with profile(activities=[ProfilerActivity.CPU]) as taken:
-        step()
-    spent: dict[str, float] = {}
-    for event in taken.key_averages():
-        word = next((word for part, word in WORDS if part in event.key), "all else, in small pieces")
-        spent[word] = spent.get(word, 0.0) + event.self_cpu_time_total * 1e-6
-    whole = sum(spent.values())
-    ranked = sorted(spent.items(), key=lambda item: -item[1])
-    lines = [[word, milliseconds(s), f"{s / whole:.0%}"] for word, s in ranked]
-    return table(["part", "ms", "share"], [*lines, ["sum", milliseconds(whole), ""]])
 
 
 def splat_error(side: int = 80) -> float:
@@ -192,8 +147,6 @@ def by_itself(side: int, rays: int) -> float:
 
 SECTIONS = {
     "growth": growth_tables,
-    "profile": profile_table,
-    "box": box_table,
     "goals": goals_table,
     "free": free_table,
     "particles": particle_tables.parts_table,
