@@ -25,7 +25,8 @@ from forewarp.capture.facts import PICTURE
 from forewarp.data import hypernerf
 from forewarp.data.images import read_image
 from forewarp.data.posed_video import PosedShot, read_scene, write_scene
-from forewarp.drawing.files import read_picture, to_bytes, write_video
+from forewarp.drawing.files import read_image as read_drawn
+from forewarp.drawing.files import to_bytes, write_video
 from forewarp.drawing.images import in_a_row
 from forewarp.progress import Counted
 from forewarp.scene.box import Box
@@ -174,7 +175,7 @@ def pictured(folder: Path, scenes: list[str], seed: int, file: str) -> None:
         drawn = sorted(runs[0].iterdir())
         view = drawn[len(drawn) // 2].name
         (truth,) = (folder / "exact" / scene / "images").glob(f"{Path(view).stem}.*")
-        rows.append(in_a_row([read_picture(path) for path in (truth, *(run / view for run in runs))], GAP))
+        rows.append(in_a_row([read_drawn(path) for path in (truth, *(run / view for run in runs))], GAP))
     turned = [row.transpose(0, 1) for row in rows]
     picture = Image.fromarray(to_bytes(in_a_row(turned, GAP).transpose(0, 1)))
     picture.quantize(256).save(folder / file, optimize=True)  # a quarter of the bytes

@@ -156,7 +156,7 @@ def told_views(story: Story) -> list:
 
     Of the telling views those that have a sheet; then others, named for what they are among those with one.
     """
-    from forewarp.drawing.files import read_picture
+    from forewarp.drawing.files import read_image
     from forewarp.report.run_media import Shown
     from forewarp.report.sheets import sheets_of, thirds
 
@@ -168,7 +168,7 @@ def told_views(story: Story) -> list:
         name: f"{why} of {len(drawn)} drawn" for name, why in telling(drawn).items() if name not in chosen
     }
     shown = [
-        Shown(why, about(story, name), dict(zip(names, thirds(read_picture(sheets[name])))))
+        Shown(why, about(story, name), dict(zip(names, thirds(read_image(sheets[name])))))
         for name, why in sorted(chosen.items(), key=lambda one: WHYS.index(one[1].split()[0]))
     ]
     if shown:
@@ -182,7 +182,7 @@ def told_views(story: Story) -> list:
         Shown(
             "in training",
             f"stage {path.parts[-3]} at {int(path.stem.split('_')[0])} %",
-            dict(zip(names, thirds(read_picture(path)))),
+            dict(zip(names, thirds(read_image(path)))),
         )
         for path in drawn[-1:]
     ]

@@ -1,4 +1,4 @@
-"""Write pictures and videos, whole or not at all."""
+"""Write images and videos, whole or not at all."""
 
 from __future__ import annotations
 
@@ -21,30 +21,30 @@ FORMATS = ("mp4", "gif", "png")
 _SMALLER = ((1, 20), (1, 26), (1, 32), (2, 26), (2, 32), (4, 32))  # size to divide by, loss (ffmpeg's crf)
 
 
-def to_bytes(picture: Tensor) -> np.ndarray:
+def to_bytes(image: Tensor) -> np.ndarray:
     """Round (H, W, 3) in [0, 1] to uint8 (H, W, 3)."""
-    return (picture.detach().clamp(0, 1) * 255).round().byte().cpu().numpy()
+    return (image.detach().clamp(0, 1) * 255).round().byte().cpu().numpy()
 
 
-def write_png(path: Path, picture: Tensor) -> Path:
+def write_png(path: Path, image: Tensor) -> Path:
     """Write (H, W, 3) in [0, 1]; make the folder."""
     with written_whole(path) as beside:
-        iio.imwrite(beside, to_bytes(picture), extension=".png")
+        iio.imwrite(beside, to_bytes(image), extension=".png")
     return path
 
 
-def png_bytes(picture: Tensor) -> bytes:
+def png_bytes(image: Tensor) -> bytes:
     """Encode (H, W, 3) in [0, 1]."""
-    return iio.imwrite("<bytes>", to_bytes(picture), extension=".png")
+    return iio.imwrite("<bytes>", to_bytes(image), extension=".png")
 
 
-def jpeg_bytes(picture: Tensor, quality: int) -> bytes:
+def jpeg_bytes(image: Tensor, quality: int) -> bytes:
     """Encode (H, W, 3) in [0, 1] with loss; ``quality`` in [1, 95]."""
-    return iio.imwrite("<bytes>", to_bytes(picture), extension=".jpg", quality=quality, subsampling=0)
+    return iio.imwrite("<bytes>", to_bytes(image), extension=".jpg", quality=quality, subsampling=0)
 
 
-def read_picture(path: Path) -> Tensor:
-    """Read a picture as (H, W, 3) in [0, 1]; alpha is dropped."""
+def read_image(path: Path) -> Tensor:
+    """Read an image as (H, W, 3) in [0, 1]; alpha is dropped."""
     return torch.from_numpy(iio.imread(path)[..., :3].copy()).float() / 255
 
 
@@ -61,9 +61,9 @@ def smaller_video(path: Path, most: int) -> tuple[bytes, str]:
         file = Path(folder) / "video.mp4"
         for shrink, loss in _SMALLER:
             even = f"scale=trunc(iw/{2 * shrink})*2:trunc(ih/{2 * shrink})*2:flags=area"
-            call = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-v", "error", "-i", str(path), "-vf", even]
-            call += ["-crf", str(loss), "-pix_fmt", "yuv420p", "-movflags", "+faststart", "-an", str(file)]
-            if subprocess.run(call, capture_output=True).returncode:
+            options = f"-vf {even} -crf {loss} -pix_fmt yuv420p -movflags +faststart -an".split()
+            call = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-v", "error", "-i", str(path)]
+            if subprocess.run([*call, *options, str(file)], capture_output=True).returncode:
                 raise OSError(errno.EIO, "ffmpeg could not read it", str(path))
             if file.stat().st_size <= most:
                 size = f", at 1/{shrink} of its width and height" if shrink > 1 else ""
@@ -71,8 +71,8 @@ def smaller_video(path: Path, most: int) -> tuple[bytes, str]:
     return b"", "left out"
 
 
-def write_video(path: Path, pictures: Iterable[Tensor], *, fps: float) -> Path:
-    """Write pictures (H, W, 3) in [0, 1], taken one by one, in the format that the suffix names.
+def write_video(path: Path, images: Iterable[Tensor], *, fps: float) -> Path:
+    """Write images (H, W, 3) in [0, 1], taken one by one, in the format that the suffix names.
 
     ``.mp4`` and ``.gif`` are files; ``.png`` makes a folder of images, named like the file without suffix.
 
@@ -81,39 +81,33 @@ def write_video(path: Path, pictures: Iterable[Tensor], *, fps: float) -> Path:
     """
     if path.suffix == ".png":
         folder = path.with_suffix("")
-        for number, picture in enumerate(pictures):
-            write_png(folder / f"{number:04d}.png", picture)
+        for number, image in enumerate(images):
+            write_png(folder / f"{number:04d}.png", image)
         return folder
+    frames = map(to_bytes, images)
     with written_whole(path) as beside:
         if path.suffix == ".gif":
-            frames = [to_bytes(picture) for picture in pictures]
-            iio.imwrite(beside, frames, extension=".gif", duration=1000 / fps, loop=0)
+            iio.imwrite(beside, list(frames), extension=".gif", duration=1000 / fps, loop=0)
         else:
-            _write_mp4(beside, map(to_bytes, pictures), fps)
+            _write_mp4(beside, frames, fps)
     return path
 
 
 def _write_mp4(path: Path, frames: Iterable[np.ndarray], fps: float) -> None:
-    frames = map(_even, frames)
+    # The codec takes even sides only.
+    frames = (np.pad(f, ((0, f.shape[0] % 2), (0, f.shape[1] % 2), (0, 0)), mode="edge") for f in frames)
     first = next(frames)
-    size = first.shape[1], first.shape[0]
-    # The default block of 16 would stretch the picture; 2 is the smallest that the codec allows.
+    # The default block of 16 would stretch the image; 2 is the smallest that the codec allows.
     options = {"fps": fps, "quality": 8, "macro_block_size": 2, "ffmpeg_log_level": "error"}
-    writer = imageio_ffmpeg.write_frames(str(path), size, **options)
+    writer = imageio_ffmpeg.write_frames(str(path), first.shape[1::-1], **options)
     writer.send(None)
     try:
         for frame in chain([first], frames):
             if frame.shape != first.shape:  # ffmpeg would take it, and shear all that follow
-                raise ValueError(
-                    f"video: expected pictures of {first.shape}, as the first, but got {frame.shape}"
-                )
-            writer.send(frame)
+                expected = f"images of {first.shape}, as the first"
+                raise ValueError(f"video: expected {expected}, but got {frame.shape}")
+            writer.send(np.ascontiguousarray(frame))
     except OSError as error:  # its message has many lines and does not name the file
         raise OSError(errno.EIO, "ffmpeg could not go on (is the disk full?)", str(path)) from error
     finally:
         writer.close()
-
-
-def _even(frame: np.ndarray) -> np.ndarray:
-    height, width = frame.shape[:2]
-    return np.ascontiguousarray(np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge"))

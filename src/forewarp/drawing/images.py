@@ -1,4 +1,4 @@
-"""Draw images (H, W, 3) in [0, 1]: colours of depth, error and flow, lines, images in a row."""
+"""Draw images (H, W, 3) in [0, 1]: colours of depth, error and flow; lines and discs; images in a row."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def depth_colors(depth: Tensor, opacity: Tensor) -> Tensor:
 
 
 def error_colors(a: Tensor, b: Tensor, full: float = 0.25) -> Tensor:
-    """Draw the mean absolute difference of two pictures (H, W, 3): black is 0, white ``full`` or more."""
+    """Draw the mean absolute difference of two images (H, W, 3): black is 0, white ``full`` or more."""
     return ramp((a - b).abs().mean(-1) / full, _ERROR)
 
 
@@ -65,65 +65,63 @@ def flow_colors(flow: Tensor, opacity: Tensor, full: float | None = None) -> Ten
     return torch.lerp(torch.ones_like(colors), colors, opacity[..., None].clamp(0, 1))
 
 
-def with_wheel(picture: Tensor, share: float = 0.16) -> Tensor:
-    """Draw the wheel of flow colours into the lower right corner of a picture (H, W, 3)."""
-    height, width = picture.shape[:2]
+def with_wheel(image: Tensor, share: float = 0.16) -> Tensor:
+    """Draw the wheel of flow colours into the lower right corner of an image (H, W, 3)."""
+    height, width = image.shape[:2]
     size = max(8, int(share * min(height, width)))
     if size + 4 > min(height, width):
-        return picture
-    axis = (torch.arange(size, device=picture.device) + 0.5) / size * 2 - 1
+        return image
+    axis = (torch.arange(size, device=image.device) + 0.5) / size * 2 - 1
     y, x = torch.meshgrid(axis, axis, indexing="ij")
     inside = ((1 - torch.hypot(x, y)) * size / 2).clamp(0, 1)
     rows, columns = slice(height - size - 2, height - 2), slice(width - size - 2, width - 2)
-    behind = picture[rows, columns]
-    picture = picture.clone()
-    picture[rows, columns] = torch.lerp(
-        behind, flow_colors(torch.stack([x, y], -1), torch.ones_like(x), 1.0), inside[..., None]
-    )
-    return picture
+    wheel, image = flow_colors(torch.stack([x, y], -1), torch.ones_like(x), 1.0), image.clone()
+    image[rows, columns] = torch.lerp(image[rows, columns], wheel, inside[..., None])
+    return image
 
 
-def in_a_row(pictures: list[Tensor], gap: int = 4) -> Tensor:
-    """Put pictures (H, W_i, 3) of one height side by side, with white gaps."""
-    white = pictures[0].new_ones(pictures[0].shape[0], gap, 3)
-    return torch.cat([part for picture in pictures for part in (white, picture)][1:], 1)
+def in_a_row(images: list[Tensor], gap: int = 4) -> Tensor:
+    """Put images (H, W_i, 3) of one height side by side, with white gaps."""
+    white = images[0].new_ones(images[0].shape[0], gap, 3)
+    return torch.cat([part for image in images for part in (white, image)][1:], 1)
 
 
-def at_least(picture: Tensor, side: int) -> Tensor:
-    """Repeat every pixel of a picture (H, W, 3) so often that its shorter side has ``side`` or more.
+def at_least(image: Tensor, side: int) -> Tensor:
+    """Repeat every pixel of an image (H, W, 3) so often that its shorter side has ``side`` or more.
 
     >>> at_least(torch.zeros(100, 120, 3), 300).shape
     torch.Size([300, 360, 3])
     """
-    times = max(1, math.ceil(side / min(picture.shape[:2])))
-    return picture.repeat_interleave(times, 0).repeat_interleave(times, 1)
+    times = max(1, math.ceil(side / min(image.shape[:2])))
+    return image.repeat_interleave(times, 0).repeat_interleave(times, 1)
 
 
-def at_most(picture: Tensor, side: int) -> Tensor:
-    """Shrink a picture (H, W, 3) whose longer side has more than ``side`` pixels; each becomes a mean.
+def at_most(image: Tensor, side: int) -> Tensor:
+    """Shrink an image (H, W, 3) whose longer side has more than ``side`` pixels; each becomes a mean.
 
     >>> at_most(torch.zeros(100, 120, 3), 60).shape
     torch.Size([50, 60, 3])
     """
-    height, width = picture.shape[:2]
-    scale = side / max(height, width)
-    if scale >= 1:
-        return picture
-    shape = max(1, round(height * scale)), max(1, round(width * scale))
-    return torch.nn.functional.interpolate(picture.permute(2, 0, 1)[None], shape, mode="area")[0].permute(
-        1, 2, 0
-    )
+    height, width = image.shape[:2]
+    scale = min(1, side / max(height, width))
+    return area_means(image, (max(1, round(height * scale)), max(1, round(width * scale))))
+
+
+def area_means(image: Tensor, shape: tuple[int, int]) -> Tensor:
+    """Resize an image (H, W, 3) to a smaller shape; each pixel is the mean of those that it covers."""
+    channels_first = image.permute(2, 0, 1)[None]
+    return torch.nn.functional.interpolate(channels_first, shape, mode="area")[0].permute(1, 2, 0)
 
 
 _SPACING = 0.5  # pixels between the discs that make a line
-_MOST = 2048  # discs per segment; longer ones leave any picture
+_MOST = 2048  # discs per segment; longer ones leave any image
 
 
-def draw_discs(picture: Tensor, at: Tensor, colors: Tensor, alpha: Tensor, radius: float) -> Tensor:
-    """Draw discs over a picture. Where they overlap, average the colours and take the largest opacity.
+def draw_discs(image: Tensor, at: Tensor, colors: Tensor, alpha: Tensor, radius: float) -> Tensor:
+    """Draw discs over an image. Where they overlap, average the colours and take the largest opacity.
 
     Args:
-        picture: (H, W, 3).
+        image: (H, W, 3).
         at: centres (M, 2) in pixels from the top-left corner.
         colors: (M, 3).
         alpha: (M,).
@@ -131,7 +129,7 @@ def draw_discs(picture: Tensor, at: Tensor, colors: Tensor, alpha: Tensor, radiu
 
     Cost: linear in M and in the square of ``radius``.
     """
-    height, width = picture.shape[:2]
+    height, width = image.shape[:2]
     reach = torch.arange(-int(radius + 1.5), int(radius + 1.5) + 1, device=at.device)
     pixel = at.floor().long()[:, None] + torch.cartesian_prod(reach, reach)  # (M, K, 2)
     gap = (pixel + 0.5 - at[:, None]).norm(dim=-1)
@@ -140,11 +138,11 @@ def draw_discs(picture: Tensor, at: Tensor, colors: Tensor, alpha: Tensor, radiu
     kept = (cover > 0) & (x >= 0) & (y >= 0) & (x < width) & (y < height)
     flat, cover = (y * width + x)[kept], cover[kept]
     colors = colors[:, None].expand(-1, pixel.shape[1], -1)[kept]
-    ink = picture.new_zeros(height * width, 3).index_add_(0, flat, colors * cover[:, None])
-    total = picture.new_zeros(height * width).index_add_(0, flat, cover)
-    most = picture.new_zeros(height * width).scatter_reduce_(0, flat, cover, "amax")
-    mixed = torch.lerp(picture.reshape(-1, 3), ink / total.clamp(min=1e-8)[:, None], most[:, None])
-    return mixed.reshape(picture.shape)
+    ink = image.new_zeros(height * width, 3).index_add_(0, flat, colors * cover[:, None])
+    total = image.new_zeros(height * width).index_add_(0, flat, cover)
+    most = image.new_zeros(height * width).scatter_reduce_(0, flat, cover, "amax")
+    mixed = torch.lerp(image.reshape(-1, 3), ink / total.clamp(min=1e-8)[:, None], most[:, None])
+    return mixed.reshape(image.shape)
 
 
 def sample_lines(vertices: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,0 +1,77 @@
+import pytest
+import torch
+
+from forewarp.drawing import images
+
+RED = torch.tensor([[1.0, 0.0, 0.0]])
+
+
+def test_depth_is_bright_near_and_white_where_nothing_is():
+    depth = torch.tensor([[2.0, 3.0, 4.0, 0.0]])
+    colors = images.depth_colors(depth, torch.tensor([[1.0, 1.0, 1.0, 0.0]]))
+    lightness = colors[0].mean(-1)
+    assert lightness[0] > lightness[1] > lightness[2]
+    assert colors[0, 3].tolist() == [1, 1, 1]
+    assert bool((images.depth_colors(torch.zeros(2, 3), torch.zeros(2, 3)) == 1).all())
+
+
+def test_error_is_black_where_images_agree_and_white_at_full():
+    a = torch.rand(2, 3, 3, generator=torch.Generator().manual_seed(0)) * 0.5
+    assert float(images.error_colors(a, a).max()) == 0
+    assert float(images.error_colors(a, a + 0.3, full=0.25).min()) > 0.85
+
+
+def test_flow_hue_is_direction_and_saturation_is_length():
+    flow = torch.tensor([[[2.0, 0.0], [-2.0, 0.0], [1.0, 0.0], [0.0, 0.0]]])
+    right, left, slow, still = images.flow_colors(flow, torch.ones(1, 4), full=2.0)[0]
+    torch.testing.assert_close(torch.stack([right, left]), images.hues(torch.tensor([0.0, 0.5])))
+    torch.testing.assert_close(slow, 0.5 * (right + still))
+    assert still[0] == still[1] == still[2] < 1  # grey, to be told from the white of nothing
+    assert bool((images.flow_colors(flow, torch.zeros(1, 4)) == 1).all())
+
+
+def test_the_wheel_stands_in_the_corner_only():
+    drawn = images.with_wheel(torch.zeros(60, 80, 3))
+    assert float(drawn[-20:, -20:].max()) > 0.5
+    assert float(drawn[:40].max()) == float(drawn[:, :60].max()) == 0
+
+
+def test_a_row_keeps_the_images_and_parts_them():
+    a, b = torch.zeros(2, 3, 3), torch.full((2, 5, 3), 0.5)
+    assert torch.equal(images.in_a_row([a, b], gap=4), torch.cat([a, torch.ones(2, 4, 3), b], 1))
+
+
+def test_a_disc_covers_its_area_wherever_it_lies_and_nothing_from_outside():
+    for x, y in ([10.0, 8.0], [10.5, 8.5], [10.3, 7.9]):
+        at = torch.tensor([[x, y], [-50.0, 3.0], [3.0, 900.0]])
+        drawn = images.draw_discs(torch.zeros(16, 20, 3), at, RED.expand(3, 3), torch.ones(3), 3.0)
+        assert float(drawn[..., 0].sum()) == pytest.approx(torch.pi * 9, rel=0.05)
+        assert float(drawn[..., 1:].max()) == 0
+        for axis, middle in ((0, x), (1, y)):
+            share = drawn[..., 0].sum(dim=axis)
+            place = torch.arange(len(share)) + 0.5
+            assert float((share * place).sum() / share.sum()) == pytest.approx(middle, abs=0.05)
+
+
+def test_overlap_does_not_darken_and_mixes_colours():
+    at, colors = torch.tensor([[5.0, 5.0], [5.0, 5.0]]), torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    drawn = images.draw_discs(torch.ones(10, 10, 3), at, colors, torch.tensor([0.5, 0.5]), 2.0)
+    torch.testing.assert_close(drawn[5, 5], torch.tensor([0.75, 0.5, 0.75]))
+
+
+def test_lines_are_sampled_densely_with_all_they_carry():
+    lines = torch.tensor([[[0.0, 0.0, 1.0], [4.0, 0.0, 0.0], [4.0, 3.0, 2.0]], [[9.0, 9.0, 5.0]] * 3])
+    samples, line = images.sample_lines(lines)
+    first = samples[line == 0]
+    assert float((first[1:, :2] - first[:-1, :2]).norm(dim=-1).max()) <= 0.5 + 1e-6
+    flat = first[first[:, 1] == 0]
+    torch.testing.assert_close(flat[:, 2], 1 - flat[:, 0] / 4)
+    assert samples[line == 1].tolist() == [[9.0, 9.0, 5.0]] * 2
+
+
+def test_hidden_behind_the_surface_by_more_than_the_slack():
+    depth = torch.full((3, 4), float("inf"))
+    depth[1, 2] = 2.0
+    at = torch.tensor([[2.5, 1.5], [2.5, 1.5], [2.5, 1.5], [0.5, 0.5]])
+    distance = torch.tensor([1.9, 2.05, 2.2, 99.0])
+    assert images.hidden(at, distance, depth, 0.1).tolist() == [False, False, True, False]
