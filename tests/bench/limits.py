@@ -15,7 +15,7 @@ from omegaconf import OmegaConf
 from tabulate import tabulate
 from torch import Tensor
 
-from forewarp.evaluation.evaluate import Shown, draw
+from forewarp.evaluation.evaluate import RenderedView, draw
 from forewarp.methods.method import HasMatter
 from forewarp.metrics.image import low_passed, psnr
 from forewarp.ops.grid import dilate
@@ -76,7 +76,7 @@ def limits_of(run: Run, views: int = 20) -> dict[str, float | str]:
     }
 
 
-def compared(shown: Shown, center: Tensor, voxel_size: float) -> dict:
+def compared(shown: RenderedView, center: Tensor, voxel_size: float) -> dict:
     """Compare a rendered view with its truth; ``voxel`` is the voxel size in pixels at the center (3,)."""
     target, camera = shown.target, shown.target.frame.camera
     truth = target.rgb.cpu()

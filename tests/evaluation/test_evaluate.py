@@ -1,16 +1,21 @@
 import json
+import platform
 from dataclasses import replace
 
 import imageio.v3 as iio
 import pytest
 import torch
 
-from forewarp.data.batches import Targets
-from forewarp.evaluation.evaluate import draw, evaluate, flow_error
+from forewarp.data.batches import Targets, color_of
+from forewarp.data.module import SceneDataModule
+from forewarp.evaluation import evaluate as evaluation
+from forewarp.evaluation.evaluate import draw, evaluate, flow_error, reduced_rendering, show, without
 from forewarp.methods.voxel.model import VoxelSnapshot
-from forewarp.metrics.suite import ImageSuite
+from forewarp.metrics.suite import LPIPS_METRICS, ImageSuite
+from forewarp.scene.camera import joined
 from forewarp.scene.frame import Truth
-from tests.support.tiny_scene import ball_data, make_run, stage
+from forewarp.scene.view import Rendering
+from tests.support.tiny_scene import ball_data, ball_scene, frame_at, make_run, stage
 
 
 @pytest.fixture(scope="module")
@@ -44,25 +49,19 @@ def test_scores_every_image_and_saves_it(run, module, tmp_path):
     assert seen == [(1, 3), (2, 3), (3, 3)]
     assert json.loads((tmp_path / "metrics.json").read_text()) == metrics
     rows = json.loads((tmp_path / "per_image.json").read_text())["images"]
-    assert [row["name"] for row in rows] == ["t_0", "t_1", "t_2"]
     assert metrics["test"]["all"]["psnr"] == pytest.approx(sum(row["scores"]["psnr"] for row in rows) / 3)
     assert {path.stem for path in (tmp_path / "images").glob("*.png")} == {"t_0", "t_1", "t_2"}
     assert len(list((tmp_path / "images" / "sheets").glob("*.png"))) == 2
     sheet = iio.imread(tmp_path / "images" / "sheets" / "t_0.png")
     assert sheet.shape == (312, 3 * 312 + 2 * 4, 3)  # 24 pixels, each 13 times
-    assert metrics["steps"] == {"coarse": 4}
+    assert (metrics["steps"], metrics["protocol"]["seed"]) == ({"coarse": 4}, 5)
     assert "flow" not in metrics  # the scene has no truth
-    assert metrics["protocol"]["seed"] == 5
     seconds = metrics["seconds"]
     assert seconds["train"] == seconds["coarse"] > 0
     assert 0 < seconds["render_again_per_frame"] < seconds["render_per_frame"]
-    assert seconds["render_again_per_frame"] == pytest.approx(sum(row["seconds_again"] for row in rows) / 3)
-
-
-def test_the_same_scene_gives_the_same_numbers(run, module, tmp_path):
-    first, second = (evaluate(module, run.datamodule, tmp_path, ImageSuite(), sheets=0) for _ in range(2))
-    assert first["test"] == second["test"]
-    assert not (tmp_path / "images" / "sheets").exists()
+    again = evaluate(module, run.datamodule, tmp_path / "again", ImageSuite(), sheets=0)
+    assert again["test"] == metrics["test"]
+    assert not (tmp_path / "again" / "images" / "sheets").exists()
 
 
 def test_warps_once_a_time(module, monkeypatch):
@@ -80,22 +79,91 @@ def test_warps_once_a_time(module, monkeypatch):
 
     monkeypatch.setattr(module.method, "at", warped)
     monkeypatch.setattr(VoxelSnapshot, "render", drawn)
-    monkeypatch.setattr("forewarp.evaluation.evaluate.now", lambda: clock[0])
+    monkeypatch.setattr(evaluation, "now", lambda: clock[0])
     frames = [targets.frames[i] for i in (2, 0, 2, 0)]
-    shown = list(draw(module, Targets(frames, targets.background, targets.has_alpha)))
+    views = list(draw(module, Targets(frames, targets.background, targets.has_alpha)))
     assert times == [0.0, 1.0]
-    assert [one.number for one in shown] == [1, 3, 0, 2]
-    assert [(one.seconds, one.seconds_again) for one in shown] == [(11, 1), (1, 1)] * 2
+    assert [view.number for view in views] == [1, 3, 0, 2]
+    assert [(view.seconds, view.seconds_again) for view in views] == [(11, 1), (1, 1)] * 2
+
+
+def dome_scene():
+    """The ball as three of four cameras of a dome see it."""
+    frames = tuple(frame_at(f"{t}/{k}", k / 4, t, 12) for t in (0.0, 0.5, 1.0) for k in range(4))
+    return replace(ball_scene(frames=2, size=12), train=frames, val=(), test=frames[::4])
+
+
+def test_training_warps_once_for_the_rays_of_several_cameras(module, monkeypatch):
+    times, at = [], module.method.at
+    monkeypatch.setattr(module.method, "at", lambda moment: times.append(moment.time) or at(moment))
+    batch = SceneDataModule(dome_scene, rays=60, views_per_step=3).batches.draw()
+    assert len({observation.moment.frame for observation in batch.observations}) == 3
+    rays = joined([observation.view.rays() for observation in batch.observations])
+    assert (len(rays), len(rays.origins.unique(dim=0))) == (60, 3)
+    assert torch.isfinite(module.loss_of(batch)[0])
+    assert times == [batch.time]
 
 
 def test_flow_is_measured_against_the_truth(run, module):
-    scene = run.datamodule.scene
     points = torch.rand(5, 1, 3)
     drifting = torch.cat([points, points + torch.tensor([0.5, 0.0, 0.0])], 1)
     truth = Truth(drifting, torch.tensor([0.0, 1.0], dtype=torch.float64))
-    flow = flow_error(module, replace(scene, truth=truth))
+    flow = flow_error(module, replace(run.datamodule.scene, truth=truth))
     predicted = module.method.trajectories(points[:, 0], torch.tensor([0.0, 1.0])).detach()
-    assert flow["epe_moving"] == pytest.approx(
-        float((predicted - drifting)[:, 1].norm(dim=-1).mean()), rel=1e-5
-    )
-    assert flow["motion_mean"] == pytest.approx(0.5)
+    error = float((predicted - drifting)[:, 1].norm(dim=-1).mean())
+    assert (flow["epe_moving"], flow["motion_mean"]) == pytest.approx((error, 0.5), rel=1e-5)
+
+
+@pytest.mark.parametrize("background", ["white", "black"])
+@pytest.mark.parametrize("straight", [True, False])
+def test_a_perfect_rendering_becomes_the_reduced_truth(background, straight):
+    frame, behind = ball_scene().test[0], color_of(background)
+    (whole,) = Targets([frame], behind, True)
+    opacity = frame.load()[..., 3].flatten() / 255
+    if not straight:
+        opaque = torch.cat([whole.rgb, torch.ones(24, 24, 1)], -1) * 255
+        frame = replace(frame, load=lambda: opaque.round().to(torch.uint8))
+    (truth,) = Targets([frame], behind, straight).reduced(2)
+    rendering = Rendering(whole.rgb.reshape(-1, 3), (opacity > 0) * 2.0, opacity)
+    small = reduced_rendering(rendering, (24, 24), 2, behind, straight=straight)
+    assert float((small.rgb.reshape(12, 12, 3) - truth.rgb).abs().max()) < 1.1 / 255  # truth has 8 bits
+    assert set(small.depth.tolist()) == {0.0, 2.0}
+    torch.testing.assert_close(small.opacity.mean(), opacity.mean())
+
+
+def test_a_run_is_scored_at_half_its_size(run, module, tmp_path):
+    metrics = evaluate(module, run.datamodule, tmp_path, ImageSuite(), sheets=1, reduce=2)
+    assert metrics["protocol"]["reduced"] == 2
+    assert iio.imread(tmp_path / "images" / "t_0.png").shape == (12, 12, 3)
+    with pytest.raises(ValueError, match="reduce: expected pictures with sides that 5 divides"):
+        evaluate(module, run.datamodule, tmp_path, ImageSuite(), reduce=5)
+
+
+def test_seconds_of_an_image_have_three_digits(capsys, tmp_path):
+    seconds = {"train": 61.0, "fine": 61.0, "render_per_frame": 0.00277, "render_again_per_frame": 12.345}
+    show({"protocol": {"scene": "x"}, "seconds": seconds}, tmp_path, {})
+    printed = capsys.readouterr().out
+    assert "trained 1:01 (fine 1:01), 0.00277 s a frame, 12.3 s another at" in printed
+    assert "departures" not in printed
+    show({"protocol": {"scene": "x", "faults": "a; b", "departures": "c"}, "seconds": seconds}, tmp_path, {})
+    assert "\ndepartures: c\nfaults: a; b\n" in capsys.readouterr().out
+
+
+def test_what_is_left_out_fits_one_line():
+    lpips = dict.fromkeys(LPIPS_METRICS, "no weights")
+    small = dict.fromkeys(("ms_ssim", "ms_ssim_legacy"), "too small")
+    assert without(lpips | small) == "without lpips (no weights), ms_ssim (too small)"
+    lpips.pop("lpips_vgg")
+    assert without(lpips) == f"without {list(lpips)[0]} (no weights), {list(lpips)[1]} (no weights)"
+
+
+@pytest.mark.parametrize(
+    ("lines", "name"),
+    [("processor : 0\nmodel name\t: A Thing 9\n", "A Thing 9"), (None, "arm"), ("model name :\n", "arm")],
+)
+def test_a_machine_is_called_by_its_processor(lines, name, monkeypatch, tmp_path):
+    monkeypatch.setattr(platform, "processor", lambda: "arm")
+    monkeypatch.setattr(evaluation, "_PROCESSOR", tmp_path / "cpuinfo")
+    if lines is not None:
+        (tmp_path / "cpuinfo").write_text(lines)
+    assert evaluation.device_name(torch.device("cpu")) == name

@@ -49,10 +49,8 @@ class AccuracyCurve(lightning.Callback):
 
     def __init__(self, *, first: float = 2.0, ratio: float = 1.4, rays: int = 10_000) -> None:
         if not (first > 0 and ratio > 1 and rays >= 1 and math.isfinite(first * ratio)):
-            raise ValueError(
-                "callbacks.accuracy: expected first > 0, ratio > 1 and rays >= 1, "
-                f"but got {first=}, {ratio=}, {rays=}"
-            )
+            expected = "first > 0, ratio > 1 and rays >= 1"
+            raise ValueError(f"callbacks.accuracy: expected {expected}, but got {first=}, {ratio=}, {rays=}")
         self.first, self.ratio, self.rays = first, ratio, rays
         self._before, self._next = 0.0, math.inf
 
@@ -85,19 +83,17 @@ class AccuracyCurve(lightning.Callback):
 
     def _add(self, trainer, module) -> None:
         with module.clock.paused():
-            scene, seconds = trainer.datamodule.scene, self._seconds(module)
+            seconds = self._seconds(module)
             scores = {"psnr": validation_psnr(module, trainer.datamodule.watched(), self.rays)}
-            if (flow := flow_error(module, scene)) is not None:
-                scores["epe_moving"] = flow["epe_moving"]
+            scores |= {"epe_moving": (flow_error(module, trainer.datamodule.scene) or {}).get("epe_moving")}
             scores = {name: value for name, value in scores.items() if value is not None}
-            about = {
-                "seconds": f"{seconds:.3f}",
-                "stage": module.settings.name,
-                "step": str(module.global_step),
-            }
-            numbers = {name: f"{value:.6g}" for name, value in scores.items()}
-            self._rows.append(about | numbers | {"size": str(module.method.size[1])})
-            write_rows(self._path, self._rows)
+            row = {"seconds": f"{seconds:.3f}", "stage": module.settings.name}
+            row |= {"step": str(module.global_step), "size": str(module.method.size[1])}
+            self._rows.append(row | {name: f"{value:.6g}" for name, value in scores.items()})
+            with written_whole(self._path) as beside, beside.open("w", newline="") as file:
+                writer = csv.DictWriter(file, COLUMNS, restval="")
+                writer.writeheader()
+                writer.writerows(self._rows)
             for logger in trainer.loggers:
                 if isinstance(logger, TensorBoardLogger):
                     curve = {f"curve/{name}": value for name, value in scores.items()}
@@ -109,11 +105,3 @@ def seconds_before(folder: Path) -> float:
     """Sum the training seconds of the finished stages beside a stage's folder."""
     done = [path for path in folder.parent.glob("*/done.json") if path.parent != folder]
     return sum(float((read_json(path) or {}).get("seconds", 0.0)) for path in done)
-
-
-def write_rows(path: Path, rows: list[dict[str, str]]) -> None:
-    """Write an ``accuracy_time.csv`` whole."""
-    with written_whole(path) as beside, beside.open("w", newline="") as file:
-        writer = csv.DictWriter(file, COLUMNS, restval="")
-        writer.writeheader()
-        writer.writerows(rows)

@@ -8,6 +8,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from statistics import fmean
 
 import torch
 from rich import box
@@ -22,59 +23,28 @@ from forewarp.files import write_json
 from forewarp.methods.effect import switched
 from forewarp.methods.method import HasTrajectories, parameter_count
 from forewarp.metrics.flow import end_point_error
-from forewarp.metrics.lpips import find_lpips
 from forewarp.metrics.registry import METRICS
 from forewarp.metrics.suite import ImageSuite, summarise
 from forewarp.ops.grid import block_means, reduced_depth
-from forewarp.progress import Counted, time_text
+from forewarp.progress import time_text
 from forewarp.scene.frame import Scene, spread
 from forewarp.scene.view import Rendering, Target
 from forewarp.training.module import DynamicSceneModule
-from forewarp.training.stages import Run
 
-_LEAST = 0.5 / 255  # alpha that 8 bits round to 0, where stored colours are 0 too
-
-
-def reduced_rendering(
-    rendering: Rendering, shape: tuple[int, int], by: int, background: Tensor, *, straight: bool
-) -> Rendering:
-    """Average each block of ``by`` x ``by`` pixels of a whole rendered picture.
-
-    Pictures with alpha are stored straight and averaged before the alpha is applied, which darkens
-    silhouettes; so is the rendering then, or it would be compared with another outline than it was fitted to.
-
-    Args:
-        rendering: of the whole picture, over ``background``.
-        shape: its (height, width).
-        by: side of a block; it divides both.
-        background: colour (3,) behind the picture.
-        straight: whether the scene's pictures have alpha.
-    """
-    rgb = rendering.rgb.clamp(0, 1).reshape(*shape, 3)
-    opacity = rendering.opacity.clamp(0, 1).reshape(*shape, 1)
-    alpha = block_means(opacity, by)
-    if straight:
-        color = (rgb - (1 - opacity) * background) / opacity.clamp(min=_LEAST)
-        color = torch.where(opacity < _LEAST, 0.0, color).clamp(0, 1)
-        rgb = block_means(color, by) * alpha + (1 - alpha) * background
-    else:
-        rgb = block_means(rgb, by)
-    depth = reduced_depth(rendering.depth.reshape(shape), by)
-    return Rendering(rgb.reshape(-1, 3), depth.flatten(), alpha.flatten())
-
-
-_SHEET_SIDE = 300  # least pixels of the shorter side of a picture on a sheet
+FAMILIES = ("lpips", "ms_ssim", "depth")
+_SHEET_SIDE = 300  # least pixels of the shorter side of an image on a sheet
+_LEAST_ALPHA = 0.5 / 255  # 8 bits round it to 0, where stored colours are 0 too
 _PACKAGES = ("forewarp", "torch", "lightning", "torchmetrics", "numba")  # what results depend on
 _PROCESSOR = Path("/proc/cpuinfo")  # Linux only
 
 
 @dataclass(frozen=True)
-class Shown:
+class RenderedView:
     """A rendered view.
 
     Attributes:
         number: index of the view in the split.
-        target: the view and the true picture.
+        target: the view and the true image.
         renderings: renderings by name, the best last.
         seconds: time of the best rendering, including the snapshot if the view before had another time.
         seconds_again: time of the best rendering without the snapshot.
@@ -89,12 +59,12 @@ class Shown:
 
 def draw(
     module: DynamicSceneModule, targets: Sequence[Target], numbers: Sequence[int] | None = None
-) -> Iterator[Shown]:
+) -> Iterator[RenderedView]:
     """Render views in the order of their times, so that each time needs one snapshot.
 
     Args:
         module: the fitted scene.
-        targets: views to render; times are read from ``targets.frames``, without decoding pictures.
+        targets: views to render; times are read from ``targets.frames``, without decoding images.
         numbers: indices of the views to render; None: all.
     """
     snapshot, wanted = None, range(len(targets)) if numbers is None else numbers
@@ -105,12 +75,12 @@ def draw(
             if snapshot is None or not snapshot.holds(target.moment):
                 snapshot = module.method.at(target.moment)
             view.rays()
-            behind, drawn, warped = target.background.to(module.device), {}, now() - begin
+            background, renderings, warped = target.background.to(module.device), {}, now() - begin
             for name in snapshot.renderings:
                 begin = now()
-                drawn[name] = snapshot.render(view, behind, name)
+                renderings[name] = snapshot.render(view, background, name)
                 again = now() - begin
-        yield Shown(number, target, drawn, warped + again, again)
+        yield RenderedView(number, target, renderings, warped + again, again)
 
 
 def evaluate(
@@ -146,42 +116,66 @@ def evaluate(
     Returns:
         the content of ``metrics.json``.
     """
-    scene, targets, finished = datamodule.scene, datamodule.targets("test"), finished or {}
-    targets = targets if reduce is None else targets.reduced(reduce)
+    scene, targets, images = datamodule.scene, datamodule.targets("test"), folder / "images"
+    finished = finished or {}
+    commits = [done["commit"] for done in finished.values() if done.get("commit")]
+    protocol = {**({"commit": commits[-1]} if commits else {}), **(protocol or {})}
     chosen = middles(len(targets), views)
+    if len(chosen) < len(targets):
+        protocol["measured"] = f"{len(chosen)} of {len(targets)} test views, evenly spread"
+    if reduce is not None:
+        targets, protocol["reduced"] = targets.reduced(reduce), reduce
     on_sheets = {chosen[i] for i in spread(len(chosen), sheets)}
     rows: dict[int, dict] = {}
-    for shown in draw(module, targets, chosen):
-        shown = shown if reduce is None else _reduced(shown, reduce, scene.has_alpha)
-        rows[shown.number] = _score(shown, suite)
-        _save(shown, Path(folder) / "images", shown.number in on_sheets)
+    for view in draw(module, targets, chosen):
+        if reduce is not None:
+            view = _reduced(view, reduce, scene.has_alpha)
+        rows[view.number] = _score(view, suite)
+        _save(view, images, view.number in on_sheets)
         if progress is not None:
             progress(len(rows), len(chosen))
-    for number, frame in enumerate(targets.frames):  # pictures of an earlier choice of views
-        for written, place in ((number in rows, "images"), (number in on_sheets, "images/sheets")):
-            if not written:
-                (Path(folder) / place / f"{frame.name}.png").unlink(missing_ok=True)
+    for number, frame in enumerate(targets.frames):  # images of an earlier choice of views
+        for is_written, place in ((number in rows, images), (number in on_sheets, images / "sheets")):
+            if not is_written:
+                (place / f"{frame.name}.png").unlink(missing_ok=True)
     per_image = [rows[number] for number in sorted(rows)]
-    if len(chosen) < len(targets):
-        measured = f"{len(chosen)} of {len(targets)} test views, evenly spread"
-        protocol = {**(protocol or {}), "measured": measured}
-    if reduce is not None:
-        protocol = {**(protocol or {}), "reduced": reduce}
+    best, others = per_image[0]["rendering"], list(per_image[0]["others"])
+    seconds = {name: float(done["seconds"]) for name, done in finished.items()}
+    clocks = [done.get("clocks", {}) for done in finished.values()]
+    shared = set.intersection(*map(set, clocks)) if clocks else set()
     metrics = {
-        "protocol": _protocol(module, scene, per_image, {**_trained_by(finished), **(protocol or {})}),
-        "seconds": _seconds(per_image, finished),
-        "clocks": _clocks(finished),
-        "steps": {name: int(noted["steps"]) for name, noted in finished.items()},
-        "peak_memory_bytes": max((int(s["peak_memory_bytes"]) for s in finished.values()), default=None),
+        "protocol": {
+            "scene": scene.name,
+            **scene.protocol,
+            **protocol,
+            **module.method.protocol(),
+            "renderings": [*others, best],
+            "scored": best,
+            "device": device_name(module.device),
+            "threads": torch.get_num_threads(),
+            "versions": versions(),
+        },
+        "seconds": {
+            "train": sum(seconds.values()),
+            **seconds,
+            "render_per_frame": fmean(row["seconds"] for row in per_image),
+            "render_again_per_frame": fmean(row["seconds_again"] for row in per_image),
+        },
+        # Only clocks that all stages were counted by.
+        "clocks": {kind: sum(float(clock[kind]) for clock in clocks) for kind in sorted(shared)},
+        "steps": {name: int(done["steps"]) for name, done in finished.items()},
+        "peak_memory_bytes": max((int(d["peak_memory_bytes"]) for d in finished.values()), default=None),
         "parameters": parameter_count(module.method),
         "size": dict([module.method.size]),
         "effects": switched(module.method),
-        **_means(per_image),
+        "test": summarise((row["ability"], row["scores"]) for row in per_image),
     }
+    for name in others:
+        metrics[f"test_{name}"] = summarise((row["ability"], row["others"][name]) for row in per_image)
     if (flow := flow_error(module, scene)) is not None:
         metrics["flow"] = flow
-    write_json(Path(folder) / "per_image.json", {"images": per_image})
-    write_json(Path(folder) / "metrics.json", metrics)
+    write_json(folder / "per_image.json", {"images": per_image})
+    write_json(folder / "metrics.json", metrics)
     return metrics
 
 
@@ -199,7 +193,7 @@ def middles(count: int, wanted: int | None) -> list[int]:
 
 def mean_scores(module: DynamicSceneModule, targets: Sequence[Target], suite: ImageSuite) -> dict[str, float]:
     """Return the mean scores of the views' best renderings; write nothing."""
-    rows = [_score(shown, suite)["scores"] for shown in draw(module, targets)]
+    rows = [_score(view, suite)["scores"] for view in draw(module, targets)]
     return summarise(("all", row) for row in rows).get("all", {})
 
 
@@ -213,138 +207,69 @@ def flow_error(module: DynamicSceneModule, scene: Scene) -> dict | None:
     return end_point_error(module.method.trajectories(points, times), truth.points)
 
 
-def _reduced(shown: Shown, by: int, straight: bool) -> Shown:
+def _reduced(view: RenderedView, by: int, has_alpha: bool) -> RenderedView:
     """Average blocks of pixels of all renderings; the target is as small already."""
-    behind, shape = shown.target.background, shown.target.view.shape
-    smaller = {
-        name: reduced_rendering(one, shape, by, behind.to(one.rgb), straight=straight)
-        for name, one in shown.renderings.items()
-    }
-    return replace(shown, renderings=smaller)
+    options = view.target.view.shape, by, view.target.background
+    smaller = {n: reduced_rendering(r, *options, straight=has_alpha) for n, r in view.renderings.items()}
+    return replace(view, renderings=smaller)
+
+
+def reduced_rendering(
+    rendering: Rendering, shape: tuple[int, int], by: int, background: Tensor, *, straight: bool
+) -> Rendering:
+    """Average each block of ``by`` x ``by`` pixels of a whole rendered image.
+
+    Images with alpha are stored straight and averaged before the alpha is applied, which darkens
+    silhouettes; so is the rendering then, or it would be compared with another outline than it was fitted to.
+
+    Args:
+        rendering: of the whole image, over ``background``.
+        shape: its (height, width).
+        by: side of a block; it divides both.
+        background: colour (3,) behind the image.
+        straight: whether the scene's images have alpha.
+    """
+    rgb = rendering.rgb.clamp(0, 1).reshape(*shape, 3)
+    opacity = rendering.opacity.clamp(0, 1).reshape(*shape, 1)
+    alpha, background = block_means(opacity, by), background.to(rgb)
+    if straight:
+        color = (rgb - (1 - opacity) * background) / opacity.clamp(min=_LEAST_ALPHA)
+        color = torch.where(opacity < _LEAST_ALPHA, 0.0, color).clamp(0, 1)
+        rgb = block_means(color, by) * alpha + (1 - alpha) * background
+    else:
+        rgb = block_means(rgb, by)
+    depth = reduced_depth(rendering.depth.reshape(shape), by)
+    return Rendering(rgb.reshape(-1, 3), depth.flatten(), alpha.flatten())
 
 
 def _image(rendering: Rendering, target: Target) -> Tensor:
     return rendering.rgb.clamp(0, 1).reshape(target.rgb.shape).cpu()
 
 
-def _score(shown: Shown, suite: ImageSuite) -> dict:
+def _score(view: RenderedView, suite: ImageSuite) -> dict:
     """Make the entry of one image: scores of the best rendering, and of the others by name."""
-    target, frame = shown.target, shown.target.frame
-    scores = {
-        name: suite.score(_image(r, target), target, r.depth.reshape(target.rgb.shape[:2]).cpu())
-        for name, r in shown.renderings.items()
-    }
-    best = list(scores)[-1]
+    target, frame, scores = view.target, view.target.frame, {}
+    for name, rendering in view.renderings.items():
+        depth = rendering.depth.reshape(target.rgb.shape[:2]).cpu()
+        scores[name] = suite.score(_image(rendering, target), target, depth)
+    best, score = scores.popitem()
     about = {"name": frame.name, "time": frame.time, "ability": frame.ability, "rendering": best}
-    others = {name: values for name, values in scores.items() if name != best}
-    seconds = {"seconds": shown.seconds, "seconds_again": shown.seconds_again}
-    return {**about, **seconds, "scores": scores[best], "others": others}
+    seconds = {"seconds": view.seconds, "seconds_again": view.seconds_again}
+    return {**about, **seconds, "scores": score, "others": scores}
 
 
-def _save(shown: Shown, folder: Path, on_sheet: bool) -> None:
-    target, image = shown.target, _image(list(shown.renderings.values())[-1], shown.target)
-    name = shown.target.frame.name + ".png"
-    write_png(folder / name, image)
-    if on_sheet:
-        parts = [target.rgb, image, error_colors(target.rgb, image)]
-        sheet = in_a_row([at_least(part, _SHEET_SIDE) for part in parts])
-        write_png(folder / "sheets" / name, sheet)
-
-
-def _means(per_image: list[dict]) -> dict[str, dict]:
-    """Average the scores of the best rendering (``test``) and of every other (``test_<rendering>``)."""
-    means = {"test": summarise((row["ability"], row["scores"]) for row in per_image)}
-    for name in per_image[0]["others"]:
-        means[f"test_{name}"] = summarise((row["ability"], row["others"][name]) for row in per_image)
-    return means
-
-
-def _seconds(per_image: list[dict], finished: Mapping[str, Mapping]) -> dict[str, float]:
-    """Return seconds of training by stage, and of rendering an image: the first of a time, and another."""
-    stages = {name: float(noted["seconds"]) for name, noted in finished.items()}
-    drawing, again = (sum(r[key] for r in per_image) / len(per_image) for key in ("seconds", "seconds_again"))
-    frames = {"render_per_frame": drawing, "render_again_per_frame": again}
-    return {"train": sum(stages.values()), **stages, **frames}
-
-
-def _clocks(finished: Mapping[str, Mapping]) -> dict[str, float]:
-    """Return the seconds of training by each clock that all stages were counted by."""
-    counted = [noted.get("clocks", {}) for noted in finished.values()]
-    shared = set.intersection(*map(set, counted)) if counted else set()
-    return {kind: sum(float(one[kind]) for one in counted) for kind in sorted(shared)}
-
-
-def _protocol(module: DynamicSceneModule, scene: Scene, per_image: list[dict], protocol: Mapping) -> dict:
-    first = per_image[0]
-    return {
-        "scene": scene.name,
-        **scene.protocol,
-        **protocol,
-        **module.method.protocol(),
-        "renderings": [*first["others"], first["rendering"]],
-        "scored": first["rendering"],
-        "device": device_name(module.device),
-        "threads": torch.get_num_threads(),
-        "versions": versions(),
-    }
-
-
-def _trained_by(finished: Mapping[str, Mapping]) -> dict:
-    """The commit by which the last stage was finished, where it was noted."""
-    noted = [stage["commit"] for stage in finished.values() if stage.get("commit")]
-    return {"commit": noted[-1]} if noted else {}
-
-
-FAMILIES = ("lpips", "ms_ssim", "depth")
-
-
-def measure(
-    run: Run,
-    module: DynamicSceneModule,
-    *,
-    device: torch.device,
-    protocol: Mapping,
-    lpips_weights: Sequence[str] | None = None,
-    sheets: int = 6,
-    views: int | None = None,
-    reduce: int | None = None,
-) -> dict:
-    """Evaluate a fitted run into its folder and print the table.
-
-    Args:
-        run: the run to measure.
-        module: the fitted scene.
-        device: device to render on.
-        protocol: further entries of ``protocol``: how the run was made.
-        lpips_weights: files or folders of backbone weights, searched before the usual places.
-        sheets, views, reduce: numbers of sheets and of test views, and pixels to average; see ``evaluate``.
-    """
-    suite = ImageSuite(
-        find_lpips(extra=lpips_weights), mask_box=run.datamodule.scene.protocol.get("mask_box", False)
-    )
-    module.to(device)
-    with Counted("test views") as progress:
-        metrics = evaluate(
-            module,
-            run.datamodule,
-            run.folder,
-            suite,
-            protocol=protocol,
-            finished=run.finished(),
-            sheets=sheets,
-            views=views,
-            reduce=reduce,
-            progress=progress,
-        )
-    show(metrics, run.folder, suite.absent)
-    return metrics
+def _save(view: RenderedView, folder: Path, is_on_sheet: bool) -> None:
+    truth, image = view.target.rgb, _image(list(view.renderings.values())[-1], view.target)
+    write_png(folder / f"{view.target.frame.name}.png", image)
+    if is_on_sheet:
+        sheet = in_a_row([at_least(i, _SHEET_SIDE) for i in (truth, image, error_colors(truth, image))])
+        write_png(folder / "sheets" / f"{view.target.frame.name}.png", sheet)
 
 
 def show(metrics: dict, folder: Path, absent: dict[str, str]) -> None:
     """Print the numbers and the paths of the files."""
-    console = Console()
-    console.print(table_of(metrics))
-    seconds, flow = metrics["seconds"], metrics.get("flow")
+    console, seconds, flow = Console(), metrics["seconds"], metrics.get("flow")
+    console.print(_table(metrics))
     others = ("train", "render_per_frame", "render_again_per_frame")
     stages = ", ".join(f"{name} {time_text(s)}" for name, s in seconds.items() if name not in others)
     lines = [
@@ -353,16 +278,12 @@ def show(metrics: dict, folder: Path, absent: dict[str, str]) -> None:
     ]
     if flow and flow["epe_moving"] is not None:
         error, motion = flow["epe_moving"], flow["motion_mean"]
-        lines.append(
-            f"flow: moving points off by {error:.4f}, {error / motion:.0%} of their motion {motion:.4f}"
-        )
-    lines += notes_of(metrics["protocol"])
-    if absent:
-        lines.append(without(absent))
-    images = Path(folder) / "images"
-    lines += [f"numbers  {Path(folder) / 'metrics.json'}", f"pictures {images}"]
-    if (images / "sheets").is_dir():
-        lines.append(f"sheets   {images / 'sheets'}: truth | prediction | error")
+        share = f"{error / motion:.0%} of their motion {motion:.4f}"
+        lines.append(f"flow: moving points off by {error:.4f}, {share}")
+    lines += [*notes_of(metrics["protocol"]), *([without(absent)] if absent else [])]
+    lines += [f"numbers  {folder / 'metrics.json'}", f"images   {folder / 'images'}"]
+    if (sheets := folder / "images" / "sheets").is_dir():
+        lines.append(f"sheets   {sheets}: truth | prediction | error")
     console.print("\n".join(lines), highlight=False, soft_wrap=True)
 
 
@@ -376,26 +297,22 @@ def without(absent: dict[str, str]) -> str:
     reasons: dict[str, str] = {}
     for name, reason in absent.items():
         family = next((f for f in FAMILIES if name.startswith(f)), name)
-        whole = all(metric in absent for metric in METRICS if metric.startswith(family))
-        reasons.setdefault(family if whole else name, reason)
+        is_whole = all(metric in absent for metric in METRICS if metric.startswith(family))
+        reasons.setdefault(family if is_whole else name, reason)
     return "without " + ", ".join(f"{name} ({reason})" for name, reason in reasons.items())
 
 
-def table_of(metrics: dict) -> Table:
+def _table(metrics: dict) -> Table:
     """Make a table with a row for every rendering and kind of test view, and a column for every metric."""
-    blocks = {key: value for key, value in metrics.items() if key.split("_")[0] == "test"}
-    names = [m for m in METRICS if any(m in scores for block in blocks.values() for scores in block.values())]
-    table = Table(
-        title=f"{metrics['protocol']['scene']}, {metrics['protocol'].get('method', '')}",
-        title_justify="left",
-        box=box.SIMPLE,
-    )
-    table.add_column("test views")
+    kinds = {key: value for key, value in metrics.items() if key.split("_")[0] == "test"}
+    names = [m for m in METRICS if any(m in scores for kind in kinds.values() for scores in kind.values())]
+    title = f"{metrics['protocol']['scene']}, {metrics['protocol'].get('method', '')}"
+    table = Table("test views", title=title, title_justify="left", box=box.SIMPLE)
     for name in names:
         table.add_column(name.replace("depth_delta_", "depth<"), justify="right")
-    for key, block in blocks.items():
+    for key, kind in kinds.items():
         suffix = key.removeprefix("test").replace("_", " ")
-        for ability, scores in block.items():
+        for ability, scores in kind.items():
             cells = [f"{scores[name]:.{METRICS[name].digits}f}" if name in scores else "" for name in names]
             table.add_row(ability + suffix, *cells)
     return table

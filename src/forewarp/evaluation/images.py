@@ -11,7 +11,7 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from torch import Tensor
 
 from forewarp.drawing.files import write_png
-from forewarp.drawing.images import depth_colors, error_colors, flow_colors, in_a_row, with_wheel
+from forewarp.drawing.images import area_means, depth_colors, error_colors, flow_colors, in_a_row, with_wheel
 from forewarp.methods.method import HasTrajectories, Snapshot
 from forewarp.scene.camera import Camera
 from forewarp.scene.view import Moment, Rendering, Target, View
@@ -31,20 +31,20 @@ def within(camera: Camera, size: int | None) -> Camera:
     return camera if size is None or max(camera.width, camera.height) <= size else sized(camera, size)
 
 
-def pictures_of(module: DynamicSceneModule, target: Target, size: int | None = None) -> dict[str, Tensor]:
-    """Draw one view: pictures (h, w, 3) in [0, 1] by name.
+def images_of(module: DynamicSceneModule, target: Target, size: int | None = None) -> dict[str, Tensor]:
+    """Draw one view: images (h, w, 3) in [0, 1] by name.
 
     ``compare`` is truth | prediction | error; near points are bright in ``depth``; ``flow``, for methods
-    with trajectories, is the displacement in the picture from the canonical time to the target's time: hue is
+    with trajectories, is the displacement in the image from the canonical time to the target's time: hue is
     the direction, saturation the length.
     """
     parts = parts_of(module, target, size)
     compared = in_a_row([parts[name] for name in ("truth", "prediction", "error")])
-    pictures = {"compare": compared, "depth": parts["depth"]}
+    images = {"compare": compared, "depth": parts["depth"]}
     if isinstance(module.method, HasTrajectories):
         camera = within(target.frame.camera, size)
-        pictures["flow"] = with_wheel(flow_colors(*image_flow(module, camera, target.moment.time)))
-    return pictures
+        images["flow"] = with_wheel(flow_colors(*image_flow(module, camera, target.moment.time)))
+    return images
 
 
 def parts_of(module: DynamicSceneModule, target: Target, size: int | None = None) -> dict[str, Tensor]:
@@ -70,10 +70,7 @@ def compare(
     shape = (camera.height, camera.width)
     drawn = module.render(camera, target.moment, target.background, snapshot)
     predicted = drawn.rgb.reshape(*shape, 3).clamp(0, 1)
-    truth = target.rgb.to(predicted)
-    if truth.shape != predicted.shape:
-        channels_first = truth.permute(2, 0, 1)[None]
-        truth = torch.nn.functional.interpolate(channels_first, shape, mode="area")[0].permute(1, 2, 0)
+    truth = area_means(target.rgb.to(predicted), shape)
     return [truth, predicted, error_colors(truth, predicted)], drawn
 
 
@@ -103,24 +100,24 @@ def image_flow(
 
 def psnr_by_view(module: DynamicSceneModule, targets: Sequence[Target], rays: int) -> list[float]:
     """Return PSNR (dB) of each image, from ``rays`` random pixels, the same in all."""
-    found = []
+    values = []
     for target in targets:
-        every = target.frame.camera.width * target.frame.camera.height
-        pixels = torch.randperm(every, generator=torch.Generator().manual_seed(0))[:rays]
-        found.append(float(module.psnr_of(target, pixels)))
-    return found
+        count = target.frame.camera.width * target.frame.camera.height
+        pixels = torch.randperm(count, generator=torch.Generator().manual_seed(0))[:rays]
+        values.append(float(module.psnr_of(target, pixels)))
+    return values
 
 
 def validation_psnr(module: DynamicSceneModule, targets: Sequence[Target], rays: int) -> float:
     """Return the mean of ``psnr_by_view``."""
-    found = psnr_by_view(module, targets, rays)
-    return sum(found) / len(found)
+    values = psnr_by_view(module, targets, rays)
+    return sum(values) / len(values)
 
 
 class TensorBoardImages(lightning.Callback):
     """Draw one view at a few moments of a stage, and log ``val/psnr`` of a few validation views.
 
-    Pictures go to TensorBoard and into the stage's ``images/``. Training is not changed: the clock is paused
+    Images go to TensorBoard and into the stage's ``images/``. Training is not changed: the clock is paused
     and no random number is drawn.
 
     Args:
@@ -141,14 +138,11 @@ class TensorBoardImages(lightning.Callback):
         psnr_rays: int = 4096,
     ) -> None:
         if not all(0 <= moment <= 1 for moment in moments):
-            raise ValueError(
-                f"callbacks.pictures.moments: expected numbers in [0, 1], but got {list(moments)}"
-            )
+            got = list(moments)
+            raise ValueError(f"callbacks.pictures.moments: expected numbers in [0, 1], but got {got}")
         if psnr_views < 0 or psnr_rays < 1:
-            raise ValueError(
-                "callbacks.pictures: expected psnr_views >= 0 and psnr_rays >= 1, "
-                f"but got {psnr_views=}, {psnr_rays=}"
-            )
+            expected, got = "psnr_views >= 0 and psnr_rays >= 1", f"{psnr_views=}, {psnr_rays=}"
+            raise ValueError(f"callbacks.pictures: expected {expected}, but got {got}")
         self.moments, self.view, self.size = sorted(moments), view, size
         self.psnr_views, self.psnr_rays = psnr_views, psnr_rays
         self._due: list[float] = []
@@ -160,48 +154,36 @@ class TensorBoardImages(lightning.Callback):
 
     def on_train_batch_end(self, trainer, module, outputs, batch, batch_idx) -> None:
         """Draw if a moment is reached."""
-        self._follow(trainer, module)
+        self._draw_if_due(trainer, module)
 
     def on_train_end(self, trainer, module) -> None:
-        """Draw the last pictures: a stage bounded by minutes ends between two steps."""
-        self._follow(trainer, module)
+        """Draw the last images: a stage bounded by minutes ends between two steps."""
+        self._draw_if_due(trainer, module)
 
-    def _follow(self, trainer, module) -> None:
+    def _draw_if_due(self, trainer, module) -> None:
         passed = [moment for moment in self._due if moment <= module.fraction]
-        if passed:
-            self._due = self._due[len(passed) :]
-            with module.clock.paused():
-                self._make(trainer, module, passed[-1])
-
-    def _make(self, trainer, module, moment: float) -> None:
-        pictures = pictures_of(module, self._target(trainer.datamodule), self.size)
-        for name, picture in pictures.items():
-            write_png(
-                Path(trainer.default_root_dir) / "images" / f"{round(100 * moment):03d}_{name}.png", picture
-            )
-            for logger in trainer.loggers:
-                if isinstance(logger, TensorBoardLogger):
-                    logger.experiment.add_image(
-                        f"images/{name}", picture, module.global_step, dataformats="HWC"
-                    )
-        self._log_psnr(trainer, module)
-
-    def _log_psnr(self, trainer, module) -> None:
-        loggers = [logger for logger in trainer.loggers if isinstance(logger, TensorBoardLogger)]
-        views = trainer.datamodule.targets("val")
-        count = min(self.psnr_views, len(views))
-        if not loggers or not count:
+        if not passed:
             return
-        spread = [views[i * len(views) // count] for i in range(count)]
-        psnr = validation_psnr(module, spread, self.psnr_rays)
-        for logger in loggers:
-            logger.log_metrics({"val/psnr": psnr}, module.global_step)
+        self._due = self._due[len(passed) :]
+        folder, number = Path(trainer.default_root_dir) / "images", f"{round(100 * passed[-1]):03d}"
+        loggers = [logger for logger in trainer.loggers if isinstance(logger, TensorBoardLogger)]
+        with module.clock.paused():
+            for name, image in images_of(module, self._target(trainer.datamodule), self.size).items():
+                write_png(folder / f"{number}_{name}.png", image)
+                for logger in loggers:
+                    step = module.global_step
+                    logger.experiment.add_image(f"images/{name}", image, step, dataformats="HWC")
+            views = trainer.datamodule.targets("val")
+            count = min(self.psnr_views, len(views))
+            if loggers and count:
+                chosen = [views[i * len(views) // count] for i in range(count)]
+                psnr = validation_psnr(module, chosen, self.psnr_rays)
+                for logger in loggers:
+                    logger.log_metrics({"val/psnr": psnr}, module.global_step)
 
     def _target(self, datamodule) -> Target:
         targets = datamodule.targets("val" if datamodule.scene.val else "train")
-        view = len(targets) // 2 if self.view is None else self.view
-        if not 0 <= view < len(targets):
-            raise ValueError(
-                f"callbacks.pictures.view: expected 0 to {len(targets) - 1}, but got {view}; use null"
-            )
+        view, last = len(targets) // 2 if self.view is None else self.view, len(targets) - 1
+        if not 0 <= view <= last:
+            raise ValueError(f"callbacks.pictures.view: expected 0 to {last}, but got {view}; use null")
         return targets[view]

@@ -1,4 +1,4 @@
-"""Draw the trajectories of points on the moving surface over a picture, as the paper's figure does."""
+"""Draw the trajectories of points on the moving surface over an image, as the paper's figure does."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Trajectories:
         cameras: the training cameras, which find the surface.
         count: most points to draw.
         tail: duration of a tail, as a share of the whole time.
-        width: line width, as a share of the picture's longer side.
+        width: line width, as a share of the image's longer side.
         points: canonical points (N, 3) to draw; None: chosen by ``moving_points``.
     """
 
@@ -42,36 +42,39 @@ class Trajectories:
         width: float = 0.004,
         points: Tensor | None = None,
     ) -> None:
-        for ability in (HasTrajectories, HasMatter):
-            if not isinstance(module.method, ability):
-                name = type(module.method).__name__
-                raise ValueError(
-                    f"path: expected a method that knows trajectories, but got {name}; use path=fixed"
-                )
+        if not (isinstance(module.method, HasTrajectories) and isinstance(module.method, HasMatter)):
+            got = type(module.method).__name__
+            raise ValueError(
+                f"path: expected a method that knows trajectories, but got {got}; use path=fixed"
+            )
         self.method, self.tail, self.width = module.method, tail, width
         # The depth of a rendered surface is uncertain by about the size of its matter.
         self.slack = 1.5 * module.method.matter().size
         self.points = moving_points(module, cameras, count) if points is None else points
         self._paths: Tensor | None = None
-        self.colors = hues(0.85 * order_of(self.points))
+        self.colors = hues(0.85 * _order(self.points))
 
     @torch.no_grad()
-    def __call__(self, picture: Tensor, drawn: Rendering, camera: Camera, time: float) -> Tensor:
-        """Draw the tails over ``picture`` (H, W, 3) of ``camera`` at ``time``; ``drawn`` is its rendering."""
+    def __call__(self, image: Tensor, drawn: Rendering, camera: Camera, time: float) -> Tensor:
+        """Draw the tails over ``image`` (H, W, 3) of ``camera`` at ``time``; ``drawn`` is its rendering."""
         if not len(self.points):
-            return picture
+            return image
         paths, times = self._tails(time)
         pixels, z = camera.project(paths)
         distance = (paths - camera.center.to(paths)).norm(dim=-1)
         strength = (1 - (time - times) / self.tail).clamp(0, 1).expand_as(distance)
         vertices = torch.cat([pixels, distance[..., None], strength[..., None]], -1)
-        before = (z > 0).all(1)
-        vertices, colors = vertices[before], self.colors[before]
-        surface = torch.where(drawn.opacity > 0.5, drawn.depth, float("inf")).reshape(picture.shape[:2])
-        marks, line = sample_lines(vertices)
-        radius = max(0.35, 0.5 * self.width * max(picture.shape[:2]))
-        picture = self._draw(picture, marks, colors[line], surface, radius)
-        return self._draw(picture, vertices[:, -1], colors, surface, 1.8 * radius)
+        is_before_camera = (z > 0).all(1)
+        vertices, colors = vertices[is_before_camera], self.colors[is_before_camera]
+        surface = torch.where(drawn.opacity > 0.5, drawn.depth, float("inf")).reshape(image.shape[:2])
+        tails, line = sample_lines(vertices)
+        radius = max(0.35, 0.5 * self.width * max(image.shape[:2]))
+        heads = vertices[:, -1], colors, 1.8 * radius
+        for marks, color, width in ((tails, colors[line], radius), heads):
+            at, distance, strength = marks[:, :2], marks[:, 2], marks[:, 3]
+            alpha = strength * ~hidden(at, distance, surface, self.slack)
+            image = draw_discs(image, at, color, alpha, width)
+        return image
 
     def forget(self) -> None:
         """Forget where the points were, as the method has changed."""
@@ -92,11 +95,6 @@ class Trajectories:
         low = at.floor().long().clamp(max=_STEPS - 1)
         return torch.lerp(self._paths[:, low], self._paths[:, low + 1], (at - low)[:, None]), times
 
-    def _draw(self, picture: Tensor, marks: Tensor, colors: Tensor, surface: Tensor, radius: float) -> Tensor:
-        at, distance, strength = marks[:, :2], marks[:, 2], marks[:, 3]
-        seen = strength * ~hidden(at, distance, surface, self.slack)
-        return draw_discs(picture, at, colors, seen, radius)
-
 
 @torch.no_grad()
 def surface(module: DynamicSceneModule, cameras: Sequence[Camera]) -> Cloud:
@@ -111,20 +109,20 @@ def seen_by(module: DynamicSceneModule, cameras: Sequence[Camera], points: Tenso
     the surface: (N,) bool.
     """
     canonical = module.method.at(Moment(module.curriculum.canonical_time))
-    black, found = torch.zeros(3, device=module.device), []
+    black, hits = torch.zeros(3, device=module.device), []
     for camera in cameras[:: max(1, len(cameras) // _VIEWS)][:_VIEWS]:
         view = View(within(camera, _VIEW_SIZE))
         drawn, rays = canonical.render(view, black), view.rays().to(module.device)
         hit = drawn.opacity > 0.5
-        found.append(rays.origins[hit] + drawn.depth[hit, None] * rays.directions[hit])
+        hits.append(rays.origins[hit] + drawn.depth[hit, None] * rays.directions[hit])
+
+    def cubes(points: Tensor) -> Tensor:
+        """Number the cube that holds each point."""
+        x, y, z = (points / size).floor().long().clamp(-(1 << 20), (1 << 20) - 1).unbind(-1)
+        return (x << 42) + (y << 21) + z
+
     # At a silhouette the mean depth lies in empty space; points of matter do not.
-    return torch.isin(_cells(points, size), _cells(torch.cat(found), size))
-
-
-def _cells(points: Tensor, size: float) -> Tensor:
-    """Return for each point (N,) the number of the cube of side ``size`` that holds it."""
-    x, y, z = (points / size).floor().long().clamp(-(1 << 20), (1 << 20) - 1).unbind(-1)
-    return (x << 42) + (y << 21) + z
+    return torch.isin(cubes(points), cubes(torch.cat(hits)))
 
 
 @torch.no_grad()
@@ -140,7 +138,7 @@ def moving_points(module: DynamicSceneModule, cameras: Sequence[Camera], count: 
     return points[far_apart(points, count)]
 
 
-def order_of(points: Tensor) -> Tensor:
+def _order(points: Tensor) -> Tensor:
     """Rank points (N, 3) along their principal axis: (N,), evenly from 0 to 1."""
     if len(points) < 2:
         return points.new_zeros(len(points))

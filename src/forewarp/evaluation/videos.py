@@ -30,33 +30,29 @@ def make_shots(path: str, frames: int, time: float, camera: Camera, cameras: Seq
         cameras: the training cameras, from which focus and up direction are computed.
 
     Raises:
-        ValueError: naming the key that is wrong.
+        ValueError: for another path.
     """
     if path not in PATHS:
         raise ValueError(f"path: expected one of {', '.join(PATHS)}, but got '{path}'")
-    if frames < 2:
-        raise ValueError(f"frames: expected at least 2, but got {frames}")
-    if not 0 <= time <= 1:
-        raise ValueError(f"time: expected a number in [0, 1], but got {time}")
     views, times = [camera] * frames, torch.linspace(0, 1, frames).tolist()
     if path in ("orbit", "both", "swing"):
         # Leave out the full turn, which repeats the first frame, so that the video loops smoothly.
-        turns, known = torch.arange(frames, dtype=torch.float64) / frames, list(cameras)
-        about = focus_point(known), mean_up(known)
-        views = swing(camera, known, *about, turns) if path == "swing" else orbit(camera, *about, turns)
+        turns, cameras = torch.arange(frames, dtype=torch.float64) / frames, list(cameras)
+        about = focus_point(cameras), mean_up(cameras)
+        views = swing(camera, cameras, *about, turns) if path == "swing" else orbit(camera, *about, turns)
     return list(zip(views, [time] * frames if path == "orbit" else times))
 
 
 def video(
     module: DynamicSceneModule, shots: Sequence[Shot], background: Tensor, paint: Paint | None = None
 ) -> Iterator[Tensor]:
-    """Render the pictures (H, W, 3) in [0, 1] of a video one by one, with one snapshot for each time.
+    """Render the images (H, W, 3) in [0, 1] of a video one by one, with one snapshot for each time.
 
     Args:
         module: the fitted scene.
-        shots: camera and time of each picture.
+        shots: camera and time of each image.
         background: colour (3,).
-        paint: draws over a picture; see ``Trajectories``.
+        paint: draws over an image; see ``Trajectories``.
     """
     snapshot = None
     for camera, time in shots:
@@ -65,6 +61,6 @@ def video(
             if snapshot is None or not snapshot.holds(moment):
                 snapshot = module.method.at(moment)
             drawn = snapshot.render(View(camera), background)
-            picture = drawn.rgb.reshape(camera.height, camera.width, 3).clamp(0, 1)
-            picture = picture if paint is None else paint(picture, drawn, camera, time)
-        yield picture
+            image = drawn.rgb.reshape(camera.height, camera.width, 3).clamp(0, 1)
+            image = image if paint is None else paint(image, drawn, camera, time)
+        yield image

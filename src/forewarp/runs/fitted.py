@@ -16,12 +16,13 @@ from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from forewarp.data.batches import color_of
-from forewarp.evaluation.evaluate import mean_scores, measure
+from forewarp.evaluation.evaluate import evaluate, mean_scores, show
 from forewarp.files import read_json, write_json
 from forewarp.methods.method import HasMatter, HasTrajectories, Method, Snapshot
 from forewarp.metrics.lpips import find_lpips, find_lpips_weights
 from forewarp.metrics.registry import METRICS, NETS
 from forewarp.metrics.suite import ImageSuite
+from forewarp.progress import Counted
 from forewarp.runs.build import build_run
 from forewarp.runs.config import saved_config, trust_of
 from forewarp.runs.overrides import key_of, typed_overrides
@@ -150,17 +151,15 @@ def measure_run(run: Run, module: DynamicSceneModule, config: DictConfig) -> dic
     protocol = {"method": method_name(config), "preset": config.preset.name, "seed": config.seed}
     budget = config.budget
     protocol |= {"minutes": budget.minutes, "iterations": budget.iterations, "clock": budget.clock}
-    extra = config.lpips_weights
-    return measure(
-        run,
-        module,
-        device=run.device,
-        protocol=protocol,
-        lpips_weights=[extra] if isinstance(extra, str) else extra,
-        sheets=config.sheets,
-        views=config.get("views"),
-        reduce=config.get("reduce"),
-    )
+    data, folder = run.datamodule, Path(run.folder)
+    mask_box = data.scene.protocol.get("mask_box", False)
+    suite = ImageSuite(find_lpips(extra=config.lpips_weights), mask_box=mask_box)
+    options = {"sheets": config.sheets, "views": config.get("views"), "reduce": config.get("reduce")}
+    options |= {"protocol": protocol, "finished": run.finished()}
+    with Counted("test views") as progress:
+        metrics = evaluate(module.to(run.device), data, folder, suite, progress=progress, **options)
+    show(metrics, folder, suite.absent)
+    return metrics
 
 
 def method_name(config: DictConfig) -> str:

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from forewarp.drawing.images import error_colors
-from forewarp.evaluation.images import image_flow, pictures_of, sized, validation_psnr, within
+from forewarp.evaluation.images import image_flow, images_of, sized, validation_psnr, within
 from forewarp.scene.view import Target
 from tests.support.known_ball import known_ball
 from tests.support.tiny_scene import RADIUS, TRAVEL, ball_center, ball_data, ball_scene, camera_at
@@ -33,18 +33,13 @@ def test_flow_is_the_projected_displacement_of_the_canonical_surface(module):
     assert float(flow.norm(dim=-1)[block].max()) < 0.05
 
 
-def test_pictures_are_reduced_and_compare_with_the_truth(module):
-    frame = ball_scene(frames=2, size=32).train[0]
-    truth = torch.full((32, 32, 3), 0.25)
-    target = Target(frame, truth, torch.ones(3))
-    pictures = pictures_of(module, target, size=16)
-    assert {name: tuple(p.shape) for name, p in pictures.items()} == {
-        "compare": (16, 3 * 16 + 8, 3),
-        "depth": (16, 16, 3),
-        "flow": (16, 16, 3),
-    }
-    assert all(float(p.min()) >= 0 and float(p.max()) <= 1 and float(p.std()) > 0 for p in pictures.values())
-    left, middle, right = (pictures["compare"][:, i : i + 16] for i in (0, 20, 40))
+def test_images_are_reduced_and_compare_with_the_truth(module):
+    frame, truth = ball_scene(frames=2, size=32).train[0], torch.full((32, 32, 3), 0.25)
+    images = images_of(module, Target(frame, truth, torch.ones(3)), size=16)
+    shapes = {"compare": (16, 3 * 16 + 8, 3), "depth": (16, 16, 3), "flow": (16, 16, 3)}
+    assert {name: tuple(image.shape) for name, image in images.items()} == shapes
+    assert all(0 <= float(i.min()) <= float(i.max()) <= 1 and float(i.std()) > 0 for i in images.values())
+    left, middle, right = (images["compare"][:, i : i + 16] for i in (0, 20, 40))
     torch.testing.assert_close(left, truth[:16, :16])
     torch.testing.assert_close(right, error_colors(left, middle))
 
@@ -62,9 +57,5 @@ def test_the_validation_psnr_is_a_mean_over_images_that_draws_nothing_global(mod
 
 def test_sizes_follow_the_longer_side():
     camera = camera_at(0.0, size=40).resized(80, 40)
-    assert [(c.width, c.height) for c in (within(camera, 60), within(camera, 90), within(camera, None))] == [
-        (60, 30),
-        (80, 40),
-        (80, 40),
-    ]
-    assert (sized(camera, 160).width, sized(camera, 160).height) == (160, 80)
+    cameras = within(camera, 60), within(camera, 90), within(camera, None), sized(camera, 160)
+    assert [(c.width, c.height) for c in cameras] == [(60, 30), (80, 40), (80, 40), (160, 80)]
