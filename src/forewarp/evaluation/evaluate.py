@@ -269,7 +269,7 @@ def _save(view: RenderedView, folder: Path, is_on_sheet: bool) -> None:
 def show(metrics: dict, folder: Path, absent: dict[str, str]) -> None:
     """Print the numbers and the paths of the files."""
     console, seconds, flow = Console(), metrics["seconds"], metrics.get("flow")
-    console.print(_table(metrics))
+    console.print(table_of(metrics))
     others = ("train", "render_per_frame", "render_again_per_frame")
     stages = ", ".join(f"{name} {time_text(s)}" for name, s in seconds.items() if name not in others)
     lines = [
@@ -302,7 +302,7 @@ def without(absent: dict[str, str]) -> str:
     return "without " + ", ".join(f"{name} ({reason})" for name, reason in reasons.items())
 
 
-def _table(metrics: dict) -> Table:
+def table_of(metrics: dict) -> Table:
     """Make a table with a row for every rendering and kind of test view, and a column for every metric."""
     kinds = {key: value for key, value in metrics.items() if key.split("_")[0] == "test"}
     names = [m for m in METRICS if any(m in scores for kind in kinds.values() for scores in kind.values())]
