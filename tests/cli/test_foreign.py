@@ -139,7 +139,7 @@ def test_no_job_of_a_sweep_measures_a_run_that_is_not_trusted(forewarp, ok, fitt
 
 
 def test_the_page_of_a_run_takes_trust(ok, fitted, monkeypatch):
-    monkeypatch.setattr("forewarp.cli.run_page.write_film", lambda *_: None)
+    monkeypatch.setattr("forewarp.cli.report.write_film", lambda *_: None)
     page = ["report", "kind=run", "run=run"]
     assert ADVICE in ok(*page).out
     assert "Rendering" not in ok(*page, TRUST).out

@@ -5,7 +5,8 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
-from forewarp.report.compare import compare, names_of
+from forewarp.metrics.registry import METRICS, Metric
+from forewarp.report.compare import compare, read_metrics
 
 
 def metrics(method, psnr=30.0, **more):
@@ -22,7 +23,7 @@ def runs(in_tmp):
 
     def write(**contents):
         for name, content in contents.items():
-            (in_tmp / name).mkdir()
+            (in_tmp / name).mkdir(parents=True, exist_ok=True)
             text = content if isinstance(content, str) else json.dumps(content)
             (in_tmp / name / "metrics.json").write_text(text)
         return list(contents)
@@ -89,8 +90,20 @@ def test_a_measure_that_a_run_lacks_has_no_row(runs):
         (["a/x", "a/x"], ["forward", "forward"], ["1 a/x", "2 a/x"]),
     ],
 )
-def test_columns_are_named_as_far_as_needed(folders, methods, names):
-    assert names_of(folders, [metrics(method) for method in methods]) == names
+def test_columns_are_named_as_far_as_needed(runs, folders, methods, names):
+    runs(**{folder: metrics(method) for folder, method in zip(folders, methods)})
+    assert list(read_metrics(folders)) == names
+
+
+def test_every_metric_of_the_list_has_a_row(runs, monkeypatch):
+    monkeypatch.setitem(METRICS, "mean_error", Metric("mean_error", "Mean error", 3))
+    scores = {"psnr": 30.0, "lpips_vgg": 0.1, "mean_error": 0.25, "depth_delta_1.25": 1.0}
+    rows = compare(runs(one=metrics("x", test={"all": scores}), two=metrics("y", test={"all": scores}))).rows
+    assert rows[1:3] == [
+        ["LPIPS (vgg), all", "0.1000", "0.1000", "+0.0000"],
+        ["Mean error, all", "0.250", "0.250", "+0.000"],
+    ]
+    assert rows[3][0] == "seconds of training"
 
 
 @pytest.mark.parametrize(

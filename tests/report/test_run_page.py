@@ -9,12 +9,8 @@ import pytest
 import torch
 import yaml
 
-from forewarp.cli.run_page import told_views
 from forewarp.drawing.files import write_png, write_video
-from forewarp.report.run_figures import figures_of
-from forewarp.report.run_files import View, read_story, telling
-from forewarp.report.run_media import Media, Shown
-from forewarp.report.run_page import write_run_page
+from forewarp.report.run_page import Media, Shown, media_of, read_story, telling, write_run_page
 from tests.support.runs_on_disk import write_run
 
 NASTY = "<img src=x onerror=alert(1)>&\"'</script>"
@@ -197,21 +193,21 @@ def test_a_broken_file_ends_in_one_line(tmp_path, file, content, says):
 
 
 def test_losses_are_against_the_clock_of_training(fitted):
-    story = read_story(fitted)
-    ends = [points[-1][0] for points in story.curves.loss.values()]
-    spent = [done["seconds"] for done in story.result.stages.values()]
-    assert list(story.curves.loss) == ["coarse", "fine"]
+    row = read_story(fitted)
+    ends = [points[-1][0] for points in row["loss"].values()]
+    spent = [done["seconds"] for done in row["stages"].values()]
+    assert list(row["loss"]) == ["coarse", "fine"]
     assert ends == pytest.approx([spent[0], sum(spent)], rel=1e-3)
-    (kind, count), rows = story.curves.size, (fitted / "accuracy_time.csv").read_text().split()
+    (kind, count), rows = row["consists"], (fitted / "accuracy_time.csv").read_text().split()
     assert kind == "voxels"
     assert rows[-1].endswith(f",{count}")
 
 
 def test_one_view_is_the_best_of_all():
-    assert telling([View("a", 0.5, "all", 30.0, {})]) == {"a": "best"}
+    views = [{"name": "a", "time": 0.5, "psnr": 30.0}, {"name": "b", "time": 0.6, "psnr": 20.0}]
+    assert telling(views[:1]) == {"a": "best"}
     assert telling([]) == {}
-    two = View("a", 0.5, "all", 30.0, {}), View("b", 0.6, "all", 20.0, {})
-    assert telling(two) == {"a": "best", "b": "worst"}
+    assert telling(views) == {"a": "best", "b": "worst"}
 
 
 @pytest.mark.parametrize(("count", "name"), [(5, "r"), (5, "r" * 120), (1, "r")])
@@ -234,13 +230,11 @@ def test_words_are_of_all_views_where_only_some_are_drawn(tmp_path):
     rows = json.loads((folder / "per_image.json").read_text())
     rows["images"][1]["scores"]["psnr"] = 3.0
     (folder / "per_image.json").write_text(json.dumps(rows))
-    (_, (through, ranked)), *_ = figures_of(read_story(folder))
-    for _, drawn, says in (through, ranked):
-        assert re.search(r" (3\d\d|40\d) of the 1500 views are drawn", says)
-        assert "time 0.001: 3.00 dB" in drawn
-    assert "The lowest, 3.0 dB, is test/r_1 at" in through[2]
-    assert "of 1500 are more than 1 dB below it" in ranked[2]
     page = write(folder)
+    assert len(re.findall(r" (?:3\d\d|40\d) of the 1500 views are drawn", page.text)) == 2
+    assert page.text.count("time 0.001: 3.00 dB") == 2
+    assert "The lowest, 3.0 dB, is test/r_1 at" in page.text
+    assert "of 1500 are more than 1 dB below it" in page.text
     assert "The first 1000 of 1500 views" in page.text
     assert page.tags.count("tr") < 1010
 
@@ -325,7 +319,7 @@ def test_a_missing_video_is_made_as_forewarp_render_does(ok, run, tmp_path, monk
         asked.append((config.path, config.format, config.frames))
         return write_video(tmp_path / "made.mp4", (noise(16, i) for i in range(2)), fps=10)
 
-    monkeypatch.setattr("forewarp.cli.run_page.write_film", film)
+    monkeypatch.setattr("forewarp.cli.report.write_film", film)
     for more in (["path=both"], ["path=orbit"]):
         ok("report", "kind=run", f"run={run}", f"out={tmp_path}", *more)
     assert asked == [("orbit", "mp4", 60)]
@@ -336,7 +330,7 @@ def test_what_was_rendered_before_an_error_is_shown(ok, run, tmp_path, monkeypat
     def full(*_):
         raise OSError(28, "No space left on device", "film.mp4")
 
-    monkeypatch.setattr("forewarp.cli.run_page.write_film", full)
+    monkeypatch.setattr("forewarp.cli.report.write_film", full)
     done = ok("report", "kind=run", f"run={run}", f"out={tmp_path}", "path=fixed")
     assert done.out.startswith("Rendering for this page stopped: film.mp4: expected room to write")
     page = Page((tmp_path / "page.html").read_text())
@@ -348,7 +342,7 @@ def test_after_an_interrupt_the_page_has_what_was_rendered(forewarp, run, tmp_pa
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("forewarp.cli.run_page.write_film", interrupted)
+    monkeypatch.setattr("forewarp.cli.report.write_film", interrupted)
     done = forewarp("report", "kind=run", f"run={run}", f"out={tmp_path}", "path=fixed")
     assert done.status == 130
     page = Page((tmp_path / "page.html").read_text())
@@ -360,7 +354,7 @@ def test_sheets_are_named_for_what_they_are_among_all_views(tmp_path):
     folder = told_run(tmp_path, views=8)
     for number in (3, 5):
         write_png(folder / "images" / "sheets" / "test" / f"r_{number}.png", torch.rand(8, 32, 3))
-    views = told_views(read_story(folder))
+    views = media_of(read_story(folder)).views
     assert [(one.why, one.about.split(",")[0]) for one in views] == [
         ("best of 2 drawn", "test/r_5"),
         ("median", "test/r_3"),

@@ -7,9 +7,7 @@ import pytest
 import torch
 
 from forewarp.drawing.files import write_video
-from forewarp.report.run_files import read_story
-from forewarp.report.run_media import Media, Shown
-from forewarp.report.run_page import write_run_page
+from forewarp.report.run_page import Media, Shown, read_story, write_run_page
 from tests.report.test_run_page import told_run
 from tests.support.browser import Tab, chromium, until
 

@@ -1,28 +1,100 @@
-"""``forewarp-report``: tables and curves of finished runs."""
+"""``forewarp-report``: tables, curves and pages of finished runs."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from glob import glob
+from importlib import import_module
 from pathlib import Path
+from typing import NamedTuple
+
+from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from forewarp.cli.entry import command
+from forewarp.cli.mistakes import one_line
+from forewarp.cli.render import check, write_film
+from forewarp.runs.config_files import project_root
+
+
+class Kind(NamedTuple):
+    """A kind of page: what it is of, where its runs are if none are named, and the function that writes it.
+
+    ``options`` gives the function's further arguments from the config.
+    """
+
+    about: str
+    runs: str
+    function: str
+    options: Callable[[DictConfig], dict] = lambda config: {}
+
+
+def published_points(config: DictConfig) -> dict:
+    """Read the results of others that curves are drawn with."""
+    from forewarp.report.benchmark import OTHERS, read_published
+
+    return {"published": read_published(Path(config.published or OTHERS))}
+
+
+def printed_tables(config: DictConfig) -> dict:
+    """Name the file of the paper's printed numbers, where another is wanted."""
+    return {"published": Path(config.published)} if config.published else {}
+
 
 KINDS = {
-    "accuracy_time": "accuracy against training time, and the cheapest way to each dB",
-    "price_list": "what each choice costs and brings, with the spread over seeds",
-    "paper": "the paper's tables and figures: Markdown, LaTeX, CSV, HTML",
-    "ablation": "what each part of the paper's method brings, and whether the paper's order holds",
-    "minutes": "what each method reaches on each scene in so many minutes, by seed and view",
-    "methods": "all methods under one clock: what each reaches, PSNR against seconds, views side by side",
-    "effects": "planned runs against every effect at once and the paper's fixed set",
+    "accuracy_time": Kind(
+        "accuracy against training time, and the cheapest way to each dB",
+        "accuracy_time",
+        "choices.write_accuracy_time",
+        lambda config: {"target": config.target, **published_points(config)},
+    ),
+    "price_list": Kind(
+        "what each choice costs and brings, with the spread over seeds",
+        "accuracy_time",
+        "choices.write_price_list",
+    ),
+    "paper": Kind(
+        "the paper's tables and figures: Markdown, LaTeX, CSV, HTML",
+        "paper",
+        "paper.write_paper",
+        lambda config: {
+            "curves": Path(config.curves or f"{config.paths.runs}/accuracy_time/results"),
+            **printed_tables(config),
+        },
+    ),
+    "ablation": Kind(
+        "what each part of the paper's method brings, and whether the paper's order holds",
+        "ablations",
+        "paper.write_ablation",
+        printed_tables,
+    ),
+    "minutes": Kind(
+        "what each method reaches on each scene in so many minutes, by seed and view",
+        "minutes",
+        "benchmark.write_minutes",
+        published_points,
+    ),
+    "methods": Kind(
+        "all methods under one clock: what each reaches, PSNR against seconds, views side by side",
+        "paper",
+        "benchmark.write_methods",
+    ),
+    "effects": Kind(
+        "planned runs against every effect at once and the paper's fixed set",
+        "effects",
+        "choices.write_effects",
+    ),
+}
+OTHER_KINDS = {
     "compare": "a few runs side by side, printed, and with out=FOLDER drawn",
     "run": "the page of one run: its video, truth against prediction, curves, effects and why",
 }
+ABOUT = {name: kind.about for name, kind in KINDS.items()} | OTHER_KINDS
 
 HELP = f"""
 forewarp-report makes tables, curves and pages of runs that are already there. Only kind=run renders anything.
 
-{chr(10).join(f"  kind={kind:<14} {about}" for kind, about in KINDS.items())}
+{chr(10).join(f"  kind={kind:<14} {about}" for kind, about in ABOUT.items())}
 
   forewarp-report kind=price_list runs=FOLDER out=FOLDER
   forewarp-report kind=compare runs=[runs/demo/particles,runs/demo/forward] out=runs/demo
@@ -46,77 +118,150 @@ What one types most:
 The runs: make accuracy-time [DATA=DATASETS SCENE=NAME MINUTES=N], make price-list DATA=DATASETS,
 make reproduce-tables [DATA=DATASETS], make ablations, make effects. Runs without results are listed.
 """
+MEGABYTES = 0.3, 1000  # least and most that may be asked for
+MOST_SIDE = 800  # pixels of a picture's longer side
 
 
-def report(config) -> None:
+def report(config: DictConfig) -> None:
     """Write the page, or print the table."""
-    if config.kind not in KINDS:
-        raise ValueError(f"kind: expected one of {', '.join(KINDS)}, but got '{config.kind}'")
+    if config.kind not in ABOUT:
+        raise ValueError(f"kind: expected one of {', '.join(ABOUT)}, but got '{config.kind}'")
     if not isinstance(config.target, int | float | None):
         raise ValueError(f"target: expected a number of dB or null, but got '{config.target}'")
     if config.kind == "run":
-        from forewarp.cli.run_page import run_page
-
         print(run_page(config))
-        return
-    if config.kind == "compare":
-        print(_compared(config, _folders(config.runs)))
-        return
-    if not isinstance(config.runs, str | None):
+    elif config.kind == "compare":
+        print(compared(config))
+    elif not isinstance(config.runs, str | None):
         raise ValueError(f"runs: expected one folder for kind={config.kind}, but got a list; name one folder")
-    folders = {kind: kind for kind in ("paper", "effects", "minutes")}
-    folders |= {"ablation": "ablations", "methods": "paper"}
-    default = folders.get(config.kind, "accuracy_time")
-    runs = Path(config.runs or f"{config.paths.runs}/{default}")
-    for file in _written(config, runs, Path(config.out or runs / "results")):
-        print(f"written: {file}")
+    else:
+        kind = KINDS[config.kind]
+        runs = Path(config.runs or f"{config.paths.runs}/{kind.runs}")
+        module, function = kind.function.split(".")
+        write = getattr(import_module(f"forewarp.report.{module}"), function)
+        for file in write(runs, Path(config.out or runs / "results"), **kind.options(config)):
+            print(f"written: {file}")
 
 
-def _folders(runs) -> list[str]:
-    """List the runs named by ``runs``: a folder, a pattern, or a list of them."""
-    named = [] if runs is None else [runs] if isinstance(runs, str) else list(runs)
-    if not named:
-        raise ValueError("runs: expected folders of runs, but got none; set runs=[FOLDER,FOLDER]")
-    return [folder for one in named for folder in sorted(glob(str(one))) or [str(one)]]
-
-
-def _compared(config, folders: list[str]) -> str:
-    """Return the table of ``kind=compare``, and draw a view by each run where ``out`` is set."""
+def compared(config: DictConfig) -> str:
+    """Return the table of ``kind=compare``; draw a view by each run where ``out`` is set."""
     from forewarp.report.compare import compare, draw_compared
 
-    drawn = draw_compared(folders, Path(config.out)) if config.out else None
+    named = (
+        [] if config.runs is None else [config.runs] if isinstance(config.runs, str) else list(config.runs)
+    )
+    folders = [folder for name in named for folder in sorted(glob(str(name))) or [str(name)]]
+    table = compare(folders).plain()
+    if not config.out:
+        return table
+    drawn = draw_compared(folders, Path(config.out))
     none = "no picture: the runs share no test view with a sheet; type views= and sheets= alike"
-    about = f"written: {drawn}" if drawn else none
-    return compare(folders).plain() + (f"\n{about}" if config.out else "")
+    return table + "\n" + (f"written: {drawn}" if drawn else none)
 
 
-def _written(config, runs: Path, out: Path) -> list[Path]:
-    """Write the page of this kind and return its files."""
-    from forewarp.report.ablation import write_ablation
-    from forewarp.report.accuracy_time import write_accuracy_time
-    from forewarp.report.curve import OTHERS, read_published
-    from forewarp.report.effects import write_effects
-    from forewarp.report.methods import write_methods
-    from forewarp.report.minutes import write_minutes
-    from forewarp.report.paper import write_paper
-    from forewarp.report.paper_printed import PAPER
-    from forewarp.report.price_list import write_price_list
+def run_page(config: DictConfig) -> str:
+    """Write the page of the run that ``config.run`` names; return what to print.
 
-    if config.kind == "price_list":
-        return write_price_list(runs, out)
-    if config.kind == "effects":
-        return write_effects(runs, out)
-    if config.kind == "minutes":
-        return write_minutes(runs, out, read_published(Path(config.published or OTHERS)))
-    if config.kind == "methods":
-        return write_methods(runs, out)
-    if config.kind == "ablation":
-        return write_ablation(runs, out, Path(config.published or PAPER))
-    if config.kind == "paper":
-        curves = Path(config.curves or f"{config.paths.runs}/accuracy_time/results")
-        return write_paper(runs, out, Path(config.published or PAPER), curves)
-    published = read_published(Path(config.published or OTHERS))
-    return write_accuracy_time(runs, out, target=config.target, published=published)
+    After Ctrl-C while pictures or the video are made, the page has those that there are.
+
+    Raises:
+        ValueError: in one line, if ``config.run`` is not one run's folder, or a setting is wrong.
+    """
+    from forewarp.report.run_page import media_of, read_story, room_of, write_run_page
+
+    folder = _named(config)
+    row = read_story(folder)
+    file = Path(config.out or folder)
+    file = file if file.suffix in (".html", ".htm") else file / "page.html"
+
+    def written() -> str:
+        size = write_run_page(file, row, media, megabytes=float(config.megabytes))
+        about = f"written: {file}: {size / 1e6:.1f} of at most {config.megabytes:g} MB"
+        return "\n".join([*media.missing, about])
+
+    media = media_of(row, config.path)  # loads torch; mistakes have been answered before
+    room_of(row, media, float(config.megabytes))  # refuses before minutes of rendering
+    try:
+        for more in _gathered(config, row, media):
+            media = more
+    except KeyboardInterrupt:
+        media = replace(media, missing=("Rendering for this page was interrupted.",))
+        print(written())
+        raise
+    return written()
+
+
+def _named(config: DictConfig) -> Path:
+    """Return the run's folder; refuse settings of which no page can be made."""
+    from forewarp.report.run_page import FILMS
+
+    low, high = MEGABYTES
+    if type(config.megabytes) not in (int, float) or not low <= config.megabytes <= high:
+        raise ValueError(f"megabytes: expected a number from {low} to {high}, but got {config.megabytes}")
+    if type(config.render) is not bool:
+        raise ValueError(f"render: expected true or false, but got {config.render}")
+    if config.path not in (None, *FILMS):
+        raise ValueError(f"path: expected one of {', '.join(FILMS)} or null, but got '{config.path}'")
+    if config.run is None:
+        got, folder = ("runs=", "<a run's folder>") if config.runs is not None else ("nothing", "runs/...")
+        raise ValueError(f"run: expected the folder of a run, but got {got}; set run={folder}")
+    if isinstance(config.run, ListConfig):
+        raise ValueError(
+            f"run: expected the folder of one run, but got {len(config.run)}; a page shows one run, and "
+            "kind=compare several"
+        )
+    return Path(str(config.run))
+
+
+def _gathered(config: DictConfig, row: dict, media) -> Iterator:
+    """Give the page's media after each part that is made; what cannot be made is told, and left out."""
+    if not config.render or row["unfinished"]:
+        return
+    try:
+        for more in _rendered(config, row, media):
+            yield (media := more)
+    except Exception as error:
+        reason = one_line(error)
+        if reason is None:
+            raise
+        yield replace(media, missing=(f"Rendering for this page stopped: {reason}.",))
+
+
+def _rendered(config: DictConfig, row: dict, media) -> Iterator:
+    """Render the telling views, and the video if the run has none; give what there is after each."""
+    from forewarp.evaluation.images import parts_of
+    from forewarp.report.run_page import FILMS, Shown, about, telling
+    from forewarp.runs.build import build_run
+    from forewarp.runs.config import saved_config
+    from forewarp.runs.fitted import opened
+    from forewarp.synth.module import Synthetic, is_scene
+
+    saved = saved_config(str(row["folder"]), config)
+    data = build_run(saved).datamodule
+    if isinstance(data, Synthetic) and not is_scene(data.folder):  # reading it would make it
+        raise ValueError(
+            f"data.root: expected the scene of the run, but got none in {data.folder}; set data.root=FOLDER"
+        )
+    run, module = opened(saved)
+    targets = run.datamodule.targets("test")
+    places = {frame.name: number for number, frame in enumerate(targets.frames)}
+    views = []
+    for name, why in telling(row["images"]).items():
+        if name in places:
+            camera = targets.frames[places[name]].camera
+            parts = parts_of(module, targets[places[name]], MOST_SIDE)
+            views.append(Shown(why, about(row, name), parts, max(camera.width, camera.height)))
+    media = replace(media, views=views or media.views)
+    yield media
+    if media.video is not None:
+        return
+    if not len(targets):
+        yield replace(media, missing=("No video: the scene has no test view to begin it from.",))
+        return
+    film = OmegaConf.load(project_root() / "conf" / "render.yaml")
+    film.path = config.path or ("both" if row["config"].get("capture") == "cut_out" else "swing")
+    check(film)
+    yield replace(media, video=write_film(film, run, module), about=FILMS[film.path])
 
 
 def main() -> None:

@@ -85,7 +85,7 @@ def measured_before(prepared) -> float | None:
 def measure(prepared, module) -> float | None:
     """Measure a fitted run, or say how to; draw its curve; return the score."""
     from forewarp.evaluation.evaluate import notes_of
-    from forewarp.report.curve import draw_own
+    from forewarp.report.figures import draw_own
     from forewarp.runs.fitted import measure_run
 
     run, config = prepared.run, prepared.config

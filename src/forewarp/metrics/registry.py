@@ -129,7 +129,11 @@ METRICS: dict[str, Metric] = {
 def metric_of(name: str) -> Metric:
     """Return a metric by name; one that is not registered, as of a package not imported, gets the defaults.
 
+    ``lpips`` is that of whichever net a table says.
+
     >>> metric_of("psnr").heading, metric_of("sharp_edges").title
     ('PSNR (dB)', 'sharp edges')
     """
+    if name == "lpips":
+        return Metric("lpips", "LPIPS", higher_is_better=False)
     return METRICS.get(name) or Metric(name, name.replace("_", " "))

@@ -1,47 +1,334 @@
-"""Write the paper's tables and figures with measured and printed numbers side by side."""
+"""The paper's tables, measured beside printed numbers, and what each part of its method brings."""
 
 from __future__ import annotations
 
+import math
+import re
 import shutil
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
+from statistics import fmean
+from typing import NamedTuple
 
-from forewarp.files import replace_file
-from forewarp.report import page, paper_figures
-from forewarp.report.collect import Result, collect, machine
-from forewarp.report.page import Section
-from forewarp.report.paper_printed import PAPER, PaperTable, read_paper
-from forewarp.report.paper_tables import comparison, measured, row_of, runs_of, stand_in, with_means
-from forewarp.report.protocols import numbered
+import yaml
 
-TITLE = "The paper's tables, measured"
-INTRODUCTION = (
-    "Written by `forewarp-report kind=paper`. Rows marked measured are runs of this project, those marked "
-    "published are what the paper prints. `forward` is the paper's method, `backward` its opponent, "
-    "`particles` this project's own; the others are our own versions of the systems they are named after. "
-    "The best and the second are marked among measured rows, if all are of the same budget, machine and "
-    "test views. Over several seeds: mean ± standard deviation. Of a scene with several kinds of test "
-    "views, columns that name no kind show those between the training times. A cell without a run is "
-    "empty; a method that gets nowhere in its minutes stands there with what it reached, and a run that "
-    "stopped, as at a dead start, is listed as left out. Memory, parameters and steps are means over a "
-    "row's runs; the protocol of each row stands below its table. Synthetic counterparts are procedural "
-    "scenes in a dataset's format: their numbers are not comparable with those published for real scenes, "
-    "which stand in the last columns. Runs as short as those of `make reproduce-tables` without DATA (a "
-    "minute of processor time) prove the machinery, not the ranking: only longer runs on real scenes tell "
-    "which method is better."
-)
-COUNTERPART = ": synthetic counterpart"
+from forewarp.files import MOST_CONFIG, read_text, replace_file
+from forewarp.metrics.gain import Estimate, pooled_deviation
+from forewarp.metrics.registry import metric_of
+from forewarp.report import figures
+from forewarp.report.choices import every_run
+from forewarp.report.results import COUNTERPART, Row, Runs, read_runs
+from forewarp.report.tables import Cell, Column, Difference, Section, Table, columns_of, rendered
+
+PAPER = Path(__file__).with_name("paper.yaml")  # the printed numbers
+# What the runs of one row of a table have in common.
+BUDGET = ("preset", "minutes", "iterations", "held_out", "device", "threads", "clock", "tested")
+ROW = ("ablation", "method", *BUDGET)
+UNPRINTED = ("particles", "backward")  # methods of this project that the paper prints no row of
 METHODS = ("particles", "forward", "backward")  # that are compared in pictures
 DATASETS = ("dnerf", "hypernerf", "nhr", "lego_complete")
+DEPTH = {"depth_delta_1.25": "δ<1.25", "depth_delta_1.5625": "δ<1.25²"}  # printed as percentages
+COSTS = (Column("training, s a run", 0), Column("GiB"), Column("parameters (M)", 3), Column("steps", 0))
+COSTS += (Column("protocol"), Column("device"))  # what a measured row says beside its scores
+LEAST = 0.1  # dB that a difference must exceed: of two seeds both may err alike
+ORDERS = ("holds", "within noise", "reversed", "one seed")
 
 
-def write_paper(runs: Path, out: Path, published: Path = PAPER, curves: Path | None = None) -> list[Path]:
+class Group(NamedTuple):
+    """Columns that are a mean over ``scenes`` of a dataset.
+
+    ``ability`` is the kind of test view; None: all, or ``time`` if a scene has several kinds.
+    """
+
+    name: str
+    dataset: str
+    metrics: tuple[str, ...]
+    scenes: tuple[str, ...]
+    ability: str | None = None
+
+
+class Printed(NamedTuple):
+    """A printed row, numbers as text, "" for a missing number.
+
+    ``model`` and ``variant`` name the measured runs to compare with the row; others have no variant.
+    """
+
+    name: str
+    values: tuple[str, ...]
+    variant: str | None = None
+    model: str | None = None
+
+
+@dataclass(frozen=True)
+class PaperTable:
+    """One of the paper's tables.
+
+    ``variants``: the measured variants to show; ``means``: more groups to compute, as name -> scenes.
+    """
+
+    title: str
+    source: str
+    variants: Sequence[str]
+    groups: Sequence[Group]
+    rows: Sequence[Printed]
+    notes: Sequence[str]
+    means: Mapping[str, tuple[str, ...]]
+
+    @property
+    def columns(self) -> list[tuple[Group, str]]:
+        """The group and metric of every column."""
+        return [(group, metric) for group in self.groups for metric in group.metrics]
+
+    @property
+    def parts(self) -> list[Printed]:
+        """The rows of the paper's own method, the whole one first."""
+        return sorted((row for row in self.rows if row.variant), key=lambda row: row.variant != "full")
+
+    def printed(self, run: Row) -> Printed | None:
+        """Return the row of a run's method and variant, or None; a plain run is compared with ``full``."""
+        wanted = run["method"], run["ablation"] or "full"
+        return next((row for row in self.rows if (row.model, row.variant or "full") == wanted), None)
+
+
+def read_paper(path: Path) -> dict[str, PaperTable]:
+    """Read tables by key from a YAML file such as ``PAPER``.
+
+    Raises:
+        ValueError: if the file is no YAML or lacks a key, or a row has another length than its table.
+    """
+    try:
+        # All values as text, so that 30.50 stays as printed.
+        content = yaml.load(read_text(Path(path), MOST_CONFIG), Loader=yaml.BaseLoader)
+        return {key: _table(key, entry, content["datasets"]) for key, entry in content["tables"].items()}
+    except yaml.YAMLError as error:
+        raise ValueError(f"{path}: expected YAML, but got {str(error).splitlines()[0]}") from None
+    except (KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"{path}: expected tables of groups and rows, but got {error!r}") from None
+
+
+def _table(key: str, entry: dict, datasets: dict) -> PaperTable:
+    groups, rows = [], []
+    for group in entry["groups"]:
+        scenes = tuple(group.get("scenes", datasets[group["dataset"]]))
+        about = group["name"], group["dataset"], tuple(group["metrics"]), scenes
+        groups.append(Group(*about, group.get("ability")))
+    columns = sum(len(group.metrics) for group in groups)
+    for row in entry["rows"]:
+        values = tuple("" if value == "null" else value for value in row["values"])
+        if len(values) != columns:
+            raise ValueError(f"{key}: {row['name']}: expected {columns} values, but got {len(values)}")
+        variant = row.get("variant", "full" if row["name"].split(" (")[0] == "Ours" else None)
+        rows.append(Printed(row["name"], values, variant, row.get("model", "forward" if variant else None)))
+    means = {name: tuple(scenes) for name, scenes in entry.get("means", {}).items()}
+    of_table = entry["title"], entry["source"], entry["variants"], groups, rows
+    return PaperTable(*of_table, entry["notes"], means)
+
+
+def dataset_of(run: Row) -> str:
+    """Return the dataset of a run's scene, also of a counterpart's."""
+    return run["dataset"].removeprefix(COUNTERPART)
+
+
+def measured(table: PaperTable, runs: Runs, variants: Sequence[str] = ()) -> list[Runs]:
+    """Return the runs of each measured row: by variant, then as printed, then ``UNPRINTED``, then others.
+
+    Args:
+        table: the paper's table.
+        runs: runs of its datasets, and others.
+        variants: in place of the table's own.
+    """
+    variants, datasets = variants or table.variants, {group.dataset for group in table.groups}
+    methods = list(dict.fromkeys([*(row.model for row in table.rows), *UNPRINTED]))
+
+    def place(of_row: Runs) -> tuple:
+        run = of_row[0]
+        by_method = methods.index(run["method"]) if run["method"] in methods else len(methods)
+        return variants.index(run["ablation"] or "plain"), by_method, *(str(run[name] or "") for name in ROW)
+
+    fitting = (r for r in runs if (r["ablation"] or "plain") in variants and dataset_of(r) in datasets)
+    return sorted(Runs(fitting).by(*ROW).values(), key=place)
+
+
+def by_seed(runs: Runs, group: Group, metric: str) -> dict[int, float]:
+    """Average a metric over the scenes of a group, for each seed that all scenes have.
+
+    Empty if there is no such seed, or the scenes' images differ in size or background.
+    """
+    scores, conditions = {}, set()
+    for run in runs:
+        of_run = run["test"].get(group.ability or run["ability"], {})
+        if dataset_of(run) == group.dataset and run["scene"] in group.scenes and metric in of_run:
+            scores[run["scene"], run["seed"]] = of_run[metric] * (100 if metric in DEPTH else 1)
+            protocol = run["metrics"].get("protocol", {})
+            conditions.add(tuple(protocol.get(key) for key in ("half_resolution", "scale", "background")))
+    seeds = sorted({seed for _, seed in scores}) if len(conditions) == 1 else []
+    whole = [seed for seed in seeds if all((scene, seed) in scores for scene in group.scenes)]
+    return {seed: fmean(scores[scene, seed] for scene in group.scenes) for seed in whole}
+
+
+def cells_of(runs: Runs, table: PaperTable) -> list[Estimate | None]:
+    """Estimate every column's mean over the seeds of ``by_seed``; None where these are none."""
+    return [Estimate.of(list(by_seed(runs, *column).values())) for column in table.columns]
+
+
+def numbered(runs: Iterable[Row]) -> dict[str, int]:
+    """Number each protocol from 1, in the order of the runs."""
+    return {text: i for i, text in enumerate(dict.fromkeys(run["protocol"] for run in runs), 1)}
+
+
+def costs_of(runs: Runs, numbers: Mapping[str, int]) -> list[Cell]:
+    """Return the cells of ``COSTS``: means over the runs, and the numbers of their protocols."""
+    means = [runs.mean(name) for name in ("train", "memory", "parameters", "steps")]
+    protocols = sorted({numbers[run["protocol"]] for run in runs})
+    return [*means, ", ".join(map(str, protocols)), Runs(runs[:1]).machines("")]
+
+
+def comparison(table: PaperTable, runs: Runs) -> Table:
+    """Make a table of each published row with the measured ones of its method below it, then the others.
+
+    After each measured row comes its difference from the published one. In each column the best and the
+    second best of the measured rows are marked, if all may be compared.
+
+    Args:
+        table: the paper's table.
+        runs: those of the table's scenes.
+    """
+    found = measured(table, runs)
+    numbers, no_costs = numbered(run for of_row in found for run in of_row), [None] * len(COSTS)
+    lines, ranked, rules = [], [], []
+    for printed in [*table.rows, None]:
+        of_method = [of_row for of_row in found if table.printed(of_row[0]) is printed]
+        rules += [len(lines)] if of_method or (printed and lines and lines[-1][1] != "published") else []
+        lines += [[printed.name, "published", *printed.values, *no_costs]] if printed else []
+        for of_row in of_method:
+            cells = cells_of(of_row, table)
+            ranked.append(len(lines))
+            lines.append([name_of(of_row), "measured", *cells, *costs_of(of_row, numbers)])
+            if printed and any(cells):
+                both = zip(cells, printed.values)
+                differences = [Difference(cell.mean - float(v)) if cell and v else None for cell, v in both]
+                lines.append(["", "difference to the paper", *differences, *no_costs])
+    columns = columns_of(["method", "kind", *(_column(*column) for column in table.columns), *COSTS])
+    marks = _marks(table, lines, ranked, 2) if _comparable(found) else {}
+    return Table(columns, lines, marks=marks, rules=[rule for rule in rules if rule])
+
+
+def stand_in(table: PaperTable, runs: Runs) -> Table | None:
+    """Make a table of the runs on synthetic counterparts, with what was published for real scenes at its end.
+
+    None if there are no such runs.
+    """
+    made, found = counterpart(table, runs), measured(table, runs)
+    if made is None or not found:
+        return None
+    every = [run for of_row in found for run in of_row]
+    numbers, datasets = numbered(every), {dataset_of(run) for run in every}
+    shown = [
+        (number, group)
+        for number, (group, metric) in enumerate(table.columns)
+        if metric == "psnr" and group.dataset in datasets and len(group.scenes) > 1
+    ]
+    lines = []
+    for of_row in found:
+        printed = table.printed(of_row[0])
+        beside = (
+            [printed.name, *(printed.values[i] for i, _ in shown)] if printed else [""] * (1 + len(shown))
+        )
+        lines.append([name_of(of_row), *cells_of(of_row, made), *costs_of(of_row, numbers), *beside])
+    columns = ["measured", *(_column(*column) for column in made.columns), *COSTS, "published as"]
+    columns += [f"published: {group.name} PSNR" for _, group in shown]
+    marks = _marks(made, lines, range(len(lines)), 1) if _comparable(found) else {}
+    return Table(columns_of(columns), lines, marks=marks)
+
+
+def counterpart(table: PaperTable, runs: Runs) -> PaperTable | None:
+    """Return the table for the measured synthetic scenes, without printed rows, or None.
+
+    A table scene by scene has none: its scenes are those of another table.
+    """
+    groups = {}
+    for group in table.groups if not table.means else ():
+        for scene in sorted({run["scene"] for run in runs if dataset_of(run) == group.dataset}):
+            name = group.name if group.ability else scene
+            groups[scene, group.ability, group.metrics] = group._replace(name=name, scenes=(scene,))
+    return replace(table, groups=list(groups.values()), rows=[], means={}) if groups else None
+
+
+def with_means(table: PaperTable, runs: Runs) -> PaperTable:
+    """Add the means that the table asks for, and the mean of the measured scenes if these are others.
+
+    A mean is a group of several scenes' groups; printed rows keep their digits.
+    """
+    scenes = max(({run["scene"] for run in row} for row in measured(table, runs)), key=len, default=set())
+    asked = dict(table.means)
+    order = tuple(group.scenes[0] for group in table.groups if group.scenes[0] in scenes)
+    if asked and order and order not in asked.values():
+        asked[f"Mean of the {len(order)} measured"] = order
+    groups, rows = list(table.groups), list(table.rows)
+    for name, scenes in asked.items():
+        own = [group for group in table.groups if len(group.scenes) == 1 and group.scenes[0] in scenes]
+        groups.append(own[0]._replace(name=name, scenes=scenes))
+        for i, row in enumerate(rows):
+            values = dict(zip(table.columns, row.values))
+            texts = [[values[group, metric] for group in own] for metric in own[0].metrics]
+            rows[i] = row._replace(values=(*row.values, *map(_printed_mean, texts)))
+    return replace(table, groups=groups, rows=rows)
+
+
+def _printed_mean(texts: list[str]) -> str:
+    digits = max(len(text.partition(".")[2]) for text in texts)
+    return "" if "" in texts else f"{fmean(map(float, texts)):.{digits}f}"
+
+
+def name_of(runs: Runs) -> str:
+    """Name a measured row: method or variant, and its conditions."""
+    run, seeds = runs[0], len(runs.by("seed"))
+    about = run["method"] if run["ablation"] is None else run["about"] or run["ablation"]
+    minutes = f"{run['minutes'] or 0:g} min" + " of processor time" * (run["clock"] == "processor")
+    parts = {f"forewarp: {about}" + " (the paper's method)" * (about == "forward"): True, run["preset"]: True}
+    parts |= {
+        minutes: run["minutes"],
+        f"{run['iterations']} steps": run["iterations"],
+        f"{seeds} seeds": seeds > 1,
+    }
+    parts |= {
+        f"{run['held_out']} views held out": run["held_out"],
+        f"{run['tested']} test views": run["tested"],
+    }
+    return ", ".join(part for part, known in parts.items() if known)
+
+
+def _comparable(found: Sequence[Runs]) -> bool:
+    """Tell whether rows differ in method and variant alone: same budget, machine and test views."""
+    return len(Runs(of_row[0] for of_row in found).by(*BUDGET)) == 1
+
+
+def _column(group: Group, metric: str) -> Column:
+    known = metric_of(metric)
+    title = DEPTH.get(metric) or known.title.partition(" (")[0]
+    return Column(f"{group.name} {title}{'↑' if known.higher_is_better else '↓'}", min(known.digits, 3))
+
+
+def _marks(table: PaperTable, lines: Sequence[Sequence[Cell]], ranked: Sequence[int], first: int) -> dict:
+    """Mark the best and the second best of each column from ``first`` on; equal texts tie."""
+    marks = {}
+    for j, (group, metric) in enumerate(table.columns, first):
+        digits = _column(group, metric).digits
+        values = {i: round(lines[i][j].mean, digits) for i in ranked if lines[i][j] is not None}
+        order = sorted(set(values.values()), reverse=metric_of(metric).higher_is_better)[:2]
+        for i, value in values.items():
+            if len(values) > 1 and value in order:
+                marks[i, j] = ("best", "second")[order.index(value)]
+    return marks
+
+
+def write_paper(folder: Path, out: Path, published: Path = PAPER, curves: Path | None = None) -> list[Path]:
     """Write ``paper.md``, ``paper.tex``, ``paper.html``, a CSV file a table, and the figures.
 
     Args:
-        runs: folder to search for measured runs.
+        folder: searched for measured runs.
         out: folder to write to.
         published: file of the printed numbers.
         curves: folder of the pictures drawn by ``kind=accuracy_time``, shown too.
@@ -49,117 +336,230 @@ def write_paper(runs: Path, out: Path, published: Path = PAPER, curves: Path | N
     Returns:
         the files written.
     """
-    results, without = collect(runs, ["metrics.json"])
-    results, older = newest(results)
-    tables = [section for table in read_paper(published).values() for section in sections_of(table, results)]
-    figures, drawn = figures_of(results, out, curves)
-    sections = [*tables, *figures]
-    if lines := [*without, *(f"{run.folder}: another run of the same is newer" for run in older)]:
-        sections.append(Section("Left out", facts=lines))
-    files = {
-        "paper.md": page.markdown(TITLE, INTRODUCTION, sections),
-        "paper.html": page.html(TITLE, INTRODUCTION.replace("`", ""), sections),
-        "paper.tex": page.latex(tables),
-    }
-    for name, text in files.items():
-        replace_file(out / name, text)
-    return [out / name for name in files] + _write_csv(tables, out) + drawn
+    runs, left_out = _read(folder)
+    real, made = runs.where(counterpart=False), runs.where(counterpart=True)
+    tables, files = [], []
+    for table in read_paper(published).values():
+        source = f"published rows: the paper, {table.source}"
+        name = "-".join(re.findall(r"\w+", table.title.split(",")[0].lower()))
+        shown = comparison(with_means(table, real), real)
+        tables.append(Section(table.title, [shown], [source, *facts(_used(table, real))], table.notes))
+        files.append(out / f"paper-{name}.csv")
+        if (shown := stand_in(table, made)) is not None:
+            tables.append(
+                Section(f"{table.title}: synthetic counterpart", [shown], facts(_used(table, made)))
+            )
+            files.append(out / f"paper-{name}-counterpart.csv")
+    for section, file in zip(tables, files):
+        replace_file(file, section.tables[0].csv() + "".join(f"# {line}\n" for line in section.facts))
+    drawn = _figures(runs, out, curves)
+    sections = [*tables, *drawn, *([Section("Left out", facts=left_out)] if left_out else [])]
+    for kind in ("md", "html", "tex"):
+        replace_file(out / f"paper.{kind}", rendered(f"paper.{kind}.j2", sections=sections, tables=tables))
+    own = [path for section in drawn for path in section.pictures if path.name.startswith("paper-")]
+    return [*(out / f"paper.{kind}" for kind in ("md", "html", "tex")), *files, *own]
 
 
-def newest(results: Sequence[Result]) -> tuple[list[Result], list[Result]]:
-    """Of runs with the same table entry select the one measured last; return these runs, and the others."""
-    kept: dict[tuple, Result] = {}
-    for run in sorted(results, key=lambda run: run.measured_at):
-        kept[run.dataset, run.is_counterpart, run.scene, run.seed, row_of(run)] = run
-    chosen = {run.folder for run in kept.values()}
-    return [r for r in results if r.folder in chosen], [r for r in results if r.folder not in chosen]
+def _read(folder: Path) -> tuple[Runs, list[str]]:
+    """Read the measured runs, of runs with the same table entry the newest; and a line for each other run."""
+    runs, left_out = read_runs(folder)
+    runs, older = runs.newest("dataset", "scene", "seed", *ROW)
+    return runs, left_out + [f"{row['folder']}: another run of the same is newer" for row in older]
 
 
-def sections_of(table: PaperTable, results: Sequence[Result]) -> list[Section]:
-    """Make the paper's table, and a table of the synthetic counterparts if any were measured."""
-    real = [run for run in results if not run.is_counterpart]
-    made = [run for run in results if run.is_counterpart]
-    printed = with_means(table, real)
-    source = f"published rows: the paper, {table.source}"
-    lines = [source, *facts(runs_of(measured(table, real)))]
-    found = [Section(table.title, [comparison(printed, real)], lines, table.notes)]
-    if (beside := stand_in(table, made)) is not None:
-        found.append(Section(table.title + COUNTERPART, [beside], facts(runs_of(measured(table, made)))))
-    return found
+def _used(table: PaperTable, runs: Runs) -> Runs:
+    return Runs(run for of_row in measured(table, runs) for run in of_row)
 
 
-def facts(runs: Sequence[Result]) -> list[str]:
+def facts(runs: Runs) -> list[str]:
     """State protocol, machine, budget, date and command of the runs."""
     if not runs:
         return ["measured: nothing yet"]
-    days = sorted({run.day for run in runs})
-    budgets = sorted({_budget(run) for run in runs})
+    budgets = set()
+    for run in runs:
+        minutes = f"{run['minutes']:g} min a run" if run["minutes"] else ""
+        minutes += " by the processor clock" if minutes and run["clock"] == "processor" else ""
+        steps = f"{run['iterations']} steps" if run["iterations"] else ""
+        budgets.add(", ".join(filter(None, (run["preset"], minutes, steps))))
     return [
         *(f"protocol {number}: {text}" for text, number in numbered(runs).items()),
-        f"machine: {machine(runs)}",
-        f"budget: {'; '.join(budgets)}",
-        f"date: {' to '.join(dict.fromkeys((days[0], days[-1])))}",
-        f"command, one of {len(runs)} runs: {runs[0].command}",
+        f"machine: {runs.machines()}",
+        f"budget: {'; '.join(sorted(budgets))}",
+        f"date: {runs.days()}",
+        f"command, one of {len(runs)} runs: {runs[0]['command']}",
     ]
 
 
-def figures_of(results: Sequence[Result], out: Path, curves: Path | None) -> tuple[list[Section], list[Path]]:
+def _figures(runs: Runs, out: Path, curves: Path | None) -> list[Section]:
     """Draw what these runs allow, and add the pictures in ``curves``; say if matplotlib is missing."""
+    sections, plain = [], runs.where(ablation=None)
+
+    def add(title: str, path: Path | None, of: Iterable[Row]) -> None:
+        if path is not None:
+            sections.append(Section(title, facts=facts(Runs(of)), pictures=[path]))
+
     try:
-        found = _draw(results, out)
+        sizes = Runs(run for run in runs if str(run["ablation"]).startswith("resolution "))
+        add("Resolution", figures.draw_resolution(out / "paper-resolution.png", sizes), sizes)
+        for scene, of_scene in plain.by("scene").items():
+            rivals = {}  # the last of several budgets or seeds
+            for same in of_scene.by("seed", *BUDGET).values():
+                methods = {run["method"]: run for run in same}
+                own = {name: methods[name] for name in METHODS if name in methods}
+                rivals = own if len(own) > 1 else rivals
+            if rivals:
+                path = figures.draw_canonical(out / f"paper-canonical-{scene}.png", rivals)
+                add(f"Canonical comparison: {scene}", path, rivals.values())
+        for dataset, method in product(DATASETS, METHODS[:2]):
+            scenes = {run["scene"]: run for run in plain.where(method=method) if dataset_of(run) == dataset}
+            path = figures.draw_sheet(out / f"paper-views-{dataset}-{method}.png", scenes)
+            add(f"Views: {dataset}, {method}", path, scenes.values())
     except ImportError as error:
-        return [Section("Figures", facts=[str(error)])], []
-    found = [(title, path, facts(runs)) for title, path, runs in found if path is not None]
-    sections = [Section(title, facts=lines, pictures=[path]) for title, path, lines in found]
+        return [Section("Figures", facts=[str(error)])]
     for path in sorted(curves.glob("accuracy-time-*.png")) if curves is not None else ():
         if path.parent.resolve() != out.resolve():
             shutil.copyfile(path, out / path.name)
     if drawn := sorted(out.glob("accuracy-time-*.png")):
         lines = ["separate runs, with views held out: forewarp-report kind=accuracy_time"]
         sections.append(Section("Accuracy against training time", facts=lines, pictures=drawn))
-    return sections, [path for _, path, _ in found]
+    return sections
 
 
-def _draw(results: Sequence[Result], out: Path) -> list[tuple[str, Path | None, list[Result]]]:
-    sides = [run for run in results if paper_figures.RESOLUTION.match(run.variant)]
-    found = [("Resolution", paper_figures.draw_resolution(out / "paper-resolution.png", sides), sides)]
-    plain = [run for run in results if row_of(run).variant == "plain"]
-    for scene, rivals in _rivals(plain).items():
-        path = paper_figures.draw_canonical(out / f"paper-canonical-{scene}.png", rivals)
-        found.append((f"Canonical comparison: {scene}", path, list(rivals.values())))
-    for dataset, method in product(DATASETS, METHODS[:2]):
-        runs = [r for r in plain if r.dataset == dataset and r.config["model"]["name"] == method]
-        runs = list({run.scene: run for run in runs}.values())
-        path = paper_figures.draw_sheet(out / f"paper-views-{dataset}-{method}.png", runs)
-        found.append((f"Views: {dataset}, {method}", path, runs))
-    return found
+def write_ablation(folder: Path, out: Path, published: Path = PAPER) -> list[Path]:
+    """Write ``ablation.md`` and ``ablation.csv`` (every run).
+
+    Args:
+        folder: searched for measured runs of ``sweeps=ablation_modules`` and ``ablation_losses``.
+        out: folder to write to.
+        published: file of the printed numbers.
+
+    Returns:
+        the files written.
+
+    Raises:
+        ValueError: if no run is of an ablation.
+    """
+    runs, left_out = _read(folder)
+    # Tables that take the method apart; a table scene by scene repeats another.
+    tables = [table for table in read_paper(published).values() if not table.means and len(table.parts) > 1]
+    known = {row.variant for table in tables for row in table.parts}
+    runs = Runs(run for run in runs if run["ablation"] in known)
+    if not runs:
+        raise ValueError(f"{folder}: expected runs of ablations, but got none; make some with make ablations")
+    orders: dict[str, list[str]] = {}  # of each budget, what became of the paper's order in each row
+    sections = [section for table in tables for section in _ablated(table, runs, orders)]
+    lines = [
+        [budget, len(found), *(sum(order.startswith(kind) for order in found) for kind in ORDERS)]
+        for budget, found in orders.items()
+    ]
+    columns = columns_of(["budget of a run", *(Column(kind, 0) for kind in ("rows", *ORDERS))])
+    caption = "Rows of all tables below, by what became of the paper's order:"
+    sections.insert(0, Section("In short", [Table(columns, lines, caption)]))
+    sections += [Section("Left out", facts=left_out)] if left_out else []
+    replace_file(out / "ablation.md", rendered("ablation.md.j2", sections=sections, least=LEAST))
+    replace_file(out / "ablation.csv", every_run(runs).csv())
+    return [out / "ablation.md", out / "ablation.csv"]
 
 
-def _rivals(runs: Sequence[Result]) -> dict[str, dict[str, Result]]:
-    """Return for each scene runs of several methods by their names, equal in preset, budget and seed."""
-    equal: dict[tuple, dict[str, Result]] = {}
-    for run in runs:
-        row = row_of(run)
-        equal.setdefault((run.scene, run.seed, row._replace(model="")), {})[row.model] = run
-    several = {key[0]: rivals for key, rivals in equal.items() if len(rivals.keys() & set(METHODS)) > 1}
-    return {scene: {m: found[m] for m in METHODS if m in found} for scene, found in sorted(several.items())}
+def _ablated(table: PaperTable, runs: Runs, orders: dict[str, list[str]]) -> list[Section]:
+    """Make a section for each scene, or mean of scenes, on which the table's rows were measured."""
+    sections = []
+    for made in (False, True):
+        of_kind = runs.where(counterpart=made)
+        shown = counterpart(table, of_kind) if made else table
+        for group in shown.groups if shown else ():
+            own = Runs(run for run in of_kind if run["scene"] in group.scenes)
+            scenes = tuple(scene for scene in group.scenes if own.where(scene=scene))
+            changes = _changes(table, group._replace(scenes=scenes), own, orders) if scenes else None
+            if changes is not None:
+                title = f"{table.title}: {group.name}"
+                title += f", of which {', '.join(scenes)}" if scenes != group.scenes else ""
+                title += f", {scenes[0]}" if made and group.name != scenes[0] else ""
+                used = Runs(run for run in own if run["ablation"] in table.variants)
+                sections.append(Section(title, [changes], facts(used), table.notes))
+    return sections
 
 
-def _write_csv(sections: Sequence[Section], out: Path) -> list[Path]:
-    files = []
-    for section in sections:
-        title = section.title.removesuffix(COUNTERPART)
-        name = "".join(c if c.isalnum() else "-" for c in title.split(",")[0].lower())
-        name += "-counterpart" * (title != section.title)
-        files.append(out / f"paper-{'-'.join(part for part in name.split('-') if part)}.csv")
-        about = "".join(f"# {line}\n" for line in section.facts)
-        replace_file(files[-1], replace(section.tables[0], marks={}).csv() + about)
-    return files
+def _changes(table: PaperTable, group: Group, runs: Runs, orders: dict[str, list[str]]) -> Table | None:
+    """List what each row changes on the scenes of ``group``, for each budget; None if nothing was measured.
+
+    Args:
+        table: the paper's table.
+        group: the scenes and the kind of test view; of the table, or of its counterpart.
+        runs: of the group's scenes.
+        orders: what became of the paper's order is added here, by budget.
+    """
+    variants = list(runs.by("ablation"))
+    by_budget: dict[tuple, dict[str, Runs]] = {}
+    for of_row in measured(table, runs.where(method="forward"), variants):
+        if by_seed(of_row, group, "psnr"):
+            budget = tuple(of_row[0][name] for name in BUDGET)
+            by_budget.setdefault(budget, {})[of_row[0]["ablation"]] = of_row
+    own = {row.variant for row in table.parts} - {"full"}
+    budgets = [found for found in by_budget.values() if "full" in found and own & set(found)]
+    budgets.sort(key=lambda found: [found["full"][0][name] or math.inf for name in ("minutes", "iterations")])
+    if not budgets:
+        return None
+    printed = _printed_changes(table, group)
+    columns, captions = ["row of the paper", Column("paper, dB", signed=True)], []
+    lines: list[list[Cell]] = [[row.name, printed.get(row.variant)] for row in table.parts]
+    for found in budgets:
+        label = _label(found["full"][0], [other["full"][0] for other in budgets])
+        psnr = {variant: by_seed(of_row, group, "psnr") for variant, of_row in found.items()}
+        whole = psnr["full"]
+        changes = {v: [of[seed] - whole[seed] for seed in of if seed in whole] for v, of in psnr.items()}
+        del changes["full"]
+        noise = pooled_deviation(list(changes.values()))  # of the rows of other tables, too
+        columns += [f"{label}: PSNR", Column("difference", signed=True), "order"]
+        columns += [Column("s a step", 3), Column("of a step of Ours", prefix="×")]
+        spread = f"noise {noise:.2f} dB" if noise is not None else "noise unknown"
+        captions.append(f"{label}, {len(whole)} seed{'s' * (len(whole) != 1)}: {spread}")
+        for row, line in zip(table.parts, lines):
+            if row.variant not in found:
+                line += [None] * 5
+                continue
+            change, order = Estimate.of(changes.get(row.variant, [])), None
+            if change and (order := verdict(change.mean, printed.get(row.variant), noise)):
+                seeds = len(psnr[row.variant])
+                order += f" ({seeds} of {len(whole)} seeds)" if seeds < len(whole) else ""
+                orders.setdefault(label, []).append(order)
+            step, of_whole = found[row.variant].mean("step"), found["full"].mean("step")
+            times = step / of_whole if step and of_whole else None
+            line += [Estimate.of(list(psnr[row.variant].values())), change, order, step, times]
+    kept = [line for line in lines if any(cell is not None for cell in line[2:])]
+    return Table(columns_of(columns), kept, "; ".join(captions) + ".")
 
 
-def _budget(run: Result) -> str:
-    budget = run.config["budget"]
-    minutes = f"{budget['minutes']:g} min a run" if budget["minutes"] else ""
-    minutes += " by the processor clock" if minutes and run.clock == "processor" else ""
-    steps = f"{budget['iterations']} steps" if budget.get("iterations") else ""
-    return ", ".join(word for word in (run.config["preset"]["name"], minutes, steps) if word)
+def verdict(change: float, printed: float | None, noise: float | None) -> str:
+    """Say whether the paper's order of a row and ``Ours`` holds.
+
+    >>> verdict(-0.5, -1.0, 0.2), verdict(0.5, -1.0, 0.2), verdict(-0.1, -1.0, 0.2)
+    ('holds', 'reversed', 'within noise')
+    >>> verdict(-0.5, -1.0, None), verdict(-0.5, None, 0.2)
+    ('one seed', '')
+    """
+    if not printed or noise is None:
+        return "one seed" if printed else ""
+    if abs(change) <= max(noise, LEAST):
+        return "within noise"
+    return "holds" if change * printed > 0 else "reversed"
+
+
+def _printed_changes(table: PaperTable, group: Group) -> dict[str, float]:
+    """Return by variant the printed difference to ``Ours``, in the widest mean of this kind of view."""
+    same = [g for g in table.groups if (g.dataset, g.ability) == (group.dataset, group.ability)]
+    widest = group if group in same else max(same, key=lambda g: len(g.scenes))
+    at = table.columns.index((widest, "psnr"))
+    numbers = {row.variant: float(row.values[at]) for row in table.parts if row.values[at]}
+    whole = numbers.pop("full", None)
+    return {variant: number - whole for variant, number in numbers.items()} if whole is not None else {}
+
+
+def _label(run: Row, others: Sequence[Row]) -> str:
+    """Name a run's budget, with what else tells it from the others."""
+    parts = [f"{run['minutes']:g} min"] if run["minutes"] else []
+    parts += [f"{run['iterations']} steps"] if run["iterations"] else []
+    for name in ("preset", "device", "threads", "clock", "tested", "held_out"):
+        several = len({other[name] for other in others}) > 1
+        parts += [f"{name.replace('_', ' ').replace('tested', 'views')} {run[name]}"] if several else []
+    return ", ".join(parts)

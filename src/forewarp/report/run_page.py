@@ -4,40 +4,216 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import math
+import re
 import shlex
+from bisect import bisect_left
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from statistics import fmean
+from typing import TYPE_CHECKING
 
-from forewarp.files import read_text, replace_file
+from markupsafe import Markup
+
+from forewarp.files import read_rows, replace_file
+from forewarp.metrics.registry import metric_of
 from forewarp.progress import time_text
-from forewarp.report.collect import UNREADABLE, unreadable
-from forewarp.report.markup import Html, el, joined
-from forewarp.report.run_facts import (
-    KINDS,
-    described,
-    effects_of,
-    near,
-    protocol_of,
-    scores_of,
-    seconds_of,
-    tiles_of,
-    views_table,
-)
-from forewarp.report.run_figures import figures_of
-from forewarp.report.run_files import Story
-from forewarp.report.run_media import Held, Media, Shown, held
-from forewarp.report.tables import Table
+from forewarp.report.choices import seconds_to
+from forewarp.report.figures import sheets_of, thirds
+from forewarp.report.results import UNREADABLE, Row, read_run, unreadable
+from forewarp.report.tables import TEMPLATES, Column, Table, rendered
 
-STYLE, SCRIPT = (Path(__file__).with_name(f"run_page.{kind}") for kind in ("css", "js"))
-_SMALL = 300  # pictures with a shorter longer side are shown as squares, not blurred
-_NOTES = 1000  # bytes that are kept for what the page says about sizes
+if TYPE_CHECKING:  # so that what is refused waits for no torch
+    from torch import Tensor
+
+ABILITIES = {"space": "at training times", "time": "between training times"}
+ABILITIES |= {"canonical": "at the canonical time", "all": "all"}
+WHYS = "best", "median", "worst", "earliest", "latest"  # views to look at, as they are shown
+PARTS = "truth", "prediction", "error"  # of a sheet
+# Videos in the order in which one of a folder is taken.
+FILMS = {
+    "both": "once around the scene while its time passes",
+    "trajectories": "one camera, with the paths of points on the moving surface",
+    "swing": "to and fro between the training cameras while the scene's time passes",
+    "fixed": "one camera, through the scene's time",
+    "orbit": "once around the scene at one time",
+}
+DRAWN, LISTED, LOSSES = 400, 1000, 150  # at most: views in a chart and in the table, points of a stage's loss
+PICTURES = 0.6  # share of the room that pictures may take; the video has the rest
+LADDER = ((800, 92), (640, 90), (480, 88), (320, 80), (200, 70), (120, 60))  # most pixels of a side, quality
+THUMB = 96, 70
+NOTES = 1000  # bytes that are kept for what the page says about sizes
 
 
-def write_run_page(file: Path, story: Story, media: Media, *, megabytes: float) -> int:
+@dataclass(frozen=True)
+class Shown:
+    """A view: why it is shown, what it is, and its pictures (H, W, 3) in [0, 1]: ``truth``, ``prediction``,
+    ``error`` and ``depth``, or some of them. ``side``: pixels of the longer side of the view that was scored,
+    where the pictures were rendered smaller; 0: as they are.
+    """
+
+    why: str
+    about: str
+    pictures: Mapping[str, Tensor]
+    side: int = 0
+
+
+@dataclass(frozen=True)
+class Media:
+    """What a page shows: views, the file of a video and what is to be seen in it; what is missing and why."""
+
+    views: Sequence[Shown] = ()
+    video: Path | None = None
+    about: str = ""
+    missing: Sequence[str] = ()
+
+
+def read_story(folder: Path) -> Row:
+    """Read a run's folder; parts whose files are missing are empty.
+
+    Returns:
+        the row of ``results.read_run`` with ``unfinished`` stages, ``trained`` (seconds of all stages, or as
+        far as the curve goes), ``loss`` by stage (seconds of training, mean loss), and ``consists``: of what
+        the method consists and how many there were at the end, as ("particles", 2874); None if unknown.
+
+    Raises:
+        ValueError: in one line, if the folder holds no run, several runs, or one that cannot be read.
+    """
+    if not (folder / "config.yaml").is_file():
+        runs = sorted(path.parent for depth in ("*", "*/*") for path in folder.glob(f"{depth}/config.yaml"))
+        if runs:
+            some = ", ".join(str(run) for run in runs[:3]) + (", ..." if len(runs) > 3 else "")
+            raise ValueError(
+                f"run: expected the folder of one run, but got {folder}, which holds {len(runs)}; "
+                f"choose one: {some}"
+            )
+        raise ValueError(
+            f"{folder / 'config.yaml'}: expected the configuration of a run, but got none; "
+            "set run=<a run's folder>"
+        )
+    try:
+        row = read_run(folder)
+        planned = row["config"].get("stage") or row["stages"]
+        stages = [name for name, stage in planned.items() if stage is not None]
+        _ = [(d["choice"], d["on"], d["because"]) for d in (row["plan"].get("effects") or {}).values()]
+        finished = sum(float(done["seconds"]) for done in row["stages"].values())
+        row["trained"] = max([finished, *(point.seconds for point in row["points"])])
+        row["unfinished"] = [name for name in stages if name not in row["stages"]]
+        row["loss"], row["consists"] = _read_curves(row, stages)
+    except UNREADABLE as error:
+        raise ValueError(
+            f"run: expected a run whose files can be read, but got {folder} ({unreadable(error)})"
+        ) from error
+    return row
+
+
+def _read_curves(row: Row, stages: Sequence[str]) -> tuple[dict[str, list], tuple[str, int] | None]:
+    """Read each stage's loss from TensorBoard's events, against seconds of training; and ``consists``."""
+    losses, consists, before = {}, None, 0.0
+    moments = read_rows(row["folder"] / "accuracy_time.csv")
+    for stage in stages:
+        scalars, done = _scalars(row["folder"] / stage / "tensorboard"), row["stages"].get(stage)
+        # The known moments of a stage: its step -> seconds of training over all stages.
+        known = {0: before}
+        known |= {int(m["step"]): float(m["seconds"]) for m in moments if m.get("stage") == stage}
+        if done is not None:
+            before += float(done["seconds"])
+            known[int(done["steps"])] = before
+        if (loss := scalars.get("train/loss")) and len(known) > 1:
+            steps, many = sorted(known.items()), -(-len(loss) // LOSSES)
+            points = [(_between(steps, step), value) for step, value in loss]
+            parts = [points[i : i + many] for i in range(0, len(points), many)]
+            losses[stage] = [(fmean(t for t, _ in part), fmean(v for _, v in part)) for part in parts]
+        # Scalars name what was counted; they are means over steps, so about as large as the last size.
+        for tag, values in scalars.items():
+            kind, noted = tag.split("/")[1].split("_")[-1], values[-1][1]
+            count = int(moments[-1].get("size") or 0) if moments else round(noted)
+            if kind in ("particles", "voxels") and abs(noted - count) < 0.1 * count:
+                consists = kind, count
+    return losses, consists
+
+
+def _scalars(folder: Path) -> dict[str, list[tuple[int, float]]]:
+    """Return the scalars in TensorBoard's events, (step, value) by tag; later events replace earlier ones."""
+    if not folder.is_dir():
+        return {}
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    kept = {"scalars": 0, "images": 1, "tensors": 1, "histograms": 1, "audio": 1, "compressedHistograms": 1}
+    events, found = EventAccumulator(str(folder), size_guidance=kept).Reload(), {}
+    for tag in (tag for tag in events.Tags()["scalars"] if tag.startswith("train/")):
+        last = {event.step: event.value for event in events.Scalars(tag) if math.isfinite(event.value)}
+        found |= {tag: sorted(last.items())} if last else {}
+    return found
+
+
+def _between(known: Sequence[tuple[int, float]], step: int) -> float:
+    """Return the seconds at a step, on straight lines between the known moments and beyond the last."""
+    at = min(max(bisect_left(known, (step, -math.inf)), 1), len(known) - 1)
+    (low, begin), (high, end) = known[at - 1], known[at]
+    return begin + (end - begin) * (step - low) / (high - low)
+
+
+def telling(images: Sequence[dict]) -> dict[str, str]:
+    """Choose the views to look at: the best, the middle one and the worst by PSNR, then the ends of the time.
+
+    >>> seen = [{"name": n, "time": t, "psnr": p} for n, t, p in (("a", 0, 30), ("b", 0.5, 20), ("c", 1, 40))]
+    >>> telling(seen), telling(seen[:2])
+    ({'c': 'best', 'a': 'median', 'b': 'worst'}, {'a': 'best', 'b': 'worst'})
+    """
+    ranked = [image["name"] for image in sorted(images, key=lambda image: (-image["psnr"], image["name"]))]
+    by_time = [image["name"] for image in sorted(images, key=lambda image: (image["time"], image["name"]))]
+    names = [ranked[0], ranked[-1], ranked[len(ranked) // 2], by_time[0], by_time[-1]] if images else []
+    chosen: dict[str, str] = {}
+    for why, name in zip(("best", "worst", "median", "earliest", "latest"), names):
+        chosen.setdefault(name, why)
+    return dict(sorted(chosen.items(), key=lambda item: WHYS.index(item[1])))
+
+
+def media_of(row: Row, path: str | None = None) -> Media:
+    """Return what the folder has: truth, prediction and error of views, and a video made after training.
+
+    Of the telling views those that have a sheet; then others, named for what they are among those with one;
+    without any the last picture that training drew.
+
+    Args:
+        row: the run.
+        path: the video, one of ``FILMS``; None: the first there is.
+    """
+    from forewarp.drawing.files import read_image
+
+    sheets, shown = sheets_of(row["folder"]), []
+    drawn = [image for image in row["images"] if image["name"] in sheets]
+    chosen = {name: f"{why} of {len(drawn)} drawn" for name, why in telling(drawn).items()}
+    chosen |= {name: why for name, why in telling(row["images"]).items() if name in sheets}
+    files = [(why, about(row, name), sheets[name]) for name, why in chosen.items()]
+    files.sort(key=lambda file: WHYS.index(file[0].split()[0]))
+    for stage in () if files else [*row["config"].get("stage", {})][::-1]:
+        for file in sorted((row["folder"] / stage / "images").glob("*_compare.png"))[-1:]:
+            told = f"stage {stage} at {int(file.stem.split('_')[0])} %"
+            files = files or [("in training", told, file)]
+    shown = [Shown(why, told, dict(zip(PARTS, thirds(read_image(file))))) for why, told, file in files]
+    done = max((file.stat().st_mtime_ns for file in row["folder"].glob("*/done.json")), default=0)
+    for name in [path] if path else FILMS:
+        file = row["folder"] / "videos" / f"{name}.mp4"
+        if file.is_file() and file.stat().st_mtime_ns >= done:
+            return Media(shown, file, FILMS[name])
+    return Media(shown)
+
+
+def about(row: Row, name: str) -> str:
+    """Say which view it is: name, time and PSNR."""
+    image = next(image for image in row["images"] if image["name"] == name)
+    return f"{name}, time {image['time']:.2f}, {image['psnr']:.1f} dB"
+
+
+def write_run_page(file: Path, row: Row, media: Media, *, megabytes: float) -> int:
     """Write the page of a run.
 
     Args:
         file: of the page.
-        story: what the run's folder tells.
+        row: what the run's folder tells, as of ``read_story``.
         media: what to show of it.
         megabytes: most of the page, in 10^6 bytes; pictures and the video are made smaller, or left out.
 
@@ -47,25 +223,23 @@ def write_run_page(file: Path, story: Story, media: Media, *, megabytes: float) 
     Raises:
         ValueError: see ``room_of``.
     """
-    text = page(story, media, held(media, room_of(story, media, megabytes))).encode()
+    text = page(row, media, *encoded(media, room_of(row, media, megabytes))).encode()
     replace_file(file, text)
     return len(text)
 
 
-def room_of(story: Story, media: Media, megabytes: float) -> float:
+def room_of(row: Row, media: Media, megabytes: float) -> float:
     """Return the bytes that a page of so many 10^6 bytes has for pictures and the video.
 
     Raises:
         ValueError: in one line, if the text alone is larger, or the run's files hold what no page can show.
     """
-    views = [dict.fromkeys([*one.pictures, "thumb"], "") for one in media.views]
-    empty = Held(views, "data:" if media.video else "")
+    views = [dict.fromkeys([*shown.pictures, "thumb"], "") for shown in media.views]
     try:
-        bare = len(page(story, media, empty).encode()) + _NOTES
+        bare = len(page(row, media, views, "data:" if media.video else "").encode()) + NOTES
     except UNREADABLE as error:
         raise ValueError(
-            f"run: expected a run whose files can be shown, but got {story.result.folder} "
-            f"({unreadable(error)})"
+            f"run: expected a run whose files can be shown, but got {row['folder']} ({unreadable(error)})"
         ) from error
     room = 1e6 * megabytes - bare
     if room < 0:
@@ -75,230 +249,280 @@ def room_of(story: Story, media: Media, megabytes: float) -> float:
     return room
 
 
-def page(story: Story, media: Media, inside: Held) -> str:
-    """Return the page as HTML."""
-    script, style = (read_text(path) for path in (SCRIPT, STYLE))
+def encoded(media: Media, room: float) -> tuple[list[dict[str, str]], str, str, str]:
+    """Encode pictures and video into at most ``room`` bytes of the page.
+
+    Returns:
+        as ``data:`` addresses the pictures and ``thumb`` of each view and the video, "" for none; what became
+        of the pictures and of the video so that they fit.
+    """
+    from forewarp.drawing.files import jpeg_bytes, smaller_video
+    from forewarp.drawing.images import at_most
+
+    def jpeg(picture: Tensor, side: int, quality: int) -> str:
+        return _address("image/jpeg", jpeg_bytes(at_most(picture.cpu(), side), quality))
+
+    pictures = [picture for shown in media.views for picture in shown.pictures.values()]
+    largest = max([*(shown.side for shown in media.views), *(max(p.shape[:2]) for p in pictures)], default=0)
+    views, note, left = [], "left out, as the page has no room for them; raise megabytes", room
+    for side, quality in LADDER if pictures else ():
+        found = []
+        for shown in media.views:
+            thumb = jpeg(next(iter(shown.pictures.values())), *THUMB)
+            found.append({n: jpeg(p, side, quality) for n, p in shown.pictures.items()} | {"thumb": thumb})
+        size = sum(len(text) for view in found for text in view.values())
+        if size <= (PICTURES * room if media.video else room):
+            smaller = f", scaled from {largest} to {side} pixels" if largest > side else ""
+            views, note, left = found, f"JPEG of quality {quality}{smaller}", room - size
+            break
+    if not media.video:
+        return views, "", note, ""
+    most = int(0.75 * left) - 100  # base64 takes four bytes for three
+    fits = media.video.stat().st_size <= most
+    video, video_note = (media.video.read_bytes(), "") if fits else smaller_video(media.video, most)
+    return views, _address("video/mp4", video) if video else "", note, video_note
+
+
+def _address(kind: str, content: bytes) -> str:
+    return f"data:{kind};base64,{base64.b64encode(content).decode()}"
+
+
+def page(
+    row: Row, media: Media, views: Sequence[dict], video: str, pictures_note: str = "", video_note: str = ""
+) -> str:
+    """Return the page as HTML; see ``encoded`` for views, video and notes."""
+    script, images = (TEMPLATES / "run_page.js").read_text(), row["images"][:LISTED]
+    kinds = [{"kind": ABILITIES.get(kind, kind), "scores": scores} for kind, scores in row["test"].items()]
+    images = [image | {"kind": ABILITIES.get(image["ability"], image["ability"])} for image in images]
+    values = {"row": row, "media": media, "views": list(zip(media.views, views)), "video": video}
+    values |= {"pictures_note": pictures_note, "video_note": video_note, "near": near, "time_text": time_text}
+    values |= {"protocol": row["metrics"].get("protocol", {}), "flow": row["metrics"].get("flow") or {}}
+    values |= {"tiles": _tiles(row), "charts": _charts(row), "effects": _effects(row), "facts": _facts(row)}
+    values |= {"abilities": ABILITIES, "folder": shlex.quote(near(str(row["folder"])))}
+    values |= {"scores": _score_table(kinds, {"kind": "test views"})}
+    values |= {"listed": _score_table(images, {"name": "view", "kind": "kind", "time": Column("time", 3)})}
+    values |= {"style": Markup((TEMPLATES / "run_page.css").read_text()), "script": Markup(script)}
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-    policy = (
-        f"default-src 'none'; img-src data:; media-src data:; style-src 'unsafe-inline'; "
-        f"script-src 'sha256-{digest}'"
+    return rendered("run_page.html.j2", digest=digest, **values)
+
+
+def _score_table(rows: Sequence[dict], heads: Mapping[str, Column | str]) -> Table:
+    """Make a table of rows with ``scores``, and what they begin with."""
+    names = list(dict.fromkeys(name for row in rows for name in row["scores"]))
+    columns = {name: Column(metric_of(name).heading, metric_of(name).digits) for name in names}
+    return Table.of([row["scores"] | row for row in rows], {**heads, **columns})
+
+
+def near(text: str) -> str:
+    """Write folders below the current one relative to it, as a page may be passed on."""
+    return re.sub(rf"(?<![\w.:/~-]){re.escape(str(Path.cwd()))}/(?=\w)", "", text)
+
+
+def _tiles(row: Row) -> dict[str, str]:
+    """Collect what one wants to know first: name -> value."""
+    clock = ", processor time" if row["config"]["budget"].get("clock") == "processor" else ""
+    tiles = {f"training{clock}": time_text(row["trained"])} if row["stages"] or row["points"] else {}
+    for name, value in row["test"].get(row["ability"], {}).items():
+        metric = metric_of(name)
+        if metric.summary and name != "psnr" and value is not None:
+            tiles[metric.heading] = f"{value:.{metric.digits}f}"
+    tiles |= {"a picture of a new time": f"{1000 * row['frame']:.3g} ms"} if row["frame"] is not None else {}
+    tiles |= {row["consists"][0]: f"{row['consists'][1]:,}"} if row["consists"] else {}
+    tiles |= {"peak memory": f"{row['memory']:.2f} GiB"} if row["memory"] is not None else {}
+    return tiles | ({"device": str(row["device"])} if row["device"] else {})
+
+
+def _effects(row: Row) -> list[dict]:
+    """List the effects, those that are on first: ``name``, ``on``, ``choice`` ("": unknown), ``because``."""
+    switched, planned = row["metrics"].get("effects") or {}, row["plan"].get("effects") or {}
+    try:
+        words = shlex.split(row["command"])
+    except ValueError:  # no closing quote
+        words = row["command"].split()
+    typed = {word.split("=")[0].lstrip("+~"): word for word in words if "=" in word}
+    chosen = [typed[key] for key in ("ablation", "experiment", "scene", "preset") if key in typed]
+    default = f"As model={row['method']} has it" + (
+        f" with {' '.join(chosen)}." if chosen else " by default."
     )
-    title = f"{story.result.scene}, {described(story)}"
-    head = el(
-        "head",
-        el("meta", charset="utf-8"),
-        el("meta", http_equiv="Content-Security-Policy", content=policy),
-        el("meta", name="viewport", content="width=device-width, initial-scale=1"),
-        el("meta", name="color-scheme", content="light dark"),
-        el("title", title),
-        el("style", Html(style)),
+    effects = []
+    for name in dict.fromkeys([*planned, *switched]):
+        decision = planned.get(name)
+        on = switched.get(name, decision["on"] if decision else False)
+        if decision is not None and on == decision["on"]:
+            choice, because = decision["choice"], str(decision["because"])
+        else:
+            own = [typed[key] for key in (f"model/{name}", f"model.{name}") if key in typed]
+            choice = row["config"]["model"].get(name)
+            because = f"Typed: {' '.join(own)}." if own else default
+        # Numbers, switches and parts say nothing without their key.
+        choice = choice if isinstance(choice, str) and choice != "none" else ""
+        effects.append({"name": name.replace("_", " "), "on": on, "choice": choice, "because": near(because)})
+    return sorted(effects, key=lambda effect: not effect["on"])
+
+
+def _facts(row: Row) -> dict[str, str]:
+    """Collect how the run was made and measured: name -> value."""
+    protocol, budget = row["metrics"].get("protocol", {}), row["config"]["budget"]
+    bounds = [f"{budget['minutes']:g} min"] if budget.get("minutes") is not None else []
+    bounds += [f"{budget['iterations']} steps"] if budget.get("iterations") is not None else []
+    clock = ", of processor time" if budget.get("clock") == "processor" else ""
+    stages = [f"{name}: {d['steps']} steps in {time_text(d['seconds'])}" for name, d in row["stages"].items()]
+    kinds = [image["ability"] for image in row["images"]]
+    words = {kind: "" if kind == "all" else f" {ABILITIES.get(kind, kind)}" for kind in kinds}
+    resolution, parameters = protocol.get("resolution"), row["metrics"].get("parameters")
+    facts = {
+        "scene": row["scene"] + ", made by a program" * row["counterpart"],
+        "dataset": protocol.get("dataset"),
+    }
+    facts["resolution"] = " x ".join(map(str, resolution)) if isinstance(resolution, list) else ""
+    facts |= {
+        "budget": (" or ".join(bounds) or "none") + clock,
+        "stages": "; ".join(stages),
+        "seed": row["seed"],
+    }
+    facts["test views"] = ", ".join(f"{kinds.count(kind)}{word}" for kind, word in words.items())
+    facts |= {"background": protocol.get("background"), "rendering scored": protocol.get("scored")}
+    facts |= {"departures": row["departures"], "parameters": f"{parameters:,}" if parameters else ""}
+    facts |= {"device": row["device"], "threads": row["threads"]}
+    facts["versions"] = ", ".join(f"{name} {of}" for name, of in protocol.get("versions", {}).items())
+    return {name: str(fact) for name, fact in facts.items() if fact not in (None, "")}
+
+
+class Axis:
+    """An axis of a chart.
+
+    Args:
+        title: beside it.
+        values: what it must hold; of a logarithmic axis > 0.
+        ends: where it begins and ends, in pixels.
+        margin: share of the range of the values that is left free.
+        log: whether it is logarithmic.
+    """
+
+    def __init__(
+        self, title: str, values: Sequence[float], ends: tuple[int, int], margin: float, log: bool = False
+    ) -> None:
+        self.title, self.ends, self.log = title, ends, log
+        scaled = [math.log10(value) if log else value for value in values]
+        low, high = min(scaled), max(scaled)
+        free = margin * (high - low) or max(abs(high), 1) * margin
+        self.low, self.high = low - free, high + free
+
+    def at(self, value: float) -> float:
+        """Return the place of a value, in pixels."""
+        share = ((math.log10(value) if self.log else value) - self.low) / (self.high - self.low)
+        return round(self.ends[0] + share * (self.ends[1] - self.ends[0]), 1)
+
+    @property
+    def ticks(self) -> list[float]:
+        """Round numbers within the axis, at most eight."""
+        if self.log:
+            decades = range(math.floor(self.low), math.ceil(self.high) + 1)
+            values = [many * 10.0**decade for decade in decades for many in (1, 2, 5)]
+            values = [round(value, 12) for value in values if self.low <= math.log10(value) <= self.high]
+            if len(values) > 7:  # powers of ten alone
+                values = [value for value in values if f"{value:e}".startswith("1.0")]
+            if len(values) >= 2:
+                return values[:: -(-len(values) // 7)]
+        low, high = (10**end if self.log else end for end in (self.low, self.high))
+        rough = (high - low) / 4
+        power = 10.0 ** math.floor(math.log10(rough))
+        step = next(power * many for many in (1, 2, 5, 10) if power * many >= 0.75 * rough)
+        return [round(i * step, 12) for i in range(math.ceil(low / step), math.floor(high / step) + 1)]
+
+
+def chart(
+    title: str,
+    says: str,
+    series: Sequence[tuple[str, str, list]],
+    axes: tuple[str, str],
+    *,
+    logs: tuple[bool, bool] = (False, False),
+    mean: float | None = None,
+) -> dict:
+    """Place series in a picture, which the template draws as SVG: without script, in the page's colours.
+
+    Args:
+        title: above the picture.
+        says: what is to be seen, below it.
+        series: name ("" for none in the legend), kind (``line``, ``dots``, or ``stems`` from the mean) and
+            points (x, y, text where the pointer rests, "" for none).
+        axes: titles of x and y.
+        logs: whether they are logarithmic.
+        mean: a dashed line at a value of y.
+    """
+    points, level = [point for _, _, of in series for point in of], [] if mean is None else [mean]
+    x = Axis(axes[0], [point[0] for point in points], (50, 446), 0.02, logs[0])
+    y = Axis(axes[1], [*level, *(point[1] for point in points)], (226, 14), 0.06, logs[1])
+    placed = [(name, kind, [(x.at(a), y.at(b), text) for a, b, text in of]) for name, kind, of in series]
+    # The name of the line stands at the end where fewer points lie.
+    close = [a for _, _, of in placed for a, b, _ in of if mean is not None and -4 < y.at(mean) - b < 20]
+    left = sum(a < x.ends[0] + 100 for a in close) <= sum(a > x.ends[1] - 100 for a in close)
+    return {"title": title, "says": says, "series": placed, "x": x, "y": y, "mean": mean, "left": left}
+
+
+def _charts(row: Row) -> dict[str, list[dict]]:
+    """Make the charts there are numbers for, by the heading of their section."""
+    found = {"Where it is good, and where not": _of_views(row["images"]) if row["images"] else []}
+    found["How it got there"] = [*_accuracy(row), *_losses(row)]
+    return {heading: charts for heading, charts in found.items() if charts}
+
+
+def _of_views(images: Sequence[dict]) -> list[dict]:
+    """Show PSNR of views through the scene's time, and from the worst to the best."""
+    ranked, by_time = (sorted(images, key=lambda image: image[key]) for key in ("psnr", "time"))
+    low, high, mean = ranked[0], ranked[-1], fmean(image["psnr"] for image in images)
+
+    def drawn(images: Sequence[dict]) -> list[tuple[int, dict, str]]:
+        """About ``DRAWN`` views, evenly, the last and the lowest too: number, view, what it is."""
+        kept = sorted({*range(0, len(images), -(-len(images) // DRAWN)), len(images) - 1, images.index(low)})
+        told = "{name}, time {time:.3f}: {psnr:.2f} dB"
+        return [(i + 1, images[i], told.format(**images[i])) for i in kept]
+
+    kinds = list(dict.fromkeys(image["ability"] for image in images))
+    series = []
+    for kind in kinds:
+        points = [(v["time"], v["psnr"], told) for _, v, told in drawn(by_time) if v["ability"] == kind]
+        series.append((ABILITIES.get(kind, kind) if len(kinds) > 1 else "", "dots", points))
+    stems = ("", "stems", [(number, view["psnr"], told) for number, view, told in drawn(ranked)])
+    count, below = len(stems[2]), sum(image["psnr"] < mean - 1 for image in images)
+    fewer = f" {count} of the {len(images)} views are drawn; the words are of all." * (count < len(images))
+    lowest = f"The lowest, {low['psnr']:.1f} dB, is {low['name']} at time {low['time']:.2f}."
+    ranks = (
+        f"From the worst view ({low['psnr']:.1f} dB) to the best ({high['psnr']:.1f} dB), from their mean; "
+        f"{below} of {len(images)} {'is' if below == 1 else 'are'} more than 1 dB below it.{fewer}"
     )
-    parts = [
-        _hero(story, media, inside),
-        _views(media, inside),
-        _figures(story),
-        _effects(story),
-        _numbers(story),
-        _protocol(story),
-        _missing(story, media, inside),
-    ]
-    body = el("body", el("main", *parts), el("script", Html(script)))
-    return f"<!doctype html>\n{el('html', head, body, lang='en')}\n"
-
-
-def _hero(story: Story, media: Media, inside: Held) -> Html:
-    film = None
-    if inside.video:
-        options = {"controls": True, "autoplay": True, "muted": True, "loop": True, "playsinline": True}
-        video = el("video", src=inside.video, aria_label=f"Video: {media.about}", **options)
-        note = f"{media.about}{'; ' + inside.video_note if inside.video_note else ''}."
-        film = el("figure", video, el("figcaption", note[:1].upper() + note[1:]), class_="film")
-    result = story.result
-    big = el("p", "Not measured", class_="big")
-    if result.metrics and (psnr := result.numbers.get("psnr")) is not None:
-        kind = "" if result.ability == "all" else f" {KINDS.get(result.ability, result.ability)}"
-        count = sum(result.ability in ("all", view.ability) for view in story.views)
-        of = f"{count} test views" if count else "test views"
-        small = el("small", el("span", "PSNR"), el("span", f"mean of {of}{kind}"))
-        big = el("p", el("b", f"{psnr:.2f}"), " dB ", small, class_="big")
-    tiles = [el("div", el("dt", name), el("dd", value)) for name, value in tiles_of(story)]
-    facts = el(
-        "div",
-        el("p", "A moving scene, reconstructed", class_="eyebrow"),
-        el("h1", result.scene),
-        el("p", described(story), class_="sub"),
-        big,
-        el("dl", *tiles, class_="tiles") if tiles else None,
-        class_="facts",
-    )
-    return el("header", film, facts, class_="hero" if film else "hero alone")
-
-
-def _views(media: Media, inside: Held) -> Html | None:
-    if not inside.views:
-        return None
-    choices, panels = [], []
-    for number, (shown, pictures) in enumerate(zip(media.views, inside.views)):
-        name = f"v{number}"
-        choices.append(el("input", type="radio", name="view", id=name, class_="pick", checked=number == 0))
-        thumb = el("img", src=pictures["thumb"], alt="")
-        words = el("span", el("b", shown.why), el("span", shown.about.split(", ")[-1]))
-        choices.append(el("label", thumb, words, for_=name))
-        panels.append(_panel(number, shown, pictures))
-    about = (
-        "Drag the line, or focus it and use the arrow keys: the truth is on its left, what the run renders "
-        "on its right. Error is black where both agree and white where they differ by a quarter of the range "
-        "or more; in depth, near is bright."
-    )
-    return _section(
-        "Truth against prediction",
-        el("p", about, el("noscript", " Without scripts the two stand beside each other.")),
-        el("div", *choices, *panels, class_="views"),
-        el("p", f"Pictures are {inside.pictures_note}.", class_="note"),
-    )
-
-
-def _panel(number: int, shown: Shown, pictures: dict[str, str]) -> Html:
-    def figure(name: str) -> Html:
-        width, height = shown.pictures[name].shape[1::-1]
-        alt = f"{name}, {shown.why}: {shown.about}"
-        small = "small" if max(width, height) < _SMALL else None
-        image = el("img", src=pictures[name], alt=alt, width=width, height=height, class_=small)
-        return el("figure", image, el("figcaption", name), class_=name)
-
-    both = [figure(name) for name in ("truth", "prediction") if name in shown.pictures]
-    label = f"Truth on the left, prediction on the right: {shown.why}"
-    if len(both) == 2:
-        cut = {"type": "range", "min": 0, "max": 100, "value": 50, "aria_label": label, "hidden": True}
-        both += [el("input", **cut), el("span", class_="seam", aria_hidden="true")]
-    others = [figure(name) for name in ("error", "depth") if name in shown.pictures]
-    height, width = next(iter(shown.pictures.values())).shape[:2]
-    return el(
-        "div",
-        el("div", *both, class_="pair", style=f"--shape: {width / height:.4f}"),
-        el("div", *others, class_="side") if others else None,
-        el("p", shown.about, class_="note"),
-        class_="panel tall" if height > 1.2 * width else "panel",
-        id=f"p{number}",
-    )
-
-
-def _figures(story: Story) -> Html | None:
-    parts = []
-    for title, figures in figures_of(story):
-        cards = [
-            el("figure", el("h3", name), chart, el("figcaption", says), class_="card")
-            for name, chart, says in figures
-        ]
-        parts.append(_section(title, el("div", *cards, class_="cards")))
-    return joined(*parts)
-
-
-def _effects(story: Story) -> Html | None:
-    about, effects = effects_of(story)
-    if not effects:
-        return None
-    rows = [
-        el(
-            "li",
-            el("span", "on" if one.on else "off", class_="badge on" if one.on else "badge"),
-            el("b", one.name.replace("_", " ")),
-            el("code", one.choice) if one.choice else None,
-            el("p", one.because),
-        )
-        for one in effects
-    ]
-    return _section("Effects, and why", el("p", about), el("ul", *rows, class_="effects"))
-
-
-def _numbers(story: Story) -> Html | None:
-    table = scores_of(story)
-    if table is None:
-        return None
-    every = None
-    if story.views:
-        summary = el("summary", f"Every test view ({len(story.views)})")
-        every = el("details", summary, _scrolled(views_table(story), "every test view"))
-    return _section("Numbers", _scrolled(table, "scores by kind of test view"), every)
-
-
-def _scrolled(table: Table, label: str) -> Html:
-    from forewarp.report.page import html_table
-
-    return el("div", Html(html_table(table)), class_="scroll", tabindex=0, role="region", aria_label=label)
-
-
-def _protocol(story: Story) -> Html:
-    rows = [joined(el("dt", name), el("dd", value)) for name, value in protocol_of(story)]
-    folder = _folder(story)
-    again = el("pre", el("code", near(story.result.command)))
-    closer = f"forewarp-view run={folder}"
-    if story.curves.size is not None:
-        closer += f"\nforewarp-export run={folder} format=html"
-    return joined(
-        _section("How it was made and measured", el("dl", *rows, class_="rows")),
-        _section(
-            "Do it again",
-            el("p", "The command that made this run; into another folder with run=..."),
-            again,
-            None if story.unfinished else el("p", "Fly through it:"),
-            None if story.unfinished else el("pre", el("code", closer)),
+    return [
+        chart(
+            "Through the scene's time",
+            f"A dot is a test view. {lowest}{fewer}",
+            series,
+            ("time in the scene", "PSNR (dB)"),
+            mean=mean,
         ),
-    )
+        chart("View by view", ranks, [stems], ("view, from worst to best", "PSNR (dB)"), mean=mean),
+    ]
 
 
-def _folder(story: Story) -> str:
-    """Write the run's folder as a command line takes it."""
-    return shlex.quote(near(str(story.result.folder)))
+def _accuracy(row: Row) -> list[dict]:
+    """Show PSNR while it trained; nothing with less than two points."""
+    curve = [point for point in row["points"] if point.seconds > 0 and math.isfinite(point.psnr)]
+    if len(curve) < 2:
+        return []
+    last, seconds = curve[-1], seconds_to(curve, curve[-1].psnr - 1)
+    soon = f"; within 1 dB of that after {seconds:.0f} s" if seconds is not None else ""
+    says = f"Of views that are not trained on: {last.psnr:.1f} dB after {last.seconds:.0f} s{soon}."
+    points = [(p.seconds, p.psnr, f"{p.seconds:.1f} s, step {p.step}: {p.psnr:.2f} dB") for p in curve]
+    axes = ("seconds of training", "PSNR (dB)")
+    return [chart("PSNR while it learned", says, [("", "line", points)], axes, logs=(True, False))]
 
 
-def _missing(story: Story, media: Media, inside: Held) -> Html:
-    notes = [*_not_known(story), *map(near, media.missing)]
-    if not media.views:
-        notes.append("No pictures: the run's folder has none of test views, and none of training.")
-    elif not inside.views:
-        notes.append(f"Pictures are {inside.pictures_note}.")
-    if not media.video and not media.missing:
-        how = "" if story.unfinished else f" forewarp-render run={_folder(story)} makes one."
-        notes.append(f"No video: the run's folder has none that was made after training.{how}")
-    if media.video and not inside.video:
-        notes.append(f"The video is {inside.video_note}, as the page has no room for it; raise megabytes.")
-    version = story.result.metrics.get("protocol", {}).get("versions", {}).get("forewarp", "")
-    measured = f" The run was measured by forewarp {version}." if version else ""
-    foot = el("footer", el("p", f"Written by forewarp-report kind=run.{measured}", class_="note"))
-    listed = el("ul", *(el("li", note) for note in notes))
-    return joined(_section("What this page lacks", listed) if notes else None, foot)
-
-
-def _not_known(story: Story) -> list[str]:
-    """Say what the run's files do not tell, and how it can be had."""
-    result, notes = story.result, []
-    measure = f"forewarp-evaluate run={_folder(story)}"
-    if story.unfinished:
-        have = "has" if len(story.unfinished) == 1 else "have"
-        notes.append(
-            f"The run is not finished, so it has no scores: of its stages {', '.join(story.unfinished)} "
-            f"{have} not ended (finished: {', '.join(result.stages) or 'none'}; trained for "
-            f"{time_text(seconds_of(story))}). It goes on with: forewarp-train resume={_folder(story)}"
-        )
-    elif not result.metrics:
-        notes.append(f"The run is not measured, so it has no scores. Measure it: {measure}")
-    elif not story.views:
-        notes.append(
-            "No PSNR by view and through the scene's time: per_image.json is missing, cut off or empty. "
-            f"Write it again: {measure}"
-        )
-    if not effects_of(story)[1]:
-        notes.append("No effects: neither a plan nor metrics.json names any.")
-    if not result.curve:
-        notes.append(
-            "No PSNR against training time: it needs validation views, or data.held_out=N, and some seconds "
-            "of training."
-        )
-    if not story.curves.loss:
-        notes.append("No loss: the folders of the stages have no TensorBoard events of it.")
-    return notes
-
-
-def _section(title: str, *parts: object) -> Html:
-    return el("section", el("h2", title), *parts)
+def _losses(row: Row) -> list[dict]:
+    """Show the loss of every stage; nothing without any."""
+    kept = {stage: [(*p, "") for p in points if min(p) > 0] for stage, points in row["loss"].items()}
+    series = [(stage, "line", points) for stage, points in kept.items() if points]
+    if not series:
+        return []
+    ends = ", ".join(f"{name} ends at {points[-1][1]:.3g}" for name, _, points in series)
+    says = f"What is minimised, averaged over steps; stages may weigh terms differently: {ends}."
+    return [chart("Loss", says, series, ("seconds of training", "loss"), logs=(True, True))]

@@ -1,15 +1,36 @@
-"""Tables of numbers with their spread over repetitions, as Markdown, plain text and CSV."""
+"""Tables of numbers with their spread over repetitions, and pages from templates."""
 
 from __future__ import annotations
 
+import base64
 import csv
 import io
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
 
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup
 from tabulate import tabulate
 
 from forewarp.metrics.gain import Estimate
+from forewarp.metrics.registry import metric_of
+
+TEMPLATES = Path(__file__).with_name("templates")
+MARKS = {
+    "": {},
+    "md": {"best": "**{}**", "second": "<u>{}</u>"},
+    "html": {"best": Markup("<b>{}</b>"), "second": Markup("<u>{}</u>")},  # these escape what they hold
+    "tex": {"best": "\\textbf{{{}}}", "second": "\\underline{{{}}}"},
+}
+_LATEX = {c: "\\" + c for c in "&%$#_{}"} | {
+    "²": "$^2$",
+    "\\": r"\textbackslash{}",
+    "^": r"\textasciicircum{}",
+}
+_LATEX |= {"±": r"$\pm$", "δ": r"$\delta$", "<": "$<$", ">": "$>$", "↑": r"$\uparrow$", "↓": r"$\downarrow$"}
+_LATEX |= {"~": r"\textasciitilde{}", "×": r"$\times$"}
 
 
 class Difference(float):
@@ -17,17 +38,17 @@ class Difference(float):
 
 
 Cell = Estimate | float | int | str | None
-MARKS = {"best": "**{}**", "second": "<u>{}</u>"}  # in Markdown
 
 
 @dataclass(frozen=True)
 class Column:
-    """A column's title and number format; ``prefix`` stands before each number."""
+    """A column's title and number format; ``prefix`` stands before numbers, ``spread``: show deviations."""
 
     name: str
     digits: int = 2
     signed: bool = False
     prefix: str = ""
+    spread: bool = True
 
     def text(self, value: Cell) -> str:
         """Format a cell; None is empty.
@@ -38,8 +59,8 @@ class Column:
         if value is None or isinstance(value, str):
             return value or ""
         if isinstance(value, Estimate):
-            deviation = "" if value.deviation is None else f" ± {value.deviation:.{self.digits}f}"
-            return self.text(value.mean) + deviation
+            with_spread = self.spread and value.deviation is not None
+            return self.text(value.mean) + (f" ± {value.deviation:.{self.digits}f}" if with_spread else "")
         sign = "+" if self.signed or isinstance(value, Difference) else ""
         return f"{self.prefix}{value:{sign}.{self.digits}f}"
 
@@ -62,19 +83,20 @@ class Table:
     marks: Mapping[tuple[int, int], str] = field(default_factory=dict)
     rules: Sequence[int] = ()
 
-    def __post_init__(self) -> None:
-        for row in self.rows:
-            if len(row) != len(self.columns):
-                raise ValueError(f"a table: expected rows of {len(self.columns)} cells, but got {row}")
+    @classmethod
+    def of(cls, rows: Iterable[Mapping], columns: Mapping[str, Column | str], caption: str = "") -> Table:
+        """Select columns of rows, by name; a title stands for a column of two digits, None is empty."""
+        cells = [[row.get(name) for name in columns] for row in rows]
+        return cls(columns_of(columns.values()), cells, caption)
 
-    def markdown(self) -> str:
+    def __str__(self) -> str:
         """Return the table for a Markdown page, numbers aligned to the right."""
-        escaped = [[cell.replace("|", "\\|") for cell in row] for row in self.texts(MARKS)]
-        return (f"{self.caption}\n\n" if self.caption else "") + self._tabulated(escaped, "pipe") + "\n"
+        escaped = self.texts("md", lambda text: text.replace("|", "\\|"))
+        return (f"{self.caption}\n\n" if self.caption else "") + self._tabulated(escaped, "pipe")
 
     def plain(self) -> str:
         """Return the table for a terminal."""
-        return self._tabulated(self.texts({}), "simple")
+        return self._tabulated(self.texts(), "simple")
 
     def _tabulated(self, texts: list[list[str]], form: str) -> str:
         names = [column.name for column in self.columns]
@@ -84,18 +106,20 @@ class Table:
     @property
     def numeric(self) -> list[bool]:
         """Whether each column holds only numbers."""
-        return [all(_is_number(row[i]) for row in self.rows) for i in range(len(self.columns))]
+        columns = [[row[i] for row in self.rows] for i in range(len(self.columns))]
+        texts = [[cell for cell in column if isinstance(cell, str) and cell] for column in columns]
+        return [all(text.replace(".", "", 1).isdigit() for text in column) for column in texts]
 
-    def texts(self, marks: Mapping[str, str], escape: Callable[[str], str] = str) -> list[list[str]]:
+    def texts(self, form: str = "", escape: Callable[[str], str] = str) -> list[list[str]]:
         """Format all cells.
 
         Args:
-            marks: mark -> format of a marked cell, with ``{}`` for the text.
+            form: one of ``MARKS``; "": no marks.
             escape: function applied to the text of each cell first.
         """
         return [
             [
-                marks.get(self.marks.get((i, j)), "{}").format(escape(self.columns[j].text(value)))
+                MARKS[form].get(self.marks.get((i, j)), "{}").format(escape(self.columns[j].text(value)))
                 for j, value in enumerate(row)
             ]
             for i, row in enumerate(self.rows)
@@ -103,21 +127,66 @@ class Table:
 
     def csv(self) -> str:
         """Return all digits as CSV; the standard deviation of an estimate has a column of its own."""
-        spread = [any(isinstance(row[i], Estimate) for row in self.rows) for i in range(len(self.columns))]
-        names = [[c.name, f"{c.name} sd"] if s else [c.name] for c, s in zip(self.columns, spread)]
-        rows = [[part for v, s in zip(row, spread) for part in _parts(v, s)] for row in self.rows]
+        lines = [[] for _ in range(1 + len(self.rows))]
+        for i, column in enumerate(self.columns):
+            cells = [row[i] for row in self.rows]
+            width = 1 + any(isinstance(cell, Estimate) for cell in cells)
+            parts = [(c.mean, c.deviation) if isinstance(c, Estimate) else (c, None) for c in cells]
+            for line, part in zip(lines, [(column.name, f"{column.name} sd"), *parts]):
+                line += part[:width]
         file = io.StringIO()
-        csv.writer(file, lineterminator="\n").writerows([[name for pair in names for name in pair], *rows])
+        csv.writer(file, lineterminator="\n").writerows(lines)  # None is empty
         return file.getvalue()
 
 
-def _is_number(value: Cell) -> bool:
-    if not isinstance(value, str) or not value:
-        return True
-    return value.replace(".", "", 1).isdigit()
+def columns_of(columns: Iterable[Column | str]) -> list[Column]:
+    """Turn titles into columns of two digits."""
+    return [Column(column) if isinstance(column, str) else column for column in columns]
 
 
-def _parts(value: Cell, spread: bool) -> list:
-    if isinstance(value, Estimate):
-        return [value.mean, "" if value.deviation is None else value.deviation]
-    return ["" if value is None else value, *([""] if spread else [])]
+def score_columns(names: Iterable[str]) -> dict[str, Column]:
+    """Make a column for each metric."""
+    return {name: Column(metric_of(name).title, metric_of(name).digits) for name in names}
+
+
+@dataclass(frozen=True)
+class Section:
+    """A heading with tables and pictures, ``facts`` on how they came about, and footnotes."""
+
+    title: str
+    tables: Sequence[Table] = ()
+    facts: Sequence[str] = ()
+    notes: Sequence[str] = ()
+    pictures: Sequence[Path] = ()
+
+
+def rendered(template: str, **values: object) -> str:
+    """Fill a template of ``templates/``; in HTML all text is escaped."""
+    return _environment().get_template(template).render(**values)
+
+
+@cache
+def _environment() -> Environment:
+    environment = Environment(
+        autoescape=lambda name: name.endswith(".html.j2"),
+        loader=FileSystemLoader(TEMPLATES),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    environment.filters |= {
+        "tex": latex_text,
+        "tex_rows": lambda table: table.texts("tex", latex_text),
+        "inlined": lambda path: "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode(),
+    }
+    return environment
+
+
+def latex_text(text: str) -> str:
+    """Escape text for LaTeX.
+
+    >>> latex_text("50 % of a_b")
+    '50 \\\\% of a\\\\_b'
+    """
+    return "".join(_LATEX.get(c, c) for c in text)

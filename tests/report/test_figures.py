@@ -1,10 +1,14 @@
 import sys
 
 import imageio.v3 as iio
+import numpy as np
 import pytest
 
-from forewarp.report.collect import Point, collect, grouped
-from forewarp.report.curve import Published, draw_run, draw_scene, pareto_front, read_published, seconds_to
+from forewarp.report import figures
+from forewarp.report.benchmark import Published
+from forewarp.report.choices import seconds_to
+from forewarp.report.figures import MARGIN, draw_run, draw_scene, pareto_front, subject, thirds
+from forewarp.report.results import Point, read_runs
 from tests.support.runs_on_disk import write_run
 
 
@@ -18,7 +22,6 @@ def curve(*pairs):
         ([(1, 24), (2, 25), (3, 26)], 2),
         ([(1, 25), (2, 24), (3, 25), (4, 25)], 3),  # once is chance
         ([(1, 24), (2, 25)], None),  # nothing follows that would confirm it
-        ([(1, 25)], None),
         ([], None),
     ],
 )
@@ -27,9 +30,7 @@ def test_a_target_is_reached_twice_in_a_row(pairs, seconds):
 
 
 def test_the_front_is_what_nothing_beats_in_both():
-    points = [(1, 20), (2, 19), (2, 22), (3, 22), (4, 30), (4, 29)]
-    front = pareto_front(points)
-    assert front == [0, 2, 4]
+    assert pareto_front([(1, 20), (2, 19), (2, 22), (3, 22), (4, 30), (4, 29)]) == [0, 2, 4]
 
 
 def test_a_run_is_drawn_with_its_flow_error_below(tmp_path):
@@ -39,43 +40,35 @@ def test_a_run_is_drawn_with_its_flow_error_below(tmp_path):
     assert not list(tmp_path.rglob("*.part"))
 
 
-def legend_of(monkeypatch, path, *arguments):
-    seen = []
-
-    def save(figure, path):
-        seen.extend(text.get_text() for text in figure.axes[0].get_legend().get_texts())
-        assert figure.axes[0].get_xscale() == "log"
-        return path
-
-    monkeypatch.setattr("forewarp.report.curve._save", save)
-    draw_scene(path, *arguments)
-    return seen
-
-
 def test_a_scene_names_those_on_the_front_and_the_hardware_of_others(tmp_path, monkeypatch):
     write_run(tmp_path)
     write_run(tmp_path, "slow", curve=((30, 20.0), (60, 24.0)))
     write_run(tmp_path, "good", curve=((30, 20.0), (60, 28.0)))
-    groups = grouped(collect(tmp_path)[0])
+    seen = []
+    monkeypatch.setattr(figures, "save", lambda figure, path: seen.append(figure.axes[0]))
     other = Published("other", 100.0, 32.0, "a GPU", "its paper", "dnerf")
-    legend = legend_of(monkeypatch, tmp_path / "scene.png", groups, "ball", [other])
+    draw_scene(tmp_path / "x.png", read_runs(tmp_path)[0].by("variant", "minutes"), "ball", [other])
+    legend = [text.get_text() for text in seen[0].get_legend().get_texts()]
     assert legend == ["base, 1 min", "good, 1 min", "Pareto front", "other (published, a GPU)"]
+    assert seen[0].get_xscale() == "log"
 
 
-def test_published_points_are_read_and_checked(tmp_path):
-    path = tmp_path / "published.yaml"
-    path.write_text("- {name: a, seconds: 60, psnr: 30.5, hardware: g, source: s, dataset: dnerf}\n")
-    assert read_published(path) == [Published("a", 60, 30.5, "g", "s", "dnerf")]
-    for text in ("- {name: a}\n", "name: a\n"):
-        path.write_text(text)
-        with pytest.raises(ValueError, match=r"published.yaml: \[0\]: expected the keys name, seconds"):
-            read_published(path)
-    path.write_text("[")
-    with pytest.raises(ValueError, match="published.yaml: expected YAML, but got"):
-        read_published(path)
-
-
-def test_absent_matplotlib_says_what_to_install(tmp_path, monkeypatch):
+def test_absent_matplotlib_says_what_to_install(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with pytest.raises(ImportError, match=r"install forewarp\[plots\]"):
         draw_run(tmp_path / "x.png", curve((1, 20)), "run")
+    figures.draw_own(write_run(tmp_path))
+    assert "without accuracy_time.png: expected matplotlib" in capsys.readouterr().out
+
+
+def test_a_picture_is_cut_to_its_subject():
+    picture = np.ones((100, 80, 3))
+    assert subject(picture) == (slice(0, 100), slice(0, 80))
+    picture[50:60, 75] = 0
+    assert subject(picture) == (slice(50 - MARGIN, 60 + MARGIN), slice(75 - MARGIN, 80))
+
+
+def test_a_sheet_falls_into_its_parts():
+    sheet = np.concatenate([np.full((2, 3, 1), i) for i in (0, 1, 2)], 1)
+    wide = np.insert(sheet, [3] * 4 + [6] * 4, 9, axis=1)
+    assert [part.tolist() for part in thirds(wide)] == [[[[i]] * 3] * 2 for i in (0, 1, 2)]

@@ -1,0 +1,482 @@
+"""Write the pages of methods under one clock, from CSV tables that later runs add to."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from statistics import fmean
+from typing import NamedTuple
+
+import yaml
+
+from forewarp.files import MOST_CONFIG, read_rows, read_text, replace_file
+from forewarp.metrics.gain import Estimate
+from forewarp.metrics.registry import metric_of
+from forewarp.report import figures
+from forewarp.report.results import (
+    CONDITIONS,
+    KEY,
+    NETS,
+    Row,
+    Runs,
+    add_to_table,
+    in_words,
+    key_of,
+    length,
+    pairs,
+    read_runs,
+)
+from forewarp.report.tables import Column, Table, columns_of, rendered, score_columns
+
+OTHERS = Path(__file__).with_name("published.yaml")  # results of others
+NOISE = 0.2  # dB that chance may take: with more of something PSNR may be this much lower
+LENGTHS = 3  # of training, at least: two points make no curve
+TASK = ("scene", "preset", "minutes", *CONDITIONS)
+BEGIN = {"label": "scene", "took": Column("minutes", 0)}
+COSTS = {"processor": Column("processor (s)", 0), "wall": Column("wall (s)", 0), "steps": Column("steps", 0)}
+COSTS |= {"ms": Column("ms a step", 1), "frame": Column("s a picture", 3)}
+COSTS |= {"parameters": Column("parameters (M)"), "memory": Column("GiB")}
+REDUCED = re.compile(r"(\d+)x(\d+) reduced (\d+)x\3")
+# Words of a picture of methods on an earlier page.
+SHOWN = re.compile(r"[^\[\]]* after (?P<minutes>\S+) minutes: (?P<methods>[^\[\]]*)$")
+
+
+class Published(NamedTuple):
+    """A result of others: PSNR (dB) on a dataset after ``seconds`` on some hardware."""
+
+    name: str
+    seconds: float
+    psnr: float
+    hardware: str
+    source: str
+    dataset: str
+
+
+def read_published(path: Path) -> list[Published]:
+    """Read a YAML list of entries with the keys of ``Published``.
+
+    Raises:
+        ValueError: if the file is no YAML, or an entry has other keys.
+    """
+    try:
+        entries = yaml.safe_load(read_text(Path(path), MOST_CONFIG))
+    except yaml.YAMLError as error:
+        raise ValueError(f"{path}: expected YAML, but got {str(error).splitlines()[0]}") from None
+    for number, entry in enumerate(entries if isinstance(entries, list) else [None]):
+        if not isinstance(entry, dict) or set(entry) != set(Published._fields):
+            got, keys = sorted(entry) if isinstance(entry, dict) else type(entry).__name__, Published._fields
+            raise ValueError(f"{path}: [{number}]: expected the keys {', '.join(keys)}, but got {got}")
+    return [Published(**entry) for entry in entries]
+
+
+def write_minutes(folder: Path, out: Path, published: Sequence[Published] = ()) -> list[Path]:
+    """Write ``<method>.md``, ``.csv`` (a row a run) and ``.png`` (PSNR by view) of each method in the runs,
+    and ``accuracy-time.md`` of them all.
+
+    Rows of a table that is there already stay, unless a run of the same ``results.KEY`` replaces them: runs
+    may be made one day after the other. Each page compares its method with the others, so that the pages of
+    methods with a table in ``out`` are written anew too.
+
+    Args:
+        folder: searched for measured runs.
+        out: folder to write to.
+        published: results of others, drawn beside.
+
+    Returns:
+        the files written.
+    """
+    runs, left_out = _timed(folder)
+    methods, written = {row["method"] for row in runs}, []
+    for file in out.glob("*.csv"):  # of earlier calls
+        if file.with_suffix(".md").is_file() and {row.get("method") for row in read_rows(file)} == {
+            file.stem
+        }:
+            methods.add(file.stem)
+    tables = {
+        method: labelled(add_to_table(out / f"{method}.csv", runs.where(method=method)))
+        for method in sorted(methods)
+    }
+    for method, own in tables.items():
+        others = {other: found for other, found in tables.items() if other != method}
+        page, picture = out / f"{method}.md", out / f"{method}.png"
+        replace_file(page, rendered("minutes.md.j2", left_out=left_out, **_of_method(method, own, others)))
+        scenes = {}
+        for group in alike(plain(own)):
+            lines = scenes.setdefault(group[0]["label"], {})
+            if points := mean_by_time(group):
+                label = f"{length(group[0]['minutes'])}, {len(group)} seed{'s' * (len(group) > 1)}"
+                lines[label] = points
+        figures.draw_by_time(picture, scenes)
+        written += [page, out / f"{method}.csv", picture]
+    return written + _write_lengths(tables, out, published)
+
+
+def _timed(folder: Path) -> tuple[Runs, list[str]]:
+    """Read the measured runs of so many minutes, the newest of equal ones; and a line for each other run."""
+    runs, left_out = read_runs(folder)
+    endless = runs.where(minutes=None)
+    runs, older = Runs(row for row in runs if row["minutes"] is not None).newest(*KEY)
+    left_out += [f"{row['folder'].relative_to(folder)}: no budget.minutes" for row in endless]
+    return runs, left_out + [
+        f"{row['folder'].relative_to(folder)}: another run of the same is newer" for row in older
+    ]
+
+
+def labelled(runs: Runs) -> Runs:
+    """Give rows a ``label``: the scene and, where its plain rows differ in preset or ``CONDITIONS``, in what;
+    likewise their dataset.
+    """
+    found = Runs()
+    for row in runs:
+        others, is_plain = plain(runs.where(scene=row["scene"])), bool(plain(Runs([row])))
+        words = in_words(row, others, ("preset", *CONDITIONS)) if is_plain else []
+        label, dataset = (", ".join([name, *words]) for name in (row["scene"], row["dataset"] or ""))
+        found.append(row | {"label": label, "dataset": dataset})
+    return found
+
+
+def plain(runs: Runs) -> Runs:
+    """Select the rows of the main tables: of the preset's own density, pictures scored as they are."""
+    return Runs(r for r in runs if r["density"] is None and not REDUCED.search(r["pictures"] or ""))
+
+
+def alike(runs: Runs) -> list[Runs]:
+    """Group rows that differ in the seed alone; by scene, minutes and number of particles or voxels."""
+    groups = runs.by("method", *TASK).values()
+    return sorted(groups, key=lambda group: (group[0]["label"], group[0]["minutes"], size_of(group)))
+
+
+def size_of(group: Runs) -> float:
+    """Return the mean number of particles or voxels, or, where it is unknown, the density or 0."""
+    return group.mean("size") or group[0]["density"] or 0.0
+
+
+def row_of(group: Runs, **more: object) -> Row:
+    """Make the row of tables for runs that differ in the seed; ``took``: the minutes that they took."""
+    took = length(group[0]["minutes"]).removesuffix(" min") + group.taken()[1]
+    step, error = group.mean("step"), group.estimate("motion_error")
+    moving = error and Estimate(*(part and 100 * part for part in (error.mean, error.deviation)))
+    return group.summary(
+        took=took, ms=step and 1000 * step, moving=moving, particles=size_of(group) or None, **more
+    )
+
+
+def mean_by_time(runs: Runs) -> list[tuple[float, float]]:
+    """Average the PSNR (dB) of the views of each time, over all rows.
+
+    >>> mean_by_time(Runs([{"views": "0:30 0.5:31"}, {"views": "0:32 0.5:34"}]))
+    [(0.0, 31.0), (0.5, 32.5)]
+    """
+    found: dict[float, list[float]] = {}
+    for time, psnr in (pair for row in runs for pair in pairs(row["views"])):
+        found.setdefault(time, []).append(psnr)
+    return [(time, fmean(found[time])) for time in sorted(found)]
+
+
+def _of_method(method: str, runs: Runs, others: Mapping[str, Runs]) -> dict:
+    """Make all that the page of a method shows."""
+    groups, scores = alike(plain(runs)), score_columns(runs.scores())
+    with_seeds = BEGIN | {"seeds": Column("seeds", 0)}
+    size = Column("particles" if method == "particles" else "voxels or parameters", 0, spread=False)
+    each = with_seeds | scores | {"ends": Column("ends (dB)", 1, spread=False), "size": size}
+
+    abilities = {"psnr_space": "space", "psnr_time": "time", "psnr_canonical": "canonical"}
+    shared = {(row["scene"], row["minutes"]) for row in runs}
+    rivals = (row for found in others.values() for row in found if (row["scene"], row["minutes"]) in shared)
+    known = Runs(
+        r for r in (*runs, *rivals) if any(r[name] is not None for name in (*abilities, "motion_error"))
+    )
+    columns = BEGIN | {"name": "method", "seeds": Column("seeds", 0)} | abilities
+    columns |= {"moving": Column("moving points (%)", 1)}
+    by_ability = [row_of(group, name=f"`{group[0]['method']}`") for group in alike(plain(known))]
+
+    sized = Runs(row for row in runs if row["size"] and not REDUCED.search(row["pictures"] or ""))
+    density = {"density": Column("density", 0), "particles": Column("particles", 0)}
+    minutes = _against_fewer(plain(runs), "minutes", lambda group: group[0]["minutes"])
+    made: dict[float, set[str]] = {}
+    for row in runs:
+        version = f"commit {row['commit']}" if row["commit"] else row["day"] or "a day unknown"
+        made.setdefault(row["minutes"], set()).add(version)
+    versions = [f"{m:g} min of {', '.join(sorted(found))}" for m, found in sorted(made.items())]
+    return {
+        "method": method,
+        "nets": NETS,
+        "noise": NOISE,
+        "machine": made_on(runs),
+        "versions": versions if len(set().union(*made.values())) > 1 else [],
+        "by_minutes": _by_minutes(plain(runs)),
+        "each": Table.of(map(row_of, groups), each),
+        "beside": {other: _beside(method, runs, other, found) for other, found in others.items()},
+        "abilities": Table.of(by_ability, columns),
+        "more_minutes": Table.of(minutes, with_seeds | scores | {"verdict": "against fewer minutes"}),
+        "more_density": Table.of(
+            _against_fewer(sized, "density", size_of),
+            with_seeds | density | scores | {"verdict": "against fewer"},
+        ),
+        "larger": Table.of(
+            _larger(Runs(row for row in runs if row["density"] is None)),
+            with_seeds | {"pictures": "pictures"} | scores | {"verdict": "the larger is"},
+        ),
+        "costs": Table.of(
+            map(row_of, groups), BEGIN | {n: replace(c, spread=False) for n, c in COSTS.items()}
+        ),
+        "commands": runs.commands("minutes"),
+    }
+
+
+def made_on(runs: Runs) -> str:
+    """Say in a line on what the runs were computed, by which clock, and when."""
+    return "; ".join(filter(None, (runs.machines("minutes by the {clock} clock"), runs.days())))
+
+
+def _by_minutes(runs: Runs) -> Table:
+    """Pivot PSNR by scene and minutes, and its mean over a dataset's scenes where all are there."""
+    scenes, minutes = runs.by("label"), list(runs.by("minutes"))
+    cells = {key: group.estimate("psnr") for key, group in runs.by("label", "minutes").items()}
+    lines = [[scene, *(cells.get((scene, m)) for m in minutes)] for scene in scenes]
+    for dataset, found in runs.by("dataset").items():
+        columns = [[cells.get((label, m)) for label in found.by("label")] for m in minutes]
+        means = [None if None in column else fmean(cell.mean for cell in column) for column in columns]
+        lines += [[f"mean of {dataset}", *means]] if len(found.by("label")) > 1 else []
+    early = any(group.taken()[0] for group in alike(runs))
+    about = " Some runs ended by their steps, before their minutes: see *Each*." * early
+    return Table(columns_of(["scene", *map(length, minutes)]), lines, "PSNR (dB) of test views." + about)
+
+
+def _against_fewer(runs: Runs, varied: str, order: Callable[[Runs], float]) -> list[Row]:
+    """List groups that differ in one thing alone, each with how its PSNR is to that of the group before."""
+    series: dict[tuple, list[Runs]] = {}
+    for group in alike(runs):
+        series.setdefault(key_of(group[0], (name for name in TASK if name != varied)), []).append(group)
+    lines = []
+    for groups in (sorted(found, key=order) for found in series.values() if len(found) > 1):
+        psnr = [None, *(group.mean("psnr") for group in groups)]
+        for group, before, now in zip(groups, psnr, psnr[1:]):
+            lines.append(row_of(group, verdict="" if None in (before, now) else held(before, now)))
+    return lines
+
+
+def held(before: float, now: float) -> str:
+    """Say whether a PSNR (dB) holds against the one before.
+
+    >>> held(30.0, 29.85), held(30.0, 29.5), held(30.0, 31.0)
+    ('holds (-0.15 dB)', 'falls by 0.50 dB', 'holds (+1.00 dB)')
+    """
+    change = now - before
+    return f"holds ({change:+.2f} dB)" if change >= -NOISE - 1e-9 else f"falls by {-change:.2f} dB"
+
+
+def _larger(runs: Runs) -> list[Row]:
+    """List runs on larger pictures, reduced to be scored, each before those that learned from small ones."""
+    groups, lines = alike(runs), []
+    for group in groups:
+        pictures = group[0]["pictures"] or ""
+        if (reduced := REDUCED.search(pictures)) is None:
+            continue
+        width, height, by = map(int, reduced.groups())
+        size = f"{width // by}x{height // by}"
+        small = key_of(group[0] | {"pictures": pictures.replace(reduced[0], size)}, TASK)
+        same = [other for other in groups if key_of(other[0], TASK) == small]
+        verdict = f"{above(group, same[-1])} the run that learned from {size}" if same else ""
+        lines += [row_of(group, verdict=verdict), *(row_of(other, verdict="") for other in same)]
+    return lines
+
+
+def _beside(method: str, runs: Runs, other: str, rivals: Runs) -> Table:
+    """Compare a method with another on the same scenes after equal minutes."""
+    names, lines = Runs([*runs, *rivals]).scores(), []
+    for group in alike(plain(runs)):
+        for rival in alike(plain(rivals)):
+            rows = group[0], rival[0]
+            # What a table of an earlier version lacks is no bar.
+            lacking = [n for n in ("device", "measured", "pictures") if None in (rows[0][n], rows[1][n])]
+            if len({key_of(row, (name for name in TASK if name not in lacking)) for row in rows}) == 1:
+                line = row_of(group)
+                seeds, psnr = f"{len(group)} and {len(rival)}", (g.estimate("psnr") for g in (group, rival))
+                verdicts = (above(group, rival, name) for name in names)
+                lines.append([line["label"], line["took"], seeds, *psnr, *verdicts])
+    columns = [
+        *BEGIN.values(),
+        "seeds",
+        f"`{method}`",
+        f"`{other}`",
+        *(metric_of(name).title for name in names),
+    ]
+    return Table(columns_of(columns), lines)
+
+
+def above(group: Runs, other: Runs, name: str = "psnr") -> str:
+    """Say by how much a mean is above or below another.
+
+    >>> above(Runs([{"psnr": 30.0}]), Runs([{"psnr": 29.5}]))
+    'above by 0.50 dB'
+    >>> above(Runs([{"lpips": 0.2}]), Runs([{"lpips": 0.1}]), "lpips")
+    'worse by 0.1000'
+    """
+    own, its, metric = group.mean(name), other.mean(name), metric_of(name)
+    if own is None or its is None:
+        return ""
+    if not round(abs(own - its), metric.digits):
+        return "equal"
+    words = ("above", "below") if metric.higher_is_better else ("worse", "better")
+    return f"{words[own < its]} by {abs(own - its):.{metric.digits}f} {metric.unit}".rstrip()
+
+
+def _write_lengths(tables: Mapping[str, Runs], out: Path, published: Sequence[Published]) -> list[Path]:
+    """Write ``accuracy-time.md`` and a picture for each scene that two methods or more have in three lengths
+    under the same ``CONDITIONS``; results of others are drawn beside scenes of their dataset.
+    """
+    runs = Runs(row | {"label": row["scene"]} for found in tables.values() for row in plain(found))
+    colors, compared = {method: f"C{number}" for number, method in enumerate(sorted(tables))}, {}
+    for of_task in runs.by("scene", "preset", *CONDITIONS).values():
+        lengths = {method: alike(found) for method, found in of_task.by("method").items()}
+        lengths = {method: groups for method, groups in lengths.items() if len(groups) >= LENGTHS}
+        if len(lengths) > 1:  # the title says in what the scene's rows differ
+            words = in_words(of_task[0], runs.where(scene=of_task[0]["scene"]), ("preset", *CONDITIONS))
+            compared[", ".join([of_task[0]["scene"], *words])] = lengths
+    scenes, pictures, used, shown = [], [], Runs(), {}
+    for title, lengths in sorted(compared.items()):
+        own = [row for groups in lengths.values() for group in groups for row in group]
+        beside = [other for other in published if other.dataset == own[0]["dataset"].split(", ")[0]]
+        picture = out / f"accuracy-time-{re.sub(r'[^a-zA-Z0-9]+', '-', title).strip('-')}.png"
+        points = {
+            method: [[(row[row["clock"]] or 60 * row["minutes"], row["psnr"]) for row in g] for g in groups]
+            for method, groups in lengths.items()
+        }
+        figures.draw_lengths(picture, points, title, beside, colors)
+        scenes.append({"title": title, "picture": picture.name, "table": _by_length(lengths)})
+        pictures.append(picture)
+        used += own
+        shown |= dict.fromkeys(beside)
+    if not scenes:
+        return []
+    about = {"machine": made_on(used), "commands": used.commands("minutes")}
+    replace_file(out / "accuracy-time.md", rendered("lengths.md.j2", scenes=scenes, published=shown, **about))
+    return [out / "accuracy-time.md", *pictures]
+
+
+def _by_length(lengths: Mapping[str, Sequence[Runs]]) -> Table:
+    """Pivot PSNR by method and length; and when the best method passes what each reaches in the end."""
+    minutes = sorted({group[0]["minutes"] for groups in lengths.values() for group in groups})
+    most = {method: max(group.mean("psnr") for group in groups) for method, groups in lengths.items()}
+    best, lines = max(most, key=most.get), []
+    for method, groups in lengths.items():
+        cells = {}
+        for group in groups:
+            psnr, words = group.estimate("psnr"), group.taken()[1]
+            cells[group[0]["minutes"]] = f"{Column('').text(psnr)}{words}" if words else psnr
+        passed = [length(g[0]["minutes"]) for g in lengths[best] if g.mean("psnr") > most[method]]
+        seeds = ", ".join(str(len(group)) for group in groups)
+        lines.append([f"`{method}`", *map(cells.get, minutes), seeds, passed[0] if passed else None])
+    return Table(columns_of(["method", *map(length, minutes), "seeds", f"passed by `{best}` after"]), lines)
+
+
+def write_methods(folder: Path, out: Path) -> list[Path]:
+    """Write ``methods.md``, ``methods.csv`` (a row a run), and two pictures of each scene.
+
+    Rows of a table that is there already stay, as in ``write_minutes``. Views are drawn of the given runs
+    alone; a picture that an earlier page shows stays if it has more methods, and the page says which of
+    them have other rows by now. Ablations are left out.
+
+    Args:
+        folder: searched for measured runs.
+        out: folder to write to.
+
+    Returns:
+        the files written.
+
+    Raises:
+        ValueError: if there is no run of a method, and no table with such runs.
+    """
+    found, left_out = _timed(folder)
+    ablations = [row for row in found if row["ablation"] not in (None, "base")]
+    left_out += [f"{row['folder'].relative_to(folder)}: an ablation" for row in ablations]
+    page, table = out / "methods.md", out / "methods.csv"
+    runs = add_to_table(table, (row for row in found if row not in ablations))
+    earlier, scenes, written = read_text(page) if page.is_file() else "", [], [page, table]
+    for scene, own in runs.by("scene").items():
+        several = len(own.by("preset")) > 1
+        own = Runs(row | {"name": row["method"] + f" ({row['preset']})" * several} for row in own)
+        pictures, drawn = _pictures(scene, own, out, earlier)
+        tables = [_reached(group, own) for group in own.by("minutes", *CONDITIONS).values()]
+        scenes.append({"name": scene, "pictures": pictures, "tables": tables})
+        written += drawn
+    about = {"machine": made_on(runs), "nets": NETS, "commands": runs.commands("methods")}
+    about |= {"presets": list(runs.by("preset")), "departures": _departures(runs), "left_out": left_out}
+    with_steps = (out / "faithful-step.md").is_file()  # by python -m tests.bench.faithful
+    replace_file(page, rendered("methods.md.j2", scenes=scenes, with_steps=with_steps, **about))
+    return written
+
+
+def _pictures(scene: str, runs: Runs, out: Path, earlier: str) -> tuple[list[dict], list[Path]]:
+    """Draw a scene's pictures; return what the page says of them, and the files drawn.
+
+    They are of the rows that may be compared with the most methods and, of equal ones, the most minutes; of a
+    method of its first seed.
+    """
+    groups = runs.by("minutes", *CONDITIONS).values()
+    chosen = max(groups, key=lambda group: (len(group.by("name")), group[0]["minutes"]))
+    first = {row["name"]: row for row in sorted(chosen, key=lambda row: -row["seed"])}
+    seen = {name: row for name, row in first.items() if "folder" in row and figures.sheets_of(row["folder"])}
+    seen = dict(sorted(seen.items(), key=lambda item: -(item[1]["psnr"] or 0.0)))
+    minutes = f"{chosen[0]['minutes']:g}"
+    now = {(row["name"], f"{row['psnr'] or 0.0:.2f}", f"{row['minutes']:g}") for row in runs}
+    curves, views = out / f"methods-{scene}.png", out / f"methods-{scene}-views.png"
+    pictures, drawn = [], []
+    for path, words, shown, draw in (
+        (
+            curves,
+            "PSNR against seconds of training",
+            first,
+            partial(figures.draw_curves, title=f"{scene}, {minutes} minutes"),
+        ),
+        (views, "Test views, the truth first,", seen, figures.draw_views),
+    ):
+        known = SHOWN.search(earlier.partition(f"]({path.name})")[0]) if path.is_file() else None
+        listed = [method.rpartition(" ")[::2] for method in known["methods"].split(", ")] if known else []
+        picture = {"file": path.name, "is_views": path == views, "changed": []}
+        changed = [name for name, psnr in listed if (name, psnr, known["minutes"]) not in now]
+        kept = known and picture | {"words": known[0], "changed": changed}
+        if len(listed) > len(shown):
+            pictures.append(kept)
+            continue
+        try:
+            if draw(path, shown):
+                methods = ", ".join(f"{name} {row['psnr'] or 0.0:.2f}" for name, row in shown.items())
+                pictures.append(picture | {"words": f"{words} after {minutes} minutes: {methods}"})
+                drawn.append(path)
+        except ImportError as error:
+            pictures.append(kept or picture | {"missing": str(error)})
+    return pictures, drawn
+
+
+def _reached(runs: Runs, others: Runs) -> Table:
+    """List all numbers of the runs of a scene that may be compared, the best PSNR first."""
+    groups = sorted(runs.by("name").values(), key=lambda group: -(group.mean("psnr") or 0.0))
+    columns = {"title": "method", "seeds": Column("seeds", 0)} | score_columns(others.scores())
+    names = {"steps": Column("steps", 0), "step": Column("s a step", 3), "frame": Column("s a frame")}
+    names |= {"parameters": Column("parameters (M)"), "memory": Column("GiB")}
+    columns |= {name: replace(column, spread=False) for name, column in names.items()}
+    measured = sorted({row["measured"] for row in runs if row["measured"]})
+    words = in_words(runs[0], others, [name for name in CONDITIONS if name != "measured"])
+    about = ", ".join([runs[0]["scene"], f"{runs[0]['minutes']:g} minutes", *words, *measured])
+    titled = [
+        group.summary(title=f"`{group[0]['name']}`" + " (the paper's)" * (group[0]["method"] == "forward"))
+        for group in groups
+    ]
+    return Table.of(titled, columns, f"**{about}**")
+
+
+def _departures(runs: Runs) -> Table:
+    """List what differs from the publications, and the faults kept from released code, with their methods."""
+    found: dict[str, set[str]] = {}
+    for field, mark in (("departures", ""), ("faults", "kept fault: ")):
+        for row in runs:
+            for departure in filter(None, (row[field] or "").split("; ")):
+                found.setdefault(mark + departure, set()).add(f"`{row['method']}`")
+    lines = [[about, ", ".join(sorted(methods))] for about, methods in found.items()]
+    lines.sort(key=lambda line: (line[0].startswith("kept"), -line[1].count(","), line[0]))
+    return Table(columns_of(["departure", "methods"]), lines)

@@ -1,0 +1,308 @@
+"""Write what choices cost and bring: accuracy against time, the price list, and planned effects."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from statistics import fmean, mode
+
+from forewarp.files import replace_file
+from forewarp.metrics.gain import FACTORS, Estimate, measure_effect
+from forewarp.metrics.registry import metric_of
+from forewarp.report.figures import draw_scene
+from forewarp.report.results import Point, Row, Runs, overrides, portable, read_runs
+from forewarp.report.tables import Column, Table, columns_of, rendered
+
+COSTS = {
+    "epe": Column("EPE", 4),
+    "step": Column("s/step", 3),
+    "frame": Column("s/frame"),
+    "memory": Column("GiB"),
+}
+COSTS |= {"parameters": Column("parameters (M)", 3), "steps": Column("steps", 0)}
+CHOICES = {"auto": "planned", "all_effects": "every effect", "full": "the paper's set", "base": "the preset"}
+WITHIN = 0.3  # dB of every effect at once that a planned run should come within, in less time
+
+
+def seconds_to(points: Sequence[Point], psnr: float) -> float | None:
+    """Return the seconds until two evaluations in a row first reach a PSNR (dB); None if none do.
+
+    >>> curve = [Point(s, p, 0) for s, p in [(1, 20), (2, 25), (4, 24), (8, 26), (16, 27)]]
+    >>> seconds_to(curve, 25), seconds_to(curve, 27)
+    (8, None)
+    """
+    steps = zip(points, points[1:])
+    return next((a.seconds for a, b in steps if a.psnr >= psnr and b.psnr >= psnr), None)
+
+
+def by_variant(runs: Runs) -> dict[str, Runs]:
+    """Group runs that differ only in the seed; the base first."""
+    return dict(sorted(runs.by("variant").items(), key=lambda item: item[0] != "base"))
+
+
+def write_accuracy_time(
+    folder: Path, out: Path, *, target: float | None = None, published: Sequence = ()
+) -> list[Path]:
+    """Write ``accuracy-time.md``, and a picture and a CSV file a scene.
+
+    Args:
+        folder: searched for runs.
+        out: folder to write to.
+        target: list each variant's seconds to this PSNR (dB); None: the last whole dB that the base, or else
+            the best run, reached.
+        published: results of others, drawn as stars.
+
+    Returns:
+        the files written.
+    """
+    runs, left_out = read_runs(folder, ["accuracy_time.csv", "metrics.json"])
+    scenes, written = [], []
+    for scene, found in runs.by("scene").items():
+        groups = {}
+        for variant, group in by_variant(found).items():
+            groups |= {(variant, minutes): same for minutes, same in group.by("minutes").items()}
+        picture, file = out / f"accuracy-time-{scene}.png", out / f"accuracy-time-{scene}.csv"
+        beside = [other for other in published if other.dataset == found[0]["dataset"]]
+        draw_scene(picture, groups, scene, beside)
+        every = variants(groups, target_of(found) if target is None else target)
+        replace_file(file, every.csv())
+        scenes.append({"name": scene, "picture": picture.name, "tables": [cheapest(groups), every]})
+        written += [picture, file]
+    about = {"machine": runs.machines(), "published": published, "left_out": left_out}
+    replace_file(out / "accuracy-time.md", rendered("accuracy_time.md.j2", scenes=scenes, **about))
+    return [out / "accuracy-time.md", *written]
+
+
+def target_of(runs: Runs) -> float:
+    """Return the last whole dB that the base, or else any run, reached in two evaluations in a row."""
+    curves = [row["points"] for row in runs.where(variant="base") or runs]
+    return float(math.floor(max(min(a.psnr, b.psnr) for c in curves for a, b in zip(c, c[1:] or c))))
+
+
+def reached(runs: Runs, psnr: float) -> Estimate | None:
+    """Return the seconds to a PSNR over the seeds; None if a seed does not reach this PSNR."""
+    times = [seconds_to(row["points"], psnr) for row in runs]
+    return None if None in times else Estimate.of(times)
+
+
+def cheapest(groups: Mapping[tuple, Runs]) -> Table:
+    """List for every whole dB the variant that reaches it first, with the command."""
+    lines = []
+    values = [point.psnr for group in groups.values() for row in group for point in row["points"]]
+    for psnr in range(math.ceil(min(values)), math.floor(max(values)) + 1):
+        times = [(reached(group, psnr), group[0]) for group in groups.values()]
+        if known := [(seconds, row) for seconds, row in times if seconds is not None]:
+            seconds, row = min(known, key=lambda pair: pair[0].mean)
+            lines.append([str(psnr), seconds, row["variant"], f"`{portable(row['command'])}`"])
+    columns = columns_of(["for dB", Column("seconds", 1), "variant", "command"])
+    return Table(columns, lines, "The cheapest way to each PSNR:")
+
+
+def variants(groups: Mapping[tuple, Runs], target: float) -> Table:
+    """List for every variant the seconds to the target PSNR and the final numbers."""
+    columns = {"variant": "variant", "minutes": Column("minutes", 1), "seeds": Column("seeds", 0)}
+    columns |= {
+        "reached": Column(f"seconds to {target:g} dB", 1),
+        "psnr": "PSNR at the end",
+        "epe": COSTS["epe"],
+    }
+    lines = []
+    for group in groups.values():
+        ends = Runs(row | row["points"][-1]._asdict() for row in group if row["points"])
+        lines.append(
+            group.summary(
+                reached=reached(group, target), psnr=ends.estimate("psnr"), epe=ends.estimate("epe")
+            )
+        )
+    caption = "At equal minutes; the steps that were done in them:"
+    return Table.of(lines, columns | {"steps": COSTS["steps"]}, caption)
+
+
+def write_price_list(folder: Path, out: Path) -> list[Path]:
+    """Write ``price-list-<model>.md`` and ``.csv`` (every run's own numbers), of ``forward`` ``price-list``.
+
+    The model is that of most runs: what is changed one at a time, beside which whole methods may stand.
+
+    Args:
+        folder: searched for measured runs.
+        out: folder to write to.
+
+    Returns:
+        the files written.
+    """
+    runs, left_out = read_runs(folder)
+    scenes = []
+    for (scene, minutes), found in runs.by("scene", "minutes").items():
+        bound = f"{minutes:g} minutes" if minutes else "bounded by steps"
+        scenes.append({"title": f"{scene}, {bound}", "tables": [references(found), changes(found)]})
+    model = mode([row["method"] for row in runs] or ["forward"])
+    name = "price-list" if model == "forward" else f"price-list-{model}"
+    text = rendered("price_list.md.j2", machine=runs.machines(), scenes=scenes, left_out=left_out)
+    replace_file(out / f"{name}.md", text)
+    replace_file(out / f"{name}.csv", every_run(runs).csv())
+    return [out / f"{name}.md", out / f"{name}.csv"]
+
+
+def measures_of(runs: Runs) -> dict[str, Column]:
+    """Return the column of every metric and cost."""
+    known = {
+        name: metric_of(name) for name in runs.scores() if name != "lpips" or runs.mean(name) is not None
+    }
+    return {name: Column(metric.heading, metric.digits) for name, metric in known.items()} | COSTS
+
+
+def against(row: Row, runs: Runs) -> str:
+    """Choose the variant to compare a run with: the one it names, else the one with most of its overrides."""
+    own = set(overrides(row["variant"]))
+    inside = [name for name in runs.by("variant") if set(overrides(name)) < own]
+    return row["against"] or max(inside, key=lambda name: len(overrides(name)), default="base")
+
+
+def references(runs: Runs) -> Table:
+    """List the numbers of the runs that others are compared with."""
+    names = {against(row, runs) for row in runs}
+    lines = [group.summary() for variant, group in by_variant(runs).items() if variant in names]
+    views = {"all": "all test views", "time": "test views between the training times"}
+    columns = {"variant": "compared with", "seeds": Column("seeds", 0)} | measures_of(runs)
+    return Table.of(
+        lines, columns, f"Of {', '.join(sorted(views.get(kind, kind) for kind in runs.by('ability')))}:"
+    )
+
+
+def changes(runs: Runs) -> Table:
+    """List the changes of every other variant against its reference with the same seed."""
+    measures, lines = measures_of(runs), []
+    for variant, group in by_variant(runs).items():
+        if variant != (other := against(group[0], runs)):
+            before = {row["seed"]: row for row in runs.where(variant=other)}
+            pairs = [(row, before[row["seed"]]) for row in group if row["seed"] in before]
+            lines.append([variant, other, len(pairs), *(measure_effect(pairs, name) for name in measures)])
+    columns = ["variant", "against", Column("seeds", 0)]
+    for name, column in measures.items():
+        signed = Column(column.name, column.digits, signed=True)
+        columns.append(Column(column.name, prefix="×") if name in FACTORS else signed)
+    return Table(columns_of(columns), lines, "Changes:")
+
+
+def every_run(runs: Runs) -> Table:
+    """List the numbers of every run."""
+    columns = {name: name for name in ("scene", "variant", "minutes", "seed")} | {"ability": "views"}
+    columns |= measures_of(runs) | {"effects": "effects", "command": "command"}
+    return Table.of((row | {"command": portable(row["command"])} for row in runs), columns)
+
+
+def write_effects(folder: Path, out: Path) -> list[Path]:
+    """Write ``effects.md`` and ``effects.csv`` (every run) of ``model=forward``, and ``effects-<model>`` of
+    any other method.
+
+    Args:
+        folder: searched for measured runs.
+        out: folder to write to.
+
+    Returns:
+        the files written.
+    """
+    runs, left_out = read_runs(folder)
+    runs, files = Runs(row for row in runs if row["ablation"] in CHOICES), []
+    for model, own in (runs.by("method") or {"forward": runs}).items():
+        name = "effects" if model == "forward" else f"effects-{model}"
+        newest, _ = own.newest("scene", "ablation", "seed")
+        planned = [
+            row for found in newest.where(ablation="auto").by("scene", "seed").values() for row in found
+        ]
+        made = Runs(row for row in newest if row["config"].get("calls_for") is not None)
+        others = Runs(row for row in newest if row["config"].get("calls_for") is None)
+        first = {row["scene"]: row["plan"].get("effects", {}) for row in reversed(planned)}
+        text = rendered(
+            "effects.md.j2",
+            model=model,
+            within=WITHIN,
+            machine=own.machines(),
+            specimens=[choices(made), called(row for row in planned if row in made)] if made else [],
+            others=choices(others) if others else None,
+            trials=trials(planned),
+            reasons={scene: first[scene] for scene in sorted(first)},
+            left_out=left_out,
+        )
+        replace_file(out / f"{name}.md", text)
+        columns = {
+            "scene": "scene",
+            "ablation": "choice",
+            "seed": Column("seed", 0),
+            "minutes": Column("minutes", 1),
+        }
+        columns |= {
+            "psnr": Column("PSNR", 3),
+            "steps": COSTS["steps"],
+            "planning": "planning, s",
+            "command": "command",
+        }
+        lines = [
+            row | {"planning": row["plan"].get("seconds"), "command": portable(row["command"])}
+            for found in own.by("scene", "ablation", "seed").values()
+            for row in found
+        ]
+        replace_file(out / f"{name}.csv", Table.of(lines, columns).csv())
+        files += [out / f"{name}.md", out / f"{name}.csv"]
+    return files
+
+
+def choices(runs: Runs) -> Table:
+    """List for every scene the numbers of each choice, mean over seeds; then the mean over scenes."""
+    columns, present = ["scene", Column("seeds", 0)], [name for name in CHOICES if runs.where(ablation=name)]
+    for name in present:
+        minutes = [f"{minutes:g}" for minutes in runs.where(ablation=name).by("minutes") if minutes]
+        columns.append(CHOICES[name] + (f", {' or '.join(minutes)} min" if minutes else ""))
+    columns += [Column("planned - every effect", signed=True), Column("seconds to it", 0), Column("of", 0)]
+    lines = []
+    for scene, found in runs.by("scene").items():
+        planned, psnr = (
+            found.where(ablation="auto"),
+            [found.where(ablation=n).estimate("psnr") for n in present],
+        )
+        whole = {row["seed"]: row for row in found.where(ablation="all_effects")}
+        pairs = [(row, whole[row["seed"]]) for row in planned if row["seed"] in whole]
+        gain = measure_effect(pairs, "psnr")
+        curves = [(a["points"], b["points"]) for a, b in pairs if a["points"] and b["points"]]
+        times = [seconds_to(points, of_whole[-1].psnr - WITHIN) for points, of_whole in curves]
+        quick = None if None in times else Estimate.of(times)
+        of = Runs(every for _, every in pairs).mean("train")
+        planning = Estimate.of([row["plan"]["seconds"] for row in planned if row["plan"]])
+        lines.append([scene, len(planned), *psnr, gain, quick, of, planning])
+    means = []
+    for cells in list(zip(*lines))[2:]:
+        values = [cell.mean if isinstance(cell, Estimate) else cell for cell in cells]
+        means.append(None if None in values else fmean(values))
+    lines += [["mean", None, *means]] if len(lines) > 1 else []
+    return Table(columns_of([*columns, Column("planning, s", 0)]), lines)
+
+
+def called(planned: Sequence[Row]) -> Table:
+    """List for every plan the effects switched on, and the effects that the scene was made to call for."""
+    lines = []
+    for row in planned:
+        wanted = sorted(row["config"]["calls_for"])
+        on = sorted(name for name, decision in row["plan"].get("effects", {}).items() if decision["on"])
+        names = [", ".join(effects) or "nothing" for effects in (wanted, on)]
+        lines.append([row["scene"], row["seed"], *names, "as made" if on == wanted else "**otherwise**"])
+    right = sum(line[-1] == "as made" for line in lines)
+    columns = columns_of(["scene", Column("seed", 0), "made to call for", "planned", ""])
+    return Table(
+        columns, lines, f"{right} of {len(lines)} plans turn on what is called for and nothing else:"
+    )
+
+
+def trials(planned: Sequence[Row]) -> Table:
+    """List for every plan what its trials gained by each effect, ± two standard errors."""
+    gains = [(row, row["plan"].get("evidence", {}).get("trials", {})) for row in planned]
+    names = list(dict.fromkeys(name for _, of_plan in gains for name in of_plan))
+    lines = [
+        {name: Estimate(gain["psnr"], gain["noise"]) for name, gain in of_plan.items()} | row
+        for row, of_plan in gains
+        if of_plan
+    ]
+    caption = "dB on held-out training views that a trial with the effect has more; empty: not tried."
+    columns = {"scene": "scene", "seed": Column("seed", 0)}
+    columns |= {name: Column(name.replace("_", " "), signed=True) for name in names}
+    return Table.of(lines, columns, caption)

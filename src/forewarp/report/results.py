@@ -1,0 +1,474 @@
+"""Read runs into one table, a row a run, from which every page is a selection and a pivot.
+
+A row is a dictionary: what tells runs apart (``KEY``), scores by metric, ``NUMBERS`` and ``TEXTS``, None
+where unknown. The row of a run's folder also holds what its files say (see ``read_run``); a CSV file keeps
+rows of earlier runs without these.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import re
+import statistics
+from collections.abc import Iterable, Sequence
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import NamedTuple
+
+import yaml
+
+from forewarp.files import MOST_CONFIG, load_json, read_json, read_rows, read_text, replace_file
+from forewarp.metrics.gain import Estimate
+from forewarp.metrics.registry import metric_of
+
+Row = dict
+
+# Rows that differ in these are not compared; how each is named where rows differ in it.
+CONDITIONS = {
+    "clock": "{} clock",
+    "threads": "threads: {:g}",
+    "device": "{}",
+    "measured": "{}",
+    "pictures": "{}",
+    "iterations": "{:g} steps at most",
+    "held_out": "{:g} views held out",
+    "density": "stage.fine.density={:g}",
+    "steps_per_picture": "stage.fine.steps_per_picture={}",
+}
+KEY = ("method", "preset", "scene", "minutes", "seed", *CONDITIONS)
+SCORES = ("psnr", "ssim", "lpips")  # that a table has, whether measured or not
+NUMBERS = (
+    "steps",
+    "step",
+    "frame",
+    "parameters",
+    "memory",
+    "ends",
+    "motion_error",
+    "psnr_space",
+    "psnr_time",
+)
+NUMBERS += ("psnr_canonical", "size", "wall", "processor")
+TEXTS = ("dataset", "day", "commit", "departures", "faults", "views", "curve", "command")
+COUNTERPART = "counterpart of "  # begins the dataset of synthetic scenes that stand in for its own
+NETS = ("vgg", "alex", "squeeze")  # LPIPS in tables is of the first whose weights were there
+PROTOCOL = (
+    "half_resolution",
+    "scale",
+    "split",
+    "frames",
+    "views",
+    "train_frames",
+    "test_views",
+    "test_frames",
+)
+PROTOCOL += ("measured", "held_out", "canonical_time", "mask_box")  # what pages tell of a run's protocol
+OWN = "run|sheets|paths.runs|paths.data"  # keys that say where a run's files are, not what it is
+# What stands for the folders of whoever types a command again.
+PLACES = {"paths.scenes": "DATASETS", "data.root": "SCENES", "lpips_weights": "WEIGHTS"}
+UNREADABLE = OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError, yaml.YAMLError
+_ENDS = 0.1  # share of the time that counts as its first and last part
+_EARLY, _LATE = 0.95, 1.5  # of its minutes: less was ended by steps, more had a last step that took long
+_MOST = 1 << 24  # bytes of a table that is read back
+
+
+class Point(NamedTuple):
+    """A row of ``accuracy_time.csv``: PSNR (dB) of the held-out views after ``seconds`` of training.
+
+    ``epe`` is the error of moving points in world units; None if the truth is unknown.
+    """
+
+    seconds: float
+    psnr: float
+    step: int
+    epe: float | None = None
+
+
+class Runs(list[Row]):
+    """Rows, to select, group and average."""
+
+    def where(self, **equal: object) -> Runs:
+        """Select the rows that have these values."""
+        return Runs(row for row in self if all(row[name] == value for name, value in equal.items()))
+
+    def by(self, *names: str) -> dict:
+        """Group rows that are equal in ``names``, in the order of these: the value, or the values -> Runs."""
+        groups: dict[tuple, Runs] = {}
+        for row in self:
+            groups.setdefault(key_of(row, names), Runs()).append(row)
+        keys = sorted(groups, key=_order)
+        return {key[0] if len(names) == 1 else key: groups[key] for key in keys}
+
+    def newest(self, *names: str) -> tuple[Runs, Runs]:
+        """Of rows that are equal in ``names`` choose the one measured last; return these, and the others."""
+        last = {key_of(row, names): row for row in sorted(self, key=lambda row: row["measured_at"])}
+        kept = {id(row) for row in last.values()}
+        return Runs(row for row in self if id(row) in kept), Runs(row for row in self if id(row) not in kept)
+
+    def estimate(self, name: str) -> Estimate | None:
+        """Estimate a number over the rows that have it; None if none has."""
+        return Estimate.of([row[name] for row in self if row.get(name) is not None])
+
+    def mean(self, name: str) -> float | None:
+        """Average a number over the rows that have it; None if none has."""
+        found = self.estimate(name)
+        return found and found.mean
+
+    def summary(self, **more: object) -> Row:
+        """Make one row of runs that differ in the seed: estimates of numbers, else what the first has.
+
+        Args:
+            more: more cells.
+        """
+        estimates = {name: self.estimate(name) for name in (*self.scores(), *NUMBERS, "epe")}
+        return self[0] | {"seeds": len(self)} | estimates | more
+
+    def scores(self) -> list[str]:
+        """List the metrics of the rows in the order of tables: ``SCORES``, then those that were added."""
+        return list(dict.fromkeys([*SCORES, *(name for row in self for name in row["scores"])]))
+
+    def machines(self, more: str | None = None) -> str:
+        """Say in one line what runs were computed on: device, threads, and torch or the words of ``more``.
+
+        >>> row = {"device": "a cpu", "threads": 2.0, "torch": "2"}
+        >>> Runs([row, row | {"threads": None, "torch": None}]).machines()
+        'a cpu, 2 threads, torch 2; a cpu'
+        """
+        lines = {}
+        for row in (row for row in self if row["device"]):
+            threads = f"{row['threads']:g} thread{'s' * (row['threads'] != 1)}" if row["threads"] else ""
+            last = more.format(**row) if more is not None else row["torch"] and f"torch {row['torch']}"
+            lines[", ".join(filter(None, (row["device"], threads, last)))] = None
+        return "; ".join(lines) or "unknown"
+
+    def days(self) -> str:
+        """Say when rows were measured: a day, or from the first to the last."""
+        days = sorted({row["day"] for row in self if row["day"]})
+        return " to ".join(dict.fromkeys([*days[:1], *days[-1:]]))
+
+    def taken(self) -> tuple[bool, str]:
+        """Tell whether runs of equal minutes ended before these by their steps; and say so, or that they took
+        longer.
+
+        >>> Runs([{"clock": "wall", "wall": 301.0, "minutes": 20.0}]).taken()
+        (True, ' (ended after 5 min)')
+        >>> Runs([{"clock": "wall", "wall": 36.2, "minutes": 1 / 6}]).taken()  # a last step that took long
+        (False, ' (took 36 s)')
+        """
+        seconds, minutes = self.mean(self[0]["clock"]), self[0]["minutes"]
+        if seconds is None or _EARLY * minutes <= seconds / 60 <= _LATE * minutes:
+            return False, ""
+        early = seconds / 60 < minutes
+        return early, f" ({'ended after' if early else 'took'} {length(seconds / 60)})"
+
+    def commands(self, sweep: str) -> list[str]:
+        """List the commands that made the rows, without seeds; those that differ only in ``model=`` as one.
+
+        Args:
+            sweep: name of the sweep that gives jobs the processor clock, one thread and a folder each.
+
+        >>> row = {"command": "forewarp-train seed=1 scene=s run=r", "clock": "processor", "threads": 1.0}
+        >>> Runs([row]).commands("minutes")
+        ['forewarp-train --multirun sweeps=minutes scene=s']
+        >>> Runs([row | {"threads": 2.0}]).commands("minutes")
+        ['forewarp-train scene=s budget.clock=processor threads=2']
+        """
+        models: dict[str, dict[str, None]] = {}
+        for row in (row for row in self if row["command"]):
+            command = re.sub(r"\sseed=\S+", "", portable(row["command"]))
+            if row["clock"] != "wall" and "#" not in command:
+                command = re.sub(r"\s(budget\.clock|threads)=\S+", "", command)
+                of_sweep = (row["clock"], row["threads"]) == ("processor", 1)
+                if of_sweep and re.search(r" (data\.)?scene=", command):
+                    command = command.replace(
+                        "forewarp-train", f"forewarp-train --multirun sweeps={sweep}", 1
+                    )
+                else:
+                    command += f" budget.clock={row['clock']}"
+                    command += f" threads={row['threads']:g}" if row["threads"] else ""
+            model = re.search(r" model=(\S+)", command)
+            command = command.replace(model[0], " model={}", 1) if model else command
+            models.setdefault(command, {}).update({model[1]: None} if model else {})
+        lines = []
+        for command, names in models.items():
+            if len(names) > 1 and "--multirun" not in command:
+                command = command.replace("forewarp-train", "forewarp-train --multirun", 1)
+            lines.append(command.replace("model={}", f"model={','.join(names)}"))
+        return sorted(lines)
+
+
+def read_runs(root: Path, needed: Sequence[str] = ("metrics.json",)) -> tuple[Runs, list[str]]:
+    """Read all runs below a folder.
+
+    Args:
+        root: folder to search for ``config.yaml``.
+        needed: files that a run must hold.
+
+    Returns:
+        the runs in the order of their folders, and a line for each run that cannot be used.
+
+    Raises:
+        ValueError: if there is no run at all.
+    """
+    runs, left_out = Runs(), []
+    for folder in sorted(path.parent for path in Path(root).rglob("config.yaml")):
+        absent = [name for name in needed if not (folder / name).is_file()]
+        try:
+            row = read_run(folder)
+        except UNREADABLE as error:
+            left_out.append(f"{folder.relative_to(root)}: cannot be read ({unreadable(error)})")
+            continue
+        if absent:
+            again = "run its command again"
+            if absent == ["accuracy_time.csv"]:  # no views were held out
+                again = "run its command with data.held_out=8 into another folder"
+            left_out.append(f"{folder.relative_to(root)}: no {', '.join(absent)}; {again}")
+        else:
+            runs.append(row)
+    if not runs and not left_out:
+        raise ValueError(
+            f"{root}: expected folders of runs, but got none; make some with forewarp-train, or set runs=..."
+        )
+    # In names that are typed overrides, drop the overrides that all such runs of a scene share.
+    for of_scene in runs.where(typed=True).by("scene").values():
+        names = [overrides(row["ablation"]) for row in of_scene]
+        shared = set.intersection(*map(set, names)) if len({*map(tuple, names)}) > 1 else set()
+        for row, name in zip(of_scene, names):
+            kept = [override for override in name if override not in shared]
+            row["variant"] = row["ablation"] = " ".join(kept) or "base"
+    return runs, left_out
+
+
+def unreadable(error: Exception) -> str:
+    """Say in a few words why a run cannot be read."""
+    return f"no key {error}" if isinstance(error, KeyError) else str(error).split("\n")[0]
+
+
+def read_run(folder: Path) -> Row:
+    """Read a run's folder; files that are missing are empty.
+
+    Beside the columns of tables the row has the content of the files (``config``, ``stages`` by name,
+    ``metrics``, ``plan``, ``points`` of the curve), and
+
+    * ``images``: ``name``, ``time``, ``ability``, ``psnr`` and ``scores`` of measured test views;
+    * ``ablation``: name of the run's choice, None without one; ``typed``: whether it is typed overrides;
+    * ``variant``: that name, else method and preset; ``about`` it; ``against``: the variant to compare with;
+    * ``ability``: the kind of test view that scores are of: ``all``, else ``time`` (between training times),
+      else the first; ``test``: the scores of every kind; ``tested``: number of views scored, None: all;
+    * ``train`` (seconds), ``epe`` (world units), ``torch``, ``counterpart``, ``effects``, ``protocol``.
+    """
+    config = yaml.safe_load(read_text(folder / "config.yaml", MOST_CONFIG))
+    stages = {file.parent.name: load_json(file) for file in sorted(folder.glob("*/done.json"))}
+    metrics = load_json(folder / "metrics.json") if (folder / "metrics.json").is_file() else {}
+    measured_at = (folder / "metrics.json").stat().st_mtime_ns if metrics else 0
+    plan = read_text(folder / "plan.yaml", MOST_CONFIG) if (folder / "plan.yaml").is_file() else "{}"
+    points, images = read_points(folder), []
+    for image in (read_json(folder / "per_image.json") or {}).get("images", []):
+        scores = {name: float(value) for name, value in image["scores"].items() if value is not None}
+        scores = {name: value for name, value in scores.items() if math.isfinite(value)}
+        if "psnr" in scores and math.isfinite(time := float(image["time"])):
+            of_image = {"name": str(image.get("name")), "time": time, "ability": str(image.get("ability"))}
+            images.append({**of_image, "psnr": scores["psnr"], "scores": scores})
+    images.sort(key=lambda image: image["name"])
+
+    protocol, test, flow, sizes = (metrics.get(key) or {} for key in ("protocol", "test", "flow", "size"))
+    budget, variant, method = config["budget"], config.get("variant") or {}, config["model"]["name"]
+    ablation = str(variant["name"] or "base") if "name" in variant else None
+    command = str(config.get("command") or f"forewarp-train # as {folder / 'config.yaml'}")
+    preset, dataset = config["preset"]["name"], str(protocol.get("dataset", ""))
+    synthetic = bool(protocol.get("synthetic")) or ".Synthetic" in str(config["data"].get("_target_", ""))
+    stands_in = synthetic and not dataset.startswith("counterpart")
+    frames, tested = protocol.get("test_frames"), str(protocol.get("measured", "")).split(" ")[0]
+    row = {"folder": folder, "config": config, "stages": stages, "metrics": metrics, "images": images}
+    row |= {"points": points, "plan": yaml.safe_load(plan), "test": test, "measured_at": measured_at}
+    row |= {"method": method, "preset": preset, "command": command, "ablation": ablation}
+    row |= {"variant": ablation or f"{method}-{preset}", "typed": set(variant) == {"name"}}
+    row |= {"about": variant.get("about", ""), "against": variant.get("against")}
+    row |= {"scene": str(config["data"]["scene"]), "seed": int(config["seed"])}
+    row |= {"minutes": budget["minutes"], "iterations": budget.get("iterations")}
+    row |= {"clock": protocol.get("clock") or budget.get("clock") or "wall"}
+    row |= {name: protocol.get(name) for name in ("threads", "device", "commit", "departures", "faults")}
+    row |= {"torch": protocol.get("versions", {}).get("torch"), "held_out": protocol.get("held_out") or None}
+    row |= {"measured": protocol.get("measured", f"all {frames} test views" if frames else None)}
+    row |= {"tested": int(tested) if tested.isdigit() else None}  # as of "10 of 30 test views, evenly spread"
+    row |= {"counterpart": synthetic, "dataset": COUNTERPART * stands_in + dataset}
+    row |= {"day": datetime.fromtimestamp(measured_at / 1e9, timezone.utc).date().isoformat()}
+    row |= {"effects": ", ".join(name for name, on in (metrics.get("effects") or {}).items() if on)}
+    row |= {"curve": " ".join(f"{point.seconds:.1f}:{point.psnr:.2f}" for point in points)}
+    views = sorted((image["time"], image["psnr"]) for image in images)
+    row |= {"views": " ".join(f"{time:.4f}:{psnr:.2f}" for time, psnr in views), "ends": ends_below(views)}
+    for key, number in (("density", float), ("steps_per_picture", str)):
+        typed = re.search(rf"\sstage\.fine\.{key}=(\S+)", command)
+        row[key] = number(typed[1]) if typed else None
+
+    told = [f"{key.replace('_', ' ')} {_text(protocol[key])}" for key in PROTOCOL if protocol.get(key)]
+    row["pictures"] = pictures_in_words(protocol)
+    words = [dataset, row["pictures"] or "background unknown", *told, protocol.get("note")]
+    row["protocol"] = ", ".join(filter(None, words))
+
+    row |= {f"psnr_{kind}": test.get(kind, {}).get("psnr") for kind in ("space", "time", "canonical")}
+    row |= {clock: metrics.get("clocks", {}).get(clock) for clock in ("wall", "processor")}
+    row |= {"epe": flow.get("epe_moving"), "steps": sum(done["steps"] for done in stages.values())}
+    row["motion_error"] = flow["epe_moving"] / flow["motion_mean"] if flow.get("motion_mean") else None
+    last = read_rows(folder / "accuracy_time.csv")[-1:]
+    sizes = [*sizes.values(), *(float(point["size"]) for point in last if point.get("size"))]
+    row["size"] = float(sizes[0]) if sizes else None
+    row |= dict.fromkeys(("train", "step", "frame", "memory", "parameters"))
+    if metrics:
+        row["train"], row["frame"] = metrics["seconds"]["train"], metrics["seconds"].get("render_per_frame")
+        row["step"] = row["train"] / row["steps"] if row["steps"] else None
+        row["memory"] = metrics["peak_memory_bytes"] / 2**30 if metrics.get("peak_memory_bytes") else None
+        row["parameters"] = metrics["parameters"] / 1e6
+    # The metrics that tables of many runs show; of LPIPS that of one net.
+    row["ability"] = [*(kind for kind in ("all", "time") if kind in test), *test, "all"][0]
+    scores = test.get(row["ability"], {})
+    nets = [scores[f"lpips_{net}"] for net in NETS if scores.get(f"lpips_{net}") is not None]
+    shown = {n: score for n, score in scores.items() if metric_of(n).summary and not n.startswith("lpips_")}
+    scores = dict.fromkeys(SCORES) | shown | {"lpips": nets[0] if nets else None}
+    return row | scores | {"scores": scores}
+
+
+def read_points(folder: Path) -> tuple[Point, ...]:
+    """Read the rows of a run's ``accuracy_time.csv``; a missing file has none."""
+    return tuple(
+        Point(float(row["seconds"]), float(row["psnr"]), int(row["step"]), _number(row["epe_moving"]))
+        for row in read_rows(folder / "accuracy_time.csv")
+    )
+
+
+def pictures_in_words(protocol: dict) -> str | None:
+    """Say how large pictures are and over which background; None if the protocol does not tell.
+
+    >>> pictures_in_words({"resolution": [[90, 60], [80, 60]], "reduced": 2, "background": "white"})
+    '90x60 and 80x60 reduced 2x2, background white'
+    """
+    sizes = protocol.get("resolution", [])
+    sizes = sizes if sizes and isinstance(sizes[0], list) else [sizes]
+    size = " and ".join("x".join(map(str, sides)) for sides in sizes)
+    if by := protocol.get("reduced"):
+        size = f"{size} reduced {by}x{by}".strip()
+    background = f"background {protocol['background']}" if "background" in protocol else ""
+    return ", ".join(filter(None, (size, background))) or None
+
+
+def _text(value: object) -> str:
+    if isinstance(value, dict):
+        return ", ".join(f"{name} {part}" for name, part in value.items())
+    return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
+
+
+def ends_below(views: Sequence[tuple[float, float]]) -> float | None:
+    """By how many dB the mean of the views (time, PSNR) at both ends is below the median of the others.
+
+    >>> ends_below([(0.0, 30.0), (0.05, 31.0), (0.5, 34.0), (0.6, 33.0), (1.0, 32.0)])
+    2.5
+    """
+    ends = [psnr for time, psnr in views if not _ENDS < time < 1 - _ENDS]
+    others = [psnr for time, psnr in views if _ENDS < time < 1 - _ENDS]
+    return statistics.median(others) - statistics.fmean(ends) if ends and others else None
+
+
+def overrides(name: str) -> list[str]:
+    """Split a name into its typed overrides, without spaces inside them.
+
+    >>> overrides("preset.rays=64 stage.fine.num_voxels=[[0, 8000]] ~stage.coarse")
+    ['preset.rays=64', 'stage.fine.num_voxels=[[0,8000]]', '~stage.coarse']
+    """
+    return [re.sub(r"\s", "", part) for part in re.split(r"\s+(?=[+~]|[\w./]+=)", name) if part]
+
+
+def add_to_table(file: Path, rows: Iterable[Row]) -> Runs:
+    """Add rows to those of a CSV file, which is written; return all.
+
+    Of rows with the same ``KEY`` the one measured last stays; a run beats a row of its day.
+
+    Raises:
+        ValueError: if there would be no row.
+    """
+    known = (
+        [_read(row) for row in csv.DictReader(io.StringIO(read_text(file, _MOST)))] if file.is_file() else []
+    )
+    rows = [row | {"command": portable(row["command"])} for row in rows]
+    known += sorted(rows, key=lambda row: row["measured_at"])
+    if not known:
+        raise ValueError(
+            "runs: expected measured runs that ended after minutes, but got none; set budget.minutes"
+        )
+    last = {key_of(row, KEY): row for row in sorted(known, key=lambda row: row["day"] or "")}
+    runs = Runs(last[key] for key in sorted(last, key=_order))
+    text, fields = io.StringIO(), (*KEY, *runs.scores(), *NUMBERS, *TEXTS)
+    writer = csv.DictWriter(text, fields, extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(runs)  # None is empty
+    replace_file(file, text.getvalue())
+    return runs
+
+
+def _read(row: dict[str, str]) -> Row:
+    """Turn a row of a CSV file into one of ``read_run``; an older table lacks some columns."""
+    scores = [*SCORES, *(name for name in row if name not in (*KEY, *SCORES, *NUMBERS, *TEXTS))]
+    numbers = ("minutes", "threads", "iterations", "held_out", "density", *scores, *NUMBERS)
+    typed = {name: row.get(name) or None for name in (*KEY, *TEXTS)}
+    typed |= {name: _number(row.get(name)) for name in numbers}
+    if " scene=counterpart_" in (typed["command"] or "") and not typed["dataset"].startswith("counterpart"):
+        typed["dataset"] = COUNTERPART + typed["dataset"]
+    typed |= {"seed": int(row["seed"]), "clock": typed["clock"] or "wall"}
+    return typed | {"scores": {name: typed[name] for name in scores}}
+
+
+def _number(text: str | None) -> float | None:
+    return float(text) if text else None
+
+
+def key_of(row: Row, names: Iterable[str]) -> tuple:
+    """Return a row's values; where all test views were measured, that is None, as in older tables."""
+    every = "measured" in row and (row["measured"] or "").startswith("all ")
+    return tuple(None if every and name == "measured" else row[name] for name in names)
+
+
+def _order(key: tuple) -> list[tuple]:
+    """Sort keys by their parts, what is unknown first."""
+    return [(part is not None, part) for part in key]
+
+
+def in_words(row: Row, others: Iterable[Row], names: Iterable[str] = CONDITIONS) -> list[str]:
+    """Say in a word each which of a row's ``names`` some of the other rows do not share.
+
+    >>> rows = [{"clock": clock, "threads": 1.0} for clock in ("wall", "processor")]
+    >>> in_words(rows[0], rows, ("clock", "threads"))
+    ['wall clock']
+    """
+    differ = [name for name in names if len({key_of(other, (name,)) for other in (row, *others)}) > 1]
+    return [CONDITIONS.get(name, "{}").format(row[name]) for name in differ if row[name] is not None]
+
+
+def pairs(text: str | None) -> list[tuple[float, float]]:
+    """Read what a row has in ``views`` and ``curve``.
+
+    >>> pairs("0.5:30.25 1:31")
+    [(0.5, 30.25), (1.0, 31.0)]
+    """
+    return [tuple(map(float, pair.split(":"))) for pair in (text or "").split()]
+
+
+def length(minutes: float) -> str:
+    """Spell a length of training.
+
+    >>> length(1 / 30), length(1.0), length(2.5)
+    ('2 s', '1 min', '2.5 min')
+    """
+    return f"{60 * minutes:.0f} s" if minutes < 1 else f"{round(minutes, 1):g} min"
+
+
+def portable(command: str) -> str:
+    """Write a command without the folders of whoever typed it.
+
+    >>> portable("forewarp-train seed=1 paths.scenes=/data paths.runs=r model=forward")
+    'forewarp-train seed=1 paths.scenes=DATASETS model=forward'
+    """
+    command = re.sub(rf"\s({OWN})=\S+", "", command)
+    for key, word in PLACES.items():
+        command = re.sub(rf"(\s{re.escape(key)}=)\S+", rf"\g<1>{word}", command)
+    return command

@@ -1,0 +1,152 @@
+"""Pages of choices, of runs that nobody trained: accuracy against time, the price list, effects."""
+
+import os
+
+import yaml
+
+from forewarp.report.benchmark import Published
+from forewarp.report.choices import choices, write_accuracy_time, write_effects, write_price_list
+from forewarp.report.results import read_runs
+from tests.support.runs_on_disk import rows_of, write_run
+
+SLOW, QUICK = ((10, 20.0), (20, 24.0), (40, 25.0)), ((5, 24.0), (10, 24.9), (20, 26.0))
+
+
+def test_each_decibel_names_the_first_to_reach_it_in_all_seeds(tmp_path):
+    runs = tmp_path / "runs"
+    write_run(runs, "base", 0, curve=((10, 24.0), (20, 25.2), (40, 25.5)))
+    write_run(runs, "base", 1, curve=((10, 24.5), (30, 25.2), (40, 25.5)))
+    write_run(runs, "good", 0, curve=((15, 23.0), (35, 27.0), (60, 27.5)))
+    write_run(runs, "lucky", 0, curve=((1, 26.0), (2, 26.0)))
+    write_run(runs, "lucky", 1, curve=((90, 26.0), (99, 26.0)))
+    page, picture, table = write_accuracy_time(runs, tmp_path / "out")
+    text = page.read_text()
+    assert rows_of(text, "24") == [["24", "10.0 ± 0.0", "base", "`forewarp-train variant=base seed=0`"]]
+    assert rows_of(text, "25")[0][1:3] == ["25.0 ± 7.1", "base"]
+    assert rows_of(text, "26")[0][1:3] == rows_of(text, "27")[0][1:3] == ["35.0", "good"]
+    assert rows_of(text, "28") == []
+    assert "seconds to 25 dB" in text  # what the base reaches
+    assert rows_of(text, "base")[0][1:] == ["1.0", "2", "25.0 ± 7.1", "25.50 ± 0.00", "", "100 ± 0"]
+    csv = table.read_text().splitlines()
+    assert csv[0].startswith("variant,minutes,seeds,seconds to 25 dB,seconds to 25 dB sd,PSNR")
+    assert (len(csv), picture.name) == (4, "accuracy-time-ball.png")
+
+
+def test_a_target_of_ones_own_and_what_has_no_curve(tmp_path):
+    write_run(tmp_path / "runs", epe=0.25)
+    write_run(tmp_path / "runs", "failed", curve=None)
+    write_run(tmp_path / "runs", "killed", psnr=None)
+    other = Published("other", 100.0, 32.0, "a GPU", "its paper", "dnerf")
+    page = write_accuracy_time(tmp_path / "runs", tmp_path, target=20.0, published=[other])[0].read_text()
+    assert rows_of(page, "base")[0][3:6] == ["10.0", "25.50", "0.2500"]
+    assert "* ball/failed-1.0-seed0: no accuracy_time.csv; run its command with data.held_out=8" in page
+    assert "* ball/killed-1.0-seed0: no metrics.json; run its command again" in page
+    assert not rows_of(page, "killed")
+    assert "* other: 32 dB, 100 s, a GPU; its paper" in page
+
+
+def test_changes_are_against_the_same_seed(tmp_path):
+    runs = tmp_path / "runs"
+    write_run(runs, "base", 0, psnr=30.0, epe=0.2)
+    write_run(runs, "base", 1, psnr=28.0, epe=0.2)
+    write_run(runs, "grid_64", 0, psnr=29.0, steps=200, epe=0.1)
+    write_run(runs, "grid_64", 1, psnr=27.5, steps=200, epe=0.1)
+    write_run(runs, "unet_16", 0, psnr=30.5, steps=50, against="grid_64")
+    # Named by what was typed; what all of them share is no part of their names.
+    write_run(runs, "data.box=null", 2, psnr=20.0, against=None)
+    write_run(runs, "data.box=null preset.rays=64", 2, psnr=21.0, against=None)
+    write_run(runs, "data.box=null model=backward preset.rays=64", 2, psnr=21.5, against=None)
+    write_run(runs, "alone", 5)
+    write_run(runs, "failed", psnr=None)
+    page, file = write_price_list(runs, tmp_path / "out")
+    text = page.read_text()
+    own, change = rows_of(text, "grid_64")
+    assert own[1:3] == ["2", "28.25 ± 1.06"]
+    assert change[1:5] == ["base", "2", "-0.75 ± 0.35", "+0.0000 ± 0.0000"]
+    assert change[5:] == ["-0.1000 ± 0.0000", "×0.50 ± 0.00", *["×1.00 ± 0.00"] * 3, "×2.00 ± 0.00"]
+    assert rows_of(text, "unet_16")[0][1:6] == ["grid_64", "1", "+1.50", "+0.0000", ""]
+    assert rows_of(text, "preset.rays=64")[1][1:4] == ["base", "1", "+1.00"]
+    assert rows_of(text, "model=backward preset.rays=64")[0][1:4] == ["preset.rays=64", "1", "+0.50"]
+    assert len(rows_of(text, "base")) == 1
+    assert rows_of(text, "alone")[0][2:4] == ["0", ""]  # nothing to compare it with
+    assert "Of all test views:" in text
+    assert "* ball/failed-1.0-seed0: no metrics.json" in text
+    lines = file.read_text().splitlines()
+    assert lines[0].startswith("scene,variant,minutes,seed,views,PSNR (dB),SSIM,EPE,s/step,")
+    assert len(lines) == 10
+
+
+def test_scenes_and_minutes_stand_apart_and_the_page_is_named_after_most_runs(tmp_path):
+    for scene, minutes, model in (
+        ("ball", 1.0, "particles"),
+        ("ball", 3.0, "particles"),
+        ("cube", None, "forward"),
+    ):
+        write_run(tmp_path, scene=scene, minutes=minutes, ability="time", config={"model": {"name": model}})
+    page, table = write_price_list(tmp_path, tmp_path / "out")
+    assert (page.name, table.name) == ("price-list-particles.md", "price-list-particles.csv")
+    text = page.read_text()
+    heads = [line for line in text.splitlines() if line.startswith("## ")]
+    assert heads == ["## ball, 1 minutes", "## ball, 3 minutes", "## cube, bounded by steps"]
+    assert "Of test views between the training times:" in text
+
+
+def write_choice(
+    root, choice, *, scene="ball", seed=0, calls_for=None, on=(), psnr=30.0, curve=SLOW, model="forward"
+):
+    """A run of a choice; of ``auto`` with its plan."""
+    own = {"calls_for": calls_for, "model": {"name": model}}
+    more = {"scene": scene, "psnr": psnr, "curve": curve, "against": "all_effects"}
+    folder = write_run(root, choice, seed, **more, config=own)
+    if choice == "auto":
+        effects = {
+            name: {"choice": "x" if name in on else "none", "on": name in on, "because": f"{name}, 3 %"}
+            for name in ("motion", "view")
+        }
+        trials = {name: {"psnr": 1.25, "noise": 0.5} for name in on}
+        plan = {"overrides": [], "effects": effects, "seconds": 12.5, "evidence": {"trials": trials}}
+        (folder / "plan.yaml").write_text(yaml.safe_dump(plan))
+    return folder
+
+
+def test_the_page_of_effects_compares_and_says_why(tmp_path):
+    write_choice(tmp_path / "runs", "auto", calls_for=["motion"], on=["motion"], psnr=31.0, curve=QUICK)
+    write_choice(tmp_path / "runs", "all_effects", calls_for=["motion"], psnr=30.0)
+    write_choice(tmp_path / "runs", "auto", calls_for=[], on=["view"], scene="cube")
+    write_choice(tmp_path / "runs", "auto", calls_for=[], scene="cube", seed=1)
+    write_choice(tmp_path / "runs", "auto", scene="hook", on=["motion", "view"], psnr=27.0)
+    write_choice(tmp_path / "more", "auto", on=["view"], model="particles")
+    page, table, *others = write_effects(tmp_path, tmp_path / "out")
+    assert [file.name for file in others] == ["effects-particles.md", "effects-particles.csv"]
+    assert others[0].read_text().startswith("# Only the effects a scene calls for: model=particles")
+    text = page.read_text()
+    ball, specimen = rows_of(text.partition("## Other")[0], "ball")
+    assert ball[1:] == ["1", "31.00", "30.00", "+1.00", "10", "50", "12"]
+    assert specimen[1:] == ["0", "motion", "motion", "as made"]
+    cubes = [row[2:] for row in rows_of(text, "cube")[1:3]]
+    assert cubes == [["nothing", "view", "**otherwise**"], ["nothing", "nothing", "as made"]]
+    assert "2 of 3 plans turn on what is called for and nothing else" in text
+    gains = text.partition("## What each effect is worth")[2]
+    assert rows_of(gains, "hook") == [["hook", "0", "+1.25 ± 0.50", "+1.25 ± 0.50"]]
+    assert "* view: **x**. view, 3 %" in text.partition("### hook")[2]
+    assert text.index("## Specimens") < text.index("## Other scenes") < text.index("## Why")
+    assert len(table.read_text().splitlines()) == 6
+
+
+def test_seeds_are_paired_and_what_is_missing_is_empty(tmp_path):
+    for seed in (0, 1):
+        write_choice(tmp_path, "auto", seed=seed, psnr=30.0 + seed)
+    write_choice(tmp_path, "all_effects", seed=1, psnr=30.5)
+    write_choice(tmp_path, "auto", scene="hook")
+    rows = choices(read_runs(tmp_path)[0]).rows
+    assert rows[0][4].mean == 0.5  # of the second seed alone
+    assert rows[1][3:7] == [None, None, None, None]
+    assert rows[2][3] is None
+
+
+def test_of_two_runs_of_a_choice_the_last_one_counts(tmp_path):
+    write_choice(tmp_path / "a", "auto", psnr=20.0)
+    last = write_choice(tmp_path / "b", "auto", psnr=31.0)
+    os.utime(last / "metrics.json", (2e9, 2e9))
+    text = write_effects(tmp_path, tmp_path / "out")[0].read_text()
+    assert rows_of(text, "ball")[0][2] == "31.00"
