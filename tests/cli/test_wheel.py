@@ -11,7 +11,7 @@ import pytest
 
 from tests.support.configs import CONF, ROOT
 
-DATA = ("paper.yaml", "published.yaml", "run_page.css", "run_page.js")  # of reports
+DATA = ("*.yaml", "templates/*")  # of reports
 SMALL = [
     *("experiment=demo", "trainer=cpu", "threads=1", "sheets=1"),
     *("data.synthesis.size=32", "data.synthesis.frames=5", "data.synthesis.test_views=[1,1,1]"),
@@ -71,7 +71,9 @@ def test_the_wheel_holds_every_configuration_and_what_reports_need(wheel):
     names = set(zipfile.ZipFile(wheel).namelist())
     wanted = {f"forewarp/conf/{name}" for name in files(CONF)}
     wanted |= {f"forewarp/sweeps/{name}" for name in files(ROOT / "sweeps")}
-    assert wanted | {f"forewarp/report/{name}" for name in DATA} <= names
+    report = ROOT / "src" / "forewarp" / "report"
+    wanted |= {f"forewarp/report/{file.relative_to(report)}" for kind in DATA for file in report.glob(kind)}
+    assert wanted <= names
     assert {name.split("/")[0].partition("-")[0] for name in names} == {"forewarp", "hydra_plugins"}
     assert "hydra_plugins/forewarp_one_at_a_time.py" in names
 
