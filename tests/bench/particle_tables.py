@@ -141,7 +141,7 @@ def plain_times(loop: Loop, size: Size) -> dict[str, float]:
         found["forward: a picture's"] = times * timed(lambda: rasterize(splats, smaller, smaller), FEW)
         found["forward, loss and backward"] = times * timed(lambda: compare(*little, truth, WHITE), FEW)
         leaves = Gaussians(*(part.clone().requires_grad_() for part in particles))
-        numbers = project(leaves, *seen[1:]).numbers.sum()
+        numbers = project(leaves, *seen[1:]).values.sum()
         found["chain, back to particles and nodes"] = timed(lambda: numbers.backward(retain_graph=True), FEW)
         skin = method.skin
         found["weights of nodes"] = timed(lambda: skin_weights(skin.shares, skin.learned.detach()), FEW)

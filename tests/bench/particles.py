@@ -90,7 +90,7 @@ def photograph(particles: Gaussians, view: Camera) -> Tensor:
     still = Warp(torch.zeros(1, 12), none.int(), none)
     splats = project(changed, still, pinhole_of(view, 0.3), torch.zeros(0), torch.ones(1))
     drawn = rasterize(splats, view.width, view.height)
-    solid = 1 - drawn.through
+    solid = 1 - drawn.transmittance
     straight = (drawn.color / solid.clamp(min=1e-6)).clamp(0, 1)
     return (255 * torch.cat([straight, solid[None]])).round().to(torch.uint8).permute(1, 2, 0).contiguous()
 

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from forewarp.methods.rows import RowsAdam
-from forewarp.ops.adam import Learned, adam_rows
+from forewarp.ops.adam import AdamState, adam_rows
 
 
 def state(shape=(6, 3), seed=0):
@@ -13,7 +13,7 @@ def state(shape=(6, 3), seed=0):
 
 def step(parts, gradient, rate=0.1):
     value, mean, square, steps = parts
-    adam_rows([Learned(value, gradient, mean, square, steps, rate)], (0.9, 0.99), 1e-15)
+    adam_rows([AdamState(value, gradient, mean, square, steps, rate)], (0.9, 0.99), 1e-15)
 
 
 @pytest.mark.parametrize("shape", [(6, 3), (37, 4), (40, 1), (33, 17)])
@@ -162,7 +162,7 @@ def test_many_parameters_take_a_step_at_one_go(backend):
     rates = [0.1 * (1 + number) for number in range(len(shapes))]
     for parts, gradient, rate in zip(alone, gradients, rates):
         step(parts, gradient, rate)
-    learned = [Learned(v, g, m, s, n, r) for (v, m, s, n), g, r in zip(together, gradients, rates)]
+    learned = [AdamState(v, g, m, s, n, r) for (v, m, s, n), g, r in zip(together, gradients, rates)]
     adam_rows(learned, (0.9, 0.99), 1e-15)
     for one, other in zip(alone, together):
         for part, twin in zip(one, other):

@@ -155,7 +155,7 @@ def test_what_is_not_seen_has_a_gradient_of_zero(uncleared, two_threads, monkeyp
     leaves = [part.clone().requires_grad_() for part in (*particles, warp.weights)]
     own = warp._replace(weights=leaves[5])
     splats = project(Gaussians(*leaves[:5]), own, pinhole(), tints, fades)
-    (splats.numbers.sum() + rasterize(splats, *SIZE).color.sum()).backward()
+    (splats.values.sum() + rasterize(splats, *SIZE).color.sum()).backward()
     for leaf in leaves:
         assert bool(leaf.grad.isfinite().all())
         assert not bool(leaf.grad[hidden].any())

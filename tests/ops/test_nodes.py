@@ -86,12 +86,12 @@ def pull(motion=zeros(7, 6), places=zeros(7, 3), edges=zeros(7, 2).long(), weigh
     pull_nodes(motion, places, zeros(7, by), edges, weights, 1.0)
 
 
-def carry(shift=zeros(7, 2, 3), turn=None, basis=zeros(2), places=zeros(7, 3)):  # noqa: B008
-    carry_nodes(shift, turn, basis, places)
+def carry(shift=zeros(7, 2, 3), rotation=None, basis=zeros(2), places=zeros(7, 3)):  # noqa: B008
+    carry_nodes(shift, rotation, basis, places)
 
 
-def spread(shift=zeros(7, 2, 3), turn=None, slope=zeros(7, 6), basis=zeros(2), bend=zeros(2)):  # noqa: B008
-    spread_nodes(shift, turn, slope, basis, bend, 1.0, 1.0)
+def spread(shift=zeros(7, 2, 3), rotation=None, by_motion=zeros(7, 6), basis=zeros(2), bend=zeros(2)):  # noqa: B008
+    spread_nodes(shift, rotation, by_motion, basis, bend, 1.0, 1.0)
 
 
 @pytest.mark.parametrize(
@@ -106,11 +106,11 @@ def spread(shift=zeros(7, 2, 3), turn=None, slope=zeros(7, 6), basis=zeros(2), b
         (partial(pull, weights=zeros(7, 1)), r"weights: expected shape \(7, 2\)"),
         (partial(pull, by=9), r"by_maps: expected shape \(7, 12\)"),
         (partial(carry, shift=zeros(7, 3, 3)), r"shift: expected shape \(7, 2, 3\)"),
-        (partial(carry, turn=zeros(3, 2, 3)), r"turn: expected shape \(7, 2, 3\)"),
+        (partial(carry, rotation=zeros(3, 2, 3)), r"rotation: expected shape \(7, 2, 3\)"),
         (partial(carry, places=zeros(7, 2)), r"places: expected shape \(M, 3\)"),
         (partial(spread, shift=zeros(7, 2, 2)), r"shift: expected shape \(M, K, 3\)"),
-        (partial(spread, turn=zeros(3, 2, 3)), r"turn: expected shape \(7, 2, 3\)"),
-        (partial(spread, slope=zeros(3, 6)), r"slope: expected shape \(7, 6\)"),
+        (partial(spread, rotation=zeros(3, 2, 3)), r"rotation: expected shape \(7, 2, 3\)"),
+        (partial(spread, by_motion=zeros(3, 6)), r"by_motion: expected shape \(7, 6\)"),
         (partial(spread, basis=zeros(3)), r"basis: expected shape \(2\)"),
         (partial(spread, bend=zeros(3)), r"bend: expected shape \(2\)"),
     ],

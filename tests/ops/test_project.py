@@ -23,7 +23,7 @@ def float32(values):
 def test_hand_worked(backend):
     # 4 units away a unit is 10 pixels, a deviation of 0.2 two pixels, its variance 4 + 0.1.
     splats = seen(one((0.1, -0.2, 0.0), scale=0.2, opacity=math.log(3), color=(0.1, 0.2, -0.6)))
-    u, v, a, b, c, solid, *color, distance = splats.numbers[0].tolist()
+    u, v, a, b, c, solid, *color, distance = splats.values[0].tolist()
     # Beside the axis the slopes of depth add a little to the variance.
     wide, high = 4.1 + (2 * 0.1 / 4) ** 2, 4.1 + (2 * 0.2 / 4) ** 2
     beside = -(2 * 0.1 / 4) * (2 * 0.2 / 4)
@@ -42,8 +42,8 @@ def test_a_node_carries_and_turns_what_follows_it(backend):
     quarter = torch.tensor([[-1.0, -1, 0, 1, -1, 0, 0, 0, 0, 0, 0.2, 0]])  # about z, then along y
     warp = Warp(quarter, torch.zeros(1, 1, dtype=torch.int32), torch.ones(1, 1))
     splats = seen(particle, warp=warp)
-    assert splats.numbers[0, :2].tolist() == pytest.approx([8.0, 11.0], abs=1e-5)
-    assert splats.numbers[0, 2] > 10 * splats.numbers[0, 4]  # a needle that now stands upright
+    assert splats.values[0, :2].tolist() == pytest.approx([8.0, 11.0], abs=1e-5)
+    assert splats.values[0, 2] > 10 * splats.values[0, 4]  # a needle that now stands upright
 
 
 @pytest.mark.parametrize("lens", [{}, LENS])
@@ -54,7 +54,7 @@ def test_kernel_equals_reference(degree, lens):
     exact = project(particles, warp, camera, tints, fades)
     fast = project(float32(particles), float32(warp), camera, tints.float(), fades.float())
     assert int((exact.reach[:, 0] > 0).sum()) > 40
-    torch.testing.assert_close(fast.numbers.double(), exact.numbers, rtol=2e-5, atol=2e-5)
+    torch.testing.assert_close(fast.values.double(), exact.values, rtol=2e-5, atol=2e-5)
     torch.testing.assert_close(fast.reach.double(), exact.reach, rtol=2e-5, atol=2e-5)
 
 
@@ -72,9 +72,9 @@ def test_gradients_of_kernel_equal_those_of_the_reference(lens):
             fades.to(kind),
         )
         slopes = torch.randn(
-            splats.numbers.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64
+            splats.values.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64
         )
-        (splats.numbers * slopes.to(kind)).sum().backward()
+        (splats.values * slopes.to(kind)).sum().backward()
         found.append([leaf.grad.double() for leaf in leaves])
     for exact, fast in zip(*found):
         assert float((exact - fast).norm() / exact.norm()) < 1e-5
@@ -86,7 +86,7 @@ def test_gradients_do_not_depend_on_how_particles_lie_in_memory():
     for means in (particles.means, particles.means.T.contiguous().T):
         leaf = means.detach().requires_grad_()
         splats = project(particles._replace(means=leaf), warp, pinhole(), tints.float(), fades.float())
-        splats.numbers.sum().backward()
+        splats.values.sum().backward()
         found.append(leaf.grad)
     assert float(found[0].norm()) > 0
     torch.testing.assert_close(found[0], found[1])
@@ -97,7 +97,7 @@ def test_gradcheck():
 
     def numbers(*leaves):
         own = Warp(leaves[5], warp.links, leaves[6])
-        return project(Gaussians(*leaves[:5]), own, pinhole(), tints, fades).numbers
+        return project(Gaussians(*leaves[:5]), own, pinhole(), tints, fades).values
 
     leaves = [t.clone().requires_grad_() for t in (*particles, warp.maps, warp.weights)]
     assert gradcheck(numbers, leaves, atol=1e-6)
@@ -108,7 +108,7 @@ def test_a_lens_bends_as_it_does_elsewhere(backend):
     splats = seen(particle, straight(**LENS))
     plane = torch.tensor([0.3 / 4.5, -0.2 / 4.5])
     expected = 40 * distort(plane, LENS["radial"], LENS["tangential"]) + 8
-    torch.testing.assert_close(splats.numbers[0, :2], expected)
+    torch.testing.assert_close(splats.values[0, :2], expected)
 
 
 @pytest.mark.parametrize(
@@ -130,9 +130,9 @@ def test_what_is_not_seen_has_no_reach_and_no_gradient(backend, particle):
     leaves = Gaussians(*(t.clone().requires_grad_() for t in particle))
     splats = seen(leaves)
     assert splats.reach.tolist() == [[0.0, 0.0]]
-    assert splats.numbers.tolist() == [[0.0] * 10]
+    assert splats.values.tolist() == [[0.0] * 10]
     if all(bool(t.isfinite().all()) for t in particle):
-        splats.numbers.sum().backward()
+        splats.values.sum().backward()
         assert not any(bool(leaf.grad.any()) for leaf in leaves if leaf.grad is not None)
 
 
@@ -143,28 +143,28 @@ def test_extreme_particles_are_finite(backend, scale, opacity, quaternion):
     particle = one((0.1, 0.1, 0.0), scale=scale, opacity=opacity, quaternion=quaternion)
     leaves = Gaussians(*(t.clone().requires_grad_() for t in particle))
     splats = seen(leaves)
-    assert bool(splats.numbers.isfinite().all())
+    assert bool(splats.values.isfinite().all())
     assert splats.reach[0, 0] > 0
-    splats.numbers.sum().backward()
+    splats.values.sum().backward()
     assert all(bool(leaf.grad.isfinite().all()) for leaf in leaves)
 
 
 def test_a_quaternion_of_length_0_turns_nothing(backend):
-    flat = seen(one(scale=(0.3, 0.1, 0.2), quaternion=(0.0, 0.0, 0.0, 0.0))).numbers
-    torch.testing.assert_close(flat, seen(one(scale=(0.3, 0.1, 0.2))).numbers)
+    flat = seen(one(scale=(0.3, 0.1, 0.2), quaternion=(0.0, 0.0, 0.0, 0.0))).values
+    torch.testing.assert_close(flat, seen(one(scale=(0.3, 0.1, 0.2))).values)
 
 
 def test_no_particles_at_all(backend):
     particles, warp, tints, fades = crowd(count=0, dtype=torch.float32)
     splats = project(particles, warp, pinhole(), tints, fades)
-    assert splats.numbers.shape == (0, 10)
+    assert splats.values.shape == (0, 10)
 
 
 def test_time_changes_colour_and_opacity(backend):
     particles = one()._replace(opacity=torch.tensor([[0.5, 2.0]]), colors=torch.ones(1, 2, 3))
     splats = project(particles, still(particles), straight(), torch.tensor([0.1]), torch.tensor([1.0, -0.5]))
-    assert splats.numbers[0, 5].item() == pytest.approx(1 / (1 + math.exp(0.5)))
-    assert splats.numbers[0, 6].item() == pytest.approx(0.5 + 0.28209479 + 0.1)
+    assert splats.values[0, 5].item() == pytest.approx(1 / (1 + math.exp(0.5)))
+    assert splats.values[0, 6].item() == pytest.approx(0.5 + 0.28209479 + 0.1)
 
 
 def test_harmonics_are_orthonormal():

@@ -63,7 +63,8 @@ def test_the_robust_function():
 
 
 @pytest.mark.parametrize(
-    ("turn", "match"), [(torch.zeros(4, 3), "turn: expected shape"), (torch.zeros(5, 2), "turn: expected")]
+    ("turn", "match"),
+    [(torch.zeros(4, 3), "rotation: expected shape"), (torch.zeros(5, 2), "rotation: expected")],
 )
 def test_shapes_that_do_not_fit(turn, match):
     with pytest.raises(ValueError, match=match):

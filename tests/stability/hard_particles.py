@@ -116,7 +116,7 @@ def drawn(hard: Hard) -> tuple:
         over_time = (t.to(leaves[0]) for t in hard[3:])
         splats = project(Gaussians(*leaves[:5]), warp, hard.camera, *over_time)
         picture = rasterize(splats, *hard.camera.size)
-        return torch.cat([picture.color, picture.far[None], picture.through[None]])
+        return torch.cat([picture.color, picture.depth[None], picture.transmittance[None]])
 
     return planes, [*hard.particles, hard.warp.maps, hard.warp.weights]
 
@@ -144,13 +144,13 @@ def node_cases() -> Iterator[Case]:
         yield "stiffness", name, lambda m, p=at: stiffness(m, p.to(m), edges, shares.to(m)), [own]
         pulled = lambda m, p=at: pull_nodes(m, p.to(m), m.repeat(1, 2), edges, shares.to(m), 0.7)[0]  # noqa: E731
         yield "pull_nodes", name, lambda m, f=pulled: f(m.detach()), [own]
-    shift, bend = uniform(23, 30, 9, 3, low=-1), spline_basis(0.4, 9, 0.0).double()
+    shift, bend = uniform(23, 30, 9, 3, low=-1), spline_basis(0.4, 9).double()
     for name, unit in (("a world of 1", 1.0), ("a world of 1e-3", 1e-3), ("a world of 1e3", 1e3)):
         both = lambda s, u=unit: spread_nodes(  # noqa: E731
             s.detach(), None, s.detach()[:, 0].repeat(1, 2), bend.to(s), bend.to(s), 3.0, u
         )
         yield "spread_nodes", name, lambda s, f=both: f(s)[0], [(unit * shift).float().double()]
-    yield "spline_basis", "41 times", lambda t: spline_basis(t.detach(), 22, 0.3), [uniform(24, 41)]
+    yield "spline_basis", "41 times", lambda t: spline_basis(t.detach(), 22), [uniform(24, 41)]
 
 
 def _drawer(seed: int) -> torch.Generator:

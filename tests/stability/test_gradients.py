@@ -38,7 +38,7 @@ from forewarp.ops.grid import (
     trilinear,
     trilinear_reference,
 )
-from forewarp.ops.lens import distort
+from forewarp.ops.lens import distort, distort_with_jacobian
 from forewarp.ops.march import accumulate, dense_weights, midpoints, render_weights, union
 from forewarp.ops.nodes import (
     carry_nodes,
@@ -46,7 +46,6 @@ from forewarp.ops.nodes import (
     move_by_screw,
     node_maps,
     skin_weights,
-    skin_weights_reference,
     stiffness,
     stretch,
 )
@@ -59,18 +58,18 @@ pytestmark = pytest.mark.stability
 MANY = settings(derandomize=True, deadline=None, database=None, max_examples=8)
 SEEDS = strategies.integers(0, 10_000)
 
+LENS = ((0.1, -0.05, 0.01), (0.01, -0.02))
 # Why operators have no gradient, and which.
 WITHOUT = {
-    "a guard or a switch": "check_shape check_march numba_installed use_numba match_threads warm_up kept_for"
-    " whole has_kernels smaller cores compile_way_back is_number",
+    "a guard or a switch": "check_shape numba_installed use_numba match_threads warm_up"
+    " has_kernels smaller cores compile_backward_kernels is_number",
     "places samples, which no loss pulls at": "march march_reference stratified by_importance clip_to_box",
-    "whole numbers, or yes and no": "map_cells unfolded index_of dilate occupied_cells neighbour_pairs"
-    " occupied_cells_reference sorted_tiles encoded_size",
-    "says that it has none": "trace undistort adam_rows arrays room_for_colors",
+    "whole numbers, or yes and no": "unfolded index_of dilate occupied_cells neighbour_pairs"
+    " occupied_cells_reference encoded_size",
+    "says that it has none": "trace undistort adam_rows arrays",
     "of times or directions, which are not learned": "spline_basis spline_shares harmonics",
     "gives its own, which test_compare and test_nodes compare": "compare compare_reference pull_nodes"
     " spread_nodes",
-    "the kernel of project, without its gradient": "projected",
 }
 
 
@@ -128,7 +127,7 @@ def of_projection(seed, see=project):
 
     def numbers(*leaves):
         moving = Warp(leaves[5], warp.links, leaves[6])
-        return see(Gaussians(*leaves[:5]), moving, pinhole(), tints, fades).numbers
+        return see(Gaussians(*leaves[:5]), moving, pinhole(), tints, fades).values
 
     return numbers, *particles, warp.maps, warp.weights
 
@@ -137,7 +136,7 @@ def of_rasterizing(seed, draw=rasterize):
     """Pictures by the numbers of splats."""
     particles, warp, tints, fades = crowd(4, scale=-1.0, seed=seed)
     splats = project(particles, warp, pinhole(), tints, fades)
-    return lambda numbers: draw(Splats(numbers, splats.reach), 3, 4), splats.numbers
+    return lambda numbers: draw(Splats(numbers, splats.reach), 3, 4), splats.values
 
 
 def of_stiffness(seed):
@@ -176,7 +175,8 @@ CHECKS = {
     "block_means": lambda s: (lambda x: block_means(x, 2), draw(s, 4, 6, 2)),
     "reduced_depth": lambda s: (reduced_depth, draw(s, 4, 6).abs() + 0.1),
     "positional_encoding": lambda s: (lambda x: positional_encoding(x, 4), draw(s, 3, 2)),
-    "distort": lambda s: (lambda p: distort(p, (0.1, -0.05, 0.01), (0.01, -0.02)), draw(s, 4, 2)),
+    "distort": lambda s: (lambda p: distort(p, *LENS), draw(s, 4, 2)),
+    "distort_with_jacobian": lambda s: (lambda p: distort_with_jacobian(p, *LENS)[1], draw(s, 4, 2)),
     "spherical_harmonics_1": lambda s: (spherical_harmonics_1, draw(s, 3, 3)),
     "project": of_projection,
     "project_reference": partial(of_projection, see=project_reference),
@@ -184,10 +184,6 @@ CHECKS = {
     "rasterize_reference": partial(of_rasterizing, draw=rasterize_reference),
     "stiffness": of_stiffness,
     "skin_weights": lambda s: (partial(skin_weights, draw(s, 5, 3).exp()), draw(s + 1, 5, 3)),
-    "skin_weights_reference": lambda s: (
-        partial(skin_weights_reference, draw(s, 5, 3).exp()),
-        draw(s + 1, 5, 3),
-    ),
     "moved": of_moved,
     "move_by_screw": lambda s: (move_by_screw, draw(s, 3, 3), draw(s + 1, 3, 3), draw(s + 2, 3, 3)),
     "second_variation": lambda s: (second_variation, draw(s, 3, 4, 5, 2)),

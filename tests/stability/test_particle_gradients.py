@@ -43,7 +43,7 @@ def test_splats_by_what_moves_nothing(degree, lens):
 
     def numbers(*leaves):
         own = particles._replace(**dict(zip(RESTING, leaves)))
-        return project(own, warp, pinhole(**lens), tints, fades).numbers
+        return project(own, warp, pinhole(**lens), tints, fades).values
 
     assert int((numbers()[:, 5] > 0).sum()) == 3
     leaves = [getattr(particles, name).clone().requires_grad_() for name in RESTING]
@@ -56,7 +56,7 @@ def test_places_behind_a_lens():
 
     def numbers(means, maps, weights):
         own = particles._replace(means=means)
-        found = project(own, Warp(maps, warp.links, weights), pinhole(**LENS), tints, fades).numbers
+        found = project(own, Warp(maps, warp.links, weights), pinhole(**LENS), tints, fades).values
         return found[:, PLACE]
 
     leaves = [t.clone().requires_grad_() for t in (particles.means, warp.maps, warp.weights)]

@@ -11,7 +11,7 @@ import torch
 from hypothesis import given, strategies
 
 from forewarp.ops import backend
-from forewarp.ops.adam import Learned, adam_rows
+from forewarp.ops.adam import AdamState, adam_rows
 from forewarp.ops.gaussians import Gaussians, Splats, rasterize
 from tests.stability.hard_particles import SEEN, UNSEEN, Hard, compared, drawn, node_cases
 from tests.stability.test_properties import MANY
@@ -126,7 +126,7 @@ def test_adam_takes_gradients_of_any_size(place, size):
     value = torch.zeros(33, 3, device=place)
     state = [torch.zeros_like(value), torch.zeros_like(value), value.new_zeros(33)]
     for _ in range(3):
-        adam_rows([Learned(value, torch.full_like(value, size), *state, 0.1)], (0.9, 0.99), 1e-30)
+        adam_rows([AdamState(value, torch.full_like(value, size), *state, 0.1)], (0.9, 0.99), 1e-30)
     expected = -0.3 if size > 1e-20 else None  # its square is 0 in float32
     assert bool(value.isfinite().all())
     assert expected is None or value.mean().item() == pytest.approx(expected, rel=1e-4)

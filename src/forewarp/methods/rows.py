@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.nn import Parameter
 
 from forewarp.methods.method import part_of
-from forewarp.ops.adam import Learned, adam_rows
+from forewarp.ops.adam import AdamState, adam_rows
 
 
 @torch.no_grad()
@@ -99,14 +99,14 @@ class RowsAdam(torch.optim.Optimizer):
         if closure is not None:
             with torch.enable_grad():
                 loss = closure()
-        alike: dict[tuple, list[Learned]] = {}
+        alike: dict[tuple, list[AdamState]] = {}
         for group in self.param_groups:
             alike.setdefault((*group["betas"], group["eps"]), []).extend(self._learned(group))
         for (first, second, eps), learned in alike.items():
             adam_rows(learned, (first, second), eps)
         return loss
 
-    def _learned(self, group: dict) -> Iterator[Learned]:
+    def _learned(self, group: dict) -> Iterator[AdamState]:
         for p in group["params"]:
             if p.grad is None or not p.numel():
                 continue
@@ -114,4 +114,4 @@ class RowsAdam(torch.optim.Optimizer):
             if not state:
                 state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(p), torch.zeros_like(p)
                 state["steps"] = torch.zeros_like(p[..., 0])
-            yield Learned(p, p.grad, state["exp_avg"], state["exp_avg_sq"], state["steps"], group["lr"])
+            yield AdamState(p, p.grad, state["exp_avg"], state["exp_avg_sq"], state["steps"], group["lr"])

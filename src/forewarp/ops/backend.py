@@ -35,6 +35,11 @@ def use_numba(tensor: Tensor) -> bool:
     return has_kernels(tensor.device)
 
 
+def arrays(*tensors: Tensor) -> tuple:
+    """Return NumPy views for kernels, contiguous; without a gradient."""
+    return tuple(t.detach().contiguous().numpy() for t in tensors)
+
+
 def cores() -> int:
     """Return how many cores this process may use."""
     allowed = getattr(os, "sched_getaffinity", None)
@@ -49,7 +54,8 @@ def match_threads() -> int:
     asked = torch.get_num_threads()
     if getattr(_MATCHED, "asked", None) == asked:
         return _MATCHED.wanted
-    numba = _numba()
+    import numba
+
     wanted = max(1, min(asked, numba.config.NUMBA_NUM_THREADS))
     if numba.get_num_threads() != wanted:
         numba.set_num_threads(wanted)
@@ -57,13 +63,6 @@ def match_threads() -> int:
         torch.set_num_threads(asked)
     _MATCHED.asked, _MATCHED.wanted = asked, wanted
     return wanted
-
-
-@cache
-def _numba():
-    import numba
-
-    return numba
 
 
 def is_number(value: Any) -> bool:
@@ -81,10 +80,9 @@ def check_shape(name: str, tensor: Tensor, shape: tuple[int | str, ...]) -> None
     """
     if tensor.shape == shape:
         return
-    ends = shape[:1] == ("...",)
-    last = shape[1:] if ends else shape
-    found = tuple(tensor.shape)[-len(last) :] if ends else tuple(tensor.shape)
-    fits = len(found) == len(last) and all(isinstance(s, str) or s == n for s, n in zip(last, found))
-    if not fits:
-        wanted = "(" + ", ".join(str(s) for s in shape) + ")"
-        raise ValueError(f"{name}: expected shape {wanted}, but got {tuple(tensor.shape)}")
+    sizes = tuple(tensor.shape)
+    last = shape[1:] if shape[:1] == ("...",) else shape
+    ends = sizes[-len(last) :] if last is not shape else sizes
+    if len(ends) != len(last) or not all(isinstance(s, str) or s == n for s, n in zip(last, ends)):
+        wanted = ", ".join(str(s) for s in shape)
+        raise ValueError(f"{name}: expected shape ({wanted}), but got {sizes}")

@@ -21,8 +21,8 @@ def dct_basis(
         bases: K in [1, T - 1].
         frames: T >= 2, the number of distinct training times.
         canonical_time: in [0, 1].
-        padding: extend the sequence at both ends by this share of its length. Every cosine has slope 0 at
-            both ends of its period, so without padding (as printed) nothing moves at the first and last
+        padding: extend the sequence at both ends by this share of its length. Every cosine has derivative 0
+            at both ends of its period, so without padding (as printed) nothing moves at the first and last
             frame.
 
     Returns:
@@ -52,15 +52,11 @@ def dct_basis(
     return (basis[0] - basis[1]).to(t.dtype)
 
 
-def spline_basis(
-    time: Tensor | float, knots: int, canonical_time: float | None = None, *, beyond: float = 0.0,
-    straight: bool = False,
-) -> Tensor:  # fmt: skip
-    """Uniform cubic B-splines over [0, 1], less their values at the canonical time, where one is given.
+def spline_basis(time: Tensor | float, knots: int, *, beyond: float = 0.0, straight: bool = False) -> Tensor:
+    """Uniform cubic B-splines over [0, 1]: a curve is ``sum_k c_k B_k(t)``.
 
     With ``s = t (K - 3)``, ``i`` its whole part and ``u`` the rest, knots i to i + 3 have the shares
-    ``(1 - u)^3, 3 u^3 - 6 u^2 + 4, -3 u^3 + 3 u^2 + 3 u + 1, u^3`` over 6, and all others none. A curve is
-    ``sum_k c_k B_k(t)``, or ``sum_k c_k (B_k(t) - B_k(canonical))``: exactly zero at the canonical time.
+    ``(1 - u)^3, 3 u^3 - 6 u^2 + 4, -3 u^3 + 3 u^2 + 3 u + 1, u^3`` over 6, and all others none.
 
     A natural spline (``straight``) has no acceleration at 0 and 1: of K + 2 such knots the outer two follow
     from those beside them, ``c_0 = 2 c_1 - c_2``, and it passes through its first and last coefficient.
@@ -68,7 +64,6 @@ def spline_basis(
     Args:
         time: in [0, 1], a float or a tensor (...,).
         knots: K >= 4; if ``straight``, >= 2.
-        canonical_time: in [0, 1], or None.
         beyond: how far beyond [0, 1] a time may be; the first and the last piece are continued there.
         straight: whether the curve ends without acceleration.
 
@@ -78,71 +73,38 @@ def spline_basis(
     Raises:
         ValueError: for fewer knots, or a time farther outside [0, 1].
 
-    Cost: K numbers a time.
+    Cost: K numbers a time, which Python makes one by one.
 
-    >>> spline_basis(1.0, 4, canonical_time=1.0)
-    tensor([0., 0., 0., 0.])
     >>> spline_basis(1.0, 3, straight=True)
     tensor([0., 0., 1.])
     """
-    if isinstance(time, float) and canonical_time is None:
+    if isinstance(time, float):
         return torch.tensor(spline_shares(time, knots, beyond=beyond, straight=straight))
-    origin = 0.0 if canonical_time is None else canonical_time
-    t = torch.as_tensor(time)
-    t = t if t.is_floating_point() else t.float()
-    both = torch.stack([t, torch.full_like(t, origin)]).double()
-    low, high = (float(both.min()), float(both.max())) if both.numel() else (origin, origin)
-    _check(low, high, knots, beyond, straight)
-    whole = _with_outer(knots, straight)
-    place = both * (whole - 3)
-    first = place.floor().clamp(0, whole - 4)
-    u = place - first
-    shares = [(1 - u) ** 3, 3 * u**3 - 6 * u**2 + 4, -3 * u**3 + 3 * u**2 + 3 * u + 1, u**3]
-    basis = both.new_zeros(*both.shape, whole)
-    basis.scatter_(
-        -1, first.long()[..., None] + torch.arange(4, device=t.device), torch.stack(shares, -1) / 6
-    )
-    if straight:
-        basis = torch.stack(_folded(list(basis.unbind(-1))), -1)
-    return (basis[0] if canonical_time is None else basis[0] - basis[1]).to(t.dtype)
+    shares = [spline_shares(t, knots, beyond=beyond, straight=straight) for t in time.flatten().tolist()]
+    return torch.tensor(shares, dtype=time.dtype, device=time.device).reshape(*time.shape, knots)
 
 
 def spline_shares(time: float, knots: int, *, beyond: float = 0.0, straight: bool = False) -> list[float]:
     """``B_k`` at a time as numbers, without what it takes to make a tensor; see ``spline_basis``."""
-    _check(time, time, knots, beyond, straight)
-    whole = _with_outer(knots, straight)
-    place = time * (whole - 3)
-    first = min(max(int(place), 0), whole - 4)
+    least = 2 if straight else 4
+    if knots < least:
+        raise ValueError(f"spline: expected at least {least} knots, but got {knots}")
+    if not -beyond <= time <= 1 + beyond:
+        span = f"[{0.0 - beyond:g}, {1 + beyond:g}]"
+        raise ValueError(f"spline: expected times in {span}, but got {time:.4g}; scale the times")
+    count = knots + 2 if straight else knots  # with those that follow from others
+    place = time * (count - 3)
+    first = min(max(int(place), 0), count - 4)
     u = place - first
-    found = [0.0] * whole
-    found[first : first + 4] = (
+    shares = [0.0] * count
+    shares[first : first + 4] = (
         (1 - u) ** 3 / 6,
         (3 * u**3 - 6 * u**2 + 4) / 6,
         (-3 * u**3 + 3 * u**2 + 3 * u + 1) / 6,
         u**3 / 6,
     )
-    return _folded(found) if straight else found
-
-
-def _check(low: float, high: float, knots: int, beyond: float, straight: bool) -> None:
-    least = 2 if straight else 4
-    if knots < least:
-        raise ValueError(f"spline: expected at least {least} knots, but got {knots}")
-    if not -beyond <= low <= high <= 1 + beyond:
-        raise ValueError(
-            f"spline: expected times in [{0.0 - beyond:g}, {1 + beyond:g}], but got {low:.4g} to {high:.4g}; "
-            "scale the times"
-        )
-
-
-def _with_outer(knots: int, straight: bool) -> int:
-    """How many knots there are, with those that follow from others."""
-    return knots + 2 if straight else knots
-
-
-def _folded(shares: list[float] | list[Tensor]) -> list:
-    """Give the outer two knots' shares to those inside, of which they are continuations."""
-    first, *inner, last = shares
-    inner[0], inner[1] = inner[0] + 2 * first, inner[1] - first
-    inner[-1], inner[-2] = inner[-1] + 2 * last, inner[-2] - last
-    return inner
+    if straight:  # the outer two knots' shares go to those inside, of which they are continuations
+        first, *shares, last = shares
+        shares[0], shares[1] = shares[0] + 2 * first, shares[1] - first
+        shares[-1], shares[-2] = shares[-1] + 2 * last, shares[-2] - last
+    return shares

@@ -12,18 +12,40 @@ import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
+from torch.nn.functional import pad
 
-from forewarp.ops.backend import check_shape, match_threads, use_numba
+from forewarp.ops.backend import arrays, check_shape, match_threads, use_numba
+from forewarp.ops.lens import distort_with_jacobian
 
-# Columns of a splat; the last three are not part of ``Splats.values``. Kernels pad them with zeros to SPLAT.
-X, Y, CONIC_A, CONIC_B, CONIC_C, OPACITY, RED, GREEN, BLUE, DEPTH, REACH_X, REACH_Y, LOG_OPACITY = range(13)
-SPLAT = 16
-SIDE = 8  # pixels of a tile along both axes
-MOST = 1 << 15  # splats of a tile that count, the nearest ones
-LEAST_LOG = -math.log(255.0)  # what adds less than a 255th to a pixel is not seen
 BLUR = 0.1  # square pixels; a pixel alone has a variance of 1/12
+FEASIBLE = 1 << 27  # splats times pixels of the reference: with gradients ten float32 tensors of these, 5 GB
 FLAT = 0.28209479177387814  # the first harmonic, 1 / sqrt(4 pi), which no direction changes
+LEAST_LOG = -math.log(255.0)  # of an alpha: less than a 255th is not seen
+MOST = 1 << 15  # splats of a tile that count, the nearest ones
+SIDE = 8  # pixels of a tile along both axes
+SPLAT = 16  # numbers of a splat as kernels read it: its columns, then zeros
 _LEAST = 1e-12  # length of a quaternion below which it rotates nothing
+
+
+class Columns(NamedTuple):
+    """Where the numbers of a splat lie; ``Splats.values`` has those up to the depth."""
+
+    x: int = 0
+    y: int = 1
+    conic_a: int = 2
+    conic_b: int = 3
+    conic_c: int = 4
+    opacity: int = 5
+    red: int = 6
+    green: int = 7
+    blue: int = 8
+    depth: int = 9
+    reach_x: int = 10
+    reach_y: int = 11
+    log_opacity: int = 12
+
+
+COLUMN = Columns()
 
 
 @dataclass(frozen=True)
@@ -32,7 +54,7 @@ class Pinhole:
 
     ``rotation`` (3, 3) world to camera, row by row in 9 numbers, ``center`` in world units; ``focal`` and
     ``middle`` in pixels, ``size`` (width, height). What is not farther than ``near`` along the axis is left
-    out, and what lies more than ``margin`` pixels beside the picture. ``blur`` (square pixels) is added to
+    out, and what lies more than ``margin`` pixels beside the image. ``blur`` (square pixels) is added to
     every splat's variance. A lens has ``radial`` and ``tangential`` numbers as in ``ops.lens``; points of the
     plane at distance 1 whose square from the axis is ``reach`` or more it shows nowhere.
     """
@@ -51,10 +73,10 @@ class Pinhole:
     reach: float = 1e8
 
     def row(self, like: Tensor) -> Tensor:
-        """All of it in 28 numbers, of the dtype and on the device of ``like``."""
-        parts = (self.rotation, self.center, self.focal, (self.skew,), self.middle, self.size, (self.near,))
-        parts += ((self.blur, self.margin), self.radial, self.tangential, (self.reach,))
-        return like.new_tensor([float(number) for part in parts for number in part])
+        """Return all of it in 28 numbers, of the dtype and on the device of ``like``."""
+        parts = (*self.rotation, *self.center, *self.focal, self.skew, *self.middle, *self.size, self.near)
+        parts += (self.blur, self.margin, *self.radial, *self.tangential, self.reach)
+        return like.new_tensor([float(number) for number in parts])
 
 
 class Gaussians(NamedTuple):
@@ -82,20 +104,35 @@ class Warp(NamedTuple):
 
 
 class Splats(NamedTuple):
-    """``numbers`` (N, 10): u, v, the conic A, B, C, opacity, colour (3), distance; ``reach`` (N, 2) pixels
-    along both axes beyond which nothing is seen of it, 0 where it is not seen at all. Differentiable are the
-    numbers.
+    """Gaussians on an image. ``values`` (N, 10), the ``Columns`` up to the depth: pixel, inverse covariance
+    (A, B; B, C), opacity, colour, distance from the camera; ``reach`` (N, 2) pixels along both axes beyond
+    which nothing is seen of it, 0 where it is not seen at all. Differentiable are the values.
     """
 
-    numbers: Tensor
+    values: Tensor
     reach: Tensor
+
+    @property
+    def opacity(self) -> Tensor:
+        """(N,)."""
+        return self.values[:, COLUMN.opacity]
+
+    @property
+    def rgb(self) -> Tensor:
+        """(N, 3)."""
+        return self.values[:, COLUMN.red : COLUMN.depth]
+
+    @property
+    def depth(self) -> Tensor:
+        """(N,) distances from the camera, world units."""
+        return self.values[:, COLUMN.depth]
 
 
 def project(particles: Gaussians, warp: Warp, pinhole: Pinhole, tints: Tensor, fades: Tensor) -> Splats:
     """Move particles and see them through a camera.
 
-    With ``F = I + sum w_k D_k`` and ``b = sum w_k d_k`` a particle goes to ``F x + b``; with J the slopes of
-    the pixel by the point, and ``T = J F R diag(s)``, its covariance in the picture is ``T T^t + blur I``.
+    With ``F = I + sum w_k D_k`` and ``b = sum w_k d_k`` a particle goes to ``F x + b``; with J the Jacobian
+    of the pixel by the point, and ``T = J F R diag(s)``, its covariance in the image is ``T T^t + blur I``.
     Colour is ``max(0, 1/2 + sum_k Y_k(direction) c_k + sum_k tint_k c'_k)``, opacity
     ``sigmoid(sum_k fade_k o_k)``.
 
@@ -116,21 +153,15 @@ def project(particles: Gaussians, warp: Warp, pinhole: Pinhole, tints: Tensor, f
     Cost: about 500 operations a particle, twice that for gradients.
     """
     _check(particles, warp, tints, fades)
-    fast = use_numba(particles.means) and particles.means.dtype == torch.float32
-    if not fast:
+    if not use_numba(particles.means) or particles.means.dtype != torch.float32:
         return project_reference(particles, warp, pinhole, tints, fades)
-    view = pinhole.row(particles.means)
-    numbers, reach = _Project.apply(*particles, *warp, view, tints, fades)
-    return Splats(numbers, reach)
+    return Splats(*_Project.apply(*particles, *warp, pinhole.row(particles.means), tints, fades))
 
 
 def _check(particles: Gaussians, warp: Warp, tints: Tensor, fades: Tensor) -> None:
-    count = len(particles.means)
-    shapes = {"means": (3,), "log_scales": (3,), "quaternions": (4,), "opacity": (len(fades),)}
-    for name, shape in shapes.items():
+    count, plain = len(particles.means), particles.colors.shape[1] - len(tints)
+    for name, shape in zip(Gaussians._fields, ((3,), (3,), (4,), (len(fades),), ("B", 3))):
         check_shape(name, getattr(particles, name), (count, *shape))
-    check_shape("colors", particles.colors, (count, "B", 3))
-    plain = particles.colors.shape[1] - len(tints)
     if plain not in (1, 4, 9, 16):
         raise ValueError(
             f"colors: expected 1, 4, 9 or 16 coefficients of direction beside {len(tints)} of time, "
@@ -142,31 +173,27 @@ def _check(particles: Gaussians, warp: Warp, tints: Tensor, fades: Tensor) -> No
 
 
 def harmonics(directions: Tensor, count: int) -> Tensor:
-    """Real spherical harmonics (N, count) of unit directions (N, 3); count is 1, 4, 9 or 16.
+    """Return real spherical harmonics (N, count) of unit directions (N, 3); count is 1, 4, 9 or 16.
 
     >>> harmonics(torch.tensor([[0.0, 0.0, 1.0]]), 4)[0, ::2]
     tensor([0.2821, 0.4886])
     """
     x, y, z = directions.unbind(-1)
-    one = math.sqrt(3 / (4 * math.pi))
-    found = [torch.full_like(x, FLAT), -one * y, one * z, -one * x]
-    two = [math.sqrt(f / math.pi) for f in (15 / 4, 5 / 16, 15 / 16)]
-    found += [two[0] * x * y, -two[0] * y * z, two[1] * (2 * z * z - x * x - y * y), -two[0] * x * z]
-    found += [two[2] * (x * x - y * y)]
+    c1 = math.sqrt(3 / (4 * math.pi))
+    values = [torch.full_like(x, FLAT), -c1 * y, c1 * z, -c1 * x]
+    a, b, c = (math.sqrt(f / math.pi) for f in (15 / 4, 5 / 16, 15 / 16))
+    values += [a * x * y, -a * y * z, b * (2 * z * z - x * x - y * y), -a * x * z, c * (x * x - y * y)]
     a, b, c, d, e = (math.sqrt(f / math.pi) for f in (35 / 32, 105 / 4, 21 / 32, 7 / 16, 105 / 16))
-    found += [-a * y * (3 * x * x - y * y), b * x * y * z, -c * y * (4 * z * z - x * x - y * y)]
-    found += [d * z * (2 * z * z - 3 * x * x - 3 * y * y), -c * x * (4 * z * z - x * x - y * y)]
-    found += [e * z * (x * x - y * y), -a * x * (x * x - 3 * y * y)]
-    return torch.stack(found[:count], -1)
+    values += [-a * y * (3 * x * x - y * y), b * x * y * z, -c * y * (4 * z * z - x * x - y * y)]
+    values += [d * z * (2 * z * z - 3 * x * x - 3 * y * y), -c * x * (4 * z * z - x * x - y * y)]
+    values += [e * z * (x * x - y * y), -a * x * (x * x - 3 * y * y)]
+    return torch.stack(values[:count], -1)
 
 
 def rotations(quaternions: Tensor) -> Tensor:
-    """Rotation matrices (N, 3, 3) of quaternions (N, 4) of any length; of length 0 it is the identity."""
-    square = quaternions.square().sum(-1, keepdim=True)
-    usable = square > _LEAST**2
-    none = torch.zeros_like(quaternions)
-    none[:, 0] = 1
-    q = torch.where(usable, quaternions, none)
+    """Return the matrices (N, 3, 3) of quaternions (N, 4) of any length; of length 0 the identity."""
+    usable = quaternions.square().sum(-1, keepdim=True) > _LEAST**2
+    q = torch.where(usable, quaternions, quaternions.new_tensor([1.0, 0.0, 0.0, 0.0]))
     w, x, y, z = (q / q.square().sum(-1, keepdim=True).sqrt()).unbind(-1)
     rows = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]
     rows += [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]
@@ -175,7 +202,7 @@ def rotations(quaternions: Tensor) -> Tensor:
 
 
 def moved(means: Tensor, warp: Warp) -> tuple[Tensor, Tensor]:
-    """Where particles go (N, 3), and the linear part (N, 3, 3) of how."""
+    """Return where particles go (N, 3), and the linear part (N, 3, 3) of how."""
     maps = warp.maps[warp.links.long()]  # (N, L, 12)
     blended = (warp.weights[..., None] * maps).sum(1)
     linear = blended[:, :9].reshape(-1, 3, 3) + torch.eye(3).to(blended)
@@ -197,34 +224,34 @@ def project_reference(
     plane = torch.stack([x / z, y / z], -1)
     seen = ahead & (255 * solid.detach() > 1) & (plane.detach().square().sum(-1) < pinhole.reach)
     plane = torch.where(seen[:, None], plane, 0.0)
-    pixel, slopes = _through_lens(pinhole, plane)
-    width, height = pinhole.size
-    low, high = pixel.detach(), pixel.new_tensor([width, height]) - pixel.detach()
+    lensed, (xx, xy, yy) = distort_with_jacobian(plane, pinhole.radial, pinhole.tangential)
+    focal = plane.new_tensor([[pinhole.focal[0], pinhole.skew], [0.0, pinhole.focal[1]]])
+    pixel = lensed @ focal.T + plane.new_tensor(pinhole.middle)
+    low, high = pixel.detach(), pixel.new_tensor(pinhole.size) - pixel.detach()
     seen = seen & (torch.cat([low, high], -1) > -pinhole.margin).all(-1)
+    lens = focal @ torch.stack([xx, xy, xy, yy], -1).reshape(-1, 2, 2)
     zero = torch.zeros_like(z)
-    flat = torch.stack(
-        [torch.stack([1 / z, zero, -x / z**2], -1), torch.stack([zero, 1 / z, -y / z**2], -1)], -2
-    )
-    rows = slopes.detach() @ flat @ rotation @ linear @ rotations(quaternions)  # (N, 2, 3)
+    flat = torch.stack([1 / z, zero, -x / z**2, zero, 1 / z, -y / z**2], -1).reshape(-1, 2, 3)
+    rows = lens.detach() @ flat @ rotation @ linear @ rotations(quaternions)  # (N, 2, 3)
     determinant = _covariance(rows.detach() * log_scales.detach().exp()[:, None], pinhole.blur)[3]
     seen = seen & (determinant > 0) & (determinant < 1e30)
-    scales = torch.where(seen[:, None], log_scales, 0.0).exp()  # an infinite one's slope would be NaN
+    scales = torch.where(seen[:, None], log_scales, 0.0).exp()  # an infinite one's gradient would be NaN
     root = torch.where(seen[:, None, None], rows * scales[:, None], 0.0)
     a, b, c, determinant = _covariance(root, pinhole.blur)
-    distance = away.square().sum(-1).clamp(min=1e-30).sqrt()
-    directions = (away / distance[:, None]).detach()
+    depth = away.square().sum(-1).clamp(min=1e-30).sqrt()
+    directions = (away / depth[:, None]).detach()
     plain = colors.shape[1] - len(tints)
     color = torch.einsum("nk,nkc->nc", harmonics(directions, plain), colors[:, :plain]) + 0.5
     color = (color + torch.einsum("k,nkc->nc", tints, colors[:, plain:])).clamp(min=0)
     conic = torch.stack([c, -b, a], -1) / determinant[:, None]
-    numbers = torch.cat([pixel, conic, solid[:, None], color, distance[:, None]], -1)
+    values = torch.cat([pixel, conic, solid[:, None], color, depth[:, None]], -1)
     reach = 2 * torch.log((255 * solid.detach()).clamp(min=1))
     reach = (reach[:, None] * torch.stack([a, c], -1).detach()).sqrt()
-    return Splats(torch.where(seen[:, None], numbers, 0.0), torch.where(seen[:, None], reach, 0.0))
+    return Splats(torch.where(seen[:, None], values, 0.0), torch.where(seen[:, None], reach, 0.0))
 
 
 def _covariance(root: Tensor, blur: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """a, b, c (N,) of ``root root^t + blur I`` of roots (N, 2, 3), and its determinant.
+    """Return a, b, c (N,) of ``root root^t + blur I`` of roots (N, 2, 3), and its determinant.
 
     The determinant's first part is the cross product's square: of a needle, a c - b b loses all digits.
     """
@@ -234,107 +261,80 @@ def _covariance(root: Tensor, blur: float) -> tuple[Tensor, Tensor, Tensor, Tens
     return a + blur, b, c + blur, normal.square().sum(-1) + blur * (a + c + blur)
 
 
-def _through_lens(pinhole: Pinhole, plane: Tensor) -> tuple[Tensor, Tensor]:
-    """Points of the plane at distance 1 -> pixels (N, 2), and the slopes (N, 2, 2) of that."""
-    (k1, k2, k3), (p1, p2) = pinhole.radial, pinhole.tangential
-    x, y = plane.unbind(-1)
-    r2 = x * x + y * y
-    scale = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    slope = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))
-    u = x * scale + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-    v = y * scale + 2 * p2 * x * y + p1 * (r2 + 2 * y * y)
-    xx, xy = scale + slope * x * x + 2 * p1 * y + 6 * p2 * x, slope * x * y + 2 * p1 * x + 2 * p2 * y
-    yy = scale + slope * y * y + 2 * p2 * x + 6 * p1 * y
-    inner = torch.stack([torch.stack([xx, xy], -1), torch.stack([xy, yy], -1)], -2)
-    outer = plane.new_tensor([[pinhole.focal[0], pinhole.skew], [0.0, pinhole.focal[1]]])
-    return torch.stack([u, v], -1) @ outer.T + plane.new_tensor(pinhole.middle), outer @ inner
-
-
-def whole(count: int) -> int:
+def _whole(count: int) -> int:
     """Round up to the sixteens that kernels treat side by side."""
     return -(-count // 16) * 16
 
 
-def arrays(*tensors: Tensor) -> tuple:
-    """Numpy views for kernels, contiguous."""
-    return tuple(t.detach().contiguous().numpy() for t in tensors)
-
-
-def room_for_colors(count: int, kinds: Sequence[int]) -> tuple[Tensor, tuple[Tensor, ...], Tensor]:
-    """Room for gradients by the colours of so many particles, ``kinds`` coefficients each in a tensor of its
-    own: the room, which the kernel fills, these tensors (N, k, 3), and where the kernel finds them in it.
+def _room_for_colors(count: int, kinds: Sequence[int]) -> tuple[Tensor, tuple[Tensor, ...], Tensor]:
+    """Make room for gradients by the colours of so many particles, ``kinds`` coefficients each in a tensor of
+    its own: the room, which the kernel fills, these tensors (N, k, 3), and where the kernel finds them in it.
     """
     room = torch.empty(3 * count * sum(kinds))
-    parts = tuple(
-        part.view(count, k, 3) for part, k in zip(room.split([3 * count * k for k in kinds]), kinds)
-    )
+    parts = room.split([3 * count * k for k in kinds])
     starts = accumulate(kinds, initial=0)
     spots = [(3 * (count * start + j), 3 * k) for start, k in zip(starts, kinds) for j in range(k)]
-    return room, parts, torch.tensor(spots, dtype=torch.int64).reshape(-1, 2)
+    colors = tuple(part.view(count, k, 3) for part, k in zip(parts, kinds))
+    return room, colors, torch.tensor(spots, dtype=torch.int64).reshape(-1, 2)
 
 
-def projected(
+def _project_numba(
     means, log_scales, quaternions, opacity, colors, maps, links, weights, view, tints, fades, *, draw=True
 ) -> tuple[tuple, Tensor]:
-    """What the kernels of both ways read, where maps have 16 numbers each, and the splats (N up to a whole
-    sixteen, 16) of the kernel; without ``draw`` nothing is computed, and they are 0.
+    """Return what the kernels of both passes read, where maps have 16 numbers each, and the splats (N up to a
+    whole sixteen, 16) of the kernel; without ``draw`` nothing is computed, and they are 0.
     """
     from forewarp.ops.kernels import project as kernels
 
-    maps = torch.nn.functional.pad(maps, (0, 4))
+    maps = pad(maps, (0, 4))
     inputs = (means, log_scales, quaternions, opacity, colors, maps, links, weights, view, tints, fades)
-    out = (means.new_empty if draw else means.new_zeros)(whole(len(means)), SPLAT)
+    splats = (means.new_empty if draw else means.new_zeros)(_whole(len(means)), SPLAT)
     if draw:
-        kernels.project(*arrays(*inputs), out.detach().numpy())
-    return inputs, out
+        kernels.project(*arrays(*inputs, splats))
+    return inputs, splats
 
 
 class _Project(torch.autograd.Function):
     @staticmethod
     def forward(ctx, *tensors):
         match_threads()
-        inputs, out = projected(*tensors)
-        means = inputs[0]
-        ctx.save_for_backward(*inputs, out)
-        out = out[: len(means)]
-        numbers, reach = torch.where(out[:, 10:11] > 0, out[:, :10], 0.0), out[:, 10:12]
+        inputs, splats = _project_numba(*tensors)
+        ctx.save_for_backward(*inputs, splats)
+        splats = splats[: len(tensors[0])]
+        reach = splats[:, COLUMN.reach_x : COLUMN.log_opacity]
         ctx.mark_non_differentiable(reach)
-        return numbers, reach
+        return torch.where(reach[:, :1] > 0, splats[:, : COLUMN.reach_x], 0.0), reach
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, slopes, _):
-        from forewarp.ops.kernels import backward
+    def backward(ctx, by_values, _):
+        from forewarp.ops.kernels import backward as kernels
 
-        shares = match_threads()
-        *inputs, out = ctx.saved_tensors
-        found = [torch.empty(t.shape) for t in inputs[:4]]
-        maps = inputs[5].new_zeros(shares, *inputs[5].shape)
-        weights = torch.empty(inputs[7].shape)
-        order = (out[:, 10] > 0).nonzero()[:, 0].int()
-        rows = slopes.new_zeros(whole(len(order)), SPLAT)
-        rows[: len(order), : slopes.shape[1]] = slopes[order.long()]
-        room, colors, spots = room_for_colors(len(inputs[0]), (inputs[4].shape[1],))
-        given = arrays(*inputs, out, order, rows, *found, room, spots, maps, weights)
-        backward.chain(*given, False)
-        return *found, *colors, maps.sum(0)[:, :12], None, weights, None, None, None
-
-
-FEASIBLE = 1 << 27  # splats times pixels of the reference: with gradients ten float32 tensors of these, 5 GB
+        threads = match_threads()
+        *inputs, splats = ctx.saved_tensors
+        gradients = [torch.empty(t.shape) for t in inputs[:4]]
+        maps, weights = inputs[5].new_zeros(threads, *inputs[5].shape), torch.empty(inputs[7].shape)
+        seen = (splats[:, COLUMN.reach_x] > 0).nonzero()[:, 0]
+        rows = by_values.new_zeros(_whole(len(seen)), SPLAT)
+        rows[: len(seen), : by_values.shape[1]] = by_values[seen]
+        room, colors, spots = _room_for_colors(len(inputs[0]), (inputs[4].shape[1],))
+        given = arrays(*inputs, splats, seen.int(), rows, *gradients, room, spots, maps, weights)
+        kernels.chain(*given, False)
+        return *gradients, *colors, maps.sum(0)[:, :12], None, weights, None, None, None
 
 
-class Picture(NamedTuple):
-    """``color`` (3, H, W) without background, ``far`` (H, W) the distance times coverage, and ``through``
-    (H, W), what is let through to the background.
+class Image(NamedTuple):
+    """``color`` (3, H, W) without background, ``depth`` (H, W) the distance times coverage, and
+    ``transmittance`` (H, W), what is let through to the background.
     """
 
     color: Tensor
-    far: Tensor
-    through: Tensor
+    depth: Tensor
+    transmittance: Tensor
 
 
-def rasterize(splats: Splats, width: int, height: int) -> Picture:
-    """Composite splats in the order of their distance.
+def rasterize(splats: Splats, width: int, height: int) -> Image:
+    """Composite splats in the order of their depth.
 
     At a pixel whose centre is (dx, dy) from a splat, ``alpha = opacity exp(-(A dx^2 + 2 B dx dy + C dy^2) /
     2)``, 0 where that is below 1/255; from near to far ``T_i = prod_(j<i) (1 - alpha_j)`` and
@@ -342,10 +342,10 @@ def rasterize(splats: Splats, width: int, height: int) -> Picture:
 
     Args:
         splats: of N particles.
-        width, height: of the picture, pixels; any numbers >= 1.
+        width, height: of the image, pixels; any numbers >= 1.
 
     Returns:
-        ``Picture``, differentiable in the splats' numbers. A tile of 8 x 8 pixels ends where nothing of it
+        ``Image``, differentiable in the splats' values. A tile of 8 x 8 pixels ends where nothing of it
         lets a thousandth through, and the kernel looks at its nearest 32,768 splats.
 
     Raises:
@@ -354,21 +354,19 @@ def rasterize(splats: Splats, width: int, height: int) -> Picture:
     Cost: of the kernel, about 60 ns a splat and tile that it touches and 10 ns a splat; of the reference,
     N H W numbers of memory.
     """
-    check_shape("splats.numbers", splats.numbers, ("N", 10))
-    check_shape("splats.reach", splats.reach, (len(splats.numbers), 2))
+    check_shape("splats.values", splats.values, ("N", COLUMN.depth + 1))
+    check_shape("splats.reach", splats.reach, (len(splats.values), 2))
     if width < 1 or height < 1:
-        raise ValueError(f"picture: expected at least 1 x 1 pixels, but got {width} x {height}")
-    if use_numba(splats.numbers) and splats.numbers.dtype == torch.float32:
-        across, down = -(-width // SIDE), -(-height // SIDE)
-        planes = _Rasterize.apply(splats.numbers, splats.reach, across, down)[:, :height, :width]
+        raise ValueError(f"image: expected at least 1 x 1 pixels, but got {width} x {height}")
+    if use_numba(splats.values) and splats.values.dtype == torch.float32:
+        planes = _Rasterize.apply(*splats, width, height)[:, :height, :width]
     else:
         planes = rasterize_reference(splats, width, height)
-    return Picture(planes[:3], planes[3], planes[4])
+    return Image(planes[:3], planes[3], planes[4])
 
 
 def rasterize_reference(splats: Splats, width: int, height: int) -> Tensor:
-    """``rasterize`` in plain PyTorch: planes (5, H, W) of colour, distance, and what is let through."""
-    numbers = splats.numbers
+    """``rasterize`` in plain PyTorch: planes (5, H, W) of colour, depth, and what is let through."""
     seen = (splats.reach[:, 0] > 0).nonzero()[:, 0]
     most = FEASIBLE / max(len(seen), 1)
     if width * height > most:
@@ -378,20 +376,19 @@ def rasterize_reference(splats: Splats, width: int, height: int) -> Tensor:
             f"{len(seen):,} x {width} x {height}; install forewarp[cpu] and compute on the CPU, in float32, "
             f"or draw at most {wide} x {high} pixels"
         )
-    order = seen[numbers.detach()[seen, 9].sort(stable=True).indices]
-    u, v, a, b, c, solid = (numbers[order, k, None, None] for k in range(6))
-    dx = torch.arange(width).to(numbers) + 0.5 - u  # (V, 1, W)
-    dy = (torch.arange(height).to(numbers) + 0.5)[:, None] - v  # (V, H, 1)
+    values = splats.values[seen[splats.depth.detach()[seen].sort(stable=True).indices]]
+    x, y, a, b, c, solid = values[:, : COLUMN.red, None, None].unbind(1)
+    dx = torch.arange(width).to(values) + 0.5 - x  # (V, 1, W)
+    dy = (torch.arange(height).to(values) + 0.5)[:, None] - y  # (V, H, 1)
     power = -0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy + solid.log()
     alpha = torch.where(power > LEAST_LOG, power.exp(), 0.0)
     passed = torch.cumprod(torch.cat([alpha.new_ones(1, height, width), 1 - alpha]), 0)
-    weights = alpha * passed[:-1]
-    shown = torch.einsum("vhw,vk->khw", weights, numbers[order, 6:])
+    shown = torch.einsum("vhw,vk->khw", alpha * passed[:-1], values[:, COLUMN.red :])
     return torch.cat([shown, passed[-1:]])
 
 
 def smaller(width: int, height: int, share: float) -> tuple[int, int]:
-    """The sides of a picture of the same form, times a share of them.
+    """Return the sides of an image of the same form, times a share of them.
 
     >>> smaller(400, 300, 0.3337)
     (133, 100)
@@ -399,74 +396,77 @@ def smaller(width: int, height: int, share: float) -> tuple[int, int]:
     return max(1, int(share * width)), max(1, int(share * height))
 
 
-class Tiles(NamedTuple):
-    """Splats sorted for drawing: rows in ``order`` of depth, their ``records``, the ``entries`` of tiles and
-    where each tile's ``ends``, the ``shares`` of threads, and the longest tile's number of entries.
+class _Tiles(NamedTuple):
+    """Splats sorted for drawing: rows in ``order`` of depth, and the ``lists`` that kernels read: records,
+    the entries of tiles, where each tile's end, and the tiles of each thread. ``longest`` is the longest
+    tile's number of entries.
     """
 
-    order: object
-    records: object
-    entries: object
-    ends: object
-    shares: object
+    order: np.ndarray
+    lists: tuple[np.ndarray, ...]
     longest: int
 
 
-def sorted_tiles(splats, across: int, down: int, threads: int) -> Tiles:
-    """Sort splats (N, 16), a numpy array of ``kernels.project``, into ``across`` x ``down`` tiles."""
+def _sorted_tiles(splats, width: int, height: int, threads: int) -> _Tiles:
+    """Sort splats (N, 16), a NumPy array of the kernel, into the tiles of an image."""
     from forewarp.ops.kernels import rasterize as kernels
 
     order = kernels.by_depth(splats)
-    records, entries, ends = kernels.sort_into_tiles(splats, order, across, down, threads)
+    records, entries, ends = kernels.sort_into_tiles(splats, order, *_tiles(width, height), threads)
     shares, longest = kernels.share_out(ends, threads)
-    return Tiles(order, records, entries, ends, shares, int(longest))
+    return _Tiles(order, (records, entries, ends, shares), int(longest))
 
 
-def kept_for(tiles: Tiles) -> Tensor:
-    """Room for what a tile keeps between its way there and back, for each thread."""
-    return torch.empty(len(tiles.shares) - 1, 2 * max(min(tiles.longest, MOST), 1), SIDE * SIDE)
+def _tiles(width: int, height: int) -> tuple[int, int]:
+    """Return how many tiles an image has across and down."""
+    return -(-width // SIDE), -(-height // SIDE)
+
+
+def _kept_for(tiles: _Tiles) -> Tensor:
+    """Make room for what each thread keeps of a tile between the forward and the backward pass."""
+    return torch.empty(len(tiles.lists[3]) - 1, 2 * max(min(tiles.longest, MOST), 1), SIDE * SIDE)
 
 
 class _Rasterize(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, numbers, reach, across, down):
+    def forward(ctx, values, reach, width, height):
         from forewarp.ops.kernels import rasterize as kernels
 
-        threads = match_threads()
-        log = numbers.detach()[:, 5:6].log()
-        splats = torch.nn.functional.pad(torch.cat([numbers.detach(), reach, log], -1), (0, 3))
-        tiles = sorted_tiles(splats.numpy(), across, down, threads)
+        threads, (across, down) = match_threads(), _tiles(width, height)
+        log_opacity = values.detach()[:, COLUMN.opacity, None].log()
+        splats = pad(torch.cat([values.detach(), reach, log_opacity], -1), (0, SPLAT - len(COLUMN)))
+        tiles = _sorted_tiles(splats.numpy(), width, height, threads)
         out = torch.empty(5, SIDE * down, SIDE * across)
-        kernels.draw(tiles.records, tiles.entries, tiles.ends, tiles.shares, out.numpy())
+        kernels.draw(*tiles.lists, out.numpy())
         ctx.tiles, ctx.splats = tiles, splats
         return out
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, slopes):
-        from forewarp.ops.kernels import backward
-        from forewarp.ops.kernels import rasterize as drawing
+    def backward(ctx, by_planes):
+        from forewarp.ops.kernels import rasterize as kernels
 
         match_threads()
-        tiles = ctx.tiles
-        kept = kept_for(tiles)
+        tiles, splats = ctx.tiles, ctx.splats
+        kept = _kept_for(tiles)
         sums = torch.empty(len(kept), len(tiles.order), SPLAT)
-        drawing.pull(
-            tiles.records,
-            tiles.entries,
-            tiles.ends,
-            tiles.shares,
-            slopes.contiguous().numpy(),
-            kept.numpy(),
-            sums.numpy(),
-        )
-        seen, ranks = backward.rank_rows(tiles.order, len(ctx.splats))
-        by_splat, pull = torch.empty(whole(len(seen)), SPLAT), torch.empty(len(ctx.splats))
-        inputs = ctx.splats.numpy(), seen, ranks, sums.numpy()
-        backward.splat_gradients(*inputs, 1.0, by_splat.numpy(), pull.numpy())
-        found = slopes.new_zeros(len(ctx.splats), 10)
-        found[torch.from_numpy(seen).long()] = by_splat[: len(seen), :10]
-        return found, None, None, None
+        kernels.pull(*tiles.lists, *arrays(by_planes, kept, sums))
+        seen, by_splat, _ = _splat_gradients(splats, tiles, sums, 1.0)
+        by_values = by_planes.new_zeros(len(splats), COLUMN.depth + 1)
+        by_values[torch.from_numpy(seen).long()] = by_splat[: len(seen), : COLUMN.depth + 1]
+        return by_values, None, None, None
+
+
+def _splat_gradients(splats: Tensor, tiles: _Tiles, sums: Tensor, factor: float) -> tuple:
+    """Return the rows of splats that are seen, ``factor`` times the gradients by their columns (V', 16), from
+    sums over pixels, and how strongly these pull each splat over the image (N,).
+    """
+    from forewarp.ops.kernels import backward as kernels
+
+    seen, ranks = kernels.rank_rows(tiles.order, len(splats))
+    by_splat, pull = torch.empty(_whole(len(seen)), SPLAT), torch.zeros(len(splats))
+    kernels.splat_gradients(*arrays(splats), seen, ranks, *arrays(sums), factor, *arrays(by_splat, pull))
+    return seen, by_splat, pull
 
 
 class Compared(NamedTuple):
@@ -556,7 +556,7 @@ def compare_reference(
     with torch.enable_grad():
         own, own_warp = Gaussians(*leaves[:5]), Warp(leaves[5], warp.links, leaves[6])
         splats = project_reference(own, own_warp, pinhole, tints, fades)
-        splats.numbers.retain_grad()
+        splats.values.retain_grad()
         planes = rasterize_reference(splats, *pinhole.size)
         behind = background.to(planes)
         drawn = planes[:3] + planes[4] * behind[:, None, None]
@@ -566,89 +566,68 @@ def compare_reference(
         loss = ((error.square() + width**2).sqrt() - width).sum()
         (factor * loss).backward()
     found = [torch.zeros_like(leaf) if leaf.grad is None else leaf.grad for leaf in leaves]
-    pull = splats.numbers.grad[:, :2].norm(dim=-1)
+    pull = splats.values.grad[:, :2].norm(dim=-1)
     squared = float(error.detach().square().sum())
     skin = _by_softmax(warp.weights.detach(), found[6]) if by_skin else None
-    seen, away = (splats.reach[:, 0] > 0).nonzero()[:, 0], splats.numbers.detach()[:, 9]
+    seen, away = (splats.reach[:, 0] > 0).nonzero()[:, 0], splats.depth.detach()
     order = seen[away[seen].argsort(stable=True)]
     colors = found[4] if kinds is None else found[4].split(list(kinds), 1)
     gradients = Gaussians(*found[:4], colors)
     return Compared(float(loss.detach()), squared, gradients, found[5], skin, pull, order, away)
 
 
-def _by_softmax(weights: Tensor, slopes: Tensor) -> Tensor:
+def _by_softmax(weights: Tensor, by_weights: Tensor) -> Tensor:
     """From the gradients (N, L) by weights that are a softmax to those by the numbers it is of."""
-    pulled = weights * slopes
+    pulled = weights * by_weights
     return pulled - weights * pulled.sum(-1, keepdim=True)
 
 
 def _compare_numba(
     particles, warp, pinhole, tints, fades, pixels, background, width, factor, by_skin, kinds
 ) -> Compared:
-    threads = match_threads()
-    view = pinhole.row(particles.means)
-    inputs, splats = projected(*particles, *warp, view, tints, fades)
-    inputs, size = arrays(*inputs), pinhole.size
-    tiles = sorted_tiles(splats.numpy(), -(-size[0] // SIDE), -(-size[1] // SIDE), threads)
-    picture = pixels.contiguous().view(torch.int32).reshape(size[1], size[0])
-    return _way_back(particles, inputs, splats, tiles, picture, background, width, factor, by_skin, kinds)
+    threads, (across, down) = match_threads(), pinhole.size
+    inputs, splats = _project_numba(*particles, *warp, pinhole.row(particles.means), tints, fades)
+    tiles = _sorted_tiles(splats.numpy(), across, down, threads)
+    image = pixels.contiguous().view(torch.int32).reshape(down, across)
+    return _compare_sorted(inputs, splats, tiles, image, background, width, factor, by_skin, kinds)
 
 
-def compile_way_back(
+def compile_backward_kernels(
     particles: Gaussians, warp: Warp, pinhole: Pinhole, tints: Tensor, fades: Tensor
 ) -> None:
-    """Compile what leads from splats and a picture back to particles, by tiles in which nothing lies."""
-    inputs, splats = projected(*particles, *warp, pinhole.row(particles.means), tints, fades, draw=False)
-    width, height = pinhole.size
-    many = -(-width // SIDE) * -(-height // SIDE)
-    none, ends = np.zeros(0, np.int32), np.zeros(many + 1, np.int64)
-    tiles = Tiles(none, np.zeros((0, DEPTH + 1), np.float32), none, ends, np.array([0, many]), 0)
-    picture = torch.zeros(height, width, dtype=torch.int32)
-    _way_back(particles, arrays(*inputs), splats, tiles, picture, torch.ones(3), 1.0, 1.0, False, None)
+    """Compile the backward kernels on empty tiles."""
+    view, (width, height) = pinhole.row(particles.means), pinhole.size
+    inputs, splats = _project_numba(*particles, *warp, view, tints, fades, draw=False)
+    count = math.prod(_tiles(width, height))
+    none, records = np.zeros(0, np.int32), np.zeros((0, COLUMN.depth + 1), np.float32)
+    tiles = _Tiles(none, (records, none, np.zeros(count + 1, np.int64), np.array([0, count])), 0)
+    image = torch.zeros(height, width, dtype=torch.int32)
+    _compare_sorted(inputs, splats, tiles, image, torch.ones(3), 1.0, 1.0, False, None)
 
 
-def _way_back(
-    particles, inputs, splats, tiles, picture, background, width, factor, by_skin, kinds
-) -> Compared:
-    """Compare sorted splats with a picture (H, W) int32 of four bytes a pixel; lead the gradients back."""
+def _compare_sorted(inputs, splats, tiles, image, background, width, factor, by_skin, kinds) -> Compared:
+    """Compare sorted splats with an image (H, W) int32 of four bytes a pixel; carry the gradients back."""
     from forewarp.ops.kernels import backward
-    from forewarp.ops.kernels import rasterize as drawing
+    from forewarp.ops.kernels import rasterize as kernels
 
-    kept = kept_for(tiles)
-    threads = len(kept)
-    sums = torch.empty(threads, len(tiles.order), SPLAT)
-    found = torch.zeros(threads, 2, dtype=torch.float64)
-    drawing.compare(
-        tiles.records,
-        tiles.entries,
-        tiles.ends,
-        tiles.shares,
-        picture.numpy().view("uint32"),
-        *arrays(background.float()),
-        np.float32(width),
-        *arrays(kept, sums, found),
-    )
-    seen, ranks = backward.rank_rows(tiles.order, len(particles.means))
-    by_splat = torch.empty(whole(len(seen)), SPLAT)
-    pull = torch.zeros(len(particles.means))
-    backward.splat_gradients(
-        splats.numpy(), seen, ranks, sums.numpy(), factor, by_splat.numpy(), pull.numpy()
-    )
-    gradients = [torch.empty(t.shape) for t in particles[:4]]
-    count, many = particles.colors.shape[:2]
-    room, colors, spots = room_for_colors(count, (many,) if kinds is None else kinds)
-    maps = torch.zeros(threads, *inputs[5].shape)
+    kept, count, coefficients = _kept_for(tiles), *inputs[4].shape[:2]
+    sums = torch.empty(len(kept), len(tiles.order), SPLAT)
+    scores = torch.zeros(len(kept), 2, dtype=torch.float64)
+    truth = image.numpy().view("uint32"), *arrays(background.float()), np.float32(width)
+    kernels.compare(*tiles.lists, *truth, *arrays(kept, sums, scores))
+    seen, by_splat, pull = _splat_gradients(splats, tiles, sums, factor)
+    gradients = [torch.empty(t.shape) for t in inputs[:4]]
+    room, colors, spots = _room_for_colors(count, (coefficients,) if kinds is None else kinds)
+    maps = torch.zeros(len(kept), *inputs[5].shape)
     skin = torch.empty(inputs[7].shape if by_skin else (0, 0))
-    found_by = arrays(by_splat, *gradients, room, spots, maps, skin)
-    backward.chain(*inputs, splats.numpy(), seen, *found_by, True)
-    loss, squared = found.sum(0).tolist()
+    outputs = arrays(by_splat, *gradients, room, spots, maps, skin)
+    backward.chain(*arrays(*inputs, splats), seen, *outputs, True)
     return Compared(
-        loss,
-        squared,
+        *scores.sum(0).tolist(),
         Gaussians(*gradients, colors[0] if kinds is None else colors),
         maps.sum(0)[:, :12],
         skin if by_skin else None,
-        pull,
+        pull[:count],
         torch.from_numpy(tiles.order),
-        splats[: len(particles.means), 9],
+        splats[:count, COLUMN.depth],
     )

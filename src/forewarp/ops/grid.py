@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from forewarp.ops.backend import check_shape, match_threads, use_numba
+from forewarp.ops.backend import arrays, check_shape, match_threads, use_numba
 
 _CORNERS = [(a, b, c) for a in (0, 1) for b in (0, 1) for c in (0, 1)]
 
@@ -88,32 +88,25 @@ class _NumbaTrilinear(torch.autograd.Function):
         ctx.save_for_backward(values if ctx.needs_input_grad[2] else None, index, points, fill)
         ctx.shape = values.shape
         out = values.new_empty(len(points), values.shape[1])
-        kernels.gather(*(_array(v) for v in (values, index, points, fill, out)))
+        kernels.gather(*arrays(values, index, points, fill, out))
         return out
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, grad):
+    def backward(ctx, gradient):
         from forewarp.ops.kernels import voxels as kernels
 
         values, index, points, fill = ctx.saved_tensors
         chunks = min(4, match_threads())
-        grad = grad.contiguous()
-        grad_values = grad_points = None
+        to_values = to_points = None
         if ctx.needs_input_grad[0]:
-            parts = grad.new_zeros(chunks, *ctx.shape)
-            kernels.gather_backward_values(*(_array(v) for v in (index, points, grad, parts)))
-            grad_values = parts.sum(0) if chunks > 1 else parts[0]
+            parts = gradient.new_zeros(chunks, *ctx.shape)
+            kernels.gather_backward_values(*arrays(index, points, gradient, parts))
+            to_values = parts.sum(0) if chunks > 1 else parts[0]
         if ctx.needs_input_grad[2]:
-            grad_points = points.new_empty(points.shape)
-            kernels.gather_backward_points(
-                *(_array(v) for v in (values, index, points, fill, grad, grad_points))
-            )
-        return grad_values, None, grad_points, None
-
-
-def _array(tensor: Tensor):
-    return tensor.detach().contiguous().numpy()
+            to_points = points.new_empty(points.shape)
+            kernels.gather_backward_points(*arrays(values, index, points, fill, gradient, to_points))
+        return to_values, None, to_points, None
 
 
 def index_of(voxels: Tensor, shape: tuple[int, int, int]) -> Tensor:
@@ -129,9 +122,8 @@ def dilate(mask: Tensor, by: int = 1) -> Tensor:
     """Grow a mask (X, Y, Z) or (H, W) by ``by`` in every direction, diagonals included."""
     grown = mask.clone()
     for _ in range(by):
-        for axis in range(mask.dim()):
+        for axis, n in enumerate(mask.shape):
             before = grown.clone()
-            n = mask.shape[axis]
             grown.narrow(axis, 1, n - 1).logical_or_(before.narrow(axis, 0, n - 1))
             grown.narrow(axis, 0, n - 1).logical_or_(before.narrow(axis, 1, n - 1))
     return grown
@@ -144,15 +136,14 @@ def occupied_cells(index: Tensor, keep: Tensor | None = None) -> Tensor:
         index: (X, Y, Z) int32.
         keep: (M,) bool over the rows; None: keep all.
     """
-    if use_numba(index):
-        from forewarp.ops.kernels import voxels as kernels
+    if not use_numba(index):
+        return occupied_cells_reference(index, keep)
+    from forewarp.ops.kernels import voxels as kernels
 
-        rows = int(index.max()) + 1 if keep is None else len(keep)
-        cells = torch.zeros([n - 1 for n in index.shape], dtype=torch.uint8)
-        kept = torch.ones(rows, dtype=torch.bool) if keep is None else keep
-        kernels.mark_cells(_array(index), _array(kept), cells.numpy())
-        return cells.view(torch.bool)
-    return occupied_cells_reference(index, keep)
+    kept = torch.ones(int(index.max()) + 1, dtype=torch.bool) if keep is None else keep
+    cells = torch.zeros([n - 1 for n in index.shape], dtype=torch.bool)
+    kernels.mark_cells(*arrays(index, kept, cells))
+    return cells
 
 
 def occupied_cells_reference(index: Tensor, keep: Tensor | None = None) -> Tensor:
@@ -177,33 +168,33 @@ def neighbour_pairs(index: Tensor) -> list[tuple[Tensor, Tensor]]:
     return pairs
 
 
-def block_sums(picture: Tensor, by: int = 2) -> Tensor:
+def block_sums(image: Tensor, by: int = 2) -> Tensor:
     """Sum each block of ``by`` x ``by`` pixels: (H, W, ...) -> (H / by, W / by, ...). Differentiable.
 
     Raises:
         ValueError: where ``by`` does not divide both sides.
 
-    Cost: one read of the picture.
+    Cost: one read of the image.
 
     >>> import torch
     >>> block_sums(torch.arange(8).reshape(2, 4)).tolist()
     [[10, 18]]
     """
-    height, width = picture.shape[:2]
+    height, width = image.shape[:2]
     if height % by or width % by:
-        raise ValueError(f"picture: expected sides that {by} divides, but got {width} x {height} pixels")
-    blocks = picture.reshape(height // by, by, width // by, by, *picture.shape[2:])
-    return blocks.sum((1, 3), dtype=None if picture.is_floating_point() else torch.int32)
+        raise ValueError(f"image: expected sides that {by} divides, but got {width} x {height} pixels")
+    blocks = image.reshape(height // by, by, width // by, by, *image.shape[2:])
+    return blocks.sum((1, 3), dtype=None if image.is_floating_point() else torch.int32)
 
 
-def block_means(picture: Tensor, by: int = 2) -> Tensor:
+def block_means(image: Tensor, by: int = 2) -> Tensor:
     """Average each block of ``by`` x ``by`` pixels; otherwise as ``block_sums``.
 
     >>> import torch
     >>> block_means(torch.tensor([[1.0, 2.0], [3.0, 5.0]])).item()
     2.75
     """
-    return block_sums(picture, by) / by**2
+    return block_sums(image, by) / by**2
 
 
 def reduced_depth(depth: Tensor, by: int = 2) -> Tensor:
@@ -258,7 +249,7 @@ def second_variation(volume: Tensor) -> Tensor:
 def huber_variation(volume: Tensor) -> Tensor:
     """Return Huber's function of the first differences, summed over axes, points and channels.
 
-    Its slope is the difference itself, at most 1.
+    Its derivative is the difference itself, at most 1.
 
     Args:
         volume: (X, Y, Z, C).

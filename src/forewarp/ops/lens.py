@@ -38,7 +38,24 @@ def distort(points: Tensor, radial: Radial, tangential: Tangential) -> Tensor:
     tensor([0.6250, 0.0000])
     """
     check_shape("points", points, ("...", 2))
-    return _bent(points, radial, tangential)[0]
+    return distort_with_jacobian(points, radial, tangential)[0]
+
+
+def distort_with_jacobian(
+    points: Tensor, radial: Radial, tangential: Tangential
+) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor]]:
+    """``distort``, and its Jacobian: dx/dx, dx/dy = dy/dx and dy/dy, each (...,)."""
+    (k1, k2, k3), (p1, p2) = radial, tangential
+    x, y = points.unbind(-1)
+    r2 = x * x + y * y
+    scale = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    slope = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))  # d scale / dx is slope * x
+    distorted_x = x * scale + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    distorted_y = y * scale + 2 * p2 * x * y + p1 * (r2 + 2 * y * y)
+    xx = scale + slope * x * x + 2 * p1 * y + 6 * p2 * x
+    xy = slope * x * y + 2 * p1 * x + 2 * p2 * y
+    yy = scale + slope * y * y + 2 * p2 * x + 6 * p1 * y
+    return torch.stack([distorted_x, distorted_y], -1), (xx, xy, yy)
 
 
 def unfolded(points: Tensor, radial: Radial, tangential: Tangential) -> Tensor:
@@ -66,7 +83,7 @@ def unfolded(points: Tensor, radial: Radial, tangential: Tangential) -> Tensor:
     place = points.detach().double()
     regular = torch.ones_like(place[..., 0], dtype=torch.bool)
     for k in range(_CHECKS):
-        regular &= _is_regular(_bent(_RATIO**k * place, radial, tangential)[1])
+        regular &= _is_regular(distort_with_jacobian(_RATIO**k * place, radial, tangential)[1])
     return regular
 
 
@@ -90,51 +107,28 @@ def undistort(points: Tensor, radial: Radial, tangential: Tangential) -> Tensor:
     """
     check_shape("points", points, ("...", 2))
     goal = points.detach().double()
-    rate = torch.ones_like(goal[..., :1])
-    ahead = _is_regular(_bent(goal, radial, tangential)[1])[..., None]
+    damping = torch.ones_like(goal[..., :1])
+    ahead = _is_regular(distort_with_jacobian(goal, radial, tangential)[1])[..., None]
     place = torch.where(ahead, goal, 0.0)  # start on the near side of a fold
-    bent, jacobian = _bent(place, radial, tangential)
-    error = (bent - goal).norm(dim=-1, keepdim=True)
+    distorted, jacobian = distort_with_jacobian(place, radial, tangential)
+    error = (distorted - goal).norm(dim=-1, keepdim=True)
     for _ in range(_STEPS):
         if not bool((error > _CLOSE_ENOUGH).any()):
             break
-        tried = place - rate * _solved(jacobian, bent - goal)
-        bent_there, jacobian_there = _bent(tried, radial, tangential)
-        error_there = (bent_there - goal).norm(dim=-1, keepdim=True)
+        (xx, xy, yy), (a, b) = jacobian, (distorted - goal).unbind(-1)
+        step = torch.stack([yy * a - xy * b, xx * b - xy * a], -1) / (xx * yy - xy * xy)[..., None]
+        tried = place - damping * step.nan_to_num(0.0, 0.0, 0.0)  # no step where the Jacobian is singular
+        distorted_there, jacobian_there = distort_with_jacobian(tried, radial, tangential)
+        error_there = (distorted_there - goal).norm(dim=-1, keepdim=True)
         closer = (error_there < error) & _is_regular(jacobian_there)[..., None]  # False for NaN
-        place, bent = torch.where(closer, tried, place), torch.where(closer, bent_there, bent)
+        place, distorted = torch.where(closer, tried, place), torch.where(closer, distorted_there, distorted)
         error = torch.where(closer, error_there, error)
         jacobian = tuple(torch.where(closer[..., 0], b, a) for a, b in zip(jacobian, jacobian_there))
-        rate = torch.where(closer, (2 * rate).clamp(max=1), rate / 2)
+        damping = torch.where(closer, (2 * damping).clamp(max=1), damping / 2)
     return place
-
-
-def _bent(
-    points: Tensor, radial: Radial, tangential: Tangential
-) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor]]:
-    """Return the distorted points and the Jacobian: dx/dx, dx/dy = dy/dx and dy/dy, each (...,)."""
-    (k1, k2, k3), (p1, p2) = radial, tangential
-    x, y = points.unbind(-1)
-    r2 = x * x + y * y
-    scale = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    slope = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))  # d scale / dx is slope * x
-    bent_x = x * scale + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-    bent_y = y * scale + 2 * p2 * x * y + p1 * (r2 + 2 * y * y)
-    xx = scale + slope * x * x + 2 * p1 * y + 6 * p2 * x
-    xy = slope * x * y + 2 * p1 * x + 2 * p2 * y
-    yy = scale + slope * y * y + 2 * p2 * x + 6 * p1 * y
-    return torch.stack([bent_x, bent_y], -1), (xx, xy, yy)
 
 
 def _is_regular(jacobian: tuple[Tensor, Tensor, Tensor]) -> Tensor:
     """Return whether the Jacobian is positive definite, (...,) bool; False if it is not finite."""
     xx, xy, yy = jacobian
     return (xx > 0) & (xx * yy - xy * xy > 0)
-
-
-def _solved(jacobian: tuple[Tensor, Tensor, Tensor], offset: Tensor) -> Tensor:
-    """Return the Newton step (..., 2); 0 where the Jacobian is singular."""
-    (xx, xy, yy), (a, b) = jacobian, offset.unbind(-1)
-    determinant = xx * yy - xy * xy
-    step = torch.stack([yy * a - xy * b, xx * b - xy * a], -1) / determinant[..., None]
-    return step.nan_to_num(0.0, 0.0, 0.0)

@@ -1,4 +1,4 @@
-"""Volume rendering: sample rays, in occupied cells or by importance, and composite what they meet."""
+"""Volume rendering: sample rays, evenly, by importance or in occupied cells, and composite the samples."""
 
 from __future__ import annotations
 
@@ -8,9 +8,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from forewarp.ops.backend import check_shape, match_threads, use_numba
-from forewarp.ops.grid import _array, index_of, occupied_cells, trilinear
+from forewarp.ops.backend import arrays, check_shape, match_threads, use_numba
+from forewarp.ops.grid import index_of, occupied_cells, trilinear
 from forewarp.ops.splat import average_splat
+
+_BLOCK = 4  # side, in cells, of the blocks of a coarse occupancy map, by which rays skip empty space
+_MARGIN = 1e-3  # cells
+
+# Sample distances ------------------------------------------------------------------------------------------
 
 
 def stratified(near: Tensor, far: Tensor, count: int, generator: torch.Generator | None = None) -> Tensor:
@@ -50,11 +55,7 @@ def midpoints(depths: Tensor) -> Tensor:
 
 @torch.no_grad()
 def by_importance(
-    edges: Tensor,
-    weights: Tensor,
-    count: int,
-    generator: torch.Generator | None = None,
-    floor: float = 1e-5,
+    edges: Tensor, weights: Tensor, count: int, generator: torch.Generator | None = None, floor: float = 1e-5
 ) -> Tensor:
     """Importance sampling (NeRF): draw ``count`` distances from a piecewise constant density.
 
@@ -94,6 +95,11 @@ def by_importance(
     return low + (high - low) * ((at - begin) / (end - begin)).clamp(0, 1)
 
 
+def _uniform(like: Tensor, generator: torch.Generator) -> Tensor:
+    """Draw numbers in [0, 1) on the generator's device, with shape, dtype and device of a tensor."""
+    return torch.rand(like.shape, generator=generator, device=generator.device, dtype=like.dtype).to(like)
+
+
 def union(*depths: Tensor) -> Tensor:
     """Merge sets of distances (R, S_i) of the same rays into one, ascending (R, sum of S_i)."""
     return torch.cat(depths, 1).sort(1).values
@@ -114,6 +120,12 @@ def clip_to_box(
     """
     check_shape("origins", origins, ("R", 3))
     check_shape("directions", directions, tuple(origins.shape))
+    enter, leave = _crossings(origins, directions, low, high)
+    return enter.clamp(near, far), leave.clamp(near, far)
+
+
+def _crossings(origins: Tensor, directions: Tensor, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
+    """Return where the lines of rays enter a box and leave it; they leave before they enter if they miss."""
     to_low, to_high = low - origins, high - origins
     inside = (to_low <= 0) & (to_high >= 0)
     level = directions == 0
@@ -121,16 +133,10 @@ def clip_to_box(
     never = torch.where(inside, -torch.inf, torch.inf).to(origins)  # for rays parallel to a face
     enter = torch.where(level, never, torch.minimum(to_low / safe, to_high / safe))
     leave = torch.where(level, -never, torch.maximum(to_low / safe, to_high / safe))
-    return enter.amax(1).clamp(near, far), leave.amin(1).clamp(near, far)
+    return enter.amax(1), leave.amin(1)
 
 
-def _uniform(like: Tensor, generator: torch.Generator) -> Tensor:
-    """Draw numbers in [0, 1) on the generator's device, with shape, dtype and device of a tensor."""
-    return torch.rand(like.shape, generator=generator, device=generator.device, dtype=like.dtype).to(like)
-
-
-_BLOCK = 4  # side, in cells, of the blocks of a coarse occupancy map, by which rays skip empty space
-_MARGIN = 1e-3  # cells
+# March -----------------------------------------------------------------------------------------------------
 
 
 def march(
@@ -155,15 +161,23 @@ def march(
 
     Cost: one test per step in blocks with occupied cells, one per empty block; memory P.
     """
-    check_march(origins, directions, near, far, step, jitter)
-    run = _numba_march if use_numba(origins) else march_reference
-    return run(origins.detach(), directions.detach(), near, far, step, cells, jitter)
+    _check_march(origins, directions, near, far, step, jitter)
+    if not use_numba(origins):
+        return march_reference(origins.detach(), directions.detach(), near, far, step, cells, jitter)
+    from forewarp.ops.kernels import voxels as kernels
+
+    counts, firsts = torch.zeros(2, len(origins), dtype=torch.int64).unbind()
+    common = (*_march_arrays(origins, directions, near, far, step, cells, jitter), *arrays(counts, firsts))
+    kernels.march(*common, *arrays(counts[:0], counts[:0], origins[:0, 0]))
+    starts, total = counts.cumsum(0) - counts, int(counts.sum())
+    ray_ids, distances = counts.new_empty(total), origins.new_empty(total)
+    kernels.march(*common, *arrays(starts, ray_ids, distances))
+    return ray_ids, distances
 
 
-def check_march(
+def _check_march(
     origins: Tensor, directions: Tensor, near: float, far: float, step: float, jitter: Tensor
 ) -> None:
-    """Raise ValueError for rays that cannot be marched (see ``march``)."""
     check_shape("origins", origins, ("R", 3))
     check_shape("directions", directions, (len(origins), 3))
     check_shape("jitter", jitter, (len(origins),))
@@ -171,70 +185,41 @@ def check_march(
         raise ValueError(f"march: expected step > 0 and 0 <= near < far, but got {step=}, {near=}, {far=}")
 
 
-def _span(origins: Tensor, directions: Tensor, near: float, far: float, shape) -> tuple[Tensor, Tensor]:
-    last = torch.tensor([float(n) for n in shape], dtype=origins.dtype, device=origins.device)
-    level = directions == 0
-    safe = torch.where(level, torch.ones_like(directions), directions)
-    a, b = -origins / safe, (last - origins) / safe
-    inf = torch.full_like(a, math.inf)
-    outside = level & ((origins < 0) | (origins > last))
-    enter = torch.where(outside, inf, torch.where(level, -inf, torch.minimum(a, b)))
-    leave = torch.where(outside, -inf, torch.where(level, inf, torch.maximum(a, b)))
-    return enter.amax(-1).clamp(min=near), leave.amin(-1).clamp(max=far)
-
-
 def march_reference(origins, directions, near, far, step, cells, jitter) -> tuple[Tensor, Tensor]:
     """``march`` in plain PyTorch: make every step inside the box, keep those in occupied cells."""
-    enter, leave = _span(origins, directions, near, far, cells.shape)
+    last = torch.tensor(cells.shape, device=cells.device) - 1
+    enter, leave = _crossings(origins, directions, torch.zeros_like(last), last + 1)
+    enter, leave = enter.clamp(min=near), leave.clamp(max=far)
     hit = enter <= leave
-    first = torch.where(hit, ((enter - near) / step - jitter).ceil().clamp(min=0), torch.zeros_like(enter))
-    extent = torch.where(hit, leave - enter, torch.zeros_like(enter))
+    first = torch.where(hit, ((enter - near) / step - jitter).ceil().clamp(min=0), 0.0)
+    extent = torch.where(hit, leave - enter, 0.0)
     steps = int(extent.max().div(step).floor()) + 2 if len(origins) else 0
     k = first[:, None] + torch.arange(steps, dtype=origins.dtype, device=origins.device)
     t = near + (k + jitter[:, None]) * step  # (R, S)
-    keep = hit[:, None] & (t <= leave[:, None])
-    ray_ids, columns = keep.nonzero(as_tuple=True)
+    ray_ids, columns = (hit[:, None] & (t <= leave[:, None])).nonzero(as_tuple=True)
     distances = t[ray_ids, columns]
     points = origins[ray_ids] + distances[:, None] * directions[ray_ids]
-    last = torch.tensor(cells.shape, device=cells.device) - 1
     x, y, z = torch.minimum(points.long().clamp(min=0), last).unbind(-1)
     inside = cells[x, y, z]
     return ray_ids[inside], distances[inside]
 
 
-def _numba_march(origins, directions, near, far, step, cells, jitter) -> tuple[Tensor, Tensor]:
-    from forewarp.ops.kernels import voxels as kernels
-
-    match_threads()
-    counts, firsts = torch.zeros(2, len(origins), dtype=torch.int64).unbind()
-    none = torch.zeros(0, dtype=torch.int64)
-    common = (*(_array(v) for v in (origins, directions)), float(near), float(far), float(step))
-    common = (*common, _array(jitter), *map_cells(cells), counts.numpy(), firsts.numpy())
-    kernels.march(*common, none.numpy(), none.numpy(), origins.new_zeros(0).numpy())
-    starts = counts.cumsum(0) - counts
-    total = int(counts.sum())
-    ray_ids, distances = torch.empty(total, dtype=torch.int64), origins.new_empty(total)
-    kernels.march(*common, starts.numpy(), ray_ids.numpy(), distances.numpy())
-    return ray_ids, distances
-
-
-def map_cells(cells: Tensor) -> tuple:
-    """Return what the kernels march through.
-
-    Returns:
-        the cells, the distance from each block to the next occupied block, the bounds of all occupied cells,
-        and the side of a block.
+def _march_arrays(origins, directions, near, far, step, cells, jitter) -> tuple:
+    """Return what the kernels march through: rays, steps, cells, the distance from each block of cells to the
+    next occupied block, the bounds of all occupied cells, and the side of a block.
     """
     from forewarp.ops.kernels import voxels as kernels
 
-    array = _array(cells.contiguous().view(torch.uint8))
-    reach = torch.empty([-(-n // _BLOCK) for n in cells.shape], dtype=torch.uint8).numpy()
-    bounds = torch.empty(2, 3, dtype=torch.float64).numpy()
-    kernels.pool_blocks(array, reach, _BLOCK, bounds)
+    match_threads()
+    reach = torch.empty([-(-n // _BLOCK) for n in cells.shape], dtype=torch.uint8)
+    bounds = torch.empty(2, 3, dtype=torch.float64)
+    kernels.pool_blocks(*arrays(cells, reach), _BLOCK, *arrays(bounds))
     # Keep samples that rounding moves just outside their cell; the box itself stays the limit.
-    bounds[0] = (bounds[0] - _MARGIN).clip(min=0)
-    bounds[1] = (bounds[1] + _MARGIN).clip(max=cells.shape)
-    return array, reach, bounds, _BLOCK
+    bounds += torch.tensor([[-_MARGIN], [_MARGIN]], dtype=torch.float64)
+    bounds[0].clamp_(min=0)
+    bounds[1] = torch.minimum(bounds[1], torch.tensor(cells.shape))
+    rays = (*arrays(origins, directions), float(near), float(far), float(step))
+    return *rays, *arrays(jitter, cells, reach, bounds), _BLOCK
 
 
 class Traced(NamedTuple):
@@ -256,22 +241,10 @@ class Traced(NamedTuple):
 
 
 def trace(
-    origins: Tensor,
-    directions: Tensor,
-    near: float,
-    far: float,
-    step: float,
-    cells: Tensor,
-    jitter: Tensor,
-    *,
-    raw: Tensor,
-    index: Tensor,
-    fill: float,
-    shift: float,
-    scale: float,
-    early_stop_eps: float = 0.0,
-    threshold: float = 0.0,
-) -> Traced:
+    origins: Tensor, directions: Tensor, near: float, far: float, step: float, cells: Tensor, jitter: Tensor,
+    *, raw: Tensor, index: Tensor, fill: float, shift: float, scale: float,
+    early_stop_eps: float = 0.0, threshold: float = 0.0,
+) -> Traced:  # fmt: skip
     """Do ``march``, ``trilinear`` and ``render_weights`` of ``softplus(raw + shift) * scale`` in one kernel.
 
     Numba only, without gradient; elsewhere the three operators are called one by one.
@@ -290,25 +263,25 @@ def trace(
 
     Cost: one read of 8 voxels per sample up to a ray's end, twice for returned samples; memory P.
     """
-    check_march(origins, directions, near, far, step, jitter)
+    _check_march(origins, directions, near, far, step, jitter)
     check_shape("raw", raw, ("M",))
     check_shape("index", index, tuple(n + 1 for n in cells.shape))
     from forewarp.ops.kernels import voxels as kernels
 
-    match_threads()
     sums = torch.zeros(len(origins), 4, dtype=torch.float64)
     read, counts, firsts = torch.zeros(3, len(origins), dtype=torch.int64).unbind()
-    common = (*(_array(v) for v in (origins, directions)), *map(float, (near, far, step)), _array(jitter))
-    common = (*common, *map_cells(cells), _array(raw), _array(index))
-    common = (*common, *map(float, (fill, shift, scale, early_stop_eps, threshold)))
-    common = (*common, *(v.numpy() for v in (sums, read, counts, firsts)))
-    ids, none = torch.zeros(0, dtype=torch.int64), origins.new_zeros(0)
-    kernels.trace(*common, *(v.numpy() for v in (ids, ids, none, none)))
+    numbers = map(float, (fill, shift, scale, early_stop_eps, threshold))
+    common = (*_march_arrays(origins, directions, near, far, step, cells, jitter), *arrays(raw, index))
+    common = (*common, *numbers, *arrays(sums, read, counts, firsts))
+    kernels.trace(*common, *arrays(counts[:0], counts[:0], origins[:0, 0], origins[:0, 0]))
     starts, total = counts.cumsum(0) - counts, int(counts.sum())
-    ids, distances, weights = torch.empty(total, dtype=torch.int64), *origins.new_empty(2, total).unbind()
-    kernels.trace(*common, *(v.numpy() for v in (starts, ids, distances, weights)))
+    ids, distances, weights = counts.new_empty(total), *origins.new_empty(2, total).unbind()
+    kernels.trace(*common, *arrays(starts, ids, distances, weights))
     opacity, distance, transmittance, _ = sums.to(origins.dtype).unbind(-1)
     return Traced(opacity, distance, transmittance, ids, distances, weights, int(read.sum()))
+
+
+# Composite -------------------------------------------------------------------------------------------------
 
 
 def render_weights(optical: Tensor, ray_ids: Tensor, rays: int) -> tuple[Tensor, Tensor]:
@@ -337,13 +310,9 @@ def render_weights(optical: Tensor, ray_ids: Tensor, rays: int) -> tuple[Tensor,
     # An optical depth of 80 is opaque in float32; the cap keeps the global sum exact.
     x = optical.double().clamp(max=80.0)
     through = x.cumsum(0) - x
-    counts = torch.zeros(rays, dtype=torch.int64, device=x.device).index_add_(
-        0, ray_ids, torch.ones_like(ray_ids)
-    )
-    starts = counts.cumsum(0) - counts
-    offset = torch.cat([through, through.new_zeros(1)])[
-        starts
-    ]  # a last ray without samples starts at the end
+    counts = torch.bincount(ray_ids, minlength=rays)
+    # A last ray without samples starts at the end.
+    offset = torch.cat([through, through.new_zeros(1)])[counts.cumsum(0) - counts]
     before = (through - offset[ray_ids]).clamp(min=0)
     weights = torch.exp(-before) * -torch.expm1(-x)
     total = torch.zeros(rays, dtype=x.dtype, device=x.device).index_add(0, ray_ids, x)

@@ -5,11 +5,15 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from forewarp.ops.backend import check_shape, match_threads, use_numba
+from forewarp.ops.backend import arrays, check_shape, match_threads, use_numba
+
+LEAST = 1e-20  # the sum of a particle's weights is divided by this at least: that of one at rest is 0
+_WIDEST = 16  # nodes of a particle that the kernel knows
+_SMALL = 0.05  # radian; below, series in the squared angle are exact to single precision
 
 
 def node_maps(motion: Tensor, places: Tensor) -> Tensor:
-    """What nodes do to points around them, less the identity.
+    """Return what nodes do to points around them, less the identity.
 
     A point x beside a node at p goes to ``R (x - p) + p + v``. ``R`` is that of the Gibbs vector r, whose
     length is the tangent of half the angle: ``R - I = D = 2 (r r^t - |r|^2 I + [r]x) / (1 + |r|^2)``: no
@@ -32,22 +36,24 @@ def node_maps(motion: Tensor, places: Tensor) -> Tensor:
     """
     check_shape("motion", motion, ("M", 6))
     check_shape("places", places, (len(motion), 3))
-    shift, turn = motion[:, :3], motion[:, 3:]
-    x, y, z = turn.unbind(-1)
-    zero, square = torch.zeros_like(x), turn.square().sum(-1)
+    shift, gibbs = motion[:, :3], motion[:, 3:]
+    x, y, z = gibbs.unbind(-1)
+    zero, square = torch.zeros_like(x), gibbs.square().sum(-1)
     across = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(-1, 3, 3)
     eye = torch.eye(3).to(motion)
-    linear = turn[:, :, None] * turn[:, None] - square[:, None, None] * eye + across
+    linear = gibbs[:, :, None] * gibbs[:, None] - square[:, None, None] * eye + across
     linear = linear * (2 / (1 + square))[:, None, None]
     rest = shift - (linear @ places[..., None])[..., 0]
     return torch.cat([linear.reshape(-1, 9), rest], -1)
 
 
-def carry_nodes(shift: Tensor, turn: Tensor | None, basis: Tensor, places: Tensor) -> tuple[Tensor, Tensor]:
-    """Where nodes are at a time, from their curves: ``motion`` (M, 6) and its ``node_maps`` (M, 12).
+def carry_nodes(
+    shift: Tensor, rotation: Tensor | None, basis: Tensor, places: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Carry nodes along their curves to a time: ``motion`` (M, 6) and its ``node_maps`` (M, 12).
 
     Args:
-        shift, turn: (M, K, 3) coefficients; None where nothing turns.
+        shift, rotation: (M, K, 3) coefficients; None where nothing rotates.
         basis: (K,) of the time.
         places: (M, 3).
 
@@ -57,23 +63,23 @@ def carry_nodes(shift: Tensor, turn: Tensor | None, basis: Tensor, places: Tenso
     Cost: 6 numbers a node and coefficient that is not 0.
     """
     check_shape("places", places, ("M", 3))
-    _check_curves(shift, turn, (len(places), len(basis), 3))
-    asks = torch.is_grad_enabled() and (shift.requires_grad or (turn is not None and turn.requires_grad))
+    _check_curves(shift, rotation, (len(places), len(basis), 3))
+    curves = [shift] if rotation is None else [shift, rotation]
+    asks = torch.is_grad_enabled() and any(curve.requires_grad for curve in curves)
     if use_numba(shift) and shift.dtype == torch.float32 and not asks:
         from forewarp.ops.kernels import nodes as kernels
 
         motion, maps = shift.new_empty(len(places), 6), shift.new_empty(len(places), 12)
-        arrays = (shift, shift[:0] if turn is None else turn, basis, places, motion, maps)
-        kernels.carry(*(a.detach().numpy() for a in arrays))
+        pair = (shift, shift[:0] if rotation is None else rotation)
+        kernels.carry(*arrays(*pair, basis, places, motion, maps))
         return motion, maps
-    went = torch.einsum("mkc,k->mc", shift, basis)
-    turned = torch.zeros_like(went) if turn is None else torch.einsum("mkc,k->mc", turn, basis)
-    motion = torch.cat([went, turned], -1)
+    parts = [torch.einsum("mkc,k->mc", curve, basis) for curve in curves]
+    motion = torch.cat([*parts, *[torch.zeros_like(parts[0])] * (2 - len(parts))], -1)
     return motion, node_maps(motion, places)
 
 
 def stiffness(motion: Tensor, places: Tensor, edges: Tensor, weights: Tensor) -> Tensor:
-    """How far nodes are from moving rigidly together: ``sum w |v_l - v_m - D_m (p_l - p_m)|^2``.
+    """Measure how far nodes are from moving rigidly: ``sum w |v_l - v_m - D_m (p_l - p_m)|^2``.
 
     Args:
         motion, places: as of ``node_maps``.
@@ -88,108 +94,108 @@ def stiffness(motion: Tensor, places: Tensor, edges: Tensor, weights: Tensor) ->
 
     Cost: about 40 operations an edge.
     """
-    _check_edges(motion, places, edges, weights)
     linear = node_maps(motion, places)[:, :9].reshape(-1, 3, 3)
+    check_shape("edges", edges, (len(motion), "E"))
+    check_shape("weights", weights, tuple(edges.shape))
     apart = places[edges] - places[:, None]
     strain = motion[edges, :3] - motion[:, None, :3] - (linear[:, None] @ apart[..., None])[..., 0]
     return (weights[..., None] * strain.square()).sum()
 
 
-def _check_edges(motion: Tensor, places: Tensor, edges: Tensor, weights: Tensor) -> None:
-    check_shape("motion", motion, ("M", 6))
-    check_shape("places", places, (len(motion), 3))
-    check_shape("edges", edges, (len(motion), "E"))
-    check_shape("weights", weights, tuple(edges.shape))
-
-
-def _check_curves(shift: Tensor, turn: Tensor | None, shape: tuple[int | str, ...]) -> None:
-    check_shape("shift", shift, shape)
-    if turn is not None:
-        check_shape("turn", turn, tuple(shift.shape))
-
-
 def pull_nodes(
     motion: Tensor, places: Tensor, by_maps: Tensor, edges: Tensor, weights: Tensor, factor: float
 ) -> tuple[Tensor, float]:
-    """Gradients by ``motion`` of a loss that has ``by_maps`` (M, 12) and of ``factor`` times ``stiffness``.
+    """Return gradients by ``motion`` of a loss with ``by_maps`` (M, 12), and of ``factor`` x ``stiffness``.
 
     Args:
         motion, places, edges, weights: as of ``stiffness``.
-        by_maps: slopes by ``node_maps``.
+        by_maps: gradients by ``node_maps``.
         factor: of the stiffness.
 
     Returns:
         gradients (M, 6), and the stiffness itself.
 
+    Raises:
+        ValueError: for shapes that do not go together.
+
     Cost: about 60 operations an edge.
     """
-    _check_edges(motion, places, edges, weights)
+    check_shape("motion", motion, ("M", 6))
+    check_shape("places", places, (len(motion), 3))
     check_shape("by_maps", by_maps, (len(motion), 12))
+    check_shape("edges", edges, (len(motion), "E"))
+    check_shape("weights", weights, tuple(edges.shape))
     if use_numba(motion) and motion.dtype == torch.float32:
         from forewarp.ops.kernels import nodes as kernels
 
-        found = torch.zeros_like(motion)
-        arrays = (motion, places, by_maps.contiguous(), edges, weights, found)
-        return found, kernels.pull(*(a.detach().numpy() for a in arrays), float(factor))
-    own = motion.detach().clone().requires_grad_()
+        gradient = torch.zeros_like(motion)
+        pulled = kernels.pull(*arrays(motion, places, by_maps, edges, weights, gradient), float(factor))
+        return gradient, pulled
+    leaf = motion.detach().clone().requires_grad_()
     with torch.enable_grad():
-        strain = stiffness(own, places, edges, weights)
-        ((node_maps(own, places) * by_maps).sum() + factor * strain).backward()
-    return own.grad, float(strain.detach())
+        strain = stiffness(leaf, places, edges, weights)
+        ((node_maps(leaf, places) * by_maps).sum() + factor * strain).backward()
+    return leaf.grad, float(strain.detach())
 
 
 def spread_nodes(
-    shift: Tensor, turn: Tensor | None, slope: Tensor, basis: Tensor, bend: Tensor, factor: float, unit: float
-) -> tuple[Tensor, Tensor | None, float]:
+    shift: Tensor, rotation: Tensor | None, by_motion: Tensor, basis: Tensor, bend: Tensor, factor: float,
+    unit: float,
+) -> tuple[Tensor, Tensor | None, float]:  # fmt: skip
     """Carry gradients by ``motion`` at a time to the coefficients of the curves, and keep curves smooth.
 
     The bend of a node is ``b = sum_k c_k bend_k``, of ``shift`` in shares of ``unit``; what is added to the
-    loss is ``factor mean b^2``, once for ``shift`` and once for ``turn``.
+    loss is ``factor mean b^2``, once for ``shift`` and once for ``rotation``.
 
     Args:
-        shift, turn: (M, K, 3) coefficients; None where nothing turns.
-        slope: (M, 6) gradients by ``motion``.
+        shift, rotation: (M, K, 3) coefficients; None where nothing rotates.
+        by_motion: (M, 6) gradients by ``motion``.
         basis, bend: (K,) of the time; of its second difference.
         factor: of the squared bend.
         unit: a length, world units.
 
     Returns:
-        gradients by ``shift`` and by ``turn`` (M, K, 3), and the mean of b^2, both kinds together.
+        gradients by ``shift`` and by ``rotation`` (M, K, 3), and the mean of b^2, both kinds together.
+
+    Raises:
+        ValueError: for shapes that do not go together.
 
     Cost: about 20 operations a coefficient.
     """
-    _check_curves(shift, turn, ("M", "K", 3))
-    check_shape("slope", slope, (len(shift), 6))
+    _check_curves(shift, rotation, ("M", "K", 3))
+    check_shape("by_motion", by_motion, (len(shift), 6))
     check_shape("basis", basis, (shift.shape[1],))
     check_shape("bend", bend, (shift.shape[1],))
-    parts = ((shift, slope[:, :3], unit), (turn, slope[:, 3:], 1.0))
-    found, total = [], 0.0
-    for value, own, scale in parts:
-        if value is None:
-            found.append(None)
+    gradients, total = [], 0.0
+    for curve, by_curve, scale in ((shift, by_motion[:, :3], unit), (rotation, by_motion[:, 3:], 1.0)):
+        if curve is None:
+            gradients.append(None)
             continue
-        value = value.detach()
-        if use_numba(value) and value.dtype == torch.float32:
+        curve = curve.detach()
+        if use_numba(curve) and curve.dtype == torch.float32:
             from forewarp.ops.kernels import nodes as kernels
 
-            gradient = torch.empty_like(value)
-            arrays = (value, own, basis, bend, gradient)
-            total += kernels.spread(*(a.numpy() for a in arrays), float(factor), float(scale))
+            gradient = torch.empty_like(curve)
+            # Half of the columns of ``by_motion`` are no contiguous array: read as they lie.
+            inputs = (t.numpy() for t in (curve, by_curve, basis, bend, gradient))
+            total += kernels.spread(*inputs, float(factor), float(scale))
         else:
-            bent = torch.einsum("mkc,k->mc", value, bend) / scale
+            bent = torch.einsum("mkc,k->mc", curve, bend) / scale
             total += float(bent.square().mean())
             pulled = 2 * factor / (bent.numel() * scale) * bent
-            gradient = own[:, None] * basis[:, None] + pulled[:, None] * bend[:, None]
-        found.append(gradient)
-    return *found, total
+            gradient = by_curve[:, None] * basis[:, None] + pulled[:, None] * bend[:, None]
+        gradients.append(gradient)
+    return *gradients, total
 
 
-LEAST = 1e-20  # sum that is divided by: that of a particle at rest is 0
-_WIDEST = 16  # nodes of a particle that the kernel knows
+def _check_curves(shift: Tensor, rotation: Tensor | None, shape: tuple[int | str, ...]) -> None:
+    check_shape("shift", shift, shape)
+    if rotation is not None:
+        check_shape("rotation", rotation, tuple(shift.shape))
 
 
 def skin_weights(shares: Tensor, learned: Tensor) -> Tensor:
-    """The weights ``s_j exp(l_j) / sum_k s_k exp(l_k)`` of the nodes that particles follow.
+    """Return the weights ``s_j exp(l_j) / sum_k s_k exp(l_k)`` of the nodes that particles follow.
 
     Args:
         shares: (N, L), >= 0; a row of zeros gives zeros.
@@ -211,27 +217,18 @@ def skin_weights(shares: Tensor, learned: Tensor) -> Tensor:
     asks = torch.is_grad_enabled() and learned.requires_grad
     fast = use_numba(learned) and learned.dtype == torch.float32 and shares.dtype == torch.float32
     if not fast or asks or not 0 < shares.shape[1] <= _WIDEST:
-        return skin_weights_reference(shares, learned)
+        top = learned.detach().amax(-1, keepdim=True)  # a row less it means the same, and is safe
+        weights = shares * (learned - top).exp()
+        return weights / weights.sum(-1, keepdim=True).clamp(min=LEAST)
     from forewarp.ops.kernels import nodes as kernels
 
     match_threads()
-    found = torch.empty(shares.shape)
-    parts = (t.detach().contiguous().view(-1).numpy() for t in (shares, learned, found))
-    kernels.weigh(*parts, shares.shape[1])
-    return found
+    weights = torch.empty(shares.shape)
+    kernels.weigh(*arrays(shares.reshape(-1), learned.reshape(-1), weights.view(-1)), shares.shape[1])
+    return weights
 
 
-def skin_weights_reference(shares: Tensor, learned: Tensor) -> Tensor:
-    """``skin_weights`` in plain PyTorch, on any device and in any precision."""
-    top = learned.detach().amax(-1, keepdim=True)  # a row less it means the same, and is safe
-    own = shares * (learned - top).exp()
-    return own / own.sum(-1, keepdim=True).clamp(min=LEAST)
-
-
-_SMALL = 0.05  # radian; below, series in the squared angle are exact to single precision
-
-
-def move_by_screw(points: Tensor, turn: Tensor, shift: Tensor) -> Tensor:
+def move_by_screw(points: Tensor, rotation: Tensor, shift: Tensor) -> Tensor:
     """Move points by the exponential of a screw (se(3)): ``x' = R x + V v``.
 
     With ``theta = |w|`` and ``W`` the matrix of ``w x``: ``R = I + a W + b W^2`` and ``V = I + b W + c W^2``,
@@ -241,7 +238,7 @@ def move_by_screw(points: Tensor, turn: Tensor, shift: Tensor) -> Tensor:
 
     Args:
         points: x (..., 3).
-        turn: w (..., 3), radian about the origin.
+        rotation: w (..., 3), radian about the origin.
         shift: v (..., 3), in the unit of the points.
 
     Returns:
@@ -251,13 +248,13 @@ def move_by_screw(points: Tensor, turn: Tensor, shift: Tensor) -> Tensor:
     tensor([1., 2., 0.])
     """
     check_shape("points", points, (*points.shape[:-1], 3))
-    check_shape("turn", turn, tuple(points.shape))
+    check_shape("rotation", rotation, tuple(points.shape))
     check_shape("shift", shift, tuple(points.shape))
-    a, b, c = _coefficients(turn.square().sum(-1, keepdim=True))
-    about = torch.linalg.cross(turn, points)
-    along = torch.linalg.cross(turn, shift)
-    turned = points + a * about + b * torch.linalg.cross(turn, about)
-    return turned + shift + b * along + c * torch.linalg.cross(turn, along)
+    a, b, c = _coefficients(rotation.square().sum(-1, keepdim=True))
+    about = torch.linalg.cross(rotation, points)
+    along = torch.linalg.cross(rotation, shift)
+    rotated = points + a * about + b * torch.linalg.cross(rotation, about)
+    return rotated + shift + b * along + c * torch.linalg.cross(rotation, along)
 
 
 def _coefficients(squared: Tensor) -> tuple[Tensor, Tensor, Tensor]:

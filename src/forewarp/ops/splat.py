@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from forewarp.ops.backend import check_shape, match_threads, use_numba
-from forewarp.ops.grid import _CORNERS, _array
+from forewarp.ops.backend import arrays, check_shape, match_threads, use_numba
+from forewarp.ops.grid import _CORNERS
 
 
 class Splat(NamedTuple):
@@ -125,7 +125,7 @@ def _numba_scatter(source: Tensor, positions: Tensor, shape: tuple[int, int, int
     from forewarp.ops.kernels import voxels as kernels
 
     index = torch.full(shape, -1, dtype=torch.int32)
-    rows = kernels.number_touched(_array(positions), index.numpy())
+    rows = kernels.number_touched(*arrays(positions, index))
     return _NumbaScatter.apply(source, positions, index, rows), index
 
 
@@ -137,7 +137,7 @@ class _NumbaScatter(torch.autograd.Function):
         chunks = min(4, match_threads())
         ctx.save_for_backward(source, positions, index)
         sums = source.new_zeros(chunks, rows, source.shape[1] + 1)
-        kernels.scatter(*(_array(v) for v in (source, positions, index, sums)))
+        kernels.scatter(*arrays(source, positions, index, sums))
         return sums.sum(0) if chunks > 1 else sums[0]
 
     @staticmethod
@@ -148,7 +148,5 @@ class _NumbaScatter(torch.autograd.Function):
         match_threads()
         source, positions, index = ctx.saved_tensors
         grad_source, grad_positions = source.new_zeros(source.shape), positions.new_zeros(positions.shape)
-        kernels.scatter_backward(
-            *(_array(v) for v in (source, positions, index, grad, grad_source, grad_positions))
-        )
+        kernels.scatter_backward(*arrays(source, positions, index, grad, grad_source, grad_positions))
         return grad_source, grad_positions, None, None

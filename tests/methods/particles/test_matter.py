@@ -29,5 +29,5 @@ def test_ellipsoids_are_seen_as_the_particles_are(method, data, time, by):
     )
     found = by(bare, still(bare), pinhole, NO_TINTS, torch.ones(1))
     wanted = by(snapshot.gaussians, snapshot.warp, pinhole, snapshot.color_basis, snapshot.opacity_basis)
-    torch.testing.assert_close(found.numbers, wanted.numbers.detach(), rtol=1e-3, atol=1e-3)
-    assert int((wanted.numbers[:, 5] > 0).sum()) > 50
+    torch.testing.assert_close(found.values, wanted.values.detach(), rtol=1e-3, atol=1e-3)
+    assert int((wanted.values[:, 5] > 0).sum()) > 50

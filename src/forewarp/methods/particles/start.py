@@ -15,7 +15,7 @@ from torch import Tensor
 
 from forewarp.methods.method import Start
 from forewarp.methods.particles.nodes import nearest
-from forewarp.ops.adam import Learned, adam_rows
+from forewarp.ops.adam import AdamState, adam_rows
 from forewarp.ops.backend import cores, use_numba
 from forewarp.ops.gaussians import (
     FLAT,
@@ -23,7 +23,7 @@ from forewarp.ops.gaussians import (
     Pinhole,
     Warp,
     compare,
-    compile_way_back,
+    compile_backward_kernels,
     project,
     rasterize,
 )
@@ -306,13 +306,13 @@ def compile_kernels(method: torch.nn.Module) -> None:
         pull_nodes(torch.zeros(1, 6), zero, torch.zeros(1, 12), edges, one, 1.0)
         skin_weights(one, one)
         moments = zero.clone(), zero.clone(), first.clone()
-        adam_rows([Learned(torch.zeros(1, 3), torch.ones(1, 3), *moments, 1e-3)], (0.9, 0.99), 1e-15)
+        adam_rows([AdamState(torch.zeros(1, 3), torch.ones(1, 3), *moments, 1e-3)], (0.9, 0.99), 1e-15)
     compare(*given, torch.zeros(72, 4, dtype=torch.uint8), torch.ones(3))
 
 
 def compile_backward() -> None:
     """Compile what leads from splats and an image back to particles: about half of all compiling."""
-    compile_way_back(*_single())
+    compile_backward_kernels(*_single())
 
 
 def _single() -> tuple[Gaussians, Warp, Pinhole, Tensor, Tensor]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
-from forewarp.ops.gaussians import CONIC_A, DEPTH, OPACITY, RED, SPLAT
+from forewarp.ops.gaussians import COLUMN, SPLAT
 from forewarp.ops.kernels.lanes import (
     fma,
     get_row,
@@ -87,7 +87,7 @@ def splat_gradients(splats, rows, ranks, sums, factor, gradients, pull):
             set_row(place, lane, added * factor)
         transpose(place)
         transpose(conics)
-        a, b, c, opacity = rows_of(conics, CONIC_A, 4)
+        a, b, c, opacity = rows_of(conics, COLUMN.conic_a, 4)
         s, sx, sy, sxx, sxy, syy = rows_of(place, 0, 6)
         along, upright = a * sx + b * sy, b * sx + c * sy
         set_rows(place, 0, (along, upright, sxx * -0.5, sxy * -1.0, syy * -0.5, s / opacity))
@@ -113,7 +113,7 @@ def _scatter(place, values, array, which, valid):
 def _by_covariance(camera, rows, scales, by_conic):
     """From gradients by the conic A, B, C to those by rows (2, 3) times scales.
 
-    Of the inverse X of a covariance: dL/dcov = -X G X, with G the gradients by X, half of B's on each side.
+    Of the inverse I of a covariance: dL/dcov = -I G I, with G the gradients by I, half of B's on each side.
     """
     by_a, by_b, by_c = by_conic
     a, b, c, determinant = covariance(camera, rows, scales)
@@ -168,7 +168,7 @@ def _by_point(camera, local, depth, inverse, px, py, lens, place, by_jacobian):
     ahead_x = first0 * camera[6] + first1 * camera[7] + first2 * camera[8]
     ahead_y = second0 * camera[6] + second1 * camera[7] + second2 * camera[8]
     square = inverse * inverse
-    far = row_of(place, _GRADIENT + DEPTH) / depth
+    far = row_of(place, _GRADIENT + COLUMN.depth) / depth
     lx = gx * inverse - ahead_x * square + far * local[0]
     ly = gy * inverse - ahead_y * square + far * local[1]
     turn = (px * ahead_x + py * ahead_y) * 2.0 - across - upright
@@ -185,8 +185,8 @@ def _color_gradients(direction, splats, tints, which, valid, place, to_colors, s
     for lane in range(SIDE_BY_SIDE):
         i = np.uintp(which[lane])
         for c in range(3):
-            place[SIDE_BY_SIDE * (ANY + c) + lane] = splats[i, RED + c]
-    zero, shown, by_color = np.float32(0), rows_of(place, ANY, 3), rows_of(place, _GRADIENT + RED, 3)
+            place[SIDE_BY_SIDE * (ANY + c) + lane] = splats[i, COLUMN.red + c]
+    zero, shown, by_color = np.float32(0), rows_of(place, ANY, 3), rows_of(place, _GRADIENT + COLUMN.red, 3)
     red = where_above(shown[0], zero, by_color[0])
     green = where_above(shown[1], zero, by_color[1])
     blue = where_above(shown[2], zero, by_color[2])
@@ -229,7 +229,7 @@ def _shape_gradients(camera, moved, log_scales, quaternions, which, valid, place
     gather(quaternions, which, place, QUATERNION, 4)
     rotation, scales = rotations(place), scales_of(log_scales, which, place)
     rows = product(moved, rotation)
-    by_root = _by_covariance(camera, rows, scales, rows_of(place, _GRADIENT + CONIC_A, 3))
+    by_root = _by_covariance(camera, rows, scales, rows_of(place, _GRADIENT + COLUMN.conic_a, 3))
     r0, r1, r2 = by_root[0] * scales[0], by_root[1] * scales[1], by_root[2] * scales[2]
     r3, r4, r5 = by_root[3] * scales[0], by_root[4] * scales[1], by_root[5] * scales[2]
     by_scale = (r0 * rows[0] + r3 * rows[3], r1 * rows[1] + r4 * rows[4], r2 * rows[2] + r5 * rows[5])
@@ -316,9 +316,11 @@ def chain(
             _color_gradients(direction, splats, tints, which, valid, place, to_colors, spots)
             for lane in range(valid):
                 i = np.uintp(which[lane])
-                by_opacity, covers = place[SIDE_BY_SIDE * (_GRADIENT + OPACITY) + lane], splats[i, OPACITY]
+                covers = splats[i, COLUMN.opacity]
+                by_opacity = place[SIDE_BY_SIDE * (_GRADIENT + COLUMN.opacity) + lane]
+                by_logit = by_opacity * covers * (np.float32(1) - covers)
                 for j in range(len(fades)):
-                    to_opacity[i, j] = by_opacity * covers * (np.float32(1) - covers) * fades[j]
+                    to_opacity[i, j] = by_logit * fades[j]
             for r in range(3):
                 for c in range(3):
                     value = by_point[r] * row_of(place, MEAN + c)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
-from forewarp.ops.gaussians import LEAST_LOG, REACH_X
+from forewarp.ops.gaussians import COLUMN, LEAST_LOG
 from forewarp.ops.kernels.lanes import (
     NARROW,
     exp,
@@ -281,4 +281,4 @@ def project(means, log_scales, quaternions, opacity, colors, maps, links, weight
                 row = SIDE_BY_SIDE * block + lane
                 put_row(out, row, row_of(place, lane))
                 if row >= count:
-                    out[row, REACH_X] = 0
+                    out[row, COLUMN.reach_x] = 0

@@ -11,24 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
-from forewarp.ops.gaussians import (
-    BLUE,
-    CONIC_A,
-    CONIC_B,
-    CONIC_C,
-    DEPTH,
-    GREEN,
-    LEAST_LOG,
-    LOG_OPACITY,
-    MOST,
-    OPACITY,
-    REACH_X,
-    REACH_Y,
-    RED,
-    SIDE,
-    X,
-    Y,
-)
+from forewarp.ops.gaussians import COLUMN, LEAST_LOG, MOST, SIDE
 from forewarp.ops.kernels.lanes import (
     add_sums,
     any_above,
@@ -49,6 +32,7 @@ from forewarp.ops.kernels.lanes import (
     root,
     row_of,
     rows,
+    rows_of,
     set_row,
     set_rows,
     sixteen,
@@ -59,7 +43,7 @@ from forewarp.ops.kernels.lanes import (
 )
 from forewarp.ops.kernels.project import SIDE_BY_SIDE
 
-RECORD = DEPTH + 1  # numbers of a record
+RECORD = COLUMN.depth + 1  # numbers of a record
 _OVER = 1e-3  # transmittance below which nothing behind is seen
 _DIGIT = 11  # bits that are sorted by at once
 _ZERO, _SHARE = np.float32(0), np.float32(1 / SIDE)
@@ -77,9 +61,9 @@ def by_depth(splats):
     count = 0
     bits = splats.view(np.uint32)
     for i in range(len(splats)):
-        if splats[i, REACH_X] > 0:
+        if splats[i, COLUMN.reach_x] > 0:
             seen[count] = i
-            keys[count] = bits[i, DEPTH]  # of positive numbers bits are ordered as they are
+            keys[count] = bits[i, COLUMN.depth]  # of positive numbers bits are ordered as they are
             count += 1
     seen, keys = seen[:count], keys[:count]
     sorted_seen, sorted_keys = np.empty(count, np.int32), np.empty(count, np.uint32)
@@ -111,9 +95,10 @@ def _write_records(splats, order, start, end, across, down, records, spans, outl
     for lane in range(SIDE_BY_SIDE):
         set_row(place, lane, get_row(splats, order[min(start + lane, end - 1)]))
     transpose(place)
-    x, y, wide, high = row_of(place, X), row_of(place, Y), row_of(place, REACH_X), row_of(place, REACH_Y)
-    a, b, c = row_of(place, CONIC_A) * -0.5, row_of(place, CONIC_B) * -1.0, row_of(place, CONIC_C) * -0.5
-    log_opacity, half = row_of(place, LOG_OPACITY), sixteen(-0.5) / a
+    x, y, a, b, c = rows_of(place, COLUMN.x, 5)
+    wide, high, log_opacity = rows_of(place, COLUMN.reach_x, 3)
+    a, b, c = a * -0.5, b * -1.0, c * -0.5
+    half = sixteen(-0.5) / a
     put_row(outline, 0, x)
     put_row(outline, 1, y)
     put_row(outline, 2, half)
@@ -121,7 +106,7 @@ def _write_records(splats, order, start, end, across, down, records, spans, outl
     put_row(outline, 4, b * b - a * c * 4.0)
     put_row(outline, 5, a * 4.0 * (np.float32(LEAST_LOG) - log_opacity))
     put_row(outline, 6, b / c * wide * -0.5)
-    set_rows(place, CONIC_A, (a, b, c, log_opacity))
+    set_rows(place, COLUMN.conic_a, (a, b, c, log_opacity))
     first, last = _span(x - wide, x + wide, across)
     top, bottom = _span(y - high, y + high, down)
     set_rows(place, RECORD, (first, last, top, bottom))
@@ -261,11 +246,11 @@ def share_out(ends, count):
 @njit(inline="always")
 def _alpha(records, i, column, y):
     """What a splat covers of each pixel of a tile, from a column on and in rows ``y``."""
-    dx = narrow_columns() + (column - records[i, X])
-    dy = y - records[i, Y]
-    along = widened(fma(dx * dx, records[i, CONIC_A], sixteen(records[i, OPACITY])))
-    across = widened(dx * records[i, CONIC_B])
-    power = fma(dy, fma(dy, records[i, CONIC_C], across), along)
+    dx = narrow_columns() + (column - records[i, COLUMN.x])
+    dy = y - records[i, COLUMN.y]
+    along = widened(fma(dx * dx, records[i, COLUMN.conic_a], sixteen(records[i, COLUMN.opacity])))
+    across = widened(dx * records[i, COLUMN.conic_b])
+    power = fma(dy, fma(dy, records[i, COLUMN.conic_c], across), along)
     return where_above(power, np.float32(LEAST_LOG), exp_down(power))
 
 
@@ -283,13 +268,13 @@ def _blend(records, entries, first, last, column, y, kept):
         alpha = _alpha(records, i, column, y)
         weight = alpha * through
         if kept is None:
-            far = fma(weight, records[i, DEPTH], far)
+            far = fma(weight, records[i, COLUMN.depth], far)
         else:
             put_row(kept, 2 * count, alpha)
             put_row(kept, 2 * count + 1, weight)
-        red = fma(weight, records[i, RED], red)
-        green = fma(weight, records[i, GREEN], green)
-        blue = fma(weight, records[i, BLUE], blue)
+        red = fma(weight, records[i, COLUMN.red], red)
+        green = fma(weight, records[i, COLUMN.green], green)
+        blue = fma(weight, records[i, COLUMN.blue], blue)
         through = through - weight
         count += 1
         if count & 3 == 0 and not any_above(through, np.float32(_OVER)):
@@ -310,15 +295,15 @@ def _walk_back(records, entries, first, count, column, y, kept, by_color, far, b
     for k in range(count - 1, -1, -1):
         i = entries[first + k]
         alpha, weight = get(kept, 2 * k), get(kept, 2 * k + 1)
-        shown = fma(blue, records[i, BLUE], behind * -1.0)
-        shown = fma(red, records[i, RED], fma(green, records[i, GREEN], shown))
+        shown = fma(blue, records[i, COLUMN.blue], behind * -1.0)
+        shown = fma(red, records[i, COLUMN.red], fma(green, records[i, COLUMN.green], shown))
         if far is not None:
-            shown = fma(far, records[i, DEPTH], shown)
+            shown = fma(far, records[i, COLUMN.depth], shown)
         behind = fma(alpha, shown, behind)
         by_power = weight * shown
-        dy = y - records[i, Y]
+        dy = y - records[i, COLUMN.y]
         low = by_power * dy
-        dx = beside + (column - records[i, X])
+        dx = beside + (column - records[i, COLUMN.x])
         s, sy, syy = fold(by_power), fold(low), fold(low * dy)
         sx = s * dx
         colors = (fold(weight * red), fold(weight * green), fold(weight * blue))
