@@ -18,11 +18,14 @@ from tests.support.configs import CONF, ROOT, composed
 PAPER = {"dnerf": 24, "hypernerf": 12, "nhr": 12, "lego_complete": 9, "ablation_modules": 60}
 PAPER |= {"ablation_losses": 32, "resolution": 16, "methods": 24}
 OTHERS = {"accuracy_time", "effects", "price_list_forward", "price_list_particles", "search", "minutes"}
-LISTS = {
-    name: yaml.safe_load((ROOT / "sweeps" / f"price_list_{name}.yaml").read_text())["hydra"]["sweeper"]
-    for name in ("forward", "particles")
+COUNTS = {"forward": 45, "particles": 48}
+CHANGES = {
+    name: yaml.safe_load((ROOT / "sweeps" / f"price_list_{name}.yaml").read_text())["hydra"]["sweeper"][
+        "changes"
+    ]
+    for name in COUNTS
 }
-CHANGES = {name: sweeper["changes"] for name, sweeper in LISTS.items()}
+HOOK = ["experiment=dnerf", "data.scene=hook"]
 
 
 def jobs_of(sweep, *words):
@@ -40,6 +43,20 @@ def job_of(sweep, *overrides):
     return config
 
 
+def some_of(jobs):
+    """Jobs that have, together, every override that occurs."""
+    seen, kept = set(), []
+    for job in jobs[::-1]:
+        if not seen.issuperset(job):
+            seen |= {*job}
+            kept.append(job)
+    return kept
+
+
+def test_no_sweep_is_forgotten():
+    assert {path.stem for path in (ROOT / "sweeps").glob("*.yaml")} == PAPER.keys() | OTHERS
+
+
 @pytest.mark.parametrize(("sweep", "count"), PAPER.items())
 def test_a_sweep_has_its_jobs(sweep, count):
     jobs = jobs_of(sweep)
@@ -49,18 +66,20 @@ def test_a_sweep_has_its_jobs(sweep, count):
     assert config.run.startswith(f"runs/paper/{config.data.scene}/")
 
 
-def test_no_sweep_is_forgotten():
-    assert {path.stem for path in (ROOT / "sweeps").glob("*.yaml")} == PAPER.keys() | OTHERS
-
-
 @pytest.mark.slow
+@pytest.mark.parametrize("sweep", [*PAPER, "effects"])
+def test_every_scene_and_choice_composes_and_has_a_folder_of_its_own(sweep):
+    jobs = some_of(jobs_of(sweep))
+    assert len({hashed(job_of(sweep, *job)).run for job in jobs}) == len(jobs)
+
+
 def test_effects_are_compared_on_every_specimen():
     jobs = jobs_of("effects")
     assert len(jobs) == 18
     auto, every, paper = (job_of("effects", *job) for job in jobs if "scene=specimen_room" in job)
-    for config in (auto, every, paper):
-        assert config.run.startswith("runs/effects/room/")
-        assert config.variant.name in config.run
+    assert {config.run.split("-")[0] for config in (auto, every, paper)} == {
+        f"runs/effects/room/{name}" for name in ("auto", "all_effects", "full")
+    }
     assert auto.effects == "auto"
     effects = ("motion", "view_dependence", "upsampler", "inpainter", "background")
     assert None not in [every.model[effect] for effect in effects]
@@ -69,17 +88,23 @@ def test_effects_are_compared_on_every_specimen():
 
 
 def test_seeds_repeat_every_job():
-    once, thrice = ({tuple(sorted(job)) for job in jobs_of("dnerf", f"seeds={n}")} for n in (1, 3))
+    once, thrice = ({tuple(sorted(job)) for job in jobs_of("nhr", f"seeds={n}")} for n in (1, 3))
     again = [{tuple(word.replace("seed=0", f"seed={n}") for word in job) for job in once} for n in range(3)]
     assert set.union(*again) == thrice
     assert len(thrice) == 3 * len(once)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("sweep", PAPER)
-def test_every_job_composes_and_has_a_folder_of_its_own(sweep):
-    folders = [hashed(job_of(sweep, *job)).run for job in jobs_of(sweep)]
-    assert len(set(folders)) == len(folders)
+def test_a_typed_scene_takes_the_place_of_those_of_a_sweep(ok, in_tmp):
+    words = ["sweeps=minutes", "paths.scenes=nowhere", "score=null"]
+    for typed, scenes in (
+        (["dataset=dnerf", "data.scene=hook,lego"], ["dnerf/hook", "dnerf/lego"]),
+        (["data.scene=broom2"], ["dnerf/broom2", "hypernerf/broom2"]),  # in the sweep's datasets
+    ):
+        said = ok("train", "--multirun", *words, *typed).out.splitlines()
+        skipped = [line for line in said if line.startswith("skipped: ")]
+        assert [line.split("nowhere/")[1] for line in skipped] == [
+            f"{scene}: no such scene" for scene in scenes
+        ]
 
 
 @pytest.mark.parametrize("every", [40, pytest.param(1, marks=pytest.mark.slow)], ids=["some", "all"])
@@ -104,7 +129,7 @@ def test_a_counterpart_stands_in_for_each_dataset(dataset):
     assert config.stage.fine.num_voxels == [[0, 13824]]
 
 
-@pytest.mark.parametrize(("method", "count"), [("forward", 45), ("particles", 48)])
+@pytest.mark.parametrize(("method", "count"), COUNTS.items())
 def test_the_price_list_changes_one_thing_at_a_time(method, count):
     changes = CHANGES[method]
     assert changes[0] == ""
@@ -120,11 +145,9 @@ def test_a_job_is_named_by_what_was_typed_but_not_by_how_it_runs(forewarp, in_tm
     how = ["checkpoint_seconds=9", "score=ssim", "evaluate=false", "sentinel.skip=1", "trust=[x]"]
     how += [f"callbacks{word}" for word in (".pictures=null", ".accuracy=null")]
     how += ["absent=skip", "data_changed=accept"]
-    for typed in ([], ["model/motion=cosines", "stage.fine.density=45"]):
-        shown = forewarp(
-            "train", "sweeps=price_list_particles", *scene, *how, *typed, "--cfg", "job", "--resolve"
-        )
-        assert yaml.safe_load(shown.out)["variant"] == {"name": " ".join(typed)}
+    typed = ["model/motion=cosines", "stage.fine.density=45"]
+    words = ["sweeps=price_list_particles", *scene, *how, *typed, "--cfg", "job", "--resolve"]
+    assert yaml.safe_load(forewarp("train", *words).out)["variant"] == {"name": " ".join(typed)}
 
 
 @pytest.mark.parametrize("folder", [CONF / "ablation", ROOT / "sweeps"], ids=["ablation", "sweeps"])
@@ -135,22 +158,31 @@ def test_what_reproduces_a_table_names_its_method(folder):
         assert re.search(named, text, re.MULTILINE) or path.stem == "accuracy_time", path
 
 
-@pytest.mark.slow
 def test_an_ablation_takes_one_thing_from_all():
-    common = ["experiment=dnerf", "data.scene=hook", "preset=fast"]
-    full = composed(*common, "ablation=full")
-    assert None not in (full.model.upsampler, full.model.inpainter, full.model.view_dependence)
+    def ablated(name):
+        return composed(*HOOK, "preset=fast", f"ablation={name}")
+
+    full = ablated("full")
     parts = {"no_upsampling": "upsampler", "no_inpainter": "inpainter", "no_view": "view_dependence"}
     for name, part in parts.items():
-        model = composed(*common, f"ablation={name}").model
+        model = ablated(name).model
         assert [key for key in full.model if full.model[key] != model[key]] == [part]
-        assert model[part] is None
+        assert model[part] is None is not full.model[part]
     for name, terms in {"no_tv": ["tv_density", "tv_flow", "tv_depth"], "no_flow": ["flow_l1"]}.items():
-        weights = composed(*common, f"ablation={name}").objective.fine.weights
-        before = full.objective.fine.weights
+        weights, before = ablated(name).objective.fine.weights, full.objective.fine.weights
         assert [term for term in before if before[term] != weights[term]] == terms
         assert all(weights[term] == 0 for term in terms)
-    assert composed(*common, "ablation=canonical_middle").data.canonical == "middle"
+    assert ablated("canonical_middle").data.canonical == "middle"
+
+
+@pytest.mark.parametrize(("preset", "tv_flow"), [("demo", 2.1e-4), ("fast", 1e-3), ("faithful", 1e-3)])
+def test_the_whole_method_has_the_papers_weights_and_networks_in_the_fine_stage(preset, tv_flow):
+    config = composed(*HOOK, f"preset={preset}", "ablation=full")
+    networks = {"upsampler", "inpainter"}
+    assert networks.isdisjoint(config.stage.coarse.effects)
+    assert networks <= set(config.stage.fine.effects)
+    weights = config.objective.fine.weights
+    assert (weights.tv_depth, weights.inpaint_diff, weights.tv_flow) == (1e-1, 1e-5, tv_flow)
 
 
 def folder_of(config, **changes):
@@ -162,8 +194,9 @@ def folder_of(config, **changes):
 
 
 def test_a_job_is_known_by_what_it_computes():
-    full = ["experiment=dnerf", "data.scene=hook", "ablation=full"]
-    job, other = (composed(f"sweeps=ablation_{sweep}", *full) for sweep in ("losses", "modules"))
+    job, other = (
+        composed(f"sweeps=ablation_{sweep}", *HOOK, "ablation=full") for sweep in ("losses", "modules")
+    )
     same = folder_of(job)
     assert same == folder_of(other)
     assert "{hash}" not in same
@@ -179,8 +212,7 @@ def test_a_job_is_known_by_what_it_computes():
 
 
 def test_what_stands_alone_begins_as_the_coarse_stage_would():
-    common = ["experiment=dnerf", "data.scene=hook", "preset=fast"]
-    full, alone = (composed(*common, f"ablation={name}").stage for name in ("full", "no_coarse"))
+    full, alone = (composed(*HOOK, "preset=fast", f"ablation={name}").stage for name in ("full", "no_coarse"))
     assert alone.coarse is None
     changed = {key for key in full.fine if full.fine[key] != alone.fine[key]}
     assert changed <= {"start", "lr_hold", "bases", "hull_frames", "hull_grow", "confine", "curriculum", "lr"}
@@ -188,29 +220,15 @@ def test_what_stands_alone_begins_as_the_coarse_stage_would():
     assert alone.fine.lr == {**full.fine.lr, "flow": full.coarse.lr.flow}
 
 
-@pytest.mark.parametrize("preset", ["demo", "fast", "faithful"])
-def test_the_voxel_networks_come_with_the_fine_stage(preset):
-    stage = composed("experiment=dnerf", "data.scene=hook", f"preset={preset}", "ablation=full").stage
-    networks = {"upsampler", "inpainter"}
-    assert networks.isdisjoint(stage.coarse.effects)
-    assert networks <= set(stage.fine.effects)
-
-
-@pytest.mark.slow
 def test_jobs_of_minutes_have_folders_of_their_own():
-    scenes = {word for job in jobs_of("minutes") for word in job if word.startswith("data.scene=")}
-    assert "data.scene=moving-hand" in scenes
-    assert len(scenes) == len(jobs_of("minutes")) == 7
+    assert sorted(job[-1] for job in jobs_of("minutes"))[-2:] == [
+        "data.scene=moving-hand",
+        "data.scene=mutant",
+    ]
+    assert len(jobs_of("minutes")) == 7
     changes = [[], ["seed=1"], ["budget.minutes=5"], ["model=forward"], ["stage.fine.density=45"]]
     changes += [["data.root=elsewhere"], ["data.half_resolution=false"]]
-    jobs = [
-        job_of("minutes", "experiment=dnerf", "data.scene=hook", "budget.minutes=1", *words)
-        for words in changes
-    ]
-    folders = [hashed(job).run for job in jobs]
-    assert len(set(folders)) == len(folders)
-    assert folders[0].startswith("runs/minutes/hook/particles-1min-seed0-")
-    for dataset in ("dnerf", "hypernerf", "nhr", "lego_complete"):
-        for model in ("particles", "forward"):
-            job = job_of("minutes", f"scene=counterpart_{dataset}", f"model={model}", "budget.minutes=1")
-            assert (job.budget.clock, job.threads, job.budget.minutes) == ("processor", 1, 1)
+    jobs = [job_of("minutes", *HOOK, "budget.minutes=1", *words) for words in changes]
+    assert len({hashed(job).run for job in jobs}) == len(jobs)
+    assert hashed(jobs[0]).run.startswith("runs/minutes/hook/particles-1min-seed0-")
+    assert (jobs[0].budget.clock, jobs[0].threads) == ("processor", 1)

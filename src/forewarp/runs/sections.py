@@ -67,8 +67,9 @@ class _Sections:
         return self._section(config_path) is not None or super().is_config(config_path)
 
     def is_group(self, config_path: str) -> bool:
-        """Tell whether a path is a group: a folder or a key of ``options.yaml``."""
-        return super().is_group(config_path) or bool(self._options(config_path))
+        """Tell whether a path is a group: a folder, a key of ``options.yaml`` or a section of ``numbers/``."""
+        of_numbers = config_path in OF_STAGES and super().is_group("numbers")
+        return super().is_group(config_path) or of_numbers or bool(self._options(config_path))
 
     def list(self, config_path: str, results_filter: ObjectType | None) -> list[str]:
         """List the options, the groups or (None) both in a group."""
@@ -155,7 +156,7 @@ class ImportlibResourcesConfigSource(
 def option_groups(conf: Path) -> dict[str, list[str]]:
     """Return every group in a folder like ``conf/``, with the names of its options."""
     source = FileConfigSource("forewarp", str(conf))
-    names = {path.relative_to(conf).as_posix() for path in conf.rglob("*") if path.is_dir()}
+    names = {path.relative_to(conf).as_posix() for path in conf.rglob("*") if path.is_dir()} | {*OF_STAGES}
     for file in conf.rglob("options.yaml"):
         folder = file.parent.relative_to(conf)
         names |= {(folder / key).as_posix() for key in _parsed(file.read_text(encoding="utf-8")).content}
