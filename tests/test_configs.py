@@ -19,12 +19,8 @@ from forewarp.renderer import Renderer
 from forewarp.runs.build import build_run
 from forewarp.scene.box import Lattice
 from forewarp.training.schedule import StageSettings
-<<<<<<< HEAD
-from tests.support.configs import CONF, composed, groups, options
-from tests.support.tiny_scene import BOX, built
-=======
 from tests.support.configs import CONF, composed, options
->>>>>>> 85a9d20 (Compose each section of numbers once in the tests)
+from tests.support.tiny_scene import BOX, built
 
 PRESETS, MODELS = options("preset"), options("model")
 EXPERIMENTS = options("experiment")
@@ -110,20 +106,11 @@ def test_faithful_is_the_papers_method():
 @pytest.mark.parametrize("preset", PRESETS)
 def test_off_is_none_whatever_the_preset(preset):
     off = run_of("model=forward", f"preset={preset}", *(f"model/{effect}=none" for effect, _ in OFF)).model
-<<<<<<< HEAD
-    on = run_of(
-        "model=forward", f"preset={preset}", *(f"model/{effect}={choice}" for effect, choice in OFF)
-    ).model
-    for effect, _ in OFF:
-        assert off.keywords[effect] is None
-        assert on.keywords[effect] is not None
-=======
-    assert [getattr(off, effect) for effect, _ in OFF] == [None] * len(OFF)
->>>>>>> 85a9d20 (Compose each section of numbers once in the tests)
+    assert [off.keywords[effect] for effect, _ in OFF] == [None] * len(OFF)
     assert {name.split(".")[0] for name, _ in method_of(off).named_parameters()} == {"radiance"}
     on = [f"model/{effect}={choice}" for effect, choice in OFF]
     if preset == "fast":
-        assert None not in [getattr(run_of("model=forward", *on).model, effect) for effect, _ in OFF]
+        assert None not in [run_of("model=forward", *on).model.keywords[effect] for effect, _ in OFF]
 
 
 def test_every_number_of_the_renderer_is_a_key_and_equals_its_default():

@@ -67,7 +67,7 @@ class _Sections:
         return self._section(config_path) is not None or super().is_config(config_path)
 
     def is_group(self, config_path: str) -> bool:
-        """Tell whether a path is a group: a folder, a key of ``options.yaml`` or a section of ``numbers/``."""
+        """Tell whether a path is a group: a folder, a key of ``options.yaml``, ``stage`` or ``objective``."""
         of_numbers = config_path in OF_STAGES and super().is_group("numbers")
         return super().is_group(config_path) or of_numbers or bool(self._options(config_path))
 
