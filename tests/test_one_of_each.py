@@ -57,7 +57,7 @@ def test_nothing_is_written_twice():
     [
         (
             "softplus",
-            {"fields/grids.py", "fields/networks.py", "methods/neural_volumes.py"},
+            {"fields/grids.py", "methods/rays.py", "methods/neural_volumes.py"},
         ),  # raw density: of voxels, of networks, of decoded volumes
         # Compositing is in log space, in ops/march.py; a splat may be opaque, which has no logarithm.
         ("cumprod", {"ops/gaussians.py"}),

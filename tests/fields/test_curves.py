@@ -1,7 +1,14 @@
+"""Curves by a few coefficients, and the field of every voxel's curve."""
+
 import pytest
 import torch
 
-from forewarp.fields.curves import Curve
+from forewarp.fields.curves import Curve, TrajectoryField
+from forewarp.fields.grids import VoxelGrid
+from forewarp.scene.box import Box, Lattice
+
+BOX = Box((-1, -1.5, -2), (1, 1.5, 2))
+LATTICE = Lattice(BOX, (5, 6, 7))
 
 
 @pytest.mark.parametrize("kind", ["spline", "cosines"])
@@ -19,3 +26,67 @@ def test_a_sum_reaches_as_far_as_it_is_told():
     torch.testing.assert_close(curve.summed([(1.1, 1.0)], beyond=0.2), curve(1.1, 0.2))
     with pytest.raises(ValueError, match=r"^spline: expected times in \[0, 1\], but got 1.1"):
         curve.summed([(1.1, 1.0)])
+
+
+def field(seed=0, **changes):
+    torch.manual_seed(seed)
+    options = {"bases": 3, "frames": 8, "canonical_time": 0.3, "nodes": 8, "width": 16, "layers": 2}
+    made = TrajectoryField(BOX, **(options | changes))
+    torch.nn.init.normal_(made.network[-1].weight, std=0.1)
+    return made
+
+
+def voxels(part=slice(None)):
+    active = torch.zeros(LATTICE.shape, dtype=torch.bool)
+    active[part] = True
+    return VoxelGrid(LATTICE, active, {"density": 1})
+
+
+def test_everything_stands_still_at_first():
+    still = TrajectoryField(BOX, bases=3, frames=8, canonical_time=0.3)
+    assert (still.flow(voxels(), 0.9) == 0).all()
+    with pytest.raises(ValueError, match="at least 2 distinct training times, but got 1; use model/motion="):
+        TrajectoryField(BOX, bases=3, frames=1, canonical_time=0.3)
+
+
+@pytest.mark.parametrize(("nodes", "features"), [(0, 0), (8, 2)])
+def test_flow_is_exactly_zero_at_the_canonical_time_only_and_paths_agree_with_it(nodes, features):
+    moving, grid, times = field(nodes=nodes, features=features), voxels(), torch.tensor([0.0, 0.3, 1.0])
+    assert (moving.flow(grid, 0.3) == 0).all()
+    assert moving.flow(grid, 0.8).abs().max() > 1e-3
+    home = LATTICE.to_world(grid.voxels)
+    paths = moving.trajectories(home, times)
+    assert paths.shape == (210, 3, 3)
+    assert torch.equal(paths[:, 1], home)
+    for i, time in enumerate(times.tolist()):
+        torch.testing.assert_close(paths[:, i] - home, moving.flow(grid, time), atol=1e-5, rtol=1e-4)
+
+
+def test_a_known_translation():
+    moving = field(bases=1, frames=2, canonical_time=0.0)
+    torch.nn.init.zeros_(moving.network[-1].weight)
+    # T = 2: b(1) - b(0) = -sqrt(2); coefficients are scaled by half the longest side.
+    moving.network[-1].bias.data = torch.tensor([0.5, -0.2, 0.1]) / (-(2**0.5) * 2.0)
+    flow = moving.flow(voxels(), 1.0)
+    torch.testing.assert_close(flow, torch.tensor([0.5, -0.2, 0.1]).expand_as(flow))
+
+
+def test_bases_wait_until_they_are_let_in():
+    moving = field()
+    whole = moving.flow(voxels(), 0.9)
+    assert moving.play(1) == 1
+    first = moving.flow(voxels(), 0.9)
+    assert not torch.allclose(whole, first)
+    first.sum().backward()
+    weight_rows = moving.network[-1].weight.grad.reshape(3, 3, -1).abs().sum((0, 2))
+    assert weight_rows[0] > 0
+    assert (weight_rows[1:] == 0).all()
+
+
+def test_the_cache_follows_the_voxels():
+    moving, grid = field(), voxels()
+    moving.flow(grid, 0.9)
+    active = torch.zeros(LATTICE.shape, dtype=torch.bool)
+    active[2:] = True
+    grid.activate(active, {})
+    torch.testing.assert_close(moving.flow(grid, 0.9), field().flow(voxels(slice(2, None)), 0.9))

@@ -78,7 +78,7 @@ def test_gradients_of_both_passes_against_differences(of):
     background = torch.ones(3, dtype=torch.float64)
 
     def looked(*_):
-        seen = made.at(Moment(0.5)).sampled(rays, background)
+        seen = made.along(Moment(0.5), rays, background)
         return seen.rgb if of == "fine" else seen.coarse.rgb
 
     assert gradcheck(looked, tuple(getattr(made, of).parameters()), fast_mode=True)
@@ -114,7 +114,7 @@ def test_nerf_draws_the_same_picture_at_all_times():
         one, other = (made.at(Moment(time)).render(view, white) for time in (0.0, 0.7))
     assert one.rgb.equal(other.rgb)
     assert one.depth.equal(other.depth)
-    one, other = (made.at(Moment(time)).sampled(view.rays(), white) for time in (0.0, 0.7))
+    one, other = (made.along(Moment(time), view.rays(), white) for time in (0.0, 0.7))
     assert one.coarse.rgb.equal(other.coarse.rgb)
 
 
@@ -230,7 +230,7 @@ def test_the_elastic_term_of_a_warp_that_scales(factor):
 def test_the_elastic_term_is_summed_over_coarse_samples_and_averaged_over_rays():
     made = liven(skipping("nerfies", elastic_samples=None))
     draw = torch.Generator().manual_seed(0)
-    seen = made.at(Moment(0.5)).sampled(View(camera()).rays(), torch.ones(3), draw)
+    seen = made.along(Moment(0.5), View(camera()).rays(), torch.ones(3), draw)
     strain = made.warp.elastic(seen.coarse.points.reshape(-1, 3), made.codes(0.5), 0.0).detach()
     expected = float((seen.coarse.weights.detach().reshape(-1) * strain).sum() / 144)
     term = made.extra_terms(seen, batch(), {}, draw)["elastic"]
@@ -254,7 +254,7 @@ def test_hypernerf_without_its_slice_is_the_nerfies_of_its_weights():
     bent.window.fill_(2.5)
     sliced.windows.copy_(torch.tensor([2.5, 0.0]))
     assert_look_alike(sliced, bent)
-    views = [made.at(Moment(0.25)).sampled(View(camera()).rays(), torch.ones(3)) for made in (sliced, bent)]
+    views = [made.along(Moment(0.25), View(camera()).rays(), torch.ones(3)) for made in (sliced, bent)]
     for one, other in (views, [seen.coarse for seen in views]):
         assert_close(one.rgb, other.rgb)
     sliced.windows[1] = 1.0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol
@@ -268,12 +268,9 @@ class VoxelGrid(nn.Module):
         voxels, index = (state.get(prefix + name) for name in ("voxels", "index"))
         if not _is(voxels, torch.int64) or voxels.ndim != 2 or voxels.shape[1] != 3:
             return "voxels"
-        last = torch.tensor(lattice.shape) - 1
-        if not bool(((voxels >= 0) & (voxels <= last)).all()):
+        if not bool(lattice.holds(voxels).all()):
             return "voxels"
-        if not _is(index, torch.int32) or tuple(index.shape) != lattice.shape:
-            return "index"
-        if not torch.equal(index, index_of(voxels, lattice.shape)):
+        if not _is(index, torch.int32) or not torch.equal(index, index_of(voxels, lattice.shape)):
             return "index"
         for name in self.names:
             values, own = state.get(prefix + name), self.parameter(name)
@@ -291,26 +288,6 @@ class VoxelGrid(nn.Module):
                 p = self.parameter(name)
                 p.data = p.data.new_empty(state_dict[prefix + name].shape)
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
-
-
-def grids_in(module: nn.Module) -> dict[str, VoxelGrid]:
-    """Return all voxel grids of a module by their names in ``state_dict``."""
-    return {name: part for name, part in module.named_modules() if isinstance(part, VoxelGrid)}
-
-
-def adopted_in(module: nn.Module) -> set[str]:
-    """Return the names in ``state_dict`` by which a module's grids adopt a checkpoint's lattices."""
-    return {
-        f"{place}.{name}"
-        for place, grid in grids_in(module).items()
-        for name in ("voxels", "index", *grid.names)
-    }
-
-
-def misfit_in(module: nn.Module, state: Mapping[str, Tensor]) -> str | None:
-    """Return what in a module's stored grids contradicts their lattices, or None."""
-    found = ((place, grid.misfit(state, f"{place}.")) for place, grid in grids_in(module).items())
-    return next((f"{place}.{name}" for place, name in found if name is not None), None)
 
 
 def _lattice(state: dict) -> Lattice:

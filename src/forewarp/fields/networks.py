@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import bisect
-from collections.abc import Callable, Sequence, Set
+from collections.abc import Sequence, Set
 
 import torch
 from torch import Tensor, nn
@@ -53,9 +53,6 @@ def mlp(
         nn.init.zeros_(parts[-1].weight)
         nn.init.zeros_(parts[-1].bias)
     return Network(*parts)
-
-
-DENSITY: dict[str, Callable[[Tensor], Tensor]] = {"relu": torch.relu, "softplus": nn.functional.softplus}
 
 
 class Trunk(nn.Module):
@@ -167,13 +164,6 @@ def start_as_glorot(layer: nn.Module) -> None:
     if isinstance(layer, nn.Linear):
         nn.init.xavier_uniform_(layer.weight)
         nn.init.zeros_(layer.bias)
-
-
-def density_of(name: str) -> Callable[[Tensor], Tensor]:
-    """Return the density activation ``relu`` or ``softplus``; ValueError for another name."""
-    if name not in DENSITY:
-        raise ValueError(f"model.sampling.density: expected {' or '.join(DENSITY)}, but got {name!r}")
-    return DENSITY[name]
 
 
 class TimeCodes(nn.Module):

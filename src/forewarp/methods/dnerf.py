@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from forewarp.fields.networks import Template, Trunk
 from forewarp.methods.method import Start
-from forewarp.methods.rays import JUMP, NO_JUMP, Field, SampledMethod, Sampling, encoder
+from forewarp.methods.rays import JUMP, NO_JUMP, Field, SampledMethod, encoder
 from forewarp.ops.encode import encoded_size
 from forewarp.quadrature import Sampled
 from forewarp.scene.view import Batch, Moment
@@ -23,47 +23,32 @@ class DNeRF(SampledMethod):
 
     Args:
         start: scene, stage and numbers.
-        sampling: see ``Sampling``.
-        width, layers, skip: see ``fields.networks.Trunk``; of the offsets' network and of the field's.
-        position_frequencies, time_frequencies, direction_frequencies: octaves of the encodings.
+        time_frequencies: octaves of the time's encoding.
         continuous: ``F(x, t) - F(x, canonical)`` in place of a jump to 0 at the canonical time.
+        network: sampling, width, layers, skip (of the offsets' network and of the field's) and other octaves:
+            see ``SampledMethod``.
     """
 
     terms = ("photo", "second_time")
 
     def __init__(
-        self,
-        start: Start,
-        *,
-        sampling: Sampling | None = None,
-        width: int = 256,
-        layers: int = 8,
-        skip: int | None = 6,
-        position_frequencies: int = 10,
-        time_frequencies: int = 10,
-        direction_frequencies: int = 4,
-        continuous: bool = False,
+        self, start: Start, *, time_frequencies: int = 10, continuous: bool = False, **network
     ) -> None:
-        super().__init__(start, sampling or Sampling())
-        self.position = encoder("position", position_frequencies)
+        super().__init__(start, **network)
         self.moment = encoder("time", time_frequencies)
-        self.direction = encoder("direction", direction_frequencies)
-        self.continuous = continuous
-        self.canonical_time = start.scene.canonical_time
-        point, time = encoded_size(3, position_frequencies), encoded_size(1, time_frequencies)
-        shape = {"width": width, "layers": layers, "skip": skip}
-        self.offsets = Trunk(point, besides=time, **shape)
-        self.offset_head = nn.Linear(width, 3)
-        self.template = Template(point, encoded_size(3, direction_frequencies), **shape)
+        self.continuous, self.canonical_time = continuous, start.scene.canonical_time
+        self.offsets = Trunk(self.sizes[0], besides=encoded_size(1, time_frequencies), **self.shape)
+        self.offset_head = nn.Linear(self.shape["width"], 3)
+        self.template = Template(*self.sizes, **self.shape)
 
     def offset(self, points: Tensor, time: float) -> Tensor:
         """How far points (..., 3) are from their canonical places at a time (..., 3), world units."""
         if time == self.canonical_time:
             return torch.zeros_like(points)
-        found = self._carried(points, time)
-        return found - self._carried(points, self.canonical_time) if self.continuous else found
+        offset = self._raw_offset(points, time)
+        return offset - self._raw_offset(points, self.canonical_time) if self.continuous else offset
 
-    def _carried(self, points: Tensor, time: float) -> Tensor:
+    def _raw_offset(self, points: Tensor, time: float) -> Tensor:
         moment = self.moment(points.new_tensor([time])).expand(*points.shape[:-1], -1)
         return self.offset_head(self.offsets(self.position(points), moment))
 
@@ -84,10 +69,11 @@ class DNeRF(SampledMethod):
 
         def second_time() -> Tensor:
             time = batch.time
-            beside = _neighbours(self.times, time)
+            place = self.times.index(time)
+            beside = [self.times[i] for i in (place - 1, place + 1) if 0 <= i < len(self.times)]
             drawn = torch.rand(2, generator=generator).tolist()
-            other = beside[int(drawn[0] * len(beside))] if beside else time
-            between = time + drawn[1] * (other - time)
+            neighbour = beside[int(drawn[0] * len(beside))] if beside else time
+            between = time + drawn[1] * (neighbour - time)
             return (self.offset(seen.points, time) - self.offset(seen.points, between)).square().sum()
 
         return {"second_time": second_time}
@@ -99,9 +85,3 @@ class DNeRF(SampledMethod):
     def faults(self) -> list[str]:
         """See ``Method``."""
         return super().faults() + ([] if self.continuous else [JUMP])
-
-
-def _neighbours(times: tuple[float, ...], time: float) -> list[float]:
-    """The training times just before and after one of them, where there are."""
-    place = times.index(time)
-    return [times[i] for i in (place - 1, place + 1) if 0 <= i < len(times)]

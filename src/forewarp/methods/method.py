@@ -10,6 +10,7 @@ from typing import Any, ClassVar, Protocol, runtime_checkable
 import torch
 from torch import Tensor, nn
 
+from forewarp.fields.grids import VoxelGrid
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.cloud import Cloud, Ellipsoids, Handover
 from forewarp.scene.frame import Scene
@@ -98,6 +99,7 @@ class Method(nn.Module):
         grows: dotted names of the parameters and buffers whose number of rows may change during training;
             they adopt a checkpoint's.
         on_cpu: why ``trainer=auto`` should leave a GPU aside, in a few words; None: it should not.
+        betas: of Adam.
     """
 
     terms: ClassVar[Sequence[str]] = ("photo",)
@@ -107,6 +109,7 @@ class Method(nn.Module):
     effects: ClassVar[Sequence] = ()
     grows: ClassVar[Sequence[str]] = ()
     on_cpu: ClassVar[str | None] = None
+    betas: ClassVar[tuple[float, float]] = (0.9, 0.99)
 
     def at(self, moment: Moment) -> Snapshot:
         """Freeze the scene at a moment."""
@@ -130,8 +133,8 @@ class Method(nn.Module):
         return {"network": list(self.parameters())}
 
     def optimizer(self, groups: list[dict]) -> torch.optim.Optimizer:
-        """Make the optimiser from groups of ``params`` with their ``lr``."""
-        return torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-8, fused=True)
+        """Make the optimiser from groups of ``params`` with their ``lr``: Adam."""
+        return torch.optim.Adam(groups, betas=self.betas, eps=1e-8, fused=True)
 
     def advance(self, progress: float, step: int, optimizer: torch.optim.Optimizer) -> dict[str, float]:
         """Follow the method's schedule before a step; return numbers to log.
@@ -177,13 +180,23 @@ class Method(nn.Module):
 
     def adopted(self) -> set[str]:
         """Return the names in ``state_dict`` that adopt a checkpoint's shape."""
-        return set(self.grows)
+        names = set(self.grows)
+        for place, grid in self._grids().items():
+            names |= {f"{place}.{name}" for name in ("voxels", "index", *grid.names)}
+        return names
+
+    def _grids(self) -> dict[str, VoxelGrid]:
+        return {name: part for name, part in self.named_modules() if isinstance(part, VoxelGrid)}
 
     def misfit(self, state: Mapping[str, Tensor]) -> str | None:
         """Return the name of a stored entry that contradicts the others; None if there is none.
 
-        All tensors in ``grows`` need the same number of rows, as kernels index one by the rows of another.
+        All tensors in ``grows`` need the same number of rows, as kernels index one by the rows of another,
+        and the voxels of a grid must fit its lattice.
         """
+        for place, grid in self._grids().items():
+            if (name := grid.misfit(state, f"{place}.")) is not None:
+                return f"{place}.{name}"
         rows = {tuple(getattr(state[name], "shape", ()))[:1] for name in self.grows[:1]}
         for name in self.grows:
             shape, own = tuple(getattr(state[name], "shape", ())), part_of(self, name)

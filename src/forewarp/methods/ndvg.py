@@ -23,6 +23,7 @@ from forewarp.scene.box import Box, Lattice
 from forewarp.scene.frame import spread
 from forewarp.scene.view import Batch, Moment
 
+RELEASED = Marching(jitter=True, occupancy=100)
 _HIDDEN = -100.0  # raw density that never comes back
 _LEAST = 1e-4  # least density, in the unit of raw density, that a stage hands over: less hardly comes back
 _OPAQUE = 1 - 1e-6  # most a sample may hide, so that what is behind keeps a gradient
@@ -86,7 +87,7 @@ class NDVG(MarchedMethod):
         self,
         start: Start,
         *,
-        marching: Marching | None = None,
+        marching: Marching = RELEASED,
         width: Sequence[int] = (64, 128),
         channels: Sequence[int] = (4, 12),
         frequencies: int = 5,
@@ -96,7 +97,7 @@ class NDVG(MarchedMethod):
         tight = start.handover is not None and start.handover.tight
         box = start.handover.box if tight else start.scene.box
         where = f"stage.{start.stage}"
-        super().__init__(start, marching or Marching(jitter=True), box, f"{where}.alpha_init")
+        super().__init__(start, marching, box, f"{where}.alpha_init")
         check_pair("model.width", width)
         check_pair("model.channels", channels)
         check_least(frequencies=frequencies, direction_frequencies=direction_frequencies)

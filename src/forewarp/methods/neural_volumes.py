@@ -19,8 +19,8 @@ from forewarp.fields.networks import (
     beside,
     read,
 )
-from forewarp.methods.method import Method, Snapshot, Start, Step, check_number
-from forewarp.methods.rays import BETWEEN_TIMES, CENTRES, ONE_TIME, DeadStart
+from forewarp.methods.method import Start, Step, check_number
+from forewarp.methods.rays import BETWEEN_TIMES, CENTRES, ONE_TIME, DeadStart, RayMethod, RaySnapshot
 from forewarp.ops.march import clip_to_box
 from forewarp.scene.camera import Rays
 from forewarp.scene.frame import Frame, Scene, spread
@@ -46,7 +46,7 @@ class Volumes:
         return found[:, :3], found[:, 3]
 
 
-class NeuralVolumes(Method):
+class NeuralVolumes(RayMethod):
     """``z = E(pictures(t))``, ``V = D(z)``, seen at x: ``V(W(x; z))`` (Neural Volumes, equations 1 to 12).
 
     Time enters only through training pictures of the instant, which are kept small in the method itself.
@@ -69,6 +69,8 @@ class NeuralVolumes(Method):
         ValueError: where fewer fixed cameras see every instant than ``pictures`` asks for.
     """
 
+    betas = (0.9, 0.999)  # of Adam, as published
+    sees_by_camera = True
     terms = ("photo", "code_prior", "opacity_prior", "opacity_variation")
 
     def __init__(
@@ -232,10 +234,6 @@ class NeuralVolumes(Method):
         seen_by = ((self.tint(one.moment.camera), len(one.view)) for one in batch.observations)
         return torch.cat([tint[:, None].expand(2, count, 3) for tint, count in seen_by], 1)
 
-    def optimizer(self, groups: list[dict]) -> torch.optim.Optimizer:
-        """Make Adam with the published betas."""
-        return torch.optim.Adam(groups, betas=(0.9, 0.999), eps=1e-8, fused=True)
-
     def departures(self) -> list[str]:
         """See ``Method``."""
         notes = [
@@ -263,20 +261,13 @@ class NeuralVolumes(Method):
 
 
 @dataclass(frozen=True)
-class VolumesSnapshot(Snapshot):
+class VolumesSnapshot(RaySnapshot):
     """Such a method at one moment. An image costs decoding once, and its rays' steps."""
-
-    moment: Moment
-    method: NeuralVolumes
 
     @cached_property
     def _still(self) -> Volumes:
         with torch.no_grad():
             return self.volumes()
-
-    def holds(self, moment: Moment) -> bool:
-        """Return whether it is the same time, seen by the same camera."""
-        return (moment.time, moment.camera) == (self.moment.time, self.moment.camera)
 
     def volumes(self) -> Volumes:
         """Decode the volumes of the moment."""

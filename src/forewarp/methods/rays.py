@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from forewarp import losses
-from forewarp.fields.grids import Activation, VoxelGrid, adopted_in, misfit_in
-from forewarp.fields.networks import Template, density_of
+from forewarp.fields.grids import Activation, VoxelGrid
+from forewarp.fields.networks import ScrewWarp, Template, TimeCodes
 from forewarp.fields.occupancy import Occupancy
 from forewarp.methods.method import (
     FRACTION,
@@ -24,7 +24,7 @@ from forewarp.methods.method import (
     steps_of,
 )
 from forewarp.methods.rows import RowsAdam, renew_parameters
-from forewarp.ops.encode import positional_encoding
+from forewarp.ops.encode import encoded_size, positional_encoding
 from forewarp.ops.march import warm_up
 from forewarp.quadrature import Quadrature, Sampled
 from forewarp.renderer import Marched, Renderer
@@ -33,15 +33,23 @@ from forewarp.scene.camera import Rays
 from forewarp.scene.frame import spread
 from forewarp.scene.view import Batch, Moment, Rendering, View
 
+# What several methods do otherwise than published, and faults that they keep: one wording of each fact.
 CENTRES = "pixel centres at +0.5"
 ALONG_RAYS = "near and far along unit rays"
 ONE_TIME = "a step's rays are of one time"
 BETWEEN_TIMES = "codes interpolated between training times"
 NO_JUMP = "offsets without a jump at the canonical time"
 JUMP = "offsets jump at the canonical time (continuous)"  # the fault that ``NO_JUMP`` mends
+# What differs from the publications in every preset, of those whose code is in PyTorch, and in JAX.
+OF_PYTORCH = (CENTRES, ALONG_RAYS, "no centre crop at first")
+OF_JAX = (ONE_TIME, BETWEEN_TIMES)
 
-
-_PATIENCE = 20  # steps
+_PATIENCE = 20  # steps without a gradient after which a run ends
+_LOOK_EVERY = 8  # steps between two looks for where matter is
+_MASKS = 64  # most training images whose alpha says where matter may be
+_RAYS = 4096  # of an image, marched at once
+_THRESHOLD = "a weight in [0, 1)", lambda weight: 0 <= weight < 1
+_YOUNG = 4  # steps between two of the first looks for where matter is
 
 
 class DeadStart:
@@ -73,11 +81,47 @@ class DeadStart:
             )
 
 
-_LOOK_EVERY = 8  # steps between two looks for where matter is
-_PICTURES = 64  # most whose outlines say where matter may be
-# What differs from the publications in every preset, of those whose code is in PyTorch, and in JAX.
-OF_PYTORCH = (CENTRES, ALONG_RAYS, "no centre crop at first")
-OF_JAX = (ONE_TIME, BETWEEN_TIMES)
+class RayMethod(Method):
+    """A method that answers for any rays at a moment, without computing anything for the moment before.
+
+    Attributes:
+        sees_by_camera: whether colour depends on the id of the camera that looks.
+    """
+
+    sees_by_camera = False
+
+    def along(
+        self, moment: Moment, rays: Rays, background: Tensor, generator: torch.Generator | None = None
+    ) -> Rendering:
+        """Render R rays over ``background`` (3,) or (R, 3); ``generator`` jitters the samples."""
+        raise NotImplementedError
+
+    def image(self, moment: Moment, rays: Rays, background: Tensor) -> Rendering:
+        """Render an image's rays without gradient, in chunks for images of any size."""
+        raise NotImplementedError
+
+    def at(self, moment: Moment) -> RaySnapshot:
+        """Fix the time; compute nothing yet."""
+        return RaySnapshot(moment, self)
+
+
+@dataclass(frozen=True)
+class RaySnapshot(Snapshot):
+    """Such a method at one moment. An image costs the same at every time: all its samples."""
+
+    moment: Moment
+    method: RayMethod
+
+    def render(self, view: View, background: Tensor, rendering: str | None = None) -> Rendering:
+        """See ``Snapshot.render``."""
+        rays = view.rays().to(self.method.device)
+        draw = self.method.along if torch.is_grad_enabled() else self.method.image
+        return draw(self.moment, rays, background.to(rays.origins))
+
+    def holds(self, moment: Moment) -> bool:
+        """Return whether it is the same time, and the same camera where that matters."""
+        alike = not self.method.sees_by_camera or moment.camera == self.moment.camera
+        return alike and moment.time == self.moment.time
 
 
 @dataclass(frozen=True)
@@ -113,9 +157,9 @@ class Sampling:
         density: ``relu`` as NeRF has it, with which some seeds start dead, or ``softplus``.
         occupancy: cells along a side of the lattice that notes where matter is (see ``Occupancy``), so that
             samples elsewhere are not evaluated; 0: evaluate all, as published.
-        hull: where the lattice is and pictures have alpha, space that less than this share of the training
-            pictures shows as covered is empty for good (see ``Occupancy.confine``); 0: no space is.
-        jitter_in_pictures: draw the samples of pictures at random too, as HyperNeRF's code does.
+        hull: where the lattice is and images have alpha, space that less than this share of the training
+            images shows as covered is empty for good (see ``Occupancy.confine``); 0: no space is.
+        jitter_in_pictures: draw the samples of images at random too, as HyperNeRF's code does.
     """
 
     samples: int = 64
@@ -124,53 +168,68 @@ class Sampling:
     inside_box: bool = False
     density: str = "relu"
     occupancy: int = 0
-    hull: float = 0.0
+    hull: float = 0.1
     jitter_in_pictures: bool = False
 
     def __post_init__(self) -> None:
         check_number("model.sampling.hull", self.hull, *FRACTION)
         check_least(of="model.sampling", occupancy=self.occupancy)
+        if self.density not in ("relu", "softplus"):
+            raise ValueError(f"model.sampling.density: expected relu or softplus, but got {self.density!r}")
 
     def departures(self, density: str, jitters: bool) -> list[str]:
-        """Name what differs from a publication with this density; ``jitters``: with random samples in
-        pictures.
-        """
-        notes = [f"{self.density} density"] if self.density != density else []
-        if not self.open_end:
-            notes.append("the last interval ends with the ray")
-        if not self.fine_samples:
-            notes.append("one pass")
-        if self.inside_box:
-            notes.append("empty outside the scene's box")
-        if self.occupancy:
-            notes.append("empty space is not sampled")
-        if self.jitter_in_pictures != jitters:
-            notes.append(f"pictures are drawn with{'' if self.jitter_in_pictures else 'out'} random samples")
-        return notes
+        """List what differs from a publication's density, and whether it ``jitters`` samples in images."""
+        without = "" if self.jitter_in_pictures else "out"
+        notes = {
+            f"{self.density} density": self.density != density,
+            "the last interval ends with the ray": not self.open_end,
+            "one pass": not self.fine_samples,
+            "empty outside the scene's box": self.inside_box,
+            "empty space is not sampled": self.occupancy > 0,
+            f"pictures are drawn with{without} random samples": self.jitter_in_pictures != jitters,
+        }
+        return [note for note, differs in notes.items() if differs]
 
 
-class SampledMethod(Method):
+class SampledMethod(RayMethod):
     """A network evaluated at samples along rays and composited: one of ``fields`` for each of two passes.
 
     Args:
         start: scene, stage and numbers.
         sampling: see ``Sampling``.
+        width, layers, skip, glorot: of the networks, see ``fields.networks.Trunk``.
+        position_frequencies, direction_frequencies: octaves of the encodings.
     """
 
+    betas = (0.9, 0.999)  # of Adam, as published
     published = "relu"  # density in the publication
-    jitters = False  # whether the released code draws the samples of pictures at random
+    jitters = False  # whether the released code draws the samples of images at random
     conventions = OF_PYTORCH
-    sees_by_camera = False  # whether colour depends on the id of the camera that looks
 
-    def __init__(self, start: Start, sampling: Sampling) -> None:
+    def __init__(
+        self,
+        start: Start,
+        *,
+        sampling: Sampling = Sampling(),
+        width: int = 256,
+        layers: int = 8,
+        skip: int | None = 6,
+        position_frequencies: int = 10,
+        direction_frequencies: int = 4,
+        glorot: bool = False,
+    ) -> None:
         super().__init__()
         box, self.sampling, self.times = start.scene.box, sampling, start.scene.times
-        self.activation = density_of(sampling.density)
+        self.shape = {"width": width, "layers": layers, "skip": skip, "glorot": glorot}
+        self.position = encoder("position", position_frequencies)
+        self.direction = encoder("direction", direction_frequencies)
+        self.sizes = encoded_size(3, position_frequencies), encoded_size(3, direction_frequencies)
+        self.activation = torch.relu if sampling.density == "relu" else nn.functional.softplus
         self.occupancy = Occupancy(box, side=sampling.occupancy) if sampling.occupancy else None
         self.confined = self.occupancy is not None and sampling.hull > 0 and start.scene.has_alpha
         if self.confined and not start.blank:
             train = start.scene.train
-            self.occupancy.confine([train[i] for i in spread(len(train), _PICTURES)], sampling.hull)
+            self.occupancy.confine([train[i] for i in spread(len(train), _MASKS)], sampling.hull)
         self.quadrature = Quadrature(
             sampling.samples,
             sampling.fine_samples,
@@ -207,9 +266,19 @@ class SampledMethod(Method):
         """Return the loss terms beside the errors of the passes."""
         return {}
 
-    def at(self, moment: Moment) -> SampledSnapshot:
-        """Fix the time; compute nothing yet."""
-        return SampledSnapshot(moment, self)
+    def along(
+        self, moment: Moment, rays: Rays, background: Tensor, generator: torch.Generator | None = None
+    ) -> Sampled:
+        """See ``RayMethod``; also return what lies along the rays."""
+        first, second = self.fields(moment)
+        coarse = None if first is None else first.radiance
+        return self.quadrature(second.density, second.radiance, rays, background, generator, coarse=coarse)
+
+    def image(self, moment: Moment, rays: Rays, background: Tensor) -> Rendering:
+        """See ``RayMethod``."""
+        first, second = self.fields(moment)
+        jitter = torch.Generator().manual_seed(0) if self.sampling.jitter_in_pictures else None
+        return self.quadrature.picture((first or second).density, second.radiance, rays, background, jitter)
 
     def look(self, batch: Batch, factors: Mapping[str, float], generator: torch.Generator) -> Step:
         """See ``Method.look``; a batch holds one time, as no neighbours are asked for, seen by one or
@@ -220,9 +289,9 @@ class SampledMethod(Method):
                 there is then no gradient.
         """
         rgb, parts = batch.joined()[1], batch.split() if self.sees_by_camera else [batch]
-        seen = Sampled.joined([self._sampled(part, generator) for part in parts])
+        seen = Sampled.joined([self._along_batch(part, generator) for part in parts])
         passes = [seen] if seen.coarse is None else [seen.coarse, seen]
-        self.dead_start.look(all(bool((one.density > 0).any()) for one in passes))
+        self.dead_start.look(all(bool((rendering.density > 0).any()) for rendering in passes))
         error = (seen.rgb - rgb).square().mean()
         terms = {"photo": lambda: error}
         if "coarse_photo" in self.terms:
@@ -234,24 +303,20 @@ class SampledMethod(Method):
             tensors=lambda: ((name, getattr(seen, name)) for name in ("density", "weights", "rgb")),
         )
 
-    def _sampled(self, batch: Batch, generator: torch.Generator) -> Sampled:
-        rays, _, background = batch.joined()
-        snapshot = self.at(batch.observations[0].moment)
-        return snapshot.sampled(rays.to(self.device), background.to(self.device), generator)
+    def _along_batch(self, batch: Batch, generator: torch.Generator) -> Sampled:
+        (rays, _, background), moment = batch.joined(), batch.observations[0].moment
+        return self.along(moment, rays.to(self.device), background.to(self.device), generator)
 
     def advance(self, progress: float, step: int, optimizer: torch.optim.Optimizer) -> dict[str, float]:
         """See ``Method``; look now and then for where matter is."""
         if self.occupancy is None or step % _LOOK_EVERY:
             return {}
-        self.occupancy.look(self._density_at, self.times, torch.default_generator)
+        self.occupancy.look(
+            lambda points, time: self.fields(Moment(time))[1].density(points),
+            self.times,
+            torch.default_generator,
+        )
         return {"occupied": float(self.occupancy.occupied.float().mean())}
-
-    def _density_at(self, points: Tensor, time: float) -> Tensor:
-        return self.fields(Moment(time))[1].density(points)
-
-    def optimizer(self, groups: list[dict]) -> torch.optim.Optimizer:
-        """Make Adam with the published betas."""
-        return torch.optim.Adam(groups, betas=(0.9, 0.999), eps=1e-8, fused=True)
 
     def departures(self) -> list[str]:
         """See ``Method``; a subclass adds its own to those of the sampling and of the platform."""
@@ -264,47 +329,74 @@ class SampledMethod(Method):
         return ["pictures are drawn with random samples (jitter_in_pictures)"] if kept else []
 
 
-@dataclass(frozen=True)
-class SampledSnapshot(Snapshot):
-    """Such a method at one moment. An image costs the same at every time: all its samples."""
+class WarpedMethod(SampledMethod):
+    """Nerfies and its successors: a code for each instant bends space, by screws, to a shared template.
 
-    moment: Moment
-    method: SampledMethod
+    Octaves of the warp's encoding come in over the stage. Where a test time is not a training time, the codes
+    beside it are interpolated.
 
-    def sampled(self, rays: Rays, background: Tensor, generator: torch.Generator | None = None) -> Sampled:
-        """Render rays; also return what lies along them."""
-        first, second = self.method.fields(self.moment)
-        coarse = None if first is None else first.radiance
-        return self.method.quadrature(
-            second.density, second.radiance, rays, background, generator, coarse=coarse
-        )
+    Args:
+        start: scene, stage and numbers.
+        sampling, skip, position_frequencies: see ``SampledMethod``.
+        warp_width, warp_layers, warp_skip, warp_frequencies: of the warp, see ``ScrewWarp``.
+        code_size: channels of an instant's code.
+        still_points: of a step, most of the points that never move that a regulariser looks at; null: all.
+        network: width, layers, direction_frequencies: see ``SampledMethod``.
+    """
 
-    def render(self, view: View, background: Tensor, rendering: str | None = None) -> Rendering:
-        """See ``Snapshot.render``; without gradients in chunks of rays, for images of any size."""
-        rays = view.rays().to(self.method.device)
-        background = background.to(rays.origins)
-        if torch.is_grad_enabled():
-            return self.sampled(rays, background)
-        first, second = self.method.fields(self.moment)
-        places = (first or second).density
-        jitter = torch.Generator().manual_seed(0) if self.method.sampling.jitter_in_pictures else None
-        return self.method.quadrature.picture(places, second.radiance, rays, background, jitter)
+    shares = {"warp_in": 0.32}  # of the stage, where its numbers do not say
+    numbers = tuple(shares)
+    published = "softplus"
+    conventions = OF_JAX
 
-    def holds(self, moment: Moment) -> bool:
-        """Return whether it is the same time, and the same camera where that matters."""
-        alike = not self.method.sees_by_camera or moment.camera == self.moment.camera
-        return alike and moment.time == self.moment.time
+    def __init__(
+        self,
+        start: Start,
+        *,
+        sampling: Sampling = Sampling(128, 128, density="softplus"),
+        skip: int | None = 5,
+        position_frequencies: int = 8,
+        warp_width: int = 128,
+        warp_layers: int = 6,
+        warp_skip: int | None = 5,
+        warp_frequencies: int = 6,
+        code_size: int = 8,
+        still_points: int | None = 16384,
+        **network,
+    ) -> None:
+        network |= {"skip": skip, "position_frequencies": position_frequencies, "glorot": True}
+        super().__init__(start, sampling=sampling, **network)
+        check_least(warp_frequencies=warp_frequencies)
+        self.codes = TimeCodes(self.times, code_size)
+        self.warp_shape = {"frequencies": warp_frequencies, "layers": warp_layers, "skip": warp_skip}
+        self.warp = ScrewWarp(code_size, width=warp_width, **self.warp_shape)
+        self.shares = self.shares | dict(start.numbers)
+        for name in self.numbers:
+            check_number(f"stage.{start.stage}.{name}", self.shares[name], *FRACTION)
+        self.still, self.still_points = start.scene.still, still_points
+
+    @property
+    def octaves_in(self) -> float:
+        """How many octaves of the warp's encoding count."""
+        raise NotImplementedError
+
+    def extra_terms(
+        self, seen: Sampled, batch: Batch, factors: Mapping[str, float], generator: torch.Generator
+    ) -> dict[str, Callable[[], Tensor | None]]:
+        """Offer ``still``, at points that never move."""
+
+        def still() -> Tensor | None:
+            return self.warp.stray(
+                self.still, self.codes.table, self.octaves_in, self.still_points, generator
+            )
+
+        return {"still": still}
 
 
 def encoder(of: str, frequencies: int) -> Callable[[Tensor], Tensor]:
     """Return ``positional_encoding`` with so many octaves, ``model.<of>_frequencies``."""
     check_least(**{f"{of}_frequencies": frequencies})
     return lambda x: positional_encoding(x, frequencies)
-
-
-_RAYS = 4096  # of a picture, at once
-_THRESHOLD = "a weight in [0, 1)", lambda weight: 0 <= weight < 1
-_YOUNG = 4  # steps between two of the first looks for where matter is
 
 
 @dataclass(frozen=True)
@@ -324,17 +416,12 @@ class Marching:
     color_threshold: float = 1e-4
     jitter: bool = False
     occupancy: int = 0
-    look_every: int = 16
+    look_every: int = 0
 
     def __post_init__(self) -> None:
         check_number("model.marching.step", self.step, "a number > 0", lambda step: step > 0)
         check_number("model.marching.color_threshold", self.color_threshold, *_THRESHOLD)
         check_least(of="model.marching", occupancy=self.occupancy, look_every=self.look_every)
-
-    def departures(self) -> list[str]:
-        """Name what differs from the publications."""
-        notes = [ALONG_RAYS, ONE_TIME]
-        return notes + (["empty space is not sampled"] if self.occupancy and self.look_every else [])
 
 
 class PointField(Protocol):
@@ -359,36 +446,32 @@ class _Placed:
         return self.field.look_up(self.lattice.to_world(points))
 
 
-class MarchedMethod(Method):
+class MarchedMethod(RayMethod):
     """Rays marched at equal steps through a box, lattices that grow during a stage, Adam by rows.
 
     A subclass makes its lattices for ``num_voxels``, sets the ``shift`` of its ``activation``, ends its
     constructor with ``begin``, and says what it is at a moment (``field``) and how it grows (``grow``).
 
     Args:
-        start: scene, stage and numbers.
+        start: scene, stage and numbers: ``num_voxels``, ``[[fraction, count], ...]``: about ``count`` voxels
+            from ``fraction`` of the stage on; ``color_threshold``, in place of the marching's.
         marching: see ``Marching``.
         box: outside, everything is empty.
         alpha_key: of the opacity at first.
-        num_voxels: ``[[fraction, count], ...]``: about ``count`` voxels from ``fraction`` of the stage on.
     """
 
     terms = ("photo", "point_color", "background_entropy")
     numbers = ("num_voxels", "color_threshold")
-    sees_by_camera = False  # whether colour depends on the id of the camera that looks
 
     def __init__(
         self, start: Start, marching: Marching, box: Box, alpha_key: str = "model.alpha_init"
     ) -> None:
         super().__init__()
-        self.alpha_key = alpha_key
-        self.box, self.times, self.marching = box, start.scene.times, marching
+        self.box, self.times, self.marching, self.alpha_key = box, start.scene.times, marching, alpha_key
         self.still = start.scene.still
-        where, numbers = f"stage.{start.stage}", start.numbers
-        self.schedule = steps_of(
-            f"{where}.num_voxels", numbers.get("num_voxels", ()), least=8, from_start=True
-        )
-        threshold = numbers.get("color_threshold")
+        where, num_voxels = f"stage.{start.stage}", start.numbers.get("num_voxels", ())
+        self.schedule = steps_of(f"{where}.num_voxels", num_voxels, least=8, from_start=True)
+        threshold = start.numbers.get("color_threshold")
         if threshold is not None:
             check_number(f"{where}.color_threshold", threshold, *_THRESHOLD)
         self.renderer = Renderer(step=marching.step, color_threshold=marching.color_threshold)
@@ -397,18 +480,13 @@ class MarchedMethod(Method):
         self.dead_start = DeadStart(
             "preset.color_threshold",
             "no sample of so much weight",
-            f"set it to 0, or a larger {self.alpha_key}, or preset.occupancy=0",
+            f"set it to 0, or a larger {alpha_key}, or preset.occupancy=0",
         )
 
     def begin(self) -> None:
         """Note where the schedule stands, once all parameters are there."""
         self.register_buffer("voxels", torch.tensor(self.schedule[0][1], dtype=torch.float64))
         self.register_buffer("raised", torch.ones(len(self.param_groups()), dtype=torch.float64))
-
-    @property
-    def last_voxels(self) -> float:
-        """The number of voxels at the end of the stage."""
-        return self.schedule[-1][1]
 
     @property
     def lattice_marched(self) -> Lattice:
@@ -421,8 +499,8 @@ class MarchedMethod(Method):
 
     @property
     def activation(self) -> Activation:
-        """Density of raw density; its unit of length is a voxel of the last lattice."""
-        return Activation(self.shift, self.marching_lattice(self.last_voxels).voxel_size)
+        """Density of raw density; its unit of length is a voxel of the stage's last lattice."""
+        return Activation(self.shift, self.marching_lattice(self.schedule[-1][1]).voxel_size)
 
     def field(self, moment: Moment) -> PointField:
         """Return what is to be asked at a moment."""
@@ -448,9 +526,27 @@ class MarchedMethod(Method):
         rows = torch.randint(len(self.still), (min(count, len(self.still)),), generator=generator)
         return self.still[rows].to(self.device)
 
-    def at(self, moment: Moment) -> MarchedSnapshot:
-        """Fix the time; compute nothing yet."""
-        return MarchedSnapshot(moment, self)
+    def along(
+        self, moment: Moment, rays: Rays, background: Tensor, generator: torch.Generator | None = None
+    ) -> Marched:
+        """See ``RayMethod``; also return the samples."""
+        return self.marched(self.field(moment), rays, background, generator)
+
+    def image(self, moment: Moment, rays: Rays, background: Tensor) -> Rendering:
+        """See ``RayMethod``."""
+        field, behind = self.field(moment), background.expand(len(rays), 3)
+        chunks = [slice(begin, begin + _RAYS) for begin in range(0, len(rays), _RAYS)]
+        return Rendering.joined([self.marched(field, rays[some], behind[some]) for some in chunks])
+
+    def marched(
+        self, field: PointField, rays: Rays, background: Tensor, generator: torch.Generator | None = None
+    ) -> Marched:
+        """March rays through the occupied cells of a field; ``generator`` jitters the samples."""
+        everywhere = torch.ones(1, 1, 1, dtype=torch.bool, device=self.device)
+        cells = everywhere if self.occupancy is None else self.occupancy.cells
+        lattice = Lattice(self.box, tuple(n + 1 for n in cells.shape))
+        placed = _Placed(field, lattice, cells, self.lattice_marched.voxel_size)
+        return self.renderer(placed, rays, background, generator=generator)
 
     def look(self, batch: Batch, factors: Mapping[str, float], generator: torch.Generator) -> Step:
         """See ``Method.look``; a batch holds one time, as no neighbours are asked for, seen by one or
@@ -460,8 +556,12 @@ class MarchedMethod(Method):
             ValueError: if no sample has a colour for many steps.
         """
         rgb, parts = batch.joined()[1], batch.split() if self.sees_by_camera else [batch]
-        fields = [self.field(part.observations[0].moment) for part in parts]
-        drawn = Marched.joined([self._drawn(*both, generator) for both in zip(fields, parts)])
+        fields, seen = [self.field(part.observations[0].moment) for part in parts], []
+        for field, part in zip(fields, parts):
+            rays, _, background = part.joined()
+            jitter = generator if self.marching.jitter else None
+            seen.append(self.marched(field, rays.to(self.device), background.to(self.device), jitter))
+        drawn = Marched.joined(seen)
         self.dead_start.look(len(drawn.weights) > 0)
         error = (drawn.rgb - rgb).square().mean()
         terms = {
@@ -476,39 +576,21 @@ class MarchedMethod(Method):
             tensors=lambda: ((name, getattr(drawn, name)) for name in ("weights", "colors", "rgb")),
         )
 
-    def _drawn(self, field: PointField, batch: Batch, generator: torch.Generator) -> Marched:
-        rays, _, background = batch.joined()
-        jitter = generator if self.marching.jitter else None
-        return self.marched_through(field, rays.to(self.device), background.to(self.device), jitter)
-
-    def marched_through(
-        self, field: PointField, rays: Rays, background: Tensor, generator: torch.Generator | None = None
-    ) -> Marched:
-        """March rays through the occupied cells of a field; ``generator`` jitters the samples."""
-        return self.renderer(self.placed(field), rays, background, generator=generator)
-
-    def placed(self, field: PointField) -> _Placed:
-        """Return a field as the renderer asks it."""
-        everywhere = torch.ones(1, 1, 1, dtype=torch.bool, device=self.device)
-        cells = everywhere if self.occupancy is None else self.occupancy.cells
-        lattice = Lattice(self.box, tuple(n + 1 for n in cells.shape))
-        return _Placed(field, lattice, cells, self.lattice_marched.voxel_size)
-
     def advance(self, progress: float, step: int, optimizer: torch.optim.Optimizer) -> dict[str, float]:
         """See ``Method``; grow, after which optimiser and learning rates start anew; look for matter."""
-        wanted = next(n for begin, n in reversed(self.schedule) if progress >= begin)
-        if wanted != float(self.voxels):
-            self.grow(wanted, optimizer)
+        num_voxels = next(n for begin, n in reversed(self.schedule) if progress >= begin)
+        if num_voxels != float(self.voxels):
+            self.grow(num_voxels, optimizer)
             optimizer.state.clear()
-            self.voxels.fill_(wanted)
+            self.voxels.fill_(num_voxels)
             pairs = [(group["base_lr"], group["lr"]) for group in optimizer.param_groups]
             self.raised.copy_(torch.tensor([first / now if now else 1.0 for first, now in pairs]))
         for group, factor in zip(optimizer.param_groups, self.raised.tolist()):
             group["lr"] *= factor
         if self.occupancy is None:
             return {}
-        pace, young = self.marching.look_every, int(self.occupancy.looks) < self.occupancy.patience
-        if pace and step % (min(pace, _YOUNG) if young else pace) == 0:
+        every, young = self.marching.look_every, int(self.occupancy.looks) < self.occupancy.patience
+        if every and step % (min(every, _YOUNG) if young else every) == 0:
             self.occupancy.look(self.density_at, self.times, torch.default_generator)
         return {"occupied": float(self.occupancy.occupied.float().mean())}
 
@@ -518,19 +600,11 @@ class MarchedMethod(Method):
 
     def optimizer(self, groups: list[dict]) -> torch.optim.Optimizer:
         """Make Adam with the published betas; voxels that no sample touched keep their moments."""
-        return RowsAdam(groups, betas=(0.9, 0.99), eps=1e-8)
+        return RowsAdam(groups, betas=self.betas, eps=1e-8)
 
     def warm_up(self) -> None:
         """Compile the kernels."""
         warm_up(self.device)
-
-    def adopted(self) -> set[str]:
-        """Let voxel grids adopt a checkpoint's lattices."""
-        return adopted_in(self)
-
-    def misfit(self, state: Mapping[str, Tensor]) -> str | None:
-        """Return what in a stored grid contradicts its lattice, as kernels do not check the index."""
-        return misfit_in(self, state)
 
     def get_extra_state(self) -> dict:
         """Return the box in plain numbers."""
@@ -542,30 +616,8 @@ class MarchedMethod(Method):
 
     def departures(self) -> list[str]:
         """See ``Method``; a subclass adds its own to those of the marching."""
-        return self.marching.departures()
-
-
-@dataclass(frozen=True)
-class MarchedSnapshot(Snapshot):
-    """Such a method at one moment."""
-
-    moment: Moment
-    method: MarchedMethod
-
-    def render(self, view: View, background: Tensor, rendering: str | None = None) -> Rendering:
-        """See ``Snapshot.render``; without gradients in chunks of rays, for images of any size."""
-        rays, field = view.rays().to(self.method.device), self.method.field(self.moment)
-        background = background.to(rays.origins)
-        if torch.is_grad_enabled():
-            return self.method.marched_through(field, rays, background)
-        behind = background.expand(len(rays), 3)
-        chunks = [slice(begin, begin + _RAYS) for begin in range(0, len(rays), _RAYS)]
-        parts = [self.method.marched_through(field, rays[some], behind[some]) for some in chunks]
-        return Rendering.joined(parts)
-
-    def holds(self, moment: Moment) -> bool:
-        """Return whether it is the same time, seen by the same camera."""
-        return (moment.time, moment.camera) == (self.moment.time, self.moment.camera)
+        looks = self.marching.occupancy and self.marching.look_every
+        return [ALONG_RAYS, ONE_TIME, *(["empty space is not sampled"] if looks else [])]
 
 
 def whole_grid(lattice: Lattice, channels: dict[str, int]) -> VoxelGrid:
@@ -575,6 +627,6 @@ def whole_grid(lattice: Lattice, channels: dict[str, int]) -> VoxelGrid:
 
 def regrow(grid: VoxelGrid, lattice: Lattice, optimizer: torch.optim.Optimizer) -> None:
     """Interpolate such a grid to another lattice; its moments start at 0."""
-    before = [grid.parameter(name) for name in grid.names]
+    before = grid.rows()
     grid.resample(lattice, torch.ones(lattice.shape, dtype=torch.bool), dict.fromkeys(grid.names, 0.0))
-    renew_parameters(optimizer, before, [grid.parameter(name) for name in grid.names], None)
+    renew_parameters(optimizer, before, grid.rows(), None)

@@ -18,6 +18,7 @@ from forewarp.ops.grid import huber_variation
 from forewarp.scene.box import Lattice
 from forewarp.scene.view import Batch, Moment
 
+RELEASED = Marching()
 _STRIDES = (1, 2, 4)
 _STILL_SHARE = 3  # as many points that never move as a third of a step's rays
 
@@ -48,7 +49,7 @@ class TiNeuVox(MarchedMethod):
         self,
         start: Start,
         *,
-        marching: Marching | None = None,
+        marching: Marching = RELEASED,
         channels: int = 4,
         width: int = 64,
         alpha_init: float = 1e-2,
@@ -59,7 +60,7 @@ class TiNeuVox(MarchedMethod):
         feature_frequencies: int = 2,
         direction_frequencies: int = 4,
     ) -> None:
-        super().__init__(start, marching or Marching(), start.scene.box)
+        super().__init__(start, marching, start.scene.box)
         self.padded, self.sees_by_camera = padded, camera
         self.frozen_from = start.numbers.get("frozen_from", 1.0)
         check_number(f"stage.{start.stage}.frozen_from", self.frozen_from, *FRACTION)

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from forewarp.fields.networks import Template
 from forewarp.methods.method import Start
-from forewarp.methods.rays import Field, SampledMethod, Sampling, encoder
+from forewarp.methods.rays import Field, SampledMethod, encoder
 from forewarp.ops.encode import encoded_size
 from forewarp.scene.view import Moment
 
@@ -20,30 +20,15 @@ class TNeRF(SampledMethod):
 
     Args:
         start: scene, stage and numbers.
-        sampling: see ``Sampling``.
-        width, layers, skip: see ``fields.networks.Trunk``.
-        position_frequencies, time_frequencies, direction_frequencies: octaves of the encodings.
+        time_frequencies: octaves of the time's encoding.
+        network: sampling, width, layers, skip and other octaves: see ``SampledMethod``.
     """
 
-    def __init__(
-        self,
-        start: Start,
-        *,
-        sampling: Sampling | None = None,
-        width: int = 256,
-        layers: int = 8,
-        skip: int | None = 6,
-        position_frequencies: int = 10,
-        time_frequencies: int = 4,
-        direction_frequencies: int = 4,
-    ) -> None:
-        super().__init__(start, sampling or Sampling())
-        self.position = encoder("position", position_frequencies)
+    def __init__(self, start: Start, *, time_frequencies: int = 4, **network) -> None:
+        super().__init__(start, **network)
         self.moment = encoder("time", time_frequencies)
-        self.direction = encoder("direction", direction_frequencies)
-        inputs = encoded_size(3, position_frequencies) + encoded_size(1, time_frequencies)
-        condition = encoded_size(3, direction_frequencies)
-        self.network = Template(inputs, condition, width=width, layers=layers, skip=skip)
+        position, direction = self.sizes
+        self.network = Template(position + encoded_size(1, time_frequencies), direction, **self.shape)
 
     def fields(self, moment: Moment) -> tuple[None, Field]:
         """See ``SampledMethod``."""

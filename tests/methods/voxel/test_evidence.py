@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from forewarp.fields.curves import TrajectoryField
-from forewarp.methods.voxel.planning import Movement, _explained, movement, residual
+from forewarp.methods.voxel.planning import Movement, _explained, movement_of, residual
 from forewarp.ops.curves import dct_basis
 from forewarp.scene.box import Lattice
 from forewarp.scene.silhouettes import survey
@@ -49,7 +49,7 @@ def test_alpha_that_is_nowhere_transparent_says_nothing():
 
 
 def test_a_shift_moves_all_and_tears_nothing():
-    found = movement(
+    found = movement_of(
         fitted(lambda at, time: time * at.new_tensor([0.8, 0, 0]).expand(len(at), 3)), [0, 0.5, 1]
     )
     assert (found.moving, found.torn) == (1.0, 0.0)
@@ -60,14 +60,14 @@ def test_what_is_drawn_out_is_torn():
     def stretched(at, time):
         return 2 * time * (at - at.mean(0)) * at.new_tensor([1.0, 0, 0])
 
-    found = movement(fitted(stretched), [0, 0.4, 1])
+    found = movement_of(fitted(stretched), [0, 0.4, 1])
     assert found.torn == 1.0  # three voxels from one to the next
     assert found.at == 1
-    assert movement(fitted(stretched), [0, 0.4]).torn == 0.0  # 1.8 voxels
+    assert movement_of(fitted(stretched), [0, 0.4]).torn == 0.0  # 1.8 voxels
 
 
 def test_nothing_moves_where_nothing_does():
-    found = movement(fitted(lambda at, time: torch.zeros_like(at)), [0, 1])
+    found = movement_of(fitted(lambda at, time: torch.zeros_like(at)), [0, 1])
     assert (found.moving, found.distance, found.torn, found.left_out) == (0, 0, 0, (0.0,))
     assert found.bases() == 0
 
@@ -76,7 +76,7 @@ def test_no_matter_does_not_move():
     method = fitted(lambda at, time: torch.ones_like(at))
     with torch.no_grad():
         method.radiance.parameter("density").fill_(-8.0)
-    assert movement(method, [0, 1]) == Movement(0, 0, 0, 0.0, (0.0,))
+    assert movement_of(method, [0, 1]) == Movement(0, 0, 0, 0.0, (0.0,))
 
 
 def test_a_wave_needs_its_own_cosine():
@@ -91,7 +91,7 @@ def test_a_wave_needs_its_own_cosine():
         return (strength @ basis).expand(len(at), 3)
 
     trajectory.coefficients = lambda points: strength.expand(len(points), 3, 8)
-    found = movement(method, times)
+    found = movement_of(method, times)
     assert len(found.left_out) == 9
     assert found.bases() == 5
     assert found.left_out[4] == pytest.approx(found.left_out[0])

@@ -16,9 +16,7 @@ from forewarp.fields.grids import (
     RadianceGrid,
     Shade,
     VoxelGrid,
-    adopted_in,
     mean_color,
-    misfit_in,
     shaded,
 )
 from forewarp.methods.method import Method, Snapshot, Start, Step
@@ -340,14 +338,6 @@ class VoxelMethod(Method):
     def size(self) -> tuple[str, int]:
         """Number of active voxels."""
         return "voxels", len(self.radiance.voxels)
-
-    def adopted(self) -> set[str]:
-        """Let voxel grids adopt a checkpoint's lattices."""
-        return adopted_in(self)
-
-    def misfit(self, state: Mapping[str, Tensor]) -> str | None:
-        """Return what in a stored grid contradicts its lattice, as kernels do not check the index."""
-        return misfit_in(self, state)
 
     def get_extra_state(self) -> dict:
         """Return the length that density is measured in, and the state of the lattices' schedule."""

@@ -58,7 +58,7 @@ class Movement:
 
 
 @torch.no_grad()
-def movement(method: ForwardWarp, times: Sequence[float]) -> Movement:
+def movement_of(method: ForwardWarp, times: Sequence[float]) -> Movement:
     """Measure how a fitted method with motion moves. Cost: one flow per time, at most ``_TIMES``."""
     grid, trajectory = method.radiance(), method.motion.trajectory
     lattice, voxels = grid.lattice, method.radiance.voxels
@@ -420,7 +420,7 @@ class VoxelPlanning:
         asked: Asked,
     ) -> None:
         """Measure how the coarse stage moves, and its errors in some training images."""
-        evidence.movement = movement(method, scene.times) if method.moves else None
+        evidence.movement = movement_of(method, scene.times) if method.moves else None
         box = method.bounds(list(scene.times))
         box = method.radiance.lattice.box if box is None else box.intersection(scene.box.scaled(1.05))
         count = max(count for _, count in asked.stages[asked.last]["num_voxels"])
