@@ -9,7 +9,10 @@ import pytest
 import torch
 import yaml
 
+from forewarp import load
+from forewarp.methods.particles.model import Particles
 from forewarp.runs.session import locked
+from forewarp.training.handover import load_handover
 from tests.support.commands import TINY
 from tests.support.dnerf_scene import write_tiny
 
@@ -233,3 +236,20 @@ def test_skipped_steps_are_told(ok, scenes, in_tmp, monkeypatch):
     monkeypatch.setattr(Sampler, "draw", spoiled)
     done = ok(*arguments(scenes, "run", *SHORT, "sentinel.skip=1"))
     assert "coarse: 1 broken steps skipped; each lies in run/coarse/broken" in done.out
+
+
+@pytest.mark.slow
+def test_particles_begin_where_voxels_found_matter(ok, refused, scenes, in_tmp, monkeypatch):
+    for start in ("hull_surface", "swept", "anywhere"):
+        fail = lambda *_: pytest.fail("they began somewhere else")  # noqa: E731
+        monkeypatch.setattr(f"forewarp.methods.particles.start.{start}", fail)
+    words = ["train", "data=dnerf", f"data.root={scenes}", "data.scene=vehicle", "trainer=cpu", "threads=1"]
+    words += ["logger=none", "run=run", "sheets=0", "evaluate=false", "stage=particles_after_forward"]
+    words += ["stage.coarse.num_voxels=[[0,800]]", "stage.coarse.start_alpha=0.5"]
+    words += ["budget.minutes=null", "budget.iterations=6"]
+    assert "expected a number, as the method is trained on single rays" in refused(*words)
+    ok(*words, "preset.rays=64")
+    assert len(load_handover(in_tmp / "run" / "coarse").cloud) >= 16
+    assert isinstance(load(in_tmp / "run").method, Particles)
+    line = refused(*words, "preset.rays=64", "model/radiance=mlp")
+    assert "model/radiance: expected an option of model=particles" in line  # of the run as ever

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 
 import pytest
@@ -11,6 +12,7 @@ from forewarp import load
 from forewarp.runs.config import saved_config
 from forewarp.runs.fitted import named, opened
 from forewarp.synth.scenes import synthesize
+from tests.support.configs import ROOT
 
 
 def test_a_run_is_opened_to_look_at_and_other_data_are_told(fitted, tmp_path, capsys):
@@ -28,6 +30,19 @@ def test_a_run_is_opened_to_look_at_and_other_data_are_told(fitted, tmp_path, ca
             f"warning: {run}/data.json: expected the data that the run was begun with"
             in capsys.readouterr().err
         )
+
+
+def test_the_script_of_the_docs_runs(fitted, in_tmp):
+    page = ROOT / "docs" / "scripts.md"
+    script = re.search(r"```python\n(.*?)```", page.read_text(), re.DOTALL)[1]
+    shutil.copytree(fitted, in_tmp / re.search(r'load\("(.*?)"\)', script)[1])
+    made = {}
+    exec(compile(script, str(page), "exec"), made)
+    assert made["picture"].shape == (32, 32, 3)
+    assert (in_tmp / "half.png").is_file()
+    assert [picture.shape for picture in made["film"]] == [(64, 64, 3)] * 8
+    assert made["paths"].shape[1:] == (5, 3)
+    assert made["pixels"].shape == (len(made["paths"]), 2)
 
 
 SMALL = [
