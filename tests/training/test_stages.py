@@ -27,10 +27,15 @@ from tests.support.tiny_scene import (
 
 
 def stages(**changes):
-    """Two short stages; the lattice of the second grows halfway; voxels are refreshed every fourth step."""
+    """Two stages of 10 steps, of which the second ends by steps for each of its 12 pictures.
+
+    The lattice of the second grows halfway; voxels are refreshed every fourth step.
+    """
     common = {"iterations": 10, "refresh_every": 4, "start": "hull", "hull_frames": 3, "hull_grow": 0.1}
     common["background_num_voxels"] = [[0, 8**3]]
     coarse = stage("coarse", num_voxels=[[0, 10**3]], bases=[[0, 2], [0.5, 4]], **common)
+    if "iterations" not in changes:
+        changes |= {"iterations": 1000, "steps_per_picture": 10 / 12}
     return [coarse, stage("fine", num_voxels=[[0, 11**3], [0.5, 14**3]], **(common | changes))]
 
 
@@ -67,29 +72,6 @@ def test_a_continued_run_equals_an_uninterrupted_one_to_the_bit(tmp_path, whole,
         with pytest.raises(SystemExit):
             run(tmp_path, [interruption]).fit()
     assert same(run(tmp_path).fit(), whole[1])
-
-
-def test_a_stage_ends_after_its_steps_for_each_picture_and_says_so(tmp_path):
-    only = stage("only", num_voxels=[[0, 10**3]], iterations=1000, steps_per_picture=0.5)
-    bounded, told = make_run(tmp_path, [only], data=ball_data(rays=64, size=16)), []
-    bounded.tell = told.append
-    bounded.fit()
-    pictures = len(bounded.datamodule.scene.train)
-    steps = round(0.5 * pictures)
-    assert bounded.finished()["only"]["steps"] == steps
-    assert told == [
-        f"only: ended after {steps} steps, 0.5 for each of {pictures} training pictures; "
-        "for as many as the budget has: stage.only.steps_per_picture=null"
-    ]
-
-
-def test_a_stage_that_steps_per_picture_bound_goes_on_to_the_bit(tmp_path):
-    """Rates and curriculum follow the steps there will be, also after an interruption."""
-    bounded = {"iterations": 1000, "steps_per_picture": 0.5}
-    fitted = run(tmp_path / "whole", **bounded).fit()
-    with pytest.raises(SystemExit):
-        run(tmp_path / "cut", [Interrupt("fine", 3)], **bounded).fit()
-    assert same(run(tmp_path / "cut", **bounded).fit(), fitted)
 
 
 def test_another_seed_gives_another_run(tmp_path, whole):
@@ -245,6 +227,7 @@ def test_a_scene_of_one_time_needs_no_motion_and_no_rate_for_it(tmp_path):
     assert module.method.motion is None
 
 
+@pytest.mark.slow
 def test_a_sliding_ball_is_learned_at_all_times(tmp_path):
     data = ball_data(rays=512, frames=16)
     fitting = stage(
@@ -296,6 +279,12 @@ def pressed(folder, *presses):
     assert signal.getsignal(signal.SIGINT) is before
 
 
+ENDED = (
+    "fine: ended after 10 steps, 0.833333 for each of 12 training pictures; for as many as the budget has: "
+)
+ENDED += "stage.fine.steps_per_picture=null"
+
+
 @pytest.mark.parametrize(("name", "step"), [("coarse", 5), ("fine", 9)])
 def test_ctrl_c_keeps_the_step_that_it_met(tmp_path, whole, capsys, name, step):
     pressed(tmp_path, name, step)
@@ -305,7 +294,7 @@ def test_ctrl_c_keeps_the_step_that_it_met(tmp_path, whole, capsys, name, step):
     ours.tell = told.append
     assert same(ours.fit(), whole[1])
     before = ["coarse: finished before"] if name == "fine" else []
-    assert told == [*before, f"{name}: goes on at {10 * (step + 1)}%, step {step + 1}"]
+    assert told == [*before, f"{name}: goes on at {10 * (step + 1)}%, step {step + 1}", ENDED]
 
 
 def test_a_second_ctrl_c_stops_at_once(tmp_path):
