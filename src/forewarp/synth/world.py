@@ -1,8 +1,8 @@
 """A subject, perhaps in a room, as one moving mesh; and specimens that each call for a few known effects.
 
 A plan made from a specimen's images should switch on only the effects that
-``conf/scene/specimen_<name>.yaml`` lists or, for a method with a list of its own,
-``conf/model_scene/<method>_specimen_<name>.yaml``.
+``scene=specimen_<name>`` lists in ``conf/options.yaml`` or, for a method with a list of its own,
+below ``scenes`` in ``conf/numbers/<method>.yaml``.
 """
 
 from __future__ import annotations
