@@ -13,7 +13,7 @@ from PIL import Image
 
 from forewarp.metrics.registry import METRICS, Metric
 from forewarp.report import figures
-from forewarp.report.benchmark import Published, mean_by_time, read_published, write_methods, write_minutes
+from forewarp.report.benchmark import Published, read_published, write_methods, write_minutes
 from forewarp.report.figures import GAP
 from tests.support.runs_on_disk import rows_of, write_run
 
@@ -168,7 +168,6 @@ def test_both_clocks_and_versions_of_the_code_are_told(tmp_path, monkeypatch):
     (line,) = [line for line in text.splitlines() if line.startswith("The runs may be of different versions")]
     assert line.endswith("1 min of commit aaa, commit bbb.")
     assert drawn[0]["ball"]["1 min, 2 seeds"][:2] == [(0.0, 31.0), (0.05, 31.0)]
-    assert mean_by_time([]) == []
 
 
 def timed(runs, method, minutes, *found, scene="ball", clock="wall", took=None):
@@ -235,10 +234,10 @@ def test_published_points_are_read_and_checked(tmp_path):
     assert read_published(path) == [Published("a", 60, 30.5, "g", "s", "dnerf")]
     for text in ("- {name: a}\n", "name: a\n"):
         path.write_text(text)
-        with pytest.raises(ValueError, match=r"published.yaml: \[0\]: expected the keys name, seconds"):
+        with pytest.raises(ValueError, match=r"published.yaml: expected entries with the keys name, seconds"):
             read_published(path)
     path.write_text("[")
-    with pytest.raises(ValueError, match="published.yaml: expected YAML, but got"):
+    with pytest.raises(ValueError, match="published.yaml: expected entries with the keys"):
         read_published(path)
 
 

@@ -145,18 +145,16 @@ def report(config: DictConfig) -> None:
 
 def compared(config: DictConfig) -> str:
     """Return the table of ``kind=compare``; draw a view by each run where ``out`` is set."""
-    from forewarp.report.compare import compare, draw_compared
+    from forewarp.report.compare import compare, draw_compared, read_compared
 
     named = (
         [] if config.runs is None else [config.runs] if isinstance(config.runs, str) else list(config.runs)
     )
-    folders = [folder for name in named for folder in sorted(glob(str(name))) or [str(name)]]
-    table = compare(folders).plain()
-    if not config.out:
-        return table
-    drawn = draw_compared(folders, Path(config.out))
+    runs = read_compared([folder for name in named for folder in sorted(glob(str(name))) or [str(name)]])
+    drawn = draw_compared(runs, Path(config.out)) if config.out else None
     none = "no picture: the runs share no test view with a sheet; type views= and sheets= alike"
-    return table + "\n" + (f"written: {drawn}" if drawn else none)
+    about = f"written: {drawn}" if drawn else none
+    return compare(runs).plain() + (f"\n{about}" if config.out else "")
 
 
 def run_page(config: DictConfig) -> str:

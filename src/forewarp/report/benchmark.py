@@ -1,4 +1,7 @@
-"""Write the pages of methods under one clock, from CSV tables that later runs add to."""
+"""Write the pages of methods under one clock, from CSV tables that later runs add to.
+
+Functions that write search a folder for measured runs, write to ``out``, and return the files written.
+"""
 
 from __future__ import annotations
 
@@ -62,39 +65,25 @@ def read_published(path: Path) -> list[Published]:
         ValueError: if the file is no YAML, or an entry has other keys.
     """
     try:
-        entries = yaml.safe_load(read_text(Path(path), MOST_CONFIG))
-    except yaml.YAMLError as error:
-        raise ValueError(f"{path}: expected YAML, but got {str(error).splitlines()[0]}") from None
-    for number, entry in enumerate(entries if isinstance(entries, list) else [None]):
-        if not isinstance(entry, dict) or set(entry) != set(Published._fields):
-            got, keys = sorted(entry) if isinstance(entry, dict) else type(entry).__name__, Published._fields
-            raise ValueError(f"{path}: [{number}]: expected the keys {', '.join(keys)}, but got {got}")
-    return [Published(**entry) for entry in entries]
+        return [Published(**entry) for entry in yaml.safe_load(read_text(path, MOST_CONFIG))]
+    except (TypeError, yaml.YAMLError) as error:
+        expected, got = f"entries with the keys {', '.join(Published._fields)}", str(error).splitlines()[0]
+        raise ValueError(f"{path}: expected {expected}, but got {got}") from None
 
 
 def write_minutes(folder: Path, out: Path, published: Sequence[Published] = ()) -> list[Path]:
     """Write ``<method>.md``, ``.csv`` (a row a run) and ``.png`` (PSNR by view) of each method in the runs,
-    and ``accuracy-time.md`` of them all.
+    and ``accuracy-time.md`` of them all, with the results of others that were ``published``.
 
     Rows of a table that is there already stay, unless a run of the same ``results.KEY`` replaces them: runs
     may be made one day after the other. Each page compares its method with the others, so that the pages of
     methods with a table in ``out`` are written anew too.
-
-    Args:
-        folder: searched for measured runs.
-        out: folder to write to.
-        published: results of others, drawn beside.
-
-    Returns:
-        the files written.
     """
     runs, left_out = _timed(folder)
     methods, written = {row["method"] for row in runs}, []
     for file in out.glob("*.csv"):  # of earlier calls
-        if file.with_suffix(".md").is_file() and {row.get("method") for row in read_rows(file)} == {
-            file.stem
-        }:
-            methods.add(file.stem)
+        named = {row.get("method") for row in read_rows(file)}
+        methods |= named if named == {file.stem} and file.with_suffix(".md").is_file() else set()
     tables = {
         method: labelled(add_to_table(out / f"{method}.csv", runs.where(method=method)))
         for method in sorted(methods)
@@ -105,10 +94,12 @@ def write_minutes(folder: Path, out: Path, published: Sequence[Published] = ()) 
         replace_file(page, rendered("minutes.md.j2", left_out=left_out, **_of_method(method, own, others)))
         scenes = {}
         for group in alike(plain(own)):
-            lines = scenes.setdefault(group[0]["label"], {})
-            if points := mean_by_time(group):
-                label = f"{length(group[0]['minutes'])}, {len(group)} seed{'s' * (len(group) > 1)}"
-                lines[label] = points
+            by_time: dict[float, list[float]] = {}
+            for time, psnr in (pair for row in group for pair in pairs(row["views"])):
+                by_time.setdefault(time, []).append(psnr)
+            label = f"{length(group[0]['minutes'])}, {len(group)} seed{'s' * (len(group) > 1)}"
+            means = {label: [(time, fmean(by_time[time])) for time in sorted(by_time)]} if by_time else {}
+            scenes.setdefault(group[0]["label"], {}).update(means)
         figures.draw_by_time(picture, scenes)
         written += [page, out / f"{method}.csv", picture]
     return written + _write_lengths(tables, out, published)
@@ -127,14 +118,14 @@ def _timed(folder: Path) -> tuple[Runs, list[str]]:
 
 def labelled(runs: Runs) -> Runs:
     """Give rows a ``label``: the scene and, where its plain rows differ in preset or ``CONDITIONS``, in what;
-    likewise their dataset.
+    and likewise a ``group``: the dataset, of whose scenes there is a mean.
     """
     found = Runs()
     for row in runs:
         others, is_plain = plain(runs.where(scene=row["scene"])), bool(plain(Runs([row])))
         words = in_words(row, others, ("preset", *CONDITIONS)) if is_plain else []
-        label, dataset = (", ".join([name, *words]) for name in (row["scene"], row["dataset"] or ""))
-        found.append(row | {"label": label, "dataset": dataset})
+        label, group = (", ".join([name, *words]) for name in (row["scene"], row["dataset"] or ""))
+        found.append(row | {"label": label, "group": group})
     return found
 
 
@@ -162,18 +153,6 @@ def row_of(group: Runs, **more: object) -> Row:
     return group.summary(
         took=took, ms=step and 1000 * step, moving=moving, particles=size_of(group) or None, **more
     )
-
-
-def mean_by_time(runs: Runs) -> list[tuple[float, float]]:
-    """Average the PSNR (dB) of the views of each time, over all rows.
-
-    >>> mean_by_time(Runs([{"views": "0:30 0.5:31"}, {"views": "0:32 0.5:34"}]))
-    [(0.0, 31.0), (0.5, 32.5)]
-    """
-    found: dict[float, list[float]] = {}
-    for time, psnr in (pair for row in runs for pair in pairs(row["views"])):
-        found.setdefault(time, []).append(psnr)
-    return [(time, fmean(found[time])) for time in sorted(found)]
 
 
 def _of_method(method: str, runs: Runs, others: Mapping[str, Runs]) -> dict:
@@ -237,7 +216,7 @@ def _by_minutes(runs: Runs) -> Table:
     scenes, minutes = runs.by("label"), list(runs.by("minutes"))
     cells = {key: group.estimate("psnr") for key, group in runs.by("label", "minutes").items()}
     lines = [[scene, *(cells.get((scene, m)) for m in minutes)] for scene in scenes]
-    for dataset, found in runs.by("dataset").items():
+    for dataset, found in runs.by("group").items():
         columns = [[cells.get((label, m)) for label in found.by("label")] for m in minutes]
         means = [None if None in column else fmean(cell.mean for cell in column) for column in columns]
         lines += [[f"mean of {dataset}", *means]] if len(found.by("label")) > 1 else []
@@ -340,7 +319,7 @@ def _write_lengths(tables: Mapping[str, Runs], out: Path, published: Sequence[Pu
     scenes, pictures, used, shown = [], [], Runs(), {}
     for title, lengths in sorted(compared.items()):
         own = [row for groups in lengths.values() for group in groups for row in group]
-        beside = [other for other in published if other.dataset == own[0]["dataset"].split(", ")[0]]
+        beside = [other for other in published if other.dataset == own[0]["dataset"]]
         picture = out / f"accuracy-time-{re.sub(r'[^a-zA-Z0-9]+', '-', title).strip('-')}.png"
         points = {
             method: [[(row[row["clock"]] or 60 * row["minutes"], row["psnr"]) for row in g] for g in groups]
@@ -380,13 +359,6 @@ def write_methods(folder: Path, out: Path) -> list[Path]:
     Rows of a table that is there already stay, as in ``write_minutes``. Views are drawn of the given runs
     alone; a picture that an earlier page shows stays if it has more methods, and the page says which of
     them have other rows by now. Ablations are left out.
-
-    Args:
-        folder: searched for measured runs.
-        out: folder to write to.
-
-    Returns:
-        the files written.
 
     Raises:
         ValueError: if there is no run of a method, and no table with such runs.

@@ -1,4 +1,7 @@
-"""Write what choices cost and bring: accuracy against time, the price list, and planned effects."""
+"""Write what choices cost and bring: accuracy against time, the price list, and planned effects.
+
+Functions that write search a folder for measured runs, write to ``out``, and return the files written.
+"""
 
 from __future__ import annotations
 
@@ -47,14 +50,10 @@ def write_accuracy_time(
     """Write ``accuracy-time.md``, and a picture and a CSV file a scene.
 
     Args:
-        folder: searched for runs.
-        out: folder to write to.
+        folder, out: see above.
         target: list each variant's seconds to this PSNR (dB); None: the last whole dB that the base, or else
             the best run, reached.
         published: results of others, drawn as stars.
-
-    Returns:
-        the files written.
     """
     runs, left_out = read_runs(folder, ["accuracy_time.csv", "metrics.json"])
     scenes, written = [], []
@@ -65,19 +64,15 @@ def write_accuracy_time(
         picture, file = out / f"accuracy-time-{scene}.png", out / f"accuracy-time-{scene}.csv"
         beside = [other for other in published if other.dataset == found[0]["dataset"]]
         draw_scene(picture, groups, scene, beside)
-        every = variants(groups, target_of(found) if target is None else target)
+        curves = [row["points"] for row in found.where(variant="base") or found]
+        twice = [min(a.psnr, b.psnr) for curve in curves for a, b in zip(curve, curve[1:] or curve)]
+        every = variants(groups, float(math.floor(max(twice))) if target is None else target)
         replace_file(file, every.csv())
         scenes.append({"name": scene, "picture": picture.name, "tables": [cheapest(groups), every]})
         written += [picture, file]
     about = {"machine": runs.machines(), "published": published, "left_out": left_out}
     replace_file(out / "accuracy-time.md", rendered("accuracy_time.md.j2", scenes=scenes, **about))
     return [out / "accuracy-time.md", *written]
-
-
-def target_of(runs: Runs) -> float:
-    """Return the last whole dB that the base, or else any run, reached in two evaluations in a row."""
-    curves = [row["points"] for row in runs.where(variant="base") or runs]
-    return float(math.floor(max(min(a.psnr, b.psnr) for c in curves for a, b in zip(c, c[1:] or c))))
 
 
 def reached(runs: Runs, psnr: float) -> Estimate | None:
@@ -123,13 +118,6 @@ def write_price_list(folder: Path, out: Path) -> list[Path]:
     """Write ``price-list-<model>.md`` and ``.csv`` (every run's own numbers), of ``forward`` ``price-list``.
 
     The model is that of most runs: what is changed one at a time, beside which whole methods may stand.
-
-    Args:
-        folder: searched for measured runs.
-        out: folder to write to.
-
-    Returns:
-        the files written.
     """
     runs, left_out = read_runs(folder)
     scenes = []
@@ -195,13 +183,6 @@ def every_run(runs: Runs) -> Table:
 def write_effects(folder: Path, out: Path) -> list[Path]:
     """Write ``effects.md`` and ``effects.csv`` (every run) of ``model=forward``, and ``effects-<model>`` of
     any other method.
-
-    Args:
-        folder: searched for measured runs.
-        out: folder to write to.
-
-    Returns:
-        the files written.
     """
     runs, left_out = read_runs(folder)
     runs, files = Runs(row for row in runs if row["ablation"] in CHOICES), []

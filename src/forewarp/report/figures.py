@@ -219,23 +219,17 @@ def draw_curves(path: Path, rows: Mapping[str, Row], title: str) -> Path | None:
 
 
 def spread_out(places: Sequence[float], gap: float) -> list[float]:
-    """Move places apart until neighbours are ``gap`` apart, as little as possible.
+    """Move places apart until neighbours are about ``gap`` apart.
 
     >>> spread_out([1.0, 5.0, 1.0], 1.0)
     [0.5, 5.0, 1.5]
     """
-    clusters: list[list[int]] = []  # indices, by place; each stands ``gap`` apart around its mean
-
-    def first(cluster: list[int]) -> float:
-        return sum(places[i] for i in cluster) / len(cluster) - gap * (len(cluster) - 1) / 2
-
-    for index in sorted(range(len(places)), key=lambda i: places[i]):
-        cluster = [index]
-        while clusters and first(clusters[-1]) + gap * len(clusters[-1]) > first(cluster):
-            cluster = clusters.pop() + cluster
-        clusters.append(cluster)
-    found = {index: first(c) + i * gap for c in clusters for i, index in enumerate(c)}
-    return [found[i] for i in range(len(places))]
+    found, order = list(places), sorted(range(len(places)), key=lambda i: places[i])
+    for _ in range(100 * len(places)):  # neighbours push each other away until none is too close
+        for low, high in zip(order, order[1:]):
+            push = max(0.0, gap - (found[high] - found[low])) / 2
+            found[low], found[high] = found[low] - push, found[high] + push
+    return found
 
 
 def sheets_of(folder: Path) -> dict[str, Path]:

@@ -1,4 +1,7 @@
-"""The paper's tables, measured beside printed numbers, and what each part of its method brings."""
+"""The paper's tables, measured beside printed numbers, and what each part of its method brings.
+
+Functions that write search a folder for measured runs, write to ``out``, and return the files written.
+"""
 
 from __future__ import annotations
 
@@ -328,13 +331,9 @@ def write_paper(folder: Path, out: Path, published: Path = PAPER, curves: Path |
     """Write ``paper.md``, ``paper.tex``, ``paper.html``, a CSV file a table, and the figures.
 
     Args:
-        folder: searched for measured runs.
-        out: folder to write to.
+        folder, out: see above.
         published: file of the printed numbers.
         curves: folder of the pictures drawn by ``kind=accuracy_time``, shown too.
-
-    Returns:
-        the files written.
     """
     runs, left_out = _read(folder)
     real, made = runs.where(counterpart=False), runs.where(counterpart=True)
@@ -429,12 +428,9 @@ def write_ablation(folder: Path, out: Path, published: Path = PAPER) -> list[Pat
     """Write ``ablation.md`` and ``ablation.csv`` (every run).
 
     Args:
-        folder: searched for measured runs of ``sweeps=ablation_modules`` and ``ablation_losses``.
-        out: folder to write to.
+        folder: of runs of ``sweeps=ablation_modules`` and ``ablation_losses``.
+        out: see above.
         published: file of the printed numbers.
-
-    Returns:
-        the files written.
 
     Raises:
         ValueError: if no run is of an ablation.

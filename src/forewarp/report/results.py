@@ -312,9 +312,7 @@ def read_run(folder: Path) -> Row:
     row |= {clock: metrics.get("clocks", {}).get(clock) for clock in ("wall", "processor")}
     row |= {"epe": flow.get("epe_moving"), "steps": sum(done["steps"] for done in stages.values())}
     row["motion_error"] = flow["epe_moving"] / flow["motion_mean"] if flow.get("motion_mean") else None
-    last = read_rows(folder / "accuracy_time.csv")[-1:]
-    sizes = [*sizes.values(), *(float(point["size"]) for point in last if point.get("size"))]
-    row["size"] = float(sizes[0]) if sizes else None
+    row["size"] = next(map(float, sizes.values()), None)
     row |= dict.fromkeys(("train", "step", "frame", "memory", "parameters"))
     if metrics:
         row["train"], row["frame"] = metrics["seconds"]["train"], metrics["seconds"].get("render_per_frame")

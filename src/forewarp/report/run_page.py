@@ -100,7 +100,9 @@ def read_story(folder: Path) -> Row:
         finished = sum(float(done["seconds"]) for done in row["stages"].values())
         row["trained"] = max([finished, *(point.seconds for point in row["points"])])
         row["unfinished"] = [name for name in stages if name not in row["stages"]]
-        row["loss"], row["consists"] = _read_curves(row, stages)
+        row["loss"] = _read_losses(row, stages)
+        sizes = row["metrics"].get("size") or {}
+        row["consists"] = next((of for of in sizes.items() if of[0] in ("particles", "voxels")), None)
     except UNREADABLE as error:
         raise ValueError(
             f"run: expected a run whose files can be read, but got {folder} ({unreadable(error)})"
@@ -108,44 +110,35 @@ def read_story(folder: Path) -> Row:
     return row
 
 
-def _read_curves(row: Row, stages: Sequence[str]) -> tuple[dict[str, list], tuple[str, int] | None]:
-    """Read each stage's loss from TensorBoard's events, against seconds of training; and ``consists``."""
-    losses, consists, before = {}, None, 0.0
-    moments = read_rows(row["folder"] / "accuracy_time.csv")
+def _read_losses(row: Row, stages: Sequence[str]) -> dict[str, list[tuple[float, float]]]:
+    """Read each stage's loss from TensorBoard's events, against seconds of training."""
+    losses, before, moments = {}, 0.0, read_rows(row["folder"] / "accuracy_time.csv")
     for stage in stages:
-        scalars, done = _scalars(row["folder"] / stage / "tensorboard"), row["stages"].get(stage)
+        loss, done = _loss(row["folder"] / stage / "tensorboard"), row["stages"].get(stage)
         # The known moments of a stage: its step -> seconds of training over all stages.
         known = {0: before}
         known |= {int(m["step"]): float(m["seconds"]) for m in moments if m.get("stage") == stage}
         if done is not None:
             before += float(done["seconds"])
             known[int(done["steps"])] = before
-        if (loss := scalars.get("train/loss")) and len(known) > 1:
+        if loss and len(known) > 1:
             steps, many = sorted(known.items()), -(-len(loss) // LOSSES)
             points = [(_between(steps, step), value) for step, value in loss]
             parts = [points[i : i + many] for i in range(0, len(points), many)]
             losses[stage] = [(fmean(t for t, _ in part), fmean(v for _, v in part)) for part in parts]
-        # Scalars name what was counted; they are means over steps, so about as large as the last size.
-        for tag, values in scalars.items():
-            kind, noted = tag.split("/")[1].split("_")[-1], values[-1][1]
-            count = int(moments[-1].get("size") or 0) if moments else round(noted)
-            if kind in ("particles", "voxels") and abs(noted - count) < 0.1 * count:
-                consists = kind, count
-    return losses, consists
+    return losses
 
 
-def _scalars(folder: Path) -> dict[str, list[tuple[int, float]]]:
-    """Return the scalars in TensorBoard's events, (step, value) by tag; later events replace earlier ones."""
+def _loss(folder: Path) -> list[tuple[int, float]]:
+    """Return (step, loss) of TensorBoard's events; later events replace earlier ones."""
     if not folder.is_dir():
-        return {}
+        return []
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     kept = {"scalars": 0, "images": 1, "tensors": 1, "histograms": 1, "audio": 1, "compressedHistograms": 1}
-    events, found = EventAccumulator(str(folder), size_guidance=kept).Reload(), {}
-    for tag in (tag for tag in events.Tags()["scalars"] if tag.startswith("train/")):
-        last = {event.step: event.value for event in events.Scalars(tag) if math.isfinite(event.value)}
-        found |= {tag: sorted(last.items())} if last else {}
-    return found
+    events = EventAccumulator(str(folder), size_guidance=kept).Reload()
+    found = events.Scalars("train/loss") if "train/loss" in events.Tags()["scalars"] else []
+    return sorted({event.step: event.value for event in found if math.isfinite(event.value)}.items())
 
 
 def _between(known: Sequence[tuple[int, float]], step: int) -> float:
@@ -297,8 +290,10 @@ def page(
     values = {"row": row, "media": media, "views": list(zip(media.views, views)), "video": video}
     values |= {"pictures_note": pictures_note, "video_note": video_note, "near": near, "time_text": time_text}
     values |= {"protocol": row["metrics"].get("protocol", {}), "flow": row["metrics"].get("flow") or {}}
-    values |= {"tiles": _tiles(row), "charts": _charts(row), "effects": _effects(row), "facts": _facts(row)}
-    values |= {"abilities": ABILITIES, "folder": shlex.quote(near(str(row["folder"])))}
+    charts = {"Where it is good, and where not": _of_views(row["images"]) if row["images"] else []}
+    charts["How it got there"] = [*_accuracy(row), *_losses(row)]
+    values |= {"charts": charts, "effects": _effects(row), "abilities": ABILITIES, "metric_of": metric_of}
+    values |= {"budget": row["config"]["budget"], "folder": shlex.quote(near(str(row["folder"])))}
     values |= {"scores": _score_table(kinds, {"kind": "test views"})}
     values |= {"listed": _score_table(images, {"name": "view", "kind": "kind", "time": Column("time", 3)})}
     values |= {"style": Markup((TEMPLATES / "run_page.css").read_text()), "script": Markup(script)}
@@ -316,20 +311,6 @@ def _score_table(rows: Sequence[dict], heads: Mapping[str, Column | str]) -> Tab
 def near(text: str) -> str:
     """Write folders below the current one relative to it, as a page may be passed on."""
     return re.sub(rf"(?<![\w.:/~-]){re.escape(str(Path.cwd()))}/(?=\w)", "", text)
-
-
-def _tiles(row: Row) -> dict[str, str]:
-    """Collect what one wants to know first: name -> value."""
-    clock = ", processor time" if row["config"]["budget"].get("clock") == "processor" else ""
-    tiles = {f"training{clock}": time_text(row["trained"])} if row["stages"] or row["points"] else {}
-    for name, value in row["test"].get(row["ability"], {}).items():
-        metric = metric_of(name)
-        if metric.summary and name != "psnr" and value is not None:
-            tiles[metric.heading] = f"{value:.{metric.digits}f}"
-    tiles |= {"a picture of a new time": f"{1000 * row['frame']:.3g} ms"} if row["frame"] is not None else {}
-    tiles |= {row["consists"][0]: f"{row['consists'][1]:,}"} if row["consists"] else {}
-    tiles |= {"peak memory": f"{row['memory']:.2f} GiB"} if row["memory"] is not None else {}
-    return tiles | ({"device": str(row["device"])} if row["device"] else {})
 
 
 def _effects(row: Row) -> list[dict]:
@@ -358,34 +339,6 @@ def _effects(row: Row) -> list[dict]:
         choice = choice if isinstance(choice, str) and choice != "none" else ""
         effects.append({"name": name.replace("_", " "), "on": on, "choice": choice, "because": near(because)})
     return sorted(effects, key=lambda effect: not effect["on"])
-
-
-def _facts(row: Row) -> dict[str, str]:
-    """Collect how the run was made and measured: name -> value."""
-    protocol, budget = row["metrics"].get("protocol", {}), row["config"]["budget"]
-    bounds = [f"{budget['minutes']:g} min"] if budget.get("minutes") is not None else []
-    bounds += [f"{budget['iterations']} steps"] if budget.get("iterations") is not None else []
-    clock = ", of processor time" if budget.get("clock") == "processor" else ""
-    stages = [f"{name}: {d['steps']} steps in {time_text(d['seconds'])}" for name, d in row["stages"].items()]
-    kinds = [image["ability"] for image in row["images"]]
-    words = {kind: "" if kind == "all" else f" {ABILITIES.get(kind, kind)}" for kind in kinds}
-    resolution, parameters = protocol.get("resolution"), row["metrics"].get("parameters")
-    facts = {
-        "scene": row["scene"] + ", made by a program" * row["counterpart"],
-        "dataset": protocol.get("dataset"),
-    }
-    facts["resolution"] = " x ".join(map(str, resolution)) if isinstance(resolution, list) else ""
-    facts |= {
-        "budget": (" or ".join(bounds) or "none") + clock,
-        "stages": "; ".join(stages),
-        "seed": row["seed"],
-    }
-    facts["test views"] = ", ".join(f"{kinds.count(kind)}{word}" for kind, word in words.items())
-    facts |= {"background": protocol.get("background"), "rendering scored": protocol.get("scored")}
-    facts |= {"departures": row["departures"], "parameters": f"{parameters:,}" if parameters else ""}
-    facts |= {"device": row["device"], "threads": row["threads"]}
-    facts["versions"] = ", ".join(f"{name} {of}" for name, of in protocol.get("versions", {}).items())
-    return {name: str(fact) for name, fact in facts.items() if fact not in (None, "")}
 
 
 class Axis:
@@ -459,13 +412,6 @@ def chart(
     close = [a for _, _, of in placed for a, b, _ in of if mean is not None and -4 < y.at(mean) - b < 20]
     left = sum(a < x.ends[0] + 100 for a in close) <= sum(a > x.ends[1] - 100 for a in close)
     return {"title": title, "says": says, "series": placed, "x": x, "y": y, "mean": mean, "left": left}
-
-
-def _charts(row: Row) -> dict[str, list[dict]]:
-    """Make the charts there are numbers for, by the heading of their section."""
-    found = {"Where it is good, and where not": _of_views(row["images"]) if row["images"] else []}
-    found["How it got there"] = [*_accuracy(row), *_losses(row)]
-    return {heading: charts for heading, charts in found.items() if charts}
 
 
 def _of_views(images: Sequence[dict]) -> list[dict]:
