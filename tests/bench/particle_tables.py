@@ -129,7 +129,7 @@ def plain_times(loop: Loop, size: Size) -> dict[str, float]:
     """
     method, smaller = loop.method, max(1, size.side // SMALLER)
     view, times = camera(size.side, 0.3), (size.side / smaller) ** 2
-    tints, fades = method.over_time(MIDDLE)
+    tints, fades = method.time_bases(MIDDLE)
     particles, warp = (type(p)(*(t.detach() for t in p)) for p in (method.gaussians(), method.warp(MIDDLE)))
     seen = (particles, warp, pinhole_of(view, method.blur), tints, fades)
     little = (*seen[:2], pinhole_of(camera(smaller, 0.3), method.blur), *seen[3:])
@@ -143,10 +143,10 @@ def plain_times(loop: Loop, size: Size) -> dict[str, float]:
         leaves = Gaussians(*(part.clone().requires_grad_() for part in particles))
         numbers = project(leaves, *seen[1:]).values.sum()
         found["chain, back to particles and nodes"] = timed(lambda: numbers.backward(retain_graph=True), FEW)
-        skin = method.skin
-        found["weights of nodes"] = timed(lambda: skin_weights(skin.shares, skin.learned.detach()), FEW)
-        motion, maps = nodes.carried(nodes.curve(MIDDLE))
-        pulled = (motion.detach(), nodes.places, maps.detach(), nodes.edges, nodes.edge_weights, 1.0)
+        skin = method.skinning
+        found["weights of nodes"] = timed(lambda: skin_weights(skin.shares, skin.logits.detach()), FEW)
+        motion, maps = nodes.motion_and_maps(nodes.curve(MIDDLE))
+        pulled = (motion.detach(), nodes.positions, maps.detach(), nodes.edges, nodes.edge_weights, 1.0)
         found["nodes"] = timed(lambda: pull_nodes(*pulled), FEW)
     copies = [torch.nn.Parameter(p.detach().clone()) for p in method.parameters()]
     for copy in copies:

@@ -117,7 +117,7 @@ def run_of(size: Size, steps: int, folder: Path, effects: Sequence[str] = ()) ->
     config = composed(
         "model=particles", "trainer=cpu", "~stage.coarse", "callbacks.pictures=null", f"run={folder}",
         "budget.minutes=null", f"budget.iterations={steps}", f"stage.fine.nodes={nodes}",
-        "stage.fine.first=1.0", "stage.fine.every=1.0", "stage.fine.density=1000",
+        "stage.fine.initial_share=1.0", "stage.fine.density_interval=1.0", "stage.fine.density=1000",
         "stage.fine.crowd_decay=0.0", *effects,  # as hook, which has fewer particles than pixels
     )  # fmt: skip
     run = build_run(config)
@@ -133,15 +133,17 @@ def _made(make: Callable[[Start], Particles], start: Start, size: Size) -> Parti
     cloud = Cloud(particles.means, torch.full_like(particles.means, 0.5), torch.ones(size.particles), apart)
     method = make(replace(start, handover=Handover(BOX, True, TIMES, cloud)))
     if not start.blank:
-        method.log_scales.copy_(particles.log_scales)
-        method.turns.copy_(particles.quaternions)
+        method.scales.copy_(particles.log_scales)
+        method.quaternions.copy_(particles.quaternions)
         method.opacity.copy_(particles.opacity)
-        method.color.copy_(particles.colors[:, :1])
+        method.colors.copy_(particles.colors[:, :1])
         if method.nodes is not None:
             draw = torch.Generator().manual_seed(1)
-            for curves in filter(lambda part: part is not None, (method.nodes.shift, method.nodes.turn)):
+            for curves in filter(
+                lambda part: part is not None, (method.nodes.translations, method.nodes.rotations)
+            ):
                 curves.copy_(0.02 * torch.randn(curves.shape, generator=draw))
-            method.nodes.seen.copy_(torch.tensor([0.0, 1.0]))
+            method.nodes.seen_times.copy_(torch.tensor([0.0, 1.0]))
     return method
 
 

@@ -101,15 +101,16 @@ WARP = {
     "background": BACKGROUND,
 }
 OF_PARTICLES = {
-    "motion": Effect({"motion": "spline"}, ((Nodes, "carried"), (Nodes, "spread_over_time")), ("nodes",)),
-    "rotation": Effect({"rotation": True}, (), ("nodes.turn",)),
-    "view_dependence": Effect({"view_dependence": 1}, (), ("shade",)),
-    "color_over_time": Effect({"color_over_time": 1}, ((Particles, "color_basis"),), ("tint",)),
-    "opacity_over_time": Effect({"opacity_over_time": 1}, ((Particles, "opacity_basis"),), ("fade",)),
-    "background": Effect({"background": 0.03}, (), ("resting", "nodes.still")),
+    "motion": Effect({"motion": "spline"}, ((Nodes, "motion_and_maps"), (Nodes, "backward")), ("nodes",)),
+    "rotation": Effect({"rotation": True}, (), ("nodes.rotations",)),
+    "view_dependence": Effect({"view_dependence": 1}, (), ("sh",)),
+    "color_over_time": Effect({"color_over_time": 1}, ((Particles, "color_basis"),)),
+    "opacity_over_time": Effect({"opacity_over_time": 1}, ((Particles, "opacity_basis"),)),
+    "background": Effect({"background": 0.03}, (), ("resting", "nodes.stopped")),
 }
-RATES = {"means": 1.5e-3, "log_scales": 5e-3, "turns": 3e-3, "opacity": 5e-2, "color": 3e-2, "shade": 1e-3}
-RATES |= {"tint": 1e-3, "fade": 3e-3, "shifts": 7e-3, "node_turns": 8e-3, "skin": 1e-2, "time_offsets": 0.3}
+RATES = {"means": 1.5e-3, "scales": 5e-3, "quaternions": 3e-3, "opacity": 5e-2, "colors": 3e-2, "sh": 1e-3}
+RATES |= {"color_over_time": 1e-3, "opacity_over_time": 3e-3, "skinning": 1e-2, "time_offsets": 0.3}
+RATES |= {"node_translations": 7e-3, "node_rotations": 8e-3}
 SMALL_NETWORK = {"width": 32, "layers": 3, "skip": None, "position_frequencies": 4}
 SMALL_NETWORK |= {"sampling": Sampling(16, 16, density="softplus", open_end=False, inside_box=True)}
 SMALL_WARP = {"warp_width": 24, "warp_layers": 3, "warp_skip": None}
@@ -217,10 +218,8 @@ METHODS = {
         RATES,
         {"photo": 1.0, "rigid": 3.0, "smooth": 0.1},
         {
-            "every": 0.05,
-            "settled": 0.9,
-            "straight": True,
-            "time_offsets": 1.5,
+            "density_interval": 0.05,
+            "density_until": 0.9,
             "lr_final_factor": dict.fromkeys(RATES, 0.1) | {"means": 0.01},
         },
         steps=150,

@@ -90,3 +90,20 @@ def test_the_cache_follows_the_voxels():
     active[2:] = True
     grid.activate(active, {})
     torch.testing.assert_close(moving.flow(grid, 0.9), field().flow(voxels(slice(2, None)), 0.9))
+
+
+def test_curves_of_few_numbers():
+    free, natural = (Curve("spline", 10, 20, 0.0, straight=straight) for straight in (False, True))
+    assert (free.count, natural.count) == (10, 8)
+    torch.testing.assert_close(natural.reach(), free.reach()[1:-1])
+    times = torch.linspace(0, 1, 15)  # far from the ends both are the same
+    torch.testing.assert_close(natural(times)[5:10, 2:6], free(times)[5:10, 3:7])
+    assert Curve("cosines", 10, 20, 0.0, straight=True).count == 10
+    assert Curve("spline", 4, 2, 0.0, straight=True)(0.25).tolist() == pytest.approx([0.75, 0.25])
+    for few in (2, 3, 4):  # as free as there are times
+        curve = Curve("spline", 4, few, 0.0, straight=True)
+        assert torch.linalg.matrix_rank(curve(torch.linspace(0, 1, few))) == few == curve.count
+    with pytest.raises(ValueError, match="model.motion: expected spline, cosines or none, but got 'fourier'"):
+        Curve("fourier", 8, 20, 0.0)
+    with pytest.raises(ValueError, match="at least 2 distinct training times, but got 1"):
+        Curve("spline", 8, 1, 0.0)

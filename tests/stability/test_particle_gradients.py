@@ -17,7 +17,7 @@ from forewarp.methods.particles.model import pinhole_of
 from forewarp.ops.gaussians import Warp, compare, project
 from tests.stability.hard_particles import BEHIND, pixels
 from tests.support.gaussians import crowd, pinhole
-from tests.support.particles import EVERY, module_with, shaken, small_data
+from tests.support.particles import EVERY, FACTORS, module_with, shaken, small_data
 
 pytestmark = pytest.mark.stability
 
@@ -81,21 +81,20 @@ def test_a_picture_compared_by_what_moves_nothing(degree, lens):
 
 
 @pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    return small_data(tmp_path_factory.mktemp("scenes"))
+def data():
+    return small_data()
 
 
-FACTORS = {"photo": 1.0, "rigid": 3.0, "smooth": 0.1}
 # Of which parameters: without view dependence and lens all there are; with either those that move nothing.
-STILL = {"log_scales", "turns", "opacity", "color", "shade", "tint", "fade"}
-MOVING = {"means", "nodes.shift", "nodes.turn", "skin.learned"}
+STILL = {"scales", "quaternions", "opacity", "colors", "sh", "color_over_time", "opacity_over_time"}
+MOVING = {"means", "nodes.translations", "nodes.rotations", "skinning.logits"}
 METHODS = {
-    "splines": ({"view_dependence": None}, {}, STILL - {"shade"} | MOVING),
-    "cosines": ({"view_dependence": None, "motion": "cosines"}, {}, STILL - {"shade"} | MOVING),
+    "splines": ({"view_dependence": None}, {}, STILL - {"sh"} | MOVING),
+    "cosines": ({"view_dependence": None, "motion": "cosines"}, {}, STILL - {"sh"} | MOVING),
     "no rotation": (
         {"view_dependence": None, "rotation": None},
         {},
-        STILL - {"shade"} | MOVING - {"nodes.turn"},
+        STILL - {"sh"} | MOVING - {"nodes.rotations"},
     ),
     "degree 3": ({"view_dependence": 3}, {}, STILL),
     "a lens": ({"view_dependence": 1}, LENS, STILL),
@@ -104,9 +103,10 @@ METHODS = {
 
 def exactly(data, options, lens, monkeypatch):
     """A shaken method in float64, whose camera has a lens or none, and a batch."""
-    module = module_with(data, numbers={"jitter": 0.0, "density": 1.0, "first": 1.0}, **EVERY | options)
+    numbers = {"jitter": 0.0, "density": 1.0, "initial_share": 1.0, "time_offsets": 0}
+    module = module_with(data, numbers=numbers, **EVERY | options)
     method = shaken(module).method.double()
-    method.nodes.seen.copy_(torch.tensor([0.0, 1.0]))  # else the first look continues curves
+    method.nodes.seen_times.copy_(torch.tensor([0.0, 1.0]))  # else the first look continues curves
     monkeypatch.setattr(model, "pinhole_of", lambda camera, blur: replace(pinhole_of(camera, blur), **lens))
     data.picker = lambda: 3
     return method, next(iter(data.train_dataloader())), module.generator
@@ -116,10 +116,8 @@ def exactly(data, options, lens, monkeypatch):
 def test_a_step_of_the_method(data, name, monkeypatch):
     """The loss is that of the step itself, all terms weighted; everything is the plain reference.
 
-    Photo, rigid and smooth reach ``nodes.shift`` and ``nodes.turn``, and the photo term alone the others.
-    With ``shade``, or behind a lens, ``means``, ``nodes.shift``, ``nodes.turn`` and ``skin.learned`` are left
-    out: they move particles, and what that does to directions and to the slopes of a lens is left out of
-    their gradients.
+    With ``sh``, or behind a lens, what moves particles is left out: what that does to directions and to the
+    slopes of a lens is left out of their gradients.
     """
     options, lens, names = METHODS[name]
     method, batch, generator = exactly(data, options, lens, monkeypatch)
@@ -131,7 +129,9 @@ def test_a_step_of_the_method(data, name, monkeypatch):
     gradients = method.look(batch, FACTORS, generator).gradients
     parameters = dict(method.named_parameters())
     assert gradients.keys() == parameters.keys()
-    assert names == (parameters.keys() if names >= MOVING - {"nodes.turn"} else parameters.keys() - MOVING)
+    assert names == (
+        parameters.keys() if names >= MOVING - {"nodes.rotations"} else parameters.keys() - MOVING
+    )
     for which in sorted(names):
         draw = torch.Generator().manual_seed(1)
         value, gradient = parameters[which].data, gradients[which]

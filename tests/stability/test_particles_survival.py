@@ -16,8 +16,13 @@ STEPS = 24  # of a stage
 SMALL = [
     *("data=dnerf", "data.scene=vehicle", "data.half_resolution=false", "data.held_out=1"),
     *("model=particles", "preset=demo", "budget.minutes=null", f"budget.iterations={2 * STEPS}"),
-    *("stage.coarse.share=0.5", "stage.fine.share=0.5", "stage.fine.every=0.1", "stage.fine.relink=2"),
-    *("model/opacity_over_time=cosines", "model/background=still", "stage.fine.rest=0.2"),
+    *(
+        "stage.coarse.share=0.5",
+        "stage.fine.share=0.5",
+        "stage.fine.density_interval=0.1",
+        "stage.fine.relink=2",
+    ),
+    *("model/opacity_over_time=cosines", "model/background=still", "stage.fine.rest_from=0.2"),
     *("callbacks.pictures=null", "callbacks.accuracy.first=0.05", "callbacks.accuracy.rays=50"),
     *("checkpoint_seconds=0", "sheets=1", "logger=none", "trainer=cpu", "threads=1"),
 ]

@@ -4,19 +4,24 @@ from functools import partial
 
 import torch
 
+from forewarp.data.module import SceneDataModule
 from forewarp.methods.particles.model import Particles
+from forewarp.methods.particles.options import NAMES
 from tests.contract.fitting import module_of
-from tests.contract.scenes import data_of, write_dnerf
 from tests.contract.table import METHODS
+from tests.support.tiny_scene import ball_scene
 
-MOVING = {"motion": "spline", "rotation": True, "view_dependence": 1}
+BARE = dict.fromkeys(NAMES)  # no effect at all
+MOVING = BARE | {"motion": "spline", "rotation": True, "view_dependence": 1}
 EVERY = MOVING | {"color_over_time": 2, "opacity_over_time": 2, "background": 0.03}
+FACTORS = {"photo": 1.0, "rigid": 3.0, "smooth": 0.1}
 
 
-def small_data(folder):
-    """The data of a small scene with a moving ball, written into a folder."""
-    write_dnerf(folder / "dnerf")
-    return data_of("dnerf", folder)
+def small_data(frames=6):
+    """The data of a scene of some small images of a moving ball."""
+    data = SceneDataModule(lambda: ball_scene(frames=frames, size=20), rays=1)
+    data.setup("fit")
+    return data
 
 
 def module_with(data, **changes):
@@ -31,15 +36,13 @@ def shaken(module):
     method, generator = module.method, torch.Generator().manual_seed(0)
     for p in method.parameters():
         p.data += 0.1 * torch.randn(p.shape, generator=generator)
-    if method.skin is not None:
-        method.skin.let_go(torch.arange(len(method.means)) % 3 == 0)
+    if method.skinning is not None:
+        method.skinning.release(torch.arange(len(method.means)) % 3 == 0)
     return module
 
 
-def look(module, data, index=None, factors=None):
-    """What a module's next step gives, of the training picture ``index``."""
+def look(module, data, index=None, factors=FACTORS):
+    """What a module's next step gives, of the training image ``index``."""
     if index is not None:
         data.picker = lambda: index
-    batch = next(iter(data.train_dataloader()))
-    factors = {"photo": 1.0, "rigid": 3.0, "smooth": 0.1} if factors is None else factors
-    return module.method.look(batch, factors, module.generator)
+    return module.method.look(next(iter(data.train_dataloader())), factors, module.generator)

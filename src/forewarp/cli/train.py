@@ -25,7 +25,7 @@ What one types most (options such as --multirun or --config-dir=FOLDER come firs
   model=ndvg|tineuvox_s|tineuvox_b    voxel grids with networks, as in their papers with preset=faithful
   model=neural_volumes                a volume decoded from pictures of the instant
   model/view_dependence=none|harmonics     switch an effect; all others work alike (of forward: none|sh|mlp)
-  stage.NAME.lr.GROUP=RATE            a learning rate; groups: means, color, shifts, ... (see --cfg job)
+  stage.NAME.lr.GROUP=RATE            a learning rate; groups: means, scales, colors, ... (see --cfg job)
   seed=N                              of all random numbers
   trainer=cpu|gpu|auto                the device
   resume=FOLDER                       go on with the run in a folder; no other override is needed

@@ -1,115 +1,212 @@
+"""Particles split and go, their opacity is bounded and decays, and what does not move comes to rest."""
+
 import math
 
+import pytest
 import torch
-from torch import nn
 
-from forewarp.methods.particles.density import renew, too_near
-from forewarp.methods.rows import RowsAdam
+from forewarp.methods.particles import density
+from forewarp.methods.particles.density import _product, _quaternions, come_to_rest, renew, too_near
+from forewarp.methods.rows import take_rows
+from forewarp.ops.gaussians import moved, rotations
+from tests.support.particles import BARE, EVERY, look, module_with, small_data
 
-
-class Few(nn.Module):
-    """Particles with what density control reads."""
-
-    grows = ("means", "log_scales", "turns", "opacity", "pulled", "shown", "idle")
-
-    def __init__(self, count=10):
-        super().__init__()
-        generator = torch.Generator().manual_seed(0)
-        self.means = nn.Parameter(torch.randn(count, 3, generator=generator))
-        self.log_scales = nn.Parameter(torch.full((count, 3), -3.0))
-        self.turns = nn.Parameter(torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1))
-        self.opacity = nn.Parameter(torch.zeros(count, 1))
-        for name in ("pulled", "idle"):
-            self.register_buffer(name, torch.zeros(count))
-        self.register_buffer("shown", torch.ones(count))
-
-    fade = None
+DATA = small_data()
+SOME = torch.tensor([0, 1, 3, 4, 5, 6, 8, 9])
 
 
-def optimizer_of(method):
-    groups = [{"params": [p], "lr": 1e-3, "name": n} for n, p in method.named_parameters()]
-    optimizer = RowsAdam(groups)
+def few(**options):
+    """Ten particles of length 0.05 that one image has shown, and their optimiser after a step."""
+    module = module_with(DATA, **BARE | options)
+    method, optimizer = module.method, module.configure_optimizers()
+    take_rows(method, optimizer, torch.arange(10))
     for p in method.parameters():
         p.grad = torch.ones_like(p)
     optimizer.step()
-    return optimizer
+    method.quaternions.data[:] = torch.tensor([1.0, 0, 0, 0])
+    method.scales.data.fill_(-3.0)
+    method.opacity.data.zero_()
+    method.extent.fill_(1.0)
+    method.image_count.fill_(1)
+    return method, optimizer
 
 
 def test_what_is_pulled_most_is_split_along_its_longest_axis():
-    few = Few()
-    optimizer = optimizer_of(few)
-    few.log_scales.data[3, 1] = -1.0
-    few.pulled[3], few.pulled[5] = 7.0, 3.0
-    before, place = few.log_scales[3].clone(), few.means[3].clone()
-    renew(few, optimizer, 11, unseen=False, extent=1.0)
-    assert len(few.means) == 11
-    length = before[1].exp()
-    apart = torch.tensor([0.0, 0.6, 0.0]) * length
-    torch.testing.assert_close(few.means[3], place - apart, atol=1e-3, rtol=0)
-    torch.testing.assert_close(few.means[10], place + apart, atol=1e-3, rtol=0)
+    method, optimizer = few()
+    method.scales.data[3, 1] = -1.0
+    method.gradient_sum[3], method.gradient_sum[5] = 7.0, 3.0
+    before, mean = method.scales[3].clone(), method.means[3].clone()
+    renew(method, 11, optimizer)
+    apart = torch.tensor([0.0, 0.6, 0.0]) * before[1].exp()
+    torch.testing.assert_close(method.means[[3, 10]], torch.stack([mean - apart, mean + apart]))
     shorter = before + torch.tensor([0.0, 1.0, 0.0]) * torch.tensor(0.6).log()
-    for row in (3, 10):
-        torch.testing.assert_close(few.log_scales[row], shorter)
-    steps = optimizer.state[few.means]["steps"]
+    torch.testing.assert_close(method.scales[[3, 10]], shorter.expand(2, 3))
+    steps = optimizer.state[method.means]["steps"]
     assert steps.tolist() == [1.0] * 10 + [0.0]  # the new half begins afresh
-    assert not bool(few.pulled.any())
-    assert len(few.idle) == 11
+    assert len(method.unseen_rounds) == 11
+    assert not bool(method.gradient_sum.any())
+    take_rows(method, optimizer, torch.arange(100) % 11)
+    method.gradient_sum.copy_(torch.arange(100.0))
+    renew(method, 1000, optimizer)
+    assert len(method.means) == 111  # at most a tenth and one are split at once
 
 
-def test_what_has_faded_or_is_too_large_goes():
-    few = Few()
-    optimizer = optimizer_of(few)
-    few.opacity.data[2], few.log_scales.data[4, 0] = -5.0, 2.0
-    kept = few.means[[0, 1, 3, 5, 6, 7, 8, 9]].clone()
-    renew(few, optimizer, 8, unseen=False, extent=1.0)
-    torch.testing.assert_close(few.means.data, kept)
+def test_what_has_faded_is_too_large_or_stood_too_near_to_a_camera_goes():
+    method, optimizer = few()
+    method.opacity.data[2], method.scales.data[7, 0] = -5.0, 2.0
+    kept = method.means[SOME].clone()
+    renew(method, 8, optimizer)
+    torch.testing.assert_close(method.means.data, kept)
+    method.image_count.fill_(1)
+    method.unseen_rounds[1] = math.inf
+    method.gradient_sum[1], method.gradient_sum[2] = 9.0, 1.0  # it is not split, though it is pulled most
+    renew(method, 8, optimizer)
+    torch.testing.assert_close(method.means[:7].data, kept[[0, 2, 3, 4, 5, 6, 7]], atol=0.05, rtol=0)
+    assert (len(method.means), bool(method.unseen_rounds.any())) == (8, False)
+    method.opacity.data.fill_(-9.0)
+    renew(method, 10, optimizer)
+    assert len(method.means) == 8  # all that there is does not vanish
 
 
-def test_what_stood_too_near_to_a_camera_goes_though_it_was_seen():
-    few = Few()
-    optimizer = optimizer_of(few)
-    few.idle[7] = math.inf
-    few.pulled[7], few.pulled[2] = 9.0, 1.0  # it is not split, though it is pulled most
-    kept = few.means[[0, 1, 3, 4, 5, 6, 8, 9]].clone()
-    renew(few, optimizer, 10, unseen=False, extent=1.0)
-    torch.testing.assert_close(few.means.data[[0, 1, 3, 4, 5, 6, 7, 8]], kept)
-    assert len(few.means) == 10
-    assert not bool(few.idle.any())
+@pytest.mark.parametrize(("last", "left"), [(1.0, 9), (0.5, 10)])
+def test_what_is_never_seen_goes_after_some_rounds_once_all_times_are_in_play(last, left):
+    method, optimizer = few(motion="spline")
+    method.nodes.seen_times.copy_(torch.tensor([0.0, last]))
+    for _ in range(5):
+        method.image_count.fill_(1)
+        method.image_count[6] = 0
+        renew(method, 10, optimizer)
+    assert len(method.means) == left
+
+
+def test_what_appears_later_is_not_thrown_away():
+    method, optimizer = few(opacity_over_time=2)
+    method.opacity.data.fill_(-20.0)
+    method.opacity_over_time.data.zero_()[:3, 0] = -15.0  # the first cosine falls from 0 to -2
+    renew(method, 3, optimizer)
+    assert len(method.means) == 3
 
 
 def test_few_that_stand_before_all_others_are_too_near_and_many_are_not():
     order, far = torch.arange(200).flip(0), torch.linspace(2.0, 3.0, 200)
     assert not len(too_near(order, far))
-    for few, gone in ((1, 1), (4, 4), (6, 0)):
-        distances = torch.cat([torch.full((few,), 0.5), far[few:]]).flip(0)  # of each row, not in that order
+    for count, gone in ((1, 1), (4, 4), (6, 0)):
+        distances = torch.cat([torch.full((count,), 0.5), far[count:]]).flip(0)  # of each row
         assert too_near(order, distances).tolist() == order[:gone].tolist()
     assert not len(too_near(order[:0], far[:0]))
     lone = torch.tensor([0.1, 2.0, 2.5])
     assert not len(too_near(torch.arange(3), lone))  # of so few it may be the scene itself
 
 
-def test_what_is_never_seen_goes_after_some_rounds_and_only_where_all_is_in_play():
-    for unseen, left in ((True, 9), (False, 10)):
-        few = Few()
-        optimizer = optimizer_of(few)
-        for _ in range(5):
-            few.shown.fill_(1)
-            few.shown[6] = 0
-            renew(few, optimizer, 10, unseen=unseen, extent=1.0)
-        assert len(few.means) == left
+def test_opacity_is_bounded_at_all_times_so_that_it_can_still_fade():
+    method, optimizer = few(opacity_over_time=3)
+    logits = method.opacity.data
+    logits[:5, 0] = torch.tensor([20.0, 5.0, -8.0, 6.0, 7.0])
+    method.opacity_over_time.data.zero_()
+    method.opacity_over_time.data[1:3, 0] = -9.0  # the first cosine falls from 0 to -2
+    method.opacity_over_time.data[3, 0] = 2.0
+    method.advance(0.999, 0, optimizer)
+    assert logits[:6, 0].tolist() == pytest.approx([6.0, -12.0, -12.0, 6.0, 6.0, 0.0])
+    bases = torch.stack([method.time_bases(i / 64)[1] for i in range(65)])
+    assert float((method.gaussians().opacity.detach() @ bases.T).amax()) == pytest.approx(6.0, abs=1e-4)
 
 
-def test_all_that_there_is_does_not_vanish():
-    few = Few()
-    optimizer = optimizer_of(few)
-    few.opacity.data.fill_(-9.0)
-    renew(few, optimizer, 10, unseen=False, extent=1.0)
-    assert len(few.means) == 10
+@pytest.mark.parametrize("share", [0.0, 1e-3, 0.2])
+def test_a_step_takes_opacity_of_what_its_image_shows_as_the_rate_falls(share):
+    module = module_with(DATA, numbers={"opacity_decay": share, "crowd_decay": 0.0, "density_until": 0.0})
+    method, optimizer = module.method, module.configure_optimizers()
+    (group,) = (group for group in optimizer.param_groups if group["name"] == "opacity")
+    method.means.data[:3] = 90.0  # beside every image
+    method.opacity.data[:, 0] = torch.linspace(-8, 6, len(method.opacity))
+    for factor in (1.0, 0.25, 0.0):
+        group["lr"] = factor * group["base_lr"]
+        method.opacity.grad, before = None, method.opacity.data.clone()
+        method.advance(0.5, 0, optimizer)
+        look(module, DATA)
+        optimizer.step()  # without gradients, as of a step that is dropped
+        assert torch.equal(method.opacity.data, before)
+        method.image_count.zero_()
+        look(module, DATA)
+        method.opacity.grad = torch.zeros_like(method.opacity)
+        optimizer.step()
+        expected = torch.where(method.image_count[:, None] > 0, 1 - factor * share, 1.0).double()
+        assert 0 < int(method.image_count.sum()) < len(expected) - 3
+        left = method.opacity.data.double().sigmoid() / before.double().sigmoid()
+        torch.testing.assert_close(left, expected, rtol=1e-5, atol=0)
+    group["base_lr"] = group["lr"] = 0.0  # what does not learn does not decay
+    method.advance(0.5, 0, optimizer)
+    assert method.decay == 0
 
 
-def test_at_most_a_tenth_is_split_at_once():
-    few = Few(100)
-    optimizer = optimizer_of(few)
-    few.pulled.copy_(torch.arange(100.0))
-    renew(few, optimizer, 1000, unseen=False, extent=1.0)
-    assert len(few.means) == 111
+@pytest.fixture
+def half():
+    """Particles whose nodes on one side of the scene move, while all others stand aside, turned."""
+    numbers = {"rest_from": 0.1, "relink": 1, "density_interval": 0.1}
+    module = module_with(DATA, **EVERY | {"background": 0.01}, numbers=numbers)
+    nodes = module.method.nodes
+    nodes.seen_times.copy_(torch.tensor([0.0, 1.0]))
+    nodes.translations.data.fill_(0.05)
+    nodes.rotations.data[..., 2] = 0.02
+    moves = nodes.positions[:, 0] > nodes.positions[:, 0].median()
+    nodes.translations.data[moves] += torch.linspace(0, 1, nodes.curve.count)[:, None]
+    return module, moves
+
+
+def placed(method, time):
+    means, linear = moved(method.means.data, method.warp(time))
+    return means.detach(), linear.detach() @ rotations(method.quaternions.data)
+
+
+def test_what_does_not_move_rests_where_it_was_and_as_it_was_turned(half):
+    method, moves = half[0].method, half[1]
+    follows, (before, turned) = method.skinning.weights() > 1e-3, placed(method, 0.5)
+    assert method.at_rest() == 0
+    come_to_rest(method, 0.01)
+    rests = method.resting
+    assert torch.equal(method.nodes.stopped, ~moves)
+    assert 0 < int(rests.sum()) < len(rests)
+    assert torch.equal(rests, (method.nodes.stopped[method.skinning.links.long()] | ~follows).all(-1))
+    assert method.at_rest() == pytest.approx(float((method.skinning.shares == 0).all(-1).float().mean()))
+    after, linear = placed(method, 0.5)
+    torch.testing.assert_close(after[rests], before[rests], atol=1e-4, rtol=0)
+    torch.testing.assert_close(linear[rests], turned[rests], atol=1e-3, rtol=0)
+    ends = [placed(method, time)[0] for time in (0.0, 1.0)]
+    assert torch.equal(ends[0][rests], ends[1][rests])
+    assert float((ends[1] - ends[0])[~rests].norm(dim=-1).max()) > 0.3
+
+
+def test_what_rests_keeps_resting_through_steps_and_density_control(half):
+    module, moves = half
+    method, optimizer = module.method, module.configure_optimizers()
+    come_to_rest(method, 0.01)
+    kept = method.nodes.translations.data[~moves].clone()
+    for number in range(1, 4):
+        step = look(module, DATA)
+        for name, p in method.named_parameters():
+            p.grad = step.gradients[name]
+        optimizer.step()
+        method.advance(0.1 * number + 0.05, number, optimizer)
+    assert torch.equal(method.nodes.translations.data[~moves], kept)
+    assert len(method.resting) == len(method.means)
+    assert int(method.skinning.shares[method.resting].count_nonzero()) == 0
+    assert bool(method.resting.any())
+
+
+@pytest.mark.parametrize(("covered", "least"), [(1e6, 0.02), (100.0, 0.5013)])
+def test_what_moves_no_farther_than_a_pixel_from_its_mean_position_may_rest(
+    half, monkeypatch, covered, least
+):
+    asked = []
+    monkeypatch.setattr(density, "come_to_rest", lambda _, least: asked.append(least))
+    method, optimizer = half[0].method, half[0].configure_optimizers()
+    method.covered_pixels.fill_(covered)
+    method.extent.fill_(2.0)
+    method.advance(0.5, 1, optimizer)
+    assert asked == [pytest.approx(least, abs=1e-4)]
+
+
+def test_quaternions_multiply_as_their_rotations_do():
+    a, b = torch.randn(2, 5, 4, generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(rotations(_product(a, b)), rotations(a) @ rotations(b))
+    a[:, 0] = a[:, 0].abs() + 0.5
+    torch.testing.assert_close(rotations(_quaternions(rotations(a))), rotations(a), atol=1e-5, rtol=0)

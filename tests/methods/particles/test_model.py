@@ -1,41 +1,48 @@
+"""A step of particles, their effects and rates, on every device and without kernels."""
+
+import math
+import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
 
 from forewarp.methods.effect import switched
 from forewarp.methods.method import Start
-from forewarp.methods.particles import density, model
+from forewarp.methods.particles import model
 from forewarp.methods.particles.model import Particles
-from forewarp.methods.particles.options import Numbers
 from forewarp.methods.particles.start import widths
-from forewarp.ops.gaussians import moved
+from forewarp.ops import backend
 from forewarp.scene.view import Moment, View
+from forewarp.training.objective import set_gradients
+from tests.contract.fitting import Losses, run_of, stage_of
 from tests.contract.scenes import data_of, write_hypernerf
-from tests.support.kernels import watch
-from tests.support.particles import EVERY, MOVING, look, module_with
+from tests.contract.table import METHODS
+from tests.stability.twin import BACKENDS, implementation
+from tests.support.elsewhere import GPU, Elsewhere
+from tests.support.particles import BARE, EVERY, FACTORS, look, module_with, shaken, small_data
+
+DATA = small_data()
 
 
 @pytest.mark.parametrize(
     "options", [{}, EVERY | {"view_dependence": 2}, {"rotation": None}, {"view_dependence": None}]
 )
-def test_gradients_are_those_of_autograd(data, options):
-    """What a step gives by itself, against the picture's graph; without jitter both see the same time."""
-    module = module_with(data, numbers={"jitter": 0.0}, **options)
-    method = module.method
-    generator = torch.Generator().manual_seed(0)
+def test_gradients_are_those_of_autograd(options):
+    """What a step gives by itself, against the image's graph; without jitter both see the same time."""
+    module = module_with(DATA, numbers={"jitter": 0.0}, **options)
+    method, generator = module.method, torch.Generator().manual_seed(0)
     for name, p in method.named_parameters():
-        if name != "means":  # round particles have no turn
+        if name != "means":  # round particles have no rotation
             p.data += 0.1 * torch.randn(p.shape, generator=generator)
-    method.nodes.seen.copy_(torch.tensor([0.0, 1.0]))
-    data.picker = lambda: 3
-    batch = next(iter(data.train_dataloader()))
-    step = method.look(batch, {"photo": 1.0}, module.generator)
-    seen = batch.observations[0]
+    method.nodes.seen_times.copy_(torch.tensor([0.0, 1.0]))
+    step = look(module, DATA, 3, {"photo": 1.0})
+    seen = next(iter(DATA.train_dataloader())).observations[0]
     drawn = method.at(seen.moment).render(View(seen.view.camera), seen.background)
     straight = seen.rgb.float() / 255
     truth = torch.lerp(seen.background.expand(len(straight), 3), straight[:, :3], straight[:, 3:])
-    loss = ((drawn.rgb - truth).square() + 0.05**2).sqrt().sub(0.05).sum() / method.covered
+    loss = ((drawn.rgb - truth).square() + 0.05**2).sqrt().sub(0.05).sum() / method.covered_pixels
     loss.backward()
     assert float(step.terms["photo"]()) == pytest.approx(float(loss.detach()), rel=1e-3)
     for name, p in method.named_parameters():
@@ -43,286 +50,202 @@ def test_gradients_are_those_of_autograd(data, options):
         assert error < 2e-3, name
 
 
-@pytest.mark.slow
-def test_particles_of_opaque_pictures_begin_no_larger_than_they_are_apart_there(data, tmp_path):
-    write_hypernerf(tmp_path / "hypernerf")
-    opaque = data_of("hypernerf", tmp_path)
-    for scene, limited in ((opaque.scene, True), (replace(opaque.scene, has_alpha=True), False)):
-        opaque.scene = scene
-        method = module_with(opaque).method
-        widest = widths(scene, method.means.data, float(method.covered))
-        larger = method.log_scales.data.exp()[:, 0] > 1.001 * widest
-        assert bool(larger.any()) != limited
-
-
-def test_with_all_effects_off_there_are_bare_particles(data):
-    method = module_with(data, **dict.fromkeys(MOVING)).method
-    assert not method.moves
-    assert set(dict(method.named_parameters())) == {"means", "log_scales", "turns", "opacity", "color"}
-    assert not set(dict(method.named_buffers())) & {"skin.links", "skin.shares"}
-    assert set(method.param_groups()) == set(dict(method.named_parameters()))
-    assert set(switched(method).values()) == {False}
-
-
-@pytest.mark.parametrize("effect", EVERY)
-def test_an_effect_that_is_off_is_absent_and_the_others_are_there(data, effect):
-    method = module_with(data, **EVERY | {effect: None}).method
-    gone = {effect} | ({"rotation", "background"} if effect == "motion" else set())
-    assert {name for name, on in switched(method).items() if not on} == gone
-
-
-def test_operators_get_nothing_of_what_is_off(data, monkeypatch):
-    seen = {}
-
-    def spied(name):
-        kept = getattr(model, name)
-
-        def spy(*given, **named):
-            seen[name] = given
-            return kept(*given, **named)
-
-        monkeypatch.setattr(model, name, spy)
-
-    spied("compare")
-    look(module_with(data, **dict.fromkeys(MOVING)), data)
-    particles, warp, _, tints, fades, *_ = seen["compare"]
-    assert particles.colors.shape[1] == particles.opacity.shape[1] == warp.links.shape[1] == 1
-    assert (len(tints), fades.tolist(), int(warp.weights.count_nonzero())) == (0, [1.0], 0)
-    look(module_with(data, **EVERY), data)
-    particles, warp, _, tints, fades, *_ = seen["compare"]
-    assert (particles.colors.shape[1], particles.opacity.shape[1], warp.links.shape[1]) == (6, 3, 6)
-    assert (len(tints), len(fades)) == (2, 3)
-
-
-def test_a_stage_uses_the_effects_that_it_names(data):
-    module = module_with(data, **EVERY, numbers={"effects": ["rotation", "color_over_time"]})
-    on = {name for name, is_on in switched(module.method).items() if is_on}
-    assert on == {"color_over_time"}  # nothing turns that does not move
-
-
-def test_what_appears_later_is_not_thrown_away(data):
-    module = module_with(data, **EVERY, numbers={"every": 0.1})
-    method, optimizer = module.method, module.configure_optimizers()
-    method.opacity.data.fill_(-20.0)
-    method.fade.data[:3, 0] = -15.0  # the first cosine falls from 0 to -2
-    assert (density.most_opaque(method) > 0).nonzero()[:, 0].tolist() == [0, 1, 2]
-    method.advance(0.15, 1, optimizer)
-    assert len(method.means) == 3
-
-
-def test_without_motion_its_terms_are_none(data):
-    step = look(module_with(data, motion=None), data)
-    assert step.terms["rigid"]() is None
-    assert step.terms["smooth"]() is None
-
-
-@pytest.mark.parametrize("motion", ["spline", "cosines"])
-def test_points_go_with_the_particles_beside_them(data, motion):
-    method = module_with(data, motion=motion).method
-    generator = torch.Generator().manual_seed(0)
-    for p in method.nodes.parameters():
-        p.data += 0.05 * torch.randn(p.shape, generator=generator)
-    method.skin.learned.data += torch.randn(method.skin.learned.shape, generator=generator)
-    times = torch.tensor([method.canonical_time, 0.7])
-    place, later = (moved(method.means.data, method.warp(float(time)))[0] for time in times)
-    paths = method.trajectories(place[:20], times)
-    torch.testing.assert_close(paths[:, 0], place[:20])
-    torch.testing.assert_close(paths[:, 1], later[:20], atol=2e-3, rtol=0)  # others are near, too
-    assert float((paths[:, 1] - paths[:, 0]).norm(dim=-1).amin()) > 0.01
-    beside = place[:20] + 0.1 * torch.randn(20, 3, generator=generator)
-    torch.testing.assert_close(method.trajectories(beside, times[:1])[:, 0], beside)
-
-
-def test_a_snapshot_holds_its_time(data):
-    snapshot = module_with(data).method.at(Moment(0.5, 2, 0))
-    assert snapshot.holds(Moment(0.5))
-    assert not snapshot.holds(Moment(0.51))
-
-
-def test_rates_of_lengths_are_of_the_scenes_extent(data):
-    module = module_with(data)
-    optimizer = module.configure_optimizers()
-    extent, before = float(module.method.extent), {g["name"]: g["lr"] for g in optimizer.param_groups}
-    module.method.advance(0.5, 0, optimizer)
-    changed = {g["name"]: g["lr"] / before[g["name"]] for g in optimizer.param_groups}
-    assert {name: factor for name, factor in changed.items() if factor != 1} == pytest.approx(
-        {"means": extent, "shifts": extent, "skin": len(data.scene.train) / 100}
-    )
-
-
-def test_what_stands_right_before_a_camera_is_to_go(data):
-    module = module_with(data)
-    method, camera = module.method, data.scene.train[0].camera
-    ahead = camera.rays(torch.tensor([camera.height // 2 * camera.width + camera.width // 2])).directions[0]
-    method.means.data[5] = camera.center + 0.1 * ahead * (method.means.data[5] - camera.center).norm()
-    data.picker = lambda: 0
-    method.look(next(iter(data.train_dataloader())), {"photo": 1.0}, module.generator)
-    assert method.idle.isinf().nonzero().flatten().tolist() == [5]
-
-
-def test_what_is_opaque_can_still_fade(data):
-    module = module_with(data)
-    method, optimizer = module.method, module.configure_optimizers()
-    method.opacity.data.fill_(20.0)  # 1 in float32, without a slope
-    method.advance(0.5, 0, optimizer)
-    assert method.opacity.sigmoid().min() > 0.997
-    gradient = look(module, data).gradients["opacity"]
-    assert (gradient[method.shown > 0] != 0).float().mean() > 0.9
-
-
-def test_what_is_opaque_at_some_time_can_still_fade(data):
-    module = module_with(data, opacity_over_time=3)
-    method, optimizer = module.method, module.configure_optimizers()
-    solid = method.opacity.data
-    solid[:4, 0] = torch.tensor([20.0, 5.0, -8.0, 6.0])
-    before = solid.clone()
-    method.fade.data[1:3, 0] = -9.0  # the first cosine falls from 0 to -2
-    method.fade.data[3:, 0] = 2.0
-    method.advance(0.5, 0, optimizer)
-    assert solid[:4, 0].tolist() == pytest.approx([6.0, -12.0, -12.0, 6.0])
-    assert torch.equal(solid[4:], before[4:])
-    fades = torch.stack([method.over_time(i / 64)[1] for i in range(65)])
-    logits = method.gaussians().opacity.detach() @ fades.T
-    assert float(logits.amax()) == pytest.approx(6.0, abs=1e-4)
-
-
-def test_without_opacity_over_time_only_what_is_too_opaque_changes(data):
-    module = module_with(data)
-    solid, optimizer = module.method.opacity.data, module.configure_optimizers()
-    solid[:, 0] = torch.linspace(-20, 20, len(solid))
-    before = solid.clone()
-    module.method.advance(0.5, 0, optimizer)
-    assert torch.equal(solid, before.clamp(max=6.0))
-
-
-@pytest.mark.parametrize("share", [0.0, 1e-3, 0.2])
-def test_a_picture_takes_opacity_of_what_it_shows_as_the_rate_falls(data, share):
-    module = module_with(data, numbers={"opacity_decay": share, "settled": 0.0})
-    method, optimizer = module.method, module.configure_optimizers()
-    (group,) = (group for group in optimizer.param_groups if group["name"] == "opacity")
-    method.means.data[:3] = 90.0  # beside every picture
-    method.opacity.data[:, 0] = torch.linspace(-8, 6, len(method.opacity))
-    for factor in (1.0, 0.25, 0.0):
-        group["lr"] = factor * group["base_lr"]
-        before = method.opacity.data.clone()
-        method.advance(0.5, 0, optimizer)
-        method.shown.zero_()
-        look(module, data)
-        assert torch.equal(method.opacity.data, before)  # a step that is dropped changes nothing
-        method.opacity.grad = torch.zeros_like(method.opacity)
-        optimizer.step()
-        wanted = torch.where(method.shown[:, None] > 0, 1 - factor * share, 1.0).double()
-        assert 0 < int(method.shown.sum()) < len(wanted) - 3
-        left = method.opacity.data.double().sigmoid() / before.double().sigmoid()
-        torch.testing.assert_close(left, wanted, rtol=1e-5, atol=0)
-        assert torch.equal(method.opacity.data, before) == (factor * share == 0)
-    group["base_lr"] = group["lr"] = 0.0  # what does not learn does not decay
-    method.advance(0.5, 0, optimizer)
-    look(module, data)
-    optimizer.step()
-    assert torch.equal(method.opacity.data, before)
-
-
-def test_a_dropped_step_takes_no_opacity(data):
-    module = module_with(data, numbers={"opacity_decay": 0.1})
-    method, optimizer = module.method, module.configure_optimizers()
-    method.advance(0.5, 0, optimizer)
-    before = method.opacity.data.clone()
-    look(module, data)
-    optimizer.step()  # no gradients
-    method.opacity.grad = torch.zeros_like(method.opacity)
-    optimizer.step()  # nor is it made up for
-    assert torch.equal(method.opacity.data, before)
-
-
-def test_what_is_crowded_decays(data):
-    module = module_with(data, numbers={"opacity_decay": 0.1, "crowd_decay": 0.5, "density": 400.0})
-    method, optimizer = module.method, module.configure_optimizers()
-    most = float(method.most)
-    assert most > 2 * float(method.covered)
-    for covered, wanted in ((most / 4, 1 - 0.9 * (1 - 0.375)), (most, 0.1), (2 * most, 0.1), (0.0, 0.55)):
-        method.covered.fill_(covered)
-        method.advance(0.5, 0, optimizer)
-        assert method.decay == pytest.approx(wanted)
-
-
-def test_particles_grow_to_what_the_pictures_call_for(data):
-    numbers = {"every": 0.1, "first": 0.5, "settled": 1.0, "density": 400.0}  # some hundreds, of 6 pictures
-    module = module_with(data, numbers=numbers)
-    method, optimizer = module.method, module.configure_optimizers()
-    assert len(method.means) == round(0.5 * float(method.most))
-    for number in range(1, 10):
-        look(module, data)
-        method.advance(number / 10, number, optimizer)
-    assert len(method.means) == pytest.approx(float(method.most), rel=0.05)
-    assert len(method.skin.links) == len(method.pulled) == len(method.means)
-
-
-@pytest.mark.parametrize(
-    ("changes", "text"),
-    [
-        ({"view_dependence": 4}, "model.view_dependence: expected a degree of 1 to 3, or null, but got 4"),
-        (
-            {"color_over_time": 0},
-            "model.color_over_time: expected a number of cosines >= 1, or null, but got 0",
-        ),
-        (
-            {"rotation": False},
-            "model.rotation: expected true, or null, but got False; choose model/rotation=none",
-        ),
-        ({"motion": "wobble"}, "model.motion: expected spline or cosines, or null, but got 'wobble'"),
-        (
-            {"numbers": {"effects": ["glow"]}},
-            r"stage.fine.effects: expected some of motion, .*, but got \['glow'\]",
-        ),
-        ({"numbers": {"first": 0.0}}, r"stage.fine.first: expected a number in \(0, 1\], but got 0.0"),
-        ({"numbers": {"density": -1.0}}, "stage.fine.density: expected a number > 0, but got -1.0"),
-        ({"numbers": {"edges": 0}}, "stage.fine.edges: expected a whole number >= 1, but got 0"),
-        ({"numbers": {"jitter": "some"}}, "stage.fine.jitter: expected a number >= 0, but got 'some'"),
-    ],
-)
-def test_refused(data, changes, text):
-    with pytest.raises(ValueError, match=text):
-        module_with(data, **changes)
-
-
-def test_numbers_follow_the_pictures():
-    numbers = Numbers()
-    assert numbers.most(4.0, 100) == numbers.most(4.0, 200) == 180
-    assert numbers.most(4.0, 25) == 90  # fewer pictures tell less
-    assert numbers.share_at(0.0) == 0.5
-    assert numbers.share_at(1.0) == 1.0
-    assert numbers.motion(100, 2)[1] == 4
-    assert numbers.motion(20_000, 200)[0] > numbers.motion(5_000, 200)[0]
-
-
-def test_two_views_of_a_time_count_as_one_step(data):
-    module = module_with(data, numbers={"jitter": 0.0})
-    data.picker = lambda: 2
-    batch = next(iter(data.train_dataloader()))
+def test_two_views_of_a_time_count_as_one_step():
+    module = module_with(DATA, numbers={"jitter": 0.0})
+    batch = next(iter(DATA.train_dataloader()))
     twice = type(batch)(batch.observations * 2, batch.frame)
     one, two = (module.method.look(b, {"photo": 1.0}, module.generator) for b in (batch, twice))
     assert float(one.terms["photo"]()) == pytest.approx(float(two.terms["photo"]()), rel=1e-5)
     torch.testing.assert_close(one.gradients["means"], two.gradients["means"], rtol=1e-3, atol=1e-6)
 
 
-def test_the_first_steps_meet_warm_kernels_only(data, monkeypatch):
-    met = watch(monkeypatch, "project", "rasterize", "backward", "nodes", "adam")
-    module = module_with(data, **EVERY)
-    module.method.warm_up()
-    warm = met.copy()
-    met.clear()
-    optimizer = module.configure_optimizers()
-    look(module, data)
-    for group in optimizer.param_groups:
-        for p in group["params"]:
-            p.grad = torch.ones_like(p)
-    optimizer.step()
-    assert len(met) > 5
-    assert met <= warm
+@pytest.mark.parametrize("effect", [None, *EVERY])
+def test_an_effect_that_is_off_is_absent_and_the_others_are_there(effect):
+    module = module_with(DATA, **(BARE if effect is None else EVERY | {effect: None}))
+    gone = set(EVERY) if effect is None else {effect}
+    gone |= {"rotation", "background"} if effect == "motion" else set()
+    assert {name for name, on in switched(module.method).items() if not on} == gone
+    if "motion" in gone:
+        step = look(module, DATA)
+        assert step.terms["rigid"]() is step.terms["smooth"]() is None
+    if effect is None:
+        names = {"means", "scales", "quaternions", "opacity", "colors"}
+        assert set(dict(module.method.named_parameters())) == set(module.method.param_groups()) == names
+        assert not any(name.startswith(("skinning.", "nodes.")) for name in module.method.state_dict())
 
 
-def test_a_stage_has_as_many_particles_as_its_own_density_says(data):
-    first = module_with(data).method
-    start = Start(data.scene, "fine", {"density": 2 * first.stage.density}, range(3), before=first)
-    assert int(Particles(start).most) == pytest.approx(2 * int(first.most), abs=1)
+@pytest.mark.parametrize(("options", "counts"), [(BARE, (1, 1, 1, 0, 1)), (EVERY, (6, 3, 6, 2, 3))])
+def test_operators_get_nothing_of_what_is_off(monkeypatch, options, counts):
+    seen, compare = [], model.compare
+    monkeypatch.setattr(
+        model, "compare", lambda *given, **named: seen.append(given) or compare(*given, **named)
+    )
+    look(module_with(DATA, **options), DATA)
+    particles, warp, _, color_basis, opacity_basis, *_ = seen[0]
+    found = particles.colors.shape[1], particles.opacity.shape[1], warp.links.shape[1]
+    assert (*found, len(color_basis), len(opacity_basis)) == counts
+    assert bool(warp.weights.any()) == (options is EVERY)
+
+
+def test_a_stage_uses_the_effects_that_it_names():
+    module = module_with(DATA, **EVERY, numbers={"effects": ["rotation", "color_over_time"]})
+    on = {name for name, is_on in switched(module.method).items() if is_on}
+    assert on == {"color_over_time"}  # nothing rotates that does not move
+
+
+def test_rates_of_lengths_are_of_the_scenes_extent():
+    module = module_with(DATA)
+    optimizer, extent = module.configure_optimizers(), float(module.method.extent)
+    before = {g["name"]: g["lr"] for g in optimizer.param_groups}
+    module.method.advance(0.5, 0, optimizer)
+    changed = {g["name"]: g["lr"] / before[g["name"]] for g in optimizer.param_groups}
+    assert {name: factor for name, factor in changed.items() if factor != 1} == pytest.approx(
+        {"means": extent, "node_translations": extent, "skinning": len(DATA.scene.train) / 100}
+    )
+
+
+def test_what_stands_right_before_a_camera_is_to_go():
+    module = module_with(DATA)
+    method, camera = module.method, DATA.scene.train[0].camera
+    ahead = camera.rays(torch.tensor([camera.height // 2 * camera.width + camera.width // 2])).directions[0]
+    method.means.data[5] = camera.center + 0.1 * ahead * (method.means.data[5] - camera.center).norm()
+    look(module, DATA, 0)
+    assert method.unseen_rounds.isinf().nonzero().flatten().tolist() == [5]
+
+
+def test_particles_grow_to_what_the_images_call_for():
+    numbers = {"density_interval": 0.1, "initial_share": 0.5, "density_until": 1.0, "density": 400.0}
+    module = module_with(DATA, numbers=numbers)
+    method, optimizer = module.method, module.configure_optimizers()
+    assert len(method.means) == round(0.5 * float(method.final_count))
+    for number in range(1, 10):
+        look(module, DATA)
+        method.advance(number / 10, number, optimizer)
+    assert len(method.means) == pytest.approx(float(method.final_count), rel=0.05)
+    assert len(method.skinning.links) == len(method.gradient_sum) == len(method.means)
+    start = Start(DATA.scene, "fine", {"density": 800.0}, range(3), before=method)
+    assert int(Particles(start).final_count) == pytest.approx(2 * int(method.final_count), abs=1)
+
+
+def test_a_snapshot_holds_its_time():
+    snapshot = module_with(DATA).method.at(Moment(0.5, 2, 0))
+    assert snapshot.holds(Moment(0.5))
+    assert not snapshot.holds(Moment(0.51))
+
+
+@pytest.mark.slow
+def test_particles_of_opaque_images_begin_no_larger_than_they_are_apart_there(tmp_path):
+    write_hypernerf(tmp_path / "hypernerf")
+    opaque = data_of("hypernerf", tmp_path)
+    for scene, limited in ((opaque.scene, True), (replace(opaque.scene, has_alpha=True), False)):
+        opaque.scene = scene
+        method = module_with(opaque).method
+        widest = widths(scene, method.means.data, float(method.covered_pixels))
+        assert bool((method.scales.data.exp()[:, 0] > 1.001 * widest).any()) != limited
+
+
+@pytest.mark.parametrize("options", [EVERY | {"background": 10.0}, BARE], ids=["every", "bare"])
+def test_a_stage_and_its_queries_stay_on_their_device(options):
+    numbers = {"density_interval": 0.1, "relink": 1, "density": 400.0, "density_until": 1.0, "rest_from": 0.3}
+    with Elsewhere():
+        module = shaken(module_with(DATA, **options, numbers=numbers))
+        method, camera = module.method.to("cuda"), DATA.scene.train[0].camera
+        optimizer = module.configure_optimizers()
+        method.warm_up()
+        begun = len(method.means)
+        for number in range(1, 6):
+            method.advance(number / 10, number, optimizer)
+            DATA.picker = lambda number=number: number
+            batch = next(iter(DATA.train_dataloader())).to("cuda")
+            step = method.look(batch, FACTORS if method.moves else {"photo": 1.0}, module.generator)
+            set_gradients(method, step.gradients)  # which refuses those of another device
+            optimizer.step()
+        assert {t.device for t in method.state_dict().values()} == {GPU}
+        assert len(method.means) > begun
+        assert (method.at_rest() > 0) == (options is not BARE)
+        snapshot = method.at(Moment(0.6))
+        for view in (View(camera), View(camera, torch.tensor([3, 4])), View(camera, crop=(1, 1, 4, 4))):
+            drawn = snapshot.render(view, torch.ones(3))
+            assert {part.device for part in vars(drawn).values()} == {GPU}
+        points, times = torch.zeros(5, 3), torch.tensor([0.2, 0.8])
+        found = [
+            method.trajectories(points.to("cuda"), times.to("cuda")),
+            *method.movement([0.1, 0.9]).values(),
+        ]
+        for cloud in (method.matter(), method.ellipsoids(0.3), method.template()):
+            found += [part for part in vars(cloud).values() if isinstance(part, torch.Tensor)]
+        assert {part.device for part in found} == {GPU}
+        assert method.bounds([0.0, 0.5]) is not None
+        after = Particles(Start(DATA.scene, "fine", {}, range(3), before=method), **options)
+        assert {t.device.type for t in after.state_dict().values()} == {"cpu"}
+
+
+def sized(width, height):
+    """A scene of 100 images of another size, of which a fifth shows something."""
+    camera = replace(DATA.scene.train[0].camera, width=width, height=height)
+
+    def load():
+        image = torch.zeros(height, width, 4, dtype=torch.uint8)
+        image[: height // 5] = 255
+        return image
+
+    frame = replace(DATA.scene.train[0], camera=camera, load=load)
+    return replace(DATA.scene, train=(frame,) * 100, val=(), test=(), held=())
+
+
+def refusal(scene, device=GPU, **numbers):
+    """What the refusal of a scene says, and the size that it names; None if it is feasible."""
+    try:
+        Particles.check_feasible(scene, "fine", numbers, device)
+    except ValueError as error:
+        width, height = map(int, re.search(r"at most (\d+) x (\d+) pixels", str(error)).groups())
+        return str(error), width, height
+    return None
+
+
+def test_without_kernels_large_images_are_refused_and_the_size_that_is_named_is_not():
+    message, width, height = refusal(sized(400, 400))
+    assert message.startswith("trainer: expected pictures of at most 1")
+    assert "have no kernels on a GPU, but got 400 x 400 and 16,1" in message
+    assert message.endswith("use trainer=cpu, or use smaller pictures")
+    assert 100 < width == height < 200
+    assert refusal(sized(width, height)) is None
+    assert refusal(sized(round(1.1 * width), round(1.1 * height)))
+    _, width, height = refusal(sized(800, 200))
+    assert width == pytest.approx(4 * height, abs=4)
+    large = replace(sized(400, 400).train[0], load=None)
+    assert refusal(replace(sized(60, 60), test=(large,)))  # those of the test count, too
+
+
+@pytest.mark.parametrize(
+    ("numbers", "feasible"),
+    [({}, False), ({"density": 20.0}, True), ({"initial_share": 0.2, "final_share": 0.2}, True)],
+)
+def test_fewer_particles_allow_larger_images(monkeypatch, numbers, feasible):
+    assert (refusal(sized(200, 200), **numbers) is None) == feasible
+    monkeypatch.setattr(backend, "numba_installed", lambda: True)
+    monkeypatch.setattr(model, "covered_pixels", None)  # with kernels nothing is looked at
+    assert refusal(sized(4000, 4000), torch.device("cpu"), **numbers) is None
+
+
+def test_without_numba_a_run_is_refused_before_anything_is_computed(tmp_path, monkeypatch):
+    monkeypatch.setattr(model, "first_points", lambda *_: pytest.fail("this takes seconds"))
+    large = SimpleNamespace(scene=sized(400, 400), setup=lambda _: None, restart=lambda _: None)
+    with (
+        implementation("reference"),
+        pytest.raises(ValueError, match=r"model: expected .* install forewarp\[cpu\]"),
+    ):
+        run_of([stage_of(METHODS["particles"])], large, tmp_path).fit()
+
+
+def test_without_numba_particles_learn_the_same(tmp_path):
+    pytest.importorskip("numba")
+    found = {}
+    for name in BACKENDS:
+        losses = Losses()
+        with implementation(name):
+            run_of([stage_of(METHODS["particles"], steps=8)], small_data(), tmp_path / name, losses).fit()
+        found[name] = losses.values
+    assert len(found["reference"]) == 8
+    assert found["reference"] == pytest.approx(found["Numba"], rel=0.02)
+    assert all(map(math.isfinite, found["Numba"]))

@@ -1,9 +1,15 @@
+"""Where particles begin, how large, and that what a step calls is compiled by then."""
+
+import subprocess
+import sys
 from dataclasses import replace
+from functools import cache
 
 import pytest
 import torch
 
 from forewarp.methods.method import Start
+from forewarp.methods.particles import start
 from forewarp.methods.particles.start import (
     _in_holes,
     anywhere,
@@ -15,22 +21,30 @@ from forewarp.methods.particles.start import (
     swept,
     widths,
 )
+from forewarp.ops.backend import numba_installed
 from forewarp.scene.cloud import Cloud, Handover
 from tests.contract.scenes import DATASETS, RADIUS, ball_center, data_of
+from tests.support.kernels import watch
+from tests.support.particles import EVERY, look, module_with, small_data
+
+compiled = pytest.mark.skipif(not numba_installed(), reason="needs Numba")
 
 
 @pytest.fixture(scope="module")
 def scene_of(tmp_path_factory):
     """``scene_of(dataset)``: a ball that slides along x."""
-    root, known = tmp_path_factory.mktemp("scenes"), {}
+    root = tmp_path_factory.mktemp("scenes")
 
+    @cache
     def read(dataset):
-        if dataset not in known:
-            DATASETS[dataset][0](root / dataset)
-            known[dataset] = data_of(dataset, root).scene
-        return known[dataset]
+        DATASETS[dataset][0](root / dataset)
+        return data_of(dataset, root).scene
 
     return read
+
+
+def inside(points, box):
+    return bool(((points >= torch.tensor(box.low)) & (points <= torch.tensor(box.high))).all())
 
 
 def test_the_hull_is_around_the_ball(scene_of):
@@ -43,64 +57,51 @@ def test_the_hull_is_around_the_ball(scene_of):
     assert cloud.size > 0
 
 
-def test_points_are_where_neighbouring_views_agree(scene_of):
+def test_a_sweep_looks_at_neighbours_in_time_and_keeps_known_points(scene_of):
     scene = scene_of("hypernerf")
     cloud = swept(scene, [], 400)
-    low, high = torch.tensor(scene.box.low), torch.tensor(scene.box.high)
     assert len(cloud) > 16
-    assert bool(((cloud.points >= low) & (cloud.points <= high)).all())
-    assert bool(cloud.points.isfinite().all())
-
-
-def test_of_several_cameras_those_of_the_same_time_are_a_sweeps_neighbours(scene_of):
-    scene = scene_of("hypernerf")
+    assert inside(cloud.points, scene.box)
+    known = cloud.points[:50]
+    cloud = swept(replace(scene, still=known), [], 400)
+    cameras, images = [f.camera for f in scene.train], [f.load() for f in scene.train]
+    assert torch.equal(cloud.points[:50], known)
+    torch.testing.assert_close(cloud.colors[:50], seen_colors(known, cameras, images))
+    assert float((cloud.colors[:50] - 0.5).abs().max()) > 0.05
 
     def unread():
-        raise AssertionError("a picture of another time was read")
+        raise AssertionError("an image of another time was read")
 
     around = [scene.train[i % len(scene.train)] for i in range(10)]
     now = [replace(frame, time=0.5, camera_id=i) for i, frame in enumerate(around)]
     other = [replace(frame, time=t, camera_id=0, load=unread) for frame in around for t in (0.4, 0.6)]
-    several = replace(scene, train=(*other, *now))
-    cloud = swept(several, list(range(len(other), len(several.train))), 400)
-    assert len(cloud) > 16
+    assert (
+        len(swept(replace(scene, train=(*other, *now)), list(range(len(other), len(other) + 10)), 400)) > 16
+    )
     with pytest.raises(AssertionError, match="another time"):
         swept(replace(scene, train=(*other, *now[:8])), list(range(len(other), len(other) + 8)), 400)
 
 
-def test_a_picture_of_a_sweep_fills_only_its_holes(scene_of):
+def test_an_image_of_a_sweep_fills_only_its_holes(scene_of):
     camera = scene_of("hypernerf").train[0].camera  # 20 x 16 pixels; cells of 4 x 4
     rays = camera.rays()
     column = torch.arange(320) % 20
     there = (rays.origins + 3.0 * rays.directions)[column < 12]
     for depth in (1.0, 5.0):  # before what is there, and behind it
-        fresh = _in_holes(there, rays.origins + depth * rays.directions, camera, 5)
-        assert torch.equal(fresh, column >= 12)
+        fills = _in_holes(there, rays.origins + depth * rays.directions, camera, 5)
+        assert torch.equal(fills, column >= 12)
     assert bool(_in_holes(torch.zeros(0, 3), there, camera, 5).all())
 
 
-def test_known_points_have_the_colour_that_pictures_show(scene_of):
-    scene = scene_of("hypernerf")
-    known = swept(scene, [], 400).points[:50]
-    cloud = swept(replace(scene, still=known), [], 400)
-    cameras, pictures = [f.camera for f in scene.train], [f.load() for f in scene.train]
-    assert torch.equal(cloud.points[:50], known)
-    torch.testing.assert_close(cloud.colors[:50], seen_colors(known, cameras, pictures))
-    assert float((cloud.colors[:50] - 0.5).abs().max()) > 0.05
-
-
-def test_what_a_stage_left_comes_first(scene_of):
+def test_what_a_stage_left_comes_first_and_random_points_last(scene_of):
+    scene = scene_of("dnerf")
     left = Cloud(torch.rand(100, 3), torch.rand(100, 3), torch.ones(100), 0.1)
-    handover = Handover(scene_of("dnerf").box, True, 6, left)
-    cloud = first_points(Start(scene_of("dnerf"), "fine", {}, [0, 1], handover), 1000)
-    assert torch.equal(cloud.points, left.points)
-    assert len(first_points(Start(scene_of("dnerf"), "fine", {}, [0, 1], handover), 30)) == 30
-
-
-def test_random_points_lie_in_the_box(scene_of):
-    box = scene_of("dnerf").box
-    points = anywhere(box, 50).points
-    assert bool(((points >= torch.tensor(box.low)) & (points <= torch.tensor(box.high))).all())
+    begun = Start(scene, "fine", {}, [0, 1], Handover(scene.box, True, 6, left))
+    assert torch.equal(first_points(begun, 1000).points, left.points)
+    assert len(first_points(begun, 30)) == 30
+    alone = replace(scene, train=scene.train[:1], has_alpha=False)
+    assert inside(first_points(Start(alone, "fine", {}, [0]), 50).points, scene.box)
+    assert inside(anywhere(scene.box, 50).points, scene.box)
 
 
 def test_pixels_that_show_anything_are_counted(scene_of):
@@ -110,30 +111,90 @@ def test_pixels_that_show_anything_are_counted(scene_of):
     assert covered_pixels(scene_of("hypernerf"), [0]) == 20 * 16
 
 
-def test_first_values_are_round_and_as_large_as_points_are_apart():
+def values_of(points, widest=None, size=1.0):
+    return first_values(Cloud(points, torch.full_like(points, 0.75), torch.ones(len(points)), size), widest)
+
+
+def test_particles_begin_round_and_no_larger_than_they_are_apart(scene_of):
     axis = torch.arange(4.0)
-    points = torch.cartesian_prod(axis, axis, axis)
-    first = first_values(Cloud(points, torch.full_like(points, 0.75), torch.ones(64), 1.0))
-    torch.testing.assert_close(first["log_scales"], torch.zeros(64, 3), atol=1e-3, rtol=0)
-    torch.testing.assert_close(0.5 + 0.28209479 * first["color"], torch.full((64, 1, 3), 0.75))
-
-
-def test_particles_begin_no_larger_than_they_are_apart_in_a_picture(scene_of):
+    first = values_of(torch.cartesian_prod(axis, axis, axis))
+    torch.testing.assert_close(first["scales"], torch.zeros(64, 3), atol=1e-3, rtol=0)
+    torch.testing.assert_close(0.5 + 0.28209479 * first["colors"], torch.full((64, 1, 3), 0.75))
+    for points in (torch.zeros(9, 3), torch.zeros(1, 3)):  # that coincide, or are alone
+        assert bool(values_of(points, size=0.3)["scales"].isfinite().all())
     scene = scene_of("hypernerf")
     camera = scene.train[0].camera
-    ahead = camera.center.float() - 2.0 * camera.camera_to_world[:3, 2].float()
-    points = ahead + 0.1 * torch.rand(50, 3)
+    points = camera.center.float() - 2.0 * camera.camera_to_world[:3, 2].float() + 0.1 * torch.rand(50, 3)
     away = torch.stack([(points - f.camera.center.float()).norm(dim=-1) for f in scene.train]).amin(0)
     widest = widths(scene, points, 200.0)
     torch.testing.assert_close(widest, away / camera.fx * 2.0)  # 200 pixels for 50 points: 2 pixels apart
-    cloud = Cloud(points * 100, torch.rand(50, 3), torch.ones(50), 1.0)
-    first = first_values(cloud, widest)
-    torch.testing.assert_close(first["log_scales"].exp(), widest[:, None].expand(-1, 3))
-    near = first_values(Cloud(points * 1e-3, cloud.colors, cloud.opacity, 1.0), widest)
-    assert bool((near["log_scales"].exp() < widest[:, None]).all())
+    far, near = (values_of(points * scale, widest)["scales"].exp() for scale in (100, 1e-3))
+    torch.testing.assert_close(far, widest[:, None].expand(-1, 3))
+    assert bool((near < widest[:, None]).all())
 
 
-def test_points_that_coincide_and_a_single_one_are_finite():
-    for points in (torch.zeros(9, 3), torch.zeros(1, 3)):
-        first = first_values(Cloud(points, torch.zeros_like(points), torch.ones(len(points)), 0.3))
-        assert bool(first["log_scales"].isfinite().all())
+@compiled
+def test_the_first_steps_meet_warm_kernels_only(monkeypatch):
+    met, data = watch(monkeypatch, "project", "rasterize", "backward", "nodes", "adam"), small_data()
+    module = module_with(data, **EVERY)
+    module.method.warm_up()
+    warm = met.copy()
+    met.clear()
+    optimizer = module.configure_optimizers()
+    look(module, data)
+    for p in module.parameters():
+        p.grad = torch.ones_like(p)
+    optimizer.step()
+    assert len(met) > 5
+    assert met <= warm
+
+
+@compiled
+@pytest.mark.slow
+def test_the_process_beside_compiles_for_the_numbers_that_a_step_has():
+    script = (
+        "import types, torch\n"
+        "from forewarp.methods.particles.start import compile_backward, compile_kernels\n"
+        "from forewarp.ops.kernels import backward, rasterize\n"
+        "kernels = (rasterize.compare, backward.rank_rows, backward.splat_gradients, backward.chain)\n"
+        "compile_backward(); before = [list(kernel.signatures) for kernel in kernels]\n"
+        "assert all(len(found) == 1 for found in before), before\n"
+        "compile_kernels(types.SimpleNamespace(means=torch.zeros(1, 3)))\n"
+        "assert [list(kernel.signatures) for kernel in kernels] == before\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize(("new", "cores", "starts"), [(True, 2, 1), (False, 2, 0), (True, 1, 0)])
+def test_another_process_is_started_only_for_new_kernels_and_a_second_core(monkeypatch, new, cores, starts):
+    started, popen = [], subprocess.Popen
+
+    def begin(command, **how):
+        started.append(command)
+        return popen([sys.executable, "-c", ""], **how)
+
+    monkeypatch.setattr(subprocess, "Popen", begin)
+    monkeypatch.setattr(start, "cores", lambda: cores)
+    with start._backward_compiled_beside(new):
+        assert len(started) == starts
+    code = "from forewarp.methods.particles.start import compile_backward; compile_backward()"
+    assert started == [[sys.executable, "-c", code]] * starts
+
+
+@pytest.mark.parametrize("starts", [True, False])
+def test_a_second_process_that_fails_is_told_and_one_that_cannot_start_is_not_missed(
+    monkeypatch, capsys, starts
+):
+    popen = subprocess.Popen
+
+    def begin(command, **how):
+        if not starts:
+            raise OSError("no more processes")
+        return popen([sys.executable, "-c", "import sys; sys.exit('no room')"], **how)
+
+    monkeypatch.setattr(subprocess, "Popen", begin)
+    monkeypatch.setattr(start, "cores", lambda: 2)
+    with start._backward_compiled_beside(True):
+        pass
+    assert capsys.readouterr().out.endswith("as a second one failed: no room\n") == starts

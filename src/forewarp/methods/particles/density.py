@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from forewarp.methods.particles.model import Particles
 
 _FADED = -4.0  # logit of the opacity below which a particle goes
-_IDLE = 5  # rounds without being seen after which it goes
+_UNSEEN = 5  # rounds without being seen after which it goes
 _MOST_A_ROUND = 0.1  # share of the particles that are split at once
 _HALF, _APART = 0.6, 0.6  # of the longest axis: a half's length, and how far each is moved along it
 _LARGE = 0.45  # of the scene's extent: what has a longer axis goes
@@ -44,66 +44,79 @@ def too_near(order: Tensor, distances: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def renew(
-    particles: Particles, optimizer: torch.optim.Optimizer, target: int, *, unseen: bool, extent: float
-) -> None:
+def control(particles: Particles, progress: float, optimizer: torch.optim.Optimizer) -> None:
+    """Run a round of density control; every few rounds, link particles to nodes anew, and let nodes rest.
+
+    Args:
+        particles: with the counters of the rounds so far.
+        progress: fraction of the stage that is done.
+        optimizer: whose moments follow.
+    """
+    stage = particles.stage
+    renew(particles, round(float(particles.final_count) * stage.share_at(progress)), optimizer)
+    if particles.nodes is not None and int(particles.round) % stage.relink == 0:
+        particles.skinning.relink(particles.nodes, particles.means.data, optimizer)
+        if particles.resting is not None:
+            particles.skinning.release(particles.resting)
+            if progress >= stage.rest_from:
+                least = max(particles.least_motion, pixel_width(float(particles.covered_pixels)))
+                come_to_rest(particles, least * float(particles.extent))
+
+
+@torch.no_grad()
+def renew(particles: Particles, target: int, optimizer: torch.optim.Optimizer) -> None:
     """Remove particles that are not needed, and split those with the largest gradients.
 
     A particle goes whose opacity has faded, that is longer than a good part of the scene, that stood too near
-    to a camera, or that, where ``unseen``, no image has shown for some rounds. The rest is split along its
-    longest axis, in the order of its mean gradient over the images that showed it, up to ``target``.
-
-    Args:
-        particles: with the counters ``pulled``, ``shown`` and ``idle``; what is infinitely ``idle`` goes.
-        optimizer: whose moments follow.
-        target: how many there should be.
-        unseen: whether all frames are in play.
-        extent: of the scene, world units.
+    to a camera (``unseen_rounds`` is infinite), or, once all times are in play, that no image has shown for
+    some rounds. The rest is split along its longest axis, in the order of its mean gradient over the images
+    that showed it, until there are ``target``.
     """
-    gone = particles.idle.isinf()
-    particles.idle.copy_(torch.where(particles.shown > 0, 0.0, particles.idle + 1))
+    gone = particles.unseen_rounds.isinf()
+    particles.unseen_rounds.copy_(torch.where(particles.image_count > 0, 0.0, particles.unseen_rounds + 1))
     gone |= most_opaque(particles) < _FADED
-    gone |= particles.log_scales.amax(-1).exp() > _LARGE * extent
-    if unseen:
-        gone |= particles.idle >= _IDLE
+    gone |= particles.scales.amax(-1).exp() > _LARGE * float(particles.extent)
+    if particles.nodes is not None:
+        first, last = particles.nodes.seen_times.tolist()
+        if first <= particles.ends[0] + 0.02 and last >= particles.ends[1] - 0.02:
+            gone |= particles.unseen_rounds >= _UNSEEN
     kept = (~gone).nonzero()[:, 0]
     if not len(kept):  # all that there is must not vanish
         kept = torch.arange(len(gone), device=gone.device)
     room = min(target - len(kept), int(_MOST_A_ROUND * len(kept)) + 1)
-    gradient = (particles.pulled / particles.shown.clamp(min=1))[kept]
+    gradient = (particles.gradient_sum / particles.image_count.clamp(min=1))[kept]
     split = kept[gradient.topk(max(0, min(room, int((gradient > 0).sum())))).indices]
-    fresh = torch.zeros(len(kept) + len(split), dtype=torch.bool, device=kept.device)
-    fresh[len(kept) :] = True
+    fresh = torch.arange(len(kept) + len(split), device=kept.device) >= len(kept)
     if len(split) or len(kept) < len(gone):
-        first = torch.searchsorted(kept, split)  # where the sources are among those that stay
+        sources = torch.searchsorted(kept, split)  # rows among those that stay
         take_rows(particles, optimizer, torch.cat([kept, split]), fresh)
-        _halve(particles, first, torch.arange(len(kept), len(kept) + len(split), device=kept.device))
-    particles.pulled.zero_()
-    particles.shown.zero_()
+        _halve(particles, sources, fresh.nonzero()[:, 0])
+    particles.gradient_sum.zero_()
+    particles.image_count.zero_()
 
 
 def _halve(particles: Particles, first: Tensor, second: Tensor) -> None:
     """Make two shorter halves of particles that lie in the rows ``first`` and, copied, ``second``."""
-    longest = particles.log_scales[first].argmax(-1)
-    length = particles.log_scales[first].gather(-1, longest[:, None]).exp()
-    axes = rotations(particles.turns[first])
+    longest = particles.scales[first].argmax(-1)
+    length = particles.scales[first].gather(-1, longest[:, None]).exp()
+    axes = rotations(particles.quaternions[first])
     axis = axes.gather(-1, longest[:, None, None].expand(-1, 3, 1))[..., 0]
     step = _APART * length * axis
     particles.means[first] -= step
     particles.means[second] += step
     shorter = torch.log(torch.tensor(_HALF))
     for rows in (first, second):
-        particles.log_scales[rows, longest] += shorter
+        particles.scales[rows, longest] += shorter
 
 
 def most_opaque(particles: Particles) -> Tensor:
     """Return the logit of each particle's opacity (N,) when it is largest."""
     base = particles.opacity.data[:, 0]
-    if particles.fade is None:
+    if particles.opacity_over_time is None:
         return base
     times = [i / _TIMES for i in range(_TIMES + 1)]
     bases = base.new_tensor([particles.opacity_basis(time) for time in times])  # (T, F)
-    return base + (bases @ particles.fade.data.T).amax(0)
+    return base + (bases @ particles.opacity_over_time.data.T).amax(0)
 
 
 @torch.no_grad()
@@ -113,7 +126,7 @@ def bound_opacity(particles: Particles) -> None:
     Cost: nothing to speak of; with opacity over time about 20 operations a particle and cosine.
     """
     base = particles.opacity.data
-    if particles.fade is not None:
+    if particles.opacity_over_time is not None:
         base[:, 0] -= (most_opaque(particles) - _MOST_OPAQUE).clamp(min=0)
     base.clamp_(max=_MOST_OPAQUE)
 
@@ -162,18 +175,18 @@ def come_to_rest(particles: Particles, least: float) -> None:
     """
     nodes = particles.nodes
     times = torch.linspace(*particles.ends, _TIMES).tolist()
-    nodes.stop(nodes.reach_of(times) < least, times)
-    follows = particles.skin.weights() > _FOLLOWS
-    free = ~(follows & ~nodes.still[particles.skin.links.long()]).any(-1) & ~particles.resting
+    nodes.stop(nodes.motion_range(times) < least, times)
+    follows = particles.skinning.weights() > _FOLLOWS
+    free = ~(follows & ~nodes.stopped[particles.skinning.links.long()]).any(-1) & ~particles.resting
     if not bool(free.any()):
         return
     at_times = zip(*(moved(particles.means.data, particles.warp(time)) for time in times))
     means, linear = (sum(parts) / len(times) for parts in at_times)
     particles.means[free] = means[free]
     left, _, right = torch.linalg.svd(linear[free])  # left @ right is the nearest rotation
-    particles.turns[free] = _product(_quaternions(left @ right), particles.turns[free])
+    particles.quaternions[free] = _product(_quaternions(left @ right), particles.quaternions[free])
     particles.resting[free] = True
-    particles.skin.let_go(free)
+    particles.skinning.release(free)
 
 
 def _quaternions(matrices: Tensor) -> Tensor:

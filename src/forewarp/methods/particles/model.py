@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from forewarp.fields.curves import Curve
 from forewarp.methods.method import Method, Snapshot, Start, Step
 from forewarp.methods.particles import density, queries
-from forewarp.methods.particles.nodes import Nodes, Skin, TimeOffsets
+from forewarp.methods.particles.nodes import Nodes, Skinning, TimeOffsets, are_rows
 from forewarp.methods.particles.options import EFFECTS, Effects, Numbers, ParticlesPlanning, view_share
 from forewarp.methods.particles.start import (
     compile_kernels,
@@ -28,7 +28,6 @@ from forewarp.ops.backend import has_kernels
 from forewarp.ops.gaussians import (
     BLUR,
     FEASIBLE,
-    Compared,
     Gaussians,
     Pinhole,
     Warp,
@@ -49,8 +48,12 @@ _MARGIN = 0.125  # share of the longer side; what projects farther outside the i
 _LENS_MARGIN = 1.3  # of the squared distance from the axis that the image's border reaches
 _BORDER = 16  # points along each side of an image
 _TRANSPARENT = 1e-6  # opacity below which a pixel has no depth
+_FEWEST_TIMES = 8  # of training, for learned corrections of them
 _COUNTED_IMAGES = 12  # whose covered pixels are counted before a run
 _SLACK = 0.98  # of a side, as smaller images are not covered to exactly the same share
+# Parameters and buffers with a row for each particle; those of effects that are off are None.
+_ROWS = ("means", "scales", "quaternions", "opacity", "colors", "sh", "color_over_time", "opacity_over_time")
+_ROWS += ("gradient_sum", "image_count", "unseen_rounds", "resting")
 
 
 @lru_cache(maxsize=4096)
@@ -167,70 +170,65 @@ class Particles(Method):
         values = self._first_values(start)
         count = len(values["means"])
         self.means = nn.Parameter(values["means"])
-        self.log_scales = nn.Parameter(values["log_scales"])
-        self.turns = nn.Parameter(values["turns"])
+        self.scales = nn.Parameter(values["scales"])  # logarithms
+        self.quaternions = nn.Parameter(values["quaternions"])  # w, x, y, z of any length
         self.opacity = nn.Parameter(values["opacity"])  # logits
-        self.color = nn.Parameter(values["color"])  # coefficient of the constant harmonic
+        self.colors = nn.Parameter(values["colors"])  # of the constant harmonic
         degree = effects.view_dependence or 0
-        self.shade = _coefficients(values.get("shade"), count, degree * (degree + 2), 3)
-        self.tint = _coefficients(values.get("tint"), count, effects.color_over_time or 0, 3)
-        self.fade = _coefficients(values.get("fade"), count, effects.opacity_over_time or 0)
-
-        self.nodes = self.skin = None
-        if effects.motion is not None:
-            node_count, knots = self.stage.motion(count, len(times))
-            curve = Curve(
-                effects.motion, knots, len(times), self.canonical_time, straight=self.stage.straight
-            )
-            self.nodes = Nodes(
-                None if start.blank else self.means.data,
-                node_count,
-                curve,
-                TimeOffsets.of(effects.motion, times, self.stage.time_offsets),
-                turns=effects.rotation is not None,
-                rests=effects.background is not None,
-                edges=self.stage.edges,
-            )
-            self.skin = Skin(self.nodes, self.means.data)
+        self.sh = _coefficients(values.get("sh"), count, degree * (degree + 2), 3)  # of the other harmonics
+        colors, opacities = effects.color_over_time or 0, effects.opacity_over_time or 0
+        self.color_over_time = _coefficients(values.get("color_over_time"), count, colors, 3)
+        self.opacity_over_time = _coefficients(values.get("opacity_over_time"), count, opacities)
+        # Of the rounds of density control; the first two are sums since the last round.
+        self.register_buffer("gradient_sum", torch.zeros(count))
+        self.register_buffer("image_count", torch.zeros(count))  # that showed a particle
+        self.register_buffer("unseen_rounds", torch.zeros(count))  # infinite: to be removed
+        self.register_buffer("round", torch.zeros((), dtype=torch.int64))
         self.least_motion = effects.background
         resting = None if effects.background is None else torch.zeros(count, dtype=torch.bool)
         self.register_buffer("resting", resting)
-        # Since the last round of density control: sums of gradients, images that showed a particle; and for
-        # how many rounds none did.
-        self.register_buffer("pulled", torch.zeros(count))
-        self.register_buffer("shown", torch.zeros(count))
-        self.register_buffer("idle", torch.zeros(count))
-        self.register_buffer("round", torch.zeros((), dtype=torch.int64))
-        rows = ["means", "log_scales", "turns", "opacity", "color", "shade", "tint", "fade"]
-        rows += ["pulled", "shown", "idle", "resting"]
-        self.grows = tuple(name for name in rows if getattr(self, name) is not None)
-        if self.skin is not None:
-            self.grows += Skin.ROWS
+
+        self.nodes = self.skinning = None
+        if effects.motion is not None:
+            nodes, knots = self.stage.motion(count, len(times))
+            natural = self.stage.natural_splines
+            curve = Curve(effects.motion, knots, len(times), self.canonical_time, straight=natural)
+            offsets = None  # cosines are exactly 0 at the canonical time, and few times do not tell
+            if self.stage.time_offsets and effects.motion == "spline" and len(times) >= _FEWEST_TIMES:
+                offsets = TimeOffsets(times, self.stage.time_offsets)
+            points, edges = None if start.blank else self.means.data, self.stage.edges
+            rotates, rests = effects.rotation is not None, effects.background is not None
+            self.nodes = Nodes(points, nodes, curve, offsets, rotates=rotates, rests=rests, edges=edges)
+            self.skinning = Skinning(self.nodes, self.means.data)
+        self.grows = tuple(name for name in _ROWS if getattr(self, name) is not None)
+        self.grows += () if self.skinning is None else Skinning.ROWS
 
     def _first_values(self, start: Start) -> dict[str, Tensor]:
         """Return the first value of every parameter: fresh, or of the stage before.
 
-        Also register ``covered``: mean number of pixels of an image that show anything; ``extent``: median
-        distance of points from the middle; and ``most``: how many particles there will be.
+        Also register ``covered_pixels``: mean number of pixels of an image that show anything; ``extent``:
+        median distance of points from the middle; and ``final_count``: how many particles there will be.
         """
         if isinstance(start.before, Particles):
             before = start.before
-            covered, extent = float(before.covered), float(before.extent)
+            covered, extent = float(before.covered_pixels), float(before.extent)
             values = {n: p.data.to("cpu", copy=True) for n, p in before.named_parameters(recurse=False)}
         elif start.blank:
             covered = extent = 1.0
             values = first_values(Cloud(torch.zeros(1, 3), torch.zeros(1, 3), torch.zeros(1), 1.0))
         else:
             covered = covered_pixels(start.scene, list(start.frames))
-            cloud = first_points(start, round(self.stage.first * self.stage.most(covered, self.views)))
+            count = round(self.stage.initial_share * self.stage.final_count(covered, self.views))
+            cloud = first_points(start, count)
             distances = (cloud.points - cloud.points.median(0).values).norm(dim=-1)
             extent = float(distances.median()) or start.scene.box.diagonal
             # Points of a hull lie on its surface, and are as far apart as particles should be large.
             widest = None if start.scene.has_alpha else widths(start.scene, cloud.points, covered)
             values = first_values(cloud, widest)
-        self.register_buffer("covered", torch.tensor(covered))
+        self.register_buffer("covered_pixels", torch.tensor(covered))
         self.register_buffer("extent", torch.tensor(extent))
-        self.register_buffer("most", torch.tensor(float(self.stage.most(covered, self.views))))
+        final_count = float(self.stage.final_count(covered, self.views))
+        self.register_buffer("final_count", torch.tensor(final_count))
         return values
 
     @classmethod
@@ -253,7 +251,7 @@ class Particles(Method):
         width, height = max(((c.width, c.height) for c in cameras), key=lambda size: size[0] * size[1])
         settings, views = Numbers(name=stage, **numbers), len(scene.train)
         covered = covered_pixels(scene, spread(views, _COUNTED_IMAGES))
-        count = settings.most(covered, views) * max(settings.first, settings.full)
+        count = settings.final_count(covered, views) * max(settings.initial_share, settings.final_share)
         scale = (FEASIBLE / (count * width * height)) ** (1 / 3)
         if scale >= 1:
             return
@@ -292,49 +290,55 @@ class Particles(Method):
         """See ``Method``; what is stored of nodes must go together, too."""
         if self.nodes is None:
             return super().misfit(state)
-        followed = self.skin.links.shape[1]  # a particle follows fewer nodes where there are few
-        links = {n: state[n][:, :1].expand(-1, followed) for n in Skin.ROWS if state[n].dim() == 2}
-        if len({state[name].shape for name in Skin.ROWS}) > 1:
-            return Skin.ROWS[0]
-        inconsistent = self.nodes.misfit(state, "nodes.", state["skin.links"])
-        return inconsistent or super().misfit({**state, **links})
+        if len({state[name].shape for name in Skinning.ROWS}) > 1:
+            return Skinning.ROWS[0]
+        if misfit := self.nodes.misfit(state, "nodes."):
+            return misfit
+        if not are_rows(state["skinning.links"], len(state["nodes.positions"])):
+            return "skinning.links"
+        width = self.skinning.links.shape[1]  # a particle follows fewer nodes where there are few
+        links = {
+            name: state[name][:, :1].expand(-1, width) for name in Skinning.ROWS if state[name].dim() == 2
+        }
+        return super().misfit({**state, **links})
 
     def at(self, moment: Moment) -> Snapshot:
         """Move every particle; nothing is rendered yet."""
-        bases = self.over_time(moment.time)
+        bases = self.time_bases(moment.time)
         return ParticlesSnapshot(moment, self.gaussians(), self.warp(moment.time), *bases, self.blur)
 
     def gaussians(self) -> Gaussians:
         """Return the particles as the operators read them: coefficients of one kind in one tensor."""
-        opacity = self.opacity if self.fade is None else torch.cat([self.opacity, self.fade], -1)
+        opacity = [self.opacity] if self.opacity_over_time is None else [self.opacity, self.opacity_over_time]
+        opacity = opacity[0] if len(opacity) == 1 else torch.cat(opacity, -1)
         colors = [getattr(self, name) for name in self._color_parameters()]
         colors = colors[0] if len(colors) == 1 else torch.cat(colors, 1)
-        return Gaussians(self.means, self.log_scales, self.turns, opacity, colors)
+        return Gaussians(self.means, self.scales, self.quaternions, opacity, colors)
 
     def _color_parameters(self) -> list[str]:
         """Return the parameters of colour that there are, in the operators' order."""
-        return [name for name in ("color", "shade", "tint") if getattr(self, name) is not None]
+        return [name for name in ("colors", "sh", "color_over_time") if getattr(self, name) is not None]
 
     def warp(self, time: float) -> Warp:
         """Return how all particles move from the canonical state to a time."""
         if self.nodes is not None:
-            return Warp(self.nodes.maps(time), self.skin.links, self.skin.weights())
+            return Warp(self.nodes.maps(time), self.skinning.links, self.skinning.weights())
         zero = self.means.new_zeros(len(self.means), 1)
         return Warp(self.means.new_zeros(1, 12), zero.int(), zero)
 
-    def over_time(self, time: float) -> tuple[Tensor, Tensor]:
+    def time_bases(self, time: float) -> tuple[Tensor, Tensor]:
         """Return what a time makes of the coefficients of colour (T,) and of opacity (1 + F,)."""
-        color = [] if self.tint is None else self.color_basis(time)
-        opacity = [] if self.fade is None else self.opacity_basis(time)
+        color = [] if self.color_over_time is None else self.color_basis(time)
+        opacity = [] if self.opacity_over_time is None else self.opacity_basis(time)
         return self.means.new_tensor(color), self.means.new_tensor([1.0, *opacity])
 
     def color_basis(self, time: float) -> list[float]:
         """Return the cosines of colour over time."""
-        return self._cosines(self.tint.shape[1], time)
+        return self._cosines(self.color_over_time.shape[1], time)
 
     def opacity_basis(self, time: float) -> list[float]:
         """Return the cosines of opacity over time."""
-        return self._cosines(self.fade.shape[1], time)
+        return self._cosines(self.opacity_over_time.shape[1], time)
 
     def _cosines(self, count: int, time: float) -> list[float]:
         """Return ``cos(pi k t) - cos(pi k t_c)`` for k = 1 .. count: 0 at the canonical time."""
@@ -346,16 +350,15 @@ class Particles(Method):
     @torch.no_grad()
     def look(self, batch: Batch, factors: Mapping[str, float], generator: torch.Generator) -> Step:
         """See ``Method``. Images are rendered one after the other, each as a whole."""
-        gradients: dict[str, Tensor] = {}
-        terms = dict.fromkeys(self.terms, 0.0)
+        terms, gradients = dict.fromkeys(self.terms, 0.0), {}
         squared, numbers, views = 0.0, 0, len(batch.observations)
-        unit = float(self.covered) * views  # the loss is a mean over pixels that show anything
         for seen in batch.observations:
-            compared, of_nodes = self._compare(seen, factors, unit, generator, gradients)
-            squared, numbers = squared + compared.squared, numbers + 3 * len(seen.view)
-            terms["photo"] += compared.loss / unit
-            for name, value in of_nodes.items():
+            squared_error, of_image, found = self._compare(seen, factors, generator, views)
+            squared, numbers = squared + squared_error, numbers + 3 * len(seen.view)
+            for name, value in of_image.items():
                 terms[name] += value / views
+            for name, value in found.items():
+                gradients[name] = gradients[name] + value if name in gradients else value
         values = {name: (lambda v=v: self.means.new_tensor(v)) for name, v in terms.items()}
         if self.nodes is None:
             values["rigid"] = values["smooth"] = lambda: None
@@ -363,102 +366,83 @@ class Particles(Method):
         return Step(values, error, {"particles": len(self.means)}, gradients)
 
     def _compare(
-        self,
-        seen: Observation,
-        factors: Mapping[str, float],
-        unit: float,
-        generator: torch.Generator,
-        gradients: dict[str, Tensor],
-    ) -> tuple[Compared, dict[str, float]]:
-        """Compare with one image, add to ``gradients``, and return the terms of the nodes, too."""
-        time = self._jittered(seen.moment.time, generator)
-        tints, fades = self.over_time(time)
-        if self.nodes is None:
+        self, seen: Observation, factors: Mapping[str, float], generator: torch.Generator, views: int
+    ) -> tuple[float, dict[str, float], dict[str, Tensor]]:
+        """Compare with one of a step's images.
+
+        Returns:
+            the sum of squared errors; the terms; and the step's gradients, by parameter.
+        """
+        time, nodes = self._jittered(seen.moment.time, generator), self.nodes
+        if nodes is None:
             warp = self.warp(time)
         else:
-            motion_time = self.nodes.taken(time)
-            self.nodes.look_ahead(motion_time)
-            basis = self.nodes.basis_of_motion((motion_time, 1.0))
-            motion, maps = self.nodes.carried(basis)
-            warp = Warp(maps, self.skin.links, self.skin.weights())
-        colors = self._color_parameters()
+            motion_time = nodes.motion_time(time)
+            nodes.extend(motion_time)
+            basis = nodes.summed_basis((motion_time, 1.0))
+            motion, maps = nodes.motion_and_maps(basis)
+            warp = Warp(maps, self.skinning.links, self.skinning.weights())
+        colors, terms = self._color_parameters(), {}
+        covered = float(self.covered_pixels)  # image losses are sums over pixels, divided by those covered
         compared = compare(
-            self.gaussians(), warp, pinhole_of(seen.view.camera, self.blur), tints, fades, seen.rgb,
-            seen.background, width=self.width, factor=factors.get("photo", 0.0) / unit,
+            self.gaussians(), warp, pinhole_of(seen.view.camera, self.blur), *self.time_bases(time),
+            seen.rgb, seen.background, width=self.width, factor=factors.get("photo", 0.0) / (covered * views),
             by_skin=self.moves, kinds=[getattr(self, name).shape[1] for name in colors],
         )  # fmt: skip
+        terms["photo"] = compared.loss / covered
         shown = compared.pull > 0
-        self.pulled.add_(compared.pull)
-        self.shown.add_(shown)
+        self.gradient_sum.add_(compared.pull)
+        self.image_count.add_(shown)
         self.shown_now.append(shown)
-        if self.progress < self.stage.settled:
-            self.idle[density.too_near(compared.order, compared.distances)] = math.inf
-        found = compared.particles
-        new = {"means": found.means, "log_scales": found.log_scales, "turns": found.quaternions}
-        new |= {"opacity": found.opacity[:, :1], **dict(zip(colors, found.colors, strict=True))}
-        if self.fade is not None:
-            new["fade"] = found.opacity[:, 1:]
-        terms = {}
-        if self.nodes is not None:
-            nodes, rigid = self.nodes, factors.get("rigid", 0.0) * self.stage.loose**self.progress
+        if self.progress < self.stage.density_until:
+            self.unseen_rounds[density.too_near(compared.order, compared.distances)] = math.inf
+        means, scales, quaternions, opacity, by_kind = compared.particles
+        gradients = {"means": means, "scales": scales, "quaternions": quaternions, "opacity": opacity[:, :1]}
+        gradients |= dict(zip(colors, by_kind, strict=True))
+        if self.opacity_over_time is not None:
+            gradients["opacity_over_time"] = opacity[:, 1:]
+        if nodes is not None:
+            rigid = factors.get("rigid", 0.0) * self.stage.rigid_final_factor**self.progress
             by_motion, terms["rigid"] = pull_nodes(
-                motion, nodes.places, compared.maps, nodes.edges, nodes.edge_weights, rigid
+                motion, nodes.positions, compared.maps, nodes.edges, nodes.edge_weights, rigid
             )
             smooth, extent = factors.get("smooth", 0.0), float(self.extent)
-            terms["smooth"], of_nodes = nodes.spread_over_time(
-                time, motion_time, basis, by_motion, smooth, extent
-            )
-            new |= {"skin.learned": compared.skin, **of_nodes}
-        for name, value in new.items():
-            gradients[name] = value if name not in gradients else gradients[name] + value
-        return compared, terms
+            terms["smooth"], of_nodes = nodes.backward(time, motion_time, basis, by_motion, smooth, extent)
+            gradients |= {"skinning.logits": compared.skin, **of_nodes}
+        return compared.squared, terms, gradients
 
     def _jittered(self, time: float, generator: torch.Generator) -> float:
         """Shift an image's time at random, less and less, so that curves do not follow single images."""
-        deviation = self.stage.jitter * max(0.0, 1 - self.progress / self.stage.calm)
+        deviation = self.stage.jitter * max(0.0, 1 - self.progress / self.stage.jitter_until)
         if self.nodes is None or deviation == 0:
             return time
         return min(1.0, max(0.0, time + deviation * float(torch.randn((), generator=generator))))
 
     def advance(self, progress: float, step: int, optimizer: torch.optim.Optimizer) -> dict[str, float]:
-        """See ``Method``: scale learning rates by the scene, and renew particles where it is time.
+        """See ``Method``: scale learning rates by the scene, and control density where it is time.
 
-        Rates of lengths are of the scene's extent; that of the skin follows the number of images, and the
+        Rates of lengths are of the scene's extent; that of the skinning follows the number of images, and the
         decay of opacity the rate of opacity.
         """
         self.progress, stage = progress, self.stage
         density.bound_opacity(self)
         for group in optimizer.param_groups:
-            if group["name"] in ("means", "shifts"):
+            if group["name"] in ("means", "node_translations"):
                 group["lr"] *= float(self.extent)
             elif group["name"] == "time_offsets":
-                self.nodes.offsets.learns = progress >= stage.calm
-                if self.nodes.offsets.learns:
-                    self.nodes.offsets.settle(group["lr"])
+                self.nodes.time_offsets.learns = progress >= stage.jitter_until
+                if self.nodes.time_offsets.learns:
+                    self.nodes.time_offsets.settle(group["lr"])
             elif group["name"] == "opacity":
-                decay = stage.decay(float(self.most), float(self.covered))
+                decay = stage.decay(float(self.final_count), float(self.covered_pixels))
                 self.decay = min(0.99, decay * group["lr"] / (group["base_lr"] or 1.0))  # rates may rise
-            elif group["name"] == "skin":
+            elif group["name"] == "skinning":
                 group["lr"] *= view_share(self.views)
-        number = int(progress / stage.every)
-        if number > int(self.round) and progress < stage.settled:
+        number = int(progress / stage.density_interval)
+        if number > int(self.round) and progress < stage.density_until:
             self.round.fill_(number)
-            self._renew(progress, optimizer)
+            density.control(self, progress, optimizer)
         return {}
-
-    def _renew(self, progress: float, optimizer: torch.optim.Optimizer) -> None:
-        """Run a round of density control; every few rounds, link particles to nodes anew, and let rest."""
-        target = round(float(self.most) * self.stage.share_at(progress))
-        low, high = self.ends if self.nodes is None else self.nodes.seen.tolist()
-        all_seen = self.moves and low <= self.ends[0] + 0.02 and high >= self.ends[1] - 0.02
-        density.renew(self, optimizer, target, unseen=all_seen, extent=float(self.extent))
-        if self.moves and int(self.round) % self.stage.relink == 0:
-            self.skin.relink(self.nodes, self.means.data, optimizer)
-            if self.resting is not None:
-                self.skin.let_go(self.resting)
-                if progress >= self.stage.rest:
-                    least = max(self.least_motion, density.pixel_width(float(self.covered)))
-                    density.come_to_rest(self, least * float(self.extent))
 
     def warm_up(self) -> None:
         """Compile the operators' kernels."""
@@ -468,7 +452,7 @@ class Particles(Method):
         """See ``Method``."""
         groups = {name: [p] for name, p in self.named_parameters(recurse=False)}
         if self.nodes is not None:
-            groups |= {"skin": [self.skin.learned]} | self.nodes.param_groups()
+            groups |= {"skinning": [self.skinning.logits]} | self.nodes.param_groups()
         return groups
 
     def optimizer(self, groups: list[dict]) -> torch.optim.Optimizer:

@@ -17,46 +17,44 @@ _LEAST = 1e-20  # squared distance; what is nearer together coincides, and canno
 _DAMP = 0.5  # of a curve's last step, where it is continued to times not yet seen
 _HALF_STEP = 1e-3  # of all time: for central differences by time
 _FULL = 0.05  # share of a spline's basis at a time, from which on its knot counts as seen
-_FARTHEST = 0.2  # of all time: no offset of a time is larger
+_FARTHEST = 0.2  # of all time: no image's time is off by more
 _BEYOND = _FARTHEST + 2 * _HALF_STEP  # of all time, by which a curve must reach beyond [0, 1]
-_FEWEST_TIMES = 8  # below which neighbours do not tell how things move
 _PULL = 0.1  # of the learning rate: by how much a step draws an offset towards 0
 
 
-def nearest(points: Tensor, places: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Find the places (M, 3) nearest to points (N, 3).
+def nearest(points: Tensor, positions: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Find the positions (M, 3) nearest to points (N, 3).
 
     Returns:
-        squared distances and rows (N, count), nearest first; fewer where there are fewer places.
+        squared distances and rows (N, count), nearest first; fewer where there are fewer positions.
 
     Raises:
-        ValueError: for points or places that are not finite.
+        ValueError: for points or positions that are not finite.
 
-    Cost: a tree of the places, on the CPU, and a walk down it for each point.
+    Cost: a tree of the positions, on the CPU, and a walk down it for each point.
     """
     from scipy.spatial import KDTree  # late, as its import takes time
 
-    ranks = range(1, min(count, len(places)) + 1)
+    ranks = list(range(1, min(count, len(positions)) + 1))
     if not len(points):
-        return points.new_zeros(0, len(ranks)), torch.zeros(
-            0, len(ranks), dtype=torch.int64, device=points.device
-        )
-    tree = KDTree(places.detach().double().cpu().numpy())
-    distances, rows = tree.query(points.detach().double().cpu().numpy(), list(ranks))
+        none = points.new_zeros(0, len(ranks))
+        return none, none.long()
+    tree = KDTree(positions.detach().double().cpu().numpy())
+    distances, rows = tree.query(points.detach().double().cpu().numpy(), ranks)
     return torch.from_numpy(distances).square().to(points), torch.from_numpy(rows).to(points.device)
 
 
 class TimeOffsets(nn.Module):
     """Learned corrections of the times that are written beside images: from these to times of the motion.
 
-    T training times are each off by ``off`` (T, 1), in units of their mean distance; times in between are
+    T training times are each off by ``values`` (T, 1), in units of their mean distance; times in between are
     interpolated linearly. Published sequences hold their first image twice, leave one out before the last,
     or round their times. A smooth motion cannot fit such times; the error then shows as a wrong depth, which
     one image cannot tell.
 
     Args:
         times: distinct, two or more.
-        most: bound of ``off``; of few times less, so that none is off by more than a fifth of all time.
+        most: bound of ``values``; of few times less, so that none is off by more than a fifth of all time.
     """
 
     def __init__(self, times: Sequence[float], most: float) -> None:
@@ -65,14 +63,7 @@ class TimeOffsets(nn.Module):
         self.step = (self.times[-1] - self.times[0]) / (len(times) - 1)
         self.most = min(most, _FARTHEST / self.step)
         self.learns = True
-        self.off = nn.Parameter(torch.zeros(len(times), 1))
-
-    @classmethod
-    def of(cls, motion: str, times: Sequence[float], most: float) -> TimeOffsets | None:
-        """Make the offsets of a motion; None if ``most`` is 0, of fewer than 8 times, and of cosines, which
-        are exactly 0 at the canonical time.
-        """
-        return cls(times, most) if most and motion == "spline" and len(times) >= _FEWEST_TIMES else None
+        self.values = nn.Parameter(torch.zeros(len(times), 1))
 
     def weights(self, time: float) -> dict[int, float]:
         """Return the rows of the one or two training times around a time, each with its weight.
@@ -89,12 +80,12 @@ class TimeOffsets(nn.Module):
 
     def __call__(self, time: float) -> float:
         """Return the time of the motion, up to ``most`` steps beyond [0, 1]."""
-        off = sum(weight * self.off.detach()[row].item() for row, weight in self.weights(time).items())
+        off = sum(weight * self.values.detach()[row].item() for row, weight in self.weights(time).items())
         return time + self.step * min(max(off, -self.most), self.most)
 
     def gradients(self, time: float, by_motion_time: float) -> Tensor:
-        """Return the gradients by ``off``, given the one by the time of the motion."""
-        gradients = torch.zeros_like(self.off)
+        """Return the gradients by ``values``, given the one by the time of the motion."""
+        gradients = torch.zeros_like(self.values)
         for row, weight in self.weights(time).items():
             gradients[row] = weight * self.step * by_motion_time
         return gradients
@@ -105,141 +96,141 @@ class TimeOffsets(nn.Module):
 
         A time's images count once in about T steps, so that a step draws by a T-th of a share of the rate.
         """
-        size = (self.off.abs() - _PULL * rate / len(self.times)).clamp(0.0, self.most)
-        self.off.copy_(size * self.off.sign())
+        size = (self.values.abs() - _PULL * rate / len(self.times)).clamp(0.0, self.most)
+        self.values.copy_(size * self.values.sign())
 
 
 class Nodes(nn.Module):
-    """M nodes: rest ``places`` (M, 3), and coefficients (M, K, 3) of ``shift`` (world units) and of ``turn``
-    (Gibbs vectors), None where nodes do not turn.
+    """M nodes at rest ``positions`` (M, 3), each with a curve of translations and of rotations over time.
+
+    Parameters are the curves' coefficients (M, K, 3): ``translations`` in world units, and ``rotations`` as
+    Gibbs vectors, None where nodes do not rotate.
 
     Args:
         points: (N, 3) canonical points that are to move; None: a checkpoint will say.
         count: number of nodes.
         curve: the curve of every node.
-        offsets: learned corrections of the images' times; None: times are used as they are given.
-        turns: whether nodes turn.
-        rests: whether nodes may ``stop``; ``still`` (M,) bool says which have.
+        time_offsets: learned corrections of the images' times; None: times are used as they are given.
+        rotates: whether nodes rotate.
+        rests: whether nodes may ``stop``; ``stopped`` (M,) bool says which have.
         edges: neighbours that a node is kept rigid with.
     """
 
-    ROWS = ("places", "edges", "edge_weights", "spread", "still", "shift", "turn")
+    ROWS = ("positions", "edges", "edge_weights", "spacing", "stopped", "translations", "rotations")
 
     def __init__(
         self,
         points: Tensor | None,
         count: int,
         curve: Curve,
-        offsets: TimeOffsets | None = None,
+        time_offsets: TimeOffsets | None = None,
         *,
-        turns: bool = True,
+        rotates: bool = True,
         rests: bool = False,
         edges: int = 6,
     ) -> None:
         super().__init__()
-        self.curve, self.offsets = curve, offsets
-        places = torch.zeros(1, 3) if points is None else points[far_apart(points, count)].clone()
-        self.register_buffer("places", places)
-        squared, neighbours = nearest(places, places, edges + 1)
+        self.curve, self.time_offsets = curve, time_offsets
+        positions = torch.zeros(1, 3) if points is None else points[far_apart(points, count)].clone()
+        count = len(positions)
+        squared, neighbours = nearest(positions, positions, edges + 1)
         squared, neighbours = squared[:, 1:], neighbours[:, 1:]  # the nearest is the node itself
         unit = squared.mean() if squared.numel() else torch.tensor(1.0)
         padded = squared + 1e-3 * unit
         stiffness = (padded > _LEAST) / padded.clamp(min=_LEAST)
+        spacing = squared[:, :3].sqrt().mean(-1) if squared.shape[1] else torch.ones(count)
+        self.translations = nn.Parameter(torch.zeros(count, curve.count, 3))
+        self.rotations = nn.Parameter(torch.zeros(count, curve.count, 3)) if rotates else None
+        self.register_buffer("positions", positions)
         self.register_buffer("edges", neighbours.contiguous())
         self.register_buffer("edge_weights", stiffness / max(neighbours.numel(), 1))
-        spread = squared[:, :3].sqrt().mean(-1) if squared.shape[1] else torch.ones(len(places))
-        self.register_buffer("spread", spread.clamp(min=1e-6 * max(float(unit), _LEAST) ** 0.5))
-        self.shift = nn.Parameter(torch.zeros(len(places), curve.count, 3))
-        self.turn = nn.Parameter(torch.zeros(len(places), curve.count, 3)) if turns else None
-        self.register_buffer("seen", torch.tensor([curve.canonical_time] * 2))
-        self.register_buffer("still", torch.zeros(len(places), dtype=torch.bool) if rests else None)
-
-    def __len__(self) -> int:
-        return len(self.places)
+        self.register_buffer("spacing", spacing.clamp(min=1e-6 * max(float(unit), _LEAST) ** 0.5))
+        self.register_buffer("stopped", torch.zeros(count, dtype=torch.bool) if rests else None)
+        self.register_buffer("seen_times", torch.tensor([curve.canonical_time] * 2))  # from, to
 
     def links(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Return the nodes that points (N, 3) follow: rows (N, L) int32, and their shares (N, L).
 
         ``exp(-(d^2 - d_min^2) / (2 s^2))``, normalised, s the mean distance of a node to its nearest three.
         """
-        squared, rows = nearest(points, self.places, LINKS)
-        shares = torch.exp(-(squared - squared[:, :1]) / (2 * self.spread[rows] ** 2))
+        squared, rows = nearest(points, self.positions, LINKS)
+        shares = torch.exp(-(squared - squared[:, :1]) / (2 * self.spacing[rows] ** 2))
         return rows.int(), (shares / shares.sum(-1, keepdim=True)).contiguous()
 
-    def taken(self, time: float) -> float:
+    def motion_time(self, time: float) -> float:
         """Return the time of the motion that an image of a given time shows."""
-        return time if self.offsets is None else self.offsets(time)
+        return time if self.time_offsets is None else self.time_offsets(time)
 
     def basis(self, time: float) -> Tensor:
         """Return the curve's basis (K,) at a given time."""
-        return self.basis_of_motion((self.taken(time), 1.0))
+        return self.summed_basis((self.motion_time(time), 1.0))
 
-    def basis_of_motion(self, *parts: tuple[float, float]) -> Tensor:
+    def summed_basis(self, *parts: tuple[float, float]) -> Tensor:
         """Return the sum of the curve's bases (K,) at times of the motion, each with its factor."""
-        return self.curve.summed(parts, 0.0 if self.offsets is None else _BEYOND).to(self.places)
+        return self.curve.summed(parts, 0.0 if self.time_offsets is None else _BEYOND).to(self.positions)
 
-    def carried(self, basis: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the motion of nodes (M, 6) for a curve's basis (K,), and their maps (M, 12)."""
-        return carry_nodes(self.shift, self.turn, basis, self.places)
+    def motion_and_maps(self, basis: Tensor) -> tuple[Tensor, Tensor]:
+        """Return translations and rotations (M, 6) for a curve's basis (K,), and the nodes' maps (M, 12)."""
+        return carry_nodes(self.translations, self.rotations, basis, self.positions)
 
     def maps(self, time: float) -> Tensor:
-        """Return ``ops.nodes.node_maps`` (M, 12) at a time."""
-        return self.carried(self.basis(time))[1]
+        """Return the nodes' maps (M, 12) at a given time; see ``ops.nodes.node_maps``."""
+        return self.motion_and_maps(self.basis(time))[1]
 
     def param_groups(self) -> dict[str, list[nn.Parameter]]:
         """Return what is learned, by the name of its learning rate."""
-        off = None if self.offsets is None else self.offsets.off
-        groups = {"shifts": self.shift, "node_turns": self.turn, "time_offsets": off}
-        return {name: [parameter] for name, parameter in groups.items() if parameter is not None}
+        groups = {"node_translations": [self.translations]}
+        if self.rotations is not None:
+            groups["node_rotations"] = [self.rotations]
+        if self.time_offsets is not None:
+            groups["time_offsets"] = [self.time_offsets.values]
+        return groups
 
     def _coefficients(self) -> list[nn.Parameter]:
-        return [self.shift] if self.turn is None else [self.shift, self.turn]
+        return [self.translations] if self.rotations is None else [self.translations, self.rotations]
 
     @torch.no_grad()
-    def look_ahead(self, motion_time: float) -> None:
+    def extend(self, motion_time: float) -> None:
         """Note that a time of the motion is seen, and continue curves beyond those seen so far: a knot beyond
         them starts as a damped continuation of the two before it.
         """
-        motion_time, (first, last) = min(max(motion_time, 0.0), 1.0), self.seen.tolist()
+        motion_time, (first, last) = min(max(motion_time, 0.0), 1.0), self.seen_times.tolist()
         if first <= motion_time <= last:
             return
         reach = self.curve.reach()
         if reach is None:
             return
-        self.seen[0], self.seen[1] = min(motion_time, first), max(motion_time, last)
-        count = len(reach)
+        self.seen_times[0], self.seen_times[1] = min(motion_time, first), max(motion_time, last)
         slack = _FULL * float(reach[0, 1] - reach[0, 0])
-        after = (reach[:, 0] > float(self.seen[1]) - slack).nonzero()[:, 0].tolist()
-        before = (reach[:, 1] < float(self.seen[0]) + slack).nonzero()[:, 0].tolist()
+        after = (reach[:, 0] > float(self.seen_times[1]) - slack).nonzero()[:, 0].tolist()
+        before = (reach[:, 1] < float(self.seen_times[0]) + slack).nonzero()[:, 0].tolist()
         for value in self._coefficients():
             for knots, step in ((after, -1), (before[::-1], 1)):
                 for j in knots:
                     near, far = j + step, j + 2 * step
-                    if 0 <= far < count:
+                    if 0 <= far < len(reach):
                         value[:, j] = value[:, near] + _DAMP * (value[:, near] - value[:, far])
 
-    def _bases(self, times: list[float]) -> Tensor:
-        return torch.stack([self.basis(time) for time in times])
-
     @torch.no_grad()
-    def reach_of(self, times: list[float]) -> Tensor:
+    def motion_range(self, times: list[float]) -> Tensor:
         """Return how far each node takes what is beside it (M,) from its mean place, world units."""
-        distance = torch.zeros(len(self.places)).to(self.places)
-        # A Gibbs vector is half the angle, and what turns lies about ``spread`` from the node.
-        for value, arm in zip(self._coefficients(), (1.0, 2 * self.spread)):
-            went = torch.einsum("mkc,tk->tmc", value, self._bases(times))
+        bases = torch.stack([self.basis(time) for time in times])
+        distance = torch.zeros_like(self.spacing)
+        # A Gibbs vector is half the angle, and what rotates lies about ``spacing`` from the node.
+        for value, arm in zip(self._coefficients(), (1.0, 2 * self.spacing)):
+            went = torch.einsum("mkc,tk->tmc", value, bases)
             distance += arm * (went - went.mean(0)).norm(dim=-1).amax(0)
         return distance
 
     @torch.no_grad()
     def stop(self, which: Tensor, times: list[float]) -> None:
-        """Let nodes (M,) bool stay where they were, and as they were turned, on average over some times.
+        """Let nodes (M,) bool stay where they were, and as they were rotated, on average over some times.
 
         Cosines are 0 at the canonical time, so that with these nodes stay where they are then.
         """
-        which = which & ~self.still
-        self.still |= which
-        mean = self._bases(times).mean(0)
+        which = which & ~self.stopped
+        self.stopped |= which
+        mean = torch.stack([self.basis(time) for time in times]).mean(0)
         for value in self._coefficients():
             stays = torch.einsum("mkc,k->mc", value[which], mean)
             value[which] = stays[:, None] if self.curve.kind == "spline" else 0.0
@@ -248,24 +239,20 @@ class Nodes(nn.Module):
         """Return the names of what has a row for each node."""
         return [name for name in self.ROWS if getattr(self, name) is not None]
 
-    def misfit(self, state: Mapping[str, Tensor], prefix: str, links: Tensor) -> str | None:
+    def misfit(self, state: Mapping[str, Tensor], prefix: str) -> str | None:
         """Name an entry of a stored state that contradicts the others; None where all is well.
 
-        All have as many rows as there are places, and nothing points at a node that there is not.
+        All have as many rows as there are positions, and no edge points at a node that there is not.
         """
-        count = len(state[prefix + "places"])
+        count, edges = len(state[prefix + "positions"]), state[prefix + "edges"]
         for name in self.rows():
             here, stored = getattr(self, name), state[prefix + name]
             free = 2 if name in ("edges", "edge_weights") else 1  # few nodes have few neighbours
             fits = stored.dtype == here.dtype and stored.dim() == here.dim() and len(stored) == count
             if not fits or stored.shape[free:] != here.shape[free:]:
                 return prefix + name
-        if state[prefix + "edges"].shape != state[prefix + "edge_weights"].shape:
-            return prefix + "edges"
-        for name, rows in ((prefix + "edges", state[prefix + "edges"]), ("skin.links", links)):
-            if rows.numel() and not 0 <= int(rows.min()) <= int(rows.max()) < count:
-                return name
-        return None
+        same = edges.shape == state[prefix + "edge_weights"].shape
+        return None if same and are_rows(edges, count) else prefix + "edges"
 
     def _load_from_state_dict(self, state, prefix, *args, **kwargs) -> None:
         for name in self.rows():  # a checkpoint says how many nodes there are
@@ -274,7 +261,7 @@ class Nodes(nn.Module):
                 here.data = here.data.new_empty(state[prefix + name].shape)
         super()._load_from_state_dict(state, prefix, *args, **kwargs)
 
-    def spread_over_time(
+    def backward(
         self, time: float, motion_time: float, basis: Tensor, by_motion: Tensor, factor: float, unit: float
     ) -> tuple[float, dict[str, Tensor]]:
         """Carry gradients by the motion at a time to the coefficients and time offsets; keep curves smooth.
@@ -290,52 +277,59 @@ class Nodes(nn.Module):
             unit: a length, world units.
 
         Returns:
-            the mean of the squared second differences, and gradients by name.
+            the mean of the squared second differences, and gradients by the parameters' names.
         """
         bend = self._second_difference(motion_time) if factor else torch.zeros_like(basis)
-        *gradients, bent = spread_nodes(self.shift, self.turn, by_motion, basis, bend, factor, unit)
-        if self.still is not None and bool(self.still.any()):
+        *gradients, bent = spread_nodes(
+            self.translations, self.rotations, by_motion, basis, bend, factor, unit
+        )
+        if self.stopped is not None and bool(self.stopped.any()):
             for gradient in gradients:
                 if gradient is not None:
-                    gradient[self.still] = 0.0  # rounding errors would be steps, as Adam takes them
-        if self.offsets is not None and self.offsets.learns:
+                    gradient[self.stopped] = 0.0  # rounding errors would be steps, as Adam takes them
+        if self.time_offsets is not None and self.time_offsets.learns:
             late, early = motion_time + _HALF_STEP, motion_time - _HALF_STEP
-            along = self.basis_of_motion((late, 0.5 / _HALF_STEP), (early, -0.5 / _HALF_STEP))
-            by_time = (self.carried(along)[0].detach() * by_motion).sum().item()
-            gradients.append(self.offsets.gradients(time, by_time))
-        names = ("nodes.shift", "nodes.turn", "nodes.offsets.off")
+            velocity = self.summed_basis((late, 0.5 / _HALF_STEP), (early, -0.5 / _HALF_STEP))
+            by_time = (self.motion_and_maps(velocity)[0].detach() * by_motion).sum().item()
+            gradients.append(self.time_offsets.gradients(time, by_time))
+        names = ("nodes.translations", "nodes.rotations", "nodes.time_offsets.values")
         return bent, {name: value for name, value in zip(names, gradients) if value is not None}
 
     def _second_difference(self, motion_time: float) -> Tensor:
         """Return the second difference (K,) of the basis around a time of the motion, within those seen."""
-        step, (low, high) = 1 / max(self.curve.pieces, 2), self.seen.tolist()
+        step, (low, high) = 1 / max(self.curve.pieces, 2), self.seen_times.tolist()
         low, high = low + step, high - step
         if low > high:
-            return self.places.new_zeros(self.curve.count)
+            return self.positions.new_zeros(self.curve.count)
         middle = min(max(motion_time, low), high)
         before, after = max(middle - step, 0.0), min(middle + step, 1.0)
-        return self.basis_of_motion((after, 1.0), (middle, -2.0), (before, 1.0))
+        return self.summed_basis((after, 1.0), (middle, -2.0), (before, 1.0))
 
 
-class Skin(nn.Module):
+def are_rows(indices: Tensor, count: int) -> bool:
+    """Return whether all indices are of ``count`` rows: kernels do not check them."""
+    return not indices.numel() or 0 <= int(indices.min()) <= int(indices.max()) < count
+
+
+class Skinning(nn.Module):
     """N particles follow up to L nodes each: ``links`` (N, L) int32, by ``weights`` that sum to 1.
 
-    A weight is that of the distance, ``shares`` (N, L), times ``exp(learned)``: what lies beside two parts
+    A weight is that of the distance, ``shares`` (N, L), times ``exp(logits)``: what lies beside two parts
     that move apart learns which of them it belongs to. A particle at rest has the shares 0, and follows none.
     """
 
-    ROWS = ("skin.links", "skin.shares", "skin.learned")
+    ROWS = ("skinning.links", "skinning.shares", "skinning.logits")
 
     def __init__(self, nodes: Nodes, points: Tensor) -> None:
         super().__init__()
         links, shares = nodes.links(points)
+        self.logits = nn.Parameter(torch.zeros_like(shares))
         self.register_buffer("links", links)
         self.register_buffer("shares", shares)
-        self.learned = nn.Parameter(torch.zeros_like(shares))
 
     def weights(self) -> Tensor:
-        """Return the weights (N, L), differentiable in ``learned``."""
-        return skin_weights(self.shares, self.learned)
+        """Return the weights (N, L), differentiable in ``logits``."""
+        return skin_weights(self.shares, self.logits)
 
     @torch.no_grad()
     def relink(self, nodes: Nodes, points: Tensor, optimizer: torch.optim.Optimizer) -> None:
@@ -344,15 +338,15 @@ class Skin(nn.Module):
         What was learned of those that stay is kept, with its moments: as factors of the shares, so that one
         that comes anew begins with its share.
         """
-        level = (self.learned + self.shares.log()).logsumexp(-1, keepdim=True).nan_to_num(neginf=0.0)
-        old_links, old_factors = self.links, self.learned - level
+        level = (self.logits + self.shares.log()).logsumexp(-1, keepdim=True).nan_to_num(neginf=0.0)
+        old_links, old_logits = self.links, self.logits - level
         self.links, self.shares = nodes.links(points)
         stays = self.links[:, :, None] == old_links[:, None]
-        self.learned.copy_((stays * old_factors[:, None]).sum(-1))
-        moments = optimizer.state.get(self.learned, {})
+        self.logits.copy_((stays * old_logits[:, None]).sum(-1))
+        moments = optimizer.state.get(self.logits, {})
         for name in {"exp_avg", "exp_avg_sq"} & moments.keys():
             moments[name] = (stays * moments[name][:, None]).sum(-1)
 
-    def let_go(self, which: Tensor) -> None:
+    def release(self, which: Tensor) -> None:
         """Let particles (N,) bool follow no node."""
         self.shares[which] = 0.0

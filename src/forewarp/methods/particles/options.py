@@ -21,12 +21,12 @@ NARROW = 15.0  # degrees between the most different cameras below which directio
 AT_REST = 0.1  # least share of particles at rest for the background to be worth having
 HARM = 0.2  # dB from which on the background costs too much
 HOPELESS = 0.5  # of ``AT_REST``: so little at rest with one seed is little with all
-RATES = {"means": 8e-3, "shade": 1e-3}  # learning rates of a trial
+RATES = {"means": 8e-3, "sh": 1e-3}  # learning rates of a trial
 
 
 @dataclass(frozen=True)
 class Effects:
-    """The choice of each effect; None: off.
+    """The choice of each effect; None: off. Defaults are those of cut-out images.
 
     Args:
         motion: the curves of the nodes, ``spline`` or ``cosines``.
@@ -41,32 +41,20 @@ class Effects:
         ValueError: naming the key of a choice that there is not.
     """
 
-    motion: str | None = None
-    rotation: bool | None = None
-    view_dependence: int | None = None
-    color_over_time: int | None = None
+    motion: str | None = "spline"
+    rotation: bool | None = True
+    view_dependence: int | None = 1
+    color_over_time: int | None = 2
     opacity_over_time: int | None = None
-    background: float | None = None
+    background: float | None = 0.03
 
     def __post_init__(self) -> None:
         for name, expected, valid in (
             ("motion", " or ".join(KINDS), lambda choice: choice in KINDS),
             ("rotation", "true", lambda choice: choice is True),
-            (
-                "view_dependence",
-                "a degree of 1 to 3",
-                lambda choice: type(choice) is int and 1 <= choice <= 3,
-            ),
-            (
-                "color_over_time",
-                "a number of cosines >= 1",
-                lambda choice: type(choice) is int and choice >= 1,
-            ),
-            (
-                "opacity_over_time",
-                "a number of cosines >= 1",
-                lambda choice: type(choice) is int and choice >= 1,
-            ),
+            ("view_dependence", "a degree of 1 to 3", lambda choice: _is_count(choice) and choice <= 3),
+            ("color_over_time", "a number of cosines >= 1", _is_count),
+            ("opacity_over_time", "a number of cosines >= 1", _is_count),
             ("background", "a number > 0", lambda choice: is_number(choice) and choice > 0),
         ):
             choice = getattr(self, name)
@@ -87,6 +75,10 @@ class Effects:
 NAMES = tuple(field.name for field in fields(Effects))
 
 
+def _is_count(choice: object) -> bool:
+    return type(choice) is int and choice >= 1
+
+
 def view_share(views: int) -> float:
     """Return how much so many training images tell of details, as a share in [0, 1] of a hundred's."""
     return min(1.0, views / _VIEWS)
@@ -98,26 +90,23 @@ class Numbers:
 
     Args:
         effects: those of the model's effects that the stage uses; one that only shapes particles uses none.
-        density: particles there are in the end, times the square root of the pixels that show anything; of
-            less than a hundred images, of their share of these pixels.
-        first: share of them to begin with.
-        full: share of them that this stage ends with.
-        nodes: how many there are, times the square root of the particles at the beginning.
-        knots: coefficients of each node's curve, times the square root of the times.
-        straight: whether splines end without acceleration: two coefficients follow from the others.
+        density: number of particles in the end, divided by the square root of the covered pixels (those that
+            show anything); of less than a hundred images, by that of their share of these pixels.
+        initial_share, final_share: shares of that number that the stage begins and ends with.
+        nodes: number of nodes, divided by the square root of the number of particles at the beginning.
+        knots: coefficients of each node's curve, divided by the square root of the number of times.
+        natural_splines: whether splines end without acceleration: two coefficients follow from the others.
         edges: neighbours that a node is kept rigid with.
-        every: share between two rounds of density control, up to ``settled``.
+        density_interval: share between two rounds of density control, up to ``density_until``.
         relink: rounds after which particles look again for the nodes beside them.
-        rest: share from which nodes that do not move come to rest, where the model has a background.
-        jitter, calm: deviation of the random shift of an image's time, which falls to 0 at the share
-            ``calm``.
+        rest_from: share from which nodes that do not move come to rest, where the model has a background.
+        jitter: deviation of the random shift of an image's time, which falls to 0 at ``jitter_until``.
         time_offsets: largest learned correction of an image's time, times the mean distance of two training
-            times; learned from ``calm`` on, of splines alone; 0: times are used as they are given.
+            times; learned from ``jitter_until`` on, of splines alone; 0: times are used as they are given.
         opacity_decay: share of their opacity that a step takes from the particles that its image shows, while
             the learning rate of opacity is its first; as that falls, so does the share.
-        crowd_decay: extra opacity decay per step, scaled by ``max(0, 1 - covered_pixels /
-            final_particle_count)``.
-        loose: what is left of the weight of ``rigid`` at the end.
+        crowd_decay: extra opacity decay per step, scaled by ``max(0, 1 - covered_pixels / final_count)``.
+        rigid_final_factor: factor that the weight of ``rigid`` falls to by the end.
         name: name of the stage.
 
     Raises:
@@ -126,22 +115,22 @@ class Numbers:
 
     effects: Sequence[str] = NAMES
     density: float = 90.0
-    first: float = 0.5
-    full: float = 1.0
+    initial_share: float = 0.5
+    final_share: float = 1.0
     nodes: float = 2.5
     knots: float = 2.2
-    straight: bool = False
+    natural_splines: bool = True
     edges: int = 6
-    every: float = 0.01
-    settled: float = 0.6
+    density_interval: float = 0.01
+    density_until: float = 0.6
     relink: int = 5
-    rest: float = 0.45
+    rest_from: float = 0.45
     jitter: float = 0.01
-    calm: float = 0.4
-    time_offsets: float = 0.0
+    jitter_until: float = 0.4
+    time_offsets: float = 1.5
     opacity_decay: float = 0.0
-    crowd_decay: float = 0.0
-    loose: float = 0.17
+    crowd_decay: float = 2.5e-3
+    rigid_final_factor: float = 0.17
     name: str = "fine"
 
     def __post_init__(self) -> None:
@@ -150,42 +139,48 @@ class Numbers:
             raise ValueError(
                 f"{where}.effects: expected some of {', '.join(NAMES)}, but got {list(self.effects)}"
             )
-        if not isinstance(self.straight, bool):
-            raise ValueError(f"{where}.straight: expected true or false, but got {self.straight!r}")
+        if not isinstance(self.natural_splines, bool):
+            raise ValueError(
+                f"{where}.natural_splines: expected true or false, but got {self.natural_splines!r}"
+            )
+        shares = "initial_share", "final_share", "density_interval", "rigid_final_factor"
         for keys, expected, valid in (
-            (("first", "every", "loose", "full"), "a number in (0, 1]", lambda value: 0 < value <= 1),
-            (("density", "nodes", "knots", "calm"), "a number > 0", lambda value: value > 0),
+            (shares, "a number in (0, 1]", lambda value: 0 < value <= 1),
+            (("density", "nodes", "knots", "jitter_until"), "a number > 0", lambda value: value > 0),
             (("edges", "relink"), "a whole number >= 1", lambda value: value >= 1 and value == int(value)),
             (("opacity_decay", "crowd_decay"), "a number in [0, 1)", lambda value: 0 <= value < 1),
-            (("jitter", "settled", "rest", "time_offsets"), "a number >= 0", lambda value: value >= 0),
+            (
+                ("density_until", "rest_from", "jitter", "time_offsets"),
+                "a number >= 0",
+                lambda value: value >= 0,
+            ),
         ):
             for key in keys:
                 value = getattr(self, key)
                 if not (is_number(value) and valid(value)):
                     raise ValueError(f"{where}.{key}: expected {expected}, but got {value!r}")
 
-    def most(self, covered: float, views: int) -> int:
-        """Return how many particles there are in the end, by covered pixels and training images.
+    def final_count(self, covered_pixels: float, views: int) -> int:
+        """Return how many particles there are in the end.
 
-        >>> Numbers().most(20_000.0, 100), Numbers().most(20_000.0, 25)
+        >>> Numbers().final_count(20_000.0, 100), Numbers().final_count(20_000.0, 25)
         (12728, 6364)
         """
-        return max(32, round(self.density * math.sqrt(covered * view_share(views))))
+        return max(32, round(self.density * math.sqrt(covered_pixels * view_share(views))))
 
-    def decay(self, most: float, covered: float) -> float:
+    def decay(self, final_count: float, covered_pixels: float) -> float:
         """Return the share of their opacity that a step takes from particles, by how crowded pixels are.
 
-        >>> numbers = Numbers(crowd_decay=2.5e-3)
-        >>> numbers.decay(10_000.0, 20_000.0), numbers.decay(10_000.0, 2000.0)
+        >>> Numbers().decay(10_000.0, 20_000.0), Numbers().decay(10_000.0, 2000.0)
         (0.0, 0.002)
         """
-        crowd = max(0.0, 1 - covered / most)
+        crowd = max(0.0, 1 - covered_pixels / final_count)
         return self.opacity_decay + self.crowd_decay * crowd * (1 - self.opacity_decay)
 
     def share_at(self, progress: float) -> float:
-        """Return the share of all particles that there should be: it grows to ``full`` before ``settled``."""
-        done = min(1.0, progress / max(0.8 * self.settled, 1e-6))
-        return self.full * (self.first + (1 - self.first) * done)
+        """Return the share of ``final_count`` at a progress: it is reached a little before control ends."""
+        done = min(1.0, progress / max(0.8 * self.density_until, 1e-6))
+        return self.final_share * (self.initial_share + (1 - self.initial_share) * done)
 
     def motion(self, particles: int, times: int) -> tuple[int, int]:
         """Return how many nodes there are, and how many coefficients each has.
@@ -202,16 +197,16 @@ STAND_INS = ("opacity_over_time", "color_over_time")  # for motion
 # In the order in which they are left out; but see ``order``.
 EFFECTS = (
     Effect("motion", "spline", attribute="nodes"),
-    Effect("rotation", "nodes", attribute="nodes.turn"),
+    Effect("rotation", "nodes", attribute="nodes.rotations"),
     Effect("background", "still", attribute="resting", rests=True),
-    Effect("opacity_over_time", "cosines", attribute="fade"),
-    Effect("color_over_time", "cosines", attribute="tint"),
-    Effect("view_dependence", "harmonics", attribute="shade"),
+    Effect("opacity_over_time", "cosines"),
+    Effect("color_over_time", "cosines"),
+    Effect("view_dependence", "harmonics", attribute="sh"),
 )
 
 
 class ParticlesEvidence(Evidence):
-    """Evidence that decides the background by what rests, as it makes steps cheaper, not pictures better."""
+    """Evidence that decides the background by what rests, as it makes steps cheaper, not images better."""
 
     def pays(self, effect: str) -> bool | None:
         """Return whether an effect is missed; the background: whether much rests, at hardly any loss."""
@@ -232,10 +227,10 @@ class ParticlesEvidence(Evidence):
 
     def of_trial(self, effect: str) -> str:
         """Describe an effect's trial; the background: how much came to rest, too."""
-        told = super().of_trial(effect)
-        if not told or effect != "background":
-            return told
-        return f"; {self.at_rest.get(effect, 0.0):.1%} at rest, {AT_REST:.0%} asked{told}"
+        trial = super().of_trial(effect)
+        if trial and effect == "background":
+            return f"; {self.at_rest.get(effect, 0.0):.1%} at rest, {AT_REST:.0%} asked{trial}"
+        return trial
 
     def asked_of(self, effect: str) -> str:
         """See ``Evidence``; the background may cost a little."""
@@ -263,17 +258,17 @@ class ParticlesPlanning:
         return [f"stage.{asked.coarse}.effects=[]"], rates
 
     def coarse(self, evidence: Evidence, asked: Asked) -> Generator[Begin | Drop, bool | None, None]:
-        """Begin with every effect that the pictures can show, and leave out one after the other."""
-        seen = {e.name: unseen(e.name, evidence.pictures) is None for e in EFFECTS}
-        on = {name: asked.choose(name) if seen[name] else "none" for name in seen}
+        """Begin with every effect that the images can show, and leave out one after the other."""
+        pictures = evidence.pictures
+        shown = {name: unseen(name, pictures) is None for name in order(pictures)}
+        on = {effect.name: asked.choose(effect.name) if shown[effect.name] else "none" for effect in EFFECTS}
         yield Begin("coarse", _choices(on))
         moves = asked.typed.get("model/motion") != "none"
-        for name in [name for name in order(evidence.pictures) if seen[name] and asked.trials]:
-            if f"model/{name}" in asked.typed or (name in OF_NODES and not moves):
+        for name in shown if asked.trials else ():
+            if not shown[name] or f"model/{name}" in asked.typed or (name in OF_NODES and not moves):
                 continue
             off = (name, *OF_NODES) if name == "motion" else (name,)
-            times_longer = longer(name, evidence.pictures)
-            pays = yield Drop(name, _choices(dict.fromkeys(off, "none")), times_longer)
+            pays = yield Drop(name, _choices(dict.fromkeys(off, "none")), longer(name, pictures))
             moves = pays if name == "motion" else moves
 
     def look(
@@ -283,28 +278,26 @@ class ParticlesPlanning:
 
     def decide(self, evidence: Evidence, asked: Asked) -> list[Decision]:
         """Decide on all effects; what the user typed wins."""
-        found: dict[str, Decision] = {}
+        decisions: dict[str, Decision] = {}
         for effect in EFFECTS:
             name, why = effect.name, unseen(effect.name, evidence.pictures)
-            if name in OF_NODES and not found["motion"].on:
+            if name in OF_NODES and not decisions["motion"].on:
                 why = "0 nodes: nothing moves"
-            pays = why is None and self._called(name, evidence)
+            called_for = why is None and self._called_for(name, evidence)
             typed = asked.typed.get(effect.group)
-            choice = typed or (asked.choose(name) if pays else effect.off)
+            choice = typed or (asked.choose(name) if called_for else effect.off)
             why = ("as typed; " if typed else "") + (why or _because(name, evidence))
-            found[name] = Decision(
-                name, choice, () if typed else _choices({name: choice}), why, choice != effect.off
-            )
-        return list(found.values())
+            overrides = () if typed else _choices({name: choice})
+            decisions[name] = Decision(name, choice, overrides, why, choice != effect.off)
+        return list(decisions.values())
 
-    def _called(self, name: str, evidence: Evidence) -> bool:
+    def _called_for(self, name: str, evidence: Evidence) -> bool:
         """Return what the trials say. Without trials nodes move and turn unless silhouettes deny it, and come
-        to rest where pictures are cut out.
+        to rest where images are cut out.
         """
-        pays = evidence.pays(name)
+        pays, cut_out = evidence.pays(name), evidence.pictures.cut_out >= CUT_OUT
         if pays is not None:
             return pays
-        cut_out = evidence.pictures.cut_out >= CUT_OUT
         moves = not cut_out or evidence.pictures.disagreement > DISAGREEMENT
         return moves and (name in ("motion", "rotation") or (name == "background" and cut_out))
 
@@ -316,9 +309,7 @@ def order(pictures: Survey) -> list[str]:
     time, and fading in and out mimics it. (In the room motion gains 0.8 dB with them, 4 dB without.)
     """
     names = [effect.name for effect in EFFECTS]
-    if pictures.cut_out >= CUT_OUT:
-        return names
-    return [*STAND_INS, *(name for name in names if name not in STAND_INS)]
+    return names if pictures.cut_out >= CUT_OUT else sorted(names, key=lambda name: name not in STAND_INS)
 
 
 def longer(name: str, pictures: Survey) -> int:
@@ -335,7 +326,7 @@ def longer(name: str, pictures: Survey) -> int:
 
 
 def unseen(name: str, pictures: Survey) -> str | None:
-    """Say why pictures cannot show an effect; None if they can."""
+    """Say why images cannot show an effect; None if they can."""
     if name == "view_dependence":
         why = f"all cameras lie within {pictures.spread:.0f} degrees: direction is not seen"
         return why if pictures.spread < NARROW else None
@@ -343,13 +334,13 @@ def unseen(name: str, pictures: Survey) -> str | None:
 
 
 def _because(name: str, evidence: Evidence) -> str:
-    pictures = evidence.pictures
+    pictures, trial = evidence.pictures, evidence.of_trial(name)
     if name != "motion":
-        return evidence.of_trial(name)[2:] or f"{pictures.times} times, and no trial"
+        return trial[2:] or f"{pictures.times} times, and no trial"
     why = f"{pictures.times} times"
     if pictures.cut_out >= CUT_OUT:
         why += f"; silhouettes: a static shape explains all but {pictures.disagreement:.1%} of the foreground"
-    return why + evidence.of_trial(name)
+    return why + trial
 
 
 def _choices(choices: dict[str, str]) -> tuple[str, ...]:

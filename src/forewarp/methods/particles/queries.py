@@ -36,8 +36,8 @@ def matter(self: Particles) -> Cloud:
     """See ``HasMatter``: the particles of which there is anything to see, at the canonical time."""
     keep = _visible(self)
     points = moved(self.means.data, self.warp(self.canonical_time))[0]
-    colors = (0.5 + FLAT * self.color.data[keep, 0]).clamp(0, 1)
-    size = 2 * float(self.log_scales.exp().mean())
+    colors = (0.5 + FLAT * self.colors.data[keep, 0]).clamp(0, 1)
+    size = 2 * float(self.scales.exp().mean())
     return Cloud(points[keep], colors, torch.sigmoid(self.opacity.data[keep, 0]), max(size, 1e-9))
 
 
@@ -46,21 +46,21 @@ def ellipsoids(self: Particles, time: float) -> Ellipsoids:
     """See ``HasEllipsoids``: all particles, also those at rest and those that have faded."""
     canonical = template(self)
     centers, linear = moved(canonical.centers, self.warp(time))
-    color_basis, opacity_basis = self.over_time(time)
+    color_basis, opacity_basis = self.time_bases(time)
     harmonics, opacity = canonical.harmonics, self.opacity[:, 0]
-    if self.tint is not None:
+    if self.color_over_time is not None:
         harmonics = harmonics.clone()
-        harmonics[:, 0] += torch.einsum("t,ntc->nc", color_basis, self.tint) / FLAT
-    if self.fade is not None:
-        opacity = opacity + self.fade @ opacity_basis[1:]
+        harmonics[:, 0] += torch.einsum("t,ntc->nc", color_basis, self.color_over_time) / FLAT
+    if self.opacity_over_time is not None:
+        opacity = opacity + self.opacity_over_time @ opacity_basis[1:]
     return Ellipsoids(centers, linear @ canonical.roots, torch.sigmoid(opacity), harmonics)
 
 
 @torch.no_grad()
 def template(self: Particles) -> Ellipsoids:
     """See ``HasEllipsoids``: before any motion; nodes move it a little at the canonical time, too."""
-    roots = rotations(self.turns) * self.log_scales.exp()[:, None]
-    harmonics = self.color if self.shade is None else torch.cat([self.color, self.shade], 1)
+    roots = rotations(self.quaternions) * self.scales.exp()[:, None]
+    harmonics = self.colors if self.sh is None else torch.cat([self.colors, self.sh], 1)
     return Ellipsoids(self.means.data, roots, torch.sigmoid(self.opacity[:, 0]), harmonics.data)
 
 
@@ -78,16 +78,18 @@ def movement(self: Particles, times: Sequence[float]) -> dict[str, Tensor]:
         nodes, warps = self.nodes, [self.warp(time) for time in times]
         maps = [torch.cat([w.maps[:, :9].reshape(-1, 3, 3), w.maps[:, 9:, None]], -1) for w in warps]
         parts = {"links": warps[0].links, "weights": warps[0].weights, "maps": torch.stack(maps)}
-        parts |= {"node_places": nodes.places, "node_shift": nodes.shift}
+        parts |= {"node_places": nodes.positions, "node_shift": nodes.translations}
         parts["node_basis"] = torch.stack([nodes.basis(time) for time in times])
-        if nodes.turn is not None:
-            parts["node_turn"] = nodes.turn
-    if self.tint is not None:
-        parts["color_over_time"] = self.tint
-        parts["color_basis"] = self.tint.new_tensor([self.color_basis(time) for time in times])
-    if self.fade is not None:
-        parts["opacity_over_time"] = self.fade
-        parts["opacity_basis"] = self.fade.new_tensor([self.opacity_basis(time) for time in times])
+        if nodes.rotations is not None:
+            parts["node_turn"] = nodes.rotations
+    if self.color_over_time is not None:
+        parts["color_over_time"] = self.color_over_time
+        parts["color_basis"] = self.color_over_time.new_tensor([self.color_basis(time) for time in times])
+    if self.opacity_over_time is not None:
+        parts["opacity_over_time"] = self.opacity_over_time
+        parts["opacity_basis"] = self.opacity_over_time.new_tensor(
+            [self.opacity_basis(time) for time in times]
+        )
     return {name: value.detach() for name, value in parts.items()}
 
 
@@ -98,7 +100,7 @@ def bounds(self: Particles, times: list[float]) -> Box | None:
     if not bool(solid.any()):
         return None
     points = torch.cat([moved(self.means.data, self.warp(time))[0][solid] for time in times])
-    pad = 2 * float(self.log_scales[solid].exp().median()) + 1e-3 * float(self.extent)
+    pad = 2 * float(self.scales[solid].exp().median()) + 1e-3 * float(self.extent)
     low, high = points.amin(0) - pad, points.amax(0) + pad
     return Box(tuple(low.tolist()), tuple(high.tolist()))
 
@@ -116,7 +118,7 @@ def trajectories(self: Particles, points: Tensor, times: Tensor) -> Tensor:
     if self.nodes is None:
         return points[:, None].expand(-1, len(times), -1).clone()
     keep = _visible(self)
-    means, links, weights = self.means.data[keep], self.skin.links[keep], self.skin.weights()[keep]
+    means, links, weights = self.means.data[keep], self.skinning.links[keep], self.skinning.weights()[keep]
 
     def at(time: float) -> tuple[Tensor, Tensor]:
         return moved(means, Warp(self.nodes.maps(time), links, weights))

@@ -154,14 +154,14 @@ def first_values(cloud: Cloud, widest: Tensor | None = None) -> dict[str, Tensor
     size = apart.clamp(0.1 * median, 4 * median)
     if widest is not None:
         size = torch.minimum(size, widest.clamp(min=1e-3 * median))
-    turns = torch.zeros(len(points), 4)
-    turns[:, 0] = 1
+    quaternions = torch.zeros(len(points), 4)
+    quaternions[:, 0] = 1
     return {
         "means": points.clone(),
-        "log_scales": size.log()[:, None].repeat(1, 3),
-        "turns": turns,
+        "scales": size.log()[:, None].repeat(1, 3),
+        "quaternions": quaternions,
         "opacity": torch.zeros(len(points), 1),
-        "color": ((cloud.colors.float() - 0.5) / FLAT)[:, None].clone(),
+        "colors": ((cloud.colors.float() - 0.5) / FLAT)[:, None].clone(),
     }
 
 
