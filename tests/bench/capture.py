@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from forewarp.capture.facts import PICTURE
+from forewarp.capture.pipeline import PICTURE
 from forewarp.data import hypernerf
 from forewarp.data.images import read_image
 from forewarp.data.posed_video import PosedShot, read_scene, write_scene

@@ -1,30 +1,86 @@
 from contextlib import nullcontext
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
+import torch
 
-from forewarp.capture import job, poses
-from forewarp.capture.poses import Search, adjust
+pytest.importorskip("pycolmap", reason="no pycolmap; make install adds it")
 
-pycolmap = pytest.importorskip("pycolmap", reason="no pycolmap; make install adds it")
+import pycolmap
+
+from forewarp.capture import pipeline, poses
+from forewarp.capture.poses import Search, adjust, read_model
+from tests.support.sparse_scene import cameras_on_arc, write_model
+
+POINTS = np.random.default_rng(0).uniform(-1, 1, (40, 3))
+LENS = (0.05, -0.02, 0.001, -0.002)
 
 
-def forget(found, image, numbers):
+@pytest.mark.parametrize(
+    ("model", "lens", "read"),
+    [
+        ("OPENCV", LENS, ((*LENS[:2], 0), LENS[2:])),
+        ("OPENCV", (0, 0, 0, 0), None),
+        ("SIMPLE_RADIAL", LENS, ((LENS[0], 0, 0), (0, 0))),
+    ],
+)
+def test_a_model_is_read_as_it_was_written(tmp_path, model, lens, read):
+    cameras = cameras_on_arc(4, roll=0.1)
+    write_model(tmp_path / "sparse", cameras, POINTS, model, lens)
+    found = read_model(tmp_path / "sparse")
+    assert list(found.cameras) == list(cameras)
+    for name, camera in cameras.items():
+        again = found.cameras[name]
+        torch.testing.assert_close(again.camera_to_world, camera.camera_to_world)
+        for key in ("width", "height", "fx", "fy", "cx", "cy"):
+            assert getattr(again, key) == getattr(camera, key)
+        assert (again.lens and (again.lens.k, again.lens.p)) == read
+    np.testing.assert_allclose(np.sort(found.points, 0), np.sort(POINTS, 0))
+    assert found.colors.tolist() == [[200, 100, 50]] * 40
+    assert len(found.seen) == 4 * 40
+    assert (found.views == 4).all()
+    assert len(found.sure()) == 40
+
+
+def test_cameras_come_in_the_order_of_time_under_our_names(tmp_path):
+    """Of the users' names 1, 2, ... 12 the plain order is 1, 10, 11, 12, 2 ..."""
+    cameras = cameras_on_arc(12)
+    theirs = [f"IMG{n}.jpg" for n in range(1, 13)]
+    write_model(tmp_path / "sparse", dict(zip(theirs, cameras.values())), POINTS)
+    found = read_model(tmp_path / "sparse", dict(zip(cameras, theirs)))
+    assert list(found.cameras) == list(cameras)
+    for name, camera in cameras.items():
+        torch.testing.assert_close(found.cameras[name].camera_to_world, camera.camera_to_world)
+
+
+def test_what_cannot_be_read_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="expected a folder with cameras.bin, images.bin and points3D.bin"):
+        read_model(tmp_path)
+    write_model(tmp_path / "fish", cameras_on_arc(3), POINTS, "OPENCV_FISHEYE", LENS)
+    with pytest.raises(ValueError, match="with k1 k2 k3 p1 p2, as OPENCV, but got OPENCV_FISHEYE; undistort"):
+        read_model(tmp_path / "fish")
+    write_model(tmp_path / "torn", cameras_on_arc(3), POINTS)
+    with pytest.raises(ValueError, match="a picture frame_000002.jpg, as the model has, but got none"):
+        read_model(tmp_path / "torn", {"picture_000001.jpg": "frame_000001.jpg"})
+    (tmp_path / "torn" / "cameras.txt").write_text("1 OPENCV x\n")
+    with pytest.raises(ValueError, match="torn: expected a COLMAP model, but got"):
+        read_model(tmp_path / "torn")
+
+
+def forget(model, image, numbers):
     """Delete what an image sees of some points."""
-    for row, point in enumerate(found.images[image].points2D):
+    for row, point in enumerate(model.images[image].points2D):
         if point.has_point3D() and point.point3D_id in numbers:
-            found.delete_observation(image, row)
+            model.delete_observation(image, row)
 
 
 @pytest.fixture
-def found():
+def model():
     """Six cameras that see sixty points, twenty of which the second half does not see."""
     pycolmap.set_random_seed(0)
-    made = pycolmap.synthesize_dataset(
-        pycolmap.SyntheticDatasetOptions(
-            num_rigs=1, num_cameras_per_rig=1, num_frames_per_rig=6, num_points3D=60
-        )
-    )
+    options = {"num_rigs": 1, "num_cameras_per_rig": 1, "num_frames_per_rig": 6, "num_points3D": 60}
+    made = pycolmap.synthesize_dataset(pycolmap.SyntheticDatasetOptions(**options))
     pycolmap.synthesize_noise(pycolmap.SyntheticNoiseOptions(point2D_stddev=0.3), made)
     for image in made.reg_image_ids()[3:]:
         forget(made, image, sorted(made.points3D)[:20])
@@ -33,35 +89,34 @@ def found():
 
 
 @pytest.mark.parametrize(("poor", "left"), [(None, 40), (0, 60), (5, 40)])
-def test_doubtful_points_stay_for_the_camera_that_needs_them(found, poor, left):
+def test_doubtful_points_stay_for_the_camera_that_needs_them(model, poor, left):
     """A camera that sees fifteen sure points alone keeps its doubtful ones, of which the last has none."""
-    doubtful, sure = sorted(found.points3D)[:20], sorted(found.points3D)[20:]
+    doubtful, sure = sorted(model.points3D)[:20], sorted(model.points3D)[20:]
     if poor is not None:
-        forget(found, found.reg_image_ids()[poor], sure[15:])
-    error, steps = found.compute_mean_reprojection_error(), []
-    assert adjust(found, Search(threads=1), lambda *step: steps.append(step)) == error
+        forget(model, model.reg_image_ids()[poor], sure[15:])
+    error, steps = model.compute_mean_reprojection_error(), []
+    assert adjust(model, Search(threads=1), lambda *step: steps.append(step)) == error
     assert steps == [(0, 1), (1, 1)]
-    assert set(found.points3D) == set(sure + (doubtful if left == 60 else []))
-    assert found.compute_mean_reprojection_error() < 0.6
+    assert set(model.points3D) == set(sure + (doubtful if left == 60 else []))
+    assert model.compute_mean_reprojection_error() < 0.6
 
 
-def test_one_poor_camera_does_not_keep_the_points_of_others(found):
+def test_one_poor_camera_does_not_keep_the_points_of_others(model):
     """The last camera has few points and no doubtful ones; one of the first sees a single doubtful point."""
-    images, doubtful = found.reg_image_ids(), sorted(found.points3D)[:20]
-    forget(found, images[0], doubtful[1:] + sorted(found.points3D)[35:])
-    adjust(found, Search(threads=1), lambda done, total: None)
-    assert set(doubtful) & set(found.points3D) == {doubtful[0]}
+    images, doubtful = model.reg_image_ids(), sorted(model.points3D)[:20]
+    forget(model, images[0], doubtful[1:] + sorted(model.points3D)[35:])
+    adjust(model, Search(threads=1), lambda done, total: None)
+    assert set(doubtful) & set(model.points3D) == {doubtful[0]}
 
 
-def test_the_error_is_kept_for_the_next_call(found, tmp_path, monkeypatch):
-    """It is that of all points, also where the poses are read again."""
-    error = found.compute_mean_reprojection_error()
-    for name, result in (("find_features", None), ("match", None), ("reconstruct", found)):
+def test_the_error_of_all_points_is_kept_for_the_next_call(model, tmp_path, monkeypatch):
+    error = model.compute_mean_reprojection_error()
+    for name, result in (("find_features", None), ("match", None), ("reconstruct", model)):
         monkeypatch.setattr(poses, name, lambda *given, result=result: result)
     for name in ("refuse_matches", "refuse_poses"):
-        monkeypatch.setattr(job, name, lambda *given: None)
-    pictures, quiet = SimpleNamespace(folder=None, masks=None), lambda done, total: None
-    first = job._found(tmp_path, pictures, Search(threads=1), lambda title: nullcontext(quiet))
-    again = job._found(tmp_path, pictures, Search(threads=1), None)
+        monkeypatch.setattr(pipeline, name, lambda *given: None)
+    frames, quiet = SimpleNamespace(folder=None, masks=None), lambda done, total: None
+    first = pipeline.find_poses(tmp_path, frames, Search(threads=1), lambda title: nullcontext(quiet))
+    again = pipeline.find_poses(tmp_path, frames, Search(threads=1), None)
     assert first.error == again.error == error
     assert len(first.points) == len(again.points) == 40

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from forewarp.capture.sparse import Sparse
+from forewarp.capture.poses import Reconstruction
 from forewarp.scene.camera import Camera, look_at
 
 
@@ -24,13 +24,13 @@ def cameras_on_arc(count=12, radius=4.0, degrees=70.0, height=1.2, focal=300.0, 
     return made
 
 
-def sparse_arc(points=400, outliers=0, error=0.5, **options) -> Sparse:
+def sparse_arc(points=400, outliers=0, error=0.5, **options) -> Reconstruction:
     """Points in the cube from -1 to 1, which all cameras see, then outliers thousands away."""
     rng, cameras = np.random.default_rng(0), cameras_on_arc(**options)
     places = np.concatenate([rng.uniform(-1, 1, (points, 3)), 3000 * rng.normal(size=(outliers, 3))])
     grid = np.meshgrid(np.arange(len(cameras)), np.arange(len(places)), indexing="ij")
     seen = np.stack(grid, -1).reshape(-1, 2)
-    return Sparse(
+    return Reconstruction(
         cameras,
         places,
         rng.integers(0, 256, places.shape).astype(np.uint8),

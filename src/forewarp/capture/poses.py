@@ -1,20 +1,155 @@
-"""Structure from motion by pycolmap: features, matches, cameras and points; it goes on from its database."""
+"""Step two of a capture: cameras and points, by pycolmap's structure from motion or from a COLMAP model."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from forewarp.capture.video import Progress
+import numpy as np
+import pycolmap
+import torch
 
-_OVERLAP = 6  # of sequential matching: the next six pictures, and those at 1, 2, 4 ... 512
-_FEW = 40  # pictures of which every pair is matched
-_SIDE = 1600  # pixels of the longer side in which features are looked for
-_LEAST_MODEL = 3
-# The last adjustment: a point's least views and greatest error in pixels, a camera's least points; the error
-# in pixels from which on a match hardly counts.
-_SURE_VIEWS, _SURE_ERROR, _LEAST_POINTS, _LOSS = 4, 1.5, 30, 0.5
-_AT_ONCE, _PAIRS_AT_ONCE = 8, 48  # between two updates of the progress
+from forewarp.capture.frames import Progress
+from forewarp.scene.camera import Camera, Lens
+
+pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value  # print nothing but what ends it
+
+_OVERLAP = 6  # of sequential matching: the next six images, and those at 1, 2, 4 ... 512
+_FEW = 40  # images of which every pair is matched
+_FEATURE_SIDE = 1600  # pixels of the longer side in which features are looked for
+_MIN_MODEL = 3  # images
+_BATCH, _PAIR_BATCH = 8, 48  # images and pairs between two updates of the progress
+# Of the last adjustment: a point is sure from so many views and up to so many pixels of error; a camera keeps
+# its other points if it has fewer sure ones; an error of so many pixels hardly counts.
+_SURE_VIEWS, _SURE_ERROR, _MIN_POINTS, _LOSS_SCALE = 4, 1.5, 30, 0.5
+_START_VIEWS, _START_ERROR = 3, 1.5  # of points that particles begin from
+_PARAMETERS = {"f", "fx", "fy", "cx", "cy", "k", "k1", "k2", "k3", "p1", "p2"}
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """Cameras and points.
+
+    Attributes:
+        cameras: by the image's name, in the order of time, near and far 0.
+        points: (N, 3).
+        colors: (N, 3) uint8.
+        errors: (N,), reprojection errors in pixels.
+        views: (N,), how many images see each point.
+        seen: (M, 2), which camera sees which point.
+        error: mean over all observations, pixels; of a search of ours, before doubtful points were deleted.
+    """
+
+    cameras: dict[str, Camera]
+    points: np.ndarray
+    colors: np.ndarray
+    errors: np.ndarray
+    views: np.ndarray
+    seen: np.ndarray
+    error: float
+
+    @property
+    def centers(self) -> np.ndarray:
+        """Where the cameras are (C, 3)."""
+        return np.stack([np.asarray(camera.center) for camera in self.cameras.values()])
+
+    def distances(self) -> np.ndarray:
+        """From each camera to each point that it sees (M,)."""
+        return np.linalg.norm(self.points[self.seen[:, 1]] - self.centers[self.seen[:, 0]], axis=1)
+
+    def sure(self) -> np.ndarray:
+        """Choose the points (K, 3) that are sure enough to begin with; all, if none is."""
+        sure = (self.views >= _START_VIEWS) & (self.errors <= _START_ERROR)
+        return self.points[sure] if sure.any() else self.points
+
+    def moved(self, rotation: np.ndarray, center: np.ndarray, scale: float) -> Reconstruction:
+        """Map the world by ``X -> scale * rotation @ (X - center)``."""
+        cameras = {}
+        for name, camera in self.cameras.items():
+            pose = camera.camera_to_world.clone()
+            pose[:3, :3] = torch.from_numpy(rotation) @ pose[:3, :3]
+            pose[:3, 3] = torch.from_numpy(scale * rotation @ (np.asarray(camera.center) - center))
+            cameras[name] = replace(camera, camera_to_world=pose)
+        return replace(self, cameras=cameras, points=scale * (self.points - center) @ rotation.T)
+
+    @classmethod
+    def of(cls, model: pycolmap.Reconstruction) -> Reconstruction:
+        """Take cameras and points out of a model of pycolmap's, whose images' names sort by time.
+
+        Raises:
+            ValueError: for a camera model that pinhole cameras with Brown's distortion do not cover.
+        """
+        images = sorted((image for image in model.images.values() if image.has_pose), key=lambda i: i.name)
+        cameras = {image.name: _camera(image) for image in images}
+        points = list(model.points3D.values())
+        number = {image.image_id: row for row, image in enumerate(images)}
+        seen = [
+            (number[element.image_id], row)
+            for row, point in enumerate(points)
+            for element in point.track.elements
+            if element.image_id in number
+        ]
+        return cls(
+            cameras,
+            np.array([p.xyz for p in points]).reshape(-1, 3),
+            np.array([p.color for p in points], dtype=np.uint8).reshape(-1, 3),
+            np.array([p.error for p in points]),
+            np.array([p.track.length() for p in points]),
+            np.unique(np.array(seen, dtype=np.int64).reshape(-1, 2), axis=0),
+            float(model.compute_mean_reprojection_error()) if points else float("nan"),
+        )
+
+
+def _camera(image: pycolmap.Image) -> Camera:
+    camera, pose = image.camera, np.eye(4)
+    names = (name.strip() for name in camera.params_info.split(","))
+    values = dict(zip(names, map(float, camera.params)))
+    beyond = any(value != 0 for name, value in values.items() if name not in _PARAMETERS)
+    if beyond or "FISHEYE" in camera.model_name or not {"f", "fx"} & values.keys():
+        raise ValueError(
+            f"{image.name}: expected a camera model with k1 k2 k3 p1 p2, as OPENCV, but got "
+            f"{camera.model_name}; undistort the pictures (colmap image_undistorter)"
+        )
+    fx, fy = (values.get(name, values.get("f", 0.0)) for name in ("fx", "fy"))
+    k = values.get("k1", values.get("k", 0.0)), values.get("k2", 0.0), values.get("k3", 0.0)
+    p = values.get("p1", 0.0), values.get("p2", 0.0)
+    pose[:3] = image.cam_from_world().inverse().matrix()
+    inner = camera.width, camera.height, fx, fy, values["cx"], values["cy"]
+    return Camera(*inner, torch.from_numpy(pose), 0.0, 0.0, lens=Lens(k, p) if any(k + p) else None)
+
+
+def read_model(folder: Path, originals: Mapping[str, str] | None = None) -> Reconstruction:
+    """Read a COLMAP model, binary or text.
+
+    Args:
+        folder: of the model.
+        originals: names of images in the model by those that they are to have; None: they stay.
+
+    Raises:
+        ValueError: where there is none, or one that cannot be read, or that has other images.
+    """
+    names = "cameras", "images", "points3D"
+    if not any(all((folder / f"{n}.{kind}").is_file() for n in names) for kind in ("bin", "txt")):
+        raise ValueError(
+            f"colmap: expected a folder with cameras.bin, images.bin and points3D.bin (or .txt), but got "
+            f"{folder}; it is often called sparse/0"
+        )
+    try:
+        model = pycolmap.Reconstruction(folder)
+    except (RuntimeError, ValueError, IndexError, OverflowError, MemoryError) as error:
+        text = (str(error).strip().splitlines() or ["a file that cannot be read"])[-1]
+        raise ValueError(f"{folder}: expected a COLMAP model, but got {text}; export it again") from error
+    if originals is not None:
+        ours = {original: name for name, original in originals.items()}
+        unknown = {image.name for image in model.images.values() if image.has_pose} - ours.keys()
+        if unknown:
+            raise ValueError(
+                f"images: expected a picture {min(unknown)}, as the model has, but got none; set images="
+            )
+        for image in model.images.values():
+            image.name = ours.get(image.name, image.name)
+    return Reconstruction.of(model)
 
 
 @dataclass(frozen=True)
@@ -22,9 +157,9 @@ class Search:
     """How poses are searched for.
 
     Args:
-        matching: sequential, exhaustive, or auto, by the number of pictures.
-        lens: pycolmap's name of the camera model that all pictures share.
-        features: most features of a picture.
+        matching: sequential, exhaustive, or auto, by the number of images.
+        lens: pycolmap's name of the camera model that all images share.
+        features: most features of an image.
         seed: of all random choices.
         threads: None: one for each processor.
     """
@@ -36,85 +171,76 @@ class Search:
     threads: int | None = None
 
 
-def find_features(folder: Path, pictures: Path, masks: Path | None, how: Search, progress: Progress) -> Path:
-    """Find the features of all pictures that have none yet; return the database.
+def find_features(folder: Path, images: Path, masks: Path | None, search: Search, progress: Progress) -> Path:
+    """Find the features of all images that have none yet; return the database.
 
     Args:
         folder: of the database.
-        pictures: folder of pictures of one size.
-        masks: folder of ``<picture's name>.png``; features on black are left out.
-        how: how to search.
-        progress: called with pictures done and all.
+        images: folder of images of one size.
+        masks: folder of ``<image's name>.png``; features on black are left out.
+        search: how to search.
+        progress: called with images done and all.
     """
-    import pycolmap
-
-    _quiet()
-    database, names = folder / "database.db", sorted(path.name for path in pictures.iterdir())
-    reader = pycolmap.ImageReaderOptions(camera_model=how.lens)
+    database, names = folder / "database.db", sorted(path.name for path in images.iterdir())
+    reader = pycolmap.ImageReaderOptions(camera_model=search.lens)
     if masks is not None:
         reader.mask_path = masks
     options = pycolmap.FeatureExtractionOptions(
-        use_gpu=False, max_image_size=_SIDE, num_threads=how.threads or -1
+        use_gpu=False, max_image_size=_FEATURE_SIDE, num_threads=search.threads or -1
     )
-    options.sift.max_num_features = how.features
+    options.sift.max_num_features = search.features
     with pycolmap.Database.open(database) as base:
         done = {image.name for image in base.read_all_images() if base.exists_keypoints(image.image_id)}
-        known = [camera.camera_id for camera in base.read_all_cameras()]
     left = [name for name in names if name not in done]
     progress(len(done), len(names))
-    for some in _batches(left, _AT_ONCE):
-        if known:
-            reader.existing_camera_id = known[0]  # else the others would get one of their own
+    for start in range(0, len(left), _BATCH):
+        with pycolmap.Database.open(database) as base:
+            for camera in base.read_all_cameras():  # one: else later images would get another
+                reader.existing_camera_id = camera.camera_id
+        batch = left[start : start + _BATCH]
         pycolmap.extract_features(
             database,
-            pictures,
-            image_names=some,
+            images,
+            image_names=batch,
             camera_mode=pycolmap.CameraMode.SINGLE,
             reader_options=reader,
             extraction_options=options,
             device=pycolmap.Device.cpu,
         )
-        if not known:
-            with pycolmap.Database.open(database) as base:
-                known = [camera.camera_id for camera in base.read_all_cameras()]
-        done.update(some)
+        done.update(batch)
         progress(len(done), len(names))
     return database
 
 
-def match(database: Path, how: Search, progress: Progress) -> None:
-    """Match and verify the pairs of pictures that are not matched yet."""
-    import pycolmap
-
-    _quiet()
+def match(database: Path, search: Search, progress: Progress) -> None:
+    """Match and verify the pairs of images that are not matched yet."""
     with pycolmap.Database.open(database) as base:
         images = sorted((image.name, image.image_id) for image in base.read_all_images())
-        pairs = pairs_of(len(images), how.matching)
+        pairs = pairs_of(len(images), search.matching)
         left = [
-            (images[i][0], images[j][0])
+            f"{images[i][0]} {images[j][0]}\n"
             for i, j in pairs
             if not base.exists_two_view_geometry(images[i][1], images[j][1])
         ]
-    options = pycolmap.FeatureMatchingOptions(use_gpu=False, num_threads=how.threads or -1)
-    verify = pycolmap.TwoViewGeometryOptions()
-    verify.ransac.random_seed = how.seed
-    chosen, done = database.with_name("pairs.txt"), len(pairs) - len(left)
-    progress(done, len(pairs))
-    for some in _batches(left, _PAIRS_AT_ONCE):
-        chosen.write_text("".join(f"{first} {second}\n" for first, second in some))
+    options = pycolmap.FeatureMatchingOptions(use_gpu=False, num_threads=search.threads or -1)
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = search.seed
+    listed = database.with_name("pairs.txt")
+    progress(len(pairs) - len(left), len(pairs))
+    for start in range(0, len(left), _PAIR_BATCH):
+        listed.write_text("".join(left[start : start + _PAIR_BATCH]))
         pycolmap.match_image_pairs(
             database,
             matching_options=options,
-            pairing_options=pycolmap.ImportedPairingOptions(match_list_path=chosen),
-            verification_options=verify,
+            pairing_options=pycolmap.ImportedPairingOptions(match_list_path=listed),
+            verification_options=verification,
             device=pycolmap.Device.cpu,
         )
-        done += len(some)
-        progress(done, len(pairs))
+        progress(len(pairs) - max(0, len(left) - start - _PAIR_BATCH), len(pairs))
 
 
 def pairs_of(count: int, matching: str) -> list[tuple[int, int]]:
-    """Choose which pairs of ``count`` pictures in a row are matched.
+    """Choose which pairs of ``count`` images in a row are matched.
 
     >>> pairs_of(3, "exhaustive"), len(pairs_of(100, "sequential"))
     ([(0, 1), (0, 2), (1, 2)], 859)
@@ -124,11 +250,10 @@ def pairs_of(count: int, matching: str) -> list[tuple[int, int]]:
     return [(i, j) for i in range(count) for j in range(i + 1, count) if every or j - i in near]
 
 
-def reconstruct(database: Path, pictures: Path, folder: Path, how: Search, progress: Progress):
-    """Find cameras and points; return the ``pycolmap.Reconstruction`` of the most pictures, or None."""
-    import pycolmap
-
-    _quiet()
+def reconstruct(
+    database: Path, images: Path, folder: Path, search: Search, progress: Progress
+) -> pycolmap.Reconstruction | None:
+    """Find cameras and points; return the model of the most images, or None."""
     with pycolmap.Database.open(database) as base:
         total = base.num_images()
     done = 1
@@ -139,63 +264,50 @@ def reconstruct(database: Path, pictures: Path, folder: Path, how: Search, progr
         progress(min(done, total), total)
 
     options = pycolmap.IncrementalPipelineOptions(
-        random_seed=how.seed, num_threads=how.threads or -1, min_model_size=_LEAST_MODEL
+        random_seed=search.seed, num_threads=search.threads or -1, min_model_size=_MIN_MODEL
     )
-    options.mapper.random_seed = options.triangulation.random_seed = how.seed
-    pycolmap.set_random_seed(how.seed)
+    options.mapper.random_seed = options.triangulation.random_seed = search.seed
+    pycolmap.set_random_seed(search.seed)
     folder.mkdir(exist_ok=True)
-    found = pycolmap.incremental_mapping(
-        database, pictures, folder, options, initial_image_pair_callback=count, next_image_callback=count
+    models = pycolmap.incremental_mapping(
+        database, images, folder, options, initial_image_pair_callback=count, next_image_callback=count
     )
-    return max(found.values(), key=lambda one: one.num_reg_images(), default=None)
+    return max(models.values(), key=lambda model: model.num_reg_images(), default=None)
 
 
-def adjust(found, how: Search, progress: Progress) -> float:
+def adjust(model: pycolmap.Reconstruction, search: Search, progress: Progress) -> float:
     """Adjust all cameras once more to the points that are sure, and so that outliers hardly count.
 
-    What moves leaves points that few pictures agree on, and the mapper's squares of errors let them bend the
+    What moves leaves points that few images agree on, and the mapper's squares of errors let them bend the
     poses. They are deleted, but those of cameras that would be left with too few.
 
     Returns:
         the mean reprojection error in pixels before it, of all points, so that nothing flatters it.
     """
-    import pycolmap
-
     progress(0, 1)
-    error = float(found.compute_mean_reprojection_error())
+    error = float(model.compute_mean_reprojection_error())
     doubtful = {
         number
-        for number, point in found.points3D.items()
+        for number, point in model.points3D.items()
         if point.track.length() < _SURE_VIEWS or point.error > _SURE_ERROR
     }
     needed = set()
-    for image in found.reg_image_ids():
-        seen = {point.point3D_id for point in found.images[image].points2D if point.has_point3D()}
-        if len(seen - doubtful) < _LEAST_POINTS:
+    for image in model.reg_image_ids():
+        seen = {point.point3D_id for point in model.images[image].points2D if point.has_point3D()}
+        if len(seen - doubtful) < _MIN_POINTS:
             needed |= seen
     for number in doubtful - needed:
-        found.delete_point3D(number)
+        model.delete_point3D(number)
     options = pycolmap.BundleAdjustmentOptions(print_summary=False)
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    options.ceres.loss_function_scale = _LOSS
-    options.ceres.solver_options.num_threads = how.threads or -1
-    what = pycolmap.BundleAdjustmentConfig()
-    for number in found.reg_image_ids():
-        what.add_image(number)
-    what.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    options.ceres.loss_function_scale = _LOSS_SCALE
+    options.ceres.solver_options.num_threads = search.threads or -1
+    config = pycolmap.BundleAdjustmentConfig()
+    for number in model.reg_image_ids():
+        config.add_image(number)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     # Not pycolmap.bundle_adjustment, which prints whatever the level of its log.
-    pycolmap.create_default_bundle_adjuster(options, what, found).solve()
-    found.update_point_3d_errors()
+    pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+    model.update_point_3d_errors()
     progress(1, 1)
     return error
-
-
-def _batches(things: list, size: int) -> list[list]:
-    return [things[i : i + size] for i in range(0, len(things), size)]
-
-
-def _quiet() -> None:
-    """Let pycolmap print nothing but what ends it."""
-    import pycolmap
-
-    pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value

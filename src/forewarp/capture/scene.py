@@ -1,60 +1,247 @@
-"""Write what was found as a scene: the pictures and smaller copies, cameras, times, points, limits."""
+"""The last step of a capture: place the world, propose its limits, write the scene, say what was found."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
+from torch import Tensor
 
-from forewarp.capture.pictures import shrunk
-from forewarp.capture.place import Limits
-from forewarp.capture.sparse import Sparse
+from forewarp.capture.frames import Frames, Progress, Source, shrunk
+from forewarp.capture.poses import Reconstruction
 from forewarp.data.images import common_header, read_image, write_jpeg, write_png
 from forewarp.data.posed_video import SCALES, PosedShot, write_scene
+from forewarp.drawing.images import draw_discs, sample_lines
+from forewarp.scene.box import Box
+from forewarp.scene.camera import Camera
+from forewarp.scene.paths import mean_up
 
-_LEAST_SIDE = 96  # pixels: smaller copies are of no use
+# Points beyond these quantiles are taken for outliers, unless they lie close to the rest.
+_QUANTILES, _SLACK, _MARGIN = (0.02, 0.98), 0.25, 0.05
+_NEAR, _FAR = 0.5, 1.25  # of the nearest and the farthest points, as what moves may be nearer
+_ROLL = 0.01  # mean square of the sine by which a hand rolls a camera, and some more
+_LEVEL = 1e-3  # sine of the angle between up and ahead below which all cameras look up or down
+_MIDWAY = 0.5  # share of its points' median distance from which on a camera's view belongs to the box
+_MIN_SIDE = 96  # pixels: smaller copies are of no use
+_DRAWING, _BORDER = 640, 0.06  # pixels of each drawing; share of it that stays free at its ends
+_FIRST, _LAST, _BOX = (0.10, 0.25, 0.75), (0.85, 0.20, 0.15), (0.55, 0.55, 0.55)  # colours of cameras, box
+_FRUSTA = 24  # cameras drawn with their view
+
+
+@dataclass(frozen=True)
+class Limits:
+    """``near`` and ``far`` along the unit ray, and a ``box`` around all that is seen."""
+
+    near: float
+    far: float
+    box: Box
+
+
+def placed(found: Reconstruction) -> Reconstruction:
+    """Rotate upwards to z and the mean direction of view to y, put the points' median into the origin, and
+    make the median distance between a camera and a point that it sees 1.
+    """
+    cameras = list(found.cameras.values())
+    up = upwards(cameras)
+    ahead = np.mean([np.asarray(camera.camera_to_world)[:3, 2] for camera in cameras], 0)
+    right = np.cross(ahead, up)
+    if np.linalg.norm(right) < _LEVEL:
+        right = np.eye(3)[np.abs(up).argmin()]
+        right = right - (right @ up) * up
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(up, right), up])
+    return found.moved(rotation, np.median(found.points, axis=0), 1 / float(np.median(found.distances())))
+
+
+def upwards(cameras: list[Camera]) -> np.ndarray:
+    """Estimate the direction away from the ground (3,), unit length.
+
+    A hand tilts a camera up and down, but holds it level: upwards is across all images' horizontal axes, as
+    far as they tell, and else the mean of the images' upward axes.
+    """
+    mean = mean_up(cameras).numpy()
+    level = np.stack([np.asarray(camera.camera_to_world)[:3, 0] for camera in cameras])
+    up = np.linalg.solve(level.T @ level / len(level) + _ROLL * np.eye(3), _ROLL * mean)
+    return up / np.linalg.norm(up)
+
+
+def limits_of(found: Reconstruction) -> Limits:
+    """Propose limits from the points, whose outliers do not count, and from where the cameras look.
+
+    What moves has hardly a point. It is before what stands still, so the box also holds the middle of every
+    camera's view from half the distance of its points on.
+    """
+    distances, midway = found.distances(), []
+    for row, camera in enumerate(found.cameras.values()):
+        of_camera = distances[found.seen[:, 0] == row]
+        if len(of_camera):
+            u, v = torch.tensor(camera.width / 2), torch.tensor(camera.height / 2)
+            step = _MIDWAY * float(np.median(of_camera)) * np.asarray(camera.directions(u, v))
+            midway.append(np.asarray(camera.center) + step)
+    low, high = bounds_of(found.sure())
+    pad = _MARGIN * float((high - low).max())
+    ends = np.array([low, high, *midway])
+    nearest, farthest = np.quantile(distances, _QUANTILES)
+    box = Box(tuple(ends.min(0) - pad), tuple(ends.max(0) + pad))
+    return Limits(_NEAR * float(nearest), _FAR * float(farthest), box)
+
+
+def bounds_of(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Bound points (N, 3) without their outliers: low (3,) and high (3,).
+
+    The quantiles, and what lies within a quarter of their span beyond them.
+
+    >>> line = np.linspace(0, 1, 101)[:, None].repeat(3, 1)
+    >>> [end.tolist() for end in bounds_of(np.concatenate([line, [[90.0, 0.5, 0.5]]]))]
+    [[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]]
+    """
+    low, high = np.quantile(points, _QUANTILES, axis=0)
+    slack = _SLACK * (high - low)
+    inside = ((points >= low - slack) & (points <= high + slack)).all(1)
+    kept = points[inside] if inside.any() else points
+    return kept.min(0), kept.max(0)
 
 
 def write(
-    folder: Path, pictures: Path, sparse: Sparse, times: Mapping[str, float], limits: Limits, progress
+    folder: Path, frames: Frames, found: Reconstruction, limits: Limits, progress: Progress
 ) -> list[int]:
-    """Write the scene of all registered pictures.
+    """Write the scene of all registered images, and smaller copies of them.
 
     Args:
         folder: to fill.
-        pictures: folder of the pictures, whose names are those of the cameras.
-        sparse: cameras and points, placed.
-        times: seconds or numbers by the picture's name; the first registered one becomes 0, the last 1.
+        frames: the images; the time of the first registered one becomes 0, that of the last 1.
+        found: cameras and points, placed.
         limits: near, far and box.
-        progress: called with pictures done and all.
+        progress: called with images done and all.
 
     Returns:
         how many times smaller the copies are.
     """
-    names = sorted(sparse.cameras, key=lambda name: times[name])
-    first, last = times[names[0]], times[names[-1]]
-    camera = sparse.cameras[names[0]]
-    has_alpha = common_header([pictures / name for name in names]).has_alpha
-    scales = [s for s in SCALES[1:] if min(camera.width, camera.height) // s >= _LEAST_SIDE]
+    names = sorted(found.cameras, key=lambda name: frames.times[name])
+    first, last = frames.times[names[0]], frames.times[names[-1]]
+    camera = found.cameras[names[0]]
+    has_alpha = common_header([frames.folder / name for name in names]).has_alpha
+    scales = [s for s in SCALES[1:] if min(camera.width, camera.height) // s >= _MIN_SIDE]
 
     def shots() -> Iterator[PosedShot]:
-        for done, name in enumerate(names):
-            pixels = read_image(pictures / name).numpy()
+        for done, name in enumerate(names, 1):
+            pixels = read_image(frames.folder / name).numpy()
             pixels = pixels if has_alpha else pixels[..., :3]
-            for scale in scales:
-                _write_smaller(folder / f"images_{scale}" / name, pixels, scale)
-            time = (times[name] - first) / (last - first)
-            yield PosedShot(name, sparse.cameras[name], pixels, time)
-            progress(done + 1, len(names))
+            for scale in scales:  # the mean of each block; what is left at the ends is left out
+                height, width = (n // scale for n in pixels.shape[:2])
+                small = shrunk(pixels[: height * scale, : width * scale], height, width)
+                write_image = write_png if name.lower().endswith(".png") else write_jpeg
+                write_image(folder / f"images_{scale}" / name, small)
+            time = (frames.times[name] - first) / (last - first)
+            yield PosedShot(name, found.cameras[name], pixels, time)
+            progress(done, len(names))
 
-    options = {"near": limits.near, "far": limits.far, "aabb": limits.box, "points": sparse.sure()}
+    options = {"near": limits.near, "far": limits.far, "aabb": limits.box, "points": found.sure()}
     write_scene(folder, shots(), **options)
     return scales
 
 
-def _write_smaller(path: Path, pixels: np.ndarray, scale: int) -> None:
-    """Write the mean of each block of ``scale`` x ``scale`` pixels; leave out what is left at the ends."""
-    height, width = (n // scale for n in pixels.shape[:2])
-    small = shrunk(pixels[: height * scale, : width * scale], height, width)
-    (write_png if path.suffix.lower() == ".png" else write_jpeg)(path, small)
+def draw(found: Reconstruction, limits: Limits) -> Tensor:
+    """Draw the capture from above (x to the right, y up) and from the side (z up): (H, 2 H, 3) in [0, 1].
+
+    Cameras go from blue to red; grey is the box.
+    """
+    return torch.cat([_drawn(found, limits, axes) for axes in ([0, 1], [0, 2])], 1)
+
+
+def _drawn(found: Reconstruction, limits: Limits, axes: list[int]) -> Tensor:
+    """Draw two axes of the world."""
+    cameras, centers = list(found.cameras.values()), found.centers
+    low, high = np.array(limits.box.low), np.array(limits.box.high)
+    shown = np.concatenate([centers, [low, high]])[:, axes]
+    middle, span = (shown.max(0) + shown.min(0)) / 2, float((shown.max(0) - shown.min(0)).max())
+    scale = _DRAWING * (1 - 2 * _BORDER) / span
+
+    def pixels(points) -> Tensor:
+        flat = (np.asarray(points)[..., axes] - middle) * scale * (1, -1) + _DRAWING / 2
+        return torch.from_numpy(np.ascontiguousarray(flat)).float()
+
+    def with_lines(image: Tensor, lines, colors: Tensor, radius: float) -> Tensor:
+        """Draw polylines (N, T, 3), each of one colour (N, 3)."""
+        points, line = sample_lines(pixels(lines))
+        return draw_discs(image, points[:, :2], colors[line], torch.full((len(points),), 0.9), radius)
+
+    inside = ((found.points >= low) & (found.points <= high)).all(1)
+    colors = torch.from_numpy(found.colors[inside]).float() / 255
+    image = torch.ones(_DRAWING, _DRAWING, 3)
+    image = draw_discs(image, pixels(found.points[inside]), colors, torch.full((len(colors),), 0.8), 1.0)
+    (x0, y0), (x1, y1) = low[axes], high[axes]
+    outline = np.zeros((1, 5, 3))
+    outline[0][:, axes] = [(x0, y0), (x1, y0), (x1, y1), (x0, y1), (x0, y0)]
+    image = with_lines(image, outline, torch.tensor([_BOX]), 0.6)
+    share = torch.linspace(0, 1, len(cameras))[:, None]
+    paint = torch.lerp(torch.tensor([_FIRST]), torch.tensor([_LAST]), share)
+    image = with_lines(image, np.stack([centers[:-1], centers[1:]], 1), paint[:-1], 0.8)
+    every = max(1, len(cameras) // _FRUSTA)
+    views = np.concatenate([_frustum(camera, 0.08 * span) for camera in cameras[::every]])
+    return with_lines(image, views, paint[::every].repeat_interleave(8, 0), 0.6)
+
+
+def _frustum(camera: Camera, depth: float) -> np.ndarray:
+    """The eight edges (8, 2, 3) of a camera's view down to a depth."""
+    u, v = torch.tensor([0, 1, 1, 0]) * camera.width, torch.tensor([0, 0, 1, 1]) * camera.height
+    center = np.asarray(camera.center)
+    corners = center + depth * np.asarray(camera.directions(u, v))
+    sides = np.stack([np.broadcast_to(center, corners.shape), corners], 1)
+    return np.concatenate([sides, np.stack([corners, np.roll(corners, -1, 0)], 1)])
+
+
+def facts_of(
+    source: Source, frames: Frames, found: Reconstruction, limits: Limits, scales: list[int]
+) -> dict:
+    """Gather the numbers of ``capture.json``."""
+    camera = next(iter(found.cameras.values()))
+    lens, inner = camera.lens, ("width", "height", "fx", "fy", "cx", "cy")
+    times = [frames.times[name] for name in found.cameras]
+    left_out = sorted(frames.times.keys() - found.cameras.keys())
+    return {
+        "source": str(source.path),
+        "found": frames.found,
+        "pictures": len(frames.times),
+        "registered": len(found.cameras),
+        "searched": source.colmap is None,
+        "left_out": [frames.originals.get(name, name) for name in left_out],
+        "originals": frames.originals,
+        "seconds": max(times) - min(times) if source.video is not None else None,
+        "reprojection_error": found.error,
+        "points": len(found.points),
+        "sure_points": len(found.sure()),
+        "camera": {name: getattr(camera, name) for name in inner}
+        | {"k": list(lens.k) if lens else [0.0] * 3, "p": list(lens.p) if lens else [0.0] * 2}
+        | {"degrees": math.degrees(2 * math.atan(camera.width / (2 * camera.fx)))},
+        # The way of the camera, where the median distance of what it sees is 1.
+        "path": float(np.linalg.norm(np.diff(found.centers, axis=0), axis=1).sum()),
+        "near": limits.near,
+        "far": limits.far,
+        "box": [*limits.box.low, *limits.box.high],
+        "scales": scales,
+    }
+
+
+def summary(facts: dict) -> list[str]:
+    """Say what was found in a few lines."""
+    camera, box = facts["camera"], facts["box"]
+    size = " x ".join(f"{high - low:.2f}" for low, high in zip(box[:3], box[3:]))
+    all_sure = facts["sure_points"] == facts["points"]
+    sure = "" if all_sure else f", {facts['sure_points']:,} of them sure"
+    lines = [
+        f"registered: {facts['registered']} of {facts['pictures']} pictures, {camera['width']} x "
+        f"{camera['height']} pixels, reprojection error {facts['reprojection_error']:.2f} pixels",
+        f"camera: {camera['degrees']:.0f} degrees wide; its path is {facts['path']:.2f} long, where what it "
+        "sees is 1 away",
+        f"points: {facts['points']:,}{sure}; box {size}, near {facts['near']:.2f}, far {facts['far']:.2f}",
+    ]
+    if facts["left_out"]:
+        few = ", ".join(facts["left_out"][:3])
+        advice = "; film slower and with more of what stands still" if facts["searched"] else ""
+        lines.append(f"left out: {len(facts['left_out'])} pictures without a pose ({few}){advice}")
+    return lines

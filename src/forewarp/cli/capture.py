@@ -41,14 +41,15 @@ def capture(config) -> None:
 
     source, out = check(config)
     # These load torch; mistakes have been answered before.
-    from forewarp.capture.facts import PICTURE, told
-    from forewarp.capture.job import Source, capture
+    from forewarp.capture.frames import Source
+    from forewarp.capture.pipeline import PICTURE, capture
     from forewarp.capture.poses import Search
+    from forewarp.capture.scene import summary
     from forewarp.progress import Counted
 
-    how = Search(config.matching, config.lens, config.features, config.seed, config.threads)
-    facts = capture(Source(**source), out, how, Counted, frames=config.frames, size=config.size)
-    for line in told(facts):
+    search = Search(config.matching, config.lens, config.features, config.seed, config.threads)
+    facts = capture(Source(**source), out, search, Counted, frames=config.frames, size=config.size)
+    for line in summary(facts):
         print(line)
     print(f"written: {out}; see {Path(out) / PICTURE}")
     where = [text_override("data.root", str(out.parent)), text_override("data.scene", out.name)]

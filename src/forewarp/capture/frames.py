@@ -1,0 +1,447 @@
+"""Step one of a capture: the images, their times and masks, from a video or a folder.
+
+Frames of a video come upright, as its rotation flag says, none dropped and none repeated.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import shutil
+import subprocess
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from threading import Thread
+
+import imageio_ffmpeg
+import numpy as np
+import torch
+from torch.nn.functional import adaptive_max_pool2d, interpolate
+
+from forewarp.data.cameras import SUFFIXES, in_order
+from forewarp.data.images import common_header, read_image, write_jpeg, write_png
+from forewarp.drawing.images import at_most
+from forewarp.files import read_json, write_json
+
+Progress = Callable[[int, int], None]
+Step = Callable[[str], object]  # title of a step -> a context manager that gives a ``Progress``
+
+_DONE = "pictures.json"  # written last
+_MOVING = 127  # a mask above it is what moves
+_MIN_IMAGES, _ENOUGH = 3, 120
+_MEASURED = 640  # pixels of the longer side at which sharpness is measured
+_COARSE = 160  # pixels of the longer side at which blur is told from what a codec adds
+_FLAT = 1e-9  # mean square of a second difference below which an image has no edges
+_WHOLE = 0.9  # share of its duration after which a video counts as whole
+_STAMP = re.compile(r"Parsed_showinfo.* n: *\d+ .* pts_time:(\S+)")
+_DURATION = re.compile(r"Duration: (\d+):(\d+):([\d.]+)")
+_DAMAGE = re.compile("partial file|ended prematurely|corrupt")
+
+
+@dataclass(frozen=True)
+class Source:
+    """What to capture: a ``video``, or a folder of ``images``, with ``colmap`` poses that are known; and a
+    folder of ``masks`` of what moves.
+    """
+
+    video: Path | None = None
+    images: Path | None = None
+    colmap: Path | None = None
+    masks: Path | None = None
+
+    @property
+    def path(self) -> Path:
+        """The video or the folder."""
+        return self.video or self.images
+
+
+@dataclass(frozen=True)
+class Frames:
+    """The images of a capture.
+
+    Attributes:
+        folder: of the images, whose names are ours and sort by time.
+        masks: a folder in which black is what moves; None: there are none.
+        times: seconds or numbers, by name.
+        rows: which of those found each image is.
+        found: how many there were to choose from.
+        edges: median width of the images' edges, in pixels of an image 640 wide.
+        size: (width, height) of all.
+        originals: the user's names by ours; empty for a video.
+    """
+
+    folder: Path
+    masks: Path | None
+    times: dict[str, float]
+    rows: Sequence[int]
+    found: int
+    edges: float
+    size: tuple[int, int]
+    originals: Mapping[str, str]
+
+
+def take(
+    work: Path, source: Source, step: Step, *, count: int | None, size: int | None, threads: int | None = None
+) -> Frames:
+    """Take the images out of a video or a folder, unless an earlier call has done so.
+
+    Args:
+        work: the work folder.
+        source: what to capture. With poses that are known images stay as stored: neither turned nor smaller.
+        step: shows progress.
+        count: of frames to choose from a video; None: 120, and at most every second one, so that blurred ones
+            can be left out. Images of a folder are all taken.
+        size: most pixels of the longer side; None: as they are.
+        threads: of ffmpeg; None: as many as it likes.
+
+    Raises:
+        ValueError: where they cannot be read or are too few.
+    """
+    folder, dark = work / "pictures", work / "masks"
+    done = read_json(work / _DONE)
+    if done is None:
+        for left in (folder, dark):
+            shutil.rmtree(left, ignore_errors=True)
+        if source.video is not None:
+            done = _from_video(folder, source.video, count, size, step, threads)
+        else:
+            done = _from_folder(folder, source, size, step)
+        if source.masks is not None:
+            _write_masks(dark, source.masks, done)
+        write_json(work / _DONE, done)
+    return Frames(folder, dark if source.masks else None, **done | {"size": tuple(done["size"])})
+
+
+def _from_video(
+    folder: Path, video: Path, count: int | None, size: int | None, step: Step, threads: int | None
+) -> dict:
+    """Write the sharpest frames, named after their numbers in the video, from 1."""
+    with step("looking at frames") as progress:
+        stamps, sharpnesses, widths = measure(video, progress, threads)
+    if len(stamps) < _MIN_IMAGES:
+        got = f"{len(stamps)} frames"
+        raise ValueError(f"{video}: expected a video of many frames, but got {got}; film longer")
+    if count is None:
+        count = max(_MIN_IMAGES, min(_ENOUGH, len(stamps) // 2))
+    chosen, times = sharpest(stamps, sharpnesses, count), {}
+    with step("taking frames") as progress:
+        for index, pixels in zip(chosen, extracted(video, chosen, size, threads)):
+            name = f"frame_{index + 1:06d}.jpg"
+            write_jpeg(folder / name, pixels)
+            times[name] = float(stamps[index])
+            progress(len(times), len(chosen))
+    if len(times) < len(chosen):
+        raise ValueError(f"{video}: expected {len(chosen)} frames, but got {len(times)}; convert the video")
+    return _record(times, chosen, len(stamps), widths[chosen], pixels, {})
+
+
+def _from_folder(folder: Path, source: Source, size: int | None, step: Step) -> dict:
+    """Copy images of one size; times are even, in the order of the names.
+
+    The copies have names of ours: COLMAP's list of pairs has no place for a space, and what comes later sorts
+    plainly. Alpha is kept where all images have it.
+    """
+    paths, as_stored = _images_in(source.images), source.colmap is not None
+    if len(paths) < _MIN_IMAGES:
+        got = f"{len(paths)} PNG or JPEG files" if paths else "none"
+        raise ValueError(f"{source.images}: expected a folder of many pictures, PNG or JPEG, but got {got}")
+    has_alpha = common_header(paths).has_alpha
+    widths, originals, first = [], {}, None
+    with step("reading pictures") as progress:
+        for done, path in enumerate(paths, 1):
+            pixels = read_image(path, upright=not as_stored).numpy()
+            first = pixels.shape if first is None else first
+            if pixels.shape != first:
+                raise ValueError(
+                    f"{path}: expected {first[1]} x {first[0]} pixels as the first, but got "
+                    f"{pixels.shape[1]} x {pixels.shape[0]}, as its EXIF orientation says; leave it out"
+                )
+            if not has_alpha and (pixels[..., 3] < 255).any():
+                raise ValueError(
+                    f"{path}: expected alpha in all pictures or in none, but got one of few that have it; "
+                    "remove it"
+                )
+            pixels = pixels if has_alpha else pixels[..., :3]
+            longer = max(pixels.shape[:2])
+            if size is not None and size < longer and not as_stored:
+                pixels = shrunk(pixels, *(max(1, round(n * size / longer)) for n in pixels.shape[:2]))
+            is_png = has_alpha or path.suffix.lower() == ".png"
+            name = f"picture_{done:06d}{'.png' if is_png else '.jpg'}"
+            (write_png if is_png else write_jpeg)(folder / name, pixels)
+            originals[name] = path.name
+            widths.append(edge_width(pixels[..., :3].mean(-1)))
+            progress(done, len(paths))
+    times = {name: float(number) for number, name in enumerate(originals)}
+    return _record(times, range(len(paths)), len(paths), widths, pixels, originals)
+
+
+def _record(
+    times: dict, rows: Sequence[int], found: int, widths, pixels: np.ndarray, originals: dict
+) -> dict:
+    """Return the numbers of ``Frames``, as JSON has them: it knows no infinity."""
+    edges, (height, width) = min(float(np.median(widths)), 1e6), pixels.shape[:2]
+    numbers = {"times": times, "rows": list(rows), "found": found, "edges": edges, "size": (width, height)}
+    return numbers | {"originals": originals}
+
+
+def _images_in(folder: Path) -> list[Path]:
+    """List images in order; other systems leave files with a leading dot beside them, which are none."""
+    return in_order(p for p in folder.iterdir() if p.suffix in SUFFIXES and not p.name.startswith("."))
+
+
+def shrunk(pixels: np.ndarray, height: int, width: int) -> np.ndarray:
+    """Make an image smaller by the mean over areas; where it has straight alpha, colours count by it.
+
+    >>> cut_out = np.array([[[90, 0, 0, 255], [0, 9, 9, 0]]], dtype=np.uint8)
+    >>> shrunk(cut_out, 1, 1).tolist()
+    [[[90, 0, 0, 128]]]
+    """
+    planes = torch.from_numpy(np.ascontiguousarray(pixels)).permute(2, 0, 1)[None].float()
+    has_alpha = planes.shape[1] == 4
+    if has_alpha:
+        planes[:, :3] *= planes[:, 3:] / 255
+    small = interpolate(planes, (height, width), mode="area")
+    if has_alpha:
+        small[:, :3] *= 255 / small[:, 3:].clamp(min=1e-3)
+    return small[0].permute(1, 2, 0).round().clamp(0, 255).byte().numpy()
+
+
+def _write_masks(folder: Path, masks: Path, done: dict) -> None:
+    """Write a mask for each image, in which black is what moves and white is matched.
+
+    There are as many as frames in the video, or images in the folder, in order; else a mask has the name of
+    its image. A folder's images have names of the user's: there the name comes first.
+    """
+    paths, originals, names = _images_in(masks), done["originals"], list(done["times"])
+    by_name = {path.stem: path for path in paths}
+    stems = [Path(originals.get(name, name)).stem for name in names]
+    are_named, are_counted = all(stem in by_name for stem in stems), len(paths) == done["found"]
+    if not are_named and not are_counted:
+        raise ValueError(
+            f"{masks}: expected {done['found']} masks, one for each frame or picture, or masks with the "
+            f"names of the pictures ({stems[0]}.png), but got {len(paths)}"
+        )
+    in_turn = are_counted and not (are_named and originals)  # frames may be counted from 0 or from 1
+    chosen = [paths[row] for row in done["rows"]] if in_turn else [by_name[stem] for stem in stems]
+    (width, height), brightest = done["size"], 0
+    for name, path in zip(names, chosen):
+        values = read_image(path)[..., 0]
+        brightest = max(brightest, int(values.max()))
+        # A pixel is kept out as soon as a part of it moves.
+        moving = adaptive_max_pool2d((values > _MOVING).float()[None, None], (height, width))[0, 0] > 0
+        write_png(folder / f"{name}.png", (255 * ~moving).byte().numpy())
+    if brightest <= _MOVING:
+        raise ValueError(
+            f"{masks}: expected masks in which what moves is brighter than {_MOVING} of 255, but got at most "
+            f"{brightest}; write it as 255, or leave out masks="
+        )
+
+
+def sharpness(grey: np.ndarray) -> float:
+    """Measure how much fine detail an image (H, W) has: the mean square of its Laplacian.
+
+    Comparable between images of the same things alone.
+    """
+    values = grey.astype(np.float32)
+    across, down = np.diff(values, 2, axis=1)[1:-1], np.diff(values, 2, axis=0)[:, 1:-1]
+    return float(((across + down) ** 2).mean())
+
+
+def edge_width(grey: np.ndarray) -> float:
+    """Estimate how wide the edges of an image (H, W) are, in pixels of one 640 wide.
+
+    Contrast does not count: an edge blurred by a Gaussian of deviation s has a gradient whose mean square is
+    2 s^2 times that of its own derivative. This is taken of the image made 160 pixels wide, as what a codec
+    adds to a blurred image is finer. So no edge is under 2 wide; sharp films give 1.9 to 2.3, those blurred
+    by 3 pixels 2.7, by 6 pixels 3.8. Of both axes the wider counts, as a shaken camera blurs along one.
+    Infinite without edges.
+
+    >>> step = 255.0 * (np.arange(640) > 319)[None].repeat(640, 0) * (np.arange(640) > 319)[:, None]
+    >>> round(edge_width(step), 1)
+    2.0
+    >>> blurred = np.cumsum(np.exp(-(np.arange(-320, 320) ** 2) / 200))
+    >>> round(edge_width(blurred * blurred[:, None]))
+    10
+    """
+    small = at_most(torch.from_numpy(grey.astype(np.float32))[..., None], _COARSE)[..., 0].numpy()
+    widths = []
+    for axis in (0, 1):
+        first, second = (float((np.diff(small, n, axis=axis) ** 2).mean()) for n in (1, 2))
+        widths.append(np.sqrt(first / (2 * second)) if second > _FLAT else np.inf)
+    return float(max(widths)) * 640 / _COARSE
+
+
+def sharpest(stamps: np.ndarray, sharp: np.ndarray, count: int) -> list[int]:
+    """Choose the sharpest frame of each of ``count`` windows of equal length in time.
+
+    A window without a frame does not count: where there are gaps, windows are so much shorter that ``count``
+    of them have frames, or as many as come nearest to it.
+
+    Args:
+        stamps: (N,) seconds, ascending, at any distances.
+        sharp: (N,) larger is better.
+        count: of windows. All frames, where there are no more.
+
+    Returns:
+        indices, ascending.
+
+    >>> sharpest(np.array([0, 1, 2, 3, 9, 10.0]), np.array([1, 5, 2, 3, 1, 2]), 2)
+    [1, 5]
+    >>> sharpest(np.array([0, 1, 2, 3, 9, 10.0]), np.array([1, 5, 2, 3, 1, 2]), 4)
+    [1, 2, 3, 5]
+    """
+    if len(stamps) <= count:
+        return list(range(len(stamps)))
+    share = (stamps - stamps[0]) / ((stamps[-1] - stamps[0]) * (1 + 1e-9))
+
+    def windows(number: int) -> list[np.ndarray]:
+        """Split all rows by which of so many windows they are in; none is empty."""
+        begins = np.flatnonzero(np.diff(np.floor(share * number))) + 1
+        return np.split(np.arange(len(share)), begins)
+
+    few = many = count
+    while len(windows(many)) < count:
+        few, many = many, 2 * many
+    while many - few > 1:
+        middle = (few + many) // 2
+        few, many = (middle, many) if len(windows(middle)) < count else (few, middle)
+    chosen = windows(many) if len(windows(many)) <= count else windows(few)
+    return [int(rows[np.argmax(sharp[rows])]) for rows in chosen]
+
+
+def measure(
+    video: Path, progress: Progress, threads: int | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Decode a video once and measure its frames.
+
+    Args:
+        video: any that ffmpeg reads.
+        progress: called with tenths of seconds done and all.
+        threads: None: as many as ffmpeg likes.
+
+    Returns:
+        seconds from the first frame (N,), ascending; ``sharpness`` (N,) and ``edge_width`` (N,).
+
+    Raises:
+        ValueError: where the file is no video, ends too early, or has a single frame.
+
+    **Cost** one decoding, and about 10 ms a frame.
+    """
+    sharp, widths, log = [], [], _Log()
+    long, short = (f"if(gt({a},{b}),{_MEASURED},-1)" for a, b in (("iw", "ih"), ("ih", "iw")))
+    small = f"scale=w='min(iw,{long})':h='min(ih,{short})',format=gray"
+    for image in _decode(video, f"showinfo=checksum=0,{small}", "pgm", log, threads):
+        sharp.append(sharpness(image))
+        widths.append(edge_width(image))
+        if len(sharp) % 10 == 1 and log.duration and log.stamps:
+            seconds = min(log.stamps[-1] - log.stamps[0], log.duration)
+            progress(round(10 * seconds), math.ceil(10 * log.duration))
+    _refuse(video, log, len(sharp))
+    progress(len(sharp), len(sharp))
+    stamps = np.array(log.stamps[: len(sharp)])
+    return stamps - stamps[0], np.array(sharp), np.array(widths)
+
+
+def extracted(
+    video: Path, chosen: Sequence[int], size: int | None, threads: int | None = None
+) -> Iterator[np.ndarray]:
+    """Yield the frames ``chosen``, ascending indices: uint8 (H, W, 3), square pixels, upright.
+
+    Args:
+        video: which ``measure`` has accepted.
+        chosen: from 0.
+        size: most pixels of the longer side; None: as filmed.
+        threads: None: as many as ffmpeg likes.
+    """
+
+    def any_of(indices: Sequence[int]) -> str:
+        """Write ``n == a or n == b ...`` as a balanced tree: ffmpeg's parser allows a depth of 100."""
+        if len(indices) == 1:
+            return rf"eq(n\,{indices[0]})"
+        half = len(indices) // 2
+        return f"({any_of(indices[:half])}+{any_of(indices[half:])})"
+
+    filters = f"select='{any_of(chosen)}',scale=w='iw*sar':h=ih"
+    if size is not None:
+        fit = f"w='if(gt(iw,ih),min(iw,{size}),-1)':h='if(gt(iw,ih),-1,min(ih,{size}))'"
+        filters += f",scale={fit}:flags=area"
+    yield from _decode(video, f"{filters},format=rgb24", "ppm", _Log(), threads)
+
+
+class _Log:
+    """What ffmpeg says while it runs: ``duration`` in seconds, 0 where unknown; ``stamps`` of the frames so
+    far; all other lines, ``rest``.
+    """
+
+    def __init__(self) -> None:
+        self.duration, self.stamps, self.rest = 0.0, [], []
+
+    def read(self, stream) -> None:
+        """Read to the end."""
+        for raw in stream:
+            line = raw.decode(errors="replace")
+            if match := _STAMP.search(line):
+                self.stamps += [float(match[1])] if match[1] != "NOPTS" else []
+            elif match := _DURATION.search(line):
+                self.duration = sum(float(part) * unit for part, unit in zip(match.groups(), (3600, 60, 1)))
+            else:
+                self.rest.append(line)
+
+
+def _decode(video: Path, filters: str, codec: str, log: _Log, threads: int | None) -> Iterator[np.ndarray]:
+    """Decode the first video stream into grey or colour images; ffmpeg's words go to ``log``."""
+    limit = ["-threads", str(threads or 0)]  # of decoder and encoder
+    begin = [imageio_ffmpeg.get_ffmpeg_exe(), "-hide_banner", "-nostdin", "-nostats"]
+    shape = ["-map", "0:v:0", "-vf", filters, "-filter_threads", limit[1], "-fps_mode", "passthrough"]
+    call = [*begin, *limit, "-i", str(video), *shape, *limit, "-f", "image2pipe", "-c:v", codec, "-"]
+    with subprocess.Popen(call, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        reader = Thread(target=log.read, args=[process.stderr])
+        reader.start()
+        try:
+            while (image := _read_netpbm(process.stdout)) is not None:
+                yield image
+        except BaseException:  # also where no more are asked for
+            process.kill()
+            raise
+        finally:
+            reader.join()
+
+
+def _read_netpbm(stream) -> np.ndarray | None:
+    """Read one binary PGM (H, W) or PPM (H, W, 3); None at the end."""
+    kind = stream.readline().strip()
+    if kind not in (b"P5", b"P6"):
+        return None
+    width, height = map(int, stream.readline().split())
+    stream.readline()
+    shape = (height, width, 3) if kind == b"P6" else (height, width)
+    raw = stream.read(math.prod(shape))
+    return np.frombuffer(raw, np.uint8).reshape(shape) if len(raw) == math.prod(shape) else None
+
+
+def _refuse(video: Path, log: _Log, count: int) -> None:
+    """Refuse what gives no frames, one frame, or fewer than the file promises."""
+    stamps, text = log.stamps, "".join(log.rest)
+    if not count:
+        got = "another file; choose a video, or images="
+        with video.open("rb") as stream:
+            if "moov atom not found" in text and stream.read(8).endswith(b"ftyp"):
+                got = "one that was cut off; copy it again"
+        got = "sound alone; choose a video" if "matches no streams" in text else got
+        raise ValueError(f"{video}: expected a video, but got {got}")
+    if count == 1:
+        raise ValueError(f"{video}: expected a video of many frames, but got one frame")
+    if len(stamps) < count or not np.all(np.diff(stamps[:count]) > 0):
+        raise ValueError(
+            f"{video}: expected a time stamp for each frame, each later than the one before, but got "
+            f"{len(stamps)} for {count} frames; save it anew with a video editor"
+        )
+    seconds = (stamps[count - 1] - stamps[0]) * count / (count - 1)
+    # The header's duration is of all streams: sound that goes on is no damage.
+    is_damaged = _DAMAGE.search(text) or ": Audio:" not in text
+    if is_damaged and seconds < _WHOLE * log.duration:
+        raise ValueError(
+            f"{video}: expected {log.duration:.1f} seconds, as its header says, but got {seconds:.1f}; copy "
+            "it again, or save the part that plays with a video editor"
+        )

@@ -1,0 +1,153 @@
+"""A capture from a video, a folder of images or a COLMAP model to a scene: frames, poses, checks, scene."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import pycolmap
+from filelock import FileLock, Timeout
+
+from forewarp.capture import poses, scene
+from forewarp.capture.checks import refuse_matches, refuse_poses
+from forewarp.capture.frames import Frames, Source, Step, take
+from forewarp.capture.poses import Reconstruction, Search
+from forewarp.drawing.files import write_png
+from forewarp.files import folder_written_whole, read_json, write_json
+
+ABOUT, PICTURE = "capture.json", "capture.png"  # in the scene's folder
+_ERROR = "error.json"  # pixels, before points were deleted
+_STATE = "about.json"  # what the work in a work folder depends on
+
+
+def capture(
+    source: Source,
+    out: Path,
+    search: Search,
+    step: Step,
+    *,
+    frames: int | None = None,
+    size: int | None = 1600,
+) -> dict:
+    """Make a scene in ``out`` and return what was found, which ``capture.json`` there holds too.
+
+    An interrupted call is gone on with by the next one of the same arguments; see ``work_folder``.
+
+    Args:
+        source: what to capture.
+        out: the scene's folder; an earlier capture in it is replaced.
+        search: how poses are found.
+        step: gives a ``Progress`` for each step.
+        frames: to choose from a video; None: 120, and at most every second one.
+        size: most pixels of the longer side; with poses that are known images are left as stored.
+
+    Raises:
+        ValueError: where nothing good comes of it, with advice; nothing is then left behind.
+    """
+    about = {**dataclasses.asdict(source), **dataclasses.asdict(search), "frames": frames, "size": size}
+    del about["threads"]
+    about["files"] = [_fingerprint(path) for path in (source.path, source.masks) if path is not None]
+    with work_folder(out, about) as work:
+        images = take(work, source, step, count=frames, size=size, threads=search.threads)
+        if source.colmap is None:
+            found = find_poses(work, images, search, step)
+        else:
+            found = poses.read_model(source.colmap, images.originals)
+        refuse_poses(found, images)
+        found = scene.placed(found)
+        limits = scene.limits_of(found)
+        with step("writing") as progress, folder_written_whole(out, ABOUT) as folder:
+            scales = scene.write(folder, images, found, limits, progress)
+            write_png(folder / PICTURE, scene.draw(found, limits))
+            facts = scene.facts_of(source, images, found, limits, scales)
+            files = (path for path in sorted(folder.rglob("*")) if path.is_file())
+            facts["bytes"] = {path.relative_to(folder).as_posix(): path.stat().st_size for path in files}
+            write_json(folder / ABOUT, facts)
+    return facts
+
+
+def find_poses(work: Path, images: Frames, search: Search, step: Step) -> Reconstruction:
+    """Find poses, unless an earlier call has done so."""
+    best, part = work / "best", work / "part"
+    if best.is_dir():
+        found = Reconstruction.of(pycolmap.Reconstruction(best))
+        return dataclasses.replace(found, **read_json(best / _ERROR))
+    with step("features") as progress:
+        database = poses.find_features(work, images.folder, images.masks, search, progress)
+    with step("matches") as progress:
+        poses.match(database, search, progress)
+    refuse_matches(database, images)
+    with step("poses") as progress:
+        model = poses.reconstruct(database, images.folder, work / "models", search, progress)
+    if model is None:
+        refuse_poses(None, images, database)
+    with step("adjustment") as progress:
+        error = poses.adjust(model, search, progress)
+    found = dataclasses.replace(Reconstruction.of(model), error=error)
+    refuse_poses(found, images, database)
+    part.mkdir(exist_ok=True)
+    model.write(part)
+    write_json(part / _ERROR, {"error": error})
+    part.rename(best)
+    return found
+
+
+def _fingerprint(path: Path) -> str:
+    """A digest of the name, bytes and time of change of a file, or of each file of a folder."""
+    files = [path] if path.is_file() else sorted(file for file in path.iterdir() if file.is_file())
+    states = [(file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in files]
+    return hashlib.sha256(repr(states).encode()).hexdigest()
+
+
+@contextmanager
+def work_folder(out: Path, about: Mapping[str, object]) -> Iterator[Path]:
+    """Give the folder ``.<name of out>.work`` beside ``out``, with what an interrupted call left in it.
+
+    Args:
+        out: of the result.
+        about: what the work depends on; work about anything else is removed first.
+
+    It is removed at the end, and where the work is refused, with the folders that were made for it; it stays
+    after Ctrl-C, a kill, errors of the system and bugs.
+
+    Raises:
+        ValueError: where another call is at work.
+    """
+    work = out.with_name(f".{out.name}.work")
+    made = [folder for folder in work.parents if not folder.exists()]
+    work.parent.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(work.with_name(work.name + ".lock"))
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        raise ValueError(
+            f"{out}: expected one capture at a time, but got another at work; wait for it"
+        ) from None
+    stays = False
+    try:
+        work.mkdir(exist_ok=True)
+        state = json.loads(json.dumps(about, default=str))
+        if read_json(work / _STATE) != state:
+            shutil.rmtree(work)
+            work.mkdir()
+            write_json(work / _STATE, state)
+        yield work
+    except BaseException as error:
+        # A refusal says what it got, unlike a bug, as a ``ValueError`` of NumPy's.
+        is_refusal = isinstance(error, ValueError) and " but got " in str(error)
+        stays = not (is_refusal or isinstance(error, ImportError))
+        raise
+    finally:
+        if not stays:  # under the lock: what another call begins afterwards is its own
+            shutil.rmtree(work, ignore_errors=True)
+            Path(lock.lock_file).unlink(missing_ok=True)
+        lock.release()
+        if not stays:
+            for folder in made:
+                with suppress(OSError):  # not empty: the result is in it
+                    folder.rmdir()

@@ -1,0 +1,314 @@
+"""The images of a capture: from a video, from a folder, and their masks."""
+
+import subprocess
+from contextlib import nullcontext
+
+import imageio_ffmpeg
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.ndimage import gaussian_filter
+
+pytest.importorskip("pycolmap", reason="no pycolmap; make install adds it")
+
+from forewarp.capture.checks import BLURRED
+from forewarp.capture.frames import Source, edge_width, extracted, measure, sharpest, sharpness, take
+from tests.support.films import numbered, write_film
+
+
+def quiet(done, total):
+    assert 0 <= done <= total
+
+
+def stamps_of(film):
+    return measure(film, quiet)[0]
+
+
+def number_of(image):
+    """The number of a frame of ``numbered``: its darkest quarter tells."""
+    return round(float(np.median(image[image < 200])) / 8)
+
+
+@pytest.mark.parametrize("stamps", ["N*40", "N*(N+1)*10", "500+N*100"], ids=["even", "uneven", "late"])
+def test_stamps_are_the_videos_own_and_the_frames_asked_for_come(tmp_path, stamps):
+    film = write_film(tmp_path / "a.mp4", numbered(24), stamps=stamps)
+    expected = np.array([eval(stamps, {"N": n}) for n in range(24)]) / 1000
+    np.testing.assert_allclose(stamps_of(film), expected - expected[0], atol=1e-6)
+    chosen = [0, 3, 4, 11, 23]
+    assert [number_of(image) for image in extracted(film, chosen, None)] == chosen
+
+
+def test_hundreds_of_frames_can_be_chosen(tmp_path):
+    film = write_film(tmp_path / "a.mp4", numbered(400, size=(16, 16), step=0))
+    assert len(list(extracted(film, list(range(0, 400, 2)), None))) == 200
+
+
+@pytest.mark.parametrize(
+    ("rotation", "size", "bright"),
+    [(0, (48, 64), "tl"), (90, (64, 48), "bl"), (-90, (64, 48), "tr"), (180, (48, 64), "br")],
+)
+def test_frames_are_turned_upright(tmp_path, rotation, size, bright):
+    film = write_film(tmp_path / "a.mp4", numbered(3), rotation=rotation)
+    (image,) = extracted(film, [1], None)
+    assert image.shape == (*size, 3)
+    rows = slice(2, 10) if bright[0] == "t" else slice(-10, -2)
+    columns = slice(2, 10) if bright[1] == "l" else slice(-10, -2)
+    assert image[rows, columns].min() > 230
+    assert len(stamps_of(film)) == 3
+
+
+def test_frames_are_made_smaller_never_larger_by_as_many_threads_as_given(tmp_path, monkeypatch):
+    film = write_film(tmp_path / "a.mp4", numbered(2))
+    calls, popen = [], subprocess.Popen
+    monkeypatch.setattr(subprocess, "Popen", lambda call, **rest: calls.append(call) or popen(call, **rest))
+    for size, shape in ((None, (48, 64, 3)), (32, (24, 32, 3)), (500, (48, 64, 3))):
+        assert [image.shape for image in extracted(film, [0, 1], size, threads=1)] == [shape] * 2
+    measure(film, quiet, threads=1)
+    assert len(calls) == 4
+    for call in calls:
+        given = {call[i + 1] for i, word in enumerate(call) if word in ("-threads", "-filter_threads")}
+        assert given == {"1"}
+
+
+@pytest.mark.parametrize(("blur", "seen"), [(0, False), (1, False), (4, True), (8, True)])
+def test_a_films_blur_is_seen_whatever_the_codec_adds(tmp_path, blur, seen):
+    """Coded as strongly as phones and web sites do."""
+    rng = np.random.default_rng(0)
+    sharp = rng.integers(0, 256, (24, 32, 3)).repeat(20, 0).repeat(20, 1).astype(float)
+    film = np.stack([gaussian_filter(np.roll(sharp, 3 * i, 1), (blur, blur, 0)) for i in range(3)])
+    path = write_film(tmp_path / "a.mp4", film.astype(np.uint8), options=("-qp", "28"))
+    assert (np.median(measure(path, quiet)[2]) > BLURRED) == seen
+
+
+def cut(path, share):
+    content = path.read_bytes()
+    path.write_bytes(content[: int(share * len(content))])
+    return path
+
+
+def noise(path, count=50, **options):
+    frames = np.random.default_rng(0).integers(0, 256, (count, 48, 64, 3), np.uint8)
+    return write_film(path, frames, **options)
+
+
+FAST = ("-movflags", "faststart")
+
+
+def tone(path, seconds, *options):
+    """A sound, with ``options`` a film's."""
+    made = path.with_name(f"with_sound_{path.name}")
+    sound = ["-f", "lavfi", "-i", f"sine=duration={seconds}", "-c:a", "aac"]
+    call = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", *options[:2], *sound, *options[2:], str(made)]
+    subprocess.run(call, check=True)
+    return made
+
+
+def with_sound(path, seconds):
+    shape = ["-map", "0:v", "-map", "1:a", "-c:v", "copy", *FAST]
+    return tone(path, seconds, "-i", str(path), *shape)
+
+
+BROKEN = {
+    "text": (lambda p: p.write_text("no video") and p, "expected a video, but got another file"),
+    "empty": (lambda p: p.touch() or p, "expected a video, but got another file"),
+    "sound": (lambda p: tone(p, 1), "expected a video, but got sound alone"),
+    "one frame": (lambda p: write_film(p, numbered(1)), "expected a video of many frames, but got one frame"),
+    "no end": (lambda p: cut(noise(p, 9), 0.5), "expected a video, but got one that was cut off"),
+    "no rest": (lambda p: cut(noise(p, options=FAST), 0.5), "expected 2.0 seconds, as its header says, but"),
+    "no rest, with sound": (
+        lambda p: cut(with_sound(noise(p), 3), 0.5),
+        "expected 3.0 seconds, as its header",
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", BROKEN)
+def test_what_is_no_whole_video_is_refused(tmp_path, kind):
+    make, says = BROKEN[kind]
+    with pytest.raises(ValueError, match=says):
+        measure(make(tmp_path / "a.mp4"), quiet)
+
+
+def test_sound_may_go_on_after_the_last_frame(tmp_path):
+    assert len(stamps_of(with_sound(noise(tmp_path / "a.mp4"), 3))) == 50
+
+
+def test_the_sharpest_of_each_window_in_time_is_chosen():
+    rng = np.random.default_rng(1)
+    stamps, sharp = np.cumsum(rng.uniform(0.01, 0.2, 100)), rng.uniform(0, 1, 100)
+    edges = np.linspace(stamps[0], stamps[-1], 8)
+    for index, low, high in zip(sharpest(stamps, sharp, 7), edges[:-1], edges[1:], strict=True):
+        assert sharp[index] == sharp[(stamps >= low) & (stamps <= high)].max()
+    stamps = np.concatenate([np.linspace(0, 1, 50), [6.0, 10.0]])
+    assert sharpest(stamps, np.arange(52.0), 3) == [49, 50, 51]
+    assert sharpest(stamps, -np.arange(52.0), 2) == [0, 50]
+
+
+@pytest.mark.parametrize("count", [1, 7, 40, 59, 60, 99])
+def test_gaps_cost_no_frames(count):
+    stamps = np.concatenate([np.linspace(0, 1, 30), np.linspace(50, 51, 30)])
+    chosen = sharpest(stamps, np.arange(60.0), count)
+    assert chosen == sorted(set(chosen))
+    assert min(count, 60) - 1 <= len(chosen) <= count
+
+
+def test_blur_lowers_sharpness_and_widens_edges():
+    rng = np.random.default_rng(0)
+    image = rng.integers(0, 256, (10, 16)).repeat(40, 0).repeat(40, 1).astype(np.uint8)
+    series = [image, *(gaussian_filter(image.astype(float), s) for s in (1, 3, 6, 12))]
+    values, widths = [sharpness(blurred) for blurred in series], [edge_width(blurred) for blurred in series]
+    assert values == sorted(values, reverse=True)
+    assert widths == sorted(widths)
+    assert edge_width(0.1 * image) == pytest.approx(widths[0], rel=1e-4)  # whatever the contrast
+    assert edge_width(image.repeat(2, 0).repeat(2, 1)) == pytest.approx(widths[0], rel=1e-4)  # or size
+    assert edge_width(np.full((9, 9), 7)) == float("inf")
+
+
+def taken(tmp_path, source, masks=None, count=4, size=None, colmap=None):
+    work = tmp_path / "work"
+    work.mkdir(exist_ok=True)
+    kind = "video" if source.suffix == ".mp4" else "images"
+    source = Source(**{kind: source}, masks=masks, colmap=colmap)
+    return take(work, source, lambda title: nullcontext(quiet), count=count, size=size)
+
+
+def test_frames_bear_their_numbers_and_stamps_and_are_taken_once(tmp_path):
+    film = write_film(tmp_path / "a.mp4", numbered(12), stamps="N*(N+1)*10")
+    frames = taken(tmp_path, film)
+    assert frames.found == 12
+    assert 3 <= len(frames.times) <= 4
+    for name, stamp in frames.times.items():
+        n = int(name[6:12]) - 1
+        assert stamp == pytest.approx(n * (n + 1) / 100)
+        assert number_of(np.asarray(Image.open(frames.folder / name))) == n
+    film.unlink()
+    assert taken(tmp_path, film) == frames
+
+
+def test_by_default_at_most_every_second_frame_is_taken(tmp_path):
+    frames = taken(tmp_path, write_film(tmp_path / "a.mp4", numbered(12)), count=None)
+    assert [(int(name[6:12]) - 1) // 2 for name in sorted(frames.times)] == list(range(6))
+
+
+def test_images_of_a_folder_come_in_the_order_of_their_names(tmp_path):
+    (tmp_path / "p").mkdir()
+    for name in ("img 10.png", "img 2.png", "img 1.png", "img 2.jpg"):
+        Image.new("RGB", (64, 48), (int(name[4:-4]),) * 3).save(tmp_path / "p" / name)
+    (tmp_path / "p" / "notes.txt").touch()
+    (tmp_path / "p" / "._img 1.png").touch()  # as macOS leaves them
+    frames = taken(tmp_path, tmp_path / "p", size=32)
+    ours = ["picture_000001.png", "picture_000002.jpg", "picture_000003.png", "picture_000004.png"]
+    assert frames.times == {name: number for number, name in enumerate(ours)}
+    assert frames.originals == dict(zip(ours, ["img 1.png", "img 2.jpg", "img 2.png", "img 10.png"]))
+    assert frames.size == (32, 24)
+    with Image.open(frames.folder / ours[3]) as image:
+        assert image.size == (32, 24)
+        assert image.getpixel((0, 0)) == (10, 10, 10)
+
+
+def quarter(folder, count=3, mode="RGB", size=(64, 48), **options):
+    """Images that are bright in the upper left quarter; of RGBA all else is transparent."""
+    folder.mkdir()
+    for n in range(count):
+        image = Image.new(mode, size)
+        image.paste((250,) * len(mode), (0, 0, size[0] // 2, size[1] // 2))
+        image.save(folder / f"{n}.{'png' if mode == 'RGBA' else 'jpg'}", **options)
+    return folder
+
+
+def turned():
+    """What says that an image is stored a quarter turn to the left."""
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    return exif
+
+
+@pytest.mark.parametrize("known", [False, True])
+def test_images_are_turned_and_made_smaller_but_for_known_poses(tmp_path, known):
+    source = quarter(tmp_path / "p", exif=turned())
+    frames = taken(tmp_path, source, size=32, colmap=tmp_path if known else None)
+    with Image.open(frames.folder / "picture_000001.jpg") as image:
+        width, height = frames.size
+        assert image.size == frames.size == ((64, 48) if known else (24, 32))
+        bright = [image.getpixel(place)[0] > 200 for place in ((3, 3), (width - 3, 3))]
+        assert bright == [known, not known]
+
+
+def test_cut_outs_stay_cut_out(tmp_path):
+    frames = taken(tmp_path, quarter(tmp_path / "p", mode="RGBA"), size=32)
+    with Image.open(frames.folder / "picture_000001.png") as image:
+        assert image.getpixel((5, 5)) == (250,) * 4
+        assert image.getpixel((25, 20))[3] == 0
+
+
+@pytest.mark.parametrize(
+    ("count", "odd", "says"),
+    [
+        (2, None, "p: expected a folder of many pictures, PNG or JPEG, but got 2 PNG or JPEG files"),
+        (3, ("RGBA", (64, 48), None), "odd.png: expected alpha in all pictures or in none"),
+        (
+            3,
+            ("RGB", (64, 48), turned()),
+            "odd.png: expected 64 x 48 pixels as the first, but got 48 x 64, as",
+        ),
+    ],
+)
+def test_folders_that_are_no_capture_are_refused(tmp_path, count, odd, says):
+    quarter(tmp_path / "p", count)
+    if odd:
+        Image.new(*odd[:2]).save(tmp_path / "p" / "odd.png", exif=odd[2])
+    with pytest.raises(ValueError, match=says):
+        taken(tmp_path, tmp_path / "p")
+
+
+def masks_in(folder, names, value=255, box=(0, 0, 16, 16), size=(128, 96)):
+    """Masks of a bright ``box`` (left, top, right, bottom)."""
+    folder.mkdir()
+    for name in names:
+        mask = Image.new("L", size)
+        mask.paste(value, box)
+        mask.save(folder / name)
+    return folder
+
+
+@pytest.mark.parametrize("by_name", [True, False])
+def test_what_moves_is_black_for_the_matcher(tmp_path, by_name):
+    film = write_film(tmp_path / "a.mp4", numbered(12))
+    # More masks than frames can only be meant by name.
+    names = [f"frame_{n:06d}.png" for n in range(1, 14)] if by_name else [f"{n}.png" for n in range(12)]
+    frames = taken(tmp_path, film, masks_in(tmp_path / "masks", names))
+    for name in frames.times:
+        mask = np.asarray(Image.open(frames.masks / f"{name}.png"))
+        assert mask.shape == (48, 64)
+        assert (mask[:8, :8] == 0).all()
+        assert (mask == 255).sum() == 48 * 64 - 64
+
+
+def test_masks_of_all_frames_count_in_order_also_when_numbered_from_0(tmp_path):
+    film, masks = write_film(tmp_path / "a.mp4", numbered(12)), tmp_path / "masks"
+    masks.mkdir()
+    for n in range(12):  # of frame n the columns up to 5 n are still
+        mask = np.uint8(255 * (np.arange(64) >= 5 * n))[None].repeat(48, 0)
+        Image.fromarray(mask).save(masks / f"frame_{n:06d}.png")
+    frames = taken(tmp_path, film, masks)
+    for name in frames.times:
+        still = np.asarray(Image.open(frames.masks / f"{name}.png"))[0] > 0
+        assert still.sum() == 5 * (int(name[6:12]) - 1)
+
+
+def test_masks_of_a_folder_go_by_the_users_names(tmp_path):
+    masks = masks_in(tmp_path / "masks", ["0.png", "1.png", "2.png", "other.png"])
+    frames = taken(tmp_path, quarter(tmp_path / "p"), masks)
+    assert {path.name for path in frames.masks.iterdir()} == {f"{name}.png" for name in frames.times}
+
+
+@pytest.mark.parametrize(
+    ("names", "value", "says"),
+    [
+        (["0.png", "1.png", "2.png"], 1, "brighter than 127 of 255, but got at most 1; write it as 255"),
+        (["1.png", "2.png"], 255, r"expected 3 masks, .* \(0.png\), but got 2"),
+    ],
+)
+def test_masks_that_fit_nothing_or_mark_nothing_are_refused(tmp_path, names, value, says):
+    with pytest.raises(ValueError, match=says):
+        taken(tmp_path, quarter(tmp_path / "p"), masks_in(tmp_path / "masks", names, value))

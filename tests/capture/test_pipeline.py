@@ -1,0 +1,59 @@
+import pytest
+from filelock import FileLock
+
+pytest.importorskip("pycolmap", reason="no pycolmap; make install adds it")
+
+from forewarp.capture.pipeline import work_folder
+
+ABOUT = {"video": "a.mp4", "frames": 12}
+
+
+def work(out, about=ABOUT, error=None):
+    """Enter, note what is there, leave a file, and end as asked."""
+    with work_folder(out, about) as folder:
+        there = sorted(path.name for path in folder.iterdir())
+        (folder / "frames").touch()
+        if error is not None:
+            raise error
+        out.mkdir(exist_ok=True)
+    return there
+
+
+def test_it_is_gone_at_the_end_and_the_next_call_keeps_what_it_begins(tmp_path, monkeypatch):
+    """That may begin as soon as the lock is free; the folder of the one before is removed by then."""
+    free, there = FileLock.release, []
+    monkeypatch.setattr(
+        FileLock,
+        "release",
+        lambda lock, *a, **k: (there.extend((tmp_path / "new").iterdir()), free(lock, *a, **k)),
+    )
+    assert work(tmp_path / "new" / "hand") == ["about.json"]
+    assert there[:1] == [tmp_path / "new" / "hand"]
+    assert [path.name for path in (tmp_path / "new").iterdir()] == ["hand"]
+
+
+@pytest.mark.parametrize("error", [ValueError("a: expected b, but got c"), ImportError("no")])
+def test_a_refusal_leaves_nothing(tmp_path, error):
+    with pytest.raises(type(error)):
+        work(tmp_path / "new" / "hand", error=error)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "error",
+    [KeyboardInterrupt(), OSError("full"), RuntimeError("a bug"), ValueError("shapes (2,) (3,) not aligned")],
+)
+def test_what_was_interrupted_goes_on_but_other_work_begins_anew(tmp_path, error):
+    with pytest.raises(type(error)):
+        work(tmp_path / "hand", error=error)
+    with pytest.raises(type(error)):
+        work(tmp_path / "other", error=error)
+    assert work(tmp_path / "hand") == ["about.json", "frames"]
+    assert work(tmp_path / "other", ABOUT | {"frames": 13}) == ["about.json"]
+
+
+def test_two_at_once_are_refused(tmp_path):
+    with work_folder(tmp_path / "hand", ABOUT) as folder:
+        with pytest.raises(ValueError, match="expected one capture at a time"):
+            work(tmp_path / "hand")
+        assert folder.is_dir()
