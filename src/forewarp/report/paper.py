@@ -200,22 +200,21 @@ def comparison(table: PaperTable, runs: Runs) -> Table:
     """
     found = measured(table, runs)
     numbers, no_costs = numbered(run for of_row in found for run in of_row), [None] * len(COSTS)
-    lines, ranked, rules = [], [], []
+    lines, rules = [], []
     for printed in [*table.rows, None]:
         of_method = [of_row for of_row in found if table.printed(of_row[0]) is printed]
         rules += [len(lines)] if of_method or (printed and lines and lines[-1][1] != "published") else []
         lines += [[printed.name, "published", *printed.values, *no_costs]] if printed else []
         for of_row in of_method:
             cells = cells_of(of_row, table)
-            ranked.append(len(lines))
             lines.append([name_of(of_row), "measured", *cells, *costs_of(of_row, numbers)])
             if printed and any(cells):
                 both = zip(cells, printed.values)
                 differences = [Difference(cell.mean - float(v)) if cell and v else None for cell, v in both]
                 lines.append(["", "difference to the paper", *differences, *no_costs])
     columns = columns_of(["method", "kind", *(_column(*column) for column in table.columns), *COSTS])
-    marks = _marks(table, lines, ranked, 2) if _comparable(found) else {}
-    return Table(columns, lines, marks=marks, rules=[rule for rule in rules if rule])
+    rules = [rule for rule in rules if rule]
+    return Table(columns, lines, marks=_marks(found, table, lines, 2), rules=rules)
 
 
 def stand_in(table: PaperTable, runs: Runs) -> Table | None:
@@ -236,14 +235,12 @@ def stand_in(table: PaperTable, runs: Runs) -> Table | None:
     lines = []
     for of_row in found:
         printed = table.printed(of_row[0])
-        beside = (
-            [printed.name, *(printed.values[i] for i, _ in shown)] if printed else [""] * (1 + len(shown))
-        )
+        values = [printed.values[i] for i, _ in shown] if printed else [""] * len(shown)
+        beside = [printed.name if printed else "", *values]
         lines.append([name_of(of_row), *cells_of(of_row, made), *costs_of(of_row, numbers), *beside])
     columns = ["measured", *(_column(*column) for column in made.columns), *COSTS, "published as"]
     columns += [f"published: {group.name} PSNR" for _, group in shown]
-    marks = _marks(made, lines, range(len(lines)), 1) if _comparable(found) else {}
-    return Table(columns_of(columns), lines, marks=marks)
+    return Table(columns_of(columns), lines, marks=_marks(found, made, lines, 1))
 
 
 def counterpart(table: PaperTable, runs: Runs) -> PaperTable | None:
@@ -289,23 +286,13 @@ def name_of(runs: Runs) -> str:
     """Name a measured row: method or variant, and its conditions."""
     run, seeds = runs[0], len(runs.by("seed"))
     about = run["method"] if run["ablation"] is None else run["about"] or run["ablation"]
-    minutes = f"{run['minutes'] or 0:g} min" + " of processor time" * (run["clock"] == "processor")
-    parts = {f"forewarp: {about}" + " (the paper's method)" * (about == "forward"): True, run["preset"]: True}
-    parts |= {
-        minutes: run["minutes"],
-        f"{run['iterations']} steps": run["iterations"],
-        f"{seeds} seeds": seeds > 1,
-    }
-    parts |= {
-        f"{run['held_out']} views held out": run["held_out"],
-        f"{run['tested']} test views": run["tested"],
-    }
-    return ", ".join(part for part, known in parts.items() if known)
-
-
-def _comparable(found: Sequence[Runs]) -> bool:
-    """Tell whether rows differ in method and variant alone: same budget, machine and test views."""
-    return len(Runs(of_row[0] for of_row in found).by(*BUDGET)) == 1
+    parts = [f"forewarp: {about}" + " (the paper's method)" * (about == "forward"), run["preset"]]
+    if run["minutes"]:
+        parts.append(f"{run['minutes']:g} min" + " of processor time" * (run["clock"] == "processor"))
+    parts += [f"{run['iterations']} steps"] if run["iterations"] else []
+    parts += [f"{seeds} seeds"] if seeds > 1 else []
+    parts += [f"{run['held_out']} views held out"] if run["held_out"] else []
+    return ", ".join(parts + ([f"{run['tested']} test views"] if run["tested"] else []))
 
 
 def _column(group: Group, metric: str) -> Column:
@@ -314,12 +301,16 @@ def _column(group: Group, metric: str) -> Column:
     return Column(f"{group.name} {title}{'↑' if known.higher_is_better else '↓'}", min(known.digits, 3))
 
 
-def _marks(table: PaperTable, lines: Sequence[Sequence[Cell]], ranked: Sequence[int], first: int) -> dict:
-    """Mark the best and the second best of each column from ``first`` on; equal texts tie."""
+def _marks(found: Sequence[Runs], table: PaperTable, lines: Sequence[Sequence[Cell]], first: int) -> dict:
+    """Mark the best and the second best measured score of each column from ``first`` on; equal texts tie.
+
+    None where rows differ in more than method and variant: in budget, machine or test views.
+    """
     marks = {}
-    for j, (group, metric) in enumerate(table.columns, first):
-        digits = _column(group, metric).digits
-        values = {i: round(lines[i][j].mean, digits) for i in ranked if lines[i][j] is not None}
+    comparable = len(Runs(of_row[0] for of_row in found).by(*BUDGET)) == 1
+    for j, (group, metric) in enumerate(table.columns if comparable else (), first):
+        digits, scores = _column(group, metric).digits, enumerate(line[j] for line in lines)
+        values = {i: round(score.mean, digits) for i, score in scores if isinstance(score, Estimate)}
         order = sorted(set(values.values()), reverse=metric_of(metric).higher_is_better)[:2]
         for i, value in values.items():
             if len(values) > 1 and value in order:
