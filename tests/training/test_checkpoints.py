@@ -60,9 +60,7 @@ def test_one_flipped_bit_is_refused(tmp_path, interrupted):
     at = content.index(stored.numpy().tobytes()[:64])
     content[at + 3] ^= 1
     (tmp_path / "last.ckpt").write_bytes(content)
-    with pytest.raises(
-        ValueError, match="last.ckpt: expected a checkpoint, but it cannot be read .BadZipFile."
-    ):
+    with pytest.raises(ValueError, match="last.ckpt: expected a checkpoint, but it cannot be read .BadZip"):
         check_checkpoint(tmp_path / "last.ckpt", module(tmp_path))
 
 
@@ -77,15 +75,6 @@ def test_a_checkpoint_cannot_execute_code(tmp_path):
     assert not (tmp_path / "deed").exists()
 
 
-def test_an_older_checkpoint_is_refused_by_what_it_lacks(tmp_path, interrupted):
-    content = torch.load(interrupted, weights_only=True)
-    content["forewarp"].pop("curriculum")
-    (tmp_path / "coarse").mkdir()
-    torch.save(content, tmp_path / "coarse" / "last.ckpt")
-    with pytest.raises(ValueError, match=r"last.ckpt: .* but got one without curriculum; delete it to begin"):
-        run(tmp_path).fit()
-
-
 def test_checkpoints_come_by_the_clock(tmp_path, monkeypatch):
     saved = []
     monkeypatch.setattr(KeepCheckpoint, "save", lambda self, trainer: saved.append(trainer.global_step))
@@ -97,21 +86,21 @@ def test_checkpoints_come_by_the_clock(tmp_path, monkeypatch):
 
 GRID = "method.radiance."
 HARM = {
-    "index out of range": ("index", lambda v, c: v.__setitem__((0, 0, 0), 10**6)),
-    "index below": ("index", lambda v, c: v.__setitem__((0, 0, 0), -2)),
-    "index swapped": ("index", lambda v, c: v.copy_(v.flip(0))),
-    "index of another shape": ("index", lambda v, c: c.update({GRID + "index": v[1:].clone()})),
-    "index of another kind": ("index", lambda v, c: c.update({GRID + "index": v.long()})),
-    "index of nothing": ("index", lambda v, c: c.update({GRID + "index": None})),
-    "voxel outside": ("voxels", lambda v, c: v.__setitem__((0, 2), 10**6)),
-    "voxel below": ("voxels", lambda v, c: v.__setitem__((0, 2), -1)),
-    "voxels of a plane": ("voxels", lambda v, c: c.update({GRID + "voxels": v[:, :2].clone()})),
-    "fewer rows": ("color", lambda v, c: c.update({GRID + "color": v[:1].clone()})),
-    "more channels": ("density", lambda v, c: c.update({GRID + "density": v.repeat(1, 2)})),
-    "another shape": ("_extra_state", lambda v, c: v.update(shape=[99, 99, 99])),
-    "an absurd shape": ("_extra_state", lambda v, c: v.update(shape=[10**6] * 3)),
-    "no shape": ("_extra_state", lambda v, c: v.pop("shape")),
-    "no box": ("_extra_state", lambda v, c: v.update(low=[9.0, 9.0, 9.0])),
+    "index out of range": ("index", lambda v: v.__setitem__((0, 0, 0), 10**6)),
+    "index below": ("index", lambda v: v.__setitem__((0, 0, 0), -2)),
+    "index swapped": ("index", lambda v: v.flip(0)),
+    "index of another shape": ("index", lambda v: v[1:].clone()),
+    "index of another kind": ("index", lambda v: v.long()),
+    "index of nothing": ("index", lambda v: "nothing"),
+    "voxel outside": ("voxels", lambda v: v.__setitem__((0, 2), 10**6)),
+    "voxel below": ("voxels", lambda v: v.__setitem__((0, 2), -1)),
+    "voxels of a plane": ("voxels", lambda v: v[:, :2].clone()),
+    "fewer rows": ("color", lambda v: v[:1].clone()),
+    "more channels": ("density", lambda v: v.repeat(1, 2)),
+    "another shape": ("_extra_state", lambda v: v | {"shape": [99, 99, 99]}),
+    "an absurd shape": ("_extra_state", lambda v: v | {"shape": [10**6] * 3}),
+    "no shape": ("_extra_state", lambda v: {}),
+    "no box": ("_extra_state", lambda v: v | {"low": [9.0, 9.0, 9.0]}),
 }
 
 
@@ -120,7 +109,9 @@ def test_a_grid_whose_parts_do_not_fit_is_refused(tmp_path, interrupted, harm):
     """Kernels would read out of bounds and crash the process."""
     content = torch.load(interrupted, weights_only=True)
     name, change = HARM[harm]
-    change(content["state_dict"][GRID + name], content["state_dict"])
+    value = content["state_dict"][GRID + name]
+    changed = change(value)
+    content["state_dict"][GRID + name] = value if changed is None else changed
     torch.save(content, tmp_path / "last.ckpt")
     named = "(index|_extra_state)" if "shape" in harm else name
     with pytest.raises(ValueError, match=f"last.ckpt: expected .* that differs in {GRID}{named};"):
@@ -133,6 +124,7 @@ def test_a_grid_whose_parts_do_not_fit_is_refused(tmp_path, interrupted, harm):
         (lambda c: c.pop("global_step"), "expected a checkpoint with its step and seconds, but got None"),
         (lambda c: c["forewarp"].update(clock=7), "expected a checkpoint with its step and seconds"),
         (lambda c: c.update(forewarp=7), "expected a checkpoint of this version"),
+        (lambda c: c["forewarp"].pop("curriculum"), "but got one without curriculum; delete it to begin"),
         (lambda c: c.update(state_dict=7), "expected a checkpoint, but it holds no weights"),
         (lambda c: c["state_dict"].update({7: 7}), "that differs in 7;"),
     ],

@@ -270,7 +270,11 @@ class VoxelGrid(nn.Module):
             return "voxels"
         if not bool(lattice.holds(voxels).all()):
             return "voxels"
-        if not _is(index, torch.int32) or not torch.equal(index, index_of(voxels, lattice.shape)):
+        if (
+            not _is(index, torch.int32) or tuple(index.shape) != lattice.shape
+        ):  # before one is made of a shape
+            return "index"
+        if not torch.equal(index, index_of(voxels, lattice.shape)):
             return "index"
         for name in self.names:
             values, own = state.get(prefix + name), self.parameter(name)
