@@ -10,13 +10,13 @@ import yaml
 from forewarp.data.module import SceneDataModule
 from forewarp.methods.particles.options import EFFECTS as PARTICLES
 from forewarp.methods.particles.options import ParticlesPlanning
+from forewarp.planning.plan import Planner
 from forewarp.planning.plan_file import read_plan, with_plan, write_plan
-from forewarp.planning.planner import Planner
 from forewarp.planning.trials import Trial, Trials
 from forewarp.scene.silhouettes import Survey
 from forewarp.synth.scenes import synthesize
 
-TINY = ["data=dnerf", "preset=demo", "trainer=cpu", "logger=none", "callbacks=default"]
+TINY = ["data=dnerf", "preset=demo", "trainer=cpu", "logger=none"]
 TINY += ["callbacks.pictures=null", "callbacks.accuracy=null", "callbacks.scalars=null", "threads=1"]
 VOXELS = [
     "model=forward",
@@ -133,7 +133,7 @@ def test_particles_are_planned_by_leaving_effects_out(forewarp, scenes, in_tmp, 
 @pytest.mark.slow
 def test_every_question_is_asked_where_all_is_open(ok, words, in_tmp, monkeypatch):
     """No alpha, and evidence that rules nothing out: each effect is tried, with its price."""
-    monkeypatch.setattr("forewarp.methods.voxel.planning.CUT_OUT", 2.0)
+    monkeypatch.setattr("forewarp.methods.effect.CUT_OUT", 2.0)
     monkeypatch.setattr("forewarp.methods.voxel.planning.BY_DIRECTION", (-9.0, 9.0))
     monkeypatch.setattr("forewarp.methods.voxel.planning.TORN", (-1.0, 9.0))
     monkeypatch.setattr("forewarp.methods.voxel.planning.HEADROOM", (99.0, -99.0))
@@ -202,14 +202,6 @@ def test_what_is_no_plan_is_refused(tmp_path, text):
         read_plan(tmp_path / "plan.yaml")
 
 
-def test_a_plan_of_an_earlier_version_is_to_be_made_anew(refused, in_tmp):
-    (in_tmp / "plan.yaml").write_text("typed: [data.scene=x]\nwords: [model/motion=none]\nof: x\n")
-    assert refused("train", "plan=plan.yaml") == (
-        "plan: expected the key overrides, but got words, as before version 0.3, in plan.yaml; "
-        "make it anew with forewarp-plan"
-    )
-
-
 @pytest.mark.parametrize(
     "word",
     [
@@ -225,11 +217,12 @@ def test_a_plan_sets_no_code(tmp_path, word):
 
 def test_what_a_plan_composes_names_no_code_of_others(refused, in_tmp):
     """Whatever words lead there: the config of a planned run is looked at before anything is made of it."""
-    mine = in_tmp / "mine" / "callbacks"
+    mine = in_tmp / "mine" / "experiment"
     mine.mkdir(parents=True)
-    (mine / "evil.yaml").write_text("x: {_target_: shutil.copyfile, src: a, dst: b, _partial_: true}\n")
+    evil = "callbacks: {x: {_target_: shutil.copyfile, src: a, dst: b, _partial_: true}}"
+    (mine / "evil.yaml").write_text(f"# @package _global_\n{evil}\n")
     file = in_tmp / "plan.yaml"
-    write_plan(file, {"typed": ["data.scene=x"], "overrides": ["callbacks=evil"], "of": "0"})
+    write_plan(file, {"typed": ["data.scene=x"], "overrides": ["experiment=evil"], "of": "0"})
     said = refused("train", f"plan={file}", "evaluate=false", f"--config-dir={mine.parent}")
     assert "callbacks.x._target_: expected a class of forewarp, but got 'shutil.copyfile'" in said
     assert not (in_tmp / "runs").exists()
@@ -254,15 +247,14 @@ def test_a_plan_names_code_of_trusted_packages_and_never_trust(tmp_path):
 
 def test_what_is_typed_beside_a_plan_wins(tmp_path):
     file = tmp_path / "plan.yaml"
-    planned = [
-        *("model/view_dependence=sh", "model/inpainter=none", "model/motion=none", "stage.coarse.bases=[]")
-    ]
+    planned = ["model=forward", "model/view_dependence=sh", "model/inpainter=none", "model/motion=none"]
+    planned.append("stage.coarse.bases=[]")
     typed = ["data.scene=x", "seed=3", "model.trajectory.features=2", "stage.coarse.bases=[[0,4]]"]
     write_plan(file, {"typed": typed, "overrides": planned, "of": "0"})
     found = with_plan("train", [f"plan={file}", "model/inpainter=unet3d", "seed=4"])
     assert found == [
-        "model=forward",  # a plan that names no method is of a time when this was the default
-        *("model/view_dependence=sh", "model/motion=none", "data.scene=x", "stage.coarse.bases=[[0,4]]"),
+        *("model=forward", "model/view_dependence=sh", "model/motion=none", "data.scene=x"),
+        "stage.coarse.bases=[[0,4]]",
         *(f"planned='{file}'", "effects=given", "run='${paths.runs}/${data.scene}/planned-{hash}'"),
         *("model/inpainter=unet3d", "seed=4"),
     ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -13,6 +13,10 @@ from forewarp.scene.frame import Scene
 from forewarp.scene.silhouettes import Survey
 from forewarp.scene.view import Target
 
+CUT_OUT = 0.001  # share of transparent pixels below which the scene has a background
+DISAGREEMENT = 0.01  # share of the foreground that no static shape explains, above which something moves
+NARROW = 15.0  # degrees between the most different cameras below which direction cannot be observed
+
 
 @dataclass(frozen=True)
 class Effect:
@@ -20,7 +24,7 @@ class Effect:
 
     Attributes:
         name: name of the config group ``model/<name>``.
-        on, off: the usual options that switch it on and off.
+        on: the usual option that switches it on; ``none`` switches it off.
         attribute: the method's attribute, perhaps a dotted name, that is None while the effect is off; by
             default ``name``.
         later: True: decide it after the coarse stage, by a trial with and without it. False: decide it by
@@ -32,7 +36,6 @@ class Effect:
 
     name: str
     on: str
-    off: str = "none"
     attribute: str | None = None
     later: bool = False
     rules_out: Callable[[Evidence], bool] = lambda evidence: False
@@ -46,10 +49,10 @@ class Effect:
 
     def is_on(self, method: Method) -> bool:
         """Return whether the effect is on in a method."""
-        found = method
+        part = method
         for name in (self.attribute or self.name).split("."):
-            found = getattr(found, name, None)
-        return found is not None
+            part = getattr(part, name, None)
+        return part is not None
 
 
 def switched(method: Method) -> dict[str, bool]:
@@ -98,6 +101,27 @@ class Evidence:
     at_rest: dict[str, float] = field(default_factory=dict)
     most_steps: int | None = None
 
+    @property
+    def cut_out(self) -> bool:
+        """Whether the subject is cut out, so that silhouettes say something."""
+        return self.pictures.cut_out >= CUT_OUT
+
+    @property
+    def seen_to_move(self) -> str:
+        """Describe what the images say of motion."""
+        why = f"{self.pictures.times} times"
+        if not self.cut_out:
+            return why
+        seen = self.pictures.disagreement
+        return f"{why}; silhouettes: a static shape explains all but {seen:.1%} of the foreground"
+
+    @property
+    def no_direction(self) -> str | None:
+        """Say why the images cannot show colour that depends on direction; None if they can."""
+        spread = self.pictures.spread
+        why = f"all cameras lie within {spread:.0f} degrees: direction is not seen"
+        return why if spread < NARROW else None
+
     def price(self, gain: Gain) -> float:
         """Return the PSNR (dB) lost to the steps that an effect's extra time displaces.
 
@@ -115,6 +139,11 @@ class Evidence:
         """Return whether an effect's gain exceeds its noise and its price; None without a trial."""
         gain = self.gains.get(effect)
         return None if gain is None else gain.psnr > max(gain.noise, self.bound(effect)) + self.price(gain)
+
+    def calls_for(self, effect: str, otherwise: bool) -> bool:
+        """Return whether an effect pays; without a trial, ``otherwise``."""
+        pays = self.pays(effect)
+        return otherwise if pays is None else pays
 
     def hopeless(self, effect: str) -> bool:
         """Return whether the trials so far rule an effect out, so that no other seed need be tried."""
@@ -168,43 +197,33 @@ class Asked:
         """Name of the last stage."""
         return list(self.stages)[-1]
 
-
-@dataclass(frozen=True)
-class Begin:
-    """Fit the coarse stage ``name`` with the overrides ``overrides`` and continue from it.
-
-    With ``change`` the ``overrides`` are added to those of the coarse stage before.
-    """
-
-    name: str
-    overrides: Sequence[str]
-    change: bool = False
+    def decided(self, effect: str, on: bool, because: str, others: Sequence[str] = ()) -> Decision:
+        """Return the decision on an effect, but what the user typed for it; ``others``: further overrides."""
+        typed = self.typed.get(f"model/{effect}")
+        if typed is not None:
+            return Decision(effect, typed, tuple(others), f"as typed; {because}", typed != "none")
+        choice = self.choose(effect) if on else "none"
+        return Decision(effect, choice, (f"model/{effect}={choice}", *others), because, on)
 
 
-@dataclass(frozen=True)
-class Rival:
-    """Fit another coarse stage ``name`` that differs in ``overrides``; continue from the better one.
+class CoarseTrials(Protocol):
+    """What a method may try with coarse stages, each of a name and of overrides."""
 
-    The rival has the ``effect`` if ``adds``, else it lacks it. The answer is whether the effect pays.
-    """
+    def begin(self, name: str, overrides: Sequence[str], *, change: bool = False) -> None:
+        """Fit a coarse stage and continue from it; with ``change`` of the coarse stage before."""
 
-    effect: str
-    name: str
-    overrides: Sequence[str]
-    adds: bool = False
+    def rival(self, effect: str, name: str, overrides: Sequence[str], *, adds: bool = False) -> bool:
+        """Fit another coarse stage, which differs in ``overrides``; continue from the better one.
 
+        The rival has the ``effect`` if it ``adds`` it, else it lacks it. Return whether the effect pays.
+        """
 
-@dataclass(frozen=True)
-class Drop:
-    """Continue the coarse stage with and, by ``overrides``, without an effect, at equal steps, seed by seed.
+    def drop(self, effect: str, overrides: Sequence[str], *, longer: int = 1) -> bool:
+        """Continue the coarse stage with and, by ``overrides``, without an effect, at equal steps.
 
-    If the effect is not missed, all later trials do without it. The answer is whether it pays. ``longer``:
-    how many times the usual steps.
-    """
-
-    effect: str
-    overrides: Sequence[str]
-    longer: int = 1
+        If the effect is not missed, all later trials do without it. Return whether it pays. ``longer``: how
+        many times the usual steps.
+        """
 
 
 class Planning(Protocol):
@@ -225,8 +244,8 @@ class Planning(Protocol):
     def always(self, asked: Asked) -> tuple[Sequence[str], Sequence[str]]:
         """Return the overrides of every trial, and the additional ones of fine trials."""
 
-    def coarse(self, evidence: Evidence, asked: Asked) -> Generator[Begin | Rival | Drop, bool | None, None]:
-        """Yield what to fit, one by one; receive for each rival and each drop whether its effect pays."""
+    def coarse(self, evidence: Evidence, asked: Asked, trials: CoarseTrials) -> None:
+        """Fit coarse stages, and try what they tell of effects."""
 
     def look(
         self, evidence: Evidence, method: Method, scene: Scene, targets: Sequence[Target], asked: Asked

@@ -1,22 +1,27 @@
-"""Make the plan of a run, or read the plan made before."""
+"""Plan a run: fit coarse stages, try effects, let the method decide, and write ``plan.yaml``."""
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import asdict, fields, is_dataclass
 from pathlib import Path
+from statistics import fmean
 
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from forewarp.data.module import most_held_out
-from forewarp.methods.effect import Planning
+from forewarp.methods.effect import Asked, Effect, Planning
 from forewarp.planning.plan_file import read_plan, write_plan
-from forewarp.planning.planner import Planner
-from forewarp.planning.trials import Trials
+from forewarp.planning.trials import Trial, Trials, gain
 from forewarp.runs.build import build_run
 from forewarp.runs.config import HASH, content_hash, trust_of
-from forewarp.runs.overrides import key_of
+from forewarp.runs.overrides import key_of, merged
 from forewarp.scene.frame import Scene
+from forewarp.scene.silhouettes import survey
+from forewarp.training.schedule import most_steps
 
 # Keys that do not change what a run computes.
 NOT_OF_IT = ("effects", "plan", "run", "evaluate", "sheets", "views", "reduce", "planned", "trust", "score")
@@ -39,7 +44,6 @@ def make_plan(config: DictConfig, overrides: Sequence[str]) -> dict:
     Raises:
         ValueError: if the run cannot be planned, or ``plan.folder`` holds a plan of another config or data.
     """
-    asked_as = list(overrides)
     typed = [override for override in overrides if key_of(override).split(".")[0] not in NOT_OF_IT]
     run = build_run(config)
     run.check_device()  # before a folder is made
@@ -59,21 +63,165 @@ def make_plan(config: DictConfig, overrides: Sequence[str]) -> dict:
             )
         return made | {"file": str(file), "found": True}
     begin = time.perf_counter()
-    trials = Trials(
-        typed,
-        folder,
-        steps=config.plan.steps or planning.steps,
-        seconds=config.plan.seconds,
-        fine_steps=config.plan.trial_steps or planning.trial_steps,
-        fine_seconds=config.plan.trial_seconds,
-        held_out=spared(run.datamodule.scene, config.plan.held_out),
-        tell=lambda name: print(f"{folder / name}", flush=True),
-    )
-    made = Planner(config, typed, trials, run.datamodule.scene, planning).plan()
-    seconds = time.perf_counter() - begin + trials.seconds_before
-    made |= {"seconds": round(seconds, 1), "of": asked, "asked": asked_as}
+    planner = Planner(config, typed, folder, run.datamodule.scene, planning)
+    made = planner.plan()
+    seconds = time.perf_counter() - begin + planner.trials.seconds_before
+    made |= {"seconds": round(seconds, 1), "of": asked, "asked": list(overrides)}
     write_plan(file, made)
     return made | {"file": str(file)}
+
+
+class Planner:
+    """Plan one run; the method says which effects there are and what counts for each (see ``CoarseTrials``).
+
+    Args:
+        config: the config of the run to plan.
+        typed: the run's overrides; the plan decides nothing that they fix.
+        folder: the plan's folder.
+        scene: the scene as the run would read it.
+        planning: the method's ``Planning``.
+    """
+
+    def __init__(
+        self, config: DictConfig, typed: list[str], folder: Path, scene: Scene, planning: Planning
+    ) -> None:
+        self.typed, self.settings, self.planning = typed, config.plan, planning
+        self.effects: dict[str, Effect] = {effect.name: effect for effect in planning.effects}
+        values = {key_of(override): override.partition("=")[2] for override in typed}
+        stages = {name: stage for name, stage in config.stage.items() if stage is not None}
+        self.asked = Asked(stages, config.preset, values, self._choose, bool(config.plan.trials))
+        always, always_fine = planning.always(self.asked)
+        self.trials = Trials(
+            typed,
+            folder,
+            steps=config.plan.steps or planning.steps,
+            seconds=config.plan.seconds,
+            fine_steps=config.plan.trial_steps or planning.trial_steps,
+            fine_seconds=config.plan.trial_seconds,
+            held_out=spared(scene, config.plan.held_out),
+            always=always,
+            always_fine=always_fine,
+        )
+        # An effect of the last stage costs time of the last stage only.
+        last = stages[self.asked.last]
+        share = last.share / sum(stage.share for stage in stages.values())
+        minutes = config.plan.minutes and config.plan.minutes * share
+        steps = config.budget.iterations and config.budget.iterations * share
+        most = most_steps(steps, last.get("steps_per_picture"), len(scene.train))
+        least = config.plan.least or planning.least
+        self.evidence = planning.evidence(survey(scene), least=least, minutes=minutes, most_steps=most)
+
+    def plan(self) -> dict:
+        """Return the plan, without seconds: overrides, effects with reasons, evidence."""
+        evidence, asked = self.evidence, self.asked
+        self.planning.coarse(evidence, asked, self)
+        scene, views = self.run.datamodule.scene, self.run.datamodule.targets("train")
+        self.planning.look(evidence, self.module.method, scene, views, asked)
+        if self.settings.trials:
+            self._try_later_effects()
+        model = f"model={HydraConfig.get().runtime.choices['model']}"  # its effects; defaults may change
+        overrides, effects = [model], {}
+        for decision in self.planning.decide(evidence, asked):
+            overrides += decision.overrides
+            if decision.on and decision.effect in self.effects:
+                overrides += self.effects[decision.effect].with_it(asked)
+            effects[decision.effect] = {n: getattr(decision, n) for n in ("choice", "on", "because")}
+        values = {field.name: getattr(evidence, field.name) for field in fields(evidence)}
+        numbers = {name: asdict(value) for name, value in values.items() if is_dataclass(value)}
+        numbers["trials"] = {effect: asdict(found) for effect, found in evidence.gains.items()}
+        numbers["at_rest"] = dict(evidence.at_rest)
+        return {
+            "typed": list(self.typed),
+            "overrides": list(dict.fromkeys(overrides)),
+            "effects": effects,
+            "evidence": json.loads(json.dumps(numbers)),  # lists for tuples, as YAML has them
+        }
+
+    def begin(self, name: str, overrides: Sequence[str], *, change: bool = False) -> None:
+        """See ``CoarseTrials``: evidence is taken from this coarse stage, and fine trials begin from it."""
+        overrides = merged(self.base, overrides) if change else list(overrides)
+        self.name, self.base, self.fine_name = name, overrides, "fine"
+        self.reached, self.run, self.module = self.trials.coarse(name, overrides)
+
+    def rival(self, effect: str, name: str, overrides: Sequence[str], *, adds: bool = False) -> bool:
+        """See ``CoarseTrials``."""
+        overrides = merged(self.base, overrides)
+        rival = self.trials.coarse(name, overrides)
+        on, off = (rival[0], self.reached) if adds else (self.reached, rival[0])
+        self.evidence.gains[effect] = gain([on], [off], equal_steps=False)
+        pays = self.evidence.pays(effect)
+        if pays == adds:
+            self.name, self.base, (self.reached, self.run, self.module) = name, overrides, rival
+        return pays
+
+    def drop(self, effect: str, overrides: Sequence[str], *, longer: int = 1) -> bool:
+        """See ``CoarseTrials``."""
+        self._price_of_steps()
+        with_it = self.fine_name, self.base
+        without = f"{self.fine_name}-no-{effect}", merged(self.base, overrides)
+        self._try(effect, with_it, without, longer)
+        pays = self.evidence.pays(effect)
+        if not pays:
+            self.fine_name, self.base = without
+        return pays
+
+    def _try_later_effects(self) -> None:
+        """Try each undecided effect in the fine stage: with and without the effect, at equal steps."""
+        later = [
+            effect
+            for effect in self.effects.values()
+            if effect.later and effect.group not in self.asked.typed and not effect.rules_out(self.evidence)
+        ]
+        if later:
+            self._price_of_steps()
+        for effect in later:
+            choice = f"{effect.group}={self._choose(effect.name)}"
+            self._try(effect.name, (f"fine-{effect.name}", merged(self.base, [choice])), ("fine", self.base))
+
+    def _price_of_steps(self) -> None:
+        """Measure once what steps are worth, if the planned run has given minutes."""
+        evidence = self.evidence
+        if evidence.minutes is None or evidence.step is not None:
+            return
+        plain = self._tried("fine", self.base, 0)
+        half = self._tried("fine-half", self.base, 0, max(1, plain.steps // 2))
+        evidence.slope, evidence.steps, evidence.step = gain([plain], [half]).psnr, plain.steps, plain.step
+
+    def _try(
+        self,
+        effect: str,
+        with_it: tuple[str, list[str]],
+        without: tuple[str, list[str]],
+        longer: int = 1,
+    ) -> None:
+        """Compare two trials, each a name and overrides, seed by seed; stop once the gain is clearly too
+        small. ``longer``: how many times the usual steps and seconds both have.
+        """
+        if longer != 1:
+            many = longer * self.trials.fine_steps
+            with_it, without = ((f"{name}-{many}", overrides) for name, overrides in (with_it, without))
+        on, off = [], []
+        for seed in range(self.settings.seeds):
+            on.append(self._tried(*with_it, seed, on[0].steps if on else None, longer))
+            off.append(self._tried(*without, seed, None, longer))
+            if off[-1].steps != on[-1].steps:  # the trial with the effect ran out of time
+                name, overrides = without
+                off[-1] = self._tried(f"{name}-{on[-1].steps}", overrides, seed, on[-1].steps)
+            self.evidence.gains[effect] = gain(on, off)
+            if self.effects[effect].rests:
+                self.evidence.at_rest[effect] = fmean(trial.at_rest for trial in on)
+            if self.evidence.hopeless(effect):
+                return
+
+    def _tried(
+        self, name: str, overrides: list[str], seed: int, steps: int | None = None, longer: int = 1
+    ) -> Trial:
+        return self.trials.fine(name, overrides, self.name, seed, steps, longer)
+
+    def _choose(self, effect: str) -> str:
+        """Return the option that switches an effect on: the configured one, else ``Effect.on``."""
+        choice = HydraConfig.get().runtime.choices.get(f"model/{effect}")
+        return choice if choice not in (None, "none") else self.effects[effect].on
 
 
 def planning_of(model: Callable, name: str) -> Planning:

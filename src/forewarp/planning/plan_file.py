@@ -31,21 +31,14 @@ def read_plan(file: Path, trust: Sequence[str] = (), typed: Sequence[str] = ()) 
         typed: overrides on this command line; the same ones in the file are accepted unchecked.
 
     Raises:
-        ValueError: if the file is no plan, is of an earlier version, or has overrides no plan may have.
+        ValueError: if the file is no plan, or has overrides no plan may have.
     """
     try:
         made = yaml.safe_load(read_text(file, MOST_CONFIG))
-        if isinstance(made, dict) and "words" in made and "overrides" not in made:
-            raise ValueError(
-                f"plan: expected the key overrides, but got words, as before version 0.3, in {file}; make it "
-                "anew with forewarp-plan"
-            )
         overrides = [*made["typed"], *made["overrides"], f"of={made['of']}"]
         others = [override for override in overrides if override not in typed]
         allowed = all(isinstance(override, str) and _is_harmless(override) for override in others)
     except (OSError, ValueError, yaml.YAMLError, TypeError, KeyError, RecursionError) as error:
-        if str(error).startswith("plan: "):
-            raise
         reason = getattr(error, "strerror", None) or type(error).__name__
         raise ValueError(
             f"plan: expected a file that forewarp-plan wrote, but got {file} ({reason}); "
@@ -58,7 +51,7 @@ def read_plan(file: Path, trust: Sequence[str] = (), typed: Sequence[str] = ()) 
         if (key := key_of(override)).endswith("._target_"):
             check_target(override.partition("=")[2], where, key, trust)
     names = ("typed", "overrides")
-    return made | {name: [one for one in made[name] if key_of(one) != "trust"] for name in names}
+    return made | {name: [word for word in made[name] if key_of(word) != "trust"] for name in names}
 
 
 def _is_harmless(override: str) -> bool:
@@ -88,13 +81,11 @@ def with_plan(name: str, arguments: list[str]) -> list[str]:
     made = read_plan(Path(files[-1]).expanduser(), without_trust(arguments)[1])
     typed = [argument for argument in arguments if not argument.startswith("plan=")]
     planned = merged(made["overrides"], made["typed"])
-    if not any(one.startswith("model=") for one in planned):
-        planned = ["model=forward", *planned]  # of a version in which this was the default
-    model = next(one for one in planned if one.startswith("model="))
-    for one in typed:
-        if one.startswith("resume=") or (one.startswith("model=") and one != model):
+    for override in typed:
+        other_model = override.startswith("model=") and override not in planned
+        if override.startswith("resume=") or other_model:
             raise ValueError(
-                f"{one}: expected no such override beside plan={files[-1]}; leave one of them out"
+                f"{override}: expected no such override beside plan={files[-1]}; leave one of them out"
             )
     file = files[-1].replace("\\", "\\\\").replace("'", "\\'")
     kept = [*planned, f"planned='{file}'", "effects=given"]

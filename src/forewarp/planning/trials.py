@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -15,7 +15,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from forewarp.evaluation.images import psnr_by_view
 from forewarp.files import read_json, write_json
 from forewarp.methods.method import HasRest
-from forewarp.metrics.gain import Gain, Numbers
+from forewarp.metrics.gain import Gain
 from forewarp.runs.build import build_run
 from forewarp.runs.overrides import merged, without_switched_off
 from forewarp.runs.session import session
@@ -44,15 +44,11 @@ class Trial:
     took: float
     at_rest: float = 0.0
 
-    @property
-    def numbers(self) -> list[Numbers]:
-        """Numbers of each view, as ``Gain.of`` takes them."""
-        return [{"psnr": psnr, "step": self.step} for psnr in self.psnr]
-
 
 def gain(on: Sequence[Trial], off: Sequence[Trial], *, equal_steps: bool = True) -> Gain:
     """Compare trials with and without an effect, seed by seed and view by view."""
-    pairs = [list(zip(a.numbers, b.numbers, strict=True)) for a, b in zip(on, off, strict=True)]
+    numbers = [[[{"psnr": psnr, "step": t.step} for psnr in t.psnr] for t in trials] for trials in (on, off)]
+    pairs = [list(zip(*views, strict=True)) for views in zip(*numbers, strict=True)]
     seconds = on[0].step * on[0].steps, off[0].step * off[0].steps
     return Gain.of(pairs, on[0].steps if equal_steps else None, seconds)
 
@@ -74,11 +70,10 @@ class Trials:
         fine_steps: steps of a fine stage.
         fine_seconds: most seconds of a fine stage.
         held_out: number of training views to hold out and score.
-        tell: called with the name of each trial before the trial runs.
-        seconds_before: total seconds of the trials that were finished before.
-        made: the fine trials so far, as several effects are compared with the same trial.
         always: the method's overrides of every trial.
         always_fine: the method's overrides of every fine trial.
+        seconds_before: total seconds of the trials that were finished before.
+        made: the fine trials so far, as several effects are compared with the same trial.
     """
 
     typed: list[str]
@@ -88,11 +83,10 @@ class Trials:
     fine_steps: int
     fine_seconds: float
     held_out: int
-    tell: Callable[[str], None] = print
-    seconds_before: float = 0.0
-    made: dict[str, Trial] = field(default_factory=dict)
     always: Sequence[str] = ()
     always_fine: Sequence[str] = ()
+    seconds_before: float = 0.0
+    made: dict[str, Trial] = field(default_factory=dict)
 
     def coarse(self, name: str, changes: Sequence[str]) -> tuple[Trial, Run, DynamicSceneModule]:
         """Fit a coarse stage with these overrides; return its result, its run and the fitted module."""
@@ -102,13 +96,7 @@ class Trials:
         return self._fitted(config)
 
     def fine(
-        self,
-        name: str,
-        changes: Sequence[str],
-        after: str,
-        seed: int,
-        steps: int | None = None,
-        longer: int = 1,
+        self, name: str, changes: Sequence[str], after: str, seed: int, steps: int | None = None, longer=1
     ) -> Trial:
         """Fit a short fine stage that begins where the coarse stage of the trial ``after`` ended.
 
@@ -120,25 +108,17 @@ class Trials:
             steps: steps of the stage; None: ``fine_steps``, or fewer if ``fine_seconds`` end first.
             longer: times ``fine_steps`` and ``fine_seconds``; of no effect where ``steps`` is given.
         """
-        if (known := self.made.get(f"{name}-seed{seed}")) is not None:
-            return known
-        seconds = longer * self.fine_seconds if steps is None else None
-        steps, always = steps or longer * self.fine_steps, [*self.always, *self.always_fine]
-        config = self._config(f"{name}-seed{seed}", changes, always, seed, steps, seconds)
-        first, last = list(config.stage)[0], list(config.stage)[-1]
-        config.stage[first].share, config.stage[last].share = 1e-6, 1.0
-        self.made[f"{name}-seed{seed}"] = self._fitted(config, self.folder / after / first)[0]
-        return self.made[f"{name}-seed{seed}"]
+        name = f"{name}-seed{seed}"
+        if name not in self.made:
+            seconds = longer * self.fine_seconds if steps is None else None
+            steps, always = steps or longer * self.fine_steps, [*self.always, *self.always_fine]
+            config = self._config(name, changes, always, seed, steps, seconds)
+            first, last = list(config.stage)[0], list(config.stage)[-1]
+            config.stage[first].share, config.stage[last].share = 1e-6, 1.0
+            self.made[name] = self._fitted(config, self.folder / after / first)[0]
+        return self.made[name]
 
-    def _config(
-        self,
-        name: str,
-        changes: Sequence[str],
-        always: Sequence[str],
-        seed: int,
-        steps: int,
-        seconds: float | None,
-    ) -> DictConfig:
+    def _config(self, name: str, changes, always, seed: int, steps: int, seconds: float | None) -> DictConfig:
         config = composed(without_switched_off(merged(merged(changes, self.typed), always)))
         data = OmegaConf.to_container(config.data, resolve=True) | {"seed": config.seed + seed}
         with open_dict(config):
@@ -147,7 +127,7 @@ class Trials:
             config.budget.iterations, config.budget.minutes = steps, None if seconds is None else seconds / 60
             config.data.held_out, config.evaluate = self.held_out, False
             config.logger, config.callbacks = None, {"progress": config.callbacks.get("progress")}
-        self.tell(name)
+        print(self.folder / name, flush=True)
         return config
 
     def _fitted(self, config: DictConfig, begun: Path | None = None) -> tuple[Trial, Run, DynamicSceneModule]:
@@ -160,18 +140,17 @@ class Trials:
             if begun is not None:
                 _share(begun, run.folder / begun.name)
             module = run.fit().to(run.device)
-            file, stage = run.folder / "trial.json", run.stages[-1]
-            known = read_json(file)
-            if known is None:
-                noted = read_json(run.stage_folder(stage) / "done.json")
-                psnr = psnr_by_view(module, run.datamodule.watched(), RAYS)
-                step, took = noted["seconds"] / noted["steps"], time.perf_counter() - begin
-                rest = module.method.at_rest() if isinstance(module.method, HasRest) else 0.0
-                known = asdict(Trial(psnr, step, noted["steps"], took, rest))
-                write_json(file, known)
-            else:
-                self.seconds_before += known["took"]
-        return Trial(**known | {"psnr": tuple(known["psnr"])}), run, module
+            file = run.folder / "trial.json"
+            if (stored := read_json(file)) is not None:
+                self.seconds_before += stored["took"]
+                return Trial(**stored | {"psnr": tuple(stored["psnr"])}), run, module
+            noted = read_json(run.stage_folder(run.stages[-1]) / "done.json")
+            psnr = psnr_by_view(module, run.datamodule.watched(), RAYS)
+            step, took = noted["seconds"] / noted["steps"], time.perf_counter() - begin
+            rest = module.method.at_rest() if isinstance(module.method, HasRest) else 0.0
+            trial = Trial(tuple(psnr), step, noted["steps"], took, rest)
+            write_json(file, asdict(trial))
+        return trial, run, module
 
 
 def _share(source: Path, target: Path) -> None:

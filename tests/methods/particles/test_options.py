@@ -5,11 +5,12 @@ from dataclasses import replace
 import pytest
 from omegaconf import OmegaConf
 
-from forewarp.methods.effect import Asked, Begin, Drop, Evidence
+from forewarp.methods.effect import Asked, Evidence
 from forewarp.methods.particles.model import Particles
 from forewarp.methods.particles.options import EFFECTS, Effects, Numbers, ParticlesPlanning
 from forewarp.metrics.gain import Gain
 from forewarp.scene.silhouettes import Survey
+from tests.support.coarse_trials import Noted
 from tests.support.configs import composed
 
 PICTURES = Survey(frames=50, times=50, cut_out=0.8, spread=160.0, disagreement=0.2)
@@ -85,15 +86,11 @@ def asked(trials=True, **typed):
 
 
 def walk(pictures, asked, pays):
-    """What a plan begins with, and the effects that it leaves out in turn; ``pays``: whether each pays."""
-    steps = ParticlesPlanning().coarse(Evidence(pictures), asked)
-    begin, drops, answer = next(steps), [], None
-    while True:
-        try:
-            drops.append(steps.send(answer))
-        except StopIteration:
-            return begin, drops
-        answer = pays
+    """The overrides that a plan begins with, and what it leaves out in turn; ``pays``: whether each pays."""
+    noted = Noted(dict.fromkeys(NAMES, pays))
+    ParticlesPlanning().coarse(Evidence(pictures), asked, noted)
+    ((_, begin),) = noted.begun
+    return begin, noted.tried
 
 
 def decided(pictures, asked, at_rest=0.3, **gains):
@@ -107,16 +104,16 @@ def decided(pictures, asked, at_rest=0.3, **gains):
 
 def test_every_effect_is_on_at_first_and_then_left_out():
     begin, drops = walk(PICTURES, asked(), True)
-    assert begin == Begin("coarse", tuple(f"model/{effect.name}={effect.on}" for effect in EFFECTS))
-    assert [drop.effect for drop in drops] == NAMES
-    off = ("model/motion=none", "model/rotation=none", "model/background=none")
-    assert drops[0] == Drop("motion", off)
-    assert drops[-1] == Drop("view_dependence", ("model/view_dependence=none",), 2)
+    assert begin == [f"model/{effect.name}={effect.on}" for effect in EFFECTS]
+    assert [effect for effect, *_ in drops] == NAMES
+    off = ["model/motion=none", "model/rotation=none", "model/background=none"]
+    assert drops[0] == ("motion", off, 1)
+    assert drops[-1] == ("view_dependence", ["model/view_dependence=none"], 2)
 
 
 def test_where_nothing_is_cut_out_motion_is_tried_for_longer_and_without_what_could_stand_in():
     _, drops = walk(replace(PICTURES, cut_out=0.0), asked(), True)
-    assert [(drop.effect, drop.longer) for drop in drops] == [
+    assert [(effect, longer) for effect, _, longer in drops] == [
         *(("opacity_over_time", 1), ("color_over_time", 1)),
         *(("motion", 3), ("rotation", 1), ("background", 3), ("view_dependence", 2)),
     ]
@@ -124,7 +121,7 @@ def test_where_nothing_is_cut_out_motion_is_tried_for_longer_and_without_what_co
 
 def test_what_does_not_move_does_not_turn():
     _, drops = walk(PICTURES, asked(), False)
-    assert not {"rotation", "background"} & {drop.effect for drop in drops}
+    assert not {"rotation", "background"} & {effect for effect, *_ in drops}
     found = decided(PICTURES, asked(), motion=NO)
     for name in ("rotation", "background"):
         assert (found[name].choice, found[name].because[:8]) == ("none", "0 nodes:")
@@ -137,8 +134,8 @@ def test_what_does_not_move_does_not_turn():
 def test_what_images_cannot_show_is_not_tried(changes, tried):
     pictures = replace(PICTURES, **changes)
     begin, drops = walk(pictures, asked(), True)
-    assert [drop.effect for drop in drops] == tried
-    assert [o for o in begin.overrides if not o.endswith("=none")] == [
+    assert [effect for effect, *_ in drops] == tried
+    assert [o for o in begin if not o.endswith("=none")] == [
         f"model/{effect.name}={effect.on}" for effect in EFFECTS if effect.name in tried
     ]
     found = decided(pictures, asked(), **dict.fromkeys(tried, YES))
@@ -147,7 +144,7 @@ def test_what_images_cannot_show_is_not_tried(changes, tried):
 
 def test_what_is_typed_is_not_tried_and_wins():
     _, drops = walk(PICTURES, asked(motion="none", view_dependence="harmonics"), True)
-    assert [drop.effect for drop in drops] == ["opacity_over_time", "color_over_time"]
+    assert [effect for effect, *_ in drops] == ["opacity_over_time", "color_over_time"]
     found = decided(PICTURES, asked(motion="cosines", color_over_time="none"), rotation=YES, motion=NO)
     assert (found["motion"].choice, found["motion"].overrides) == ("cosines", ())
     assert found["motion"].because.startswith("as typed; ")

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from forewarp.fields.curves import TrajectoryField
-from forewarp.methods.voxel.planning import Movement, _explained, movement_of, residual
+from forewarp.methods.voxel.planning import Movement, explained_by_direction, movement_of, residual
 from forewarp.ops.curves import dct_basis
 from forewarp.scene.box import Lattice
 from forewarp.scene.silhouettes import survey
@@ -28,7 +28,7 @@ def fitted(flow):
     return method
 
 
-def test_a_scene_that_stands_still_is_explained_by_its_hull():
+def test_a_scene_that_stands_still_isexplained_by_direction_by_its_hull():
     still = ball_scene(times=[0.0] * 12)
     assert survey(still).times == 1
     assert survey(still).disagreement < 0.01
@@ -106,14 +106,14 @@ def samples(views=24, places=30, seed=0):
     return where, towards.repeat_interleave(places, 0), torch.arange(views).repeat_interleave(places)
 
 
-def test_only_an_error_linear_in_direction_is_explained():
+def test_only_an_error_linear_in_direction_isexplained_by_direction():
     where, towards, views = samples()
     generator = torch.Generator().manual_seed(1)
     slope, noise = (torch.randn(n, 3, generator=generator) for n in (3, len(where)))
-    assert _explained(where, towards, towards @ slope, views, 0.05) > 0.6
-    assert _explained(where, towards, noise, views, 0.05) < 0.02
-    assert abs(_explained(where, towards, where.sin(), views, 0.05)) < 0.02  # of the place alone
-    assert _explained(where * float("nan"), towards, where, views, 0.05) == 0  # what is met nowhere
+    assert explained_by_direction(where, towards, towards @ slope, views, 0.05) > 0.6
+    assert explained_by_direction(where, towards, noise, views, 0.05) < 0.02
+    assert abs(explained_by_direction(where, towards, where.sin(), views, 0.05)) < 0.02  # of the place alone
+    assert explained_by_direction(where * float("nan"), towards, where, views, 0.05) == 0  # met nowhere
 
 
 def test_of_a_fitted_ball(tmp_path):

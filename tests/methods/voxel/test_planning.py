@@ -4,11 +4,12 @@ from dataclasses import replace
 
 import pytest
 
-from forewarp.methods.effect import Asked, Begin, Rival
+from forewarp.methods.effect import Asked
 from forewarp.methods.voxel import planning as decisions
 from forewarp.methods.voxel.planning import Movement, Residual, VoxelEvidence, VoxelPlanning
 from forewarp.metrics.gain import Gain
 from forewarp.scene.silhouettes import Survey
+from tests.support.coarse_trials import Noted
 
 MOVING = VoxelEvidence(
     Survey(frames=50, times=50, cut_out=0.8, spread=160.0, disagreement=0.2),
@@ -26,16 +27,24 @@ def with_gains(**gains):
     return replace(MOVING, gains=gains)
 
 
+def asked(trials=True, bases=10, **typed):
+    """Make a run to plan, with overrides that the user typed."""
+    stages = {"coarse": {"num_voxels": [[0, 1000]]}, "fine": {"num_voxels": [[0, 8000], [0.5, 27000]]}}
+    on = {effect.name: effect.on for effect in decisions.EFFECTS}
+    typed = {key.replace("__", "/"): value for key, value in typed.items()}
+    return Asked(stages, {"bases": bases}, typed, on.get, trials)
+
+
 def test_one_time_needs_no_trial_to_stand_still():
     pictures = replace(MOVING.pictures, times=1)
-    found = decisions.of_motion(evidence(pictures=pictures, movement=None), "dct")
+    found = decisions.of_motion(evidence(pictures=pictures, movement=None), asked())
     assert (found.choice, found.on, found.overrides) == ("none", False, ("model/motion=none",))
     assert found.because == "1 time: nothing can be seen to move"
 
 
 @pytest.mark.parametrize(("gain", "choice"), [(YES, "dct"), (NO, "none"), (UNSURE, "none")])
 def test_a_trial_decides_and_is_named(gain, choice):
-    found = decisions.of_motion(with_gains(motion=gain), "dct")
+    found = decisions.of_motion(with_gains(motion=gain), asked())
     assert found.choice == choice
     assert found.because.endswith(f"; {gain}, more than {max(gain.noise, 0.1):.2f} asked")
     assert "20.0% of the foreground" in found.because
@@ -45,15 +54,15 @@ def test_a_trial_decides_and_is_named(gain, choice):
 def test_without_trials_the_evidence_decides():
     still = replace(MOVING.movement, moving=0.0)
     agree = replace(MOVING.pictures, disagreement=0.0)
-    assert decisions.of_motion(evidence(), "dct").on
-    assert not decisions.of_motion(evidence(movement=still, pictures=agree), "dct").on
-    assert not decisions.of_view(evidence(), "sh").on
-    assert decisions.of_view(evidence(residual=replace(MOVING.residual, by_direction=0.2)), "sh").on
-    assert not decisions.of_inpainter(evidence(), "unet3d").on
-    assert decisions.of_inpainter(evidence(movement=replace(MOVING.movement, torn=0.5)), "unet3d").on
-    assert not decisions.of_upsampler(evidence(), "learned").on
+    assert decisions.of_motion(evidence(), asked()).on
+    assert not decisions.of_motion(evidence(movement=still, pictures=agree), asked()).on
+    assert not decisions.of_view(evidence(), asked()).on
+    assert decisions.of_view(evidence(residual=replace(MOVING.residual, by_direction=0.2)), asked()).on
+    assert not decisions.of_inpainter(evidence(), asked()).on
+    assert decisions.of_inpainter(evidence(movement=replace(MOVING.movement, torn=0.5)), asked()).on
+    assert not decisions.of_upsampler(evidence(), asked()).on
     limited = replace(MOVING.residual, allowed=28.5)
-    assert decisions.of_upsampler(evidence(residual=limited), "learned").choice == "learned"
+    assert decisions.of_upsampler(evidence(residual=limited), asked()).choice == "learned"
 
 
 def open_questions(found):
@@ -71,7 +80,7 @@ def test_only_what_is_open_is_tried():
 def test_cameras_that_stand_together_see_no_direction():
     narrow = evidence(pictures=replace(MOVING.pictures, spread=6.0))
     assert open_questions(narrow) == ["inpainter"]
-    found = decisions.of_view(replace(narrow, gains={"view_dependence": YES}), "sh")
+    found = decisions.of_view(replace(narrow, gains={"view_dependence": YES}), asked())
     assert (found.choice, found.because) == (
         "none",
         "all cameras lie within 6 degrees: direction is not seen",
@@ -81,26 +90,26 @@ def test_cameras_that_stand_together_see_no_direction():
 def test_bases_follow_the_spectrum_or_the_trial():
     left = (4.0, 2.0, 1.5, 1.2, 0.0)  # the last of four has much to say
     flat = replace(MOVING.movement, left_out=left)
-    assert decisions.of_bases(evidence(movement=flat), 4, 8).choice == "8"
-    assert decisions.of_bases(evidence(), 4, 8).choice == "4"
-    tried = decisions.of_bases(with_gains(bases=NO), 4, 8)
+    assert decisions.of_bases(evidence(movement=flat), asked(bases=4)).choice == "8"
+    assert decisions.of_bases(evidence(), asked(bases=4)).choice == "4"
+    tried = decisions.of_bases(with_gains(bases=NO), asked(bases=4))
     assert (tried.choice, tried.on) == ("4", False)
     why = "2 of 4 cosines leave out no more than 0.5 voxels; 8 of them against 4: "
     assert tried.because == f"{why}{NO}, more than 0.20 asked"
-    assert decisions.of_bases(with_gains(bases=YES), 4, 8).choice == "8"
+    assert decisions.of_bases(with_gains(bases=YES), asked(bases=4)).choice == "8"
 
 
 def test_a_background_needs_something_that_moves_before_it():
     bare = replace(MOVING.pictures, cut_out=0.0)
-    start = ["stage.coarse.confine=0.0"]
-    assert decisions.of_background(evidence(), True, "grid", []).because.startswith("80% of the pixels")
-    assert not decisions.of_background(evidence(), True, "grid", []).on
-    found = decisions.of_background(evidence(pictures=bare), True, "grid", start)
+    start = ["stage.coarse.start_alpha=1e-2", "stage.coarse.confine=0.0"]
+    assert decisions.of_background(evidence(), asked(), True).because.startswith("80% of the pixels")
+    assert not decisions.of_background(evidence(), asked(), True).on
+    found = decisions.of_background(evidence(pictures=bare), asked(), True)
     assert (found.choice, found.overrides) == ("grid", ("model/background=grid", *start))
-    still = decisions.of_background(evidence(pictures=bare), False, "grid", start)
+    still = decisions.of_background(evidence(pictures=bare), asked(), False)
     assert (still.on, still.overrides) == (False, ("model/background=none", *start))
     against = replace(with_gains(background=NO), pictures=bare)
-    assert decisions.of_background(against, True, "grid", start).overrides == (
+    assert decisions.of_background(against, asked(), True).overrides == (
         "model/background=none",
         *start,
     )
@@ -116,7 +125,7 @@ def test_a_time_makes_dear_effects_dearer_the_shorter_it_is():
     assert 0 < long.price(gain) < short.price(gain)
     assert [e.pays("inpainter") for e in (free, long, short)] == [True, True, False]
     assert (
-        f"whose steps are worth {short.price(gain):.2f} dB" in decisions.of_inpainter(short, "unet3d").because
+        f"whose steps are worth {short.price(gain):.2f} dB" in decisions.of_inpainter(short, asked()).because
     )
 
 
@@ -133,49 +142,34 @@ def test_the_price_is_what_fewer_steps_cost_on_the_curve_that_was_seen():
     assert bounded[900] == found.price(Gain(0, 0, 4.0, 20))
 
 
-def asked(trials=True, **typed):
-    """Make a run to plan, with overrides that the user typed."""
-    stages = {"coarse": {"num_voxels": [[0, 1000]]}, "fine": {"num_voxels": [[0, 8000], [0.5, 27000]]}}
-    on = {effect.name: effect.on for effect in decisions.EFFECTS}
-    typed = {key.replace("__", "/"): value for key, value in typed.items()}
-    return Asked(stages, {"bases": 10}, typed, on.get, trials)
-
-
-def walk(found, asked, *answers):
-    """Return the coarse stages that a plan asks for, given the answers to its rivals."""
-    steps, said, heard = VoxelPlanning().coarse(found, asked), [], iter(answers)
-    answer = None
-    while True:
-        try:
-            said.append(steps.send(answer))
-        except StopIteration:
-            return said
-        answer = next(heard) if isinstance(said[-1], Rival) else None
+def walk(found, asked, **answers):
+    """Return what a plan begins with, and what it tries, given which effects pay."""
+    noted = Noted(answers)
+    VoxelPlanning().coarse(found, asked, noted)
+    return noted.begun, noted.tried
 
 
 def test_coarse_stages_ask_for_cosines_then_motion_then_the_background():
-    bare = replace(MOVING.pictures, cut_out=0.0)
-    first, *rivals = walk(evidence(pictures=bare), asked(), False, True, True)
-    assert first == Begin(
+    bare = evidence(pictures=replace(MOVING.pictures, cut_out=0.0))
+    (first,), tried = walk(bare, asked(), bases=False, motion=True, background=True)
+    start = ["stage.coarse.start_alpha=1e-2", "stage.coarse.confine=0.0"]
+    assert first == (
         "coarse",
-        ["model/motion=dct", "model/background=grid", *decisions.PLAIN]
-        + ["stage.coarse.start_alpha=1e-2", "stage.coarse.confine=0.0"],
+        ["model/motion=dct", "model/background=grid", *decisions.PLAIN, *start],
     )
-    assert [(r.effect, r.adds) for r in rivals] == [("bases", True), ("motion", False), ("background", False)]
-    assert rivals[0].overrides == ["preset.bases=20", "stage.coarse.bases=[[0,20]]"]
-
-
-def test_what_stands_still_before_a_background_is_one_field():
-    bare = replace(MOVING.pictures, cut_out=0.0)
-    *_, last = walk(evidence(pictures=bare), asked(), False, False)
-    assert last == Begin("coarse-still-alone", ["model/background=none"], change=True)
+    assert [(effect, adds) for effect, _, adds in tried] == [
+        *(("bases", True), ("motion", False), ("background", False))
+    ]
+    assert tried[0][1] == ["preset.bases=20", "stage.coarse.bases=[[0,20]]"]
+    begun, _ = walk(bare, asked(), bases=False, motion=False)  # what stands still is one field
+    assert begun[1] == ("coarse-still-alone", ["model/background=none"], "changed")
 
 
 def test_what_is_typed_is_not_asked():
-    assert len(walk(evidence(), asked(trials=False))) == 1
-    assert [r.effect for r in walk(evidence(), asked(model__motion="dct"), True)[1:]] == []
-    (still,) = walk(evidence(), asked(model__motion="none"))
-    assert still.name == "coarse-still"
+    assert walk(evidence(), asked(trials=False))[1] == []
+    assert walk(evidence(), asked(model__motion="dct"))[1] == []
+    (((name, _),), _) = walk(evidence(), asked(model__motion="none"))
+    assert name == "coarse-still"
 
 
 def test_dear_effects_go_on_the_lattice_that_they_were_tried_on():

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Generator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 from forewarp.fields.curves import KINDS
-from forewarp.methods.effect import Asked, Begin, Decision, Drop, Effect, Evidence
+from forewarp.methods.effect import DISAGREEMENT, Asked, CoarseTrials, Decision, Effect, Evidence
 from forewarp.methods.method import Method
 from forewarp.ops.backend import is_number
 from forewarp.scene.frame import Scene
@@ -15,9 +15,6 @@ from forewarp.scene.silhouettes import Survey
 from forewarp.scene.view import Target
 
 _VIEWS = 100  # training images from which on more of them call for no more particles
-CUT_OUT = 0.001  # share of transparent pixels below which silhouettes say nothing
-DISAGREEMENT = 0.01  # share of the foreground that no static shape explains, above which something moves
-NARROW = 15.0  # degrees between the most different cameras below which direction cannot be observed
 AT_REST = 0.1  # least share of particles at rest for the background to be worth having
 HARM = 0.2  # dB from which on the background costs too much
 HOPELESS = 0.5  # of ``AT_REST``: so little at rest with one seed is little with all
@@ -223,7 +220,7 @@ class ParticlesEvidence(Evidence):
 
     def bound(self, effect: str) -> float:
         """See ``Evidence``; less in longer trials, as what is rough falls with the root of the steps."""
-        return self.least / math.sqrt(longer(effect, self.pictures))
+        return self.least / math.sqrt(longer(effect, self))
 
     def of_trial(self, effect: str) -> str:
         """Describe an effect's trial; the background: how much came to rest, too."""
@@ -257,18 +254,17 @@ class ParticlesPlanning:
         rates = [f"stage.{asked.last}.lr.{name}={rate:g}" for name, rate in RATES.items()]
         return [f"stage.{asked.coarse}.effects=[]"], rates
 
-    def coarse(self, evidence: Evidence, asked: Asked) -> Generator[Begin | Drop, bool | None, None]:
+    def coarse(self, evidence: Evidence, asked: Asked, trials: CoarseTrials) -> None:
         """Begin with every effect that the images can show, and leave out one after the other."""
-        pictures = evidence.pictures
-        shown = {name: unseen(name, pictures) is None for name in order(pictures)}
-        on = {effect.name: asked.choose(effect.name) if shown[effect.name] else "none" for effect in EFFECTS}
-        yield Begin("coarse", _choices(on))
+        seen = {e.name: unseen(e.name, evidence) is None for e in EFFECTS}
+        on = {name: asked.choose(name) if seen[name] else "none" for name in seen}
+        trials.begin("coarse", _choices(on))
         moves = asked.typed.get("model/motion") != "none"
-        for name in shown if asked.trials else ():
-            if not shown[name] or f"model/{name}" in asked.typed or (name in OF_NODES and not moves):
+        for name in [name for name in order(evidence) if seen[name] and asked.trials]:
+            if f"model/{name}" in asked.typed or (name in OF_NODES and not moves):
                 continue
             off = (name, *OF_NODES) if name == "motion" else (name,)
-            pays = yield Drop(name, _choices(dict.fromkeys(off, "none")), longer(name, pictures))
+            pays = trials.drop(name, _choices(dict.fromkeys(off, "none")), longer=longer(name, evidence))
             moves = pays if name == "motion" else moves
 
     def look(
@@ -280,39 +276,35 @@ class ParticlesPlanning:
         """Decide on all effects; what the user typed wins."""
         decisions: dict[str, Decision] = {}
         for effect in EFFECTS:
-            name, why = effect.name, unseen(effect.name, evidence.pictures)
+            name, why = effect.name, unseen(effect.name, evidence)
             if name in OF_NODES and not decisions["motion"].on:
                 why = "0 nodes: nothing moves"
-            called_for = why is None and self._called_for(name, evidence)
-            typed = asked.typed.get(effect.group)
-            choice = typed or (asked.choose(name) if called_for else effect.off)
-            why = ("as typed; " if typed else "") + (why or _because(name, evidence))
-            overrides = () if typed else _choices({name: choice})
-            decisions[name] = Decision(name, choice, overrides, why, choice != effect.off)
+            on = why is None and self._called_for(name, evidence)
+            decisions[name] = asked.decided(name, on, why or _because(name, evidence))
         return list(decisions.values())
 
     def _called_for(self, name: str, evidence: Evidence) -> bool:
         """Return what the trials say. Without trials nodes move and turn unless silhouettes deny it, and come
         to rest where images are cut out.
         """
-        pays, cut_out = evidence.pays(name), evidence.pictures.cut_out >= CUT_OUT
-        if pays is not None:
-            return pays
-        moves = not cut_out or evidence.pictures.disagreement > DISAGREEMENT
-        return moves and (name in ("motion", "rotation") or (name == "background" and cut_out))
+        moves = not evidence.cut_out or evidence.pictures.disagreement > DISAGREEMENT
+        alone = name in ("motion", "rotation") or (name == "background" and evidence.cut_out)
+        return evidence.calls_for(name, moves and alone)
 
 
-def order(pictures: Survey) -> list[str]:
+def order(evidence: Evidence) -> list[str]:
     """Return the names of the effects in the order in which they are left out.
 
     Where nothing is cut out, those that could stand in for motion go first: everything is visible all the
     time, and fading in and out mimics it. (In the room motion gains 0.8 dB with them, 4 dB without.)
     """
     names = [effect.name for effect in EFFECTS]
-    return names if pictures.cut_out >= CUT_OUT else sorted(names, key=lambda name: name not in STAND_INS)
+    if evidence.cut_out:
+        return names
+    return [*STAND_INS, *(name for name in names if name not in STAND_INS)]
 
 
-def longer(name: str, pictures: Survey) -> int:
+def longer(name: str, evidence: Evidence) -> int:
     """Return how many times the usual steps trials of an effect have.
 
     Those of view dependence are longer: after few steps it makes up for a shape that is still rough. (A matte
@@ -320,27 +312,22 @@ def longer(name: str, pictures: Survey) -> int:
     0.6.) So are those of motion and background where nothing is cut out, as the start is so rough that all
     learn as fast at first. (The room gains 0.5 dB by motion after 700 steps, and 2.2 dB after 2,100.)
     """
-    if name in ("motion", "background") and pictures.cut_out < CUT_OUT:
+    if name in ("motion", "background") and not evidence.cut_out:
         return 3
     return 2 if name == "view_dependence" else 1
 
 
-def unseen(name: str, pictures: Survey) -> str | None:
-    """Say why images cannot show an effect; None if they can."""
+def unseen(name: str, evidence: Evidence) -> str | None:
+    """Say why the images cannot show an effect; None if they can."""
     if name == "view_dependence":
-        why = f"all cameras lie within {pictures.spread:.0f} degrees: direction is not seen"
-        return why if pictures.spread < NARROW else None
-    return "1 time: nothing can be seen to change" if pictures.times < 2 else None
+        return evidence.no_direction
+    return "1 time: nothing can be seen to change" if evidence.pictures.times < 2 else None
 
 
 def _because(name: str, evidence: Evidence) -> str:
-    pictures, trial = evidence.pictures, evidence.of_trial(name)
-    if name != "motion":
-        return trial[2:] or f"{pictures.times} times, and no trial"
-    why = f"{pictures.times} times"
-    if pictures.cut_out >= CUT_OUT:
-        why += f"; silhouettes: a static shape explains all but {pictures.disagreement:.1%} of the foreground"
-    return why + trial
+    if name == "motion":
+        return evidence.seen_to_move + evidence.of_trial(name)
+    return evidence.of_trial(name)[2:] or f"{evidence.pictures.times} times, and no trial"
 
 
 def _choices(choices: dict[str, str]) -> tuple[str, ...]:

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Generator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from forewarp.fields.grids import FieldAtTime
-from forewarp.methods.effect import Asked, Begin, Decision, Effect, Evidence, Rival
+from forewarp.fields.grids import RadianceGrid
+from forewarp.methods.effect import DISAGREEMENT, Asked, CoarseTrials, Decision, Effect, Evidence
 from forewarp.methods.voxel.effects import Together
 from forewarp.methods.voxel.model import SOLID
 from forewarp.metrics.image import low_passed
@@ -24,8 +24,19 @@ from forewarp.scene.view import Target, View
 if TYPE_CHECKING:
     from forewarp.methods.voxel.forward import ForwardWarp
 
+MOVING = 0.02  # share of moving solid voxels above which the scene moves
 REACH = 2.0  # distance of neighbours in voxels; a splat reaches one voxel to either side
+# Pairs of bounds: beyond the first the effect is worth a trial, beyond the second it is chosen without one.
+BY_DIRECTION = (0.0, 0.05)  # share of the error that direction explains
+TORN = (0.1, 0.3)  # share of solid voxels
+HEADROOM = (3.0, 1.0)  # dB that the last lattice allows beyond what is reached; the less, the more needed
+VIEWS = 24  # training views whose errors are measured
+# Off while motion is learned, as view-dependent colour would explain it away.
+PLAIN = ("model/view_dependence=none", "model/inpainter=none", "model/upsampler=none")
 _TIMES = 40  # at most this many times are examined
+_POINTS = 20_000  # about the most voxels whose cosines are examined
+_WIDER = 4.0  # positions are encoded in a box this much wider, which holds a static background too
+_NARROWER = 1e-4  # shares of that box are kept away from its ends, where a logit is infinite
 
 
 @dataclass(frozen=True)
@@ -73,38 +84,29 @@ def movement_of(method: ForwardWarp, times: Sequence[float]) -> Movement:
     pairs = neighbour_pairs(index_of(voxels, lattice.shape))
     torn = [_torn(pairs, flow / flow.new_tensor(lattice.spacing)) for flow in flows]
     worst = max(range(len(torn)), key=torn.__getitem__)
+    left_out = (0.0,)
+    if bool(moves.any()):
+        points = lattice.to_world(voxels[moves])
+        coefficients = trajectory.coefficients(points[:: max(1, len(points) // _POINTS)])  # (N, 3, K)
+        basis = trajectory.basis(torch.tensor(some))
+        rests = [coefficients[..., k:] @ basis[:, k:].T for k in range(trajectory.bases + 1)]
+        left_out = tuple(float(r.square().sum(1).mean().sqrt()) / lattice.voxel_size for r in rests)
     return Movement(
         moving=float(moves.float().mean()),
         distance=float(far[moves].mean()) if bool(moves.any()) else 0.0,
         torn=torn[worst],
         at=some[worst],
-        left_out=_left_out(trajectory, lattice.to_world(voxels[moves]), some, lattice.voxel_size),
+        left_out=left_out,
     )
 
 
 def _torn(pairs: list[tuple[Tensor, Tensor]], flow: Tensor) -> float:
     """Return the share of voxels that a flow (N, 3), in voxels, tears from a neighbour; ``pairs`` by axis."""
     torn = torch.zeros(len(flow), dtype=torch.bool, device=flow.device)
-    for (rows, other), step in zip(pairs, torch.eye(3, device=flow.device)):
-        far = (step + flow[other] - flow[rows]).norm(dim=-1) > REACH
-        torn[rows[far]] = torn[other[far]] = True
+    for (rows, neighbours), step in zip(pairs, torch.eye(3, device=flow.device)):
+        far = (step + flow[neighbours] - flow[rows]).norm(dim=-1) > REACH
+        torn[rows[far]] = torn[neighbours[far]] = True
     return float(torn.float().mean())
-
-
-def _left_out(trajectory, points: Tensor, times: Sequence[float], voxel_size: float) -> tuple[float, ...]:
-    """RMS over points and times of the movement in the cosines above the k-th, k = 0 ... K, in voxels."""
-    if not len(points):
-        return (0.0,)
-    coefficients = trajectory.coefficients(points[:: max(1, len(points) // 20_000)])  # (N, 3, K)
-    basis = trajectory.basis(torch.tensor(times))
-    rest = []
-    for k in range(trajectory.bases + 1):
-        left = coefficients[..., k:] @ basis[:, k:].T
-        rest.append(float(left.square().sum(1).mean().sqrt()) / voxel_size)
-    return tuple(rest)
-
-
-_WIDER = 4.0  # positions are encoded in a box this much wider, which holds a static background too
 
 
 @dataclass(frozen=True)
@@ -133,70 +135,55 @@ def residual(method: ForwardWarp, targets: Sequence[Target], voxel_size: float, 
         voxel_size: voxel size of the last stage's lattice, world units.
         rays: number of pixels of each image.
     """
-    generator = torch.Generator().manual_seed(0)
-    places, directions, errors, views, bounds = [], [], [], [], []
+    generator, samples, bounds = torch.Generator().manual_seed(0), [], []
     for number, target in enumerate(targets):
         camera = target.frame.camera
         pixels = torch.randperm(camera.width * camera.height, generator=generator)[:rays]
-        shown = _seen(method, target, pixels)
-        error = target.rgb.reshape(-1, 3)[pixels] - shown[0]
-        places.append(shown[1]), directions.append(camera.rays(pixels).directions), errors.append(error)
-        views.append(torch.full((len(pixels),), number))
-        voxel = voxel_size * camera.fx / max(float(shown[2]), 1e-6)
+        rgb, places, depth = _seen(method, target, pixels)
+        error = target.rgb.reshape(-1, 3)[pixels] - rgb
+        views = torch.full((len(pixels),), number)
+        samples.append((places, camera.rays(pixels).directions, error, views))
+        voxel = voxel_size * camera.fx / max(depth, 1e-6)  # in pixels
         bounds.append(float((low_passed(target.rgb, voxel) - target.rgb).square().mean()))
-    error = torch.cat(errors)
-    share = _explained(
-        torch.cat(places),
-        torch.cat(directions),
-        error,
-        torch.cat(views),
-        2 * method.radiance.lattice.voxel_size,
-    )
-    return Residual(_psnr(float(error.square().mean())), share, _psnr(sum(bounds) / len(bounds)))
+    places, directions, errors, views = (torch.cat(parts) for parts in zip(*samples))
+    cell = 2 * method.radiance.lattice.voxel_size
+    share = explained_by_direction(places, directions, errors, views, cell)
+    reached, allowed = float(errors.square().mean()), sum(bounds) / len(bounds)
+    return Residual(-10 * math.log10(max(reached, 1e-10)), share, -10 * math.log10(max(allowed, 1e-10)))
 
 
-def _psnr(error: float) -> float:
-    return -10 * math.log10(max(error, 1e-10))
-
-
-def _seen(method: ForwardWarp, target: Target, pixels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _seen(method: ForwardWarp, target: Target, pixels: Tensor) -> tuple[Tensor, Tensor, float]:
     """Return colours (R, 3), canonical positions (R, 3), NaN for none, and median depth of some pixels."""
     view, time = View(target.frame.camera, pixels), target.frame.time
     drawn = method.at(target.moment).render(view, target.background.to(method.device))
-    place, box = _places(method, time), method.radiance.lattice.box
-    rays = view.rays().to(method.device)
-    found = method.renderer.picture(place, rays, rays.origins.new_zeros(3))
-    solid = found.opacity > 0.5
-    low, high = (found.rgb.new_tensor(end) for end in (box.scaled(_WIDER).low, box.scaled(_WIDER).high))
-    at = low + (high - low) * found.rgb / found.opacity.clamp(min=1e-6)[:, None]
-    at[~solid] = math.nan
-    return (
-        drawn.rgb.clamp(0, 1).cpu(),
-        at.cpu(),
-        found.depth[solid].median() if bool(solid.any()) else found.depth.new_tensor(1.0),
-    )
-
-
-def _places(method: ForwardWarp, time: float) -> FieldAtTime:
-    """Return the field at a time with canonical positions in place of colours."""
     box = method.radiance.lattice.box.scaled(_WIDER)
 
-    def placed(grid, voxels: Tensor):
+    def placed(grid: RadianceGrid, voxels: Tensor) -> RadianceGrid:
+        """Put canonical positions in place of colours."""
         at = grid.lattice.to_world(voxels)
         low, high = at.new_tensor(box.low), at.new_tensor(box.high)
-        share = ((at - low) / (high - low)).clamp(1e-4, 1 - 1e-4)
+        share = ((at - low) / (high - low)).clamp(_NARROWER, 1 - _NARROWER)
         return grid.with_values(torch.cat([grid.raw_density[:, None], torch.logit(share)], -1))
 
     field = placed(method.radiance(), method.radiance.voxels)
     if method.motion is not None and time != method.canonical_time:
         flow = method.motion.flow(method.radiance, time)
         field, _, _ = method.motion.warp(field, method.radiance.voxels, flow)
-    if method.background is None:
-        return field
-    return Together(field, placed(method.background(), method.background.voxels))
+    if method.background is not None:
+        field = Together(field, placed(method.background(), method.background.voxels))
+    rays = view.rays().to(method.device)
+    positions = method.renderer.picture(field, rays, rays.origins.new_zeros(3))
+    solid = positions.opacity > 0.5
+    low, high = (positions.rgb.new_tensor(end) for end in (box.low, box.high))
+    at = low + (high - low) * positions.rgb / positions.opacity.clamp(min=1e-6)[:, None]
+    at[~solid] = math.nan
+    depth = float(positions.depth[solid].median()) if bool(solid.any()) else 1.0
+    return drawn.rgb.clamp(0, 1).cpu(), at.cpu(), depth
 
 
-def _explained(places: Tensor, directions: Tensor, errors: Tensor, views: Tensor, cell: float) -> float:
+def explained_by_direction(
+    places: Tensor, directions: Tensor, errors: Tensor, views: Tensor, cell: float
+) -> float:
     """Return the share of the squared error that direction explains, beyond what position explains.
 
     Fit a colour linear in direction, and a constant one, in each cell of space to one half of the images, and
@@ -218,36 +205,23 @@ def _explained(places: Tensor, directions: Tensor, errors: Tensor, views: Tensor
     inputs = torch.cat([torch.ones_like(directions[:, :1]), directions.float()], -1).double()
     left = [0.0, 0.0]
     for half in (0, 1):
-        fitted, other = views % 2 == half, views % 2 != half
+        fitted, checked = views % 2 == half, views % 2 != half
         for kind, width in enumerate((1, 4)):
             weights = _fits(inputs[fitted, :width], errors[fitted].double(), cells[fitted], count)
-            rest = errors[other] - torch.einsum("pi,pic->pc", inputs[other, :width], weights[cells[other]])
-            left[kind] += float(rest.square().sum())
+            fit = torch.einsum("pi,pic->pc", inputs[checked, :width], weights[cells[checked]])
+            left[kind] += float((errors[checked] - fit).square().sum())
     return (left[0] - left[1]) / max(float(errors.square().sum()), 1e-12)
 
 
 def _fits(inputs: Tensor, values: Tensor, cells: Tensor, count: int) -> Tensor:
     """Ridge regression of ``values`` (P, C) on ``inputs`` (P, I) in every cell: (cells, I, C)."""
-    width = inputs.shape[1]
-    squares = inputs.new_zeros(count, width, width).index_add_(0, cells, inputs[:, :, None] * inputs[:, None])
-    products = inputs.new_zeros(count, width, values.shape[1]).index_add_(
-        0, cells, inputs[:, :, None] * values[:, None]
-    )
-    ridge = torch.eye(width, dtype=inputs.dtype) * 2.0  # as strong as two images without error
-    return torch.linalg.solve(squares + ridge, products)
 
+    def summed(vectors: Tensor) -> Tensor:
+        products = inputs[:, :, None] * vectors[:, None]
+        return inputs.new_zeros(count, *products.shape[1:]).index_add_(0, cells, products)
 
-CUT_OUT = 0.001  # share of transparent pixels below which the scene has a background
-MOVING = 0.02  # share of moving solid voxels above which the scene moves
-DISAGREEMENT = 0.01  # share of the foreground that no static shape explains
-NARROW = 15.0  # degrees between the most different cameras below which direction cannot be observed
-# Pairs of bounds: beyond the first the effect is worth a trial, beyond the second it is chosen without one.
-BY_DIRECTION = (0.0, 0.05)  # share of the error that direction explains
-TORN = (0.1, 0.3)  # share of solid voxels
-HEADROOM = (3.0, 1.0)  # dB that the last lattice allows beyond what is reached; the less, the more needed
-VIEWS = 24  # training views whose errors are measured
-# Off while motion is learned, as view-dependent colour would explain it away.
-PLAIN = ("model/view_dependence=none", "model/inpainter=none", "model/upsampler=none")
+    ridge = torch.eye(inputs.shape[1], dtype=inputs.dtype) * 2.0  # as strong as two images without error
+    return torch.linalg.solve(summed(inputs) + ridge, summed(values))
 
 
 @dataclass
@@ -258,91 +232,12 @@ class VoxelEvidence(Evidence):
     residual: Residual | None = None
 
 
-def of_motion(evidence: VoxelEvidence, on: str) -> Decision:
-    """Decide on motion."""
-    times, seen, moved = evidence.pictures.times, evidence.pictures.disagreement, evidence.movement
-    if times < 2:
-        return Decision("motion", "none", ("model/motion=none",), "1 time: nothing can be seen to move")
-    share = moved.moving if moved is not None else 0.0
-    why = f"{times} times; silhouettes: a static shape explains all but {seen:.1%} of the foreground"
-    why = why if evidence.pictures.cut_out >= CUT_OUT else f"{times} times"
-    why += f"; {share:.0%} of the solid voxels move" + (f", by {moved.distance:.2g}" if share else "")
-    pays = evidence.pays("motion")
-    pays = (share > MOVING or seen > DISAGREEMENT) if pays is None else pays
-    return _switch("motion", pays, on, why + evidence.of_trial("motion"))
-
-
-def of_bases(evidence: VoxelEvidence, usual: int, more: int) -> Decision:
-    """Decide on the number of cosines: the usual one, or more."""
-    left, pays = evidence.movement.left_out, evidence.pays("bases")
-    moved = evidence.movement
-    why = f"{moved.bases()} of {len(left) - 1} cosines leave out no more than {moved.enough:.1f} voxels"
-    if pays is None:
-        pays = len(left) > 2 and left[-2] > moved.enough  # the last cosine still matters
-    else:
-        why += f"; {more} of them against {usual}: " + evidence.of_trial("bases")[2:]
-    return Decision("bases", str(more if pays else usual), (), why, pays)
-
-
-def of_background(evidence: VoxelEvidence, moves: bool, on: str, start: Sequence[str]) -> Decision:
-    """Decide on a grid for the static background; ``start``: overrides for scenes without silhouettes."""
-    cut_out, pays = evidence.pictures.cut_out, evidence.pays("background")
-    if cut_out >= CUT_OUT:
-        why = f"{cut_out:.0%} of the pixels are transparent: the subject is cut out"
-        return Decision("background", "none", ("model/background=none",), why)
-    why = "0 % of the pixels are transparent"
-    if not moves:
-        why += ", but nothing moves: one field holds all"
-        return Decision("background", "none", ("model/background=none", *start), why)
-    chosen = _switch("background", pays is not False, on, why + evidence.of_trial("background"))
-    return replace(chosen, overrides=(*chosen.overrides, *start))
-
-
-def of_view(evidence: VoxelEvidence, on: str) -> Decision:
-    """Decide on view dependence."""
-    if evidence.pictures.spread < NARROW:
-        why = f"all cameras lie within {evidence.pictures.spread:.0f} degrees: direction is not seen"
-        return Decision("view_dependence", "none", ("model/view_dependence=none",), why)
-    share = evidence.residual.by_direction
-    why = f"direction explains {max(share, 0):.1%} of what the coarse stage leaves" + evidence.of_trial(
-        "view_dependence"
-    )
-    return _switch("view_dependence", _called(evidence, "view_dependence", share > BY_DIRECTION[1]), on, why)
-
-
-def of_inpainter(evidence: VoxelEvidence, on: str) -> Decision:
-    """Decide on inpainting."""
-    moved = evidence.movement
-    if moved is None:
-        return Decision(
-            "inpainter", "none", ("model/inpainter=none",), "0 % of the voxels move: nothing opens"
-        )
-    why = f"{moved.torn:.1%} of the solid voxels are torn from a neighbour at time {moved.at:.2f}"
-    pays = _called(evidence, "inpainter", moved.torn > TORN[1])
-    return _switch("inpainter", pays, on, why + evidence.of_trial("inpainter"))
-
-
-def of_upsampler(evidence: VoxelEvidence, on: str) -> Decision:
-    """Decide on up-sampling."""
-    left = evidence.residual
-    why = f"the last lattice allows {left.allowed:.1f} dB, {left.psnr:.1f} are reached"
-    pays = _called(evidence, "upsampler", left.allowed - left.psnr < HEADROOM[1])
-    return _switch("upsampler", pays, on, why + evidence.of_trial("upsampler"))
-
-
-def _called(evidence: VoxelEvidence, effect: str, alone: bool) -> bool:
-    """Return what the trial says; without a trial, what the evidence ``alone`` says."""
-    pays = evidence.pays(effect)
-    return alone if pays is None else pays
-
-
-def _switch(effect: str, is_on: bool, on: str, because: str) -> Decision:
-    choice = on if is_on else "none"
-    return Decision(effect, choice, (f"model/{effect}={choice}",), because, is_on)
-
-
 def _not_in_coarse(asked: Asked) -> tuple[str, ...]:
     return (f"stage.{asked.coarse}.effects=[motion,background]",)
+
+
+def _on_first_lattice(asked: Asked) -> tuple[str, ...]:
+    return (f"stage.{asked.last}.num_voxels=[[0,{asked.stages[asked.last]['num_voxels'][0][1]}]]",)
 
 
 def _as_tried(asked: Asked) -> tuple[str, ...]:
@@ -350,12 +245,8 @@ def _as_tried(asked: Asked) -> tuple[str, ...]:
     return (*_not_in_coarse(asked), *_on_first_lattice(asked))
 
 
-def _on_first_lattice(asked: Asked) -> tuple[str, ...]:
-    return (f"stage.{asked.last}.num_voxels=[[0,{asked.stages[asked.last]['num_voxels'][0][1]}]]",)
-
-
 def _view_is_out(evidence: VoxelEvidence) -> bool:
-    return evidence.pictures.spread < NARROW or evidence.residual.by_direction <= BY_DIRECTION[0]
+    return evidence.no_direction is not None or evidence.residual.by_direction <= BY_DIRECTION[0]
 
 
 def _inpainter_is_out(evidence: VoxelEvidence) -> bool:
@@ -389,27 +280,27 @@ class VoxelPlanning:
         """Keep later effects out of the coarse stage; run fine trials on the last stage's first lattice."""
         return _not_in_coarse(asked), _on_first_lattice(asked)
 
-    def coarse(self, evidence: VoxelEvidence, asked: Asked) -> Generator[Begin | Rival, bool | None, None]:
+    def coarse(self, evidence: VoxelEvidence, asked: Asked, trials: CoarseTrials) -> None:
         """Compare coarse stages: number of cosines, motion or none, static background or none."""
-        pictures, start = evidence.pictures, _start(evidence, asked)
-        if pictures.times < 2 or asked.typed.get("model/motion") == "none":
+        start = _start(evidence, asked)
+        if evidence.pictures.times < 2 or asked.typed.get("model/motion") == "none":
             static = ["model/motion=none", "model/background=none"]
-            yield Begin("coarse-still", [*static, *PLAIN, *start])
-            return
+            return trials.begin("coarse-still", [*static, *PLAIN, *start])
         behind = "model/background=" + (asked.choose("background") if start else "none")
-        yield Begin("coarse", [f"model/motion={asked.choose('motion')}", behind, *PLAIN, *start])
+        trials.begin("coarse", [f"model/motion={asked.choose('motion')}", behind, *PLAIN, *start])
         if not asked.trials:
-            return
+            return None
         usual, more = _bases(evidence, asked)
         if more > usual and not asked.typed.keys() & {"preset.bases", "model/motion"}:
-            yield Rival("bases", "coarse-bases", _more_bases(more, asked), adds=True)
+            trials.rival("bases", "coarse-bases", _more_bases(more, asked), adds=True)
         moves = "model/motion" in asked.typed
         if not moves:
-            moves = yield Rival("motion", "coarse-still", ["model/motion=none"])
+            moves = trials.rival("motion", "coarse-still", ["model/motion=none"])
         if start and not moves:  # one grid holds the whole static scene
-            yield Begin("coarse-still-alone", ["model/background=none"], change=True)
+            trials.begin("coarse-still-alone", ["model/background=none"], change=True)
         elif start and "model/background" not in asked.typed:
-            yield Rival("background", "coarse-alone", ["model/background=none"])
+            trials.rival("background", "coarse-alone", ["model/background=none"])
+        return None
 
     def look(
         self,
@@ -429,36 +320,90 @@ class VoxelPlanning:
 
     def decide(self, evidence: VoxelEvidence, asked: Asked) -> list[Decision]:
         """Decide on all effects; what the user typed wins."""
-        start = _start(evidence, asked)
-        motion = overruled(of_motion(evidence, asked.choose("motion")), asked)
-        moves, found = motion.on and evidence.movement is not None, []
-        if moves:
-            usual, more = _bases(evidence, asked)
-            bases = of_bases(evidence, usual, more)
-            found.append(replace(bases, overrides=tuple(_more_bases(more, asked)) if bases.on else ()))
-        found += [
-            of_background(evidence, moves, asked.choose("background"), start),
-            of_view(evidence, asked.choose("view_dependence")),
-            of_inpainter(evidence, asked.choose("inpainter")),
-            of_upsampler(evidence, asked.choose("upsampler")),
+        motion = of_motion(evidence, asked)
+        moves = motion.on and evidence.movement is not None
+        return [
+            motion,
+            *([of_bases(evidence, asked)] if moves else []),
+            of_background(evidence, asked, moves),
+            of_view(evidence, asked),
+            of_inpainter(evidence, asked),
+            of_upsampler(evidence, asked),
         ]
-        return [motion, *(overruled(decision, asked) for decision in found)]
 
 
-def overruled(decision: Decision, asked: Asked) -> Decision:
-    """Replace a decision by what the user typed for it, if anything."""
-    key = "preset.bases" if decision.effect == "bases" else f"model/{decision.effect}"
-    if key not in asked.typed:
-        return decision
-    choice = asked.typed[key]
-    kept = () if key == "preset.bases" else tuple(o for o in decision.overrides if o.split("=")[0] != key)
-    on = choice != "none" and decision.effect != "bases"
-    return Decision(decision.effect, choice, kept, f"as typed; {decision.because}", on)
+def of_motion(evidence: VoxelEvidence, asked: Asked) -> Decision:
+    """Decide on motion."""
+    if evidence.pictures.times < 2:
+        return asked.decided("motion", False, "1 time: nothing can be seen to move")
+    moved = evidence.movement
+    share = moved.moving if moved is not None else 0.0
+    why = f"{evidence.seen_to_move}; {share:.0%} of the solid voxels move"
+    why += (f", by {moved.distance:.2g}" if share else "") + evidence.of_trial("motion")
+    alone = share > MOVING or evidence.pictures.disagreement > DISAGREEMENT
+    return asked.decided("motion", evidence.calls_for("motion", alone), why)
+
+
+def of_bases(evidence: VoxelEvidence, asked: Asked) -> Decision:
+    """Decide on the number of cosines: the usual one, or more."""
+    (usual, more), moved = _bases(evidence, asked), evidence.movement
+    left = moved.left_out
+    why = f"{moved.bases()} of {len(left) - 1} cosines leave out no more than {moved.enough:.1f} voxels"
+    if "bases" in evidence.gains:
+        why += f"; {more} of them against {usual}: " + evidence.of_trial("bases")[2:]
+    if (typed := asked.typed.get("preset.bases")) is not None:
+        return Decision("bases", typed, (), f"as typed; {why}")
+    # Without a trial: more if the last cosine still matters.
+    on = evidence.calls_for("bases", len(left) > 2 and left[-2] > moved.enough)
+    overrides = tuple(_more_bases(more, asked)) if on else ()
+    return Decision("bases", str(more if on else usual), overrides, why, on)
+
+
+def of_background(evidence: VoxelEvidence, asked: Asked, moves: bool) -> Decision:
+    """Decide on a grid for the static background."""
+    start = _start(evidence, asked)
+    if evidence.cut_out:
+        why = f"{evidence.pictures.cut_out:.0%} of the pixels are transparent: the subject is cut out"
+        return asked.decided("background", False, why)
+    why = "0 % of the pixels are transparent"
+    if not moves:
+        why += ", but nothing moves: one field holds all"
+        return asked.decided("background", False, why, start)
+    on = evidence.calls_for("background", True)
+    return asked.decided("background", on, why + evidence.of_trial("background"), start)
+
+
+def of_view(evidence: VoxelEvidence, asked: Asked) -> Decision:
+    """Decide on view dependence."""
+    if evidence.no_direction is not None:
+        return asked.decided("view_dependence", False, evidence.no_direction)
+    share = evidence.residual.by_direction
+    why = f"direction explains {max(share, 0):.1%} of what the coarse stage leaves"
+    on = evidence.calls_for("view_dependence", share > BY_DIRECTION[1])
+    return asked.decided("view_dependence", on, why + evidence.of_trial("view_dependence"))
+
+
+def of_inpainter(evidence: VoxelEvidence, asked: Asked) -> Decision:
+    """Decide on inpainting."""
+    moved = evidence.movement
+    if moved is None:
+        return asked.decided("inpainter", False, "0 % of the voxels move: nothing opens")
+    why = f"{moved.torn:.1%} of the solid voxels are torn from a neighbour at time {moved.at:.2f}"
+    on = evidence.calls_for("inpainter", moved.torn > TORN[1])
+    return asked.decided("inpainter", on, why + evidence.of_trial("inpainter"))
+
+
+def of_upsampler(evidence: VoxelEvidence, asked: Asked) -> Decision:
+    """Decide on up-sampling."""
+    left = evidence.residual
+    why = f"the last lattice allows {left.allowed:.1f} dB, {left.psnr:.1f} are reached"
+    on = evidence.calls_for("upsampler", left.allowed - left.psnr < HEADROOM[1])
+    return asked.decided("upsampler", on, why + evidence.of_trial("upsampler"))
 
 
 def _start(evidence: VoxelEvidence, asked: Asked) -> list[str]:
     """Return the overrides for a scene without silhouettes: start with faint matter everywhere."""
-    if evidence.pictures.cut_out >= CUT_OUT:
+    if evidence.cut_out:
         return []
     return [f"stage.{asked.coarse}.start_alpha=1e-2", f"stage.{asked.coarse}.confine=0.0"]
 
