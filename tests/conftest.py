@@ -12,8 +12,6 @@ import torch
 
 from tests.support.commands import call, fitted_run
 
-collect_ignore = ["foreign"]  # the package that tests/cli/test_foreign.py imports as somebody else's
-
 
 @pytest.fixture(scope="session", autouse=True)
 def _one_thread():

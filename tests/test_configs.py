@@ -209,32 +209,6 @@ def test_each_number_of_a_method_is_taken_where_it_is_keyed(model):
     assert (band.stage.fine.num_voxels, still.stage.coarse.num_voxels) == ([[0, 15625]], [[0, 46656]])
 
 
-def test_systems_of_the_tables_have_their_numbers_of_a_dataset():
-    captures = ["experiment=hypernerf", "data.scene=broom2", "preset=faithful"]
-    ndvg, nerf = (composed(f"model={model}", *captures) for model in ("ndvg", "nerf"))
-    assert (list(k for k, v in ndvg.stage.items() if v), ndvg.budget.iterations) == (["fine"], 10000)
-    assert ndvg.data.canonical == 0
-    # The NeRF of HyperNeRF's tables.
-    asked = {"skip": 5, "position_frequencies": 8, "glorot": True, "width": 256, "layers": 8}
-    assert nerf.model.items() >= asked.items()
-    looks = {"density": "softplus", "samples": 128, "fine_samples": 128, "open_end": True}
-    assert nerf.model.sampling.items() >= looks.items()
-    assert (nerf.data.rays, nerf.budget.iterations) == (6144, 250_000)
-    assert (nerf.stage.fine.lr.network, nerf.stage.fine.lr_final_factor) == (1e-3, 0.1)
-    lego = composed("model=ndvg", "experiment=lego_complete", "data.scene=x", "preset=faithful")
-    assert lego.data.box is None
-
-
-def test_frames_of_some_scenes_come_in_sooner_with_faithful_alone():
-    common = ["model=dnerf", "experiment=dnerf", "data.scene=lego"]
-    faithful = composed(*common, "preset=faithful")
-    for scene, all_in in (("lego", 0.0125), ("trex", 0.0125), ("bouncingballs", 0.0125), ("hook", 0.125)):
-        faithful.data.scene = scene
-        expected = {"start": 3, "all_in": all_in, "from_zero": True}
-        assert build_run(faithful).stages[0].settings.curriculum.items() >= expected.items()
-    assert composed(*common).stage.fine.curriculum.all_in == 0.3
-
-
 def test_effects_follow_the_images_and_the_command_line_wins():
     def chosen(*words):
         choices = composed("data.scene=x", "model=forward", *words, hydra=True).hydra.runtime.choices

@@ -23,7 +23,7 @@ MADE = {"index.md", "reference/index.md"}  # by docs/site/hooks.py
 FENCE = re.compile(r"^( *)```(\w*)\n(.*?)^ *```", re.MULTILINE | re.DOTALL)
 # What a reader types into the search -> the title of the first page that it lists.
 FOUND = {"average splat": "forewarp.ops", "page of a run": "The page of a run", "the viewer": "The viewer"}
-# Of packages that tests/cli/test_extending.py writes, of plans that must exist, and patterns of commands.
+# Of packages that tests/cli/test_foreign.py writes, of plans that must exist, and patterns of commands.
 OTHERS = ("--config-dir", "mine", "model=balls", "plan=", "specimen_<", "...")
 
 

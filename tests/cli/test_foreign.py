@@ -1,155 +1,192 @@
-"""Somebody else's package, found on the path alone: a method, data, an effect, a callback and a logger."""
+"""The package of docs/extending.md, found on the path alone: a method, an effect, data, and what watches."""
 
 import importlib
 import json
 import os
+import re
 import shutil
 import signal
 import sys
 from pathlib import Path
 
+import imageio.v3 as imageio
+import numpy as np
 import pytest
 import torch
 import yaml
 
 from forewarp import load
-from forewarp.training.handover import load_handover
+from forewarp.scene.camera import look_at
 from tests.support.commands import call
 
-HERE = Path(__file__).parents[1] / "foreign"
+PAGE = Path(__file__).parents[2] / "docs" / "extending.md"
 SMALL = [
-    *("hydra.searchpath=[pkg://theirs.conf]", "trainer=cpu", "data.rays=64", "threads=1"),
-    *("budget.minutes=null", "budget.iterations=6", "checkpoint_seconds=0", "sheets=0"),
+    *("experiment=mine", "data.scene=toy", "data.rays=32", "trainer=cpu", "threads=1", "sheets=0"),
+    *("budget.minutes=null", "budget.iterations=6", "checkpoint_seconds=0", "callbacks.pictures=null"),
 ]
-DISC = [*SMALL, "experiment=disc", "model=forward", "model/view_dependence=tint", "~stage.fine"]
-MIST = [*SMALL, "experiment=disc", "model=mist"]
-TRUST = "trust=[theirs]"
-ADVICE = "; if you trust the package theirs, add trust=[theirs] (or set FOREWARP_TRUST=theirs)"
+BALLS = [*SMALL, "model=balls"]
+SHEEN = [*SMALL, "model=forward", "model/view_dependence=sheen", "~stage.fine"]
+TRUST = "trust=[mine]"
+ADVICE = "; if you trust the package mine, add trust=[mine] (or set FOREWARP_TRUST=mine)"
+# A callback that interrupts a run as Ctrl-C does, and lattices for 16 pixels of a method of ours.
+MORE = {
+    "mine/stop.py": """
+import signal
+
+import lightning
 
 
-@pytest.fixture(autouse=True)
-def theirs(monkeypatch):
-    """The package can be imported, and nothing of it remains."""
-    monkeypatch.syspath_prepend(str(HERE))
-    monkeypatch.delenv("FOREWARP_TRUST", raising=False)
-    importlib.invalidate_caches()
-    yield
-    forget("theirs")
+class Stop(lightning.Callback):
+    def on_train_batch_end(self, trainer, module, *_):
+        if module.global_step == 3:
+            signal.raise_signal(signal.SIGINT)
+""",
+    "mine/conf/numbers/forward.yaml": """
+exceptions:
+  mine:
+    stage: {coarse: {num_voxels: [[0, 800]]}, fine: {num_voxels: [[0, 1000]]}}
+""",
+}
 
 
-@pytest.fixture
-def ctrl_c():
-    """Ctrl-C works, also where whoever started the tests in the background has it ignored."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
+def files_of(page):
+    """Return the files that the page gives whole: name -> text."""
+    return {name: text for name, text in re.findall(r"^`(mine/\S+)`\n\n```\w+\n(.*?)```", page, re.M | re.S)}
 
 
-def forget(package):
-    for name in [name for name in sys.modules if name.split(".")[0] == package]:
+def write_toy(folder):
+    """Write sixteen images of a rising disc in the format of the page's reader."""
+    folder.mkdir(parents=True)
+    frames, rows = [], np.mgrid[:16, :16]
+    for i in range(16):
+        disc = np.hypot(rows[0] - 10 + i / 4, rows[1] - 8) < 3
+        imageio.imwrite(folder / f"{i}.png", disc[..., None] * np.array([128, 64, 128, 255], np.uint8))
+        angle = torch.tensor(0.4 * i)
+        center = torch.stack([3 * angle.cos(), 3 * angle.sin(), torch.tensor(1.0)])
+        pose = look_at(center, torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
+        frames.append({"image": f"{i}.png", "time": i / 15, "focal": 19.0, "pose": pose.tolist()})
+    content = {"size": [16, 16], "range": [1.0, 5.5], "box": [[-1] * 3, [1] * 3], "frames": frames}
+    (folder / "cameras.json").write_text(json.dumps(content))
+
+
+def forget_mine():
+    for name in [name for name in sys.modules if name.split(".")[0] == "mine"]:
         del sys.modules[name]
 
 
 @pytest.fixture(scope="module")
-def originals(tmp_path_factory):
-    """A finished run of their data and effect, and one of their method."""
-    root = tmp_path_factory.mktemp("theirs")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(HERE))
-        for name, overrides in (("disc", DISC), ("mist", MIST)):
-            done = call("train", *overrides, f"run={root / name}")
-            assert done.status == 0, done.err
-    forget("theirs")
+def work(tmp_path_factory):
+    """A folder with the page's package and a scene."""
+    root = tmp_path_factory.mktemp("work")
+    for name, text in (files_of(PAGE.read_text()) | MORE).items():
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_text(text)
+    for folder in ("mine", "mine/conf"):
+        (root / folder / "__init__.py").touch()
+    write_toy(root / "scenes" / "toy")
     return root
 
 
+@pytest.fixture(autouse=True)
+def mine(work, monkeypatch):
+    """The package can be imported, and nothing of it remains."""
+    monkeypatch.syspath_prepend(str(work))
+    monkeypatch.delenv("FOREWARP_TRUST", raising=False)
+    importlib.invalidate_caches()
+    yield
+    forget_mine()
+
+
+@pytest.fixture(scope="module")
+def found(work):
+    """Words that find the options and the scene."""
+    return ["hydra.searchpath=[pkg://mine.conf]", f"data.root={work / 'scenes'}"]
+
+
+@pytest.fixture(scope="module")
+def originals(work, found):
+    """A finished run of the effect, and one of the method, which finds its options in a folder."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(work))
+        folder = ["--config-dir", str(work / "mine" / "conf"), found[1]]
+        for name, words in (("sheen", [*found, *SHEEN]), ("balls", [*folder, *BALLS])):
+            done = call("train", *words, f"run={work / name}")
+            assert done.status == 0, done.err
+    forget_mine()
+    return work
+
+
 @pytest.fixture
-def fitted(originals, in_tmp):
+def sheen(originals, in_tmp):
     """``run`` in the current folder: a finished run, in a process that has not seen the package."""
-    return shutil.copytree(originals / "disc", in_tmp / "run")
+    return shutil.copytree(originals / "sheen", in_tmp / "run")
 
 
 @pytest.fixture
-def mist(originals, in_tmp):
-    """As ``fitted``, of their method."""
-    return shutil.copytree(originals / "mist", in_tmp / "run")
+def balls(originals, in_tmp):
+    """As ``sheen``, of the method."""
+    return shutil.copytree(originals / "balls", in_tmp / "run")
 
 
-def steps_of(run, stage="coarse"):
-    return json.loads((run / stage / "done.json").read_text())["steps"]
-
-
-def test_what_is_typed_trains_and_trains_again_without_trust(forewarp, ok, fitted):
-    config = yaml.safe_load((fitted / "config.yaml").read_text())
-    assert config["data"]["_target_"] == "theirs.data.DiscDataModule"
-    assert config["model"]["view_dependence"]["_target_"] == "theirs.effects.Tint"
+def test_what_is_typed_trains_and_trains_again_without_trust(ok, found, sheen):
+    config = yaml.safe_load((sheen / "config.yaml").read_text())
+    assert config["data"]["_target_"] == "mine.data.MineDataModule"
+    assert config["model"]["view_dependence"]["_target_"] == "mine.effects.Sheen"
     assert config["trust"] is None
-    assert (fitted / "coarse" / "steps.txt").read_text() == "6"
-    assert "theirs/step" in (fitted / "coarse" / "csv" / "metrics.csv").read_text()
-    again = forewarp("train", *DISC, "run=run")
-    assert (again.status, again.out.strip()[:15]) == (0, "measured before"), again
-    (fitted / "metrics.json").unlink()
-    again = ok("train", *DISC, "run=run")
-    assert "coarse: finished before" in again.out
+    assert "mine/psnr" in (sheen / "coarse" / "csv" / "metrics.csv").read_text()
+    words = ["train", *found, *SHEEN, "run=run"]
+    assert ok(*words).out.startswith("measured before")
+    (sheen / "metrics.json").unlink()
+    assert "coarse: finished before" in ok(*words).out
+    assert type(load("run", trust=["mine"]).method.view_dependence).__name__ == "Sheen"
 
 
 @pytest.mark.slow
-def test_an_interrupted_run_goes_on(forewarp, ok, refused, in_tmp, ctrl_c):
-    stopped = forewarp("train", *DISC, "run=run", "callbacks.count.stop_at=3", "evaluate=false", TRUST)
+def test_an_interrupted_run_goes_on(forewarp, ok, refused, found, in_tmp):
+    # Ctrl-C works, also where whoever started the tests in the background has it ignored.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    stop = "+callbacks.stop={_target_: mine.stop.Stop, _partial_: true}"
+    stopped = forewarp("train", *found, *SHEEN, "run=run", stop, "evaluate=false", TRUST)
+    signal.signal(signal.SIGINT, before)
     assert stopped.status == 130, stopped
-    run = in_tmp / "run"
-    assert (run / "coarse" / "last.ckpt").is_file()
-    config = run / "config.yaml"
-    text = config.read_text()
-    assert yaml.safe_load(text)["trust"] is None  # a folder has no say in it
-    config.write_text(text.replace("stop_at: 3", "stop_at: null").replace("trust: null", "trust: [theirs]"))
-    forget("theirs")
+    config = in_tmp / "run" / "config.yaml"
+    saved = yaml.safe_load(config.read_text())
+    assert saved["trust"] is None  # a folder has no say in it
+    config.write_text(
+        yaml.safe_dump(saved | {"trust": ["mine"], "callbacks": saved["callbacks"] | {"stop": None}})
+    )
+    forget_mine()
     assert refused("train", "resume=run").endswith(ADVICE)
-    assert "theirs" not in sys.modules
-    done = ok("train", "resume=run", TRUST)
-    assert "coarse: goes on at 50%, step 3" in done.out
-    assert steps_of(run) == 6
+    assert "mine" not in sys.modules
+    assert "coarse: goes on at 50%, step 3" in ok("train", "resume=run", TRUST).out
+    assert json.loads((in_tmp / "run" / "coarse" / "done.json").read_text())["steps"] == 6
 
 
-def test_a_stored_run_is_measured_by_who_trusts_it(ok, refused, fitted, monkeypatch):
+def test_a_stored_run_is_measured_by_who_trusts_it(ok, refused, sheen, monkeypatch):
     line = refused("evaluate", "run=run")
     assert line.startswith(
-        "run/config.yaml: data._target_: expected a class of forewarp, but got 'theirs.data."
+        "run/config.yaml: data._target_: expected a class of forewarp, but got 'mine.data."
     )
     assert line.endswith(ADVICE)
-    assert "theirs" not in sys.modules
-    for override in ("trust=theirs", "trust=[other,theirs]"):
+    assert "mine" not in sys.modules
+    for override in ("trust=mine", "trust=[other,mine]"):
         ok("evaluate", "run=run", override)
-    monkeypatch.setenv("FOREWARP_TRUST", "other, theirs")
+    monkeypatch.setenv("FOREWARP_TRUST", "other, mine")
     ok("evaluate", "run=run")
 
 
-@pytest.mark.slow
-def test_no_job_of_a_sweep_measures_a_run_that_is_not_trusted(forewarp, ok, fitted):
-    shutil.copytree(fitted, "again")
-    sweep = ["evaluate", "--multirun", "run=run,again"]
-    written = [Path(run, "metrics.json").stat().st_mtime_ns for run in ("run", "again")]
-    done = forewarp(*sweep)
-    assert done.status == 2
-    assert done.err.count(f"{ADVICE}\n") == 2
-    assert "2 of 2 jobs failed" in done.err
-    assert "theirs" not in sys.modules
-    assert written == [Path(run, "metrics.json").stat().st_mtime_ns for run in ("run", "again")]
-    ok(*sweep, TRUST)
-
-
-def test_the_page_of_a_run_takes_trust(ok, fitted, monkeypatch):
+def test_the_page_of_a_run_takes_trust(ok, sheen, monkeypatch):
     monkeypatch.setattr("forewarp.cli.report.write_film", lambda *_: None)
     page = ["report", "kind=run", "run=run"]
     assert ADVICE in ok(*page).out
     assert "Rendering" not in ok(*page, TRUST).out
 
 
-def test_the_environment_goes_along_whatever_a_launcher_hands_on(ok, fitted, monkeypatch):
+def test_the_environment_goes_along_whatever_a_launcher_hands_on(ok, sheen, monkeypatch):
     """A job of another process or machine: its environment is its own."""
     import hydra
 
-    monkeypatch.setenv("FOREWARP_TRUST", "theirs")
+    monkeypatch.setenv("FOREWARP_TRUST", "mine")
     begun = hydra.main
 
     def elsewhere(**options):
@@ -167,41 +204,27 @@ def test_the_environment_goes_along_whatever_a_launcher_hands_on(ok, fitted, mon
     ok("evaluate", "run=run")
 
 
-def test_a_method_of_theirs_is_measured_and_rendered_with_trust(ok, refused, mist):
-    assert steps_of(mist, "fine") == 6
+def test_a_method_is_measured_rendered_and_opened_with_trust(ok, refused, balls):
     still = ["format=png", "frames=2", "size=16", "threads=1"]
     for words in (["evaluate", "run=run"], ["render", "run=run", *still]):
-        forget("theirs")
+        forget_mine()
         assert refused(*words).endswith(ADVICE)
         ok(*words, TRUST)
-    assert len(list((mist / "videos").rglob("*.png"))) == 2
+    assert len(list((balls / "videos").rglob("*.png"))) == 2
+    forget_mine()
+    with pytest.raises(ValueError, match="expected a class of forewarp, but got 'mine"):
+        load(balls)
+    assert "mine" not in sys.modules
+    scene = load(balls, trust=["mine"])
+    assert scene.render(scene.frames("test")[0].camera, 0.5).shape == (16, 16, 3)
+    assert scene.trajectories(scene.matter().points, [0.0, 1.0]).shape == (64, 2, 3)
 
 
 @pytest.mark.slow
-def test_a_method_of_theirs_is_swept_beside_ours_and_reported(ok, in_tmp):
-    run = "run=runs/disc/${model.name}-seed${seed}"
-    done = ok("train", "--multirun", *SMALL, "experiment=disc", "model=forward,mist", run)
-    assert done.out.count("of 1 validation view") == 2  # and scored
-    assert {path.name for path in in_tmp.glob("runs/disc/*-seed*")} == {"forward-seed0", "mist-seed0"}
+def test_a_method_is_swept_beside_ours_and_reported(ok, found, in_tmp):
+    run = "run=runs/toy/${model.name}-seed${seed}"
+    done = ok("train", "--multirun", *found, *SMALL, "data.held_out=2", "model=forward,balls", run)
+    assert done.out.count("of 2 held out views") == 2  # and scored
+    assert {path.name for path in in_tmp.glob("runs/toy/*-seed*")} == {"forward-seed0", "balls-seed0"}
     ok("report", "kind=accuracy_time", "runs=runs", "out=page")
-    assert "mist-demo" in (in_tmp / "page" / "accuracy-time.md").read_text()
-
-
-def test_a_method_of_theirs_is_opened_with_trust(mist):
-    with pytest.raises(ValueError, match="expected a class of forewarp, but got 'theirs"):
-        load(mist)
-    assert "theirs" not in sys.modules
-    scene = load(mist, trust=["theirs"])
-    frame = scene.frames("test")[0]
-    assert scene.render(frame.camera, 0.5).shape == (16, 16, 3)
-    assert scene.trajectories(scene.matter().points, [0.0, 1.0]).shape == (8, 2, 3)
-
-
-def test_a_stage_has_a_method_of_its_own(ok, in_tmp):
-    ok("train", *SMALL, "experiment=disc_in_two", "run=run", "evaluate=false")
-    run = in_tmp / "run"
-    assert [steps_of(run, stage) for stage in ("coarse", "fine")] == [3, 3]
-    module = load(run, trust=["theirs"]).module
-    left = load_handover(run / "coarse").cloud.points
-    assert torch.cdist(module.method.began, left).amin(-1).max() == 0
-    ok("evaluate", "run=run", TRUST)
+    assert "balls-fast" in (in_tmp / "page" / "accuracy-time.md").read_text()

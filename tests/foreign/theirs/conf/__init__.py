@@ -1,1 +1,0 @@
-"""Configurations, found with ``hydra.searchpath=[pkg://theirs.conf]`` or ``--config-dir``."""
