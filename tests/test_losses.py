@@ -3,8 +3,10 @@ import math
 import pytest
 import torch
 from torch.autograd import gradcheck
+from torch.nn import functional as F
 
 from forewarp import losses
+from forewarp.metrics.image import _similarity
 from forewarp.ops.grid import neighbour_pairs
 
 IDS = torch.tensor([0, 0, 2])
@@ -81,6 +83,14 @@ def test_nothing_to_measure_is_zero_and_attached():
         value.backward()
 
 
+def test_losses_of_whole_images():
+    image, truth = torch.rand(2, 13, 9, 3, dtype=torch.float64)
+    padded = (F.pad(x.permute(2, 0, 1), (5, 5, 5, 5)) for x in (image, truth))
+    torch.testing.assert_close(losses.dssim(image, truth), (1 - _similarity(*padded)[0]).sum() / 2)
+    assert losses.dssim(image, image).item() == pytest.approx(0, abs=1e-9)
+    assert losses.robust(torch.full((1, 1, 3), 0.75), torch.zeros(1, 1, 3), 1.0).item() == 0.75
+
+
 def test_gradcheck():
     def draw(*shape):
         return (0.1 + 0.8 * torch.rand(*shape, dtype=torch.float64)).requires_grad_()
@@ -89,6 +99,8 @@ def test_gradcheck():
     pairs = neighbour_pairs(torch.arange(60, dtype=torch.int32).reshape(3, 4, 5))
     assert gradcheck(lambda c: losses.photometric(c, truth), draw(3, 3))
     assert gradcheck(lambda c: losses.point_color(torch.ones(3).double(), c, IDS, truth), draw(3, 3))
+    assert gradcheck(lambda image: losses.robust(image, truth, 0.05), draw(3, 3))
+    assert gradcheck(lambda image: losses.dssim(image, truth[:, None].expand(3, 2, 3)), draw(3, 2, 3))
     assert gradcheck(losses.background_entropy, draw(5))
     assert gradcheck(losses.sample_entropy, draw(5))
     assert gradcheck(losses.flow_l1, draw(5, 3))

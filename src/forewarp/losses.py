@@ -84,3 +84,31 @@ def moving_opacity(alpha: Tensor) -> Tensor:
 def static_points(displacement: Tensor) -> Tensor:
     """Squared displacement (N, 3) of points known to be static, mean over points (Nerfies)."""
     return displacement.square().sum(-1).mean()
+
+
+def robust(image: Tensor, truth: Tensor, width: float) -> Tensor:
+    """``sqrt(e^2 + width^2) - width`` of the errors of images (H, W, 3), summed over pixels and channels."""
+    return ((image - truth).square() + width**2).sqrt().sub(width).sum()
+
+
+def dssim(image: Tensor, truth: Tensor) -> Tensor:
+    """Structural dissimilarity ``(1 - SSIM) / 2`` of images (H, W, 3), summed over pixels and channels.
+
+    Windows are Gaussian, 11 pixels wide and of sigma 1.5; beyond the border images are 0.
+
+    Source: Wang et al., "Image Quality Assessment: From Error Visibility to Structural Similarity" (2004).
+    """
+    offsets = torch.arange(-5, 6).to(image)
+    row = torch.exp(-(offsets**2) / (2 * 1.5**2))
+    window = (row[:, None] * row / row.sum() ** 2)[None, None]
+    a, b = (x.permute(2, 0, 1)[:, None] for x in (image, truth))
+    blurred = (torch.nn.functional.conv2d(x, window, padding=5) for x in (a, b, a * a, b * b, a * b))
+    mean_a, mean_b, square_a, square_b, product = blurred
+    covariance = 2 * (product - mean_a * mean_b) + 0.03**2
+    variances = square_a - mean_a**2 + square_b - mean_b**2 + 0.03**2
+    means = (2 * mean_a * mean_b + 0.01**2) / (mean_a**2 + mean_b**2 + 0.01**2)
+    return (1 - means * covariance / variances).sum() / 2
+
+
+# Terms of methods that compare whole images, besides ``photo``: sums over an image's pixels and channels.
+IMAGE_LOSSES = {"dssim": dssim}

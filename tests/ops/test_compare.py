@@ -47,6 +47,33 @@ def test_kernel_equals_reference(options):
     assert bool((away.diff() >= 0).all())
 
 
+@pytest.mark.parametrize("kind", [torch.float32, torch.float64])  # by the kernels, by the reference
+def test_the_fused_loss_is_that_of_a_callable(kind):
+    def robust(image, truth):
+        assert image.shape == truth.shape == (SIZE[1], SIZE[0], 3)
+        return ((image - truth).square() + 0.5**2).sqrt().sub(0.5).sum()
+
+    fused, called = (run(kind, width=0.5, factor=0.01, loss=loss) for loss in (None, robust))
+    assert called.loss == pytest.approx(fused.loss, rel=1e-5)
+    assert called.squared == pytest.approx(fused.squared, rel=1e-5)
+    for one_part, other in zip(gradients_of(fused), gradients_of(called), strict=True):
+        assert float((one_part - other).norm() / one_part.norm()) < 2e-5
+    assert called.order.tolist() == fused.order.tolist()
+    assert torch.equal(called.distances[called.order], fused.distances[fused.order])
+
+
+def test_gradients_of_a_loss_of_neighbouring_pixels():
+    """By the kernels, against the reference in float64."""
+
+    def edges(image, truth):
+        return (image.diff(dim=1) - truth.diff(dim=1)).square().sum()
+
+    exact, fast = (run(kind, loss=edges) for kind in (torch.float64, torch.float32))
+    assert fast.loss == pytest.approx(exact.loss, rel=1e-5)
+    for one_part, other in zip(gradients_of(exact), gradients_of(fast), strict=True):
+        assert float((one_part - other).norm() / one_part.norm()) < 2e-5
+
+
 @pytest.mark.parametrize("kind", [torch.float32, torch.float64])  # by the kernel, by the reference
 def test_gradients_of_colours_come_apart(kind):
     whole, count = run(kind).particles.colors, crowd(dtype=kind)[0].colors.shape[1]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import accumulate
 from typing import NamedTuple
@@ -500,11 +500,12 @@ def compare(
     factor: float = 1.0,
     by_skin: bool = False,
     kinds: Sequence[int] | None = None,
+    loss: Callable[[Tensor, Tensor], Tensor] | None = None,
 ) -> Compared:
     """The loss ``sum sqrt(e^2 + width^2) - width`` over pixels and channels, and its gradients.
 
     ``e`` is the picture of ``project`` and ``rasterize`` over ``background`` less the truth over the same:
-    near 0 the loss is a square, far from it the error itself.
+    near 0 the loss is a square, far from it the error itself. A ``loss`` of the image takes its place.
 
     Args:
         particles, warp, pinhole, tints, fades: as of ``project``.
@@ -515,6 +516,8 @@ def compare(
         by_skin: whether gradients (N, L) by the numbers are wanted whose softmax the warp's weights are.
         kinds: how many coefficients of colour in turn have gradients (N, k, 3) in a tensor of their own;
             None: all (N, B, 3) are in one.
+        loss: called with the image and the truth (H, W, 3), returns a differentiable (); autograd leads from
+            it to the kernels. None: the loss above, which a kernel computes together with its gradients.
 
     Returns:
         ``Compared``; nothing in it has a graph.
@@ -522,7 +525,8 @@ def compare(
     Raises:
         ValueError: for shapes that do not go together, or another kind of pixels.
 
-    Cost: that of ``rasterize`` twice and of ``project`` thrice.
+    Cost: that of ``rasterize`` twice and of ``project`` thrice; with a ``loss``, of ``rasterize`` thrice and
+    of the loss.
     """
     _check(particles, warp, tints, fades)
     check_shape("pixels", pixels, (pinhole.size[0] * pinhole.size[1], 4))
@@ -533,9 +537,10 @@ def compare(
         raise ValueError(
             f"kinds: expected {particles.colors.shape[1]} coefficients in all, but got {tuple(kinds)}"
         )
-    fast = use_numba(particles.means) and particles.means.dtype == torch.float32
-    run = _compare_numba if fast else compare_reference
-    return run(particles, warp, pinhole, tints, fades, pixels, background, width, factor, by_skin, kinds)
+    given = particles, warp, pinhole, tints, fades, pixels, background, width, factor, by_skin, kinds
+    if loss is None and use_numba(particles.means) and particles.means.dtype == torch.float32:
+        return _compare_numba(*given)
+    return compare_reference(*given, loss)
 
 
 def compare_reference(
@@ -550,21 +555,31 @@ def compare_reference(
     factor: float,
     by_skin: bool,
     kinds: Sequence[int] | None,
+    loss: Callable[[Tensor, Tensor], Tensor] | None = None,
 ) -> Compared:
-    """``compare`` in plain PyTorch, on any device and in any precision."""
+    """``compare`` in plain PyTorch, on any device and in any precision; a ``loss`` by ``project`` and
+    ``rasterize``, which use kernels.
+    """
     leaves = [t.detach().clone().requires_grad_() for t in (*particles, warp.maps, warp.weights)]
     with torch.enable_grad():
         own, own_warp = Gaussians(*leaves[:5]), Warp(leaves[5], warp.links, leaves[6])
-        splats = project_reference(own, own_warp, pinhole, tints, fades)
+        splats = (project if loss else project_reference)(own, own_warp, pinhole, tints, fades)
         splats.values.retain_grad()
-        planes = rasterize_reference(splats, *pinhole.size)
-        behind = background.to(planes)
-        drawn = planes[:3] + planes[4] * behind[:, None, None]
-        straight = pixels.to(planes) / 255
+        if loss:
+            color, _, transmittance = rasterize(splats, *pinhole.size)
+        else:
+            planes = rasterize_reference(splats, *pinhole.size)
+            color, transmittance = planes[:3], planes[4]
+        behind = background.to(color)
+        drawn = color + transmittance * behind[:, None, None]
+        straight = pixels.to(color) / 255
         truth = torch.lerp(behind.expand_as(straight[:, :3]), straight[:, :3], straight[:, 3:])
         error = drawn.reshape(3, -1).T - truth
-        loss = ((error.square() + width**2).sqrt() - width).sum()
-        (factor * loss).backward()
+        if loss:
+            value = loss(drawn.permute(1, 2, 0), truth.reshape(*drawn.shape[1:], 3))
+        else:
+            value = ((error.square() + width**2).sqrt() - width).sum()
+        (factor * value).backward()
     found = [torch.zeros_like(leaf) if leaf.grad is None else leaf.grad for leaf in leaves]
     pull = splats.values.grad[:, :2].norm(dim=-1)
     squared = float(error.detach().square().sum())
@@ -573,7 +588,7 @@ def compare_reference(
     order = seen[away[seen].argsort(stable=True)]
     colors = found[4] if kinds is None else found[4].split(list(kinds), 1)
     gradients = Gaussians(*found[:4], colors)
-    return Compared(float(loss.detach()), squared, gradients, found[5], skin, pull, order, away)
+    return Compared(float(value.detach()), squared, gradients, found[5], skin, pull, order, away)
 
 
 def _by_softmax(weights: Tensor, by_weights: Tensor) -> Tensor:

@@ -50,6 +50,20 @@ def test_gradients_are_those_of_autograd(options):
         assert error < 2e-3, name
 
 
+def test_image_losses_are_weighted_with_the_photo_term():
+    """Their gradients are those of the photo term, by its kernel, and of each loss by itself."""
+    module, steps = module_with(DATA, numbers={"jitter": 0.0}), []
+    shaken(module).method.nodes.seen_times.copy_(torch.tensor([0.0, 1.0]))
+    for factors in ({"photo": 1.0}, {"dssim": 1.0}, {"photo": 2.0, "dssim": 0.5}):
+        steps.append(look(module, DATA, 3, factors))
+    photo, dssim, both = ({name: float(value()) for name, value in step.terms.items()} for step in steps)
+    assert (both["photo"], both["dssim"]) == pytest.approx((photo["photo"], dssim["dssim"]), rel=1e-5)
+    assert dssim["dssim"] > 0.01
+    for name, gradient in steps[2].gradients.items():
+        expected = 2.0 * steps[0].gradients[name] + 0.5 * steps[1].gradients[name]
+        assert float((gradient - expected).norm()) <= 1e-4 * float(expected.norm()) + 1e-12, name
+
+
 def test_two_views_of_a_time_count_as_one_step():
     module = module_with(DATA, numbers={"jitter": 0.0})
     batch = next(iter(DATA.train_dataloader()))

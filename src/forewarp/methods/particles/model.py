@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
 from forewarp.fields.curves import Curve
+from forewarp.losses import IMAGE_LOSSES, robust
 from forewarp.methods.method import Method, Snapshot, Start, Step
 from forewarp.methods.particles import density, queries
 from forewarp.methods.particles.nodes import Nodes, Skinning, TimeOffsets, are_rows
@@ -146,7 +147,7 @@ class Particles(Method):
         choices: see ``options.Effects``.
     """
 
-    terms = ("photo", "rigid", "smooth")
+    terms = ("photo", *IMAGE_LOSSES, "rigid", "smooth")
     numbers = tuple(key for key in Numbers.__dataclass_fields__ if key != "name")
     asks = Asks(kind="pictures", straight=True)
     effects = EFFECTS
@@ -383,13 +384,14 @@ class Particles(Method):
             motion, maps = nodes.motion_and_maps(basis)
             warp = Warp(maps, self.skinning.links, self.skinning.weights())
         colors, terms = self._color_parameters(), {}
-        covered = float(self.covered_pixels)  # image losses are sums over pixels, divided by those covered
+        loss, covered = self._image_loss(factors, terms), float(self.covered_pixels)
+        factor = (factors.get("photo", 0.0) if loss is None else 1.0) / (covered * views)
         compared = compare(
             self.gaussians(), warp, pinhole_of(seen.view.camera, self.blur), *self.time_bases(time),
-            seen.rgb, seen.background, width=self.width, factor=factors.get("photo", 0.0) / (covered * views),
-            by_skin=self.moves, kinds=[getattr(self, name).shape[1] for name in colors],
+            seen.rgb, seen.background, width=self.width, factor=factor, by_skin=self.moves,
+            kinds=[getattr(self, name).shape[1] for name in colors], loss=loss,
         )  # fmt: skip
-        terms["photo"] = compared.loss / covered
+        terms = {name: value / covered for name, value in (terms or {"photo": compared.loss}).items()}
         shown = compared.pull > 0
         self.gradient_sum.add_(compared.pull)
         self.image_count.add_(shown)
@@ -410,6 +412,23 @@ class Particles(Method):
             terms["smooth"], of_nodes = nodes.backward(time, motion_time, basis, by_motion, smooth, extent)
             gradients |= {"skinning.logits": compared.skin, **of_nodes}
         return compared.squared, terms, gradients
+
+    def _image_loss(self, factors: Mapping[str, float], terms: dict[str, float]) -> Callable | None:
+        """Return the weighted sum of all losses of an image, which notes each in ``terms``.
+
+        None if ``photo`` is the only one: a kernel computes it together with its gradients.
+        """
+        losses = {"photo": partial(robust, width=self.width)} | IMAGE_LOSSES
+        losses = {name: loss for name, loss in losses.items() if name in factors}
+        if losses.keys() <= {"photo"}:
+            return None
+
+        def weighted(image: Tensor, truth: Tensor) -> Tensor:
+            values = {name: loss(image, truth) for name, loss in losses.items()}
+            terms.update({name: float(value.detach()) for name, value in values.items()})
+            return sum(factors[name] * value for name, value in values.items())
+
+        return weighted
 
     def _jittered(self, time: float, generator: torch.Generator) -> float:
         """Shift an image's time at random, less and less, so that curves do not follow single images."""
