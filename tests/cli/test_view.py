@@ -2,6 +2,7 @@ import shutil
 import socket
 import sys
 from contextlib import nullcontext
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -12,9 +13,10 @@ from omegaconf import OmegaConf
 pytest.importorskip("viser", reason="no viser: pip install forewarp[viewer]")
 
 from forewarp.cli.prepare import viewer_of
-from forewarp.cli.view import view
+from forewarp.cli.view import refuse_other_scene, view
 from forewarp.viewer.queue import RenderQueue
 from tests.support.configs import composed
+from tests.support.tiny_scene import ball_scene
 
 
 @pytest.fixture
@@ -65,6 +67,18 @@ def test_a_taken_port_and_a_run_that_is_not_finished_end_in_one_line(refused, fi
     half = shutil.copytree(fitted, tmp_path / "half")
     (half / "fine" / "done.json").unlink()
     assert "half/fine: expected a finished stage, but got none" in refused("view", f"run={half}")
+
+
+def test_two_runs_of_different_scenes_are_refused():
+    scene, views = ball_scene(frames=6), "got one with other test views"
+    refuse_other_scene(scene, replace(scene, train=scene.train[:5]))
+    for changes, says in (
+        ({"name": "cube"}, "expected a run of ball, as run= is, but got one of cube"),
+        ({"test": scene.test[:2]}, views),
+        ({"test": scene.test[::-1]}, views),
+    ):
+        with pytest.raises(ValueError, match=says):
+            refuse_other_scene(scene, replace(scene, **changes))
 
 
 @pytest.mark.parametrize(

@@ -17,26 +17,24 @@ def run_all(queue):
         pass
 
 
-def test_the_newest_of_each_is_run_and_what_waits_longest_comes_first(queue):
+def test_urgent_jobs_come_first_then_old_ones_and_the_newest_of_each_is_run(queue):
     done = []
-    for page, number in (("a", 1), ("b", 2), ("a", 3), ("c", 4), ("c", 5), ("b", 6)):
-        queue.submit(page, "image", lambda number=number: done.append(number))
-    run_all(queue)
-    assert done == [3, 5, 6]
 
+    def submit(page, number, kind="image", **when):
+        queue.submit(page, kind, lambda: done.append(number), **when)
 
-def test_urgent_jobs_come_first_and_later_ones_when_they_are_due(queue):
-    done = []
-    queue.submit("page", "video", lambda: done.append("video"), priority=2)
-    queue.submit("page", "rest", lambda: done.append("rest"), priority=1, delay=0.5)
-    queue.submit("page", "image", lambda: done.append("image"))
+    submit("a", 9, "video", priority=2)
+    submit("a", 8, "rest", priority=1, delay=0.5)
+    for page, number in (("a", 1), ("b", 2), ("a", 3), ("c", 4), ("c", 5), ("b", 6), ("d", 7)):
+        submit(page, number)
+    queue.cancel("d")
     run_all(queue)
-    assert done == ["image", "video"]
+    assert done == [3, 5, 6, 9]
     assert not queue.has_due_job()
     queue._clock.now = 0.5
     assert queue.has_due_job()
     run_all(queue)
-    assert done == ["image", "video", "rest"]
+    assert done == [3, 5, 6, 9, 8]
     assert not queue.has_due_job()
 
 
@@ -65,16 +63,6 @@ def test_a_job_learns_whether_it_is_still_wanted(queue, meanwhile, stale):
     queue.run_next()
     assert answers == [False, stale]
     assert not queue.is_stale()
-
-
-def test_what_a_page_asked_for_goes_with_it(queue):
-    done = []
-    for page in (1, 2):
-        for kind in ("image", "video"):
-            queue.submit(page, kind, lambda page=page: done.append(page))
-    queue.cancel(1)
-    run_all(queue)
-    assert done == [2, 2]
 
 
 def test_a_job_that_fails_or_gives_up_ends_alone(queue, capsys):

@@ -80,25 +80,17 @@ def test_a_port_that_is_taken_since_is_refused(viewer, tmp_path, monkeypatch):
         ({"host": ""}, "host: expected an address of this machine, but got nothing; use host=127.0.0.1"),
         ({"host": "192.0.2.1"}, "host: expected an address of this machine .* but got 192.0.2.1"),
         ({"host": "no such.host"}, "host: expected an address of this machine .* but got no such.host"),
+        ({"port": 65535, "error": errno.EADDRINUSE}, "got 65535, which is in use; use port=0"),
+        ({"port": 80, "error": errno.EACCES}, "one that you may open, but got 80, .* use port=8080"),
     ],
 )
-def test_an_address_that_cannot_be_is_refused(where, says):
+def test_an_address_on_which_nothing_can_listen_is_refused(monkeypatch, where, says):
+    where = {"host": "127.0.0.1", "port": 0} | where
+    error = where.pop("error", None)
+    if error is not None:
+        monkeypatch.setattr("socket.create_server", Mock(side_effect=OSError(error, os.strerror(error))))
     with pytest.raises(ValueError, match=says):
-        check_address(**{"host": "127.0.0.1", "port": 0} | where)
-
-
-@pytest.mark.parametrize(
-    ("failure", "port", "says"),
-    [
-        (errno.EADDRINUSE, 65535, "got 65535, which is in use; use port=0"),
-        (errno.EACCES, 80, "port: expected one that you may open, but got 80, .* use port=8080"),
-        (errno.EADDRNOTAVAIL, 80, "host: expected an address .* that port 80 .* but got 127.0.0.1"),
-    ],
-)
-def test_why_a_port_cannot_be_opened_is_told(monkeypatch, failure, port, says):
-    monkeypatch.setattr("socket.create_server", Mock(side_effect=OSError(failure, os.strerror(failure))))
-    with pytest.raises(ValueError, match=says):
-        check_address("127.0.0.1", port)
+        check_address(**where)
 
 
 def test_pages_of_foreign_sites_are_sent_nothing(viewer, tmp_path):

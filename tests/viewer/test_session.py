@@ -43,7 +43,7 @@ def _as_fast_as_it_can(monkeypatch):
     monkeypatch.setattr(session_module, "MIN_INTERVAL", 0.0)
 
 
-def test_thirty_images_a_second_are_enough(watch, monkeypatch):
+def test_thirty_images_a_second_are_enough_and_quick_ones_are_full_at_once(watch, monkeypatch):
     monkeypatch.setattr(session_module, "MIN_INTERVAL", MIN_INTERVAL)
     viewer = FakeViewer(watch, cost=1e-9)
     session, page = session_of(viewer)
@@ -53,6 +53,11 @@ def test_thirty_images_a_second_are_enough(watch, monkeypatch):
         viewer.queue.run_next()
         watch.now += 0.001
     assert 27 <= len(page.images) <= 31
+    assert page.images[-1][:2] == ((400, 533), True)
+    session.play(False)
+    run(viewer)
+    watch.now += REST_SECONDS
+    assert run(viewer) == 0
 
 
 def test_small_while_moving_and_full_at_rest(viewer, watch):
@@ -75,17 +80,6 @@ def test_small_while_moving_and_full_at_rest(viewer, watch):
     assert page.said[0].endswith("small while moving")
 
 
-def test_quick_images_are_full_at_once(watch):
-    viewer = FakeViewer(watch, cost=1e-9)
-    session, page = session_of(viewer)
-    for step in range(5):
-        session.change(time=step / 5)
-        run(viewer)
-    assert page.images[-1] == ((400, 533), True, 0.8)
-    watch.now += REST_SECONDS
-    assert run(viewer) == 0
-
-
 def test_what_came_in_between_is_dropped(viewer, watch):
     session, page = session_of(viewer)
     for step in range(10):
@@ -99,20 +93,6 @@ def test_what_came_in_between_is_dropped(viewer, watch):
     assert len(page.images) == 1
     run(viewer)
     assert page.images[-1][1:] == (False, 0.5)
-
-
-def test_two_pages_keep_their_own(viewer, watch):
-    (first, page), (second, other) = session_of(viewer), session_of(viewer)
-    first.change(time=0.25)
-    second.change(time=0.75, channel="depth")
-    run(viewer)
-    assert (page.images[-1][2], other.images[-1][2]) == (0.25, 0.75)
-    assert (first.state.channel, second.state.channel) == ("colour", "depth")
-    first.play(True)
-    watch.now += 0.1 * PLAYBACK_SECONDS
-    run(viewer, 20)
-    assert other.times == []
-    assert page.times[0] == pytest.approx(0.35, abs=0.01)
 
 
 @pytest.mark.parametrize("loop", [True, False])
@@ -216,8 +196,7 @@ def test_a_training_view_is_left_by_a_new_camera_time_or_channel(viewer, watch):
 
 def test_a_training_view_or_a_time_that_is_none_becomes_the_nearest(viewer):
     session, _ = session_of(viewer)
-    for index, nearest in ((-1, 0), (3, 3), (4, 3), (10**9, 3)):
-        assert (session.show_training_view(index), session.state.training_view) == (nearest, nearest)
+    assert [session.show_training_view(index) for index in (-1, 3, 4, 10**9)] == [0, 3, 3, 3]
     for time, nearest in ((-0.5, 0.0), (7.0, 1.0), (float("nan"), 0.0)):
         session.change(time=time)
         assert session.state.time == nearest
@@ -281,18 +260,15 @@ def test_a_path_goes_through_its_keys_smoothly(times):
         assert sorted(within, reverse=then < first) == within
 
 
-def test_a_single_key_makes_no_video():
-    with pytest.raises(ValueError, match="and 2 pictures of them, but got 1 key views and 50 pictures"):
-        camera_path(keys_of(0.5), 50)
-
-
 @pytest.mark.parametrize(("seconds", "images"), [(1e9, 15_000), (-1.0, 2), (float("nan"), 2)])
-def test_a_video_is_as_long_as_it_may_be(tmp_path, seconds, images):
+def test_a_video_is_as_long_as_it_may_be_and_has_two_keys(tmp_path, seconds, images):
     session, progress = Session(FakeViewer(), FakePage()), []
     session.close()
     with pytest.raises(Cancelled):
         session.write_video(tmp_path, keys_of(0.0, 1.0), seconds, lambda *done: progress.append(done))
     assert progress == [(0, images)]
+    with pytest.raises(ValueError, match=f"2 pictures of them, but got 1 key views and {images} pictures"):
+        session.write_video(tmp_path, keys_of(0.5), seconds, print)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -23,6 +23,7 @@ What one types most:
 
 A run in training: forewarp-train ... viewer=true
 """
+TOLERANCE = 1e-3  # by which two runs' test cameras may differ, of their distance to the origin
 
 
 def require_viewer() -> None:
@@ -50,7 +51,7 @@ def view(config) -> None:
     # These load torch; mistakes have been answered before.
     from pathlib import Path
 
-    from forewarp.viewer.rendering import Viewer, refuse_other_scene
+    from forewarp.viewer.rendering import Viewer
     from forewarp.viewer.server import serve
 
     renderers = [renderer_of(saved, config) for saved in runs.values()]
@@ -78,6 +79,27 @@ def renderer_of(saved, config):
     run, module = opened(saved)
     name = Path(saved.run).resolve().name
     return SceneRenderer(name, module, run.datamodule, count=config.points, tail=float(config.tail))
+
+
+def refuse_other_scene(scene, other) -> None:
+    """Refuse a second run of another scene: of another name, or other test cameras and times.
+
+    Raises:
+        ValueError: naming ``run2``.
+    """
+    import torch
+
+    if scene.name != other.name:
+        raise ValueError(f"run2: expected a run of {scene.name}, as run= is, but got one of {other.name}")
+    same = len(scene.test) == len(other.test) and all(
+        abs(a.time - b.time) < TOLERANCE
+        and torch.allclose(a.camera.center, b.camera.center, rtol=TOLERANCE, atol=TOLERANCE)
+        for a, b in zip(scene.test, other.test)
+    )
+    if not same:
+        raise ValueError(
+            f"run2: expected a run of the same {scene.name} as run= is, but got one with other test views"
+        )
 
 
 def main() -> None:

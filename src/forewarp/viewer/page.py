@@ -71,7 +71,7 @@ class Page:
         self.about_splats.visible = SPLATS in channels
         for control in (self.trajectories, self.follow, self.follow_none):
             control.visible = can_follow
-        if not can_follow:
+        if not can_follow and self.trajectories.value:
             self.trajectories.value = False
 
     # What the session shows.

@@ -11,6 +11,8 @@ from collections.abc import Callable, Hashable
 from itertools import count
 from typing import NamedTuple
 
+Job = Callable[[], None]
+
 FRAME_SECONDS = 0.1  # that an image may take while the camera moves
 _FIRST_ROWS, _MIN_ROWS = 160, 72  # rows of the first image while moving, and of the smallest
 _CHUNK_SECONDS = 0.3  # that a chunk of a large image may take
@@ -25,7 +27,7 @@ class _Request(NamedTuple):
     priority: int
     number: int
     due: float
-    job: Callable[[], None]
+    job: Job
 
 
 class RenderQueue:
@@ -46,15 +48,7 @@ class RenderQueue:
         self._changed = threading.Condition()
         self.closed = False
 
-    def submit(
-        self,
-        page: Hashable,
-        kind: Hashable,
-        job: Callable[[], None],
-        *,
-        priority: int = 0,
-        delay: float = 0.0,
-    ) -> None:
+    def submit(self, page: Hashable, kind: Hashable, job: Job, priority: int = 0, delay: float = 0.0) -> None:
         """Submit a job; an earlier one of the same page and kind is cancelled, also if it is running.
 
         Args:

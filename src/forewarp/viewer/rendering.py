@@ -16,7 +16,6 @@ from forewarp.drawing.images import depth_colors, flow_colors, in_a_row, with_wh
 from forewarp.evaluation.images import compare, image_flow
 from forewarp.evaluation.trajectories import Trajectories
 from forewarp.methods.method import HasEllipsoids, HasMatter, HasTrajectories, Snapshot
-from forewarp.scene.box import Box
 from forewarp.scene.camera import Camera
 from forewarp.scene.frame import Scene
 from forewarp.scene.paths import focus_point, mean_up
@@ -32,9 +31,9 @@ _PATHS, _POINTS = 4, 64  # sets of followed points that are kept, which pages sh
 _FOLLOWED = {"tail": 1.0, "width": 0.008}  # how the trajectory of a followed point is drawn
 _MIN_FULL_ROWS = 400  # rows of an image at rest, if the training images have fewer
 _GAP = 4  # white pixels between two images
-_TOLERANCE = 1e-3  # by which two runs' test cameras may differ, of their distance to the origin
 
 Point = tuple[float, float, float]
+IsStale = Callable[[], bool]
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,21 +71,18 @@ class ViewState:
 
 
 def camera_of(state: ViewState, width: int, height: int, scene: Scene) -> Camera:
-    """Make the pinhole camera of a page, ``width`` x ``height`` pixels, which sees all of the scene's box."""
-    focal = 0.5 * height / math.tan(0.5 * state.fov)
-    near, far = near_and_far(state.pose[:3, 3], scene.box, [frame.camera for frame in scene.train])
-    return Camera(width, height, focal, focal, 0.5 * width, 0.5 * height, state.pose, near, far)
+    """Make the pinhole camera of a page, ``width`` x ``height`` pixels.
 
-
-def near_and_far(center: Tensor, box: Box, cameras: Sequence[Camera]) -> tuple[float, float]:
-    """Return near and far of a camera at ``center`` (3,): those of the training cameras, and wider where the
-    box begins nearer or ends farther.
+    Its near and far are those of the training cameras, and wider where the box begins nearer or ends farther.
     """
-    low, high = (torch.tensor(corner, dtype=torch.float64) for corner in (box.low, box.high))
+    center, cameras = state.pose[:3, 3], [frame.camera for frame in scene.train]
+    low, high = (torch.tensor(corner, dtype=torch.float64) for corner in (scene.box.low, scene.box.high))
     outside = float(torch.maximum(low - center, center - high).clamp(min=0).norm())
     farthest = float(torch.maximum((center - low).abs(), (center - high).abs()).norm())
-    near = min(*(camera.near for camera in cameras), max(outside, _MIN_NEAR * box.diagonal))
-    return near, max(farthest, *(camera.far for camera in cameras))
+    near = min(*(camera.near for camera in cameras), max(outside, _MIN_NEAR * scene.box.diagonal))
+    far = max(farthest, *(camera.far for camera in cameras))
+    focal = 0.5 * height / math.tan(0.5 * state.fov)
+    return Camera(width, height, focal, focal, 0.5 * width, 0.5 * height, state.pose, near, far)
 
 
 def turning_axis(pose: Tensor, up: Tensor) -> Tensor:
@@ -106,24 +102,17 @@ class SceneRenderer:
         name: what pages call it.
         module: the fitted module.
         datamodule: serves the scene and the training images.
-        count, tail: see ``Trajectories``.
         renewal: seconds after which points of a method in training are chosen anew.
+        tracks: ``count`` and ``tail`` of ``Trajectories``.
     """
 
     def __init__(
-        self,
-        name: str,
-        module: DynamicSceneModule,
-        datamodule,
-        *,
-        count: int = 300,
-        tail: float = 0.5,
-        renewal: float = float("inf"),
+        self, name: str, module: DynamicSceneModule, datamodule, renewal: float = math.inf, **tracks: float
     ) -> None:
         self.name, self.module, self.scene = name, module, datamodule.scene
         self.targets = datamodule.targets("train")
         self.background = self.targets.background
-        self.count, self.tail, self.renewal = count, tail, renewal
+        self.renewal, self.tracks = renewal, tracks
         self._snapshots: list[Snapshot] = []
         self._trajectories: tuple[float, Trajectories] | None = None
         self._canonical = lru_cache(_POINTS)(self.canonical_point)
@@ -172,9 +161,7 @@ class SceneRenderer:
             self.snapshot_at(self._canonical_moment)
 
     @torch.no_grad()
-    def image(
-        self, state: ViewState, camera: Camera, chunks: int = 1, is_stale: Callable[[], bool] = bool
-    ) -> Tensor:
+    def image(self, state: ViewState, camera: Camera, chunks: int = 1, is_stale: IsStale = bool) -> Tensor:
         """Render what a page shows, (H, W, 3) in [0, 1] on the CPU.
 
         Args:
@@ -201,7 +188,7 @@ class SceneRenderer:
             image = trajectories(image, rendering, camera, state.time)
         return image.cpu()
 
-    def _render(self, camera: Camera, moment: Moment, chunks: int, is_stale: Callable) -> Rendering:
+    def _render(self, camera: Camera, moment: Moment, chunks: int, is_stale: IsStale) -> Rendering:
         snapshot, parts = self.snapshot_at(moment), []
         for chunk in range(chunks):
             if is_stale():
@@ -246,7 +233,7 @@ class SceneRenderer:
             now = time.monotonic()
             if self._trajectories is None or now - self._trajectories[0] > self.renewal:
                 cameras = [frame.camera for frame in self.scene.train]
-                chosen = Trajectories(self.module, cameras, count=self.count, tail=self.tail)
+                chosen = Trajectories(self.module, cameras, **self.tracks)
                 self._trajectories = now, chosen
             overlays.append(self._trajectories[1])
         if self.can_follow and state.followed:
@@ -268,7 +255,7 @@ class Viewer:
     """
 
     def __init__(
-        self, scene: Scene, renderers: Sequence[SceneRenderer] = (), *, rows: int | None = None
+        self, scene: Scene, renderers: Sequence[SceneRenderer] = (), rows: int | None = None
     ) -> None:
         self.scene, self.renderers = scene, list(renderers)
         cameras = [frame.camera for frame in scene.train]
@@ -345,22 +332,3 @@ def on_white(image: Tensor, width: int, height: int) -> Tensor:
     top, left = (height - image.shape[0]) // 2, (width - image.shape[1]) // 2
     white[top : top + image.shape[0], left : left + image.shape[1]] = image
     return white
-
-
-def refuse_other_scene(scene: Scene, other: Scene) -> None:
-    """Refuse two runs of different scenes.
-
-    Raises:
-        ValueError: if the names differ, or what the test images were taken with.
-    """
-    if scene.name != other.name:
-        raise ValueError(f"run2: expected a run of {scene.name}, as run= is, but got one of {other.name}")
-    same = len(scene.test) == len(other.test) and all(
-        abs(a.time - b.time) < _TOLERANCE
-        and torch.allclose(a.camera.center, b.camera.center, rtol=_TOLERANCE, atol=_TOLERANCE)
-        for a, b in zip(scene.test, other.test)
-    )
-    if not same:
-        raise ValueError(
-            f"run2: expected a run of the same {scene.name} as run= is, but got one with other test views"
-        )

@@ -25,6 +25,8 @@ from forewarp.viewer.rendering import Viewer, ViewState
 if TYPE_CHECKING:
     from forewarp.viewer.page import Page
 
+Progress = Callable[[int, int], None]
+
 MIN_INTERVAL = 1 / 30  # seconds between two images while time plays
 REST_SECONDS = 0.15  # without a change, after which the camera is at rest
 PLAYBACK_SECONDS = 4.0  # in which the whole time passes at speed 1
@@ -228,7 +230,7 @@ class Session:
         return future.result()
 
     def write_video(
-        self, folder: Path, keys: Sequence[ViewState], seconds: float, progress: Callable[[int, int], None]
+        self, folder: Path, keys: Sequence[ViewState], seconds: float, progress: Progress
     ) -> Path:
         """Write a video through key views into ``folder``, as ``path-<number>.mp4`` that is not there yet.
 
