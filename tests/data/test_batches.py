@@ -9,7 +9,7 @@ import torch
 from forewarp.data.batches import Sampler, Targets, color_of
 from forewarp.data.dnerf import read_scene
 from forewarp.data.files import SceneError
-from forewarp.data.images import MaskedImage, composited
+from forewarp.data.images import StoredImage, composited
 from forewarp.data.module import DNeRFDataModule
 from forewarp.scene.camera import joined
 from forewarp.scene.frame import Frame, Scene
@@ -17,24 +17,25 @@ from forewarp.scene.view import Asks, Moment
 from tests.support.dnerf_scene import real, shots, write_tiny
 
 
-@pytest.fixture
-def scene(tmp_path) -> Scene:
-    write_tiny(tmp_path / "toy")
-    return read_scene(tmp_path, "toy")
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory) -> Scene:
+    root = tmp_path_factory.mktemp("batches")
+    write_tiny(root / "toy")
+    return read_scene(root, "toy")
 
 
 def rays_of(batch):
     """Those of all its pixels, after one another."""
-    return joined([one.view.rays() for one in batch.observations])
+    return joined([observation.view.rays() for observation in batch.observations])
 
 
 def rgb_of(batch):
-    return torch.cat([one.rgb for one in batch.observations])
+    return torch.cat([observation.rgb for observation in batch.observations])
 
 
-def behind(batch):
+def background_of(batch):
     """The background of every pixel."""
-    return torch.cat([one.background.expand(len(one.view), 3) for one in batch.observations])
+    return torch.cat([o.background.expand(len(o.view), 3) for o in batch.observations])
 
 
 def colours(batches, count=3):
@@ -44,25 +45,15 @@ def colours(batches, count=3):
 @pytest.mark.parametrize("background", ["white", "black", "random"])
 def test_every_ray_carries_the_colour_of_its_pixel(scene, background):
     batch = Sampler(scene, rays=50, background=background).draw()
-    frame = scene.train[batch.frame]
-    rays = rays_of(batch)
-    ahead = rays.origins + rays.directions
-    pixel = frame.camera.project(ahead.double())[0].long()
+    frame, rays = scene.train[batch.frame], rays_of(batch)
+    pixel = frame.camera.project((rays.origins + rays.directions).double())[0].long()
     rgba = frame.load()[pixel[:, 1], pixel[:, 0]]
-    torch.testing.assert_close(rgb_of(batch), composited(rgba, behind(batch)))
-    if background != "random":
-        assert torch.equal(behind(batch), torch.full((50, 3), float(background == "white")))
-    assert batch.time == frame.time
-    assert rays.directions.norm(dim=-1).allclose(torch.ones(50))
-    assert len(rays) == len(batch) == 50
-
-
-def test_a_random_background_is_another_for_every_pixel(scene):
-    random = Sampler(scene, rays=500, background="random")
-    first, second = behind(random.draw()), behind(random.draw())
-    assert first.shape == (500, 3)
-    assert len(first.unique(dim=0)) == 500
-    assert not torch.equal(first, second)
+    torch.testing.assert_close(rgb_of(batch), composited(rgba, background_of(batch)))
+    if background == "random":  # another colour for every pixel
+        assert len(background_of(batch).unique(dim=0)) == 50
+    else:
+        assert torch.equal(background_of(batch), torch.full((50, 3), float(background == "white")))
+    assert (batch.time, len(rays), len(batch)) == (frame.time, 50, 50)
 
 
 def test_all_pixels_and_frames_are_drawn(scene):
@@ -74,8 +65,7 @@ def test_all_pixels_and_frames_are_drawn(scene):
 
 
 def test_the_picker_chooses_the_frame(scene):
-    batches = Sampler(scene, rays=9)
-    order = iter([2, 0, 3])
+    batches, order = Sampler(scene, rays=9), iter([2, 0, 3])
     batches.picker = lambda: next(order)
     assert [b.frame for b in islice(batches, 3)] == [2, 0, 3]
     batches.picker = lambda: 4
@@ -87,15 +77,14 @@ BAD = [
     ({"background": "blue"}, "data.background: expected white, black or random, but got 'blue'"),
     ({"rays": 0}, "data.rays: expected at least 1, but got 0"),
     ({"views_per_step": 0}, "data.views_per_step: expected at least 1, but got 0"),
+    ({"rays": None}, "data.rays: expected a number, as the method is trained on single rays, but got null"),
 ]
 
 
 @pytest.mark.parametrize(("options", "match"), BAD)
 def test_bad_settings(scene, options, match):
     with pytest.raises(SceneError, match=match):
-        Sampler(scene, **options)
-    with pytest.raises(SceneError, match="data.rays: expected a number, as the method is trained on single"):
-        Sampler(scene, rays=None).draw()
+        Sampler(scene, **options).draw()
     assert len(Sampler(scene, rays=None, views_per_step=8, asks=Asks("pictures")).draw().observations) == 1
     with pytest.raises(SceneError, match="data.eval_background: expected white or black, but got 'random'"):
         color_of("random")
@@ -120,7 +109,7 @@ def test_targets_are_loaded_when_asked_for(scene):
     assert target.depth.tolist() == [[1, 0, 2]]
     by_depth = Targets([frame], color_of("black"), has_alpha=False)[0].foreground
     assert by_depth.tolist() == [[True, False, True]]
-    assert ([t.frame.name for t in targets], target.moment.frame) == (["a"], None)
+    assert target.moment.frame is None
     assert [t.moment.frame for t in Targets(scene.train, torch.ones(3), True, trained=True)] == [0, 1, 2, 3]
 
 
@@ -133,107 +122,82 @@ def of_times(scene: Scene, *times: float) -> Scene:
     return replace(scene, train=tuple(frames))
 
 
-def frames_of(batch, scene):
-    """Which training frame each ray starts in."""
-    centers = torch.stack([f.camera.center.float() for f in scene.train])
-    return (rays_of(batch).origins[:, None] - centers).norm(dim=-1).argmin(-1)
+def shown(scene, observation):
+    """What an observation should show, of its frame's own image."""
+    whole, rows = scene.train[observation.moment.frame].load().reshape(-1, 4), observation.view.indices
+    return composited(whole if rows is None else whole[rows], observation.background)
 
 
 def test_a_batch_may_have_rays_of_several_frames_of_one_time(scene):
-    scene = of_times(scene, 0.5, 0.0, 0.5, 0.5)
+    scene, seen = of_times(scene, 0.5, 0.0, 0.5, 0.5), set()
     batches = Sampler(scene, rays=50, background="random", views_per_step=2, picker=lambda: 2)
-    seen = set()
     for batch in islice(batches, 20):
-        frames = frames_of(batch, scene)
-        one, other = frames.unique().tolist()
-        assert 2 in (one, other)
-        assert torch.bincount(frames).max() == 25
-        seen |= {one, other}
-        used = [scene.train[i].camera for i in (one, other)]
-        rays = rays_of(batch)
+        frames = [observation.moment.frame for observation in batch.observations]
+        assert frames[0] == 2
+        assert [len(observation.view) for observation in batch.observations] == [25, 25]
+        seen |= set(frames)
+        for observation in batch.observations:
+            torch.testing.assert_close(observation.rgb, shown(scene, observation))
+        cameras, rays = [scene.train[i].camera for i in frames], rays_of(batch)
         assert (batch.time, batch.frame, len(rays)) == (0.5, 2, 50)
-        assert rays.near == min(c.near for c in used)
-        assert rays.far == max(c.far for c in used)
-        for i, rgb, direction, background in zip(frames, rgb_of(batch), rays.directions, behind(batch)):
-            frame = scene.train[i]
-            pixel = frame.camera.project(frame.camera.center + direction.double())[0].long()
-            torch.testing.assert_close(rgb, composited(frame.load()[pixel[1], pixel[0]], background))
+        assert (rays.near, rays.far) == (min(c.near for c in cameras), max(c.far for c in cameras))
     assert seen == {0, 2, 3}
     for rays, count in ((50, 3), (2, 2)):  # more views than there are, or than rays
         batch = Sampler(scene, rays=rays, views_per_step=8, picker=lambda: 2).draw()
-        assert len(frames_of(batch, scene).unique()) == count
-
-
-def shown(scene, one):
-    """What an observation should show, of its frame's own image."""
-    pixels = scene.train[one.moment.frame].load()
-    rows = one.view.indices
-    whole = pixels.reshape(-1, 4)
-    return composited(whole if rows is None else whole[rows], one.background)
+        assert len(batch.observations) == count
 
 
 @pytest.mark.parametrize("background", ["white", "random"])
-def test_crops_are_square_parts_of_a_picture_over_one_colour(scene, background):
-    sampler = Sampler(scene, background=background, asks=Asks("crops", side=3))
-    corners = set()
+def test_crops_are_square_parts_of_an_image_over_one_colour(scene, background):
+    sampler, corners = Sampler(scene, background=background, asks=Asks("crops", side=3)), set()
     for batch in islice(sampler, 400):
-        (one,) = batch.observations
-        top, left, height, width = one.view.crop
-        assert (height, width) == one.view.shape == (3, 3)
-        assert one.background.shape == (3,)
+        (crop,) = batch.observations
+        top, left, height, width = crop.view.crop
+        assert (height, width) == crop.view.shape == (3, 3)
+        assert crop.background.shape == (3,)
         image = scene.train[batch.frame].load()[top : top + 3, left : left + 3].reshape(-1, 4)
-        torch.testing.assert_close(one.rgb, composited(image, one.background))
-        assert one.moment == Moment(scene.train[batch.frame].time, batch.frame, one.moment.camera)
+        torch.testing.assert_close(crop.rgb, composited(image, crop.background))
+        assert crop.moment == Moment(scene.train[batch.frame].time, batch.frame, crop.moment.camera)
         corners.add((top, left))
     assert corners == {(top, left) for top in range(4) for left in range(6)}  # of 6 x 8 pixels
     (whole,) = Sampler(scene, asks=Asks("crops", side=7)).draw().observations
-    assert whole.view.shape == (6, 7)  # never larger than the picture
+    assert whole.view.shape == (6, 7)  # never larger than the image
 
 
 @pytest.mark.parametrize("kind", ["pixels", "crops", "pictures"])
 def test_neighbouring_times_come_after_the_picked_one_nearest_first(scene, kind):
-    scene = of_times(scene, 0.0, 0.25, 0.5, 1.0)
-    sampler = Sampler(scene, rays=10, asks=Asks(kind, side=2, neighbours=2))
-    seen = {}
-    for batch in islice(sampler, 40):
-        times = [one.moment.time for one in batch.observations]
+    scene, seen = of_times(scene, 0.0, 0.25, 0.5, 1.0), {}
+    for batch in islice(Sampler(scene, rays=10, asks=Asks(kind, side=2, neighbours=2)), 40):
+        times = [observation.moment.time for observation in batch.observations]
         assert batch.time == times[0] == scene.train[batch.frame].time
         seen[batch.frame] = times[1:]
-        for one in batch.observations:
-            torch.testing.assert_close(one.rgb, shown(scene, one))
-        assert kind != "pixels" or [len(one.view) for one in batch.observations] == [4, 3, 3]
+        for observation in batch.observations:
+            torch.testing.assert_close(observation.rgb, shown(scene, observation))
+        assert kind != "pixels" or [len(o.view) for o in batch.observations] == [4, 3, 3]
     assert seen == {0: [0.25, 0.5], 1: [0.0, 0.5], 2: [0.25, 0.0], 3: [0.5, 0.25]}
-    moved = batch.to("cpu")
-    assert [one.moment for one in moved.observations] == [one.moment for one in batch.observations]
-    assert (moved.frame, len(moved)) == (batch.frame, len(batch))
 
 
 def test_a_neighbouring_time_is_seen_from_any_of_its_cameras(scene):
     scene = of_times(scene, 0.0, 1.0, 1.0, 1.0)
-    sampler = Sampler(scene, rays=4, picker=lambda: 0, asks=Asks(neighbours=3))
-    batches = list(islice(sampler, 40))
-    assert {len(batch.observations) for batch in batches} == {2}  # there is one other time
+    batches = islice(Sampler(scene, rays=4, picker=lambda: 0, asks=Asks(neighbours=3)), 40)
+    pairs = [[observation.moment.frame for observation in batch.observations] for batch in batches]
+    assert {len(pair) for pair in pairs} == {2}  # there is one other time
+    assert {pair[1] for pair in pairs} == {1, 2, 3}
     few = Sampler(scene, rays=1, picker=lambda: 0, asks=Asks(neighbours=3)).draw()
-    assert [len(one.view) for one in few.observations] == [1]  # none without a pixel
-    assert {batch.observations[1].moment.frame for batch in batches} == {1, 2, 3}
+    assert [len(observation.view) for observation in few.observations] == [1]  # none without a pixel
 
 
-def test_pictures_of_the_instant_are_whole_and_over_white(scene):
+def test_images_of_the_instant_are_whole_and_over_white(scene):
     scene = of_times(scene, 0.5, 0.0, 0.5, 0.5)
-    plain = Sampler(scene, rays=9, background="random", picker=lambda: 2)
-    sampler = Sampler(scene, rays=9, background="random", picker=lambda: 2, asks=Asks(instant=2))
-    batch = sampler.draw()
-    assert torch.equal(rgb_of(batch), rgb_of(plain.draw()))  # they cost no random number
-    assert [one.moment.frame for one in batch.instant] == [2, 0]
-    for one in batch.instant:
-        assert one.view.shape == (6, 8)
-        assert torch.equal(one.background, torch.ones(3))
-        torch.testing.assert_close(one.rgb, shown(scene, one))
-    assert len(batch) == len(batch.to("cpu")) == 9
-    assert len(batch.to("cpu").instant) == 2
-    assert plain.draw().instant == ()
-    alone = Sampler(scene, picker=lambda: 1, asks=Asks(instant=5)).draw()
-    assert [one.moment.frame for one in alone.instant] == [1]
+    options = {"rays": 9, "background": "random", "picker": lambda: 2}
+    plain, batch = Sampler(scene, **options).draw(), Sampler(scene, **options, asks=Asks(instant=2)).draw()
+    assert torch.equal(rgb_of(batch), rgb_of(plain))  # they cost no random number
+    assert [image.moment.frame for image in batch.to("cpu").instant] == [2, 0]
+    for image in batch.instant:
+        assert image.view.shape == (6, 8)
+        assert torch.equal(image.background, torch.ones(3))
+        torch.testing.assert_close(image.rgb, shown(scene, image))
+    assert (len(batch), len(batch.to("cpu")), plain.instant) == (9, 9, ())
 
 
 ASKED = [{}, {"views_per_step": 3}, *({"asks": Asks(kind, 4, 1)} for kind in ("crops", "pictures"))]
@@ -244,9 +208,7 @@ def test_batches_repeat_and_continue_exactly(scene, options):
     scene = of_times(scene, 0.5, 0.5, 0.5, 1.0) if "views_per_step" in options else scene
     options = {"rays": 9, "background": "random", **options}
     sampler = Sampler(scene, **options)
-    first = colours(sampler)
-    state = sampler.state_dict()
-    expected = colours(sampler)
+    first, state, expected = colours(sampler), sampler.state_dict(), colours(sampler)
     assert torch.equal(colours(Sampler(scene, **options)), first)
     other = Sampler(scene, seed=5, **options)
     assert not torch.equal(colours(other), first)
@@ -256,11 +218,9 @@ def test_batches_repeat_and_continue_exactly(scene, options):
 
 @pytest.mark.parametrize("depth", [False, True])
 def test_reduced_truth_is_what_half_resolution_loads(tmp_path, depth):
-    splits = {"test": shots(3, 2, (6, 8), depth=depth)}
-    write_tiny(tmp_path / "toy", **splits)
+    write_tiny(tmp_path / "toy", test=shots(3, 2, (6, 8), depth=depth))
     whole, half = (DNeRFDataModule(tmp_path, "toy", half_resolution=halve) for halve in (False, True))
-    pairs = list(zip(whole.targets("test").reduced(2), half.targets("test"), strict=True))
-    for target, loaded in pairs:
+    for target, loaded in zip(whole.targets("test").reduced(2), half.targets("test"), strict=True):
         assert torch.equal(target.rgb, loaded.rgb)
         assert torch.equal(target.foreground, loaded.foreground)
         assert target.depth is None if not depth else torch.equal(target.depth, loaded.depth)
@@ -275,10 +235,10 @@ def test_the_real_scene_of_800_pixels_reduced_is_that_of_400():
     assert float((whole[7].rgb - published).abs().max()) <= 1 / 255
 
 
-def test_what_cannot_be_reduced(tmp_path):
-    targets = DNeRFDataModule(write_tiny(tmp_path / "toy").parent, "toy").targets("test")
+def test_what_cannot_be_reduced(scene, tmp_path):
+    targets = Targets(scene.test, torch.ones(3), has_alpha=True)
     with pytest.raises(SceneError, match="reduce: expected pictures with sides that 4 divides, but got 8"):
         targets.reduced(4)
-    frame = replace(targets.frames[0], load=MaskedImage(tmp_path, tmp_path, (8, 6)))
+    frame = replace(scene.test[0], load=StoredImage(tmp_path, (8, 6), mask=tmp_path))
     with pytest.raises(SceneError, match="reduce: expected whole pictures, but got test/r_0 cut out"):
-        Targets([frame], targets.background, has_alpha=True).reduced(2)
+        Targets([frame], torch.ones(3), has_alpha=True).reduced(2)

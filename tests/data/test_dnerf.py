@@ -1,13 +1,26 @@
-"""D-NeRF scenes: what is written is read and real scenes are understood."""
+"""D-NeRF and Lego Complete scenes: what is written is read and real scenes are understood."""
 
 import json
 
+import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
 
-from forewarp.data.dnerf import read_scene
-from tests.support.dnerf_scene import ANGLE, REAL_SCENES, edit, real, shots, write_tiny
+from forewarp.data import dnerf
+from forewarp.data.dnerf import read_lego_complete, read_scene
+from tests.support.dnerf_scene import (
+    ANGLE,
+    FEW,
+    REAL_SCENES,
+    edit,
+    real,
+    shots,
+    truth,
+    views,
+    write_kinds,
+    write_tiny,
+)
 
 
 def test_round_trip_of_a_stock_scene(tmp_path):
@@ -28,7 +41,8 @@ def test_round_trip_of_a_stock_scene(tmp_path):
 
 
 def test_a_frame_may_name_its_ability_and_missing_times_are_spread(tmp_path):
-    write_tiny(tmp_path / "toy")
+    write_tiny(tmp_path / "toy", train=shots(4, times=[0.7, 0.2, 0.9, 0.5]))
+    assert read_scene(tmp_path, "toy").canonical_time == 0.2  # the smallest training time
     edit(tmp_path / "toy", "test", lambda c: c["frames"][1].update(ability="time"))
     edit(tmp_path / "toy", "train", lambda c: [f.pop("time") for f in c["frames"]])
     (tmp_path / "toy" / "train" / "transforms.json").write_text("broken")  # stray files are ignored
@@ -38,11 +52,6 @@ def test_a_frame_may_name_its_ability_and_missing_times_are_spread(tmp_path):
     assert scene.times == pytest.approx((0, 1 / 3, 2 / 3, 1))
 
 
-def test_canonical_is_the_smallest_training_time(tmp_path):
-    write_tiny(tmp_path / "toy", train=shots(3, times=[0.7, 0.2, 0.9]))
-    assert read_scene(tmp_path, "toy").canonical_time == 0.2
-
-
 @pytest.mark.parametrize(("value", "expected"), [("auto", (8, 6)), (False, (8, 6)), (True, (4, 3))])
 def test_half_resolution_of_a_small_scene(tmp_path, value, expected):
     write_tiny(tmp_path / "toy", test=shots(2, depth=True))
@@ -50,8 +59,8 @@ def test_half_resolution_of_a_small_scene(tmp_path, value, expected):
     frame, camera = scene.test[0], scene.test[0].camera
     assert (camera.width, camera.height) == (2 * camera.cx, 2 * camera.cy) == expected
     assert camera.fx == pytest.approx(expected[0] / 2 / np.tan(ANGLE / 2))
-    assert tuple(frame.load().shape) == (expected[1], expected[0], 4)
-    assert tuple(frame.load_depth().shape) == (expected[1], expected[0])
+    assert frame.load().shape == (*expected[::-1], 4)
+    assert frame.load_depth().shape == expected[::-1]
     assert scene.protocol["half_resolution"] is (value is True)
 
 
@@ -59,8 +68,7 @@ def test_a_known_point_projects_where_it_was_painted(tmp_path):
     """The formulas of the format, by hand: x right, y up, looking along -z."""
     write_tiny(tmp_path / "toy", size=(60, 80))
     content = json.loads((tmp_path / "toy" / "transforms_train.json").read_text())
-    matrix = np.array(content["frames"][0]["transform_matrix"])
-    point = np.array([0.3, -0.2, 0.5])
+    matrix, point = np.array(content["frames"][0]["transform_matrix"]), np.array([0.3, -0.2, 0.5])
     local = matrix[:3, :3].T @ (point - matrix[:3, 3])
     focal = 40 / np.tan(ANGLE / 2)
     expected = [focal * local[0] / -local[2] + 40, -focal * local[1] / -local[2] + 30]
@@ -81,37 +89,69 @@ def test_real_scenes_read(name):
     assert scene.train[-1].load().shape == (400, 400, 4)
 
 
-def test_real_silhouettes_agree_on_where_the_object_is():
-    """Voxels that project into the silhouettes of an almost still while must fill them again."""
-    frames = [f for f in read_scene(real("dnerf"), "lego").train if f.time < 0.15]
-    axis = torch.linspace(-1.5, 1.5, 72)
-    points = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
-    votes, views = torch.zeros(len(points)), []
-    for frame in frames:
-        mask = frame.load()[..., 3] > 127
-        pixel, depth = frame.camera.project(points)
-        seen = ((pixel >= 0) & (pixel < 400)).all(-1) & (depth > 0)
-        column, row = pixel.long().clamp(0, 399).unbind(-1)
-        votes += (seen & mask[row, column]).float()
-        views.append((mask, row, column))
-    hull = votes >= 0.9 * len(frames)
-    overlaps = []
-    for mask, row, column in views:
-        hit = torch.zeros(400, 400)
-        hit[row[hull], column[hull]] = 1
-        # A voxel is about 6 pixels wide.
-        hit = torch.nn.functional.max_pool2d(hit[None, None], 9, 1, 4)[0, 0] > 0
-        overlaps.append(((hit & mask).sum() / (hit | mask).sum()).item())
-    assert len(overlaps) == 8
-    assert min(overlaps) > 0.8
-    assert sum(overlaps) / 8 > 0.88  # any other signs of the axes stay below 0.83
-
-
 def test_the_released_size_halves_to_the_published_one():
-    full = read_scene(real("dnerf_800"), "hellwarrior")
-    half = read_scene(real("dnerf"), "hellwarrior")
+    full, half = read_scene(real("dnerf_800"), "hellwarrior"), read_scene(real("dnerf"), "hellwarrior")
     assert (full.protocol["half_resolution"], half.protocol["half_resolution"]) == (True, False)
-    pairs = [(*scene.train[::25], *scene.test[::10]) for scene in (full, half)]
+    pairs = [(*scene.train[::50], *scene.test[::10]) for scene in (full, half)]
     for a, b in zip(*pairs, strict=True):
         assert a.camera.fx == pytest.approx(b.camera.fx)
         assert (a.load().int() - b.load().int()).abs().max() <= 1
+
+
+def test_round_trip_of_three_kinds_of_test_view(tmp_path):
+    write_kinds(tmp_path / "lift")
+    scene = read_lego_complete(tmp_path, "lift")
+    assert (len(scene.train), scene.val, scene.canonical_time) == (3, (), 0.0)
+    for frame, shot in zip(scene.test, views(), strict=True):
+        assert (frame.ability, frame.time) == (shot.ability, shot.time)
+        assert np.array_equal(frame.load(), shot.rgba)
+        assert np.array_equal(frame.load_depth(), shot.depth)
+    assert len({frame.name for frame in scene.test}) == 9
+    assert torch.equal(scene.truth.points, truth().points)
+    assert torch.equal(scene.truth.times, truth().times)
+    expected = {"dataset": "lego_complete", "training_times": 3, "test_views": FEW}
+    assert scene.protocol | expected == scene.protocol
+
+
+def test_what_differs_from_the_published_counts_is_said_once(tmp_path, monkeypatch):
+    folder = write_kinds(tmp_path / "lift", train=shots(4, times=[0, 0, 0.5, 1]))
+    edit(folder, "test_space", {"frames.0.time": 0.25})
+    edit(folder, "test_canonical", {"frames.0.time": 0.5})
+    edit(folder, "test_canonical", lambda c: c["frames"][1].pop("depth_file_path"))
+    assert read_lego_complete(tmp_path, "lift").protocol["note"] == (
+        "not the published protocol: 3 training times instead of 50; 4 training images at 3 times; "
+        "4 space views instead of 200; 3 time views instead of 197; 2 canonical views instead of 50; "
+        "1 space views not at a training time; 1 canonical views not at the canonical time; "
+        "1 of 9 test views without a depth"
+    )
+    monkeypatch.setattr(dnerf, "TRAINING_TIMES", 3)
+    monkeypatch.setattr(dnerf, "TEST_VIEWS", FEW)
+    write_kinds(tmp_path / "lift")
+    assert "note" not in read_lego_complete(tmp_path, "lift").protocol
+
+
+@pytest.mark.parametrize("place", ["", "frames.1."])
+def test_depth_may_be_a_png_with_its_scale(tmp_path, place):
+    folder = write_kinds(tmp_path / "lift")
+    steps = np.arange(48, dtype=np.uint16).reshape(6, 8) * 1000
+    iio.imwrite(folder / "d.png", steps)
+    edit(folder, "test_time", {"frames.1.depth_file_path": "d.png", f"{place}depth_scale": 1e-4})
+
+    def depth(**options):
+        frames = read_scene(tmp_path, "lift", **options).test
+        return next(f for f in frames if f.name == "test_time/r_1").load_depth()
+
+    np.testing.assert_allclose(depth(), steps * 1e-4, rtol=1e-6)
+    halved = depth(half_resolution=True)[0, 0]
+    assert halved == pytest.approx((1000 + 8000 + 9000) / 3 * 1e-4)  # of the three met
+
+
+def test_an_ability_may_have_its_file_in_its_folder(tmp_path):
+    folder = write_kinds(tmp_path / "lift")
+    text = (folder / "transforms_test_space.json").read_text()
+    (folder / "transforms_test_space.json").unlink()
+    (folder / "test_space" / "transforms.json").write_text(text.replace("./test_space/", "./"))
+    scene = read_lego_complete(tmp_path, "lift")
+    assert scene.protocol["test_views"] == FEW
+    assert scene.test[0].name == "test_space/r_0"
+    assert scene.test[0].load_depth().shape == (6, 8)

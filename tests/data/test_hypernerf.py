@@ -10,44 +10,54 @@ import torch
 
 from forewarp.data.files import SceneError
 from forewarp.data.hypernerf import read_camera, read_scene, reduced, write_camera
-from forewarp.data.images import write_png
+from forewarp.data.images import write_image
 from tests.support import reference
 from tests.support.dnerf_scene import real
 from tests.support.edits import GONE, edit
 from tests.support.rig_scene import CENTER, FAR, LENS, NEAR, SCALE, hand, phone, rig, truth, write_rig
 
-MIDDLE = torch.tensor(CENTER, dtype=torch.float64)
-
 
 def normalised(points):
-    return (torch.as_tensor(points).double() - MIDDLE) * SCALE
+    return (torch.as_tensor(points).double() - torch.tensor(CENTER, dtype=torch.float64)) * SCALE
 
 
-def by_name(scene):
-    return {frame.name: frame for frame in (*scene.train, *scene.test)}
+def printed_formulas(content, point, ratio):
+    """Where the format says that a point of the unscaled world lies in the image ``ratio`` times as large."""
+    x, y, z = np.array(content["orientation"]) @ (point - np.array(content["position"]))
+    xd, yd = reference.bend(x / z, y / z, content["radial_distortion"], content["tangential_distortion"])
+    u = content["focal_length"] * xd + content["skew"] * yd + content["principal_point"][0]
+    v = content["focal_length"] * content["pixel_aspect_ratio"] * yd + content["principal_point"][1]
+    return (ratio * np.array([u, v])).tolist(), z
 
 
 @pytest.mark.parametrize("scale", [1, 2])
 def test_round_trip_of_a_rig(tmp_path, scale):
-    write_rig(tmp_path / "toy", rig(size=(12, 8), skew=2.0))
-    scene = read_scene(tmp_path, "toy", scale=scale)
-    frames, shots = by_name(scene), list(rig(size=(12, 8), skew=2.0))
-    assert len(frames) == len(shots) == 10
-    for shot in shots:
-        frame, camera = frames[shot.name], frames[shot.name].camera
-        assert frame.time == shot.time_id / 4
-        expected = shot.camera.camera_to_world.clone()
+    points = np.array([[1.0, 2, 3], [2.5, -1, 0.75]], np.float32)
+    folder = write_rig(tmp_path / "toy", rig(size=(12, 8), skew=2.0), points=points, trajectories=truth())
+    scene, point = read_scene(tmp_path, "toy", scale=scale), np.array(CENTER) + [0.4, -0.3, 0.6]
+    frames = {frame.name: frame for frame in (*scene.train, *scene.test)}
+    for shot in rig(size=(12, 8), skew=2.0):
+        frame = frames.pop(shot.name)
+        camera, expected = frame.camera, shot.camera.camera_to_world.clone()
         expected[:3, 3] = normalised(expected[:3, 3])
         torch.testing.assert_close(camera.camera_to_world, expected, atol=1e-6, rtol=0)
         assert (camera.width, camera.height) == (12 // scale, 8 // scale)
         for key in ("fx", "fy", "cx", "cy", "skew"):
             assert getattr(camera, key) == pytest.approx(getattr(shot.camera, key) / scale, rel=1e-12)
-        assert camera.lens == shot.camera.lens
+        assert (frame.time, camera.lens) == (shot.time_id / 4, shot.camera.lens)
         assert (camera.near, camera.far) == (NEAR, FAR)
         blocks = shot.rgb.reshape(8 // scale, scale, 12 // scale, scale, 3).mean((1, 3))
         assert np.array_equal(frame.load()[..., :3], np.rint(blocks))
         assert (frame.load()[..., 3] == 255).all()
-    assert (scene.has_alpha, scene.val, scene.truth, scene.still) == (False, (), None, None)
+        content = json.loads((folder / "camera" / f"{frame.name}.json").read_text())
+        pixel, z = printed_formulas(content, point, 1 / scale)
+        projected, depth = camera.project(normalised(point))
+        assert projected.tolist() == pytest.approx(pixel, abs=1e-9)
+        assert depth.item() == pytest.approx(z * SCALE)
+    assert (frames, scene.has_alpha, scene.val) == ({}, False, ())
+    torch.testing.assert_close(scene.still.double(), normalised(points), atol=1e-6, rtol=0)
+    torch.testing.assert_close(scene.truth.points.double(), normalised(truth().points), atol=1e-6, rtol=0)
+    assert torch.equal(scene.truth.times, truth().times)
 
 
 def test_a_rig_is_split_as_it_says(tmp_path):
@@ -56,9 +66,7 @@ def test_a_rig_is_split_as_it_says(tmp_path):
     scene = read_scene(tmp_path, "toy")
     assert [f.name for f in scene.train] == [s.name for s in shots if s.split == "train"]
     assert [f.name for f in scene.test] == [s.name for s in shots[:-1] if s.split == "val"]
-    assert {f.ability for f in scene.test} == {"all"}
-    assert scene.times == (0.0, 0.25, 0.5, 0.75, 1.0)
-    assert scene.canonical_time == 0.5
+    assert (scene.times, scene.canonical_time) == ((0.0, 0.25, 0.5, 0.75, 1.0), 0.5)
     expected = {"dataset": "hypernerf", "scale": 2, "split": "vrig", "resolution": [6, 4]}
     assert scene.protocol == expected | {"train_frames": 5, "test_frames": 4}
 
@@ -69,8 +77,7 @@ def test_without_val_ids_every_fourth_is_trained_on(tmp_path):
     assert [f.name for f in scene.train] == ["000001", "000005", "000009"]
     assert [f.name for f in scene.test] == ["000003", "000007"]
     assert scene.times == pytest.approx((0.0, 0.4, 0.8))  # of all items the last is at 1
-    assert scene.canonical_time == 0.4
-    assert scene.protocol["split"] == "interpolation"
+    assert (scene.canonical_time, scene.protocol["split"]) == (0.4, "interpolation")
 
 
 def test_time_id_counts_before_warp_id_and_entries_of_no_item_not_at_all(tmp_path):
@@ -91,43 +98,11 @@ def test_no_item_leaves_the_scene(tmp_path):
         read_scene(tmp_path, "toy")
 
 
-def test_points_and_trajectories_are_normalised(tmp_path):
-    points = np.array([[1.0, 2, 3], [2.5, -1, 0.75]], np.float32)
-    write_rig(tmp_path / "toy", points=points, trajectories=truth())
-    scene = read_scene(tmp_path, "toy")
-    assert scene.still.dtype == scene.truth.points.dtype == torch.float32
-    torch.testing.assert_close(scene.still.double(), normalised(points), atol=1e-6, rtol=0)
-    torch.testing.assert_close(scene.truth.points.double(), normalised(truth().points), atol=1e-6, rtol=0)
-    assert torch.equal(scene.truth.times, truth().times)
-
-
-def printed_formulas(content, point, ratio):
-    """Where FORMATS says that a point of the unscaled world lies in the image ``ratio`` times as large."""
-    x, y, z = np.array(content["orientation"]) @ (point - np.array(content["position"]))
-    xd, yd = reference.bend(x / z, y / z, content["radial_distortion"], content["tangential_distortion"])
-    u = content["focal_length"] * xd + content["skew"] * yd + content["principal_point"][0]
-    v = content["focal_length"] * content["pixel_aspect_ratio"] * yd + content["principal_point"][1]
-    return ratio * np.array([u, v]), z
-
-
-@pytest.mark.parametrize("scale", [1, 2])
-def test_a_point_projects_where_the_files_say(tmp_path, scale):
-    folder = write_rig(tmp_path / "toy", rig(size=(480, 320), times=2, skew=7.0))
-    point = np.array(CENTER) + [0.4, -0.3, 0.6]
-    for frame in by_name(read_scene(tmp_path, "toy", scale=scale)).values():
-        content = json.loads((folder / "camera" / f"{frame.name}.json").read_text())
-        expected, z = printed_formulas(content, point, 1 / scale)
-        pixel, depth = frame.camera.project(normalised(point))
-        assert pixel.tolist() == pytest.approx(expected.tolist(), abs=1e-9)
-        assert depth.item() == pytest.approx(z * SCALE)
-
-
 def test_both_spellings_of_the_tangential_distortion(tmp_path):
     path = tmp_path / "camera.json"
     write_camera(path, phone(1, size=(1073, 719)))
     small = reduced(read_camera(path, 1, 2), 4)
     assert (small.width, small.height, small.lens) == (268, 180, LENS)  # rounded
-    assert read_camera(path, 1, 2).lens == LENS
     edit(path, {"tangential": [0.001, 0.002]})
     assert read_camera(path, 1, 2).lens.p == (0.001, 0.002)
     edit(path, dict.fromkeys(["tangential_distortion", "tangential"], GONE))
@@ -136,11 +111,9 @@ def test_both_spellings_of_the_tangential_distortion(tmp_path):
 
 def test_a_genuine_lens_is_undone():
     path = real("hypernerf") / "camera-with-distortion" / "camera.json"
-    content = json.loads(path.read_text())
     camera = read_camera(path, 0.1, 2.0)
-    assert camera.lens.p == tuple(content["tangential"])
+    assert camera.lens.p == tuple(json.loads(path.read_text())["tangential"])
     assert (camera.width, camera.height, camera.skew) == (2448, 3264, 0)
-    assert camera.fy == pytest.approx(camera.fx * 1.0010612377729717)
     pixels = torch.arange(0, 2448 * 3264, 4999)
     rays = camera.rays(pixels, dtype=torch.float64)
     again, depth = camera.project(rays.origins + 1.7 * rays.directions)
@@ -150,31 +123,25 @@ def test_a_genuine_lens_is_undone():
 
 
 def test_a_genuine_capture_by_three_phones_is_understood(tmp_path):
-    source = real("hypernerf") / "paper-windmill-no-images"
-    folder = tmp_path / "windmill"
+    source, folder = real("hypernerf") / "paper-windmill-no-images", tmp_path / "windmill"
     (folder / "rgb" / "2x").mkdir(parents=True)
     for name in ("dataset.json", "metadata.json", "scene.json"):
         shutil.copy(source / name, folder)
     (folder / "camera").symlink_to(source / "camera")
-    ids = json.loads((source / "dataset.json").read_text())["ids"]
-    write_png(tmp_path / "blank.png", np.zeros((480, 360, 3), np.uint8))
-    for item in ids:
+    write_image(tmp_path / "blank.png", np.zeros((480, 360, 3), np.uint8))
+    for item in json.loads((source / "dataset.json").read_text())["ids"]:
         (folder / "rgb" / "2x" / f"{item}.png").symlink_to(tmp_path / "blank.png")
     scene = read_scene(tmp_path, "windmill")
     assert (len(scene.train), len(scene.test), scene.protocol["split"]) == (277, 419, "vrig")
     assert (scene.canonical_time, scene.times[-1]) == (0.5, 1.0)
     assert scene.train[0].camera.near == pytest.approx(0.10891095985144743)
-    assert scene.train[0].camera.lens is None
     for frame in scene.train:  # the phone is carried around what it looks at
         assert frame.camera.center.norm() < 2
-    left, right = {f.name: f for f in scene.train}["0_00000"], {f.name: f for f in scene.test}["1_00000"]
-    assert left.time == right.time == 0
 
 
 def test_a_genuine_hand_held_video_is_understood():
     scene = read_scene(real("hypernerf"), "moving-hand")
     assert (len(scene.train), len(scene.test)) == (22, 21)
-    assert scene.protocol["resolution"] == [256, 192]
     assert scene.train[0].load().shape == (192, 256, 4)
     assert scene.canonical_time == pytest.approx(40 / 85)
     assert scene.train[0].time < scene.test[0].time < scene.train[1].time

@@ -1,4 +1,6 @@
-"""Images: headers, decoding, what is refused, composition, halving, cut-outs."""
+"""Images: headers, decoding, what is refused, composition, halving, cut-outs, what is kept in memory."""
+
+import gc
 
 import imageio.v3 as iio
 import numpy as np
@@ -8,16 +10,15 @@ import torch
 from forewarp.data.files import SceneError
 from forewarp.data.images import (
     CACHE,
-    CachedImage,
-    MaskedImage,
+    ImageCache,
+    StoredImage,
     composited,
     halved_cutout,
     inspect_image,
     read_gray16,
     read_image,
     reduced,
-    write_jpeg,
-    write_png,
+    write_image,
 )
 
 NOISE = np.random.default_rng(0).integers(0, 256, (37, 53, 3), dtype=np.uint8)
@@ -28,23 +29,20 @@ def test_composition_by_hand():
     rgba = torch.tensor([[[255, 0, 51, 255], [255, 0, 51, 0], [255, 0, 51, 51]]], dtype=torch.uint8)
     expected = torch.tensor([[[1, 0, 0.2], [0.5, 0.5, 1], [0.6, 0.4, 0.84]]])
     torch.testing.assert_close(composited(rgba, torch.tensor([0.5, 0.5, 1])), expected)
-    behind = torch.rand(3, 3)  # a colour per ray
-    assert torch.equal(composited(torch.zeros(3, 4, dtype=torch.uint8), behind), behind)
+    colors = torch.rand(3, 3)  # a colour per ray
+    assert torch.equal(composited(torch.zeros(3, 4, dtype=torch.uint8), colors), colors)
 
 
 def test_halving_is_the_rounded_mean_of_straight_values():
-    rgba = torch.randint(0, 256, (6, 10, 4), dtype=torch.uint8)
-    mean = rgba.double().reshape(3, 2, 5, 2, 4).mean((1, 3))
-    assert torch.equal(reduced(rgba), mean.round().to(torch.uint8))  # half to even, as torch rounds
-    mean = rgba[:, :9].double().reshape(2, 3, 3, 3, 4).mean((1, 3))
-    assert torch.equal(reduced(rgba[:, :9], 3), mean.round().to(torch.uint8))
+    rgba = torch.randint(0, 256, (6, 9, 4), dtype=torch.uint8)
+    mean = rgba.double().reshape(2, 3, 3, 3, 4).mean((1, 3))
+    assert torch.equal(reduced(rgba, 3), mean.round().to(torch.uint8))  # half to even, as torch rounds
     block = torch.tensor([[[10, 20, 30, 255], [0] * 4], [[20, 40, 61, 255], [0] * 4]], dtype=torch.uint8)
     assert halved_cutout(block).tolist() == [[[15, 30, 46, 128]]]
     assert halved_cutout(torch.zeros(3, 5, 4, dtype=torch.uint8)).tolist() == [[[0] * 4] * 2]
 
 
-RGBA = np.dstack([NOISE, NOISE[..., 0]])
-GREY = NOISE[..., 0].clip(1)
+RGBA, GREY = np.dstack([NOISE, NOISE[..., 0]]), NOISE[..., 0].clip(1)
 KINDS = [  # what is written, how, and the pixels read
     (NOISE, {}, np.insert(NOISE, 3, 255, -1)),
     (RGBA, {}, RGBA),
@@ -59,6 +57,9 @@ def test_header_and_pixels_of_a_png(tmp_path, pixels, options, expected):
     header = inspect_image(tmp_path / "a.png")
     assert (header.size, header.has_alpha) == ((53, 37), bool((expected[..., 3] < 255).any()))
     assert np.array_equal(read_image(tmp_path / "a.png"), expected)
+    steps = np.arange(48, dtype=np.uint16).reshape(6, 8) * 1000
+    iio.imwrite(tmp_path / "d.png", steps)
+    assert np.array_equal(read_gray16(tmp_path / "d.png"), steps)
 
 
 @pytest.mark.parametrize("options", [{}, {"progressive": True}, {"comment": b"c" * 60000}])
@@ -67,21 +68,10 @@ def test_header_and_pixels_of_a_jpeg(tmp_path, options):
         iio.imwrite(tmp_path / "a.jpg", pixels, plugin="pillow", quality=97, subsampling=0, **options)
         with (tmp_path / "a.jpg").open("ab") as file:
             file.write(bytes(9000))  # what follows the end does no harm
-        header = inspect_image(tmp_path / "a.jpg")
+        header, rgba = inspect_image(tmp_path / "a.jpg"), read_image(tmp_path / "a.jpg").numpy()
         assert (header.size, header.has_alpha) == ((53, 37), False)
-        rgba = read_image(tmp_path / "a.jpg").numpy()
         assert (rgba[..., 3] == 255).all()
         assert np.abs(rgba[..., 0].astype(int) - NOISE[..., 0]).mean() < 4
-
-
-def test_what_is_written_is_read(tmp_path):
-    write_jpeg(tmp_path / "a.jpg", NOISE)
-    assert (read_image(tmp_path / "a.jpg")[..., :3].int() - torch.from_numpy(NOISE)).abs().max() < 30
-    with pytest.raises(ValueError, match="a.jpg: expected uint8 pixels, but got float64"):
-        write_jpeg(tmp_path / "a.jpg", NOISE / 255)
-    steps = np.arange(48, dtype=np.uint16).reshape(6, 8) * 1000
-    iio.imwrite(tmp_path / "d.png", steps)
-    assert np.array_equal(read_gray16(tmp_path / "d.png"), steps)
 
 
 WHOLE = "expected a whole image, but got a truncated or harmed one"
@@ -104,48 +94,37 @@ CASES = [(n, h) for n in ("a.png", "a.jpg") for h in HARM] + [("a.jpg", h) for h
 @pytest.mark.parametrize(("name", "harm"), CASES)
 def test_bad_images_are_refused_in_one_line(tmp_path, name, harm):
     change, match = {**HARM, **HARM_JPEG}[harm]
-    (write_png if name == "a.png" else write_jpeg)(tmp_path / name, NOISE)
-    content = change((tmp_path / name).read_bytes())
-    (tmp_path / name).write_bytes(content)
+    write_image(tmp_path / name, NOISE)
+    (tmp_path / name).write_bytes(change((tmp_path / name).read_bytes()))
     for read in (inspect_image, read_image):
         with pytest.raises(SceneError, match=rf"{name}: .*{match}") as caught:
             read(tmp_path / name)
         assert "\n" not in str(caught.value)
 
 
-def test_other_kinds_of_pixel_and_missing_files_are_refused(tmp_path):
+def test_other_kinds_of_pixel_are_refused(tmp_path):
     iio.imwrite(tmp_path / "a.png", NOISE[..., 0].astype(np.uint16))
-    with pytest.raises(SceneError, match="expected 8 bits a channel, grey or RGB, but got 16 bits; convert"):
-        inspect_image(tmp_path / "a.png")
-    iio.imwrite(tmp_path / "a.jpg", np.concatenate([NOISE, NOISE[..., :1]], -1), plugin="pillow", mode="CMYK")
-    with pytest.raises(SceneError, match="expected 8 bits a channel, grey or RGB, but got CMYK; convert"):
-        inspect_image(tmp_path / "a.jpg")
-    with pytest.raises(SceneError, match=r"b.png: expected an image, but got No such file"):
-        read_image(tmp_path / "b.png")
-
-
-def test_an_image_is_decoded_once(tmp_path):
-    pixels = torch.randint(0, 256, (4, 6, 4), dtype=torch.uint8)
-    write_png(tmp_path / "a.png", pixels)
-    load = CachedImage(tmp_path / "a.png", (6, 4))
-    assert torch.equal(load(), pixels)
-    (tmp_path / "a.png").unlink()
-    assert load() is load()
+    iio.imwrite(tmp_path / "b.jpg", RGBA, plugin="pillow", mode="CMYK")
+    for name, got in (("a.png", "16 bits"), ("b.jpg", "CMYK")):
+        with pytest.raises(SceneError, match=f"8 bits a channel, grey or RGB, but got {got}; convert"):
+            inspect_image(tmp_path / name)
 
 
 @pytest.fixture
-def files(tmp_path):
+def cut_out(tmp_path):
     """A rectangle of rows 8 to 20 and columns 5 to 30 in front of a studio, 40 x 31, and its mask."""
     image = np.broadcast_to(np.array(STUDIO, np.uint8), (31, 40, 3)).copy()
     mask = np.zeros((31, 40), np.uint8)
     image[8:21, 5:31], mask[8:21, 5:31] = SKIN, 255
-    write_jpeg(tmp_path / "image.jpg", image, quality=100)
-    write_jpeg(tmp_path / "mask.jpg", mask)
-    return tmp_path / "image.jpg", tmp_path / "mask.jpg"
+    write_image(tmp_path / "image.jpg", image, quality=100)
+    write_image(tmp_path / "mask.jpg", mask)
+    return lambda **options: StoredImage(
+        tmp_path / "image.jpg", (40, 31), mask=tmp_path / "mask.jpg", **options
+    )
 
 
-def test_the_foreground_is_cut_out_and_only_it_is_kept(files):
-    load, before = MaskedImage(*files, (40, 31)), CACHE.bytes
+def test_the_foreground_is_cut_out_and_only_it_is_kept(cut_out):
+    load, before = cut_out(), CACHE.bytes
     rgba = load()
     assert CACHE.bytes - before == 13 * 26 * 4
     expected = torch.zeros(31, 40, dtype=torch.uint8)
@@ -153,19 +132,60 @@ def test_the_foreground_is_cut_out_and_only_it_is_kept(files):
     assert torch.equal(rgba[..., 3], expected)
     assert (rgba[expected == 0] == 0).all()
     assert (rgba[10:19, 7:29, :3].int() - torch.tensor(SKIN)).abs().max() <= 4
-    files[0].unlink()
+    load.path.unlink()
     assert torch.equal(load(), rgba)
 
 
-def test_halves_cut_off_an_odd_row_and_mix_in_no_studio(files):
-    rgba = MaskedImage(*files, (40, 31), halve=True)()
+def test_halves_cut_off_an_odd_row_and_mix_in_no_studio(cut_out):
+    rgba = cut_out(halve=True)()
     assert rgba.shape == (15, 20, 4)
     assert rgba[4:10, 3:15, 3].eq(255).all()
     assert rgba[4:10, 2, 3].eq(128).all()  # columns 4 and 5, of which one is foreground
-    edge = rgba[5:9, 2, :3].int() - torch.tensor(SKIN)
-    assert edge.abs().max() <= 12
+    assert (rgba[5:9, 2, :3].int() - torch.tensor(SKIN)).abs().max() <= 12
+    write_image(cut_out().mask, np.full((31, 40), 100, np.uint8))
+    assert not cut_out()().any()
 
 
-def test_an_empty_mask_is_an_empty_image(files):
-    write_jpeg(files[1], np.full((31, 40), 100, np.uint8))
-    assert torch.equal(MaskedImage(*files, (40, 31))(), torch.zeros(31, 40, 4, dtype=torch.uint8))
+class Owner:
+    """Somebody that images are made for."""
+
+
+def maker(log, name, size=4):
+    def make():
+        log.append(name)
+        return torch.full((size,), len(log), dtype=torch.uint8)
+
+    return make
+
+
+def test_the_limit_holds_and_the_longest_unused_goes_first():
+    cache, log, owners = ImageCache(10), [], {name: Owner() for name in "abc"}
+    for name in "abacab":
+        made = cache.get(owners[name], maker(log, name))
+        assert cache.get(owners[name], maker(log, name)) is made
+        assert cache.bytes <= 10
+    assert log == ["a", "b", "c", "b"]  # c took the place of b, which was not asked for since
+    large = Owner()
+    for _ in range(2):  # what is too large is made every time
+        assert len(cache.get(large, maker(log, "large", 11))) == 11
+    assert (log[4:], cache.bytes) == (["large", "large"], 8)
+    cache.resize(5)
+    assert cache.bytes == 4
+    owners.clear()
+    gc.collect()
+    assert cache.bytes == 0  # an owner's end frees its image
+
+
+def test_eviction_changes_no_pixel(tmp_path):
+    images, loads, before = torch.randint(0, 256, (5, 6, 8, 4), dtype=torch.uint8), [], CACHE.limit
+    for i, image in enumerate(images):
+        write_image(tmp_path / f"{i}.png", image)
+        loads.append(StoredImage(tmp_path / f"{i}.png", (8, 6)))
+    try:
+        for limit in (2 * images[0].nbytes, 0):
+            CACHE.resize(limit)
+            for i in (0, 1, 2, 0, 4, 3, 3, 1, 0):
+                assert torch.equal(loads[i](), images[i])
+                assert CACHE.bytes <= limit
+    finally:
+        CACHE.resize(before)

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from forewarp.data.files import SceneError
-from forewarp.data.images import write_png
+from forewarp.data.images import write_image
 from forewarp.data.posed_video import FILE, read_scene, write_scene
 from forewarp.scene.box import Box
 from forewarp.scene.camera import look_at
@@ -249,7 +249,7 @@ def masked(folder):
     mask = np.zeros((20, 30, 3), np.uint8)
     mask[5:12, 8:20] = 255
     for i in range(10):
-        write_png(folder / "masks" / f"m_{i}.png", mask)
+        write_image(folder / "masks" / f"m_{i}.png", mask)
     edit(folder / FILE, {f"frames.{i}.mask_path": f"masks/m_{i}" for i in range(10)})
     return mask[..., 0] > 0
 
@@ -264,7 +264,7 @@ def test_masks_become_alpha(tmp_path):
     assert without.box.diagonal < read_scene(tmp_path, "bare").box.diagonal
     pixels = next(shots(channels=4)).pixels
     for i in range(10):
-        write_png(tmp_path / "toy" / "images" / f"frame_{i + 1}.png", pixels)
+        write_image(tmp_path / "toy" / "images" / f"frame_{i + 1}.png", pixels)
     rgba = read_scene(tmp_path, "toy").train[0].load()
     together = pixels[..., 3:] * mask[..., None]  # masks and alpha count together
     assert np.array_equal(rgba, np.concatenate([pixels[..., :3] * (together > 0), together], -1))
@@ -297,7 +297,7 @@ def test_images_are_written_and_read_with_and_without_their_suffix(tmp_path, suf
 def test_smaller_images_beside_the_others(tmp_path):
     write_tiny(tmp_path / "toy")
     for shot in shots():
-        write_png(tmp_path / "toy" / "images_4" / shot.name, shot.pixels[::4, ::4][:, :7])
+        write_image(tmp_path / "toy" / "images_4" / shot.name, shot.pixels[::4, ::4][:, :7])
     scene = read_scene(tmp_path, "toy", scale=4)
     camera, full = scene.train[0].camera, read_scene(tmp_path, "toy").train[0].camera
     assert (camera.width, camera.height) == (7, 5)  # of 7.5

@@ -19,8 +19,7 @@ import numpy as np
 import torch
 from torch.nn.functional import adaptive_max_pool2d, interpolate
 
-from forewarp.data.cameras import SUFFIXES, in_order
-from forewarp.data.images import common_header, read_image, write_jpeg, write_png
+from forewarp.data.images import SUFFIXES, common_header, in_order, read_image, write_image
 from forewarp.drawing.images import at_most
 from forewarp.files import read_json, write_json
 
@@ -128,7 +127,7 @@ def _from_video(
     with step("taking frames") as progress:
         for index, pixels in zip(chosen, extracted(video, chosen, size, threads)):
             name = f"frame_{index + 1:06d}.jpg"
-            write_jpeg(folder / name, pixels)
+            write_image(folder / name, pixels)
             times[name] = float(stamps[index])
             progress(len(times), len(chosen))
     if len(times) < len(chosen):
@@ -168,7 +167,7 @@ def _from_folder(folder: Path, source: Source, size: int | None, step: Step) -> 
                 pixels = shrunk(pixels, *(max(1, round(n * size / longer)) for n in pixels.shape[:2]))
             is_png = has_alpha or path.suffix.lower() == ".png"
             name = f"picture_{done:06d}{'.png' if is_png else '.jpg'}"
-            (write_png if is_png else write_jpeg)(folder / name, pixels)
+            write_image(folder / name, pixels)
             originals[name] = path.name
             widths.append(edge_width(pixels[..., :3].mean(-1)))
             progress(done, len(paths))
@@ -230,7 +229,7 @@ def _write_masks(folder: Path, masks: Path, done: dict) -> None:
         brightest = max(brightest, int(values.max()))
         # A pixel is kept out as soon as a part of it moves.
         moving = adaptive_max_pool2d((values > _MOVING).float()[None, None], (height, width))[0, 0] > 0
-        write_png(folder / f"{name}.png", (255 * ~moving).byte().numpy())
+        write_image(folder / f"{name}.png", (255 * ~moving).byte().numpy())
     if brightest <= _MOVING:
         raise ValueError(
             f"{masks}: expected masks in which what moves is brighter than {_MOVING} of 255, but got at most "

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from forewarp.capture.frames import Frames, Progress, Source, shrunk
 from forewarp.capture.poses import Reconstruction
-from forewarp.data.images import common_header, read_image, write_jpeg, write_png
+from forewarp.data.images import common_header, read_image, write_image
 from forewarp.data.posed_video import SCALES, PosedShot, write_scene
 from forewarp.drawing.images import draw_discs, sample_lines
 from forewarp.scene.box import Box
@@ -134,7 +134,6 @@ def write(
             for scale in scales:  # the mean of each block; what is left at the ends is left out
                 height, width = (n // scale for n in pixels.shape[:2])
                 small = shrunk(pixels[: height * scale, : width * scale], height, width)
-                write_image = write_png if name.lower().endswith(".png") else write_jpeg
                 write_image(folder / f"images_{scale}" / name, small)
             time = (frames.times[name] - first) / (last - first)
             yield PosedShot(name, found.cameras[name], pixels, time)

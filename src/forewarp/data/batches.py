@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 from torch.utils.data import IterableDataset
 
-from forewarp.data.files import SceneError
-from forewarp.data.images import MaskedImage, composited, reduced
+from forewarp.data.files import mismatch
+from forewarp.data.images import StoredImage, composited, reduced
 from forewarp.ops.grid import reduced_depth
 from forewarp.scene.frame import Frame, Scene
 from forewarp.scene.view import Asks, Batch, Moment, Observation, Target, View
@@ -21,12 +21,12 @@ COLORS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 def color_of(background: str) -> Tensor:
     """Look up the background colour (3,) white or black."""
     if background not in COLORS:
-        raise SceneError(f"data.eval_background: expected white or black, but got {background!r}")
+        raise mismatch("data.eval_background", "white or black", repr(background))
     return torch.tensor(COLORS[background])
 
 
 def pixels_of(frame: Frame) -> Tensor:
-    """Load a frame's picture.
+    """Load a frame's image.
 
     Raises:
         SceneError: unless its reader gives a uint8 tensor (H, W, 4) of the camera's size.
@@ -34,7 +34,7 @@ def pixels_of(frame: Frame) -> Tensor:
     rgba, shape = frame.load(), (frame.camera.height, frame.camera.width, 4)
     if not (isinstance(rgba, Tensor) and rgba.dtype == torch.uint8 and tuple(rgba.shape) == shape):
         got = f"{type(rgba).__name__} {getattr(rgba, 'dtype', '')} {tuple(getattr(rgba, 'shape', ()))}"
-        raise SceneError(f"{frame.name}: expected a picture as a torch.uint8 tensor {shape}, but got {got}")
+        raise mismatch(frame.name, f"a picture as a torch.uint8 tensor {shape}", got)
     return rgba
 
 
@@ -45,7 +45,7 @@ class Sampler(IterableDataset):
     single pixels has ``rays`` of them (None: the method asks for no such batch). If ``views_per_step`` is
     above 1, the rays are divided among up to that many random frames of the picked frame's time, so one
     snapshot serves them all. ``background`` is white, black or random: a colour per pixel, or one for a whole
-    picture or crop, drawn at each step. An image without alpha hides the colour, so a random one penalises
+    image or crop, drawn at each step. An image without alpha hides the colour, so a random one penalises
     transparency in the rendering. A second ``iter`` goes on where the first stopped; ``state_dict`` holds
     what an exact continuation needs.
 
@@ -65,18 +65,17 @@ class Sampler(IterableDataset):
         asks: Asks | None = None,
     ) -> None:
         if rays is not None and int(rays) < 1:
-            raise SceneError(f"data.rays: expected at least 1, but got {rays}")
+            raise mismatch("data.rays", "at least 1", rays)
         if background not in (*COLORS, "random"):
-            raise SceneError(f"data.background: expected white, black or random, but got {background!r}")
+            raise mismatch("data.background", "white, black or random", repr(background))
         if int(views_per_step) < 1:
-            raise SceneError(f"data.views_per_step: expected at least 1, but got {views_per_step}")
+            raise mismatch("data.views_per_step", "at least 1", views_per_step)
         self.frames, self.background, self.picker, self.asks = scene.train, background, picker, asks or Asks()
         self.rays = None if rays is None else int(rays)
         self.views_per_step = min(int(views_per_step), self.rays or 1)
-        self._of_time: dict[float, list[int]] = {}
+        self._of_time: dict[float, list[int]] = {}  # time -> frames
         for index, frame in enumerate(scene.train):
             self._of_time.setdefault(frame.time, []).append(index)
-        self._times = sorted(self._of_time)
         self.seed, self._generator = seed, torch.Generator().manual_seed(seed)
 
     def __iter__(self) -> Iterator[Batch]:
@@ -89,19 +88,23 @@ class Sampler(IterableDataset):
 
     def draw(self) -> Batch:
         """Draw the next batch."""
-        index = self._uniform() if self.picker is None else int(self.picker())
+        index = self._below(len(self.frames)) if self.picker is None else int(self.picker())
         if not 0 <= index < len(self.frames):
             raise ValueError(f"picker: expected a training frame in [0, {len(self.frames)}), but got {index}")
-        frames = [*self._views(index), *self._neighbours(self.frames[index].time)]
-        if self.asks.kind == "pixels" and self.rays is None:
-            raise SceneError(
-                "data.rays: expected a number, as the method is trained on single rays, but got null; set "
-                "preset.rays=2048"
-            )
-        if self.asks.kind == "pixels":
-            frames = frames[: self.rays]  # none without a pixel
-        drawn = self._pixels(frames) if self.asks.kind == "pixels" else self._areas(frames)
-        return Batch(tuple(drawn), index, self._instant(index))
+        time = self.frames[index].time
+        same_time = [i for i in self._of_time[time] if i != index]
+        frames = [index]
+        if self.views_per_step > 1 and same_time:
+            order = torch.randperm(len(same_time), generator=self._generator)
+            frames += [same_time[i] for i in order[: self.views_per_step - 1].tolist()]
+        if self.asks.neighbours:  # a frame of each of the nearest other times, nearest first
+            near = sorted(sorted(self._of_time.keys() - {time}), key=lambda other: abs(other - time))
+            choices = [self._of_time[other] for other in near[: self.asks.neighbours]]
+            frames += [choice[self._below(len(choice))] for choice in choices]
+        observations = self._pixels(frames) if self.asks.kind == "pixels" else self._areas(frames)
+        white, whole = torch.tensor(COLORS["white"]), [index, *same_time][: self.asks.instant]
+        instant = (self._observed(i, View(self.frames[i].camera), white) for i in whole)
+        return Batch(tuple(observations), index, tuple(instant))
 
     def restart(self, number: int) -> None:
         """Start random stream ``number`` from its beginning; the first stream is 0."""
@@ -115,35 +118,21 @@ class Sampler(IterableDataset):
         """Continue where ``state_dict`` was saved."""
         self._generator.set_state(state["generator"].cpu())
 
-    def _views(self, index: int) -> list[int]:
-        """Choose a batch's frames: the picked one; if ``views_per_step`` > 1, also others of its time."""
-        others = [i for i in self._of_time[self.frames[index].time] if i != index]
-        if self.views_per_step == 1 or not others:
-            return [index]
-        order = torch.randperm(len(others), generator=self._generator)
-        return [index, *(others[i] for i in order[: self.views_per_step - 1].tolist())]
-
-    def _neighbours(self, time: float) -> list[int]:
-        """Choose a frame of each of the nearest other times that the method asks for, nearest first."""
-        if not self.asks.neighbours:
-            return []
-        near = sorted((t for t in self._times if t != time), key=lambda other: abs(other - time))
-        chosen = [self._of_time[t] for t in near[: self.asks.neighbours]]
-        return [frames[self._whole(len(frames))] for frames in chosen]
-
     def _pixels(self, frames: list[int]) -> Iterator[Observation]:
         """Draw random pixels, shared out among frames."""
+        if self.rays is None:
+            expected, advice = "a number, as the method is trained on single rays", "set preset.rays=2048"
+            raise mismatch("data.rays", expected, "null", advice)
+        frames = frames[: self.rays]  # none without a pixel
         counts = [self.rays // len(frames) + (i < self.rays % len(frames)) for i in range(len(frames))]
         views = []
         for index, count in zip(frames, counts, strict=True):
             camera = self.frames[index].camera
-            views.append(
-                View(camera, torch.randint(camera.width * camera.height, (count,), generator=self._generator))
-            )
-        behind = self._behind(self.rays).split(counts) if self.background == "random" else None
-        for number, (index, view) in enumerate(zip(frames, views)):
-            background = color_of(self.background) if behind is None else behind[number]
-            yield self._observed(index, view, background)
+            pixels = torch.randint(camera.width * camera.height, (count,), generator=self._generator)
+            views.append(View(camera, pixels))
+        colors = self._colors(self.rays).split(counts) if self.background == "random" else None
+        for i, (index, view) in enumerate(zip(frames, views)):
+            yield self._observed(index, view, color_of(self.background) if colors is None else colors[i])
 
     def _areas(self, frames: list[int]) -> Iterator[Observation]:
         """Draw a crop or the whole of each frame, over one colour."""
@@ -152,18 +141,9 @@ class Sampler(IterableDataset):
             view = View(camera)
             if self.asks.kind == "crops":
                 height, width = min(side, camera.height), min(side, camera.width)
-                top, left = self._whole(camera.height - height + 1), self._whole(camera.width - width + 1)
+                top, left = self._below(camera.height - height + 1), self._below(camera.width - width + 1)
                 view = View(camera, crop=(top, left, height, width))
-            yield self._observed(index, view, self._behind(1)[0])
-
-    def _instant(self, index: int) -> tuple[Observation, ...]:
-        """Take whole pictures of the picked time over white, the picked one first."""
-        if not self.asks.instant:
-            return ()
-        others = [i for i in self._of_time[self.frames[index].time] if i != index]
-        white = COLORS["white"]
-        chosen = [index, *others][: self.asks.instant]
-        return tuple(self._observed(i, View(self.frames[i].camera), torch.tensor(white)) for i in chosen)
+            yield self._observed(index, view, self._colors(1)[0])
 
     def _observed(self, index: int, view: View, background: Tensor) -> Observation:
         frame, rows = self.frames[index], view.indices
@@ -172,68 +152,59 @@ class Sampler(IterableDataset):
         rgb = rgba if self.asks.straight else composited(rgba, background)
         return Observation(Moment(frame.time, index, frame.camera_id), view, rgb, background)
 
-    def _behind(self, count: int) -> Tensor:
+    def _colors(self, count: int) -> Tensor:
         """Choose colours (count, 3) behind pixels."""
         if self.background != "random":
             return color_of(self.background).expand(count, 3)
         return torch.rand(count, 3, generator=self._generator)
 
-    def _whole(self, below: int) -> int:
-        return int(torch.randint(below, (), generator=self._generator))
-
-    def _uniform(self) -> int:
-        return self._whole(len(self.frames))
+    def _below(self, count: int) -> int:
+        return int(torch.randint(count, (), generator=self._generator))
 
 
 class Targets(Sequence[Target]):
     """The frames as whole images over a constant background; decoded at the first use.
 
-    ``by`` above 1 averages blocks of so many pixels a side: see ``reduced``.
+    Args:
+        frames, background, has_alpha: of the scene.
+        trained: ``frames`` are all training frames in order: a target's place is its index.
+        factor: above 1 averages blocks of so many pixels a side: see ``reduced``.
     """
 
     def __init__(
-        self,
-        frames: Sequence[Frame],
-        background: Tensor,
-        has_alpha: bool,
-        *,
-        trained: bool = False,
-        by: int = 1,
+        self, frames: Sequence[Frame], background: Tensor, has_alpha: bool, trained=False, factor: int = 1
     ) -> None:
         self.frames, self.background, self.has_alpha = frames, background, has_alpha
-        self.trained = trained  # ``frames`` are all training frames in order: a target's place is its index
-        self.by = by  # pictures are this many times smaller than their frame's camera
+        self.trained, self.factor = trained, factor
 
-    def reduced(self, by: int) -> Targets:
-        """The same views, true pictures averaged over ``by`` x ``by`` pixels as ``data.half_resolution`` of
-        D-NeRF does; a target's view keeps its camera.
+    def reduced(self, factor: int) -> Targets:
+        """The same views, true images averaged over ``factor`` x ``factor`` pixels as
+        ``data.half_resolution`` of D-NeRF does; a target's view keeps its camera.
 
         Raises:
-            SceneError: where ``by`` does not divide a picture's sides, or a mask cuts a picture out.
+            SceneError: where ``factor`` does not divide an image's sides, or a mask cuts an image out.
         """
         for frame in self.frames:
             width, height = frame.camera.width, frame.camera.height
-            if width % by or height % by:
-                raise SceneError(
-                    f"reduce: expected pictures with sides that {by} divides, but got {width} x {height} "
-                    f"pixels of {frame.name}; set another number, or leave reduce out"
-                )
-            if isinstance(frame.load, MaskedImage):
-                raise SceneError(
-                    f"reduce: expected whole pictures, but got {frame.name} cut out by a mask, whose outline "
-                    "is averaged in another way; use data.half_resolution, or leave reduce out"
-                )
-        return Targets(self.frames, self.background, self.has_alpha, trained=self.trained, by=by)
+            if width % factor or height % factor:
+                expected, got = f"pictures with sides that {factor} divides", f"{width} x {height} pixels"
+                advice = "set another number, or leave reduce out"
+                raise mismatch("reduce", expected, f"{got} of {frame.name}", advice)
+            if isinstance(frame.load, StoredImage) and frame.load.mask is not None:
+                got = f"{frame.name} cut out by a mask, whose outline is averaged in another way"
+                advice = "use data.half_resolution, or leave reduce out"
+                raise mismatch("reduce", "whole pictures", got, advice)
+        return Targets(self.frames, self.background, self.has_alpha, self.trained, factor)
 
     def __len__(self) -> int:
         return len(self.frames)
 
     def __getitem__(self, index: int) -> Target:
         frame = self.frames[index]
-        rgba = pixels_of(frame)
-        depth = frame.load_depth() if frame.load_depth else None
-        if self.by > 1:
-            rgba, depth = reduced(rgba, self.by), None if depth is None else reduced_depth(depth, self.by)
+        rgba, depth = pixels_of(frame), frame.load_depth() if frame.load_depth else None
+        if self.factor > 1:
+            rgba = reduced(rgba, self.factor)
+            depth = None if depth is None else reduced_depth(depth, self.factor)
         foreground = None if depth is None else depth > 0
         if self.has_alpha:
             foreground = rgba[..., 3] > 127  # at least half covered

@@ -4,22 +4,18 @@ from __future__ import annotations
 
 import glob
 import hashlib
-import math
 import operator
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass, field
+from math import inf, isfinite
 from pathlib import Path
 from reprlib import repr as short
 from typing import BinaryIO
 from unicodedata import category
 
 from forewarp.files import MOST_BYTES, check_size, load_json
-
-
-class SceneError(ValueError):
-    """The user's input or files are wrong; the message is one line."""
-
 
 MOST_FRAMES = 1_000_000
 MARKERS = {  # by reader: the file that every scene of its format has
@@ -29,20 +25,25 @@ MARKERS = {  # by reader: the file that every scene of its format has
     "nhr": "CamPose.inf",
     "posed_video": "transforms.json",
 }
+RECORD = "synthesis.json"  # of every synthesised scene, or folder of them
+LOCK = ".lock"  # of every folder of a run
 _UNPRINTABLE = {"Cc", "Cs", "Zl", "Zp"}  # control characters, surrogates, line and paragraph separators
+# What a fingerprint takes: the content of small files, name and size of large ones.
+_READ = {".json", ".inf", ".txt", ".csv"}
+_LISTED = {".png", ".jpg", ".jpeg", ".npy", ".npz", ".ply", ".obj"}
 
 
-@contextmanager
-def refused(path: Path, what: str) -> Iterator[None]:
-    """Turn errors of reading a file into SceneErrors; an OSError is told as ``what`` was expected."""
-    try:
-        yield
-    except OSError as error:
-        raise SceneError(f"{path}: expected {what}, but got {error.strerror or error}") from error
-    except SceneError:
-        raise
-    except ValueError as error:
-        raise SceneError(str(error)) from error
+class SceneError(ValueError):
+    """The user's input or files are wrong; the message is one line."""
+
+
+def mismatch(where: object, expected: str, got: object, advice: str = "") -> SceneError:
+    """Make the error that something is not as expected; ``where`` names file and key.
+
+    >>> mismatch("a.json: time", "a number", "'noon'", "remove it")
+    SceneError("a.json: time: expected a number, but got 'noon'; remove it")
+    """
+    return SceneError(f"{where}: expected {expected}, but got {got}" + (f"; {advice}" if advice else ""))
 
 
 @contextmanager
@@ -50,28 +51,22 @@ def opened(path: Path, most: int = MOST_BYTES, what: str = "a readable file") ->
     """Open a regular file of at most ``most`` bytes.
 
     Raises:
-        SceneError: where it cannot be read, naming ``what`` was expected.
+        SceneError: where it cannot be read, naming ``what`` was expected, and for any ValueError within.
     """
-    with refused(path, what):
+    try:
         check_size(path, most)
         with path.open("rb") as stream:
             yield stream
+    except OSError as error:
+        raise mismatch(path, what, error.strerror or error) from error
+    except ValueError as error:
+        raise error if isinstance(error, SceneError) else SceneError(str(error)) from error
 
 
-def read_bytes(path: Path, most: int = MOST_BYTES, what: str = "a readable file") -> bytes:
+def read_bytes(path: Path, most: int = MOST_BYTES) -> bytes:
     """Read a file; SceneError as ``opened``."""
-    with opened(path, most, what) as stream:
+    with opened(path, most) as stream:
         return stream.read()
-
-
-def frames_of(content: dict, path: Path) -> list:
-    """Check the list ``frames`` of a file, which has from one to a million entries."""
-    frames = content.get("frames")
-    if not isinstance(frames, list) or not frames:
-        raise SceneError(f"{path}: frames: expected a list of at least one frame, but got {short(frames)}")
-    if len(frames) > MOST_FRAMES:
-        raise SceneError(f"{path}: frames: expected at most {MOST_FRAMES} frames, but got {len(frames)}")
-    return frames
 
 
 def read_json(path: Path) -> dict:
@@ -80,24 +75,40 @@ def read_json(path: Path) -> dict:
     Raises:
         SceneError: where the file is missing, too large, does not parse (with the line) or holds no object.
     """
-    with refused(path, "a readable file"):
+    with opened(path):
         return load_json(path)
 
 
-def number(value: object, where: str, low: float = -math.inf, high: float = math.inf) -> float:
+def number(value: object, where: str, low: float = -inf, high: float = inf) -> float:
     """Check a finite number, ``low <= value <= high``; ``where`` names file and key.
 
     >>> number(1, "a.json: time", 0, 1)
     1.0
     """
     try:
-        is_number = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+        is_number = isinstance(value, (int, float)) and not isinstance(value, bool) and isfinite(value)
     except OverflowError:  # an integer beyond every float
         is_number = False
     if not is_number or not low <= value <= high:
-        within = "" if math.isinf(low) and math.isinf(high) else f" in [{low:g}, {high:g}]"
-        raise SceneError(f"{where}: expected a number{within}, but got {short(value)}")
+        within = "" if (low, high) == (-inf, inf) else f" in [{low:g}, {high:g}]"
+        raise mismatch(where, f"a number{within}", short(value))
     return float(value)
+
+
+def whole(value: object, where: str, least: int, multiple: int = 1) -> int:
+    """Check a whole number of at least ``least`` that ``multiple`` divides; ``where`` names the key to set.
+
+    >>> whole(16, "size", 8)
+    16
+    """
+    try:
+        is_good = operator.index(value) >= least and value % multiple == 0 and not isinstance(value, bool)
+    except TypeError:
+        is_good = False
+    if not is_good:
+        kind = "a whole number" if multiple == 1 else f"a multiple of {multiple}"
+        raise mismatch(where, f"{kind} of at least {least}", short(value), f"set {where}")
+    return operator.index(value)
 
 
 def numbers_of(words: list[str], count: int, where: str) -> list[float]:
@@ -109,37 +120,11 @@ def numbers_of(words: list[str], count: int, where: str) -> list[float]:
     try:
         values = [float(word) for word in words]
     except ValueError:
-        values = None
-    if values is None or len(values) != count or not all(map(math.isfinite, values)):
+        values = []
+    if len(values) != count or not all(map(isfinite, values)):
         got = f"{len(words)} values" if values and len(values) != count else repr(" ".join(words))[:60]
-        raise SceneError(f"{where}: expected {count} finite numbers, but got {got}")
+        raise mismatch(where, f"{count} finite numbers", got)
     return values
-
-
-def numbers(
-    content: dict, key: str, count: int, path: Path, low: float = -math.inf, high: float = math.inf
-) -> list[float]:
-    """Check that a file holds ``count`` finite numbers, ``low <= value <= high``, under ``key``."""
-    values = content.get(key)
-    if not isinstance(values, list) or len(values) != count:
-        raise SceneError(f"{path}: {key}: expected {count} numbers, but got {short(values)}")
-    return [number(value, f"{path}: {key}[{i}]", low, high) for i, value in enumerate(values)]
-
-
-def whole(value: object, where: str, least: int, multiple: int = 1) -> int:
-    """Check a whole number of at least ``least`` that ``multiple`` divides; ``where`` names the key to set.
-
-    >>> whole(16, "size", 8)
-    16
-    """
-    try:
-        good = operator.index(value) >= least and value % multiple == 0 and not isinstance(value, bool)
-    except TypeError:
-        good = False
-    if not good:
-        kind = "a whole number" if multiple == 1 else f"a multiple of {multiple}"
-        raise SceneError(f"{where}: expected {kind} of at least {least}, but got {short(value)}; set {where}")
-    return operator.index(value)
 
 
 def inside(folder: Path, name: object, where: str) -> Path:
@@ -148,40 +133,97 @@ def inside(folder: Path, name: object, where: str) -> Path:
     Judged by the text alone, so a folder may link to where its images really are. A backslash, which Windows
     takes for a separator, is refused.
     """
-    if not isinstance(name, str) or not name or any(category(c) in _UNPRINTABLE or c == "\\" for c in name):
-        raise SceneError(f"{where}: expected a path inside the scene folder, but got {short(name)}")
-    normal = os.path.normpath(name)
+    is_text = isinstance(name, str) and not any(category(c) in _UNPRINTABLE or c == "\\" for c in name)
+    normal = os.path.normpath(name) if is_text and name else ".."
     if os.path.isabs(normal) or normal.split(os.sep)[0] in ("..", "."):
-        raise SceneError(f"{where}: expected a path inside the scene folder, but got {name!r}")
+        raise mismatch(where, "a path inside the scene folder", short(name))
     return folder / normal
 
 
-def scene_folder(root: str | Path, scene: str, marker: str) -> Path:
-    """Find the folder ``root/scene``, which must hold the file ``marker``.
+@dataclass(frozen=True)
+class Entry:
+    """Keys of an object in a JSON file, or else those ``common`` to all of its kind in the file.
+
+    ``prefix`` says where in the file the object lies, ``frames[3].`` for example.
+    """
+
+    file: Path
+    own: Mapping
+    prefix: str = ""
+    common: Mapping = field(default_factory=dict)
+
+    def where(self, key: str) -> str:
+        """Name file and key, for errors."""
+        is_shared = key in self.common and key not in self.own
+        return f"{self.file}: {'' if is_shared else self.prefix}{key}"
+
+    def get(self, key: str, default: object = None) -> object:
+        """Return the value of a key, unchecked."""
+        return self.own.get(key, self.common.get(key, default))
+
+    def number(self, key: str, low: float = -inf, high: float = inf, default: object = None) -> float:
+        """Check a number as ``number`` does."""
+        return number(self.get(key, default), self.where(key), low, high)
+
+    def numbers(
+        self, key: str, count: int, low: float = -inf, high: float = inf, default=None
+    ) -> list[float]:
+        """Check a list of ``count`` numbers."""
+        values, where = self.get(key, default), self.where(key)
+        if not isinstance(values, list) or len(values) != count:
+            raise mismatch(where, f"{count} numbers", short(values))
+        return [number(value, f"{where}[{i}]", low, high) for i, value in enumerate(values)]
+
+    def path(self, key: str) -> Path:
+        """Check a path that begins at the file's folder and does not lead out of it."""
+        return inside(self.file.parent, self.get(key), self.where(key))
+
+
+def frames_of(file: Path, content: dict, common: Mapping) -> list[Entry]:
+    """Check the list ``frames`` of a file, which has from one to a million objects.
+
+    Args:
+        file: for errors.
+        content: content of the file.
+        common: what a frame has where it does not say otherwise.
+    """
+    frames, where = content.get("frames"), f"{file}: frames"
+    if not isinstance(frames, list) or not frames:
+        raise mismatch(where, "a list of at least one frame", short(frames))
+    if len(frames) > MOST_FRAMES:
+        raise mismatch(where, f"at most {MOST_FRAMES} frames", len(frames))
+    for i, frame in enumerate(frames):
+        if not isinstance(frame, dict):
+            raise mismatch(f"{where}[{i}]", "an object", short(frame))
+    return [Entry(file, frame, f"frames[{i}].", common) for i, frame in enumerate(frames)]
+
+
+def scene_folder(root: str | Path, scene: str, reader: str) -> Path:
+    """Find the folder ``root/scene``, which must hold the file of the reader's format in ``MARKERS``.
 
     Raises:
         SceneError: where there is none, naming the scenes that there are.
     """
-    root = Path(root)
+    root, marker = Path(root), MARKERS[reader]
     if not root.is_dir():
-        raise SceneError(f"data.root: expected an existing folder, but got {root}; set data.root")
+        raise mismatch("data.root", "an existing folder", root, "set data.root")
     if not scene or not (root / scene / marker).is_file():
         there = ", ".join(sorted(p.name for p in root.iterdir() if (p / marker).is_file())) or "none"
         advice = f"scenes in {root}: {there}"
-        deeper = sorted(root.glob(f"*/{glob.escape(scene)}/{marker}")) if scene else []
-        if deeper:
+        if deeper := sorted(root.glob(f"*/{glob.escape(scene)}/{marker}")) if scene else []:
             advice = f"did you mean data.root={deeper[0].parents[len(Path(scene).parts)]}?"
         if (root / marker).is_file():
             folder = root.resolve()
             advice = f"did you mean data.root={folder.parent} data.scene={folder.name}?"
-        raise SceneError(f"{root / scene}: expected a scene with {marker}, but got none; {advice}")
+        raise mismatch(root / scene, f"a scene with {marker}", "none", advice)
     return root / scene
 
 
-_READ = {".json", ".inf", ".txt", ".csv"}  # small: their content counts
-RECORD = "synthesis.json"  # of every synthesised scene, or folder of them
-LOCK = ".lock"  # of every folder of a run
-_LISTED = {".png", ".jpg", ".jpeg", ".npy", ".npz", ".ply", ".obj"}  # large: name and size count
+def remove(folder: Path, *patterns: str) -> None:
+    """Remove the files of a scene that is to be replaced, in the order of the patterns; others stay."""
+    for pattern in patterns:
+        for stale in folder.glob(pattern):
+            stale.unlink()
 
 
 def fingerprint(folder: Path) -> dict:
@@ -192,21 +234,16 @@ def fingerprint(folder: Path) -> dict:
 
     Cost: reads the text files; about 5 microseconds for every other one.
     """
-    texts, listed = {}, []
+    texts, names, sizes = {}, [], []
     for path in _files(folder):
         name, suffix, size = path.relative_to(folder).as_posix(), path.suffix.lower(), path.stat().st_size
         if suffix in _READ and size <= MOST_BYTES:
             texts[name] = hashlib.sha256(read_bytes(path)).hexdigest()
         elif suffix in _READ | _LISTED:
-            listed.append((name, size))
-    digest = hashlib.sha256(
-        "".join(f"{size} {name}\n" for name, size in listed).encode(errors="surrogatepass")
-    )
-    sizes = [size for _, size in listed]
-    return {
-        "texts": texts,
-        "images": {"count": len(sizes), "bytes": sum(sizes), "sha256": digest.hexdigest()},
-    }
+            names.append(f"{size} {name}\n")
+            sizes.append(size)
+    digest = hashlib.sha256("".join(names).encode(errors="surrogatepass")).hexdigest()
+    return {"texts": texts, "images": {"count": len(sizes), "bytes": sum(sizes), "sha256": digest}}
 
 
 def difference(before: dict, now: dict) -> str | None:
@@ -214,22 +251,21 @@ def difference(before: dict, now: dict) -> str | None:
     old, new = before.get("texts", {}), now["texts"]
     if changed := sorted(name for name in {*old, *new} if old.get(name) != new.get(name)):
         return ", ".join(changed[:3]) + (f" and {len(changed) - 3} more" if len(changed) > 3 else "")
-    old, new = before.get("images", {}), now["images"]
-    if old != new:
-        return "images: {count} files of {bytes} bytes now".format(**new)
+    if before.get("images", {}) != now["images"]:
+        return "images: {count} files of {bytes} bytes now".format(**now["images"])
     return None
 
 
 def _files(folder: Path) -> list[Path]:
-    found, been = [], set()
+    """List the files of a folder and of those below it, in the order of their names."""
+    files, visited = [], set()
     for place, folders, names in os.walk(folder, followlinks=True):
         real = os.path.realpath(place)
-        of_a_run = LOCK in names and Path(place) != folder
-        if real in been or of_a_run:  # links may form a circle
+        if real in visited or (LOCK in names and Path(place) != folder):  # links may form a circle
             folders.clear()
             continue
-        been.add(real)
+        visited.add(real)
         folders[:] = sorted(name for name in folders if not name.startswith("."))
         paths = (Path(place) / name for name in sorted(names) if not name.startswith("."))
-        found += [path for path in paths if path.is_file()]
-    return found
+        files += [path for path in paths if path.is_file()]
+    return files

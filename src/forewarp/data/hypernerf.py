@@ -21,20 +21,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from forewarp.data import files
 from forewarp.data.arrays import read_cloud, read_truth, write_array, write_truth
-from forewarp.data.cameras import MOST_UNITS, box_of, check_lens, frustum_box, pose_of
-from forewarp.data.files import (
-    MARKERS,
-    MOST_FRAMES,
-    SceneError,
-    inside,
-    number,
-    numbers,
-    read_json,
-    scene_folder,
-    whole,
-)
-from forewarp.data.images import CachedImage, inspect_image, write_png
+from forewarp.data.cameras import MOST_UNITS, Normalisation, box_of, check_lens, frustum_box, pose_of
+from forewarp.data.files import Entry, inside, mismatch, number, read_json, remove, scene_folder, whole
+from forewarp.data.images import StoredImage, check_pixels, inspect_image, write_image
 from forewarp.files import write_json
 from forewarp.scene.camera import Camera, Lens
 from forewarp.scene.frame import Frame, Scene, Truth, middle_of
@@ -59,27 +50,6 @@ class RigShot:
     rgb: Tensor | np.ndarray
 
 
-@dataclass(frozen=True)
-class _World:
-    """What ``scene.json`` says; ``near`` and ``far`` are in normalised units."""
-
-    center: Tensor
-    scale: float
-    near: float
-    far: float
-
-    def normalised(self, points: Tensor) -> Tensor:
-        """Normalise points (..., 3) of the unscaled world, float64."""
-        return (points.double() - self.center) * self.scale
-
-    def camera(self, path: Path) -> Camera:
-        """Read a camera file in normalised units."""
-        camera = read_camera(path, self.near, self.far)
-        pose = camera.camera_to_world.clone()
-        pose[:3, 3] = self.normalised(pose[:3, 3])
-        return replace(camera, camera_to_world=pose)
-
-
 def read_scene(root: str | Path, scene: str, *, scale: int = 2, box: Sequence[float] | None = None) -> Scene:
     """Read ``root/scene``; pixels are decoded when a frame is first loaded.
 
@@ -94,25 +64,32 @@ def read_scene(root: str | Path, scene: str, *, scale: int = 2, box: Sequence[fl
     Raises:
         SceneError: for every file or value that is missing or wrong, with file and key.
     """
-    folder = scene_folder(root, scene, MARKERS["hypernerf"])
-    images, world = _image_folder(folder, scale), _read_world(folder / "scene.json")
+    folder = scene_folder(root, scene, "hypernerf")
+    images = folder / "rgb" / f"{whole(scale, 'data.scale', 1)}x"
+    if not images.is_dir():
+        there = sorted((p.name for p in folder.glob("rgb/*x") if p.is_dir()), key=lambda n: (len(n), n))
+        advice = f"set data.scale to one of those there: {', '.join(there) or 'none'}"
+        raise mismatch(images, "a folder of images", "none", advice)
+    world = Entry(folder / "scene.json", read_json(folder / "scene.json"))
+    center, size = world.numbers("center", 3, -MOST_UNITS, MOST_UNITS), world.number("scale", *_SCALES)
+    near, far = (world.number(key, 0, MOST_UNITS) for key in ("near", "far"))
+    if near >= far:
+        raise mismatch(f"{world.file}: near, far", "near < far", f"{near:g} and {far:g}")
+    normalised = Normalisation(center, size, near, far)
     how, ids, train_ids, test_ids = _read_split(folder / "dataset.json")
     times, camera_ids = _read_items(folder / "metadata.json", ids)
 
     def frame(item: str) -> Frame:
         where = f"{folder / 'dataset.json'}: ids"
         path = inside(images, f"{item}.png", where)
-        camera = reduced(world.camera(inside(folder / "camera", f"{item}.json", where)), scale)
+        camera = read_camera(inside(folder / "camera", f"{item}.json", where), near, far)
+        camera = reduced(normalised.camera(camera), scale)
         size = camera.width, camera.height
-        if (found := inspect_image(path).size) != size:
-            raise SceneError(
-                f"{path}: expected {size[0]} x {size[1]} pixels, the camera's image_size / {scale}, but got "
-                f"{found[0]} x {found[1]}"
-            )
-        return Frame(item, times[item], camera, CachedImage(path, size), camera_id=camera_ids[item])
+        inspect_image(path, size, f", the camera's image_size / {scale}")
+        return Frame(item, times[item], camera, StoredImage(path, size), camera_id=camera_ids[item])
 
     train, test = (tuple(map(frame, items)) for items in (train_ids, test_ids))
-    canonical = middle_of(f.time for f in train)
+    canonical, points = middle_of(f.time for f in train), folder / "points.npy"
     protocol = {
         "dataset": "hypernerf",
         "scale": scale,
@@ -124,9 +101,8 @@ def read_scene(root: str | Path, scene: str, *, scale: int = 2, box: Sequence[fl
     bounds = frustum_box(f.camera for f in train) if box is None else box_of(box)
     truth = read_truth(folder / "trajectories.npz", canonical)
     if truth is not None:
-        truth = replace(truth, points=world.normalised(truth.points).float())
-    cloud = folder / "points.npy"
-    still = world.normalised(torch.from_numpy(read_cloud(cloud, 3))).float() if cloud.exists() else None
+        truth = replace(truth, points=normalised.points(truth.points).float())
+    still = normalised.points(read_cloud(points, 3)).float() if points.exists() else None
     return Scene(scene, train, (), test, bounds, canonical, False, truth, protocol, still)
 
 
@@ -155,22 +131,20 @@ def write_scene(
         scales: scales of the images to write; every side is a multiple of all of them.
         trajectories: unscaled world, the canonical time first.
     """
-    folder = Path(folder)
-    _remove(folder)
-    metadata: dict[str, dict[str, int]] = {}
+    folder, metadata = Path(folder), {}
+    remove(folder, "dataset.json", "metadata.json", "scene.json", "points.npy", "trajectories.npz")
+    remove(folder, "camera/*.json", "rgb/*x/*.png")
     parts: dict[str, list[str]] = {"train": [], "val": [], "": []}
     for shot in shots:
         if shot.name in metadata or shot.split not in parts:
             got = f"{shot.name!r} of split {shot.split!r}"
-            raise ValueError(f"shots: expected different names, each of train, val or '', but got {got}")
+            raise mismatch("shots", "different names, each of train, val or ''", got)
         _write_shot(folder, shot, scales)
         parts[shot.split].append(shot.name)
         times = dict.fromkeys(("time_id", "warp_id", "appearance_id"), int(shot.time_id))
         metadata[shot.name] = times | {"camera_id": shot.camera_id}
-    if points is not None:
-        write_array(folder / "points.npy", points)
-    if trajectories is not None:
-        write_truth(folder / "trajectories.npz", trajectories)
+    write_array(folder / "points.npy", points)
+    write_truth(folder / "trajectories.npz", trajectories)
     world = {"scale": float(scale), "center": [float(v) for v in center]}
     world |= {"near": float(near), "far": float(far)}
     dataset = {"count": len(metadata), "num_exemplars": len(parts["train"]), "ids": list(metadata)}
@@ -186,18 +160,25 @@ def read_camera(path: Path, near: float, far: float) -> Camera:
         SceneError: for a key that is missing or has a wrong number of values, for no rotation, and for a lens
             that cannot be undone.
     """
-    content = read_json(path)
-    width, height = numbers(content, "image_size", 2, path, 1, _MOST_PIXELS)
+    entry = Entry(path, read_json(path))
+    width, height = entry.numbers("image_size", 2, 1, _MOST_PIXELS)
     if width % 1 or height % 1:
-        raise SceneError(f"{path}: image_size: expected whole numbers, but got {width:g} x {height:g}")
-    focal = number(content.get("focal_length"), f"{path}: focal_length", 1e-3, _MOST_PIXELS_OFF)
-    aspect = number(content.get("pixel_aspect_ratio", 1.0), f"{path}: pixel_aspect_ratio", *_ASPECTS)
-    skew = number(content.get("skew", 0.0), f"{path}: skew", -_MOST_PIXELS_OFF, _MOST_PIXELS_OFF)
-    cx, cy = numbers(content, "principal_point", 2, path, -_MOST_PIXELS_OFF, _MOST_PIXELS_OFF)
-    pose = torch.from_numpy(_pose(content, path))
-    size = int(width), int(height)
-    camera = Camera(*size, focal, focal * aspect, cx, cy, pose, near, far, skew, _lens(content, path))
-    check_lens(camera, f"{path}: radial_distortion")
+        raise mismatch(entry.where("image_size"), "whole numbers", f"{width:g} x {height:g}")
+    focal = entry.number("focal_length", 1e-3, _MOST_PIXELS_OFF)
+    aspect = entry.number("pixel_aspect_ratio", *_ASPECTS, 1.0)
+    skew = entry.number("skew", -_MOST_PIXELS_OFF, _MOST_PIXELS_OFF, 0.0)
+    cx, cy = entry.numbers("principal_point", 2, -_MOST_PIXELS_OFF, _MOST_PIXELS_OFF)
+    rows, where, matrix = entry.get("orientation"), entry.where("orientation"), np.eye(4)
+    if not isinstance(rows, list) or [len(r) if isinstance(r, list) else 0 for r in rows] != [3, 3, 3]:
+        raise mismatch(where, "3 x 3 numbers", short(rows))
+    matrix[:3, :3] = np.array([[number(v, where) for v in row] for row in rows]).T
+    matrix[:3, 3] = entry.numbers("position", 3)
+    tangential = "tangential" if "tangential" in entry.own else "tangential_distortion"
+    k = tuple(entry.numbers("radial_distortion", 3, -_MOST_BENT, _MOST_BENT, [0.0] * 3))
+    p = tuple(entry.numbers(tangential, 2, -_MOST_BENT, _MOST_BENT, [0.0] * 2))
+    lens, pose = Lens(k, p) if any(k + p) else None, torch.from_numpy(pose_of(matrix, where))
+    camera = Camera(int(width), int(height), focal, focal * aspect, cx, cy, pose, near, far, skew, lens)
+    check_lens(camera, entry.where("radial_distortion"))
     return camera
 
 
@@ -221,32 +202,11 @@ def write_camera(path: Path, camera: Camera) -> None:
 def reduced(camera: Camera, scale: int) -> Camera:
     """Scale a camera to an image whose sides are ``scale`` times smaller; sizes are rounded, all else exact.
 
-    The skew shrinks too. Public loaders leave it as it is, which slants the picture wherever it is not 0.
+    The skew shrinks too. Public loaders leave it as it is, which slants the image wherever it is not 0.
     """
     size = {"width": round(camera.width / scale), "height": round(camera.height / scale)}
     pixels = {key: getattr(camera, key) / scale for key in ("fx", "fy", "cx", "cy", "skew")}
     return replace(camera, **size, **pixels)
-
-
-def _image_folder(folder: Path, scale: int) -> Path:
-    images = folder / "rgb" / f"{whole(scale, 'data.scale', 1)}x"
-    if not images.is_dir():
-        there = sorted((p.name for p in folder.glob("rgb/*x") if p.is_dir()), key=lambda n: (len(n), n))
-        raise SceneError(
-            f"{images}: expected a folder of images, but got none; set data.scale to one of those there: "
-            f"{', '.join(there) or 'none'}"
-        )
-    return images
-
-
-def _read_world(path: Path) -> _World:
-    content = read_json(path)
-    center = numbers(content, "center", 3, path, -MOST_UNITS, MOST_UNITS)
-    scale = number(content.get("scale"), f"{path}: scale", *_SCALES)
-    near, far = (number(content.get(key), f"{path}: {key}", 0, MOST_UNITS) for key in ("near", "far"))
-    if near >= far:
-        raise SceneError(f"{path}: near, far: expected near < far, but got {near:g} and {far:g}")
-    return _World(torch.tensor(center, dtype=torch.float64), scale, near, far)
 
 
 def _read_split(path: Path) -> tuple[str, list[str], list[str], list[str]]:
@@ -259,29 +219,24 @@ def _read_split(path: Path) -> tuple[str, list[str], list[str], list[str]]:
     lists = {key: content.get(key, []) for key in ("ids", "train_ids", "val_ids")}
     for key, ids in lists.items():
         if not isinstance(ids, list) or not all(isinstance(i, str) for i in ids) or len({*ids}) < len(ids):
-            raise SceneError(f"{path}: {key}: expected a list of different names, but got {short(ids)}")
+            raise mismatch(f"{path}: {key}", "a list of different names", short(ids))
     ids, train, val = lists.values()
-    if len(ids) > MOST_FRAMES:
-        raise SceneError(f"{path}: ids: expected at most {MOST_FRAMES} items, but got {len(ids)}")
+    if len(ids) > files.MOST_FRAMES:
+        raise mismatch(f"{path}: ids", f"at most {files.MOST_FRAMES} items", len(ids))
     for key in ("train_ids", "val_ids"):
         if unknown := [i for i in lists[key] if i not in {*ids}]:
-            raise SceneError(
-                f"{path}: {key}: expected items of ids, but got {short(unknown[0])}; list it in ids"
-            )
+            raise mismatch(f"{path}: {key}", "items of ids", short(unknown[0]), "list it in ids")
     if both := {*train} & {*val}:
-        raise SceneError(f"{path}: val_ids: expected none of train_ids, but got {short(min(both))}")
+        raise mismatch(f"{path}: val_ids", "none of train_ids", short(min(both)))
     if val and not train:
-        raise SceneError(f"{path}: train_ids: expected at least one beside val_ids, but got none")
+        raise mismatch(f"{path}: train_ids", "at least one beside val_ids", "none")
     if val:
         return "vrig", ids, train, val
     if len(ids) <= _EVERY:
-        raise SceneError(
-            f"{path}: ids: expected more than {_EVERY} items to test between where val_ids is empty, but got "
-            f"{len(ids)}"
-        )
+        expected = f"more than {_EVERY} items to test between where val_ids is empty"
+        raise mismatch(f"{path}: ids", expected, len(ids))
     chosen = range(0, len(ids), _EVERY)
-    test = [ids[i + _EVERY // 2] for i in chosen[:-1]]
-    return "interpolation", ids, [ids[i] for i in chosen], test
+    return "interpolation", ids, [ids[i] for i in chosen], [ids[i + _EVERY // 2] for i in chosen[:-1]]
 
 
 def _read_items(path: Path, ids: list[str]) -> tuple[dict[str, float], dict[str, int | None]]:
@@ -293,63 +248,29 @@ def _read_items(path: Path, ids: list[str]) -> tuple[dict[str, float], dict[str,
     Raises:
         SceneError: for an item that is missing or has no time, and for a number that is not whole.
     """
-    content, numbered, cameras = read_json(path), {}, {}
-    entries = [content.get(item) for item in ids]
-    key = "time_id" if any(isinstance(e, dict) and "time_id" in e for e in entries) else "warp_id"
-
-    def count(value: object, where: str) -> int:
-        if number(value, where, 0, _MOST_MOMENTS) % 1:
-            raise SceneError(f"{where}: expected a whole number, but got {value:g}")
-        return int(value)
-
-    for item, entry in zip(ids, entries):
-        where = f"{path}: {item!r}"
-        if not isinstance(entry, dict):
-            raise SceneError(f"{where}: expected an object for this item, but got {short(entry)}")
-        numbered[item] = count(entry.get(key), f"{where}.{key}")
-        camera = entry.get("camera_id")
-        cameras[item] = None if camera is None else count(camera, f"{where}.camera_id")
-    last = max(numbered.values()) or 1
-    return {item: value / last for item, value in numbered.items()}, cameras
-
-
-def _pose(content: dict, path: Path) -> np.ndarray:
-    """Camera-to-world (4, 4) float64."""
-    rows = content.get("orientation")
-    fits = isinstance(rows, list) and [len(r) if isinstance(r, list) else 0 for r in rows] == [3, 3, 3]
-    if not fits:
-        raise SceneError(f"{path}: orientation: expected 3 x 3 numbers, but got {short(rows)}")
-    where = f"{path}: orientation"
-    matrix = np.eye(4)
-    matrix[:3, :3] = np.array([[number(v, where) for v in row] for row in rows]).T
-    matrix[:3, 3] = numbers(content, "position", 3, path)
-    return pose_of(matrix, where)
-
-
-def _lens(content: dict, path: Path) -> Lens | None:
-    """Read the lens; return None if it does not distort."""
-    name = "tangential" if "tangential" in content else "tangential_distortion"
-    bent = {"radial_distortion": [0.0] * 3, name: [0.0] * 2} | content
-    radial = numbers(bent, "radial_distortion", 3, path, -_MOST_BENT, _MOST_BENT)
-    tangential = numbers(bent, name, 2, path, -_MOST_BENT, _MOST_BENT)
-    return Lens(tuple(radial), tuple(tangential)) if any(radial + tangential) else None
+    content = read_json(path)
+    for item in ids:
+        if not isinstance(content.get(item), dict):
+            raise mismatch(f"{path}: {item!r}", "an object for this item", short(content.get(item)))
+    entries = {item: Entry(path, content[item], f"{item!r}.") for item in ids}
+    key = "time_id" if any("time_id" in entry.own for entry in entries.values()) else "warp_id"
+    numbers: dict[str, dict] = {key: {}, "camera_id": dict.fromkeys(ids)}
+    for item, entry in entries.items():
+        for name in numbers:
+            if name == "camera_id" and entry.get(name) is None:
+                continue
+            number = entry.number(name, 0, _MOST_MOMENTS)
+            if number % 1:
+                raise mismatch(entry.where(name), "a whole number", f"{number:g}")
+            numbers[name][item] = int(number)
+    last = max(numbers[key].values()) or 1
+    return {item: number / last for item, number in numbers[key].items()}, numbers["camera_id"]
 
 
 def _write_shot(folder: Path, shot: RigShot, scales: Sequence[int]) -> None:
-    rgb, size = np.asarray(shot.rgb), (shot.camera.height, shot.camera.width)
-    if rgb.shape != (*size, 3) or rgb.dtype != np.uint8 or any(n % s for n in size for s in scales):
-        expected = f"uint8 {(*size, 3)} with sides that are multiples of {tuple(scales)}"
-        raise ValueError(f"{shot.name}: expected {expected}, but got {rgb.dtype} {rgb.shape}")
+    height, width = shot.camera.height, shot.camera.width
+    rgb = check_pixels(shot.name, shot.rgb, (height, width, 3))
     for s in scales:
-        means = rgb.reshape(size[0] // s, s, size[1] // s, s, 3).mean((1, 3))
-        write_png(folder / "rgb" / f"{s}x" / f"{shot.name}.png", np.rint(means).astype(np.uint8))
+        means = rgb.reshape(height // s, s, width // s, s, 3).mean((1, 3))
+        write_image(folder / "rgb" / f"{s}x" / f"{shot.name}.png", np.rint(means).astype(np.uint8))
     write_camera(folder / "camera" / f"{shot.name}.json", shot.camera)
-
-
-def _remove(folder: Path) -> None:
-    """Remove the capture that is there, the list of its items first; other files stay."""
-    for name in ("dataset.json", "metadata.json", "scene.json", "points.npy", "trajectories.npz"):
-        (folder / name).unlink(missing_ok=True)
-    for pattern in ("camera/*.json", "rgb/*x/*.png"):
-        for stale in folder.glob(pattern):
-            stale.unlink()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import re
 import warnings
 import weakref
 from collections import OrderedDict
@@ -18,9 +19,15 @@ from PIL import Image, ImageOps, UnidentifiedImageError
 from torch import Tensor
 
 from forewarp.clock import left_out
-from forewarp.data.files import SceneError, opened
+from forewarp.data.files import mismatch, number, opened
 from forewarp.files import MOST_IMAGE, written_whole
 from forewarp.ops.grid import block_means, block_sums
+
+SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
+_FORMATS = ("PNG", "JPEG")
+_MOST_PIXELS = 80_000_000  # Pillow warns a little above
+_JPEG_END, _JPEG_TAIL = b"\xff\xd9", 4096  # some cameras write a little behind the end
+_FOREGROUND = 127  # a mask above it is foreground; masks are lossy, so never quite 0 or 255
 
 
 class ImageCache:
@@ -47,7 +54,7 @@ class ImageCache:
         if key in self._kept:
             self._kept.move_to_end(key)
             return self._kept[key][1]
-        with left_out():  # reading pictures is no training
+        with left_out():  # reading images is no training
             made = make()
         if made.nbytes <= self.limit:
             # Freed as soon as the owner dies; until then no other object can have its id.
@@ -62,9 +69,7 @@ class ImageCache:
         Raises:
             SceneError: for anything but a number >= 0.
         """
-        if isinstance(limit, bool) or not isinstance(limit, (int, float)) or not 0 <= limit < float("inf"):
-            raise SceneError(f"data.cache_bytes: expected a number of bytes >= 0, but got {limit!r}")
-        self.limit = int(limit)
+        self.limit = int(number(limit, "data.cache_bytes", 0))
         self._shrink()
 
     def _shrink(self) -> None:
@@ -72,17 +77,10 @@ class ImageCache:
             self._drop(next(iter(self._kept)))
 
     def _drop(self, key: int) -> None:
-        _, gone = self._kept.pop(key)
-        self.bytes -= gone.nbytes
+        self.bytes -= self._kept.pop(key)[1].nbytes
 
 
 CACHE = ImageCache(1_500_000_000)
-
-
-_FORMATS = ("PNG", "JPEG")
-_MOST_PIXELS = 80_000_000  # Pillow warns a little above
-_JPEG_END, _JPEG_TAIL = b"\xff\xd9", 4096  # some cameras write a little behind the end
-_FOREGROUND = 127  # a mask above it is foreground; masks are lossy, so never quite 0 or 255
 
 
 @dataclass(frozen=True)
@@ -93,16 +91,24 @@ class Header:
     has_alpha: bool
 
 
-def inspect_image(path: Path) -> Header:
+def inspect_image(path: Path, size: tuple[int, int] | None = None, why: str = "") -> Header:
     """Check that a PNG or JPEG is whole and of a kind that is read; decode nothing.
 
+    Args:
+        path: of the image.
+        size: (width, height) that it must have; None: any.
+        why: what the error says of that size.
+
     Raises:
-        SceneError: where the file is missing, empty, truncated, harmed, too large or of another kind.
+        SceneError: where the file is missing, empty, truncated, harmed, too large or of another kind or size.
 
     Cost: one read of a PNG, whose checksums are compared; two small reads of a JPEG, which has none.
     """
     with opened(path, MOST_IMAGE, "an image") as stream:
-        return _inspect(stream, path)
+        header = _inspect(stream, path)
+    if size not in (None, header.size):
+        raise mismatch(path, f"{by(size)} pixels{why}", by(header.size))
+    return header
 
 
 def common_header(paths: Iterable[Path]) -> Header:
@@ -111,33 +117,28 @@ def common_header(paths: Iterable[Path]) -> Header:
     Raises:
         SceneError: as ``inspect_image``, and where one differs in size from the first.
     """
-    headers = {path: inspect_image(path) for path in paths}
-    size = next(iter(headers.values())).size
-    for path, header in headers.items():
-        if header.size != size:
-            raise SceneError(f"{path}: expected {_by(size)} pixels as the first, but got {_by(header.size)}")
-    return Header(size, all(h.has_alpha for h in headers.values()))
+    size, have_alpha = None, True
+    for path in paths:
+        header = inspect_image(path, size, " as the first")
+        size, have_alpha = header.size, have_alpha and header.has_alpha
+    return Header(size, have_alpha)
 
 
-def read_image(path: Path, *, upright: bool = False) -> Tensor:
+def read_image(path: Path, size: tuple[int, int] | None = None, *, upright: bool = False) -> Tensor:
     """Decode a PNG or JPEG: uint8 (H, W, 4), straight alpha; without an alpha channel it is 255.
 
     Args:
         path: of the image.
+        size: (width, height) that it must have; None: any.
         upright: turn it as its EXIF orientation says; else it is as stored.
 
     Raises:
         SceneError: as ``inspect_image``, and where the pixels cannot be decoded.
     """
-    return torch.from_numpy(_decode(path, "RGBA", upright))
-
-
-def read_sized(path: Path, size: tuple[int, int]) -> Tensor:
-    """``read_image`` of a file that must hold ``size`` (width, height); SceneError where it does not."""
-    pixels = read_image(path)
-    if (got := (pixels.shape[1], pixels.shape[0])) != size:
-        raise SceneError(f"{path}: expected {_by(size)} pixels, but got {_by(got)}")
-    return pixels
+    pixels = _decode(path, "RGBA", upright)
+    if size not in (None, pixels.shape[1::-1]):
+        raise mismatch(path, f"{by(size)} pixels", by(pixels.shape[1::-1]))
+    return torch.from_numpy(pixels)
 
 
 def read_gray16(path: Path) -> np.ndarray:
@@ -149,23 +150,28 @@ def read_gray16(path: Path) -> np.ndarray:
     return _decode(path, "I;16").astype(np.uint16)
 
 
-def write_png(path: Path, pixels: Tensor | np.ndarray) -> None:
-    """Write uint8 (H, W, 4) or (H, W, 3) as a PNG with or without alpha, whole or not at all."""
+def check_pixels(where: object, pixels: Tensor | np.ndarray, *shapes: tuple[int, ...]) -> np.ndarray:
+    """Refuse pixels to write that are not uint8 of one of these shapes."""
+    pixels = np.asarray(pixels)
+    if pixels.dtype != np.uint8 or pixels.shape not in shapes:
+        expected = f"uint8 pixels of shape {' or '.join(map(str, shapes))}"
+        raise mismatch(where, expected, f"{pixels.dtype} of {pixels.shape}")
+    return pixels
+
+
+def write_image(path: Path, pixels: Tensor | np.ndarray, quality: int = 97) -> None:
+    """Write uint8 pixels, whole or not at all: (H, W, 4) or (H, W, 3) as .png, (H, W, 3) or (H, W) as .jpg.
+
+    A JPEG has full colour resolution; ``quality`` is its.
+    """
+    is_png = path.suffix.lower() == ".png"
+    options = {"format": "PNG"} if is_png else {"format": "JPEG", "quality": quality, "subsampling": 0}
     with written_whole(path) as beside:
-        Image.fromarray(np.ascontiguousarray(pixels)).save(beside, "PNG")
+        Image.fromarray(np.ascontiguousarray(pixels)).save(beside, **options)
 
 
-def write_jpeg(path: Path, pixels: Tensor | np.ndarray, quality: int = 97) -> None:
-    """Write uint8 (H, W, 3) or (H, W) as a JPEG of full colour resolution, whole or not at all."""
-    pixels = np.ascontiguousarray(pixels)
-    if pixels.dtype != np.uint8:
-        raise ValueError(f"{path}: expected uint8 pixels, but got {pixels.dtype}")
-    with written_whole(path) as beside:
-        Image.fromarray(pixels).save(beside, "JPEG", quality=quality, subsampling=0)
-
-
-def reduced(rgba: Tensor, by: int = 2) -> Tensor:
-    """Average each block of ``by`` x ``by`` pixels of *straight* RGBA, uint8 (H, W, 4) -> (H/by, W/by, 4).
+def reduced(rgba: Tensor, factor: int = 2) -> Tensor:
+    """Average blocks of ``factor`` x ``factor`` pixels of *straight* RGBA: uint8 (H, W, 4) to (H/f, W/f, 4).
 
     Averaging before the alpha is applied darkens silhouettes a little; the published numbers do so. Rounded
     half to even: exactly what the released half-size copies hold.
@@ -173,7 +179,7 @@ def reduced(rgba: Tensor, by: int = 2) -> Tensor:
     >>> reduced(torch.tensor([[[1], [2]], [[3], [5]]], dtype=torch.uint8)).item()
     3
     """
-    return block_means(rgba, by).round().to(torch.uint8)
+    return block_means(rgba, factor).round().to(torch.uint8)
 
 
 def halved_cutout(rgba: Tensor) -> Tensor:
@@ -189,8 +195,7 @@ def halved_cutout(rgba: Tensor) -> Tensor:
     """
     height, width = (n // 2 * 2 for n in rgba.shape[:2])
     rgba = rgba[:height, :width]
-    sums = block_sums(rgba[..., :3])
-    count = block_sums(rgba[..., 3] > 0)[..., None].clamp(min=1)
+    sums, count = block_sums(rgba[..., :3]), block_sums(rgba[..., 3] > 0)[..., None].clamp(min=1)
     color = torch.div(sums + count // 2, count, rounding_mode="floor").to(torch.uint8)
     return torch.cat([color, reduced(rgba[..., 3:])], -1)
 
@@ -201,43 +206,31 @@ def composited(rgba: Tensor, background: Tensor) -> Tensor:
     return torch.lerp(background.expand_as(straight[..., :3]), straight[..., :3], straight[..., 3:])
 
 
-class CachedImage:
+class StoredImage:
     """An image decoded at its first use and kept while there is room, uint8 (H, W, 4); it is read-only.
 
-    ``size`` (width, height) is what the file must hold; with ``halve`` half of that is given.
-    """
-
-    def __init__(self, path: Path, size: tuple[int, int], halve: bool = False) -> None:
-        self.path, self.size, self.halve = path, size, halve
-
-    def __call__(self) -> Tensor:
-        """Give the pixels; SceneError where the file cannot be decoded or has another size."""
-        return CACHE.get(self, self._decode)
-
-    def _decode(self) -> Tensor:
-        pixels = read_sized(self.path, self.size)
-        return reduced(pixels) if self.halve else pixels
-
-
-class MaskedImage:
-    """An image cut out by a mask in another file, decoded when asked for: uint8 (H, W, 4), 0 where alpha is.
-
-    Where the image has an alpha of its own, it counts inside the mask. Only the smallest rectangle that holds
-    the foreground is kept, a fraction of most images.
+    A ``mask`` in another file cuts it out: where the image has an alpha of its own, it counts inside the
+    mask; colour is 0 where alpha is. Only the smallest rectangle that holds the foreground is kept then, a
+    fraction of most images.
 
     Args:
-        image, mask: files of one size; a mask's first channel counts, above 127 is foreground.
-        size: (width, height), what both must hold.
-        halve: average 2 x 2 pixels; an odd last row or column is cut off.
+        path: of the image.
+        size: (width, height), what the files must hold.
+        halve: average 2 x 2 pixels; of a cut-out an odd last row or column is cut off.
+        mask: of the same size; its first channel counts, above 127 is foreground.
     """
 
-    def __init__(self, image: Path, mask: Path, size: tuple[int, int], halve: bool = False) -> None:
-        self.image, self.mask, self.size, self.halve = image, mask, size, halve
+    def __init__(
+        self, path: Path, size: tuple[int, int], halve: bool = False, mask: Path | None = None
+    ) -> None:
+        self.path, self.size, self.halve, self.mask = path, size, halve, mask
         self._corner = (0, 0)
 
     def __call__(self) -> Tensor:
         """Give the pixels; SceneError where a file cannot be decoded or has another size."""
         part = CACHE.get(self, self._decode)
+        if self.mask is None:
+            return part
         (row, column), (rows, columns) = self._corner, part.shape[:2]
         width, height = (n // 2 if self.halve else n for n in self.size)
         whole = torch.zeros(height, width, 4, dtype=torch.uint8)
@@ -245,23 +238,22 @@ class MaskedImage:
         return whole
 
     def _decode(self) -> Tensor:
-        """Cut out the foreground's rectangle and note where it lies."""
-        rgba = read_sized(self.image, self.size)
-        on = (read_sized(self.mask, self.size)[..., 0] > _FOREGROUND) & (rgba[..., 3] > 0)
-        rgba *= on[..., None]
-        if self.halve:
-            rgba = halved_cutout(rgba)
+        """Decode the image, or cut out the foreground's rectangle and note where it lies."""
+        rgba = read_image(self.path, self.size)
+        if self.mask is None:
+            return reduced(rgba) if self.halve else rgba
+        rgba *= ((read_image(self.mask, self.size)[..., 0] > _FOREGROUND) & (rgba[..., 3] > 0))[..., None]
+        rgba = halved_cutout(rgba) if self.halve else rgba
         foreground = rgba[..., 3] > 0
         if not bool(foreground.any()):
             return rgba[:0, :0].clone()
         rows, columns = (foreground.any(axis).nonzero()[:, 0] for axis in (1, 0))
         self._corner = (int(rows[0]), int(columns[0]))
-        part = rgba[self._corner[0] : int(rows[-1]) + 1, self._corner[1] : int(columns[-1]) + 1]
-        return part.clone()
+        return rgba[self._corner[0] : int(rows[-1]) + 1, self._corner[1] : int(columns[-1]) + 1].clone()
 
 
 def _decode(path: Path, mode: str, upright: bool = False) -> np.ndarray:
-    """Decode the first picture of a file in one of Pillow's modes, turned upright if wanted."""
+    """Decode the first image of a file in one of Pillow's modes, turned upright if wanted."""
     with opened(path, MOST_IMAGE, "an image") as stream:
         content = io.BytesIO(stream.read())
     _inspect(content, path, mode)
@@ -271,53 +263,42 @@ def _decode(path: Path, mode: str, upright: bool = False) -> np.ndarray:
         turn = ImageOps.exif_transpose if upright else (lambda image: image)
         return np.array(turn(Image.open(content, formats=_FORMATS)).convert(mode))
     except Exception as error:  # decoders raise OSError, SyntaxError, struct.error and more
-        raise SceneError(
-            f"{path}: expected an image, but got data that cannot be decoded ({error})"
-        ) from error
+        raise mismatch(path, "an image", f"data that cannot be decoded ({error})") from error
 
 
 def _inspect(stream: BinaryIO, path: Path, mode: str = "RGBA") -> Header:
     """Check an open image, which is to be read in one of Pillow's modes."""
-    image = _identified(stream, path)
-    if not 0 < image.width * image.height <= _MOST_PIXELS:
-        raise SceneError(
-            f"{path}: expected an image of 1 to {_MOST_PIXELS} pixels, but got {_by(image.size)}"
-        )
-    has_16_bits = ";16" in str(image.tile[0][3])  # the mode alone hides it
-    if mode == "I;16" and not (has_16_bits and image.mode.startswith("I")):
-        raise SceneError(f"{path}: expected a grey PNG of 16 bits a pixel, but got mode {image.mode}")
-    if mode == "RGBA" and (has_16_bits or image.mode == "CMYK"):
-        got = "16 bits" if has_16_bits else "CMYK"
-        raise SceneError(f"{path}: expected 8 bits a channel, grey or RGB, but got {got}; convert the image")
-    header = Header(image.size, image.has_transparency_data)
-    try:
-        whole = image.verify() is None if image.format == "PNG" else _has_jpeg_end(stream)
-    except Exception:  # OSError, SyntaxError and more
-        whole = False
-    if not whole:
-        raise SceneError(
-            f"{path}: expected a whole image, but got a truncated or harmed one; copy the file again"
-        )
-    return header
-
-
-def _identified(stream: BinaryIO, path: Path) -> Image.Image:
-    """Read an image's header."""
+    few_pixels = f"an image of 1 to {_MOST_PIXELS} pixels"
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", Image.DecompressionBombWarning)
             image = Image.open(stream, formats=_FORMATS)
         if not image.tile:
             raise UnidentifiedImageError
-        return image
     except (Image.DecompressionBombWarning, Image.DecompressionBombError) as error:
-        raise SceneError(f"{path}: expected an image of 1 to {_MOST_PIXELS} pixels, but got more") from error
+        raise mismatch(path, few_pixels, "more") from error
     except Exception as error:  # OSError, ValueError and more
         got = str(error)
         if isinstance(error, UnidentifiedImageError):
-            empty = not stream.seek(0, os.SEEK_END)
-            got = "an empty file" if empty else "another kind of file or a harmed header"
-        raise SceneError(f"{path}: expected a PNG or JPEG image, but got {got}") from error
+            is_empty = not stream.seek(0, os.SEEK_END)
+            got = "an empty file" if is_empty else "another kind of file or a harmed header"
+        raise mismatch(path, "a PNG or JPEG image", got) from error
+    if not 0 < image.width * image.height <= _MOST_PIXELS:
+        raise mismatch(path, few_pixels, by(image.size))
+    has_16_bits = ";16" in str(image.tile[0][3])  # the mode alone hides it
+    if mode == "I;16" and not (has_16_bits and image.mode.startswith("I")):
+        raise mismatch(path, "a grey PNG of 16 bits a pixel", f"mode {image.mode}")
+    if mode == "RGBA" and (has_16_bits or image.mode == "CMYK"):
+        got = "16 bits" if has_16_bits else "CMYK"
+        raise mismatch(path, "8 bits a channel, grey or RGB", got, "convert the image")
+    header = Header(image.size, image.has_transparency_data)
+    try:
+        is_whole = image.verify() is None if image.format == "PNG" else _has_jpeg_end(stream)
+    except Exception:  # OSError, SyntaxError and more
+        is_whole = False
+    if not is_whole:
+        raise mismatch(path, "a whole image", "a truncated or harmed one", "copy the file again")
+    return header
 
 
 def _has_jpeg_end(stream: BinaryIO) -> bool:
@@ -330,5 +311,23 @@ def _has_jpeg_end(stream: BinaryIO) -> bool:
     return False
 
 
-def _by(size: tuple[int, int]) -> str:
-    return f"{size[0]} x {size[1]}"
+def by(size: Iterable[int]) -> str:
+    """Write a size (width, height) in words.
+
+    >>> by((640, 480))
+    '640 x 480'
+    """
+    return " x ".join(map(str, size))
+
+
+def in_order(things: Iterable, name: Callable[..., str] = str) -> list:
+    """Sort things by their names, numbers within them by value.
+
+    >>> in_order(["b2", "b10", "a"])
+    ['a', 'b2', 'b10']
+    """
+
+    def parts(thing) -> list:
+        return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name(thing))]
+
+    return sorted(things, key=parts)

@@ -14,14 +14,15 @@ from torch import Tensor
 
 from forewarp.data import dnerf, hypernerf, nhr, posed_video
 from forewarp.data.batches import Sampler, Targets, color_of
-from forewarp.data.files import RECORD, SceneError, fingerprint, whole
+from forewarp.data.files import RECORD, fingerprint, mismatch, whole
 from forewarp.data.images import CACHE
 from forewarp.scene.frame import Scene, Truth, middle_of, spread
-from forewarp.scene.view import Asks, Target
+from forewarp.scene.view import Target
 
+WATCHED = 8  # validation views at most that a run's PSNR curve measures where no views are held out
 _SAME_TIME = 1e-6
 _WINDOW = 0.08  # share of the sequence on either side of a time whose silhouettes are looked at
-_SIDE = 100  # pixels of a picture's shorter side that are enough to tell how spread out it is
+_SIDE = 100  # pixels of an image's shorter side that are enough to tell how spread out it is
 _FAR = 0.2  # share by which an end of the sequence counts less than its middle
 
 
@@ -41,12 +42,10 @@ def hold_out(scene: Scene, count: int) -> Scene:
     """
     if whole(count, "data.held_out", 0) == 0:
         return scene
-    frames = _spare(scene)
-    if count > len(frames) // 2:
-        raise SceneError(
-            f"data.held_out: expected at most {len(frames) // 2} of the {len(scene.train)} training frames "
-            f"of {scene.name}, but got {count}; set data.held_out={len(frames) // 2}"
-        )
+    most, frames = most_held_out(scene), _spare(scene)
+    if count > most:
+        expected = f"at most {most} of the {len(scene.train)} training frames of {scene.name}"
+        raise mismatch("data.held_out", expected, count, f"set data.held_out={most}")
     chosen = {frames[(2 * i + 1) * len(frames) // (2 * count)][1] for i in range(count)}
     return replace(
         scene,
@@ -61,6 +60,12 @@ def most_held_out(scene: Scene) -> int:
     return len(_spare(scene)) // 2
 
 
+def _spare(scene: Scene) -> list[tuple[float, int]]:
+    """List (time, index) of the frames that may be held out: not those at first, last and canonical time."""
+    kept = {scene.times[0], scene.times[-1], scene.canonical_time} if len(scene.times) > 1 else set()
+    return sorted((f.time, i) for i, f in enumerate(scene.train) if f.time not in kept)
+
+
 def with_canonical(scene: Scene, canonical: str | float | None) -> Scene:
     """Make another training time canonical.
 
@@ -70,7 +75,7 @@ def with_canonical(scene: Scene, canonical: str | float | None) -> Scene:
     Args:
         scene: as read.
         canonical: ``middle``, the time nearest to the middle; ``spread``, the one whose silhouettes are most
-            spread out (``spread_time``; ``middle`` where pictures have no alpha); a time in [0, 1]: the
+            spread out (``spread_time``; ``middle`` where images have no alpha); a time in [0, 1]: the
             training time nearest to it; None changes nothing.
 
     Raises:
@@ -78,19 +83,20 @@ def with_canonical(scene: Scene, canonical: str | float | None) -> Scene:
     """
     if canonical is None:
         return scene
-    number = isinstance(canonical, int | float) and not isinstance(canonical, bool) and 0 <= canonical <= 1
-    if canonical not in ("middle", "spread") and not number:
-        raise SceneError(
-            f"data.canonical: expected middle, spread, a time in [0, 1] or null, but got {canonical!r}"
-        )
-    if number:
+    is_time = isinstance(canonical, int | float) and not isinstance(canonical, bool) and 0 <= canonical <= 1
+    if canonical not in ("middle", "spread") and not is_time:
+        raise mismatch("data.canonical", "middle, spread, a time in [0, 1] or null", repr(canonical))
+    if is_time:
         time = min(scene.times, key=lambda t: abs(t - canonical))
-    elif canonical == "spread" and scene.has_alpha:
-        time = spread_time(scene)
     else:
-        time = middle_of(scene.times)
+        time = spread_time(scene) if canonical == "spread" and scene.has_alpha else middle_of(scene.times)
+    truth, known = scene.truth, [] if scene.truth is None else scene.truth.times.tolist()
+    at = [i for i, t in enumerate(known) if abs(t - time) < _SAME_TIME]
+    if at:
+        order = [at[0], *(i for i in range(len(known)) if i != at[0])]
+        truth = Truth(truth.points[:, order], truth.times[order])
     protocol = {**scene.protocol, "canonical_time": time}
-    return replace(scene, canonical_time=time, truth=_beginning_at(scene.truth, time), protocol=protocol)
+    return replace(scene, canonical_time=time, truth=truth if at else None, protocol=protocol)
 
 
 def spread_time(scene: Scene) -> float:
@@ -101,13 +107,18 @@ def spread_time(scene: Scene) -> float:
     ``_WINDOW`` of the time; the first and the last time count ``_FAR`` less than the middle one, as motion
     is learned outwards.
 
-    Cost: every training picture is decoded, as training does anyway, and a third of a millisecond each.
+    Cost: every training image is decoded, as training does anyway, and a third of a millisecond each.
     """
-    spreads = sorted((frame.time, outline(_small(frame.load()[..., 3] > 127))) for frame in scene.train)
-    first, length = spreads[0][0], max(spreads[-1][0] - spreads[0][0], _SAME_TIME)
+    spreads = []
+    for frame in scene.train:
+        mask = frame.load()[..., 3] > 127
+        step = max(1, min(mask.shape) // _SIDE)
+        spreads.append((frame.time, outline(mask[::step, ::step])))
+    first, last = min(spreads)[0], max(spreads)[0]
+    length = max(last - first, _SAME_TIME)
 
     def score(time: float) -> float:
-        near = [value for t, value in spreads if abs(t - time) <= _WINDOW * length]
+        near = [value for t, value in sorted(spreads) if abs(t - time) <= _WINDOW * length]
         return sum(near) / len(near) * (1 - _FAR * abs(2 * (time - first) / length - 1))
 
     return max(scene.times, key=lambda time: round(score(time), 9))
@@ -127,30 +138,13 @@ def outline(mask: Tensor) -> float:
     return float((mask & ~inside).sum()) / area**0.5 if area else 0.0
 
 
-def _small(mask: Tensor) -> Tensor:
-    """Leave out rows and columns of a mask (H, W) that is far larger than ``_SIDE`` pixels."""
-    step = max(1, min(mask.shape) // _SIDE)
-    return mask[::step, ::step]
+def _of_batches(name: str, meaning: str) -> property:
+    """Make a property that is the stream's attribute ``name``."""
 
+    def assign(self, value) -> None:
+        setattr(self.batches, name, value)
 
-def _spare(scene: Scene) -> list[tuple[float, int]]:
-    """List (time, index) of the frames that may be held out: not those at first, last and canonical time."""
-    kept = {scene.times[0], scene.times[-1], scene.canonical_time} if len(scene.times) > 1 else set()
-    return sorted((f.time, i) for i, f in enumerate(scene.train) if f.time not in kept)
-
-
-def _beginning_at(truth: Truth | None, time: float) -> Truth | None:
-    """Put ``time`` first; return None if the trajectories lack it."""
-    at = (
-        [] if truth is None else [i for i, t in enumerate(truth.times.tolist()) if abs(t - time) < _SAME_TIME]
-    )
-    if not at:
-        return None
-    order = [at[0], *(i for i in range(len(truth.times)) if i != at[0])]
-    return Truth(truth.points[:, order], truth.times[order])
-
-
-WATCHED = 8  # validation views at most that a run's PSNR curve measures where no views are held out
+    return property(lambda self: getattr(self.batches, name), assign, doc=meaning)
 
 
 class SceneDataModule(LightningDataModule):
@@ -160,9 +154,9 @@ class SceneDataModule(LightningDataModule):
 
     Args:
         read: gives the scene; called once, at the first use.
-        rays: pixels of a batch; None where the method asks for whole pictures.
+        rays: pixels of a batch; None where the method asks for whole images.
         background: behind training pixels: white, black or random (a colour each).
-        eval_background: behind whole images: white or black; None: white behind cut-out pictures; as in
+        eval_background: behind whole images: white or black; None: white behind cut-out images; as in
             training behind opaque ones, which do not teach what lies behind (black where that is random).
         seed: seed of the pixels, the background colours and the default choice of frames.
         views_per_step: training frames of one time that share a batch's rays.
@@ -170,9 +164,10 @@ class SceneDataModule(LightningDataModule):
         held_out: training frames that are never trained on (``hold_out``).
         canonical: another canonical time than the format's own (None): see ``with_canonical``.
         place: the scene's folder, where it has one.
-
-    ``picker`` may be set at any time: a callable that chooses the training frame of the next batch.
     """
+
+    picker = _of_batches("picker", "Chooses the training frame of the next batch; None: uniformly at random.")
+    asks = _of_batches("asks", "What the trained method wants of a batch.")
 
     def __init__(
         self,
@@ -191,25 +186,21 @@ class SceneDataModule(LightningDataModule):
         super().__init__()
         self.place = None if place is None else Path(place)
         self._read, self.cache_bytes, self.held_out = read, cache_bytes, held_out
-        self._canonical = canonical
+        self._canonical, self._eval_background = canonical, eval_background
         self._draw = {"rays": rays, "background": background, "seed": seed, "views_per_step": views_per_step}
-        self._eval_background = eval_background
 
     @cached_property
     def scene(self) -> Scene:
         """The scene; its protocol names the background that it is measured on."""
         scene = hold_out(with_canonical(self._read(), self._canonical), self.held_out)
-        behind = self._behind(scene) if scene.has_alpha else "none"
-        protocol = {**scene.protocol, "background": behind}
+        protocol = {**scene.protocol, "background": self._background(scene) if scene.has_alpha else "none"}
         if self.place is not None and any((p / RECORD).is_file() for p in (self.place, self.place.parent)):
             protocol["synthetic"] = True  # however it is read
         return replace(scene, protocol=protocol)
 
-    def _behind(self, scene: Scene) -> str:
-        if self._eval_background is not None:
-            return self._eval_background
-        if scene.has_alpha:
-            return "white"
+    def _background(self, scene: Scene) -> str:
+        if self._eval_background is not None or scene.has_alpha:
+            return self._eval_background or "white"
         return "black" if self._draw["background"] == "random" else self._draw["background"]
 
     @cached_property
@@ -217,36 +208,18 @@ class SceneDataModule(LightningDataModule):
         """The stream of training batches."""
         return Sampler(self.scene, **self._draw)
 
-    @property
-    def picker(self) -> Callable[[], int] | None:
-        """Chooses the training frame of the next batch; None: uniformly at random."""
-        return self.batches.picker
-
-    @picker.setter
-    def picker(self, picker: Callable[[], int] | None) -> None:
-        self.batches.picker = picker
-
-    @property
-    def asks(self) -> Asks:
-        """What the trained method wants of a batch."""
-        return self.batches.asks
-
-    @asks.setter
-    def asks(self, asks: Asks) -> None:
-        self.batches.asks = asks
-
     def setup(self, stage: str | None = None) -> None:
         """Read the scene, once, and refuse bad settings."""
         CACHE.resize(self.cache_bytes)
         _ = self.batches
-        color_of(self._behind(self.scene))
+        color_of(self._background(self.scene))
 
     def targets(self, split: str) -> Targets:
         """Give the whole images of ``train``, ``val``, ``test`` or ``held``."""
         if split not in ("train", "val", "test", "held"):
-            raise SceneError(f"split: expected train, val, test or held, but got {split!r}")
-        behind = color_of(self._behind(self.scene))
-        return Targets(getattr(self.scene, split), behind, self.scene.has_alpha, trained=split == "train")
+            raise mismatch("split", "train, val, test or held", repr(split))
+        color = color_of(self._background(self.scene))
+        return Targets(getattr(self.scene, split), color, self.scene.has_alpha, split == "train")
 
     def watched(self) -> Targets:
         """Choose the views of a run's PSNR curve: those held out, else up to 8 validation views."""
@@ -291,21 +264,18 @@ class _FolderDataModule(SceneDataModule):
     """
 
     _reader: Callable[..., Scene]
-    _options: tuple[str, ...]  # what the reader takes
+    _described_by: Callable[..., Scene]  # its keyword arguments are those of the reader
 
     def __init__(self, root: str | Path, scene: str, **options) -> None:
-        read = {name: options.pop(name) for name in self._options if name in options}
+        names = [n for n, p in signature(self._described_by).parameters.items() if p.kind is p.KEYWORD_ONLY]
+        read = {name: options.pop(name) for name in names if name in options}
         super().__init__(partial(self._reader, root, scene, **read), place=Path(root) / scene, **options)
-
-
-def _options_of(reader: Callable) -> tuple[str, ...]:
-    return tuple(name for name, p in signature(reader).parameters.items() if p.kind is p.KEYWORD_ONLY)
 
 
 class DNeRFDataModule(_FolderDataModule):
     """A D-NeRF scene, as ``dnerf.read_scene`` reads it."""
 
-    _reader, _options = staticmethod(dnerf.read_scene), _options_of(dnerf.read_scene)
+    _reader = _described_by = staticmethod(dnerf.read_scene)
 
 
 class LegoCompleteDataModule(DNeRFDataModule):
@@ -317,16 +287,16 @@ class LegoCompleteDataModule(DNeRFDataModule):
 class NHRDataModule(_FolderDataModule):
     """An NHR scene, as ``nhr.read_scene`` reads it."""
 
-    _reader, _options = staticmethod(nhr.read_scene), _options_of(nhr.read_scene)
+    _reader = _described_by = staticmethod(nhr.read_scene)
 
 
 class PosedVideoDataModule(_FolderDataModule):
     """A capture with poses, as ``posed_video.read_scene`` reads it; ``canonical`` is the reader's."""
 
-    _reader, _options = staticmethod(posed_video.read_scene), _options_of(posed_video.read_scene)
+    _reader = _described_by = staticmethod(posed_video.read_scene)
 
 
 class HyperNeRFDataModule(_FolderDataModule):
     """A HyperNeRF capture, as ``hypernerf.read_scene`` reads it."""
 
-    _reader, _options = staticmethod(hypernerf.read_scene), _options_of(hypernerf.read_scene)
+    _reader = _described_by = staticmethod(hypernerf.read_scene)

@@ -8,7 +8,6 @@ in ``pointclouds/frame<f + 1>.npy`` (older: .obj). Beside them there may be ``tr
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,8 +17,8 @@ import torch
 
 from forewarp.data.arrays import read_cloud, read_truth, shortened, write_array, write_truth
 from forewarp.data.cameras import box_of, pose_of
-from forewarp.data.files import MARKERS, SceneError, number, numbers_of, read_bytes, scene_folder, whole
-from forewarp.data.images import MaskedImage, inspect_image, write_jpeg
+from forewarp.data.files import mismatch, numbers_of, read_bytes, remove, scene_folder, whole
+from forewarp.data.images import StoredImage, by, check_pixels, inspect_image, write_image
 from forewarp.files import replace_file
 from forewarp.scene.box import Box
 from forewarp.scene.camera import Camera
@@ -65,23 +64,30 @@ def read_scene(
 
     Cost: two small reads an image and one of every point.
     """
-    folder = scene_folder(root, scene, MARKERS["nhr"])
+    folder = scene_folder(root, scene, "nhr")
     if not isinstance(half_resolution, bool):
-        raise SceneError(f"data.half_resolution: expected true or false, but got {half_resolution!r}")
-    poses, lenses = _read_cameras(folder)
+        raise mismatch("data.half_resolution", "true or false", repr(half_resolution))
+    poses, matrices = _read_poses(folder / "CamPose.inf"), _read_intrinsics(folder / "Intrinsic.inf")
+    if len(poses) != len(matrices):
+        got = f"{len(matrices)} there and {len(poses)} in CamPose.inf"
+        raise mismatch(folder / "Intrinsic.inf", "as many cameras as poses", got)
     held = _held_out(test_views, len(poses), folder)
-    every, (moments, there) = whole(test_every, "data.test_every", 1), _moments(folder, frames)
+    every, moments = whole(test_every, "data.test_every", 1), whole(frames, "data.frames", 1)
+    there = {path.name for path in folder.glob("img/*") if path.is_dir()}
+    on_disk = sum(name.isdecimal() and name == str(int(name)) for name in there)
+    moments = min(moments, on_disk)
+    for f in range(max(moments, 1)):
+        if str(f) not in there:
+            raise mismatch(folder / "img" / str(f), "a folder of images", "none")
     sizes = _read_sizes(folder, moments, len(poses), half_resolution)
     bounds = _bounds(folder, moments) if box is None else box_of(box)
-    cameras = [_camera(*of, half_resolution, bounds) for of in zip(sizes, lenses, poses, strict=True)]
+    cameras = [_camera(*of, half_resolution, bounds) for of in zip(sizes, matrices, poses, strict=True)]
 
     def view(f: int, k: int) -> Frame:
         place, name = folder / "img" / str(f), f"img_{k:04d}.jpg"
-        load = MaskedImage(place / name, place / "mask" / name, sizes[k], half_resolution)
-        ability = "space" if k in held else "all"
-        return Frame(
-            f"{f}/img_{k:04d}", f / max(moments - 1, 1), cameras[k], load, ability=ability, camera_id=k
-        )
+        load = StoredImage(place / name, sizes[k], half_resolution, place / "mask" / name)
+        time, ability = f / max(moments - 1, 1), "space" if k in held else "all"
+        return Frame(f"{f}/img_{k:04d}", time, cameras[k], load, ability=ability, camera_id=k)
 
     train = tuple(view(f, k) for f in range(moments) for k in range(len(poses)) if k not in held)
     test = tuple(view(f, k) for f in range(0, moments, every) for k in held)
@@ -95,7 +101,9 @@ def read_scene(
         "test_frames": len(test),
         "mask_box": True,
     }
-    truth = _trajectories(folder, moments, there)
+    truth = read_truth(folder / "trajectories.npz", 0.0)
+    if truth is not None and moments < on_disk:  # the file's times are those of all frames on disk
+        truth = shortened(truth, (moments - 1) / (on_disk - 1))
     return Scene(scene, train, (), test, bounds, 0.0, True, truth, protocol)
 
 
@@ -113,60 +121,26 @@ def write_scene(
     """
     folder = Path(folder)
     if any(camera.lens is not None for camera in cameras):
-        raise ValueError("cameras: expected none with a lens, as the format has none; undistort the images")
-    _remove(folder)
-    for f, frame in enumerate(frames):
-        _write_frame(folder, f, frame, cameras)
-    if trajectories is not None:
-        write_truth(folder / "trajectories.npz", trajectories)
-    _write_cameras(folder, cameras)
-
-
-def _write_frame(folder: Path, f: int, frame: DomeFrame, cameras: Sequence[Camera]) -> None:
-    counts = (len(frame.images), len(frame.masks))
-    if counts != (len(cameras),) * 2:
-        raise ValueError(f"frame {f}: expected {len(cameras)} images and as many masks, but got {counts}")
-    place = folder / "img" / str(f)
-    for k, (camera, image, mask) in enumerate(zip(cameras, frame.images, frame.masks)):
-        name, shape = f"img_{k:04d}.jpg", (camera.height, camera.width)
-        got = tuple(image.shape), tuple(mask.shape)
-        if got != ((*shape, 3), shape):
-            raise ValueError(f"frame {f}: {name}: expected the camera's size {shape}, but got {got}")
-        write_jpeg(place / name, image)
-        write_jpeg(place / "mask" / name, mask)
-    write_array(folder / "pointclouds" / f"frame{f + 1}.npy", frame.points)
-
-
-def _remove(folder: Path) -> None:
-    """Remove the scene that is there, poses first; other files stay."""
-    for name in ("CamPose.inf", "Intrinsic.inf", "trajectories.npz"):
-        (folder / name).unlink(missing_ok=True)
-    for pattern in ("img/*/img_*.jpg", "img/*/mask/img_*.jpg", "pointclouds/frame*.*"):
-        for stale in folder.glob(pattern):
-            stale.unlink()
+        raise mismatch("cameras", "none with a lens, as the format has none", "one", "undistort the images")
+    remove(folder, "CamPose.inf", "Intrinsic.inf", "trajectories.npz", "pointclouds/frame*.*")
+    remove(folder, "img/*/img_*.jpg", "img/*/mask/img_*.jpg")
     for emptied in (*folder.glob("img/*/mask"), *folder.glob("img/*")):
         if not any(emptied.iterdir()):
             emptied.rmdir()
-
-
-def _write_cameras(folder: Path, cameras: Sequence[Camera]) -> None:
-    """Write what ``_read_cameras`` reads, with all digits, the poses last."""
-    lenses = [
+    for f, frame in enumerate(frames):
+        for k, (camera, image, mask) in enumerate(zip(cameras, frame.images, frame.masks, strict=True)):
+            place, name, shape = folder / "img" / str(f), f"img_{k:04d}.jpg", (camera.height, camera.width)
+            write_image(place / name, check_pixels(f"frame {f}: {name}", image, (*shape, 3)))
+            write_image(place / "mask" / name, check_pixels(f"frame {f}: mask/{name}", mask, shape))
+        write_array(folder / "pointclouds" / f"frame{f + 1}.npy", frame.points)
+    write_truth(folder / "trajectories.npz", trajectories)
+    blocks = [
         f"{k}\n{c.fx!r} {c.skew!r} {c.cx!r}\n0.0 {c.fy!r} {c.cy!r}\n0.0 0.0 1.0\n\n"
         for k, c in enumerate(cameras)
     ]
-    replace_file(folder / "Intrinsic.inf", "".join(lenses))
+    replace_file(folder / "Intrinsic.inf", "".join(blocks))
     poses = [camera.camera_to_world[:3, _ORDER].double().T.flatten().tolist() for camera in cameras]
     replace_file(folder / "CamPose.inf", "".join(" ".join(map(repr, pose)) + "\n" for pose in poses))
-
-
-def _read_cameras(folder: Path) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Read the poses (4, 4) and intrinsic matrices (3, 3), float64; refuse files with unequal numbers."""
-    poses, lenses = _read_poses(folder / "CamPose.inf"), _read_lenses(folder / "Intrinsic.inf")
-    if len(poses) != len(lenses):
-        got = f"{len(lenses)} there and {len(poses)} in CamPose.inf"
-        raise SceneError(f"{folder / 'Intrinsic.inf'}: expected as many cameras as poses, but got {got}")
-    return poses, lenses
 
 
 def _read_poses(path: Path) -> list[np.ndarray]:
@@ -177,132 +151,72 @@ def _read_poses(path: Path) -> list[np.ndarray]:
     """
     poses = []
     for line, words in _lines(path):
-        where = f"{path}: line {line}"
-        columns = np.array(numbers_of(words, 12, where)).reshape(4, 3).T
-        matrix = np.eye(4)
-        matrix[:3, _ORDER] = columns
+        matrix, where = np.eye(4), f"{path}: line {line}"
+        matrix[:3, _ORDER] = np.array(numbers_of(words, 12, where)).reshape(4, 3).T
         poses.append(pose_of(matrix, where))
     return poses
 
 
-def _read_lenses(path: Path) -> list[np.ndarray]:
+def _read_intrinsics(path: Path) -> list[np.ndarray]:
     """Read the matrix (3, 3) of every block: fx s cx, 0 fy cy, 0 0 1, in pixels of the stored images.
 
     A block is a camera's number and nine numbers, however they are spread over lines; cameras count up from
     0 or from 1.
 
     Raises:
-        SceneError: naming the line where a block is anything else.
+        SceneError: naming the line where a block begins that is anything else.
     """
     words = [(line, word) for line, row in _lines(path) for word in row]
     first, matrices = int(words[0][1] == "1"), []
     for k, block in enumerate((words[i : i + 10] for i in range(0, len(words), 10)), first):
-        line, word = block[0]
-        if word != str(k):
-            raise SceneError(f"{path}: line {line}: expected the number {k} of a camera, but got {word!r}")
-        if len(block) < 10:
-            raise SceneError(
-                f"{path}: line {block[-1][0]}: expected nine numbers of camera {k}, but got the end of the "
-                f"file after {len(block) - 1}"
-            )
-        rows = (block[i : i + 3] for i in (1, 4, 7))
-        matrices.append(_matrix([(row[0][0], [word for _, word in row]) for row in rows], path))
+        where = f"{path}: line {block[0][0]}"
+        values = numbers_of([word for _, word in block], 10, where)
+        matrix = np.array(values[1:]).reshape(3, 3)
+        focals, offsets = matrix[[0, 1], [0, 1]], np.abs(matrix[[0, 0, 1], [1, 2, 2]])
+        are_pixels = (focals >= 1e-3).all() and max(*focals, *offsets) <= _MOST_PIXELS_OFF
+        if values[0] != k or matrix[1, 0] != 0 or matrix[2].tolist() != [0, 0, 1] or not are_pixels:
+            expected = f"the number {k} of a camera and its matrix fx s cx, 0 fy cy, 0 0 1 in pixels"
+            raise mismatch(where, expected, " ".join(f"{value:g}" for value in values))
+        matrices.append(matrix)
     return matrices
-
-
-def _matrix(rows: list[tuple[int, list[str]]], path: Path) -> np.ndarray:
-    """Check the numbered rows fx s cx, 0 fy cy, 0 0 1 and make a matrix (3, 3)."""
-    where = [f"{path}: line {line}" for line, _ in rows]
-    (fx, skew, cx), (zero, fy, cy), last = (numbers_of(words, 3, at) for at, (_, words) in zip(where, rows))
-    for at, focal, *others in ((where[0], fx, skew, cx), (where[1], fy, cy)):
-        number(focal, f"{at}: focal length", 1e-3, _MOST_PIXELS_OFF)
-        for value in others:
-            number(value, f"{at}: principal point and skew", -_MOST_PIXELS_OFF, _MOST_PIXELS_OFF)
-    if zero != 0:
-        raise SceneError(f"{where[1]}: expected a row 0 fy cy, but got {zero:g} {fy:g} {cy:g}")
-    if last != [0, 0, 1]:
-        raise SceneError(f"{where[2]}: expected the row 0 0 1, but got {' '.join(f'{v:g}' for v in last)}")
-    return np.array([[fx, skew, cx], [zero, fy, cy], last])
 
 
 def _lines(path: Path) -> list[tuple[int, list[str]]]:
     """List the lines that are not blank: their numbers from 1 and their words."""
     text = read_bytes(path).decode("utf-8-sig", errors="replace")
-    found = [(n, line.split()) for n, line in enumerate(text.split("\n"), 1) if line.strip()]
-    if not found:
-        raise SceneError(f"{path}: expected at least one camera, but got an empty file")
-    return found
+    lines = [(n, line.split()) for n, line in enumerate(text.split("\n"), 1) if line.strip()]
+    if not lines:
+        raise mismatch(path, "at least one camera", "an empty file")
+    return lines
 
 
 def _held_out(views: Sequence[int] | None, count: int, folder: Path) -> list[int]:
     """Choose the cameras that are measured, ascending."""
     if count < 2:
-        raise SceneError(f"{folder / 'CamPose.inf'}: expected at least 2 cameras, one to measure, but got 1")
+        raise mismatch(folder / "CamPose.inf", "at least 2 cameras, one to measure", "1")
     if views is None:
         tests = max(1, round(count * 6 / 56))
         return [i * count // tests for i in range(tests)]
-    good = isinstance(views, Sequence) and all(type(k) is int and 0 <= k < count for k in views)
-    if not good or not 0 < len(set(views)) < count or len(set(views)) < len(views):
-        raise SceneError(
-            f"data.test_views: expected different cameras of 0 to {count - 1}, not all, but got {views!r}"
-        )
+    are_cameras = isinstance(views, Sequence) and all(type(k) is int and 0 <= k < count for k in views)
+    if not are_cameras or not 0 < len(set(views)) < count or len(set(views)) < len(views):
+        raise mismatch("data.test_views", f"different cameras of 0 to {count - 1}, not all", repr(views))
     return sorted(views)
-
-
-def _moments(folder: Path, frames: int) -> tuple[int, int]:
-    """Count the frames to read, numbered from 0 without a gap, and those on disk."""
-    wanted, place = whole(frames, "data.frames", 1), folder / "img"
-    there = {p.name for p in place.iterdir() if p.is_dir()} if place.is_dir() else set()
-    numbers = [int(name) for name in there if name.isdecimal() and name == str(int(name))]
-    count = min(wanted, len(numbers))
-    missing = [f for f in range(max(count, 1)) if str(f) not in there]
-    if missing:
-        raise SceneError(f"{place / str(missing[0])}: expected a folder of images, but got none")
-    return count, len(numbers)
-
-
-def _trajectories(folder: Path, moments: int, there: int) -> Truth | None:
-    """Read the trajectories of the first ``moments``; the file's times are those of all frames on disk."""
-    truth = read_truth(folder / "trajectories.npz", 0.0)
-    if truth is None or moments == there:
-        return truth
-    return shortened(truth, (moments - 1) / (there - 1))
 
 
 def _read_sizes(folder: Path, moments: int, views: int, halve: bool) -> list[tuple[int, int]]:
     """Read the size (width, height) of every camera's images and check that all have it."""
     names = [f"img_{k:04d}.jpg" for k in range(views)]
-    sizes: list[tuple[int, int]] = []
+    sizes: list[tuple[int, int] | None] = [None] * views
     for f in range(moments):
         for place in (folder / "img" / str(f), folder / "img" / str(f) / "mask"):
-            _check_names(place, names)
-            found = [inspect_image(place / name).size for name in names]
-            sizes = sizes or found
-            for name, size, expected in zip(names, found, sizes, strict=True):
-                if size != expected:
-                    raise SceneError(
-                        f"{place / name}: expected {expected[0]} x {expected[1]} pixels as in "
-                        f"img/0/{name}, but got {size[0]} x {size[1]}"
-                    )
-                if halve and min(size) < 2:
-                    got = f"{size[0]} x {size[1]}"
-                    raise SceneError(
-                        f"{place / name}: expected at least 2 x 2 pixels to halve, but got {got}"
-                    )
+            if extra := sorted({path.name for path in place.glob("img_*")}.difference(names)):
+                expected = f"images of the {views} cameras of CamPose.inf"
+                raise mismatch(place / extra[0], expected, "another")
+            for k, name in enumerate(names):
+                sizes[k] = inspect_image(place / name, sizes[k], f" as in img/0/{name}").size
+                if halve and min(sizes[k]) < 2:
+                    raise mismatch(place / name, "at least 2 x 2 pixels to halve", by(sizes[k]))
     return sizes
-
-
-def _check_names(place: Path, names: list[str]) -> None:
-    there = {name for name in os.listdir(place) if name.startswith("img_")} if place.is_dir() else set()
-    for name in names:
-        if name not in there:
-            raise SceneError(
-                f"{place / name}: expected an image of every camera of CamPose.inf, but got none"
-            )
-    if extra := sorted(there.difference(names)):
-        raise SceneError(
-            f"{place / extra[0]}: expected images of the {len(names)} cameras of CamPose.inf, but got another"
-        )
 
 
 def _bounds(folder: Path, moments: int) -> Box:
@@ -317,17 +231,15 @@ def _bounds(folder: Path, moments: int) -> Box:
     try:
         return Box(tuple((low - margin).tolist()), tuple((high + margin).tolist()))
     except ValueError as error:
-        raise SceneError(
-            f"{folder / 'pointclouds'}: expected points that span a box, but got {low.tolist()} to "
-            f"{high.tolist()}; set data.box"
-        ) from error
+        got = f"{low.tolist()} to {high.tolist()}"
+        raise mismatch(folder / "pointclouds", "points that span a box", got, "set data.box") from error
 
 
-def _camera(size: tuple[int, int], lens: np.ndarray, pose: np.ndarray, halve: bool, box: Box) -> Camera:
+def _camera(size: tuple[int, int], matrix: np.ndarray, pose: np.ndarray, halve: bool, box: Box) -> Camera:
     """Make a camera whose near and far enclose the sphere around the box."""
     scale = 0.5 if halve else 1.0  # exactly, whatever an odd side loses
     width, height = (n // 2 if halve else n for n in size)
-    fx, skew, cx, _, fy, cy = (scale * lens[:2]).flatten().tolist()
+    fx, skew, cx, _, fy, cy = (scale * matrix[:2]).flatten().tolist()
     radius = box.diagonal / 2
     away = float(np.linalg.norm(pose[:3, 3] - box.center))
     near, far = max(away - radius, 1e-3 * radius), away + radius

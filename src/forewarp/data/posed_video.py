@@ -9,6 +9,7 @@ which may be any: the scene is normalised. The optional ``points.npy`` (N, 3) ho
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,27 +21,25 @@ from torch import Tensor
 
 from forewarp.data.arrays import read_cloud, write_array
 from forewarp.data.cameras import (
-    FLIP,
     MOST_UNITS,
     SPLITS,
-    SUFFIXES,
-    ImageEntry,
+    Normalisation,
     box_of,
+    camera_of,
     frustum_box,
-    name_of,
-    pose_of,
-    read_entries,
-    split_entries,
-    with_even_times,
+    opengl_rows,
 )
-from forewarp.data.files import MARKERS, SceneError, number, read_json, scene_folder, whole
-from forewarp.data.images import CachedImage, MaskedImage, write_jpeg, write_png
+from forewarp.data.files import frames_of, inside, mismatch, number, read_json, remove, scene_folder, whole
+from forewarp.data.images import SUFFIXES, StoredImage, check_pixels, in_order, inspect_image, write_image
 from forewarp.files import write_json
 from forewarp.scene.box import Box
 from forewarp.scene.camera import Camera
 from forewarp.scene.frame import Frame, Scene, middle_of
 from forewarp.scene.paths import focus_point
 
+FILE, POINTS = "transforms.json", "points.npy"
+SCALES = (1, 2, 4, 8)
+_OF_CAMERA = ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_model", "k1", "k2", "k3", "p1", "p2")
 # Near and far as shares of the cameras' distance from what they look at, where nothing else is known. Two
 # real captures that gave them had near at 0.01 and 0.55 and far at 2.4 and 2.2.
 _NEAR, _FAR = 0.2, 2.5
@@ -49,141 +48,6 @@ _SAME_PLACE = 1e-9
 _AHEAD = 4.0  # assumed distance of what is looked at, in radii of the cameras' places
 
 log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class Region:
-    """The part of the file's world that becomes the scene, and the map ``X_scene = (X - center) * scale``.
-
-    ``near``, ``far`` and ``box`` are in scene units.
-    """
-
-    center: tuple[float, float, float]
-    scale: float
-    near: float
-    far: float
-    box: Box
-
-    def placed(self, camera: Camera) -> Camera:
-        """Move a camera from the file's units to the scene's."""
-        pose = camera.camera_to_world.clone()
-        pose[:3, 3] = (pose[:3, 3] - torch.tensor(self.center, dtype=torch.float64)) * self.scale
-        return replace(camera, camera_to_world=pose, near=self.near, far=self.far)
-
-    def points(self, points: np.ndarray) -> Tensor:
-        """Move points (N, 3) from the file's units to the scene's: float32."""
-        return ((torch.from_numpy(points).double() - torch.tensor(self.center)) * self.scale).float()
-
-    def moved(self, box: Box) -> Box:
-        """Move a box from the file's units to the scene's."""
-        low, high = (
-            tuple((v - c) * self.scale for v, c in zip(end, self.center)) for end in (box.low, box.high)
-        )
-        return Box(low, high)
-
-
-def region_of(
-    cameras: Sequence[Camera],
-    where: str,
-    *,
-    near: float | None = None,
-    far: float | None = None,
-    box: Box | None = None,
-    normalise: bool = True,
-    cut_out: bool = False,
-) -> Region:
-    """Find the region that cameras look at.
-
-    Args:
-        cameras: cameras of all frames; their near and far are not used.
-        where: the file, for errors.
-        near, far, box: what is known, in the file's units; None is derived: ``near`` and ``far`` from the
-            distance to the focus, the point looked at; the box holds all rays between them.
-        cut_out: the images are cut out; then the box holds only what they show around the focus.
-        normalise: put the focus at the origin and the farthest camera at distance 1.
-
-    Raises:
-        SceneError: where something cannot be derived from the cameras.
-    """
-    focus, distances = _focus(cameras, near, far, where)
-    near, far = _range(distances, near, far, where)
-    size = max(float((camera.center - focus).norm()) for camera in cameras) if normalise else 1.0
-    center = tuple(focus.tolist()) if normalise else (0.0, 0.0, 0.0)
-    region = Region(center, 1 / size, near / size, far / size, Box((0, 0, 0), (1, 1, 1)))
-    try:
-        if box is not None:
-            return replace(region, box=region.moved(box))
-        seen = frustum_box(region.placed(camera) for camera in cameras)
-        if cut_out:
-            seen = seen.intersection(region.moved(_shown(focus, distances, cameras)))
-        return replace(region, box=seen)
-    except ValueError as error:
-        raise SceneError(f"{where}: {error}; set data.near, data.far and data.box") from error
-
-
-def _focus(
-    cameras: Sequence[Camera], near: float | None, far: float | None, where: str
-) -> tuple[Tensor, Tensor]:
-    """Find the focus (3,) and its distances along the optical axes of the cameras that face it, float64."""
-    centers = torch.stack([camera.center for camera in cameras])
-    axes = torch.stack([camera.camera_to_world[:3, 2] for camera in cameras])
-    radius = float((centers - centers.mean(0)).norm(dim=-1).max())
-    ahead = _AHEAD * radius if near is None or far is None else 0.5 * (near + far)
-    if radius <= _SAME_PLACE * (1 + float(centers.abs().max())) and (near is None or far is None):
-        raise SceneError(
-            f"{where}: expected cameras that move, but got one place; set data.near and data.far"
-        )
-    focus = focus_point([replace(camera, near=0.0, far=2 * ahead) for camera in cameras])
-    distances = ((focus - centers) * axes).sum(-1)
-    if not _LEAST * ahead < float(distances.median()) < _MOST * ahead:
-        # The axes are nearly parallel or diverge: only the direction of view can be trusted.
-        axis = axes.mean(0)
-        focus = centers.mean(0) + ahead * axis / axis.norm().clamp(min=0.1)
-        distances = ((focus - centers) * axes).sum(-1)
-    distances = distances[distances > _LEAST * ahead]
-    if not len(distances):
-        raise SceneError(
-            f"{where}: expected cameras that look at something in common, but got views in all directions; "
-            "remove those that look away"
-        )
-    return focus, distances
-
-
-def _range(distances: Tensor, near: float | None, far: float | None, where: str) -> tuple[float, float]:
-    """Choose near and far in the file's units; log what is derived."""
-    derived = [name for name, value in (("near", near), ("far", far)) if value is None]
-    low, high = _NEAR * float(distances.min()), _FAR * float(distances.max())
-    near, far = (
-        (low if far is None else min(low, far / 2)) if near is None else near,
-        (high if near is None else max(high, 2 * near)) if far is None else far,
-    )
-    if not near < far:
-        raise SceneError(
-            f"{where}: expected near < far, but got {near:g} and {far:g}; set data.near, data.far"
-        )
-    if derived:
-        log.warning(
-            "%s: %s derived from the cameras: near %.4g, far %.4g in the file's units; where something is "
-            "cut off or blurred set data.near and data.far",
-            where,
-            " and ".join(derived),
-            near,
-            far,
-        )
-    return near, far
-
-
-def _shown(focus: Tensor, distances: Tensor, cameras: Sequence[Camera]) -> Box:
-    """Make the cube around the focus that holds what all pictures show of it."""
-    width = max(max(camera.width / camera.fx, camera.height / camera.fy) for camera in cameras)
-    half = 0.5 * float(distances.max()) * width
-    low, high = ([v + sign * half for v in focus.tolist()] for sign in (-1, 1))
-    return Box(tuple(low), tuple(high))
-
-
-FILE, POINTS = MARKERS["posed_video"], "points.npy"
-SCALES = (1, 2, 4, 8)
-_OF_CAMERA = {"w", "h", "fl_x", "fl_y", "cx", "cy", "camera_model", "k1", "k2", "k3", "p1", "p2"}
 
 
 @dataclass(frozen=True)
@@ -231,36 +95,202 @@ def read_scene(
     Raises:
         SceneError: for every file or value that is missing or wrong, with file and key.
     """
-    _check(scale, canonical, test_every, normalise)
-    file = scene_folder(root, scene, FILE) / FILE
+    if type(scale) is not int or scale not in SCALES:
+        raise mismatch("data.scale", f"one of {SCALES}", repr(scale))
+    if canonical not in ("middle", "first"):
+        raise mismatch("data.canonical", "middle or first", repr(canonical))
+    whole(test_every, "data.test_every", 2)
+    if not isinstance(normalise, bool):
+        raise mismatch("data.normalise", "true or false", repr(normalise))
+    file = scene_folder(root, scene, "posed_video") / FILE
     content = read_json(file)
-    entries = read_entries(file, content, scale)
-    timeless = entries[0].time is None
-    entries = with_even_times(entries) if timeless else sorted(entries, key=lambda e: e.time)
-    parts, how = split_entries(file, content, entries, test_every)
-    near, far, bounds = _limits(file, content, near, far, box)
-    has_alpha = any(e.mask is not None or _is_transparent(e) for e in entries)
+    entries = _read_entries(file, content, scale)
+    is_timeless = entries[0].time is None
+    entries = _with_even_times(entries) if is_timeless else sorted(entries, key=lambda e: e.time)
+    parts, how = _split_entries(file, content, entries, test_every)
+    near, far = (_length(file, content, key, value) for key, value in (("near", near), ("far", far)))
+    bounds = _bounds(file, content, box)
+    has_alpha = any(entry.mask is not None or _is_transparent(entry) for entry in entries)
     options = {"near": near, "far": far, "box": bounds, "normalise": normalise, "cut_out": has_alpha}
-    region = region_of([e.camera for e in entries], str(file), **options)
-    train, val, test = (
-        tuple(Frame(e.name, e.time, region.placed(e.camera), _load(e)) for e in parts[split])
-        for split in SPLITS
-    )
+    space, seen = space_of([entry.camera for entry in entries], str(file), **options)
+
+    def frame(entry: ImageEntry) -> Frame:
+        return Frame(entry.name, entry.time, space.camera(entry.camera), _load(entry))
+
+    train, val, test = (tuple(map(frame, parts[split])) for split in SPLITS)
     start = (min if canonical == "first" else middle_of)([frame.time for frame in train])
     protocol = {
         "dataset": "video_with_poses",
         "resolution": [train[0].camera.width, train[0].camera.height],
-        "times": "spread in the order of the files' names" if timeless else "as given",
+        "times": "spread in the order of the files' names" if is_timeless else "as given",
         "split": how,
         "test_frames": len(test),
-        "normalisation": {"center": list(region.center), "scale": region.scale},
-        "near": region.near,
-        "far": region.far,
-        "derived": [n for n, v in (("near", near), ("far", far), ("box", bounds)) if v is None],
+        "normalisation": {"center": list(space.center), "scale": space.scale},
+        "near": space.near,
+        "far": space.far,
+        "derived": [name for name in ("near", "far", "box") if options[name] is None],
     }
     cloud = file.parent / POINTS
-    still = region.points(read_cloud(cloud, 3)) if cloud.exists() else None
-    return Scene(scene, train, val, test, region.box, start, has_alpha, protocol=protocol, still=still)
+    still = space.points(read_cloud(cloud, 3)).float() if cloud.exists() else None
+    return Scene(scene, train, val, test, seen, start, has_alpha, protocol=protocol, still=still)
+
+
+@dataclass(frozen=True)
+class ImageEntry:
+    """A checked entry: ``camera`` in the file's units, at the size of the image; its near and far are 0.
+
+    ``name`` is the image's path without its suffix; ``has_alpha`` says what the image's header does.
+    """
+
+    name: str
+    time: float | None
+    camera: Camera
+    image: Path
+    mask: Path | None
+    has_alpha: bool
+
+
+def _read_entries(file: Path, content: dict, scale: int = 1) -> list[ImageEntry]:
+    """Read all frames of a nerfstudio-style ``transforms.json`` in its order.
+
+    Args:
+        file: for errors and as the place that paths start from.
+        content: content of the file.
+        scale: take images that are ``scale`` times smaller, from ``images_4`` in place of ``images``.
+
+    Raises:
+        SceneError: for every key or image that is missing or wrong.
+
+    Cost: one read of each PNG, of a JPEG's beginning and end.
+    """
+    entries = [_image_entry(entry, scale) for entry in frames_of(file, content, content)]
+    for key, given in (
+        ("time", [e.time is not None for e in entries]),
+        ("mask_path", [e.mask is not None for e in entries]),
+        ("file_path: alpha", [e.has_alpha or e.mask is not None for e in entries]),
+    ):
+        if any(given) and not all(given):
+            got = f"{sum(given)} of {len(given)} and none in frames[{given.index(False)}]"
+            raise mismatch(f"{file}: frames: {key}", "one in all frames or in none", got)
+    names = [entry.name for entry in entries]
+    if len(set(names)) < len(names):
+        twice = next(name for i, name in enumerate(names) if name in names[:i])
+        raise mismatch(f"{file}: frames", "each image once", f"{twice} twice", "remove one")
+    return entries
+
+
+def _image_entry(entry, scale: int) -> ImageEntry:
+    image, mask = _file(entry, "file_path", scale), None
+    header = inspect_image(image)
+    if "mask_path" in entry.own:
+        mask = _file(entry, "mask_path", scale)
+        inspect_image(mask, header.size, f" as {image.name}")
+    time = number(entry.own["time"], entry.where("time"), 0, 1) if "time" in entry.own else None
+    camera = camera_of(entry, header.size, scale, image)
+    name = _name_of(entry.file.parent, entry.own.get("file_path"), entry.where("file_path"))
+    return ImageEntry(name, time, camera, image, mask, header.has_alpha)
+
+
+def _file(entry, key: str, scale: int) -> Path:
+    """Find the image that a key names, with or without its suffix."""
+    folder, where = entry.file.parent, entry.where(key)
+    path = entry.path(key)
+    if scale > 1 and path.parent == folder:
+        raise mismatch(where, "images in a folder", _name_of(folder, path.name, where), "set data.scale=1")
+    if scale > 1:
+        path = path.parent.with_name(f"{path.parent.name}_{scale}") / path.name
+    if path.suffix in SUFFIXES:
+        return path
+    for candidate in (path.with_name(path.name + suffix) for suffix in SUFFIXES):
+        if os.path.isfile(candidate):
+            return candidate
+    raise mismatch(where, "an image, PNG or JPEG", f"no {path}.png or .jpg")
+
+
+def _name_of(folder: Path, value: object, where: str) -> str:
+    """Name an image by its path without the suffix."""
+    path = inside(folder, value, where)
+    return path.relative_to(folder).as_posix().removesuffix(path.suffix if path.suffix in SUFFIXES else "")
+
+
+def _with_even_times(entries: list[ImageEntry]) -> list[ImageEntry]:
+    """Sort entries by name, as ``in_order``, and space their times evenly over [0, 1]."""
+    entries = in_order(entries, lambda entry: entry.name)
+    return [replace(entry, time=i / max(len(entries) - 1, 1)) for i, entry in enumerate(entries)]
+
+
+def _split_entries(file: Path, content: dict, entries: list[ImageEntry], test_every: int) -> tuple[dict, str]:
+    """Split the entries; also say in words how.
+
+    Args:
+        file, content: where ``<split>_filenames`` may list frames; what no list names trains, or tests where
+            the training frames are listed.
+        entries: in the order of time.
+        test_every: every n-th is a test frame where nothing is listed, the first and the last never; of three
+            frames or more at least one.
+
+    Raises:
+        SceneError: for a list that names no frame or one of another list, and where a split is empty.
+    """
+    listed = [split for split in SPLITS if f"{split}_filenames" in content]
+    if listed:
+        names = {split: _listed(file, content, f"{split}_filenames", entries) for split in listed}
+        if sum(map(len, names.values())) > len(set().union(*names.values())):
+            raise mismatch(file, "lists of filenames that share none", "one in two of them")
+        parts = {split: [e for e in entries if e.name in names.get(split, ())] for split in SPLITS}
+        for home in [split for split in ("train", "test") if split not in listed][:1]:
+            parts[home] = [e for e in entries if not any(e.name in split for split in names.values())]
+        how = "as listed in the file"
+    else:
+        held = slice(max(1, min(test_every // 2, len(entries) - 2)), -1, test_every)
+        parts = {"train": entries.copy(), "val": [], "test": entries[held]}
+        del parts["train"][held]
+        how = f"every {test_every}th frame held out"
+    for split in ("train", "test"):
+        if not parts[split]:
+            advice = f"name some in {split}_filenames"
+            raise mismatch(file, f"a frame to {split} on", f"none of {len(entries)}", advice)
+    return parts, how
+
+
+def _listed(file: Path, content: dict, key: str, entries: list[ImageEntry]) -> set[str]:
+    """Read the frame names in the list of paths ``content[key]``; refuse names that are no frame."""
+    value, where = content[key], f"{file}: {key}"
+    if not isinstance(value, list):
+        raise mismatch(where, "a list of paths", short(value))
+    names = {_name_of(file.parent, path, f"{where}[{i}]") for i, path in enumerate(value)}
+    if unknown := sorted(names - {entry.name for entry in entries}):
+        raise mismatch(where, "paths of frames", short(unknown[0]))
+    return names
+
+
+def _length(file: Path, content: dict, key: str, value: float | None) -> float | None:
+    """Take near or far, in the file's units, from the config, else from the file, else None."""
+    where = f"{file}: {key}" if value is None else f"data.{key}"
+    value = content.get(key) if value is None else value
+    least = 0.0 if key == "near" else 1 / MOST_UNITS
+    return None if value is None else number(value, where, least, MOST_UNITS)
+
+
+def _bounds(file: Path, content: dict, box: Sequence[float] | None) -> Box | None:
+    """Take the box, in the file's units, from the config, else from the file, else None."""
+    corners = content.get("aabb")
+    if box is not None or corners is None:
+        return None if box is None else box_of(box)
+    try:
+        return Box(*(tuple(number(v, "aabb", -MOST_UNITS, MOST_UNITS) for v in corner) for corner in corners))
+    except (TypeError, ValueError) as error:
+        expected = "[[x0, y0, z0], [x1, y1, z1]], each low end below its high end"
+        raise mismatch(f"{file}: aabb", expected, short(corners)) from error
+
+
+def _load(entry: ImageEntry) -> StoredImage:
+    return StoredImage(entry.image, (entry.camera.width, entry.camera.height), mask=entry.mask)
+
+
+def _is_transparent(entry: ImageEntry) -> bool:
+    """Tell whether any pixel is not opaque; decode the image only where its header says it has alpha."""
+    return entry.has_alpha and bool((_load(entry)()[..., 3] < 255).any())
 
 
 def write_scene(
@@ -283,110 +313,134 @@ def write_scene(
         ValueError: for a shot that ``read_scene`` would refuse.
     """
     folder = Path(folder)
-    for name in (FILE, POINTS):
-        (folder / name).unlink(missing_ok=True)
+    remove(folder, FILE, POINTS)
     entries, lists, taken = [], {split: [] for split in SPLITS}, set()
     for shot in shots:
-        _check_shot(folder, shot, taken)
-        entries.append(_write_shot(folder, shot))
+        entries.append(_write_shot(folder, shot, taken))
         if shot.split:
             lists[shot.split].append(entries[-1]["file_path"])
-    common = {key: value for key, value in (entries[0] if entries else {}).items() if key in _OF_CAMERA}
-    for entry in entries:
-        common = {key: value for key, value in common.items() if entry.get(key) == value}
+    common = {key: entries[0][key] for key in _OF_CAMERA if entries and key in entries[0]}
+    common = {key: value for key, value in common.items() if all(e.get(key) == value for e in entries)}
     content = {**common, **{f"{split}_filenames": names for split, names in lists.items() if names}}
     content |= {key: value for key, value in (("near", near), ("far", far)) if value is not None}
     content |= {} if aabb is None else {"aabb": [aabb.low, aabb.high]}
     content["frames"] = [{k: v for k, v in entry.items() if k not in common} for entry in entries]
-    if points is not None and len(points):
-        write_array(folder / POINTS, np.asarray(points, dtype=np.float32))
+    write_array(folder / POINTS, points if points is not None and len(points) else None)
     write_json(folder / FILE, content)
 
 
-def _check_shot(folder: Path, shot: PosedShot, taken: set[str]) -> None:
-    """Refuse what ``read_scene`` would; ``taken`` are the names so far, to which this one's is added."""
-    camera, pixels = shot.camera, np.asarray(shot.pixels)
-    suffix, name = Path(shot.name).suffix, name_of(folder, f"images/{shot.name}", f"shots: {shot.name!r}")
+def _write_shot(folder: Path, shot: PosedShot, taken: set[str]) -> dict:
+    """Write an image and make its entry; ``taken`` are the names so far, to which this one's is added."""
+    camera, suffix, is_png = shot.camera, Path(shot.name).suffix, shot.name.lower().endswith(".png")
+    name = _name_of(folder, f"images/{shot.name}", f"shots: {shot.name!r}")
     if suffix not in SUFFIXES:
-        raise ValueError(f"{shot.name}: expected a name in {', '.join(SUFFIXES)}, but got {suffix!r}")
+        raise mismatch(shot.name, f"a name in {', '.join(SUFFIXES)}", repr(suffix))
     if name in taken:
-        raise ValueError(f"{shot.name}: expected names that differ without their suffix, but got two alike")
+        raise mismatch(shot.name, "names that differ without their suffix", "two alike")
     taken.add(name)
     if shot.split not in ("", *SPLITS):
-        raise ValueError(f"{shot.name}: expected a split of {', '.join(SPLITS)}, but got {shot.split!r}")
-    if pixels.shape[2:] == (4,) and not _is_png(shot.name):
-        raise ValueError(f"{shot.name}: expected 3 channels, as a JPEG has no alpha, but got 4; name it .png")
+        raise mismatch(shot.name, f"a split of {', '.join(SPLITS)}", repr(shot.split))
+    if camera.skew:
+        raise mismatch(shot.name, "a camera without skew", f"a skew of {camera.skew:g}")
     shapes = [(camera.height, camera.width, channels) for channels in (3, 4)]
-    if pixels.dtype != np.uint8 or pixels.shape not in shapes or camera.skew:
-        raise ValueError(
-            f"{shot.name}: expected uint8 pixels of shape {shapes[0]} or {shapes[1]} and no skew, but got "
-            f"{pixels.dtype} of {pixels.shape} and a skew of {camera.skew:g}"
-        )
-
-
-def _write_shot(folder: Path, shot: PosedShot) -> dict:
-    """Write an image and make its entry."""
-    camera = shot.camera
-    entry = {"file_path": f"images/{shot.name}", "w": camera.width, "h": camera.height}
-    entry |= {
-        "fl_x": camera.fx,
-        "fl_y": camera.fy,
-        "cx": camera.cx,
-        "cy": camera.cy,
-        "camera_model": "OPENCV",
-    }
+    pixels = check_pixels(shot.name, shot.pixels, *shapes[: 2 if is_png else 1])  # a JPEG has no alpha
+    entry = {"file_path": f"images/{shot.name}", "w": camera.width, "h": camera.height, "fl_x": camera.fx}
+    entry |= {"fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy, "camera_model": "OPENCV"}
     if camera.lens is not None:
         entry |= dict(zip(("k1", "k2", "k3", "p1", "p2"), camera.lens.k + camera.lens.p))
     if shot.time is not None:
         entry["time"] = number(shot.time, f"{shot.name}: time", 0, 1)
-    entry["transform_matrix"] = (pose_of(camera.camera_to_world.tolist(), shot.name) @ FLIP).tolist()
-    write = write_png if _is_png(shot.name) else write_jpeg
-    write(folder / entry["file_path"], np.asarray(shot.pixels))
+    entry["transform_matrix"] = opengl_rows(camera.camera_to_world, shot.name)
+    write_image(folder / entry["file_path"], pixels)
     return entry
 
 
-def _is_png(name: str) -> bool:
-    return name.lower().endswith(".png")
+def space_of(
+    cameras: Sequence[Camera],
+    where: str,
+    *,
+    near: float | None = None,
+    far: float | None = None,
+    box: Box | None = None,
+    normalise: bool = True,
+    cut_out: bool = False,
+) -> tuple[Normalisation, Box]:
+    """Find the part of the world that cameras of unknown scale look at: how to normalise it, and its box.
 
+    Args:
+        cameras: cameras of all frames; their near and far are not used.
+        where: the file, for errors.
+        near, far, box: what is known, in the file's units; None is derived: ``near`` and ``far`` from the
+            distance to the focus, the point looked at; the box holds all rays between them.
+        cut_out: the images are cut out; then the box holds only what they show around the focus.
+        normalise: put the focus at the origin and the farthest camera at distance 1.
 
-def _check(scale: int, canonical: str, test_every: int, normalise: bool) -> None:
-    """Refuse options that have no meaning."""
-    if type(scale) is not int or scale not in SCALES:
-        raise SceneError(f"data.scale: expected one of {SCALES}, but got {scale!r}")
-    if canonical not in ("middle", "first"):
-        raise SceneError(f"data.canonical: expected middle or first, but got {canonical!r}")
-    whole(test_every, "data.test_every", 2)
-    if not isinstance(normalise, bool):
-        raise SceneError(f"data.normalise: expected true or false, but got {normalise!r}")
+    Raises:
+        SceneError: where something cannot be derived from the cameras.
+    """
+    focus, distances = _focus(cameras, near, far, where)
+    near, far = _range(distances, near, far, where)
+    size = max(float((camera.center - focus).norm()) for camera in cameras) if normalise else 1.0
+    center = tuple(focus.tolist()) if normalise else (0.0, 0.0, 0.0)
+    space = Normalisation(center, 1 / size, near / size, far / size)
 
+    def moved(box: Box) -> Box:
+        return Box(
+            *(tuple((v - c) * space.scale for v, c in zip(end, center)) for end in (box.low, box.high))
+        )
 
-def _load(entry: ImageEntry) -> CachedImage | MaskedImage:
-    size = (entry.camera.width, entry.camera.height)
-    return (
-        CachedImage(entry.image, size) if entry.mask is None else MaskedImage(entry.image, entry.mask, size)
-    )
-
-
-def _is_transparent(entry: ImageEntry) -> bool:
-    """Tell whether any pixel is not opaque; decode the image only where its header says it has alpha."""
-    return entry.has_alpha and bool((_load(entry)()[..., 3] < 255).any())
-
-
-def _limits(
-    file: Path, content: dict, near: float | None, far: float | None, box: Sequence[float] | None
-) -> tuple[float | None, float | None, Box | None]:
-    """Take near, far and box, in the file's units, from the config, else from the file, else None."""
-    least = {"near": 0.0, "far": 1 / MOST_UNITS}
-    found = []
-    for key, value in (("near", near), ("far", far)):
-        where = f"data.{key}" if value is not None else f"{file}: {key}"
-        value = content.get(key) if value is None else value
-        found.append(None if value is None else number(value, where, least[key], MOST_UNITS))
-    if box is not None or content.get("aabb") is None:
-        return *found, None if box is None else box_of(box)
     try:
-        low, high = (tuple(number(v, "aabb", -MOST_UNITS, MOST_UNITS) for v in c) for c in content["aabb"])
-        return *found, Box(low, high)
-    except (TypeError, ValueError) as error:
-        expected = "[[x0, y0, z0], [x1, y1, z1]], each low end below its high end"
-        raise SceneError(f"{file}: aabb: expected {expected}, but got {short(content['aabb'])}") from error
+        if box is not None:
+            return space, moved(box)
+        seen = frustum_box(map(space.camera, cameras))
+        if cut_out:  # the cube around the focus that holds what all images show of it
+            width = max(max(camera.width / camera.fx, camera.height / camera.fy) for camera in cameras)
+            half = 0.5 * float(distances.max()) * width
+            shown = Box(tuple(v - half for v in focus.tolist()), tuple(v + half for v in focus.tolist()))
+            seen = seen.intersection(moved(shown))
+        return space, seen
+    except ValueError as error:
+        advice = "set data.near, data.far and data.box"
+        raise mismatch(where, "cameras that see a part of space", f"none ({error})", advice) from error
+
+
+def _focus(
+    cameras: Sequence[Camera], near: float | None, far: float | None, where: str
+) -> tuple[Tensor, Tensor]:
+    """Find the focus (3,) and its distances along the optical axes of the cameras that face it, float64."""
+    centers = torch.stack([camera.center for camera in cameras])
+    axes = torch.stack([camera.camera_to_world[:3, 2] for camera in cameras])
+    radius, is_open = float((centers - centers.mean(0)).norm(dim=-1).max()), near is None or far is None
+    ahead = _AHEAD * radius if is_open else 0.5 * (near + far)
+    if is_open and radius <= _SAME_PLACE * (1 + float(centers.abs().max())):
+        raise mismatch(where, "cameras that move", "one place", "set data.near and data.far")
+    focus = focus_point([replace(camera, near=0.0, far=2 * ahead) for camera in cameras])
+    distances = ((focus - centers) * axes).sum(-1)
+    if not _LEAST * ahead < float(distances.median()) < _MOST * ahead:
+        # The axes are nearly parallel or diverge: only the direction of view can be trusted.
+        axis = axes.mean(0)
+        focus = centers.mean(0) + ahead * axis / axis.norm().clamp(min=0.1)
+        distances = ((focus - centers) * axes).sum(-1)
+    distances = distances[distances > _LEAST * ahead]
+    if not len(distances):
+        expected, advice = "cameras that look at something in common", "remove those that look away"
+        raise mismatch(where, expected, "views in all directions", advice)
+    return focus, distances
+
+
+def _range(distances: Tensor, near: float | None, far: float | None, where: str) -> tuple[float, float]:
+    """Choose near and far in the file's units; log what is derived."""
+    derived = " and ".join(name for name, value in (("near", near), ("far", far)) if value is None)
+    low, high = _NEAR * float(distances.min()), _FAR * float(distances.max())
+    near, far = (
+        (low if far is None else min(low, far / 2)) if near is None else near,
+        (high if near is None else max(high, 2 * near)) if far is None else far,
+    )
+    if not near < far:
+        raise mismatch(where, "near < far", f"{near:g} and {far:g}", "set data.near, data.far")
+    if derived:
+        log.warning(
+            f"{where}: {derived} derived from the cameras: near {near:.4g}, far {far:.4g} in the file's "
+            "units; where something is cut off or blurred set data.near and data.far"
+        )
+    return near, far
