@@ -78,16 +78,12 @@ def test_known_points_project_by_the_formats_formulas(tmp_path, made):
 
 def test_points_that_never_move_are_in_the_scenes_units(tmp_path):
     points = np.random.default_rng(0).uniform(-20, 20, (7, 3)) + MIDDLE.numpy()
-    for given in (points, None):  # an old scene's points do not stay
-        write_scene(tmp_path / "toy", shots(), near=20.0, far=120.0, points=given)
-        scene = read_scene(tmp_path, "toy")
-        if given is None:
-            assert scene.still is None
-            return
-        assert scene.still.dtype == torch.float32
-        frame, camera = next(iter(frames_of(scene).values())), cameras(10)[0]
-        before, after = camera.project(torch.from_numpy(points)), frame.camera.project(scene.still.double())
-        torch.testing.assert_close(before[0], after[0], atol=1e-3, rtol=0)
+    write_scene(tmp_path / "toy", shots(), near=20.0, far=120.0, points=points)
+    scene = read_scene(tmp_path, "toy")
+    assert scene.still.dtype == torch.float32
+    frame, camera = next(iter(frames_of(scene).values())), cameras(10)[0]
+    before, after = camera.project(torch.from_numpy(points)), frame.camera.project(scene.still.double())
+    torch.testing.assert_close(before[0], after[0], atol=1e-3, rtol=0)
 
 
 def test_each_frame_may_have_its_own_camera(made):
@@ -121,19 +117,10 @@ def test_given_times_are_kept(tmp_path, made):
     assert scene.protocol["times"] == "as given"
 
 
-@pytest.mark.parametrize(
-    ("count", "every", "held"),
-    [
-        (10, 2, [2, 4, 6, 8]),
-        (10, 3, [2, 5, 8]),
-        (6, 8, [5]),
-        (13, 8, [5]),
-        (21, 8, [5, 13]),
-        (4, 2, [2]),
-        (5, 8, [4]),
-        (3, 8, [2]),
-    ],
-)
+HELD = [(10, 2, [2, 4, 6, 8]), (10, 3, [2, 5, 8]), (13, 8, [5]), (21, 8, [5, 13]), (5, 8, [4]), (3, 8, [2])]
+
+
+@pytest.mark.parametrize(("count", "every", "held"), HELD)
 def test_every_nth_frame_is_held_out_but_never_the_first_or_the_last(tmp_path, count, every, held):
     write_tiny(tmp_path / "toy", count=count)
     scene = read_scene(tmp_path, "toy", test_every=every)
@@ -155,9 +142,7 @@ def test_lists_choose_the_splits(tmp_path, made):
 
 
 def test_nothing_depends_on_the_unit(tmp_path):
-    unit = 1e3
-
-    views = cameras(10)
+    unit, views = 1e3, cameras(10)
     for view in views:
         view.camera_to_world[:3, 3] *= unit
     write_tiny(tmp_path / "a", near=None, far=None)
@@ -165,17 +150,16 @@ def test_nothing_depends_on_the_unit(tmp_path):
     a, b = read_scene(tmp_path, "a"), read_scene(tmp_path, "b")
     assert a.box.low == pytest.approx(b.box.low)
     assert a.box.high == pytest.approx(b.box.high)
-    for one, two in zip(a.train, b.train, strict=True):
-        torch.testing.assert_close(one.camera.camera_to_world, two.camera.camera_to_world)
-        assert (one.camera.near, one.camera.far) == pytest.approx((two.camera.near, two.camera.far))
+    for camera, same in zip((f.camera for f in a.train), (f.camera for f in b.train), strict=True):
+        torch.testing.assert_close(camera.camera_to_world, same.camera_to_world)
+        assert (camera.near, camera.far) == pytest.approx((same.near, same.far))
     assert max(float(f.camera.center.norm()) for f in a.train) <= 1 + 1e-9
     assert a.protocol["normalisation"]["scale"] == pytest.approx(unit * b.protocol["normalisation"]["scale"])
 
 
-def test_derived_ends_hold_what_is_looked_at_and_are_said(tmp_path, caplog):
-    write_tiny(tmp_path / "toy", near=None, far=None)
+def test_derived_ends_hold_what_is_looked_at_and_are_said(made, caplog):
     with caplog.at_level(logging.WARNING):
-        scene = read_scene(tmp_path, "toy")
+        scene = made(near=None, far=None)
     assert "toy/transforms.json: near and far derived from the cameras: near 14, far 175" in caplog.text
     assert scene.protocol["derived"] == ["near", "far", "box"]
     camera = scene.train[0].camera
@@ -184,9 +168,8 @@ def test_derived_ends_hold_what_is_looked_at_and_are_said(tmp_path, caplog):
     assert all(low < 0 < high for low, high in zip(scene.box.low, scene.box.high))
 
 
-def test_ends_come_from_the_config_then_from_the_file(tmp_path):
-    write_tiny(tmp_path / "toy")
-    scale = read_scene(tmp_path, "toy").protocol["normalisation"]["scale"]
+def test_ends_come_from_the_config_then_from_the_file(tmp_path, made):
+    scale = made().protocol["normalisation"]["scale"]
     for options, expected in (({}, (20, 120)), ({"near": 30}, (30, 120)), ({"near": 5, "far": 60}, (5, 60))):
         camera = read_scene(tmp_path, "toy", **options).train[0].camera
         assert (camera.near / scale, camera.far / scale) == pytest.approx(expected)
@@ -200,8 +183,8 @@ def test_a_box_is_in_the_files_units(tmp_path, made):
         assert [v / known["scale"] + c for v, c in zip(end, known["center"])] == pytest.approx(expected)
     assert scene.protocol["derived"] == []
     assert read_scene(tmp_path, "toy", normalise=False).box == box
-    other = read_scene(tmp_path, "toy", normalise=False, box=[0, 0, 0, 1, 1, 1]).box
-    assert other == Box((0, 0, 0), (1, 1, 1))
+    unit = read_scene(tmp_path, "toy", normalise=False, box=[0, 0, 0, 1, 1, 1]).box
+    assert unit == Box((0, 0, 0), (1, 1, 1))
 
 
 def looking_out(span):
@@ -244,24 +227,16 @@ def test_a_camera_in_one_place_needs_an_end(tmp_path, turn):
         assert f.camera.near < float(-f.camera.center @ f.camera.camera_to_world[:3, 2]) < f.camera.far
 
 
-def masked(folder):
-    write_tiny(folder)
-    mask = np.zeros((20, 30, 3), np.uint8)
+def test_masks_become_alpha(tmp_path, made):
+    bare, mask = made(), np.zeros((20, 30, 3), np.uint8)
     mask[5:12, 8:20] = 255
     for i in range(10):
-        write_image(folder / "masks" / f"m_{i}.png", mask)
-    edit(folder / FILE, {f"frames.{i}.mask_path": f"masks/m_{i}" for i in range(10)})
-    return mask[..., 0] > 0
-
-
-def test_masks_become_alpha(tmp_path):
-    mask = masked(tmp_path / "toy")
-    scene = read_scene(tmp_path, "toy")
+        write_image(tmp_path / "toy" / "masks" / f"m_{i}.png", mask)
+    edit(tmp_path / "toy" / FILE, {f"frames.{i}.mask_path": f"masks/m_{i}" for i in range(10)})
+    scene, mask = read_scene(tmp_path, "toy"), mask[..., 0] > 0
     assert scene.has_alpha
     assert np.array_equal(scene.train[0].load()[..., 3] > 0, mask)
-    without = read_scene(tmp_path, "toy", near=20, far=120)
-    write_tiny(tmp_path / "bare")
-    assert without.box.diagonal < read_scene(tmp_path, "bare").box.diagonal
+    assert scene.box.diagonal < bare.box.diagonal
     pixels = next(shots(channels=4)).pixels
     for i in range(10):
         write_image(tmp_path / "toy" / "images" / f"frame_{i + 1}.png", pixels)
