@@ -2,14 +2,22 @@
 
 import os
 
+import pytest
 import yaml
 
+from forewarp.report import figures
 from forewarp.report.benchmark import Published
 from forewarp.report.choices import choices, write_accuracy_time, write_effects, write_price_list
 from forewarp.report.results import read_runs
 from tests.support.runs_on_disk import rows_of, write_run
 
 SLOW, QUICK = ((10, 20.0), (20, 24.0), (40, 25.0)), ((5, 24.0), (10, 24.9), (20, 26.0))
+
+
+@pytest.fixture(autouse=True)
+def unsaved(monkeypatch):
+    """Pictures are not laid out and written, which takes most of the time."""
+    monkeypatch.setattr(figures, "save", lambda figure, path: path)
 
 
 def test_each_decibel_names_the_first_to_reach_it_in_all_seeds(tmp_path):

@@ -183,9 +183,9 @@ def test_an_effect_names_what_was_typed_and_an_option_that_says_something(tmp_pa
 
 def test_pictures_and_video_are_made_smaller_until_the_page_fits(tmp_path):
     folder = told_run(tmp_path)
-    film = write_video(tmp_path / "film.mp4", (noise(160, i) for i in range(20)), fps=10)
+    film = write_video(tmp_path / "film.mp4", (noise(128, i) for i in range(12)), fps=10)
     media = Media([shown("best", 300), shown("worst", 300)], film, "once around")
-    large, small = write(folder, media, 40), write(folder, media, 0.35)
+    large, small = write(folder, media, 40), write(folder, media, 0.2)
     assert "Pictures are JPEG of quality 92." in large.text
     assert "Once around." in large.text
     assert re.search(r"Pictures are JPEG of quality \d+, scaled from 300 to \d+ pixels", small.text)
