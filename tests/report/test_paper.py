@@ -4,6 +4,7 @@ import base64
 import json
 import os
 import re
+import sys
 
 import imageio.v3 as iio
 import numpy as np
@@ -178,6 +179,14 @@ def test_pages_tell_how_numbers_came_about(whole):
     assert r"\resizebox{\textwidth}{!}{%" in latex
     assert r"\underline{" in latex or r"\textbf{" in latex
     assert r"\footnotesize machine: a cpu, 2 threads, torch 2" in latex
+
+
+def test_without_matplotlib_the_page_says_why_it_has_no_figure(tmp_path, monkeypatch):
+    for side in (20, 40):
+        paper_run(tmp_path, "broom2", f"resolution [[0, {side**3}]]", dataset="hypernerf")
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    write_paper(tmp_path, tmp_path / "out")
+    assert "install forewarp[plots]" in (tmp_path / "out" / "paper.md").read_text().split("## Figures")[1]
 
 
 def test_a_scene_with_one_kind_of_view_is_measured_by_it(tmp_path):

@@ -221,6 +221,11 @@ def test_the_markup_of_the_views_is_within_the_limit(tmp_path, count, name):
             "not subscriptable",
         ),
         ("coarse/done.json", '{"steps": 3}', "no key 'seconds'"),
+        (
+            "config.yaml",
+            "{data: {scene: a}, model: {name: b}, preset: {name: c}, seed: 0, budget: {minutes: x}}",
+            "must be real number",
+        ),
     ],
 )
 def test_a_broken_file_ends_in_one_line(tmp_path, file, content, says):
