@@ -24,8 +24,8 @@ def exporter(kind, **defaults):
 
 
 @pytest.fixture(scope="session")
-def _particles(tmp_path_factory):
-    data = small_data(tmp_path_factory.mktemp("scenes"))
+def _particles():
+    data = small_data()
     module = shaken(module_with(data, **EVERY | {"view_dependence": 2}))
     module.method.opacity.data += 1
     return Source(module, "particles", [frame.camera for frame in data.scene.train], TIMES)
