@@ -17,7 +17,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 
 from forewarp.cli.view import require_viewer
-from forewarp.data.files import MARKERS, scene_folder
+from forewarp.data.files import scene_folder
 from forewarp.runs.config import check_planned, hashed, resumed, trust_of
 from forewarp.runs.overrides import key_of, typed_overrides
 
@@ -142,7 +142,7 @@ def refuse_missing_scene(config: DictConfig) -> None:
     """
     reader = READERS.get(config.data.get("_target_"))
     if reader is not None and config.get("absent", "refuse") == "refuse":
-        scene_folder(Path(config.data.root).expanduser(), str(config.data.scene), MARKERS[reader])
+        scene_folder(Path(config.data.root).expanduser(), str(config.data.scene), reader)
 
 
 def refuse_seeds(config: DictConfig) -> None:
