@@ -349,7 +349,9 @@ def test_the_second_stage_of_ndvg_goes_on_where_the_first_ended():
     hidden = second.canonical.density[:, 0] == -100
     assert 0.3 < float(hidden.float().mean()) < 1
     assert 0 < float(second.occupancy.occupied.float().mean()) < 1
-    third = NDVG(replace(begun, numbers={"num_voxels": [[0, 9**3]], "carry": True}), **SMALL["ndvg"])
+    third = NDVG(
+        replace(begun, numbers={"num_voxels": [[0, 9**3]], "carry": True, "masked": False}), **SMALL["ndvg"]
+    )
     carried, left = (
         m.activation.sigma(m.canonical.density)[
             m.canonical.lattice.to_world(m.canonical.voxels).norm(dim=-1) < 0.2

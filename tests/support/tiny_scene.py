@@ -87,7 +87,7 @@ def ball_data(rays=256, seed=0, **changes):
 
 RADIANCE = partial(DirectRadiance, alpha_init=1e-2, alpha_threshold=1e-4)
 FEATURES = partial(FeatureRadiance, alpha_init=1e-2, alpha_threshold=0.0, width=8)
-INPAINTER = partial(UNet3d, levels=2)
+INPAINTER = partial(UNet3d, width=16, levels=2)
 EVERYTHING = {
     "radiance": FEATURES,
     "view_dependence": ViewNetwork,

@@ -105,7 +105,7 @@ class TrajectoryField(nn.Module):
         bases: int,
         frames: int,
         canonical_time: float,
-        nodes: int = 25,
+        nodes: int = 0,
         features: int = 0,
         width: int = 64,
         layers: int = 4,

@@ -47,13 +47,13 @@ class NDVGStage:
         masked: leave canonical voxels empty for good where the stage before has less than ``box_alpha``.
     """
 
-    deformation_voxels: float = (190 / 160) ** 3
+    deformation_voxels: float = 1.675
     view_dependence: bool = True
     alpha_init: float = 1e-2
     sink: float = 1.0
     box_alpha: float = 1e-3
     carry: bool = False
-    masked: bool = False
+    masked: bool = True
 
     def checked(self, where: str) -> NDVGStage:
         """Return this; ``ValueError`` for a number out of range, naming its key in ``where``."""

@@ -189,7 +189,7 @@ class UNet3d(nn.Module):
         self,
         *,
         channels: int,
-        width: int = 16,
+        width: int = 64,
         levels: int = 4,
         margin: int = 4,
         coverage_channel: bool = False,
