@@ -29,14 +29,8 @@ class FieldAtTime(Protocol):
     """
 
     lattice: Lattice
-
-    @property
-    def voxel_size(self) -> float:
-        """Size of the finest voxels, in world units; a ray's step is a share of this."""
-
-    @property
-    def cells(self) -> Tensor:
-        """Cells (X-1, Y-1, Z-1) bool that may hold matter."""
+    voxel_size: float  # of the finest voxels, in world units; a ray's step is a share of this
+    cells: Tensor  # (X-1, Y-1, Z-1) bool, that may hold matter
 
     def density(self, points: Tensor) -> Tensor:
         """Density (P,), per world unit of length."""
@@ -202,7 +196,8 @@ class VoxelGrid(nn.Module):
                 values[new] = births[name]
             else:
                 values[new] = self._neighbour_mean(old.data, voxels[new])
-            self._renew(name, values)
+            # A new Parameter, as autograd keeps the shape of the old one while any graph lives.
+            setattr(self, name, nn.Parameter(values))
         self._place(self.lattice, voxels)
         return rows
 
@@ -220,12 +215,8 @@ class VoxelGrid(nn.Module):
             p = self.parameter(name)
             fill = p.data.new_full((p.shape[1],), empty.get(name, 0.0))
             values = trilinear(p.data, self.index, points, fill)
-            self._renew(name, values if name in empty else values / share)
+            setattr(self, name, nn.Parameter(values if name in empty else values / share))
         self._place(lattice, voxels)
-
-    def _renew(self, name: str, values: Tensor) -> None:
-        # A new Parameter, as autograd keeps the shape of the old one while any graph lives.
-        setattr(self, name, nn.Parameter(values))
 
     def _place(self, lattice: Lattice, voxels: Tensor) -> None:
         self.lattice = lattice
@@ -233,12 +224,12 @@ class VoxelGrid(nn.Module):
         self.index = index_of(voxels, lattice.shape)
 
     def _neighbour_mean(self, values: Tensor, voxels: Tensor) -> Tensor:
-        last = torch.tensor(self.lattice.shape, device=voxels.device) - 1
+        last = voxels.new_tensor(self.lattice.shape) - 1
         total = values.new_zeros(len(voxels), values.shape[1])
         count = values.new_zeros(len(voxels), 1)
         for offset in torch.cartesian_prod(*[torch.arange(-1, 2)] * 3).to(voxels.device):
             at = voxels + offset
-            inside = ((at >= 0) & (at <= last)).all(-1)
+            inside = self.lattice.holds(at)
             x, y, z = torch.minimum(at.clamp(min=0), last).unbind(-1)
             row = torch.where(inside, self.index[x, y, z].long(), -1)
             there = (row >= 0)[:, None]
@@ -468,7 +459,7 @@ def read_strided(grid: VoxelGrid, points: Tensor, strides: Sequence[int], *, pad
     values, (index, strided) = grid.parameter(grid.names[0]), _indices(grid, tuple(strides), padded)
     lattice = grid.lattice
     at, last = lattice.to_lattice(points), points.new_tensor(lattice.shape) - 1
-    inside = ((at >= 0) & (at <= last)).all(-1, keepdim=True)
+    inside = lattice.holds(at)[..., None]
     at = at * ((points.new_tensor(index.shape) - 1) / last)
     zero = values.new_zeros(values.shape[1])
     read = [trilinear(values, one, at / stride, zero) for one, stride in zip(strided, strides)]

@@ -289,7 +289,7 @@ class NDVGField:
         self.offsets, mask = self.offset(points)
         placed = points + self.offsets
         at = canonical.lattice.to_lattice(placed.detach())
-        inside = ((at >= 0) & (at <= at.new_tensor(canonical.lattice.shape) - 1)).all(-1)
+        inside = canonical.lattice.holds(at)
         step = method.marching.step * method.lattice_marched.voxel_size
         alpha = inside * mask * method.activation.alpha(_read(canonical, "density", placed)[:, 0], step)
 

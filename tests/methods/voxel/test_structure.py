@@ -1,3 +1,5 @@
+"""How a stage changes voxel grids: schedules, active voxels, lattices, bounds."""
+
 from functools import partial
 
 import pytest
@@ -5,9 +7,21 @@ import torch
 
 from forewarp.fields.grids import DirectRadiance
 from forewarp.methods.voxel.backward import Deformation
-from forewarp.methods.voxel.structure import refresh, resample, seen_rows
+from forewarp.methods.voxel.structure import VoxelStage, refresh, resample, seen_rows
 from forewarp.scene.box import Box, Lattice
 from tests.support.tiny_scene import BOX, backward_model, built, forward_model
+
+
+def numbers(**changes):
+    return VoxelStage(**({"name": "coarse", "num_voxels": [[0, 8000]]} | changes))
+
+
+def test_schedules_hold_until_the_next_entry():
+    made = numbers(num_voxels=[[0, 10], [0.5, 20], [0.75, 30]])
+    assert [made.at("num_voxels", f) for f in (0, 0.49, 0.5, 0.74, 0.75, 1)] == [10, 10, 20, 20, 30, 30]
+    assert made.at("bases", 0.5) is None
+    assert numbers(num_voxels=[[0.2, 10]]).at("num_voxels", 0.0) == 10  # the first holds from the beginning
+
 
 SHAPE = (6, 5, 7)
 LATTICE = Lattice(Box((0, 0, 0), (5, 4, 6)), SHAPE)
