@@ -72,11 +72,13 @@ def returned(monkeypatch):
     """What the jobs gave to Hydra, in order."""
     from hydra.core import utils
 
-    values, setter = [], utils.JobReturn.return_value.fset
-    kept = property(
-        utils.JobReturn.return_value.fget, lambda job, value: (values.append(value), setter(job, value))
-    )
-    monkeypatch.setattr(utils.JobReturn, "return_value", kept)
+    values, before = [], utils.JobReturn.return_value
+
+    def keep(job, value):
+        values.append(value)
+        before.fset(job, value)
+
+    monkeypatch.setattr(utils.JobReturn, "return_value", property(before.fget, keep))
     return values
 
 
@@ -135,7 +137,4 @@ def test_another_metric_is_refused_with_a_list(refused, fitted, in_tmp, word):
     assert line.startswith("score: expected a metric of validation views (psnr, psnr_box, ssim, ms_ssim, ")
     assert "lpips_squeeze" in line
     assert not list(in_tmp.iterdir())
-
-
-def test_null_is_no_metric():
     assert named(None) is None

@@ -1,4 +1,3 @@
-import io
 import re
 from dataclasses import replace
 from functools import partial
@@ -55,71 +54,48 @@ def watched(tmp_path_factory):
     return watched_run(folder, *all_watchers(), record).fit(), folder, record.losses
 
 
-@pytest.fixture(scope="module")
-def events(watched):
-    return events_of(watched[1])
-
-
-class Terminal(io.StringIO):
-    """A stream that claims to be a terminal."""
-
-    def isatty(self):
-        return True
-
-
 def test_lines_where_there_is_no_terminal(tmp_path, capsys):
     progress = StageProgress(every=0)
     progress.later = 7200.0
     watched_run(tmp_path, progress).fit()
     lines = [line for line in capsys.readouterr().err.splitlines() if "compiling" not in line]
     assert len(lines) == STEPS + 1
-    shape = (
-        r"coarse +(\d+)% \| (.*) \| train psnr -?[\d.]+ \| loss [\d.]+ \| frames (\d+)/12 \| "
-        r"voxels [\d,]+( \| [\d.]+ steps/s)?"
-    )
-    found = [re.fullmatch(shape, line) for line in lines]
-    assert all(found), lines
-    assert all(
-        re.fullmatch(r"\d+:\d\d left \| 2:\d\d:\d\d to the end of the run", match[2]) for match in found[:-1]
-    )
-    assert re.fullmatch(r"\d+:\d\d trained", found[-1][2])
-    percents = [int(match[1]) for match in found]
+    shape = r"coarse +(\d+)% \| (.*) \| train psnr -?[\d.]+ \| loss [\d.]+ \| frames (\d+)/12 \| "
+    shape += r"voxels [\d,]+( \| [\d.]+ steps/s)?"
+    shown = [re.fullmatch(shape, line) for line in lines]
+    assert all(shown), lines
+    left = r"\d+:\d\d left \| 2:\d\d:\d\d to the end of the run"
+    assert all(re.fullmatch(left, match[2]) for match in shown[:-1])
+    assert re.fullmatch(r"\d+:\d\d trained", shown[-1][2])
+    percents = [int(match[1]) for match in shown]
     assert percents == sorted(percents)
     assert percents[-2:] == [100, 100]
-    assert [found[0][3], found[-1][3]] == ["10", "12"]
-    assert [bool(match[4]) for match in found] == [False] + [True] * STEPS  # none is timed by the first step
+    assert [shown[0][3], shown[-1][3]] == ["10", "12"]
+    assert [bool(match[4]) for match in shown] == [False] + [True] * STEPS  # none is timed by the first step
 
 
-def test_a_terminal_gets_a_bar_that_is_not_drawn_too_often(monkeypatch):
-    now = [100.0]
-    monkeypatch.setattr("forewarp.progress.time.perf_counter", lambda: now[0])
-    stream = Terminal()
-    line = ProgressLine("fine", refresh=0.25, stream=stream)
-    assert line.due()
-    line.show(0.5, 65, "psnr 30 dB")
-    assert not line.due()
-    now[0] += 0.26
-    assert line.due()
-    line.close(1.0, "done")
-    text = stream.getvalue()
-    assert all(part in text for part in ("fine", "50% | 1:05 left | psnr 30 dB", "100% | done", "━"))
-    assert text.endswith("\x1b[?25h")  # the cursor is back
-
-
-def test_every_named_curve_is_there(watched, events):
+def test_every_named_curve_is_there_and_a_mean_over_the_steps_between(watched):
+    module, folder, losses = watched
+    events = events_of(folder)
     terms = {f"train/loss/{name}" for name in ("photo", "point_color", "tv_flow")}
     counts = {"frames_in_play", "occupied_voxels", "coverage", "dropped_voxels", "samples", "bases_in_play"}
     rates = {f"lr/{kind}" for kind in ("density", "color", "shading", "flow")}
     expected = {"train/loss", "train/psnr"} | terms | {f"train/{name}" for name in counts} | rates
     assert expected <= set(events.Tags()["scalars"])
-
-
-def test_the_validation_curve_is_the_psnr_of_the_moments(watched, events):
+    curve = events.Scalars("train/loss")
+    assert [point.step for point in curve] == [5, 10, 12]
+    assert curve[1].value == pytest.approx(sum(losses[5:10]) / 5, rel=1e-5)
+    assert curve[2].value == pytest.approx(sum(losses[10:]) / 2, rel=1e-5)
     curve = events.Scalars("val/psnr")
     assert [point.step for point in curve] == [3, 6, 12]
     assert curve[2].value > curve[0].value
     target = ball_data().targets("val")[0]  # fewer pixels than psnr_rays: all of them
-    assert curve[2].value == pytest.approx(float(watched[0].psnr_of(target)), abs=1e-4)
+    assert curve[2].value == pytest.approx(float(module.psnr_of(target)), abs=1e-4)
+    names = ("compare", "depth", "flow")
+    files = sorted(path.name for path in (folder / "coarse" / "images").iterdir())
+    assert files == sorted(f"{moment}_{name}.png" for moment in ("025", "050", "100") for name in names)
+    for name in names:
+        assert [image.step for image in events.Images(f"images/{name}")] == [3, 6, 12]
 
 
 def test_without_validation_views_there_is_no_validation_curve(tmp_path):
@@ -130,21 +106,6 @@ def test_without_validation_views_there_is_no_validation_curve(tmp_path):
     tags = events_of(tmp_path).Tags()
     assert tags["images"]
     assert "val/psnr" not in tags["scalars"]
-
-
-def test_curves_are_means_over_the_steps_between(watched, events):
-    curve, losses = events.Scalars("train/loss"), watched[2]
-    assert [point.step for point in curve] == [5, 10, 12]
-    assert curve[1].value == pytest.approx(sum(losses[5:10]) / 5, rel=1e-5)
-    assert curve[2].value == pytest.approx(sum(losses[10:]) / 2, rel=1e-5)
-
-
-def test_pictures_are_in_tensorboard_and_on_disk(watched, events):
-    names = ("compare", "depth", "flow")
-    files = sorted(path.name for path in (watched[1] / "coarse" / "images").iterdir())
-    assert files == sorted(f"{moment}_{name}.png" for moment in ("025", "050", "100") for name in names)
-    for name in names:
-        assert [image.step for image in events.Images(f"images/{name}")] == [3, 6, 12]
 
 
 def test_an_interrupted_watched_run_ends_as_an_unwatched_one(tmp_path, tmp_path_factory, capsys):

@@ -27,11 +27,8 @@ def test_round_trip(tmp_path, moving):
     assert read.notes == notes
     for name in ("points", "colors", "opacity"):
         assert torch.equal(getattr(read.cloud, name), getattr(cloud, name))
-    if moving:
-        assert torch.equal(read.times, times)
-        assert torch.equal(read.paths, paths)
-    else:
-        assert (read.times, read.paths) == (None, None)
+    assert (read.times is None) == (read.paths is None) == (not moving)
+    assert not moving or (torch.equal(read.times, times) and torch.equal(read.paths, paths))
 
 
 def _numbers(**changes):
@@ -57,9 +54,7 @@ def test_what_is_no_handover_is_refused_in_one_line(tmp_path, spoil):
     save_handover(Handover(BOX, True, 3, cloud, notes={"density_scale": 0.1}), tmp_path)
     load_handover(tmp_path)
     spoil(tmp_path / "handover.json", tmp_path / "handover.pt")
-    with pytest.raises(
-        ValueError, match=r"handover\.\w+: expected what a stage leaves to the next, but got something"
-    ):
+    with pytest.raises(ValueError, match=r"handover\.\w+: expected what a stage leaves to the next, but got"):
         load_handover(tmp_path)
 
 
@@ -86,7 +81,7 @@ def test_the_box_holds_what_the_stage_calls_matter():
     assert make_handover(ball_method(SCENE, raw=2.0, box_alpha=0.01), SCENE, None, 6).tight
 
 
-def test_a_stage_leaves_its_matter_and_the_paths_of_it():
+def test_a_stage_leaves_its_matter_and_the_paths_of_it_or_a_sample(monkeypatch):
     method = ball_method(SCENE)
     handover = make_handover(method, SCENE, None, 6)
     cloud, matter = handover.cloud, method.matter()
@@ -96,12 +91,9 @@ def test_a_stage_leaves_its_matter_and_the_paths_of_it():
     assert cloud.size == method.radiance.lattice.voxel_size
     assert handover.times.tolist() == pytest.approx(list(SCENE.times))
     assert torch.equal(handover.paths, method.trajectories(cloud.points, handover.times))
-
-
-def test_of_much_matter_and_many_times_a_sample_is_left(monkeypatch):
     monkeypatch.setattr("forewarp.training.handover._POINTS", 7)
     monkeypatch.setattr("forewarp.training.handover._TIMES", 3)
-    handover = make_handover(ball_method(SCENE), SCENE, None, 6)
+    handover = make_handover(method, SCENE, None, 6)
     assert handover.paths.shape == (7, 3, 3)
     assert handover.times.tolist() == pytest.approx([SCENE.times[i] for i in (0, 2, 4)], abs=0.21)
 
@@ -117,19 +109,16 @@ def test_a_stage_that_found_nothing_keeps_its_box_and_says_so(box):
     assert len(handover.cloud) == 0
 
 
-def test_matter_that_has_left_the_scene_is_none():
-    class Astray(Method):
-        def bounds(self, times):
-            return Box((9.0, 9.0, 9.0), (10.0, 10.0, 10.0))
+class Astray(Method):
+    """A method that moved out of the scene, and can tell nothing else."""
 
-    assert make_handover(Astray(), SCENE, None, 4) == Handover(BOX, False, 4)
+    def bounds(self, times):
+        return Box((9.0, 9.0, 9.0), (10.0, 10.0, 10.0))
 
 
-def test_of_a_method_that_can_tell_nothing_the_box_is_left(tmp_path):
-    class Least(Method):
-        pass
-
-    handover = make_handover(Least(), SCENE, None, 4)
+@pytest.mark.parametrize("method", [Astray, Method])
+def test_of_a_method_that_can_tell_nothing_the_box_is_left(tmp_path, method):
+    handover = make_handover(method(), SCENE, None, 4)
     assert handover == Handover(BOX, False, 4)
     save_handover(handover, tmp_path)
     assert load_handover(tmp_path) == handover

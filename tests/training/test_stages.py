@@ -39,8 +39,10 @@ def stages(**changes):
     return [coarse, stage("fine", num_voxels=[[0, 11**3], [0.5, 14**3]], **(common | changes))]
 
 
-def run(folder, callbacks=(), **changes):
-    return make_run(folder, stages(**changes), data=ball_data(rays=64, size=16), callbacks=callbacks)
+def run(folder, callbacks=(), plan=None, **changes):
+    """A run of the stages of ``plan``, or of ``stages(**changes)``, over small images."""
+    plan = stages(**changes) if plan is None else plan
+    return make_run(folder, plan, data=ball_data(rays=64, size=16), callbacks=callbacks)
 
 
 @pytest.fixture(scope="module")
@@ -79,20 +81,17 @@ def test_another_seed_gives_another_run(tmp_path, whole):
     assert not same(other, whole[1])
 
 
-def test_a_stage_that_ended_before_it_was_noted_only_notes_it(tmp_path, whole):
-    shutil.copytree(whole[0], tmp_path, dirs_exist_ok=True)
-    (tmp_path / "fine" / "done.json").unlink()
-    again = run(tmp_path).fit()
-    assert same(again, whole[1])
-    assert run(tmp_path).finished()["fine"]["steps"] == 10
-
-
-def test_a_finished_run_is_not_run_again(tmp_path, whole):
+def test_a_finished_run_is_loaded_and_one_that_was_not_noted_only_noted(tmp_path, whole):
     shutil.copytree(whole[0], tmp_path, dirs_exist_ok=True)
     before = {p: p.stat().st_mtime_ns for p in tmp_path.rglob("*") if p.is_file()}
     assert same(run(tmp_path, [Crash()]).fit(), whole[1])
     assert same(run(tmp_path).load(), whole[1])
     assert before == {p: p.stat().st_mtime_ns for p in tmp_path.rglob("*") if p.is_file()}
+    (tmp_path / "fine" / "done.json").unlink()
+    with pytest.raises(ValueError, match="fine: expected a finished stage, but got none; continue with"):
+        run(tmp_path).load()
+    assert same(run(tmp_path).fit(), whole[1])
+    assert run(tmp_path).finished()["fine"]["steps"] == 10
 
 
 def test_what_a_run_leaves(whole):
@@ -104,9 +103,9 @@ def test_what_a_run_leaves(whole):
     assert done["fine"]["seconds"] > 0
     assert done["fine"]["frames_in_play"] == 12
     handover = json.loads((folder / "coarse" / "handover.json").read_text())
-    box = module.method.radiance.lattice.box
-    assert box.low == pytest.approx(tuple(handover["low"]))
-    assert module.method.radiance.lattice.count == pytest.approx(14**3, rel=0.3)
+    lattice = module.method.radiance.lattice
+    assert lattice.box.low == pytest.approx(tuple(handover["low"]))
+    assert lattice.count == pytest.approx(14**3, rel=0.3)
     assert module.method.motion.trajectory.bases_in_play == 4
 
 
@@ -120,9 +119,8 @@ def test_what_a_run_leaves(whole):
     ],
 )
 def test_a_mistake_in_a_later_stage_is_refused_before_anything_is_trained(tmp_path, wrong, text):
-    plan = [stage("coarse"), stage("fine", **wrong)]
     with pytest.raises((TypeError, ValueError), match=text):
-        make_run(tmp_path, plan, data=ball_data(rays=64, size=16)).fit()
+        run(tmp_path, plan=[stage("coarse"), stage("fine", **wrong)]).fit()
     assert not (tmp_path / "coarse" / "last.ckpt").exists()
 
 
@@ -155,11 +153,6 @@ def test_rates_bases_lattice_and_frames_follow_the_fraction(tmp_path):
     assert len(set(lattices[:5])) == len(set(lattices[5:])) == 1
     assert lattices[5] > lattices[4]
     assert playing == (2, 4, 6, 8, 10, 12, 12, 12, 12, 12)
-
-
-def test_an_unfinished_run_cannot_be_loaded(tmp_path):
-    with pytest.raises(ValueError, match="coarse: expected a finished stage, but got none; continue with"):
-        run(tmp_path).load()
 
 
 CLEARED = Path("/proc/self/clear_refs")
@@ -202,9 +195,9 @@ def test_the_commit_of_the_code_is_known_in_its_checkout_alone(monkeypatch, tmp_
 
 def test_every_stage_counts_its_own_memory(tmp_path, monkeypatch):
     order = []
-    monkeypatch.setattr("forewarp.training.stages.reset_peak_memory", lambda: order.append("reset"))
-    monkeypatch.setattr("forewarp.training.stages.peak_memory_bytes", lambda: order.append("peak") or 7)
-    ours = run(tmp_path, iterations=2)
+    monkeypatch.setattr(stages_module, "reset_peak_memory", lambda: order.append("reset"))
+    monkeypatch.setattr(stages_module, "peak_memory_bytes", lambda: order.append("peak") or 7)
+    ours = run(tmp_path, plan=[stage("coarse", iterations=2), stage("fine", iterations=2)])
     ours.fit()
     ours.fit()  # all is finished
     assert order == ["reset", "peak"] * 2
@@ -230,17 +223,9 @@ def test_a_scene_of_one_time_needs_no_motion_and_no_rate_for_it(tmp_path):
 @pytest.mark.slow
 def test_a_sliding_ball_is_learned_at_all_times(tmp_path):
     data = ball_data(rays=512, frames=16)
-    fitting = stage(
-        num_voxels=[[0, 16**3]],
-        iterations=300,
-        start="hull",
-        hull_frames=4,
-        hull_grow=0.08,
-        refresh_every=25,
-        lr_hold=0.5,
-        curriculum={"start": 4, "all_in": 0.5},
-    )
-    module = make_run(tmp_path, [fitting], data=data).fit()
+    numbers = {"num_voxels": [[0, 16**3]], "start": "hull", "hull_frames": 4, "hull_grow": 0.08}
+    numbers |= {"refresh_every": 25, "lr_hold": 0.5, "curriculum": {"start": 4, "all_in": 0.5}}
+    module = make_run(tmp_path, [stage(iterations=300, **numbers)], data=data).fit()
     scores = [float(module.psnr_of(target)) for target in data.targets("test")]
     assert min(scores) > 22
     assert sum(scores) / 3 > 25  # a still radiance field reaches 22
@@ -279,10 +264,8 @@ def pressed(folder, *presses):
     assert signal.getsignal(signal.SIGINT) is before
 
 
-ENDED = (
-    "fine: ended after 10 steps, 0.833333 for each of 12 training pictures; for as many as the budget has: "
-)
-ENDED += "stage.fine.steps_per_picture=null"
+ENDED = "fine: ended after 10 steps, 0.833333 for each of 12 training pictures; for as many as the budget "
+ENDED += "has: stage.fine.steps_per_picture=null"
 
 
 @pytest.mark.parametrize(("name", "step"), [("coarse", 5), ("fine", 9)])
