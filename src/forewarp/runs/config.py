@@ -141,12 +141,7 @@ def read_config(path: Path, trust: Sequence[str] | None = ()) -> DictConfig:
     Raises:
         ValueError: if the file is no config of a run, or names untrusted code.
     """
-    return parsed(read_text(path, MOST_CONFIG), path, trust)
-
-
-def parsed(text: str, path: Path, trust: Sequence[str] | None = ()) -> DictConfig:
-    """Parse the text of a config like ``read_config``; ``path`` is named in errors."""
-    config = trusted_config(text, path, trust)
+    config = trusted_config(read_text(path, MOST_CONFIG), path, trust)
     for key in (*IDENTITY, "trainer", "logger", "callbacks"):
         if key not in config and key != "objective":  # a method may have no objective
             raise ValueError(f"{path}: expected the key {key}, but got none; delete the run's folder")
@@ -296,7 +291,11 @@ def _check_foreign(name: str, refusal: str, trust: Sequence[str]) -> None:
     if any(part.startswith("__") for part in parts):
         raise ValueError(refusal)
     try:
-        found = _located(parts)
+        found = importlib.import_module(parts[0])
+        for i, part in enumerate(parts[1:], 2):  # first modules, then attributes
+            if not hasattr(found, part) and inspect.ismodule(found):
+                importlib.import_module(".".join(parts[:i]))
+            found = getattr(found, part)
     except Exception as error:  # an import may raise anything
         reason = str(error).partition("\n")[0] or type(error).__name__
         raise ValueError(f"{refusal}, which cannot be imported ({reason:.120})") from None
@@ -306,16 +305,6 @@ def _check_foreign(name: str, refusal: str, trust: Sequence[str]) -> None:
         raise ValueError(f"{refusal}, which is nothing to call that {parts[0]} defines")
     if not _is_below(home, trust) and not (inspect.isclass(found) and _is_below(home, ["forewarp"])):
         raise ValueError(f"{refusal}, which {home} defines{advice(home, trust)}")
-
-
-def _located(parts: Sequence[str]) -> object:
-    """Import a dotted name: first modules, then attributes."""
-    found = importlib.import_module(parts[0])
-    for i, part in enumerate(parts[1:], 2):
-        if not hasattr(found, part) and inspect.ismodule(found):
-            importlib.import_module(".".join(parts[:i]))
-        found = getattr(found, part)
-    return found
 
 
 def _is_below(name: str, trust: Sequence[str]) -> bool:
