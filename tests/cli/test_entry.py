@@ -86,7 +86,7 @@ def test_options_of_ones_own_stand_beside_ours(ok, in_tmp):
         (["~stage.coarse", "~stage.fine"], "stage: expected at least one stage, but got none"),
         (
             ["model=forward", "+stage.coarse.bogus=1"],
-            "unexpected keyword argument 'bogus'; leave that key out",
+            "stage.coarse: expected a key of num_voxels,",
         ),
         (["model=forward", "+model.renderer.bogus=1"], "model.renderer: "),
         (
