@@ -79,14 +79,6 @@ def test_what_is_never_seen_goes_after_some_rounds_once_all_times_are_in_play(la
     assert len(method.means) == left
 
 
-def test_what_appears_later_is_not_thrown_away():
-    method, optimizer = few(opacity_over_time=2)
-    method.opacity.data.fill_(-20.0)
-    method.opacity_over_time.data.zero_()[:3, 0] = -15.0  # the first cosine falls from 0 to -2
-    renew(method, 3, optimizer)
-    assert len(method.means) == 3
-
-
 def test_few_that_stand_before_all_others_are_too_near_and_many_are_not():
     order, far = torch.arange(200).flip(0), torch.linspace(2.0, 3.0, 200)
     assert not len(too_near(order, far))
@@ -98,7 +90,7 @@ def test_few_that_stand_before_all_others_are_too_near_and_many_are_not():
     assert not len(too_near(torch.arange(3), lone))  # of so few it may be the scene itself
 
 
-def test_opacity_is_bounded_at_all_times_so_that_it_can_still_fade():
+def test_opacity_counts_where_it_is_largest_and_is_bounded_there():
     method, optimizer = few(opacity_over_time=3)
     logits = method.opacity.data
     logits[:5, 0] = torch.tensor([20.0, 5.0, -8.0, 6.0, 7.0])
@@ -109,6 +101,10 @@ def test_opacity_is_bounded_at_all_times_so_that_it_can_still_fade():
     assert logits[:6, 0].tolist() == pytest.approx([6.0, -12.0, -12.0, 6.0, 6.0, 0.0])
     bases = torch.stack([method.time_bases(i / 64)[1] for i in range(65)])
     assert float((method.gaussians().opacity.detach() @ bases.T).amax()) == pytest.approx(6.0, abs=1e-4)
+    logits.fill_(-20.0)
+    method.opacity_over_time.data.zero_()[:3, 0] = -15.0
+    renew(method, 3, optimizer)
+    assert len(method.means) == 3  # what appears later is not thrown away
 
 
 @pytest.mark.parametrize("share", [0.0, 1e-3, 0.2])
