@@ -9,14 +9,18 @@ from pathlib import Path
 import pytest
 import torch
 from hypothesis import given, strategies
+from torch.autograd import gradcheck
 
+from forewarp.methods.particles import model
+from forewarp.methods.particles.model import pinhole_of
 from forewarp.ops import backend
 from forewarp.ops.adam import AdamState, adam_rows
-from forewarp.ops.gaussians import Gaussians, Splats, rasterize
+from forewarp.ops.gaussians import Gaussians, Splats, Warp, project, rasterize
 from tests.stability.hard_particles import SEEN, UNSEEN, Hard, compared, drawn, node_cases
 from tests.stability.test_properties import MANY
 from tests.stability.twin import answers, relative_error, rows
-from tests.support.gaussians import NO_FADES, NO_TINTS, crowd, one, still, straight
+from tests.support.gaussians import NO_FADES, NO_TINTS, crowd, one, pinhole, still, straight
+from tests.support.particles import EVERY, FACTORS, module_with, shaken, small_data
 
 pytestmark = pytest.mark.stability
 
@@ -131,6 +135,111 @@ def test_adam_takes_gradients_of_any_size(place, size):
     assert bool(value.isfinite().all())
     assert expected is None or value.mean().item() == pytest.approx(expected, rel=1e-4)
     torch.testing.assert_close(value, value[:1, :1].expand(33, 3))
+
+
+# Two things are left out of gradients by design (``ops.gaussians``): that a direction turns when a particle
+# moves, which harmonics of degree 1 and more would see, and that a lens's Jacobian changes then, which the
+# shape of a splat would see. Where either is on, only what moves nothing is held to finite differences, and
+# with a lens that which moves, in the values of a splat that have nothing to do with the Jacobian.
+LENS = {"radial": (0.1, -0.05, 0.01), "tangential": (0.01, -0.02), "reach": 4.0}
+RESTING = ("log_scales", "quaternions", "opacity", "colors")  # what moves no particle
+PLACE = [0, 1, 5, 6, 7, 8, 9]  # of a splat's values; the others, the conic, are its shape
+STEP = 1e-6
+
+
+def along(loss, value, slope):
+    """The derivative of ``loss()`` while ``value`` is moved along ``slope`` in place."""
+    start, sides = value.clone(), []
+    for sign in (1, -1):
+        value.copy_(start + sign * STEP * slope)
+        sides.append(loss())
+    value.copy_(start)
+    return (sides[0] - sides[1]) / (2 * STEP)
+
+
+@pytest.mark.parametrize(("degree", "lens"), [(1, {}), (2, {}), (3, LENS)])
+def test_splats_by_what_moves_nothing(degree, lens):
+    particles, warp, tints, fades = crowd(count=3, degree=degree)
+
+    def numbers(*leaves):
+        own = particles._replace(**dict(zip(RESTING, leaves)))
+        return project(own, warp, pinhole(**lens), tints, fades).values
+
+    assert int((numbers()[:, 5] > 0).sum()) == 3
+    leaves = [getattr(particles, name).clone().requires_grad_() for name in RESTING]
+    assert gradcheck(numbers, leaves, atol=1e-6)
+
+
+def test_places_behind_a_lens():
+    """Of colour there is one coefficient, which no direction changes."""
+    particles, warp, tints, fades = crowd(count=3, degree=0)
+
+    def numbers(means, maps, weights):
+        own = particles._replace(means=means)
+        found = project(own, Warp(maps, warp.links, weights), pinhole(**LENS), tints, fades).values
+        return found[:, PLACE]
+
+    leaves = [t.clone().requires_grad_() for t in (particles.means, warp.maps, warp.weights)]
+    assert gradcheck(numbers, leaves, atol=1e-6)
+
+
+# Of which parameters: without view dependence and lens all there are; with either those that move nothing.
+STILL = {"scales", "quaternions", "opacity", "colors", "sh", "color_over_time", "opacity_over_time"}
+MOVING = {"means", "nodes.translations", "nodes.rotations", "skinning.logits"}
+METHODS = {
+    "splines": ({"view_dependence": None}, {}, STILL - {"sh"} | MOVING),
+    "cosines": ({"view_dependence": None, "motion": "cosines"}, {}, STILL - {"sh"} | MOVING),
+    "no rotation": (
+        {"view_dependence": None, "rotation": None},
+        {},
+        STILL - {"sh"} | MOVING - {"nodes.rotations"},
+    ),
+    "degree 3": ({"view_dependence": 3}, {}, STILL),
+    "a lens": ({"view_dependence": 1}, LENS, STILL),
+}
+
+
+def exactly(options, lens, monkeypatch):
+    """A shaken method in float64, whose camera has a lens or none, and a batch."""
+    data = small_data()
+    numbers = {"jitter": 0.0, "density": 1.0, "initial_share": 1.0, "time_offsets": 0}
+    module = module_with(data, numbers=numbers, **EVERY | options)
+    method = shaken(module).method.double()
+    method.nodes.seen_times.copy_(torch.tensor([0.0, 1.0]))  # else the first look continues curves
+    monkeypatch.setattr(model, "pinhole_of", lambda camera, blur: replace(pinhole_of(camera, blur), **lens))
+    data.picker = lambda: 3
+    return method, next(iter(data.train_dataloader())), module.generator
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_a_step_of_the_method(name, monkeypatch):
+    """The loss is that of the step itself, all terms weighted; everything is the plain reference.
+
+    With ``sh``, or behind a lens, what moves particles is left out: what that does to directions and to the
+    slopes of a lens is left out of their gradients.
+    """
+    options, lens, names = METHODS[name]
+    method, batch, generator = exactly(options, lens, monkeypatch)
+
+    def loss():
+        terms = method.look(batch, FACTORS, generator).terms
+        return sum(factor * float(terms[term]()) for term, factor in FACTORS.items())
+
+    gradients = method.look(batch, FACTORS, generator).gradients
+    parameters = dict(method.named_parameters())
+    assert gradients.keys() == parameters.keys()
+    assert names == (
+        parameters.keys() if names >= MOVING - {"nodes.rotations"} else parameters.keys() - MOVING
+    )
+    for which in sorted(names):
+        draw = torch.Generator().manual_seed(1)
+        value, gradient = parameters[which].data, gradients[which]
+        assert gradient.dtype == torch.float64
+        assert bool(gradient.any()), which
+        for _ in range(2):
+            slope = torch.randn(value.shape, generator=draw, dtype=torch.float64)
+            expected = along(loss, value, slope)
+            assert float((gradient * slope).sum()) == pytest.approx(expected, rel=1e-5, abs=1e-7), which
 
 
 OF_PARTICLES = {"project", "backward", "rasterize", "nodes", "adam"}
