@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import namedtuple
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import accumulate
@@ -25,27 +26,9 @@ MOST = 1 << 15  # splats of a tile that count, the nearest ones
 SIDE = 8  # pixels of a tile along both axes
 SPLAT = 16  # numbers of a splat as kernels read it: its columns, then zeros
 _LEAST = 1e-12  # length of a quaternion below which it rotates nothing
-
-
-class Columns(NamedTuple):
-    """Where the numbers of a splat lie; ``Splats.values`` has those up to the depth."""
-
-    x: int = 0
-    y: int = 1
-    conic_a: int = 2
-    conic_b: int = 3
-    conic_c: int = 4
-    opacity: int = 5
-    red: int = 6
-    green: int = 7
-    blue: int = 8
-    depth: int = 9
-    reach_x: int = 10
-    reach_y: int = 11
-    log_opacity: int = 12
-
-
-COLUMN = Columns()
+# Where the numbers of a splat lie; ``Splats.values`` has those up to the depth.
+_NAMES = "x y conic_a conic_b conic_c opacity red green blue depth reach_x reach_y log_opacity"
+COLUMN = namedtuple("Columns", _NAMES)(*range(13))
 
 
 @dataclass(frozen=True)
@@ -104,7 +87,7 @@ class Warp(NamedTuple):
 
 
 class Splats(NamedTuple):
-    """Gaussians on an image. ``values`` (N, 10), the ``Columns`` up to the depth: pixel, inverse covariance
+    """Gaussians on an image. ``values`` (N, 10), by ``COLUMN`` up to the depth: pixel, inverse covariance
     (A, B; B, C), opacity, colour, distance from the camera; ``reach`` (N, 2) pixels along both axes beyond
     which nothing is seen of it, 0 where it is not seen at all. Differentiable are the values.
     """
@@ -413,8 +396,11 @@ def _sorted_tiles(splats, width: int, height: int, threads: int) -> _Tiles:
 
     order = kernels.by_depth(splats)
     records, entries, ends = kernels.sort_into_tiles(splats, order, *_tiles(width, height), threads)
-    shares, longest = kernels.share_out(ends, threads)
-    return _Tiles(order, (records, entries, ends, shares), int(longest))
+    # Runs of tiles of about as much work each: a tile without entries costs about as much as four entries.
+    work = ends + 4 * np.arange(len(ends))
+    starts = np.searchsorted(work[:-1] * threads, work[-1] * np.arange(threads))
+    shares = np.append(starts, len(ends) - 1)
+    return _Tiles(order, (records, entries, ends, shares), int(np.diff(ends).max()))
 
 
 def _tiles(width: int, height: int) -> tuple[int, int]:
@@ -463,9 +449,13 @@ def _splat_gradients(splats: Tensor, tiles: _Tiles, sums: Tensor, factor: float)
     """
     from forewarp.ops.kernels import backward as kernels
 
-    seen, ranks = kernels.rank_rows(tiles.order, len(splats))
+    # Rows lie side by side in memory: in the order of depth half of the time would be waiting.
+    ranks = np.full(len(splats), -1, np.int32)
+    ranks[tiles.order] = np.arange(len(tiles.order))
+    seen = np.flatnonzero(ranks >= 0).astype(np.int32)
     by_splat, pull = torch.empty(_whole(len(seen)), SPLAT), torch.zeros(len(splats))
-    kernels.splat_gradients(*arrays(splats), seen, ranks, *arrays(sums), factor, *arrays(by_splat, pull))
+    inputs = (*arrays(splats), seen, ranks[seen], *arrays(sums), factor)
+    kernels.splat_gradients(*inputs, *arrays(by_splat, pull))
     return seen, by_splat, pull
 
 
@@ -628,7 +618,9 @@ def _compare_sorted(inputs, splats, tiles, image, background, width, factor, by_
     kept, count, coefficients = _kept_for(tiles), *inputs[4].shape[:2]
     sums = torch.empty(len(kept), len(tiles.order), SPLAT)
     scores = torch.zeros(len(kept), 2, dtype=torch.float64)
-    truth = image.numpy().view("uint32"), *arrays(background.float()), np.float32(width)
+    (high, wide), edge = image.shape, (0, -image.shape[1] % SIDE, 0, -image.shape[0] % SIDE)
+    padded = pad(image, edge) if any(edge) else image
+    truth = padded.numpy().view("uint32"), wide, high, *arrays(background.float()), np.float32(width)
     kernels.compare(*tiles.lists, *truth, *arrays(kept, sums, scores))
     seen, by_splat, pull = _splat_gradients(splats, tiles, sums, factor)
     gradients = [torch.empty(t.shape) for t in inputs[:4]]

@@ -136,21 +136,10 @@ def occupied_cells(index: Tensor, keep: Tensor | None = None) -> Tensor:
         index: (X, Y, Z) int32.
         keep: (M,) bool over the rows; None: keep all.
     """
-    if not use_numba(index):
-        return occupied_cells_reference(index, keep)
-    from forewarp.ops.kernels import voxels as kernels
-
-    kept = torch.ones(int(index.max()) + 1, dtype=torch.bool) if keep is None else keep
-    cells = torch.zeros([n - 1 for n in index.shape], dtype=torch.bool)
-    kernels.mark_cells(*arrays(index, kept, cells))
-    return cells
-
-
-def occupied_cells_reference(index: Tensor, keep: Tensor | None = None) -> Tensor:
-    """``occupied_cells`` in plain PyTorch."""
     cells = index >= 0
-    if keep is not None:  # -1 reads the last entry: False
-        cells = torch.cat([keep, keep.new_zeros(1)])[index.long()]
+    if keep is not None:
+        kept = torch.cat([keep.new_zeros(1), keep])  # -1 reads the first entry: False
+        cells = kept.index_select(0, (index + 1).reshape(-1)).view(index.shape)
     for axis in range(3):
         n = cells.shape[axis] - 1
         cells = cells.narrow(axis, 0, n) | cells.narrow(axis, 1, n)

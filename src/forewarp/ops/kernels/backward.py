@@ -47,24 +47,6 @@ from forewarp.ops.kernels.project import (
 _GRADIENT, _ROWS = ROWS, ROWS + SPLAT  # where gradients by the splats' columns begin in a room, and its rows
 
 
-@njit(cache=True)
-def rank_rows(order, count):
-    """Rows (V,) int32 of ``count`` that are in an order, the lowest first, and their places (V,) in it.
-
-    What is read row by row should lie side by side: in the order of depth half of the time would be waiting.
-    """
-    places = np.full(count, -1, np.int32)
-    for k in range(len(order)):
-        places[order[k]] = k
-    rows, ranks = np.empty(len(order), np.int32), np.empty(len(order), np.int32)
-    found = 0
-    for i in range(count):
-        if places[i] >= 0:
-            rows[found], ranks[found] = i, places[i]
-            found += 1
-    return rows, ranks
-
-
 @njit(parallel=True, cache=True)
 def splat_gradients(splats, rows, ranks, sums, factor, gradients, pull):
     """Turn sums over pixels (S, V, 16) of splats in the order of depth into ``factor`` times the gradients by
@@ -182,10 +164,7 @@ def _color_gradients(direction, splats, tints, which, valid, place, to_colors, s
     plain = len(spots) - len(tints)
     x, y, z = direction
     harmonics(x, y, z, plain, place)
-    for lane in range(SIDE_BY_SIDE):
-        i = np.uintp(which[lane])
-        for c in range(3):
-            place[SIDE_BY_SIDE * (ANY + c) + lane] = splats[i, COLUMN.red + c]
+    gather(splats[:, COLUMN.red :], which, place, ANY, 3)
     zero, shown, by_color = np.float32(0), rows_of(place, ANY, 3), rows_of(place, _GRADIENT + COLUMN.red, 3)
     red = where_above(shown[0], zero, by_color[0])
     green = where_above(shown[1], zero, by_color[1])
@@ -249,21 +228,6 @@ def _transposed(m):
     return m[0], m[3], m[6], m[1], m[4], m[7], m[2], m[5], m[8]
 
 
-@njit(inline="always")
-def own_rows(seen, share, shares, count):
-    """Return a thread's rows of ``count``: from the first that its blocks of ``seen`` write to, to that of
-    the next thread; the first one's begin at 0.
-    """
-    blocks, first, end = (len(seen) + SIDE_BY_SIDE - 1) // SIDE_BY_SIDE, 0, count
-    if share > 0:
-        k = SIDE_BY_SIDE * (blocks * share // shares)
-        first = seen[k] if k < len(seen) else count
-    if share + 1 < shares:
-        k = SIDE_BY_SIDE * (blocks * (share + 1) // shares)
-        end = seen[k] if k < len(seen) else count
-    return first, end
-
-
 @njit(parallel=True, cache=True)
 def chain(
     means, log_scales, quaternions, opacity, colors, maps, links, weights, camera, tints, fades,
@@ -280,8 +244,7 @@ def chain(
     count, shares = len(seen), to_maps.shape[0]
     blocks = (count + SIDE_BY_SIDE - 1) // SIDE_BY_SIDE
     for share in prange(shares):
-        place, which = room(_ROWS), np.empty(SIDE_BY_SIDE, np.intp)
-        first, end = own_rows(seen, share, shares, len(means))
+        first, end = len(means) * share // shares, len(means) * (share + 1) // shares
         to_means[first:end] = 0
         to_scales[first:end] = 0
         to_quaternions[first:end] = 0
@@ -291,6 +254,8 @@ def chain(
             for i in range(first, end):
                 at = np.uintp(spots[k, 0] + i * spots[k, 1])
                 to_colors[at], to_colors[at + 1], to_colors[at + 2] = 0, 0, 0
+    for share in prange(shares):
+        place, which = room(_ROWS), np.empty(SIDE_BY_SIDE, np.intp)
         for block in range(blocks * share // shares, blocks * (share + 1) // shares):
             start = SIDE_BY_SIDE * block
             valid = min(SIDE_BY_SIDE, count - start)

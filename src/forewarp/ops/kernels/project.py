@@ -205,8 +205,7 @@ def scales_of(log_scales, which, place):
 def _opacities(opacity, which, fades, place):
     logit = sixteen(0.0)
     for k in range(len(fades)):
-        for lane in range(SIDE_BY_SIDE):
-            place[SIDE_BY_SIDE * ANY + lane] = opacity[np.uintp(which[lane]), k]
+        gather(opacity[:, k:], which, place, ANY, 1)
         logit = fma(row_of(place, ANY), fades[k], logit)
     return sixteen(1.0) / (exp(logit * -1.0) + 1.0)
 
@@ -219,10 +218,7 @@ def _colors(direction, colors, tints, which, place):
     harmonics(x, y, z, plain, place)
     red, green, blue = sixteen(0.5), sixteen(0.5), sixteen(0.5)
     for k in range(colors.shape[1]):
-        for lane in range(SIDE_BY_SIDE):
-            i = np.uintp(which[lane])
-            for c in range(3):
-                place[SIDE_BY_SIDE * (ANY + c) + lane] = colors[i, k, c]
+        gather(colors[:, k], which, place, ANY, 3)
         factor = row_of(place, BASIS + k) if k < plain else sixteen(tints[k - plain])
         r, g, b = rows_of(place, ANY, 3)
         red, green, blue = fma(factor, r, red), fma(factor, g, green), fma(factor, b, blue)

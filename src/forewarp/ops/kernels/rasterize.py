@@ -221,25 +221,6 @@ def sort_into_tiles(splats, order, across, down, shares):
     return records, entries, ends
 
 
-@njit(cache=True)
-def share_out(ends, count):
-    """Cut the tiles into ``count`` runs of about as many entries each; also the longest tile's number.
-
-    A tile without entries costs about as much as four entries.
-    """
-    tiles = len(ends) - 1
-    shares = np.empty(count + 1, np.int64)
-    whole = ends[tiles] + 4 * tiles
-    shares[0], share, most = 0, 1, 0
-    for tile in range(tiles):
-        most = max(most, ends[tile + 1] - ends[tile])
-        while share < count and (ends[tile] + 4 * tile) * count >= share * whole:
-            shares[share] = tile
-            share += 1
-    shares[share:] = tiles
-    return shares, most
-
-
 # Draw ------------------------------------------------------------------------------------------------------
 
 
@@ -377,18 +358,16 @@ def _score(residual, width, score):
 
 
 @njit(parallel=True, cache=True)
-def compare(records, entries, ends, shares, pixels, background, width, kept, sums, scores):
+def compare(records, entries, ends, shares, pixels, wide, high, background, width, kept, sums, scores):
     """Draw tiles, compare them with an image, and gather the gradients of the loss, tile by tile.
 
     The loss is the sum over pixels and channels of ``sqrt(e^2 + width^2) - width``; a tile is not looked at
-    again. ``pixels`` (H, W) uint32 are straight RGBA. Into ``scores`` (S, 2) go loss and squared error,
-    into ``sums`` (S, V, 16) the gradients; whatever was there before is gone.
+    again. ``pixels`` (H', W') uint32 are straight RGBA, of which ``high`` x ``wide`` count. Into ``scores``
+    (S, 2) go loss and squared error, into ``sums`` (S, V, 16) the gradients; what was there before is gone.
     """
-    height, wide = pixels.shape
-    across = (wide + SIDE - 1) // SIDE
+    across = pixels.shape[1] // SIDE
     for share in prange(len(shares) - 1):
-        patch, full = np.zeros((SIDE, SIDE), np.uint32), np.ones((SIDE, SIDE), np.float32)
-        edge, score = np.zeros((SIDE, SIDE), np.float32), np.zeros(2, np.float64)
+        score = np.zeros(2, np.float64)
         sums[share] = 0
         for tile in range(shares[share], shares[share + 1]):
             row, column = SIDE * (tile // across), SIDE * (tile % across)
@@ -396,18 +375,11 @@ def compare(records, entries, ends, shares, pixels, background, width, kept, sum
             through, red, green, blue, _, count = _blend(
                 records, entries, first, ends[tile + 1], left, y, kept[share]
             )
-            truth, at, to, inside = pixels, row, column, full
-            if row + SIDE > height or column + SIDE > wide:  # only a part of it lies in the image
-                patch[:] = 0
-                edge[:] = 0
-                for i in range(min(SIDE, height - row)):
-                    for j in range(min(SIDE, wide - column)):
-                        patch[i, j], edge[i, j] = pixels[row + i, column + j], 1
-                truth, at, to, inside = patch, 0, 0, edge
-            counts = get_tile(inside, 0, 0)
-            red = _residual(truth, at, to, through, red, background[0], 0, counts)
-            green = _residual(truth, at, to, through, green, background[1], 1, counts)
-            blue = _residual(truth, at, to, through, blue, background[2], 2, counts)
+            inside = where_above(wide - widened(narrow_columns() + left), _ZERO, lanes(1.0))
+            inside = where_above(high - y, _ZERO, inside)
+            red = _residual(pixels, row, column, through, red, background[0], 0, inside)
+            green = _residual(pixels, row, column, through, green, background[1], 1, inside)
+            blue = _residual(pixels, row, column, through, blue, background[2], 2, inside)
             if total(fma(red, red, fma(green, green, blue * blue))) == 0:  # which NaN is not
                 continue
             red, green, blue = (

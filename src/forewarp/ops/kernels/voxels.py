@@ -14,11 +14,20 @@ from numba import njit, prange
 
 
 @njit(inline="always")
-def _base(x, n):
+def _lower(x, n):
     """The lower of the two voxels of an axis around ``x``, and the fraction beyond it; clamped."""
     base = int(min(max(np.floor(x), 0.0), n - 2.0))
     base = min(max(base, 0), n - 2)  # NaN converts to any integer
     return base, min(max(x - base, 0.0), 1.0)
+
+
+@njit(inline="always")
+def _cell(point, index):
+    """The lowest of the 8 voxels around a point (3), and the fractions beyond it; clamped to the lattice."""
+    x, fx = _lower(point[0], index.shape[0])
+    y, fy = _lower(point[1], index.shape[1])
+    z, fz = _lower(point[2], index.shape[2])
+    return x, y, z, fx, fy, fz
 
 
 @njit(inline="always")
@@ -32,11 +41,8 @@ def _corner(i, fx, fy, fz):
 def gather(values, index, points, fill, out):
     """out[p] = trilinear read of a sparse lattice; absent voxels read ``fill``."""
     channels = values.shape[1]
-    nx, ny, nz = index.shape
     for p in prange(points.shape[0]):
-        x0, fx = _base(points[p, 0], nx)
-        y0, fy = _base(points[p, 1], ny)
-        z0, fz = _base(points[p, 2], nz)
+        x0, y0, z0, fx, fy, fz = _cell(points[p], index)
         for c in range(channels):
             out[p, c] = 0.0
         for i in range(8):
@@ -55,12 +61,9 @@ def gather(values, index, points, fill, out):
 def gather_backward_values(index, points, gradient, out):
     """out[chunk, row] += weight * gradient[p]; ``out`` holds one copy a chunk."""
     chunks, channels, total = out.shape[0], gradient.shape[1], points.shape[0]
-    nx, ny, nz = index.shape
     for chunk in prange(chunks):
         for p in range(total * chunk // chunks, total * (chunk + 1) // chunks):
-            x0, fx = _base(points[p, 0], nx)
-            y0, fy = _base(points[p, 1], ny)
-            z0, fz = _base(points[p, 2], nz)
+            x0, y0, z0, fx, fy, fz = _cell(points[p], index)
             for i in range(8):
                 a, b, d, wx, wy, wz = _corner(i, fx, fy, fz)
                 row = index[x0 + a, y0 + b, z0 + d]
@@ -76,9 +79,7 @@ def gather_backward_points(values, index, points, fill, gradient, out):
     channels = values.shape[1]
     nx, ny, nz = index.shape
     for p in prange(points.shape[0]):
-        x0, fx = _base(points[p, 0], nx)
-        y0, fy = _base(points[p, 1], ny)
-        z0, fz = _base(points[p, 2], nz)
+        x0, y0, z0, fx, fy, fz = _cell(points[p], index)
         gx, gy, gz = 0.0, 0.0, 0.0
         for i in range(8):
             a, b, d, wx, wy, wz = _corner(i, fx, fy, fz)
@@ -94,27 +95,14 @@ def gather_backward_points(values, index, points, fill, gradient, out):
         out[p, 2] = gz if 0 <= points[p, 2] <= nz - 1 else 0.0
 
 
-@njit(cache=True)
-def mark_cells(index, keep, cells):
-    """cells[x, y, z] = 1 where a corner of the cell is present and kept."""
-    nx, ny, nz = index.shape
-    for x in range(nx):
-        for y in range(ny):
-            for z in range(nz):
-                row = index[x, y, z]
-                if row >= 0 and keep[row]:
-                    for a in range(max(x - 1, 0), min(x + 1, nx - 1)):
-                        for b in range(max(y - 1, 0), min(y + 1, ny - 1)):
-                            for d in range(max(z - 1, 0), min(z + 1, nz - 1)):
-                                cells[a, b, d] = 1
-
-
 # Splat -----------------------------------------------------------------------------------------------------
 
 
 @njit(inline="always")
 def _floor(position):
-    return int(np.floor(position[0])), int(np.floor(position[1])), int(np.floor(position[2]))
+    """The lowest of the 8 voxels around a position (3), and the fractions beyond it."""
+    x, y, z = int(np.floor(position[0])), int(np.floor(position[1])), int(np.floor(position[2]))
+    return x, y, z, position[0] - x, position[1] - y, position[2] - z
 
 
 @njit(cache=True)
@@ -127,7 +115,7 @@ def number_touched(positions, index):
     for q in range(positions.shape[0]):
         if np.isnan(positions[q, 0]):
             continue
-        x0, y0, z0 = _floor(positions[q])
+        x0, y0, z0 = _floor(positions[q])[:3]
         for x in range(max(x0, 0), min(x0 + 2, nx)):
             for y in range(max(y0, 0), min(y0 + 2, ny)):
                 for z in range(max(z0, 0), min(z0 + 2, nz)):
@@ -150,8 +138,7 @@ def scatter(source, positions, index, out):
         for q in range(total * chunk // chunks, total * (chunk + 1) // chunks):
             if np.isnan(positions[q, 0]):
                 continue
-            x0, y0, z0 = _floor(positions[q])
-            fx, fy, fz = positions[q, 0] - x0, positions[q, 1] - y0, positions[q, 2] - z0
+            x0, y0, z0, fx, fy, fz = _floor(positions[q])
             for i in range(8):
                 a, b, d, wx, wy, wz = _corner(i, fx, fy, fz)
                 x, y, z = x0 + a, y0 + b, z0 + d
@@ -171,8 +158,7 @@ def scatter_backward(source, positions, index, gradient, to_source, to_positions
     for q in prange(positions.shape[0]):
         if np.isnan(positions[q, 0]):
             continue
-        x0, y0, z0 = _floor(positions[q])
-        fx, fy, fz = positions[q, 0] - x0, positions[q, 1] - y0, positions[q, 2] - z0
+        x0, y0, z0, fx, fy, fz = _floor(positions[q])
         gx, gy, gz = 0.0, 0.0, 0.0
         for i in range(8):
             a, b, d, wx, wy, wz = _corner(i, fx, fy, fz)
@@ -318,10 +304,7 @@ def _sweep(reach, sign):
 @njit(cache=True)
 def _raw(raw, index, fill, x, y, z):
     """Interpolate one channel of a sparse lattice."""
-    nx, ny, nz = index.shape
-    x0, fx = _base(x, nx)
-    y0, fy = _base(y, ny)
-    z0, fz = _base(z, nz)
+    x0, y0, z0, fx, fy, fz = _cell((x, y, z), index)
     total = 0.0
     for i in range(8):
         a, b, c, wx, wy, wz = _corner(i, fx, fy, fz)
