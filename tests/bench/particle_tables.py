@@ -26,7 +26,7 @@ STEPS, FEW = 40, 5  # repetitions: of what takes milliseconds, of what takes lon
 # Of which kernels a part consists: the module's name in ``ops.kernels``, and its functions; none named: all.
 PARTS = {
     "projection": (("project", ()),),
-    "sorting into tiles": (("rasterize", ("by_depth", "sort_into_tiles", "share_out")),),
+    "sorting into tiles": (("rasterize", ("sort_into_tiles",)),),
     "forward: a picture's": (("rasterize", ("draw",)),),
     "forward, loss and backward": (("rasterize", ("compare",)),),
     "chain, back to particles and nodes": (("backward", ()),),

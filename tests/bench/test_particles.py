@@ -51,7 +51,7 @@ def test_every_kernel_of_a_step_belongs_to_a_part(loop):
     }
     assert counted == spent.keys()
     assert hasattr(project.project, "py_func")  # put back
-    assert hasattr(rasterize.by_depth, "py_func")
+    assert hasattr(rasterize.draw, "py_func")
 
 
 @pytest.mark.slow

@@ -249,18 +249,6 @@ def _whole(count: int) -> int:
     return -(-count // 16) * 16
 
 
-def _room_for_colors(count: int, kinds: Sequence[int]) -> tuple[Tensor, tuple[Tensor, ...], Tensor]:
-    """Make room for gradients by the colours of so many particles, ``kinds`` coefficients each in a tensor of
-    its own: the room, which the kernel fills, these tensors (N, k, 3), and where the kernel finds them in it.
-    """
-    room = torch.empty(3 * count * sum(kinds))
-    parts = room.split([3 * count * k for k in kinds])
-    starts = accumulate(kinds, initial=0)
-    spots = [(3 * (count * start + j), 3 * k) for start, k in zip(starts, kinds) for j in range(k)]
-    colors = tuple(part.view(count, k, 3) for part, k in zip(parts, kinds))
-    return room, colors, torch.tensor(spots, dtype=torch.int64).reshape(-1, 2)
-
-
 def _project_numba(
     means, log_scales, quaternions, opacity, colors, maps, links, weights, view, tints, fades, *, draw=True
 ) -> tuple[tuple, Tensor]:
@@ -291,19 +279,38 @@ class _Project(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx, by_values, _):
-        from forewarp.ops.kernels import backward as kernels
-
         threads = match_threads()
         *inputs, splats = ctx.saved_tensors
-        gradients = [torch.empty(t.shape) for t in inputs[:4]]
-        maps, weights = inputs[5].new_zeros(threads, *inputs[5].shape), torch.empty(inputs[7].shape)
         seen = (splats[:, COLUMN.reach_x] > 0).nonzero()[:, 0]
         rows = by_values.new_zeros(_whole(len(seen)), SPLAT)
         rows[: len(seen), : by_values.shape[1]] = by_values[seen]
-        room, colors, spots = _room_for_colors(len(inputs[0]), (inputs[4].shape[1],))
-        given = arrays(*inputs, splats, seen.int(), rows, *gradients, room, spots, maps, weights)
-        kernels.chain(*given, False)
-        return *gradients, *colors, maps.sum(0)[:, :12], None, weights, None, None, None
+        kinds, seen = [inputs[4].shape[1]], seen.int().numpy()
+        gradients, colors, maps, weights = _chain(inputs, splats, seen, rows, threads, kinds)
+        return *gradients, *colors, maps, None, weights, None, None, None
+
+
+def _chain(inputs, splats, seen, by_splat, threads, kinds, *, by_weights=True, softmax=False) -> tuple:
+    """Carry gradients by splats (V', 16) of the rows ``seen`` to the Gaussians, maps and weights.
+
+    Returns:
+        gradients by all of the Gaussians but the colours; by colours, ``kinds`` coefficients (N, k, 3) in a
+        tensor of their own; by maps; and by weights, or by the numbers whose softmax they are, if
+        ``by_weights``.
+    """
+    from forewarp.ops.kernels import backward as kernels
+
+    count, starts = len(inputs[0]), accumulate(kinds, initial=0)
+    gradients = [torch.empty(t.shape) for t in inputs[:4]]
+    room = torch.empty(3 * count * sum(kinds))
+    colors = [part.view(count, k, 3) for part, k in zip(room.split([3 * count * k for k in kinds]), kinds)]
+    # Where the kernel finds a coefficient in the room: that of the first Gaussian, and from one to the next.
+    spots = [(3 * (count * start + j), 3 * k) for start, k in zip(starts, kinds) for j in range(k)]
+    spots = torch.tensor(spots, dtype=torch.int64).reshape(-1, 2)
+    maps = torch.zeros(threads, *inputs[5].shape)
+    weights = torch.empty(inputs[7].shape if by_weights else (0, 0))
+    outputs = arrays(by_splat, *gradients, room, spots, maps, weights)
+    kernels.chain(*arrays(*inputs, splats), seen, *outputs, softmax)
+    return gradients, colors, maps.sum(0)[:, :12], weights
 
 
 class Image(NamedTuple):
@@ -390,17 +397,19 @@ class _Tiles(NamedTuple):
     longest: int
 
 
-def _sorted_tiles(splats, width: int, height: int, threads: int) -> _Tiles:
-    """Sort splats (N, 16), a NumPy array of the kernel, into the tiles of an image."""
+def _sorted_tiles(splats: np.ndarray, width: int, height: int, threads: int) -> _Tiles:
+    """Sort splats (N, 16) by depth and into the tiles of an image; of equal depths the first comes first."""
     from forewarp.ops.kernels import rasterize as kernels
 
-    order = kernels.by_depth(splats)
+    seen = np.flatnonzero(splats[:, COLUMN.reach_x] > 0).astype(np.int32)
+    bits = splats[seen, COLUMN.depth].view(np.uint32)  # of positive numbers they are ordered as the numbers
+    order = np.argsort(bits.astype(np.uint16), kind="stable")  # of 16 bits NumPy sorts by counting
+    order = seen[order[np.argsort((bits >> 16).astype(np.uint16)[order], kind="stable")]]
     records, entries, ends = kernels.sort_into_tiles(splats, order, *_tiles(width, height), threads)
     # Runs of tiles of about as much work each: a tile without entries costs about as much as four entries.
     work = ends + 4 * np.arange(len(ends))
     starts = np.searchsorted(work[:-1] * threads, work[-1] * np.arange(threads))
-    shares = np.append(starts, len(ends) - 1)
-    return _Tiles(order, (records, entries, ends, shares), int(np.diff(ends).max()))
+    return _Tiles(order, (records, entries, ends, np.append(starts, len(ends) - 1)), int(np.diff(ends).max()))
 
 
 def _tiles(width: int, height: int) -> tuple[int, int]:
@@ -612,10 +621,9 @@ def compile_backward_kernels(
 
 def _compare_sorted(inputs, splats, tiles, image, background, width, factor, by_skin, kinds) -> Compared:
     """Compare sorted splats with an image (H, W) int32 of four bytes a pixel; carry the gradients back."""
-    from forewarp.ops.kernels import backward
     from forewarp.ops.kernels import rasterize as kernels
 
-    kept, count, coefficients = _kept_for(tiles), *inputs[4].shape[:2]
+    kept, (count, coefficients) = _kept_for(tiles), inputs[4].shape[:2]
     sums = torch.empty(len(kept), len(tiles.order), SPLAT)
     scores = torch.zeros(len(kept), 2, dtype=torch.float64)
     (high, wide), edge = image.shape, (0, -image.shape[1] % SIDE, 0, -image.shape[0] % SIDE)
@@ -623,18 +631,10 @@ def _compare_sorted(inputs, splats, tiles, image, background, width, factor, by_
     truth = padded.numpy().view("uint32"), wide, high, *arrays(background.float()), np.float32(width)
     kernels.compare(*tiles.lists, *truth, *arrays(kept, sums, scores))
     seen, by_splat, pull = _splat_gradients(splats, tiles, sums, factor)
-    gradients = [torch.empty(t.shape) for t in inputs[:4]]
-    room, colors, spots = _room_for_colors(count, (coefficients,) if kinds is None else kinds)
-    maps = torch.zeros(len(kept), *inputs[5].shape)
-    skin = torch.empty(inputs[7].shape if by_skin else (0, 0))
-    outputs = arrays(by_splat, *gradients, room, spots, maps, skin)
-    backward.chain(*arrays(*inputs, splats), seen, *outputs, True)
-    return Compared(
-        *scores.sum(0).tolist(),
-        Gaussians(*gradients, colors[0] if kinds is None else colors),
-        maps.sum(0)[:, :12],
-        skin if by_skin else None,
-        pull[:count],
-        torch.from_numpy(tiles.order),
-        splats[:count, COLUMN.depth],
+    gradients, colors, maps, skin = _chain(
+        inputs, splats, seen, by_splat, len(kept), kinds or [coefficients], by_weights=by_skin, softmax=True
     )
+    gradients = Gaussians(*gradients, colors[0] if kinds is None else tuple(colors))
+    order, depth = torch.from_numpy(tiles.order), splats[:count, COLUMN.depth]
+    skin = skin if by_skin else None
+    return Compared(*scores.sum(0).tolist(), gradients, maps, skin, pull[:count], order, depth)

@@ -45,41 +45,12 @@ from forewarp.ops.kernels.project import SIDE_BY_SIDE
 
 RECORD = COLUMN.depth + 1  # numbers of a record
 _OVER = 1e-3  # transmittance below which nothing behind is seen
-_DIGIT = 11  # bits that are sorted by at once
 _ZERO, _SHARE = np.float32(0), np.float32(1 / SIDE)
 _HALF = np.float32(0.5)  # a tile's first pixel's centre
 _SLACK = np.float32(1e-3)  # pixels that rounding may move an edge by
 
 
 # Sort ------------------------------------------------------------------------------------------------------
-
-
-@njit(cache=True)
-def by_depth(splats):
-    """Rows (V,) int32 of the splats that are seen, from near to far; equal depths in their order."""
-    seen, keys = np.empty(len(splats), np.int32), np.empty(len(splats), np.uint32)
-    count = 0
-    bits = splats.view(np.uint32)
-    for i in range(len(splats)):
-        if splats[i, COLUMN.reach_x] > 0:
-            seen[count] = i
-            keys[count] = bits[i, COLUMN.depth]  # of positive numbers bits are ordered as they are
-            count += 1
-    seen, keys = seen[:count], keys[:count]
-    sorted_seen, sorted_keys = np.empty(count, np.int32), np.empty(count, np.uint32)
-    for digit in range(3):
-        shift, mask = np.uint32(_DIGIT * digit), np.uint32((1 << _DIGIT) - 1)
-        starts = np.zeros((1 << _DIGIT) + 1, np.int64)
-        for i in range(count):
-            starts[((keys[i] >> shift) & mask) + 1] += 1
-        for i in range(1 << _DIGIT):
-            starts[i + 1] += starts[i]
-        for i in range(count):
-            place = (keys[i] >> shift) & mask
-            sorted_seen[starts[place]], sorted_keys[starts[place]] = seen[i], keys[i]
-            starts[place] += 1
-        seen, sorted_seen, keys, sorted_keys = sorted_seen, seen, sorted_keys, keys
-    return seen
 
 
 @njit(forceinline=True)
