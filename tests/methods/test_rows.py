@@ -5,7 +5,7 @@ import torch
 from torch import nn
 
 from forewarp.methods.method import Method
-from forewarp.methods.rows import take_rows
+from forewarp.methods.rows import RowsAdam, take_rows
 
 
 class Points(nn.Module):
@@ -62,3 +62,25 @@ def test_a_state_of_other_rows_is_adopted_and_one_that_contradicts_itself_is_nam
     assert method.misfit(state | {"seen": more["seen"]}) == "seen"
     assert method.misfit(state | {"seen": state["seen"].float()}) == "seen"
     assert method.misfit(state | {"points.place": torch.ones(4, 3)}) == "points.place"
+
+
+def test_groups_have_rates_and_betas_of_their_own():
+    values = [torch.nn.Parameter(torch.zeros(20, 3)) for _ in range(3)]
+    groups = [
+        {"params": values[:1], "lr": 0.1},
+        {"params": values[1:2], "lr": 0.2},
+        {"params": values[2:], "lr": 0.1, "betas": (0.5, 0.5)},
+    ]
+    optimizer = RowsAdam(groups)
+    for sign in (1.0, -2.0):
+        for value in values:
+            value.grad = torch.full((20, 3), sign)
+        optimizer.step()
+    first, second, third = (float(value.detach()[0, 0]) for value in values)
+    assert second == pytest.approx(2 * first)
+    assert third != pytest.approx(first, abs=1e-3)
+
+
+def test_betas_of_one_are_refused():
+    with pytest.raises(ValueError, match=r"betas: expected numbers from 0 to below 1, but got \(0.9, 1.0\)"):
+        RowsAdam([{"params": [torch.nn.Parameter(torch.zeros(2))]}], betas=(0.9, 1.0))

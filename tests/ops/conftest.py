@@ -1,7 +1,5 @@
 """Every operator is tested in both of its implementations."""
 
-import importlib.util
-
 import pytest
 import torch
 
@@ -13,8 +11,8 @@ SHAPE = (3, 4, 5)
 @pytest.fixture(params=["reference", "numba"])
 def backend(request, monkeypatch):
     """Runs the test once in plain PyTorch and once with the Numba kernels."""
-    if request.param == "numba" and importlib.util.find_spec("numba") is None:
-        pytest.skip("Numba is not installed")
+    if request.param == "numba":
+        pytest.importorskip("numba")
     monkeypatch.setattr(choice, "numba_installed", lambda: request.param == "numba")
     return request.param
 

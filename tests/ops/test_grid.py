@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from forewarp.ops import grid
-from tests.support.reference import lattice_cells, trilinear_read
+from tests.support.reference import lattice_cells, patch_roughness, trilinear_read, variation
 
 SHAPE = (3, 4, 5)
 
@@ -18,15 +18,6 @@ def test_equals_the_slow_twin(backend, sparse):
     points = random_points()
     read = grid.trilinear(values, index, points, fill)
     torch.testing.assert_close(read, trilinear_read(values, index, points, fill))
-
-
-def test_a_voxel_reads_itself_and_an_absent_one_the_fill(backend, sparse):
-    values, index, fill = sparse
-    cells = torch.tensor(lattice_cells(SHAPE), dtype=torch.float64)
-    read = grid.trilinear(values, index, cells, fill)
-    rows = index.reshape(-1).long()
-    assert torch.equal(read[rows >= 0], values[rows[rows >= 0]])
-    assert (read[rows < 0] == fill).all()
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -81,11 +72,11 @@ def test_a_second_derivative_is_refused_and_not_silently_zero(sparse):
     pytest.importorskip("numba")
     values, index, fill = sparse
     points = random_points(3, low=0.1, high=1.9).requires_grad_()
-    (slope,) = torch.autograd.grad(
+    (gradient,) = torch.autograd.grad(
         grid.trilinear(values, index, points, fill).square().sum(), points, create_graph=True
     )
     with pytest.raises(RuntimeError, match="once_differentiable"):
-        slope.sum().backward()
+        gradient.sum().backward()
 
 
 def test_index_of_inverts_the_list_of_voxels():
@@ -94,8 +85,6 @@ def test_index_of_inverts_the_list_of_voxels():
     assert [int(index[tuple(v)]) for v in voxels.tolist()] == [0, 1, 2]
     assert int((index >= 0).sum()) == 3
     assert (grid.index_of(voxels[:0], SHAPE) == -1).all()
-    with pytest.raises(ValueError, match=r"voxels: expected shape \(N, 3\)"):
-        grid.index_of(torch.zeros(3), SHAPE)
 
 
 def test_dilate_equals_the_largest_distance():
@@ -109,7 +98,7 @@ def test_dilate_equals_the_largest_distance():
 
 
 @pytest.mark.parametrize("keeping", [None, torch.arange(40) % 7 == 3, torch.zeros(40, dtype=torch.bool)])
-def test_occupied_cells_have_a_corner_that_is_present_and_kept(backend, sparse, keeping):
+def test_occupied_cells_have_a_corner_that_is_present_and_kept(sparse, keeping):
     index = sparse[1].clone()
     index[0] = -1
     cells = grid.occupied_cells(index, keeping)
@@ -122,11 +111,50 @@ def test_occupied_cells_have_a_corner_that_is_present_and_kept(backend, sparse, 
 def test_neighbour_pairs_are_all_pairs_at_distance_one(sparse):
     index = sparse[1]
     found = {frozenset(p) for a, b in grid.neighbour_pairs(index) for p in zip(a.tolist(), b.tolist())}
-    rows = {cell: int(index[cell]) for cell in lattice_cells(SHAPE) if index[cell] >= 0}
-    expected = {
-        frozenset((r, s))
-        for a, r in rows.items()
-        for b, s in rows.items()
-        if sum(abs(i - j) for i, j in zip(a, b)) == 1
-    }
-    assert found == expected
+    cells = (index >= 0).nonzero()
+    near = (cells[:, None] - cells).abs().sum(-1) == 1
+    rows = index[cells.unbind(-1)]
+    assert found == {frozenset((int(rows[a]), int(rows[b]))) for a, b in near.nonzero().tolist()}
+
+
+def test_hand_worked_variation():
+    index = torch.arange(4, dtype=torch.int32).reshape(2, 2, 1)
+    values = torch.tensor([[0.0], [1.0], [5.0], [3.0]])
+    # x: |5 - 0|, |3 - 1| -> 3.5; y: |1 - 0|, |3 - 5| -> 1.5; z has one voxel.
+    assert grid.total_variation(values, grid.neighbour_pairs(index)).item() == 5.0
+
+
+def test_variation_equals_the_slow_twin_and_is_0_of_constants_and_lonely_voxels(sparse):
+    values, index, _ = sparse
+    padded = np.concatenate([values.numpy(), np.full((1, 2), np.nan)])
+    pairs = grid.neighbour_pairs(index)
+    assert grid.total_variation(values, pairs).item() == pytest.approx(variation(padded[index.numpy()]))
+    assert grid.total_variation(torch.ones(40, 2), pairs).item() == 0
+    alone = grid.neighbour_pairs(grid.index_of(torch.tensor([[1, 1, 1]]), SHAPE))
+    assert grid.total_variation(torch.ones(1, 2), alone).item() == 0
+
+
+def test_patches_equal_the_slow_twin_and_opacity_is_not_pulled():
+    depth, opacity = torch.rand(3, 5, 5, requires_grad=True), torch.rand(3, 5, 5, requires_grad=True)
+    rough = grid.patch_variation(depth, opacity)
+    assert rough.item() == pytest.approx(patch_roughness(depth, opacity))
+    rough.backward()
+    assert opacity.grad is None
+    assert depth.grad.abs().sum() > 0
+    assert grid.patch_variation(depth, torch.zeros(3, 5, 5)).item() == 0
+
+
+def test_second_differences_of_a_ramp_are_none_and_of_a_square_are_two():
+    axes = torch.meshgrid(*map(torch.arange, (3, 4, 5)), indexing="ij")
+    ramp = (axes[0] + 2 * axes[1] - 3 * axes[2]).float()[..., None]
+    assert grid.second_variation(ramp).item() == 0
+    assert grid.second_variation((axes[1] ** 2).float()[..., None]).item() == pytest.approx(2 / 3)
+
+
+@pytest.mark.parametrize(("value", "gradient", "total"), [(0.5, 0.5, 0.125), (3.0, 1.0, 2.5)])
+def test_the_gradient_of_hubers_variation_is_the_difference_up_to_one(value, gradient, total):
+    volume = torch.tensor([0.0, value]).reshape(2, 1, 1, 1).requires_grad_()
+    rough = grid.huber_variation(volume)
+    rough.backward()
+    assert rough.item() == pytest.approx(total)
+    assert volume.grad.flatten().tolist() == pytest.approx([-gradient, gradient])

@@ -64,11 +64,10 @@ WITHOUT = {
     "a guard or a switch": "check_shape numba_installed use_numba match_threads warm_up"
     " has_kernels smaller cores compile_backward_kernels is_number",
     "places samples, which no loss pulls at": "march march_reference stratified by_importance clip_to_box",
-    "whole numbers, or yes and no": "unfolded index_of dilate occupied_cells neighbour_pairs"
-    " occupied_cells_reference encoded_size",
+    "whole numbers, or yes and no": "unfolded index_of dilate occupied_cells neighbour_pairs encoded_size",
     "says that it has none": "trace undistort adam_rows arrays",
     "of times or directions, which are not learned": "spline_basis spline_shares harmonics",
-    "gives its own, which test_compare and test_nodes compare": "compare compare_reference pull_nodes"
+    "gives its own, which test_gaussians and test_nodes compare": "compare compare_reference pull_nodes"
     " spread_nodes",
 }
 
