@@ -190,7 +190,7 @@ class Loop:
 
     def covered(self) -> float:
         """Pixels that show something, on average over the pictures."""
-        return float(self.method.covered)
+        return float(self.method.covered_pixels)
 
     @torch.no_grad()
     def picture(self) -> Tensor:

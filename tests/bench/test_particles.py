@@ -25,7 +25,7 @@ def few(monkeypatch):
 
 
 def test_the_figure_is_as_large_as_asked_and_stays_so(loop):
-    assert (len(loop.method.means), len(loop.method.nodes)) == (300, 9)
+    assert (len(loop.method.means), len(loop.method.nodes.positions)) == (300, 9)
     before = loop.method.means.detach().clone()
     for _ in range(3):
         loop.step()
@@ -83,10 +83,10 @@ def test_each_effect_is_timed_alone_and_what_is_off_is_absent(few):
     bare, shaded, moving, usual = (
         Loop(TINY, list(particle_tables.ALONE.values())[k]).method for k in (0, 2, 5, 8)
     )
-    assert (bare.nodes, bare.shade, bare.tint, bare.fade, bare.resting) == (None,) * 5
-    assert shaded.shade.shape == (300, 15, 3)
-    assert moving.nodes.turn is None
-    assert None not in (usual.nodes.turn, usual.shade, usual.tint, usual.resting)
+    assert (bare.nodes, bare.sh, bare.color_over_time, bare.opacity_over_time, bare.resting) == (None,) * 5
+    assert shaded.sh.shape == (300, 15, 3)
+    assert moving.nodes.rotations is None
+    assert None not in (usual.nodes.rotations, usual.sh, usual.color_over_time, usual.resting)
 
 
 def test_steps_grow_with_threads_as_far_as_there_are_cores(few, monkeypatch):

@@ -12,6 +12,7 @@ from unittest.mock import patch
 
 import torch
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
 
 # A scene of 32 x 32 pixels, with test views of all three kinds.
 SCENE = {"size": 32, "frames": 6, "test_views": (2, 1, 2), "val_views": 1, "samples_per_pixel": 1}
@@ -50,6 +51,7 @@ def call(name, *arguments):
             status = leaving.code
         finally:
             GlobalHydra.instance().clear()
+            HydraConfig.instance().cfg = None
             quiet.setLevel(level)
             logging.disable(disabled)
             torch.set_num_threads(threads)

@@ -76,7 +76,7 @@ class TimeOffsets(nn.Module):
             return {min(after, len(self.times) - 1): 1.0}
         low, high = self.times[after - 1 : after + 1]
         share = (time - low) / (high - low)
-        return {row: weight for row, weight in ((after - 1, 1 - share), (after, share)) if weight > 0}
+        return {row: part for row, part in ((after - 1, 1 - share), (after, share)) if part > 0}
 
     def __call__(self, time: float) -> float:
         """Return the time of the motion, up to ``most`` steps beyond [0, 1]."""
