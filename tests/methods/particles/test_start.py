@@ -148,7 +148,7 @@ def test_the_process_beside_compiles_for_the_numbers_that_a_step_has():
         "import types, torch\n"
         "from forewarp.methods.particles.start import compile_backward, compile_kernels\n"
         "from forewarp.ops.kernels import backward, rasterize\n"
-        "kernels = (rasterize.compare, backward.rank_rows, backward.splat_gradients, backward.chain)\n"
+        "kernels = (rasterize.compare, backward.splat_gradients, backward.chain)\n"
         "compile_backward(); before = [list(kernel.signatures) for kernel in kernels]\n"
         "assert all(len(found) == 1 for found in before), before\n"
         "compile_kernels(types.SimpleNamespace(means=torch.zeros(1, 3)))\n"
