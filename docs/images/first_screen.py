@@ -8,40 +8,33 @@ Each folder holds the measured runs ``particles``, ``forward`` and ``backward`` 
 import sys
 from pathlib import Path
 
-from forewarp.files import read_json
-from forewarp.report.compare import read_metrics
-from forewarp.report.sheets import figure_of, read_picture, sheets_of, show, thirds
+import numpy as np
+from PIL import Image
+
+from forewarp.report.compare import read_compared
+from forewarp.report.figures import figure_of, save, sheets_of, thirds, view_near
 
 METHODS = ("particles", "forward", "backward")
 NEAR = 0.5  # the time of the views that are shown
 
 
-def row_of(folder: Path) -> dict:
-    """Return the pictures of a scene's view nearest to ``NEAR``: title -> (H, W, C)."""
-    sheets = {method: sheets_of(folder / method) for method in METHODS}
-    times = {
-        image["name"]: image["time"] for image in read_json(folder / METHODS[0] / "per_image.json")["images"]
-    }
-    shared = set.intersection(*map(set, sheets.values()))
-    view = min(sorted(shared), key=lambda name: abs(times[name] - NEAR))
-    parts = {method: thirds(read_picture(sheets[method][view])) for method in METHODS}
-    return {"truth": parts[METHODS[0]][0]} | {about(folder / m, m): parts[m][1] for m in METHODS}
-
-
-def about(run: Path, method: str) -> str:
-    """Say how good a run is, and after how long."""
-    metrics = read_metrics(run)
-    psnr = [image["scores"]["psnr"] for image in read_json(run / "per_image.json")["images"]]
-    return f"{method}: {sum(psnr) / len(psnr):.1f} dB, {metrics['seconds']['train']:.0f} s"
-
-
 def main(out: str, *folders: str) -> None:
     """Draw a row for each folder into ``out``."""
-    rows = [row_of(Path(folder)) for folder in folders]
-    figure, axes = figure_of(len(rows), 1 + len(METHODS), (11, 2.9 * len(rows)))
-    for line, pictures in zip(axes, rows):
-        show(line, pictures)
-    figure.savefig(out, dpi=100)
+    figure, axes = figure_of(len(folders), 1 + len(METHODS), (11, 2.9 * len(folders)))
+    for line, folder in zip(axes, folders):
+        runs = read_compared([Path(folder) / method for method in METHODS])
+        view = view_near(runs, NEAR)
+        sheets = [Image.open(sheets_of(row["folder"])[view]) for row in runs.values()]
+        parts = [thirds(np.asarray(sheet) / 255) for sheet in sheets]
+        psnr = [np.mean([image["scores"]["psnr"] for image in row["images"]]) for row in runs.values()]
+        after = [row["metrics"]["seconds"]["train"] for row in runs.values()]
+        titles = [f"{METHODS[i]}: {psnr[i]:.1f} dB, {after[i]:.0f} s" for i in range(len(METHODS))]
+        pictures = {"truth": parts[0][0], **{titles[i]: parts[i][1] for i in range(len(METHODS))}}
+        for axis, (title, picture) in zip(line, pictures.items()):
+            axis.imshow(picture)
+            axis.set_title(title, fontsize="small")
+            axis.set_axis_off()
+    save(figure, Path(out))
 
 
 if __name__ == "__main__":
