@@ -4,6 +4,7 @@ import importlib
 import importlib.util
 import os
 import re
+import runpy
 import shlex
 import subprocess
 import sys
@@ -93,6 +94,16 @@ def test_links_that_lead_nowhere_are_found(tmp_path):
     page = tmp_path / "page.md"
     page.write_text("# A b\n[a](#a-b) [b](#b) [c](page.md#a-b) [d](none.md) [e](https://x.org) `[f](none)`")
     assert broken(page) == ["#b", "none.md"]
+
+
+@pytest.mark.parametrize("script", sorted(DOCS.rglob("*.py")), ids=lambda script: script.name)
+def test_scripts_find_what_they_import(script):
+    try:
+        runpy.run_path(str(script), run_name="imported")  # does not call its main
+    except ModuleNotFoundError as error:
+        if error.name.startswith("forewarp"):
+            raise
+        pytest.skip(f"no {error.name}")
 
 
 def test_the_moving_picture_is_small():
