@@ -9,8 +9,8 @@ from forewarp.runs.build import build_run
 from forewarp.scene.cloud import Handover
 from forewarp.training.schedule import Curriculum
 from tests.support.configs import composed
-from tests.support.full_size import at_full_size
-from tests.support.sliding_square import moving_scene
+from tests.support.sampled_methods import at_full_size
+from tests.support.still_cameras import moving_scene
 
 approx = pytest.approx
 # Keys of the composed configuration with what the publications say.

@@ -30,8 +30,7 @@ from forewarp.drawing.files import to_bytes, write_video
 from forewarp.drawing.images import in_a_row
 from forewarp.progress import Counted
 from forewarp.scene.box import Box
-from tests.support.alignment import pose_errors
-from tests.support.handheld import WALKS, cameras_of, pictures_of, smeared
+from tests.support.captures import WALKS, cameras_of, pictures_of, pose_errors, smeared
 
 FRAMES, SECONDS, SHAKEN = 120, 8.0, 4  # every fourth frame is blurred
 GAP = 8  # pixels between pictures

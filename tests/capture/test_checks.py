@@ -11,7 +11,7 @@ from forewarp.capture import checks
 from forewarp.capture.checks import Evidence, refuse_matches, refuse_poses, unrotated
 from forewarp.capture.frames import Frames
 from forewarp.scene.camera import Lens
-from tests.support.sparse_scene import cameras_on_arc, sparse_arc
+from tests.support.captures import cameras_on_arc, sparse_arc
 
 GOOD = Evidence(features=900, shift=0.2, unrotated=0.5)
 

@@ -11,7 +11,7 @@ import pycolmap
 
 from forewarp.capture import pipeline, poses
 from forewarp.capture.poses import Search, adjust, read_model
-from tests.support.sparse_scene import cameras_on_arc, write_model
+from tests.support.captures import cameras_on_arc, write_model
 
 POINTS = np.random.default_rng(0).uniform(-1, 1, (40, 3))
 LENS = (0.05, -0.02, 0.001, -0.002)

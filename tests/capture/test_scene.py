@@ -9,8 +9,7 @@ pytest.importorskip("pycolmap", reason="no pycolmap; make install adds it")
 from forewarp.capture.frames import Frames, Source
 from forewarp.capture.scene import Limits, draw, facts_of, limits_of, placed, summary, upwards
 from forewarp.scene.box import Box
-from tests.support.alignment import pose_errors
-from tests.support.sparse_scene import cameras_on_arc, sparse_arc
+from tests.support.captures import cameras_on_arc, pose_errors, sparse_arc
 
 ROTATION = Rotation.from_euler("xyz", [40, -70, 110], degrees=True).as_matrix()
 ANYWHERE = (ROTATION, np.array([7.0, -3.0, 100.0]), 0.02)  # a world as structure from motion leaves it

@@ -23,11 +23,9 @@ from forewarp.scene.box import Box
 from forewarp.synth.raycast import render
 from forewarp.synth.scenes import random_cameras
 from forewarp.synth.world import World
-from tests.support.alignment import pose_errors
+from tests.support.captures import WALKS, cameras_of, cameras_on_arc, pictures_of, pose_errors, write_model
 from tests.support.configs import CONF
 from tests.support.films import numbered, write_film
-from tests.support.handheld import WALKS, cameras_of, pictures_of
-from tests.support.sparse_scene import cameras_on_arc, write_model
 
 POINTS = np.random.default_rng(0).uniform(-1, 1, (200, 3))
 

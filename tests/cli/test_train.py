@@ -14,7 +14,7 @@ from forewarp.methods.particles.model import Particles
 from forewarp.runs.session import locked
 from forewarp.training.handover import load_handover
 from tests.support.commands import TINY
-from tests.support.dnerf_scene import write_tiny
+from tests.support.written_scenes import write_dnerf
 
 # A run of one stage and 6 steps, beside ``data.root`` and ``run``.
 SHORT = ["budget.iterations=6", "stage.coarse.num_voxels=[[0,800]]", "~stage.fine", "logger=none"]
@@ -205,7 +205,7 @@ def test_what_cannot_be_trained_is_refused_before_a_folder_is_made(
     root = scenes
     if word == "data.scene=tiny":
         root = in_tmp
-        write_tiny(root / "tiny")
+        write_dnerf(root / "tiny")
         (root / "tiny" / "train" / "r_1.png").unlink()
     assert says.format(root=root) in refused(*arguments(root, "run"), word)
     assert not (in_tmp / "run").exists()

@@ -14,13 +14,13 @@ from forewarp.data.module import DNeRFDataModule
 from forewarp.scene.camera import joined
 from forewarp.scene.frame import Frame, Scene
 from forewarp.scene.view import Asks, Moment
-from tests.support.dnerf_scene import real, shots, write_tiny
+from tests.support.written_scenes import dnerf_shots, real, write_dnerf
 
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory) -> Scene:
     root = tmp_path_factory.mktemp("batches")
-    write_tiny(root / "toy")
+    write_dnerf(root / "toy")
     return read_scene(root, "toy")
 
 
@@ -218,7 +218,7 @@ def test_batches_repeat_and_continue_exactly(scene, options):
 
 @pytest.mark.parametrize("depth", [False, True])
 def test_reduced_truth_is_what_half_resolution_loads(tmp_path, depth):
-    write_tiny(tmp_path / "toy", test=shots(3, 2, (6, 8), depth=depth))
+    write_dnerf(tmp_path / "toy", test=dnerf_shots(3, 2, (6, 8), depth=depth))
     whole, half = (DNeRFDataModule(tmp_path, "toy", half_resolution=halve) for halve in (False, True))
     for target, loaded in zip(whole.targets("test").reduced(2), half.targets("test"), strict=True):
         assert torch.equal(target.rgb, loaded.rgb)

@@ -9,24 +9,27 @@ import torch
 
 from forewarp.data import dnerf
 from forewarp.data.dnerf import read_lego_complete, read_scene
-from tests.support.dnerf_scene import (
+from tests.support.written_scenes import (
     ANGLE,
     FEW,
-    REAL_SCENES,
+    LEGO_TRUTH,
+    dnerf_shots,
     edit,
+    lego_views,
     real,
-    shots,
-    truth,
-    views,
-    write_kinds,
-    write_tiny,
+    write_dnerf,
+    write_lego,
 )
 
 
 def test_round_trip_of_a_stock_scene(tmp_path):
-    write_tiny(tmp_path / "toy")
+    write_dnerf(tmp_path / "toy")
     scene = read_scene(tmp_path, "toy")
-    for split, expected in (("train", shots(4)), ("val", shots(2, 1)), ("test", shots(3, 2))):
+    for split, expected in (
+        ("train", dnerf_shots(4)),
+        ("val", dnerf_shots(2, 1)),
+        ("test", dnerf_shots(3, 2)),
+    ):
         for frame, shot in zip(getattr(scene, split), expected, strict=True):
             assert frame.name == f"{split}/{shot.name}"
             assert (frame.time, frame.ability, frame.load_depth) == (shot.time, "all", None)
@@ -41,10 +44,10 @@ def test_round_trip_of_a_stock_scene(tmp_path):
 
 
 def test_a_frame_may_name_its_ability_and_missing_times_are_spread(tmp_path):
-    write_tiny(tmp_path / "toy", train=shots(4, times=[0.7, 0.2, 0.9, 0.5]))
+    write_dnerf(tmp_path / "toy", train=dnerf_shots(4, times=[0.7, 0.2, 0.9, 0.5]))
     assert read_scene(tmp_path, "toy").canonical_time == 0.2  # the smallest training time
-    edit(tmp_path / "toy", "test", lambda c: c["frames"][1].update(ability="time"))
-    edit(tmp_path / "toy", "train", lambda c: [f.pop("time") for f in c["frames"]])
+    edit(tmp_path / "toy" / "transforms_test.json", lambda c: c["frames"][1].update(ability="time"))
+    edit(tmp_path / "toy" / "transforms_train.json", lambda c: [f.pop("time") for f in c["frames"]])
     (tmp_path / "toy" / "train" / "transforms.json").write_text("broken")  # stray files are ignored
     (tmp_path / "toy" / "train" / "r_900.png").write_bytes(b"")
     scene = read_scene(tmp_path, "toy")
@@ -54,7 +57,7 @@ def test_a_frame_may_name_its_ability_and_missing_times_are_spread(tmp_path):
 
 @pytest.mark.parametrize(("value", "expected"), [("auto", (8, 6)), (False, (8, 6)), (True, (4, 3))])
 def test_half_resolution_of_a_small_scene(tmp_path, value, expected):
-    write_tiny(tmp_path / "toy", test=shots(2, depth=True))
+    write_dnerf(tmp_path / "toy", test=dnerf_shots(2, depth=True))
     scene = read_scene(tmp_path, "toy", half_resolution=value)
     frame, camera = scene.test[0], scene.test[0].camera
     assert (camera.width, camera.height) == (2 * camera.cx, 2 * camera.cy) == expected
@@ -66,7 +69,7 @@ def test_half_resolution_of_a_small_scene(tmp_path, value, expected):
 
 def test_a_known_point_projects_where_it_was_painted(tmp_path):
     """The formulas of the format, by hand: x right, y up, looking along -z."""
-    write_tiny(tmp_path / "toy", size=(60, 80))
+    write_dnerf(tmp_path / "toy", size=(60, 80))
     content = json.loads((tmp_path / "toy" / "transforms_train.json").read_text())
     matrix, point = np.array(content["frames"][0]["transform_matrix"]), np.array([0.3, -0.2, 0.5])
     local = matrix[:3, :3].T @ (point - matrix[:3, 3])
@@ -78,11 +81,13 @@ def test_a_known_point_projects_where_it_was_painted(tmp_path):
     assert depth.item() == pytest.approx(-local[2])
 
 
-@pytest.mark.parametrize("name", REAL_SCENES)
+REAL = {"bouncingballs": 150, "hellwarrior": 100, "hook": 100, "jumpingjacks": 200, "lego": 50, "mutant": 150}
+
+
+@pytest.mark.parametrize("name", REAL)
 def test_real_scenes_read(name):
     scene = read_scene(real("dnerf"), name, box=[-1.5] * 3 + [1.5] * 3)
-    counts = dict(zip(REAL_SCENES, (150, 100, 100, 200, 50, 150)))
-    assert (len(scene.train), len(scene.test)) == (counts[name], 20)
+    assert (len(scene.train), len(scene.test)) == (REAL[name], 20)
     assert len(scene.val) == (11 if name == "lego" else 20)
     assert (scene.canonical_time, scene.times[-1], scene.has_alpha) == (0.0, 1.0, True)
     assert scene.train[0].camera.fx == pytest.approx(555.5555, abs=1e-3)
@@ -99,25 +104,25 @@ def test_the_released_size_halves_to_the_published_one():
 
 
 def test_round_trip_of_three_kinds_of_test_view(tmp_path):
-    write_kinds(tmp_path / "lift")
+    write_lego(tmp_path / "lift")
     scene = read_lego_complete(tmp_path, "lift")
     assert (len(scene.train), scene.val, scene.canonical_time) == (3, (), 0.0)
-    for frame, shot in zip(scene.test, views(), strict=True):
+    for frame, shot in zip(scene.test, lego_views(), strict=True):
         assert (frame.ability, frame.time) == (shot.ability, shot.time)
         assert np.array_equal(frame.load(), shot.rgba)
         assert np.array_equal(frame.load_depth(), shot.depth)
     assert len({frame.name for frame in scene.test}) == 9
-    assert torch.equal(scene.truth.points, truth().points)
-    assert torch.equal(scene.truth.times, truth().times)
+    assert torch.equal(scene.truth.points, LEGO_TRUTH.points)
+    assert torch.equal(scene.truth.times, LEGO_TRUTH.times)
     expected = {"dataset": "lego_complete", "training_times": 3, "test_views": FEW}
     assert scene.protocol | expected == scene.protocol
 
 
 def test_what_differs_from_the_published_counts_is_said_once(tmp_path, monkeypatch):
-    folder = write_kinds(tmp_path / "lift", train=shots(4, times=[0, 0, 0.5, 1]))
-    edit(folder, "test_space", {"frames.0.time": 0.25})
-    edit(folder, "test_canonical", {"frames.0.time": 0.5})
-    edit(folder, "test_canonical", lambda c: c["frames"][1].pop("depth_file_path"))
+    folder = write_lego(tmp_path / "lift", train=dnerf_shots(4, times=[0, 0, 0.5, 1]))
+    edit(folder / "transforms_test_space.json", {"frames.0.time": 0.25})
+    edit(folder / "transforms_test_canonical.json", {"frames.0.time": 0.5})
+    edit(folder / "transforms_test_canonical.json", lambda c: c["frames"][1].pop("depth_file_path"))
     assert read_lego_complete(tmp_path, "lift").protocol["note"] == (
         "not the published protocol: 3 training times instead of 50; 4 training images at 3 times; "
         "4 space views instead of 200; 3 time views instead of 197; 2 canonical views instead of 50; "
@@ -126,16 +131,19 @@ def test_what_differs_from_the_published_counts_is_said_once(tmp_path, monkeypat
     )
     monkeypatch.setattr(dnerf, "TRAINING_TIMES", 3)
     monkeypatch.setattr(dnerf, "TEST_VIEWS", FEW)
-    write_kinds(tmp_path / "lift")
+    write_lego(tmp_path / "lift")
     assert "note" not in read_lego_complete(tmp_path, "lift").protocol
 
 
 @pytest.mark.parametrize("place", ["", "frames.1."])
 def test_depth_may_be_a_png_with_its_scale(tmp_path, place):
-    folder = write_kinds(tmp_path / "lift")
+    folder = write_lego(tmp_path / "lift")
     steps = np.arange(48, dtype=np.uint16).reshape(6, 8) * 1000
     iio.imwrite(folder / "d.png", steps)
-    edit(folder, "test_time", {"frames.1.depth_file_path": "d.png", f"{place}depth_scale": 1e-4})
+    edit(
+        folder / "transforms_test_time.json",
+        {"frames.1.depth_file_path": "d.png", f"{place}depth_scale": 1e-4},
+    )
 
     def depth(**options):
         frames = read_scene(tmp_path, "lift", **options).test
@@ -147,7 +155,7 @@ def test_depth_may_be_a_png_with_its_scale(tmp_path, place):
 
 
 def test_an_ability_may_have_its_file_in_its_folder(tmp_path):
-    folder = write_kinds(tmp_path / "lift")
+    folder = write_lego(tmp_path / "lift")
     text = (folder / "transforms_test_space.json").read_text()
     (folder / "transforms_test_space.json").unlink()
     (folder / "test_space" / "transforms.json").write_text(text.replace("./test_space/", "./"))

@@ -29,8 +29,7 @@ from forewarp.data.files import (
     whole,
 )
 from forewarp.data.images import inspect_image, read_gray16, read_image
-from tests.support.dnerf_scene import write_tiny
-from tests.support.rig_scene import write_rig
+from tests.support.written_scenes import write_dnerf, write_rig
 
 BIG, EYE, NAN = 60_000, np.eye(4), float("nan")
 BAD_POSES = {
@@ -206,7 +205,7 @@ def test_pipes_and_devices_are_no_files(tmp_path):
 
 @pytest.fixture
 def scene(tmp_path):
-    return write_tiny(tmp_path / "a")
+    return write_dnerf(tmp_path / "a")
 
 
 def append(path):

@@ -15,8 +15,26 @@ from forewarp.data.dnerf import Shot
 from forewarp.data.files import SceneError
 from forewarp.data.nhr import DomeFrame
 from forewarp.data.posed_video import PosedShot
-from tests.support import dnerf_scene, nhr_scene, posed_scene, rig_scene
-from tests.support.edits import GONE, edit
+from tests.support.written_scenes import (
+    BALLS,
+    GONE,
+    RIG_TRUTH,
+    STEP,
+    dnerf_shots,
+    dome,
+    dome_frames,
+    dome_truth,
+    edit,
+    hand,
+    posed_cameras,
+    posed_shots,
+    rig,
+    write_dnerf,
+    write_dome,
+    write_lego,
+    write_rig,
+    write_video,
+)
 
 READ = {
     "dnerf": dnerf.read_scene,
@@ -31,11 +49,11 @@ READ = {
 def written(tmp_path_factory):
     """A root with a scene of each format; not to be changed."""
     root = tmp_path_factory.mktemp("whole")
-    dnerf_scene.write_tiny(root / "dnerf")
-    dnerf_scene.write_kinds(root / "lego")
-    rig_scene.write_rig(root / "rig", points=np.zeros((2, 3)), trajectories=rig_scene.truth())
-    nhr_scene.write_dome(root / "dome")
-    posed_scene.write_tiny(root / "video")
+    write_dnerf(root / "dnerf")
+    write_lego(root / "lego")
+    write_rig(root / "rig", points=np.zeros((2, 3)), trajectories=RIG_TRUTH)
+    write_dome(root / "dome")
+    write_video(root / "video")
     iio.imwrite(root / "video" / "m.png", np.zeros((4, 4, 3), np.uint8))
     return root
 
@@ -176,7 +194,7 @@ BAD = {
         (POSES, line(2, lambda w: w[:11]), "inf: line 2: expected 12 finite numbers, but got 11"),
         (POSES, line(2, lambda w: [w[0] + "0", *w[1:3], *w[:3], *w[6:]]), "line 2: expected a rotation"),
         (POSES, line(4, None), "Intrinsic.inf: expected as many cameras .*got 4 there and 3 in"),
-        (".", lambda p: nhr_scene.write_dome(p, nhr_scene.dome(1), 1), "expected at least 2 cameras, one to"),
+        (".", lambda p: write_dome(p, dome(1), 1), "expected at least 2 cameras, one to"),
         (LENSES, None, "expected a readable file, but got No such file"),
         (
             LENSES,
@@ -292,7 +310,7 @@ def test_a_missing_scene_names_those_that_exist(written, name):
 
 
 def test_sides_that_cannot_be_halved(tmp_path):
-    dnerf_scene.write_tiny(tmp_path / "odd", size=(5, 8))
+    write_dnerf(tmp_path / "odd", size=(5, 8))
     with pytest.raises(SceneError, match="expected even sides to halve, but got 8 x 5"):
         dnerf.read_scene(tmp_path, "odd", half_resolution=True)
 
@@ -305,36 +323,36 @@ def test_smaller_images_need_a_folder(scene):
         posed_video.read_scene(folder.parent, "video", scale=2)
 
 
-def write_dnerf(folder, splits):
+def write_splits(folder, splits):
     dnerf.write_scene(folder, splits, camera_angle_x=1)
 
 
-def write_dome(folder, frame):
-    nhr.write_scene(folder, nhr_scene.dome(), [frame])
+def write_moment(folder, frame):
+    nhr.write_scene(folder, dome(), [frame])
 
 
 def shot(name="a", **changes):
     return replace(Shot(name, 0, np.eye(4), PIXELS), **changes)
 
 
-RIG, *_ = rig_scene.rig()
-DOME = next(nhr_scene.dome_frames(nhr_scene.dome()))
-RGB, ONE = np.zeros((20, 30, 3), np.uint8), posed_scene.cameras(1)[0]
+RIG, *_ = rig()
+DOME = next(dome_frames(dome()))
+RGB, ONE = np.zeros((20, 30, 3), np.uint8), posed_cameras(1)[0]
 POSED = PosedShot("a.png", ONE, RGB)
 UNWRITABLE = {
-    write_dnerf: [
+    write_splits: [
         ({"train": [shot(), shot()]}, "expected shots of different names"),
         ({"train": [shot(rgba=PIXELS / 1.0)]}, "expected uint8 pixels"),
         ({"train": [shot(), shot("b", rgba=PIXELS[:2])]}, r"uint8 pixels of .* got uint8 of \(2, 8, 4\)"),
         ({"train": [shot(pose=2 * np.eye(4))]}, "train/a: pose: expected a rotation"),
     ],
-    rig_scene.write_rig: [
+    write_rig: [
         ([RIG, RIG], "shots: expected different names"),
         ([replace(RIG, split="test")], "of train, val or '', but got 'left1_000000' of split 'test'"),
         ([replace(RIG, rgb=RIG.rgb / 255)], "left1_000000: expected uint8"),
-        (rig_scene.rig(size=(11, 8)), "cannot reshape"),
+        (rig(size=(11, 8)), "cannot reshape"),
     ],
-    write_dome: [
+    write_moment: [
         (DomeFrame(DOME.images[:1], DOME.masks, DOME.points), "is shorter than"),
         (DomeFrame(DOME.masks, DOME.masks, DOME.points), "frame 0: img_0000.jpg: expected uint8 pixels of"),
     ],
@@ -358,27 +376,27 @@ def test_the_writers_refuse_what_could_not_be_read(tmp_path, write, what, match)
         write(tmp_path / "toy", what)
 
 
-TWO_VIEWS, SPLITS = nhr_scene.dome(2), ["train"] * 5 + ["test"] * 5
+TWO_VIEWS, SPLITS = dome(2), ["train"] * 5 + ["test"] * 5
 FORMATS = {  # what reads it, what writes a scene with all that may be there, what writes shots and no more
     "dnerf": (
         dnerf.read_scene,
-        dnerf_scene.write_kinds,
-        lambda folder, cut: dnerf_scene.write_tiny(folder, test=cut(dnerf_scene.shots(2))),
+        write_lego,
+        lambda folder, cut: write_dnerf(folder, test=cut(dnerf_shots(2))),
     ),
     "hypernerf": (
         hypernerf.read_scene,
-        lambda f: rig_scene.write_rig(f, points=np.zeros((1, 3)), trajectories=rig_scene.truth()),
-        lambda folder, cut: rig_scene.write_rig(folder, cut(rig_scene.hand(5))),
+        lambda f: write_rig(f, points=np.zeros((1, 3)), trajectories=RIG_TRUTH),
+        lambda folder, cut: write_rig(folder, cut(hand(5))),
     ),
     "nhr": (
         nhr.read_scene,
-        lambda folder: nhr_scene.write_dome(folder, trajectories=nhr_scene.truth()),
-        lambda folder, cut: nhr.write_scene(folder, TWO_VIEWS, cut(nhr_scene.dome_frames(TWO_VIEWS, 2))),
+        lambda folder: write_dome(folder, trajectories=dome_truth()),
+        lambda folder, cut: nhr.write_scene(folder, TWO_VIEWS, cut(dome_frames(TWO_VIEWS, 2))),
     ),
     "video": (
         posed_video.read_scene,
-        lambda folder: posed_scene.write_tiny(folder, splits=SPLITS),
-        lambda folder, cut: posed_video.write_scene(folder, cut(posed_scene.shots()), near=20, far=120),
+        lambda folder: write_video(folder, splits=SPLITS),
+        lambda folder, cut: posed_video.write_scene(folder, cut(posed_shots()), near=20, far=120),
     ),
 }
 
@@ -411,7 +429,7 @@ def test_a_box_is_as_given_or_bounds_all_training_rays(tmp_path, name):
     write(tmp_path / "toy")
     assert read(tmp_path, "toy", box=[-1, -2, -3, 1, 2, 3]).box.high == (1, 2, 3)
     if name == "nhr":  # what its point clouds span, a tenth more on each side
-        low, high = nhr_scene.BALLS.min(0), (nhr_scene.BALLS + 2 * nhr_scene.STEP).max(0)
+        low, high = BALLS.min(0), (BALLS + 2 * STEP).max(0)
         expected, near = (low - 0.1 * (high - low), high + 0.1 * (high - low)), 1e-6
     else:
         scene, points = read(tmp_path, "toy"), []

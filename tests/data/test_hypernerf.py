@@ -12,9 +12,21 @@ from forewarp.data.files import SceneError
 from forewarp.data.hypernerf import read_camera, read_scene, reduced, write_camera
 from forewarp.data.images import write_image
 from tests.support import reference
-from tests.support.dnerf_scene import real
-from tests.support.edits import GONE, edit
-from tests.support.rig_scene import CENTER, FAR, LENS, NEAR, SCALE, hand, phone, rig, truth, write_rig
+from tests.support.written_scenes import (
+    CENTER,
+    FAR,
+    GONE,
+    LENS,
+    NEAR,
+    RIG_TRUTH,
+    SCALE,
+    edit,
+    hand,
+    phone,
+    real,
+    rig,
+    write_rig,
+)
 
 
 def normalised(points):
@@ -33,7 +45,7 @@ def printed_formulas(content, point, ratio):
 @pytest.mark.parametrize("scale", [1, 2])
 def test_round_trip_of_a_rig(tmp_path, scale):
     points = np.array([[1.0, 2, 3], [2.5, -1, 0.75]], np.float32)
-    folder = write_rig(tmp_path / "toy", rig(size=(12, 8), skew=2.0), points=points, trajectories=truth())
+    folder = write_rig(tmp_path / "toy", rig(size=(12, 8), skew=2.0), points=points, trajectories=RIG_TRUTH)
     scene, point = read_scene(tmp_path, "toy", scale=scale), np.array(CENTER) + [0.4, -0.3, 0.6]
     frames = {frame.name: frame for frame in (*scene.train, *scene.test)}
     for shot in rig(size=(12, 8), skew=2.0):
@@ -56,8 +68,8 @@ def test_round_trip_of_a_rig(tmp_path, scale):
         assert depth.item() == pytest.approx(z * SCALE)
     assert (frames, scene.has_alpha, scene.val) == ({}, False, ())
     torch.testing.assert_close(scene.still.double(), normalised(points), atol=1e-6, rtol=0)
-    torch.testing.assert_close(scene.truth.points.double(), normalised(truth().points), atol=1e-6, rtol=0)
-    assert torch.equal(scene.truth.times, truth().times)
+    torch.testing.assert_close(scene.truth.points.double(), normalised(RIG_TRUTH.points), atol=1e-6, rtol=0)
+    assert torch.equal(scene.truth.times, RIG_TRUTH.times)
 
 
 def test_a_rig_is_split_as_it_says(tmp_path):

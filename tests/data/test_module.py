@@ -11,8 +11,8 @@ from forewarp.data.files import SceneError, fingerprint
 from forewarp.data.module import DNeRFDataModule, SceneDataModule, hold_out, outline, with_canonical
 from forewarp.scene.frame import Truth
 from forewarp.scene.view import Batch, Target
-from tests.support.dnerf_scene import shots, write_tiny
 from tests.support.tiny_scene import ball_scene
+from tests.support.written_scenes import dnerf_shots, write_dnerf
 
 
 class Recorder(LightningModule):
@@ -44,7 +44,7 @@ def trainer(steps, **options) -> Trainer:
 
 @pytest.fixture
 def make(tmp_path):
-    write_tiny(tmp_path / "toy")
+    write_dnerf(tmp_path / "toy")
     return lambda **options: DNeRFDataModule(tmp_path, "toy", rays=16, **options)
 
 
@@ -72,7 +72,7 @@ def test_an_interrupted_run_sees_what_an_unbroken_one_sees(make, tmp_path):
 
 
 def test_a_scene_without_validation_trains_and_the_picker_is_asked_once_a_step(tmp_path):
-    write_tiny(tmp_path / "toy", val=())
+    write_dnerf(tmp_path / "toy", val=())
     calls, model, data = [], Recorder(), DNeRFDataModule(tmp_path, "toy", rays=4)
     data.picker = lambda: calls.append(1) or 2
     trainer(4, val_check_interval=2, check_val_every_n_epoch=None).fit(model, datamodule=data)
@@ -110,7 +110,7 @@ def test_behind_opaque_images_is_what_was_there_in_training(options, color):
 
 
 def test_targets_by_split(tmp_path):
-    write_tiny(tmp_path / "toy", test=shots(2, ability="time", depth=True))
+    write_dnerf(tmp_path / "toy", test=dnerf_shots(2, ability="time", depth=True))
     data = DNeRFDataModule(tmp_path, "toy", eval_background="black")
     assert [len(data.targets(s)) for s in ("train", "val", "test")] == [4, 2, 2]
     target = data.targets("test")[1]

@@ -10,7 +10,7 @@ import torch
 
 from forewarp.data.images import write_image
 from forewarp.data.nhr import read_scene
-from tests.support.nhr_scene import BALLS, COLORS, STEP, dome, dome_frames, place, truth, write_dome
+from tests.support.written_scenes import BALLS, COLORS, STEP, dome, dome_frames, dome_truth, place, write_dome
 
 KEYS = ("width", "height", "fx", "fy", "cx", "cy", "skew")
 
@@ -19,7 +19,7 @@ KEYS = ("width", "height", "fx", "fy", "cx", "cy", "skew")
 def written(tmp_path_factory):
     """A root with the scene ``toy``; not to be changed."""
     root = tmp_path_factory.mktemp("nhr")
-    write_dome(root / "toy", trajectories=truth())
+    write_dome(root / "toy", trajectories=dome_truth())
     return root
 
 
@@ -46,7 +46,7 @@ def test_round_trip(written):
             assert np.array_equal(rgba[..., 3], mask)
             assert np.abs(rgba[..., :3].astype(int) - moment.images[k])[mask > 0].mean() < 6
     assert (scene.val, scene.canonical_time, scene.has_alpha, scene.times) == ((), 0.0, True, (0, 0.5, 1))
-    assert torch.equal(scene.truth.points, truth().points)
+    assert torch.equal(scene.truth.points, dome_truth().points)
     expected = {"dataset": "nhr", "resolution": [[60, 48], [48, 60]], "half_resolution": False, "frames": 3}
     assert scene.protocol == expected | {"views": 4, "test_views": [0], "test_frames": 3, "mask_box": True}
 
@@ -115,7 +115,7 @@ def test_held_out_views(tmp_path, written):
 
 @pytest.mark.parametrize(("frames", "there"), [(1, 3), (3, 5), (2, 3), (9, 5)])
 def test_true_trajectories_keep_step_with_the_frames_that_are_read(tmp_path, frames, there):
-    write_dome(tmp_path / "toy", count=there, trajectories=truth(there))
+    write_dome(tmp_path / "toy", count=there, trajectories=dome_truth(there))
     scene = read_scene(tmp_path, "toy", frames=frames)
     if frames == 1:
         assert scene.truth is None

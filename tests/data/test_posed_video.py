@@ -14,8 +14,17 @@ from forewarp.data.posed_video import FILE, read_scene, write_scene
 from forewarp.scene.box import Box
 from forewarp.scene.camera import look_at
 from tests.support import reference
-from tests.support.edits import GONE, edit
-from tests.support.posed_scene import LENS, MIDDLE, UP, cameras, placed, shots, write_tiny
+from tests.support.written_scenes import (
+    GONE,
+    LENS,
+    MIDDLE,
+    UP,
+    edit,
+    placed,
+    posed_cameras,
+    posed_shots,
+    write_video,
+)
 
 
 def frames_of(scene):
@@ -27,7 +36,7 @@ def made(tmp_path):
     """Write ``toy`` and read it."""
 
     def make(**options):
-        write_tiny(tmp_path / "toy", **options)
+        write_video(tmp_path / "toy", **options)
         return read_scene(tmp_path, "toy")
 
     return make
@@ -37,7 +46,7 @@ def test_round_trip(made):
     scene = made()
     frames = frames_of(scene)
     assert len(frames) == 10
-    for i, shot in enumerate(shots()):
+    for i, shot in enumerate(posed_shots()):
         frame, expected = frames[f"images/frame_{i + 1}"], placed(scene, shot.camera)
         assert frame.time == pytest.approx(i / 9)
         torch.testing.assert_close(frame.camera.camera_to_world, expected.camera_to_world, atol=1e-9, rtol=0)
@@ -78,16 +87,16 @@ def test_known_points_project_by_the_formats_formulas(tmp_path, made):
 
 def test_points_that_never_move_are_in_the_scenes_units(tmp_path):
     points = np.random.default_rng(0).uniform(-20, 20, (7, 3)) + MIDDLE.numpy()
-    write_scene(tmp_path / "toy", shots(), near=20.0, far=120.0, points=points)
+    write_scene(tmp_path / "toy", posed_shots(), near=20.0, far=120.0, points=points)
     scene = read_scene(tmp_path, "toy")
     assert scene.still.dtype == torch.float32
-    frame, camera = next(iter(frames_of(scene).values())), cameras(10)[0]
+    frame, camera = next(iter(frames_of(scene).values())), posed_cameras(10)[0]
     before, after = camera.project(torch.from_numpy(points)), frame.camera.project(scene.still.double())
     torch.testing.assert_close(before[0], after[0], atol=1e-3, rtol=0)
 
 
 def test_each_frame_may_have_its_own_camera(made):
-    views = cameras(5) + cameras(5, size=(16, 12), lens=None)
+    views = posed_cameras(5) + posed_cameras(5, size=(16, 12), lens=None)
     views[2] = replace(views[2], fx=50.0, cx=11.0)
     scene = made(views=views)
     for i, view in enumerate(views):
@@ -97,7 +106,7 @@ def test_each_frame_may_have_its_own_camera(made):
 
 
 def test_only_a_focal_length_is_needed_and_no_order(tmp_path):
-    write_tiny(tmp_path / "toy")
+    write_video(tmp_path / "toy")
     optional = ("fl_y", "cx", "cy", "w", "h", "k1", "k2", "k3", "p1", "p2", "camera_model")
     edit(tmp_path / "toy" / FILE, dict.fromkeys(optional, GONE))
     edit(tmp_path / "toy" / FILE, lambda c: c["frames"].reverse())  # in the order of their names' numbers
@@ -122,7 +131,7 @@ HELD = [(10, 2, [2, 4, 6, 8]), (10, 3, [2, 5, 8]), (13, 8, [5]), (21, 8, [5, 13]
 
 @pytest.mark.parametrize(("count", "every", "held"), HELD)
 def test_every_nth_frame_is_held_out_but_never_the_first_or_the_last(tmp_path, count, every, held):
-    write_tiny(tmp_path / "toy", count=count)
+    write_video(tmp_path / "toy", count=count)
     scene = read_scene(tmp_path, "toy", test_every=every)
     assert [f.name for f in scene.test] == [f"images/frame_{i}" for i in held]
     assert {0.0, 1.0} <= {f.time for f in scene.train}
@@ -142,11 +151,11 @@ def test_lists_choose_the_splits(tmp_path, made):
 
 
 def test_nothing_depends_on_the_unit(tmp_path):
-    unit, views = 1e3, cameras(10)
+    unit, views = 1e3, posed_cameras(10)
     for view in views:
         view.camera_to_world[:3, 3] *= unit
-    write_tiny(tmp_path / "a", near=None, far=None)
-    write_tiny(tmp_path / "b", near=None, far=None, views=views)
+    write_video(tmp_path / "a", near=None, far=None)
+    write_video(tmp_path / "b", near=None, far=None, views=views)
     a, b = read_scene(tmp_path, "a"), read_scene(tmp_path, "b")
     assert a.box.low == pytest.approx(b.box.low)
     assert a.box.high == pytest.approx(b.box.high)
@@ -189,7 +198,7 @@ def test_a_box_is_in_the_files_units(tmp_path, made):
 
 def looking_out(span):
     """Cameras on a part of a circle that look away from its middle."""
-    for i, camera in enumerate(cameras(10)):
+    for i, camera in enumerate(posed_cameras(10)):
         angle = torch.tensor(span * i / 10)
         offset = torch.stack([angle.cos(), angle.sin(), torch.tensor(0.0)])
         yield replace(camera, camera_to_world=look_at(MIDDLE + offset, MIDDLE + 2 * offset, UP))
@@ -197,7 +206,7 @@ def looking_out(span):
 
 def in_a_row():
     """Cameras beside one another whose parallel axes meet nowhere."""
-    for i, camera in enumerate([cameras(1)[0]] * 10):
+    for i, camera in enumerate([posed_cameras(1)[0]] * 10):
         pose = camera.camera_to_world.clone()
         pose[:3, 3] = MIDDLE + i * pose[:3, 0]
         yield replace(camera, camera_to_world=pose)
@@ -205,13 +214,13 @@ def in_a_row():
 
 @pytest.mark.parametrize("views", [in_a_row(), looking_out(1.0)], ids=["row", "out"])
 def test_cameras_whose_axes_do_not_meet_look_at_what_lies_before_them(tmp_path, views):
-    write_tiny(tmp_path / "toy", near=None, far=None, views=[*views])
+    write_video(tmp_path / "toy", near=None, far=None, views=[*views])
     for frame in read_scene(tmp_path, "toy").train:
         assert float(-frame.camera.center @ frame.camera.camera_to_world[:3, 2]) > frame.camera.near > 0
 
 
 def test_cameras_that_look_in_all_directions_are_refused(tmp_path):
-    write_tiny(tmp_path / "out", views=[*looking_out(2 * np.pi)])
+    write_video(tmp_path / "out", views=[*looking_out(2 * np.pi)])
     with pytest.raises(SceneError, match="cameras that look at something in common, but got views in"):
         read_scene(tmp_path, "out")
 
@@ -219,8 +228,8 @@ def test_cameras_that_look_in_all_directions_are_refused(tmp_path):
 @pytest.mark.parametrize("turn", [False, True])
 def test_a_camera_in_one_place_needs_an_end(tmp_path, turn):
     targets = [MIDDLE + torch.tensor([20.0, 3.0 * i * turn, 0.0]) for i in range(10)]
-    views = [replace(cameras(1)[0], camera_to_world=look_at(MIDDLE, at, UP)) for at in targets]
-    write_tiny(tmp_path / "toy", views=views, near=None)
+    views = [replace(posed_cameras(1)[0], camera_to_world=look_at(MIDDLE, at, UP)) for at in targets]
+    write_video(tmp_path / "toy", views=views, near=None)
     with pytest.raises(SceneError, match=r"expected cameras that move, but got one place; set data.near and"):
         read_scene(tmp_path, "toy")
     for f in read_scene(tmp_path, "toy", near=1).train:
@@ -237,7 +246,7 @@ def test_masks_become_alpha(tmp_path, made):
     assert scene.has_alpha
     assert np.array_equal(scene.train[0].load()[..., 3] > 0, mask)
     assert scene.box.diagonal < bare.box.diagonal
-    pixels = next(shots(channels=4)).pixels
+    pixels = next(posed_shots(channels=4)).pixels
     for i in range(10):
         write_image(tmp_path / "toy" / "images" / f"frame_{i + 1}.png", pixels)
     rgba = read_scene(tmp_path, "toy").train[0].load()
@@ -248,11 +257,11 @@ def test_masks_become_alpha(tmp_path, made):
 def test_alpha_counts_where_it_says_something(tmp_path, made):
     scene = made(channels=4)
     assert scene.has_alpha
-    assert np.array_equal(scene.train[0].load(), next(shots(channels=4)).pixels)
-    solid = [replace(s, pixels=s.pixels | np.uint8([0, 0, 0, 255])) for s in shots(channels=4)]
+    assert np.array_equal(scene.train[0].load(), next(posed_shots(channels=4)).pixels)
+    solid = [replace(s, pixels=s.pixels | np.uint8([0, 0, 0, 255])) for s in posed_shots(channels=4)]
     write_scene(tmp_path / "solid", solid, near=20, far=120)
     assert not read_scene(tmp_path, "solid").has_alpha
-    solid[-1] = [*shots(channels=4)][-1]  # one image that is cut out is enough
+    solid[-1] = [*posed_shots(channels=4)][-1]  # one image that is cut out is enough
     write_scene(tmp_path / "solid", solid, near=20, far=120)
     assert read_scene(tmp_path, "solid").has_alpha
 
@@ -260,7 +269,7 @@ def test_alpha_counts_where_it_says_something(tmp_path, made):
 @pytest.mark.parametrize("suffix", [".jpeg", ".JPG", ".PNG"])
 def test_images_are_written_and_read_with_and_without_their_suffix(tmp_path, suffix):
     smooth = np.full((20, 30, 3), 0, np.uint8) + np.arange(30, dtype=np.uint8)[:, None] * 8
-    same = [replace(s, pixels=smooth) for s in shots(suffix=suffix)]
+    same = [replace(s, pixels=smooth) for s in posed_shots(suffix=suffix)]
     write_scene(tmp_path / "toy", same, near=20, far=120)
     edit(tmp_path / "toy" / FILE, lambda c: c["frames"][0].update(file_path="images/frame_1"))
     content = (tmp_path / "toy" / "images" / f"frame_1{suffix}").read_bytes()
@@ -270,8 +279,8 @@ def test_images_are_written_and_read_with_and_without_their_suffix(tmp_path, suf
 
 
 def test_smaller_images_beside_the_others(tmp_path):
-    write_tiny(tmp_path / "toy")
-    for shot in shots():
+    write_video(tmp_path / "toy")
+    for shot in posed_shots():
         write_image(tmp_path / "toy" / "images_4" / shot.name, shot.pixels[::4, ::4][:, :7])
     scene = read_scene(tmp_path, "toy", scale=4)
     camera, full = scene.train[0].camera, read_scene(tmp_path, "toy").train[0].camera

@@ -4,8 +4,7 @@ import torch
 from forewarp.drawing.images import error_colors
 from forewarp.evaluation.images import image_flow, images_of, sized, validation_psnr, within
 from forewarp.scene.view import Target
-from tests.support.known_ball import known_ball
-from tests.support.tiny_scene import RADIUS, TRAVEL, ball_center, ball_data, ball_scene, camera_at
+from tests.support.tiny_scene import RADIUS, TRAVEL, ball_center, ball_data, ball_scene, camera_at, known_ball
 
 
 @pytest.fixture(scope="module")

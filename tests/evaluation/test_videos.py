@@ -3,8 +3,7 @@ import torch
 
 from forewarp.evaluation.trajectories import Trajectories, moving_points
 from forewarp.evaluation.videos import make_shots, video
-from tests.support.known_ball import known_ball
-from tests.support.tiny_scene import ball_scene, camera_at
+from tests.support.tiny_scene import ball_scene, camera_at, known_ball
 
 WHITE = torch.ones(3)
 

@@ -7,9 +7,8 @@ import pytest
 
 from forewarp.export import formats
 from forewarp.export.tracks import Source
-from tests.support.known_ball import known_ball
 from tests.support.particles import EVERY, module_with, shaken, small_data
-from tests.support.tiny_scene import ball_scene
+from tests.support.tiny_scene import ball_scene, known_ball
 
 TIMES = (0.0, 0.4, 1.0)
 

@@ -21,7 +21,7 @@ from forewarp.scene.camera import Camera, look_at
 from forewarp.scene.frame import Frame, Scene
 from forewarp.scene.view import Moment, View
 from tests.support.sampled_methods import GENTLE, KINDS, batch, learned, shown, start
-from tests.support.sliding_square import camera, moving_scene, over_white, static_ceiling
+from tests.support.still_cameras import camera, moving_scene, over_white, static_ceiling
 from tests.support.tiny_scene import BOX, RADIUS, TRAVEL, ball_center, photograph
 
 POINT = 3 * (1 + 2 * 3)  # channels of an encoded point of the small methods

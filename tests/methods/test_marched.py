@@ -19,9 +19,8 @@ from forewarp.scene.view import Batch, Moment, View
 from forewarp.training.objective import Objective
 from forewarp.training.schedule import StageSettings
 from forewarp.training.stages import Stage
-from tests.support.full_size import at_full_size
-from tests.support.sampled_methods import batch
-from tests.support.sliding_square import camera, moving_scene, static_ceiling
+from tests.support.sampled_methods import at_full_size, batch
+from tests.support.still_cameras import camera, moving_scene, static_ceiling
 from tests.support.tiny_scene import make_run
 
 S, B = {}, {"channels": 6, "width": 256, "alpha_init": 1e-3}

@@ -24,7 +24,7 @@ from forewarp.scene.view import Batch, Moment, Observation, View
 from forewarp.training.objective import Objective
 from forewarp.training.schedule import StageSettings
 from forewarp.training.stages import Stage
-from tests.support.sliding_square import TIMES, camera, moving_scene, picture, static_ceiling
+from tests.support.still_cameras import TIMES, camera, moving_scene, picture, static_ceiling
 from tests.support.tiny_scene import make_run
 
 SMALL = {"picture_size": (16, 16), "tower": (8, 16), "features": 32, "code": 12, "decoder": (32, 16, 16, 8)}

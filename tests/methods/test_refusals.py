@@ -13,7 +13,7 @@ from forewarp.methods.nerfies import Nerfies
 from forewarp.methods.rays import Marching, Sampling
 from forewarp.methods.tineuvox import TiNeuVox
 from forewarp.methods.tnerf import TNeRF
-from tests.support.sliding_square import moving_scene
+from tests.support.still_cameras import moving_scene
 
 SAMPLED = (NeRF, TNeRF, DNeRF, Nerfies, HyperNeRF)
 OPACITY = r"alpha_init: expected a number in \(0, 1\), but got"

@@ -11,7 +11,7 @@ from forewarp.methods.ndvg import NDVG
 from forewarp.methods.tineuvox import TiNeuVox
 from forewarp.scene.view import Moment, View
 from tests.support.sampled_methods import KINDS, learned
-from tests.support.sliding_square import camera, moving_scene, static_ceiling
+from tests.support.still_cameras import camera, moving_scene, static_ceiling
 
 GRIDS = {
     "tineuvox": partial(TiNeuVox, width=16, position_frequencies=3),

@@ -16,7 +16,7 @@ from forewarp.methods.tnerf import TNeRF
 from forewarp.ops.encode import positional_encoding
 from forewarp.scene.view import Batch, Moment, Observation, View
 from tests.support.sampled_methods import GENTLE, KINDS, SMALL, WARP, batch, learned, method, shown, start
-from tests.support.sliding_square import camera, moving_scene, static_ceiling
+from tests.support.still_cameras import camera, moving_scene, static_ceiling
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from forewarp.methods.tnerf import TNeRF
 from forewarp.training.objective import Objective
 from forewarp.training.schedule import StageSettings
 from forewarp.training.stages import Stage
-from tests.support.niche import niche_scene
+from tests.support.still_cameras import niche_scene
 from tests.support.tiny_scene import make_run
 
 FIELD = {"width": 48, "layers": 3, "skip": None, "position_frequencies": 4, "direction_frequencies": 1}

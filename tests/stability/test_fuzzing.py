@@ -26,8 +26,19 @@ from forewarp.scene.frame import Scene
 from forewarp.scene.view import Moment, View
 from forewarp.training.checkpoints import check_state, load_weights
 from tests.stability.harm import harmed
-from tests.support import dnerf_scene, nhr_scene, posed_scene, rig_scene
 from tests.support.configs import composed
+from tests.support.written_scenes import (
+    LEGO_TRUTH,
+    RIG_TRUTH,
+    dnerf_shots,
+    dome,
+    dome_truth,
+    rig,
+    write_dnerf,
+    write_dome,
+    write_rig,
+    write_video,
+)
 
 pytestmark = pytest.mark.stability
 
@@ -37,30 +48,30 @@ QUICK = settings(FUZZ, max_examples=30, derandomize=True, deadline=60_000)  # ot
 
 
 def three_kinds(folder):
-    test = [s for i, a in enumerate(dnerf.ABILITIES) for s in dnerf_scene.shots(2, i, ability=a, depth=True)]
-    splits, truth = {"train": dnerf_scene.shots(3), "test": test}, dnerf_scene.truth()
+    test = [s for i, a in enumerate(dnerf.ABILITIES) for s in dnerf_shots(2, i, ability=a, depth=True)]
+    splits, truth = {"train": dnerf_shots(3), "test": test}, LEGO_TRUTH
     dnerf.write_scene(folder, splits, camera_angle_x=0.7, trajectories=truth)
 
 
 def two_phones(folder):
     points = np.arange(12.0).reshape(4, 3)
-    rig_scene.write_rig(folder, rig_scene.rig(3), points=points, trajectories=rig_scene.truth())
+    write_rig(folder, rig(3), points=points, trajectories=RIG_TRUTH)
 
 
-def dome(folder):
-    cameras = nhr_scene.dome(3, sizes=((24, 18), (18, 24)))
-    nhr_scene.write_dome(folder, cameras, 2, trajectories=nhr_scene.truth(2))
+def small_dome(folder):
+    cameras = dome(3, sizes=((24, 18), (18, 24)))
+    write_dome(folder, cameras, 2, trajectories=dome_truth(2))
 
 
 def video(folder):
-    posed_scene.write_tiny(folder, times=[i / 9 for i in range(10)], channels=4)
+    write_video(folder, times=[i / 9 for i in range(10)], channels=4)
 
 
 FORMATS = {
-    "dnerf": (dnerf_scene.write_tiny, dnerf.read_scene),
+    "dnerf": (write_dnerf, dnerf.read_scene),
     "lego_complete": (three_kinds, dnerf.read_lego_complete),
     "hypernerf": (two_phones, hypernerf.read_scene),
-    "nhr": (dome, nhr.read_scene),
+    "nhr": (small_dome, nhr.read_scene),
     "video_with_poses": (video, posed_video.read_scene),
 }
 
@@ -103,7 +114,7 @@ def of_run(root):
     for name in ("config", "checkpoint"):
         (root / name).mkdir()
     (root / "config" / "config.yaml").write_text(OmegaConf.to_yaml(config))
-    dnerf_scene.write_tiny(root / "toy")
+    write_dnerf(root / "toy")
     scene = dnerf.read_scene(root, "toy")
     run = replace(build_run(config), datamodule=SimpleNamespace(scene=scene))
     module = run._module(run.stages[0], blank=True)

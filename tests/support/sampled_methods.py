@@ -1,5 +1,6 @@
-"""Small NeRF, T-NeRF, D-NeRF, Nerfies and HyperNeRF of the sliding square."""
+"""Small NeRF, T-NeRF, D-NeRF, Nerfies and HyperNeRF of the sliding square; how large grids grow."""
 
+import math
 from functools import partial
 
 import torch
@@ -7,16 +8,17 @@ import torch
 from forewarp.data.module import SceneDataModule
 from forewarp.methods.dnerf import DNeRF
 from forewarp.methods.hypernerf import HyperNeRF
-from forewarp.methods.method import Start
+from forewarp.methods.method import Start, parameter_count
 from forewarp.methods.nerf import NeRF
 from forewarp.methods.nerfies import Nerfies
 from forewarp.methods.rays import Sampling
 from forewarp.methods.tnerf import TNeRF
+from forewarp.scene.box import Lattice
 from forewarp.scene.view import Batch, Moment, Observation, View
 from forewarp.training.objective import Objective
 from forewarp.training.schedule import StageSettings
 from forewarp.training.stages import Stage
-from tests.support.sliding_square import camera, moving_scene
+from tests.support.still_cameras import camera, moving_scene
 from tests.support.tiny_scene import make_run
 
 SMALL = {"width": 32, "layers": 3, "skip": None, "position_frequencies": 3, "direction_frequencies": 1}
@@ -68,3 +70,17 @@ def learned(kind, folder, read=moving_scene, *, iterations=260, rays=96):
     module = make_run(folder, [Stage(settings, Objective(weights))], data=data, model=model).fit()
     psnr = torch.stack([module.psnr_of(target).double() for target in data.targets("train")])
     return module.method, float(-10 * torch.log10((10 ** (-psnr / 10)).mean()))
+
+
+def at_full_size(made, num_voxels):
+    """How many parameters NDVG or TiNeuVox has with about so many voxels."""
+    marched = made.marching_lattice(num_voxels)
+    if hasattr(made, "canonical"):
+        grids = [(made.canonical, Lattice.of_count(made.box, num_voxels)), (made.deformation, marched)]
+    else:
+        grids = [(made.grid, marched)]
+    count = parameter_count(made)
+    for grid, lattice in grids:
+        channels = sum(parameter.shape[1] for parameter in grid.parameters())
+        count += channels * math.prod(lattice.shape) - parameter_count(grid)
+    return count

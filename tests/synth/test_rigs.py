@@ -4,10 +4,32 @@ import torch
 
 from forewarp.data import hypernerf, nhr
 from forewarp.synth import rigs
-from forewarp.synth.raycast import Posed, camera_rays, surface_points
+from forewarp.synth.raycast import Hits, Posed, camera_rays, light_points, surface_points
 from forewarp.synth.rigs import dome_cameras, rig_cameras, synthesize_hypernerf, synthesize_nhr
 from forewarp.synth.world import World
-from tests.support.lit_points import color_errors, lit_points
+
+
+def lit_points(world, faces, barycentric, time, center):
+    """Return colours (N, 3) in [0, 1] at ``time``, and whether each is visible from ``center`` (3,)."""
+    posed = Posed(world, time)
+    hits = Hits(np.arange(len(faces)), faces, barycentric, np.zeros(len(faces)))
+    points = world.points(faces, barycentric, time)
+    away = points - center
+    distance = np.linalg.norm(away, axis=-1)
+    first = posed.first_hits(np.broadcast_to(center, points.shape), away / distance[:, None])
+    visible = np.zeros(len(faces), dtype=bool)
+    visible[first.ray] = np.abs(first.distance - distance[first.ray]) < 1e-3
+    return posed.color(hits, light_points(24)), visible
+
+
+def color_errors(rgb, camera, points, colors):
+    """Return the colour errors (M,) of the pixels that show the points (N, 3) inside the image."""
+    pixel, depth = camera.project(points.double())
+    size = torch.tensor([camera.width, camera.height])
+    inside = ((pixel > 0) & (pixel < size)).all(-1) & (depth > 0)
+    column, row = pixel[inside].floor().long().unbind(-1)
+    seen = rgb[row, column, :3].double().numpy() / 255
+    return np.abs(seen - colors[inside.numpy()]).mean(-1)
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,7 @@ import threading
 import pytest
 
 from forewarp.viewer.queue import FRAME_SECONDS, Cancelled, FrameRateControl, RenderQueue
-from tests.support.fake_viewer import Watch
+from tests.support.fakes import Watch
 
 
 @pytest.fixture

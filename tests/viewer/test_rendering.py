@@ -8,8 +8,7 @@ from forewarp.scene.camera import look_at
 from forewarp.scene.view import Moment, View
 from forewarp.viewer.queue import Cancelled
 from forewarp.viewer.rendering import SceneRenderer, Viewer, ViewState, camera_of, turning_axis
-from tests.support.known_ball import known_ball
-from tests.support.tiny_scene import BOX, ball_center, ball_data, ball_scene, camera_at
+from tests.support.tiny_scene import BOX, ball_center, ball_data, ball_scene, camera_at, known_ball
 
 SIZE = 60
 

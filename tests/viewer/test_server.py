@@ -27,9 +27,8 @@ from forewarp.viewer.rendering import SceneRenderer, Viewer, ViewState
 from forewarp.viewer.session import Session
 from tests.contract.fitting import stage_of
 from tests.contract.table import METHODS
-from tests.support.fake_viewer import FakePage
-from tests.support.known_ball import known_ball
-from tests.support.tiny_scene import ball_data, ball_scene, make_run, same, stage
+from tests.support.fakes import FakePage
+from tests.support.tiny_scene import ball_data, ball_scene, known_ball, make_run, same, stage
 
 
 @pytest.fixture(scope="module")

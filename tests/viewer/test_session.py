@@ -9,7 +9,7 @@ import torch
 from forewarp.viewer import session as session_module
 from forewarp.viewer.queue import FRAME_SECONDS, Cancelled, RenderQueue
 from forewarp.viewer.session import MIN_INTERVAL, PLAYBACK_SECONDS, REST_SECONDS, Session, camera_path
-from tests.support.fake_viewer import FakePage, FakeViewer, Watch
+from tests.support.fakes import FakePage, FakeViewer, Watch
 from tests.support.films import read_film
 from tests.support.tiny_scene import camera_at
 

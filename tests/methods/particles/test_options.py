@@ -10,8 +10,8 @@ from forewarp.methods.particles.model import Particles
 from forewarp.methods.particles.options import EFFECTS, Effects, Numbers, ParticlesPlanning
 from forewarp.metrics.gain import Gain
 from forewarp.scene.silhouettes import Survey
-from tests.support.coarse_trials import Noted
 from tests.support.configs import composed
+from tests.support.fakes import Noted
 
 PICTURES = Survey(frames=50, times=50, cut_out=0.8, spread=160.0, disagreement=0.2)
 NAMES = [effect.name for effect in EFFECTS]

@@ -22,7 +22,7 @@ from forewarp.metrics.gain import Gain
 from forewarp.ops.curves import dct_basis
 from forewarp.scene.box import Lattice
 from forewarp.scene.silhouettes import Survey, survey
-from tests.support.coarse_trials import Noted
+from tests.support.fakes import Noted
 from tests.support.tiny_scene import BOX, ball_data, ball_scene, built, forward_model, make_run, stage
 
 LATTICE = Lattice(BOX, (12, 9, 8))
