@@ -66,19 +66,20 @@ def test_options_of_every_method_compose_and_instantiate(words):
     "words", rows_of(*(f"model/{effect}" for effect, _ in OFF), "model/radiance"), ids=" ".join
 )
 def test_options_of_voxels_compose_and_instantiate(words):
-    assert isinstance(method_of(run_of("model=forward", *words).model), torch.nn.Module)
+    model = run_of("model=forward", *words).model
+    assert isinstance(method_of(model), torch.nn.Module)
+    chosen = {word.removeprefix("model/").split("=")[0] for word in words if not word.endswith("=none")}
+    assert None not in [model.keywords[effect] for effect in chosen]
 
 
 def test_effects_of_particles_are_switched():
     off = run_of(*(f"{group}=none" for group, _ in OF_PARTICLES[1:])).model.keywords
     assert off == dict.fromkeys(group.removeprefix("model/") for group, _ in OF_PARTICLES)
-    for chosen in (OF_PARTICLES[1:], [("model/motion", "spline")]):
-        given = run_of(*(f"{group}={option}" for group, option in chosen)).model.keywords
-        assert None not in [given[group.removeprefix("model/")] for group, _ in chosen]
-        assert Effects(**given)
-    given = run_of("model/view_dependence=mlp").model.keywords
+    given = run_of(*(f"{group}={option}" for group, option in OF_PARTICLES[1:])).model.keywords
+    assert None not in given.values()
+    assert Effects(**given)
     with pytest.raises(ValueError, match="model.view_dependence: expected a degree of 1 to 3, or null, but"):
-        Effects(**given)
+        Effects(**given | {"view_dependence": "mlp"})
 
 
 @pytest.mark.parametrize("name", [path.stem for path in CONF.glob("*.yaml") if path.stem != "options"])
@@ -108,9 +109,6 @@ def test_off_is_none_whatever_the_preset(preset):
     off = run_of("model=forward", f"preset={preset}", *(f"model/{effect}=none" for effect, _ in OFF)).model
     assert [off.keywords[effect] for effect, _ in OFF] == [None] * len(OFF)
     assert {name.split(".")[0] for name, _ in method_of(off).named_parameters()} == {"radiance"}
-    on = [f"model/{effect}={choice}" for effect, choice in OFF]
-    if preset == "fast":
-        assert None not in [run_of("model=forward", *on).model.keywords[effect] for effect, _ in OFF]
 
 
 def test_every_number_of_the_renderer_is_a_key_and_equals_its_default():
@@ -166,8 +164,9 @@ def test_every_weight_may_be_typed():
 
 @pytest.mark.parametrize("data", options("data"))
 def test_every_dataset_takes_a_canonical_time_and_the_presets_background(data):
-    common = [f"data={data}", "data.scene=x", "preset.background=black"]
-    config = composed(*common, "data.canonical=middle")
+    config = composed("data.scene=x", "data.canonical=middle", name=f"data/{data}")
+    outside = {"preset": {"background": "black", "rays": 8}, "paths": {"data": "a", "scenes": "b"}, "seed": 0}
+    config = OmegaConf.create(outside | OmegaConf.to_container(config))
     assert (config.data.canonical, config.data.background) == ("middle", "black")
     assert isinstance(instantiate(config.data, _convert_="all"), SceneDataModule)
 
@@ -181,20 +180,25 @@ def every_section():
             texts = [OmegaConf.load(file) for file in files if file.is_file()]
             own = {experiment for text in texts for experiment in text.get("exceptions", {})}
             for experiment in sorted(own) or [EXPERIMENTS[(3 * i + j) % len(EXPERIMENTS)]]:
-                marks = [] if j == i % 3 else pytest.mark.slow
-                yield pytest.param(model, preset, experiment, marks=marks)
+                yield model, preset, experiment
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("model", "preset", "experiment"), list(every_section()))
 def test_every_section_of_numbers_composes_and_instantiates(model, preset, experiment):
-    words = [] if model == "particles" else [f"model={model}"]  # the default
-    config = composed(*words, f"preset={preset}", f"experiment={experiment}", "data.scene=x")
+    config = composed(f"model={model}", f"preset={preset}", f"experiment={experiment}", "data.scene=x")
     assert (config.model.name, config.preset.name) == (model, preset)
     build_run(config)
     if model in OF_THE_TABLES and experiment in ("hypernerf", "demo_hypernerf"):
         # Trained over the background that they are measured on.
         assert (config.data.background, config.data.eval_background) == ("black", "black")
         assert config.model.get("camera") == (True if "tineuvox" in model else None)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_every_method_composes_and_instantiates(model):
+    """Shares its compositions with tests/test_defaults.py."""
+    assert [stage.settings.name for stage in run_of(f"model={model}", "preset=faithful").stages]
 
 
 @pytest.mark.parametrize("model", ["forward", pytest.param("backward", marks=pytest.mark.slow)])

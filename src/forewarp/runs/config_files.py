@@ -53,8 +53,11 @@ def _register(folder: Path) -> None:
     Adding the folder above to Hydra's search path would make everything in it a config group.
     """
     from hydra.core.config_store import ConfigStore
-    from omegaconf import OmegaConf
+
+    from forewarp.runs.sections import parsed
 
     store = ConfigStore.instance()
     for file in sorted(folder.glob("*.yaml")):
-        store.store(file.stem, OmegaConf.load(file), folder.name, "_global_", provider="forewarp")
+        store.store(
+            file.stem, parsed(file.read_text("utf-8")).content, folder.name, "_global_", provider="forewarp"
+        )

@@ -41,7 +41,8 @@ class _File(NamedTuple):
 
 
 @lru_cache(maxsize=512)  # parsing takes more than half of a composition
-def _parsed(text: str) -> _File:
+def parsed(text: str) -> _File:
+    """Parse a YAML file and the package that its header names."""
     return _File(
         OmegaConf.to_container(OmegaConf.create(text)), ConfigSource._get_header_dict(text)["package"]
     )
@@ -132,7 +133,7 @@ class _Sections:
         """Read a file once; None if there is none."""
         if name not in self._files:
             file = self._folder() / self._normalize_file_name(name) if super().is_config(name) else None
-            self._files[name] = file and _parsed(file.read_text(encoding="utf-8"))
+            self._files[name] = file and parsed(file.read_text(encoding="utf-8"))
         return self._files[name]
 
 
@@ -159,5 +160,5 @@ def option_groups(conf: Path) -> dict[str, list[str]]:
     names = {path.relative_to(conf).as_posix() for path in conf.rglob("*") if path.is_dir()} | {*OF_STAGES}
     for file in conf.rglob("options.yaml"):
         folder = file.parent.relative_to(conf)
-        names |= {(folder / key).as_posix() for key in _parsed(file.read_text(encoding="utf-8")).content}
+        names |= {(folder / key).as_posix() for key in parsed(file.read_text(encoding="utf-8")).content}
     return {name: source.list(name, ObjectType.CONFIG) for name in sorted(names)}
