@@ -20,7 +20,7 @@ def world():
 
 @pytest.fixture(scope="module")
 def shot(world):
-    camera = orbit_camera(-0.9, 0.5, 60)
+    camera = orbit_camera(-0.9, 0.5, 40)
     return camera, *render(world, 0.4, camera, 4)
 
 

@@ -2,12 +2,14 @@
 
 import numpy as np
 import pytest
+from omegaconf import OmegaConf
 
 from forewarp.synth.raycast import Posed, camera_rays, light_points, render
 from forewarp.synth.scenes import random_cameras
-from forewarp.synth.vehicle import GROUND
+from forewarp.synth.vehicle import GROUND, MOTIONS
 from forewarp.synth.world import BLOCKS, LIGHT_AT, ROOM_HIGH, ROOM_LOW, SPECIMENS, World
-from tests.support.configs import composed
+from tests.support.configs import CONF
+from tests.synth.test_shapes import volume
 
 TIMES = np.linspace(0, 1, 41)
 
@@ -24,9 +26,8 @@ def paths(name):
 
 @pytest.mark.parametrize("name", SPECIMENS)
 def test_it_moves_exactly_where_motion_is_called_for(name):
-    places = paths(name)
-    moved = np.abs(places - places[0]).max()
-    called_for = composed(f"scene=specimen_{name}", "model=forward").calls_for
+    moved = np.abs(np.diff(paths(name)[[0, -2]], axis=0)).max()
+    called_for = OmegaConf.load(CONF / "options.yaml").scene[f"specimen_{name}"].calls_for
     assert (moved > 0.1) if "motion" in called_for else (moved == 0)
 
 
@@ -45,13 +46,17 @@ def test_the_band_is_drawn_out_and_the_wings_turn_by_a_sixth_of_a_turn():
     np.testing.assert_allclose(SPECIMENS["spin"].joints(1)["wings"], turned, atol=1e-12)
 
 
+def beyond_cosines(values, count):
+    """What the first cosines leave of values (T, N) over ``TIMES``: the largest error."""
+    basis = np.cos(np.pi * (np.arange(len(TIMES)) + 0.5)[:, None] / len(TIMES) * np.arange(count))
+    return np.abs(basis @ np.linalg.lstsq(basis, values, rcond=None)[0] - values).max()
+
+
 def test_the_quick_one_needs_more_cosines_than_the_slow_one():
-    basis = np.cos(np.pi * (np.arange(len(TIMES)) + 0.5)[:, None] / len(TIMES) * np.arange(7))
-    left = {}
-    for name in ("rigid", "quick"):
-        places = np.stack([SPECIMENS[name].joints(time)["chassis"].ravel() for time in TIMES])
-        left[name] = np.abs(basis @ np.linalg.lstsq(basis, places, rcond=None)[0] - places).max()
-    assert left["rigid"] < 5e-3 < 0.015 < left["quick"]
+    slow, quick = (
+        np.stack([SPECIMENS[n].joints(t)["chassis"].ravel() for t in TIMES]) for n in ("rigid", "quick")
+    )
+    assert beyond_cosines(slow, 7) < 5e-3 < 0.015 < beyond_cosines(quick, 7)
 
 
 def test_only_the_glossy_one_throws_light_back_in_one_direction():
@@ -109,3 +114,54 @@ def test_walls_of_a_room_end_every_ray_cast_no_shadow_and_never_move():
     walls = np.unique(world.faces[~world.casts])
     np.testing.assert_array_equal(world.place(0.0)[walls], world.place(0.9)[walls])
     assert min(*ROOM_HIGH, -ROOM_LOW[0], -ROOM_LOW[1]) > 1.365  # all that moves stays within this
+
+
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_every_motion_spans_few_low_frequencies(motion):
+    """Ten cosines hold every joint's map to 5e-3: what a trajectory grid can learn."""
+    maps = np.stack([np.stack([*MOTIONS[motion](time).values()]).ravel() for time in TIMES])
+    assert beyond_cosines(maps, 10) < 5e-3
+    assert np.abs(maps - maps[0]).max() > 0.1
+
+
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_band_and_ball_keep_their_volumes_and_the_band_follows_the_pin(motion):
+    maps = [MOTIONS[motion](t) for t in TIMES]
+    for part, volume_at_rest in (("band", np.linalg.det(maps[0]["band"])), ("ball", 1)):
+        volumes = np.linalg.det([at[part] for at in maps])
+        np.testing.assert_allclose(volumes, volume_at_rest, rtol=1e-12)
+    for at in maps:
+        np.testing.assert_allclose(at["band"] @ (1, 0, 0, 1), at["stick"] @ (0.36, 0.125, 0, 1), atol=1e-12)
+
+
+def test_wheels_roll_without_slipping():
+    start, end = MOTIONS["drive"](0), MOTIONS["drive"](1)
+    angles = [np.arctan2(*(np.linalg.inv(at["chassis"]) @ at["wheel0"])[[2, 0], 0]) for at in (start, end)]
+    assert angles[0] - angles[1] == pytest.approx(0.42 / 0.16)  # the way over the radius
+
+
+def test_every_part_is_closed_and_turned_outwards():
+    for part in World().parts:
+        edges = part.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+        forward, backward = ({tuple(e) for e in side} for side in (edges, edges[:, ::-1]))
+        assert len(forward) == len(edges), part.name
+        assert forward == backward, part.name
+        assert volume((part.vertices, part.faces)) > 0, part.name
+
+
+@pytest.mark.parametrize(
+    ("motion", "moving"),
+    [
+        ("lift", {"boom", "boom_pins", "stick", "stick_pins", "bucket", "band"}),
+        ("lift_tilt", {"boom", "boom_pins", "stick", "stick_pins", "bucket", "band", "ball"}),
+        ("drive", {part.name for part in World().parts} - {"ground", "ball"}),
+    ],
+)
+def test_exactly_what_a_motion_moves_moves_above_ground_and_in_sight(motion, moving):
+    world = World(motion)
+    places = np.stack([world.place(time) for time in (0.0, 0.35, 0.7, 1.0)])
+    assert np.linalg.norm(places, axis=-1).max() < 1.365  # the sphere that fits into the view
+    part_of_vertex = np.repeat([p.name for p in world.parts], [len(p.vertices) for p in world.parts])
+    assert places[:, part_of_vertex != "ground", 2].min() > GROUND
+    changed = (places[-1] != places[0]).any(-1)  # by one bit
+    assert set(part_of_vertex[changed]) == moving

@@ -14,13 +14,13 @@ from forewarp.data.files import LOCK, RECORD, SceneError, read_json
 from forewarp.data.module import DNeRFDataModule, HyperNeRFDataModule, LegoCompleteDataModule, NHRDataModule
 from forewarp.progress import Counted
 from forewarp.scene.frame import Scene
-from forewarp.synth import rigs, scenes
+from forewarp.synth import scenes
 
 WRITERS = {
     "dnerf": scenes.synthesize,
     "lego_complete": scenes.synthesize_lego_complete,
-    "hypernerf": rigs.synthesize_hypernerf,
-    "nhr": rigs.synthesize_nhr,
+    "hypernerf": scenes.synthesize_hypernerf,
+    "nhr": scenes.synthesize_nhr,
 }
 
 
