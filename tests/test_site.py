@@ -14,9 +14,10 @@ from types import SimpleNamespace
 import pytest
 import yaml
 
+from forewarp.runs.sections import option_groups
 from tests.support.browser import Tab, chromium, until
 from tests.support.commands import call
-from tests.support.configs import ROOT
+from tests.support.configs import CONF, ROOT
 
 DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
@@ -58,16 +59,18 @@ def broken(page: Path) -> list[str]:
 
 
 def commands() -> list[str]:
-    """Return what pages show after ``forewarp-``, each command once."""
-    found = set()
+    """Return what pages show after ``forewarp-``; of commands that differ in numbers and names alone, one."""
+    found, groups = {}, set(option_groups(CONF))
     for page in PAGES:
         for _, language, text in FENCE.findall(page.read_text()):
             for line in text.replace("\\\n", " ").splitlines() if language == "bash" else ():
                 shown = re.match(r"\s*(?:\.venv/bin/)?forewarp-(.*)", line)
                 if shown and not any(word in line for word in OTHERS):
                     words = shlex.split(re.sub(r"<[^>]*>", "folder", shown[1]), comments=True)
-                    found.add(shlex.join(words))
-    return sorted(found)
+                    keys = (word.partition("=")[0] for word in words)
+                    kind = (word if key in groups else key for word, key in zip(words, keys))
+                    found.setdefault(frozenset(kind), shlex.join(words))
+    return sorted(found.values())
 
 
 def composed(line: str) -> tuple[str, list[str]]:

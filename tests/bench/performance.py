@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import math
 import os
-import statistics
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
@@ -19,40 +17,24 @@ from forewarp.ops.march import warm_up
 from forewarp.ops.splat import average_splat
 from forewarp.runs.config_files import project_root
 from forewarp.training.stages import peak_memory_bytes, reset_peak_memory
-from tests.bench import particle_tables, start_up
-from tests.bench.timed_cases import (
+from tests.bench import particles, start_up
+from tests.bench.workloads import (
     ALONE,
     CASES,
+    OCCUPANCY,
     REPEATS,
+    VERDICTS,
     Case,
     frame_work,
     milliseconds,
+    slope,
     splat_work,
     step_by_hand,
     step_with,
     step_work,
     timed,
 )
-from tests.bench.workloads import OCCUPANCY
-from tests.stability.report import replace_section, table
-from tests.stability.twin import implementation
-
-VERDICTS = {True: "reached", False: "**missed**", None: ""}
-
-
-def slope(amounts: Sequence[float], seconds: Sequence[float]) -> float:
-    """Fit the power with which seconds grow with the amount of work.
-
-    >>> round(slope([1, 2, 4, 8], [3, 6, 12, 24]), 6)
-    1.0
-    """
-    x, y = [math.log(a) for a in amounts], [math.log(s) for s in seconds]
-    return statistics.linear_regression(x, y).slope
-
-
-def mebibytes(count: int) -> str:
-    """Format bytes as whole MiB."""
-    return f"{count / 2**20:.0f}"
+from tests.stability.report import implementation, replace_section, table
 
 
 def cost_of(case: Case, size: float, dense: bool) -> tuple[float, int]:
@@ -75,8 +57,8 @@ def growth_tables(cases: Mapping[str, Case] = CASES) -> str:
             beside = ["", "", ""]
             if size in case.dense_sizes:
                 slow, much = cost_of(case, size, True)
-                beside = [milliseconds(slow), mebibytes(much), f"{slow / seconds:.1f}"]
-            lines.append([f"{size:g}", milliseconds(seconds), mebibytes(peak), *beside])
+                beside = [milliseconds(slow), f"{much / 2**20:.0f}", f"{slow / seconds:.1f}"]
+            lines.append([f"{size:g}", milliseconds(seconds), f"{peak / 2**20:.0f}", *beside])
         fitted = slope([case.work(size) for size in case.sizes], [seconds for seconds, _ in own])
         against = {2: "it", 4: "its square", 8: "its cube"}[case.work(2)]
         head = [case.axis, "ms", "MiB", "dense, ms", "dense, MiB", "times cheaper"]
@@ -139,7 +121,7 @@ def free_table(side: int = 48, rays: int = 2048) -> str:
 def by_itself(side: int, rays: int) -> float:
     """Time the dense step in a process without the large memory pages that the commands ask for."""
     work = f"step_work({side}, True, rays={rays})"
-    code = "from tests.bench.timed_cases import step_work, timed; "
+    code = "from tests.bench.workloads import step_work, timed; "
     plain = {name: value for name, value in os.environ.items() if name != "THP_MEM_ALLOC_ENABLE"}
     call = [sys.executable, "-c", f"{code}print(timed({work}, 2))"]
     return float(subprocess.run(call, env=plain, check=True, capture_output=True, text=True).stdout)
@@ -149,10 +131,10 @@ SECTIONS = {
     "growth": growth_tables,
     "goals": goals_table,
     "free": free_table,
-    "particles": particle_tables.parts_table,
-    "particles, growth": particle_tables.growth_table,
-    "particles, effects": particle_tables.effects_table,
-    "particles, goals": particle_tables.goals_table,
+    "particles": particles.parts_table,
+    "particles, growth": particles.growth_table,
+    "particles, effects": particles.effects_table,
+    "particles, goals": particles.goals_table,
     "start": start_up.start_table,
 }
 

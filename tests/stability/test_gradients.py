@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from hypothesis import given, settings, strategies
 from torch.autograd import gradcheck
 
 from forewarp import ops
@@ -54,9 +53,6 @@ from tests.support.gaussians import crowd, pinhole
 from tests.support.hard_cases import index_with
 
 pytestmark = pytest.mark.stability
-
-MANY = settings(derandomize=True, deadline=None, database=None, max_examples=8)
-SEEDS = strategies.integers(0, 10_000)
 
 LENS = ((0.1, -0.05, 0.01), (0.01, -0.02))
 # Why operators have no gradient, and which.
@@ -213,15 +209,10 @@ def test_gradients_equal_finite_differences(operator, numba, monkeypatch):
     if numba:
         pytest.importorskip("numba")
     monkeypatch.setattr(backend, "numba_installed", lambda: numba)
-
-    @MANY
-    @given(SEEDS)
-    def check(seed):
+    for seed in (0, 37, 5113):
         function, *inputs = CHECKS[operator](seed)
         leaves = [x.detach().clone().requires_grad_() for x in inputs]
-        assert gradcheck(function, leaves, atol=1e-6)
-
-    check()
+        assert gradcheck(function, leaves, atol=1e-6), seed
 
 
 def test_every_operator_is_checked_or_has_no_gradient():

@@ -14,7 +14,6 @@ from forewarp.methods.particles.model import Particles
 from forewarp.methods.particles.nodes import Nodes, Skinning
 from forewarp.methods.particles.start import anywhere
 from forewarp.ops.gaussians import BLUR
-from forewarp.ops.nodes import pull_nodes
 from forewarp.scene.box import Box
 from forewarp.scene.camera import Lens
 from forewarp.scene.view import Moment
@@ -22,7 +21,7 @@ from tests.contract.fitting import module_of, stage_of
 from tests.contract.table import METHODS
 from tests.stability.test_training import FEW, SCENE, Diary, in_other_units, pictured
 from tests.support.particles import BARE, EVERY, look, module_with, shaken, small_data
-from tests.support.tiny_scene import ball_scene, make_run, photograph, same
+from tests.support.tiny_scene import ball_scene, make_run, photograph
 
 pytestmark = pytest.mark.stability
 
@@ -132,20 +131,6 @@ def test_no_number_depends_on_the_unit_of_length(tmp_path, factor, has_alpha):
     assert other == pytest.approx(plain, rel=2e-3)
 
 
-@pytest.mark.slow
-def test_two_threads_train_alike(tmp_path, two_threads):
-    """A short run with all effects and density control, twice on two threads: equal to the bit."""
-    scene = ball_scene(frames=6, size=40)
-    (once, losses), (again, same_losses) = (
-        fit(tmp_path / folder, scene, 16, density_interval=0.2) for folder in ("once", "again")
-    )
-    assert torch.get_num_threads() == 2
-    assert int(once.method.round) >= 2  # particles have been renewed
-    assert losses == same_losses
-    assert len(set(losses)) == 16
-    assert same(once, again)
-
-
 def behind_a_lens(scene, lens):
     """The scene photographed anew through a lens, from the hull's frames to the test views."""
 
@@ -170,28 +155,6 @@ def test_other_units_and_images_through_a_lens_train_to_the_same_accuracy(tmp_pa
     assert found[0] > 28
     assert found[1:3] == pytest.approx([found[0]] * 2, abs=1.0)
     assert found[3] < found[2] - 1  # a lens that is left out is seen
-
-
-@pytest.mark.slow
-def test_images_of_two_sizes_train_to_the_same_accuracy(tmp_path):
-    """By one preset, nothing typed; views of the larger are averaged to the smaller ones, then scored."""
-    small, found, count = ball_scene(frames=24, size=32), [], []
-    for factor in (1, 3):
-        scene = ball_scene(frames=24, size=32 * factor)
-        module, _ = fit_longer(tmp_path / str(factor), scene, LONGEST)
-        errors = []
-        for truth, frame in zip(small.test, scene.test):
-            drawn = module.render(frame.camera, Moment(frame.time), torch.ones(3)).rgb
-            drawn = drawn.reshape(32 * factor, 32 * factor, 3).permute(2, 0, 1)
-            drawn = torch.nn.functional.avg_pool2d(drawn, factor).permute(1, 2, 0)
-            straight = truth.load() / 255
-            expected = torch.lerp(torch.ones(3), straight[..., :3], straight[..., 3:])
-            errors.append((drawn - expected).square().mean())
-        found.append(float(-10 * torch.stack(errors).mean().log10()))
-        count.append(len(module.method.means))
-    assert found[0] > 36
-    assert found[1] > found[0]
-    assert count[1] / count[0] == pytest.approx(3, rel=0.15)
 
 
 def enlarged(scene, factor):
@@ -259,27 +222,6 @@ def random_nodes(points, count, curve, **options):
     for value in filter(lambda v: v is not None, (nodes.translations, nodes.rotations)):
         value.data = torch.randn(value.shape, generator=torch.Generator().manual_seed(0))
     return nodes
-
-
-@pytest.mark.parametrize("rotates", [True, False])
-@pytest.mark.parametrize("count", [1, 2, 9])
-def test_nodes_that_coincide(rotates, count):
-    """Points that all lie at one place, or at two: nodes, shares, strain and paths are finite."""
-    for apart in (0.0, 1e-6, 1.0):
-        points = torch.full((count, 3), 0.3)
-        points[count // 2 :, 0] += apart
-        nodes = random_nodes(points, 6, Curve("spline", 5, 9, 0.25), rotates=rotates, rests=True)
-        assert bool(nodes.edge_weights.any()) == (apart > 0 and len(nodes.positions) > 1)
-        links, shares = nodes.links(points + 0.1)
-        torch.testing.assert_close(shares.sum(-1), torch.ones(count))
-        assert int(links.max()) < len(nodes.positions)
-        motion, maps = nodes.motion_and_maps(nodes.curve(0.7))
-        by_motion, strain = pull_nodes(
-            motion.detach(), nodes.positions, torch.ones_like(maps), nodes.edges, nodes.edge_weights, 1.0
-        )
-        found = [by_motion, torch.tensor(strain), paths(nodes, points, [0.0, 0.25, 1.0])]
-        found += [nodes.edge_weights, nodes.spacing, nodes.motion_range([0.0, 1.0])]
-        assert all(value.isfinite().all() for value in found)
 
 
 @pytest.mark.parametrize("kind", ["spline", "cosines"])

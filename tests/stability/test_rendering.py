@@ -1,4 +1,4 @@
-"""Extreme rays and densities (cases 5 to 9, 12 to 14)."""
+"""Extreme rays, densities and cameras (cases 5 to 9, 12 to 14 and 23 to 26)."""
 
 import math
 
@@ -6,11 +6,13 @@ import pytest
 import torch
 
 from forewarp import losses
+from forewarp.drawing.images import depth_colors
 from forewarp.fields.grids import Activation
 from forewarp.ops.march import render_weights
 from forewarp.renderer import Renderer
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.camera import Camera, look_at
+from forewarp.scene.paths import RandomPatches, focus_point, mean_up, orbit
 from tests.support.hard_cases import LATTICE, check_finite, grid, index_with, raw_of, rays
 
 pytestmark = pytest.mark.stability
@@ -142,13 +144,45 @@ def test_a_flat_box_is_rendered(place, thin):
     assert float(drawn.opacity.detach().max()) > 0.1
 
 
-def test_a_point_beside_and_in_the_camera_projects_to_a_number(device):
-    pose = torch.eye(4, dtype=torch.float64)
-    camera = Camera(6, 5, 5.0, 5.0, 3.0, 2.5, pose, 1.0, 9.0)
-    for unit in (1e-3, 1.0, 1e3):
-        points = unit * torch.tensor([[0.0, 0, 0], [1, 0, 0], [-1, 2, 0], [0, 0, 2], [1, 1, -1e-20]])
-        pixels, z = camera.project(points.to(device).requires_grad_())
-        assert pixels.isfinite().all()
-        assert pixels[0].tolist() == pixels[3].tolist() == [3.0, 2.5]
-        assert not (z[[0, 1, 2, 4]] > 0).any()
-        assert float(pixels[1, 0].detach().abs()) > 1e5  # a point at the side is out of every picture
+UP = torch.tensor([0.0, 0.0, 1.0])
+
+
+@pytest.mark.parametrize("opacity", [0.0, 1e-9, 1.0])
+def test_the_depth_term_of_empty_and_solid_patches(device, opacity):
+    depth = torch.rand(2, 4, 4, generator=torch.Generator().manual_seed(0)).to(device).requires_grad_()
+    check_finite(losses.tv_depth(depth, torch.full((2, 4, 4), opacity, device=device)), depth)
+
+
+def camera(center, target):
+    return Camera(8, 8, 9.0, 9.0, 4.0, 4.0, look_at(torch.tensor(center), torch.tensor(target), UP), 1.0, 5.0)
+
+
+@pytest.mark.parametrize("factor", [1e-3, 1.0, 1e3])
+@pytest.mark.parametrize("kind", ["parallel", "one", "opposite", "coinciding", "upwards"])
+def test_random_views_of_degenerate_rigs(kind, factor):
+    rigs = {
+        "parallel": [((0.0, 0, 0), (1.0, 0, 0)), ((0.0, 1, 0), (1.0, 1, 0))],
+        "one": [((3.0, 0, 0), (0.0, 0, 0))],
+        "opposite": [((3.0, 0, 0), (0.0, 0, 0)), ((-3.0, 0, 0), (0.0, 0, 0))],
+        "coinciding": [((3.0, 0, 0), (0.0, 0, 0)), ((3.0, 0, 0), (0.0, 0, 0))],
+        "upwards": [((0.0, 0, -3), (0.0, 0, 0)), ((0.0, 0, 3), (0.0, 0, 0))],
+    }
+    scaled = [[tuple(factor * v for v in point) for point in pair] for pair in rigs[kind]]
+    cameras = [camera(*pair) for pair in scaled]
+    patches, generator = RandomPatches(cameras, patches=2, size=4), torch.Generator().manual_seed(0)
+    for _ in range(5):
+        rays = patches.draw(generator)
+        assert rays.origins.isfinite().all()
+        torch.testing.assert_close(rays.directions.norm(dim=-1), torch.ones(len(rays)))
+    for view in orbit(cameras[0], focus_point(cameras), mean_up(cameras), torch.linspace(0, 1, 5)):
+        assert view.camera_to_world.isfinite().all()
+
+
+@pytest.mark.parametrize("factor", [1e-6, 1.0, 1e6])
+def test_depth_is_painted_alike_in_any_unit(factor):
+    depth, opacity = torch.linspace(2.0, 2.001, 12).reshape(3, 4), torch.ones(3, 4)
+    torch.testing.assert_close(
+        depth_colors(factor * depth, opacity), depth_colors(depth, opacity), atol=2e-2, rtol=0
+    )
+    assert depth_colors(torch.full((3, 4), factor), opacity).isfinite().all()
+    assert depth_colors(torch.zeros(3, 4), opacity).isfinite().all()

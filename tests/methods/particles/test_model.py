@@ -16,7 +16,7 @@ from forewarp.scene.view import Moment, View
 from forewarp.training.objective import set_gradients
 from tests.contract.fitting import Losses, run_of, stage_of
 from tests.contract.table import METHODS
-from tests.stability.twin import BACKENDS, implementation
+from tests.stability.report import BACKENDS, implementation
 from tests.support.elsewhere import GPU, Elsewhere
 from tests.support.particles import BARE, EVERY, FACTORS, look, module_with, shaken, small_data
 
