@@ -153,17 +153,17 @@ PLACE = [0, 1, 5, 6, 7, 8, 9]  # of a splat's values; the others, the conic, are
 STEP = 1e-6
 
 
-def along(loss, value, slope):
-    """The derivative of ``loss()`` while ``value`` is moved along ``slope`` in place."""
+def along(loss, value, direction):
+    """The derivative of ``loss()`` while ``value`` is moved along ``direction`` in place."""
     start, sides = value.clone(), []
     for sign in (1, -1):
-        value.copy_(start + sign * STEP * slope)
+        value.copy_(start + sign * STEP * direction)
         sides.append(loss())
     value.copy_(start)
     return (sides[0] - sides[1]) / (2 * STEP)
 
 
-@pytest.mark.parametrize(("degree", "lens"), [(1, {}), (2, {}), (3, LENS)])
+@pytest.mark.parametrize(("degree", "lens"), [(2, {}), (3, LENS)])
 def test_splats_by_what_moves_nothing(degree, lens):
     particles, warp, tints, fades = crowd(count=3, degree=degree)
 
@@ -194,9 +194,8 @@ STILL = {"scales", "quaternions", "opacity", "colors", "sh", "color_over_time", 
 MOVING = {"means", "nodes.translations", "nodes.rotations", "skinning.logits"}
 METHODS = {
     "splines": ({"view_dependence": None}, {}, STILL - {"sh"} | MOVING),
-    "cosines": ({"view_dependence": None, "motion": "cosines"}, {}, STILL - {"sh"} | MOVING),
-    "no rotation": (
-        {"view_dependence": None, "rotation": None},
+    "cosines, no rotation": (
+        {"view_dependence": None, "rotation": None, "motion": "cosines"},
         {},
         STILL - {"sh"} | MOVING - {"nodes.rotations"},
     ),
@@ -242,10 +241,9 @@ def test_a_step_of_the_method(name, monkeypatch):
         value, gradient = parameters[which].data, gradients[which]
         assert gradient.dtype == torch.float64
         assert bool(gradient.any()), which
-        for _ in range(2):
-            slope = torch.randn(value.shape, generator=draw, dtype=torch.float64)
-            expected = along(loss, value, slope)
-            assert float((gradient * slope).sum()) == pytest.approx(expected, rel=1e-5, abs=1e-7), which
+        direction = torch.randn(value.shape, generator=draw, dtype=torch.float64)
+        expected = along(loss, value, direction)
+        assert float((gradient * direction).sum()) == pytest.approx(expected, rel=1e-5, abs=1e-7), which
 
 
 OF_PARTICLES = {"project", "backward", "rasterize", "nodes", "adam"}
