@@ -204,35 +204,35 @@ STEPS, STOP = 14, 9
 
 @pytest.fixture(scope="module")
 def straight(scenes, tmp_path_factory):
-    """``straight(name, dataset)`` returns the module after an uninterrupted run of a few steps."""
+    """``straight(name)`` returns the module after an uninterrupted run of a few steps."""
 
     @cache
-    def fit(name, dataset):
+    def fit(name):
         stages = [stage_of(METHODS[name], steps=STEPS)]
-        return run_of(stages, data_of(dataset, scenes), tmp_path_factory.mktemp("run")).fit()
+        return run_of(stages, data_of("dnerf", scenes), tmp_path_factory.mktemp("run")).fit()
 
     return fit
 
 
-@on(DATASETS)
-def test_two_runs_of_one_seed_are_equal(name, dataset, straight, scenes, tmp_path):
+@each
+def test_two_runs_of_one_seed_are_equal(name, straight, scenes, tmp_path):
     torch.manual_seed(5)  # nothing that was drawn before matters
-    again = run_of([stage_of(METHODS[name], steps=STEPS)], data_of(dataset, scenes), tmp_path).fit()
-    assert_equal_states(straight(name, dataset), again)
-    assert straight(name, dataset).last == again.last
+    again = run_of([stage_of(METHODS[name], steps=STEPS)], data_of("dnerf", scenes), tmp_path).fit()
+    assert_equal_states(straight(name), again)
+    assert straight(name).last == again.last
 
 
-@on(DATASETS)
-def test_a_run_that_was_stopped_continues_exactly(name, dataset, straight, scenes, tmp_path):
+@each
+def test_a_run_that_was_stopped_continues_exactly(name, straight, scenes, tmp_path):
     stages = [stage_of(METHODS[name], steps=STEPS)]
     with pytest.raises(SystemExit):
-        run_of(stages, data_of(dataset, scenes), tmp_path, Stop(STOP)).fit()
+        run_of(stages, data_of("dnerf", scenes), tmp_path, Stop(STOP)).fit()
     torch.manual_seed(5)
     told = []
-    again = run_of(stages, data_of(dataset, scenes), tmp_path, tell=told.append).fit()
+    again = run_of(stages, data_of("dnerf", scenes), tmp_path, tell=told.append).fit()
     assert told == [f"fine: goes on at {STOP / STEPS:.0%}, step {STOP}"]
-    assert_equal_states(straight(name, dataset), again)
-    assert straight(name, dataset).last == again.last
+    assert_equal_states(straight(name), again)
+    assert straight(name).last == again.last
 
 
 @pytest.fixture(scope="module")
@@ -249,7 +249,7 @@ def clean():
 @pytest.mark.slow
 @each
 def test_a_run_that_was_killed_continues_exactly(name, straight, scenes, tmp_path, clean):
-    whole = straight(name, "dnerf")  # first: reads kernels, so that the child finds them compiled
+    whole = straight(name)  # first: reads kernels, so that the child finds them compiled
     child = clean.Process(target=killed, args=(name, "dnerf", scenes, tmp_path, STOP, STEPS))
     child.start()
     child.join(300)  # on a busy machine the first one imports for a minute
@@ -261,10 +261,10 @@ def test_a_run_that_was_killed_continues_exactly(name, straight, scenes, tmp_pat
 
 
 @pytest.mark.parametrize("place", ["after", "before"])
-@on(DATASETS)
-def test_it_works_beside_a_voxel_stage(name, dataset, place, scenes, tmp_path):
+@each
+def test_it_works_beside_a_voxel_stage(name, place, scenes, tmp_path):
     """Fit a stage of each method, then load the second without the first."""
-    names, data = ("forward", name) if place == "after" else (name, "forward"), data_of(dataset, scenes)
+    names, data = ("forward", name) if place == "after" else (name, "forward"), data_of("dnerf", scenes)
     stages = [stage_of(METHODS[n], s, steps=6) for n, s in zip(names, ("coarse", "fine"))]
     run = run_of(stages, data, tmp_path)
     module = run.fit()
