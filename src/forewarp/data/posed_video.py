@@ -105,19 +105,25 @@ def read_scene(
     file = scene_folder(root, scene, "posed_video") / FILE
     content = read_json(file)
     entries = _read_entries(file, content, scale)
-    is_timeless = entries[0].time is None
-    entries = _with_even_times(entries) if is_timeless else sorted(entries, key=lambda e: e.time)
+    is_timeless, last = entries[0].time is None, max(len(entries) - 1, 1)
+    if is_timeless:
+        entries = in_order(entries, lambda entry: entry.name)
+        entries = [replace(entry, time=i / last) for i, entry in enumerate(entries)]
+    entries.sort(key=lambda entry: entry.time)
     parts, how = _split_entries(file, content, entries, test_every)
     near, far = (_length(file, content, key, value) for key, value in (("near", near), ("far", far)))
     bounds = _bounds(file, content, box)
-    has_alpha = any(entry.mask is not None or _is_transparent(entry) for entry in entries)
+    has_alpha = any(
+        entry.load.mask is not None or (entry.has_alpha and bool((entry.load()[..., 3] < 255).any()))
+        for entry in entries
+    )
     options = {"near": near, "far": far, "box": bounds, "normalise": normalise, "cut_out": has_alpha}
     space, seen = space_of([entry.camera for entry in entries], str(file), **options)
 
-    def frame(entry: ImageEntry) -> Frame:
-        return Frame(entry.name, entry.time, space.camera(entry.camera), _load(entry))
-
-    train, val, test = (tuple(map(frame, parts[split])) for split in SPLITS)
+    train, val, test = (
+        tuple(Frame(entry.name, entry.time, space.camera(entry.camera), entry.load) for entry in parts[split])
+        for split in SPLITS
+    )
     start = (min if canonical == "first" else middle_of)([frame.time for frame in train])
     protocol = {
         "dataset": "video_with_poses",
@@ -145,8 +151,7 @@ class ImageEntry:
     name: str
     time: float | None
     camera: Camera
-    image: Path
-    mask: Path | None
+    load: StoredImage
     has_alpha: bool
 
 
@@ -163,11 +168,22 @@ def _read_entries(file: Path, content: dict, scale: int = 1) -> list[ImageEntry]
 
     Cost: one read of each PNG, of a JPEG's beginning and end.
     """
-    entries = [_image_entry(entry, scale) for entry in frames_of(file, content, content)]
+    entries = []
+    for entry in frames_of(file, content, content):
+        image, mask = _file(entry, "file_path", scale), None
+        header = inspect_image(image)
+        if "mask_path" in entry.own:
+            mask = _file(entry, "mask_path", scale)
+            inspect_image(mask, header.size, f" as {image.name}")
+        time = number(entry.own["time"], entry.where("time"), 0, 1) if "time" in entry.own else None
+        camera = camera_of(entry, header.size, scale, image)
+        name = _name_of(file.parent, entry.own.get("file_path"), entry.where("file_path"))
+        load = StoredImage(image, header.size, mask=mask)
+        entries.append(ImageEntry(name, time, camera, load, header.has_alpha))
     for key, given in (
         ("time", [e.time is not None for e in entries]),
-        ("mask_path", [e.mask is not None for e in entries]),
-        ("file_path: alpha", [e.has_alpha or e.mask is not None for e in entries]),
+        ("mask_path", [e.load.mask is not None for e in entries]),
+        ("file_path: alpha", [e.has_alpha or e.load.mask is not None for e in entries]),
     ):
         if any(given) and not all(given):
             got = f"{sum(given)} of {len(given)} and none in frames[{given.index(False)}]"
@@ -177,18 +193,6 @@ def _read_entries(file: Path, content: dict, scale: int = 1) -> list[ImageEntry]
         twice = next(name for i, name in enumerate(names) if name in names[:i])
         raise mismatch(f"{file}: frames", "each image once", f"{twice} twice", "remove one")
     return entries
-
-
-def _image_entry(entry, scale: int) -> ImageEntry:
-    image, mask = _file(entry, "file_path", scale), None
-    header = inspect_image(image)
-    if "mask_path" in entry.own:
-        mask = _file(entry, "mask_path", scale)
-        inspect_image(mask, header.size, f" as {image.name}")
-    time = number(entry.own["time"], entry.where("time"), 0, 1) if "time" in entry.own else None
-    camera = camera_of(entry, header.size, scale, image)
-    name = _name_of(entry.file.parent, entry.own.get("file_path"), entry.where("file_path"))
-    return ImageEntry(name, time, camera, image, mask, header.has_alpha)
 
 
 def _file(entry, key: str, scale: int) -> Path:
@@ -211,12 +215,6 @@ def _name_of(folder: Path, value: object, where: str) -> str:
     """Name an image by its path without the suffix."""
     path = inside(folder, value, where)
     return path.relative_to(folder).as_posix().removesuffix(path.suffix if path.suffix in SUFFIXES else "")
-
-
-def _with_even_times(entries: list[ImageEntry]) -> list[ImageEntry]:
-    """Sort entries by name, as ``in_order``, and space their times evenly over [0, 1]."""
-    entries = in_order(entries, lambda entry: entry.name)
-    return [replace(entry, time=i / max(len(entries) - 1, 1)) for i, entry in enumerate(entries)]
 
 
 def _split_entries(file: Path, content: dict, entries: list[ImageEntry], test_every: int) -> tuple[dict, str]:
@@ -282,15 +280,6 @@ def _bounds(file: Path, content: dict, box: Sequence[float] | None) -> Box | Non
     except (TypeError, ValueError) as error:
         expected = "[[x0, y0, z0], [x1, y1, z1]], each low end below its high end"
         raise mismatch(f"{file}: aabb", expected, short(corners)) from error
-
-
-def _load(entry: ImageEntry) -> StoredImage:
-    return StoredImage(entry.image, (entry.camera.width, entry.camera.height), mask=entry.mask)
-
-
-def _is_transparent(entry: ImageEntry) -> bool:
-    """Tell whether any pixel is not opaque; decode the image only where its header says it has alpha."""
-    return entry.has_alpha and bool((_load(entry)()[..., 3] < 255).any())
 
 
 def write_scene(
