@@ -14,7 +14,7 @@ from forewarp.data.module import DNeRFDataModule
 from forewarp.scene.camera import joined
 from forewarp.scene.frame import Frame, Scene
 from forewarp.scene.view import Asks, Moment
-from tests.support.written_scenes import dnerf_shots, real, write_dnerf
+from tests.support.written_scenes import dnerf_shots, write_dnerf
 
 
 @pytest.fixture(scope="module")
@@ -225,14 +225,6 @@ def test_reduced_truth_is_what_half_resolution_loads(tmp_path, depth):
         assert torch.equal(target.foreground, loaded.foreground)
         assert target.depth is None if not depth else torch.equal(target.depth, loaded.depth)
         assert (target.view.shape, loaded.view.shape) == ((6, 8), (3, 4))  # rendered whole
-
-
-def test_the_real_scene_of_800_pixels_reduced_is_that_of_400():
-    wide, small = real("dnerf_800"), real("dnerf")
-    whole = DNeRFDataModule(wide, "hellwarrior", half_resolution=False).targets("test").reduced(2)
-    assert torch.equal(whole[7].rgb, DNeRFDataModule(wide, "hellwarrior").targets("test")[7].rgb)
-    published = DNeRFDataModule(small, "hellwarrior").targets("test")[7].rgb
-    assert float((whole[7].rgb - published).abs().max()) <= 1 / 255
 
 
 def test_what_cannot_be_reduced(scene, tmp_path):

@@ -93,7 +93,7 @@ def test_what_is_written_reads_back(tmp_path):
 
 def test_the_default_counts_of_lego_complete_are_the_published_ones(monkeypatch, tmp_path):
     written = {}
-    monkeypatch.setattr(scenes, "write_worlds", lambda worlds, times, **_: written.update(worlds))
+    monkeypatch.setattr(scenes, "write_worlds", lambda worlds, *_: written.update(worlds))
     synthesize_lego_complete(tmp_path)
     assert [folder.name for folder in written] == ["lift", "lift_tilt", "drive"]
     for _, views, _ in written.values():

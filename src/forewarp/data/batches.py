@@ -98,8 +98,8 @@ class Sampler(IterableDataset):
             order = torch.randperm(len(same_time), generator=self._generator)
             frames += [same_time[i] for i in order[: self.views_per_step - 1].tolist()]
         if self.asks.neighbours:  # a frame of each of the nearest other times, nearest first
-            near = sorted(sorted(self._of_time.keys() - {time}), key=lambda other: abs(other - time))
-            choices = [self._of_time[other] for other in near[: self.asks.neighbours]]
+            nearest = sorted(sorted(self._of_time.keys() - {time}), key=lambda t: abs(t - time))
+            choices = [self._of_time[t] for t in nearest[: self.asks.neighbours]]
             frames += [choice[self._below(len(choice))] for choice in choices]
         observations = self._pixels(frames) if self.asks.kind == "pixels" else self._areas(frames)
         white, whole = torch.tensor(COLORS["white"]), [index, *same_time][: self.asks.instant]

@@ -90,13 +90,12 @@ def with_canonical(scene: Scene, canonical: str | float | None) -> Scene:
         time = min(scene.times, key=lambda t: abs(t - canonical))
     else:
         time = spread_time(scene) if canonical == "spread" and scene.has_alpha else middle_of(scene.times)
-    truth, known = scene.truth, [] if scene.truth is None else scene.truth.times.tolist()
-    at = [i for i, t in enumerate(known) if abs(t - time) < _SAME_TIME]
-    if at:
-        order = [at[0], *(i for i in range(len(known)) if i != at[0])]
-        truth = Truth(truth.points[:, order], truth.times[order])
+    truth = None
+    if scene.truth is not None and bool((scene.truth.times - time).abs().min() < _SAME_TIME):
+        order = ((scene.truth.times - time).abs() >= _SAME_TIME).argsort(stable=True)
+        truth = Truth(scene.truth.points[:, order], scene.truth.times[order])
     protocol = {**scene.protocol, "canonical_time": time}
-    return replace(scene, canonical_time=time, truth=truth if at else None, protocol=protocol)
+    return replace(scene, canonical_time=time, truth=truth, protocol=protocol)
 
 
 def spread_time(scene: Scene) -> float:

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from forewarp.data import dnerf, hypernerf, nhr
-from forewarp.data.files import SceneError, whole
+from forewarp.data.files import mismatch, whole
 from forewarp.scene.camera import Camera, Lens, look_at
 from forewarp.scene.frame import Truth
 from forewarp.synth.raycast import Hits, Posed, camera_rays, light_points, render_all, surface_points
@@ -104,16 +104,16 @@ def synthesize(
 
     **Cost** about size^2 * samples_per_pixel * 7 rays an image, at one to two million a second on one core.
     """
-    check_numbers(samples_per_pixel, workers, size=(size, 8), frames=(frames, 2), seed=(seed, 0))
-    whole(val_views, "val_views", 0)
+    numbers = {"size": (size, 8), "frames": (frames, 2), "seed": (seed, 0), "val_views": (val_views, 0)}
+    check_numbers(samples_per_pixel, workers, **numbers)
     check_motion(motion, SUBJECTS)
     check_views(test_views, "space, time, canonical")
     times = np.linspace(0, 1, 2 * frames - 1)
     train, between = times[::2], times[1::2]
     test = spread_over(train, test_views[0]), spread_over(between, test_views[1]), np.zeros(test_views[2])
     views = views_at(motion, (seed,), size, train, spread_over(train, val_views), test)
-    rendering = {"samples": samples_per_pixel, "workers": workers, "progress": progress}
-    write_worlds({Path(folder): (World(motion), views, (seed,))}, times, **rendering)
+    worlds = {Path(folder): (World(motion), views, (seed,))}
+    write_worlds(worlds, times, samples_per_pixel, workers, progress)
     return Path(folder)
 
 
@@ -152,15 +152,14 @@ def synthesize_lego_complete(
     **Cost** a quarter of a second an image of 400 x 400 on one core: at the defaults 1521 of them and 0.9 GB.
     """
     if isinstance(motions, str) or not isinstance(motions, Sequence) or not motions:
-        expected = f"a list of {', '.join(MOTIONS)}"
-        raise SceneError(f"motions: expected {expected}, but got {motions!r}; set motions")
+        raise mismatch("motions", f"a list of {', '.join(MOTIONS)}", repr(motions), "set motions")
     for motion in motions:
         check_motion(motion, name="motions")
     if len(set(motions)) < len(motions):
-        raise SceneError(f"motions: expected each once, but got {list(motions)}; set motions")
+        raise mismatch("motions", "each once", list(motions), "set motions")
     check_views(test_views, "views a training time, steps between training times, canonical views")
-    check_numbers(samples_per_pixel, workers, size=(size, 8), frames=(frames, 2), seed=(seed, 0))
-    whole(val_views, "val_views", 0)
+    numbers = {"size": (size, 8), "frames": (frames, 2), "seed": (seed, 0), "val_views": (val_views, 0)}
+    check_numbers(samples_per_pixel, workers, **numbers)
     steps = max(test_views[1], 1)
     times = np.linspace(0, 1, steps * (frames - 1) + 1)
     train, between = times[::steps], times if test_views[1] else times[:0]
@@ -172,8 +171,7 @@ def synthesize_lego_complete(
         stream = (seed, 100 + list(MOTIONS).index(motion))
         views = views_at(motion, stream, size, train, val, test)
         worlds[Path(folder) / motion] = World(motion), views, stream
-    rendering = {"samples": samples_per_pixel, "workers": workers, "progress": progress}
-    write_worlds(worlds, times, **rendering, shadow_rays=_LEGO_SHADOW_RAYS)
+    write_worlds(worlds, times, samples_per_pixel, workers, progress, _LEGO_SHADOW_RAYS)
     return Path(folder)
 
 
@@ -200,30 +198,30 @@ def spread_over(times: np.ndarray, count: int) -> np.ndarray:
 
 
 def write_worlds(
-    worlds: Mapping[Path, tuple[World, Views, Sequence[int]]], times: np.ndarray, **rendering
+    worlds: Mapping[Path, tuple[World, Views, Sequence[int]]], times: np.ndarray, *rendering
 ) -> None:
     """Write views of worlds with trajectories at ``times``, the first of them canonical.
 
     Args:
         worlds: world, views and random stream of each scene's folder.
         times: (T,) in [0, 1].
-        rendering: arguments of ``raycast.render_all``.
+        rendering: other arguments of ``raycast.render_all``.
     """
     splits = [(world, split) for world, views, _ in worlds.values() for split in views.values()]
     to_render = [(world, view.time, view.camera) for world, split in splits for view in split]
-    with closing(render_all(to_render, **rendering)) as images:
+    with closing(render_all(to_render, *rendering)) as images:
         for folder, (world, views, stream) in worlds.items():
             seen_from = random_cameras(POINT_VIEWS, 8, np.random.default_rng([*stream, _POINT_VIEWS]))
             points = surface_points(world, POINTS, seen_from, np.random.default_rng([*stream, _POINTS]))
-            shots = {split: _shots(images, of_split) for split, of_split in views.items()}
+            # Taken from one stream of images, so in the order in which the splits are written.
+            shots = {split: map(_shot, of_split, images) for split, of_split in views.items()}
             truth = world.trajectories(*points, times)
             dnerf.write_scene(folder, shots, camera_angle_x=CAMERA_ANGLE_X, trajectories=truth)
 
 
-def _shots(images: Iterator[tuple[np.ndarray, np.ndarray]], views: list[ImageSpec]) -> Iterator[dnerf.Shot]:
-    for view, (rgba, depth) in zip(views, images):
-        known = None if view.ability == "all" else depth
-        yield dnerf.Shot(view.name, view.time, view.camera.camera_to_world, rgba, known, view.ability)
+def _shot(view: ImageSpec, image: tuple[np.ndarray, np.ndarray]) -> dnerf.Shot:
+    depth = None if view.ability == "all" else image[1]
+    return dnerf.Shot(view.name, view.time, view.camera.camera_to_world, image[0], depth, view.ability)
 
 
 def orbit_camera(azimuth: float, sine: float, size: int) -> Camera:
@@ -290,7 +288,7 @@ def synthesize_hypernerf(
     whole(size, "size", 16, multiple=8)
     check_numbers(samples_per_pixel, workers, frames=(frames, 3), seed=(seed, 0))
     if frames % 2 == 0:
-        raise SceneError(f"frames: expected an odd number, one in the middle, but got {frames}; set frames")
+        raise mismatch("frames", "an odd number, one in the middle", frames, "set frames")
     check_motion(motion)
     world, times = World(motion, has_room=True), np.linspace(0, 1, frames)
     pairs = rig_cameras(size, times, seed)
@@ -473,12 +471,11 @@ def check_numbers(samples_per_pixel: int, workers: int | None, **numbers: tuple[
 def check_motion(motion: str, among: Collection[str] = MOTIONS, name: str = "motion") -> None:
     """Check that a motion has one of the names ``among``; ``name`` is the key to set."""
     if not isinstance(motion, str) or motion not in among:
-        raise SceneError(f"{name}: expected one of {', '.join(among)}, but got {motion!r}; set {name}")
+        raise mismatch(name, f"one of {', '.join(among)}", repr(motion), f"set {name}")
 
 
 def check_views(counts: Sequence[int], meaning: str) -> None:
     """Check the three counts of ``test_views``, not all of them 0; ``meaning`` says what they count."""
     is_three = isinstance(counts, Sequence) and len(counts) == 3
     if not is_three or not any([whole(count, "test_views", 0) for count in counts]):
-        expected = f"three numbers ({meaning}), not all 0"
-        raise SceneError(f"test_views: expected {expected}, but got {counts!r}; set test_views")
+        raise mismatch("test_views", f"three numbers ({meaning}), not all 0", repr(counts), "set test_views")
