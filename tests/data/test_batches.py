@@ -6,7 +6,7 @@ from itertools import islice
 import pytest
 import torch
 
-from forewarp.data.batches import Sampler, Targets, color_of
+from forewarp.data.batches import Sampler, Targets, color_of, pixels_of
 from forewarp.data.dnerf import read_scene
 from forewarp.data.files import SceneError
 from forewarp.data.images import StoredImage, composited
@@ -111,6 +111,12 @@ def test_targets_are_loaded_when_asked_for(scene):
     assert by_depth.tolist() == [[True, False, True]]
     assert target.moment.frame is None
     assert [t.moment.frame for t in Targets(scene.train, torch.ones(3), True, trained=True)] == [0, 1, 2, 3]
+
+
+def test_a_reader_that_gives_no_image_is_refused(scene):
+    frame = replace(scene.train[0], load=lambda: torch.zeros(6, 8, 3))
+    with pytest.raises(SceneError, match=r"r_0: expected a picture as a torch.uint8 tensor"):
+        pixels_of(frame)
 
 
 def of_times(scene: Scene, *times: float) -> Scene:

@@ -130,6 +130,7 @@ ROWS = (b"IDAT", zlib.compress(bytes(17 * 4)))
 BOMBS = [
     ("a.png", png_bomb()),
     ("a.png", png_bomb(10_000)),  # Pillow only warns of it
+    ("a.png", png_bomb(9_000)),  # and not even that
     ("a.jpg", b"\xff\xd8\xff\xc0" + JPEG_FRAME + b"\xff\xda\x00\x02\xff\xd9"),
     ("a.jpg", png_bomb()),
     ("a.png", png_with(size(4, 4), size(BIG, BIG), ROWS)),  # the last header before the pixels counts
@@ -141,6 +142,14 @@ def test_a_decompression_bomb_is_not_decoded(tmp_path, name, content):
     (tmp_path / name).write_bytes(content)
     for read in (inspect_image, read_image):
         refused_cheaply(read, tmp_path / name, "expected an image of 1 to 80000000 pixels, but")
+
+
+@pytest.mark.parametrize(
+    ("chunks", "got"), [((), "another kind"), (((b"IDAT", b"none"),), "data that cannot be decoded")]
+)
+def test_a_png_of_right_checksums_may_hold_no_pixels(tmp_path, chunks, got):
+    (tmp_path / "a.png").write_bytes(png_with(size(4, 4), *chunks))
+    refused_cheaply(read_image, tmp_path / "a.png", f"expected .* image, but got {got}")
 
 
 def film(count, side, bits=8, color=6):

@@ -195,6 +195,11 @@ BAD = {
         (POSES, line(2, lambda w: [w[0] + "0", *w[1:3], *w[:3], *w[6:]]), "line 2: expected a rotation"),
         (POSES, line(4, None), "Intrinsic.inf: expected as many cameras .*got 4 there and 3 in"),
         (".", lambda p: write_dome(p, dome(1), 1), "expected at least 2 cameras, one to"),
+        (
+            ".",
+            lambda p: write_dome(p, dome(2, sizes=((1, 1),)), 1),
+            "at least 2 x 2 pixels to halve",
+        ),
         (LENSES, None, "expected a readable file, but got No such file"),
         (
             LENSES,
@@ -368,6 +373,11 @@ UNWRITABLE = {
         ([POSED, replace(POSED, name="./a.jpg")], "a.*: expected names that differ without"),
     ],
 }
+
+
+def test_a_dome_has_no_lenses(tmp_path):
+    with pytest.raises(SceneError, match="cameras: expected none with a lens, as the format has none"):
+        nhr.write_scene(tmp_path, [ONE], [DOME])
 
 
 @pytest.mark.parametrize(("write", "what", "match"), rows(UNWRITABLE))
