@@ -122,8 +122,7 @@ def test_make_hands_over_what_was_typed():
 @pytest.mark.parametrize(
     ("line", "page"),
     [
-        ("reproduce-tables METHODS=nerf", "paper/results/paper.md"),
-        ("ablations SEEDS=1 MORE=ablation=full,no_tv", "results/ablation.md"),
+        ("ablations SEEDS=1 MORE='ablation=full,no_tv scene=counterpart_dnerf'", "results/ablation.md"),
         ("accuracy-time CHANGES=stage.fine.density=45", "accuracy_time/results/accuracy-time.md"),
         ("bench-gpu DEVICE=cpu", "bench-gpu/results/price-list.md"),
         ("effects MODEL=particles MORE=scene=specimen_still", "effects/results/effects-particles.md"),
