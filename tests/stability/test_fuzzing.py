@@ -201,7 +201,7 @@ def harmed(draw, files: dict[Path, bytes]) -> Changes:
 
 MEMORY = 1 << 30
 FUZZ = settings.get_profile("fuzz")  # of conftest.py
-QUICK = settings(FUZZ, max_examples=30, derandomize=True, deadline=60_000)  # other tests may share the core
+QUICK = settings(FUZZ, max_examples=20, derandomize=True, deadline=60_000)  # other tests may share the core
 
 
 def three_kinds(folder):

@@ -48,8 +48,7 @@ def fit(folder, scene, iterations, weights=None, model=None, **changes):
     return make_run(folder, [fitting], data=data, model=model, callbacks=[diary]).fit(), diary.losses
 
 
-@pytest.mark.parametrize("factor", [1e-3, 2.0**20])
-def test_no_term_of_the_loss_depends_on_the_unit_of_length(tmp_path, factor):
+def test_no_term_of_the_loss_depends_on_the_unit_of_length(tmp_path):
     """With all terms on, the first steps are equal except for rounding."""
     weights = dict.fromkeys(VoxelMethod.terms, 0.1)
     options = {"iterations": 4, "weights": weights, "start": "hull", "patches": 2, "refresh_every": 2}
@@ -59,8 +58,9 @@ def test_no_term_of_the_loss_depends_on_the_unit_of_length(tmp_path, factor):
     }
     scene = replace(ball_scene(frames=6, size=16), still=torch.tensor([[0.9, 0.1, 0.2], [-0.8, 0.3, -0.2]]))
     _, plain = fit(tmp_path / "a", scene, **options)
-    _, other = fit(tmp_path / "b", in_other_units(scene, factor), **options)
-    assert other == pytest.approx(plain, rel=2e-4)
+    for factor in (1e-3, 2.0**20):
+        _, losses = fit(tmp_path / str(factor), in_other_units(scene, factor), **options)
+        assert losses == pytest.approx(plain, rel=2e-4)
 
 
 def paths_of(factor):
@@ -100,7 +100,7 @@ HARD = {
     **{
         f"rates {boost} too high": (
             SCENE,
-            {"iterations": 40, "lr": {kind: boost * rate for kind, rate in RATES.items()}}
+            {"iterations": 20, "lr": {kind: boost * rate for kind, rate in RATES.items()}}
             | {"start": "hull", "refresh_every": 10},
         )
         for boost in (10.0, 300.0)
