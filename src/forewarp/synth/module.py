@@ -10,7 +10,7 @@ from pathlib import Path
 
 from filelock import FileLock
 
-from forewarp.data.files import LOCK, RECORD, SceneError, read_json
+from forewarp.data.files import LOCK, RECORD, mismatch, read_json
 from forewarp.data.module import DNeRFDataModule, HyperNeRFDataModule, LegoCompleteDataModule, NHRDataModule
 from forewarp.progress import Counted
 from forewarp.scene.frame import Scene
@@ -51,8 +51,7 @@ def write_whole(
             shutil.rmtree(folder)
         os.replace(beside, folder)
     except OSError as error:
-        got = error.strerror or error
-        raise SceneError(f"{folder}: expected a folder to write to, but got {got}; set folder") from error
+        raise mismatch(folder, "a folder to write to", error.strerror or error, "set folder") from error
     finally:
         shutil.rmtree(beside, ignore_errors=True)
     return folder
@@ -99,15 +98,13 @@ class Synthetic:
         before = {"dataset": "dnerf", **read_json(record)}
         for key, value in {"dataset": self.dataset, **self.synthesis}.items():
             if key in before and before[key] != value:
-                got = f"{before[key]}; use another data.scene or delete the scene"
-                raise SceneError(f"{record}: {key}: expected {value}, but got {got}")
+                advice = "use another data.scene or delete the scene"
+                raise mismatch(f"{record}: {key}", value, before[key], advice)
 
     def _write(self) -> None:
         if self.folder.exists() and (not self.folder.is_dir() or any(self.folder.iterdir())):
-            raise SceneError(
-                f"{self.folder}: expected a synthesised scene or nothing, but got something else; "
-                "use another data.root or data.scene"
-            )
+            advice = "use another data.root or data.scene"
+            raise mismatch(self.folder, "a synthesised scene or nothing", "something else", advice)
         with Counted(f"writing {self.folder.name}") as progress:
             write_whole(self.folder, self.dataset, self.synthesis, progress=progress)
 
