@@ -155,7 +155,7 @@ def test_larger_pictures_are_compared_at_the_size_of_small_ones(tmp_path):
         write_run(runs, name, psnr=psnr, minutes=3.0, metrics={"protocol": protocol}, **PARTICLES)
     text = write_minutes(runs, tmp_path / "out")[0].read_text()
     assert rows_of(text, "ball")[0] == ["ball", "33.00"]
-    large, small = rows_of(section(text, "Larger pictures"), "ball")
+    large, small = rows_of(section(text, "Larger images"), "ball")
     assert large[3:5] == ["800x800 reduced 2x2, background white", "33.40"]
     assert large[-1] == "above by 0.40 dB the run that learned from 400x400"
     assert small[3:5] == ["400x400, background white", "33.00"]
@@ -171,8 +171,8 @@ def test_both_clocks_and_versions_of_the_code_are_told(tmp_path, monkeypatch):
     text = write_minutes(runs, tmp_path / "out")[0].read_text()
     (row,) = rows_of(section(text, "What it costs"), "ball")
     assert row[2:6] == ["60", "70", "100", "500.0"]
-    (line,) = [line for line in text.splitlines() if line.startswith("The runs may be of different versions")]
-    assert line.endswith("1 min of commit aaa, commit bbb.")
+    (line,) = [line for line in text.splitlines() if line.startswith("The runs are of 2 versions")]
+    assert "commits" in line
     assert drawn[0]["ball"]["1 min, 2 seeds"][:2] == [(0.0, 31.0), (0.05, 31.0)]
 
 
@@ -288,8 +288,8 @@ def test_methods_are_ranked_and_what_they_depart_from_is_listed_once(tmp_path, m
     assert rows_of(text, "kept fault: padded") == [["kept fault: padded", "`ndvg`"]]
     assert "**ball, 5 minutes, 5 of 20 test views, evenly spread**" in text
     assert "* ball/full-1.0-seed0: an ablation" in text
-    models = "model=forward,ndvg,particles,tnerf"
-    assert f"\nforewarp-train --multirun scene=ball {models} budget.clock=processor threads=2\n" in text
+    assert "some of `model=forward,ndvg,particles,tnerf`" in text
+    assert "\nforewarp-train scene=ball budget.clock=processor threads=2\n" in text
     assert "minutes: particles 30.00, forward 27.00, ndvg 22.00](methods-ball-views.png)" in text
     assert next(csv.DictReader(table.read_text().splitlines()))["curve"] == "10.0:22.00 100.0:27.00"
     assert (curves.name, views.name) == ("methods-ball.png", "methods-ball-views.png")
@@ -334,9 +334,8 @@ def test_a_picture_of_more_methods_stays(tmp_path):
         text = write_methods(tmp_path / "later", tmp_path / "out")[0].read_text()
         assert picture.read_text() == "as it was"
         assert "after 5 minutes: forward 25.00, ndvg 25.00](methods-ball-views.png)" in text
-        assert (
-            text.count("The picture is of runs before the table's of `ndvg`.") == 1
-        )  # curves are of the table
+        # Curves are of the table.
+        assert text.count("The image is of runs before the table's of `ndvg`.") == 1
 
 
 def test_without_matplotlib_the_page_says_why_it_has_no_picture(tmp_path, monkeypatch):

@@ -50,7 +50,7 @@ def test_runs_side_by_side_with_their_difference(ok, runs, monkeypatch):
         ["moving points' error, % of motion", "25", "25", "+0"],
         ["steps", "100", "100"],
         ["seconds of training", "50", "50"],
-        ["seconds a picture", "0.500", "0.500"],
+        ["seconds per image", "0.500", "0.500"],
     ]
 
 
@@ -58,7 +58,7 @@ def test_conditions_in_which_runs_differ_are_told_and_what_one_lacks_has_no_row(
     some = {"threads": 1, "held_out": 8, "measured": "5 of 20 test views"}
     folders = runs(one=of("forward", {"psnr": 30.0, "ssim": 0.9}), two=of("backward", protocol=some))
     rows = {row[0]: row[1:] for row in compare(read_compared(folders)).rows}
-    assert list(rows) == ["all", "steps", "seconds of training", "seconds a picture"] + [
+    assert list(rows) == ["all", "steps", "seconds of training", "seconds per image"] + [
         *("threads", "test views", "views held out")
     ]
     assert rows["all"] == ["30.00", "30.00", None]  # of other views

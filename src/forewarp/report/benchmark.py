@@ -40,7 +40,7 @@ LENGTHS = 3  # of training, at least: two points make no curve
 TASK = ("scene", "preset", "minutes", *CONDITIONS)
 BEGIN = {"label": "scene", "took": Column("minutes", 0)}
 COSTS = {"processor": Column("processor (s)", 0), "wall": Column("wall (s)", 0), "steps": Column("steps", 0)}
-COSTS |= {"ms": Column("ms a step", 1), "frame": Column("s a picture", 3)}
+COSTS |= {"ms": Column("ms a step", 1), "frame": Column("seconds per image", 3)}
 COSTS |= {"parameters": Column("parameters (M)"), "memory": Column("GiB")}
 REDUCED = re.compile(r"(\d+)x(\d+) reduced (\d+)x\3")
 # Words of a picture of methods on an earlier page.
@@ -175,17 +175,12 @@ def _of_method(method: str, runs: Runs, others: Mapping[str, Runs]) -> dict:
     sized = Runs(row for row in runs if row["size"] and not REDUCED.search(row["pictures"] or ""))
     density = {"density": Column("density", 0), "particles": Column("particles", 0)}
     minutes = _against_fewer(plain(runs), "minutes", lambda group: group[0]["minutes"])
-    made: dict[float, set[str]] = {}
-    for row in runs:
-        version = f"commit {row['commit']}" if row["commit"] else row["day"] or "a day unknown"
-        made.setdefault(row["minutes"], set()).add(version)
-    versions = [f"{m:g} min of {', '.join(sorted(found))}" for m, found in sorted(made.items())]
     return {
         "method": method,
         "nets": NETS,
         "noise": NOISE,
         "machine": made_on(runs),
-        "versions": versions if len(set().union(*made.values())) > 1 else [],
+        "versions": len({row["commit"] or row["day"] for row in runs}),
         "by_minutes": _by_minutes(plain(runs)),
         "each": Table.of(map(row_of, groups), each),
         "beside": {other: _beside(method, runs, other, found) for other, found in others.items()},
@@ -197,12 +192,12 @@ def _of_method(method: str, runs: Runs, others: Mapping[str, Runs]) -> dict:
         ),
         "larger": Table.of(
             _larger(Runs(row for row in runs if row["density"] is None)),
-            with_seeds | {"pictures": "pictures"} | scores | {"verdict": "the larger is"},
+            with_seeds | {"pictures": "images"} | scores | {"verdict": "the larger is"},
         ),
         "costs": Table.of(
             map(row_of, groups), BEGIN | {n: replace(c, spread=False) for n, c in COSTS.items()}
         ),
-        "commands": runs.commands("minutes"),
+        "command": runs.command(),
     }
 
 
@@ -332,7 +327,7 @@ def _write_lengths(tables: Mapping[str, Runs], out: Path, published: Sequence[Pu
         shown |= dict.fromkeys(beside)
     if not scenes:
         return []
-    about = {"machine": made_on(used), "commands": used.commands("minutes")}
+    about = {"machine": made_on(used), "command": used.command()}
     replace_file(out / "accuracy-time.md", rendered("lengths.md.j2", scenes=scenes, published=shown, **about))
     return [out / "accuracy-time.md", *pictures]
 
@@ -376,7 +371,7 @@ def write_methods(folder: Path, out: Path) -> list[Path]:
         tables = [_reached(group, own) for group in own.by("minutes", *CONDITIONS).values()]
         scenes.append({"name": scene, "pictures": pictures, "tables": tables})
         written += drawn
-    about = {"machine": made_on(runs), "nets": NETS, "commands": runs.commands("methods")}
+    about = {"machine": made_on(runs), "nets": NETS, "command": runs.command()}
     about |= {"presets": list(runs.by("preset")), "departures": _departures(runs), "left_out": left_out}
     with_steps = (out / "faithful-step.md").is_file()  # by python -m tests.bench.faithful
     replace_file(page, rendered("methods.md.j2", scenes=scenes, with_steps=with_steps, **about))
@@ -409,7 +404,7 @@ def _pictures(scene: str, runs: Runs, out: Path, earlier: str) -> tuple[list[dic
     ):
         known = SHOWN.search(earlier.partition(f"]({path.name})")[0]) if path.is_file() else None
         listed = [method.rpartition(" ")[::2] for method in known["methods"].split(", ")] if known else []
-        picture = {"file": path.name, "is_views": path == views, "changed": []}
+        picture = {"file": path.name, "changed": []}
         changed = [name for name, psnr in listed if (name, psnr, known["minutes"]) not in now]
         kept = known and picture | {"words": known[0], "changed": changed}
         if len(listed) > len(shown):

@@ -203,7 +203,7 @@ def write_effects(folder: Path, out: Path) -> list[Path]:
             specimens=[choices(made), called(row for row in planned if row in made)] if made else [],
             others=choices(others) if others else None,
             trials=trials(planned),
-            reasons={scene: first[scene] for scene in sorted(first)},
+            reasons=reasons(first),
             left_out=left_out,
         )
         replace_file(out / f"{name}.md", text)
@@ -227,6 +227,16 @@ def write_effects(folder: Path, out: Path) -> list[Path]:
         replace_file(out / f"{name}.csv", Table.of(lines, columns).csv())
         files += [out / f"{name}.md", out / f"{name}.csv"]
     return files
+
+
+def reasons(effects: Mapping[str, Mapping]) -> Table:
+    """List for every scene what was planned of each effect, and why."""
+    lines = [
+        [scene, name.replace("_", " "), decision["choice"], decision["because"]]
+        for scene in sorted(effects)
+        for name, decision in effects[scene].items()
+    ]
+    return Table(columns_of(["scene", "effect", "choice", "because"]), lines)
 
 
 def choices(runs: Runs) -> Table:

@@ -16,7 +16,7 @@ ABILITIES = {
     "canonical": "canonical time",
     "all": "all",
 }
-COSTS = {"steps": ("steps", 0), "train": ("seconds of training", 0), "frame": ("seconds a picture", 3)}
+COSTS = {"steps": ("steps", 0), "train": ("seconds of training", 0), "frame": ("seconds per image", 3)}
 # Shown where the runs differ in them, as their numbers then tell little of the methods.
 CONDITIONS = {"clock": "clock of the minutes", "threads": "threads", "device": "computed on"}
 CONDITIONS |= {"pictures": "pictures", "measured": "test views", "held_out": "views held out"}
@@ -59,7 +59,7 @@ def compare(runs: dict[str, Row]) -> Table:
 def draw_compared(runs: dict[str, Row], out: Path) -> Path | None:
     """Draw a test view in the middle of the time by every run into ``compare.png``.
 
-    Return None if the runs share no test view with a picture.
+    Return None if the runs share no test view with an image.
     """
     return draw_beside(out / "compare.png", runs, 0.5, "test view")
 

@@ -22,7 +22,7 @@ from forewarp.metrics.gain import Estimate, pooled_deviation
 from forewarp.metrics.registry import metric_of
 from forewarp.report import figures
 from forewarp.report.choices import every_run
-from forewarp.report.results import COUNTERPART, Row, Runs, read_runs
+from forewarp.report.results import COUNTERPART, Row, Runs, portable, read_runs
 from forewarp.report.tables import Cell, Column, Difference, Section, Table, columns_of, rendered
 
 PAPER = Path(__file__).with_name("paper.yaml")  # the printed numbers
@@ -64,7 +64,7 @@ class Printed(NamedTuple):
     model: str | None = None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PaperTable:
     """One of the paper's tables.
 
@@ -188,7 +188,7 @@ def costs_of(runs: Runs, numbers: Mapping[str, int]) -> list[Cell]:
     return [*means, ", ".join(map(str, protocols)), Runs(runs[:1]).machines("")]
 
 
-def comparison(table: PaperTable, runs: Runs) -> Table:
+def comparison(table: PaperTable, runs: Runs, numbers: Mapping[str, int] | None = None) -> Table:
     """Make a table of each published row with the measured ones of its method below it, then the others.
 
     After each measured row comes its difference from the published one. In each column the best and the
@@ -197,9 +197,10 @@ def comparison(table: PaperTable, runs: Runs) -> Table:
     Args:
         table: the paper's table.
         runs: those of the table's scenes.
+        numbers: of the page's protocols, as of ``numbered``; None: those of ``runs`` alone.
     """
     found = measured(table, runs)
-    numbers, no_costs = numbered(run for of_row in found for run in of_row), [None] * len(COSTS)
+    numbers, no_costs = numbers or numbered(runs), [None] * len(COSTS)
     lines, rules = [], []
     for printed in [*table.rows, None]:
         of_method = [of_row for of_row in found if table.printed(of_row[0]) is printed]
@@ -217,16 +218,15 @@ def comparison(table: PaperTable, runs: Runs) -> Table:
     return Table(columns, lines, marks=_marks(found, table, lines, 2), rules=rules)
 
 
-def stand_in(table: PaperTable, runs: Runs) -> Table | None:
+def stand_in(table: PaperTable, runs: Runs, numbers: Mapping[str, int] | None = None) -> Table | None:
     """Make a table of the runs on synthetic counterparts, with what was published for real scenes at its end.
 
-    None if there are no such runs.
+    None if there are no such runs; ``numbers`` as of ``comparison``.
     """
     made, found = counterpart(table, runs), measured(table, runs)
     if made is None or not found:
         return None
-    every = [run for of_row in found for run in of_row]
-    numbers, datasets = numbered(every), {dataset_of(run) for run in every}
+    numbers, datasets = numbers or numbered(runs), {dataset_of(run) for of_row in found for run in of_row}
     shown = [
         (number, group)
         for number, (group, metric) in enumerate(table.columns)
@@ -321,6 +321,8 @@ def _marks(found: Sequence[Runs], table: PaperTable, lines: Sequence[Sequence[Ce
 def write_paper(folder: Path, out: Path, published: Path = PAPER, curves: Path | None = None) -> list[Path]:
     """Write ``paper.md``, ``paper.tex``, ``paper.html``, a CSV file a table, and the figures.
 
+    Tables without a measured row are left out.
+
     Args:
         folder, out: see above.
         published: file of the printed numbers.
@@ -328,22 +330,29 @@ def write_paper(folder: Path, out: Path, published: Path = PAPER, curves: Path |
     """
     runs, left_out = _read(folder)
     real, made = runs.where(counterpart=False), runs.where(counterpart=True)
-    tables, files = [], []
-    for table in read_paper(published).values():
-        source = f"published rows: the paper, {table.source}"
+    shown_runs = {
+        table: [Runs(run for row in measured(table, kind) for run in row) for kind in (real, made)]
+        for table in read_paper(published).values()
+    }
+    used = Runs(run for kinds in shown_runs.values() for kind in kinds for run in kind)
+    numbers, tables, files = numbered(used), [], []
+    for table, (of_real, of_made) in shown_runs.items():
         name = "-".join(re.findall(r"\w+", table.title.split(",")[0].lower()))
-        shown = comparison(with_means(table, real), real)
-        tables.append(Section(table.title, [shown], [source, *facts(_used(table, real))], table.notes))
-        files.append(out / f"paper-{name}.csv")
-        if (shown := stand_in(table, made)) is not None:
-            tables.append(
-                Section(f"{table.title}: synthetic counterpart", [shown], facts(_used(table, made)))
-            )
+        if of_real:
+            shown = comparison(with_means(table, real), real, numbers)
+            notes = [f"published rows: the paper, {table.source}", *table.notes]
+            tables.append(Section(table.title, [shown], facts(of_real, numbers), notes))
+            files.append(out / f"paper-{name}.csv")
+        if (shown := stand_in(table, made, numbers)) is not None:
+            title = f"{table.title}: synthetic counterpart"
+            tables.append(Section(title, [shown], facts(of_made, numbers)))
             files.append(out / f"paper-{name}-counterpart.csv")
+        left_out += [] if of_real or of_made else [f"{table.title}: no measured row"]
     for section, file in zip(tables, files):
         replace_file(file, section.tables[0].csv() + "".join(f"# {line}\n" for line in section.facts))
     drawn = _figures(runs, out, curves)
-    sections = [*tables, *drawn, *([Section("Left out", facts=left_out)] if left_out else [])]
+    sections = [*tables, *drawn, _about(tables, used, numbers)]
+    sections += [Section("Left out", facts=left_out)] if left_out else []
     for kind in ("md", "html", "tex"):
         replace_file(out / f"paper.{kind}", rendered(f"paper.{kind}.j2", sections=sections, tables=tables))
     own = [path for section in drawn for path in section.pictures if path.name.startswith("paper-")]
@@ -357,12 +366,18 @@ def _read(folder: Path) -> tuple[Runs, list[str]]:
     return runs, left_out + [f"{row['folder']}: another run of the same is newer" for row in older]
 
 
-def _used(table: PaperTable, runs: Runs) -> Runs:
-    return Runs(run for of_row in measured(table, runs) for run in of_row)
+def _about(tables: Iterable[Section], runs: Runs, numbers: Mapping[str, int]) -> Section:
+    """Gather what a page tells once: how the runs were made, and each footnote with its tables."""
+    notes: dict[str, list[str]] = {}
+    for section in tables:
+        for note in section.notes:
+            notes.setdefault(note, []).append(section.title.partition(":")[0])
+    lines = [f"{', '.join(dict.fromkeys(titles))}: {note}" for note, titles in notes.items()]
+    return Section("How they were measured", facts=[*facts(runs, numbers), *lines])
 
 
-def facts(runs: Runs) -> list[str]:
-    """State protocol, machine, budget, date and command of the runs."""
+def facts(runs: Runs, numbers: Mapping[str, int]) -> list[str]:
+    """State protocols by their numbers on the page, machine, budget, date and a command of the runs."""
     if not runs:
         return ["measured: nothing yet"]
     budgets = set()
@@ -371,12 +386,13 @@ def facts(runs: Runs) -> list[str]:
         minutes += " by the processor clock" if minutes and run["clock"] == "processor" else ""
         steps = f"{run['iterations']} steps" if run["iterations"] else ""
         budgets.add(", ".join(filter(None, (run["preset"], minutes, steps))))
+    protocols = sorted((numbers[text], text) for text in runs.by("protocol"))
     return [
-        *(f"protocol {number}: {text}" for text, number in numbered(runs).items()),
+        *(f"protocol {number}: {text}" for number, text in protocols),
         f"machine: {runs.machines()}",
         f"budget: {'; '.join(sorted(budgets))}",
         f"date: {runs.days()}",
-        f"command, one of {len(runs)} runs: {runs[0]['command']}",
+        f"command, one of {len({run['folder'] for run in runs})} runs: {portable(runs[0]['command'])}",
     ]
 
 
@@ -384,13 +400,12 @@ def _figures(runs: Runs, out: Path, curves: Path | None) -> list[Section]:
     """Draw what these runs allow, and add the pictures in ``curves``; say if matplotlib is missing."""
     sections, plain = [], runs.where(ablation=None)
 
-    def add(title: str, path: Path | None, of: Iterable[Row]) -> None:
-        if path is not None:
-            sections.append(Section(title, facts=facts(Runs(of)), pictures=[path]))
+    def add(title: str, path: Path | None) -> None:
+        sections.extend([Section(title, pictures=[path])] if path is not None else [])
 
     try:
         sizes = Runs(run for run in runs if str(run["ablation"]).startswith("resolution "))
-        add("Resolution", figures.draw_resolution(out / "paper-resolution.png", sizes), sizes)
+        add("Resolution", figures.draw_resolution(out / "paper-resolution.png", sizes))
         for scene, of_scene in plain.by("scene").items():
             rivals = {}  # the last of several budgets or seeds
             for same in of_scene.by("seed", *BUDGET).values():
@@ -398,12 +413,12 @@ def _figures(runs: Runs, out: Path, curves: Path | None) -> list[Section]:
                 own = {name: methods[name] for name in METHODS if name in methods}
                 rivals = own if len(own) > 1 else rivals
             if rivals:
-                path = figures.draw_canonical(out / f"paper-canonical-{scene}.png", rivals)
-                add(f"Canonical comparison: {scene}", path, rivals.values())
+                drawn = figures.draw_canonical(out / f"paper-canonical-{scene}.png", rivals)
+                add(f"Canonical comparison: {scene}", drawn)
         for dataset, method in product(DATASETS, METHODS[:2]):
             scenes = {run["scene"]: run for run in plain.where(method=method) if dataset_of(run) == dataset}
-            path = figures.draw_sheet(out / f"paper-views-{dataset}-{method}.png", scenes)
-            add(f"Views: {dataset}, {method}", path, scenes.values())
+            drawn = figures.draw_sheet(out / f"paper-views-{dataset}-{method}.png", scenes)
+            add(f"Views: {dataset}, {method}", drawn)
     except ImportError as error:
         return [Section("Figures", facts=[str(error)])]
     for path in sorted(curves.glob("accuracy-time-*.png")) if curves is not None else ():
@@ -433,22 +448,27 @@ def write_ablation(folder: Path, out: Path, published: Path = PAPER) -> list[Pat
     runs = Runs(run for run in runs if run["ablation"] in known)
     if not runs:
         raise ValueError(f"{folder}: expected runs of ablations, but got none; make some with make ablations")
+    numbers = numbered(runs)
     orders: dict[str, list[str]] = {}  # of each budget, what became of the paper's order in each row
-    sections = [section for table in tables for section in _ablated(table, runs, orders)]
+    sections = [section for table in tables for section in _ablated(table, runs, orders, numbers)]
     lines = [
         [budget, len(found), *(sum(order.startswith(kind) for order in found) for kind in ORDERS)]
         for budget, found in orders.items()
     ]
     columns = columns_of(["budget of a run", *(Column(kind, 0) for kind in ("rows", *ORDERS))])
     caption = "Rows of all tables below, by what became of the paper's order:"
-    sections.insert(0, Section("In short", [Table(columns, lines, caption)]))
+    used = Runs(run for run in runs if any(run["ablation"] in table.variants for table in tables))
+    about = _about(sections, used, numbers)
+    sections = [Section("In short", [Table(columns, lines, caption)]), *sections, about]
     sections += [Section("Left out", facts=left_out)] if left_out else []
     replace_file(out / "ablation.md", rendered("ablation.md.j2", sections=sections, least=LEAST))
     replace_file(out / "ablation.csv", every_run(runs).csv())
     return [out / "ablation.md", out / "ablation.csv"]
 
 
-def _ablated(table: PaperTable, runs: Runs, orders: dict[str, list[str]]) -> list[Section]:
+def _ablated(
+    table: PaperTable, runs: Runs, orders: dict[str, list[str]], numbers: Mapping[str, int]
+) -> list[Section]:
     """Make a section for each scene, or mean of scenes, on which the table's rows were measured."""
     sections = []
     for made in (False, True):
@@ -463,7 +483,7 @@ def _ablated(table: PaperTable, runs: Runs, orders: dict[str, list[str]]) -> lis
                 title += f", of which {', '.join(scenes)}" if scenes != group.scenes else ""
                 title += f", {scenes[0]}" if made and group.name != scenes[0] else ""
                 used = Runs(run for run in own if run["ablation"] in table.variants)
-                sections.append(Section(title, [changes], facts(used), table.notes))
+                sections.append(Section(title, [changes], facts(used, numbers), table.notes))
     return sections
 
 

@@ -14,6 +14,7 @@ import re
 import statistics
 from collections.abc import Iterable, Sequence
 from datetime import datetime, timezone
+from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
@@ -163,40 +164,31 @@ class Runs(list[Row]):
         early = seconds / 60 < minutes
         return early, f" ({'ended after' if early else 'took'} {length(seconds / 60)})"
 
-    def commands(self, sweep: str) -> list[str]:
-        """List the commands that made the rows, without seeds; those that differ only in ``model=`` as one.
+    def command(self) -> dict | None:
+        """Return the words that the runs' commands share, without seeds, and the values of each other key.
 
-        Args:
-            sweep: name of the sweep that gives jobs the processor clock, one thread and a folder each.
+        A sweep's clock and threads, which are not typed, are added. None if no command is known.
 
-        >>> row = {"command": "forewarp-train seed=1 scene=s run=r", "clock": "processor", "threads": 1.0}
-        >>> Runs([row]).commands("minutes")
-        ['forewarp-train --multirun sweeps=minutes scene=s']
-        >>> Runs([row | {"threads": 2.0}]).commands("minutes")
-        ['forewarp-train scene=s budget.clock=processor threads=2']
+        >>> row = {"command": "forewarp-train seed=1 scene=s model=a run=r", "clock": "wall", "threads": 2}
+        >>> Runs([row, row | {"command": "forewarp-train scene=s model=b"}]).command()
+        {'shared': 'forewarp-train scene=s threads=2', 'varied': ['`model=a,b`']}
         """
-        models: dict[str, dict[str, None]] = {}
-        for row in (row for row in self if row["command"]):
-            command = re.sub(r"\sseed=\S+", "", portable(row["command"]))
-            if row["clock"] != "wall" and "#" not in command:
-                command = re.sub(r"\s(budget\.clock|threads)=\S+", "", command)
-                of_sweep = (row["clock"], row["threads"]) == ("processor", 1)
-                if of_sweep and re.search(r" (data\.)?scene=", command):
-                    command = command.replace(
-                        "forewarp-train", f"forewarp-train --multirun sweeps={sweep}", 1
-                    )
-                else:
-                    command += f" budget.clock={row['clock']}"
-                    command += f" threads={row['threads']:g}" if row["threads"] else ""
-            model = re.search(r" model=(\S+)", command)
-            command = command.replace(model[0], " model={}", 1) if model else command
-            models.setdefault(command, {}).update({model[1]: None} if model else {})
-        lines = []
-        for command, names in models.items():
-            if len(names) > 1 and "--multirun" not in command:
-                command = command.replace("forewarp-train", "forewarp-train --multirun", 1)
-            lines.append(command.replace("model={}", f"model={','.join(names)}"))
-        return sorted(lines)
+        commands = []
+        for row in self:
+            if "#" not in (row["command"] or "#"):  # this sign begins a comment in place of a lost command
+                typed = re.sub(r"\s(seed|budget\.clock|threads)=\S+", "", portable(row["command"]))
+                typed += f" budget.clock={row['clock']}" if row["clock"] != "wall" else ""
+                typed += f" threads={row['threads']:g}" if row["threads"] else ""
+                commands.append(overrides(typed))
+        words = dict.fromkeys(chain(*commands))
+        shared = [word for word in words if all(word in command for command in commands)]
+        varied: dict[str, list[str]] = {}
+        for word in words:
+            if word not in shared:
+                key, _, value = word.partition("=")
+                varied.setdefault(key, []).append(value)
+        listed = [f"`{key}={','.join(values)}`" for key, values in varied.items()]
+        return {"shared": " ".join(shared), "varied": listed} if commands else None
 
 
 def read_runs(root: Path, needed: Sequence[str] = ("metrics.json",)) -> tuple[Runs, list[str]]:
