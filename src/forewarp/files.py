@@ -30,6 +30,8 @@ _LEFT = 24 * 3600  # seconds after which nobody fills a folder any more
 def written_whole(path: Path, *, synced: bool = False) -> Iterator[Path]:
     """Write to the path that this gives, which is renamed to ``path`` at the end; make its folder.
 
+    The file has a random name and is made here, so that no link that lies in wait is written through.
+
     Args:
         path: appears whole or not at all; a file or a link already there is replaced.
         synced: wait until the bytes are on the disk before renaming.
@@ -37,9 +39,13 @@ def written_whole(path: Path, *, synced: bool = False) -> Iterator[Path]:
     Raises:
         OSError: naming ``path``, where it cannot be written; nothing is then left behind.
     """
-    beside = path.with_name(f".{path.name}.part{path.suffix}")
+    beside = path.with_name(f".{path.name}.{secrets.token_hex(8)}.part{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        if synced:  # large: what killed processes left is not kept
+            for old in filter(_is_left, path.parent.glob(f".{glob.escape(path.name)}.*.part{path.suffix}")):
+                old.unlink()
+        os.close(os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_NOFOLLOW", 0), 0o666))
         yield beside
         if synced:
             with beside.open("rb+") as file:
@@ -101,10 +107,27 @@ def folder_written_whole(path: Path, mark: str) -> Iterator[Path]:
 
 
 def _is_left(part: Path) -> bool:
-    """Whether a half-filled folder is so old that the call that filled it was killed."""
+    """Whether a half-written file or folder is so old that the call that wrote it was killed."""
     with suppress(OSError):
         return time.time() - part.stat().st_mtime > _LEFT
     return False
+
+
+def refuse_links(folder: Path) -> None:
+    """Refuse a folder in which a link lies, at any depth; the folder itself may be one.
+
+    What is written into a folder that came from someone else then stays in it.
+
+    Raises:
+        ValueError: naming the link.
+    """
+    for parent, folders, files in os.walk(folder):
+        for name in sorted((*folders, *files)):
+            if os.path.islink(path := os.path.join(parent, name)):
+                raise ValueError(
+                    f"{path}: expected no links inside a run's folder, as files would be written where they "
+                    f"lead, but got one to {os.readlink(path)}; put the file itself there, or delete the link"
+                )
 
 
 def check_replaceable(path: Path, mark: str) -> None:

@@ -8,7 +8,15 @@ import pytest
 from omegaconf import OmegaConf
 
 from forewarp.files import MOST_CONFIG
-from forewarp.runs.config import read_config, saved_config, trust_of, trusted_config, without_trust
+from forewarp.runs.config import (
+    HOMES,
+    check_values,
+    read_config,
+    saved_config,
+    trust_of,
+    trusted_config,
+    without_trust,
+)
 from tests.support.configs import CONF, composed
 
 
@@ -16,8 +24,8 @@ def read(text, *trust):
     return trusted_config(text, "config.yaml", trust)
 
 
-def target(name):
-    return f"a: {{_target_: {name}}}"
+def target(name, key="model"):
+    return f"{key}: {{_target_: {name}}}"
 
 
 TARGETS = [
@@ -97,10 +105,40 @@ def test_what_we_write_ourselves_is_trusted(words):
 
 def test_every_target_of_ours_is_trusted():
     files = [path for path in CONF.rglob("*.yaml") if path.relative_to(CONF).parts[0] != "hydra"]
-    named = {name for path in files for name in re.findall(r"_target_: (\S+)", path.read_text())}
+    named = {name.strip("}") for path in files for name in re.findall(r"_target_: (\S+)", path.read_text())}
     assert len(named) > 20
-    for name in named:
-        read(target(name.strip("}")))
+    places = {name: [key for key in HOMES if is_read(target(name, key))] for name in named}
+    assert [name for name, keys in places.items() if not keys] == []
+    assert places["forewarp.evaluation.curves.AccuracyCurve"] == ["callbacks"]
+    assert places["forewarp.synth.module.SyntheticDataModule"] == ["data"]
+
+
+def is_read(text):
+    try:
+        return bool(read(text))
+    except ValueError:
+        return False
+
+
+def test_a_class_of_ours_is_refused_where_it_does_not_belong():
+    writes = "forewarp.training.checkpoints.KeepCheckpoint"
+    for text in (target(writes, "callbacks"), target("forewarp.renderer.Renderer", "planned")):
+        with pytest.raises(ValueError, match="which is none for this key"):
+            read(text)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        *(("checkpoint_seconds", value) for value in ("nan", "-1", "[nan]", "inf", "often")),
+        *(("evaluate", "maybe"), ("seed", str(2**32)), ("seed", "-1"), ("seed", "1.5")),
+        *(("lpips_weights", "1e400"), ("lpips_weights", "[a,3]"), ("callbacks.progress", "text")),
+        *(("data.scene", "' '"), ("data.scene", "../../x"), ("data.scene", "/x")),
+    ],
+)
+def test_a_value_that_would_be_noticed_late_is_refused_at_once(key, value):
+    with pytest.raises(ValueError, match=f"^{re.escape(key)}: expected "):
+        check_values(composed(f"{key}={value}"))
 
 
 def test_a_file_that_holds_no_config_is_refused(tmp_path):
@@ -138,7 +176,7 @@ def strangers(tmp_path, monkeypatch):
 def test_what_is_not_trusted_is_refused_before_it_is_imported(strangers):
     thing = target("strangers.module.Thing")
     line = (
-        "config.yaml: a._target_: expected a class of forewarp, but got 'strangers.module.Thing'; "
+        "config.yaml: model._target_: expected a class of forewarp, but got 'strangers.module.Thing'; "
         "if you trust the package strangers, add trust=[strangers] (or set FOREWARP_TRUST=strangers)"
     )
     for text in (thing, f"{thing}\ntrust: [strangers]"):  # a folder has no say in it
@@ -146,7 +184,7 @@ def test_what_is_not_trusted_is_refused_before_it_is_imported(strangers):
             read(text)
     with pytest.raises(ValueError, match=r"add trust=\[strangers,strangersother\] \(or set"):
         read(target("strangersother.Thing"), "strangers")
-    assert trusted_config(thing, "x", None).a._target_ == "strangers.module.Thing"  # compared, never made
+    assert trusted_config(thing, "x", None).model._target_ == "strangers.module.Thing"  # compared, never made
     assert not [name for name in sys.modules if name.startswith("strangers")]
     read(target("builtins.print"), "builtins")
     with pytest.raises(ValueError, match=r"expected a class of forewarp, but got 'builtins.print'$"):

@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from shutil import copyfile
 from typing import TYPE_CHECKING
 
 from hydra.core.hydra_config import HydraConfig
@@ -18,7 +17,8 @@ from omegaconf import DictConfig
 
 from forewarp.cli.view import require_viewer
 from forewarp.data.files import scene_folder
-from forewarp.runs.config import check_planned, hashed, resumed, trust_of
+from forewarp.files import MOST_CONFIG, read_text, replace_file
+from forewarp.runs.config import check_planned, check_values, hashed, resumed, trust_of
 from forewarp.runs.overrides import key_of, typed_overrides
 
 if TYPE_CHECKING:  # loads torch
@@ -53,6 +53,7 @@ class Prepared:
         score: what the job returns.
         measured: whether the run was finished and measured before.
         viewer: ``host`` and ``port`` of a page that shows the run while it trains; None: no page.
+        plan: text of the plan that is followed; None: there is none, or the run's folder has it.
     """
 
     run: Run
@@ -60,6 +61,7 @@ class Prepared:
     score: Score
     measured: bool
     viewer: dict | None
+    plan: str | None
 
     @contextmanager
     def session(self) -> Iterator[None]:
@@ -76,9 +78,8 @@ class Prepared:
 
                 stack.enter_context(live(self.run, **self.viewer))
             stack.enter_context(session(self.run, self.config, finished=self.measured))
-            plan = self.config.get("planned")
-            if plan is not None and not self.measured and Path(plan).is_file():
-                copyfile(plan, Path(self.run.folder) / "plan.yaml")
+            if self.plan is not None:
+                replace_file(Path(self.run.folder) / "plan.yaml", self.plan)
             yield
 
 
@@ -96,7 +97,7 @@ def prepare(config: DictConfig) -> Prepared | None:
     if config.get("planned") is not None:
         check_planned(config, trust)
     viewer = viewer_of(config)  # as typed: a stored config has none
-    config = resumed(config)
+    config, resumes = resumed(config), config.get("resume") is not None
     refuse_missing_scene(config)
     # What follows loads torch; mistakes in the command have been answered before.
     from forewarp.runs.build import build_run
@@ -120,7 +121,9 @@ def prepare(config: DictConfig) -> Prepared | None:
         run.datamodule.setup("fit")
         if config.evaluate and config.get("reduce") is not None:
             run.datamodule.targets("test").reduced(config.reduce)
-    return Prepared(run, config, Score(run, config), measured, viewer)
+    plan = config.get("planned")  # of a stored config it could name any file
+    plan = None if plan is None or measured or resumes else read_text(Path(plan), MOST_CONFIG)
+    return Prepared(run, config, Score(run, config), measured, viewer, plan)
 
 
 def refuse_all(config: DictConfig) -> None:
@@ -132,6 +135,7 @@ def refuse_all(config: DictConfig) -> None:
     refuse_two_models(config)
     refuse_other_methods(config)
     refuse_numbers(config, "views", "sheets", "reduce")
+    check_values(config)
 
 
 def refuse_missing_scene(config: DictConfig) -> None:

@@ -10,6 +10,7 @@ import hashlib
 import importlib
 import inspect
 import json
+import math
 import os
 import re
 import sys
@@ -21,7 +22,8 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from forewarp.files import MOST_CONFIG, read_text
+from forewarp.data.files import RECORD
+from forewarp.files import MOST_CONFIG, read_text, refuse_links
 from forewarp.runs.overrides import key_of, typed_overrides
 
 # Two runs differ if these keys differ; device, folder and what is shown do not count.
@@ -33,6 +35,7 @@ MAY_CHANGE = (
     *("sentinel", "data_changed", "score", "viewer", "host", "port"),
 )
 MOST_LEVELS = 40
+MOST_SEED = 2**32 - 100  # each stage adds its number, and 32 bits hold the sum
 TRUST_VARIABLE = "FOREWARP_TRUST"
 # Allowed beside the classes of forewarp. Listed by full name, as a prefix would allow all of torch.
 ELSEWHERE = {
@@ -41,6 +44,21 @@ ELSEWHERE = {
     "lightning.pytorch.loggers.CSVLogger",
     "lightning.pytorch.loggers.TensorBoardLogger",
 }
+# Where a config may name our own classes: key at the top -> beginnings of their full names. Classes that
+# write to a path, such as the checkpoints' callback, are in none of these modules.
+_PARTS_OF_METHODS = ("forewarp.methods.", "forewarp.fields.", "forewarp.renderer.")
+HOMES = {
+    "data": ("forewarp.data.module.", "forewarp.synth.module."),
+    "model": _PARTS_OF_METHODS,
+    "objective": ("forewarp.training.objective.",),
+    "stage": (*_PARTS_OF_METHODS, "forewarp.training.objective.", "forewarp.training.schedule."),
+    "callbacks": (
+        "forewarp.training.callbacks.",
+        *("forewarp.evaluation.curves.AccuracyCurve", "forewarp.evaluation.images.TensorBoardImages"),
+    ),
+    "trainer": ("lightning.Trainer", "lightning.pytorch.Trainer"),
+    "logger": ("lightning.pytorch.loggers.",),
+}
 _RESERVED = {"_target_", "_partial_", "_recursive_", "_convert_"}
 # What OmegaConf and PyYAML raise for a text that is no config.
 _UNREADABLE = (
@@ -48,6 +66,7 @@ _UNREADABLE = (
     *(RecursionError, OverflowError),
 )
 _PARTS = {"name", "version", "sub_dir"}  # keys that make up the path a logger writes to
+_PLAIN = {"default_hp_metric", "flush_logs_every_n_steps", "log_graph", "prefix"}  # its others
 
 
 def hashed(config: DictConfig) -> DictConfig:
@@ -91,7 +110,8 @@ def saved_config(run: str | None, changes: DictConfig, key: str = "run") -> Dict
         key: name of the key that holds the folder, for errors.
 
     Raises:
-        ValueError: if there is no run, or the config names code that is not trusted.
+        ValueError: if there is no run, a link lies in its folder, its scene is procedural and missing, or
+            the config names code that is not trusted.
     """
     if run is None:
         raise ValueError("run: expected the folder of a run, but got nothing; set run=runs/...")
@@ -107,6 +127,9 @@ def saved_config(run: str | None, changes: DictConfig, key: str = "run") -> Dict
     if (changes.get("data") or {}).get("root") is not None:
         saved.data.root = changes.data.root
     saved.run = str(run)
+    refuse_links(Path(run))
+    check_values(saved)
+    refuse_to_synthesize(saved)
     return saved
 
 
@@ -146,6 +169,49 @@ def read_config(path: Path, trust: Sequence[str] | None = ()) -> DictConfig:
         if key not in config and key != "objective":  # a method may have no objective
             raise ValueError(f"{path}: expected the key {key}, but got none; delete the run's folder")
     return config
+
+
+def check_values(config: DictConfig) -> None:
+    """Refuse values of a run's config that would be noticed late, or never.
+
+    Raises:
+        ValueError: naming the key.
+    """
+    seconds, seed, weights = (config.get(key) for key in ("checkpoint_seconds", "seed", "lpips_weights"))
+    if type(seconds) not in (int, float) or not 0 <= seconds < math.inf:
+        raise ValueError(f"checkpoint_seconds: expected a number >= 0, but got {seconds}")
+    if type(seed) is not int or not 0 <= seed <= MOST_SEED:
+        raise ValueError(f"seed: expected a whole number in [0, {MOST_SEED}], but got {seed}")
+    if type(config.get("evaluate", True)) is not bool:
+        raise ValueError(f"evaluate: expected true or false, but got {config.evaluate}")
+    places = OmegaConf.create([weights]) if isinstance(weights, str) else weights
+    if places is not None and not (
+        OmegaConf.is_list(places) and all(isinstance(place, str) for place in places)
+    ):
+        raise ValueError(
+            f"lpips_weights: expected a file, a folder, a list of them or null, but got {weights}"
+        )
+    for name, callback in (config.get("callbacks") or {}).items():
+        if callback is not None and "_target_" not in (callback if OmegaConf.is_dict(callback) else {}):
+            raise ValueError(f"callbacks.{name}: expected a class (_target_) or null, but got {callback}")
+    scene = None if OmegaConf.is_missing(config.data, "scene") else config.data.get("scene")
+    if isinstance(scene, str) and (not scene.strip() or {"..", "/"} & set(Path(scene).parts)):
+        raise ValueError(f"data.scene: expected the name of a folder below data.root, but got {scene!r}")
+
+
+def refuse_to_synthesize(config: DictConfig) -> None:
+    """Refuse a stored config whose procedural scene is missing: a run's folder writes nothing elsewhere.
+
+    Raises:
+        ValueError: naming the scene's folder.
+    """
+    target, root = str(config.data.get("_target_")), Path(str(config.data.get("root")))
+    folder = root if "LegoComplete" in target else root / str(config.data.get("scene"))
+    if target.startswith("forewarp.synth.") and not (folder / RECORD).is_file():
+        raise ValueError(
+            f"{folder}: expected the procedural scene that the run was fitted to, but got none; write it "
+            "with forewarp-synthesize or by the run's own command (command: in config.yaml), or set data.root"
+        )
 
 
 def make_absolute(config: DictConfig) -> None:
@@ -264,7 +330,8 @@ def check_target(name: object, where: Path | str, key: str, trust: Sequence[str]
     Raises:
         ValueError: naming file and key, and how to trust the package.
     """
-    if isinstance(name, str) and name in ELSEWHERE:
+    home = HOMES.get(re.split(r"[./\[]", key)[0], ())
+    if isinstance(name, str) and name in ELSEWHERE and name.startswith(home):
         return
     refusal = f"{where}: {key}: expected a class of forewarp, but got {name!r:.80}"
     parts = name.split(".") if isinstance(name, str) else []
@@ -273,14 +340,16 @@ def check_target(name: object, where: Path | str, key: str, trust: Sequence[str]
     if parts[0] != "forewarp":
         _check_foreign(name, refusal, trust)
         return
-    home, _, last = name.rpartition(".")
+    module, _, last = name.rpartition(".")
     try:
-        found = getattr(importlib.import_module(home), last)
+        found = getattr(importlib.import_module(module), last)
     except Exception as error:  # an import may raise anything
         raise ValueError(f"{refusal} ({type(error).__name__})") from None
     # A module's own imports do not count: ``forewarp.cli.entry.Path`` is not a class of forewarp.
-    if not inspect.isclass(found) or found.__module__ != home:
+    if not inspect.isclass(found) or found.__module__ != module:
         raise ValueError(refusal)
+    if not name.startswith(home):
+        raise ValueError(f"{refusal}, which is none for this key")
 
 
 def _check_foreign(name: str, refusal: str, trust: Sequence[str]) -> None:
@@ -325,8 +394,15 @@ def advice(name: str, trust: Sequence[str] = ()) -> str:
 
 
 def _check_logger(node: dict, where: Path, key: str) -> None:
-    """Refuse a logger whose name, appended to the stage's folder, would lead out of it."""
-    for name in _PARTS & node.keys() if node["_target_"].endswith("Logger") else ():
+    """Refuse a logger that would write outside its stage's folder, by its name or by an option."""
+    if not node["_target_"].startswith("lightning.pytorch.loggers."):
+        return
+    if others := sorted(node.keys() - _PARTS - _PLAIN - _RESERVED):
+        raise ValueError(
+            f"{where}: {key}.{others[0]}: expected one of {', '.join(sorted(_PARTS | _PLAIN))}, but got "
+            "another option; delete it"
+        )
+    for name in sorted(_PARTS & node.keys()):
         if not re.fullmatch(r"(\w[\w.-]*)?", str(node[name])):
             raise ValueError(
                 f"{where}: {key}.{name}: expected the name of a folder, but got {node[name]!r:.80}"

@@ -15,7 +15,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from forewarp.data.files import LOCK, difference
-from forewarp.files import read_json, read_text, replace_file, write_json
+from forewarp.files import read_json, read_text, refuse_links, replace_file, write_json
 from forewarp.runs.config import IDENTITY, make_absolute, read_config
 from forewarp.runs.overrides import command_line, typed_overrides
 from forewarp.training.stages import Run
@@ -51,10 +51,11 @@ def locked(folder: Path) -> Iterator[None]:
     not support locks, go on unlocked. ``.lock`` names the process and stays behind.
 
     Raises:
-        ValueError: if another process holds the lock; names it.
+        ValueError: if another process holds the lock, naming it; if a link lies in the folder.
         OSError: if the folder cannot be made or written; names the key ``run``.
     """
     folder = Path(folder)
+    refuse_links(folder)
     holder, lock = folder / LOCK, FileLock(folder / f"{LOCK}.held", timeout=0, fallback_to_soft=False)
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -336,7 +336,10 @@ def _backward_compiled_beside(new: bool) -> Iterator[None]:
         yield
         return
     with TemporaryFile() as errors:
-        process, code = None, f"from {__name__} import compile_backward; compile_backward()"
+        # Without the current folder, where a file may be called as a package that is imported.
+        code = "import sys; sys.path = [place for place in sys.path if place]; "
+        code += f"from {__name__} import compile_backward; compile_backward()"
+        process = None
         with suppress(OSError):
             process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.DEVNULL, stderr=errors)
         yield

@@ -1,0 +1,132 @@
+"""A run's folder that a stranger made: whatever command opens it, nothing outside it is written or run."""
+
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+from omegaconf import OmegaConf
+
+from forewarp.files import replace_file
+
+OPENS = {  # command -> how it is pointed at the folder, and what keeps it short
+    "train": ("resume={}", "checkpoint_seconds=0"),
+    "evaluate": ("run={}", "sheets=0"),
+    "render": ("run={}", "path=orbit", "frames=2", "size=16"),
+    "export": ("run={}", "format=ply"),
+    "report": ("kind=run", "run={}"),
+}
+SECRET = "the user's own"
+
+
+def within(key, value):
+    """Change a key of the stored config."""
+
+    def change(run, outside):
+        config = OmegaConf.load(run / "config.yaml")
+        OmegaConf.update(config, key, value(outside) if callable(value) else value, force_add=True)
+        OmegaConf.save(config, run / "config.yaml")
+
+    return change
+
+
+def link(name, to):
+    """Put a link in the place of what lies at ``name``."""
+
+    def change(run, outside):
+        place = run / name
+        shutil.rmtree(place) if place.is_dir() else place.unlink(missing_ok=True)
+        place.parent.mkdir(exist_ok=True)
+        place.symlink_to(outside / to)
+
+    return change
+
+
+def keeper(outside):
+    target = "forewarp.training.checkpoints.KeepCheckpoint"
+    return {"_target_": target, "_partial_": True, "path": f"{outside}/secret", "seconds": 0}
+
+
+def synthetic(outside):
+    target = "forewarp.synth.module.SyntheticDataModule"
+    return {"_target_": target, "root": str(outside), "scene": "new", "synthesis": {}}
+
+
+KINDS = {  # what is wrong with the folder -> how it is made, and what the refusal names
+    "planned": (within("planned", lambda outside: f"{outside}/secret"), None),
+    "callback": (within("callbacks.x", keeper), "callbacks.x._target_"),
+    "logger": (within("logger.log_dir", lambda outside: str(outside)), "logger.log_dir"),
+    "scene": (within("data.scene", "../../x"), "data.scene"),
+    "synthetic": (within("data", synthetic), "new"),
+    "images": (link("images", "."), "images"),
+    "stage": (link("fine", "."), "fine"),
+    "plan": (link("plan.yaml", "secret"), "plan.yaml"),
+    "lock": (link(".lock.held", "secret"), ".lock.held"),
+    "deep": (link("coarse/tensorboard/deep", "."), "deep"),
+    "nowhere": (link("videos", "not/there"), "videos"),
+}
+
+
+def tree(folder):
+    """Return all that lies in a folder, with the content of its files."""
+    paths = sorted(Path(folder).rglob("*"))
+    return {path: path.read_bytes() if path.is_file() and not path.is_symlink() else None for path in paths}
+
+
+@pytest.fixture
+def outside(in_tmp):
+    (in_tmp / "outside").mkdir()
+    (in_tmp / "outside" / "secret").write_text(SECRET)
+    return in_tmp / "outside"
+
+
+ATTACKS = [(kind, name) for kind in KINDS for name in OPENS if kind != "planned" or name == "train"]
+
+
+@pytest.mark.parametrize(("kind", "name"), ATTACKS)
+def test_nothing_outside_is_written(kind, name, fitted, outside, forewarp):
+    make, named = KINDS[kind]
+    run = Path(shutil.copytree(fitted, "run"))
+    make(run, outside)
+    before, scenes = tree(outside), tree(fitted.parent / "scenes")
+    done = forewarp(name, *(word.format(run) for word in OPENS[name]))
+    assert tree(outside) == before
+    assert tree(fitted.parent / "scenes") == scenes
+    assert not any(SECRET.encode() in (content or b"") for content in tree(run).values())
+    assert "Traceback" not in done.err
+    if named is None:
+        assert done.status == 0, done
+    elif name != "report":  # which writes page.html alone, and says in it what it leaves out
+        assert done.status == 2, done
+        assert named in done.err.splitlines()[-1]
+
+
+def test_the_folder_itself_may_be_a_link(fitted, in_tmp, forewarp):
+    shutil.copytree(fitted, "disk/run")
+    Path("run").symlink_to("disk/run")
+    assert forewarp("evaluate", "run=run", "sheets=0", "views=1").status == 0
+
+
+def test_a_file_is_not_written_through_a_link_that_lies_in_wait(in_tmp, monkeypatch):
+    Path("secret").write_text(SECRET)
+    Path(".page.md.guessed.part.md").symlink_to("secret")
+    with monkeypatch.context() as patch:
+        patch.setattr("forewarp.files.secrets.token_hex", lambda count: "guessed")
+        with pytest.raises(FileExistsError):
+            replace_file(Path("page.md"), "x")
+    Path("page.md").symlink_to("secret")
+    replace_file(Path("page.md"), "x")
+    assert not Path("page.md").is_symlink()  # the link is replaced, not followed
+    assert Path("secret").read_text() == SECRET
+
+
+def test_a_helper_process_imports_nothing_of_the_current_folder(in_tmp, monkeypatch):
+    from forewarp.methods.particles import start
+
+    for name in ("numba", "numpy", "forewarp"):
+        Path(f"{name}.py").write_text("open('trace', 'w')\nraise SystemExit(3)\n")
+    monkeypatch.setattr(start, "compile_backward", None)  # the other process has its own
+    monkeypatch.setattr(start, "cores", lambda: 2)
+    with start._backward_compiled_beside(new=True):
+        pass
+    assert not os.path.exists("trace")
