@@ -201,11 +201,18 @@ def load_json(path: Path) -> dict:
 
 
 def read_rows(path: Path) -> list[dict[str, str]]:
-    """Read the rows of a CSV file whose first line names the columns; a missing file has none."""
+    """Read the rows of a CSV file whose first line names the columns; a missing file has none.
+
+    Raises:
+        ValueError: in one line, for a file that is no table of text.
+    """
     if not path.is_file():
         return []
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
+    try:
+        with path.open(newline="") as file:
+            return list(csv.DictReader(file))
+    except (csv.Error, ValueError) as error:  # NUL bytes, bytes that are no text
+        raise ValueError(f"{path}: expected a table, but got {short(str(error))}; delete it") from error
 
 
 def read_text(path: Path, most: int = MOST_BYTES) -> str:

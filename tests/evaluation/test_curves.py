@@ -138,3 +138,10 @@ def test_a_run_with_validation_views_has_a_curve_and_no_other(tmp_path, views):
 def test_bad_settings_are_named(bad):
     with pytest.raises(ValueError, match="callbacks.accuracy: expected first > 0, ratio > 1 and rays >= 1"):
         AccuracyCurve(**bad)
+
+
+@pytest.mark.parametrize("content", [b"a,b\n1,2\n", b"seconds,stage\nmany,x\n", b"\xff\x00,\n1\n"])
+def test_a_damaged_curve_is_named(content, tmp_path):
+    (tmp_path / "accuracy_time.csv").write_bytes(content)
+    with pytest.raises(ValueError, match=r"accuracy_time.csv: expected a table.*delete it"):
+        run(tmp_path).fit()

@@ -303,3 +303,16 @@ def test_a_video_through_its_keys(tmp_path):
         session.write_video(tmp_path, keys, 0.4, lambda *_: None)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["path-1.mp4", "path-2.mp4"]
     viewer.queue.close()
+
+
+def test_an_image_is_no_wider_than_a_screen_whatever_a_browser_tells():
+    viewer = FakeViewer()
+    viewer.rows = 720
+    session = Session(viewer, FakePage())
+    for canvas, size in (
+        ((1280, 720), (1280, 720)),
+        ((3_000_000, 10), (2880, 1)),
+        ((2, 3_000_000), (1, 720)),
+    ):
+        session.page.canvas = lambda canvas=canvas: canvas
+        assert session.full_size() == size

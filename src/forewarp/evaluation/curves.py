@@ -60,8 +60,17 @@ class AccuracyCurve(lightning.Callback):
             return
         folder = Path(trainer.default_root_dir)
         self._path, self._before = folder.parent / FILE, seconds_before(folder)
-        now = self._seconds(module)
-        self._rows = [row for row in read_rows(self._path) if float(row["seconds"]) <= now]
+        now, rows = self._seconds(module), read_rows(self._path)
+        try:
+            seconds = [float(row["seconds"]) for row in rows]
+            self._rows = [
+                {name: row[name] for name in COLUMNS} for row, at in zip(rows, seconds) if at <= now
+            ]
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(
+                f"{self._path}: expected a table with the columns {', '.join(COLUMNS)}, but got another or "
+                "half a one; delete it, and the curve begins where training goes on"
+            ) from error
         last = float(self._rows[-1]["seconds"]) if self._rows else 0.0
         self._next = next_moment(last, self.first, self.ratio)
 

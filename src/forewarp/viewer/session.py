@@ -31,6 +31,7 @@ MIN_INTERVAL = 1 / 30  # seconds between two images while time plays
 REST_SECONDS = 0.15  # without a change, after which the camera is at rest
 PLAYBACK_SECONDS = 4.0  # in which the whole time passes at speed 1
 VIDEO_FPS = 25.0
+WIDEST = 4  # columns of an image for each row of the largest
 MIN_VIDEO_SECONDS, MAX_VIDEO_SECONDS = 0.1, 600.0
 
 
@@ -124,13 +125,15 @@ class Session:
         self.viewer.queue.cancel(self)
 
     def full_size(self) -> tuple[int, int]:
-        """Width and height of an image at rest: the canvas's shape, with at most ``viewer.rows`` rows.
+        """Width and height of an image at rest: the canvas's shape, with at most ``viewer.rows`` rows and
+        ``WIDEST`` times as many columns, whatever a browser tells.
 
         On a slow machine the browser tells a canvas of half the pixels that it has.
         """
         width, height = self.page.canvas()
-        rows = max(1, min(2 * height, self.viewer.rows))
-        return max(1, round(width * rows / height)), rows
+        most = WIDEST * self.viewer.rows
+        rows = max(1, min(2 * height, self.viewer.rows, most * height // width))
+        return max(1, min(most, round(width * rows / height))), rows
 
     def _advance(self) -> None:
         """Move time on while it plays."""

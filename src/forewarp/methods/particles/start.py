@@ -210,8 +210,8 @@ def _sweep(scene: Scene, i: int, side: int) -> tuple[Tensor, Tensor, Tensor]:
     rgb, camera = _small(scene, i, side)
     step = max(1, round(max(camera.width, camera.height) / side))
     rows, columns = torch.meshgrid(
-        torch.arange(step // 2, camera.height, step),
-        torch.arange(step // 2, camera.width, step),
+        torch.arange(min(step // 2, camera.height - 1), camera.height, step),
+        torch.arange(min(step // 2, camera.width - 1), camera.width, step),
         indexing="ij",
     )
     rays = camera.rays((rows * camera.width + columns).flatten())
