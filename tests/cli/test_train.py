@@ -253,3 +253,13 @@ def test_particles_begin_where_voxels_found_matter(ok, refused, scenes, in_tmp, 
     assert isinstance(load(in_tmp / "run").method, Particles)
     line = refused(*words, "preset.rays=64", "model/radiance=mlp")
     assert "model/radiance: expected an option of model=particles" in line  # of the run as ever
+
+
+def test_paths_and_names_are_taken_as_typed(fitted, in_tmp, ok):
+    root, name = in_tmp / "josé + familie", "Größe [2], it's (1)"
+    shutil.copytree(fitted.parent / "scenes" / "vehicle", root / name)
+    words = [*(word for word in TINY if not word.startswith(("stage.fine", "data.scene", "budget"))), *SHORT]
+    ok("train", *words, f"data.root={root}", f"data.scene={name}", f"run={root}/läufe/{name}")
+    ok("train", f"resume={root}/läufe/{name}", "evaluate=false")
+    ok("evaluate", f"run={root}/läufe/{name}", f"data.root={root}", "views=1", "sheets=0")
+    assert (root / "läufe" / name / "metrics.json").is_file()

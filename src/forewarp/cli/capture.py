@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import sys
-
 from forewarp.cli.entry import command
-from forewarp.runs.overrides import command_line, key_of, text_override
+from forewarp.runs.overrides import command_line, text_override
 
 HELP = """
 forewarp-capture makes a scene from a video: it takes the sharpest frames, finds the cameras' poses from what
@@ -103,25 +101,8 @@ def check(config) -> tuple[dict, object]:
     return source, out
 
 
-def as_text(arguments: list[str]) -> list[str]:
-    """Quote paths so that Hydra keeps them as they were typed: ``2024``, ``VID (1).mp4``.
-
-    >>> as_text(["images=2024", "out=null", "video='a b.mp4'", "seed=1"])
-    ["images='2024'", 'out=null', "video='a b.mp4'", 'seed=1']
-    """
-    if {"-m", "--multirun"} & set(arguments):  # there a comma is between several
-        return arguments
-    found = []
-    for argument in arguments:
-        key, _, value = argument.partition("=")
-        bare = key_of(argument) in PATHS and value not in ("", "null") and value[0] not in "'\"$"
-        found.append(text_override(key, value) if bare else argument)
-    return found
-
-
 def main() -> None:
     """Run the console script."""
-    sys.argv[1:] = as_text(sys.argv[1:])
     command("capture", capture, HELP)
 
 

@@ -16,6 +16,7 @@ from pathlib import Path
 
 from forewarp.cli.mistakes import flat, one_line, refuse_dashes, unknown_key, with_run_key
 from forewarp.runs.config_files import configurations, project_root
+from forewarp.runs.overrides import as_text
 
 TRACEBACK_VARIABLE = "FOREWARP_TRACEBACK"
 MISTAKE, INTERRUPTED = 2, 130
@@ -61,7 +62,7 @@ def _arguments(name: str) -> list[str]:
 
     ``dataset=NAME`` is ``experiment=NAME`` where scenes are trained on, and a group where they are written.
     """
-    arguments = with_run_key(name, sys.argv[1:])
+    arguments = as_text(with_run_key(name, sys.argv[1:]))
     if name in ("train", "plan"):
         arguments = [re.sub(r"^dataset=", "experiment=", argument) for argument in arguments]
     refuse_dashes(arguments)

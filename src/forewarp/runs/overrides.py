@@ -5,7 +5,12 @@ from __future__ import annotations
 import re
 import shlex
 from collections.abc import Sequence
+from contextlib import suppress
 
+TEXTS = re.compile(  # keys that hold a path, or the name of a scene's folder
+    r"data\.(root|scene)|paths\.\w+|plan\.folder|run2?|runs|resume|out|video|images|colmap|masks|curves|published|"
+    "lpips_weights"
+)
 OF_A_SWEEP = ("sweeps=", "seeds=", "launcher=")  # these say how jobs are run, not what a job computes
 
 
@@ -24,6 +29,31 @@ def command_line(name: str, overrides: Sequence[str]) -> str:
     "forewarp-train data.scene=hook 'stage.fine.num_voxels=[[0,4000]]'"
     """
     return shlex.join([f"forewarp-{name}", *overrides])
+
+
+def as_text(arguments: Sequence[str]) -> list[str]:
+    """Quote paths and names of scenes so that Hydra keeps them as they were typed: ``2024``, ``VID (1).mp4``.
+
+    >>> as_text(["data.root=/data/josé", "data.scene=hand (1)", "out=null", "run='a b'", "seed=1"])
+    ["data.root='/data/josé'", "data.scene='hand (1)'", 'out=null', "run='a b'", 'seed=1']
+    """
+    swept, found = bool({"-m", "--multirun"} & set(arguments)), []
+    for argument in arguments:
+        key, _, value = argument.partition("=")
+        typed = TEXTS.fullmatch(key_of(argument)) and value not in ("", "null") and value[0] not in "'\"$[{"
+        several = typed and (swept or key == "data.scene") and _is_sweep(argument)
+        found.append(text_override(key, value) if typed and not several else argument)
+    return found
+
+
+def _is_sweep(override: str) -> bool:
+    """Tell whether Hydra takes an override for several values, as ``data.scene=hook,lego``."""
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from hydra.errors import HydraException
+
+    with suppress(HydraException):
+        return OverridesParser.create().parse_override(override).is_sweep_override()
+    return False
 
 
 def text_override(key: str, text: str) -> str:
