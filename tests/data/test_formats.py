@@ -346,6 +346,7 @@ RGB, ONE = np.zeros((20, 30, 3), np.uint8), posed_cameras(1)[0]
 POSED = PosedShot("a.png", ONE, RGB)
 UNWRITABLE = {
     write_splits: [
+        ({"training": []}, r"splits: expected train, val and test, but got \['training'\]"),
         ({"train": [shot(), shot()]}, "expected shots of different names"),
         ({"train": [shot(rgba=PIXELS / 1.0)]}, "expected uint8 pixels"),
         ({"train": [shot(), shot("b", rgba=PIXELS[:2])]}, r"uint8 pixels of .* got uint8 of \(2, 8, 4\)"),

@@ -178,9 +178,11 @@ def write_scene(
         trajectories: exact point trajectories, the canonical time first.
 
     Raises:
-        ValueError: for a shot that ``read_scene`` would refuse.
+        ValueError: for another split, and for a shot that ``read_scene`` would refuse.
     """
     folder = Path(folder)
+    if unknown := sorted(splits.keys() - set(SPLITS)):
+        raise mismatch("splits", "train, val and test", unknown)
     remove(folder, "transforms_*.json", "test_*/transforms.json", "trajectories.npz")
     files: dict[str, dict[str, dict]] = {}  # transforms file -> image path -> entry
     shape = None
