@@ -11,7 +11,7 @@ from forewarp.data.module import SceneDataModule
 from forewarp.evaluation import evaluate as evaluation
 from forewarp.evaluation.evaluate import draw, evaluate, flow_error, reduced_rendering, show, without
 from forewarp.methods.voxel.model import VoxelSnapshot
-from forewarp.metrics.suite import LPIPS_METRICS, ImageSuite
+from forewarp.metrics.registry import LPIPS_METRICS, ImageSuite
 from forewarp.scene.camera import joined
 from forewarp.scene.frame import Truth
 from forewarp.scene.view import Rendering

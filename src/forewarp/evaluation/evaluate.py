@@ -22,9 +22,8 @@ from forewarp.drawing.images import at_least, error_colors, in_a_row
 from forewarp.files import write_json
 from forewarp.methods.effect import switched
 from forewarp.methods.method import HasTrajectories, parameter_count
-from forewarp.metrics.flow import end_point_error
-from forewarp.metrics.registry import METRICS
-from forewarp.metrics.suite import ImageSuite, summarise
+from forewarp.metrics.geometry import end_point_error
+from forewarp.metrics.registry import METRICS, ImageSuite, summarise
 from forewarp.ops.grid import block_means, reduced_depth
 from forewarp.progress import time_text
 from forewarp.scene.frame import Scene, spread

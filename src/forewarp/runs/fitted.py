@@ -20,8 +20,7 @@ from forewarp.evaluation.evaluate import evaluate, mean_scores, show
 from forewarp.files import read_json, write_json
 from forewarp.methods.method import HasMatter, HasTrajectories, Method, Snapshot
 from forewarp.metrics.lpips import find_lpips, find_lpips_weights
-from forewarp.metrics.registry import METRICS, NETS
-from forewarp.metrics.suite import ImageSuite
+from forewarp.metrics.registry import METRICS, NETS, ImageSuite
 from forewarp.progress import Counted
 from forewarp.runs.build import build_run
 from forewarp.runs.config import saved_config, trust_of

@@ -7,8 +7,7 @@ import torch
 from forewarp.evaluation.evaluate import table_of
 from forewarp.metrics import image, lpips
 from forewarp.metrics.lpips import LPIPS
-from forewarp.metrics.registry import METRICS, Metric
-from forewarp.metrics.suite import ImageSuite, summarise
+from forewarp.metrics.registry import METRICS, ImageSuite, Metric, summarise
 from forewarp.scene.camera import Camera
 from forewarp.scene.frame import Frame
 from forewarp.scene.view import Target
@@ -45,7 +44,7 @@ def test_scores_are_the_metrics_in_fixed_order(alex):
 
 def test_what_an_image_does_not_allow_is_left_out_and_said_once(caplog, monkeypatch):
     # The command line, where a test before this one ran it, quietens loggers.
-    for name in ("forewarp", "forewarp.metrics", "forewarp.metrics.suite"):
+    for name in ("forewarp", "forewarp.metrics", "forewarp.metrics.registry"):
         for key, value in (("disabled", False), ("propagate", True), ("level", logging.NOTSET)):
             monkeypatch.setattr(logging.getLogger(name), key, value)
     with caplog.at_level(logging.WARNING):
