@@ -7,12 +7,12 @@ import pytest
 
 SOURCE = Path(__file__).parents[1] / "src" / "forewarp"
 BOTTOM = {"clock", "files", "progress"}  # open to all
-LOWER = {"ops", "scene", "losses", "metrics", "fields", "drawing", "renderer", "quadrature"}
+LOWER = {"ops", "scene", "losses", "metrics", "fields", "drawing", "renderer"}
 MAY_IMPORT = {
     **dict.fromkeys(["clock", "files", "progress", "ops"], set()),
     "scene": {"ops"},
     "losses": {"ops"},
-    **dict.fromkeys(["metrics", "drawing", "fields", "data", "quadrature"], {"ops", "scene"}),
+    **dict.fromkeys(["metrics", "drawing", "fields", "data"], {"ops", "scene"}),
     "report": {"drawing", "metrics"},
     "synth": {"ops", "scene", "data"},
     "browser": {"ops", "scene"},

@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from forewarp.quadrature import Quadrature
+from forewarp.renderer import Quadrature
 from forewarp.scene.box import Box
 from forewarp.scene.camera import Rays
 
@@ -154,7 +154,7 @@ def test_pictures_in_pieces_and_permuted(monkeypatch):
     quadrature, some = Quadrature(12, 12), rays(9)
     behind = torch.rand(9, 3)
     whole = quadrature(*slab(2.0), some, behind)
-    monkeypatch.setattr("forewarp.quadrature._POINTS", 48)
+    monkeypatch.setattr("forewarp.renderer._POINTS", 48)
     pieces = quadrature.picture(*slab(2.0), some, behind)
     order = torch.randperm(9)
     turned = quadrature(*slab(2.0), some[order], behind[order])

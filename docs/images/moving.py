@@ -13,8 +13,7 @@ import torch
 from PIL import Image, ImageDraw, ImageFont
 
 import forewarp
-from forewarp.scene.camera import look_at
-from forewarp.scene.paths import focus_point
+from forewarp.scene.camera import focus_point, look_at
 
 SIDE, FOOT = 270, 26  # pixels of a picture's side and of the line below it
 SHOWN = 0.95  # share of a picture's side that is shown, around its middle

@@ -25,9 +25,8 @@ from forewarp.capture.pipeline import PICTURE
 from forewarp.data import hypernerf
 from forewarp.data.images import read_image
 from forewarp.data.posed_video import PosedShot, read_scene, write_scene
-from forewarp.drawing.files import read_image as read_drawn
-from forewarp.drawing.files import to_bytes, write_video
-from forewarp.drawing.images import in_a_row
+from forewarp.drawing.images import in_a_row, to_bytes, write_video
+from forewarp.drawing.images import read_image as read_drawn
 from forewarp.progress import Counted
 from forewarp.scene.box import Box
 from tests.support.captures import WALKS, cameras_of, pictures_of, pose_errors, smeared

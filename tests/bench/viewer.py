@@ -21,7 +21,7 @@ from forewarp.cli.entry import quiet
 from forewarp.cli.view import renderer_of
 from forewarp.runs.config import saved_config
 from forewarp.runs.config_files import project_root
-from forewarp.scene.paths import orbit
+from forewarp.scene.camera import orbit
 from forewarp.viewer.rendering import SPLATS, Viewer, ViewState
 from forewarp.viewer.server import serve
 from tests.stability.report import replace_section, table

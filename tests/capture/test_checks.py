@@ -7,9 +7,9 @@ from scipy.spatial.transform import Rotation
 
 pytest.importorskip("pycolmap", reason="no pycolmap; make install adds it")
 
-from forewarp.capture import checks
-from forewarp.capture.checks import Evidence, refuse_matches, refuse_poses, unrotated
+from forewarp.capture import poses as checks
 from forewarp.capture.frames import Frames
+from forewarp.capture.poses import Evidence, refuse_matches, refuse_poses, unrotated
 from forewarp.scene.camera import Lens
 from tests.support.captures import cameras_on_arc, sparse_arc
 

@@ -11,8 +11,8 @@ from scipy.ndimage import gaussian_filter
 
 pytest.importorskip("pycolmap", reason="no pycolmap; make install adds it")
 
-from forewarp.capture.checks import BLURRED
 from forewarp.capture.frames import Source, edge_width, extracted, measure, sharpest, sharpness, take
+from forewarp.capture.poses import BLURRED
 from tests.support.films import numbered, write_film
 
 

@@ -2,7 +2,7 @@ import imageio.v3 as iio
 import pytest
 import torch
 
-from forewarp.drawing.files import write_png, write_video
+from forewarp.drawing.images import write_png, write_video
 from tests.support.films import read_film
 
 

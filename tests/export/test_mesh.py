@@ -5,7 +5,7 @@ import pytest
 import torch
 import trimesh
 
-from forewarp.export.mesh import lattice_in, voxelize
+from forewarp.export.ply import lattice_in, voxelize
 from forewarp.scene.box import Box
 from forewarp.scene.cloud import Ellipsoids
 from tests.export.conftest import TIMES, exporter
@@ -69,7 +69,7 @@ def test_ellipsoids_on_a_lattice_are_those_one_by_one(monkeypatch):
     some = wanted[0] > 0.3
     assert some.sum() > 100
     for pairs in (1 << 19, 500):
-        monkeypatch.setattr("forewarp.export.mesh._CHUNK", pairs)
+        monkeypatch.setattr("forewarp.export.ply._CHUNK", pairs)
         opacity, colors = voxelize(cloud, lattice)
         # Boxes hold a little more than the ellipsoids that end where nothing is drawn.
         np.testing.assert_allclose(opacity.flatten(), wanted[0], atol=0.05)
@@ -94,7 +94,7 @@ def test_nothing_found_is_one_line(particles, tmp_path, monkeypatch):
     with pytest.raises(ValueError, match=between + r"0 and 0\.\d+, but got 0.9"):
         export(particles, tmp_path / "mesh", level=0.9)
     full = torch.linspace(0.6, 1, 8).reshape(2, 2, 2), torch.ones(2, 2, 2, 3)
-    monkeypatch.setattr("forewarp.export.mesh.voxelize", lambda *_: full)
+    monkeypatch.setattr("forewarp.export.ply.voxelize", lambda *_: full)
     with pytest.raises(ValueError, match=between + "0.6 and 1, but got 0.5"):
         export(particles, tmp_path / "mesh")
     monkeypatch.setattr(particles.method, "bounds", lambda times: None)

@@ -9,8 +9,8 @@ from scipy.special import expit
 
 from forewarp.export.ply import splat_columns, write_ply
 from forewarp.ops.gaussians import FLAT, Gaussians
+from forewarp.scene.camera import mean_up
 from forewarp.scene.cloud import Ellipsoids
-from forewarp.scene.paths import mean_up
 from forewarp.scene.view import Moment, View
 from tests.export.conftest import TIMES, exporter
 from tests.support.gaussians import NO_TINTS, still

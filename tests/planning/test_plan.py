@@ -13,7 +13,7 @@ from forewarp.methods.particles.options import ParticlesPlanning
 from forewarp.planning.plan import Planner
 from forewarp.planning.plan_file import read_plan, with_plan, write_plan
 from forewarp.planning.trials import Trial, Trials
-from forewarp.scene.silhouettes import Survey
+from forewarp.scene.frame import Survey
 from forewarp.synth.scenes import synthesize
 
 TINY = ["data=dnerf", "preset=demo", "trainer=cpu", "logger=none"]

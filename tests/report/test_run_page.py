@@ -9,7 +9,7 @@ import pytest
 import torch
 import yaml
 
-from forewarp.drawing.files import write_png, write_video
+from forewarp.drawing.images import write_png, write_video
 from forewarp.metrics.registry import METRICS, Metric
 from forewarp.report.run_page import Axis, Media, Shown, chart, media_of, read_story, telling, write_run_page
 from tests.support.runs_on_disk import write_run

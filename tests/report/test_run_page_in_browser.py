@@ -6,7 +6,7 @@ import imageio.v3 as iio
 import pytest
 import torch
 
-from forewarp.drawing.files import write_video
+from forewarp.drawing.images import write_video
 from forewarp.report.run_page import Media, Shown, read_story, write_run_page
 from tests.report.test_run_page import told_run
 from tests.support.browser import Tab, chromium, until

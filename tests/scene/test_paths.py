@@ -3,8 +3,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from forewarp.scene.camera import Camera, look_at
-from forewarp.scene.paths import RandomPatches, focus_point, mean_up, orbit, swing
+from forewarp.scene.camera import Camera, RandomPatches, focus_point, look_at, mean_up, orbit, swing
 from tests.support.tiny_scene import camera_at
 
 Z = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)

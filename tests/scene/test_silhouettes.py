@@ -1,7 +1,7 @@
 import torch
 
 from forewarp.scene.box import Box, Lattice
-from forewarp.scene.silhouettes import visual_hull
+from forewarp.scene.frame import visual_hull
 from tests.support.tiny_scene import RADIUS, ball_center, camera_at, photograph
 
 LATTICE = Lattice(Box((-1, -0.7, -0.6), (1, 0.9, 0.6)), (12, 11, 10))

@@ -11,8 +11,7 @@ from forewarp.fields.grids import Activation
 from forewarp.ops.march import render_weights
 from forewarp.renderer import Renderer
 from forewarp.scene.box import Box, Lattice
-from forewarp.scene.camera import Camera, look_at
-from forewarp.scene.paths import RandomPatches, focus_point, mean_up, orbit
+from forewarp.scene.camera import Camera, RandomPatches, focus_point, look_at, mean_up, orbit
 from tests.support.hard_cases import LATTICE, check_finite, grid, index_with, raw_of, rays
 
 pytestmark = pytest.mark.stability

@@ -20,10 +20,10 @@ import viser
 
 from forewarp.scene.cloud import Ellipsoids
 from forewarp.viewer import server as server_module
-from forewarp.viewer.address import check_address
 from forewarp.viewer.page import Page
 from forewarp.viewer.queue import Cancelled
 from forewarp.viewer.rendering import SceneRenderer, Viewer, ViewState
+from forewarp.viewer.server import check_address
 from forewarp.viewer.session import Session
 from tests.contract.fitting import stage_of
 from tests.contract.table import METHODS

@@ -14,10 +14,9 @@ import pycolmap
 from filelock import FileLock, Timeout
 
 from forewarp.capture import poses, scene
-from forewarp.capture.checks import refuse_matches, refuse_poses
 from forewarp.capture.frames import Frames, Source, Step, take
-from forewarp.capture.poses import Reconstruction, Search
-from forewarp.drawing.files import write_png
+from forewarp.capture.poses import Reconstruction, Search, refuse_matches, refuse_poses
+from forewarp.drawing.images import write_png
 from forewarp.files import folder_written_whole, read_json, write_json
 
 ABOUT, PICTURE = "capture.json", "capture.png"  # in the scene's folder

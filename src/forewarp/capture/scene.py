@@ -17,8 +17,7 @@ from forewarp.data.images import common_header, read_image, write_image
 from forewarp.data.posed_video import SCALES, PosedShot, write_scene
 from forewarp.drawing.images import draw_discs, sample_lines
 from forewarp.scene.box import Box
-from forewarp.scene.camera import Camera
-from forewarp.scene.paths import mean_up
+from forewarp.scene.camera import Camera, mean_up
 
 # Points beyond these quantiles are taken for outliers, unless they lie close to the rest.
 _QUANTILES, _SLACK, _MARGIN = (0.02, 0.98), 0.25, 0.05

@@ -224,14 +224,14 @@ def refuse_numbers(config: DictConfig, *keys: str) -> None:
 
 def viewer_of(config: DictConfig) -> dict | None:
     """Return where a page should listen, None if none is asked for; refuse one that cannot be made."""
-    from forewarp.viewer.address import check_address
-
     viewer, port = config.get("viewer", False), config.get("port")
     if type(viewer) is not bool:
         raise ValueError(f"viewer: expected true or false, but got {viewer}")
     if not viewer:
         return None
     require_viewer()
+    from forewarp.viewer.server import check_address
+
     if _is_swept() and port != 0 and "BasicLauncher" not in str(HydraConfig.get().launcher.get("_target_")):
         raise ValueError(
             f"port: expected 0 where jobs may run at once, so that each takes one that is free, but got "

@@ -51,7 +51,7 @@ def render(config) -> None:
 
 def write_film(config, run, module) -> Path:
     """Write the video that the config describes into the run's folder; return its file."""
-    from forewarp.drawing.files import write_video
+    from forewarp.drawing.images import write_video
     from forewarp.progress import Counted
 
     pictures = pictures_of(config, module, run.datamodule)
@@ -89,7 +89,7 @@ def counted(pictures, total: int, progress):
 def check(config) -> None:
     """Refuse settings of which no video can be made, before anything is loaded."""
     from forewarp.cli.prepare import LEAST, RANGES, refuse_numbers
-    from forewarp.drawing.files import FORMATS
+    from forewarp.drawing.images import FORMATS
     from forewarp.evaluation.videos import PATHS
 
     for key, known in (("path", PATHS), ("format", FORMATS)):

@@ -33,7 +33,7 @@ from forewarp.data.files import frames_of, inside, mismatch, number, read_json, 
 from forewarp.data.images import SUFFIXES, StoredImage, check_pixels, in_order, inspect_image, write_image
 from forewarp.files import write_json
 from forewarp.scene.box import Box
-from forewarp.scene.camera import Camera
+from forewarp.scene.camera import Camera, focus_point
 from forewarp.scene.frame import Frame, Scene, middle_of
 from forewarp.scene.paths import focus_point
 

@@ -17,8 +17,7 @@ from rich.table import Table
 from torch import Tensor
 
 from forewarp.clock import now
-from forewarp.drawing.files import write_png
-from forewarp.drawing.images import at_least, error_colors, in_a_row
+from forewarp.drawing.images import at_least, error_colors, in_a_row, write_png
 from forewarp.files import write_json
 from forewarp.methods.effect import switched
 from forewarp.methods.method import HasTrajectories, parameter_count

@@ -10,8 +10,15 @@ import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 from torch import Tensor
 
-from forewarp.drawing.files import write_png
-from forewarp.drawing.images import area_means, depth_colors, error_colors, flow_colors, in_a_row, with_wheel
+from forewarp.drawing.images import (
+    area_means,
+    depth_colors,
+    error_colors,
+    flow_colors,
+    in_a_row,
+    with_wheel,
+    write_png,
+)
 from forewarp.methods.method import HasTrajectories, Snapshot
 from forewarp.scene.camera import Camera
 from forewarp.scene.view import Moment, Rendering, Target, View

@@ -7,8 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 import torch
 from torch import Tensor
 
-from forewarp.scene.camera import Camera
-from forewarp.scene.paths import focus_point, mean_up, orbit, swing
+from forewarp.scene.camera import Camera, focus_point, mean_up, orbit, swing
 from forewarp.scene.view import Moment, Rendering, View
 from forewarp.training.module import DynamicSceneModule
 

@@ -30,8 +30,8 @@ class Format(NamedTuple):
 
 FORMATS = {
     "ply": Format("ply", ("degree", "up")),
-    "mesh": Format("mesh", ("resolution", "level", "files", "up"), "skimage", "export"),
-    "gltf": Format("gltf", ("points", "seconds")),
+    "mesh": Format("ply", ("resolution", "level", "files", "up"), "skimage", "export"),
+    "gltf": Format("tracks", ("points", "seconds")),
     "html": Format("html", ("points", "seconds", "megabytes"), "viser", "viewer"),
     "npz": Format("tracks", ("points", "views")),
 }

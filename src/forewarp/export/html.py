@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from forewarp.browser import begin_at, silent, splat_arrays, vertical_fov
-from forewarp.drawing.files import to_bytes
+from forewarp.drawing.images import to_bytes
 from forewarp.export.tracks import Progress, Source, no_progress, tracks_of
+from forewarp.scene.camera import focus_point, mean_up
 from forewarp.scene.frame import spread
-from forewarp.scene.paths import focus_point, mean_up
 
 _PAGE_SIZE = 100.0  # units of the page across the cameras: squares of small lengths vanish in half precision
 _MIN_TIMES = 12  # times that are kept while particles can be left out instead

@@ -1,7 +1,8 @@
-"""``format=ply``: Gaussians in the layout of splat viewers, voxels as coloured points; and the PLY writer."""
+"""``format=ply``: Gaussians or coloured points; ``format=mesh``: the surface; and the PLY writer of both."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -10,7 +11,10 @@ import torch
 from torch import Tensor
 
 from forewarp.export.tracks import Progress, Source, tracks_of
+from forewarp.methods.method import HasBounds, HasSolid
+from forewarp.scene.box import Box, Lattice
 from forewarp.scene.cloud import Ellipsoids
+from forewarp.scene.view import Moment
 
 _TYPES = {"float32": "float", "uint8": "uchar"}
 _ALL = 1 << 31  # more points than there are
@@ -116,4 +120,154 @@ def export_ply(source: Source, folder: Path, progress: Progress, *, degree: int,
         "degree": degree,
         "degree of the run": int(template.harmonics.shape[1] ** 0.5) - 1,
         "colors": "sRGB, as in the pictures: 1/2 + 0.28209479177387814 f_dc is the mean over directions",
+    }
+
+
+_BLUR = 0.5  # spacings of the lattice that Gaussians are blurred by, so that none falls between its points
+_CUTOFF = 1 / 255  # opacity below which a Gaussian ends, as in rendered images
+_MAX_OPACITY = 1 - 1e-6  # of a Gaussian, so that its optical depth is finite
+_CHUNK = 1 << 19  # pairs of a Gaussian and a lattice point that are evaluated at once
+
+
+def lattice_in(box: Box, resolution: int) -> Lattice:
+    """Make a lattice of cubes: ``resolution`` points along the longest side of a box, and two more around.
+
+    >>> lattice_in(Box((0, 0, 0), (1, 2, 1)), 5).shape
+    (7, 9, 7)
+    """
+    step = max(box.size) / (resolution - 1)
+    counts = [math.ceil(side / step - 1e-6) + 5 for side in box.size]
+    low = [c - 0.5 * step * (n - 1) for c, n in zip(box.center, counts)]
+    high = [l + step * (n - 1) for l, n in zip(low, counts)]
+    return Lattice(Box(tuple(low), tuple(high)), tuple(counts))
+
+
+def voxelize(cloud: Ellipsoids, lattice: Lattice) -> tuple[Tensor, Tensor]:
+    """Evaluate Gaussians on a lattice: opacity (X, Y, Z) and colour (X, Y, Z, 3).
+
+    The opacity is ``1 - prod_i (1 - o_i g_i)``, where ``g_i`` is the Gaussian, 1 in its centre, blurred by
+    half a lattice spacing; the colour is the mean weighted by optical depth ``-log(1 - o_i g_i)``.
+
+    Cost: linear in the pairs of a Gaussian and a lattice point inside it; memory in a chunk of them.
+    """
+    step = lattice.spacing[0]
+    blurred = cloud.covariances.double() + (_BLUR * step) ** 2 * torch.eye(3).to(cloud.covariances).double()
+    opacity, colors = cloud.opacity.double().clamp(max=_MAX_OPACITY), cloud.colors.double()
+    # The box of lattice points in which a Gaussian's opacity is above the cutoff.
+    radius_squared = (2 * (opacity / _CUTOFF).clamp(min=1).log())[:, None]
+    half = (radius_squared * blurred.diagonal(dim1=-2, dim2=-1)).sqrt() / step
+    center = lattice.to_lattice(cloud.centers.double())
+    last = torch.tensor(lattice.shape, device=center.device) - 1
+    low = (center - half).ceil().clamp(min=0).minimum(last + 1.0).long()
+    high = (center + half).floor().clamp(min=-1).minimum(last.double()).long()
+    counts = (high - low + 1).clamp(min=0) * (opacity > _CUTOFF)[:, None]
+    sizes = counts.prod(-1)
+    ends = sizes.cumsum(0)
+    inverse = torch.linalg.inv(blurred) * step**2
+    sums = torch.zeros(lattice.count, 4, dtype=torch.float64, device=center.device)  # optical depth, r, g, b
+    strides = torch.tensor([lattice.shape[1] * lattice.shape[2], lattice.shape[2], 1], device=center.device)
+    begin = 0
+    while begin < len(cloud):
+        done = int(ends[begin - 1]) if begin else 0
+        end = max(begin + 1, int(torch.searchsorted(ends, done + _CHUNK, right=True)))
+        rows = torch.arange(begin, end, device=center.device)
+        owner = rows.repeat_interleave(sizes[rows])  # (P,), the Gaussian of each pair
+        rank = torch.arange(len(owner), device=center.device) + done - (ends - sizes)[owner]
+        wide, deep = counts[owner, 1], counts[owner, 2]
+        point = low[owner] + torch.stack([rank // (wide * deep), rank // deep % wide, rank % deep], -1)
+        offset = point - center[owner]
+        gaussian = torch.exp(-0.5 * torch.einsum("pi,pij,pj->p", offset, inverse[owner], offset))
+        depth = -torch.log1p(-opacity[owner] * gaussian)[:, None]
+        sums.index_add_(0, (point * strides).sum(-1), torch.cat([depth, depth * colors[owner]], -1))
+        begin = end
+    mean = sums[:, 1:] / sums[:, :1].clamp(min=1e-12)
+    total = -torch.expm1(-sums[:, 0])
+    return total.float().cpu().reshape(lattice.shape), mean.float().cpu().reshape(*lattice.shape, 3)
+
+
+def isosurface(
+    opacity: Tensor, colors: Tensor, lattice: Lattice, level: float
+) -> tuple[Tensor, Tensor, np.ndarray]:
+    """Find the surface where an opacity (X, Y, Z) is ``level``, with colours (X, Y, Z, 3), by marching cubes.
+
+    Returns:
+        vertices (V, 3) in world units, their colours (V, 3) in [0, 1], and faces (F, 3), rows of vertices,
+        counter-clockwise seen from outside.
+    """
+    from scipy.ndimage import map_coordinates
+    from skimage.measure import marching_cubes
+
+    places, faces, _, _ = marching_cubes(opacity.numpy(), level, gradient_direction="ascent")
+    # Colours of lattice points count by their opacity, as empty ones have none.
+    weighted = torch.cat([opacity[..., None] * colors, opacity[..., None]], -1).numpy()
+    read = [map_coordinates(weighted[..., i], places.T, order=1) for i in range(4)]
+    rgb = np.stack(read[:3], -1) / np.maximum(read[3], 1e-12)[:, None]
+    vertices = lattice.to_world(torch.from_numpy(places.astype(np.float32)))
+    return vertices, torch.from_numpy(rgb).clamp(0, 1), faces
+
+
+@torch.no_grad()
+def export_mesh(
+    source: Source, folder: Path, progress: Progress, *, resolution: int, level: float, files: str, up: str
+) -> dict:
+    """Write ``mesh_0000.ply`` (or ``.obj``) and so on.
+
+    Args:
+        source: the scene and its times.
+        folder: to write into.
+        progress: called after each file.
+        resolution: points of the lattice along the longest side of the box of all matter at all times.
+        level: opacity of the surface.
+        files: ``ply`` or ``obj``.
+        up: see ``Source.rotation_to``.
+
+    Returns:
+        the facts for ``about.json``.
+
+    Raises:
+        ValueError: for a method that cannot tell where matter is, or where nothing or all is as opaque.
+    """
+    method = source.method
+    if not isinstance(method, HasBounds) or not (
+        source.has_ellipsoids or isinstance(method.at(Moment(source.times[0])), HasSolid)
+    ):
+        raise ValueError(
+            "format=mesh: expected a method that knows where matter is, as particles, forward or backward, "
+            f"but got {source.model}"
+        )
+    box = method.bounds(list(source.times))
+    if box is None:
+        raise ValueError("run: expected matter to make a mesh of, but got none; train it longer")
+    lattice, rotation = lattice_in(box, resolution), source.rotation_to(up).float()
+    vertex_counts, face_counts = [], []
+    for number, time in enumerate(source.times):
+        if source.has_ellipsoids:
+            opacity, colors = voxelize(method.ellipsoids(time), lattice)
+        else:
+            opacity, colors = method.at(Moment(time)).solid(lattice)
+        lowest, highest = float(opacity.min()), float(opacity.max())
+        if not lowest < level < highest:
+            raise ValueError(
+                f"level: expected a number between the lowest and the highest opacity at time {time:.4g}, "
+                f"{lowest:.3g} and {highest:.3g}, but got {level}"
+            )
+        vertices, rgb, faces = isosurface(opacity, colors, lattice, level)
+        vertices, path = vertices @ rotation.T, folder / f"mesh_{number:04d}.{files}"
+        if files == "ply":
+            write_ply(path, point_columns(vertices, rgb), faces)
+        else:
+            with path.open("w") as file:  # colours behind the places, a common extension of OBJ
+                rows = np.concatenate([vertices.numpy(), rgb.numpy()], -1)
+                np.savetxt(file, rows, "v %.7g %.7g %.7g %.4f %.4f %.4f")
+                np.savetxt(file, faces + 1, "f %d %d %d")
+        vertex_counts.append(len(vertices))
+        face_counts.append(len(faces))
+        progress(number + 1, len(source.times))
+    return {
+        "vertices": vertex_counts,
+        "faces": face_counts,
+        "level": level,
+        "up": up,
+        "spacing": lattice.spacing[0],
+        "colors": "sRGB, as in the pictures, the mean over directions",
     }

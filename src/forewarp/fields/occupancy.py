@@ -8,8 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from forewarp.scene.box import Box
-from forewarp.scene.frame import Frame
-from forewarp.scene.silhouettes import sightings
+from forewarp.scene.frame import Frame, sightings
 
 _FADE = 0.8  # of what was found, at each look
 _OPAQUE = 0.01  # a cell counts as occupied if a step of one cell through it is at least so opaque,

@@ -11,7 +11,7 @@ from forewarp.fields.networks import Template, Trunk
 from forewarp.methods.method import Start
 from forewarp.methods.rays import JUMP, NO_JUMP, Field, SampledMethod, encoder
 from forewarp.ops.encode import encoded_size
-from forewarp.quadrature import Sampled
+from forewarp.renderer import Sampled
 from forewarp.scene.view import Batch, Moment
 
 

@@ -9,8 +9,7 @@ from typing import Protocol
 
 from forewarp.methods.method import Method
 from forewarp.metrics.gain import Gain
-from forewarp.scene.frame import Scene
-from forewarp.scene.silhouettes import Survey
+from forewarp.scene.frame import Scene, Survey
 from forewarp.scene.view import Target
 
 CUT_OUT = 0.001  # share of transparent pixels below which the scene has a background

@@ -10,7 +10,7 @@ from torch import Tensor
 from forewarp.fields.networks import CameraCodes, Template, drawn
 from forewarp.methods.method import Start
 from forewarp.methods.rays import Field, WarpedMethod
-from forewarp.quadrature import Sampled
+from forewarp.renderer import Sampled
 from forewarp.scene.view import Batch, Moment
 
 

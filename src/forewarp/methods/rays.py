@@ -26,8 +26,7 @@ from forewarp.methods.method import (
 from forewarp.methods.rows import RowsAdam, renew_parameters
 from forewarp.ops.encode import encoded_size, positional_encoding
 from forewarp.ops.march import warm_up
-from forewarp.quadrature import Quadrature, Sampled
-from forewarp.renderer import Marched, Renderer
+from forewarp.renderer import Marched, Quadrature, Renderer, Sampled
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.camera import Rays
 from forewarp.scene.frame import spread

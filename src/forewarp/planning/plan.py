@@ -19,8 +19,7 @@ from forewarp.planning.trials import Trial, Trials, gain
 from forewarp.runs.build import build_run
 from forewarp.runs.config import HASH, content_hash, trust_of
 from forewarp.runs.overrides import key_of, merged
-from forewarp.scene.frame import Scene
-from forewarp.scene.silhouettes import survey
+from forewarp.scene.frame import Scene, survey
 from forewarp.training.schedule import most_steps
 
 # Keys that do not change what a run computes.

@@ -174,7 +174,7 @@ def media_of(row: Row, path: str | None = None) -> Media:
         row: the run.
         path: the video, one of ``FILMS``; None: the first there is.
     """
-    from forewarp.drawing.files import read_image
+    from forewarp.drawing.images import read_image
 
     sheets, shown = sheets_of(row["folder"]), []
     drawn = [image for image in row["images"] if image["name"] in sheets]
@@ -249,8 +249,7 @@ def encoded(media: Media, room: float) -> tuple[list[dict[str, str]], str, str, 
         as ``data:`` addresses the pictures and ``thumb`` of each view and the video, "" for none; what became
         of the pictures and of the video so that they fit.
     """
-    from forewarp.drawing.files import jpeg_bytes, smaller_video
-    from forewarp.drawing.images import at_most
+    from forewarp.drawing.images import at_most, jpeg_bytes, smaller_video
 
     def jpeg(picture: Tensor, side: int, quality: int) -> str:
         return _address("image/jpeg", jpeg_bytes(at_most(picture.cpu(), side), quality))

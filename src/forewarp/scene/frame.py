@@ -1,13 +1,16 @@
-"""Frames, and the scene they belong to."""
+"""Frames, the scene they belong to, and what its silhouettes tell before fitting."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+import math
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 
+import torch
 from torch import Tensor
 
-from forewarp.scene.box import Box
+from forewarp.ops.grid import dilate
+from forewarp.scene.box import Box, Lattice
 from forewarp.scene.camera import Camera
 
 
@@ -89,3 +92,91 @@ def middle_of(times: Iterable[float]) -> float:
     """
     times = sorted(set(times))
     return min(times, key=lambda time: round(abs(time - 0.5 * (times[0] + times[-1])), 9))
+
+
+_VIEWS, _SIDE = 40, 40
+
+
+def visual_hull(points: Tensor, cameras: list[Camera], masks: list[Tensor], misses: int = 0) -> Tensor:
+    """Select points inside the silhouette in all but ``misses`` of the views that see them.
+
+    Args:
+        points: (N, 3) world units.
+        cameras: V cameras.
+        masks: V masks (H, W) bool, True on the foreground; dilate them if the scene moves.
+        misses: number of views that may disagree.
+
+    Returns:
+        (N,) bool. A point that fewer than half of the views see is outside.
+    """
+    covered, seen = sightings(points, cameras, masks)
+    return (2 * seen >= len(cameras)) & (seen > misses) & (seen - covered <= misses)
+
+
+def sightings(points: Tensor, cameras: list[Camera], masks: list[Tensor]) -> tuple[Tensor, Tensor]:
+    """Count the views inside whose silhouette each point lies, and those that see it, (N,) int32 each.
+
+    Arguments are those of ``visual_hull``.
+    """
+    covered, seen = torch.zeros(2, len(points), dtype=torch.int32)
+    for camera, mask in zip(cameras, masks, strict=True):
+        row, column, visible = _pixels(camera, points)
+        on = mask[row.clamp(0, camera.height - 1), column.clamp(0, camera.width - 1)]
+        covered += (visible & on).int()
+        seen += visible.int()
+    return covered, seen
+
+
+def _pixels(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return row and column (N,) of the pixel that shows each point, and whether the image has it."""
+    pixel, z = camera.project(points)
+    column, row = pixel.floor().long().unbind(-1)
+    return row, column, (z > 0) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
+
+
+@dataclass(frozen=True)
+class Survey:
+    """Properties of the training images.
+
+    ``times``: distinct times of the ``frames``. ``cut_out``: share of transparent pixels, 0 without alpha.
+    ``spread``: largest angle between two cameras, seen from the scene's middle, degrees. ``disagreement``:
+    share of the foreground that no static object can explain, as no point of the visual hull projects there
+    (0 without alpha).
+    """
+
+    frames: int
+    times: int
+    cut_out: float
+    spread: float
+    disagreement: float
+
+
+def survey(scene: Scene) -> Survey:
+    """Measure the training frames. Cost: ``_VIEWS`` images, ``_SIDE``^3 points in each."""
+    frames = [scene.train[i] for i in spread(len(scene.train), _VIEWS)]
+    cut_out = 0.0
+    if scene.has_alpha:
+        cut_out = sum(float((f.load()[..., 3] < 128).float().mean()) for f in frames) / len(frames)
+    middle = torch.tensor(scene.box.center).double()
+    towards = torch.stack([frame.camera.center.double() - middle for frame in scene.train])
+    towards = torch.nn.functional.normalize(towards, dim=-1)
+    angle = math.degrees(math.acos(float((towards @ towards.T).min().clamp(-1, 1))))
+    disagreement = _disagreement(scene, frames) if cut_out > 0 and len(frames) > 1 else 0.0
+    return Survey(len(scene.train), len(scene.times), cut_out, angle, disagreement)
+
+
+def _disagreement(scene: Scene, frames: Sequence[Frame]) -> float:
+    lattice = Lattice.of_count(scene.box, _SIDE**3)
+    points, reach = lattice.to_world(lattice.all_voxels()), []
+    for frame in frames:  # how many pixels a voxel is wide
+        depth = float(frame.camera.project(points.mean(0, keepdim=True))[1])
+        reach.append(max(1, math.ceil(lattice.voxel_size * frame.camera.fx / max(depth, 1e-6))))
+    foregrounds = [frame.load()[..., 3] > 127 for frame in frames]
+    masks = [dilate(foreground, pixels) for foreground, pixels in zip(foregrounds, reach)]
+    points, missed = points[visual_hull(points, [frame.camera for frame in frames], masks)], 0
+    for frame, foreground, pixels in zip(frames, foregrounds, reach):
+        row, column, inside = _pixels(frame.camera, points)
+        covered = torch.zeros_like(foreground)
+        covered[row[inside], column[inside]] = True
+        missed += int((foreground & ~dilate(covered, pixels)).sum())
+    return missed / max(sum(int(foreground.sum()) for foreground in foregrounds), 1)

@@ -14,8 +14,7 @@ from torch import Tensor
 from viser.transforms import SO3
 
 from forewarp.browser import splat_arrays, vertical_fov
-from forewarp.drawing.files import png_bytes, to_bytes
-from forewarp.drawing.images import hues
+from forewarp.drawing.images import hues, png_bytes, to_bytes
 from forewarp.scene.cloud import Ellipsoids
 from forewarp.scene.frame import spread
 from forewarp.viewer.queue import Cancelled

@@ -16,9 +16,8 @@ from forewarp.drawing.images import depth_colors, flow_colors, in_a_row, with_wh
 from forewarp.evaluation.images import compare, image_flow
 from forewarp.evaluation.trajectories import Trajectories
 from forewarp.methods.method import HasEllipsoids, HasMatter, HasTrajectories, Snapshot
-from forewarp.scene.camera import Camera
+from forewarp.scene.camera import Camera, focus_point, mean_up
 from forewarp.scene.frame import Scene
-from forewarp.scene.paths import focus_point, mean_up
 from forewarp.scene.view import Moment, Rendering, View
 from forewarp.training.module import DynamicSceneModule
 from forewarp.viewer.queue import Cancelled, RenderQueue

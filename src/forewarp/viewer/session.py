@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from forewarp.browser import vertical_fov
-from forewarp.drawing.files import write_video
+from forewarp.drawing.images import write_video
 from forewarp.viewer.queue import Cancelled, FrameRate, FrameRateControl
 from forewarp.viewer.rendering import Viewer, ViewState
 

@@ -9,7 +9,7 @@ from forewarp.methods.effect import Asked, Evidence
 from forewarp.methods.particles.model import Particles
 from forewarp.methods.particles.options import EFFECTS, Effects, Numbers, ParticlesPlanning
 from forewarp.metrics.gain import Gain
-from forewarp.scene.silhouettes import Survey
+from forewarp.scene.frame import Survey
 from tests.support.configs import composed
 from tests.support.fakes import Noted
 

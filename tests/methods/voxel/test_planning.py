@@ -21,7 +21,7 @@ from forewarp.methods.voxel.planning import (
 from forewarp.metrics.gain import Gain
 from forewarp.ops.curves import dct_basis
 from forewarp.scene.box import Lattice
-from forewarp.scene.silhouettes import Survey, survey
+from forewarp.scene.frame import Survey, survey
 from tests.support.fakes import Noted
 from tests.support.tiny_scene import BOX, ball_data, ball_scene, built, forward_model, make_run, stage
 

@@ -10,8 +10,7 @@ from forewarp.fields.curves import KINDS
 from forewarp.methods.effect import DISAGREEMENT, Asked, CoarseTrials, Decision, Effect, Evidence
 from forewarp.methods.method import Method
 from forewarp.ops.backend import is_number
-from forewarp.scene.frame import Scene
-from forewarp.scene.silhouettes import Survey
+from forewarp.scene.frame import Scene, Survey
 from forewarp.scene.view import Target
 
 _VIEWS = 100  # training images from which on more of them call for no more particles

@@ -32,8 +32,7 @@ from forewarp.ops.nodes import carry_nodes, pull_nodes, skin_weights, spread_nod
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.camera import Camera
 from forewarp.scene.cloud import Cloud
-from forewarp.scene.frame import Scene, spread
-from forewarp.scene.silhouettes import visual_hull
+from forewarp.scene.frame import Scene, spread, visual_hull
 
 _FRAMES = 12  # whose silhouettes carve the hull
 _DRIFT = 0.2  # share of an image's width by which a silhouette is taken to move in all the time there is

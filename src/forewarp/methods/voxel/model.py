@@ -26,9 +26,8 @@ from forewarp.ops.grid import neighbour_pairs
 from forewarp.ops.march import warm_up
 from forewarp.renderer import Renderer
 from forewarp.scene.box import Box, Lattice
-from forewarp.scene.camera import Rays
+from forewarp.scene.camera import RandomPatches, Rays
 from forewarp.scene.cloud import Cloud
-from forewarp.scene.paths import RandomPatches
 from forewarp.scene.view import Batch, Moment, Rendering, View
 
 SOLID = 0.1  # opacity over one voxel above which it counts as matter

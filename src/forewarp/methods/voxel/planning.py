@@ -17,8 +17,7 @@ from forewarp.methods.voxel.model import SOLID
 from forewarp.metrics.image import low_passed
 from forewarp.ops.grid import index_of, neighbour_pairs
 from forewarp.scene.box import Lattice
-from forewarp.scene.frame import Scene, spread
-from forewarp.scene.silhouettes import Survey
+from forewarp.scene.frame import Scene, Survey, spread
 from forewarp.scene.view import Target, View
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ from forewarp.methods.method import FRACTION, Start, check_number, steps_of
 from forewarp.methods.rows import renew_parameters
 from forewarp.ops.grid import dilate, trilinear
 from forewarp.scene.box import Box, Lattice
-from forewarp.scene.silhouettes import visual_hull
+from forewarp.scene.frame import visual_hull
 
 EFFECTS = ("motion", "view_dependence", "upsampler", "inpainter", "background")
 
