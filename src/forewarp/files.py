@@ -190,7 +190,7 @@ def load_json(path: Path) -> dict:
     """
     raw = read_bytes(path)
     try:
-        content = json.loads(raw.decode())
+        content = json.loads(raw.decode("utf-8-sig"))  # Windows begins a text with a byte order mark
     except json.JSONDecodeError as error:
         raise ValueError(f"{path}: line {error.lineno}: expected JSON, but got {error.msg}") from error
     except (ValueError, RecursionError) as error:  # bytes that are no text, absurd numbers or nesting

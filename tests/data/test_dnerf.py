@@ -43,12 +43,13 @@ def test_round_trip_of_a_stock_scene(tmp_path):
     assert scene.protocol == expected
 
 
-def test_a_frame_may_name_its_ability_and_missing_times_are_spread(tmp_path):
+def test_a_frame_may_name_its_ability_and_missing_times_are_in_the_names(tmp_path):
     write_dnerf(tmp_path / "toy", train=dnerf_shots(4, times=[0.7, 0.2, 0.9, 0.5]))
     assert read_scene(tmp_path, "toy").canonical_time == 0.2  # the smallest training time
     changes = {"frames.1.ability": "time", "frames.1.file_path": "test/r_1.png"}
     edit(tmp_path / "toy" / "transforms_test.json", changes)
-    edit(tmp_path / "toy" / "transforms_train.json", lambda c: [f.pop("time") for f in c["frames"]])
+    for split in ("train", "val", "test"):
+        edit(tmp_path / "toy" / f"transforms_{split}.json", lambda c: [f.pop("time", 0) for f in c["frames"]])
     (tmp_path / "toy" / "train" / "transforms.json").write_text("broken")  # stray files are ignored
     (tmp_path / "toy" / "train" / "r_900.png").write_bytes(b"")
     scene = read_scene(tmp_path, "toy")

@@ -80,8 +80,8 @@ def test_bad_boxes(values):
         box_of(values)
 
 
-OUTSIDE = ["../x", "/etc/passwd", "a/../../x", "./train/../../x", "..", ".", "", "a\n", "a\x00b", "a\\b"]
-OUTSIDE += ["\ud800.png", "./../x", "..\\x", 7, None, ["a"]]
+OUTSIDE = ["../x", "/etc/passwd", "a/../../x", "./train/../../x", "..", ".", "", "a\n", "a\x00b"]
+OUTSIDE += ["\ud800.png", "./../x", "..\\x", "C:\\x", 7, None, ["a"]]
 
 
 @pytest.mark.parametrize("name", OUTSIDE)

@@ -117,20 +117,18 @@ BAD = {
         (T, None, "expected a scene with transforms_train.json, but got none; scenes in .*: none"),
         (T, b'{\n"a": 1,\n}', "transforms_train.json: line 3: expected JSON, but got"),
         (T, b"\xff\xfe\x00", "expected JSON, but got"),
-        (T, {"camera_angle_x": GONE}, "camera_angle_x: expected a number .*got None"),
+        (T, {"camera_angle_x": GONE}, "expected fl_x or camera_angle_x, but got neither"),
         (T, {"camera_angle_x": 0}, r"camera_angle_x: expected radians inside \(0, pi\)"),
         (T, {"frames": []}, "frames: expected a list of at least one frame"),
         (T, {"frames.1": [1]}, r"frames\[1\]: expected an object, but got \[1\]"),
         (T, {"frames.1.transform_matrix": GONE}, r"frames\[1\].transform_matrix: expected 4 x 4 .*None"),
         (T, {"frames.1.time": 1.5}, r"frames\[1\].time: expected a number in \[0, 1\], but got 1.5"),
-        (T, {"frames.1.file_path": "r_9"}, "r_9.png: expected an image, but got No such file"),
         (T, {"frames.1.depth_file_path": "/etc/x"}, f"depth_file_path: {OUT}"),
         (T, {"frames.1.depth_file_path": "e" * 999}, "depth_file_path: expected an existing file"),
         (T, {"frames.1.ability": "flight"}, "ability: expected one of space, time, canonical"),
         ("train/r_2.png", flip, f"r_2.png: {WHOLE}"),
         ("train/r_2.png", PIXELS[:4, :4], "r_2.png: expected 8 x 6 pixels as the first, but got 4 x 4"),
         ("transforms_test_time.json", b"{}", "test.json: expected it or one file per ability, but got both"),
-        ("transforms_test.json", None, "but got neither"),
     ],
     "lego": [
         (TIME, {"frames.0.ability": "all"}, "got test_time/r_0 without an ability; use data=dnerf"),
@@ -168,15 +166,13 @@ BAD = {
     "video": [
         ("images/frame_1.png", np.zeros((20, 30, 4), np.uint8), "alpha: expected one in all frames or"),
         (FRAMES, lambda c: c.update(frames=c["frames"][:1]), "a frame to test on, but got none of 1"),
-        (FRAMES, {"frames.1.file_path": "images/x.jpg"}, "x.jpg: expected an image, but got No such file"),
-        (FRAMES, {"frames.1.file_path": "x" * 999}, "file_path: expected an image, PNG or JPEG, but got no"),
         (FRAMES, {"frames.1.file_path": "./images/frame_1.png"}, "expected each image once, but got imag"),
         (FRAMES, {"frames.1.mask_path": "images/frame_1.png"}, "mask_path: expected one in all .*1 of"),
         (FRAMES, lambda c: [e.update(mask_path="m.png") for e in c["frames"]], "m.png: expected 30 x 20 "),
         (FRAMES, lambda c: [e.update(mask_path="../x.png") for e in c["frames"]], f"mask_path: {OUT}"),
         (FRAMES, {"frames.1.time": 0.5}, "frames: time: expected one in all .*1 of 10"),
         (FRAMES, {"frames.1.time": 3}, r"frames\[1\].time: expected a number in \[0, 1\], but got 3"),
-        (FRAMES, {"fl_x": GONE}, r"frames\[0\].fl_x: expected a number in .*got None"),
+        (FRAMES, {"fl_x": GONE, "fl_y": GONE}, "fl_x: expected fl_x or camera_angle_x, but got neither"),
         (FRAMES, {"frames.1.fl_x": -30}, r"frames\[1\].fl_x: expected a number in .*got -30"),
         (FRAMES, {"w": 60}, "frame_1.png: expected 60 x 20 pixels as .*json: w and h say, but got 30 x 20"),
         (FRAMES, {"camera_model": "OPENCV_FISHEYE"}, "json: camera_model: expected one of OPENCV, .*FISHEYE"),
@@ -274,7 +270,7 @@ def test_what_goes_bad_later_is_refused_when_it_is_loaded(scene, name, file, how
 OPTIONS = {
     "dnerf": [
         ({"half_resolution": "yes"}, "data.half_resolution: expected true, false or auto, but got 'yes'"),
-        ({"near": 6, "far": 2}, "data.near, data.far: expected near < far, but got 6 and 2"),
+        ({"near": 6, "far": 2}, "data.near, data.far: expected near < far, but got 6.0 and 2.0"),
         ({"box": [1, 2]}, "data.box: expected six numbers"),
     ],
     "rig": [
@@ -290,7 +286,7 @@ OPTIONS = {
     ],
     "video": [
         ({"scale": 3}, r"data.scale: expected one of \(1, 2, 4, 8\), but got 3"),
-        ({"scale": 2}, "images_2/frame_1.png: expected an image, but got No such file"),
+        ({"scale": 2}, "expected the images that it lists, as .*images_2/frame_1.png, but got none of them"),
         ({"near": 200}, "expected near < far, but got 200 and 120; set data.near, data.far"),
         ({"far": 0}, "data.far: expected a number"),
         ({"normalise": "yes"}, "data.normalise: expected true or false, but got 'yes'"),
@@ -428,7 +424,7 @@ def test_a_rewritten_scene_keeps_nothing_of_the_old_one(tmp_path, name):
     for folder in ("toy", "fresh"):
         rewrite(tmp_path / folder, iter)
     found, expected = read(tmp_path, "toy"), read(tmp_path, "fresh")
-    assert found.protocol == expected.protocol
+    assert {**found.protocol, "assumed": None} == {**expected.protocol, "assumed": None}
     assert (found.truth, found.still) == (None, None)
     for split in ("train", "val", "test"):
         assert [f.name for f in getattr(found, split)] == [f.name for f in getattr(expected, split)]

@@ -403,7 +403,7 @@ def test_a_run_keeps_its_trainer_unless_one_is_named(ok, run, tmp_path, monkeypa
         seen.append(config.trainer.accelerator)
         raise ValueError("enough")
 
-    monkeypatch.setattr("forewarp.runs.build.build_run", build)
+    monkeypatch.setattr("forewarp.runs.fitted.build_run", build)
     ok("report", "kind=run", f"run={run}", f"out={tmp_path}", *typed)
     assert seen == [device]
 

@@ -77,7 +77,7 @@ def test_it_says_why_and_how_to_choose_the_gpu(machine):
     machine(cuda=True)
     config = config_of("model=particles", "trainer=auto")
     run = build_run(config)
-    run.datamodule.scene = SimpleNamespace(name="x", train=(), test=())
+    run.datamodule.scene = SimpleNamespace(name="x", train=(), test=(), protocol={})
     first, second, third = beginning(run, config).splitlines()
     assert first.endswith("on the CPU")
     assert second.startswith("model=particles leaves the GPU aside: its kernels are the CPU's")

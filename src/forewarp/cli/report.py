@@ -229,17 +229,10 @@ def _rendered(config: DictConfig, row: dict, media) -> Iterator:
     """Render the telling views, and the video if the run has none; give what there is after each."""
     from forewarp.evaluation.images import parts_of
     from forewarp.report.run_page import FILMS, Shown, about, telling
-    from forewarp.runs.build import build_run
     from forewarp.runs.config import saved_config
     from forewarp.runs.fitted import opened
-    from forewarp.synth.module import Synthetic, is_scene
 
     saved = saved_config(str(row["folder"]), config)
-    data = build_run(saved).datamodule
-    if isinstance(data, Synthetic) and not is_scene(data.folder):  # reading it would make it
-        raise ValueError(
-            f"data.root: expected the scene of the run, but got none in {data.folder}; set data.root=FOLDER"
-        )
     run, module = opened(saved)
     targets = run.datamodule.targets("test")
     places = {frame.name: number for number, frame in enumerate(targets.frames)}

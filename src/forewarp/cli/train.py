@@ -114,6 +114,7 @@ def beginning(run, config) -> str:
     scene, why = run.datamodule.scene, why_on_cpu(config)
     images = f"{images_of(scene.train, 'training')} and {images_of(scene.test, 'test')}"
     lines = [f"{scene.name}: {images}, on the {run.device.type.upper()}", why, f"run: {run.folder}"]
+    lines[1:1] = [f"assumed: {line}" for line in scene.protocol.get("assumed", [])]
     return "\n".join(line for line in lines if line is not None)
 
 

@@ -1,25 +1,33 @@
-"""Check poses, lenses and boxes, and read what the frames of ``transforms*.json`` files share."""
+"""Check poses, lenses and boxes; find the part of space that cameras look at."""
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from pathlib import Path
 from reprlib import repr as short
 
 import numpy as np
 import torch
+from torch import Tensor
 
-from forewarp.data.files import Entry, mismatch
+from forewarp.data.files import mismatch
 from forewarp.scene.box import Box
-from forewarp.scene.camera import Camera, Lens
+from forewarp.scene.camera import Camera, Lens, focus_point
+
+log = logging.getLogger(__name__)
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL's axes of a camera to OpenCV's, and back
 MOST_UNITS = 1e9  # largest coordinate: farther from the origin single precision is long lost
 SPLITS = ("train", "val", "test")
-MODELS = ("OPENCV", "PINHOLE", "RADIAL", "SIMPLE_RADIAL", "SIMPLE_PINHOLE")
 _SAME_PIXEL = 0.01
+# Near and far as shares of the cameras' distance from what they look at, where nothing else is known. Two
+# real captures that gave them had near at 0.01 and 0.55 and far at 2.4 and 2.2.
+_NEAR, _FAR = 0.2, 2.5
+_LEAST, _MOST = 1e-3, 50.0  # a focus outside these shares of the assumed distance is not trusted
+_SAME_PLACE = 1e-9
+_AHEAD = 4.0  # assumed distance of what is looked at, in radii of the cameras' places
 # Poses are stored with six digits or more; a scale or a shear in a pose is never this small.
 _ROTATION_TOLERANCE = 1e-3
 
@@ -49,13 +57,6 @@ def pose_of(value: object, where: str) -> np.ndarray:
     return matrix
 
 
-def opengl_pose(entry: Entry) -> torch.Tensor:
-    """Read a frame's ``transform_matrix``, whose axes are OpenGL's: (4, 4) float64 with OpenCV's axes."""
-    return torch.from_numpy(
-        pose_of(entry.own.get("transform_matrix"), entry.where("transform_matrix")) @ FLIP
-    )
-
-
 def opengl_rows(pose: np.ndarray | torch.Tensor, where: str) -> list[list[float]]:
     """Make the ``transform_matrix`` of a pose (4, 4) with OpenCV's axes, to be written."""
     return (pose_of(np.asarray(pose, np.float64), where) @ FLIP).tolist()
@@ -79,7 +80,7 @@ def frustum_box(cameras: Iterable[Camera]) -> Box:
     points = []
     for camera in cameras:
         # Corners are not enough: at equal length a ray through the middle of an edge reaches further.
-        rays = camera.rays(_nine_pixels(camera), dtype=torch.float64)
+        rays = camera.rays(nine_pixels(camera), dtype=torch.float64)
         points += [rays.origins + distance * rays.directions for distance in (camera.near, camera.far)]
     cloud = torch.cat(points)
     return Box(tuple(cloud.amin(0).tolist()), tuple(cloud.amax(0).tolist()))
@@ -100,13 +101,13 @@ def check_lens(camera: Camera, where: str) -> None:
 def _can_be_undone(lens: Lens, width: int, height: int, *pinhole: float) -> bool:
     pose = torch.eye(4, dtype=torch.float64)
     camera = Camera(width, height, *pinhole[:4], pose, 0.0, 0.0, pinhole[4], lens)
-    pixels = _nine_pixels(camera)
+    pixels = nine_pixels(camera)
     u, v = pixels % width + 0.5, torch.div(pixels, width, rounding_mode="floor") + 0.5
     again, _ = camera.project(camera.directions(u, v))
     return bool(((again - torch.stack([u, v], -1)).abs() < _SAME_PIXEL).all())
 
 
-def _nine_pixels(camera: Camera) -> torch.Tensor:
+def nine_pixels(camera: Camera) -> torch.Tensor:
     """Flat indices (9,) of the corners, the middles of the edges and the centre."""
     columns = torch.tensor([0, camera.width // 2, camera.width - 1])
     rows = torch.tensor([0, camera.height // 2, camera.height - 1])
@@ -135,28 +136,94 @@ class Normalisation:
         return replace(camera, camera_to_world=pose, near=self.near, far=self.far)
 
 
-def camera_of(entry: Entry, stored: tuple[int, int], scale: int, image: Path) -> Camera:
-    """Read a nerfstudio-style camera: that of an image of ``stored`` pixels, whose entry is of one ``scale``
-    times as large.
+def space_of(
+    cameras: Sequence[Camera],
+    where: str,
+    *,
+    near: float | None = None,
+    far: float | None = None,
+    box: Box | None = None,
+    normalise: bool = True,
+    cut_out: bool = False,
+    radius: float = 1.0,
+) -> tuple[Normalisation, Box]:
+    """Find the part of the world that cameras of unknown scale look at: how to normalise it, and its box.
+
+    Args:
+        cameras: cameras of all frames; their near and far are not used.
+        where: the file, for errors.
+        near, far, box: what is known, in the file's units; None is derived: ``near`` and ``far`` from the
+            distance to the focus, the point looked at; the box holds all rays between them.
+        cut_out: the images are cut out; then the box holds only what they show around the focus.
+        normalise: put the focus at the origin and the farthest camera at distance ``radius``.
+        radius: see ``normalise``.
+
+    Raises:
+        SceneError: where something cannot be derived from the cameras.
     """
-    model = entry.get("camera_model", "OPENCV")
-    if model not in MODELS:
-        expected = f"one of {', '.join(MODELS)}"
-        raise mismatch(entry.where("camera_model"), expected, short(model), "undistort the images")
-    sizes = [entry.number(key, 1, 1e6, n * scale) for key, n in zip("wh", stored)]
-    if any(abs(n - size / scale) >= 1 for n, size in zip(stored, sizes)):
-        expected = " x ".join(f"{size / scale:g}" for size in sizes)
-        got = f"{stored[0]} x {stored[1]}"
-        raise mismatch(image, f"{expected} pixels as {entry.where('w')} and h say", got)
-    width, height = map(round, sizes)
-    fx = entry.number("fl_x", 0.01 * width, 100 * width)
-    fy = entry.number("fl_y", 0.01 * height, 100 * height, fx)
-    cx, cy = (entry.number(key, -n, 2 * n, n / 2) for key, n in (("cx", width), ("cy", height)))
-    k = tuple(entry.number(key, -1e6, 1e6, 0.0) for key in ("k1", "k2", "k3"))
-    p = tuple(entry.number(key, -1e6, 1e6, 0.0) for key in ("p1", "p2"))
-    if entry.number("k4", default=0.0) != 0:
-        raise mismatch(entry.where("k4"), "0", entry.get("k4"), "undistort the images")
-    lens = Lens(k, p) if any(k + p) else None
-    camera = Camera(width, height, fx, fy, cx, cy, opengl_pose(entry), 0.0, 0.0, lens=lens).resized(*stored)
-    check_lens(camera, entry.where("k1"))
-    return camera
+    focus, distances = _focus(cameras, near, far, where)
+    near, far = _range(distances, near, far, where)
+    size = max(float((camera.center - focus).norm()) for camera in cameras) / radius if normalise else 1.0
+    center = tuple(focus.tolist()) if normalise else (0.0, 0.0, 0.0)
+    space = Normalisation(center, 1 / size, near / size, far / size)
+
+    def moved(box: Box) -> Box:
+        return Box(
+            *(tuple((v - c) * space.scale for v, c in zip(end, center)) for end in (box.low, box.high))
+        )
+
+    try:
+        if box is not None:
+            return space, moved(box)
+        seen = frustum_box(map(space.camera, cameras))
+        if cut_out:  # the cube around the focus that holds what all images show of it
+            width = max(max(camera.width / camera.fx, camera.height / camera.fy) for camera in cameras)
+            half = 0.5 * float(distances.max()) * width
+            shown = Box(tuple(v - half for v in focus.tolist()), tuple(v + half for v in focus.tolist()))
+            seen = seen.intersection(moved(shown))
+        return space, seen
+    except ValueError as error:
+        advice = "set data.near, data.far and data.box"
+        raise mismatch(where, "cameras that see a part of space", f"none ({error})", advice) from error
+
+
+def _focus(
+    cameras: Sequence[Camera], near: float | None, far: float | None, where: str
+) -> tuple[Tensor, Tensor]:
+    """Find the focus (3,) and its distances along the optical axes of the cameras that face it, float64."""
+    centers = torch.stack([camera.center for camera in cameras])
+    axes = torch.stack([camera.camera_to_world[:3, 2] for camera in cameras])
+    radius, is_open = float((centers - centers.mean(0)).norm(dim=-1).max()), near is None or far is None
+    ahead = _AHEAD * radius if is_open else 0.5 * (near + far)
+    if is_open and radius <= _SAME_PLACE * (1 + float(centers.abs().max())):
+        raise mismatch(where, "cameras that move", "one place", "set data.near and data.far")
+    focus = focus_point([replace(camera, near=0.0, far=2 * ahead) for camera in cameras])
+    distances = ((focus - centers) * axes).sum(-1)
+    if not _LEAST * ahead < float(distances.median()) < _MOST * ahead:
+        # The axes are nearly parallel or diverge: only the direction of view can be trusted.
+        axis = axes.mean(0)
+        focus = centers.mean(0) + ahead * axis / axis.norm().clamp(min=0.1)
+        distances = ((focus - centers) * axes).sum(-1)
+    distances = distances[distances > _LEAST * ahead]
+    if not len(distances):
+        expected, advice = "cameras that look at something in common", "remove those that look away"
+        raise mismatch(where, expected, "views in all directions", advice)
+    return focus, distances
+
+
+def _range(distances: Tensor, near: float | None, far: float | None, where: str) -> tuple[float, float]:
+    """Choose near and far in the file's units; log what is derived."""
+    derived = " and ".join(name for name, value in (("near", near), ("far", far)) if value is None)
+    low, high = _NEAR * float(distances.min()), _FAR * float(distances.max())
+    near, far = (
+        (low if far is None else min(low, far / 2)) if near is None else near,
+        (high if near is None else max(high, 2 * near)) if far is None else far,
+    )
+    if not near < far:
+        raise mismatch(where, "near < far", f"{near:g} and {far:g}", "set data.near, data.far")
+    if derived:
+        log.warning(
+            f"{where}: {derived} derived from the cameras: near {near:.4g}, far {far:.4g} in the file's "
+            "units; where something is cut off or blurred set data.near and data.far"
+        )
+    return near, far

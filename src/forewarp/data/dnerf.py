@@ -13,7 +13,6 @@ the canonical time (``canonical``).
 
 from __future__ import annotations
 
-import math
 import os
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -25,10 +24,29 @@ import numpy as np
 from torch import Tensor
 
 from forewarp.data.arrays import StoredDepth, read_truth, write_array, write_truth
-from forewarp.data.cameras import MOST_UNITS, SPLITS, box_of, frustum_box, opengl_pose, opengl_rows
-from forewarp.data.files import frames_of, mismatch, number, read_json, remove, scene_folder
-from forewarp.data.images import StoredImage, by, check_pixels, common_header, write_image
+from forewarp.data.cameras import (
+    MOST_UNITS,
+    SPLITS,
+    Normalisation,
+    box_of,
+    frustum_box,
+    opengl_rows,
+    space_of,
+)
+from forewarp.data.files import MARKERS, frames_of, mismatch, number, read_json, remove, scene_folder, whole
+from forewarp.data.images import StoredImage, by, check_pixels, inspect_image, write_image
+from forewarp.data.transforms import (
+    camera_of,
+    check_axes,
+    check_directions,
+    hold_out_every,
+    image_of,
+    pose_in,
+    those_there,
+    times_of,
+)
 from forewarp.files import write_json
+from forewarp.scene.box import Box
 from forewarp.scene.camera import Camera
 from forewarp.scene.frame import Frame, Scene, Truth
 
@@ -37,6 +55,9 @@ TRAINING_TIMES = 50  # of the published Lego Complete data, as are the counts of
 TEST_VIEWS = {"space": 200, "time": 197, "canonical": 50}
 _SAME_TIME = 1e-4  # times are stored with four digits or more; neighbours are 1/196 apart
 _PUBLISHED_WIDTH = 400
+# The published scenes: cameras 4.03 from the origin, and what is taken for them by all who report numbers.
+_RADIUS, _LEAST_DISTANCE, _MOST_DISTANCE = 4.0, 3.5, 4.6
+_NEAR, _FAR, _BOX = 2.0, 6.0, (-1.5, -1.5, -1.5, 1.5, 1.5, 1.5)
 
 
 @dataclass(frozen=True)
@@ -55,14 +76,15 @@ class Shot:
 
 @dataclass(frozen=True)
 class _Record:
-    """A checked entry of a transforms file; the pose has OpenCV's axes, ``angle`` is the field of view."""
+    """A checked entry of a transforms file: ``camera`` at the size of the image, its near and far 0."""
 
-    time: float
-    pose: Tensor
-    angle: float
+    time: float | None
+    camera: Camera
     image: Path
+    has_alpha: bool
     depth: tuple[Path, float | None] | None  # file and world units a step, where it says so
     ability: str
+    by_angle: bool  # the field of view is told by ``camera_angle_x`` alone
 
 
 def read_scene(
@@ -70,36 +92,58 @@ def read_scene(
     scene: str,
     *,
     half_resolution: bool | str = "auto",
-    box: Sequence[float] | None = None,
-    near: float = 2.0,
-    far: float = 6.0,
+    box: Sequence[float] | str | None = None,
+    near: float | None = None,
+    far: float | None = None,
+    axes: str | None = None,
+    inverse: bool = False,
+    angle: str = "width",
+    test_every: int = 8,
 ) -> Scene:
     """Read ``root/scene``; pixels are decoded when a frame is first loaded.
 
+    Where all cameras are about 4 from the origin, as in the published scenes, the world stays as it is. Else
+    what the cameras look at is moved to the origin and the farthest camera to distance 4, unless depth or
+    trajectories come with the scene. Frames without an image are left out and counted; without test images
+    training images are held out.
+
     Args:
         half_resolution: average 2 x 2 pixels; "auto" does so where images are wider than 400, as published.
-        box: x0 y0 z0 x1 y1 z1 in world units; None takes the bounds of all training rays from near to far.
-        near, far: along the unit ray, world units.
+        box: x0 y0 z0 x1 y1 z1 in the file's units; "auto": +-1.5 where cameras are as published, else what
+            the images show; None takes the bounds of all training rays from near to far.
+        near, far: along the unit ray, the file's units; None: 2 and 6 where cameras are as published, else
+            derived from the cameras.
+        axes, inverse: of the poses in the files, see ``posed_video.read_scene``.
+        angle: ``camera_angle_x`` is that of the ``width`` or of the ``longer`` side.
+        test_every: every n-th training image is tested on where there are no test images.
 
     Raises:
         SceneError: for every file or value that is missing or wrong, with file and key.
     """
-    if not number(near, "data.near", 0, MOST_UNITS) < number(far, "data.far", 0, MOST_UNITS):
-        raise mismatch("data.near, data.far", "near < far", f"{near} and {far}")
-    folder = scene_folder(root, scene, "dnerf")
-    records = {split: _read_split(folder, split) for split in SPLITS}
-    header = common_header(record.image for split in records.values() for record in split)
+    near = None if near is None else number(near, "data.near", 0, MOST_UNITS)
+    far = None if far is None else number(far, "data.far", 0, MOST_UNITS)
+    check_axes(axes, inverse)
+    if angle not in ("width", "longer"):
+        raise mismatch("data.angle", "width or longer", repr(angle))
     if half_resolution not in (True, False, "auto"):
         raise mismatch("data.half_resolution", "true, false or auto", repr(half_resolution))
-    size = header.size
+    folder = scene_folder(root, scene, "dnerf")
+    every = whole(test_every, "data.test_every", 2)
+    records, assumed = _read_records(folder, axes, inverse, angle == "longer", every)
+    everything = [record for split in records.values() for record in split]
+    size, has_alpha = _common(everything)
     halve = size[0] > _PUBLISHED_WIDTH if half_resolution == "auto" else bool(half_resolution)
     if halve and (size[0] % 2 or size[1] % 2):
         raise mismatch(folder, "even sides to halve", by(size), "set data.half_resolution=false")
     width, height = (n // 2 if halve else n for n in size)
 
+    cameras = [record.camera for record in records["train"]]
+    is_metric = any(record.depth for record in everything) or (folder / "trajectories.npz").exists()
+    space, bounds = _space(cameras, str(folder), near, far, box, has_alpha, is_metric)
+
     def frame(record: _Record) -> Frame:
-        focal = 0.5 * width / math.tan(0.5 * record.angle)
-        camera = Camera(width, height, focal, focal, width / 2, height / 2, record.pose, near, far)
+        camera = space.camera(record.camera)
+        camera = camera.resized(width, height) if halve else camera
         name = record.image.relative_to(folder).with_suffix("").as_posix()
         depth = StoredDepth(record.depth[0], size, halve, record.depth[1]) if record.depth else None
         return Frame(name, record.time, camera, StoredImage(record.image, size, halve), depth, record.ability)
@@ -112,41 +156,118 @@ def read_scene(
         "half_resolution": halve,
         "test_frames": len(test),
     }
-    bounds = frustum_box(f.camera for f in train) if box is None else box_of(box)
+    if space.scale != 1 or any(space.center):
+        protocol["normalisation"] = {"center": list(space.center), "scale": space.scale}
+    if assumed:
+        protocol["assumed"] = assumed
     truth = read_truth(folder / "trajectories.npz", canonical)
-    return Scene(scene, train, val, test, bounds, canonical, header.has_alpha, truth, protocol)
+    return Scene(scene, train, val, test, bounds, canonical, has_alpha, truth, protocol)
 
 
-def _read_split(folder: Path, split: str) -> list[_Record]:
-    """Read the records of a split; ``val`` may be absent, ``test`` may be one file per ability."""
+def _space(
+    cameras: Sequence[Camera],
+    where: str,
+    near: float | None,
+    far: float | None,
+    box: Sequence[float] | str | None,
+    cut_out: bool,
+    is_metric: bool,
+) -> tuple[Normalisation, Box]:
+    """Find near, far and the box, and where a world of other units is moved to: see ``read_scene``."""
+    distances = [float(camera.center.norm()) for camera in cameras]
+    as_published = all(_LEAST_DISTANCE < distance < _MOST_DISTANCE for distance in distances)
+    given = None if box is None or box == "auto" else box_of(box)
+    if not as_published:
+        options = {"near": near, "far": far, "box": given, "normalise": not is_metric, "cut_out": cut_out}
+        return space_of(cameras, where, **options, radius=_RADIUS)
+    near, far = _NEAR if near is None else near, _FAR if far is None else far
+    if not near < far:
+        raise mismatch("data.near, data.far", "near < far", f"{near} and {far}")
+    space = Normalisation((0.0, 0.0, 0.0), 1.0, near, far)
+    if box == "auto":
+        return space, box_of(_BOX)
+    return space, frustum_box(map(space.camera, cameras)) if given is None else given
+
+
+def _common(records: Sequence[_Record]) -> tuple[tuple[int, int], bool]:
+    """Return the size of all images and whether they have alpha.
+
+    Raises:
+        SceneError: naming an image that differs from the first in either.
+    """
+    first = records[0]
+    for record in records:
+        size, expected = ((r.camera.width, r.camera.height) for r in (record, first))
+        if size != expected:
+            raise mismatch(record.image, f"{by(expected)} pixels as the first", by(size))
+    bare = [record for record in records if not record.has_alpha]
+    if 0 < len(bare) < len(records):
+        got = f"{len(bare)} of {len(records)} without, as {bare[0].image}"
+        raise mismatch(first.image.parent, "an alpha channel in all images or in none", got)
+    return (first.camera.width, first.camera.height), not bare
+
+
+def _read_records(
+    folder: Path, axes: str | None, inverse: bool, longer: bool, test_every: int
+) -> tuple[dict[str, list[_Record]], list[str]]:
+    """Read the records of all splits, each with a time; also say in lines what was assumed."""
+    records, assumed = {}, []
+    for split in SPLITS:
+        files = _files(folder, split)
+        found = [_read_file(path, ability, axes, inverse, longer) for path, ability in files.items()]
+        records[split] = [record for part, _ in found for record in part]
+        assumed += [line for _, lines in found for line in lines]
+    everything = [record for split in SPLITS for record in records[split]]
+    names = [record.image.relative_to(folder).with_suffix("").as_posix() for record in everything]
+    times, told = times_of(names, [record.time for record in everything], str(folder))
+    assumed += [told] if told else []
+    timed = iter(replace(record, time=time) for record, time in zip(everything, times))
+    records = {split: [next(timed) for _ in records[split]] for split in SPLITS}
+    if not records["test"]:
+        ordered = sorted(records["train"], key=lambda record: record.time)
+        records["train"], records["test"] = hold_out_every(ordered, test_every)
+        line = f"{folder}: no test images: every {test_every}th training image is tested on instead"
+        assumed.append(f"{line} ({len(records['test'])}; data.test_every)")
+        if not records["test"]:
+            raise mismatch(folder, "images to test on, or at least 3 to train on", f"{len(ordered)} in all")
+    if axes is None:
+        poses = [record.camera.camera_to_world for record in records["train"]]
+        check_directions(poses, str(folder / MARKERS["dnerf"]), inverse=inverse)
+    portrait = [r for r in everything if r.by_angle and r.camera.height > r.camera.width]
+    if portrait and not longer:
+        line = f"{folder}: camera_angle_x taken as the angle of the width of these upright images"
+        assumed.append(f"{line}; if it is that of the height, as of Blender's, set data.angle=longer")
+    return records, assumed
+
+
+def _files(folder: Path, split: str) -> dict[Path, str]:
+    """List the transforms files of a split with their abilities: all in one, or one file per ability."""
     stock = folder / f"transforms_{split}.json"
     files = {stock: "all"} if stock.is_file() else {}
-    if split == "test":
-        parts = {}
-        for ability in ABILITIES:
-            places = (
-                folder / f"transforms_test_{ability}.json",
-                folder / f"test_{ability}" / "transforms.json",
-            )
-            parts |= dict.fromkeys([path for path in places if path.is_file()][:1], ability)
-        if files and parts:
-            raise mismatch(stock, "it or one file per ability", "both", "remove one kind")
-        files = files or parts
-        if not files:
-            raise mismatch(stock, "this file or transforms_test_<ability>.json", "neither")
-    return [record for path, ability in files.items() for record in _read_records(path, ability)]
+    if split != "test":
+        return files
+    parts = {}
+    for ability in ABILITIES:
+        places = (folder / f"transforms_test_{ability}.json", folder / f"test_{ability}" / "transforms.json")
+        parts |= dict.fromkeys([path for path in places if path.is_file()][:1], ability)
+    if files and parts:
+        raise mismatch(stock, "it or one file per ability", "both", "remove one kind")
+    return files or parts
 
 
-def _read_records(path: Path, ability: str) -> list[_Record]:
+def _read_file(
+    path: Path, ability: str, axes: str | None, inverse: bool, longer: bool
+) -> tuple[list[_Record], list[str]]:
+    """Read a transforms file; without its images where it is of a test split that was never rendered."""
     content, records = read_json(path), []
-    angle = number(content.get("camera_angle_x"), f"{path}: camera_angle_x", 0, math.pi)
-    if angle in (0, math.pi):
-        raise mismatch(f"{path}: camera_angle_x", "radians inside (0, pi)", angle)
-    entries = frames_of(path, content, {"ability": ability, "depth_scale": content.get("depth_scale")})
-    for i, entry in enumerate(entries):
-        image, depth, ability = entry.path("file_path"), None, entry.get("ability")
-        if image.suffix != ".png":
-            image = image.with_name(image.name + ".png")
+    entries = frames_of(path, content, content | {"ability": ability})
+    images = [image_of(entry) for entry in entries]
+    if ability != "all" or path.stem == "transforms_train" or any(os.path.isfile(i) for i in images):
+        there, assumed = those_there(list(zip(entries, images)), images, str(path))
+    else:
+        there, assumed = [], [f"{path}: none of its {len(images)} images is there: left out"]
+    for entry, image in there:
+        depth, ability = None, entry.get("ability")
         if "depth_file_path" in entry.own:
             file, scale = entry.path("depth_file_path"), entry.get("depth_scale")
             if not os.path.isfile(file):
@@ -154,9 +275,13 @@ def _read_records(path: Path, ability: str) -> list[_Record]:
             depth = file, None if scale is None else entry.number("depth_scale", 1e-12, 1e6)
         if ability not in (*ABILITIES, "all"):
             raise mismatch(entry.where("ability"), f"one of {', '.join(ABILITIES)}", short(ability))
-        time = entry.number("time", 0, 1, i / max(len(entries) - 1, 1))
-        records.append(_Record(time, opengl_pose(entry), angle, image, depth, ability))
-    return records
+        time = entry.number("time", 0, 1) if "time" in entry.own else None
+        header = inspect_image(image)
+        pose = pose_in(entry, axes, inverse)
+        camera = camera_of(entry, header.size, 1, image, pose=pose, longer=longer)
+        by_angle = entry.get("fl_x") is None
+        records.append(_Record(time, camera, image, header.has_alpha, depth, ability, by_angle))
+    return records, assumed
 
 
 def write_scene(

@@ -6,6 +6,7 @@ import glob
 import hashlib
 import operator
 import os
+import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -24,6 +25,17 @@ MARKERS = {  # by reader: the file that every scene of its format has
     "hypernerf": "dataset.json",
     "nhr": "CamPose.inf",
     "posed_video": "transforms.json",
+}
+LAYOUTS = {  # what people call a layout: a file or folder that tells it, and what reads it
+    "HyperNeRF": ("dataset.json", "experiment=hypernerf"),
+    "NHR": ("CamPose.inf", "experiment=nhr"),
+    "D-NeRF": ("transforms_train.json", "experiment=dnerf"),
+    "nerfstudio": ("transforms.json", "experiment=video_with_poses"),
+    "COLMAP": ("sparse", "forewarp-capture images=<its images> colmap=<its sparse/0>"),
+    "DyNeRF": (
+        "poses_bounds.npy",
+        "a transforms.json with a time in each frame; no reader knows it",
+    ),
 }
 RECORD = "synthesis.json"  # of every synthesised scene, or folder of them
 LOCK = ".lock"  # of every folder of a run
@@ -130,11 +142,13 @@ def numbers_of(words: list[str], count: int, where: str) -> list[float]:
 def inside(folder: Path, name: object, where: str) -> Path:
     """Join a relative path to ``folder``; refuse one that leads out of it.
 
-    Judged by the text alone, so a folder may link to where its images really are. A backslash, which Windows
-    takes for a separator, is refused.
+    Judged by the text alone, so a folder may link to where its images really are. A backslash separates, as
+    files written on Windows have it.
     """
-    is_text = isinstance(name, str) and not any(category(c) in _UNPRINTABLE or c == "\\" for c in name)
-    normal = os.path.normpath(name) if is_text and name else ".."
+    is_text = isinstance(name, str) and not any(category(c) in _UNPRINTABLE for c in name)
+    normal = os.path.normpath(name.replace("\\", "/")) if is_text and name else ".."
+    if re.match("[A-Za-z]:", normal):  # a drive of Windows
+        normal = ".."
     if os.path.isabs(normal) or normal.split(os.sep)[0] in ("..", "."):
         raise mismatch(where, "a path inside the scene folder", short(name))
     return folder / normal
@@ -210,6 +224,8 @@ def scene_folder(root: str | Path, scene: str, reader: str) -> Path:
     if not scene or not (root / scene / marker).is_file():
         there = ", ".join(sorted(p.name for p in root.iterdir() if (p / marker).is_file())) or "none"
         advice = f"scenes in {root}: {there}"
+        if scene and (other := layout_of(root / scene)):
+            advice = f"this is a scene in the layout of {other}: use {LAYOUTS[other][1]}"
         if deeper := sorted(root.glob(f"*/{glob.escape(scene)}/{marker}")) if scene else []:
             advice = f"did you mean data.root={deeper[0].parents[len(Path(scene).parts)]}?"
         if (root / marker).is_file():
@@ -217,6 +233,12 @@ def scene_folder(root: str | Path, scene: str, reader: str) -> Path:
             advice = f"did you mean data.root={folder.parent} data.scene={folder.name}?"
         raise mismatch(root / scene, f"a scene with {marker}", "none", advice)
     return root / scene
+
+
+def layout_of(folder: Path) -> str | None:
+    """Name the layout of a scene's folder by the file that every scene of it has; None: of none known."""
+    there = [name for name, (marker, _) in LAYOUTS.items() if (folder / marker).exists()]
+    return there[0] if there else None
 
 
 def remove(folder: Path, *patterns: str) -> None:

@@ -86,7 +86,8 @@ def read_scene(root: str | Path, scene: str, *, scale: int = 2, box: Sequence[fl
         camera = reduced(normalised.camera(camera), scale)
         size = camera.width, camera.height
         inspect_image(path, size, f", the camera's image_size / {scale}")
-        return Frame(item, times[item], camera, StoredImage(path, size), camera_id=camera_ids[item])
+        load = StoredImage(path, size, opaque=True)  # of dycheck's an alpha of 0 says "no depth here"
+        return Frame(item, times[item], camera, load, camera_id=camera_ids[item])
 
     train, test = (tuple(map(frame, items)) for items in (train_ids, test_ids))
     canonical, points = middle_of(f.time for f in train), folder / "points.npy"
@@ -242,8 +243,8 @@ def _read_split(path: Path) -> tuple[str, list[str], list[str], list[str]]:
 def _read_items(path: Path, ids: list[str]) -> tuple[dict[str, float], dict[str, int | None]]:
     """Read the time in [0, 1] of each item of a ``metadata.json`` and its camera's number, where it has one.
 
-    The time is ``time_id``, or where none of ``ids`` has one ``warp_id``, over the greatest of them. Entries
-    of other items are not looked at.
+    The time is ``time_id``, or where none of ``ids`` has one ``warp_id``, between the least and the greatest
+    of them. Entries of other items are not looked at.
 
     Raises:
         SceneError: for an item that is missing or has no time, and for a number that is not whole.
@@ -263,8 +264,9 @@ def _read_items(path: Path, ids: list[str]) -> tuple[dict[str, float], dict[str,
             if number % 1:
                 raise mismatch(entry.where(name), "a whole number", f"{number:g}")
             numbers[name][item] = int(number)
-    last = max(numbers[key].values()) or 1
-    return {item: number / last for item, number in numbers[key].items()}, numbers["camera_id"]
+    first, last = min(numbers[key].values()), max(numbers[key].values())
+    span = max(last - first, 1)
+    return {item: (number - first) / span for item, number in numbers[key].items()}, numbers["camera_id"]
 
 
 def _write_shot(folder: Path, shot: RigShot, scales: Sequence[int]) -> None:

@@ -218,12 +218,18 @@ class StoredImage:
         size: (width, height), what the files must hold.
         halve: average 2 x 2 pixels; of a cut-out an odd last row or column is cut off.
         mask: of the same size; its first channel counts, above 127 is foreground.
+        opaque: leave the image's own alpha aside.
     """
 
     def __init__(
-        self, path: Path, size: tuple[int, int], halve: bool = False, mask: Path | None = None
+        self,
+        path: Path,
+        size: tuple[int, int],
+        halve: bool = False,
+        mask: Path | None = None,
+        opaque: bool = False,
     ) -> None:
-        self.path, self.size, self.halve, self.mask = path, size, halve, mask
+        self.path, self.size, self.halve, self.mask, self.opaque = path, size, halve, mask, opaque
         self._corner = (0, 0)
 
     def __call__(self) -> Tensor:
@@ -240,6 +246,8 @@ class StoredImage:
     def _decode(self) -> Tensor:
         """Decode the image, or cut out the foreground's rectangle and note where it lies."""
         rgba = read_image(self.path, self.size)
+        if self.opaque:
+            rgba[..., 3] = 255
         if self.mask is None:
             return reduced(rgba) if self.halve else rgba
         rgba *= ((read_image(self.mask, self.size)[..., 0] > _FOREGROUND) & (rgba[..., 3] > 0))[..., None]

@@ -8,46 +8,36 @@ which may be any: the scene is normalised. The optional ``points.npy`` (N, 3) ho
 
 from __future__ import annotations
 
-import logging
-import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from reprlib import repr as short
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from forewarp.data.arrays import read_cloud, write_array
-from forewarp.data.cameras import (
-    MOST_UNITS,
-    SPLITS,
-    Normalisation,
-    box_of,
-    camera_of,
-    frustum_box,
-    opengl_rows,
-)
+from forewarp.data.cameras import MOST_UNITS, SPLITS, box_of, opengl_rows, space_of
 from forewarp.data.files import frames_of, inside, mismatch, number, read_json, remove, scene_folder, whole
 from forewarp.data.images import SUFFIXES, StoredImage, check_pixels, in_order, inspect_image, write_image
+from forewarp.data.transforms import (
+    camera_of,
+    check_axes,
+    check_directions,
+    hold_out_every,
+    pose_in,
+    those_there,
+    times_of,
+    with_suffix,
+)
 from forewarp.files import write_json
 from forewarp.scene.box import Box
-from forewarp.scene.camera import Camera, focus_point
+from forewarp.scene.camera import Camera
 from forewarp.scene.frame import Frame, Scene, middle_of
-from forewarp.scene.paths import focus_point
 
 FILE, POINTS = "transforms.json", "points.npy"
 SCALES = (1, 2, 4, 8)
 _OF_CAMERA = ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_model", "k1", "k2", "k3", "p1", "p2")
-# Near and far as shares of the cameras' distance from what they look at, where nothing else is known. Two
-# real captures that gave them had near at 0.01 and 0.55 and far at 2.4 and 2.2.
-_NEAR, _FAR = 0.2, 2.5
-_LEAST, _MOST = 1e-3, 50.0  # a focus outside these shares of the assumed distance is not trusted
-_SAME_PLACE = 1e-9
-_AHEAD = 4.0  # assumed distance of what is looked at, in radii of the cameras' places
-
-log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -75,13 +65,16 @@ def read_scene(
     normalise: bool = True,
     canonical: str = "middle",
     test_every: int = 8,
+    axes: str | None = None,
+    inverse: bool = False,
 ) -> Scene:
     """Read ``root/scene``; pixels are decoded when a frame is first loaded.
 
     The subject is cut out where there are masks, or where some image has a pixel that is not opaque: images
     with an alpha channel are decoded until one such is found.
 
-    Without ``time`` in the file the frames are evenly spaced over [0, 1] in the order of their names.
+    Without ``time`` in the file, numbers in the images' names tell it; see ``transforms.times_of``. Frames
+    without an image are left out and counted.
 
     Args:
         scale: 1, 2, 4 or 8: take the smaller images in ``images_<scale>`` beside ``images``.
@@ -91,10 +84,14 @@ def read_scene(
         canonical: the training time nearest to the ``middle``, or the ``first``.
         test_every: every n-th frame is a test frame, the first and the last never, where the file does not
             list ``<split>_filenames``.
+        axes: of the poses in the file: opengl or opencv; None: OpenGL's, unless the cameras look away from
+            what they surround, which is refused.
+        inverse: poses in the file are world-to-camera.
 
     Raises:
         SceneError: for every file or value that is missing or wrong, with file and key.
     """
+    check_axes(axes, inverse)
     if type(scale) is not int or scale not in SCALES:
         raise mismatch("data.scale", f"one of {SCALES}", repr(scale))
     if canonical not in ("middle", "first"):
@@ -104,13 +101,11 @@ def read_scene(
         raise mismatch("data.normalise", "true or false", repr(normalise))
     file = scene_folder(root, scene, "posed_video") / FILE
     content = read_json(file)
-    entries = _read_entries(file, content, scale)
-    is_timeless, last = entries[0].time is None, max(len(entries) - 1, 1)
-    if is_timeless:
-        entries = in_order(entries, lambda entry: entry.name)
-        entries = [replace(entry, time=i / last) for i, entry in enumerate(entries)]
-    entries.sort(key=lambda entry: entry.time)
-    parts, how = _split_entries(file, content, entries, test_every)
+    entries, absent, assumed = _read_entries(file, content, scale, axes, inverse)
+    times, told = times_of([entry.name for entry in entries], [entry.time for entry in entries], str(file))
+    entries = [replace(entry, time=time) for entry, time in zip(entries, times)]
+    entries = sorted(in_order(entries, lambda entry: entry.name) if told else entries, key=lambda e: e.time)
+    parts, how = _split_entries(file, content, entries, test_every, absent)
     near, far = (_length(file, content, key, value) for key, value in (("near", near), ("far", far)))
     bounds = _bounds(file, content, box)
     has_alpha = any(
@@ -128,7 +123,7 @@ def read_scene(
     protocol = {
         "dataset": "video_with_poses",
         "resolution": [train[0].camera.width, train[0].camera.height],
-        "times": "spread in the order of the files' names" if is_timeless else "as given",
+        "times": "as given" if told is None else "made up",
         "split": how,
         "test_frames": len(test),
         "normalisation": {"center": list(space.center), "scale": space.scale},
@@ -136,6 +131,8 @@ def read_scene(
         "far": space.far,
         "derived": [name for name in ("near", "far", "box") if options[name] is None],
     }
+    if assumed := [*assumed, *filter(None, [told])]:
+        protocol["assumed"] = assumed
     cloud = file.parent / POINTS
     still = space.points(read_cloud(cloud, 3)).float() if cloud.exists() else None
     return Scene(scene, train, val, test, seen, start, has_alpha, protocol=protocol, still=still)
@@ -155,33 +152,41 @@ class ImageEntry:
     has_alpha: bool
 
 
-def _read_entries(file: Path, content: dict, scale: int = 1) -> list[ImageEntry]:
-    """Read all frames of a nerfstudio-style ``transforms.json`` in its order.
+def _read_entries(
+    file: Path, content: dict, scale: int, axes: str | None, inverse: bool
+) -> tuple[list[ImageEntry], set[str], list[str]]:
+    """Read all frames of a nerfstudio-style ``transforms.json`` in its order, less those without an image.
 
     Args:
         file: for errors and as the place that paths start from.
         content: content of the file.
         scale: take images that are ``scale`` times smaller, from ``images_4`` in place of ``images``.
+        axes, inverse: see ``read_scene``.
+
+    Returns:
+        the entries, the names of those left out, and lines that say what was assumed.
 
     Raises:
         SceneError: for every key or image that is missing or wrong.
 
     Cost: one read of each PNG, of a JPEG's beginning and end.
     """
+    frames = frames_of(file, content, content)
+    images = [_file(entry, "file_path", scale) for entry in frames]
+    there, assumed = those_there(list(zip(frames, images)), images, str(file))
+    absent = {_name_of(file.parent, f.own.get("file_path"), f.where("file_path")) for f in frames}
     entries = []
-    for entry in frames_of(file, content, content):
-        image, mask = _file(entry, "file_path", scale), None
-        header = inspect_image(image)
+    for entry, image in there:
+        mask, header = None, inspect_image(image)
         if "mask_path" in entry.own:
             mask = _file(entry, "mask_path", scale)
             inspect_image(mask, header.size, f" as {image.name}")
         time = number(entry.own["time"], entry.where("time"), 0, 1) if "time" in entry.own else None
-        camera = camera_of(entry, header.size, scale, image)
+        camera = camera_of(entry, header.size, scale, image, pose=pose_in(entry, axes, inverse))
         name = _name_of(file.parent, entry.own.get("file_path"), entry.where("file_path"))
         load = StoredImage(image, header.size, mask=mask)
         entries.append(ImageEntry(name, time, camera, load, header.has_alpha))
     for key, given in (
-        ("time", [e.time is not None for e in entries]),
         ("mask_path", [e.load.mask is not None for e in entries]),
         ("file_path: alpha", [e.has_alpha or e.load.mask is not None for e in entries]),
     ):
@@ -192,23 +197,20 @@ def _read_entries(file: Path, content: dict, scale: int = 1) -> list[ImageEntry]
     if len(set(names)) < len(names):
         twice = next(name for i, name in enumerate(names) if name in names[:i])
         raise mismatch(f"{file}: frames", "each image once", f"{twice} twice", "remove one")
-    return entries
+    if axes is None:
+        check_directions([e.camera.camera_to_world for e in entries], str(file), inverse=inverse)
+    return entries, absent - {*names}, assumed
 
 
 def _file(entry, key: str, scale: int) -> Path:
-    """Find the image that a key names, with or without its suffix."""
+    """Find the image that a key names, with or without its suffix, ``scale`` times smaller."""
     folder, where = entry.file.parent, entry.where(key)
     path = entry.path(key)
     if scale > 1 and path.parent == folder:
         raise mismatch(where, "images in a folder", _name_of(folder, path.name, where), "set data.scale=1")
     if scale > 1:
         path = path.parent.with_name(f"{path.parent.name}_{scale}") / path.name
-    if path.suffix in SUFFIXES:
-        return path
-    for candidate in (path.with_name(path.name + suffix) for suffix in SUFFIXES):
-        if os.path.isfile(candidate):
-            return candidate
-    raise mismatch(where, "an image, PNG or JPEG", f"no {path}.png or .jpg")
+    return with_suffix(path)
 
 
 def _name_of(folder: Path, value: object, where: str) -> str:
@@ -217,7 +219,9 @@ def _name_of(folder: Path, value: object, where: str) -> str:
     return path.relative_to(folder).as_posix().removesuffix(path.suffix if path.suffix in SUFFIXES else "")
 
 
-def _split_entries(file: Path, content: dict, entries: list[ImageEntry], test_every: int) -> tuple[dict, str]:
+def _split_entries(
+    file: Path, content: dict, entries: list[ImageEntry], test_every: int, absent: set[str]
+) -> tuple[dict, str]:
     """Split the entries; also say in words how.
 
     Args:
@@ -226,13 +230,14 @@ def _split_entries(file: Path, content: dict, entries: list[ImageEntry], test_ev
         entries: in the order of time.
         test_every: every n-th is a test frame where nothing is listed, the first and the last never; of three
             frames or more at least one.
+        absent: names of frames without an image, which a list may have.
 
     Raises:
         SceneError: for a list that names no frame or one of another list, and where a split is empty.
     """
     listed = [split for split in SPLITS if f"{split}_filenames" in content]
     if listed:
-        names = {split: _listed(file, content, f"{split}_filenames", entries) for split in listed}
+        names = {split: _listed(file, content, f"{split}_filenames", entries, absent) for split in listed}
         if sum(map(len, names.values())) > len(set().union(*names.values())):
             raise mismatch(file, "lists of filenames that share none", "one in two of them")
         parts = {split: [e for e in entries if e.name in names.get(split, ())] for split in SPLITS}
@@ -240,9 +245,8 @@ def _split_entries(file: Path, content: dict, entries: list[ImageEntry], test_ev
             parts[home] = [e for e in entries if not any(e.name in split for split in names.values())]
         how = "as listed in the file"
     else:
-        held = slice(max(1, min(test_every // 2, len(entries) - 2)), -1, test_every)
-        parts = {"train": entries.copy(), "val": [], "test": entries[held]}
-        del parts["train"][held]
+        train, test = hold_out_every(entries, test_every)
+        parts = {"train": train, "val": [], "test": test}
         how = f"every {test_every}th frame held out"
     for split in ("train", "test"):
         if not parts[split]:
@@ -251,13 +255,13 @@ def _split_entries(file: Path, content: dict, entries: list[ImageEntry], test_ev
     return parts, how
 
 
-def _listed(file: Path, content: dict, key: str, entries: list[ImageEntry]) -> set[str]:
+def _listed(file: Path, content: dict, key: str, entries: list[ImageEntry], absent: set[str]) -> set[str]:
     """Read the frame names in the list of paths ``content[key]``; refuse names that are no frame."""
     value, where = content[key], f"{file}: {key}"
     if not isinstance(value, list):
         raise mismatch(where, "a list of paths", short(value))
     names = {_name_of(file.parent, path, f"{where}[{i}]") for i, path in enumerate(value)}
-    if unknown := sorted(names - {entry.name for entry in entries}):
+    if unknown := sorted(names - absent - {entry.name for entry in entries}):
         raise mismatch(where, "paths of frames", short(unknown[0]))
     return names
 
@@ -342,94 +346,3 @@ def _write_shot(folder: Path, shot: PosedShot, taken: set[str]) -> dict:
     entry["transform_matrix"] = opengl_rows(camera.camera_to_world, shot.name)
     write_image(folder / entry["file_path"], pixels)
     return entry
-
-
-def space_of(
-    cameras: Sequence[Camera],
-    where: str,
-    *,
-    near: float | None = None,
-    far: float | None = None,
-    box: Box | None = None,
-    normalise: bool = True,
-    cut_out: bool = False,
-) -> tuple[Normalisation, Box]:
-    """Find the part of the world that cameras of unknown scale look at: how to normalise it, and its box.
-
-    Args:
-        cameras: cameras of all frames; their near and far are not used.
-        where: the file, for errors.
-        near, far, box: what is known, in the file's units; None is derived: ``near`` and ``far`` from the
-            distance to the focus, the point looked at; the box holds all rays between them.
-        cut_out: the images are cut out; then the box holds only what they show around the focus.
-        normalise: put the focus at the origin and the farthest camera at distance 1.
-
-    Raises:
-        SceneError: where something cannot be derived from the cameras.
-    """
-    focus, distances = _focus(cameras, near, far, where)
-    near, far = _range(distances, near, far, where)
-    size = max(float((camera.center - focus).norm()) for camera in cameras) if normalise else 1.0
-    center = tuple(focus.tolist()) if normalise else (0.0, 0.0, 0.0)
-    space = Normalisation(center, 1 / size, near / size, far / size)
-
-    def moved(box: Box) -> Box:
-        return Box(
-            *(tuple((v - c) * space.scale for v, c in zip(end, center)) for end in (box.low, box.high))
-        )
-
-    try:
-        if box is not None:
-            return space, moved(box)
-        seen = frustum_box(map(space.camera, cameras))
-        if cut_out:  # the cube around the focus that holds what all images show of it
-            width = max(max(camera.width / camera.fx, camera.height / camera.fy) for camera in cameras)
-            half = 0.5 * float(distances.max()) * width
-            shown = Box(tuple(v - half for v in focus.tolist()), tuple(v + half for v in focus.tolist()))
-            seen = seen.intersection(moved(shown))
-        return space, seen
-    except ValueError as error:
-        advice = "set data.near, data.far and data.box"
-        raise mismatch(where, "cameras that see a part of space", f"none ({error})", advice) from error
-
-
-def _focus(
-    cameras: Sequence[Camera], near: float | None, far: float | None, where: str
-) -> tuple[Tensor, Tensor]:
-    """Find the focus (3,) and its distances along the optical axes of the cameras that face it, float64."""
-    centers = torch.stack([camera.center for camera in cameras])
-    axes = torch.stack([camera.camera_to_world[:3, 2] for camera in cameras])
-    radius, is_open = float((centers - centers.mean(0)).norm(dim=-1).max()), near is None or far is None
-    ahead = _AHEAD * radius if is_open else 0.5 * (near + far)
-    if is_open and radius <= _SAME_PLACE * (1 + float(centers.abs().max())):
-        raise mismatch(where, "cameras that move", "one place", "set data.near and data.far")
-    focus = focus_point([replace(camera, near=0.0, far=2 * ahead) for camera in cameras])
-    distances = ((focus - centers) * axes).sum(-1)
-    if not _LEAST * ahead < float(distances.median()) < _MOST * ahead:
-        # The axes are nearly parallel or diverge: only the direction of view can be trusted.
-        axis = axes.mean(0)
-        focus = centers.mean(0) + ahead * axis / axis.norm().clamp(min=0.1)
-        distances = ((focus - centers) * axes).sum(-1)
-    distances = distances[distances > _LEAST * ahead]
-    if not len(distances):
-        expected, advice = "cameras that look at something in common", "remove those that look away"
-        raise mismatch(where, expected, "views in all directions", advice)
-    return focus, distances
-
-
-def _range(distances: Tensor, near: float | None, far: float | None, where: str) -> tuple[float, float]:
-    """Choose near and far in the file's units; log what is derived."""
-    derived = " and ".join(name for name, value in (("near", near), ("far", far)) if value is None)
-    low, high = _NEAR * float(distances.min()), _FAR * float(distances.max())
-    near, far = (
-        (low if far is None else min(low, far / 2)) if near is None else near,
-        (high if near is None else max(high, 2 * near)) if far is None else far,
-    )
-    if not near < far:
-        raise mismatch(where, "near < far", f"{near:g} and {far:g}", "set data.near, data.far")
-    if derived:
-        log.warning(
-            f"{where}: {derived} derived from the cameras: near {near:.4g}, far {far:.4g} in the file's "
-            "units; where something is cut off or blurred set data.near and data.far"
-        )
-    return near, far

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import csv
 import io
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
@@ -149,6 +150,9 @@ def score_columns(names: Iterable[str]) -> dict[str, Column]:
     return {name: Column(metric_of(name).title, metric_of(name).digits) for name in names}
 
 
+_TAG = re.compile(r"<(?!/?u>)(?=[A-Za-z/!?])")  # a run's names and notes may hold any; ours underline
+
+
 @dataclass(frozen=True)
 class Section:
     """A heading with tables and pictures, ``facts`` on how they came about, and footnotes."""
@@ -161,8 +165,9 @@ class Section:
 
 
 def rendered(template: str, **values: object) -> str:
-    """Fill a template of ``templates/``; in HTML all text is escaped."""
-    return _environment().get_template(template).render(**values)
+    """Fill a template of ``templates/``; in HTML all text is escaped, in Markdown all tags but ours."""
+    text = _environment().get_template(template).render(**values)
+    return _TAG.sub("&lt;", text) if template.endswith(".md.j2") else text
 
 
 @cache

@@ -177,6 +177,9 @@ def check_values(config: DictConfig) -> None:
     Raises:
         ValueError: naming the key.
     """
+    for key in ("data", "callbacks"):
+        if not OmegaConf.is_dict(config.get(key)):
+            raise ValueError(f"{key}: expected keys of its own, but got {config.get(key)!r:.80}")
     seconds, seed, weights = (config.get(key) for key in ("checkpoint_seconds", "seed", "lpips_weights"))
     if type(seconds) not in (int, float) or not 0 <= seconds < math.inf:
         raise ValueError(f"checkpoint_seconds: expected a number >= 0, but got {seconds}")
@@ -191,7 +194,7 @@ def check_values(config: DictConfig) -> None:
         raise ValueError(
             f"lpips_weights: expected a file, a folder, a list of them or null, but got {weights}"
         )
-    for name, callback in (config.get("callbacks") or {}).items():
+    for name, callback in config.callbacks.items():
         if callback is not None and "_target_" not in (callback if OmegaConf.is_dict(callback) else {}):
             raise ValueError(f"callbacks.{name}: expected a class (_target_) or null, but got {callback}")
     scene = None if OmegaConf.is_missing(config.data, "scene") else config.data.get("scene")
@@ -209,8 +212,8 @@ def refuse_to_synthesize(config: DictConfig) -> None:
     folder = root if "LegoComplete" in target else root / str(config.data.get("scene"))
     if target.startswith("forewarp.synth.") and not (folder / RECORD).is_file():
         raise ValueError(
-            f"{folder}: expected the procedural scene that the run was fitted to, but got none; write it "
-            "with forewarp-synthesize or by the run's own command (command: in config.yaml), or set data.root"
+            f"data.root: expected the scene of the run, but got none in {folder}; write it with "
+            "forewarp-synthesize or the run's own command (command: in its config.yaml), or set data.root"
         )
 
 

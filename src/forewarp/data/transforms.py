@@ -1,0 +1,306 @@
+"""Read what the frames of every ``transforms*.json`` have in common, whatever its layout.
+
+Intrinsics are ``fl_x fl_y cx cy w h k1 k2 k3 p1 p2 camera_model`` or ``camera_angle_x``, at the top of the
+file or in a frame. A pose is camera-to-world with OpenGL's axes (x right, y up, looking along -z), unless the
+caller says otherwise. What a file leaves open is assumed here, in one way, and told in a line.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from collections.abc import Sequence
+from pathlib import Path, PurePosixPath
+from reprlib import repr as short
+from typing import TypeVar
+
+import numpy as np
+import torch
+
+from forewarp.data.cameras import FLIP, check_lens, pose_of
+from forewarp.data.files import Entry, mismatch
+from forewarp.data.images import SUFFIXES, by
+from forewarp.scene.camera import Camera, Lens
+
+Thing = TypeVar("Thing")
+MODELS = ("OPENCV", "PINHOLE", "RADIAL", "SIMPLE_RADIAL", "SIMPLE_PINHOLE")
+AXES = ("opengl", "opencv")
+# Keys of instant-ngp that say that the lens is none of these, whatever k1 .. say.
+_OTHER_LENSES = ("is_fisheye", "ftheta_p0", "latlong", "equirectangular")
+_SAME_FOCAL = 0.02  # share by which two focal lengths of one camera may differ
+_OUTSIDE = 0.9  # share of a side beyond which a principal point is another image's
+_LEAST_CAMERAS = 4  # of which can be told whether they look at something in common
+_MEET, _MISS = 0.15, 0.5  # miss of the axes in shares of the distance: they meet in a point, they do not
+_CAMERA_WORDS = re.compile(r"(cam|camera|view|sensor|c|v)[_-]?$", re.IGNORECASE)
+
+
+def camera_of(
+    entry: Entry,
+    stored: tuple[int, int],
+    scale: int,
+    image: Path,
+    *,
+    pose: torch.Tensor,
+    longer: bool = False,
+) -> Camera:
+    """Read the camera of an image of ``stored`` pixels (width, height), its near and far 0.
+
+    Args:
+        entry: whose intrinsics are of an image ``scale`` times as large.
+        stored: width and height of the image on disk.
+        scale: see ``entry``.
+        image: file of the image, for errors.
+        pose: camera-to-world (4, 4) with OpenCV's axes.
+        longer: ``camera_angle_x`` is the angle of the longer side, as Blender's is (sensor fit AUTO).
+
+    Raises:
+        SceneError: for a key that is missing, wrong or contradicts another, for a lens that is no pinhole
+            with Brown's distortion or cannot be undone, and for intrinsics of a larger image.
+    """
+    model = entry.get("camera_model", "OPENCV")
+    for key in _OTHER_LENSES:
+        if entry.get(key) not in (None, False, 0):
+            raise mismatch(
+                entry.where(key), "a pinhole camera", short(entry.get(key)), "undistort the images"
+            )
+    if model not in MODELS:
+        expected = f"one of {', '.join(MODELS)}"
+        raise mismatch(entry.where("camera_model"), expected, short(model), "undistort the images")
+    sizes = [entry.number(key, 1, 1e6, n * scale) for key, n in zip("wh", stored)]
+    if any(abs(n - size / scale) >= 1 for n, size in zip(stored, sizes)):
+        expected = " x ".join(f"{size / scale:g}" for size in sizes)
+        raise mismatch(image, f"{expected} pixels as {entry.where('w')} and h say", by(stored))
+    width, height = map(round, sizes)
+    fx = _focal(entry, width, height, longer)
+    fy = entry.number("fl_y", 0.01 * height, 100 * height, fx)
+    cx, cy = (entry.number(key, -n, 2 * n, n / 2) for key, n in (("cx", width), ("cy", height)))
+    if entry.get("w") is None and (cx >= _OUTSIDE * width or cy >= _OUTSIDE * height):
+        got = f"({cx:g}, {cy:g}) of images of {by(stored)} pixels"
+        advice = "they are of larger images: divide fl_x, fl_y, cx and cy by how many times these are smaller"
+        raise mismatch(entry.where("cx"), "a principal point inside the image", got, advice)
+    k = tuple(entry.number(key, -1e6, 1e6, 0.0) for key in ("k1", "k2", "k3"))
+    p = tuple(entry.number(key, -1e6, 1e6, 0.0) for key in ("p1", "p2"))
+    if entry.number("k4", default=0.0) != 0:
+        raise mismatch(entry.where("k4"), "0", entry.get("k4"), "undistort the images")
+    lens = Lens(k, p) if any(k + p) else None
+    camera = Camera(width, height, fx, fy, cx, cy, pose, 0.0, 0.0, lens=lens)
+    camera = camera.resized(*stored) if (width, height) != tuple(stored) else camera
+    check_lens(camera, entry.where("k1"))
+    return camera
+
+
+def _focal(entry: Entry, width: int, height: int, longer: bool) -> float:
+    """Return the horizontal focal length in pixels, from ``fl_x``, ``fl_y`` or ``camera_angle_x``."""
+    angle, least, most = entry.get("camera_angle_x"), 0.01 * width, 100 * width
+    named = next((key for key in ("fl_x", "fl_y") if entry.get(key) is not None), None)
+    if named is None and angle is None:
+        raise mismatch(entry.where("fl_x"), "fl_x or camera_angle_x", "neither")
+    if angle is not None:
+        angle = entry.number("camera_angle_x", 0, math.pi)
+        if angle in (0, math.pi):
+            raise mismatch(entry.where("camera_angle_x"), "radians inside (0, pi)", angle)
+    half = None if angle is None else 2 * math.tan(0.5 * angle)
+    if named is None:
+        return (max(width, height) if longer else width) / half
+    focal = entry.number(named, least, most)
+    same_place = ("camera_angle_x" in entry.own) == (named in entry.own)
+    agrees = half is None or any(abs(side / half / focal - 1) < _SAME_FOCAL for side in (width, height))
+    if same_place and not agrees:  # else a frame's own number stands for that of all
+        told = 2 * math.atan(0.5 * width / focal)
+        expected = f"{told:.4g} radians ({math.degrees(told):.1f} degrees), as {named} says"
+        got = f"{angle:.4g} ({math.degrees(angle):.1f} degrees)"
+        raise mismatch(entry.where("camera_angle_x"), expected, got, "remove the one that is wrong")
+    return focal
+
+
+def pose_in(entry: Entry, axes: str | None, inverse: bool) -> torch.Tensor:
+    """Read a frame's ``transform_matrix``: camera-to-world (4, 4) float64 with OpenCV's axes.
+
+    Args:
+        entry: the frame.
+        axes: of the camera in the file: opengl (or None) or opencv.
+        inverse: the file's matrix is world-to-camera.
+    """
+    pose = pose_of(entry.own.get("transform_matrix"), entry.where("transform_matrix"))
+    pose = np.linalg.inv(pose) if inverse else pose
+    return torch.from_numpy(pose if axes == "opencv" else pose @ FLIP)
+
+
+def check_axes(axes: object, inverse: object) -> None:
+    """Refuse values of ``data.axes`` and ``data.inverse`` that ``pose_in`` does not know."""
+    if axes is not None and axes not in AXES:
+        raise mismatch("data.axes", f"{' or '.join(AXES)}, or null", repr(axes))
+    if not isinstance(inverse, bool):
+        raise mismatch("data.inverse", "true or false", repr(inverse))
+
+
+def check_directions(poses: Sequence[torch.Tensor], where: str, *, inverse: bool) -> None:
+    """Refuse poses that make sense only if they were written in another way than assumed.
+
+    Args:
+        poses: as ``pose_in`` reads them where ``data.axes`` is null.
+        where: the file, for errors.
+        inverse: whether they were taken for world-to-camera matrices.
+
+    Raises:
+        SceneError: if all cameras look away from one point, as OpenCV's axes read as OpenGL's do, or have
+            nothing in common but their inverses have: naming the key that mends it.
+    """
+    if len(poses) < _LEAST_CAMERAS:
+        return
+    miss, ahead = _meeting(torch.stack(list(poses)))
+    if miss < _MEET and ahead == 0:
+        raise mismatch(
+            where,
+            "cameras that look at what they surround (OpenGL's axes: x right, y up, looking along -z)",
+            "cameras that all look away from one point",
+            "set data.axes=opencv, or data.axes=opengl if they do look outwards",
+        )
+    if miss < _MISS or inverse:
+        return
+    for axes, flip in (("opengl", torch.from_numpy(FLIP)), ("opencv", torch.eye(4, dtype=torch.float64))):
+        # What was read as ``matrix @ FLIP`` is taken back, inverted, and given these axes.
+        others = torch.linalg.inv(torch.stack(list(poses)) @ torch.from_numpy(FLIP)) @ flip
+        miss, ahead = _meeting(others)
+        if miss < _MEET and ahead == 1:
+            raise mismatch(
+                where,
+                "camera-to-world matrices",
+                "cameras that look at nothing in common, as their inverses do",
+                f"set data.inverse=true data.axes={axes}, or data.axes=opengl if they are right",
+            )
+
+
+def _meeting(poses: torch.Tensor) -> tuple[float, float]:
+    """Tell how well the optical axes of poses (N, 4, 4) meet in one point, and for how many it lies ahead.
+
+    Return the median distance of the point from the axes in shares of that from the cameras (infinite where
+    axes are nearly parallel or cameras stand in one place), and the share of cameras before which it lies.
+    """
+    centers, axes = poses[:, :3, 3], poses[:, :3, 2]
+    across = torch.eye(3, dtype=torch.float64) - axes[:, :, None] * axes[:, None, :]
+    normal = across.sum(0)
+    if float(torch.linalg.eigvalsh(normal)[0]) < 0.02 * len(poses):  # nearly parallel
+        return math.inf, 0.5
+    point = torch.linalg.solve(normal, (across @ centers[:, :, None]).sum(0)[:, 0])
+    away = point - centers
+    distance = away.norm(dim=-1)
+    if float(distance.median()) < 1e-9 * (1 + float(centers.abs().max())):
+        return math.inf, 0.5
+    miss = (across @ away[:, :, None])[..., 0].norm(dim=-1) / distance.clamp(min=1e-12)
+    return float(miss.median()), float(((away * axes).sum(-1) > 0).double().mean())
+
+
+def image_of(entry: Entry, key: str = "file_path") -> Path:
+    """Find the image that a key names, with or without its suffix; PNG where none is there."""
+    return with_suffix(entry.path(key))
+
+
+def with_suffix(path: Path) -> Path:
+    """Find an image whose suffix a path may leave out; a PNG where none is there."""
+    if path.suffix in SUFFIXES:
+        return path
+    named = [path.with_name(path.name + suffix) for suffix in SUFFIXES]
+    return next((candidate for candidate in named if os.path.isfile(candidate)), named[0])
+
+
+def hold_out_every(things: Sequence[Thing], every: int) -> tuple[list[Thing], list[Thing]]:
+    """Split things in the order of time: each ``every``-th is held out, the first and the last never.
+
+    >>> hold_out_every(range(10), 4)
+    ([0, 1, 3, 4, 5, 7, 8, 9], [2, 6])
+    """
+    held, kept = slice(max(1, min(every // 2, len(things) - 2)), -1, every), list(things)
+    del kept[held]
+    return kept, list(things[held])
+
+
+def those_there(things: Sequence[Thing], images: Sequence[Path], where: str) -> tuple[list[Thing], list[str]]:
+    """Leave out what has no image, and say so.
+
+    Args:
+        things: one for each of ``images``.
+        images: files that should be there.
+        where: the file that lists them.
+
+    Returns:
+        the things whose image is there, and lines that say what was assumed.
+
+    Raises:
+        SceneError: where no image is there.
+    """
+    there = [os.path.isfile(image) for image in images]
+    if all(there):
+        return list(things), []
+    missing = images[there.index(False)]
+    if not any(there):
+        raise mismatch(where, f"the images that it lists, as {missing}", "none of them")
+    count = f"{there.count(False)} of {len(there)}"
+    line = f"{where}: {count} images are not there and left out ({missing.name}, ..)"
+    return [thing for thing, is_there in zip(things, there) if is_there], [line]
+
+
+def times_of(
+    names: Sequence[str], times: Sequence[float | None], where: str
+) -> tuple[list[float], str | None]:
+    """Give each image a time in [0, 1], where the file has none by the numbers in the images' names.
+
+    Where folders or names tell several cameras apart, images of one number share a time.
+
+    Args:
+        names: paths of the images without suffix, ``cam01/0003``; of all splits together.
+        times: what the file says.
+        where: the file, for errors.
+
+    Returns:
+        the times, and a line that says what was assumed; None if the file has all times.
+
+    Raises:
+        SceneError: if only some images have a time.
+
+    >>> times_of(["a/0001", "a/0003", "b/0001", "b/0003"], [None] * 4, "t.json")[0]
+    [0.0, 1.0, 0.0, 1.0]
+    """
+    given = [time is not None for time in times]
+    if all(given):
+        return list(times), None
+    if any(given):
+        got = f"{sum(given)} of {len(given)}, and none for {names[given.index(False)]}"
+        raise mismatch(f"{where}: frames: time", "one in all frames or in none", got)
+    numbers = _numbers(names)
+    if numbers is None:
+        order = sorted(range(len(names)), key=lambda i: _natural(names[i]))
+        ranks = {i: rank for rank, i in enumerate(order)}
+        last = max(len(names) - 1, 1)
+        line = f"{where}: no time in the frames: spread evenly in the order of the images' names"
+        return [ranks[i] / last for i in range(len(names))], line
+    first, last = min(numbers), max(numbers)
+    line = f"{where}: no time in the frames: taken from the numbers in the images' names, {first} to {last}"
+    if len(set(numbers)) < len(numbers):
+        line += "; images of one number share a time"
+    return [(number - first) / max(last - first, 1) for number in numbers], line
+
+
+def _natural(name: str) -> list:
+    return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)]
+
+
+def _numbers(names: Sequence[str]) -> list[int] | None:
+    """Return each name's frame number; None where names do not tell."""
+    parts = [re.split(r"(\d+)", PurePosixPath(name).as_posix()) for name in names]
+    if len({len(part) for part in parts}) > 1:
+        parts = [part[-3:] if len(part) >= 3 else part for part in parts]  # folders may be called differently
+        if any(len(part) < 3 for part in parts):
+            return None
+    places = [i for i in range(1, len(parts[0]), 2) if len({part[i] for part in parts}) > 1]
+    frames = [i for i in places if not all(_CAMERA_WORDS.search(part[i - 1]) for part in parts)]
+    if not frames:
+        return None
+    numbers = [int(part[frames[-1]]) for part in parts]
+    others = [
+        tuple(name.split("/")[:-1]) + tuple(p for i, p in enumerate(part) if i != frames[-1])
+        for name, part in zip(names, parts)
+    ]
+    # Of one camera no number may come twice, or it is no frame's.
+    return numbers if len({*zip(others, numbers)}) == len(names) else None

@@ -1,0 +1,194 @@
+"""What any program may write into a transforms.json: read rightly, or refused with the key that mends it."""
+
+import json
+import math
+import shutil
+
+import numpy as np
+import pytest
+import torch
+
+from forewarp.data import dnerf, posed_video
+from forewarp.data.cameras import FLIP
+from forewarp.data.files import Entry, SceneError, layout_of
+from forewarp.data.module import DNeRFDataModule, check_seen
+from forewarp.data.transforms import camera_of, check_directions, times_of
+from forewarp.scene.camera import look_at
+from tests.support.written_scenes import edit, write_dnerf
+
+EYE = torch.eye(4, dtype=torch.float64)
+WIDE = 2 * math.atan(0.5)  # of images as wide as their focal length
+
+
+def camera(stored=(80, 60), common=None, **own):
+    return camera_of(Entry("t.json", own, "frames[0].", common or {}), stored, 1, "a.png", pose=EYE)
+
+
+@pytest.mark.parametrize(
+    ("keys", "fx", "fy", "cx"),
+    [
+        ({"camera_angle_x": WIDE}, 80, 80, 40),
+        ({"camera_angle_x": WIDE, "fl_x": 80.5}, 80.5, 80.5, 40),
+        ({"fl_x": 90, "fl_y": 70, "cx": 50}, 90, 70, 50),
+        ({"fl_x": 90, "common": {"camera_angle_x": WIDE}}, 90, 90, 40),  # a frame's own number wins
+    ],
+)
+def test_one_reading_of_intrinsics(keys, fx, fy, cx):
+    made = camera(**keys)
+    assert (made.fx, made.fy, made.cx) == pytest.approx((fx, fy, cx))
+
+
+def test_an_angle_of_upright_images_is_of_the_width_or_as_told():
+    entry = Entry("t.json", {"camera_angle_x": WIDE})
+    for longer, focal in ((False, 60), (True, 80)):
+        assert camera_of(entry, (60, 80), 1, "a.png", pose=EYE, longer=longer).fx == pytest.approx(focal)
+    assert camera((60, 80), fl_x=80, camera_angle_x=WIDE).fx == 80  # fl_x tells which side it is of
+
+
+@pytest.mark.parametrize(
+    ("keys", "said"),
+    [
+        ({"camera_angle_x": WIDE, "fl_x": 120}, "camera_angle_x: expected .* as fl_x says, but got .*remove"),
+        ({"fl_x": 300, "cx": 160, "cy": 120}, r"cx: expected a principal point inside .*larger images"),
+        ({"fl_x": 80, "is_fisheye": True}, "is_fisheye: expected a pinhole camera"),
+        ({}, "expected fl_x or camera_angle_x, but got neither"),
+    ],
+)
+def test_intrinsics_that_cannot_be_right_are_named(keys, said):
+    with pytest.raises(SceneError, match=said):
+        camera(**keys)
+
+
+@pytest.mark.parametrize(
+    ("names", "times"),
+    [
+        (["images/0001", "images/0002", "images/0005"], [0, 0.25, 1]),
+        (["cam00/0003", "cam00/0007", "cam01/0003", "cam01/0007"], [0, 1, 0, 1]),
+        (["f_001_cam0", "f_001_cam1", "f_002_cam0", "f_002_cam1"], [0, 0, 1, 1]),
+        (["images_train/0001", "images_train/0005", "images_test/0003"], [0, 1, 0.5]),
+        (["b", "a", "c"], [0.5, 0, 1]),
+        (["a/1", "a/01", "b/7"], [0.0, 0.5, 1.0]),  # one number twice: no frame's
+    ],
+)
+def test_times_that_a_file_does_not_tell_are_in_the_names(names, times):
+    found, told = times_of(names, [None] * len(names), "t.json")
+    assert sorted(found) == pytest.approx(sorted(times))
+    assert found == pytest.approx(times) or names[0] == "a/1"
+    assert told.startswith("t.json: no time in the frames: ")
+    assert times_of(names, times, "t.json") == (times, None)
+
+
+def around(count=8):
+    angles = [2 * math.pi * i / count for i in range(count)]
+    places = [torch.tensor([4 * math.cos(a), 4 * math.sin(a), 1.5], dtype=torch.float64) for a in angles]
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    return [look_at(place, torch.zeros(3, dtype=torch.float64), up).double() for place in places]
+
+
+def test_poses_written_in_another_way_are_recognised():
+    flip, right = torch.from_numpy(FLIP), around()
+    check_directions(right, "t.json", inverse=False)
+    with pytest.raises(SceneError, match="look away from one point; set data.axes=opencv"):
+        check_directions([pose @ flip for pose in right], "t.json", inverse=False)
+    for axes, stored in (("opencv", right), ("opengl", [pose @ flip for pose in right])):
+        misread = [torch.linalg.inv(pose) @ flip for pose in stored]
+        with pytest.raises(SceneError, match=f"set data.inverse=true data.axes={axes}"):
+            check_directions(misread, "t.json", inverse=False)
+    in_a_row = [right[0].clone() for _ in range(6)]
+    for i, pose in enumerate(in_a_row):
+        pose[:3, 3] += i * pose[:3, 0]
+    check_directions(in_a_row, "t.json", inverse=False)
+
+
+@pytest.mark.parametrize("axes", ["opencv", "opengl"])
+def test_keys_mend_poses_written_in_another_way(axes, tmp_path):
+    write_dnerf(tmp_path / "toy")
+    expected = dnerf.read_scene(tmp_path, "toy")
+
+    def rewrite(content):
+        for frame in content["frames"]:
+            pose = np.array(frame["transform_matrix"])
+            frame["transform_matrix"] = np.linalg.inv(pose @ FLIP if axes == "opencv" else pose).tolist()
+
+    for split in ("train", "val", "test"):
+        edit(tmp_path / "toy" / f"transforms_{split}.json", rewrite)
+    scene = dnerf.read_scene(tmp_path, "toy", axes=axes, inverse=True)
+    for frame, other in zip(scene.train, expected.train):
+        torch.testing.assert_close(frame.camera.camera_to_world, other.camera.camera_to_world)
+
+
+def test_what_is_not_there_is_left_out_and_told(tmp_path):
+    folder = write_dnerf(tmp_path / "toy", size=(6, 8))
+    (folder / "train" / "r_1.png").unlink()
+    shutil.rmtree(folder / "test")
+    scene = dnerf.read_scene(tmp_path, "toy")
+    assert len(scene.train) + len(scene.test) == 3
+    assert len(scene.test) == 1
+    first, second, third = scene.protocol["assumed"]
+    assert "1 of 4 images are not there and left out (r_1.png" in first
+    assert "transforms_test.json: none of its 3 images is there" in second
+    assert "every 8th training image is tested on instead (1; data.test_every)" in third
+    (folder / "transforms_test.json").unlink()
+    assert len(dnerf.read_scene(tmp_path, "toy").test) == 1
+    shutil.rmtree(folder / "train")
+    with pytest.raises(
+        SceneError, match="expected the images that it lists, as .*r_0.png, but got none of them"
+    ):
+        dnerf.read_scene(tmp_path, "toy")
+
+
+def moved(folder, shift, factor):
+    for file in folder.glob("transforms_*.json"):
+        content = json.loads(file.read_text())
+        for frame in content["frames"]:
+            for row, by in zip(frame["transform_matrix"], shift):
+                row[3] = factor * row[3] + by
+        file.write_text(json.dumps(content))
+
+
+@pytest.mark.parametrize(
+    ("shift", "factor"), [((7, -3, 1), 1), ((0, 0, 0), 3.5), ((0, 0, 0), 1e6), ((0, 0, 0), 1e-6)]
+)
+def test_a_scene_of_other_units_is_moved_to_where_the_published_ones_are(shift, factor, tmp_path):
+    folder = tmp_path / "toy"
+    poses = around(12)
+    shots = [
+        dnerf.Shot(f"r_{i}", i / 11, pose, np.full((8, 8, 4), 200, np.uint8)) for i, pose in enumerate(poses)
+    ]
+    dnerf.write_scene(folder, {"train": shots, "test": shots[:2]}, camera_angle_x=0.7)
+    as_is = dnerf.read_scene(tmp_path, "toy", box="auto")
+    assert (as_is.train[0].camera.near, as_is.train[0].camera.far) == (2, 6)
+    assert as_is.box.high == (1.5, 1.5, 1.5)
+    moved(folder, shift, factor)
+    scene = dnerf.read_scene(tmp_path, "toy", box="auto")
+    check_seen(scene)
+    distances = [float(frame.camera.center.norm()) for frame in scene.train]
+    assert distances == pytest.approx([4.0] * 12, rel=1e-4)
+    assert max(map(abs, (*scene.box.low, *scene.box.high))) < 8
+    with pytest.raises(SceneError, match=r"expected a box that cameras see .*cameras look at \("):
+        _ = DNeRFDataModule(tmp_path, "toy", box=[v * factor for v in (30, 30, 30, 31, 31, 31)]).scene
+
+
+def test_images_with_and_without_alpha_are_not_mixed(tmp_path):
+    from forewarp.data.images import write_image
+
+    write_dnerf(tmp_path / "toy")
+    write_image(tmp_path / "toy" / "train" / "r_2.png", np.zeros((6, 8, 3), np.uint8))
+    with pytest.raises(SceneError, match=r"in all images or in none, but got 1 of 9 without, as .*r_2.png"):
+        dnerf.read_scene(tmp_path, "toy")
+
+
+def test_files_of_windows_and_images_of_any_suffix(tmp_path):
+    folder = write_dnerf(tmp_path / "toy")
+    (folder / "train" / "r_0.png").rename(folder / "train" / "r_0.PNG")
+    edit(folder / "transforms_train.json", {"frames.1.file_path": "train\\r_1.png"})
+    file = folder / "transforms_train.json"
+    file.write_bytes(b"\xef\xbb\xbf" + file.read_bytes())
+    assert [frame.name for frame in dnerf.read_scene(tmp_path, "toy").train][:2] == ["train/r_0", "train/r_1"]
+
+
+def test_another_layout_is_named(tmp_path):
+    write_dnerf(tmp_path / "toy")
+    assert layout_of(tmp_path / "toy") == "D-NeRF"
+    with pytest.raises(SceneError, match="this is a scene in the layout of D-NeRF: use experiment=dnerf"):
+        posed_video.read_scene(tmp_path, "toy")
