@@ -125,15 +125,17 @@ def load_numpy(path: Path) -> np.ndarray | dict[str, np.ndarray]:
     with opened(path, MOST_ARRAYS, "a NumPy file") as stream:
         try:
             if zipfile.is_zipfile(stream):
-                unpacked = sum(part.file_size for part in zipfile.ZipFile(stream).infolist())
+                with zipfile.ZipFile(stream) as archive:
+                    unpacked = sum(part.file_size for part in archive.infolist())
                 if unpacked > MOST_ARRAYS:
                     raise ValueError(f"{unpacked} bytes unpacked")
+                stream.seek(0)
+                with np.load(
+                    stream, allow_pickle=False
+                ) as loaded:  # NumPy's own file would stay open on errors
+                    return dict(loaded)
             # Mapped, so that a header which declares more than the file holds is refused without allocation.
-            loaded = np.load(path, mmap_mode="r", allow_pickle=False)
-            if isinstance(loaded, np.ndarray):
-                return loaded
-            with loaded:
-                return dict(loaded)
+            return np.load(path, mmap_mode="r", allow_pickle=False)
         except Exception as error:  # OSError, ValueError, MemoryError, BadZipFile, zlib.error and more
             got = f"one that cannot be read ({short(str(error))})"
             raise mismatch(path, "a NumPy file", got) from error
