@@ -64,6 +64,9 @@ def locked(folder: Path) -> Iterator[None]:
         except OSError as error:
             if isinstance(error, Timeout) or error.errno != errno.ENOSYS:  # ENOSYS: no locks here
                 raise
+        for part in folder.rglob(".*.part*"):  # of killed processes, as nobody else works here
+            if part.is_file():
+                part.unlink()
         replace_file(holder, f"process {os.getpid()} on {socket.gethostname()}\n")
     except Timeout:
         try:
