@@ -42,9 +42,6 @@ def written_whole(path: Path, *, synced: bool = False) -> Iterator[Path]:
     beside = path.with_name(f".{path.name}.{secrets.token_hex(8)}.part{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        if synced:  # large: what killed processes left is not kept
-            for old in filter(_is_left, path.parent.glob(f".{glob.escape(path.name)}.*.part{path.suffix}")):
-                old.unlink()
         os.close(os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_NOFOLLOW", 0), 0o666))
         yield beside
         if synced:
@@ -107,7 +104,7 @@ def folder_written_whole(path: Path, mark: str) -> Iterator[Path]:
 
 
 def _is_left(part: Path) -> bool:
-    """Whether a half-written file or folder is so old that the call that wrote it was killed."""
+    """Whether a half-filled folder is so old that the call that filled it was killed."""
     with suppress(OSError):
         return time.time() - part.stat().st_mtime > _LEFT
     return False

@@ -1,9 +1,11 @@
 """What all readers share: numbers, poses, boxes; what is too large or leads out; fingerprints of files."""
 
+import gc
 import io
 import os
 import struct
 import tracemalloc
+import warnings
 import zipfile
 import zlib
 from contextlib import contextmanager
@@ -173,6 +175,16 @@ def test_of_a_film_one_image_is_decoded(tmp_path):
         assert read_gray16(tmp_path / "b.png").shape == (512, 512)
     (tmp_path / "a.png").write_bytes(png_with(size(4, 4), ROWS, size(BIG, BIG)))  # nothing behind the pixels
     assert read_image(tmp_path / "a.png").shape == (4, 4, 4)
+
+
+def test_what_only_begins_as_an_archive_is_refused_and_closed(tmp_path):
+    (tmp_path / "a.npz").write_bytes(b"PK\x03\x04 and no more")
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        with pytest.raises(SceneError, match="a.npz: expected a NumPy file"):
+            load_numpy(tmp_path / "a.npz")
+        gc.collect()
+    assert [str(warning.message) for warning in told if "a.npz" in str(warning.message)] == []
 
 
 def test_files_are_bounded_by_their_size(tmp_path, monkeypatch):

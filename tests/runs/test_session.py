@@ -95,3 +95,13 @@ def test_data_that_changed_are_refused_unless_accepted(tmp_path, capsys):
     check_data(run, "refuse")  # it was accepted once for all
     data = None  # a scene without files
     check_data(run, "refuse")
+
+
+def test_what_a_killed_process_left_is_removed_but_not_what_may_be_written_now(tmp_path):
+    left = [tmp_path / "fine" / ".last.ckpt.0a.part.ckpt", tmp_path / ".metrics.json.0b.part.json"]
+    now = [tmp_path / "videos" / ".orbit.mp4.0c.part.mp4", tmp_path / ".page.html.0d.part.html"]
+    for file in (*left, *now):
+        file.parent.mkdir(exist_ok=True)
+        file.touch()
+    with locked(tmp_path):
+        assert [file.exists() for file in (*left, *now)] == [False, False, True, True]

@@ -330,8 +330,6 @@ def put(changes):
             path.write_bytes(content)
 
 
-# A library that gives up on a harmed file may leave it to the collector to close.
-@pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.parametrize("name", [*FORMATS, "config", "checkpoint"])
 def test_harmed_files_are_read_or_refused_in_one_line(loaders, bounded, name):
     loader, outcomes = loaders[name], Counter()

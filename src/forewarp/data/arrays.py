@@ -130,12 +130,11 @@ def load_numpy(path: Path) -> np.ndarray | dict[str, np.ndarray]:
                 if unpacked > MOST_ARRAYS:
                     raise ValueError(f"{unpacked} bytes unpacked")
                 stream.seek(0)
-                with np.load(
-                    stream, allow_pickle=False
-                ) as loaded:  # NumPy's own file would stay open on errors
+                with np.load(stream, allow_pickle=False) as loaded:
                     return dict(loaded)
-            # Mapped, so that a header which declares more than the file holds is refused without allocation.
-            return np.load(path, mmap_mode="r", allow_pickle=False)
+            # Mapped, so that a header that declares more than the file holds is refused without allocation.
+            # np.load would leave a file open that begins as an archive and is none.
+            return np.lib.format.open_memmap(path, mode="r")
         except Exception as error:  # OSError, ValueError, MemoryError, BadZipFile, zlib.error and more
             got = f"one that cannot be read ({short(str(error))})"
             raise mismatch(path, "a NumPy file", got) from error

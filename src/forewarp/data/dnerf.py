@@ -40,10 +40,10 @@ from forewarp.data.transforms import (
     check_axes,
     check_directions,
     hold_out_every,
-    image_of,
     pose_in,
-    those_there,
     times_of,
+    with_images,
+    with_suffix,
 )
 from forewarp.files import write_json
 from forewarp.scene.box import Box
@@ -182,7 +182,7 @@ def _space(
         return space_of(cameras, where, **options, radius=_RADIUS)
     near, far = _NEAR if near is None else near, _FAR if far is None else far
     if not near < far:
-        raise mismatch("data.near, data.far", "near < far", f"{near} and {far}")
+        raise mismatch("data.near, data.far", "near < far", f"{near:g} and {far:g}")
     space = Normalisation((0.0, 0.0, 0.0), 1.0, near, far)
     if box == "auto":
         return space, box_of(_BOX)
@@ -261,9 +261,9 @@ def _read_file(
     """Read a transforms file; without its images where it is of a test split that was never rendered."""
     content, records = read_json(path), []
     entries = frames_of(path, content, content | {"ability": ability})
-    images = [image_of(entry) for entry in entries]
+    images = [with_suffix(entry.path("file_path")) for entry in entries]
     if ability != "all" or path.stem == "transforms_train" or any(os.path.isfile(i) for i in images):
-        there, assumed = those_there(list(zip(entries, images)), images, str(path))
+        there, assumed = with_images(list(zip(entries, images)), images, str(path))
     else:
         there, assumed = [], [f"{path}: none of its {len(images)} images is there: left out"]
     for entry, image in there:
@@ -279,7 +279,7 @@ def _read_file(
         header = inspect_image(image)
         pose = pose_in(entry, axes, inverse)
         camera = camera_of(entry, header.size, 1, image, pose=pose, longer=longer)
-        by_angle = entry.get("fl_x") is None
+        by_angle = entry.get("fl_x") is None and entry.get("fl_y") is None
         records.append(_Record(time, camera, image, header.has_alpha, depth, ability, by_angle))
     return records, assumed
 

@@ -19,15 +19,15 @@ from torch import Tensor
 from forewarp.data.arrays import read_cloud, write_array
 from forewarp.data.cameras import MOST_UNITS, SPLITS, box_of, opengl_rows, space_of
 from forewarp.data.files import frames_of, inside, mismatch, number, read_json, remove, scene_folder, whole
-from forewarp.data.images import SUFFIXES, StoredImage, check_pixels, in_order, inspect_image, write_image
+from forewarp.data.images import SUFFIXES, StoredImage, check_pixels, inspect_image, write_image
 from forewarp.data.transforms import (
     camera_of,
     check_axes,
     check_directions,
     hold_out_every,
     pose_in,
-    those_there,
     times_of,
+    with_images,
     with_suffix,
 )
 from forewarp.files import write_json
@@ -104,7 +104,7 @@ def read_scene(
     entries, absent, assumed = _read_entries(file, content, scale, axes, inverse)
     times, told = times_of([entry.name for entry in entries], [entry.time for entry in entries], str(file))
     entries = [replace(entry, time=time) for entry, time in zip(entries, times)]
-    entries = sorted(in_order(entries, lambda entry: entry.name) if told else entries, key=lambda e: e.time)
+    entries.sort(key=lambda entry: entry.time)
     parts, how = _split_entries(file, content, entries, test_every, absent)
     near, far = (_length(file, content, key, value) for key, value in (("near", near), ("far", far)))
     bounds = _bounds(file, content, box)
@@ -123,7 +123,7 @@ def read_scene(
     protocol = {
         "dataset": "video_with_poses",
         "resolution": [train[0].camera.width, train[0].camera.height],
-        "times": "as given" if told is None else "made up",
+        "times": "as given" if told is None else "from the images' names",
         "split": how,
         "test_frames": len(test),
         "normalisation": {"center": list(space.center), "scale": space.scale},
@@ -173,7 +173,7 @@ def _read_entries(
     """
     frames = frames_of(file, content, content)
     images = [_file(entry, "file_path", scale) for entry in frames]
-    there, assumed = those_there(list(zip(frames, images)), images, str(file))
+    there, assumed = with_images(list(zip(frames, images)), images, str(file))
     absent = {_name_of(file.parent, f.own.get("file_path"), f.where("file_path")) for f in frames}
     entries = []
     for entry, image in there:

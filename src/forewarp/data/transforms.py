@@ -11,7 +11,7 @@ import math
 import os
 import re
 from collections.abc import Sequence
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from reprlib import repr as short
 from typing import TypeVar
 
@@ -20,7 +20,7 @@ import torch
 
 from forewarp.data.cameras import FLIP, check_lens, pose_of
 from forewarp.data.files import Entry, mismatch
-from forewarp.data.images import SUFFIXES, by
+from forewarp.data.images import SUFFIXES, by, in_order
 from forewarp.scene.camera import Camera, Lens
 
 Thing = TypeVar("Thing")
@@ -173,10 +173,10 @@ def check_directions(poses: Sequence[torch.Tensor], where: str, *, inverse: bool
 
 
 def _meeting(poses: torch.Tensor) -> tuple[float, float]:
-    """Tell how well the optical axes of poses (N, 4, 4) meet in one point, and for how many it lies ahead.
+    """Return how far the optical axes of poses (N, 4, 4) miss a common point, and for how many it is ahead.
 
-    Return the median distance of the point from the axes in shares of that from the cameras (infinite where
-    axes are nearly parallel or cameras stand in one place), and the share of cameras before which it lies.
+    The first is the median over cameras of the point's distance from the axis over its distance from the
+    camera, infinite where axes are nearly parallel or cameras stand in one place; the second is a share.
     """
     centers, axes = poses[:, :3, 3], poses[:, :3, 2]
     across = torch.eye(3, dtype=torch.float64) - axes[:, :, None] * axes[:, None, :]
@@ -190,11 +190,6 @@ def _meeting(poses: torch.Tensor) -> tuple[float, float]:
         return math.inf, 0.5
     miss = (across @ away[:, :, None])[..., 0].norm(dim=-1) / distance.clamp(min=1e-12)
     return float(miss.median()), float(((away * axes).sum(-1) > 0).double().mean())
-
-
-def image_of(entry: Entry, key: str = "file_path") -> Path:
-    """Find the image that a key names, with or without its suffix; PNG where none is there."""
-    return with_suffix(entry.path(key))
 
 
 def with_suffix(path: Path) -> Path:
@@ -216,7 +211,7 @@ def hold_out_every(things: Sequence[Thing], every: int) -> tuple[list[Thing], li
     return kept, list(things[held])
 
 
-def those_there(things: Sequence[Thing], images: Sequence[Path], where: str) -> tuple[list[Thing], list[str]]:
+def with_images(things: Sequence[Thing], images: Sequence[Path], where: str) -> tuple[list[Thing], list[str]]:
     """Leave out what has no image, and say so.
 
     Args:
@@ -270,7 +265,7 @@ def times_of(
         raise mismatch(f"{where}: frames: time", "one in all frames or in none", got)
     numbers = _numbers(names)
     if numbers is None:
-        order = sorted(range(len(names)), key=lambda i: _natural(names[i]))
+        order = in_order(range(len(names)), lambda i: names[i])
         ranks = {i: rank for rank, i in enumerate(order)}
         last = max(len(names) - 1, 1)
         line = f"{where}: no time in the frames: spread evenly in the order of the images' names"
@@ -282,13 +277,9 @@ def times_of(
     return [(number - first) / max(last - first, 1) for number in numbers], line
 
 
-def _natural(name: str) -> list:
-    return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)]
-
-
 def _numbers(names: Sequence[str]) -> list[int] | None:
     """Return each name's frame number; None where names do not tell."""
-    parts = [re.split(r"(\d+)", PurePosixPath(name).as_posix()) for name in names]
+    parts = [re.split(r"(\d+)", name) for name in names]
     if len({len(part) for part in parts}) > 1:
         parts = [part[-3:] if len(part) >= 3 else part for part in parts]  # folders may be called differently
         if any(len(part) < 3 for part in parts):

@@ -187,10 +187,8 @@ def check_values(config: DictConfig) -> None:
         raise ValueError(f"seed: expected a whole number in [0, {MOST_SEED}], but got {seed}")
     if type(config.get("evaluate", True)) is not bool:
         raise ValueError(f"evaluate: expected true or false, but got {config.evaluate}")
-    places = OmegaConf.create([weights]) if isinstance(weights, str) else weights
-    if places is not None and not (
-        OmegaConf.is_list(places) and all(isinstance(place, str) for place in places)
-    ):
+    places = weights if OmegaConf.is_list(weights) else [] if weights is None else [weights]
+    if not all(isinstance(place, str) for place in places):
         raise ValueError(
             f"lpips_weights: expected a file, a folder, a list of them or null, but got {weights}"
         )

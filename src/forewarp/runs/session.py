@@ -20,6 +20,7 @@ from forewarp.runs.config import IDENTITY, make_absolute, read_config
 from forewarp.runs.overrides import command_line, typed_overrides
 from forewarp.training.stages import Run
 
+UNLOCKED = ("videos", "exports", ".page")  # what is written into a run's folder while another may train it
 # Named first in a refusal, as other differences follow from these.
 _TYPED = ("model.name", "data.scene", "data.root", "seed", "preset", "budget")
 
@@ -64,8 +65,9 @@ def locked(folder: Path) -> Iterator[None]:
         except OSError as error:
             if isinstance(error, Timeout) or error.errno != errno.ENOSYS:  # ENOSYS: no locks here
                 raise
-        for part in folder.rglob(".*.part*"):  # of killed processes, as nobody else works here
-            if part.is_file():
+        # What a killed process left half-written; videos and exports may be written now, without the lock.
+        for part in (*folder.glob(".*.part*"), *folder.glob("*/**/.*.part*")):
+            if part.is_file() and not part.relative_to(folder).parts[0].startswith(UNLOCKED):
                 part.unlink()
         replace_file(holder, f"process {os.getpid()} on {socket.gethostname()}\n")
     except Timeout:
