@@ -12,8 +12,9 @@ WORST = ("failed", "skipped", "not run", "passed")
 HEAD = """# Conformance
 
 What each method was seen to do by the contract suite (`tests/contract`), on one scene of 20 pixels and 6
-times in the format of each dataset: D-NeRF, HyperNeRF, NHR, Lego Complete. Written by `make conformance`;
-do not edit. How a method joins: [extending](extending.md).
+times in the format of each dataset: D-NeRF, HyperNeRF, NHR, Lego Complete; what does not depend on the format
+(equal, stopped and killed runs, a voxel stage beside) in D-NeRF's alone. Written by `make conformance`; do
+not edit. How a method joins: [extending](extending.md).
 """
 
 
