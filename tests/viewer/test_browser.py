@@ -275,7 +275,13 @@ def test_two_runs_side_by_side(browser, fitted, particles, tmp_path):
 
 
 def test_a_run_is_seen_while_it_trains(browser, fitted, tmp_path):
-    command = [sys.executable, "-u", "-m", "forewarp.cli.train", *words(fitted, 600)]
+    command = [
+        sys.executable,
+        "-u",
+        "-m",
+        "forewarp.cli.train",
+        *words(fitted, 1800),
+    ]  # some 30 s: the page must come before the end
     command += [f"run={tmp_path}/run", "viewer=true", "port=0"]
     with open(tmp_path / "said", "w") as log:
         process = subprocess.Popen(command, stdout=log, stderr=log, cwd=tmp_path)
@@ -285,7 +291,7 @@ def test_a_run_is_seen_while_it_trains(browser, fitted, tmp_path):
             first = until(step_said, tab)
             before = tab.picture()
             tab.press("play")
-            until(lambda: (step_said(tab) or 0) > first + 50)
+            until(lambda: (step_said(tab) or 0) > first + 20)
             assert far(before, tab.picture()) > 1
         assert process.wait(180) == 0
     finally:
