@@ -137,7 +137,7 @@ def of(part):
     ("check", "line", "allowed"),
     [
         (above, "from forewarp.methods.method import Method", True),
-        (above, "from forewarp.methods.voxel.losses import TERMS", False),
+        (above, "from forewarp.methods.voxel.model import VoxelMethod", False),
         (above, "from forewarp.methods import voxel", False),
         (above, "def f():\n    import forewarp.methods.voxel.model", False),
         (above, "module.method.radiance.shape", False),

@@ -13,7 +13,7 @@ from forewarp.data import dnerf, hypernerf, nhr, posed_video
 from forewarp.data.module import SceneDataModule
 from forewarp.methods.particles.options import Effects
 from forewarp.methods.voxel.effects import LearnedUpsampler, UNet3d, ViewNetwork
-from forewarp.methods.voxel.losses import TERMS
+from forewarp.methods.voxel.forward import ForwardWarp
 from forewarp.methods.voxel.structure import VoxelStage
 from forewarp.renderer import Renderer
 from forewarp.runs.build import build_run
@@ -133,7 +133,7 @@ def test_budget_is_shared_out_and_every_weight_may_be_typed():
     assert [stage.settings.iterations for stage in stages] == [400, 600]
     coarse, fine = (stage.objective.weights for stage in stages)
     assert (coarse["tv_depth"], fine["tv_depth"], fine["flow_l1"]) == (0.5, 0.0, 0.25)
-    assert set(coarse) == set(TERMS)
+    assert set(coarse) == set(ForwardWarp.terms)
 
 
 @pytest.mark.parametrize(("dropped", "left"), [("~stage.fine", "coarse"), ("stage.coarse=null", "fine")])

@@ -12,7 +12,7 @@ from pathlib import Path
 import torch
 
 from forewarp.cli.entry import quiet
-from forewarp.methods.voxel.losses import TERMS
+from forewarp.methods.voxel.forward import ForwardWarp
 from forewarp.ops.march import warm_up
 from forewarp.ops.splat import average_splat
 from forewarp.runs.config_files import project_root
@@ -104,7 +104,7 @@ def goals_table(side: int = 80, rays: int = 8192, picture: int = 400, frame_side
 
 def free_table(side: int = 48, rays: int = 2048) -> str:
     """Time a step with each effect, relative to a step written by hand without the platform."""
-    photo, every = {"photo": 1.0}, dict.fromkeys(TERMS, 0.0)
+    photo, every = {"photo": 1.0}, dict.fromkeys(ForwardWarp.terms, 0.0)
     works = {
         "written without any of it": step_by_hand(side, rays),
         "everything off": step_with({}, side, rays, photo),

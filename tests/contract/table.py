@@ -93,7 +93,7 @@ WARP = {
     "view_dependence": VIEW,
     "upsampler": Effect(
         {"upsampler": partial(LearnedUpsampler, width=8)},
-        ((LearnedUpsampler, "residual"), (LearnedUpsampler, "alone"), (TrilinearUpsampler, "forward")),
+        ((LearnedUpsampler, "residual"), (LearnedUpsampler, "forward"), (TrilinearUpsampler, "forward")),
     ),
     "inpainter": Effect(
         {"inpainter": partial(UNet3d, width=16, levels=2)}, ((UNet3d, "features"), (UNet3d, "residual"))

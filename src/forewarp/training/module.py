@@ -42,7 +42,7 @@ class DynamicSceneModule(lightning.LightningModule):
     ) -> None:
         super().__init__()
         self.automatic_optimization = False
-        method.check(settings.name, (), objective.names)
+        method.check(settings.name, (), objective.names, objective.literal)
         self.method = method
         self.objective, self.settings = objective, settings
         self.curriculum = curriculum

@@ -1,4 +1,4 @@
-"""How a voxel method is made for a stage, and what it cannot be made from, by the name of the key."""
+"""How a voxel method is made for a stage, what it cannot be made from, and its loss terms."""
 
 from dataclasses import replace
 from functools import partial
@@ -6,13 +6,17 @@ from functools import partial
 import pytest
 import torch
 
+from forewarp import losses
 from forewarp.fields.curves import TrajectoryField
 from forewarp.methods.method import Start
 from forewarp.methods.voxel.effects import LearnedUpsampler, Motion, TrilinearUpsampler, UNet3d
-from forewarp.methods.voxel.losses import voxel_terms
-from forewarp.methods.voxel.structure import EFFECTS, VoxelStage
+from forewarp.methods.voxel.model import VoxelMethod, VoxelSnapshot
+from forewarp.methods.voxel.structure import EFFECTS
+from forewarp.ops.grid import neighbour_pairs
+from forewarp.renderer import Marched
 from forewarp.scene.box import Lattice
 from forewarp.scene.cloud import Handover
+from forewarp.scene.view import Moment
 from forewarp.training.handover import make_handover
 from tests.support.tiny_scene import (
     BOX,
@@ -23,6 +27,7 @@ from tests.support.tiny_scene import (
     RADIUS,
     backward_model,
     ball_center,
+    ball_data,
     ball_method,
     ball_scene,
     built,
@@ -30,26 +35,18 @@ from tests.support.tiny_scene import (
 )
 
 LATTICE = Lattice(BOX, (5, 4, 6))
-
-
-def build(model, effects=EFFECTS, **numbers):
-    return built(model, LATTICE, effects=effects, **numbers)
-
-
 FULL = forward_model(**EVERYTHING, trajectory=partial(TrajectoryField, bases=3, nodes=8, features=2))
 
 
 @pytest.mark.parametrize("effect", EFFECTS)
 def test_a_stage_uses_the_effects_that_it_names(effect):
-    method = build(FULL, [effect])
-    on = {name for name in EFFECTS if getattr(method, name) is not None}
-    assert on == {effect}
+    method = built(FULL, LATTICE, effects=[effect])
+    assert {name for name in EFFECTS if getattr(method, name) is not None} == {effect}
 
 
 def test_a_stage_may_interpolate_instead():
-    method = build(FULL, ["motion"], upsample=1.5)
-    assert type(method.upsampler) is TrilinearUpsampler
-    assert method.upsampler.scale == 1.5
+    upsampler = built(FULL, LATTICE, effects=["motion"], upsample=1.5).upsampler
+    assert (type(upsampler), upsampler.scale) == (TrilinearUpsampler, 1.5)
 
 
 SCENE = ball_scene(frames=6, size=16)
@@ -57,15 +54,14 @@ SCENE = ball_scene(frames=6, size=16)
 
 def fresh(model=None, scene=SCENE, frames=range(6), **numbers):
     """The method of a first stage."""
-    return (model or forward_model())(
-        Start(scene, "coarse", {"num_voxels": [[0, 1500]]} | numbers, list(frames))
-    )
+    numbers = {"num_voxels": [[0, 1500]]} | numbers
+    return (model or forward_model())(Start(scene, "coarse", numbers, list(frames)))
 
 
-def carried(before, handover, model=None, name="coarse", **numbers):
+def carried(before, handover, model=None, **numbers):
     """The method of a stage after another."""
     numbers = {"num_voxels": [[0, 1500]]} | numbers
-    return (model or forward_model())(Start(SCENE, name, numbers, range(6), handover, before))
+    return (model or forward_model())(Start(SCENE, "fine", numbers, range(6), handover, before))
 
 
 def left(method):
@@ -83,12 +79,11 @@ def test_a_fresh_method_starts_faint_everywhere(radiance):
 
 
 def test_the_hull_is_where_matter_may_be():
-    method = fresh(start="hull", hull_frames=2, hull_grow=0.1)
-    points = method.radiance.lattice.to_world(method.radiance.voxels)
-    everywhere = method.radiance.lattice.to_world(method.radiance.lattice.all_voxels())
+    radiance = fresh(start="hull", hull_frames=2, hull_grow=0.1).radiance
+    everywhere = radiance.lattice.to_world(radiance.lattice.all_voxels())
     ball_now = (everywhere - ball_center(0.0)).norm(dim=-1) < 0.8 * RADIUS
-    assert (method.radiance.index.flatten()[ball_now] >= 0).all()
-    assert len(points) < 0.5 * len(everywhere)
+    assert (radiance.index.flatten()[ball_now] >= 0).all()
+    assert len(radiance.voxels) < 0.5 * len(everywhere)
 
 
 def test_left_to_itself_it_starts_in_the_hull_where_there_is_alpha_and_in_the_box_elsewhere():
@@ -100,8 +95,8 @@ def test_left_to_itself_it_starts_in_the_hull_where_there_is_alpha_and_in_the_bo
 def test_the_hull_of_a_moment_is_that_of_all_its_views():
     frames = [replace(frame, time=0.0) for frame in SCENE.train[:3]]
     scene = replace(SCENE, train=(*frames, *SCENE.train[3:]))
-    one, three = (fresh(scene=scene, frames=range(4), start="hull", hull_frames=n) for n in (1, 3))
-    assert torch.equal(one.radiance.voxels, three.radiance.voxels)
+    first, all_three = (fresh(scene=scene, frames=range(4), start="hull", hull_frames=n) for n in (1, 3))
+    assert torch.equal(first.radiance.voxels, all_three.radiance.voxels)
 
 
 def test_what_only_waits_for_a_checkpoint_looks_at_no_picture():
@@ -109,11 +104,9 @@ def test_what_only_waits_for_a_checkpoint_looks_at_no_picture():
         raise AssertionError("a picture was loaded")
 
     scene = replace(SCENE, train=tuple(replace(frame, load=refuse) for frame in SCENE.train))
-    blank = Start(
-        scene, "fine", {"num_voxels": [[0, 1500]], "start": "hull"}, range(6), before=None, blank=True
-    )
-    method = forward_model()(blank)
-    assert len(method.radiance.voxels) == method.radiance.lattice.count
+    numbers = {"num_voxels": [[0, 1500]], "start": "hull"}
+    radiance = forward_model()(Start(scene, "fine", numbers, range(6), blank=True)).radiance
+    assert len(radiance.voxels) == radiance.lattice.count
     with pytest.raises(AssertionError, match="a picture was loaded"):
         fresh(scene=scene, start="hull")
 
@@ -125,18 +118,17 @@ def test_carrying_keeps_matter_motion_and_unit():
     sigma, at = before.radiance().density, before.radiance.lattice.to_lattice
     points = ball_center(0.0) + 0.2 * (torch.rand(50, 3) - 0.5)
     expected = sigma(at(points)).detach()
-    after = carried(before, handover, name="fine", num_voxels=[[0, 4000]])
-    assert after.radiance.lattice.box == handover.box
-    assert after.radiance.activation.density_scale == unit
-    assert after.radiance.lattice.count == pytest.approx(4000, rel=0.2)
-    torch.testing.assert_close(after.radiance().density(after.radiance.lattice.to_lattice(points)), expected)
+    after = carried(before, handover, num_voxels=[[0, 4000]])
+    lattice = after.radiance.lattice
+    assert (lattice.box, after.radiance.activation.density_scale) == (handover.box, unit)
+    assert lattice.count == pytest.approx(4000, rel=0.2)
+    torch.testing.assert_close(after.radiance().density(lattice.to_lattice(points)), expected)
     for name, value in after.motion.trajectory.state_dict().items():
         assert torch.equal(value, path[name])
 
 
 def test_carrying_into_a_stage_with_more_effects():
     before = fresh(forward_model(view_dependence=None))
-    before.radiance.density.data[:] = 3.0
     before.radiance.color.data[:] = 0.5
     after = carried(before, left(before))
     assert (after.radiance.shading == 0).all()
@@ -147,105 +139,78 @@ def test_carrying_a_network():
     model = forward_model(radiance=FEATURES)
     before = fresh(model)
     torch.nn.init.normal_(before.radiance.network[-1].weight)
-    after = carried(before, left(before), model)
-    for ours, theirs in zip(after.radiance.network.parameters(), before.radiance.network.parameters()):
-        assert torch.equal(ours, theirs)
+    networks = (made.radiance.network.parameters() for made in (carried(before, left(before), model), before))
+    assert all(map(torch.equal, *networks))
 
 
 def test_where_nothing_is_carried_the_box_and_the_unit_are_kept():
     before = ball_method(SCENE)
     handover = make_handover(before, SCENE, None, 6)
-    after = carried(before, handover, carry=False)
-    assert after.radiance.lattice.box == handover.box
-    assert after.radiance.activation.density_scale == before.radiance.activation.density_scale
-    assert (after.radiance.density == after.radiance.density[0]).all()
+    radiance = carried(before, handover, carry=False).radiance
+    assert radiance.lattice.box == handover.box
+    assert radiance.activation.density_scale == before.radiance.activation.density_scale
+    assert (radiance.density == radiance.density[0]).all()
 
 
 def test_after_a_stage_of_another_method_only_its_box_is_used():
     box = BOX.scaled(0.5)
-    after = carried(torch.nn.Linear(1, 1), Handover(box, True, 6, notes={"particles": 3.0}))
-    assert after.radiance.lattice.box == box
-    assert after.radiance.activation.density_scale == after.radiance.lattice.voxel_size
-    assert (after.radiance.density == after.radiance.density[0]).all()
+    radiance = carried(torch.nn.Linear(1, 1), Handover(box, True, 6, notes={"particles": 3.0})).radiance
+    assert radiance.lattice.box == box
+    assert radiance.activation.density_scale == radiance.lattice.voxel_size
+    assert (radiance.density == radiance.density[0]).all()
 
 
 OPAQUE = replace(ball_scene(frames=2, size=8), has_alpha=False)
 PATHS = partial(TrajectoryField, BOX, bases=2, frames=5, canonical_time=0.0, nodes=8)
 ODD = forward_model(upsampler=partial(TrilinearUpsampler, scale=1.5), inpainter=INPAINTER)
-OPACITIES, OPACITY = (
-    "stage.coarse: expected 0 < birth_alpha < keep_alpha < 1",
-    r"expected a number in \(0, 1\), but",
-)
 
 
-def made(model):
-    """Make the method of a first stage."""
-    return model(Start(OPAQUE, "coarse", {"num_voxels": [[0, 100]]}, [0]))
+def refusing(model=None, **numbers):
+    """A call that makes the method of a first stage over opaque images."""
+    start = Start(OPAQUE, "coarse", {"num_voxels": [[0, 100]]} | numbers, [0])
+    return partial(model or forward_model(), start)
 
 
+SCHEDULE = r"stage.coarse.num_voxels: expected \[\[fraction, count\], ...\] .* but got"
+SPREADING = "stage.coarse: expected 0 < birth_alpha < keep_alpha < 1"
+SPLAT = "model.motion: expected 0 < tau <= 1, 0 <= fade <= 1 and"
 GHOST = "model.{0}: expected a factory or null, but got .*choose model/{0}=none"
 STAGES = [
-    ({"num_voxels": []}, r"stage.coarse.num_voxels: expected \[\[fraction, count\], ...\] .* but got \[\]"),
-    ({"num_voxels": [[0.5, 100], [0, 100]]}, "stage.coarse.num_voxels: expected .* ascending fractions"),
-    ({"num_voxels": 100}, "stage.coarse.num_voxels: expected .* but got 100"),
-    ({"num_voxels": [[2, 100]]}, "stage.coarse.num_voxels: expected"),
-    ({"num_voxels": [[0, 0]]}, "stage.coarse.num_voxels: expected"),
+    *(({"num_voxels": given}, SCHEDULE) for given in ([], [[0.5, 100], [0, 100]], 100, [[2, 9]], [[0, 0]])),
     ({"bases": [[0, 1, 2]]}, "stage.coarse.bases: expected"),
     ({"effects": ["motion", "shine"]}, "stage.coarse.effects: expected some of .* got .*shine"),
     ({"start": "points"}, "stage.coarse.start: expected auto, box or hull, but got 'points'"),
     ({"confine": 1.5}, r"stage.coarse.confine: expected a fraction in \[0, 1\], but got 1.5"),
-    ({"start_alpha": 1.0}, f"stage.coarse.start_alpha: {OPACITY}"),
-    ({"box_alpha": 0.0}, f"stage.coarse.box_alpha: {OPACITY}"),
-    *((wrong, OPACITIES) for wrong in ({"birth_alpha": 1e-2}, {"birth_alpha": 0.0}, {"keep_alpha": 1.0})),
+    ({"start_alpha": 1.0}, r"stage.coarse.start_alpha: expected a number in \(0, 1\), but"),
+    ({"box_alpha": 0.0}, r"stage.coarse.box_alpha: expected a number in \(0, 1\), but"),
+    *((wrong, SPREADING) for wrong in ({"birth_alpha": 1e-2}, {"birth_alpha": 0.0}, {"keep_alpha": 1.0})),
 ]
 REFUSED = [
+    *((refusing(**wrong), text) for wrong, text in STAGES),
     *(
-        (partial(VoxelStage, **({"name": "coarse", "num_voxels": [[0, 8000]]} | wrong)), text)
-        for wrong, text in STAGES
-    ),
-    *(
-        (lambda name=name: made(forward_model(**{name: {"width": 3}})), GHOST.format(name))
+        (refusing(forward_model(**{name: {"width": 3}})), GHOST.format(name))
         for name in ("inpainter", "background")
     ),
     *(
-        (
-            lambda wrong=wrong: made(backward_model(deformation=wrong)),
-            "model.deformation: expected a factory, but got",
-        )
+        (refusing(backward_model(deformation=wrong)), "model.deformation: expected a factory, but got")
         for wrong in (None, {"width": 3})
     ),
-    (
-        lambda: made(forward_model(trajectory=None)),
-        "model.trajectory: expected a factory, but got null; choose another model/motion",
-    ),
+    (refusing(forward_model(trajectory=None)), "model.trajectory: .* got null; choose another model/motion"),
     *(
-        (
-            lambda wrong=wrong: Motion(PATHS(), **wrong),
-            "model.motion: expected 0 < tau <= 1, 0 <= fade <= 1 and",
-        )
+        (lambda wrong=wrong: Motion(PATHS(), **wrong), SPLAT)
         for wrong in ({"tau": 0.0}, {"tau": 2.0}, {"fade": -0.1}, {"fade": 1.5}, {"rest": 0.5})
     ),
     *(
-        (
-            partial(UNet3d, channels=4, **wrong),
-            "model.inpainter: expected a width that is a multiple of 16 and",
-        )
+        (partial(UNet3d, channels=4, **wrong), "model.inpainter: .* width that is a multiple of 16 and")
         for wrong in ({"width": 12}, {"levels": 1})
     ),
     *(
         (partial(TrilinearUpsampler, scale=scale), "model.upsampler.scale: expected a number > 1, but got")
-        for scale in (1, 0.5, float("nan"))
+        for scale in (1, float("nan"))
     ),
     (partial(LearnedUpsampler, scale=1.5, channels=4), "expects a whole number, but got 1.5"),
-    (
-        lambda: built(ODD, Lattice(BOX, (7, 6, 5))),
-        "model.upsampler.scale: expected a whole number beside an inpainter, but got 1.5",
-    ),
-    (
-        lambda: forward_model()(Start(OPAQUE, "coarse", {"num_voxels": [[0, 100]], "start": "hull"}, [0])),
-        "stage.coarse.start: expected box, since the images of 'ball' have no alpha",
-    ),
-    (partial(voxel_terms, ["ssim"]), r"objective.literal: .* but got \['ssim'\]"),
+    (refusing(ODD), "model.upsampler.scale: expected a whole number beside an inpainter, but got 1.5"),
+    (refusing(start="hull"), "stage.coarse.start: expected box, since the images of 'ball' have no alpha"),
 ]
 
 
@@ -253,3 +218,87 @@ REFUSED = [
 def test_refuses_by_the_name_of_the_key(call, text):
     with pytest.raises(ValueError, match=text):
         call()
+
+
+PATCHES = torch.rand(2, 4, 4, generator=torch.Generator().manual_seed(3)), torch.ones(2, 4, 4)
+STRAY = torch.randn(7, 3, generator=torch.Generator().manual_seed(3))
+TRUTH = torch.rand(4, 3, generator=torch.Generator().manual_seed(9))
+
+
+def drawn(seed):
+    """A rendering of four rays that has three samples with a colour, of seven in all."""
+    draw = partial(torch.rand, generator=torch.Generator().manual_seed(seed))
+    parts = draw(4, 3), draw(4), draw(4), draw(4), draw(3), draw(3, 3)
+    return Marched(*parts, torch.tensor([0, 0, 3]), 3, draw(7), torch.tensor([0, 0, 0, 0, 1, 3, 3]))
+
+
+def terms_of(renderings, literal=(), **on):
+    """The snapshot that terms are computed from, and their values, but for those of what is not on."""
+    method = fresh(num_voxels=[[0, 64]])
+    torch.nn.init.normal_(method.radiance.density)
+    method._literal, method._patches_of = frozenset(literal), lambda *_: PATCHES
+    method._stray = lambda *_: STRAY if on else None
+    canonical = method.radiance()
+    state = VoxelSnapshot(
+        Moment(0.5), {}, canonical, method.renderer, length=0.5, **{k: v(canonical) for k, v in on.items()}
+    )
+    terms = method.terms_of(state, renderings, TRUTH, torch.Generator())
+    assert tuple(terms) == VoxelMethod.terms
+    values = {name: term() for name, term in terms.items()}
+    return state, {name: value for name, value in values.items() if value is not None}
+
+
+def test_every_term_is_the_pure_function_of_its_parts():
+    both = {"upsampled": drawn(0), "inpainted": drawn(1)}
+    state, found = terms_of(
+        both,
+        flow=lambda grid: grid.values[:, :3].sin(),
+        inpaint_difference=lambda grid: grid.values.cos(),
+        background=lambda grid: grid.with_values(grid.values + 1),
+    )
+    grid, flow = state.canonical, state.flow / 0.5
+    pairs = neighbour_pairs(grid.index)
+    expected = {
+        "photo": sum(losses.photometric(r.rgb, TRUTH) for r in both.values()),
+        "point_color": sum(losses.point_color(r.weights, r.colors, r.ray_ids, TRUTH) for r in both.values()),
+        "background_entropy": sum(losses.background_entropy(r.transmittance) for r in both.values()),
+        "flow_l1": losses.flow_l1(flow),
+        "inpaint_diff": losses.inpaint_diff(state.inpaint_difference),
+        "tv_density": sum(losses.tv_density(g.raw_density, pairs) for g in (grid, state.background)),
+        "tv_flow": losses.tv_flow(flow, pairs),
+        "tv_depth": losses.tv_depth(*PATCHES),
+        "static_points": losses.static_points(STRAY),
+        "moving_opacity": losses.moving_opacity(grid.activation.alpha(grid.raw_density, grid.voxel_size)),
+    }
+    torch.testing.assert_close(found, expected)
+
+
+def test_terms_of_effects_that_are_off_are_left_out():
+    off = {"flow_l1", "tv_flow", "inpaint_diff", "static_points", "moving_opacity"}
+    assert set(terms_of({"warped": drawn(0)})[1]) == set(VoxelMethod.terms) - off
+
+
+def test_the_printed_forms():
+    rendering = drawn(0)
+    plain, printed = (terms_of({"warped": rendering}, literal)[1] for literal in ((), VoxelMethod.literal))
+    assert printed["photo"].item() == pytest.approx(3 * plain["photo"].item())
+    samples = rendering.weights, rendering.colors, rendering.ray_ids
+    expected = losses.point_color(*samples, TRUTH, all_ray_ids=rendering.all_ray_ids)
+    torch.testing.assert_close(printed["point_color"], expected)
+    assert printed["point_color"] < plain["point_color"]
+    expected = losses.sample_entropy(rendering.all_weights)
+    torch.testing.assert_close(printed["background_entropy"], expected)
+
+
+@pytest.mark.parametrize(("literal", "needed"), [((), False), (["photo"], False), (["point_color"], True)])
+def test_the_weights_of_all_samples_are_kept_only_for_a_printed_form(literal, needed, monkeypatch):
+    asked, march = [], VoxelSnapshot.march
+
+    def noted(self, name, rays, background, **options):
+        asked.append(options["keep_all_weights"])
+        return march(self, name, rays, background, **options)
+
+    monkeypatch.setattr(VoxelSnapshot, "march", noted)
+    method = forward_model()(Start(SCENE, "fine", {"num_voxels": [[0, 64]]}, [0], literal=literal))
+    method.look(ball_data(rays=4, frames=2, size=8).batches.draw(), {}, torch.Generator())
+    assert asked == [needed]

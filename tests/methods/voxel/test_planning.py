@@ -8,8 +8,9 @@ import torch
 
 from forewarp.fields.curves import TrajectoryField
 from forewarp.methods.effect import Asked
-from forewarp.methods.voxel import planning as decisions
 from forewarp.methods.voxel.planning import (
+    EFFECTS,
+    PLAIN,
     Movement,
     Residual,
     VoxelEvidence,
@@ -40,92 +41,66 @@ def fitted(flow):
     return method
 
 
-def test_a_scene_that_stands_still_isexplained_by_direction_by_its_hull():
-    still = ball_scene(times=[0.0] * 12)
-    assert survey(still).times == 1
-    assert survey(still).disagreement < 0.01
-    moving = survey(ball_scene())
+def test_silhouettes_tell_motion_where_they_are():
+    still = survey(ball_scene(times=[0.0] * 12))
+    assert still.times == 1
+    assert still.disagreement < 0.01
+    scene = ball_scene()
+    moving = survey(scene)
     assert (moving.frames, moving.times) == (12, 12)
     assert moving.disagreement > 0.1
     assert 0.7 < moving.cut_out < 1
     assert 90 < moving.spread <= 180
-
-
-def test_alpha_that_is_nowhere_transparent_says_nothing():
-    scene = ball_scene()
     opaque = torch.full((24, 24, 4), 255, dtype=torch.uint8)
-    filled = replace(scene, train=tuple(replace(f, load=lambda: opaque) for f in scene.train))
-    found = survey(filled)
-    assert (found.cut_out, found.disagreement) == (0, 0)
+    filled = survey(replace(scene, train=tuple(replace(f, load=lambda: opaque) for f in scene.train)))
+    assert (filled.cut_out, filled.disagreement) == (0, 0)
     assert survey(replace(scene, has_alpha=False)).cut_out == 0
 
 
 def test_a_shift_moves_all_and_tears_nothing():
-    found = movement_of(
-        fitted(lambda at, time: time * at.new_tensor([0.8, 0, 0]).expand(len(at), 3)), [0, 0.5, 1]
-    )
-    assert (found.moving, found.torn) == (1.0, 0.0)
-    assert found.distance == pytest.approx(0.8)
+    method = fitted(lambda at, time: time * at.new_tensor([0.8, 0, 0]).expand(len(at), 3))
+    found = movement_of(method, [0, 0.5, 1])
+    assert (found.moving, found.torn, found.distance) == (1.0, 0.0, pytest.approx(0.8))
 
 
 def test_what_is_drawn_out_is_torn():
-    def stretched(at, time):
-        return 2 * time * (at - at.mean(0)) * at.new_tensor([1.0, 0, 0])
-
-    found = movement_of(fitted(stretched), [0, 0.4, 1])
-    assert found.torn == 1.0  # three voxels from one to the next
-    assert found.at == 1
-    assert movement_of(fitted(stretched), [0, 0.4]).torn == 0.0  # 1.8 voxels
+    method = fitted(lambda at, time: 2 * time * (at - at.mean(0)) * at.new_tensor([1.0, 0, 0]))
+    found = movement_of(method, [0, 0.4, 1])
+    assert (found.torn, found.at) == (1.0, 1)  # three voxels from one to the next
+    assert movement_of(method, [0, 0.4]).torn == 0.0  # 1.8 voxels
 
 
-def test_nothing_moves_where_nothing_does():
+def test_nothing_moves_where_nothing_does_or_is():
     found = movement_of(fitted(lambda at, time: torch.zeros_like(at)), [0, 1])
     assert (found.moving, found.distance, found.torn, found.left_out) == (0, 0, 0, (0.0,))
     assert found.bases() == 0
-
-
-def test_no_matter_does_not_move():
-    method = fitted(lambda at, time: torch.ones_like(at))
-    with torch.no_grad():
-        method.radiance.parameter("density").fill_(-8.0)
-    assert movement_of(method, [0, 1]) == Movement(0, 0, 0, 0.0, (0.0,))
+    empty = fitted(lambda at, time: torch.ones_like(at))
+    torch.nn.init.constant_(empty.radiance.density, -8.0)
+    assert movement_of(empty, [0, 1]) == Movement(0, 0, 0, 0.0, (0.0,))
 
 
 def test_a_wave_needs_its_own_cosine():
-    times = [i / 19 for i in range(20)]
-    method = fitted(lambda at, time: wave(at, time))
-    trajectory = method.motion.trajectory
     strength = torch.zeros(3, 8)
     strength[0, 4] = 1.0  # the fifth cosine
-
-    def wave(at, time):
-        basis = dct_basis(time, 8, trajectory.frames, 0.0)
-        return (strength @ basis).expand(len(at), 3)
-
-    trajectory.coefficients = lambda points: strength.expand(len(points), 3, 8)
-    found = movement_of(method, times)
-    assert len(found.left_out) == 9
-    assert found.bases() == 5
+    method = fitted(lambda at, time: (strength @ dct_basis(time, 8, 20, 0.0)).expand(len(at), 3))
+    method.motion.trajectory.coefficients = lambda points: strength.expand(len(points), 3, 8)
+    found = movement_of(method, [i / 19 for i in range(20)])
+    assert (len(found.left_out), found.bases()) == (9, 5)
     assert found.left_out[4] == pytest.approx(found.left_out[0])
     assert found.left_out[5:] == (0, 0, 0, 0)
 
 
-def samples(views=24, places=30, seed=0):
-    """Return places (P, 3), directions (P, 3) and images (P,); each image sees all places from one side."""
-    generator = torch.Generator().manual_seed(seed)
-    where = torch.rand(places, 3, generator=generator).repeat(views, 1) + 0.01
+def test_only_an_error_linear_in_direction_is_explained_by_direction():
+    generator, views, count = torch.Generator().manual_seed(0), 24, 30  # each sees all places from one side
+    where = torch.rand(count, 3, generator=generator).repeat(views, 1) + 0.01
     towards = torch.nn.functional.normalize(torch.randn(views, 3, generator=generator), dim=-1)
-    return where, towards.repeat_interleave(places, 0), torch.arange(views).repeat_interleave(places)
-
-
-def test_only_an_error_linear_in_direction_isexplained_by_direction():
-    where, towards, views = samples()
-    generator = torch.Generator().manual_seed(1)
-    slope, noise = (torch.randn(n, 3, generator=generator) for n in (3, len(where)))
-    assert explained_by_direction(where, towards, towards @ slope, views, 0.05) > 0.6
-    assert explained_by_direction(where, towards, noise, views, 0.05) < 0.02
-    assert abs(explained_by_direction(where, towards, where.sin(), views, 0.05)) < 0.02  # of the place alone
-    assert explained_by_direction(where * float("nan"), towards, where, views, 0.05) == 0  # met nowhere
+    slope, noise = (torch.randn(n, 3, generator=generator) for n in (3, views * count))
+    towards = towards.repeat_interleave(count, 0)
+    images = torch.arange(views).repeat_interleave(count)
+    assert explained_by_direction(where, towards, towards @ slope, images, 0.05) > 0.6
+    assert explained_by_direction(where, towards, noise, images, 0.05) < 0.02
+    assert abs(explained_by_direction(where, towards, where.sin(), images, 0.05)) < 0.02  # of place alone
+    assert explained_by_direction(where * float("nan"), towards, where, images, 0.05) == 0  # met nowhere
 
 
 def test_of_a_fitted_ball(tmp_path):
@@ -133,143 +108,128 @@ def test_of_a_fitted_ball(tmp_path):
     run = make_run(tmp_path, [stage(iterations=60)], data=data, model=forward_model(view_dependence=None))
     module = run.fit()
     targets = [data.targets("train")[i] for i in range(6)]
-    found = residual(module.method, targets, voxel_size=0.05, rays=300)
-    drawn = sum(float(10 ** (-module.psnr_of(target) / 10)) for target in targets) / 6
-    assert abs(10 ** (-found.psnr / 10) / drawn - 1) < 0.3  # from half of the pixels
+    found, coarser = (residual(module.method, targets, voxel_size=v, rays=300) for v in (0.05, 0.4))
+    mean = sum(float(10 ** (-module.psnr_of(target) / 10)) for target in targets) / 6
+    assert abs(10 ** (-found.psnr / 10) / mean - 1) < 0.3  # from half of the pixels
     assert found.by_direction < 0.3
-    coarser = residual(module.method, targets, voxel_size=0.4, rays=300)
     assert coarser.allowed < found.allowed
 
 
-MOVING = VoxelEvidence(
-    Survey(frames=50, times=50, cut_out=0.8, spread=160.0, disagreement=0.2),
-    movement=Movement(moving=0.4, distance=0.3, torn=0.2, at=0.9, left_out=(4.0, 2.0, 0.4, 0.1, 0.0)),
-    residual=Residual(psnr=28.0, by_direction=0.02, allowed=38.0),
-)
+PICTURES = Survey(frames=50, times=50, cut_out=0.8, spread=160.0, disagreement=0.2)
+MOTION = Movement(moving=0.4, distance=0.3, torn=0.2, at=0.9, left_out=(4.0, 2.0, 0.4, 0.1, 0.0))
+ERRORS = Residual(psnr=28.0, by_direction=0.02, allowed=38.0)
 YES, NO, UNSURE = Gain(1.0, 0.2, 2.0, 100), Gain(-0.1, 0.2, 20.0, 100), Gain(0.15, 0.2, 1.2, 100)
+BARE, NARROW = replace(PICTURES, cut_out=0.0), replace(PICTURES, spread=6.0)
+START = ["stage.coarse.start_alpha=1e-2", "stage.coarse.confine=0.0"]
 
 
-def evidence(**changes):
-    return replace(MOVING, gains={}, **changes)
-
-
-def with_gains(**gains):
-    return replace(MOVING, gains=gains)
+def evidence(pictures=PICTURES, movement=MOTION, residual=ERRORS, gains=(), **known):
+    return VoxelEvidence(pictures, movement=movement, residual=residual, gains=dict(gains), **known)
 
 
 def asked(trials=True, bases=10, **typed):
     """Make a run to plan, with overrides that the user typed."""
     stages = {"coarse": {"num_voxels": [[0, 1000]]}, "fine": {"num_voxels": [[0, 8000], [0.5, 27000]]}}
-    on = {effect.name: effect.on for effect in decisions.EFFECTS}
+    on = {effect.name: effect.on for effect in EFFECTS}
     typed = {key.replace("__", "/"): value for key, value in typed.items()}
     return Asked(stages, {"bases": bases}, typed, on.get, trials)
 
 
-def test_one_time_needs_no_trial_to_stand_still():
-    pictures = replace(MOVING.pictures, times=1)
-    found = decisions.of_motion(evidence(pictures=pictures, movement=None), asked())
-    assert (found.choice, found.on, found.overrides) == ("none", False, ("model/motion=none",))
-    assert found.because == "1 time: nothing can be seen to move"
+def decided(effect, found, to_plan=None):
+    """The decision on one effect."""
+    return next(d for d in VoxelPlanning().decide(found, to_plan or asked()) if d.effect == effect)
 
 
-@pytest.mark.parametrize(("gain", "choice"), [(YES, "dct"), (NO, "none"), (UNSURE, "none")])
-def test_a_trial_decides_and_is_named(gain, choice):
-    found = decisions.of_motion(with_gains(motion=gain), asked())
-    assert found.choice == choice
-    assert found.because.endswith(f"; {gain}, more than {max(gain.noise, 0.1):.2f} asked")
-    assert "20.0% of the foreground" in found.because
-    assert "40% of the solid voxels move, by 0.3" in found.because
+STILL = evidence(replace(PICTURES, disagreement=0.0), replace(MOTION, moving=0.0))
+LAST_COUNTS = replace(MOTION, left_out=(4.0, 2.0, 1.5, 1.2, 0.0))  # the last of four cosines says much
 
 
-def test_without_trials_the_evidence_decides():
-    still = replace(MOVING.movement, moving=0.0)
-    agree = replace(MOVING.pictures, disagreement=0.0)
-    assert decisions.of_motion(evidence(), asked()).on
-    assert not decisions.of_motion(evidence(movement=still, pictures=agree), asked()).on
-    assert not decisions.of_view(evidence(), asked()).on
-    assert decisions.of_view(evidence(residual=replace(MOVING.residual, by_direction=0.2)), asked()).on
-    assert not decisions.of_inpainter(evidence(), asked()).on
-    assert decisions.of_inpainter(evidence(movement=replace(MOVING.movement, torn=0.5)), asked()).on
-    assert not decisions.of_upsampler(evidence(), asked()).on
-    limited = replace(MOVING.residual, allowed=28.5)
-    assert decisions.of_upsampler(evidence(residual=limited), asked()).choice == "learned"
+@pytest.mark.parametrize(
+    ("effect", "found", "choice", "because"),
+    [
+        ("motion", evidence(replace(PICTURES, times=1), None), "none", "1 time: nothing can be seen to move"),
+        ("motion", evidence(), "dct", "20.0% of the foreground; 40% of the solid voxels move, by 0.3"),
+        ("motion", STILL, "none", "0% of the solid voxels move"),
+        *(
+            ("motion", evidence(gains={"motion": gain}), choice, f"{gain}, more than 0.20 asked")
+            for gain, choice in ((YES, "dct"), (NO, "none"), (UNSURE, "none"))
+        ),
+        ("view_dependence", evidence(), "none", "direction explains 2.0% of"),
+        ("view_dependence", evidence(residual=replace(ERRORS, by_direction=0.2)), "sh", "explains 20.0% of"),
+        (
+            "view_dependence",
+            evidence(NARROW, gains={"view_dependence": YES}),
+            "none",
+            "all cameras lie within 6 degrees: direction is not seen",
+        ),
+        ("inpainter", evidence(), "none", "20.0% of the solid voxels are torn"),
+        ("inpainter", evidence(movement=replace(MOTION, torn=0.5)), "unet3d", "50.0% of the solid voxels"),
+        ("inpainter", evidence(movement=None), "none", "0 % of the voxels move: nothing opens"),
+        ("upsampler", evidence(), "none", "the last lattice allows 38.0 dB, 28.0 are reached"),
+        ("upsampler", evidence(residual=replace(ERRORS, allowed=28.5)), "learned", "allows 28.5 dB"),
+        ("bases", evidence(movement=LAST_COUNTS), "8", "4 of 4 cosines leave out no more than 0.5 voxels"),
+        ("bases", evidence(), "4", "2 of 4 cosines"),
+        ("bases", evidence(gains={"bases": NO}), "4", f"8 of them against 4: {NO}, more than 0.20 asked"),
+        ("bases", evidence(gains={"bases": YES}), "8", f"8 of them against 4: {YES}"),
+        ("background", evidence(), "none", "80% of the pixels are transparent"),
+        ("background", evidence(BARE), "grid", "0 % of the pixels are transparent"),
+        ("background", evidence(BARE, gains={"background": NO}), "none", f"transparent; {NO}"),
+        ("background", evidence(BARE, None), "none", "but nothing moves: one field holds all"),
+    ],
+)
+def test_evidence_decides_or_a_trial_and_is_named(effect, found, choice, because):
+    decision = decided(effect, found, asked(bases=4))
+    assert (decision.choice, decision.on) == (choice, choice not in ("none", "4"))
+    assert because in decision.because
+    if effect == "bases":
+        assert decision.overrides == (("preset.bases=8", "stage.coarse.bases=[[0,8]]") if decision.on else ())
+    else:
+        start = START if effect == "background" and found.pictures is BARE else []
+        assert decision.overrides == (f"model/{effect}={choice}", *start)
 
 
-def open_questions(found):
-    """The later effects that the evidence does not rule out."""
-    return [e.name for e in decisions.EFFECTS if e.later and not e.rules_out(found)]
-
-
-def test_only_what_is_open_is_tried():
-    assert open_questions(evidence()) == ["view_dependence", "inpainter"]
-    assert open_questions(evidence(movement=None)) == ["view_dependence"]
-    sure = Residual(psnr=28.0, by_direction=-0.01, allowed=30.0)
-    assert open_questions(evidence(movement=None, residual=sure)) == ["upsampler"]
-
-
-def test_cameras_that_stand_together_see_no_direction():
-    narrow = evidence(pictures=replace(MOVING.pictures, spread=6.0))
-    assert open_questions(narrow) == ["inpainter"]
-    found = decisions.of_view(replace(narrow, gains={"view_dependence": YES}), asked())
-    assert (found.choice, found.because) == (
-        "none",
-        "all cameras lie within 6 degrees: direction is not seen",
+def test_what_is_typed_overrules():
+    found = decided(
+        "view_dependence", evidence(gains={"view_dependence": YES}), asked(model__view_dependence="none")
     )
+    assert (found.choice, found.on, found.overrides) == ("none", False, ())
+    assert found.because.startswith("as typed; ")
+    found = decided("bases", evidence(), replace(asked(), typed={"preset.bases": "3"}))
+    assert (found.choice, found.overrides, found.because[:10]) == ("3", (), "as typed; ")
 
 
-def test_bases_follow_the_spectrum_or_the_trial():
-    left = (4.0, 2.0, 1.5, 1.2, 0.0)  # the last of four has much to say
-    flat = replace(MOVING.movement, left_out=left)
-    assert decisions.of_bases(evidence(movement=flat), asked(bases=4)).choice == "8"
-    assert decisions.of_bases(evidence(), asked(bases=4)).choice == "4"
-    tried = decisions.of_bases(with_gains(bases=NO), asked(bases=4))
-    assert (tried.choice, tried.on) == ("4", False)
-    why = "2 of 4 cosines leave out no more than 0.5 voxels; 8 of them against 4: "
-    assert tried.because == f"{why}{NO}, more than 0.20 asked"
-    assert decisions.of_bases(with_gains(bases=YES), asked(bases=4)).choice == "8"
-
-
-def test_a_background_needs_something_that_moves_before_it():
-    bare = replace(MOVING.pictures, cut_out=0.0)
-    start = ["stage.coarse.start_alpha=1e-2", "stage.coarse.confine=0.0"]
-    assert decisions.of_background(evidence(), asked(), True).because.startswith("80% of the pixels")
-    assert not decisions.of_background(evidence(), asked(), True).on
-    found = decisions.of_background(evidence(pictures=bare), asked(), True)
-    assert (found.choice, found.overrides) == ("grid", ("model/background=grid", *start))
-    still = decisions.of_background(evidence(pictures=bare), asked(), False)
-    assert (still.on, still.overrides) == (False, ("model/background=none", *start))
-    against = replace(with_gains(background=NO), pictures=bare)
-    assert decisions.of_background(against, asked(), True).overrides == (
-        "model/background=none",
-        *start,
-    )
+@pytest.mark.parametrize(
+    ("found", "open_questions"),
+    [
+        (evidence(), ["view_dependence", "inpainter"]),
+        (evidence(movement=None), ["view_dependence"]),
+        (evidence(NARROW), ["inpainter"]),
+        (evidence(movement=None, residual=Residual(28.0, by_direction=-0.01, allowed=30.0)), ["upsampler"]),
+    ],
+)
+def test_only_what_is_open_is_tried(found, open_questions):
+    assert [e.name for e in EFFECTS if e.later and not e.rules_out(found)] == open_questions
 
 
 def test_a_time_makes_dear_effects_dearer_the_shorter_it_is():
     gain = Gain(0.6, 0.1, 20.0, 100)
-    known = {"slope": 0.4, "steps": 100, "step": 0.01}
-    free, long, short = (
-        replace(with_gains(inpainter=gain), minutes=minutes, **known) for minutes in (None, 100.0, 0.5)
-    )
-    assert free.price(gain) == 0
-    assert 0 < long.price(gain) < short.price(gain)
+    known = {"gains": {"inpainter": gain}, "slope": 0.4, "steps": 100, "step": 0.01}
+    free, long, short = (evidence(minutes=minutes, **known) for minutes in (None, 100.0, 0.5))
+    assert 0 == free.price(gain) < long.price(gain) < short.price(gain)
     assert [e.pays("inpainter") for e in (free, long, short)] == [True, True, False]
-    assert (
-        f"whose steps are worth {short.price(gain):.2f} dB" in decisions.of_inpainter(short, asked()).because
-    )
+    assert f"whose steps are worth {short.price(gain):.2f} dB" in decided("inpainter", short).because
 
 
 def test_the_price_is_what_fewer_steps_cost_on_the_curve_that_was_seen():
     """PSNR = end - c / sqrt(steps), c from the slope between 50 and 100 steps of 0.1 s."""
-    c = 0.5 / (50**-0.5 - 100**-0.5)
-    found = replace(with_gains(), minutes=1.0, slope=0.5, steps=100, step=0.1)
-    assert found.price(Gain(0, 0, 4.0, 20)) == pytest.approx(c * (150**-0.5 - 600**-0.5))
+    c, known = 0.5 / (50**-0.5 - 100**-0.5), {"minutes": 1.0, "slope": 0.5, "steps": 100, "step": 0.1}
+    found, whole = evidence(**known), c * (150**-0.5 - 600**-0.5)
+    assert found.price(Gain(0, 0, 4.0, 20)) == pytest.approx(whole)
     assert found.price(Gain(0, 0, 0.5, 100)) == 0
     assert found.price(Gain(0, 0, 4.0, None)) == 0  # the trial itself was of equal time
-    bounded = {most: replace(found, most_steps=most).price(Gain(0, 0, 4.0, 20)) for most in (100, 300, 900)}
-    assert bounded[100] == 0  # with and without it the minutes are enough for all steps there are
-    assert bounded[300] == pytest.approx(c * (150**-0.5 - 300**-0.5))
-    assert bounded[900] == found.price(Gain(0, 0, 4.0, 20))
+    # With 100 steps the minutes are enough with and without the effect.
+    for most, price in ((100, 0.0), (300, c * (150**-0.5 - 300**-0.5)), (900, whole)):
+        assert evidence(most_steps=most, **known).price(Gain(0, 0, 4.0, 20)) == pytest.approx(price)
 
 
 def walk(found, asked, **answers):
@@ -280,18 +240,12 @@ def walk(found, asked, **answers):
 
 
 def test_coarse_stages_ask_for_cosines_then_motion_then_the_background():
-    bare = evidence(pictures=replace(MOVING.pictures, cut_out=0.0))
-    (first,), tried = walk(bare, asked(), bases=False, motion=True, background=True)
-    start = ["stage.coarse.start_alpha=1e-2", "stage.coarse.confine=0.0"]
-    assert first == (
-        "coarse",
-        ["model/motion=dct", "model/background=grid", *decisions.PLAIN, *start],
-    )
-    assert [(effect, adds) for effect, _, adds in tried] == [
-        *(("bases", True), ("motion", False), ("background", False))
-    ]
+    (first,), tried = walk(evidence(BARE), asked(), bases=False, motion=True, background=True)
+    assert first == ("coarse", ["model/motion=dct", "model/background=grid", *PLAIN, *START])
+    questions = [("bases", True), ("motion", False), ("background", False)]
+    assert [(effect, adds) for effect, _, adds in tried] == questions
     assert tried[0][1] == ["preset.bases=20", "stage.coarse.bases=[[0,20]]"]
-    begun, _ = walk(bare, asked(), bases=False, motion=False)  # what stands still is one field
+    begun, _ = walk(evidence(BARE), asked(), bases=False, motion=False)  # what stands still is one field
     assert begun[1] == ("coarse-still-alone", ["model/background=none"], "changed")
 
 
@@ -303,20 +257,7 @@ def test_what_is_typed_is_not_asked():
 
 
 def test_dear_effects_go_on_the_lattice_that_they_were_tried_on():
-    with_it = {effect.name: effect.with_it(asked()) for effect in decisions.EFFECTS}
+    with_it = {effect.name: effect.with_it(asked()) for effect in EFFECTS}
     coarse = "stage.coarse.effects=[motion,background]"
     assert with_it["inpainter"] == with_it["upsampler"] == (coarse, "stage.fine.num_voxels=[[0,8000]]")
-    assert with_it["view_dependence"] == (coarse,)
-    assert with_it["motion"] == ()
-
-
-def test_what_is_typed_overrules():
-    found = with_gains(view_dependence=YES)
-    by_hand = {d.effect: d for d in VoxelPlanning().decide(found, asked(model__view_dependence="none"))}
-    assert (
-        by_hand["view_dependence"].choice,
-        by_hand["view_dependence"].on,
-        by_hand["view_dependence"].overrides,
-    ) == ("none", False, ())
-    assert by_hand["view_dependence"].because.startswith("as typed; ")
-    assert {d.effect: d for d in VoxelPlanning().decide(found, asked())}["view_dependence"].on
+    assert (with_it["view_dependence"], with_it["motion"]) == ((coarse,), ())

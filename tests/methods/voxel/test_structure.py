@@ -12,24 +12,20 @@ from forewarp.scene.box import Box, Lattice
 from tests.support.tiny_scene import BOX, backward_model, built, forward_model
 
 
-def numbers(**changes):
-    return VoxelStage(**({"name": "coarse", "num_voxels": [[0, 8000]]} | changes))
-
-
 def test_schedules_hold_until_the_next_entry():
-    made = numbers(num_voxels=[[0, 10], [0.5, 20], [0.75, 30]])
+    made = VoxelStage(num_voxels=[[0.2, 10], [0.5, 20], [0.75, 30]])  # the first holds from the beginning
     assert [made.at("num_voxels", f) for f in (0, 0.49, 0.5, 0.74, 0.75, 1)] == [10, 10, 20, 20, 30, 30]
     assert made.at("bases", 0.5) is None
-    assert numbers(num_voxels=[[0.2, 10]]).at("num_voxels", 0.0) == 10  # the first holds from the beginning
 
 
 SHAPE = (6, 5, 7)
 LATTICE = Lattice(Box((0, 0, 0), (5, 4, 6)), SHAPE)
 COMMON = {"features": 3, "alpha_init": 1e-2, "density_scale": 1.0, "alpha_threshold": 0.0}
+ALPHAS = {"keep_alpha": 1e-2, "birth_alpha": 5e-3}
 SOLID, AIR = 8.0, -9.0
 
 
-def radiance(solid=((2, 2, 3),)):
+def radiance(*solid):
     """All voxels active, a few solid, colours numbered."""
     made = DirectRadiance(LATTICE, torch.ones(SHAPE, dtype=torch.bool), **COMMON)
     made.density.data[:] = AIR
@@ -57,18 +53,13 @@ def around(at):
     return active
 
 
-def number_of(made):
-    """Every active voxel's number in the whole lattice."""
-    x, y, z = made.voxels.unbind(-1)
-    return (x * SHAPE[1] + y) * SHAPE[2] + z
-
-
 def test_refresh_keeps_values_and_moments_in_the_right_rows():
-    made = radiance()
+    made = radiance((2, 2, 3))
     optimizer = adam(made)
-    assert refresh(made, optimizer, keep_alpha=1e-2, birth_alpha=5e-3)
+    assert refresh(made, optimizer, **ALPHAS)
     assert torch.equal(made.index >= 0, around((2, 2, 3)))
-    number = number_of(made)
+    x, y, z = made.voxels.unbind(-1)
+    number = (x * SHAPE[1] + y) * SHAPE[2] + z
     assert torch.equal(made.color[:, 0], number.float())
     assert int((made.density == SOLID).sum()) == 1
     for parameter in (made.density, made.color):
@@ -79,60 +70,58 @@ def test_refresh_keeps_values_and_moments_in_the_right_rows():
 
 
 def test_refresh_gives_births_to_new_voxels_and_no_moments():
-    made = radiance()
+    made = radiance((2, 2, 3))
     optimizer = adam(made)
-    refresh(made, optimizer, keep_alpha=1e-2, birth_alpha=5e-3)
+    refresh(made, optimizer, **ALPHAS)
+    assert not refresh(made, optimizer, **ALPHAS)  # nothing has changed
     old = made.index >= 0
     made.density.data[made.index[3, 3, 4].long()] = SOLID  # matter has reached a corner of the active set
-    assert refresh(made, optimizer, keep_alpha=1e-2, birth_alpha=5e-3)
+    assert refresh(made, optimizer, **ALPHAS)
     assert torch.equal(made.index >= 0, around((2, 2, 3)) | around((3, 3, 4)))
-    new = torch.tensor([not bool(old[tuple(v)]) for v in made.voxels.tolist()])
+    new = ~old[made.voxels.unbind(-1)]
     alpha = made.activation.alpha(made.density[new, 0], LATTICE.voxel_size)
     torch.testing.assert_close(alpha, torch.full_like(alpha, 5e-3), rtol=1e-3, atol=0)
     for parameter in made.parameters():
         moments = optimizer.state[parameter]["exp_avg"]
-        assert (moments[new] == 0).all()
-        assert (moments[~new] != 0).all()
+        assert ((moments == 0).all(-1) == new).all()
 
 
 def test_an_empty_grid_is_left_as_it_is():
-    made = radiance([])
+    made = radiance()
     before = made.density
-    assert not refresh(made, adam(made), keep_alpha=1e-2, birth_alpha=5e-3)
+    assert not refresh(made, adam(made), **ALPHAS)
     assert made.density is before
 
 
 def test_what_no_view_has_seen_is_forgotten_where_asked():
-    made = radiance([(0, 0, 0), (5, 4, 6)])
+    made = radiance((0, 0, 0), (5, 4, 6))
     assert seen_rows(made, torch.optim.Adam(made.parameters())).all()  # nothing is known yet
     optimizer = adam(made, unseen=[0])
     assert seen_rows(made, optimizer).logical_not().nonzero().tolist() == [[0]]
-    refresh(made, optimizer, keep_alpha=1e-2, birth_alpha=5e-3, only_seen=True)
+    refresh(made, optimizer, **ALPHAS, only_seen=True)
     assert torch.equal(made.index >= 0, around((5, 4, 6)))
 
 
 def test_voxels_are_born_only_where_allowed():
-    made = radiance([(2, 2, 3)])
-    allowed = torch.zeros(SHAPE, dtype=torch.bool)
+    made, allowed = radiance((2, 2, 3)), torch.zeros(SHAPE, dtype=torch.bool)
     allowed[3:] = True
-    refresh(made, adam(made), keep_alpha=1e-2, birth_alpha=5e-3, allowed=allowed)
+    refresh(made, adam(made), **ALPHAS, allowed=allowed)
     expected = around((2, 2, 3)) & allowed
     expected[2, 2, 3] = True  # matter itself stays
     assert torch.equal(made.index >= 0, expected)
 
 
 def test_resample_follows_what_is_occupied():
-    made = radiance([tuple(v) for v in around((2, 2, 3)).nonzero().tolist()])
-    optimizer = adam(made)
+    made = radiance(*map(tuple, around((2, 2, 3)).nonzero().tolist()))
+    optimizer = adam(made, unseen=[0])
     before = made().density(torch.tensor([[2.0, 2.0, 3.0]]))
     place = LATTICE.to_world(torch.tensor([[2, 2, 3]]))
-    resample(made, Box((0, 0, 1), (5, 4, 6)), 1500, keep_alpha=1e-2, optimizer=optimizer)
+    options = {"keep_alpha": 1e-2, "optimizer": optimizer, "only_seen": True}
+    resample(made, Box((0, 0, 1), (5, 4, 6)), 1500, **options)
     assert made.lattice.count == pytest.approx(1500, rel=0.2)
-    at = made.lattice.to_lattice(place)
-    torch.testing.assert_close(made().density(at), before)
+    torch.testing.assert_close(made().density(made.lattice.to_lattice(place)), before)
     reach = (made.lattice.to_world(made.voxels) - place).abs().amax(-1).max()
     assert 1.2 < reach < 2.5  # the block and a little more, not the whole box
-    assert len(made.voxels) < made.lattice.count
     assert all(optimizer.state[p]["exp_avg"].shape == p.shape for p in made.parameters())
     made().values.sum().backward()
     optimizer.step()
@@ -149,41 +138,27 @@ def test_resample_does_not_lose_the_border_to_rounding():
 
 
 def test_resample_of_an_empty_field_keeps_all_voxels():
-    made = radiance([])
+    made = radiance()
     resample(made, LATTICE.box, 400, keep_alpha=1e-2)
     assert (made.index >= 0).all()
 
 
-def moving(kind, shift):
-    """A method in which everything moves by ``shift`` until time 1."""
-    backward = backward_model(deformation=partial(Deformation, width=8, layers=2))
-    model = backward if kind == "backward" else forward_model()
-    method = built(model, Lattice(BOX, (12, 9, 8)), density_scale=0.2, frames=2)
-    method.radiance.density.data[:] = AIR
-    method.radiance.density.data[method.radiance.index[3, 4, 4].long()] = SOLID
-    if kind == "backward":
-        method.deformation.network[-1].bias.data = -torch.tensor(shift) / method.deformation.scale
-    else:  # of two frames: one basis, b(1) - b(0) = -sqrt(2)
-        trajectory = method.motion.trajectory
-        trajectory.network[-1].bias.data = torch.tensor(shift) / (-(2**0.5) * trajectory.scale)
-    return method
-
-
 @pytest.mark.parametrize("kind", ["forward", "backward"])
 def test_the_box_of_all_times_of_a_known_translation(kind):
-    method = moving(kind, (0.7, -0.3, 0.0))
-    home = method.radiance.lattice.to_world(torch.tensor([3.0, 4.0, 4.0]))
-    voxel_size = method.radiance.lattice.voxel_size
-    box = method.bounds([0.0, 1.0])
-    low = home + torch.tensor([0.0, -0.3, 0.0]) - 2 * voxel_size
-    high = home + torch.tensor([0.7, 0.0, 0.0]) + 2 * voxel_size
-    assert box.low == pytest.approx(low.tolist(), abs=1e-5)
-    assert box.high == pytest.approx(high.tolist(), abs=1e-5)
-    still = method.bounds([0.0])
-    assert still.size == pytest.approx([4 * voxel_size] * 3, abs=1e-5)
-
-
-def test_nothing_has_no_box():
-    method = moving("forward", (0.7, 0.0, 0.0))
-    method.radiance.density.data[:] = AIR
-    assert method.bounds([0.0, 1.0]) is None
+    backward = backward_model(deformation=partial(Deformation, width=8, layers=2))
+    model, shift = backward if kind == "backward" else forward_model(), torch.tensor([0.7, -0.3, 0.0])
+    method = built(model, Lattice(BOX, (12, 9, 8)), density_scale=0.2, frames=2)
+    radiance = method.radiance
+    radiance.density.data[:] = AIR
+    assert method.bounds([0.0, 1.0]) is None  # nothing has no box
+    radiance.density.data[radiance.index[3, 4, 4].long()] = SOLID
+    if kind == "backward":
+        method.deformation.network[-1].bias.data = -shift / method.deformation.scale
+    else:  # of two frames: one basis, b(1) - b(0) = -sqrt(2)
+        trajectory = method.motion.trajectory
+        trajectory.network[-1].bias.data = shift / (-(2**0.5) * trajectory.scale)
+    home, margin = radiance.lattice.to_world(torch.tensor([3.0, 4.0, 4.0])), 2 * radiance.lattice.voxel_size
+    for times, moved in (([0.0], torch.zeros(3)), ([0.0, 1.0], shift)):
+        box = method.bounds(times)
+        assert box.low == pytest.approx((home + moved.clamp(max=0) - margin).tolist(), abs=1e-5)
+        assert box.high == pytest.approx((home + moved.clamp(min=0) + margin).tolist(), abs=1e-5)

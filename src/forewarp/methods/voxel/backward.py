@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor, nn
 
-from forewarp.fields.grids import RadianceGrid, Shade
+from forewarp.fields.grids import RadianceGrid
 from forewarp.fields.networks import mlp
 from forewarp.methods.method import Start
-from forewarp.methods.voxel.effects import Together
 from forewarp.methods.voxel.model import Factory, VoxelMethod, VoxelSnapshot
 from forewarp.methods.voxel.planning import EFFECTS
-from forewarp.ops.encode import positional_encoding
+from forewarp.ops.encode import encoded_size, positional_encoding
 from forewarp.ops.grid import dilate
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.view import Moment
@@ -44,43 +44,31 @@ class Deformation(nn.Module):
         time_frequencies: int = 5,
     ) -> None:
         super().__init__()
-        self.lattice = Lattice(box, (2, 2, 2))
+        self.lattice, self.scale = Lattice(box, (2, 2, 2)), 0.5 * max(box.size)
         self.canonical_time = canonical_time
-        self.scale = 0.5 * max(box.size)
         self.frequencies, self.time_frequencies = frequencies, time_frequencies
-        inputs = 3 * (1 + 2 * frequencies) + 1 + 2 * time_frequencies
+        inputs = encoded_size(3, frequencies) + encoded_size(1, time_frequencies)
         self.network = mlp(inputs, 3, width=width, layers=layers, zero_last=True, leaky=True)
 
     def forward(self, points: Tensor, time: float) -> Tensor:
         """World points (P, 3) at ``time`` -> displacement (P, 3)."""
-        position = positional_encoding(
-            self.lattice.normalised(self.lattice.to_lattice(points)), self.frequencies
-        )
+        place = self.lattice.normalised(self.lattice.to_lattice(points))
         clock = positional_encoding(points.new_tensor([[2 * time - 1]]), self.time_frequencies)
-        inputs = torch.cat([position, clock.expand(len(points), -1)], -1)
+        inputs = [positional_encoding(place, self.frequencies), clock.expand(len(points), -1)]
         # Fade in over a twentieth of the sequence, to be continuous in time.
         gate = min(1.0, abs(time - self.canonical_time) * 20)
-        return gate * self.scale * self.network(inputs)
+        return gate * self.scale * self.network(torch.cat(inputs, -1))
 
 
-@dataclass(frozen=True)
-class MovedField:
-    """The canonical grid, read at points displaced to the canonical time."""
+@dataclass(frozen=True, kw_only=True)
+class MovedField(RadianceGrid):
+    """The canonical grid, read at points that ``deformation`` displaces from ``time`` to the canonical time.
 
-    canonical: RadianceGrid
+    Directions are not warped.
+    """
+
     deformation: Deformation
     time: float
-    cells: Tensor
-
-    @property
-    def lattice(self) -> Lattice:
-        """The canonical lattice, in whose coordinates points are given."""
-        return self.canonical.lattice
-
-    @property
-    def voxel_size(self) -> float:
-        """Voxel size of the canonical lattice."""
-        return self.canonical.voxel_size
 
     def _moved(self, points: Tensor) -> Tensor:
         displacement = self.deformation(self.lattice.to_world(points), self.time)
@@ -89,11 +77,30 @@ class MovedField:
     def density(self, points: Tensor) -> Tensor:
         """Density (P,); 0 where the canonical position lies outside the box."""
         moved = self._moved(points)
-        return self.canonical.density(moved) * self.lattice.holds(moved.detach())
+        return super().density(moved) * self.lattice.holds(moved.detach())
 
-    def colors(self, points: Tensor, directions: Tensor, shade: Shade | None) -> Tensor:
-        """Colour (P, 3); directions are not warped."""
-        return self.canonical.colors(self._moved(points), directions, shade)
+    def features(self, points: Tensor) -> Tensor:
+        """Colour features (P, C)."""
+        return super().features(self._moved(points))
+
+    @cached_property
+    @torch.no_grad()
+    def cells(self) -> Tensor:
+        """Cells that the displacement carries near an occupied canonical cell."""
+        source, lattice = super().cells, self.lattice
+        coarse = Lattice(lattice.box, tuple(min(n, _NODES) for n in lattice.shape))
+        nodes = coarse.to_world(coarse.all_voxels(source.device))
+        moved = lattice.to_lattice(nodes + self.deformation(nodes, self.time))
+        reach = max(-(-n // m) for n, m in zip(lattice.shape, coarse.shape)) + 1
+        near = dilate(source, reach)
+        last = torch.tensor(source.shape, device=source.device) - 1
+        x, y, z = torch.minimum(moved.round().long().clamp(min=0), last).unbind(-1)
+        hit = near[x, y, z].reshape(coarse.shape)
+        axes = [
+            ((torch.arange(n, device=hit.device) + 0.5) / n * (m - 1)).round().long()
+            for n, m in zip(source.shape, coarse.shape)
+        ]
+        return dilate(hit)[axes[0]][:, axes[1]][:, :, axes[2]]
 
 
 class BackwardWarp(VoxelMethod):
@@ -121,35 +128,9 @@ class BackwardWarp(VoxelMethod):
     def at(self, moment: Moment) -> VoxelSnapshot:
         """Return the field ``backward``: the displaced one, or the canonical one at the canonical time."""
         canonical = field = self.radiance()
-        time = moment.time
-        if self.deformation is not None and time != self.canonical_time:
-            field = MovedField(canonical, self.deformation, time, self._cells(canonical, time))
-        static = None
-        if self.background is not None:
-            static = self.background()
-            field = Together(field, static)
-        return VoxelSnapshot(
-            moment, {"backward": field}, canonical, self.renderer, self.view_dependence, background=static
-        )
-
-    @torch.no_grad()
-    def _cells(self, canonical: RadianceGrid, time: float) -> Tensor:
-        """Find the cells at ``time`` that the displacement carries near an occupied canonical cell."""
-        source = canonical.cells
-        lattice = canonical.lattice
-        coarse = Lattice(lattice.box, tuple(min(n, _NODES) for n in lattice.shape))
-        nodes = coarse.to_world(coarse.all_voxels(source.device))
-        moved = lattice.to_lattice(nodes + self.deformation(nodes, time))
-        reach = max(-(-n // m) for n, m in zip(lattice.shape, coarse.shape)) + 1
-        near = dilate(source, reach)
-        last = torch.tensor(source.shape, device=source.device) - 1
-        x, y, z = torch.minimum(moved.round().long().clamp(min=0), last).unbind(-1)
-        hit = near[x, y, z].reshape(coarse.shape)
-        axes = [
-            ((torch.arange(n, device=hit.device) + 0.5) / n * (m - 1)).round().long()
-            for n, m in zip(source.shape, coarse.shape)
-        ]
-        return dilate(hit)[axes[0]][:, axes[1]][:, :, axes[2]]
+        if self.deformation is not None and moment.time != self.canonical_time:
+            field = MovedField(**vars(canonical), deformation=self.deformation, time=moment.time)
+        return self.snapshot(moment, {"backward": field}, canonical)
 
     @torch.no_grad()
     def trajectories(self, points: Tensor, times: Tensor) -> Tensor:

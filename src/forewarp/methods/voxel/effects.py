@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -12,11 +11,11 @@ from torch.nn import functional
 from torch.utils.checkpoint import checkpoint
 
 from forewarp.fields.curves import TrajectoryField
-from forewarp.fields.grids import EMPTY, DirectRadiance, FieldAtTime, RadianceGrid, VoxelGrid
+from forewarp.fields.grids import EMPTY, DirectRadiance, FieldAtTime, RadianceGrid, Shade, VoxelGrid
 from forewarp.fields.networks import mlp
-from forewarp.ops.encode import positional_encoding, spherical_harmonics_1
+from forewarp.ops.encode import encoded_size, positional_encoding, spherical_harmonics_1
 from forewarp.ops.grid import index_of, occupied_cells, trilinear
-from forewarp.ops.splat import Splat, average_splat, with_copies
+from forewarp.ops.splat import average_splat, with_copies
 from forewarp.scene.box import Lattice
 
 
@@ -58,21 +57,19 @@ class Motion(nn.Module):
         Returns:
             the warped grid, its coverage (M,), and the number of voxels that left the box.
         """
-        splat = self._splat(canonical, voxels, flow / flow.new_tensor(canonical.lattice.spacing))
+        values, shape = canonical.values, canonical.lattice.shape
+        flow = flow / flow.new_tensor(canonical.lattice.spacing)
+        learns = torch.is_grad_enabled() and (values.requires_grad or flow.requires_grad)
+        moves = None if learns or self.rest == 0 else ~(flow.abs() < self.rest).all(-1)
+        if moves is None or bool(moves.all()):
+            splat = average_splat(values, voxels + flow, shape, self.tau)
+        else:
+            splat = average_splat(values[moves], voxels[moves] + flow[moves], shape, self.tau)
+            splat = with_copies(splat, values[~moves], voxels[~moves], self.tau)
         share = (splat.coverage / max(self.fade, self.tau)).clamp(max=1.0)[:, None]
         density = splat.values[:, :1] * share + EMPTY * (1 - share)
         values = torch.cat([density, splat.values[:, 1:]], -1)
         return replace(canonical, index=splat.index, values=values), splat.coverage, splat.dropped
-
-    def _splat(self, canonical: RadianceGrid, voxels: Tensor, flow: Tensor) -> Splat:
-        """Splat along a flow (N, 3) in voxels."""
-        values, shape = canonical.values, canonical.lattice.shape
-        asks = torch.is_grad_enabled() and (values.requires_grad or flow.requires_grad)
-        moves = None if asks or self.rest == 0 else ~(flow.abs() < self.rest).all(-1)
-        if moves is None or bool(moves.all()):
-            return average_splat(values, voxels + flow, shape, self.tau)
-        splat = average_splat(values[moves], voxels[moves] + flow[moves], shape, self.tau)
-        return with_copies(splat, values[~moves], voxels[~moves], self.tau)
 
 
 @dataclass(frozen=True)
@@ -86,6 +83,11 @@ class Crop:
     def shape(self) -> tuple[int, int, int]:
         """Number of voxels per axis."""
         return tuple(h - l + 1 for l, h in zip(self.low, self.high))
+
+    @property
+    def slices(self) -> tuple[slice, slice, slice]:
+        """The region's part of an array over the lattice."""
+        return tuple(slice(l, h + 1) for l, h in zip(self.low, self.high))
 
     def scaled(self, scale: int) -> Crop:
         """Return the same region on a lattice refined ``scale`` times; its corners do not move."""
@@ -104,8 +106,7 @@ def occupied_crop(index: Tensor, margin: int) -> Crop:
 
 def densify(grid: RadianceGrid, crop: Crop) -> Tensor:
     """Return the crop's values (1, 1 + C, x, y, z); absent voxels are empty space. Differentiable."""
-    region = tuple(slice(l, h + 1) for l, h in zip(crop.low, crop.high))
-    rows = grid.index[region].reshape(-1).long()
+    rows = grid.index[crop.slices].reshape(-1).long()
     padded = torch.cat([grid.values, grid.fill[None]])
     dense = padded.index_select(0, torch.where(rows < 0, len(padded) - 1, rows))
     return dense.reshape(1, *crop.shape, -1).permute(0, 4, 1, 2, 3)
@@ -116,7 +117,7 @@ def sparsify(grid: RadianceGrid, lattice: Lattice, crop: Crop, dense: Tensor) ->
     index = torch.full(lattice.shape, -1, dtype=torch.int32, device=dense.device)
     count = dense[0, 0].numel()
     rows = torch.arange(count, dtype=torch.int32, device=dense.device).reshape(crop.shape)
-    index[tuple(slice(l, h + 1) for l, h in zip(crop.low, crop.high))] = rows
+    index[crop.slices] = rows
     values = dense[0].permute(1, 2, 3, 0).reshape(count, -1)
     return replace(grid, lattice=lattice, index=index, values=values)
 
@@ -127,8 +128,8 @@ def convolve(layer: nn.Conv3d, x: Tensor) -> Tensor:
     With one thread PyTorch itself takes oneDNN only for volumes above some size, and is about seven times
     slower below it.
     """
-    own = x.device.type != "cpu" or x.dtype != torch.float32 or torch.is_autocast_enabled("cpu")
-    if own or torch.get_num_threads() > 1 or not torch.backends.mkldnn.is_available():
+    plain = x.device.type == "cpu" and x.dtype == torch.float32 and not torch.is_autocast_enabled("cpu")
+    if not plain or torch.get_num_threads() > 1 or not torch.backends.mkldnn.is_available():
         return layer(x)
     return functional.conv3d(x.to_mkldnn(), layer.weight, layer.bias, padding=layer.padding).to_dense()
 
@@ -217,14 +218,11 @@ class UNet3d(nn.Module):
 
     def features(self, dense: Tensor) -> Tensor:
         """(1, I, x, y, z) -> (1, width, x, y, z); any size of at least one voxel."""
-        skips = []
-        x = dense
-        for level, block in enumerate(self.encode):
-            if level:
-                x = functional.max_pool3d(x, 2, ceil_mode=True)
-            x = block(x)
+        x, skips = self.encode[0](dense), []
+        for block in self.encode[1:]:
             skips.append(x)
-        for block, skip in zip(self.decode, skips[-2::-1]):
+            x = block(functional.max_pool3d(x, 2, ceil_mode=True))
+        for block, skip in zip(self.decode, reversed(skips)):
             # To the size of the skip, as odd sizes do not double.
             x = functional.interpolate(x, size=skip.shape[2:], mode="nearest")
             x = block(torch.cat([x, skip], 1))
@@ -275,7 +273,8 @@ class TrilinearUpsampler(nn.Module):
 class LearnedUpsampler(TrilinearUpsampler):
     """Interpolate, then add detail by two convolutions at the fine resolution: the paper's up-layer.
 
-    Its last layer starts as 0, so that training starts from plain interpolation.
+    Its last layer starts as 0, so that training starts from plain interpolation. An inpainter asks for
+    ``residual`` alone.
 
     Args:
         scale: a whole number > 1.
@@ -310,19 +309,19 @@ class LearnedUpsampler(TrilinearUpsampler):
     def residual(self, features: Tensor, crop: Crop) -> Tensor:
         """Coarse features (1, F, x, y, z) of ``crop`` -> detail (1, 1 + C, x', y', z') of the fine crop."""
         first, second = self.layers
+        parts = (
+            lambda volume: first(interpolate_dense(volume, crop, self.scale)),
+            lambda volume: self.head(second(volume)),
+        )
+        volume = self.project(features)  # to few channels first, as all the cost is at the fine resolution
+        for part in parts:
+            if self.recompute:
+                volume = checkpoint(part, volume, use_reentrant=False, preserve_rng_state=False)
+            else:
+                volume = part(volume)
+        return volume.to(self.head.weight.dtype)  # half precision ends with the convolutions
 
-        def held(part: Callable[[Tensor], Tensor], volume: Tensor) -> Tensor:
-            if not self.recompute:
-                return part(volume)
-            return checkpoint(part, volume, use_reentrant=False, preserve_rng_state=False)
-
-        # Project to few channels first, as all the cost is at the fine resolution.
-        coarse = self.project(features)
-        fine = held(lambda volume: first(interpolate_dense(volume, crop, self.scale)), coarse)
-        detail = held(lambda volume: self.head(second(volume)), fine)
-        return detail.to(self.head.weight.dtype)  # half precision ends with the convolutions
-
-    def alone(self, grid: RadianceGrid) -> RadianceGrid:
+    def forward(self, grid: RadianceGrid) -> RadianceGrid:
         """Up-sample a warped grid without an inpainter: interpolation plus learned detail."""
         crop = occupied_crop(grid.index, self.margin)
         dense = densify(grid, crop)
@@ -362,7 +361,7 @@ class ViewNetwork(nn.Module):
     def __init__(self, *, features: int = 12, width: int = 64, layers: int = 2, frequencies: int = 4) -> None:
         super().__init__()
         self.features, self.frequencies = features, frequencies
-        self.network = mlp(features + 3 * (1 + 2 * frequencies), 3, width=width, layers=layers)
+        self.network = mlp(features + encoded_size(3, frequencies), 3, width=width, layers=layers)
 
     def forward(self, features: Tensor, directions: Tensor) -> Tensor:
         """Features (S, C), unit directions (S, 3) -> colour (S, 3) in [0, 1]."""
@@ -404,22 +403,22 @@ class Together:
 
     def _in_moving(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Return which rows of the points lie in the moving lattice, and these in its coordinates."""
-        own = self.moving.lattice.to_lattice(self.lattice.to_world(points))
-        rows = self.moving.lattice.holds(own).nonzero()[:, 0]
-        return rows, own[rows]
+        inner = self.moving.lattice.to_lattice(self.lattice.to_world(points))
+        rows = self.moving.lattice.holds(inner).nonzero()[:, 0]
+        return rows, inner[rows]
 
     def density(self, points: Tensor) -> Tensor:
         """Density (P,)."""
-        rows, own = self._in_moving(points)
-        moving = points.new_zeros(len(points)).index_copy(0, rows, self.moving.density(own))
+        rows, inner = self._in_moving(points)
+        moving = points.new_zeros(len(points)).index_copy(0, rows, self.moving.density(inner))
         return self.static.density(points) + moving
 
-    def colors(self, points: Tensor, directions: Tensor, shade: Callable | None) -> Tensor:
+    def colors(self, points: Tensor, directions: Tensor, shade: Shade | None) -> Tensor:
         """Colour (P, 3): the mean of both fields' colours, weighted by density."""
-        rows, own = self._in_moving(points)
+        rows, inner = self._in_moving(points)
         static = self.static.colors(points, directions, None)
-        moving = self.moving.colors(own, directions[rows], shade)
-        sigma = self.moving.density(own)
+        moving = self.moving.colors(inner, directions[rows], shade)
+        sigma = self.moving.density(inner)
         # The floor avoids 0 / 0 where both fields are empty.
         share = sigma / (sigma + self.static.density(points[rows])).clamp(min=torch.finfo(sigma.dtype).tiny)
         mixed = torch.lerp(static[rows], moving, share[:, None])

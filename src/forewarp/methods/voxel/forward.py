@@ -11,7 +11,6 @@ from forewarp.fields.grids import DirectRadiance, RadianceGrid
 from forewarp.methods.method import Start
 from forewarp.methods.voxel.effects import (
     LearnedUpsampler,
-    Together,
     TrilinearUpsampler,
     densify,
     interpolate_dense,
@@ -73,11 +72,9 @@ class ForwardWarp(VoxelMethod):
             field = trajectory(scene.box, frames=len(scene.times), canonical_time=scene.canonical_time)
             self.motion = motion(field)
         inpainter = None if inpainter is None else inpainter(channels=channels, head=not learned)
-        if learned:
-            width = 0 if inpainter is None else inpainter.width
-            self.upsampler = upsampler(channels=channels, features=width)
-        elif upsampler is not None:
-            self.upsampler = upsampler()
+        if upsampler is not None:
+            asked = {"channels": channels, "features": getattr(inpainter, "width", 0)} if learned else {}
+            self.upsampler = upsampler(**asked)
         self.inpainter = inpainter
         scale = getattr(self.upsampler, "scale", 1)
         if inpainter is not None and scale != int(scale):
@@ -95,26 +92,13 @@ class ForwardWarp(VoxelMethod):
             flow = self.motion.flow(self.radiance, moment.time)  # V_flow
             warped, coverage, dropped = self.motion.warp(canonical, self.radiance.voxels, flow)
         if self.inpainter is None:
-            fields, difference = {self.first_rendering: self._upsample(warped)}, None  # V_RUp
+            upsampled, difference = warped if self.upsampler is None else self.upsampler(warped), None
+            fields = {self.first_rendering: upsampled}  # V_RUp
         else:
             fields, difference = self._inpaint(warped, coverage)  # V_RUp, V_RInp
-        static = None
-        if self.background is not None:
-            static = self.background()
-            fields = {name: Together(field, static) for name, field in fields.items()}
-        return VoxelSnapshot(
-            moment,
-            fields,
-            canonical,
-            self.renderer,
-            self.view_dependence,
-            flow,
-            coverage,
-            dropped,
-            difference,
-            static,
-            length=2 / 3 * self.half_extent if self.moves else 1.0,
-        )
+        found = {"flow": flow, "coverage": coverage, "dropped": dropped, "inpaint_difference": difference}
+        length = 2 / 3 * self.half_extent if self.moves else 1.0
+        return self.snapshot(moment, fields, canonical, length=length, **found)
 
     def departures(self) -> list[str]:
         """See ``Method``; docs/method.md has the rest, which every preset shares."""
@@ -131,12 +115,6 @@ class ForwardWarp(VoxelMethod):
     def first_rendering(self) -> str:
         """Name of the rendering without inpainting: ``upsampled``, or ``warped`` without an up-sampler."""
         return "warped" if self.upsampler is None else "upsampled"
-
-    def _upsample(self, warped: RadianceGrid) -> RadianceGrid:
-        if self.upsampler is None:
-            return warped
-        learned = isinstance(self.upsampler, LearnedUpsampler)
-        return self.upsampler.alone(warped) if learned else self.upsampler(warped)
 
     def _inpaint(
         self, warped: RadianceGrid, coverage: Tensor | None
@@ -164,9 +142,9 @@ class ForwardWarp(VoxelMethod):
     def advance(self, progress: float, step: int, optimizer: torch.optim.Optimizer) -> dict[str, float]:
         """Follow the schedules of the lattices and of the trajectory bases."""
         noted = super().advance(progress, step, optimizer)
-        if self.motion is None:
-            return noted
-        return noted | {"bases_in_play": self.motion.trajectory.play(self.stage.at("bases", progress))}
+        if self.motion is not None:
+            noted["bases_in_play"] = self.motion.trajectory.play(self.stage.at("bases", progress))
+        return noted
 
     def trajectories(self, points: Tensor, times: Tensor) -> Tensor:
         """Return the paths (N, T, 3) of canonical points (N, 3) at ``times`` (T,), in world units."""

@@ -10,21 +10,22 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from forewarp import losses
 from forewarp.fields.grids import (
     Activation,
+    CanonicalRadiance,
     FieldAtTime,
     RadianceGrid,
     Shade,
-    VoxelGrid,
     mean_color,
     shaded,
 )
 from forewarp.methods.method import Method, Snapshot, Start, Step
-from forewarp.methods.voxel.losses import LITERAL, TERMS, Seen, voxel_terms
-from forewarp.methods.voxel.structure import Lattices, VoxelStage, first_voxels, resample
+from forewarp.methods.voxel.effects import Together
+from forewarp.methods.voxel.structure import VoxelStage, first_voxels, refresh, resample
 from forewarp.ops.grid import neighbour_pairs
 from forewarp.ops.march import warm_up
-from forewarp.renderer import Renderer
+from forewarp.renderer import Marched, Renderer
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.camera import RandomPatches, Rays
 from forewarp.scene.cloud import Cloud
@@ -126,7 +127,9 @@ class VoxelMethod(Method):
         half_extent: half the scene's longest side, in world units.
     """
 
-    terms, literal = TERMS, LITERAL
+    terms = ("photo", "point_color", "background_entropy", "flow_l1", "inpaint_diff", "tv_density", "tv_flow")
+    terms += ("tv_depth", "static_points", "moving_opacity")
+    literal = ("photo", "point_color", "background_entropy")  # their printed form differs
     numbers = tuple(field.name for field in fields(VoxelStage) if field.name != "name")
     moves: bool
 
@@ -144,25 +147,32 @@ class VoxelMethod(Method):
         self.renderer = (renderer or Renderer()).with_threshold(stage.color_threshold)
         scene, before = start.scene, _carried(start, stage)
         self.canonical_time, self.half_extent = scene.canonical_time, 0.5 * max(scene.box.size)
-        self.lattices: Lattices | None = None
-        box = scene.box if start.handover is None else start.handover.box
+        box, notes = scene.box, {}
+        if start.handover is not None:
+            box, notes = start.handover.box, start.handover.notes
+        lattice, active = _resampled(before and before.radiance, box, stage, "num_voxels")
+        density_scale = notes.get("density_scale", lattice.voxel_size)
         if before is not None:
-            resample(before.radiance, box, stage.at("num_voxels", 0.0), keep_alpha=stage.keep_alpha)
-            lattice, active = before.radiance.lattice, before.radiance.index >= 0
             density_scale = before.radiance.activation.density_scale
         else:
-            lattice = Lattice.of_count(box, stage.at("num_voxels", 0.0))
-            active, density_scale = first_voxels(start, stage, lattice), _density_scale(start, lattice)
-        common = {"density_scale": density_scale}
+            active = first_voxels(start, stage, lattice)
         view_dependence = self.used("view_dependence", view_dependence)
         shade = None if view_dependence is None else view_dependence()
         features = 3 if shade is None else shade.features
         self.channels = 1 + features  # of a radiance grid
+        common = {"density_scale": density_scale}
         self.radiance = radiance(lattice, active, features=features, box=scene.box, **common)
         self.view_dependence, self.background = shade, None
+        # The grids that follow a schedule, by its key.
+        self.grids: dict[str, CanonicalRadiance] = {"num_voxels": self.radiance}
         if (background := self.used("background", background)) is not None:
-            static = _static_lattice(scene.box.scaled(1.05), stage, getattr(before, "background", None))
-            self.background = background(*static, **common)
+            room, key = scene.box.scaled(1.05), "background_num_voxels"
+            static = _resampled(before and before.background, room, stage, key)
+            self.background = self.grids[key] = background(*static, **common)
+        # By the same keys: a grid's present number of voxels, and the step at which it got them.
+        self.followed = {key: [stage.at(key, 0.0), 0] for key in self.grids}
+        # Voxels that were active at the start; meaningful on the first lattice only.
+        self.home: Tensor = self.radiance.index >= 0
 
     def used(self, name: str, option: Factory | None) -> Factory | None:
         """Return the factory of an effect; None if the effect is off, or is not one of this stage's.
@@ -186,14 +196,22 @@ class VoxelMethod(Method):
             alike = {k: v for k, v in theirs.items() if torch.is_tensor(v) and k in ours}
             self.load_state_dict(ours | {k: v for k, v in alike.items() if v.shape == ours[k].shape})
         elif not start.blank:
-            for grid in filter(None, (self.radiance, self.background)):
+            for grid in self.grids.values():
                 grid.fill(self.stage.start_alpha)
-        self.lattices = Lattices(self.radiance, self.background, self.stage)
-        self._terms, self._photo_on = voxel_terms(start.literal), start.photo_on
-        self._keep_all_weights = bool({"point_color", "background_entropy"} & set(start.literal))
+        self._literal, self._photo_on = frozenset(start.literal), start.photo_on
         cameras = [frame.camera for frame in start.scene.train]
         self.patches = RandomPatches(cameras, patches=self.stage.patches) if cameras else None
         self.static_points, self._pairs = start.scene.still, []
+
+    def snapshot(
+        self, moment: Moment, fields: dict[str, FieldAtTime], canonical: RadianceGrid, **found
+    ) -> VoxelSnapshot:
+        """Make a snapshot; the static background, if there is one, joins every field."""
+        static = None if self.background is None else self.background()
+        if static is not None:
+            fields = {name: Together(field, static) for name, field in fields.items()}
+        shade = self.view_dependence
+        return VoxelSnapshot(moment, fields, canonical, self.renderer, shade, background=static, **found)
 
     @classmethod
     def check(
@@ -208,19 +226,12 @@ class VoxelMethod(Method):
         """See ``Method.look``; all rays of a batch have one time and are marched together."""
         state = self.at(batch.observations[0].moment)
         rays, rgb, background = batch.joined()
-        rays, options = rays.to(self.device), {"keep_all_weights": self._keep_all_weights}
-        seen = Seen(
-            rgb,
-            state,
-            {
-                name: state.march(name, rays, background, generator=generator, **options)
-                for name in self._compared(state)
-            },
-            lambda: self._patches_of(state, generator),
-            lambda: self._stray(batch.time, generator),
-            self._neighbours,
-        )
-        best = list(seen.renderings.values())[-1]
+        rays, keep_all = rays.to(self.device), bool({"point_color", "background_entropy"} & self._literal)
+        renderings = {
+            name: state.march(name, rays, background, generator=generator, keep_all_weights=keep_all)
+            for name in self._compared(state)
+        }
+        best = list(renderings.values())[-1]
         noted = {
             "occupied_voxels": len(state.canonical.values),
             "samples": best.samples,
@@ -228,23 +239,80 @@ class VoxelMethod(Method):
         }
         if state.coverage is not None:
             noted["coverage"] = float(state.coverage.detach().clamp(max=1).mean())
-        return Step(
-            {name: partial(term, seen) for name, term in self._terms.items()},
-            (best.rgb.detach() - rgb).square().mean(),
-            noted,
-            tensors=seen.tensors,
-        )
+        terms = self.terms_of(state, renderings, rgb, generator)
+        error = (best.rgb.detach() - rgb).square().mean()
+        return Step(terms, error, noted, tensors=partial(_tensors, state, renderings))
+
+    def terms_of(
+        self, state: VoxelSnapshot, renderings: dict[str, Marched], rgb: Tensor, generator: torch.Generator
+    ) -> dict[str, Callable[[], Tensor | None]]:
+        """Return the loss terms: what each function of ``losses`` is applied to.
+
+        Those named in ``Start.literal`` have the form printed in the paper.
+
+        Args:
+            state: the method at the batch's time.
+            renderings: renderings of the batch's R rays, by name; per-ray terms are summed over them.
+            rgb: the true colours (R, 3).
+            generator: draws random views, and some of the static points.
+        """
+        seen, canonical, literal = renderings.values(), state.canonical, self._literal
+
+        def photo() -> Tensor:
+            return sum(losses.photometric(r.rgb, rgb, literal="photo" in literal) for r in seen)
+
+        def point_color() -> Tensor:
+            ids = [r.all_ray_ids if "point_color" in literal else None for r in seen]
+            samples = [(r.weights, r.colors, r.ray_ids) for r in seen]
+            return sum(losses.point_color(*s, rgb, all_ray_ids=every) for s, every in zip(samples, ids))
+
+        def background_entropy() -> Tensor:
+            if "background_entropy" in literal:
+                return sum(losses.sample_entropy(r.all_weights) for r in seen)
+            return sum(losses.background_entropy(r.transmittance) for r in seen)
+
+        def flow_l1() -> Tensor | None:
+            return None if state.flow is None else losses.flow_l1(state.flow / state.length)
+
+        def inpaint_diff() -> Tensor | None:
+            residual = state.inpaint_difference
+            return None if residual is None else losses.inpaint_diff(residual)
+
+        def tv_density() -> Tensor:
+            grids = [grid for grid in (canonical, state.background) if grid is not None]
+            return sum(losses.tv_density(g.raw_density, self._neighbours(g.index)) for g in grids)
+
+        def tv_flow() -> Tensor | None:
+            if state.flow is None:
+                return None
+            return losses.tv_flow(state.flow / state.length, self._neighbours(canonical.index))
+
+        def tv_depth() -> Tensor:
+            return losses.tv_depth(*self._patches_of(state, generator))
+
+        def static_points() -> Tensor | None:
+            stray = self._stray(state.moment.time, generator)
+            return None if stray is None else losses.static_points(stray)
+
+        def moving_opacity() -> Tensor | None:
+            if state.background is None:
+                return None
+            alpha = canonical.activation.alpha(canonical.raw_density, canonical.lattice.voxel_size)
+            return losses.moving_opacity(alpha)
+
+        terms = (photo, point_color, background_entropy, flow_l1, inpaint_diff)
+        terms += (tv_density, tv_flow, tv_depth, static_points, moving_opacity)
+        return {term.__name__: term for term in terms}
 
     def _compared(self, state: VoxelSnapshot) -> list[str]:
         """Names of the renderings that the per-ray terms compare: those in ``photo_on``, or all.
 
         A stage without up-sampler has ``warped`` in the place of ``upsampled``.
         """
-        names = list(state.fields)
-        if self._photo_on is None:
-            return names
-        known = {"upsampled", "warped"} if {"upsampled", "warped"} & set(self._photo_on) else set()
-        return [n for n in names if n in {*self._photo_on, *known}] or names
+        names, wanted = list(state.fields), set(self._photo_on or ())
+        if wanted & {"upsampled", "warped"}:
+            wanted |= {"upsampled", "warped"}
+        return [name for name in names if name in wanted] or names
 
     def _patches_of(self, state: VoxelSnapshot, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         rays = self.patches.draw(generator).to(self.device)
@@ -273,23 +341,30 @@ class VoxelMethod(Method):
         """Group parameters: ``density``, ``color``, ``shading`` and ``grid`` (rows of voxel grids), ``flow``
         (the trajectory or deformation network) and ``network`` (all other networks).
         """
+        of_rows = {name: name for name in ("density", "color", "shading", "grid")} | {"features": "grid"}
         groups: dict[str, list[nn.Parameter]] = {}
         for name, parameter in self.named_parameters():
-            head, last = name.split(".")[0], name.split(".")[-1]
-            if last in ("density", "color", "shading"):
-                kind = last
-            elif last in ("features", "grid"):
-                kind = "grid"
-            elif head in ("motion", "deformation"):
-                kind = "flow"
-            else:
-                kind = "network"
-            groups.setdefault(kind, []).append(parameter)
+            part, last = name.split(".")[0], name.split(".")[-1]
+            of_part = "flow" if part in ("motion", "deformation") else "network"
+            groups.setdefault(of_rows.get(last, of_part), []).append(parameter)
         return groups
 
     def advance(self, progress: float, step: int, optimizer: torch.optim.Optimizer) -> dict[str, float]:
-        """Follow the schedule of the lattices."""
-        self.lattices.follow(progress, step, optimizer)
+        """Resample or refresh the grids that are due at ``progress``."""
+        stage = self.stage
+        due = stage.refresh_every and step and step % stage.refresh_every == 0
+        for key, grid in self.grids.items():
+            (present, since), num_voxels = self.followed[key], stage.at(key, progress)
+            only_seen = stage.see_steps > 0 and step - since >= stage.see_steps
+            common = {"keep_alpha": stage.keep_alpha, "optimizer": optimizer, "only_seen": only_seen}
+            if num_voxels != present:
+                resample(grid, grid.lattice.box, num_voxels, **common)
+                self.followed[key] = [num_voxels, step]
+            elif due and progress >= stage.refresh_from:
+                confined = key == "num_voxels" and progress < stage.confine
+                confined = confined and self.home.shape == grid.lattice.shape
+                allowed = self.home.to(grid.index.device) if confined else None
+                refresh(grid, birth_alpha=stage.birth_alpha, allowed=allowed, **common)
         return {}
 
     def moved(self, points: Tensor, rows: Tensor, time: float) -> Tensor:
@@ -339,17 +414,16 @@ class VoxelMethod(Method):
         return "voxels", len(self.radiance.voxels)
 
     def get_extra_state(self) -> dict:
-        """Return the length that density is measured in, and the state of the lattices' schedule."""
-        schedule = {} if self.lattices is None else self.lattices.state_dict()
+        """Return the length that density is measured in, and how far the lattices' schedule is."""
+        schedule = {"home": self.home, "followed": self.followed}
         return {"density_scale": self.radiance.activation.density_scale, "lattices": schedule}
 
     def set_extra_state(self, state: dict) -> None:
         """Adopt a checkpoint's state."""
-        for grid in (self.radiance, self.background):
-            if grid is not None:
-                grid.activation = Activation(grid.activation.shift, float(state["density_scale"]))
-        if self.lattices is not None and state["lattices"]:
-            self.lattices.load_state_dict(state["lattices"])
+        for grid in self.grids.values():
+            grid.activation = Activation(grid.activation.shift, float(state["density_scale"]))
+        self.home = state["lattices"]["home"]
+        self.followed = {key: list(state["lattices"]["followed"][key]) for key in self.grids}
 
 
 def _carried(start: Start, stage: VoxelStage) -> VoxelMethod | None:
@@ -358,21 +432,24 @@ def _carried(start: Start, stage: VoxelStage) -> VoxelMethod | None:
     return before if isinstance(before, VoxelMethod) else None
 
 
-def _density_scale(start: Start, lattice: Lattice) -> float:
-    """Return the length that density is measured in: of the stage before, or a voxel."""
-    notes = {} if start.handover is None else start.handover.notes
-    density_scale = notes.get("density_scale", lattice.voxel_size)
-    if not density_scale > 0:
-        raise ValueError(
-            f"stage.{start.stage}: expected a density_scale > 0 from the stage before, "
-            f"but got {density_scale}; delete the folder of that stage"
-        )
-    return density_scale
+def _tensors(state: VoxelSnapshot, renderings: Mapping[str, Marched]) -> Iterable[tuple[str, Tensor | None]]:
+    """Yield everything that a step computed, from the grids to the renderings, by name."""
+    for name in ("flow", "coverage", "inpaint_difference"):
+        yield f"state.{name}", getattr(state, name)
+    grids = {"canonical": state.canonical, "background": state.background, **state.fields}
+    yield from ((f"state.{name}.values", getattr(grid, "values", None)) for name, grid in grids.items())
+    for name, drawn in renderings.items():
+        yield from ((f"{name}.{part}", getattr(drawn, part)) for part in ("rgb", "depth", "opacity"))
 
 
-def _static_lattice(box: Box, stage: VoxelStage, before: VoxelGrid | None) -> tuple[Lattice, Tensor]:
-    """Return lattice and active voxels of the static background: of the stage before, or all of ``box``."""
-    num_voxels = stage.at("background_num_voxels", 0.0)
+def _resampled(
+    before: CanonicalRadiance | None, box: Box, stage: VoxelStage, key: str
+) -> tuple[Lattice, Tensor]:
+    """Return lattice and active voxels of a grid: those of ``before``, resampled to ``box``, or all.
+
+    ``key`` is that of the grid's schedule.
+    """
+    num_voxels = stage.at(key, 0.0)
     if before is None:
         lattice = Lattice.of_count(box, num_voxels)
         return lattice, torch.ones(lattice.shape, dtype=torch.bool)

@@ -121,58 +121,12 @@ def first_voxels(start: Start, stage: VoxelStage, lattice: Lattice) -> Tensor:
     frames, count = [scene.train[i] for i in start.frames], stage.hull_frames
     while count < len(frames) and frames[count].time == frames[count - 1].time:
         count += 1  # all views of each time: some neighbouring cameras alone bound nothing
-    frames, masks = frames[:count], []
-    for frame in frames:
-        pixels = max(1, round(stage.hull_grow * frame.camera.width))
-        masks.append(dilate(frame.load()[..., 3] > 127, pixels))
+    cameras = [frame.camera for frame in frames[:count]]
+    grown = [max(1, round(stage.hull_grow * camera.width)) for camera in cameras]
+    masks = [dilate(frame.load()[..., 3] > 127, pixels) for frame, pixels in zip(frames, grown)]
     points = lattice.to_world(lattice.all_voxels())
-    inside = visual_hull(points, [frame.camera for frame in frames], masks, stage.hull_misses)
+    inside = visual_hull(points, cameras, masks, stage.hull_misses)
     return inside.reshape(lattice.shape) if bool(inside.any()) else everywhere
-
-
-class Lattices:
-    """Let the canonical grid, and the static background's, follow the schedule of a stage.
-
-    Args:
-        radiance: the canonical grid.
-        background: the static grid, or None.
-        stage: the numbers of the stage.
-    """
-
-    def __init__(self, radiance: VoxelGrid, background: VoxelGrid | None, stage: VoxelStage) -> None:
-        self.stage, self.grids = stage, {"num_voxels": radiance}
-        if background is not None:
-            self.grids["background_num_voxels"] = background
-        # By the key of a grid's schedule: its present number of voxels, and the step at which it got them.
-        self.followed = {key: [stage.at(key, 0.0), 0] for key in self.grids}
-        # Voxels that were active at the start; meaningful on the first lattice only.
-        self.home: Tensor = radiance.index >= 0
-
-    def follow(self, fraction: float, step: int, optimizer: torch.optim.Optimizer) -> None:
-        """Resample or refresh the grids that are due at a fraction of the stage."""
-        stage = self.stage
-        due = stage.refresh_every and step and step % stage.refresh_every == 0
-        for key, grid in self.grids.items():
-            (present, since), num_voxels = self.followed[key], stage.at(key, fraction)
-            only_seen = stage.see_steps > 0 and step - since >= stage.see_steps
-            common = {"keep_alpha": stage.keep_alpha, "optimizer": optimizer, "only_seen": only_seen}
-            if num_voxels != present:
-                resample(grid, grid.lattice.box, num_voxels, **common)
-                self.followed[key] = [num_voxels, step]
-            elif due and fraction >= stage.refresh_from:
-                confined = key == "num_voxels" and fraction < stage.confine
-                confined = confined and self.home.shape == grid.lattice.shape
-                allowed = self.home.to(grid.index.device) if confined else None
-                refresh(grid, birth_alpha=stage.birth_alpha, allowed=allowed, **common)
-
-    def state_dict(self) -> dict:
-        """Return all that is needed to continue."""
-        return {"home": self.home, "followed": self.followed}
-
-    def load_state_dict(self, state: dict) -> None:
-        """Continue from a ``state_dict``."""
-        self.home = state["home"]
-        self.followed = {key: list(state["followed"][key]) for key in self.grids}
 
 
 def seen_rows(radiance: VoxelGrid, optimizer: torch.optim.Optimizer) -> Tensor:
@@ -180,7 +134,7 @@ def seen_rows(radiance: VoxelGrid, optimizer: torch.optim.Optimizer) -> Tensor:
     name = "color" if "color" in radiance.names else radiance.names[0]
     moments = optimizer.state.get(radiance.parameter(name), {}).get("exp_avg_sq")
     if moments is None:
-        return torch.ones(len(radiance.voxels), dtype=torch.bool, device=radiance.voxels.device)
+        return torch.ones_like(radiance.voxels[:, 0], dtype=torch.bool)
     return moments.amax(-1) > 0
 
 
@@ -215,10 +169,8 @@ def refresh(
         solid = solid & seen_rows(radiance, optimizer)
     mask = torch.zeros(grid.lattice.shape, dtype=torch.bool, device=solid.device)
     mask[radiance.voxels[solid].unbind(-1)] = True
-    if not bool(mask.any()):
-        return False
     active = dilate(mask, 1) if allowed is None else (dilate(mask, 1) & allowed) | mask
-    if bool((active == (radiance.index >= 0)).all()):
+    if not bool(mask.any()) or torch.equal(active, radiance.index >= 0):
         return False
     before = radiance.rows()
     rows = radiance.activate(active, radiance.births(birth_alpha))
