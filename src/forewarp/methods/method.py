@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor, nn
 
 from forewarp.fields.grids import VoxelGrid
+from forewarp.ops.backend import is_number
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.cloud import Cloud, Ellipsoids, Handover
 from forewarp.scene.frame import Scene
@@ -165,8 +165,8 @@ class Method(nn.Module):
 
     def protocol(self) -> dict[str, str]:
         """Return what readers of the method's results should know: departures and kept faults, if any."""
-        found = {"departures": self.departures(), "faults": self.faults()}
-        return {name: "; ".join(notes) for name, notes in found.items() if notes}
+        about = {"departures": self.departures(), "faults": self.faults()}
+        return {name: "; ".join(notes) for name, notes in about.items() if notes}
 
     @property
     def size(self) -> tuple[str, int]:
@@ -200,9 +200,8 @@ class Method(nn.Module):
         rows = {tuple(getattr(state[name], "shape", ()))[:1] for name in self.grows[:1]}
         for name in self.grows:
             shape, own = tuple(getattr(state[name], "shape", ())), part_of(self, name)
-            if shape[:1] not in rows or not shape or shape[1:] != tuple(own.shape[1:]):
-                return name
-            if state[name].dtype != own.dtype:
+            fits = bool(shape) and shape[:1] in rows and shape[1:] == tuple(own.shape[1:])
+            if not fits or state[name].dtype != own.dtype:
                 return name
         return None
 
@@ -215,15 +214,14 @@ class Method(nn.Module):
         Raises:
             ValueError: naming the first unknown one, and those that are known.
         """
-        for key, what, given, known in (
+        for key, expected, given, known in (
             (f"stage.{stage}", "a key of", numbers, cls.numbers),
             ("objective", "a term of", terms, cls.terms),
             ("objective.literal", "some of", literal, cls.literal),
         ):
-            for name in given:
-                if name not in known:
-                    there = ", ".join(known) or "none"
-                    raise ValueError(f"{key}: expected {what} {there}, but got '{name}'")
+            if unknown := [name for name in given if name not in known]:
+                names = ", ".join(known) or "none"
+                raise ValueError(f"{key}: expected {expected} {names}, but got '{unknown[0]}'")
 
     @classmethod
     def check_feasible(
@@ -249,6 +247,11 @@ def part_of(method: nn.Module, name: str) -> Tensor:
     """Return a parameter or buffer by its dotted name."""
     place, _, last = name.rpartition(".")
     return getattr(method.get_submodule(place), last)
+
+
+def those_that_hold(notes: Mapping[str, object]) -> list[str]:
+    """Return the notes whose condition holds, in order."""
+    return [note for note, holds in notes.items() if holds]
 
 
 def parameter_count(method: nn.Module) -> int:
@@ -326,8 +329,8 @@ def check_number(key: str, given: Any, wanted: str, good: Callable[[float], bool
     Raises:
         ValueError: naming the key, and in words what it takes.
     """
-    if isinstance(given, bool) or not isinstance(given, int | float) or not good(given):
-        raise ValueError(f"{key}: expected {wanted}, but got {given}")
+    if not is_number(given) or not good(given):
+        raise ValueError(f"{key}: expected {wanted}, but got {given!r}")
 
 
 def check_least(least: int = 0, *, of: str = "model", **given: Any) -> None:
@@ -347,8 +350,8 @@ def check_pair(key: str, given: Any) -> None:
     Raises:
         ValueError: naming the key.
     """
-    whole = isinstance(given, list | tuple) and [n for n in given if type(n) is int and n >= 1]
-    if not whole or len(given) != 2 or len(whole) != 2:
+    pair = isinstance(given, list | tuple) and len(given) == 2
+    if not pair or not all(type(number) is int and number >= 1 for number in given):
         raise ValueError(f"{key}: expected two whole numbers >= 1, but got {given}")
 
 
@@ -370,9 +373,9 @@ def steps_of(
         pairs = [(float(begin), float(count)) for begin, count in given]
     except (TypeError, ValueError):
         pairs = []
+    fractions = [begin for begin, _ in pairs]
     good = pairs and all(0 <= begin <= 1 and count >= least for begin, count in pairs)
-    good = good and all(one[0] <= other[0] for one, other in pairwise(pairs))
-    if not good or (from_start and pairs[0][0] != 0):
+    if not good or fractions != sorted(fractions) or (from_start and fractions[0] != 0):
         form = "[[0, count], [fraction, count], ...]" if from_start else "[[fraction, count], ...]"
         raise ValueError(
             f"{key}: expected {form} with ascending fractions and counts >= {least:g}, but got {given}"

@@ -15,7 +15,7 @@ from forewarp import losses
 from forewarp.fields.grids import VoxelGrid, density_shift
 from forewarp.fields.networks import mlp
 from forewarp.fields.occupancy import Occupancy
-from forewarp.methods.method import Start, check_least, check_number, check_pair
+from forewarp.methods.method import Start, check_least, check_number, check_pair, those_that_hold
 from forewarp.methods.rays import JUMP, NO_JUMP, MarchedMethod, Marching, regrow, whole_grid
 from forewarp.ops.encode import encoded_size, positional_encoding
 from forewarp.ops.grid import dilate, second_variation, trilinear
@@ -101,8 +101,8 @@ class NDVG(MarchedMethod):
         check_pair("model.width", width)
         check_pair("model.channels", channels)
         check_least(frequencies=frequencies, direction_frequencies=direction_frequencies)
-        own = {f.name: start.numbers[f.name] for f in fields(NDVGStage) if f.name in start.numbers}
-        self.stage = NDVGStage(**own).checked(where)
+        given = {f.name: start.numbers[f.name] for f in fields(NDVGStage) if f.name in start.numbers}
+        self.stage = NDVGStage(**given).checked(where)
         self.shift = density_shift(self.stage.alpha_init, self.alpha_key)
         self.canonical_time = start.scene.canonical_time
         self.octaves, self.continuous = (frequencies, direction_frequencies), continuous
@@ -110,15 +110,15 @@ class NDVG(MarchedMethod):
         self.never_seen = 0 if seen is None else len(start.scene.train) - seen  # by the first stage
         self.pulls = bool(start.weights.get("still"))
         viewed, first = self.stage.view_dependence, self.schedule[0][1]
-        self.canonical = whole_grid(
-            Lattice.of_count(box, first), {"density": 1, "color": channels[1] if viewed else 3}
-        )
+        colors = {"density": 1, "color": channels[1] if viewed else 3}
+        self.canonical = whole_grid(Lattice.of_count(box, first), colors)
         self.deformation = whole_grid(self.marching_lattice(first), {"features": channels[0]})
-        place, direction = encoded_size(3, frequencies), encoded_size(3, direction_frequencies)
-        inputs = encoded_size(channels[0], frequencies) + place + encoded_size(1, frequencies)
+        inputs = encoded_size(channels[0] + 3 + 1, frequencies)
         self.network = mlp(inputs, 4, width=width[0], layers=4, zero_last=True)
-        self.color = mlp(channels[1] + place + direction, 3, width=width[1], layers=3) if viewed else None
+        self.color = None
         if viewed:
+            inputs = channels[1] + encoded_size(3, frequencies) + encoded_size(3, direction_frequencies)
+            self.color = mlp(inputs, 3, width=width[1], layers=3)
             nn.init.zeros_(self.color[-1].bias)
         self.begin()
         if isinstance(start.before, NDVG) and not start.blank:
@@ -147,13 +147,9 @@ class NDVG(MarchedMethod):
             self.occupancy.settle(before.density_found, _some(self.times))
         voxels = self.canonical.lattice.to_world(self.canonical.voxels)
         if self.stage.carry:
-            optical = (
-                before.activation.sigma(_read(before.canonical, "density", voxels))
-                * self.activation.density_scale
-            )
-            self.canonical.density.copy_(
-                torch.log(torch.expm1(optical.double()).clamp(min=_LEAST)) - self.shift
-            )
+            sigma = before.activation.sigma(_read(before.canonical, "density", voxels))
+            raised = torch.expm1((sigma * self.activation.density_scale).double()).clamp(min=_LEAST)
+            self.canonical.density.copy_(torch.log(raised) - self.shift)
         if self.stage.masked:
             old = before.canonical
             size = old.lattice.voxel_size
@@ -173,10 +169,9 @@ class NDVG(MarchedMethod):
 
     def carried(self, points: Tensor, time: float) -> tuple[Tensor, Tensor]:
         """World points (P, 3) -> what ``F`` says of them at a time: offset (P, 3), raw mask (P,)."""
-        read = positional_encoding(_read(self.deformation, "features", points), self.octaves[0])
-        place = positional_encoding(points, self.octaves[0])
-        moment = positional_encoding(points.new_tensor([time]), self.octaves[0]).expand(len(points), -1)
-        found = self.network(torch.cat([read, place, moment], -1))
+        inputs = _read(self.deformation, "features", points), points, points.new_tensor([[time]])
+        encoded = [positional_encoding(x, self.octaves[0]).expand(len(points), -1) for x in inputs]
+        found = self.network(torch.cat(encoded, -1))
         return found[:, :3], found[:, 3]
 
     def density_found(self, points: Tensor, time: float) -> Tensor:
@@ -218,9 +213,8 @@ class NDVG(MarchedMethod):
             if self.continuous or not len(field.points):
                 return None
             count = max(1, len(field.points) // len(self.times))
-            rows = torch.randint(len(field.points), (count,), generator=generator)
-            found, _ = self.carried(field.points[rows.to(self.device)], self.canonical_time)
-            return of_all(found)
+            rows = torch.randint(len(field.points), (count,), generator=generator).to(self.device)
+            return of_all(self.carried(field.points[rows], self.canonical_time)[0])
 
         def tv_deformation() -> Tensor:
             shape = self.deformation.lattice.shape
@@ -239,31 +233,22 @@ class NDVG(MarchedMethod):
 
     def param_groups(self) -> dict[str, list[nn.Parameter]]:
         """Group parameters: ``density``, ``color`` and ``deformation`` (the grids), ``network``."""
-        networks = [self.network, *([] if self.color is None else [self.color])]
-        return {
-            "density": [self.canonical.density],
-            "color": [self.canonical.color],
-            "deformation": [self.deformation.features],
-            "network": [p for network in networks for p in network.parameters()],
-        }
+        groups = {"density": [self.canonical.density], "color": [self.canonical.color]}
+        groups |= {"deformation": [self.deformation.features], "network": list(self.network.parameters())}
+        groups["network"] += [] if self.color is None else self.color.parameters()
+        return groups
 
     def departures(self) -> list[str]:
         """See ``MarchedMethod``."""
-        found = super().departures()
-        if self.continuous:
-            found.append(NO_JUMP)
-        if self.stage.carry:
-            found.append("the second stage starts from the density of the first")
-        return found
+        carried = "the second stage starts from the density of the first"
+        return super().departures() + those_that_hold({NO_JUMP: self.continuous, carried: self.stage.carry})
 
     def faults(self) -> list[str]:
         """See ``Method``."""
-        found = [] if self.continuous else [JUMP]
-        if self.never_seen > 0:
-            found.append(f"the first stage never sees the last {self.never_seen} training pictures (pool)")
-        if self.still is not None and not self.pulls:
-            found.append("points that never move are not looked at (weights.still)")
-        return found
+        unseen = f"the first stage never sees the last {self.never_seen} training pictures (pool)"
+        free = "points that never move are not looked at (weights.still)"
+        loose = self.still is not None and not self.pulls
+        return those_that_hold({JUMP: not self.continuous, unseen: self.never_seen > 0, free: loose})
 
 
 class NDVGField:
@@ -297,10 +282,8 @@ class NDVGField:
             there = placed[rows]
             features = _read(canonical, "color", there)
             if method.color is not None:
-                encoded = (
-                    positional_encoding(x, octaves) for x, octaves in zip((there, directions), method.octaves)
-                )
-                features = method.color(torch.cat([features, *encoded], -1))
+                place, direction = map(positional_encoding, (there, directions), method.octaves)
+                features = method.color(torch.cat([features, place, direction], -1))
             return mask[rows, None] * torch.sigmoid(features)
 
         return -torch.log1p(-alpha.clamp(max=_OPAQUE)) / step, color

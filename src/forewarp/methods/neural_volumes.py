@@ -19,7 +19,7 @@ from forewarp.fields.networks import (
     beside,
     read,
 )
-from forewarp.methods.method import Start, Step, check_number
+from forewarp.methods.method import Start, Step, check_number, those_that_hold
 from forewarp.methods.rays import BETWEEN_TIMES, CENTRES, ONE_TIME, DeadStart, RayMethod, RaySnapshot
 from forewarp.ops.march import clip_to_box
 from forewarp.scene.camera import Rays
@@ -100,13 +100,10 @@ class NeuralVolumes(RayMethod):
         check_number("model.step", step, "a length in (0, 1]", lambda length: 0 < length <= 1)
         self.step, self.jitter_in_pictures = step, jitter_in_pictures
         self.from_identity = from_identity
-        self.dead_start = DeadStart(
-            "preset.first_opacity",
-            "rays that are all clear or all opaque",
-            "set it to 0.1, or another seed=N"
-            if first_opacity != 0.1
-            else f"set another seed=N, or a smaller stage.{start.stage}.lr",
-        )
+        advice = "set it to 0.1, or another seed=N"
+        if first_opacity == 0.1:
+            advice = f"set another seed=N, or a smaller stage.{start.stage}.lr"
+        self.dead_start = DeadStart("preset.first_opacity", "rays that are all clear or all opaque", advice)
         self.first = {"opacity": first_opacity, "deviation of the code": first_deviation}
         scene = start.scene
         self.times = scene.times
@@ -120,18 +117,16 @@ class NeuralVolumes(RayMethod):
             nn.init.constant_(self.decoder.grow[-1].bias[3], math.log(math.expm1(first_opacity)))
         shape = {"maps": maps, "side": warp_side, "width": warp_width, "weight_width": weight_width}
         self.warp = AffineMixture(code, **shape, from_identity=from_identity)
-        known = sorted({frame.camera_id for frame in scene.train} - {None})
-        self.rows = {camera: row for row, camera in enumerate(known)}
-        self.gain = nn.Parameter(torch.ones(len(known), 3)) if known else None
-        self.bias = nn.Parameter(torch.zeros(len(known), 3)) if known else None
+        cameras = sorted({frame.camera_id for frame in scene.train} - {None})
+        self.rows = {camera: row for row, camera in enumerate(cameras)}
+        self.gain = nn.Parameter(torch.ones(len(cameras), 3)) if cameras else None
+        self.bias = nn.Parameter(torch.zeros(len(cameras), 3)) if cameras else None
         self.reach = max(scene.box.size) / 2  # half a side of the cube
         self.register_buffer("center", torch.tensor(scene.box.center))
-        held = torch.zeros(len(shots), len(shots[0]), 3, *size, dtype=torch.uint8)
-        if not start.blank:
-            for row, frames in zip(held, shots):
-                for place, frame in zip(row, frames):
-                    place.copy_(fitted_picture(frame.load(), size))
-        self.register_buffer("pictures", held)
+        self.register_buffer("pictures", torch.zeros(len(shots), len(shots[0]), 3, *size, dtype=torch.uint8))
+        for row, frames in zip(self.pictures, () if start.blank else shots):
+            for place, frame in zip(row, frames):
+                place.copy_(fitted_picture(frame.load(), size))
 
     def encoded(self, row: int) -> tuple[Tensor, Tensor]:
         """Return a training time's code, by its number: mean, and logarithm of the deviation."""
@@ -172,9 +167,8 @@ class NeuralVolumes(RayMethod):
         ``tint``: of the camera that looks (2, 3), or of each ray's (2, R, 3); see ``tint``. ``generator``
         draws where a ray begins, and the length of its steps; None: as they are on average.
         """
-        origins = (rays.origins.to(self.center) - self.center) / self.reach
-        directions, half = rays.directions.to(self.center), self.reach
-        corner = torch.ones_like(self.center)
+        half, corner = self.reach, torch.ones_like(self.center)
+        origins, directions = (rays.origins.to(corner) - self.center) / half, rays.directions.to(corner)
         near, far = clip_to_box(origins, directions, rays.near / half, rays.far / half, -corner, corner)
         met = (far > near).nonzero()[:, 0]
         origins, directions, near, far = origins[met], directions[met], near[met], far[met]
@@ -193,9 +187,10 @@ class NeuralVolumes(RayMethod):
         rgb = near.new_zeros(len(near), 3).index_add(0, row, weights[inside][:, None] * color)
         total = weights.sum(1)
         depth = half * (weights * depths).sum(1) / total.clamp(min=1e-6)
-        whole = rgb.new_zeros(len(rays))
-        rgb = rgb.new_zeros(len(rays), 3).index_copy(0, met, rgb)
-        total, depth = whole.index_copy(0, met, total), whole.index_copy(0, met, depth)
+        rgb, depth, total = (
+            part.new_zeros(len(rays), *part.shape[1:]).index_copy(0, met, part)
+            for part in (rgb, depth, total)
+        )
         if tint is not None:
             rgb = rgb * tint[0] + tint[1]
         return Rendering(rgb + (1 - total)[:, None] * background.to(rgb), depth, total)
@@ -236,19 +231,11 @@ class NeuralVolumes(RayMethod):
 
     def departures(self) -> list[str]:
         """See ``Method``."""
-        notes = [
-            f"code from {self.pictures.shape[1]} picture(s) of an instant",
-            CENTRES,
-            ONE_TIME,
-            BETWEEN_TIMES,
-            "no return to earlier weights where the loss jumps",
-        ]
-        if self.from_identity:
-            notes.append("the warp starts as the identity")
+        notes = [f"code from {self.pictures.shape[1]} picture(s) of an instant", CENTRES, ONE_TIME]
+        notes += [BETWEEN_TIMES, "no return to earlier weights where the loss jumps"]
+        notes += ["the warp starts as the identity"] if self.from_identity else []
         notes += [f"first {name} {value:g}" for name, value in self.first.items() if value is not None]
-        if not self.jitter_in_pictures:
-            notes.append("pictures are drawn without random steps")
-        return notes
+        return notes + ([] if self.jitter_in_pictures else ["pictures are drawn without random steps"])
 
     def faults(self) -> list[str]:
         """See ``Method``."""
@@ -257,7 +244,7 @@ class NeuralVolumes(RayMethod):
             "at first most rays are opaque (first_opacity)": self.first["opacity"] is None,
             "pictures are drawn with random steps (jitter_in_pictures)": self.jitter_in_pictures,
         }
-        return [fault for fault, on in kept.items() if on]
+        return those_that_hold(kept)
 
 
 @dataclass(frozen=True)
@@ -281,20 +268,14 @@ class VolumesSnapshot(RaySnapshot):
             return made.march(self.volumes(), rays, background, tint)
         draw = torch.Generator().manual_seed(0) if made.jitter_in_pictures else None
         behind, chunk = background.expand(len(rays), 3), max(1, int(_POINTS * made.step / 4))
-        parts = [
-            made.march(self._still, rays[i : i + chunk], behind[i : i + chunk], tint, draw)
-            for i in range(0, len(rays), chunk)
-        ]
-        return Rendering.joined(parts)
+        chunks = [slice(begin, begin + chunk) for begin in range(0, len(rays), chunk)]
+        return Rendering.joined([made.march(self._still, rays[c], behind[c], tint, draw) for c in chunks])
 
 
 def shots_of(scene: Scene, wanted: int | None) -> list[list[Frame]]:
     """Choose the pictures of each training time: by the same cameras, or one by whichever camera there is."""
-    of_time: dict[float, list[Frame]] = {time: [] for time in scene.times}
-    for frame in scene.train:
-        of_time[frame.time].append(frame)
-    seen_by = [{frame.camera_id for frame in frames} - {None} for frames in of_time.values()]
-    fixed = sorted(set.intersection(*seen_by))
+    by_time = [[frame for frame in scene.train if frame.time == time] for time in scene.times]
+    fixed = sorted(set.intersection(*({frame.camera_id for frame in frames} for frames in by_time)) - {None})
     there = max(len(fixed), 1)
     if wanted is not None and not 1 <= wanted <= there:
         raise ValueError(
@@ -302,11 +283,9 @@ def shots_of(scene: Scene, wanted: int | None) -> list[list[Frame]]:
             f"instant, but got {wanted}; set model.pictures=null"
         )
     if not fixed:
-        return [frames[:1] for frames in of_time.values()]
+        return [frames[:1] for frames in by_time]
     chosen = [fixed[i] for i in spread(len(fixed), min(wanted or _MOST, there))]
-    return [
-        [next(f for f in frames if f.camera_id == camera) for camera in chosen] for frames in of_time.values()
-    ]
+    return [[next(f for f in frames if f.camera_id == camera) for camera in chosen] for frames in by_time]
 
 
 def fitted_picture(rgba: Tensor, size: tuple[int, int]) -> Tensor:

@@ -22,6 +22,7 @@ from forewarp.methods.method import (
     check_least,
     check_number,
     steps_of,
+    those_that_hold,
 )
 from forewarp.methods.rows import RowsAdam, renew_parameters
 from forewarp.ops.encode import encoded_size, positional_encoding
@@ -187,7 +188,7 @@ class Sampling:
             "empty space is not sampled": self.occupancy > 0,
             f"pictures are drawn with{without} random samples": self.jitter_in_pictures != jitters,
         }
-        return [note for note, differs in notes.items() if differs]
+        return those_that_hold(notes)
 
 
 class SampledMethod(RayMethod):
@@ -223,23 +224,20 @@ class SampledMethod(RayMethod):
         self.position = encoder("position", position_frequencies)
         self.direction = encoder("direction", direction_frequencies)
         self.sizes = encoded_size(3, position_frequencies), encoded_size(3, direction_frequencies)
-        self.activation = torch.relu if sampling.density == "relu" else nn.functional.softplus
+        # An open end would hide the background from a softplus density.
+        self.activation, mend = torch.relu, "density=softplus model.sampling.open_end=false"
+        if sampling.density == "softplus":
+            self.activation, mend = nn.functional.softplus, "occupancy=0"
+        advice = f"set another seed=N, or model.sampling.{mend}"
+        self.dead_start = DeadStart("model.sampling", "a density of 0 along every ray", advice)
         self.occupancy = Occupancy(box, side=sampling.occupancy) if sampling.occupancy else None
         self.confined = self.occupancy is not None and sampling.hull > 0 and start.scene.has_alpha
         if self.confined and not start.blank:
             train = start.scene.train
             self.occupancy.confine([train[i] for i in spread(len(train), _MASKS)], sampling.hull)
-        self.quadrature = Quadrature(
-            sampling.samples,
-            sampling.fine_samples,
-            sampling.open_end,
-            box if sampling.inside_box or sampling.occupancy else None,
-            self.occupancy,
-        )
-        alive = "density=softplus model.sampling.open_end=false"  # an open end would hide the background
-        alive = alive if sampling.density == "relu" else "occupancy=0"
-        advice = f"set another seed=N, or model.sampling.{alive}"
-        self.dead_start = DeadStart("model.sampling", "a density of 0 along every ray", advice)
+        within = box if sampling.inside_box or sampling.occupancy else None
+        counts = sampling.samples, sampling.fine_samples
+        self.quadrature = Quadrature(*counts, sampling.open_end, within, self.occupancy)
 
     def passes(self, make: Callable[[], Template]) -> tuple[Template | None, Template]:
         """Make a network for each pass; None in place of the first where there is one pass."""
@@ -310,11 +308,11 @@ class SampledMethod(RayMethod):
         """See ``Method``; look now and then for where matter is."""
         if self.occupancy is None or step % _LOOK_EVERY:
             return {}
-        self.occupancy.look(
-            lambda points, time: self.fields(Moment(time))[1].density(points),
-            self.times,
-            torch.default_generator,
-        )
+
+        def density(points: Tensor, time: float) -> Tensor:
+            return self.fields(Moment(time))[1].density(points)
+
+        self.occupancy.look(density, self.times, torch.default_generator)
         return {"occupied": float(self.occupancy.occupied.float().mean())}
 
     def departures(self) -> list[str]:
@@ -384,12 +382,8 @@ class WarpedMethod(SampledMethod):
     ) -> dict[str, Callable[[], Tensor | None]]:
         """Offer ``still``, at points that never move."""
 
-        def still() -> Tensor | None:
-            return self.warp.stray(
-                self.still, self.codes.table, self.octaves_in, self.still_points, generator
-            )
-
-        return {"still": still}
+        stray, codes = self.warp.stray, self.codes.table
+        return {"still": lambda: stray(self.still, codes, self.octaves_in, self.still_points, generator)}
 
 
 def encoder(of: str, frequencies: int) -> Callable[[Tensor], Tensor]:
@@ -471,16 +465,13 @@ class MarchedMethod(RayMethod):
         where, num_voxels = f"stage.{start.stage}", start.numbers.get("num_voxels", ())
         self.schedule = steps_of(f"{where}.num_voxels", num_voxels, least=8, from_start=True)
         threshold = start.numbers.get("color_threshold")
-        if threshold is not None:
-            check_number(f"{where}.color_threshold", threshold, *_THRESHOLD)
-        self.renderer = Renderer(step=marching.step, color_threshold=marching.color_threshold)
-        self.renderer = self.renderer.with_threshold(threshold)
+        if threshold is None:
+            threshold = marching.color_threshold
+        check_number(f"{where}.color_threshold", threshold, *_THRESHOLD)
+        self.renderer = Renderer(step=marching.step, color_threshold=threshold)
         self.occupancy = Occupancy(box, side=marching.occupancy, patience=8) if marching.occupancy else None
-        self.dead_start = DeadStart(
-            "preset.color_threshold",
-            "no sample of so much weight",
-            f"set it to 0, or a larger {alpha_key}, or preset.occupancy=0",
-        )
+        advice = f"set it to 0, or a larger {alpha_key}, or preset.occupancy=0"
+        self.dead_start = DeadStart("preset.color_threshold", "no sample of so much weight", advice)
 
     def begin(self) -> None:
         """Note where the schedule stands, once all parameters are there."""

@@ -65,11 +65,10 @@ def renew_parameters(
     for group in optimizer.param_groups:
         group["params"] = [renewed.get(id(p), p) for p in group["params"]]
     for old, new in zip(before, after):
-        state = optimizer.state.pop(old, None)
-        if state is None:
+        if (state := optimizer.state.pop(old, None)) is None:
             continue
         for key, value in state.items():
-            if not torch.is_tensor(value) or value.dim() == 0:
+            if not torch.is_tensor(value) or value.dim() == 0:  # the number of steps
                 continue
             if rows is None or not len(value):
                 state[key] = torch.zeros_like(new)

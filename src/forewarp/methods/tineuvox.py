@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from forewarp.fields.grids import density_shift, read_strided
 from forewarp.fields.networks import Template, mlp
-from forewarp.methods.method import FRACTION, Start, check_least, check_number
+from forewarp.methods.method import FRACTION, Start, check_least, check_number, those_that_hold
 from forewarp.methods.rays import MarchedMethod, Marching, regrow, whole_grid
 from forewarp.ops.encode import encoded_size, positional_encoding
 from forewarp.ops.grid import huber_variation
@@ -65,18 +65,18 @@ class TiNeuVox(MarchedMethod):
         self.frozen_from = start.numbers.get("frozen_from", 1.0)
         check_number(f"stage.{start.stage}.frozen_from", self.frozen_from, *FRACTION)
         self.frozen = False
-        octaves = {"position": position_frequencies, "time": time_frequencies}
-        octaves |= {"feature": feature_frequencies, "direction": direction_frequencies}
-        check_least(**{f"{name}_frequencies": count for name, count in octaves.items()})
+        octaves = {"position_frequencies": position_frequencies, "time_frequencies": time_frequencies}
+        octaves |= {
+            "feature_frequencies": feature_frequencies,
+            "direction_frequencies": direction_frequencies,
+        }
+        check_least(**octaves)
         check_least(1, channels=channels, width=width)
         self.octaves = tuple(octaves.values())
         self.shift = density_shift(alpha_init, self.alpha_key)
         self.grid = whole_grid(self.marching_lattice(self.schedule[0][1]), {"features": channels})
-        place, moment, direction = (
-            encoded_size(size, n)
-            for size, n in ((3, position_frequencies), (1, time_frequencies), (3, direction_frequencies))
-        )
-        code = 5 * channels
+        place, moment = encoded_size(3, position_frequencies), encoded_size(1, time_frequencies)
+        direction, code = encoded_size(3, direction_frequencies), 5 * channels
         self.time_code = mlp(moment, code, width=width, layers=2)
         self.cameras = sorted({frame.camera_id for frame in start.scene.train} - {None}) or [0.5]
         self.camera_code = mlp(moment, code, width=width, layers=2) if camera else None
@@ -145,13 +145,9 @@ class TiNeuVox(MarchedMethod):
 
     def param_groups(self) -> dict[str, list[nn.Parameter]]:
         """Group parameters: ``grid``, ``deformation``, and ``network`` (all other networks)."""
-        grid, moving = [self.grid.features], list(self.offsets.parameters())
-        known = {id(p) for p in (*grid, *moving)}
-        return {
-            "grid": grid,
-            "deformation": moving,
-            "network": [p for p in self.parameters() if id(p) not in known],
-        }
+        groups = {"grid": [self.grid.features], "deformation": list(self.offsets.parameters())}
+        known = {id(p) for group in groups.values() for p in group}
+        return groups | {"network": [p for p in self.parameters() if id(p) not in known]}
 
     def departures(self) -> list[str]:
         """See ``MarchedMethod``."""
@@ -159,10 +155,9 @@ class TiNeuVox(MarchedMethod):
 
     def faults(self) -> list[str]:
         """See ``Method``."""
-        found = ["the grid is padded with zeros (padded)"] if self.padded else []
-        if self.frozen_from < 1:
-            found.append(f"the grid stays as it is from {self.frozen_from:g} of the stage on (frozen_from)")
-        return found
+        frozen = f"the grid stays as it is from {self.frozen_from:g} of the stage on (frozen_from)"
+        padded = "the grid is padded with zeros (padded)"
+        return those_that_hold({padded: self.padded, frozen: self.frozen_from < 1})
 
 
 class TiNeuVoxField:
@@ -178,20 +173,17 @@ class TiNeuVoxField:
 
     def offset(self, points: Tensor) -> Tensor:
         """World points (P, 3) -> how far they are moved (P, 3), world units."""
-        return self._offset(self._placed(points))
+        return self.method.offsets(self._placed(points))
 
     def _placed(self, points: Tensor) -> Tensor:
         """``[PE(x), tau]`` (P, I)."""
         position = positional_encoding(points, self.method.octaves[0])
         return torch.cat([position, self.tau.expand(len(points), -1)], -1)
 
-    def _offset(self, placed: Tensor) -> Tensor:
-        return self.method.offsets(placed)
-
     def look_up(self, points: Tensor) -> tuple[Tensor, Callable[[Tensor | slice, Tensor], Tensor]]:
         """See ``PointField``."""
         method, placed = self.method, self._placed(points)
-        read = positional_encoding(method.read(points + self._offset(placed)), method.octaves[2])
+        read = positional_encoding(method.read(points + method.offsets(placed)), method.octaves[2])
         hidden = method.head.trunk(torch.cat([read, placed], -1))
 
         def color(rows: Tensor | slice, directions: Tensor) -> Tensor:

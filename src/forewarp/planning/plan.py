@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, fields, is_dataclass
 from pathlib import Path
 from statistics import fmean
@@ -14,6 +14,7 @@ from omegaconf import DictConfig
 
 from forewarp.data.module import most_held_out
 from forewarp.methods.effect import Asked, Effect, Planning
+from forewarp.methods.method import check_least, check_number
 from forewarp.planning.plan_file import read_plan, write_plan
 from forewarp.planning.trials import Trial, Trials, gain
 from forewarp.runs.build import build_run
@@ -24,9 +25,7 @@ from forewarp.training.schedule import most_steps
 
 # Keys that do not change what a run computes.
 NOT_OF_IT = ("effects", "plan", "run", "evaluate", "sheets", "views", "reduce", "planned", "trust", "score")
-LEAST = {"steps": 1, "trial_steps": 1, "seeds": 1, "held_out": 2}  # whole numbers
-OF_METHOD = ("steps", "trial_steps", "least")  # null: as the method has it
-AMOUNTS = ("seconds", "trial_seconds", "minutes", "least")
+MAY_BE_NULL = ("minutes", "steps", "trial_steps", "least")
 
 
 def make_plan(config: DictConfig, overrides: Sequence[str]) -> dict:
@@ -46,7 +45,12 @@ def make_plan(config: DictConfig, overrides: Sequence[str]) -> dict:
     typed = [override for override in overrides if key_of(override).split(".")[0] not in NOT_OF_IT]
     run = build_run(config)
     run.check_device()  # before a folder is made
-    planning = planning_of(run.model, config.model.name)
+    planning = getattr(run.model, "planning", getattr(getattr(run.model, "func", None), "planning", None))
+    if planning is None:
+        raise ValueError(
+            f"model: expected a method whose effects can be planned, but {config.model.name} has none; use "
+            "model=particles or model=forward, or leave out effects=auto"
+        )
     refuse(config, typed)
     run.datamodule.setup("fit")
     # A typed key is not decided by the plan, even if its value is the default.
@@ -79,6 +83,9 @@ class Planner:
         folder: the plan's folder.
         scene: the scene as the run would read it.
         planning: the method's ``Planning``.
+
+    Raises:
+        ValueError: if the scene can spare fewer than two training views.
     """
 
     def __init__(
@@ -89,18 +96,20 @@ class Planner:
         values = {key_of(override): override.partition("=")[2] for override in typed}
         stages = {name: stage for name, stage in config.stage.items() if stage is not None}
         self.asked = Asked(stages, config.preset, values, self._choose, bool(config.plan.trials))
-        always, always_fine = planning.always(self.asked)
-        self.trials = Trials(
-            typed,
-            folder,
-            steps=config.plan.steps or planning.steps,
-            seconds=config.plan.seconds,
-            fine_steps=config.plan.trial_steps or planning.trial_steps,
-            fine_seconds=config.plan.trial_seconds,
-            held_out=spared(scene, config.plan.held_out),
-            always=always,
-            always_fine=always_fine,
-        )
+        can_spare = most_held_out(scene)
+        if can_spare < 2:
+            raise ValueError(
+                f"plan: expected a scene that can spare 2 training views for its trials, but {scene.name} of "
+                f"{len(scene.train)} can spare {can_spare}; choose the effects yourself"
+            )
+        bounds = {
+            "steps": config.plan.steps or planning.steps,
+            "seconds": config.plan.seconds,
+            "fine_steps": config.plan.trial_steps or planning.trial_steps,
+            "fine_seconds": config.plan.trial_seconds,
+        }
+        held_out = min(config.plan.held_out, can_spare)
+        self.trials = Trials(typed, folder, held_out, *planning.always(self.asked), **bounds)
         # An effect of the last stage costs time of the last stage only.
         last = stages[self.asked.last]
         share = last.share / sum(stage.share for stage in stages.values())
@@ -166,16 +175,12 @@ class Planner:
 
     def _try_later_effects(self) -> None:
         """Try each undecided effect in the fine stage: with and without the effect, at equal steps."""
-        later = [
-            effect
-            for effect in self.effects.values()
-            if effect.later and effect.group not in self.asked.typed and not effect.rules_out(self.evidence)
-        ]
-        if later:
-            self._price_of_steps()
-        for effect in later:
-            choice = f"{effect.group}={self._choose(effect.name)}"
-            self._try(effect.name, (f"fine-{effect.name}", merged(self.base, [choice])), ("fine", self.base))
+        for effect in self.effects.values():
+            typed = effect.group in self.asked.typed
+            if effect.later and not typed and not effect.rules_out(self.evidence):
+                self._price_of_steps()
+                overrides = merged(self.base, [f"{effect.group}={self._choose(effect.name)}"])
+                self._try(effect.name, (f"fine-{effect.name}", overrides), ("fine", self.base))
 
     def _price_of_steps(self) -> None:
         """Measure once what steps are worth, if the planned run has given minutes."""
@@ -187,11 +192,7 @@ class Planner:
         evidence.slope, evidence.steps, evidence.step = gain([plain], [half]).psnr, plain.steps, plain.step
 
     def _try(
-        self,
-        effect: str,
-        with_it: tuple[str, list[str]],
-        without: tuple[str, list[str]],
-        longer: int = 1,
+        self, effect: str, with_it: tuple[str, list[str]], without: tuple[str, list[str]], longer: int = 1
     ) -> None:
         """Compare two trials, each a name and overrides, seed by seed; stop once the gain is clearly too
         small. ``longer``: how many times the usual steps and seconds both have.
@@ -223,52 +224,23 @@ class Planner:
         return choice if choice not in (None, "none") else self.effects[effect].on
 
 
-def planning_of(model: Callable, name: str) -> Planning:
-    """Return the ``Planning`` of a method: what decides which effects to switch on.
-
-    Raises:
-        ValueError: if the method has no effects to plan.
-    """
-    planning = getattr(model, "planning", getattr(getattr(model, "func", None), "planning", None))
-    if planning is None:
-        raise ValueError(
-            f"model: expected a method whose effects can be planned, but {name} has none; use "
-            "model=particles or model=forward, or leave out effects=auto"
-        )
-    return planning
-
-
-def spared(scene: Scene, wanted: int) -> int:
-    """Return how many training views to hold out: as many as wanted, or as the scene can spare.
-
-    Raises:
-        ValueError: if the scene can spare fewer than two.
-    """
-    most = most_held_out(scene)
-    if most < 2:
-        raise ValueError(
-            f"plan: expected a scene that can spare 2 training views for its trials, but {scene.name} of "
-            f"{len(scene.train)} can spare {most}; choose the effects yourself"
-        )
-    return min(wanted, most)
-
-
 def refuse(config: DictConfig, typed: Sequence[str]) -> None:
     """Refuse a run that cannot be planned, before its data are read."""
     if config.get("resume") is not None:
         raise ValueError("resume: expected nothing where a run is planned; leave it out")
-    if gone := [one for one in typed if one.startswith("~") and not one.startswith("~stage.")]:
-        raise ValueError(
-            f"{gone[0]}: expected overrides that set a key, as a plan keeps them; use {gone[0][1:]}=null"
-        )
-    if any(one.startswith("~") for one in typed) or len(config.stage) < 2:
+    removed = [override for override in typed if override.startswith("~")]
+    for override in removed:
+        if not override.startswith("~stage."):
+            raise ValueError(
+                f"{override}: expected overrides that set a key, as a plan keeps them; "
+                f"use {override[1:]}=null"
+            )
+    if removed or len(config.stage) < 2:
         raise ValueError("stage: expected a coarse stage and another, but got one; leave out ~stage.<name>")
-    for key, least in LEAST.items():
-        value = config.plan[key]
-        if not (isinstance(value, int) and value >= least) and not (value is None and key in OF_METHOD):
-            raise ValueError(f"plan.{key}: expected a whole number >= {least}, but got {value}")
-    for key in AMOUNTS:
-        value = config.plan[key]
-        free = value is None and key in ("minutes", *OF_METHOD)
-        if not (isinstance(value, int | float) and value > 0) and not free:
-            raise ValueError(f"plan.{key}: expected a number > 0, but got {value}")
+    given = {key: value for key, value in config.plan.items() if value is not None or key not in MAY_BE_NULL}
+    check_least(2, of="plan", held_out=given.pop("held_out"))
+    check_least(
+        1, of="plan", **{key: given[key] for key in ("seeds", "steps", "trial_steps") if key in given}
+    )
+    for key in ("seconds", "trial_seconds", "minutes", "least"):
+        check_number(f"plan.{key}", given.get(key, 1.0), "a number > 0", lambda amount: amount > 0)

@@ -65,26 +65,26 @@ class Trials:
     Args:
         typed: overrides of the run to plan.
         folder: the plan's folder, with one folder for each trial.
+        held_out: number of training views to hold out and score.
+        always: the method's overrides of every trial.
+        always_fine: the method's overrides of every fine trial.
         steps: steps of a coarse stage.
         seconds: most seconds of a coarse stage.
         fine_steps: steps of a fine stage.
         fine_seconds: most seconds of a fine stage.
-        held_out: number of training views to hold out and score.
-        always: the method's overrides of every trial.
-        always_fine: the method's overrides of every fine trial.
         seconds_before: total seconds of the trials that were finished before.
         made: the fine trials so far, as several effects are compared with the same trial.
     """
 
     typed: list[str]
     folder: Path
+    held_out: int
+    always: Sequence[str]
+    always_fine: Sequence[str]
     steps: int
     seconds: float
     fine_steps: int
     fine_seconds: float
-    held_out: int
-    always: Sequence[str] = ()
-    always_fine: Sequence[str] = ()
     seconds_before: float = 0.0
     made: dict[str, Trial] = field(default_factory=dict)
 
@@ -155,16 +155,18 @@ class Trials:
 
 def _share(source: Path, target: Path) -> None:
     """Link a finished stage into another run, or copy it if the file system has no hard links."""
-    if target.is_dir():
-        return
-    beside = target.with_name(target.name + ".part")
-    shutil.rmtree(beside, ignore_errors=True)
-    beside.mkdir(parents=True)
-    for name in ("last.ckpt", NUMBERS, POINTS, "done.json"):
-        if not (source / name).is_file():  # not every method hands over points
-            continue
+
+    def link(file: str, copy: str) -> None:
         try:
-            os.link(source / name, beside / name)
+            os.link(file, copy)
         except OSError:
-            shutil.copyfile(source / name, beside / name)
-    beside.rename(target)
+            shutil.copyfile(file, copy)
+
+    def is_no_result(folder: str, names: list[str]) -> set[str]:
+        return set(names) - {"last.ckpt", NUMBERS, POINTS, "done.json"}
+
+    if not target.is_dir():
+        beside = target.with_name(target.name + ".part")
+        shutil.rmtree(beside, ignore_errors=True)
+        shutil.copytree(source, beside, ignore=is_no_result, copy_function=link)
+        beside.rename(target)

@@ -120,22 +120,22 @@ def check_state(path: Path, module: DynamicSceneModule) -> tuple[int, float]:
         the steps and the seconds of training that it holds.
 
     Raises:
-        ValueError: naming what is missing, for example in a checkpoint of an older version.
+        ValueError: naming what it should hold.
     """
-    content, needed = check_checkpoint(path, module), {}
-    module.on_save_checkpoint(needed)
-    state = content.get("forewarp")
-    state = state if isinstance(state, dict) else {}
-    lacking = sorted(needed["forewarp"].keys() - state.keys())
-    steps, clock = content.get("global_step"), state.get("clock")
-    seconds = clock.get("seconds") if isinstance(clock, dict) else None
-    if lacking:
-        wrong = f"of this version, but got one without {', '.join(lacking)}"
-    elif type(steps) is not int or type(seconds) not in (int, float):
-        wrong = f"with its step and seconds, but got {steps} and {seconds}"
-    else:
-        return steps, seconds
-    raise ValueError(f"{path}: expected a checkpoint {wrong}; delete it to begin the stage anew")
+    content, saved = check_checkpoint(path, module), {}
+    module.on_save_checkpoint(saved)
+    needed = saved["forewarp"].keys()
+    try:
+        state, steps = content["forewarp"], content["global_step"]
+        seconds = state["clock"]["seconds"]
+        if needed <= state.keys() and type(steps) is int and type(seconds) in (int, float):
+            return steps, seconds
+    except (KeyError, TypeError, AttributeError):
+        pass
+    raise ValueError(
+        f"{path}: expected a checkpoint with its step and {', '.join(needed)}, but got one without; "
+        "delete it to begin the stage anew"
+    )
 
 
 def misfits(module: DynamicSceneModule, weights: dict) -> list[str]:

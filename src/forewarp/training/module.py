@@ -90,7 +90,15 @@ class DynamicSceneModule(lightning.LightningModule):
         factors = self.objective.factors(self.global_step)
         step = self.look(batch, factors)
         loss, raw = total(step, factors)
-        self._remember(batch, step, loss, raw)
+        error = float(step.squared_error)
+        self.curriculum.report(batch.frame, error)
+        self.last = {
+            "loss": float(loss.detach()),
+            "psnr": -10 * math.log10(max(error, 1e-10)),
+            "frames_in_play": self.curriculum.in_play,
+            **self._noted,
+            **step.noted,
+        } | {f"loss/{name}": float(value) for name, value in raw.items()}
         return loss, step.gradients
 
     def look(self, batch: Batch, factors: Mapping[str, float]) -> Step:
@@ -106,17 +114,6 @@ class DynamicSceneModule(lightning.LightningModule):
         self.log("val/psnr", psnr, batch_size=1, prog_bar=True)
         return psnr
 
-    def _remember(self, batch: Batch, step: Step, loss: Tensor, raw: dict[str, Tensor]) -> None:
-        error = float(step.squared_error)
-        self.curriculum.report(batch.frame, error)
-        self.last = {
-            "loss": float(loss.detach()),
-            "psnr": -10 * math.log10(max(error, 1e-10)),
-            "frames_in_play": self.curriculum.in_play,
-            **self._noted,
-            **step.noted,
-        } | {f"loss/{name}": float(value) for name, value in raw.items()}
-
     def on_fit_start(self) -> None:
         """Let the curriculum pick the frames, and the method say what a batch holds."""
         self.trainer.datamodule.picker = self.curriculum
@@ -124,9 +121,8 @@ class DynamicSceneModule(lightning.LightningModule):
 
     def on_train_start(self) -> None:
         """Compile the kernels, then start the training clock."""
-        with told_if_slow(
-            self.settings.name, "compiling what this method runs, once on a machine: up to a minute"
-        ):
+        about = "compiling what this method runs, once on a machine: up to a minute"
+        with told_if_slow(self.settings.name, about):
             self.method.warm_up()
         if self._torch_state is not None:  # restored last: callbacks may have drawn random numbers
             torch.set_rng_state(self._torch_state)
@@ -152,15 +148,14 @@ class DynamicSceneModule(lightning.LightningModule):
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """Make the method's optimiser, with the stage's learning rate for each parameter group."""
-        groups = []
-        for kind, parameters in self.method.param_groups().items():
-            if kind not in self.settings.lr:
-                raise ValueError(
-                    f"stage.{self.settings.name}.lr: expected a rate for '{kind}', "
-                    f"but got {sorted(self.settings.lr)}"
-                )
-            lr = float(self.settings.lr[kind])
-            groups.append({"params": parameters, "lr": lr, "base_lr": lr, "name": kind})
+        kinds, lr = self.method.param_groups(), self.settings.lr
+        if missing := [kind for kind in kinds if kind not in lr]:
+            where = f"stage.{self.settings.name}.lr"
+            raise ValueError(f"{where}: expected a rate for '{missing[0]}', but got {sorted(lr)}")
+        groups = [
+            {"params": parameters, "lr": float(lr[kind]), "base_lr": float(lr[kind]), "name": kind}
+            for kind, parameters in kinds.items()
+        ]
         return self.method.optimizer(groups)
 
     def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:

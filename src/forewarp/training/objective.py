@@ -44,27 +44,20 @@ class Objective:
 
     def factors(self, number: int) -> dict[str, float]:
         """Return the factor of each term that counts in step ``number``."""
-        found = {}
-        for name, weight in self.weights.items():
-            every = self.every.get(name, 1)
-            if weight != 0 and number % every == 0:
-                found[name] = weight * every
-        return found
+        every = {name: self.every.get(name, 1) for name in self.weights}
+        due = {name: weight for name, weight in self.weights.items() if number % every[name] == 0}
+        return {name: weight * every[name] for name, weight in due.items() if weight != 0}
 
 
 def parts(step: Step, factors: Mapping[str, float]) -> dict[str, tuple[Tensor, float]]:
     """Evaluate the terms of a step; return value and factor by name, without terms whose effect is off."""
-    found = {}
-    for name, factor in factors.items():
-        if name not in step.terms:
-            raise ValueError(
-                f"model: expected look to give the term '{name}', as the method's terms say, but got "
-                f"{', '.join(step.terms) or 'none'}"
-            )
-        value = step.terms[name]()
-        if value is not None:  # else the effect that it measures is off
-            found[name] = value, factor
-    return found
+    if missing := [name for name in factors if name not in step.terms]:
+        raise ValueError(
+            f"model: expected look to give the term '{missing[0]}', as the method's terms say, but got "
+            f"{', '.join(step.terms) or 'none'}"
+        )
+    values = {name: (step.terms[name](), factor) for name, factor in factors.items()}
+    return {name: found for name, found in values.items() if found[0] is not None}  # None: an effect is off
 
 
 def total(step: Step, factors: Mapping[str, float]) -> tuple[Tensor, dict[str, Tensor]]:

@@ -10,8 +10,7 @@ from typing import Any
 
 import torch
 
-from forewarp.methods.method import Model
-from forewarp.ops.backend import is_number
+from forewarp.methods.method import Model, check_number
 from forewarp.training.objective import Objective
 
 _ENDS = 0.05  # of all time, at its beginning and at its end
@@ -63,25 +62,24 @@ class StageSettings:
                 f"{where}: expected iterations or minutes, but got neither; set budget.minutes=10"
             )
         for key in ("iterations", "minutes", "steps_per_picture"):
-            value = getattr(self, key)
-            if value is not None and not (is_number(value) and value > 0):
-                raise ValueError(f"{where}.{key}: expected a number > 0, or null, but got {value!r}")
+            if (bound := getattr(self, key)) is not None:
+                check_number(f"{where}.{key}", bound, "a number > 0, or null", lambda bound: bound > 0)
         if not isinstance(self.lr, Mapping):
             raise ValueError(f"{where}.lr: expected a rate for each group, but got {self.lr!r}")
-        for key, low, high, what in (
-            ("lr", 0.0, math.inf, "a number >= 0"),
-            ("lr_hold", 0.0, 1.0, "a number in [0, 1]"),
-            ("lr_final_factor", 1e-30, math.inf, "a number > 0"),
+        for key, *wanted in (
+            ("lr", "a number >= 0", lambda rate: rate >= 0),
+            ("lr_hold", "a number in [0, 1]", lambda fraction: 0 <= fraction <= 1),
+            ("lr_final_factor", "a number > 0", lambda factor: factor > 0),
         ):
             given = getattr(self, key)
-            for group, value in given.items() if isinstance(given, Mapping) else [(None, given)]:
-                if group is not None and group not in self.lr:
-                    raise ValueError(
-                        f"{where}.{key}: expected groups of {', '.join(self.lr)}, but got '{group}'"
-                    )
-                if not (is_number(value) and low <= value <= high):
-                    at = key if group is None else f"{key}.{group}"
-                    raise ValueError(f"{where}.{at}: expected {what}, but got {value!r}")
+            if not isinstance(given, Mapping):
+                check_number(f"{where}.{key}", given, *wanted)
+                continue
+            for group, value in given.items():
+                if group not in self.lr:
+                    groups = ", ".join(self.lr)
+                    raise ValueError(f"{where}.{key}: expected groups of {groups}, but got '{group}'")
+                check_number(f"{where}.{key}.{group}", value, *wanted)
 
     @classmethod
     def of(cls, name: str, **keys: Any) -> StageSettings:
@@ -161,13 +159,11 @@ def share_out(
     if not kept:
         raise ValueError("stage: expected at least one stage, but got none; leave one of them on")
     for name, plan in kept.items():
-        if not (isinstance(plan.share, int | float) and plan.share > 0):
-            raise ValueError(
-                f"stage.{name}.share: expected a number > 0, but got {plan.share}; drop it with ~stage.{name}"
-            )
-    for key, value in (("minutes", minutes), ("iterations", iterations)):
-        if value is not None and not (isinstance(value, int | float) and value > 0):
-            raise ValueError(f"budget.{key}: expected a number > 0 or null, but got {value}")
+        wanted = f"a number > 0, or ~stage.{name} to drop it"
+        check_number(f"stage.{name}.share", plan.share, wanted, lambda share: share > 0)
+    for key, bound in (("minutes", minutes), ("iterations", iterations)):
+        if bound is not None:
+            check_number(f"budget.{key}", bound, "a number > 0 or null", lambda bound: bound > 0)
     whole, stages = sum(plan.share for plan in kept.values()), []
     for name, plan in kept.items():
         bounds = {

@@ -113,15 +113,14 @@ class Sentinel(lightning.Callback):
 
     def on_before_optimizer_step(self, trainer, module, optimizer) -> None:
         """Check loss and gradients; drop the gradients of a step to skip: nothing is learned of it."""
-        found = None
+        found, gradients = None, {name: p.grad for name, p in module.method.named_parameters()}
         if not math.isfinite(module.last["loss"]):
-            terms = [name for name, value in module.last.items() if not math.isfinite(value)]
-            terms = [name.removeprefix("loss/") for name in terms if name.startswith("loss/")]
-            found = "loss: the loss" + (f" (terms {', '.join(terms)})" if terms else "")
-        elif not all_finite(p.grad for p in module.method.parameters() if p.grad is not None):
-            named = ((name, p.grad) for name, p in module.method.named_parameters())
-            if name := first_bad(named, squared=True):  # a norm may overflow where no entry's square does
-                found = f"gradient: {name}"
+            losses = {name: value for name, value in module.last.items() if name.startswith("loss")}
+            found = f"loss: {', '.join(name for name, value in losses.items() if not math.isfinite(value))}"
+        elif not all_finite(gradient for gradient in gradients.values() if gradient is not None) and (
+            name := first_bad(gradients.items(), squared=True)
+        ):  # a norm may overflow where no entry's square does
+            found = f"gradient: {name}"
         if found:
             self._stop(trainer, module, found, may_skip=True)
             for parameter in module.method.parameters():

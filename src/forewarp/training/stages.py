@@ -82,10 +82,9 @@ class Run:
             ValueError: see ``Method.check``.
         """
         for stage in self.stages:
+            settings, objective = stage.settings, stage.objective
             check = self._of_method(stage, "check")
-            if check is not None:
-                objective = stage.objective
-                check(stage.settings.name, stage.settings.numbers, objective.names, objective.literal)
+            check(settings.name, settings.numbers, objective.names, objective.literal)
 
     def check_device(self) -> None:
         """Refuse a device that there is not, and to train on a GPU by the processor's clock.
@@ -130,8 +129,7 @@ class Run:
         """Refuse, before training, what a method cannot do on this device, and mistakes in later stages."""
         for stage in stages:
             settings, check = stage.settings, self._of_method(stage, "check_feasible")
-            if check is not None:
-                check(self.datamodule.scene, settings.name, settings.numbers, self.device)
+            check(self.datamodule.scene, settings.name, settings.numbers, self.device)
             if stage is not self.stages[0]:
                 self._module(stage, blank=True)
 
@@ -172,10 +170,10 @@ class Run:
         done = {stage.settings.name: _done(self.stage_folder(stage)) for stage in self.stages}
         return {name: content for name, content in done.items() if content is not None}
 
-    def _of_method(self, stage: Stage, name: str) -> Callable | None:
-        """Return what the method of a stage has by this name before it is built."""
+    def _of_method(self, stage: Stage, name: str) -> Callable:
+        """Return a check of a stage's method before it is built; a factory of another kind has none."""
         model = stage.model or self.model
-        return getattr(getattr(model, "func", model), name, None)
+        return getattr(getattr(model, "func", model), name, lambda *_: None)
 
     def _module(
         self,

@@ -83,20 +83,14 @@ def movement_of(method: ForwardWarp, times: Sequence[float]) -> Movement:
     pairs = neighbour_pairs(index_of(voxels, lattice.shape))
     torn = [_torn(pairs, flow / flow.new_tensor(lattice.spacing)) for flow in flows]
     worst = max(range(len(torn)), key=torn.__getitem__)
-    left_out = (0.0,)
+    left_out, distance = (0.0,), 0.0
     if bool(moves.any()):
-        points = lattice.to_world(voxels[moves])
+        distance, points = float(far[moves].mean()), lattice.to_world(voxels[moves])
         coefficients = trajectory.coefficients(points[:: max(1, len(points) // _POINTS)])  # (N, 3, K)
         basis = trajectory.basis(torch.tensor(some))
         rests = [coefficients[..., k:] @ basis[:, k:].T for k in range(trajectory.bases + 1)]
         left_out = tuple(float(r.square().sum(1).mean().sqrt()) / lattice.voxel_size for r in rests)
-    return Movement(
-        moving=float(moves.float().mean()),
-        distance=float(far[moves].mean()) if bool(moves.any()) else 0.0,
-        torn=torn[worst],
-        at=some[worst],
-        left_out=left_out,
-    )
+    return Movement(float(moves.float().mean()), distance, torn[worst], some[worst], left_out)
 
 
 def _torn(pairs: list[tuple[Tensor, Tensor]], flow: Tensor) -> float:
@@ -283,12 +277,12 @@ class VoxelPlanning:
         """Compare coarse stages: number of cosines, motion or none, static background or none."""
         start = _start(evidence, asked)
         if evidence.pictures.times < 2 or asked.typed.get("model/motion") == "none":
-            static = ["model/motion=none", "model/background=none"]
-            return trials.begin("coarse-still", [*static, *PLAIN, *start])
+            trials.begin("coarse-still", ["model/motion=none", "model/background=none", *PLAIN, *start])
+            return
         behind = "model/background=" + (asked.choose("background") if start else "none")
         trials.begin("coarse", [f"model/motion={asked.choose('motion')}", behind, *PLAIN, *start])
         if not asked.trials:
-            return None
+            return
         usual, more = _bases(evidence, asked)
         if more > usual and not asked.typed.keys() & {"preset.bases", "model/motion"}:
             trials.rival("bases", "coarse-bases", _more_bases(more, asked), adds=True)
@@ -299,7 +293,6 @@ class VoxelPlanning:
             trials.begin("coarse-still-alone", ["model/background=none"], change=True)
         elif start and "model/background" not in asked.typed:
             trials.rival("background", "coarse-alone", ["model/background=none"])
-        return None
 
     def look(
         self,
@@ -364,12 +357,10 @@ def of_background(evidence: VoxelEvidence, asked: Asked, moves: bool) -> Decisio
     if evidence.cut_out:
         why = f"{evidence.pictures.cut_out:.0%} of the pixels are transparent: the subject is cut out"
         return asked.decided("background", False, why)
-    why = "0 % of the pixels are transparent"
-    if not moves:
-        why += ", but nothing moves: one field holds all"
-        return asked.decided("background", False, why, start)
-    on = evidence.calls_for("background", True)
-    return asked.decided("background", on, why + evidence.of_trial("background"), start)
+    why, on = ", but nothing moves: one field holds all", False
+    if moves:
+        why, on = evidence.of_trial("background"), evidence.calls_for("background", True)
+    return asked.decided("background", on, f"0 % of the pixels are transparent{why}", start)
 
 
 def of_view(evidence: VoxelEvidence, asked: Asked) -> Decision:
