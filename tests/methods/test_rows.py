@@ -65,22 +65,15 @@ def test_a_state_of_other_rows_is_adopted_and_one_that_contradicts_itself_is_nam
 
 
 def test_groups_have_rates_and_betas_of_their_own():
-    values = [torch.nn.Parameter(torch.zeros(20, 3)) for _ in range(3)]
-    groups = [
-        {"params": values[:1], "lr": 0.1},
-        {"params": values[1:2], "lr": 0.2},
-        {"params": values[2:], "lr": 0.1, "betas": (0.5, 0.5)},
-    ]
-    optimizer = RowsAdam(groups)
+    values = [nn.Parameter(torch.zeros(20, 3)) for _ in range(3)]
+    changes = {"lr": 0.1}, {"lr": 0.2}, {"lr": 0.1, "betas": (0.5, 0.5)}
+    optimizer = RowsAdam([{"params": [value], **change} for value, change in zip(values, changes)])
     for sign in (1.0, -2.0):
         for value in values:
             value.grad = torch.full((20, 3), sign)
-        optimizer.step()
+        assert optimizer.step(lambda: 7) == 7
     first, second, third = (float(value.detach()[0, 0]) for value in values)
     assert second == pytest.approx(2 * first)
     assert third != pytest.approx(first, abs=1e-3)
-
-
-def test_betas_of_one_are_refused():
     with pytest.raises(ValueError, match=r"betas: expected numbers from 0 to below 1, but got \(0.9, 1.0\)"):
-        RowsAdam([{"params": [torch.nn.Parameter(torch.zeros(2))]}], betas=(0.9, 1.0))
+        RowsAdam([{"params": values}], betas=(0.9, 1.0))
