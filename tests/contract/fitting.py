@@ -7,7 +7,7 @@ from dataclasses import replace
 import lightning
 import torch
 
-from forewarp.training.objective import Objective
+from forewarp.training.objective import Objective, set_gradients
 from forewarp.training.schedule import StageSettings
 from forewarp.training.stages import Stage
 from tests.contract.scenes import data_of
@@ -35,6 +35,22 @@ def module_of(entry, data, **changes):
     module = run_of([stage], data, ".")._module(stage)
     data.picker, data.asks = module.curriculum, module.method.asks
     return module
+
+
+def batch_of(data):
+    """Draw a batch."""
+    return next(iter(data.train_dataloader()))
+
+
+def gradients_of(module, batch):
+    """Compute the gradients of a step, as training does, and return them."""
+    module.zero_grad()
+    loss, gradients = module.loss_of(batch)
+    if gradients is None:
+        loss.backward()
+    else:
+        set_gradients(module.method, gradients)
+    return {name: p.grad for name, p in module.method.named_parameters() if p.grad is not None}
 
 
 class Losses(lightning.Callback):

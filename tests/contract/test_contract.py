@@ -14,9 +14,8 @@ import torch
 from forewarp.methods.method import HasBounds, HasMatter, HasTrajectories
 from forewarp.scene.view import Moment, View
 from forewarp.training.handover import load_handover
-from forewarp.training.objective import set_gradients, total
-from tests.contract.conformance import kinds_of
-from tests.contract.fitting import Stop, killed, module_of, run_of, stage_of
+from forewarp.training.objective import total
+from tests.contract.fitting import Stop, batch_of, gradients_of, killed, module_of, run_of, stage_of
 from tests.contract.scenes import DATASETS, TIMES, data_of
 from tests.contract.table import METHODS
 
@@ -46,21 +45,6 @@ def on(datasets, first="dnerf"):
     )
 
 
-def batch_of(data):
-    return next(iter(data.train_dataloader()))
-
-
-def backward(module, batch):
-    """Take one step and return the gradients."""
-    module.zero_grad()
-    loss, gradients = module.loss_of(batch)
-    if gradients is None:
-        loss.backward()
-    else:
-        set_gradients(module.method, gradients)
-    return {name: p.grad for name, p in module.method.named_parameters() if p.grad is not None}
-
-
 def assert_equal_states(one, other):
     one, other = one.state_dict(), other.state_dict()
     assert one.keys() == other.keys()
@@ -74,7 +58,7 @@ def assert_equal_states(one, other):
 def test_it_builds(name, dataset, scenes):
     data = data_of(dataset, scenes)
     module = module_of(METHODS[name], data)
-    gradients = backward(module, batch_of(data))
+    gradients = gradients_of(module, batch_of(data))
     assert module.last["loss"] > 0
     assert any(bool(g.any()) for g in gradients.values())
 
@@ -143,7 +127,7 @@ def test_gradients_and_all_terms_are_finite(name, scenes):
     data, entry = data_of("dnerf", scenes), METHODS[name]
     terms = module_of(entry, data).method.terms
     module = module_of(entry, data, weights=dict.fromkeys(terms, 1e-2))
-    gradients = backward(module, batch_of(data))
+    gradients = gradients_of(module, batch_of(data))
     assert gradients
     assert all(bool(g.isfinite().all()) for g in gradients.values())
     raw = {key: value for key, value in module.last.items() if key.startswith("loss")}
@@ -186,12 +170,12 @@ def test_an_effect_that_is_off_is_absent_and_one_that_is_on_is_called(name, effe
         monkeypatch.setattr(of, function, lambda *a, at=f"{of.__name__}.{function}", **k: pytest.fail(at))
     module = module_of(entry, data, model=partial(full_model(entry), **dict.fromkeys(part.on)))
     data.picker = lambda: TIMES - 1  # a time at which things have moved
-    backward(module, batch_of(data))
+    gradients_of(module, batch_of(data))
     assert not owned(module, part.owns or (effect,))
     module = module_of(entry, data, model=full_model(entry))
     assert part.parts or owned(module, part.owns or (effect,))
     with pytest.raises(pytest.fail.Exception) if part.parts else nullcontext():
-        backward(module, batch_of(data))
+        gradients_of(module, batch_of(data))
 
 
 def owned(module, names):
@@ -292,6 +276,23 @@ def check_handover(handover, scene):
         assert bool((away < scene.box.diagonal).all())  # which NaN is not
         canonical = handover.times == torch.tensor(scene.canonical_time, dtype=handover.times.dtype)
         assert bool((away[:, canonical] < 1e-4 * scene.box.diagonal).all())
+
+
+def kinds_of(method, entry, losses):
+    """Return what a method says of itself, by the heads of the columns of docs/conformance.md."""
+    can = {"trajectories": HasTrajectories, "bounds": HasBounds, "matter": HasMatter}
+    asks, share = method.asks, sum(losses[-10:]) / 10 / (sum(losses[:5]) / 5)
+    asked = [f"{asks.kind} of side {asks.side}" if asks.kind == "crops" else asks.kind]
+    asked += [f"{asks.neighbours} neighbouring times"] * bool(asks.neighbours)
+    asked += [f"up to {asks.instant} pictures of the time"] * bool(asks.instant)
+    return {
+        "size in": method.size[0],
+        "asks for": ", ".join(asked),
+        "loss terms": ", ".join(method.terms),
+        "effects": ", ".join(entry.effects) or "none",
+        "abilities": ", ".join(word for word, kind in can.items() if isinstance(method, kind)) or "none",
+        "loss falls": f"below {entry.falls:.0%} in {entry.steps} steps" if share < entry.falls else "**no**",
+    }
 
 
 @each
