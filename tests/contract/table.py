@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 from functools import partial
 
 from forewarp.fields.curves import TrajectoryField
-from forewarp.fields.grids import DirectRadiance
 from forewarp.methods.dnerf import DNeRF
 from forewarp.methods.hypernerf import HyperNeRF
 from forewarp.methods.method import Method, Start
@@ -30,6 +29,8 @@ from forewarp.methods.voxel.effects import (
     ViewNetwork,
 )
 from forewarp.methods.voxel.forward import ForwardWarp
+from tests.support.tiny_scene import EVERYTHING, INPAINTER, RADIANCE
+from tests.support.tiny_scene import RATES as VOXEL_RATES
 
 
 @dataclass(frozen=True)
@@ -66,46 +67,46 @@ class Entry:
     slow: bool = False
 
 
-GRID = partial(DirectRadiance, alpha_init=1e-2, alpha_threshold=1e-4)
 TRAJECTORY = partial(TrajectoryField, bases=4, nodes=6, width=24, layers=3)
 VOXELS = {
-    "numbers": {
-        "num_voxels": [[0, 10**3], [0.6, 12**3]],
-        "background_num_voxels": [[0, 6**3]],
-        "keep_alpha": 1e-2,
-    }
-    | {"birth_alpha": 5e-3, "refresh_every": 5},
-    "lr": {"density": 0.3, "color": 0.1, "shading": 0.02, "flow": 5e-3, "network": 1e-3},
+    "lr": VOXEL_RATES,
     "weights": {"photo": 1.0, "point_color": 0.01, "background_entropy": 1e-3},
+    "numbers": {"num_voxels": [[0, 10**3], [0.6, 12**3]], "background_num_voxels": [[0, 6**3]]}
+    | {"keep_alpha": 1e-2, "birth_alpha": 5e-3, "refresh_every": 5},
     "steps": 100,
 }
+
+
+def calls(of, *names):
+    """Pairs of a class and the names of its functions."""
+    return tuple((of, name) for name in names)
+
+
 VIEW = Effect(
-    {"view_dependence": SphericalHarmonics}, ((SphericalHarmonics, "forward"), (ViewNetwork, "forward"))
+    {"view_dependence": SphericalHarmonics},
+    calls(SphericalHarmonics, "forward") + calls(ViewNetwork, "forward"),
 )
 BACKGROUND = Effect(
-    {"background": partial(StaticBackground, features=3, alpha_init=1e-2, alpha_threshold=0.0)},
-    ((StaticBackground, "forward"), (Together, "density")),
+    {"background": EVERYTHING["background"]}, calls(StaticBackground, "forward") + calls(Together, "density")
 )
 WARP = {
     "motion": Effect(
-        {"motion": Motion}, ((Motion, "flow"), (Motion, "warp"), (TrajectoryField, "coefficients"))
+        {"motion": Motion}, calls(Motion, "flow", "warp") + calls(TrajectoryField, "coefficients")
     ),
     "view_dependence": VIEW,
     "upsampler": Effect(
-        {"upsampler": partial(LearnedUpsampler, width=8)},
-        ((LearnedUpsampler, "residual"), (LearnedUpsampler, "forward"), (TrilinearUpsampler, "forward")),
+        {"upsampler": EVERYTHING["upsampler"]},
+        calls(LearnedUpsampler, "residual", "forward") + calls(TrilinearUpsampler, "forward"),
     ),
-    "inpainter": Effect(
-        {"inpainter": partial(UNet3d, width=16, levels=2)}, ((UNet3d, "features"), (UNet3d, "residual"))
-    ),
+    "inpainter": Effect({"inpainter": INPAINTER}, calls(UNet3d, "features", "residual")),
     "background": BACKGROUND,
 }
 OF_PARTICLES = {
-    "motion": Effect({"motion": "spline"}, ((Nodes, "motion_and_maps"), (Nodes, "backward")), ("nodes",)),
+    "motion": Effect({"motion": "spline"}, calls(Nodes, "motion_and_maps", "backward"), ("nodes",)),
     "rotation": Effect({"rotation": True}, (), ("nodes.rotations",)),
     "view_dependence": Effect({"view_dependence": 1}, (), ("sh",)),
-    "color_over_time": Effect({"color_over_time": 1}, ((Particles, "color_basis"),)),
-    "opacity_over_time": Effect({"opacity_over_time": 1}, ((Particles, "opacity_basis"),)),
+    "color_over_time": Effect({"color_over_time": 1}, calls(Particles, "color_basis")),
+    "opacity_over_time": Effect({"opacity_over_time": 1}, calls(Particles, "opacity_basis")),
     "background": Effect({"background": 0.03}, (), ("resting", "nodes.stopped")),
 }
 RATES = {"means": 1.5e-3, "scales": 5e-3, "quaternions": 3e-3, "opacity": 5e-2, "colors": 3e-2, "sh": 1e-3}
@@ -113,92 +114,65 @@ RATES |= {"color_over_time": 1e-3, "opacity_over_time": 3e-3, "skinning": 1e-2, 
 RATES |= {"node_translations": 7e-3, "node_rotations": 8e-3}
 SMALL_NETWORK = {"width": 32, "layers": 3, "skip": None, "position_frequencies": 4}
 SMALL_NETWORK |= {"sampling": Sampling(16, 16, density="softplus", open_end=False, inside_box=True)}
-SMALL_WARP = {"warp_width": 24, "warp_layers": 3, "warp_skip": None}
+SMALL_WARP = {"warp_width": 24, "warp_layers": 3, "warp_skip": None, "still_points": 64}
 SMALL_VOLUMES = {"picture_size": (8, 8), "tower": (8, 16), "features": 16, "code": 8}
 SMALL_VOLUMES |= {"decoder": (32, 16, 16, 8), "maps": 4, "warp_side": 6, "warp_width": 16, "weight_width": 8}
-SMALL_VOLUMES |= {
-    "step": 1 / 12,
-    "from_identity": True,
-    "first_opacity": 0.1,
-    "first_deviation": 0.05,
-    "jitter_in_pictures": False,
-}
+SMALL_VOLUMES |= {"step": 1 / 12, "from_identity": True, "first_opacity": 0.1, "first_deviation": 0.05}
+NETWORK = {"lr": {"network": 2e-3}, "falls": 0.6, "steps": 150}
+MARCHED = {"photo": 1.0, "point_color": 0.01, "background_entropy": 1e-3, "still": 0.1}
+MARCHING = Marching(jitter=True, occupancy=12)
 
 METHODS = {
     "forward": Entry(
-        partial(ForwardWarp, radiance=GRID, motion=Motion, trajectory=TRAJECTORY), **VOXELS, effects=WARP
+        partial(ForwardWarp, radiance=RADIANCE, motion=Motion, trajectory=TRAJECTORY), **VOXELS, effects=WARP
     ),
     "backward": Entry(
-        partial(BackwardWarp, radiance=GRID, deformation=partial(Deformation, width=24, layers=3)),
+        partial(BackwardWarp, radiance=RADIANCE, deformation=partial(Deformation, width=24, layers=3)),
         **VOXELS,
         effects={"view_dependence": VIEW, "background": BACKGROUND},
     ),
-    "tnerf": Entry(
-        partial(TNeRF, **SMALL_NETWORK, time_frequencies=2),
-        {"network": 2e-3},
-        falls=0.6,
-        steps=150,
-    ),
-    "nerf": Entry(
-        partial(NeRF, **SMALL_NETWORK),
-        {"network": 2e-3},
-        {"photo": 1.0, "coarse_photo": 1.0},
-        falls=0.6,  # it cannot show what moves
-        steps=150,
-        slow=True,
+    "tnerf": Entry(partial(TNeRF, **SMALL_NETWORK, time_frequencies=2), **NETWORK),
+    "nerf": Entry(  # it cannot show what moves
+        partial(NeRF, **SMALL_NETWORK), weights={"photo": 1.0, "coarse_photo": 1.0}, **NETWORK, slow=True
     ),
     "dnerf": Entry(
         partial(DNeRF, **SMALL_NETWORK, time_frequencies=2),
-        {"network": 2e-3},
-        {"photo": 1.0, "second_time": 1e-4},
-        falls=0.6,
-        steps=150,
+        weights={"photo": 1.0, "second_time": 1e-4},
+        **NETWORK,
         slow=True,
     ),
     "nerfies": Entry(
-        partial(Nerfies, **SMALL_NETWORK, **SMALL_WARP, elastic_samples=64, still_points=64),
-        {"network": 2e-3},
-        {"photo": 1.0, "coarse_photo": 1.0, "elastic": 1e-3, "still": 1e-3},
-        {"warp_in": 0.3},
-        falls=0.6,
-        steps=150,
+        partial(Nerfies, **SMALL_NETWORK, **SMALL_WARP, elastic_samples=64),
+        weights={"photo": 1.0, "coarse_photo": 1.0, "elastic": 1e-3, "still": 1e-3},
+        numbers={"warp_in": 0.3},
+        **NETWORK,
         slow=True,
     ),
     "hypernerf": Entry(
-        partial(HyperNeRF, **SMALL_NETWORK, **SMALL_WARP, slice_width=16, still_points=64),
-        {"network": 2e-3},
-        {"photo": 1.0, "coarse_photo": 1.0, "still": 1e-3},
-        {"warp_in": 0.3, "slice_from": 0.01, "slice_in": 0.2},
-        falls=0.6,
-        steps=150,
+        partial(HyperNeRF, **SMALL_NETWORK, **SMALL_WARP, slice_width=16),
+        weights={"photo": 1.0, "coarse_photo": 1.0, "still": 1e-3},
+        numbers={"warp_in": 0.3, "slice_from": 0.01, "slice_in": 0.2},
+        **NETWORK,
         slow=True,
     ),
     "tineuvox": Entry(
-        partial(
-            TiNeuVox,
-            marching=Marching(jitter=True, occupancy=12),
-            width=24,
-            position_frequencies=3,
-            camera=True,
-            padded=False,
-        ),
+        partial(TiNeuVox, marching=MARCHING, width=24, position_frequencies=3, camera=True, padded=False),
         {"grid": 8e-2, "deformation": 2e-3, "network": 5e-3},
-        {"photo": 1.0, "point_color": 0.01, "background_entropy": 1e-3, "still": 0.1, "tv_grid": 1e-6},
+        MARCHED | {"tv_grid": 1e-6},
         {"num_voxels": [[0, 9**3], [0.4, 13**3]]},
         steps=100,
         slow=True,
     ),
     "ndvg": Entry(
-        partial(NDVG, marching=Marching(jitter=True, occupancy=12), width=(24, 24), continuous=True),
+        partial(NDVG, marching=MARCHING, width=(24, 24), continuous=True),
         {"density": 0.1, "color": 0.1, "deformation": 0.1, "network": 3e-3},
-        {"photo": 1.0, "point_color": 0.01, "background_entropy": 1e-3, "flow_l1": 1e-2}
-        | {"tv_deformation": 1.0, "canonical": 1.0, "still": 0.1},
+        MARCHED | {"flow_l1": 1e-2, "tv_deformation": 1.0, "canonical": 1.0},
         {"num_voxels": [[0, 9**3], [0.4, 12**3]], "alpha_init": 1e-2},
         steps=100,
         slow=True,
     ),
     "neural_volumes": Entry(
-        partial(NeuralVolumes, **SMALL_VOLUMES),
+        partial(NeuralVolumes, **SMALL_VOLUMES, jitter_in_pictures=False),
         {"network": 5e-3},
         {"photo": 104.04, "code_prior": 1e-3, "opacity_prior": 1e-2, "opacity_variation": 1e-2},
         falls=0.7,  # its rays also miss what an instant's one picture does not show
@@ -208,20 +182,12 @@ METHODS = {
     "particles": Entry(
         partial(
             Particles,
-            motion="spline",
-            rotation=True,
-            view_dependence=1,
-            color_over_time=1,
-            opacity_over_time=1,
-            background=0.03,
+            **{name: choice for effect in OF_PARTICLES.values() for name, choice in effect.on.items()},
         ),
         RATES,
         {"photo": 1.0, "rigid": 3.0, "smooth": 0.1},
-        {
-            "density_interval": 0.05,
-            "density_until": 0.9,
-            "lr_final_factor": dict.fromkeys(RATES, 0.1) | {"means": 0.01},
-        },
+        {"density_interval": 0.05, "density_until": 0.9}
+        | {"lr_final_factor": dict.fromkeys(RATES, 0.1) | {"means": 0.01}},
         steps=150,
         effects=OF_PARTICLES,
     ),
