@@ -49,8 +49,7 @@ def interrupted(tmp_path_factory):
     ids=["width", "motion"],  # of one time: none
 )
 def test_another_configuration_is_refused_by_what_differs(tmp_path, interrupted, changes, name):
-    text = f"expected a checkpoint of this configuration, but got one that differs in {name}"
-    with pytest.raises(ValueError, match=text):
+    with pytest.raises(ValueError, match=f"a checkpoint of this configuration, but .* differs in {name}"):
         load_weights(module(tmp_path, **changes), interrupted)
 
 
@@ -88,16 +87,13 @@ GRID = "method.radiance."
 HARM = {
     "index out of range": ("index", lambda v: v.__setitem__((0, 0, 0), 10**6)),
     "index below": ("index", lambda v: v.__setitem__((0, 0, 0), -2)),
-    "index swapped": ("index", lambda v: v.flip(0)),
     "index of another shape": ("index", lambda v: v[1:].clone()),
     "index of another kind": ("index", lambda v: v.long()),
     "index of nothing": ("index", lambda v: "nothing"),
     "voxel outside": ("voxels", lambda v: v.__setitem__((0, 2), 10**6)),
-    "voxel below": ("voxels", lambda v: v.__setitem__((0, 2), -1)),
     "voxels of a plane": ("voxels", lambda v: v[:, :2].clone()),
     "fewer rows": ("color", lambda v: v[:1].clone()),
     "more channels": ("density", lambda v: v.repeat(1, 2)),
-    "another shape": ("_extra_state", lambda v: v | {"shape": [99, 99, 99]}),
     "an absurd shape": ("_extra_state", lambda v: v | {"shape": [10**6] * 3}),
     "no shape": ("_extra_state", lambda v: {}),
     "no box": ("_extra_state", lambda v: v | {"low": [9.0, 9.0, 9.0]}),
@@ -118,21 +114,18 @@ def test_a_grid_whose_parts_do_not_fit_is_refused(tmp_path, interrupted, harm):
         load_weights(module(tmp_path), tmp_path / "last.ckpt")
 
 
+INCOMPLETE = (
+    "expected a checkpoint with its step and generator, torch_rng, curriculum, clock, but got one without"
+)
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        *(
-            (
-                change,
-                "expected a checkpoint with its step and generator, torch_rng, curriculum, clock, but got",
-            )
-            for change in (
-                lambda c: c.pop("global_step"),
-                lambda c: c["forewarp"].update(clock=7),
-                lambda c: c.update(forewarp=7),
-                lambda c: c["forewarp"].pop("curriculum"),
-            )
-        ),
+        (lambda c: c.pop("global_step"), INCOMPLETE),
+        (lambda c: c["forewarp"].update(clock=7), INCOMPLETE),
+        (lambda c: c.update(forewarp=7), INCOMPLETE),
+        (lambda c: c["forewarp"].pop("curriculum"), INCOMPLETE),
         (lambda c: c.update(state_dict=7), "expected a checkpoint, but it holds no weights"),
         (lambda c: c["state_dict"].update({7: 7}), "that differs in 7;"),
     ],

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from forewarp.methods.method import Method, Start
 from forewarp.scene.box import Box
@@ -23,12 +24,10 @@ def test_round_trip(tmp_path, moving):
     box, notes = Box((-1.0, 0.25, 1 / 3), (1.0, 2.0, 3.0)), {"density_scale": 0.1}
     save_handover(Handover(box, True, 17, cloud, times, paths, notes), tmp_path)
     read = load_handover(tmp_path)
-    assert (read.box, read.tight, read.frames_in_play, read.cloud.size) == (box, True, 17, 0.25)
-    assert read.notes == notes
-    for name in ("points", "colors", "opacity"):
-        assert torch.equal(getattr(read.cloud, name), getattr(cloud, name))
+    assert (read.box, read.tight, read.frames_in_play, read.notes) == (box, True, 17, notes)
+    assert_close(vars(read.cloud), vars(cloud), rtol=0, atol=0)
+    assert not moving or (read.times.equal(times) and read.paths.equal(paths))
     assert (read.times is None) == (read.paths is None) == (not moving)
-    assert not moving or (torch.equal(read.times, times) and torch.equal(read.paths, paths))
 
 
 def _numbers(**changes):
@@ -83,14 +82,12 @@ def test_the_box_holds_what_the_stage_calls_matter():
 
 def test_a_stage_leaves_its_matter_and_the_paths_of_it_or_a_sample(monkeypatch):
     method = ball_method(SCENE)
-    handover = make_handover(method, SCENE, None, 6)
-    cloud, matter = handover.cloud, method.matter()
-    assert 20 < len(cloud) == len(matter)
-    assert torch.equal(cloud.points, matter.points)
-    assert float((cloud.points - ball_center(0.0)).norm(dim=-1).max()) < RADIUS
-    assert cloud.size == method.radiance.lattice.voxel_size
+    handover, matter = make_handover(method, SCENE, None, 6), method.matter()
+    assert 20 < len(handover.cloud) == len(matter)
+    assert handover.cloud.points.equal(matter.points)
+    assert float((matter.points - ball_center(0.0)).norm(dim=-1).max()) < RADIUS
     assert handover.times.tolist() == pytest.approx(list(SCENE.times))
-    assert torch.equal(handover.paths, method.trajectories(cloud.points, handover.times))
+    assert handover.paths.equal(method.trajectories(matter.points, handover.times))
     monkeypatch.setattr("forewarp.training.handover._POINTS", 7)
     monkeypatch.setattr("forewarp.training.handover._TIMES", 3)
     handover = make_handover(method, SCENE, None, 6)

@@ -94,7 +94,7 @@ def test_steps_are_skipped_where_asked_counted_and_change_no_weight(tmp_path):
     module, done = ours.fit(), ours.finished()["coarse"]  # the count is continued
     assert all(p.isfinite().all() for p in module.parameters())
     assert (done["skipped_steps"], done["steps"]) == (2, 8)
-    assert sorted(p.name for p in (tmp_path / "coarse" / "broken").iterdir()) == ["step_3.pt", "step_5.pt"]
+    assert {p.name for p in (tmp_path / "coarse" / "broken").iterdir()} == {"step_3.pt", "step_5.pt"}
     assert not all(map(torch.equal, poison.weights[7], poison.weights[6]))
     kept = torch.load(tmp_path / "coarse" / "broken" / "step_5.pt", weights_only=True)["state_dict"]
     assert all(map(torch.equal, poison.weights[6], (kept[name] for name, _ in module.named_parameters())))
@@ -120,11 +120,10 @@ def test_what_is_not_finite_is_named_and_never_saved(tmp_path, what, model, foun
     assert all(v.isfinite().all() for v in tensors if torch.is_tensor(v))
 
 
-@pytest.mark.parametrize("skip", [0, 2])
-def test_a_step_that_cannot_be_stored_hides_nothing(tmp_path, skip):
+def test_a_step_that_cannot_be_stored_hides_nothing(tmp_path):
     (tmp_path / "coarse").mkdir()
     (tmp_path / "coarse" / "broken").write_text("")
-    message = broken(tmp_path, Poison("batch", 5), skip=skip)
+    message = broken(tmp_path, Poison("batch", 5), skip=2)
     assert "expected finite numbers, but got loss: batch[0].rgb (terms photo) at step 5," in message
     assert "coarse/broken/step_5.pt could not be written (File exists); begin anew" in message
 

@@ -76,11 +76,6 @@ def test_a_continued_run_equals_an_uninterrupted_one_to_the_bit(tmp_path, whole,
     assert same(run(tmp_path).fit(), whole[1])
 
 
-def test_another_seed_gives_another_run(tmp_path, whole):
-    other = make_run(tmp_path, stages(), data=ball_data(rays=64, size=16, seed=1), seed=1).fit()
-    assert not same(other, whole[1])
-
-
 def test_a_finished_run_is_loaded_and_one_that_was_not_noted_only_noted(tmp_path, whole):
     shutil.copytree(whole[0], tmp_path, dirs_exist_ok=True)
     before = {p: p.stat().st_mtime_ns for p in tmp_path.rglob("*") if p.is_file()}
@@ -100,8 +95,7 @@ def test_what_a_run_leaves(whole):
     assert not list(folder.rglob("*.part"))
     done = run(folder).finished()
     assert done["coarse"]["steps"] == done["fine"]["steps"] == 10
-    assert done["fine"]["seconds"] > 0
-    assert done["fine"]["frames_in_play"] == 12
+    assert (done["fine"]["seconds"] > 0, done["fine"]["frames_in_play"]) == (True, 12)
     handover = json.loads((folder / "coarse" / "handover.json").read_text())
     lattice = module.method.radiance.lattice
     assert lattice.box.low == pytest.approx(tuple(handover["low"]))
@@ -142,14 +136,11 @@ class Diary(lightning.Callback):
 def test_rates_bases_lattice_and_frames_follow_the_fraction(tmp_path):
     diary = Diary()
     run(tmp_path, [diary], lr_hold=0.5, curriculum={"start": 2, "all_in": 0.5}).fit()
-    coarse = [s[1:] for s in diary.steps if s[0] == "coarse"]
-    fine = [s[1:] for s in diary.steps if s[0] == "fine"]
-    assert len(coarse) == len(fine) == 10
+    coarse, fine = ([s[1:] for s in diary.steps if s[0] == name] for name in ("coarse", "fine"))
     assert [bases for _, bases, _, _ in coarse] == [2] * 5 + [4] * 5
     assert len({lattice for _, _, lattice, _ in coarse}) == 1
     rates, _, lattices, playing = zip(*fine)
-    assert rates[:6] == (1,) * 6
-    assert list(rates[5:]) == pytest.approx([0.1 ** (k / 5) for k in range(5)])
+    assert list(rates) == pytest.approx([1] * 5 + [0.1 ** (k / 5) for k in range(5)])
     assert len(set(lattices[:5])) == len(set(lattices[5:])) == 1
     assert lattices[5] > lattices[4]
     assert playing == (2, 4, 6, 8, 10, 12, 12, 12, 12, 12)
@@ -218,21 +209,6 @@ def test_a_scene_of_one_time_needs_no_motion_and_no_rate_for_it(tmp_path):
     still = [stage(iterations=4, lr=rates)]
     module = make_run(tmp_path, still, data=ball_data(rays=64, size=16, times=[0.0] * 4)).fit()
     assert module.method.motion is None
-
-
-@pytest.mark.slow
-def test_a_sliding_ball_is_learned_at_all_times(tmp_path):
-    data = ball_data(rays=512, frames=16)
-    numbers = {"num_voxels": [[0, 16**3]], "start": "hull", "hull_frames": 4, "hull_grow": 0.08}
-    numbers |= {"refresh_every": 25, "lr_hold": 0.5, "curriculum": {"start": 4, "all_in": 0.5}}
-    module = make_run(tmp_path, [stage(iterations=300, **numbers)], data=data).fit()
-    scores = [float(module.psnr_of(target)) for target in data.targets("test")]
-    assert min(scores) > 22
-    assert sum(scores) / 3 > 25  # a still radiance field reaches 22
-    moved = module.method.trajectories(torch.tensor([[-0.3, 0.1, 0.0]]), torch.tensor([0.0, 1.0]))[0]
-    x, y, z = (moved[1] - moved[0]).tolist()  # of the centre, which no view sees
-    assert 0.3 < x < 1.2
-    assert max(abs(y), abs(z)) < 0.25
 
 
 class CtrlC(lightning.Callback):
