@@ -6,11 +6,12 @@ from types import SimpleNamespace
 
 import pytest
 import yaml
+from omegaconf import OmegaConf
 
 from forewarp.data.module import SceneDataModule
 from forewarp.methods.particles.options import EFFECTS as PARTICLES
 from forewarp.methods.particles.options import ParticlesPlanning
-from forewarp.planning.plan import Planner
+from forewarp.planning.plan import Planner, refuse
 from forewarp.planning.plan_file import read_plan, with_plan, write_plan
 from forewarp.planning.trials import Trial, Trials
 from forewarp.scene.frame import Survey
@@ -183,15 +184,33 @@ def test_auto_plans_and_fits_in_one_go_a_scene_of_one_time_without_motion(
 
 def test_mistakes_are_one_line(refused, words, in_tmp):
     assert "use model=particles or model=forward" in refused("plan", *words, "model=backward")
-    for typed, said in (
-        ("~stage.fine", "stage: expected a coarse stage and another"),
-        ("~objective.fine.weights.photo", "~objective.fine.weights.photo: expected overrides that set a key"),
-        ("plan.seeds=0", "plan.seeds: expected a whole number >= 1, but got 0"),
-        ("plan.minutes=-1", "plan.minutes: expected a number > 0, but got -1"),
-    ):
-        assert refused("plan", *words, typed).startswith(said)
+    assert refused("plan", *words, "~stage.fine").startswith("stage: expected a coarse stage and another")
     assert refused("train", *words, "effects=some") == "effects: expected given or auto, but got some"
     assert not (in_tmp / "runs").exists()
+
+
+NUMBERS = {"seeds": 1, "held_out": 2, "seconds": 9, "trial_seconds": 9}
+NUMBERS |= dict.fromkeys(("steps", "trial_steps", "minutes", "least"))
+
+
+@pytest.mark.parametrize(
+    ("changes", "typed", "said"),
+    [
+        ({"seeds": 0}, [], "plan.seeds: expected a whole number >= 1, but got 0"),
+        ({"seeds": None}, [], "plan.seeds: expected a whole number >= 1, but got None"),
+        ({"held_out": 1}, [], "plan.held_out: expected a whole number >= 2, but got 1"),
+        ({"steps": 0.5}, [], "plan.steps: expected a whole number >= 1, but got 0.5"),
+        ({"seconds": None}, [], "plan.seconds: expected a number > 0, but got None"),
+        ({"minutes": -1}, [], "plan.minutes: expected a number > 0, but got -1"),
+        ({}, ["~seed"], "~seed: expected overrides that set a key, as a plan keeps them; use seed=null"),
+        ({"resume": "runs/x"}, [], "resume: expected nothing where a run is planned"),
+    ],
+)
+def test_what_cannot_be_planned_is_refused_by_its_key(changes, typed, said):
+    config = {"plan": NUMBERS | changes, "stage": {"coarse": 1, "fine": 1}, "resume": changes.get("resume")}
+    with pytest.raises(ValueError, match=f"^{said}"):
+        refuse(OmegaConf.create(config), typed)
+    refuse(OmegaConf.create(config | {"plan": NUMBERS, "resume": None}), [])
 
 
 @pytest.mark.parametrize("text", ["", "[]", "overrides: [a=b]", "{", "typed: 3\noverrides: 4", "\0", None])
