@@ -150,7 +150,6 @@ def test_the_box_of_all_times_of_a_known_translation(kind):
     method = built(model, Lattice(BOX, (12, 9, 8)), density_scale=0.2, frames=2)
     radiance = method.radiance
     radiance.density.data[:] = AIR
-    assert method.bounds([0.0, 1.0]) is None  # nothing has no box
     radiance.density.data[radiance.index[3, 4, 4].long()] = SOLID
     if kind == "backward":
         method.deformation.network[-1].bias.data = -shift / method.deformation.scale
@@ -162,3 +161,9 @@ def test_the_box_of_all_times_of_a_known_translation(kind):
         box = method.bounds(times)
         assert box.low == pytest.approx((home + moved.clamp(max=0) - margin).tolist(), abs=1e-5)
         assert box.high == pytest.approx((home + moved.clamp(min=0) + margin).tolist(), abs=1e-5)
+
+
+def test_nothing_has_no_box():
+    method = built(forward_model(), Lattice(BOX, (12, 9, 8)))
+    torch.nn.init.constant_(method.radiance.density, AIR)
+    assert method.bounds([0.0, 1.0]) is None
