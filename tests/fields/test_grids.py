@@ -232,3 +232,9 @@ def test_strided_reads_are_0_outside_and_differentiable_inside():
     assert not read_strided(grid, torch.full((2, 3), 9.0, dtype=torch.float64), (1, 2)).any()
     points = (0.9 * points[:3].double() + 0.05).requires_grad_()
     assert torch.autograd.gradcheck(lambda p, _: read_strided(grid, p, (1, 2, 4)), (points, grid.features))
+
+
+@pytest.mark.parametrize("scale", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_length_that_density_cannot_be_measured_in_is_refused(scale):
+    with pytest.raises(ValueError, match="density_scale: expected a length > 0"):
+        Activation(-4.6, scale)

@@ -64,6 +64,13 @@ class Activation:
     shift: float
     density_scale: float
 
+    def __post_init__(self) -> None:
+        if not 0 < self.density_scale < float("inf"):
+            raise ValueError(
+                f"density_scale: expected a length > 0 from the stage before, but got {self.density_scale}; "
+                "delete the folder of that stage"
+            )
+
     def sigma(self, raw: Tensor) -> Tensor:
         """Return the density per world unit of length, in the shape of ``raw``."""
         return torch.nn.functional.softplus(raw + self.shift) / self.density_scale
