@@ -19,7 +19,6 @@ from forewarp.methods.nerfies import Nerfies
 from forewarp.methods.rays import NO_JUMP, OF_JAX, OF_PYTORCH, Sampling
 from forewarp.methods.tnerf import TNeRF
 from forewarp.ops.encode import positional_encoding
-from forewarp.ops.nodes import geman_mcclure
 from forewarp.scene.view import Batch, Moment, Observation, View
 from forewarp.training.objective import Objective
 from forewarp.training.schedule import StageSettings
@@ -89,11 +88,11 @@ def test_gradients_of_the_regularisers_against_differences():
     def stray(table, *_):
         return warp.stray(points, table, 0.7, None, draw())
 
-    for term, values, factor in ((strain, code, 0.05), (stray, table, 0.02)):
+    for term, values, factor, most in ((strain, code, 0.05, 0.06), (stray, table, 0.02, 0.002)):
         with torch.no_grad():  # so that the robust terms are not at their ends
             warp.shift.weight.mul_(factor)
             warp.turn.weight.mul_(factor)
-        assert 0.02 < float(term(values).detach().mean()) < 1.9
+        assert 0.01 < float(term(values).detach().mean()) / most < 0.95
         assert gradcheck(term, (values, *warp.parameters()), fast_mode=True)
 
 
@@ -353,8 +352,9 @@ def test_the_elastic_term_of_a_warp_that_scales(factor):
         warp.shift.weight.copy_((factor - 1) * torch.cat([eye, -eye], 1))
     points = torch.randn(9, 3)
     assert_close(warp(points, torch.zeros(2), 1.0), factor * points)
-    expected = geman_mcclure(torch.tensor(3 * math.log(factor) ** 2 / 0.03**2))
-    assert_close(warp.elastic(points, torch.zeros(2), 1.0), expected.expand(9), rtol=1e-4, atol=0)
+    q = 3 * math.log(factor) ** 2 / 0.03**2
+    expected = torch.full((9,), 0.03 * 2 * q / (q + 4))
+    assert_close(warp.elastic(points, torch.zeros(2), 1.0), expected, rtol=1e-4, atol=0)
 
 
 def test_the_elastic_term_is_summed_over_coarse_samples_and_averaged_over_rays():
@@ -415,7 +415,7 @@ def test_points_that_never_move_are_pulled_to_stay(kind):
     term = made.extra_terms(seen, batch(), {}, generator)["still"]
     low = float(term().detach())
     torch.nn.init.constant_(made.warp.shift.bias, 0.1)
-    assert low < 1 < 1.9 < float(term().detach()) <= 2
+    assert low < 0.001 < 0.0019 < float(term().detach()) <= 0.002
     assert method(kind, **GENTLE).extra_terms(seen, batch(), {}, generator)["still"]() is None
 
 

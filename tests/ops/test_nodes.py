@@ -203,8 +203,11 @@ def test_a_rigid_map_is_not_stretched_and_its_gradient_is_finite():
 
 
 def test_the_robust_function():
-    q = torch.tensor([0.0, 1e-4, 4.0, 1e30, torch.inf], requires_grad=True)
-    rho = nodes.geman_mcclure(q)
-    torch.testing.assert_close(rho, torch.tensor([0.0, 5e-5, 1.0, 2.0, 2.0]), atol=1e-8, rtol=1e-4)
-    (gradient,) = torch.autograd.grad(rho[1], q)
-    assert float(gradient[1]) == pytest.approx(0.5, rel=1e-3)
+    q = torch.tensor([0.0, 1e-4, 4.0, 1e30, torch.inf])
+    for scale in (1.0, 0.03, 1e-3):
+        squared = (q * scale**2).requires_grad_()
+        rho = nodes.geman_mcclure(squared, scale)
+        expected = scale * torch.tensor([0.0, 5e-5, 1.0, 2.0, 2.0])
+        torch.testing.assert_close(rho, expected, atol=1e-8 * scale, rtol=1e-4)
+        (gradient,) = torch.autograd.grad(rho[1], squared)
+        assert float(gradient[1]) == pytest.approx(0.5 / scale, rel=1e-3)

@@ -184,7 +184,7 @@ CHECKS = {
     "second_variation": lambda s: (second_variation, draw(s, 3, 4, 5, 2)),
     "huber_variation": lambda s: (huber_variation, 2 * draw(s, 3, 4, 5, 2)),
     "stretch": lambda s: (stretch, torch.eye(3, dtype=torch.float64) + 0.2 * draw(s, 2, 3, 3)),
-    "geman_mcclure": lambda s: (geman_mcclure, draw(s, 5).square()),
+    "geman_mcclure": lambda s: (partial(geman_mcclure, scale=0.5), draw(s, 5).square()),
     "rotations": lambda s: (rotations, draw(s, 3, 4)),
     "node_maps": lambda s: (lambda m: node_maps(m, draw(s, 3, 3)), draw(s + 1, 3, 6)),
     "carry_nodes": lambda s: (

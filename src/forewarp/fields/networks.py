@@ -264,8 +264,8 @@ class ScrewWarp(nn.Module):
         return self.frequencies * min(1.0, progress / max(warp_in, 1e-6))
 
     def elastic(self, points: Tensor, code: Tensor, window: float) -> Tensor:
-        """How far the warp at points (P, 3) is from rigid (P,), in [0, 2]: robust squared logarithms of the
-        singular values of its Jacobian.
+        """How far the warp at points (P, 3) is from rigid (P,), in [0, 0.06]: robust squared logarithms of
+        the singular values of its Jacobian.
 
         Cost: the warp, and three times its gradient, through which gradients pass too.
         """
@@ -273,12 +273,12 @@ class ScrewWarp(nn.Module):
         moved = self(points, code, window)
         rows = [torch.autograd.grad(moved[:, i].sum(), points, create_graph=True)[0] for i in range(3)]
         jacobian = torch.stack(rows, 1)
-        return geman_mcclure(stretch(jacobian) / _ELASTIC**2)
+        return geman_mcclure(stretch(jacobian), _ELASTIC)
 
     def stray(
         self, still: Tensor | None, table: Tensor, window: float, most: int | None, generator: torch.Generator
     ) -> Tensor | None:
-        """How far the warp moves points that should stay (P, 3): mean in [0, 2]; None without such points.
+        """How far the warp moves points that should stay (P, 3): mean in [0, 0.002]; None without any.
 
         ``most`` of them are drawn (None: all), and for each one of the codes in ``table`` (T, D).
         """
@@ -288,7 +288,7 @@ class ScrewWarp(nn.Module):
         codes = table[torch.randint(len(table), (len(points),), generator=generator).to(table.device)]
         noise = torch.randn(points.shape, generator=generator).to(points)
         near = points + _JITTER * noise
-        return geman_mcclure((self(near, codes, window) - near).square().sum(-1) / _STILL**2).mean()
+        return geman_mcclure((self(near, codes, window) - near).square().sum(-1), _STILL).mean()
 
 
 def drawn(rows: Tensor, count: int | None, generator: torch.Generator) -> Tensor:

@@ -290,10 +290,13 @@ def stretch(jacobian: Tensor, floor: float = 1e-6) -> Tensor:
     return torch.linalg.svdvals(jacobian).clamp(min=floor).log().square().sum(-1)
 
 
-def geman_mcclure(squared: Tensor) -> Tensor:
-    """``rho = 2 q / (q + 4)`` of squared residuals q over squared scales: half of q near 0, at most 2.
+def geman_mcclure(squared: Tensor, scale: float) -> Tensor:
+    """Robust loss ``2 q / (q + 4) * scale`` of squared residuals, q over ``scale^2``: at most ``2 * scale``.
 
-    >>> geman_mcclure(torch.tensor([0.0, 4.0, torch.inf]))
-    tensor([0., 1., 2.])
+    Near 0 it is a half of the squared residual over the scale. Barron's general robust loss of shape -2 is
+    ``2 q / (q + 4)``; Nerfies' and HyperNeRF's code multiplies it by its scale, for which their weights are.
+
+    >>> geman_mcclure(torch.tensor([0.0, 1.0, torch.inf]), 0.5)
+    tensor([0.0000, 0.5000, 1.0000])
     """
-    return 2 / (1 + 4 / squared.clamp(min=torch.finfo(squared.dtype).tiny))
+    return 2 * scale / (1 + 4 / (squared / scale**2).clamp(min=torch.finfo(squared.dtype).tiny))
