@@ -122,7 +122,10 @@ def test_make_hands_over_what_was_typed():
 @pytest.mark.parametrize(
     ("line", "page"),
     [
-        ("ablations JOBS=1 SEEDS=1 MORE='ablation=full,no_tv scene=counterpart_dnerf'", "results/ablation.md"),
+        (
+            "ablations JOBS=1 SEEDS=1 MORE='ablation=full,no_tv scene=counterpart_dnerf'",
+            "results/ablation.md",
+        ),
         ("accuracy-time CHANGES=stage.fine.density=45", "accuracy_time/results/accuracy-time.md"),
         ("bench-gpu DEVICE=cpu", "bench-gpu/results/price-list.md"),
         ("effects MODEL=particles MORE=scene=specimen_still", "effects/results/effects-particles.md"),
