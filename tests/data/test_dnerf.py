@@ -9,6 +9,7 @@ import torch
 
 from forewarp.data import dnerf
 from forewarp.data.dnerf import read_lego_complete, read_scene
+from forewarp.data.images import write_image
 from tests.support.written_scenes import (
     ANGLE,
     FEW,
@@ -67,6 +68,19 @@ def test_half_resolution_of_a_small_scene(tmp_path, value, expected):
     assert frame.load().shape == (*expected[::-1], 4)
     assert frame.load_depth().shape == expected[::-1]
     assert scene.protocol["half_resolution"] is (value is True)
+
+
+def test_a_mask_path_cuts_an_image_out(tmp_path):
+    mask = np.zeros((6, 8), np.uint8)
+    mask[2:4, 3:6] = 255
+    write_dnerf(tmp_path / "toy")
+    write_image(tmp_path / "toy" / "m.jpg", mask)
+    for split in ("train", "val", "test"):
+        path = tmp_path / "toy" / f"transforms_{split}.json"
+        edit(path, lambda c: [frame.update(mask_path="m.jpg") for frame in c["frames"]])
+    scene, bare = read_scene(tmp_path, "toy"), next(dnerf_shots(4)).rgba
+    assert scene.has_alpha
+    assert np.array_equal(scene.train[0].load()[..., 3], bare[..., 3] * (mask > 0))
 
 
 def test_a_known_point_projects_where_it_was_painted(tmp_path):

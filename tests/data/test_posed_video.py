@@ -10,9 +10,11 @@ import torch
 
 from forewarp.data.files import SceneError
 from forewarp.data.images import write_image
+from forewarp.data.module import PosedVideoDataModule
 from forewarp.data.posed_video import FILE, read_scene, write_scene
 from forewarp.scene.box import Box
 from forewarp.scene.camera import look_at
+from forewarp.scene.view import Asks
 from tests.support import reference
 from tests.support.written_scenes import (
     GONE,
@@ -236,20 +238,79 @@ def test_a_camera_in_one_place_needs_an_end(tmp_path, turn):
         assert f.camera.near < float(-f.camera.center @ f.camera.camera_to_world[:3, 2]) < f.camera.far
 
 
-def test_masks_become_alpha(tmp_path, made):
-    bare, mask = made(), np.zeros((20, 30, 3), np.uint8)
-    mask[5:12, 8:20] = 255
-    for i in range(10):
-        write_image(tmp_path / "toy" / "masks" / f"m_{i}.png", mask)
-    edit(tmp_path / "toy" / FILE, {f"frames.{i}.mask_path": f"masks/m_{i}" for i in range(10)})
-    scene, mask = read_scene(tmp_path, "toy"), mask[..., 0] > 0
+@pytest.fixture
+def masked(tmp_path, made):
+    """Write ``toy`` with a mask of the same brightness and place in all frames; return where it is bright."""
+    made()
+
+    def mask(brightness=255):
+        pixels = np.zeros((20, 30, 3), np.uint8)
+        pixels[5:12, 8:20] = brightness
+        for i in range(10):
+            write_image(tmp_path / "toy" / "masks" / f"m_{i}.png", pixels)
+        edit(tmp_path / "toy" / FILE, {f"frames.{i}.mask_path": f"masks/m_{i}" for i in range(10)})
+        return pixels[..., 0] > 0
+
+    return mask
+
+
+@pytest.mark.parametrize("brightness", [255, 1])
+def test_masks_of_nerfstudio_tell_where_to_train_and_measure(tmp_path, masked, brightness):
+    mask = torch.from_numpy(masked(brightness))
+    data = PosedVideoDataModule(tmp_path, "toy", rays=2000)
+    scene = data.scene
+    assert not scene.has_alpha
+    assert bool((scene.train[0].load()[..., 3] == 255).all())
+    assert "data.masks=alpha" in scene.protocol["assumed"][0]
+    assert scene.protocol["masks"].startswith("ignore: PSNR is of the pixels that count")
+    drawn = next(iter(data.train_dataloader())).observations[0].view.pixels
+    assert set(drawn.tolist()) == set(mask.flatten().nonzero()[:, 0].tolist())
+    assert torch.equal(data.targets("test")[0].valid, mask)
+    smaller = data.targets("test").reduced(2)[0].valid  # none of whose pixels was dark
+    assert torch.equal(smaller, mask.reshape(10, 2, 15, 2).all(3).all(1))
+    data.batches.asks = Asks(kind="pictures")
+    assert torch.equal(next(iter(data.train_dataloader())).observations[0].valid, mask.flatten())
+    assert len(read_scene(tmp_path, "toy", masks="ignore").protocol["assumed"]) == 1  # the times alone
+    assert read_scene(tmp_path, "toy", masks="off").train[0].load_valid is None
+
+
+def test_masks_that_cannot_be_meant_are_refused(tmp_path, masked):
+    masked(100)
+    with pytest.raises(SceneError, match=r"m_0.png: expected a mask with a bright pixel.*none above 127"):
+        read_scene(tmp_path, "toy")
+    with pytest.raises(
+        SceneError, match="data.masks: expected one of alpha, ignore, off or null, but got 'x'"
+    ):
+        read_scene(tmp_path, "toy", masks="x")
+
+
+def test_alpha_over_an_image_is_not_taken_for_a_cut_out_unasked(tmp_path):
+    """As dycheck's, whose alpha of 0 means that depth is missing there."""
+    shots = [replace(s, pixels=s.pixels | np.uint8([0, 0, 0, 255])) for s in posed_shots(channels=4)]
+    for shot in shots:
+        shot.pixels[:10, :20, 3] = 0
+    write_scene(tmp_path / "toy", shots, near=20, far=120)
+    with pytest.raises(
+        SceneError, match=r"frame_1.png: expected one colour where .*an image beneath.*masks=off"
+    ):
+        read_scene(tmp_path, "toy")
+    alpha, off, ignore = (read_scene(tmp_path, "toy", masks=m) for m in ("alpha", "off", "ignore"))
+    assert [scene.has_alpha for scene in (alpha, off, ignore)] == [True, False, False]
+    assert bool((off.train[0].load()[..., 3] == 255).all())
+    assert off.train[0].load_valid is None
+    assert torch.equal(~ignore.train[0].load_valid(), alpha.train[0].load()[..., 3] == 0)
+
+
+def test_masks_become_alpha_where_they_are_told_to(tmp_path, made, masked):
+    bare, mask = made(), masked()
+    scene = read_scene(tmp_path, "toy", masks="alpha")
     assert scene.has_alpha
     assert np.array_equal(scene.train[0].load()[..., 3] > 0, mask)
     assert scene.box.diagonal < bare.box.diagonal
     pixels = next(posed_shots(channels=4)).pixels
     for i in range(10):
         write_image(tmp_path / "toy" / "images" / f"frame_{i + 1}.png", pixels)
-    rgba = read_scene(tmp_path, "toy").train[0].load()
+    rgba = read_scene(tmp_path, "toy", masks="alpha").train[0].load()
     together = pixels[..., 3:] * mask[..., None]  # masks and alpha count together
     assert np.array_equal(rgba, np.concatenate([pixels[..., :3] * (together > 0), together], -1))
 

@@ -1,5 +1,6 @@
 import logging
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -74,6 +75,15 @@ def test_the_mask_box_is_scored_where_it_is_asked_for():
         suite = ImageSuite(mask_box=True)
         assert "psnr_box" not in suite.score(prediction, target(foreground=nothing))
         assert suite.absent["psnr_box"] == "frame test/r_007 has no foreground"
+
+
+def test_pixels_that_do_not_count_are_not_scored():
+    valid = torch.rand(34, 40, generator=torch.Generator().manual_seed(1)) < 0.7
+    true = replace(target(), valid=valid)
+    prediction = torch.where(valid[..., None], (true.rgb + 0.1).clamp(0, 1), 1 - true.rgb)
+    scores, found = ImageSuite().score(prediction, true), (true.rgb + 0.1).clamp(0, 1)
+    assert scores["psnr"] == image.psnr(found[valid][None], true.rgb[valid][None])
+    assert scores["ssim"] == image.ssim(torch.where(valid[..., None], found, true.rgb), true.rgb)
 
 
 def test_errors_name_the_frame():

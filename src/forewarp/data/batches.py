@@ -11,7 +11,7 @@ from torch.utils.data import IterableDataset
 
 from forewarp.data.files import mismatch
 from forewarp.data.images import StoredImage, composited, reduced
-from forewarp.ops.grid import reduced_depth
+from forewarp.ops.grid import block_means, reduced_depth
 from forewarp.scene.frame import Frame, Scene
 from forewarp.scene.view import Asks, Batch, Moment, Observation, Target, View
 
@@ -46,8 +46,8 @@ class Sampler(IterableDataset):
     above 1, the rays are divided among up to that many random frames of the picked frame's time, so one
     snapshot serves them all. ``background`` is white, black or random: a colour per pixel, or one for a whole
     image or crop, drawn at each step. An image without alpha hides the colour, so a random one penalises
-    transparency in the rendering. A second ``iter`` goes on where the first stopped; ``state_dict`` holds
-    what an exact continuation needs.
+    transparency in the rendering. Single pixels are drawn of the valid ones alone. A second ``iter`` goes on
+    where the first stopped; ``state_dict`` holds what an exact continuation needs.
 
     Cost: linear in the pixels, below 2 ms for 8192; a frame is decoded when it is first picked, and kept
     while there is room.
@@ -127,9 +127,11 @@ class Sampler(IterableDataset):
         counts = [self.rays // len(frames) + (i < self.rays % len(frames)) for i in range(len(frames))]
         views = []
         for index, count in zip(frames, counts, strict=True):
-            camera = self.frames[index].camera
-            pixels = torch.randint(camera.width * camera.height, (count,), generator=self._generator)
-            views.append(View(camera, pixels))
+            frame = self.frames[index]
+            allowed = None if frame.load_valid is None else frame.load_valid().flatten().nonzero()[:, 0]
+            most = frame.camera.width * frame.camera.height if allowed is None else len(allowed)
+            pixels = torch.randint(most, (count,), generator=self._generator)
+            views.append(View(frame.camera, pixels if allowed is None else allowed[pixels]))
         colors = self._colors(self.rays).split(counts) if self.background == "random" else None
         for i, (index, view) in enumerate(zip(frames, views)):
             yield self._observed(index, view, color_of(self.background) if colors is None else colors[i])
@@ -150,7 +152,11 @@ class Sampler(IterableDataset):
         rgba = pixels_of(frame).reshape(-1, 4)
         rgba = rgba if rows is None else rgba[rows]
         rgb = rgba if self.asks.straight else composited(rgba, background)
-        return Observation(Moment(frame.time, index, frame.camera_id), view, rgb, background)
+        valid = None
+        if frame.load_valid is not None and view.pixels is None:
+            valid = frame.load_valid().flatten()
+            valid = valid if rows is None else valid[rows]
+        return Observation(Moment(frame.time, index, frame.camera_id), view, rgb, background, valid)
 
     def _colors(self, count: int) -> Tensor:
         """Choose colours (count, 3) behind pixels."""
@@ -202,12 +208,14 @@ class Targets(Sequence[Target]):
     def __getitem__(self, index: int) -> Target:
         frame = self.frames[index]
         rgba, depth = pixels_of(frame), frame.load_depth() if frame.load_depth else None
+        valid = None if frame.load_valid is None else frame.load_valid()
         if self.factor > 1:
             rgba = reduced(rgba, self.factor)
             depth = None if depth is None else reduced_depth(depth, self.factor)
+            valid = None if valid is None else block_means(valid.float(), self.factor) == 1
         foreground = None if depth is None else depth > 0
         if self.has_alpha:
             foreground = rgba[..., 3] > 127  # at least half covered
         place = index % len(self.frames) if self.trained else None
         rgb = composited(rgba, self.background)
-        return Target(frame, rgb, self.background, foreground, depth, place)
+        return Target(frame, rgb, self.background, foreground, depth, place, valid)

@@ -5,6 +5,7 @@ negate its y and z columns. Beside the stock ``transforms_test.json`` a scene ma
 ability (``transforms_test_space.json``, ``..._time.json``, ``..._canonical.json``), exact ray depth
 (``depth_file_path``: float32 .npy, or 16-bit PNG times the file's ``depth_scale``, 0 = background) and
 ``trajectories.npz`` (``points`` (N, T, 3), ``times`` (T,)). ``test_space/transforms.json`` serves as well.
+A frame's ``mask_path`` cuts its image out.
 
 Lego Complete scenes have this layout with three kinds of test view, each with exact ray depth. Numbers are
 comparable with 50 training times and test views at training times (``space``), at all times (``time``) and at
@@ -82,6 +83,7 @@ class _Record:
     camera: Camera
     image: Path
     has_alpha: bool
+    mask: Path | None
     depth: tuple[Path, float | None] | None  # file and world units a step, where it says so
     ability: str
     by_angle: bool  # the field of view is told by ``camera_angle_x`` alone
@@ -146,7 +148,14 @@ def read_scene(
         camera = camera.resized(width, height) if halve else camera
         name = record.image.relative_to(folder).with_suffix("").as_posix()
         depth = StoredDepth(record.depth[0], size, halve, record.depth[1]) if record.depth else None
-        return Frame(name, record.time, camera, StoredImage(record.image, size, halve), depth, record.ability)
+        return Frame(
+            name,
+            record.time,
+            camera,
+            StoredImage(record.image, size, halve, record.mask),
+            depth,
+            record.ability,
+        )
 
     train, val, test = (tuple(map(frame, records[split])) for split in SPLITS)
     canonical = min(f.time for f in train)
@@ -276,11 +285,15 @@ def _read_file(
         if ability not in (*ABILITIES, "all"):
             raise mismatch(entry.where("ability"), f"one of {', '.join(ABILITIES)}", short(ability))
         time = entry.number("time", 0, 1) if "time" in entry.own else None
-        header = inspect_image(image)
+        header, mask = inspect_image(image), None
+        if "mask_path" in entry.own:
+            mask = with_suffix(entry.path("mask_path"))
+            inspect_image(mask, header.size, f" as {image.name}")
+        has_alpha = header.has_alpha or mask is not None
         pose = pose_in(entry, axes, inverse)
         camera = camera_of(entry, header.size, 1, image, pose=pose, longer=longer)
         by_angle = entry.get("fl_x") is None and entry.get("fl_y") is None
-        records.append(_Record(time, camera, image, header.has_alpha, depth, ability, by_angle))
+        records.append(_Record(time, camera, image, has_alpha, mask, depth, ability, by_angle))
     return records, assumed
 
 

@@ -27,6 +27,7 @@ SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 _FORMATS = ("PNG", "JPEG")
 _MOST_PIXELS = 80_000_000  # Pillow warns a little above
 _JPEG_END, _JPEG_TAIL = b"\xff\xd9", 4096  # some cameras write a little behind the end
+_LEAST_HIDDEN, _COLORS = 0.01, 64  # share of an image, and colours, that tell an image beneath
 _FOREGROUND = 127  # a mask above it is foreground; masks are lossy, so never quite 0 or 255
 
 
@@ -250,7 +251,7 @@ class StoredImage:
             rgba[..., 3] = 255
         if self.mask is None:
             return reduced(rgba) if self.halve else rgba
-        rgba *= ((read_image(self.mask, self.size)[..., 0] > _FOREGROUND) & (rgba[..., 3] > 0))[..., None]
+        rgba *= (_bright(self.mask, self.size) & (rgba[..., 3] > 0))[..., None]
         rgba = halved_cutout(rgba) if self.halve else rgba
         foreground = rgba[..., 3] > 0
         if not bool(foreground.any()):
@@ -258,6 +259,50 @@ class StoredImage:
         rows, columns = (foreground.any(axis).nonzero()[:, 0] for axis in (1, 0))
         self._corner = (int(rows[0]), int(columns[0]))
         return rgba[self._corner[0] : int(rows[-1]) + 1, self._corner[1] : int(columns[-1]) + 1].clone()
+
+
+class StoredMask:
+    """A mask decoded at its first use and kept while there is room, bool (H, W), read-only: true where a
+    channel is bright.
+
+    Args:
+        path: of the mask.
+        size: (width, height), what the file must hold.
+        channel: 0 of a mask; 3 of an image whose alpha it is.
+    """
+
+    def __init__(self, path: Path, size: tuple[int, int], channel: int = 0) -> None:
+        self.path, self.size, self.channel = path, size, channel
+
+    def __call__(self) -> Tensor:
+        """Give the mask; SceneError where it cannot be decoded, has another size or is dark everywhere."""
+        return CACHE.get(self, self._decode)
+
+    def _decode(self) -> Tensor:
+        mask = _bright(self.path, self.size, self.channel)
+        if not bool(mask.any()):
+            expected, advice = "a mask with a bright pixel", "remove the frame, or set data.masks=off"
+            raise mismatch(self.path, expected, "none above 127", advice)
+        return mask
+
+
+def _bright(path: Path, size: tuple[int, int], channel: int = 0) -> Tensor:
+    """Decode where a channel is bright, (H, W) bool; masks of 0 and 1 are taken for what they are."""
+    values = read_image(path, size)[..., channel]
+    return values > (_FOREGROUND if int(values.max()) > 1 else 0)
+
+
+def hides_image(rgba: Tensor) -> bool:
+    """Tell whether what is fully transparent in an image (H, W, 4) shows something nevertheless.
+
+    Programs that cut out leave one colour there, or few; where many colours are, alpha may mean another thing
+    ("no depth here", as of dycheck) or the image was given a mask and nothing was erased.
+    """
+    beneath = rgba[rgba[..., 3] == 0][:, :3]
+    if len(beneath) < max(_LEAST_HIDDEN * rgba[..., 3].numel(), _COLORS):
+        return False
+    colors, counts = beneath.unique(dim=0, return_counts=True)
+    return len(colors) >= _COLORS and int(counts.max()) < len(beneath) / 2
 
 
 def _decode(path: Path, mode: str, upright: bool = False) -> np.ndarray:

@@ -19,7 +19,15 @@ from torch import Tensor
 from forewarp.data.arrays import read_cloud, write_array
 from forewarp.data.cameras import MOST_UNITS, SPLITS, box_of, opengl_rows, space_of
 from forewarp.data.files import frames_of, inside, mismatch, number, read_json, remove, scene_folder, whole
-from forewarp.data.images import SUFFIXES, StoredImage, check_pixels, inspect_image, write_image
+from forewarp.data.images import (
+    SUFFIXES,
+    StoredImage,
+    StoredMask,
+    check_pixels,
+    hides_image,
+    inspect_image,
+    write_image,
+)
 from forewarp.data.transforms import (
     camera_of,
     check_axes,
@@ -36,6 +44,7 @@ from forewarp.scene.camera import Camera
 from forewarp.scene.frame import Frame, Scene, middle_of
 
 FILE, POINTS = "transforms.json", "points.npy"
+MASKS = ("alpha", "ignore", "off")
 SCALES = (1, 2, 4, 8)
 _OF_CAMERA = ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_model", "k1", "k2", "k3", "p1", "p2")
 
@@ -67,10 +76,11 @@ def read_scene(
     test_every: int = 8,
     axes: str | None = None,
     inverse: bool = False,
+    masks: str | None = None,
 ) -> Scene:
-    """Read ``root/scene``; pixels are decoded when a frame is first loaded.
+    """Read ``root/scene``; pixels are decoded when a frame is first loaded, masks at once.
 
-    The subject is cut out where there are masks, or where some image has a pixel that is not opaque: images
+    The subject is cut out where masks are alpha, or where some image has a pixel that is not opaque: images
     with an alpha channel are decoded until one such is found.
 
     Without ``time`` in the file, numbers in the images' names tell it; see ``transforms.times_of``. Frames
@@ -87,11 +97,17 @@ def read_scene(
         axes: of the poses in the file: opengl or opencv; None: OpenGL's, unless the cameras look away from
             what they surround, which is refused.
         inverse: poses in the file are world-to-camera.
+        masks: what the dark pixels of ``mask_path``, or without it of the images' alpha, mean: ``alpha``
+            (beside the subject), ``ignore`` (not to be trained or measured on) or ``off`` (nothing). None:
+            those of ``mask_path`` ignore, as nerfstudio's do; alpha is alpha, unless there is an image
+            beneath it, which is refused.
 
     Raises:
         SceneError: for every file or value that is missing or wrong, with file and key.
     """
     check_axes(axes, inverse)
+    if masks not in (None, *MASKS):
+        raise mismatch("data.masks", f"one of {', '.join(MASKS)} or null", repr(masks))
     if type(scale) is not int or scale not in SCALES:
         raise mismatch("data.scale", f"one of {SCALES}", repr(scale))
     if canonical not in ("middle", "first"):
@@ -101,22 +117,32 @@ def read_scene(
         raise mismatch("data.normalise", "true or false", repr(normalise))
     file = scene_folder(root, scene, "posed_video") / FILE
     content = read_json(file)
-    entries, absent, assumed = _read_entries(file, content, scale, axes, inverse)
+    entries, absent, assumed = _read_entries(file, content, scale, axes, inverse, masks)
     times, told = times_of([entry.name for entry in entries], [entry.time for entry in entries], str(file))
     entries = [replace(entry, time=time) for entry, time in zip(entries, times)]
     entries.sort(key=lambda entry: entry.time)
     parts, how = _split_entries(file, content, entries, test_every, absent)
     near, far = (_length(file, content, key, value) for key, value in (("near", near), ("far", far)))
     bounds = _bounds(file, content, box)
-    has_alpha = any(
-        entry.load.mask is not None or (entry.has_alpha and bool((entry.load()[..., 3] < 255).any()))
-        for entry in entries
-    )
+    cut_out = (e for e in entries if e.load.mask or (e.has_alpha and bool((e.load()[..., 3] < 255).any())))
+    has_alpha = (first := next(cut_out, None)) is not None
+    if has_alpha and masks is None and hides_image(first.load()):
+        advice = (
+            "set data.masks=alpha if that is beside the subject, data.masks=off if alpha means another thing"
+        )
+        got = "an image beneath them too"
+        raise mismatch(first.load.path, "one colour where pixels are transparent", got, advice)
+    if masks is None and entries[0].load_valid is not None:
+        line = "dark pixels of mask_path are not trained or measured on"
+        assumed.append(f"{file}: {line}; if they are beside a subject to cut out, set data.masks=alpha")
     options = {"near": near, "far": far, "box": bounds, "normalise": normalise, "cut_out": has_alpha}
     space, seen = space_of([entry.camera for entry in entries], str(file), **options)
 
     train, val, test = (
-        tuple(Frame(entry.name, entry.time, space.camera(entry.camera), entry.load) for entry in parts[split])
+        tuple(
+            Frame(e.name, e.time, space.camera(e.camera), e.load, load_valid=e.load_valid)
+            for e in parts[split]
+        )
         for split in SPLITS
     )
     start = (min if canonical == "first" else middle_of)([frame.time for frame in train])
@@ -131,6 +157,10 @@ def read_scene(
         "far": space.far,
         "derived": [name for name in ("near", "far", "box") if options[name] is None],
     }
+    if train[0].load_valid is not None:
+        protocol["masks"] = (
+            "ignore: PSNR is of the pixels that count, other metrics see the true colour elsewhere"
+        )
     if assumed := [*assumed, *filter(None, [told])]:
         protocol["assumed"] = assumed
     cloud = file.parent / POINTS
@@ -142,7 +172,7 @@ def read_scene(
 class ImageEntry:
     """A checked entry: ``camera`` in the file's units, at the size of the image; its near and far are 0.
 
-    ``name`` is the image's path without its suffix; ``has_alpha`` says what the image's header does.
+    ``name`` is the image's path without its suffix; ``has_alpha`` says whether it may be cut out.
     """
 
     name: str
@@ -150,10 +180,11 @@ class ImageEntry:
     camera: Camera
     load: StoredImage
     has_alpha: bool
+    load_valid: StoredMask | None = None
 
 
 def _read_entries(
-    file: Path, content: dict, scale: int, axes: str | None, inverse: bool
+    file: Path, content: dict, scale: int, axes: str | None, inverse: bool, masks: str | None
 ) -> tuple[list[ImageEntry], set[str], list[str]]:
     """Read all frames of a nerfstudio-style ``transforms.json`` in its order, less those without an image.
 
@@ -161,7 +192,7 @@ def _read_entries(
         file: for errors and as the place that paths start from.
         content: content of the file.
         scale: take images that are ``scale`` times smaller, from ``images_4`` in place of ``images``.
-        axes, inverse: see ``read_scene``.
+        axes, inverse, masks: see ``read_scene``.
 
     Returns:
         the entries, the names of those left out, and lines that say what was assumed.
@@ -169,25 +200,31 @@ def _read_entries(
     Raises:
         SceneError: for every key or image that is missing or wrong.
 
-    Cost: one read of each PNG, of a JPEG's beginning and end.
+    Cost: one read of each PNG, of a JPEG's beginning and end; masks that ignore are decoded.
     """
     frames = frames_of(file, content, content)
     images = [_file(entry, "file_path", scale) for entry in frames]
     there, assumed = with_images(list(zip(frames, images)), images, str(file))
     absent = {_name_of(file.parent, f.own.get("file_path"), f.where("file_path")) for f in frames}
-    entries = []
+    entries, has_mask = [], []
     for entry, image in there:
         mask, header = None, inspect_image(image)
-        if "mask_path" in entry.own:
+        if "mask_path" in entry.own and masks != "off":
             mask = _file(entry, "mask_path", scale)
             inspect_image(mask, header.size, f" as {image.name}")
         time = number(entry.own["time"], entry.where("time"), 0, 1) if "time" in entry.own else None
         camera = camera_of(entry, header.size, scale, image, pose=pose_in(entry, axes, inverse))
         name = _name_of(file.parent, entry.own.get("file_path"), entry.where("file_path"))
-        load = StoredImage(image, header.size, mask=mask)
-        entries.append(ImageEntry(name, time, camera, load, header.has_alpha))
+        valid = None
+        if masks != "alpha" and (mask or masks == "ignore"):
+            valid = StoredMask(mask or image, header.size, 0 if mask else 3)
+            valid()  # refuses a mask without a bright pixel
+        opaque = masks == "off" or (masks == "ignore" and mask is None)
+        load = StoredImage(image, header.size, mask=None if valid else mask, opaque=opaque)
+        has_mask.append(mask is not None)
+        entries.append(ImageEntry(name, time, camera, load, header.has_alpha and not opaque, valid))
     for key, given in (
-        ("mask_path", [e.load.mask is not None for e in entries]),
+        ("mask_path", has_mask),
         ("file_path: alpha", [e.has_alpha or e.load.mask is not None for e in entries]),
     ):
         if any(given) and not all(given):

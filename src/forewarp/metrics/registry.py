@@ -67,6 +67,16 @@ def _of_image(name: str):
     return score
 
 
+def _psnr(prediction: Tensor, target: Target, depth: Tensor | None) -> float | None:
+    """PSNR of the pixels that count."""
+    from forewarp.metrics.image import psnr
+
+    if target.valid is None:
+        return psnr(prediction, target.rgb)
+    valid = target.valid  # a row of pixels: none where averaging has left none
+    return psnr(prediction[valid][None], target.rgb[valid][None]) if bool(valid.any()) else None
+
+
 def _psnr_in_box(prediction: Tensor, target: Target, depth: Tensor | None) -> float | None:
     """PSNR in the bounding rectangle of the foreground."""
     from forewarp.metrics.image import psnr
@@ -92,7 +102,7 @@ def _depth_within(threshold: float):
 METRICS: dict[str, Metric] = {
     metric.name: metric
     for metric in (
-        Metric("psnr", "PSNR", 2, unit="dB", score=_of_image("psnr")),
+        Metric("psnr", "PSNR", 2, unit="dB", score=_psnr),
         Metric(
             "psnr_box",
             "PSNR in the box",
@@ -177,6 +187,8 @@ class ImageSuite:
     ) -> dict[str, float]:
         """Compute all metrics that the image's size and truth allow, in the order of ``METRICS``.
 
+        Where some pixels do not count, PSNR is of the others alone; other metrics see the true colour there.
+
         Args:
             prediction: (H, W, 3) in [0, 1].
             target: the true image, and its depth and foreground if known.
@@ -186,6 +198,8 @@ class ImageSuite:
             ValueError: naming the frame, for a shape that differs or a colour that is not finite.
         """
         scores = {}
+        if target.valid is not None and prediction.shape == target.rgb.shape:
+            prediction = target.rgb.where(~target.valid[..., None], prediction.to(target.rgb))
         try:
             for name, metric in METRICS.items():
                 lacks_depth = metric.needs_depth and (predicted_depth is None or target.depth is None)

@@ -22,7 +22,8 @@ class Frame:
     camera's size; without an alpha channel on disk alpha is 255. ``load_depth()``, if not None,
     gives exact ray depth (H, W) float32 in world units, 0 on the background. ``ability`` is what a test
     frame measures: ``space``, ``time``, ``canonical``, or ``all`` if the dataset does not say.
-    ``camera_id`` numbers the physical cameras from 0, if the dataset tells them apart.
+    ``camera_id`` numbers the physical cameras from 0, if the dataset tells them apart. ``load_valid()``, if
+    not None, gives (H, W) bool: the pixels, at least one, that count in training and in metrics.
     """
 
     name: str
@@ -32,6 +33,7 @@ class Frame:
     load_depth: Callable[[], Tensor] | None = None
     ability: str = "all"
     camera_id: int | None = None
+    load_valid: Callable[[], Tensor] | None = None
 
 
 @dataclass(frozen=True)

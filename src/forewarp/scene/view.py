@@ -108,17 +108,19 @@ class Asks:
 class Observation:
     """Pixels of one image: the true ``rgb`` (R, 3) in [0, 1] over ``background`` (3,) or (R, 3), the colour
     of rays that hit nothing. If the method asks for ``straight`` pixels, ``rgb`` is (R, 4) uint8: colour
-    and alpha as stored.
+    and alpha as stored. ``valid`` (R,) bool: those to learn from; None: all, as always of single pixels.
     """
 
     moment: Moment
     view: View
     rgb: Tensor
     background: Tensor
+    valid: Tensor | None = None
 
     def to(self, device) -> Observation:
         """Move the colours to another device; the view stays on the CPU."""
-        return replace(self, rgb=self.rgb.to(device), background=self.background.to(device))
+        valid = None if self.valid is None else self.valid.to(device)
+        return replace(self, rgb=self.rgb.to(device), background=self.background.to(device), valid=valid)
 
 
 @dataclass(frozen=True)
@@ -169,7 +171,7 @@ class Target:
     frame's camera or, where it was reduced, smaller.
 
     If known: ``foreground`` (H, W) bool, ``depth`` (H, W) exact ray depth in world units (0 on the
-    background), ``index`` among the training frames.
+    background), ``index`` among the training frames, ``valid`` (H, W) bool, the pixels that count.
     """
 
     frame: Frame
@@ -178,6 +180,7 @@ class Target:
     foreground: Tensor | None = None
     depth: Tensor | None = None
     index: int | None = None
+    valid: Tensor | None = None
 
     @property
     def moment(self) -> Moment:
@@ -191,6 +194,6 @@ class Target:
 
     def to(self, device) -> Target:
         """Move the tensors to another device."""
-        names = ("rgb", "background", "foreground", "depth")
+        names = ("rgb", "background", "foreground", "depth", "valid")
         known = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
         return replace(self, **{name: tensor.to(device) for name, tensor in known.items()})

@@ -183,8 +183,13 @@ class DynamicSceneModule(lightning.LightningModule):
         self.clock.load_state_dict(state["clock"])
 
     def psnr_of(self, target: Target, pixels: Tensor | None = None) -> Tensor:
-        """Return the PSNR (dB) of the best rendering of an image, or of its flat ``pixels`` (R,) alone."""
+        """Return the PSNR (dB) of the best rendering of an image, or of its flat ``pixels`` (R,) alone; where
+        some pixels do not count, of as many that do.
+        """
         truth = target.rgb.reshape(-1, 3)
+        if target.valid is not None:
+            valid = target.valid.flatten().cpu().nonzero()[:, 0]
+            pixels = valid if pixels is None else valid[pixels.cpu() % len(valid)]
         truth = truth if pixels is None else truth[pixels]
         drawn = self.render(View(target.frame.camera, pixels), target.moment, target.background)
         error = (drawn.rgb.clamp(0, 1) - truth.to(drawn.rgb)).square().mean()

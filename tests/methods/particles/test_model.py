@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from forewarp.data.batches import composited
 from forewarp.methods.effect import switched
 from forewarp.methods.method import Start
 from forewarp.methods.particles import model
@@ -45,6 +46,28 @@ def test_gradients_are_those_of_autograd(options):
     for name, p in method.named_parameters():
         error = float((p.grad - step.gradients[name]).norm() / p.grad.norm().clamp(min=1e-9))
         assert error < 2e-3, name
+
+
+@pytest.mark.parametrize("factors", [{"photo": 1.0}, {"photo": 1.0, "dssim": 0.2}])
+def test_pixels_that_do_not_count_change_nothing(factors):
+    DATA.asks = Particles.asks
+    batch = next(iter(DATA.train_dataloader()))
+    seen, steps = batch.observations[0], []
+    valid = torch.zeros(seen.view.shape, dtype=torch.bool)
+    valid[: len(valid) // 2] = True
+    module = module_with(DATA, numbers={"jitter": 0.0})
+    shaken(module).method.nodes.seen_times.copy_(torch.tensor([0.0, 1.0]))
+    for add in (0, 99):
+        rgb = seen.rgb + (~valid.flatten())[:, None].byte() * add
+        masked = replace(batch, observations=(replace(seen, rgb=rgb, valid=valid.flatten()),))
+        steps.append(module.method.look(masked, factors, module.generator))
+    for name, gradient in steps[0].gradients.items():
+        if "dssim" not in factors:  # a window of it may reach beyond the edge
+            assert torch.equal(gradient, steps[1].gradients[name]), name
+    assert steps[0].squared_error == steps[1].squared_error or "dssim" in factors
+    drawn = module.method.at(seen.moment).render(View(seen.view.camera), seen.background)
+    error = (drawn.rgb - composited(seen.rgb, seen.background))[valid.flatten()].square().mean()
+    assert float(steps[0].squared_error) == pytest.approx(float(error.detach()), rel=1e-3)
 
 
 def test_image_losses_are_weighted_with_the_photo_term():

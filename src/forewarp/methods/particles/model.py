@@ -355,7 +355,8 @@ class Particles(Method):
         squared, numbers, views = 0.0, 0, len(batch.observations)
         for seen in batch.observations:
             squared_error, of_image, found = self._compare(seen, factors, generator, views)
-            squared, numbers = squared + squared_error, numbers + 3 * len(seen.view)
+            count = len(seen.view) if seen.valid is None else int(seen.valid.sum())
+            squared, numbers = squared + squared_error, numbers + 3 * count
             for name, value in of_image.items():
                 terms[name] += value / views
             for name, value in found.items():
@@ -384,13 +385,14 @@ class Particles(Method):
             motion, maps = nodes.motion_and_maps(basis)
             warp = Warp(maps, self.skinning.links, self.skinning.weights())
         colors, terms = self._color_parameters(), {}
-        loss, covered = self._image_loss(factors, terms), float(self.covered_pixels)
+        loss, covered = self._image_loss(factors, terms, seen.valid), float(self.covered_pixels)
         factor = (factors.get("photo", 0.0) if loss is None else 1.0) / (covered * views)
         compared = compare(
             self.gaussians(), warp, pinhole_of(seen.view.camera, self.blur), *self.time_bases(time),
             seen.rgb, seen.background, width=self.width, factor=factor, by_skin=self.moves,
             kinds=[getattr(self, name).shape[1] for name in colors], loss=loss,
         )  # fmt: skip
+        squared = terms.pop("squared", compared.squared)
         terms = {name: value / covered for name, value in (terms or {"photo": compared.loss}).items()}
         shown = compared.pull > 0
         self.gradient_sum.add_(compared.pull)
@@ -411,19 +413,26 @@ class Particles(Method):
             smooth, extent = factors.get("smooth", 0.0), float(self.extent)
             terms["smooth"], of_nodes = nodes.backward(time, motion_time, basis, by_motion, smooth, extent)
             gradients |= {"skinning.logits": compared.skin, **of_nodes}
-        return compared.squared, terms, gradients
+        return squared, terms, gradients
 
-    def _image_loss(self, factors: Mapping[str, float], terms: dict[str, float]) -> Callable | None:
+    def _image_loss(
+        self, factors: Mapping[str, float], terms: dict[str, float], valid: Tensor | None
+    ) -> Callable | None:
         """Return the weighted sum of all losses of an image, which notes each in ``terms``.
 
-        None if ``photo`` is the only one: a kernel computes it together with its gradients.
+        Where pixels are not ``valid`` (R,) the image counts as equal to the truth and has no gradient; the
+        ``squared`` error is noted too then. None if ``photo`` is the only loss and all pixels are valid: a
+        kernel computes it together with its gradients.
         """
         losses = {"photo": partial(robust, width=self.width)} | IMAGE_LOSSES
         losses = {name: loss for name, loss in losses.items() if name in factors}
-        if losses.keys() <= {"photo"}:
+        if losses.keys() <= {"photo"} and (valid is None or not losses):
             return None
 
         def weighted(image: Tensor, truth: Tensor) -> Tensor:
+            if valid is not None:
+                image = torch.where(valid.reshape(*image.shape[:2], 1), image, truth)
+                terms["squared"] = float((image.detach() - truth).square().sum())
             values = {name: loss(image, truth) for name, loss in losses.items()}
             terms.update({name: float(value.detach()) for name, value in values.items()})
             return sum(factors[name] * value for name, value in values.items())

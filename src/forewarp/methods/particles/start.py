@@ -205,7 +205,10 @@ def _small(scene: Scene, i: int, side: int) -> tuple[Tensor, Camera]:
 
 
 def _sweep(scene: Scene, i: int, side: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Return points (P, 3) of an image's lattice at their best depths, their colours, and their size ()."""
+    """Return points (P, 3) of an image's lattice at their best depths, their colours, and their size ().
+
+    None is at a pixel that is not valid.
+    """
     rgb, camera = _small(scene, i, side)
     step = max(1, round(max(camera.width, camera.height) / side))
     rows, columns = torch.meshgrid(
@@ -226,8 +229,14 @@ def _sweep(scene: Scene, i: int, side: int) -> tuple[Tensor, Tensor, Tensor]:
     costs = torch.stack([_difference(scene, j, side, points, color) for j in neighbours])
     best_half = costs.sort(0).values[: max(1, len(neighbours) // 2)].mean(0)
     depth = depths[best_half.argmin(-1)]
-    points = rays.origins + depth[:, None] * rays.directions
-    return points, color, depth.median() * step / camera.fx
+    points, size = rays.origins + depth[:, None] * rays.directions, depth.median() * step / camera.fx
+    if scene.train[i].load_valid is not None:  # what is not learned from is no start either
+        valid = scene.train[i].load_valid()[None, None].float()
+        valid = torch.nn.functional.interpolate(valid, rgb.shape[:2], mode="area")[
+            0, 0, rows, columns
+        ].flatten()
+        points, color = points[valid == 1], color[valid == 1]
+    return points, color, size
 
 
 def _nearest_plane(camera: Camera, neighbours: Sequence[Camera]) -> float:

@@ -131,7 +131,9 @@ def residual(method: ForwardWarp, targets: Sequence[Target], voxel_size: float, 
     generator, samples, bounds = torch.Generator().manual_seed(0), [], []
     for number, target in enumerate(targets):
         camera = target.frame.camera
-        pixels = torch.randperm(camera.width * camera.height, generator=generator)[:rays]
+        pixels = torch.randperm(camera.width * camera.height, generator=generator)
+        pixels = pixels if target.valid is None else pixels[target.valid.flatten()[pixels]]
+        pixels = pixels[:rays]
         rgb, places, depth = _seen(method, target, pixels)
         error = target.rgb.reshape(-1, 3)[pixels] - rgb
         views = torch.full((len(pixels),), number)
