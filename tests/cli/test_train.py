@@ -75,7 +75,10 @@ def test_a_run_leaves_what_it_promises_and_says_so(fitted):
     assert "canonical" in out
     assert "metrics.json" in out
     told = [line.split()[0] for line in err.strip().splitlines()]
-    assert list(dict.fromkeys(told)) == ["coarse", "fine", "test"]  # a slow machine says each more than once
+    # A slow machine says each more than once. A run so short is doubted.
+    assert list(dict.fromkeys(told)) == ["coarse", "fine", "test", "warning:", "likely"]
+    assert "likely cause 1: too little training" in err
+    assert read(fitted / "metrics.json")["protocol"]["doubts"][0].startswith("training images are reached to")
 
 
 def test_metrics_have_the_promised_shape(fitted):

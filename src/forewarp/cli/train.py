@@ -86,6 +86,7 @@ def measure(prepared, module) -> float | None:
     """Measure a fitted run, or say how to; draw its curve; return the score."""
     from forewarp.evaluation.evaluate import notes_of
     from forewarp.report.figures import draw_own
+    from forewarp.runs.doubts import doubts, tell
     from forewarp.runs.fitted import measure_run
 
     run, config = prepared.run, prepared.config
@@ -94,6 +95,7 @@ def measure(prepared, module) -> float | None:
     else:
         fitted = f"fitted: {run.folder}; measure it with forewarp-evaluate run={run.folder}"
         print(fitted, *notes_of(module.method.protocol()), sep="\n")
+        tell(doubts(run, module.to(run.device)))
     draw_own(run.folder)
     if config.evaluate:
         at = quote(f"run={run.folder}")

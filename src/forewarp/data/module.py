@@ -64,15 +64,8 @@ def check_seen(scene: Scene) -> None:
     Raises:
         SceneError: saying what the cameras look at.
     """
-    low, high = (torch.tensor(end, dtype=torch.float64) for end in (scene.box.low, scene.box.high))
-    for frame in scene.train:
-        camera = frame.camera
-        rays = camera.rays(nine_pixels(camera), dtype=torch.float64)
-        slabs = torch.stack([(end - rays.origins) / rays.directions for end in (low, high)])
-        enter = slabs.amin(0).nan_to_num(-math.inf).amax(-1).clamp(min=camera.near)
-        leave = slabs.amax(0).nan_to_num(math.inf).amin(-1).clamp(max=camera.far)
-        if bool((enter < leave).any()):
-            return
+    if blind_frames(scene) < len(scene.train):
+        return
     focus = ", ".join(f"{v:.4g}" for v in focus_point([frame.camera for frame in scene.train]).tolist())
     near, far = scene.train[0].camera.near, scene.train[0].camera.far
     raise mismatch(
@@ -81,6 +74,20 @@ def check_seen(scene: Scene) -> None:
         f"{scene.box.low} to {scene.box.high}, near {near:g}, far {far:g}; cameras look at ({focus})",
         "set data.box=null data.near=null data.far=null, where the format has these keys",
     )
+
+
+def blind_frames(scene: Scene) -> int:
+    """Count the training frames whose camera sees nothing of the box between its near and far planes."""
+    low, high = (torch.tensor(end, dtype=torch.float64) for end in (scene.box.low, scene.box.high))
+    blind = 0
+    for frame in scene.train:
+        camera = frame.camera
+        rays = camera.rays(nine_pixels(camera), dtype=torch.float64)
+        slabs = torch.stack([(end - rays.origins) / rays.directions for end in (low, high)])
+        enter = slabs.amin(0).nan_to_num(-math.inf).amax(-1).clamp(min=camera.near)
+        leave = slabs.amax(0).nan_to_num(math.inf).amin(-1).clamp(max=camera.far)
+        blind += not bool((enter < leave).any())
+    return blind
 
 
 def most_held_out(scene: Scene) -> int:
@@ -193,6 +200,11 @@ class SceneDataModule(LightningDataModule):
         place: the scene's folder, where it has one.
     """
 
+    suspects: tuple[str, ...] = (  # likeliest causes of a bad fit, for who reads this format
+        "numbers too small for the scene: preset=fast in place of preset=demo",
+        "minutes too few for the method: raise budget.minutes",
+        "motion or looks that the method cannot show: see docs, or model=particles",
+    )
     picker = _of_batches("picker", "Chooses the training frame of the next batch; None: uniformly at random.")
     asks = _of_batches("asks", "What the trained method wants of a batch.")
 
@@ -304,6 +316,11 @@ class DNeRFDataModule(_FolderDataModule):
     """A D-NeRF scene, as ``dnerf.read_scene`` reads it."""
 
     _reader = _described_by = staticmethod(dnerf.read_scene)
+    suspects = (
+        "poses in other axes, or world-to-camera: data.axes=opencv, data.inverse=true",
+        "a box, near or far that misses the subject: data.box=null data.near=null data.far=null",
+        "times or poses that belong to other images: compare file_path, time and transform_matrix of a frame",
+    )
 
 
 class LegoCompleteDataModule(DNeRFDataModule):
@@ -316,15 +333,30 @@ class NHRDataModule(_FolderDataModule):
     """An NHR scene, as ``nhr.read_scene`` reads it."""
 
     _reader = _described_by = staticmethod(nhr.read_scene)
+    suspects = (
+        "images of another size than the intrinsics: data.half_resolution=false",
+        "point clouds that miss the subject: data.box=[x0,y0,z0,x1,y1,z1]",
+        "frames of the cameras that are not of one moment: compare the images of a number",
+    )
 
 
 class PosedVideoDataModule(_FolderDataModule):
     """A capture with poses, as ``posed_video.read_scene`` reads it; ``canonical`` is the reader's."""
 
     _reader = _described_by = staticmethod(posed_video.read_scene)
+    suspects = (
+        "poses in other axes, or world-to-camera: data.axes=opencv, data.inverse=true",
+        "poses found on what moves, or on captions: look at them with forewarp-view, mask what moves",
+        "times that are not those of the images: give every frame its time in transforms.json",
+    )
 
 
 class HyperNeRFDataModule(_FolderDataModule):
     """A HyperNeRF capture, as ``hypernerf.read_scene`` reads it."""
 
     _reader = _described_by = staticmethod(hypernerf.read_scene)
+    suspects = (
+        "camera files in other axes: orientation is world-to-camera with OpenCV's axes",
+        "scene.json's scale, center, near and far are not those of the cameras: data.box=null",
+        "warp_id in metadata.json does not count the moments",
+    )

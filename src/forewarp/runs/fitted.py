@@ -24,6 +24,7 @@ from forewarp.metrics.registry import METRICS, NETS, ImageSuite
 from forewarp.progress import Counted
 from forewarp.runs.build import build_run
 from forewarp.runs.config import saved_config, trust_of
+from forewarp.runs.doubts import doubts, tell
 from forewarp.runs.overrides import key_of, typed_overrides
 from forewarp.runs.session import warn_if_changed
 from forewarp.scene.camera import Camera
@@ -155,9 +156,13 @@ def measure_run(run: Run, module: DynamicSceneModule, config: DictConfig) -> dic
     suite = ImageSuite(find_lpips(extra=config.lpips_weights), mask_box=mask_box)
     options = {"sheets": config.sheets, "views": config.get("views"), "reduce": config.get("reduce")}
     options |= {"protocol": protocol, "finished": run.finished()}
+    module = module.to(run.device)
+    if lines := doubts(run, module):
+        protocol["doubts"] = lines
     with Counted("test views") as progress:
-        metrics = evaluate(module.to(run.device), data, folder, suite, progress=progress, **options)
+        metrics = evaluate(module, data, folder, suite, progress=progress, **options)
     show(metrics, folder, suite.absent)
+    tell(lines)
     return metrics
 
 

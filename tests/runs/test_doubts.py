@@ -1,0 +1,57 @@
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from forewarp.data.module import DNeRFDataModule, SceneDataModule, blind_frames
+from forewarp.runs.doubts import doubts
+from tests.support.tiny_scene import ball_scene
+
+SCENE = ball_scene(frames=3, size=8)
+
+
+def run(steps=5000, iterations=None, suspects=SceneDataModule.suspects, scene=SCENE):
+    """A finished run of one stage, ``fine``, which took 7.7 s."""
+    data = SceneDataModule(lambda: scene)
+    data.suspects = suspects
+    stage = SimpleNamespace(settings=SimpleNamespace(name="fine", iterations=iterations))
+    made = {"fine": {"steps": steps, "seconds": 7.7}}
+    return SimpleNamespace(stages=[stage], datamodule=data, finished=lambda: made)
+
+
+def reaching(psnr):
+    """A module that shows training pixels so well."""
+    return SimpleNamespace(psnr_of=lambda target, pixels: torch.tensor(float(psnr)))
+
+
+def test_a_good_fit_is_not_doubted():
+    assert doubts(run(), reaching(30)) == []
+
+
+def test_a_stage_that_minutes_ended_after_a_step_is_named():
+    (line,) = doubts(run(steps=1), reaching(30))
+    assert line.startswith("stage.fine ended after 1 steps in 7.7 s; raise budget.minutes")
+    assert doubts(run(steps=4, iterations=4), reaching(30)) == []
+
+
+@pytest.mark.parametrize(
+    ("steps", "first"), [(5000, "poses in other axes"), (900, "too little training, 900")]
+)
+def test_low_psnr_names_the_three_likeliest_causes_of_the_format(steps, first):
+    line, *causes = doubts(run(steps, suspects=DNeRFDataModule.suspects), reaching(12.9))
+    assert line.startswith("training images are reached to 12.9 dB; one color alone has")
+    assert [cause[: len("  likely cause 1")] for cause in causes] == [
+        f"  likely cause {i}" for i in (1, 2, 3)
+    ]
+    assert first in causes[0]
+
+
+def test_cameras_that_see_nothing_of_the_box_are_counted():
+    camera = SCENE.train[0].camera
+    turned = camera.camera_to_world @ torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64).diag()
+    away = replace(camera, camera_to_world=turned)
+    scene = replace(SCENE, train=(replace(SCENE.train[0], camera=away), *SCENE.train[1:]))
+    assert (blind_frames(SCENE), blind_frames(scene)) == (0, 1)
+    (line,) = doubts(run(scene=scene), reaching(30))
+    assert line.startswith(f"1 of {len(scene.train)} training cameras see nothing of the box")
