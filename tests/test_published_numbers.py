@@ -184,11 +184,12 @@ def made_by(config, name, frames=3):
     """
     scene, run = moving_scene(still=torch.zeros(4, 3)), build_run(config)
     (stage,) = (one for one in run.stages if one.settings.name == name)
-    numbers, weights = dict(stage.settings.numbers), stage.objective.weights
+    numbers, terms = dict(stage.settings.numbers), stage.objective
+    terms = {"weights": terms.weights, "literal": terms.literal}
     if "num_voxels" in numbers:
         numbers["num_voxels"] = [[0, 1000], [1, numbers["num_voxels"][-1][1]]]
     handover = Handover(scene.box, False, frames)
-    given = Start(scene, name, numbers, handover=handover, blank=True, weights=weights)
+    given = Start(scene, name, numbers, handover=handover, blank=True, **terms)
     with torch.device("meta" if config.model.name == "neural_volumes" else "cpu"):
         return run.model(given)
 
@@ -210,8 +211,7 @@ def test_ndvg_never_sees_the_last_images():
     (coarse, _) = build_run(of_preset("faithful", "ndvg")).stages
     assert coarse.settings.iterations == 5000
     curriculum, in_play = Curriculum([i / 199 for i in range(200)], 0.0, **coarse.settings.curriculum), []
-    for step in (0, 300, 4999):
-        curriculum.fraction = coarse.settings.fraction(step, 0)
+    for curriculum.step in (0, 300, 4999):
         in_play.append(curriculum.in_play)
     assert in_play == [10, 10, 166]
 
@@ -231,7 +231,7 @@ def test_faithful_neural_volumes_has_the_published_numbers():
 
 JUMP = "offsets jump at the canonical time (continuous)"
 STILL = "points that never move are not looked at (weights.still)"
-UNSEEN = "the first stage never sees the last 1 training pictures (pool)"
+UNSEEN = "the first stage never sees the last 1 images (iterations_per_time)"
 PADDED = "the grid is padded with zeros (padded)"
 FROZEN = "the grid stays as it is from 0.95 of the stage on (frozen_from)"
 FAULTS = {

@@ -104,7 +104,7 @@ def measured(method: str, scene: Path, rays: int | None = None) -> dict:
 
 def stepped(run: Run, module: DynamicSceneModule, optimizer: torch.optim.Optimizer) -> int:
     """Take the last step of a stage, forward, backward and optimiser; return the rays of its batch."""
-    module.curriculum.fraction = 1.0
+    module.curriculum.fraction, module.curriculum.step = 1.0, module.settings.iterations
     run.datamodule.picker, run.datamodule.asks = module.curriculum, module.method.asks
     last = module.settings.iterations - 1
     module.method.advance(1.0, last, optimizer)

@@ -303,7 +303,7 @@ def test_the_released_faults_are_named():
     still = method("ndvg", still=some_points(5), continuous=True)
     assert still.faults() == ["points that never move are not looked at (weights.still)"]
     of_some = start(still=some_points(5), weights={"still": 1.0})
-    short = "the first stage never sees the last 1 training pictures (pool)"
+    short = "the first stage never sees the last 1 images (iterations_per_time)"
     for frames, faults in ((2, [short]), (3, [])):
         left = Handover(of_some.scene.box, False, frames)
         begun = replace(of_some, handover=left, blank=True)

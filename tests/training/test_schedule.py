@@ -115,18 +115,39 @@ AS_IF_FROM_NONE = {"start": 3, "all_in": 0.125, "from_zero": True}
 @pytest.mark.parametrize(
     ("count", "options", "expected"),
     [
-        (200, {"pace": 166.67}, {0: 10, 0.06: 10, 0.066: 11, 0.9998: 166}),
-        (100, {"pace": 166.67}, {0: 10, 0.06: 10, 0.066: 11, 0.9998: 100}),  # however many times there are
         (100, {"all_in": 0.0, "most": 7}, {0: 7, 1: 7}),
         # D-NeRF's max(int(i / 100k * count), 3)
         (50, AS_IF_FROM_NONE, {0: 3, 0.01: 4, 0.0625: 25, 0.125: 50, 1: 50}),
         (200, AS_IF_FROM_NONE, {0: 3, 0.01: 16, 0.0625: 100, 0.125: 200, 1: 200}),
     ],
 )
-def test_times_come_in_at_a_pace_or_as_if_from_none_on(count, options, expected):
+def test_times_come_in_as_if_from_none_on(count, options, expected):
     curriculum, played = Curriculum([i / count for i in range(count)], 0.0, **options), {}
     for curriculum.fraction in expected:
         played[curriculum.fraction] = curriculum.in_play
+    assert played == expected
+
+
+PRINTED = {"iterations_per_time": 60, "newest_share": 0.0}
+NDVGS = {"iterations_per_time": 30, "from_zero": True}  # its max(10, i // 30)
+
+
+@pytest.mark.parametrize(
+    ("count", "options", "expected"),
+    [
+        *((count, PRINTED, {0: 10, 59: 10, 60: 11, 60 * (count - 10): count}) for count in (28, 100, 135)),
+        (135, PRINTED, {60 * 125 - 1: 134, 20_000: 135}),
+        (200, NDVGS, {0: 10, 329: 10, 330: 11, 4999: 166}),
+        (100, NDVGS, {0: 10, 329: 10, 330: 11, 4999: 100}),
+        (4, PRINTED, {0: 4, 600: 4}),
+    ],
+)
+@pytest.mark.parametrize("fraction", [0.0, 0.7])  # of the stage, which does not matter
+def test_times_come_in_after_so_many_steps_however_many_there_are(count, options, expected, fraction):
+    curriculum, played = Curriculum([i / count for i in range(count)], 0.0, **options), {}
+    curriculum.fraction = fraction
+    for curriculum.step in expected:
+        played[curriculum.step] = curriculum.in_play
     assert played == expected
 
 
@@ -162,9 +183,10 @@ def test_goes_on_where_it_was_saved():
     first, second = (Curriculum(TIMES, 0.5, seed=seed, error_share=0.3) for seed in (1, 2))
     draws(first, 0.4, 17)
     first.report(3, 0.2)
+    first.step = 7
     state = first.state_dict()
     second.load_state_dict(state)
-    assert second.fraction == 0.4
+    assert (second.fraction, second.step) == (0.4, 7)
     assert [first() for _ in range(50)] == [second() for _ in range(50)]
     first.report(5, 0.2)
     assert state["errors"][5].isnan()  # a saved state does not change afterwards
@@ -211,7 +233,11 @@ REFUSED = [
     (shared, {"minutes": "soon"}, f"budget.minutes: expected {FREE} 'soon'"),
     (shared, {"iterations": 0}, f"budget.iterations: expected {FREE} 0"),
     (shared, {"minutes": None}, "stage.a: expected iterations or minutes, but got neither"),
-    (curriculum, {"pace": -1.0}, "x.pace: expected a number >= 0 or null, but got -1.0"),
+    (
+        curriculum,
+        {"iterations_per_time": 0},
+        "x.iterations_per_time: expected a whole number >= 1, but got 0",
+    ),
     (curriculum, {"most": 0}, "x.most: expected at least 1 or null, but got 0"),
     *((curriculum, {key: value}, "x: expected start >= 1, ") for key, value in BAD_SHARES.items()),
 ]

@@ -146,6 +146,19 @@ def test_rates_bases_lattice_and_frames_follow_the_fraction(tmp_path):
     assert playing == (2, 4, 6, 8, 10, 12, 12, 12, 12, 12)
 
 
+def test_times_come_in_by_steps_and_what_a_short_stage_leaves_out_is_told(tmp_path):
+    told, diary = [], Diary()
+    ours = run(tmp_path, [diary], iterations=10, curriculum={"start": 2, "iterations_per_time": 3})
+    ours.tell = told.append
+    ours.fit()
+    assert [step[-1] for step in diary.steps if step[0] == "fine"] == [2, 2, 2, 3, 3, 3, 4, 4, 4, 5]
+    (line,) = told
+    assert line.startswith(
+        "fine: ended when 5 of 12 training images had come in; for all, set a larger budget,"
+    )
+    assert line.endswith(" or stage.fine.curriculum.iterations_per_time=null")
+
+
 CLEARED = Path("/proc/self/clear_refs")
 
 

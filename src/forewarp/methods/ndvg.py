@@ -245,7 +245,7 @@ class NDVG(MarchedMethod):
 
     def faults(self) -> list[str]:
         """See ``Method``."""
-        unseen = f"the first stage never sees the last {self.never_seen} training pictures (pool)"
+        unseen = f"the first stage never sees the last {self.never_seen} images (iterations_per_time)"
         free = "points that never move are not looked at (weights.still)"
         loose = self.still is not None and not self.pulls
         return those_that_hold({JUMP: not self.continuous, unseen: self.never_seen > 0, free: loose})

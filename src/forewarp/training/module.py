@@ -139,7 +139,7 @@ class DynamicSceneModule(lightning.LightningModule):
         if fraction >= 1:
             self.trainer.should_stop = True
             return -1
-        self.curriculum.fraction = fraction
+        self.curriculum.fraction, self.curriculum.step = fraction, self.global_step
         optimizer = self.optimizers().optimizer
         for group in optimizer.param_groups:
             group["lr"] = group["base_lr"] * self.settings.lr_factor(fraction, group["name"])

@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from forewarp.methods.method import Model, check_number
+from forewarp.methods.method import Model, check_least, check_number
 from forewarp.training.objective import Objective
 
 _ENDS = 0.05  # of all time, at its beginning and at its end
@@ -190,7 +190,8 @@ class Curriculum:
 
     Call it for the index of the next training frame. The number of distinct times in play grows linearly
     with the fraction of the stage that is done, and each time brings all its frames, so a run bounded by
-    minutes sees them all too. A share of the draws goes to the newest frames, whose motion is unknown yet.
+    minutes sees them all too; or, as published, with the steps. A share of the draws goes to the newest
+    frames, whose motion is unknown yet.
 
     Args:
         times: time of every training frame.
@@ -199,8 +200,8 @@ class Curriculum:
         all_in: fraction of the stage at which all times are in play; 0: from the start.
         from_zero: times come in as if from none on, of which ``start`` are in play in any case; False: from
             ``start`` on.
-        pace: distinct times that come into play in a whole stage, ``start`` at least, whatever ``all_in``; a
-            longer sequence is never seen whole; null: by ``all_in``.
+        iterations_per_time: one more time comes in after each so many steps, whatever ``all_in``; a stage too
+            short for its sequence never sees it whole; null: by ``all_in``.
         most: number of times that ever come into play; null: all.
         newest_share: share of the draws that goes to the newest frames, while frames still come in.
         newest_part: share of the frames in play that counts as the newest.
@@ -220,7 +221,7 @@ class Curriculum:
         start: int = 10,
         all_in: float = 0.6,
         from_zero: bool = False,
-        pace: float | None = None,
+        iterations_per_time: int | None = None,
         most: int | None = None,
         newest_share: float = 0.3,
         newest_part: float = 0.125,
@@ -242,31 +243,29 @@ class Curriculum:
         self._ends = [place + 1 for place in last_of_time.values()]  # frames in play, by number of times
         if most is not None and most < 1:
             raise ValueError(f"{where}.most: expected at least 1 or null, but got {most}")
-        if pace is not None and not pace >= 0:
-            raise ValueError(f"{where}.pace: expected a number >= 0 or null, but got {pace}")
+        if iterations_per_time is not None:
+            check_least(1, of=where, iterations_per_time=iterations_per_time)
         self._ends = self._ends[:most]
-        self.start, self.all_in, self.pace = min(start, len(self._ends)), all_in, pace
-        self.from_zero = from_zero
+        self.start, self.all_in, self.from_zero = min(start, len(self._ends)), all_in, from_zero
+        self.iterations_per_time = iterations_per_time
         self.newest_share, self.newest_part = newest_share, newest_part
         self.error_share, self.ends_share = error_share, ends_share
         first, last = min(times), max(times)
         near = _ENDS * (last - first)
         self.at_ends = [i for i, time in enumerate(times) if time <= first + near or time >= last - near]
         self.errors = torch.full((len(times),), float("nan"))
-        self.fraction = 0.0
+        self.fraction, self.step = 0.0, 0  # of the stage, set before each step
         self.generator = torch.Generator().manual_seed(seed)
 
     @property
     def in_play(self) -> int:
         """Number of frames that may be drawn now."""
-        count = len(self._ends)
+        count, first = len(self._ends), 0 if self.from_zero else self.start
         done = 1.0 if self.all_in == 0 else min(1.0, self.fraction / self.all_in)
-        if self.pace is not None:
-            grown = int(self.pace * self.fraction + 1e-9)
-        elif self.from_zero:
-            grown = int(count * done + 1e-9)
+        if self.iterations_per_time is not None:
+            grown = first + self.step // self.iterations_per_time
         else:
-            grown = self.start + int((count - self.start) * done)
+            grown = first + int((count - first) * done + (1e-9 if self.from_zero else 0.0))
         return self._ends[min(max(self.start, grown), count) - 1]
 
     def frames(self) -> list[int]:
@@ -302,15 +301,16 @@ class Curriculum:
         self.errors[frame] = error if math.isnan(before) else 0.5 * (before + error)
 
     def state_dict(self) -> dict:
-        """Return the generator's state, the fraction done and the frames' errors."""
+        """Return the generator's state, how far the stage is and the frames' errors."""
         return {
             "generator": self.generator.get_state(),
             "fraction": self.fraction,
+            "step": self.step,
             "errors": self.errors.clone(),
         }
 
     def load_state_dict(self, state: dict) -> None:
         """Continue from a ``state_dict``."""
         self.generator.set_state(state["generator"])
-        self.fraction = state["fraction"]
+        self.fraction, self.step = state["fraction"], state.get("step", 0)
         self.errors = state["errors"].clone()

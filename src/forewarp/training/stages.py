@@ -234,16 +234,20 @@ class Run:
             trainer.fit(module, datamodule=self.datamodule, ckpt_path=checkpoint, weights_only=True)
         if module.fraction < 1:  # fit returned early, as when a callback stops it: the stage is not finished
             raise KeyboardInterrupt
-        most = module.settings.iterations
+        curriculum, most = module.curriculum, module.settings.iterations
+        in_play, count = curriculum.in_play, len(curriculum.order)
         if most != settings.iterations and module.global_step >= most:
-            count = len(self.datamodule.scene.train)
             self.tell(
                 f"{settings.name}: ended after {most:,} steps, {settings.steps_per_picture:g} for each of "
                 f"{count} training pictures; for as many as the budget has: "
                 f"stage.{settings.name}.steps_per_picture=null"
             )
+        if in_play < count and curriculum.iterations_per_time is not None:
+            self.tell(
+                f"{settings.name}: ended when {in_play} of {count} training images had come in; for all, set "
+                f"a larger budget, or stage.{settings.name}.curriculum.iterations_per_time=null"
+            )
         keeper.save(trainer)
-        in_play = module.curriculum.in_play
         save_handover(make_handover(module.method, self.datamodule.scene, before, in_play), folder)
         done = {
             "seconds": module.clock.seconds,
