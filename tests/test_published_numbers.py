@@ -6,13 +6,14 @@ from omegaconf import OmegaConf
 
 from forewarp.methods.method import Start, parameter_count
 from forewarp.runs.build import build_run
+from forewarp.scene.box import Box, Lattice
 from forewarp.scene.cloud import Handover
 from forewarp.training.schedule import Curriculum
 from tests.support.configs import composed
 from tests.support.sampled_methods import at_full_size
 from tests.support.still_cameras import moving_scene
 
-approx = pytest.approx
+approx, BOX = pytest.approx, Box((-1, -1.5, -2), (1, 1.5, 2))
 # Keys of the composed configuration with what the publications say.
 ALONG_RAYS = {
     "model.direction_frequencies": 4,
@@ -258,6 +259,88 @@ def test_faults_of_the_released_code_are_on_in_faithful_and_off_in_fast(model):
         assert made_by(config, "fine").faults() == kept
         if model == "ndvg":
             assert made_by(config, "fine", frames=2).faults() == [*kept[:1], UNSEEN, *kept[1:]]
+
+
+# The paper's method by the place where it is printed: sections 3 and 4, and appendices A.2, A.4 and A.5.
+WEIGHTS_FORWARD = {"photo": 1, "flow_l1": 1e-5, "tv_density": 1e-6, "tv_flow": 1e-3, "tv_depth": 1e-1}
+NONE_PRINTED = {"static_points": 0, "moving_opacity": 0}
+RATES = {"grid": 1e-1, "network": 1e-3, "flow": 1e-3}
+FORWARD = {
+    "3.4 coarse: the feature is the colour, no inpainting": {
+        "stage.coarse.effects": ["motion", "background"],
+    },
+    "A.2 F1": {
+        "model.radiance.grid_features": 12,
+        "model.radiance.frequencies": 5,
+        "model.radiance.width": 128,
+        "model.radiance.layers": 3,
+    },
+    "A.2 F2": {
+        "model.trajectory.features": 0,
+        "model.trajectory.frequencies": 5,
+        "model.trajectory.width": 64,
+        "model.trajectory.layers": 4,
+        "model.trajectory.bases": 15,
+        "model.trajectory.nodes": 0,
+        "model.trajectory.padding": 0,
+    },
+    "A.2 F3": {"model.inpainter.levels": 4, "model.inpainter.coverage_channel": False},
+    "A.2 F4": {
+        "model.view_dependence.features": 12,
+        "model.view_dependence.frequencies": 4,
+        "model.view_dependence.width": 64,
+        "model.view_dependence.layers": 2,
+    },
+    "A.4 w1 to w7": {
+        "objective.coarse.weights": WEIGHTS_FORWARD
+        | NONE_PRINTED
+        | {"point_color": 1e-1, "background_entropy": 1e-2, "inpaint_diff": 0},
+        "objective.fine.weights": WEIGHTS_FORWARD
+        | NONE_PRINTED
+        | {"point_color": 1e-2, "background_entropy": 1e-3, "inpaint_diff": 1e-5},
+    },
+    "A.4 ten images, and one more every 60 iterations": {
+        "stage.fine.curriculum.start": 10,
+        "stage.fine.curriculum.iterations_per_time": 60,
+        "stage.coarse.curriculum.iterations_per_time": 60,
+    },
+    "A.5 sizes, steps and rates": {
+        "stage.coarse.num_voxels": [[0, 67**3]],
+        "stage.coarse.upsample": 1.5,
+        "stage.fine.num_voxels": [[0, 80**3]],
+        "stage.fine.upsample": None,
+        "model.upsampler.scale": 2,
+        "stage.coarse.lr": RATES | dict.fromkeys(("density", "color", "shading"), 1e-1),
+        "stage.fine.lr": RATES | dict.fromkeys(("density", "color", "shading"), 1e-1),
+        "budget.iterations": 120_000,
+        "stage.coarse.share": 20,
+        "stage.fine.share": 100,
+    },
+}
+ON_CAPTURES = {
+    "A.2 F2": FORWARD["A.2 F2"] | {"model.trajectory.features": 12, "model.trajectory.bases": 25},
+    "A.5 sizes, steps and rates": FORWARD["A.5 sizes, steps and rates"]
+    | {"stage.fine.num_voxels": [[0, 70**3]]},
+    "4.2 a static grid": {"stage.fine.background_num_voxels": [[0, 160**3]]},
+    "as all are measured": {"data.background": "black", "data.eval_background": "black"},
+}
+
+
+@pytest.mark.parametrize("dataset", ["dnerf", "hypernerf", "nhr", "lego_complete"])
+def test_the_papers_method_has_its_printed_numbers(dataset):
+    config = composed("model=forward", f"experiment={dataset}", "data.scene=x", "preset=faithful")
+    resolved = OmegaConf.create(OmegaConf.to_container(config, resolve=True))
+    captured = dataset == "hypernerf"
+    for place, numbers in (FORWARD | (ON_CAPTURES if captured else {})).items():
+        for key, value in numbers.items():
+            assert OmegaConf.select(resolved, key) == value, (place, key)
+    assert (resolved.model.background is not None) == captured
+    trajectory, lattice = build_run(config).model.keywords["trajectory"], Lattice(BOX, (5, 6, 7))
+    field = trajectory(BOX, frames=82, canonical_time=0.5, voxels=lattice)
+    sizes = [tuple(layer.weight.shape) for layer in field.network if isinstance(layer, torch.nn.Linear)]
+    inputs, outputs = (33 + 12, 3 * 25) if captured else (33, 3 * 15)
+    assert sizes == [(64, inputs), (64, 64), (64, 64), (outputs, 64)]
+    assert captured == (field.features is not None and field.features.grid.shape == (lattice.count, 12))
 
 
 def test_the_papers_method_names_what_it_does_otherwise():

@@ -90,7 +90,9 @@ class TrajectoryField(nn.Module):
         frames: T, the number of distinct training times.
         canonical_time: time at which flow is exactly 0.
         nodes: number of nodes along the box's mean side, at least 8; 0: no nodes.
-        features: channels of the deformation feature grid; 0: none.
+        features: channels of the deformation feature grid, at the nodes or, without nodes, at ``voxels``; 0:
+            none.
+        voxels: lattice of the canonical voxels; None: that of the nodes.
         width, layers, frequencies: size of F2, octaves of the positional encoding.
         padding: lets objects move at the first and last frame (see ``dct_basis``).
 
@@ -107,6 +109,7 @@ class TrajectoryField(nn.Module):
         canonical_time: float,
         nodes: int = 0,
         features: int = 0,
+        voxels: Lattice | None = None,
         width: int = 64,
         layers: int = 4,
         frequencies: int = 5,
@@ -125,9 +128,9 @@ class TrajectoryField(nn.Module):
         self.at_nodes = nodes > 0
         self.features = None
         if features:
-            self.features = VoxelGrid(
-                self.lattice, torch.ones(self.lattice.shape, dtype=torch.bool), {"grid": features}
-            )
+            places = self.lattice if self.at_nodes or voxels is None else voxels
+            everywhere = torch.ones(places.shape, dtype=torch.bool)
+            self.features = VoxelGrid(places, everywhere, {"grid": features})
         self.frequencies, self.padding = frequencies, padding
         inputs = 3 * (1 + 2 * frequencies) + features
         self.network = mlp(inputs, 3 * self.bases, width=width, layers=layers, zero_last=True, leaky=True)
@@ -145,7 +148,7 @@ class TrajectoryField(nn.Module):
         coordinates = self.lattice.to_lattice(points)
         inputs = positional_encoding(self.lattice.normalised(coordinates), self.frequencies)
         if self.features is not None:
-            grid = self.features.parameter("grid")
+            grid, coordinates = self.features.parameter("grid"), self.features.lattice.to_lattice(points)
             read = trilinear(grid, self.features.index, coordinates, grid.new_zeros(grid.shape[1]))
             inputs = torch.cat([inputs, read], -1)
         return self.scale * self.network(inputs).reshape(-1, 3, self.bases)

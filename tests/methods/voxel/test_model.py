@@ -127,6 +127,24 @@ def test_carrying_keeps_matter_motion_and_unit():
         assert torch.equal(value, path[name])
 
 
+@pytest.mark.parametrize("nodes", [0, 8])
+def test_deformation_features_lie_at_nodes_or_voxels_and_are_carried_to_others(nodes):
+    model = forward_model(trajectory=partial(TrajectoryField, bases=3, nodes=nodes, features=2))
+    before = fresh(model)
+    torch.nn.init.normal_(before.motion.trajectory.network[-1].weight)
+    features = before.motion.trajectory.features
+    assert features.lattice == (before.motion.trajectory.lattice if nodes else before.radiance.lattice)
+    assert any(features.grid is parameter for parameter in before.param_groups()["grid"])
+    points = 0.5 * torch.rand(50, 3, generator=torch.Generator().manual_seed(0)) - 0.25
+    features.grid.data = features.lattice.to_world(features.voxels) @ torch.rand(3, 2)  # linear in the place
+    times = torch.tensor([0.4, 1.0])
+    expected = before.trajectories(points, times).detach()
+    after = carried(before, left(before), model, num_voxels=[[0, 3000]])
+    lattice = after.motion.trajectory.features.lattice
+    assert lattice == (after.motion.trajectory.lattice if nodes else after.radiance.lattice)
+    torch.testing.assert_close(after.trajectories(points, times), expected)
+
+
 def test_carrying_into_a_stage_with_more_effects():
     before = fresh(forward_model(view_dependence=None))
     before.radiance.color.data[:] = 0.5

@@ -69,8 +69,8 @@ class ForwardWarp(VoxelMethod):
                 raise ValueError(
                     "model.trajectory: expected a factory, but got null; choose another model/motion or model"
                 )
-            field = trajectory(scene.box, frames=len(scene.times), canonical_time=scene.canonical_time)
-            self.motion = motion(field)
+            times = {"frames": len(scene.times), "canonical_time": scene.canonical_time}
+            self.motion = motion(trajectory(scene.box, **times, voxels=self.radiance.lattice))
         inpainter = None if inpainter is None else inpainter(channels=channels, head=not learned)
         if upsampler is not None:
             asked = {"channels": channels, "features": getattr(inpainter, "width", 0)} if learned else {}

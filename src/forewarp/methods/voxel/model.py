@@ -192,6 +192,11 @@ class VoxelMethod(Method):
         """Take over what the stage before has learned, or start with faint matter; prepare the loss terms."""
         before = _carried(start, self.stage)
         if before is not None:
+            grids = self._grids()
+            for place, grid in before._grids().items():  # F2's features; those of voxels are resampled by now
+                if place in grids and grid.lattice != grids[place].lattice:
+                    empty = dict.fromkeys(grid.names, 0.0)
+                    grid.resample(grids[place].lattice, grids[place].index >= 0, empty)
             ours, theirs = self.state_dict(), before.state_dict()
             alike = {k: v for k, v in theirs.items() if torch.is_tensor(v) and k in ours}
             self.load_state_dict(ours | {k: v for k, v in alike.items() if v.shape == ours[k].shape})
