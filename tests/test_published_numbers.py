@@ -344,11 +344,31 @@ def test_the_papers_method_has_its_printed_numbers(dataset):
 
 
 def test_the_papers_method_names_what_it_does_otherwise():
-    forward = ["model=forward", "experiment=dnerf", "data.scene=hook", "preset=fast"]
-    plain = made_by(composed(*forward), "coarse").departures()
-    assert plain == [
-        *("no up-sampling", "no inpainter", "voxels hold density and colour, without the network F1"),
-        "motion (F2) at the nodes of a coarse lattice",
+    def of(*words, stage="fine"):
+        words = ("model=forward", "experiment=dnerf", "data.scene=hook", "preset.inpainter_width=16", *words)
+        return made_by(composed(*words), stage).departures()
+
+    common = [
+        "not normalised as printed: photo, point_color, background_entropy (literal)",
+        "learning rates end at lr_final_factor times the first (printed: constant)",
+        "matter fades where little of it is splatted (tau, fade)",
     ]
-    assert made_by(composed(*forward, "ablation=full"), "fine").departures() == plain[2:]
-    assert "colour without direction" in made_by(composed(*forward, "ablation=no_view"), "fine").departures()
+    ours = [
+        "voxels hold density and colour, without the network F1",
+        "voxels without matter are left out (refresh_every)",
+        "motion (F2) at the nodes of a coarse lattice",
+        "cosines of a longer period (padding)",
+    ]
+    added = "the inpainter and the up-layer add to the interpolated grid"
+    faithful = of("preset=faithful")
+    assert faithful == [added, *common]
+    literal = "objective.fine.literal=[photo,point_color,background_entropy]"
+    assert of("preset=faithful", literal) == [added, *common[1:]]
+    fast = of("preset=fast", stage="coarse")
+    assert sorted(fast) == sorted(["no up-sampling", "no inpainter", *common, *ours])
+    assert sorted(of("preset=fast", "ablation=full")) == sorted([added, *common, *ours])
+    assert "colour without direction" in of("preset=fast", "ablation=no_view")
+    held = "points known to be static are held (static_points)"
+    for preset in ("faithful", "fast"):
+        words = ("model=forward", "experiment=hypernerf", "data.scene=broom2", f"preset={preset}")
+        assert (held in made_by(composed(*words), "coarse").departures()) == (preset == "fast")

@@ -254,7 +254,7 @@ def terms_of(renderings, literal=(), **on):
     """The snapshot that terms are computed from, and their values, but for those of what is not on."""
     method = fresh(num_voxels=[[0, 64]])
     torch.nn.init.normal_(method.radiance.density)
-    method._literal, method._patches_of = frozenset(literal), lambda *_: PATCHES
+    method.printed, method._patches_of = frozenset(literal), lambda *_: PATCHES
     method._stray = lambda *_: STRAY if on else None
     canonical = method.radiance()
     state = VoxelSnapshot(

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from forewarp.fields.grids import DirectRadiance, RadianceGrid
-from forewarp.methods.method import Start
+from forewarp.methods.method import Start, those_that_hold
 from forewarp.methods.voxel.effects import (
     LearnedUpsampler,
     TrilinearUpsampler,
@@ -102,14 +102,28 @@ class ForwardWarp(VoxelMethod):
 
     def departures(self) -> list[str]:
         """See ``Method``; docs/method.md has the rest, which every preset shares."""
-        parts = {"no up-sampling": self.upsampler, "no inpainter": self.inpainter}
-        parts["colour without direction"] = self.view_dependence
-        notes = [about for about, part in parts.items() if part is None]
-        if isinstance(self.radiance, DirectRadiance):
-            notes.append("voxels hold density and colour, without the network F1")
-        if self.motion is not None and self.motion.trajectory.at_nodes:
-            notes.append("motion (F2) at the nodes of a coarse lattice")
-        return notes
+        direct = isinstance(self.radiance, DirectRadiance)
+        as_in_dvgo = [n for n in self.literal if self.weights.get(n) and n not in self.printed]
+        held = self.static_points is not None and self.weights.get("static_points", 0) > 0
+        adds = self.inpainter is not None or isinstance(self.upsampler, LearnedUpsampler)
+        notes = {
+            "no up-sampling": self.upsampler is None,
+            "no inpainter": self.inpainter is None,
+            "colour without direction": self.view_dependence is None,
+            "voxels hold density and colour, without the network F1": direct,
+            "voxels without matter are left out (refresh_every)": self.stage.refresh_every > 0,
+            "the inpainter and the up-layer add to the interpolated grid": adds,
+            f"not normalised as printed: {', '.join(as_in_dvgo)} (literal)": as_in_dvgo,
+            "points known to be static are held (static_points)": held,
+            "learning rates end at lr_final_factor times the first (printed: constant)": True,
+        }
+        if self.motion is not None:
+            notes |= {
+                "motion (F2) at the nodes of a coarse lattice": self.motion.trajectory.at_nodes,
+                "cosines of a longer period (padding)": self.motion.trajectory.padding > 0,
+                "matter fades where little of it is splatted (tau, fade)": True,
+            }
+        return those_that_hold(notes)
 
     @property
     def first_rendering(self) -> str:

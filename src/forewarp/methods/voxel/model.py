@@ -125,6 +125,7 @@ class VoxelMethod(Method):
     Attributes:
         moves: False if the scene is static.
         half_extent: half the scene's longest side, in world units.
+        weights, printed: of the stage's loss terms (see ``Objective``); which have the printed form.
     """
 
     terms = ("photo", "point_color", "background_entropy", "flow_l1", "inpaint_diff", "tv_density", "tv_flow")
@@ -203,7 +204,8 @@ class VoxelMethod(Method):
         elif not start.blank:
             for grid in self.grids.values():
                 grid.fill(self.stage.start_alpha)
-        self._literal, self._photo_on = frozenset(start.literal), start.photo_on
+        self.weights, self.printed = start.weights, frozenset(start.literal)
+        self._photo_on = start.photo_on
         cameras = [frame.camera for frame in start.scene.train]
         self.patches = RandomPatches(cameras, patches=self.stage.patches) if cameras else None
         self.static_points, self._pairs = start.scene.still, []
@@ -231,7 +233,7 @@ class VoxelMethod(Method):
         """See ``Method.look``; all rays of a batch have one time and are marched together."""
         state = self.at(batch.observations[0].moment)
         rays, rgb, background = batch.joined()
-        rays, keep_all = rays.to(self.device), bool({"point_color", "background_entropy"} & self._literal)
+        rays, keep_all = rays.to(self.device), bool({"point_color", "background_entropy"} & self.printed)
         renderings = {
             name: state.march(name, rays, background, generator=generator, keep_all_weights=keep_all)
             for name in self._compared(state)
@@ -261,7 +263,7 @@ class VoxelMethod(Method):
             rgb: the true colours (R, 3).
             generator: draws random views, and some of the static points.
         """
-        seen, canonical, literal = renderings.values(), state.canonical, self._literal
+        seen, canonical, literal = renderings.values(), state.canonical, self.printed
 
         def photo() -> Tensor:
             return sum(losses.photometric(r.rgb, rgb, literal="photo" in literal) for r in seen)
