@@ -155,7 +155,7 @@ def test_pictures_in_pieces_and_permuted(monkeypatch):
     behind = torch.rand(9, 3)
     whole = quadrature(*slab(2.0), some, behind)
     monkeypatch.setattr("forewarp.renderer._POINTS", 48)
-    pieces = quadrature.picture(*slab(2.0), some, behind)
+    pieces = quadrature.image(*slab(2.0), some, behind)
     order = torch.randperm(9)
     turned = quadrature(*slab(2.0), some[order], behind[order])
     for name in ("rgb", "depth", "opacity"):

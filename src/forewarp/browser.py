@@ -22,7 +22,7 @@ def silent() -> Iterator[None]:
 
 
 def vertical_fov(camera: Camera) -> float:
-    """Return the angle that a camera's picture spans from top to bottom, radians."""
+    """Return the angle that a camera's image spans from top to bottom, radians."""
     return 2 * math.atan(0.5 * camera.height / camera.fy)
 
 

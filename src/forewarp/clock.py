@@ -24,7 +24,7 @@ def now(kind: str = "wall") -> float:
 
 @contextmanager
 def left_out() -> Iterator[None]:
-    """Let no training clock count what runs inside: reading pictures. Not to be nested."""
+    """Let no training clock count what runs inside: reading images. Not to be nested."""
     began = {kind: read() for kind, read in KINDS.items()}
     try:
         yield

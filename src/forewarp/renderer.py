@@ -61,6 +61,12 @@ class Marched(Rendering):
         )
 
 
+@torch.no_grad()
+def _in_chunks(render: Callable[[slice], Rendering], count: int, chunk: int) -> Rendering:
+    """Join the renderings of so many rays, ``chunk`` at a time."""
+    return Rendering.joined([render(slice(begin, begin + chunk)) for begin in range(0, count, chunk)])
+
+
 class Renderer:
     """March rays through occupied cells and composite the samples.
 
@@ -189,7 +195,7 @@ class Renderer:
             samples=found.samples,
         )
 
-    def picture(
+    def image(
         self,
         field: FieldAtTime,
         rays: Rays,
@@ -198,12 +204,7 @@ class Renderer:
         chunk: int = 65536,
     ) -> Rendering:
         """Render an image's rays without gradient. Cost: time linear in the rays, memory in ``chunk``."""
-        with torch.no_grad():
-            parts = [
-                self(field, rays[begin : begin + chunk], background, shade)
-                for begin in range(0, len(rays), chunk)
-            ]
-        return Rendering.joined(parts)
+        return _in_chunks(lambda part: self(field, rays[part], background, shade), len(rays), chunk)
 
     @staticmethod
     def _starts(
@@ -358,8 +359,7 @@ class Quadrature:
             opacity=nothing.index_copy(0, met, seen.opacity),
         )
 
-    @torch.no_grad()
-    def picture(
+    def image(
         self,
         density: Density,
         radiance: Radiance,
@@ -370,11 +370,9 @@ class Quadrature:
         """Render an image's rays without gradient. Cost: time linear in the rays, memory bounded."""
         chunk = max(1, _POINTS // (self.samples + self.fine_samples))
         behind = background.expand(len(rays), 3)
-        parts = [
-            self(density, radiance, rays[begin : begin + chunk], behind[begin : begin + chunk], generator)
-            for begin in range(0, len(rays), chunk)
-        ]
-        return Rendering.joined(parts)
+        return _in_chunks(
+            lambda part: self(density, radiance, rays[part], behind[part], generator), len(rays), chunk
+        )
 
     def _stretch(self, rays: Rays) -> tuple[Tensor, Tensor]:
         """Return where each ray starts and ends, (R,) each."""

@@ -313,9 +313,9 @@ def plain_times(loop: Loop, size: Size) -> dict[str, float]:
     """
     method, smaller = loop.method, max(1, size.side // SMALLER)
     view, times = camera(size.side, 0.3), (size.side / smaller) ** 2
-    tints, fades = method.time_bases(MIDDLE)
+    color_basis, opacity_basis = method.time_bases(MIDDLE)
     particles, warp = (type(p)(*(t.detach() for t in p)) for p in (method.gaussians(), method.warp(MIDDLE)))
-    seen = (particles, warp, pinhole_of(view, method.blur), tints, fades)
+    seen = (particles, warp, pinhole_of(view, method.blur), color_basis, opacity_basis)
     little = (*seen[:2], pinhole_of(camera(smaller, 0.3), method.blur), *seen[3:])
     truth = torch.zeros(smaller**2, 4, dtype=torch.uint8)
     nodes, found = method.nodes, {}

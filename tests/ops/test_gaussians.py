@@ -28,12 +28,12 @@ def seen(particles, camera=None, warp=None):
 
 def seen_crowd(kind, count=60, lens=None, **changes):
     """Splats of a crowd, and the leaves: Gaussians, maps, weights."""
-    particles, warp, tints, fades = crowd(count, **changes)
+    particles, warp, *bases = crowd(count, **changes)
     particles = particles._replace(means=particles.means.T.contiguous().T)  # columns side by side
     particles = leaves_of(particles, kind)
     maps, weights = (t.to(kind).clone().requires_grad_() for t in (warp.maps, warp.weights))
     warp = Warp(maps, warp.links, weights)
-    splats = project(particles, warp, pinhole(**lens or {}), tints.to(kind), fades.to(kind))
+    splats = project(particles, warp, pinhole(**lens or {}), *(basis.to(kind) for basis in bases))
     return splats, (*particles, maps, weights)
 
 
@@ -326,9 +326,9 @@ def pixels(size=SIZE, seed=0):
 
 
 def run(kind, truth=None, **options):
-    particles, warp, tints, fades = crowd(dtype=kind)
+    particles, warp, *bases = crowd(dtype=kind)
     truth = pixels() if truth is None else truth
-    return compare(particles, warp, pinhole(), tints, fades, truth, BEHIND.to(kind), by_skin=True, **options)
+    return compare(particles, warp, pinhole(), *bases, truth, BEHIND.to(kind), by_skin=True, **options)
 
 
 def alone(particle, truth, background, size=(16, 16), **options):
@@ -338,7 +338,7 @@ def alone(particle, truth, background, size=(16, 16), **options):
 
 
 def gradients_of(compared):
-    return (*compared.particles, compared.maps, compared.skin, compared.pull)
+    return (*compared.particles, compared.maps, compared.skin, compared.pixel_gradient)
 
 
 @pytest.mark.parametrize("options", [{}, {"width": 0.5, "factor": 0.01}])
@@ -348,7 +348,7 @@ def test_compare_by_the_kernel_equals_the_reference(options):
     assert fast.squared == pytest.approx(exact.squared, rel=1e-5)
     close_in_norm(gradients_of(exact), gradients_of(fast), 2e-5)
     assert fast.order.tolist() == exact.order.tolist()
-    assert fast.distances.shape == exact.distances.shape == fast.pull.shape
+    assert fast.distances.shape == exact.distances.shape == fast.pixel_gradient.shape
     near, depths = (compared.distances[compared.order] for compared in (fast, exact))
     torch.testing.assert_close(near.double(), depths, atol=1e-5, rtol=1e-5)
     assert bool((depths.diff() >= 0).all())
@@ -374,14 +374,16 @@ def test_the_loss_of_nothing(backend):
 def test_a_perfect_image_has_no_loss_and_no_gradient(backend):
     compared = alone(one((0.0, 0.0, -9.0)), (0, 0, 0, 0), 1.0)
     assert (compared.loss, compared.squared) == (0.0, 0.0)
-    assert not any(bool(gradient.any()) for gradient in (*compared.particles, compared.pull))
+    assert not any(bool(gradient.any()) for gradient in (*compared.particles, compared.pixel_gradient))
 
 
 def test_images_pull_at_what_is_seen_and_backgrounds_say_where_nothing_is(backend):
     opaque, empty = alone(one(), (255, 255, 255, 255), 0.0), alone(one(), (0, 0, 0, 0), 1.0)
     assert opaque.particles.opacity.item() < 0  # more of it would be nearer to white
     assert bool((opaque.particles.colors[0, 0] < 0).all())
-    assert opaque.pull.item() < 1e-3 * abs(opaque.particles.opacity.item()) + 1  # it stands in the middle
+    assert (
+        opaque.pixel_gradient.item() < 1e-3 * abs(opaque.particles.opacity.item()) + 1
+    )  # it stands in the middle
     assert empty.particles.opacity.item() > 0  # less of it
 
 
@@ -397,22 +399,22 @@ def test_of_many_only_what_is_seen_has_gradients(two_threads, monkeypatch, threa
     empty = torch.empty
     monkeypatch.setattr(torch, "empty", lambda *size: empty(*size).fill_(torch.nan))
     monkeypatch.setattr(gaussians, "match_threads", lambda: threads)
-    particles, warp, tints, fades = crowd(count=60, dtype=F32)
+    particles, warp, *bases = crowd(count=60, dtype=F32)
     hidden = torch.ones(60, dtype=torch.bool)
     hidden[shown] = False
-    particles.opacity[hidden] = -100 * fades.sign()
-    rest = (pinhole(), tints, fades, pixels(), BEHIND)
+    particles.opacity[hidden] = -100 * bases[1].sign()
+    rest = (pinhole(), *bases, pixels(), BEHIND)
     kinds = (1, particles.colors.shape[1] - 3, 2)
     assert compare(particles, warp, *rest).skin is None
     compared = compare(particles, warp, *rest, by_skin=True, kinds=kinds)
-    for part in (*compared.particles[:4], *compared.particles.colors, compared.skin, compared.pull):
+    for part in (*compared.particles[:4], *compared.particles.colors, compared.skin, compared.pixel_gradient):
         assert bool(part.isfinite().all())
         assert not bool(part[hidden].any())
     assert bool(compared.maps.isfinite().all())
-    assert bool(compared.pull.any()) == (not bool(hidden.all()))
+    assert bool(compared.pixel_gradient.any()) == (not bool(hidden.all()))
 
     leaves, weights = leaves_of(particles), warp.weights.clone().requires_grad_()
-    splats = project(leaves, warp._replace(weights=weights), pinhole(), tints, fades)
+    splats = project(leaves, warp._replace(weights=weights), pinhole(), *bases)
     (splats.values.sum() + rasterize(splats, *SIZE).color.sum()).backward()
     for leaf in (*leaves, weights):
         assert bool(leaf.grad.isfinite().all())

@@ -21,7 +21,7 @@ from forewarp.fields.grids import Activation
 from forewarp.ops.backend import numba_installed
 from forewarp.ops.curves import dct_basis, spline_basis
 from forewarp.ops.encode import positional_encoding
-from forewarp.ops.gaussians import Compared, Gaussians, Pinhole, Warp, compare, project, rasterize
+from forewarp.ops.gaussians import Gaussians, ImageLoss, Pinhole, Warp, compare, project, rasterize
 from forewarp.ops.grid import neighbour_pairs, patch_variation, total_variation, trilinear
 from forewarp.ops.march import accumulate, march, render_weights
 from forewarp.ops.nodes import node_maps, pull_nodes, spread_nodes, stiffness
@@ -158,16 +158,18 @@ class Hard(NamedTuple):
     particles: Gaussians
     warp: Warp
     camera: Pinhole
-    tints: Tensor
-    fades: Tensor
+    color_basis: Tensor
+    opacity_basis: Tensor
 
 
 def changed(camera: Pinhole | None = None, moving: bool = True, **changes) -> Hard:
     """Random particles; of each part that is named the old numbers are replaced by ``change(old)``."""
-    particles, warp, tints, fades = crowd(dtype=torch.float32)
+    particles, warp, *bases = crowd(dtype=torch.float32)
     particles = particles._replace(**{n: change(getattr(particles, n)) for n, change in changes.items()})
     warp = warp if moving else still(particles)
-    return Hard(*_as((particles, warp), torch.float64), camera or pinhole(), tints.double(), fades.double())
+    return Hard(
+        *_as((particles, warp), torch.float64), camera or pinhole(), *(basis.double() for basis in bases)
+    )
 
 
 def _as(groups: tuple, kind: torch.dtype, place: torch.device | str = "cpu") -> list:
@@ -233,12 +235,12 @@ def pixels(size: tuple[int, int] = SIZE, seed: int = 0) -> Tensor:
     return torch.randint(0, 256, (size[0] * size[1], 4), generator=generator).to(torch.uint8)
 
 
-def compared(hard: Hard, kind: torch.dtype, place: torch.device | str = "cpu") -> Compared:
+def compared(hard: Hard, kind: torch.dtype, place: torch.device | str = "cpu") -> ImageLoss:
     """``compare`` with a random picture, in a precision."""
     particles, warp = _as(hard[:2], kind, place)
-    tints, fades, behind = (t.to(place, kind) for t in (*hard[3:], BEHIND))
+    *bases, behind = (t.to(place, kind) for t in (*hard[3:], BEHIND))
     truth = pixels(hard.camera.size).to(place)
-    return compare(particles, warp, hard.camera, tints, fades, truth, behind, by_skin=True)
+    return compare(particles, warp, hard.camera, *bases, truth, behind, by_skin=True)
 
 
 def drawn(hard: Hard) -> tuple:

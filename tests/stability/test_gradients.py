@@ -118,19 +118,19 @@ def of_total_variation(seed):
 
 def of_projection(seed, see=project):
     """All that a splat is made of: particles, nodes' maps, shares of nodes."""
-    particles, warp, tints, fades = crowd(count=3, degree=0, seed=seed)
+    particles, warp, *bases = crowd(count=3, degree=0, seed=seed)
 
     def numbers(*leaves):
         moving = Warp(leaves[5], warp.links, leaves[6])
-        return see(Gaussians(*leaves[:5]), moving, pinhole(), tints, fades).values
+        return see(Gaussians(*leaves[:5]), moving, pinhole(), *bases).values
 
     return numbers, *particles, warp.maps, warp.weights
 
 
 def of_rasterizing(seed, draw=rasterize):
     """Pictures by the numbers of splats."""
-    particles, warp, tints, fades = crowd(4, scale=-1.0, seed=seed)
-    splats = project(particles, warp, pinhole(), tints, fades)
+    particles, warp, *bases = crowd(4, scale=-1.0, seed=seed)
+    splats = project(particles, warp, pinhole(), *bases)
     return lambda numbers: draw(Splats(numbers, splats.reach), 3, 4), splats.values
 
 

@@ -34,11 +34,11 @@ pytestmark = pytest.mark.stability
 # Relative to the largest entry. Where all of a picture is covered many times over, what is let through ends a
 # tile at a thousandth. Of a needle a tenth of a square pixel is the smaller side, and a few digits go.
 COVERED = {"as large as the scene": 5e-3, "larger than all": 2e-2, "needles, 1 to 60,000": 4e-5}
-NAMES = ("loss", *Gaussians._fields, "maps", "skin", "pull")
+NAMES = ("loss", *Gaussians._fields, "maps", "skin", "pixel_gradient")
 
 
 def parts(found):
-    return (torch.tensor([found.loss]), *found.particles, found.maps, found.skin, found.pull)
+    return (torch.tensor([found.loss]), *found.particles, found.maps, found.skin, found.pixel_gradient)
 
 
 def check_close(ours, exact, most):
@@ -62,7 +62,7 @@ def test_pictures_and_gradients_keep_their_digits(place, name):
 @pytest.mark.parametrize("name", SEEN)
 def test_what_a_step_gives_keeps_its_digits(place, name):
     exact, ours = (compared(SEEN[name], kind, place) for kind in (torch.float64, torch.float32))
-    assert float(exact.pull.sum()) > 0
+    assert float(exact.pixel_gradient.sum()) > 0
     check_close(parts(ours), parts(exact), COVERED.get(name, 2e-5))
 
 
@@ -88,8 +88,8 @@ def turned(seed):
 
 @pytest.mark.parametrize("seed", range(0, 200_000, 10_007))
 def test_random_views(place, seed):
-    particles, warp, tints, fades = crowd(40, seed=seed % 97, dtype=torch.float32)
-    hard = Hard(particles, warp, turned(seed), tints, fades)
+    particles, warp, *bases = crowd(40, seed=seed % 97, dtype=torch.float32)
+    hard = Hard(particles, warp, turned(seed), *bases)
     exact, ours = (compared(hard, kind, place) for kind in (torch.float64, torch.float32))
     check_close(parts(ours), parts(exact), 1e-3)
 
@@ -165,11 +165,11 @@ def along(loss, value, direction):
 
 @pytest.mark.parametrize(("degree", "lens"), [(2, {}), (3, LENS)])
 def test_splats_by_what_moves_nothing(degree, lens):
-    particles, warp, tints, fades = crowd(count=3, degree=degree)
+    particles, warp, *bases = crowd(count=3, degree=degree)
 
     def numbers(*leaves):
         own = particles._replace(**dict(zip(RESTING, leaves)))
-        return project(own, warp, pinhole(**lens), tints, fades).values
+        return project(own, warp, pinhole(**lens), *bases).values
 
     assert int((numbers()[:, 5] > 0).sum()) == 3
     leaves = [getattr(particles, name).clone().requires_grad_() for name in RESTING]
@@ -178,11 +178,11 @@ def test_splats_by_what_moves_nothing(degree, lens):
 
 def test_places_behind_a_lens():
     """Of colour there is one coefficient, which no direction changes."""
-    particles, warp, tints, fades = crowd(count=3, degree=0)
+    particles, warp, *bases = crowd(count=3, degree=0)
 
     def numbers(means, maps, weights):
         own = particles._replace(means=means)
-        found = project(own, Warp(maps, warp.links, weights), pinhole(**LENS), tints, fades).values
+        found = project(own, Warp(maps, warp.links, weights), pinhole(**LENS), *bases).values
         return found[:, PLACE]
 
     leaves = [t.clone().requires_grad_() for t in (particles.means, warp.maps, warp.weights)]

@@ -56,7 +56,7 @@ class Tab:
     def open(self, address: str) -> None:
         """Go to the page and wait for its first picture."""
         self.page.goto(address)
-        self.page.get_by_text("pictures/s").wait_for(timeout=1000 * _PATIENCE)
+        self.page.get_by_text("images/s").wait_for(timeout=1000 * _PATIENCE)
         for close in self.page.locator(".mantine-Notification-closeButton").all():
             close.click()  # "WebGL is running in software mode"
 
@@ -66,7 +66,7 @@ class Tab:
 
     def status(self) -> str:
         """The line that says how fast pictures come."""
-        return self.page.get_by_text("pictures/s").inner_text()
+        return self.page.get_by_text("images/s").inner_text()
 
     def canvas(self) -> dict[str, float]:
         """Where the picture is on the page."""

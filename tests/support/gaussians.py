@@ -23,7 +23,9 @@ def straight(size=(16, 16), **changes):
     return Pinhole(eye, (0.0, 0.0, -4.0), (40.0, 40.0), middle, size, 0.2, **changes)
 
 
-def crowd(count=60, nodes=5, degree=2, tints=2, fades=2, dtype=torch.float64, seed=0, scale=-2.0):
+def crowd(
+    count=60, nodes=5, degree=2, color_basis=2, opacity_basis=2, dtype=torch.float64, seed=0, scale=-2.0
+):
     """Random particles, how they move, and what a time makes of colour and opacity."""
     generator = torch.Generator().manual_seed(seed)
 
@@ -34,14 +36,14 @@ def crowd(count=60, nodes=5, degree=2, tints=2, fades=2, dtype=torch.float64, se
         0.5 * random(count, 3),
         scale + 0.5 * random(count, 3),
         random(count, 4),
-        random(count, fades),
-        0.3 * random(count, (degree + 1) ** 2 + tints, 3),
+        random(count, opacity_basis),
+        0.3 * random(count, (degree + 1) ** 2 + color_basis, 3),
     )
     links = torch.randint(0, nodes, (count, 4), generator=generator).int()
     shares = torch.rand(count, 4, generator=generator, dtype=torch.float64).to(dtype)
     warp = Warp(0.1 * random(nodes, 12), links, shares / shares.sum(-1, keepdim=True))
-    weights = torch.cat([torch.ones(1, dtype=dtype), 0.3 * random(fades - 1)])
-    return particles, warp, random(tints), weights
+    weights = torch.cat([torch.ones(1, dtype=dtype), 0.3 * random(opacity_basis - 1)])
+    return particles, warp, random(color_basis), weights
 
 
 def one(mean=(0.0, 0.0, 0.0), scale=0.1, opacity=0.0, color=(0.0, 0.0, 0.0), quaternion=(1.0, 0.0, 0.0, 0.0)):

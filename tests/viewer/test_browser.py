@@ -127,7 +127,7 @@ def test_the_page_shows_what_the_method_renders_and_what_the_browser_draws(serve
     assert far(first, then) > 2 * far(then, exact(viewer, tab, time=0.5))
     tab.choose("show", "depth")
     assert shows(tab, exact(viewer, tab, time=0.5, channel="depth"), 2)
-    assert re.search(r"\d+\.\d pictures/s", tab.status())
+    assert re.search(r"\d+\.\d images/s", tab.status())
     tab.choose("show", "splats")
     until(lambda: "drawn by the browser" in tab.status())
     near, other = exact(viewer, tab, time=0.5), exact(viewer, tab, time=0.9)

@@ -267,7 +267,7 @@ def test_a_video_is_as_long_as_it_may_be_and_has_two_keys(tmp_path, seconds, ima
     with pytest.raises(Cancelled):
         session.write_video(tmp_path, keys_of(0.0, 1.0), seconds, lambda *done: progress.append(done))
     assert progress == [(0, images)]
-    with pytest.raises(ValueError, match=f"2 pictures of them, but got 1 key views and {images} pictures"):
+    with pytest.raises(ValueError, match=f"2 images of them, but got 1 key views and {images} images"):
         session.write_video(tmp_path, keys_of(0.5), seconds, print)
     assert list(tmp_path.iterdir()) == []
 

@@ -94,6 +94,8 @@ def write(
     require(kind)
     export = getattr(import_module(f"forewarp.export.{FORMATS[kind].module}"), f"export_{kind}")
     with folder_written_whole(folder, ABOUT) as part:
+        if kind != "mesh":  # which asks for matter alone
+            source.check_tracks(kind)
         facts = export(source, part, progress, **options)
         files = sorted(file for file in part.rglob("*") if file.is_file())
         sizes = {file.relative_to(part).as_posix(): file.stat().st_size for file in files}

@@ -65,9 +65,8 @@ def export_html(
         the facts for ``about.json``; ``thinned`` if anything was left out.
 
     Raises:
-        ValueError: for a method whose points cannot be followed, or if nothing fits.
+        ValueError: if nothing fits.
     """
-    source.refuse_without_tracks("html")
     layer = _splats(source) if source.has_ellipsoids else _points(source, points)
     count, total, limit = len(layer.order), len(source.times), megabytes * 1e6
     two_times = [source.times[i] for i in spread(total, 2)]
@@ -93,7 +92,7 @@ def export_html(
         layer.kind: rows,
         "times on the page": kept,
         "seconds": seconds,
-        "colors": "sRGB, as in the pictures, the mean over directions",
+        "colors": "sRGB, as in the images, the mean over directions",
     }
     if (rows, len(kept)) != (count, total):
         facts["thinned"] = f"{rows} of {count} {layer.kind}, {len(kept)} of {total} times"

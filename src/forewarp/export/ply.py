@@ -87,11 +87,7 @@ def export_ply(source: Source, folder: Path, progress: Progress, *, degree: int,
 
     Returns:
         the facts for ``about.json``.
-
-    Raises:
-        ValueError: for a method that is neither particles nor can be followed.
     """
-    source.refuse_without_tracks("ply")
     (folder / "frames").mkdir()
     rotation, total = source.rotation_to(up), len(source.times)
     files = [folder / "frames" / f"frame_{number:04d}.ply" for number in range(total)]
@@ -102,7 +98,7 @@ def export_ply(source: Source, folder: Path, progress: Progress, *, degree: int,
         return {
             "points": len(tracks),
             "kind": "points of the surface",
-            "colors": "sRGB, 8 bits, as in the pictures",
+            "colors": "sRGB, 8 bits, as in the images",
             "up": up,
         }
     for number, (file, time) in enumerate(zip(files, source.times)):
@@ -119,7 +115,7 @@ def export_ply(source: Source, folder: Path, progress: Progress, *, degree: int,
         "up": up,
         "degree": degree,
         "degree of the run": int(template.harmonics.shape[1] ** 0.5) - 1,
-        "colors": "sRGB, as in the pictures: 1/2 + 0.28209479177387814 f_dc is the mean over directions",
+        "colors": "sRGB, as in the images: 1/2 + 0.28209479177387814 f_dc is the mean over directions",
     }
 
 
@@ -269,5 +265,5 @@ def export_mesh(
         "level": level,
         "up": up,
         "spacing": lattice.spacing[0],
-        "colors": "sRGB, as in the pictures, the mean over directions",
+        "colors": "sRGB, as in the images, the mean over directions",
     }

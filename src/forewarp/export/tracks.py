@@ -73,7 +73,7 @@ class Source:
         before = mean_up(list(self.cameras)).numpy()
         return torch.from_numpy(Rotation.align_vectors([_UP[up]], [before])[0].as_matrix())
 
-    def refuse_without_tracks(self, kind: str) -> None:
+    def check_tracks(self, kind: str) -> None:
         """Refuse a method that ``tracks_of`` cannot follow.
 
         Raises:
@@ -165,11 +165,7 @@ def export_npz(source: Source, folder: Path, progress: Progress, *, points: int,
 
     Returns:
         the facts for ``about.json``.
-
-    Raises:
-        ValueError: for a method whose points cannot be followed.
     """
-    source.refuse_without_tracks("npz")
     tracks = tracks_of(source, points)
     numbers = spread(len(source.cameras), views)
     cameras = [source.cameras[i] for i in numbers]
@@ -196,7 +192,7 @@ def export_npz(source: Source, folder: Path, progress: Progress, *, points: int,
         "points": len(tracks),
         "views": len(cameras),
         "visible": float(visible.float().mean()),
-        "colors": "sRGB, as in the pictures",
+        "colors": "sRGB, as in the images",
     }
 
 
@@ -276,11 +272,7 @@ def export_gltf(source: Source, folder: Path, progress: Progress, *, points: int
 
     Returns:
         the facts for ``about.json``.
-
-    Raises:
-        ValueError: for a method whose points cannot be followed.
     """
-    source.refuse_without_tracks("gltf")
     tracks = tracks_of(source, points, progress)
     radius = _RADIUS * neighbour_distance(tracks.points, tracks.size)
     (folder / "points.glb").write_bytes(glb(tracks, radius, source.rotation_to("y"), seconds))

@@ -275,7 +275,7 @@ class SampledMethod(RayMethod):
         """See ``RayMethod``."""
         first, second = self.fields(moment)
         jitter = torch.Generator().manual_seed(0) if self.sampling.jitter_in_pictures else None
-        return self.quadrature.picture((first or second).density, second.radiance, rays, background, jitter)
+        return self.quadrature.image((first or second).density, second.radiance, rays, background, jitter)
 
     def look(self, batch: Batch, factors: Mapping[str, float], generator: torch.Generator) -> Step:
         """See ``Method.look``; a batch holds one time, as no neighbours are asked for, seen by one or

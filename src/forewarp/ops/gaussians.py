@@ -65,8 +65,8 @@ class Pinhole:
 class Gaussians(NamedTuple):
     """Canonical particles, each a Gaussian: ``means`` (N, 3) world units, ``log_scales`` (N, 3),
     ``quaternions`` (N, 4) as w, x, y, z of any length, ``opacity`` (N, F) logits and ``colors`` (N, B, 3),
-    each the coefficients of what a moment gives: F numbers ``fades``; B - T harmonics of direction, then T
-    numbers ``tints``.
+    each the coefficients of what a moment gives: F numbers ``opacity_basis``; B - T harmonics of direction,
+    then T numbers ``color_basis``.
     """
 
     means: Tensor
@@ -111,20 +111,22 @@ class Splats(NamedTuple):
         return self.values[:, COLUMN.depth]
 
 
-def project(particles: Gaussians, warp: Warp, pinhole: Pinhole, tints: Tensor, fades: Tensor) -> Splats:
+def project(
+    particles: Gaussians, warp: Warp, pinhole: Pinhole, color_basis: Tensor, opacity_basis: Tensor
+) -> Splats:
     """Move particles and see them through a camera.
 
     With ``F = I + sum w_k D_k`` and ``b = sum w_k d_k`` a particle goes to ``F x + b``; with J the Jacobian
     of the pixel by the point, and ``T = J F R diag(s)``, its covariance in the image is ``T T^t + blur I``.
-    Colour is ``max(0, 1/2 + sum_k Y_k(direction) c_k + sum_k tint_k c'_k)``, opacity
-    ``sigmoid(sum_k fade_k o_k)``.
+    Colour is ``max(0, 1/2 + sum_k Y_k(direction) c_k + sum_k f_k c'_k)`` with f the ``color_basis``, opacity
+    ``sigmoid(sum_k g_k o_k)`` with g the ``opacity_basis``.
 
     Args:
         particles: N of them.
         warp: of the moment; particles whose weights are all 0 stay where they are.
         pinhole: the camera.
-        tints: (T,), T < B, with B - T one of 1, 4, 9, 16.
-        fades: (F,).
+        color_basis: (T,), T < B, with B - T one of 1, 4, 9, 16.
+        opacity_basis: (F,).
 
     Returns:
         ``Splats``. Differentiable in particles, maps and weights; directions, and how a lens bends around
@@ -135,19 +137,21 @@ def project(particles: Gaussians, warp: Warp, pinhole: Pinhole, tints: Tensor, f
 
     Cost: about 500 operations a particle, twice that for gradients.
     """
-    _check(particles, warp, tints, fades)
+    _check(particles, warp, color_basis, opacity_basis)
     if not use_numba(particles.means) or particles.means.dtype != torch.float32:
-        return project_reference(particles, warp, pinhole, tints, fades)
-    return Splats(*_Project.apply(*particles, *warp, pinhole.row(particles.means), tints, fades))
+        return project_reference(particles, warp, pinhole, color_basis, opacity_basis)
+    return Splats(
+        *_Project.apply(*particles, *warp, pinhole.row(particles.means), color_basis, opacity_basis)
+    )
 
 
-def _check(particles: Gaussians, warp: Warp, tints: Tensor, fades: Tensor) -> None:
-    count, plain = len(particles.means), particles.colors.shape[1] - len(tints)
-    for name, shape in zip(Gaussians._fields, ((3,), (3,), (4,), (len(fades),), ("B", 3))):
+def _check(particles: Gaussians, warp: Warp, color_basis: Tensor, opacity_basis: Tensor) -> None:
+    count, plain = len(particles.means), particles.colors.shape[1] - len(color_basis)
+    for name, shape in zip(Gaussians._fields, ((3,), (3,), (4,), (len(opacity_basis),), ("B", 3))):
         check_shape(name, getattr(particles, name), (count, *shape))
     if plain not in (1, 4, 9, 16):
         raise ValueError(
-            f"colors: expected 1, 4, 9 or 16 coefficients of direction beside {len(tints)} of time, "
+            f"colors: expected 1, 4, 9 or 16 coefficients of direction beside {len(color_basis)} of time, "
             f"but got {plain}"
         )
     check_shape("maps", warp.maps, ("M", 12))
@@ -193,7 +197,7 @@ def moved(means: Tensor, warp: Warp) -> tuple[Tensor, Tensor]:
 
 
 def project_reference(
-    particles: Gaussians, warp: Warp, pinhole: Pinhole, tints: Tensor, fades: Tensor
+    particles: Gaussians, warp: Warp, pinhole: Pinhole, color_basis: Tensor, opacity_basis: Tensor
 ) -> Splats:
     """``project`` in plain PyTorch, on any device and in any precision."""
     means, log_scales, quaternions, opacity, colors = particles
@@ -201,7 +205,7 @@ def project_reference(
     rotation = means.new_tensor(pinhole.rotation).reshape(3, 3)
     away = points - means.new_tensor(pinhole.center)
     local = away @ rotation.T
-    solid = torch.sigmoid(opacity @ fades)
+    solid = torch.sigmoid(opacity @ opacity_basis)
     ahead = local[:, 2].detach() > pinhole.near
     x, y, z = torch.where(ahead[:, None], local, local.new_tensor([0.0, 0.0, 1.0])).unbind(-1)
     plane = torch.stack([x / z, y / z], -1)
@@ -223,9 +227,9 @@ def project_reference(
     a, b, c, determinant = _covariance(root, pinhole.blur)
     depth = away.square().sum(-1).clamp(min=1e-30).sqrt()
     directions = (away / depth[:, None]).detach()
-    plain = colors.shape[1] - len(tints)
+    plain = colors.shape[1] - len(color_basis)
     color = torch.einsum("nk,nkc->nc", harmonics(directions, plain), colors[:, :plain]) + 0.5
-    color = (color + torch.einsum("k,nkc->nc", tints, colors[:, plain:])).clamp(min=0)
+    color = (color + torch.einsum("k,nkc->nc", color_basis, colors[:, plain:])).clamp(min=0)
     conic = torch.stack([c, -b, a], -1) / determinant[:, None]
     values = torch.cat([pixel, conic, solid[:, None], color, depth[:, None]], -1)
     reach = 2 * torch.log((255 * solid.detach()).clamp(min=1))
@@ -250,15 +254,16 @@ def _whole(count: int) -> int:
 
 
 def _project_numba(
-    means, log_scales, quaternions, opacity, colors, maps, links, weights, view, tints, fades, *, draw=True
+    means, log_scales, quaternions, opacity, colors, maps, *others, draw: bool = True
 ) -> tuple[tuple, Tensor]:
     """Return what the kernels of both passes read, where maps have 16 numbers each, and the splats (N up to a
-    whole sixteen, 16) of the kernel; without ``draw`` nothing is computed, and they are 0.
+    whole sixteen, 16) of the kernel; without ``draw`` nothing is computed, and they are 0. ``others``: links,
+    weights, the camera's row and both bases.
     """
     from forewarp.ops.kernels import project as kernels
 
     maps = pad(maps, (0, 4))
-    inputs = (means, log_scales, quaternions, opacity, colors, maps, links, weights, view, tints, fades)
+    inputs = (means, log_scales, quaternions, opacity, colors, maps, *others)
     splats = (means.new_empty if draw else means.new_zeros)(_whole(len(means)), SPLAT)
     if draw:
         kernels.project(*arrays(*inputs, splats))
@@ -454,7 +459,7 @@ class _Rasterize(torch.autograd.Function):
 
 def _splat_gradients(splats: Tensor, tiles: _Tiles, sums: Tensor, factor: float) -> tuple:
     """Return the rows of splats that are seen, ``factor`` times the gradients by their columns (V', 16), from
-    sums over pixels, and how strongly these pull each splat over the image (N,).
+    sums over pixels, and the lengths (N,) of those by the pixel.
     """
     from forewarp.ops.kernels import backward as kernels
 
@@ -462,17 +467,17 @@ def _splat_gradients(splats: Tensor, tiles: _Tiles, sums: Tensor, factor: float)
     ranks = np.full(len(splats), -1, np.int32)
     ranks[tiles.order] = np.arange(len(tiles.order))
     seen = np.flatnonzero(ranks >= 0).astype(np.int32)
-    by_splat, pull = torch.empty(_whole(len(seen)), SPLAT), torch.zeros(len(splats))
+    by_splat, pixel_gradient = torch.empty(_whole(len(seen)), SPLAT), torch.zeros(len(splats))
     inputs = (*arrays(splats), seen, ranks[seen], *arrays(sums), factor)
-    kernels.splat_gradients(*inputs, *arrays(by_splat, pull))
-    return seen, by_splat, pull
+    kernels.splat_gradients(*inputs, *arrays(by_splat, pixel_gradient))
+    return seen, by_splat, pixel_gradient
 
 
-class Compared(NamedTuple):
+class ImageLoss(NamedTuple):
     """``loss`` and ``squared``: sums over pixels and channels; ``particles``, ``maps`` and ``skin``: the
-    gradients of ``factor`` times the loss; ``pull`` (N,) how strongly that pulls each over the
-    picture, per pixel; 0 of particles that the picture does not show. ``order`` (V,): the rows of those that
-    the picture may show, from near to far; ``distances`` (N,): from the camera, known of these alone. Where
+    gradients of ``factor`` times the loss; ``pixel_gradient`` (N,): the length of its gradient by the pixel
+    where a particle lies, 0 of particles that the image does not show. ``order`` (V,): the rows of those that
+    the image may show, from near to far; ``distances`` (N,): from the camera, known of these alone. Where
     ``kinds`` of colours are asked for, ``particles.colors`` is a tuple of tensors.
     """
 
@@ -481,7 +486,7 @@ class Compared(NamedTuple):
     particles: Gaussians
     maps: Tensor
     skin: Tensor | None
-    pull: Tensor
+    pixel_gradient: Tensor
     order: Tensor
     distances: Tensor
 
@@ -490,8 +495,8 @@ def compare(
     particles: Gaussians,
     warp: Warp,
     pinhole: Pinhole,
-    tints: Tensor,
-    fades: Tensor,
+    color_basis: Tensor,
+    opacity_basis: Tensor,
     pixels: Tensor,
     background: Tensor,
     *,
@@ -500,14 +505,14 @@ def compare(
     by_skin: bool = False,
     kinds: Sequence[int] | None = None,
     loss: Callable[[Tensor, Tensor], Tensor] | None = None,
-) -> Compared:
+) -> ImageLoss:
     """The loss ``sum sqrt(e^2 + width^2) - width`` over pixels and channels, and its gradients.
 
-    ``e`` is the picture of ``project`` and ``rasterize`` over ``background`` less the truth over the same:
+    ``e`` is the image of ``project`` and ``rasterize`` over ``background`` less the truth over the same:
     near 0 the loss is a square, far from it the error itself. A ``loss`` of the image takes its place.
 
     Args:
-        particles, warp, pinhole, tints, fades: as of ``project``.
+        particles, warp, pinhole, color_basis, opacity_basis: as of ``project``.
         pixels: (H W, 4) uint8, the truth as straight RGBA.
         background: (3,).
         width: where the loss turns from a square to a line, > 0.
@@ -519,7 +524,7 @@ def compare(
             it to the kernels. None: the loss above, which a kernel computes together with its gradients.
 
     Returns:
-        ``Compared``; nothing in it has a graph.
+        ``ImageLoss``; nothing in it has a graph.
 
     Raises:
         ValueError: for shapes that do not go together, or another kind of pixels.
@@ -527,7 +532,7 @@ def compare(
     Cost: that of ``rasterize`` twice and of ``project`` thrice; with a ``loss``, of ``rasterize`` thrice and
     of the loss.
     """
-    _check(particles, warp, tints, fades)
+    _check(particles, warp, color_basis, opacity_basis)
     check_shape("pixels", pixels, (pinhole.size[0] * pinhole.size[1], 4))
     check_shape("background", background, (3,))
     if pixels.dtype != torch.uint8 or not width > 0:
@@ -536,33 +541,22 @@ def compare(
         raise ValueError(
             f"kinds: expected {particles.colors.shape[1]} coefficients in all, but got {tuple(kinds)}"
         )
-    given = particles, warp, pinhole, tints, fades, pixels, background, width, factor, by_skin, kinds
+    seen = particles, warp, pinhole, color_basis, opacity_basis
+    given = pixels, background, width, factor, by_skin, kinds
     if loss is None and use_numba(particles.means) and particles.means.dtype == torch.float32:
-        return _compare_numba(*given)
-    return compare_reference(*given, loss)
+        return _compare_numba(*seen, *given)
+    return compare_reference(seen, *given, loss)
 
 
-def compare_reference(
-    particles: Gaussians,
-    warp: Warp,
-    pinhole: Pinhole,
-    tints: Tensor,
-    fades: Tensor,
-    pixels: Tensor,
-    background: Tensor,
-    width: float,
-    factor: float,
-    by_skin: bool,
-    kinds: Sequence[int] | None,
-    loss: Callable[[Tensor, Tensor], Tensor] | None = None,
-) -> Compared:
+def compare_reference(seen: tuple, pixels, background, width, factor, by_skin, kinds, loss=None) -> ImageLoss:
     """``compare`` in plain PyTorch, on any device and in any precision; a ``loss`` by ``project`` and
-    ``rasterize``, which use kernels.
+    ``rasterize``, which use kernels. ``seen`` are the arguments of ``project``.
     """
+    particles, warp, pinhole, *bases = seen
     leaves = [t.detach().clone().requires_grad_() for t in (*particles, warp.maps, warp.weights)]
     with torch.enable_grad():
         own, own_warp = Gaussians(*leaves[:5]), Warp(leaves[5], warp.links, leaves[6])
-        splats = (project if loss else project_reference)(own, own_warp, pinhole, tints, fades)
+        splats = (project if loss else project_reference)(own, own_warp, pinhole, *bases)
         splats.values.retain_grad()
         if loss:
             color, _, transmittance = rasterize(splats, *pinhole.size)
@@ -580,14 +574,14 @@ def compare_reference(
             value = ((error.square() + width**2).sqrt() - width).sum()
         (factor * value).backward()
     found = [torch.zeros_like(leaf) if leaf.grad is None else leaf.grad for leaf in leaves]
-    pull = splats.values.grad[:, :2].norm(dim=-1)
+    pixel_gradient = splats.values.grad[:, :2].norm(dim=-1)
     squared = float(error.detach().square().sum())
     skin = _by_softmax(warp.weights.detach(), found[6]) if by_skin else None
     seen, away = (splats.reach[:, 0] > 0).nonzero()[:, 0], splats.depth.detach()
     order = seen[away[seen].argsort(stable=True)]
     colors = found[4] if kinds is None else found[4].split(list(kinds), 1)
     gradients = Gaussians(*found[:4], colors)
-    return Compared(float(value.detach()), squared, gradients, found[5], skin, pull, order, away)
+    return ImageLoss(float(value.detach()), squared, gradients, found[5], skin, pixel_gradient, order, away)
 
 
 def _by_softmax(weights: Tensor, by_weights: Tensor) -> Tensor:
@@ -597,21 +591,21 @@ def _by_softmax(weights: Tensor, by_weights: Tensor) -> Tensor:
 
 
 def _compare_numba(
-    particles, warp, pinhole, tints, fades, pixels, background, width, factor, by_skin, kinds
-) -> Compared:
-    threads, (across, down) = match_threads(), pinhole.size
-    inputs, splats = _project_numba(*particles, *warp, pinhole.row(particles.means), tints, fades)
+    particles, warp, pinhole, color_basis, opacity_basis, pixels, background, width, factor, by_skin, kinds
+) -> ImageLoss:
+    threads, (across, down), camera = match_threads(), pinhole.size, pinhole.row(particles.means)
+    inputs, splats = _project_numba(*particles, *warp, camera, color_basis, opacity_basis)
     tiles = _sorted_tiles(splats.numpy(), across, down, threads)
     image = pixels.contiguous().view(torch.int32).reshape(down, across)
     return _compare_sorted(inputs, splats, tiles, image, background, width, factor, by_skin, kinds)
 
 
 def compile_backward_kernels(
-    particles: Gaussians, warp: Warp, pinhole: Pinhole, tints: Tensor, fades: Tensor
+    particles: Gaussians, warp: Warp, pinhole: Pinhole, color_basis: Tensor, opacity_basis: Tensor
 ) -> None:
     """Compile the backward kernels on empty tiles."""
     view, (width, height) = pinhole.row(particles.means), pinhole.size
-    inputs, splats = _project_numba(*particles, *warp, view, tints, fades, draw=False)
+    inputs, splats = _project_numba(*particles, *warp, view, color_basis, opacity_basis, draw=False)
     count = math.prod(_tiles(width, height))
     none, records = np.zeros(0, np.int32), np.zeros((0, COLUMN.depth + 1), np.float32)
     tiles = _Tiles(none, (records, none, np.zeros(count + 1, np.int64), np.array([0, count])), 0)
@@ -619,7 +613,7 @@ def compile_backward_kernels(
     _compare_sorted(inputs, splats, tiles, image, torch.ones(3), 1.0, 1.0, False, None)
 
 
-def _compare_sorted(inputs, splats, tiles, image, background, width, factor, by_skin, kinds) -> Compared:
+def _compare_sorted(inputs, splats, tiles, image, background, width, factor, by_skin, kinds) -> ImageLoss:
     """Compare sorted splats with an image (H, W) int32 of four bytes a pixel; carry the gradients back."""
     from forewarp.ops.kernels import rasterize as kernels
 
@@ -630,11 +624,11 @@ def _compare_sorted(inputs, splats, tiles, image, background, width, factor, by_
     padded = pad(image, edge) if any(edge) else image
     truth = padded.numpy().view("uint32"), wide, high, *arrays(background.float()), np.float32(width)
     kernels.compare(*tiles.lists, *truth, *arrays(kept, sums, scores))
-    seen, by_splat, pull = _splat_gradients(splats, tiles, sums, factor)
+    seen, by_splat, pixel_gradient = _splat_gradients(splats, tiles, sums, factor)
     gradients, colors, maps, skin = _chain(
         inputs, splats, seen, by_splat, len(kept), kinds or [coefficients], by_weights=by_skin, softmax=True
     )
     gradients = Gaussians(*gradients, colors[0] if kinds is None else tuple(colors))
     order, depth = torch.from_numpy(tiles.order), splats[:count, COLUMN.depth]
     skin = skin if by_skin else None
-    return Compared(*scores.sum(0).tolist(), gradients, maps, skin, pull[:count], order, depth)
+    return ImageLoss(*scores.sum(0).tolist(), gradients, maps, skin, pixel_gradient[:count], order, depth)

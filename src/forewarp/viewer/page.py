@@ -306,7 +306,7 @@ class Page:
         """Write and send a video through key views, or say why there is none."""
 
         def progress(done: int, total: int) -> None:
-            tell(f"{done} of {total} pictures")
+            tell(f"{done} of {total} images")
 
         try:
             file = self.session.write_video(self.folder, keys, seconds, progress)

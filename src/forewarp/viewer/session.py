@@ -175,7 +175,7 @@ class Session:
             elif state.channel != "motion":
                 chunks = self._control.chunks(kind, width, rows)
             if chunks > 1:
-                self.page.tell(f"{self._rate:.1f} pictures/s | drawing {width} x {rows}")
+                self.page.tell(f"{self._rate:.1f} images/s | drawing {width} x {rows}")
             viewer.prepare(state)
             prepared = self._clock()  # what the time alone needs does not depend on the rows
             image = viewer.image(state, width, rows, chunks)
@@ -192,7 +192,7 @@ class Session:
         if moving:  # the rate of a single image is what it took
             self._rate = self._frame_rate.record(self._clock()) or 1 / max(seconds, 1e-3)
         note = f"{viewer.note} | " if viewer.note else ""
-        self.page.tell(f"{note}{self._rate:.1f} pictures/s | {1000 * seconds:.0f} ms | {about}")
+        self.page.tell(f"{note}{self._rate:.1f} images/s | {1000 * seconds:.0f} ms | {about}")
         if not moving or queue.is_stale():
             return
         if self.playing:
@@ -284,8 +284,8 @@ def camera_path(keys: Sequence[ViewState], number: int) -> list[ViewState]:
 
     if len(keys) < 2 or number < 2:
         raise ValueError(
-            f"key views: expected at least 2, and 2 pictures of them, but got {len(keys)} key views and "
-            f"{number} pictures; go to another view or time and add it"
+            f"key views: expected at least 2, and 2 images of them, but got {len(keys)} key views and "
+            f"{number} images; go to another view or time and add it"
         )
     key_poses = np.stack([key.pose.double().numpy() for key in keys])
     knots, positions = np.arange(len(keys)), np.linspace(0, len(keys) - 1, number)

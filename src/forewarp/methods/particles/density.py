@@ -32,7 +32,7 @@ def too_near(order: Tensor, distances: Tensor) -> Tensor:
     lie between images. A thing that comes near is more than a few; of fewer than fifty none is too near.
 
     Args:
-        order, distances: (V,) and (N,), as of ``ops.compare.Compared``.
+        order, distances: (V,) and (N,), as of ``ops.gaussians.ImageLoss``.
 
     >>> too_near(torch.arange(50), torch.tensor([0.1] + [2.0] * 49))
     tensor([0])

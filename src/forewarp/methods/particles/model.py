@@ -394,8 +394,8 @@ class Particles(Method):
         )  # fmt: skip
         squared = terms.pop("squared", compared.squared)
         terms = {name: value / covered for name, value in (terms or {"photo": compared.loss}).items()}
-        shown = compared.pull > 0
-        self.gradient_sum.add_(compared.pull)
+        shown = compared.pixel_gradient > 0
+        self.gradient_sum.add_(compared.pixel_gradient)
         self.image_count.add_(shown)
         self.shown_now.append(shown)
         if self.progress < self.stage.density_until:

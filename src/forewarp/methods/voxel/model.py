@@ -79,7 +79,7 @@ class VoxelSnapshot(Snapshot):
         """See ``Snapshot.render``; without gradients in chunks of rays, for images of any size."""
         field = self.fields[rendering or self.renderings[-1]]
         rays = view.rays().to(self.canonical.values.device)
-        draw = self.renderer if torch.is_grad_enabled() else self.renderer.picture
+        draw = self.renderer if torch.is_grad_enabled() else self.renderer.image
         return draw(field, rays, background.to(rays.origins), self.shade)
 
     def march(self, name: str, rays: Rays, background: Tensor, **options):

@@ -167,7 +167,7 @@ def _seen(method: ForwardWarp, target: Target, pixels: Tensor) -> tuple[Tensor, 
     if method.background is not None:
         field = Together(field, placed(method.background(), method.background.voxels))
     rays = view.rays().to(method.device)
-    positions = method.renderer.picture(field, rays, rays.origins.new_zeros(3))
+    positions = method.renderer.image(field, rays, rays.origins.new_zeros(3))
     solid = positions.opacity > 0.5
     low, high = (positions.rgb.new_tensor(end) for end in (box.low, box.high))
     at = low + (high - low) * positions.rgb / positions.opacity.clamp(min=1e-6)[:, None]

@@ -48,14 +48,14 @@ _GRADIENT, _ROWS = ROWS, ROWS + SPLAT  # where gradients by the splats' columns 
 
 
 @njit(parallel=True, cache=True)
-def splat_gradients(splats, rows, ranks, sums, factor, gradients, pull):
+def splat_gradients(splats, rows, ranks, sums, factor, gradients, pixel_gradient):
     """Turn sums over pixels (S, V, 16) of splats in the order of depth into ``factor`` times the gradients by
     the columns (V', 16) of ``rows``, whose places in that order are ``ranks``; V' is V or more, a multiple
     of 16.
 
     The sums are of q, q dx, q dy, q dx^2, q dx dy, q dy^2, with q the gradient by the exponent and dx, dy
-    from the splat to the pixel, then those by colour and depth. ``pull`` (N,) takes the lengths of those by
-    x, y.
+    from the splat to the pixel, then those by colour and depth. ``pixel_gradient`` (N,) takes the lengths of
+    those by x, y.
     """
     count = len(rows)
     for block in prange(gradients.shape[0] // SIDE_BY_SIDE):
@@ -78,7 +78,7 @@ def splat_gradients(splats, rows, ranks, sums, factor, gradients, pull):
         for lane in range(SIDE_BY_SIDE):
             put_row(gradients, first + lane, row_of(place, lane))
             if first + lane < count:
-                pull[rows[first + lane]] = conics[lane]
+                pixel_gradient[rows[first + lane]] = conics[lane]
 
 
 @njit(forceinline=True)
@@ -159,9 +159,9 @@ def _by_point(camera, local, depth, inverse, px, py, lens, place, by_jacobian):
 
 
 @njit(forceinline=True)
-def _color_gradients(direction, splats, tints, which, valid, place, to_colors, spots):
+def _color_gradients(direction, splats, color_basis, which, valid, place, to_colors, spots):
     """Fill the gradients by the coefficients of colour; direction has none."""
-    plain = len(spots) - len(tints)
+    plain = len(spots) - len(color_basis)
     x, y, z = direction
     harmonics(x, y, z, plain, place)
     gather(splats[:, COLUMN.red :], which, place, ANY, 3)
@@ -170,7 +170,7 @@ def _color_gradients(direction, splats, tints, which, valid, place, to_colors, s
     green = where_above(shown[1], zero, by_color[1])
     blue = where_above(shown[2], zero, by_color[2])
     for k in range(len(spots)):
-        factor = row_of(place, BASIS + k) if k < plain else sixteen(tints[k - plain])
+        factor = row_of(place, BASIS + k) if k < plain else sixteen(color_basis[k - plain])
         set_rows(place, ANY, (factor * red, factor * green, factor * blue))
         for lane in range(valid):
             at = spots[k, 0] + np.uintp(which[lane]) * spots[k, 1]
@@ -230,7 +230,7 @@ def _transposed(m):
 
 @njit(parallel=True, cache=True)
 def chain(
-    means, log_scales, quaternions, opacity, colors, maps, links, weights, camera, tints, fades,
+    means, log_scales, quaternions, opacity, colors, maps, links, weights, camera, color_basis, opacity_basis,
     splats, seen, gradients,
     to_means, to_scales, to_quaternions, to_opacity, to_colors, spots, to_maps, to_weights, softmax,
 ):  # fmt: skip
@@ -278,14 +278,14 @@ def chain(
             by_point = _by_point(camera, local, depth, inverse, px, py, lens, place, by_jacobian)
             x, y, z = by_point
             _scatter(place, rotated_back(warp, x, y, z), to_means, which, valid)
-            _color_gradients(direction, splats, tints, which, valid, place, to_colors, spots)
+            _color_gradients(direction, splats, color_basis, which, valid, place, to_colors, spots)
             for lane in range(valid):
                 i = np.uintp(which[lane])
                 covers = splats[i, COLUMN.opacity]
                 by_opacity = place[SIDE_BY_SIDE * (_GRADIENT + COLUMN.opacity) + lane]
                 by_logit = by_opacity * covers * (np.float32(1) - covers)
-                for j in range(len(fades)):
-                    to_opacity[i, j] = by_logit * fades[j]
+                for j in range(len(opacity_basis)):
+                    to_opacity[i, j] = by_logit * opacity_basis[j]
             for r in range(3):
                 for c in range(3):
                     value = by_point[r] * row_of(place, MEAN + c)

@@ -202,24 +202,24 @@ def scales_of(log_scales, which, place):
 
 
 @njit(forceinline=True)
-def _opacities(opacity, which, fades, place):
+def _opacities(opacity, which, opacity_basis, place):
     logit = sixteen(0.0)
-    for k in range(len(fades)):
+    for k in range(len(opacity_basis)):
         gather(opacity[:, k:], which, place, ANY, 1)
-        logit = fma(row_of(place, ANY), fades[k], logit)
+        logit = fma(row_of(place, ANY), opacity_basis[k], logit)
     return sixteen(1.0) / (exp(logit * -1.0) + 1.0)
 
 
 @njit(forceinline=True)
-def _colors(direction, colors, tints, which, place):
+def _colors(direction, colors, color_basis, which, place):
     """The colours of 16 splats: what direction and time make of their coefficients."""
-    plain = colors.shape[1] - len(tints)
+    plain = colors.shape[1] - len(color_basis)
     x, y, z = direction
     harmonics(x, y, z, plain, place)
     red, green, blue = sixteen(0.5), sixteen(0.5), sixteen(0.5)
     for k in range(colors.shape[1]):
         gather(colors[:, k], which, place, ANY, 3)
-        factor = row_of(place, BASIS + k) if k < plain else sixteen(tints[k - plain])
+        factor = row_of(place, BASIS + k) if k < plain else sixteen(color_basis[k - plain])
         r, g, b = rows_of(place, ANY, 3)
         red, green, blue = fma(factor, r, red), fma(factor, g, green), fma(factor, b, blue)
     return maximum(0.0, red), maximum(0.0, green), maximum(0.0, blue)  # NaN stays NaN
@@ -240,7 +240,20 @@ def _squared_reach(camera, ahead, beside, lens, determinant, opacity, log_opacit
 
 
 @njit(parallel=True, cache=True)
-def project(means, log_scales, quaternions, opacity, colors, maps, links, weights, camera, tints, fades, out):
+def project(
+    means,
+    log_scales,
+    quaternions,
+    opacity,
+    colors,
+    maps,
+    links,
+    weights,
+    camera,
+    color_basis,
+    opacity_basis,
+    out,
+):
     """Fill ``out`` (N', 16) with splats; see ``gaussians.project``. N' is N or more, a multiple of 16.
 
     A splat: x, y, conic (3), opacity, colour (3), depth, how far it reaches along both axes (one that is not
@@ -261,9 +274,9 @@ def project(means, log_scales, quaternions, opacity, colors, maps, links, weight
             gather(quaternions, which, place, QUATERNION, 4)
             rows = product(product(jacobian, rows_of(place, 0, 9)), rotations(place))
             a, b, c, determinant = covariance(camera, rows, scales_of(log_scales, which, place))
-            solid = _opacities(opacity, which, fades, place)
+            solid = _opacities(opacity, which, opacity_basis, place)
             log_solid = log(solid)
-            red, green, blue = _colors(direction, colors, tints, which, place)
+            red, green, blue = _colors(direction, colors, color_basis, which, place)
             square = px * px + py * py
             reach = _squared_reach(camera, local[2], square, lens, determinant, solid, log_solid)
             reach_x = where_above(reach, np.float32(0), root(reach * a))
