@@ -7,7 +7,7 @@ import pytest
 from forewarp.report import figures
 from forewarp.report.benchmark import Published
 from forewarp.report.choices import seconds_to
-from forewarp.report.figures import MARGIN, draw_run, draw_scene, pareto_front, subject, thirds
+from forewarp.report.figures import MARGIN, draw_scene, pareto_front, subject, thirds
 from forewarp.report.results import Point, read_runs
 from tests.support.runs_on_disk import write_run
 
@@ -34,9 +34,11 @@ def test_the_front_is_what_nothing_beats_in_both():
 
 
 def test_a_run_is_drawn_with_its_flow_error_below(tmp_path):
-    flat = draw_run(tmp_path / "a" / "flat.png", curve((1, 20), (2, 21)), "run")
-    both = draw_run(tmp_path / "both.png", [Point(1, 20, 0, 0.5), Point(2, 21, 0, 0.4)], "run")
-    assert iio.imread(both).shape[0] > iio.imread(flat).shape[0]
+    heights = []
+    for variant, epe in (("flat", None), ("both", 0.5)):
+        figures.draw_own(folder := write_run(tmp_path, variant, epe=epe))
+        heights.append(iio.imread(folder / "accuracy_time.png").shape[0])
+    assert heights[0] < heights[1]
     assert not list(tmp_path.rglob("*.part"))
 
 
@@ -55,10 +57,9 @@ def test_a_scene_names_those_on_the_front_and_the_hardware_of_others(tmp_path, m
 
 def test_absent_matplotlib_says_what_to_install(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    with pytest.raises(ImportError, match=r"install forewarp\[plots\]"):
-        draw_run(tmp_path / "x.png", curve((1, 20)), "run")
     figures.draw_own(write_run(tmp_path))
-    assert "without accuracy_time.png: expected matplotlib" in capsys.readouterr().out
+    told = "without accuracy_time.png: expected matplotlib for plots; install forewarp[plots]"
+    assert told in capsys.readouterr().out
 
 
 def test_a_picture_is_cut_to_its_subject():

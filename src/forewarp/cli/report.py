@@ -145,16 +145,17 @@ def report(config: DictConfig) -> None:
 
 def compared(config: DictConfig) -> str:
     """Return the table of ``kind=compare``; draw a view by each run where ``out`` is set."""
-    from forewarp.report.compare import compare, draw_compared, read_compared
+    from forewarp.report.compare import compare, read_compared
+    from forewarp.report.figures import draw_beside
 
-    named = (
-        [] if config.runs is None else [config.runs] if isinstance(config.runs, str) else list(config.runs)
-    )
+    named = [config.runs] if isinstance(config.runs, str) else list(config.runs or ())
     runs = read_compared([folder for name in named for folder in sorted(glob(str(name))) or [str(name)]])
-    drawn = draw_compared(runs, Path(config.out)) if config.out else None
-    none = "no picture: the runs share no test view with a sheet; type views= and sheets= alike"
-    about = f"written: {drawn}" if drawn else none
-    return compare(runs).plain() + (f"\n{about}" if config.out else "")
+    table = compare(runs).plain()
+    if not config.out:
+        return table
+    drawn = draw_beside(Path(config.out) / "compare.png", runs, 0.5, "test view")
+    none = "no image: the runs share no test view with a sheet; type views= and sheets= alike"
+    return f"{table}\n{f'written: {drawn}' if drawn else none}"
 
 
 def run_page(config: DictConfig) -> str:

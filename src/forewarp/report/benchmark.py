@@ -32,7 +32,7 @@ from forewarp.report.results import (
     pairs,
     read_runs,
 )
-from forewarp.report.tables import Column, Table, columns_of, rendered, score_columns
+from forewarp.report.tables import Column, Table, rendered, score_columns
 
 OTHERS = Path(__file__).with_name("published.yaml")  # results of others
 NOISE = 0.2  # dB that chance may take: with more of something PSNR may be this much lower
@@ -217,7 +217,7 @@ def _by_minutes(runs: Runs) -> Table:
         lines += [[f"mean of {dataset}", *means]] if len(found.by("label")) > 1 else []
     early = any(group.taken()[0] for group in alike(runs))
     about = " Some runs ended by their steps, before their minutes: see *Each*." * early
-    return Table(columns_of(["scene", *map(length, minutes)]), lines, "PSNR (dB) of test views." + about)
+    return Table(["scene", *map(length, minutes)], lines, "PSNR (dB) of test views." + about)
 
 
 def _against_fewer(runs: Runs, varied: str, order: Callable[[Runs], float]) -> list[Row]:
@@ -279,7 +279,7 @@ def _beside(method: str, runs: Runs, other: str, rivals: Runs) -> Table:
         f"`{other}`",
         *(metric_of(name).title for name in names),
     ]
-    return Table(columns_of(columns), lines)
+    return Table(columns, lines)
 
 
 def above(group: Runs, other: Runs, name: str = "psnr") -> str:
@@ -345,7 +345,7 @@ def _by_length(lengths: Mapping[str, Sequence[Runs]]) -> Table:
         passed = [length(g[0]["minutes"]) for g in lengths[best] if g.mean("psnr") > most[method]]
         seeds = ", ".join(str(len(group)) for group in groups)
         lines.append([f"`{method}`", *map(cells.get, minutes), seeds, passed[0] if passed else None])
-    return Table(columns_of(["method", *map(length, minutes), "seeds", f"passed by `{best}` after"]), lines)
+    return Table(["method", *map(length, minutes), "seeds", f"passed by `{best}` after"], lines)
 
 
 def write_methods(folder: Path, out: Path) -> list[Path]:
@@ -446,4 +446,4 @@ def _departures(runs: Runs) -> Table:
                 found.setdefault(mark + departure, set()).add(f"`{row['method']}`")
     lines = [[about, ", ".join(sorted(methods))] for about, methods in found.items()]
     lines.sort(key=lambda line: (line[0].startswith("kept"), -line[1].count(","), line[0]))
-    return Table(columns_of(["departure", "methods"]), lines)
+    return Table(["departure", "methods"], lines)

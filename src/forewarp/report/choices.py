@@ -15,7 +15,7 @@ from forewarp.metrics.gain import FACTORS, Estimate, measure_effect
 from forewarp.metrics.registry import metric_of
 from forewarp.report.figures import draw_scene
 from forewarp.report.results import Point, Row, Runs, overrides, portable, read_runs
-from forewarp.report.tables import Column, Table, columns_of, rendered
+from forewarp.report.tables import Column, Table, rendered
 
 COSTS = {
     "epe": Column("EPE", 4),
@@ -90,7 +90,7 @@ def cheapest(groups: Mapping[tuple, Runs]) -> Table:
         if known := [(seconds, row) for seconds, row in times if seconds is not None]:
             seconds, row = min(known, key=lambda pair: pair[0].mean)
             lines.append([str(psnr), seconds, row["variant"], f"`{portable(row['command'])}`"])
-    columns = columns_of(["for dB", Column("seconds", 1), "variant", "command"])
+    columns = ["for dB", Column("seconds", 1), "variant", "command"]
     return Table(columns, lines, "The cheapest way to each PSNR:")
 
 
@@ -170,7 +170,7 @@ def changes(runs: Runs) -> Table:
     for name, column in measures.items():
         signed = Column(column.name, column.digits, signed=True)
         columns.append(Column(column.name, prefix="×") if name in FACTORS else signed)
-    return Table(columns_of(columns), lines, "Changes:")
+    return Table(columns, lines, "Changes:")
 
 
 def every_run(runs: Runs) -> Table:
@@ -236,7 +236,7 @@ def reasons(effects: Mapping[str, Mapping]) -> Table:
         for scene in sorted(effects)
         for name, decision in effects[scene].items()
     ]
-    return Table(columns_of(["scene", "effect", "choice", "because"]), lines)
+    return Table(["scene", "effect", "choice", "because"], lines)
 
 
 def choices(runs: Runs) -> Table:
@@ -266,7 +266,7 @@ def choices(runs: Runs) -> Table:
         values = [cell.mean if isinstance(cell, Estimate) else cell for cell in cells]
         means.append(None if None in values else fmean(values))
     lines += [["mean", None, *means]] if len(lines) > 1 else []
-    return Table(columns_of([*columns, Column("planning, s", 0)]), lines)
+    return Table([*columns, Column("planning, s", 0)], lines)
 
 
 def called(planned: Sequence[Row]) -> Table:
@@ -278,7 +278,7 @@ def called(planned: Sequence[Row]) -> Table:
         names = [", ".join(effects) or "nothing" for effects in (wanted, on)]
         lines.append([row["scene"], row["seed"], *names, "as made" if on == wanted else "**otherwise**"])
     right = sum(line[-1] == "as made" for line in lines)
-    columns = columns_of(["scene", Column("seed", 0), "made to call for", "planned", ""])
+    columns = ["scene", Column("seed", 0), "made to call for", "planned", ""]
     return Table(
         columns, lines, f"{right} of {len(lines)} plans turn on what is called for and nothing else:"
     )

@@ -6,9 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from forewarp.metrics.registry import METRICS, metric_of
-from forewarp.report.figures import draw_beside
 from forewarp.report.results import UNREADABLE, Row, read_run, unreadable
-from forewarp.report.tables import Column, Difference, Table, columns_of
+from forewarp.report.tables import Column, Difference, Table
 
 ABILITIES = {
     "space": "at training times",
@@ -53,15 +52,7 @@ def compare(runs: dict[str, Row]) -> Table:
     for name, words in CONDITIONS.items():
         values = ["none named" if row[name] is None else str(row[name]) for row in rows]
         lines += [[words, *values, *[None] * two]] if len(set(values)) > 1 else []
-    return Table(columns_of(["PSNR (dB) of test views", *runs, *["difference"] * two]), lines)
-
-
-def draw_compared(runs: dict[str, Row], out: Path) -> Path | None:
-    """Draw a test view in the middle of the time by every run into ``compare.png``.
-
-    Return None if the runs share no test view with an image.
-    """
-    return draw_beside(out / "compare.png", runs, 0.5, "test view")
+    return Table(["PSNR (dB) of test views", *runs, *["difference"] * two], lines)
 
 
 def read_compared(folders: Sequence[str | Path]) -> dict[str, Row]:

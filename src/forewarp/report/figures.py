@@ -27,9 +27,8 @@ def figure_of(rows: int, columns: int, size: tuple[float, float], heights: Seque
         ImportError: if matplotlib is missing.
     """
     try:
-        from matplotlib.figure import (
-            Figure,
-        )  # without pyplot, which keeps global state and looks for a display
+        # Without pyplot, which keeps global state and looks for a display.
+        from matplotlib.figure import Figure
     except ImportError:
         raise ImportError(NO_PLOTS) from None
     figure = Figure(figsize=size, layout="constrained")
@@ -60,19 +59,16 @@ def over_seconds(axis, label: str, seconds: Sequence[float] = ()) -> None:
 
 
 def draw_own(folder: Path) -> None:
-    """Draw a run's curve into ``accuracy_time.png``, if there is a curve and matplotlib is installed."""
+    """Draw a run's PSNR, and below it the flow error if known, against seconds into ``accuracy_time.png``, if
+    there is a curve and matplotlib is installed.
+    """
     if points := read_points(folder):
         try:
-            print(f"curve    {draw_run(folder / 'accuracy_time.png', points, folder.name)}")
+            figure, axes = _curves([(points, {"color": "C0", "linewidth": 2})])
+            axes[0].set_title(folder.name)
+            print(f"curve    {save(figure, folder / 'accuracy_time.png')}")
         except ImportError as error:
             print(f"without accuracy_time.png: {error}")
-
-
-def draw_run(path: Path, points: Sequence[Point], title: str) -> Path:
-    """Draw a run's PSNR, and below it the flow error if known, against seconds."""
-    figure, axes = _curves([(points, {"color": "C0", "linewidth": 2})])
-    axes[0].set_title(title)
-    return save(figure, path)
 
 
 def draw_scene(path: Path, groups: Mapping[tuple, Sequence[Row]], title: str, published: Sequence) -> Path:
@@ -87,9 +83,8 @@ def draw_scene(path: Path, groups: Mapping[tuple, Sequence[Row]], title: str, pu
     every = [(key, point) for key, group in groups.items() for row in group for point in row["points"]]
     front = [every[i] for i in pareto_front([(point.seconds, point.psnr) for _, point in every])]
     keys = list(dict.fromkeys(key for key, _ in front))
-    styles = {
-        key: {"color": f"C{i % 10}", "linestyle": "--" if i >= 10 else "-"} for i, key in enumerate(keys)
-    }
+    dashes = "-", "--"
+    styles = {key: {"color": f"C{i % 10}", "linestyle": dashes[i >= 10]} for i, key in enumerate(keys)}
     grey = {"color": "0.8", "zorder": 1}
     lines = [(row["points"], styles.get(key, grey)) for key, group in groups.items() for row in group]
     figure, axes = _curves(lines, [other.seconds for other in published])
@@ -138,13 +133,7 @@ def _stars(axis, published: Sequence, first: int) -> None:
     axis.legend(fontsize="x-small", loc="lower right")
 
 
-def draw_lengths(
-    path: Path,
-    points: Mapping[str, Sequence[Sequence[tuple[float, float]]]],
-    title: str,
-    published: Sequence,
-    colors,
-) -> Path:
+def draw_lengths(path: Path, points: Mapping, title: str, published: Sequence, colors: Mapping) -> Path:
     """Draw a point a run and a line a method over seconds of training; a method keeps its color.
 
     Args:
@@ -289,14 +278,6 @@ def draw_beside(path: Path, runs: Mapping[str, Row], near: float, about: str) ->
     return save(figure, path)
 
 
-def draw_canonical(path: Path, rivals: Mapping[str, Row]) -> Path | None:
-    """Draw the view nearest to the canonical time by each method; None if they share no view with a sheet."""
-    first = next(iter(rivals.values()))
-    usual = 0.5 if first["dataset"].endswith("hypernerf") else 0.0
-    at = first["metrics"]["protocol"].get("canonical_time", usual)
-    return draw_beside(path, rivals, at, f"{first['scene']}, near the canonical time")
-
-
 def draw_sheet(path: Path, runs: Mapping[str, Row]) -> Path | None:
     """Draw a row for each scene: truth, result and error of a view; None if no run has a sheet."""
     found = {scene: sheets for scene in sorted(runs) if (sheets := sheets_of(runs[scene]["folder"]))}
@@ -314,12 +295,10 @@ def draw_resolution(path: Path, rows: Sequence[Row]) -> Path | None:
 
     Return None if no scene has two sizes.
     """
-    runs = Runs(
-        row | {"side": round(row["config"]["stage"]["fine"]["num_voxels"][-1][1] ** (1 / 3))}
-        for row in rows
-        if row["psnr"] is not None
-    )
-    lines = {}
+    runs, lines = Runs(), {}
+    for row in (row for row in rows if row["psnr"] is not None):
+        voxels = row["config"]["stage"]["fine"]["num_voxels"][-1][1]
+        runs.append(row | {"side": round(voxels ** (1 / 3))})
     for key, group in runs.by("scene", "method", "preset", "minutes", "iterations").items():
         *names, minutes, iterations = key
         label = ", ".join([*names, f"{minutes or iterations:g}"])

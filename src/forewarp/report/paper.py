@@ -23,7 +23,7 @@ from forewarp.metrics.registry import metric_of
 from forewarp.report import figures
 from forewarp.report.choices import every_run
 from forewarp.report.results import COUNTERPART, Row, Runs, portable, read_runs
-from forewarp.report.tables import Cell, Column, Difference, Section, Table, columns_of, rendered
+from forewarp.report.tables import Cell, Column, Difference, Section, Table, rendered
 
 PAPER = Path(__file__).with_name("paper.yaml")  # the printed numbers
 # What the runs of one row of a table have in common.
@@ -213,7 +213,7 @@ def comparison(table: PaperTable, runs: Runs, numbers: Mapping[str, int] | None 
                 both = zip(cells, printed.values)
                 differences = [Difference(cell.mean - float(v)) if cell and v else None for cell, v in both]
                 lines.append(["", "difference to the paper", *differences, *no_costs])
-    columns = columns_of(["method", "kind", *(_column(*column) for column in table.columns), *COSTS])
+    columns = ["method", "kind", *(_column(*column) for column in table.columns), *COSTS]
     rules = [rule for rule in rules if rule]
     return Table(columns, lines, marks=_marks(found, table, lines, 2), rules=rules)
 
@@ -240,7 +240,7 @@ def stand_in(table: PaperTable, runs: Runs, numbers: Mapping[str, int] | None = 
         lines.append([name_of(of_row), *cells_of(of_row, made), *costs_of(of_row, numbers), *beside])
     columns = ["measured", *(_column(*column) for column in made.columns), *COSTS, "published as"]
     columns += [f"published: {group.name} PSNR" for _, group in shown]
-    return Table(columns_of(columns), lines, marks=_marks(found, made, lines, 1))
+    return Table(columns, lines, marks=_marks(found, made, lines, 1))
 
 
 def counterpart(table: PaperTable, runs: Runs) -> PaperTable | None:
@@ -271,15 +271,13 @@ def with_means(table: PaperTable, runs: Runs) -> PaperTable:
         own = [group for group in table.groups if len(group.scenes) == 1 and group.scenes[0] in scenes]
         groups.append(own[0]._replace(name=name, scenes=scenes))
         for i, row in enumerate(rows):
-            values = dict(zip(table.columns, row.values))
-            texts = [[values[group, metric] for group in own] for metric in own[0].metrics]
-            rows[i] = row._replace(values=(*row.values, *map(_printed_mean, texts)))
+            values, means = dict(zip(table.columns, row.values)), []
+            for metric in own[0].metrics:
+                texts = [values[group, metric] for group in own]
+                digits = max(len(text.partition(".")[2]) for text in texts)
+                means.append("" if "" in texts else f"{fmean(map(float, texts)):.{digits}f}")
+            rows[i] = row._replace(values=(*row.values, *means))
     return replace(table, groups=groups, rows=rows)
-
-
-def _printed_mean(texts: list[str]) -> str:
-    digits = max(len(text.partition(".")[2]) for text in texts)
-    return "" if "" in texts else f"{fmean(map(float, texts)):.{digits}f}"
 
 
 def name_of(runs: Runs) -> str:
@@ -413,7 +411,11 @@ def _figures(runs: Runs, out: Path, curves: Path | None) -> list[Section]:
                 own = {name: methods[name] for name in METHODS if name in methods}
                 rivals = own if len(own) > 1 else rivals
             if rivals:
-                drawn = figures.draw_canonical(out / f"paper-canonical-{scene}.png", rivals)
+                first = next(iter(rivals.values()))
+                usual = 0.5 if dataset_of(first) == "hypernerf" else 0.0
+                at = first["metrics"]["protocol"].get("canonical_time", usual)
+                words = f"{scene}, near the canonical time"
+                drawn = figures.draw_beside(out / f"paper-canonical-{scene}.png", rivals, at, words)
                 add(f"Canonical comparison: {scene}", drawn)
         for dataset, method in product(DATASETS, METHODS[:2]):
             scenes = {run["scene"]: run for run in plain.where(method=method) if dataset_of(run) == dataset}
@@ -455,7 +457,7 @@ def write_ablation(folder: Path, out: Path, published: Path = PAPER) -> list[Pat
         [budget, len(found), *(sum(order.startswith(kind) for order in found) for kind in ORDERS)]
         for budget, found in orders.items()
     ]
-    columns = columns_of(["budget of a run", *(Column(kind, 0) for kind in ("rows", *ORDERS))])
+    columns = ["budget of a run", *(Column(kind, 0) for kind in ("rows", *ORDERS))]
     caption = "Rows of all tables below, by what became of the paper's order:"
     used = Runs(run for run in runs if any(run["ablation"] in table.variants for table in tables))
     about = _about(sections, used, numbers)
@@ -534,7 +536,7 @@ def _changes(table: PaperTable, group: Group, runs: Runs, orders: dict[str, list
             times = step / of_whole if step and of_whole else None
             line += [Estimate.of(list(psnr[row.variant].values())), change, order, step, times]
     kept = [line for line in lines if any(cell is not None for cell in line[2:])]
-    return Table(columns_of(columns), kept, "; ".join(captions) + ".")
+    return Table(columns, kept, "; ".join(captions) + ".")
 
 
 def verdict(change: float, printed: float | None, noise: float | None) -> str:

@@ -25,11 +25,8 @@ MARKS = {
     "html": {"best": Markup("<b>{}</b>"), "second": Markup("<u>{}</u>")},  # these escape what they hold
     "tex": {"best": "\\textbf{{{}}}", "second": "\\underline{{{}}}"},
 }
-_LATEX = {c: "\\" + c for c in "&%$#_{}"} | {
-    "²": "$^2$",
-    "\\": r"\textbackslash{}",
-    "^": r"\textasciicircum{}",
-}
+_LATEX = {c: "\\" + c for c in "&%$#_{}"}
+_LATEX |= {"²": "$^2$", "\\": r"\textbackslash{}", "^": r"\textasciicircum{}"}
 _LATEX |= {"±": r"$\pm$", "δ": r"$\delta$", "<": "$<$", ">": "$>$", "↑": r"$\uparrow$", "↓": r"$\downarrow$"}
 _LATEX |= {"~": r"\textasciitilde{}", "×": r"$\times$"}
 
@@ -71,24 +68,27 @@ class Table:
     """A table with a caption.
 
     Attributes:
-        columns: the columns, from left to right.
+        columns: the columns, from left to right; a title stands for a column of two digits.
         rows: rows of cells, one per column; a published number is a string, as printed.
         caption: text above the table.
         marks: (row, column) -> ``best`` or ``second``.
         rules: indices of rows with a line above, in LaTeX and HTML.
     """
 
-    columns: Sequence[Column]
+    columns: Sequence[Column | str]
     rows: Sequence[Sequence[Cell]]
     caption: str = ""
     marks: Mapping[tuple[int, int], str] = field(default_factory=dict)
     rules: Sequence[int] = ()
 
+    def __post_init__(self) -> None:
+        columns = [Column(column) if isinstance(column, str) else column for column in self.columns]
+        object.__setattr__(self, "columns", columns)
+
     @classmethod
     def of(cls, rows: Iterable[Mapping], columns: Mapping[str, Column | str], caption: str = "") -> Table:
-        """Select columns of rows, by name; a title stands for a column of two digits, None is empty."""
-        cells = [[row.get(name) for name in columns] for row in rows]
-        return cls(columns_of(columns.values()), cells, caption)
+        """Select columns of rows, by name; None is empty."""
+        return cls([*columns.values()], [[row.get(name) for name in columns] for row in rows], caption)
 
     def __str__(self) -> str:
         """Return the table for a Markdown page, numbers aligned to the right."""
@@ -138,11 +138,6 @@ class Table:
         file = io.StringIO()
         csv.writer(file, lineterminator="\n").writerows(lines)  # None is empty
         return file.getvalue()
-
-
-def columns_of(columns: Iterable[Column | str]) -> list[Column]:
-    """Turn titles into columns of two digits."""
-    return [Column(column) if isinstance(column, str) else column for column in columns]
 
 
 def score_columns(names: Iterable[str]) -> dict[str, Column]:
