@@ -54,12 +54,20 @@ def test_cameras_come_in_the_order_of_time_under_our_names(tmp_path):
         torch.testing.assert_close(found.cameras[name].camera_to_world, camera.camera_to_world)
 
 
+@pytest.mark.parametrize("place", ["sparse/0", "sparse", "colmap/sparse/0"])
+def test_a_model_is_found_where_colmap_and_nerfstudio_put_it(tmp_path, place):
+    cameras = cameras_on_arc(3)
+    write_model(tmp_path / place, cameras, POINTS)
+    assert read_model(tmp_path).cameras.keys() == cameras.keys()
+
+
 def test_what_cannot_be_read_is_refused(tmp_path):
     with pytest.raises(ValueError, match="expected a folder with cameras.bin, images.bin and points3D.bin"):
         read_model(tmp_path)
-    write_model(tmp_path / "fish", cameras_on_arc(3), POINTS, "OPENCV_FISHEYE", LENS)
-    with pytest.raises(ValueError, match="with k1 k2 k3 p1 p2, as OPENCV, but got OPENCV_FISHEYE; undistort"):
-        read_model(tmp_path / "fish")
+    for lens in ("OPENCV_FISHEYE", "SIMPLE_DIVISION"):  # the second has a k, which is none of Brown's
+        write_model(tmp_path / lens, cameras_on_arc(3), POINTS, lens, LENS)
+        with pytest.raises(ValueError, match=f"with k1 k2 k3 p1 p2, as OPENCV, but got {lens}; undistort"):
+            read_model(tmp_path / lens)
     write_model(tmp_path / "torn", cameras_on_arc(3), POINTS)
     with pytest.raises(ValueError, match="a picture frame_000002.jpg, as the model has, but got none"):
         read_model(tmp_path / "torn", {"picture_000001.jpg": "frame_000001.jpg"})

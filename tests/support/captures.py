@@ -125,6 +125,7 @@ def write_model(folder, cameras, points, model="OPENCV", lens=(0.0, 0.0, 0.0, 0.
     numbers = {
         "OPENCV": (one.fx, one.fy, one.cx, one.cy, *lens),
         "SIMPLE_RADIAL": (one.fx, one.cx, one.cy, lens[0]),
+        "SIMPLE_DIVISION": (one.fx, one.cx, one.cy, lens[0]),
         "OPENCV_FISHEYE": (one.fx, one.fy, one.cx, one.cy, *lens),
     }[model]
     (folder / "cameras.txt").write_text(f"1 {model} {one.width} {one.height} {' '.join(map(str, numbers))}\n")

@@ -25,6 +25,9 @@ _BATCH, _PAIR_BATCH = 8, 48  # images and pairs between two updates of the progr
 # its other points if it has fewer sure ones; an error of so many pixels hardly counts.
 _SURE_VIEWS, _SURE_ERROR, _MIN_POINTS, _LOSS_SCALE = 4, 1.5, 30, 0.5
 _START_VIEWS, _START_ERROR = 3, 1.5  # of points that particles begin from
+# Camera models of Brown's distortion; a ``k`` of another, as of SIMPLE_DIVISION, is another lens.
+_MODELS = {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"}
+_PLACES = ("", "sparse/0", "sparse", "colmap/sparse/0")  # of a model in a folder that is given
 _PARAMETERS = {"f", "fx", "fy", "cx", "cy", "k", "k1", "k2", "k3", "p1", "p2"}
 
 
@@ -107,7 +110,7 @@ def _camera(image: pycolmap.Image) -> Camera:
     names = (name.strip() for name in camera.params_info.split(","))
     values = dict(zip(names, map(float, camera.params)))
     beyond = any(value != 0 for name, value in values.items() if name not in _PARAMETERS)
-    if beyond or "FISHEYE" in camera.model_name or not {"f", "fx"} & values.keys():
+    if beyond or camera.model_name not in _MODELS:
         raise ValueError(
             f"{image.name}: expected a camera model with k1 k2 k3 p1 p2, as OPENCV, but got "
             f"{camera.model_name}; undistort the pictures (colmap image_undistorter)"
@@ -124,18 +127,25 @@ def read_model(folder: Path, originals: Mapping[str, str] | None = None) -> Reco
     """Read a COLMAP model, binary or text.
 
     Args:
-        folder: of the model.
+        folder: of the model, or one with ``sparse/0``, ``sparse`` or ``colmap/sparse/0`` in it.
         originals: names of images in the model by those that they are to have; None: they stay.
 
     Raises:
         ValueError: where there is none, or one that cannot be read, or that has other images.
     """
     names = "cameras", "images", "points3D"
-    if not any(all((folder / f"{n}.{kind}").is_file() for n in names) for kind in ("bin", "txt")):
+    models = [
+        folder / place
+        for place in _PLACES
+        for kind in ("bin", "txt")
+        if all((folder / place / f"{n}.{kind}").is_file() for n in names)
+    ]
+    if not models:
         raise ValueError(
             f"colmap: expected a folder with cameras.bin, images.bin and points3D.bin (or .txt), but got "
             f"{folder}; it is often called sparse/0"
         )
+    folder = models[0]
     try:
         model = pycolmap.Reconstruction(folder)
     except (RuntimeError, ValueError, IndexError, OverflowError, MemoryError) as error:
