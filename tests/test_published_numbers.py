@@ -245,7 +245,6 @@ FAULTS = {
     "tineuvox_s": [PADDED, FROZEN],
     "tineuvox_b": [PADDED, FROZEN],
     "neural_volumes": [
-        "at first the warp draws all points to the middle (from_identity)",
         "at first most rays are opaque (first_opacity)",
         "pictures are drawn with random steps (jitter_in_pictures)",
     ],

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import bisect
+import math
 from collections.abc import Sequence, Set
+from functools import partial
 
 import torch
 from torch import Tensor, nn
@@ -159,11 +161,21 @@ class Template(nn.Module):
         return torch.sigmoid(self.color_head(shaded))
 
 
-def start_as_glorot(layer: nn.Module) -> None:
-    """Give a linear layer Glorot's uniform weights and a bias of 0; leave others as they are."""
-    if isinstance(layer, nn.Linear):
-        nn.init.xavier_uniform_(layer.weight)
-        nn.init.zeros_(layer.bias)
+def start_as_glorot(layer: nn.Module, gain: float = 1.0) -> None:
+    """Give a linear layer or a convolution Glorot's uniform weights and a bias of 0; leave others alone.
+
+    A transposed convolution counts the weights that one of its outputs reads, and starts equal within blocks
+    of its stride, so that its outputs show no pattern (Neural Volumes).
+    """
+    if not isinstance(layer, (nn.Linear, nn.Conv2d, nn.ConvTranspose3d)):
+        return
+    spreads = isinstance(layer, nn.ConvTranspose3d)
+    nn.init.xavier_uniform_(layer.weight, gain * math.prod(layer.stride) ** 0.5 if spreads else gain)
+    nn.init.zeros_(layer.bias)
+    for axis, stride in enumerate(layer.stride if spreads else (), 2):
+        first = torch.arange(0, layer.weight.shape[axis], stride)
+        blocks = layer.weight.detach().index_select(axis, first).repeat_interleave(stride, axis)
+        layer.weight.data.copy_(blocks)
 
 
 class TimeCodes(nn.Module):
@@ -301,6 +313,8 @@ def drawn(rows: Tensor, count: int | None, generator: torch.Generator) -> Tensor
 DEVIATION_SCALE = 0.01  # of the layer that gives the logarithm of the deviation
 _SLOPE = 0.2  # of leaky ReLUs
 _LEAST = 1e-3  # least total weight of the maps at a point
+_SHORT = 1e-5  # added to the squared length of a quaternion
+_start_leaky = partial(start_as_glorot, gain=nn.init.calculate_gain("leaky_relu", _SLOPE))
 
 
 class PictureEncoder(nn.Module):
@@ -339,6 +353,9 @@ class PictureEncoder(nn.Module):
         )
         self.joined = nn.Linear(pictures * tower[-1] * (size[0] // by) * (size[1] // by), width)
         self.mean, self.deviation = nn.Linear(width, code), nn.Linear(width, code)
+        self.apply(_start_leaky)
+        for last in (self.mean, self.deviation):
+            start_as_glorot(last)
 
     def forward(self, pictures: Tensor) -> tuple[Tensor, Tensor]:
         """See the class."""
@@ -358,6 +375,8 @@ class VolumeDecoder(nn.Module):
         self.grow = nn.ModuleList(
             nn.ConvTranspose3d(i, o, 4, 2, 1) for i, o in zip(channels, (*channels[1:], out))
         )
+        self.apply(_start_leaky)
+        start_as_glorot(self.grow[-1])
 
     def forward(self, code: Tensor) -> Tensor:
         """See the class."""
@@ -369,16 +388,16 @@ class VolumeDecoder(nn.Module):
 
 class AffineMixture(nn.Module):
     """An inverse warp: ``W(x) = sum_i g_i(A_i x) A_i x / max(sum_i g_i(A_i x), 0.001)`` with affine maps
-    ``A_i x = s_i * R_i (x - t_i)`` and decoded weights ``g_i``, on a lattice.
+    ``A_i x = s_i * R_i (x - t_i)`` and decoded weights ``g_i`` on a lattice, beyond which they are as at its
+    border.
 
     Args:
         code: C.
         maps: their number.
         side: lattice points along an axis of the weights and of W.
         width, weight_width: hidden channels of the maps and of the weights.
-        from_identity: start from ``s = 1`` and ``R = I``, and go on beyond the cube with the weights at its
-            border. As released, scales are small and rotations any at first, so that W draws all points to
-            the middle, and weights are 0 beyond the cube, near which gradients have peaks.
+        from_identity: add 1 to ``s`` and the identity to ``R``, so that W is near the identity where codes
+            are small. As released, scales of either sign and any rotations are mixed at first.
     """
 
     def __init__(
@@ -399,6 +418,9 @@ class AffineMixture(nn.Module):
 
         self.scale, self.turn, self.shift = (head(width, maps * size) for size in (3, 4, 3))
         self.weight = head(weight_width, maps * side**3)
+        self.apply(_start_leaky)
+        for branch in (self.scale, self.turn, self.shift, self.weight):
+            start_as_glorot(branch[-1])
         axis = torch.linspace(-1, 1, side)
         z, y, x = torch.meshgrid(axis, axis, axis, indexing="ij")
         self.register_buffer("lattice", torch.stack([x, y, z], -1), persistent=False)
@@ -411,16 +433,17 @@ class AffineMixture(nn.Module):
         if self.from_identity:
             scale = 1 + scale
             turn = turn + turn.new_tensor([1.0, 0.0, 0.0, 0.0])
+        squared, eye = turn.square().sum(-1)[:, None, None], torch.eye(3).to(turn)
+        rotation = eye + (rotations(turn) - eye) * squared / (squared + _SHORT)  # smooth also where turn is 0
         flat = points.reshape(-1, 3) - shift[:, None]
-        found = scale[:, None] * (flat @ rotations(turn).mT)
+        found = scale[:, None] * (flat @ rotation.mT)
         return found.reshape(self.maps, *points.shape)
 
     def forward(self, code: Tensor) -> Tensor:
         """Code (C,) -> W at the lattice's points (3, S, S, S)."""
         places = self.moved(code, self.lattice)
         weights = self.weight(code).exp().reshape(self.maps, 1, *[self.side] * 3)
-        beyond = "border" if self.from_identity else "zeros"
-        weights = functional.grid_sample(weights, places, padding_mode=beyond, align_corners=True)
+        weights = functional.grid_sample(weights, places, padding_mode="border", align_corners=True)
         weights = weights[:, 0, ..., None]
         whole = (weights * places).sum(0) / weights.sum(0).clamp(min=_LEAST)
         return whole.permute(3, 0, 1, 2)

@@ -60,7 +60,7 @@ class NeuralVolumes(RayMethod):
         decoder: see ``fields.networks.VolumeDecoder``.
         maps, warp_side, warp_width, weight_width, from_identity: see ``fields.networks.AffineMixture``.
         first_opacity: of the volume before training, > 0; null: as released, about 0.7, with which most rays
-            are opaque at first, and have no gradient.
+            are opaque at first, and the background has no part in them.
         first_deviation: of the code before training, > 0; null: as released, about 1, many times the code.
         step: length of a step along a ray, in half sides of the cube around the scene's box.
         jitter_in_pictures: march from random places in pictures too, as the released code does.
@@ -145,13 +145,13 @@ class NeuralVolumes(RayMethod):
         return Volumes(torch.cat([color, functional.softplus(raw[3:])]), self.warp(code))
 
     def tint(self, camera: int | None) -> Tensor | None:
-        """Return what a camera makes of colour (2, 3): a factor, and what is added then.
+        """Return what a camera makes of colour (2, 3): a factor, and what is added then (learned in 1 / 255).
 
         A camera that took no training picture has the mean of the others; None: no camera is known.
         """
         if self.gain is None:
             return None
-        every = torch.stack([self.gain, self.bias])
+        every = torch.stack([self.gain, self.bias / 255])
         return every[:, self.rows[camera]] if camera in self.rows else every.mean(1)
 
     def march(
@@ -165,23 +165,23 @@ class NeuralVolumes(RayMethod):
         """March R rays through the cube. Opacity adds up along a ray, until it is 1.
 
         ``tint``: of the camera that looks (2, 3), or of each ray's (2, R, 3); see ``tint``. ``generator``
-        draws where a ray begins, and the length of its steps; None: as they are on average.
+        draws where a ray begins, and the length of each step; None: as they are on average.
         """
         half, corner = self.reach, torch.ones_like(self.center)
         origins, directions = (rays.origins.to(corner) - self.center) / half, rays.directions.to(corner)
         near, far = clip_to_box(origins, directions, rays.near / half, rays.far / half, -corner, corner)
         met = (far > near).nonzero()[:, 0]
         origins, directions, near, far = origins[met], directions[met], near[met], far[met]
-        begin, length = near - 0.5 * self.step, torch.full_like(near, self.step)
+        count = int((1.05 * (far - near).amax() / self.step).ceil()) + 2 if len(met) else 0  # steps vary
+        begin, lengths = near - 0.5 * self.step, near.new_full((len(near), count), self.step)
         if generator is not None:
             begin = near - self.step * torch.rand(near.shape, generator=generator).to(near)
-            length = length * (0.01 * torch.randn(near.shape, generator=generator)).exp().to(near)
-        count = int((((far - begin) / length).amax()).ceil()) + 1 if len(met) else 0
-        depths = begin[:, None] + length[:, None] * torch.arange(count, device=near.device)
+            lengths = lengths * (0.01 * torch.randn(lengths.shape, generator=generator)).exp().to(near)
+        depths = begin[:, None] + lengths.cumsum(1) - lengths
         inside = (depths >= near[:, None]) & (depths < far[:, None])
         row, _ = inside.nonzero(as_tuple=True)
         color, opacity = volumes.at(origins[row] + depths[inside][:, None] * directions[row])
-        optical = torch.zeros_like(depths).masked_scatter(inside, opacity * length[row])
+        optical = torch.zeros_like(depths).masked_scatter(inside, opacity * lengths[inside])
         through = optical.cumsum(1).clamp(max=1)
         weights = through - functional.pad(through, (1, 0))[:, :-1]
         rgb = near.new_zeros(len(near), 3).index_add(0, row, weights[inside][:, None] * color)
@@ -240,7 +240,6 @@ class NeuralVolumes(RayMethod):
     def faults(self) -> list[str]:
         """See ``Method``."""
         kept = {
-            "at first the warp draws all points to the middle (from_identity)": not self.from_identity,
             "at first most rays are opaque (first_opacity)": self.first["opacity"] is None,
             "pictures are drawn with random steps (jitter_in_pictures)": self.jitter_in_pictures,
         }
@@ -289,14 +288,15 @@ def shots_of(scene: Scene, wanted: int | None) -> list[list[Frame]]:
 
 
 def fitted_picture(rgba: Tensor, size: tuple[int, int]) -> Tensor:
-    """Fit a picture (H, W, 4) uint8, over white, into the top left of one of a size: (3, *size) uint8."""
+    """Fit a picture (H, W, 4) uint8, over white, into the middle of a grey (3, *size) one."""
     alpha = rgba[..., 3:].float() / 255
     rgb = (alpha * rgba[..., :3].float() + (1 - alpha) * 255).permute(2, 0, 1)
     factor = min(size[0] / rgb.shape[1], size[1] / rgb.shape[2])
     fits = [max(1, min(most, round(side * factor))) for side, most in zip(rgb.shape[1:], size)]
     small = functional.interpolate(rgb[None], fits, mode="bilinear", antialias=True)[0]
-    whole = torch.zeros(3, *size, dtype=torch.uint8)
-    whole[:, : fits[0], : fits[1]] = small.round().clamp(0, 255).to(torch.uint8)
+    whole = torch.full((3, *size), int(_MEAN), dtype=torch.uint8)  # what the encoder reads as 0
+    top, left = ((most - side) // 2 for most, side in zip(size, fits))
+    whole[:, top : top + fits[0], left : left + fits[1]] = small.round().clamp(0, 255).to(torch.uint8)
     return whole
 
 
