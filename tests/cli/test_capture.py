@@ -74,15 +74,13 @@ def test_mistakes_end_before_anything_is_loaded(in_tmp, words, says):
     [
         (["images=2024_11"], "images: expected an existing folder, but got none: 2024_11;"),
         (["video=VID (1),a=b.mp4"], "video: expected an existing file, but got none: VID (1),a=b.mp4;"),
-        (["video=few.mp4"], "hundreds of features to match, but got 6 in a picture; there is hardly any"),
         (["images=empty"], "empty: expected a folder of many pictures, PNG or JPEG, but got none"),
     ],
 )
 def test_a_refusal_is_one_line_and_leaves_nothing(refused, in_tmp, words, says):
-    write_film(in_tmp / "few.mp4", numbered(4))
     (in_tmp / "empty").mkdir()
     assert says in refused("capture", "threads=1", *words)
-    assert sorted(path.name for path in in_tmp.iterdir()) == ["empty", "few.mp4"]
+    assert sorted(path.name for path in in_tmp.iterdir()) == ["empty"]
 
 
 def test_without_its_package_it_says_what_to_install(in_tmp, monkeypatch):
@@ -111,7 +109,16 @@ def test_a_camera_that_turns_is_refused(refused, in_tmp):
     write_film(in_tmp / "a.mp4", turned(6))
     said = refused("capture", "video=a.mp4", "out=new/hand", "threads=1", "features=400")
     assert "is explained by turning it; it only turns" in said
-    assert [path.name for path in in_tmp.iterdir()] == ["a.mp4"]
+    assert "force=true; what was found stays in new/.hand.work" in said
+    work = in_tmp / "new" / ".hand.work"
+    assert (work / "database.db").is_file()
+    assert len(list((work / "pictures").iterdir())) == 3
+
+
+def test_hardly_any_texture_is_refused(refused, in_tmp):
+    write_film(in_tmp / "few.mp4", numbered(4))
+    said = refused("capture", "threads=1", "video=few.mp4")
+    assert "hundreds of features to match, but got 6 in a picture; there is hardly any" in said
 
 
 def test_a_camera_that_stands_is_refused_also_by_images_with_spaces_and_alpha(refused, in_tmp):

@@ -36,6 +36,13 @@ _WHOLE = 0.9  # share of its duration after which a video counts as whole
 _STAMP = re.compile(r"Parsed_showinfo.* n: *\d+ .* pts_time:(\S+)")
 _DURATION = re.compile(r"Duration: (\d+):(\d+):([\d.]+)")
 _DAMAGE = re.compile("partial file|ended prematurely|corrupt")
+_HDR = {"arib-std-b67": "HLG", "smpte2084": "PQ"}
+_TRANSFER = re.compile(r"Video: .*\b(" + "|".join(_HDR) + r")\b")
+# 203 cd/m2 are the white of SDR (BT.2408); below 0.8 of it colours stay, above they are compressed.
+_TO_SDR = (
+    "zscale=tin={0}:pin=bt2020:min=bt2020nc:t=linear:npl=203:agamma=false,format=gbrpf32le,zscale=p=bt709,"
+    "tonemap=mobius:param=0.8:peak=4.9,zscale=t=bt709:m=bt709:r=pc"
+)
 
 
 @dataclass(frozen=True)
@@ -124,7 +131,9 @@ def _from_video(
     if count is None:
         count = max(_MIN_IMAGES, min(_ENOUGH, len(stamps) // 2))
     chosen, times = sharpest(stamps, sharpnesses, count), {}
-    with step("taking frames") as progress:
+    transfer = hdr_of(video)
+    mapped = f" ({_HDR[transfer]}, tone-mapped to SDR)" if transfer else ""
+    with step(f"taking frames{mapped}") as progress:
         for index, pixels in zip(chosen, extracted(video, chosen, size, threads)):
             name = f"frame_{index + 1:06d}.jpg"
             write_image(folder / name, pixels)
@@ -365,7 +374,17 @@ def extracted(
     if size is not None:
         fit = f"w='if(gt(iw,ih),min(iw,{size}),-1)':h='if(gt(iw,ih),-1,min(ih,{size}))'"
         filters += f",scale={fit}:flags=area"
+    transfer = hdr_of(video)
+    filters += f",{_TO_SDR.format(transfer)}" if transfer else ""
     yield from _decode(video, f"{filters},format=rgb24", "ppm", _Log(), threads)
+
+
+def hdr_of(video: Path) -> str | None:
+    """Return ffmpeg's name of the transfer of an HDR video, HLG or PQ; None: it is SDR."""
+    call = [imageio_ffmpeg.get_ffmpeg_exe(), "-hide_banner", "-nostdin", "-i", str(video)]
+    said = subprocess.run(call, capture_output=True).stderr.decode(errors="replace")
+    match = _TRANSFER.search(said)
+    return match and match[1]
 
 
 class _Log:

@@ -32,6 +32,7 @@ def capture(
     *,
     frames: int | None = None,
     size: int | None = 1600,
+    force: bool = False,
 ) -> dict:
     """Make a scene in ``out`` and return what was found, which ``capture.json`` there holds too.
 
@@ -44,9 +45,10 @@ def capture(
         step: gives a ``Progress`` for each step.
         frames: to choose from a video; None: 120, and at most every second one.
         size: most pixels of the longer side; with poses that are known images are left as stored.
+        force: go on where matches say that the camera stands or only turns.
 
     Raises:
-        ValueError: where nothing good comes of it, with advice; nothing is then left behind.
+        ValueError: where nothing good comes of it, with advice; frames, features and matches stay.
     """
     about = {**dataclasses.asdict(source), **dataclasses.asdict(search), "frames": frames, "size": size}
     del about["threads"]
@@ -54,7 +56,7 @@ def capture(
     with work_folder(out, about) as work:
         images = take(work, source, step, count=frames, size=size, threads=search.threads)
         if source.colmap is None:
-            found = find_poses(work, images, search, step)
+            found = find_poses(work, images, search, step, force)
         else:
             found = poses.read_model(source.colmap, images.originals)
         refuse_poses(found, images)
@@ -70,7 +72,7 @@ def capture(
     return facts
 
 
-def find_poses(work: Path, images: Frames, search: Search, step: Step) -> Reconstruction:
+def find_poses(work: Path, images: Frames, search: Search, step: Step, force: bool = False) -> Reconstruction:
     """Find poses, unless an earlier call has done so."""
     best, part = work / "best", work / "part"
     if best.is_dir():
@@ -80,7 +82,8 @@ def find_poses(work: Path, images: Frames, search: Search, step: Step) -> Recons
         database = poses.find_features(work, images.folder, images.masks, search, progress)
     with step("matches") as progress:
         poses.match(database, search, progress)
-    refuse_matches(database, images)
+    if not force:
+        refuse_matches(database, images)
     with step("poses") as progress:
         model = poses.reconstruct(database, images.folder, work / "models", search, progress)
     if model is None:
@@ -111,8 +114,8 @@ def work_folder(out: Path, about: Mapping[str, object]) -> Iterator[Path]:
         out: of the result.
         about: what the work depends on; work about anything else is removed first.
 
-    It is removed at the end, and where the work is refused, with the folders that were made for it; it stays
-    after Ctrl-C, a kill, errors of the system and bugs.
+    It is removed at the end, and where no frames could be taken, with the folders that were made for it; it
+    stays after a refusal of matches or poses, Ctrl-C, a kill, errors of the system and bugs.
 
     Raises:
         ValueError: where another call is at work.
@@ -139,7 +142,10 @@ def work_folder(out: Path, about: Mapping[str, object]) -> Iterator[Path]:
     except BaseException as error:
         # A refusal says what it got, unlike a bug, as a ``ValueError`` of NumPy's.
         is_refusal = isinstance(error, ValueError) and " but got " in str(error)
-        stays = not (is_refusal or isinstance(error, ImportError))
+        taken = (work / "pictures.json").exists()
+        stays = taken or not (is_refusal or isinstance(error, ImportError))
+        if is_refusal and taken:
+            raise ValueError(f"{error}; what was found stays in {work}") from error
         raise
     finally:
         if not stays:  # under the lock: what another call begins afterwards is its own

@@ -21,6 +21,7 @@ from forewarp.scene.camera import Camera, mean_up
 
 # Points beyond these quantiles are taken for outliers, unless they lie close to the rest.
 _QUANTILES, _SLACK, _MARGIN = (0.02, 0.98), 0.25, 0.05
+_LEAST_NEAR = 0.01  # of the points' median distance: what is burnt into a film lies before it
 _NEAR, _FAR = 0.5, 1.25  # of the nearest and the farthest points, as what moves may be nearer
 _ROLL = 0.01  # mean square of the sine by which a hand rolls a camera, and some more
 _LEVEL = 1e-3  # sine of the angle between up and ahead below which all cameras look up or down
@@ -86,7 +87,8 @@ def limits_of(found: Reconstruction) -> Limits:
     ends = np.array([low, high, *midway])
     nearest, farthest = np.quantile(distances, _QUANTILES)
     box = Box(tuple(ends.min(0) - pad), tuple(ends.max(0) + pad))
-    return Limits(_NEAR * float(nearest), _FAR * float(farthest), box)
+    near = max(_NEAR * float(nearest), _LEAST_NEAR * float(np.median(distances)))
+    return Limits(near, _FAR * float(farthest), box)
 
 
 def bounds_of(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -24,6 +24,7 @@ What one types most:
   matching=exhaustive           match every pair of pictures, where the camera comes back to where it was
   lens=SIMPLE_RADIAL            a simpler camera, where few pictures or points tell of the lens
   threads=N seed=N              processors; random choices
+  force=true                    go on where the camera is said to stand or only to turn
   overwrite=true                replace an earlier capture in out
 
 After Ctrl-C the same command goes on.
@@ -45,8 +46,12 @@ def capture(config) -> None:
     from forewarp.capture.scene import summary
     from forewarp.progress import Counted
 
+    if type(config.force) is not bool:
+        raise ValueError(f"force: expected true or false, but got {config.force}")
     search = Search(config.matching, config.lens, config.features, config.seed, config.threads)
-    facts = capture(Source(**source), out, search, Counted, frames=config.frames, size=config.size)
+    facts = capture(
+        Source(**source), out, search, Counted, frames=config.frames, size=config.size, force=config.force
+    )
     for line in summary(facts):
         print(line)
     print(f"written: {out}; see {Path(out) / PICTURE}")
