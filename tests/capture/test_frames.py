@@ -201,7 +201,7 @@ def test_images_of_a_folder_come_in_the_order_of_their_names(tmp_path):
     ours = ["picture_000001.png", "picture_000002.jpg", "picture_000003.png", "picture_000004.png"]
     assert frames.times == {name: number for number, name in enumerate(ours)}
     assert frames.originals == dict(zip(ours, ["img 1.png", "img 2.jpg", "img 2.png", "img 10.png"]))
-    assert frames.size == (32, 24)
+    assert set(frames.sizes.values()) == {(32, 24)}
     with Image.open(frames.folder / ours[3]) as image:
         assert image.size == (32, 24)
         assert image.getpixel((0, 0)) == (10, 10, 10)
@@ -229,10 +229,22 @@ def test_images_are_turned_and_made_smaller_but_for_known_poses(tmp_path, known)
     source = quarter(tmp_path / "p", exif=turned())
     frames = taken(tmp_path, source, size=32, colmap=tmp_path if known else None)
     with Image.open(frames.folder / "picture_000001.jpg") as image:
-        width, height = frames.size
-        assert image.size == frames.size == ((64, 48) if known else (24, 32))
+        width, height = size = frames.sizes["picture_000001.jpg"]
+        assert image.size == size == ((64, 48) if known else (24, 32))
         bright = [image.getpixel(place)[0] > 200 for place in ((3, 3), (width - 3, 3))]
         assert bright == [known, not known]
+
+
+def test_with_known_poses_images_lie_in_folders_of_cameras_and_differ_in_size(tmp_path):
+    for camera, size in (("cam00", (64, 48)), ("cam01", (48, 64))):
+        (tmp_path / "p" / camera).mkdir(parents=True)
+        for number in (3, 5, 6):
+            Image.new("RGB", size).save(tmp_path / "p" / camera / f"{number:04d}.png")
+    frames = taken(tmp_path, tmp_path / "p", colmap=tmp_path)
+    names = [f"cam0{camera}/{number:04d}.png" for number in (3, 5, 6) for camera in (0, 1)]
+    assert list(frames.originals.values()) == names
+    assert list(frames.times.values()) == pytest.approx([0, 0, 2 / 3, 2 / 3, 1, 1])
+    assert list(frames.sizes.values()) == 3 * [(64, 48), (48, 64)]
 
 
 def test_cut_outs_stay_cut_out(tmp_path):
@@ -259,6 +271,12 @@ def test_folders_that_are_no_capture_are_refused(tmp_path, count, odd, says):
     if odd:
         Image.new(*odd[:2]).save(tmp_path / "p" / "odd.png", exif=odd[2])
     with pytest.raises(ValueError, match=says):
+        taken(tmp_path, tmp_path / "p")
+
+
+def test_images_that_nothing_here_reads_are_named(tmp_path):
+    (quarter(tmp_path / "p") / "IMG_1.HEIC").touch()
+    with pytest.raises(ValueError, match=r"IMG_1.HEIC: expected PNG or JPEG, but got HEIC; convert"):
         taken(tmp_path, tmp_path / "p")
 
 

@@ -157,6 +157,19 @@ def test_poses_that_are_known_become_a_scene(ok, refused, in_tmp):
     assert not [path for path in (in_tmp / "captures").iterdir() if path.name != "hand"]
 
 
+def test_poses_without_points_become_a_scene_whose_limits_its_reader_derives(ok, in_tmp):
+    cameras = cameras_on_arc(8)
+    write_images(in_tmp / "pictures", cameras)
+    write_model(in_tmp / "sparse" / "0", cameras, POINTS[:0])
+    said = ok("capture", "images=pictures", "colmap=.", "out=captures/hand").out.splitlines()
+    assert said[2] == "points: none; box, near and far are derived when the scene is read"
+    assert not (in_tmp / "captures" / "hand" / "capture.png").exists()
+    scene = read_scene("captures", "hand")
+    frames = sorted((*scene.train, *scene.test), key=lambda frame: frame.time)
+    _, degrees, away = pose_errors([frame.camera for frame in frames], list(cameras.values()))
+    assert max(degrees.max(), away.max()) < 1e-5
+
+
 def test_known_poses_keep_cut_outs_as_they_are_stored(ok, refused, in_tmp):
     """With names as phones give them, of which the next line can be typed."""
     name = "VID (1), it's"

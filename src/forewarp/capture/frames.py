@@ -20,6 +20,7 @@ import torch
 from torch.nn.functional import adaptive_max_pool2d, interpolate
 
 from forewarp.data.images import SUFFIXES, common_header, in_order, read_image, write_image
+from forewarp.data.transforms import times_of
 from forewarp.drawing.images import at_most
 from forewarp.files import read_json, write_json
 
@@ -73,7 +74,7 @@ class Frames:
         rows: which of those found each image is.
         found: how many there were to choose from.
         edges: median width of the images' edges, in pixels of an image 640 wide.
-        size: (width, height) of all.
+        sizes: (width, height), by name; all alike, unless poses are known.
         originals: the user's names by ours; empty for a video.
     """
 
@@ -83,7 +84,7 @@ class Frames:
     rows: Sequence[int]
     found: int
     edges: float
-    size: tuple[int, int]
+    sizes: dict[str, tuple[int, int]]
     originals: Mapping[str, str]
 
 
@@ -116,7 +117,8 @@ def take(
         if source.masks is not None:
             _write_masks(dark, source.masks, done)
         write_json(work / _DONE, done)
-    return Frames(folder, dark if source.masks else None, **done | {"size": tuple(done["size"])})
+    sizes = {name: tuple(size) for name, size in done["sizes"].items()}
+    return Frames(folder, dark if source.masks else None, **done | {"sizes": sizes})
 
 
 def _from_video(
@@ -141,26 +143,36 @@ def _from_video(
             progress(len(times), len(chosen))
     if len(times) < len(chosen):
         raise ValueError(f"{video}: expected {len(chosen)} frames, but got {len(times)}; convert the video")
-    return _record(times, chosen, len(stamps), widths[chosen], pixels, {})
+    height, width = pixels.shape[:2]
+    return _record(times, chosen, len(stamps), widths[chosen], dict.fromkeys(times, (width, height)), {})
 
 
 def _from_folder(folder: Path, source: Source, size: int | None, step: Step) -> dict:
-    """Copy images of one size; times are even, in the order of the names.
+    """Copy images; times are even, in the order of the names.
+
+    Without known poses all have one size. With them, images may lie in subfolders, and those of several
+    cameras share a time where folders and numbers tell so: see ``transforms.times_of``.
 
     The copies have names of ours: COLMAP's list of pairs has no place for a space, and what comes later sorts
     plainly. Alpha is kept where all images have it.
     """
-    paths, as_stored = _images_in(source.images), source.colmap is not None
+    as_stored = source.colmap is not None
+    paths = _images_in(source.images, as_stored)
     if len(paths) < _MIN_IMAGES:
         got = f"{len(paths)} PNG or JPEG files" if paths else "none"
         raise ValueError(f"{source.images}: expected a folder of many pictures, PNG or JPEG, but got {got}")
-    has_alpha = common_header(paths).has_alpha
-    widths, originals, first = [], {}, None
+    numbers = dict(zip(paths, range(len(paths))))
+    if any(path.parent != source.images for path in paths):
+        names = [path.relative_to(source.images).with_suffix("").as_posix() for path in paths]
+        numbers = dict(zip(paths, times_of(names, [None] * len(names), str(source.images))[0]))
+        paths.sort(key=numbers.get)
+    has_alpha = common_header(paths, one_size=not as_stored).has_alpha
+    widths, originals, sizes, times, first = [], {}, {}, {}, None
     with step("reading pictures") as progress:
         for done, path in enumerate(paths, 1):
             pixels = read_image(path, upright=not as_stored).numpy()
             first = pixels.shape if first is None else first
-            if pixels.shape != first:
+            if pixels.shape != first and not as_stored:
                 raise ValueError(
                     f"{path}: expected {first[1]} x {first[0]} pixels as the first, but got "
                     f"{pixels.shape[1]} x {pixels.shape[0]}, as its EXIF orientation says; leave it out"
@@ -177,25 +189,34 @@ def _from_folder(folder: Path, source: Source, size: int | None, step: Step) -> 
             is_png = has_alpha or path.suffix.lower() == ".png"
             name = f"picture_{done:06d}{'.png' if is_png else '.jpg'}"
             write_image(folder / name, pixels)
-            originals[name] = path.name
+            originals[name] = path.relative_to(source.images).as_posix()
+            sizes[name], times[name] = (pixels.shape[1], pixels.shape[0]), float(numbers[path])
             widths.append(edge_width(pixels[..., :3].mean(-1)))
             progress(done, len(paths))
-    times = {name: float(number) for number, name in enumerate(originals)}
-    return _record(times, range(len(paths)), len(paths), widths, pixels, originals)
+    return _record(times, range(len(paths)), len(paths), widths, sizes, originals)
 
 
-def _record(
-    times: dict, rows: Sequence[int], found: int, widths, pixels: np.ndarray, originals: dict
-) -> dict:
+def _record(times: dict, rows: Sequence[int], found: int, widths, sizes: dict, originals: dict) -> dict:
     """Return the numbers of ``Frames``, as JSON has them: it knows no infinity."""
-    edges, (height, width) = min(float(np.median(widths)), 1e6), pixels.shape[:2]
-    numbers = {"times": times, "rows": list(rows), "found": found, "edges": edges, "size": (width, height)}
+    edges = min(float(np.median(widths)), 1e6)
+    numbers = {"times": times, "rows": list(rows), "found": found, "edges": edges, "sizes": sizes}
     return numbers | {"originals": originals}
 
 
-def _images_in(folder: Path) -> list[Path]:
-    """List images in order; other systems leave files with a leading dot beside them, which are none."""
-    return in_order(p for p in folder.iterdir() if p.suffix in SUFFIXES and not p.name.startswith("."))
+def _images_in(folder: Path, deep: bool = False) -> list[Path]:
+    """List images in order, with ``deep`` also those in subfolders; other systems leave files with a leading
+    dot beside them, which are none.
+
+    Raises:
+        ValueError: for images of HEIC, which nothing here reads.
+    """
+    files = [p for p in folder.glob("**/*" if deep else "*") if not p.name.startswith(".")]
+    if heic := sorted(p for p in files if p.suffix.lower() in (".heic", ".heif")):
+        raise ValueError(
+            f"{heic[0]}: expected PNG or JPEG, but got HEIC; convert the pictures to JPEG, or set the "
+            "phone's camera to its most compatible format"
+        )
+    return in_order(p for p in files if p.suffix in SUFFIXES)
 
 
 def shrunk(pixels: np.ndarray, height: int, width: int) -> np.ndarray:
@@ -221,9 +242,9 @@ def _write_masks(folder: Path, masks: Path, done: dict) -> None:
     There are as many as frames in the video, or images in the folder, in order; else a mask has the name of
     its image. A folder's images have names of the user's: there the name comes first.
     """
-    paths, originals, names = _images_in(masks), done["originals"], list(done["times"])
-    by_name = {path.stem: path for path in paths}
-    stems = [Path(originals.get(name, name)).stem for name in names]
+    paths, originals, names = _images_in(masks, deep=True), done["originals"], list(done["times"])
+    by_name = {path.relative_to(masks).with_suffix("").as_posix(): path for path in paths}
+    stems = [Path(originals.get(name, name)).with_suffix("").as_posix() for name in names]
     are_named, are_counted = all(stem in by_name for stem in stems), len(paths) == done["found"]
     if not are_named and not are_counted:
         raise ValueError(
@@ -232,8 +253,9 @@ def _write_masks(folder: Path, masks: Path, done: dict) -> None:
         )
     in_turn = are_counted and not (are_named and originals)  # frames may be counted from 0 or from 1
     chosen = [paths[row] for row in done["rows"]] if in_turn else [by_name[stem] for stem in stems]
-    (width, height), brightest = done["size"], 0
+    brightest = 0
     for name, path in zip(names, chosen):
+        width, height = done["sizes"][name]
         values = read_image(path)[..., 0]
         brightest = max(brightest, int(values.max()))
         # A pixel is kept out as soon as a part of it moves.

@@ -64,7 +64,8 @@ def capture(
         limits = scene.limits_of(found)
         with step("writing") as progress, folder_written_whole(out, ABOUT) as folder:
             scales = scene.write(folder, images, found, limits, progress)
-            write_png(folder / PICTURE, scene.draw(found, limits))
+            if limits is not None:
+                write_png(folder / PICTURE, scene.draw(found, limits))
             facts = scene.facts_of(source, images, found, limits, scales)
             files = (path for path in sorted(folder.rglob("*")) if path.is_file())
             facts["bytes"] = {path.relative_to(folder).as_posix(): path.stat().st_size for path in files}
@@ -101,8 +102,8 @@ def find_poses(work: Path, images: Frames, search: Search, step: Step, force: bo
 
 def _fingerprint(path: Path) -> str:
     """A digest of the name, bytes and time of change of a file, or of each file of a folder."""
-    files = [path] if path.is_file() else sorted(file for file in path.iterdir() if file.is_file())
-    states = [(file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in files]
+    files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
+    states = [(str(file), file.stat().st_size, file.stat().st_mtime_ns) for file in files]
     return hashlib.sha256(repr(states).encode()).hexdigest()
 
 

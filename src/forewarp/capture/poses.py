@@ -399,26 +399,27 @@ def refuse_poses(found: Reconstruction | None, frames: Frames, database: Path | 
         raise ValueError(
             f"poses: expected most of {total} pictures registered, but got {registered}; {advice}"
         )
-    if not len(found.seen):
-        raise ValueError(
-            "poses: expected points that cameras see, but got none; keep points3D and its tracks in it"
-        )
-    for camera in found.cameras.values():
-        if (camera.width, camera.height) != frames.size:
+    for name, camera in found.cameras.items():
+        if (camera.width, camera.height) != frames.sizes[name]:
             raise ValueError(
                 "colmap: expected cameras of {} x {} pixels, as the pictures, but got {} x {}; set images= to"
-                " the pictures that the model was made from".format(*frames.size, camera.width, camera.height)
+                " the pictures that the model was made from".format(
+                    *frames.sizes[name], camera.width, camera.height
+                )
             )
-    degrees = np.degrees(2 * np.arctan(camera.width / (2 * camera.fx)))
-    try:
-        check_lens(camera, "lens")
-        if degrees > MAX_DEGREES:
-            raise SceneError(f"lens: expected at most {MAX_DEGREES:.0f} degrees, but got {degrees:.0f}")
-    except SceneError as error:
-        text = str(error).partition(";")[0]
-        raise ValueError(
-            f"{text}; if it is a fisheye, film without it or undistort first; else {_WALK}"
-        ) from error
+    for camera in {(c.width, c.fx, c.lens): c for c in found.cameras.values()}.values():
+        degrees = np.degrees(2 * np.arctan(camera.width / (2 * camera.fx)))
+        try:
+            check_lens(camera, "lens")
+            if degrees > MAX_DEGREES:
+                raise SceneError(f"lens: expected at most {MAX_DEGREES:.0f} degrees, but got {degrees:.0f}")
+        except SceneError as error:
+            text = str(error).partition(";")[0]
+            raise ValueError(
+                f"{text}; if it is a fisheye, film without it or undistort first; else {_WALK}"
+            ) from error
+    if not len(found.seen):  # of known poses alone; the reader derives what points would tell
+        return
     extent = np.linalg.norm(found.centers - np.median(found.centers, axis=0), axis=1).max()
     parallax = extent / np.median(found.distances())
     if parallax < MIN_PARALLAX:

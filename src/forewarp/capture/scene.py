@@ -43,8 +43,10 @@ class Limits:
 
 def placed(found: Reconstruction) -> Reconstruction:
     """Rotate upwards to z and the mean direction of view to y, put the points' median into the origin, and
-    make the median distance between a camera and a point that it sees 1.
+    make the median distance between a camera and a point that it sees 1. Without points it stays as it is.
     """
+    if not len(found.seen):
+        return found
     cameras = list(found.cameras.values())
     up = upwards(cameras)
     ahead = np.mean([np.asarray(camera.camera_to_world)[:3, 2] for camera in cameras], 0)
@@ -69,12 +71,15 @@ def upwards(cameras: list[Camera]) -> np.ndarray:
     return up / np.linalg.norm(up)
 
 
-def limits_of(found: Reconstruction) -> Limits:
-    """Propose limits from the points, whose outliers do not count, and from where the cameras look.
+def limits_of(found: Reconstruction) -> Limits | None:
+    """Propose limits from the points, whose outliers do not count, and from where the cameras look; None
+    without points: the reader derives them.
 
     What moves has hardly a point. It is before what stands still, so the box also holds the middle of every
     camera's view from half the distance of its points on.
     """
+    if not len(found.seen):
+        return None
     distances, midway = found.distances(), []
     for row, camera in enumerate(found.cameras.values()):
         of_camera = distances[found.seen[:, 0] == row]
@@ -108,7 +113,7 @@ def bounds_of(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def write(
-    folder: Path, frames: Frames, found: Reconstruction, limits: Limits, progress: Progress
+    folder: Path, frames: Frames, found: Reconstruction, limits: Limits | None, progress: Progress
 ) -> list[int]:
     """Write the scene of all registered images, and smaller copies of them.
 
@@ -124,9 +129,9 @@ def write(
     """
     names = sorted(found.cameras, key=lambda name: frames.times[name])
     first, last = frames.times[names[0]], frames.times[names[-1]]
-    camera = found.cameras[names[0]]
-    has_alpha = common_header([frames.folder / name for name in names]).has_alpha
-    scales = [s for s in SCALES[1:] if min(camera.width, camera.height) // s >= _MIN_SIDE]
+    shortest = min(min(camera.width, camera.height) for camera in found.cameras.values())
+    has_alpha = common_header([frames.folder / name for name in names], one_size=False).has_alpha
+    scales = [s for s in SCALES[1:] if shortest // s >= _MIN_SIDE]
 
     def shots() -> Iterator[PosedShot]:
         for done, name in enumerate(names, 1):
@@ -136,12 +141,12 @@ def write(
                 height, width = (n // scale for n in pixels.shape[:2])
                 small = shrunk(pixels[: height * scale, : width * scale], height, width)
                 write_image(folder / f"images_{scale}" / name, small)
-            time = (frames.times[name] - first) / (last - first)
+            time = (frames.times[name] - first) / (last - first) if last > first else 0.0
             yield PosedShot(name, found.cameras[name], pixels, time)
             progress(done, len(names))
 
-    options = {"near": limits.near, "far": limits.far, "aabb": limits.box, "points": found.sure()}
-    write_scene(folder, shots(), **options)
+    options = {"near": limits.near, "far": limits.far, "aabb": limits.box} if limits else {}
+    write_scene(folder, shots(), points=found.sure(), **options)
     return scales
 
 
@@ -196,7 +201,7 @@ def _frustum(camera: Camera, depth: float) -> np.ndarray:
 
 
 def facts_of(
-    source: Source, frames: Frames, found: Reconstruction, limits: Limits, scales: list[int]
+    source: Source, frames: Frames, found: Reconstruction, limits: Limits | None, scales: list[int]
 ) -> dict:
     """Gather the numbers of ``capture.json``."""
     camera = next(iter(found.cameras.values()))
@@ -212,7 +217,7 @@ def facts_of(
         "left_out": [frames.originals.get(name, name) for name in left_out],
         "originals": frames.originals,
         "seconds": max(times) - min(times) if source.video is not None else None,
-        "reprojection_error": found.error,
+        "reprojection_error": found.error if limits else None,
         "points": len(found.points),
         "sure_points": len(found.sure()),
         "camera": {name: getattr(camera, name) for name in inner}
@@ -220,9 +225,9 @@ def facts_of(
         | {"degrees": math.degrees(2 * math.atan(camera.width / (2 * camera.fx)))},
         # The way of the camera, where the median distance of what it sees is 1.
         "path": float(np.linalg.norm(np.diff(found.centers, axis=0), axis=1).sum()),
-        "near": limits.near,
-        "far": limits.far,
-        "box": [*limits.box.low, *limits.box.high],
+        "near": limits and limits.near,
+        "far": limits and limits.far,
+        "box": limits and [*limits.box.low, *limits.box.high],
         "scales": scales,
     }
 
@@ -230,16 +235,21 @@ def facts_of(
 def summary(facts: dict) -> list[str]:
     """Say what was found in a few lines."""
     camera, box = facts["camera"], facts["box"]
-    size = " x ".join(f"{high - low:.2f}" for low, high in zip(box[:3], box[3:]))
-    all_sure = facts["sure_points"] == facts["points"]
-    sure = "" if all_sure else f", {facts['sure_points']:,} of them sure"
     lines = [
         f"registered: {facts['registered']} of {facts['pictures']} pictures, {camera['width']} x "
-        f"{camera['height']} pixels, reprojection error {facts['reprojection_error']:.2f} pixels",
-        f"camera: {camera['degrees']:.0f} degrees wide; its path is {facts['path']:.2f} long, where what it "
-        "sees is 1 away",
-        f"points: {facts['points']:,}{sure}; box {size}, near {facts['near']:.2f}, far {facts['far']:.2f}",
+        f"{camera['height']} pixels",
+        f"camera: {camera['degrees']:.0f} degrees wide; its path is {facts['path']:.2f} long",
+        "points: none; box, near and far are derived when the scene is read",
     ]
+    if box is not None:
+        size = " x ".join(f"{high - low:.2f}" for low, high in zip(box[:3], box[3:]))
+        all_sure = facts["sure_points"] == facts["points"]
+        sure = "" if all_sure else f", {facts['sure_points']:,} of them sure"
+        lines[0] += f", reprojection error {facts['reprojection_error']:.2f} pixels"
+        lines[1] += ", where what it sees is 1 away"
+        lines[2] = (
+            f"points: {facts['points']:,}{sure}; box {size}, near {facts['near']:.2f}, far {facts['far']:.2f}"
+        )
     if facts["left_out"]:
         few = ", ".join(facts["left_out"][:3])
         advice = "; film slower and with more of what stands still" if facts["searched"] else ""

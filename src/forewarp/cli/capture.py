@@ -54,7 +54,8 @@ def capture(config) -> None:
     )
     for line in summary(facts):
         print(line)
-    print(f"written: {out}; see {Path(out) / PICTURE}")
+    drawn = Path(out) / PICTURE
+    print(f"written: {out}" + (f"; see {drawn}" if drawn.is_file() else ""))
     where = [text_override("data.root", str(out.parent)), text_override("data.scene", out.name)]
     print(f"next: {command_line('train', ['experiment=video_with_poses', *where])}")
 

@@ -112,15 +112,15 @@ def inspect_image(path: Path, size: tuple[int, int] | None = None, why: str = ""
     return header
 
 
-def common_header(paths: Iterable[Path]) -> Header:
-    """Check images that must have one size; alpha where all of them have it.
+def common_header(paths: Iterable[Path], one_size: bool = True) -> Header:
+    """Check images that must have one size, unless ``one_size`` is false; alpha where all of them have it.
 
     Raises:
         SceneError: as ``inspect_image``, and where one differs in size from the first.
     """
     size, have_alpha = None, True
     for path in paths:
-        header = inspect_image(path, size, " as the first")
+        header = inspect_image(path, size if one_size else None, " as the first")
         size, have_alpha = header.size, have_alpha and header.has_alpha
     return Header(size, have_alpha)
 
