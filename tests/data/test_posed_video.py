@@ -97,6 +97,58 @@ def test_points_that_never_move_are_in_the_scenes_units(tmp_path):
     torch.testing.assert_close(before[0], after[0], atol=1e-3, rtol=0)
 
 
+HEAD = (
+    "ply\nformat {} 1.0\nelement vertex {}\n"
+    + "".join(f"property float {axis}\n" for axis in "xyz")
+    + "end_header\n"
+)
+
+
+@pytest.mark.parametrize("kind", ["ascii", "binary_little_endian", "binary_big_endian"])
+def test_points_of_a_ply_are_those_of_points_npy(tmp_path, kind):
+    points = np.random.default_rng(0).uniform(-20, 20, (5, 3)).astype(np.float32) + MIDDLE.numpy()
+    write_scene(tmp_path / "npy", posed_shots(), near=20.0, far=120.0, points=points)
+    write_scene(tmp_path / "ply", posed_shots(), near=20.0, far=120.0)
+    folder, expected = tmp_path / "ply", read_scene(tmp_path, "npy").still
+    order = ">" if kind == "binary_big_endian" else "<"
+    table = np.zeros(5, [("red", "u1"), ("x", f"{order}f4"), ("z", f"{order}f8"), ("y", f"{order}f4")])
+    for axis, values in zip("xyz", points.T):
+        table[axis] = values
+    head = (
+        f"ply\nformat {kind} 1.0\nelement vertex 5\nproperty uchar red\nproperty float x\nproperty double z\n"
+    )
+    head += "property float y\nelement face 1\nproperty list uchar int i\nend_header\n"
+    text = "\n".join(" ".join(map(str, row)) for row in table.tolist()) + "\n3 0 1 2\n"
+    body = text.encode() if kind == "ascii" else table.tobytes()
+    (folder / "sparse_pc.ply").write_bytes(head.encode() + body)
+    torch.testing.assert_close(read_scene(tmp_path, "ply").still, expected)
+    (folder / "sparse_pc.ply").rename(folder / "cloud.ply")
+    content = json.loads((folder / FILE).read_text())
+    (folder / FILE).write_text(json.dumps(content | {"ply_file_path": "cloud.ply"}))
+    torch.testing.assert_close(read_scene(tmp_path, "ply").still, expected)
+    (folder / "cloud.ply").unlink()
+    scene = read_scene(tmp_path, "ply")
+    assert scene.still is None
+    assert any("ply_file_path names no file" in line for line in scene.protocol["assumed"])
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("solid\n", "a PLY whose first element is vertices with x, y, z"),
+        ("ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n0\n", "with x, y, z"),
+        (HEAD.format("binary_little_endian", 9) + "short", "expected 9 vertices, but got a file that ends"),
+        (HEAD.format("ascii", 2) + "0 0 0\n1 1\n", "expected 6 finite numbers, but got 5 values"),
+        (HEAD.format("ascii", 1).replace("float z", "list uchar int z") + "0", "vertices of plain numbers"),
+    ],
+)
+def test_a_ply_that_cannot_be_read_is_refused(tmp_path, text, says):
+    write_scene(tmp_path / "toy", posed_shots(), near=20.0, far=120.0)
+    (tmp_path / "toy" / "sparse_pc.ply").write_text(text)
+    with pytest.raises(SceneError, match=says):
+        read_scene(tmp_path, "toy")
+
+
 def test_each_frame_may_have_its_own_camera(made):
     views = posed_cameras(5) + posed_cameras(5, size=(16, 12), lens=None)
     views[2] = replace(views[2], fx=50.0, cx=11.0)

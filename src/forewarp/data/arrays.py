@@ -79,13 +79,17 @@ def shortened(truth: Truth, end: float) -> Truth | None:
 
 
 def read_cloud(path: Path, columns: int) -> np.ndarray:
-    """Read points (N, columns) float32, N >= 1, places first, from a .npy file or the ``v`` lines of an .obj.
+    """Read points (N, columns) float32, N >= 1, places first, from a .npy file, the ``v`` lines of an .obj
+    or the vertices of a .ply, of which places alone are read.
 
     Raises:
         SceneError: where the file is missing, has another shape, values that are not finite, or places beyond
             ``MOST_UNITS``.
     """
-    points = _obj_vertices(path, columns) if path.suffix == ".obj" else load_numpy(path)
+    if path.suffix == ".obj":
+        points = _obj_vertices(path, columns)
+    else:
+        points = _ply_places(path) if path.suffix == ".ply" else load_numpy(path)
     shape, advice = getattr(points, "shape", ()), "export it again"
     if len(shape) != 2 or shape[1] != columns or not shape[0] or points.dtype.kind not in "iuf":
         got = f"shape {shape}" if hasattr(points, "shape") else "several arrays"
@@ -101,6 +105,41 @@ def read_cloud(path: Path, columns: int) -> np.ndarray:
         got = f"{farthest.max():g} in row {farthest.argmax()}"
         raise mismatch(path, f"points within {MOST_UNITS:g} units", got, advice)
     return points
+
+
+_PLY_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
+_PLY_TYPES = {
+    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
+    **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
+    **{"float": "f4", "float32": "f4", "double": "f8", "float64": "f8"},
+}
+
+
+def _ply_places(path: Path) -> np.ndarray:
+    """Read the places (N, 3) of a PLY's vertices, text or binary, which must be its first element."""
+    with opened(path, MOST_POINTS) as stream:
+        head, _, body = stream.read().partition(b"end_header")
+    lines = [line.split() for line in head.decode("latin1").splitlines()]
+    order = next((_PLY_ORDERS.get(line[1]) for line in lines if line[:1] == ["format"] and line[1:]), None)
+    starts = [i for i, line in enumerate(lines) if line[:1] == ["element"]]
+    vertices = lines[starts[0] : (*starts, None)[1]] if starts else [[]]
+    columns = [(line[-1], _PLY_TYPES.get(line[1])) for line in vertices[1:] if line[:1] == ["property"]]
+    is_read = vertices[0][1:2] == ["vertex"] and vertices[0][-1].isdecimal() and order is not None
+    if not head.startswith(b"ply") or not is_read or not {"x", "y", "z"} <= dict(columns).keys():
+        raise mismatch(path, "a PLY whose first element is vertices with x, y, z", "another file")
+    if None in dict(columns).values() or len(dict(columns)) < len(columns):
+        raise mismatch(path, "vertices of plain numbers with different names", f"{columns}")
+    count = int(vertices[0][-1])
+    if order == "=":
+        words = body.split()[: count * len(columns)]
+        table = numbers_of([word.decode("latin1") for word in words], count * len(columns), str(path))
+        rows = dict(zip(dict(columns), np.array(table).reshape(count, -1).T))
+    else:
+        dtype, begin = np.dtype([(name, order + kind) for name, kind in columns]), body.find(b"\n") + 1
+        if len(body) - begin < count * dtype.itemsize:
+            raise mismatch(path, f"{count} vertices", "a file that ends before", "copy it again")
+        rows = np.frombuffer(body, dtype, count, begin)
+    return np.stack([np.asarray(rows[name], np.float64) for name in "xyz"], 1)
 
 
 def write_array(path: Path, values: Tensor | np.ndarray | None) -> None:

@@ -161,11 +161,20 @@ def read_scene(
         protocol["masks"] = (
             "ignore: PSNR is of the pixels that count, other metrics see the true colour elsewhere"
         )
+    cloud = _points_of(file, content)
+    if cloud is None and "ply_file_path" in content:
+        assumed.append(f"{file}: ply_file_path names no file: there are no points to begin from")
     if assumed := [*assumed, *filter(None, [told])]:
         protocol["assumed"] = assumed
-    cloud = file.parent / POINTS
-    still = space.points(read_cloud(cloud, 3)).float() if cloud.exists() else None
+    still = None if cloud is None else space.points(read_cloud(cloud, 3)).float()
     return Scene(scene, train, val, test, seen, start, has_alpha, protocol=protocol, still=still)
+
+
+def _points_of(file: Path, content: dict) -> Path | None:
+    """Find points that never move: ``points.npy``, the file's ``ply_file_path``, or ``sparse_pc.ply``."""
+    named = content.get("ply_file_path", "sparse_pc.ply")
+    paths = file.parent / POINTS, inside(file.parent, named, f"{file}: ply_file_path")
+    return next((path for path in paths if path.is_file()), None)
 
 
 @dataclass(frozen=True)
