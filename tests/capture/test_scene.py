@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -71,6 +72,20 @@ def test_limits_hold_what_moves_before_the_points():
     assert ((halfway > box.low) & (halfway < box.high)).all()
 
 
+def test_points_before_the_lens_neither_pull_near_to_it_nor_pass_unsaid():
+    """As a logo burnt into a film leaves them."""
+    found = placed(sparse_arc())
+    assert not limits_of(found).has_nearer
+    rows = np.arange(len(found.cameras))
+    points = np.concatenate([found.points, found.centers + 1e-8])
+    stuck = np.stack([rows, len(found.points) + rows], 1).repeat(40, 0)
+    more = {"points": points, "seen": np.concatenate([found.seen, stuck])}
+    more |= {name: np.resize(getattr(found, name), len(points)) for name in ("errors", "views")}
+    limits = limits_of(replace(found, **more))
+    assert limits.has_nearer
+    assert limits.near == pytest.approx(0.01, rel=0.2)
+
+
 def test_the_drawing_shows_cameras_points_and_box():
     found = placed(sparse_arc())
     image = draw(found, limits_of(found))
@@ -88,7 +103,9 @@ def test_facts_are_those_of_the_capture_and_are_told_with_advice():
     ours = [*found.cameras, "frame_000013.jpg", "frame_000014.jpg"]
     originals = {name: f"IMG {n}.jpg" for n, name in enumerate(ours, 1)}
     times = {name: float(n) for n, name in enumerate(ours)}
-    frames = Frames(Path("pictures"), None, times, range(14), 14, 1.0, (320, 240), originals)
+    frames = Frames(
+        Path("pictures"), None, times, range(14), 14, 1.0, dict.fromkeys(times, (320, 240)), originals
+    )
     limits = Limits(0.5, 2.0, Box((-1, -1, -1), (1, 2, 3)))
     facts = facts_of(Source(images=Path("p")), frames, found, limits, [2])
     chord = 2 * 4 * np.sin(np.radians(70 / 11) / 2)
@@ -106,3 +123,4 @@ def test_facts_are_those_of_the_capture_and_are_told_with_advice():
     known = summary(facts | {"searched": False, "sure_points": 300})
     assert known[2].startswith("points: 400, 300 of them sure; box")
     assert known[3] == left_out
+    assert any("as captions or logos" in line for line in summary(facts | {"has_nearer": True}))

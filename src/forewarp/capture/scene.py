@@ -34,11 +34,14 @@ _FRUSTA = 24  # cameras drawn with their view
 
 @dataclass(frozen=True)
 class Limits:
-    """``near`` and ``far`` along the unit ray, and a ``box`` around all that is seen."""
+    """``near`` and ``far`` along the unit ray, and a ``box`` around all that is seen; ``has_nearer`` says
+    that points lie so near that they can be no part of the scene.
+    """
 
     near: float
     far: float
     box: Box
+    has_nearer: bool = False
 
 
 def placed(found: Reconstruction) -> Reconstruction:
@@ -92,8 +95,9 @@ def limits_of(found: Reconstruction) -> Limits | None:
     ends = np.array([low, high, *midway])
     nearest, farthest = np.quantile(distances, _QUANTILES)
     box = Box(tuple(ends.min(0) - pad), tuple(ends.max(0) + pad))
-    near = max(_NEAR * float(nearest), _LEAST_NEAR * float(np.median(distances)))
-    return Limits(near, _FAR * float(farthest), box)
+    least = _LEAST_NEAR * float(np.median(distances))
+    near = max(_NEAR * float(nearest), least)
+    return Limits(near, _FAR * float(farthest), box, has_nearer=near == least)
 
 
 def bounds_of(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -227,6 +231,7 @@ def facts_of(
         "path": float(np.linalg.norm(np.diff(found.centers, axis=0), axis=1).sum()),
         "near": limits and limits.near,
         "far": limits and limits.far,
+        "has_nearer": limits is not None and limits.has_nearer,
         "box": limits and [*limits.box.low, *limits.box.high],
         "scales": scales,
     }
@@ -249,6 +254,11 @@ def summary(facts: dict) -> list[str]:
         lines[1] += ", where what it sees is 1 away"
         lines[2] = (
             f"points: {facts['points']:,}{sure}; box {size}, near {facts['near']:.2f}, far {facts['far']:.2f}"
+        )
+    if facts["has_nearer"]:
+        lines.append(
+            f"near: expected points from {facts['near']:.2g} on, but got nearer ones, as captions or logos "
+            "in the pictures make them, which also bend poses; give masks= in which these are bright"
         )
     if facts["left_out"]:
         few = ", ".join(facts["left_out"][:3])
