@@ -337,7 +337,7 @@ def test_masks_that_fit_nothing_or_mark_nothing_are_refused(tmp_path, names, val
 def test_hdr_comes_back_as_the_sdr_it_was_made_from(tmp_path, transfer):
     """Made by the formulas of BT.2100 and BT.2408: SDR white is 203 cd/m2."""
     rng = np.random.default_rng(0)
-    sdr = np.kron(rng.integers(20, 220, (6, 8, 3)), np.ones((8, 8, 1)))
+    sdr = np.kron(rng.integers(20, 230, (6, 8, 3)), np.ones((8, 8, 1)))
     to_2020 = np.array([[0.6274, 0.3293, 0.0433], [0.0691, 0.9195, 0.0114], [0.0164, 0.0880, 0.8956]])
     light = 203 * ((sdr / 255) ** 2.4 @ to_2020.T)  # cd/m2
     weights = np.array([0.2627, 0.6780, 0.0593])

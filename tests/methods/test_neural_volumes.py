@@ -284,7 +284,7 @@ def test_the_released_faults_and_what_mends_them_are_named():
     assert [fault.split()[-1] for fault in method(**released).faults()] == [f"({key})" for key in released]
     mended = method()
     assert mended.faults() == []
-    for note in ("the warp starts as the identity", "first opacity 0.1", "pictures are drawn without"):
+    for note in ("the warp starts near the identity", "first opacity 0.1", "pictures are drawn without"):
         assert note in mended.protocol()["departures"]
 
 

@@ -6,17 +6,18 @@ import torch
 
 from forewarp.data.module import DNeRFDataModule, SceneDataModule, blind_frames
 from forewarp.runs.doubts import doubts
+from forewarp.training.schedule import StageSettings
 from tests.support.tiny_scene import ball_scene
 
 SCENE = ball_scene(frames=3, size=8)
 
 
-def run(steps=5000, iterations=None, suspects=SceneDataModule.suspects, scene=SCENE):
+def run(steps=5000, iterations=None, suspects=SceneDataModule.suspects, scene=SCENE, **noted):
     """A finished run of one stage, ``fine``, which took 7.7 s."""
     data = SceneDataModule(lambda: scene)
     data.suspects = suspects
-    stage = SimpleNamespace(settings=SimpleNamespace(name="fine", iterations=iterations))
-    made = {"fine": {"steps": steps, "seconds": 7.7}}
+    settings = StageSettings("fine", {}, iterations=iterations, minutes=None if iterations else 0.05)
+    stage, made = SimpleNamespace(settings=settings), {"fine": {"steps": steps, "seconds": 7.7, **noted}}
     return SimpleNamespace(stages=[stage], datamodule=data, finished=lambda: made)
 
 
@@ -55,3 +56,10 @@ def test_cameras_that_see_nothing_of_the_box_are_counted():
     assert (blind_frames(SCENE), blind_frames(scene)) == (0, 1)
     (line,) = doubts(run(scene=scene), reaching(30))
     assert line.startswith(f"1 of {len(scene.train)} training cameras see nothing of the box")
+
+
+def test_images_that_never_came_in_are_counted():
+    (line,) = doubts(run(frames_in_play=2), reaching(30))
+    assert line.startswith(
+        f"{len(SCENE.train) - 2} of {len(SCENE.train)} training images were never trained on"
+    )

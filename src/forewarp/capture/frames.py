@@ -42,7 +42,7 @@ _TRANSFER = re.compile(r"Video: .*\b(" + "|".join(_HDR) + r")\b")
 # 203 cd/m2 are the white of SDR (BT.2408); below 0.8 of it colours stay, above they are compressed.
 _TO_SDR = (
     "zscale=tin={0}:pin=bt2020:min=bt2020nc:t=linear:npl=203:agamma=false,format=gbrpf32le,zscale=p=bt709,"
-    "tonemap=mobius:param=0.8:peak=4.9,zscale=t=bt709:m=bt709:r=pc"
+    "tonemap=mobius:param=0.8:peak=4.9:desat=0,zscale=t=bt709:m=bt709:r=pc"
 )
 
 
@@ -76,6 +76,7 @@ class Frames:
         edges: median width of the images' edges, in pixels of an image 640 wide.
         sizes: (width, height), by name; all alike, unless poses are known.
         originals: the user's names by ours; empty for a video.
+        assumed: a line about where times come from; None where that is plain.
     """
 
     folder: Path
@@ -86,6 +87,7 @@ class Frames:
     edges: float
     sizes: dict[str, tuple[int, int]]
     originals: Mapping[str, str]
+    assumed: str | None = None
 
 
 def take(
@@ -161,10 +163,11 @@ def _from_folder(folder: Path, source: Source, size: int | None, step: Step) -> 
     if len(paths) < _MIN_IMAGES:
         got = f"{len(paths)} PNG or JPEG files" if paths else "none"
         raise ValueError(f"{source.images}: expected a folder of many pictures, PNG or JPEG, but got {got}")
-    numbers = dict(zip(paths, range(len(paths))))
+    numbers, assumed = dict(zip(paths, range(len(paths)))), None
     if any(path.parent != source.images for path in paths):
         names = [path.relative_to(source.images).with_suffix("").as_posix() for path in paths]
-        numbers = dict(zip(paths, times_of(names, [None] * len(names), str(source.images))[0]))
+        times, assumed = times_of(names, [None] * len(names), str(source.images))
+        numbers = dict(zip(paths, times))
         paths.sort(key=numbers.get)
     has_alpha = common_header(paths, one_size=not as_stored).has_alpha
     widths, originals, sizes, times, first = [], {}, {}, {}, None
@@ -193,7 +196,8 @@ def _from_folder(folder: Path, source: Source, size: int | None, step: Step) -> 
             sizes[name], times[name] = (pixels.shape[1], pixels.shape[0]), float(numbers[path])
             widths.append(edge_width(pixels[..., :3].mean(-1)))
             progress(done, len(paths))
-    return _record(times, range(len(paths)), len(paths), widths, sizes, originals)
+    record = _record(times, range(len(paths)), len(paths), widths, sizes, originals)
+    return record | {"assumed": assumed}
 
 
 def _record(times: dict, rows: Sequence[int], found: int, widths, sizes: dict, originals: dict) -> dict:
@@ -210,13 +214,17 @@ def _images_in(folder: Path, deep: bool = False) -> list[Path]:
     Raises:
         ValueError: for images of HEIC, which nothing here reads.
     """
-    files = [p for p in folder.glob("**/*" if deep else "*") if not p.name.startswith(".")]
+    files = [p for p in folder.glob("**/*" if deep else "*") if not _is_hidden(p.relative_to(folder))]
     if heic := sorted(p for p in files if p.suffix.lower() in (".heic", ".heif")):
         raise ValueError(
             f"{heic[0]}: expected PNG or JPEG, but got HEIC; convert the pictures to JPEG, or set the "
             "phone's camera to its most compatible format"
         )
     return in_order(p for p in files if p.suffix in SUFFIXES)
+
+
+def _is_hidden(path: Path) -> bool:
+    return any(part.startswith(".") for part in path.parts)
 
 
 def shrunk(pixels: np.ndarray, height: int, width: int) -> np.ndarray:

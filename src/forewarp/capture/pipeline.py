@@ -83,8 +83,7 @@ def find_poses(work: Path, images: Frames, search: Search, step: Step, force: bo
         database = poses.find_features(work, images.folder, images.masks, search, progress)
     with step("matches") as progress:
         poses.match(database, search, progress)
-    if not force:
-        refuse_matches(database, images)
+    refuse_matches(database, images, force)
     with step("poses") as progress:
         model = poses.reconstruct(database, images.folder, work / "models", search, progress)
     if model is None:
@@ -103,6 +102,7 @@ def find_poses(work: Path, images: Frames, search: Search, step: Step, force: bo
 def _fingerprint(path: Path) -> str:
     """A digest of the name, bytes and time of change of a file, or of each file of a folder."""
     files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
+    files = [file for file in files if not any(part.startswith(".") for part in file.relative_to(path).parts)]
     states = [(str(file), file.stat().st_size, file.stat().st_mtime_ns) for file in files]
     return hashlib.sha256(repr(states).encode()).hexdigest()
 
@@ -146,7 +146,9 @@ def work_folder(out: Path, about: Mapping[str, object]) -> Iterator[Path]:
         taken = (work / "pictures.json").exists()
         stays = taken or not (is_refusal or isinstance(error, ImportError))
         if is_refusal and taken:
-            raise ValueError(f"{error}; what was found stays in {work}") from error
+            raise ValueError(
+                f"{error}; what was found stays in {work}, from which the same command goes on"
+            ) from error
         raise
     finally:
         if not stays:  # under the lock: what another call begins afterwards is its own

@@ -327,7 +327,7 @@ def adjust(model: pycolmap.Reconstruction, search: Search, progress: Progress) -
 MIN_FEATURES = 60  # of an image, in the median
 STILL = 0.01  # share of an image's longer side: a camera that stands shifts less
 BLURRED = 2.5  # pixels of an image 640 wide, as ``frames.edge_width`` has them
-TURNED = 0.015  # share of the shift that no rotation explains: by hand 0.010, with a long lens 0.028
+TURNED = 0.015  # share of shift that no rotation explains: turned by hand 0.010, moved with a long lens 0.028
 MIN_MODEL, MIN_REGISTERED = 3, 0.5  # images; share of them, where poses are searched for
 MAX_DEGREES = 130.0
 MAX_ERROR = 2.5  # pixels
@@ -353,8 +353,8 @@ class Evidence:
     unrotated: float
 
 
-def refuse_matches(database: Path, frames: Frames) -> None:
-    """Refuse images without features, and cameras that stand or only turn.
+def refuse_matches(database: Path, frames: Frames, force: bool = False) -> None:
+    """Refuse images without features and, unless ``force``, cameras that stand or only turn.
 
     Raises:
         ValueError: with what was found, and advice.
@@ -365,10 +365,12 @@ def refuse_matches(database: Path, frames: Frames) -> None:
             "pictures: expected hundreds of features to match, but got "
             f"{evidence.features:.0f} in a picture; {_advice(evidence, frames)}"
         )
+    if force:
+        return
     if evidence.shift < STILL:
         raise ValueError(
             f"camera: expected one that moves, but got matches that shift by {100 * evidence.shift:.1f} % of "
-            "the picture at most; walk around the subject while filming"
+            "the picture at most; walk around the subject while filming, or go on with force=true"
         )
     if evidence.unrotated < TURNED:
         raise ValueError(

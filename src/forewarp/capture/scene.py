@@ -220,6 +220,7 @@ def facts_of(
         "searched": source.colmap is None,
         "left_out": [frames.originals.get(name, name) for name in left_out],
         "originals": frames.originals,
+        "assumed": frames.assumed,
         "seconds": max(times) - min(times) if source.video is not None else None,
         "reprojection_error": found.error if limits else None,
         "points": len(found.points),
@@ -255,6 +256,8 @@ def summary(facts: dict) -> list[str]:
         lines[2] = (
             f"points: {facts['points']:,}{sure}; box {size}, near {facts['near']:.2f}, far {facts['far']:.2f}"
         )
+    if facts["assumed"]:
+        lines.append(f"assumed: {facts['assumed']}")
     if facts["has_nearer"]:
         lines.append(
             f"near: expected points from {facts['near']:.2g} on, but got nearer ones, as captions or logos "

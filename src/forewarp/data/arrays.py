@@ -123,7 +123,11 @@ def _ply_places(path: Path) -> np.ndarray:
     order = next((_PLY_ORDERS.get(line[1]) for line in lines if line[:1] == ["format"] and line[1:]), None)
     starts = [i for i, line in enumerate(lines) if line[:1] == ["element"]]
     vertices = lines[starts[0] : (*starts, None)[1]] if starts else [[]]
-    columns = [(line[-1], _PLY_TYPES.get(line[1])) for line in vertices[1:] if line[:1] == ["property"]]
+    columns = [
+        (line[-1], _PLY_TYPES.get(line[1]))
+        for line in vertices[1:]
+        if line[:1] == ["property"] and len(line) > 2
+    ]
     is_read = vertices[0][1:2] == ["vertex"] and vertices[0][-1].isdecimal() and order is not None
     if not head.startswith(b"ply") or not is_read or not {"x", "y", "z"} <= dict(columns).keys():
         raise mismatch(path, "a PLY whose first element is vertices with x, y, z", "another file")
@@ -133,7 +137,7 @@ def _ply_places(path: Path) -> np.ndarray:
     if order == "=":
         words = body.split()[: count * len(columns)]
         table = numbers_of([word.decode("latin1") for word in words], count * len(columns), str(path))
-        rows = dict(zip(dict(columns), np.array(table).reshape(count, -1).T))
+        rows = dict(zip(dict(columns), np.array(table).reshape(count, len(columns)).T))
     else:
         dtype, begin = np.dtype([(name, order + kind) for name, kind in columns]), body.find(b"\n") + 1
         if len(body) - begin < count * dtype.itemsize:

@@ -202,7 +202,7 @@ class SceneDataModule(LightningDataModule):
 
     suspects: tuple[str, ...] = (  # likeliest causes of a bad fit, for who reads this format
         "numbers too small for the scene: preset=fast in place of preset=demo",
-        "minutes too few for the method: raise budget.minutes",
+        "a method that needs more training: raise the budget",
         "motion or looks that the method cannot show: see docs, or model=particles",
     )
     picker = _of_batches("picker", "Chooses the training frame of the next batch; None: uniformly at random.")

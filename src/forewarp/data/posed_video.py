@@ -3,7 +3,8 @@
 A pose on disk is camera-to-world with OpenGL's axes (x right, y up, looking along -z). The camera
 (``w h fl_x fl_y cx cy k1 k2 k3 p1 p2 camera_model``) stands at the top or, where it differs, in a frame. All
 lengths (``near``, ``far``, ``aabb``; ``data.near``, ``data.far``, ``data.box``) are in the file's units,
-which may be any: the scene is normalised. The optional ``points.npy`` (N, 3) holds points that never move.
+which may be any: the scene is normalised. The optional ``points.npy`` (N, 3), or the PLY that the file names,
+holds points that never move.
 """
 
 from __future__ import annotations
@@ -164,9 +165,14 @@ def read_scene(
     cloud = _points_of(file, content)
     if cloud is None and "ply_file_path" in content:
         assumed.append(f"{file}: ply_file_path names no file: there are no points to begin from")
+    still = None if cloud is None else space.points(read_cloud(cloud, 3)).float()
+    if still is not None and cloud.suffix == ".ply":
+        assumed.append(
+            f"{cloud}: its {len(still)} points are taken for points that never move; remove it if the "
+            "subject is among them"
+        )
     if assumed := [*assumed, *filter(None, [told])]:
         protocol["assumed"] = assumed
-    still = None if cloud is None else space.points(read_cloud(cloud, 3)).float()
     return Scene(scene, train, val, test, seen, start, has_alpha, protocol=protocol, still=still)
 
 
@@ -225,6 +231,10 @@ def _read_entries(
         camera = camera_of(entry, header.size, scale, image, pose=pose_in(entry, axes, inverse))
         name = _name_of(file.parent, entry.own.get("file_path"), entry.where("file_path"))
         valid = None
+        if masks == "ignore" and mask is None and not header.has_alpha:
+            raise mismatch(
+                image, "a mask_path or alpha, as data.masks=ignore", "neither", "set data.masks=null"
+            )
         if masks != "alpha" and (mask or masks == "ignore"):
             valid = StoredMask(mask or image, header.size, 0 if mask else 3)
             valid()  # refuses a mask without a bright pixel

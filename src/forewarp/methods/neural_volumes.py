@@ -233,7 +233,7 @@ class NeuralVolumes(RayMethod):
         """See ``Method``."""
         notes = [f"code from {self.pictures.shape[1]} picture(s) of an instant", CENTRES, ONE_TIME]
         notes += [BETWEEN_TIMES, "no return to earlier weights where the loss jumps"]
-        notes += ["the warp starts as the identity"] if self.from_identity else []
+        notes += ["the warp starts near the identity"] if self.from_identity else []
         notes += [f"first {name} {value:g}" for name, value in self.first.items() if value is not None]
         return notes + ([] if self.jitter_in_pictures else ["pictures are drawn without random steps"])
 

@@ -139,7 +139,8 @@ def residual(method: ForwardWarp, targets: Sequence[Target], voxel_size: float, 
         views = torch.full((len(pixels),), number)
         samples.append((places, camera.rays(pixels).directions, error, views))
         voxel = voxel_size * camera.fx / max(depth, 1e-6)  # in pixels
-        bounds.append(float((low_passed(target.rgb, voxel) - target.rgb).square().mean()))
+        gap = low_passed(target.rgb, voxel) - target.rgb
+        bounds.append(float((gap if target.valid is None else gap[target.valid]).square().mean()))
     places, directions, errors, views = (torch.cat(parts) for parts in zip(*samples))
     cell = 2 * method.radiance.lattice.voxel_size
     share = explained_by_direction(places, directions, errors, views, cell)
