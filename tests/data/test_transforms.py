@@ -12,9 +12,9 @@ from forewarp.data import dnerf, posed_video
 from forewarp.data.cameras import FLIP
 from forewarp.data.files import Entry, SceneError, layout_of
 from forewarp.data.module import DNeRFDataModule, check_seen
-from forewarp.data.transforms import camera_of, check_directions, times_of
+from forewarp.data.transforms import camera_of, check_directions, looks_turned, times_of
 from forewarp.scene.camera import look_at
-from tests.support.written_scenes import edit, write_dnerf
+from tests.support.written_scenes import dnerf_shots, edit, write_dnerf
 
 EYE = torch.eye(4, dtype=torch.float64)
 WIDE = 2 * math.atan(0.5)  # of images as wide as their focal length
@@ -51,6 +51,11 @@ def test_an_angle_of_upright_images_is_of_the_width_or_as_told():
         ({"camera_angle_x": WIDE, "fl_x": 120}, "camera_angle_x: expected .* as fl_x says, but got .*remove"),
         ({"fl_x": 300, "cx": 160, "cy": 120}, r"cx: expected a principal point inside .*larger images"),
         ({"fl_x": 80, "is_fisheye": True}, "is_fisheye: expected a pinhole camera"),
+        ({"fl_x": 80, "k5": 0.1}, "k5: expected 0, but got 0.1; undistort"),
+        (
+            {"fl_x": 80, "distortion_params": [0.1, 0, 0, 0, 0, 0]},
+            "distortion_params: expected a lens as k1 k2",
+        ),
         ({}, "expected fl_x or camera_angle_x, but got neither"),
     ],
 )
@@ -76,6 +81,9 @@ def test_times_that_a_file_does_not_tell_are_in_the_names(names, times):
     assert found == pytest.approx(times) or names[0] == "a/1"
     assert told.startswith("t.json: no time in the frames: ")
     assert times_of(names, times, "t.json") == (times, None)
+    assert (
+        "all times lie from 0.1 to 0.102" in times_of(names, [0.1, *[0.102] * (len(names) - 1)], "t.json")[1]
+    )
 
 
 def around(count=8):
@@ -98,6 +106,29 @@ def test_poses_written_in_another_way_are_recognised():
     for i, pose in enumerate(in_a_row):
         pose[:3, 3] += i * pose[:3, 0]
     check_directions(in_a_row, "t.json", inverse=False)
+
+
+def test_orientations_that_are_inverted_or_of_other_axes_are_recognised():
+    right, inverted = around(), around()
+    for pose in inverted:
+        pose[:3, :3] = pose[:3, :3].T.clone()
+    assert not looks_turned(right)
+    assert looks_turned(inverted)
+    assert looks_turned([pose @ torch.from_numpy(FLIP) for pose in right])
+
+
+def test_splits_that_disagree_or_overlap_are_named(tmp_path):
+    folder = write_dnerf(tmp_path / "toy", test=dnerf_shots(5, 2, (6, 8)))
+    files = [folder / f"transforms_{split}.json" for split in ("test", "train")]
+    test, train = (json.loads(file.read_text()) for file in files)
+    (folder / "transforms_test.json").write_text(json.dumps(train))
+    (line,) = dnerf.read_scene(tmp_path, "toy").protocol["assumed"]
+    assert line.startswith(f"{folder}: 4 test images are trained on, too")
+    for frame, pose in zip(test["frames"], around(5)):  # OpenCV's axes
+        frame["transform_matrix"] = pose.tolist()
+    (folder / "transforms_test.json").write_text(json.dumps(test))
+    with pytest.raises(SceneError, match="test images: .* look away from one point; write them as in"):
+        dnerf.read_scene(tmp_path, "toy")
 
 
 @pytest.mark.parametrize("axes", ["opencv", "opengl"])

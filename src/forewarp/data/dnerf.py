@@ -239,9 +239,14 @@ def _read_records(
         assumed.append(f"{line} ({len(records['test'])}; data.test_every)")
         if not records["test"]:
             raise mismatch(folder, "images to test on, or at least 3 to train on", f"{len(ordered)} in all")
-    if axes is None:
-        poses = [record.camera.camera_to_world for record in records["train"]]
-        check_directions(poses, str(folder / MARKERS["dnerf"]), inverse=inverse)
+    trained = {record.image for record in records["train"]}
+    for split in SPLITS:
+        poses = [record.camera.camera_to_world for record in records[split]]
+        advice = None if split == "train" else f"write them as in {MARKERS['dnerf']}"
+        if axes is None:
+            check_directions(poses, f"{folder}: {split} images", inverse=inverse, advice=advice)
+        if split != "train" and (both := sum(record.image in trained for record in records[split])):
+            assumed.append(f"{folder}: {both} {split} images are trained on, too; their scores say little")
     portrait = [r for r in everything if r.by_angle and r.camera.height > r.camera.width]
     if portrait and not longer:
         line = f"{folder}: camera_angle_x taken as the angle of the width of these upright images"

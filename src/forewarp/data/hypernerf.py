@@ -26,6 +26,7 @@ from forewarp.data.arrays import read_cloud, read_truth, write_array, write_trut
 from forewarp.data.cameras import MOST_UNITS, Normalisation, box_of, check_lens, frustum_box, pose_of
 from forewarp.data.files import Entry, inside, mismatch, number, read_json, remove, scene_folder, whole
 from forewarp.data.images import StoredImage, check_pixels, inspect_image, write_image
+from forewarp.data.transforms import looks_turned
 from forewarp.files import write_json
 from forewarp.scene.camera import Camera, Lens
 from forewarp.scene.frame import Frame, Scene, Truth, middle_of
@@ -99,6 +100,11 @@ def read_scene(root: str | Path, scene: str, *, scale: int = 2, box: Sequence[fl
         "train_frames": len(train),
         "test_frames": len(test),
     }
+    if looks_turned([frame.camera.camera_to_world for frame in train]):
+        protocol["assumed"] = [
+            f"{folder / 'camera'}: orientation taken as world-to-camera with OpenCV's axes, by which the "
+            "cameras do not look at one thing; invert it, or convert OpenGL's axes, if it is written so"
+        ]
     bounds = frustum_box(f.camera for f in train) if box is None else box_of(box)
     truth = read_truth(folder / "trajectories.npz", canonical)
     if truth is not None:

@@ -31,6 +31,7 @@ _OTHER_LENSES = ("is_fisheye", "ftheta_p0", "latlong", "equirectangular")
 _SAME_FOCAL = 0.02  # share by which two focal lengths of one camera may differ
 _OUTSIDE = 0.9  # share of a side beyond which a principal point is another image's
 _LEAST_CAMERAS = 4  # of which can be told whether they look at something in common
+_LEAST_SPAN = 0.05  # of all times: less is hardly what was meant
 _MEET, _MISS = 0.15, 0.5  # miss of the axes in shares of the distance: they meet in a point, they do not
 _CAMERA_WORDS = re.compile(r"(cam|camera|view|sensor|c|v)[_-]?$", re.IGNORECASE)
 
@@ -81,8 +82,12 @@ def camera_of(
         raise mismatch(entry.where("cx"), "a principal point inside the image", got, advice)
     k = tuple(entry.number(key, -1e6, 1e6, 0.0) for key in ("k1", "k2", "k3"))
     p = tuple(entry.number(key, -1e6, 1e6, 0.0) for key in ("p1", "p2"))
-    if entry.number("k4", default=0.0) != 0:
-        raise mismatch(entry.where("k4"), "0", entry.get("k4"), "undistort the images")
+    for key in ("k4", "k5", "k6"):
+        if entry.number(key, default=0.0) != 0:
+            raise mismatch(entry.where(key), "0", entry.get(key), "undistort the images")
+    if entry.get("distortion_params") and not any(k + p):
+        expected, got = "a lens as k1 k2 k3 p1 p2", short(entry.get("distortion_params"))
+        raise mismatch(entry.where("distortion_params"), expected, got, "write its terms under these names")
     lens = Lens(k, p) if any(k + p) else None
     camera = Camera(width, height, fx, fy, cx, cy, pose, 0.0, 0.0, lens=lens)
     camera = camera.resized(*stored) if (width, height) != tuple(stored) else camera
@@ -135,13 +140,16 @@ def check_axes(axes: object, inverse: object) -> None:
         raise mismatch("data.inverse", "true or false", repr(inverse))
 
 
-def check_directions(poses: Sequence[torch.Tensor], where: str, *, inverse: bool) -> None:
+def check_directions(
+    poses: Sequence[torch.Tensor], where: str, *, inverse: bool, advice: str | None = None
+) -> None:
     """Refuse poses that make sense only if they were written in another way than assumed.
 
     Args:
         poses: as ``pose_in`` reads them where ``data.axes`` is null.
         where: the file, for errors.
         inverse: whether they were taken for world-to-camera matrices.
+        advice: what to do, where keys would not mend it.
 
     Raises:
         SceneError: if all cameras look away from one point, as OpenCV's axes read as OpenGL's do, or have
@@ -149,30 +157,47 @@ def check_directions(poses: Sequence[torch.Tensor], where: str, *, inverse: bool
     """
     if len(poses) < _LEAST_CAMERAS:
         return
-    miss, ahead = _meeting(torch.stack(list(poses)))
+    miss, ahead = meeting(torch.stack(list(poses)))
     if miss < _MEET and ahead == 0:
         raise mismatch(
             where,
             "cameras that look at what they surround (OpenGL's axes: x right, y up, looking along -z)",
             "cameras that all look away from one point",
-            "set data.axes=opencv, or data.axes=opengl if they do look outwards",
+            advice or "set data.axes=opencv, or data.axes=opengl if they do look outwards",
         )
     if miss < _MISS or inverse:
         return
     for axes, flip in (("opengl", torch.from_numpy(FLIP)), ("opencv", torch.eye(4, dtype=torch.float64))):
         # What was read as ``matrix @ FLIP`` is taken back, inverted, and given these axes.
         others = torch.linalg.inv(torch.stack(list(poses)) @ torch.from_numpy(FLIP)) @ flip
-        miss, ahead = _meeting(others)
+        miss, ahead = meeting(others)
         if miss < _MEET and ahead == 1:
             raise mismatch(
                 where,
                 "camera-to-world matrices",
                 "cameras that look at nothing in common, as their inverses do",
-                f"set data.inverse=true data.axes={axes}, or data.axes=opengl if they are right",
+                advice or f"set data.inverse=true data.axes={axes}, or data.axes=opengl if they are right",
             )
 
 
-def _meeting(poses: torch.Tensor) -> tuple[float, float]:
+def looks_turned(poses: Sequence[torch.Tensor]) -> bool:
+    """Tell whether cameras all look away from a point, or would look at one with their rotations inverted.
+
+    Args:
+        poses: camera-to-world (4, 4) with OpenCV's axes.
+    """
+    if len(poses) < _LEAST_CAMERAS:
+        return False
+    poses = torch.stack(list(poses))
+    turned = poses.clone()
+    turned[:, :3, :3] = poses[:, :3, :3].mT
+    (miss, ahead), (others_miss, others_ahead) = meeting(poses), meeting(turned)
+    if miss < _MEET:
+        return ahead == 0
+    return miss >= _MISS and others_miss < _MEET and others_ahead == 1
+
+
+def meeting(poses: torch.Tensor) -> tuple[float, float]:
     """Return how far the optical axes of poses (N, 4, 4) miss a common point, and for how many it is ahead.
 
     The first is the median over cameras of the point's distance from the axis over its distance from the
@@ -249,7 +274,7 @@ def times_of(
         where: the file, for errors.
 
     Returns:
-        the times, and a line that says what was assumed; None if the file has all times.
+        the times, and a line that says what was assumed; None if the file has all times, well spread.
 
     Raises:
         SceneError: if only some images have a time.
@@ -259,7 +284,9 @@ def times_of(
     """
     given = [time is not None for time in times]
     if all(given):
-        return list(times), None
+        first, last = min(times), max(times)
+        line = f"{where}: all times lie from {first:g} to {last:g}, where 0 to 1 is the whole sequence"
+        return list(times), line if len(times) > 1 and last - first < _LEAST_SPAN else None
     if any(given):
         got = f"{sum(given)} of {len(given)}, and none for {names[given.index(False)]}"
         raise mismatch(f"{where}: frames: time", "one in all frames or in none", got)
