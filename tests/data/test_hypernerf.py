@@ -110,6 +110,14 @@ def test_no_item_leaves_the_scene(tmp_path):
         read_scene(tmp_path, "toy")
 
 
+def test_intrinsics_of_larger_images_are_named(tmp_path):
+    folder = write_rig(tmp_path / "toy", rig())
+    for file in (folder / "camera").iterdir():
+        edit(file, lambda content: content.update(principal_point=content["image_size"]))
+    with pytest.raises(SceneError, match="principal_point: expected .* are of images 2 times as large"):
+        read_scene(tmp_path, "toy", scale=1)
+
+
 def test_both_spellings_of_the_tangential_distortion(tmp_path):
     path = tmp_path / "camera.json"
     write_camera(path, phone(1, size=(1073, 719)))

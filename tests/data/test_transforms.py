@@ -51,6 +51,7 @@ def test_an_angle_of_upright_images_is_of_the_width_or_as_told():
         ({"camera_angle_x": WIDE, "fl_x": 120}, "camera_angle_x: expected .* as fl_x says, but got .*remove"),
         ({"fl_x": 300, "cx": 160, "cy": 120}, r"cx: expected a principal point inside .*larger images"),
         ({"fl_x": 80, "is_fisheye": True}, "is_fisheye: expected a pinhole camera"),
+        ({"fl_x": 160, "cx": 80, "cy": 60, "w": 80, "h": 60}, r"cx: expected .* images 2 times as large"),
         ({"fl_x": 80, "k5": 0.1}, "k5: expected 0, but got 0.1; undistort"),
         (
             {"fl_x": 80, "distortion_params": [0.1, 0, 0, 0, 0, 0]},
@@ -98,6 +99,9 @@ def test_poses_written_in_another_way_are_recognised():
     check_directions(right, "t.json", inverse=False)
     with pytest.raises(SceneError, match="look away from one point; set data.axes=opencv"):
         check_directions([pose @ flip for pose in right], "t.json", inverse=False)
+    mixed = [pose @ flip if i % 2 else pose for i, pose in enumerate(right)]
+    with pytest.raises(SceneError, match="50% of them that look away from it; write all in the same axes"):
+        check_directions(mixed, "t.json", inverse=False)
     for axes, stored in (("opencv", right), ("opengl", [pose @ flip for pose in right])):
         misread = [torch.linalg.inv(pose) @ flip for pose in stored]
         with pytest.raises(SceneError, match=f"set data.inverse=true data.axes={axes}"):
@@ -124,6 +128,10 @@ def test_splits_that_disagree_or_overlap_are_named(tmp_path):
     (folder / "transforms_test.json").write_text(json.dumps(train))
     (line,) = dnerf.read_scene(tmp_path, "toy").protocol["assumed"]
     assert line.startswith(f"{folder}: 4 test images are trained on, too")
+    twice = test | {"frames": [*test["frames"], test["frames"][0]]}
+    (folder / "transforms_test.json").write_text(json.dumps(twice))
+    with pytest.raises(SceneError, match="test: expected each image once, but got r_0.png twice"):
+        dnerf.read_scene(tmp_path, "toy")
     for frame, pose in zip(test["frames"], around(5)):  # OpenCV's axes
         frame["transform_matrix"] = pose.tolist()
     (folder / "transforms_test.json").write_text(json.dumps(test))

@@ -20,6 +20,7 @@ log = logging.getLogger(__name__)
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL's axes of a camera to OpenCV's, and back
 MOST_UNITS = 1e9  # largest coordinate: farther from the origin single precision is long lost
+_LARGER, _SAME_FACTOR = 1.5, 0.05  # of a middle beyond the image's own, which tells a larger image's
 SPLITS = ("train", "val", "test")
 _SAME_PIXEL = 0.01
 # Near and far as shares of the cameras' distance from what they look at, where nothing else is known. Two
@@ -95,6 +96,20 @@ def check_lens(camera: Camera, where: str) -> None:
     if camera.lens is not None and not _can_be_undone(camera.lens, *shape):
         got = f"k={camera.lens.k} and p={camera.lens.p}"
         raise mismatch(where, "a lens that can be undone all over the picture", got, "undistort the images")
+
+
+def check_middle(camera: Camera, where: str) -> None:
+    """Refuse intrinsics of a larger image, whose middle is beyond this one's by one factor on both sides.
+
+    Args:
+        camera: at the size of the stored image.
+        where: the principal point's key, for errors.
+    """
+    across, down = 2 * camera.cx / camera.width, 2 * camera.cy / camera.height
+    if min(across, down) > _LARGER and abs(across / down - 1) < _SAME_FACTOR:
+        got = f"({camera.cx:g}, {camera.cy:g}) of {camera.width} x {camera.height} pixels"
+        advice = f"the intrinsics are of images {(across + down) / 2:.3g} times as large: scale them down"
+        raise mismatch(where, "a principal point near the middle", got, advice)
 
 
 @lru_cache(1024)

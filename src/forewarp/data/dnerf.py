@@ -241,6 +241,11 @@ def _read_records(
             raise mismatch(folder, "images to test on, or at least 3 to train on", f"{len(ordered)} in all")
     trained = {record.image for record in records["train"]}
     for split in SPLITS:
+        images = Counter(record.image for record in records[split]).most_common(1)
+        if images and images[0][1] > 1:
+            raise mismatch(
+                f"{folder}: {split}", "each image once", f"{images[0][0].name} twice", "remove one"
+            )
         poses = [record.camera.camera_to_world for record in records[split]]
         advice = None if split == "train" else f"write them as in {MARKERS['dnerf']}"
         if axes is None:

@@ -23,7 +23,15 @@ from torch import Tensor
 
 from forewarp.data import files
 from forewarp.data.arrays import read_cloud, read_truth, write_array, write_truth
-from forewarp.data.cameras import MOST_UNITS, Normalisation, box_of, check_lens, frustum_box, pose_of
+from forewarp.data.cameras import (
+    MOST_UNITS,
+    Normalisation,
+    box_of,
+    check_lens,
+    check_middle,
+    frustum_box,
+    pose_of,
+)
 from forewarp.data.files import Entry, inside, mismatch, number, read_json, remove, scene_folder, whole
 from forewarp.data.images import StoredImage, check_pixels, inspect_image, write_image
 from forewarp.data.transforms import looks_turned
@@ -185,6 +193,7 @@ def read_camera(path: Path, near: float, far: float) -> Camera:
     p = tuple(entry.numbers(tangential, 2, -_MOST_BENT, _MOST_BENT, [0.0] * 2))
     lens, pose = Lens(k, p) if any(k + p) else None, torch.from_numpy(pose_of(matrix, where))
     camera = Camera(int(width), int(height), focal, focal * aspect, cx, cy, pose, near, far, skew, lens)
+    check_middle(camera, entry.where("principal_point"))
     check_lens(camera, entry.where("radial_distortion"))
     return camera
 

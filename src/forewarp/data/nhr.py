@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from forewarp.data.arrays import read_cloud, read_truth, shortened, write_array, write_truth
-from forewarp.data.cameras import box_of, pose_of
+from forewarp.data.cameras import box_of, check_middle, pose_of
 from forewarp.data.files import mismatch, numbers_of, read_bytes, remove, scene_folder, whole
 from forewarp.data.images import StoredImage, by, check_pixels, inspect_image, write_image
 from forewarp.files import replace_file
@@ -82,6 +82,8 @@ def read_scene(
     sizes = _read_sizes(folder, moments, len(poses), half_resolution)
     bounds = _bounds(folder, moments) if box is None else box_of(box)
     cameras = [_camera(*of, half_resolution, bounds) for of in zip(sizes, matrices, poses, strict=True)]
+    for number, camera in enumerate(cameras):
+        check_middle(camera, f"{folder / 'Intrinsic.inf'}: camera {number}")
 
     def view(f: int, k: int) -> Frame:
         place, name = folder / "img" / str(f), f"img_{k:04d}.jpg"

@@ -18,7 +18,7 @@ from typing import TypeVar
 import numpy as np
 import torch
 
-from forewarp.data.cameras import FLIP, check_lens, pose_of
+from forewarp.data.cameras import FLIP, check_lens, check_middle, pose_of
 from forewarp.data.files import Entry, mismatch
 from forewarp.data.images import SUFFIXES, by, in_order
 from forewarp.scene.camera import Camera, Lens
@@ -31,6 +31,7 @@ _OTHER_LENSES = ("is_fisheye", "ftheta_p0", "latlong", "equirectangular")
 _SAME_FOCAL = 0.02  # share by which two focal lengths of one camera may differ
 _OUTSIDE = 0.9  # share of a side beyond which a principal point is another image's
 _LEAST_CAMERAS = 4  # of which can be told whether they look at something in common
+_ALL = 0.9  # share of cameras before which a common point must lie
 _LEAST_SPAN = 0.05  # of all times: less is hardly what was meant
 _MEET, _MISS = 0.15, 0.5  # miss of the axes in shares of the distance: they meet in a point, they do not
 _CAMERA_WORDS = re.compile(r"(cam|camera|view|sensor|c|v)[_-]?$", re.IGNORECASE)
@@ -91,6 +92,7 @@ def camera_of(
     lens = Lens(k, p) if any(k + p) else None
     camera = Camera(width, height, fx, fy, cx, cy, pose, 0.0, 0.0, lens=lens)
     camera = camera.resized(*stored) if (width, height) != tuple(stored) else camera
+    check_middle(camera, entry.where("cx"))
     check_lens(camera, entry.where("k1"))
     return camera
 
@@ -165,6 +167,10 @@ def check_directions(
             "cameras that all look away from one point",
             advice or "set data.axes=opencv, or data.axes=opengl if they do look outwards",
         )
+    if miss < _MEET and ahead < _ALL:
+        expected, got = "cameras that look at one thing", f"{1 - ahead:.0%} of them that look away from it"
+        advice = advice or "write all in the same axes, or set data.axes=opengl if they are right"
+        raise mismatch(where, expected, got, advice)
     if miss < _MISS or inverse:
         return
     for axes, flip in (("opengl", torch.from_numpy(FLIP)), ("opencv", torch.eye(4, dtype=torch.float64))):
