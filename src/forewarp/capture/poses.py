@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -43,6 +43,7 @@ class Reconstruction:
         views: (N,), how many images see each point.
         seen: (M, 2), which camera sees which point.
         error: mean over all observations, pixels; of a search of ours, before doubtful points were deleted.
+        absent: images of the model that were left out, as there is no picture of them.
     """
 
     cameras: dict[str, Camera]
@@ -52,6 +53,7 @@ class Reconstruction:
     views: np.ndarray
     seen: np.ndarray
     error: float
+    absent: Sequence[str] = ()
 
     @property
     def centers(self) -> np.ndarray:
@@ -78,13 +80,15 @@ class Reconstruction:
         return replace(self, cameras=cameras, points=scale * (self.points - center) @ rotation.T)
 
     @classmethod
-    def of(cls, model: pycolmap.Reconstruction) -> Reconstruction:
-        """Take cameras and points out of a model of pycolmap's, whose images' names sort by time.
+    def of(cls, model: pycolmap.Reconstruction, absent: Sequence[str] = ()) -> Reconstruction:
+        """Take cameras and points out of a model of pycolmap's, whose images' names sort by time, leaving
+        out the ``absent`` images.
 
         Raises:
             ValueError: for a camera model that pinhole cameras with Brown's distortion do not cover.
         """
-        images = sorted((image for image in model.images.values() if image.has_pose), key=lambda i: i.name)
+        there = (image for image in model.images.values() if image.has_pose and image.name not in absent)
+        images = sorted(there, key=lambda image: image.name)
         cameras = {image.name: _camera(image) for image in images}
         points = list(model.points3D.values())
         number = {image.image_id: row for row, image in enumerate(images)}
@@ -153,14 +157,16 @@ def read_model(folder: Path, originals: Mapping[str, str] | None = None) -> Reco
         raise ValueError(f"{folder}: expected a COLMAP model, but got {text}; export it again") from error
     if originals is not None:
         ours = {original: name for name, original in originals.items()}
-        unknown = {image.name for image in model.images.values() if image.has_pose} - ours.keys()
-        if unknown:
+        absent = sorted({image.name for image in model.images.values() if image.has_pose} - ours.keys())
+        if len(absent) == sum(image.has_pose for image in model.images.values()):
             raise ValueError(
-                f"images: expected a picture {min(unknown)}, as the model has, but got none; set images="
+                f"images: expected pictures as {absent[0]}, as the model has, but got none; set images="
             )
         for image in model.images.values():
             image.name = ours.get(image.name, image.name)
-    return Reconstruction.of(model)
+    else:
+        absent = []
+    return replace(Reconstruction.of(model, absent), absent=absent)
 
 
 @dataclass(frozen=True)

@@ -221,6 +221,7 @@ def facts_of(
         "left_out": [frames.originals.get(name, name) for name in left_out],
         "originals": frames.originals,
         "assumed": frames.assumed,
+        "absent": list(found.absent),
         "seconds": max(times) - min(times) if source.video is not None else None,
         "reprojection_error": found.error if limits else None,
         "points": len(found.points),
@@ -255,6 +256,10 @@ def summary(facts: dict) -> list[str]:
         lines[1] += ", where what it sees is 1 away"
         lines[2] = (
             f"points: {facts['points']:,}{sure}; box {size}, near {facts['near']:.2f}, far {facts['far']:.2f}"
+        )
+    if facts["absent"]:
+        lines.append(
+            f"left out: {len(facts['absent'])} cameras whose picture is not there ({facts['absent'][0]})"
         )
     if facts["assumed"]:
         lines.append(f"assumed: {facts['assumed']}")
