@@ -26,6 +26,7 @@ from forewarp.ops.grid import block_means, block_sums
 SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 _FORMATS = ("PNG", "JPEG")
 _MOST_PIXELS = 80_000_000  # Pillow warns a little above
+_ORIENTATION = 0x0112  # EXIF's tag
 _JPEG_END, _JPEG_TAIL = b"\xff\xd9", 4096  # some cameras write a little behind the end
 _LEAST_HIDDEN, _COLORS = 0.01, 64  # share of an image, and colours, that tell an image beneath
 _FOREGROUND = 127  # a mask above it is foreground; masks are lossy, so never quite 0 or 255
@@ -86,10 +87,13 @@ CACHE = ImageCache(1_500_000_000)
 
 @dataclass(frozen=True)
 class Header:
-    """What an image says of itself: ``size`` is (width, height) in pixels."""
+    """What an image says of itself: ``size`` is (width, height) in pixels; ``is_turned`` tells whether a JPEG
+    is to be turned before it is shown.
+    """
 
     size: tuple[int, int]
     has_alpha: bool
+    is_turned: bool = False
 
 
 def inspect_image(path: Path, size: tuple[int, int] | None = None, why: str = "") -> Header:
@@ -344,7 +348,7 @@ def _inspect(stream: BinaryIO, path: Path, mode: str = "RGBA") -> Header:
     if mode == "RGBA" and (has_16_bits or image.mode == "CMYK"):
         got = "16 bits" if has_16_bits else "CMYK"
         raise mismatch(path, "8 bits a channel, grey or RGB", got, "convert the image")
-    header = Header(image.size, image.has_transparency_data)
+    header = Header(image.size, image.has_transparency_data, _is_turned(image))
     try:
         is_whole = image.verify() is None if image.format == "PNG" else _has_jpeg_end(stream)
     except Exception:  # OSError, SyntaxError and more
@@ -352,6 +356,14 @@ def _inspect(stream: BinaryIO, path: Path, mode: str = "RGBA") -> Header:
     if not is_whole:
         raise mismatch(path, "a whole image", "a truncated or harmed one", "copy the file again")
     return header
+
+
+def _is_turned(image: Image.Image) -> bool:
+    """Tell whether a JPEG's EXIF orientation turns it; of a PNG asking would decode it."""
+    try:
+        return image.format == "JPEG" and image.getexif().get(_ORIENTATION, 1) not in (0, 1)
+    except Exception:  # a harmed tag, of what no pixel depends on
+        return False
 
 
 def _has_jpeg_end(stream: BinaryIO) -> bool:

@@ -221,9 +221,10 @@ def _read_entries(
     images = [_file(entry, "file_path", scale) for entry in frames]
     there, assumed = with_images(list(zip(frames, images)), images, str(file))
     absent = {_name_of(file.parent, f.own.get("file_path"), f.where("file_path")) for f in frames}
-    entries, has_mask = [], []
+    entries, has_mask, turned = [], [], []
     for entry, image in there:
         mask, header = None, inspect_image(image)
+        turned += [image] if header.is_turned else []
         if "mask_path" in entry.own and masks != "off":
             mask = _file(entry, "mask_path", scale)
             inspect_image(mask, header.size, f" as {image.name}")
@@ -249,6 +250,11 @@ def _read_entries(
         if any(given) and not all(given):
             got = f"{sum(given)} of {len(given)} and none in frames[{given.index(False)}]"
             raise mismatch(f"{file}: frames: {key}", "one in all frames or in none", got)
+    if turned:
+        assumed.append(
+            f"{file}: {len(turned)} images are read as stored, although their EXIF orientation turns them "
+            f"({turned[0].name}, ..); if poses are of the images upright, turn the pixels"
+        )
     names = [entry.name for entry in entries]
     if len(set(names)) < len(names):
         twice = next(name for i, name in enumerate(names) if name in names[:i])
