@@ -466,6 +466,7 @@ OF_THE_NICHE = {
 
 @pytest.mark.slow
 def test_fields_that_know_the_time_show_what_appears_better_than_bent_ones(tmp_path):
+    """Each beside the one that it adds the time, or its slice, to."""
     psnr, rates = {}, {"lr": {"network": 3e-3}, "lr_final_factor": 0.1}
     settings = StageSettings.of("fine", iterations=2000, curriculum={"all_in": 0.0}, **rates)
     for kind, model in OF_THE_NICHE.items():
@@ -475,5 +476,5 @@ def test_fields_that_know_the_time_show_what_appears_better_than_bent_ones(tmp_p
         run = make_run(tmp_path / kind, [Stage(settings, Objective(weights))], data=data, model=model)
         module = run.fit()
         psnr[kind] = sum(float(module.psnr_of(target)) for target in data.targets("train")) / 8
-    print({kind: round(value, 1) for kind, value in psnr.items()})  # for docs/methods.md
-    assert min(psnr["tnerf"], psnr["hypernerf"]) > max(psnr["nerfies"], psnr["dnerf"]) + 1, psnr
+    assert psnr["tnerf"] > psnr["dnerf"] + 1, psnr
+    assert psnr["hypernerf"] > psnr["nerfies"] + 1, psnr
