@@ -12,7 +12,7 @@ from forewarp.scene.frame import spread
 from forewarp.training.module import DynamicSceneModule
 from forewarp.training.stages import Run
 
-FEW = 50  # steps of a stage, or fewer, that have hardly moved its learning rates
+FEW = 10  # steps of a stage, or fewer, that can hardly have changed anything
 SHORT = 1000  # steps of a run, or fewer, that may be all that is wrong with it
 LOW, ABOVE = 21.0, 5.0  # dB; a fit is in doubt below LOW, or less than ABOVE better than one colour
 _VIEWS, _PIXELS = 8, 2000  # training images that are looked at, and pixels of each
