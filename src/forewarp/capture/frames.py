@@ -214,7 +214,7 @@ def _images_in(folder: Path, deep: bool = False) -> list[Path]:
     Raises:
         ValueError: for images of HEIC, which nothing here reads.
     """
-    files = [p for p in folder.glob("**/*" if deep else "*") if not _is_hidden(p.relative_to(folder))]
+    files = [p for p in folder.glob("**/*" if deep else "*") if not is_hidden(p.relative_to(folder))]
     if heic := sorted(p for p in files if p.suffix.lower() in (".heic", ".heif")):
         raise ValueError(
             f"{heic[0]}: expected PNG or JPEG, but got HEIC; convert the pictures to JPEG, or set the "
@@ -223,7 +223,8 @@ def _images_in(folder: Path, deep: bool = False) -> list[Path]:
     return in_order(p for p in files if p.suffix in SUFFIXES)
 
 
-def _is_hidden(path: Path) -> bool:
+def is_hidden(path: Path) -> bool:
+    """Tell whether a name in a path begins with a dot."""
     return any(part.startswith(".") for part in path.parts)
 
 

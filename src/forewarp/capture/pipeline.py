@@ -14,7 +14,7 @@ import pycolmap
 from filelock import FileLock, Timeout
 
 from forewarp.capture import poses, scene
-from forewarp.capture.frames import Frames, Source, Step, take
+from forewarp.capture.frames import Frames, Source, Step, is_hidden, take
 from forewarp.capture.poses import Reconstruction, Search, refuse_matches, refuse_poses
 from forewarp.drawing.images import write_png
 from forewarp.files import folder_written_whole, read_json, write_json
@@ -102,7 +102,7 @@ def find_poses(work: Path, images: Frames, search: Search, step: Step, force: bo
 def _fingerprint(path: Path) -> str:
     """A digest of the name, bytes and time of change of a file, or of each file of a folder."""
     files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
-    files = [file for file in files if not any(part.startswith(".") for part in file.relative_to(path).parts)]
+    files = [file for file in files if not is_hidden(file.relative_to(path))]
     states = [(str(file), file.stat().st_size, file.stat().st_mtime_ns) for file in files]
     return hashlib.sha256(repr(states).encode()).hexdigest()
 

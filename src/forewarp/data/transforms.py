@@ -159,7 +159,7 @@ def check_directions(
     """
     if len(poses) < _LEAST_CAMERAS:
         return
-    miss, ahead = meeting(torch.stack(list(poses)))
+    miss, ahead = _meeting(torch.stack(list(poses)))
     if miss < _MEET and ahead == 0:
         raise mismatch(
             where,
@@ -176,7 +176,7 @@ def check_directions(
     for axes, flip in (("opengl", torch.from_numpy(FLIP)), ("opencv", torch.eye(4, dtype=torch.float64))):
         # What was read as ``matrix @ FLIP`` is taken back, inverted, and given these axes.
         others = torch.linalg.inv(torch.stack(list(poses)) @ torch.from_numpy(FLIP)) @ flip
-        miss, ahead = meeting(others)
+        miss, ahead = _meeting(others)
         if miss < _MEET and ahead == 1:
             raise mismatch(
                 where,
@@ -197,13 +197,13 @@ def looks_turned(poses: Sequence[torch.Tensor]) -> bool:
     poses = torch.stack(list(poses))
     turned = poses.clone()
     turned[:, :3, :3] = poses[:, :3, :3].mT
-    (miss, ahead), (others_miss, others_ahead) = meeting(poses), meeting(turned)
+    (miss, ahead), (others_miss, others_ahead) = _meeting(poses), _meeting(turned)
     if miss < _MEET:
         return ahead == 0
     return miss >= _MISS and others_miss < _MEET and others_ahead == 1
 
 
-def meeting(poses: torch.Tensor) -> tuple[float, float]:
+def _meeting(poses: torch.Tensor) -> tuple[float, float]:
     """Return how far the optical axes of poses (N, 4, 4) miss a common point, and for how many it is ahead.
 
     The first is the median over cameras of the point's distance from the axis over its distance from the
