@@ -49,8 +49,8 @@ class Sampler(IterableDataset):
     transparency in the rendering. Single pixels are drawn of the valid ones alone. A second ``iter`` goes on
     where the first stopped; ``state_dict`` holds what an exact continuation needs.
 
-    Cost: linear in the pixels, below 2 ms for 8192; a frame is decoded when it is first picked, and kept
-    while there is room.
+    Cost: linear in the pixels, below 2 ms for 8192; under a mask also in those of the whole image. A frame is
+    decoded when it is first picked, and kept while there is room.
     """
 
     def __init__(
