@@ -35,11 +35,11 @@ from tests.support.written_scenes import write_dnerf, write_rig
 
 BIG, EYE, NAN = 60_000, np.eye(4), float("nan")
 BAD_POSES = {
-    "none": (None, "expected 4 x 4 finite numbers, but got None; check the export"),
-    "3 x 4": (EYE[:3], "expected 4 x 4 finite"),
-    "ragged": ([[1], [1, 2]], "expected 4 x 4 finite"),
-    "words": ([["a"] * 4] * 4, "expected 4 x 4 finite"),
-    "nan": (EYE * NAN, "expected 4 x 4 finite"),
+    "none": (None, "expected 4 x 4 or 3 x 4 finite numbers, but got None; check the export"),
+    "3 x 3": (EYE[:3, :3], "expected 4 x 4 or 3 x 4 finite"),
+    "ragged": ([[1], [1, 2]], "expected 4 x 4 or 3 x 4"),
+    "words": ([["a"] * 4] * 4, "expected 4 x 4 or 3 x 4"),
+    "nan": (EYE * NAN, "expected 4 x 4 or 3 x 4"),
     "scale": (np.diag([2.0, 2, 2, 1]), "expected a rotation, but got determinant 8"),
     "mirror": (np.diag([1.0, 1, -1, 1]), "expected a rotation, but got determinant -1"),
     "last row": ([*EYE[:3], [0, 0, 1, 1]], "expected the last row 0 0 0 1"),

@@ -161,6 +161,27 @@ def test_files_by_others(toy):
     assert (alpha[:, 31:] == 255).all()
 
 
+def test_an_excerpt_is_read_in_order(toy):
+    """Folders 8, 10, 14; cameras from 1; clouds as the frames, or in their order."""
+    expected = read_scene(toy.parent, "toy")
+    image = expected.train[4].load()
+    for f, number in ((2, 14), (1, 10), (0, 8)):
+        for folder in (toy / "img" / str(f), toy / "img" / str(f) / "mask"):
+            for k in (3, 2, 1, 0):
+                (folder / f"img_{k:04d}.jpg").rename(folder / f"img_{k + 1:04d}.jpg")
+        (toy / "img" / str(f)).rename(toy / "img" / f"{number:03d}")
+        (toy / "pointclouds" / f"frame{f + 1}.npy").rename(toy / "pointclouds" / f"frame{number + 1}.npy")
+    for _ in range(2):
+        scene = read_scene(toy.parent, "toy")
+        assert [frame.name for frame in scene.test] == ["008/img_0001", "010/img_0001", "014/img_0001"]
+        assert (scene.times, scene.box) == ((0, 1 / 3, 1), expected.box)
+        assert torch.equal(scene.train[4].load(), image)
+        assert "frames 8 to 14 (3) and cameras from 1 taken in order" in scene.protocol["assumed"][0]
+        for number, f in ((9, 0), (11, 1), (15, 2)):
+            if (cloud := toy / "pointclouds" / f"frame{number}.npy").exists():
+                cloud.rename(cloud.with_name(f"frame{f}.npy"))
+
+
 def test_reading_a_scene_decodes_no_image(written, monkeypatch):
     def decode(*_):
         raise AssertionError

@@ -156,6 +156,24 @@ def test_keys_mend_poses_written_in_another_way(axes, tmp_path):
         torch.testing.assert_close(frame.camera.camera_to_world, other.camera.camera_to_world)
 
 
+def test_times_in_any_unit_and_matrices_of_three_rows(tmp_path):
+    folder = write_dnerf(tmp_path / "toy")
+    expected = dnerf.read_scene(tmp_path, "toy")
+
+    def rewrite(content):
+        for frame in content["frames"]:
+            frame["time"] = 3000 + 40 * frame["time"]
+            del frame["transform_matrix"][3]
+
+    for split in ("train", "val", "test"):
+        edit(folder / f"transforms_{split}.json", rewrite)
+    scene = dnerf.read_scene(tmp_path, "toy")
+    assert scene.times == pytest.approx(expected.times)
+    assert scene.protocol["assumed"] == [f"{folder}: all times lie from 3000 to 3040: taken as 0 to 1"]
+    for frame, other in zip(scene.train, expected.train):
+        assert torch.equal(frame.camera.camera_to_world, other.camera.camera_to_world)
+
+
 def test_what_is_not_there_is_left_out_and_told(tmp_path):
     folder = write_dnerf(tmp_path / "toy", size=(6, 8))
     (folder / "train" / "r_1.png").unlink()

@@ -36,6 +36,8 @@ _ROTATION_TOLERANCE = 1e-3
 def pose_of(value: object, where: str) -> np.ndarray:
     """Check a camera-to-world matrix, whose upper left part must be a rotation: (4, 4) float64.
 
+    The last row may be left out.
+
     Raises:
         SceneError: for another shape, entries that are no finite numbers, or no rotation.
     """
@@ -43,8 +45,10 @@ def pose_of(value: object, where: str) -> np.ndarray:
         matrix = np.array(value)
     except ValueError:  # rows of different lengths
         matrix = np.array(None)
+    if matrix.shape == (3, 4) and matrix.dtype.kind in "if":
+        matrix = np.concatenate([matrix, [[0, 0, 0, 1]]])
     if matrix.shape != (4, 4) or matrix.dtype.kind not in "if" or not np.isfinite(matrix).all():
-        raise mismatch(where, "4 x 4 finite numbers", short(value), "check the export")
+        raise mismatch(where, "4 x 4 or 3 x 4 finite numbers", short(value), "check the export")
     matrix = matrix.astype(np.float64)
     rotation, largest = matrix[:3, :3], np.abs(matrix).max()
     if largest > MOST_UNITS:

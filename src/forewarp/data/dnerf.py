@@ -42,6 +42,7 @@ from forewarp.data.transforms import (
     check_directions,
     hold_out_every,
     pose_in,
+    time_in,
     times_of,
     with_images,
     with_suffix,
@@ -294,7 +295,6 @@ def _read_file(
             depth = file, None if scale is None else entry.number("depth_scale", 1e-12, 1e6)
         if ability not in (*ABILITIES, "all"):
             raise mismatch(entry.where("ability"), f"one of {', '.join(ABILITIES)}", short(ability))
-        time = entry.number("time", 0, 1) if "time" in entry.own else None
         header, mask = inspect_image(image), None
         if "mask_path" in entry.own:
             mask = with_suffix(entry.path("mask_path"))
@@ -303,7 +303,7 @@ def _read_file(
         pose = pose_in(entry, axes, inverse)
         camera = camera_of(entry, header.size, 1, image, pose=pose, longer=longer)
         by_angle = entry.get("fl_x") is None and entry.get("fl_y") is None
-        records.append(_Record(time, camera, image, has_alpha, mask, depth, ability, by_angle))
+        records.append(_Record(time_in(entry), camera, image, has_alpha, mask, depth, ability, by_angle))
     return records, assumed
 
 

@@ -3,7 +3,8 @@
 ``CamPose.inf`` has a line per camera, the columns of [R|T] camera-to-world with OpenCV's axes in the order
 z, x, y, centre; ``Intrinsic.inf`` a block per camera, its number and a 3 x 3 matrix. Frame f, from 0, has
 ``img/<f>/img_%04d.jpg``, the foreground in ``img/<f>/mask/`` under the same names, and its points x y z r g b
-in ``pointclouds/frame<f + 1>.npy`` (older: .obj). Beside them there may be ``trajectories.npz``.
+in ``pointclouds/frame<f + 1>.npy`` (older: .obj). Frames and cameras of an excerpt may be numbered otherwise,
+with gaps: they are taken in order. Beside them there may be ``trajectories.npz``.
 """
 
 from __future__ import annotations
@@ -55,7 +56,8 @@ def read_scene(
     Args:
         half_resolution: average 2 x 2 pixels; an odd last row or column is cut off.
         box: x0 y0 z0 x1 y1 z1 in world units; None takes the bounds of all point clouds, 10 % wider per side.
-        frames: how many, from the first; where there are fewer, all. The last of them is at the time 1.
+        frames: how many, from the first; where there are fewer, all. The last of them is at the time 1, those
+            between by their numbers.
         test_views: numbers of the cameras held out; None spreads 6 of every 56 over them.
         test_every: measure every n-th frame only.
 
@@ -73,24 +75,29 @@ def read_scene(
         raise mismatch(folder / "Intrinsic.inf", "as many cameras as poses", got)
     held = _held_out(test_views, len(poses), folder)
     every, moments = whole(test_every, "data.test_every", 1), whole(frames, "data.frames", 1)
-    there = {path.name for path in folder.glob("img/*") if path.is_dir()}
-    on_disk = sum(name.isdecimal() and name == str(int(name)) for name in there)
-    moments = min(moments, on_disk)
-    for f in range(max(moments, 1)):
-        if str(f) not in there:
-            raise mismatch(folder / "img" / str(f), "a folder of images", "none")
-    sizes = _read_sizes(folder, moments, len(poses), half_resolution)
-    bounds = _bounds(folder, moments) if box is None else box_of(box)
+    there = (path for path in folder.glob("img/*") if path.is_dir() and path.name.isdecimal())
+    places = sorted(there, key=lambda path: int(path.name))
+    on_disk = [int(path.name) for path in places]
+    if not places or len({*on_disk}) < len(places):
+        got = f"{places[0].name} and one of the same number" if places else "none"
+        raise mismatch(folder / "img", "a folder of images for each frame, named by its number", got)
+    numbers, moments = on_disk[:moments], min(moments, len(places))
+    counted = (path.stem[4:] for path in places[0].glob("img_*.jpg"))
+    first = min((int(number) for number in counted if number.isdecimal()), default=0)
+    names = [f"img_{k:04d}.jpg" for k in range(first, first + len(poses))]
+    sizes = _read_sizes(places[:moments], names, half_resolution)
+    bounds = _bounds(folder, numbers) if box is None else box_of(box)
     cameras = [_camera(*of, half_resolution, bounds) for of in zip(sizes, matrices, poses, strict=True)]
     for number, camera in enumerate(cameras):
         check_middle(camera, f"{folder / 'Intrinsic.inf'}: camera {number}")
 
     def view(f: int, k: int) -> Frame:
-        place, name = folder / "img" / str(f), f"img_{k:04d}.jpg"
+        place, name = places[f], names[k]
         load = StoredImage(place / name, sizes[k], half_resolution, place / "mask" / name)
-        time, ability = f / max(moments - 1, 1), "space" if k in held else "all"
-        return Frame(f"{f}/img_{k:04d}", time, cameras[k], load, ability=ability, camera_id=k)
+        time, ability = (numbers[f] - numbers[0]) / span, "space" if k in held else "all"
+        return Frame(f"{place.name}/{Path(name).stem}", time, cameras[k], load, ability=ability, camera_id=k)
 
+    span = max(numbers[-1] - numbers[0], 1)
     train = tuple(view(f, k) for f in range(moments) for k in range(len(poses)) if k not in held)
     test = tuple(view(f, k) for f in range(0, moments, every) for k in held)
     protocol = {
@@ -103,9 +110,12 @@ def read_scene(
         "test_frames": len(test),
         "mask_box": True,
     }
+    if on_disk[0] != 0 or first != 0 or on_disk[-1] - on_disk[0] >= len(on_disk):
+        said = f"frames {on_disk[0]} to {on_disk[-1]} ({len(on_disk)}) and cameras from {first}"
+        protocol["assumed"] = [f"{folder / 'img'}: {said} taken in order, times by their numbers"]
     truth = read_truth(folder / "trajectories.npz", 0.0)
-    if truth is not None and moments < on_disk:  # the file's times are those of all frames on disk
-        truth = shortened(truth, (moments - 1) / (on_disk - 1))
+    if truth is not None and moments < len(places):  # the file's times are those of all frames on disk
+        truth = shortened(truth, (numbers[-1] - numbers[0]) / (on_disk[-1] - on_disk[0]))
     return Scene(scene, train, (), test, bounds, 0.0, True, truth, protocol)
 
 
@@ -205,28 +215,37 @@ def _held_out(views: Sequence[int] | None, count: int, folder: Path) -> list[int
     return sorted(views)
 
 
-def _read_sizes(folder: Path, moments: int, views: int, halve: bool) -> list[tuple[int, int]]:
+def _read_sizes(folders: Sequence[Path], names: Sequence[str], halve: bool) -> list[tuple[int, int]]:
     """Read the size (width, height) of every camera's images and check that all have it."""
-    names = [f"img_{k:04d}.jpg" for k in range(views)]
-    sizes: list[tuple[int, int] | None] = [None] * views
-    for f in range(moments):
-        for place in (folder / "img" / str(f), folder / "img" / str(f) / "mask"):
+    sizes: list[tuple[int, int] | None] = [None] * len(names)
+    for folder in folders:
+        for place in (folder, folder / "mask"):
             if extra := sorted({path.name for path in place.glob("img_*")}.difference(names)):
-                expected = f"images of the {views} cameras of CamPose.inf"
+                expected = f"images of the {len(names)} cameras of CamPose.inf"
                 raise mismatch(place / extra[0], expected, "another")
             for k, name in enumerate(names):
-                sizes[k] = inspect_image(place / name, sizes[k], f" as in img/0/{name}").size
+                why = f" as in img/{folders[0].name}/{name}"
+                sizes[k] = inspect_image(place / name, sizes[k], why).size
                 if halve and min(sizes[k]) < 2:
                     raise mismatch(place / name, "at least 2 x 2 pixels to halve", by(sizes[k]))
     return sizes
 
 
-def _bounds(folder: Path, moments: int) -> Box:
-    """Put a box around the points of all frames, with some padding."""
+def _bounds(folder: Path, numbers: Sequence[int]) -> Box:
+    """Put a box around the points of the frames of these numbers, with some padding.
+
+    A cloud's number is its frame's and 1, or those of an excerpt are in the frames' order.
+    """
+    clouds: dict[int, Path] = {}
+    for path in (*folder.glob("pointclouds/frame*.obj"), *folder.glob("pointclouds/frame*.npy")):  # .npy wins
+        if path.stem[5:].isdecimal():
+            clouds[int(path.stem[5:])] = path
+    chosen = [clouds.get(number + 1, folder / "pointclouds" / f"frame{number + 1}.npy") for number in numbers]
+    if not all(path.is_file() for path in chosen) and len(clouds) >= len(numbers) and numbers[0] != 0:
+        chosen = [clouds[number] for number in sorted(clouds)][: len(numbers)]
     corners = []
-    for f in range(1, moments + 1):
-        path, old = (folder / "pointclouds" / f"frame{f}{suffix}" for suffix in (".npy", ".obj"))
-        points = read_cloud(old if old.is_file() and not path.is_file() else path, 6)[:, :3]
+    for path in chosen:
+        points = read_cloud(path, 6)[:, :3]
         corners += [points.min(0), points.max(0)]
     low, high = np.min(corners, 0).astype(np.float64), np.max(corners, 0).astype(np.float64)
     margin = _PADDING * (high - low)

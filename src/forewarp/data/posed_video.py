@@ -35,6 +35,7 @@ from forewarp.data.transforms import (
     check_directions,
     hold_out_every,
     pose_in,
+    time_in,
     times_of,
     with_images,
     with_suffix,
@@ -228,7 +229,6 @@ def _read_entries(
         if "mask_path" in entry.own and masks != "off":
             mask = _file(entry, "mask_path", scale)
             inspect_image(mask, header.size, f" as {image.name}")
-        time = number(entry.own["time"], entry.where("time"), 0, 1) if "time" in entry.own else None
         camera = camera_of(entry, header.size, scale, image, pose=pose_in(entry, axes, inverse))
         name = _name_of(file.parent, entry.own.get("file_path"), entry.where("file_path"))
         valid = None
@@ -242,7 +242,7 @@ def _read_entries(
         opaque = masks == "off" or (masks == "ignore" and mask is None)
         load = StoredImage(image, header.size, mask=None if valid else mask, opaque=opaque)
         has_mask.append(mask is not None)
-        entries.append(ImageEntry(name, time, camera, load, header.has_alpha and not opaque, valid))
+        entries.append(ImageEntry(name, time_in(entry), camera, load, header.has_alpha and not opaque, valid))
     for key, given in (
         ("mask_path", has_mask),
         ("file_path: alpha", [e.has_alpha or e.load.mask is not None for e in entries]),

@@ -32,6 +32,7 @@ _SAME_FOCAL = 0.02  # share by which two focal lengths of one camera may differ
 _OUTSIDE = 0.9  # share of a side beyond which a principal point is another image's
 _LEAST_CAMERAS = 4  # of which can be told whether they look at something in common
 _ALL = 0.9  # share of cameras before which a common point must lie
+_MOST_TIME = 1e12
 _LEAST_SPAN = 0.05  # of all times: less is hardly what was meant
 _MEET, _MISS = 0.15, 0.5  # miss of the axes in shares of the distance: they meet in a point, they do not
 _CAMERA_WORDS = re.compile(r"(cam|camera|view|sensor|c|v)[_-]?$", re.IGNORECASE)
@@ -119,6 +120,11 @@ def _focal(entry: Entry, width: int, height: int, longer: bool) -> float:
         got = f"{angle:.4g} ({math.degrees(angle):.1f} degrees)"
         raise mismatch(entry.where("camera_angle_x"), expected, got, "remove the one that is wrong")
     return focal
+
+
+def time_in(entry: Entry) -> float | None:
+    """Read a frame's ``time``, in any unit; None where it has none."""
+    return entry.number("time", -_MOST_TIME, _MOST_TIME) if "time" in entry.own else None
 
 
 def pose_in(entry: Entry, axes: str | None, inverse: bool) -> torch.Tensor:
@@ -272,7 +278,8 @@ def times_of(
 ) -> tuple[list[float], str | None]:
     """Give each image a time in [0, 1], where the file has none by the numbers in the images' names.
 
-    Where folders or names tell several cameras apart, images of one number share a time.
+    Where folders or names tell several cameras apart, images of one number share a time. Times in the file
+    that are not all in [0, 1], such as milliseconds or numbers of frames, are scaled to it.
 
     Args:
         names: paths of the images without suffix, ``cam01/0003``; of all splits together.
@@ -280,18 +287,25 @@ def times_of(
         where: the file, for errors.
 
     Returns:
-        the times, and a line that says what was assumed; None if the file has all times, well spread.
+        the times, and a line that says what was assumed; None if the file has all times, in [0, 1] and well
+        spread.
 
     Raises:
         SceneError: if only some images have a time.
 
     >>> times_of(["a/0001", "a/0003", "b/0001", "b/0003"], [None] * 4, "t.json")[0]
     [0.0, 1.0, 0.0, 1.0]
+    >>> times_of(["a", "b", "c"], [300, 400, 500], "t.json")
+    ([0.0, 0.5, 1.0], 't.json: all times lie from 300 to 500: taken as 0 to 1')
     """
     given = [time is not None for time in times]
     if all(given):
         first, last = min(times), max(times)
-        line = f"{where}: all times lie from {first:g} to {last:g}, where 0 to 1 is the whole sequence"
+        span = f"{where}: all times lie from {first:g} to {last:g}"
+        if first < 0 or last > 1:
+            length = max(last - first, 1e-12)
+            return [(time - first) / length for time in times], f"{span}: taken as 0 to 1"
+        line = f"{span}, where 0 to 1 is the whole sequence"
         return list(times), line if len(times) > 1 and last - first < _LEAST_SPAN else None
     if any(given):
         got = f"{sum(given)} of {len(given)}, and none for {names[given.index(False)]}"
