@@ -1,11 +1,4 @@
-"""``forewarp-capture``: a scene from a video, from pictures, or from a COLMAP model."""
-
-from __future__ import annotations
-
-from forewarp.cli.entry import command
-from forewarp.runs.overrides import command_line, text_override
-
-HELP = """
+"""
 forewarp-capture makes a scene from a video: it takes the sharpest frames, finds the cameras' poses from what
 stands still, and writes what experiment=video_with_poses reads (docs/capture.md).
 
@@ -29,6 +22,12 @@ What one types most:
 
 After Ctrl-C the same command goes on.
 """
+
+from __future__ import annotations
+
+from forewarp.cli.entry import command
+from forewarp.runs.overrides import command_line, text_override
+
 MATCHING = ("auto", "sequential", "exhaustive")
 PATHS = ("video", "images", "colmap", "masks", "out")
 LENSES = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
@@ -109,7 +108,7 @@ def check(config) -> tuple[dict, object]:
 
 def main() -> None:
     """Run the console script."""
-    command("capture", capture, HELP)
+    command("capture", capture, __doc__)
 
 
 if __name__ == "__main__":

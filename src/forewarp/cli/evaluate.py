@@ -1,11 +1,4 @@
-"""``forewarp-evaluate``: measure a finished run again."""
-
-from __future__ import annotations
-
-from forewarp.cli.entry import command
-from forewarp.cli.prepare import refuse_numbers
-
-HELP = """
+"""
 forewarp-evaluate measures a finished run on its test views and prints the table. Everything is rebuilt from
 the run's own config.yaml; images/, per_image.json and metrics.json are written again.
 
@@ -22,6 +15,11 @@ What one types most:
   sheets=N                 how many pictures of truth | prediction | error
   threads=N trainer=cpu    threads and device to compute with
 """
+
+from __future__ import annotations
+
+from forewarp.cli.entry import command
+from forewarp.cli.prepare import refuse_numbers
 
 
 def evaluate(config) -> None:
@@ -46,7 +44,7 @@ def evaluate(config) -> None:
 
 def main() -> None:
     """Run the console script."""
-    command("evaluate", evaluate, HELP)
+    command("evaluate", evaluate, __doc__)
 
 
 if __name__ == "__main__":

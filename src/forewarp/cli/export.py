@@ -1,10 +1,4 @@
-"""``forewarp-export``: a finished run in formats of other programs."""
-
-from __future__ import annotations
-
-from forewarp.cli.entry import command
-
-HELP = """
+"""
 forewarp-export writes a finished run for other programs, into its exports/<format>/ (docs/exports.md).
 
   forewarp-export run=runs/vehicle/particles-demo-seed0 format=ply
@@ -31,6 +25,10 @@ What one types most:
   data.root=FOLDER              where the data are now, if they moved
   threads=N trainer=cpu         threads and device to compute with
 """
+
+from __future__ import annotations
+
+from forewarp.cli.entry import command
 
 
 def export(config) -> None:
@@ -112,7 +110,7 @@ def check(config) -> list[float]:
 
 def main() -> None:
     """Run the console script."""
-    command("export", export, HELP)
+    command("export", export, __doc__)
 
 
 if __name__ == "__main__":

@@ -1,10 +1,4 @@
-"""``forewarp-plan``: find out which effects a scene calls for, and why."""
-
-from __future__ import annotations
-
-from forewarp.cli.entry import command
-
-HELP = """
+"""
 forewarp-plan finds out which effects a scene calls for, and says for each the number that decides. It reads
 the pictures and fits short runs. Of particles it leaves out one effect after the other, and keeps those that
 are missed; of voxels (model=forward) it measures what coarse stages leave unexplained, and tries the effects
@@ -26,6 +20,10 @@ types most:
   plan.folder=FOLDER     where plan.yaml and the trials go; an interrupted plan goes on there
 Overrule a plan by an override: forewarp-train plan=FILE model/view_dependence=none
 """
+
+from __future__ import annotations
+
+from forewarp.cli.entry import command
 
 
 def plan(config) -> None:
@@ -62,7 +60,7 @@ def planned():
 
 def main() -> None:
     """Run the console script."""
-    command("plan", plan, HELP, config="train")
+    command("plan", plan, __doc__, config="train")
 
 
 if __name__ == "__main__":

@@ -1,14 +1,4 @@
-"""``forewarp-render``: videos of a finished run."""
-
-from __future__ import annotations
-
-from pathlib import Path
-
-from forewarp.cli.entry import command
-
-LEAST_SIZE = 400  # pixels of the longer side, unless size= asks for another
-
-HELP = """
+"""
 forewarp-render makes a video of a finished run, into its videos/.
 
   forewarp-render run=runs/vehicle/particles-demo-seed0 path=both
@@ -30,6 +20,14 @@ What one types most:
   data.root=FOLDER              where the data are now, if they moved
   threads=N trainer=cpu         threads and device to compute with
 """
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from forewarp.cli.entry import command
+
+LEAST_SIZE = 400  # pixels of the longer side, unless size= asks for another
 
 
 def render(config) -> None:
@@ -100,7 +98,7 @@ def check(config) -> None:
 
 def main() -> None:
     """Run the console script."""
-    command("render", render, HELP)
+    command("render", render, __doc__)
 
 
 if __name__ == "__main__":

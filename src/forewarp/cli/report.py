@@ -1,100 +1,15 @@
-"""``forewarp-report``: tables, curves and pages of finished runs."""
-
-from __future__ import annotations
-
-from collections.abc import Callable, Iterator
-from dataclasses import replace
-from glob import glob
-from importlib import import_module
-from pathlib import Path
-from typing import NamedTuple
-
-from omegaconf import DictConfig, ListConfig, OmegaConf
-
-from forewarp.cli.entry import command
-from forewarp.cli.mistakes import one_line
-from forewarp.cli.render import check, write_film
-from forewarp.runs.config_files import project_root
-
-
-class Kind(NamedTuple):
-    """A kind of page: what it is of, where its runs are if none are named, and the function that writes it.
-
-    ``options`` gives the function's further arguments from the config.
-    """
-
-    about: str
-    runs: str
-    function: str
-    options: Callable[[DictConfig], dict] = lambda config: {}
-
-
-def published_points(config: DictConfig) -> dict:
-    """Read the results of others that curves are drawn with."""
-    from forewarp.report.benchmark import OTHERS, read_published
-
-    return {"published": read_published(Path(config.published or OTHERS))}
-
-
-def printed_tables(config: DictConfig) -> dict:
-    """Name the file of the paper's printed numbers, where another is wanted."""
-    return {"published": Path(config.published)} if config.published else {}
-
-
-KINDS = {
-    "accuracy_time": Kind(
-        "accuracy against training time, and the cheapest way to each dB",
-        "accuracy_time",
-        "choices.write_accuracy_time",
-        lambda config: {"target": config.target, **published_points(config)},
-    ),
-    "price_list": Kind(
-        "what each choice costs and brings, with the spread over seeds",
-        "accuracy_time",
-        "choices.write_price_list",
-    ),
-    "paper": Kind(
-        "the paper's tables and figures: Markdown, LaTeX, CSV, HTML",
-        "paper",
-        "paper.write_paper",
-        lambda config: {
-            "curves": Path(config.curves or f"{config.paths.runs}/accuracy_time/results"),
-            **printed_tables(config),
-        },
-    ),
-    "ablation": Kind(
-        "what each part of the paper's method brings, and whether the paper's order holds",
-        "ablations",
-        "paper.write_ablation",
-        printed_tables,
-    ),
-    "minutes": Kind(
-        "what each method reaches on each scene in so many minutes, by seed and view",
-        "minutes",
-        "benchmark.write_minutes",
-        published_points,
-    ),
-    "methods": Kind(
-        "all methods under one clock: what each reaches, PSNR against seconds, views side by side",
-        "paper",
-        "benchmark.write_methods",
-    ),
-    "effects": Kind(
-        "planned runs against every effect at once and the paper's fixed set",
-        "effects",
-        "choices.write_effects",
-    ),
-}
-OTHER_KINDS = {
-    "compare": "a few runs side by side, printed, and with out=FOLDER drawn",
-    "run": "the page of one run: its video, truth against prediction, curves, effects and why",
-}
-ABOUT = {name: kind.about for name, kind in KINDS.items()} | OTHER_KINDS
-
-HELP = f"""
+"""
 forewarp-report makes tables, curves and pages of runs that are already there. Only kind=run renders anything.
 
-{chr(10).join(f"  kind={kind:<14} {about}" for kind, about in ABOUT.items())}
+  kind=accuracy_time  accuracy against training time, and the cheapest way to each dB
+  kind=price_list     what each choice costs and brings, with the spread over seeds
+  kind=paper          the paper's tables and figures: Markdown, LaTeX, CSV, HTML
+  kind=ablation       what each part of the paper's method brings, and whether the paper's order holds
+  kind=minutes        what each method reaches on each scene in so many minutes, by seed and view
+  kind=methods        all methods under one clock: what each reaches, PSNR against seconds, views side by side
+  kind=effects        planned runs against every effect at once and the paper's fixed set
+  kind=compare        a few runs side by side, printed, and with out=FOLDER drawn
+  kind=run            the page of one run: its video, truth against prediction, curves, effects and why
 
   forewarp-report kind=price_list runs=FOLDER out=FOLDER
   forewarp-report kind=compare runs=[runs/demo/particles,runs/demo/forward] out=runs/demo
@@ -118,14 +33,76 @@ What one types most:
 The runs: make accuracy-time [DATA=DATASETS SCENE=NAME MINUTES=N], make price-list DATA=DATASETS,
 make reproduce-tables [DATA=DATASETS], make ablations, make effects. Runs without results are listed.
 """
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from glob import glob
+from importlib import import_module
+from pathlib import Path
+from typing import NamedTuple
+
+from omegaconf import DictConfig, ListConfig, OmegaConf
+
+from forewarp.cli.entry import command
+from forewarp.cli.mistakes import one_line
+from forewarp.cli.render import check, write_film
+from forewarp.runs.config_files import project_root
+
+
+class Kind(NamedTuple):
+    """A kind of page: where its runs are if none are named, and the function that writes it.
+
+    ``options`` gives the function's further arguments from the config.
+    """
+
+    runs: str
+    function: str
+    options: Callable[[DictConfig], dict] = lambda config: {}
+
+
+def published_points(config: DictConfig) -> dict:
+    """Read the results of others that curves are drawn with."""
+    from forewarp.report.benchmark import OTHERS, read_published
+
+    return {"published": read_published(Path(config.published or OTHERS))}
+
+
+def printed_tables(config: DictConfig) -> dict:
+    """Name the file of the paper's printed numbers, where another is wanted."""
+    return {"published": Path(config.published)} if config.published else {}
+
+
+def curves_and_tables(config: DictConfig) -> dict:
+    """Name the folder of the pictures by ``kind=accuracy_time`` too."""
+    curves = Path(config.curves or f"{config.paths.runs}/accuracy_time/results")
+    return {"curves": curves, **printed_tables(config)}
+
+
+def target_and_points(config: DictConfig) -> dict:
+    """Give the PSNR that seconds are listed for, and the results of others."""
+    return {"target": config.target, **published_points(config)}
+
+
+KINDS = {
+    "accuracy_time": Kind("accuracy_time", "choices.write_accuracy_time", target_and_points),
+    "price_list": Kind("accuracy_time", "choices.write_price_list"),
+    "paper": Kind("paper", "paper.write_paper", curves_and_tables),
+    "ablation": Kind("ablations", "paper.write_ablation", printed_tables),
+    "minutes": Kind("minutes", "benchmark.write_minutes", published_points),
+    "methods": Kind("paper", "benchmark.write_methods"),
+    "effects": Kind("effects", "choices.write_effects"),
+}
+NAMES = (*KINDS, "compare", "run")
 MEGABYTES = 0.3, 1000  # least and most that may be asked for
 MOST_SIDE = 800  # pixels of a picture's longer side
 
 
 def report(config: DictConfig) -> None:
     """Write the page, or print the table."""
-    if config.kind not in ABOUT:
-        raise ValueError(f"kind: expected one of {', '.join(ABOUT)}, but got '{config.kind}'")
+    if config.kind not in NAMES:
+        raise ValueError(f"kind: expected one of {', '.join(NAMES)}, but got '{config.kind}'")
     if not isinstance(config.target, int | float | None):
         raise ValueError(f"target: expected a number of dB or null, but got '{config.target}'")
     if config.kind == "run":
@@ -258,7 +235,7 @@ def _rendered(config: DictConfig, row: dict, media) -> Iterator:
 
 def main() -> None:
     """Run the console script."""
-    command("report", report, HELP)
+    command("report", report, __doc__)
 
 
 if __name__ == "__main__":

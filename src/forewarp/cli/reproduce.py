@@ -1,21 +1,4 @@
-"""``forewarp-reproduce``: run the sweeps of a table, a price list or a comparison, then write its page."""
-
-from __future__ import annotations
-
-import difflib
-import shlex
-import subprocess
-import sys
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, fields
-from pathlib import Path
-
-import yaml
-
-from forewarp.cli.entry import INTERRUPTED, MISTAKE, project_root
-from forewarp.runs.overrides import merged
-
-HELP = """
+"""
 forewarp-reproduce runs the sweeps of a page, and then writes the page. A failed job is named at the end and
 stops no other; finished jobs are skipped, so the same command continues. `make TARGET KEY=...` calls it.
 
@@ -49,6 +32,21 @@ Keys (capitals do, too):
   more="K=V ..."    overrides added to every sweep
   small=1           tiny scenes and a few steps, to try the command
 """
+
+from __future__ import annotations
+
+import difflib
+import shlex
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import yaml
+
+from forewarp.cli.entry import INTERRUPTED, MISTAKE, project_root
+from forewarp.runs.overrides import merged
 
 TABLES = ["dnerf", "hypernerf", "nhr", "lego_complete"]
 ABLATIONS = ["ablation_modules", "ablation_losses"]
@@ -380,7 +378,7 @@ def main() -> None:
     """Run the console script."""
     kind, *arguments = sys.argv[1:] or ["--help"]
     if {"-h", "--help"} & {kind, *arguments}:
-        print(HELP.strip())
+        print(__doc__.strip())
         return
     try:
         job = plan_of(kind, Keys.typed(arguments))

@@ -1,10 +1,4 @@
-"""``forewarp-synthesize``: write procedural scenes."""
-
-from __future__ import annotations
-
-from forewarp.cli.entry import command
-
-HELP = """
+"""
 forewarp-synthesize writes a procedural brick vehicle whose arm lifts, whose rubber band stretches and whose
 ball bounces, with exact point trajectories, in the format of one of four datasets. The files depend on the
 keys alone, not on the number of processes.
@@ -30,6 +24,10 @@ What one types most:
 
 Train on it: forewarp-train data=dnerf data.root=scenes data.scene=large
 """
+
+from __future__ import annotations
+
+from forewarp.cli.entry import command
 
 
 def synthesize(config) -> None:
@@ -61,7 +59,7 @@ def synthesize(config) -> None:
 
 def main() -> None:
     """Run the console script."""
-    command("synthesize", synthesize, HELP)
+    command("synthesize", synthesize, __doc__)
 
 
 if __name__ == "__main__":

@@ -1,12 +1,4 @@
-"""``forewarp-train``: fit a scene, stage by stage, and measure it."""
-
-from __future__ import annotations
-
-from shlex import quote
-
-from forewarp.cli.entry import command
-
-HELP = """
+"""
 forewarp-train fits a moving scene, stage by stage, by the method that model= names, and measures it on its
 test views. The same command run again skips what is finished and goes on with what was interrupted.
 
@@ -53,6 +45,12 @@ images), images/ of the test views, per_image.json and metrics.json. With data.h
 also holds accuracy_time.csv and accuracy_time.png.
 Watch: tensorboard --logdir runs
 """
+
+from __future__ import annotations
+
+from shlex import quote
+
+from forewarp.cli.entry import command
 
 
 def train(config) -> float | None:
@@ -130,7 +128,7 @@ def images_of(frames, kind: str) -> str:
 
 def main() -> None:
     """Run the console script."""
-    command("train", train, HELP)
+    command("train", train, __doc__)
 
 
 if __name__ == "__main__":

@@ -1,10 +1,4 @@
-"""``forewarp-view``: see a finished run in the browser, or two beside each other."""
-
-from __future__ import annotations
-
-from forewarp.cli.entry import command
-
-HELP = """
+"""
 forewarp-view opens a page on which one flies around a finished run and through its time. It prints the page's
 address, and runs until Ctrl-C.
 
@@ -23,6 +17,11 @@ What one types most:
 
 A run in training: forewarp-train ... viewer=true
 """
+
+from __future__ import annotations
+
+from forewarp.cli.entry import command
+
 TOLERANCE = 1e-3  # by which two runs' test cameras may differ, of their distance to the origin
 
 
@@ -104,7 +103,7 @@ def refuse_other_scene(scene, other) -> None:
 
 def main() -> None:
     """Run the console script."""
-    command("view", view, HELP)
+    command("view", view, __doc__)
 
 
 if __name__ == "__main__":
