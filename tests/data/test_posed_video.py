@@ -12,7 +12,7 @@ from PIL import Image
 from forewarp.data.files import SceneError
 from forewarp.data.images import write_image
 from forewarp.data.module import PosedVideoDataModule
-from forewarp.data.posed_video import FILE, read_scene, write_scene
+from forewarp.data.posed_video import FILE, PosedShot, read_scene, write_scene
 from forewarp.scene.box import Box
 from forewarp.scene.camera import look_at
 from forewarp.scene.view import Asks
@@ -338,6 +338,52 @@ def test_masks_of_nerfstudio_tell_where_to_train_and_measure(tmp_path, masked, b
     assert torch.equal(next(iter(data.train_dataloader())).observations[0].valid, mask.flatten())
     assert len(read_scene(tmp_path, "toy", masks="ignore").protocol["assumed"]) == 1  # the times alone
     assert read_scene(tmp_path, "toy", masks="off").train[0].load_valid is None
+
+
+def test_what_moves_is_written_and_read_at_every_scale(tmp_path, made):
+    made()
+    file, (width, height), moving = tmp_path / "toy" / FILE, (30, 20), np.zeros((20, 30), bool)
+    moving[5:12, 8:19] = True
+    assert read_scene(tmp_path, "toy").test[0].load_moving is None
+    for i in range(10):
+        mask = moving if i != 3 else np.zeros_like(moving)  # nothing moves in one
+        write_image(tmp_path / "toy" / "moving" / f"m_{i}.png", np.uint8(255) * mask)
+        small = np.full((height // 2, width // 2, 3), 90, np.uint8)
+        write_image(tmp_path / "toy" / "images_2" / f"frame_{i}.png", small)
+    edit(file, {f"frames.{i}.moving_path": f"moving/m_{i}.png" for i in range(10)})
+    edit(file, {"moving_from": "a friend", "seconds": 4.5})
+    data = PosedVideoDataModule(tmp_path, "toy", rays=2000)
+    assert (data.scene.protocol["moving"], data.scene.protocol["seconds"]) == ("a friend", 4.5)
+    assert torch.equal(data.targets("test")[0].moving, torch.from_numpy(moving))
+    frames = (*data.scene.train, *data.scene.test)
+    assert [bool(f.load_moving().any()) for f in frames].count(False) == 1
+    shares = torch.from_numpy(moving).float().reshape(10, 2, 15, 2).mean((1, 3))
+    assert torch.equal(data.targets("test").reduced(2)[0].moving, shares >= 0.5)
+    smaller = read_scene(tmp_path, "toy", scale=2)  # from the same files
+    assert torch.equal(smaller.train[0].load_moving(), shares >= 0.5)
+    shots = [
+        PosedShot(f"a_{i}.jpg", f.camera, f.load()[..., :3], f.time, moving=f.load_moving().numpy())
+        for i, f in enumerate(data.scene.train)
+    ]
+    write_scene(tmp_path / "again", shots, near=0.1, far=9.0, seconds=4.5, moving_from="a friend")
+    again = read_scene(tmp_path, "again")
+    assert again.protocol["moving"] == "a friend"
+    assert torch.equal(again.test[0].load_moving(), torch.from_numpy(moving))
+
+
+def test_masks_of_what_moves_are_of_all_frames_and_of_the_images_size(tmp_path, made):
+    made()
+    write_image(tmp_path / "toy" / "moving.png", np.zeros((20, 30), np.uint8))
+    edit(tmp_path / "toy" / FILE, {"frames.0.moving_path": "moving.png"})
+    with pytest.raises(
+        SceneError, match=r"moving_path: expected one in all frames or in none, but got 1 of 10"
+    ):
+        read_scene(tmp_path, "toy")
+    write_image(tmp_path / "toy" / "moving.png", np.zeros((10, 15), np.uint8))
+    with pytest.raises(
+        SceneError, match=r"moving.png: expected 30 x 20 pixels as frame_\d.png, but got 15 x 10"
+    ):
+        read_scene(tmp_path, "toy")
 
 
 def test_masks_that_cannot_be_meant_are_refused(tmp_path, masked):

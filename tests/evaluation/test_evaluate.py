@@ -64,6 +64,41 @@ def test_scores_every_image_and_saves_it(run, module, tmp_path):
     assert not (tmp_path / "again" / "images" / "sheets").exists()
 
 
+def test_what_moves_is_scored_apart(run, module, tmp_path, capsys):
+    def masked(frame, mask):
+        return replace(frame, load_moving=lambda: mask)
+
+    scene, masks = run.datamodule.scene, torch.zeros(3, 24, 24, dtype=torch.bool)
+    masks[0, 4:9, 3:20], masks[1, 10:12, 10:12] = True, True  # nothing moves in the last
+    valid = torch.ones(24, 24, dtype=torch.bool)
+    valid[:6] = False
+    test = [masked(frame, mask) for frame, mask in zip(scene.test, masks)]
+    test[0] = replace(test[0], load_valid=lambda: valid)
+    data = SceneDataModule(lambda: replace(scene, test=tuple(test), protocol={"seconds": 2.0}), rays=60)
+    metrics = evaluate(module, data, tmp_path, ImageSuite())
+    images = {}
+    for view in draw(module, data.targets("test")):
+        rgb = list(view.renderings.values())[-1].rgb.reshape(24, 24, 3).clamp(0, 1)
+        images[view.number] = ((255 * rgb).round() - (255 * view.target.rgb).round()).square().mean(
+            -1
+        ) / 255**2
+    expected = [
+        -10 * torch.log10(images[i][chosen].mean()).item()
+        for i, chosen in enumerate((masks[0] & valid, masks[1]))
+    ]
+    assert metrics["test"]["moving"] == {"psnr": pytest.approx(sum(expected) / 2, abs=1e-4)}
+    counted = (~masks[0] & valid, ~masks[1], ~masks[2])
+    still = [-10 * torch.log10(images[i][chosen].mean()).item() for i, chosen in enumerate(counted)]
+    assert metrics["test"]["still"] == {"psnr": pytest.approx(sum(still) / 3, abs=1e-4)}
+    rows = json.loads((tmp_path / "per_image.json").read_text())["images"]
+    assert [sorted(row["parts"]) for row in rows] == [["moving", "still"], ["moving", "still"], ["still"]]
+    assert rows[1]["parts"]["moving"]["psnr"] == pytest.approx(expected[1], abs=1e-4)
+    assert metrics["protocol"]["nearest_training_frame"].endswith(" s")
+    show(metrics, tmp_path, {})
+    shown = {line.split()[0]: line.split() for line in capsys.readouterr().out.splitlines() if line.strip()}
+    assert shown["moving"][1] == f"{metrics['test']['moving']['psnr']:.2f}"
+
+
 def test_warps_once_a_time(module, monkeypatch):
     targets = ball_data().targets("test")
     times, at, render, clock = [], module.method.at, VoxelSnapshot.render, [0.0]

@@ -87,12 +87,15 @@ def test_the_page_tells_what_the_run_is(tmp_path, monkeypatch):
     effects["view"] = {"choice": "none", "on": False, "because": "trial +0.1 dB"}
     flow, size = {"epe_moving": 0.1, "motion_mean": 0.4}, {"particles": 2874}
     test = {"all": {"psnr": 31.25, "ssim": 0.9, "mean_error": 0.125}}
+    test |= {"moving": {"psnr": 17.25}, "still": {"psnr": 33.5}}
+    gaps = {"nearest_training_frame": "1 to 2 steps of 0.04 s", "moving": "images and poses"}
     folder = told_run(
         tmp_path,
         plan={"effects": effects, "seconds": 65.0},
         metrics={
             "effects": {"motion": True, "view": False, "extra": True},
             "test": test,
+            "protocol": gaps,
             "flow": flow,
             "size": size,
         },
@@ -108,6 +111,10 @@ def test_the_page_tells_what_the_run_is(tmp_path, monkeypatch):
         "25.5 dB after 40 s",
         "particles 2,874",
         "Mean error 0.125",
+        "PSNR of what moves (dB) 17.25",
+        "PSNR of what is still (dB) 33.50",
+        "nearest training frame 1 to 2 steps of 0.04 s",
+        "what moves, known from images and poses",
     ]
     expected += ["off by 0.1000 world units, 25% of their motion", "coarse: 100 steps in 0:50", "format=html"]
     assert [text for text in expected if text not in page.text] == []

@@ -165,7 +165,7 @@ def check_pixels(where: object, pixels: Tensor | np.ndarray, *shapes: tuple[int,
 
 
 def write_image(path: Path, pixels: Tensor | np.ndarray, quality: int = 97) -> None:
-    """Write uint8 pixels, whole or not at all: (H, W, 4) or (H, W, 3) as .png, (H, W, 3) or (H, W) as .jpg.
+    """Write uint8 pixels, whole or not at all: (H, W), (H, W, 3) or, as .png, (H, W, 4).
 
     A JPEG has full colour resolution; ``quality`` is its.
     """
@@ -290,7 +290,20 @@ class StoredMask:
         return mask
 
 
-def _bright(path: Path, size: tuple[int, int], channel: int = 0) -> Tensor:
+class MovingMask(StoredMask):
+    """A mask of what moves, bool (H, W), kept as others; it may be dark everywhere.
+
+    The file may be some times as large as ``size``: a pixel moves where half of it does.
+    """
+
+    def _decode(self) -> Tensor:
+        mask, shape = _bright(self.path), self.size[::-1]
+        if mask.shape == shape:
+            return mask
+        return torch.nn.functional.interpolate(mask[None, None].float(), shape, mode="area")[0, 0] >= 0.5
+
+
+def _bright(path: Path, size: tuple[int, int] | None = None, channel: int = 0) -> Tensor:
     """Decode where a channel is bright, (H, W) bool; masks of 0 and 1 are taken for what they are."""
     values = read_image(path, size)[..., channel]
     return values > (_FOREGROUND if int(values.max()) > 1 else 0)

@@ -5,6 +5,10 @@ A pose on disk is camera-to-world with OpenGL's axes (x right, y up, looking alo
 lengths (``near``, ``far``, ``aabb``; ``data.near``, ``data.far``, ``data.box``) are in the file's units,
 which may be any: the scene is normalised. The optional ``points.npy`` (N, 3), or the PLY that the file names,
 holds points that never move.
+
+Beyond nerfstudio's keys a frame may have ``moving_path``, a grey PNG as large as the unscaled image, bright
+where something moves, which is scored apart. ``moving_from`` says where these come from, ``seconds`` how long
+the film is.
 """
 
 from __future__ import annotations
@@ -22,8 +26,10 @@ from forewarp.data.cameras import MOST_UNITS, SPLITS, box_of, opengl_rows, space
 from forewarp.data.files import frames_of, inside, mismatch, number, read_json, remove, scene_folder, whole
 from forewarp.data.images import (
     SUFFIXES,
+    MovingMask,
     StoredImage,
     StoredMask,
+    by,
     check_pixels,
     hides_image,
     inspect_image,
@@ -55,7 +61,8 @@ _OF_CAMERA = ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_model", "k1", "k2", 
 class PosedShot:
     """An image to write: ``name`` its file, .png or .jpg; ``pixels`` uint8 (H, W, 3), or (H, W, 4) of
     straight alpha; ``camera`` of that size, its near and far are not written; ``time`` in [0, 1] or None;
-    ``split`` train, val or test, or "" where the reader is to choose.
+    ``split`` train, val or test, or "" where the reader is to choose; ``moving`` bool (H, W), what moves, or
+    None where it is not known.
     """
 
     name: str
@@ -63,6 +70,7 @@ class PosedShot:
     pixels: Tensor | np.ndarray
     time: float | None = None
     split: str = ""
+    moving: np.ndarray | None = None
 
 
 def read_scene(
@@ -134,7 +142,7 @@ def read_scene(
         )
         got = "an image beneath them too"
         raise mismatch(first.load.path, "one colour where pixels are transparent", got, advice)
-    if masks is None and entries[0].load_valid is not None:
+    if masks is None and entries[0].valid is not None:
         line = "dark pixels of mask_path are not trained or measured on"
         assumed.append(f"{file}: {line}; if they are beside a subject to cut out, set data.masks=alpha")
     options = {"near": near, "far": far, "box": bounds, "normalise": normalise, "cut_out": has_alpha}
@@ -142,7 +150,7 @@ def read_scene(
 
     train, val, test = (
         tuple(
-            Frame(e.name, e.time, space.camera(e.camera), e.load, load_valid=e.load_valid)
+            Frame(e.name, e.time, space.camera(e.camera), e.load, load_valid=e.valid, load_moving=e.moving)
             for e in parts[split]
         )
         for split in SPLITS
@@ -163,6 +171,10 @@ def read_scene(
         protocol["masks"] = (
             "ignore: PSNR is of the pixels that count, other metrics see the true colour elsewhere"
         )
+    if train[0].load_moving is not None:
+        protocol["moving"] = str(content.get("moving_from", "moving_path of the frames"))
+    if "seconds" in content:
+        protocol["seconds"] = number(content["seconds"], f"{file}: seconds", 0, 1e9)
     cloud = _points_of(file, content)
     if cloud is None and "ply_file_path" in content:
         assumed.append(f"{file}: ply_file_path names no file: there are no points to begin from")
@@ -196,7 +208,8 @@ class ImageEntry:
     camera: Camera
     load: StoredImage
     has_alpha: bool
-    load_valid: StoredMask | None = None
+    valid: StoredMask | None = None
+    moving: MovingMask | None = None
 
 
 def _read_entries(
@@ -224,11 +237,17 @@ def _read_entries(
     absent = {_name_of(file.parent, f.own.get("file_path"), f.where("file_path")) for f in frames}
     entries, has_mask, turned = [], [], []
     for entry, image in there:
-        mask, header = None, inspect_image(image)
+        mask, moving, header = None, None, inspect_image(image)
         turned += [image] if header.is_turned else []
         if "mask_path" in entry.own and masks != "off":
             mask = _file(entry, "mask_path", scale)
             inspect_image(mask, header.size, f" as {image.name}")
+        if "moving_path" in entry.own:
+            moving = MovingMask(_file(entry, "moving_path", 1), header.size)
+            size = inspect_image(moving.path).size
+            if any(abs(n - big / scale) >= 1 for n, big in zip(header.size, size)):
+                expected = f"{by(scale * n for n in header.size)} pixels as {image.name}"
+                raise mismatch(moving.path, expected, by(size))
         camera = camera_of(entry, header.size, scale, image, pose=pose_in(entry, axes, inverse))
         name = _name_of(file.parent, entry.own.get("file_path"), entry.where("file_path"))
         valid = None
@@ -242,9 +261,11 @@ def _read_entries(
         opaque = masks == "off" or (masks == "ignore" and mask is None)
         load = StoredImage(image, header.size, mask=None if valid else mask, opaque=opaque)
         has_mask.append(mask is not None)
-        entries.append(ImageEntry(name, time_in(entry), camera, load, header.has_alpha and not opaque, valid))
+        is_cut_out = header.has_alpha and not opaque
+        entries.append(ImageEntry(name, time_in(entry), camera, load, is_cut_out, valid, moving))
     for key, given in (
         ("mask_path", has_mask),
+        ("moving_path", [e.moving is not None for e in entries]),
         ("file_path: alpha", [e.has_alpha or e.load.mask is not None for e in entries]),
     ):
         if any(given) and not all(given):
@@ -356,6 +377,8 @@ def write_scene(
     far: float | None = None,
     aabb: Box | None = None,
     points: np.ndarray | None = None,
+    seconds: float | None = None,
+    moving_from: str | None = None,
 ) -> None:
     """Write a scene that ``read_scene`` reads; ``transforms.json`` is removed first and written last.
 
@@ -363,6 +386,8 @@ def write_scene(
         shots: consumed one by one; all or none have a split.
         near, far, aabb, points: where known, in the units of the cameras' places; ``points`` (N, 3) never
             move.
+        seconds: between times 0 and 1.
+        moving_from: who says what moves.
 
     Raises:
         ValueError: for a shot that ``read_scene`` would refuse.
@@ -376,8 +401,9 @@ def write_scene(
             lists[shot.split].append(entries[-1]["file_path"])
     common = {key: entries[0][key] for key in _OF_CAMERA if entries and key in entries[0]}
     common = {key: value for key, value in common.items() if all(e.get(key) == value for e in entries)}
+    told = {"near": near, "far": far, "seconds": seconds, "moving_from": moving_from}
     content = {**common, **{f"{split}_filenames": names for split, names in lists.items() if names}}
-    content |= {key: value for key, value in (("near", near), ("far", far)) if value is not None}
+    content |= {key: value for key, value in told.items() if value is not None}
     content |= {} if aabb is None else {"aabb": [aabb.low, aabb.high]}
     content["frames"] = [{k: v for k, v in entry.items() if k not in common} for entry in entries]
     write_array(folder / POINTS, points if points is not None and len(points) else None)
@@ -407,4 +433,8 @@ def _write_shot(folder: Path, shot: PosedShot, taken: set[str]) -> dict:
         entry["time"] = number(shot.time, f"{shot.name}: time", 0, 1)
     entry["transform_matrix"] = opengl_rows(camera.camera_to_world, shot.name)
     write_image(folder / entry["file_path"], pixels)
+    if shot.moving is not None:
+        mask = np.uint8(255) * np.asarray(shot.moving, bool)
+        entry["moving_path"] = f"moving/{shot.name.removesuffix(suffix)}.png"
+        write_image(folder / entry["moving_path"], check_pixels(shot.name, mask, shapes[0][:2]))
     return entry

@@ -7,8 +7,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
+from itertools import chain
 from pathlib import Path
-from statistics import fmean
+from statistics import fmean, median
 
 import torch
 from rich import box
@@ -22,7 +23,7 @@ from forewarp.files import write_json
 from forewarp.methods.effect import switched
 from forewarp.methods.method import HasTrajectories, parameter_count
 from forewarp.metrics.geometry import end_point_error
-from forewarp.metrics.registry import METRICS, ImageSuite, summarise
+from forewarp.metrics.registry import METRICS, ImageSuite, scores_of_parts, summarise
 from forewarp.ops.grid import block_means, reduced_depth
 from forewarp.progress import time_text
 from forewarp.scene.frame import Scene, spread
@@ -137,6 +138,7 @@ def evaluate(
             if not is_written:
                 (place / f"{frame.name}.png").unlink(missing_ok=True)
     per_image = [rows[number] for number in sorted(rows)]
+    parts = chain.from_iterable(row["parts"].items() for row in per_image)
     best, others = per_image[0]["rendering"], list(per_image[0]["others"])
     seconds = {name: float(done["seconds"]) for name, done in finished.items()}
     clocks = [done.get("clocks", {}) for done in finished.values()]
@@ -145,6 +147,7 @@ def evaluate(
         "protocol": {
             "scene": scene.name,
             **scene.protocol,
+            **from_training(scene),
             **protocol,
             **module.method.protocol(),
             "renderings": [*others, best],
@@ -166,7 +169,7 @@ def evaluate(
         "parameters": parameter_count(module.method),
         "size": dict([module.method.size]),
         "effects": switched(module.method),
-        "test": summarise((row["ability"], row["scores"]) for row in per_image),
+        "test": summarise(chain(((row["ability"], row["scores"]) for row in per_image), parts)),
     }
     for name in others:
         metrics[f"test_{name}"] = summarise((row["ability"], row["others"][name]) for row in per_image)
@@ -187,6 +190,27 @@ def middles(count: int, wanted: int | None) -> list[int]:
     if wanted is None or wanted >= count:
         return list(range(count))
     return [(2 * i + 1) * count // (2 * wanted) for i in range(wanted)]
+
+
+def from_training(scene: Scene) -> dict[str, str]:
+    """Say how far in time test frames are from the nearest training frame: steps between the frames, and
+    seconds where the scene's protocol has the length of its film; {} without steps.
+
+    >>> from types import SimpleNamespace as Of
+    >>> train, test = ([Of(time=t) for t in times] for times in ((0.0, 0.2, 0.3, 0.6), (0.1, 0.4, 0.45)))
+    >>> from_training(Of(train=train, test=test, protocol={"seconds": 5.0}))
+    {'nearest_training_frame': '1 to 1.5 steps of 0.5 s'}
+    """
+    train, test = ([frame.time for frame in frames] for frames in (scene.train, scene.test))
+    times = sorted({*train, *test})
+    if len(times) < 2 or not test:
+        return {}
+    step = median(b - a for a, b in zip(times, times[1:]))
+    gaps = sorted(min(abs(time - at) for at in train) / step for time in test)
+    least, most = (f"{gap:.2g}" for gap in (gaps[0], gaps[-1]))
+    steps = (least if least == most else f"{least} to {most}") + (" step" if most == "1" else " steps")
+    seconds = scene.protocol.get("seconds")
+    return {"nearest_training_frame": f"{steps} of {seconds * step:.3g} s" if seconds else steps}
 
 
 def mean_scores(module: DynamicSceneModule, targets: Sequence[Target], suite: ImageSuite) -> dict[str, float]:
@@ -248,12 +272,13 @@ def _score(view: RenderedView, suite: ImageSuite) -> dict:
     """Make the entry of one image: scores of the best rendering, and of the others by name."""
     target, frame, scores = view.target, view.target.frame, {}
     for name, rendering in view.renderings.items():
-        depth = rendering.depth.reshape(target.rgb.shape[:2]).cpu()
-        scores[name] = suite.score(_image(rendering, target), target, depth)
+        depth, image = rendering.depth.reshape(target.rgb.shape[:2]).cpu(), _image(rendering, target)
+        scores[name] = suite.score(image, target, depth)
     best, score = scores.popitem()
+    parts = scores_of_parts(image, target)
     about = {"name": frame.name, "time": frame.time, "ability": frame.ability, "rendering": best}
     seconds = {"seconds": view.seconds, "seconds_again": view.seconds_again}
-    return {**about, **seconds, "scores": score, "others": scores}
+    return {**about, **seconds, "scores": score, "parts": parts, "others": scores}
 
 
 def _save(view: RenderedView, folder: Path, is_on_sheet: bool) -> None:

@@ -19,6 +19,7 @@ NETS = "squeeze", "vgg", "alex"  # backbones of LPIPS
 LPIPS_METRICS = tuple(f"lpips_{net}" for net in NETS)
 THRESHOLDS = (1.02, 1.25, 1.25**2)  # ratios of rendered and true depth
 ABILITIES = ("space", "time", "canonical", "all")
+PARTS = ("moving", "still")  # of images whose masks say what moves
 
 log = logging.getLogger(__name__)
 
@@ -69,12 +70,35 @@ def _of_image(name: str):
 
 def _psnr(prediction: Tensor, target: Target, depth: Tensor | None) -> float | None:
     """PSNR of the pixels that count."""
+    return _psnr_of(target.valid, prediction, target)
+
+
+def _psnr_of(chosen: Tensor | None, prediction: Tensor, target: Target) -> float | None:
+    """PSNR of chosen pixels (H, W), None: of all; gives None where none is chosen."""
     from forewarp.metrics.image import psnr
 
-    if target.valid is None:
+    if chosen is None:
         return psnr(prediction, target.rgb)
-    valid = target.valid  # a row of pixels: none where averaging has left none
-    return psnr(prediction[valid][None], target.rgb[valid][None]) if bool(valid.any()) else None
+    return psnr(prediction[chosen][None], target.rgb[chosen][None]) if bool(chosen.any()) else None
+
+
+def scores_of_parts(prediction: Tensor, target: Target) -> dict[str, dict[str, float]]:
+    """Return the PSNR of what moves and of what is still, of the pixels that count; other metrics make no
+    sense of a part of an image.
+
+    Args:
+        prediction: (H, W, 3) in [0, 1].
+        target: the true image and, where it is known, what moves.
+
+    Returns:
+        ``{part: {"psnr": ...}}`` without parts that have no pixel.
+    """
+    if target.moving is None:
+        return {}
+    valid = True if target.valid is None else target.valid
+    chosen = zip(PARTS, (valid & target.moving, valid & ~target.moving))
+    found = {part: _psnr_of(pixels, prediction, target) for part, pixels in chosen}
+    return {part: {"psnr": value} for part, value in found.items() if value is not None}
 
 
 def _psnr_in_box(prediction: Tensor, target: Target, depth: Tensor | None) -> float | None:
@@ -224,13 +248,14 @@ class ImageSuite:
 
 
 def summarise(rows: Iterable[tuple[str, Mapping[str, float]]]) -> dict[str, dict[str, float]]:
-    """Average the scores of images per ability; abilities are never averaged together.
+    """Average the scores of images per ability or part; abilities are never averaged together.
 
     Args:
-        rows: the ability (``space``, ``time``, ``canonical`` or ``all``) and the scores of each image.
+        rows: the ability (``space``, ``time``, ``canonical`` or ``all``) or part (``moving``, ``still``) and
+            the scores of each image.
 
     Returns:
-        ``{ability: {metric: mean}}`` in fixed order. A metric that some images lack is the mean over
+        ``{ability or part: {metric: mean}}`` in fixed order. A metric that some images lack is the mean over
         the others.
 
     Raises:
@@ -239,10 +264,10 @@ def summarise(rows: Iterable[tuple[str, Mapping[str, float]]]) -> dict[str, dict
     >>> summarise([("time", {"psnr": 30.0}), ("space", {"psnr": 20.0}), ("time", {"psnr": 20.0})])
     {'space': {'psnr': 20.0}, 'time': {'psnr': 25.0}}
     """
-    collected: dict[str, dict[str, list[float]]] = {ability: {} for ability in ABILITIES}
+    collected: dict[str, dict[str, list[float]]] = {kind: {} for kind in (*ABILITIES, *PARTS)}
     for ability, scores in rows:
-        if ability not in ABILITIES:
-            raise ValueError(f"ability: expected one of {', '.join(ABILITIES)}, but got {ability!r}")
+        if ability not in collected:
+            raise ValueError(f"ability: expected one of {', '.join(collected)}, but got {ability!r}")
         for name, value in scores.items():
             if name not in METRICS:
                 raise ValueError(f"metric: expected one of {', '.join(METRICS)}, but got {name!r}")

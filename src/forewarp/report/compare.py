@@ -6,15 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from forewarp.metrics.registry import METRICS, metric_of
-from forewarp.report.results import UNREADABLE, Row, read_run, unreadable
+from forewarp.report.results import KINDS, UNREADABLE, Row, read_run, unreadable
 from forewarp.report.tables import Column, Difference, Table
 
-ABILITIES = {
-    "space": "at training times",
-    "time": "between them",
-    "canonical": "canonical time",
-    "all": "all",
-}
 COSTS = {"steps": ("steps", 0), "train": ("seconds of training", 0), "frame": ("seconds per image", 3)}
 # Shown where the runs differ in them, as their numbers then tell little of the methods.
 CONDITIONS = {"clock": "clock of the minutes", "threads": "threads", "device": "computed on"}
@@ -41,9 +35,9 @@ def compare(runs: dict[str, Row]) -> Table:
 
     added = (name for row in rows for scores in row["test"].values() for name in scores)
     for metric in map(metric_of, dict.fromkeys([*METRICS, *added])):
-        for ability, words in ABILITIES.items() if metric.summary else ():
+        for kind, words in KINDS.items() if metric.summary else ():
             name = words if metric.name == "psnr" else f"{metric.heading}, {words}"
-            values = [row["test"].get(ability, {}).get(metric.name) for row in rows]
+            values = [row["test"].get(kind, {}).get(metric.name) for row in rows]
             add(name, values, metric.digits, same_views)
     shares = [None if row["motion_error"] is None else 100 * row["motion_error"] for row in rows]
     add("moving points' error, % of motion", shares, 0, True)

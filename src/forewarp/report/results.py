@@ -53,6 +53,9 @@ NUMBERS = (
 )
 NUMBERS += ("psnr_canonical", "size", "wall", "processor")
 TEXTS = ("dataset", "day", "commit", "departures", "faults", "views", "curve", "command")
+# Kinds of test view, and parts of their pixels, that scores are of.
+KINDS = {"space": "at training times", "time": "between training times", "canonical": "at the canonical time"}
+KINDS |= {"all": "all", "moving": "what moves", "still": "what is still"}
 COUNTERPART = "counterpart of "  # begins the dataset of synthetic scenes that stand in for its own
 NETS = ("vgg", "alex", "squeeze")  # LPIPS in tables is of the first whose weights were there
 PROTOCOL = (

@@ -21,14 +21,12 @@ from forewarp.metrics.registry import metric_of
 from forewarp.progress import time_text
 from forewarp.report.choices import seconds_to
 from forewarp.report.figures import sheets_of, thirds
-from forewarp.report.results import UNREADABLE, Row, read_run, unreadable
+from forewarp.report.results import KINDS, UNREADABLE, Row, read_run, unreadable
 from forewarp.report.tables import TEMPLATES, Column, Table, rendered
 
 if TYPE_CHECKING:  # so that what is refused waits for no torch
     from torch import Tensor
 
-ABILITIES = {"space": "at training times", "time": "between training times"}
-ABILITIES |= {"canonical": "at the canonical time", "all": "all"}
 WHYS = "best", "median", "worst", "earliest", "latest"  # views to look at, as they are shown
 PARTS = "truth", "prediction", "error"  # of a sheet
 # Videos in the order in which one of a folder is taken.
@@ -284,14 +282,14 @@ def page(
 ) -> str:
     """Return the page as HTML; see ``encoded`` for views, video and notes."""
     script, images = (TEMPLATES / "run_page.js").read_text(), row["images"][:LISTED]
-    kinds = [{"kind": ABILITIES.get(kind, kind), "scores": scores} for kind, scores in row["test"].items()]
-    images = [image | {"kind": ABILITIES.get(image["ability"], image["ability"])} for image in images]
+    kinds = [{"kind": KINDS.get(kind, kind), "scores": scores} for kind, scores in row["test"].items()]
+    images = [image | {"kind": KINDS.get(image["ability"], image["ability"])} for image in images]
     values = {"row": row, "media": media, "views": list(zip(media.views, views)), "video": video}
     values |= {"pictures_note": pictures_note, "video_note": video_note, "near": near, "time_text": time_text}
     values |= {"protocol": row["metrics"].get("protocol", {}), "flow": row["metrics"].get("flow") or {}}
     charts = {"Where it is good, and where not": _of_views(row["images"]) if row["images"] else []}
     charts["How it got there"] = [*_accuracy(row), *_losses(row)]
-    values |= {"charts": charts, "effects": _effects(row), "abilities": ABILITIES, "metric_of": metric_of}
+    values |= {"charts": charts, "effects": _effects(row), "abilities": KINDS, "metric_of": metric_of}
     values |= {"budget": row["config"]["budget"], "folder": shlex.quote(near(str(row["folder"])))}
     values |= {"scores": _score_table(kinds, {"kind": "test views"})}
     values |= {"listed": _score_table(images, {"name": "view", "kind": "kind", "time": Column("time", 3)})}
@@ -428,7 +426,7 @@ def _of_views(images: Sequence[dict]) -> list[dict]:
     series = []
     for kind in kinds:
         points = [(v["time"], v["psnr"], told) for _, v, told in drawn(by_time) if v["ability"] == kind]
-        series.append((ABILITIES.get(kind, kind) if len(kinds) > 1 else "", "dots", points))
+        series.append((KINDS.get(kind, kind) if len(kinds) > 1 else "", "dots", points))
     stems = ("", "stems", [(number, view["psnr"], told) for number, view, told in drawn(ranked)])
     count, below = len(stems[2]), sum(image["psnr"] < mean - 1 for image in images)
     fewer = f" {count} of the {len(images)} views are drawn; the words are of all." * (count < len(images))

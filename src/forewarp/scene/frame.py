@@ -24,6 +24,7 @@ class Frame:
     frame measures: ``space``, ``time``, ``canonical``, or ``all`` if the dataset does not say.
     ``camera_id`` numbers the physical cameras from 0, if the dataset tells them apart. ``load_valid()``, if
     not None, gives (H, W) bool: the pixels, at least one, that count in training and in metrics.
+    ``load_moving()``, if not None, gives (H, W) bool: the pixels of what moves, which are scored apart.
     """
 
     name: str
@@ -34,6 +35,7 @@ class Frame:
     ability: str = "all"
     camera_id: int | None = None
     load_valid: Callable[[], Tensor] | None = None
+    load_moving: Callable[[], Tensor] | None = None
 
 
 @dataclass(frozen=True)

@@ -171,7 +171,8 @@ class Target:
     frame's camera or, where it was reduced, smaller.
 
     If known: ``foreground`` (H, W) bool, ``depth`` (H, W) exact ray depth in world units (0 on the
-    background), ``index`` among the training frames, ``valid`` (H, W) bool, the pixels that count.
+    background), ``index`` among the training frames, ``valid`` (H, W) bool, the pixels that count,
+    ``moving`` (H, W) bool, those of what moves.
     """
 
     frame: Frame
@@ -181,6 +182,7 @@ class Target:
     depth: Tensor | None = None
     index: int | None = None
     valid: Tensor | None = None
+    moving: Tensor | None = None
 
     @property
     def moment(self) -> Moment:
@@ -194,6 +196,6 @@ class Target:
 
     def to(self, device) -> Target:
         """Move the tensors to another device."""
-        names = ("rgb", "background", "foreground", "depth", "valid")
+        names = ("rgb", "background", "foreground", "depth", "valid", "moving")
         known = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
         return replace(self, **{name: tensor.to(device) for name, tensor in known.items()})
