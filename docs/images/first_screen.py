@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from forewarp.report.compare import read_compared
+from forewarp.report.choices import read_compared
 from forewarp.report.figures import figure_of, save, sheets_of, thirds, view_near
 
 METHODS = ("particles", "forward", "backward")

@@ -22,7 +22,7 @@ from forewarp.ops.grid import dilate
 from forewarp.runs.build import build_run
 from forewarp.runs.config import saved_config
 from forewarp.scene.frame import spread
-from forewarp.training.handover import load_handover
+from forewarp.training.checkpoints import load_handover
 from forewarp.training.stages import Run
 
 REGIONS = ("outside", "outline", "inside")

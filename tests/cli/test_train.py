@@ -12,7 +12,7 @@ import yaml
 from forewarp import load
 from forewarp.methods.particles.model import Particles
 from forewarp.runs.session import locked
-from forewarp.training.handover import load_handover
+from forewarp.training.checkpoints import load_handover
 from tests.support.commands import TINY
 from tests.support.written_scenes import write_dnerf
 

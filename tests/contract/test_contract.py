@@ -13,7 +13,7 @@ import torch
 
 from forewarp.methods.method import HasBounds, HasMatter, HasTrajectories
 from forewarp.scene.view import Moment, View
-from forewarp.training.handover import load_handover
+from forewarp.training.checkpoints import load_handover
 from forewarp.training.objective import total
 from tests.contract.fitting import Stop, batch_of, gradients_of, killed, module_of, run_of, stage_of
 from tests.contract.scenes import DATASETS, TIMES, data_of

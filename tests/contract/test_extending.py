@@ -3,7 +3,7 @@
 import importlib
 import re
 
-from forewarp.training.handover import load_handover
+from forewarp.training.checkpoints import load_handover
 from tests.contract.fitting import Losses, run_of, stage_of
 from tests.contract.scenes import data_of
 from tests.contract.table import METHODS, Entry

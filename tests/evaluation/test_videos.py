@@ -1,8 +1,8 @@
 import pytest
 import torch
 
+from forewarp.evaluation.images import make_shots, video
 from forewarp.evaluation.trajectories import Trajectories, moving_points
-from forewarp.evaluation.videos import make_shots, video
 from tests.support.tiny_scene import ball_scene, camera_at, known_ball
 
 WHITE = torch.ones(3)
@@ -34,12 +34,6 @@ def test_a_swing_stays_between_the_cameras_while_time_passes(cameras):
     shots = make_shots("swing", 5, 0.5, cameras[3], cameras[:7])
     assert [time for _, time in shots] == [0, 0.25, 0.5, 0.75, 1]
     torch.testing.assert_close(shots[0][0].center, cameras[3].center)
-
-
-def test_an_unknown_path_is_named(cameras):
-    expected = "path: expected one of fixed, swing, orbit, both, trajectories, but got 'spiral'"
-    with pytest.raises(ValueError, match=expected):
-        make_shots("spiral", 4, 0.5, cameras[0], cameras)
 
 
 def test_the_warp_is_made_once_a_time(cameras):

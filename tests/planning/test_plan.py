@@ -11,9 +11,8 @@ from omegaconf import OmegaConf
 from forewarp.data.module import SceneDataModule
 from forewarp.methods.particles.options import EFFECTS as PARTICLES
 from forewarp.methods.particles.options import ParticlesPlanning
-from forewarp.planning.plan import Planner, refuse
+from forewarp.planning.plan import Planner, Trial, Trials, refuse
 from forewarp.planning.plan_file import read_plan, with_plan, write_plan
-from forewarp.planning.trials import Trial, Trials
 from forewarp.scene.frame import Survey
 from forewarp.synth.scenes import synthesize
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from forewarp.metrics.registry import METRICS, Metric
-from forewarp.report.compare import compare, read_compared
+from forewarp.report.choices import compare, read_compared
 from tests.support.runs_on_disk import write_run
 
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from forewarp.data.module import DNeRFDataModule, SceneDataModule, blind_frames
-from forewarp.runs.doubts import doubts
+from forewarp.runs.fitted import doubts
 from forewarp.training.schedule import StageSettings
 from tests.support.tiny_scene import ball_scene
 

@@ -11,7 +11,7 @@ from torch.testing import assert_close
 from forewarp.methods.method import Method, Start
 from forewarp.scene.box import Box
 from forewarp.scene.cloud import Cloud, Handover
-from forewarp.training.handover import load_handover, make_handover, save_handover
+from forewarp.training.checkpoints import load_handover, make_handover, save_handover
 from tests.support.tiny_scene import BOX, RADIUS, ball_center, ball_method, ball_scene, forward_model
 
 SCENE = ball_scene(frames=6, size=16)
@@ -88,8 +88,8 @@ def test_a_stage_leaves_its_matter_and_the_paths_of_it_or_a_sample(monkeypatch):
     assert float((matter.points - ball_center(0.0)).norm(dim=-1).max()) < RADIUS
     assert handover.times.tolist() == pytest.approx(list(SCENE.times))
     assert handover.paths.equal(method.trajectories(matter.points, handover.times))
-    monkeypatch.setattr("forewarp.training.handover._POINTS", 7)
-    monkeypatch.setattr("forewarp.training.handover._TIMES", 3)
+    monkeypatch.setattr("forewarp.training.checkpoints._POINTS", 7)
+    monkeypatch.setattr("forewarp.training.checkpoints._TIMES", 3)
     handover = make_handover(method, SCENE, None, 6)
     assert handover.paths.shape == (7, 3, 3)
     assert handover.times.tolist() == pytest.approx([SCENE.times[i] for i in (0, 2, 4)], abs=0.21)

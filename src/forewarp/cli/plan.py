@@ -45,15 +45,16 @@ def plan(config) -> None:
 
 def planned():
     """Make or read a plan of what was typed; return the config of the run that the plan says."""
+    from hydra import compose
+
     from forewarp.planning.plan import make_plan
     from forewarp.planning.plan_file import own_folder, show_plan
-    from forewarp.planning.trials import composed
     from forewarp.runs.overrides import merged, typed_overrides, without_switched_off
 
     typed = typed_overrides(of_sweep=True)
-    made = make_plan(composed(typed), typed_overrides())
+    made = make_plan(compose("train", typed), typed_overrides())
     show_plan(made, to_fit=False)
-    config = composed(without_switched_off(merged([*made["overrides"], *own_folder(typed)], typed)))
+    config = compose("train", without_switched_off(merged([*made["overrides"], *own_folder(typed)], typed)))
     config.planned = made["file"]
     return config
 

@@ -60,9 +60,8 @@ def write_film(config, run, module) -> Path:
 
 def pictures_of(config, module, datamodule):
     """Render the pictures of the video that the config describes."""
-    from forewarp.evaluation.images import sized
+    from forewarp.evaluation.images import make_shots, sized, video
     from forewarp.evaluation.trajectories import Trajectories
-    from forewarp.evaluation.videos import make_shots, video
 
     cameras = [frame.camera for frame in datamodule.scene.train]
     targets = datamodule.targets("test")
@@ -88,7 +87,7 @@ def check(config) -> None:
     """Refuse settings of which no video can be made, before anything is loaded."""
     from forewarp.cli.prepare import LEAST, RANGES, refuse_numbers
     from forewarp.drawing.images import FORMATS
-    from forewarp.evaluation.videos import PATHS
+    from forewarp.evaluation.images import PATHS
 
     for key, known in (("path", PATHS), ("format", FORMATS)):
         if config[key] not in known:

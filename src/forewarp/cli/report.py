@@ -122,7 +122,7 @@ def report(config: DictConfig) -> None:
 
 def compared(config: DictConfig) -> str:
     """Return the table of ``kind=compare``; draw a view by each run where ``out`` is set."""
-    from forewarp.report.compare import compare, read_compared
+    from forewarp.report.choices import compare, read_compared
     from forewarp.report.figures import draw_beside
 
     named = [config.runs] if isinstance(config.runs, str) else list(config.runs or ())

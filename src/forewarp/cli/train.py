@@ -84,8 +84,7 @@ def measure(prepared, module) -> float | None:
     """Measure a fitted run, or say how to; draw its curve; return the score."""
     from forewarp.evaluation.evaluate import notes_of
     from forewarp.report.figures import draw_own
-    from forewarp.runs.doubts import doubts, tell
-    from forewarp.runs.fitted import measure_run
+    from forewarp.runs.fitted import doubts, measure_run, tell
 
     run, config = prepared.run, prepared.config
     if config.evaluate:

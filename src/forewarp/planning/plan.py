@@ -3,29 +3,180 @@
 from __future__ import annotations
 
 import json
+import os
+import shutil
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, fields, is_dataclass
+from dataclasses import asdict, dataclass, field, fields, is_dataclass
 from pathlib import Path
 from statistics import fmean
 
+from hydra import compose
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf, open_dict
 
 from forewarp.data.module import most_held_out
+from forewarp.evaluation.images import psnr_by_view
+from forewarp.files import read_json, write_json
 from forewarp.methods.effect import Asked, Effect, Planning
-from forewarp.methods.method import check_least, check_number
+from forewarp.methods.method import HasRest, check_least, check_number
+from forewarp.metrics.gain import Gain
 from forewarp.planning.plan_file import read_plan, write_plan
-from forewarp.planning.trials import Trial, Trials, gain
 from forewarp.runs.build import build_run
 from forewarp.runs.config import HASH, content_hash, trust_of
-from forewarp.runs.overrides import key_of, merged
+from forewarp.runs.overrides import key_of, merged, without_switched_off
+from forewarp.runs.session import session
 from forewarp.scene.frame import Scene, survey
+from forewarp.training.checkpoints import NUMBERS, POINTS
+from forewarp.training.module import DynamicSceneModule
 from forewarp.training.schedule import most_steps
+from forewarp.training.stages import Run
 
+RAYS = 10_000  # pixels rendered of each held-out view
 # Keys that do not change what a run computes.
 NOT_OF_IT = ("effects", "plan", "run", "evaluate", "sheets", "views", "reduce", "planned", "trust", "score")
 MAY_BE_NULL = ("minutes", "steps", "trial_steps", "least")
+
+
+@dataclass(frozen=True)
+class Trial:
+    """The result of a short run.
+
+    Attributes:
+        psnr: PSNR of each held-out view, dB.
+        step: training seconds per step.
+        steps: number of steps done.
+        took: seconds in all, with loading and scoring.
+        at_rest: share of the matter that came to rest; 0 for a method that does not tell.
+    """
+
+    psnr: tuple[float, ...]
+    step: float
+    steps: int
+    took: float
+    at_rest: float = 0.0
+
+
+def gain(on: Sequence[Trial], off: Sequence[Trial], *, equal_steps: bool = True) -> Gain:
+    """Compare trials with and without an effect, seed by seed and view by view."""
+    numbers = [[[{"psnr": psnr, "step": t.step} for psnr in t.psnr] for t in trials] for trials in (on, off)]
+    pairs = [list(zip(*views, strict=True)) for views in zip(*numbers, strict=True)]
+    seconds = on[0].step * on[0].steps, off[0].step * off[0].steps
+    return Gain.of(pairs, on[0].steps if equal_steps else None, seconds)
+
+
+@dataclass
+class Trials:
+    """Run all short runs of one plan; finished ones are not run again.
+
+    Args:
+        typed: overrides of the run to plan.
+        folder: the plan's folder, with one folder for each trial.
+        held_out: number of training views to hold out and score.
+        always: the method's overrides of every trial.
+        always_fine: the method's overrides of every fine trial.
+        steps: steps of a coarse stage.
+        seconds: most seconds of a coarse stage.
+        fine_steps: steps of a fine stage.
+        fine_seconds: most seconds of a fine stage.
+        seconds_before: total seconds of the trials that were finished before.
+        made: the fine trials so far, as several effects are compared with the same trial.
+    """
+
+    typed: list[str]
+    folder: Path
+    held_out: int
+    always: Sequence[str]
+    always_fine: Sequence[str]
+    steps: int
+    seconds: float
+    fine_steps: int
+    fine_seconds: float
+    seconds_before: float = 0.0
+    made: dict[str, Trial] = field(default_factory=dict)
+
+    def coarse(self, name: str, changes: Sequence[str]) -> tuple[Trial, Run, DynamicSceneModule]:
+        """Fit a coarse stage with these overrides; return its result, its run and the fitted module."""
+        config = self._config(name, changes, self.always, 0, self.steps, self.seconds)
+        for later in list(config.stage)[1:]:
+            config.stage[later] = None
+        return self._fitted(config)
+
+    def fine(
+        self, name: str, changes: Sequence[str], after: str, seed: int, steps: int | None = None, longer=1
+    ) -> Trial:
+        """Fit a short fine stage that begins where the coarse stage of the trial ``after`` ended.
+
+        Args:
+            name: name of the trial.
+            changes: overrides of the trial.
+            after: name of the trial whose coarse stage to continue.
+            seed: added to the run's seed.
+            steps: steps of the stage; None: ``fine_steps``, or fewer if ``fine_seconds`` end first.
+            longer: times ``fine_steps`` and ``fine_seconds``; of no effect where ``steps`` is given.
+        """
+        name = f"{name}-seed{seed}"
+        if name not in self.made:
+            seconds = longer * self.fine_seconds if steps is None else None
+            steps, always = steps or longer * self.fine_steps, [*self.always, *self.always_fine]
+            config = self._config(name, changes, always, seed, steps, seconds)
+            first, last = list(config.stage)[0], list(config.stage)[-1]
+            config.stage[first].share, config.stage[last].share = 1e-6, 1.0
+            self.made[name] = self._fitted(config, self.folder / after / first)[0]
+        return self.made[name]
+
+    def _config(self, name: str, changes, always, seed: int, steps: int, seconds: float | None) -> DictConfig:
+        config = compose("train", without_switched_off(merged(merged(changes, self.typed), always)))
+        data = OmegaConf.to_container(config.data, resolve=True) | {"seed": config.seed + seed}
+        with open_dict(config):
+            config.data = data  # resolved before the seed changes, as synthetic scenes are made from the seed
+            config.run, config.seed, config.effects = str(self.folder / name), config.seed + seed, "given"
+            config.budget.iterations, config.budget.minutes = steps, None if seconds is None else seconds / 60
+            config.data.held_out, config.evaluate = self.held_out, False
+            config.logger, config.callbacks = None, {"progress": config.callbacks.get("progress")}
+        print(self.folder / name, flush=True)
+        return config
+
+    def _fitted(self, config: DictConfig, begun: Path | None = None) -> tuple[Trial, Run, DynamicSceneModule]:
+        """Fit and score a trial, or read the stored result; ``begun``: folder of a finished first stage."""
+        begin = time.perf_counter()
+        run = build_run(config)
+        run.tell = lambda line: None
+        run.datamodule.setup("fit")
+        with session(run, config):
+            if begun is not None:
+                _share(begun, run.folder / begun.name)
+            module = run.fit().to(run.device)
+            file = run.folder / "trial.json"
+            if (stored := read_json(file)) is not None:
+                self.seconds_before += stored["took"]
+                return Trial(**stored | {"psnr": tuple(stored["psnr"])}), run, module
+            noted = read_json(run.stage_folder(run.stages[-1]) / "done.json")
+            psnr = psnr_by_view(module, run.datamodule.watched(), RAYS)
+            step, took = noted["seconds"] / noted["steps"], time.perf_counter() - begin
+            rest = module.method.at_rest() if isinstance(module.method, HasRest) else 0.0
+            trial = Trial(tuple(psnr), step, noted["steps"], took, rest)
+            write_json(file, asdict(trial))
+        return trial, run, module
+
+
+def _share(source: Path, target: Path) -> None:
+    """Link a finished stage into another run, or copy it if the file system has no hard links."""
+
+    def link(file: str, copy: str) -> None:
+        try:
+            os.link(file, copy)
+        except OSError:
+            shutil.copyfile(file, copy)
+
+    def is_no_result(folder: str, names: list[str]) -> set[str]:
+        return set(names) - {"last.ckpt", NUMBERS, POINTS, "done.json"}
+
+    if not target.is_dir():
+        beside = target.with_name(target.name + ".part")
+        shutil.rmtree(beside, ignore_errors=True)
+        shutil.copytree(source, beside, ignore=is_no_result, copy_function=link)
+        beside.rename(target)
 
 
 def make_plan(config: DictConfig, overrides: Sequence[str]) -> dict:

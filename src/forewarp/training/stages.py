@@ -22,8 +22,14 @@ from forewarp.files import read_json, write_json
 from forewarp.methods.method import Model, Start, parameter_count
 from forewarp.scene.cloud import Handover
 from forewarp.scene.frame import Scene
-from forewarp.training.checkpoints import KeepCheckpoint, check_state, load_weights
-from forewarp.training.handover import load_handover, make_handover, save_handover
+from forewarp.training.checkpoints import (
+    KeepCheckpoint,
+    check_state,
+    load_handover,
+    load_weights,
+    make_handover,
+    save_handover,
+)
 from forewarp.training.module import DynamicSceneModule
 from forewarp.training.schedule import Curriculum, Stage
 from forewarp.training.sentinel import Sentinel

@@ -17,7 +17,7 @@ from forewarp.renderer import Marched
 from forewarp.scene.box import Lattice
 from forewarp.scene.cloud import Handover
 from forewarp.scene.view import Moment
-from forewarp.training.handover import make_handover
+from forewarp.training.checkpoints import make_handover
 from tests.support.tiny_scene import (
     BOX,
     EVERYTHING,
