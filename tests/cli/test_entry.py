@@ -145,6 +145,15 @@ def test_what_follows_an_option_is_no_run(in_tmp):
     words = ["--config-dir", "demo", "demo", "run=demo", "-x", "other"]
     assert with_run_key("render", words) == ["--config-dir", "demo", "run=demo", "run=demo", "-x", "other"]
     assert with_run_key("report", ["demo"]) == ["demo"]
+    for name in ("~a", "a=b"):
+        (in_tmp / name).mkdir()
+        assert with_run_key("render", [name]) == [f"run={name}"]
+
+
+@pytest.mark.parametrize("seeds", ["0", "-1", "1.5", "x", "null"])
+def test_a_number_of_seeds_that_would_run_nothing_is_refused(refused, in_tmp, seeds):
+    line = f"seeds: expected a whole number of at least 1, but got {seeds}"
+    assert refused("train", "--multirun", f"seeds={seeds}") == line
 
 
 def test_the_whole_story_on_demand(forewarp, monkeypatch, in_tmp):

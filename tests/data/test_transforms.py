@@ -10,9 +10,10 @@ import torch
 
 from forewarp.data import dnerf, posed_video
 from forewarp.data.cameras import FLIP
+from forewarp.data.checks import check_seen
 from forewarp.data.files import Entry, SceneError, layout_of
-from forewarp.data.module import DNeRFDataModule, check_seen
-from forewarp.data.transforms import camera_of, check_directions, looks_turned, times_of
+from forewarp.data.module import DNeRFDataModule
+from forewarp.data.transforms import camera_of, check_directions, left_aside, looks_turned, times_of
 from forewarp.scene.camera import look_at
 from tests.support.written_scenes import dnerf_shots, edit, write_dnerf
 
@@ -63,6 +64,16 @@ def test_an_angle_of_upright_images_is_of_the_width_or_as_told():
 def test_intrinsics_that_cannot_be_right_are_named(keys, said):
     with pytest.raises(SceneError, match=said):
         camera(**keys)
+
+
+@pytest.mark.parametrize(("angle", "said"), [(2 * math.atan(0.375), 0), (WIDE, 1)])
+def test_a_vertical_angle_that_contradicts_is_told(angle, said, tmp_path):
+    entry = Entry("t.json", {"fl_x": 80, "camera_angle_y": angle})
+    lines = left_aside([(entry, camera(**entry.own))])
+    assert len(lines) == said
+    assert all(
+        "camera_angle_y: 53.1 degrees left aside, as the other keys say 41.1" in line for line in lines
+    )
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,7 @@ from forewarp.runs.config import (
     trusted_config,
     without_trust,
 )
+from forewarp.runs.overrides import as_text
 from tests.support.configs import CONF, composed
 
 
@@ -131,7 +132,7 @@ def test_a_class_of_ours_is_refused_where_it_does_not_belong():
     ("key", "value"),
     [
         *(("checkpoint_seconds", value) for value in ("nan", "-1", "[nan]", "inf", "often")),
-        *(("evaluate", "maybe"), ("seed", str(2**32)), ("seed", "-1"), ("seed", "1.5")),
+        *(("evaluate", "maybe"), ("seed", str(2**32)), ("seed", "-1"), ("seed", "1.5"), ("data.seed", "-1")),
         *(("lpips_weights", "1e400"), ("lpips_weights", "[a,3]"), ("callbacks.progress", "text")),
         *(("data.scene", "' '"), ("data.scene", "../../x"), ("data.scene", "/x")),
     ],
@@ -139,6 +140,42 @@ def test_a_class_of_ours_is_refused_where_it_does_not_belong():
 def test_a_value_that_would_be_noticed_late_is_refused_at_once(key, value):
     with pytest.raises(ValueError, match=f"^{re.escape(key)}: expected "):
         check_values(composed(f"{key}={value}"))
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *(
+            "{a}",
+            "null",
+            "a=b",
+            "~x",
+            "-x",
+            "[a]",
+            "[a",
+            "{",
+            "'",
+            "a'b",
+            "a\\",
+            "$x",
+            "true",
+            "1e3",
+            "007",
+            "(1)",
+            " a ",
+        )
+    ],
+)
+def test_odd_names_are_taken_as_typed(name):
+    config = composed(*as_text([f"data.scene={name}", f"run=runs/{name}"]))
+    assert (config.data.scene, config.run) == (name, f"runs/{name}")
+
+
+def test_a_list_null_and_an_interpolation_stay_hydras_and_home_is_found(monkeypatch):
+    monkeypatch.setenv("HOME", "/home/me")
+    assert as_text(["runs=[a,b]", "run=null", "run=${paths.runs}/x", "out=~/x", "data.scene=~/x"]) == [
+        *("runs=[a,b]", "run=null", "run=${paths.runs}/x", "out=/home/me/x", "data.scene='~/x'")
+    ]
 
 
 def test_a_file_that_holds_no_config_is_refused(tmp_path):

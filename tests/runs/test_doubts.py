@@ -4,7 +4,8 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from forewarp.data.module import DNeRFDataModule, SceneDataModule, blind_frames
+from forewarp.data.checks import blind_frames
+from forewarp.data.module import DNeRFDataModule, SceneDataModule
 from forewarp.runs.fitted import doubts
 from forewarp.training.schedule import StageSettings
 from tests.support.tiny_scene import ball_scene

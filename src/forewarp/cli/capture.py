@@ -26,6 +26,7 @@ After Ctrl-C the same command goes on.
 from __future__ import annotations
 
 from forewarp.cli.entry import command
+from forewarp.runs.config import check_seed
 from forewarp.runs.overrides import command_line, text_override
 
 MATCHING = ("auto", "sequential", "exhaustive")
@@ -90,8 +91,7 @@ def check(config) -> tuple[dict, object]:
         value = config[key]
         if not (or_null and value is None) and (type(value) is not int or value < least):
             raise ValueError(f"{key}: expected a whole number of at least {least}, but got {value}")
-    if type(config.seed) is not int or config.seed < 0:
-        raise ValueError(f"seed: expected a whole number of at least 0, but got {config.seed}")
+    check_seed(config.seed)
     for key, known in (("matching", MATCHING), ("lens", LENSES)):
         if config[key] not in known:
             raise ValueError(f"{key}: expected one of {', '.join(known)}, but got '{config[key]}'")

@@ -65,6 +65,9 @@ def _arguments(name: str) -> list[str]:
     arguments = as_text(with_run_key(name, sys.argv[1:]))
     if name in ("train", "plan"):
         arguments = [re.sub(r"^dataset=", "experiment=", argument) for argument in arguments]
+        for seeds in (argument[6:] for argument in arguments if argument.startswith("seeds=")):
+            if not re.fullmatch("[1-9][0-9]*", seeds):  # of none Hydra would run nothing, and say nothing
+                raise ValueError(f"seeds: expected a whole number of at least 1, but got {seeds}")
     refuse_dashes(arguments)
     if any(argument.startswith("plan=") for argument in arguments):
         from forewarp.planning.plan_file import with_plan

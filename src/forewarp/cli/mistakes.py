@@ -20,7 +20,7 @@ FOLDERS = {"evaluate": "run", "render": "run", "view": "run", "export": "run", "
 
 
 def with_run_key(name: str, arguments: list[str]) -> list[str]:
-    """Put ``run=`` (for ``train``: ``resume=``) before a bare folder.
+    """Put ``run=`` (for ``train``: ``resume=``) before a bare folder, whose name may hold ``=``.
 
     Args:
         name: name of the command.
@@ -28,7 +28,7 @@ def with_run_key(name: str, arguments: list[str]) -> list[str]:
     """
     key, before = FOLDERS.get(name), ["", *arguments]
     bare = [
-        key and "=" not in one and one[:1] not in "-+~" and before[i][:1] != "-" and Path(one).is_dir()
+        key and one[:1] != "-" and before[i][:1] != "-" and one != "" and Path(one).is_dir()
         for i, one in enumerate(arguments)
     ]
     return [f"{key}={one}" if is_bare else one for is_bare, one in zip(bare, arguments)]

@@ -100,8 +100,9 @@ def prepare(config: DictConfig) -> Prepared | None:
     config, resumes = resumed(config), config.get("resume") is not None
     refuse_missing_scene(config)
     # What follows loads torch; mistakes in the command have been answered before.
+    from forewarp.data.checks import remarks
     from forewarp.runs.build import build_run
-    from forewarp.runs.fitted import Score, is_measured, named
+    from forewarp.runs.fitted import Score, is_measured, named, tell
 
     named(config.get("score"))
     run = build_run(hashed(config))
@@ -110,7 +111,8 @@ def prepare(config: DictConfig) -> Prepared | None:
     if config.get("absent") == "skip" and not synthetic and place is not None and not place.is_dir():
         print(f"skipped: {place}: no such scene")
         return None
-    if config.get("effects") == "auto" and config.get("resume") is None:
+    is_planned = config.get("effects") == "auto" and config.get("resume") is None
+    if is_planned:
         from forewarp.cli.plan import planned
 
         config = hashed(planned())
@@ -121,6 +123,8 @@ def prepare(config: DictConfig) -> Prepared | None:
         run.datamodule.setup("fit")
         if config.evaluate and config.get("reduce") is not None:
             run.datamodule.targets("test").reduced(config.reduce)
+        if not is_planned:  # else the plan has said so
+            tell(remarks(run.datamodule.scene))
     plan = config.get("planned")  # of a stored config it could name any file
     plan = None if plan is None or measured or resumes else read_text(Path(plan), MOST_CONFIG)
     return Prepared(run, config, Score(run, config), measured, viewer, plan)

@@ -37,11 +37,13 @@ def synthesize(config) -> None:
     from omegaconf import OmegaConf
 
     from forewarp.data.files import RECORD
+    from forewarp.runs.config import check_seed
 
     arguments = OmegaConf.to_container(config, resolve=True)
     folder, overwrite = Path(arguments.pop("folder")), arguments.pop("overwrite")
     dataset, workers = arguments.pop("dataset"), arguments.pop("workers")
     arguments.pop("paths")
+    check_seed(arguments["seed"])
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"folder: expected a folder, but got the file {folder}; set folder=...")
     is_scene = (folder / RECORD).is_file()

@@ -35,12 +35,13 @@ from forewarp.data.cameras import (
     space_of,
 )
 from forewarp.data.files import MARKERS, frames_of, mismatch, number, read_json, remove, scene_folder, whole
-from forewarp.data.images import StoredImage, by, check_pixels, inspect_image, write_image
+from forewarp.data.images import StoredImage, alpha_of, by, check_pixels, inspect_image, write_image
 from forewarp.data.transforms import (
     camera_of,
     check_axes,
     check_directions,
     hold_out_every,
+    left_aside,
     pose_in,
     time_in,
     times_of,
@@ -102,6 +103,7 @@ def read_scene(
     inverse: bool = False,
     angle: str = "width",
     test_every: int = 8,
+    alpha: str | None = None,
 ) -> Scene:
     """Read ``root/scene``; pixels are decoded when a frame is first loaded.
 
@@ -119,6 +121,7 @@ def read_scene(
         axes, inverse: of the poses in the files, see ``posed_video.read_scene``.
         angle: ``camera_angle_x`` is that of the ``width`` or of the ``longer`` side.
         test_every: every n-th training image is tested on where there are no test images.
+        alpha: colours are ``straight`` or ``premultiplied``; None: as the edges of some images show.
 
     Raises:
         SceneError: for every file or value that is missing or wrong, with file and key.
@@ -139,6 +142,9 @@ def read_scene(
     if halve and (size[0] % 2 or size[1] % 2):
         raise mismatch(folder, "even sides to halve", by(size), "set data.half_resolution=false")
     width, height = (n // 2 if halve else n for n in size)
+    cut_out = [record.image for record in records["train"] if record.has_alpha and record.mask is None]
+    premultiplied, told = alpha_of(alpha, cut_out, folder)
+    assumed += told
 
     cameras = [record.camera for record in records["train"]]
     is_metric = any(record.depth for record in everything) or (folder / "trajectories.npz").exists()
@@ -153,7 +159,7 @@ def read_scene(
             name,
             record.time,
             camera,
-            StoredImage(record.image, size, halve, record.mask),
+            StoredImage(record.image, size, halve, record.mask, premultiplied=premultiplied),
             depth,
             record.ability,
         )
@@ -304,7 +310,7 @@ def _read_file(
         camera = camera_of(entry, header.size, 1, image, pose=pose, longer=longer)
         by_angle = entry.get("fl_x") is None and entry.get("fl_y") is None
         records.append(_Record(time_in(entry), camera, image, has_alpha, mask, depth, ability, by_angle))
-    return records, assumed
+    return records, assumed + left_aside(zip((entry for entry, _ in there), (r.camera for r in records)))
 
 
 def write_scene(

@@ -8,7 +8,7 @@ import re
 import warnings
 import weakref
 from collections import OrderedDict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -22,6 +22,7 @@ from forewarp.clock import left_out
 from forewarp.data.files import mismatch, number, opened
 from forewarp.files import MOST_IMAGE, written_whole
 from forewarp.ops.grid import block_means, block_sums
+from forewarp.scene.frame import spread
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 _FORMATS = ("PNG", "JPEG")
@@ -29,6 +30,7 @@ _MOST_PIXELS = 80_000_000  # Pillow warns a little above
 _ORIENTATION = 0x0112  # EXIF's tag
 _JPEG_END, _JPEG_TAIL = b"\xff\xd9", 4096  # some cameras write a little behind the end
 _LEAST_HIDDEN, _COLORS = 0.01, 64  # share of an image, and colours, that tell an image beneath
+_ROUNDED, _STRAY, _LEAST_EDGES, _EDGES_OF = 2, 0.01, 50, 4  # of an edge; share, least edges, images
 _FOREGROUND = 127  # a mask above it is foreground; masks are lossy, so never quite 0 or 255
 
 
@@ -205,10 +207,61 @@ def halved_cutout(rgba: Tensor) -> Tensor:
     return torch.cat([color, reduced(rgba[..., 3:])], -1)
 
 
+def straight(rgba: Tensor) -> Tensor:
+    """Divide premultiplied colours by their alpha: uint8 (H, W, 4) -> (H, W, 4).
+
+    >>> straight(torch.tensor([[[50, 100, 0, 100], [0, 0, 0, 0]]], dtype=torch.uint8)).tolist()
+    [[[128, 255, 0, 100], [0, 0, 0, 0]]]
+    """
+    colors, alpha = rgba[..., :3].float(), rgba[..., 3:]
+    colors = (255 * colors / alpha.clamp(min=1)).round().clamp(max=255).to(torch.uint8)
+    return torch.cat([colors, alpha], -1)
+
+
+def is_premultiplied(images: Iterable[Tensor]) -> bool:
+    """Tell whether colours of images (H, W, 4) are multiplied by alpha: no edge is brighter than its alpha.
+
+    Of straight alpha edges are about as bright as what they are of. Those that would be too bright for their
+    alpha, were they half as bright, are counted; there must be some.
+    """
+    brightest, alpha = [], []
+    for rgba in images:
+        brightest.append(rgba[..., :3].amax(-1).flatten().int())
+        alpha.append(rgba[..., 3].flatten().int())
+    brightest, alpha = torch.cat(brightest), torch.cat(alpha)
+    solid = brightest[alpha == 255]
+    if not len(solid):
+        return False
+    telling = (alpha > 0) & (2 * alpha < solid.median())
+    above = int((brightest[telling] > alpha[telling] + _ROUNDED).sum())
+    return int(telling.sum()) >= _LEAST_EDGES and above <= _STRAY * int(telling.sum())
+
+
+def alpha_of(alpha: str | None, paths: Sequence[Path], where: object) -> tuple[bool, list[str]]:
+    """Tell whether images are premultiplied, as said or as some of them show; and in a line what they show.
+
+    Args:
+        alpha: straight, premultiplied, or None to look at a few of ``paths``.
+        paths: images with alpha.
+        where: what they belong to.
+
+    Raises:
+        SceneError: for another value.
+    """
+    if alpha not in (None, "straight", "premultiplied"):
+        raise mismatch("data.alpha", "straight, premultiplied or null", repr(alpha))
+    if alpha is not None or not paths:
+        return alpha == "premultiplied", []
+    if not is_premultiplied(read_image(paths[i]) for i in spread(len(paths), _EDGES_OF)):
+        return False, []
+    line = f"{where}: colours are taken as multiplied by alpha, as no edge is brighter than its alpha"
+    return True, [f"{line}; if they are not, set data.alpha=straight"]
+
+
 def composited(rgba: Tensor, background: Tensor) -> Tensor:
     """``rgb * a + (1 - a) * background``: uint8 (..., 4) over (3,) or (..., 3) gives float32 (..., 3)."""
-    straight = rgba.float() / 255.0
-    return torch.lerp(background.expand_as(straight[..., :3]), straight[..., :3], straight[..., 3:])
+    shown = rgba.float() / 255.0
+    return torch.lerp(background.expand_as(shown[..., :3]), shown[..., :3], shown[..., 3:])
 
 
 class StoredImage:
@@ -224,6 +277,7 @@ class StoredImage:
         halve: average 2 x 2 pixels; of a cut-out an odd last row or column is cut off.
         mask: of the same size; its first channel counts, above 127 is foreground.
         opaque: leave the image's own alpha aside.
+        premultiplied: colours on disk are multiplied by alpha.
     """
 
     def __init__(
@@ -233,8 +287,10 @@ class StoredImage:
         halve: bool = False,
         mask: Path | None = None,
         opaque: bool = False,
+        premultiplied: bool = False,
     ) -> None:
-        self.path, self.size, self.halve, self.mask, self.opaque = path, size, halve, mask, opaque
+        self.path, self.size, self.halve, self.mask = path, size, halve, mask
+        self.opaque, self.premultiplied = opaque, premultiplied
         self._corner = (0, 0)
 
     def __call__(self) -> Tensor:
@@ -251,6 +307,8 @@ class StoredImage:
     def _decode(self) -> Tensor:
         """Decode the image, or cut out the foreground's rectangle and note where it lies."""
         rgba = read_image(self.path, self.size)
+        if self.premultiplied:
+            rgba = straight(rgba)
         if self.opaque:
             rgba[..., 3] = 255
         if self.mask is None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import cached_property, partial
@@ -15,10 +14,9 @@ from torch import Tensor
 
 from forewarp.data import dnerf, hypernerf, nhr, posed_video
 from forewarp.data.batches import Sampler, Targets, color_of
-from forewarp.data.cameras import nine_pixels
+from forewarp.data.checks import check_seen
 from forewarp.data.files import RECORD, fingerprint, mismatch, whole
 from forewarp.data.images import CACHE
-from forewarp.scene.camera import focus_point
 from forewarp.scene.frame import Scene, Truth, middle_of, spread
 from forewarp.scene.view import Target
 
@@ -56,38 +54,6 @@ def hold_out(scene: Scene, count: int) -> Scene:
         held=tuple(scene.train[i] for i in sorted(chosen)),
         protocol={**scene.protocol, "held_out": count},
     )
-
-
-def check_seen(scene: Scene) -> None:
-    """Refuse a box that no training camera sees between its near and far planes.
-
-    Raises:
-        SceneError: saying what the cameras look at.
-    """
-    if blind_frames(scene) < len(scene.train):
-        return
-    focus = ", ".join(f"{v:.4g}" for v in focus_point([frame.camera for frame in scene.train]).tolist())
-    near, far = scene.train[0].camera.near, scene.train[0].camera.far
-    raise mismatch(
-        "data.box, data.near, data.far",
-        "a box that cameras see between near and far",
-        f"{scene.box.low} to {scene.box.high}, near {near:g}, far {far:g}; cameras look at ({focus})",
-        "set data.box=null data.near=null data.far=null, where the format has these keys",
-    )
-
-
-def blind_frames(scene: Scene) -> int:
-    """Count the training frames whose camera sees nothing of the box between its near and far planes."""
-    low, high = (torch.tensor(end, dtype=torch.float64) for end in (scene.box.low, scene.box.high))
-    blind = 0
-    for frame in scene.train:
-        camera = frame.camera
-        rays = camera.rays(nine_pixels(camera), dtype=torch.float64)
-        slabs = torch.stack([(end - rays.origins) / rays.directions for end in (low, high)])
-        enter = slabs.amin(0).nan_to_num(-math.inf).amax(-1).clamp(min=camera.near)
-        leave = slabs.amax(0).nan_to_num(math.inf).amin(-1).clamp(max=camera.far)
-        blind += not bool((enter < leave).any())
-    return blind
 
 
 def most_held_out(scene: Scene) -> int:

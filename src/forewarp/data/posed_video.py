@@ -29,6 +29,7 @@ from forewarp.data.images import (
     MovingMask,
     StoredImage,
     StoredMask,
+    alpha_of,
     by,
     check_pixels,
     hides_image,
@@ -40,6 +41,7 @@ from forewarp.data.transforms import (
     check_axes,
     check_directions,
     hold_out_every,
+    left_aside,
     pose_in,
     time_in,
     times_of,
@@ -87,6 +89,7 @@ def read_scene(
     axes: str | None = None,
     inverse: bool = False,
     masks: str | None = None,
+    alpha: str | None = None,
 ) -> Scene:
     """Read ``root/scene``; pixels are decoded when a frame is first loaded, masks at once.
 
@@ -111,6 +114,7 @@ def read_scene(
             (beside the subject), ``ignore`` (not to be trained or measured on) or ``off`` (nothing). None:
             those of ``mask_path`` ignore, as nerfstudio's do; alpha is alpha, unless there is an image
             beneath it, which is refused.
+        alpha: colours are ``straight`` or ``premultiplied``; None: as the edges of some images show.
 
     Raises:
         SceneError: for every file or value that is missing or wrong, with file and key.
@@ -128,14 +132,19 @@ def read_scene(
     file = scene_folder(root, scene, "posed_video") / FILE
     content = read_json(file)
     entries, absent, assumed = _read_entries(file, content, scale, axes, inverse, masks)
+    cut_out = [entry.load for entry in entries if entry.has_alpha]
+    premultiplied, told = alpha_of(alpha, [load.path for load in cut_out], file)
+    assumed += told
+    for load in cut_out:  # none is decoded yet
+        load.premultiplied = premultiplied
     times, told = times_of([entry.name for entry in entries], [entry.time for entry in entries], str(file))
     entries = [replace(entry, time=time) for entry, time in zip(entries, times)]
     entries.sort(key=lambda entry: entry.time)
     parts, how = _split_entries(file, content, entries, test_every, absent)
     near, far = (_length(file, content, key, value) for key, value in (("near", near), ("far", far)))
     bounds = _bounds(file, content, box)
-    cut_out = (e for e in entries if e.load.mask or (e.has_alpha and bool((e.load()[..., 3] < 255).any())))
-    has_alpha = (first := next(cut_out, None)) is not None
+    shown = (e for e in entries if e.load.mask or (e.has_alpha and bool((e.load()[..., 3] < 255).any())))
+    has_alpha = (first := next(shown, None)) is not None
     if has_alpha and masks is None and hides_image(first.load()):
         advice = (
             "set data.masks=alpha if that is beside the subject, data.masks=off if alpha means another thing"
@@ -282,6 +291,7 @@ def _read_entries(
         raise mismatch(f"{file}: frames", "each image once", f"{twice} twice", "remove one")
     if axes is None:
         check_directions([e.camera.camera_to_world for e in entries], str(file), inverse=inverse)
+    assumed += left_aside(zip((entry for entry, _ in there), (e.camera for e in entries)))
     return entries, absent - {*names}, assumed
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from reprlib import repr as short
 from typing import TypeVar
@@ -122,6 +122,22 @@ def _focal(entry: Entry, width: int, height: int, longer: bool) -> float:
     return focal
 
 
+def left_aside(cameras: Iterable[tuple[Entry, Camera]]) -> list[str]:
+    """Say in a line where ``camera_angle_y`` is another angle than the camera's, as of some add-ons'."""
+    for entry, camera in cameras:
+        if entry.get("camera_angle_y") is None:
+            continue
+        told, angle = (
+            entry.number("camera_angle_y", 0, math.pi),
+            2 * math.atan(0.5 * camera.height / camera.fy),
+        )
+        if abs(math.tan(0.5 * told) / math.tan(0.5 * angle) - 1) > _SAME_FOCAL:
+            degrees = f"{math.degrees(told):.1f} degrees"
+            said = f"left aside, as the other keys say {math.degrees(angle):.1f}"
+            return [f"{entry.where('camera_angle_y')}: {degrees} {said}; write fl_y if they are wrong"]
+    return []
+
+
 def time_in(entry: Entry) -> float | None:
     """Read a frame's ``time``, in any unit; None where it has none."""
     return entry.number("time", -_MOST_TIME, _MOST_TIME) if "time" in entry.own else None
@@ -165,7 +181,7 @@ def check_directions(
     """
     if len(poses) < _LEAST_CAMERAS:
         return
-    miss, ahead = _meeting(torch.stack(list(poses)))
+    miss, ahead, _ = _meeting(torch.stack(list(poses)))
     if miss < _MEET and ahead == 0:
         raise mismatch(
             where,
@@ -182,7 +198,7 @@ def check_directions(
     for axes, flip in (("opengl", torch.from_numpy(FLIP)), ("opencv", torch.eye(4, dtype=torch.float64))):
         # What was read as ``matrix @ FLIP`` is taken back, inverted, and given these axes.
         others = torch.linalg.inv(torch.stack(list(poses)) @ torch.from_numpy(FLIP)) @ flip
-        miss, ahead = _meeting(others)
+        miss, ahead, _ = _meeting(others)
         if miss < _MEET and ahead == 1:
             raise mismatch(
                 where,
@@ -203,14 +219,26 @@ def looks_turned(poses: Sequence[torch.Tensor]) -> bool:
     poses = torch.stack(list(poses))
     turned = poses.clone()
     turned[:, :3, :3] = poses[:, :3, :3].mT
-    (miss, ahead), (others_miss, others_ahead) = _meeting(poses), _meeting(turned)
+    (miss, ahead, _), (others_miss, others_ahead, _) = _meeting(poses), _meeting(turned)
     if miss < _MEET:
         return ahead == 0
     return miss >= _MISS and others_miss < _MEET and others_ahead == 1
 
 
-def _meeting(poses: torch.Tensor) -> tuple[float, float]:
-    """Return how far the optical axes of poses (N, 4, 4) miss a common point, and for how many it is ahead.
+def common_point(poses: Sequence[torch.Tensor]) -> torch.Tensor | None:
+    """Return the point (3,) that nearly all cameras look at, float64; None where there is none.
+
+    Args:
+        poses: camera-to-world (4, 4) with OpenCV's axes.
+    """
+    if len(poses) < _LEAST_CAMERAS:
+        return None
+    miss, ahead, point = _meeting(torch.stack(list(poses)))
+    return point if miss < _MEET and ahead >= _ALL else None
+
+
+def _meeting(poses: torch.Tensor) -> tuple[float, float, torch.Tensor | None]:
+    """Return how far the optical axes of poses (N, 4, 4) miss a common point, how many have it ahead, and it.
 
     The first is the median over cameras of the point's distance from the axis over its distance from the
     camera, infinite where axes are nearly parallel or cameras stand in one place; the second is a share.
@@ -219,14 +247,14 @@ def _meeting(poses: torch.Tensor) -> tuple[float, float]:
     across = torch.eye(3, dtype=torch.float64) - axes[:, :, None] * axes[:, None, :]
     normal = across.sum(0)
     if float(torch.linalg.eigvalsh(normal)[0]) < 0.02 * len(poses):  # nearly parallel
-        return math.inf, 0.5
+        return math.inf, 0.5, None
     point = torch.linalg.solve(normal, (across @ centers[:, :, None]).sum(0)[:, 0])
     away = point - centers
     distance = away.norm(dim=-1)
     if float(distance.median()) < 1e-9 * (1 + float(centers.abs().max())):
-        return math.inf, 0.5
+        return math.inf, 0.5, None
     miss = (across @ away[:, :, None])[..., 0].norm(dim=-1) / distance.clamp(min=1e-12)
-    return float(miss.median()), float(((away * axes).sum(-1) > 0).double().mean())
+    return float(miss.median()), float(((away * axes).sum(-1) > 0).double().mean()), point
 
 
 def with_suffix(path: Path) -> Path:

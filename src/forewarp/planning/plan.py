@@ -15,6 +15,7 @@ from hydra import compose
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf, open_dict
 
+from forewarp.data.checks import remarks
 from forewarp.data.module import most_held_out
 from forewarp.evaluation.images import psnr_by_view
 from forewarp.files import read_json, write_json
@@ -24,6 +25,7 @@ from forewarp.metrics.gain import Gain
 from forewarp.planning.plan_file import read_plan, write_plan
 from forewarp.runs.build import build_run
 from forewarp.runs.config import HASH, content_hash, trust_of
+from forewarp.runs.fitted import tell
 from forewarp.runs.overrides import key_of, merged, without_switched_off
 from forewarp.runs.session import session
 from forewarp.scene.frame import Scene, survey
@@ -204,6 +206,7 @@ def make_plan(config: DictConfig, overrides: Sequence[str]) -> dict:
         )
     refuse(config, typed)
     run.datamodule.setup("fit")
+    tell(remarks(run.datamodule.scene))
     # A typed key is not decided by the plan, even if its value is the default.
     asked = content_hash(config, ("plan",), sorted(typed), run.datamodule.fingerprint())
     folder = Path(str(config.plan.folder).replace(HASH, asked))

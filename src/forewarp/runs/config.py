@@ -35,7 +35,7 @@ MAY_CHANGE = (
     *("sentinel", "data_changed", "score", "viewer", "host", "port"),
 )
 MOST_LEVELS = 40
-MOST_SEED = 2**32 - 100  # each stage adds its number, and 32 bits hold the sum
+MOST_SEED = 2**31 - 100  # each stage adds its number, and what finds poses takes 31 bits
 TRUST_VARIABLE = "FOREWARP_TRUST"
 # Allowed beside the classes of forewarp. Listed by full name, as a prefix would allow all of torch.
 ELSEWHERE = {
@@ -180,11 +180,12 @@ def check_values(config: DictConfig) -> None:
     for key in ("data", "callbacks"):
         if not OmegaConf.is_dict(config.get(key)):
             raise ValueError(f"{key}: expected keys of its own, but got {config.get(key)!r:.80}")
-    seconds, seed, weights = (config.get(key) for key in ("checkpoint_seconds", "seed", "lpips_weights"))
+    seconds, weights = config.get("checkpoint_seconds"), config.get("lpips_weights")
     if type(seconds) not in (int, float) or not 0 <= seconds < math.inf:
         raise ValueError(f"checkpoint_seconds: expected a number >= 0, but got {seconds}")
-    if type(seed) is not int or not 0 <= seed <= MOST_SEED:
-        raise ValueError(f"seed: expected a whole number in [0, {MOST_SEED}], but got {seed}")
+    for key in ("seed", "data.seed", "data.synthesis.seed"):
+        if key == "seed" or OmegaConf.select(config, key) is not None:
+            check_seed(OmegaConf.select(config, key), key)
     if type(config.get("evaluate", True)) is not bool:
         raise ValueError(f"evaluate: expected true or false, but got {config.evaluate}")
     places = weights if OmegaConf.is_list(weights) else [] if weights is None else [weights]
@@ -198,6 +199,12 @@ def check_values(config: DictConfig) -> None:
     scene = None if OmegaConf.is_missing(config.data, "scene") else config.data.get("scene")
     if isinstance(scene, str) and (not scene.strip() or {"..", "/"} & set(Path(scene).parts)):
         raise ValueError(f"data.scene: expected the name of a folder below data.root, but got {scene!r}")
+
+
+def check_seed(seed: object, key: str = "seed") -> None:
+    """Refuse a seed that random numbers of some package could not begin from."""
+    if type(seed) is not int or not 0 <= seed <= MOST_SEED:
+        raise ValueError(f"{key}: expected a whole number in [0, {MOST_SEED}], but got {seed}")
 
 
 def refuse_to_synthesize(config: DictConfig) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import fmean
@@ -18,7 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from forewarp.data.batches import color_of
-from forewarp.data.module import blind_frames
+from forewarp.data.checks import blind_frames
 from forewarp.evaluation.evaluate import evaluate, mean_scores, show
 from forewarp.files import read_json, write_json
 from forewarp.methods.method import HasMatter, HasTrajectories, Method, Snapshot
@@ -347,8 +347,8 @@ def doubts(run: Run, module: DynamicSceneModule) -> list[str]:
     return lines
 
 
-def tell(lines: list[str]) -> None:
-    """Print doubts to stderr, so that they are seen behind the tables."""
+def tell(lines: Iterable[str]) -> None:
+    """Print doubts to stderr, so that they are seen beside the tables."""
     for line in lines:
         print(line if line.startswith(" ") else f"warning: {line}", file=sys.stderr)
 

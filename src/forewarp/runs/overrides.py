@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
 from collections.abc import Sequence
 from contextlib import suppress
 
-TEXTS = re.compile(  # keys that hold a path, or the name of a scene's folder
+# Keys that hold a path, or the name of a scene's folder; those in which a list of paths may stand.
+TEXTS = re.compile(
     r"data\.(root|scene)|paths\.\w+|plan\.folder|run2?|runs|resume|out|video|images|colmap|masks|curves|published|"
     "lpips_weights"
 )
+LISTS = ("runs", "published", "lpips_weights")
 OF_A_SWEEP = ("sweeps=", "seeds=", "launcher=")  # these say how jobs are run, not what a job computes
 
 
@@ -34,16 +37,31 @@ def command_line(name: str, overrides: Sequence[str]) -> str:
 def as_text(arguments: Sequence[str]) -> list[str]:
     """Quote paths and names of scenes so that Hydra keeps them as they were typed: ``2024``, ``VID (1).mp4``.
 
+    What is typed in quotes, an interpolation, null where a key may be null, and a list of paths where there
+    may be several are left as they are; a leading ``~/`` is the home folder.
+
     >>> as_text(["data.root=/data/josé", "data.scene=hand (1)", "out=null", "run='a b'", "seed=1"])
     ["data.root='/data/josé'", "data.scene='hand (1)'", 'out=null', "run='a b'", 'seed=1']
+    >>> as_text(["data.scene=null", "data.scene={a}", "run=[a]", "runs=[a]"])
+    ["data.scene='null'", "data.scene='{a}'", "run='[a]'", 'runs=[a]']
     """
     swept, found = bool({"-m", "--multirun"} & set(arguments)), []
     for argument in arguments:
         key, _, value = argument.partition("=")
-        typed = TEXTS.fullmatch(key_of(argument)) and value not in ("", "null") and value[0] not in "'\"$[{"
-        several = typed and (swept or key == "data.scene") and _is_sweep(argument)
+        name = key_of(argument)
+        typed = TEXTS.fullmatch(name) and value and not _is_of_hydra(name, value)
+        several = typed and (swept or name == "data.scene") and _is_sweep(argument)
+        if typed and name != "data.scene" and value.startswith("~/"):
+            value = os.path.expanduser(value)
         found.append(text_override(key, value) if typed and not several else argument)
     return found
+
+
+def _is_of_hydra(key: str, value: str) -> bool:
+    """Tell whether a path or name was typed as Hydra's grammar has it."""
+    is_quoted = len(value) > 1 and value[0] == value[-1] and value[0] in "'\""
+    is_null, is_list = value == "null" and key != "data.scene", value[0] == "[" and key in LISTS
+    return is_quoted or is_null or is_list or value.startswith("${")
 
 
 def _is_sweep(override: str) -> bool:

@@ -55,6 +55,10 @@ class Box:
         """Add ``by`` world units on every side."""
         return Box(tuple(v - by for v in self.low), tuple(v + by for v in self.high))
 
+    def holds(self, point: Tensor) -> bool:
+        """Return whether a point (3,) lies within the box."""
+        return all(low <= value <= high for low, value, high in zip(self.low, point.tolist(), self.high))
+
     def meets(self, other: Box) -> bool:
         """Return whether two boxes share more than a face."""
         return all(max(a, b) < min(c, d) for a, b, c, d in zip(self.low, other.low, self.high, other.high))

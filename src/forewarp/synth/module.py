@@ -11,7 +11,13 @@ from pathlib import Path
 from filelock import FileLock
 
 from forewarp.data.files import LOCK, RECORD, mismatch, read_json
-from forewarp.data.module import DNeRFDataModule, HyperNeRFDataModule, LegoCompleteDataModule, NHRDataModule
+from forewarp.data.module import (
+    DNeRFDataModule,
+    HyperNeRFDataModule,
+    LegoCompleteDataModule,
+    NHRDataModule,
+    SceneDataModule,
+)
 from forewarp.progress import Counted
 from forewarp.scene.frame import Scene
 from forewarp.synth import scenes
@@ -72,6 +78,7 @@ class Synthetic:
     """
 
     dataset = "dnerf"
+    suspects = SceneDataModule.suspects  # its poses and times are right
 
     def __init__(self, root: str | Path, scene: str, *, synthesis: Mapping, **arguments) -> None:
         super().__init__(root, scene, **arguments)

@@ -1,0 +1,159 @@
+"""What a scene's cameras, box, alpha, masks and points say against each other, before training."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from forewarp.data import dnerf, nhr, posed_video
+from forewarp.data.checks import remarks
+from forewarp.data.files import SceneError
+from forewarp.data.images import is_premultiplied, straight, write_image
+from forewarp.scene.box import Box
+from tests.support.tiny_scene import ball_scene
+from tests.support.written_scenes import (
+    MIDDLE,
+    dnerf_shots,
+    dome,
+    dome_frames,
+    edit,
+    posed_cameras,
+    write_dome,
+    write_video,
+)
+
+SCENE = ball_scene(frames=8, size=16)
+
+
+def changed(frames=None, **changes):
+    """The scene, its training frames changed by a function of each image's pixels."""
+    if frames is not None:
+        changes["train"] = tuple(replace(f, load=lambda f=f: frames(f.load().clone())) for f in SCENE.train)
+    return replace(SCENE, **changes)
+
+
+def ranged(near, far):
+    return tuple(replace(f, camera=replace(f.camera, near=near, far=far)) for f in SCENE.train)
+
+
+def with_alpha(change):
+    def of(rgba):
+        rgba[..., 3] = change(rgba[..., 3])
+        return rgba
+
+    return of
+
+
+def test_what_fits_together_is_not_doubted():
+    assert list(remarks(SCENE)) == []
+
+
+@pytest.mark.parametrize(
+    ("scene", "said"),
+    [
+        (changed(train=ranged(0.1, 1.0)), r"look at, .* is \S+ away, with far at 1; set data.far"),
+        (changed(train=ranged(30.0, 60.0)), r"away, with near at 30; set data.near"),
+        (changed(box=Box((5, 5, 5), (6, 6, 6))), r"look at, .* lies far outside the box .*data.box=null"),
+        (changed(box=Box((-0.1, -0.1, -0.1), (0.1, 0.1, 0.1))), r"\d\d% of the subject's pixels see nothing"),
+        (
+            changed(with_alpha(lambda alpha: 255 - alpha)),
+            "in 8 of 8 .* fills all edges, as if alpha or masks",
+        ),
+        (changed(with_alpha(lambda alpha: alpha * 0 + 255)), "alpha is opaque in all training images"),
+        (changed(still=torch.full((4, 3), 500.0)), "cameras see 0% of the 4 points that never move"),
+    ],
+)
+def test_what_contradicts_itself_is_told(scene, said):
+    assert any(re.search(said, line) for line in remarks(scene))
+
+
+def test_images_without_a_subject_are_refused_and_few_of_them_told():
+    with pytest.raises(SceneError, match="expected a subject in some training images, but got none in 8"):
+        list(remarks(changed(with_alpha(torch.zeros_like))))
+    shown = [False, True, False, False, True, False, False, False]
+    train = tuple(
+        f if on else replace(f, load=lambda f=f: torch.zeros_like(f.load()))
+        for f, on in zip(SCENE.train, shown)
+    )
+    (line,) = remarks(replace(SCENE, train=train))
+    assert line.startswith("6 of 8 training images looked at show no subject")
+
+
+def test_masks_of_a_dome_may_be_inverted(tmp_path):
+    write_dome(tmp_path / "right")
+    assert list(remarks(nhr.read_scene(tmp_path, "right", half_resolution=False))) == []
+    frames = [replace(f, masks=[255 - mask for mask in f.masks]) for f in dome_frames(dome())]
+    nhr.write_scene(tmp_path / "turned", dome(), frames)
+    (line,) = remarks(nhr.read_scene(tmp_path, "turned", half_resolution=False))
+    assert "alpha or masks were inverted" in line
+
+
+def test_near_and_far_of_a_file_are_told_in_its_units(tmp_path):
+    write_video(tmp_path / "toy", near=1.0, far=30.0)
+    (line,) = remarks(posed_video.read_scene(tmp_path, "toy"))
+    at = ", ".join(f"{v:g}" for v in MIDDLE.tolist())
+    assert line == (
+        f"the point that all cameras look at, ({at}), is 70 away, with far at 30; set data.far, or mend "
+        "the file's"
+    )
+
+
+def test_masks_that_leave_little_are_told(tmp_path):
+    folder = tmp_path / "toy"
+    write_video(folder)
+    mask = np.zeros((20, 30), np.uint8)
+    mask[:5] = 255
+    write_image(folder / "mask.png", mask)
+    edit(
+        folder / "transforms.json",
+        lambda content: [f.update(mask_path="mask.png") for f in content["frames"]],
+    )
+    (line,) = remarks(posed_video.read_scene(tmp_path, "toy"))
+    assert line.startswith("masks leave 25% of the pixels to train on")
+
+
+def ball(premultiplied, brightness=200, size=64):
+    """A ball whose edge is soft, uint8 (H, W, 4)."""
+    row, column = np.mgrid[:size, :size] - size / 2 + 0.5
+    alpha = np.clip(20 - np.hypot(row, column) + 0.5, 0, 1)[..., None] ** 0.5
+    rgb = np.full((size, size, 3), brightness) * np.where(alpha > 0, 1, 0) * (alpha if premultiplied else 1)
+    return np.rint(np.concatenate([rgb, 255 * alpha], -1)).astype(np.uint8)
+
+
+@pytest.mark.parametrize("read", ["dnerf", "video"])
+def test_premultiplied_colours_are_recognised_by_edges(read, tmp_path):
+    shots = [replace(shot, rgba=ball(True)) for shot in dnerf_shots(4)]
+    expected = torch.from_numpy(ball(False))
+    if read == "dnerf":
+        dnerf.write_scene(tmp_path / "toy", {"train": shots, "test": shots[:1]}, camera_angle_x=0.7)
+        reader = dnerf.read_scene
+    else:
+        views = posed_cameras(4, (64, 64))
+        posed_video.write_scene(
+            tmp_path / "toy",
+            [posed_video.PosedShot(f"{i}.png", view, ball(True)) for i, view in enumerate(views)],
+        )
+        reader = posed_video.read_scene
+    scene = reader(tmp_path, "toy")
+    assert any("colours are taken as multiplied by alpha" in line for line in scene.protocol["assumed"])
+    rgba = scene.train[0].load()
+    solid = rgba[..., 3] > 100
+    assert int((rgba[solid].int() - expected[solid].int()).abs().max()) <= 2
+    as_is = reader(tmp_path, "toy", alpha="straight").train[0].load()
+    assert torch.equal(as_is, torch.from_numpy(ball(True)))
+    with pytest.raises(
+        SceneError, match="data.alpha: expected straight, premultiplied or null, but got 'associated'"
+    ):
+        reader(tmp_path, "toy", alpha="associated")
+
+
+def test_straight_dark_and_opaque_images_are_left_as_they_are():
+    images = {
+        name: torch.from_numpy(ball(*of)) for name, of in {"straight": (False,), "dark": (False, 20)}.items()
+    }
+    assert not any(is_premultiplied([image] * 4) for image in images.values())
+    assert not is_premultiplied([torch.full((8, 8, 4), 255, dtype=torch.uint8)])
+    assert is_premultiplied([torch.from_numpy(ball(True))] * 4)
+    assert torch.equal(straight(images["straight"])[32, 32], images["straight"][32, 32])
