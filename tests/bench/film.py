@@ -151,13 +151,10 @@ class Filming:
         if aside is not None:
             cameras = [replace(c, camera_to_world=c.camera_to_world @ aside) for c in cameras]
         near = self._near_movers(times, cameras)
-        total, seen, covered = (
-            np.zeros((height * width, 3)),
-            np.zeros(height * width),
-            np.zeros(height * width),
-        )
+        everywhere = np.arange(height * width)
+        total, seen, covered = (np.zeros((len(everywhere), *more)) for more in ((3,), (), ()))
         for i, (instant, camera) in enumerate(zip(times, cameras)):
-            rows = np.arange(height * width) if i % EVERY == EVERY // 2 else near
+            rows = everywhere if i % EVERY == EVERY // 2 else near
             posed, pose = Posed(self.world, instant), camera.camera_to_world.numpy()
             directions = self.directions[i][rows] @ pose[:3, :3].T
             hits = posed.first_hits(np.broadcast_to(pose[:3, 3], directions.shape), directions)
@@ -234,7 +231,7 @@ def film(folder: Path, form: Form = PHONE) -> None:
 
 
 def aside_of(number: int) -> Tensor:
-    """Return the place (4, 4) of a camera beside another one: above, right, below and left by turns."""
+    """Return the place (4, 4) of a camera beside another one: below, left, above and right by turns."""
     aside, turn = torch.eye(4, dtype=torch.float64), number * np.pi / 2
     aside[:2, 3] = BESIDE * torch.tensor([np.cos(turn), np.sin(turn)])
     return aside
