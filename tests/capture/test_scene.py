@@ -107,7 +107,7 @@ def test_facts_are_those_of_the_capture_and_are_told_with_advice():
         Path("pictures"), None, times, range(14), 14, 1.0, dict.fromkeys(times, (320, 240)), originals
     )
     limits = Limits(0.5, 2.0, Box((-1, -1, -1), (1, 2, 3)))
-    facts = facts_of(Source(images=Path("p")), frames, found, limits, [2])
+    facts = facts_of(Source(images=Path("p")), frames, found, limits, [2], 0.12)
     chord = 2 * 4 * np.sin(np.radians(70 / 11) / 2)
     assert facts["path"] == pytest.approx(11 * chord)
     assert facts["camera"]["degrees"] == pytest.approx(2 * np.degrees(np.arctan(160 / 300)))
@@ -118,9 +118,10 @@ def test_facts_are_those_of_the_capture_and_are_told_with_advice():
         "registered: 12 of 14 pictures, 320 x 240 pixels, reprojection error 0.50 pixels",
         f"camera: 56 degrees wide; its path is {11 * chord:.2f} long, where what it sees is 1 away",
         "points: 400; box 2.00 x 3.00 x 4.00, near 0.50, far 2.00",
+        "moving: 12% of the pixels; test frames are scored there and elsewhere",
         f"{left_out}; film slower and with more of what stands still",
     ]
     known = summary(facts | {"searched": False, "sure_points": 300})
     assert known[2].startswith("points: 400, 300 of them sure; box")
-    assert known[3] == left_out
+    assert known[4] == left_out
     assert any("as captions or logos" in line for line in summary(facts | {"has_nearer": True}))

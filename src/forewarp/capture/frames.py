@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from threading import Thread
 
+import cv2
 import imageio_ffmpeg
 import numpy as np
 import torch
@@ -29,7 +30,9 @@ Step = Callable[[str], object]  # title of a step -> a context manager that give
 
 _DONE = "pictures.json"  # written last
 _MOVING = 127  # a mask above it is what moves
-_MIN_IMAGES, _ENOUGH = 3, 120
+_MIN_IMAGES, _SHORT, _ENOUGH, _MOST = 3, 150, 120, 300  # frames: fewest, of a short film, of a slow one, most
+_STEP = 8.0  # pixels of 640, by which what is fast may move from one frame that is taken to the next
+_FAST, _FLOW = 0.9, 160  # quantile of an image's motion that counts; pixels of the longer side to measure it
 _MEASURED = 640  # pixels of the longer side at which sharpness is measured
 _COARSE = 160  # pixels of the longer side at which blur is told from what a codec adds
 _FLAT = 1e-9  # mean square of a second difference below which an image has no edges
@@ -77,6 +80,7 @@ class Frames:
         sizes: (width, height), by name; all alike, unless poses are known.
         originals: the user's names by ours; empty for a video.
         assumed: a line about where times come from; None where that is plain.
+        why: of a video, why so many frames were taken.
     """
 
     folder: Path
@@ -88,6 +92,7 @@ class Frames:
     sizes: dict[str, tuple[int, int]]
     originals: Mapping[str, str]
     assumed: str | None = None
+    why: str | None = None
 
 
 def take(
@@ -99,8 +104,7 @@ def take(
         work: the work folder.
         source: what to capture. With poses that are known images stay as stored: neither turned nor smaller.
         step: shows progress.
-        count: of frames to choose from a video; None: 120, and at most every second one, so that blurred ones
-            can be left out. Images of a folder are all taken.
+        count: of frames to choose from a video; None: see ``frames_for``. Images of a folder are all taken.
         size: most pixels of the longer side; None: as they are.
         threads: of ffmpeg; None: as many as it likes.
 
@@ -128,12 +132,11 @@ def _from_video(
 ) -> dict:
     """Write the sharpest frames, named after their numbers in the video, from 1."""
     with step("looking at frames") as progress:
-        stamps, sharpnesses, widths = measure(video, progress, threads)
+        stamps, sharpnesses, widths, speeds = measure(video, progress, threads)
     if len(stamps) < _MIN_IMAGES:
         got = f"{len(stamps)} frames"
         raise ValueError(f"{video}: expected a video of many frames, but got {got}; film longer")
-    if count is None:
-        count = max(_MIN_IMAGES, min(_ENOUGH, len(stamps) // 2))
+    count, why = frames_for(speeds) if count is None else (count, "frames= says so")
     chosen, times = sharpest(stamps, sharpnesses, count), {}
     transfer = hdr_of(video)
     mapped = f" ({_HDR[transfer]}, tone-mapped to SDR)" if transfer else ""
@@ -146,7 +149,30 @@ def _from_video(
     if len(times) < len(chosen):
         raise ValueError(f"{video}: expected {len(chosen)} frames, but got {len(times)}; convert the video")
     height, width = pixels.shape[:2]
-    return _record(times, chosen, len(stamps), widths[chosen], dict.fromkeys(times, (width, height)), {})
+    record = _record(times, chosen, len(stamps), widths[chosen], dict.fromkeys(times, (width, height)), {})
+    return record | {"why": why}
+
+
+def frames_for(speeds: np.ndarray) -> tuple[int, str]:
+    """Choose how many frames of a video to take, and say why.
+
+    Every frame of a short video; of a longer one as many as keep what is fast from moving far between two
+    frames, and at least 120 of the sharpest, but no more than every second one for that alone.
+
+    Args:
+        speeds: (N,) pixels of 640 by which what is fast in a frame has moved since the frame before.
+
+    >>> frames_for(np.full(140, 9.0))
+    (140, 'every frame of a short film')
+    >>> frames_for(np.full(600, 2.0))
+    (150, 'what is fast moves by 2 pixels of 640 a frame')
+    """
+    found = len(speeds)
+    if found <= _SHORT:
+        return found, "every frame of a short film"
+    fast = min(_MOST, math.ceil(float(speeds.sum()) / _STEP))
+    count = min(found, max(fast, min(_ENOUGH, found // 2)))
+    return count, f"what is fast moves by {float(speeds.mean()):.2g} pixels of 640 a frame"
 
 
 def _from_folder(folder: Path, source: Source, size: int | None, step: Step) -> dict:
@@ -311,6 +337,21 @@ def edge_width(grey: np.ndarray) -> float:
     return float(max(widths)) * 640 / _COARSE
 
 
+def speed(before: np.ndarray, grey: np.ndarray) -> float:
+    """Measure how far what is fast has moved from one image (H, W) uint8 to the next, in pixels of one 640
+    wide: the ninth decile of the lengths of optical flow (DIS).
+
+    >>> image = np.random.default_rng(0).integers(0, 255, (30, 40)).repeat(4, 0).repeat(4, 1).astype(np.uint8)
+    >>> round(speed(image, np.roll(image, 2, 1)))
+    8
+    """
+    scale = _FLOW / max(grey.shape)
+    size = max(8, round(scale * grey.shape[1])), max(8, round(scale * grey.shape[0]))
+    small = [cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (before, grey)]
+    flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_FAST).calc(*small, None)
+    return float(np.quantile(np.hypot(flow[..., 0], flow[..., 1]), _FAST)) * 640 / _FLOW
+
+
 def sharpest(stamps: np.ndarray, sharp: np.ndarray, count: int) -> list[int]:
     """Choose the sharpest frame of each of ``count`` windows of equal length in time.
 
@@ -351,7 +392,7 @@ def sharpest(stamps: np.ndarray, sharp: np.ndarray, count: int) -> list[int]:
 
 def measure(
     video: Path, progress: Progress, threads: int | None = None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Decode a video once and measure its frames.
 
     Args:
@@ -360,26 +401,29 @@ def measure(
         threads: None: as many as ffmpeg likes.
 
     Returns:
-        seconds from the first frame (N,), ascending; ``sharpness`` (N,) and ``edge_width`` (N,).
+        seconds from the first frame (N,), ascending; ``sharpness`` (N,); ``edge_width`` (N,); and ``speed``
+        (N,), 0 of the first.
 
     Raises:
         ValueError: where the file is no video, ends too early, or has a single frame.
 
     **Cost** one decoding, and about 10 ms a frame.
     """
-    sharp, widths, log = [], [], _Log()
+    sharp, widths, speeds, before, log = [], [], [], None, _Log()
     long, short = (f"if(gt({a},{b}),{_MEASURED},-1)" for a, b in (("iw", "ih"), ("ih", "iw")))
     small = f"scale=w='min(iw,{long})':h='min(ih,{short})',format=gray"
     for image in _decode(video, f"showinfo=checksum=0,{small}", "pgm", log, threads):
         sharp.append(sharpness(image))
         widths.append(edge_width(image))
+        speeds.append(0.0 if before is None else speed(before, image))
+        before = image
         if len(sharp) % 10 == 1 and log.duration and log.stamps:
             seconds = min(log.stamps[-1] - log.stamps[0], log.duration)
             progress(round(10 * seconds), math.ceil(10 * log.duration))
     _refuse(video, log, len(sharp))
     progress(len(sharp), len(sharp))
     stamps = np.array(log.stamps[: len(sharp)])
-    return stamps - stamps[0], np.array(sharp), np.array(widths)
+    return stamps - stamps[0], np.array(sharp), np.array(widths), np.array(speeds)
 
 
 def extracted(

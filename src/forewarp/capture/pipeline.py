@@ -43,7 +43,7 @@ def capture(
         out: the scene's folder; an earlier capture in it is replaced.
         search: how poses are found.
         step: gives a ``Progress`` for each step.
-        frames: to choose from a video; None: 120, and at most every second one.
+        frames: to choose from a video; None: see ``frames.frames_for``.
         size: most pixels of the longer side; with poses that are known images are left as stored.
         force: go on where matches say that the camera stands or only turns.
 
@@ -62,11 +62,11 @@ def capture(
         refuse_poses(found, images)
         found = scene.placed(found)
         limits = scene.limits_of(found)
-        with step("writing") as progress, folder_written_whole(out, ABOUT) as folder:
-            scales = scene.write(folder, images, found, limits, progress)
+        with step("what moves") as progress, folder_written_whole(out, ABOUT) as folder:
+            written = scene.write(folder, source, images, found, limits, progress)
             if limits is not None:
                 write_png(folder / PICTURE, scene.draw(found, limits))
-            facts = scene.facts_of(source, images, found, limits, scales)
+            facts = scene.facts_of(source, images, found, limits, *written)
             files = (path for path in sorted(folder.rglob("*")) if path.is_file())
             facts["bytes"] = {path.relative_to(folder).as_posix(): path.stat().st_size for path in files}
             write_json(folder / ABOUT, facts)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import repeat
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ import torch
 from torch import Tensor
 
 from forewarp.capture.frames import Frames, Progress, Source, shrunk
+from forewarp.capture.motion import moving_masks
 from forewarp.capture.poses import Reconstruction
 from forewarp.data.images import common_header, read_image, write_image
 from forewarp.data.posed_video import SCALES, PosedShot, write_scene
@@ -117,28 +119,44 @@ def bounds_of(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def write(
-    folder: Path, frames: Frames, found: Reconstruction, limits: Limits | None, progress: Progress
-) -> list[int]:
-    """Write the scene of all registered images, and smaller copies of them.
+    folder: Path,
+    source: Source,
+    frames: Frames,
+    found: Reconstruction,
+    limits: Limits | None,
+    progress: Progress,
+) -> tuple[list[int], float | None]:
+    """Write the scene of all registered images, smaller copies of them, and masks of what moves: those that
+    were given, else those of ``motion.moving_masks``; none of several cameras.
 
     Args:
         folder: to fill.
+        source: what the images are from.
         frames: the images; the time of the first registered one becomes 0, that of the last 1.
         found: cameras and points, placed.
         limits: near, far and box.
         progress: called with images done and all.
 
     Returns:
-        how many times smaller the copies are.
+        how many times smaller the copies are, and which share of all pixels moves; None without masks.
     """
     names = sorted(found.cameras, key=lambda name: frames.times[name])
     first, last = frames.times[names[0]], frames.times[names[-1]]
     shortest = min(min(camera.width, camera.height) for camera in found.cameras.values())
     has_alpha = common_header([frames.folder / name for name in names], one_size=False).has_alpha
     scales = [s for s in SCALES[1:] if shortest // s >= _MIN_SIDE]
+    cameras, times = [found.cameras[name] for name in names], {frames.times[name] for name in names}
+    masks, share = repeat(None), 0.0
+    follows = len(times) == len(names) and len({(c.width, c.height) for c in cameras}) == 1
+    if frames.masks is not None:
+        masks = (read_image(frames.masks / f"{name}.png")[..., 0].numpy() == 0 for name in names)
+    elif follows:
+        masks = moving_masks([frames.folder / name for name in names], cameras)
 
     def shots() -> Iterator[PosedShot]:
-        for done, name in enumerate(names, 1):
+        nonlocal share
+        for done, (name, moving) in enumerate(zip(names, masks), 1):
+            share += 0.0 if moving is None else float(moving.mean()) / len(names)
             pixels = read_image(frames.folder / name).numpy()
             pixels = pixels if has_alpha else pixels[..., :3]
             for scale in scales:  # the mean of each block; what is left at the ends is left out
@@ -146,12 +164,16 @@ def write(
                 small = shrunk(pixels[: height * scale, : width * scale], height, width)
                 write_image(folder / f"images_{scale}" / name, small)
             time = (frames.times[name] - first) / (last - first) if last > first else 0.0
-            yield PosedShot(name, found.cameras[name], pixels, time)
+            yield PosedShot(name, found.cameras[name], pixels, time, moving=moving)
             progress(done, len(names))
 
     options = {"near": limits.near, "far": limits.far, "aabb": limits.box} if limits else {}
+    if frames.masks is not None or follows:
+        options["moving_from"] = "the masks given" if frames.masks else "optical flow against the cameras"
+    if source.video is not None:
+        options["seconds"] = last - first
     write_scene(folder, shots(), points=found.sure(), **options)
-    return scales
+    return scales, share if "moving_from" in options else None
 
 
 def draw(found: Reconstruction, limits: Limits) -> Tensor:
@@ -205,7 +227,12 @@ def _frustum(camera: Camera, depth: float) -> np.ndarray:
 
 
 def facts_of(
-    source: Source, frames: Frames, found: Reconstruction, limits: Limits | None, scales: list[int]
+    source: Source,
+    frames: Frames,
+    found: Reconstruction,
+    limits: Limits | None,
+    scales: list[int],
+    moving: float | None,
 ) -> dict:
     """Gather the numbers of ``capture.json``."""
     camera = next(iter(found.cameras.values()))
@@ -221,6 +248,7 @@ def facts_of(
         "left_out": [frames.originals.get(name, name) for name in left_out],
         "originals": frames.originals,
         "assumed": frames.assumed,
+        "why": frames.why,
         "absent": list(found.absent),
         "seconds": max(times) - min(times) if source.video is not None else None,
         "reprojection_error": found.error if limits else None,
@@ -236,6 +264,7 @@ def facts_of(
         "has_nearer": limits is not None and limits.has_nearer,
         "box": limits and [*limits.box.low, *limits.box.high],
         "scales": scales,
+        "moving": moving,
     }
 
 
@@ -256,6 +285,12 @@ def summary(facts: dict) -> list[str]:
         lines[1] += ", where what it sees is 1 away"
         lines[2] = (
             f"points: {facts['points']:,}{sure}; box {size}, near {facts['near']:.2f}, far {facts['far']:.2f}"
+        )
+    if facts["why"]:
+        lines.insert(0, f"frames: {facts['pictures']} of {facts['found']}; {facts['why']}")
+    if facts["moving"] is not None:
+        lines.append(
+            f"moving: {facts['moving']:.0%} of the pixels; test frames are scored there and elsewhere"
         )
     if facts["absent"]:
         lines.append(

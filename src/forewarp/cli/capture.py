@@ -12,7 +12,7 @@ What one types most:
   masks=FOLDER                  what moves is bright; poses are not found from it. A mask for each frame
                                 of the video in order, or masks with the pictures' names
   out=FOLDER                    the scene's folder (captures/<name of the video>)
-  frames=N                      how many frames of a video; by default 120, but at most every second one
+  frames=N                      how many frames of a video; by default all of a short one, else by its motion
   size=1600                     pixels of the longer side, at most; null: as filmed
   matching=exhaustive           match every pair of pictures, where the camera comes back to where it was
   lens=SIMPLE_RADIAL            a simpler camera, where few pictures or points tell of the lens
@@ -95,8 +95,9 @@ def check(config) -> tuple[dict, object]:
     for key, known in (("matching", MATCHING), ("lens", LENSES)):
         if config[key] not in known:
             raise ValueError(f"{key}: expected one of {', '.join(known)}, but got '{config[key]}'")
-    if find_spec("pycolmap") is None:
-        raise ImportError("capture: expected pycolmap, but got none; install forewarp[capture]")
+    for package in ("pycolmap", "cv2"):
+        if find_spec(package) is None:
+            raise ImportError(f"capture: expected {package}, but got none; install forewarp[capture]")
     out = Path(config.out or Path("captures") / (video or images).resolve().stem)
     if Path.cwd().is_relative_to(out.resolve()):
         raise ValueError(f"out: expected a folder to be made, but got {out}, which you are in; name another")
