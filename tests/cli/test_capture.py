@@ -112,7 +112,7 @@ def test_a_camera_that_turns_is_refused(refused, in_tmp):
     assert "force=true; what was found stays in new/.hand.work" in said
     work = in_tmp / "new" / ".hand.work"
     assert (work / "database.db").is_file()
-    assert len(list((work / "pictures").iterdir())) == 3
+    assert len(list((work / "pictures").iterdir())) == 6
 
 
 def test_hardly_any_texture_is_refused(refused, in_tmp):
@@ -142,7 +142,8 @@ def test_poses_that_are_known_become_a_scene(ok, refused, in_tmp):
     assert said[0].startswith("registered: 8 of 8 pictures, 320 x 240 pixels")
     assert said[-1] == "next: forewarp-train experiment=video_with_poses data.root=captures data.scene=hand"
     names = {path.name for path in (in_tmp / "captures" / "hand").iterdir()}
-    assert names == {"transforms.json", "capture.json", "capture.png", "points.npy", "images", "images_2"}
+    kept = {"transforms.json", "capture.json", "capture.png", "points.npy", "images", "images_2", "moving"}
+    assert names == kept
     for scale in (1, 2):
         scene = read_scene("captures", "hand", scale=scale)
         frames = sorted((*scene.train, *scene.test), key=lambda frame: frame.time)

@@ -342,8 +342,8 @@ def speed(before: np.ndarray, grey: np.ndarray) -> float:
     wide: the ninth decile of the lengths of optical flow (DIS).
 
     >>> image = np.random.default_rng(0).integers(0, 255, (30, 40)).repeat(4, 0).repeat(4, 1).astype(np.uint8)
-    >>> round(speed(image, np.roll(image, 2, 1)))
-    8
+    >>> 7 < speed(image, np.roll(image, 2, 1)) < 10
+    True
     """
     scale = _FLOW / max(grey.shape)
     size = max(8, round(scale * grey.shape[1])), max(8, round(scale * grey.shape[0]))

@@ -22,6 +22,7 @@ _SIDE, _STEP = 480, 4  # pixels of the longer side in which flow is measured; be
 _REACH = 5  # images before and after that a pixel is followed through
 _AGREE, _SLOPPY = 0.5, 0.05  # pixels, and share of the flow, by which there and back may differ
 _LEAST = 4  # images of a pixel's way from which on it is known
+_TELLS = 0.3  # share of an image's pixels that must be known; of photos far apart hardly one is
 _OFF = 2.0  # pixels by which a point at rest may miss its way
 _SPECK, _GAP = 3, 5  # of the grid: smaller spots, and smaller holes, are noise
 
@@ -116,8 +117,8 @@ def _whole(moves: np.ndarray, known: np.ndarray) -> np.ndarray:
         return cv2.morphologyEx(mask.astype(np.uint8), kind, disc) > 0
 
     sure = filtered(moves & known, cv2.MORPH_OPEN, _SPECK)
-    if not sure.any():
-        return sure
+    if not sure.any() or known.mean() < _TELLS:
+        return np.zeros_like(sure)
     mask = away_from(sure) <= away_from(known & ~sure)
     mask = filtered(filtered(mask, cv2.MORPH_OPEN, _SPECK), cv2.MORPH_CLOSE, _GAP)
     outlines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+import cv2
 import pycolmap
 from filelock import FileLock, Timeout
 
@@ -52,6 +53,7 @@ def capture(
     """
     about = {**dataclasses.asdict(source), **dataclasses.asdict(search), "frames": frames, "size": size}
     del about["threads"]
+    cv2.setNumThreads(search.threads or -1)
     about["files"] = [_fingerprint(path) for path in (source.path, source.masks) if path is not None]
     with work_folder(out, about) as work:
         images = take(work, source, step, count=frames, size=size, threads=search.threads)

@@ -90,7 +90,8 @@ class Numbers:
             show anything); of less than a hundred images, by that of their share of these pixels.
         initial_share, final_share: shares of that number that the stage begins and ends with.
         nodes: number of nodes, divided by the square root of the number of particles at the beginning.
-        knots: coefficients of each node's curve, divided by the square root of the number of times.
+        knots: coefficients of each node's curve, divided by the square root of the number of times; at most
+            half as many as times and four more, or what lies between two of them would be left open.
         natural_splines: whether splines end without acceleration: two coefficients follow from the others.
         edges: neighbours that a node is kept rigid with.
         density_interval: share between two rounds of density control, up to ``density_until``.
@@ -184,7 +185,7 @@ class Numbers:
         >>> Numbers().motion(6364, 100)
         (199, 22)
         """
-        knots = min(times + 2, round(self.knots * math.sqrt(times)))
+        knots = min(times // 2 + 4, round(self.knots * math.sqrt(times)))
         return max(4, round(self.nodes * math.sqrt(particles))), max(4, knots)
 
 
