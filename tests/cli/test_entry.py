@@ -150,6 +150,12 @@ def test_what_follows_an_option_is_no_run(in_tmp):
         assert with_run_key("render", [name]) == [f"run={name}"]
 
 
+def test_an_interpolation_is_typed_as_it_is(refused, in_tmp):
+    line = "data.scene: expected a key of the configuration between ${ and }, but got 'x'"
+    assert refused("train", "data.scene=a${x}b") == line
+    assert refused("train", "run=${paths.runs}/x", "evaluate=maybe").startswith("evaluate: expected true")
+
+
 @pytest.mark.parametrize("seeds", ["0", "-1", "1.5", "x", "null"])
 def test_a_number_of_seeds_that_would_run_nothing_is_refused(refused, in_tmp, seeds):
     line = f"seeds: expected a whole number of at least 1, but got {seeds}"

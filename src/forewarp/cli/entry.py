@@ -16,7 +16,7 @@ from pathlib import Path
 
 from forewarp.cli.mistakes import flat, one_line, refuse_dashes, unknown_key, with_run_key
 from forewarp.runs.config_files import configurations, project_root
-from forewarp.runs.overrides import as_text
+from forewarp.runs.overrides import as_text, typed_overrides
 
 TRACEBACK_VARIABLE = "FOREWARP_TRACEBACK"
 MISTAKE, INTERRUPTED = 2, 130
@@ -118,7 +118,6 @@ def _keep_memory() -> None:
 def _run(name: str, task: Callable, conf: Path, config_name: str) -> list[int]:
     """Return the exit status of each job; with ``--multirun`` a failed job does not stop the others."""
     import hydra
-    from hydra.core.hydra_config import HydraConfig
 
     from forewarp.runs.config import TRUST_VARIABLE
 
@@ -135,7 +134,7 @@ def _run(name: str, task: Callable, conf: Path, config_name: str) -> list[int]:
         except Exception as error:
             status = _tell(name, error, config_name)
         with suppress(OSError), open(ended, "a") as file:
-            file.write(f"{status} {' '.join(HydraConfig.get().overrides.task)}\n")
+            file.write(f"{status} {' '.join(typed_overrides(of_sweep=True))}\n")
         return result
 
     # In a file, as jobs may be other processes; those of other machines do not reach it.

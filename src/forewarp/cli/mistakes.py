@@ -120,8 +120,11 @@ def _every_key(node, prefix: str = "") -> Iterator[str]:
 def one_line(error: BaseException) -> str | None:
     """Return the line for an error that the user can mend; None for a bug of forewarp."""
     from hydra.errors import HydraException, InstantiationException
-    from omegaconf.errors import OmegaConfBaseException
+    from omegaconf.errors import InterpolationKeyError, OmegaConfBaseException
 
+    if isinstance(error, InterpolationKeyError):
+        got = flat(str(error)).removeprefix("Interpolation key ").removesuffix(" not found")
+        return f"{error.full_key}: expected a key of the configuration between ${{ and }}, but got {got}"
     if isinstance(error, InstantiationException):
         where = _after(str(error), "full_key:")
         if isinstance(error.__cause__, ValueError | OSError | ImportError):

@@ -178,7 +178,9 @@ def words(text: str) -> list[str]:
 def demo(keys: Keys) -> Job:
     """Fit the procedural vehicle by three methods, and make a video by particles."""
     # Kernels of particles compile for half a minute the first time, beside the others' training.
-    common = ["experiment=demo", "threads=1", f"budget.minutes={keys.minutes or 0.3}"]
+    # Processor time, as beside other work a wall clock would leave some stages without a step.
+    common = ["experiment=demo", "threads=1", "trainer=cpu", "budget.clock=processor"]
+    common.append(f"budget.minutes={keys.minutes or 0.3}")
     fits = {model: f"runs/demo/{model}" for model in ("particles", "forward", "backward")}
     lanes = [[[*common, f"model={model}", f"run={run}"]] for model, run in fits.items()]
     lanes[0][0].append("~stage.coarse")  # in so short a run its start alone may take all its time

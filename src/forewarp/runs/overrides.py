@@ -20,8 +20,9 @@ OF_A_SWEEP = ("sweeps=", "seeds=", "launcher=")  # these say how jobs are run, n
 def typed_overrides(*, of_sweep: bool = False) -> list[str]:
     """List the overrides of this job's command line; ``of_sweep`` keeps those that only say how jobs run."""
     from hydra.core.hydra_config import HydraConfig
+    from omegaconf import OmegaConf
 
-    typed = list(HydraConfig.get().overrides.task)
+    typed = OmegaConf.to_container(HydraConfig.get().overrides.task)  # ${..} as typed
     return typed if of_sweep else [override for override in typed if not override.startswith(OF_A_SWEEP)]
 
 
