@@ -151,7 +151,7 @@ def test_what_follows_an_option_is_no_run(in_tmp):
 
 
 def test_an_interpolation_is_typed_as_it_is(refused, in_tmp):
-    line = "data.scene: expected a key of the configuration between ${ and }, but got 'x'"
+    line = "${x}: expected a key of the configuration, but got none of this name; no name may hold ${"
     assert refused("train", "data.scene=a${x}b") == line
     assert refused("train", "run=${paths.runs}/x", "evaluate=maybe").startswith("evaluate: expected true")
 

@@ -123,8 +123,8 @@ def one_line(error: BaseException) -> str | None:
     from omegaconf.errors import InterpolationKeyError, OmegaConfBaseException
 
     if isinstance(error, InterpolationKeyError):
-        got = flat(str(error)).removeprefix("Interpolation key ").removesuffix(" not found")
-        return f"{error.full_key}: expected a key of the configuration between ${{ and }}, but got {got}"
+        key = re.sub(r".*key '(.*)' not found", r"${\1}", flat(str(error)))
+        return f"{key}: expected a key of the configuration, but got none of this name; no name may hold ${{"
     if isinstance(error, InstantiationException):
         where = _after(str(error), "full_key:")
         if isinstance(error.__cause__, ValueError | OSError | ImportError):
