@@ -62,7 +62,7 @@ class Marched(Rendering):
 
 
 @torch.no_grad()
-def _in_chunks(render: Callable[[slice], Rendering], count: int, chunk: int) -> Rendering:
+def in_chunks(render: Callable[[slice], Rendering], count: int, chunk: int) -> Rendering:
     """Join the renderings of so many rays, ``chunk`` at a time."""
     return Rendering.joined([render(slice(begin, begin + chunk)) for begin in range(0, count, chunk)])
 
@@ -204,7 +204,7 @@ class Renderer:
         chunk: int = 65536,
     ) -> Rendering:
         """Render an image's rays without gradient. Cost: time linear in the rays, memory in ``chunk``."""
-        return _in_chunks(lambda part: self(field, rays[part], background, shade), len(rays), chunk)
+        return in_chunks(lambda part: self(field, rays[part], background, shade), len(rays), chunk)
 
     @staticmethod
     def _starts(
@@ -370,7 +370,7 @@ class Quadrature:
         """Render an image's rays without gradient. Cost: time linear in the rays, memory bounded."""
         chunk = max(1, _POINTS // (self.samples + self.fine_samples))
         behind = background.expand(len(rays), 3)
-        return _in_chunks(
+        return in_chunks(
             lambda part: self(density, radiance, rays[part], behind[part], generator), len(rays), chunk
         )
 

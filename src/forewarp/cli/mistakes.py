@@ -126,17 +126,18 @@ def one_line(error: BaseException) -> str | None:
         key = re.sub(r".*key '(.*)' not found", r"${\1}", flat(str(error)))
         return f"{key}: expected a key of the configuration, but got none of this name; no name may hold ${{"
     if isinstance(error, InstantiationException):
-        where = _after(str(error), "full_key:")
         if isinstance(error.__cause__, ValueError | OSError | ImportError):
             return one_line(error.__cause__)
-        return f"{where or 'config'}: {flat(str(error.__cause__ or error))}"
+        where = re.search(r"full_key: *(.+)", str(error))
+        return f"{where[1].strip() if where else 'config'}: {flat(str(error.__cause__ or error))}"
     missing = re.search(r"Missing mandatory value: ([\w.]+)", str(error))
     if missing and isinstance(error, OmegaConfBaseException):
         return f"{missing[1]}: expected a value, but got none; set {missing[1]}=..."
     if getattr(error, "override", None):  # Hydra could not parse it
         return f"{error.override}: {flat(str(error))}"
-    if isinstance(error, HydraException) and (found := _absent_plugin(str(error))):
-        kind, plugin = found
+    absent = re.search(r"hydra/(launcher|sweeper)[/'=:\s]+(joblib|ray|submitit_\w+|optuna)", str(error))
+    if isinstance(error, HydraException) and absent:
+        kind, plugin = absent.groups()
         otherwise = ", or use launcher=local" if kind == "launcher" else ""
         expected = f"{kind}: expected the package of hydra/{kind}={plugin}, but got none"
         return f"{expected}; install forewarp[sweeps]{otherwise}"
@@ -172,11 +173,6 @@ def _to_install(error: ImportError) -> str:
     return f"; install {error.name.partition('.')[0]}, or put its folder on PYTHONPATH"
 
 
-def _absent_plugin(text: str) -> tuple[str, ...] | None:
-    found = re.search(r"hydra/(launcher|sweeper)[/'=:\s]+(joblib|ray|submitit_\w+|optuna)", text)
-    return found and found.groups()
-
-
 def _of_system(error: OSError) -> str:
     reason, file = error.strerror or str(error), error.filename
     full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -185,11 +181,6 @@ def _of_system(error: OSError) -> str:
     )
     expected = "room to write" if full else "a usable file or folder"
     return f"{file or 'a file'}: expected {expected}, but got {reason}; {advice}"
-
-
-def _after(text: str, mark: str) -> str:
-    """Return the rest of the line after ``mark``; empty if it does not occur."""
-    return text.split(mark, 1)[1].strip().splitlines()[0] if mark in text else ""
 
 
 def flat(text: str) -> str:

@@ -36,8 +36,7 @@ make reproduce-tables [DATA=DATASETS], make ablations, make effects. Runs withou
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import replace
+from collections.abc import Callable
 from glob import glob
 from importlib import import_module
 from pathlib import Path
@@ -158,12 +157,16 @@ def run_page(config: DictConfig) -> str:
     media = media_of(row, config.path)  # loads torch; mistakes have been answered before
     room_of(row, media, float(config.megabytes))  # refuses before minutes of rendering
     try:
-        for more in _gathered(config, row, media):
-            media = more
+        if config.render and not row["unfinished"]:
+            _render(config, row, media)
     except KeyboardInterrupt:
-        media = replace(media, missing=("Rendering for this page was interrupted.",))
+        media.missing = ["Rendering for this page was interrupted."]
         print(written())
         raise
+    except Exception as error:
+        if (reason := one_line(error)) is None:
+            raise
+        media.missing = [f"Rendering for this page stopped: {reason}."]
     return written()
 
 
@@ -189,22 +192,8 @@ def _named(config: DictConfig) -> Path:
     return Path(str(config.run))
 
 
-def _gathered(config: DictConfig, row: dict, media) -> Iterator:
-    """Give the page's media after each part that is made; what cannot be made is told, and left out."""
-    if not config.render or row["unfinished"]:
-        return
-    try:
-        for more in _rendered(config, row, media):
-            yield (media := more)
-    except Exception as error:
-        reason = one_line(error)
-        if reason is None:
-            raise
-        yield replace(media, missing=(f"Rendering for this page stopped: {reason}.",))
-
-
-def _rendered(config: DictConfig, row: dict, media) -> Iterator:
-    """Render the telling views, and the video if the run has none; give what there is after each."""
+def _render(config: DictConfig, row: dict, media) -> None:
+    """Render the telling views, and the video if the run has none; ``media`` takes each once it is made."""
     from forewarp.evaluation.images import parts_of
     from forewarp.report.run_page import FILMS, Shown, about, telling
     from forewarp.runs.config import saved_config
@@ -220,17 +209,16 @@ def _rendered(config: DictConfig, row: dict, media) -> Iterator:
             camera = targets.frames[places[name]].camera
             parts = parts_of(module, targets[places[name]], MOST_SIDE)
             views.append(Shown(why, about(row, name), parts, max(camera.width, camera.height)))
-    media = replace(media, views=views or media.views)
-    yield media
+    media.views = views or media.views
     if media.video is not None:
         return
     if not len(targets):
-        yield replace(media, missing=("No video: the scene has no test view to begin it from.",))
+        media.missing = ["No video: the scene has no test view to begin it from."]
         return
     film = OmegaConf.load(project_root() / "conf" / "render.yaml")
     film.path = config.path or ("both" if row["config"].get("capture") == "cut_out" else "swing")
     check(film)
-    yield replace(media, video=write_film(film, run, module), about=FILMS[film.path])
+    media.video, media.about = write_film(film, run, module), FILMS[film.path]
 
 
 def main() -> None:

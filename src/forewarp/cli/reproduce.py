@@ -40,14 +40,20 @@ import shlex
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 
 import yaml
 
 from forewarp.cli.entry import INTERRUPTED, MISTAKE, project_root
 from forewarp.runs.overrides import merged
 
+# Keys that may be typed, with what they are where they are left out.
+KEYS = dict.fromkeys(
+    shlex.split("data scenes methods model preset minutes steps seeds sweeps changes views out"), ""
+)
+KEYS |= {"jobs": "2", "threads": "", "launcher": "", "device": "gpu", "more": "", "small": ""}
 TABLES = ["dnerf", "hypernerf", "nhr", "lego_complete"]
 ABLATIONS = ["ablation_modules", "ablation_losses"]
 # Sweeps and the counterparts they run on without data, in two lanes of about the same length, a core each.
@@ -74,28 +80,8 @@ TINY = shlex.split(
 Sweep = list[str]  # the overrides of one `forewarp-train`
 
 
-@dataclass
-class Keys:
+class Keys(SimpleNamespace):
     """What was typed, as text; "" where a key was left out."""
-
-    data: str = ""
-    scenes: str = ""
-    methods: str = ""
-    model: str = ""
-    preset: str = ""
-    minutes: str = ""
-    steps: str = ""
-    seeds: str = ""
-    sweeps: str = ""
-    changes: str = ""
-    views: str = ""
-    out: str = ""
-    jobs: str = "2"
-    threads: str = ""
-    launcher: str = ""
-    device: str = "gpu"
-    more: str = ""
-    small: str = ""
 
     @classmethod
     def typed(cls, arguments: list[str]) -> Keys:
@@ -104,16 +90,16 @@ class Keys:
         Raises:
             ValueError: for another word, or a key that there is not.
         """
-        known, typed = [field.name for field in fields(cls)], {}
+        typed = {}
         for argument in arguments:
             key, equals, value = argument.partition("=")
             key = key.lower()
-            if not equals or key not in known:
-                near = difflib.get_close_matches(key, known, 1)
-                hint = f"did you mean {near[0]}=?" if near else f"known are {', '.join(known)}"
+            if not equals or key not in KEYS:
+                near = difflib.get_close_matches(key, KEYS, 1)
+                hint = f"did you mean {near[0]}=?" if near else f"known are {', '.join(KEYS)}"
                 raise ValueError(f"expected key=value with a known key, but got '{argument}'; {hint}")
             typed |= {key: value} if value else {}
-        return cls(**typed)
+        return cls(**KEYS | typed)
 
     def chosen(self, *scenes: str) -> Sweep:
         """Return overrides that choose scenes of D-NeRF in ``data``; none without it."""

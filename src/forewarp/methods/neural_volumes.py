@@ -22,6 +22,7 @@ from forewarp.fields.networks import (
 from forewarp.methods.method import Start, Step, check_number, those_that_hold
 from forewarp.methods.rays import BETWEEN_TIMES, CENTRES, ONE_TIME, DeadStart, RayMethod, RaySnapshot
 from forewarp.ops.march import clip_to_box
+from forewarp.renderer import in_chunks
 from forewarp.scene.camera import Rays
 from forewarp.scene.frame import Frame, Scene, spread
 from forewarp.scene.view import Batch, Moment, Rendering, View
@@ -267,8 +268,8 @@ class VolumesSnapshot(RaySnapshot):
             return made.march(self.volumes(), rays, background, tint)
         draw = torch.Generator().manual_seed(0) if made.jitter_in_pictures else None
         behind, chunk = background.expand(len(rays), 3), max(1, int(_POINTS * made.step / 4))
-        chunks = [slice(begin, begin + chunk) for begin in range(0, len(rays), chunk)]
-        return Rendering.joined([made.march(self._still, rays[c], behind[c], tint, draw) for c in chunks])
+        volumes = self._still
+        return in_chunks(lambda c: made.march(volumes, rays[c], behind[c], tint, draw), len(rays), chunk)
 
 
 def shots_of(scene: Scene, wanted: int | None) -> list[list[Frame]]:

@@ -27,7 +27,7 @@ from forewarp.methods.method import (
 from forewarp.methods.rows import RowsAdam, renew_parameters
 from forewarp.ops.encode import encoded_size, positional_encoding
 from forewarp.ops.march import warm_up
-from forewarp.renderer import Marched, Quadrature, Renderer, Sampled
+from forewarp.renderer import Marched, Quadrature, Renderer, Sampled, in_chunks
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.camera import Rays
 from forewarp.scene.frame import spread
@@ -525,8 +525,7 @@ class MarchedMethod(RayMethod):
     def image(self, moment: Moment, rays: Rays, background: Tensor) -> Rendering:
         """See ``RayMethod``."""
         field, behind = self.field(moment), background.expand(len(rays), 3)
-        chunks = [slice(begin, begin + _RAYS) for begin in range(0, len(rays), _RAYS)]
-        return Rendering.joined([self.marched(field, rays[some], behind[some]) for some in chunks])
+        return in_chunks(lambda some: self.marched(field, rays[some], behind[some]), len(rays), _RAYS)
 
     def marched(
         self, field: PointField, rays: Rays, background: Tensor, generator: torch.Generator | None = None

@@ -57,7 +57,7 @@ class Shown:
     side: int = 0
 
 
-@dataclass(frozen=True)
+@dataclass
 class Media:
     """What a page shows: views, the file of a video and what is to be seen in it; what is missing and why."""
 
