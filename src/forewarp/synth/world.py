@@ -72,6 +72,11 @@ def _sheet() -> list[Part]:
     ]
 
 
+def _tiled(name: str, joint: str, low, high, colors, scale: float, casts: bool = True) -> Part:
+    """Make a box between two corners (3,), in a mosaic of tiles."""
+    return Part(name, joint, *box(low, high), Material("mosaic", colors, scale), casts=casts)
+
+
 def _plate(material: Material) -> Part:
     return Part("plate", "ground", *rounded_slab(0.7, 0.2, -0.07, 0.0), material)
 
@@ -87,14 +92,10 @@ def _globe_joints(time: float) -> dict[str, np.ndarray]:
 def _corner() -> list[Part]:
     """Make a floor and two walls behind the subject; they fill every image."""
     near, far, outside, floor = -1.1, 5.0, -1.1 - 0.1, GROUND - 0.0702
-    walls = [
-        ("floor", (outside, outside, floor - 0.1), (far, far, floor), STONES),
-        ("wall_x", (outside, outside, floor), (near, far, far), TILES),
-        ("wall_y", (near, outside, floor), (far, near, far), LACQUER),
-    ]
     return [
-        Part(name, "room", *box(low, high), Material("mosaic", colors, 0.22), casts=False)
-        for name, low, high, colors in walls
+        _tiled("floor", "room", (outside, outside, floor - 0.1), (far, far, floor), STONES, 0.22, False),
+        _tiled("wall_x", "room", (outside, outside, floor), (near, far, far), TILES, 0.22, False),
+        _tiled("wall_y", "room", (near, outside, floor), (far, near, far), LACQUER, 0.22, False),
     ]
 
 
@@ -119,14 +120,12 @@ BLOCKS = {
 
 def _blocks() -> list[Part]:
     """Put four blocks around a pillar on a plate, which each come or go."""
-    pillar = Part(
-        "pillar", "ground", *box((-0.14, -0.14, 0.0), (0.14, 0.14, 0.7)), Material("mosaic", STONES, 0.14)
-    )
+    pillar = _tiled("pillar", "ground", (-0.14, -0.14, 0.0), (0.14, 0.14, 0.7), STONES, 0.14)
     parts = [_plate(Material("mosaic", TILES, 0.2)), pillar]
     for name, (_, (x, y), colors) in BLOCKS.items():
         middle = 0.35 * np.array([x, y, 0.0])
-        block = box(middle - (0.2, 0.2, 0.0), middle + (0.2, 0.2, 0.42))
-        parts.append(Part(name, "ground", *block, Material("mosaic", colors, 0.13)))
+        low, high = middle - (0.2, 0.2, 0.0), middle + (0.2, 0.2, 0.42)
+        parts.append(_tiled(name, "ground", low, high, colors, 0.13))
     return parts
 
 
@@ -151,17 +150,13 @@ def _wings() -> list[Part]:
 def room() -> list[Part]:
     """Make six thin closed boxes, which cast no shadow, as the light is outside."""
     (x0, y0, z0), (x1, y1, z1), t = ROOM_LOW, ROOM_HIGH, 0.1
-    walls = [
-        ("floor", (x0 - t, y0 - t, z0 - t), (x1 + t, y1 + t, z0), FLOOR, 0.30),
-        ("ceiling", (x0 - t, y0 - t, z1), (x1 + t, y1 + t, z1 + t), CEILING, 0.50),
-        ("left", (x0 - t, y0, z0), (x0, y1, z1), LEFT, 0.38),
-        ("right", (x1, y0, z0), (x1 + t, y1, z1), RIGHT, 0.38),
-        ("front", (x0 - t, y0 - t, z0), (x1 + t, y0, z1), BACK, 0.34),
-        ("back", (x0 - t, y1, z0), (x1 + t, y1 + t, z1), BACK, 0.34),
-    ]
     return [
-        Part(name, "ground", *box(low, high), Material("mosaic", colors, scale), casts=False)
-        for name, low, high, colors, scale in walls
+        _tiled("floor", "ground", (x0 - t, y0 - t, z0 - t), (x1 + t, y1 + t, z0), FLOOR, 0.30, False),
+        _tiled("ceiling", "ground", (x0 - t, y0 - t, z1), (x1 + t, y1 + t, z1 + t), CEILING, 0.50, False),
+        _tiled("left", "ground", (x0 - t, y0, z0), (x0, y1, z1), LEFT, 0.38, False),
+        _tiled("right", "ground", (x1, y0, z0), (x1 + t, y1, z1), RIGHT, 0.38, False),
+        _tiled("front", "ground", (x0 - t, y0 - t, z0), (x1 + t, y0, z1), BACK, 0.34, False),
+        _tiled("back", "ground", (x0 - t, y1, z0), (x1 + t, y1 + t, z1), BACK, 0.34, False),
     ]
 
 
