@@ -11,7 +11,7 @@ from omegaconf import OmegaConf
 from forewarp.data.module import SceneDataModule
 from forewarp.methods.particles.options import EFFECTS as PARTICLES
 from forewarp.methods.particles.options import ParticlesPlanning
-from forewarp.planning.plan import Planner, Trial, Trials, refuse
+from forewarp.planning.plan import Planner, Trial, refuse
 from forewarp.planning.plan_file import read_plan, with_plan, write_plan
 from forewarp.scene.frame import Survey
 from forewarp.synth.scenes import synthesize
@@ -140,8 +140,8 @@ def test_every_question_is_asked_where_all_is_open(ok, words, in_tmp, monkeypatc
     monkeypatch.setattr(
         "forewarp.methods.effect.Evidence.pays", lambda self, effect: effect in self.gains or None
     )
-    fitted, kept = [], Trials._fitted
-    monkeypatch.setattr(Trials, "_fitted", lambda self, c, *a: (fitted.append(c.run), kept(self, c, *a))[1])
+    fitted, kept = [], Planner._fitted
+    monkeypatch.setattr(Planner, "_fitted", lambda self, c, *a: (fitted.append(c.run), kept(self, c, *a))[1])
     ok("plan", *words, *SHORT, "plan.minutes=0.1", "stage.coarse.start_alpha=2e-2")
     assert len(fitted) == len(set(fitted))  # none of them twice
     (file,) = in_tmp.glob("runs/vehicle/plan-*/plan.yaml")

@@ -7,7 +7,7 @@ import os
 import shutil
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, fields, is_dataclass
+from dataclasses import asdict, dataclass, fields, is_dataclass
 from pathlib import Path
 from statistics import fmean
 
@@ -65,101 +65,6 @@ def gain(on: Sequence[Trial], off: Sequence[Trial], *, equal_steps: bool = True)
     pairs = [list(zip(*views, strict=True)) for views in zip(*numbers, strict=True)]
     seconds = on[0].step * on[0].steps, off[0].step * off[0].steps
     return Gain.of(pairs, on[0].steps if equal_steps else None, seconds)
-
-
-@dataclass
-class Trials:
-    """Run all short runs of one plan; finished ones are not run again.
-
-    Args:
-        typed: overrides of the run to plan.
-        folder: the plan's folder, with one folder for each trial.
-        held_out: number of training views to hold out and score.
-        always: the method's overrides of every trial.
-        always_fine: the method's overrides of every fine trial.
-        steps: steps of a coarse stage.
-        seconds: most seconds of a coarse stage.
-        fine_steps: steps of a fine stage.
-        fine_seconds: most seconds of a fine stage.
-        seconds_before: total seconds of the trials that were finished before.
-        made: the fine trials so far, as several effects are compared with the same trial.
-    """
-
-    typed: list[str]
-    folder: Path
-    held_out: int
-    always: Sequence[str]
-    always_fine: Sequence[str]
-    steps: int
-    seconds: float
-    fine_steps: int
-    fine_seconds: float
-    seconds_before: float = 0.0
-    made: dict[str, Trial] = field(default_factory=dict)
-
-    def coarse(self, name: str, changes: Sequence[str]) -> tuple[Trial, Run, DynamicSceneModule]:
-        """Fit a coarse stage with these overrides; return its result, its run and the fitted module."""
-        config = self._config(name, changes, self.always, 0, self.steps, self.seconds)
-        for later in list(config.stage)[1:]:
-            config.stage[later] = None
-        return self._fitted(config)
-
-    def fine(
-        self, name: str, changes: Sequence[str], after: str, seed: int, steps: int | None = None, longer=1
-    ) -> Trial:
-        """Fit a short fine stage that begins where the coarse stage of the trial ``after`` ended.
-
-        Args:
-            name: name of the trial.
-            changes: overrides of the trial.
-            after: name of the trial whose coarse stage to continue.
-            seed: added to the run's seed.
-            steps: steps of the stage; None: ``fine_steps``, or fewer if ``fine_seconds`` end first.
-            longer: times ``fine_steps`` and ``fine_seconds``; of no effect where ``steps`` is given.
-        """
-        name = f"{name}-seed{seed}"
-        if name not in self.made:
-            seconds = longer * self.fine_seconds if steps is None else None
-            steps, always = steps or longer * self.fine_steps, [*self.always, *self.always_fine]
-            config = self._config(name, changes, always, seed, steps, seconds)
-            first, last = list(config.stage)[0], list(config.stage)[-1]
-            config.stage[first].share, config.stage[last].share = 1e-6, 1.0
-            self.made[name] = self._fitted(config, self.folder / after / first)[0]
-        return self.made[name]
-
-    def _config(self, name: str, changes, always, seed: int, steps: int, seconds: float | None) -> DictConfig:
-        config = compose("train", without_switched_off(merged(merged(changes, self.typed), always)))
-        data = OmegaConf.to_container(config.data, resolve=True) | {"seed": config.seed + seed}
-        with open_dict(config):
-            config.data = data  # resolved before the seed changes, as synthetic scenes are made from the seed
-            config.run, config.seed, config.effects = str(self.folder / name), config.seed + seed, "given"
-            config.budget.iterations, config.budget.minutes = steps, None if seconds is None else seconds / 60
-            config.data.held_out, config.evaluate = self.held_out, False
-            config.logger, config.callbacks = None, {"progress": config.callbacks.get("progress")}
-        print(self.folder / name, flush=True)
-        return config
-
-    def _fitted(self, config: DictConfig, begun: Path | None = None) -> tuple[Trial, Run, DynamicSceneModule]:
-        """Fit and score a trial, or read the stored result; ``begun``: folder of a finished first stage."""
-        begin = time.perf_counter()
-        run = build_run(config)
-        run.tell = lambda line: None
-        run.datamodule.setup("fit")
-        with session(run, config):
-            if begun is not None:
-                _share(begun, run.folder / begun.name)
-            module = run.fit().to(run.device)
-            file = run.folder / "trial.json"
-            if (stored := read_json(file)) is not None:
-                self.seconds_before += stored["took"]
-                return Trial(**stored | {"psnr": tuple(stored["psnr"])}), run, module
-            noted = read_json(run.stage_folder(run.stages[-1]) / "done.json")
-            psnr = psnr_by_view(module, run.datamodule.watched(), RAYS)
-            step, took = noted["seconds"] / noted["steps"], time.perf_counter() - begin
-            rest = module.method.at_rest() if isinstance(module.method, HasRest) else 0.0
-            trial = Trial(tuple(psnr), step, noted["steps"], took, rest)
-            write_json(file, asdict(trial))
-        return trial, run, module
 
 
 def _share(source: Path, target: Path) -> None:
@@ -222,7 +127,7 @@ def make_plan(config: DictConfig, overrides: Sequence[str]) -> dict:
     begin = time.perf_counter()
     planner = Planner(config, typed, folder, run.datamodule.scene, planning)
     made = planner.plan()
-    seconds = time.perf_counter() - begin + planner.trials.seconds_before
+    seconds = time.perf_counter() - begin + planner.seconds_before
     made |= {"seconds": round(seconds, 1), "of": asked, "asked": list(overrides)}
     write_plan(file, made)
     return made | {"file": str(file)}
@@ -256,14 +161,12 @@ class Planner:
                 f"plan: expected a scene that can spare 2 training views for its trials, but {scene.name} of "
                 f"{len(scene.train)} can spare {can_spare}; choose the effects yourself"
             )
-        bounds = {
-            "steps": config.plan.steps or planning.steps,
-            "seconds": config.plan.seconds,
-            "fine_steps": config.plan.trial_steps or planning.trial_steps,
-            "fine_seconds": config.plan.trial_seconds,
-        }
-        held_out = min(config.plan.held_out, can_spare)
-        self.trials = Trials(typed, folder, held_out, *planning.always(self.asked), **bounds)
+        self.folder, self.held_out = folder, min(config.plan.held_out, can_spare)
+        self.fine_steps = config.plan.trial_steps or planning.trial_steps
+        # Overrides of every trial, and further ones of fine trials.
+        self.always, self.always_fine = planning.always(self.asked)
+        self.seconds_before = 0.0  # of the trials that were finished before
+        self.made: dict[str, Trial] = {}  # fine trials so far: several effects are compared with the same
         # An effect of the last stage costs time of the last stage only.
         last = stages[self.asked.last]
         share = last.share / sum(stage.share for stage in stages.values())
@@ -303,12 +206,12 @@ class Planner:
         """See ``CoarseTrials``: evidence is taken from this coarse stage, and fine trials begin from it."""
         overrides = merged(self.base, overrides) if change else list(overrides)
         self.name, self.base, self.fine_name = name, overrides, "fine"
-        self.reached, self.run, self.module = self.trials.coarse(name, overrides)
+        self.reached, self.run, self.module = self._coarse(name, overrides)
 
     def rival(self, effect: str, name: str, overrides: Sequence[str], *, adds: bool = False) -> bool:
         """See ``CoarseTrials``."""
         overrides = merged(self.base, overrides)
-        rival = self.trials.coarse(name, overrides)
+        rival = self._coarse(name, overrides)
         on, off = (rival[0], self.reached) if adds else (self.reached, rival[0])
         self.evidence.gains[effect] = gain([on], [off], equal_steps=False)
         pays = self.evidence.pays(effect)
@@ -352,7 +255,7 @@ class Planner:
         small. ``longer``: how many times the usual steps and seconds both have.
         """
         if longer != 1:
-            many = longer * self.trials.fine_steps
+            many = longer * self.fine_steps
             with_it, without = ((f"{name}-{many}", overrides) for name, overrides in (with_it, without))
         on, off = [], []
         for seed in range(self.settings.seeds):
@@ -367,10 +270,69 @@ class Planner:
             if self.evidence.hopeless(effect):
                 return
 
+    def _coarse(self, name: str, changes: Sequence[str]) -> tuple[Trial, Run, DynamicSceneModule]:
+        """Fit a coarse stage with these overrides; return its result, its run and the fitted module."""
+        steps = self.settings.steps or self.planning.steps
+        config = self._config(name, changes, self.always, 0, steps, self.settings.seconds)
+        for later in list(config.stage)[1:]:
+            config.stage[later] = None
+        return self._fitted(config)
+
     def _tried(
-        self, name: str, overrides: list[str], seed: int, steps: int | None = None, longer: int = 1
+        self, name: str, changes: list[str], seed: int, steps: int | None = None, longer: int = 1
     ) -> Trial:
-        return self.trials.fine(name, overrides, self.name, seed, steps, longer)
+        """Fit a short fine stage that begins where the chosen coarse stage ended; not twice.
+
+        Args:
+            name: name of the trial.
+            changes: overrides of the trial.
+            seed: added to the run's seed.
+            steps: steps of the stage; None: ``fine_steps``, or fewer if ``plan.trial_seconds`` end first.
+            longer: how many times these steps and seconds; of no effect where ``steps`` is given.
+        """
+        name = f"{name}-seed{seed}"
+        if name not in self.made:
+            seconds = longer * self.settings.trial_seconds if steps is None else None
+            steps, always = steps or longer * self.fine_steps, [*self.always, *self.always_fine]
+            config = self._config(name, changes, always, seed, steps, seconds)
+            first, last = list(config.stage)[0], list(config.stage)[-1]
+            config.stage[first].share, config.stage[last].share = 1e-6, 1.0
+            self.made[name] = self._fitted(config, self.folder / self.name / first)[0]
+        return self.made[name]
+
+    def _config(self, name: str, changes, always, seed: int, steps: int, seconds: float | None) -> DictConfig:
+        config = compose("train", without_switched_off(merged(merged(changes, self.typed), always)))
+        data = OmegaConf.to_container(config.data, resolve=True) | {"seed": config.seed + seed}
+        with open_dict(config):
+            config.data = data  # resolved before the seed changes, as synthetic scenes are made from the seed
+            config.run, config.seed, config.effects = str(self.folder / name), config.seed + seed, "given"
+            config.budget.iterations, config.budget.minutes = steps, None if seconds is None else seconds / 60
+            config.data.held_out, config.evaluate = self.held_out, False
+            config.logger, config.callbacks = None, {"progress": config.callbacks.get("progress")}
+        print(self.folder / name, flush=True)
+        return config
+
+    def _fitted(self, config: DictConfig, begun: Path | None = None) -> tuple[Trial, Run, DynamicSceneModule]:
+        """Fit and score a trial, or read the stored result; ``begun``: folder of a finished first stage."""
+        begin = time.perf_counter()
+        run = build_run(config)
+        run.tell = lambda line: None
+        run.datamodule.setup("fit")
+        with session(run, config):
+            if begun is not None:
+                _share(begun, run.folder / begun.name)
+            module = run.fit().to(run.device)
+            file = run.folder / "trial.json"
+            if (stored := read_json(file)) is not None:
+                self.seconds_before += stored["took"]
+                return Trial(**stored | {"psnr": tuple(stored["psnr"])}), run, module
+            noted = read_json(run.stage_folder(run.stages[-1]) / "done.json")
+            psnr = psnr_by_view(module, run.datamodule.watched(), RAYS)
+            step, took = noted["seconds"] / noted["steps"], time.perf_counter() - begin
+            rest = module.method.at_rest() if isinstance(module.method, HasRest) else 0.0
+            trial = Trial(tuple(psnr), step, noted["steps"], took, rest)
+            write_json(file, asdict(trial))
+        return trial, run, module
 
     def _choose(self, effect: str) -> str:
         """Return the option that switches an effect on: the configured one, else ``Effect.on``."""
