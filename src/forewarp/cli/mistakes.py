@@ -58,7 +58,7 @@ def unknown_key(error: Exception, name: str, arguments: list[str]) -> str | None
     """
     from hydra.errors import HydraException
 
-    from forewarp.runs.sections import option_groups
+    from forewarp.runs.config_files import option_groups
 
     unknown = re.match(r"Could not override '([^'@]+)'", str(error))
     if unknown is None or not isinstance(error, HydraException):
