@@ -103,7 +103,6 @@ class LPIPS(nn.Module):
     Args:
         net: ``squeeze``, ``vgg`` or ``alex``.
         backbone: weight file in torchvision's format, of the whole model or of its ``features``.
-        heads: file of linear heads ``lin<k>.model.1.weight``; None: torchmetrics' own.
 
     Raises:
         ValueError: for an unknown net, or a file without the net's weights.
@@ -112,13 +111,13 @@ class LPIPS(nn.Module):
     shift: Tensor
     scale: Tensor
 
-    def __init__(self, net: str, backbone: str | Path, heads: str | Path | None = None) -> None:
+    def __init__(self, net: str, backbone: str | Path) -> None:
         super().__init__()
         _check_net(net)
         self.net = net
         self.features = _BACKBONES[net]()
         _load_backbone(self.features, Path(backbone), net)
-        for k, weight in enumerate(_read_heads(net, heads)):
+        for k, weight in enumerate(heads_of(net)):
             self.register_buffer(f"head{k}", weight)
         self.register_buffer("shift", torch.tensor([-0.030, -0.088, -0.188])[:, None, None])
         self.register_buffer("scale", torch.tensor([0.458, 0.448, 0.450])[:, None, None])
@@ -194,20 +193,16 @@ def _check_net(net: str) -> None:
         raise ValueError(f"lpips: expected a net of {', '.join(NETS)}, but got {net!r}")
 
 
-def _read(file: Path, what: str) -> dict[str, Tensor]:
-    """Read a state dict; unpickle tensors only."""
+def _load_backbone(features: nn.Sequential, file: Path, net: str) -> None:
+    """Load a state dict; unpickle tensors only."""
+    what = f"weights of {net}'s features"
     try:
-        state = torch.load(file, map_location="cpu", weights_only=True)
+        stored = torch.load(file, map_location="cpu", weights_only=True)
     except (OSError, RuntimeError, EOFError, pickle.UnpicklingError) as error:
         raise ValueError(f"{file}: expected {what}, but got {type(error).__name__} on reading") from error
-    if not isinstance(state, dict):
-        raise ValueError(f"{file}: expected {what}, but got a {type(state).__name__}")
-    return state
-
-
-def _load_backbone(features: nn.Sequential, file: Path, net: str) -> None:
-    what = f"weights of {net}'s features"
-    state = {key.removeprefix("features."): value for key, value in _read(file, what).items()}
+    if not isinstance(stored, dict):
+        raise ValueError(f"{file}: expected {what}, but got a {type(stored).__name__}")
+    state = {key.removeprefix("features."): value for key, value in stored.items()}
     for key, parameter in features.state_dict().items():
         if key not in state or state[key].shape != parameter.shape:
             got = f"shape {tuple(state[key].shape)}" if key in state else "none"
@@ -217,14 +212,8 @@ def _load_backbone(features: nn.Sequential, file: Path, net: str) -> None:
     features.load_state_dict({key: state[key] for key in features.state_dict()})
 
 
-def _read_heads(net: str, heads: str | Path | None) -> list[Tensor]:
-    """Read the heads (1, C, 1, 1), one per tap."""
-    if heads is None:
-        heads = resources.files("torchmetrics") / "functional" / "image" / "lpips_models" / f"{net}.pth"
-    what = f"LPIPS heads of {net}"
-    state = _read(Path(str(heads)), what)
-    keys = [f"lin{k}.model.1.weight" for k in range(len(_TAPS[net]))]
-    missing = [key for key in keys if key not in state]
-    if missing:
-        raise ValueError(f"{heads}: expected {what}, but got no {missing[0]!r}")
-    return [state[key] for key in keys]
+def heads_of(net: str) -> list[Tensor]:
+    """Read torchmetrics' linear heads (1, C, 1, 1), one per tap."""
+    file = resources.files("torchmetrics") / "functional" / "image" / "lpips_models" / f"{net}.pth"
+    state = torch.load(Path(str(file)), map_location="cpu", weights_only=True)
+    return [state[f"lin{k}.model.1.weight"] for k in range(len(_TAPS[net]))]
