@@ -4,6 +4,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 pytest.importorskip("pycolmap", reason="no pycolmap; make install adds it")
 
@@ -129,7 +130,12 @@ def test_one_poor_camera_does_not_keep_the_points_of_others(model):
 
 def test_the_error_of_all_points_is_kept_for_the_next_call(model, tmp_path, monkeypatch):
     error = model.compute_mean_reprojection_error()
-    for name, result in (("find_features", None), ("match", None), ("reconstruct", model)):
+    for name, result in (
+        ("find_features", None),
+        ("match", None),
+        ("burnt_in", np.zeros((2, 2), bool)),
+        ("reconstruct", model),
+    ):
         monkeypatch.setattr(poses, name, lambda *given, result=result: result)
     for name in ("refuse_matches", "refuse_poses"):
         monkeypatch.setattr(pipeline, name, lambda *given: None)
@@ -138,3 +144,54 @@ def test_the_error_of_all_points_is_kept_for_the_next_call(model, tmp_path, monk
     again = pipeline.find_poses(tmp_path, frames, Search(threads=1), None)
     assert first.error == again.error == error
     assert len(first.points) == len(again.points) == 40
+
+
+def matched(folder, turn=0.0, far=0, logo=0, count=6, size=(640, 480)):
+    """A database of images whose camera moves to the right, past points near, and ``far`` ones without
+    end; ``turn`` of its degrees are random. ``logo`` points stand where they are, in the upper right corner.
+    """
+    rng, middle = np.random.default_rng(0), np.array(size) / 2
+    near = rng.uniform((-2, -1, 2), (2, 1, 5), (300, 3))
+    away = rng.uniform((-500, -400, 999), (500, -300, 1000), (far, 3))
+    burnt = rng.uniform((560, 20), (630, 60), (logo, 2))
+    places = []
+    for number in range(count):
+        rotation = Rotation.from_rotvec(np.radians(turn) * rng.normal(size=3)).as_matrix()
+        seen = (np.concatenate([near, away]) - (0.1 * number, 0, 0)) @ rotation.T
+        world = 500 * seen[:, :2] / seen[:, 2:] + middle + rng.normal(size=(len(seen), 2)) / 5
+        places.append(np.concatenate([world, burnt]).clip(0, np.array(size) - 1))
+    path = folder / "database.db"
+    with pycolmap.Database.open(path) as base:
+        camera = base.write_camera(
+            pycolmap.Camera(model="SIMPLE_PINHOLE", width=640, height=480, params=(500, 320, 240))
+        )
+        images = []
+        for number, ends in enumerate(places):
+            images.append(base.write_image(pycolmap.Image(name=f"{number}.png", camera_id=camera)))
+            base.write_keypoints(images[-1], ends.astype(np.float32))
+        every = np.arange(len(places[0]), dtype=np.uint32).repeat(2).reshape(-1, 2)
+        geometry = pycolmap.TwoViewGeometry(config=3, inlier_matches=every[: 300 + far])
+        for i in range(count):
+            for j in range(i + 1, count):
+                base.write_matches(images[i], images[j], every)
+                base.write_two_view_geometry(images[i], images[j], geometry)
+    return path
+
+
+def test_what_is_burnt_in_is_found_and_left_out(tmp_path):
+    database = matched(tmp_path, turn=2.0, logo=40)
+    burnt = poses.burnt_in(database)
+    assert burnt[20:60, 560:630].all()
+    assert burnt.mean() < 0.05
+    poses.leave_out(database, burnt)
+    with pycolmap.Database.open(database) as base:
+        matches = base.read_all_matches()[1]
+        assert len(matches) == 15
+        assert max(rows.max() for rows in matches) < 300 < min(map(len, matches)) + 20
+        assert base.read_two_view_geometry_num_inliers()[0] == []  # to be verified anew
+
+
+@pytest.mark.parametrize(("turn", "far"), [(2.0, 0), (2.0, 200), (0.0, 200)])
+def test_the_world_is_not_taken_for_burnt_in(tmp_path, turn, far):
+    """Nor are mountains behind a camera that does not turn, which stand still too."""
+    assert not poses.burnt_in(matched(tmp_path, turn, far)).any()

@@ -8,7 +8,9 @@ from scipy.spatial.transform import Rotation
 pytest.importorskip("pycolmap", reason="no pycolmap; make install adds it")
 
 from forewarp.capture.frames import Frames, Source
-from forewarp.capture.scene import Limits, draw, facts_of, limits_of, placed, summary, upwards
+from forewarp.capture.scene import Limits, draw, facts_of, limits_of, placed, summary, upwards, write
+from forewarp.data.images import write_image
+from forewarp.data.posed_video import read_scene
 from forewarp.scene.box import Box
 from tests.support.captures import cameras_on_arc, pose_errors, sparse_arc
 
@@ -125,3 +127,23 @@ def test_facts_are_those_of_the_capture_and_are_told_with_advice():
     assert known[2].startswith("points: 400, 300 of them sure; box")
     assert known[4] == left_out
     assert any("as captions or logos" in line for line in summary(facts | {"has_nearer": True}))
+
+
+def test_what_is_burnt_in_is_said_and_no_frame_trains_on_it(tmp_path):
+    found = sparse_arc(count=4)
+    sizes, times = dict.fromkeys(found.cameras, (320, 240)), dict(zip(found.cameras, range(4)))
+    for name in found.cameras:
+        write_image(tmp_path / "pictures" / name, np.full((240, 320, 3), 90, np.uint8))
+    frames = Frames(tmp_path / "pictures", None, times, range(4), 4, 1.0, sizes, {})
+    burnt = np.zeros((240, 320), bool)
+    burnt[10:50, 260:310] = True
+    limits = limits_of(found)
+    source, quiet = Source(video=Path("a.mp4")), lambda done, total: None
+    written = write(tmp_path / "hand", source, frames, found, limits, quiet, burnt)
+    for scale in (1, 2):
+        scene = read_scene(tmp_path, "hand", scale=scale)
+        for frame in (*scene.train, *scene.test):
+            np.testing.assert_array_equal(frame.load_valid(), ~burnt[::scale, ::scale])
+    said = summary(facts_of(source, frames, found, limits, *written, burnt))
+    start = "burnt in: a logo or a caption in 2.6 % of the images (top right), left out of poses"
+    assert any(line.startswith(start) for line in said)

@@ -11,16 +11,19 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import cv2
+import numpy as np
 import pycolmap
 from filelock import FileLock, Timeout
 
 from forewarp.capture import poses, scene
 from forewarp.capture.frames import Frames, Source, Step, is_hidden, take
 from forewarp.capture.poses import Reconstruction, Search, refuse_matches, refuse_poses
+from forewarp.data.images import read_image, write_image
 from forewarp.drawing.images import write_png
 from forewarp.files import folder_written_whole, read_json, write_json
 
 ABOUT, PICTURE = "capture.json", "capture.png"  # in the scene's folder
+_BURNT = "burnt_in.png"  # in the work folder: dark where something is burnt into all images
 _ERROR = "error.json"  # pixels, before points were deleted
 _STATE = "about.json"  # what the work in a work folder depends on
 
@@ -65,10 +68,11 @@ def capture(
         found = scene.placed(found)
         limits = scene.limits_of(found)
         with step("what moves") as progress, folder_written_whole(out, ABOUT) as folder:
-            written = scene.write(folder, source, images, found, limits, progress)
+            burnt = _burnt_in(work)
+            written = scene.write(folder, source, images, found, limits, progress, burnt)
             if limits is not None:
                 write_png(folder / PICTURE, scene.draw(found, limits))
-            facts = scene.facts_of(source, images, found, limits, *written)
+            facts = scene.facts_of(source, images, found, limits, *written, burnt)
             files = (path for path in sorted(folder.rglob("*")) if path.is_file())
             facts["bytes"] = {path.relative_to(folder).as_posix(): path.stat().st_size for path in files}
             write_json(folder / ABOUT, facts)
@@ -85,6 +89,12 @@ def find_poses(work: Path, images: Frames, search: Search, step: Step, force: bo
         database = poses.find_features(work, images.folder, images.masks, search, progress)
     with step("matches") as progress:
         poses.match(database, search, progress)
+    if (burnt := _burnt_in(work)) is None and (burnt := poses.burnt_in(database)).any():
+        write_image(work / _BURNT, np.where(burnt, 0, 255).astype(np.uint8))
+    if burnt.any():
+        with step("matches without what is burnt in") as progress:
+            poses.leave_out(database, burnt)
+            poses.match(database, search, progress)
     refuse_matches(database, images, force)
     with step("poses") as progress:
         model = poses.reconstruct(database, images.folder, work / "models", search, progress)
@@ -99,6 +109,12 @@ def find_poses(work: Path, images: Frames, search: Search, step: Step, force: bo
     write_json(part / _ERROR, {"error": error})
     part.rename(best)
     return found
+
+
+def _burnt_in(work: Path) -> np.ndarray | None:
+    """Read where an earlier call or step found something burnt in, (H, W) bool; None: nowhere."""
+    path = work / _BURNT
+    return read_image(path)[..., 0].numpy() == 0 if path.exists() else None
 
 
 def _fingerprint(path: Path) -> str:

@@ -25,6 +25,14 @@ _BATCH, _PAIR_BATCH = 8, 48  # images and pairs between two updates of the progr
 # its other points if it has fewer sure ones; an error of so many pixels hardly counts.
 _SURE_VIEWS, _SURE_ERROR, _MIN_POINTS, _LOSS_SCALE = 4, 1.5, 30, 0.5
 _START_VIEWS, _START_ERROR = 3, 1.5  # of points that particles begin from
+# In pixels of an image up to 640 wide: shift up to which a match stands still, from which on it moves, and
+# distance from lines through one point up to which matches may be of a camera that does not turn.
+_STILL, _MOVES, _STRAIGHT = 1.0, 5.0, 2.0
+_CELLS, _BURNT_PAIRS = 32, 240  # along the longer side; pairs that are looked at
+# A cell is burnt in if it has matches that stand still in such a share of the pairs and in so many, and they
+# are such a share of its matches. Films without have 0.02 at most, captions 0.1 to 0.4, logos 1.
+_BURNT_SHARE, _BURNT_LEAST, _BURNT_MATCHES = 0.04, 5, 0.5
+_BURNT_MOST = 0.3  # share of the image: more than that is the world behind something that moves
 # Camera models of Brown's distortion; a ``k`` of another, as of SIMPLE_DIVISION, is another lens.
 _MODELS = {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"}
 _PLACES = ("", "sparse/0", "sparse", "colmap/sparse/0")  # of a model in a folder that is given
@@ -254,6 +262,90 @@ def match(database: Path, search: Search, progress: Progress) -> None:
             device=pycolmap.Device.cpu,
         )
         progress(len(pairs) - max(0, len(left) - start - _PAIR_BATCH), len(pairs))
+
+
+def burnt_in(database: Path) -> np.ndarray:
+    """Find what is burnt into the images, as a logo or a caption: it stands still while the world moves.
+
+    Pairs of images count if most of their sure matches move, and not along lines through one point: things
+    far away stand still too if the camera does not turn. What is found is grown by a cell.
+
+    Returns:
+        (H, W) bool, true where something is burnt in.
+
+    Cost: of 240 pairs, one to two seconds.
+    """
+    with pycolmap.Database.open(database) as base:
+        camera = base.read_all_cameras()[0]
+        size = np.array([camera.width, camera.height])
+        unit, cell = max(1.0, size.max() / 640), -(-size.max() // _CELLS)
+        places = {
+            image.image_id: base.read_keypoints(image.image_id)[:, :2].clip(0, size - 1)
+            for image in base.read_all_images()
+        }
+        pairs = [pycolmap.pair_id_to_image_pair(key) for key in base.read_two_view_geometry_num_inliers()[0]]
+        count, still_pairs, still, seen = 0, *np.zeros((3, *-(-size // cell)))
+        for pair in pairs[:: max(1, len(pairs) // _BURNT_PAIRS)]:
+            sure = base.read_two_view_geometry(*pair).inlier_matches.T
+            first, second = (places[image][rows] for image, rows in zip(pair, sure))
+            moves = np.linalg.norm(second - first, axis=1) > _MOVES * unit
+            if moves.sum() < max(_MIN_INLIERS, len(moves) / 2):
+                continue
+            first, second = first[moves], second[moves]
+            if off_lines(first - size / 2, second - size / 2) < _STRAIGHT * unit:
+                continue
+            count += 1
+            every = [places[image][rows] for image, rows in zip(pair, base.read_matches(*pair).T)]
+            stands = every[0][np.linalg.norm(every[1] - every[0], axis=1) < _STILL * unit]
+            here, there = np.zeros((2, *still.shape))
+            np.add.at(here, tuple((stands // cell).astype(int).T), 1)
+            np.add.at(there, tuple((first // cell).astype(int).T), 1)
+            still, seen, still_pairs = still + here, seen + here + there, still_pairs + (here > 0)
+    burnt = (still_pairs >= max(_BURNT_LEAST, _BURNT_SHARE * count)) & (still > _BURNT_MATCHES * seen)
+    grown = torch.nn.functional.max_pool2d(torch.from_numpy(burnt.T)[None].float(), 3, 1, 1)[0].bool().numpy()
+    full = grown.repeat(cell, 0).repeat(cell, 1)[: size[1], : size[0]]
+    return full & (full.mean() < _BURNT_MOST)
+
+
+def off_lines(first: np.ndarray, second: np.ndarray) -> float:
+    """Return how far matches lie from lines through one point, in the median.
+
+    A camera that moves but does not turn shifts all it sees along such lines. The point is fitted repeatedly
+    to the better half of the matches, as others may be wrong.
+
+    Args:
+        first, second: (M, 2) from the middle of the image.
+    """
+    scale = float(np.abs(first).max())
+    a, b = (np.concatenate([ends / scale, np.ones((len(ends), 1))], 1) for ends in (first, second))
+    normals, kept = np.cross(a, b), np.arange(len(a))
+    for _ in range(4):
+        lines = np.cross(np.linalg.svd(normals[kept], full_matrices=False)[2][-1], a)
+        distances = np.abs((lines * b).sum(1)) / np.maximum(np.linalg.norm(lines[:, :2], axis=1), 1e-9)
+        kept = np.argsort(distances)[: max(3, len(distances) // 2)]
+    return scale * float(np.median(distances))
+
+
+def leave_out(database: Path, burnt: np.ndarray) -> None:
+    """Remove all matches of what is burnt in, and what was verified with them, which ``match`` does anew.
+
+    Args:
+        database: of features and matches.
+        burnt: (H, W) bool, true where something is burnt in.
+    """
+    with pycolmap.Database.open(database) as base:
+        kept = {}
+        for image in base.read_all_images():
+            ends = base.read_keypoints(image.image_id)[:, :2].clip(0, np.array(burnt.shape[::-1]) - 1)
+            columns, rows = ends.astype(int).T
+            kept[image.image_id] = ~burnt[rows, columns]
+        for key, matches in zip(*base.read_all_matches()):
+            pair = pycolmap.pair_id_to_image_pair(key)
+            good = kept[pair[0]][matches[:, 0]] & kept[pair[1]][matches[:, 1]]
+            if not good.all():
+                base.delete_two_view_geometry(*pair)
+                base.delete_matches(*pair)
+                base.write_matches(*pair, matches[good])
 
 
 def pairs_of(count: int, matching: str) -> list[tuple[int, int]]:

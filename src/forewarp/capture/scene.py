@@ -29,6 +29,7 @@ _ROLL = 0.01  # mean square of the sine by which a hand rolls a camera, and some
 _LEVEL = 1e-3  # sine of the angle between up and ahead below which all cameras look up or down
 _MIDWAY = 0.5  # share of its points' median distance from which on a camera's view belongs to the box
 _MIN_SIDE = 96  # pixels: smaller copies are of no use
+MASK = "masks/burnt_in.png"  # in the scene's folder: dark where something is burnt in
 _DRAWING, _BORDER = 640, 0.06  # pixels of each drawing; share of it that stays free at its ends
 _FIRST, _LAST, _BOX = (0.10, 0.25, 0.75), (0.85, 0.20, 0.15), (0.55, 0.55, 0.55)  # colours of cameras, box
 _FRUSTA = 24  # cameras drawn with their view
@@ -125,6 +126,7 @@ def write(
     found: Reconstruction,
     limits: Limits | None,
     progress: Progress,
+    burnt: np.ndarray | None = None,
 ) -> tuple[list[int], float | None]:
     """Write the scene of all registered images, smaller copies of them, and masks of what moves: those that
     were given, else those of ``motion.moving_masks``; none of several cameras.
@@ -136,6 +138,7 @@ def write(
         found: cameras and points, placed.
         limits: near, far and box.
         progress: called with images done and all.
+        burnt: (H, W) bool, true where something is burnt into all images; not to be trained on.
 
     Returns:
         how many times smaller the copies are, and which share of all pixels moves; None without masks.
@@ -156,6 +159,8 @@ def write(
     def shots() -> Iterator[PosedShot]:
         nonlocal share
         for done, (name, moving) in enumerate(zip(names, masks), 1):
+            if moving is not None and burnt is not None:  # it moves against the world, but is none of it
+                moving = moving & ~burnt
             share += 0.0 if moving is None else float(moving.mean()) / len(names)
             pixels = read_image(frames.folder / name).numpy()
             pixels = pixels if has_alpha else pixels[..., :3]
@@ -172,6 +177,12 @@ def write(
         options["moving_from"] = "the masks given" if frames.masks else "optical flow against the cameras"
     if source.video is not None:
         options["seconds"] = last - first
+    if burnt is not None:
+        options["mask"] = MASK
+        for scale in (1, *scales):
+            height, width = (n // scale * scale for n in burnt.shape)
+            small = np.where(burnt[:height:scale, :width:scale], 0, 255).astype(np.uint8)
+            write_image(folder / (MASK if scale == 1 else MASK.replace("/", f"_{scale}/")), small)
     write_scene(folder, shots(), points=found.sure(), **options)
     return scales, share if "moving_from" in options else None
 
@@ -233,6 +244,7 @@ def facts_of(
     limits: Limits | None,
     scales: list[int],
     moving: float | None,
+    burnt: np.ndarray | None = None,
 ) -> dict:
     """Gather the numbers of ``capture.json``."""
     camera = next(iter(found.cameras.values()))
@@ -249,6 +261,7 @@ def facts_of(
         "originals": frames.originals,
         "assumed": frames.assumed,
         "why": frames.why,
+        "burnt_in": None if burnt is None else {"share": float(burnt.mean()), "places": _places_of(burnt)},
         "absent": list(found.absent),
         "seconds": max(times) - min(times) if source.video is not None else None,
         "reprojection_error": found.error if limits else None,
@@ -266,6 +279,19 @@ def facts_of(
         "scales": scales,
         "moving": moving,
     }
+
+
+def _places_of(mask: np.ndarray) -> list[str]:
+    """Name those ninths of an image that hold a fifth or more of what is true in a mask (H, W).
+
+    >>> _places_of(np.arange(81).reshape(9, 9) < 3)
+    ['top left']
+    """
+    names = [
+        f"{row} {column}" for row in ("top", "middle", "bottom") for column in ("left", "middle", "right")
+    ]
+    parts = (part for rows in np.array_split(mask, 3) for part in np.array_split(rows, 3, axis=1))
+    return [name for name, part in zip(names, parts) if part.sum() >= 0.2 * mask.sum()]
 
 
 def summary(facts: dict) -> list[str]:
@@ -298,6 +324,12 @@ def summary(facts: dict) -> list[str]:
         )
     if facts["assumed"]:
         lines.append(f"assumed: {facts['assumed']}")
+    if burnt := facts["burnt_in"]:
+        lines.append(
+            f"burnt in: a logo or a caption in {100 * burnt['share']:.1f} % of the images "
+            f"({', '.join(burnt['places'])}), left out of poses and not trained on: {MASK}; crop it away "
+            "before, or set data.masks=off to train on it"
+        )
     if facts["has_nearer"]:
         lines.append(
             f"near: expected points from {facts['near']:.2g} on, but got nearer ones, as captions or logos "

@@ -389,6 +389,7 @@ def write_scene(
     points: np.ndarray | None = None,
     seconds: float | None = None,
     moving_from: str | None = None,
+    mask: str | None = None,
 ) -> None:
     """Write a scene that ``read_scene`` reads; ``transforms.json`` is removed first and written last.
 
@@ -398,6 +399,7 @@ def write_scene(
             move.
         seconds: between times 0 and 1.
         moving_from: who says what moves.
+        mask: path in ``folder``, written by the caller, of an image that is dark where no frame counts.
 
     Raises:
         ValueError: for a shot that ``read_scene`` would refuse.
@@ -406,7 +408,7 @@ def write_scene(
     remove(folder, FILE, POINTS)
     entries, lists, taken = [], {split: [] for split in SPLITS}, set()
     for shot in shots:
-        entries.append(_write_shot(folder, shot, taken))
+        entries.append(_write_shot(folder, shot, taken) | ({} if mask is None else {"mask_path": mask}))
         if shot.split:
             lists[shot.split].append(entries[-1]["file_path"])
     common = {key: entries[0][key] for key in _OF_CAMERA if entries and key in entries[0]}
